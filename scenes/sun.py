@@ -1,55 +1,50 @@
-"""Sun extraction: separate the dominant light of an environment map (sun or lamp) from the rest, so that no light counts twice.
+"""Suns of sIBL sets: the sun that a set names replaces what its environment map shows there, so that no light counts twice.
 
-The renderer samples the extracted sun with shadow rays of its own. If an sIBL set names a sun, it replaces what the map shows there.
+Renderer (`scenes.lamps`) and USD export treat it as a light of its own.
 """
 
 from __future__ import annotations
 
 from typing import NamedTuple
 
-import cv2
 import numpy as np
 
 from synpick_warp.scenes.environment import LUMINANCE, map_directions
 from synpick_warp.scenes.types import Sun
 
 SUN_SEARCH_RADIUS = np.radians(15.0)
-"""Texels within this angle of the brightest direction can belong to the sun [rad]."""
+"""Texels within this angle of its direction can belong to the sun [rad]."""
 SUN_CONTRAST = 4.0
 """The part of a texel's luminance above this multiple of the map's mean belongs to the sun."""
 MAX_SUN_TANGENT = np.tan(np.radians(4.0))
-"""Tangent of the maximum angular radius of a sun that gets its own shadow rays. A larger sun stays in the map, which paths sample."""
-MIN_SUN_HEIGHT = 0.15
-"""Minimum z of the direction to the sun; light from a lower sun does not reach the objects in a tote."""
+"""Tangent of the maximum angular radius of a sun that is a light of its own. A larger one is drawn into the map as a disc."""
 SOLAR_TANGENT = np.tan(np.radians(0.267))
 """Tangent of the real sun's angular radius: the minimum for an sIBL set's sun."""
 
 
 class ExtractedSun(NamedTuple):
-    """Dominant light of an environment map, and the map without it."""
+    """Sun of an environment map, and the map without it."""
 
     rest: np.ndarray
     """The map without it (rows, 2 rows, 3)."""
     direction: np.ndarray
     """Unit direction to it (3)."""
     irradiance: np.ndarray
-    """Irradiance on a surface that faces it (3); zero if no light is dominant."""
+    """Irradiance on a surface that faces it (3); zero if the map is not bright there."""
     radius_tangent: float
     """Tangent of its angular radius."""
 
 
-def extract_sun(radiance: np.ndarray, direction: np.ndarray | None = None) -> ExtractedSun:
-    """Split a map into its dominant light above the horizon and the rest.
+def extract_sun(radiance: np.ndarray, direction: np.ndarray) -> ExtractedSun:
+    """Split a map into the bright light around a direction, above the horizon, and the rest.
 
     Args:
         radiance: (rows, 2 rows, 3).
-        direction: Unit direction (3) to extract light around; None: that of the brightest place.
+        direction: Unit direction (3) to extract light around.
     """
     directions, solid_angles = map_directions(radiance.shape[0])
     luminance = radiance @ LUMINANCE
-    smooth = np.where(directions[..., 2] > MIN_SUN_HEIGHT, cv2.GaussianBlur(luminance, (0, 0), 1.5), -1.0)
-    peak = directions[np.unravel_index(np.argmax(smooth), smooth.shape)] if direction is None else direction
-    fraction = sun_fraction(radiance, peak)
+    fraction = sun_fraction(radiance, direction)
     weight = fraction * luminance * solid_angles
     if weight.sum() <= 0.0:
         return ExtractedSun(radiance, np.array([0.0, 0.0, 1.0]), np.zeros(3), 0.0)

@@ -61,7 +61,7 @@ class FrameBatch:
     light_exposure: np.ndarray
     """Exposure compensation of the episode, relative to the automatic exposure [EV] (B) float32."""
     light_direction: np.ndarray
-    """Unit vector towards the sun (the map's dominant light) in the world frame; zero: the map has none (B, 3) float32."""
+    """Unit vector towards the sun or strongest lamp of the map, in the world frame; zero: the map has none (B, 3) float32."""
     layers: dict[str, np.ndarray] = field(default_factory=dict)
     """Layers (AOVs) that `render.layers` names, each (B, H, W[, C]); see `synpick_warp.layer_codec`."""
     boundary_count: np.ndarray | None = None

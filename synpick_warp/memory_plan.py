@@ -30,7 +30,13 @@ from synpick_warp.stages.perception.arrays import Observation, Plan
 from synpick_warp.stages.perception.images import SCRATCH, count_views, perception_sizes
 from synpick_warp.stages.perception.plan import CYCLES, VoteArrays, plan_sizes
 from synpick_warp.stages.render.annotate import BORDER_BOXES, border_sizes
-from synpick_warp.stages.render.denoised import DENOISED_SCRATCH, LIGHT_HISTORY, MOVING_BODIES, history_sizes, scratch_sizes
+from synpick_warp.stages.render.denoised import (
+    DENOISED_SCRATCH,
+    LIGHT_HISTORY,
+    MOVING_BODIES,
+    history_sizes,
+    scratch_sizes,
+)
 from synpick_warp.stages.render.layers import BODY_MOTIONS, MOTION_LAYERS
 from synpick_warp.stages.render.mask_runs import BoundaryBuffers, BoundaryScratch, boundary_sizes
 from synpick_warp.stages.render.postprocess import LensArrays, has_lens_filter

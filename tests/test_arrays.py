@@ -20,12 +20,13 @@ from synpick_warp.stages.render.denoised import (
     COARSE_LIGHT,
     FIRST_FRAME_PATHS,
     GUIDE,
+    LAMP_SHADOWS,
     LIGHT_HISTORY,
     MOVING_BODIES,
     PATH_LISTS,
     RATIO_IMAGES,
     FootprintLists,
-    ShadowArrays,
+    ShadowRays,
     first_frame_paths,
     paths_per_coarse_pixel,
     scratch_sizes,
@@ -67,7 +68,8 @@ BASE = [
     GUIDE,
     COARSE_LIGHT,
     RATIO_IMAGES,
-    ShadowArrays,
+    LAMP_SHADOWS,
+    ShadowRays,
     FootprintLists,
     VISIBILITY_BUFFER,
     BORDER_BOXES,
@@ -169,7 +171,7 @@ def test_a_bakes_table_lists_every_array_with_its_copies():
 
 @pytest.mark.parametrize(
     ("cell", "width", "shape"),
-    [(0, 8, (6, 8, 6, 8)), (0, 960, (3, 480, 6, 960)), (0, 1920, (2, 384, 3, 960)), (3, 8, (2, 3, 6, 8)), (64, 8, (1,) * 4)],
+    [(0, 8, (6, 8, 6, 8)), (0, 960, (3, 480, 6, 960)), (0, 1920, (2, 384, 2, 640)), (3, 8, (2, 3, 3, 4)), (64, 8, (1,) * 4)],
 )
 def test_coarse_pixels_cover_the_image(cell, width, shape):
     sizes = scratch_sizes(settings(render__coarse_pixel=cell).render, width, 6)
@@ -208,7 +210,7 @@ def test_first_frames_trace_no_more_paths_than_a_history_counts():
 def test_the_path_traced_reference_has_no_coarse_grid():
     names = {name.split(".")[0] for name, *_ in describe_arrays(settings(render__mode="reference"))}
     assert "ShadedImage" in names
-    assert not names & {"Guide", "Gathered", "Shares", "ShadowArrays"}
+    assert not names & {"Guide", "CoarseLight", "RatioImages", "LampShadows"}
 
 
 @pytest.mark.parametrize("mode", [{"bake__mode": "target"}, {"bake__mode": "mixed", "bake__mix": [1, 0, 3]}])

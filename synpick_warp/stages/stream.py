@@ -91,15 +91,15 @@ class TickReport:
 
 @dataclass(frozen=True, eq=False)
 class LightTable:
-    """Names and sun directions of the environment maps."""
+    """Names of the environment maps, and directions of their first lamps."""
 
     name: np.ndarray
     """Name (light) str."""
     direction: np.ndarray
-    """Unit vector towards the sun (dominant light) of the unrotated map (light, 3) float32; zero: none."""
+    """Unit vector towards the first lamp (the sun, or the strongest) of the unrotated map (light, 3) float32; zero: none."""
 
     def directions(self, light: np.ndarray, yaw: np.ndarray) -> np.ndarray:
-        """Sun directions in the world (..., 3) float32 of maps `light` (...) with yaw `yaw` (...) [rad]."""
+        """Directions to the first lamps in the world (..., 3) float32 of maps `light` (...) with yaw `yaw` (...) [rad]."""
         x, y, z = np.moveaxis(self.direction[light].astype(np.float64), -1, 0)
         c, s = np.cos(yaw), np.sin(yaw)
         return np.stack([c * x - s * y, s * x + c * y, z], axis=-1).astype(np.float32)
@@ -107,8 +107,7 @@ class LightTable:
 
 def name_lights(names: list[str], lights: Any) -> LightTable:
     """Build the table of environment maps from their names and the struct `Lights`."""
-    shines = lights.sun_irradiance.numpy().max(axis=1, keepdims=True) > 0.0
-    return LightTable(np.array(names), np.where(shines, lights.sun_direction.numpy(), 0.0).astype(np.float32))
+    return LightTable(np.array(names), lights.lamp_direction.numpy()[:, 0].astype(np.float32))
 
 
 class TickReader:

@@ -4,7 +4,6 @@ import warp as wp
 
 from synpick_warp.kernels.render.lighting.history import (
     LightHistory,
-    MovingBodies,
     covered_fraction,
     lag_frames,
     path_number,
@@ -12,6 +11,7 @@ from synpick_warp.kernels.render.lighting.history import (
     update_frame,
     usable_paths,
 )
+from synpick_warp.kernels.render.lighting.moving_bodies import MovingBodies
 from synpick_warp.kernels.render.visibility.gbuffer import Meshes
 
 wp.set_module_options({"enable_backward": False})

@@ -140,11 +140,13 @@ def test_the_real_set(real_lights):
     assert light.sun.direction @ map_directions(512)[0][brightest] > np.cos(np.radians(3.0))
     np.testing.assert_allclose(light.sun.irradiance / np.pi, 1.5 * srgb_to_linear(np.array((255, 214, 170)) / 255))
     table, alone = precompute_environment(light, None), precompute_environment(EnvironmentMap("kiara", light.radiance), None)
-    # The glow around it is wide: no main light, all stays in the map, and facing it is as bright as the set says.
-    assert table.sun_radius > MAX_SUN_TANGENT
-    assert not table.sun_irradiance.any()
-    assert table.sunless.tobytes() == table.radiance.tobytes()
-    rest = replace_sun(alone.radiance.astype(np.float64), light.sun)[0]
+    # The glow around it is wide: it is drawn into the map, of which its brightest part is a lamp. Facing it is as bright as the set says.
+    replaced = replace_sun(alone.radiance.astype(np.float64), light.sun)
+    assert replaced.radius_tangent > MAX_SUN_TANGENT
+    (glow,) = table.lamps
+    assert glow.direction @ light.sun.direction > np.cos(np.radians(10.0))
+    np.testing.assert_allclose(facing(table.lampless, glow.direction) + glow.irradiance, facing(table.radiance, glow.direction), rtol=3e-3)
+    rest = replaced.rest
     gained = facing(table.radiance, light.sun.direction) - facing(rest, light.sun.direction)
     np.testing.assert_allclose(gained, light.sun.irradiance, rtol=0.01)
     assert facing(table.radiance, light.sun.direction) @ LUMINANCE > facing(alone.radiance, light.sun.direction) @ LUMINANCE
@@ -169,12 +171,14 @@ def test_a_plane_that_faces_the_sun_receives_the_sun_and_the_rest_once():
     """The clipped disc is gone from diffuse light, reflections and background; the sun stands there instead."""
     light = EnvironmentMap("set", clipped(SUN.direction), SUN)
     table = precompute_environment(light, None)
-    np.testing.assert_allclose(table.sun_direction, SUN.direction, rtol=1e-6)
-    np.testing.assert_allclose(table.sun_irradiance, SUN.irradiance, rtol=1e-6)
-    rest, _, taken, _ = extract_sun(light.radiance.astype(np.float64))
+    (sun,) = table.lamps
+    np.testing.assert_allclose(sun.direction, SUN.direction, rtol=1e-6)
+    np.testing.assert_allclose(sun.irradiance, SUN.irradiance, rtol=1e-6)
+    assert (sun.points @ sun.direction).min() > 1.0 / np.sqrt(1.0 + sun.radius_tangent**2)
+    rest, _, taken, _ = extract_sun(light.radiance.astype(np.float64), SUN.direction)
     assert taken.min() > 0.1
     np.testing.assert_allclose(sh_basis(SUN.direction) @ table.irradiance, facing(rest, SUN.direction), rtol=0.03)
-    total = sh_basis(SUN.direction) @ table.irradiance + table.sun_irradiance
+    total = sh_basis(SUN.direction) @ table.irradiance + sun.irradiance
     np.testing.assert_allclose(total, facing(rest, SUN.direction) + SUN.irradiance, rtol=0.01)
     np.testing.assert_allclose(facing(table.radiance, SUN.direction), facing(rest, SUN.direction) + SUN.irradiance, rtol=0.01)
     assert table.prefiltered.max() < 3.0
@@ -193,17 +197,17 @@ def test_exposure_and_table_include_the_sun():
 def test_a_map_with_an_unclipped_sun_keeps_its_luminance():
     weak = Sun(SUN.direction, SUN.irradiance * 1e-4)
     light = EnvironmentMap("set", clipped(SUN.direction, value=4000.0), weak)
-    taken = extract_sun(resize_map(light.radiance, BACKGROUND_ROWS))[2]
-    table = precompute_environment(light, None)
-    np.testing.assert_allclose(table.sun_irradiance @ LUMINANCE, taken @ LUMINANCE, rtol=1e-4)
-    np.testing.assert_allclose(table.sun_irradiance / table.sun_irradiance[0], weak.irradiance / weak.irradiance[0], rtol=1e-5)
+    taken = extract_sun(resize_map(light.radiance, BACKGROUND_ROWS), SUN.direction)[2]
+    (sun,) = precompute_environment(light, None).lamps
+    np.testing.assert_allclose(sun.irradiance @ LUMINANCE, taken @ LUMINANCE, rtol=1e-4)
+    np.testing.assert_allclose(sun.irradiance / sun.irradiance[0], weak.irradiance / weak.irradiance[0], rtol=1e-5)
 
 
 def test_a_sun_over_an_even_map_is_as_wide_as_the_sun():
     table = precompute_environment(EnvironmentMap("set", np.ones((64, 128, 3), np.float32), SUN), None)
-    assert table.sun_radius == pytest.approx(SOLAR_TANGENT)
+    assert table.lamps[0].radius_tangent == pytest.approx(SOLAR_TANGENT)
     np.testing.assert_allclose(sh_basis(SUN.direction) @ table.irradiance, np.pi, rtol=1e-3)
-    assert 0.05 < precompute_environment(EnvironmentMap("set", clipped(SUN.direction), SUN), None).sun_radius < 0.09
+    assert 0.05 < precompute_environment(EnvironmentMap("set", clipped(SUN.direction), SUN), None).lamps[0].radius_tangent < 0.09
 
 
 @given(z=st.floats(1e-3, 1.0), azimuth=st.floats(-np.pi, np.pi), spread=st.floats(0.0, 0.5))
@@ -230,15 +234,21 @@ def test_hills_occlude_their_part_of_the_disc():
     np.testing.assert_allclose(draw_sun_disc(np.zeros_like(bright), direction, SUN.irradiance, 0.2), whole)
 
 
-def test_without_a_set_the_sun_is_extracted_from_the_map():
+def test_without_a_set_the_bright_place_of_the_map_is_a_lamp():
     light = EnvironmentMap("map", clipped(SUN.direction))
-    rest, direction, irradiance, _ = extract_sun(resize_map(light.radiance, BACKGROUND_ROWS))
     table = precompute_environment(light, None)
-    np.testing.assert_allclose(table.sun_direction, direction, rtol=1e-6)
-    np.testing.assert_allclose(table.sun_irradiance, irradiance, rtol=1e-6)
-    assert facing(table.radiance, direction) == pytest.approx(facing(light.radiance, direction), rel=0.01)
-    assert table.radiance.shape == (BACKGROUND_ROWS, 2 * BACKGROUND_ROWS, 3)
-    assert facing(rest, direction)[0] < facing(light.radiance, direction)[0]
+    (sun,) = table.lamps
+    assert sun.direction @ SUN.direction > np.cos(np.radians(2.0))
+    np.testing.assert_array_equal(table.radiance, resize_map(light.radiance, BACKGROUND_ROWS).astype(np.float32))
+    np.testing.assert_allclose(facing(table.lampless, sun.direction) + sun.irradiance, facing(table.radiance, sun.direction), rtol=1e-3)
+
+
+def test_a_set_without_lamps_keeps_its_sun_in_the_map():
+    light = EnvironmentMap("set", clipped(SUN.direction), SUN)
+    table = precompute_environment(light, None, max_lamps=0)
+    assert table.lamps == []
+    np.testing.assert_array_equal(table.lampless, table.radiance)
+    np.testing.assert_array_equal(table.radiance, precompute_environment(light, None).radiance)
 
 
 def test_the_sun_of_a_set_casts_a_shadow_in_its_colour(device):

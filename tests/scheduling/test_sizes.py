@@ -70,7 +70,7 @@ def test_batches_shrink_until_plan_and_headroom_fit(give, gpu, mode):
     planned = sum(term.size for term in plan_memory(config, GPU) if term.on_device)
     assert HEADROOM * planned + RUNTIME_BYTES <= gpu * GIB
     # The larger part shrinks first: batches, or worlds where the light averaged over their frames is larger.
-    assert config.bake.worlds >= min(512, 16 * gpu)
+    assert config.bake.worlds >= min(512, 13 * gpu)
     if gpu >= 12.0:
         assert views_per_batch(config, GPU) >= 12
     check_memory(config, GPU)

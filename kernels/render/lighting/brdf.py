@@ -312,7 +312,7 @@ def evaluate_brdf(tables: AlbedoTables, brdf: Brdf, incoming: wp.vec3) -> BrdfVa
 
 @wp.func
 def evaluate_disc(tables: AlbedoTables, brdf: Brdf, center: wp.vec3, radius: float) -> wp.vec3:
-    """Evaluate the BRDF times cosine, averaged over a disc light (the sun) about `center`.
+    """Evaluate the BRDF times cosine, averaged over a disc light (a lamp) about `center`.
 
     `radius` is the tangent of the light's angular radius, and small. The half vectors of a disc light fill an ellipse in slope space,
     approximated by a disc of the same area: in sharp highlights of wide lamps at cosines below 0.5 the middle is too bright and the sides

@@ -20,9 +20,11 @@ class CoarseGrid:
 
     size: int
     """Width of a coarse pixel [px]; 0 in mode unoccluded, which has none."""
+    period: int
+    """Period of the sample points of shadow rays [coarse pixels], a power of two: any window of this width holds each of period² points
+    once, any aligned one of half the width a stratified quarter of them."""
     window: int
-    """Width of the shadow filter [coarse pixels], a power of two. Any window of this width holds each of window² sample points once,
-    so that the filtered noise shows no pattern."""
+    """Width of the shadow filter [coarse pixels], even, or 1."""
     image: ImageGrid
     """Full-resolution grid [px]."""
     grid: ImageGrid

@@ -55,8 +55,8 @@ SEQUENCE_PERIOD = wp.constant(16)
 """Tile width of the sampler [coarse pixels]: the pixels of a tile share one Sobol' sequence, dealt out by Morton index, so that every
 aligned power-of-two sub-tile holds a contiguous, well-stratified part of it."""
 INDIRECT_CLAMP = wp.constant(4.0)
-"""Firefly clamp of indirect light: at most this many times the radiance of a white surface that faces the sun, on top of the clamp for
-unoccluded light. Few paths find sunlit surfaces, so each of them has a large weight."""
+"""Firefly clamp of indirect light: at most this many times the radiance of a white surface that faces all lamps, on top of the clamp
+for unoccluded light. Few paths find surfaces that lamps light, so each of them has a large weight."""
 SHIFT_RANGE = wp.constant(1.0)
 """Range of the Cranley-Patterson rotation of the first dimension over the image: a slow gradient keeps neighbouring pixels stratified
 within a filter kernel, and a range of 1 leaves the image's mean unbiased."""
@@ -71,7 +71,7 @@ class CoarseLight:
     """
 
     diffuse: wp.array3d[wp.vec4]
-    """Diffuse reflection of the environment map without its sun, occluded and unoccluded; packed by `pack_light`."""
+    """Diffuse reflection of the environment map without its lamps, occluded and unoccluded; packed by `pack_light`."""
     specular: wp.array3d[wp.vec4]
     """Specular reflection, likewise; the occluded value includes light from other surfaces."""
     indirect: wp.array3d[wp.uint64]
@@ -100,7 +100,7 @@ def make_context(
 ) -> PathContext:
     """Path-tracing context of a coarse pixel: stream of random numbers, rotation and map of the environment.
 
-    All images of an episode use one stream; see `first_path_index`. The first surface is lit by the map without its sun: row `light` +
+    All images of an episode use one stream; see `first_path_index`. The first surface is lit by the map without its lamps: row `light` +
     number of maps of `Lights.radiance`. `yaw` is in radians.
     """
     context = PathContext()
@@ -130,10 +130,10 @@ def average_paths(
     """Monte Carlo mean of the reflected light over `samples` paths from `index` on, which start at `first`, `width` [m] wide.
 
     Firefly clamp: a path counts with at most `firefly_clamp` times the unoccluded light; indirect light with INDIRECT_CLAMP more, because
-    the unoccluded light lacks the sun.
+    the unoccluded light lacks the lamps.
     """
     sum = SplitRadiance()
-    sunlit = (INDIRECT_CLAMP / wp.PI) * scene.lights.sun_irradiance[context.light]
+    lamplit = (INDIRECT_CLAMP / wp.PI) * scene.lights.total_lamp_irradiance[context.light]
     # One loop over all bounces of all paths: a thread whose path ends early starts the next while others of its warp go on.
     sample = int(0)
     path = init_path(first, width)
@@ -141,8 +141,8 @@ def average_paths(
         path = extend_path(scene, bodies, rules, context, index + sample, first.brdf.diffuse, path)
         if path.bounce == TERMINATED:
             sum.diffuse += clamp_light(path.radiance.diffuse, firefly_clamp * unoccluded.diffuse)
-            sum.indirect += clamp_light(path.radiance.indirect, firefly_clamp * unoccluded.diffuse + sunlit)
-            limit = firefly_clamp * unoccluded.specular + wp.cw_mul(specular_albedo(first.brdf), sunlit)
+            sum.indirect += clamp_light(path.radiance.indirect, firefly_clamp * unoccluded.diffuse + lamplit)
+            limit = firefly_clamp * unoccluded.specular + wp.cw_mul(specular_albedo(first.brdf), lamplit)
             sum.specular += clamp_light(path.radiance.specular, limit)
             path = init_path(first, width)
             sample += 1
@@ -325,7 +325,7 @@ def trace_coarse_paths_kernel(
     """Trace paths from the middle pixel of each coarse pixel: their mean light and the unoccluded light, and the guide image.
 
     With a history only those in `lists` do, as many paths as `new_paths` says; the path of a coarse pixel with a usable history is
-    blended into it. The sun's direct light is left out, see `shadows`.
+    blended into it. The lamps' direct light is left out, see `shadows`.
     """
     index = wp.tid() + first
     known, bits = int(0), int(0)

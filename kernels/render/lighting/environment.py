@@ -1,4 +1,4 @@
-"""Environment lighting: radiance maps (equirectangular), irradiance by spherical harmonics, prefiltered specular maps, dominant sun."""
+"""Environment lighting: radiance maps (equirectangular), irradiance by spherical harmonics, prefiltered specular maps, lamps."""
 
 import warp as wp
 
@@ -8,6 +8,8 @@ from synpick_warp.kernels.render.visibility.records import read_record
 
 wp.set_module_options({"enable_backward": False})
 
+MAX_LAMPS = wp.constant(8)
+"""Maximum number of lamps of a map, and of shadow rays from a pixel of the shadow grid, which stores a bit for each."""
 PREFILTER_LEVELS = wp.constant(5)
 """Levels of the prefiltered specular map, for roughness 1/5, 2/5, ... 1."""
 SH_CONSTANT = wp.constant(0.282095)
@@ -18,35 +20,55 @@ SH_CONSTANT = wp.constant(0.282095)
 class Lights:
     """Environment maps and their precomputed tables. Constant. A world rotates its map about +z by its yaw.
 
-    A map's sun is its dominant light, split off where it is small enough: see `scenes.sun`. Directions are in the map's frame.
+    A map's lamps are its small and bright lights, split off from the rest: see `scenes.lamps`. Directions are in the map's frame.
     """
 
     maps: int
     """Number of environment maps."""
     radiance: wp.array3d[wp.vec4]
-    """(2 maps, row, column): first every map as it is, then every map without its sun. Row 0 is the zenith, column
+    """(2 maps, row, column): first every map as it is, then every map without its lamps. Row 0 is the zenith, column
     u = azimuth / 2π + 0.5. The fourth component is padding, so that `read_record` applies."""
     prefiltered: wp.array4d[wp.uint64]
-    """(map, level, row, column): radiance without the sun, convolved with GGX lobes of increasing roughness; times the map's exposure, and
-    packed as by `pack_half3`."""
+    """(map, level, row, column): radiance without the lamps, convolved with GGX lobes of increasing roughness; times the map's exposure,
+    and packed as by `pack_half3`."""
     irradiance: wp.array2d[wp.vec3]
-    """(map, coefficient): irradiance without the sun as nine real spherical harmonics, already convolved with the cosine."""
-    sun_direction: wp.array[wp.vec3]
-    """(map): unit vector towards the sun."""
-    sun_irradiance: wp.array[wp.vec3]
-    """(map): irradiance of the sun on a surface that faces it; zero: the map has no sun."""
-    sun_radius: wp.array[float]
-    """(map): tangent of the sun's angular radius."""
+    """(map, coefficient): irradiance without the lamps as nine real spherical harmonics, already convolved with the cosine."""
+    lamps: wp.array[int]
+    """(map): number of lamps, at most MAX_LAMPS."""
+    lamp_direction: wp.array2d[wp.vec3]
+    """(map, lamp): unit vector towards the lamp's center."""
+    lamp_irradiance: wp.array2d[wp.vec3]
+    """(map, lamp): irradiance of the lamp on a surface that faces it."""
+    lamp_radius: wp.array2d[float]
+    """(map, lamp): tangent of the lamp's angular radius."""
+    lamp_point: wp.array3d[wp.vec3]
+    """(map, lamp, point): unit vectors towards parts of the lamp of equal irradiance; see `scenes.lamps.stratify_light`."""
+    lamp_rays: wp.array[int]
+    """(map): shadow rays to each lamp from a pixel of the shadow grid, a power of two; with all lamps at most MAX_LAMPS."""
+    total_lamp_irradiance: wp.array[wp.vec3]
+    """(map): sum of `lamp_irradiance`; zero: the map has no lamps."""
     exposure: wp.array[float]
     """(map): factor that brings the map's radiance to display range."""
 
 
 @wp.func
+def unit_heading(angle: float) -> wp.vec2:
+    """Unit vector (cos, sin) of an angle [rad]."""
+    return wp.vec2(wp.cos(angle), wp.sin(angle))
+
+
+@wp.func
+def rotate_heading(direction: wp.vec3, heading: wp.vec2) -> wp.vec3:
+    """`direction`, rotated counter-clockwise about +z by the angle of a `unit_heading`."""
+    x = heading[0] * direction[0] - heading[1] * direction[1]
+    y = heading[1] * direction[0] + heading[0] * direction[1]
+    return wp.vec3(x, y, direction[2])
+
+
+@wp.func
 def rotate_z(direction: wp.vec3, angle: float) -> wp.vec3:
     """`direction`, rotated counter-clockwise about +z by `angle` [rad]."""
-    c = wp.cos(angle)
-    s = wp.sin(angle)
-    return wp.vec3(c * direction[0] - s * direction[1], s * direction[0] + c * direction[1], direction[2])
+    return rotate_heading(direction, unit_heading(angle))
 
 
 @wp.func
@@ -103,7 +125,7 @@ def read_texel(lights: Lights, index: int) -> wp.vec3:
 def environment_radiance(lights: Lights, light: int, direction: wp.vec3) -> wp.vec3:
     """Radiance from a unit direction in the map's frame, bilinear.
 
-    `light` is a row of `Lights.radiance`: the index of a map, or that plus `maps` for the map without its sun.
+    `light` is a row of `Lights.radiance`: the index of a map, or that plus `maps` for the map without its lamps.
     """
     rows = lights.radiance.shape[1]
     columns = lights.radiance.shape[2]
@@ -133,7 +155,7 @@ def prefiltered_level(lights: Lights, light: int, level: int, taps: BilinearTaps
 
 @wp.func
 def prefiltered_radiance(lights: Lights, light: int, direction: wp.vec3, roughness: float) -> wp.vec3:
-    """Prefiltered specular radiance without the sun (Karis, 2013), trilinear: the GGX lobe's mean about a unit direction of the map."""
+    """Prefiltered specular radiance without the lamps (Karis, 2013), trilinear: the GGX lobe's mean about a unit direction of the map."""
     level = wp.clamp(roughness * float(PREFILTER_LEVELS) - 1.0, 0.0, float(PREFILTER_LEVELS - 1))
     lower = clamp_index(int(level), PREFILTER_LEVELS - 1)
     taps = find_taps(direction, lights.prefiltered.shape[2], lights.prefiltered.shape[3])
@@ -147,7 +169,7 @@ def prefiltered_radiance(lights: Lights, light: int, direction: wp.vec3, roughne
 
 @wp.func
 def sh_irradiance(lights: Lights, light: int, normal: wp.vec3) -> wp.vec3:
-    """Irradiance by spherical harmonics of order 2 (Ramamoorthi and Hanrahan, 2001), without the sun; clamped at zero.
+    """Irradiance by spherical harmonics of order 2 (Ramamoorthi and Hanrahan, 2001), without the lamps; clamped at zero.
 
     `normal` is a unit vector in the map's frame.
     """

@@ -221,7 +221,7 @@ def sample_direct_light(
     weight = mis_weight(rules.strategy, LIGHT_SAMPLING, sample.pdf, brdf_pdf(vertex.brdf, result.direction)) / sample.pdf
     if weight <= 0.0 or wp.dot(result.direction, vertex.brdf.normal) <= 0.0:
         return result
-    if is_blocked(scene.meshes, scene.table, bodies, context.view, vertex.origin, result.direction, FAR):
+    if is_blocked(scene.meshes, scene.table, bodies, context.view, -1, vertex.origin, result.direction, FAR):
         return result
     result.radiance = weight * environment_radiance(scene.lights, light, sample.direction)
     return result

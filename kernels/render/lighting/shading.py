@@ -1,4 +1,4 @@
-"""Deferred shading: radiance of each pixel from the G-buffer, denoised visibility ratios, indirect light and sun visibility.
+"""Deferred shading: radiance of each pixel from the G-buffer, denoised visibility ratios, indirect light and lamp shadows.
 
 `shade_kernel` shades the center of each pixel. `shade_samples_kernel` supersamples the shading of bodies: textures and normals of one
 triangle a pixel. The light is gathered once, and silhouettes are left to anti-aliasing.
@@ -9,7 +9,7 @@ import warp as wp
 from synpick_warp.codes import Segment
 from synpick_warp.kernels.render.lighting.brdf import AlbedoTables, Brdf, evaluate_disc, make_brdf
 from synpick_warp.kernels.render.lighting.coarse_grid import CoarseGrid
-from synpick_warp.kernels.render.lighting.environment import Lights, environment_radiance, rotate_z
+from synpick_warp.kernels.render.lighting.environment import Lights, environment_radiance, rotate_heading, rotate_z, unit_heading
 from synpick_warp.kernels.render.lighting.materials import (
     Surface,
     interpolate_surface,
@@ -19,7 +19,8 @@ from synpick_warp.kernels.render.lighting.materials import (
 )
 from synpick_warp.kernels.render.lighting.path_tracing import PathScene
 from synpick_warp.kernels.render.lighting.plane_distance import tangent_plane
-from synpick_warp.kernels.render.lighting.shadows import upsample_shadow
+from synpick_warp.kernels.render.lighting.shadow_upsampling import LampShadows, upsample_shadows
+from synpick_warp.kernels.render.lighting.shadows import byte_of
 from synpick_warp.kernels.render.lighting.unoccluded import unoccluded_light
 from synpick_warp.kernels.render.lighting.upsampling import RatioImages, Ratios, upsample_ratios
 from synpick_warp.kernels.render.visibility.camera import Cameras, Views, camera_ray, in_image, tile_pixel
@@ -52,22 +53,42 @@ class PixelLight:
 
     ratios: Ratios
     """Visibility ratios of the environment's diffuse and specular light, and indirect light, which is absolute."""
-    sun: float
-    """Visible fraction of the sun."""
+    lamps: wp.uint64
+    """Visible fraction of each lamp, byte k that of lamp k in 1/255, also of lamps behind the surface."""
 
 
 @wp.func
-def shade_surface(tables: AlbedoTables, lights: Lights, light: int, yaw: float, brdf: Brdf, ratios: Ratios, sun: float) -> wp.vec3:
-    """Radiance towards the camera: unoccluded light times its visibility `ratios`, indirect light, and sunlight times visibility `sun`."""
+def lamp_light(
+    tables: AlbedoTables, lights: Lights, light: int, yaw: float, brdf: Brdf, face_normal: wp.vec3, visible: wp.uint64
+) -> wp.vec3:
+    """Radiance of the lamps' light that a surface reflects towards the camera; `visible` as in `PixelLight.lamps`.
+
+    Lamps behind the triangle, whose geometric normal is `face_normal`, give no light, whatever the interpolated normal says.
+    """
+    result = wp.vec3()
+    if visible == wp.uint64(0):
+        return result
+    heading = unit_heading(yaw)
+    for lamp in range(lights.lamps[light]):
+        fraction = byte_of(visible, lamp)
+        if fraction > 0:
+            direction = rotate_heading(lights.lamp_direction[light, lamp], heading)
+            if wp.dot(face_normal, direction) > 0.0:
+                reflected = evaluate_disc(tables, brdf, direction, lights.lamp_radius[light, lamp])
+                result += (float(fraction) / 255.0) * wp.cw_mul(reflected, lights.lamp_irradiance[light, lamp])
+    return result
+
+
+@wp.func
+def shade_surface(
+    tables: AlbedoTables, lights: Lights, light: int, yaw: float, brdf: Brdf, face_normal: wp.vec3, ratios: Ratios, lamps: wp.uint64
+) -> wp.vec3:
+    """Radiance towards the camera: unoccluded light times its visibility `ratios`, indirect light, and that of the visible `lamps`."""
     unoccluded = unoccluded_light(lights, light, yaw, brdf)
     result = wp.cw_mul(brdf.diffuse, wp.cw_mul(unoccluded.diffuse, ratios.diffuse) + ratios.indirect) + wp.cw_mul(
         unoccluded.specular, ratios.specular
     )
-    if sun > 0.0:
-        to_sun = rotate_z(lights.sun_direction[light], yaw)
-        reflected = evaluate_disc(tables, brdf, to_sun, lights.sun_radius[light])
-        result += sun * wp.cw_mul(reflected, lights.sun_irradiance[light])
-    return result
+    return result + lamp_light(tables, lights, light, yaw, brdf, face_normal, lamps)
 
 
 @wp.func
@@ -79,21 +100,20 @@ def gather_light(
     sky: Sky,
     gbuffer: GBuffer,
     ratios: RatioImages,
-    sun_visibility: wp.array3d[wp.uint64],
+    shadows: LampShadows,
     camera: int,
     view: int,
     row: int,
     column: int,
     face_normal: wp.vec3,
 ) -> PixelLight:
-    """Upsample the denoised light and the sun's visibility to a pixel whose surface has the geometric normal `face_normal`."""
+    """Upsample the denoised light and the lamps' shadows to a pixel whose surface has the geometric normal `face_normal`."""
     segment = gbuffer.segment[view, row, column]
     normal = wp.transpose(cameras.to_world[camera]) * face_normal
     plane = tangent_plane(cameras.intrinsics[camera], row, column, segment, gbuffer.depth[view, row, column], normal)
     result = PixelLight()
-    if wp.max(scene.lights.sun_irradiance[sky.light]) > 0.0:
-        if wp.dot(face_normal, rotate_z(scene.lights.sun_direction[sky.light], sky.yaw)) > 0.0:
-            result.sun = upsample_shadow(sun_visibility, shadow_grid, view, row, column, plane)
+    if scene.lights.lamps[sky.light] > 0:
+        result.lamps = upsample_shadows(shadows, shadow_grid, view, row, column, plane)
     result.ratios = upsample_ratios(ratios, coarse, view, row, column, plane)
     result.ratios.indirect = result.ratios.indirect / scene.lights.exposure[sky.light]
     return result
@@ -106,7 +126,7 @@ def shade_point(scene: PathScene, sky: Sky, surface: Surface, outgoing: wp.vec3,
     metallic = scene.surfaces.metallic[surface.row]
     roughness = widen_roughness(scene.surfaces.roughness[surface.row], surface.normal_spread)
     brdf = make_brdf(scene.surfaces.albedo, color, metallic, roughness, surface.normal, outgoing)
-    return shade_surface(scene.surfaces.albedo, scene.lights, sky.light, sky.yaw, brdf, light.ratios, light.sun)
+    return shade_surface(scene.surfaces.albedo, scene.lights, sky.light, sky.yaw, brdf, surface.face_normal, light.ratios, light.lamps)
 
 
 @wp.func
@@ -162,7 +182,7 @@ def shade_pixel(
     bodies: ViewBodies,
     gbuffer: GBuffer,
     ratios: RatioImages,
-    sun_visibility: wp.array3d[wp.uint64],
+    shadows: LampShadows,
     views: Views,
     view: int,
     row: int,
@@ -188,9 +208,7 @@ def shade_pixel(
     surface = make_table_surface(scene.meshes, outgoing)
     if segment != Segment.TABLE:
         surface = interpolate_surface(scene.meshes, scene.surfaces, bodies, view, body, triangle, barycentric, outgoing, width)
-    light = gather_light(
-        scene, cameras, coarse, shadow_grid, sky, gbuffer, ratios, sun_visibility, camera, view, row, column, surface.face_normal
-    )
+    light = gather_light(scene, cameras, coarse, shadow_grid, sky, gbuffer, ratios, shadows, camera, view, row, column, surface.face_normal)
     if segment == Segment.TABLE or samples_per_axis == 1:
         return shade_point(scene, sky, surface, outgoing, light)
     corners = camera_triangle(scene.meshes, bodies, view, body, triangle)
@@ -224,7 +242,7 @@ def shade_kernel(
     bodies: ViewBodies,
     gbuffer: GBuffer,
     ratios: RatioImages,
-    sun_visibility: wp.array3d[wp.uint64],  # (view, shadow_row, shadow_column)
+    shadows: LampShadows,
     views: Views,
     first: int,
     # Out:
@@ -235,7 +253,7 @@ def shade_kernel(
     if in_image(coarse.image, row, column):
         sky = world_sky(light, light_yaw, views.world[view])
         radiance_out[view, row, column] = shade_pixel(
-            scene, cameras, coarse, shadow_grid, sky, bodies, gbuffer, ratios, sun_visibility, views, view, row, column, 1
+            scene, cameras, coarse, shadow_grid, sky, bodies, gbuffer, ratios, shadows, views, view, row, column, 1
         )
 
 
@@ -253,7 +271,7 @@ def shade_samples_kernel(
     bodies: ViewBodies,
     gbuffer: GBuffer,
     ratios: RatioImages,
-    sun_visibility: wp.array3d[wp.uint64],  # (view, shadow_row, shadow_column)
+    shadows: LampShadows,
     views: Views,
     first: int,
     # Out:
@@ -264,5 +282,5 @@ def shade_samples_kernel(
     if in_image(coarse.image, row, column):
         sky = world_sky(light, light_yaw, views.world[view])
         radiance_out[view, row, column] = shade_pixel(
-            scene, cameras, coarse, shadow_grid, sky, bodies, gbuffer, ratios, sun_visibility, views, view, row, column, SAMPLES_PER_AXIS
+            scene, cameras, coarse, shadow_grid, sky, bodies, gbuffer, ratios, shadows, views, view, row, column, SAMPLES_PER_AXIS
         )

@@ -1,60 +1,215 @@
-"""Sun shadows: one shadow ray per coarse pixel to a point of the sun's disc, filtered and upsampled along surfaces (soft shadows)."""
+"""Lamp shadows: shadow rays to sample points of the lamps from the pixels of the shadow grid, filtered along surfaces.
+
+The sample points of neighbouring coarse pixels are stratified, so that a small filter sees the whole lamp (soft shadows). On a resting
+surface a ray is traced again only if a moving body may block it now, or may have blocked it in the previous frame; and all of them every
+REFRESH_FRAMES frames.
+"""
 
 import warp as wp
 
 from synpick_warp.codes import Segment
-from synpick_warp.kernels.render.lighting.coarse_grid import (
-    MIN_WEIGHT,
-    PLANE_TOLERANCE,
-    CoarseGrid,
-    middle_pixel,
-    morton_index,
-    window_coordinate,
-)
-from synpick_warp.kernels.render.lighting.environment import Lights, rotate_z
-from synpick_warp.kernels.render.lighting.plane_distance import Plane, plane_distance, tangent_plane
-from synpick_warp.kernels.render.lighting.sampling import rotate_to_axis, sobol_point
-from synpick_warp.kernels.render.lighting.upsampling import RING
+from synpick_warp.kernels.render.lighting.coarse_grid import PLANE_TOLERANCE, CoarseGrid, flat_index, middle_pixel, morton_index
+from synpick_warp.kernels.render.lighting.environment import Lights, rotate_heading, unit_heading
+from synpick_warp.kernels.render.lighting.history import LightHistory
+from synpick_warp.kernels.render.lighting.moving_bodies import MovingBodies
+from synpick_warp.kernels.render.lighting.plane_distance import plane_distance, tangent_plane
 from synpick_warp.kernels.render.visibility.bvh_rays import RAY_OFFSET, is_blocked
-from synpick_warp.kernels.render.visibility.camera import Cameras, Views, camera_ray, clamp_index, hit_position, in_image, tile_pixel
-from synpick_warp.kernels.render.visibility.gbuffer import FAR, GBuffer, Meshes, Table, ViewBodies, face_normal, read_hit
+from synpick_warp.kernels.render.visibility.camera import (
+    TILE_HEIGHT,
+    TILE_WIDTH,
+    Cameras,
+    Views,
+    camera_ray,
+    hit_position,
+    in_image,
+    tile_pixel,
+)
+from synpick_warp.kernels.render.visibility.gbuffer import FAR, GBuffer, Hit, Meshes, Table, ViewBodies, body_of, face_normal, read_hit
+from synpick_warp.kernels.render.visibility.records import write_record
 from synpick_warp.kernels.tuning import RAY_REGISTERS
 
 wp.set_module_options({"enable_backward": False, "fast_math": True})
 
-VISIBILITY_BITS = wp.constant(16)
-"""Bits of a packed sun visibility."""
-VISIBILITY_MASK = wp.constant((1 << 16) - 1)
-"""The lowest VISIBILITY_BITS, and packed sun visibility 1."""
-VISIBILITY_STEP = wp.constant(1.0 / ((1 << 16) - 1))
-"""Smallest packed sun visibility above 0."""
+ALL_RAYS = wp.constant(0xFF)
+"""Bits of MAX_LAMPS shadow rays, all of them free."""
+LAMP_POINTS = wp.constant(16)
+"""Number of a lamp's sample points."""
+REFRESH_FRAMES = wp.constant(16)
+"""Period in which all shadow rays are traced again [frames]: bodies that move by less than `moving_bodies.REST_DISPLACEMENT` a frame change
+shadows, too."""
+CALM_FRAMES = wp.constant(64)
+"""Minimum of `MovingBodies.drift_frames` of a surface whose shadows are reused: it then moves by at most MAX_DRIFT / 4 in REFRESH_FRAMES
+frames, half the width of a coarse pixel at full HD."""
+TILE_SHIFT = wp.constant(3)
+"""Tiles of a row of tiles refresh their shadow rays this many frames after those of the row above."""
+MIN_DIRECTION = wp.constant(1.0e-9)
+"""Divisors that are components of directions are at least this."""
+SPREAD_BITS = wp.constant(wp.uint64(0x8040201008040201))
+"""Bit k of byte k."""
+EVERY_BYTE = wp.constant(wp.uint64(0x0101010101010101))
+"""1 in each byte."""
+CARRY_BITS = wp.constant(wp.uint64(0x7F7F7F7F7F7F7F7F))
+"""Added to bytes of at most 0x80, this sets their highest bit if they are not 0."""
+
+
+@wp.struct
+class LampShadows:
+    """Shadows of the lamps on the shadow grid. Scratch."""
+
+    record: wp.array3d[wp.vec4]
+    """(view, shadow_row, shadow_column): packed by `pack_shadows`."""
 
 
 @wp.func
-def pack_visibility(visibility: float, depth: float, segment: wp.uint8) -> wp.uint64:
-    """Pack a coarse pixel's sun visibility in VISIBILITY_BITS with its segmentation id and, in the upper half, its depth [m]; so filter and
-    upsampling read each neighbour once."""
-    fraction = wp.uint32(visibility * float(VISIBILITY_MASK) + 0.5)
-    lower = (wp.uint32(segment) << wp.uint32(VISIBILITY_BITS)) | fraction
-    return (wp.uint64(wp.cast(depth, wp.uint32)) << wp.uint64(32)) | wp.uint64(lower)
+def pack_last(segment: int, rays: int) -> wp.uint16:
+    """Pack a segmentation id and the bits of a pixel's shadow rays, for the next frame."""
+    return wp.uint16((segment << 8) | rays)
 
 
 @wp.func
-def packed_visibility(packed: wp.uint64) -> float:
-    """Sun visibility of a packed coarse pixel."""
-    return VISIBILITY_STEP * float(int(wp.uint32(packed) & wp.uint32(VISIBILITY_MASK)))
+def pack_rays(rays: int, depth: float, segment: int) -> wp.uint64:
+    """Pack the bits of a pixel's shadow rays (1: free) with the surface's segmentation id and depth [m]; so the filter reads each neighbour
+    once. Ray j to lamp k has bit k * `Lights.lamp_rays` + j."""
+    return (wp.uint64(wp.cast(depth, wp.uint32)) << wp.uint64(32)) | wp.uint64((segment << 8) | rays)
 
 
 @wp.func
-def packed_segment(packed: wp.uint64) -> wp.uint8:
-    """Segmentation id of a packed coarse pixel."""
-    return wp.uint8(wp.uint32(packed) >> wp.uint32(VISIBILITY_BITS))
+def rays_bits(packed: wp.uint64) -> int:
+    """Bits of packed shadow rays."""
+    return int(wp.uint32(packed)) & ALL_RAYS
 
 
 @wp.func
-def packed_depth(packed: wp.uint64) -> float:
-    """Depth of a packed coarse pixel [m]."""
+def rays_segment(packed: wp.uint64) -> wp.uint8:
+    """Segmentation id of packed shadow rays."""
+    return wp.uint8(wp.uint32(packed) >> wp.uint32(8))
+
+
+@wp.func
+def rays_depth(packed: wp.uint64) -> float:
+    """Depth of packed shadow rays [m]."""
     return wp.cast(wp.uint32(packed >> wp.uint64(32)), wp.float32)
+
+
+@wp.func
+def spread_bits(bits: int) -> wp.uint64:
+    """Bytes 0 or 1 of eight bits."""
+    isolated = (wp.uint64(bits) * EVERY_BYTE) & SPREAD_BITS
+    return ((isolated + CARRY_BITS) >> wp.uint64(7)) & EVERY_BYTE
+
+
+@wp.func
+def byte_of(packed: wp.uint64, index: int) -> int:
+    """Byte of a word, from the lowest on."""
+    return int(packed >> wp.uint64(8 * index)) & 0xFF
+
+
+@wp.func
+def ray_direction(lights: Lights, which: int, heading: wp.vec2, ray: int, pixel: int) -> wp.vec3:
+    """Unit vector, in the world, to the sample point of shadow ray `ray` from the pixel with Morton index `pixel`.
+
+    A pixel takes a run of a lamp's points, and its neighbours the next ones.
+    """
+    rays = lights.lamp_rays[which]
+    point = (pixel * rays + ray % rays) % LAMP_POINTS
+    return rotate_heading(lights.lamp_point[which, ray // rays, point], heading)
+
+
+@wp.func
+def pack_shadows(fractions: wp.uint64, rays: wp.uint64) -> wp.vec4:
+    """Pack the visible fractions of the lamps, byte k that of lamp k in 1/255, with depth and segmentation id of packed shadow rays."""
+    return wp.vec4(
+        wp.cast(wp.uint32(fractions), wp.float32),
+        wp.cast(wp.uint32(fractions >> wp.uint64(32)), wp.float32),
+        rays_depth(rays),
+        wp.cast(wp.uint32(rays_segment(rays)), wp.float32),
+    )
+
+
+@wp.func
+def meets_box(origin: wp.vec3, inverse: wp.vec3, lower: wp.vec3, upper: wp.vec3) -> bool:
+    """Slab test (Kay and Kajiya, 1986): whether a ray meets an axis-aligned box; `inverse` is 1 / direction."""
+    first = wp.cw_mul(lower - origin, inverse)
+    second = wp.cw_mul(upper - origin, inverse)
+    near = wp.max(wp.min(first, second))
+    far = wp.min(wp.max(first, second))
+    return far >= wp.max(near, 0.0)
+
+
+@wp.func
+def may_change(moving: MovingBodies, view: int, origin: wp.vec3, direction: wp.vec3) -> bool:
+    """Whether a moving body may block a ray now, or may have blocked it in the previous frame: by their bounding boxes."""
+    inverse = wp.vec3()
+    for i in range(3):
+        inverse[i] = 1.0 / wp.where(wp.abs(direction[i]) < MIN_DIRECTION, MIN_DIRECTION, direction[i])
+    for rank in range(moving.count[view]):
+        if meets_box(origin, inverse, moving.lower[view, rank], moving.upper[view, rank]):
+            return True
+    return False
+
+
+@wp.func
+def is_refreshed(row: int, column: int, frame: int) -> bool:
+    """Whether a coarse pixel traces all its shadow rays in this frame anyway; by tiles, so that all threads of a warp do."""
+    return (TILE_SHIFT * (row // TILE_HEIGHT) + column // TILE_WIDTH + frame) % REFRESH_FRAMES == 0
+
+
+@wp.func
+def is_calm(moving: MovingBodies, view: int, segment: int, instances: int) -> bool:
+    """Whether a surface moves so little that its shadows may be reused."""
+    if segment == Segment.TABLE:
+        return True
+    return moving.drift_frames[view, body_of(segment, instances)] >= CALM_FRAMES
+
+
+@wp.func
+def faces_lamp(lights: Lights, which: int, heading: wp.vec2, ray: int, normal: wp.vec3) -> bool:
+    """Whether the center of a shadow ray's lamp lies before a surface of unit `normal`."""
+    return wp.dot(normal, rotate_heading(lights.lamp_direction[which, ray // lights.lamp_rays[which]], heading)) > 0.0
+
+
+@wp.func
+def visible_normal(meshes: Meshes, bodies: ViewBodies, view: int, hit: Hit, instances: int, ray: wp.vec3) -> wp.vec3:
+    """Geometric unit normal of a hit, in the world, on the side from which a `ray` comes."""
+    normal = face_normal(meshes, bodies, view, hit, instances)
+    return wp.where(wp.dot(normal, ray) > 0.0, -normal, normal)
+
+
+@wp.func
+def is_shadowed(
+    meshes: Meshes, table: Table, bodies: ViewBodies, view: int, tote: int, position: wp.vec3, normal: wp.vec3, direction: wp.vec3
+) -> bool:
+    """Whether a part of a lamp in unit `direction` lies behind a surface, or something before it; `tote` as in `is_blocked`."""
+    if wp.dot(normal, direction) <= 0.0:
+        return True
+    return is_blocked(meshes, table, bodies, view, tote, position + RAY_OFFSET * normal, direction, FAR)
+
+
+@wp.func
+def last_rays(
+    history: LightHistory, moving: MovingBodies, views: Views, view: int, slot: int, row: int, column: int, segment: int
+) -> tuple[bool, int]:
+    """(True, bits of a pixel's shadow rays in the previous frame) if they may be reused, else (False, 0)."""
+    if history.max_paths == 0 or moving.holds[view] == 0:
+        return False, 0
+    last = int(history.shadows[slot, row, column])
+    if last >> 8 != segment or is_refreshed(row, column, history.frame[slot]) or not is_calm(moving, view, segment, views.instances):
+        return False, 0
+    return True, last & ALL_RAYS
+
+
+@wp.func
+def changed_rays(
+    lights: Lights, moving: MovingBodies, view: int, which: int, position: wp.vec3, heading: wp.vec2, rays: int, pixel: int
+) -> int:
+    """Bits of those of the first `rays` shadow rays that a moving body may have changed; `position` is the surface's."""
+    result = int(0)
+    if moving.count[view] == 0:
+        return result
+    for ray in range(rays):
+        if may_change(moving, view, position, ray_direction(lights, which, heading, ray, pixel)):
+            result |= 1 << ray
+    return result
 
 
 @wp.kernel(cuda_max_registers=RAY_REGISTERS)
@@ -72,36 +227,68 @@ def trace_shadow_rays_kernel(
     bodies: ViewBodies,
     gbuffer: GBuffer,
     views: Views,
+    moving: MovingBodies,
     first: int,
     # Out:
-    visibility_out: wp.array3d[wp.uint64],  # (view, shadow_row, shadow_column)
+    history_inout: LightHistory,
+    rays_out: wp.array3d[wp.uint64],  # (view, shadow_row, shadow_column)
 ):
-    """Sun visibility, packed: 1 where the ray from a coarse pixel's middle pixel to a sample point of the sun's disc is free, else 0."""
+    """Trace the shadow rays of a coarse pixel from its middle pixel, or reuse those of the previous frame; packed by `pack_rays`.
+
+    Under a map without lamps nothing is written. Rays to lamps behind the surface count as free, so that the filter darkens no edges.
+    """
     view, row, column = tile_pixel(coarse.grid, wp.tid() + first)
     if not in_image(coarse.grid, row, column):
         return
-    which = light[views.world[view]]
+    world, camera = views.world[view], views.camera[view]
+    which = light[world]
+    rays = lights.lamps[which] * lights.lamp_rays[which]
+    if rays == 0:
+        return
     pixel = middle_pixel(coarse, row, column)
-    visibility = float(1.0)
-    segment = gbuffer.segment[view, pixel[0], pixel[1]]
+    segment = int(gbuffer.segment[view, pixel[0], pixel[1]])
     depth = gbuffer.depth[view, pixel[0], pixel[1]]
-    if wp.max(lights.sun_irradiance[which]) > 0.0 and int(segment) != Segment.NOTHING:
-        camera = views.camera[view]
-        ray = camera_ray(cameras.intrinsics[camera], pixel[0], pixel[1], wp.vec2(0.0, 0.0))
-        normal = face_normal(meshes, bodies, view, read_hit(gbuffer, view, pixel[0], pixel[1]), views.instances)
-        if wp.dot(normal, cameras.to_world[camera] * ray) > 0.0:
-            normal = -normal
-        center = rotate_z(lights.sun_direction[which], light_yaw[views.world[view]])
-        # A surface that faces away gets no sunlight in any case; visibility 1 there keeps the filter from darkening edges.
-        if wp.dot(normal, center) > 0.0:
-            point = sobol_point(morton_index(coarse.window, row, column))
-            radius = lights.sun_radius[which] * wp.sqrt(point[0])
-            angle = wp.TAU * point[1]
-            direction = wp.normalize(rotate_to_axis(center, wp.vec3(radius * wp.cos(angle), radius * wp.sin(angle), 1.0)))
-            origin = hit_position(cameras, camera, ray, depth) + RAY_OFFSET * normal
-            if is_blocked(meshes, table, bodies, view, origin, direction, FAR):
-                visibility = 0.0
-    visibility_out[view, row, column] = pack_visibility(visibility, depth, segment)
+    slot = world * history_inout.cameras + camera
+    free = int(ALL_RAYS)
+    if segment != Segment.NOTHING:
+        camera_direction = camera_ray(cameras.intrinsics[camera], pixel[0], pixel[1], wp.vec2(0.0, 0.0))
+        position = hit_position(cameras, camera, camera_direction, depth)
+        heading, index = unit_heading(light_yaw[world]), morton_index(coarse.period, row, column)
+        known, last = last_rays(history_inout, moving, views, view, slot, row, column, segment)
+        traced = int(ALL_RAYS)
+        if known:
+            free = last
+            traced = changed_rays(lights, moving, view, which, position, heading, rays, index)
+        if traced != 0:
+            hit = read_hit(gbuffer, view, pixel[0], pixel[1])
+            normal = visible_normal(meshes, bodies, view, hit, views.instances, cameras.to_world[camera] * camera_direction)
+            for ray in range(rays):
+                bit = 1 << ray
+                if traced & bit != 0:
+                    free |= bit
+                    if faces_lamp(lights, which, heading, ray, normal):
+                        direction = ray_direction(lights, which, heading, ray, index)
+                        if is_shadowed(meshes, table, bodies, view, views.instances, position, normal, direction):
+                            free -= bit
+    if history_inout.max_paths > 0:
+        history_inout.shadows[slot, row, column] = pack_last(segment, free)
+    rays_out[view, row, column] = pack_rays(free, depth, segment)
+
+
+@wp.func
+def lamp_fractions(free: wp.uint64, pixels: int, lamps: int, rays: int) -> wp.uint64:
+    """Visible fractions of the lamps, packed as for `pack_shadows`.
+
+    Byte r of `free` is the number of `pixels` whose shadow ray r is free; a pixel has `rays` rays to each lamp.
+    """
+    result = wp.uint64(0)
+    samples = pixels * rays
+    for lamp in range(lamps):
+        count = int(0)
+        for ray in range(rays):
+            count += byte_of(free, lamp * rays + ray)
+        result |= wp.uint64((255 * count + samples // 2) // samples) << wp.uint64(8 * lamp)
+    return result
 
 
 @wp.kernel
@@ -116,103 +303,51 @@ def filter_shadows_kernel(
     # In:
     bodies: ViewBodies,
     gbuffer: GBuffer,
-    visibility: wp.array3d[wp.uint64],  # (view, shadow_row, shadow_column)
+    rays: wp.array3d[wp.uint64],  # (view, shadow_row, shadow_column)
     views: Views,
     first: int,
     # Out:
-    visibility_out: wp.array3d[wp.uint64],  # (view, shadow_row, shadow_column)
+    shadows_out: LampShadows,
 ):
-    """Mean sun visibility over a window of coarse pixels on one body and near one tangent plane, packed; not written without a sun."""
+    """Visible fraction of each lamp: the mean over a window of coarse pixels on one body and near one tangent plane.
+
+    The member of `shadows_out` is written, but for views under a map without lamps.
+    """
     view, row, column = tile_pixel(coarse.grid, wp.tid() + first)
     if not in_image(coarse.grid, row, column):
         return
-    pixel = middle_pixel(coarse, row, column)
-    own = visibility[view, row, column]
-    segment = packed_segment(own)
-    depth = packed_depth(own)
-    if wp.max(lights.sun_irradiance[light[views.world[view]]]) <= 0.0:
+    which = light[views.world[view]]
+    if lights.lamps[which] == 0:
         return
+    pixel = middle_pixel(coarse, row, column)
+    own = rays[view, row, column]
+    segment = rays_segment(own)
     if int(segment) == Segment.NOTHING:
         # Bodies smaller than a coarse pixel may have only background pixels to interpolate from.
-        visibility_out[view, row, column] = pack_visibility(1.0, depth, segment)
+        write_record(shadows_out.record, flat_index(coarse.grid, view, row, column), pack_shadows(~wp.uint64(0), own))
         return
     camera = views.camera[view]
     normal = wp.transpose(cameras.to_world[camera]) * face_normal(
         meshes, bodies, view, read_hit(gbuffer, view, pixel[0], pixel[1]), views.instances
     )
-    plane = tangent_plane(cameras.intrinsics[camera], pixel[0], pixel[1], segment, depth, normal)
+    plane = tangent_plane(cameras.intrinsics[camera], pixel[0], pixel[1], segment, rays_depth(own), normal)
     tolerance = PLANE_TOLERANCE * float(coarse.size) * plane.width
-    visible = float(0.0)
-    total = float(0.0)
+    visible = wp.uint64(0)
+    total = int(0)
     for i in range(coarse.window):
         r = row + i - coarse.window // 2
         if r >= 0 and r < coarse.grid.height:
             for j in range(coarse.window):
                 c = column + j - coarse.window // 2
                 if c >= 0 and c < coarse.grid.width:
-                    packed = visibility[view, r, c]
-                    if packed_segment(packed) == segment:
+                    packed = rays[view, r, c]
+                    if rays_segment(packed) == segment:
                         other = middle_pixel(coarse, r, c)
-                        if plane_distance(plane, other[0] - pixel[0], other[1] - pixel[1], packed_depth(packed)) < tolerance:
-                            visible += packed_visibility(packed)
-                            total += 1.0
-    if total > 0.0:
-        visibility_out[view, row, column] = pack_visibility(visible / total, depth, segment)
-    else:
-        visibility_out[view, row, column] = own
-
-
-@wp.func
-def on_plane(packed: wp.uint64, coarse: CoarseGrid, row: int, column: int, plane: Plane, r: int, c: int) -> bool:
-    """Whether the coarse pixel (r, c), packed, shows the surface of the pixel (row, column), whose tangent plane is `plane`."""
-    pixel = middle_pixel(coarse, r, c)
-    distance = plane_distance(plane, pixel[0] - row, pixel[1] - column, packed_depth(packed))
-    return packed_segment(packed) == plane.segment and distance <= PLANE_TOLERANCE * float(coarse.size) * plane.width
-
-
-@wp.func
-def upsample_shadow(
-    visibility: wp.array3d[wp.uint64],  # (view, shadow_row, shadow_column)
-    coarse: CoarseGrid,
-    view: int,
-    row: int,
-    column: int,
-    plane: Plane,
-) -> float:
-    """Sun visibility at a pixel by joint bilateral upsampling from the four nearest coarse pixels; `plane` is the pixel's tangent plane.
-
-    If all four are on other surfaces, the ring around them is searched too, as for visibility ratios: sunlight of another surface would
-    show as bright pixels along the edge.
-    """
-    y = window_coordinate(coarse, row)
-    x = window_coordinate(coarse, column)
-    top = int(wp.floor(y))
-    left = int(wp.floor(x))
-    visible = float(0.0)
-    total = float(0.0)
-    found = bool(False)
-    for i in range(2):
-        r = clamp_index(top + i, coarse.grid.height)
-        vertical = 1.0 - wp.abs(y - float(top + i))
-        for j in range(2):
-            c = clamp_index(left + j, coarse.grid.width)
-            weight = vertical * (1.0 - wp.abs(x - float(left + j))) + MIN_WEIGHT
-            packed = visibility[view, r, c]
-            if on_plane(packed, coarse, row, column, plane, r, c):
-                found = True
-            else:
-                weight *= MIN_WEIGHT
-            visible += weight * packed_visibility(packed)
-            total += weight
-    if not found:
-        # Not unrolled: few pixels come here.
-        ring = int(RING)
-        for i in range(-ring, 2 + ring):
-            r = clamp_index(top + i, coarse.grid.height)
-            for j in range(-ring, 2 + ring):
-                c = clamp_index(left + j, coarse.grid.width)
-                packed = visibility[view, r, c]
-                if on_plane(packed, coarse, row, column, plane, r, c):
-                    visible += packed_visibility(packed)
-                    total += 1.0
-    return visible / total
+                        if plane_distance(plane, other[0] - pixel[0], other[1] - pixel[1], rays_depth(packed)) < tolerance:
+                            visible += spread_bits(rays_bits(packed))
+                            total += 1
+    if total == 0:
+        visible = spread_bits(rays_bits(own))
+        total = int(1)
+    fractions = lamp_fractions(visible, total, lights.lamps[which], lights.lamp_rays[which])
+    write_record(shadows_out.record, flat_index(coarse.grid, view, row, column), pack_shadows(fractions, own))

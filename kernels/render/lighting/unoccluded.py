@@ -13,7 +13,7 @@ wp.set_module_options({"enable_backward": False})
 MIN_UNOCCLUDED = wp.constant(0.05)
 """Unoccluded light is at least this fraction of the map's mean, so that visibility ratios stay bounded."""
 MIN_EXPOSED = wp.constant(1.0e-3)
-"""And, times the map's exposure, at least this, so that half precision holds it and its ratios where a map is black but for its sun."""
+"""And, times the map's exposure, at least this, so that half precision holds it and its ratios where a map is black but for its lamps."""
 
 
 @wp.func
@@ -24,7 +24,7 @@ def max_channels(a: wp.vec3, b: wp.vec3) -> wp.vec3:
 
 @wp.func
 def unoccluded_light(lights: Lights, light: int, yaw: float, brdf: Brdf) -> SplitRadiance:
-    """Radiance reflected from an unoccluded environment map without its sun; nothing is indirect.
+    """Radiance reflected from an unoccluded environment map without its lamps; nothing is indirect.
 
     Diffuse by spherical harmonics, specular by the split-sum approximation (Karis, 2013). `light` is the index of the map, rotated by `yaw`
     [rad] about +z.

@@ -36,8 +36,8 @@ def is_in_interior(interior: Interior, point: wp.vec3) -> bool:
 def stays_in_interior(interior: Interior, start: wp.vec3, direction: wp.vec3, reach: float) -> bool:
     """Conservative early-out: True if the ray's segment up to `reach`, clipped to the tote's height, lies in its empty convex interior.
 
-    Both ends of the clipped segment are tested; convexity does the rest. It spares camera rays that hit an object in the tote the tote's
-    BVH; for rays of paths it does not pay.
+    Both ends of the clipped segment are tested; convexity does the rest. It spares camera rays that hit an object in the tote, and shadow
+    rays to lamps, the tote's BVH; for rays of paths it does not pay.
     """
     begin = float(0.0)
     end = float(reach)
@@ -158,11 +158,15 @@ def is_blocked(
     table: Table,
     bodies: ViewBodies,
     view: int,
+    tote: int,
     origin: wp.vec3,
     direction: wp.vec3,
     reach: float,
 ) -> bool:
-    """Any-hit query (shadow ray): True if something lies within `reach` [m] of `origin` along the unit vector `direction`, in the world."""
+    """Any-hit query (shadow ray): True if something lies within `reach` [m] of `origin` along the unit vector `direction`, in the world.
+
+    `tote` is the row of the tote, whose BVH is skipped for rays in its empty interior; -1: without this test.
+    """
     if table.visible != 0 and direction[2] < 0.0:
         if origin[2] + reach * direction[2] < table.height:
             return True
@@ -176,6 +180,8 @@ def is_blocked(
         if wp.dot(closest, closest) < sphere[3]:
             body = read_ray_body(bodies, record)
             start = body.rotation * (origin - body.position)
-            if query_any_hit(meshes.bvh, body.root, start, body.rotation * direction, reach):
-                return True
+            local = body.rotation * direction
+            if body.row != tote or not stays_in_interior(meshes.interior, start, local, reach):
+                if query_any_hit(meshes.bvh, body.root, start, local, reach):
+                    return True
     return False

@@ -1,10 +1,11 @@
-"""Denoised renderer: coarse path pass, variance-guided denoiser, sun shadows, deferred shading and anti-aliasing.
+"""Denoised renderer: coarse path pass, variance-guided denoiser, lamp shadows, deferred shading and anti-aliasing.
 
 Mode unoccluded leaves out the first two: no ambient occlusion, no indirect light.
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -19,13 +20,12 @@ from synpick_warp.kernels.render.lighting.denoise import choose_widths_kernel, f
 from synpick_warp.kernels.render.lighting.history import (
     NEVER,
     LightHistory,
-    MovingBodies,
     advance_history_kernel,
-    find_moving_bodies_kernel,
 )
+from synpick_warp.kernels.render.lighting.moving_bodies import MovingBodies, find_moving_bodies_kernel
 from synpick_warp.kernels.render.lighting.path_lists import REGION_PIXELS, PathLists
 from synpick_warp.kernels.render.lighting.shading import shade_kernel, shade_samples_kernel
-from synpick_warp.kernels.render.lighting.shadows import filter_shadows_kernel, trace_shadow_rays_kernel
+from synpick_warp.kernels.render.lighting.shadows import LAMP_POINTS, LampShadows, filter_shadows_kernel, trace_shadow_rays_kernel
 from synpick_warp.kernels.render.lighting.upsampling import RatioImages
 from synpick_warp.kernels.render.visibility.camera import TILE_PIXELS
 from synpick_warp.kernels.tuning import CPU_FOOTPRINT_THREADS, FOOTPRINT_THREADS, LANE_COLUMNS, LANE_STRIDE, PIXEL_BLOCK, VIEW_BLOCK
@@ -51,14 +51,16 @@ length, so that the following frames trace fewer paths. Frame 8 gains 2 dB in PS
 SINGLE_PATH_VARIANCE_SCALE = 2.0
 """Variance multiplier at one path per coarse pixel, where the sample variance underestimates bright small sources: few paths hit them, and
 those that do would look like a change of the light (on ten piles, 1 is 0.2 dB worse; 1.5 and 3 are nearly as good)."""
-SHADOW_WINDOW = 4
-"""Width of the shadow filter [pixels of the shadow grid]: 16 rays estimate the visible fraction of the sun."""
+SHADOW_PERIOD = math.isqrt(int(LAMP_POINTS))
+"""Period of the sample points of lamps [pixels of the shadow grid]."""
+SHADOW_WINDOW = 2
+"""Width of the shadow filter [pixels of the shadow grid]. At full HD 2 instead of 4 gain 0.1 dB in PSNR (tools/README.md, "Pictures")."""
 MIN_ROUGHNESS = 0.3
 """Path regularization: smallest roughness after the first surface (Kaplanyan and Dachsbacher, 2013). Caustics blur instead of sparkling."""
 FIREFLY_CLAMP = 32.0
-"""Firefly clamp: a path counts with at most this many times the unoccluded light, or single paths would show as patches; light from sunlit
-surfaces is added to the limit. The light cut off is a bias: in eight episodes under real maps 8, 16, 32, 64 give -1.0, -0.5, -0.4, -0.3 %
-and 31.15, 31.20, 31.17, 31.15 dB (tools/README.md, "Pictures")."""
+"""Firefly clamp: a path counts with at most this many times the unoccluded light, or single paths would show as patches; light from
+surfaces that lamps light is added to the limit. The light cut off is a bias: in eight episodes under real maps 8, 16, 32, 64 give -1.0,
+-0.5, -0.4, -0.3 % and 31.15, 31.20, 31.17, 31.15 dB (tools/README.md, "Pictures")."""
 ROULETTE = 1
 """First bounce with Russian roulette: few paths are long, since many neighbours share them."""
 
@@ -68,20 +70,29 @@ instead of 4 rays take 0.055 ms per view at 480x270 and improve PSNR by 0.2 dB; 
 
 GUIDE = struct_arrays(Guide, "view", "cell_row", "cell_column")
 COARSE_LIGHT = struct_arrays(CoarseLight, "view", "cell_row", "cell_column")
-LIGHT_HISTORY = struct_arrays(LightHistory, "world_camera", "cell_row", "cell_column", episode=("world_camera",), frame=("world_camera",))
-MOVING_BODIES = struct_arrays(MovingBodies, "view", "body", holds=("view",), count=("view",), units={"to_body": "m"})
+LAMP_SHADOWS = struct_arrays(LampShadows, "view", "shadow_row", "shadow_column")
+LIGHT_HISTORY = struct_arrays(
+    LightHistory,
+    "world_camera",
+    "cell_row",
+    "cell_column",
+    shadows=("world_camera", "shadow_row", "shadow_column"),
+    episode=("world_camera",),
+    frame=("world_camera",),
+)
+MOVING_BODIES = struct_arrays(
+    MovingBodies, "view", "body", holds=("view",), count=("view",), units={"to_body": "m", "lower": "m", "upper": "m"}
+)
 PATH_LISTS = struct_arrays(PathLists, "view", "region", "rank", count=("view", "region", "path_kind"))
 RATIO_IMAGES = struct_arrays(RatioImages, "view", "cell_row", "cell_column")
 
 
 @dataclass(frozen=True, eq=False)
-class ShadowArrays:
-    """Sun visibility at the middle of each coarse pixel of the shadow grid, packed by `pack_visibility`."""
+class ShadowRays:
+    """Shadow rays of the pixels of the shadow grid."""
 
-    traced: wp.array = device_array("view", "shadow_row", "shadow_column", dtype=wp.uint64)
-    """0 or 1, from one shadow ray."""
-    filtered: wp.array = device_array("view", "shadow_row", "shadow_column", dtype=wp.uint64)
-    """0 to 1."""
+    packed: wp.array = device_array("view", "shadow_row", "shadow_column", dtype=wp.uint64)
+    """As by `shadows.pack_rays`."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,7 +105,15 @@ class FootprintLists:
     """Footprints in each list."""
 
 
-DENOISED_SCRATCH = ((GUIDE, 1), (PATH_LISTS, 1), (COARSE_LIGHT, 2), (RATIO_IMAGES, 2), (ShadowArrays, 1), (FootprintLists, 1))
+DENOISED_SCRATCH = (
+    (GUIDE, 1),
+    (PATH_LISTS, 1),
+    (COARSE_LIGHT, 2),
+    (RATIO_IMAGES, 2),
+    (ShadowRays, 1),
+    (LAMP_SHADOWS, 1),
+    (FootprintLists, 1),
+)
 """Arrays that `DenoisedRenderer` allocates, and how many of each."""
 
 
@@ -102,6 +121,14 @@ def coarse_size(render: Render, width: int, histories: int = 0) -> int:
     """Width of a coarse pixel [px] in images of `width` px; `histories` as in `DenoisedRenderer`."""
     columns = MIN_HISTORY_COLUMNS if accumulates(render, histories) else MIN_COARSE_COLUMNS
     return render.coarse_pixel or max(1, width // columns)
+
+
+def shadow_size(size: int) -> int:
+    """Width of a pixel of the shadow grid [px], whose coarse pixels are `size` px wide: three quarters of it.
+
+    At full HD 3 px are as good as 2, with less than half of the rays; 4 px are 0.2 to 0.3 dB worse.
+    """
+    return max(1, 3 * size // 4)
 
 
 def traces_paths(render: Render) -> bool:
@@ -145,7 +172,7 @@ def coverage_rays(render: Render, width: int, histories: int = 0) -> int:
 def scratch_sizes(render: Render, width: int, height: int, histories: int = 0) -> dict[str, int]:
     """Extents of the dimensions of `DENOISED_SCRATCH` other than the view, for images of `width` x `height` px."""
     size = coarse_size(render, width, histories)
-    shadow = max(1, size // 2)
+    shadow = shadow_size(size)
     chunks = -(-footprint_grid(width, height).tiles // int(CHUNK_TILES)) if render.antialias else 0
     columns, rows = (-(-width // size), -(-height // size)) if traces_paths(render) else (0, 0)
     return {
@@ -166,10 +193,11 @@ def history_sizes(render: Render, width: int, height: int, histories: int) -> di
     return scratch_sizes(render, width, height, histories) | {"world_camera": histories if accumulates(render, histories) else 0}
 
 
-def build_coarse_grid(image: Any, size: int, window: int) -> Any:
-    """The struct `CoarseGrid` over an `ImageGrid`: coarse pixels of `size` x `size` px, shadow filter of `window` x `window` of them."""
+def build_coarse_grid(image: Any, size: int, window: int = 1, period: int = 1) -> Any:
+    """The struct `CoarseGrid` over an `ImageGrid`: coarse pixels of `size` x `size` px; see there for `window` and `period`."""
     coarse = CoarseGrid()
     coarse.size = size
+    coarse.period = period
     coarse.window = window
     coarse.image = image
     coarse.grid = build_grid(-(-image.width // size), -(-image.height // size))
@@ -188,7 +216,7 @@ def interleaved_threads(columns: int, rows: int) -> int:
 
 
 class DenoisedRenderer:
-    """Renders linear radiance from a few paths per coarse pixel and a denoiser; in mode unoccluded from unoccluded light and sun shadows.
+    """Renders linear radiance from a few paths per coarse pixel and a denoiser; in mode unoccluded from unoccluded light and lamp shadows.
     Allocates its scratch once; `shade` only launches kernels."""
 
     def __init__(self, render: Render, seed: int, scene: RenderScene, instances: int, views: int, histories: int = 0) -> None:
@@ -206,10 +234,10 @@ class DenoisedRenderer:
         sizes = {"view": views} | scratch_sizes(render, scene.width, scene.height, histories)
         self.scene = scene
         self.traces_paths = traces_paths(render)
-        self.coarse = build_coarse_grid(scene.grid, size, 1)
+        self.coarse = build_coarse_grid(scene.grid, size)
         if not self.traces_paths:
             self.coarse.size = 0
-        self.shadow_grid = build_coarse_grid(scene.grid, max(1, size // 2), SHADOW_WINDOW)
+        self.shadow_grid = build_coarse_grid(scene.grid, shadow_size(size), SHADOW_WINDOW, SHADOW_PERIOD)
         self.rules = make_path_rules(render, seed, paths_per_coarse_pixel(render, scene.width, histories), ROULETTE)
         self.rules.first_samples = first_frame_paths(render, scene.width, histories)
         self.rules.min_roughness = MIN_ROUGHNESS
@@ -223,7 +251,8 @@ class DenoisedRenderer:
         self.path_lists = allocate_struct(PATH_LISTS, sizes, scene.device)
         self.coarse_light, self.blocks = (allocate_struct(COARSE_LIGHT, sizes, scene.device) for _ in range(2))
         self.chosen, self.ratios = (allocate_struct(RATIO_IMAGES, sizes, scene.device) for _ in range(2))
-        self.shadows = allocate(ShadowArrays, sizes, scene.device)
+        self.shadow_rays = allocate(ShadowRays, sizes, scene.device)
+        self.shadows = allocate_struct(LAMP_SHADOWS, sizes, scene.device)
         self.shade_kernel = shade_samples_kernel if supersamples(render, scene.width, histories) else shade_kernel
         self.antialias = render.antialias
         self.coverage_rays = coverage_rays(render, scene.width, histories)
@@ -247,7 +276,7 @@ class DenoisedRenderer:
                 self.trace_coarse_paths(snapshot, bodies, gbuffer, views)
             with scope("denoise", device):
                 self.denoise(views)
-        with scope("sun shadows", device):
+        with scope("lamp shadows", device):
             self.trace_shadows(snapshot, bodies, gbuffer, views)
         with scope("shade pixels", device):
             self.shade_pixels(snapshot, bodies, gbuffer, views, image.radiance)
@@ -289,18 +318,18 @@ class DenoisedRenderer:
         self._launch(smooth_ratios_kernel, self.coarse.grid, views, [*shared, self.chosen, views], [self.ratios])
 
     def trace_shadows(self, snapshot: Snapshot, bodies: Any, gbuffer: Any, views: Any) -> None:
-        """Sun visibility of the shadow grid: shadow rays and filter."""
-        scene, coarse, shadows = self.scene, self.shadow_grid, self.shadows
+        """Visibility of the lamps on the shadow grid: shadow rays and filter."""
+        scene, coarse, rays = self.scene, self.shadow_grid, self.shadow_rays.packed
         inputs = [scene.meshes, scene.table, scene.cameras, coarse, scene.lights, snapshot.light, snapshot.light_yaw, bodies, gbuffer]
-        self._launch(trace_shadow_rays_kernel, coarse.grid, views, [*inputs, views], [shadows.traced])
-        inputs = [scene.meshes, scene.cameras, coarse, scene.lights, snapshot.light, bodies, gbuffer, shadows.traced]
-        self._launch(filter_shadows_kernel, coarse.grid, views, [*inputs, views], [shadows.filtered])
+        self._launch(trace_shadow_rays_kernel, coarse.grid, views, [*inputs, views, self.moving], [self.history, rays])
+        inputs = [scene.meshes, scene.cameras, coarse, scene.lights, snapshot.light, bodies, gbuffer, rays]
+        self._launch(filter_shadows_kernel, coarse.grid, views, [*inputs, views], [self.shadows])
 
     def shade_pixels(self, snapshot: Snapshot, bodies: Any, gbuffer: Any, views: Any, radiance: wp.array) -> None:
         """Deferred shading: radiance of each pixel."""
         scene = self.scene
         inputs = [scene.paths, scene.cameras, self.coarse, self.shadow_grid, snapshot.light, snapshot.light_yaw, bodies, gbuffer]
-        inputs += [self.ratios, self.shadows.filtered, views]
+        inputs += [self.ratios, self.shadows, views]
         self._launch(self.shade_kernel, scene.grid, views, inputs, [radiance])
 
     def resolve_footprints(self, bodies: Any, gbuffer: Any, views: Any, image: Any) -> None:

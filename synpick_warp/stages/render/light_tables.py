@@ -1,4 +1,4 @@
-"""Tables that lighting precomputes: per environment map its sun, SH irradiance, prefiltered specular map, exposure and sampling CDFs;
+"""Tables that lighting precomputes: per environment map its lamps, SH irradiance, prefiltered specular map, exposure and sampling CDFs;
 once per device the directional albedo of the GGX lobe."""
 
 from __future__ import annotations
@@ -11,10 +11,12 @@ import numpy as np
 import warp as wp
 
 from synpick_warp.kernels.render.lighting.brdf import ALBEDO_COLUMNS, ALBEDO_ROWS, AlbedoTables, measure_albedo_kernel
-from synpick_warp.kernels.render.lighting.environment import PREFILTER_LEVELS
+from synpick_warp.kernels.render.lighting.environment import MAX_LAMPS, PREFILTER_LEVELS
 from synpick_warp.kernels.render.lighting.sampling import EnvironmentCdf
+from synpick_warp.kernels.render.lighting.shadows import LAMP_POINTS
 from synpick_warp.scenes.environment import BACKGROUND_ROWS, LUMINANCE, WHITE_VALUE, map_directions, resize_map
-from synpick_warp.scenes.sun import MAX_SUN_TANGENT, draw_sun_disc, extract_sun, replace_sun
+from synpick_warp.scenes.lamps import Lamp, extract_lamps, sample_disc
+from synpick_warp.scenes.sun import MAX_SUN_TANGENT, draw_sun_disc, replace_sun
 from synpick_warp.scenes.types import EnvironmentMap
 
 PREFILTER_ROWS = 32
@@ -33,18 +35,14 @@ class EnvironmentTables:
 
     radiance: np.ndarray
     """(BACKGROUND_ROWS, 2 BACKGROUND_ROWS, 3) float32: the whole map, with the sun of its sIBL set drawn as a disc."""
-    sunless: np.ndarray
-    """(BACKGROUND_ROWS, 2 BACKGROUND_ROWS, 3) float32: the map without its sun."""
+    lampless: np.ndarray
+    """(BACKGROUND_ROWS, 2 BACKGROUND_ROWS, 3) float32: the map without its lamps."""
     prefiltered: np.ndarray
     """(PREFILTER_LEVELS, PREFILTER_ROWS, 2 PREFILTER_ROWS, 3) float32."""
     irradiance: np.ndarray
     """(9, 3) float32: coefficients of spherical harmonics."""
-    sun_direction: np.ndarray
-    """(3) float32, unit vector towards the sun."""
-    sun_irradiance: np.ndarray
-    """(3) float32, on a surface that faces the sun; zero: no sun."""
-    sun_radius: float
-    """Tangent of the sun's angular radius."""
+    lamps: list[Lamp]
+    """The sun of its sIBL set, if it is narrow, then others, the strongest first; see `scenes.lamps`."""
     exposure: float
     """Factor that brings the map's radiance to display range."""
 
@@ -94,34 +92,48 @@ def prefilter_specular(radiance: np.ndarray) -> np.ndarray:
     return np.maximum(np.stack(levels), 0.0)
 
 
-def precompute_environment(light: EnvironmentMap, ground: np.ndarray | None) -> EnvironmentTables:
+def separate_lamps(light: EnvironmentMap, max_lamps: int) -> tuple[np.ndarray, np.ndarray, list[Lamp]]:
+    """Split an environment map into its lamps and the rest.
+
+    A sun that its sIBL set names is the first lamp, with the set's direction; a wide one is treated as any other light of the map.
+
+    Returns:
+        The whole map (BACKGROUND_ROWS, 2 BACKGROUND_ROWS, 3), with the set's sun drawn as a disc; the map without its lamps; the lamps.
+    """
+    radiance = resize_map(light.radiance, BACKGROUND_ROWS)
+    if light.sun is None:
+        return radiance, *extract_lamps(radiance, max_lamps, int(LAMP_POINTS))
+    rest, direction, irradiance, radius = replace_sun(radiance, light.sun)
+    disc = draw_sun_disc((rest < radiance).any(axis=2), direction, irradiance, radius)
+    if radius > MAX_SUN_TANGENT or max_lamps == 0:
+        return rest + disc, *extract_lamps(rest + disc, max_lamps, int(LAMP_POINTS))
+    lampless, others = extract_lamps(rest, max_lamps - 1, int(LAMP_POINTS), rest + disc)
+    sun = Lamp(direction, irradiance, radius, sample_disc(direction, radius, int(LAMP_POINTS)))
+    return rest + disc, lampless, [sun, *others]
+
+
+def precompute_environment(light: EnvironmentMap, ground: np.ndarray | None, max_lamps: int = int(MAX_LAMPS)) -> EnvironmentTables:
     """Precompute the tables of one environment map.
 
     Args:
         light: The map.
         ground: Linear albedo (3) of the table, which replaces the map below the horizon in unoccluded lighting; None: no table.
+        max_lamps: Maximum number of lamps.
     """
-    radiance = resize_map(light.radiance, BACKGROUND_ROWS)
+    radiance, lampless, lamps = separate_lamps(light, max_lamps)
     directions, solid_angles = map_directions(BACKGROUND_ROWS)
-    sunless, direction, irradiance, radius = extract_sun(radiance) if light.sun is None else replace_sun(radiance, light.sun)
-    if light.sun is not None:
-        radiance = sunless + draw_sun_disc((sunless < radiance).any(axis=2), direction, irradiance, radius)
-    if radius > MAX_SUN_TANGENT:
-        sunless, irradiance = radiance, np.zeros(3)
     upward = np.maximum(directions[..., 2], 0.0) * solid_angles
     upward_irradiance = (radiance * upward[..., None]).sum(axis=(0, 1))
     # What unoccluded surfaces face: the table hides the map below the horizon.
-    unoccluded = sunless if ground is None else np.where(directions[..., 2:] < 0.0, ground * upward_irradiance / np.pi, sunless)
+    unoccluded = lampless if ground is None else np.where(directions[..., 2:] < 0.0, ground * upward_irradiance / np.pi, lampless)
     coefficients = np.einsum("ijk,ijc->kc", sh_basis(directions) * solid_angles[..., None], unoccluded) * COSINE_LOBE[:, None]
     white = max(float(upward_irradiance @ LUMINANCE) / np.pi, 1e-9)
     return EnvironmentTables(
         radiance=radiance.astype(np.float32),
-        sunless=sunless.astype(np.float32),
+        lampless=lampless.astype(np.float32),
         prefiltered=prefilter_specular(resize_map(unoccluded, PREFILTER_ROWS)).astype(np.float32),
         irradiance=coefficients.astype(np.float32),
-        sun_direction=direction.astype(np.float32),
-        sun_irradiance=irradiance.astype(np.float32),
-        sun_radius=radius,
+        lamps=lamps,
         exposure=WHITE_VALUE / white,
     )
 

@@ -11,15 +11,21 @@ import warp as wp
 
 from synpick_warp.configs import schema
 from synpick_warp.kernels.render.lighting.color import MAX_HALF
-from synpick_warp.kernels.render.lighting.environment import Lights
+from synpick_warp.kernels.render.lighting.environment import MAX_LAMPS, Lights
 from synpick_warp.kernels.render.lighting.materials import TEXEL_BITS, TEXEL_MASK, TRIANGLE_RECORDS, Surfaces
 from synpick_warp.kernels.render.lighting.path_tracing import PathScene
+from synpick_warp.kernels.render.lighting.shadows import LAMP_POINTS
 from synpick_warp.kernels.render.visibility.camera import TILE_HEIGHT, TILE_PIXELS, TILE_WIDTH, Cameras, ImageGrid
 from synpick_warp.kernels.render.visibility.gbuffer import Meshes, Table
 from synpick_warp.scenes.assets.appearance import linear_to_srgb, srgb_to_linear
 from synpick_warp.scenes.tote import TABLE_ROUGHNESS
 from synpick_warp.scenes.types import Camera, Catalog, EnvironmentMap, Fixture, Interior, Material, TriangleMesh
-from synpick_warp.stages.render.light_tables import build_environment_cdf, measure_albedo, precompute_environment
+from synpick_warp.stages.render.light_tables import (
+    EnvironmentTables,
+    build_environment_cdf,
+    measure_albedo,
+    precompute_environment,
+)
 from synpick_warp.stages.render.wide_bvh import build_wide_bvh
 
 
@@ -210,20 +216,50 @@ def pack_half3_array(colors: np.ndarray) -> np.ndarray:
     return halves.view(np.uint64)[..., 0]
 
 
-def build_lights(maps: tuple[EnvironmentMap, ...], ground: np.ndarray | None, exposure: float, device: wp.Device) -> Any:
-    """The struct `Lights`; `exposure` multiplies the automatic exposure, `ground` is the table's linear albedo."""
-    tables = [precompute_environment(light, ground) for light in maps]
+MAX_RAYS_PER_LAMP = 4
+"""Maximum number of shadow rays to a lamp from a pixel of the shadow grid."""
+
+
+def lamp_table(tables: list[EnvironmentTables], name: str, *shape: int) -> np.ndarray:
+    """Member `name`, of `shape`, of the lamps of all maps (map, MAX_LAMPS, ...) float32; zero beyond a map's lamps."""
+    result = np.zeros((len(tables), int(MAX_LAMPS), *shape), np.float32)
+    for index, table in enumerate(tables):
+        for rank, lamp in enumerate(table.lamps):
+            result[index, rank] = getattr(lamp, name)
+    return result
+
+
+def rays_per_lamp(lamps: int) -> int:
+    """Shadow rays to each of a map's lamps: the fewer lamps, the more light each has, and the more its penumbra shows noise."""
+    return max(rays for rays in (1, 2, MAX_RAYS_PER_LAMP) if rays * max(lamps, 1) <= int(MAX_LAMPS) or rays == 1)
+
+
+def build_lights(
+    maps: tuple[EnvironmentMap, ...], ground: np.ndarray | None, exposure: float, device: wp.Device, lamps: int = int(MAX_LAMPS)
+) -> Any:
+    """The struct `Lights`; `exposure` multiplies the automatic exposure, `ground` is the table's linear albedo, `lamps` the maximum number
+    of lamps of a map."""
+    tables = [precompute_environment(light, ground, lamps) for light in maps]
     lights = Lights()
     lights.maps = len(tables)
-    radiance = np.stack([t.radiance for t in tables] + [t.sunless for t in tables])
+    radiance = np.stack([t.radiance for t in tables] + [t.lampless for t in tables])
     lights.radiance = wp.array(np.pad(radiance, [(0, 0)] * 3 + [(0, 1)]), dtype=wp.vec4, device=device)
     lights.prefiltered = wp.array(np.stack([pack_half3_array(exposure * t.exposure * t.prefiltered) for t in tables]), device=device)
     lights.irradiance = wp.array(np.stack([t.irradiance for t in tables]), dtype=wp.vec3, device=device)
-    lights.sun_direction = wp.array(np.stack([t.sun_direction for t in tables]), dtype=wp.vec3, device=device)
-    lights.sun_irradiance = wp.array(np.stack([t.sun_irradiance for t in tables]), dtype=wp.vec3, device=device)
-    lights.sun_radius = wp.array([t.sun_radius for t in tables], dtype=wp.float32, device=device)
+    lights.lamps = wp.array([len(t.lamps) for t in tables], dtype=wp.int32, device=device)
+    lights.lamp_direction = wp.array(lamp_table(tables, "direction", 3), dtype=wp.vec3, device=device)
+    lights.lamp_irradiance = wp.array(lamp_table(tables, "irradiance", 3), dtype=wp.vec3, device=device)
+    lights.lamp_radius = wp.array(lamp_table(tables, "radius_tangent"), dtype=wp.float32, device=device)
+    lights.lamp_point = wp.array(lamp_table(tables, "points", int(LAMP_POINTS), 3), dtype=wp.vec3, device=device)
+    lights.lamp_rays = wp.array([rays_per_lamp(len(t.lamps)) for t in tables], dtype=wp.int32, device=device)
+    lights.total_lamp_irradiance = wp.array(lamp_table(tables, "irradiance", 3).sum(axis=1), dtype=wp.vec3, device=device)
     lights.exposure = wp.array([exposure * t.exposure for t in tables], dtype=wp.float32, device=device)
     return lights
+
+
+def shadowed_lamps(settings: schema.Render) -> int:
+    """Maximum number of lamps of a map that get shadow rays; mode unoccluded, which is for speed, takes the strongest alone."""
+    return min(settings.lamps, 1) if settings.mode == schema.UNOCCLUDED else settings.lamps
 
 
 def build_render_scene(
@@ -257,7 +293,7 @@ def build_render_scene(
     paths.meshes = meshes
     paths.table = table
     paths.surfaces = build_surfaces(shapes, materials, device)
-    paths.lights = build_lights(lights, ground, settings.exposure, device)
+    paths.lights = build_lights(lights, ground, settings.exposure, device, shadowed_lamps(settings))
     paths.cdf = build_environment_cdf(paths.lights.radiance.numpy()[..., :3], device, settings.table)
     return RenderScene(
         meshes=meshes,

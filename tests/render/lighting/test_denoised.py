@@ -13,7 +13,6 @@ from synpick_warp.configs.schema import FAST, REFERENCE, Config
 from synpick_warp.factory.assembly import make_renderer
 from synpick_warp.scenes.assets.appearance import linear_to_srgb
 from synpick_warp.scenes.environment import map_directions
-from synpick_warp.scenes.sun import MAX_SUN_TANGENT
 from synpick_warp.scenes.types import Catalog, EnvironmentMap, Material
 from synpick_warp.stages.buffers import allocate_view_buffers
 from synpick_warp.stages.render.light_tables import measure_albedo, precompute_environment
@@ -91,8 +90,8 @@ def test_grey_plane_under_a_uniform_map_equals_the_reference(device, table):
 @pytest.mark.parametrize("cosine", [1.0, 0.6, 0.25])
 @pytest.mark.parametrize("degrees", [2.0, 3.5, 6.0, 12.0])
 def test_plane_under_a_lamp_has_the_analytic_irradiance(device, cosine, degrees):
-    # A disc of angular radius a and radiance L that is entirely above the horizon: E = π L sin² a cos θ. Narrow lamps have shadow rays of
-    # their own, wide ones do not; light of up to 8 times the unoccluded light passes the firefly clamp.
+    # A disc of angular radius a and radiance L that is entirely above the horizon: E = π L sin² a cos θ. Wide discs are several lamps, and
+    # the light of most of 12° stays in the map.
     radius = np.radians(degrees)
     radiance = 3.0 / (np.pi * np.sin(radius) ** 2)
     light = lamp(cosine, radius, radiance)
@@ -102,20 +101,18 @@ def test_plane_under_a_lamp_has_the_analytic_irradiance(device, cosine, degrees)
     np.testing.assert_allclose(picture.radiance[0].mean(axis=(0, 1)), value[0] * 3.0, rtol=0.02)
 
 
-@pytest.mark.parametrize(("degrees", "split"), [(1.0, True), (3.0, True), (6.0, False), (12.0, False)])
-def test_only_narrow_lamps_are_split_off_as_sun(degrees, split):
-    light = lamp(0.7, np.radians(degrees), 200.0, 0.2)
-    tables = precompute_environment(light, None)
-    assert (tables.sun_irradiance.max() > 0.0) == split
-    assert (tables.sun_radius <= MAX_SUN_TANGENT) == split
-    assert (tables.sunless.max() < 10.0) == split
-    # Split or not, no light is lost or counts twice.
-    directions, solid_angles = map_directions(len(tables.sunless))
+@pytest.mark.parametrize(("degrees", "lamps"), [(1.0, 1), (3.0, 1), (5.0, 1), (12.0, 6)])
+def test_tables_split_a_map_into_lamps_and_the_rest(degrees, lamps):
+    tables = precompute_environment(lamp(0.7, np.radians(degrees), 200.0, 0.2), None)
+    assert len(tables.lamps) == lamps
+    assert tables.lampless.max() < (10.0 if lamps == 1 else 201.0)
+    # No light is lost or counts twice.
+    directions, solid_angles = map_directions(len(tables.lampless))
     for normal in (toward(1.0), toward(0.5, 1.0), toward(0.7, -0.4)):
         cosine = np.maximum(directions @ normal, 0.0) * solid_angles
-        whole, sunless = ((image * cosine[..., None]).sum(axis=(0, 1)) for image in (tables.radiance, tables.sunless))
-        sunlight = tables.sun_irradiance * max(float(normal @ tables.sun_direction), 0.0)
-        np.testing.assert_allclose(sunless + sunlight, whole, rtol=5e-3)
+        whole, rest = ((image * cosine[..., None]).sum(axis=(0, 1)) for image in (tables.radiance, tables.lampless))
+        light = sum(each.irradiance * max(float(normal @ each.direction), 0.0) for each in tables.lamps)
+        np.testing.assert_allclose(rest + light, whole, rtol=5e-3)
 
 
 def test_cluttered_scene_approaches_the_reference(device):
@@ -202,8 +199,8 @@ def test_sun_shadow_has_its_geometric_outline(device, yaw):
     objects = [(sheet(2.0, 2.0), surface(HALF)), (sheet(0.06, 0.06), surface(HALF), (0.0, 0.0, 0.1, *UPRIGHT))]
     light = sun((1.0, 0.0, 1.0), rows=256, strength=6000.0)
     tables = precompute_environment(light, None)
-    direction = tables.sun_direction
-    assert tables.sun_irradiance.max() > 0.0
+    (only,) = tables.lamps
+    direction = only.direction
     lit = render_objects(device, *objects, lights=(light,), view=view, light_yaw=yaw, config=settings(coarse_paths=16))
     ground = lit.instance[0] == 1
     rows, columns = np.mgrid[:160, :160]
@@ -250,7 +247,7 @@ def test_scratch_has_the_size_of_the_scenes_images(device):
     )
     shading = make_renderer(config, scene, 1, 2).shading
     assert shading.guide.surface.shape == shading.ratios.record.shape == (2, 12, 16)
-    assert shading.shadows.filtered.shape == (2, 24, 32)
+    assert shading.shadow_rays.packed.shape == shading.shadows.record.shape == (2, 16, 22)
 
 
 def test_light_does_not_leak_from_the_rim_of_a_pit_to_its_floor(device):

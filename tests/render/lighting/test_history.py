@@ -12,7 +12,8 @@ import warp as wp
 
 from synpick_warp.configs.schema import FAST, REFERENCE, Config
 from synpick_warp.factory.assembly import make_renderer
-from synpick_warp.kernels.render.lighting.history import LIGHT_CHANGE, MAX_DRIFT, MAX_PERIOD_BITS, MAX_TRAVEL, LightHistory
+from synpick_warp.kernels.render.lighting.history import LIGHT_CHANGE, MAX_PERIOD_BITS, MAX_TRAVEL, LightHistory
+from synpick_warp.kernels.render.lighting.moving_bodies import MAX_DRIFT
 from synpick_warp.scenes.types import EnvironmentMap
 from synpick_warp.stages.buffers import Snapshot, allocate_view_buffers
 from synpick_warp.stages.render.renderer import Renderer

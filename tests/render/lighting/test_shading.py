@@ -11,7 +11,6 @@ from synpick_warp.configs.schema import Config
 from synpick_warp.factory.assembly import make_renderer
 from synpick_warp.scenes.assets.appearance import linear_to_srgb, srgb_to_linear
 from synpick_warp.scenes.environment import map_directions
-from synpick_warp.scenes.sun import extract_sun
 from synpick_warp.scenes.types import EnvironmentMap, Material
 from synpick_warp.stages import launch
 from synpick_warp.stages.render.light_tables import precompute_environment, prefilter_specular, sh_basis
@@ -188,23 +187,6 @@ def test_sh_irradiance_of_a_gradient():
     radiance = np.repeat((1.0 + directions[..., 2:]).astype(np.float32), 3, axis=2)
     coefficients = precompute_environment(EnvironmentMap("gradient", radiance), None).irradiance
     np.testing.assert_allclose(sh_basis(np.array([0.6, 0.0, 0.8])) @ coefficients, np.pi + 2 * np.pi / 3 * 0.8, rtol=2e-3)
-
-
-@pytest.mark.parametrize("direction", [(0.0, 0.0, 1.0), (1.0, 0.0, 0.4), (-0.3, -0.8, 0.5)])
-def test_extracted_sun_has_its_direction_and_energy(direction):
-    light = sun(direction).radiance.astype(np.float64)
-    _, solid_angles = map_directions(len(light))
-    rest, extracted, irradiance, radius = extract_sun(light)
-    assert extracted @ np.array(direction) / np.linalg.norm(direction) > np.cos(np.radians(2.0))
-    np.testing.assert_allclose(
-        irradiance + (rest * solid_angles[..., None]).sum(axis=(0, 1)), (light * solid_angles[..., None]).sum(axis=(0, 1))
-    )
-    assert 0.0 <= radius < 0.03
-    assert rest.max() < 10.0
-
-
-def test_uniform_map_has_no_sun():
-    assert not extract_sun(np.ones((32, 64, 3)))[2].any()
 
 
 def test_prefiltered_maps_of_a_uniform_map_and_a_spot():

@@ -70,7 +70,7 @@ def _measure_size(config: Config, factory: Factory, worlds: int, min_seconds: fl
     yield from _pair(size, pixels, everything, theirs_colored, seconds)
     unoccluded = OurViews(replace(config, render=replace(config.render, mode=UNOCCLUDED)), factory, cameras, snapshot, worlds)
     seconds = time_view(functools.partial(unoccluded.render)), seconds[1]
-    plain = "render.mode unoccluded, color by light maps with sun shadows and anti-aliasing, depth, ids, amodal bits, counts, boxes"
+    plain = "render.mode unoccluded, color by light maps with shadows of one lamp and anti-aliasing, depth, ids, amodal bits, counts, boxes"
     yield from _pair(size, pixels, plain, theirs_colored, seconds)
 
 

@@ -1,0 +1,136 @@
+"""Moving bodies: which bodies of a view moved since the previous frame, how far, and the space they take and took.
+
+The light of resting surfaces is reused (`history`, `shadows`) where none of these changes it.
+"""
+
+import warp as wp
+
+from synpick_warp.kernels.render.visibility.camera import Views
+from synpick_warp.kernels.render.visibility.gbuffer import FAR, Meshes
+
+wp.set_module_options({"enable_backward": False})
+
+REST_DISPLACEMENT = wp.constant(2.5e-4)
+"""Rest threshold: a body that displaces none of its points by more in a frame does not change the light of others [m]."""
+MAX_DRIFT = wp.constant(4.0e-3)
+"""Maximum displacement of a body over the frames that its own histories average [m]: at most two coarse pixels in full HD."""
+MAX_FRAMES = wp.constant(1 << 20)
+"""Maximum history length where nothing changes [frames]: longer than any history."""
+
+
+@wp.struct
+class MovingBodies:
+    """Motion of the bodies of each view since the previous frame. Scratch."""
+
+    holds: wp.array[int]
+    """(view): 1: the history contains the previous frame of the same episode."""
+    drift_frames: wp.array2d[int]
+    """(view, body): maximum history length on the body itself, MAX_DRIFT over its displacement in a frame."""
+    count: wp.array[int]
+    """(view): number of bodies that moved, appeared or disappeared."""
+    mesh: wp.array2d[int]
+    """(view, rank): row of `Meshes` of each moving body."""
+    to_body: wp.array2d[wp.transformf]
+    """(view, rank): world to body [m]; of a body that disappeared, at its last pose."""
+    change: wp.array2d[float]
+    """(view, rank): displacement as a fraction of the body's size, at most 1."""
+    lower: wp.array2d[wp.vec3]
+    upper: wp.array2d[wp.vec3]
+    """(view, rank): axis-aligned box in the world around each moving body, where it is and where it was [m]."""
+
+
+@wp.func
+def mean_projected_area(size: wp.vec3) -> float:
+    """Mean area of the projections of a box along all directions: a quarter of its surface (Cauchy) [m²]."""
+    return 0.5 * (size[0] * size[1] + size[1] * size[2] + size[2] * size[0])
+
+
+@wp.func
+def max_displacement(now: wp.transformf, then: wp.transformf, center: wp.vec3, radius: float) -> float:
+    """Upper bound of the displacement of the points of a body: that of its bounding sphere's centre and the turn about it [m]."""
+    turn = wp.transform_get_rotation(now) * wp.quat_inverse(wp.transform_get_rotation(then))
+    sine = wp.length(wp.vec3(turn[0], turn[1], turn[2]))
+    return wp.length(wp.transform_point(now, center) - wp.transform_point(then, center)) + 2.0 * radius * wp.min(sine, 1.0)
+
+
+@wp.func
+def displacement_fraction(meshes: Meshes, mesh: int, displacement: float) -> float:
+    """Displacement of a body's points [m] as a fraction of its size, at most 1; 0: it rests."""
+    if displacement <= REST_DISPLACEMENT:
+        return 0.0
+    return wp.min(displacement / wp.sqrt(mean_projected_area(meshes.upper[mesh] - meshes.lower[mesh])), 1.0)
+
+
+@wp.func
+def world_box(meshes: Meshes, mesh: int, pose: wp.transformf) -> tuple[wp.vec3, wp.vec3]:
+    """Lower and upper corner of the axis-aligned box, in the world, around a mesh's bounding box at a pose; an empty box for mesh -1."""
+    if mesh < 0:
+        return wp.vec3(FAR, FAR, FAR), wp.vec3(-FAR, -FAR, -FAR)
+    half = 0.5 * (meshes.upper[mesh] - meshes.lower[mesh])
+    center = wp.transform_point(pose, meshes.lower[mesh] + half)
+    rotation = wp.quat_to_matrix(wp.transform_get_rotation(pose))
+    reach = wp.vec3()
+    for i in range(3):
+        for j in range(3):
+            reach[i] += wp.abs(rotation[i, j]) * half[j]
+    return center - reach, center + reach
+
+
+@wp.kernel
+def find_moving_bodies_kernel(
+    # Scene:
+    meshes: Meshes,
+    # State: worlds
+    catalog_index: wp.array2d[int],  # (world, instance)
+    pose: wp.array2d[wp.transformf],  # (world, instance) [m]
+    fixture_pose: wp.array2d[wp.transformf],  # (world, fixture) [m]
+    fixture_visible: wp.array2d[int],  # (world, fixture)
+    last_catalog_index: wp.array2d[int],  # (world, instance)
+    last_pose: wp.array2d[wp.transformf],  # (world, instance) [m]
+    last_fixture_pose: wp.array2d[wp.transformf],  # (world, fixture) [m]
+    last_fixture_visible: wp.array2d[int],  # (world, fixture)
+    # In:
+    views: Views,
+    bodies: int,
+    # Out:
+    moving_inout: MovingBodies,
+):
+    """List the bodies of each view that moved since the previous frame, came or went, if the history holds that frame (`holds`)."""
+    view = wp.tid()
+    if moving_inout.holds[view] == 0:
+        return
+    world = views.world[view]
+    count = int(0)
+    for body in range(bodies):
+        mesh = int(-1)
+        last_mesh = int(-1)
+        now = wp.transform_identity(dtype=float)
+        then = wp.transform_identity(dtype=float)
+        if body < views.instances:
+            mesh = catalog_index[world, body]
+            last_mesh = last_catalog_index[world, body]
+            now = pose[world, body]
+            then = last_pose[world, body]
+        else:
+            fixture = body - views.instances
+            mesh = wp.where(fixture_visible[world, fixture] != 0, meshes.entries + fixture, -1)
+            last_mesh = wp.where(last_fixture_visible[world, fixture] != 0, meshes.entries + fixture, -1)
+            now = fixture_pose[world, fixture]
+            then = last_fixture_pose[world, fixture]
+        change = float(mesh != last_mesh)
+        drift_frames = wp.where(mesh != last_mesh, 0, MAX_FRAMES)
+        if mesh == last_mesh and mesh >= 0:
+            displacement = max_displacement(now, then, meshes.center[mesh], meshes.radius[mesh])
+            change = displacement_fraction(meshes, mesh, displacement)
+            drift_frames = int(MAX_DRIFT / wp.max(displacement, MAX_DRIFT / float(MAX_FRAMES)))
+        moving_inout.drift_frames[view, body] = drift_frames
+        if change > 0.0:
+            moving_inout.mesh[view, count] = wp.where(mesh >= 0, mesh, last_mesh)
+            moving_inout.to_body[view, count] = wp.transform_inverse(wp.where(mesh >= 0, now, then))
+            moving_inout.change[view, count] = change
+            lower, upper = world_box(meshes, mesh, now)
+            last_lower, last_upper = world_box(meshes, last_mesh, then)
+            moving_inout.lower[view, count] = wp.min(lower, last_lower)
+            moving_inout.upper[view, count] = wp.max(upper, last_upper)
+            count += 1
+    moving_inout.count[view] = count

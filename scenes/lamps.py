@@ -1,0 +1,158 @@
+"""Lamp extraction: split an environment map into its lamps, the small and bright lights, and the rest, so that no light counts twice.
+
+The renderer samples each lamp with shadow rays of its own, and the rest with paths. Unlike a median cut (Debevec, 2005), which turns the
+whole map into lights, it takes what exceeds a contrast threshold, by a mode search (mean shift; Comaniciu and Meer, 2002).
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+
+from synpick_warp.scenes.environment import LUMINANCE, map_directions
+from synpick_warp.scenes.sun import disc_radius_tangent
+
+LAMP_RADIUS = np.radians(6.0)
+"""Radius of the search window [rad]: light within this angle of a lamp's center belongs to it. Wider light is split into several lamps."""
+LAMP_CONTRAST = 4.0
+"""The part of a texel's luminance above this multiple of the map's mean belongs to a lamp."""
+MIN_LAMP_SHARE = 0.03
+"""Minimum share of a lamp in the irradiance of a surface that faces up; weaker ones stay in the map, which paths sample."""
+MIN_LAMP_HEIGHT = 0.15
+"""Minimum z of the direction to a lamp; light from lower ones does not reach the objects in a tote."""
+SEARCH_BLUR = 4.0
+"""Standard deviation of the blur of the map in which the search starts at the brightest texel [texels]: the middle of a lamp, not its
+brightest point."""
+SHIFTS = 4
+"""Iterations of the mean shift."""
+DISC_RINGS, DISC_SPOKES = 16, 64
+"""Points along the radius and around a disc from which its sample points are averaged."""
+
+
+class Lamp(NamedTuple):
+    """A small and bright light of an environment map: the sun, a lamp, a window or a part of one."""
+
+    direction: np.ndarray
+    """Unit direction to its center (3)."""
+    irradiance: np.ndarray
+    """Irradiance on a surface that faces it (3)."""
+    radius_tangent: float
+    """Tangent of the angular radius of a uniform disc with its second moment."""
+    points: np.ndarray
+    """Sample points (points, 3): unit directions to parts of equal irradiance; see `stratify_light`."""
+
+
+def extract_lamps(radiance: np.ndarray, max_lamps: int, points: int, whole: np.ndarray | None = None) -> tuple[np.ndarray, list[Lamp]]:
+    """Split a map into at most `max_lamps` lamps above the horizon and the rest.
+
+    Args:
+        radiance: (rows, 2 rows, 3).
+        max_lamps: Maximum number of lamps.
+        points: Sample points of each, a power of two.
+        whole: The map (rows, 2 rows, 3) that contrast and shares refer to, if a sun was taken from it before; None: `radiance`.
+
+    Returns:
+        The map without the lamps, and the lamps, those with the largest irradiance of a surface that faces up first.
+    """
+    directions, solid_angles = map_directions(len(radiance))
+    luminance = radiance @ LUMINANCE
+    total = solid_angles * (luminance if whole is None else whole @ LUMINANCE)
+    threshold = LAMP_CONTRAST * total.sum() / (4.0 * np.pi)
+    min_irradiance = MIN_LAMP_SHARE * (total * np.maximum(directions[..., 2], 0.0)).sum()
+    high = directions[..., 2] > MIN_LAMP_HEIGHT
+    left, found = luminance, []
+    # Searches find lamps by radiance, not by irradiance: twice as many leave some to choose from.
+    for _ in range(2 * max_lamps):
+        blurred = np.where(high, cv2.GaussianBlur(np.maximum(left - threshold, 0.0), (0, 0), SEARCH_BLUR), 0.0)
+        if blurred.max() <= 0.0:
+            break
+        excess = _shift_window(left, threshold, directions[np.unravel_index(blurred.argmax(), blurred.shape)])
+        if excess is None:
+            break
+        left = left - excess
+        flux, upward = (float((excess * solid_angles * factor).sum()) for factor in (1.0, directions[..., 2]))
+        if upward >= max(min_irradiance, MIN_LAMP_HEIGHT * flux):
+            found.append((upward, excess))
+    found = sorted(found, key=lambda pair: -pair[0])[:max_lamps]
+    fractions = [excess / np.maximum(luminance, 1e-12) for _, excess in found]
+    lamps = [_build_lamp(radiance * fraction[..., None], points) for fraction in fractions]
+    return radiance * (1.0 - sum(fractions, np.zeros_like(luminance)))[..., None], lamps
+
+
+def _shift_window(luminance: np.ndarray, threshold: float, center: np.ndarray) -> np.ndarray | None:
+    """Mean shift of the search window from the unit direction `center` (3).
+
+    Returns the luminance (rows, 2 rows) above the threshold in the last window, None if there is none.
+    """
+    directions, solid_angles = map_directions(len(luminance))
+    result = None
+    for _ in range(SHIFTS):
+        inside = (directions @ center > np.cos(LAMP_RADIUS)) & (directions[..., 2] > 0.0)
+        excess = np.where(inside, np.maximum(luminance - threshold, 0.0), 0.0)
+        if not excess.any():
+            break
+        result = excess
+        center = ((excess * solid_angles)[..., None] * directions).sum(axis=(0, 1))
+        center /= np.linalg.norm(center)
+    return result
+
+
+def _build_lamp(radiance: np.ndarray, points: int) -> Lamp:
+    """The lamp that is the whole light of a map (rows, 2 rows, 3), black elsewhere."""
+    directions, solid_angles = map_directions(len(radiance))
+    weight = (radiance @ LUMINANCE) * solid_angles
+    center = (weight[..., None] * directions).sum(axis=(0, 1))
+    center /= np.linalg.norm(center)
+    irradiance = (radiance * solid_angles[..., None]).sum(axis=(0, 1))
+    lit = weight > 0.0
+    samples = stratify_light(weight[lit], directions[lit], points)
+    return Lamp(center, irradiance, disc_radius_tangent(weight, center), samples)
+
+
+def sample_disc(direction: np.ndarray, radius_tangent: float, count: int) -> np.ndarray:
+    """Stratified sample points of a uniform disc about a unit direction (3): unit directions (count, 3), as those of `stratify_light`."""
+    radius = radius_tangent * np.sqrt((np.arange(DISC_RINGS) + 0.5) / DISC_RINGS)
+    angle = 2.0 * np.pi * (np.arange(DISC_SPOKES) + 0.5) / DISC_SPOKES
+    across = np.cross(direction, np.eye(3)[np.abs(direction).argmin()])
+    across /= np.linalg.norm(across)
+    side = np.stack([across, np.cross(direction, across)])
+    offsets = (radius[:, None, None] * np.stack([np.cos(angle), np.sin(angle)], axis=-1)).reshape(-1, 2)
+    directions = direction + offsets @ side
+    return stratify_light(np.ones(len(directions)), directions / np.linalg.norm(directions, axis=1)[:, None], count)
+
+
+def stratify_light(weight: np.ndarray, directions: np.ndarray, count: int) -> np.ndarray:
+    """Stratified sample points of a light: it is bisected into `count` parts of equal weight, each across its longer axis.
+
+    Args:
+        weight: Weights of the light's texels (n), positive.
+        directions: Unit directions to them (n, 3).
+        count: Number of points, a power of two.
+
+    Returns:
+        Unit directions to the parts' centers (count, 3). Bit k of a point's index says in which half of the k-th bisection it lies, so
+        that any aligned run of 2^k points has one in each of its parts.
+    """
+    mean = (weight[:, None] * directions).sum(axis=0) / weight.sum()
+    if count == 1:
+        return (mean / np.linalg.norm(mean))[None]
+    offset = directions - mean
+    axis = np.linalg.eigh((weight[:, None] * offset).T @ offset)[1][:, -1]
+    # Libraries differ in its sign.
+    axis *= np.sign(axis[np.abs(axis).argmax()])
+    order = np.argsort(offset @ axis, kind="stable")
+    weight, directions = weight[order], directions[order]
+    total = np.cumsum(weight)
+    middle = int(np.searchsorted(total, 0.5 * total[-1]))
+    # Both halves get their part of the texel in the middle.
+    excess = total[middle] - 0.5 * total[-1]
+    lower, upper = weight[: middle + 1].copy(), weight[middle:].copy()
+    lower[-1] -= excess
+    upper[0] = excess
+    halves = []
+    for part, texels in ((lower, directions[: middle + 1]), (upper, directions[middle:])):
+        lit = part > 0.0
+        halves.append(stratify_light(part[lit], texels[lit], count // 2))
+    return np.stack(halves, axis=1).reshape(count, 3)
