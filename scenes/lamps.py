@@ -21,10 +21,11 @@ LAMP_CONTRAST = 4.0
 MIN_LAMP_SHARE = 0.03
 """Minimum share of a lamp in the irradiance of a surface that faces up; weaker ones stay in the map, which paths sample."""
 MIN_LAMP_HEIGHT = 0.15
-"""Minimum z of the direction to a lamp; light from lower ones does not reach the objects in a tote."""
+"""Minimum z of the texel at which a search starts, and of a lamp's mean direction; light from lower ones does not reach the objects in a
+tote."""
 SEARCH_BLUR = 4.0
-"""Standard deviation of the blur of the map in which the search starts at the brightest texel [texels]: the middle of a lamp, not its
-brightest point."""
+"""Standard deviation of the Gaussian blur of the map, whose brightest texel starts a search [texels]: it prefers a lamp's middle to a
+single bright texel."""
 SHIFTS = 4
 """Iterations of the mean shift."""
 DISC_RINGS, DISC_SPOKES = 16, 64
@@ -39,7 +40,7 @@ class Lamp(NamedTuple):
     irradiance: np.ndarray
     """Irradiance on a surface that faces it (3)."""
     radius_tangent: float
-    """Tangent of the angular radius of a uniform disc with its second moment."""
+    """Tangent of the angular radius of the uniform disc with the same second moment."""
     points: np.ndarray
     """Sample points (points, 3): unit directions to parts of equal irradiance; see `stratify_light`."""
 
@@ -65,12 +66,12 @@ def extract_lamps(radiance: np.ndarray, max_lamps: int, points: int, whole: np.n
     left, found = luminance, []
     # Searches find lamps by radiance, not by irradiance: twice as many leave some to choose from.
     for _ in range(2 * max_lamps):
-        blurred = np.where(high, cv2.GaussianBlur(np.maximum(left - threshold, 0.0), (0, 0), SEARCH_BLUR), 0.0)
+        bright = np.maximum(left - threshold, 0.0)
+        # A texel without light may have more around it, but a window there could be empty.
+        blurred = np.where(high & (bright > 0.0), cv2.GaussianBlur(bright, (0, 0), SEARCH_BLUR), 0.0)
         if blurred.max() <= 0.0:
             break
-        excess = _shift_window(left, threshold, directions[np.unravel_index(blurred.argmax(), blurred.shape)])
-        if excess is None:
-            break
+        excess = _shift_window(bright, directions[np.unravel_index(blurred.argmax(), blurred.shape)])
         left = left - excess
         flux, upward = (float((excess * solid_angles * factor).sum()) for factor in (1.0, directions[..., 2]))
         if upward >= max(min_irradiance, MIN_LAMP_HEIGHT * flux):
@@ -81,16 +82,16 @@ def extract_lamps(radiance: np.ndarray, max_lamps: int, points: int, whole: np.n
     return radiance * (1.0 - sum(fractions, np.zeros_like(luminance)))[..., None], lamps
 
 
-def _shift_window(luminance: np.ndarray, threshold: float, center: np.ndarray) -> np.ndarray | None:
-    """Mean shift of the search window from the unit direction `center` (3).
+def _shift_window(bright: np.ndarray, center: np.ndarray) -> np.ndarray:
+    """Mean shift of the search window from the unit direction `center` (3) of a texel with light.
 
-    Returns the luminance (rows, 2 rows) above the threshold in the last window, None if there is none.
+    Returns the luminance `bright` (rows, 2 rows), that above the threshold, in the last window that has any, 0 elsewhere.
     """
-    directions, solid_angles = map_directions(len(luminance))
-    result = None
+    directions, solid_angles = map_directions(len(bright))
+    result = bright
     for _ in range(SHIFTS):
         inside = (directions @ center > np.cos(LAMP_RADIUS)) & (directions[..., 2] > 0.0)
-        excess = np.where(inside, np.maximum(luminance - threshold, 0.0), 0.0)
+        excess = np.where(inside, bright, 0.0)
         if not excess.any():
             break
         result = excess
@@ -118,7 +119,8 @@ def sample_disc(direction: np.ndarray, radius_tangent: float, count: int) -> np.
     across = np.cross(direction, np.eye(3)[np.abs(direction).argmin()])
     across /= np.linalg.norm(across)
     side = np.stack([across, np.cross(direction, across)])
-    offsets = (radius[:, None, None] * np.stack([np.cos(angle), np.sin(angle)], axis=-1)).reshape(-1, 2)
+    # Slightly elliptical: of a disc, all axes are the longest, and libraries would choose different ones.
+    offsets = (1.0, 0.999) * (radius[:, None, None] * np.stack([np.cos(angle), np.sin(angle)], axis=-1)).reshape(-1, 2)
     directions = direction + offsets @ side
     return stratify_light(np.ones(len(directions)), directions / np.linalg.norm(directions, axis=1)[:, None], count)
 
@@ -133,7 +135,7 @@ def stratify_light(weight: np.ndarray, directions: np.ndarray, count: int) -> np
 
     Returns:
         Unit directions to the parts' centers (count, 3). Bit k of a point's index says in which half of the k-th bisection it lies, so
-        that any aligned run of 2^k points has one in each of its parts.
+        that any aligned run of 2^k points has one in each of the 2^k parts of the first k bisections.
     """
     mean = (weight[:, None] * directions).sum(axis=0) / weight.sum()
     if count == 1:

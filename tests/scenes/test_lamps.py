@@ -88,6 +88,14 @@ def test_weak_low_and_uniform_light_gives_no_lamps():
         np.testing.assert_array_equal(rest, radiance)
 
 
+@pytest.mark.parametrize("polar", [78.0, 84.0, 91.0, 97.0])
+def test_bright_light_at_or_below_the_horizon_hides_no_lamp(polar):
+    """Its blur reaches into the part of the map where searches start."""
+    _, lamps = extract_lamps(room((toward(polar), 3.0, 400.0), (toward(40.0, 120.0), 3.0, 100.0)), 8, 16)
+    assert any(lamp.direction @ toward(40.0, 120.0) > 0.999 for lamp in lamps)
+    assert all(lamp.direction[2] > 0.15 for lamp in lamps)
+
+
 def test_a_black_map_has_no_lamps():
     assert extract_lamps(np.zeros((16, 32, 3)), 8, 16)[1] == []
 

@@ -5,13 +5,14 @@ The light of resting surfaces is reused (`history`, `shadows`) where none of the
 
 import warp as wp
 
+from synpick_warp.kernels.render.visibility.bvh_rays import RAY_OFFSET
 from synpick_warp.kernels.render.visibility.camera import Views
 from synpick_warp.kernels.render.visibility.gbuffer import FAR, Meshes
 
 wp.set_module_options({"enable_backward": False})
 
 REST_DISPLACEMENT = wp.constant(2.5e-4)
-"""Rest threshold: a body that displaces none of its points by more in a frame does not change the light of others [m]."""
+"""Rest threshold: a body that displaces none of its points by more in a frame is taken not to change the light of others [m]."""
 MAX_DRIFT = wp.constant(4.0e-3)
 """Maximum displacement of a body over the frames that its own histories average [m]: at most two coarse pixels in full HD."""
 MAX_FRAMES = wp.constant(1 << 20)
@@ -63,13 +64,16 @@ def displacement_fraction(meshes: Meshes, mesh: int, displacement: float) -> flo
 
 @wp.func
 def world_box(meshes: Meshes, mesh: int, pose: wp.transformf) -> tuple[wp.vec3, wp.vec3]:
-    """Lower and upper corner of the axis-aligned box, in the world, around a mesh's bounding box at a pose; an empty box for mesh -1."""
+    """Lower and upper corner of the axis-aligned box, in the world, around a mesh's bounding box at a pose; an empty box for mesh -1.
+
+    It is wider by RAY_OFFSET, since rays that are tested against it start at surfaces, and those that are traced above them.
+    """
     if mesh < 0:
         return wp.vec3(FAR, FAR, FAR), wp.vec3(-FAR, -FAR, -FAR)
     half = 0.5 * (meshes.upper[mesh] - meshes.lower[mesh])
     center = wp.transform_point(pose, meshes.lower[mesh] + half)
     rotation = wp.quat_to_matrix(wp.transform_get_rotation(pose))
-    reach = wp.vec3()
+    reach = wp.vec3(RAY_OFFSET, RAY_OFFSET, RAY_OFFSET)
     for i in range(3):
         for j in range(3):
             reach[i] += wp.abs(rotation[i, j]) * half[j]

@@ -23,9 +23,7 @@ EVEN_BYTES = wp.constant(wp.uint64(0x00FF00FF00FF00FF))
 WEIGHT_SUM = wp.constant(256)
 """Sum of the fixed-point weights: with bytes they fill 16 bits."""
 HALF_WEIGHTS = wp.constant(wp.uint64(0x0080008000800080))
-"""Half of the weights' sum in each part of 16 bits, which rounds."""
-
-
+"""Rounding term: half of WEIGHT_SUM in each 16 bits."""
 TapVector = wp.types.vector(length=4, dtype=wp.uint64)
 """Visible fractions of the lamps at the four nearest coarse pixels."""
 
@@ -106,7 +104,7 @@ def upsample_shadows(shadows: LampShadows, coarse: CoarseGrid, view: int, row: i
     """Visible fraction of each lamp at a pixel, as in `shadows.pack_shadows`, from the four nearest coarse pixels on its surface.
 
     If all four are on other surfaces, the ring around them is searched too, as for visibility ratios: light of another surface would
-    show as bright pixels along the edge. `plane` is the pixel's tangent plane.
+    show as bright pixels along the edge. If none there is on it either, the four are interpolated. `plane` is the pixel's tangent plane.
     """
     y = window_coordinate(coarse, row)
     x = window_coordinate(coarse, column)
@@ -125,7 +123,8 @@ def upsample_shadows(shadows: LampShadows, coarse: CoarseGrid, view: int, row: i
             if on_plane(record, coarse, row, column, plane, r, c):
                 found = True
             else:
-                weight *= MIN_WEIGHT
+                # Also against the MIN_WEIGHT of a tap on the surface.
+                weight *= MIN_WEIGHT * MIN_WEIGHT
             weights[2 * i + j] = weight
             taps[2 * i + j] = shadow_fractions(record)
     if not found:

@@ -31,7 +31,7 @@ from synpick_warp.kernels.tuning import RAY_REGISTERS
 wp.set_module_options({"enable_backward": False, "fast_math": True})
 
 ALL_RAYS = wp.constant(0xFF)
-"""Bits of MAX_LAMPS shadow rays, all of them free."""
+"""Bits of all shadow rays of a pixel, at most eight."""
 LAMP_POINTS = wp.constant(16)
 """Number of a lamp's sample points."""
 REFRESH_FRAMES = wp.constant(16)
@@ -41,9 +41,9 @@ CALM_FRAMES = wp.constant(64)
 """Minimum of `MovingBodies.drift_frames` of a surface whose shadows are reused: it then moves by at most MAX_DRIFT / 4 in REFRESH_FRAMES
 frames, half the width of a coarse pixel at full HD."""
 TILE_SHIFT = wp.constant(3)
-"""Tiles of a row of tiles refresh their shadow rays this many frames after those of the row above."""
+"""A row of tiles refreshes its shadow rays this many frames before the row above."""
 MIN_DIRECTION = wp.constant(1.0e-9)
-"""Divisors that are components of directions are at least this."""
+"""Components of directions with a smaller magnitude are replaced by this before they divide."""
 SPREAD_BITS = wp.constant(wp.uint64(0x8040201008040201))
 """Bit k of byte k."""
 EVERY_BYTE = wp.constant(wp.uint64(0x0101010101010101))
@@ -93,7 +93,7 @@ def rays_depth(packed: wp.uint64) -> float:
 
 @wp.func
 def spread_bits(bits: int) -> wp.uint64:
-    """Bytes 0 or 1 of eight bits."""
+    """Spread the low eight bits over the bytes of a word: byte k is bit k, 0 or 1."""
     isolated = (wp.uint64(bits) * EVERY_BYTE) & SPREAD_BITS
     return ((isolated + CARRY_BITS) >> wp.uint64(7)) & EVERY_BYTE
 
@@ -108,7 +108,8 @@ def byte_of(packed: wp.uint64, index: int) -> int:
 def ray_direction(lights: Lights, which: int, heading: wp.vec2, ray: int, pixel: int) -> wp.vec3:
     """Unit vector, in the world, to the sample point of shadow ray `ray` from the pixel with Morton index `pixel`.
 
-    A pixel takes a run of a lamp's points, and its neighbours the next ones.
+    Pixels that follow each other in Morton order take consecutive runs of `Lights.lamp_rays` points, so that a square of 4 x 4 of them,
+    or of 2 x 2 with four rays each, takes all.
     """
     rays = lights.lamp_rays[which]
     point = (pixel * rays + ray % rays) % LAMP_POINTS
@@ -156,7 +157,8 @@ def is_refreshed(row: int, column: int, frame: int) -> bool:
 
 @wp.func
 def is_calm(moving: MovingBodies, view: int, segment: int, instances: int) -> bool:
-    """Whether a surface moves so little that its shadows may be reused."""
+    """Whether a visible body moved by at most MAX_DRIFT / CALM_FRAMES in this frame, so that its shadows may be reused; the table never
+    moves."""
     if segment == Segment.TABLE:
         return True
     return moving.drift_frames[view, body_of(segment, instances)] >= CALM_FRAMES
@@ -179,7 +181,7 @@ def visible_normal(meshes: Meshes, bodies: ViewBodies, view: int, hit: Hit, inst
 def is_shadowed(
     meshes: Meshes, table: Table, bodies: ViewBodies, view: int, tote: int, position: wp.vec3, normal: wp.vec3, direction: wp.vec3
 ) -> bool:
-    """Whether a part of a lamp in unit `direction` lies behind a surface, or something before it; `tote` as in `is_blocked`."""
+    """Whether a unit `direction` points below the surface, or a shadow ray in it is blocked; `tote` as in `is_blocked`."""
     if wp.dot(normal, direction) <= 0.0:
         return True
     return is_blocked(meshes, table, bodies, view, tote, position + RAY_OFFSET * normal, direction, FAR)
@@ -189,7 +191,10 @@ def is_shadowed(
 def last_rays(
     history: LightHistory, moving: MovingBodies, views: Views, view: int, slot: int, row: int, column: int, segment: int
 ) -> tuple[bool, int]:
-    """(True, bits of a pixel's shadow rays in the previous frame) if they may be reused, else (False, 0)."""
+    """(True, bits of a pixel's shadow rays in the previous frame) if they may be reused, else (False, 0).
+
+    They may if the history holds that frame, the pixel showed the same body, which is calm, and it is not refreshed in this frame.
+    """
     if history.max_paths == 0 or moving.holds[view] == 0:
         return False, 0
     last = int(history.shadows[slot, row, column])
@@ -311,7 +316,7 @@ def filter_shadows_kernel(
 ):
     """Visible fraction of each lamp: the mean over a window of coarse pixels on one body and near one tangent plane.
 
-    The member of `shadows_out` is written, but for views under a map without lamps.
+    Every coarse pixel is written, except in views under a map without lamps.
     """
     view, row, column = tile_pixel(coarse.grid, wp.tid() + first)
     if not in_image(coarse.grid, row, column):

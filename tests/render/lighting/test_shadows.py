@@ -12,6 +12,7 @@ import warp as wp
 from synpick_warp.configs.schema import FAST, Config
 from synpick_warp.factory.assembly import make_renderer
 from synpick_warp.kernels.render.lighting.shadows import REFRESH_FRAMES
+from synpick_warp.kernels.render.visibility.bvh_rays import RAY_OFFSET
 from synpick_warp.kernels.render.visibility.gbuffer import Meshes
 from synpick_warp.scenes.types import EnvironmentMap
 from synpick_warp.stages.render.renderer import Renderer
@@ -102,7 +103,7 @@ def test_rays_that_pass_through_a_box_meet_it(device):
     assert (meets & ~expected).mean() < 0.01
 
 
-def test_boxes_around_bodies_touch_their_corners(device):
+def test_boxes_around_bodies_are_their_corners_box_and_a_margin(device):
     random = np.random.default_rng(4)
     lower, upper = np.array([-0.02, -0.05, 0.0]), np.array([0.07, 0.01, 0.3])
     poses = np.concatenate([random.normal(size=(50, 3)), random.normal(size=(50, 4))], axis=1).astype(np.float32)
@@ -116,8 +117,8 @@ def test_boxes_around_bodies_touch_their_corners(device):
     for i, pose in enumerate(poses):
         q, w = pose[3:6], pose[6]
         turned = corners + 2.0 * np.cross(q, np.cross(q, corners) + w * corners) + pose[:3]
-        np.testing.assert_allclose(results[0].numpy()[i], turned.min(axis=0), atol=1e-6)
-        np.testing.assert_allclose(results[1].numpy()[i], turned.max(axis=0), atol=1e-6)
+        np.testing.assert_allclose(results[0].numpy()[i], turned.min(axis=0) - RAY_OFFSET, atol=1e-6)
+        np.testing.assert_allclose(results[1].numpy()[i], turned.max(axis=0) + RAY_OFFSET, atol=1e-6)
 
 
 def stirred(frame: int, balls: int = 2) -> ToyScene:
