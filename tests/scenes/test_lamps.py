@@ -90,7 +90,7 @@ def test_weak_low_and_uniform_light_gives_no_lamps():
 
 @pytest.mark.parametrize("polar", [78.0, 84.0, 91.0, 97.0])
 def test_bright_light_at_or_below_the_horizon_hides_no_lamp(polar):
-    """Its blur reaches into the part of the map where searches start."""
+    """Although the Gaussian blur spreads it to heights at which searches start."""
     _, lamps = extract_lamps(room((toward(polar), 3.0, 400.0), (toward(40.0, 120.0), 3.0, 100.0)), 8, 16)
     assert any(lamp.direction @ toward(40.0, 120.0) > 0.999 for lamp in lamps)
     assert all(lamp.direction[2] > 0.15 for lamp in lamps)
@@ -102,7 +102,7 @@ def test_a_black_map_has_no_lamps():
 
 @given(st.integers(0, 2**32 - 1), st.sampled_from([1, 2, 4, 16]))
 def test_points_stand_for_equal_parts_of_the_light(seed, count):
-    """Their mean is the light's, whatever the weights, and no point lies outside it."""
+    """The mean of the points is the weighted centroid of the texels, for random weights; points are unit vectors."""
     random = np.random.default_rng(seed)
     texels = int(random.integers(1, 200))
     directions = np.array([0.3, 0.2, 0.9]) + 0.1 * random.normal(size=(texels, 3))

@@ -21,8 +21,8 @@ class CoarseGrid:
     size: int
     """Width of a coarse pixel [px]; 0 in mode unoccluded, which has none."""
     period: int
-    """Period of the sample points of shadow rays [coarse pixels], a power of two: any window of this width holds each of period² points
-    once, any aligned one of half the width a stratified quarter of them."""
+    """Tile width of the shadow rays' sample pattern [coarse pixels], a power of two: any window of this width contains each of the period²
+    sample points once; an aligned window of half the width contains a stratified quarter of them."""
     window: int
     """Width of the shadow filter [coarse pixels], even, or 1."""
     image: ImageGrid

@@ -32,14 +32,14 @@ MAX_PERIOD_BITS = wp.constant(3)
 BAYER_BITS = wp.constant(4)
 """Bits of a threshold of the 4 x 4 Bayer matrix."""
 PERIOD_PATHS = wp.constant(64)
-"""Part of the sample sequence of each update period, which repeats after it [paths]: twice as many as a history counts by default."""
+"""Length of the sample sequence of each update period [paths], after which it repeats: twice the default maximum history length."""
 NEVER = wp.constant(-2)
 """Frame index of an empty history, which no frame continues."""
 
 
 @wp.struct
 class LightHistory:
-    """Average light of the coarse pixels of each world and camera, over the frames of an episode, and their last shadows; members as in
+    """Temporally accumulated light of the coarse pixels, and the previous frame's shadow rays, of each world and camera. Members as in
     `CoarseLight`."""
 
     diffuse: wp.array3d[wp.uint64]

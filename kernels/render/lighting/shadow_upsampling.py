@@ -11,7 +11,7 @@ from synpick_warp.kernels.render.lighting.coarse_grid import (
     window_coordinate,
 )
 from synpick_warp.kernels.render.lighting.plane_distance import Plane, plane_distance
-from synpick_warp.kernels.render.lighting.shadows import LampShadows
+from synpick_warp.kernels.render.lighting.shadows import LampShadows, shadow_depth, shadow_fractions, shadow_segment
 from synpick_warp.kernels.render.lighting.upsampling import RING
 from synpick_warp.kernels.render.visibility.camera import clamp_index
 from synpick_warp.kernels.render.visibility.records import read_record
@@ -21,17 +21,11 @@ wp.set_module_options({"enable_backward": False, "fast_math": True})
 EVEN_BYTES = wp.constant(wp.uint64(0x00FF00FF00FF00FF))
 """Bytes 0, 2, 4, 6, each with room for a sum in 16 bits."""
 WEIGHT_SUM = wp.constant(256)
-"""Sum of the fixed-point weights: with bytes they fill 16 bits."""
+"""Sum of the fixed-point weights; weighted sums of 8-bit values fit into 16 bits."""
 HALF_WEIGHTS = wp.constant(wp.uint64(0x0080008000800080))
 """Rounding term: half of WEIGHT_SUM in each 16 bits."""
 TapVector = wp.types.vector(length=4, dtype=wp.uint64)
 """Visible fractions of the lamps at the four nearest coarse pixels."""
-
-
-@wp.func
-def shadow_fractions(record: wp.vec4) -> wp.uint64:
-    """Visible fractions of the lamps of a packed coarse pixel, as in `shadows.pack_shadows`."""
-    return (wp.uint64(wp.cast(record[1], wp.uint32)) << wp.uint64(32)) | wp.uint64(wp.cast(record[0], wp.uint32))
 
 
 @wp.func
@@ -58,17 +52,18 @@ def blend_bytes(taps: TapVector, weights: wp.vec4) -> wp.uint64:
 def on_plane(record: wp.vec4, coarse: CoarseGrid, row: int, column: int, plane: Plane, r: int, c: int) -> bool:
     """Whether the coarse pixel (r, c), packed, shows the surface of the pixel (row, column), whose tangent plane is `plane`."""
     pixel = middle_pixel(coarse, r, c)
-    distance = plane_distance(plane, pixel[0] - row, pixel[1] - column, record[2])
-    same = wp.cast(record[3], wp.uint32) == wp.uint32(plane.segment)
-    return same and distance <= PLANE_TOLERANCE * float(coarse.size) * plane.width
+    distance = plane_distance(plane, pixel[0] - row, pixel[1] - column, shadow_depth(record))
+    return shadow_segment(record) == plane.segment and distance <= PLANE_TOLERANCE * float(coarse.size) * plane.width
 
 
 @wp.func
 def sum_ring(
     shadows: LampShadows, coarse: CoarseGrid, view: int, row: int, column: int, plane: Plane, top: int, left: int
 ) -> tuple[wp.uint64, wp.uint64, int]:
-    """Sums of the even and of the odd bytes of the fractions, and number, of the coarse pixels that show the surface of the pixel (row,
-    column): among the four from (top, left) on and the ring around them, whose 16 bytes fit into 16 bits."""
+    """Sum the fractions over the 4 x 4 coarse pixels around (top, left) that show the surface of the pixel (row, column).
+
+    Returns the sums of the even bytes, those of the odd bytes, in 16 bits each, and the number of coarse pixels.
+    """
     even = wp.uint64(0)
     odd = wp.uint64(0)
     total = int(0)

@@ -62,7 +62,7 @@ class LampShadows:
 
 @wp.func
 def pack_last(segment: int, rays: int) -> wp.uint16:
-    """Pack a segmentation id and the bits of a pixel's shadow rays, for the next frame."""
+    """Pack a segmentation id and the visibility bits of a pixel's shadow rays into the history."""
     return wp.uint16((segment << 8) | rays)
 
 
@@ -125,6 +125,24 @@ def pack_shadows(fractions: wp.uint64, rays: wp.uint64) -> wp.vec4:
         rays_depth(rays),
         wp.cast(wp.uint32(rays_segment(rays)), wp.float32),
     )
+
+
+@wp.func
+def shadow_fractions(record: wp.vec4) -> wp.uint64:
+    """Visible fractions of the lamps in a record of `pack_shadows`."""
+    return (wp.uint64(wp.cast(record[1], wp.uint32)) << wp.uint64(32)) | wp.uint64(wp.cast(record[0], wp.uint32))
+
+
+@wp.func
+def shadow_depth(record: wp.vec4) -> float:
+    """Depth in a record of `pack_shadows` [m]."""
+    return record[2]
+
+
+@wp.func
+def shadow_segment(record: wp.vec4) -> wp.uint8:
+    """Segmentation id in a record of `pack_shadows`."""
+    return wp.uint8(wp.cast(record[3], wp.uint32))
 
 
 @wp.func

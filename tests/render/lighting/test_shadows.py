@@ -156,7 +156,7 @@ def test_reused_shadows_are_those_that_would_be_traced(device):
 
 
 def test_shadows_are_reused(device):
-    """In a still scene every ray is traced once in REFRESH_FRAMES frames: shadows that are inverted in the history stay so until then."""
+    """Static scene: inverted bits in the history persist until their rays are retraced, one of REFRESH_FRAMES parts in each frame."""
     reusing, _ = renderers(device)
     wrong = []
     for _ in show(reusing, [(frame, stirred(3, 1)) for frame in range(int(REFRESH_FRAMES) + 1)], device):
