@@ -24,6 +24,7 @@ from synpick_warp.stages.render.denoised import (
     LIGHT_HISTORY,
     MOVING_BODIES,
     PATH_LISTS,
+    PATH_QUEUES,
     RATIO_IMAGES,
     FootprintLists,
     ShadowRays,
@@ -47,6 +48,7 @@ NAMES = (
     "image field boundary cell_row cell_column shadow_row shadow_column chunk chunk_footprint block "
     "world_camera view_instance one slot slot_word group depth_byte "
     "sample_row sample_block quad interval lane byte region rank path_kind record"
+    " queue_region queue_stage stage_parity queue_slot path_record"
 )
 WORLDS = MIN_GPU_WORLDS + 1
 SIZES = {name: 2 + number for number, name in enumerate(NAMES.split())}
@@ -76,6 +78,7 @@ BASE = [
     LIGHT_HISTORY,
     MOVING_BODIES,
     PATH_LISTS,
+    PATH_QUEUES,
     DepthBuffers,
     *DEPTH_SCRATCH,
 ]

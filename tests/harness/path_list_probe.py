@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from synpick_warp.kernels.render.lighting.path_lists import PathLists, append_pixel, listed_pixel
+from synpick_warp.kernels.render.lighting.paths.lists import PathLists, append_pixel, listed_pixel
 
 wp.set_module_options({"enable_backward": False})
 

@@ -1,6 +1,6 @@
 """Variance-guided denoiser: the widest of three kernels (16², 8², 4² coarse pixels) whose mean agrees with the narrower ones within noise.
 
-It filters visibility ratios (see `coarse_paths`) in three passes: joint bilateral means over blocks, choice of the kernel, smoothing.
+It filters visibility ratios (see `paths.coarse`) in three passes: joint bilateral means over blocks, choice of the kernel, smoothing.
 `upsampling` then interpolates them at full resolution.
 """
 
@@ -17,8 +17,8 @@ from synpick_warp.kernels.render.lighting.coarse_grid import (
     surface_normal,
     surface_segment,
 )
-from synpick_warp.kernels.render.lighting.coarse_paths import CoarseLight, pack_light, unpack_half2
 from synpick_warp.kernels.render.lighting.color import luminance, pack_half3, unpack_half3
+from synpick_warp.kernels.render.lighting.paths.light import CoarseLight, pack_light, unpack_half2
 from synpick_warp.kernels.render.lighting.plane_distance import Plane, plane_distance, tangent_plane
 from synpick_warp.kernels.render.lighting.unoccluded import visibility_ratio
 from synpick_warp.kernels.render.lighting.upsampling import RatioImages, RatioRecord, Ratios, add_ratios, pack_ratios

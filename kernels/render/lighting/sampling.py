@@ -34,7 +34,7 @@ class EnvironmentSample:
     pdf: float
     """Probability density over solid angle [1/sr]."""
     radiance: wp.vec3
-    """Radiance from this direction over its density, times its MIS weight; set by `path_tracing.sample_direct_light`."""
+    """Radiance from this direction over its density, times its MIS weight; set by `paths.tracing.sample_direct_light`."""
 
 
 @wp.func

@@ -17,7 +17,7 @@ from synpick_warp.kernels.render.lighting.materials import (
     sample_base_color,
     widen_roughness,
 )
-from synpick_warp.kernels.render.lighting.path_tracing import PathScene
+from synpick_warp.kernels.render.lighting.paths.tracing import PathScene
 from synpick_warp.kernels.render.lighting.plane_distance import tangent_plane
 from synpick_warp.kernels.render.lighting.shadow_upsampling import LampShadows, upsample_shadows
 from synpick_warp.kernels.render.lighting.shadows import byte_of

@@ -1,6 +1,6 @@
 """Unoccluded environment lighting without any ray: SH irradiance for the diffuse lobe, a prefiltered map for the specular one.
 
-It is the denominator of the ratio estimator in `coarse_paths`.
+It is the denominator of the ratio estimator in `paths.coarse`.
 """
 
 import warp as wp

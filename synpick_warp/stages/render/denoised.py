@@ -15,7 +15,6 @@ from synpick_warp.arrays import allocate, allocate_struct, device_array, struct_
 from synpick_warp.configs.schema import UNOCCLUDED, Render
 from synpick_warp.kernels.render.images.antialias import CHUNK_TILES, find_footprints_kernel, resolve_footprints_kernel
 from synpick_warp.kernels.render.lighting.coarse_grid import CoarseGrid, Guide
-from synpick_warp.kernels.render.lighting.coarse_paths import CoarseLight, reuse_histories_kernel, trace_coarse_paths_kernel
 from synpick_warp.kernels.render.lighting.denoise import choose_widths_kernel, filter_blocks_kernel, smooth_ratios_kernel
 from synpick_warp.kernels.render.lighting.history import (
     NEVER,
@@ -23,7 +22,12 @@ from synpick_warp.kernels.render.lighting.history import (
     advance_history_kernel,
 )
 from synpick_warp.kernels.render.lighting.moving_bodies import MovingBodies, find_moving_bodies_kernel
-from synpick_warp.kernels.render.lighting.path_lists import REGION_PIXELS, PathLists
+from synpick_warp.kernels.render.lighting.paths.bounces import extend_queued_paths_kernel
+from synpick_warp.kernels.render.lighting.paths.coarse import start_paths_kernel, trace_coarse_paths_kernel
+from synpick_warp.kernels.render.lighting.paths.light import CoarseLight
+from synpick_warp.kernels.render.lighting.paths.lists import REGION_PIXELS, PathLists
+from synpick_warp.kernels.render.lighting.paths.queues import PATH_RECORDS, QUEUE_CAPACITY, PathQueues
+from synpick_warp.kernels.render.lighting.paths.reuse import reuse_histories_kernel
 from synpick_warp.kernels.render.lighting.shading import shade_kernel, shade_samples_kernel
 from synpick_warp.kernels.render.lighting.shadows import LAMP_POINTS, LampShadows, filter_shadows_kernel, trace_shadow_rays_kernel
 from synpick_warp.kernels.render.lighting.upsampling import RatioImages
@@ -84,6 +88,14 @@ MOVING_BODIES = struct_arrays(
     MovingBodies, "view", "body", holds=("view",), count=("view",), units={"to_body": "m", "lower": "m", "upper": "m"}
 )
 PATH_LISTS = struct_arrays(PathLists, "view", "region", "rank", count=("view", "region", "path_kind"))
+PATH_QUEUES = struct_arrays(
+    PathQueues,
+    "view",
+    "queue_region",
+    count=("view", "queue_region", "queue_stage"),
+    slot=("view", "queue_region", "stage_parity", "queue_slot"),
+    record=("view", "queue_region", "path_record"),
+)
 RATIO_IMAGES = struct_arrays(RatioImages, "view", "cell_row", "cell_column")
 
 
@@ -188,6 +200,19 @@ def scratch_sizes(render: Render, width: int, height: int, histories: int = 0) -
     }
 
 
+def queue_sizes(render: Render, width: int, height: int, histories: int, device: wp.Device) -> dict[str, int]:
+    """Extents of the dimensions of `PATH_QUEUES` other than the view. There are none on a CPU, whose threads wait for no others."""
+    queues = device.is_cuda and traces_paths(render)
+    size = coarse_size(render, width, histories)
+    return {
+        "queue_region": interleaved_threads(-(-width // size), -(-height // size)) // int(REGION_PIXELS) if queues else 0,
+        "queue_stage": max(1, render.bounces - 1),
+        "stage_parity": 2,
+        "queue_slot": int(QUEUE_CAPACITY),
+        "path_record": int(PATH_RECORDS) * int(QUEUE_CAPACITY),
+    }
+
+
 def history_sizes(render: Render, width: int, height: int, histories: int) -> dict[str, int]:
     """Extents of the dimensions of `LIGHT_HISTORY`, for `histories` worlds times cameras with images of `width` x `height` px."""
     return scratch_sizes(render, width, height, histories) | {"world_camera": histories if accumulates(render, histories) else 0}
@@ -241,7 +266,7 @@ class DenoisedRenderer:
         self.rules = make_path_rules(render, seed, paths_per_coarse_pixel(render, scene.width, histories), ROULETTE)
         self.rules.first_samples = first_frame_paths(render, scene.width, histories)
         self.rules.min_roughness = MIN_ROUGHNESS
-        self.firefly_clamp = FIREFLY_CLAMP
+        self.rules.firefly_clamp = FIREFLY_CLAMP
         self.variance_scale = SINGLE_PATH_VARIANCE_SCALE if self.rules.samples == 1 else 1.0
         self.history = allocate_struct(LIGHT_HISTORY, history_sizes(render, scene.width, scene.height, histories), scene.device)
         self.history.cameras, self.history.max_paths = scene.camera_count, render.history if accumulates(render, histories) else 0
@@ -249,6 +274,8 @@ class DenoisedRenderer:
         self.moving = allocate_struct(MOVING_BODIES, {"view": views, "body": instances + len(FIXTURES)}, scene.device)
         self.guide = allocate_struct(GUIDE, sizes, scene.device)
         self.path_lists = allocate_struct(PATH_LISTS, sizes, scene.device)
+        queues = queue_sizes(render, scene.width, scene.height, histories, scene.device)
+        self.queues = allocate_struct(PATH_QUEUES, {"view": views} | queues, scene.device)
         self.coarse_light, self.blocks = (allocate_struct(COARSE_LIGHT, sizes, scene.device) for _ in range(2))
         self.chosen, self.ratios = (allocate_struct(RATIO_IMAGES, sizes, scene.device) for _ in range(2))
         self.shadow_rays = allocate(ShadowRays, sizes, scene.device)
@@ -305,10 +332,20 @@ class DenoisedRenderer:
             inputs += [bodies, gbuffer, views, self.moving, self.history]
             outputs = [self.path_lists, self.guide, self.coarse_light]
             launch_views(reuse_histories_kernel, views.count, threads, inputs, outputs, scene.device)
-        inputs = [scene.paths, scene.cameras, self.coarse, snapshot.episode, snapshot.light, snapshot.light_yaw]
-        inputs += [bodies, gbuffer, views, self.path_lists, self.rules, self.firefly_clamp]
-        outputs = [self.history, self.guide, self.coarse_light]
-        launch_pixels(trace_coarse_paths_kernel, views.count * threads, inputs, outputs, scene.device)
+        worlds = [snapshot.episode, snapshot.light, snapshot.light_yaw]
+        inputs = [scene.paths, scene.cameras, self.coarse, *worlds, bodies, gbuffer, views, self.path_lists, self.rules]
+        outputs = [self.queues, self.history, self.guide, self.coarse_light]
+        regions = self.queues.count.shape[1]
+        if regions == 0:
+            launch_pixels(trace_coarse_paths_kernel, views.count * threads, inputs, outputs, scene.device)
+            return
+        self.queues.count.zero_()
+        launch_views(trace_coarse_paths_kernel, views.count, threads, inputs, outputs, scene.device)
+        launch_views(start_paths_kernel, views.count, threads, inputs, outputs, scene.device)
+        inputs = [scene.paths, self.coarse, *worlds, bodies, views, self.rules]
+        outputs = [self.queues, self.history, self.coarse_light]
+        for stage in range(self.rules.bounces - 1):
+            launch_views(extend_queued_paths_kernel, views.count, regions * int(QUEUE_CAPACITY), [*inputs, stage], outputs, scene.device)
 
     def denoise(self, views: Any) -> None:
         """Filter visibility ratios: block means, choice of the kernel's width, smoothing."""

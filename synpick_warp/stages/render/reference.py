@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from synpick_warp.configs.schema import Render
-from synpick_warp.kernels.render.lighting.path_tracing import COMBINED, PathRules, trace_paths_kernel
+from synpick_warp.kernels.render.lighting.paths.tracing import COMBINED, PathRules, trace_paths_kernel
 from synpick_warp.kernels.render.visibility.camera import TILE_PIXELS
 from synpick_warp.stages.buffers import Snapshot
 from synpick_warp.stages.launch import launch_pixels

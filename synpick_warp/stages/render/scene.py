@@ -13,7 +13,7 @@ from synpick_warp.configs import schema
 from synpick_warp.kernels.render.lighting.color import MAX_HALF
 from synpick_warp.kernels.render.lighting.environment import MAX_LAMPS, Lights
 from synpick_warp.kernels.render.lighting.materials import TEXEL_BITS, TEXEL_MASK, TRIANGLE_RECORDS, Surfaces
-from synpick_warp.kernels.render.lighting.path_tracing import PathScene
+from synpick_warp.kernels.render.lighting.paths.tracing import PathScene
 from synpick_warp.kernels.render.lighting.shadows import LAMP_POINTS
 from synpick_warp.kernels.render.visibility.camera import TILE_HEIGHT, TILE_PIXELS, TILE_WIDTH, Cameras, ImageGrid
 from synpick_warp.kernels.render.visibility.gbuffer import Meshes, Table

@@ -8,7 +8,7 @@ import warp as wp
 from hypothesis import given
 from hypothesis import strategies as st
 
-from synpick_warp.kernels.render.lighting.coarse_paths import SEQUENCE_PERIOD
+from synpick_warp.kernels.render.lighting.paths.coarse import SEQUENCE_PERIOD
 from synpick_warp.stages.render.denoised import build_coarse_grid, interleaved_threads
 from synpick_warp.stages.render.scene import build_grid
 from tests.harness.denoise_probe import count_visits_kernel, morton_kernel

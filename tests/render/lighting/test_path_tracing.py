@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from synpick_warp.configs.schema import REFERENCE, Config
-from synpick_warp.kernels.render.lighting.path_tracing import BRDF_SAMPLING, LIGHT_SAMPLING
+from synpick_warp.kernels.render.lighting.paths.tracing import BRDF_SAMPLING, LIGHT_SAMPLING
 from synpick_warp.scenes.assets.appearance import linear_to_srgb
 from synpick_warp.scenes.environment import map_directions
 from synpick_warp.scenes.types import EnvironmentMap, Material

@@ -4,7 +4,7 @@ A pixel's radiance is the mean over N paths of Σ_k T_k (w_l f L / p_l + w_s L_s
 At each surface one direction is sampled by the map's radiance (next-event estimation) and one by the BRDF, combined by multiple importance
 sampling with the power heuristic (Veach, 1997), w_l = p_l² / (p_l² + p_s²). Only the map emits light.
 
-`trace_paths_kernel` is the path-traced reference; `coarse_paths` uses the same functions at few paths per coarse pixel.
+`trace_paths_kernel` is the path-traced reference; `coarse` uses the same functions at few paths per coarse pixel.
 """
 
 import warp as wp
@@ -71,6 +71,8 @@ class PathRules:
     """COMBINED, LIGHT_SAMPLING or BRDF_SAMPLING."""
     min_roughness: float
     """Path regularization: smallest roughness of surfaces after the first. Caustics through two mirrors are rare, bright and noisy."""
+    firefly_clamp: float
+    """Maximum light of a path of the coarse path pass, relative to the unoccluded light; the reference has no clamp."""
     seed: wp.uint64
 
 
@@ -119,8 +121,12 @@ class Path:
     radiance: SplitRadiance
     """Radiance collected so far."""
     throughput: Throughput
-    vertex: Vertex
-    """Last vertex, at which the path scatters next."""
+    hit: Hit
+    """Last hit, at which the path scatters next; not set before the first bounce."""
+    position: wp.vec3
+    """Position of that hit, in the world [m]."""
+    direction: wp.vec3
+    """Unit direction of the ray that found it."""
     bounce: int
     """Bounces so far, or TERMINATED."""
     width: float
@@ -236,19 +242,33 @@ def escaped_radiance(scene: PathScene, rules: PathRules, context: PathContext, l
 
 
 @wp.func
-def init_path(first: Vertex, width: float) -> Path:
+def init_path(width: float) -> Path:
     """Start a path at the surface that the camera sees; `width` is its footprint's there [m]."""
     path = Path()
-    path.vertex = first
     path.width = width
     return path
 
 
 @wp.func
+def next_vertex(scene: PathScene, bodies: ViewBodies, rules: PathRules, context: PathContext, path: Path) -> Vertex:
+    """Build the vertex at the last hit of a path that goes on."""
+    return make_vertex(
+        scene, bodies, context.view, context.instances, path.hit, path.position, -path.direction, path.width, rules.min_roughness
+    )
+
+
+@wp.func
 def extend_path(
-    scene: PathScene, bodies: ViewBodies, rules: PathRules, context: PathContext, index: int, first_diffuse: wp.vec3, path: Path
+    scene: PathScene,
+    bodies: ViewBodies,
+    rules: PathRules,
+    context: PathContext,
+    index: int,
+    first_diffuse: wp.vec3,
+    path: Path,
+    vertex: Vertex,
 ) -> Path:
-    """Scatter path `index` once: add direct light at its last vertex, then move it to the next one or terminate it.
+    """Scatter path `index` once at its last `vertex`: add the direct light there, then move the path to the next hit or terminate it.
 
     `first_diffuse` is the diffuse colour of the path's first surface, which multiplies all its diffuse light in the end.
     """
@@ -259,19 +279,19 @@ def extend_path(
     result = path
     result.bounce = TERMINATED
     dimension = 1 + DIMENSIONS_PER_BOUNCE * bounce
-    direct = sample_direct_light(scene, bodies, rules, context, light, path.vertex, sample_point(context, index, dimension))
+    direct = sample_direct_light(scene, bodies, rules, context, light, vertex, sample_point(context, index, dimension))
     if wp.max(direct.radiance) > 0.0:
-        value = evaluate_brdf(scene.surfaces.albedo, path.vertex.brdf, direct.direction)
-        throughput = extend_throughput(path.throughput, value, path.vertex.brdf.diffuse, bounce)
+        value = evaluate_brdf(scene.surfaces.albedo, vertex.brdf, direct.direction)
+        throughput = extend_throughput(path.throughput, value, vertex.brdf.diffuse, bounce)
         result.radiance = add_light(result.radiance, throughput, direct.radiance, bounce)
 
     choice = sample_point(context, index, dimension + 2)
-    direction = sample_brdf(path.vertex.brdf, choice[0], sample_point(context, index, dimension + 1))
-    pdf = brdf_pdf(path.vertex.brdf, direction)
-    if pdf <= 0.0 or wp.dot(direction, path.vertex.face_normal) <= 0.0:
+    direction = sample_brdf(vertex.brdf, choice[0], sample_point(context, index, dimension + 1))
+    pdf = brdf_pdf(vertex.brdf, direction)
+    if pdf <= 0.0 or wp.dot(direction, vertex.face_normal) <= 0.0:
         return result
-    value = evaluate_brdf(scene.surfaces.albedo, path.vertex.brdf, direction)
-    throughput = extend_throughput(path.throughput, value, path.vertex.brdf.diffuse, bounce)
+    value = evaluate_brdf(scene.surfaces.albedo, vertex.brdf, direction)
+    throughput = extend_throughput(path.throughput, value, vertex.brdf.diffuse, bounce)
     scale = 1.0 / pdf
     if bounce >= rules.roulette:
         survival = wp.min(scale * wp.max(wp.cw_mul(first_diffuse, throughput.diffuse) + throughput.specular), MAX_SURVIVAL)
@@ -280,7 +300,7 @@ def extend_path(
         scale = scale / survival
     throughput.diffuse = throughput.diffuse * scale
     throughput.specular = throughput.specular * scale
-    hit = trace_ray(scene.meshes, scene.table, bodies, context.view, context.instances, path.vertex.origin, direction)
+    hit = trace_ray(scene.meshes, scene.table, bodies, context.view, context.instances, vertex.origin, direction)
     if hit.segment == Segment.NOTHING:
         radiance = escaped_radiance(scene, rules, context, light, direction, pdf)
         result.radiance = add_light(result.radiance, throughput, radiance, bounce)
@@ -288,11 +308,10 @@ def extend_path(
     if bounce + 1 == rules.bounces:
         return result
     result.throughput = throughput
-    result.width = path.width + FOOTPRINT_GROWTH * path.vertex.brdf.roughness * hit.depth
-    position = path.vertex.origin + hit.depth * direction
-    result.vertex = make_vertex(
-        scene, bodies, context.view, context.instances, hit, position, -direction, result.width, rules.min_roughness
-    )
+    result.width = path.width + FOOTPRINT_GROWTH * vertex.brdf.roughness * hit.depth
+    result.hit = hit
+    result.position = vertex.origin + hit.depth * direction
+    result.direction = direction
     result.bounce = bounce + 1
     return result
 
@@ -347,8 +366,10 @@ def trace_paths_kernel(
             width = footprint * hit.depth
             vertex = make_vertex(scene, bodies, view, views.instances, hit, start, -direction, width, 0.0)
             diffuse = vertex.brdf.diffuse
-            path = init_path(vertex, width)
+            path = init_path(width)
             while path.bounce != TERMINATED:
-                path = extend_path(scene, bodies, rules, context, index, diffuse, path)
+                if path.bounce > 0:
+                    vertex = next_vertex(scene, bodies, rules, context, path)
+                path = extend_path(scene, bodies, rules, context, index, diffuse, path, vertex)
             total += wp.cw_mul(diffuse, path.radiance.diffuse + path.radiance.indirect) + path.radiance.specular
     radiance_out[view, row, column] = total / float(rules.samples)

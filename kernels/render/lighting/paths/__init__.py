@@ -1,0 +1,1 @@
+"""Path tracing: the reference tracer, and the coarse path pass with its lists, queues and light."""

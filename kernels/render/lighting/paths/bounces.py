@@ -1,0 +1,72 @@
+"""Later bounces of the coarse path pass: extends the paths that `coarse` queued, see `queues`."""
+
+import warp as wp
+
+from synpick_warp.kernels.render.lighting.coarse_grid import CoarseGrid, flat_index, interleaved_pixel
+from synpick_warp.kernels.render.lighting.history import LightHistory
+from synpick_warp.kernels.render.lighting.paths.coarse import finish_pixel, make_context
+from synpick_warp.kernels.render.lighting.paths.light import CoarseLight, clamp_path, lamplit_radiance
+from synpick_warp.kernels.render.lighting.paths.lists import REGION_PIXELS
+from synpick_warp.kernels.render.lighting.paths.queues import (
+    QUEUE_CAPACITY,
+    PathQueues,
+    first_record,
+    queued_slot,
+    read_path,
+    requeue_path,
+)
+from synpick_warp.kernels.render.lighting.paths.tracing import TERMINATED, PathRules, PathScene, extend_path, next_vertex
+from synpick_warp.kernels.render.visibility.camera import Views
+from synpick_warp.kernels.render.visibility.gbuffer import ViewBodies
+from synpick_warp.kernels.tuning import SINGLE_PATH_REGISTERS
+
+wp.set_module_options({"enable_backward": False, "fast_math": True})
+
+
+@wp.kernel(cuda_max_registers=SINGLE_PATH_REGISTERS)
+def extend_queued_paths_kernel(
+    # Scene:
+    scene: PathScene,
+    coarse: CoarseGrid,
+    # State: worlds
+    episode: wp.array[int],  # (world)
+    light: wp.array[int],  # (world)
+    light_yaw: wp.array[float],  # (world) [rad]
+    # In:
+    bodies: ViewBodies,
+    views: Views,
+    rules: PathRules,
+    stage: int,
+    first: int,
+    # Out:
+    queues_inout: PathQueues,
+    history_inout: LightHistory,
+    coarse_light_out: CoarseLight,
+):
+    """Extend the paths in the queues of a stage by one bounce.
+
+    A path that ends completes its coarse pixel, as in `trace_coarse_paths_kernel`; others are queued for the next stage.
+    """
+    index = wp.tid() + first
+    rank = index % QUEUE_CAPACITY
+    regions = queues_inout.count.shape[1]
+    region = (index // QUEUE_CAPACITY) % regions
+    view = index // (QUEUE_CAPACITY * regions)
+    slot = queued_slot(queues_inout, view, region, stage, rank)
+    if slot < 0:
+        return
+    path, pixel = read_path(queues_inout, first_record(queues_inout, view, region, slot))
+    view, row, column = interleaved_pixel(coarse, (view * regions + region) * REGION_PIXELS + pixel.offset)
+    world = views.world[view]
+    context = make_context(scene, coarse, rules, views, view, row, column, episode[world], light[world], light_yaw[world])
+    vertex = next_vertex(scene, bodies, rules, context, path)
+    path = extend_path(scene, bodies, rules, context, pixel.number, pixel.diffuse, path, vertex)
+    if path.bounce == TERMINATED:
+        lamplit = lamplit_radiance(scene.lights, context.light)
+        radiance = clamp_path(path.radiance, pixel.unoccluded, lamplit, pixel.specular_limit, rules.firefly_clamp)
+        cell = flat_index(coarse.grid, view, row, column)
+        history = world * history_inout.cameras + views.camera[view]
+        exposure = scene.lights.exposure[context.light]
+        finish_pixel(coarse_light_out, history_inout, exposure, cell, history, row, column, pixel, radiance, 1)
+    else:
+        requeue_path(queues_inout, view, region, stage + 1, slot, path, pixel)

@@ -1,0 +1,343 @@
+"""Coarse path pass: few paths per coarse pixel, and the unoccluded light that they are compared with (ratio estimator).
+
+Next to the light that paths find, the kernel stores what the surface would reflect of the unoccluded environment map, which needs no ray.
+Their ratio, the visibility ratio, varies slowly over a surface even where it bends or its colour changes. So the denoiser filters the
+ratio, and each pixel multiplies it by its own unoccluded light (after Heitz, Hill and McGuire, 2018).
+"""
+
+import warp as wp
+
+from synpick_warp.codes import Segment, Stream
+from synpick_warp.kernels.render.lighting.brdf import SplitRadiance
+from synpick_warp.kernels.render.lighting.coarse_grid import (
+    CoarseGrid,
+    Guide,
+    flat_index,
+    interleaved_pixel,
+    morton_index,
+)
+from synpick_warp.kernels.render.lighting.history import (
+    LightHistory,
+    accumulate,
+    history_frame,
+    path_number,
+    scale_light,
+)
+from synpick_warp.kernels.render.lighting.paths.light import CoarseLight, clamp_path, lamplit_radiance, limit_specular, store_light
+from synpick_warp.kernels.render.lighting.paths.lists import REGION_PIXELS, PathLists, listed_pixel
+from synpick_warp.kernels.render.lighting.paths.queues import PathPixel, PathQueues, queue_path
+from synpick_warp.kernels.render.lighting.paths.surface import coarse_surface, write_guide
+from synpick_warp.kernels.render.lighting.paths.tracing import (
+    TERMINATED,
+    PathContext,
+    PathRules,
+    PathScene,
+    Vertex,
+    extend_path,
+    init_path,
+    make_vertex,
+    next_vertex,
+)
+from synpick_warp.kernels.render.lighting.unoccluded import unoccluded_light
+from synpick_warp.kernels.render.visibility.camera import Cameras, Views, in_image
+from synpick_warp.kernels.render.visibility.gbuffer import GBuffer, ViewBodies
+from synpick_warp.kernels.render.visibility.records import write_record
+from synpick_warp.kernels.rng import stream_key
+from synpick_warp.kernels.tuning import COARSE_PATH_REGISTERS, SINGLE_PATH_REGISTERS
+
+wp.set_module_options({"enable_backward": False, "fast_math": True})
+
+SEQUENCE_PERIOD = wp.constant(16)
+"""Tile width of the sampler [coarse pixels]: the pixels of a tile share one Sobol' sequence, dealt out by Morton index, so that every
+aligned power-of-two sub-tile holds a contiguous, well-stratified part of it."""
+SHIFT_RANGE = wp.constant(1.0)
+"""Range of the Cranley-Patterson rotation of the first dimension over the image: a slow gradient keeps neighbouring pixels stratified
+within a filter kernel, and a range of 1 leaves the image's mean unbiased."""
+
+
+@wp.func
+def make_context(
+    scene: PathScene,
+    coarse: CoarseGrid,
+    rules: PathRules,
+    views: Views,
+    view: int,
+    row: int,
+    column: int,
+    episode: int,
+    light: int,
+    yaw: float,
+) -> PathContext:
+    """Path-tracing context of a coarse pixel: stream of random numbers, rotation and map of the environment.
+
+    All images of an episode use one stream; see `first_path_index`. The first surface is lit by the map without its lamps: row `light` +
+    number of maps of `Lights.radiance`. `yaw` is in radians.
+    """
+    context = PathContext()
+    context.view = view
+    context.instances = views.instances
+    context.light = light
+    context.first_light = light + scene.lights.maps
+    context.yaw = yaw
+    context.key = stream_key(rules.seed, episode, 0, Stream.PATHS)
+    context.shift = wp.vec2(SHIFT_RANGE * float(row) / float(coarse.grid.height), SHIFT_RANGE * float(column) / float(coarse.grid.width))
+    return context
+
+
+@wp.func
+def average_paths(
+    scene: PathScene,
+    bodies: ViewBodies,
+    rules: PathRules,
+    context: PathContext,
+    samples: int,
+    first: Vertex,
+    width: float,
+    pixel: PathPixel,
+) -> SplitRadiance:
+    """Monte Carlo mean of the reflected light over `samples` paths of a coarse pixel.
+
+    The paths start at the vertex `first`, and are `width` [m] wide there.
+    """
+    sum = SplitRadiance()
+    lamplit = lamplit_radiance(scene.lights, context.light)
+    # One loop over all bounces of all paths: a thread whose path ends early starts the next while others of its warp go on.
+    sample = int(0)
+    path = init_path(width)
+    while sample < samples:
+        vertex = first
+        if path.bounce > 0:
+            vertex = next_vertex(scene, bodies, rules, context, path)
+        path = extend_path(scene, bodies, rules, context, pixel.number + sample, pixel.diffuse, path, vertex)
+        if path.bounce == TERMINATED:
+            light = clamp_path(path.radiance, pixel.unoccluded, lamplit, pixel.specular_limit, rules.firefly_clamp)
+            sum.diffuse += light.diffuse
+            sum.indirect += light.indirect
+            sum.specular += light.specular
+            path = init_path(width)
+            sample += 1
+    return scale_light(sum, 1.0 / float(samples))
+
+
+@wp.func
+def first_path_index(samples: int, row: int, column: int, number: int, has_history: bool) -> int:
+    """Sobol' index of a coarse pixel's first path, in the sequence of its tile of SEQUENCE_PERIOD² coarse pixels.
+
+    A coarse pixel without a history takes its first `samples` points. One with a history takes a point, which `number` selects, see
+    `path_number`, behind the `samples` points with which a history may have begun.
+    """
+    index = morton_index(SEQUENCE_PERIOD, row, column)
+    if has_history:
+        return index + SEQUENCE_PERIOD * SEQUENCE_PERIOD * (samples + number)
+    return index * samples
+
+
+@wp.func
+def new_paths(rules: PathRules, history: LightHistory, slot: int, known: int) -> int:
+    """Number of paths that a coarse pixel traces, with `known` usable paths in its history.
+
+    One with a usable history; otherwise `rules.samples`, in the first frame of an episode `rules.first_samples`, since all histories begin
+    there and most persist.
+    """
+    if known > 0:
+        return 1
+    if history.max_paths > 0:
+        if history.frame[slot] == 0:
+            return rules.first_samples
+    return rules.samples
+
+
+@wp.func
+def finish_pixel(
+    out: CoarseLight,
+    history: LightHistory,
+    exposure: float,
+    cell: int,
+    slot: int,
+    row: int,
+    column: int,
+    pixel: PathPixel,
+    paths: SplitRadiance,
+    samples: int,
+):
+    """Blend the mean light of `samples` new paths into a coarse pixel's history, and write the result by the pixel's `flat_index`."""
+    mean = accumulate(history, slot, row, column, pixel.segment, scale_light(paths, exposure), pixel.known, samples)
+    store_light(out, cell, mean, scale_light(pixel.unoccluded, exposure))
+
+
+@wp.func
+def make_path_pixel(
+    scene: PathScene, rules: PathRules, context: PathContext, vertex: Vertex, index: int, segment: int, known: int, number: int
+) -> PathPixel:
+    """Build the `PathPixel` of a thread `index` in interleaved order, whose surface is `vertex`; other parameters as there."""
+    lamplit = lamplit_radiance(scene.lights, context.light)
+    pixel = PathPixel()
+    pixel.offset = index % REGION_PIXELS
+    pixel.segment = segment
+    pixel.known = known
+    pixel.number = number
+    pixel.diffuse = vertex.brdf.diffuse
+    pixel.unoccluded = unoccluded_light(scene.lights, context.light, context.yaw, vertex.brdf)
+    pixel.specular_limit = limit_specular(vertex.brdf, pixel.unoccluded, lamplit, rules.firefly_clamp)
+    return pixel
+
+
+@wp.func
+def trace_pixel(
+    scene: PathScene,
+    cameras: Cameras,
+    coarse: CoarseGrid,
+    episode: wp.array[int],
+    light: wp.array[int],
+    light_yaw: wp.array[float],
+    bodies: ViewBodies,
+    gbuffer: GBuffer,
+    views: Views,
+    lists: PathLists,
+    rules: PathRules,
+    thread: int,
+    queues: PathQueues,
+    history: LightHistory,
+    guide_out: Guide,
+    coarse_light_out: CoarseLight,
+    queued: bool,
+):
+    """Trace the paths of the coarse pixel of a `thread`, if it is for this kernel: single paths are queued where there are queues.
+
+    Kernels pass a constant `queued`, so that the compiler removes the other case.
+    """
+    regions = queues.count.shape[1]
+    index = thread
+    known, bits = int(0), int(0)
+    if history.max_paths > 0:
+        index, known, bits = listed_pixel(lists, index)
+        if index < 0:
+            return
+    view, row, column = interleaved_pixel(coarse, index)
+    if not in_image(coarse.grid, row, column):
+        return
+    camera, world = views.camera[view], views.world[view]
+    slot = world * history.cameras + camera
+    samples = new_paths(rules, history, slot, known)
+    if queued != (samples == 1 and regions > 0):
+        return
+    cell = flat_index(coarse.grid, view, row, column)
+    surface = coarse_surface(cameras, coarse, gbuffer, view, camera, row, column)
+    if surface.hit.segment == Segment.NOTHING:
+        write_record(guide_out.surface, cell, wp.vec4())
+        return
+    vertex = make_vertex(scene, bodies, view, views.instances, surface.hit, surface.position, surface.outgoing, surface.width, 0.0)
+    write_guide(guide_out, cameras.to_world[camera], cell, surface.hit, vertex.brdf.normal)
+    context = make_context(scene, coarse, rules, views, view, row, column, episode[world], light[world], light_yaw[world])
+    frame = history_frame(history, slot, known)
+    number = first_path_index(wp.where(known > 0, rules.first_samples, samples), row, column, path_number(frame, bits), known > 0)
+    pixel = make_path_pixel(scene, rules, context, vertex, index, surface.hit.segment, known, number)
+    paths = SplitRadiance()
+    if queued:
+        path = extend_path(scene, bodies, rules, context, pixel.number, pixel.diffuse, init_path(surface.width), vertex)
+        if path.bounce != TERMINATED:
+            queue_path(queues, view, (index // REGION_PIXELS) % regions, path, pixel)
+            return
+        lamplit = lamplit_radiance(scene.lights, context.light)
+        paths = clamp_path(path.radiance, pixel.unoccluded, lamplit, pixel.specular_limit, rules.firefly_clamp)
+    else:
+        paths = average_paths(scene, bodies, rules, context, samples, vertex, surface.width, pixel)
+    finish_pixel(coarse_light_out, history, scene.lights.exposure[context.light], cell, slot, row, column, pixel, paths, samples)
+
+
+@wp.kernel(cuda_max_registers=COARSE_PATH_REGISTERS)
+def trace_coarse_paths_kernel(
+    # Scene:
+    scene: PathScene,
+    cameras: Cameras,
+    coarse: CoarseGrid,
+    # State: worlds
+    episode: wp.array[int],  # (world)
+    light: wp.array[int],  # (world)
+    light_yaw: wp.array[float],  # (world) [rad]
+    # In:
+    bodies: ViewBodies,
+    gbuffer: GBuffer,
+    views: Views,
+    lists: PathLists,
+    rules: PathRules,
+    first: int,
+    # Out:
+    queues_inout: PathQueues,
+    history_inout: LightHistory,
+    guide_out: Guide,
+    coarse_light_out: CoarseLight,
+):
+    """Trace paths from the middle pixel of each coarse pixel: their mean light and the unoccluded light, and the guide image.
+
+    With a history only those in `lists` do, as many paths as `new_paths` says; the path of a coarse pixel with a usable history is
+    blended into it. The lamps' direct light is left out, see `shadows`. Where there are queues, coarse pixels with a single path are left
+    to `start_paths_kernel`.
+    """
+    trace_pixel(
+        scene,
+        cameras,
+        coarse,
+        episode,
+        light,
+        light_yaw,
+        bodies,
+        gbuffer,
+        views,
+        lists,
+        rules,
+        wp.tid() + first,
+        queues_inout,
+        history_inout,
+        guide_out,
+        coarse_light_out,
+        False,
+    )
+
+
+@wp.kernel(cuda_max_registers=SINGLE_PATH_REGISTERS)
+def start_paths_kernel(
+    # Scene:
+    scene: PathScene,
+    cameras: Cameras,
+    coarse: CoarseGrid,
+    # State: worlds
+    episode: wp.array[int],  # (world)
+    light: wp.array[int],  # (world)
+    light_yaw: wp.array[float],  # (world) [rad]
+    # In:
+    bodies: ViewBodies,
+    gbuffer: GBuffer,
+    views: Views,
+    lists: PathLists,
+    rules: PathRules,
+    first: int,
+    # Out:
+    queues_inout: PathQueues,
+    history_inout: LightHistory,
+    guide_out: Guide,
+    coarse_light_out: CoarseLight,
+):
+    """Trace the first bounce of the path of each coarse pixel that has a single one, as in `trace_coarse_paths_kernel`.
+
+    Paths that go on are queued for `extend_queued_paths_kernel`.
+    """
+    trace_pixel(
+        scene,
+        cameras,
+        coarse,
+        episode,
+        light,
+        light_yaw,
+        bodies,
+        gbuffer,
+        views,
+        lists,
+        rules,
+        wp.tid() + first,
+        queues_inout,
+        history_inout,
+        guide_out,
+        coarse_light_out,
+        True,
+    )

@@ -1,0 +1,158 @@
+"""Path queues of the coarse path pass: stream compaction between bounces, as in wavefront path tracing (Laine, Karras and Aila, 2013).
+
+Half of the paths end at their first bounce, and threads whose path has ended would wait for the others of their warp. So paths that go on
+are queued, and another kernel extends them with full warps. Each region of `lists` has a queue of its own, so that neighbours in a
+queue are neighbours in the image, and few threads contend for a counter.
+"""
+
+import warp as wp
+
+from synpick_warp.kernels.render.lighting.brdf import SplitRadiance
+from synpick_warp.kernels.render.lighting.paths.lists import REGION_PIXELS
+from synpick_warp.kernels.render.lighting.paths.tracing import Path
+from synpick_warp.kernels.render.visibility.records import read_record, write_record
+
+wp.set_module_options({"enable_backward": False})
+
+QUEUE_CAPACITY = REGION_PIXELS
+"""Paths that a region's queue holds: one from each coarse pixel. At full HD a view's queues take 22 MB."""
+PATH_RECORDS = wp.constant(10)
+"""Number of 16-byte records of a queued path; see `write_path`."""
+_SEGMENT_BITS = wp.constant(8)
+"""Bits of a segmentation id."""
+_KNOWN_BITS = wp.constant(8)
+"""Bits for the paths of a history, see `LightHistory.paths`."""
+
+
+@wp.struct
+class PathQueues:
+    """Queues of the paths that go on after a bounce. Scratch."""
+
+    count: wp.array3d[int]
+    """(view, region, stage): paths that were queued after bounce 1 + stage."""
+    slot: wp.array4d[wp.uint16]
+    """(view, region, parity, rank): slots of the paths that were queued for the even and the odd stages."""
+    record: wp.array3d[wp.vec4]
+    """(view, region, path_record): records of the paths, packed by `write_path`; record k of all slots, then record k + 1."""
+
+
+@wp.struct
+class PathPixel:
+    """Coarse pixel of a path: what completes it once the path has ended."""
+
+    offset: int
+    """Place in its region, in interleaved order."""
+    segment: int
+    """Segmentation id of its surface."""
+    known: int
+    """Usable paths of its history."""
+    number: int
+    """Sobol' index of the path; of the first one, if it has several."""
+    diffuse: wp.vec3
+    """Diffuse colour of its surface."""
+    unoccluded: SplitRadiance
+    """Unoccluded light that its surface reflects."""
+    specular_limit: float
+    """Firefly clamp of its specular light: limit of the largest channel."""
+
+
+@wp.func
+def first_record(queues: PathQueues, view: int, region: int, slot: int) -> int:
+    """Flat index of a slot's first record; the next ones follow at a distance of QUEUE_CAPACITY."""
+    return (view * queues.count.shape[1] + region) * (PATH_RECORDS * QUEUE_CAPACITY) + slot
+
+
+@wp.func
+def record_of(values: wp.vec3, last: float) -> wp.vec4:
+    """Record of a vector and one more value."""
+    return wp.vec4(values[0], values[1], values[2], last)
+
+
+@wp.func
+def vector_of(record: wp.vec4) -> wp.vec3:
+    """Vector of a record of `record_of`."""
+    return wp.vec3(record[0], record[1], record[2])
+
+
+@wp.func
+def write_path(queues: PathQueues, first: int, path: Path, pixel: PathPixel):
+    """Pack a path and its coarse pixel into records, from flat index `first` on; integers as bits."""
+    segments = (((path.bounce << _SEGMENT_BITS) | path.hit.segment) << _SEGMENT_BITS) | pixel.segment
+    place = (pixel.offset << _KNOWN_BITS) | pixel.known
+    b = path.hit.barycentric
+    light = pixel.unoccluded
+    write_record(queues.record, first, record_of(path.position, path.width))
+    write_record(queues.record, first + QUEUE_CAPACITY, record_of(path.direction, wp.cast(path.hit.triangle, float)))
+    write_record(queues.record, first + 2 * QUEUE_CAPACITY, wp.vec4(b[0], b[1], wp.cast(segments, float), wp.cast(place, float)))
+    write_record(queues.record, first + 3 * QUEUE_CAPACITY, record_of(path.throughput.diffuse, wp.cast(pixel.number, float)))
+    write_record(queues.record, first + 4 * QUEUE_CAPACITY, record_of(path.throughput.specular, pixel.specular_limit))
+    write_record(queues.record, first + 5 * QUEUE_CAPACITY, record_of(path.radiance.diffuse, light.diffuse[0]))
+    write_record(queues.record, first + 6 * QUEUE_CAPACITY, record_of(path.radiance.specular, light.diffuse[1]))
+    write_record(queues.record, first + 7 * QUEUE_CAPACITY, record_of(path.radiance.indirect, light.diffuse[2]))
+    write_record(queues.record, first + 8 * QUEUE_CAPACITY, record_of(pixel.diffuse, light.specular[0]))
+    write_record(queues.record, first + 9 * QUEUE_CAPACITY, wp.vec4(light.specular[1], light.specular[2], 0.0, 0.0))
+
+
+@wp.func
+def read_path(queues: PathQueues, first: int) -> tuple[Path, PathPixel]:
+    """Unpack the records of `write_path`."""
+    origin = read_record(queues.record, first)
+    ray = read_record(queues.record, first + QUEUE_CAPACITY)
+    hit = read_record(queues.record, first + 2 * QUEUE_CAPACITY)
+    diffuse = read_record(queues.record, first + 3 * QUEUE_CAPACITY)
+    specular = read_record(queues.record, first + 4 * QUEUE_CAPACITY)
+    direct_light = read_record(queues.record, first + 5 * QUEUE_CAPACITY)
+    specular_light = read_record(queues.record, first + 6 * QUEUE_CAPACITY)
+    indirect_light = read_record(queues.record, first + 7 * QUEUE_CAPACITY)
+    surface = read_record(queues.record, first + 8 * QUEUE_CAPACITY)
+    rest = read_record(queues.record, first + 9 * QUEUE_CAPACITY)
+    segments = wp.cast(hit[2], int)
+    place = wp.cast(hit[3], int)
+    segment_mask = (1 << _SEGMENT_BITS) - 1
+    path = Path()
+    path.position = vector_of(origin)
+    path.width = origin[3]
+    path.direction = vector_of(ray)
+    path.hit.triangle = wp.cast(ray[3], int)
+    path.hit.barycentric = wp.vec2(hit[0], hit[1])
+    path.hit.segment = (segments >> _SEGMENT_BITS) & segment_mask
+    path.bounce = segments >> (2 * _SEGMENT_BITS)
+    path.throughput.diffuse = vector_of(diffuse)
+    path.throughput.specular = vector_of(specular)
+    path.radiance.diffuse = vector_of(direct_light)
+    path.radiance.specular = vector_of(specular_light)
+    path.radiance.indirect = vector_of(indirect_light)
+    pixel = PathPixel()
+    pixel.offset = place >> _KNOWN_BITS
+    pixel.segment = segments & segment_mask
+    pixel.known = place & ((1 << _KNOWN_BITS) - 1)
+    pixel.number = wp.cast(diffuse[3], int)
+    pixel.diffuse = vector_of(surface)
+    pixel.unoccluded.diffuse = wp.vec3(direct_light[3], specular_light[3], indirect_light[3])
+    pixel.unoccluded.specular = wp.vec3(surface[3], rest[0], rest[1])
+    pixel.specular_limit = specular[3]
+    return path, pixel
+
+
+@wp.func
+def queue_path(queues: PathQueues, view: int, region: int, path: Path, pixel: PathPixel):
+    """Queue a path after its first bounce. Which slot it gets may vary; its light does not depend on it."""
+    slot = wp.atomic_add(queues.count, view, region, 0, 1)
+    queues.slot[view, region, 0, slot] = wp.uint16(slot)
+    write_path(queues, first_record(queues, view, region, slot), path, pixel)
+
+
+@wp.func
+def requeue_path(queues: PathQueues, view: int, region: int, stage: int, slot: int, path: Path, pixel: PathPixel):
+    """Queue a path for a later `stage`; it stays in its slot."""
+    rank = wp.atomic_add(queues.count, view, region, stage, 1)
+    queues.slot[view, region, stage % 2, rank] = wp.uint16(slot)
+    write_path(queues, first_record(queues, view, region, slot), path, pixel)
+
+
+@wp.func
+def queued_slot(queues: PathQueues, view: int, region: int, stage: int, rank: int) -> int:
+    """Slot of the path of a `rank` in a stage's queue; -1: none."""
+    if rank >= queues.count[view, region, stage]:
+        return -1
+    return int(queues.slot[view, region, stage % 2, rank])

@@ -1,0 +1,74 @@
+"""Temporal reuse: light of the coarse pixels that trace no path in a frame, and lists of those that do."""
+
+import warp as wp
+
+from synpick_warp.codes import Segment
+from synpick_warp.kernels.render.lighting.coarse_grid import CoarseGrid, Guide, flat_index, interleaved_pixel
+from synpick_warp.kernels.render.lighting.history import (
+    LightHistory,
+    MovingBodies,
+    lag_limit,
+    read_history,
+    scale_light,
+    update_frame,
+    usable_paths,
+)
+from synpick_warp.kernels.render.lighting.paths.light import CoarseLight, store_light
+from synpick_warp.kernels.render.lighting.paths.lists import PathLists, append_pixel
+from synpick_warp.kernels.render.lighting.paths.surface import coarse_surface, write_guide
+from synpick_warp.kernels.render.lighting.paths.tracing import PathScene, make_vertex
+from synpick_warp.kernels.render.lighting.unoccluded import unoccluded_light
+from synpick_warp.kernels.render.visibility.camera import Cameras, Views, in_image
+from synpick_warp.kernels.render.visibility.gbuffer import GBuffer, ViewBodies
+from synpick_warp.kernels.render.visibility.records import write_record
+from synpick_warp.kernels.tuning import RAY_REGISTERS
+
+wp.set_module_options({"enable_backward": False, "fast_math": True})
+
+
+@wp.kernel(cuda_max_registers=RAY_REGISTERS)
+def reuse_histories_kernel(
+    # Scene:
+    scene: PathScene,
+    cameras: Cameras,
+    coarse: CoarseGrid,
+    # State: worlds
+    light: wp.array[int],  # (world)
+    light_yaw: wp.array[float],  # (world) [rad]
+    # In:
+    bodies: ViewBodies,
+    gbuffer: GBuffer,
+    views: Views,
+    moving: MovingBodies,
+    history: LightHistory,
+    first: int,
+    # Out:
+    lists_inout: PathLists,
+    guide_out: Guide,
+    coarse_light_out: CoarseLight,
+):
+    """Temporal reuse: the history's light for coarse pixels that trace no path in this frame, see `period_bits`; the others are listed.
+
+    Of coarse pixels that are listed nothing is written.
+    """
+    index = wp.tid() + first
+    view, row, column = interleaved_pixel(coarse, index)
+    if not in_image(coarse.grid, row, column):
+        return
+    cell = flat_index(coarse.grid, view, row, column)
+    camera, world = views.camera[view], views.world[view]
+    surface = coarse_surface(cameras, coarse, gbuffer, view, camera, row, column)
+    if surface.hit.segment == Segment.NOTHING:
+        write_record(guide_out.surface, cell, wp.vec4())
+        return
+    limit = lag_limit(scene.meshes, history, moving, views, view, row, column, surface.hit.segment, surface.position)
+    slot = world * history.cameras + camera
+    known, bits = usable_paths(history, slot, row, column, limit)
+    if bits == 0 or update_frame(row, column, bits) == history.frame[slot] % (1 << bits):
+        append_pixel(lists_inout, view, index, known, bits)
+        return
+    vertex = make_vertex(scene, bodies, view, views.instances, surface.hit, surface.position, surface.outgoing, surface.width, 0.0)
+    unoccluded = unoccluded_light(scene.lights, light[world], light_yaw[world], vertex.brdf)
+    exposure = scene.lights.exposure[light[world]]
+    store_light(coarse_light_out, cell, read_history(history, slot, row, column), scale_light(unoccluded, exposure))
+    write_guide(guide_out, cameras.to_world[camera], cell, surface.hit, vertex.brdf.normal)
