@@ -107,7 +107,7 @@ class LightTable:
 
 def name_lights(names: list[str], lights: Any) -> LightTable:
     """Build the table of environment maps from their names and the struct `Lights`."""
-    return LightTable(np.array(names), lights.lamp_direction.numpy()[:, 0].astype(np.float32))
+    return LightTable(np.array(names), lights.lamp.numpy()[:, 0, 0, :3].astype(np.float32))
 
 
 class TickReader:

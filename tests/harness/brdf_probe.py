@@ -3,7 +3,15 @@
 import numpy as np
 import warp as wp
 
-from synpick_warp.kernels.render.lighting.brdf import AlbedoTables, brdf_pdf, evaluate_brdf, evaluate_disc, make_brdf, sample_brdf
+from synpick_warp.kernels.render.lighting.brdf import (
+    AlbedoTables,
+    brdf_pdf,
+    evaluate_brdf,
+    evaluate_disc,
+    make_brdf,
+    sample_brdf,
+    view_factors,
+)
 from synpick_warp.kernels.render.lighting.sampling import (
     EnvironmentCdf,
     environment_pdf,
@@ -54,7 +62,8 @@ def evaluate_disc_kernel(
 ):
     """Mean of BRDF times cosine over disc lights about `center`; normal +z."""
     i = wp.tid()
-    value_out[i] = evaluate_disc(tables, make_brdf(tables, base, metallic, roughness, UP, outgoing), center[i], radius)
+    brdf = make_brdf(tables, base, metallic, roughness, UP, outgoing)
+    value_out[i] = evaluate_disc(tables, brdf, view_factors(brdf), center[i], radius)
 
 
 @wp.kernel

@@ -280,24 +280,40 @@ def measure_angles(brdf: Brdf, incoming: wp.vec3) -> Angles:
     return angles
 
 
+@wp.struct
+class ViewFactors:
+    """Factors of the BRDF that depend on the view direction alone: several lights share them."""
+
+    smith: float
+    """`smith_term` of the view direction."""
+    multi_scatter: float
+    """(1 - E(μ_o)) / (π (1 - Ē))."""
+    diffuse: float
+    """(1 - E_d(μ_o)) / (π (1 - Ē_d))."""
+
+
 @wp.func
-def evaluate_lobes(tables: AlbedoTables, brdf: Brdf, angles: Angles, distribution: float) -> BrdfValue:
+def view_factors(brdf: Brdf) -> ViewFactors:
+    """Factors of a BRDF for its view direction."""
+    factors = ViewFactors()
+    factors.smith = smith_term(wp.dot(brdf.outgoing, brdf.normal), brdf.alpha)
+    lost = wp.max(1.0 - brdf.mean_albedo[0] - brdf.mean_albedo[1], MIN_LOST_ALBEDO)
+    factors.multi_scatter = (1.0 - brdf.albedo[0] - brdf.albedo[1]) / (wp.PI * lost)
+    factors.diffuse = (1.0 - coat_albedo(brdf, brdf.albedo)) / (wp.PI * (1.0 - coat_albedo(brdf, brdf.mean_albedo)))
+    return factors
+
+
+@wp.func
+def evaluate_lobes(tables: AlbedoTables, brdf: Brdf, view: ViewFactors, angles: Angles, distribution: float) -> BrdfValue:
     """Both lobes for light and view directions at these `angles`; `distribution` is D at the half vector."""
     value = BrdfValue()
     one = wp.vec3(1.0, 1.0, 1.0)
     fresnel = brdf.f0 + schlick_weight(angles.difference) * (one - brdf.f0)
-    masking = 2.0 / (smith_term(angles.incoming, brdf.alpha) + smith_term(angles.outgoing, brdf.alpha))
-    single = distribution * masking / (4.0 * wp.max(angles.outgoing, MIN_COSINE)) * fresnel
-
+    smith = smith_term(angles.incoming, brdf.alpha) + view.smith
     albedo = directional_albedo(tables, brdf.roughness, angles.incoming)
-    lost = (
-        (1.0 - albedo[0] - albedo[1])
-        * (1.0 - brdf.albedo[0] - brdf.albedo[1])
-        / wp.max(1.0 - brdf.mean_albedo[0] - brdf.mean_albedo[1], MIN_LOST_ALBEDO)
-    )
-    transmitted = (1.0 - coat_albedo(brdf, albedo)) * (1.0 - coat_albedo(brdf, brdf.albedo)) / (1.0 - coat_albedo(brdf, brdf.mean_albedo))
-    value.specular = single + (angles.incoming / wp.PI * lost) * brdf.multi_scatter
-    value.diffuse = angles.incoming / wp.PI * transmitted
+    multi_scatter = angles.incoming * (1.0 - albedo[0] - albedo[1]) * view.multi_scatter
+    value.specular = distribution / (2.0 * smith * wp.max(angles.outgoing, MIN_COSINE)) * fresnel + multi_scatter * brdf.multi_scatter
+    value.diffuse = angles.incoming * (1.0 - coat_albedo(brdf, albedo)) * view.diffuse
     return value
 
 
@@ -307,16 +323,16 @@ def evaluate_brdf(tables: AlbedoTables, brdf: Brdf, incoming: wp.vec3) -> BrdfVa
     angles = measure_angles(brdf, incoming)
     if angles.incoming <= 0.0 or angles.outgoing <= 0.0:
         return BrdfValue()
-    return evaluate_lobes(tables, brdf, angles, ggx_distribution(angles.half_way, angles.squared_sine, brdf.alpha))
+    return evaluate_lobes(tables, brdf, view_factors(brdf), angles, ggx_distribution(angles.half_way, angles.squared_sine, brdf.alpha))
 
 
 @wp.func
-def evaluate_disc(tables: AlbedoTables, brdf: Brdf, center: wp.vec3, radius: float) -> wp.vec3:
+def evaluate_disc(tables: AlbedoTables, brdf: Brdf, view: ViewFactors, center: wp.vec3, radius: float) -> wp.vec3:
     """Evaluate the BRDF times cosine, averaged over a disc light (a lamp) about `center`.
 
-    `radius` is the tangent of the light's angular radius, and small. The half vectors of a disc light fill an ellipse in slope space,
-    approximated by a disc of the same area: in sharp highlights of wide lamps at cosines below 0.5 the middle is too bright and the sides
-    are too dark.
+    `view` is that of `view_factors`; `radius` is the tangent of the light's angular radius, and small. The half vectors of a disc light
+    fill an ellipse in slope space, approximated by a disc of the same area: in sharp highlights of wide lamps at cosines below 0.5 the
+    middle is too bright and the sides are too dark.
     """
     angles = measure_angles(brdf, center)
     if angles.incoming <= 0.0 or angles.outgoing <= 0.0:
@@ -324,7 +340,8 @@ def evaluate_disc(tables: AlbedoTables, brdf: Brdf, center: wp.vec3, radius: flo
     # A half vector rotates by half the angle in the plane of both directions, by more across it; slopes change by more than angles do.
     cube = angles.half_way * angles.half_way * angles.half_way
     slopes = 0.5 * radius / wp.sqrt(wp.max(angles.difference * cube, MIN_COSINE))
-    value = evaluate_lobes(tables, brdf, angles, ggx_disc_distribution(angles.half_way, angles.squared_sine, brdf.alpha, slopes))
+    distribution = ggx_disc_distribution(angles.half_way, angles.squared_sine, brdf.alpha, slopes)
+    value = evaluate_lobes(tables, brdf, view, angles, distribution)
     return value.specular + value.diffuse * brdf.diffuse
 
 

@@ -35,18 +35,14 @@ class Lights:
     """(map, coefficient): irradiance without the lamps as nine real spherical harmonics, already convolved with the cosine."""
     lamps: wp.array[int]
     """(map): number of lamps, at most MAX_LAMPS."""
-    lamp_direction: wp.array2d[wp.vec3]
-    """(map, lamp): unit vector towards the lamp's center."""
-    lamp_irradiance: wp.array2d[wp.vec3]
-    """(map, lamp): irradiance of the lamp on a surface that faces it."""
-    lamp_radius: wp.array2d[float]
-    """(map, lamp): tangent of the lamp's angular radius."""
+    lamp: wp.array3d[wp.vec4]
+    """(map, lamp, 2): unit vector towards the lamp's center and tangent of its angular radius; irradiance on a surface that faces it."""
     lamp_point: wp.array3d[wp.vec3]
     """(map, lamp, point): unit vectors towards parts of the lamp of equal irradiance; see `scenes.lamps.stratify_light`."""
     lamp_rays: wp.array[int]
     """(map): shadow rays to each lamp from a pixel of the shadow grid, a power of two; with all lamps at most MAX_LAMPS."""
     total_lamp_irradiance: wp.array[wp.vec3]
-    """(map): sum of `lamp_irradiance`; zero: the map has no lamps."""
+    """(map): sum of the lamps' irradiances; zero: the map has no lamps."""
     exposure: wp.array[float]
     """(map): factor that brings the map's radiance to display range."""
 
@@ -69,6 +65,26 @@ def rotate_heading(direction: wp.vec3, heading: wp.vec2) -> wp.vec3:
 def rotate_z(direction: wp.vec3, angle: float) -> wp.vec3:
     """`direction`, rotated counter-clockwise about +z by `angle` [rad]."""
     return rotate_heading(direction, unit_heading(angle))
+
+
+@wp.func
+def lamp_center(lights: Lights, light: int, lamp: int) -> wp.vec4:
+    """Unit vector towards a lamp's center, in the map's frame, and the tangent of its angular radius."""
+    return read_record(lights.lamp, 2 * (light * MAX_LAMPS + lamp))
+
+
+@wp.func
+def lamp_irradiance(lights: Lights, light: int, lamp: int) -> wp.vec3:
+    """Irradiance of a lamp on a surface that faces it."""
+    record = read_record(lights.lamp, 2 * (light * MAX_LAMPS + lamp) + 1)
+    return wp.vec3(record[0], record[1], record[2])
+
+
+@wp.func
+def lamp_direction(lights: Lights, light: int, lamp: int, heading: wp.vec2) -> wp.vec3:
+    """Unit vector towards a lamp's center, in the world; `heading` is the `unit_heading` of the map's yaw."""
+    center = lamp_center(lights, light, lamp)
+    return rotate_heading(wp.vec3(center[0], center[1], center[2]), heading)
 
 
 @wp.func

@@ -38,6 +38,9 @@ class MovingBodies:
     lower: wp.array2d[wp.vec3]
     upper: wp.array2d[wp.vec3]
     """(view, rank): axis-aligned box in the world around each moving body, where it is and where it was [m]."""
+    all_lower: wp.array[wp.vec3]
+    all_upper: wp.array[wp.vec3]
+    """(view): box around these boxes [m]."""
 
 
 @wp.func
@@ -80,6 +83,32 @@ def world_box(meshes: Meshes, mesh: int, pose: wp.transformf) -> tuple[wp.vec3, 
     return center - reach, center + reach
 
 
+@wp.func
+def list_moving_body(
+    meshes: Meshes,
+    moving: MovingBodies,
+    view: int,
+    rank: int,
+    mesh: int,
+    last_mesh: int,
+    now: wp.transformf,
+    then: wp.transformf,
+    change: float,
+):
+    """Write a moving body: its mesh (-1: absent) and pose, both in this and in the previous frame, and its `change`."""
+    moving.mesh[view, rank] = wp.where(mesh >= 0, mesh, last_mesh)
+    moving.to_body[view, rank] = wp.transform_inverse(wp.where(mesh >= 0, now, then))
+    moving.change[view, rank] = change
+    lower, upper = world_box(meshes, mesh, now)
+    last_lower, last_upper = world_box(meshes, last_mesh, then)
+    lower = wp.min(lower, last_lower)
+    upper = wp.max(upper, last_upper)
+    moving.lower[view, rank] = lower
+    moving.upper[view, rank] = upper
+    moving.all_lower[view] = wp.min(moving.all_lower[view], lower)
+    moving.all_upper[view] = wp.max(moving.all_upper[view], upper)
+
+
 @wp.kernel
 def find_moving_bodies_kernel(
     # Scene:
@@ -105,6 +134,8 @@ def find_moving_bodies_kernel(
         return
     world = views.world[view]
     count = int(0)
+    moving_inout.all_lower[view] = wp.vec3(FAR, FAR, FAR)
+    moving_inout.all_upper[view] = wp.vec3(-FAR, -FAR, -FAR)
     for body in range(bodies):
         mesh = int(-1)
         last_mesh = int(-1)
@@ -129,12 +160,6 @@ def find_moving_bodies_kernel(
             drift_frames = int(MAX_DRIFT / wp.max(displacement, MAX_DRIFT / float(MAX_FRAMES)))
         moving_inout.drift_frames[view, body] = drift_frames
         if change > 0.0:
-            moving_inout.mesh[view, count] = wp.where(mesh >= 0, mesh, last_mesh)
-            moving_inout.to_body[view, count] = wp.transform_inverse(wp.where(mesh >= 0, now, then))
-            moving_inout.change[view, count] = change
-            lower, upper = world_box(meshes, mesh, now)
-            last_lower, last_upper = world_box(meshes, last_mesh, then)
-            moving_inout.lower[view, count] = wp.min(lower, last_lower)
-            moving_inout.upper[view, count] = wp.max(upper, last_upper)
+            list_moving_body(meshes, moving_inout, view, count, mesh, last_mesh, now, then, change)
             count += 1
     moving_inout.count[view] = count

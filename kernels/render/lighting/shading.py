@@ -7,9 +7,17 @@ triangle a pixel. The light is gathered once, and silhouettes are left to anti-a
 import warp as wp
 
 from synpick_warp.codes import Segment
-from synpick_warp.kernels.render.lighting.brdf import AlbedoTables, Brdf, evaluate_disc, make_brdf
+from synpick_warp.kernels.render.lighting.brdf import AlbedoTables, Brdf, evaluate_disc, make_brdf, view_factors
 from synpick_warp.kernels.render.lighting.coarse_grid import CoarseGrid
-from synpick_warp.kernels.render.lighting.environment import Lights, environment_radiance, rotate_heading, rotate_z, unit_heading
+from synpick_warp.kernels.render.lighting.environment import (
+    Lights,
+    environment_radiance,
+    lamp_center,
+    lamp_direction,
+    lamp_irradiance,
+    rotate_z,
+    unit_heading,
+)
 from synpick_warp.kernels.render.lighting.materials import (
     Surface,
     interpolate_surface,
@@ -69,13 +77,14 @@ def lamp_light(
     if visible == wp.uint64(0):
         return result
     heading = unit_heading(yaw)
+    view = view_factors(brdf)
     for lamp in range(lights.lamps[light]):
         fraction = byte_of(visible, lamp)
         if fraction > 0:
-            direction = rotate_heading(lights.lamp_direction[light, lamp], heading)
+            direction = lamp_direction(lights, light, lamp, heading)
             if wp.dot(face_normal, direction) > 0.0:
-                reflected = evaluate_disc(tables, brdf, direction, lights.lamp_radius[light, lamp])
-                result += (float(fraction) / 255.0) * wp.cw_mul(reflected, lights.lamp_irradiance[light, lamp])
+                reflected = evaluate_disc(tables, brdf, view, direction, lamp_center(lights, light, lamp)[3])
+                result += (float(fraction) / 255.0) * wp.cw_mul(reflected, lamp_irradiance(lights, light, lamp))
     return result
 
 

@@ -9,7 +9,7 @@ import warp as wp
 
 from synpick_warp.codes import Segment
 from synpick_warp.kernels.render.lighting.coarse_grid import PLANE_TOLERANCE, CoarseGrid, flat_index, middle_pixel, morton_index
-from synpick_warp.kernels.render.lighting.environment import Lights, rotate_heading, unit_heading
+from synpick_warp.kernels.render.lighting.environment import Lights, lamp_direction, rotate_heading, unit_heading
 from synpick_warp.kernels.render.lighting.history import LightHistory
 from synpick_warp.kernels.render.lighting.moving_bodies import MovingBodies
 from synpick_warp.kernels.render.lighting.plane_distance import plane_distance, tangent_plane
@@ -157,10 +157,13 @@ def meets_box(origin: wp.vec3, inverse: wp.vec3, lower: wp.vec3, upper: wp.vec3)
 
 @wp.func
 def may_change(moving: MovingBodies, view: int, origin: wp.vec3, direction: wp.vec3) -> bool:
-    """Whether a moving body may block a ray now, or may have blocked it in the previous frame: by their bounding boxes."""
+    """Whether a moving body may block a ray now, or may have blocked it in the previous frame: by their bounding boxes, and first by the
+    box around all of them, so there must be one."""
     inverse = wp.vec3()
     for i in range(3):
         inverse[i] = 1.0 / wp.where(wp.abs(direction[i]) < MIN_DIRECTION, MIN_DIRECTION, direction[i])
+    if not meets_box(origin, inverse, moving.all_lower[view], moving.all_upper[view]):
+        return False
     for rank in range(moving.count[view]):
         if meets_box(origin, inverse, moving.lower[view, rank], moving.upper[view, rank]):
             return True
@@ -185,7 +188,7 @@ def is_calm(moving: MovingBodies, view: int, segment: int, instances: int) -> bo
 @wp.func
 def faces_lamp(lights: Lights, which: int, heading: wp.vec2, ray: int, normal: wp.vec3) -> bool:
     """Whether the center of a shadow ray's lamp lies before a surface of unit `normal`."""
-    return wp.dot(normal, rotate_heading(lights.lamp_direction[which, ray // lights.lamp_rays[which]], heading)) > 0.0
+    return wp.dot(normal, lamp_direction(lights, which, ray // lights.lamp_rays[which], heading)) > 0.0
 
 
 @wp.func

@@ -85,7 +85,11 @@ LIGHT_HISTORY = struct_arrays(
     frame=("world_camera",),
 )
 MOVING_BODIES = struct_arrays(
-    MovingBodies, "view", "body", holds=("view",), count=("view",), units={"to_body": "m", "lower": "m", "upper": "m"}
+    MovingBodies,
+    "view",
+    "body",
+    **dict.fromkeys(("holds", "count", "all_lower", "all_upper"), ("view",)),
+    units=dict.fromkeys(("to_body", "lower", "upper", "all_lower", "all_upper"), "m"),
 )
 PATH_LISTS = struct_arrays(PathLists, "view", "region", "rank", count=("view", "region", "path_kind"))
 PATH_QUEUES = struct_arrays(

@@ -247,12 +247,12 @@ def build_lights(
     lights.prefiltered = wp.array(np.stack([pack_half3_array(exposure * t.exposure * t.prefiltered) for t in tables]), device=device)
     lights.irradiance = wp.array(np.stack([t.irradiance for t in tables]), dtype=wp.vec3, device=device)
     lights.lamps = wp.array([len(t.lamps) for t in tables], dtype=wp.int32, device=device)
-    lights.lamp_direction = wp.array(lamp_table(tables, "direction", 3), dtype=wp.vec3, device=device)
-    lights.lamp_irradiance = wp.array(lamp_table(tables, "irradiance", 3), dtype=wp.vec3, device=device)
-    lights.lamp_radius = wp.array(lamp_table(tables, "radius_tangent"), dtype=wp.float32, device=device)
+    direction, irradiance = (lamp_table(tables, name, 3) for name in ("direction", "irradiance"))
+    centers = np.concatenate([direction, lamp_table(tables, "radius_tangent", 1)], axis=-1)
+    lights.lamp = wp.array(np.stack([centers, np.pad(irradiance, [(0, 0)] * 2 + [(0, 1)])], axis=2), dtype=wp.vec4, device=device)
     lights.lamp_point = wp.array(lamp_table(tables, "points", int(LAMP_POINTS), 3), dtype=wp.vec3, device=device)
     lights.lamp_rays = wp.array([rays_per_lamp(len(t.lamps)) for t in tables], dtype=wp.int32, device=device)
-    lights.total_lamp_irradiance = wp.array(lamp_table(tables, "irradiance", 3).sum(axis=1), dtype=wp.vec3, device=device)
+    lights.total_lamp_irradiance = wp.array(irradiance.sum(axis=1), dtype=wp.vec3, device=device)
     lights.exposure = wp.array([exposure * t.exposure for t in tables], dtype=wp.float32, device=device)
     return lights
 
