@@ -289,7 +289,7 @@ def _images(config: Config, device: wp.Device, written: bool = True) -> Iterator
         scratch = views | scratch_sizes(config.render, width, height, histories)
         groups += [(kind, scratch, copies) for kind, copies in DENOISED_SCRATCH]
         groups += [(MOVING_BODIES, views, 1)]
-        groups += [(PATH_QUEUES, views | queue_sizes(config.render, width, height, histories, device), 1)]
+        groups += [(PATH_QUEUES, queue_sizes(config.render, width, height, views["view"], histories, device), 1)]
         sizes = history_sizes(config.render, width, height, histories)
         yield _term("light averaged over frames", _HISTORY, [(LIGHT_HISTORY, sizes, 1)])
     if written and _host_images(config, device).jpeg_quality:

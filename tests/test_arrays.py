@@ -18,7 +18,6 @@ from synpick_warp.stages.perception.plan import CYCLES, VoteArrays
 from synpick_warp.stages.render.annotate import BORDER_BOXES
 from synpick_warp.stages.render.denoised import (
     COARSE_LIGHT,
-    FIRST_FRAME_PATHS,
     GUIDE,
     LAMP_SHADOWS,
     LIGHT_HISTORY,
@@ -28,14 +27,13 @@ from synpick_warp.stages.render.denoised import (
     RATIO_IMAGES,
     FootprintLists,
     ShadowRays,
-    first_frame_paths,
-    paths_per_coarse_pixel,
     scratch_sizes,
 )
 from synpick_warp.stages.render.layers import BODY_MOTIONS
 from synpick_warp.stages.render.mask_runs import BoundaryBuffers, BoundaryScratch
 from synpick_warp.stages.render.raster import VISIBILITY_BUFFER
 from synpick_warp.stages.render.renderer import SHADED_IMAGE
+from synpick_warp.stages.render.sampling_rates import FIRST_FRAME_PATHS, first_frame_paths, paths_per_coarse_pixel
 from synpick_warp.stages.render.view_setup import GBUFFER, VIEW_BODIES, VIEWS
 from synpick_warp.stages.sim.physics import MIN_GPU_WORLDS
 from synpick_warp.stages.sim.worlds import AttemptState, SealState, WorldState, WorldStatus
@@ -48,7 +46,7 @@ NAMES = (
     "image field boundary cell_row cell_column shadow_row shadow_column chunk chunk_footprint block "
     "world_camera view_instance one slot slot_word group depth_byte "
     "sample_row sample_block quad interval lane byte region rank path_kind record"
-    " queue_region queue_stage stage_parity queue_slot path_record"
+    " queue_view queue_region queue_stage stage_parity queue_slot path_record"
 )
 WORLDS = MIN_GPU_WORLDS + 1
 SIZES = {name: 2 + number for number, name in enumerate(NAMES.split())}

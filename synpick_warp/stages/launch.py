@@ -65,19 +65,22 @@ def launch_pixels(kernel: wp.Kernel, pixels: int, inputs: list[Any], outputs: li
         pass
 
 
-def launch_views(kernel: wp.Kernel, views: int, threads: int, inputs: list[Any], outputs: list[Any], device: wp.Device) -> None:
-    """Launch a kernel over `threads` threads for each view; threads of one view may write the same elements by atomic operations.
+def launch_views(
+    kernel: wp.Kernel, views: int, threads: int, inputs: list[Any], outputs: list[Any], device: wp.Device, first_view: int = 0
+) -> None:
+    """Launch a kernel over `threads` threads for each of `views` views from `first_view` on.
 
-    The kernel's last input is the index of the first thread. On the CPU, where Warp's atomic operations are not atomic, the threads of a
-    view run sequentially, and views in parallel.
+    Threads of one view may write the same elements by atomic operations. The kernel's last input is the index of the first thread. On the
+    CPU, where Warp's atomic operations are not atomic, the threads of a view run sequentially, and views in parallel.
     """
     if device.is_cuda:
-        wp.launch(kernel, dim=views * threads, inputs=[*inputs, 0], outputs=outputs, device=device, block_dim=PIXEL_BLOCK)
+        first = first_view * threads
+        wp.launch(kernel, dim=views * threads, inputs=[*inputs, first], outputs=outputs, device=device, block_dim=PIXEL_BLOCK)
         return
     kernel.module.load(device, 1)
 
     def launch_view(view: int) -> None:
         wp.launch(kernel, dim=threads, inputs=[*inputs, view * threads], outputs=outputs, device=device)
 
-    for _ in _pool().map(launch_view, range(views)):
+    for _ in _pool().map(launch_view, range(first_view, first_view + views)):
         pass

@@ -12,7 +12,7 @@ from typing import Any
 import warp as wp
 
 from synpick_warp.arrays import allocate, allocate_struct, device_array, struct_arrays
-from synpick_warp.configs.schema import UNOCCLUDED, Render
+from synpick_warp.configs.schema import Render
 from synpick_warp.kernels.render.images.antialias import CHUNK_TILES, find_footprints_kernel, resolve_footprints_kernel
 from synpick_warp.kernels.render.lighting.coarse_grid import CoarseGrid, Guide
 from synpick_warp.kernels.render.lighting.denoise import choose_widths_kernel, filter_blocks_kernel, smooth_ratios_kernel
@@ -32,26 +32,24 @@ from synpick_warp.kernels.render.lighting.shading import shade_kernel, shade_sam
 from synpick_warp.kernels.render.lighting.shadows import LAMP_POINTS, LampShadows, filter_shadows_kernel, trace_shadow_rays_kernel
 from synpick_warp.kernels.render.lighting.upsampling import RatioImages
 from synpick_warp.kernels.render.visibility.camera import TILE_PIXELS
-from synpick_warp.kernels.tuning import CPU_FOOTPRINT_THREADS, FOOTPRINT_THREADS, LANE_COLUMNS, LANE_STRIDE, PIXEL_BLOCK, VIEW_BLOCK
+from synpick_warp.kernels.tuning import CPU_FOOTPRINT_THREADS, FOOTPRINT_THREADS, PIXEL_BLOCK, VIEW_BLOCK
 from synpick_warp.stages.buffers import FIXTURES, Snapshot
 from synpick_warp.stages.launch import launch_pixels, launch_views
 from synpick_warp.stages.render.reference import make_path_rules
+from synpick_warp.stages.render.sampling_rates import (
+    accumulates,
+    coarse_size,
+    coverage_rays,
+    first_frame_paths,
+    interleaved_threads,
+    paths_per_coarse_pixel,
+    shadow_size,
+    supersamples,
+    traces_paths,
+)
 from synpick_warp.stages.render.scene import RenderScene, build_grid
 from synpick_warp.stages.timing import scope
 
-MIN_COARSE_COLUMNS = 384
-"""Default size of coarse pixels: an image's width has at least this many, and fewer than twice as many. At full HD they are 1.9 mm wide at
-the bottom of the tote. In narrower images coarse pixels are pixels."""
-MIN_HISTORY_COLUMNS = 480
-"""The same where histories accumulate: most coarse pixels then trace no path in a frame, so they may be narrower, with a path each. At full
-HD, 4 px and one path had 35.3 dB, 5 px and two paths 34.5 dB (mean of the frames 0, 8 and 30 of a pick; tools/README.md, "Pictures")."""
-MAX_COLUMNS_TWO_PATHS = 480
-"""Default number of paths: two per coarse pixel if an image's width has at most this many, else one. At 640x360, where coarse pixels are
-pixels, ten piles have a PSNR of 32.5 dB with one path and 33.6 dB with two, in 1.5 times the time."""
-FIRST_FRAME_PATHS = 32
-"""Default number of paths per coarse pixel in the first frame of an episode. They initialize all light histories at their default maximum
-length, so that the following frames trace fewer paths. Frame 8 gains 2 dB in PSNR at 480x270, 1.6 dB at full HD (tools/README.md,
-"Pictures")."""
 SINGLE_PATH_VARIANCE_SCALE = 2.0
 """Variance multiplier at one path per coarse pixel, where the sample variance underestimates bright small sources: few paths hit them, and
 those that do would look like a change of the light (on ten piles, 1 is 0.2 dB worse; 1.5 and 3 are nearly as good)."""
@@ -68,9 +66,10 @@ surfaces that lamps light is added to the limit. The light cut off is a bias: in
 ROULETTE = 1
 """First bounce with Russian roulette: few paths are long, since many neighbours share them."""
 
-COVERAGE_RAYS, NARROW_COVERAGE_RAYS = 4, 16
-"""Number of coverage rays per anti-aliased pixel: in wide images, and in narrow images, whose shading is supersampled. On an H200, 16
-instead of 4 rays take 0.055 ms per view at 480x270 and improve PSNR by 0.2 dB; at full HD, 8 instead of 4 rays take 0.072 ms."""
+
+QUEUE_VIEWS = 32
+"""Views with path queues, which take some 22 MB a view; those of a larger batch take turns. With 8 views at a time, a launch waits for its
+longest path on a nearly idle GPU, and queues gain nothing (tools/README.md, "Path queues")."""
 
 GUIDE = struct_arrays(Guide, "view", "cell_row", "cell_column")
 COARSE_LIGHT = struct_arrays(CoarseLight, "view", "cell_row", "cell_column")
@@ -94,11 +93,11 @@ MOVING_BODIES = struct_arrays(
 PATH_LISTS = struct_arrays(PathLists, "view", "region", "rank", count=("view", "region", "path_kind"))
 PATH_QUEUES = struct_arrays(
     PathQueues,
-    "view",
+    "queue_view",
     "queue_region",
-    count=("view", "queue_region", "queue_stage"),
-    slot=("view", "queue_region", "stage_parity", "queue_slot"),
-    record=("view", "queue_region", "path_record"),
+    count=("queue_view", "queue_region", "queue_stage"),
+    slot=("queue_view", "queue_region", "stage_parity", "queue_slot"),
+    record=("queue_view", "queue_region", "path_record"),
 )
 RATIO_IMAGES = struct_arrays(RatioImages, "view", "cell_row", "cell_column")
 
@@ -133,58 +132,6 @@ DENOISED_SCRATCH = (
 """Arrays that `DenoisedRenderer` allocates, and how many of each."""
 
 
-def coarse_size(render: Render, width: int, histories: int = 0) -> int:
-    """Width of a coarse pixel [px] in images of `width` px; `histories` as in `DenoisedRenderer`."""
-    columns = MIN_HISTORY_COLUMNS if accumulates(render, histories) else MIN_COARSE_COLUMNS
-    return render.coarse_pixel or max(1, width // columns)
-
-
-def shadow_size(size: int) -> int:
-    """Width of a pixel of the shadow grid [px], whose coarse pixels are `size` px wide: three quarters of it.
-
-    At full HD 3 px are as good as 2, with less than half of the rays; 4 px are 0.2 to 0.3 dB worse.
-    """
-    return max(1, 3 * size // 4)
-
-
-def traces_paths(render: Render) -> bool:
-    """Whether coarse paths are traced; otherwise all environment light is unoccluded."""
-    return render.mode != UNOCCLUDED
-
-
-def accumulates(render: Render, histories: int) -> bool:
-    """Whether light is accumulated over frames (temporal accumulation); `histories` as in `DenoisedRenderer`."""
-    return bool(histories and render.history) and traces_paths(render)
-
-
-def paths_per_coarse_pixel(render: Render, width: int, histories: int = 0) -> int:
-    """Number of paths per coarse pixel in images of `width` px: 1 if coarse pixels are narrower because of histories."""
-    size = coarse_size(render, width, histories)
-    few = size < coarse_size(render, width) or width > MAX_COLUMNS_TWO_PATHS * size
-    return render.coarse_paths or (1 if few else 2)
-
-
-def first_frame_paths(render: Render, width: int, histories: int = 0) -> int:
-    """Number of paths per coarse pixel in the first frame of an episode, which initializes all light histories."""
-    paths = paths_per_coarse_pixel(render, width, histories)
-    if render.coarse_paths or not accumulates(render, histories):
-        return paths
-    return max(paths, min(FIRST_FRAME_PATHS, render.history))
-
-
-def supersamples(render: Render, width: int, histories: int = 0) -> bool:
-    """Whether shading is supersampled: only in narrow images, in which a coarse pixel is one pixel.
-
-    A pixel then covers much detail of textures and normals. Four samples gain 0.2 to 0.5 dB in PSNR (tools/README.md, "Pictures").
-    """
-    return traces_paths(render) and coarse_size(render, width, histories) == 1
-
-
-def coverage_rays(render: Render, width: int, histories: int = 0) -> int:
-    """Number of coverage rays per anti-aliased pixel in images of `width` px; `histories` as in `DenoisedRenderer`."""
-    return NARROW_COVERAGE_RAYS if supersamples(render, width, histories) else COVERAGE_RAYS
-
-
 def scratch_sizes(render: Render, width: int, height: int, histories: int = 0) -> dict[str, int]:
     """Extents of the dimensions of `DENOISED_SCRATCH` other than the view, for images of `width` x `height` px."""
     size = coarse_size(render, width, histories)
@@ -204,12 +151,17 @@ def scratch_sizes(render: Render, width: int, height: int, histories: int = 0) -
     }
 
 
-def queue_sizes(render: Render, width: int, height: int, histories: int, device: wp.Device) -> dict[str, int]:
-    """Extents of the dimensions of `PATH_QUEUES` other than the view. There are none on a CPU, whose threads wait for no others."""
-    queues = device.is_cuda and traces_paths(render)
+def queue_sizes(render: Render, width: int, height: int, views: int, histories: int, device: wp.Device) -> dict[str, int]:
+    """Extents of the dimensions of `PATH_QUEUES`, for at most `views` views of a batch.
+
+    There are no queues on a CPU, which has no warps, and where all coarse pixels trace several paths.
+    """
+    single = accumulates(render, histories) or paths_per_coarse_pixel(render, width, histories) == 1
     size = coarse_size(render, width, histories)
+    regions = interleaved_threads(-(-width // size), -(-height // size)) // int(REGION_PIXELS)
     return {
-        "queue_region": interleaved_threads(-(-width // size), -(-height // size)) // int(REGION_PIXELS) if queues else 0,
+        "queue_view": min(views, QUEUE_VIEWS),
+        "queue_region": regions if device.is_cuda and traces_paths(render) and single else 0,
         "queue_stage": max(1, render.bounces - 1),
         "stage_parity": 2,
         "queue_slot": int(QUEUE_CAPACITY),
@@ -236,12 +188,6 @@ def build_coarse_grid(image: Any, size: int, window: int = 1, period: int = 1) -
 def footprint_grid(width: int, height: int) -> Any:
     """The struct `ImageGrid` of AA footprints, with the halves of footprints at the image border."""
     return build_grid(width + 1, height + 1)
-
-
-def interleaved_threads(columns: int, rows: int) -> int:
-    """Threads per view of a kernel in interleaved order, over `columns` x `rows` coarse pixels; see `interleaved_pixel`."""
-    across, down = int(LANE_STRIDE) * int(LANE_COLUMNS), int(LANE_STRIDE) * int(TILE_PIXELS) // int(LANE_COLUMNS)
-    return -(-columns // across) * -(-rows // down) * across * down
 
 
 class DenoisedRenderer:
@@ -278,8 +224,8 @@ class DenoisedRenderer:
         self.moving = allocate_struct(MOVING_BODIES, {"view": views, "body": instances + len(FIXTURES)}, scene.device)
         self.guide = allocate_struct(GUIDE, sizes, scene.device)
         self.path_lists = allocate_struct(PATH_LISTS, sizes, scene.device)
-        queues = queue_sizes(render, scene.width, scene.height, histories, scene.device)
-        self.queues = allocate_struct(PATH_QUEUES, {"view": views} | queues, scene.device)
+        queues = queue_sizes(render, scene.width, scene.height, views, histories, scene.device)
+        self.queues = allocate_struct(PATH_QUEUES, queues, scene.device)
         self.coarse_light, self.blocks = (allocate_struct(COARSE_LIGHT, sizes, scene.device) for _ in range(2))
         self.chosen, self.ratios = (allocate_struct(RATIO_IMAGES, sizes, scene.device) for _ in range(2))
         self.shadow_rays = allocate(ShadowRays, sizes, scene.device)
@@ -332,24 +278,30 @@ class DenoisedRenderer:
         scene, threads = self.scene, interleaved_threads(self.coarse.grid.width, self.coarse.grid.height)
         if self.history.max_paths > 0:
             self.path_lists.count.zero_()
-            inputs = [scene.paths, scene.cameras, self.coarse, snapshot.light, snapshot.light_yaw]
-            inputs += [bodies, gbuffer, views, self.moving, self.history]
-            outputs = [self.path_lists, self.guide, self.coarse_light]
+            inputs = [scene.paths, scene.cameras, self.coarse, snapshot.light, snapshot.light_yaw, bodies, gbuffer, views, self.moving]
+            outputs = [self.history, self.path_lists, self.guide, self.coarse_light]
             launch_views(reuse_histories_kernel, views.count, threads, inputs, outputs, scene.device)
         worlds = [snapshot.episode, snapshot.light, snapshot.light_yaw]
         inputs = [scene.paths, scene.cameras, self.coarse, *worlds, bodies, gbuffer, views, self.path_lists, self.rules]
         outputs = [self.queues, self.history, self.guide, self.coarse_light]
-        regions = self.queues.count.shape[1]
-        if regions == 0:
+        if self.queues.count.shape[1] == 0:
             launch_pixels(trace_coarse_paths_kernel, views.count * threads, inputs, outputs, scene.device)
             return
-        self.queues.count.zero_()
         launch_views(trace_coarse_paths_kernel, views.count, threads, inputs, outputs, scene.device)
-        launch_views(start_paths_kernel, views.count, threads, inputs, outputs, scene.device)
-        inputs = [scene.paths, self.coarse, *worlds, bodies, views, self.rules]
+        turn = self.queues.count.shape[0]
+        for first_view in range(0, views.count, turn):
+            count = min(views.count - first_view, turn)
+            self.queues.count.zero_()
+            launch_views(start_paths_kernel, count, threads, inputs, outputs, scene.device, first_view)
+            self.extend_queued_paths(worlds, bodies, views, first_view, count)
+
+    def extend_queued_paths(self, worlds: list[wp.array], bodies: Any, views: Any, first_view: int, count: int) -> None:
+        """Later bounces of the queued paths of `count` views from `first_view` on, one launch a bounce."""
+        threads = self.queues.count.shape[1] * int(QUEUE_CAPACITY)
         outputs = [self.queues, self.history, self.coarse_light]
         for stage in range(self.rules.bounces - 1):
-            launch_views(extend_queued_paths_kernel, views.count, regions * int(QUEUE_CAPACITY), [*inputs, stage], outputs, scene.device)
+            inputs = [self.scene.paths, self.coarse, *worlds, bodies, views, self.rules, stage]
+            launch_views(extend_queued_paths_kernel, count, threads, inputs, outputs, self.scene.device, first_view)
 
     def denoise(self, views: Any) -> None:
         """Filter visibility ratios: block means, choice of the kernel's width, smoothing."""

@@ -13,7 +13,7 @@ from synpick_warp.configs.schema import FAST, REFERENCE, Config
 from synpick_warp.kernels.render.images.antialias import sample_offset
 from synpick_warp.scenes.assets.appearance import srgb_to_linear
 from synpick_warp.scenes.types import Material, TriangleMesh
-from synpick_warp.stages.render.denoised import COVERAGE_RAYS, NARROW_COVERAGE_RAYS
+from synpick_warp.stages.render.sampling_rates import COVERAGE_RAYS, NARROW_COVERAGE_RAYS
 from tests.worlds.toy_scene import UPRIGHT, RenderedViews, ToyScene, box, camera, entry, even_light, render, sheet, sun
 
 VIEW = camera(48, 40, 200.0, (0.0, 0.0, 2.0))

@@ -9,7 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from synpick_warp.kernels.render.lighting.paths.coarse import SEQUENCE_PERIOD
-from synpick_warp.stages.render.denoised import build_coarse_grid, interleaved_threads
+from synpick_warp.stages.render.denoised import build_coarse_grid
+from synpick_warp.stages.render.sampling_rates import interleaved_threads
 from synpick_warp.stages.render.scene import build_grid
 from tests.harness.denoise_probe import count_visits_kernel, morton_kernel
 from tests.harness.devices import default_device

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import warp as wp
 
+from synpick_warp.codes import Segment
 from synpick_warp.configs.schema import FAST, REFERENCE, Config
 from synpick_warp.factory.assembly import make_renderer
 from synpick_warp.kernels.render.lighting.history import LIGHT_CHANGE, MAX_PERIOD_BITS, MAX_TRAVEL, LightHistory
@@ -90,6 +91,18 @@ def test_a_still_scene_is_remembered_up_to_the_limit(renderer, device):
     assert counts[:2] == [[1], [2]]
     assert [counts[frame - 1][0] for frame in (2 + 2, 2 + 2 * 2, 2 + 2 * 2 + 4 * 4)] == [3, 4, 8]
     assert counts[FILLED:] == [[PATHS]] * 4
+
+
+def test_history_ends_where_nothing_is_visible(renderer, device):
+    """The sheet disappears: what returns to its pixels later, even slowly, begins a new history."""
+    gone = toy()
+    gone.placed[0].pop(0)
+    frames = show(renderer, [(0, toy()), (1, gone)], device)
+    segments = [renderer.shading.history.segment.numpy()[0].copy() for _ in frames]  # type: ignore[union-attr]
+    assert (segments[0] == 1).mean() > 0.5
+    background = renderer.shading.guide.surface.numpy()[0, ..., 3] == Segment.NOTHING  # type: ignore[union-attr]
+    assert background.mean() > 0.5
+    assert (segments[1][background] == Segment.NOTHING).all()
 
 
 @pytest.mark.parametrize(

@@ -97,7 +97,7 @@ def average_paths(
 ) -> SplitRadiance:
     """Monte Carlo mean of the reflected light over `samples` paths of a coarse pixel.
 
-    The paths start at the vertex `first`, and are `width` [m] wide there.
+    The paths start at the vertex `first`; `width` is their footprint there [m].
     """
     sum = SplitRadiance()
     lamplit = lamplit_radiance(scene.lights, context.light)
@@ -169,7 +169,10 @@ def finish_pixel(
 def make_path_pixel(
     scene: PathScene, rules: PathRules, context: PathContext, vertex: Vertex, index: int, segment: int, known: int, number: int
 ) -> PathPixel:
-    """Build the `PathPixel` of a thread `index` in interleaved order, whose surface is `vertex`; other parameters as there."""
+    """Build the `PathPixel` of the coarse pixel with `index` in interleaved order.
+
+    `vertex` is its surface, with a segmentation id, `known` the usable paths of its history, `number` the Sobol' index of its first path.
+    """
     lamplit = lamplit_radiance(scene.lights, context.light)
     pixel = PathPixel()
     pixel.offset = index % REGION_PIXELS
@@ -202,9 +205,9 @@ def trace_pixel(
     coarse_light_out: CoarseLight,
     queued: bool,
 ):
-    """Trace the paths of the coarse pixel of a `thread`, if it is for this kernel: single paths are queued where there are queues.
+    """Trace the paths of a thread's coarse pixel, if it belongs to this kernel.
 
-    Kernels pass a constant `queued`, so that the compiler removes the other case.
+    With `queued`, those with one path do, if there are queues; else all others. A constant, so that the compiler removes the other case.
     """
     regions = queues.count.shape[1]
     index = thread
@@ -229,8 +232,8 @@ def trace_pixel(
     vertex = make_vertex(scene, bodies, view, views.instances, surface.hit, surface.position, surface.outgoing, surface.width, 0.0)
     write_guide(guide_out, cameras.to_world[camera], cell, surface.hit, vertex.brdf.normal)
     context = make_context(scene, coarse, rules, views, view, row, column, episode[world], light[world], light_yaw[world])
-    frame = history_frame(history, slot, known)
-    number = first_path_index(wp.where(known > 0, rules.first_samples, samples), row, column, path_number(frame, bits), known > 0)
+    beginning = wp.where(known > 0, rules.first_samples, samples)
+    number = first_path_index(beginning, row, column, path_number(history_frame(history, slot, known), bits), known > 0)
     pixel = make_path_pixel(scene, rules, context, vertex, index, surface.hit.segment, known, number)
     paths = SplitRadiance()
     if queued:
@@ -270,7 +273,7 @@ def trace_coarse_paths_kernel(
 ):
     """Trace paths from the middle pixel of each coarse pixel: their mean light and the unoccluded light, and the guide image.
 
-    With a history only those in `lists` do, as many paths as `new_paths` says; the path of a coarse pixel with a usable history is
+    With a history only those in `lists` are traced, with `new_paths` paths each; the path of a coarse pixel with a usable history is
     blended into it. The lamps' direct light is left out, see `shadows`. Where there are queues, coarse pixels with a single path are left
     to `start_paths_kernel`.
     """

@@ -41,8 +41,11 @@ def clamp_light(light: wp.vec3, limit: float) -> wp.vec3:
 def clamp_path(
     radiance: SplitRadiance, unoccluded: SplitRadiance, lamplit: wp.vec3, specular_limit: float, firefly_clamp: float
 ) -> SplitRadiance:
-    """Firefly clamp: a path counts with at most `firefly_clamp` times the unoccluded light; indirect light with `lamplit_radiance` more,
-    because the unoccluded light lacks the lamps. `specular_limit` is that of `limit_specular`."""
+    """Firefly clamp: a path counts with at most `firefly_clamp` times the unoccluded light.
+
+    The limit of indirect light is higher by `lamplit` (see `lamplit_radiance`), since the unoccluded light excludes the lamps.
+    `specular_limit` is that of `limit_specular`.
+    """
     result = SplitRadiance()
     result.diffuse = clamp_light(radiance.diffuse, wp.max(firefly_clamp * unoccluded.diffuse))
     result.indirect = clamp_light(radiance.indirect, wp.max(firefly_clamp * unoccluded.diffuse + lamplit))

@@ -15,7 +15,7 @@ REGION_PIXELS = wp.constant(int(LANE_STRIDE) * int(LANE_STRIDE) * int(TILE_PIXEL
 """Coarse pixels of a region."""
 FRESH, AGED = wp.constant(0), wp.constant(1)
 """Kinds of listed coarse pixels: without a usable history (`PathRules.samples` paths each), and with one (one path each)."""
-_KNOWN_BITS = wp.constant(8)
+KNOWN_BITS = wp.constant(8)
 """Bits of an entry for the paths of a history: `LightHistory.paths` is 8 bits wide."""
 _PERIOD_BITS = wp.constant(2)
 """Bits of an entry for `period_bits`, which is at most 3."""
@@ -34,14 +34,14 @@ class PathLists:
 @wp.func
 def pack_entry(offset: int, known: int, bits: int) -> int:
     """Entry of a coarse pixel: its place in the region, and `usable_paths` of its history."""
-    return (((offset << _KNOWN_BITS) | known) << _PERIOD_BITS) | bits
+    return (((offset << KNOWN_BITS) | known) << _PERIOD_BITS) | bits
 
 
 @wp.func
 def unpack_entry(entry: int) -> tuple[int, int, int]:
     """(offset, known, bits) of `pack_entry`."""
-    offset = entry >> (_KNOWN_BITS + _PERIOD_BITS)
-    known = (entry >> _PERIOD_BITS) & ((1 << _KNOWN_BITS) - 1)
+    offset = entry >> (KNOWN_BITS + _PERIOD_BITS)
+    known = (entry >> _PERIOD_BITS) & ((1 << KNOWN_BITS) - 1)
     return offset, known, entry & ((1 << _PERIOD_BITS) - 1)
 
 

@@ -1,27 +1,25 @@
 """Path queues of the coarse path pass: stream compaction between bounces, as in wavefront path tracing (Laine, Karras and Aila, 2013).
 
-Half of the paths end at their first bounce, and threads whose path has ended would wait for the others of their warp. So paths that go on
-are queued, and another kernel extends them with full warps. Each region of `lists` has a queue of its own, so that neighbours in a
-queue are neighbours in the image, and few threads contend for a counter.
+Half of the paths end at their first bounce, which leaves the threads of a warp without work. The others are compacted into queues, and
+another kernel extends them by a bounce with full warps. Each region of `lists` has a queue of its own, so that neighbours in a queue are
+neighbours in the image, and few threads contend for a counter.
 """
 
 import warp as wp
 
 from synpick_warp.kernels.render.lighting.brdf import SplitRadiance
-from synpick_warp.kernels.render.lighting.paths.lists import REGION_PIXELS
+from synpick_warp.kernels.render.lighting.paths.lists import KNOWN_BITS, REGION_PIXELS
 from synpick_warp.kernels.render.lighting.paths.tracing import Path
 from synpick_warp.kernels.render.visibility.records import read_record, write_record
 
 wp.set_module_options({"enable_backward": False})
 
 QUEUE_CAPACITY = REGION_PIXELS
-"""Paths that a region's queue holds: one from each coarse pixel. At full HD a view's queues take 22 MB."""
+"""Paths that a region's queue holds: one from each coarse pixel."""
 PATH_RECORDS = wp.constant(10)
 """Number of 16-byte records of a queued path; see `write_path`."""
 _SEGMENT_BITS = wp.constant(8)
 """Bits of a segmentation id."""
-_KNOWN_BITS = wp.constant(8)
-"""Bits for the paths of a history, see `LightHistory.paths`."""
 
 
 @wp.struct
@@ -29,19 +27,20 @@ class PathQueues:
     """Queues of the paths that go on after a bounce. Scratch."""
 
     count: wp.array3d[int]
-    """(view, region, stage): paths that were queued after bounce 1 + stage."""
+    """(queue_view, region, stage): length of a queue. Stage s holds paths with `Path.bounce` = s + 1."""
     slot: wp.array4d[wp.uint16]
-    """(view, region, parity, rank): slots of the paths that were queued for the even and the odd stages."""
+    """(queue_view, region, stage % 2, rank): slot of each queued path from stage 1 on; double-buffered. In stage 0 it is the rank."""
     record: wp.array3d[wp.vec4]
-    """(view, region, path_record): records of the paths, packed by `write_path`; record k of all slots, then record k + 1."""
+    """(queue_view, region, path_record): paths packed by `write_path`, as a structure of arrays: element k * QUEUE_CAPACITY + slot is
+    record k of a slot."""
 
 
 @wp.struct
 class PathPixel:
-    """Coarse pixel of a path: what completes it once the path has ended."""
+    """Coarse pixel of a path: the data that its light is combined with when the path terminates."""
 
     offset: int
-    """Place in its region, in interleaved order."""
+    """Index in its region, in interleaved order."""
     segment: int
     """Segmentation id of its surface."""
     known: int
@@ -57,9 +56,15 @@ class PathPixel:
 
 
 @wp.func
+def queue_view(queues: PathQueues, view: int) -> int:
+    """Row of the queues of a view: views of a large batch take turns."""
+    return view % queues.count.shape[0]
+
+
+@wp.func
 def first_record(queues: PathQueues, view: int, region: int, slot: int) -> int:
     """Flat index of a slot's first record; the next ones follow at a distance of QUEUE_CAPACITY."""
-    return (view * queues.count.shape[1] + region) * (PATH_RECORDS * QUEUE_CAPACITY) + slot
+    return (queue_view(queues, view) * queues.count.shape[1] + region) * (PATH_RECORDS * QUEUE_CAPACITY) + slot
 
 
 @wp.func
@@ -78,7 +83,7 @@ def vector_of(record: wp.vec4) -> wp.vec3:
 def write_path(queues: PathQueues, first: int, path: Path, pixel: PathPixel):
     """Pack a path and its coarse pixel into records, from flat index `first` on; integers as bits."""
     segments = (((path.bounce << _SEGMENT_BITS) | path.hit.segment) << _SEGMENT_BITS) | pixel.segment
-    place = (pixel.offset << _KNOWN_BITS) | pixel.known
+    place = (pixel.offset << KNOWN_BITS) | pixel.known
     b = path.hit.barycentric
     light = pixel.unoccluded
     write_record(queues.record, first, record_of(path.position, path.width))
@@ -123,9 +128,9 @@ def read_path(queues: PathQueues, first: int) -> tuple[Path, PathPixel]:
     path.radiance.specular = vector_of(specular_light)
     path.radiance.indirect = vector_of(indirect_light)
     pixel = PathPixel()
-    pixel.offset = place >> _KNOWN_BITS
+    pixel.offset = place >> KNOWN_BITS
     pixel.segment = segments & segment_mask
-    pixel.known = place & ((1 << _KNOWN_BITS) - 1)
+    pixel.known = place & ((1 << KNOWN_BITS) - 1)
     pixel.number = wp.cast(diffuse[3], int)
     pixel.diffuse = vector_of(surface)
     pixel.unoccluded.diffuse = wp.vec3(direct_light[3], specular_light[3], indirect_light[3])
@@ -136,23 +141,24 @@ def read_path(queues: PathQueues, first: int) -> tuple[Path, PathPixel]:
 
 @wp.func
 def queue_path(queues: PathQueues, view: int, region: int, path: Path, pixel: PathPixel):
-    """Queue a path after its first bounce. Which slot it gets may vary; its light does not depend on it."""
-    slot = wp.atomic_add(queues.count, view, region, 0, 1)
-    queues.slot[view, region, 0, slot] = wp.uint16(slot)
+    """Queue a path after its first bounce. Slots are assigned in arbitrary order; results do not depend on it."""
+    slot = wp.atomic_add(queues.count, queue_view(queues, view), region, 0, 1)
     write_path(queues, first_record(queues, view, region, slot), path, pixel)
 
 
 @wp.func
 def requeue_path(queues: PathQueues, view: int, region: int, stage: int, slot: int, path: Path, pixel: PathPixel):
-    """Queue a path for a later `stage`; it stays in its slot."""
-    rank = wp.atomic_add(queues.count, view, region, stage, 1)
-    queues.slot[view, region, stage % 2, rank] = wp.uint16(slot)
+    """Queue a path for a later `stage`, from 1 on; it stays in its slot."""
+    rank = wp.atomic_add(queues.count, queue_view(queues, view), region, stage, 1)
+    queues.slot[queue_view(queues, view), region, stage % 2, rank] = wp.uint16(slot)
     write_path(queues, first_record(queues, view, region, slot), path, pixel)
 
 
 @wp.func
 def queued_slot(queues: PathQueues, view: int, region: int, stage: int, rank: int) -> int:
-    """Slot of the path of a `rank` in a stage's queue; -1: none."""
-    if rank >= queues.count[view, region, stage]:
+    """Slot of the path with a `rank` in the queue of a stage; -1: the queue is shorter."""
+    if rank >= queues.count[queue_view(queues, view), region, stage]:
         return -1
-    return int(queues.slot[view, region, stage % 2, rank])
+    if stage == 0:
+        return rank
+    return int(queues.slot[queue_view(queues, view), region, stage % 2, rank])

@@ -40,16 +40,16 @@ def reuse_histories_kernel(
     gbuffer: GBuffer,
     views: Views,
     moving: MovingBodies,
-    history: LightHistory,
     first: int,
     # Out:
+    history_inout: LightHistory,
     lists_inout: PathLists,
     guide_out: Guide,
     coarse_light_out: CoarseLight,
 ):
     """Temporal reuse: the history's light for coarse pixels that trace no path in this frame, see `period_bits`; the others are listed.
 
-    Of coarse pixels that are listed nothing is written.
+    Writes no light for listed coarse pixels. Where nothing is visible, the history ends.
     """
     index = wp.tid() + first
     view, row, column = interleaved_pixel(coarse, index)
@@ -58,17 +58,18 @@ def reuse_histories_kernel(
     cell = flat_index(coarse.grid, view, row, column)
     camera, world = views.camera[view], views.world[view]
     surface = coarse_surface(cameras, coarse, gbuffer, view, camera, row, column)
+    slot = world * history_inout.cameras + camera
     if surface.hit.segment == Segment.NOTHING:
         write_record(guide_out.surface, cell, wp.vec4())
+        history_inout.segment[slot, row, column] = wp.uint8(Segment.NOTHING)
         return
-    limit = lag_limit(scene.meshes, history, moving, views, view, row, column, surface.hit.segment, surface.position)
-    slot = world * history.cameras + camera
-    known, bits = usable_paths(history, slot, row, column, limit)
-    if bits == 0 or update_frame(row, column, bits) == history.frame[slot] % (1 << bits):
+    limit = lag_limit(scene.meshes, history_inout, moving, views, view, row, column, surface.hit.segment, surface.position)
+    known, bits = usable_paths(history_inout, slot, row, column, limit)
+    if bits == 0 or update_frame(row, column, bits) == history_inout.frame[slot] % (1 << bits):
         append_pixel(lists_inout, view, index, known, bits)
         return
     vertex = make_vertex(scene, bodies, view, views.instances, surface.hit, surface.position, surface.outgoing, surface.width, 0.0)
     unoccluded = unoccluded_light(scene.lights, light[world], light_yaw[world], vertex.brdf)
     exposure = scene.lights.exposure[light[world]]
-    store_light(coarse_light_out, cell, read_history(history, slot, row, column), scale_light(unoccluded, exposure))
+    store_light(coarse_light_out, cell, read_history(history_inout, slot, row, column), scale_light(unoccluded, exposure))
     write_guide(guide_out, cameras.to_world[camera], cell, surface.hit, vertex.brdf.normal)
