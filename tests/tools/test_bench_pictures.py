@@ -17,7 +17,7 @@ from tests.tools.test_tools import FEW_STEPS
 from tools.bench import __main__ as bench
 from tools.bench import pictures
 
-WORLDS, CAMERAS, BATCH, HISTORY_TICKS, KEPT_TICKS, ROUNDS = 2, 3, 4, 2, 3, 2
+WORLDS, CAMERAS, BATCH, AFTER, HISTORY_TICKS, KEPT_TICKS, ROUNDS = 2, 3, 4, 2, 2, 3, 2
 SETTINGS = ("bake.mode=move", "settle.rest_displacement=1e-3", f"render.views_per_batch={BATCH}")
 SMALL = ("--worlds", str(WORLDS), "--resolution", "32x18", *FEW_STEPS, *(part for text in SETTINGS for part in ("--set", text)))
 
@@ -54,7 +54,7 @@ def measured(tmp_path_factory):
         mock.patch.object(Renderer, "render", watch_render),
         mock.patch.object(Simulation, "tick", watch_tick),
     ):
-        assert bench.main(["--parts", "pictures", "--json", str(file), *SMALL]) == 0
+        assert bench.main(["--parts", "pictures", "--after", str(AFTER), "--json", str(file), *SMALL]) == 0
     rows = {row["name"]: row for row in json.loads(file.read_text())["rows"]}
     return SimpleNamespace(rows=rows, batches=batches, ticks=simulations)
 
@@ -79,6 +79,7 @@ def test_each_pass_renders_each_view_of_each_kept_tick_once(measured):
     first, passes = split_passes(measured)
     assert [len(of_renderer) for of_renderer in passes.values()] == [ROUNDS] * 2
     assert len(all_views(first)) == HISTORY_TICKS * WORLDS * CAMERAS
+    assert min(frame for _, frame, _ in all_views(first)) >= AFTER
     episodes = {episode for episode, *_ in all_views(first)}
     last = {episode: max(frame for other, frame, _ in all_views(first) if other == episode) for episode in episodes}
     assert len(episodes) == WORLDS

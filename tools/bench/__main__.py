@@ -100,7 +100,7 @@ def main(arguments: list[str] | None = None) -> int:
             console.print(f"{name:20} {value}")
         measured_peers = measure_peers(config, options.compare, options.seconds)
         bake = WholeBake(options.episodes, options.worlds or 0)
-        parts = measure(config, options.parts, options.seconds, traces, bake, options.markdown, options.devices)
+        parts = measure(config, options.parts, options.seconds, traces, bake, options.markdown, options.devices, options.after)
         for row in itertools.chain(parts, measured_peers):
             rows.append(row)
             console.print(f"{row.part:11} {row.name:52} {row.value:14,.3f} {row.unit}", soft_wrap=True)
@@ -134,6 +134,8 @@ def _parse(arguments: list[str] | None) -> argparse.Namespace:
     parser.add_argument("--parts", type=make_names_parser(PARTS, "part"), help=parts_help)
     peers_help = f"peers to measure beside ours, comma-separated, of {', '.join(PEERS)}; then no parts unless --parts names some"
     parser.add_argument("--compare", type=make_names_parser(PEERS, "peer"), default=(), metavar="PEERS", help=peers_help)
+    after_help = "ticks simulated before the part pictures, in which little moves just after the drop (default: 0)"
+    parser.add_argument("--after", type=positive_count, default=0, metavar="TICKS", help=after_help)
     parser.add_argument("--episodes", type=positive_count, help=f"episodes of the part whole (default: {WHOLE_EPISODES})")
     devices_help = "several devices of the part steady, as of bake: cuda:0,cuda:1 or all; --worlds is the number of each"
     parser.add_argument("--devices", default="", help=devices_help)
@@ -143,7 +145,12 @@ def _parse(arguments: list[str] | None) -> argparse.Namespace:
     if options.parts is None:
         options.parts = () if options.compare else DEFAULT_PARTS
     options.devices = tuple(name.strip() for name in options.devices.split(",")) if options.devices else ()
-    for name, part, use in (("devices", "steady", "several"), ("markdown", "growth", "it"), ("episodes", "whole", "it")):
+    for name, part, use in (
+        ("devices", "steady", "several"),
+        ("markdown", "growth", "it"),
+        ("episodes", "whole", "it"),
+        ("after", "pictures", "it"),
+    ):
         if getattr(options, name) and part not in options.parts:
             parser.error(f"--{name} needs the part {part}, the only one that uses {use}")
     if options.devices and options.device != parser.get_default("device"):
@@ -174,6 +181,7 @@ def measure(
     bake: WholeBake,
     markdown: Path | None,
     devices: tuple[str, ...] = (),
+    after: int = 0,
 ) -> Iterator[Row]:
     """Measure the parts; yields rows as they arrive.
 
@@ -185,6 +193,7 @@ def measure(
         bake: Size of the bake of the part whole.
         markdown: File for the table of the part growth; None: none.
         devices: Devices of the part steady; empty: that of the settings.
+        after: Ticks simulated before the part pictures.
     """
     if set(parts) - OWN_WORLDS:
         started = time.perf_counter()
@@ -211,7 +220,7 @@ def measure(
     if "bake" in parts:
         yield from _measure_bake(config)
     if "pictures" in parts:
-        yield from measure_pictures(config)
+        yield from measure_pictures(config, after)
     steady_rate = 0.0
     if "steady" in parts:
         for row in measure_steady(config, min_seconds, devices):

@@ -77,12 +77,13 @@ def light_history(renderer: Renderer) -> Any:
     return shading.history if isinstance(shading, DenoisedRenderer) and shading.history.max_paths > 0 else None
 
 
-def measure_pictures(config: Config) -> Iterator[Row]:
+def measure_pictures(config: Config, after: int = 0) -> Iterator[Row]:
     """Simulate, keep and render ticks: rows of counts, and of the rates with `render.history` as set, and with 0.
 
     Args:
         config: All settings. More device memory is needed than for a bake: for a copy of the histories, the kept snapshots, and the scratch
             arrays of a second renderer.
+        after: Ticks simulated before the histories begin; just after the drop little moves.
     """
     started = time.perf_counter()
     config = plan_spare_episodes(config)
@@ -90,6 +91,8 @@ def measure_pictures(config: Config) -> Iterator[Row]:
     factory = build_factory(config, SilentProgress(), needs_images=any(kind.needs_images for kind in kinds))
     stream, device = factory.stream, factory.simulation.device
     simulate_until_live(factory)
+    for _ in range(after):
+        _tick(factory)
     for _ in range(HISTORY_TICKS):
         render_ticks(stream, stream.renderer, [keep_tick(factory)])
     ticks = [keep_tick(factory) for _ in range(KEPT_TICKS)]
