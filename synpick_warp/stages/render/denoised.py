@@ -67,9 +67,12 @@ ROULETTE = 1
 """First bounce with Russian roulette: few paths are long, since many neighbours share them."""
 
 
-QUEUE_VIEWS = 32
-"""Views with path queues, which take some 22 MB a view; those of a larger batch take turns. With 8 views at a time, a launch waits for its
-longest path on a nearly idle GPU, and queues gain nothing (tools/README.md, "Path queues")."""
+MAX_QUEUE_VIEWS = 32
+"""Maximum number of views with path queues at a time; the views of a larger batch take turns. With 8 views of a batch of 25, launches wait
+for their longest path on a nearly idle GPU, and queues gain nothing (tools/README.md, "Path queues")."""
+MAX_QUEUE_FRACTION = 1 / 96
+"""Maximum size of path queues as a fraction of the device's memory. At full HD, 42 views fit into that of an H100, and 6 into that of a GPU
+of 12 GiB, which is better used for worlds."""
 
 GUIDE = struct_arrays(Guide, "view", "cell_row", "cell_column")
 COARSE_LIGHT = struct_arrays(CoarseLight, "view", "cell_row", "cell_column")
@@ -159,14 +162,22 @@ def queue_sizes(render: Render, width: int, height: int, views: int, histories: 
     single = accumulates(render, histories) or paths_per_coarse_pixel(render, width, histories) == 1
     size = coarse_size(render, width, histories)
     regions = interleaved_threads(-(-width // size), -(-height // size)) // int(REGION_PIXELS)
+    queues = device.is_cuda and traces_paths(render) and single
     return {
-        "queue_view": min(views, QUEUE_VIEWS),
-        "queue_region": regions if device.is_cuda and traces_paths(render) and single else 0,
+        "queue_view": queue_views(views, regions, device.total_memory) if queues else views,
+        "queue_region": regions if queues else 0,
         "queue_stage": max(1, render.bounces - 1),
         "stage_parity": 2,
         "queue_slot": int(QUEUE_CAPACITY),
         "path_record": int(PATH_RECORDS) * int(QUEUE_CAPACITY),
     }
+
+
+def queue_views(views: int, regions: int, memory: int) -> int:
+    """Number of views with path queues at a time, on a device with this much `memory` [bytes], so that turns are of equal length."""
+    size = regions * int(QUEUE_CAPACITY) * int(PATH_RECORDS) * wp.types.type_size_in_bytes(wp.vec4)
+    most = max(1, min(MAX_QUEUE_VIEWS, int(MAX_QUEUE_FRACTION * memory) // size))
+    return -(-views // -(-views // most))
 
 
 def history_sizes(render: Render, width: int, height: int, histories: int) -> dict[str, int]:

@@ -16,8 +16,7 @@ from synpick_warp.kernels.render.lighting.paths.lists import REGION_PIXELS
 from synpick_warp.kernels.render.lighting.paths.queues import QUEUE_CAPACITY
 from synpick_warp.scenes.types import EnvironmentMap
 from synpick_warp.stages.buffers import allocate_view_buffers
-from synpick_warp.stages.render import denoised
-from synpick_warp.stages.render.denoised import PATH_QUEUES, queue_sizes
+from synpick_warp.stages.render.denoised import PATH_QUEUES, queue_sizes, queue_views
 from synpick_warp.stages.render.renderer import Renderer
 from synpick_warp.stages.render.sampling_rates import interleaved_threads
 from synpick_warp.stages.render.view_setup import make_views
@@ -44,10 +43,10 @@ def pile(frame: int, bounces: int, walls: bool, paths: int) -> ToyScene:
 
 
 def make_queues(renderer: Renderer, regions: int, views: int = 1) -> Any:
-    """Queues of a renderer; 0 regions: none."""
+    """Queues of a renderer for some views at a time; 0 regions: none."""
     render = replace(Config().render, bounces=renderer.shading.rules.bounces)  # type: ignore[union-attr]
     sizes = queue_sizes(render, VIEW.width, VIEW.height, views, 1, renderer.scene.device)
-    return allocate_struct(PATH_QUEUES, sizes | {"queue_region": regions}, renderer.scene.device)
+    return allocate_struct(PATH_QUEUES, sizes | {"queue_region": regions, "queue_view": views}, renderer.scene.device)
 
 
 def light_of(bounces: int, walls: bool, paths: int, regions: int, device: wp.Device) -> tuple[np.ndarray, np.ndarray]:
@@ -95,9 +94,8 @@ def test_paths_survive_packing(device):
     np.testing.assert_array_equal(outputs[1].numpy(), vectors)
 
 
-def test_batches_of_more_views_than_queues_take_turns(device, monkeypatch):
+def test_batches_of_more_views_than_queues_take_turns(device):
     """Three views with queues for two: each has the light that it has without queues."""
-    monkeypatch.setattr(denoised, "QUEUE_VIEWS", 2)
     each = pile(0, 4, True, 1)
     renderer = make_renderer(each.settings(), build_scene(each, device), each.instances, 3)
     regions = interleaved_threads(VIEW.width, VIEW.height) // int(REGION_PIXELS)
@@ -105,7 +103,13 @@ def test_batches_of_more_views_than_queues_take_turns(device, monkeypatch):
     views, out = make_views(zeros, zeros, 3, 4), allocate_view_buffers(3, VIEW.width, VIEW.height, 4, device)
     images = []
     for count in (0, regions):
-        renderer.shading.queues = make_queues(renderer, count, views=3)  # type: ignore[union-attr]
+        renderer.shading.queues = make_queues(renderer, count, views=2)  # type: ignore[union-attr]
         renderer.render(snapshot(each, device), views, out)
         images.append(renderer.image.radiance.numpy())
     assert np.isclose(images[1], images[0], rtol=1e-3, atol=1e-4).mean() > 0.999
+
+
+@pytest.mark.parametrize(("views", "gigabytes", "expected"), [(25, 80, 25), (25, 24, 9), (13, 12, 5), (414, 80, 32), (1, 1, 1)])
+def test_views_take_turns_of_equal_length(views, gigabytes, expected):
+    """Full HD: a view's queues take 20.9 MB."""
+    assert queue_views(views, 255, gigabytes << 30) == expected
