@@ -12,8 +12,8 @@ best, fewer and more are slower."""
 COARSE_PATH_REGISTERS = 56
 """Register limit of kernels that trace whole paths, which are fastest with slightly fewer."""
 SINGLE_PATH_REGISTERS = 72
-"""The same of kernels that trace one bounce of a path at a time: they keep fewer values live, so that more registers spare all spills of
-rays (H100, a full-HD view of all stages: 56, 64, 72 registers 0.991, 0.985, 0.977 ms)."""
+"""The same of kernels that trace one bounce of a path at a time, which keep fewer values live (H100, all stages of a full-HD view: 0.991,
+0.985, 0.977 ms with 56, 64, 72 registers; with later changes 0.907 and 0.925 ms with 72 and 96)."""
 SHADE_REGISTERS = 80
 """Register limit of the shading kernel, which waits for memory less than ray tracing does, and keeps more values live."""
 SAMPLE_SHADE_REGISTERS = 128

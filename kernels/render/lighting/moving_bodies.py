@@ -40,7 +40,7 @@ class MovingBodies:
     """(view, rank): axis-aligned box in the world around each moving body, where it is and where it was [m]."""
     all_lower: wp.array[wp.vec3]
     all_upper: wp.array[wp.vec3]
-    """(view): box around these boxes [m]."""
+    """(view): union of these boxes [m]."""
 
 
 @wp.func
@@ -95,7 +95,7 @@ def list_moving_body(
     then: wp.transformf,
     change: float,
 ):
-    """Write a moving body: its mesh (-1: absent) and pose, both in this and in the previous frame, and its `change`."""
+    """Append a moving body: `mesh` (-1: absent) and pose `now` in this frame, `last_mesh` and `then` in the previous one."""
     moving.mesh[view, rank] = wp.where(mesh >= 0, mesh, last_mesh)
     moving.to_body[view, rank] = wp.transform_inverse(wp.where(mesh >= 0, now, then))
     moving.change[view, rank] = change

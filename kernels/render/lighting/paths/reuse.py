@@ -49,7 +49,7 @@ def reuse_histories_kernel(
 ):
     """Temporal reuse: the history's light for coarse pixels that trace no path in this frame, see `period_bits`; the others are listed.
 
-    Writes no light for listed coarse pixels. Where nothing is visible, the history ends.
+    Writes nothing but the list for listed coarse pixels. Where nothing is visible, the history ends.
     """
     index = wp.tid() + first
     view, row, column = interleaved_pixel(coarse, index)
