@@ -157,8 +157,10 @@ def meets_box(origin: wp.vec3, inverse: wp.vec3, lower: wp.vec3, upper: wp.vec3)
 
 @wp.func
 def may_change(moving: MovingBodies, view: int, origin: wp.vec3, direction: wp.vec3) -> bool:
-    """Whether a moving body may block a ray now, or may have blocked it in the previous frame: by their bounding boxes, after
-    the union of these. Requires `MovingBodies.count` > 0."""
+    """Whether a moving body may block a ray now, or may have blocked it in the previous frame.
+
+    Tests the union of the moving bodies' bounding boxes first, then each box. `MovingBodies.count` must be above 0.
+    """
     inverse = wp.vec3()
     for i in range(3):
         inverse[i] = 1.0 / wp.where(wp.abs(direction[i]) < MIN_DIRECTION, MIN_DIRECTION, direction[i])

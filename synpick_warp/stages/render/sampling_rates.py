@@ -7,20 +7,21 @@ from synpick_warp.kernels.render.visibility.camera import TILE_PIXELS
 from synpick_warp.kernels.tuning import LANE_COLUMNS, LANE_STRIDE
 
 MIN_COARSE_COLUMNS = 384
-"""Default size of coarse pixels: an image's width has at least this many, and fewer than twice as many. At full HD they are 1.9 mm wide at
-the bottom of the tote. In narrower images coarse pixels are pixels."""
+"""Minimum number of coarse pixels across an image, from which their default width follows: 5 px at full HD, 1.9 mm at the bottom of the
+tote. In images of less than twice this width, coarse pixels are pixels."""
 MIN_HISTORY_COLUMNS = 480
-"""The same where histories accumulate: most coarse pixels then trace no path in a frame, so they may be narrower, with a path each. At full
-HD, 4 px and one path had 35.3 dB, 5 px and two paths 34.5 dB (mean of the frames 0, 8 and 30 of a pick; tools/README.md, "Pictures")."""
+"""Minimum number of coarse pixels across an image with light histories. Most coarse pixels then trace no path in a frame, so they may be
+narrower: 4 px at full HD, with one path each. That gives a PSNR of 35.3 dB, 5 px with two paths 34.5 dB (mean of the frames 0, 8 and 30 of
+a pick; tools/README.md, "Pictures")."""
 MAX_COLUMNS_TWO_PATHS = 480
-"""Default number of paths: two per coarse pixel if an image's width has at most this many, else one. At 640x360, where coarse pixels are
-pixels, ten piles have a PSNR of 32.5 dB with one path and 33.6 dB with two, in 1.5 times the time."""
+"""Maximum number of coarse pixels across an image with two paths per coarse pixel by default; wider images have one. At 640x360, where
+coarse pixels are pixels, ten piles have a PSNR of 32.5 dB with one path and 33.6 dB with two, in 1.5 times the time."""
 FIRST_FRAME_PATHS = 32
 """Default number of paths per coarse pixel in the first frame of an episode. They initialize all light histories at their default maximum
 length, so that the following frames trace fewer paths. Frame 8 gains 2 dB in PSNR at 480x270, 1.6 dB at full HD (tools/README.md,
 "Pictures")."""
 COVERAGE_RAYS, NARROW_COVERAGE_RAYS = 4, 16
-"""Number of coverage rays per anti-aliased pixel: in wide images, and in narrow images, whose shading is supersampled. On an H200, 16
+"""Number of coverage rays per anti-aliased pixel, in images with wide coarse pixels and in images with supersampled shading. On an H200, 16
 instead of 4 rays take 0.055 ms per view at 480x270 and improve PSNR by 0.2 dB; at full HD, 8 instead of 4 rays take 0.072 ms."""
 
 
@@ -31,7 +32,7 @@ def coarse_size(render: Render, width: int, histories: int = 0) -> int:
 
 
 def shadow_size(size: int) -> int:
-    """Width of a pixel of the shadow grid [px], whose coarse pixels are `size` px wide: three quarters of it.
+    """Width of a pixel of the shadow grid [px]: three quarters of that of a coarse pixel, `size`.
 
     At full HD 3 px are as good as 2, with less than half of the rays; 4 px are 0.2 to 0.3 dB worse.
     """
@@ -64,7 +65,7 @@ def first_frame_paths(render: Render, width: int, histories: int = 0) -> int:
 
 
 def supersamples(render: Render, width: int, histories: int = 0) -> bool:
-    """Whether shading is supersampled: only in narrow images, in which a coarse pixel is one pixel.
+    """Whether shading is supersampled: only where coarse pixels are pixels.
 
     A pixel then covers much detail of textures and normals. Four samples gain 0.2 to 0.5 dB in PSNR (tools/README.md, "Pictures").
     """

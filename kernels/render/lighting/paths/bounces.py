@@ -4,8 +4,8 @@ import warp as wp
 
 from synpick_warp.kernels.render.lighting.coarse_grid import CoarseGrid, flat_index, interleaved_pixel
 from synpick_warp.kernels.render.lighting.history import LightHistory
-from synpick_warp.kernels.render.lighting.paths.coarse import finish_pixel, make_context
-from synpick_warp.kernels.render.lighting.paths.light import CoarseLight, clamp_path, lamplit_radiance
+from synpick_warp.kernels.render.lighting.paths.coarse import finish_path, make_context
+from synpick_warp.kernels.render.lighting.paths.light import CoarseLight
 from synpick_warp.kernels.render.lighting.paths.lists import REGION_PIXELS
 from synpick_warp.kernels.render.lighting.paths.queues import (
     QUEUE_CAPACITY,
@@ -62,11 +62,8 @@ def extend_queued_paths_kernel(
     vertex = next_vertex(scene, bodies, rules, context, path)
     path = extend_path(scene, bodies, rules, context, pixel.number, pixel.diffuse, path, vertex)
     if path.bounce == TERMINATED:
-        lamplit = lamplit_radiance(scene.lights, context.light)
-        radiance = clamp_path(path.radiance, pixel.unoccluded, lamplit, pixel.specular_limit, rules.firefly_clamp)
         cell = flat_index(coarse.grid, view, row, column)
-        history = world * history_inout.cameras + views.camera[view]
-        exposure = scene.lights.exposure[context.light]
-        finish_pixel(coarse_light_out, history_inout, exposure, cell, history, row, column, pixel, radiance, 1)
+        history_slot = world * history_inout.cameras + views.camera[view]
+        finish_path(scene, rules, context, coarse_light_out, history_inout, cell, history_slot, row, column, pixel, path.radiance)
     else:
         requeue_path(queues_inout, view, region, stage + 1, slot, path, pixel)

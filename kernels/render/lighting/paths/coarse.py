@@ -160,9 +160,32 @@ def finish_pixel(
     paths: SplitRadiance,
     samples: int,
 ):
-    """Blend the mean light of `samples` new paths into a coarse pixel's history, and write the result by the pixel's `flat_index`."""
+    """Blend new light into the history of a coarse pixel, and write the result.
+
+    `paths` is the mean light of `samples` new paths, `cell` the pixel's `flat_index`, `slot` the row of its camera in the history.
+    """
     mean = accumulate(history, slot, row, column, pixel.segment, scale_light(paths, exposure), pixel.known, samples)
     store_light(out, cell, mean, scale_light(pixel.unoccluded, exposure))
+
+
+@wp.func
+def finish_path(
+    scene: PathScene,
+    rules: PathRules,
+    context: PathContext,
+    out: CoarseLight,
+    history: LightHistory,
+    cell: int,
+    slot: int,
+    row: int,
+    column: int,
+    pixel: PathPixel,
+    radiance: SplitRadiance,
+):
+    """Finish a coarse pixel whose single path has terminated with this `radiance`; other parameters as of `finish_pixel`."""
+    lamplit = lamplit_radiance(scene.lights, context.light)
+    light = clamp_path(radiance, pixel.unoccluded, lamplit, pixel.specular_limit, rules.firefly_clamp)
+    finish_pixel(out, history, scene.lights.exposure[context.light], cell, slot, row, column, pixel, light, 1)
 
 
 @wp.func
@@ -235,17 +258,16 @@ def trace_pixel(
     beginning = wp.where(known > 0, rules.first_samples, samples)
     number = first_path_index(beginning, row, column, path_number(history_frame(history, slot, known), bits), known > 0)
     pixel = make_path_pixel(scene, rules, context, vertex, index, surface.hit.segment, known, number)
-    paths = SplitRadiance()
     if queued:
         path = extend_path(scene, bodies, rules, context, pixel.number, pixel.diffuse, init_path(surface.width), vertex)
-        if path.bounce != TERMINATED:
+        if path.bounce == TERMINATED:
+            finish_path(scene, rules, context, coarse_light_out, history, cell, slot, row, column, pixel, path.radiance)
+        else:
             queue_path(queues, view, (index // REGION_PIXELS) % regions, path, pixel)
-            return
-        lamplit = lamplit_radiance(scene.lights, context.light)
-        paths = clamp_path(path.radiance, pixel.unoccluded, lamplit, pixel.specular_limit, rules.firefly_clamp)
     else:
         paths = average_paths(scene, bodies, rules, context, samples, vertex, surface.width, pixel)
-    finish_pixel(coarse_light_out, history, scene.lights.exposure[context.light], cell, slot, row, column, pixel, paths, samples)
+        exposure = scene.lights.exposure[context.light]
+        finish_pixel(coarse_light_out, history, exposure, cell, slot, row, column, pixel, paths, samples)
 
 
 @wp.kernel(cuda_max_registers=COARSE_PATH_REGISTERS)

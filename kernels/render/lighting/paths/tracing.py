@@ -126,7 +126,7 @@ class Path:
     position: wp.vec3
     """Position of that hit, in the world [m]."""
     direction: wp.vec3
-    """Unit direction of the ray that found it."""
+    """Unit direction of the ray to that hit."""
     bounce: int
     """Bounces so far, or TERMINATED."""
     width: float
