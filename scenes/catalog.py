@@ -21,6 +21,7 @@ from synpick_warp.scenes.collision.hulls import hull_size, mass_properties
 from synpick_warp.scenes.collision.shapes import collision_shapes, default_cache_dir
 from synpick_warp.scenes.embedded.objects import procedural_objects
 from synpick_warp.scenes.types import Catalog, CatalogEntry, ConvexPiece, HullSize, Material, RawObject, TriangleMesh
+from synpick_warp.system.threads import map_in_threads
 
 _MILLIMETRE = 1e-3
 # Minimum diameter [m]: smaller bodies vanish in the contact margin, and come from files in another unit than expected.
@@ -81,11 +82,11 @@ def _read_folder(folder: Path, config: Config, report: Callable[[str], None]) ->
         if ignored := len(files) - len(models):
             report(f"models folder {folder}: {ignored} meshes that are not named obj_NNNNNN.ply are ignored")
         infos = read_models_info(folder / "models_info.json", models)
-        return [_read_bop(obj_id, file, infos.get(obj_id, ModelInfo()), config) for obj_id, file in sorted(models.items())]
+        return map_in_threads(lambda item: _read_bop(*item, infos.get(item[0], ModelInfo()), config), sorted(models.items()))
     for first, second in itertools.pairwise(files):
         if first.stem == second.stem:
             raise CatalogError(f"models folder {folder}: {first.name} and {second.name} have the same name; keep one of them")
-    return [_read_own(obj_id, file, config) for obj_id, file in enumerate(files, 1)]
+    return map_in_threads(lambda item: _read_own(*item, config), enumerate(files, 1))
 
 
 def _read_bop(obj_id: int, file: Path, info: ModelInfo, config: Config) -> RawObject:

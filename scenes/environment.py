@@ -5,6 +5,8 @@ Row 0 looks up (+z); azimuth atan2(y, x) lies at the fraction u = azimuth / 2π 
 
 from __future__ import annotations
 
+import functools
+
 import cv2
 import numpy as np
 
@@ -17,14 +19,27 @@ LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
 
 
 def map_directions(rows: int) -> tuple[np.ndarray, np.ndarray]:
-    """Unit directions (rows, 2 rows, 3) of a map's texel centres and their solid angles (rows, 2 rows) [sr]."""
+    """Unit directions (rows, 2 rows, 3) of a map's texel centres and their solid angles (rows, 2 rows) [sr], read-only.
+
+    Those of up to `BACKGROUND_ROWS` rows, which all maps are resampled to, are cached.
+    """
+    return _cached_directions(rows) if rows <= BACKGROUND_ROWS else _compute_directions(rows)
+
+
+def _compute_directions(rows: int) -> tuple[np.ndarray, np.ndarray]:
+    """Compute what `map_directions` returns."""
     polar = (np.arange(rows) + 0.5) / rows * np.pi
     azimuth = ((np.arange(2 * rows) + 0.5) / (2 * rows) - 0.5) * 2.0 * np.pi
     polar, azimuth = np.meshgrid(polar, azimuth, indexing="ij")
     directions = np.stack([np.sin(polar) * np.cos(azimuth), np.sin(polar) * np.sin(azimuth), np.cos(polar)], axis=-1)
     edges = np.cos(np.arange(rows + 1) / rows * np.pi)
     solid_angles = np.repeat((edges[:-1] - edges[1:])[:, None], 2 * rows, axis=1) * (2.0 * np.pi / (2 * rows))
+    for values in (directions, solid_angles):
+        values.setflags(write=False)
     return directions, solid_angles
+
+
+_cached_directions = functools.cache(_compute_directions)
 
 
 def resize_map(radiance: np.ndarray, rows: int) -> np.ndarray:

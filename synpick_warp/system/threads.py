@@ -1,19 +1,42 @@
-"""Names and checks of the threads of this process that may launch Warp kernels."""
+"""Threads of this process: a parallel map, and names and checks of those that may launch Warp kernels."""
 
 from __future__ import annotations
 
 import re
 import threading
+from collections.abc import Callable, Iterable
+from concurrent.futures import ThreadPoolExecutor
+from typing import TypeVar
 
-PIXELS, COPIES, LINK = "pixels", "copies", "bake link"
+from synpick_warp.system.cores import count_cores
+
+PIXELS, COPIES, LINK, SETUP = "pixels", "copies", "bake link", "setup"
 """Name prefixes of this package's threads. PIXELS threads launch kernels only while the caller waits; the others never do."""
 ZARR_THREADS = {"async.concurrency": 1, "threading.max_workers": 1}
 """Configuration of zarr: one worker thread, as writer processes already run in parallel. Zarr names its pool's threads only if the
 pool size is set."""
-_HARMLESS = re.compile(rf"({PIXELS}|{COPIES})_\d+|{LINK}|zarr_(io|pool_\d+)|QueueFeederThread")
+_HARMLESS = re.compile(rf"({PIXELS}|{COPIES}|{SETUP})_\d+|{LINK}|zarr_(io|pool_\d+)|QueueFeederThread")
 """Names of threads that never launch kernels beside the caller: those above, zarr's event loop and pool, multiprocessing's queues."""
 _HARMLESS_PACKAGES = ("rich", "tqdm")
 """Packages whose thread classes only refresh progress bars."""
+
+_Item = TypeVar("_Item")
+_Result = TypeVar("_Result")
+
+
+def map_in_threads(function: Callable[[_Item], _Result], items: Iterable[_Item]) -> list[_Result]:
+    """Parallel map: results of `function`, in the order of the items, computed by a thread per usable core.
+
+    It pays for functions that spend their time in NumPy, OpenCV or decoders, which release the interpreter lock. They must not launch
+    kernels. The first item that fails raises its error, as in a loop; items that no thread has begun by then are skipped.
+    """
+    with ThreadPoolExecutor(count_cores(), thread_name_prefix=SETUP) as pool:
+        futures = [pool.submit(function, item) for item in items]
+        try:
+            return [future.result() for future in futures]
+        except BaseException:
+            pool.shutdown(cancel_futures=True)
+            raise
 
 
 def is_only_launcher() -> bool:

@@ -37,7 +37,15 @@ def waiting_thread(name: str) -> Iterator[None]:
 
 @pytest.mark.parametrize(
     ("name", "only"),
-    [("pixels_0", True), ("copies_3", True), ("bake link", True), ("zarr_io", True), ("copies_worker", False), ("loader", False)],
+    [
+        ("pixels_0", True),
+        ("copies_3", True),
+        ("setup_0", True),
+        ("bake link", True),
+        ("zarr_io", True),
+        ("copies_worker", False),
+        ("loader", False),
+    ],
 )
 def test_unknown_threads_may_launch_kernels(name, only):
     assert threads.is_only_launcher()
@@ -65,3 +73,18 @@ def test_another_thread_sees_the_main_thread_as_a_launcher():
     thread.start()
     thread.join()
     assert found == [False]
+
+
+def test_a_parallel_map_keeps_the_order_and_raises_the_first_items_error(monkeypatch):
+    monkeypatch.setattr(threads, "count_cores", lambda: 2)
+    barrier = threading.Barrier(2, timeout=30.0)  # Both items must be in progress at once.
+
+    def invert(number: int) -> float:
+        barrier.wait()
+        return 1.0 / number
+
+    assert threads.map_in_threads(invert, [4, 2]) == [0.25, 0.5]
+    with pytest.raises(ZeroDivisionError):
+        threads.map_in_threads(lambda number: 1.0 / number, [0, 1, 2])
+    assert threads.map_in_threads(str, []) == []
+    assert threads.is_only_launcher()

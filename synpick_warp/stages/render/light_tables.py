@@ -18,6 +18,7 @@ from synpick_warp.scenes.environment import BACKGROUND_ROWS, LUMINANCE, WHITE_VA
 from synpick_warp.scenes.lamps import Lamp, extract_lamps, sample_disc
 from synpick_warp.scenes.sun import MAX_SUN_TANGENT, draw_sun_disc, replace_sun
 from synpick_warp.scenes.types import EnvironmentMap
+from synpick_warp.system.threads import map_in_threads
 
 PREFILTER_ROWS = 32
 """Rows of the prefiltered specular map: its sharpest lobe is wider than a texel of 5.6°."""
@@ -176,7 +177,7 @@ def environment_cdf(radiance: np.ndarray, table: bool = False) -> tuple[np.ndarr
 
 def build_environment_cdf(radiance: np.ndarray, device: wp.Device, table: bool = False) -> Any:
     """The struct `EnvironmentCdf` of maps (map, rows, 2 rows, 3); `table`: whether a table hides them below the horizon."""
-    marginals, conditionals = zip(*(environment_cdf(map_radiance, table) for map_radiance in radiance), strict=True)
+    marginals, conditionals = zip(*map_in_threads(lambda each: environment_cdf(each, table), radiance), strict=True)
     cdf = EnvironmentCdf()
     marginal, conditional = np.stack(marginals), np.stack(conditionals)
     cdf.marginal = wp.array(marginal, dtype=wp.float32, device=device)

@@ -27,6 +27,7 @@ from synpick_warp.stages.render.light_tables import (
     precompute_environment,
 )
 from synpick_warp.stages.render.wide_bvh import build_wide_bvh
+from synpick_warp.system.threads import map_in_threads
 
 
 @dataclass(frozen=True, eq=False)
@@ -143,7 +144,7 @@ def build_meshes(
 
 def build_surfaces(shapes: list[TriangleMesh], materials: list[Material], device: wp.Device) -> Any:
     """The struct `Surfaces`: normals, uv, materials, mip-mapped textures; `materials` ends with the table's, which has no shape."""
-    chains = [mip_levels(material.texture) if material.texture is not None else [] for material in materials]
+    chains = map_in_threads(lambda material: mip_levels(material.texture) if material.texture is not None else [], materials)
     depth = max(1, *(len(chain) for chain in chains))
     first_texel = np.zeros((len(chains), depth), dtype=np.int32)
     texels, total = [], 0
@@ -239,7 +240,7 @@ def build_lights(
 ) -> Any:
     """The struct `Lights`; `exposure` multiplies the automatic exposure, `ground` is the table's linear albedo, `lamps` the maximum number
     of lamps of a map."""
-    tables = [precompute_environment(light, ground, lamps) for light in maps]
+    tables = map_in_threads(lambda light: precompute_environment(light, ground, lamps), maps)
     lights = Lights()
     lights.maps = len(tables)
     radiance = np.stack([t.radiance for t in tables] + [t.lampless for t in tables])
