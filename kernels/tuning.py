@@ -10,14 +10,14 @@ RAY_REGISTERS = 64
 """Register limit of kernels that trace rays. With more, too few threads are resident to hide the latency of BVH nodes; from 56 to 64 is
 best, fewer and more are slower."""
 COARSE_PATH_REGISTERS = 56
-"""Register limit of kernels that trace whole paths, which are fastest with slightly fewer."""
+"""Register limit of kernels that trace paths from the camera to their last bounce. It is below RAY_REGISTERS, as they run fastest so."""
 SINGLE_PATH_REGISTERS = 72
-"""The same of kernels that trace one bounce of a path at a time, which keep fewer values live (H100, all stages of a full-HD view: 0.991,
-0.985, 0.977 ms with 56, 64, 72 registers; with later changes 0.907 and 0.925 ms with 72 and 96)."""
+"""Register limit of kernels that trace one bounce of a path per launch. A full-HD view takes 0.991, 0.985 and 0.977 ms in all stages with a
+limit of 56, 64 and 72 registers, and with later changes 0.907 and 0.925 ms with 72 and 96 (H100)."""
 SHADE_REGISTERS = 80
 """Register limit of the shading kernel, which waits for memory less than ray tracing does, and keeps more values live."""
 SAMPLE_SHADE_REGISTERS = 128
-"""The same where several points of a pixel are shaded: fewer spill more (from ptxas for sm_90, not timed)."""
+"""Register limit of the shading kernel where it supersamples: lower limits spill more (from ptxas for sm_90, not timed)."""
 FILTER_REGISTERS = 80
 """Register limit of the denoiser's block filter: the smallest without spills, for the highest occupancy (from ptxas for sm_90; other limits
 were not timed)."""

@@ -21,13 +21,13 @@ LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
 def map_directions(rows: int) -> tuple[np.ndarray, np.ndarray]:
     """Unit directions (rows, 2 rows, 3) of a map's texel centres and their solid angles (rows, 2 rows) [sr], read-only.
 
-    Those of up to `BACKGROUND_ROWS` rows, which all maps are resampled to, are cached.
+    Results for up to `BACKGROUND_ROWS` rows are cached; those for larger maps would take too much memory.
     """
     return _cached_directions(rows) if rows <= BACKGROUND_ROWS else _compute_directions(rows)
 
 
 def _compute_directions(rows: int) -> tuple[np.ndarray, np.ndarray]:
-    """Compute what `map_directions` returns."""
+    """Uncached implementation of `map_directions`."""
     polar = (np.arange(rows) + 0.5) / rows * np.pi
     azimuth = ((np.arange(2 * rows) + 0.5) / (2 * rows) - 0.5) * 2.0 * np.pi
     polar, azimuth = np.meshgrid(polar, azimuth, indexing="ij")

@@ -1,4 +1,4 @@
-"""Threads of this process: a parallel map, and names and checks of those that may launch Warp kernels."""
+"""Thread utilities: a parallel map, thread names, and a check whether other threads may launch Warp kernels."""
 
 from __future__ import annotations
 
@@ -25,10 +25,10 @@ _Result = TypeVar("_Result")
 
 
 def map_in_threads(function: Callable[[_Item], _Result], items: Iterable[_Item]) -> list[_Result]:
-    """Parallel map: results of `function`, in the order of the items, computed by a thread per usable core.
+    """Parallel map with a thread pool, one thread per usable core. Results are in the order of the items.
 
-    It pays for functions that spend their time in NumPy, OpenCV or decoders, which release the interpreter lock. They must not launch
-    kernels. The first item that fails raises its error, as in a loop; items that no thread has begun by then are skipped.
+    Use it for functions that spend their time in NumPy, OpenCV or image decoders, which release the interpreter lock. Functions must not
+    launch kernels. If calls fail, the error of the first failed item is raised, and pending items are cancelled.
     """
     with ThreadPoolExecutor(count_cores(), thread_name_prefix=SETUP) as pool:
         futures = [pool.submit(function, item) for item in items]

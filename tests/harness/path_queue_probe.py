@@ -10,7 +10,7 @@ wp.set_module_options({"enable_backward": False})
 MAX_INTEGERS = (63, 255, (1 << 26) - 1, 511, 255, 255, (1 << 30) - 1)
 """Largest bounce, segmentation id and triangle of the hit; offset, segmentation id, known paths and Sobol' index of the coarse pixel."""
 VECTORS = 12
-"""Vectors of a path; its width, specular limit and barycentric weights fill the last two."""
+"""Number of 3-vectors that hold a path's floating-point values."""
 
 
 @wp.kernel
@@ -23,7 +23,10 @@ def repack_kernel(
     integers_out: wp.array2d[int],  # (path, integer)
     vectors_out: wp.array2d[wp.vec3],  # (path, vector)
 ):
-    """Write each path to its slot of view 0, region 0, and read it back. See VECTORS for the last two."""
+    """Round trip: store each path in its slot of the queue (view 0, region 0), and load it again.
+
+    The last two vectors hold scalars: width, specular limit and barycentric weights.
+    """
     slot = wp.tid()
     path = Path()
     pixel = PathPixel()

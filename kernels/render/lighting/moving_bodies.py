@@ -95,7 +95,8 @@ def list_moving_body(
     then: wp.transformf,
     change: float,
 ):
-    """Append a moving body: `mesh` (-1: absent) and pose `now` in this frame, `last_mesh` and `then` in the previous one."""
+    """Append a moving body to the list: mesh index and pose in this frame (`mesh`, `now`) and in the previous one (`last_mesh`, `then`). A
+    mesh index of -1 means that the body is absent."""
     moving.mesh[view, rank] = wp.where(mesh >= 0, mesh, last_mesh)
     moving.to_body[view, rank] = wp.transform_inverse(wp.where(mesh >= 0, now, then))
     moving.change[view, rank] = change

@@ -7,15 +7,15 @@ from synpick_warp.kernels.render.visibility.camera import TILE_PIXELS
 from synpick_warp.kernels.tuning import LANE_COLUMNS, LANE_STRIDE
 
 MIN_COARSE_COLUMNS = 384
-"""Minimum number of coarse pixels across an image, from which their default width follows: 5 px at full HD, 1.9 mm at the bottom of the
-tote. In images of less than twice this width, coarse pixels are pixels."""
+"""Minimum number of coarse pixels in an image row. It determines the default width of coarse pixels: 5 px at full HD, 1.9 mm at the bottom
+of the tote. In images less than twice as wide, each coarse pixel is one pixel."""
 MIN_HISTORY_COLUMNS = 480
-"""Minimum number of coarse pixels across an image with light histories. Most coarse pixels then trace no path in a frame, so they may be
-narrower: 4 px at full HD, with one path each. That gives a PSNR of 35.3 dB, 5 px with two paths 34.5 dB (mean of the frames 0, 8 and 30 of
-a pick; tools/README.md, "Pictures")."""
+"""Minimum number of coarse pixels in a row of an image with light histories. Most coarse pixels then trace no path in a frame, so they
+may be narrower: 4 px at full HD, with one path each. That gives a PSNR of 35.3 dB, 5 px with two paths 34.5 dB (mean of the frames 0, 8 and
+30 of a pick; tools/README.md, "Pictures")."""
 MAX_COLUMNS_TWO_PATHS = 480
-"""Maximum number of coarse pixels across an image with two paths per coarse pixel by default; wider images have one. At 640x360, where
-coarse pixels are pixels, ten piles have a PSNR of 32.5 dB with one path and 33.6 dB with two, in 1.5 times the time."""
+"""Maximum number of coarse pixels in an image row for two paths per coarse pixel; beyond it the default is one path. At 640x360, where each
+coarse pixel is one pixel, ten piles have a PSNR of 32.5 dB with one path and 33.6 dB with two, in 1.5 times the time."""
 FIRST_FRAME_PATHS = 32
 """Default number of paths per coarse pixel in the first frame of an episode. They initialize all light histories at their default maximum
 length, so that the following frames trace fewer paths. Frame 8 gains 2 dB in PSNR at 480x270, 1.6 dB at full HD (tools/README.md,
@@ -32,9 +32,9 @@ def coarse_size(render: Render, width: int, histories: int = 0) -> int:
 
 
 def shadow_size(size: int) -> int:
-    """Width of a pixel of the shadow grid [px]: three quarters of that of a coarse pixel, `size`.
+    """Width of a shadow-grid pixel [px]: three quarters of the coarse-pixel width `size` [px], rounded down, at least 1.
 
-    At full HD 3 px are as good as 2, with less than half of the rays; 4 px are 0.2 to 0.3 dB worse.
+    At full HD, 3 px give the same PSNR as 2 px with less than half of the rays; 4 px lose 0.2 to 0.3 dB.
     """
     return max(1, 3 * size // 4)
 

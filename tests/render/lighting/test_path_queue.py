@@ -62,8 +62,8 @@ def light_of(bounces: int, walls: bool, paths: int, regions: int, device: wp.Dev
 
 
 def assert_same_light(queued: np.ndarray, alone: np.ndarray, device: wp.Device) -> None:
-    """Compare bit by bit on a CPU. On a GPU the compiler contracts operations of both kernels in different ways, which may change
-    a few decisions."""
+    """Compare bit by bit on a CPU. On a GPU the compiler contracts multiplications and additions (FMA) differently in the two kernels, so
+    that rounding may change the outcome of a few comparisons."""
     if device.is_cuda:
         assert np.isclose(queued, alone, rtol=1e-3, atol=1e-4).mean() > 0.999
     else:

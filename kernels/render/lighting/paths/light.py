@@ -61,7 +61,7 @@ def lamplit_radiance(lights: Lights, light: int) -> wp.vec3:
 
 @wp.func
 def limit_specular(brdf: Brdf, unoccluded: SplitRadiance, lamplit: wp.vec3, firefly_clamp: float) -> float:
-    """Firefly clamp of the specular light of a surface: limit of its largest channel; `lamplit` as of `clamp_path`."""
+    """Firefly clamp of the specular light of a surface: limit of its largest channel. Parameters: see `clamp_path`."""
     return wp.max(firefly_clamp * unoccluded.specular + wp.cw_mul(specular_albedo(brdf), lamplit))
 
 

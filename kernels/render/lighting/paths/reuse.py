@@ -47,9 +47,10 @@ def reuse_histories_kernel(
     guide_out: Guide,
     coarse_light_out: CoarseLight,
 ):
-    """Temporal reuse: the history's light for coarse pixels that trace no path in this frame, see `period_bits`; the others are listed.
+    """Temporal reuse: coarse pixels that trace no path in this frame (see `period_bits`) get the light of their history.
 
-    Writes nothing but the list for listed coarse pixels. Where nothing is visible, the history ends.
+    All other coarse pixels are appended to the path lists; their light and history are left unchanged. Where no surface is visible, the
+    history is reset.
     """
     index = wp.tid() + first
     view, row, column = interleaved_pixel(coarse, index)
