@@ -16,7 +16,7 @@ from synpick_warp.attempts import AttemptLog
 from synpick_warp.configs.schema import Config
 from synpick_warp.configs.splits import plan_episodes
 from synpick_warp.exporters.registry import load_exporter_classes
-from synpick_warp.factory.compilation import compile_launches, is_cache_warm, sole_compiler
+from synpick_warp.factory.compilation import compile_launches, is_cache_warm, make_compiler, sole_compiler
 from synpick_warp.memory_plan import check_memory
 from synpick_warp.progress import Progress, SilentProgress
 from synpick_warp.scenes.cameras import make_cameras
@@ -120,10 +120,11 @@ def compile_if_cold(
     with sole_compiler(progress):
         if is_cache_warm(device):
             return
-        progress.stage("compiling kernels of the assets")
-        factory = build_smallest(config, device, SilentProgress(), records_physics, needs_images)
-        compile_launches(factory.simulation, factory.stream if renders else None, progress)
-        del factory
+        progress.stage("compiling kernels, once")
+        with make_compiler(progress) as compiler:
+            factory = build_smallest(config, device, SilentProgress(), records_physics, needs_images)
+            compile_launches(compiler, factory.simulation, factory.stream if renders else None)
+            del factory
     gc.collect()  # Tracebacks that Warp's code generation leaves hold frames, and these its arrays.
 
 

@@ -11,7 +11,7 @@ from synpick_warp.kernels.sim.snapshot import take_snapshot_kernel
 from synpick_warp.progress import Progress
 from synpick_warp.stages.sim.simulate import Simulation
 from synpick_warp.stages.stream import FrameStream, TickReader
-from synpick_warp.system.kernels import DryLaunches, build_of, compilation_lock, compile_modules
+from synpick_warp.system.kernels import Compiler, DryLaunches, build_of, compilation_lock
 
 
 def is_cache_warm(device: wp.Device) -> bool:
@@ -27,22 +27,25 @@ def sole_compiler(progress: Progress) -> AbstractContextManager[None]:
     return compilation_lock(lambda: progress.stage("waiting for another process, which compiles kernels"))
 
 
-def compile_launches(simulation: Simulation, stream: FrameStream | None, progress: Progress) -> int:
-    """Compile and load what `launch_all` launches and the kernel cache lacks.
+def make_compiler(progress: Progress) -> Compiler:
+    """A compiler that reports "compiling kernels: 14 of 37 modules"."""
+    return Compiler(lambda ready, total: progress.stage(f"compiling kernels: {ready} of {total} modules"))
+
+
+def compile_launches(compiler: Compiler, simulation: Simulation, stream: FrameStream | None) -> None:
+    """Compile and load what `launch_all` launches and the kernel cache lacks, and last the kernel of `is_cache_warm`.
 
     Args:
+        compiler: Entered.
         simulation: Worlds that have not ticked yet. No kernel runs, so that their state stays; contents of scratch arrays may change.
         stream: Renderer and encoders; None: nothing is rendered.
-        progress: Receives "compiling kernels: 14 of 37 modules".
-
-    Returns:
-        The number of compiled modules.
     """
     with DryLaunches() as dry:
         launch_all(simulation, stream)
     simulation.clear_graphs()
     marker = build_of(take_snapshot_kernel, simulation.device)
-    return compile_modules(dry.builds, lambda ready, count: progress.stage(f"compiling kernels: {ready} of {count} modules"), marker)
+    compiler.submit(build for build in dry.builds if build != marker)
+    compiler.compile_last(marker)
 
 
 def launch_all(simulation: Simulation, stream: FrameStream | None) -> None:

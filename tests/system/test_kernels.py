@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import subprocess
 import sys
+import threading
+import time
+from typing import Any
 
 import numpy as np
 import pytest
 import warp as wp
 
 from synpick_warp.system import kernels
-from synpick_warp.system.kernels import DryLaunches, ModuleBuild, build_of, compilation_lock, compile_modules
+from synpick_warp.system.kernels import Compiler, DryLaunches, ModuleBuild, build_of, compilation_lock, split_modules
 
 MODULES = 3
 
@@ -52,21 +55,49 @@ def test_dry_launches_run_nothing_and_list_what_they_would_load(device, empty_ca
 
 
 def test_modules_that_the_cache_lacks_are_compiled_once_and_counted(device, empty_cache):
-    scales = [make_kernel(5.0 + index) for index in range(MODULES)]
+    """Submitted ones, a marker after them, and one that a launch compiles."""
+    scales = [make_kernel(5.0 + index) for index in range(MODULES + 2)]
     builds = [build_of(scale, device) for scale in scales]
     assert not any(build.is_cached() for build in builds)
-    reports = []
-    assert compile_modules(builds, lambda *counts: reports.append(counts)) == MODULES
-    assert reports == [(ready, MODULES) for ready in range(MODULES + 1)]
-    assert all(build.is_cached() for build in builds)
-    binaries = kernels.list_binaries()
-    assert len(binaries) == MODULES
-    assert compile_modules(builds, lambda *counts: reports.append(counts)) == 0
+    values, reports = wp.ones(4, dtype=float, device=device), []
+    with Compiler(lambda *counts: reports.append(counts)) as compiler:
+        Compiler.start_early(scales[0], device, builds[0].block)
+        compiler.submit(builds[:MODULES])
+        compiler.compile_last(builds[MODULES])
+        for scale in scales:
+            wp.launch(scale, dim=4, inputs=[values], device=device)
+    assert (compiler.compiled, reports[-1]) == (MODULES + 2, (MODULES + 2, MODULES + 2))
+    assert all(ready <= total for ready, total in reports)
+    np.testing.assert_array_equal(values.numpy(), 5.0 * 6.0 * 7.0 * 8.0 * 9.0)
+    assert len(kernels.list_binaries()) == MODULES + 2
+    with Compiler(lambda *_: pytest.fail("nothing is missing")) as compiler:
+        compiler.submit(builds)
+    assert compiler.compiled == 0
+
+
+def test_a_launch_waits_for_the_thread_that_compiles_its_module(device, empty_cache, monkeypatch):
+    """Reports go on meanwhile, and nothing is compiled twice."""
+    scale, reports, loads, load = make_kernel(13.0), [], [], wp.Module.load
+    begun = threading.Event()
+
+    def load_slowly(module, *arguments, **options):
+        loads.append(threading.current_thread().name)
+        if loads[-1].startswith("compile"):
+            begun.set()
+            while len(reports) < 3:
+                time.sleep(0.01)
+        return load(module, *arguments, **options)
+
+    monkeypatch.setattr(wp.Module, "load", load_slowly)
+    monkeypatch.setattr(kernels, "REPORT_INTERVAL", 0.01)
     values = wp.ones(4, dtype=float, device=device)
-    for scale in scales:
+    with Compiler(lambda *counts: reports.append(counts)) as compiler:
+        compiler.submit([build_of(scale, device)])
+        assert begun.wait(60)
         wp.launch(scale, dim=4, inputs=[values], device=device)
-    np.testing.assert_array_equal(values.numpy(), 5.0 * 6.0 * 7.0)
-    assert (len(reports), kernels.list_binaries()) == (MODULES + 1, binaries)
+    np.testing.assert_array_equal(values.numpy(), 13.0)
+    assert loads[0].startswith("compile")
+    assert (reports[0], reports[-1], compiler.compiled) == ((0, 1), (1, 1), 1)
 
 
 def test_a_compiler_that_fails_is_told(device, empty_cache, monkeypatch):
@@ -76,8 +107,31 @@ def test_a_compiler_that_fails_is_told(device, empty_cache, monkeypatch):
         raise RuntimeError("no space left")
 
     monkeypatch.setattr(wp.Module, "load", fail)
-    with pytest.raises(RuntimeError, match="no space left"):
-        compile_modules(builds, lambda *_: None)
+    with pytest.raises(RuntimeError, match="no space left"), Compiler(lambda *_: None) as compiler:
+        compiler.submit(builds)
+    assert wp.Module.load is fail
+
+
+def test_kernels_of_a_library_get_modules_of_their_own(device, empty_cache):
+    """One is launched, and the other one is not compiled; a generic kernel's overloads do not compile others again."""
+    module = wp.get_module("tests.library")
+
+    def double(values: wp.array[float]):
+        values[wp.tid()] *= 2.0
+
+    def triple(values: wp.array[Any]):
+        values[wp.tid()] *= values.dtype(3.0)
+
+    doubling, tripling = (wp.Kernel(func, key=func.__name__, module=module) for func in (double, triple))
+    split_modules(("tests.lib",))
+    values = wp.ones(4, dtype=float, device=device)
+    wp.launch(doubling, dim=4, inputs=[values], device=device)
+    assert len(kernels.list_binaries()) == 1
+    wp.launch(tripling, dim=4, inputs=[values], device=device)
+    wp.launch(tripling, dim=4, inputs=[wp.ones(4, dtype=wp.float64, device=device)], device=device)
+    np.testing.assert_array_equal(values.numpy(), 6.0)
+    assert {kernel.module.name for kernel in (doubling, tripling)} == {"tests.library.double", "tests.library.triple"}
+    assert len(kernels.list_binaries()) == 3
 
 
 HOLDER = """

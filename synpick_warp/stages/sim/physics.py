@@ -18,8 +18,11 @@ from synpick_warp.kernels.sim import gripper, rest
 from synpick_warp.scenes import build
 from synpick_warp.stages.sim.broad_phase import replace_broad_phase
 from synpick_warp.stages.sim.fused_solver import KNOWN_NEWTON, choose_solver
+from synpick_warp.system.kernels import Compiler, split_modules
 from synpick_warp.system.threads import is_only_launcher
 
+# Of the kernels in these modules of Newton, a bake launches a fifth.
+split_modules(("newton._src.geometry.", "newton._src.sim.", "newton._src.solvers.solver", "newton._src.solvers.steel."))
 # Sentinel: default of `next` for an exhausted iterator.
 ENDED = object()
 # Contacts with a larger gap get no constraint rows [m]. The collision pipeline finds none that far apart: a hook disables a contact so.
@@ -36,6 +39,8 @@ VELOCITY_LIMIT_FRACTION = 0.5
 # 0.208 s; 512 worlds 0.254 instead of 0.269, in a second run 0.261 and 0.260. With one substep a tick of 2,048 worlds takes 0.313 s in one
 # block for each world, 0.301 in two, 0.299 in four.
 NARROW_PHASE_BLOCK, NARROW_PHASE_BLOCKS, NARROW_PHASE_WORLD_BLOCKS = 32, 8, 2
+# Block size of the narrow phase's refinement in Newton; its kernel takes longer to compile than any other.
+REFINE_BLOCK = 32
 # On an H200, models of one and two worlds round differently from those of 8, 64 and 512, which agree bit by bit.
 MIN_GPU_WORLDS = 8
 # Maximum worlds if `bake.worlds` is 0. On a GPU more worlds need memory and hide more of the latency of physics, which rendering hides as
@@ -280,6 +285,7 @@ def make_pipeline(physics: PhysicsConfig, model: newton.Model) -> newton.Collisi
         narrow_phase.split_convex_block_dim = NARROW_PHASE_BLOCK
         blocks = max(NARROW_PHASE_BLOCKS * model.device.sm_count, NARROW_PHASE_WORLD_BLOCKS * model.world_count)
         narrow_phase.split_convex_total_num_threads = NARROW_PHASE_BLOCK * blocks
+        Compiler.start_early(narrow_phase.narrow_phase_refine_kernel, model.device, REFINE_BLOCK)
     return pipeline
 
 
