@@ -5,8 +5,9 @@ Whoever assembles stages (bake, stream, warm-up) passes the whole `Config` on; s
 
 from __future__ import annotations
 
+import contextlib
 import gc
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -16,7 +17,7 @@ from synpick_warp.attempts import AttemptLog
 from synpick_warp.configs.schema import Config
 from synpick_warp.configs.splits import plan_episodes
 from synpick_warp.exporters.registry import load_exporter_classes
-from synpick_warp.factory.compilation import compile_launches, is_cache_warm, make_compiler, sole_compiler
+from synpick_warp.factory.compilation import is_cache_warm, make_compiler, sole_compiler, submit_launches, submit_slow
 from synpick_warp.memory_plan import check_memory
 from synpick_warp.progress import Progress, SilentProgress
 from synpick_warp.scenes.cameras import make_cameras
@@ -102,30 +103,37 @@ def build_factory(
     config = fit_to_device(without_pictures(config), device, planned, writers, processes)
     check_memory(config, device, writers, processes)
     renders = any(kind.needs_views for kind in load_exporter_classes(config.bake.formats))
-    compile_if_cold(config, device, progress, records_physics, needs_images, renders)
-    return _assemble(config, device, progress, episodes, records_physics, needs_images, longest_first)
+    with compiling_if_cold(config, device, progress, records_physics, needs_images, renders):
+        return _assemble(config, device, progress, episodes, records_physics, needs_images, longest_first)
 
 
-def compile_if_cold(
+@contextlib.contextmanager
+def compiling_if_cold(
     config: Config, device: wp.Device, progress: Progress, records_physics: bool = False, needs_images: bool = True, renders: bool = True
-) -> None:
-    """Compile the kernels of a bake in parallel if the kernel cache is cold, with a minimal factory that is freed again.
+) -> Iterator[None]:
+    """Compile the kernels of a bake in parallel if the kernel cache is cold, while the body of the context builds worlds.
+
+    A minimal factory, which is freed again, shows which kernels there are. They are ready when the context is left.
 
     Args:
         config, device, progress, records_physics, needs_images: As of `build_factory`.
         renders: Whether views are rendered.
     """
     if is_cache_warm(device):
+        yield
         return
     with sole_compiler(progress):
         if is_cache_warm(device):
+            yield
             return
         progress.stage("compiling kernels, once")
-        with make_compiler(progress) as compiler:
+        with make_compiler(device, progress) as compiler:
+            submit_slow(compiler, device)
             factory = build_smallest(config, device, SilentProgress(), records_physics, needs_images)
-            compile_launches(compiler, factory.simulation, factory.stream if renders else None)
+            submit_launches(compiler, factory.simulation, factory.stream if renders else None)
             del factory
-    gc.collect()  # Tracebacks that Warp's code generation leaves hold frames, and these its arrays.
+            gc.collect()  # Tracebacks that Warp's code generation leaves hold frames, and these its arrays.
+            yield
 
 
 def build_smallest(config: Config, device: wp.Device, progress: Progress, records_physics: bool, needs_images: bool) -> Factory:

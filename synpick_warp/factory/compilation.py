@@ -7,8 +7,10 @@ from contextlib import AbstractContextManager
 import warp as wp
 
 from synpick_warp.codes import Status
+from synpick_warp.kernels.render.visibility.wide_bvh import read_binary_bvh_kernel
 from synpick_warp.kernels.sim.snapshot import take_snapshot_kernel
 from synpick_warp.progress import Progress
+from synpick_warp.stages.sim.physics import slow_builds
 from synpick_warp.stages.sim.simulate import Simulation
 from synpick_warp.stages.stream import FrameStream, TickReader
 from synpick_warp.system.kernels import Compiler, DryLaunches, build_of, compilation_lock
@@ -27,13 +29,19 @@ def sole_compiler(progress: Progress) -> AbstractContextManager[None]:
     return compilation_lock(lambda: progress.stage("waiting for another process, which compiles kernels"))
 
 
-def make_compiler(progress: Progress) -> Compiler:
-    """A compiler that reports "compiling kernels: 14 of 37 modules"."""
-    return Compiler(lambda ready, total: progress.stage(f"compiling kernels: {ready} of {total} modules"))
+def make_compiler(device: wp.Device, progress: Progress) -> Compiler:
+    """A compiler that reports "compiling kernels: 14 of 37 modules"; it compiles the kernel of `is_cache_warm` last."""
+    last = build_of(take_snapshot_kernel, device)
+    return Compiler(lambda ready, total: progress.stage(f"compiling kernels: {ready} of {total} modules"), last)
 
 
-def compile_launches(compiler: Compiler, simulation: Simulation, stream: FrameStream | None) -> None:
-    """Compile and load what `launch_all` launches and the kernel cache lacks, and last the kernel of `is_cache_warm`.
+def submit_slow(compiler: Compiler, device: wp.Device) -> None:
+    """Start to compile what every bake needs and takes longest, before worlds are built that launch it."""
+    compiler.submit([build_of(read_binary_bvh_kernel, wp.get_device("cpu")), *slow_builds(device)])
+
+
+def submit_launches(compiler: Compiler, simulation: Simulation, stream: FrameStream | None) -> None:
+    """Start to compile what `launch_all` launches.
 
     Args:
         compiler: Entered.
@@ -43,9 +51,7 @@ def compile_launches(compiler: Compiler, simulation: Simulation, stream: FrameSt
     with DryLaunches() as dry:
         launch_all(simulation, stream)
     simulation.clear_graphs()
-    marker = build_of(take_snapshot_kernel, simulation.device)
-    compiler.submit(build for build in dry.builds if build != marker)
-    compiler.compile_last(marker)
+    compiler.submit(dry.builds)
 
 
 def launch_all(simulation: Simulation, stream: FrameStream | None) -> None:

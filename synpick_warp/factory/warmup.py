@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from synpick_warp.configs.schema import Config
 from synpick_warp.exporters.registry import load_exporter_classes
 from synpick_warp.factory.assembly import build_smallest
-from synpick_warp.factory.compilation import compile_launches, launch_all, make_compiler, sole_compiler
+from synpick_warp.factory.compilation import launch_all, make_compiler, sole_compiler, submit_launches, submit_slow
 from synpick_warp.kernels.render.images.ground_truth import gather_cameras_kernel
 from synpick_warp.progress import Progress
 from synpick_warp.system.device import pick_device
@@ -46,10 +46,11 @@ def warm_up(config: Config, progress: Progress) -> WarmUp:
     needs = [any(getattr(kind, name) for kind in kinds) for name in ("needs_physics", "needs_images")]
     with sole_compiler(progress):
         before = list_binaries()
-        with make_compiler(progress) as compiler:
+        with make_compiler(device, progress) as compiler:
+            submit_slow(compiler, device)
             compiler.submit([build_of(gather_cameras_kernel, device)])  # The one module that only the online stream needs.
             factory = build_smallest(config, device, progress, *needs)
             stream = factory.stream if any(kind.needs_views for kind in kinds) else None
-            compile_launches(compiler, factory.simulation, stream)
+            submit_launches(compiler, factory.simulation, stream)
         launch_all(factory.simulation, stream)
     return WarmUp(len(list_binaries() - before), time.perf_counter() - started)

@@ -22,7 +22,7 @@ from synpick_warp.codes import Phase
 from synpick_warp.configs.schema import Config
 from synpick_warp.episodes import BakeSummary, episode_row, is_resampled, remedy
 from synpick_warp.errors import ConfigError
-from synpick_warp.factory.assembly import Stages, build_stages, compile_if_cold
+from synpick_warp.factory.assembly import Stages, build_stages, compiling_if_cold
 from synpick_warp.memory_plan import check_episodes, check_memory, explain_shortage
 from synpick_warp.online.selection import Selection, choose_episodes
 from synpick_warp.progress import Progress
@@ -194,8 +194,8 @@ def open_stream(
     config = fit_to_device(config, device, len(indices), DEVICE_ONLY)
     check_memory(config, device, DEVICE_ONLY)
     with explain_shortage(config):
-        compile_if_cold(config, device, progress)
-        stages = build_stages(config, device, progress, indices)
+        with compiling_if_cold(config, device, progress):
+            stages = build_stages(config, device, progress, indices)
         ring = BatchRing(stages.sizes, config.render.layers, stages.renderer, config.bop.depth_scale)
     return ViewStream(Producer(stages, ring, selection, BakeSummary(len(indices)), progress))
 

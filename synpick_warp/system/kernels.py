@@ -14,7 +14,7 @@ from collections.abc import Callable, Collection, Iterable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from pathlib import Path
 from types import TracebackType
-from typing import Any, ClassVar, NamedTuple, Self
+from typing import Any, NamedTuple, Self
 
 import warp as wp
 from warp._src import context
@@ -148,22 +148,22 @@ class Compiler:
     """Thread pool that compiles and loads Warp modules ahead of their launches.
 
     While it is entered, a launch whose module is being compiled waits for it, and modules that launches compile themselves are counted as
-    well. Leaving it waits for all modules. Reports come from the thread that entered it.
+    well. Leaving it waits for all modules, and then compiles the last one. Reports come from the thread that entered it.
 
     Attributes:
         compiled: Number of modules that were compiled.
     """
 
-    _active: ClassVar[Self | None] = None
-
-    def __init__(self, report: Callable[[int, int], None]) -> None:
+    def __init__(self, report: Callable[[int, int], None], last: ModuleBuild | None = None) -> None:
         """Start no thread yet.
 
         Args:
             report: Progress callback (ready, total): whenever a module begins or is ready, and every `REPORT_INTERVAL` meanwhile; not
                 called if the kernel cache has all.
+            last: A module that is compiled after all others, so that the kernel cache has all if it has this one.
         """
         self.compiled = 0
+        self._last = last
         self._report = report
         self._tasks: dict[ModuleBuild, Future[Any]] = {}
         self._seen: set[ModuleBuild] = set()
@@ -173,7 +173,7 @@ class Compiler:
         self._pool = ThreadPoolExecutor(min(count_cores(), MAX_COMPILERS), thread_name_prefix="compile")
 
     def __enter__(self) -> Self:
-        compiler, self._load, Compiler._active = self, wp.Module.load, self
+        compiler, self._load = self, wp.Module.load
 
         def load(module: wp.Module, device: Any, block_dim: int | None = None, *others: Any, **options: Any) -> Any:
             if threading.current_thread() is compiler._owner:
@@ -187,28 +187,18 @@ class Compiler:
         try:
             if error is None:
                 self._wait(self._tasks.values())
+                if self._last is not None:
+                    self._last.module.load(self._last.device, self._last.block)
                 self._say()
         finally:
-            wp.Module.load, Compiler._active = self._load, None  # type: ignore[method-assign]
+            wp.Module.load = self._load  # type: ignore[method-assign]
             self._pool.shutdown(cancel_futures=True)
-
-    @classmethod
-    def start_early(cls, kernel: Any, device: wp.Device, block: int) -> None:
-        """Start to compile the module of a kernel that takes long to compile; does nothing where no compiler is entered."""
-        if cls._active is not None:
-            cls._active.submit([ModuleBuild(kernel.module, device.alias, block)])
 
     def submit(self, builds: Iterable[ModuleBuild]) -> None:
         """Start to compile those modules that the kernel cache lacks, in this order."""
         for build in builds:
-            if build not in self._tasks and not build.is_cached():
+            if build not in self._tasks and build != self._last and not build.is_cached():
                 self._tasks[build] = self._pool.submit(self._load, build.module, build.device, build.block)
-        self._say()
-
-    def compile_last(self, build: ModuleBuild) -> None:
-        """Compile a module after all that were submitted: a marker that the kernel cache has them."""
-        self._wait(self._tasks.values())
-        build.module.load(build.device, build.block)
         self._say()
 
     def _await(self, build: ModuleBuild) -> None:

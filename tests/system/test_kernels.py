@@ -60,10 +60,9 @@ def test_modules_that_the_cache_lacks_are_compiled_once_and_counted(device, empt
     builds = [build_of(scale, device) for scale in scales]
     assert not any(build.is_cached() for build in builds)
     values, reports = wp.ones(4, dtype=float, device=device), []
-    with Compiler(lambda *counts: reports.append(counts)) as compiler:
-        Compiler.start_early(scales[0], device, builds[0].block)
-        compiler.submit(builds[:MODULES])
-        compiler.compile_last(builds[MODULES])
+    with Compiler(lambda *counts: reports.append(counts), last=builds[MODULES]) as compiler:
+        compiler.submit(builds[: MODULES + 1])
+        assert not builds[MODULES].is_cached()
         for scale in scales:
             wp.launch(scale, dim=4, inputs=[values], device=device)
     assert (compiler.compiled, reports[-1]) == (MODULES + 2, (MODULES + 2, MODULES + 2))

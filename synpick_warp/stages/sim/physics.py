@@ -10,6 +10,9 @@ from typing import Any, Protocol
 import newton
 import numpy as np
 import warp as wp
+from newton._src.geometry import narrow_phase as narrow
+from newton._src.sim import collide
+from newton._src.sim import model as newton_model
 
 from synpick_warp.configs.schema import Config
 from synpick_warp.configs.schema import Physics as PhysicsConfig
@@ -18,11 +21,14 @@ from synpick_warp.kernels.sim import gripper, rest
 from synpick_warp.scenes import build
 from synpick_warp.stages.sim.broad_phase import replace_broad_phase
 from synpick_warp.stages.sim.fused_solver import KNOWN_NEWTON, choose_solver
-from synpick_warp.system.kernels import Compiler, split_modules
+from synpick_warp.system.kernels import ModuleBuild, split_modules
 from synpick_warp.system.threads import is_only_launcher
 
 # Of the kernels in these modules of Newton, a bake launches a fifth.
 split_modules(("newton._src.geometry.", "newton._src.sim.", "newton._src.solvers.solver", "newton._src.solvers.steel."))
+for _type in (bool, float, int, wp.uint64, wp.vec2i, wp.vec3, wp.vec3i, wp.vec4i, wp.transform):
+    # Newton adds these overloads one launch after the other, and each compiles all of them before it once more.
+    wp.overload(newton_model._copy_variant_shape_kernel, {"variant_values": wp.array(dtype=_type), "values": wp.array(dtype=_type)})
 # Sentinel: default of `next` for an exhausted iterator.
 ENDED = object()
 # Contacts with a larger gap get no constraint rows [m]. The collision pipeline finds none that far apart: a hook disables a contact so.
@@ -285,8 +291,21 @@ def make_pipeline(physics: PhysicsConfig, model: newton.Model) -> newton.Collisi
         narrow_phase.split_convex_block_dim = NARROW_PHASE_BLOCK
         blocks = max(NARROW_PHASE_BLOCKS * model.device.sm_count, NARROW_PHASE_WORLD_BLOCKS * model.world_count)
         narrow_phase.split_convex_total_num_threads = NARROW_PHASE_BLOCK * blocks
-        Compiler.start_early(narrow_phase.narrow_phase_refine_kernel, model.device, REFINE_BLOCK)
     return pipeline
+
+
+def slow_builds(device: wp.Device) -> list[ModuleBuild]:
+    """Modules that take longest to compile, and that every bake launches: Newton's narrow phase of convex shapes.
+
+    Kernels that are created twice are one: their modules have the same name, and the same source.
+    """
+    options: dict[str, Any] = {"support_func": narrow.support_map_lean, "post_process_contact": narrow.post_process_minkowski_only}
+    if not device.is_cuda:
+        kernel: Any = narrow.create_narrow_phase_kernel_gjk_mpr(True, collide.write_contact, **options)
+        return [ModuleBuild(kernel.module, device.alias, 1)]
+    mpr, gjk, refine, manifold = narrow.create_narrow_phase_kernels_gjk_mpr_split(True, collide.write_contact, **options)
+    blocks = {refine: REFINE_BLOCK, manifold: NARROW_PHASE_BLOCK, mpr: NARROW_PHASE_BLOCK, gjk: NARROW_PHASE_BLOCK}
+    return [ModuleBuild(kernel.module, device.alias, block) for kernel, block in blocks.items()]
 
 
 def make_solver(physics: PhysicsConfig, model: newton.Model, slots: int) -> newton.solvers.SolverSteel:
