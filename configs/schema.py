@@ -84,9 +84,13 @@ class Objects:
     piece_vertices: int = setting(32, "", "Maximum vertices of each piece of a convex decomposition.", low=8, high=256)
     pieces: int = setting(16, "", "Maximum pieces of a convex decomposition.", low=1, high=64)
     concavity: float = setting(0.05, "", "CoACD's concavity threshold; smaller values follow the surface more closely.", low=0.01, high=1.0)
+    decomposition_time: float = setting(
+        300.0, "s", "Time limit of a convex decomposition; an object that takes longer gets its convex hull.", above=0.0, high=86400.0
+    )
     concave_ratio: float = setting(
         0.6, "", "Objects without a row in the object table are decomposed if mesh volume / hull volume is below this.", low=0.0, high=1.0
     )
+    strict: bool = setting(False, "", "End the bake at the first object that cannot be used, instead of leaving it out with a line.")
     density: float = setting(400.0, "kg/m³", "Density over the volume of the convex hull, for objects without a mass.", above=0.0)
     metallic: float = setting(0.1, "", "Metallic factor of objects whose material names none.", low=0.0, high=1.0)
     roughness: float = setting(0.5, "", "Roughness of objects whose material names none.", low=0.0, high=1.0)
