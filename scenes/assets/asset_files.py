@@ -102,20 +102,39 @@ def read_referred(folder: Path, name: str, owner: object, limit: int) -> tuple[P
     Raises:
         CatalogError: The name leads out of the folder, or the file is missing, too large or not a regular file.
     """
-    fault = None
-    try:
-        path = path_inside(folder, name, owner, CatalogError)
-    except CatalogError as error:
-        path, fault = folder, error
-    if fault is not None or not os.path.lexists(path):
-        scope = _scope.get() or AssetScope(folder)
-        found = _find_elsewhere(folder, name, scope.root) if name.isprintable() and len(name) <= MAX_NAME else None
-        if found is None:
-            raise fault or CatalogError(f"{owner} refers to {name!a}, but there is no file {path}; add it or remove the reference")
-        if os.path.normpath(found) != os.path.normpath(folder / name):
-            scope.moved.append(f"{owner} refers to {name!a}; {found} is read")
-        path = found
+    scope = _scope.get() or AssetScope(folder)
+    path = locate(folder, name, owner, CatalogError, scope.root)
+    if not os.path.lexists(path):
+        raise CatalogError(f"{owner} refers to {name!a}, but there is no file {path}; add it or remove the reference")
+    if os.path.normpath(path) != os.path.normpath(folder / name):
+        scope.moved.append(f"{owner} refers to {name!a}; {path} is read")
     return path, read_file(path, limit, CatalogError)
+
+
+def locate(folder: Path, name: str, owner: object, error: type[SynpickError], root: Path | None = None) -> Path:
+    """Path of a file that another one names; if it is not there, of what the name may mean (see `read_referred`), if that is there.
+
+    Args:
+        folder: Folder of the file that names it.
+        name: The name.
+        owner: The file that names it, for errors.
+        error: Class of the exception.
+        root: Folder that the name must not lead out of; None: `folder`.
+
+    Raises:
+        SynpickError: As `error`: the name leads out of the folder.
+    """
+    path, fault = folder, None
+    try:
+        path = path_inside(folder, name, owner, error)
+    except SynpickError as caught:
+        fault = caught
+    if fault is None and os.path.lexists(path):
+        return path
+    found = _find_elsewhere(folder, name, root or folder) if name.isprintable() and len(name) <= MAX_NAME else None
+    if found is None and fault is not None:
+        raise fault
+    return found or path
 
 
 def _find_elsewhere(folder: Path, name: str, root: Path) -> Path | None:

@@ -176,7 +176,7 @@ def corrected_entry(entry: Any, own: dict[str, Any]) -> dict[str, Any]:
     """An object's entry for a data set: as it is if it agrees with the mesh, else with the sizes of its `own` [mm], or `own` altogether."""
     low, size = (np.array([own[key] for key in keys]) * _MILLIMETRE for keys in (_EXTENTS[:3], _EXTENTS[3:]))
     try:
-        info, said = compare_sizes(_convert(entry, 0, Path()), low, size, own["diameter"] * _MILLIMETRE)
+        _, said = compare_sizes(_convert(entry, 0, Path()), low, size, own["diameter"] * _MILLIMETRE)
     except CatalogError:
         return own
     if not said:

@@ -167,7 +167,7 @@ def build_stages(
     cameras = make_cameras(config.cameras)
     fixtures = make_fixtures(config.tote, config.gripper)
     catalog = load_catalog(config, report=progress.note)
-    lights = load_lights(config.bake.lights)
+    lights = load_lights(config.bake.lights, progress.note, config.objects.strict)
     if longest_first and episodes is not None:
         episodes = order_longest_first(config, catalog, episodes, device)
     progress.stage(f"building {config.bake.worlds} worlds of {len(catalog)} objects on {device.alias}")

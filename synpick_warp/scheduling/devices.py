@@ -265,7 +265,8 @@ def bake_on_devices(
     with DeviceProcesses(names, program, output.lock) as processes:
         report = partial(processes.report_once, progress)
         report("stage", "loading objects and lights")
-        catalog, lights = load_catalog(config, report=partial(report, "note")), load_lights(config.bake.lights)
+        catalog = load_catalog(config, report=partial(report, "note"))
+        lights = load_lights(config.bake.lights, partial(report, "note"), config.objects.strict)
         prepare_folder(output, kinds, catalog, lights)
         dealt = deal_episodes(order_longest_first(config, catalog, output.remaining, pick_device("cpu")), len(names))
         writers = deal_writers(count_writers(config), len(names))
