@@ -179,6 +179,9 @@ class Arrangement:
         above=0.0,
     )
     max_objects: int = setting(24, "", "Maximum objects of an episode.", low=1, high=32)
+    repeat_to_fill: bool = setting(
+        True, "", "Let objects repeat in an episode, as pick.repeats does, where all of the catalog together stay below the budget."
+    )
     slot_shortfall: float = setting(
         1e-3,
         "",

@@ -312,8 +312,8 @@ def _check_rows(image: np.ndarray, path: Path) -> None:
 
     A sky that ends at the horizon has black rows, too, all those below it.
     """
-    black = ~image.any(axis=2)
-    rows = np.flatnonzero(black.all(axis=1))
+    black = (image == 0.0).all(axis=2)
+    rows = np.flatnonzero(np.all(black, axis=1))
     if len(rows) and black.sum() == len(rows) * image.shape[1] and abs(len(rows) - image.shape[0] / 2) > 1:
         raise LightError(
             f"{path}: {len(rows)} of {image.shape[0]} rows are black, from row {rows[0]} on, while no other texel is: it was cut short; "

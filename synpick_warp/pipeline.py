@@ -226,7 +226,7 @@ class _Run:
     def _end(self, report: TickReport, world: int, record: EpisodeRecord) -> None:
         row = episode_row(self.config, report, world, record)
         end = episode_end(self.config, row, record)
-        advice = remedy(self.config, row.ending)
+        advice = remedy(self.factory.simulation.config, row.ending)
         if advice:
             self.summary.remedies[row.ending] = advice
         if is_resampled(self.config, row):

@@ -27,8 +27,10 @@ SETTINGS = {key: value for key, value in (QUICK | TINY).items() if not key.start
         ("target", [(0.1, 0.1, 0.1), (0.1, 0.1, 0.1)]),
         ("move", [(0.003, 0.003, 0.003)]),
         ("pick", [(0.144, 0.144, 0.144)]),
+        ("move", [(0.1, 0.08, 0.001)]),
+        ("move", [(0.1, 0.08, 0.001), (0.1, 0.002, 0.002), (0.01, 0.003, 0.002)]),
     ],
-    ids=["a litre", "twins", "3 mm", "the whole budget"],
+    ids=["a litre", "twins", "3 mm", "the whole budget", "plates of 1 mm", "plates, rods and bolts"],
 )
 def test_a_catalog_of_one_or_two_objects_gives_episodes(mode, sizes, tmp_path):
     """Fault 4: with cubes of 100 mm, all 20 arrangements needed more body slots than a world had."""
@@ -40,3 +42,24 @@ def test_a_catalog_of_one_or_two_objects_gives_episodes(mode, sizes, tmp_path):
     assert [row.ending.delivers for row in summary.episodes] == [True]
     assert summary.redraws == 0
     assert summary.views > 0
+
+
+def test_one_model_fills_the_tote_in_mode_pick(tmp_path):
+    """There was one object in the tote, and no word."""
+    (tmp_path / "models").mkdir()
+    trimesh.creation.box((0.1, 0.1, 0.1)).export(tmp_path / "models" / "box.ply")
+    config = load_config("smoke", SETTINGS | {"bake.mode": "pick", "bake.models": str(tmp_path / "models")})
+    progress = Notes()
+    summary = run_bake(config, tmp_path / "out", progress)
+    assert [row.objects for row in summary.episodes] == [3]
+    assert "1 objects take 0.001 of 0.003 m³ together, so that they repeat in an episode" in progress.lines
+
+
+class Notes(SilentProgress):
+    """Keeps notes."""
+
+    def __init__(self) -> None:
+        self.lines: list[str] = []
+
+    def note(self, text: str) -> None:
+        self.lines.append(text)

@@ -67,6 +67,7 @@ def test_errors_are_results_and_large_results_arrive(capfd):
 
 def test_a_server_that_has_ended_is_started_again():
     list(run_isolated(math.sqrt, [(4.0,)], LIMITS))
+    assert isolation._server._worker is not None
     isolation._server._worker.process.kill()
     assert list(run_isolated(math.sqrt, [(4.0,)], LIMITS)) == [2.0]
 
