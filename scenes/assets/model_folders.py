@@ -127,6 +127,9 @@ def _in_subfolders(entries: list[Path], report: Say) -> list[tuple[Path, Path]]:
     found = []
     for place in entries:
         if place.is_dir() and (meshes := _meshes_below(place)):
+            bop = next((mesh for mesh in meshes if bop_obj_id(mesh) is not None), None)
+            if bop is not None:
+                raise CatalogError(f"models folder {place.parent}: its folder {bop.parent.name} has BOP models; give {bop.parent}")
             found.append((place, meshes[0]))
             if len(meshes) > 1:
                 report(f"{place}: {len(meshes)} meshes, of which {meshes[0].relative_to(place)} is read")

@@ -191,6 +191,12 @@ def test_a_folder_per_object_with_textures_beside(tmp_path, mtl, depth):
     assert sum("2 meshes, of which" in line for line in lines) == 2
 
 
+def test_a_whole_bop_data_set_is_pointed_to_its_models(tmp_path):
+    write(tmp_path / "set", models__obj_000001_dot_ply=box(100.0, 60.0, 20.0), camera_dot_json="{}")
+    with pytest.raises(CatalogError, match=r"its folder models has BOP models; give .*/set/models$"):
+        load(tmp_path / "set", tmp_path)
+
+
 def test_a_set_of_lights_from_windows(tmp_path):
     folder = write(tmp_path / "set", a_dot_ibl="[Reflection]\nREFfile = Maps\\REF.hdr\n")
     (folder / "maps").mkdir()
