@@ -27,10 +27,8 @@ SETTINGS = {key: value for key, value in (QUICK | TINY).items() if not key.start
         ("target", [(0.1, 0.1, 0.1), (0.1, 0.1, 0.1)]),
         ("move", [(0.003, 0.003, 0.003)]),
         ("pick", [(0.144, 0.144, 0.144)]),
-        ("move", [(0.1, 0.08, 0.001)]),
-        ("move", [(0.1, 0.08, 0.001), (0.1, 0.002, 0.002), (0.01, 0.003, 0.002)]),
     ],
-    ids=["a litre", "twins", "3 mm", "the whole budget", "plates of 1 mm", "plates, rods and bolts"],
+    ids=["a litre", "twins", "3 mm", "the whole budget"],
 )
 def test_a_catalog_of_one_or_two_objects_gives_episodes(mode, sizes, tmp_path):
     """Fault 4: with cubes of 100 mm, all 20 arrangements needed more body slots than a world had."""
@@ -42,6 +40,19 @@ def test_a_catalog_of_one_or_two_objects_gives_episodes(mode, sizes, tmp_path):
     assert [row.ending.delivers for row in summary.episodes] == [True]
     assert summary.redraws == 0
     assert summary.views > 0
+
+
+def test_plates_of_a_millimetre_come_to_rest(tmp_path):
+    """All 20 arrangements had more contacts than the solver has capacity for by default: 24 plates have 700."""
+    (tmp_path / "models").mkdir()
+    trimesh.creation.box((0.1, 0.08, 0.001)).export(tmp_path / "models" / "plate.ply")
+    config = load_config("smoke", SETTINGS | {"bake.mode": "move", "bake.models": str(tmp_path / "models")})
+    progress = Notes()
+    summary = run_bake(config, tmp_path / "out", progress)
+    assert [(row.ending.delivers, row.objects) for row in summary.episodes] == [(True, 24)]
+    assert summary.views > 0
+    assert not any("more contacts arose" in line for line in progress.lines)
+    assert sum("thin objects: capacity for" in line for line in progress.lines) == 1
 
 
 def test_one_model_fills_the_tote_in_mode_pick(tmp_path):
