@@ -59,7 +59,9 @@ class Bake:
     episodes: int = setting(4, "", "Episodes (sequences) to generate; each becomes one BOP scene per camera.", low=1, high=INT32_MAX)
     seed: int = setting(0, "", "Random seed, from which every random number of the bake follows.", low=0, high=2**63 - 1)
     device: str = setting("auto", "", "Device: cpu, cuda:N, or auto (the first GPU if there is one).")
-    models: str = setting("", "", "Folder of BOP models, or of OBJ, GLB and PLY meshes; empty: the embedded procedural objects.")
+    models: str = setting(
+        "", "", "Folder of BOP models, of OBJ, GLB and PLY meshes, or of a folder per object; empty: the embedded procedural objects."
+    )
     lights: str = setting("", "", "Folder of HDR environment maps (.hdr) and sIBL sets; empty: the embedded procedural maps.")
     formats: tuple[str, ...] = setting(
         ("bop",),
@@ -84,8 +86,14 @@ class Objects:
     piece_vertices: int = setting(32, "", "Maximum vertices of each piece of a convex decomposition.", low=8, high=256)
     pieces: int = setting(16, "", "Maximum pieces of a convex decomposition.", low=1, high=64)
     concavity: float = setting(0.05, "", "CoACD's concavity threshold; smaller values follow the surface more closely.", low=0.01, high=1.0)
+    decomposition_time: float = setting(
+        300.0, "s", "Time limit of a convex decomposition; an object that takes longer gets its convex hull.", above=0.0, high=86400.0
+    )
     concave_ratio: float = setting(
         0.6, "", "Objects without a row in the object table are decomposed if mesh volume / hull volume is below this.", low=0.0, high=1.0
+    )
+    strict: bool = setting(
+        False, "", "End the bake at the first object or light map that cannot be used, instead of leaving it out with a line."
     )
     density: float = setting(400.0, "kg/m³", "Density over the volume of the convex hull, for objects without a mass.", above=0.0)
     metallic: float = setting(0.1, "", "Metallic factor of objects whose material names none.", low=0.0, high=1.0)
@@ -175,6 +183,9 @@ class Arrangement:
         above=0.0,
     )
     max_objects: int = setting(24, "", "Maximum objects of an episode.", low=1, high=32)
+    repeat_to_fill: bool = setting(
+        True, "", "Let objects repeat in an episode, as pick.repeats does, where all of the catalog together stay below the budget."
+    )
     slot_shortfall: float = setting(
         1e-3,
         "",

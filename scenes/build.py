@@ -8,7 +8,8 @@ largest variant, and every shape costs time in the broad phase.
 from __future__ import annotations
 
 import warnings
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import newton
 import numpy as np
@@ -28,6 +29,15 @@ EMPTY_INERTIA = 1e-3
 CUP_ARMATURE = 1e-3
 # Monte Carlo trials that determine the slot counts; a fraction of 1e-3 of them is known to 10 %.
 SLOT_TRIALS = 100_000
+# Contacts of two convex shapes side by side, and such pairs of an object with floor and walls: a pile of 24 plates of 1 mm has up to 713.
+_PAIR_CONTACTS, _FIXTURES = 5, 1.5
+MAX_CONTACTS = 4096
+"""Contacts of a world that thin objects get at most, 1 MB on a GPU."""
+MAX_ROWS = 3072
+"""Rows of a world that thin objects get at most: `contact_sweep.MAX_SHARED_ROWS`, up to which a GPU keeps them in shared memory. Contacts
+take two rows each, where a pile rests."""
+MIN_SIDE = 1e-5
+"""Least side of a box about an object [m]."""
 GRIPPER_BODIES = 2
 GRIPPER_DOFS = 4
 FREE_COORDS = 7
@@ -187,6 +197,54 @@ def build_model(config: Config, catalog: Catalog, device: wp.Device) -> BuiltMod
         model = scene.finalize(device=device)
     layout = Layout(config.bake.worlds, config.arrangement.max_objects, single, compound, world.shape_count, guides, *gripper)
     return BuiltModel(model, layout, variant, empty)
+
+
+def with_repeats(config: Config, catalog: Catalog) -> Config:
+    """Let objects repeat in an episode if all together stay below the volume budget: a catalog of one object fills the tote, too."""
+    budget = config.arrangement.volume
+    volumes = [entry.volume for entry in catalog.entries if entry.volume <= budget]
+    if not config.arrangement.repeat_to_fill or sum(volumes) >= budget or len(volumes) >= config.arrangement.max_objects:
+        return config
+    return replace(config, pick=replace(config.pick, repeats=True), move=replace(config.move, repeats=True))
+
+
+def with_capacities(config: Config, catalog: Catalog) -> Config:
+    """Raise the capacities of the section physics for objects thinner than the contact margin, which touch others through each other.
+
+    The margin of two shapes is twice `physics.gap`. Within a margin m of an object of side lengths a, b, c there is room for about
+    (a + 2 m)(b + 2 m)(c + 2 m) / (a b c) - 1 others of its kind: 23 for plates of 100 x 80 x 1 mm. Piles of objects that are thicker than
+    the margin keep the capacities of the settings.
+    """
+    physics, count, margin = config.physics, config.arrangement.max_objects, 2.0 * config.physics.gap
+    needed = 0.0
+    for entry in catalog.entries:
+        sides = np.sort(oriented_sides(entry.pieces))
+        if sides[0] >= margin:
+            continue
+        neighbors = float(np.prod(sides + 2.0 * margin) / np.prod(sides)) - 1.0
+        pairs = min(count * neighbors, count * (count - 1)) / 2.0 + _FIXTURES * count
+        needed = max(needed, _PAIR_CONTACTS * pairs * len(entry.pieces))
+    if needed <= physics.contacts_per_world:
+        return config
+    contacts = min(int(np.ceil(needed)), max(MAX_CONTACTS, physics.contacts_per_world))
+    share = contacts / physics.contacts_per_world
+    return replace(
+        config,
+        physics=replace(
+            physics,
+            contacts_per_world=contacts,
+            pairs_per_world=round(share * physics.pairs_per_world),
+            rows_per_world=max(physics.rows_per_world, min(3 * contacts, MAX_ROWS)),
+            gripper_rows_per_world=round(share * physics.gripper_rows_per_world),
+        ),
+    )
+
+
+def oriented_sides(pieces: Sequence[ConvexPiece]) -> np.ndarray:
+    """Side lengths (3) [m] of a box about convex pieces, along their principal axes."""
+    points = np.concatenate([piece.vertices for piece in pieces]).astype(np.float64)
+    centered = points - points.mean(axis=0)
+    return np.maximum(np.ptp(centered @ np.linalg.svd(centered, full_matrices=False)[2].T, axis=0), MIN_SIDE)
 
 
 def _hull(piece: ConvexPiece) -> newton.Mesh:

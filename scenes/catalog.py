@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -11,17 +10,18 @@ import numpy as np
 from trimesh.bounds import oriented_bounds
 
 from synpick_warp.configs.schema import Config, ObjectRow, Objects, Tote
-from synpick_warp.errors import CatalogError
+from synpick_warp.errors import CatalogError, SynpickError
 from synpick_warp.scenes.assets.appearance import FileMaterial
-from synpick_warp.scenes.assets.asset_files import check_file_name
-from synpick_warp.scenes.assets.meshes import SUFFIXES, read_mesh, signed_volume
-from synpick_warp.scenes.assets.models_info import ModelInfo, bop_files, read_models_info
+from synpick_warp.scenes.assets.asset_files import asset_scope
+from synpick_warp.scenes.assets.meshes import read_mesh, signed_volume
+from synpick_warp.scenes.assets.model_folders import ModelFile, list_models
+from synpick_warp.scenes.assets.models_info import ModelInfo, check_against_mesh, read_models_info
 from synpick_warp.scenes.collision.decomposition import ShapeRecipe
 from synpick_warp.scenes.collision.hulls import hull_size, mass_properties
 from synpick_warp.scenes.collision.shapes import collision_shapes, default_cache_dir
 from synpick_warp.scenes.embedded.objects import procedural_objects
 from synpick_warp.scenes.types import Catalog, CatalogEntry, ConvexPiece, HullSize, Material, RawObject, TriangleMesh
-from synpick_warp.system.threads import map_in_threads
+from synpick_warp.system.isolation import Failure, Limits, run_isolated
 
 _MILLIMETRE = 1e-3
 # Minimum diameter [m]: smaller bodies vanish in the contact margin, and come from files in another unit than expected.
@@ -31,6 +31,8 @@ _MIN_DIAMETER = 2e-3
 _MAX_ORIGIN_DISTANCE = 1.5
 # Allowed masses [kg]: others have no useful inverse in 32-bit floats.
 _MASS_RANGE = (1e-7, 1e4)
+READ_LIMITS = Limits(600.0, 2**33)
+"""Limits of a mesh file with its textures: 10 min and 8 GiB; the largest files that are read take a minute and 3 GiB."""
 _UNITS = "files named obj_NNNNNN.ply are read in millimetres, all others in metres"
 
 
@@ -41,8 +43,9 @@ def _ignore(line: str) -> None:
 def load_catalog(config: Config, cache_dir: Path | None = None, report: Callable[[str], None] = _ignore) -> Catalog:
     """Load the object catalog.
 
-    `bake.models` is a BOP model folder (obj_NNNNNN.ply in millimetres, models_info.json), or a folder of .ply, .obj and .glb meshes in
-    metres, which get obj_ids from 1 in the order of their file names. If it is empty: the embedded objects.
+    `bake.models` is a BOP model folder (obj_NNNNNN.ply in millimetres, models_info.json), a folder of meshes in metres, which get obj_ids
+    from 1 in the order of their file names, or a folder of such folders. If it is empty: the embedded objects. Objects that cannot be used
+    are left out, with a line each; with `objects.strict`, the first of them is an error. Files are read in isolated processes.
 
     Args:
         config: Settings: bake.models, objects, object_rows, tote, arrangement.volume.
@@ -50,71 +53,120 @@ def load_catalog(config: Config, cache_dir: Path | None = None, report: Callable
         report: Called with each line of progress.
 
     Raises:
-        CatalogError: The folder or one of its files cannot be used, or an object does not fit into the tote or has an invalid mass.
+        CatalogError: The folder cannot be used, or none of its objects: a file is damaged, an object does not fit into the tote or has an
+            invalid mass.
     """
-    folder = Path(config.bake.models).expanduser()
-    raws = _read_folder(folder, config, report) if config.bake.models else procedural_objects()
-    origins = [str(raw.source or raw.name) for raw in raws]
-    for raw, origin in zip(raws, origins, strict=True):
-        _check_size(raw, origin, config.tote)
-    masses = [_checked_mass(raw, origin, config) for raw, origin in zip(raws, origins, strict=True)]
+    faults = _Faults(config, report)
+    raws = _read_folder(config, report, faults) if config.bake.models else procedural_objects()
     recipes = [_recipe(raw, config.objects) for raw in raws]
-    shapes = collision_shapes([raw.name for raw in raws], [raw.mesh for raw in raws], recipes, cache_dir or default_cache_dir(), report)
-    entries = [_entry(raw, pieces, mass) for raw, pieces, mass in zip(raws, shapes, masses, strict=True)]
+    names, meshes = [raw.name for raw in raws], [raw.mesh for raw in raws]
+    seconds = config.objects.decomposition_time
+    shapes = collision_shapes(names, meshes, recipes, cache_dir or default_cache_dir(), report, seconds)
+    entries = []
+    for raw, shape in zip(raws, shapes, strict=True):
+        if isinstance(shape, CatalogError):
+            faults.add(shape)
+        else:
+            entries.append(_entry(raw, shape, _checked_mass(raw, config)))
+    if not entries:
+        raise faults.summary()
+    faults.tell()
     _report_undrawable(entries, config.arrangement.volume, report)
     return Catalog(tuple(sorted(entries, key=lambda entry: entry.obj_id)))
 
 
-def _read_folder(folder: Path, config: Config, report: Callable[[str], None]) -> list[RawObject]:
+class _Faults:
+    """Objects that cannot be used: with `objects.strict`, or if there is no other object, the first one is an error."""
+
+    def __init__(self, config: Config, report: Callable[[str], None]) -> None:
+        self._config, self._report = config, report
+        self._errors: list[CatalogError] = []
+
+    def add(self, error: CatalogError) -> None:
+        """Take the error of an object; raises it if settings are strict."""
+        if self._config.objects.strict:
+            raise error
+        self._errors.append(error)
+
+    def tell(self) -> None:
+        """Report the objects that are left out, a line each."""
+        for error in self._errors:
+            self._report(f"left out: {error}")
+
+    def summary(self) -> CatalogError:
+        """The error of a folder of which no object can be used."""
+        if len(self._errors) == 1:
+            return self._errors[0]
+        count, folder = len(self._errors), self._config.bake.models
+        return CatalogError(f"models folder {folder}: none of its {count} objects can be used; the first: {self._errors[0]}")
+
+
+def _read_folder(config: Config, report: Callable[[str], None], faults: _Faults) -> list[RawObject]:
     """Read all models of a folder, ordered by obj_id."""
-    if not folder.is_dir():
-        raise CatalogError(f"models folder {folder}: no such folder; give a BOP model folder, or a folder of OBJ, GLB or PLY meshes")
-    try:
-        files = sorted(file for file in folder.iterdir() if file.suffix.lower() in SUFFIXES and not file.name.startswith("."))
-    except OSError as error:
-        raise CatalogError(f"models folder {folder}: cannot be listed ({error.strerror})") from error
-    if not files:
-        raise CatalogError(f"models folder {folder}: it contains no models; add obj_NNNNNN.ply files, or .obj, .glb or .ply meshes")
-    models = bop_files(files)
-    for file in models.values() if models else files:
-        check_file_name(file, CatalogError)
-    if models:
-        if ignored := len(files) - len(models):
-            report(f"models folder {folder}: {ignored} meshes that are not named obj_NNNNNN.ply are ignored")
-        infos = read_models_info(folder / "models_info.json", models)
-        return map_in_threads(lambda item: _read_bop(*item, infos.get(item[0], ModelInfo()), config), sorted(models.items()))
-    for first, second in itertools.pairwise(files):
-        if first.stem == second.stem:
-            raise CatalogError(f"models folder {folder}: {first.name} and {second.name} have the same name; keep one of them")
-    return map_in_threads(lambda item: _read_own(*item, config), enumerate(files, 1))
+    folder = Path(config.bake.models).expanduser()
+    models = list_models(folder, report, faults.add)
+    infos: dict[int, ModelInfo] = {}
+    if models and models[0].is_bop:
+
+        def without(error: CatalogError) -> None:
+            if config.objects.strict:
+                raise error
+            report(f"{error}; until then it has no symmetries")
+
+        infos = read_models_info(folder / "models_info.json", [model.obj_id for model in models], without)
+    calls = [(model, infos.get(model.obj_id, ModelInfo()), config) for model in models]
+    raws = []
+    for model, result in zip(models, run_isolated(_read_model, calls, READ_LIMITS), strict=True):
+        if isinstance(result, Failure):
+            faults.add(CatalogError(f"{model.path}: the process that reads it {result.reason}; repair or simplify the file"))
+        elif isinstance(result, SynpickError):
+            faults.add(CatalogError(str(result)))
+        else:
+            raw, lines = result
+            for line in lines:
+                report(line)
+            raws.append(raw)
+    if not raws:
+        raise faults.summary()
+    return raws
 
 
-def _read_bop(obj_id: int, file: Path, info: ModelInfo, config: Config) -> RawObject:
-    """Read a model of a BOP folder, with the row of the object table that has its obj_id, if the diameter agrees."""
-    mesh, material = read_mesh(file, _MILLIMETRE)
-    hull = hull_size(mesh.vertices)
-    size = hull.diameter
-    tolerance = config.objects.diameter_tolerance
-    if info.diameter is not None and size > 0.0 and not _near(size, info.diameter, tolerance):
-        raise CatalogError(
-            f"{file}: diameter {size * 1e3:.4g} mm, but models_info.json says {info.diameter * 1e3:.4g}; both must be in millimetres"
-        )
-    row = next((row for row in config.object_rows if row.id == obj_id and _fits(row, size, tolerance)), None)
-    raw = _raw(obj_id, file, mesh, hull, material, row, config.objects)
-    return replace(raw, symmetries_discrete=info.symmetries_discrete, symmetries_continuous=info.symmetries_continuous, source=file)
+def _read_model(model: ModelFile, info: ModelInfo, config: Config) -> tuple[RawObject, list[str]]:
+    """Read and check a model; returns it with lines on what was corrected. Runs in an isolated process.
 
-
-def _read_own(obj_id: int, file: Path, config: Config) -> RawObject:
-    """Read a mesh that is not a BOP model. Its obj_id is its position, so rows of the object table are matched by name and diameter."""
-    mesh, material = read_mesh(file, 1.0)
+    A BOP model has the row of the object table with its obj_id, others the row with their name, if the diameter agrees.
+    """
+    lines: list[str] = []
+    with asset_scope(model.root) as scope:
+        mesh, material = read_mesh(model.path, _MILLIMETRE if model.is_bop else 1.0)
     hull, tolerance = hull_size(mesh.vertices), config.objects.diameter_tolerance
-    row = next((row for row in config.object_rows if row.name == file.stem and _fits(row, hull.diameter, tolerance)), None)
-    return _raw(obj_id, file, mesh, hull, material, row, config.objects)
+    if model.is_bop and hull.diameter > 0.0:
+        info, said = _check_info(info, mesh, hull, model, config.objects.strict)
+        lines += said
+    rows = (row for row in config.object_rows if (row.id == model.obj_id if model.is_bop else row.name == model.name))
+    row = next((row for row in rows if _fits(row, hull.diameter, tolerance)), None)
+    raw = _raw(model, mesh, hull, material, row, config.objects)
+    raw = replace(raw, symmetries_discrete=info.symmetries_discrete, symmetries_continuous=info.symmetries_continuous)
+    if model.is_bop and not scope.moved:  # A copy of the file could not name its texture as it does.
+        raw = replace(raw, source=model.path)
+    _check_size(raw, str(model.path if model.is_bop else raw.name), config.tote)
+    _checked_mass(raw, config)
+    return raw, [*scope.moved[:1], *lines]
 
 
-def _raw(
-    obj_id: int, file: Path, mesh: TriangleMesh, hull: HullSize, given: FileMaterial, row: ObjectRow | None, objects: Objects
-) -> RawObject:
+def _check_info(info: ModelInfo, mesh: TriangleMesh, hull: HullSize, model: ModelFile, strict: bool) -> tuple[ModelInfo, list[str]]:
+    """Compare a model with its entry in models_info.json; returns the corrected entry, and a line if it was wrong."""
+    try:
+        info, said = check_against_mesh(info, mesh.vertices, hull.diameter)
+    except CatalogError as error:
+        raise CatalogError(f"{model.path}: {error}") from error
+    line = f"{model.path}: models_info.json gives {'; '.join(said)}"
+    if said and strict:
+        raise CatalogError(line)
+    return info, [line] if said else []
+
+
+def _raw(model: ModelFile, mesh: TriangleMesh, hull: HullSize, given: FileMaterial, row: ObjectRow | None, objects: Objects) -> RawObject:
     """Combine mesh file and row. Material properties of the file have priority over the row, the row over the section objects."""
     defaults = row or objects
     material = Material(
@@ -124,8 +176,8 @@ def _raw(
         defaults.roughness if given.roughness is None else given.roughness,
     )
     return RawObject(
-        obj_id=obj_id,
-        name=row.name if row and row.name else file.stem,
+        obj_id=model.obj_id,
+        name=row.name if row and row.name else model.name,
         mesh=mesh,
         hull=hull,
         material=material,
@@ -185,8 +237,9 @@ def _by(sides: list[float]) -> str:
     return " x ".join(f"{side:.3g}" for side in sides)
 
 
-def _checked_mass(raw: RawObject, origin: str, config: Config) -> float:
+def _checked_mass(raw: RawObject, config: Config) -> float:
     """Mass [kg]: the object's own, or density times hull volume."""
+    origin = raw.source or raw.name
     mass = config.objects.density * raw.hull.volume if raw.mass is None else raw.mass
     if not _MASS_RANGE[0] <= mass <= _MASS_RANGE[1]:
         source = "by objects.density" if raw.mass is None else "in its row of the object table"

@@ -5,21 +5,27 @@ from __future__ import annotations
 import configparser
 import itertools
 import os
+from collections.abc import Callable
 from pathlib import Path
 
 import cv2
 import numpy as np
 
-from synpick_warp.errors import LightError
+from synpick_warp.errors import LightError, SynpickError
 from synpick_warp.inputs.files import read_file
-from synpick_warp.inputs.paths import path_inside
 from synpick_warp.scenes.assets.appearance import srgb_to_linear
-from synpick_warp.scenes.assets.asset_files import check_file_name
+from synpick_warp.scenes.assets.asset_files import check_file_name, locate
 from synpick_warp.scenes.assets.image_size import image_size
+from synpick_warp.scenes.assets.radiance import canonical_radiance, orient_radiance
 from synpick_warp.scenes.embedded.skies import skies
 from synpick_warp.scenes.environment import LUMINANCE, map_directions
 from synpick_warp.scenes.types import EnvironmentMap, Sun
+from synpick_warp.system.isolation import Failure, Limits, run_isolated
 
+READ_LIMITS = Limits(300.0, 2**32)
+"""Limits of a map: 5 min and 4 GiB; the largest takes some seconds and 1.2 GB."""
+_SUFFIXES = (".hdr", ".exr", ".ibl")
+_EXR = b"v/1\x01"
 MAX_HEIGHT = 512
 """Maps with more rows are downsampled to this many: 0.35° a texel is finer than any shading here resolves."""
 SUN_ROWS = 64
@@ -44,19 +50,24 @@ MIN_RADIANCE = 1e-6
 """Least radiance that a map's brightest texel must have: the automatic exposure divides by the radiance of white, at least 1e-9."""
 
 
-def load_lights(folder: str) -> tuple[EnvironmentMap, ...]:
+def _ignore(line: str) -> None:
+    """Default for `report`."""
+
+
+def load_lights(folder: str, report: Callable[[str], None] = _ignore, strict: bool = False) -> tuple[EnvironmentMap, ...]:
     """Load all environment maps of a folder and its direct subfolders, sorted by name.
 
     A folder with an .ibl file is an sIBL set (hdrlabs.com/sibl), of which the reflection map and the sun are used. In other folders
     every .hdr file is a map. The image's middle column becomes azimuth 0 (+x); columns right of it, as seen from inside, get negative
-    azimuth.
+    azimuth. Maps are read in isolated processes; those that cannot be used are left out with a line each.
 
     Args:
         folder: The folder; empty: the embedded maps.
+        report: Called with each line on what is left out or missing.
+        strict: Whether the first map that cannot be used is an error.
 
     Raises:
-        LightError: The folder does not exist or contains no map, a map cannot be read or is invalid, two have the same name, or a
-            set refers to a missing file.
+        LightError: The folder does not exist or contains no map that can be used, or two have the same name.
     """
     if not folder:
         return skies()
@@ -65,11 +76,18 @@ def load_lights(folder: str) -> tuple[EnvironmentMap, ...]:
         raise LightError(f"lights folder {folder} does not exist; give a folder with .hdr maps or sIBL sets, or none for the embedded maps")
     try:
         folders = [root, *sorted(path for path in root.iterdir() if path.is_dir())]
-        maps = [light for each in folders for light in _read_folder(each)]
+        files = [path for each in folders for path in _list_maps(each)]
     except OSError as error:
         raise LightError(f"lights folder {folder} cannot be read: {error.strerror}; check its permissions") from error
-    if not maps:
+    if not files:
         raise LightError(f"lights folder {folder} contains no environment map; add .hdr files or sIBL sets (.ibl with its maps)")
+    maps, faults = _load_all(files, report, strict)
+    if not maps:
+        if len(faults) == 1:
+            raise faults[0]
+        raise LightError(f"lights folder {folder}: none of its {len(faults)} maps can be used; the first: {faults[0]}")
+    for fault in faults:
+        report(f"left out: {fault}")
     maps.sort(key=lambda light: light.name)
     for first, second in itertools.pairwise(maps):
         if first.name == second.name:  # The name is all that a data set says of a view's map.
@@ -77,21 +95,44 @@ def load_lights(folder: str) -> tuple[EnvironmentMap, ...]:
     return tuple(maps)
 
 
-def _read_folder(folder: Path) -> list[EnvironmentMap]:
-    """Read the maps directly in a folder."""
-    files = sorted(path for path in folder.iterdir() if not path.is_dir() and path.suffix.lower() in (".hdr", ".ibl"))
-    for path in files:
-        check_file_name(path, LightError)
-    sets = [path for path in files if path.suffix.lower() == ".ibl"]
-    if sets:
-        return [_read_set(path) for path in sets]
-    return [EnvironmentMap(path.stem, _validate(_read_image(path, gamma=1.0), path)) for path in files if path.suffix.lower() == ".hdr"]
+def _list_maps(folder: Path) -> list[Path]:
+    """The maps directly in a folder: its sIBL sets, or if there are none its image files."""
+    files = sorted(path for path in folder.iterdir() if not path.is_dir() and path.suffix.lower() in _SUFFIXES)
+    return [path for path in files if path.suffix.lower() == ".ibl"] or files
 
 
-def _read_set(path: Path) -> EnvironmentMap:
+def _load_all(files: list[Path], report: Callable[[str], None], strict: bool) -> tuple[list[EnvironmentMap], list[LightError]]:
+    """Load maps in isolated processes; returns them, and the errors of the others."""
+    maps, faults = [], []
+    results = run_isolated(_load_map, [(path, strict, MAX_HEIGHT) for path in files], READ_LIMITS)
+    for path, result in zip(files, results, strict=True):
+        if isinstance(result, Failure | SynpickError):
+            reason = f"{path}: the process that reads it {result.reason}; replace it" if isinstance(result, Failure) else str(result)
+            faults.append(LightError(reason))
+            if strict:
+                raise faults[-1]
+        else:
+            light, lines = result
+            maps.append(light)
+            for line in lines:
+                report(line)
+    return maps, faults
+
+
+def _load_map(path: Path, strict: bool, max_height: int) -> tuple[EnvironmentMap, list[str]]:
+    """Load the map of an image file or an sIBL set, with at most `max_height` rows, and lines on what is missing."""
+    check_file_name(path, LightError)
+    lines: list[str] = []
+    if path.suffix.lower() == ".ibl":
+        return _read_set(path, strict, max_height, lines), lines
+    return EnvironmentMap(path.stem, _validate(_read_image(path, gamma=1.0), path, max_height)), lines
+
+
+def _read_set(path: Path, strict: bool, max_height: int, lines: list[str]) -> EnvironmentMap:
     """Read the reflection map of an sIBL set, times its REFmulti, and its sun. Set files are INI, with comments that begin with two dashes.
 
-    The reflection map is used for diffuse light and background, too: the set's environment map is a blurred copy of it.
+    The reflection map is used for diffuse light and background, too: the set's environment map is a blurred copy of it. If one of those
+    that are not used is missing, that is a line, or an error if `strict`.
     """
     parser = configparser.ConfigParser(interpolation=None, strict=False, comment_prefixes=("#", ";", "--", "//"))
     text = read_file(path, MAX_SET_FILE, LightError).decode("utf-8-sig", errors="replace")
@@ -104,20 +145,23 @@ def _read_set(path: Path) -> EnvironmentMap:
     # The format spells it "Enviroment".
     for section, key in (("Background", "BGfile"), ("Enviroment", "EVfile"), ("Reflection", "REFfile")):
         file = _text(parser, section, key)
-        if file and not os.path.lexists(path_inside(path.parent, file, path, LightError)):
-            raise LightError(f"{path} names {key} = {file}, but there is no such file beside it; add it")
+        if file and not os.path.lexists(locate(path.parent, file, path, LightError)):
+            fault = f"{path} names {key} = {file}, but there is no such file beside it"
+            if strict or key == "REFfile":
+                raise LightError(f"{fault}; add it")
+            lines.append(f"{fault}; it is not used")
     file = _text(parser, "Reflection", "REFfile")
     if not file:
         raise LightError(f"{path} names no reflection map; it needs REFfile in [Reflection]")
     if _number(parser, path, "REFmap", 1.0) != 1.0:
         raise LightError(f"{path} has REFmap = {_text(parser, 'Reflection', 'REFmap')}; only 1, a spherical map, can be read")
     gain = _number(parser, path, "REFmulti", 1.0)
-    map_file = path_inside(path.parent, file, path, LightError)
+    map_file = locate(path.parent, file, path, LightError)
     image = _read_image(map_file, gamma=_number(parser, path, "REFgamma", 1.0, MAX_GAMMA))
     with np.errstate(over="ignore"):  # infinite values are refused by _validate
         image = image * np.float32(gain)
     sun = _read_sun(parser, path)
-    radiance = _validate(image, map_file)
+    radiance = _validate(image, map_file, max_height)
     return EnvironmentMap(path.stem, radiance, sun if sun is not None and _is_bright(radiance, sun.direction) else None)
 
 
@@ -210,28 +254,40 @@ def _read_image(path: Path, gamma: float) -> np.ndarray:
 
 
 def _decode(path: Path) -> np.ndarray | None:
-    """Decode an image as stored, in OpenCV's channel order; None if it cannot be read. OpenCV's own messages are suppressed.
+    """Decode an image in OpenCV's channel order; None if it cannot be read. OpenCV's own messages are suppressed.
 
     The size is read from the header first, since OpenCV allocates up to 2^30 pixels before it reads any.
+
+    Raises:
+        LightError: It is too large, or of a format that is known but not read.
     """
     data = read_file(path, MAX_MAP_FILE, LightError)
+    if data.startswith(_EXR) or path.suffix.lower() == ".exr":
+        raise LightError(f"{path}: OpenEXR maps are not read; save it as Radiance (.hdr)")
     size = image_size(data)
     if size is None:
         return None
     if size[0] * size[1] > MAX_MAP_PIXELS:
         raise LightError(f"{path} is {size[0]} x {size[1]} pixels; allowed: up to 8192 x 4096; scale it down, {MAX_HEIGHT} rows are used")
+    header = None
+    if data[:2] == b"#?":
+        found = canonical_radiance(data, path)
+        if found is None:
+            return None
+        data, header = found
     logging = cv2.utils.logging
     level = logging.getLogLevel()
     logging.setLogLevel(logging.LOG_LEVEL_SILENT)
     try:
-        return cv2.imread(str(path), cv2.IMREAD_UNCHANGED | cv2.IMREAD_ANYDEPTH)
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED | cv2.IMREAD_ANYDEPTH)
     except cv2.error:
         return None
     finally:
         logging.setLogLevel(level)
+    return image if image is None or header is None else orient_radiance(image, header)
 
 
-def _validate(image: np.ndarray, path: Path) -> np.ndarray:
+def _validate(image: np.ndarray, path: Path, max_height: int) -> np.ndarray:
     """Validate radiance, limit its resolution, and convert it to this project's orientation."""
     height, width = image.shape[:2]
     if width != 2 * height:
@@ -244,7 +300,22 @@ def _validate(image: np.ndarray, path: Path) -> np.ndarray:
         raise LightError(f"{path} has radiance {image.max():g}; allowed: up to {MAX_RADIANCE:g}; scale the map down")
     if image.max() < MIN_RADIANCE:
         raise LightError(f"{path} is black: no radiance above {MIN_RADIANCE:g}; an environment map must contain some light")
-    if height > MAX_HEIGHT:
-        image = cv2.resize(image, (2 * MAX_HEIGHT, MAX_HEIGHT), interpolation=cv2.INTER_AREA)
+    _check_rows(image, path)
+    if height > max_height:
+        image = cv2.resize(image, (2 * max_height, max_height), interpolation=cv2.INTER_AREA)
     # Columns run clockwise as seen from above, azimuth counter-clockwise.
     return np.ascontiguousarray(image[:, ::-1], dtype=np.float32)
+
+
+def _check_rows(image: np.ndarray, path: Path) -> None:
+    """Refuse a map that was cut short and filled up: rows of zeros, where no other texel is black.
+
+    A sky that ends at the horizon has black rows, too, all those below it.
+    """
+    black = (image == 0.0).all(axis=2)
+    rows = np.flatnonzero(np.all(black, axis=1))
+    if len(rows) and black.sum() == len(rows) * image.shape[1] and abs(len(rows) - image.shape[0] / 2) > 1:
+        raise LightError(
+            f"{path}: {len(rows)} of {image.shape[0]} rows are black, from row {rows[0]} on, while no other texel is: it was cut short; "
+            "replace it"
+        )

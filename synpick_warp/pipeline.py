@@ -107,7 +107,9 @@ def _fill(
         with scope("build"):
             factory = build_factory(config, progress, output.remaining, *_needs(kinds), longest_first=True)
     else:
-        prepare_folder(output, kinds, load_catalog(config, report=progress.note), load_lights(config.bake.lights))
+        prepare_folder(
+            output, kinds, load_catalog(config, report=progress.note), load_lights(config.bake.lights, progress.note, config.objects.strict)
+        )
     with WriterPool(count_writers(config), slot_bytes(kinds, config), output.lock) as pool:
         started = time.perf_counter()
         if factory is not None:
@@ -224,7 +226,7 @@ class _Run:
     def _end(self, report: TickReport, world: int, record: EpisodeRecord) -> None:
         row = episode_row(self.config, report, world, record)
         end = episode_end(self.config, row, record)
-        advice = remedy(self.config, row.ending)
+        advice = remedy(self.factory.simulation.config, row.ending)
         if advice:
             self.summary.remedies[row.ending] = advice
         if is_resampled(self.config, row):

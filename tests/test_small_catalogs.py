@@ -40,3 +40,37 @@ def test_a_catalog_of_one_or_two_objects_gives_episodes(mode, sizes, tmp_path):
     assert [row.ending.delivers for row in summary.episodes] == [True]
     assert summary.redraws == 0
     assert summary.views > 0
+
+
+def test_plates_of_a_millimetre_come_to_rest(tmp_path):
+    """All 20 arrangements had more contacts than the solver has capacity for by default: 24 plates have 700."""
+    (tmp_path / "models").mkdir()
+    trimesh.creation.box((0.1, 0.08, 0.001)).export(tmp_path / "models" / "plate.ply")
+    config = load_config("smoke", SETTINGS | {"bake.mode": "move", "bake.models": str(tmp_path / "models")})
+    progress = Notes()
+    summary = run_bake(config, tmp_path / "out", progress)
+    assert [(row.ending.delivers, row.objects) for row in summary.episodes] == [(True, 24)]
+    assert summary.views > 0
+    assert not any("more contacts arose" in line for line in progress.lines)
+    assert sum("thin objects: capacity for" in line for line in progress.lines) == 1
+
+
+def test_one_model_fills_the_tote_in_mode_pick(tmp_path):
+    """There was one object in the tote, and no word."""
+    (tmp_path / "models").mkdir()
+    trimesh.creation.box((0.1, 0.1, 0.1)).export(tmp_path / "models" / "box.ply")
+    config = load_config("smoke", SETTINGS | {"bake.mode": "pick", "bake.models": str(tmp_path / "models")})
+    progress = Notes()
+    summary = run_bake(config, tmp_path / "out", progress)
+    assert [row.objects for row in summary.episodes] == [3]
+    assert "1 objects take 0.001 of 0.003 m³ together, so that they repeat in an episode" in progress.lines
+
+
+class Notes(SilentProgress):
+    """Keeps notes."""
+
+    def __init__(self) -> None:
+        self.lines: list[str] = []
+
+    def note(self, text: str) -> None:
+        self.lines.append(text)

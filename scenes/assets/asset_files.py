@@ -8,16 +8,19 @@ from __future__ import annotations
 
 import logging
 import os
+import re
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from contextvars import ContextVar
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 
 from synpick_warp.errors import CatalogError, SynpickError
 from synpick_warp.inputs.files import read_file
-from synpick_warp.inputs.paths import path_inside
+from synpick_warp.inputs.paths import MAX_NAME, path_inside
 
 MAX_MESH_FILE = 2**28
 """Largest binary mesh file [bytes]: 256 MiB, some 2 million triangles with their textures."""
@@ -29,6 +32,9 @@ MAX_PARTS = 2**12
 """Maximum number of parts, materials, nodes or buffers of one model: 4096."""
 MAX_SHOWN = 200
 """Length to which a library's message is cut."""
+
+# Where exporters put textures, below the folder of the mesh or of the object.
+_TEXTURE_FOLDERS = ((), ("textures",), ("texture",), ("materials", "textures"), ("materials",), ("maps",), ("images",), ("tex",))
 
 # Readers log what they leave out; without a handler, Python prints such lines to standard error.
 logging.getLogger("trimesh").addHandler(logging.NullHandler())
@@ -59,8 +65,33 @@ def describe_error(error: BaseException) -> str:
     return text if len(text) <= MAX_SHOWN else f"{text[:MAX_SHOWN]}…"
 
 
+@dataclass(frozen=True)
+class AssetScope:
+    """What the files of one object may refer to, and which names were found elsewhere than they say."""
+
+    root: Path
+    """Folder of the object: names in its files may lead up to it, not out of it."""
+    moved: list[str] = field(default_factory=list)
+    """A line for each name that is read from another place."""
+
+
+_scope: ContextVar[AssetScope | None] = ContextVar("scope", default=None)
+
+
+@contextmanager
+def asset_scope(root: Path) -> Iterator[AssetScope]:
+    """Let the files of one object refer to all of its folder; without a scope, they refer to the folder that they lie in."""
+    token = _scope.set(scope := AssetScope(root))
+    try:
+        yield scope
+    finally:
+        _scope.reset(token)
+
+
 def read_referred(folder: Path, name: str, owner: object, limit: int) -> tuple[Path, bytes]:
-    """Read a file that a model file names, inside the model folder only.
+    """Read a file that a model file names, inside the object's folder only (`asset_scope`).
+
+    A name that is not there is also tried with Windows' separators, in other letter case, and in the folders where exporters put textures.
 
     Args:
         folder: Folder of the model file.
@@ -71,10 +102,74 @@ def read_referred(folder: Path, name: str, owner: object, limit: int) -> tuple[P
     Raises:
         CatalogError: The name leads out of the folder, or the file is missing, too large or not a regular file.
     """
-    path = path_inside(folder, name, owner, CatalogError)
+    scope = _scope.get() or AssetScope(folder)
+    path = locate(folder, name, owner, CatalogError, scope.root)
     if not os.path.lexists(path):
         raise CatalogError(f"{owner} refers to {name!a}, but there is no file {path}; add it or remove the reference")
+    if os.path.normpath(path) != os.path.normpath(folder / name):
+        scope.moved.append(f"{owner} refers to {name!a}; {path} is read")
     return path, read_file(path, limit, CatalogError)
+
+
+def locate(folder: Path, name: str, owner: object, error: type[SynpickError], root: Path | None = None) -> Path:
+    """Path of a file that another one names; if it is not there, of what the name may mean (see `read_referred`), if that is there.
+
+    Args:
+        folder: Folder of the file that names it.
+        name: The name.
+        owner: The file that names it, for errors.
+        error: Class of the exception.
+        root: Folder that the name must not lead out of; None: `folder`.
+
+    Raises:
+        SynpickError: As `error`: the name leads out of the folder.
+    """
+    path, fault = folder, None
+    try:
+        path = path_inside(folder, name, owner, error)
+    except SynpickError as caught:
+        fault = caught
+    if fault is None and os.path.lexists(path):
+        return path
+    found = _find_elsewhere(folder, name, root or folder) if name.isprintable() and len(name) <= MAX_NAME else None
+    if found is None and fault is not None:
+        raise fault
+    return found or path
+
+
+def _find_elsewhere(folder: Path, name: str, root: Path) -> Path | None:
+    """A file inside `root` that a name may mean, seen from `folder`; None: there is none."""
+    parts = [part for part in re.sub(r"^[A-Za-z]:", "", name).replace("\\", "/").split("/") if part not in ("", ".")]
+    if not parts:
+        return None
+    places = [(folder, parts)]
+    if ".." not in parts:
+        places += [(base, [*place, parts[-1]]) for base in dict.fromkeys((folder, root)) for place in _TEXTURE_FOLDERS]
+    whole = root.resolve()
+    for base, names in places:
+        path = _match_case(base, names)
+        if path is not None and path.is_file() and path.resolve().is_relative_to(whole):
+            return path
+    return None
+
+
+def _match_case(folder: Path, names: Sequence[str]) -> Path | None:
+    """Descend from a folder by names in any letter case; exact ones first. None: there is no such entry."""
+    path = folder
+    for name in names:
+        if name == "..":
+            path = path.parent
+            continue
+        if not (path / name).exists():
+            try:
+                entries = sorted(path.iterdir()) if path.is_dir() else []
+            except OSError:
+                return None
+            name = next((entry.name for entry in entries if entry.name.casefold() == name.casefold()), "")
+            if not name:
+                return None
+        path = path / name
+    return path
 
 
 class FileTable:

@@ -13,7 +13,7 @@ from synpick_warp.scenes.assets.asset_files import quiet_decoding
 MAX_HEADER = 2**16
 """Longest header of a Radiance file [bytes]."""
 _FORMATS = ("PNG", "JPEG", "WEBP", "BMP", "PPM", "JPEG2000")
-_RESOLUTION = re.compile(rb"-Y\s*\+?(\d{1,9})\s*\+X\s*\+?(\d{1,9})")
+_RESOLUTION = re.compile(rb"[-+]([XY])\s*\+?(\d{1,9})\s*[-+]([XY])\s*\+?(\d{1,9})")
 _WIDTH, _HEIGHT = 256, 257
 """TIFF tags."""
 _TIFF_TYPES = {3: "H", 4: "I"}
@@ -40,11 +40,13 @@ def _radiance_size(data: bytes) -> tuple[int, int] | None:
 
     OpenCV cuts long lines into pieces, so that it may take another line for the resolution than the first after the empty one.
     """
-    empty = data.find(b"\n\n", 0, MAX_HEADER)
-    if empty < 0:
+    empty = re.compile(rb"\n\r?\n").search(data, 0, MAX_HEADER)
+    if empty is None:
         return None
-    header = data[: max(data.find(b"\n", empty + 2, empty + 2 + 256), empty + 2)]
-    sizes = [(int(width), int(height)) for height, width in _RESOLUTION.findall(header)]
+    header = data[: max(data.find(b"\n", empty.end(), empty.end() + 256), empty.end())]
+    # By the letter of the second axis: X is the width.
+    found = ((int(first), int(second), axis) for _, first, axis, second in _RESOLUTION.findall(header))
+    sizes = [(second, first) if axis == b"X" else (first, second) for first, second, axis in found]
     return max(sizes, key=lambda size: size[0] * size[1], default=None)
 
 

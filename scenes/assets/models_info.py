@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Iterable
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -29,8 +29,21 @@ _ROTATION_TOLERANCE = 1e-3
 _ADVICE = "or remove the file to go without symmetries"
 _NEEDED = "diameter above 0 in mm, symmetries_discrete of 16 numbers each, symmetries_continuous of axis and offset of 3 numbers each"
 
+_EXTENTS = ("min_x", "min_y", "min_z", "size_x", "size_y", "size_z")
+# Relative difference between a diameter or extent and that of the mesh, from which it belongs to another mesh.
+_TOLERANCE = 0.1
+# Relative difference from which a diameter that is the bounding box's diagonal is wrong, and within which it is the diagonal.
+_OFF, _SAME = 0.01, 1e-3
+# A symmetry that displaces the surface by more than this fraction of the diameter is none: scans of symmetric objects stay within 0.05.
+_ASYMMETRY = 0.1
+# Directions in which surfaces are compared, and vertices that are looked at.
+_DIRECTIONS, _SAMPLES = 128, 20_000
+_TURNS = 8
+"""Rotations by which a continuous symmetry is checked."""
+
 # A coordinate, or a length in mm: larger numbers are mistakes, whose squares overflow.
-_Number = Annotated[float, msgspec.Meta(ge=-1e9, le=1e9)]
+_MAX_NUMBER = 1e9
+_Number = Annotated[float, msgspec.Meta(ge=-_MAX_NUMBER, le=_MAX_NUMBER)]
 
 
 class _Axis(msgspec.Struct):
@@ -58,47 +71,162 @@ class ModelInfo:
     """Row-major 4 x 4 rigid transforms, translation in metres; without the identity."""
     symmetries_continuous: tuple[tuple[tuple[float, float, float], tuple[float, float, float]], ...] = ()
     """(unit axis, point on it [m])."""
+    extents: tuple[float, ...] | None = None
+    """Least coordinates and sizes of the bounding box, x, y, z each [m]; None: not all are given."""
 
 
-def bop_files(files: Iterable[Path]) -> dict[int, Path]:
-    """Select the files that are BOP models (obj_NNNNNN.ply), by obj_id.
+def bop_obj_id(file: Path) -> int | None:
+    """The obj_id in the name of a BOP model (obj_NNNNNN.ply); None for other files.
 
     Raises:
-        CatalogError: Two files have the same obj_id, or one is too large.
+        CatalogError: The number is too large.
     """
-    models: dict[int, Path] = {}
-    for file in files:
-        if match := _NAME.fullmatch(file.name):
-            obj_id = int(match[1])
-            if obj_id > MAX_OBJ_ID:
-                raise CatalogError(f"{file}: the number in its name is too large; allowed: 0 to {MAX_OBJ_ID}; rename the file")
-            if obj_id in models:
-                raise CatalogError(f"{models[obj_id]} and {file.name} are both object {obj_id}; keep one of them")
-            models[obj_id] = file
-    return models
+    match = _NAME.fullmatch(file.name)
+    if match is None:
+        return None
+    if int(match[1]) > MAX_OBJ_ID:
+        raise CatalogError(f"{file}: the number in its name is too large; allowed: 0 to {MAX_OBJ_ID}; rename the file")
+    return int(match[1])
 
 
-def read_models_info(path: Path, obj_ids: Iterable[int]) -> dict[int, ModelInfo]:
+def _raise(error: CatalogError) -> None:
+    """Default for `fault`."""
+    raise error
+
+
+def read_models_info(path: Path, obj_ids: Iterable[int], fault: Callable[[CatalogError], None] = _raise) -> dict[int, ModelInfo]:
     """Read models_info.json; an empty dictionary if the file is missing, which is no error.
 
     Args:
         path: The file.
         obj_ids: Objects that must have an entry; other entries are ignored.
+        fault: Called with the error of an object that has no entry, or one whose diameter or symmetries are invalid. If it does not
+            raise it, the object has no entry in the result.
 
     Raises:
-        CatalogError: The file is not valid JSON or lacks an object, or an entry's diameter or symmetries are invalid.
+        CatalogError: The file is not valid JSON.
     """
     entries = read_entries(path)
     infos = {}
     for obj_id in obj_ids if entries is not None else ():
-        place, entry = f"{path}: object {obj_id}", (entries or {}).get(str(obj_id))
-        if not isinstance(entry, dict):
-            raise CatalogError(f"{path}: no entry for object {obj_id}; add one, {_ADVICE}")
         try:
-            infos[obj_id] = _info(msgspec.convert(entry, _Entry), place)
-        except msgspec.ValidationError as error:
-            raise CatalogError(f"{place}: {str(error).replace('`', '')}; needed: {_NEEDED}") from None
+            infos[obj_id] = _convert((entries or {}).get(str(obj_id)), obj_id, path)
+        except CatalogError as error:
+            fault(error)
     return infos
+
+
+def _convert(entry: Any, obj_id: int, path: Path) -> ModelInfo:
+    place = f"{path}: object {obj_id}"
+    if not isinstance(entry, dict):
+        raise CatalogError(f"{path}: no entry for object {obj_id}; add one, {_ADVICE}")
+    given = [entry.get(key) for key in _EXTENTS]
+    extents = tuple(value * _MILLIMETRE for value in given if isinstance(value, int | float) and abs(value) < _MAX_NUMBER)
+    try:
+        return replace(_info(msgspec.convert(entry, _Entry), place), extents=extents if len(extents) == len(_EXTENTS) else None)
+    except msgspec.ValidationError as error:
+        raise CatalogError(f"{place}: {str(error).replace('`', '')}; needed: {_NEEDED}") from None
+
+
+def check_against_mesh(info: ModelInfo, vertices: np.ndarray, diameter: float) -> tuple[ModelInfo, list[str]]:
+    """Compare an entry with its mesh: is the diameter the bounding box's diagonal, or of another mesh, and do the symmetries hold?
+
+    Args:
+        info: The entry.
+        vertices: The mesh's (V, 3) [m].
+        diameter: The mesh's own [m].
+
+    Returns:
+        The entry, converted if its lengths are in metres, and what is wrong with it.
+
+    Raises:
+        CatalogError: The mesh is in metres, where the entry is in millimetres.
+    """
+    low = vertices.min(axis=0).astype(np.float64)
+    size = vertices.max(axis=0) - low
+    info, said = compare_sizes(info, low, size, diameter)
+    return info, said + _check_symmetries(info, vertices[:: -(-len(vertices) // _SAMPLES)].astype(np.float64), diameter)
+
+
+def compare_sizes(info: ModelInfo, low: np.ndarray, size: np.ndarray, diameter: float) -> tuple[ModelInfo, list[str]]:
+    """The part of `check_against_mesh` that needs the mesh's bounding box (least coordinates and size, 3 each) and diameter [m] only."""
+    said = []
+    diagonal = float(np.linalg.norm(size))
+    if info.diameter is not None and any(_near(info.diameter / _MILLIMETRE, own, _TOLERANCE) for own in (diameter, diagonal)):
+        given, own = f"{info.diameter / _MILLIMETRE:.4g}", f"{diameter / _MILLIMETRE:.4g} mm"
+        said.append(f"diameter {given}, where its mesh has {own}: lengths in metres; they are converted")
+        info = _scaled(info, 1.0 / _MILLIMETRE)
+    elif info.diameter is not None and any(_near(info.diameter * _MILLIMETRE, own, _TOLERANCE) for own in (diameter, diagonal)):
+        given = f"{info.diameter / _MILLIMETRE:.4g}"
+        raise CatalogError(f"its diameter is {diameter / _MILLIMETRE:.4g} mm, but models_info.json says {given}; scale it to millimetres")
+    if info.diameter is not None and not _near(info.diameter, diameter, _OFF):
+        named = f"diameter {info.diameter / _MILLIMETRE:.4g} mm"
+        own = f"its own, {diameter / _MILLIMETRE:.4g} mm, is used"
+        if _near(info.diameter, diagonal, _SAME):
+            said.append(f"{named}, which is the diagonal of its bounding box; {own}")
+        elif not _near(info.diameter, diameter, _TOLERANCE):
+            said.append(f"{named}, which belongs to another mesh; {own}")
+    if info.extents is not None and np.abs(np.asarray(info.extents) - (*low, *size)).max() > _TOLERANCE * diameter:
+        given, own = (" x ".join(f"{value / _MILLIMETRE:.4g}" for value in sizes) for sizes in (info.extents[3:], size))
+        said.append(f"a bounding box of {given} mm, or elsewhere than it is; its own, {own} mm, is used")
+    return info, said
+
+
+def corrected_entry(entry: Any, own: dict[str, Any]) -> dict[str, Any]:
+    """An object's entry for a data set: as it is if it agrees with the mesh, else with the sizes of its `own` [mm], or `own` altogether."""
+    low, size = (np.array([own[key] for key in keys]) * _MILLIMETRE for keys in (_EXTENTS[:3], _EXTENTS[3:]))
+    try:
+        _, said = compare_sizes(_convert(entry, 0, Path()), low, size, own["diameter"] * _MILLIMETRE)
+    except CatalogError:
+        return own
+    if not said:
+        return entry
+    return own if any("metres" in line for line in said) else entry | {key: own[key] for key in ("diameter", *_EXTENTS)}
+
+
+def _near(value: float, expected: float, tolerance: float) -> bool:
+    return abs(value - expected) <= tolerance * expected
+
+
+def _scaled(info: ModelInfo, factor: float) -> ModelInfo:
+    """The entry with all lengths multiplied."""
+    return ModelInfo(
+        None if info.diameter is None else factor * info.diameter,
+        tuple(tuple(value * factor if at in (3, 7, 11) else value for at, value in enumerate(row)) for row in info.symmetries_discrete),
+        tuple((axis, (factor * x, factor * y, factor * z)) for axis, (x, y, z) in info.symmetries_continuous),
+        None if info.extents is None else tuple(factor * value for value in info.extents),
+    )
+
+
+def _check_symmetries(info: ModelInfo, vertices: np.ndarray, diameter: float) -> list[str]:
+    """Name the symmetries that do not map a mesh onto itself, by its extents (support function) in random directions."""
+    directions = np.random.default_rng(0).normal(size=(_DIRECTIONS, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    extent = (vertices @ directions.T).max(axis=0)
+    moves = [(f"symmetries_discrete[{index}]", [np.reshape(row, (4, 4))]) for index, row in enumerate(info.symmetries_discrete)]
+    moves += [
+        (f"symmetries_continuous[{index}]", [_turn(np.array(axis), np.array(offset), turn) for turn in range(1, _TURNS)])
+        for index, (axis, offset) in enumerate(info.symmetries_continuous)
+    ]
+    said = []
+    for name, matrices in moves:
+        off = 0.0
+        for matrix in matrices:
+            moved = (vertices @ (directions @ matrix[:3, :3]).T).max(axis=0) + directions @ matrix[:3, 3]
+            off = max(off, float(np.abs(moved - extent).max()))
+        if off > _ASYMMETRY * diameter:
+            said.append(f"{name}, which moves its surface by {off / _MILLIMETRE:.3g} mm; it is used as given, correct or remove it")
+    return said
+
+
+def _turn(axis: np.ndarray, offset: np.ndarray, turn: int) -> np.ndarray:
+    """Rotation about an axis through a point by `turn` of _TURNS parts of a circle (Rodrigues), as a 4 x 4 matrix."""
+    angle = 2.0 * np.pi * turn / _TURNS
+    cross = np.cross(np.eye(3), axis)
+    rotation = np.eye(3) + np.sin(angle) * cross + (1.0 - np.cos(angle)) * cross @ cross
+    matrix = np.eye(4)
+    matrix[:3, :3], matrix[:3, 3] = rotation, offset - rotation @ offset
+    return matrix
 
 
 def read_entries(path: Path) -> dict[str, Any] | None:

@@ -25,6 +25,10 @@ _SEARCH_STEPS = 60
 # A mesh with a larger fraction of its vertices inside the body is repaired (remeshed) first. Where a handle ends in a mug's wall it is
 # 0.02; for a drill assembled from boxes and cylinders 0.24, and without repair that took 180 s instead of 10.
 _MAX_BURIED = 0.1
+# Triangles whose height is below this fraction of their longest side have no area: single precision has rounded the corners.
+_NEEDLE = 1e-6
+# A closed surface has at least four triangles.
+_MIN_FACES = 4
 # Vertices sampled to estimate that fraction.
 _SAMPLES = 512
 
@@ -50,7 +54,8 @@ def decompose(mesh: TriangleMesh, recipe: ShapeRecipe) -> tuple[ConvexPiece, ...
 
     CoACD's manifold preprocessing, which remeshes the surface, takes two to five times as long for the real bowl and mug and thickens
     their walls (0.261 l instead of 0.230 for the bowl's pieces), and CoACD asks for it wherever two triangles intersect. So the mesh is
-    preprocessed only if it is open, walls run inside the body, or a decomposition without it has lost a part.
+    preprocessed only if it is open, walls run inside the body, or a decomposition without it has lost a part. Repeated triangles, and
+    those without area in an open mesh, are removed first: they keep CoACD busy for minutes.
 
     Returns:
         The pieces; none if CoACD finds none.
@@ -61,8 +66,13 @@ def decompose(mesh: TriangleMesh, recipe: ShapeRecipe) -> tuple[ConvexPiece, ...
     vertices, faces = merge_positions(mesh.vertices, mesh.faces)
     pieces: list[np.ndarray] = []
     volumes: list[float] = []
-    faces = _without_opposites(faces)
-    for mode in ("auto",) if _needs_repair(vertices, faces) else ("off", "auto"):
+    faces = _without_repeats(faces)
+    repair = _needs_repair(vertices, faces)
+    if repair:  # Without its needles, a closed mesh would be open.
+        vertices, faces = _without_needles(vertices, faces)
+    if len(faces) < _MIN_FACES:
+        return ()
+    for mode in ("auto",) if repair else ("off", "auto"):
         hulls = coacd.run_coacd(
             coacd.Mesh(vertices.astype(np.float64), faces.astype(np.int32)),
             threshold=recipe.concavity,
@@ -79,14 +89,27 @@ def decompose(mesh: TriangleMesh, recipe: ShapeRecipe) -> tuple[ConvexPiece, ...
     return tuple(simplify_hull(points, recipe.piece_vertices) for points in kept)
 
 
-def _without_opposites(faces: np.ndarray) -> np.ndarray:
-    """Remove pairs of coincident triangles with opposite orientation: merging vertices leaves some, and they enclose nothing."""
+def _without_repeats(faces: np.ndarray) -> np.ndarray:
+    """Remove repeated triangles: of those with the same corners, one remains of the orientation that more of them have.
+
+    None remains of as many of either orientation: merging vertices leaves such pairs, and they enclose nothing.
+    """
     shift = faces.argmin(axis=1)[:, None]
     turned = np.take_along_axis(faces, (shift + np.arange(3)) % 3, axis=1)
     corners, index = np.unique(np.sort(faces, axis=1), axis=0, return_inverse=True)
     side = np.where(turned[:, 1] < turned[:, 2], 1, -1)
-    balanced = np.bincount(index, weights=side, minlength=len(corners)) == 0
-    return faces[~balanced[index]]
+    surplus = np.bincount(index, weights=side, minlength=len(corners))[index]
+    kept = np.flatnonzero(surplus * side > 0)
+    return faces[np.sort(kept[np.unique(index[kept], return_index=True)[1]])]
+
+
+def _without_needles(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Remove triangles of no area, but for rounding, and the vertices that no other triangle has."""
+    corners = vertices[faces].astype(np.float64)
+    sides = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
+    doubled = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    used, index = np.unique(faces[doubled > _NEEDLE * sides**2], return_inverse=True)
+    return vertices[used], index.reshape(-1, 3)
 
 
 def _needs_repair(vertices: np.ndarray, faces: np.ndarray) -> bool:

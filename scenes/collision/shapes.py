@@ -6,25 +6,35 @@ import hashlib
 import importlib.metadata
 import os
 import tempfile
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
 
-from synpick_warp.errors import CatalogError
+from synpick_warp.configs.schema import Objects
+from synpick_warp.errors import CatalogError, SynpickError
 from synpick_warp.inputs.files import check_regular_file
-from synpick_warp.scenes.collision.decomposition import ShapeRecipe
+from synpick_warp.scenes.collision.decomposition import ShapeRecipe, decompose
 from synpick_warp.scenes.collision.hulls import hull_volume
-from synpick_warp.scenes.collision.parallel import decompose_all
 from synpick_warp.scenes.collision.simplification import simplify_hull
 from synpick_warp.scenes.types import ConvexPiece, TriangleMesh
 from synpick_warp.system.caches import USER_VARIABLE, user_cache
+from synpick_warp.system.isolation import Failure, Limits, run_isolated
 
 MAX_CACHE_FILE = 2**26
 """Largest cache file [bytes]: 64 MiB; a decomposition has some 10 kB."""
 # Part of the cache's key, as is the text of ShapeRecipe. Raise it with any change to simplification.py or decomposition.py that gives other
 # shapes for the same input.
 _RECIPE = 3
+DECOMPOSITION_MEMORY = 2**33
+"""Memory limit of a decomposition [bytes]: 8 GiB; the remeshing of a scan with two million triangles takes a few."""
+HULL_LIMITS = Limits(120.0, 2**32)
+"""Limits of the simplification of a convex hull: 120 s and 4 GiB; a scan with two million vertices takes seconds."""
+_REMEDY = "repair the mesh, or set concave = false"
+_LATE = "decimate the mesh, raise objects.decomposition_time, or set concave = false"
+
+Shape = tuple[ConvexPiece, ...]
+"""Collision shape: one hull, or the pieces of a decomposition."""
 
 
 def default_cache_dir() -> Path:
@@ -34,9 +44,17 @@ def default_cache_dir() -> Path:
 
 
 def collision_shapes(
-    names: Sequence[str], meshes: Sequence[TriangleMesh], recipes: Sequence[ShapeRecipe], cache_dir: Path, report: Callable[[str], None]
-) -> list[tuple[ConvexPiece, ...]]:
+    names: Sequence[str],
+    meshes: Sequence[TriangleMesh],
+    recipes: Sequence[ShapeRecipe],
+    cache_dir: Path,
+    report: Callable[[str], None],
+    seconds: float = Objects.decomposition_time,
+) -> list[Shape | CatalogError]:
     """Compute the collision shape of each mesh (convex hull, or convex decomposition), or read it from the cache.
+
+    Both are computed in isolated processes (`system.isolation`). What CoACD crashes on, cannot decompose or does not finish in time gets
+    its convex hull instead, and a line says so.
 
     Args:
         names: Names of the objects, for progress and errors.
@@ -44,33 +62,85 @@ def collision_shapes(
         recipes: One recipe per name.
         cache_dir: Folder of the cache; created if missing. If it cannot be written, that is reported and shapes are computed each time.
         report: Called with each line of progress.
+        seconds: Time limit of a decomposition [s].
 
-    Raises:
-        CatalogError: A mesh has no volume, or its decomposition failed.
+    Returns:
+        The shape of each mesh, or an error if it has none because it has no volume.
     """
     files = [cache_dir / f"{_key(mesh, recipe)}.npz" for mesh, recipe in zip(meshes, recipes, strict=True)]
-    shapes = [_load(file) for file in files]
+    shapes: list[Shape | CatalogError | None] = [_load(file) for file in files]
+    save = _Saver(report)
+    slow = [index for index, shape in enumerate(shapes) if shape is None and recipes[index].concave]
+    for index, failure in _decompose_all(slow, names, meshes, recipes, files, shapes, report, save, seconds):
+        report(f"{names[index]}: its convex decomposition {failure.reason}; its convex hull is used instead: {_remedy(failure)}")
+        # A hull for lack of time is cached by that time, all others are not: the next bake may have another library, or more memory.
+        files[index] = _late_file(files[index], seconds) if failure.timed_out else Path(os.devnull)
+        shapes[index] = _load(files[index])
     missing = [index for index, shape in enumerate(shapes) if shape is None]
-    slow = [index for index in missing if recipes[index].concave]
-    if slow:
-        report(f"decomposing {len(slow)} concave objects, once, up to a minute each: {', '.join(names[index] for index in slow)}")
-    jobs = [(names[index], meshes[index], recipes[index]) for index in slow]
-    writable = True
-    # Each shape is cached as soon as it is computed, so that a stopped bake need not repeat it.
-    for index, shape in zip(slow, decompose_all(jobs), strict=True):
-        if not shape:
-            raise CatalogError(f"{names[index]}: CoACD found no convex pieces; repair the mesh, or set concave = false")
-        report(f"{names[index]}: {len(shape)} convex pieces")
-        shapes[index] = shape
-        writable = writable and _save(files[index], shape, report)
-    for index in (index for index in missing if not recipes[index].concave):
-        try:
-            shape = (simplify_hull(meshes[index].vertices, recipes[index].hull_vertices),)
-        except CatalogError as error:
-            raise CatalogError(f"{names[index]}: {error}") from error
-        shapes[index] = shape
-        writable = writable and _save(files[index], shape, report)
+    hulls = run_isolated(simplify_hull, [(meshes[index].vertices, recipes[index].hull_vertices) for index in missing], HULL_LIMITS)
+    for index, result in zip(missing, hulls, strict=True):
+        if isinstance(result, ConvexPiece):
+            shapes[index] = save(files[index], (result,))
+        else:
+            said = f"its convex hull {result.reason}; repair the mesh" if isinstance(result, Failure) else str(result)
+            shapes[index] = CatalogError(f"{names[index]}: {said}")
     return [shape or () for shape in shapes]
+
+
+def _decompose_all(
+    slow: Sequence[int],
+    names: Sequence[str],
+    meshes: Sequence[TriangleMesh],
+    recipes: Sequence[ShapeRecipe],
+    files: Sequence[Path],
+    shapes: list[Shape | CatalogError | None],
+    report: Callable[[str], None],
+    save: _Saver,
+    seconds: float,
+) -> Iterator[tuple[int, Failure]]:
+    """Decompose the objects with the indices `slow` into `shapes`; yields the others of them, and why each has no decomposition.
+
+    Each shape is cached as soon as it is computed, so that a stopped bake need not repeat it. A decomposition that did not end within the
+    same time before is not tried again.
+    """
+    late = [index for index in slow if _load(_late_file(files[index], seconds))]
+    yield from ((index, Failure(f"took longer than {seconds:g} s before", timed_out=True)) for index in late)
+    fresh = [index for index in slow if index not in late]
+    if fresh:
+        listed = ", ".join(names[index] for index in fresh)
+        report(f"decomposing {len(fresh)} concave objects, once, mostly within a minute, at most {seconds:g} s each: {listed}")
+    results = run_isolated(decompose, [(meshes[index], recipes[index]) for index in fresh], Limits(seconds, DECOMPOSITION_MEMORY))
+    for index, result in zip(fresh, results, strict=True):
+        if isinstance(result, Failure):
+            yield index, result
+        elif isinstance(result, SynpickError) or not result:
+            yield index, Failure(f"failed ({result})" if result else "found no convex pieces")
+        else:
+            report(f"{names[index]}: {len(result)} convex pieces")
+            shapes[index] = save(files[index], result)
+
+
+def _remedy(failure: Failure) -> str:
+    return _LATE if failure.timed_out else _REMEDY
+
+
+def _late_file(file: Path, seconds: float) -> Path:
+    """Cache file of the convex hull of an object whose decomposition did not end within a time [s]."""
+    return file.with_stem(f"{file.stem}-{seconds:g}s")
+
+
+class _Saver:
+    """Writes shapes into the cache, until that fails once."""
+
+    def __init__(self, report: Callable[[str], None]) -> None:
+        self._report = report
+        self._writable = True
+
+    def __call__(self, file: Path, shape: Shape) -> Shape:
+        """Write a shape and return it; the null device stands for no file."""
+        if self._writable and file != Path(os.devnull):
+            self._writable = _save(file, shape, self._report)
+        return shape
 
 
 def _key(mesh: TriangleMesh, recipe: ShapeRecipe) -> str:
@@ -81,7 +151,7 @@ def _key(mesh: TriangleMesh, recipe: ShapeRecipe) -> str:
     return digest.hexdigest()
 
 
-def _load(file: Path) -> tuple[ConvexPiece, ...] | None:
+def _load(file: Path) -> Shape | None:
     """Read a cache file; None if it is missing or damaged."""
     try:
         check_regular_file(file, MAX_CACHE_FILE, CatalogError)
@@ -100,7 +170,7 @@ def _load(file: Path) -> tuple[ConvexPiece, ...] | None:
     return pieces if valid and pieces else None
 
 
-def _save(file: Path, pieces: tuple[ConvexPiece, ...], report: Callable[[str], None]) -> bool:
+def _save(file: Path, pieces: Shape, report: Callable[[str], None]) -> bool:
     """Write a cache file atomically, since several bakes may share the folder. False if it cannot be written."""
     vertices, faces = (np.concatenate(rows) for rows in zip(*((piece.vertices, piece.faces) for piece in pieces), strict=True))
     counts = np.array([(len(piece.vertices), len(piece.faces)) for piece in pieces])

@@ -20,6 +20,7 @@ from synpick_warp.exporters.registry import load_exporter_classes
 from synpick_warp.factory.compilation import is_cache_warm, make_compiler, sole_compiler, submit_launches, submit_slow
 from synpick_warp.memory_plan import check_memory
 from synpick_warp.progress import Progress, SilentProgress
+from synpick_warp.scenes.build import find_repeat_rules, with_capacities, with_repeats
 from synpick_warp.scenes.cameras import make_cameras
 from synpick_warp.scenes.catalog import load_catalog
 from synpick_warp.scenes.fixtures import make_fixtures
@@ -176,7 +177,8 @@ def build_stages(
     cameras = make_cameras(config.cameras)
     fixtures = make_fixtures(config.tote, config.gripper)
     catalog = load_catalog(config, report=progress.note)
-    lights = load_lights(config.bake.lights)
+    lights = load_lights(config.bake.lights, progress.note, config.objects.strict)
+    config = _fit_to_catalog(config, catalog, device, progress)
     if longest_first and episodes is not None:
         episodes = order_longest_first(config, catalog, episodes, device)
     progress.stage(f"building {config.bake.worlds} worlds of {len(catalog)} objects on {device.alias}")
@@ -188,6 +190,24 @@ def build_stages(
     object_ids = np.array([entry.obj_id for entry in catalog.entries], dtype=np.int32)
     table = name_lights([light.name for light in lights], scene.lights)
     return Stages(config, catalog, cameras, lights, simulation, renderer, sizes, object_ids, table)
+
+
+def _fit_to_catalog(config: Config, catalog: Catalog, device: wp.Device, progress: Progress) -> Config:
+    """Settings that follow from the objects: whether they repeat in an episode, capacities for contacts of thin ones.
+
+    Raises:
+        ConfigError: The capacities do not fit into the device's memory.
+    """
+    filled = with_repeats(config, catalog)
+    if find_repeat_rules(filled) != find_repeat_rules(config):
+        total = sum(entry.volume for entry in catalog.entries)
+        budget = config.arrangement.volume
+        progress.note(f"{len(catalog)} objects take {total:.3g} of {budget:g} m³ together, so that they repeat in an episode")
+    fitted = with_capacities(filled, catalog)
+    if fitted.physics != config.physics:
+        progress.note(f"thin objects: capacity for {fitted.physics.contacts_per_world:,} contacts a world")
+        check_memory(fitted, device, 0)
+    return fitted
 
 
 def make_renderer(config: Config, scene: RenderScene, instances: int, views: int, histories: int = 0) -> Renderer:

@@ -34,6 +34,7 @@ from synpick_warp.exporters.base import ExportContext, Exporter
 from synpick_warp.exporters.registry import Exporters, aborting, slot_bytes
 from synpick_warp.exporters.writing.pool import WriterPool
 from synpick_warp.progress import Progress
+from synpick_warp.scenes.build import with_repeats
 from synpick_warp.scenes.cameras import make_cameras
 from synpick_warp.scenes.catalog import load_catalog
 from synpick_warp.scenes.lights import load_lights
@@ -265,9 +266,10 @@ def bake_on_devices(
     with DeviceProcesses(names, program, output.lock) as processes:
         report = partial(processes.report_once, progress)
         report("stage", "loading objects and lights")
-        catalog, lights = load_catalog(config, report=partial(report, "note")), load_lights(config.bake.lights)
+        catalog = load_catalog(config, report=partial(report, "note"))
+        lights = load_lights(config.bake.lights, partial(report, "note"), config.objects.strict)
         prepare_folder(output, kinds, catalog, lights)
-        dealt = deal_episodes(order_longest_first(config, catalog, output.remaining, pick_device("cpu")), len(names))
+        dealt = deal_episodes(order_longest_first(with_repeats(config, catalog), catalog, output.remaining, pick_device("cpu")), len(names))
         writers = deal_writers(count_writers(config), len(names))
         shares = [
             Share(output.out, replace(config, bake=replace(config.bake, device=name, writers=count)), episodes, len(names))

@@ -13,9 +13,11 @@ from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
 
 from synpick_warp.errors import ConfigError
+from synpick_warp.kernels.sim import contact_sweep
 from synpick_warp.scenes import build
+from synpick_warp.scenes.embedded.objects import procedural_objects
 from synpick_warp.scenes.tote import guide_walls
-from synpick_warp.scenes.types import Catalog
+from synpick_warp.scenes.types import Catalog, ConvexPiece
 from tests.harness.fuzz import fuzz_examples
 from tests.twins import arrangement
 from tests.worlds.small_worlds import ANGLE, BOX, CUBE, catalog, settings
@@ -354,3 +356,49 @@ def test_any_catalog_of_one_to_three_objects_gets_arrangements(data, budget, roo
     assert (taken.sum(axis=1) >= 1).all()
     # More than three of 40 with a chance of 1e-3 each: less than once in ten million.
     assert (taken > slots).any(axis=1).sum() <= 3
+
+
+# ---- settings that follow from the catalog ----
+
+
+def test_only_objects_thinner_than_the_contact_margin_raise_capacities():
+    config = settings(bake__mode="move", arrangement__max_objects=24)
+    assert build.with_capacities(config, catalog(BOX, CUBE, ANGLE)) is config
+    for size, least in (((0.1, 0.08, 0.001), 1300), ((0.002, 0.002, 0.1), 1300), ((0.3, 0.2, 0.0005), 1300), ((0.2, 0.2, 0.0079), 512)):
+        physics = build.with_capacities(config, catalog(BOX, (size,))).physics
+        assert least <= physics.contacts_per_world <= build.MAX_CONTACTS
+        assert physics.rows_per_world in (1536, build.MAX_ROWS)
+        assert physics.pairs_per_world >= 1024
+    few = settings(bake__mode="move", arrangement__max_objects=3)
+    assert build.with_capacities(few, catalog(((0.1, 0.08, 0.001),))) is few
+    roomy = settings(arrangement__max_objects=24, physics__contacts_per_world=8192)
+    assert build.with_capacities(roomy, catalog(((0.1, 0.08, 0.001),))) is roomy
+
+
+def test_rows_stay_in_shared_memory():
+    assert build.MAX_ROWS == contact_sweep.MAX_SHARED_ROWS
+
+
+def test_the_embedded_objects_keep_the_capacities():
+    margin = 2.0 * settings().physics.gap
+    for raw in procedural_objects():
+        assert build.oriented_sides([ConvexPiece(raw.mesh.vertices, raw.mesh.faces)]).min() > margin
+
+
+@pytest.mark.parametrize(
+    ("overrides", "shapes", "repeats"),
+    [
+        ({"arrangement__volume": 3e-3}, [BOX], True),
+        ({"arrangement__volume": 3e-3}, [BOX, CUBE], True),
+        ({"arrangement__volume": 3e-3, "arrangement__repeat_to_fill": False}, [BOX, CUBE], False),
+        ({"arrangement__volume": 3e-3, "arrangement__max_objects": 2}, [BOX, CUBE], False),
+        ({"arrangement__volume": 3.1e-4}, [BOX, CUBE], False),
+        ({"arrangement__volume": 1.5e-4}, [BOX, CUBE], True),
+    ],
+)
+def test_objects_repeat_where_all_of_them_stay_below_the_budget(overrides, shapes, repeats):
+    """An object that alone exceeds the budget is never drawn, and does not count."""
+    config = settings(bake__mode="pick", **{"arrangement__max_objects": 24} | overrides)
+    filled = build.with_repeats(config, catalog(*shapes))
+    assert build.find_repeat_rules(filled) == {repeats}
+    assert (filled is config) == (not repeats)

@@ -16,13 +16,13 @@ from hypothesis import strategies as st
 
 from synpick_warp.errors import CatalogError
 from synpick_warp.scenes.assets.meshes import smooth_normals
-from synpick_warp.scenes.collision import parallel
 from synpick_warp.scenes.collision import shapes as collision
 from synpick_warp.scenes.collision.decomposition import ShapeRecipe, decompose
 from synpick_warp.scenes.collision.hulls import hull_volume, mass_properties
 from synpick_warp.scenes.collision.shapes import collision_shapes, default_cache_dir
 from synpick_warp.scenes.collision.simplification import simplify_hull
 from synpick_warp.scenes.types import ConvexPiece, TriangleMesh
+from synpick_warp.system.isolation import Failure
 from tests.harness.environment import checkout_environment
 from tests.harness.pieces import assert_valid
 
@@ -45,6 +45,11 @@ def bowl(segments: int = 10) -> trimesh.Trimesh:
 
 def never(line: str) -> None:
     pytest.fail(line)
+
+
+def nothing(function, calls, limits):
+    assert not calls, "computed again"
+    return []
 
 
 def test_mass_properties_of_a_cube_far_from_its_origin():
@@ -103,7 +108,7 @@ def test_a_decomposed_bowl_stays_hollow(bowl_shape):
 
 def test_the_second_time_a_shape_comes_from_the_cache(bowl_shape, monkeypatch):
     cache, mesh, shape = bowl_shape
-    monkeypatch.setattr(parallel, "decompose", lambda *_: pytest.fail("computed again"))
+    monkeypatch.setattr(collision, "run_isolated", nothing)
     (again,) = collision_shapes(["bowl"], [mesh], [CONCAVE], cache, never)
     assert len(again) == len(shape)
     for one, two in zip(again, shape, strict=True):
@@ -117,7 +122,7 @@ def test_hulls_are_cached_too_and_no_temporary_file_is_left(tmp_path, monkeypatc
     mesh = as_mesh(trimesh.creation.box((0.1, 0.1, 0.1)))
     (shape,) = collision_shapes(["box"], [mesh], [HULL], tmp_path / "new", never)
     assert [file.suffix for file in (tmp_path / "new").iterdir()] == [".npz"]
-    monkeypatch.setattr(collision, "simplify_hull", lambda *_: pytest.fail("computed again"))
+    monkeypatch.setattr(collision, "run_isolated", nothing)
     (again,) = collision_shapes(["box"], [mesh], [HULL], tmp_path / "new", never)
     assert np.array_equal(again[0].vertices, shape[0].vertices)
 
@@ -200,38 +205,51 @@ def test_a_script_without_main_guard_can_decompose(tmp_path):
     assert (result.returncode, result.stdout, result.stderr) == (0, "[1, 1]\n", "")
 
 
+def fall_back(tmp_path, monkeypatch, result, seconds=300.0):
+    """Collision shape and lines of a mug whose decomposition ends with `result`."""
+
+    def run(function, calls, limits):
+        return [result if function is decompose else function(*call) for call in calls]
+
+    monkeypatch.setattr(collision, "run_isolated", run)
+    lines: list[str] = []
+    (shape,) = collision_shapes(["mug"], [as_mesh(bowl())], [CONCAVE], tmp_path, lines.append, seconds)
+    return shape, lines
+
+
 @pytest.mark.parametrize(
-    ("program", "words"),
+    ("result", "said"),
     [
-        ("import os; os.kill(os.getpid(), 9)", "b: the process that decomposes it was killed, probably for lack of memory"),
-        ("import os; os.kill(os.getpid(), 11)", "b: the process that decomposes it was ended by signal 11; repair the mesh"),
-        ("raise SystemExit('no library')", "b: the process that decomposes it ended with status 1: no library; repair the mesh"),
+        ((), "found no convex pieces"),
+        (Failure("crashed (SIGSEGV)"), "crashed (SIGSEGV)"),
+        (CatalogError("all vertices lie in one plane"), "failed (all vertices lie in one plane)"),
     ],
 )
-def test_a_process_that_dies_is_named_with_its_cause_and_the_others_are_stopped(monkeypatch, program, words):
-    """The first job's process waits for a minute, unless it is killed."""
-    start = "import pickle, sys, time; first = pickle.load(sys.stdin.buffer)[0]\nif first: time.sleep(60)\n"
-    monkeypatch.setattr(parallel, "_WORKER", start + program)
-    jobs = [("b", False, None), ("a", True, None)]
-    with pytest.raises(CatalogError) as caught:
-        list(parallel.decompose_all(jobs))
-    assert str(caught.value).startswith(words)
-    assert "\n" not in str(caught.value)
-
-
-def test_an_error_in_a_process_is_raised_in_the_caller(monkeypatch):
-    program = "from synpick_warp.scenes.collision import parallel as p; from synpick_warp.errors import CatalogError as E\n"
-    program += "def fail(*_): raise E('all vertices lie in one plane')\np.decompose = fail\np.main()"
-    monkeypatch.setattr(parallel, "_WORKER", program)
-    with pytest.raises(CatalogError, match="all vertices lie in one plane"):
-        list(parallel.decompose_all([("a", None, None), ("b", None, None)]))
-
-
-def test_a_failed_decomposition_is_a_clear_error(tmp_path, monkeypatch):
-    monkeypatch.setattr(parallel, "decompose", lambda *_: ())
-    with pytest.raises(CatalogError, match="mug: CoACD found no convex pieces"):
-        collision_shapes(["mug"], [as_mesh(bowl())], [CONCAVE], tmp_path, lambda _: None)
+def test_what_cannot_be_decomposed_gets_its_hull_with_a_line_and_is_tried_again(tmp_path, monkeypatch, result, said):
+    for _ in range(2):
+        (hull,), lines = fall_back(tmp_path, monkeypatch, result)
+        assert_valid(hull)
+        assert lines[-1].startswith(f"mug: its convex decomposition {said}; its convex hull is used instead: ")
+        assert len(lines) == 2
     assert not list(tmp_path.iterdir())
+
+
+def test_a_decomposition_that_takes_too_long_is_not_tried_again_within_the_same_time(tmp_path, monkeypatch):
+    (hull,), lines = fall_back(tmp_path, monkeypatch, Failure("took longer than 300 s and was stopped", timed_out=True))
+    assert "raise objects.decomposition_time" in lines[-1]
+    (again,), lines = fall_back(tmp_path, monkeypatch, "not asked")
+    assert np.array_equal(again.vertices, hull.vertices)
+    assert lines == ["mug: its convex decomposition took longer than 300 s before; its convex hull is used instead: " + collision._LATE]
+    shape, _ = fall_back(tmp_path, monkeypatch, (hull, hull), seconds=600.0)
+    assert len(shape) == 2
+
+
+def test_a_hull_that_cannot_be_computed_is_the_error_of_its_object(tmp_path):
+    flat = as_mesh(trimesh.creation.box((0.1, 0.1, 0.0)))
+    good, bad = collision_shapes(["good", "bad"], [as_mesh(bowl()), flat], [HULL, HULL], tmp_path, never)
+    assert len(good) == 1
+    assert isinstance(bad, CatalogError)
+    assert str(bad) == "bad: all vertices lie in one plane; a body needs a volume"
 
 
 @pytest.mark.parametrize(
@@ -265,6 +283,22 @@ def test_only_open_meshes_inner_walls_and_lost_parts_are_preprocessed(monkeypatc
     (piece,) = decompose(as_mesh(shell), CONCAVE)
     assert asked == modes
     assert_valid(piece)
+
+
+@pytest.mark.parametrize("copies", [1, 3])
+def test_repeated_triangles_and_needles_do_not_reach_coacd(monkeypatch, copies):
+    """Each triangle of an open box three times, another turned round once, and needles between its corners."""
+    box, given = trimesh.creation.box((0.1, 0.1, 0.1)), []
+    corners = np.concatenate([box.vertices, (box.vertices[:1] + box.vertices[1:2]) / 2, [(0.3, 0.0, 0.0)]])
+    faces = np.concatenate([*[box.faces[1:]] * copies, box.faces[1:3, ::-1][: copies - 1], [(0, 8, 1), (0, 0, 1)] * copies])
+    monkeypatch.setattr(coacd, "run_coacd", lambda mesh, **_: given.append(mesh) or [(box.vertices, None)])
+    mesh = TriangleMesh(corners.astype(np.float32), faces.astype(np.int32), corners, corners[:, :2])
+    decompose(mesh, CONCAVE)
+    assert len(given[0].indices) == 11
+    assert len(given[0].vertices) == 8
+    given.clear()
+    assert decompose(replace(mesh, faces=faces[-2:].astype(np.int32)), CONCAVE) == ()
+    assert not given
 
 
 def test_slivers_of_a_decomposition_are_dropped(monkeypatch):

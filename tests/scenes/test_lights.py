@@ -44,9 +44,9 @@ def make_set(folder, multi="2.0", gamma="2.2", image=None, sun=""):
     return folder
 
 
-def refused(folder, *words):
+def refused(folder, *words, strict=False):
     with pytest.raises(LightError) as caught:
-        load_lights(str(folder))
+        load_lights(str(folder), strict=strict)
     message = str(caught.value)
     assert "\n" not in message
     for word in words:
@@ -220,7 +220,13 @@ def test_a_set_with_a_missing_file(tmp_path, file):
     if file == "back.jpg":
         (folder / "room.ibl").write_text(f"[Background]\nBGfile = {file}\n" + (folder / "room.ibl").read_text())
     (folder / file).unlink(missing_ok=True)
-    refused(tmp_path, "room.ibl", file)
+    refused(tmp_path, "room.ibl", file, strict=True)
+    lines = []
+    if file == "ref.hdr":
+        refused(tmp_path, "room.ibl", file)
+    else:  # Only the reflection map is used.
+        assert len(load_lights(str(tmp_path), lines.append)) == 1
+        assert f"{file}, but there is no such file beside it; it is not used" in lines[0]
 
 
 @pytest.mark.parametrize("value", ["-1", "0", "nan", "inf", "bright"])

@@ -18,7 +18,7 @@ from synpick_warp.exporters.writing.png import encode_png
 from synpick_warp.inputs.paths import path_inside
 from synpick_warp.layer_codec import layer_notes
 from synpick_warp.scenes.assets.appearance import decode_texture, linear_to_srgb, srgb_to_linear
-from synpick_warp.scenes.assets.models_info import read_entries
+from synpick_warp.scenes.assets.models_info import corrected_entry, read_entries
 from synpick_warp.scenes.assets.ply import read_ply_file, read_ply_texture
 from synpick_warp.scenes.types import Camera, Catalog, CatalogEntry, Material
 
@@ -45,7 +45,10 @@ def write_constants(out: Path, catalog: Catalog, camera: Camera, depth_scale: fl
 
 
 def write_models(folder: Path, catalog: Catalog) -> None:
-    """Write every object's PLY file and texture, and models_info.json. Models loaded from BOP models are copied byte for byte."""
+    """Write every object's PLY file and texture, and models_info.json.
+
+    Models loaded from BOP models are copied byte for byte, and their entries as they are, if these have the sizes of the meshes.
+    """
     folder.mkdir()
     infos = {}
     for entry in catalog.entries:
@@ -56,7 +59,7 @@ def write_models(folder: Path, catalog: Catalog) -> None:
                 path.with_suffix(".png").write_bytes(encode_png(_tint_texture(entry.material)))
         else:
             _copy_model(entry, entry.source, path)
-        infos[str(entry.obj_id)] = _read_source_info(entry) or make_model_info(entry)
+        infos[str(entry.obj_id)] = corrected_entry(_read_source_info(entry), make_model_info(entry))
     _write_json(folder / "models_info.json", infos)
 
 

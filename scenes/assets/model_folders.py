@@ -1,0 +1,159 @@
+"""Layouts of model folders: which mesh files of a folder are its objects, with obj_ids and names.
+
+Three layouts: BOP's (obj_NNNNNN.ply), meshes side by side, and a folder per object, as Google Scanned Objects (Downs et al., ICRA 2022) and
+YCB (Calli et al., 2015) have.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from synpick_warp.errors import CatalogError
+from synpick_warp.scenes.assets.asset_files import check_file_name
+from synpick_warp.scenes.assets.meshes import SUFFIXES
+from synpick_warp.scenes.assets.models_info import bop_obj_id
+
+MAX_DEPTH = 3
+"""Depth to which an object's folder is searched for its mesh."""
+MAX_ENTRIES = 4096
+"""Maximum entries of an object's folder that are looked at."""
+MAX_OBJECTS = 4096
+"""Maximum objects of a model folder."""
+# Of several meshes in an object's folder, textured ones are preferred, by what their names begin with; then GLB, whose material is richest.
+_PREFERRED = ("textured", "model", "mesh", "visual")
+_FORMATS = (".glb", ".gltf", ".obj", ".ply", ".stl")
+
+Say = Callable[[str], None]
+Fault = Callable[[CatalogError], None]
+
+
+@dataclass(frozen=True)
+class ModelFile:
+    """A mesh file that is an object."""
+
+    obj_id: int
+    path: Path
+    name: str
+    """By which rows of the object table are found: the file's name without suffix, or that of the object's folder."""
+    root: Path
+    """Folder that names in the file must not lead out of."""
+    is_bop: bool
+    """In millimetres, with an entry in models_info.json."""
+
+
+def list_models(folder: Path, report: Say, fault: Fault) -> list[ModelFile]:
+    """List the objects of a model folder.
+
+    Args:
+        folder: The folder.
+        report: Called with each line on what is ignored.
+        fault: Called with the error of each object that cannot be used; it may raise it.
+
+    Raises:
+        CatalogError: The folder is missing, cannot be listed or contains no models.
+    """
+    if not folder.is_dir():
+        raise CatalogError(f"models folder {folder}: no such folder; give a BOP model folder, or a folder of OBJ, GLB or PLY meshes")
+    try:
+        entries = sorted(entry for entry in folder.iterdir() if not entry.name.startswith("."))
+        files = [entry for entry in entries if entry.suffix.lower() in SUFFIXES]
+        found = [] if files else _in_subfolders(entries, report)
+    except OSError as error:
+        raise CatalogError(f"models folder {folder}: cannot be listed ({error.strerror})") from error
+    if not files and not found:
+        raise CatalogError(f"models folder {folder}: it contains no models; add obj_NNNNNN.ply files, or .obj, .glb or .ply meshes")
+    if max(len(files), len(found)) > MAX_OBJECTS:
+        raise CatalogError(f"models folder {folder}: more than {MAX_OBJECTS} meshes; bake a part of them")
+    models, faults = _list_bop(files, folder, report)
+    if not models and not faults:
+        models, faults = _list_own(files, found, folder)
+    for error in faults:
+        fault(error)
+    return models
+
+
+def _list_bop(files: list[Path], folder: Path, report: Say) -> tuple[list[ModelFile], list[CatalogError]]:
+    """The BOP models among files, by obj_id, and the errors of those that cannot be used; nothing if there are none."""
+    models: dict[int, ModelFile] = {}
+    faults: list[CatalogError] = []
+    others = 0
+    for file in files:
+        try:
+            obj_id = bop_obj_id(file)
+            if obj_id is None:
+                others += 1
+                continue
+            check_file_name(file, CatalogError)
+            if obj_id in models:
+                raise CatalogError(f"{models[obj_id].path} and {file.name} are both object {obj_id}; keep one of them")
+            models[obj_id] = ModelFile(obj_id, file, file.stem, folder, True)
+        except CatalogError as error:
+            faults.append(error)
+    if others and (models or faults):
+        report(f"models folder {folder}: {others} meshes that are not named obj_NNNNNN.ply are ignored")
+    return [models[obj_id] for obj_id in sorted(models)], faults
+
+
+def _list_own(files: list[Path], found: list[tuple[Path, Path]], folder: Path) -> tuple[list[ModelFile], list[CatalogError]]:
+    """Meshes that are not BOP models, and the errors of those that cannot be used. Their obj_ids are positions, also of unusable ones.
+
+    Args:
+        files: Meshes side by side.
+        found: Folder of an object, and its mesh.
+        folder: The model folder.
+    """
+    models: list[ModelFile] = []
+    faults: list[CatalogError] = []
+    names: dict[str, Path] = {}
+    for obj_id, (place, path) in enumerate([*((folder, file) for file in files), *found], 1):
+        name = path.stem if place == folder else place.name
+        try:
+            check_file_name(place if place != folder else path, CatalogError)
+            check_file_name(path, CatalogError)
+            if name in names:
+                raise CatalogError(f"models folder {folder}: {names[name].name} and {path.name} have the same name; keep one of them")
+            names[name] = path
+            models.append(ModelFile(obj_id, path, name, place, False))
+        except CatalogError as error:
+            faults.append(error)
+    return models, faults
+
+
+def _in_subfolders(entries: list[Path], report: Say) -> list[tuple[Path, Path]]:
+    """Folder and mesh of each object that has a folder of its own."""
+    found = []
+    for place in entries:
+        if place.is_dir() and (meshes := _meshes_below(place)):
+            bop = next((mesh for mesh in meshes if bop_obj_id(mesh) is not None), None)
+            if bop is not None:
+                raise CatalogError(f"models folder {place.parent}: its folder {bop.parent.name} has BOP models; give {bop.parent}")
+            found.append((place, meshes[0]))
+            if len(meshes) > 1:
+                report(f"{place}: {len(meshes)} meshes, of which {meshes[0].relative_to(place)} is read")
+    return found
+
+
+def _meshes_below(place: Path) -> list[Path]:
+    """The meshes in an object's folder and its subfolders, the preferred one first. Links to folders are not followed."""
+    meshes: list[Path] = []
+    seen = 0
+    for root, folders, files in os.walk(place):
+        depth = len(Path(root).relative_to(place).parts)
+        folders[:] = sorted(name for name in folders if not name.startswith(".")) if depth < MAX_DEPTH else []
+        seen += len(files) + len(folders)
+        meshes += [Path(root, name) for name in sorted(files) if Path(name).suffix.lower() in SUFFIXES and not name.startswith(".")]
+        if seen > MAX_ENTRIES:
+            break
+    return sorted(meshes, key=lambda path: _preference(path, place))
+
+
+def _preference(path: Path, place: Path) -> tuple[int, int, int, str]:
+    """Sort key of a mesh in an object's folder: preferred names, then formats, then fewer folders between."""
+    stem = path.stem.lower()
+    rank = next((rank for rank, start in enumerate(_PREFERRED) if stem.startswith(start)), len(_PREFERRED))
+    if stem == place.name.lower():
+        rank = 1
+    return rank, _FORMATS.index(path.suffix.lower()), len(path.parts), str(path)

@@ -1,0 +1,321 @@
+"""Process isolation: calls of native libraries on data of users, each in a process of its own with limits of time and memory.
+
+A call that crashes, hangs or takes too much memory ends its own process, and the caller gets a `Failure`. The processes are forked from a
+server: a fresh interpreter that has imported the functions' modules, and that neither CUDA nor threads of this process have touched. So a
+call costs milliseconds, and starts from the same state each time, whatever libraries keep between calls. Each has a supervisor, which
+kills it when its time is over, or when the caller ends or closes the link (Ctrl-C).
+"""
+
+from __future__ import annotations
+
+import atexit
+import contextlib
+import importlib
+import math
+import mmap
+import os
+import pickle
+import resource
+import select
+import signal
+import socket
+import struct
+import sys
+import tempfile
+import threading
+import warnings
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, BinaryIO
+
+from synpick_warp.errors import SynpickError
+from synpick_warp.inputs.files import describe_bytes
+from synpick_warp.system.cores import count_cores
+from synpick_warp.system.processes import ProcessError, WorkerProcess, start_process
+from synpick_warp.system.threads import SETUP
+
+MODULES = ("synpick_warp.scenes.catalog", "synpick_warp.scenes.lights")
+"""What the server imports before it forks; functions of other modules work too, but import theirs in each call."""
+IDLE_TIME = 30.0
+"""A server without requests for this long exits [s]; the next call starts another one."""
+_GRACE = 5
+"""How much later than its supervisor's the alarm of a process itself ends it [s], should the supervisor have died."""
+_REQUEST = struct.Struct("<dQQ")
+"""Time limit [s], memory limit [bytes], size of the pickled function and arguments [bytes]."""
+_END = struct.Struct("<i?")
+"""Exit status, as of subprocess, and whether the time was over."""
+_STARTED = b"S"
+_BLOCK = 1 << 20
+_MAX_SHOWN = 200
+
+
+@dataclass(frozen=True)
+class Limits:
+    """Limits of a call."""
+
+    seconds: float
+    """Wall time [s]."""
+    memory: int
+    """Address space beyond that of the interpreter [bytes]."""
+
+
+@dataclass(frozen=True)
+class Failure:
+    """Why a call has no result."""
+
+    reason: str
+    """Predicate, such as "crashed (SIGSEGV)"."""
+    timed_out: bool = False
+
+
+_STOPPED = Failure("was stopped")
+
+
+class _Server:
+    """The running server, if there is one, and the links of running calls."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._worker: WorkerProcess | None = None
+
+    def open_link(self, result: int, fresh: bool) -> socket.socket:
+        """Ask the server for a process that writes its result into the file with handle `result`.
+
+        Args:
+            result: Handle of an open file.
+            fresh: Start another server first.
+
+        Returns:
+            The link to the process's supervisor.
+        """
+        ours, theirs = socket.socketpair()
+        with theirs, self._lock:
+            if fresh or self._worker is None or self._worker.process.poll() is not None:
+                self.stop()
+                program = f"from synpick_warp.system.isolation import main; main({MODULES!r})"
+                self._worker = start_process(program, has_threads=True)
+            with socket.socket(fileno=os.dup(self._worker.link.fileno())) as control, contextlib.suppress(OSError):
+                socket.send_fds(control, [b"r"], [theirs.fileno(), result])
+        return ours
+
+    def stop(self) -> None:
+        """End the server; calls that run come to their end."""
+        if self._worker is not None:
+            self._worker.kill()
+            self._worker = None
+
+
+_server = _Server()
+atexit.register(_server.stop)
+
+
+def run_isolated(function: Callable[..., Any], calls: Sequence[tuple[Any, ...]], limits: Limits) -> Iterator[Any]:
+    """Call a function with each tuple of arguments, in a process each, as many at a time as there are usable cores.
+
+    Args:
+        function: A function of a module, by whose name the process finds it.
+        calls: Arguments of each call; they are pickled.
+        limits: Limits of each call.
+
+    Yields:
+        For each call, in order and as soon as it and all before it have ended: its result, the `SynpickError` that it raised, or a
+        `Failure`.
+
+    Raises:
+        ProcessError: No process can be started.
+    """
+    if not calls:
+        return
+    links = _Links()
+    with ThreadPoolExecutor(min(len(calls), count_cores()), thread_name_prefix=SETUP) as threads:
+        try:
+            yield from threads.map(lambda arguments: links.call(pickle.dumps((function, arguments)), limits), calls)
+        finally:
+            # After an error, or Ctrl-C, nobody waits for the other calls.
+            links.close()
+
+
+class _Links:
+    """The links of the running calls, to be closed together."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._open: set[socket.socket] = set()
+        self._closed = False
+
+    def call(self, request: bytes, limits: Limits) -> Any:
+        """Run a call and wait for its end."""
+        with _open_scratch() as result:
+            for attempt in range(2):
+                try:
+                    link = _server.open_link(result.fileno(), fresh=attempt > 0)
+                except OSError as error:
+                    advice = "end other processes, or raise the limits"
+                    raise ProcessError(f"no process can be started to read a file: {error.strerror}; {advice}") from error
+                with link:
+                    with self._lock:
+                        if self._closed:
+                            return _STOPPED
+                        self._open.add(link)
+                    try:
+                        # An idle server may exit at this moment: then the link closes without a word.
+                        if _receive(link, 1) == _STARTED:
+                            return _outcome(_exchange(link, request, limits), result, limits)
+                        if self._closed:
+                            return _STOPPED
+                    finally:
+                        with self._lock:
+                            self._open.discard(link)
+        raise ProcessError("the process that reads files could not be started; see its message above, if any, and please report it")
+
+    def close(self) -> None:
+        """Close all links, by which their processes are killed, and open no others."""
+        with self._lock:
+            self._closed = True
+            for link in self._open:
+                with contextlib.suppress(OSError):
+                    link.shutdown(socket.SHUT_RDWR)
+
+
+def _receive(link: socket.socket, size: int) -> bytes:
+    """Receive up to `size` bytes, fewer if the other end closes."""
+    data = bytearray()
+    with contextlib.suppress(OSError):
+        while len(data) < size and (part := link.recv(min(size - len(data), _BLOCK))):
+            data += part
+    return bytes(data)
+
+
+def _open_scratch() -> BinaryIO:
+    """An empty file in memory, or where there is none, on disk: results of hundreds of megabytes pass through sockets slowly."""
+    if hasattr(os, "memfd_create"):
+        return os.fdopen(os.memfd_create("synpick"), "w+b")
+    return tempfile.TemporaryFile()
+
+
+def _exchange(link: socket.socket, request: bytes, limits: Limits) -> bytes:
+    """Send a request, and receive its end."""
+    with contextlib.suppress(OSError):
+        link.sendall(_REQUEST.pack(limits.seconds, limits.memory, len(request)))
+        link.sendall(request)
+    return _receive(link, _END.size)
+
+
+def _outcome(end: bytes, stream: BinaryIO, limits: Limits) -> Any:
+    """Result of a call from its end, and from the file with the pickled result."""
+    if len(end) < _END.size:
+        return _STOPPED
+    code, timed_out = _END.unpack(end)
+    if timed_out or code == -signal.SIGALRM:
+        return Failure(f"took longer than {limits.seconds:g} s and was stopped", timed_out=True)
+    if code == -signal.SIGKILL:
+        return Failure("was killed, probably for lack of memory")
+    if code < 0:
+        return Failure(f"crashed ({signal.Signals(-code).name})")
+    if code > 0:
+        return Failure(f"ended with status {code}")
+    with mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ) as data:
+        result = pickle.loads(data)
+    return Failure(f"needs more than {describe_bytes(limits.memory)} of memory") if isinstance(result, MemoryError) else result
+
+
+# ---- in the server and its children ----
+
+
+def main(modules: Sequence[str]) -> None:
+    """Entry point of the server: fork a supervisor for each link that arrives, until the caller's end, or too long without any."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.signal(signal.SIGCHLD, signal.SIG_IGN)  # The kernel reaps supervisors.
+    warnings.simplefilter("ignore")  # Python 3.12 warns of a fork beside the threads of BLAS, which handles forks.
+    for module in modules:
+        importlib.import_module(module)
+    control = socket.socket(fileno=int(sys.argv[1]))
+    while select.select([control], [], [], IDLE_TIME)[0]:
+        message, handles, _, _ = socket.recv_fds(control, 1, 2)
+        if not message:
+            return
+        if os.fork() == 0:
+            control.close()
+            _exit_after(_supervise, socket.socket(fileno=handles[0]), handles[1])
+        for handle in handles:
+            os.close(handle)
+
+
+def _exit_after(function: Callable[..., int], *arguments: Any) -> None:
+    """Exit with the function's status, whatever it raises: a forked process must not go on as its parent would."""
+    code = 1
+    try:
+        code = function(*arguments)
+    finally:
+        os._exit(code)
+
+
+def _supervise(link: socket.socket, result: int) -> int:
+    """Run a request in a child, and send its end; the child is killed if its time is over or the caller has closed the link."""
+    signal.signal(signal.SIGCHLD, signal.SIG_DFL)
+    link.sendall(_STARTED)
+    header = _receive(link, _REQUEST.size)
+    if len(header) < _REQUEST.size:
+        return 0
+    seconds, memory, size = _REQUEST.unpack(header)
+    request = _receive(link, size)
+    if len(request) < size:
+        return 0
+    alive, held = os.pipe()  # The child alone holds the other end: it closes as the child ends.
+    child = os.fork()
+    if child == 0:
+        os.close(alive)
+        _exit_after(_work, result, request, seconds, memory)
+    os.close(held)
+    ready = select.select([alive, link], [], [], seconds)[0]
+    if alive not in ready:
+        os.kill(child, signal.SIGKILL)
+    _, status = os.waitpid(child, 0)
+    with contextlib.suppress(OSError):
+        link.sendall(_END.pack(os.waitstatus_to_exitcode(status), not ready))
+    return 0
+
+
+def _work(result_file: int, request: bytes, seconds: float, memory: int) -> int:
+    """Run a request within its limits and write the pickled result; what native code prints is discarded."""
+    os.setpgid(0, 0)
+    null = os.open(os.devnull, os.O_RDWR)
+    for stream in (0, 1, 2):
+        os.dup2(null, stream)
+    signal.alarm(math.ceil(seconds) + _GRACE)
+    _limit_memory(memory)
+    try:
+        function, arguments = pickle.loads(request)
+        result = function(*arguments)
+    except (SynpickError, MemoryError) as error:
+        result = error
+    except Exception as error:  # native libraries raise nearly anything
+        text = " ".join(str(error).split())
+        text = text if text.isprintable() else ascii(text)[1:-1]
+        result = Failure(f"failed ({': '.join(filter(None, (type(error).__name__, text[:_MAX_SHOWN])))})")
+    _lift_memory_limit()
+    with os.fdopen(result_file, "wb", buffering=_BLOCK) as stream:
+        pickle.dump(result, stream, protocol=5)
+    return 0
+
+
+def _limit_memory(memory: int) -> None:
+    """Limit the address space, no cores; and let the kernel end this process first if memory runs out."""
+    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+    with contextlib.suppress(OSError):
+        Path("/proc/self/oom_score_adj").write_text("1000")
+    with contextlib.suppress(OSError, ValueError):
+        pages = int(Path("/proc/self/statm").read_text().split()[0])
+        soft, hard = resource.getrlimit(resource.RLIMIT_AS)
+        wanted = pages * resource.getpagesize() + memory
+        known = [limit for limit in (soft, hard) if limit != resource.RLIM_INFINITY]
+        resource.setrlimit(resource.RLIMIT_AS, (min([wanted, *known]), hard))
+
+
+def _lift_memory_limit() -> None:
+    """Lift the soft limit again, so that a result that was computed can be written."""
+    with contextlib.suppress(OSError, ValueError):
+        hard = resource.getrlimit(resource.RLIMIT_AS)[1]
+        resource.setrlimit(resource.RLIMIT_AS, (hard, hard))

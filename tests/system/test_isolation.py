@@ -1,0 +1,93 @@
+"""Isolated processes: a call that crashes, hangs, takes too much memory or is interrupted ends alone."""
+
+from __future__ import annotations
+
+import math
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+
+from synpick_warp.errors import CatalogError
+from synpick_warp.system import isolation
+from synpick_warp.system.isolation import Failure, Limits, run_isolated
+from tests.harness.environment import checkout_environment
+
+LIMITS = Limits(60.0, 2**30)
+
+
+def crash(number: int) -> None:
+    os.kill(os.getpid(), number)
+
+
+def complain() -> None:
+    raise CatalogError("one line")
+
+
+def noise() -> int:
+    os.write(1, b"on standard output")
+    os.write(2, b"on standard error")
+    return 7
+
+
+@pytest.mark.parametrize(
+    ("function", "arguments", "said"),
+    [
+        (crash, (signal.SIGSEGV,), "crashed (SIGSEGV)"),
+        (crash, (signal.SIGKILL,), "was killed, probably for lack of memory"),
+        (os.abort, (), "crashed (SIGABRT)"),
+        (os._exit, (3,), "ended with status 3"),
+        (bytearray, (2**32,), "needs more than 1 GiB of memory"),
+        (math.sqrt, (-1.0,), "failed (ValueError: math domain error)"),
+    ],
+)
+def test_a_call_that_fails_does_so_alone(function, arguments, said):
+    assert list(run_isolated(function, [arguments], LIMITS)) == [Failure(said)]
+    assert list(run_isolated(math.sqrt, [(4.0,), (9.0,)], LIMITS)) == [2.0, 3.0]
+
+
+def test_a_call_that_takes_too_long_is_stopped():
+    (late, early) = run_isolated(time.sleep, [(600.0,), (0.0,)], Limits(1.0, 2**30))
+    assert late == Failure("took longer than 1 s and was stopped", timed_out=True)
+    assert early is None
+
+
+def test_errors_are_results_and_large_results_arrive(capfd):
+    (error,) = run_isolated(complain, [()], LIMITS)
+    assert isinstance(error, CatalogError)
+    assert str(error) == "one line"
+    (data,) = run_isolated(bytearray, [(2**25,)], LIMITS)
+    assert len(data) == 2**25
+    assert list(run_isolated(noise, [()], LIMITS)) == [7]
+    assert capfd.readouterr() == ("", "")
+
+
+def test_a_server_that_has_ended_is_started_again():
+    list(run_isolated(math.sqrt, [(4.0,)], LIMITS))
+    assert isolation._server._worker is not None
+    isolation._server._worker.process.kill()
+    assert list(run_isolated(math.sqrt, [(4.0,)], LIMITS)) == [2.0]
+
+
+PROGRAM = """
+import sys, time
+from synpick_warp.system.isolation import Limits, run_isolated
+print("started", flush=True)
+list(run_isolated(time.sleep, [(600.0,)] * int(sys.argv[1]), Limits(600.0, 2**30)))
+"""
+
+
+@pytest.mark.parametrize("calls", [1, 2])
+def test_ctrl_c_ends_all_calls_at_once(calls):
+    """Of a single call, too: decompositions of one object ran in the caller, deaf to Ctrl-C."""
+    command = [sys.executable, "-c", PROGRAM, str(calls)]
+    with subprocess.Popen(command, env=checkout_environment(), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        process.stdout.readline()
+        time.sleep(3.0)
+        process.send_signal(signal.SIGINT)
+        _, errors = process.communicate(timeout=60)
+    assert "KeyboardInterrupt" in errors
