@@ -14,7 +14,7 @@ from synpick_warp.configs.schema import Config, ObjectRow, Objects, Tote
 from synpick_warp.errors import CatalogError
 from synpick_warp.scenes.assets.appearance import FileMaterial
 from synpick_warp.scenes.assets.asset_files import check_file_name
-from synpick_warp.scenes.assets.meshes import SUFFIXES, read_mesh, signed_volume
+from synpick_warp.scenes.assets.meshes import SUFFIXES, MeshOptions, read_mesh, signed_volume
 from synpick_warp.scenes.assets.models_info import ModelInfo, bop_files, read_models_info
 from synpick_warp.scenes.collision.decomposition import ShapeRecipe
 from synpick_warp.scenes.collision.hulls import hull_size, mass_properties
@@ -82,16 +82,27 @@ def _read_folder(folder: Path, config: Config, report: Callable[[str], None]) ->
         if ignored := len(files) - len(models):
             report(f"models folder {folder}: {ignored} meshes that are not named obj_NNNNNN.ply are ignored")
         infos = read_models_info(folder / "models_info.json", models)
-        return map_in_threads(lambda item: _read_bop(*item, infos.get(item[0], ModelInfo()), config), sorted(models.items()))
+        return _read_all(lambda item, said: _read_bop(*item, infos.get(item[0], ModelInfo()), config, said), sorted(models.items()), report)
     for first, second in itertools.pairwise(files):
         if first.stem == second.stem:
             raise CatalogError(f"models folder {folder}: {first.name} and {second.name} have the same name; keep one of them")
-    return map_in_threads(lambda item: _read_own(*item, config), enumerate(files, 1))
+    return _read_all(lambda item, said: _read_own(*item, config, said), list(enumerate(files, 1)), report)
 
 
-def _read_bop(obj_id: int, file: Path, info: ModelInfo, config: Config) -> RawObject:
+def _read_all(
+    read: Callable[[tuple[int, Path], Callable[[str], None]], RawObject], items: list[tuple[int, Path]], report: Callable[[str], None]
+) -> list[RawObject]:
+    """Read files in threads, and report what their readers say in the order of the files."""
+    said: dict[tuple[int, Path], list[str]] = {item: [] for item in items}
+    objects = map_in_threads(lambda item: read(item, said[item].append), items)
+    for line in itertools.chain.from_iterable(said.values()):
+        report(line)
+    return objects
+
+
+def _read_bop(obj_id: int, file: Path, info: ModelInfo, config: Config, say: Callable[[str], None]) -> RawObject:
     """Read a model of a BOP folder, with the row of the object table that has its obj_id, if the diameter agrees."""
-    mesh, material = read_mesh(file, _MILLIMETRE)
+    mesh, material = read_mesh(file, _MILLIMETRE, MeshOptions(config.objects.crease_angle), say)
     hull = hull_size(mesh.vertices)
     size = hull.diameter
     tolerance = config.objects.diameter_tolerance
@@ -104,9 +115,9 @@ def _read_bop(obj_id: int, file: Path, info: ModelInfo, config: Config) -> RawOb
     return replace(raw, symmetries_discrete=info.symmetries_discrete, symmetries_continuous=info.symmetries_continuous, source=file)
 
 
-def _read_own(obj_id: int, file: Path, config: Config) -> RawObject:
+def _read_own(obj_id: int, file: Path, config: Config, say: Callable[[str], None]) -> RawObject:
     """Read a mesh that is not a BOP model. Its obj_id is its position, so rows of the object table are matched by name and diameter."""
-    mesh, material = read_mesh(file, 1.0)
+    mesh, material = read_mesh(file, 1.0, MeshOptions(config.objects.crease_angle, config.objects.center), say)
     hull, tolerance = hull_size(mesh.vertices), config.objects.diameter_tolerance
     row = next((row for row in config.object_rows if row.name == file.stem and _fits(row, hull.diameter, tolerance)), None)
     return _raw(obj_id, file, mesh, hull, material, row, config.objects)
@@ -157,7 +168,8 @@ def _check_size(raw: RawObject, origin: str, tote: Tote) -> None:
     radius = float(np.linalg.norm(raw.mesh.vertices, axis=1).max())
     if radius > _MAX_ORIGIN_DISTANCE * size:
         raise CatalogError(
-            f"{origin}: a vertex lies {radius:.4g} m from the origin, but the body's diameter is {size:.4g} m; centre it on its origin"
+            f"{origin}: a vertex lies {radius:.4g} m from the origin, but the body's diameter is {size:.4g} m; centre it "
+            "on its origin, or set objects.center = true"
         )
 
 

@@ -75,17 +75,3 @@ def read_referred(folder: Path, name: str, owner: object, limit: int) -> tuple[P
     if not os.path.lexists(path):
         raise CatalogError(f"{owner} refers to {name!a}, but there is no file {path}; add it or remove the reference")
     return path, read_file(path, limit, CatalogError)
-
-
-class FileTable:
-    """Files by name, in memory: what a reader may open besides the model itself (trimesh's resolver protocol)."""
-
-    def __init__(self, file_name: str) -> None:
-        self.file_name = file_name
-        self.files: dict[str, bytes] = {}
-
-    def get(self, name: str) -> bytes:
-        """Content of a file; raises KeyError for others."""
-        return self.files[name]
-
-    __getitem__ = get
