@@ -91,7 +91,7 @@ def _finish(part: MeshPart, unit: float, options: MeshOptions, notes: Notes) -> 
     if options.center:
         offset = -(metres.min(axis=0) + metres.max(axis=0)) / 2.0
         if np.abs(offset).max() > 1e-6 * np.ptp(metres, axis=0).max():
-            notes.said.append(f"centred: moved by {', '.join(f'{value:.6g}' for value in offset)} m")
+            notes.said.append(f"centred: moved by {', '.join(f'{value:.6g}' for value in offset.round(6) + 0.0)} m")
             metres = metres + offset
     vertices = metres.astype(np.float32)
     faces, given = _orient_outward(vertices, part.faces, part.normals)

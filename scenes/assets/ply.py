@@ -16,6 +16,7 @@ from synpick_warp.inputs.files import read_file
 from synpick_warp.scenes.assets.appearance import MAX_TEXTURE_FILE, FileMaterial, decode_texture
 from synpick_warp.scenes.assets.asset_files import MAX_MESH_FILE, MAX_ROWS, MAX_TEXT_MESH, describe_error, quiet_decoding, read_referred
 from synpick_warp.scenes.assets.mesh_parts import NO_MATERIAL, WHITE, MeshPart, Notes
+from synpick_warp.scenes.assets.ply_binary import read_binary
 
 MAX_HEADER = 2**16
 """Longest header [bytes]; models have less than 1 kB."""
@@ -79,9 +80,7 @@ def read_ply(path: Path, notes: Notes) -> list[MeshPart]:
     """
     data = read_ply_file(path)
     try:
-        # fix_texture would reorder vertices; textures are read below, where a missing one is an error.
-        kwargs = load_ply(io.BytesIO(_without_edges(data, path)), fix_texture=False, skip_materials=True)
-        part = _ply_part(kwargs["metadata"]["_ply_raw"], path, notes)
+        part = _ply_part(_elements(data, path), path, notes)
     except CatalogError:
         raise
     except Exception as error:  # the reader raises nearly anything on damaged files
@@ -106,8 +105,7 @@ def read_ply_vertices(path: Path) -> np.ndarray:
     data = read_ply_file(path)
     try:
         with quiet_decoding():
-            content = load_ply(io.BytesIO(_without_edges(data, path)), fix_texture=False, skip_materials=True)
-        vertices = _columns(content["metadata"]["_ply_raw"].get("vertex", {}), ("x", "y", "z"))
+            vertices = _columns(_elements(data, path).get("vertex", {}), ("x", "y", "z"))
     except CatalogError:
         raise
     except Exception as error:  # the reader raises nearly anything on damaged files
@@ -119,11 +117,15 @@ def read_ply_vertices(path: Path) -> np.ndarray:
     return vertices
 
 
-def _without_edges(data: bytes, path: Path) -> bytes:
-    """Rename the element edge, from which the reader would make lines."""
-    start = _header(data, path)[1]
+def _elements(data: bytes, path: Path) -> dict[str, Any]:
+    """Elements of a PLY file, each with length, properties (type by name) and data (values by name)."""
+    lines, start = _header(data, path)
+    # The reader takes all lists of a property in a binary file for equally long; it would make lines of the element edge.
+    if len(lines) > 1 and lines[1].split()[1:2] in (["binary_little_endian"], ["binary_big_endian"]) and any(" list " in line for line in lines):
+        return read_binary(lines, data, start)
     renamed = re.sub(rb"(?m)^([ \t]*element[ \t]+)edge(?=[ \t])", rb"\1edg_", data[:start])
-    return data if renamed == data[:start] else renamed + data[start:]
+    # fix_texture would reorder vertices; textures are read elsewhere, where a missing one is an error.
+    return load_ply(io.BytesIO(renamed + data[start:]), fix_texture=False, skip_materials=True)["metadata"]["_ply_raw"]
 
 
 def _header(data: bytes, path: Path) -> tuple[list[str], int]:

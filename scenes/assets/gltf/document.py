@@ -175,6 +175,10 @@ class Material(_Struct):
     alphaMode: str = "OPAQUE"  # noqa: N815
 
 
+class _Head(_Struct):
+    asset: Any = None
+
+
 class Gltf(_Struct):
     extensionsUsed: list[str] = []  # noqa: N815
     extensionsRequired: list[str] = []  # noqa: N815
@@ -213,7 +217,11 @@ def read_document(path: Path, notes: Notes) -> Document:
         header, chunks = _split_chunks(data, path)
     else:
         header, chunks = data.removeprefix(b"\xef\xbb\xbf"), []
-    gltf = decode_json(header, Gltf, f"{path}: its JSON chunk" if chunks else path, CatalogError)
+    where = f"{path}: its JSON chunk" if chunks else path
+    version = decode_json(header, _Head, where, CatalogError).asset
+    if isinstance(version, dict) and str(version.get("version", "2")).startswith("1"):
+        raise CatalogError(f"{path}: it is glTF 1.0, which is not readable; export it as glTF 2.0")
+    gltf = decode_json(header, Gltf, where, CatalogError)
     _check_extensions(gltf, path, notes)
     _check_sizes(gltf, path)
     _check_tree(gltf, path)
@@ -225,8 +233,8 @@ def _check_extensions(gltf: Gltf, path: Path, notes: Notes) -> None:
     needed = sorted(set(gltf.extensionsRequired) - _IMPLEMENTED)
     refused = [ascii(name)[1:-1][:80] for name in needed if not name.startswith(_DISPENSABLE)]
     if refused:
-        compressed = any(name in _COMPRESSED for name in refused)
-        advice = "export it without compression" if compressed else "export it without, textures as PNG or JPEG"
+        advice = "export it with textures as PNG or JPEG" if any("texture" in name for name in refused) else "export it without it"
+        advice = "export it without compression" if any(name in _COMPRESSED for name in refused) else advice
         raise CatalogError(f"{path}: requires the extension {', '.join(refused[:8])}, which is not implemented; {advice}")
     notes.ignored += [ascii(name)[1:-1][:80] for name in sorted(set(gltf.extensionsUsed) | set(needed)) if name not in _IMPLEMENTED]
     notes.ignored += [name for name in ("animations", "skins") if getattr(gltf, name)]
@@ -235,7 +243,7 @@ def _check_extensions(gltf: Gltf, path: Path, notes: Notes) -> None:
 def _split_chunks(data: bytes, path: Path) -> tuple[bytes, list[bytes]]:
     """The JSON chunk and all binary chunks; chunks of other types are ignored, as glTF demands."""
     if data[:4] == b"glTF" and data[4:8] == b"\1\0\0\0":
-        raise CatalogError(f"{path}: not readable as GLB (it is glTF 1.0); export it as glTF 2.0")
+        raise CatalogError(f"{path}: it is glTF 1.0, which is not readable; export it as glTF 2.0")
     if data[:4] != b"glTF" or len(data) < 20 or data[4:8] != b"\2\0\0\0" or data[16:20] != _JSON:
         raise CatalogError(f"{path}: not readable as GLB (it does not begin with the header of glTF 2.0 and a JSON chunk)")
     at, chunks = 12, []
@@ -283,7 +291,8 @@ def _primitive_rows(gltf: Gltf, primitive: Primitive, path: Path) -> int:
     for key, index in (*used.items(), *([("indices", primitive.indices)] if primitive.indices is not None else ())):
         accessor = item_at(gltf.accessors, index, "accessor", path)
         if accessor.bufferView is None and accessor.sparse is None and accessor.count:
-            raise CatalogError(f"{path}: {key} without data, as in files with compressed geometry; export it without compression")
+            names = ", ".join(ascii(name)[1:-1][:80] for name in sorted(primitive.extensions)) or "compressed geometry"
+            raise CatalogError(f"{path}: {key} without data, as in files with {names}; export it without compression")
     count = gltf.accessors[used["POSITION"]].count
     corners = gltf.accessors[primitive.indices].count if primitive.indices is not None else count
     return max(count, corners // 3 if primitive.mode == TRIANGLES else corners)

@@ -95,7 +95,8 @@ def _parse_statement(material: MtlMaterial, key: str, words: list[str], line: st
         _parse_map(material, key, words, line)
     elif key not in _SILENT:
         material.ignored.append(ascii(words[0])[1:-1][:40])
-    elif (key == "d" and _numbers(words[-1:]) not in ([1.0], [])) or (key == "tr" and _numbers(words[1:2]) not in ([0.0], [])):
+    elif (key == "d" and _numbers(words[-1:]) not in ([1.0], [])) or (key == "tr" and _numbers(words[1:2]) not in ([0.0], [1.0], [])):
+        # Of Tr both ends are written for opaque materials.
         material.ignored.append("transparency")
     elif key == "ke" and any(_numbers(words[1:])):
         material.ignored.append("emission")

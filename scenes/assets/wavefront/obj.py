@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 from trimesh.exchange.obj import load_obj
+from trimesh.geometry import triangulate_quads
 
 from synpick_warp.errors import CatalogError
 from synpick_warp.inputs.files import read_file
@@ -67,7 +68,7 @@ def _part(
     mesh: dict[str, Any], used: dict[str, None], known: dict[str, MtlMaterial], materials: dict[str, FileMaterial], path: Path, notes: Notes
 ) -> MeshPart:
     """Convert one of the reader's meshes."""
-    vertices, faces = np.asarray(mesh["vertices"], np.float64), np.asarray(mesh["faces"], np.int64)
+    vertices, faces = np.asarray(mesh["vertices"], np.float64), triangulate_quads(mesh["faces"])
     normals, visual, colors = mesh.get("vertex_normals"), mesh.get("visual"), mesh.get("vertex_colors")
     if vertices.shape[1:] != (3,) or faces.shape[1:] != (3,) or (normals is not None and np.shape(normals) != vertices.shape):
         raise CatalogError(f"{path}: vertices, normals or triangles with other than three numbers each; repair the mesh")
