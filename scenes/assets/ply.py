@@ -121,7 +121,11 @@ def _elements(data: bytes, path: Path) -> dict[str, Any]:
     """Elements of a PLY file, each with length, properties (type by name) and data (values by name)."""
     lines, start = _header(data, path)
     # The reader takes all lists of a property in a binary file for equally long; it would make lines of the element edge.
-    if len(lines) > 1 and lines[1].split()[1:2] in (["binary_little_endian"], ["binary_big_endian"]) and any(" list " in line for line in lines):
+    if (
+        len(lines) > 1
+        and lines[1].split()[1:2] in (["binary_little_endian"], ["binary_big_endian"])
+        and any(" list " in line for line in lines)
+    ):
         return read_binary(lines, data, start)
     renamed = re.sub(rb"(?m)^([ \t]*element[ \t]+)edge(?=[ \t])", rb"\1edg_", data[:start])
     # fix_texture would reorder vertices; textures are read elsewhere, where a missing one is an error.

@@ -149,6 +149,88 @@ def test_vertex_colors_become_a_color_or_a_texture(tmp_path):
     assert np.array_equal(finish.texture[row, column], [(60 * i, 255 - 60 * i, 7) for i in tote_corner])
 
 
+@pytest.mark.parametrize(
+    ("kind", "largest", "names"),
+    [
+        ("uchar", 255, ("red", "green", "blue")),
+        ("uchar", 255, ("diffuse_red", "diffuse_green", "diffuse_blue")),
+        ("uchar", 255, ("r", "g", "b")),
+        ("ushort", 65535, ("red", "green", "blue")),
+        ("int", 255, ("red", "green", "blue")),
+        ("float", 1, ("red", "green", "blue")),
+        ("float", 255, ("red", "green", "blue")),
+    ],
+)
+@pytest.mark.parametrize("at", ["vertex", "face"])
+def test_colors_of_any_type_and_name(tmp_path, kind, largest, names, at):
+    color = [largest, 0, largest // 5 if kind != "float" else largest / 5]
+    text = ascii_ply([(*corner, *color) if at == "vertex" else corner for corner in CORNERS], FACES, ("x", "y", "z"))
+    columns = "".join(f"property {kind} {name}\n" for name in names)
+    text = (
+        text.replace("property float z\n", f"property float z\n{columns}")
+        if at == "vertex"
+        else text.replace("end_header", f"{columns}end_header")
+    )
+    if at == "face":
+        text = "\n".join(f"{line} {color[0]} {color[1]} {color[2]}" if line.startswith("3 ") else line for line in text.split("\n"))
+    (tmp_path / "a.ply").write_text(text)
+    _, finish = read_mesh(tmp_path / "a.ply", 1.0)
+    assert finish.color == pytest.approx((1.0, 0.0, 0.2))
+
+
+def test_each_face_has_its_color_also_polygons(tmp_path):
+    """A box of quads and triangles mixed, text and binary."""
+    box = trimesh.creation.box((2, 2, 2)).vertices
+    sides = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6), (0, 6, 4), (1, 5, 7), (1, 7, 3)]
+    header = f"ply\nformat FORMAT 1.0\nelement vertex 8\nproperty float x\nproperty float y\nproperty float z\nelement face {len(sides)}\n"
+    header += "property list uchar int vertex_indices\nproperty uchar red\nproperty uchar green\nproperty uchar blue\nend_header\n"
+    rows = [(len(side), *side, 30 * number, 255, 0) for number, side in enumerate(sides)]
+    text = header.replace("FORMAT", "ascii") + "\n".join(" ".join(map(str, row)) for row in [*box.tolist(), *rows])
+    contents = [text.encode()]
+    for order, name in (("<", "binary_little_endian"), (">", "binary_big_endian")):
+        body = box.astype(f"{order}f4").tobytes() + b"".join(struct.pack(f"{order}B{row[0]}i3B", *row) for row in rows)
+        contents.append(header.replace("FORMAT", name).encode() + body)
+    for content in contents:
+        (tmp_path / "a.ply").write_bytes(content)
+        mesh, finish = read_mesh(tmp_path / "a.ply", 1.0)
+        assert len(mesh.faces) == 12
+        assert signed_volume(mesh.vertices, mesh.faces) == pytest.approx(8.0)
+        height, width = finish.texture.shape[:2]
+        middle = mesh.uv[mesh.faces].mean(axis=1)
+        texel = finish.texture[((1 - middle[:, 1]) * height).astype(int), (middle[:, 0] * width).astype(int)]
+        centre = mesh.vertices[mesh.faces].mean(axis=1)
+        found = {(int(np.abs(at).argmax()), bool(at.max() > 0.99), int(red)) for at, red in zip(centre, texel[:, 0], strict=True)}
+        assert {red for _, _, red in found} == {30 * number for number in range(len(sides))}
+        # Both halves of a quad have one colour: each of its sides has one, those of two triangles have two.
+        assert len(found) == len(sides)
+
+
+def test_strips_of_triangles(tmp_path):
+    text = ascii_ply(CORNERS, []).replace(
+        "element face 0\nproperty list uchar int vertex_indices", "element tristrips 1\nproperty list int int vertex_indices"
+    )
+    (tmp_path / "a.ply").write_text(text + "8 0 2 1 3 -1 0 3 2\n")
+    mesh, _ = read_mesh(tmp_path / "a.ply", 1.0, SMOOTH)
+    assert np.array_equal(np.sort(mesh.faces), np.sort([(0, 2, 1), (1, 2, 3), (0, 3, 2)]))
+
+
+@pytest.mark.parametrize("kind", ["stl", "stl_ascii"])
+def test_an_stl_is_read_with_its_equal_corners_merged(tmp_path, kind):
+    ball = trimesh.creation.icosphere(2, 0.1)
+    data = ball.export(file_type=kind)
+    (tmp_path / "a.stl").write_bytes(data if isinstance(data, bytes) else (data + data).encode())
+    mesh, finish = read_mesh(tmp_path / "a.stl", 1.0)
+    assert len(mesh.vertices) == len(ball.vertices)
+    assert finish.color == (0.7, 0.7, 0.7)
+
+
+def test_what_is_ignored_of_a_ply_is_one_line(tmp_path):
+    (tmp_path / "a.ply").write_text(ascii_ply([(*corner, 1, 2) for corner in CORNERS], FACES, ("x", "y", "z", "quality", "radius")))
+    said: list[str] = []
+    read_mesh(tmp_path / "a.ply", 1.0, report=said.append)
+    assert said == [f"{tmp_path / 'a.ply'}: ignored: quality, radius"]
+
+
 @given(st.lists(st.tuples(*[st.integers(0, 255)] * 3), min_size=3, max_size=3), st.tuples(*[st.floats(0.0, 1.0)] * 3))
 def test_baked_vertex_colors_interpolate_linearly(colors, weights):
     total = sum(weights)
@@ -336,6 +418,13 @@ GOOD = ascii_ply(CORNERS, FACES)
         ("a.ply", b"\x00\xff" * 50, "not readable"),
         ("a.obj", "v 0 0 0\nv 1 0 0\nv 0 1 0\n", "a.obj"),
         ("a.obj", "", "a.obj"),
+        ("a.stl", "", "no triangles"),
+        ("a.stl", b"\x00" * 80 + struct.pack("<I", 2) + bytes(50), "cut short"),
+        ("a.stl", b"\x00" * 80 + struct.pack("<I", 2**32 - 1), "announces 4294967295 triangles"),
+        ("a.stl", "solid x\nvertex 0 0 0\nvertex 1 0 0\n", "not readable as STL"),
+        ("a.stl", "solid x\nvertex 0 0 0\nvertex 1 0 0\nvertex 0 nan 0\n", "not finite"),
+        ("a.gltf", "{}", "no triangles"),
+        ("a.gltf", "hello", "a.gltf is damaged"),
         ("a.glb", b"glTF", "not readable"),
         ("a.glb", "", "not readable"),
     ],
