@@ -31,7 +31,7 @@ class Case:
     said: tuple[str, ...] = ()
     """Words of its line; empty: there is no line."""
     check: Callable[[CatalogEntry], bool] = lambda entry: True
-    objects: Objects = Objects()
+    center: bool = False
 
     @property
     def folder(self) -> Path:
@@ -84,7 +84,7 @@ MESHES = (
     Case("ply_face_colour", check=lambda entry: len(texels(entry)) >= 2),
     Case("obj_two_materials_tiled", check=shows_both_textures),
     Case("obj_utf16", GREY, check=extent(0.1, 0.08, 0.06)),
-    Case("obj_off_origin", GREY, ("centred: moved by -0.4, -0.1, -0.2 m",), is_centred, Objects(center=True)),
+    Case("obj_off_origin", GREY, ("centred: moved by -0.4, -0.1, -0.2 m",), is_centred, center=True),
     Case("obj_sheet_1mm", GREY, check=extent(0.1, 0.08, 0.001)),
 )
 
@@ -92,7 +92,7 @@ MESHES = (
 @pytest.mark.parametrize("case", MESHES, ids=lambda case: case.name)
 def test_meshes(tmp_path, case):
     lines: list[str] = []
-    catalog = load_catalog(Config(bake=Bake(models=str(case.folder)), objects=case.objects), tmp_path, lines.append)
+    catalog = load_catalog(Config(bake=Bake(models=str(case.folder)), objects=Objects(center=case.center)), tmp_path, lines.append)
     (entry,) = catalog.entries
     assert entry.material.color == pytest.approx(case.color or (1.0, 1.0, 1.0), abs=0.003)
     assert (entry.material.texture is None) == (case.color is not None)

@@ -166,11 +166,8 @@ def test_colors_of_any_type_and_name(tmp_path, kind, largest, names, at):
     color = [largest, 0, largest // 5 if kind != "float" else largest / 5]
     text = ascii_ply([(*corner, *color) if at == "vertex" else corner for corner in CORNERS], FACES, ("x", "y", "z"))
     columns = "".join(f"property {kind} {name}\n" for name in names)
-    text = (
-        text.replace("property float z\n", f"property float z\n{columns}")
-        if at == "vertex"
-        else text.replace("end_header", f"{columns}end_header")
-    )
+    before = "element face" if at == "vertex" else "end_header"
+    text = text.replace(before, columns + before)
     if at == "face":
         text = "\n".join(f"{line} {color[0]} {color[1]} {color[2]}" if line.startswith("3 ") else line for line in text.split("\n"))
     (tmp_path / "a.ply").write_text(text)
@@ -206,9 +203,7 @@ def test_each_face_has_its_color_also_polygons(tmp_path):
 
 
 def test_strips_of_triangles(tmp_path):
-    text = ascii_ply(CORNERS, []).replace(
-        "element face 0\nproperty list uchar int vertex_indices", "element tristrips 1\nproperty list int int vertex_indices"
-    )
+    text = ascii_ply(CORNERS, []).replace("face 0\nproperty list uchar", "tristrips 1\nproperty list int")
     (tmp_path / "a.ply").write_text(text + "8 0 2 1 3 -1 0 3 2\n")
     mesh, _ = read_mesh(tmp_path / "a.ply", 1.0, SMOOTH)
     assert np.array_equal(np.sort(mesh.faces), np.sort([(0, 2, 1), (1, 2, 3), (0, 3, 2)]))

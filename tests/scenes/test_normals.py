@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 import trimesh
 from hypothesis import given
 from hypothesis import strategies as st
+from trimesh.exchange.gltf import export_gltf
 
 from synpick_warp.configs.schema import Bake, Config, Objects
 from synpick_warp.exporters.bop.shared.models import write_models
@@ -25,10 +28,11 @@ def write(folder, mesh: trimesh.Trimesh, kind: str, *, split: bool = False):
     bare = trimesh.Trimesh(mesh.vertices[mesh.faces].reshape(-1, 3) if split else mesh.vertices, faces, process=False)
     file = folder / f"part.{kind}"
     if kind == "gltf":
-        for name, data in trimesh.exchange.gltf.export_gltf(trimesh.Scene([bare])).items():
+        for name, data in export_gltf(trimesh.Scene([bare])).items():
             (folder / (file.name if name == "model.gltf" else name)).write_bytes(data)
     else:
-        file.write_bytes(data if isinstance(data := bare.export(file_type=kind), bytes) else data.encode())
+        content: Any = bare.export(file_type=kind)
+        file.write_bytes(content.encode() if isinstance(content, str) else content)
     return file
 
 

@@ -12,6 +12,7 @@ from PIL import Image
 from synpick_warp.errors import CatalogError
 from synpick_warp.scenes.assets.meshes import read_mesh
 
+RED = "newmtl skin\nKd 1 0 0\n"
 GREY = (0.7, 0.7, 0.7)
 UV = np.array([[0, 0], [1, 0], [1, 1], [0, 1]])
 HEAD = "mtllib a.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nvt 0 0\nvt 1 0\nvt 1 1\nvt 0 1\n"
@@ -62,7 +63,7 @@ def test_options_of_a_texture(tmp_path, options, scale, offset, said, name):
         ("newmtl skin\nKa 1 1 1\nKs 1 1 1\nNs 30\nillum 2\nd 1\n", GREY, None, None, ""),
         ("newmtl skin\nmap_Ka skin.png\n", GREY, None, None, "ignored: map_Ka"),
         (
-            "newmtl skin\nKd 1 0 0\nnorm n.png\nmap_d a.png\nKe 1 1 1\nd 0.5\n",
+            RED + "norm n.png\nmap_d a.png\nKe 1 1 1\nd 0.5\n",
             (1, 0, 0),
             None,
             None,
@@ -70,13 +71,13 @@ def test_options_of_a_texture(tmp_path, options, scale, offset, said, name):
         ),
         ("newmtl skin\nKd spectral file.rfl\n", GREY, None, None, "ignored: Kd spectral"),
         (
-            "newmtl skin\nKd 1 0 0\nnewmtl old\nmap_Kd gone.png\n",
+            RED + "newmtl old\nmap_Kd gone.png\n",
             (1, 0, 0),
             None,
             None,
             "the image 'gone.png' of an unused material is missing",
         ),
-        ("newmtl skin\nKd 1 0 0\nnewmtl old\nmap_Kd grey.png\n", (1, 0, 0), None, None, ""),
+        (RED + "newmtl old\nmap_Kd grey.png\n", (1, 0, 0), None, None, ""),
         (
             "newmtl other\nKd 1 0 0\n",
             GREY,
@@ -132,11 +133,8 @@ def test_textures_that_repeat_beside_others(tmp_path, low, high):
     """Two materials on two triangles each; the colour at the corners of the first, in the middle of the image's left or right half."""
     image = np.zeros((64, 64, 3), np.uint8)
     image[:, :32], image[:, 32:] = (255, 0, 0), (0, 0, 255)
-    obj = (
-        HEAD.replace("vt 0 0", f"vt {low + 0.25} {low + 0.5}")
-        .replace("vt 1 0", f"vt {high - 0.25} 0.5")
-        .replace("vt 1 1", f"vt {low + 0.75} {high}")
-    )
+    first, second, third = f"vt {low + 0.25} {low + 0.5}", f"vt {high - 0.25} 0.5", f"vt {low + 0.75} {high}"
+    obj = HEAD.replace("vt 0 0", first).replace("vt 1 0", second).replace("vt 1 1", third)
     obj += "usemtl skin\n" + "".join(FACES[:2]) + "usemtl other\n" + "".join(FACES[2:])
     read(tmp_path, None)
     Image.fromarray(image).save(tmp_path / "half.png")
