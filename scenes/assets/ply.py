@@ -121,57 +121,6 @@ def _elements(data: bytes, path: Path) -> dict[str, Any]:
     """Elements of a PLY file, each with length, properties (type by name) and data (values by name)."""
     lines, start = _header(data, path)
     # The reader takes all lists of a property in a binary file for equally long; it would make lines of the element edge.
-    if (
-        len(lines) > 1
-        and lines[1].split()[1:2] in (["binary_little_endian"], ["binary_big_endian"])
-        and any(" list " in line for line in lines)
-    ):
-        return read_binary(lines, data, start)
-    renamed = re.sub(rb"(?m)^([ \t]*element[ \t]+)edge(?=[ \t])", rb"\1edg_", data[:start])
-    # fix_texture would reorder vertices; textures are read elsewhere, where a missing one is an error.
-    return load_ply(io.BytesIO(renamed + data[start:]), fix_texture=False, skip_materials=True)["metadata"]["_ply_raw"]
-
-
-def _header(data: bytes, path: Path) -> tuple[list[str], int]:
-    """Lines of the header, and where the body begins; ends, as for the reader, at the first line with the word end_header."""
-    lines, start = [], 0
-    while start < min(len(data), MAX_HEADER):
-        end = data.find(b"\n", start, MAX_HEADER) + 1 or len(data)
-        try:
-            lines.append(data[start:end].decode("utf-8").strip())
-        except UnicodeDecodeError:
-            raise CatalogError(
-                f"{path}: not readable as PLY (line {len(lines) + 1} of its header is not UTF-8); save it as UTF-8"
-            ) from None
-        start = end
-        if lines[0] != "ply":
-            raise CatalogError(f"{path}: not readable as PLY (its first line is not ply)")
-        if "end_header" in lines[-1].split():
-            return lines, start
-    raise CatalogError(f"{path}: not readable as PLY (no header that ends within {MAX_HEADER} bytes)")
-
-
-def _check_elements(lines: list[str], data: bytes, start: int, path: Path) -> None:
-    """Check the counts of a header before anything is allocated for them."""
-    elements: dict[str, int] = {}
-    counts: dict[str, set[str]] = {}
-    for number, line in enumerate(lines[2:-1], start=3):
-        words = line.split()
-        if words[:1] == ["element"]:
-            if len(words) != 3 or not words[2].isascii() or not words[2].isdecimal() or words[1] in elements:
-                raise CatalogError(f"{path}: not readable as PLY (line {number}: {line[:80]!a})")
-            if len(words[2]) > 20 or int(words[2]) > MAX_ROWS:
-                raise CatalogError(f"{path}: {line[:80]!a}; allowed: at most {MAX_ROWS} vertices and as many faces; decimate the mesh")
-            elements[words[1]], counts[words[1]] = int(words[2]), set()
-        elif words[:1] == ["property"]:
-            owner = list(counts)[-1] if counts else ""
-            if not owner or words[-1] in counts[owner]:
-                raise CatalogError(f"{path}: not readable as PLY (line {number}: {line[:80]!a})")
-            counts[owner].add(words[-1])
-        elif not words or "element" in words[0] or "property" in words[0]:
-            raise CatalogError(f"{path}: not readable as PLY (line {number}: {line[:80]!a})")
-    if sum(map(len, counts.values())) > MAX_PROPERTIES:
-        raise CatalogError(f"{path}: more than {MAX_PROPERTIES} properties; remove those that are not needed")
     if len(lines) > 1 and lines[1].startswith("format binary_") and any(" list " in line for line in lines):
         return read_binary(lines, data, start)
     renamed = re.sub(rb"(?m)^([ \t]*element[ \t]+)edge(?=[ \t])", rb"\1edg_", data[:start])
