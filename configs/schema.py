@@ -98,6 +98,18 @@ class Objects:
     density: float = setting(400.0, "kg/m³", "Density over the volume of the convex hull, for objects without a mass.", above=0.0)
     metallic: float = setting(0.1, "", "Metallic factor of objects whose material names none.", low=0.0, high=1.0)
     roughness: float = setting(0.5, "", "Roughness of objects whose material names none.", low=0.0, high=1.0)
+    crease_angle: float = setting(
+        35.0,
+        "°",
+        "Meshes without normals are smooth where triangles meet at up to this angle, and have a sharp edge beyond; 180: smooth all over.",
+        low=0.0,
+        high=180.0,
+    )
+    center: bool = setting(
+        False,
+        "",
+        "Move the centre of each mesh's bounding box to its origin; BOP models, whose poses refer to their origin, stay as they are.",
+    )
     diameter_tolerance: float = setting(
         0.1,
         "",

@@ -13,7 +13,7 @@ from synpick_warp.configs.schema import Config, ObjectRow, Objects, Tote
 from synpick_warp.errors import CatalogError, SynpickError
 from synpick_warp.scenes.assets.appearance import FileMaterial
 from synpick_warp.scenes.assets.asset_files import asset_scope
-from synpick_warp.scenes.assets.meshes import read_mesh, signed_volume
+from synpick_warp.scenes.assets.meshes import MeshOptions, read_mesh, signed_volume
 from synpick_warp.scenes.assets.model_folders import ModelFile, list_models
 from synpick_warp.scenes.assets.models_info import ModelInfo, check_against_mesh, read_models_info
 from synpick_warp.scenes.collision.decomposition import ShapeRecipe
@@ -137,8 +137,9 @@ def _read_model(model: ModelFile, info: ModelInfo, config: Config) -> tuple[RawO
     A BOP model has the row of the object table with its obj_id, others the row with their name, if the diameter agrees.
     """
     lines: list[str] = []
+    options = MeshOptions(config.objects.crease_angle, config.objects.center and not model.is_bop)
     with asset_scope(model.root) as scope:
-        mesh, material = read_mesh(model.path, _MILLIMETRE if model.is_bop else 1.0)
+        mesh, material = read_mesh(model.path, _MILLIMETRE if model.is_bop else 1.0, options, lines.append)
     hull, tolerance = hull_size(mesh.vertices), config.objects.diameter_tolerance
     if model.is_bop and hull.diameter > 0.0:
         info, said = _check_info(info, mesh, hull, model, config.objects.strict)
@@ -209,7 +210,8 @@ def _check_size(raw: RawObject, origin: str, tote: Tote) -> None:
     radius = float(np.linalg.norm(raw.mesh.vertices, axis=1).max())
     if radius > _MAX_ORIGIN_DISTANCE * size:
         raise CatalogError(
-            f"{origin}: a vertex lies {radius:.4g} m from the origin, but the body's diameter is {size:.4g} m; centre it on its origin"
+            f"{origin}: a vertex lies {radius:.4g} m from the origin, but the body's diameter is {size:.4g} m; centre it "
+            "on its origin, or set objects.center = true"
         )
 
 

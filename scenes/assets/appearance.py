@@ -16,6 +16,10 @@ MAX_TEXTURE_FILE = 2**27
 """Largest image file [bytes]: 128 MiB."""
 MAX_TEXTURE_PIXELS = 2**26
 """Maximum number of pixels of a texture, and of all textures of one model: 8192², which take 0.7 GB while they are decoded."""
+MAX_TEXTURE_SIDE = 2**14
+"""Largest side of a texture of tiles [px]."""
+UV_TOLERANCE = 1e-3
+"""Texture coordinates may leave 0..1 by this, by rounding."""
 TEXTURE_FORMATS = ("PNG", "JPEG", "WEBP", "BMP", "TIFF", "TGA", "GIF", "PPM", "JPEG2000", "DDS")
 """Formats that Pillow may decode: rasters only; for others, such as EPS, it starts other programs."""
 
@@ -94,68 +98,134 @@ def decode_texture(data: bytes, source: str) -> np.ndarray:
     raise CatalogError(f"{source}: too large an image, {size} pixels; {limit}")
 
 
-def bake_vertex_colors(faces: np.ndarray, colors: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Bake vertex colours into a texture atlas with 2 x 2 texels for each triangle.
+def bake_vertex_colors(
+    faces: np.ndarray, colors: np.ndarray, factor: np.ndarray | None = None, skin: tuple[np.ndarray, np.ndarray] | None = None
+) -> tuple[np.ndarray, np.ndarray]:
+    """Bake vertex colours, and a texture beneath them, into a texture atlas with N x N texels for each triangle.
 
-    With corner colours a, b, c, three texels hold these and the fourth b + c - a, clipped to 0 .. 1: where nothing is clipped, bilinear
-    filtering equals barycentric interpolation over the triangle up to 8-bit rounding. It never reads another triangle's texels.
+    Without a texture N is 2: with corner colours a, b, c, three texels hold these and the fourth b + c - a, clipped to 0 .. 1. Where
+    nothing is clipped, bilinear filtering equals barycentric interpolation over the triangle up to 8-bit rounding. It never reads another
+    triangle's texels.
 
     Args:
         faces: Vertex indices (F, 3).
-        colors: Vertex colours, sRGB (V, 3) uint8.
+        colors: Vertex colours, sRGB in 0..1 (V, 3).
+        factor: Linear factor (3); None: 1.
+        skin: Texture coordinates (V, 2), and the texture (H, W, 3) uint8, which repeats; its colours are multiplied in linear light.
 
     Returns:
         Texture coordinates of the 3 F corners (3 F, 2) float32, and the texture (S, S, 3) uint8.
     """
+    texels = 2 if skin is None else _texels_per_triangle(faces, *skin)
     cells = int(np.ceil(np.sqrt(len(faces))))
-    side = 2 * cells
-    row, column = (2 * index for index in np.divmod(np.arange(len(faces)), cells))
-    corner = srgb_to_linear(colors[faces] / 255.0)
-    texture = np.zeros((side, side, 3))
-    texture[row, column], texture[row, column + 1], texture[row + 1, column] = corner[:, 0], corner[:, 1], corner[:, 2]
-    texture[row + 1, column + 1] = corner[:, 1] + corner[:, 2] - corner[:, 0]
-    rows = np.stack([row, row, row + 1], axis=1) + 0.5
-    columns = np.stack([column, column + 1, column], axis=1) + 0.5
+    side = texels * cells
+    row, column = (texels * index for index in np.divmod(np.arange(len(faces)), cells))
+    light = srgb_to_linear(colors) * (1.0 if factor is None else factor)
+    atlas = np.zeros((side, side, 3), np.uint8)
+    for down in range(texels):
+        for right in range(texels):
+            weights = np.array([texels - 1 - down - right, right, down]) / (texels - 1)
+            texel = np.einsum("c,fci->fi", weights, light[faces]).clip(0.0, 1.0)
+            if skin is not None:
+                texel = texel * _sample(skin[1], np.einsum("c,fci->fi", weights, skin[0][faces]))
+            atlas[row + down, column + right] = np.rint(linear_to_srgb(texel) * 255.0)
+    rows = np.stack([row, row, row + texels - 1], axis=1) + 0.5
+    columns = np.stack([column, column + texels - 1, column], axis=1) + 0.5
     uv = np.stack([columns / side, 1.0 - rows / side], axis=-1).reshape(-1, 2)
-    return uv.astype(np.float32), np.rint(linear_to_srgb(texture) * 255.0).astype(np.uint8)
+    return uv.astype(np.float32), atlas
 
 
-def join_textures(parts: list[tuple[np.ndarray | None, FileMaterial]], owner: str) -> tuple[list[np.ndarray], np.ndarray]:
+def _texels_per_triangle(faces: np.ndarray, uv: np.ndarray, texture: np.ndarray) -> int:
+    """Texels along a triangle's edge: as many as most triangles have in the texture, as far as the atlas stays within half the limit."""
+    edges = np.diff(uv[faces][:, (0, 1, 2, 0)] * (texture.shape[1], texture.shape[0]), axis=1)
+    wanted = np.ceil(np.percentile(np.linalg.norm(edges, axis=2).max(axis=1), 95)) + 1.0
+    return int(np.clip(wanted, 2, max(np.sqrt(MAX_TEXTURE_PIXELS / 8 / len(faces)), 2)))
+
+
+def _sample(texture: np.ndarray, uv: np.ndarray) -> np.ndarray:
+    """Bilinear samples of a texture that repeats, in linear light (N, 3)."""
+    height, width = texture.shape[:2]
+    x, y = uv[:, 0] * width - 0.5, (1.0 - uv[:, 1]) * height - 0.5
+    left, top = np.floor(x).astype(np.int64), np.floor(y).astype(np.int64)
+    right_share, low_share = (x - left)[:, None], (y - top)[:, None]
+    table = srgb_to_linear(np.arange(256) / 255.0)
+    upper, lower = (
+        table[texture[line % height, left % width]] * (1.0 - right_share) + table[texture[line % height, (left + 1) % width]] * right_share
+        for line in (top, top + 1)
+    )
+    return upper * (1.0 - low_share) + lower * low_share
+
+
+def tile_texture(texture: np.ndarray, tiles: tuple[int, int], said: list[str]) -> np.ndarray:
+    """Lay out a texture in tiles, columns times rows, scaled down as far as the limit on pixels demands, which is added to `said`."""
+    height, width = texture.shape[:2]
+    scale = np.sqrt(MAX_TEXTURE_PIXELS / 4 / (height * width * tiles[0] * tiles[1]))
+    if scale < 1.0:
+        width, height = max(int(width * scale), 1), max(int(height * scale), 1)
+        said.append(f"a texture repeats {tiles[0]} x {tiles[1]} times beside other materials: scaled to {width} x {height} pixels")
+        # With more repetitions than pixels, the texture is its mean, and the rest is left out.
+        tiles = min(tiles[0], MAX_TEXTURE_SIDE // width), min(tiles[1], MAX_TEXTURE_SIDE // height)
+        texture = np.asarray(Image.fromarray(texture).resize((width, height), Image.Resampling.BOX))
+    return np.tile(texture, (tiles[1], tiles[0], 1))
+
+
+def join_textures(parts: list[tuple[np.ndarray | None, FileMaterial]], owner: str, said: list[str]) -> tuple[list[np.ndarray], np.ndarray]:
     """Merge the materials of several parts into one texture atlas, with base colour factors multiplied in.
 
     Args:
-        parts: Texture coordinates (V, 2) or None, and the material, of each part.
+        parts: Texture coordinates (V, 2) in 0..1, or None, and the material, of each part.
         owner: The mesh file, for errors.
+        said: Warnings are added to it.
 
     Returns:
         New texture coordinates of each part, one row (1, 2) for parts without a texture; and the atlas (H, W, 3) uint8.
 
     Raises:
-        CatalogError: A texture repeats, which an atlas does not allow, or the atlas is too large.
+        CatalogError: The atlas is too large.
     """
-    blocks, uvs = [], []
+    places: dict[tuple[int, tuple[float, ...]], int] = {}
+    blocks, index = [], []
     for uv, material in parts:
-        if material.texture is None or uv is None:
-            texture, uv = np.full((4, 4, 3), 255, np.uint8), np.full((1, 2), 0.5)
-        else:
-            texture = material.texture
-        # A table of the 256 levels, since whole images in 64-bit floats take eight times the room.
-        levels = srgb_to_linear(np.arange(256) / 255.0)[:, None] * srgb_to_linear(material.color)
-        table = np.rint(linear_to_srgb(levels) * 255.0).astype(np.uint8)
-        blocks.append(np.stack([table[texture[..., channel], channel] for channel in range(3)], axis=-1))
-        uvs.append(uv)
+        texture = None if uv is None else material.texture
+        key = (id(texture), material.color)
+        if key not in places:
+            places[key] = len(blocks)
+            blocks.append(_tint(np.full((4, 4, 3), 255, np.uint8) if texture is None else texture, material.color))
+        index.append(places[key])
+    blocks = _fit_blocks(blocks, owner, said)
     width, height = max(block.shape[1] for block in blocks), sum(block.shape[0] for block in blocks)
-    if width * height > MAX_TEXTURE_PIXELS:
-        raise CatalogError(f"{owner}: its textures together take {width} x {height} pixels; allowed: {MAX_TEXTURE_PIXELS}; scale them down")
-    atlas, top, new_uvs = np.zeros((height, width, 3), np.uint8), 0, []
-    for block, uv in zip(blocks, uvs, strict=True):
-        if uv.min() < -1e-3 or uv.max() > 1.0 + 1e-3:
-            raise CatalogError(f"{owner}: several materials, and a texture that repeats (coordinates beyond 0..1); bake one image")
-        rows, columns = block.shape[:2]
-        atlas[top : top + rows, :columns] = block
+    atlas, tops = np.zeros((height, width, 3), np.uint8), np.cumsum([0, *(block.shape[0] for block in blocks)])
+    for block, top in zip(blocks, tops, strict=False):
+        atlas[top : top + block.shape[0], : block.shape[1]] = block
+    uvs = []
+    for (uv, material), place in zip(parts, index, strict=True):
+        uv = np.full((1, 2), 0.5) if uv is None or material.texture is None else uv
+        rows, columns = blocks[place].shape[:2]
         # At least half a texel from the block's border, so that filtering does not bleed.
         column = np.clip(uv[:, 0] * columns, 0.5, columns - 0.5)
-        row = top + np.clip((1.0 - uv[:, 1]) * rows, 0.5, rows - 0.5)
-        new_uvs.append(np.stack([column / width, 1.0 - row / height], axis=1))
-        top += rows
-    return new_uvs, atlas
+        row = tops[place] + np.clip((1.0 - uv[:, 1]) * rows, 0.5, rows - 0.5)
+        uvs.append(np.stack([column / width, 1.0 - row / height], axis=1))
+    return uvs, atlas
+
+
+def _tint(texture: np.ndarray, color: tuple[float, float, float]) -> np.ndarray:
+    """Multiply a texture by a base colour factor in linear light."""
+    # A table of the 256 levels, since whole images in 64-bit floats take eight times the room.
+    levels = srgb_to_linear(np.arange(256) / 255.0)[:, None] * srgb_to_linear(color)
+    table = np.rint(linear_to_srgb(levels) * 255.0).astype(np.uint8)
+    return np.stack([table[texture[..., channel], channel] for channel in range(3)], axis=-1)
+
+
+def _fit_blocks(blocks: list[np.ndarray], owner: str, said: list[str]) -> list[np.ndarray]:
+    """Scale the blocks of an atlas down until it is within the limit on pixels."""
+    first = blocks
+    for halvings in range(8):
+        if halvings:
+            sizes = [(max(block.shape[1] >> halvings, 4), max(block.shape[0] >> halvings, 4)) for block in first]
+            blocks = [
+                np.asarray(Image.fromarray(block).resize(size, Image.Resampling.BOX)) for block, size in zip(first, sizes, strict=True)
+            ]
+        if max(block.shape[1] for block in blocks) * sum(block.shape[0] for block in blocks) <= MAX_TEXTURE_PIXELS:
+            said += [f"its textures together are too large: scaled by 1/{2**halvings}"] if halvings else []
+            return blocks
+    raise CatalogError(f"{owner}: {len(blocks)} textures are too many for one image; merge its materials")

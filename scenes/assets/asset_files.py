@@ -170,17 +170,3 @@ def _match_case(folder: Path, names: Sequence[str]) -> Path | None:
                 return None
         path = path / name
     return path
-
-
-class FileTable:
-    """Files by name, in memory: what a reader may open besides the model itself (trimesh's resolver protocol)."""
-
-    def __init__(self, file_name: str) -> None:
-        self.file_name = file_name
-        self.files: dict[str, bytes] = {}
-
-    def get(self, name: str) -> bytes:
-        """Content of a file; raises KeyError for others."""
-        return self.files[name]
-
-    __getitem__ = get

@@ -1,8 +1,8 @@
-"""Mesh parts: geometry and material as read from a mesh file, before they are validated and merged."""
+"""Mesh parts: geometry and material as read from a mesh file, before they are validated and merged; and notes on what was left out."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -10,6 +10,12 @@ from synpick_warp.scenes.assets.appearance import FileMaterial
 
 # Default base colour (sRGB): a light grey, since highlights do not show on pure white.
 GREY = (0.7, 0.7, 0.7)
+WHITE = (1.0, 1.0, 1.0)
+NO_MATERIAL = FileMaterial(GREY, None, None, None)
+"""Material of a part whose file has none: light grey, the rest by the settings."""
+
+# Longest list in a note; of more only the number is told.
+_MAX_LISTED = 8
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,5 +31,23 @@ class MeshPart:
     uv: np.ndarray | None
     """(V, 2)."""
     colors: np.ndarray | None
-    """sRGB (V, 3) uint8."""
+    """Vertex colours, sRGB in 0..1 (V, 3); multiply the material's base colour in linear light."""
     material: FileMaterial
+
+
+@dataclass(eq=False)
+class Notes:
+    """What a reader replaced or left out of a mesh file, told in one line per file."""
+
+    said: list[str] = field(default_factory=list)
+    """Warnings: what is missing and what is used instead."""
+    ignored: list[str] = field(default_factory=list)
+    """Names of features that the file has and that are not used."""
+
+    def line(self, source: object) -> str | None:
+        """All notes as one line; None: there are none."""
+        ignored = list(dict.fromkeys(self.ignored))
+        more = [f"{len(ignored) - _MAX_LISTED} more"] if len(ignored) > _MAX_LISTED else []
+        said = list(dict.fromkeys(self.said))[:_MAX_LISTED]
+        said += [f"ignored: {', '.join(ignored[:_MAX_LISTED] + more)}"] if ignored else []
+        return f"{source}: {'; '.join(said)}" if said else None

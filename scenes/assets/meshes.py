@@ -1,21 +1,42 @@
-"""Mesh import: PLY, OBJ and GLB files, each as one triangle mesh with one material."""
+"""Mesh import: PLY, OBJ, glTF and STL files, each as one triangle mesh with one material."""
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
 from synpick_warp.errors import CatalogError
-from synpick_warp.scenes.assets.appearance import FileMaterial, as_color, bake_vertex_colors, join_textures
+from synpick_warp.scenes.assets.appearance import (
+    UV_TOLERANCE,
+    FileMaterial,
+    as_color,
+    bake_vertex_colors,
+    join_textures,
+    linear_to_srgb,
+    srgb_to_linear,
+    tile_texture,
+)
 from synpick_warp.scenes.assets.asset_files import MAX_ROWS, quiet_decoding
-from synpick_warp.scenes.assets.mesh_parts import MeshPart
+from synpick_warp.scenes.assets.gltf.parts import read_gltf
+from synpick_warp.scenes.assets.mesh_parts import WHITE, MeshPart, Notes
+from synpick_warp.scenes.assets.normals import DEFAULT_CREASE, crease_normals, smooth_normals
 from synpick_warp.scenes.assets.ply import read_ply
-from synpick_warp.scenes.assets.scene_files import read_scene
+from synpick_warp.scenes.assets.stl import read_stl
+from synpick_warp.scenes.assets.wavefront.obj import read_obj
 from synpick_warp.scenes.types import TriangleMesh
 
-SUFFIXES = (".ply", ".obj", ".glb")
+_READERS: dict[str, Callable[[Path, Notes], list[MeshPart]]] = {
+    ".ply": read_ply,
+    ".obj": read_obj,
+    ".glb": read_gltf,
+    ".gltf": read_gltf,
+    ".stl": read_stl,
+}
+SUFFIXES = tuple(_READERS)
+"""Endings of mesh files."""
 
 # Maximum coordinate [m]: larger ones are mistakes, and lose precision in 32-bit floats.
 _MAX_EXTENT = 1e4
@@ -23,64 +44,84 @@ _MAX_EXTENT = 1e4
 _MAX_UV = 1e4
 
 
-def read_mesh(path: Path, unit: float) -> tuple[TriangleMesh, FileMaterial]:
+@dataclass(frozen=True)
+class MeshOptions:
+    """How meshes are completed: settings of the section objects."""
+
+    crease_angle: float = DEFAULT_CREASE
+    """Largest angle between two triangles that are smooth at a common vertex, in meshes without normals [°]."""
+    center: bool = False
+    """Move the centre of the mesh's bounding box to the origin."""
+
+
+def _ignore(line: str) -> None:
+    """Default for `report`."""
+
+
+def read_mesh(
+    path: Path, unit: float, options: MeshOptions = MeshOptions(), report: Callable[[str], None] = _ignore
+) -> tuple[TriangleMesh, FileMaterial]:
     """Read a mesh file. Parts are merged into one mesh, several materials into a texture atlas; vertex colours are baked into a texture.
 
     Args:
-        path: A .ply, .obj or .glb file.
+        path: A .ply, .obj, .glb, .gltf or .stl file.
         unit: Length of the file's unit [m].
+        options: How the mesh is completed.
+        report: Called with one line if features of the file are ignored or replaced.
 
     Raises:
         CatalogError: The file cannot be read, has no triangles or invalid ones, or refers to a texture that is missing.
     """
+    notes = Notes()
     with quiet_decoding():
-        parts = read_ply(path) if path.suffix.lower() == ".ply" else read_scene(path)
-        return _finish(_join([_bake_colors(_clean(part, unit, path)) for part in parts], path), unit)
+        parts = [_clean(part, unit, path) for part in _READERS[path.suffix.lower()](path, notes) if len(part.faces)]
+        parts = [part for part in parts if len(part.faces)]
+        if not parts:
+            raise CatalogError(f"{path}: no triangles; a model needs a surface, a point cloud has none")
+        mesh = _finish(_join([_bake_colors(part) for part in parts], path, options, notes), unit, options, notes)
+    line = notes.line(path)
+    if line is not None:
+        report(line)
+    return mesh
 
 
-def _finish(part: MeshPart, unit: float) -> tuple[TriangleMesh, FileMaterial]:
-    """Convert a validated part to metres, orient it outward and complete its normals."""
-    vertices = (part.vertices * unit).astype(np.float32)
-    faces, normals = _orient_outward(vertices, part.faces, part.normals)
-    smooth = smooth_normals(vertices, faces)
-    if normals is not None:
-        length = np.linalg.norm(normals, axis=1, keepdims=True)
-        given = np.isfinite(length) & (length > 0.0)
-        smooth = np.where(given, normals / np.where(given, length, 1.0), smooth).astype(np.float32)
+def _finish(part: MeshPart, unit: float, options: MeshOptions, notes: Notes) -> tuple[TriangleMesh, FileMaterial]:
+    """Convert a validated part to metres, centre it if asked to, orient it outward and complete its normals."""
+    metres = part.vertices * unit
+    if options.center:
+        offset = -(metres.min(axis=0) + metres.max(axis=0)) / 2.0
+        if np.abs(offset).max() > 1e-6 * np.ptp(metres, axis=0).max():
+            notes.said.append(f"centred: moved by {', '.join(f'{value:.6g}' for value in offset.round(6) + 0.0)} m")
+            metres = metres + offset
+    vertices = metres.astype(np.float32)
+    faces, given = _orient_outward(vertices, part.faces, part.normals)
+    part = complete_normals(replace(part, vertices=vertices, faces=faces, normals=given), options.crease_angle)
+    vertices, normals = part.vertices.astype(np.float32), np.asarray(part.normals, np.float32)
     uv = np.zeros((len(vertices), 2), np.float32) if part.uv is None else part.uv.astype(np.float32)
-    return TriangleMesh(vertices, faces.astype(np.int32), smooth, uv), part.material
+    return TriangleMesh(vertices, part.faces.astype(np.int32), normals, uv), part.material
 
 
-def smooth_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Compute smooth vertex normals: area-weighted means over all triangles at a position, so that texture seams do not show.
-
-    Args:
-        vertices: (V, 3).
-        faces: (F, 3).
-
-    Returns:
-        Unit normals (V, 3) float32. Where the triangles at a position cancel out, those of the vertex alone are used, or +z.
-    """
-    corners = vertices[faces].astype(np.float64)
-    doubled = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    own = np.zeros((len(vertices), 3))
-    for corner in range(3):
-        np.add.at(own, faces[:, corner], doubled)
-    _, position = np.unique(vertices, axis=0, return_inverse=True)
-    shared = np.zeros((position.max() + 1, 3))
-    np.add.at(shared, position, own)
-    normals = np.zeros((len(vertices), 3))
-    # Sums within the rounding error of the areas have no direction.
-    min_length = 1e-9 * np.abs(doubled).max()
-    for candidate in (np.broadcast_to((0.0, 0.0, 1.0), own.shape), own, shared[position]):
-        length = np.linalg.norm(candidate, axis=1, keepdims=True)
-        normals = np.where(length > min_length, candidate / np.where(length > min_length, length, 1.0), normals)
-    return normals.astype(np.float32)
+def complete_normals(part: MeshPart, crease_angle: float) -> MeshPart:
+    """Make the normals of a part unit vectors; if it has none, compute them with creases, where vertices are split."""
+    length = np.zeros((1, 1)) if part.normals is None else np.linalg.norm(part.normals, axis=1, keepdims=True)
+    given = np.isfinite(length) & (length > 0.0)
+    if part.normals is None or not given.any():
+        source, faces, normals = crease_normals(part.vertices, part.faces, crease_angle)
+        rows = {name: None if (data := getattr(part, name)) is None else data[source] for name in ("vertices", "uv", "colors")}
+        return replace(part, faces=faces, normals=normals, **rows)
+    smooth = part.normals / np.where(given, length, 1.0)
+    if not given.all():
+        smooth = np.where(given, smooth, smooth_normals(part.vertices, part.faces))
+    return replace(part, normals=smooth)
 
 
 def signed_volume(vertices: np.ndarray, faces: np.ndarray) -> float:
-    """Signed volume of a mesh, positive if its triangles face outward; about the centroid, so that small holes matter little."""
-    corners = (vertices - vertices.mean(axis=0, dtype=np.float64))[faces]
+    """Signed volume of a mesh, positive if its triangles face outward.
+
+    About the mean of the triangles' corners, so that small holes matter little, and vertices that are split do not.
+    """
+    corners = vertices[faces].astype(np.float64)
+    corners -= corners.mean(axis=(0, 1))
     return float(np.einsum("fi,fi->", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])) / 6.0)
 
 
@@ -120,7 +161,7 @@ def _clean(part: MeshPart, unit: float, path: Path) -> MeshPart:
         raise CatalogError(f"{path}: a vertex lies {np.abs(part.vertices).max() * unit:.3g} m from the origin; check the file's unit")
     faces = _drop_degenerate(part.faces)
     if not len(faces):
-        raise CatalogError(f"{path}: no triangles; a model needs a surface, a point cloud has none")
+        return replace(part, faces=faces)
     used, index = np.unique(faces, return_inverse=True)
     if part.uv is not None and not (np.abs(part.uv[used]) <= _MAX_UV).all():
         raise CatalogError(f"{path}: texture coordinates that are not finite or beyond {_MAX_UV:g}; repair the mesh")
@@ -131,48 +172,75 @@ def _clean(part: MeshPart, unit: float, path: Path) -> MeshPart:
 
 
 def _bake_colors(part: MeshPart) -> MeshPart:
-    """Convert vertex colours to a base colour factor, if uniform, or to a baked texture."""
+    """Multiply vertex colours into the base colour factor, if they are uniform, or into a baked texture."""
     if part.colors is None:
         return part
+    factor = srgb_to_linear(part.material.color)
     if (part.colors == part.colors[0]).all():
-        return replace(part, colors=None, material=replace(part.material, color=as_color(part.colors[0] / 255.0)))
-    uv, texture = bake_vertex_colors(part.faces, part.colors)
+        color = as_color(linear_to_srgb(factor * srgb_to_linear(part.colors[0])))
+        return replace(part, colors=None, material=replace(part.material, color=color))
+    skin = None if part.material.texture is None or part.uv is None else (part.uv, part.material.texture)
+    uv, texture = bake_vertex_colors(part.faces, part.colors, factor, skin)
     order = part.faces.reshape(-1)
     return MeshPart(
         part.vertices[order],
         np.arange(len(order)).reshape(-1, 3),
-        smooth_normals(part.vertices, part.faces)[order] if part.normals is None else part.normals[order],
+        None if part.normals is None else part.normals[order],
         uv,
         None,
-        replace(part.material, color=(1.0, 1.0, 1.0), texture=texture),
+        replace(part.material, color=WHITE, texture=texture),
     )
 
 
-def _join(parts: list[MeshPart], path: Path) -> MeshPart:
+def _join(parts: list[MeshPart], path: Path, options: MeshOptions, notes: Notes) -> MeshPart:
     """Merge all parts into one: one material, with metallic and roughness averaged by area."""
     if len(parts) == 1:
         return parts[0]
     first = parts[0].material
-    uvs = [np.zeros((len(part.vertices), 2)) if part.uv is None else part.uv for part in parts]
-    same = all(part.material.texture is first.texture and part.material.color == first.color for part in parts)
-    if not same:
-        moved, texture = join_textures([(part.uv, part.material) for part in parts], str(path))
-        uvs = [np.broadcast_to(uv, (len(part.vertices), 2)) for uv, part in zip(moved, parts, strict=True)]
-        first = replace(first, color=(1.0, 1.0, 1.0), texture=texture)
+    if not all(part.material.texture is first.texture and part.material.color == first.color for part in parts):
+        parts = [_unroll(part, notes) for part in parts]
+        moved, texture = join_textures([(part.uv, part.material) for part in parts], str(path), notes.said)
+        parts = [replace(part, uv=np.broadcast_to(uv, (len(part.vertices), 2))) for uv, part in zip(moved, parts, strict=True)]
+        first = replace(first, color=WHITE, texture=texture)
     mean = {}
     for name in ("metallic", "roughness"):
         known = [(value, _area(part)) for part in parts if (value := getattr(part.material, name)) is not None]
         total = sum(area for _, area in known)
         mean[name] = sum(value * area for value, area in known) / total if total > 0.0 else None
+    if any(part.normals is not None for part in parts):
+        parts = [complete_normals(part, options.crease_angle) for part in parts]
     start = np.cumsum([0, *(len(part.vertices) for part in parts)])
-    normals = [smooth_normals(part.vertices, part.faces) if part.normals is None else part.normals for part in parts]
+    normals = [part.normals for part in parts if part.normals is not None]
     return MeshPart(
         np.concatenate([part.vertices for part in parts]),
         np.concatenate([part.faces + offset for part, offset in zip(parts, start, strict=False)]),
-        np.concatenate(normals) if any(part.normals is not None for part in parts) else None,
-        np.concatenate(uvs),
+        np.concatenate(normals) if normals else None,
+        np.concatenate([np.zeros((len(part.vertices), 2)) if part.uv is None else part.uv for part in parts]),
         None,
         replace(first, **mean),
+    )
+
+
+def _unroll(part: MeshPart, notes: Notes) -> MeshPart:
+    """Replace a texture that repeats by an image of its tiles, with each triangle moved by whole repetitions."""
+    texture = part.material.texture
+    if texture is None or part.uv is None or (part.uv.min() >= -UV_TOLERANCE and part.uv.max() <= 1.0 + UV_TOLERANCE):
+        return part
+    corners = part.uv[part.faces]
+    # A shift of a whole triangle: its coordinates begin in the first tile.
+    shift = np.repeat(np.floor(corners.min(axis=1) + UV_TOLERANCE), 3, axis=0)
+    rows, index = np.unique(np.column_stack([part.faces.reshape(-1), shift]), axis=0, return_inverse=True)
+    source = rows[:, 0].astype(np.int64)
+    uv = part.uv[source] - rows[:, 1:]
+    tiles = np.maximum(np.ceil(uv.max(axis=0) - UV_TOLERANCE), 1.0).astype(int)
+    image = tile_texture(texture, (int(tiles[0]), int(tiles[1])), notes.said)
+    return MeshPart(
+        part.vertices[source],
+        index.reshape(-1, 3),
+        None if part.normals is None else part.normals[source],
+        uv / tiles,
+        None,
+        replace(part.material, texture=image),
     )
 
 

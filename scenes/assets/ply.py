@@ -4,18 +4,19 @@ from __future__ import annotations
 
 import io
 import re
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from trimesh.exchange.ply import load_ply
-from trimesh.geometry import triangulate_quads
 
 from synpick_warp.errors import CatalogError
 from synpick_warp.inputs.files import read_file
 from synpick_warp.scenes.assets.appearance import MAX_TEXTURE_FILE, FileMaterial, decode_texture
 from synpick_warp.scenes.assets.asset_files import MAX_MESH_FILE, MAX_ROWS, MAX_TEXT_MESH, describe_error, quiet_decoding, read_referred
-from synpick_warp.scenes.assets.mesh_parts import GREY, MeshPart
+from synpick_warp.scenes.assets.mesh_parts import NO_MATERIAL, WHITE, MeshPart, Notes
+from synpick_warp.scenes.assets.ply_binary import read_binary
 
 MAX_HEADER = 2**16
 """Longest header [bytes]; models have less than 1 kB."""
@@ -26,6 +27,9 @@ MAX_VALUES = 2**24
 
 # Property names of texture coordinates: BOP's first, then those of Blender and MeshLab.
 _UV_COLUMNS = (("texture_u", "texture_v"), ("u", "v"), ("s", "t"))
+# Property names of colours, sRGB: those of most programs, then older ones.
+_COLORS = (("red", "green", "blue"), ("diffuse_red", "diffuse_green", "diffuse_blue"), ("r", "g", "b"))
+_INDICES = ("vertex_indices", "vertex_index")
 # All that numbers consist of: digits, signs, exponents, "nan", "infinity".
 _NUMBERS = b"0123456789+-.eEnNaAiIfFtTyY \t\r\n"
 
@@ -68,7 +72,7 @@ def read_ply_texture(data: bytes, path: Path) -> tuple[str, bytes] | None:
     return None if name is None else (name, read_referred(path.parent, name, path, MAX_TEXTURE_FILE)[1])
 
 
-def read_ply(path: Path) -> list[MeshPart]:
+def read_ply(path: Path, notes: Notes) -> list[MeshPart]:
     """Read a PLY file in BOP's format; vertices keep their order, since texture coordinates refer to it.
 
     Raises:
@@ -76,20 +80,20 @@ def read_ply(path: Path) -> list[MeshPart]:
     """
     data = read_ply_file(path)
     try:
-        # fix_texture would reorder vertices; textures are read below, where a missing one is an error.
-        kwargs = load_ply(io.BytesIO(_without_edges(data, path)), fix_texture=False, skip_materials=True)
-        part = _ply_part(kwargs, path)
+        part = _ply_part(_elements(data, path), path, notes)
     except CatalogError:
         raise
     except Exception as error:  # the reader raises nearly anything on damaged files
         raise CatalogError(f"{path}: not readable as PLY ({describe_error(error)})") from error
     found = read_ply_texture(data, path)
     if found is None:
-        return [part if part.uv is None else MeshPart(part.vertices, part.faces, part.normals, None, part.colors, part.material)]
+        return [replace(part, uv=None)]
     texture = decode_texture(found[1], str(path.parent / found[0]))
     if part.uv is None:
         raise CatalogError(f"{path}: refers to a texture, but its vertices have no texture_u, texture_v; unwrap it or remove the texture")
-    return [MeshPart(part.vertices, part.faces, part.normals, part.uv, None, FileMaterial((1.0, 1.0, 1.0), texture, None, None))]
+    if part.colors is not None:
+        notes.ignored.append("colours beside a texture")
+    return [replace(part, colors=None, material=FileMaterial(WHITE, texture, None, None))]
 
 
 def read_ply_vertices(path: Path) -> np.ndarray:
@@ -101,8 +105,7 @@ def read_ply_vertices(path: Path) -> np.ndarray:
     data = read_ply_file(path)
     try:
         with quiet_decoding():
-            content = load_ply(io.BytesIO(_without_edges(data, path)), fix_texture=False, skip_materials=True)
-        vertices = _columns(content["metadata"]["_ply_raw"].get("vertex", {}), ("x", "y", "z"))
+            vertices = _columns(_elements(data, path).get("vertex", {}), ("x", "y", "z"))
     except CatalogError:
         raise
     except Exception as error:  # the reader raises nearly anything on damaged files
@@ -114,11 +117,15 @@ def read_ply_vertices(path: Path) -> np.ndarray:
     return vertices
 
 
-def _without_edges(data: bytes, path: Path) -> bytes:
-    """Rename the element edge, from which the reader would make lines."""
-    start = _header(data, path)[1]
+def _elements(data: bytes, path: Path) -> dict[str, Any]:
+    """Elements of a PLY file, each with length, properties (type by name) and data (values by name)."""
+    lines, start = _header(data, path)
+    # The reader takes all lists of a property in a binary file for equally long; it would make lines of the element edge.
+    if len(lines) > 1 and lines[1].startswith("format binary_") and any(" list " in line for line in lines):
+        return read_binary(lines, data, start)
     renamed = re.sub(rb"(?m)^([ \t]*element[ \t]+)edge(?=[ \t])", rb"\1edg_", data[:start])
-    return data if renamed == data[:start] else renamed + data[start:]
+    # fix_texture would reorder vertices; textures are read elsewhere, where a missing one is an error.
+    return load_ply(io.BytesIO(renamed + data[start:]), fix_texture=False, skip_materials=True)["metadata"]["_ply_raw"]
 
 
 def _header(data: bytes, path: Path) -> tuple[list[str], int]:
@@ -178,42 +185,99 @@ def _check_ascii(data: bytes, start: int, rows: int, values: int, path: Path) ->
         raise CatalogError(f"{path}: not readable as PLY (its header announces {rows} rows, its body is shorter); the file is cut short")
 
 
-def _ply_part(kwargs: dict[str, Any], path: Path) -> MeshPart:
-    """Convert what the reader returns; texture coordinates are None or (V, 2), with vertices split if faces carry them."""
-    elements = kwargs["metadata"]["_ply_raw"]
+def _ply_part(elements: dict[str, Any], path: Path, notes: Notes) -> MeshPart:
+    """Convert the reader's elements; texture coordinates are None or (V, 2), with vertices split where faces carry them or colours."""
     vertex, face = elements.get("vertex", {}), elements.get("face", {})
-    faces = np.asarray(kwargs.get("faces", np.zeros((0, 3))), dtype=np.int64)
-    faces = triangulate_quads(faces, dtype=np.int64) if faces.size else faces
-    if not faces.size:
-        raise CatalogError(f"{path}: no triangles; a model needs a surface, a point cloud has none")
-    corner_uv = _corner_uv(face, len(faces))
-    vertices, normals, colors = (_columns(vertex, names) for names in (("x", "y", "z"), ("nx", "ny", "nz"), ("red", "green", "blue")))
-    uv = next((rows for names in _UV_COLUMNS if (rows := _columns(vertex, names)) is not None), None)
-    if vertices is None:
+    corners, source = _triangles(face, elements.get("tristrips", {}), path)
+    columns = [_columns(vertex, names) for names in (("x", "y", "z"), ("nx", "ny", "nz"))]
+    columns += [next((rows for names in _UV_COLUMNS if (rows := _columns(vertex, names)) is not None), None), _colors(vertex)]
+    if columns[0] is None:
         raise CatalogError(f"{path}: vertices without x, y and z")
-    if colors is not None:
-        scale = 1 if np.dtype(vertex["properties"]["red"]).kind in "iu" else 255
-        colors = np.clip(np.rint(np.nan_to_num(colors) * scale), 0, 255).astype(np.uint8)
-    if corner_uv is not None:
-        order = faces.reshape(-1)
-        if order.min() < 0:
-            raise CatalogError(f"{path}: a triangle refers to vertex {order.min()}; repair the mesh")
-        vertices, uv, faces = vertices[order], corner_uv, np.arange(len(order)).reshape(-1, 3)
-        normals, colors = (None if rows is None else rows[order] for rows in (normals, colors))
-    return MeshPart(vertices, faces, normals, uv, colors, FileMaterial(GREY, None, None, None))
+    face_colors = _colors(face) if columns[3] is None and source is not None else None
+    flat, faces = corners
+    corner_uv = _corner_uv(face, len(flat))
+    if corner_uv is not None or face_colors is not None:
+        order = flat[faces].reshape(-1)
+        if not 0 <= order.min() <= order.max() < len(columns[0]):
+            wrong = order.min() if order.min() < 0 else order.max()
+            raise CatalogError(f"{path}: a triangle refers to vertex {wrong}, but there are {len(columns[0])}; repair the mesh")
+        columns = [None if rows is None else rows[order] for rows in columns]
+        if corner_uv is not None:
+            columns[2] = corner_uv[faces].reshape(-1, 2)
+        if face_colors is not None and source is not None:
+            columns[3] = np.repeat(face_colors[source], 3, axis=0)
+        triangles = np.arange(len(order)).reshape(-1, 3)
+    else:
+        triangles = flat[faces]
+    known = {"texnumber", "alpha", *_INDICES, *(("texcoord",) if corner_uv is not None else ()), *sum((*_UV_COLUMNS, *_COLORS), ())}
+    known |= {"x", "y", "z", "nx", "ny", "nz", "diffuse_alpha"}
+    notes.ignored += [ascii(name)[1:-1][:40] for part in (vertex, face) for name in part.get("properties", {}) if name not in known]
+    vertices, normals, uv, colors = columns
+    assert vertices is not None
+    return MeshPart(vertices, triangles, normals, uv, colors, NO_MATERIAL if colors is None else replace(NO_MATERIAL, color=WHITE))
 
 
-def _columns(vertex: dict[str, Any], names: tuple[str, ...]) -> np.ndarray | None:
+def _triangles(face: dict[str, Any], strips: dict[str, Any], path: Path) -> tuple[tuple[np.ndarray, np.ndarray], np.ndarray | None]:
+    """Triangulate polygons as fans, and strips.
+
+    Returns:
+        The vertices of all corners (C,) and triangles of corners (F, 3); and the face of each triangle (F,), None for strips.
+    """
+    name = next((name for name in (*_INDICES, *face.get("properties", {})) if name in face.get("properties", {})), None)
+    if name is not None and face.get("length"):
+        flat, lengths = _lists(face, name)
+        count = np.maximum(lengths - 2, 0)
+        source = np.repeat(np.arange(len(lengths)), count)
+        step = np.arange(len(source)) - np.repeat(np.cumsum(count) - count, count)
+        first = (np.cumsum(lengths) - lengths)[source]
+        corners, source_faces = np.stack([first, first + step + 1, first + step + 2], axis=1), source
+    elif strips.get("length"):
+        flat, source_faces = np.concatenate([_lists(strips, next(iter(strips["properties"])))[0], [-1]]), None
+        start = np.flatnonzero((flat[:-2] >= 0) & (flat[1:-1] >= 0) & (flat[2:] >= 0))
+        begin = np.maximum.accumulate(np.where(flat < 0, np.arange(len(flat)) + 1, 0))[start]
+        odd = (start - begin) % 2
+        corners = np.stack([start, start + 1 + odd, start + 2 - odd], axis=1)
+    else:
+        flat, corners, source_faces = np.zeros(0, np.int64), np.zeros((0, 3), np.int64), None
+    if not len(corners):
+        raise CatalogError(f"{path}: no triangles; a model needs a surface, a point cloud has none")
+    return (flat.astype(np.int64), corners.astype(np.int64)), source_faces
+
+
+def _lists(element: dict[str, Any], name: str) -> tuple[np.ndarray, np.ndarray]:
+    """Values of a list property, one after another, and the length of each row's list."""
+    rows = element["data"][name]
+    rows = rows["f1"] if getattr(rows, "dtype", None) is not None and rows.dtype.names else np.asarray(rows)
+    if rows.dtype == object:
+        return np.concatenate([np.atleast_1d(row) for row in rows]), np.array([np.size(row) for row in rows])
+    rows = rows.reshape(element["length"], -1)
+    return rows.reshape(-1), np.full(len(rows), rows.shape[1])
+
+
+def _columns(element: dict[str, Any], names: tuple[str, ...]) -> np.ndarray | None:
     """Stack columns (V, len(names)) float64; None unless all exist."""
-    if not all(name in vertex.get("properties", {}) for name in names):
+    if not element.get("length") or not all(name in element.get("properties", {}) for name in names):
         return None
-    return np.stack([np.asarray(vertex["data"][name], dtype=np.float64).reshape(-1) for name in names], axis=1)
+    return np.stack([np.asarray(element["data"][name], dtype=np.float64).reshape(-1) for name in names], axis=1)
+
+
+def _colors(element: dict[str, Any]) -> np.ndarray | None:
+    """Colours (V, 3) in 0..1; None if there are none. Bytes, 16-bit integers or numbers up to 1 or 255, as the values show."""
+    for names in _COLORS:
+        colors = _columns(element, names)
+        if colors is not None:
+            kind = np.dtype(element["properties"][names[0]])
+            colors = np.nan_to_num(colors)
+            largest = 255.0 if kind.itemsize == 1 or (kind.kind != "f" and colors.max() <= 255.0) else 65535.0
+            if kind.kind == "f":
+                largest = 1.0 if colors.max() <= 1.0 else 255.0
+            return np.clip(colors / largest, 0.0, 1.0)
+    return None
 
 
 def _corner_uv(face: dict[str, Any], count: int) -> np.ndarray | None:
-    """Texture coordinates of the triangles' corners (3 F, 2), if the file stores them per face; otherwise None."""
+    """Texture coordinates of the faces' corners (C, 2), if the file stores them per face; otherwise None."""
     if "texcoord" not in face.get("properties", {}):
         return None
-    data = face["data"]["texcoord"]
-    rows = data["f1"] if getattr(data, "dtype", None) is not None and data.dtype.names else data
-    return np.asarray(rows, dtype=np.float64).reshape(3 * count, 2)
+    values = _lists(face, "texcoord")[0]
+    return np.asarray(values, dtype=np.float64).reshape(count, 2)

@@ -17,8 +17,10 @@ from trimesh.visual.material import PBRMaterial
 
 from synpick_warp.errors import CatalogError
 from synpick_warp.scenes.assets.appearance import bake_vertex_colors, linear_to_srgb, rgb8, srgb_to_linear
-from synpick_warp.scenes.assets.meshes import merge_positions, read_mesh, signed_volume, smooth_normals
+from synpick_warp.scenes.assets.meshes import MeshOptions, merge_positions, read_mesh, signed_volume
+from synpick_warp.scenes.assets.normals import smooth_normals
 
+SMOOTH = MeshOptions(crease_angle=180.0)
 CORNERS = [(0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, 1)]
 FACES = [(0, 2, 1), (0, 1, 3), (0, 3, 2), (1, 2, 3)]
 
@@ -57,7 +59,7 @@ def test_a_ply_keeps_order_texture_coordinates_and_scale(tmp_path, binary):
     data = (binary_ply if binary else ascii_ply)(vertices, faces, columns, comment="comment TextureFile skin.png")
     file = tmp_path / "obj_000001.ply"
     file.write_bytes(data if isinstance(data, bytes) else data.encode())
-    mesh, finish = read_mesh(file, 1e-3)
+    mesh, finish = read_mesh(file, 1e-3, SMOOTH)
     rows = np.asarray(vertices, np.float32)
     assert np.allclose(mesh.vertices, rows[:, :3] / 1000, atol=1e-7)
     assert np.array_equal(mesh.uv, rows[:, 3:])
@@ -98,7 +100,7 @@ def test_texture_coordinates_at_the_faces_split_vertices(tmp_path):
 def test_an_inside_out_mesh_is_flipped(tmp_path):
     file = tmp_path / "a.ply"
     file.write_text(ascii_ply(CORNERS, [face[::-1] for face in FACES]))
-    mesh, _ = read_mesh(file, 1.0)
+    mesh, _ = read_mesh(file, 1.0, SMOOTH)
     assert signed_volume(mesh.vertices, mesh.faces) == pytest.approx(1 / 6)
     assert mesh.normals[1, 0] > 0.0
 
@@ -114,7 +116,7 @@ def test_inside_out_normals_are_flipped_with_their_triangles(tmp_path):
 def test_unused_vertices_and_degenerate_triangles_are_dropped(tmp_path):
     file = tmp_path / "a.ply"
     file.write_text(ascii_ply([(9, 9, 9), *CORNERS], [*[tuple(i + 1 for i in face) for face in FACES], (1, 1, 2)]))
-    mesh, _ = read_mesh(file, 1.0)
+    mesh, _ = read_mesh(file, 1.0, SMOOTH)
     assert np.array_equal(mesh.vertices, np.asarray(CORNERS, np.float32))
     assert np.array_equal(mesh.faces, FACES)
 
@@ -147,11 +149,88 @@ def test_vertex_colors_become_a_color_or_a_texture(tmp_path):
     assert np.array_equal(finish.texture[row, column], [(60 * i, 255 - 60 * i, 7) for i in tote_corner])
 
 
+@pytest.mark.parametrize(
+    ("kind", "largest", "names"),
+    [
+        ("uchar", 255, ("red", "green", "blue")),
+        ("uchar", 255, ("diffuse_red", "diffuse_green", "diffuse_blue")),
+        ("uchar", 255, ("r", "g", "b")),
+        ("ushort", 65535, ("red", "green", "blue")),
+        ("int", 255, ("red", "green", "blue")),
+        ("float", 1, ("red", "green", "blue")),
+        ("float", 255, ("red", "green", "blue")),
+    ],
+)
+@pytest.mark.parametrize("at", ["vertex", "face"])
+def test_colors_of_any_type_and_name(tmp_path, kind, largest, names, at):
+    color = [largest, 0, largest // 5 if kind != "float" else largest / 5]
+    text = ascii_ply([(*corner, *color) if at == "vertex" else corner for corner in CORNERS], FACES, ("x", "y", "z"))
+    columns = "".join(f"property {kind} {name}\n" for name in names)
+    before = "element face" if at == "vertex" else "end_header"
+    text = text.replace(before, columns + before)
+    if at == "face":
+        text = "\n".join(f"{line} {color[0]} {color[1]} {color[2]}" if line.startswith("3 ") else line for line in text.split("\n"))
+    (tmp_path / "a.ply").write_text(text)
+    _, finish = read_mesh(tmp_path / "a.ply", 1.0)
+    assert finish.color == pytest.approx((1.0, 0.0, 0.2))
+
+
+def test_each_face_has_its_color_also_polygons(tmp_path):
+    """A box of quads and triangles mixed, text and binary."""
+    box = trimesh.creation.box((2, 2, 2)).vertices
+    sides = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6), (0, 6, 4), (1, 5, 7), (1, 7, 3)]
+    header = f"ply\nformat FORMAT 1.0\nelement vertex 8\nproperty float x\nproperty float y\nproperty float z\nelement face {len(sides)}\n"
+    header += "property list uchar int vertex_indices\nproperty uchar red\nproperty uchar green\nproperty uchar blue\nend_header\n"
+    rows = [(len(side), *side, 30 * number, 255, 0) for number, side in enumerate(sides)]
+    text = header.replace("FORMAT", "ascii") + "\n".join(" ".join(map(str, row)) for row in [*box.tolist(), *rows])
+    contents = [text.encode()]
+    for order, name in (("<", "binary_little_endian"), (">", "binary_big_endian")):
+        body = box.astype(f"{order}f4").tobytes() + b"".join(struct.pack(f"{order}B{row[0]}i3B", *row) for row in rows)
+        contents.append(header.replace("FORMAT", name).encode() + body)
+    for content in contents:
+        (tmp_path / "a.ply").write_bytes(content)
+        mesh, finish = read_mesh(tmp_path / "a.ply", 1.0)
+        assert len(mesh.faces) == 12
+        assert signed_volume(mesh.vertices, mesh.faces) == pytest.approx(8.0)
+        height, width = finish.texture.shape[:2]
+        middle = mesh.uv[mesh.faces].mean(axis=1)
+        texel = finish.texture[((1 - middle[:, 1]) * height).astype(int), (middle[:, 0] * width).astype(int)]
+        centre = mesh.vertices[mesh.faces].mean(axis=1)
+        found = {(int(np.abs(at).argmax()), bool(at.max() > 0.99), int(red)) for at, red in zip(centre, texel[:, 0], strict=True)}
+        assert {red for _, _, red in found} == {30 * number for number in range(len(sides))}
+        # Both halves of a quad have one colour: each of its sides has one, those of two triangles have two.
+        assert len(found) == len(sides)
+
+
+def test_strips_of_triangles(tmp_path):
+    text = ascii_ply(CORNERS, []).replace("face 0\nproperty list uchar", "tristrips 1\nproperty list int")
+    (tmp_path / "a.ply").write_text(text + "8 0 2 1 3 -1 0 3 2\n")
+    mesh, _ = read_mesh(tmp_path / "a.ply", 1.0, SMOOTH)
+    assert np.array_equal(np.sort(mesh.faces), np.sort([(0, 2, 1), (1, 2, 3), (0, 3, 2)]))
+
+
+@pytest.mark.parametrize("kind", ["stl", "stl_ascii"])
+def test_an_stl_is_read_with_its_equal_corners_merged(tmp_path, kind):
+    ball = trimesh.creation.icosphere(2, 0.1)
+    data = ball.export(file_type=kind)
+    (tmp_path / "a.stl").write_bytes(data if isinstance(data, bytes) else (data + data).encode())
+    mesh, finish = read_mesh(tmp_path / "a.stl", 1.0)
+    assert len(mesh.vertices) == len(ball.vertices)
+    assert finish.color == (0.7, 0.7, 0.7)
+
+
+def test_what_is_ignored_of_a_ply_is_one_line(tmp_path):
+    (tmp_path / "a.ply").write_text(ascii_ply([(*corner, 1, 2) for corner in CORNERS], FACES, ("x", "y", "z", "quality", "radius")))
+    said: list[str] = []
+    read_mesh(tmp_path / "a.ply", 1.0, report=said.append)
+    assert said == [f"{tmp_path / 'a.ply'}: ignored: quality, radius"]
+
+
 @given(st.lists(st.tuples(*[st.integers(0, 255)] * 3), min_size=3, max_size=3), st.tuples(*[st.floats(0.0, 1.0)] * 3))
 def test_baked_vertex_colors_interpolate_linearly(colors, weights):
     total = sum(weights)
     share = np.array(weights) / total if total > 1e-3 else np.full(3, 1 / 3)
-    uv, texture = bake_vertex_colors(np.array([[0, 1, 2]]), np.array(colors, np.uint8))
+    uv, texture = bake_vertex_colors(np.array([[0, 1, 2]]), np.array(colors) / 255.0)
     light = srgb_to_linear(texture / 255.0)
     u, v = share @ uv
     x, y = u * 2 - 0.5, (1 - v) * 2 - 0.5
@@ -213,7 +292,7 @@ def textured_box(color, **material) -> trimesh.Trimesh:
 
 def test_a_glb_has_its_material(tmp_path):
     box = textured_box((200, 10, 10), metallicFactor=0.7, roughnessFactor=0.2)
-    mesh, finish = read_mesh(glb(tmp_path, box), 1.0)
+    mesh, finish = read_mesh(glb(tmp_path, box), 1.0, SMOOTH)
     assert np.allclose(mesh.uv, box.visual.uv, atol=1e-6)
     assert finish.texture is not None
     assert np.all(finish.texture == (200, 10, 10))
@@ -305,12 +384,10 @@ def test_an_obj_with_a_plain_color(tmp_path):
     assert finish.color == pytest.approx((0.2, 0.4, 0.6), abs=0.003)
 
 
-@pytest.mark.parametrize("missing", ["a.mtl", "skin.png"])
-def test_files_that_an_obj_refers_to_must_exist(tmp_path, missing):
+def test_the_image_of_a_material_must_exist(tmp_path):
     (tmp_path / "a.obj").write_text(OBJ)
-    if missing != "a.mtl":
-        (tmp_path / "a.mtl").write_text("newmtl skin\nmap_Kd skin.png\n")
-    with pytest.raises(CatalogError, match=missing):
+    (tmp_path / "a.mtl").write_text("newmtl skin\nmap_Kd skin.png\n")
+    with pytest.raises(CatalogError, match=r"skin\.png"):
         read_mesh(tmp_path / "a.obj", 1.0)
 
 
@@ -336,6 +413,13 @@ GOOD = ascii_ply(CORNERS, FACES)
         ("a.ply", b"\x00\xff" * 50, "not readable"),
         ("a.obj", "v 0 0 0\nv 1 0 0\nv 0 1 0\n", "a.obj"),
         ("a.obj", "", "a.obj"),
+        ("a.stl", "", "no triangles"),
+        ("a.stl", b"\x00" * 80 + struct.pack("<I", 2) + bytes(50), "cut short"),
+        ("a.stl", b"\x00" * 80 + struct.pack("<I", 2**32 - 1), "announces 4294967295 triangles"),
+        ("a.stl", "solid x\nvertex 0 0 0\nvertex 1 0 0\n", "not readable as STL"),
+        ("a.stl", "solid x\nvertex 0 0 0\nvertex 1 0 0\nvertex 0 nan 0\n", "not finite"),
+        ("a.gltf", "{}", "no triangles"),
+        ("a.gltf", "hello", "a.gltf is damaged"),
         ("a.glb", b"glTF", "not readable"),
         ("a.glb", "", "not readable"),
     ],
@@ -358,13 +442,6 @@ def test_a_texture_needs_coordinates_and_a_readable_image(tmp_path):
     (tmp_path / "t.png").write_bytes(b"no picture")
     with pytest.raises(CatalogError, match="not readable as an image"):
         read_mesh(file, 1.0)
-
-
-def test_repeating_textures_cannot_be_put_into_an_atlas(tmp_path):
-    one, two = textured_box((1, 2, 3)), textured_box((4, 5, 6))
-    two.visual.uv = 3.0 * two.visual.uv
-    with pytest.raises(CatalogError, match="repeats"):
-        read_mesh(glb(tmp_path, one, two), 1.0)
 
 
 def test_normals_where_triangles_cancel_out():

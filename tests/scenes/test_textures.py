@@ -16,7 +16,7 @@ from trimesh.visual.material import PBRMaterial
 
 from synpick_warp.errors import CatalogError
 from synpick_warp.scenes.assets.appearance import decode_texture
-from synpick_warp.scenes.assets.meshes import read_mesh
+from synpick_warp.scenes.assets.meshes import MeshOptions, read_mesh
 
 CORNERS = ("0 0 0", "1 0 0", "0 1 0", "0 0 1")
 UNWRAPPED_OBJ = "mtllib a.mtl\n" + "".join(f"v {corner}\n" for corner in CORNERS) + "usemtl skin\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n"
@@ -100,4 +100,4 @@ def test_invalid_texture_coordinates(tmp_path, value):
         read_mesh(tmp_path / "a.ply", 1.0)
     # A vertex that no triangle uses may have any.
     (tmp_path / "a.ply").write_text(ply([*rows, f"9 9 9 {value} 0.5"], textured=True))
-    assert len(read_mesh(tmp_path / "a.ply", 1.0)[0].vertices) == 4
+    assert len(read_mesh(tmp_path / "a.ply", 1.0, MeshOptions(crease_angle=180.0))[0].vertices) == 4

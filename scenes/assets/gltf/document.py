@@ -1,0 +1,347 @@
+"""glTF 2.0 documents (.glb, .gltf): container, JSON schema and buffers, validated before anything is decoded.
+
+Of the JSON only what is declared here is read: geometry, nodes, base colour and metallic-roughness with their images.
+"""
+
+from __future__ import annotations
+
+import base64
+import binascii
+import os
+import struct
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal, TypeVar
+from urllib.parse import unquote, unquote_to_bytes
+
+import msgspec
+
+from synpick_warp.errors import CatalogError
+from synpick_warp.inputs.files import read_file
+from synpick_warp.inputs.json import decode_json
+from synpick_warp.scenes.assets.asset_files import MAX_MESH_FILE, MAX_PARTS, MAX_ROWS, read_referred
+from synpick_warp.scenes.assets.mesh_parts import Notes
+
+MAX_DEPTH = 256
+"""Maximum depth of the tree of nodes."""
+_JSON, _BIN = b"JSON", b"BIN\0"
+COMPONENTS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
+"""NumPy types of an accessor's components."""
+WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
+TRIANGLES, STRIP, FAN = 4, 5, 6
+QUANTIZATION, TRANSFORM, WEBP = "KHR_mesh_quantization", "KHR_texture_transform", "EXT_texture_webp"
+GLOSSINESS = "KHR_materials_pbrSpecularGlossiness"
+_IMPLEMENTED = {QUANTIZATION, TRANSFORM, WEBP, GLOSSINESS}
+# Required extensions that change how a surface looks, or what is beside it, but neither its shape nor its base colour: they are ignored.
+_DISPENSABLE = ("KHR_materials_", "KHR_lights_", "EXT_lights_", "KHR_animation_", "KHR_xmp", "KHR_node_visibility")
+_COMPRESSED = ("KHR_draco_mesh_compression", "EXT_meshopt_compression", "KHR_meshopt_compression")
+
+Index = Annotated[int, msgspec.Meta(ge=0, lt=2**31)]
+Three = tuple[float, float, float]
+Four = tuple[float, float, float, float]
+_Item = TypeVar("_Item")
+
+
+class _Struct(msgspec.Struct):
+    """A part of the document; keys that are not declared are left out."""
+
+
+class Buffer(_Struct):
+    uri: str | None = None
+
+
+class View(_Struct):
+    buffer: Index
+    byteLength: Index  # noqa: N815
+    byteOffset: Index = 0  # noqa: N815
+    byteStride: Annotated[int, msgspec.Meta(ge=1, le=255)] | None = None  # noqa: N815
+    extensions: dict[str, Any] = {}
+
+
+class SparseIndices(_Struct):
+    bufferView: Index  # noqa: N815
+    componentType: Literal[5121, 5123, 5125]  # noqa: N815
+    byteOffset: Index = 0  # noqa: N815
+
+
+class SparseValues(_Struct):
+    bufferView: Index  # noqa: N815
+    byteOffset: Index = 0  # noqa: N815
+
+
+class Sparse(_Struct):
+    count: Index
+    indices: SparseIndices
+    values: SparseValues
+
+
+class Accessor(_Struct):
+    componentType: Literal[5120, 5121, 5122, 5123, 5125, 5126]  # noqa: N815
+    count: Index
+    type: Literal["SCALAR", "VEC2", "VEC3", "VEC4", "MAT2", "MAT3", "MAT4"]
+    bufferView: Index | None = None  # noqa: N815
+    byteOffset: Index = 0  # noqa: N815
+    normalized: bool = False
+    sparse: Sparse | None = None
+
+
+class Primitive(_Struct):
+    attributes: dict[str, Index]
+    indices: Index | None = None
+    mode: int = TRIANGLES
+    material: Index | None = None
+    targets: list[Any] = []
+    extensions: dict[str, Any] = {}
+
+
+class Mesh(_Struct):
+    primitives: list[Primitive]
+
+
+class Node(_Struct):
+    mesh: Index | None = None
+    skin: Index | None = None
+    children: list[Index] = []
+    matrix: Annotated[list[float], msgspec.Meta(min_length=16, max_length=16)] | None = None
+    translation: Three = (0.0, 0.0, 0.0)
+    rotation: Four = (0.0, 0.0, 0.0, 1.0)
+    scale: Three = (1.0, 1.0, 1.0)
+
+
+class Scene(_Struct):
+    nodes: list[Index] = []
+
+
+class Image(_Struct):
+    uri: str | None = None
+    bufferView: Index | None = None  # noqa: N815
+
+
+class Sampler(_Struct):
+    wrapS: int = 10497  # noqa: N815
+    wrapT: int = 10497  # noqa: N815
+
+
+class Texture(_Struct):
+    source: Index | None = None
+    sampler: Index | None = None
+    extensions: dict[str, Any] = {}
+
+
+class Transform(_Struct):
+    offset: tuple[float, float] = (0.0, 0.0)
+    rotation: float = 0.0
+    scale: tuple[float, float] = (1.0, 1.0)
+    texCoord: Index | None = None  # noqa: N815
+
+
+class InfoExtensions(_Struct):
+    transform: Transform | None = msgspec.field(name=TRANSFORM, default=None)
+
+
+class TextureInfo(_Struct):
+    index: Index
+    texCoord: Index = 0  # noqa: N815
+    extensions: InfoExtensions | None = None
+
+
+class Pbr(_Struct):
+    baseColorFactor: Four = (1.0, 1.0, 1.0, 1.0)  # noqa: N815
+    metallicFactor: float = 1.0  # noqa: N815
+    roughnessFactor: float = 1.0  # noqa: N815
+    baseColorTexture: TextureInfo | None = None  # noqa: N815
+    metallicRoughnessTexture: TextureInfo | None = None  # noqa: N815
+
+
+class Glossiness(_Struct):
+    diffuseFactor: Four = (1.0, 1.0, 1.0, 1.0)  # noqa: N815
+    specularFactor: Three = (1.0, 1.0, 1.0)  # noqa: N815
+    glossinessFactor: float = 1.0  # noqa: N815
+    diffuseTexture: TextureInfo | None = None  # noqa: N815
+    specularGlossinessTexture: TextureInfo | None = None  # noqa: N815
+
+
+class MaterialExtensions(_Struct):
+    glossiness: Glossiness | None = msgspec.field(name=GLOSSINESS, default=None)
+
+
+class Material(_Struct):
+    pbrMetallicRoughness: Pbr | None = None  # noqa: N815
+    extensions: MaterialExtensions | None = None
+    normalTexture: Any = None  # noqa: N815
+    occlusionTexture: Any = None  # noqa: N815
+    emissiveTexture: Any = None  # noqa: N815
+    emissiveFactor: Three = (0.0, 0.0, 0.0)  # noqa: N815
+    alphaMode: str = "OPAQUE"  # noqa: N815
+
+
+class _Head(_Struct):
+    asset: Any = None
+
+
+class Gltf(_Struct):
+    extensionsUsed: list[str] = []  # noqa: N815
+    extensionsRequired: list[str] = []  # noqa: N815
+    buffers: list[Buffer] = []
+    bufferViews: list[View] = []  # noqa: N815
+    accessors: list[Accessor] = []
+    images: list[Image] = []
+    samplers: list[Sampler] = []
+    textures: list[Texture] = []
+    materials: list[Material] = []
+    meshes: list[Mesh] = []
+    nodes: list[Node] = []
+    skins: list[Any] = []
+    animations: list[Any] = []
+    scenes: list[Scene] = []
+    scene: Index = 0
+
+
+@dataclass(frozen=True, eq=False)
+class Document:
+    """A validated glTF document."""
+
+    path: Path
+    gltf: Gltf
+    buffers: list[bytes]
+
+
+def read_document(path: Path, notes: Notes) -> Document:
+    """Read a .glb or .gltf file and the buffers that it refers to.
+
+    Raises:
+        CatalogError: The file is damaged, exceeds a limit, refers to a file outside of its folder, or needs an unknown extension.
+    """
+    data = read_file(path, MAX_MESH_FILE, CatalogError)
+    if data[:4] == b"glTF" or path.suffix.lower() == ".glb":
+        header, chunks = _split_chunks(data, path)
+    else:
+        header, chunks = data.removeprefix(b"\xef\xbb\xbf"), []
+    where = f"{path}: its JSON chunk" if chunks else path
+    version = decode_json(header, _Head, where, CatalogError).asset
+    if isinstance(version, dict) and str(version.get("version", "2")).startswith("1"):
+        raise CatalogError(f"{path}: it is glTF 1.0, which is not readable; export it as glTF 2.0")
+    gltf = decode_json(header, Gltf, where, CatalogError)
+    _check_extensions(gltf, path, notes)
+    _check_sizes(gltf, path)
+    _check_tree(gltf, path)
+    return Document(path, gltf, _read_buffers(gltf, chunks, path))
+
+
+def _check_extensions(gltf: Gltf, path: Path, notes: Notes) -> None:
+    """Refuse a file that requires what is not implemented, and note what is ignored."""
+    needed = sorted(set(gltf.extensionsRequired) - _IMPLEMENTED)
+    refused = [ascii(name)[1:-1][:80] for name in needed if not name.startswith(_DISPENSABLE)]
+    if refused:
+        advice = "export it with textures as PNG or JPEG" if any("texture" in name for name in refused) else "export it without it"
+        advice = "export it without compression" if any(name in _COMPRESSED for name in refused) else advice
+        raise CatalogError(f"{path}: requires the extension {', '.join(refused[:8])}, which is not implemented; {advice}")
+    notes.ignored += [ascii(name)[1:-1][:80] for name in sorted(set(gltf.extensionsUsed) | set(needed)) if name not in _IMPLEMENTED]
+    notes.ignored += [name for name in ("animations", "skins") if getattr(gltf, name)]
+
+
+def _split_chunks(data: bytes, path: Path) -> tuple[bytes, list[bytes]]:
+    """The JSON chunk and all binary chunks; chunks of other types are ignored, as glTF demands."""
+    if data[:4] == b"glTF" and data[4:8] == b"\1\0\0\0":
+        raise CatalogError(f"{path}: it is glTF 1.0, which is not readable; export it as glTF 2.0")
+    if data[:4] != b"glTF" or len(data) < 20 or data[4:8] != b"\2\0\0\0" or data[16:20] != _JSON:
+        raise CatalogError(f"{path}: not readable as GLB (it does not begin with the header of glTF 2.0 and a JSON chunk)")
+    at, chunks = 12, []
+    while at + 8 <= len(data) and len(chunks) <= MAX_PARTS:
+        length, kind = struct.unpack_from("<I4s", data, at)
+        if at + 8 + length > len(data):
+            raise CatalogError(f"{path}: not readable as GLB (its chunk at byte {at} is cut short)")
+        chunks.append((kind, data[at + 8 : at + 8 + length]))
+        at += 8 + length
+    return chunks[0][1], [chunk for kind, chunk in chunks[1:] if kind == _BIN]
+
+
+def item_at(items: list[_Item], index: int, what: str, path: Path) -> _Item:
+    """Item of a list, or an error that names what is missing."""
+    if index >= len(items):
+        raise CatalogError(f"{path}: refers to {what} {index}, but there are {len(items)}; export it again")
+    return items[index]
+
+
+def _check_sizes(gltf: Gltf, path: Path) -> None:
+    """Check what would be allocated: views and accessors in bytes, vertices and triangles of all meshes and of all nodes."""
+    for name in ("buffers", "bufferViews", "accessors", "images", "textures", "materials", "meshes", "nodes"):
+        limit = MAX_PARTS * (8 if name in ("bufferViews", "accessors") else 1)
+        if len(getattr(gltf, name)) > limit:
+            raise CatalogError(f"{path}: {len(getattr(gltf, name))} {name}; allowed: {limit}; merge the meshes' parts")
+    viewed = sum(view.byteLength for view in gltf.bufferViews)
+    stored = sum(each.count * int(COMPONENTS[each.componentType][2]) * WIDTHS[each.type] for each in gltf.accessors)
+    if max(viewed, stored) > 2 * MAX_MESH_FILE:
+        raise CatalogError(f"{path}: its accessors take {max(viewed, stored)} bytes; allowed: {2 * MAX_MESH_FILE}; decimate the mesh")
+    rows = []
+    for mesh in gltf.meshes:
+        mesh.primitives = [each for each in mesh.primitives if each.mode in (TRIANGLES, STRIP, FAN)]
+        rows.append(sum(_primitive_rows(gltf, each, path) for each in mesh.primitives))
+    drawn = sum(item_at(rows, node.mesh, "mesh", path) for node in gltf.nodes if node.mesh is not None)
+    parts = sum(len(gltf.meshes[node.mesh].primitives) for node in gltf.nodes if node.mesh is not None)
+    if max(sum(rows), drawn) > MAX_ROWS or max(parts, sum(len(mesh.primitives) for mesh in gltf.meshes)) > MAX_PARTS:
+        raise CatalogError(f"{path}: more than {MAX_ROWS} vertices or {MAX_PARTS} parts; decimate the mesh")
+
+
+def _primitive_rows(gltf: Gltf, primitive: Primitive, path: Path) -> int:
+    """Vertices or triangles of a primitive, whichever are more."""
+    used = {key: index for key, index in primitive.attributes.items() if key in ("POSITION", "NORMAL", "COLOR_0") or "TEXCOORD_" in key}
+    if "POSITION" not in used:
+        raise CatalogError(f"{path}: a mesh has no positions; export it again")
+    for key, index in (*used.items(), *([("indices", primitive.indices)] if primitive.indices is not None else ())):
+        accessor = item_at(gltf.accessors, index, "accessor", path)
+        if accessor.bufferView is None and accessor.sparse is None and accessor.count:
+            names = ", ".join(ascii(name)[1:-1][:80] for name in sorted(primitive.extensions)) or "compressed geometry"
+            raise CatalogError(f"{path}: {key} without data, as in files with {names}; export it without compression")
+    count = gltf.accessors[used["POSITION"]].count
+    corners = gltf.accessors[primitive.indices].count if primitive.indices is not None else count
+    return max(count, corners // 3 if primitive.mode == TRIANGLES else corners)
+
+
+def _check_tree(gltf: Gltf, path: Path) -> None:
+    """Check that nodes form trees, as glTF demands: one parent each, roots without, and no deeper than MAX_DEPTH."""
+    parents: dict[int, int] = {}
+    for number, node in enumerate(gltf.nodes):
+        for child in node.children:
+            item_at(gltf.nodes, child, "node", path)
+            if parents.setdefault(child, number) != number or child == number:
+                raise CatalogError(f"{path}: node {child} has two parents; export it again")
+    for scene in gltf.scenes:
+        for root in scene.nodes:
+            item_at(gltf.nodes, root, "node", path)
+            if root in parents:
+                raise CatalogError(f"{path}: node {root} is a root and a child; export it again")
+    for number in range(len(gltf.nodes)):
+        depth, node = 0, number
+        while node in parents:
+            depth, node = depth + 1, parents[node]
+            if depth > MAX_DEPTH:
+                raise CatalogError(f"{path}: its nodes are nested deeper than {MAX_DEPTH}; export it again")
+
+
+def _read_buffers(gltf: Gltf, chunks: list[bytes], path: Path) -> list[bytes]:
+    """Content of all buffers: binary chunks, embedded ones, and files in the model's folder."""
+    buffers, rest, total = [], list(reversed(chunks)), 0
+    for buffer in gltf.buffers:
+        buffers.append(read_uri(buffer.uri, MAX_MESH_FILE, path) if buffer.uri is not None else rest.pop() if rest else b"")
+        total += len(buffers[-1])
+        if total > 2 * MAX_MESH_FILE:
+            raise CatalogError(f"{path}: its buffers take more than {2 * MAX_MESH_FILE} bytes; decimate the mesh")
+    for view in gltf.bufferViews:
+        if view.byteOffset + view.byteLength > len(item_at(buffers, view.buffer, "buffer", path)):
+            if compressed := sorted(set(view.extensions) & set(_COMPRESSED)):
+                raise CatalogError(f"{path}: {compressed[0]} without uncompressed data; export it without compression")
+            raise CatalogError(f"{path}: not readable as {path.suffix[1:].upper()} (a buffer is shorter than its views); it is cut short")
+    return buffers
+
+
+def read_uri(uri: str, limit: int, path: Path) -> bytes:
+    """Content of a URI: embedded data, or a relative name, percent-encoded or not."""
+    if not uri.startswith("data:"):
+        name = uri if os.path.lexists(path.parent / uri) else unquote(uri)
+        return read_referred(path.parent, name, path, limit)[1]
+    kind, _, content = uri.partition(",")
+    try:
+        return base64.b64decode(content) if kind.endswith(";base64") else unquote_to_bytes(content)
+    except (binascii.Error, ValueError):
+        raise CatalogError(f"{path}: data that are not base64; export it again") from None

@@ -1,0 +1,326 @@
+"""glTF import: accessors, materials and nodes of a validated document, as one part for each instance of a primitive."""
+
+from __future__ import annotations
+
+import io
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from PIL import Image as PillowImage
+from scipy.spatial.transform import Rotation
+
+from synpick_warp.errors import CatalogError
+from synpick_warp.scenes.assets.appearance import (
+    MAX_TEXTURE_FILE,
+    MAX_TEXTURE_PIXELS,
+    FileMaterial,
+    as_color,
+    decode_texture,
+    linear_to_srgb,
+    srgb_to_linear,
+)
+from synpick_warp.scenes.assets.asset_files import describe_error
+from synpick_warp.scenes.assets.gltf.document import (
+    COMPONENTS,
+    FAN,
+    GLOSSINESS,
+    QUANTIZATION,
+    STRIP,
+    TRIANGLES,
+    WEBP,
+    WIDTHS,
+    Accessor,
+    Document,
+    Glossiness,
+    Material,
+    Node,
+    Pbr,
+    Primitive,
+    TextureInfo,
+    View,
+    item_at,
+    read_document,
+    read_uri,
+)
+from synpick_warp.scenes.assets.mesh_parts import NO_MATERIAL, WHITE, MeshPart, Notes
+
+# Factors may exceed 0..1 by rounding.
+_FACTOR_TOLERANCE = 1e-3
+_DIELECTRIC = 0.04
+"""Reflectance of a dielectric at normal incidence (glTF 2.0, appendix B)."""
+_CLAMP, _MIRROR = 33071, 33648
+
+
+def read_gltf(path: Path, notes: Notes) -> list[MeshPart]:
+    """Read a .glb or .gltf file: one part for each primitive of each node of the default scene.
+
+    Raises:
+        CatalogError: The file or one that it refers to cannot be used.
+    """
+    document = read_document(path, notes)
+    try:
+        return _Reader(document, notes).parts()
+    except CatalogError:
+        raise
+    except Exception as error:  # values that are valid one by one, and do not fit together
+        raise CatalogError(f"{path}: not readable as {path.suffix[1:].upper()} ({describe_error(error)})") from error
+
+
+class _Reader:
+    """Decodes one document; materials and images are decoded once, so that parts share them."""
+
+    def __init__(self, document: Document, notes: Notes) -> None:
+        self.path, self.gltf, self.buffers, self.notes = document.path, document.gltf, document.buffers, notes
+        self.images: dict[int, np.ndarray] = {}
+        self.files: dict[int, bytes] = {}
+        self.tiles: dict[tuple[int, bool, bool], np.ndarray] = {}
+        self.materials: dict[int, tuple[FileMaterial, TextureInfo | None]] = {}
+        self.pixels = 0
+
+    def parts(self) -> list[MeshPart]:
+        """All parts of the default scene, depth first; without scenes, of all nodes."""
+        nodes, scenes = self.gltf.nodes, self.gltf.scenes
+        children = {child for node in nodes for child in node.children}
+        roots = [number for number in range(len(nodes)) if number not in children]
+        roots = item_at(scenes, self.gltf.scene, "scene", self.path).nodes if scenes else roots
+        stack = [(root, np.eye(4)) for root in reversed(roots)]
+        parts: list[MeshPart] = []
+        while stack:
+            number, parent = stack.pop()
+            node = nodes[number]
+            transform = parent @ _node_matrix(node)
+            if node.mesh is not None:
+                parts += [_transform(self.part(each), transform) for each in self.gltf.meshes[node.mesh].primitives]
+            stack += [(child, transform) for child in reversed(node.children)]
+        return parts
+
+    def part(self, primitive: Primitive) -> MeshPart:
+        """Geometry and material of a primitive."""
+        attributes = primitive.attributes
+        vertices = self.values(attributes["POSITION"], "POSITION", (3,))
+        count = len(vertices)
+        corners = np.arange(count)
+        if primitive.indices is not None:
+            corners = self.values(primitive.indices, "indices", (1,))[:, 0].astype(np.int64)
+        normals = self.attribute(attributes.get("NORMAL"), "NORMAL", (3,), count)
+        colors = self.attribute(attributes.get("COLOR_0"), "COLOR_0", (3, 4), count)
+        material, info = (NO_MATERIAL, None) if primitive.material is None else self.material(primitive.material)
+        uv = None
+        if info is not None:
+            coordinates = (
+                info.texCoord if info.extensions is None or info.extensions.transform is None else info.extensions.transform.texCoord
+            )
+            name = f"TEXCOORD_{info.texCoord if coordinates is None else coordinates}"
+            uv = self.attribute(attributes.get(name), name, (2,), count)
+            if uv is None:
+                raise CatalogError(f"{self.path}: has a texture, but vertices without texture coordinates; unwrap it or remove the texture")
+            material, uv = self.wrapped(material, _transform_uv(uv, info), info)
+        if primitive.targets:
+            self.notes.ignored.append("morph targets")
+        if colors is not None:
+            material = replace(material, color=WHITE) if primitive.material is None else material
+            colors = linear_to_srgb(colors[:, :3])
+        return MeshPart(vertices, _triangles(corners, primitive.mode), normals, uv, colors, material)
+
+    def attribute(self, index: int | None, name: str, widths: tuple[int, ...], count: int) -> np.ndarray | None:
+        """Values of an attribute that may be absent, one row for each of `count` vertices."""
+        if index is None:
+            return None
+        values = self.values(index, name, widths)
+        if len(values) != count:
+            raise CatalogError(f"{self.path}: {name} has {len(values)} values for {count} vertices; export it again")
+        return values
+
+    def values(self, index: int, name: str, widths: tuple[int, ...]) -> np.ndarray:
+        """Decode an accessor (glTF 2.0, section 3.6.2): strided, sparse, normalized; (count, width) float64.
+
+        Integers in colours and normals are normalized in any case, and those in texture coordinates unless KHR_mesh_quantization is used.
+        """
+        accessor = item_at(self.gltf.accessors, index, "accessor", self.path)
+        if WIDTHS[accessor.type] not in widths:
+            allowed = " or ".join(kind for kind, width in WIDTHS.items() if width in widths and kind[:3] != "MAT")
+            raise CatalogError(f"{self.path}: {name} is of type {accessor.type}; needed: {allowed}; export it again")
+        values = self.raw(accessor)
+        always = name in ("NORMAL", "COLOR_0") or (name[0] == "T" and QUANTIZATION not in self.gltf.extensionsUsed)
+        kind = values.dtype
+        values = values.astype(np.float64)
+        if kind.kind == "f" or name == "indices" or not (accessor.normalized or always):
+            return values
+        return np.maximum(values / np.iinfo(kind).max, -1.0)
+
+    def raw(self, accessor: Accessor) -> np.ndarray:
+        """Stored numbers of an accessor (count, width), with its sparse values in their places."""
+        kind, width, sparse = np.dtype(COMPONENTS[accessor.componentType]), WIDTHS[accessor.type], accessor.sparse
+        values = np.zeros((accessor.count, width), kind)
+        if accessor.bufferView is not None:
+            values = self.rows(accessor.bufferView, accessor.byteOffset, accessor.count, width, kind)
+        if sparse is not None:
+            index_kind = np.dtype(COMPONENTS[sparse.indices.componentType])
+            places = self.rows(sparse.indices.bufferView, sparse.indices.byteOffset, sparse.count, 1, index_kind)
+            if places.size and places.max() >= accessor.count:
+                raise CatalogError(f"{self.path}: a sparse accessor refers to row {places.max()} of {accessor.count}; export it again")
+            values = values.copy()
+            values[places[:, 0]] = self.rows(sparse.values.bufferView, sparse.values.byteOffset, sparse.count, width, kind)
+        return values
+
+    def rows(self, view_index: int, offset: int, count: int, width: int, kind: np.dtype) -> np.ndarray:
+        """Rows of a buffer view, a view of its bytes."""
+        view: View = item_at(self.gltf.bufferViews, view_index, "buffer view", self.path)
+        size = kind.itemsize * width
+        stride = view.byteStride or size
+        if count and offset + stride * (count - 1) + size > view.byteLength:
+            raise CatalogError(f"{self.path}: an accessor is longer than its buffer view; export it again")
+        if not count:
+            return np.zeros((0, width), kind)
+        return np.ndarray((count, width), kind, self.buffers[view.buffer], view.byteOffset + offset, (stride, kind.itemsize))
+
+    def material(self, index: int) -> tuple[FileMaterial, TextureInfo | None]:
+        """A material and its reference to a base colour texture."""
+        if index not in self.materials:
+            material = item_at(self.gltf.materials, index, "material", self.path)
+            self.note_ignored(material)
+            gloss = material.extensions.glossiness if material.extensions else None
+            self.materials[index] = self.gloss(gloss) if gloss else self.pbr(material.pbrMetallicRoughness or Pbr())
+        return self.materials[index]
+
+    def note_ignored(self, material: Material) -> None:
+        """Note what a material has beyond base colour, metallic and roughness."""
+        self.notes.ignored += [name for name in ("normalTexture", "occlusionTexture") if getattr(material, name) is not None]
+        if material.emissiveTexture is not None or any(material.emissiveFactor):
+            self.notes.ignored.append("emission")
+        if material.alphaMode != "OPAQUE":
+            self.notes.ignored.append("transparency")
+
+    def pbr(self, pbr: Pbr) -> tuple[FileMaterial, TextureInfo | None]:
+        """Convert metallic-roughness; of the metallic-roughness texture, the mean is used."""
+        for name, value in (("metallicFactor", pbr.metallicFactor), ("roughnessFactor", pbr.roughnessFactor)):
+            if not -_FACTOR_TOLERANCE <= value <= 1.0 + _FACTOR_TOLERANCE:
+                raise CatalogError(f"{self.path}: {name} is {value:g}; allowed: 0 to 1; correct the material")
+        metallic, roughness = pbr.metallicFactor, pbr.roughnessFactor
+        if pbr.metallicRoughnessTexture is not None:
+            # glTF 2.0, section 3.9.2: green is roughness, blue is metalness. The renderer takes one value per object: the mean.
+            mean = self.texture(pbr.metallicRoughnessTexture).reshape(-1, 3).mean(axis=0) / 255.0
+            metallic, roughness = metallic * float(mean[2]), roughness * float(mean[1])
+        return self.base(pbr.baseColorFactor[:3], pbr.baseColorTexture, metallic, roughness, "baseColorFactor"), pbr.baseColorTexture
+
+    def gloss(self, gloss: Glossiness) -> tuple[FileMaterial, TextureInfo | None]:
+        """Convert specular-glossiness by its means: a metal has its specular colour, all else its diffuse colour."""
+        specular, alpha = np.asarray(gloss.specularFactor), 1.0
+        if gloss.specularGlossinessTexture is not None:
+            pixels = self.texture(gloss.specularGlossinessTexture).reshape(-1, 3)
+            specular = specular * srgb_to_linear(pixels.mean(axis=0) / 255.0)
+            alpha = _mean_alpha(self.files[self.source(gloss.specularGlossinessTexture)])
+        roughness = float(np.clip(1.0 - gloss.glossinessFactor * alpha, 0.0, 1.0))
+        diffuse = np.asarray(gloss.diffuseFactor[:3])
+        if gloss.diffuseTexture is not None:
+            diffuse = diffuse * srgb_to_linear(self.texture(gloss.diffuseTexture).reshape(-1, 3).mean(axis=0) / 255.0)
+        # The quadratic equation of KHR_materials_pbrSpecularGlossiness, appendix "Best practices".
+        bright, shiny = (float(np.sqrt(np.dot(color**2, (0.299, 0.587, 0.114)))) for color in (diffuse, specular))
+        linear = bright * (1.0 - float(specular.max())) / (1.0 - _DIELECTRIC) + shiny - 2.0 * _DIELECTRIC
+        root = np.sqrt(max(linear**2 - 4.0 * _DIELECTRIC * (_DIELECTRIC - shiny), 0.0))
+        metallic = 0.0 if shiny < _DIELECTRIC else float(np.clip((root - linear) / (2.0 * _DIELECTRIC), 0.0, 1.0))
+        if metallic > 0.5:
+            return self.base(specular, gloss.specularGlossinessTexture, metallic, roughness, GLOSSINESS), gloss.specularGlossinessTexture
+        return self.base(gloss.diffuseFactor[:3], gloss.diffuseTexture, metallic, roughness, GLOSSINESS), gloss.diffuseTexture
+
+    def base(self, factor: object, info: TextureInfo | None, metallic: float, roughness: float, name: str) -> FileMaterial:
+        """Material of a linear base colour factor and a texture."""
+        linear = np.asarray(factor, dtype=np.float64)
+        if linear.min() < -_FACTOR_TOLERANCE or linear.max() > 1.0 + _FACTOR_TOLERANCE:
+            self.notes.said.append(f"{name} {' '.join(f'{value:g}' for value in linear)} is cut to 0..1")
+        texture = None if info is None else self.texture(info)
+        return FileMaterial(as_color(linear_to_srgb(linear)), texture, metallic, roughness)
+
+    def source(self, info: TextureInfo) -> int:
+        """Index of a texture's image."""
+        texture = item_at(self.gltf.textures, info.index, "texture", self.path)
+        webp = texture.extensions.get(WEBP)
+        source = webp.get("source") if isinstance(webp, dict) else texture.source
+        if not isinstance(source, int) or source < 0:
+            known = f" ({', '.join(sorted(texture.extensions))[:80]})" if texture.extensions else ""
+            raise CatalogError(f"{self.path}: texture {info.index} is of a format that cannot be read{ascii(known)[1:-1]}; use PNG or JPEG")
+        return source
+
+    def texture(self, info: TextureInfo) -> np.ndarray:
+        """Decode the image of a texture (H, W, 3) uint8."""
+        source = self.source(info)
+        if source not in self.images:
+            image = item_at(self.gltf.images, source, "image", self.path)
+            if image.uri is not None:
+                data = read_uri(image.uri, MAX_TEXTURE_FILE, self.path)
+            else:
+                index = len(self.gltf.bufferViews) if image.bufferView is None else image.bufferView
+                view = item_at(self.gltf.bufferViews, index, "buffer view", self.path)
+                data = self.buffers[view.buffer][view.byteOffset : view.byteOffset + view.byteLength]
+            self.files[source], self.images[source] = data, decode_texture(data, f"{self.path}: image {source}")
+            self.pixels += self.images[source].size // 3
+            if self.pixels > MAX_TEXTURE_PIXELS:
+                raise CatalogError(f"{self.path}: its textures have more than {MAX_TEXTURE_PIXELS} pixels together; scale them down")
+        return self.images[source]
+
+    def wrapped(self, material: FileMaterial, uv: np.ndarray, info: TextureInfo) -> tuple[FileMaterial, np.ndarray]:
+        """Apply a sampler's wrap modes where coordinates leave 0..1: mirrored repetition as an image twice the size that repeats."""
+        texture = self.gltf.textures[info.index]
+        if texture.sampler is None or material.texture is None or not len(uv) or (uv.min() >= -1e-3 and uv.max() <= 1.0 + 1e-3):
+            return material, uv
+        sampler = item_at(self.gltf.samplers, texture.sampler, "sampler", self.path)
+        if _CLAMP in (sampler.wrapS, sampler.wrapT):
+            self.notes.ignored.append("a texture's wrap mode CLAMP_TO_EDGE")
+        mirror = sampler.wrapS == _MIRROR, sampler.wrapT == _MIRROR
+        if not any(mirror):
+            return material, uv
+        key = (self.source(info), *mirror)
+        if key not in self.tiles:
+            image = material.texture
+            image = np.concatenate([image, image[:, ::-1]], axis=1) if mirror[0] else image
+            # The upper half of the image, v in 1..2 before scaling, is the mirrored one.
+            self.tiles[key] = np.concatenate([image[::-1], image], axis=0) if mirror[1] else image
+        return replace(material, texture=self.tiles[key]), uv / np.where(mirror, 2.0, 1.0)
+
+
+def _mean_alpha(data: bytes) -> float:
+    """Mean of an image's alpha channel, 1 without one; the image has been decoded before."""
+    with PillowImage.open(io.BytesIO(data)) as image:
+        return float(np.asarray(image.convert("RGBA"))[..., 3].mean() / 255.0)
+
+
+def _triangles(corners: np.ndarray, mode: int) -> np.ndarray:
+    """Triangles (F, 3) of a list, strip or fan of corners."""
+    if mode == TRIANGLES:
+        return corners[: len(corners) // 3 * 3].reshape(-1, 3)
+    if len(corners) < 3:
+        return np.zeros((0, 3), np.int64)
+    first = np.arange(len(corners) - 2)
+    if mode == FAN:
+        return np.stack([corners[1:-1], corners[2:], np.broadcast_to(corners[0], len(first))], axis=1)
+    assert mode == STRIP
+    odd = first % 2
+    return np.stack([corners[first], corners[first + 1 + odd], corners[first + 2 - odd]], axis=1)
+
+
+def _transform_uv(uv: np.ndarray, info: TextureInfo) -> np.ndarray:
+    """Apply KHR_texture_transform, and turn v up."""
+    transform = info.extensions.transform if info.extensions else None
+    if transform is not None:
+        cosine, sine = np.cos(transform.rotation), np.sin(transform.rotation)
+        uv = uv * transform.scale @ np.array([[cosine, -sine], [sine, cosine]]) + transform.offset
+    return np.stack([uv[:, 0], 1.0 - uv[:, 1]], axis=1)
+
+
+def _node_matrix(node: Node) -> np.ndarray:
+    """Local transform of a node (4, 4): its matrix, or translation, rotation and scale."""
+    if node.matrix is not None:
+        return np.asarray(node.matrix).reshape(4, 4).T
+    matrix = np.eye(4)
+    matrix[:3, :3], matrix[:3, 3] = Rotation.from_quat(node.rotation).as_matrix() * node.scale, node.translation
+    return matrix
+
+
+def _transform(part: MeshPart, transform: np.ndarray) -> MeshPart:
+    """Transform a part by a 4 x 4 matrix; a reflection flips the triangles' orientation."""
+    vertices = part.vertices @ transform[:3, :3].T + transform[:3, 3]
+    determinant = np.linalg.det(transform[:3, :3])
+    normals = None if part.normals is None or determinant == 0.0 else part.normals @ np.linalg.inv(transform[:3, :3])
+    faces = part.faces if determinant > 0.0 else part.faces[:, ::-1]
+    return replace(part, vertices=vertices, faces=faces, normals=normals)

@@ -1,0 +1,63 @@
+"""STL import: binary and text."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+
+from synpick_warp.errors import CatalogError
+from synpick_warp.inputs.files import read_file
+from synpick_warp.scenes.assets.asset_files import MAX_MESH_FILE, MAX_ROWS, MAX_TEXT_MESH
+from synpick_warp.scenes.assets.mesh_parts import NO_MATERIAL, MeshPart, Notes
+from synpick_warp.scenes.assets.text import decode_text
+
+_HEADER = 84
+_TRIANGLE = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
+_VERTEX = re.compile(r"\bvertex\s+(\S+)\s+(\S+)\s+(\S+)", re.IGNORECASE)
+
+
+def read_stl(path: Path, notes: Notes) -> list[MeshPart]:
+    """Read an STL file. Equal corners become one vertex; the triangles' own normals are not used, since they are often wrong.
+
+    Raises:
+        CatalogError: The file cannot be read, or is too large.
+    """
+    data = read_file(path, MAX_MESH_FILE, CatalogError)
+    count = int.from_bytes(data[80:_HEADER], "little")
+    # Text may begin with any word, and binary files with "solid": the announced size decides.
+    if len(data) >= _HEADER and (len(data) == _HEADER + count * _TRIANGLE.itemsize or b"\0" in data[:_HEADER].rstrip(b"\0")):
+        corners = _binary(data, count, path, notes)
+    else:
+        corners = _text(data, path)
+    if not len(corners):
+        raise CatalogError(f"{path}: no triangles; a model needs a surface")
+    vertices, index = np.unique(corners.reshape(-1, 3), axis=0, return_inverse=True)
+    return [MeshPart(vertices, index.reshape(-1, 3).astype(np.int64), None, None, None, NO_MATERIAL)]
+
+
+def _binary(data: bytes, count: int, path: Path, notes: Notes) -> np.ndarray:
+    """Corners of a binary file (F, 3, 3) float64."""
+    if count > MAX_ROWS:
+        raise CatalogError(f"{path}: announces {count} triangles; allowed: at most {MAX_ROWS}; decimate the mesh")
+    if len(data) < _HEADER + count * _TRIANGLE.itemsize:
+        raise CatalogError(f"{path}: not readable as STL (its header announces {count} triangles, its body is shorter); it is cut short")
+    triangles = np.frombuffer(data, _TRIANGLE, count, _HEADER)
+    if np.any(triangles["attribute"]):
+        notes.ignored.append("colours or other attributes of triangles")
+    return triangles["corners"].astype(np.float64)
+
+
+def _text(data: bytes, path: Path) -> np.ndarray:
+    """Corners of a text file (F, 3, 3) float64, of all its solids together."""
+    if len(data) > MAX_TEXT_MESH:
+        raise CatalogError(f"{path}: too large for a text file; save it as binary STL")
+    text = decode_text(data)
+    if text.count("vertex") + text.count("VERTEX") > 3 * MAX_ROWS:
+        raise CatalogError(f"{path}: more than {MAX_ROWS} triangles; decimate the mesh")
+    numbers = _VERTEX.findall(text)
+    try:
+        return np.array(numbers, dtype=np.float64).reshape(-1, 3, 3)
+    except ValueError:
+        raise CatalogError(f"{path}: not readable as STL (its {len(numbers)} vertices are not three numbers each, three a facet)") from None

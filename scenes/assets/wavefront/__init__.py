@@ -1,0 +1,1 @@
+"""Wavefront import: OBJ meshes and MTL materials."""

@@ -1,0 +1,177 @@
+"""MTL import: colours, textures with their options, and the metallic and roughness of MTL's PBR extension."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from synpick_warp.errors import CatalogError
+from synpick_warp.scenes.assets.appearance import MAX_TEXTURE_FILE, MAX_TEXTURE_PIXELS, FileMaterial, as_color, decode_texture
+from synpick_warp.scenes.assets.asset_files import read_referred
+from synpick_warp.scenes.assets.mesh_parts import GREY, WHITE, Notes
+
+# Options of a texture statement, with the largest number of arguments of each.
+_OPTIONS = {"-blendu": 1, "-blendv": 1, "-bm": 1, "-boost": 1, "-cc": 1, "-clamp": 1, "-imfchan": 1, "-mm": 2, "-o": 3, "-s": 3, "-t": 3}
+_OPTIONS |= {"-texres": 1, "-type": 1, "-colorspace": 1}
+# Options that, with these arguments, change nothing here.
+_NEUTRAL = {"-blendu": ("on",), "-blendv": ("on",), "-cc": ("off",), "-clamp": ("off",), "-mm": ("0", "1"), "-colorspace": ("srgb",)}
+_NEUTRAL |= {"-imfchan": ("m",), "-t": ("0", "0", "0"), "-boost": ("0",)}
+# Statements of the Phong model, which has no counterpart in the metallic-roughness model; every exporter writes them.
+_SILENT = {"ka", "ks", "ns", "ni", "illum", "tf", "d", "tr", "ke", "pcr", "aniso", "anisor", "sharpness", "ps", "pc", "xd"}
+
+
+@dataclass(eq=False)
+class MtlMaterial:
+    """A material of a library, before its images are read."""
+
+    library: Path
+    color: tuple[float, float, float] | None = None
+    """Kd."""
+    maps: dict[str, str] = field(default_factory=dict)
+    """Image names of map_kd, map_pm and map_pr."""
+    scale: tuple[float, float] = (1.0, 1.0)
+    offset: tuple[float, float] = (0.0, 0.0)
+    """Of the texture coordinates of map_Kd."""
+    factors: dict[str, float] = field(default_factory=dict)
+    """pm (metallic) and pr (roughness)."""
+    ignored: list[str] = field(default_factory=list)
+
+    def transform(self, uv: np.ndarray) -> np.ndarray:
+        """Apply the options -s and -o of map_Kd to texture coordinates (V, 2)."""
+        return uv * self.scale + self.offset
+
+    def missing_images(self) -> list[str]:
+        """Names of images that are not there."""
+        return [name for name in self.maps.values() if not os.path.lexists(self.library.parent / name.replace("\\", "/"))]
+
+
+@dataclass(eq=False)
+class TexturePixels:
+    """Decodes the images of an OBJ's materials, each once, up to the limit on their pixels together."""
+
+    owner: Path
+    images: dict[Path, np.ndarray] = field(default_factory=dict)
+
+    def read(self, name: str, library: Path) -> np.ndarray:
+        """Decode an image (H, W, 3) uint8 that a library names."""
+        path, data = read_referred(library.parent, name, library, MAX_TEXTURE_FILE)
+        if path not in self.images:
+            self.images[path] = decode_texture(data, str(path))
+            if sum(image.size // 3 for image in self.images.values()) > MAX_TEXTURE_PIXELS:
+                raise CatalogError(f"{self.owner}: its textures have more than {MAX_TEXTURE_PIXELS} pixels together; scale them down")
+        return self.images[path]
+
+
+def parse_library(text: str, library: Path) -> dict[str, MtlMaterial]:
+    """Parse a material library.
+
+    Raises:
+        CatalogError: A colour is not finite.
+    """
+    materials: dict[str, MtlMaterial] = {}
+    current: MtlMaterial | None = None
+    for line in text.replace("\\\n", " ").splitlines():
+        words = line.split()
+        key = words[0].lower() if len(words) > 1 else ""
+        if key == "newmtl":
+            current = materials.setdefault(" ".join(words[1:]), MtlMaterial(library))
+        elif current is not None and key and key[0] != "#":
+            _parse_statement(current, key, words, line.strip())
+    return materials
+
+
+def _parse_statement(material: MtlMaterial, key: str, words: list[str], line: str) -> None:
+    """Parse one statement of a material."""
+    if key == "kd":
+        material.color = _color(words[1:], material)
+    elif key in ("pm", "pr"):
+        values = _numbers(words[1:2])
+        if values and np.isfinite(values[0]):
+            material.factors[key] = float(np.clip(values[0], 0.0, 1.0))
+    elif key in ("map_kd", "map_pm", "map_pr"):
+        _parse_map(material, key, words, line)
+    elif key not in _SILENT:
+        material.ignored.append(ascii(words[0])[1:-1][:40])
+    elif (key == "d" and _numbers(words[-1:]) not in ([1.0], [])) or (key == "tr" and _numbers(words[1:2]) not in ([0.0], [1.0], [])):
+        # Of Tr both ends are written for opaque materials.
+        material.ignored.append("transparency")
+    elif key == "ke" and any(_numbers(words[1:])):
+        material.ignored.append("emission")
+
+
+def _parse_map(material: MtlMaterial, key: str, words: list[str], line: str) -> None:
+    """Parse a texture statement: options, then the image's name, which may contain blanks."""
+    at = 1
+    while at < len(words) and words[at].lower() in _OPTIONS:
+        option = words[at].lower()
+        end = at + 1
+        while (
+            end < len(words) - 1
+            and end - at <= _OPTIONS[option]
+            and (option not in ("-o", "-s", "-t", "-mm") or _numbers(words[end : end + 1]))
+        ):
+            end += 1
+        arguments = words[at + 1 : end]
+        values = _numbers(arguments)
+        if option in ("-o", "-s") and values and np.isfinite(values).all() and key == "map_kd":
+            # A value that is left out is the default: of -s 1, of -o 0.
+            first, second = (*values, 1.0 if option == "-s" else 0.0)[:2]
+            if option == "-s":
+                material.scale = (first, second)
+            else:
+                material.offset = (first, second)
+        elif not _is_neutral(option, arguments):
+            material.ignored.append(f"{ascii(words[0])[1:-1]} {option}")
+        at = end
+    name = line.split(maxsplit=at)[at:]
+    if name:
+        material.maps[key] = name[0].strip().strip('"')
+
+
+def _is_neutral(option: str, arguments: list[str]) -> bool:
+    expected = _NEUTRAL.get(option)
+    if expected is None:
+        return option in ("-texres", "-type", "-bm", "-o", "-s")
+    return all(
+        word.lower() == other or _numbers([word]) == _numbers([other]) != [] for word, other in zip(arguments, expected, strict=False)
+    )
+
+
+def _numbers(words: list[str]) -> list[float]:
+    """Words as numbers; none, if one is not a number."""
+    try:
+        return [float(word) for word in words]
+    except ValueError:
+        return []
+
+
+def _color(words: list[str], material: MtlMaterial) -> tuple[float, float, float] | None:
+    """A diffuse colour of one or three numbers; None if it is given as a spectrum, or in another colour space."""
+    values = _numbers(words)
+    if not values:
+        material.ignored.append(f"Kd {ascii(words[0])[1:-1][:20]}")
+        return material.color
+    if not np.isfinite(values).all():
+        shown = ascii(" ".join(words))[1:-1][:80]
+        raise CatalogError(f"{material.library}: Kd {shown} is not finite; give red, green and blue from 0 to 1")
+    return as_color(np.clip((values if len(values) >= 3 else values[:1] * 3)[:3], 0.0, 1.0))
+
+
+def read_material(material: MtlMaterial, pixels: TexturePixels, notes: Notes) -> FileMaterial:
+    """Convert a material, reading its images; of maps of metallic and roughness, the mean is used.
+
+    Raises:
+        CatalogError: An image is missing or damaged.
+    """
+    notes.ignored += material.ignored
+    texture = pixels.read(material.maps["map_kd"], material.library) if "map_kd" in material.maps else None
+    factors = dict(material.factors)
+    for key in ("pm", "pr"):
+        if f"map_{key}" in material.maps:
+            factors[key] = float(pixels.read(material.maps[f"map_{key}"], material.library).mean() / 255.0)
+    # With an image Kd is ignored: exporters leave 0.64, or 0, there.
+    color = WHITE if texture is not None else material.color or GREY
+    return FileMaterial(color, texture, factors.get("pm"), factors.get("pr"))

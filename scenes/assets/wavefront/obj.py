@@ -1,0 +1,121 @@
+"""OBJ import: text and material libraries are decoded and checked here, so that the reader (trimesh) opens no file by itself."""
+
+from __future__ import annotations
+
+import io
+import os
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from trimesh.exchange.obj import load_obj
+from trimesh.geometry import triangulate_quads
+
+from synpick_warp.errors import CatalogError
+from synpick_warp.inputs.files import read_file
+from synpick_warp.inputs.paths import path_inside
+from synpick_warp.scenes.assets.appearance import FileMaterial
+from synpick_warp.scenes.assets.asset_files import MAX_PARTS, MAX_ROWS, MAX_TEXT_MESH, describe_error, read_referred
+from synpick_warp.scenes.assets.mesh_parts import NO_MATERIAL, WHITE, MeshPart, Notes
+from synpick_warp.scenes.assets.text import decode_text
+from synpick_warp.scenes.assets.wavefront.mtl import MtlMaterial, TexturePixels, parse_library, read_material
+
+MAX_LIBRARY = 2**22
+"""Largest material library [bytes]: 4 MiB."""
+_LIBRARY = "library"
+
+
+def read_obj(path: Path, notes: Notes) -> list[MeshPart]:
+    """Read an OBJ file with its material libraries and the images of the materials that it uses: one part for each material.
+
+    Raises:
+        CatalogError: The file or one that it refers to cannot be used.
+    """
+    text = decode_text(read_file(path, MAX_TEXT_MESH, CatalogError))
+    if text.count("\n") > 4 * MAX_ROWS:
+        raise CatalogError(f"{path}: more than {4 * MAX_ROWS} lines; decimate the mesh")
+    lines = text.split("\n")
+    # As the reader takes them: the rest of the line behind the word.
+    used = dict.fromkeys(line[line.index("usemtl ") + 7 :].strip() for line in lines if "usemtl " in line)
+    if len(used) > MAX_PARTS or text.count("usemtl ") > MAX_ROWS:
+        raise CatalogError(f"{path}: more than {MAX_PARTS} materials; merge them")
+    known = _read_libraries(path, lines, notes)
+    for name in known.keys() - used.keys():
+        notes.said += [f"the image {ascii(image)[:80]} of an unused material is missing" for image in known[name].missing_images()]
+    pixels = TexturePixels(path)
+    materials = {name: read_material(known[name], pixels, notes) for name in used if name in known}
+    try:
+        parts = [_part(mesh, used, known, materials, path, notes) for mesh in _load(text, used)]
+    except CatalogError:
+        raise
+    except Exception as error:  # the reader raises nearly anything on damaged files
+        raise CatalogError(f"{path}: not readable as OBJ ({describe_error(error)})") from error
+    if not parts:
+        raise CatalogError(f"{path}: no triangles; a model needs a surface, a point cloud has none")
+    return parts
+
+
+def _load(text: str, used: dict[str, None]) -> list[dict[str, Any]]:
+    """The reader's meshes, ordered by name, each with the name of its material as `material`."""
+    # A library of names only: which mesh has which material; what the materials are is read here.
+    table = {_LIBRARY: "\n".join(f"newmtl {name}" for name in used).encode()}
+    content = load_obj(io.BytesIO(f"mtllib {_LIBRARY}\n{text}".encode()), resolver=table)
+    return [mesh for _, mesh in sorted(content.get("geometry", {}).items())]
+
+
+def _part(
+    mesh: dict[str, Any], used: dict[str, None], known: dict[str, MtlMaterial], materials: dict[str, FileMaterial], path: Path, notes: Notes
+) -> MeshPart:
+    """Convert one of the reader's meshes."""
+    vertices, faces = np.asarray(mesh["vertices"], np.float64), triangulate_quads(mesh["faces"])
+    normals, visual, colors = mesh.get("vertex_normals"), mesh.get("visual"), mesh.get("vertex_colors")
+    if vertices.shape[1:] != (3,) or faces.shape[1:] != (3,) or (normals is not None and np.shape(normals) != vertices.shape):
+        raise CatalogError(f"{path}: vertices, normals or triangles with other than three numbers each; repair the mesh")
+    # Without a material the reader invents one of some name.
+    name, uv = getattr(getattr(visual, "material", None), "name", ""), getattr(visual, "uv", None)
+    material = materials.get(name, NO_MATERIAL)
+    if material.texture is not None:
+        if uv is None or len(uv) != len(vertices):
+            raise CatalogError(f"{path}: has a texture, but vertices without texture coordinates; unwrap it or remove the texture")
+        uv = known[name].transform(np.asarray(uv, np.float64)[:, :2])
+    if colors is not None:
+        if len(colors) != len(vertices):
+            raise CatalogError(f"{path}: {len(colors)} vertex colours for {len(vertices)} vertices; repair the mesh")
+        if name in materials:
+            notes.ignored.append("vertex colours beside a material")
+        # OBJ does not specify the colours' space; files contain colours of sRGB images.
+        colors = None if name in materials else _unit_colors(np.asarray(colors)[:, :3])
+    if name not in materials:
+        if known:
+            what = f"no material {ascii(name)[:80]} in its libraries" if name in used else "triangles without a material"
+            notes.said.append(f"{what}, the default is used")
+        notes.ignored += ["texture coordinates without a texture"] if uv is not None else []
+    if colors is not None:
+        material = replace(NO_MATERIAL, color=WHITE)
+    return MeshPart(vertices, faces, normals, None if material.texture is None else uv, colors, material)
+
+
+def _unit_colors(colors: np.ndarray) -> np.ndarray:
+    """Colours in 0..1: of integers and of numbers beyond 1, 255 is the largest."""
+    colors = np.nan_to_num(np.asarray(colors, np.float64))
+    return np.clip(colors / (255.0 if colors.size and colors.max() > 1.0 else 1.0), 0.0, 1.0)
+
+
+def _read_libraries(path: Path, lines: list[str], notes: Notes) -> dict[str, MtlMaterial]:
+    """Materials of all libraries that an OBJ file names, by name; a library that is not there is noted."""
+    known: dict[str, MtlMaterial] = {}
+    names = [line.strip().removeprefix("mtllib").strip() for line in lines if line.split(maxsplit=1)[:1] == ["mtllib"]]
+    for name in dict.fromkeys(names):
+        try:
+            library, data = read_referred(path.parent, name, path, MAX_LIBRARY)
+        except CatalogError:
+            # Refused again if the name leads out of the folder; otherwise a library that was not shipped.
+            if os.path.lexists(path_inside(path.parent, name, path, CatalogError)):
+                raise
+            notes.said.append(f"there is no material library {ascii(name)[:80]}, the default material is used")
+            continue
+        known |= parse_library(decode_text(data), library)
+        if len(known) > MAX_PARTS:
+            raise CatalogError(f"{path}: its material libraries have more than {MAX_PARTS} materials; merge them")
+    return known

@@ -1,0 +1,294 @@
+"""glTF import: accessors, materials, texture coordinates, nodes, containers, and extensions that are not implemented."""
+
+from __future__ import annotations
+
+import base64
+import io
+import json
+import struct
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from synpick_warp.errors import CatalogError
+from synpick_warp.scenes.assets.appearance import linear_to_srgb, srgb_to_linear
+from synpick_warp.scenes.assets.meshes import read_mesh
+
+CORNERS = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], np.float32)
+FACES = np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]], np.uint16)
+UV = np.array([[0, 0], [1, 0], [0, 1], [1, 1]], np.float32)
+KINDS = {"i1": 5120, "u1": 5121, "i2": 5122, "u2": 5123, "u4": 5125, "f4": 5126}
+SHAPES = {1: "SCALAR", 2: "VEC2", 3: "VEC3", 4: "VEC4"}
+
+
+class Builder:
+    """A glTF document of one tetrahedron, and its binary chunk."""
+
+    def __init__(self, **material: Any) -> None:
+        self.binary = b""
+        self.content: dict[str, Any] = {"asset": {"version": "2.0"}, "scene": 0, "scenes": [{"nodes": [0]}], "nodes": [{"mesh": 0}]}
+        self.content |= {"bufferViews": [], "accessors": []}
+        self.primitive: dict[str, Any] = {"attributes": {}, "indices": self.add(FACES.reshape(-1, 1))}
+        self.content["meshes"] = [{"primitives": [self.primitive]}]
+        self.attribute("POSITION", CORNERS)
+        if material:
+            self.content["materials"] = [material]
+            self.primitive["material"] = 0
+
+    def view(self, data: bytes, **more: Any) -> int:
+        self.content["bufferViews"].append({"buffer": 0, "byteOffset": len(self.binary), "byteLength": len(data), **more})
+        self.binary += data + bytes(-len(data) % 4)
+        return len(self.content["bufferViews"]) - 1
+
+    def add(self, rows: np.ndarray, *, stride: int = 0, **more: Any) -> int:
+        """Add an accessor, each row in `stride` bytes."""
+        data = rows.tobytes()
+        if stride:
+            data = b"".join(row.tobytes().ljust(stride, b"\xaa") for row in rows)
+            more["bufferView"] = self.view(data, byteStride=stride)
+        kind = {"componentType": KINDS[rows.dtype.str[1:]], "count": len(rows), "type": SHAPES[rows.shape[1]]}
+        self.content["accessors"].append(kind | ({} if "bufferView" in more else {"bufferView": self.view(data)}) | more)
+        return len(self.content["accessors"]) - 1
+
+    def attribute(self, name: str, rows: np.ndarray, **more: Any) -> Builder:
+        self.primitive["attributes"][name] = self.add(rows, **more)
+        return self
+
+    def image(self) -> Builder:
+        """A texture of four colours."""
+        file = io.BytesIO()
+        Image.fromarray(np.array([[[255, 0, 0], [0, 255, 0]], [[0, 0, 255], [200, 100, 50]]], np.uint8)).save(file, "png")
+        self.content |= {"images": [{"bufferView": self.view(file.getvalue()), "mimeType": "image/png"}], "textures": [{"source": 0}]}
+        return self
+
+    def glb(self) -> bytes:
+        text = json.dumps(self.content | {"buffers": [{"byteLength": len(self.binary)}]}).encode()
+        text += b" " * (-len(text) % 4)
+        chunks = struct.pack("<I4s", len(text), b"JSON") + text + struct.pack("<I4s", len(self.binary), b"BIN\0") + self.binary
+        return struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks
+
+    def read(self, folder: Path) -> tuple[Any, Any, list[str]]:
+        (folder / "a.glb").write_bytes(self.glb())
+        said: list[str] = []
+        return *read_mesh(folder / "a.glb", 1.0, report=said.append), said
+
+
+def pbr(**more: Any) -> dict[str, Any]:
+    return {"pbrMetallicRoughness": more}
+
+
+TEXTURE = {"baseColorTexture": {"index": 0}}
+
+
+def at_corners(mesh: Any, values: np.ndarray) -> np.ndarray:
+    """Values (V, N) of the first vertex at each corner of the tetrahedron."""
+    return np.stack([values[np.flatnonzero(np.abs(mesh.vertices - corner).max(axis=1) < 1e-4)[0]] for corner in CORNERS])
+
+
+# ---- colours ----
+
+LINEAR = np.array([60000, 20000, 3000]) / 65535
+
+
+@pytest.mark.parametrize("kind", ["f4", "u1", "u2"])
+@pytest.mark.parametrize("alpha", [False, True])
+@pytest.mark.parametrize("material", [{}, pbr(baseColorFactor=[0.5, 0.25, 1.0, 1.0])])
+def test_vertex_colours_are_linear_and_multiply_the_factor(tmp_path, kind, alpha, material):
+    largest = 1.0 if kind == "f4" else np.iinfo(kind).max
+    rows = np.tile([*LINEAR, *((1.0,) if alpha else ())], (4, 1)) * largest
+    rows = (rows if kind == "f4" else np.rint(rows)).astype(kind)
+    # Rows of an attribute begin at multiples of four bytes.
+    stride = -(-rows.shape[1] * rows.itemsize // 4) * 4
+    _, finish, _ = Builder(**material).attribute("COLOR_0", rows, stride=stride, normalized=kind != "f4").read(tmp_path)
+    expected = linear_to_srgb(LINEAR * ((0.5, 0.25, 1.0) if material else 1.0))
+    assert finish.texture is None
+    assert finish.color == pytest.approx(expected, abs=0.004 if kind != "u1" else 0.02)
+
+
+def test_vertex_colours_multiply_the_texture(tmp_path):
+    colors = np.array([[1, 1, 1], [0.5, 0.5, 0.5], [1, 0, 1], [0.2, 0.4, 0.6]], np.float32)
+    builder = Builder(**pbr(**TEXTURE)).image().attribute("COLOR_0", colors)
+    # In the middles of the four texels.
+    mesh, finish, _ = builder.attribute("TEXCOORD_0", 0.25 + 0.5 * UV).read(tmp_path)
+    height, width = finish.texture.shape[:2]
+    uv = at_corners(mesh, mesh.uv)
+    texel = finish.texture[((1.0 - uv[:, 1]) * height).astype(int), (uv[:, 0] * width).astype(int)]
+    skin = srgb_to_linear(np.array([[255, 0, 0], [0, 255, 0], [0, 0, 255], [200, 100, 50]]) / 255)
+    assert np.abs(texel - 255 * linear_to_srgb(skin * colors)).max() <= 1.0
+    assert finish.color == (1.0, 1.0, 1.0)
+
+
+def test_a_factor_beyond_one_is_cut_and_told(tmp_path):
+    _, finish, said = Builder(**pbr(baseColorFactor=[1.5, 0.5, 0.5, 1.0])).read(tmp_path)
+    assert finish.color == pytest.approx(linear_to_srgb([1.0, 0.5, 0.5]))
+    assert said == [f"{tmp_path / 'a.glb'}: baseColorFactor 1.5 0.5 0.5 is cut to 0..1"]
+
+
+# ---- texture coordinates ----
+
+
+@pytest.mark.parametrize("kind", ["f4", "u1", "u2"])
+@pytest.mark.parametrize("coordinates", [0, 1])
+def test_texture_coordinates_of_any_type_and_set(tmp_path, kind, coordinates):
+    rows = UV if kind == "f4" else (UV * np.iinfo(kind).max).astype(kind)
+    builder = Builder(**pbr(baseColorTexture={"index": 0, "texCoord": coordinates})).image()
+    builder.attribute("TEXCOORD_0", np.full((4, 2), 0.3, np.float32))
+    mesh, _, _ = builder.attribute(f"TEXCOORD_{coordinates}", rows, stride=4 if kind == "u1" else 0, normalized=kind != "f4").read(tmp_path)
+    assert at_corners(mesh, mesh.uv) == pytest.approx(np.column_stack([UV[:, 0], 1.0 - UV[:, 1]]), abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("transform", "expected"),
+    [
+        ({"scale": [0.25, 0.5]}, UV * (0.25, 0.5)),
+        ({"offset": [0.25, 0.5]}, np.add(UV, (0.25, 0.5))),
+        # By 90 degrees, u runs up the image, against v.
+        ({"rotation": np.pi / 2}, np.column_stack([UV[:, 1], -UV[:, 0]])),
+        ({"rotation": np.pi / 2, "scale": [2, 3], "offset": [0.5, 0]}, np.column_stack([3 * UV[:, 1] + 0.5, -2 * UV[:, 0]])),
+        ({"texCoord": 1}, 0.5 * UV),
+    ],
+)
+def test_texture_transforms(tmp_path, transform, expected):
+    info = {"index": 0, "extensions": {"KHR_texture_transform": transform}}
+    builder = Builder(**pbr(baseColorTexture=info)).image().attribute("TEXCOORD_0", UV).attribute("TEXCOORD_1", 0.5 * UV)
+    builder.content |= {"extensionsUsed": ["KHR_texture_transform"], "extensionsRequired": ["KHR_texture_transform"]}
+    mesh, _, said = builder.read(tmp_path)
+    assert at_corners(mesh, mesh.uv) == pytest.approx(np.column_stack([expected[:, 0], 1.0 - expected[:, 1]]), abs=1e-6)
+    assert not said
+
+
+def test_a_mirrored_texture_repeats_mirrored(tmp_path):
+    builder = Builder(**pbr(**TEXTURE)).image().attribute("TEXCOORD_0", 2.0 * UV)
+    builder.content["samplers"] = [{"wrapS": 33648, "wrapT": 33648}]
+    builder.content["textures"][0]["sampler"] = 0
+    mesh, finish, _ = builder.read(tmp_path)
+    assert at_corners(mesh, mesh.uv) == pytest.approx(np.column_stack([UV[:, 0], 0.5 - UV[:, 1]]))
+    rows = np.array([[255, 0], [0, 200]])
+    mirrored = np.block([[rows[::-1], rows[::-1, ::-1]], [rows, rows[:, ::-1]]])
+    assert np.array_equal(finish.texture[..., 0], mirrored)
+
+
+# ---- geometry ----
+
+
+@pytest.mark.parametrize(("kind", "normalized"), [("i2", True), ("i1", True), ("u2", True), ("i2", False), ("u1", False)])
+def test_quantized_positions_and_normals(tmp_path, kind, normalized):
+    largest = np.iinfo(kind).max if normalized else 100
+    builder = Builder()
+    builder.content |= {"extensionsUsed": ["KHR_mesh_quantization"], "extensionsRequired": ["KHR_mesh_quantization"]}
+    builder.content["nodes"] = [{"mesh": 0, "scale": [0.1] * 3 if normalized else [0.001] * 3}]
+    builder.attribute("POSITION", (CORNERS * largest).astype(kind), stride=8 if "2" in kind else 4, normalized=normalized)
+    normals = np.array([[0, 0, 1], [1, 0, 0], [0, 1, 0], [0, 0, -1]])
+    mesh, _, said = builder.attribute("NORMAL", (127 * normals).astype("i1"), stride=4, normalized=True).read(tmp_path)
+    assert mesh.vertices == pytest.approx(0.1 * CORNERS, abs=1e-6)
+    assert mesh.normals == pytest.approx(normals)
+    assert not said
+
+
+def test_sparse_values_replace_others_or_zeros(tmp_path):
+    for base in (True, False):
+        builder = Builder()
+        sparse = {"count": 2, "indices": {"bufferView": builder.view(np.array([1, 3], "u1").tobytes()), "componentType": 5121}}
+        sparse["values"] = {"bufferView": builder.view(np.array([[5, 0, 0], [0, 0, 7]], "f4").tobytes())}
+        accessor = builder.content["accessors"][builder.primitive["attributes"]["POSITION"]]
+        accessor["sparse"] = sparse
+        if not base:
+            del accessor["bufferView"]
+            builder.primitive["indices"] = builder.add(np.array([[0], [1], [3]], "u1"))
+        mesh, _, _ = builder.read(tmp_path)
+        assert mesh.vertices.max(axis=0) == pytest.approx((5, 1 if base else 0, 7))
+
+
+@pytest.mark.parametrize(("mode", "corners"), [(4, [0, 1, 2, 2, 1, 3]), (5, [0, 1, 2, 3]), (6, [1, 3, 2, 0])])
+def test_lists_strips_and_fans_of_triangles(tmp_path, mode, corners):
+    builder = Builder()
+    builder.primitive |= {"mode": mode, "indices": builder.add(np.array(corners, "u1")[:, None])}
+    mesh, _, _ = builder.read(tmp_path)
+    faces = [[int(np.argwhere((mesh.vertices[index] == CORNERS).all(axis=1))[0, 0]) for index in face] for face in mesh.faces]
+    assert {tuple(sorted(face)) for face in faces} == {(0, 1, 2), (1, 2, 3)}
+    # Neighbours that face the same side run along their common edge in opposite directions.
+    edges = [(face[corner], face[corner - 1]) for face in faces for corner in range(3)]
+    assert len(set(edges)) == len(edges)
+
+
+def test_transforms_of_nodes_are_chained(tmp_path):
+    builder = Builder()
+    half = np.sqrt(0.5)
+    builder.content["nodes"] = [
+        {"children": [1], "translation": [1, 2, 3], "scale": [2, 2, 2]},
+        {"mesh": 0, "rotation": [0, 0, half, half]},
+        {"mesh": 0, "name": "not in the scene"},
+    ]
+    mesh, _, _ = builder.read(tmp_path)
+    turned = np.column_stack([-CORNERS[:, 1], CORNERS[:, 0], CORNERS[:, 2]])
+    assert mesh.vertices[:4] == pytest.approx(2 * turned + (1, 2, 3), abs=1e-6)
+
+
+def test_parts_have_one_order(tmp_path):
+    builder = Builder()
+    first = builder.primitive["attributes"]["POSITION"]
+    parts = [first, *(builder.add(CORNERS * 0.1 + part) for part in range(1, 6))]
+    builder.content["meshes"] = [{"primitives": [{"attributes": {"POSITION": part}, "indices": 0} for part in parts]}]
+    orders = {builder.read(tmp_path)[0].vertices.tobytes() for _ in range(8)}
+    assert len(orders) == 1
+
+
+# ---- containers and extensions ----
+
+
+@pytest.mark.parametrize("uri", ["file", "data", "percent"])
+def test_gltf_files_with_buffers_outside_and_inside(tmp_path, uri):
+    builder = Builder(**pbr(**TEXTURE)).image().attribute("TEXCOORD_0", UV)
+    name = {"file": "the buffer.bin", "percent": "the%20buffer.bin", "data": ""}[uri]
+    (tmp_path / "the buffer.bin").write_bytes(builder.binary)
+    where = name or "data:application/octet-stream;base64," + base64.b64encode(builder.binary).decode()
+    content = builder.content | {"buffers": [{"byteLength": len(builder.binary), "uri": where}]}
+    (tmp_path / "a.gltf").write_text(json.dumps(content), encoding="utf-8-sig" if uri == "data" else "utf-8")
+    mesh, finish = read_mesh(tmp_path / "a.gltf", 1.0)
+    expected, skin, _ = builder.read(tmp_path)
+    assert np.array_equal(mesh.vertices, expected.vertices)
+    assert finish.texture is not None
+    assert np.array_equal(finish.texture, skin.texture)
+
+
+@pytest.mark.parametrize(
+    ("extension", "advice"),
+    [
+        ("KHR_draco_mesh_compression", "export it without compression"),
+        ("EXT_meshopt_compression", "export it without compression"),
+        ("KHR_texture_basisu", "textures as PNG or JPEG"),
+        ("VENDOR_thing", "export it without it"),
+    ],
+)
+def test_required_extensions_that_are_not_implemented_are_named(tmp_path, extension, advice):
+    builder = Builder()
+    builder.content |= {"extensionsUsed": [extension], "extensionsRequired": [extension]}
+    with pytest.raises(CatalogError, match=rf"requires the extension {extension}, which is not implemented; .*{advice}"):
+        builder.read(tmp_path)
+
+
+def test_what_is_ignored_is_one_line(tmp_path):
+    builder = Builder(normalTexture={"index": 0}, alphaMode="BLEND", emissiveFactor=[1, 0, 0])
+    builder.content |= {"extensionsUsed": ["KHR_materials_clearcoat"], "extensionsRequired": ["KHR_materials_clearcoat"]}
+    builder.content["animations"] = [{}]
+    _, finish, said = builder.read(tmp_path)
+    assert said == [f"{tmp_path / 'a.glb'}: ignored: KHR_materials_clearcoat, animations, normalTexture, emission, transparency"]
+    assert (finish.metallic, finish.roughness) == (1.0, 1.0)
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"asset": {"version": "1.0"}, "accessors": {}}, "glTF 1.0"),
+        ({"scene": 7}, "refers to scene 7"),
+        ({"nodes": [{"mesh": 0, "rotation": [0, 0, 0, 0]}]}, "not readable as GLB"),
+    ],
+)
+def test_documents_that_cannot_be_read_are_one_line(tmp_path, change, said):
+    builder = Builder()
+    builder.content |= change
+    with pytest.raises(CatalogError, match=said):
+        builder.read(tmp_path)
