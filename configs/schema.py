@@ -31,6 +31,10 @@ CLASSIC = "classic"
 MULTISENSOR = "multisensor"
 LAYOUTS = (CLASSIC, MULTISENSOR)
 """Layouts of scene folders: BOP's classic one, and that of BOP-Industrial 2025."""
+EXCEED = "exceed"
+WITHIN = "within"
+FILLS = (EXCEED, WITHIN)
+"""Rules that end the draw of an episode's objects at the volume budget."""
 FORMATS = ("bop", "shards", "usd", "zarr", "lerobot", "coco")
 """Output formats."""
 
@@ -171,8 +175,15 @@ class Arrangement:
     volume: float = setting(
         7e-3,
         "m³",
-        "Volume budget: objects are drawn while the total volume of their collision shapes stays within it (paper: 7 l).",
+        "Budget for the total volume of the collision shapes of an episode's objects (paper: 7 l); fill says how it ends the draw.",
         above=0.0,
+    )
+    fill: str = setting(
+        EXCEED,
+        "",
+        "How the budget ends the draw: exceed (the object that reaches or exceeds it is the last; the paper's tables, released) or within "
+        "(that object is left out). An object that alone is larger is never drawn.",
+        choices=FILLS,
     )
     max_objects: int = setting(24, "", "Maximum objects of an episode.", low=1, high=32)
     slot_shortfall: float = setting(

@@ -128,10 +128,11 @@ def sample_objects_kernel(
     catalog_index_out: wp.array2d[int],  # (world, instance)
     body_slot_out: wp.array2d[int],  # (world, instance)
 ):
-    """Sample objects uniformly until the next one would exceed the volume budget V: Σ volume ≤ V.
+    """Sample objects uniformly up to a volume budget V: with `exceed` until Σ volume ≥ V, else while Σ volume ≤ V.
 
-    The first object is resampled until one fits. `catalog_index` receives the objects (-1: none), `body_slot` the next free slot of
-    their class, single or compound; if a class runs out of slots, the episode ends with ARRANGEMENT_OVERFLOW.
+    An object larger than V is resampled; without `exceed`, after the first object, it ends the draw as any other that does not fit.
+    `catalog_index` receives the objects (-1: none), `body_slot` the next free slot of their class, single or compound; if a class runs
+    out of slots, the episode ends with ARRANGEMENT_OVERFLOW.
     """
     world = wp.tid()
     phase = phase_inout[world]
@@ -153,7 +154,9 @@ def sample_objects_kernel(
             candidate = uniform_index(key, sample, catalog.count)
             repeated = repeats == 0 and is_sampled(catalog_index_out, world, count, candidate)
             fits = total + catalog.volume[candidate] <= drop.volume
-            if not repeated and not fits and count > 0:
+            if drop.exceed == 1:
+                fits = catalog.volume[candidate] <= drop.volume
+            elif not repeated and not fits and count > 0:
                 open = False
             if not repeated and fits:
                 slot = singles
@@ -167,6 +170,8 @@ def sample_objects_kernel(
                 body_slot_out[world, count] = slot
                 total += catalog.volume[candidate]
                 count += 1
+            if drop.exceed == 1 and total >= drop.volume:
+                open = False
             if overflow or count == layout.instances or (repeats == 0 and count == catalog.count):
                 open = False
     if overflow:
