@@ -354,6 +354,16 @@ class Converters(Exporters):
             converter.convert(episode, count_down)
 
 
+def check_trajectories(names: Sequence[str], source: Source) -> None:
+    """Check that the source has the trajectories that formats are made of.
+
+    Raises:
+        DatasetError: There are none, or an attribute or array is missing or damaged.
+    """
+    if {"usd", "lerobot"} & set(names):
+        source.check_trajectories(gripper="lerobot" in names)
+
+
 def check_formats(names: Sequence[str], config: Config, folder: Path) -> None:
     """Check that a data set can be converted to these formats.
 

@@ -101,7 +101,8 @@ def describe_tasks(
             of_frame[begin : attempt["end_frame"]] = f"{verb} the {speak(name)} out of the tote"
         begin = attempt["end_frame"]
     # The frame in which the last attempt was judged belongs to no attempt.
-    of_frame[begin:] = of_frame[max(0, begin - 1)]
+    if 0 < begin < frames:
+        of_frame[begin:] = of_frame[begin - 1]
     sentences = list(dict.fromkeys(of_frame.tolist()))
     return sentences, np.array([sentences.index(sentence) for sentence in of_frame], np.int32)
 
