@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import math
 import re
 from collections import Counter
 from collections.abc import Iterator
 
 from synpick_warp.configs.check import format_value
-from synpick_warp.configs.fields import INT32_MAX
 from synpick_warp.configs.modes import bake_modes
 from synpick_warp.configs.schema import FORMATS, MIXED, Config
 from synpick_warp.configs.splits import MAX_SHARD_SCENES, scenes_end
@@ -73,16 +73,14 @@ def _cameras(config: Config) -> Iterator[Conflict]:
             yield "cameras.positions", f"positions other than cameras.target, the position of camera {index}"
         elif math.hypot(*_cross(forward, up)) <= _PARALLEL * math.hypot(*forward) * math.hypot(*up):
             yield "cameras.ups", f"up vectors that are not zero or parallel to the viewing direction, as that of camera {index} is"
+        elif position[2] <= 0.0:
+            yield "cameras.positions", f"positions above the tote's floor, z > 0, below which camera {index} sees no object [m]"
+        elif not _sees_tote(config, position):
+            yield "cameras.target", f"a point that lets each camera see the tote, which lies outside of the images of camera {index} [m]"
 
 
 def _times(config: Config) -> Iterator[Conflict]:
-    settle, step = config.settle, config.physics.step
-    tick = config.physics.steps_per_tick * step
-    counted = [(f"settle.{name}", tick) for name in ("min_time", "max_time", "relax_time", "stuck_time")]
-    for key, unit in [*counted, ("pick.press_time", step)]:
-        section, _, name = key.partition(".")
-        if getattr(getattr(config, section), name) > INT32_MAX * unit:
-            yield key, f"at most {INT32_MAX * unit:g}, {INT32_MAX:,} {'steps' if unit == step else 'ticks'} of physics.step [s]"
+    settle = config.settle
     rest = settle.rest_ticks * config.physics.steps_per_tick * config.physics.step
     if settle.max_time < settle.min_time:
         yield "settle.max_time", f"at least settle.min_time, {settle.min_time:g} [s]"
@@ -122,11 +120,52 @@ def _sensors(config: Config) -> Iterator[Conflict]:
             value = getattr(getattr(config, section), item.name)
             if isinstance(value, tuple) and value[0] > value[1]:
                 yield f"{section}.{item.name}", f"minimum and maximum in this order: {format_value([value[1], value[0]])}"
+    yield from _depth_sensor(config)
     low, high = config.effects.jpeg_quality
     if high and not low:
         yield "effects.jpeg_quality", f"from 1 to 100, or 0, 0: {format_value([1, high])}"
     if high and config.bop.color_format != "jpg":
         yield "effects.jpeg_quality", f"0, 0 with bop.color_format {config.bop.color_format}"
+
+
+def _depth_sensor(config: Config) -> Iterator[Conflict]:
+    """With the layer depth_sensor: the tote must lie within what the sensor measures, and its disparity be more than a step."""
+    if "depth_sensor" not in config.render.layers:
+        return
+    sensor, (width, _) = config.depth_sensor, config.cameras.resolution
+    focal = width / 2 / math.tan(math.radians(config.cameras.fov) / 2)
+    for index, position in enumerate(config.cameras.positions):
+        depths = _tote_depths(config, position)
+        near, far = max(0.0, min(depths)), max(depths)
+        if sensor.distances[1] < near or sensor.distances[0] > far:
+            yield "depth_sensor.distances", f"a range that reaches the tote, {near:.3g} to {far:.3g} m from camera {index} [m]"
+        if focal * sensor.baseline < sensor.disparity_step * far:
+            least = sensor.disparity_step * far / focal
+            yield "depth_sensor.baseline", f"at least {least:.3g}, so that the disparity of the tote is a disparity_step or more [m]"
+
+
+def _tote_depths(config: Config, position: tuple[float, ...]) -> list[float]:
+    """Planar depths of the corners of the tote's outer box in the image of a camera at `position`, which looks at cameras.target [m]."""
+    length, width, height = config.tote.outer_size
+    forward = [b - a for a, b in zip(position, config.cameras.target, strict=True)]
+    size = math.hypot(*forward) or 1.0
+    corners = itertools.product((-length / 2, length / 2), (-width / 2, width / 2), (-config.tote.wall, height - config.tote.wall))
+    return [sum((c - a) * f for a, c, f in zip(position, corner, forward, strict=True)) / size for corner in corners]
+
+
+def _sees_tote(config: Config, position: tuple[float, ...]) -> bool:
+    """Whether the tote's bounding sphere meets the cone around a camera's view, which is wider than its image."""
+    length, width, height = config.tote.outer_size
+    center = (0.0, 0.0, height / 2 - config.tote.wall)
+    forward = [b - a for a, b in zip(position, config.cameras.target, strict=True)]
+    away, radius = [b - a for a, b in zip(position, center, strict=True)], math.hypot(length, width, height) / 2
+    distance = math.hypot(*away)
+    if distance <= radius:
+        return True
+    cosine = sum(a * b for a, b in zip(forward, away, strict=True)) / (math.hypot(*forward) * distance)
+    columns, rows = config.cameras.resolution
+    cone = math.atan(math.tan(math.radians(config.cameras.fov) / 2) * math.hypot(1.0, rows / columns))
+    return math.acos(max(-1.0, min(1.0, cosine))) <= cone + math.asin(radius / distance)
 
 
 def _bop(config: Config) -> Iterator[Conflict]:
@@ -144,9 +183,9 @@ def _bop(config: Config) -> Iterator[Conflict]:
         long = next((split.name for split in config.splits if split.first + split.episodes > most), "")
         key = f"splits.{long}.episodes" if long else "bake.episodes"
         yield key, f"episode indices below {most} with the format shards, whose names hold no more scenes"
-    far = max((math.dist(position, (0.0, 0.0, 0.0)) for position in config.cameras.positions), default=0.0)
+    far = max((depth for position in config.cameras.positions for depth in _tote_depths(config, position)), default=0.0)
     if bop.depth_scale * 1e-3 * DEPTH_COUNTS < far:
-        yield "bop.depth_scale", f"at least {far * 1e3 / DEPTH_COUNTS:.3g}, so that 16 bits reach the tote from {far:.3g} m [mm]"
+        yield "bop.depth_scale", f"at least {far * 1e3 / DEPTH_COUNTS:.3g}, so that 16 bits reach the tote at {far:.3g} m [mm]"
 
 
 def _object_rows(config: Config) -> Iterator[Conflict]:

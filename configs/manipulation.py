@@ -11,20 +11,23 @@ from synpick_warp.configs.fields import INT32_MAX, setting
 class Move:
     """Mode move: the gripper, with locked wrist, visits the corners of the tote and stirs the pile."""
 
-    stiffness: float = setting(1000.0, "N/m", "Stiffness of the impedance controller (paper).", above=0.0)
+    stiffness: float = setting(1000.0, "N/m", "Stiffness of the impedance controller (paper).", above=0.0, high=1e6)
     damping: float = setting(
         60.0,
         "N·s/m",
         "Damping of the impedance controller; the paper names none, and with the released value of 1 objects penetrate each other by 7 mm.",
         low=0.0,
+        high=1e5,
     )
-    force: float = setting(30.0, "N", "Force limit of the impedance controller (paper).", above=0.0)
-    speed: float = setting(0.1, "m/s", "Speed of the setpoint (paper).", above=0.0)
+    force: float = setting(30.0, "N", "Force limit of the impedance controller (paper).", above=0.0, high=1e5)
+    speed: float = setting(0.1, "m/s", "Speed of the setpoint (paper).", low=1e-3, high=100.0)
     corner: float = setting(
         0.75, "", "Position of the visited corners, as a fraction of half the inner floor's size (released).", above=0.0, high=1.0
     )
-    height: float = setting(0.02, "m", "Height of the TCP above the floor at a corner (released).", low=0.0)
-    start_height: float = setting(0.35, "m", "Height of the TCP above the floor in the first frame, over the first corner.", above=0.0)
+    height: float = setting(0.02, "m", "Height of the TCP above the floor at a corner (released).", low=0.0, high=10.0)
+    start_height: float = setting(
+        0.35, "m", "Height of the TCP above the floor in the first frame, over the first corner.", above=0.0, high=10.0
+    )
     rounds: int = setting(
         2, "", "Rounds over all four corners (released: eight corners, drawn with replacement).", low=1, high=INT32_MAX // 4
     )
@@ -35,22 +38,26 @@ class Move:
 class Pick:
     """Modes pick and target: look, approach, grasp, lift, until the tote is empty or too many attempts have failed."""
 
-    stiffness: float = setting(2500.0, "N/m", "Stiffness of the impedance controller (paper).", above=0.0)
-    damping: float = setting(200.0, "N·s/m", "Damping of the impedance controller (paper).", low=0.0)
-    force: float = setting(200.0, "N", "Force limit of the impedance controller (paper).", above=0.0)
-    appear_height: float = setting(1.0, "m", "Height above the grasp point at which the gripper appears (released).", above=0.0)
-    speed: float = setting(1.0, "m/s", "Speed of the setpoint in the approach (released).", above=0.0)
+    stiffness: float = setting(2500.0, "N/m", "Stiffness of the impedance controller (paper).", above=0.0, high=1e6)
+    damping: float = setting(200.0, "N·s/m", "Damping of the impedance controller (paper).", low=0.0, high=1e5)
+    force: float = setting(200.0, "N", "Force limit of the impedance controller (paper).", above=0.0, high=1e5)
+    appear_height: float = setting(1.0, "m", "Height above the grasp point at which the gripper appears (released).", above=0.0, high=10.0)
+    speed: float = setting(1.0, "m/s", "Speed of the setpoint in the approach (released).", low=1e-3, high=100.0)
     near: float = setting(
-        0.05, "m", "Distance to the grasp point below which the setpoint is slow and moves along the surface normal (released).", low=0.0
+        0.05,
+        "m",
+        "Distance to the grasp point below which the setpoint is slow and moves along the surface normal (released).",
+        low=0.0,
+        high=10.0,
     )
-    near_speed: float = setting(0.1, "m/s", "Speed of the setpoint within that distance (released).", above=0.0)
+    near_speed: float = setting(0.1, "m/s", "Speed of the setpoint within that distance (released).", low=1e-3, high=100.0)
     press_time: float = setting(
-        0.1, "s", "Time for which the setpoint rests at the grasp point, so that the cup, which lags, makes contact.", low=0.0
+        0.1, "s", "Time for which the setpoint rests at the grasp point, so that the cup, which lags, makes contact.", low=0.0, high=60.0
     )
-    lift_height: float = setting(1.0, "m", "Height by which the setpoint is lifted (released).", above=0.0)
-    lift_speed: float = setting(0.5, "m/s", "Speed of the setpoint while lifting (released).", above=0.0)
+    lift_height: float = setting(1.0, "m", "Height by which the setpoint is lifted (released).", above=0.0, high=10.0)
+    lift_speed: float = setting(0.5, "m/s", "Speed of the setpoint while lifting (released).", low=1e-3, high=100.0)
     failures: int = setting(3, "", "Failed attempts that end the episode (paper: 3; released: 4).", low=1, high=INT32_MAX)
-    floor: float = setting(-0.1, "m", "Objects below this height are removed from the scene (released).", high=0.0)
+    floor: float = setting(-0.1, "m", "Objects below this height are removed from the scene (released).", low=-10.0, high=0.0)
     repeats: bool = setting(False, "", "Whether an episode may contain several instances of an object (paper: no).")
 
 
@@ -86,22 +93,24 @@ class Perception:
         "",
         "Centroid, or midpoint to the pole of inaccessibility, is used if its distance to the contour exceeds this fraction of the pole's.",
         low=0.0,
+        high=10.0,
     )
-    heavy_mass: float = setting(0.8, "kg", "Mass above which objects are grasped nearer to their centroid.", low=0.0)
-    heavy_center_fraction: float = setting(0.4, "", "Same as center_fraction, for heavy objects.", low=0.0)
+    heavy_mass: float = setting(0.8, "kg", "Mass above which objects are grasped nearer to their centroid.", low=0.0, high=1e6)
+    heavy_center_fraction: float = setting(0.4, "", "Same as center_fraction, for heavy objects.", low=0.0, high=10.0)
     contour_offset: float = setting(
-        3.0, "px", "Distance from the contour, inside and outside, at which the depths of neighbours are compared.", above=0.0
+        3.0, "px", "Distance from the contour, inside and outside, at which the depths of neighbours are compared.", above=0.0, high=256.0
     )
     deep_distance: float = setting(
-        0.02, "m", "A neighbour lower than the suction point by more than this casts down-weighted occlusion votes.", low=0.0
+        0.02, "m", "A neighbour lower than the suction point by more than this casts down-weighted occlusion votes.", low=0.0, high=10.0
     )
     deep_weight: float = setting(0.1, "", "Weight of those votes.", low=0.0, high=1.0)
-    min_votes: float = setting(5.0, "", "Minimum occlusion votes for an edge of the clutter graph.", above=0.0)
+    min_votes: float = setting(5.0, "", "Minimum occlusion votes for an edge of the clutter graph.", above=0.0, high=1e6)
     reach: float = setting(
         1.2,
         "",
         "A neighbour casts no vote if its contour extends farther from the compared pixel than this many bounding box diagonals.",
         above=0.0,
+        high=1e3,
     )
     exact_cycle: int = setting(
         10,
@@ -120,8 +129,8 @@ class Suction:
     """The suction cup: seal test by rays, and the compliant constraint (spring-damper) that holds attached objects."""
 
     rays: int = setting(10, "", "Rays of the seal test, on a circle at the cup's lip (paper).", low=3, high=64)
-    radius: float = setting(0.01, "m", "Radius of that circle (released).", above=0.0)
-    reach: float = setting(0.03, "m", "Length of the rays (paper).", above=0.0)
+    radius: float = setting(0.01, "m", "Radius of that circle (released).", above=0.0, high=0.25)
+    reach: float = setting(0.03, "m", "Length of the rays (paper).", above=0.0, high=1.0)
     surface: str = setting(
         "hull",
         "",
@@ -129,16 +138,19 @@ class Suction:
         choices=("hull", "mesh"),
     )
     tolerated_misses: int = setting(0, "", "Maximum rays that may miss for a good seal (paper: 0; released: 2).", low=0, high=INT32_MAX)
-    good_force: float = setting(40.0, "N", "Break force of a good seal (paper).", above=0.0)
-    poor_force: float = setting(2.0, "N", "Break force of any other seal (paper: 2; released: 0.2).", above=0.0)
-    stiffness: float = setting(2e4, "N/m", "Linear stiffness of a seal; 40 N stretch it by 2 mm, within the paper's 5 mm.", above=0.0)
-    damping: float = setting(100.0, "N·s/m", "Linear damping of a seal.", low=0.0)
-    twist_stiffness: float = setting(50.0, "N·m/rad", "Torsional stiffness about the cup's axis.", low=0.0)
-    twist_damping: float = setting(0.1, "N·m·s/rad", "Angular damping of twist and swing.", low=0.0)
+    good_force: float = setting(40.0, "N", "Break force of a good seal (paper).", above=0.0, high=1e5)
+    poor_force: float = setting(2.0, "N", "Break force of any other seal (paper: 2; released: 0.2).", above=0.0, high=1e5)
+    stiffness: float = setting(
+        2e4, "N/m", "Linear stiffness of a seal; 40 N stretch it by 2 mm, within the paper's 5 mm.", above=0.0, high=1e6
+    )
+    damping: float = setting(100.0, "N·s/m", "Linear damping of a seal.", low=0.0, high=1e5)
+    twist_stiffness: float = setting(50.0, "N·m/rad", "Torsional stiffness about the cup's axis.", low=0.0, high=1e6)
+    twist_damping: float = setting(0.1, "N·m·s/rad", "Angular damping of twist and swing.", low=0.0, high=1e5)
     swing_limit: float = setting(5.0, "°", "Angle by which an attached object may swing freely (released).", low=0.0, high=90.0)
     swing_stiffness: float = setting(
         50.0,
         "N·m/rad",
         "Stiffness against swing beyond that angle; with 10, an object of 1.1 kg that hangs by its end swings by 18°.",
         low=0.0,
+        high=1e6,
     )

@@ -31,6 +31,10 @@ CLASSIC = "classic"
 MULTISENSOR = "multisensor"
 LAYOUTS = (CLASSIC, MULTISENSOR)
 """Layouts of scene folders: BOP's classic one, and that of BOP-Industrial 2025."""
+EXCEED = "exceed"
+WITHIN = "within"
+FILLS = (EXCEED, WITHIN)
+"""Rules that end the draw of an episode's objects at the volume budget."""
 FORMATS = ("bop", "shards", "usd", "zarr", "lerobot", "coco")
 """Output formats."""
 
@@ -95,7 +99,7 @@ class Objects:
     strict: bool = setting(
         False, "", "End the bake at the first object or light map that cannot be used, instead of leaving it out with a line."
     )
-    density: float = setting(400.0, "kg/m³", "Density over the volume of the convex hull, for objects without a mass.", above=0.0)
+    density: float = setting(400.0, "kg/m³", "Density over the volume of the convex hull, for objects without a mass.", above=0.0, high=1e5)
     metallic: float = setting(0.1, "", "Metallic factor of objects whose material names none.", low=0.0, high=1.0)
     roughness: float = setting(0.5, "", "Roughness of objects whose material names none.", low=0.0, high=1.0)
     crease_angle: float = setting(
@@ -138,10 +142,10 @@ class ObjectRow:
 class Tote:
     """The tote (an open box). Its frame is the world frame: origin at the centre of the inner floor, z up. Sizes of the released mesh."""
 
-    outer_size: tuple[float, float, float] = setting((0.615, 0.373, 0.200), "m", "Outer length, width and height.", above=0.0)
-    floor_size: tuple[float, float] = setting((0.513, 0.319), "m", "Length and width of the inner floor.", above=0.0)
-    rim_size: tuple[float, float] = setting((0.545, 0.352), "m", "Length and width of the opening at the rim.", above=0.0)
-    wall: float = setting(0.0045, "m", "Thickness of walls and floor.", above=0.0)
+    outer_size: tuple[float, float, float] = setting((0.615, 0.373, 0.200), "m", "Outer length, width and height.", above=0.0, high=10.0)
+    floor_size: tuple[float, float] = setting((0.513, 0.319), "m", "Length and width of the inner floor.", above=0.0, high=10.0)
+    rim_size: tuple[float, float] = setting((0.545, 0.352), "m", "Length and width of the opening at the rim.", above=0.0, high=10.0)
+    wall: float = setting(0.0045, "m", "Thickness of walls and floor.", above=0.0, high=1.0)
     color: tuple[float, float, float] = setting((0.65, 0.05, 0.04), "sRGB", "Base colour.", low=0.0, high=1.0)
     metallic: float = setting(0.0, "", "Metallic factor.", low=0.0, high=1.0)
     roughness: float = setting(0.5, "", "Roughness.", low=0.0, high=1.0)
@@ -151,16 +155,18 @@ class Tote:
 class Gripper:
     """The suction gripper: a conical shaft that translates along x, y and z, and a suction cup on a wrist joint about the y axis."""
 
-    finger_length: float = setting(0.35, "m", "Length of the shaft, from its top to the wrist axis.", above=0.0)
-    finger_width: float = setting(0.075, "m", "Diameter of the shaft at its top.", above=0.0)
-    cup_width: float = setting(0.042, "m", "Diameter of the suction cup.", above=0.0)
-    cup_length: float = setting(0.055, "m", "Distance from the wrist axis to the tool centre point (TCP) at the cup's lip.", above=0.0)
-    finger_mass: float = setting(1.5, "kg", "Mass of the shaft.", above=0.0)
-    cup_mass: float = setting(0.5, "kg", "Mass of the cup.", above=0.0)
+    finger_length: float = setting(0.35, "m", "Length of the shaft, from its top to the wrist axis.", low=0.005, high=2.0)
+    finger_width: float = setting(0.075, "m", "Diameter of the shaft at its top.", low=0.005, high=1.0)
+    cup_width: float = setting(0.042, "m", "Diameter of the suction cup.", low=0.005, high=0.5)
+    cup_length: float = setting(
+        0.055, "m", "Distance from the wrist axis to the tool centre point (TCP) at the cup's lip.", low=0.005, high=0.5
+    )
+    finger_mass: float = setting(1.5, "kg", "Mass of the shaft.", low=0.001, high=1e3)
+    cup_mass: float = setting(0.5, "kg", "Mass of the cup.", low=0.001, high=1e3)
     tilt_limit: float = setting(90.0, "°", "Joint limit of the wrist, to both sides.", above=0.0, high=90.0)
-    tilt_stiffness: float = setting(2500.0, "N·m/rad", "Stiffness of the wrist's PD position drive.", above=0.0)
-    tilt_damping: float = setting(200.0, "N·m·s/rad", "Damping of the wrist's PD position drive.", low=0.0)
-    tilt_torque: float = setting(200.0, "N·m", "Torque limit of the wrist's drive.", above=0.0)
+    tilt_stiffness: float = setting(2500.0, "N·m/rad", "Stiffness of the wrist's PD position drive.", above=0.0, high=1e6)
+    tilt_damping: float = setting(200.0, "N·m·s/rad", "Damping of the wrist's PD position drive.", low=0.0, high=1e5)
+    tilt_torque: float = setting(200.0, "N·m", "Torque limit of the wrist's drive.", above=0.0, high=1e5)
     color: tuple[float, float, float] = setting((0.55, 0.56, 0.58), "sRGB", "Base colour of the shaft.", low=0.0, high=1.0)
     cup_color: tuple[float, float, float] = setting((0.05, 0.05, 0.055), "sRGB", "Base colour of the cup.", low=0.0, high=1.0)
     metallic: float = setting(0.01, "", "Metallic factor of shaft and cup (released).", low=0.0, high=1.0)
@@ -174,13 +180,19 @@ class Cameras:
     resolution: tuple[int, int] = setting((1920, 1080), "px", "Image width and height.", low=1, high=8192)
     fov: float = setting(20.0, "°", "Horizontal field of view.", low=1.0, high=170.0)
     positions: tuple[tuple[float, float, float], ...] = setting(
-        ((0.0, 0.0, 2.0), (0.0, 0.573, 2.0), (0.0, -0.573, 2.0)), "m", "Position of each camera in the tote's frame (released)."
+        ((0.0, 0.0, 2.0), (0.0, 0.573, 2.0), (0.0, -0.573, 2.0)),
+        "m",
+        "Position of each camera in the tote's frame (released).",
+        low=-100.0,
+        high=100.0,
     )
-    target: tuple[float, float, float] = setting((0.0, 0.0, 0.16), "m", "Look-at point of all cameras (released).")
+    target: tuple[float, float, float] = setting((0.0, 0.0, 0.16), "m", "Look-at point of all cameras (released).", low=-100.0, high=100.0)
     ups: tuple[tuple[float, float, float], ...] = setting(
         ((0.0, 1.0, 0.0), (0.0, -1.0, 0.0), (0.0, 1.0, 0.0)),
         "",
         "Up vector of each camera; by default +y for the first, and towards the tote's centre line for the others.",
+        low=-1e3,
+        high=1e3,
     )
 
 
@@ -191,8 +203,16 @@ class Arrangement:
     volume: float = setting(
         7e-3,
         "m³",
-        "Volume budget: objects are drawn while the total volume of their collision shapes stays within it (paper: 7 l).",
+        "Budget for the total volume of the collision shapes of an episode's objects (paper: 7 l); fill says how it ends the draw.",
         above=0.0,
+        high=1.0,
+    )
+    fill: str = setting(
+        EXCEED,
+        "",
+        "How the budget ends the draw: exceed (the object that reaches or exceeds it is the last; the paper's tables, released) or within "
+        "(that object is left out). An object that alone is larger is never drawn.",
+        choices=FILLS,
     )
     max_objects: int = setting(24, "", "Maximum objects of an episode.", low=1, high=32)
     repeat_to_fill: bool = setting(
@@ -205,7 +225,7 @@ class Arrangement:
         above=0.0,
         high=0.5,
     )
-    clearance: float = setting(0.01, "m", "Gap between the bounding spheres of consecutive objects in the drop column.", low=0.0)
+    clearance: float = setting(0.01, "m", "Gap between the bounding spheres of consecutive objects in the drop column.", low=0.0, high=1.0)
     spread: float = setting(
         0.3, "", "Drop positions are uniform over this fraction of the tote's opening, less the object's radius.", low=0.0, high=1.0
     )
@@ -215,16 +235,26 @@ class Arrangement:
 class Settle:
     """When a dropped pile counts as at rest, and which objects are dropped again."""
 
-    min_time: float = setting(1.0, "s", "Minimum simulated time from the drop to the first frame.", low=0.0)
-    max_time: float = setting(10.0, "s", "A world whose pile is not at rest after this time resamples its arrangement.", above=0.0)
-    rest_displacement: float = setting(1e-4, "m", "An object is at rest if none of its points is displaced by more in a tick.", above=0.0)
-    relax_time: float = setting(
-        4.0, "s", "Time after which relaxed_displacement replaces rest_displacement, since some piles keep jittering slightly.", low=0.0
+    min_time: float = setting(1.0, "s", "Minimum simulated time from the drop to the first frame.", low=0.0, high=3600.0)
+    max_time: float = setting(
+        10.0, "s", "A world whose pile is not at rest after this time resamples its arrangement.", above=0.0, high=3600.0
     )
-    relaxed_displacement: float = setting(2e-3, "m", "Relaxed rest threshold after relax_time: displacement in a tick.", above=0.0)
+    rest_displacement: float = setting(
+        1e-4, "m", "An object is at rest if none of its points is displaced by more in a tick.", above=0.0, high=0.1
+    )
+    relax_time: float = setting(
+        4.0,
+        "s",
+        "Time after which relaxed_displacement replaces rest_displacement, since some piles keep jittering slightly.",
+        low=0.0,
+        high=3600.0,
+    )
+    relaxed_displacement: float = setting(
+        2e-3, "m", "Relaxed rest threshold after relax_time: displacement in a tick.", above=0.0, high=0.1
+    )
     rest_ticks: int = setting(8, "", "Consecutive ticks for which all objects must be at rest.", low=1, high=INT32_MAX)
-    stuck_depth: float = setting(0.01, "m", "An object that penetrates another by more is stuck (released).", above=0.0)
-    stuck_time: float = setting(0.4, "s", "An object stuck for this long is dropped again (released).", above=0.0)
+    stuck_depth: float = setting(0.01, "m", "An object that penetrates another by more is stuck (released).", above=0.0, high=1.0)
+    stuck_time: float = setting(0.4, "s", "An object stuck for this long is dropped again (released).", above=0.0, high=3600.0)
     max_redrops: int = setting(8, "", "Maximum objects dropped again in an arrangement; one with more is resampled.", low=0, high=INT32_MAX)
     tries: int = setting(20, "", "Arrangements tried before an episode is given up.", low=1, high=INT32_MAX)
 
@@ -233,11 +263,11 @@ class Settle:
 class Physics:
     """Rigid-body solver and contacts. Values without a source were measured with Newton 1.8."""
 
-    step: float = setting(2e-3, "s", "Time step (paper).", above=0.0, high=0.02)
+    step: float = setting(2e-3, "s", "Time step (paper).", low=1e-5, high=0.02)
     steps_per_tick: int = setting(
         33, "", "Steps per tick, which is one output frame: 33 steps of 2 ms are 15 Hz (paper).", low=1, high=1000
     )
-    gravity: float = setting(9.81, "m/s²", "Gravitational acceleration.", low=0.0)
+    gravity: float = setting(9.81, "m/s²", "Gravitational acceleration.", low=0.0, high=100.0)
     substeps: int = setting(
         1,
         "",
@@ -247,20 +277,21 @@ class Physics:
     )
     iterations: int = setting(16, "", "Projected Gauss-Seidel iterations per solver substep.", low=1, high=1000)
     friction: float = setting(0.5, "", "Coulomb friction coefficient of every shape.", low=0.0, high=10.0)
-    gap: float = setting(4e-3, "m", "Contact margin of a shape: contacts are generated below twice this distance.", low=0.0)
-    angular_damping: float = setting(0.05, "1/s", "Angular damping of the objects (PhysX's default).", low=0.0)
+    gap: float = setting(4e-3, "m", "Contact margin of a shape: contacts are generated below twice this distance.", low=0.0, high=0.1)
+    angular_damping: float = setting(0.05, "1/s", "Angular damping of the objects (PhysX's default).", low=0.0, high=1e3)
     max_speed: float = setting(
         4.0,
         "m/s",
         "Speed limit of the objects: 8 mm per solver substep are no more than the contact margin of two shapes, so nothing tunnels.",
         above=0.0,
+        high=100.0,
     )
     contacts_per_world: int = setting(512, "", "Contact capacity per world; about 140 contacts are usual.", low=16, high=INT32_MAX)
     pairs_per_world: int = setting(1024, "", "Broad-phase pair capacity per world.", low=16, high=INT32_MAX)
     rows_per_world: int = setting(1536, "", "Capacity for the objects' contact constraint rows per world.", low=48, high=INT32_MAX)
     gripper_rows_per_world: int = setting(256, "", "Capacity for the gripper's constraint rows per world.", low=48, high=INT32_MAX)
     deterministic: bool = setting(True, "", "On a GPU, sort contact rows, so that a bake can be reproduced bit for bit.")
-    guide_height: float = setting(8.0, "m", "Height of the temporary walls on the rim that guide the drop.", above=0.0)
+    guide_height: float = setting(8.0, "m", "Height of the temporary walls on the rim that guide the drop.", above=0.0, high=100.0)
 
 
 @dataclass(frozen=True)
@@ -277,7 +308,7 @@ class Render:
     samples: int = setting(64, "", "Mode reference: paths per pixel; powers of two are stratified best.", low=1, high=65536)
     bounces: int = setting(4, "", "Maximum surfaces along a path; 1: direct light only.", low=1, high=64)
     random_yaw: bool = setting(True, "", "Rotate each episode's environment map by a random yaw about the vertical.")
-    exposure: float = setting(1.0, "", "Factor on the automatic exposure.", above=0.0)
+    exposure: float = setting(1.0, "", "Factor on the automatic exposure.", low=0.01, high=100.0)
     exposure_spread: float = setting(
         0.3,
         "EV",
@@ -339,7 +370,7 @@ class Bop:
     split: str = setting("train_pbr", "", "Name of the split's folder; the BOP toolkit reads JPEG only from splits named *_pbr.")
     color_format: str = setting("jpg", "", "File format of RGB images.", choices=("jpg", "png"))
     jpeg_quality: int = setting(95, "", "JPEG quality.", low=1, high=100)
-    depth_scale: float = setting(0.1, "mm", "Depth of one count in 16-bit depth images; 0.1 mm reaches 6.5 m.", above=0.0)
+    depth_scale: float = setting(0.1, "mm", "Depth of one count in 16-bit depth images; 0.1 mm reaches 6.5 m.", above=0.0, high=10.0)
     masks: bool = setting(True, "", "Write mask/ (amodal) and mask_visib/ (visible): one file per instance and view.")
     coco: bool = setting(True, "", "Write COCO annotations (scene_gt_coco.json).")
     layout: str = setting(

@@ -77,7 +77,7 @@ class DepthSensor:
     """
 
     baseline: float = setting(
-        0.075, "m", "Distance from the camera to the projector at its right (Khoshelham and Elberink, 2012).", above=0.0
+        0.075, "m", "Distance from the camera to the projector at its right (Khoshelham and Elberink, 2012).", above=0.0, high=1.0
     )
     disparity_step: float = setting(
         0.125,
@@ -86,11 +86,13 @@ class DepthSensor:
         above=0.0,
         high=16.0,
     )
-    distances: tuple[float, float] = setting((0.4, 5.0), "m", "Minimum and maximum depth that is measured.", above=0.0)
-    noise: float = setting(0.0012, "m", "Axial noise at noise_distance, as standard deviation (Nguyen et al., 2012).", low=0.0)
-    noise_growth: float = setting(0.0019, "1/m", "Quadratic growth of axial noise with depth (Nguyen et al., 2012).", low=0.0)
-    noise_distance: float = setting(0.4, "m", "Depth of minimum axial noise (Nguyen et al., 2012).", low=0.0)
-    noise_angle: float = setting(1e-4, "m^1.5", "Growth of axial noise with the angle of incidence (Nguyen et al., 2012).", low=0.0)
+    distances: tuple[float, float] = setting((0.4, 5.0), "m", "Minimum and maximum depth that is measured.", above=0.0, high=100.0)
+    noise: float = setting(0.0012, "m", "Axial noise at noise_distance, as standard deviation (Nguyen et al., 2012).", low=0.0, high=1.0)
+    noise_growth: float = setting(0.0019, "1/m", "Quadratic growth of axial noise with depth (Nguyen et al., 2012).", low=0.0, high=1.0)
+    noise_distance: float = setting(0.4, "m", "Depth of minimum axial noise (Nguyen et al., 2012).", low=0.0, high=100.0)
+    noise_angle: float = setting(
+        1e-4, "m^1.5", "Growth of axial noise with the angle of incidence (Nguyen et al., 2012).", low=0.0, high=1.0
+    )
     lateral_noise: float = setting(
         0.5,
         "px",
@@ -98,7 +100,7 @@ class DepthSensor:
         low=0.0,
         high=16.0,
     )
-    grazing_angle: float = setting(80.0, "°", "Angle of incidence above which there is no depth.", above=0.0, high=89.0)
+    grazing_angle: float = setting(80.0, "°", "Angle of incidence above which there is no depth.", low=10.0, high=89.0)
     edge_width: int = setting(
         1,
         "px",
@@ -106,5 +108,5 @@ class DepthSensor:
         low=0,
         high=16,
     )
-    edge_step: float = setting(1.0, "px", "Disparity difference that makes an edge.", above=0.0)
+    edge_step: float = setting(1.0, "px", "Disparity difference that makes an edge.", above=0.0, high=1e3)
     shadows: bool = setting(True, "", "No depth where the projector is occluded.")

@@ -69,6 +69,8 @@ class DropData:
 
     volume: float
     """Budget for the total volume of an episode's objects [m³]."""
+    exceed: int
+    """1: the object that exceeds the budget is the last; 0: the one before it."""
     move_repeats: int
     """1: an object may occur several times in mode MOVE."""
     pick_repeats: int

@@ -16,7 +16,7 @@ import numpy as np
 import warp as wp
 
 from synpick_warp.configs.modes import mode_weights
-from synpick_warp.configs.schema import Config, Gripper, Physics
+from synpick_warp.configs.schema import EXCEED, Arrangement, Config, Gripper, Physics
 from synpick_warp.errors import ConfigError
 from synpick_warp.scenes.gripper import cup_collider, finger_collider, rod_inertia
 from synpick_warp.scenes.tote import TABLE_SIZE, guide_walls, tote_colliders
@@ -95,6 +95,8 @@ class BuiltModel:
 def count_slots(config: Config, catalog: Catalog) -> tuple[int, int]:
     """Determine the body slots (single, compound) that suffice for all draws but a fraction `slot_shortfall`, in each possible mode.
 
+    The object that exceeds the budget, if `fill` keeps it, has its slot as well.
+
     A Monte Carlo estimate: the volume budget couples how many objects are drawn with which ones, so there is no simple formula.
     Slots cost time whether used or not, and compound ones most: their count is minimized first, then that of single slots.
 
@@ -112,10 +114,10 @@ def count_slots(config: Config, catalog: Catalog) -> tuple[int, int]:
         )
     needed = []
     for repeats in find_repeat_rules(config):
-        slots = _slots_of_trials(_draw_trials(volume, budget, config.arrangement.max_objects, repeats), compound, shortfall)
+        slots = _slots_of_trials(_draw_trials(volume, budget, config.arrangement, repeats), compound, shortfall)
         # Where a sum of volumes meets the budget but for rounding, as of three cubes of a litre and three litres, 64-bit floats may
         # find room for one object fewer than the kernels do, in every draw. Other catalogs keep the count of the 64-bit draws.
-        rounded = _draw_trials(volume.astype(np.float32), np.float32(budget), config.arrangement.max_objects, repeats)
+        rounded = _draw_trials(volume.astype(np.float32), np.float32(budget), config.arrangement, repeats)
         noise = 4.0 * np.sqrt(shortfall / SLOT_TRIALS)
         if (_count_by_type(rounded, compound) > slots).any(axis=1).mean() > shortfall + noise:
             slots = _slots_of_trials(rounded, compound, shortfall)
@@ -142,28 +144,31 @@ def find_repeat_rules(config: Config) -> set[bool]:
     return {rules[mode] for mode, weight in mode_weights(config).items() if weight > 0.0}
 
 
-def _draw_trials(volume: np.ndarray, budget: float | np.float32, capacity: int, repeats: bool) -> np.ndarray:
+def _draw_trials(volume: np.ndarray, budget: float | np.float32, rule: Arrangement, repeats: bool) -> np.ndarray:
     """Draw as kernels.sim.arrangement.sample_objects_kernel does: catalog indices (SLOT_TRIALS, capacity), -1 after the last.
 
     Volumes [m³] are summed in the type of `volume` (entry); the kernel's is float32.
     """
-    rng = np.random.default_rng(0)
+    rng, exceed, capacity = np.random.default_rng(0), rule.fill == EXCEED, rule.max_objects
     drawn = np.full((SLOT_TRIALS, capacity), -1, dtype=np.int32)
     total = np.zeros(SLOT_TRIALS, volume.dtype)
     # `active`: trials that still draw. The first object is drawn from those that fit.
     active, choice = np.arange(SLOT_TRIALS), np.flatnonzero(volume <= budget)
     if not len(choice):
         return drawn
-    for position in range(capacity if repeats else min(capacity, len(volume))):
+    for position in range(capacity if repeats else min(capacity, len(choice if exceed else volume))):
         candidate = rng.choice(choice, size=len(active))
         repeated = np.arange(0 if repeats else len(active))
         while len(repeated := repeated[(drawn[active[repeated], :position] == candidate[repeated, None]).any(axis=1)]):
             candidate[repeated] = rng.choice(choice, size=len(repeated))
-        fits = total[active] + volume[candidate] <= budget
-        active, candidate = active[fits], candidate[fits]
+        if not exceed:
+            fits = total[active] + volume[candidate] <= budget
+            active, candidate = active[fits], candidate[fits]
+            choice = np.arange(len(volume))
         drawn[active, position] = candidate
         total[active] += volume[candidate]
-        choice = np.arange(len(volume))
+        if exceed:
+            active = active[total[active] < budget]
     return drawn
 
 

@@ -112,6 +112,12 @@ def is_sampled(catalog_index: wp.array2d[int], world: int, count: int, candidate
     return result
 
 
+@wp.func
+def fits_budget(total: float, volume: float, drop: DropData) -> bool:
+    """True if an object may be drawn after others of a total volume [m³]; with `exceed`, if it alone is within the budget."""
+    return wp.where(drop.exceed == 1, volume, total + volume) <= drop.volume
+
+
 @wp.kernel
 def sample_objects_kernel(
     # Scene:
@@ -128,10 +134,10 @@ def sample_objects_kernel(
     catalog_index_out: wp.array2d[int],  # (world, instance)
     body_slot_out: wp.array2d[int],  # (world, instance)
 ):
-    """Sample objects uniformly until the next one would exceed the volume budget V: Σ volume ≤ V.
+    """Sample objects uniformly up to a volume budget V: with `exceed` until Σ volume ≥ V, else while Σ volume ≤ V.
 
-    The first object is resampled until one fits. `catalog_index` receives the objects (-1: none), `body_slot` the next free slot of
-    their class, single or compound; if a class runs out of slots, the episode ends with ARRANGEMENT_OVERFLOW.
+    An object larger than V is resampled; without `exceed`, after the first one, it ends the draw. `catalog_index` receives the objects (-1:
+    none), `body_slot` the next free slot of their class, single or compound; without one the episode ends with ARRANGEMENT_OVERFLOW.
     """
     world = wp.tid()
     phase = phase_inout[world]
@@ -152,22 +158,22 @@ def sample_objects_kernel(
         if open:
             candidate = uniform_index(key, sample, catalog.count)
             repeated = repeats == 0 and is_sampled(catalog_index_out, world, count, candidate)
-            fits = total + catalog.volume[candidate] <= drop.volume
-            if not repeated and not fits and count > 0:
+            fits = fits_budget(total, catalog.volume[candidate], drop)
+            if drop.exceed == 0 and not repeated and not fits and count > 0:
                 open = False
             if not repeated and fits:
                 slot = singles
                 if catalog.compound[candidate] == 1:
                     slot = layout.single_slots + compounds
-                    compounds += 1
-                else:
-                    singles += 1
+                compounds += catalog.compound[candidate]
+                singles += 1 - catalog.compound[candidate]
                 overflow = overflow or singles > layout.single_slots or compounds > layout.slots - layout.single_slots
                 catalog_index_out[world, count] = candidate
                 body_slot_out[world, count] = slot
                 total += catalog.volume[candidate]
                 count += 1
-            if overflow or count == layout.instances or (repeats == 0 and count == catalog.count):
+            full = count == layout.instances or (repeats == 0 and count == catalog.count)
+            if overflow or full or (drop.exceed == 1 and total >= drop.volume):
                 open = False
     if overflow:
         clear_catalog_indices(catalog_index_out, world, layout.instances)

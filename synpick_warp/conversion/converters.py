@@ -8,7 +8,7 @@ from __future__ import annotations
 import functools
 import os
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from fractions import Fraction
 from pathlib import Path
 from typing import ClassVar
@@ -30,6 +30,7 @@ from synpick_warp.exporters.bop.shards.exporter import ShardsExporter
 from synpick_warp.exporters.bop.shards.tar_files import find_shards
 from synpick_warp.exporters.registry import Exporters
 from synpick_warp.exporters.writing.files import PARTIAL, output_error
+from synpick_warp.exporters.writing.notes import write_notes
 from synpick_warp.exporters.writing.pool import WriterPool
 from synpick_warp.scenes.types import Catalog, EnvironmentMap
 
@@ -63,6 +64,15 @@ class Converter(ABC):
     @abstractmethod
     def convert(self, episode: SourceEpisode, on_committed: Done) -> None:
         """Submit the tasks that write an episode, and call `on_committed` when all of its files are in place."""
+
+    def write_notes(self, names: Mapping[int, str]) -> list[Path]:
+        """Write camera.json and dataset_info.md where the format's exporter does; `names`: obj_id -> name. Returns their paths."""
+        from synpick_warp.scenes.cameras import make_cameras
+
+        try:
+            return write_notes(self.out, self.config, names, make_cameras(self.config.cameras))
+        except OSError as error:
+            raise output_error(self.out, error) from error
 
     def require_images(self) -> None:
         """Check that the source has views."""
@@ -218,8 +228,9 @@ class CocoConverter(_SceneConverter):
 
     def write_constants(self) -> list[Path]:
         """See base class."""
-        coco.write_categories(self.out, _read_names(self.source), self.content.keypoints)
-        return [coco.CATEGORIES]
+        names = _read_names(self.source)
+        coco.write_categories(self.out, names, self.content.keypoints)
+        return [coco.CATEGORIES, *self.write_notes(names)]
 
     def files(self, episode: int) -> list[Path]:
         """See `Exporter`."""
@@ -273,6 +284,10 @@ class LerobotConverter(Converter):
         self.require_images()
         source.data.require_store()
         self._settings = episode_settings(config, out, {item.object_id: item.name for item in source.data.objects})
+
+    def write_constants(self) -> list[Path]:
+        """See base class."""
+        return self.write_notes(self._settings.objects)
 
     def files(self, episode: int) -> list[Path]:
         """See `Exporter`."""
@@ -352,6 +367,16 @@ class Converters(Exporters):
 
         for converter in self._converters:
             converter.convert(episode, count_down)
+
+
+def check_trajectories(names: Sequence[str], source: Source) -> None:
+    """Check that the source has the trajectories that formats are made of.
+
+    Raises:
+        DatasetError: There are none, or an attribute or array is missing or damaged.
+    """
+    if {"usd", "lerobot"} & set(names):
+        source.check_trajectories(gripper="lerobot" in names)
 
 
 def check_formats(names: Sequence[str], config: Config, folder: Path) -> None:

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from synpick_warp.codes import Ending
-from synpick_warp.conversion.converters import Converters, check_formats
+from synpick_warp.conversion.converters import Converters, check_formats, check_trajectories
 from synpick_warp.conversion.source import Source
 from synpick_warp.dataset.writing import OutputFolder, finalize_data_set
 from synpick_warp.errors import DatasetError
@@ -47,6 +47,7 @@ def convert(folder: Path, out: Path, formats: Sequence[str], processes: int, rep
     """
     source = Source(folder)
     check_formats(formats, source.config, folder)
+    check_trajectories(formats, source)
     _check_apart(folder, out)
     config = dataclasses.replace(source.config, bake=dataclasses.replace(source.config.bake, formats=tuple(formats)))
     classes = load_exporter_classes(formats)

@@ -7,14 +7,15 @@ import os
 import shutil
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
-
-import numpy as np
 
 from synpick_warp.codes import Ending
 from synpick_warp.configs.schema import Config
 from synpick_warp.conversion.scenes import SceneSource
+from synpick_warp.conversion.trajectories import check_trajectory, read_ticks
+from synpick_warp.dataset.annotations import ADVICE, check_content
 from synpick_warp.dataset.manifest import (
     CONSTANTS,
     INPUTS,
@@ -26,9 +27,10 @@ from synpick_warp.dataset.manifest import (
     read_settings,
 )
 from synpick_warp.dataset.reading import DataSet, Episode
-from synpick_warp.dataset.trajectory import read_array
+from synpick_warp.dataset.trajectory import GROUP_FILE, StoreAttributes
 from synpick_warp.dataset.view_files import SceneFolder, SceneShards
 from synpick_warp.errors import DatasetError
+from synpick_warp.exporters.trajectory.arrays import STORE
 from synpick_warp.exporters.writing.checksums import open_regular
 from synpick_warp.frames import EpisodeEnd, TickBatch
 
@@ -64,26 +66,13 @@ class SourceEpisode:
             found.append(SceneSource(folder, shards, scene, size, self.frames))
         return found
 
+    def check_trajectory(self, *, gripper: bool) -> None:
+        """See `trajectories.check_trajectory`."""
+        check_trajectory(self.data, self.end, self.source.light_count, gripper=gripper)
+
     def ticks(self) -> Iterator[TickBatch]:
-        """The frames as they came from the simulation, with gripper state and setpoints; poses of absent instances are NaN."""
-        data = self.data
-        arrays = {name: read_array(data.ticks[name]) for name in ("time", "object_id", "pose", "fixture_pose", "fixture_visible")}
-        state = {name: read_array(data.ticks[name]) for name in ("task", "attached") if name in data.ticks}
-        steps = self.source.steps_per_tick
-        setpoint = read_array(data.steps["setpoint"]).reshape(self.frames, steps, 3) if "setpoint" in data.steps else None
-        light = data.attributes["light"]
-        columns = {"light": light["map"], "light_yaw": light["yaw"], "light_exposure": light["exposure"]}
-        kinds = {"light": np.int32, "light_yaw": np.float32, "light_exposure": np.float32}
-        for frame in range(self.frames):
-            row = slice(frame, frame + 1)
-            yield TickBatch(
-                episode=np.array([self.end.episode], np.int32),
-                frame=np.array([frame], np.int32),
-                **{name: values[row] for name, values in arrays.items()},
-                **{name: np.array([columns[name]], kind) for name, kind in kinds.items()},
-                tick={name: values[row] for name, values in state.items()},
-                steps={} if setpoint is None else {"setpoint": setpoint[row]},
-            )
+        """See `trajectories.read_ticks`."""
+        return read_ticks(self.data, self.source.steps_per_tick)
 
 
 class Source:
@@ -119,6 +108,30 @@ class Source:
     def steps_per_tick(self) -> int:
         """Physics steps of a frame."""
         return self.config.physics.steps_per_tick
+
+    @property
+    def light_count(self) -> int:
+        """Number of environment maps that the trajectory store names."""
+        return len(self._store.lights)
+
+    @cached_property
+    def _store(self) -> StoreAttributes:
+        return check_content(self.data.attributes, StoreAttributes, self.data.folder / STORE / GROUP_FILE)
+
+    def check_trajectories(self, *, gripper: bool) -> None:
+        """Check that the trajectories of all episodes have what a format needs; `gripper`: states and commands of the gripper, too.
+
+        Raises:
+            DatasetError: There are none, or an attribute or array is missing or damaged.
+        """
+        self.data.require_store()
+        if self._store.steps_per_tick != self.steps_per_tick:
+            there = f"steps_per_tick is {self._store.steps_per_tick}, the settings have {self.steps_per_tick}"
+            raise DatasetError(f"{self.data.folder / STORE / GROUP_FILE} is damaged: {there}; {ADVICE}")
+        for index in self.episodes:
+            episode = self.episode(index)
+            if Ending(episode.end.ending).delivers:
+                episode.check_trajectory(gripper=gripper)
 
     def episode(self, index: int) -> SourceEpisode:
         """A committed episode.

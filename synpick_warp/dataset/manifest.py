@@ -25,8 +25,8 @@ from typing import Any
 import msgspec
 
 from synpick_warp import __version__
-from synpick_warp.configs.load import load_config
-from synpick_warp.configs.schema import Config
+from synpick_warp.configs.load import load_config, override_config
+from synpick_warp.configs.schema import CLASSIC, WITHIN, Config
 from synpick_warp.dataset.records import Entry, EpisodeEntry, IndicesEntry, Manifest, read_record
 from synpick_warp.errors import DatasetError
 from synpick_warp.exporters.writing.checksums import parse_checksums
@@ -61,8 +61,9 @@ FREE_SETTINGS = (
 )
 """Settings that may differ when a bake is resumed: no episode depends on them. Objects and lights are compared by content, not by the name
 of their folder. A device of another type computes the same episodes up to rounding."""
-YOUNGER_SETTINGS = ("bop.layout", "bop.keypoints")
-"""Settings that older manifests lack: left out where they have their defaults, so that older data sets can still be resumed."""
+YOUNGER_SETTINGS: dict[str, Any] = {"bop.layout": CLASSIC, "bop.keypoints": 0, "arrangement.fill": WITHIN}
+"""Settings that older manifests lack, and what held before: left out where they have these values, so that older data sets can still be
+read, and resumed with them."""
 PACKAGES = ("warp-lang", "newton", "numpy", "scipy", "coacd", "opencv-python-headless", "isal", "orjson", "usd-core", "zarr")
 """Packages whose versions the output depends on."""
 FORMAT_PACKAGES = {"lerobot": ("av", "pyarrow")}
@@ -95,7 +96,7 @@ def make_manifest(config: Config) -> dict[str, Any]:
 
 
 def fixed_settings(config: Config) -> dict[str, Any]:
-    """Settings that determine the output: all but FREE_SETTINGS, defaults of YOUNGER_SETTINGS and the splits' numbers of episodes.
+    """Settings that determine the output: all but FREE_SETTINGS, YOUNGER_SETTINGS as before and the splits' numbers of episodes.
 
     Nested; formats sorted by name.
     """
@@ -103,10 +104,9 @@ def fixed_settings(config: Config) -> dict[str, Any]:
     for key in FREE_SETTINGS:
         section, name = key.split(".")
         del settings[section][name]
-    defaults = dataclasses.asdict(Config())
-    for key in YOUNGER_SETTINGS:
+    for key, before in YOUNGER_SETTINGS.items():
         section, name = key.split(".")
-        if settings[section][name] == defaults[section][name]:
+        if settings[section][name] == before:
             del settings[section][name]
     settings["bake"]["formats"] = sorted(set(config.bake.formats))
     for split in settings["splits"]:
@@ -162,8 +162,10 @@ def read_settings(folder: Path, manifest: Mapping[str, Any]) -> Config:
     """
     path = path_inside(folder, CONFIG_FILE, folder, DatasetError)
     check_regular_file(path, MAX_TOML, DatasetError)
-    config = load_config(str(path), {})
-    said = describe_differences({"settings": make_manifest(config)["settings"]}, {"settings": manifest["settings"]})
+    settings = manifest["settings"]
+    before = {key: value for key, value in YOUNGER_SETTINGS.items() if key.split(".")[1] not in settings.get(key.split(".")[0], {})}
+    config = override_config(load_config(str(path), {}), before)
+    said = describe_differences({"settings": make_manifest(config)["settings"]}, {"settings": settings})
     if said:
         raise DatasetError(f"{path} does not match the manifest: {said}")
     return config

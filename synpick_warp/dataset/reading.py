@@ -61,7 +61,8 @@ class Episode:
             index: Index of the episode.
         """
         self._data_set = data_set
-        self._group = data_set.folder / STORE / EPISODES / f"{index:06d}"
+        self.group = data_set.folder / STORE / EPISODES / f"{index:06d}"
+        """Folder of its group in the trajectory store, if there is one."""
         self._scenes: dict[int, SceneFiles] = {}
         self.index = index
 
@@ -91,14 +92,14 @@ class Episode:
         return self._data_set.listed_files(episode_entry(self.index))
 
     def _arrays(self, name: str) -> Arrays:
-        return Arrays(self._group / name, EPISODE_GROUPS[name], self._context)
+        return Arrays(self.group / name, EPISODE_GROUPS[name], self._context)
 
     @cached_property
     def row(self) -> dict[str, Any]:
         """The episode's line of episodes.jsonl: mode, ending, frames, seconds, counts of objects and attempts."""
         if self._record is not None:
             return self._record["row"]
-        check_content(self.attributes, EpisodeRow, self._group / GROUP_FILE)
+        check_content(self.attributes, EpisodeRow, self.group / GROUP_FILE)
         return self.attributes
 
     @cached_property
@@ -109,7 +110,7 @@ class Episode:
             DatasetError: The data set has no trajectories.
         """
         self._data_set.require_store()
-        return read_attributes(self._group)
+        return read_attributes(self.group)
 
     @property
     def ticks(self) -> Arrays:
@@ -137,9 +138,9 @@ class Episode:
         if self._record is not None:
             return tuple(self._record.get("attempts", ()))
         if "record" not in self.attempt_arrays:
-            raise DatasetError(f"{self._group} has no array attempts/record; {ADVICE}")
+            raise DatasetError(f"{self.group} has no array attempts/record; {ADVICE}")
         lines = read_array(self.attempt_arrays["record"]).tobytes().splitlines()
-        source = self._group / "attempts" / "record"
+        source = self.group / "attempts" / "record"
         return tuple(decode_json(line, dict[str, Any], f"{source}, line {row},", DatasetError, ADVICE) for row, line in enumerate(lines, 1))
 
     @cached_property

@@ -98,6 +98,8 @@ class StoreAttributes(Struct):
     """What the attributes of every trajectory store have, as far as it is used here."""
 
     steps_per_tick: Annotated[int, Meta(ge=1, lt=2**20)]
+    lights: Annotated[list[str], Meta(max_length=2**16)] = []
+    """Names of the environment maps."""
 
 
 class _ObjectsAttributes(Struct):

@@ -11,7 +11,7 @@ import numpy as np
 import warp as wp
 
 from synpick_warp.configs.modes import mode_weights
-from synpick_warp.configs.schema import CYCLE, MODES, Config, Gripper, Move, Physics, Settle, Suction, Tote
+from synpick_warp.configs.schema import CYCLE, EXCEED, MODES, Config, Gripper, Move, Physics, Settle, Suction, Tote
 from synpick_warp.kernels import structs
 from synpick_warp.scenes import build
 from synpick_warp.scenes.types import Catalog, CatalogEntry
@@ -153,6 +153,7 @@ def drop_data(config: Config, lights: int) -> structs.DropData:
         structs.DropData,
         config.arrangement,
         config.render,
+        exceed=config.arrangement.fill == EXCEED,
         move_repeats=config.move.repeats,
         pick_repeats=config.pick.repeats,
         rim_length=tote.rim_size[0],

@@ -16,6 +16,8 @@ from synpick_warp.configs.load import COMMAND_LINE, load_config, parse_assignmen
 from synpick_warp.configs.schema import Config, ObjectRow
 from synpick_warp.configs.write import config_to_toml
 from synpick_warp.errors import ConfigError
+from synpick_warp.scenes.collision.hulls import hull_size
+from synpick_warp.scenes.gripper import cup_collider, finger_collider
 
 COUPLED = {
     "bake.episodes",
@@ -23,6 +25,8 @@ COUPLED = {
     "bop.split",
     "bop.color_format",
     "bop.depth_scale",
+    "depth_sensor.baseline",
+    "depth_sensor.disparity_step",
     "move.height",
     "move.start_height",
     "pick.near",
@@ -140,8 +144,8 @@ def test_whole_numbers_are_allowed_for_floats():
 @pytest.mark.parametrize(
     ("key", "value", "expected"),
     [
-        ("physics.step", 0.5, "physics.step is 0.5 on the command line; allowed: above 0, at most 0.02 [s]"),
-        ("physics.step", 0, "physics.step is 0 on the command line; allowed: above 0, at most 0.02 [s]"),
+        ("physics.step", 0.5, "physics.step is 0.5 on the command line; allowed: at least 1e-05, at most 0.02 [s]"),
+        ("physics.step", 0, "physics.step is 0 on the command line; allowed: at least 1e-05, at most 0.02 [s]"),
         ("bake.worlds", -1, "bake.worlds is -1 on the command line; allowed: at least 0, at most 65536"),
         ("bake.worlds", 2.0, "bake.worlds is 2.0 on the command line; allowed: a whole number"),
         ("bake.worlds", True, "bake.worlds is true on the command line; allowed: a whole number"),
@@ -193,7 +197,7 @@ def test_an_unknown_key_is_reported_with_a_suggestion(key, hint):
 @pytest.mark.parametrize(
     ("text", "expected"),
     [
-        ("[physics]\nstep = 0.5\n", "physics.step is 0.5 in {path}; allowed: above 0, at most 0.02 [s]"),
+        ("[physics]\nstep = 0.5\n", "physics.step is 0.5 in {path}; allowed: at least 1e-05, at most 0.02 [s]"),
         ("[physics]\nstepp = 1\n", "there is no key physics.stepp, set in {path}; keys of physics: step, "),
         ("[fysics]\nstep = 1\n", "there is no section fysics, set in {path}; sections: bake, objects, "),
         ("physics = 3\n", "physics is 3 in {path}; allowed: a section, [physics]"),
@@ -261,7 +265,38 @@ def test_a_bad_value_in_the_file_is_reported_even_if_the_command_line_replaces_i
             {"bake.formats": ["shards"], "bake.episodes": 333_334},
             "bake.episodes is 333334 on the command line; allowed: episode indices below 333333 with the format shards",
         ),
+        # Labels that would be empty or wrong: depth that overflows or is 0, cameras that see no object, sensors out of range.
         ({"bop.depth_scale": 0.01}, "bop.depth_scale is 0.01 on the command line; allowed: at least 0.03"),
+        ({"bop.depth_scale": 1e6}, r"bop.depth_scale is 1000000.0 on the command line; allowed: above 0, at most 10 \[mm\]"),
+        (
+            {"cameras.positions": [[0, 0, 60]], "cameras.ups": [[0, 1, 0]], "bop.depth_scale": 0.5},
+            r"bop.depth_scale is 0.5 on .*; allowed: at least 0.916, so that 16 bits reach the tote at 60 m \[mm\]",
+        ),
+        ({"cameras.positions": [[0, 0, 1e9]] * 3}, r"cameras.positions is .*; allowed: each at least -100, at most 100 \[m\]"),
+        ({"cameras.positions": [[0, 0.5, -0.3]] * 3}, "cameras.positions is .*; allowed: positions above the tote's floor, z > 0"),
+        ({"cameras.target": [3, 0, 0]}, "cameras.target is .*; allowed: a point that lets each camera see the tote.* camera 0"),
+        ({"cameras.target": [0, 0.5, 1.9], "cameras.fov": 40}, "cameras.target is .*; allowed: a point that lets each camera see the tote"),
+        (
+            {"render.layers": ["depth_sensor"], "depth_sensor.distances": [5, 9]},
+            r"depth_sensor.distances is \[5.0, 9.0\] on .*; allowed: a range that reaches the tote, 1.8 to 2 m from camera 0 \[m\]",
+        ),
+        (
+            {"render.layers": ["depth_sensor"], "depth_sensor.distances": [0.1, 1]},
+            r"depth_sensor.distances is \[0.1, 1.0\] on .*; allowed: a range that reaches the tote",
+        ),
+        (
+            {"render.layers": ["depth_sensor"], "depth_sensor.baseline": 1e-5},
+            "depth_sensor.baseline is 1e-05 on .*; allowed: at least 4.6e-05, so that the disparity of the tote is a disparity_step",
+        ),
+        ({"depth_sensor.grazing_angle": 1}, "depth_sensor.grazing_angle is 1 on .*; allowed: at least 10, at most 89"),
+        ({"render.exposure": 1e9}, "render.exposure is .*; allowed: at least 0.01, at most 100"),
+        ({"render.exposure": 1e-9}, "render.exposure is .*; allowed: at least 0.01, at most 100"),
+        ({"gripper.cup_length": 1e6}, r"gripper.cup_length is 1000000.0 on .*; allowed: at least 0.005, at most 0.5 \[m\]"),
+        ({"gripper.finger_width": 1e-9}, r"gripper.finger_width is 1e-09 on .*; allowed: at least 0.005, at most 1 \[m\]"),
+        ({"move.speed": 1e-9}, r"move.speed is 1e-09 on .*; allowed: at least 0.001, at most 100 \[m/s\]"),
+        ({"pick.floor": -1000}, r"pick.floor is -1000.* on .*; allowed: at least -10, at most 0 \[m\]"),
+        ({"physics.step": 1e-30}, r"physics.step is 1e-30 on .*; allowed: at least 1e-05, at most 0.02 \[s\]"),
+        ({"tote.outer_size": [1e6, 1e6, 0.2]}, r"tote.outer_size is .*; allowed: each above 0, at most 10 \[m\]"),
     ],
 )
 def test_values_that_contradict_each_other(overrides, expected):
@@ -276,10 +311,34 @@ def test_values_that_contradict_each_other(overrides, expected):
         {"pick.near": 1.0, "pick.near_speed": 1.0, "pick.lift_height": 0.2},
         {"suction.radius": 0.021, "suction.tolerated_misses": 9, "suction.poor_force": 40},
         {"perception.resolution": [640, 160]},
+        {"cameras.fov": 1.0, "cameras.target": [0.25, 0.15, 0.0]},
+        {"cameras.positions": [[0, 0, 0.1]] * 3},
+        {"cameras.positions": [[0, 0, 60]] * 3, "cameras.ups": [[0, 1, 0]] * 3, "bop.depth_scale": 1.0},
+        {"depth_sensor.distances": [5, 9]},
+        {"render.layers": ["depth_sensor"], "cameras.resolution": [320, 180]},
     ],
 )
 def test_values_at_the_limits_of_their_constraints(overrides):
     load_config(None, overrides)
+
+
+def test_every_number_has_limits_at_both_ends():
+    """Of a setting with one end open, some value makes labels meaningless, such as depth in counts of a kilometre."""
+    for section, kind in sections().items():
+        for name, (item, annotation) in settings_of(kind).items():
+            if any(word in str(annotation) for word in ("float", "int")):
+                rules = item.metadata
+                assert rules["high"] is not None, f"{section}.{name}"
+                assert (rules["low"] is None) != (rules["above"] is None), f"{section}.{name}"
+
+
+@pytest.mark.parametrize("size", [{"cup_length": 0.5, "cup_width": 0.005}, {"cup_length": 0.005, "cup_width": 0.5}])
+@pytest.mark.parametrize("shaft", [{"finger_length": 2.0, "finger_width": 0.005}, {"finger_length": 0.005, "finger_width": 1.0}])
+def test_grippers_at_the_limits_have_volume(size, shaft):
+    """Beyond them "all vertices lie in one plane" came, without a key."""
+    gripper = load_config(None, {f"gripper.{name}": value for name, value in {**size, **shaft}.items()} | {"suction.radius": 0.002}).gripper
+    for piece in (cup_collider(gripper), finger_collider(gripper)):
+        assert hull_size(piece.vertices).volume > 0.0
 
 
 def test_object_ids_are_unique(tmp_path):

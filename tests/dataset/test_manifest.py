@@ -14,6 +14,7 @@ import pytest
 from synpick_warp.codes import Ending
 from synpick_warp.configs.load import load_config, settings_of
 from synpick_warp.configs.schema import Config
+from synpick_warp.configs.write import config_to_toml
 from synpick_warp.dataset import manifest
 from synpick_warp.dataset.digests import digest_inputs
 from synpick_warp.dataset.writing import commit_episode
@@ -197,3 +198,14 @@ def test_a_list_that_does_not_fit_its_record(tmp_path):
     with pytest.raises(DatasetError, match="does not match"):
         manifest.read_checksums(tmp_path, place)
     assert json.loads((tmp_path / "manifest" / "constants.json").read_text())["files"] == 1
+
+
+def test_data_sets_from_before_a_setting_are_read_with_what_held_then(tmp_path):
+    """Their manifest and config.toml lack arrangement.fill, which was within; the default is another now."""
+    config = settings(arrangement__fill="within")
+    content = manifest.make_manifest(config)
+    assert "fill" not in content["settings"]["arrangement"]
+    lines = config_to_toml(config).splitlines()
+    (tmp_path / "config.toml").write_text("\n".join(line for line in lines if not line.startswith("fill")) + "\n")
+    assert manifest.read_settings(tmp_path, content).arrangement.fill == "within"
+    assert manifest.make_manifest(settings())["settings"]["arrangement"]["fill"] == "exceed"

@@ -44,7 +44,7 @@ def test_arrays_by_name_are_those_in_memory(folder):
     episode = synpick_warp.open(str(folder))[4]
     batches = list(ticks((4,), FRAMES))
     force = episode.steps["contact_force"]
-    assert force.attrs["unit"] == "N"
+    assert force.attrs["units"] == "N"
     assert force.shape == (FRAMES * STEP_COUNT, 4, 3)
     np.testing.assert_array_equal(force[4:8], batches[1].steps["contact_force"][0, :, :4])
     np.testing.assert_array_equal(episode.ticks["peak_force"][:], [batch.tick["peak_force"][0] for batch in batches])

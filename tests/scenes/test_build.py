@@ -177,6 +177,7 @@ def needs(config, volume, compound, episodes: int, *, repeats: bool) -> np.ndarr
             volume=volume,
             compound=compound,
             budget=config.arrangement.volume,
+            exceed=config.arrangement.fill == "exceed",
             repeats=repeats,
             room=room,
             single_slots=room,
@@ -198,13 +199,15 @@ def overflows(taken: np.ndarray, slots: tuple[int, int]) -> float:
     size=st.sampled_from((0.5e-3, 1.5e-3, 6e-3)),
     share=st.sampled_from((0.2, 0.5)),
     mode=st.sampled_from(("pick", "target", "move")),
+    fill=st.sampled_from(("exceed", "within")),
 )
-def test_slots_suffice_for_all_but_the_accepted_fraction_of_draws(seed, size, share, mode, objects):
+def test_slots_suffice_for_all_but_the_accepted_fraction_of_draws(seed, size, share, mode, fill, objects):
     """By brute force with the twin's draws, also where single objects may exceed the whole budget. One slot fewer would not suffice."""
     numbers = np.random.default_rng(seed)
     volume, compound = numbers.uniform(0.1 * size, size, 9), (numbers.uniform(size=9) < share).astype(int)
     shortfall, episodes = 0.05, 400
-    config = settings(bake__mode=mode, arrangement__volume=3e-3, arrangement__max_objects=20, arrangement__slot_shortfall=shortfall)
+    limits = {"arrangement__volume": 3e-3, "arrangement__max_objects": 20, "arrangement__slot_shortfall": shortfall}
+    config = settings(bake__mode=mode, arrangement__fill=fill, **limits)
     slots = build.count_slots(config, fake(volume, compound, objects))
     taken = needs(config, volume, compound, episodes, repeats=mode == "move")
     # Four standard deviations of the brute force.
@@ -234,13 +237,14 @@ def test_with_a_budget_for_everything_and_no_repeats_every_object_has_a_slot(obj
 
 
 def test_without_repeats_a_budget_for_few_needs_few_slots(objects):
-    """Known: thirty objects, seven of which fill the budget; with repeats it is the same number of bodies, of any kind."""
+    """Known: thirty objects, of which seven stay within the budget and eight exceed it; with repeats as many bodies, of any kind."""
     thirty = fake(np.full(30, 1e-4), np.array([0] * 28 + [1] * 2), objects)
-    config = {"arrangement__volume": 7.5e-4, "arrangement__max_objects": 32}
-    assert build.count_slots(settings(bake__mode="pick", **config), thirty) == (7, 2)
-    single, compound = build.count_slots(settings(bake__mode="move", **config), thirty)
-    assert single == 7
-    assert compound > 2
+    for fill, count in (("within", 7), ("exceed", 8)):
+        config = {"arrangement__volume": 7.5e-4, "arrangement__max_objects": 32, "arrangement__fill": fill}
+        assert build.count_slots(settings(bake__mode="pick", **config), thirty) == (count, 2)
+        single, compound = build.count_slots(settings(bake__mode="move", **config), thirty)
+        assert single == count
+        assert compound > 2
 
 
 def test_the_first_object_is_redrawn_until_it_fits_and_the_next_that_does_not_fit_ends_the_draw(objects):
@@ -250,8 +254,11 @@ def test_the_first_object_is_redrawn_until_it_fits_and_the_next_that_does_not_fi
     rare = fake(volume, np.arange(100) == 40, objects)
     # A second object fits in one draw of a hundred with repeats, and never without.
     for mode, shortfall, most in (("move", 0.02, 1), ("move", 0.005, 2), ("pick", 0.005, 1)):
-        config = settings(bake__mode=mode, arrangement__volume=2.5e-4, arrangement__slot_shortfall=shortfall, arrangement__max_objects=2)
-        assert build.count_slots(config, rare) == (0, most)
+        limits = {"arrangement__volume": 2.5e-4, "arrangement__slot_shortfall": shortfall, "arrangement__max_objects": 2}
+        assert build.count_slots(settings(bake__mode=mode, arrangement__fill="within", **limits), rare) == (0, most)
+        # Drawing on until the budget is exceeded, the other 99 are passed over.
+        both = (0, 2 if mode == "move" else 1)
+        assert build.count_slots(settings(bake__mode=mode, arrangement__fill="exceed", **limits), rare) == both
 
 
 @pytest.mark.parametrize(
@@ -276,7 +283,7 @@ def test_repeat_rules_of_the_possible_modes(mode, mix, rules, expected):
 def test_mixed_modes_have_enough_slots_for_each_mode(objects):
     """For each slot type: picking may need more of one and moving more of the other."""
     some = fake(np.full(6, 1e-4), np.array([0, 0, 0, 0, 1, 1]), objects)
-    config = {"arrangement__volume": 5.5e-4, "arrangement__max_objects": 12}
+    config = {"arrangement__volume": 5.5e-4, "arrangement__max_objects": 12, "arrangement__fill": "within"}
     single = [build.count_slots(settings(bake__mode=mode, **config), some) for mode in ("pick", "target", "move")]
     assert build.count_slots(settings(bake__mode="mixed", **config), some) == tuple(np.max(single, axis=0))
     assert build.count_slots(settings(bake__mode="mixed", bake__mix=[1, 1, 0], **config), some) == single[0] == single[1] != single[2]
@@ -334,8 +341,9 @@ def sizes_of_boxes(budget: float) -> st.SearchStrategy[float]:
     room=st.sampled_from((1, 2, 3, 24, 32)),
     mode=st.sampled_from(("move", "pick")),
     repeats=st.booleans(),
+    fill=st.sampled_from(("exceed", "within")),
 )
-def test_any_catalog_of_one_to_three_objects_gets_arrangements(data, budget, room, mode, repeats, objects):
+def test_any_catalog_of_one_to_three_objects_gets_arrangements(data, budget, room, mode, repeats, fill, objects):
     """Either all but single draws have their body slots, or one line says that no object fits."""
     volume = np.array(data.draw(st.lists(sizes_of_boxes(budget), min_size=1, max_size=3)))
     compound = np.array(data.draw(st.lists(st.integers(0, 1), min_size=len(volume), max_size=len(volume))))
@@ -344,6 +352,7 @@ def test_any_catalog_of_one_to_three_objects_gets_arrangements(data, budget, roo
         move__repeats=repeats,
         pick__repeats=repeats,
         arrangement__volume=budget,
+        arrangement__fill=fill,
         arrangement__max_objects=room,
         arrangement__slot_shortfall=1e-3,
     )

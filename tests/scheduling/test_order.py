@@ -30,6 +30,7 @@ def predicted_frames(config, episodes, modes) -> np.ndarray:
             volume=np.array([entry.volume for entry in OBJECTS.entries]),
             compound=np.zeros(len(OBJECTS)),
             budget=config.arrangement.volume,
+            exceed=config.arrangement.fill == "exceed",
             repeats=config.move.repeats if mode == Mode.MOVE else config.pick.repeats,
             room=config.arrangement.max_objects,
             single_slots=config.arrangement.max_objects,

@@ -36,7 +36,12 @@ def catalogs(draw):
         "instances": draw(st.integers(1, 16)),
         "single_slots": draw(st.integers(0, 16)),
         "compound_slots": draw(st.integers(0, 6)),
-        "drop": {"volume": draw(st.floats(0.01, 3.0)), "move_repeats": draw(st.integers(0, 1)), "pick_repeats": draw(st.integers(0, 1))},
+        "drop": {
+            "volume": draw(st.floats(0.01, 3.0)),
+            "exceed": draw(st.integers(0, 1)),
+            "move_repeats": draw(st.integers(0, 1)),
+            "pick_repeats": draw(st.integers(0, 1)),
+        },
         "mix": draw(st.sampled_from(((0.0, 0.0, 1.0), (1.0, 0.0, 0.0), (1.0, 1.0, 2.0)))),
     }
 
@@ -56,6 +61,7 @@ def expected_arrangements(worlds: KernelWorlds, seed: int = SEED) -> list[arrang
             volume=worlds.volume,
             compound=worlds.compound,
             budget=worlds.scene.drop.volume,
+            exceed=bool(worlds.scene.drop.exceed),
             repeats=may_repeat(worlds, world),
             room=worlds.instances,
             single_slots=worlds.single_slots,
@@ -83,7 +89,16 @@ def test_draws_are_the_twins_and_keep_the_law(sizes, seed, first, arrangement, d
 
 
 def check_law(worlds: KernelWorlds, world: int, catalog_index: np.ndarray, slot: np.ndarray) -> None:
-    assert worlds.volume[catalog_index].sum() <= worlds.scene.drop.volume * (1 + 1e-6)
+    drop, volume = worlds.scene.drop, worlds.volume[catalog_index]
+    assert (volume <= drop.volume * (1 + 1e-6)).all()
+    if not drop.exceed:
+        assert volume.sum() <= drop.volume * (1 + 1e-6)
+    elif len(volume):
+        # Only the last object exceeds the budget, and none is missing unless there is no further room or object.
+        assert volume[:-1].sum() < drop.volume * (1 + 1e-6)
+        drawable = (worlds.volume <= drop.volume).sum()
+        full = len(volume) == (worlds.instances if may_repeat(worlds, world) else min(worlds.instances, drawable))
+        assert full or volume.sum() >= drop.volume * (1 - 1e-6)
     assert len(set(slot)) == len(slot)
     np.testing.assert_array_equal(slot >= worlds.single_slots, worlds.compound[catalog_index] == 1)
     assert (slot < worlds.slots).all()
@@ -184,17 +199,22 @@ def test_a_budget_for_everything_draws_everything_without_repeats(device):
     assert len(np.unique(worlds.state.catalog_index.numpy(), axis=0)) == 6
 
 
-def test_the_budget_may_be_met_exactly(device):
-    worlds = arrangement_worlds(
-        device, WORLDS, volume=np.array([0.25]), compound=np.array([0]), radius=np.array([0.1]), drop={"volume": 1.0}
-    )
+@pytest.mark.parametrize(
+    ("volume", "exceed", "objects"), [(1.0, 0, 4), (1.0, 1, 4), (1.1, 0, 4), (1.1, 1, 5), (0.9, 0, 3), (0.9, 1, 4), (9.0, 1, 8)]
+)
+def test_the_budget_may_be_met_exactly_and_the_object_that_exceeds_it_stays_or_not(device, volume, exceed, objects):
+    """Objects of a quarter, of which a world holds eight."""
+    one = {"volume": np.array([0.25]), "compound": np.array([0]), "radius": np.array([0.1])}
+    worlds = arrangement_worlds(device, WORLDS, **one, drop={"volume": volume, "exceed": exceed})
     worlds.begin(Phase.START)
     arrange.sample_episodes(worlds.scene, worlds.state, SEED)
-    assert ((worlds.state.catalog_index.numpy() == 0).sum(axis=1) == 4).all()
+    assert ((worlds.state.catalog_index.numpy() == 0).sum(axis=1) == objects).all()
 
 
-def test_an_object_that_never_fits_is_never_drawn(device):
-    worlds = arrangement_worlds(device, WORLDS, drop={"volume": 0.25})
+@pytest.mark.parametrize("repeats", [0, 1])
+@pytest.mark.parametrize("exceed", [0, 1])
+def test_an_object_that_never_fits_is_never_drawn(device, exceed, repeats):
+    worlds = arrangement_worlds(device, WORLDS, drop={"volume": 0.25, "exceed": exceed, "move_repeats": repeats})
     worlds.begin(Phase.START)
     arrange.sample_episodes(worlds.scene, worlds.state, SEED)
     catalog_index = worlds.state.catalog_index.numpy()
@@ -214,8 +234,16 @@ def test_each_mode_has_its_own_rule_of_repeating(device):
     np.testing.assert_array_equal(count, np.where(moving, 8, 3))
 
 
-@pytest.mark.parametrize("mix", [(1.0, 0.0, 0.0), (1.0, 1.0, 2.0)])
-def test_counted_slots_hold_the_draws_of_all_modes(device, mix):
+@pytest.mark.parametrize(
+    ("mix", "fill", "slots"),
+    [
+        ((1.0, 0.0, 0.0), "within", (2, 1)),
+        ((1.0, 1.0, 2.0), "within", None),
+        ((1.0, 0.0, 0.0), "exceed", (2, 1)),
+        ((1.0, 1.0, 2.0), "exceed", None),
+    ],
+)
+def test_counted_slots_hold_the_draws_of_all_modes(device, mix, fill, slots):
     """What scenes.build counts is enough for what the device draws, but for the accepted share."""
     shortfall, episodes = 0.02, 2000
     config = small_worlds.settings(
@@ -224,6 +252,7 @@ def test_counted_slots_hold_the_draws_of_all_modes(device, mix):
         arrangement__volume=1.2e-3,
         arrangement__max_objects=12,
         arrangement__slot_shortfall=shortfall,
+        arrangement__fill=fill,
     )
     objects = small_worlds.catalog()
     single, compound = build.count_slots(config, objects)
@@ -236,13 +265,13 @@ def test_counted_slots_hold_the_draws_of_all_modes(device, mix):
         instances=12,
         single_slots=single,
         compound_slots=compound,
-        drop={"volume": 1.2e-3, "move_repeats": 1, "pick_repeats": 0},
+        drop={"volume": 1.2e-3, "exceed": int(fill == "exceed"), "move_repeats": 1, "pick_repeats": 0},
     )
     worlds.begin(Phase.START)
     arrange.sample_episodes(worlds.scene, worlds.state, SEED)
     over = (worlds.state.ending.numpy() == Ending.ARRANGEMENT_OVERFLOW).mean()
     assert over <= shortfall + 4 * np.sqrt(shortfall / episodes)
-    assert (single, compound) == (2, 1) if mix[2] == 0.0 else over > 0.0
+    assert (single, compound) == slots if slots else over > 0.0
 
 
 @pytest.mark.parametrize("phase", [Phase.EMPTY, Phase.SETTLE, Phase.ACT, Phase.OVER])

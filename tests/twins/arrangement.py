@@ -38,12 +38,13 @@ def sample_objects(
     volume: np.ndarray,
     compound: np.ndarray,
     budget: float,
+    exceed: bool,
     repeats: bool,
     room: int,
     single_slots: int,
     compound_slots: int,
 ) -> Arrangement:
-    """Sample until the next object would exceed the budget; sums in float32, as on the device."""
+    """Sample until the total reaches the budget (`exceed`), or until the next object would exceed it; sums in float32, as on the device."""
     key = rng.stream_key(seed, episode, arrangement, Stream.OBJECTS)
     sequence = rng.uniform_index(key, np.arange(MAX_SAMPLES), len(volume))
     entries: list[int] = []
@@ -54,8 +55,8 @@ def sample_objects(
         if not repeats and candidate in entries:
             continue
         following = total + np.float32(volume[candidate])
-        if following > np.float32(budget):
-            if entries:
+        if (np.float32(volume[candidate]) if exceed else following) > np.float32(budget):
+            if entries and not exceed:
                 break
             continue
         if not free[bool(compound[candidate])]:
@@ -63,7 +64,7 @@ def sample_objects(
         entries.append(candidate)
         slots.append(free[bool(compound[candidate])].pop(0))
         total = following
-        if len(entries) == room or (not repeats and len(entries) == len(volume)):
+        if (exceed and total >= np.float32(budget)) or len(entries) == room or (not repeats and len(entries) == len(volume)):
             break
     return Arrangement(tuple(entries), tuple(slots))
 

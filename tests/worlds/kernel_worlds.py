@@ -20,6 +20,7 @@ GUIDES = (6, 7, 8, 9)
 SHAPES = 20
 
 DROP: dict[str, Any] = {
+    "exceed": 0,
     "volume": 1.0,
     "move_repeats": 1,
     "pick_repeats": 1,

@@ -16,10 +16,11 @@ from synpick_warp.configs.splits import bop_folder, bop_folders
 from synpick_warp.exporters.base import ExportContext, view_bytes
 from synpick_warp.exporters.bop.keypoints import sample_keypoints
 from synpick_warp.exporters.bop.scene import discard_scenes
-from synpick_warp.exporters.bop.shared.models import CAMERA_FILE, MODEL_FOLDERS, NOTES_FILE, describe_dataset, write_constants
+from synpick_warp.exporters.bop.shared.models import MODEL_FOLDERS, describe_dataset, write_constants
 from synpick_warp.exporters.bop.shared.toolkit import PARAMS_FILE, format_dataset_params
 from synpick_warp.exporters.bop.view import ViewSettings, make_camera_constants, make_view_task
 from synpick_warp.exporters.writing.files import PARTIAL, output_error
+from synpick_warp.exporters.writing.notes import CAMERA_FILE, NOTES_FILE
 from synpick_warp.exporters.writing.pool import WriteTask
 from synpick_warp.frames import EpisodeEnd, FrameBatch, TickBatch
 

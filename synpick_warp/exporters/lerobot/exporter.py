@@ -43,6 +43,7 @@ from synpick_warp.exporters.lerobot.layout import (
 from synpick_warp.exporters.lerobot.part import TICK
 from synpick_warp.exporters.lerobot.video import GROUP, write_frame, write_spooled_group
 from synpick_warp.exporters.writing.files import PARTIAL, output_error
+from synpick_warp.exporters.writing.notes import note_files, write_notes
 from synpick_warp.exporters.writing.pool import WriterPool, WriteTask
 from synpick_warp.frames import EpisodeEnd, FrameBatch, TickBatch
 from synpick_warp.system.shared_memory import shared_bytes
@@ -103,7 +104,7 @@ class LerobotExporter:
         """See `Exporter`."""
         videos = video_folders(len(config.cameras.positions), episodes_end(config))
         between = (EPISODES.parent, EPISODES.parent.parent, META, DATA.parent, DATA.parent.parent)
-        return SharedFiles((), (INFO, STATS, TASKS, EPISODES, DATA, CARD), (PARTS, *videos, *between, FOLDER))
+        return SharedFiles(note_files(config), (INFO, STATS, TASKS, EPISODES, DATA, CARD), (PARTS, *videos, *between, FOLDER))
 
     @staticmethod
     def finalize(out: Path, config: Config, pool: WriterPool) -> list[Path]:
@@ -114,8 +115,12 @@ class LerobotExporter:
             raise output_error(out / FOLDER, error) from error
 
     def write_constants(self) -> list[Path]:
-        """See `Exporter`: none."""
-        return []
+        """See `Exporter`: camera and notes."""
+        context = self._context
+        try:
+            return write_notes(context.out, context.config, self._settings.objects, context.cameras)
+        except OSError as error:
+            raise output_error(context.out, error) from error
 
     def write_views(self, batch: FrameBatch) -> None:
         """See `Exporter`."""

@@ -80,7 +80,7 @@ def make_rows(ticks: np.ndarray, attempts: Sequence[Mapping[str, Any]], sentence
 def describe_tasks(
     mode: str, frames: int, attempts: Iterable[Mapping[str, Any]], objects: Mapping[int, str]
 ) -> tuple[list[str], np.ndarray]:
-    """The task of each frame in words: that of the running attempt, or else of the next one, or else the episode's.
+    """The task of each frame in words: that of the running attempt, or else of the next one, of the last one, or of the episode.
 
     Args:
         mode: Mode of the episode.
@@ -100,6 +100,9 @@ def describe_tasks(
             name = objects.get(attempt["object_id"], f"object {attempt['object_id']}")
             of_frame[begin : attempt["end_frame"]] = f"{verb} the {speak(name)} out of the tote"
         begin = attempt["end_frame"]
+    # The frame in which the last attempt was judged belongs to no attempt.
+    if 0 < begin < frames:
+        of_frame[begin:] = of_frame[begin - 1]
     sentences = list(dict.fromkeys(of_frame.tolist()))
     return sentences, np.array([sentences.index(sentence) for sentence in of_frame], np.int32)
 

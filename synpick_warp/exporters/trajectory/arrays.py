@@ -51,6 +51,8 @@ class GroupSpec:
 
     description: str
     arrays: Mapping[str, ArraySpec] = field(default_factory=dict)
+    coordinates: tuple[str, ...] = ()
+    """Arrays that xarray takes for coordinates of the others (CF conventions)."""
 
 
 _GONE = " NaN: the instance is not in the scene."
@@ -78,6 +80,7 @@ TICKS = GroupSpec(
         "attached": ArraySpec(("tick", "instance"), "|b1", "1", "Whether the instance hangs on the cup, or was picked in this tick."),
         "peak_force": ArraySpec(("tick",), "<f4", "N", "Largest force of any seal in any step of the tick."),
     },
+    ("time",),
 )
 STEPS = GroupSpec(
     "One row per step of physics. With S steps per tick, rows f S to f S + S - 1 are the steps that led to frame f; the last one is the "
@@ -109,6 +112,7 @@ STEPS = GroupSpec(
         ),
         "task": ArraySpec(("step",), "|i1", "1", "Task of the gripper in the step.", names(Task)),
     },
+    ("time",),
 )
 ARRANGEMENT = GroupSpec(
     "Which objects the episode has, and how they were first dropped.",

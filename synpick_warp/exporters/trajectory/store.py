@@ -20,8 +20,9 @@ zarr.config.set(ZARR_THREADS)
 
 
 def add_group(parent: zarr.Group, name: str, doc: GroupSpec, attributes: Mapping[str, Any] | None = None) -> zarr.Group:
-    """Create an empty group with its description as attribute."""
-    return parent.create_group(name, attributes={"description": doc.description, **(attributes or {})})
+    """Create an empty group with its description, and the names of its coordinates if it has any, as attributes."""
+    coordinates = {"coordinates": " ".join(doc.coordinates)} if doc.coordinates else {}
+    return parent.create_group(name, attributes={"description": doc.description, **coordinates, **(attributes or {})})
 
 
 def add_array(group: zarr.Group, name: str, spec: ArraySpec, data: np.ndarray, level: int, chunk: int = 0, shard: int = 0) -> None:
@@ -36,7 +37,7 @@ def add_array(group: zarr.Group, name: str, spec: ArraySpec, data: np.ndarray, l
         chunk: Rows per chunk (compressed together); 0: all.
         shard: Rows per shard (file), a multiple of `chunk`; 0: the array is not sharded.
     """
-    attributes: dict[str, Any] = {"unit": spec.unit, "description": spec.description}
+    attributes: dict[str, Any] = {"units": spec.unit, "description": spec.description}
     labels = {dim: list(LABELS[dim]) for dim in spec.dims if dim in LABELS}
     if labels:
         attributes["labels"] = labels

@@ -21,6 +21,7 @@ from synpick_warp.dataset.reading import LEROBOT_PARTS
 from synpick_warp.errors import ConfigError, DatasetError
 from synpick_warp.exporters.lerobot import layout
 from synpick_warp.exporters.lerobot.exporter import LerobotExporter, video_rate
+from synpick_warp.exporters.lerobot.part import describe_tasks
 from synpick_warp.exporters.lerobot.video import GROUP
 from synpick_warp.exporters.registry import load_exporter_classes
 from tests.harness.exporter_contract import ExporterContract, digests, exporting, finish
@@ -107,6 +108,34 @@ def test_attempts_become_tasks_rewards_and_outcomes(data, dataset):
     assert data["next.reward"][first].tolist() == [0, 0, 0, 0, 1, 0, 0, 0, 0, 0, 0]
     assert data["next.success"][first].sum() == 1
     assert np.flatnonzero(data["next.done"]).tolist() == [FRAMES - 1, 2 * FRAMES - 1]
+
+
+OBJECTS = {1: "001_first", 2: "second"}
+FIRST, SECOND, WHOLE, STIR = (
+    "pick the first out of the tote",
+    "pick the second out of the tote",
+    "pick all objects out of the tote",
+    "stir the objects in the tote",
+)
+
+
+@pytest.mark.parametrize(
+    ("mode", "attempts", "sentences"),
+    [
+        # (obj_id of the target, first frame, frame in which it had ended). The last attempt ends in the episode's last frame.
+        ("pick", [(1, 0, 3), (2, 3, 6)], 3 * [FIRST] + 4 * [SECOND]),
+        ("pick", [(1, 0, 6)], 7 * [FIRST]),
+        ("pick", [(1, 1, 3), (None, 3, 4)], 3 * [FIRST] + 4 * [WHOLE]),
+        ("pick", [(None, 0, 1), (2, 1, 6)], [WHOLE] + 6 * [SECOND]),
+        ("pick", [], 7 * [WHOLE]),
+        ("move", [], 7 * [STIR]),
+    ],
+)
+def test_the_last_frame_keeps_the_sentence_of_the_last_attempt(mode, attempts, sentences):
+    rows = [{"object_id": target, "frame": first, "end_frame": last} for target, first, last in attempts]
+    found, tasks = describe_tasks(mode, 7, rows, OBJECTS)
+    assert [found[task] for task in tasks] == sentences
+    assert len(found) == len(set(sentences))
 
 
 def test_videos_show_the_views_at_exact_times(dataset, episodes):

@@ -191,7 +191,7 @@ def test_every_array_has_unit_description_and_dimension_names(store):
     once, each = (sum(len(doc.arrays) for doc in docs.values()) for docs in (tables.CONSTANT_GROUPS, tables.EPISODE_GROUPS))
     assert len(stored) == once + len(EPISODES) * each
     for path, array in stored.items():
-        assert array.attrs["unit"], path
+        assert array.attrs["units"], path
         assert array.attrs["description"].endswith("."), path
         names = array.metadata.dimension_names
         assert len(names) == len(set(names)) == array.ndim, path
@@ -202,6 +202,10 @@ def test_every_array_has_unit_description_and_dimension_names(store):
     for path, group in store.members(max_depth=None):
         if isinstance(group, zarr.Group) and path.count("/") != 1:
             assert group.attrs["description"].endswith("."), path
+            for name in group.attrs.get("coordinates", "").split():
+                # As xarray takes them: along a dimension of the group's other arrays.
+                assert group[name].metadata.dimension_names == (path.rpartition("/")[2].removesuffix("s"),), path
+            assert ("coordinates" in group.attrs) == path.endswith(("/ticks", "/steps")), path
 
 
 def test_equally_named_dimensions_have_equal_sizes(store):

@@ -75,6 +75,8 @@ def make_annotations(
 ) -> Iterator[dict[str, Any]]:
     """Annotations of a view's visible instances, without ids: box of the visible mask, its run lengths, extras of ours, keypoints.
 
+    Widths and heights of both boxes count pixels (+ 1), unlike those of scene_gt_info.json; `bbox_amodal` may exceed the image.
+
     Args:
         poses: The view's entry in scene_gt.json.
         infos: The view's entry in scene_gt_info.json.
@@ -93,7 +95,7 @@ def make_annotations(
                 "area": mask.visible.count,
                 "iscrowd": 0,
                 "segmentation": make_rle(mask.visible, height, width),
-                "bbox_amodal": info["bbox_obj"],
+                "bbox_amodal": [*info["bbox_obj"][:2], *(size + 1 for size in info["bbox_obj"][2:])],
                 "visib_fract": info["visib_fract"],
                 "instance_id": pose["instance_id"],
             } | extra

@@ -39,6 +39,7 @@ from synpick_warp.exporters.bop.view import (
     read_depth,
 )
 from synpick_warp.exporters.writing.files import output_error
+from synpick_warp.exporters.writing.notes import note_files, write_notes
 from synpick_warp.exporters.writing.pool import WriterPool
 
 
@@ -80,7 +81,7 @@ class CocoExporter(SceneExporter):
     def shared_files(config: Config) -> SharedFiles:
         """See `Exporter`."""
         places = tuple(map(annotation_file, bop_folders(config)))
-        return SharedFiles((CATEGORIES,), places, (IMAGES, PARTS, places[0].parent, FOLDER))
+        return SharedFiles((CATEGORIES, *note_files(config)), places, (IMAGES, PARTS, places[0].parent, FOLDER))
 
     @staticmethod
     def finalize(out: Path, config: Config, pool: WriterPool) -> list[Path]:
@@ -91,9 +92,13 @@ class CocoExporter(SceneExporter):
             raise output_error(out / FOLDER, error) from error
 
     def write_constants(self) -> list[Path]:
-        """See `Exporter`: names and keypoints of the objects."""
-        write_categories(self._out, {entry.obj_id: entry.name for entry in self._context.catalog.entries}, self._keypoints)
-        return [CATEGORIES]
+        """See `Exporter`: names and keypoints of the objects, camera and notes."""
+        names = {entry.obj_id: entry.name for entry in self._context.catalog.entries}
+        write_categories(self._out, names, self._keypoints)
+        try:
+            return [CATEGORIES, *write_notes(self._out, self._context.config, names, self._cameras)]
+        except OSError as error:
+            raise output_error(self._out, error) from error
 
     def files(self, episode: int) -> list[Path]:
         """See `Exporter`: folders of images, and parts."""

@@ -14,6 +14,7 @@ from synpick_warp.configs.schema import MULTISENSOR, Config
 from synpick_warp.errors import CatalogError
 from synpick_warp.exporters.bop.shared.toolkit import describe_toolkit
 from synpick_warp.exporters.bop.view import MILLIMETERS
+from synpick_warp.exporters.writing.notes import CAMERA_FILE, write_camera
 from synpick_warp.exporters.writing.png import encode_png
 from synpick_warp.inputs.paths import path_inside
 from synpick_warp.layer_codec import layer_notes
@@ -22,7 +23,6 @@ from synpick_warp.scenes.assets.models_info import corrected_entry, read_entries
 from synpick_warp.scenes.assets.ply import read_ply_file, read_ply_texture
 from synpick_warp.scenes.types import Camera, Catalog, CatalogEntry, Material
 
-CAMERA_FILE, NOTES_FILE = "camera.json", "dataset_info.md"
 MODEL_FOLDERS = ("models", "models_eval")
 """The toolkit renders the first and evaluates with the second; ours are equal."""
 
@@ -38,7 +38,7 @@ def write_constants(out: Path, catalog: Catalog, camera: Camera, depth_scale: fl
         if (out / name).exists():
             shutil.rmtree(out / name)
         write_models(out / name, catalog)
-    _write_json(out / CAMERA_FILE, _make_camera_file(camera, depth_scale))
+    write_camera(out / CAMERA_FILE, camera, depth_scale)
     for name, text in texts.items():
         (out / name).write_text(text, encoding="utf-8", newline="\n")
     return [Path(name) for name in (*MODEL_FOLDERS, CAMERA_FILE, *texts)]
@@ -154,11 +154,6 @@ def _tint_texture(material: Material) -> np.ndarray:
     return np.stack([table[material.texture[..., channel], channel] for channel in range(3)], axis=-1)
 
 
-def _make_camera_file(camera: Camera, depth_scale: float) -> dict[str, Any]:
-    (fx, _, cx), (_, fy, cy), _ = camera.matrix.tolist()
-    return {"width": camera.width, "height": camera.height, "fx": fx, "fy": fy, "cx": cx, "cy": cy, "depth_scale": depth_scale}
-
-
 def _write_json(path: Path, content: object) -> None:
     path.write_text(json.dumps(content, indent=2) + "\n", encoding="ascii")
 
@@ -189,8 +184,8 @@ BOP challenge (scenewise). {_describe_scenes(config, count)} of {_describe_folde
 
 - Lengths are in millimetres. A depth image's count times `depth_scale` ({config.bop.depth_scale:g}) is the planar depth, along the
   optical axis; 0: no surface.
-- Pictures have {camera.width} x {camera.height} pixels. The centre of pixel (row, column) is (column + 0.5, row + 0.5). Cameras have
-  x right, y down, z forward.
+- Pictures have {camera.width} x {camera.height} pixels. The centre of pixel (row, column) is (column + 0.5, row + 0.5): for OpenCV and
+  Open3D, whose pixel centres have whole coordinates, subtract 0.5 from cx and cy. Cameras have x right, y down, z forward.
 - `cam_R_w2c` and `cam_t_w2c` lead from the tote's frame (centre of its inner floor, z up) to the camera.
 - `light` in scene_camera.json describes the episode's light: the map's name, its yaw [rad], the exposure relative to the automatic
   one [EV], and the direction to the sun or lamp that casts shadows, in the tote's frame; null if none is dominant.

@@ -1,0 +1,74 @@
+"""camera.json, and dataset_info.md of data sets that have neither the format bop nor shards, whose notes are those of BOP."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+
+from synpick_warp.configs.modes import bake_modes
+from synpick_warp.configs.schema import Config
+from synpick_warp.scenes.types import Camera
+
+CAMERA_FILE, NOTES_FILE = "camera.json", "dataset_info.md"
+
+
+def note_files(config: Config) -> tuple[Path, ...]:
+    """Files that `write_notes` writes, relative to the data set; none where bop or shards write theirs."""
+    return () if {"bop", "shards"} & set(config.bake.formats) else (Path(CAMERA_FILE), Path(NOTES_FILE))
+
+
+def write_camera(path: Path, camera: Camera, depth_scale: float) -> None:
+    """Write camera.json: size, intrinsics [px] and millimetres per count of depth."""
+    (fx, _, cx), (_, fy, cy), _ = camera.matrix.tolist()
+    content = {"width": camera.width, "height": camera.height, "fx": fx, "fy": fy, "cx": cx, "cy": cy, "depth_scale": depth_scale}
+    path.write_text(json.dumps(content, indent=2) + "\n", encoding="ascii")
+
+
+def write_notes(out: Path, config: Config, names: Mapping[int, str], cameras: tuple[Camera, ...]) -> list[Path]:
+    """Write `note_files`, replacing existing ones; returns their paths.
+
+    Args:
+        out: The data set.
+        config: Its settings.
+        names: obj_id -> name.
+        cameras: The cameras.
+
+    Raises:
+        OSError: A file cannot be written.
+    """
+    places = note_files(config)
+    if places:
+        write_camera(out / CAMERA_FILE, cameras[0], config.bop.depth_scale)
+        (out / NOTES_FILE).write_text(_describe(config, names, cameras), encoding="utf-8", newline="\n")
+    return list(places)
+
+
+def _describe(config: Config, names: Mapping[int, str], cameras: tuple[Camera, ...]) -> str:
+    """Text of dataset_info.md: conventions, cameras and objects."""
+    camera, period = cameras[0], config.physics.step * config.physics.steps_per_tick
+    objects = "\n".join(f"| {index} | {name} |" for index, name in sorted(names.items()))
+    poses = "\n".join(f"| {index} | {_row(one.rotation.ravel())} | {_row(one.translation)} |" for index, one in enumerate(cameras))
+    return f"""# A SynPick data set
+
+Made by synpick-warp (mode {", ".join(bake_modes(config))}, seed {config.bake.seed}, {len(cameras)} cameras, formats
+{", ".join(sorted(config.bake.formats))}). Frames are {period:g} s apart.
+
+- Pictures have {camera.width} x {camera.height} pixels and no lens distortion; `camera.json` has the intrinsics of all cameras.
+  The centre of pixel (row, column) is (column + 0.5, row + 0.5): for OpenCV and Open3D, whose pixel centres have whole
+  coordinates, subtract 0.5 from cx and cy. Cameras have x right, y down, z forward.
+- The world is the tote's frame: centre of its inner floor, z up, metres.
+- `config.toml` has all settings, `episodes.jsonl` a line an episode, `attempts.jsonl` one for each attempt to pick.
+
+| camera | world to camera, row-major | translation [m] |
+|---|---|---|
+{poses}
+
+| obj_id | name |
+|---|---|
+{objects}
+"""
+
+
+def _row(values: object) -> str:
+    return ", ".join(f"{value:.9g}" for value in (0.0 + round(float(value), 9) for value in values))  # type: ignore[attr-defined]
