@@ -10,9 +10,10 @@ from typing import Annotated
 from cyclopts import Parameter
 from rich.console import Console
 
+from synpick_warp.cli.folders import check_output_file, find_data_set
 from synpick_warp.cli.options import MAX_THREADS, WholeNumber, check_range
 from synpick_warp.configs.check import escape
-from synpick_warp.errors import ConfigError, DatasetError
+from synpick_warp.errors import DatasetError
 
 MAX_DEPTH_VIEWS = 100_000
 MEBIBYTE = 2**20
@@ -20,7 +21,7 @@ MEBIBYTE = 2**20
 
 
 def show_statistics(
-    folder: Annotated[Path, Parameter(name="DIR", help="A data set.")],
+    folder: Annotated[Path | None, Parameter(name="DIR", help="A data set (default: the last one in the current folder).")] = None,
     /,
     *,
     json: Annotated[bool, Parameter(negative=(), help="Print all statistics as JSON instead of tables.")] = False,
@@ -35,12 +36,12 @@ def show_statistics(
     """
     check_range("--depth-views", depth_views, 0, MAX_DEPTH_VIEWS)
     check_range("--threads", threads, 0, MAX_THREADS)
+    folder = find_data_set(folder, "synpick-warp stats DIR")
     from synpick_warp.statistics.output import check_csv_folder, print_statistics, to_json, write_csv
 
     if csv is not None:
         check_csv_folder(csv)
-        if csv.resolve().is_relative_to(folder.resolve()):
-            raise ConfigError(f"--csv is {csv}, inside the data set {folder}; name a folder outside of it")
+        check_output_file(csv, "--csv", folder)
     from synpick_warp.cli.display import CountProgress, make_console
     from synpick_warp.dataset.reading import open_data_set
     from synpick_warp.statistics.collect import collect

@@ -38,7 +38,6 @@ from synpick_warp.report.tables import findings_list, settings_tables, statistic
 from synpick_warp.statistics import Statistics, compute_statistics
 
 SUFFIXES = (".html", ".htm")
-DEFAULT_NAME = "report.html"
 FRAMES = 12
 """Sampled frames on the page."""
 MAX_FRAMES = 200

@@ -23,6 +23,8 @@ CANDIDATES = ("pole", "centroid", "midpoint")
 
 MAX_ATTEMPTS = 100
 """Most attempts of one figure."""
+MIN_CHOICE = 3
+"""Fewest visible objects of an attempt that is worth seeing."""
 MAX_RUNS = 20
 """Most ranges of numbers that a message lists."""
 
@@ -93,12 +95,7 @@ def read_attempts(dataset: Path, episode: int, number: int | None) -> list[Attem
     Raises:
         DatasetError: The file is missing or damaged, or has no such episode or attempt.
     """
-    path = dataset / ATTEMPTS_FILE
-    if not path.exists():
-        raise DatasetError(
-            f"{dataset} has no {path.name}: it has no pick attempts; explain draws those of a bake with mode pick, target or mixed"
-        )
-    lines = read_file(path, MAX_JSON, DatasetError).splitlines()
+    path, lines = _read_lines(dataset)
     keys = [decode_json(line, records.AttemptKey, _line(path, row), DatasetError, ADVICE) for row, line in enumerate(lines)]
     episodes = sorted({key.episode for key in keys})
     if episode not in episodes:
@@ -116,6 +113,46 @@ def read_attempts(dataset: Path, episode: int, number: int | None) -> list[Attem
         for count, row in rows
         if number in (None, count)
     ]
+
+
+def choose_attempts(dataset: Path, count: int) -> list[Attempt]:
+    """Choose the first attempts worth seeing; if there are fewer, others from the beginning stand in. In the order of the file.
+
+    Worth seeing is an attempt that chose among MIN_CHOICE objects or more, of which some lie on others, and engaged one.
+
+    Raises:
+        DatasetError: The file is missing or damaged, or has no attempt.
+    """
+    path, lines = _read_lines(dataset)
+    worthy: dict[int, Attempt] = {}
+    others: dict[int, Attempt] = {}
+    for row, line in enumerate(lines):
+        attempt = _attempt(decode_json(line, records.Attempt, _line(path, row), DatasetError, ADVICE), _line(path, row))
+        chosen = attempt.target is not None and len(attempt.seen) >= MIN_CHOICE and any(one.above for one in attempt.seen)
+        if chosen and attempt.engaged:
+            worthy[row] = attempt
+        elif len(others) < count:
+            others[row] = attempt
+        if len(worthy) == count:
+            break
+    if not worthy and not others:
+        raise DatasetError(f"{path} has no attempt; explain draws those of a bake with mode pick, target or mixed")
+    rows = [*worthy, *others][:count]
+    return [(worthy | others)[row] for row in sorted(rows)]
+
+
+def _read_lines(dataset: Path) -> tuple[Path, list[bytes]]:
+    """The file of attempts, and its lines.
+
+    Raises:
+        DatasetError: It is missing or cannot be read.
+    """
+    path = dataset / ATTEMPTS_FILE
+    if not path.exists():
+        raise DatasetError(
+            f"{dataset} has no {path.name}: it has no pick attempts; explain draws those of a bake with mode pick, target or mixed"
+        )
+    return path, read_file(path, MAX_JSON, DatasetError).splitlines()
 
 
 def parse_attempt(content: Mapping[str, Any], source: str) -> Attempt:

@@ -159,7 +159,7 @@ def test_wrong_options_are_named_in_one_line(folder, tmp_path, capsys):
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "thesis.txt").touch()
     assert refused(capsys, folder, "--csv", tmp_path / "full") == f"--csv is {tmp_path / 'full'}; allowed: a new or an empty folder"
-    assert refused(capsys, folder, "--csv", folder / "tables").startswith(f"--csv is {folder / 'tables'}, inside the data set")
+    assert refused(capsys, folder, "--csv", folder / "tables").startswith(f"--csv is {folder / 'tables'}, among the files of the data set")
 
 
 def test_names_are_neither_formulas_nor_markup(copy, capsys):

@@ -179,10 +179,10 @@ def test_a_sheet_has_at_most_the_views_of_the_set_and_at_most_max_views(dataset,
 
 def test_a_link_in_place_of_the_sheet_is_replaced_and_not_followed(dataset, tmp_path):
     (tmp_path / "victim").write_text("mine")
-    (dataset / "contact-sheet.png").symlink_to(tmp_path / "victim")
+    (tmp_path / "set-contact-sheet.png").symlink_to(tmp_path / "victim")
     assert main(["preview", str(dataset), "--views", "1"]) == 0
     assert (tmp_path / "victim").read_text() == "mine"
-    assert not (dataset / "contact-sheet.png").is_symlink()
+    assert not (tmp_path / "set-contact-sheet.png").is_symlink()
 
 
 @pytest.mark.parametrize("name", ["depth", "mask_visib"])
@@ -212,4 +212,4 @@ def test_wrong_types_in_annotations_are_one_line(dataset, capsys, name, place, v
     assert main(["preview", str(dataset)]) == 2
     [line] = capsys.readouterr().err.splitlines()
     assert re.search(said, line)
-    assert not (dataset / "contact-sheet.png").exists()
+    assert not (dataset.parent / "set-contact-sheet.png").exists()
