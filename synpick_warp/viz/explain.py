@@ -20,23 +20,20 @@ from synpick_warp.dataset.object_names import object_names
 from synpick_warp.dataset.view_files import read_image
 from synpick_warp.errors import DatasetError
 from synpick_warp.inputs.paths import path_inside
+from synpick_warp.viz.drawing import FONT, INK, WHITE, Image, check_picture_name, instance_color, put_text, readable_on, write_picture
 from synpick_warp.viz.explain_graph import (
     CYCLIC,
     GREY,
-    INK,
     OUTVOTED,
     RED,
-    WHITE,
     clutter_edges,
     disc,
     draw_graph,
     fixed,
     put_boxed,
-    readable_on,
 )
 from synpick_warp.viz.explain_panels import GREEN, LINE, PLOT_HEIGHT, SMALL, SOFT, TEXT, WORDS_WIDTH, draw_load, draw_words
 from synpick_warp.viz.explain_record import MODE_WORDS, Attempt, Pixel, choose_attempts, labels, read_attempts
-from synpick_warp.viz.preview import FONT, Image, check_picture_name, instance_color, put_text, write_picture
 
 DEFAULT_ATTEMPTS = 3
 """Attempts that are drawn if none is named."""

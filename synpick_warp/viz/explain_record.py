@@ -16,6 +16,7 @@ from synpick_warp.dataset.records import Pixel
 from synpick_warp.errors import DatasetError
 from synpick_warp.inputs.files import read_file
 from synpick_warp.inputs.json import MAX_JSON, decode_json
+from synpick_warp.viz.drawing import short_labels
 
 MODE_WORDS = {"pick": "untargeted", "target": "targeted"}
 CANDIDATES = ("pole", "centroid", "midpoint")
@@ -229,15 +230,8 @@ def _seen(record: records.InstanceObservation) -> SeenObject:
 
 
 def labels(attempt: Attempt) -> dict[int, str]:
-    """Short label of every visible instance: its obj_id, with a letter where several share it."""
-    by_object: dict[int, list[int]] = {}
-    for one in attempt.seen:
-        by_object.setdefault(one.object_id, []).append(one.instance)
-    return {
-        instance: f"{object_id}{chr(ord('a') + place) if len(group) > 1 else ''}"
-        for object_id, group in by_object.items()
-        for place, instance in enumerate(group)
-    }
+    """Short label of every visible instance, see `short_labels`."""
+    return short_labels((one.instance, one.object_id) for one in attempt.seen)
 
 
 def full_names(attempt: Attempt, names: Mapping[int, str]) -> dict[int, str]:

@@ -17,11 +17,11 @@ from synpick_warp.configs.write import config_to_toml
 from synpick_warp.errors import DatasetError, OutputError
 from synpick_warp.exporters.bop.exporter import BopExporter
 from synpick_warp.viz import explain
+from synpick_warp.viz.drawing import FONT, instance_color
 from synpick_warp.viz.explain import object_names, to_color_image, write_explanation
 from synpick_warp.viz.explain_graph import RED
 from synpick_warp.viz.explain_panels import draw_load, fitted, ticks, wrapped
 from synpick_warp.viz.explain_record import choice_words, labels, seal_words
-from synpick_warp.viz.preview import FONT, instance_color
 from tests.harness.exporter_contract import export
 from tests.worlds.attempt_records import attempt, nothing_seen, record, seen, seen_object
 from tests.worlds.box_views import config
