@@ -36,6 +36,7 @@ from synpick_warp.report.sampling import (
 from synpick_warp.report.strips import choose_episodes, make_strip
 from synpick_warp.report.tables import findings_list, settings_tables, statistics_tables, tiles
 from synpick_warp.statistics import Statistics, compute_statistics
+from synpick_warp.viz.depth_colors import tote_scale
 
 SUFFIXES = (".html", ".htm")
 FRAMES = 12
@@ -89,7 +90,7 @@ def write_report(data_set: DataSet, out: Path, *, frames: int = FRAMES, threads:
         parts=_parts(data_set, statistics, samples, findings, versions),
         findings=findings,
         data=samples.data,
-        charts=make_charts(Source(statistics, samples.brightness, data_set.config)),
+        charts=make_charts(Source(statistics, samples.brightness, data_set.config, _durations(data_set, episodes))),
         album=album,
         footer=f"synpick-warp {__version__}, report of {data_set.folder.resolve().name}. The page loads nothing from anywhere.",
     )
@@ -113,7 +114,8 @@ def take_samples(data_set: DataSet, statistics: Statistics, episodes: Episodes, 
     asked["frames"] = len(views)
     for done, view in enumerate(views):
         report("frames", done, len(views))
-        data["frames"] += _present(make_frame(view, content, names, episodes.rows[view.episode].mode, album))
+        scale = tote_scale(data_set.config, [view.records.camera])
+        data["frames"] += _present(make_frame(view, content, names, episodes.rows[view.episode].mode, album, scale))
     chosen = choose_episodes(episodes)
     asked["strips"] = len(chosen)
     for place, index in enumerate(chosen):
@@ -127,6 +129,14 @@ def take_samples(data_set: DataSet, statistics: Statistics, episodes: Episodes, 
         report("attempts", done, len(attempts))
         data["attempts"] += _present(make_attempt(data_set, found, content, names, album))
     return Samples(data, _measure(sample_views(data_set, episodes, SURVEY_VIEWS), report), asked)
+
+
+def _durations(data_set: DataSet, episodes: Episodes) -> dict[str, float]:
+    """Time of the longest episode of each mode [s]."""
+    physics, longest = data_set.config.physics, dict[str, int]()
+    for row in episodes.rows.values():
+        longest[row.mode] = max(longest.get(row.mode, 0), row.frames)
+    return {mode: frames * physics.step * physics.steps_per_tick for mode, frames in longest.items()}
 
 
 def _present(made: dict[str, Any] | None) -> list[dict[str, Any]]:

@@ -102,8 +102,8 @@ def draw_labels(image: Image, boxes: Sequence[Box], texts: Sequence[str], colors
         if place is None:
             continue
         if not place.meets(Box(box.x - 1, box.y - 1, box.width + 2, box.height + 2)):
-            ends = [(round(each.x + each.width / 2), round(each.y + each.height / 2)) for each in (place, box)]
-            cv2.line(image, *ends, _ground(color), 1, cv2.LINE_AA)
+            start, end = ((round(each.x + each.width / 2), round(each.y + each.height / 2)) for each in (place, box))
+            cv2.line(image, start, end, _ground(color), 1, cv2.LINE_AA)
         _put_label(image, text, place, color)
 
 

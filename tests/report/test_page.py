@@ -133,7 +133,7 @@ def test_sets_of_every_shape(data, tmp_path, capsys):
     shutil.copytree(data, folder)
     shutil.rmtree(folder / "train")
     assert main(["report", str(folder)]) == 0
-    assert capsys.readouterr().out.startswith(f"report: {folder / 'report.html'} (")
+    assert capsys.readouterr().out.startswith(f"report: {tmp_path / 'set-report.html'} (")
     assert len(Parsed(folder / "report.html").content()["frames"]) == 12
     shutil.rmtree(folder / "train_web")
     assert main(["report", str(folder), "--views", "2"]) == 0
