@@ -9,7 +9,7 @@ from cyclopts import Parameter
 from rich.console import Console
 
 from synpick_warp.cli.folders import beside, check_output_file, find_data_set
-from synpick_warp.cli.options import MAX_THREADS, WholeNumber, check_range
+from synpick_warp.cli.options import MAX_THREADS, PaperOption, WholeNumber, check_range
 from synpick_warp.configs.check import escape
 from synpick_warp.errors import DatasetError
 
@@ -24,6 +24,7 @@ def write_page(
     out: Annotated[Path | None, Parameter(help="HTML file to write (default DIR-report.html, beside the data set).")] = None,
     split: Annotated[str | None, Parameter(help="Only the episodes of this split (default: all splits).")] = None,
     views: Annotated[WholeNumber, Parameter(help="Frames that are shown, spread over the data set.")] = 12,
+    paper: PaperOption = None,
     threads: Annotated[WholeNumber, Parameter(help="Processes that count; 0: one per core.")] = 0,
 ) -> int:
     """Write a report: one HTML page with frames, film strips, explained attempts, plots, findings and settings.
@@ -48,6 +49,6 @@ def write_page(
     if split is not None:
         data_set = data_set.split(split)
     with CountProgress(Console(stderr=True, highlight=False, soft_wrap=True)) as counter:
-        write_report(data_set, page, frames=views, threads=threads, report=counter.report)
+        write_report(data_set, page, frames=views, paper=paper, threads=threads, report=counter.report)
     print(f"report: {escape(str(page))} ({page.stat().st_size / MEGABYTE:.1f} MB)")
     return 0

@@ -11,7 +11,7 @@ from cyclopts import Parameter
 from rich.console import Console
 
 from synpick_warp.cli.folders import check_output_file, find_data_set
-from synpick_warp.cli.options import MAX_THREADS, WholeNumber, check_range
+from synpick_warp.cli.options import MAX_THREADS, PaperOption, WholeNumber, check_range
 from synpick_warp.configs.check import escape
 from synpick_warp.errors import DatasetError
 
@@ -28,9 +28,12 @@ def show_statistics(
     csv: Annotated[Path | None, Parameter(help="New or empty folder for all tables as CSV files.")] = None,
     split: Annotated[str | None, Parameter(help="Only the episodes of this split (default: all splits).")] = None,
     depth_views: Annotated[WholeNumber, Parameter(help="Views whose depth image is read, spread over the data set; 0: none.")] = 64,
+    paper: PaperOption = None,
     threads: Annotated[WholeNumber, Parameter(help="Processes that read; 0: one per core.")] = 0,
 ) -> int:
-    """Count views, instances, visibility, attempts, seal forces, viewing directions, depth and lights, beside the paper's numbers.
+    """Count views, instances, visibility, attempts, seal forces, viewing directions, depth and lights.
+
+    The paper's numbers stand beside those of its own objects, or if --paper asks for them; --json and --csv always have them.
 
     Reads each annotation file once and holds only counts. Exit codes: 0; 2, the folder is not a data set, or a file of it is damaged.
     """
@@ -65,7 +68,7 @@ def show_statistics(
     if json:
         print(to_json(statistics))
     elif csv is None:
-        print_statistics(make_console(), statistics)
+        print_statistics(make_console(), statistics, paper)
     rate = f"{collected.views / wall:,.0f} views/s"
     summary = f"{collected.views:,} views in {wall:.1f} s ({rate}); peak memory {collected.memory / MEBIBYTE:,.0f} MiB"
     print(summary, file=sys.stderr if json else sys.stdout)

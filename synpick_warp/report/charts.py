@@ -173,8 +173,8 @@ def _objects(source: Source) -> Chart | None:
 
 
 def _edges(rows: Rows, width: float, top: float) -> list[float]:
-    """At most MAX_TICKS edges of bins, at equal steps, the last one among them."""
-    first, last = min(row["low"] for row in rows), max(top, *(row["high"] for row in rows))
+    """Edges of bins, at equal steps, the last one among them; 0 lies on the axis, and at most MAX_TICKS follow the first edge."""
+    first, last = min(0.0, *(row["low"] for row in rows)), max(top, *(row["high"] for row in rows))
     bins = round((last - first) / width)
     step = -(-bins // MAX_TICKS)
     return [round(last - index * width, 6) for index in range(0, bins + 1, step)][::-1]
@@ -190,7 +190,7 @@ def _histogram(rows: Rows, width: float, titles: tuple[str, str], labels: str, c
             titles[0],
             bin={"binned": True, "step": width},
             axis={"format": labels, "values": edges, "labelOverlap": False},
-            scale={"domain": [min(edges[0], *(row["low"] for row in rows)), edges[-1]]},
+            scale={"domain": [min(0.0, *(row["low"] for row in rows)), edges[-1]]},
         ),
         "x2": {"field": "high"},
         "y": _field("count", "quantitative", titles[1], stack="zero", axis=_COUNT_AXIS),
@@ -223,7 +223,9 @@ def _visibility(source: Source) -> Chart | None:
         return None
     mean = source.statistics.total.annotations.visibility
     caption = f"Visible fraction of each instance's silhouette; the mean is {mean:.3f}. Invisible instances are in the first bar."
-    return Chart("visibility", "Visibility", caption, _histogram(rows, 1 / VISIBILITY_BINS, ("visible fraction", "instances"), ".0%"))
+    return Chart(
+        "visibility", "Visibility", caption, _histogram(rows, 1 / VISIBILITY_BINS, ("visible fraction", "instances"), ".0%", top=1.0)
+    )
 
 
 def _named(source: Source, counts: dict[str, dict[Any, int]], value: str) -> tuple[Rows, list[str]]:
@@ -409,5 +411,6 @@ def _luma(source: Source) -> Chart | None:
         counts[min(int(view.mean * BRIGHTNESS_BINS), BRIGHTNESS_BINS - 1)] += 1
     if not any(counts):
         return None
-    spec = _histogram(_bins(counts, 1 / BRIGHTNESS_BINS), 1 / BRIGHTNESS_BINS, ("mean brightness (sRGB)", "views"), ".0%", colored=False)
+    rows, titles = _bins(counts, 1 / BRIGHTNESS_BINS), ("mean brightness (sRGB)", "views")
+    spec = _histogram(rows, 1 / BRIGHTNESS_BINS, titles, ".0%", colored=False, top=1.0)
     return Chart("brightness", "Brightness", f"Mean luma of {len(source.brightness)} views, spread over the data set.", spec)

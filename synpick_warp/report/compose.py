@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import os
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -55,7 +55,9 @@ class Samples:
     """Number of frames, strips and attempts that were to be shown; fewer are if the pictures' budget is spent."""
 
 
-def write_report(data_set: DataSet, out: Path, *, frames: int = FRAMES, threads: int = 0, report: Report | None = None) -> Path:
+def write_report(
+    data_set: DataSet, out: Path, *, frames: int = FRAMES, paper: bool | None = None, threads: int = 0, report: Report | None = None
+) -> Path:
     """Write the report of a data set, or of one of its splits.
 
         write_report(synpick_warp.open("DATA"), Path("report.html"))
@@ -64,6 +66,7 @@ def write_report(data_set: DataSet, out: Path, *, frames: int = FRAMES, threads:
         data_set: The data set; with settings.
         out: HTML file to write; its folder is created. A file is replaced, a link never followed.
         frames: Number of sampled frames.
+        paper: Whether the paper's numbers stand beside; None: if the objects are the paper's.
         threads: Maximum number of processes that count; 0: one per core.
         report: Receives the progress.
 
@@ -83,11 +86,12 @@ def write_report(data_set: DataSet, out: Path, *, frames: int = FRAMES, threads:
     versions, remarks = _versions(data_set)
     findings = [*remarks, *find(Figures(statistics, episodes, samples.brightness, data_set.planned))]
     findings.sort(key=lambda finding: finding.level != WARNING)
+    shown = statistics if (statistics.has_paper_objects if paper is None else paper) else replace(statistics, paper=())
     page = Page(
         title=data_set.folder.resolve().name or "data set",
         lead=_lead(data_set, statistics, findings),
         tiles=tiles(statistics),
-        parts=_parts(data_set, statistics, samples, findings, versions),
+        parts=_parts(data_set, shown, samples, findings, versions),
         findings=findings,
         data=samples.data,
         charts=make_charts(Source(statistics, samples.brightness, data_set.config, _durations(data_set, episodes))),
