@@ -16,6 +16,7 @@ from synpick_warp.cli.convert import convert
 from synpick_warp.cli.estimate import estimate
 from synpick_warp.cli.evaluate import evaluate
 from synpick_warp.cli.folders import DEFAULT_NAME, check_output_file, choose_output
+from synpick_warp.cli.limits import describe_limit
 from synpick_warp.cli.options import (
     EXIT_INCOMPLETE,
     Count,
@@ -225,7 +226,9 @@ def warmup(
     resolved = _resolve(config, given, resolution, set_)
     _check_inputs(resolved)
     from synpick_warp.cli.display import make_console, make_progress
-    from synpick_warp.factory.warmup import warm_up
+    from synpick_warp.factory.warmup import check_caches, warm_up
+
+    check_caches()
 
     with make_progress(make_console()) as progress:
         result = warm_up(resolved, progress)
@@ -280,6 +283,12 @@ def _run(arguments: list[str]) -> int:
     except KeyboardInterrupt:
         print(f"{NAME}: interrupted", file=sys.stderr)
         return EXIT_INTERRUPTED
+    except Exception as error:
+        said = describe_limit(error)
+        if said is None:
+            raise
+        print(f"{NAME}: error: {one_line(said)}", file=sys.stderr)
+        return EXIT_MISTAKE
 
 
 def _resolve(

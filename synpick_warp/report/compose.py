@@ -36,6 +36,7 @@ from synpick_warp.report.sampling import (
 from synpick_warp.report.strips import choose_episodes, make_strip
 from synpick_warp.report.tables import findings_list, settings_tables, statistics_tables, tiles
 from synpick_warp.statistics import Statistics, compute_statistics
+from synpick_warp.system.folders import make_folder
 from synpick_warp.viz.depth_colors import tote_scale
 
 SUFFIXES = (".html", ".htm")
@@ -238,7 +239,7 @@ def write_text(out: Path, pieces: Iterable[str]) -> None:
     """
     partial = out.with_name(f".{out.name}.{os.getpid()}")
     try:
-        out.parent.mkdir(parents=True, exist_ok=True)
+        make_folder(out.parent)
         try:
             # A link of the name is replaced, never followed.
             with open(partial, "x", encoding="utf-8", newline="\n") as file:

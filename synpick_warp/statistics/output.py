@@ -23,6 +23,7 @@ from synpick_warp.errors import OutputError
 from synpick_warp.exporters.writing.files import output_error
 from synpick_warp.statistics.compute import OTHER_OBJECTS, Statistics
 from synpick_warp.statistics.tables import PAPER, TIMELINE, Table, Value, make_tables
+from synpick_warp.system.folders import make_folder
 
 MAX_TEXT_ROWS = 24
 """Rows of objects over time in text: of a longer table, evenly spread rows are shown."""
@@ -68,7 +69,8 @@ def write_csv(statistics: Statistics, folder: Path) -> list[Path]:
     partial = folder.with_name(f".{folder.name}.{os.getpid()}")
     tables = make_tables(statistics)
     try:
-        partial.mkdir(parents=True)
+        make_folder(partial.parent)
+        partial.mkdir()
         try:
             for table in tables:
                 (partial / f"{table.name}.csv").write_text(to_csv(table), encoding="utf-8")

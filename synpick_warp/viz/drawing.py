@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 
 from synpick_warp.errors import OutputError
+from synpick_warp.system.folders import make_folder
 
 FONT = cv2.FONT_HERSHEY_SIMPLEX
 GOLDEN = 0.6180339887498949
@@ -45,7 +46,7 @@ def write_picture(out: Path, picture: Image) -> Path:
         )
     partial_file = out.with_name(f".{out.name}.{os.getpid()}")
     try:
-        out.parent.mkdir(parents=True, exist_ok=True)
+        make_folder(out.parent)
         if out.is_dir():
             raise OutputError(f"cannot write {out}: it is a folder")
         try:
