@@ -71,7 +71,8 @@ def put_text(image: Image, text: str, place: tuple[int, int], size: float, color
 
 def text_size(text: str, size: float) -> tuple[int, int]:
     """Width and height of a text [px] at OpenCV's font scale `size`."""
-    return cv2.getTextSize(text, FONT, size, 1)[0]
+    width, height = cv2.getTextSize(text, FONT, size, 1)[0]
+    return width, height
 
 
 def instance_color(instance: int) -> tuple[int, int, int]:
