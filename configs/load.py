@@ -290,6 +290,8 @@ def _build(values: Values, override: str) -> Config:
         if written and written == override and all("mode" in table for table in tables.values()):
             raise ConfigError(f"bake.mode is {format_value(mode)} {written}; allowed: none, as each split sets its own: splits.NAME.mode")
         values = values | {"bake.episodes": (total, source)}
+    elif "bake.episodes" not in values and (worlds := values.get("bake.worlds", (0, "")))[0]:
+        values = values | {"bake.episodes": worlds}
     parts: dict[str, Any] = {
         section: kind(**{name: values[f"{section}.{name}"][0] for name in settings_of(kind) if f"{section}.{name}" in values})
         for section, kind in sections().items()

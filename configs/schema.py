@@ -60,7 +60,13 @@ class Bake:
         low=0,
         high=65536,
     )
-    episodes: int = setting(4, "", "Episodes (sequences) to generate; each becomes one BOP scene per camera.", low=1, high=INT32_MAX)
+    episodes: int = setting(
+        4,
+        "",
+        "Episodes (sequences) to generate; each becomes one BOP scene per camera. As many as bake.worlds, where only those are set.",
+        low=1,
+        high=INT32_MAX,
+    )
     seed: int = setting(0, "", "Random seed, from which every random number of the bake follows.", low=0, high=2**63 - 1)
     device: str = setting("auto", "", "Device: cpu, cuda:N, or auto (the first GPU if there is one).")
     models: str = setting(

@@ -84,6 +84,19 @@ def test_the_command_says_what_it_did(tmp_path, monkeypatch, capsys):
     assert list(Path(tmp_path).iterdir()) == []
 
 
+@pytest.mark.parametrize(("variable", "name"), [("WARP_CACHE_PATH", "kernel"), ("XDG_CACHE_HOME", "shape")])
+def test_a_cache_that_cannot_be_written_is_a_mistake(tmp_path, monkeypatch, capsys, variable, name):
+    """The kernels went into a temporary folder, which was removed, with exit code 0."""
+    monkeypatch.setattr(warmup, "warm_up", lambda config, progress: pytest.fail("it compiles"))
+    monkeypatch.setenv("WARP_CACHE_PATH", str(tmp_path / "kernels"))
+    (tmp_path / "file").touch()
+    monkeypatch.setenv(variable, str(tmp_path / "file" / "cache"))
+    assert main(["warmup", "--config", "smoke", "--device", "cpu"]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith(f"synpick-warp: error: the {name} cache {tmp_path}/file/cache")
+    assert line.endswith(f"(Not a directory), so that a warm-up would be lost; set {variable} to a folder that can be written")
+
+
 def test_folders_that_are_missing_are_named(capsys):
     assert main(["warmup", "--models", "/nowhere/models"]) == 2
     assert "there is no models folder /nowhere/models" in capsys.readouterr().err

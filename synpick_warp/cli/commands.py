@@ -15,6 +15,8 @@ from synpick_warp import __version__
 from synpick_warp.cli.convert import convert
 from synpick_warp.cli.estimate import estimate
 from synpick_warp.cli.evaluate import evaluate
+from synpick_warp.cli.folders import DEFAULT_NAME, check_output_file, choose_output
+from synpick_warp.cli.limits import describe_limit
 from synpick_warp.cli.options import (
     EXIT_INCOMPLETE,
     Count,
@@ -25,6 +27,7 @@ from synpick_warp.cli.options import (
     parse_shard,
     parse_splits,
 )
+from synpick_warp.cli.pictures import explain, preview
 from synpick_warp.cli.report import write_page
 from synpick_warp.cli.statistics import show_statistics
 from synpick_warp.cli.streams import SafeStreams, StreamError, describe_fault
@@ -88,13 +91,29 @@ DevicesOption = Annotated[
         "GPU, or without one a process per CPU core. They fill one data set, with the bytes of one device; others can resume it."
     ),
 ]
+OutOption = Annotated[
+    Path | None,
+    Parameter(
+        help="Output folder: new, empty, or of an interrupted bake with the same settings "
+        f"(default {DEFAULT_NAME} in the current folder, or {DEFAULT_NAME}-2, ... if other bakes have taken it)."
+    ),
+]
 DeviceOption = Annotated[str | None, Parameter(help=_help("bake.device"))]
+
+
+ShardOption = Annotated[
+    str | None, Parameter(help="i/n: only episodes with index % n == i, such as 0/4; combine the data sets with merge.")
+]
+SplitOption = Annotated[
+    str | None,
+    Parameter(help="Only these splits of the settings, such as train or train,test (default: all of a file's; a preset's must be named)."),
+]
 
 
 @app.command
 def bake(
     *,
-    out: Annotated[Path, Parameter(help="Output folder: new, empty, or of an interrupted bake with the same settings.")],
+    out: OutOption = None,
     config: ConfigOption = None,
     worlds: WorldsOption = None,
     episodes: Annotated[WholeNumber | None, Parameter(help=_help("bake.episodes"))] = None,
@@ -107,15 +126,8 @@ def bake(
     resolution: ResolutionOption = None,
     writers: Annotated[Count | None, Parameter(help=_help("bake.writers", " auto is 0."))] = None,
     formats: Annotated[str | None, Parameter(help=_help("bake.formats", " Joined by commas."))] = None,
-    shard: Annotated[
-        str | None, Parameter(help="i/n: only episodes with index % n == i, such as 0/4; combine the data sets with merge.")
-    ] = None,
-    split: Annotated[
-        str | None,
-        Parameter(
-            help="Only these splits of the settings, such as train or train,test (default: all of a file's; a preset's must be named)."
-        ),
-    ] = None,
+    shard: ShardOption = None,
+    split: SplitOption = None,
     set_: SetOption = None,
     profile: Annotated[
         bool, Parameter(negative=(), help="Print the time of each stage at the end, and write a Chrome trace (see --profile-out).")
@@ -147,6 +159,9 @@ def bake(
     resolved = _resolve(config, given, resolution, set_, splits=split is not None)
     part = parse_shard(shard) if shard is not None else (0, 1)
     plan_shard(resolved, names, part, "--shard")
+    if out is None:
+        out, choice = choose_output(resolved)
+        print(choice, flush=True)
     if not profile and profile_out is None:
         return _bake(resolved, out, part, names, several)
     trace = profile_out or out.with_name(f"{out.name}-profile.json")
@@ -173,47 +188,6 @@ def merge(
         shown = ", ".join(map(str, merged.missing[:MAX_LISTED])) + (", ..." if len(merged.missing) > MAX_LISTED else "")
         print(f"{len(merged.missing):,} are in no part: {shown}; `bake --out {out}` with the same settings generates them")
     return EXIT_INCOMPLETE if merged.missing else 0
-
-
-@app.command
-def preview(
-    folder: Annotated[Path, Parameter(name="DIR", help="A data set.")],
-    /,
-    *,
-    out: Annotated[Path | None, Parameter(help="PNG file to write (default contact-sheet.png in the data set).")] = None,
-    views: Annotated[WholeNumber, Parameter(help="Number of views, spread over the data set.")] = 8,
-) -> int:
-    """Draw a contact sheet: colour, depth, instance masks, bounding boxes and layers of sampled views."""
-    if views < 1:
-        raise ConfigError(f"--views is {views}; allowed: at least 1")
-    from synpick_warp.viz.preview import write_contact_sheet
-
-    sheet = out or folder / "contact-sheet.png"
-    write_contact_sheet(folder, sheet, views)
-    print(f"contact sheet: {sheet}")
-    return 0
-
-
-@app.command
-def explain(
-    folder: Annotated[Path, Parameter(name="DIR", help="A data set with pick attempts.")],
-    /,
-    *,
-    episode: Annotated[WholeNumber, Parameter(help="Index of the episode.")],
-    attempt: Annotated[WholeNumber | None, Parameter(help="Index of the attempt in the episode (default: all).")] = None,
-    out: Annotated[
-        Path | None,
-        Parameter(help="PNG or JPEG file to write (default explain-EPISODE.png or explain-EPISODE-ATTEMPT.png in the data set)."),
-    ] = None,
-) -> int:
-    """Draw pick attempts: image with contours and suction points, clutter graph, choice of the target with its reason, seal force."""
-    from synpick_warp.viz.explain import write_explanation
-
-    suffix = "" if attempt is None else f"-{attempt:03d}"
-    picture = out or folder / f"explain-{episode:06d}{suffix}.png"
-    write_explanation(folder, picture, episode, attempt)
-    print(f"explanation: {picture}")
-    return 0
 
 
 @app.command
@@ -252,7 +226,9 @@ def warmup(
     resolved = _resolve(config, given, resolution, set_)
     _check_inputs(resolved)
     from synpick_warp.cli.display import make_console, make_progress
-    from synpick_warp.factory.warmup import warm_up
+    from synpick_warp.factory.warmup import check_caches, warm_up
+
+    check_caches()
 
     with make_progress(make_console()) as progress:
         result = warm_up(resolved, progress)
@@ -267,6 +243,8 @@ def show_config(*, config: ConfigOption = None, set_: SetOption = None) -> int:
     return 0
 
 
+app.command(preview)
+app.command(explain)
 app.command(evaluate, name="eval")
 app.command(estimate)
 app.command(convert)
@@ -305,6 +283,12 @@ def _run(arguments: list[str]) -> int:
     except KeyboardInterrupt:
         print(f"{NAME}: interrupted", file=sys.stderr)
         return EXIT_INTERRUPTED
+    except Exception as error:
+        said = describe_limit(error)
+        if said is None:
+            raise
+        print(f"{NAME}: error: {one_line(said)}", file=sys.stderr)
+        return EXIT_MISTAKE
 
 
 def _resolve(
@@ -323,9 +307,11 @@ def check_trace_file(trace: Path, out: Path) -> None:
 
     Raises:
         ConfigError: The file is inside the data set, or its folder does not exist.
+        OutputError: It is inside another data set.
     """
     if trace.resolve().is_relative_to(out.resolve()):
         raise ConfigError(f"--profile-out is {trace}, inside the data set {out}; name a file outside of it")
+    check_output_file(trace, "--profile-out")
     if trace.is_dir() or (trace.parent != out.parent and not trace.parent.is_dir()):
         raise ConfigError(f"--profile-out is {trace}; allowed: a file in an existing folder")
 

@@ -7,15 +7,25 @@ from typing import Annotated
 
 from cyclopts import Parameter
 
+from synpick_warp.cli.folders import beside, find_data_set
 from synpick_warp.cli.options import MAX_THREADS, WholeNumber, check_range
+from synpick_warp.configs.schema import FORMATS
 
 
 def convert(
-    folder: Annotated[Path, Parameter(name="DIR", help="A data set; its committed episodes are converted.")],
+    folder: Annotated[
+        Path | None,
+        Parameter(name="DIR", help="A data set; its committed episodes are converted (default: the last one in the current folder)."),
+    ] = None,
     /,
     *,
     to: Annotated[str, Parameter(help="Formats to write, joined by commas: bop, shards, usd, lerobot, coco.")],
-    out: Annotated[Path, Parameter(help="Folder of the converted data set: new, empty, or of an interrupted conversion.")],
+    out: Annotated[
+        Path | None,
+        Parameter(
+            help="Folder of the converted data set: new, empty, or of an interrupted conversion (default DIR-FORMATS, beside the data set)."
+        ),
+    ] = None,
     processes: Annotated[WholeNumber, Parameter(help="Processes that convert; 0: one per core.")] = 0,
 ) -> int:
     """Convert a data set to other formats. After an interruption, the same command resumes with the remaining episodes.
@@ -28,6 +38,8 @@ def convert(
     from synpick_warp.conversion.run import convert as run_conversion
 
     names = [name.strip() for name in to.split(",")]
+    folder = find_data_set(folder, "synpick-warp convert DIR")
+    out = out or beside(folder, f"-{'-'.join(name for name in names if name in FORMATS) or 'converted'}")
     with CountProgress(make_console()) as counter:
         converted = run_conversion(folder, out, names, processes, counter.report)
     before = f" ({converted.resumed:,} of them before)" if converted.resumed else ""

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
+from synpick_warp.cli.folders import check_output_file, find_data_set, has_images
 from synpick_warp.cli.options import MAX_THREADS, WholeNumber, check_range
 from synpick_warp.configs.check import escape, format_value
 from synpick_warp.errors import ConfigError, OutputError
@@ -30,10 +31,23 @@ _MAX_RANGE = 10**6
 """Most indices of an option: more are a mistake."""
 
 
+DataOption = Annotated[
+    Path | None,
+    Parameter(help="A data set in the format bop or shards, with masks (bop.masks; default: the last one in the current folder)."),
+]
+OutOption = Annotated[
+    Path | None,
+    Parameter(
+        help="BOP result file to write; an existing file is replaced (default METHOD_DATASET-SPLIT.csv in the current folder, where "
+        "DATASET is the folder's name in lower-case letters and digits)."
+    ),
+]
+
+
 def estimate(
     *,
-    data: Annotated[Path, Parameter(help="A data set in the format bop or shards, with masks (bop.masks).")],
-    out: Annotated[Path, Parameter(help="BOP result file to write, such as METHOD_DATASET-SPLIT.csv; an existing file is replaced.")],
+    data: DataOption = None,
+    out: OutOption = None,
     method: Annotated[
         str,
         Parameter(
@@ -66,9 +80,15 @@ def estimate(
 
     Unless all images of the data set are estimated, their list is written beside it as OUT-targets.json, for `eval --targets`.
     """
+    from synpick_warp.cli.evaluate import toolkit_ending
+    from synpick_warp.dataset.reading import open_data_set
+
     selection = make_selection(method, every, targets, modes, cameras, episodes)
     options = make_options(method, depth, masks, visib_min, seed, batch, threads)
+    data = find_data_set(data, "synpick-warp estimate --data DIR", has_images)
+    out = Path(f"{method}_{toolkit_ending(open_data_set(data))}.csv") if out is None else out
     check_output(out, selection)
+    check_output_file(out, "--out", data)
     if options.method == "gicp":
         from synpick_warp.estimation.gicp import load_small_gicp
 

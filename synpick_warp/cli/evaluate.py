@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, TextIO
 
 from cyclopts import Parameter
 
+from synpick_warp.cli.folders import check_output_file, find_data_set, has_images
 from synpick_warp.cli.options import WholeNumber, check_range
 from synpick_warp.configs.check import escape, format_value
 from synpick_warp.configs.schema import MULTISENSOR
@@ -35,9 +36,18 @@ _FIRST_SENSOR = "awk -F, -v OFS=, 'NR == 1 || $1 %% %d == 0 { if (NR > 1) $1 /= 
 _TRACK = re.compile(r"([0-9]{1,9}):([0-9]{1,9})")
 
 
+DataOption = Annotated[Path | None, Parameter(help="A data set in the format bop or shards (default: the last one in the current folder).")]
+
+
+PlotsOption = Annotated[
+    Path | None,
+    Parameter(help="New or empty folder for pictures: recall, error by visibility and speed, trajectory, sweep of alpha, worst estimates."),
+]
+
+
 def evaluate(
     *,
-    data: Annotated[Path, Parameter(help="A data set in the format bop or shards.")],
+    data: DataOption = None,
     results: Annotated[
         list[Path],
         Parameter(negative=(), consume_multiple=True, help="BOP result files, one per method; methods stand side by side in the table."),
@@ -62,12 +72,7 @@ def evaluate(
         Parameter(name="--filter", help="ema: score each method a second time, through the tracking filter of the SynPick paper."),
     ] = None,
     alpha: Annotated[float | None, Parameter(help="Weight of the new estimate in --filter ema, above 0, at most 1 (default 0.05).")] = None,
-    plots: Annotated[
-        Path | None,
-        Parameter(
-            help="New or empty folder for pictures: recall, error by visibility and speed, trajectory, sweep of alpha, worst estimates."
-        ),
-    ] = None,
+    plots: PlotsOption = None,
     track: Annotated[
         str | None, Parameter(help="SCENE:INSTANCE of the trajectory in --plots (default: the one that moves farthest).")
     ] = None,
@@ -77,6 +82,9 @@ def evaluate(
     Instances without an estimate count as missed. BOP's own scores come from the BOP toolkit, by the command that is printed.
     """
     check_options(results, format_, out, visib_min, convention, top, vertices)
+    data = find_data_set(data, "synpick-warp eval --data DIR", has_images)
+    if out is not None:
+        check_output_file(out, "--out", data, [*results, *([] if targets is None else [targets])])
     weight = check_filter(filter_, alpha)
     chosen = check_plots(plots, track)
     from synpick_warp.dataset.reading import open_data_set
@@ -227,7 +235,7 @@ def check_options(
     """Check the options before anything is read.
 
     Raises:
-        ConfigError: A value is not allowed, or the output would replace a result file.
+        ConfigError: A value is not allowed.
         OutputError: The output's folder does not exist, or it is a folder itself.
     """
     from synpick_warp.evaluation.auc import CONVENTIONS
@@ -243,8 +251,6 @@ def check_options(
         raise ConfigError(f"--vertices is {vertices}; allowed: 0 for all, to {_MAX_VERTICES}")
     if out is None:
         return
-    if any(out.resolve() == path.resolve() for path in results):
-        raise ConfigError(f"--out is {out}, one of the result files; name another file")
     if out.is_dir() or not out.absolute().parent.is_dir():
         raise OutputError(f"--out is {out}; allowed: a file in an existing folder")
 
@@ -296,6 +302,18 @@ def method_names(results: Sequence[Path]) -> list[str]:
     return stems if len(set(stems)) == len(stems) else [escape(str(path)) for path in results]
 
 
+def toolkit_name(data_set: DataSet) -> str:
+    """Name of a data set in the BOP toolkit: lower-case letters and digits of its folder's."""
+    return re.sub("[^A-Za-z0-9]", "", data_set.folder.absolute().name).lower() or "synpick"
+
+
+def toolkit_ending(data_set: DataSet) -> str:
+    """Data set and split as in the names of BOP result files, such as "synpickdata-train-pbr"."""
+    folders = bop_folders(data_set.config)
+    split, _, kind = next((name for name in folders if split_kind(name) == "test"), folders[0]).partition("_")
+    return f"{toolkit_name(data_set)}-{split}{f'-{kind}' if kind else ''}"
+
+
 def toolkit_command(data_set: DataSet, results: Sequence[Path]) -> str:
     """Command that computes BOP's scores (VSD, MSSD, MSPD), with comments about names that the toolkit needs otherwise.
 
@@ -303,10 +321,7 @@ def toolkit_command(data_set: DataSet, results: Sequence[Path]) -> str:
     """
     cameras = len(data_set.config.cameras.positions) if data_set.config.bop.layout == MULTISENSOR else 0
     folder = data_set.folder.absolute()
-    name = re.sub("[^A-Za-z0-9]", "", folder.name).lower() or "synpick"
-    folders = bop_folders(data_set.config)
-    split, _, kind = next((name for name in folders if split_kind(name) == "test"), folders[0]).partition("_")
-    ending = f"{name}-{split}{f'-{kind}' if kind else ''}"
+    name, ending = toolkit_name(data_set), toolkit_ending(data_set)
     lines = [f"# BOP scores by the BOP toolkit, once `{name}` is in its dataset_params.py:"]
     if name != folder.name:
         lines.append(f"ln -sfn {shlex.quote(str(folder))} {shlex.quote(str(folder.parent / name))}")

@@ -47,6 +47,12 @@ WholeNumber = Annotated[int, Parameter(converter=parse_whole_number)]
 Count = Annotated[int, Parameter(converter=parse_count)]
 """Type of count options that accept `auto`."""
 
+PaperOption = Annotated[
+    bool | None,
+    Parameter(help="Show the numbers of the SynPick paper beside these, or don't (default: if the objects are those of the paper)."),
+]
+"""Type of the option for the comparison with the paper."""
+
 
 def one_line(text: str) -> str:
     """Join the lines of a message, escape what does not print, such as terminal sequences in file names, and truncate."""

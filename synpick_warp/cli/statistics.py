@@ -10,9 +10,10 @@ from typing import Annotated
 from cyclopts import Parameter
 from rich.console import Console
 
-from synpick_warp.cli.options import MAX_THREADS, WholeNumber, check_range
+from synpick_warp.cli.folders import check_output_file, find_data_set
+from synpick_warp.cli.options import MAX_THREADS, PaperOption, WholeNumber, check_range
 from synpick_warp.configs.check import escape
-from synpick_warp.errors import ConfigError, DatasetError
+from synpick_warp.errors import DatasetError
 
 MAX_DEPTH_VIEWS = 100_000
 MEBIBYTE = 2**20
@@ -20,27 +21,30 @@ MEBIBYTE = 2**20
 
 
 def show_statistics(
-    folder: Annotated[Path, Parameter(name="DIR", help="A data set.")],
+    folder: Annotated[Path | None, Parameter(name="DIR", help="A data set (default: the last one in the current folder).")] = None,
     /,
     *,
     json: Annotated[bool, Parameter(negative=(), help="Print all statistics as JSON instead of tables.")] = False,
     csv: Annotated[Path | None, Parameter(help="New or empty folder for all tables as CSV files.")] = None,
     split: Annotated[str | None, Parameter(help="Only the episodes of this split (default: all splits).")] = None,
     depth_views: Annotated[WholeNumber, Parameter(help="Views whose depth image is read, spread over the data set; 0: none.")] = 64,
+    paper: PaperOption = None,
     threads: Annotated[WholeNumber, Parameter(help="Processes that read; 0: one per core.")] = 0,
 ) -> int:
-    """Count views, instances, visibility, attempts, seal forces, viewing directions, depth and lights, beside the paper's numbers.
+    """Count views, instances, visibility, attempts, seal forces, viewing directions, depth and lights.
+
+    The paper's numbers stand beside those of its own objects, or if --paper asks for them; --json and --csv always have them.
 
     Reads each annotation file once and holds only counts. Exit codes: 0; 2, the folder is not a data set, or a file of it is damaged.
     """
     check_range("--depth-views", depth_views, 0, MAX_DEPTH_VIEWS)
     check_range("--threads", threads, 0, MAX_THREADS)
+    folder = find_data_set(folder, "synpick-warp stats DIR")
     from synpick_warp.statistics.output import check_csv_folder, print_statistics, to_json, write_csv
 
     if csv is not None:
         check_csv_folder(csv)
-        if csv.resolve().is_relative_to(folder.resolve()):
-            raise ConfigError(f"--csv is {csv}, inside the data set {folder}; name a folder outside of it")
+        check_output_file(csv, "--csv", folder)
     from synpick_warp.cli.display import CountProgress, make_console
     from synpick_warp.dataset.reading import open_data_set
     from synpick_warp.statistics.collect import collect
@@ -64,7 +68,7 @@ def show_statistics(
     if json:
         print(to_json(statistics))
     elif csv is None:
-        print_statistics(make_console(), statistics)
+        print_statistics(make_console(), statistics, paper)
     rate = f"{collected.views / wall:,.0f} views/s"
     summary = f"{collected.views:,} views in {wall:.1f} s ({rate}); peak memory {collected.memory / MEBIBYTE:,.0f} MiB"
     print(summary, file=sys.stderr if json else sys.stdout)

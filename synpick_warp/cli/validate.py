@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
+from synpick_warp.cli.folders import find_data_set, has_scenes
 from synpick_warp.cli.options import MAX_THREADS, WholeNumber, check_range, one_line
 from synpick_warp.errors import ConfigError
 
@@ -21,7 +22,13 @@ _MAX_SAMPLE = 10**9
 
 
 def validate(
-    folder: Annotated[Path | None, Parameter(name="DIR", help="A BOP data set: the folder that contains train_pbr, models, ...")] = None,
+    folder: Annotated[
+        Path | None,
+        Parameter(
+            name="DIR",
+            help="A BOP data set: the folder that contains train_pbr, models, ... (default: the last one of ours in the current folder)",
+        ),
+    ] = None,
     /,
     *,
     sample: Annotated[
@@ -43,11 +50,10 @@ def validate(
     if rules:
         _print_rules(as_json=json)
         return 0
-    if folder is None:
-        raise ConfigError("validate needs the folder of a data set; --rules lists the rules")
     options = _make_options(sample, threads, poses=poses, fast=fast)
     if limit < 0:
         raise ConfigError(f"--limit is {limit}; allowed: 0 for all, or more")
+    folder = find_data_set(folder, "synpick-warp validate DIR", has_scenes)
     from rich.console import Console
 
     from synpick_warp.cli.display import CountProgress

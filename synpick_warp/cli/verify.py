@@ -7,11 +7,12 @@ from typing import Annotated
 
 from cyclopts import Parameter
 
+from synpick_warp.cli.folders import find_data_set
 from synpick_warp.cli.options import EXIT_INCOMPLETE, MAX_THREADS, WholeNumber, check_range
 
 
 def verify(
-    folder: Annotated[Path, Parameter(name="DIR", help="A data set.")],
+    folder: Annotated[Path | None, Parameter(name="DIR", help="A data set (default: the last one in the current folder).")] = None,
     /,
     *,
     threads: Annotated[WholeNumber, Parameter(help="Maximum number of processes; 0: one per core.")] = 0,
@@ -21,6 +22,7 @@ def verify(
     Exit codes: 0, all match; 1, a file is damaged or missing (it is named), or the bake is not finished; 2, the folder is not a data set.
     """
     check_range("--threads", threads, 0, MAX_THREADS)
+    folder = find_data_set(folder, "synpick-warp verify DIR")
     from rich.console import Console
 
     from synpick_warp.cli.display import CountProgress

@@ -11,6 +11,7 @@ import itertools
 import os
 import stat
 from collections.abc import Iterator, Mapping, Sequence
+from itertools import takewhile
 from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple
 
@@ -184,12 +185,13 @@ class _Added:
 
     def make_folder(self, folder: Path) -> None:
         """Create a folder and its parents, where they are missing."""
-        if folder not in self._folders:
-            if not folder.is_dir():
-                self.make_folder(folder.parent)
-                folder.mkdir()
-                self.paths.append(folder)
-            self._folders.add(folder)
+        if folder in self._folders:
+            return
+        missing = list(takewhile(lambda each: not each.is_dir(), (folder, *folder.parents)))
+        for each in reversed(missing):
+            each.mkdir()
+            self.paths.append(each)
+        self._folders.add(folder)
 
     def link(self, source: Path, target: Path) -> None:
         """Hard-link a regular file, or copy it where links are not possible. An existing file is never written to: it may be a hard link.

@@ -51,6 +51,7 @@ from synpick_warp.exporters.writing.pool import WriterPool
 from synpick_warp.frames import EpisodeEnd
 from synpick_warp.inputs.files import check_regular_file
 from synpick_warp.inputs.toml import MAX_TOML
+from synpick_warp.system.folders import make_folder
 
 LOCK_TIMEOUT = 20.0
 """Longest wait for the writer processes of a killed bake to exit [s]."""
@@ -89,7 +90,7 @@ class OutputFolder:
         check_output_folder(out)
         self._created = [folder for folder in (out, *out.parents) if not os.path.lexists(folder)]
         try:
-            out.mkdir(parents=True, exist_ok=True)
+            make_folder(out)
             self.lock = lock_folder(out)
         except OSError as error:
             raise output_error(out, error) from error

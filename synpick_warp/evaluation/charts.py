@@ -20,6 +20,7 @@ from PIL import ImageDraw, ImageFont
 from synpick_warp.errors import OutputError
 from synpick_warp.exporters.writing.files import output_error, write_atomically
 from synpick_warp.exporters.writing.png import encode_png
+from synpick_warp.system.folders import make_folder
 
 Color = tuple[int, int, int]
 """Red, green, blue."""
@@ -220,7 +221,7 @@ def write_chart(out: Path, picture: Image) -> Path:
     if out.suffix.lower() != ".png":
         raise OutputError(f"{out} is not a PNG file; its name must end in .png")
     try:
-        out.parent.mkdir(parents=True, exist_ok=True)
+        make_folder(out.parent)
         write_atomically(out, encode_png(picture))
     except OSError as error:
         raise output_error(out, error) from error

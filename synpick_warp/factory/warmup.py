@@ -8,12 +8,16 @@ from __future__ import annotations
 import time
 from dataclasses import dataclass
 
+import warp as wp
+
 from synpick_warp.configs.schema import Config
 from synpick_warp.exporters.registry import load_exporter_classes
 from synpick_warp.factory.assembly import build_smallest
 from synpick_warp.factory.compilation import launch_all, make_compiler, sole_compiler, submit_launches, submit_slow
 from synpick_warp.kernels.render.images.ground_truth import gather_cameras_kernel
 from synpick_warp.progress import Progress
+from synpick_warp.scenes.collision.shapes import default_cache_dir
+from synpick_warp.system.caches import KERNEL_VARIABLE, USER_VARIABLE, CacheError, find_fault, kernel_cache, user_cache
 from synpick_warp.system.device import pick_device
 from synpick_warp.system.kernels import build_of, list_binaries
 
@@ -26,6 +30,25 @@ class WarmUp:
     """Modules that were compiled; the others were in the cache."""
     seconds: float
     """Duration [s]."""
+
+
+def check_caches() -> None:
+    """Check that kernels and collision shapes can be kept: a warm-up into a temporary cache, as a bake may have one, is lost at its end.
+
+    Raises:
+        CacheError: A cache cannot be written.
+    """
+    caches = (
+        ("kernel", kernel_cache(wp.config.version), KERNEL_VARIABLE),
+        ("shape", default_cache_dir() if user_cache() else None, USER_VARIABLE),
+    )
+    for name, folder, variable in caches:
+        reason = "the user has no home" if folder is None else find_fault(folder)
+        if reason is not None:
+            raise CacheError(
+                f"the {name} cache {folder or '~/.cache'} cannot be written ({reason}), so that a warm-up would be lost; "
+                f"set {variable} to a folder that can be written"
+            )
 
 
 def warm_up(config: Config, progress: Progress) -> WarmUp:

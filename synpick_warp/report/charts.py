@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 from synpick_warp.configs.schema import Config
@@ -13,6 +14,7 @@ from synpick_warp.statistics.annotations import VISIBILITY_BINS
 from synpick_warp.statistics.attempts import FORCE_BIN
 from synpick_warp.statistics.coverage import BANDS, MIN_VISIBILITY, SECTORS
 from synpick_warp.statistics.lights import EXPOSURE_BIN
+from synpick_warp.statistics.timeline import TIME_BIN
 
 MODES = ("pick", "target", "move")
 """Order of the modes in legends and stacks."""
@@ -21,6 +23,8 @@ MAX_LINES = 40
 """Most objects or light maps of a bar chart; the rest are counted together."""
 ROW = 19
 """Height of a line of a bar chart [px]."""
+MAX_TICKS = 10
+"""Most labels of a histogram's axis, beside the first."""
 HEIGHT = 220
 """Height of the other plots [px]."""
 TURN, HALF_TURN = 360.0, 180.0
@@ -48,6 +52,8 @@ class Source:
     statistics: Statistics
     brightness: Sequence[Brightness]
     config: Config
+    durations: Mapping[str, float] = field(default_factory=dict)
+    """Mode -> time from the first frame to the end of the last, of its longest episode [s]."""
 
 
 def make_charts(source: Source) -> list[Chart]:
@@ -166,15 +172,25 @@ def _objects(source: Source) -> Chart | None:
     return Chart("objects", "Annotations per object", caption, spec, wide=True)
 
 
-def _histogram(rows: Rows, width: float, titles: tuple[str, str], labels: str, colored: bool = True) -> Spec:
-    """Bars of a width from `low` to `high` with a count, stacked by mode if there are modes."""
+def _edges(rows: Rows, width: float, top: float) -> list[float]:
+    """Edges of bins, at equal steps, the last one among them; 0 lies on the axis, and at most MAX_TICKS follow the first edge."""
+    first, last = min(0.0, *(row["low"] for row in rows)), max(top, *(row["high"] for row in rows))
+    bins = round((last - first) / width)
+    step = -(-bins // MAX_TICKS)
+    return [round(last - index * width, 6) for index in range(0, bins + 1, step)][::-1]
+
+
+def _histogram(rows: Rows, width: float, titles: tuple[str, str], labels: str, colored: bool = True, top: float = -math.inf) -> Spec:
+    """Bars of a width from `low` to `high` with a count, stacked by mode if there are modes; the axis reaches `top`."""
+    edges = _edges(rows, width, top)
     encoding = {
         "x": _field(
             "low",
             "quantitative",
             titles[0],
             bin={"binned": True, "step": width},
-            axis={"format": labels, "labelOverlap": "greedy", "labelSeparation": 8},
+            axis={"format": labels, "values": edges, "labelOverlap": False},
+            scale={"domain": [min(0.0, *(row["low"] for row in rows)), edges[-1]]},
         ),
         "x2": {"field": "high"},
         "y": _field("count", "quantitative", titles[1], stack="zero", axis=_COUNT_AXIS),
@@ -207,7 +223,9 @@ def _visibility(source: Source) -> Chart | None:
         return None
     mean = source.statistics.total.annotations.visibility
     caption = f"Visible fraction of each instance's silhouette; the mean is {mean:.3f}. Invisible instances are in the first bar."
-    return Chart("visibility", "Visibility", caption, _histogram(rows, 1 / VISIBILITY_BINS, ("visible fraction", "instances"), ".0%"))
+    return Chart(
+        "visibility", "Visibility", caption, _histogram(rows, 1 / VISIBILITY_BINS, ("visible fraction", "instances"), ".0%", top=1.0)
+    )
 
 
 def _named(source: Source, counts: dict[str, dict[Any, int]], value: str) -> tuple[Rows, list[str]]:
@@ -240,7 +258,7 @@ def _forces(source: Source) -> Chart | None:
         return None
     suction = source.config.suction
     rules = [_limit(suction.poor_force, "poor seal breaks", "left"), _limit(suction.good_force, "good seal breaks", "right")]
-    bars = _histogram(rows, FORCE_BIN, (_FORCE, "attempts"), "~g")
+    bars = _histogram(rows, FORCE_BIN, (_FORCE, "attempts"), "~g", top=-(-suction.good_force // FORCE_BIN) * FORCE_BIN)
     spec = {"height": bars.pop("height"), "layer": [bars, *rules]}
     caption = f"Largest force on a seal during each of {source.statistics.total.episodes.seals:,} lifts that engaged an object."
     return Chart("forces", "Seal forces", caption, spec)
@@ -277,13 +295,17 @@ def _timeline(source: Source) -> Chart | None:
         {"mode": mode, "time": time, "objects": round(total / frames, 3), "frames": frames}
         for (mode, time), (frames, total) in sorted(sums.items())
     ]
+    for mode in dict.fromkeys(row["mode"] for row in rows):
+        # A bin's mean holds from its begin to the next one's, and the last one's to the end of the longest episode.
+        last = [row for row in rows if row["mode"] == mode][-1]
+        rows.append({**last, "time": max(last["time"], round(source.durations.get(mode, 0.0), 3))})
     spec: Spec = {
         "data": {"values": rows},
         "height": HEIGHT,
         "params": [_LEGEND],
-        "mark": {"type": "line", "point": {"size": 18}, "strokeWidth": 2},
+        "mark": {"type": "line", "interpolate": "step-after", "strokeWidth": 2, "clip": True},
         "encoding": {
-            "x": _field("time", "quantitative", "time since the first frame [s]"),
+            "x": _field("time", "quantitative", "time since the first frame [s]", scale={"domain": [0, max(row["time"] for row in rows)]}),
             "y": _field("objects", "quantitative", "objects in the scene", scale={"zero": True}),
             "color": _mode_color(rows),
             "opacity": _FADED,
@@ -295,7 +317,8 @@ def _timeline(source: Source) -> Chart | None:
             ],
         },
     }
-    return Chart("timeline", "Objects over time", "Mean number of objects in the scene, over the episodes that last so long.", spec)
+    caption = f"Mean number of objects in the scene in each {TIME_BIN:g} s, over the episodes that last so long."
+    return Chart("timeline", "Objects over time", caption, spec)
 
 
 def _coverage(source: Source) -> Chart | None:
@@ -388,5 +411,6 @@ def _luma(source: Source) -> Chart | None:
         counts[min(int(view.mean * BRIGHTNESS_BINS), BRIGHTNESS_BINS - 1)] += 1
     if not any(counts):
         return None
-    spec = _histogram(_bins(counts, 1 / BRIGHTNESS_BINS), 1 / BRIGHTNESS_BINS, ("mean brightness (sRGB)", "views"), ".0%", colored=False)
+    rows, titles = _bins(counts, 1 / BRIGHTNESS_BINS), ("mean brightness (sRGB)", "views")
+    spec = _histogram(rows, 1 / BRIGHTNESS_BINS, titles, ".0%", colored=False, top=1.0)
     return Chart("brightness", "Brightness", f"Mean luma of {len(source.brightness)} views, spread over the data set.", spec)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import os
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -36,9 +36,10 @@ from synpick_warp.report.sampling import (
 from synpick_warp.report.strips import choose_episodes, make_strip
 from synpick_warp.report.tables import findings_list, settings_tables, statistics_tables, tiles
 from synpick_warp.statistics import Statistics, compute_statistics
+from synpick_warp.system.folders import make_folder
+from synpick_warp.viz.depth_colors import tote_scale
 
 SUFFIXES = (".html", ".htm")
-DEFAULT_NAME = "report.html"
 FRAMES = 12
 """Sampled frames on the page."""
 MAX_FRAMES = 200
@@ -55,7 +56,9 @@ class Samples:
     """Number of frames, strips and attempts that were to be shown; fewer are if the pictures' budget is spent."""
 
 
-def write_report(data_set: DataSet, out: Path, *, frames: int = FRAMES, threads: int = 0, report: Report | None = None) -> Path:
+def write_report(
+    data_set: DataSet, out: Path, *, frames: int = FRAMES, paper: bool | None = None, threads: int = 0, report: Report | None = None
+) -> Path:
     """Write the report of a data set, or of one of its splits.
 
         write_report(synpick_warp.open("DATA"), Path("report.html"))
@@ -64,6 +67,7 @@ def write_report(data_set: DataSet, out: Path, *, frames: int = FRAMES, threads:
         data_set: The data set; with settings.
         out: HTML file to write; its folder is created. A file is replaced, a link never followed.
         frames: Number of sampled frames.
+        paper: Whether the paper's numbers stand beside; None: if the objects are the paper's.
         threads: Maximum number of processes that count; 0: one per core.
         report: Receives the progress.
 
@@ -83,14 +87,15 @@ def write_report(data_set: DataSet, out: Path, *, frames: int = FRAMES, threads:
     versions, remarks = _versions(data_set)
     findings = [*remarks, *find(Figures(statistics, episodes, samples.brightness, data_set.planned))]
     findings.sort(key=lambda finding: finding.level != WARNING)
+    shown = statistics if (statistics.has_paper_objects if paper is None else paper) else replace(statistics, paper=())
     page = Page(
         title=data_set.folder.resolve().name or "data set",
         lead=_lead(data_set, statistics, findings),
         tiles=tiles(statistics),
-        parts=_parts(data_set, statistics, samples, findings, versions),
+        parts=_parts(data_set, shown, samples, findings, versions),
         findings=findings,
         data=samples.data,
-        charts=make_charts(Source(statistics, samples.brightness, data_set.config)),
+        charts=make_charts(Source(statistics, samples.brightness, data_set.config, _durations(data_set, episodes))),
         album=album,
         footer=f"synpick-warp {__version__}, report of {data_set.folder.resolve().name}. The page loads nothing from anywhere.",
     )
@@ -114,7 +119,8 @@ def take_samples(data_set: DataSet, statistics: Statistics, episodes: Episodes, 
     asked["frames"] = len(views)
     for done, view in enumerate(views):
         report("frames", done, len(views))
-        data["frames"] += _present(make_frame(view, content, names, episodes.rows[view.episode].mode, album))
+        scale = tote_scale(data_set.config, [view.records.camera])
+        data["frames"] += _present(make_frame(view, content, names, episodes.rows[view.episode].mode, album, scale))
     chosen = choose_episodes(episodes)
     asked["strips"] = len(chosen)
     for place, index in enumerate(chosen):
@@ -128,6 +134,14 @@ def take_samples(data_set: DataSet, statistics: Statistics, episodes: Episodes, 
         report("attempts", done, len(attempts))
         data["attempts"] += _present(make_attempt(data_set, found, content, names, album))
     return Samples(data, _measure(sample_views(data_set, episodes, SURVEY_VIEWS), report), asked)
+
+
+def _durations(data_set: DataSet, episodes: Episodes) -> dict[str, float]:
+    """Time of the longest episode of each mode [s]."""
+    physics, longest = data_set.config.physics, dict[str, int]()
+    for row in episodes.rows.values():
+        longest[row.mode] = max(longest.get(row.mode, 0), row.frames)
+    return {mode: frames * physics.step * physics.steps_per_tick for mode, frames in longest.items()}
 
 
 def _present(made: dict[str, Any] | None) -> list[dict[str, Any]]:
@@ -225,7 +239,7 @@ def write_text(out: Path, pieces: Iterable[str]) -> None:
     """
     partial = out.with_name(f".{out.name}.{os.getpid()}")
     try:
-        out.parent.mkdir(parents=True, exist_ok=True)
+        make_folder(out.parent)
         try:
             # A link of the name is replaced, never followed.
             with open(partial, "x", encoding="utf-8", newline="\n") as file:

@@ -16,10 +16,10 @@ from synpick_warp.dataset.view import View
 from synpick_warp.errors import DatasetError
 from synpick_warp.report.album import Album, Section, encode_photo
 from synpick_warp.report.sampling import Content, Episodes, spread
+from synpick_warp.viz.drawing import instance_color
 from synpick_warp.viz.explain import draw_observation
 from synpick_warp.viz.explain_graph import KEPT, clutter_edges, lay_out
 from synpick_warp.viz.explain_record import CANDIDATES, Attempt, break_force, choice_words, labels, parse_attempt, seal_words, suction_kind
-from synpick_warp.viz.preview import instance_color
 
 MAX_ATTEMPTS = 6
 """Attempts on the page."""

@@ -11,7 +11,8 @@ from synpick_warp.dataset.view import MILLIMETERS, View
 from synpick_warp.report.album import Album, Picture, Section, encode_ids, encode_photo, shrink
 from synpick_warp.report.sampling import Content
 from synpick_warp.statistics.records import MAX_NAME
-from synpick_warp.viz.preview import color_depth, describe_depth, instance_color
+from synpick_warp.viz.depth_colors import DepthScale, color_depth, describe_depth, pooled_scale
+from synpick_warp.viz.drawing import instance_color
 from synpick_warp.viz.preview_layers import draw_layer
 
 WIDTH = 960
@@ -22,7 +23,9 @@ LAYER_WIDTH = 640
 """Largest width of depth and of layers [px]."""
 
 
-def make_frame(view: View, content: Content, names: Mapping[int, str], mode: str, album: Album) -> dict[str, Any] | None:
+def make_frame(
+    view: View, content: Content, names: Mapping[int, str], mode: str, album: Album, scale: DepthScale | None
+) -> dict[str, Any] | None:
     """JSON of a frame, whose pictures are added to the album; None: they exceed the budget.
 
     Args:
@@ -31,6 +34,7 @@ def make_frame(view: View, content: Content, names: Mapping[int, str], mode: str
         names: Object id -> name; it may lack some.
         mode: Mode of the episode.
         album: Receives the pictures.
+        scale: Of the depth images of its scene; None: that of the image itself.
 
     Raises:
         DatasetError: A file is missing or damaged.
@@ -45,10 +49,11 @@ def make_frame(view: View, content: Content, names: Mapping[int, str], mode: str
             panels.append(("amodal", "amodal masks", encode_ids(np.concatenate(planes))))
     if content.depth:
         depth = view.depth * MILLIMETERS
-        colored = color_depth(depth)
-        panels.append(("depth", describe_depth(depth), encode_photo(shrink(colored, LAYER_WIDTH))))
+        scale = scale or pooled_scale([depth])
+        panels.append(("depth", describe_depth(scale), encode_photo(shrink(color_depth(depth, scale), LAYER_WIDTH))))
+    counts = scale and DepthScale(*(each / float(view.records.camera["depth_scale"]) for each in scale))
     for name in view.layers:
-        caption, picture = draw_layer(name, view.layer(name))
+        caption, picture = draw_layer(name, view.layer(name), counts)
         panels.append((name, caption, encode_photo(shrink(picture, LAYER_WIDTH))))
     places = album.add(Section.FRAMES, [picture for _, _, picture in panels])
     if places is None:

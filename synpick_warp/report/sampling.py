@@ -91,20 +91,30 @@ def read_episodes(data_set: DataSet) -> Episodes:
 
 
 def sample_views(data_set: DataSet, episodes: Episodes, count: int) -> list[View]:
-    """Sample distinct views, sorted: episodes at equal steps, frames and cameras by a low-discrepancy (R2) sequence.
+    """Sample distinct views, sorted: episodes at equal steps, times at equal steps, and cameras in equal numbers.
 
-    Fewer than `count` views are returned if the chosen episodes have fewer.
+    The times of an episode are the middles of as many equal parts as it has views; where it has one, the times of all of them are, in an
+    order of low discrepancy (R2). Fewer than `count` views are returned if the chosen episodes have fewer.
     """
     indices = [index for index, row in episodes.rows.items() if row.frames]
     cameras, keys = data_set.camera_count, set()
-    places = r2_points(np.arange(count if indices else 0), start=0.5).tolist()
-    for number, (time, place) in enumerate(places):
-        index = indices[number * len(indices) // count]
+    number = np.arange(count if indices else 0)
+    points = _middles(r2_points(number, start=0.5))
+    chosen = number * len(indices) // max(1, count)
+    for each in np.flatnonzero(np.bincount(chosen) > 1):
+        points[chosen == each] = _middles(points[chosen == each])
+    for each, (time, place) in zip(chosen.tolist(), points.tolist(), strict=True):
+        index = indices[each]
         frames = episodes.rows[index].frames
         first = int(time * frames) * cameras + int(place * cameras)
         views = (divmod((first + step) % (frames * cameras), cameras) for step in range(min(count, frames * cameras)))
         keys.update(next(([(index, *view)] for view in views if (index, *view) not in keys), []))
     return [data_set[index].view(frame, camera) for index, frame, camera in sorted(keys)]
+
+
+def _middles(points: np.ndarray) -> np.ndarray:
+    """Move points (N, 2) to the middles of N equal parts of each axis, in their order along it."""
+    return (np.argsort(np.argsort(points, axis=0), axis=0) + 0.5) / max(1, len(points))
 
 
 def measure_brightness(view: View) -> Brightness:

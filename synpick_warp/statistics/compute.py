@@ -20,6 +20,8 @@ from synpick_warp.statistics.paper import Comparison, compare
 from synpick_warp.statistics.timeline import TimePoint
 from synpick_warp.system.cores import count_cores
 
+OTHER_OBJECTS = "the objects are not those of the paper, so their distributions are not compared"
+"""What is missing of data sets of other objects."""
 DEPTH_VIEWS = 64
 """Views whose depth image is read."""
 
@@ -67,6 +69,11 @@ class Statistics:
     """Groups that the paper has, too."""
     missing: tuple[str, ...]
     """What the data set does not have, a sentence each."""
+
+    @property
+    def has_paper_objects(self) -> bool:
+        """Whether the objects are those of the paper, with which a comparison makes sense."""
+        return any(row.distance is not None for row in self.paper)
 
 
 def compute_statistics(data_set: DataSet, *, depth_views: int = DEPTH_VIEWS, threads: int = 0, report: Report | None = None) -> Statistics:
@@ -124,7 +131,7 @@ def assemble(data_set: DataSet, collected: Collected) -> Statistics:
     if not total.episodes.attempts:
         missing.append("no attempts: no episode picks, so there are neither outcomes nor seal forces")
     if any(row.distance is None for row in paper):
-        missing.append("the objects are not those of the paper, so their distributions are not compared")
+        missing.append(OTHER_OBJECTS)
     return Statistics(data_set.camera_count, rows, total, objects, depth, lights, paper, tuple(missing))
 
 

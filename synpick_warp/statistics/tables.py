@@ -16,6 +16,8 @@ from synpick_warp.statistics.paper import read_paper
 
 ALL = "all"
 """Label of the row over all splits or modes."""
+PAPER = "paper"
+"""Name of the table beside the paper's numbers."""
 TIMELINE = "objects_over_time"
 """Name of the table of objects over time."""
 Value = int | float | str | None
@@ -123,7 +125,7 @@ def _paper(statistics: Statistics) -> Table:
         f"Beside SynPick (CASE 2021; in all {paper.total_views:,} views, mean visibility {paper.total_visibility}): frames of a sequence,\n"
         "instances a view, total variation (TV) distance of the instances over objects to the paper's, and of its train to its test"
     )
-    table = Table("paper", title, columns)
+    table = Table(PAPER, title, columns)
     for row in statistics.paper:
         ours, theirs = row.ours, row.paper
         seen = None if ours.visibility is None or theirs.visibility is None else ours.visibility - theirs.visibility

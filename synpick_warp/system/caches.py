@@ -15,6 +15,7 @@ import tempfile
 from pathlib import Path
 
 from synpick_warp.errors import SynpickError
+from synpick_warp.system.folders import make_folder
 
 KERNEL_VARIABLE = "WARP_CACHE_PATH"
 """Moves the cache of compiled kernels."""
@@ -89,7 +90,7 @@ def usable_kernel_cache(version: str) -> Path | None:
 def find_fault(folder: Path) -> str | None:
     """Find out why a folder cannot be written, by writing into it; it is created if missing. None: it can."""
     try:
-        folder.mkdir(parents=True, exist_ok=True)
+        make_folder(folder)
         with tempfile.TemporaryFile(dir=folder) as probe:
             probe.write(_PROBE)
             probe.flush()

@@ -20,24 +20,23 @@ from synpick_warp.dataset.object_names import object_names
 from synpick_warp.dataset.view_files import read_image
 from synpick_warp.errors import DatasetError
 from synpick_warp.inputs.paths import path_inside
+from synpick_warp.viz.drawing import FONT, INK, WHITE, Image, check_picture_name, instance_color, put_text, readable_on, write_picture
 from synpick_warp.viz.explain_graph import (
     CYCLIC,
     GREY,
-    INK,
     OUTVOTED,
     RED,
-    WHITE,
     clutter_edges,
     disc,
     draw_graph,
     fixed,
     put_boxed,
-    readable_on,
 )
 from synpick_warp.viz.explain_panels import GREEN, LINE, PLOT_HEIGHT, SMALL, SOFT, TEXT, WORDS_WIDTH, draw_load, draw_words
-from synpick_warp.viz.explain_record import MODE_WORDS, Attempt, Pixel, labels, read_attempts
-from synpick_warp.viz.preview import FONT, Image, check_picture_name, instance_color, put_text, write_picture
+from synpick_warp.viz.explain_record import MODE_WORDS, Attempt, Pixel, choose_attempts, labels, read_attempts
 
+DEFAULT_ATTEMPTS = 3
+"""Attempts that are drawn if none is named."""
 MARGIN = 20
 """Margin of the sheet, and gap between columns [px]."""
 HEAD = 64
@@ -66,13 +65,13 @@ class _Scene:
     """Instance id -> modal mask; None: the data set has no masks."""
 
 
-def write_explanation(dataset: Path, out: Path, episode: int, attempt: int | None) -> Path:
-    """Draw one attempt of an episode, or all of them below each other, and write the image file.
+def write_explanation(dataset: Path, out: Path, episode: int | None, attempt: int | None = None) -> Path:
+    """Draw one attempt of an episode, all of them, or the first ones worth seeing, below each other, and write the image file.
 
     Args:
         dataset: Folder of the data set.
         out: PNG or JPEG file to write; its folder is created.
-        episode: Index of the episode.
+        episode: Index of the episode; None: the first DEFAULT_ATTEMPTS worth seeing, of any.
         attempt: Index of the attempt in the episode; None: all.
 
     Raises:
@@ -83,7 +82,7 @@ def write_explanation(dataset: Path, out: Path, episode: int, attempt: int | Non
     check_picture_name(out)
     if not dataset.is_dir():
         raise DatasetError(f"there is no folder {dataset}; name the folder of a BOP data set")
-    attempts = read_attempts(dataset, episode, attempt)
+    attempts = choose_attempts(dataset, DEFAULT_ATTEMPTS) if episode is None else read_attempts(dataset, episode, attempt)
     path = dataset / "config.toml"
     if not path.exists():
         raise DatasetError(f"{dataset} has no config.toml; the settings of the bake are needed to explain what it did")

@@ -16,8 +16,8 @@ import numpy as np
 from scipy.optimize import isotonic_regression
 
 from synpick_warp.errors import DatasetError
+from synpick_warp.viz.drawing import FONT, INK, WHITE, Image, instance_color, put_text, readable_on
 from synpick_warp.viz.explain_record import Attempt, SeenObject, labels
-from synpick_warp.viz.preview import FONT, Image, instance_color, put_text
 
 RADIUS = 20
 """Radius of a node [px]."""
@@ -41,10 +41,8 @@ _SAMPLES = 12
 """Number of points of a curve between two layers."""
 _SHIFT = 4
 """Fractional bits of OpenCV's fixed-point coordinates."""
-INK = (40, 40, 40)
 GREY = (150, 150, 150)
 RED = (60, 60, 200)
-WHITE = (255, 255, 255)
 KEPT, OUTVOTED, CYCLIC = "kept", "outvoted by the opposite", "dropped to break a cycle"
 
 Key = int | tuple[int, int, int]
@@ -313,9 +311,3 @@ def put_boxed(
     low, high = np.rint(np.array(place) - half).astype(int), np.rint(np.array(place) + half).astype(int)
     cv2.rectangle(canvas, low.tolist(), high.tolist(), ground, -1)
     put_centered(canvas, text, place, size, color, 1)
-
-
-def readable_on(color: tuple[int, int, int]) -> tuple[int, int, int]:
-    """Text colour with contrast to a background (blue first): dark or white by luma."""
-    blue, green, red = color
-    return INK if 0.114 * blue + 0.587 * green + 0.299 * red > 110 else WHITE

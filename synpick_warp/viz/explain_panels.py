@@ -8,9 +8,9 @@ import cv2
 import numpy as np
 
 from synpick_warp.configs.schema import Config
-from synpick_warp.viz.explain_graph import GREY, INK, RED, disc, fixed
+from synpick_warp.viz.drawing import FONT, INK, Image, instance_color, put_text
+from synpick_warp.viz.explain_graph import GREY, RED, disc, fixed
 from synpick_warp.viz.explain_record import Attempt, break_force, choice_words, labels, seal_words, suction_kind
-from synpick_warp.viz.preview import FONT, Image, instance_color, put_text
 
 WORDS_WIDTH = 470
 """Width of the text and the table [px]."""

@@ -16,6 +16,7 @@ from synpick_warp.dataset.records import Pixel
 from synpick_warp.errors import DatasetError
 from synpick_warp.inputs.files import read_file
 from synpick_warp.inputs.json import MAX_JSON, decode_json
+from synpick_warp.viz.drawing import short_labels
 
 MODE_WORDS = {"pick": "untargeted", "target": "targeted"}
 CANDIDATES = ("pole", "centroid", "midpoint")
@@ -23,6 +24,8 @@ CANDIDATES = ("pole", "centroid", "midpoint")
 
 MAX_ATTEMPTS = 100
 """Most attempts of one figure."""
+MIN_CHOICE = 3
+"""Fewest visible objects of an attempt that is worth seeing."""
 MAX_RUNS = 20
 """Most ranges of numbers that a message lists."""
 
@@ -93,12 +96,7 @@ def read_attempts(dataset: Path, episode: int, number: int | None) -> list[Attem
     Raises:
         DatasetError: The file is missing or damaged, or has no such episode or attempt.
     """
-    path = dataset / ATTEMPTS_FILE
-    if not path.exists():
-        raise DatasetError(
-            f"{dataset} has no {path.name}: it has no pick attempts; explain draws those of a bake with mode pick, target or mixed"
-        )
-    lines = read_file(path, MAX_JSON, DatasetError).splitlines()
+    path, lines = _read_lines(dataset)
     keys = [decode_json(line, records.AttemptKey, _line(path, row), DatasetError, ADVICE) for row, line in enumerate(lines)]
     episodes = sorted({key.episode for key in keys})
     if episode not in episodes:
@@ -116,6 +114,46 @@ def read_attempts(dataset: Path, episode: int, number: int | None) -> list[Attem
         for count, row in rows
         if number in (None, count)
     ]
+
+
+def choose_attempts(dataset: Path, count: int) -> list[Attempt]:
+    """Choose the first attempts worth seeing; if there are fewer, others from the beginning stand in. In the order of the file.
+
+    Worth seeing is an attempt that chose among MIN_CHOICE objects or more, of which some lie on others, and engaged one.
+
+    Raises:
+        DatasetError: The file is missing or damaged, or has no attempt.
+    """
+    path, lines = _read_lines(dataset)
+    worthy: dict[int, Attempt] = {}
+    others: dict[int, Attempt] = {}
+    for row, line in enumerate(lines):
+        attempt = _attempt(decode_json(line, records.Attempt, _line(path, row), DatasetError, ADVICE), _line(path, row))
+        chosen = attempt.target is not None and len(attempt.seen) >= MIN_CHOICE and any(one.above for one in attempt.seen)
+        if chosen and attempt.engaged:
+            worthy[row] = attempt
+        elif len(others) < count:
+            others[row] = attempt
+        if len(worthy) == count:
+            break
+    if not worthy and not others:
+        raise DatasetError(f"{path} has no attempt; explain draws those of a bake with mode pick, target or mixed")
+    rows = [*worthy, *others][:count]
+    return [(worthy | others)[row] for row in sorted(rows)]
+
+
+def _read_lines(dataset: Path) -> tuple[Path, list[bytes]]:
+    """The file of attempts, and its lines.
+
+    Raises:
+        DatasetError: It is missing or cannot be read.
+    """
+    path = dataset / ATTEMPTS_FILE
+    if not path.exists():
+        raise DatasetError(
+            f"{dataset} has no {path.name}: it has no pick attempts; explain draws those of a bake with mode pick, target or mixed"
+        )
+    return path, read_file(path, MAX_JSON, DatasetError).splitlines()
 
 
 def parse_attempt(content: Mapping[str, Any], source: str) -> Attempt:
@@ -192,15 +230,8 @@ def _seen(record: records.InstanceObservation) -> SeenObject:
 
 
 def labels(attempt: Attempt) -> dict[int, str]:
-    """Short label of every visible instance: its obj_id, with a letter where several share it."""
-    by_object: dict[int, list[int]] = {}
-    for one in attempt.seen:
-        by_object.setdefault(one.object_id, []).append(one.instance)
-    return {
-        instance: f"{object_id}{chr(ord('a') + place) if len(group) > 1 else ''}"
-        for object_id, group in by_object.items()
-        for place, instance in enumerate(group)
-    }
+    """Short label of every visible instance, see `short_labels`."""
+    return short_labels((one.instance, one.object_id) for one in attempt.seen)
 
 
 def full_names(attempt: Attempt, names: Mapping[int, str]) -> dict[int, str]:

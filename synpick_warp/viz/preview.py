@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import colorsys
+import contextlib
 import itertools
-import os
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -15,10 +14,18 @@ from typing import Any, NamedTuple
 import cv2
 import numpy as np
 
+from synpick_warp.configs.load import load_config
+from synpick_warp.configs.schema import Config
+from synpick_warp.configs.splits import scene_episode
 from synpick_warp.dataset.annotations import SCENE_SCHEMAS, read_checked
+from synpick_warp.dataset.manifest import CONFIG_FILE, episode_entry, read_entry
+from synpick_warp.dataset.object_names import object_names
 from synpick_warp.dataset.view_files import SceneFolder, check_planes, read_image
-from synpick_warp.errors import DatasetError, OutputError
+from synpick_warp.errors import DatasetError, OutputError, SynpickError
+from synpick_warp.viz.depth_colors import DepthScale, color_depth, describe_depth, pooled_scale, tote_scale
+from synpick_warp.viz.drawing import GOLDEN, Image, check_picture_name, instance_color, put_text, write_picture
 from synpick_warp.viz.preview_layers import layer_pictures
+from synpick_warp.viz.preview_legend import PAPER, Box, draw_labels, draw_legend, label_texts, legend_width
 
 _PANEL_WIDTH = 480
 """Width of one image on the sheet [px]."""
@@ -30,17 +37,10 @@ _CAPTION = 20
 """Height of the caption above an image [px]."""
 _GAP = 4
 """Gap between images [px]."""
-FONT = cv2.FONT_HERSHEY_SIMPLEX
-_GOLDEN = 0.6180339887498949
-"""Golden ratio conjugate (√5 - 1) / 2: multiples modulo 1 are a low-discrepancy sequence for any count."""
+_MIN_LEGEND = 120
+"""Minimum height of a row without its caption [px], for the legend of low images."""
 _SENSOR = re.compile(r"(_[A-Za-z0-9_]+)?")
 """Suffix of a sensor's files; empty: classic layout."""
-_SUFFIXES = (".png", ".jpg", ".jpeg")
-_DEPTH_RANGE = (1.0, 99.0)
-"""Percentiles of the depths that map to the first and the last colour."""
-
-Image = np.ndarray
-"""(H, W, 3) uint8, blue first, OpenCV's order."""
 
 
 class Scene(NamedTuple):
@@ -63,8 +63,8 @@ class Scene(NamedTuple):
 class _View:
     scene: Scene
     frame: int
-    depth_scale: float
-    """[mm]"""
+    camera: dict[str, Any]
+    """Record of scene_camera."""
     truth: list[tuple[dict[str, Any], dict[str, Any]]]
     """Records of scene_gt and scene_gt_info, per instance."""
 
@@ -84,48 +84,52 @@ def write_contact_sheet(dataset: Path, out: Path, views: int) -> Path:
     check_picture_name(out)
     if views < 1:
         raise OutputError(f"{views} views requested; a contact sheet has at least 1")
-    rows = [_row(view) for view in _read_views(sample(find_scenes(dataset), views))]
+    shown = list(_read_views(sample(find_scenes(dataset), views)))
+    baked = read_baked(dataset, {record["obj_id"] for view in shown for record, _ in view.truth})
+    scale = tote_scale(baked.config, [view.camera for view in shown]) if baked.config else None
+    scale = scale or pooled_scale(_read_depth(view) for view in shown)
+    most = max(len(view.truth) for view in shown)
+    rows = [_row(view, scale, baked, most) for view in shown]
     width = max(row.shape[1] for row in rows)
     sheet = np.concatenate([np.pad(row, ((0, 0), (0, width - row.shape[1]), (0, 0))) for row in rows])
     return write_picture(out, sheet)
 
 
-def check_picture_name(out: Path) -> None:
-    """Raise OutputError unless the file name ends as a PNG or JPEG file."""
-    if out.suffix.lower() not in _SUFFIXES:
-        raise OutputError(f"{out} is not an image file; its name must end in {', '.join(_SUFFIXES)}")
+class Baked(NamedTuple):
+    """What is known of the bake behind a data set; nothing of data sets of other programs."""
+
+    dataset: Path
+    config: Config | None
+    names: dict[int, str]
+    """obj_id -> name of an object."""
+
+    def facts(self, scene: Scene, frame: int, camera: Mapping[str, Any]) -> list[str]:
+        """What is to be said of a view: scene, episode, mode, time, light."""
+        lines = [f"{scene.folder.parent.name}/{scene.folder.name}{scene.sensor.replace('_', ' ', 1)}, image {frame}"]
+        if self.config is not None:
+            episode, physics = scene_episode(self.config, int(scene.folder.name)), self.config.physics
+            parts = [f"episode {episode}", f"{frame * physics.step * physics.steps_per_tick:.2f} s"]
+            with contextlib.suppress(SynpickError):
+                entry = read_entry(self.dataset, episode_entry(episode))
+                parts += [f"mode {entry['row']['mode']}"] if entry is not None else []
+            lines.append(", ".join(parts))
+        light = camera.get("light")
+        if isinstance(light, dict) and isinstance(light.get("map"), str):
+            lines.append(f"light {light['map']}")
+        return lines
 
 
-def write_picture(out: Path, picture: Image) -> Path:
-    """Write an image in the format of its suffix; its folder is created.
+def read_baked(dataset: Path, object_ids: set[int]) -> Baked:
+    """Read settings and names of a data set, as far as it has them.
 
     Raises:
-        OutputError: It cannot be written.
+        ConfigError: Its settings are damaged.
+        DatasetError: Its models_info.json is.
     """
-    try:
-        encoded, data = cv2.imencode(out.suffix, picture)
-    except cv2.error:
-        encoded, data = False, np.empty(0, np.uint8)
-    if not encoded:
-        raise OutputError(
-            f"cannot write {out}: OpenCV cannot encode {picture.shape[1]} x {picture.shape[0]} pixels; use .png or fewer views"
-        )
-    partial_file = out.with_name(f".{out.name}.{os.getpid()}")
-    try:
-        out.parent.mkdir(parents=True, exist_ok=True)
-        if out.is_dir():
-            raise OutputError(f"cannot write {out}: it is a folder")
-        try:
-            # A link of that name in the data set is replaced, never followed.
-            with open(partial_file, "xb") as file:
-                file.write(data.tobytes())
-            partial_file.replace(out)
-        except BaseException:
-            partial_file.unlink(missing_ok=True)
-            raise
-    except (OSError, ValueError) as error:
-        raise OutputError(f"cannot write {out}: {getattr(error, 'strerror', None) or error}") from error
-    return out
+    path = dataset / CONFIG_FILE
+    config = load_config(str(path), {}) if path.exists() else None
+    named = (dataset / "models" / "models_info.json").exists()
+    return Baked(dataset, config, object_names(dataset, config or load_config(), object_ids) if named else {})
 
 
 def find_scenes(dataset: Path) -> list[Scene]:
@@ -172,7 +176,7 @@ def sample(scenes: list[Scene], views: int) -> list[tuple[Scene, int]]:
         group = groups[number % len(groups)]
         in_group = -(-(views - number % len(groups)) // len(groups))
         scene, frames = group[number // len(groups) * len(group) // in_group]
-        samples.add((scene, frames[int((0.5 + number * _GOLDEN) % 1.0 * len(frames))]))
+        samples.add((scene, frames[int((0.5 + number * GOLDEN) % 1.0 * len(frames))]))
     return sorted(samples)
 
 
@@ -182,26 +186,44 @@ def _read_views(samples: list[tuple[Scene, int]]) -> Iterator[_View]:
         files = SceneFolder(scene.folder, suffix=scene.sensor)
         for _, frame in group:
             camera, truth, infos = files.records(frame)
-            yield _View(scene, frame, float(camera["depth_scale"]), list(zip(truth, infos, strict=True)))
+            yield _View(scene, frame, camera, list(zip(truth, infos, strict=True)))
 
 
-def _row(view: _View) -> Image:
-    """Draw all panels of a view side by side."""
+def _read_depth(view: _View, size: tuple[int, int] | None = None) -> np.ndarray:
+    """Depth image of a view [mm]; `size` is the width and height that it must have [px]."""
     stem = f"{view.frame:06d}"
-    folder, sensor = view.scene
-    color = read_image(view.scene.images("rgb"), stem, cv2.IMREAD_COLOR)
-    size = color.shape[1::-1]
     counts = read_image(view.scene.images("depth"), stem, cv2.IMREAD_UNCHANGED, size)
-    depth = check_planes(counts, None, f"{view.scene.images('depth') / stem}.png") * view.depth_scale
+    return check_planes(counts, None, f"{view.scene.images('depth') / stem}.png") * float(view.camera["depth_scale"])
+
+
+def _row(view: _View, depth_scale: DepthScale | None, baked: Baked, most: int) -> Image:
+    """Draw all panels of a view side by side; `most` is the largest number of instances of all views."""
+    folder, sensor = view.scene
+    color = read_image(view.scene.images("rgb"), f"{view.frame:06d}", cv2.IMREAD_COLOR)
+    size = color.shape[1::-1]
+    depth = _read_depth(view, size)
+    facts = baked.facts(view.scene, view.frame, view.camera)
     panels: list[tuple[str, Callable[[float], Image]]] = [
-        (f"{folder.parent.name}/{folder.name}{sensor.replace('_', ' ', 1)} image {view.frame}", lambda scale: _fit(color, scale)),
-        (describe_depth(depth), lambda scale: _fit(color_depth(depth), scale, smooth=False)),
+        (facts[0], lambda scale: _fit(color, scale)),
+        (f"{describe_depth(depth_scale)}; one scale", lambda scale: _fit(color_depth(depth, depth_scale), scale, smooth=False)),
         (_instances_caption(view), lambda scale: _fit(_color_instances(view, color), scale, smooth=False)),
-        ("boxes: amodal thin, visible thick; obj_id and visible fraction", lambda scale: _draw_boxes(view, _fit(color, scale), scale)),
+        ("boxes: amodal thin, visible thick", lambda scale: _draw_boxes(view, _fit(color, scale), scale)),
+        (
+            "object: label, visible fraction, name",
+            lambda scale: _draw_legend(view, facts[1:], baked, max(_MIN_LEGEND, round(size[1] * scale)), most),
+        ),
     ]
-    panels += [(caption, partial(_fit, picture, smooth=False)) for caption, picture in layer_pictures(folder, view.frame, size, sensor)]
+    counts = depth_scale and DepthScale(*(each / float(view.camera["depth_scale"]) for each in depth_scale))
+    layers = layer_pictures(folder, view.frame, size, sensor, counts)
+    panels += [(caption, partial(_fit, picture, smooth=False)) for caption, picture in layers]
     scale = min(_PANEL_WIDTH / size[0], _MAX_PANEL_HEIGHT / size[1])
-    return np.concatenate([_captioned(draw(scale), caption) for caption, draw in panels], axis=1)
+    drawn = [(caption, draw(scale)) for caption, draw in panels]
+    height = max(image.shape[0] for _, image in drawn)
+    return np.concatenate([_captioned(image, caption, height) for caption, image in drawn], axis=1)
+
+
+def _draw_legend(view: _View, facts: Sequence[str], baked: Baked, height: int, most: int) -> Image:
+    return draw_legend((legend_width(height, most), height), facts, view.truth, baked.names)
 
 
 def _fit(image: Image, scale: float, smooth: bool = True) -> Image:
@@ -211,42 +233,11 @@ def _fit(image: Image, scale: float, smooth: bool = True) -> Image:
     return np.pad(fitted, ((0, 0), (0, _PANEL_WIDTH - size[0]), (0, 0)))
 
 
-def _captioned(image: Image, caption: str) -> Image:
-    """Add a caption above an image and gaps around it."""
+def _captioned(image: Image, caption: str, height: int) -> Image:
+    """Add a caption above an image, gaps around it, and space below it up to a height [px]."""
     head = np.zeros((_CAPTION, image.shape[1], 3), np.uint8)
-    put_text(head, caption, (4, 14), 0.42, (230, 230, 230))
-    return np.pad(np.concatenate((head, image)), ((0, _GAP), (0, _GAP), (0, 0)))
-
-
-def put_text(image: Image, text: str, place: tuple[int, int], size: float, color: tuple[int, int, int], thickness: int = 1) -> None:
-    """Draw text; `place` is its lower left corner [px], `size` OpenCV's font scale."""
-    # Names of folders and texts of records may have characters that cannot be encoded, or that end OpenCV's string.
-    shown = "".join(letter if letter.isprintable() else "?" for letter in text)
-    cv2.putText(image, shown, place, FONT, size, color, thickness, cv2.LINE_AA)
-
-
-def _depth_limits(depth: np.ndarray) -> tuple[float, float] | None:
-    """Depth range of the colour map [mm]; None: no surface."""
-    known = depth[depth > 0]
-    if not known.size:
-        return None
-    low, high = np.percentile(known, _DEPTH_RANGE)
-    return float(low), float(high)
-
-
-def describe_depth(depth: np.ndarray) -> str:
-    """Caption of `color_depth`: the depths of the first and the last colour; depth [mm]."""
-    limits = _depth_limits(depth)
-    return "depth: none" if limits is None else f"depth {limits[0] / 1000:.3f} (red) to {limits[1] / 1000:.3f} m (blue); black: none"
-
-
-def color_depth(depth: np.ndarray) -> Image:
-    """Depth as a TURBO colour map, near red, far blue, no surface black."""
-    low, high = _depth_limits(depth) or (0.0, 1.0)
-    nearness = np.clip((high - depth) / max(high - low, 1e-9), 0.0, 1.0)
-    colored = cv2.applyColorMap(np.rint(255 * nearness).astype(np.uint8), cv2.COLORMAP_TURBO)
-    colored[depth == 0] = 0
-    return colored
+    put_text(head, caption, (4, 14), 0.42, PAPER)
+    return np.pad(np.concatenate((head, image)), ((0, height - image.shape[0] + _GAP), (0, _GAP), (0, 0)))
 
 
 def _instances_caption(view: _View) -> str:
@@ -268,14 +259,9 @@ def _color_instances(view: _View, color: Image) -> Image:
     return drawn
 
 
-def instance_color(instance: int) -> tuple[int, int, int]:
-    """Colour of an instance id, the same in all images of an episode; blue first."""
-    red, green, blue = colorsys.hsv_to_rgb(instance * _GOLDEN % 1.0, 0.85 - 0.3 * (instance % 2), 1.0)
-    return round(255 * blue), round(255 * green), round(255 * red)
-
-
 def _draw_boxes(view: _View, image: Image, scale: float) -> Image:
-    """Draw amodal and visible bounding boxes with object id and visible fraction, in place."""
+    """Draw amodal and visible bounding boxes with labels, in place."""
+    texts, boxes, labels, colors = label_texts(view.truth), [], [], []
     for index, (record, info) in enumerate(view.truth):
         if info["px_count_visib"] == 0:
             continue
@@ -285,9 +271,8 @@ def _draw_boxes(view: _View, image: Image, scale: float) -> Image:
             # BOP's boxes end with their last pixel; OpenCV takes corner coordinates, hence + 1.
             first, second = ((round(scale * u), round(scale * v)) for u, v in ((x, y), (x + width + 1, y + height + 1)))
             cv2.rectangle(image, first, second, color, thickness)
-        x, y = info["bbox_visib"][:2]
-        place = (max(0, round(scale * x) + 3), max(10, round(scale * y) + 11))
-        text = f"{record['obj_id']}: {info['visib_fract']:.2f}"
-        cv2.putText(image, text, place, FONT, 0.36, (0, 0, 0), 3, cv2.LINE_AA)
-        put_text(image, text, place, 0.36, (255, 255, 255))
+        boxes.append(Box(*(scale * value for value in info["bbox_visib"])))
+        labels.append(texts[index])
+        colors.append(color)
+    draw_labels(image, boxes, labels, colors)
     return image

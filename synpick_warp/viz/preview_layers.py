@@ -9,18 +9,13 @@ import cv2
 import numpy as np
 
 from synpick_warp.layer_codec import read_layer
+from synpick_warp.viz.depth_colors import DepthScale, color_depth
+from synpick_warp.viz.drawing import GOLDEN, Image
 
 _MOTION_RANGE = 99.0
 """Percentile of an image's motions that maps to full colour."""
-_DEPTH_RANGE = (1.0, 99.0)
-"""Percentiles of the depths that map to the first and the last colour."""
-_GOLDEN = 0.6180339887498949
-"""Golden ratio conjugate (√5 - 1) / 2: multiples modulo 1 are a low-discrepancy sequence for any count."""
 _GREY = 64
 """Grey level of unknown pixels, which differ from static ones."""
-
-Image = np.ndarray
-"""(H, W, 3) uint8, blue first."""
 
 
 def color_layer(name: str, values: np.ndarray) -> Image:
@@ -28,21 +23,26 @@ def color_layer(name: str, values: np.ndarray) -> Image:
     return draw_layer(name, values)[1]
 
 
-def draw_layer(name: str, values: np.ndarray) -> tuple[str, Image]:
-    """Caption and colours of one layer, from its values as `synpick_warp.layer_codec.read_layer` returns them."""
-    return _DRAW[name](values)
+def draw_layer(name: str, values: np.ndarray, depth_scale: DepthScale | None = None) -> tuple[str, Image]:
+    """Caption and colours of one layer, from its values as `synpick_warp.layer_codec.read_layer` returns them.
+
+    `depth_scale` is that of depth images beside it, in the unit of the values; None: the image's own.
+    """
+    return _draw_depth_sensor(values, depth_scale) if name == "depth_sensor" else _DRAW[name](values)
 
 
-def layer_pictures(scene: Path, frame: int, size: tuple[int, int], sensor: str = "") -> list[tuple[str, Image]]:
-    """Draw each layer of a scene that `_DRAW` has: caption and image, whose width and height must be `size` [px].
+def layer_pictures(
+    scene: Path, frame: int, size: tuple[int, int], sensor: str = "", depth_scale: DepthScale | None = None
+) -> list[tuple[str, Image]]:
+    """Draw each layer of a scene that can be drawn: caption and image, whose width and height must be `size` [px].
 
     `sensor` is the suffix of the folders of one sensor, such as "_cam1"; empty: classic layout.
 
     Raises:
         DatasetError: The scene has a layer, but not for this frame, or not of this size.
     """
-    present = {name: draw for name, draw in _DRAW.items() if (scene / f"{name}{sensor}").is_dir()}
-    return [draw(read_layer(scene, name, frame, size, sensor)) for name, draw in present.items()]
+    present = [name for name in (*_DRAW, "depth_sensor") if (scene / f"{name}{sensor}").is_dir()]
+    return [draw_layer(name, read_layer(scene, name, frame, size, sensor), depth_scale) for name in present]
 
 
 def _draw_normals(values: np.ndarray) -> tuple[str, Image]:
@@ -62,7 +62,7 @@ def _draw_nocs(values: np.ndarray) -> tuple[str, Image]:
 
 def _draw_classes(values: np.ndarray) -> tuple[str, Image]:
     present = np.unique(values[values > 0])
-    hue = (values * _GOLDEN) % 1.0
+    hue = (values * GOLDEN) % 1.0
     return f"classes: {len(present)} present", _from_hsv(hue, np.where(values > 0, 1.0, 0.0))
 
 
@@ -80,15 +80,9 @@ def _draw_scene_flow(values: np.ndarray) -> tuple[str, Image]:
     return f"scene flow: x, y, z as red, green, blue, up to {1e3 * full:.1f} mm", _with_unknown(colors, size)
 
 
-def _draw_depth_sensor(values: np.ndarray) -> tuple[str, Image]:
+def _draw_depth_sensor(values: np.ndarray, scale: DepthScale | None) -> tuple[str, Image]:
     """Depth as a TURBO colour map; holes are black."""
-    known = values[values > 0]
-    low, high = np.percentile(known, _DEPTH_RANGE) if known.size else (0.0, 1.0)
-    nearness = np.clip((high - values) / max(high - low, 1e-9), 0.0, 1.0)
-    colors = cv2.applyColorMap(np.rint(255.0 * nearness).astype(np.uint8), cv2.COLORMAP_TURBO)
-    holes = values == 0
-    colors[holes] = 0
-    return f"depth sensor: {100.0 * holes.mean():.1f} % holes, black", colors
+    return f"depth sensor: {100.0 * (values == 0).mean():.1f} % holes, black", color_depth(values, scale)
 
 
 def _full_scale(size: np.ndarray) -> float:
@@ -120,5 +114,4 @@ _DRAW: dict[str, Callable[[np.ndarray], tuple[str, Image]]] = {
     "classes": _draw_classes,
     "flow": _draw_flow,
     "scene_flow": _draw_scene_flow,
-    "depth_sensor": _draw_depth_sensor,
 }

@@ -146,7 +146,7 @@ def test_unknown_key_in_a_file(tmp_path, bakes, capsys):
     assert said.endswith("did you mean worlds?")
 
 
-@pytest.mark.parametrize("arguments", [["bake"], ["bake", "--out"], ["bkae"], ["preview"], ["--frobnicate"]])
+@pytest.mark.parametrize("arguments", [["bake", "--out"], ["bkae"], ["merge"], ["--frobnicate"]])
 def test_incomplete_command_lines(capsys, arguments):
     mistake(capsys, *arguments)
 

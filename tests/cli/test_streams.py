@@ -96,10 +96,24 @@ def test_rich_prints_into_an_ascii_stream(tmp_path, monkeypatch):
     assert (tmp_path / "out").read_text() == "worlds 2 \\xb7 3 m\\xb3 \\ud800\n"
 
 
+BAKE_ON_FULL_DEVICE = """
+import sys, synpick_warp.pipeline as pipeline
+from synpick_warp.cli.commands import main
+def build(*_, **__): raise AssertionError("the bake goes on")
+# No kernels are compiled or loaded, whatever the load of the machine: the first line comes before, and ends the bake.
+pipeline.build_factory = build
+pipeline.advise_processes = lambda *_: "the first line"
+sys.exit(main(sys.argv[1:]))
+"""
+
+
 def test_a_bake_on_a_full_device_stops_in_its_first_progress_line(tmp_path):
     """Fault 10: nothing is left behind."""
     out = tmp_path / "deep" / "set"
-    result = run(f"bake --config smoke --device cpu --resolution 160x90 --worlds 1 --episodes 1 --mode move --out {out}", ">/dev/full")
+    arguments = f"bake --config smoke --device cpu --resolution 160x90 --worlds 1 --episodes 1 --mode move --out {out}"
+    with open("/dev/full", "w") as full:
+        command = [sys.executable, "-c", BAKE_ON_FULL_DEVICE, *arguments.split()]
+        result = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, check=False)
     assert (result.returncode, result.stderr.decode()) == (2, FULL)
     assert not out.parent.exists()
 

@@ -136,7 +136,7 @@ def test_methods_have_different_names(tmp_path):
         (["--top", "1.5"], '--top is "1.5"; allowed: a whole number'),
         (["--out", "{folder}/none/table.txt"], "/none/table.txt; allowed: a file in an existing folder"),
         (["--out", "{folder}"], "; allowed: a file in an existing folder"),
-        (["--out", "{good}"], ", one of the result files; name another file"),
+        (["--out", "{good}"], ", which the command reads; name another file"),
         (["--plots", "{folder}"], "--plots is {folder}; allowed: a new folder, or an empty one"),
         (["--plots", "{good}"], "; allowed: a new folder, or an empty one"),
         (["--plots", "{good}/below"], "/below, but {good} is a file; name another folder"),

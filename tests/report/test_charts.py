@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace as Namespace
 
+import numpy as np
 import pytest
 
 pytest.importorskip("vl_convert")
@@ -12,7 +14,7 @@ import synpick_warp
 from synpick_warp.configs.load import load_config
 from synpick_warp.report.charts import Source, make_charts, object_labels
 from synpick_warp.report.page import VEGA_LITE
-from synpick_warp.report.sampling import Brightness, find_content, measure_brightness, read_episodes, sample_views
+from synpick_warp.report.sampling import Brightness, Episodes, find_content, measure_brightness, read_episodes, sample_views
 from synpick_warp.statistics import compute_statistics
 from synpick_warp.statistics.timeline import TimePoint
 
@@ -46,6 +48,31 @@ def test_the_values_are_those_of_the_statistics(charts, statistics):
     assert [(row["low"], row["count"]) for row in charts["brightness"].spec["data"]["values"]] == [(0.3, 1), (0.95, 1)]
 
 
+@pytest.mark.parametrize("name", ["visibility", "brightness", "exposure", "forces"])
+def test_the_last_tick_of_an_axis_is_where_its_bars_or_rules_end(charts, statistics, name):
+    """100 % was missing beside 95 %."""
+    spec = charts[name].spec if name in charts else _exposed(statistics).spec
+    bars = spec.get("layer", [spec])[0]
+    x, ends = bars["encoding"]["x"], [row["high"] for row in bars["data"]["values"]]
+    ticks = x["axis"]["values"]
+    assert 2 <= len(ticks) <= 11
+    assert ticks[-1] == x["scale"]["domain"][1] == (load_config().suction.good_force if name == "forces" else max(ends))
+    assert np.diff(ticks) == pytest.approx(np.diff(ticks)[0])
+
+
+def _exposed(statistics):
+    lights = replace(statistics.lights, exposure={-0.3: 2, 0.1: 1})
+    return next(each for each in make_charts(Source(replace(statistics, lights=lights), [], load_config())) if each.name == "exposure")
+
+
+def test_objects_over_time_last_as_long_as_the_longest_episode(statistics):
+    group = replace(statistics.groups[0], objects_over_time=(TimePoint(0.0, 30, 5.0), TimePoint(2.0, 9, 3.0)))
+    source = Source(replace(statistics, groups=(group,)), [], load_config(), {group.mode: 3.4})
+    spec = next(chart for chart in make_charts(source) if chart.name == "timeline").spec
+    assert [(row["time"], row["objects"]) for row in spec["data"]["values"]] == [(0.0, 5.0), (2.0, 3.0), (3.4, 3.0)]
+    assert spec["encoding"]["x"]["scale"]["domain"] == [0, 3.4]
+
+
 def test_every_plot_compiles(charts):
     import vl_convert
 
@@ -67,6 +94,18 @@ def test_names_stand_in_values_only(statistics):
     assert len(set(labels.values())) == len(objects)
 
 
+def sampled(rows: dict[int, Namespace], count: int) -> list[tuple[int, int, int]]:
+    """Episode, frame and camera of the views that are sampled of episodes of so many frames."""
+
+    class Set:
+        camera_count = 3
+
+        def __getitem__(self, index: int) -> Namespace:
+            return Namespace(view=lambda frame, camera: (index, frame, camera))
+
+    return sample_views(Set(), Episodes(rows, {}, len(rows)), count)
+
+
 def test_views_are_sampled_evenly_and_distinct(data):
     opened = synpick_warp.open(data)
     episodes = read_episodes(opened)
@@ -75,6 +114,14 @@ def test_views_are_sampled_evenly_and_distinct(data):
         keys = [(view.episode, view.frame, view.camera) for view in sample_views(opened, episodes, count)]
         assert len(set(keys)) == len(keys) == min(count, 18)
         assert len({key[0] for key in keys}) == min(count, 3)
+    rows = {0: Namespace(frames=90), 7: Namespace(frames=40)}
+    one = sampled(rows, 12)
+    for index, frames in ((0, 90), (7, 40)):
+        assert [frame * 6 // frames for episode, frame, _ in one if episode == index] == [0, 1, 2, 3, 4, 5]
+        assert np.bincount([camera for episode, _, camera in one if episode == index]).tolist() == [2, 2, 2]
+    many = sampled({index: Namespace(frames=100) for index in range(300)}, 24)
+    assert sorted(frame * 24 // 100 for _, frame, _ in many) == list(range(24))
+    assert np.bincount([camera for _, _, camera in many]).tolist() == [8, 8, 8]
     view = opened[0].view(0)
     assert find_content(opened, view).masks
     assert measure_brightness(view).mean == pytest.approx(float((view.rgb[::4, ::4] @ [0.2126, 0.7152, 0.0722]).mean()) / 255, abs=1e-4)

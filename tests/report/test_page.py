@@ -133,12 +133,12 @@ def test_sets_of_every_shape(data, tmp_path, capsys):
     shutil.copytree(data, folder)
     shutil.rmtree(folder / "train")
     assert main(["report", str(folder)]) == 0
-    assert capsys.readouterr().out.startswith(f"report: {folder / 'report.html'} (")
-    assert len(Parsed(folder / "report.html").content()["frames"]) == 12
+    assert capsys.readouterr().out.startswith(f"report: {tmp_path / 'set-report.html'} (")
+    assert len(Parsed(tmp_path / "set-report.html").content()["frames"]) == 12
     shutil.rmtree(folder / "train_web")
     assert main(["report", str(folder), "--views", "2"]) == 0
-    assert Parsed(folder / "report.html").content()["frames"] == []
-    assert "This data set has no images." in (folder / "report.html").read_text()
+    assert Parsed(tmp_path / "set-report.html").content()["frames"] == []
+    assert "This data set has no images." in (tmp_path / "set-report.html").read_text()
 
 
 def test_sets_of_several_sensors_have_the_same_pictures(tmp_path):

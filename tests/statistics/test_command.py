@@ -9,11 +9,12 @@ import shutil
 from pathlib import Path
 
 import pytest
+from rich.console import Console
 
 import synpick_warp
 from synpick_warp.cli.commands import main
 from synpick_warp.configs.schema import Split
-from synpick_warp.statistics import compute_statistics
+from synpick_warp.statistics import Statistics, compute_statistics
 from synpick_warp.statistics.output import to_csv
 from synpick_warp.statistics.tables import Column, Table, make_tables
 from tests.harness.scripted_bake import bake, settings
@@ -76,6 +77,31 @@ def test_text_json_and_csv_are_the_same_numbers(folder, tmp_path, capsys):
         assert header == [column.name for column in table.columns]
         assert rows == [["" if value is None else str(value) for value in row] for row in table.rows]
         assert all(len(row) == len(header) for row in rows)
+
+
+@pytest.mark.parametrize("width", [40, 79, 100, 120, 300])
+def test_no_column_is_cut_at_any_width(folder, capsys, monkeypatch, width):
+    monkeypatch.setattr("synpick_warp.cli.display.make_console", lambda: Console(width=width, highlight=False))
+    text, _ = run(capsys, folder, "--paper")
+    assert "…" not in text
+    statistics = compute_statistics(synpick_warp.open(folder))
+    for table in make_tables(statistics):
+        if table.name == "paper":
+            assert all(f"{column.label or column.name.replace('_', ' ')}" in text for column in table.columns)
+            assert all(format(row.paper.views, ",") in text for row in statistics.paper)
+    if width > 79:
+        assert max(map(len, text.splitlines()[1:4])) <= width
+
+
+def test_the_paper_stands_beside_its_own_objects_or_if_asked_for(folder, tmp_path, capsys, monkeypatch):
+    hint = "the objects are not those of the paper; --paper shows its numbers beside these"
+    for arguments, shown, hinted in (([], False, True), (["--paper"], True, False), (["--no-paper"], False, False)):
+        text, _ = run(capsys, folder, *arguments)
+        assert ("Beside SynPick" in text, hint in text) == (shown, hinted)
+    monkeypatch.setattr(Statistics, "has_paper_objects", True)
+    text, _ = run(capsys, folder)
+    assert "Beside SynPick" in text
+    assert hint not in text
 
 
 def test_splits_are_counted_apart_and_alone(folder, capsys):
@@ -159,7 +185,7 @@ def test_wrong_options_are_named_in_one_line(folder, tmp_path, capsys):
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "thesis.txt").touch()
     assert refused(capsys, folder, "--csv", tmp_path / "full") == f"--csv is {tmp_path / 'full'}; allowed: a new or an empty folder"
-    assert refused(capsys, folder, "--csv", folder / "tables").startswith(f"--csv is {folder / 'tables'}, inside the data set")
+    assert refused(capsys, folder, "--csv", folder / "tables").startswith(f"--csv is {folder / 'tables'}, among the files of the data set")
 
 
 def test_names_are_neither_formulas_nor_markup(copy, capsys):

@@ -17,11 +17,11 @@ from synpick_warp.configs.write import config_to_toml
 from synpick_warp.errors import DatasetError, OutputError
 from synpick_warp.exporters.bop.exporter import BopExporter
 from synpick_warp.viz import explain
+from synpick_warp.viz.drawing import FONT, instance_color
 from synpick_warp.viz.explain import object_names, to_color_image, write_explanation
 from synpick_warp.viz.explain_graph import RED
 from synpick_warp.viz.explain_panels import draw_load, fitted, ticks, wrapped
 from synpick_warp.viz.explain_record import choice_words, labels, seal_words
-from synpick_warp.viz.preview import FONT, instance_color
 from tests.harness.exporter_contract import export
 from tests.worlds.attempt_records import attempt, nothing_seen, record, seen, seen_object
 from tests.worlds.box_views import config
@@ -335,7 +335,7 @@ def test_the_command(dataset, tmp_path, capsys):
     assert main(["explain", str(dataset), "--episode", "1"]) == 0
     assert main(["explain", str(dataset), "--episode", "1", "--attempt", "2"]) == 0
     assert main(["explain", str(dataset), "--episode", "1", "--attempt", "0", "--out", str(tmp_path / "deep" / "a.jpg")]) == 0
-    files = [dataset / "explain-000001.png", dataset / "explain-000001-002.png", tmp_path / "deep" / "a.jpg"]
+    files = [tmp_path / "set-explain-000001.png", tmp_path / "set-explain-000001-002.png", tmp_path / "deep" / "a.jpg"]
     assert capsys.readouterr().out == "".join(f"explanation: {file}\n" for file in files)
     heights = [cv2.imread(str(file)).shape[0] for file in files]
     assert heights[0] > heights[1] + heights[2]
@@ -347,7 +347,7 @@ def test_the_command(dataset, tmp_path, capsys):
         (["--episode", "2"], "attempts.jsonl has no attempt of episode 2; episodes that have: 1, 4"),
         (["--episode", "1", "--attempt", "-1"], "attempts.jsonl has no attempt -1 of episode 1; attempts: 0 to 2"),
         (["--episode", "1", "--out", "a.txt"], "a.txt is not an image file; its name must end in .png, .jpg, .jpeg"),
-        ([], 'Command "explain" parameter --episode requires an argument.'),
+        (["--attempt", "1"], "--attempt is 1, but no episode is named; add --episode"),
     ],
 )
 def test_a_mistake_at_the_command_line_is_one_line_and_exit_code_2(dataset, capsys, monkeypatch, arguments, said):

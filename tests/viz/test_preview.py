@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import re
 import shutil
@@ -12,15 +13,22 @@ import numpy as np
 import pytest
 
 from synpick_warp.cli.commands import main
+from synpick_warp.configs.write import config_to_toml
 from synpick_warp.errors import DatasetError, OutputError
 from synpick_warp.exporters.bop.exporter import BopExporter
 from synpick_warp.exporters.bop.view import write_layer
-from synpick_warp.viz.preview import MAX_VIEWS, find_scenes, sample, write_contact_sheet
+from synpick_warp.viz.depth_colors import color_depth, pooled_scale, tote_scale
+from synpick_warp.viz.drawing import instance_color, short_labels
+from synpick_warp.viz.preview import MAX_VIEWS, find_scenes, read_baked, sample, write_contact_sheet
+from synpick_warp.viz.preview_legend import COLUMN, LINE, Box, draw_legend, legend_width, place_labels
 from tests.harness.exporter_contract import export
 from tests.harness.hostile import replaced
+from tests.harness.scripted_bake import bake, settings
 from tests.worlds.box_views import cameras, config
 
 FRAMES = 5
+LEGEND = COLUMN + 4
+"""Width of the legend and the gap beside it [px]."""
 EPISODES = (0, 1)
 
 
@@ -35,10 +43,10 @@ def dataset(made, tmp_path) -> Path:
     return Path(shutil.copytree(made, tmp_path / "set"))
 
 
-def test_a_row_a_view_and_four_pictures_a_row(dataset, tmp_path):
+def test_a_row_a_view_four_pictures_and_a_legend_a_row(dataset, tmp_path):
     out = write_contact_sheet(dataset, tmp_path / "new" / "sheet.png", 4)
     sheet = cv2.imread(str(out))
-    assert sheet.shape == (4 * (20 + 360 + 4), 4 * (480 + 4), 3)
+    assert sheet.shape == (4 * (20 + 360 + 4), 4 * (480 + 4) + LEGEND, 3)
     first = sheet[20:380, :480]
     scene, frame = sample(find_scenes(dataset), 4)[0]
     color = cv2.imread(str(scene.images("rgb") / f"{frame:06d}.jpg"))
@@ -64,8 +72,8 @@ def test_layers_get_columns_of_their_own(dataset, tmp_path):
             for frame in range(FRAMES):
                 write_layer(layer, scene, name, frame)
     sheet = cv2.imread(str(write_contact_sheet(dataset, tmp_path / "sheet.png", 1)))
-    assert sheet.shape[1] == 10 * (480 + 4)
-    panels = {name: sheet[20:380, 484 * (4 + i) : 484 * (4 + i) + 480] for i, name in enumerate(values)}
+    assert sheet.shape[1] == 10 * (480 + 4) + LEGEND
+    panels = {name: sheet[20:380, LEGEND + 484 * (4 + i) : LEGEND + 484 * (4 + i) + 480] for i, name in enumerate(values)}
     expected = {"normals": (255, 128, 128), "albedo": (50, 100, 200), "nocs": (51, 0, 255), "classes": (0, 0, 0)}
     for name, color in (expected | {"scene_flow": (64, 64, 64)}).items():
         assert (panels[name] == color).all(), name
@@ -104,6 +112,79 @@ def test_instances_and_boxes_are_drawn_where_they_are(dataset, tmp_path):
     assert abs(rows.min() - 5 * y) <= 2
     assert abs(columns.max() - 5 * (x + width + 1)) <= 2
     assert abs(rows.max() - 5 * (y + height + 1)) <= 2
+
+
+@pytest.mark.parametrize("count", [1, 4, 32])
+def test_labels_overlap_neither_each_other_nor_the_border(count):
+    """The boxes of a full tote, some of them equal, as those of objects that lie on each other are."""
+    draw = np.random.default_rng(count)
+    boxes = [Box(*draw.uniform(-20, (400, 200)), *draw.uniform(5, 120, 2)) for _ in range(count)]
+    boxes[1::4] = boxes[0::4][: len(boxes[1::4])]
+    labels = place_labels(boxes, [(34, 15)] * count, (480, 270))
+    assert None not in labels
+    assert not any(first.meets(second) for first, second in itertools.combinations(labels, 2))
+    assert all(0 <= each.x <= 480 - 34 and 0 <= each.y <= 270 - 15 for each in labels)
+
+
+def test_labels_that_find_no_room_are_left_out():
+    assert place_labels([Box(0, 0, 9, 9)] * 3, [(34, 15)] * 3, (40, 34)).count(None) == 1
+    assert place_labels([Box(0, 0, 9, 9)], [(34, 15)], (20, 32)) == [None]
+
+
+def test_instances_of_an_object_have_letters():
+    assert short_labels([(5, 9), (2, 4), (0, 9)]) == {5: "9a", 2: "4", 0: "9b"}
+    assert short_labels([(index, 1) for index in range(28)])[27] == "1ab"
+
+
+def test_the_legend_has_every_object_in_its_colour_or_counts_the_rest():
+    truth = [({"obj_id": 7, "instance_id": index}, {"visib_fract": 0.5, "px_count_visib": 9 * (index != 2)}) for index in range(12)]
+    width = legend_width(360, len(truth))
+    assert width == COLUMN
+    panel = draw_legend((width, 360), ["mode pick"], truth, {7: "mug"})
+    grounds = [tuple(round(0.85 * value) for value in instance_color(index)) for index in range(12)]
+    assert all((panel == ground).all(axis=2).sum() > 100 for ground in grounds)
+    short = draw_legend((legend_width(120, 40), 120), [], truth * 4, {})
+    assert short.shape == (120, 2 * COLUMN, 3)
+    assert short[-LINE:, COLUMN:].any()
+
+
+def test_depth_has_one_scale_the_totes(dataset, tmp_path):
+    """From the rim, which has the corner nearest to a camera, to the floor's farthest corner, in all views and rows."""
+    (dataset / "config.toml").write_text(config_to_toml(config()))
+    views = sample(find_scenes(dataset), 6)
+    records = [json.loads(scene.annotations().read_text())[str(frame)] for scene, frame in views]
+    near, far = tote_scale(read_baked(dataset, set()).config, records)
+    tote = config().tote
+    heights = {"near": tote.outer_size[2] - tote.wall, "far": 0.0}
+    sizes = {"near": tote.rim_size, "far": tote.floor_size}
+    depths = {name: [] for name in heights}
+    for record in records:
+        rotation, offset = np.array(record["cam_R_w2c"]).reshape(3, 3), np.array(record["cam_t_w2c"])
+        for name, corners in depths.items():
+            for x, y in itertools.product((-0.5, 0.5), repeat=2):
+                point = 1000 * np.array([x * sizes[name][0], y * sizes[name][1], heights[name]])
+                corners.append((rotation @ point + offset)[2])
+    assert (near, far) == pytest.approx((min(depths["near"] + depths["far"]), max(depths["near"] + depths["far"])))
+    sheet = cv2.imread(str(write_contact_sheet(dataset, tmp_path / "sheet.png", 6)))
+    for row, (scene, frame) in enumerate(views):
+        depth = cv2.imread(str(scene.images("depth") / f"{frame:06d}.png"), cv2.IMREAD_UNCHANGED) * records[row]["depth_scale"]
+        expected = color_depth(depth, (near, far))
+        np.testing.assert_array_equal(sheet[384 * row + 20 : 384 * row + 380, 484 : 484 + 480][2::5, 2::5], expected)
+
+
+def test_without_a_tote_the_scale_is_that_of_all_views_together():
+    depths = [np.full((70, 70), 500.0), np.full((70, 70), 900.0), np.zeros((70, 70))]
+    assert pooled_scale(depths) == (500.0, 900.0)
+    assert pooled_scale(depths[2:]) is None
+    assert (color_depth(depths[2]) == 0).all()
+
+
+def test_mode_time_and_light_of_a_view_are_told(dataset, tmp_path):
+    bake(tmp_path / "baked", settings(2, ("bop",)))
+    scene = find_scenes(tmp_path / "baked")[3]
+    told = read_baked(tmp_path / "baked", set()).facts(scene, 1, {"light": {"map": "studio"}})
+    assert told == ["train_pbr/000003, image 1", "episode 1, 0.01 s, mode pick", "light studio"]
+    assert read_baked(dataset, set()).facts(find_scenes(dataset)[3], 1, {"light": 3}) == told[:1]
 
 
 def test_sets_of_several_sensors_are_drawn_as_the_classic_layout(tmp_path):
@@ -179,10 +260,10 @@ def test_a_sheet_has_at_most_the_views_of_the_set_and_at_most_max_views(dataset,
 
 def test_a_link_in_place_of_the_sheet_is_replaced_and_not_followed(dataset, tmp_path):
     (tmp_path / "victim").write_text("mine")
-    (dataset / "contact-sheet.png").symlink_to(tmp_path / "victim")
+    (tmp_path / "set-contact-sheet.png").symlink_to(tmp_path / "victim")
     assert main(["preview", str(dataset), "--views", "1"]) == 0
     assert (tmp_path / "victim").read_text() == "mine"
-    assert not (dataset / "contact-sheet.png").is_symlink()
+    assert not (tmp_path / "set-contact-sheet.png").is_symlink()
 
 
 @pytest.mark.parametrize("name", ["depth", "mask_visib"])
@@ -212,4 +293,4 @@ def test_wrong_types_in_annotations_are_one_line(dataset, capsys, name, place, v
     assert main(["preview", str(dataset)]) == 2
     [line] = capsys.readouterr().err.splitlines()
     assert re.search(said, line)
-    assert not (dataset / "contact-sheet.png").exists()
+    assert not (dataset.parent / "set-contact-sheet.png").exists()

@@ -20,7 +20,7 @@ from synpick_warp.cli.doctor import describe_machine
 from synpick_warp.configs.schema import Config
 from synpick_warp.errors import SynpickError
 from synpick_warp.system.device import pick_device
-from synpick_warp.viz.preview import write_picture
+from synpick_warp.viz.drawing import write_picture
 from tools.options import configure, fail, make_parser, print_machine, print_rows, write_json
 from tools.reports.render_checks import measure_furnaces, measure_planes
 from tools.reports.render_piles import compare_piles

@@ -8,6 +8,7 @@ import uuid
 from pathlib import Path
 
 from synpick_warp.errors import OutputError
+from synpick_warp.system.folders import make_folder
 
 PARTIAL = ".partial"
 """Staging folder in the data set for uncommitted files: on the same file system, so that a rename commits them atomically.
@@ -27,7 +28,7 @@ def check_output_folder(out: Path) -> None:
     """
     created = [folder for folder in (out, *out.parents) if not os.path.lexists(folder)]
     try:
-        out.mkdir(parents=True, exist_ok=True)
+        make_folder(out)
         # Other hidden names are never touched: what a bake leaves that was killed before its manifest, or the user's, such as .git.
         names = [] if (out / MANIFEST_FILE).exists() else [name for name in os.listdir(out) if name == PARTIAL or not name.startswith(".")]
         if names:

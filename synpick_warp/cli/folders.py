@@ -1,0 +1,232 @@
+"""Default folders and files of the commands: where a bake writes without --out, which data set the others read, where outputs go.
+
+A data set is a folder with manifest.json and manifest/. The others take the current folder if it is one, else the last data set in it:
+finished ones before unfinished ones, then by the time at which an episode was last committed, which neither reading nor checking changes.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import re
+import stat
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+from synpick_warp.cli.options import one_line
+from synpick_warp.configs.check import escape
+from synpick_warp.configs.schema import Config
+from synpick_warp.errors import DatasetError, OutputError, SynpickError
+
+DEFAULT_NAME = "synpick-data"
+"""Folder of a bake without --out; its neighbours are synpick-data-2, synpick-data-3, ..."""
+_NUMBERED = re.compile(rf"{DEFAULT_NAME}(?:-([2-9]|[1-9][0-9]{{1,8}}))?")
+_MAX_NAMED = 3
+"""Most folders that a message names."""
+OWN_SUFFIXES = (".png", ".jpg", ".jpeg", ".html", ".htm", ".csv")
+"""Suffixes of pictures, pages and tables, which no format has in the data set's own folder: there, outputs may have them."""
+
+
+class _Found(NamedTuple):
+    """A data set in the current folder; the last one is the largest."""
+
+    finished: bool
+    committed: int
+    """Time at which an entry of the manifest was last written [ns]."""
+    folder: Path
+
+
+def is_data_set(folder: Path | str) -> bool:
+    """Whether a folder has the manifest of a data set, and a folder of entries; nothing is read."""
+    return _has(f"{folder}/manifest.json", stat.S_ISREG) and _has(f"{folder}/manifest", stat.S_ISDIR)
+
+
+def _has(path: str, kind: Callable[[int], bool]) -> bool:
+    try:
+        return kind(os.lstat(path).st_mode)
+    except (OSError, ValueError):
+        return False
+
+
+# ---- where a bake writes ----
+
+
+def choose_output(config: Config) -> tuple[Path, str]:
+    """Choose the folder of a bake without --out: that of the same bake, else the first of DEFAULT_NAME and its neighbours that is free.
+
+    The same bake has the same settings, number of episodes, and folders of objects and lights; it resumes.
+
+    Returns:
+        The folder, relative to the current one, and the choice in a line.
+
+    Raises:
+        OutputError: The current folder is in a data set, or cannot be read.
+    """
+    try:
+        inside = next((folder for folder in (Path.cwd(), *Path.cwd().parents) if is_data_set(folder)), None)
+        names = sorted((int(match[1] or 1), name) for name in os.listdir() if (match := _NUMBERED.fullmatch(name)))
+    except OSError as error:
+        raise OutputError(f"the current folder cannot be read: {error.strerror}; name the data set's folder with --out") from None
+    if inside is not None:
+        raise OutputError(f"the current folder is in the data set {inside}; name the new data set's folder with --out")
+    known = {number: Path(name) for number, name in names}
+    own = next((folder for folder in known.values() if _is_same_bake(folder, config)), None)
+    if own is not None:
+        return own, f"data set: ./{own}, which the same bake has started"
+    number = 1
+    while number in known and not _is_free(known[number]):
+        number += 1
+    taken = [str(folder) for folder in known.values()][: number - 1]
+    more = f" and {len(taken) - _MAX_NAMED} more" if len(taken) > _MAX_NAMED else ""
+    reason = f"; {', '.join(taken[:_MAX_NAMED])}{more} {'is' if len(taken) == 1 else 'are'} taken" if taken else ""
+    folder = Path(DEFAULT_NAME if number == 1 else f"{DEFAULT_NAME}-{number}")
+    return folder, f"data set: ./{folder} (--out names another folder{reason})"
+
+
+def _is_same_bake(folder: Path, config: Config) -> bool:
+    from synpick_warp.dataset.manifest import CONFIG_FILE, INPUTS, describe_differences, make_manifest, read_manifest, read_settings
+
+    if not is_data_set(folder):
+        return False
+    try:
+        manifest = read_manifest(folder)
+        if describe_differences(make_manifest(config), {name: manifest[name] for name in manifest if name != INPUTS}):
+            return False
+        # Without settings it was killed before its first episode.
+        return not os.path.lexists(folder / CONFIG_FILE) or _extent(read_settings(folder, manifest)) == _extent(config)
+    except (SynpickError, OSError):
+        return False
+
+
+def _extent(config: Config) -> tuple[object, ...]:
+    """Episodes and folders, which the manifest does not have."""
+    folders = (os.path.abspath(path) if path else "" for path in (config.bake.models, config.bake.lights))
+    return (config.bake.episodes, *(split.episodes for split in config.splits), *folders)
+
+
+def _is_free(folder: Path) -> bool:
+    """Whether a bake can take an existing folder: it is empty but for hidden files, and no other bake is about to fill it."""
+    if not _has(str(folder), stat.S_ISDIR):
+        return False
+    try:
+        if any(name == ".partial" or not name.startswith(".") for name in os.listdir(folder)):
+            return False
+        handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+    except OSError:
+        return False
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    except OSError:  # A file system without locks.
+        return True
+    else:
+        return True
+    finally:
+        os.close(handle)
+
+
+# ---- which data set is read ----
+
+
+def has_scenes(folder: Path) -> bool:
+    """Whether a data set has BOP scenes."""
+    return next(folder.glob("*/*/scene_camera*.json"), None) is not None
+
+
+def has_attempts(folder: Path) -> bool:
+    """Whether a data set has BOP scenes and pick attempts."""
+    try:
+        return (folder / "attempts.jsonl").stat().st_size > 0 and has_scenes(folder)
+    except OSError:
+        return False
+
+
+def has_images(folder: Path) -> bool:
+    """Whether a data set has BOP scenes or shards."""
+    return has_scenes(folder) or next(folder.glob("*_web/*.tar"), None) is not None
+
+
+_NEEDS: dict[Callable[[Path], bool], str] = {
+    has_scenes: "BOP scenes (--formats bop)",
+    has_attempts: "BOP scenes (--formats bop) with pick attempts (--mode pick, target, mixed or cycle)",
+    has_images: "images (--formats bop or shards)",
+}
+
+
+def find_data_set(named: Path | None, usage: str, suits: Callable[[Path], bool] | None = None) -> Path:
+    """Return the data set that is named, or else the last one of the current folder, which is announced on the standard error.
+
+    Args:
+        named: Folder that the user has named, which is not checked; None: none.
+        usage: How the command is called with a folder, for messages.
+        suits: Whether the command can use a data set; None: any.
+
+    Raises:
+        DatasetError: There is none.
+    """
+    if named is not None:
+        return named
+    try:
+        found = [_Found(True, 0, Path.cwd())] if is_data_set(".") else sorted(_list_data_sets(), reverse=True)
+    except OSError as error:
+        raise DatasetError(f"the current folder cannot be read: {error.strerror}; name a data set: {usage}") from None
+    if not found:
+        raise DatasetError(f"there is no data set in the current folder; name one ({usage}), or make one first (synpick-warp bake)")
+    last = next((each for each in found if suits is None or suits(each.folder)), None)
+    if last is None:
+        needed = _NEEDS[suits] if suits else ""
+        here = ", ".join(str(each.folder) for each in found[:_MAX_NAMED])
+        raise DatasetError(f"no data set in the current folder ({escape(here)}) has {needed}; name one that has: {usage}")
+    state = "" if last.finished else ", which is not finished"
+    print(one_line(f"synpick-warp: data set: {last.folder}{state} (the last one here; {usage} takes another)"), file=sys.stderr)
+    return last.folder
+
+
+def _list_data_sets() -> Iterator[_Found]:
+    """Data sets in the current folder."""
+    with os.scandir() as entries:
+        for entry in entries:
+            if not entry.name.startswith(".") and entry.is_dir() and is_data_set(entry.name):
+                committed = os.lstat(f"{entry.name}/manifest").st_mtime_ns
+                yield _Found(_has(f"{entry.name}/manifest/joined.json", stat.S_ISREG), committed, Path(entry.name))
+
+
+# ---- where outputs go ----
+
+
+def beside(folder: Path, ending: str) -> Path:
+    """Path of an output beside a data set: its folder's name with an ending."""
+    place = folder if folder.name not in ("", "..") else folder.resolve()
+    return place.with_name(f"{place.name or 'data-set'}{ending}")
+
+
+def check_output_file(out: Path, option: str, data_set: Path | None = None, inputs: Sequence[Path] = ()) -> None:
+    """Check that an output replaces no file of a data set, nor one that the command reads; call it before anything is read.
+
+    In the folder of a data set itself files may have the suffixes OWN_SUFFIXES; in its subfolders there are no outputs.
+
+    Args:
+        out: The file, or a folder.
+        option: Option that names it.
+        data_set: The data set that the command reads, which may be one of other programs.
+        inputs: Other files that the command reads.
+
+    Raises:
+        OutputError: It does.
+    """
+    try:
+        place = out.parent.resolve() / out.name
+        roots = [folder for folder in place.parents if is_data_set(folder)]
+        if data_set is not None and data_set.resolve() in place.parents:
+            roots.append(data_set.resolve())
+        same = next((path for path in inputs if path.resolve() in (place, out.resolve())), None)
+    except (OSError, RuntimeError, ValueError) as error:
+        raise OutputError(f"{option} is {out}: {getattr(error, 'strerror', None) or error}") from None
+    if same is not None:
+        raise OutputError(f"{option} is {out}, which the command reads; name another file")
+    for root in roots:
+        if place.parent != root or place.suffix.lower() not in OWN_SUFFIXES:
+            raise OutputError(f"{option} is {out}, among the files of the data set {root}; name a file outside of it")

@@ -1,0 +1,67 @@
+"""Commands `preview` and `explain`: a contact sheet of sampled views, and figures of pick attempts."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+from cyclopts import Parameter
+
+from synpick_warp.cli.folders import beside, check_output_file, find_data_set, has_attempts, has_scenes
+from synpick_warp.cli.options import WholeNumber
+from synpick_warp.configs.check import escape
+from synpick_warp.errors import ConfigError
+
+
+def preview(
+    folder: Annotated[Path | None, Parameter(name="DIR", help="A data set (default: the last one in the current folder).")] = None,
+    /,
+    *,
+    out: Annotated[Path | None, Parameter(help="PNG or JPEG file to write (default DIR-contact-sheet.png, beside the data set).")] = None,
+    views: Annotated[WholeNumber, Parameter(help="Number of views, spread over the data set.")] = 8,
+) -> int:
+    """Draw a contact sheet: colour, depth, instance masks, bounding boxes and layers of sampled views."""
+    if views < 1:
+        raise ConfigError(f"--views is {views}; allowed: at least 1")
+    folder = find_data_set(folder, "synpick-warp preview DIR", has_scenes)
+    sheet = out or beside(folder, "-contact-sheet.png")
+    from synpick_warp.viz.preview import check_picture_name, write_contact_sheet
+
+    check_picture_name(sheet)
+    check_output_file(sheet, "--out", folder)
+    write_contact_sheet(folder, sheet, views)
+    print(f"contact sheet: {escape(str(sheet))}")
+    return 0
+
+
+def explain(
+    folder: Annotated[
+        Path | None, Parameter(name="DIR", help="A data set with pick attempts (default: the last one in the current folder).")
+    ] = None,
+    /,
+    *,
+    episode: Annotated[
+        WholeNumber | None, Parameter(help="Index of the episode (default: the first three attempts worth seeing, of any).")
+    ] = None,
+    attempt: Annotated[WholeNumber | None, Parameter(help="Index of the attempt in the episode (default: all).")] = None,
+    out: Annotated[
+        Path | None,
+        Parameter(help="PNG or JPEG file to write (default DIR-explain.png, with indices if they are given, beside the data set)."),
+    ] = None,
+) -> int:
+    """Draw pick attempts: image with contours and suction points, clutter graph, choice of the target with its reason, seal force.
+
+    Worth seeing is an attempt that chose among several objects, some of which lie on others, and engaged one.
+    """
+    if episode is None and attempt is not None:
+        raise ConfigError(f"--attempt is {attempt}, but no episode is named; add --episode")
+    folder = find_data_set(folder, "synpick-warp explain DIR", has_attempts)
+    ending = "" if episode is None else f"-{episode:06d}" if attempt is None else f"-{episode:06d}-{attempt:03d}"
+    picture = out or beside(folder, f"-explain{ending}.png")
+    from synpick_warp.viz.explain import check_picture_name, write_explanation
+
+    check_picture_name(picture)
+    check_output_file(picture, "--out", folder)
+    write_explanation(folder, picture, episode, attempt)
+    print(f"explanation: {escape(str(picture))}")
+    return 0

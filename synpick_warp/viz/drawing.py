@@ -1,0 +1,103 @@
+"""Drawing primitives of all figures: text, colours and short labels of instances, picture files."""
+
+from __future__ import annotations
+
+import colorsys
+import os
+from collections.abc import Iterable
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from synpick_warp.errors import OutputError
+from synpick_warp.system.folders import make_folder
+
+FONT = cv2.FONT_HERSHEY_SIMPLEX
+GOLDEN = 0.6180339887498949
+"""Golden ratio conjugate (√5 - 1) / 2: multiples modulo 1 are a low-discrepancy sequence for any count."""
+INK = (40, 40, 40)
+WHITE = (255, 255, 255)
+_SUFFIXES = (".png", ".jpg", ".jpeg")
+
+Image = np.ndarray
+"""(H, W, 3) uint8, blue first, OpenCV's order."""
+
+
+def check_picture_name(out: Path) -> None:
+    """Raise OutputError unless the file name ends as a PNG or JPEG file."""
+    if out.suffix.lower() not in _SUFFIXES:
+        raise OutputError(f"{out} is not an image file; its name must end in {', '.join(_SUFFIXES)}")
+
+
+def write_picture(out: Path, picture: Image) -> Path:
+    """Write an image in the format of its suffix; its folder is created.
+
+    Raises:
+        OutputError: It cannot be written.
+    """
+    try:
+        encoded, data = cv2.imencode(out.suffix, picture)
+    except cv2.error:
+        encoded, data = False, np.empty(0, np.uint8)
+    if not encoded:
+        raise OutputError(
+            f"cannot write {out}: OpenCV cannot encode {picture.shape[1]} x {picture.shape[0]} pixels; use .png or fewer views"
+        )
+    partial_file = out.with_name(f".{out.name}.{os.getpid()}")
+    try:
+        make_folder(out.parent)
+        if out.is_dir():
+            raise OutputError(f"cannot write {out}: it is a folder")
+        try:
+            # A link of that name in the data set is replaced, never followed.
+            with open(partial_file, "xb") as file:
+                file.write(data.tobytes())
+            partial_file.replace(out)
+        except BaseException:
+            partial_file.unlink(missing_ok=True)
+            raise
+    except (OSError, ValueError) as error:
+        raise OutputError(f"cannot write {out}: {getattr(error, 'strerror', None) or error}") from error
+    return out
+
+
+def put_text(image: Image, text: str, place: tuple[int, int], size: float, color: tuple[int, int, int], thickness: int = 1) -> None:
+    """Draw text; `place` is its lower left corner [px], `size` OpenCV's font scale."""
+    # Names of folders and texts of records may have characters that cannot be encoded, or that end OpenCV's string.
+    shown = "".join(letter if letter.isprintable() else "?" for letter in text)
+    cv2.putText(image, shown, place, FONT, size, color, thickness, cv2.LINE_AA)
+
+
+def text_size(text: str, size: float) -> tuple[int, int]:
+    """Width and height of a text [px] at OpenCV's font scale `size`."""
+    width, height = cv2.getTextSize(text, FONT, size, 1)[0]
+    return width, height
+
+
+def instance_color(instance: int) -> tuple[int, int, int]:
+    """Colour of an instance id, the same in all images of an episode; blue first."""
+    red, green, blue = colorsys.hsv_to_rgb(instance * GOLDEN % 1.0, 0.85 - 0.3 * (instance % 2), 1.0)
+    return round(255 * blue), round(255 * green), round(255 * red)
+
+
+def readable_on(color: tuple[int, int, int]) -> tuple[int, int, int]:
+    """Text colour with contrast to a background (blue first): dark or white by luma."""
+    blue, green, red = color
+    return INK if 0.114 * blue + 0.587 * green + 0.299 * red > 110 else WHITE
+
+
+def short_labels(objects: Iterable[tuple[int, int]]) -> dict[int, str]:
+    """Short label of each (instance id, obj_id): its obj_id, with letters where several instances share it: 9a, 9b, ..., 9z, 9aa."""
+    by_object: dict[int, list[int]] = {}
+    for instance, object_id in objects:
+        by_object.setdefault(object_id, []).append(instance)
+    return {
+        instance: f"{object_id}{_letters(place) if len(group) > 1 else ''}"
+        for object_id, group in by_object.items()
+        for place, instance in enumerate(group)
+    }
+
+
+def _letters(place: int) -> str:
+    return (_letters(place // 26 - 1) if place >= 26 else "") + chr(ord("a") + place % 26)

@@ -1,0 +1,247 @@
+"""Default folders: where a bake writes without --out, which data set the other commands read, and outputs that must replace nothing."""
+
+from __future__ import annotations
+
+import dataclasses
+import fcntl
+import json
+import os
+import shutil
+from pathlib import Path
+
+import pytest
+
+from synpick_warp.cli.commands import main
+from synpick_warp.cli.folders import beside, choose_output
+from synpick_warp.configs.load import load_config
+from synpick_warp.configs.schema import Config
+from synpick_warp.configs.write import config_to_toml
+from synpick_warp.dataset.manifest import encode_manifest, make_manifest
+from synpick_warp.errors import OutputError
+from tests.harness.scripted_bake import bake, settings
+
+
+def start(folder: str, config: Config) -> Path:
+    """What a bake with these settings leaves that has begun."""
+    out = Path(folder)
+    (out / "manifest").mkdir(parents=True)
+    (out / "manifest.json").write_bytes(encode_manifest(make_manifest(config)))
+    (out / "config.toml").write_text(config_to_toml(config))
+    return out
+
+
+@pytest.fixture
+def here(tmp_path, monkeypatch) -> Path:
+    (tmp_path / "here").mkdir()
+    monkeypatch.chdir(tmp_path / "here")
+    return tmp_path / "here"
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory) -> Path:
+    """A data set of three episodes of mode pick."""
+    out = tmp_path_factory.mktemp("folders") / "PICKS"
+    config = settings(3, ("bop",))
+    bake(out, dataclasses.replace(config, bop=dataclasses.replace(config.bop, split="train", color_format="png")))
+    return out
+
+
+# ---- where a bake writes ----
+
+
+@pytest.mark.parametrize(
+    ("preset", "given", "episodes"),
+    [
+        (None, {}, 4),
+        (None, {"bake.worlds": 512}, 512),
+        (None, {"bake.worlds": 512, "bake.episodes": 7}, 7),
+        (None, {"bake.worlds": 0}, 4),
+        ("smoke", {}, 2),
+        ("smoke", {"bake.worlds": 8}, 8),
+        ("synpick-test", {"bake.worlds": 8}, 60),
+    ],
+)
+def test_episodes_are_as_many_as_the_worlds_asked_for_unless_they_are_set(preset, given, episodes):
+    assert load_config(preset, given).bake.episodes == episodes
+
+
+def test_a_file_may_set_either(tmp_path):
+    for text, episodes in (("worlds = 5", 5), ("worlds = 5\nepisodes = 3", 3), ("episodes = 9", 9)):
+        (tmp_path / "my.toml").write_text(f"[bake]\n{text}\n")
+        assert load_config(tmp_path / "my.toml").bake.episodes == episodes
+    assert load_config(tmp_path / "my.toml", {"bake.worlds": 2}).bake.episodes == 9
+
+
+def test_splits_set_their_own_episodes():
+    assert load_config("synpick", {"bake.worlds": 512}, splits=True).bake.episodes == 300
+
+
+def test_a_bake_without_a_folder_takes_the_first_that_is_free_or_its_own(here):
+    config, other = load_config("smoke"), load_config("smoke", {"bake.seed": 5})
+    assert choose_output(config) == (Path("synpick-data"), "data set: ./synpick-data (--out names another folder)")
+    (here / "synpick-data").mkdir()
+    (here / "synpick-data" / ".git").mkdir()
+    assert choose_output(config)[0] == Path("synpick-data")
+    start("synpick-data", config)
+    assert choose_output(config) == (Path("synpick-data"), "data set: ./synpick-data, which the same bake has started")
+    said = "data set: ./synpick-data-2 (--out names another folder; synpick-data is taken)"
+    assert choose_output(other) == (Path("synpick-data-2"), said)
+    start("synpick-data-12", other)
+    assert choose_output(other)[0] == Path("synpick-data-12")
+
+
+@pytest.mark.parametrize(
+    "given",
+    [{"bake.episodes": 3}, {"bake.worlds": 3}, {"bake.models": "there"}, {"bake.lights": "there"}, {"bake.formats": ["shards"]}],
+)
+def test_another_bake_is_one_of_other_settings_extent_or_inputs(here, given):
+    start("synpick-data", load_config("smoke"))
+    assert choose_output(load_config("smoke", given))[0] == Path("synpick-data-2")
+
+
+def test_where_it_was_baked_and_how_fast_makes_no_other_bake(here):
+    start("synpick-data", load_config("smoke", {"bake.models": "there"}))
+    same = load_config("smoke", {"bake.models": str(here / "there"), "bake.worlds": 1, "bake.episodes": 2, "bake.writers": 3})
+    assert choose_output(same)[0] == Path("synpick-data")
+
+
+def test_what_only_looks_like_a_folder_of_ours_is_left_alone(here):
+    config = load_config("smoke")
+    (here / "synpick-data").write_text("a file")
+    (here / "synpick-data-2").symlink_to("nowhere")
+    start("synpick-data-3", config).joinpath("manifest.json").write_text("{")
+    (here / "synpick-data-4").mkdir()
+    (here / "synpick-data-4" / "thesis.txt").touch()
+    (here / "synpick-data-5").mkdir()
+    handle = os.open("synpick-data-5", os.O_RDONLY)
+    fcntl.flock(handle, fcntl.LOCK_EX)  # A bake that has not written its manifest yet.
+    folder, said = choose_output(config)
+    os.close(handle)
+    assert folder == Path("synpick-data-6")
+    assert said.endswith("synpick-data, synpick-data-2, synpick-data-3 and 2 more are taken)")
+    assert choose_output(config)[0] == Path("synpick-data-5")
+
+
+def test_a_bake_within_a_data_set_needs_a_folder(here, monkeypatch, capsys):
+    monkeypatch.chdir(start("DATA", load_config("smoke")) / "manifest")
+    with pytest.raises(OutputError, match=r"the current folder is in the data set .*DATA; name the new data set's folder with --out"):
+        choose_output(load_config("smoke"))
+    assert main(["bake", "--config", "smoke", "--device", "cpu"]) == 2
+
+
+# ---- which data set the others read ----
+
+
+COMMANDS = ["preview", "explain", "stats", "report", "validate --fast", "verify", "convert --to shards", "eval --results a.csv"]
+
+
+@pytest.mark.parametrize("command", [*COMMANDS, "estimate --method single"])
+def test_without_a_data_set_the_commands_say_what_to_do(here, capsys, command):
+    (here / "other").mkdir()
+    (here / "manifest.json").write_text("{}")
+    assert main(command.split()) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith("synpick-warp: error: there is no data set in the current folder; name one (synpick-warp ")
+    assert line.endswith(" DIR), or make one first (synpick-warp bake)")
+
+
+def touch(folder: Path, seconds: int, *, finished: bool = True) -> None:
+    if finished:
+        (folder / "manifest" / "joined.json").touch()
+    os.utime(folder / "manifest", (seconds, seconds))
+
+
+def test_the_last_data_set_is_the_finished_one_that_was_written_last(here, capsys):
+    """By the time of the last commit; verify reads the settings of each, and says whose manifest it is."""
+    for name, seconds, finished in (("b", 300, True), ("a", 200, True), ("c", 900, False), (".hidden", 999, True)):
+        touch(start(name, load_config("smoke")), seconds, finished=finished)
+    assert main(["verify"]) == 1
+    assert capsys.readouterr().err == "synpick-warp: data set: b (the last one here; synpick-warp verify DIR takes another)\n"
+    for name in ("a", "b"):
+        (here / name / "manifest" / "joined.json").unlink()
+        os.utime(here / name / "manifest", (100, 100))
+    assert main(["verify"]) == 1
+    assert capsys.readouterr().err.startswith("synpick-warp: data set: c, which is not finished (the last one here; ")
+
+
+def test_a_command_takes_the_last_data_set_that_it_can_read(made, here, capsys):
+    (here / "PICKS").symlink_to(made)
+    touch(start("zarr-only", load_config("smoke")), 2**32)
+    assert main(["preview", "--views", "1"]) == 0
+    assert main(["explain"]) == 0
+    captured = capsys.readouterr()
+    assert captured.out == "contact sheet: PICKS-contact-sheet.png\nexplanation: PICKS-explain.png\n"
+    assert captured.err.count("data set: PICKS (the last one here; ") == 2
+    assert Path("PICKS-explain.png").stat().st_size > 10_000
+    (here / "PICKS").unlink()
+    assert main(["preview"]) == 2
+    assert "no data set in the current folder (zarr-only) has BOP scenes (--formats bop); name one that has" in capsys.readouterr().err
+
+
+def test_within_a_data_set_it_is_the_one(made, monkeypatch, capsys):
+    monkeypatch.chdir(made)
+    assert main(["verify"]) == 0
+    assert f"data set: {made} (the last one here; " in capsys.readouterr().err
+
+
+def test_a_named_data_set_is_not_announced(made, capsys):
+    assert main(["verify", str(made)]) == 0
+    assert capsys.readouterr().err == ""
+
+
+# ---- where outputs go ----
+
+
+@pytest.mark.parametrize(
+    ("folder", "said"), [("DATA", "DATA-x.png"), ("a/DATA/", "a/DATA-x.png"), (".", "{here}-x.png"), ("a/..", "{here}-x.png")]
+)
+def test_outputs_stand_beside_the_data_set(here, folder, said):
+    assert str(beside(Path(folder), "-x.png")) == said.format(here=here)
+
+
+OWN = ["manifest.json", "config.toml", "episodes.jsonl", "camera.json", "new.json", "train/000000/rgb/000000.png", "models/page.html"]
+
+
+@pytest.mark.parametrize("foreign", [False, True])
+@pytest.mark.parametrize("name", OWN)
+def test_no_output_replaces_or_adds_a_file_of_a_data_set(made, here, capsys, name, foreign):
+    """Not of the one that is read, and not of another one; nor of one of other programs."""
+    if foreign:
+        made = shutil.copytree(made, here / "foreign")
+        (made / "manifest.json").unlink()
+    target = str(made / name)
+    suffixes = {"preview": (".png",), "explain": (".png",), "report": (".html",)}
+    before = {path: path.read_bytes() for path in made.iterdir() if path.is_file()}
+    commands = {
+        "preview": ["preview", str(made)],
+        "explain": ["explain", str(made)],
+        "report": ["report", str(made)],
+        "eval": ["eval", "--data", str(made), "--results", "a.csv"],
+        "estimate": ["estimate", "--data", str(made), "--method", "single"],
+    }
+    for command, arguments in commands.items():
+        assert main([*arguments, "--out", target]) == 2
+        (line,) = capsys.readouterr().err.splitlines()
+        if target.endswith(suffixes.get(command, "")):
+            assert line == f"synpick-warp: error: --out is {target}, among the files of the data set {made}; name a file outside of it"
+    if not foreign:
+        assert main(["bake", "--config", "smoke", "--out", str(here / "new"), "--device", "cpu", "--profile-out", target]) == 2
+        assert "--profile-out is " in capsys.readouterr().err
+    assert {path: path.read_bytes() for path in made.iterdir() if path.is_file()} == before
+
+
+def test_a_picture_in_the_folder_of_a_data_set_is_a_file_of_nobody(made, capsys):
+    assert main(["preview", str(made), "--out", str(made / "contact-sheet.png"), "--views", "1"]) == 0
+    assert main(["preview", str(made), "--out", str(made / "contact-sheet.png"), "--views", "1"]) == 0
+    assert main(["verify", str(made)]) == 0
+    (made / "contact-sheet.png").unlink()
+
+
+def test_an_output_through_a_link_or_onto_an_input_is_found(made, here, capsys):
+    (here / "link").symlink_to(made)
+    (here / "a.csv").write_text("scene_id,im_id,obj_id,score,R,t,time\n")
+    (here / "targets.json").write_text(json.dumps([]))
+    arguments = ["eval", "--data", str(made), "--results", "a.csv", "--targets", "targets.json", "--out"]
+    for out, said in (("link/manifest.json", "among the files"), ("a.csv", "which the command reads"), ("targets.json", "which the com")):
+        assert main([*arguments, out]) == 2
+        assert said in capsys.readouterr().err

@@ -1,0 +1,70 @@
+"""Resources that the system does not grant: one line, exit code 2."""
+
+from __future__ import annotations
+
+import resource
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from synpick_warp.cli import commands
+from synpick_warp.cli.commands import main
+from tests.harness.scripted_bake import bake, settings
+
+pytest.importorskip("vl_convert")
+
+
+@pytest.mark.parametrize(
+    ("error", "said"),
+    [
+        (MemoryError(), "memory is exhausted; free memory, or raise its limit (ulimit -v)"),
+        (MemoryError("Unable to allocate 3 GiB"), "memory is exhausted (Unable to allocate 3 GiB); free memory, or raise its limit"),
+        (RuntimeError("can't start new thread"), "no thread can be started; close other programs, or raise the limit of processes"),
+        (OSError(24, "Too many open files"), "[Errno 24] Too many open files; raise the limit of open files (ulimit -n)"),
+        (ImportError("x.so: failed to map segment from shared object"), "memory is exhausted (x.so: failed to map segment"),
+        (ImportError("x.so: cannot open shared object file: Too many open files"), "x.so: cannot open shared object file: Too many "),
+    ],
+)
+@pytest.mark.parametrize("wrapped", [False, True])
+def test_a_limit_is_one_line(monkeypatch, capsys, error, said, wrapped):
+    def fail(*_, **__):
+        if wrapped:
+            raise ValueError("a consequence") from error
+        raise error
+
+    monkeypatch.setattr(commands, "load_config", fail)
+    assert main(["config"]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith(f"synpick-warp: error: {said}")
+
+
+@pytest.mark.parametrize("error", [RuntimeError("a fault of ours"), ImportError("no module named x"), OSError(5, "Input/output error")])
+def test_other_faults_keep_their_traceback(monkeypatch, error):
+    def fail(*_, **__):
+        raise error
+
+    monkeypatch.setattr(commands, "load_config", fail)
+    with pytest.raises(type(error)):
+        main(["config"])
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory) -> Path:
+    out = tmp_path_factory.mktemp("limits") / "set"
+    bake(out, settings(1, ("bop",)))
+    return out
+
+
+@pytest.mark.parametrize(("limit", "value"), [(resource.RLIMIT_AS, 3 << 30), (resource.RLIMIT_AS, 6 << 28), (resource.RLIMIT_NOFILE, 8)])
+def test_a_report_under_limits_is_a_page_or_one_line(data, tmp_path, limit, value):
+    """The plots' library, a browser's engine, aborted with its stack, or panicked."""
+    command = [sys.executable, "-m", "synpick_warp", "report", str(data), "--views", "1", "--out", str(tmp_path / "page.html")]
+    done = subprocess.run(
+        command, capture_output=True, text=True, check=False, preexec_fn=lambda: resource.setrlimit(limit, (value, value))
+    )
+    lines = done.stderr.splitlines()
+    assert done.returncode in (0, 2), done.stderr
+    assert (tmp_path / "page.html").exists() == (done.returncode == 0)
+    assert not done.returncode or (len(lines) == 1 and lines[0].startswith("synpick-warp: error: ")), done.stderr

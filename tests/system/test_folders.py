@@ -1,0 +1,66 @@
+"""Folders of any depth."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+from pathlib import Path
+
+import pytest
+
+from synpick_warp.cli.commands import main
+from synpick_warp.system.folders import make_folder
+from tests.harness.scripted_bake import bake, settings
+
+DEPTH = 1900
+"""More than Python's stack has calls; the path is shorter than Linux allows, 4,096 bytes."""
+
+
+def test_a_folder_with_parents_a_folder_that_is_there_and_a_file(tmp_path):
+    make_folder(tmp_path / "a" / "b")
+    make_folder(tmp_path / "a" / "b")
+    assert (tmp_path / "a" / "b").is_dir()
+    (tmp_path / "file").touch()
+    for path, error in ((tmp_path / "file", FileExistsError), (tmp_path / "file" / "below", NotADirectoryError)):
+        with pytest.raises(error):
+            make_folder(path)
+
+
+@pytest.fixture
+def here(tmp_path, monkeypatch):
+    """The current folder, which is removed again by a program that is not recursive, as pytest's is."""
+    monkeypatch.chdir(tmp_path)
+    yield tmp_path
+    subprocess.run(["rm", "-rf", "d"], cwd=tmp_path, check=True)
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory) -> Path:
+    out = tmp_path_factory.mktemp("deep") / "set"
+    bake(out, settings(1, ("bop", "zarr")))
+    return out
+
+
+@pytest.mark.parametrize(
+    ("command", "output"),
+    [
+        ("preview {data} --views 1 --out", "sheet.png"),
+        ("explain {data} --out", "sheet.png"),
+        ("report {data} --views 1 --out", "page.html"),
+        ("stats {data} --csv", "tables"),
+        ("convert {data} --to coco --processes 1 --out", "set"),
+        ("merge {data} --out", "set"),
+    ],
+)
+def test_outputs_lie_at_any_depth(data, here, command, output):
+    """RecursionError, with a traceback."""
+    out = "/".join(["d"] * DEPTH + [output])
+    assert main([*command.format(data=data).split(), out]) == 0
+    assert os.path.exists(out)
+
+
+def test_a_bake_is_refused_in_one_line_at_any_depth(here, capsys):
+    out = "/".join(["d"] * DEPTH)
+    assert main(["bake", "--config", "smoke", "--device", "cpu", "--mode", "move", "--models", str(here), "--out", out]) == 2
+    assert "contains no models" in capsys.readouterr().err
+    assert list(here.iterdir()) == []
