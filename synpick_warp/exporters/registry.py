@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import contextlib
 import importlib
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 
 from synpick_warp.configs.schema import Config
@@ -137,6 +137,6 @@ def shared_files(classes: Iterable[type[Exporter]], config: Config) -> SharedFil
     return SharedFiles(constants, indices, folders)
 
 
-def finalize(classes: Iterable[type[Exporter]], out: Path, config: Config, pool: WriterPool) -> list[Path]:
-    """Write the index files that span episodes, of every format; returns them, relative to the data set."""
-    return sorted(path for exporter_class in classes for path in exporter_class.finalize(out, config, pool))
+def finalize(classes: Iterable[type[Exporter]], out: Path, config: Config, pool: WriterPool, episodes: Sequence[int]) -> list[Path]:
+    """Write the index files over the committed episodes, of every format; returns them, relative to the data set."""
+    return sorted(path for exporter_class in classes for path in exporter_class.finalize(out, config, pool, episodes))

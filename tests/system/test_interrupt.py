@@ -87,7 +87,8 @@ def stopped(*parts: Callable[[], object]) -> None:
             for part in parts:
                 part()
 
-    pytest.raises(KeyboardInterrupt, run)
+    with pytest.raises(KeyboardInterrupt):
+        run()
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
     assert signal.getitimer(signal.ITIMER_REAL) == (0.0, 0.0)
 

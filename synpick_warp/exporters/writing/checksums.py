@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from synpick_warp.errors import DatasetError
-from synpick_warp.exporters.writing.files import MANIFEST_FILE, PARTIAL, write_atomically
+from synpick_warp.exporters.writing.files import MANIFEST_FILE, PARTIAL, is_litter, write_atomically
 from synpick_warp.inputs.paths import path_inside
 
 _LINE = re.compile(r"([0-9a-f]{64})  (.+)")
@@ -95,9 +95,11 @@ def list_files(out: Path, paths: Sequence[Path]) -> list[str]:
 
 
 def _walk(folder: str, name: str) -> Iterator[str]:
-    """Yield the names of all files in a folder and its subfolders, with `name` in place of the folder's path."""
+    """Yield the names of all files in a folder and its subfolders but litter, with `name` in place of the folder's path."""
     with os.scandir(folder) as entries:
         for entry in entries:
+            if is_litter(entry.name):
+                continue
             if entry.is_dir():
                 yield from _walk(entry.path, f"{name}/{entry.name}")
             else:
