@@ -92,9 +92,8 @@ def merge(parts: Sequence[Path], out: Path) -> Merged:
     finally:
         for lock in locks:
             os.close(lock)
-    there = committed_episodes(out)
-    planned = {index for each in plan_episodes(config) for index in each}
-    return Merged(len(there), sorted(planned - set(there)))
+    there = set(committed_episodes(out))
+    return Merged(len(there), [index for each in plan_episodes(config) for index in each if index not in there])
 
 
 def _check_folders(parts: Sequence[Path], out: Path) -> None:
@@ -195,8 +194,8 @@ class _Added:
         if folder not in self._folders:
             if not folder.is_dir():
                 self.make_folder(folder.parent)
-                folder.mkdir()
-                self.paths.append(folder)
+                with self._noted(folder):
+                    folder.mkdir()
             self._folders.add(folder)
 
     def link(self, source: Path, target: Path) -> None:
@@ -215,9 +214,21 @@ class _Added:
         except OSError as error:
             raise DatasetError(f"{source} cannot be read: {error.strerror}; `synpick-warp verify` names what is damaged") from None
         with open(source, "rb", opener=lambda *_: handle) as file:
-            if os.fstat(handle).st_mode & _EXECUTE or not _hard_link(source, target):
+            with self._noted(target):
+                is_linked = not os.fstat(handle).st_mode & _EXECUTE and _hard_link(source, target)
+            if not is_linked:
+                self.paths.pop()
                 self._copy(file, target)
-        self.paths.append(target)
+
+    @contextlib.contextmanager
+    def _noted(self, path: Path) -> Iterator[None]:
+        """Note a path before it is created, as an interrupt may follow at once; what exists already is not ours."""
+        self.paths.append(path)
+        try:
+            yield
+        except OSError:
+            self.paths.pop()
+            raise
 
     def _copy(self, source: BinaryIO, target: Path) -> None:
         with open(target, "xb") as file:

@@ -44,15 +44,15 @@ class KeptInterrupt:
     def __enter__(self) -> Self:
         if threading.current_thread() is threading.main_thread() and signal.getsignal(signal.SIGINT) is signal.default_int_handler:
             self._caller = sys._getframe(1)
-            self._before = signal.signal(signal.SIGALRM, self._retry)
             signal.signal(signal.SIGINT, self._handle)
         return self
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         if self._caller is None:
             return
-        signal.setitimer(signal.ITIMER_REAL, 0.0)
-        signal.signal(signal.SIGALRM, self._before)  # type: ignore[arg-type]
+        if self._count:
+            signal.setitimer(signal.ITIMER_REAL, 0.0)
+            signal.signal(signal.SIGALRM, self._before)  # type: ignore[arg-type]
         signal.signal(signal.SIGINT, signal.default_int_handler)
         self._caller = None
         # What a command returns or raises after an interrupt that it has swallowed means nothing.
@@ -61,6 +61,8 @@ class KeptInterrupt:
 
     def _handle(self, _: int, frame: FrameType | None) -> None:
         self._count += 1
+        if self._count == 1:
+            self._before = signal.signal(signal.SIGALRM, self._retry)
         signal.setitimer(signal.ITIMER_REAL, RETRY, RETRY)
         self._raise(frame)
 

@@ -43,9 +43,9 @@ def open_regular(path: Path | str) -> int:
     return handle
 
 
-def checksum(path: Path | str) -> str:
-    """SHA-256 of a regular file, in hexadecimal. Raises as `open_regular`."""
-    return _hash_file(path)[0]
+def checksum(path: Path | str, limit: int | None = None) -> str:
+    """SHA-256 of a regular file, in hexadecimal. Raises as `open_regular`, and OSError if it is larger than `limit` [bytes]."""
+    return _hash_file(path, limit)[0]
 
 
 def parse_checksums(lines: bytes, folder: Path, source: Path, advice: str) -> dict[str, str]:
@@ -106,10 +106,12 @@ def _walk(folder: str, name: str) -> Iterator[str]:
                 yield f"{name}/{entry.name}"
 
 
-def _hash_file(path: Path | str) -> tuple[str, int]:
+def _hash_file(path: Path | str, limit: int | None = None) -> tuple[str, int]:
     """Hash a regular file; returns its SHA-256 in hexadecimal and its size [bytes]."""
     with open(open_regular(path), "rb", buffering=0) as file:
         size = os.fstat(file.fileno()).st_size
+        if limit is not None and size > limit:
+            raise OSError(0, "it is larger than all files of its entry together", str(path))
         digest = hashlib.sha256(file.read()) if size <= _WHOLE else hashlib.file_digest(file, "sha256")
         return digest.hexdigest(), size
 

@@ -164,6 +164,21 @@ def test_merged_files_cannot_be_executed(narrow, tmp_path):
     assert {path.stat().st_mode & 0o7111 for path in (tmp_path / "merged").rglob("*") if path.is_file()} == {0}
 
 
+@pytest.mark.parametrize("call", ["link", "mkdir"])
+def test_a_merge_that_is_interrupted_after_its_first_file_leaves_nothing(narrow, tmp_path, monkeypatch, call):
+    made = getattr(os, call)
+
+    def make(*arguments: object, **options: object) -> None:
+        made(*arguments, **options)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(os, call, make)
+    (tmp_path / "merged" / ".git").mkdir(parents=True) if call == "link" else None
+    with pytest.raises(KeyboardInterrupt):
+        merge([narrow], tmp_path / "merged")
+    assert [path.name for path in tmp_path.glob("merged/*")] in ([], [".git"])
+
+
 # ---- pipes, sockets and devices ----
 
 
@@ -327,6 +342,13 @@ def test_shapes_that_arrays_state_are_compared_with_what_is_stored(tmp_path, arr
     episode = synpick_warp.open(store.parent)[0]
     with pytest.raises(DatasetError, match="states"):
         (episode.ticks if group == "ticks" else episode.attempt_arrays)[name]
+
+
+def test_a_file_with_a_hole_of_terabytes_is_not_read(narrow, tmp_path):
+    folder = copied(narrow, tmp_path / "set")
+    replace(folder / "models" / "models_info.json", b"{}")
+    os.truncate(folder / "models" / "models_info.json", 2**42)
+    assert "models_info.json cannot be read: it is larger than all files of its entry" in verify(folder).problem
 
 
 # ---- LeRobot's statistics ----
