@@ -7,7 +7,8 @@ How to add a format:
 2. Add a line to EXPORTERS: the format's name, the module and the class.
 3. Allow the name as a value of the setting `bake.formats`: `FORMATS` in configs/schema.py. Settings must not import exporters, so
    the name stands there once more; a test compares both.
-4. Let its test class inherit `ExporterContract` (tests/harness/exporter_contract.py): determinism, atomic commits, resuming.
+4. Add the names of its files to `dataset/file_names.py`: `merge`, `convert` and `verify` take no others.
+5. Let its test class inherit `ExporterContract` (tests/harness/exporter_contract.py): determinism, atomic commits, resuming.
 
 A new subpackage also goes into `packages` in pyproject.toml. Nothing else lists formats.
 """
