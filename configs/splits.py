@@ -7,7 +7,7 @@ from 0 to `bake.episodes`, in the folder `bop.split`.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 from synpick_warp.configs.check import format_value, suggest, to_index
 from synpick_warp.configs.schema import MULTISENSOR, Config, Split
@@ -125,6 +125,11 @@ def bop_scene(config: Config, episode: int, camera: int) -> tuple[int, str]:
     if config.bop.layout == MULTISENSOR:
         return episode, f"_{sensor_name(camera)}"
     return len(config.cameras.positions) * episode + camera, ""
+
+
+def scene_ids(config: Config, episodes: Iterable[int]) -> set[int]:
+    """Ids of all BOP scenes of episodes."""
+    return {bop_scene(config, episode, camera)[0] for episode in episodes for camera in range(len(config.cameras.positions))}
 
 
 def scene_episode(config: Config, scene: int) -> int:

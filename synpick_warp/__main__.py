@@ -4,7 +4,19 @@ from __future__ import annotations
 
 import sys
 
-from synpick_warp.cli.commands import main
+from synpick_warp.system.interrupt import KeptInterrupt
+
+
+def start() -> int:
+    """Run the command line; an interrupt while its modules are imported is one line, too."""
+    try:
+        with KeptInterrupt():
+            from synpick_warp.cli.commands import main
+    except KeyboardInterrupt:
+        print("synpick-warp: interrupted", file=sys.stderr)
+        return 130  # 128 + SIGINT, the shell convention
+    return main()
+
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(start())

@@ -40,6 +40,7 @@ from synpick_warp.configs.splits import plan_shard
 from synpick_warp.configs.write import config_to_toml
 from synpick_warp.errors import CatalogError, ConfigError, LightError, SynpickError
 from synpick_warp.system.garbage import collection_paused
+from synpick_warp.system.interrupt import KeptInterrupt
 
 NAME = "synpick-warp"
 EXIT_MISTAKE = 2
@@ -274,7 +275,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _run(arguments: list[str]) -> int:
     """Run the command line; mistakes are one line on the standard error, except those of the standard output."""
     try:
-        return app(arguments, exit_on_error=False, print_error=False) or 0
+        with KeptInterrupt():
+            return app(arguments, exit_on_error=False, print_error=False) or 0
     except StreamError:
         return EXIT_MISTAKE
     except (SynpickError, cyclopts.CycloptsError) as error:

@@ -16,6 +16,8 @@ from synpick_warp.configs.schema import Config
 from synpick_warp.conversion.scenes import SceneSource
 from synpick_warp.conversion.trajectories import check_trajectory, read_ticks
 from synpick_warp.dataset.annotations import ADVICE, check_content
+from synpick_warp.dataset.file_names import check_file_names
+from synpick_warp.dataset.frame_counts import check_frames
 from synpick_warp.dataset.manifest import (
     CONSTANTS,
     INPUTS,
@@ -32,6 +34,7 @@ from synpick_warp.dataset.view_files import SceneFolder, SceneShards
 from synpick_warp.errors import DatasetError
 from synpick_warp.exporters.trajectory.arrays import STORE
 from synpick_warp.exporters.writing.checksums import open_regular
+from synpick_warp.exporters.writing.files import remove_folder
 from synpick_warp.frames import EpisodeEnd, TickBatch
 
 _COPY_BYTES = 1 << 20
@@ -143,6 +146,7 @@ class Source:
         if entry is None:
             raise DatasetError(f"{self.folder / episode_entry(index)}.json is missing; resume the bake")
         row: dict[str, Any] = entry["row"]
+        check_frames(self.folder, self.config, index, row["frames"])
         lines = tuple(json.dumps(attempt) + "\n" for attempt in entry["attempts"])
         return SourceEpisode(self, EpisodeEnd(index, row["arrangement"], row["frames"], int(Ending[row["ending"].upper()]), row, lines))
 
@@ -153,13 +157,14 @@ class Source:
             DatasetError: A file is missing or no regular file, or the source has none of a name.
             OSError: A file cannot be written.
         """
-        listed = [Path(name) for name in read_checksums(self.folder, CONSTANTS)]
+        known = read_checksums(self.folder, CONSTANTS)
+        check_file_names(self.folder, CONSTANTS, known, self.config)
+        listed = [Path(name) for name in known]
         for name in names:
             files = [path for path in listed if path == name or name in path.parents]
             if not files:
                 raise DatasetError(f"{self.folder} has no {name}; bake it with --formats bop or shards")
-            if (out / name).is_dir():
-                shutil.rmtree(out / name)
+            remove_folder(out / name)
             for path in files:
                 (out / path).parent.mkdir(exist_ok=True)
                 self._copy(path, out / path)

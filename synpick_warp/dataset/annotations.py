@@ -38,6 +38,10 @@ Side = Annotated[int, Meta(ge=1, le=MAX_SIDE)]
 """Width or height of an image [px]."""
 
 
+MAX_SYMMETRIES = 1024
+"""Most symmetries of an object; a polyhedron has up to 60 rotations, and every one multiplies the work of evaluation."""
+
+
 class CameraEntry(Struct, gc=False):
     """A view's entry in scene_camera.json [mm]. Data sets of others may lack the extrinsics."""
 
@@ -97,8 +101,8 @@ class ModelInfo(ModelDiameter, gc=False):
     size_x: Annotated[float, Meta(ge=0.0, le=1e9)]
     size_y: Annotated[float, Meta(ge=0.0, le=1e9)]
     size_z: Annotated[float, Meta(ge=0.0, le=1e9)]
-    symmetries_discrete: list[Matrix4] | UnsetType = UNSET
-    symmetries_continuous: list[ContinuousSymmetry] | UnsetType = UNSET
+    symmetries_discrete: Annotated[list[Matrix4], Meta(max_length=MAX_SYMMETRIES)] | UnsetType = UNSET
+    symmetries_continuous: Annotated[list[ContinuousSymmetry], Meta(max_length=MAX_SYMMETRIES)] | UnsetType = UNSET
 
 
 class EpisodeRow(Struct, gc=False):

@@ -18,14 +18,17 @@ from typing import Any, BinaryIO, NamedTuple
 from synpick_warp.configs.schema import Config
 from synpick_warp.configs.splits import plan_episodes
 from synpick_warp.configs.write import config_to_toml
+from synpick_warp.dataset.file_names import check_file_names
 from synpick_warp.dataset.manifest import (
+    ATTEMPTS_FILE,
     CONFIG_FILE,
     CONSTANTS,
     ENTRIES,
+    EPISODES_FILE,
+    INDICES,
     committed_episodes,
     describe_differences,
     encode_manifest,
-    entry_advice,
     episode_entry,
     read_checksums,
     read_entry,
@@ -34,7 +37,8 @@ from synpick_warp.dataset.manifest import (
 )
 from synpick_warp.dataset.writing import finalize_data_set, lock_folder
 from synpick_warp.errors import DatasetError
-from synpick_warp.exporters.registry import load_exporter_classes, slot_bytes
+from synpick_warp.exporters.base import Exporter
+from synpick_warp.exporters.registry import load_exporter_classes, shared_files, slot_bytes
 from synpick_warp.exporters.writing.checksums import open_regular
 from synpick_warp.exporters.writing.files import MANIFEST_FILE, check_output_folder, output_error, write_atomically
 from synpick_warp.exporters.writing.pool import WriterPool
@@ -42,6 +46,8 @@ from synpick_warp.system.cores import count_cores
 
 MAX_EPISODES = 10_000_000
 """Most episodes of a merged data set: its missing ones are listed."""
+_EXECUTE = 0o111 | stat.S_ISUID | stat.S_ISGID | stat.S_ISVTX
+"""Rights that no file of a data set has. Some file systems show them on every file, so they are no error."""
 _COPY_BYTES = 1 << 20
 """Size of a copy block [B]."""
 
@@ -72,8 +78,8 @@ def merge(parts: Sequence[Path], out: Path) -> Merged:
         if said:
             raise DatasetError(f"{part} was made with other settings than {parts[0]}: {said}; only parts of one data set can be merged")
     _check_folders(parts, out)
-    sources = _sources(parts)
     config = _config(parts, manifest)
+    sources = _sources(parts, config)
     check_output_folder(out)
     if (out / MANIFEST_FILE).exists():
         raise DatasetError(f"{out} is already a data set; --out takes a new or an empty folder")
@@ -87,9 +93,8 @@ def merge(parts: Sequence[Path], out: Path) -> Merged:
     finally:
         for lock in locks:
             os.close(lock)
-    there = committed_episodes(out)
-    planned = {index for each in plan_episodes(config) for index in each}
-    return Merged(len(there), sorted(planned - set(there)))
+    there = set(committed_episodes(out))
+    return Merged(len(there), [index for each in plan_episodes(config) for index in each if index not in there])
 
 
 def _check_folders(parts: Sequence[Path], out: Path) -> None:
@@ -113,22 +118,17 @@ def _check_folders(parts: Sequence[Path], out: Path) -> None:
         raise DatasetError(f"a part or --out cannot be read: {getattr(error, 'strerror', None) or error}") from None
 
 
-def _sources(parts: Sequence[Path]) -> dict[Path, Path]:
+def _sources(parts: Sequence[Path], config: Config) -> dict[Path, Path]:
     """Choose the part that each manifest entry is taken from: entry -> part. Reads, and so validates, all entries and checksum lists."""
     sources: dict[Path, Path] = {}
-    owners: dict[str, Path] = {}
     for part in parts:
         for entry in (CONSTANTS, *map(episode_entry, committed_episodes(part))):
             checksums, known = read_checksums(part, entry), sources.setdefault(entry, part)
-            if known is not part:
-                if read_checksums(known, entry) != checksums or read_entry(known, entry) != read_entry(part, entry):
-                    raise DatasetError(
-                        f"{known} and {part} have different files for {entry.name}; only parts of one data set can be merged"
-                    )
+            check_file_names(part, entry, checksums, config)
+            if known is part:
                 continue
-            for name in checksums:
-                if owners.setdefault(name, entry) != entry:
-                    raise DatasetError(f"{part / entry}.sha256 names {name}, as does {owners[name]}.sha256; {entry_advice(entry)}")
+            if read_checksums(known, entry) != checksums or read_entry(known, entry) != read_entry(part, entry):
+                raise DatasetError(f"{known} and {part} have different files for {entry.name}; only parts of one data set can be merged")
     if not any(entry != CONSTANTS for entry in sources):
         raise DatasetError(f"{' and '.join(map(str, parts))} have no committed episode")
     return sources
@@ -149,7 +149,7 @@ def _config(parts: Sequence[Path], manifest: Mapping[str, Any]) -> Config:
 
 
 def _fill(out: Path, sources: dict[Path, Path], config: Config, manifest: bytes) -> None:
-    """Link all files, then all entries, and build the indices; once the manifest is there, a bake can resume the data set."""
+    """Link all files, then all entries, and build the indices; an error removes all of it again."""
     kinds = load_exporter_classes(config.bake.formats)
     added = _Added(out)
     lock = lock_folder(out)
@@ -161,17 +161,24 @@ def _fill(out: Path, sources: dict[Path, Path], config: Config, manifest: bytes)
                     added.link(part / name, out / name)
                 for suffix in (".sha256", ".json"):
                     added.link(part / f"{entry}{suffix}", out / f"{entry}{suffix}")
+            added.paths += _later_paths(out, kinds, config)
             write_atomically(out / CONFIG_FILE, config_to_toml(config).encode())
-            added.paths.append(out / CONFIG_FILE)
             write_atomically(out / MANIFEST_FILE, manifest)
+            with WriterPool(config.bake.writers or count_cores(), slot_bytes(kinds, config), lock) as pool:
+                finalize_data_set(out, config, kinds, pool)
         except BaseException:
             added.remove()
             raise
-        writers = config.bake.writers or count_cores()
-        with WriterPool(writers, slot_bytes(kinds, config), lock) as pool:
-            finalize_data_set(out, config, kinds, pool)
     finally:
         os.close(lock)
+
+
+def _later_paths(out: Path, kinds: Sequence[type[Exporter]], config: Config) -> list[Path]:
+    """Files and folders that are not linked but written, folders before what is in them."""
+    shared = shared_files(kinds, config)
+    entry = (INDICES.with_suffix(suffix) for suffix in (".json", ".sha256"))
+    names = (*reversed(shared.folders), *shared.indices, EPISODES_FILE, ATTEMPTS_FILE, *entry, CONFIG_FILE, MANIFEST_FILE)
+    return [out / name for name in names]
 
 
 class _Added:
@@ -189,12 +196,13 @@ class _Added:
             return
         missing = list(takewhile(lambda each: not each.is_dir(), (folder, *folder.parents)))
         for each in reversed(missing):
-            each.mkdir()
-            self.paths.append(each)
+            with self._noted(each):
+                each.mkdir()
         self._folders.add(folder)
 
     def link(self, source: Path, target: Path) -> None:
-        """Hard-link a regular file, or copy it where links are not possible. An existing file is never written to: it may be a hard link.
+        """Hard-link a regular file, or copy it where links are not possible, or would bring the right to execute it along. An existing
+        file is never written to: it may be a hard link.
 
         Raises:
             DatasetError: The source is missing, is a symbolic link or no regular file, or cannot be read.
@@ -208,13 +216,21 @@ class _Added:
         except OSError as error:
             raise DatasetError(f"{source} cannot be read: {error.strerror}; `synpick-warp verify` names what is damaged") from None
         with open(source, "rb", opener=lambda *_: handle) as file:
-            try:
-                os.link(source, target, follow_symlinks=False)
-            except FileExistsError:
-                raise
-            except OSError:
+            with self._noted(target):
+                is_linked = not os.fstat(handle).st_mode & _EXECUTE and _hard_link(source, target)
+            if not is_linked:
+                self.paths.pop()
                 self._copy(file, target)
-        self.paths.append(target)
+
+    @contextlib.contextmanager
+    def _noted(self, path: Path) -> Iterator[None]:
+        """Note a path before it is created, as an interrupt may follow at once; what exists already is not ours."""
+        self.paths.append(path)
+        try:
+            yield
+        except OSError:
+            self.paths.pop()
+            raise
 
     def _copy(self, source: BinaryIO, target: Path) -> None:
         with open(target, "xb") as file:
@@ -224,16 +240,27 @@ class _Added:
                     file.write(block)
                 file.flush()
                 state = os.fstat(source.fileno())
-                os.fchmod(file.fileno(), stat.S_IMODE(state.st_mode))
+                os.fchmod(file.fileno(), stat.S_IMODE(state.st_mode) & ~_EXECUTE)
                 os.utime(file.fileno(), ns=(state.st_atime_ns, state.st_mtime_ns))
             except OSError as error:
                 raise OSError(error.errno, error.strerror, str(target)) from error
 
     def remove(self) -> None:
         """Remove all that was added."""
-        for path in dict.fromkeys(reversed(self.paths)):
+        for path in reversed(self.paths):
             with contextlib.suppress(OSError):
                 path.rmdir() if path.is_dir() and not path.is_symlink() else path.unlink()
+
+
+def _hard_link(source: Path, target: Path) -> bool:
+    """Hard-link a file; returns whether the file system allows it. Raises FileExistsError."""
+    try:
+        os.link(source, target, follow_symlinks=False)
+    except FileExistsError:
+        raise
+    except OSError:
+        return False
+    return True
 
 
 def _read_blocks(source: BinaryIO) -> Iterator[bytes]:

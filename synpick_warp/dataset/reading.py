@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING, Any
 from synpick_warp.configs.check import format_value
 from synpick_warp.configs.splits import episode_range, plan_episodes
 from synpick_warp.dataset.annotations import ADVICE, EpisodeEntry, EpisodeRow, Key, ModelInfo, check_content, read_checked
+from synpick_warp.dataset.frame_counts import check_frames
 from synpick_warp.dataset.manifest import CONFIG_FILE, CONSTANTS, ENTRIES, MANIFEST_FILE, episode_entry, read_checksums
 from synpick_warp.dataset.scene_index import SceneIndex, numbered
 from synpick_warp.dataset.trajectory import (
@@ -85,7 +86,8 @@ class Episode:
     def _sizes(self) -> dict[str, int]:
         """Sizes of the arrays' dimensions."""
         store = check_content(self._data_set.attributes, StoreAttributes, self._data_set.folder / STORE)
-        return {"tick": len(self), "step": len(self) * store.steps_per_tick}
+        attempts = {} if self._record is None else {"attempt": len(self.attempts)}
+        return {"tick": len(self), "step": len(self) * store.steps_per_tick} | attempts
 
     @cached_property
     def _files(self) -> frozenset[Path]:
@@ -97,10 +99,11 @@ class Episode:
     @cached_property
     def row(self) -> dict[str, Any]:
         """The episode's line of episodes.jsonl: mode, ending, frames, seconds, counts of objects and attempts."""
-        if self._record is not None:
-            return self._record["row"]
-        check_content(self.attributes, EpisodeRow, self.group / GROUP_FILE)
-        return self.attributes
+        row = self.attributes if self._record is None else self._record["row"]
+        frames = check_content(row, EpisodeRow, self.group / GROUP_FILE).frames
+        data = self._data_set
+        check_frames(data.folder, data.config if (data.folder / CONFIG_FILE).exists() else None, self.index, frames)
+        return row
 
     @cached_property
     def attributes(self) -> dict[str, Any]:

@@ -22,6 +22,8 @@ Checksum = Annotated[str, msgspec.Meta(pattern=r"\A[0-9a-f]{64}\Z")]
 """SHA-256 in hexadecimal."""
 MAX_INSTANCES = 255
 """Most instances of a scene: their ids are bytes of an image."""
+MAX_OBSERVED = 32
+"""Most instances that perception sees: those of a world, as the bits of a mask."""
 Instances = Annotated[list[Index], msgspec.Meta(max_length=MAX_INSTANCES)]
 Amount = Annotated[float, msgspec.Meta(ge=0.0, le=1e9)]
 """Non-negative quantity in any unit; small enough for every drawing."""
@@ -106,8 +108,8 @@ class Observation(msgspec.Struct):
     """Perception result of an attempt, see `attempts.ObservationRecord`."""
 
     resolution: tuple[Side, Side]
-    instances: Annotated[list[InstanceObservation], msgspec.Meta(max_length=MAX_INSTANCES)]
-    votes: list[tuple[Index, Index, Amount]]
+    instances: Annotated[list[InstanceObservation], msgspec.Meta(max_length=MAX_OBSERVED)]
+    votes: Annotated[list[tuple[Index, Index, Amount]], msgspec.Meta(max_length=MAX_OBSERVED * (MAX_OBSERVED - 1))]
 
 
 class AttemptKey(msgspec.Struct):

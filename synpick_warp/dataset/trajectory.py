@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from msgspec import Meta, Struct
 
 from synpick_warp.dataset.annotations import ADVICE, check_content
+from synpick_warp.dataset.records import MAX_INSTANCES
 from synpick_warp.errors import DatasetError
 from synpick_warp.exporters.trajectory.arrays import CAMERAS, LABELS, OBJECTS, GroupSpec
 from synpick_warp.inputs.files import check_regular_file, describe_bytes, read_file
@@ -25,6 +26,8 @@ GROUP_FILE = "zarr.json"
 """Metadata of a zarr group or array (zarr format 3)."""
 MAX_ARRAY = 2**36
 """Largest array and chunk [bytes]: 64 GiB, the poses of 200 objects in 12 million steps."""
+_SMALL, _MAX_RATIO = 2**20, 1000
+"""Arrays whose shape nothing else tells: size that any may have [bytes], and most bytes for each byte that is stored."""
 _MAX_METADATA = 2**24
 """Largest zarr.json [bytes]; those of a bake have some kilobytes."""
 
@@ -155,9 +158,27 @@ class Arrays(Mapping[str, "zarr.Array"]):
                 wanted = " x ".join(name if size is None else str(size) for name, size in zip(spec.dims, expected, strict=True))
                 there = f"{dtype.name} of shape {' x '.join(map(str, shape))}"
                 raise DatasetError(f"the array {folder} is {there}; expected: {np.dtype(spec.dtype).name} of shape {wanted}; {ADVICE}")
+            free = {name: given for name, size, given in zip(spec.dims, expected, shape, strict=True) if size is None}
+            self._check_extent(folder, free, math.prod(shape) * dtype.itemsize, sizes.get("tick"))
         chunk = metadata.chunk_grid.configuration.chunk_shape
         if len(chunk) != len(shape) or max(math.prod(shape), math.prod(chunk)) * dtype.itemsize > MAX_ARRAY:
             raise DatasetError(f"the array {folder} has chunks of another shape, or more than {describe_bytes(MAX_ARRAY)}; {ADVICE}")
+
+    def _check_extent(self, folder: Path, free: Mapping[str, int], size: int, ticks: int | None) -> None:
+        """Compare the sizes that an array states and nothing else determines with the largest possible, or with what is stored.
+
+        Args:
+            folder: The array.
+            free: These sizes, by dimension.
+            size: Size of the array [bytes].
+            ticks: Number of frames, if it is known.
+        """
+        most = {"instance": MAX_INSTANCES, "lift_tick": ticks}
+        stored = sum(entry.stat(follow_symlinks=False).st_size for entry in os.scandir(folder))
+        exceeds = any(given > (most.get(name) or given) for name, given in free.items())
+        if exceeds or (free.keys() - most.keys() and size > _SMALL + _MAX_RATIO * stored):
+            there = " and ".join(f"{given:,} as {name}" for name, given in free.items())
+            raise DatasetError(f"the array {folder} states {there}, more than its {describe_bytes(stored)} can hold; {ADVICE}")
 
     def _check_files(self, folder: Path) -> None:
         """Check that the chunk files that the manifest lists exist, and that all are regular files.

@@ -6,7 +6,6 @@ What is read is checked once: annotations against their schemas, images against 
 from __future__ import annotations
 
 import os
-import tarfile
 from collections.abc import Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
@@ -16,14 +15,13 @@ import numpy as np
 
 from synpick_warp.dataset.annotations import ADVICE, MASK_SCHEMA, SCENE_SCHEMAS, VIEW_SCHEMAS, check_json, read_checked
 from synpick_warp.errors import DatasetError
-from synpick_warp.inputs.files import check_regular_file, describe_bytes, read_file_if_present
+from synpick_warp.inputs.files import read_file_if_present
 from synpick_warp.inputs.image_files import MAX_IMAGE_FILE, decode_image, image_size
+from synpick_warp.inputs.tar_files import list_members
 
 SUFFIXES = (".png", ".jpg")
 """File formats of images; colour may be either."""
 RECORD_NAMES = ("camera", "gt", "gt_info")
-MAX_SHARD = 2**44
-"""Largest shard [bytes]: the limit of a file on ext4."""
 
 
 class ViewRecords(NamedTuple):
@@ -214,35 +212,6 @@ class SceneShards:
         if len(data) < size:
             raise DatasetError(f"{shard} is damaged: it ends within {self._key(frame)}.{name}; {ADVICE}")
         return data
-
-
-def list_members(shard: Path) -> list[tuple[str, int, int]]:
-    """List the members of a tar file: name, offset and size [B]. Only headers are read; members must be regular files, as in shards.
-
-    Raises:
-        DatasetError: The file cannot be read, is truncated, or has another member: a link, a device, a sparse file, an extended header.
-    """
-    check_regular_file(shard, MAX_SHARD, DatasetError)
-    members = []
-    try:
-        with shard.open("rb") as file:
-            end = shard.stat().st_size
-            while any(block := file.read(tarfile.BLOCKSIZE)):
-                info = tarfile.TarInfo.frombuf(block, "utf-8", "strict")
-                start = file.tell()
-                if info.type not in (tarfile.REGTYPE, tarfile.AREGTYPE):
-                    raise DatasetError(f"{shard} has a member at byte {start - len(block)} that is not a regular file; {ADVICE}")
-                if not 0 <= info.size <= min(MAX_IMAGE_FILE, end - start):
-                    raise DatasetError(
-                        f"{shard} is damaged: the member at byte {start - len(block)} has {describe_bytes(info.size)}; {ADVICE}"
-                    )
-                members.append((info.name, start, info.size))
-                file.seek(start + -(-info.size // tarfile.BLOCKSIZE) * tarfile.BLOCKSIZE)
-    except OSError as error:
-        raise DatasetError(f"{shard} cannot be read: {error.strerror}") from None
-    except (tarfile.TarError, ValueError) as error:  # Names that are not UTF-8 are ValueErrors.
-        raise DatasetError(f"{shard} is damaged: {error}; {ADVICE}") from None
-    return members
 
 
 def _check_stated_size(data: bytes, size: tuple[int, int] | None, source: object) -> bytes:

@@ -13,7 +13,6 @@ import fcntl
 import json
 import os
 import re
-import shutil
 import time
 from collections.abc import Sequence
 from functools import partial
@@ -43,10 +42,19 @@ from synpick_warp.dataset.manifest import (
     read_manifest,
 )
 from synpick_warp.errors import ConfigError, DatasetError, OutputError
-from synpick_warp.exporters.base import Exporter, SharedFiles
+from synpick_warp.exporters.base import Exporter, SharedFiles, list_folders
 from synpick_warp.exporters.registry import Exporters, finalize, load_exporter_classes, shared_files
 from synpick_warp.exporters.writing.checksums import join_manifest_entry, name_parts, write_checksums, write_manifest_entry
-from synpick_warp.exporters.writing.files import PARTIAL, check_output_folder, output_error, sync_folder, write_atomically
+from synpick_warp.exporters.writing.files import (
+    PARTIAL,
+    check_output_folder,
+    is_folder,
+    is_litter,
+    output_error,
+    remove_folder,
+    sync_folder,
+    write_atomically,
+)
 from synpick_warp.exporters.writing.pool import WriterPool
 from synpick_warp.frames import EpisodeEnd
 from synpick_warp.inputs.files import check_regular_file
@@ -121,7 +129,7 @@ class OutputFolder:
             said = describe_differences(self._manifest, {name: self._known[name] for name in self._known if name != INPUTS})
             if said:
                 raise ConfigError(f"{out} was started with other settings: {said}; {_ADVICE}")
-            _check_links(out, self._shared)
+            _check_kinds(out, self._shared)
         entries = committed_episodes(out)
         foreign = next((index for index in reversed(entries) if not is_planned(config, index)), None)
         if foreign is not None:
@@ -155,7 +163,7 @@ class OutputFolder:
         self._exporters = exporters
         try:
             if self._known:
-                shutil.rmtree(self.out / PARTIAL, ignore_errors=True)
+                remove_folder(self.out / PARTIAL, ignore_errors=True)
             else:
                 write_atomically(self.out / MANIFEST_FILE, encode_manifest({**self._manifest, INPUTS: inputs}))
             self._is_ours = True
@@ -192,7 +200,7 @@ class OutputFolder:
         self._remove_entry(CONSTANTS)
         for name in self._shared.constants:
             _remove(self.out / name)
-        for name in self._shared.folders:
+        for name in list_folders(self.out, self._shared.folders):
             with contextlib.suppress(OSError):
                 (self.out / name).rmdir()
 
@@ -208,7 +216,7 @@ class OutputFolder:
         """Superset of the episodes with files: each number in a file name is taken as an episode index and as a BOP scene id."""
         cameras = len(self.config.cameras.positions)
         found: set[int] = set()
-        for folder in (ENTRIES, *self._shared.folders):
+        for folder in (ENTRIES, *list_folders(self.out, self._shared.folders)):
             names = os.listdir(self.out / folder) if (self.out / folder).is_dir() else []
             for index in (int(match[1]) for match in map(_INDEXED.fullmatch, names) if match):
                 found |= {index, index // cameras}
@@ -231,7 +239,7 @@ class OutputFolder:
         """
         with contextlib.suppress(OSError, DatasetError):
             if self._is_ours:
-                shutil.rmtree(self.out / PARTIAL, ignore_errors=True)
+                remove_folder(self.out / PARTIAL, ignore_errors=True)
                 if not committed_episodes(self.out):
                     self._remove_data_set()
         with contextlib.suppress(OSError):
@@ -245,7 +253,7 @@ class OutputFolder:
             self._remove_incomplete(episodes_end(self.config))
         self._remove_indices()
         self._remove_constants()
-        if any(os.path.lexists(self.out / folder) for folder in self._shared.folders):
+        if any(os.path.lexists(self.out / folder) for folder in list_folders(self.out, self._shared.folders)):
             return
         if (self.out / ENTRIES).is_dir():
             for name in filter(_TEMPORARY.fullmatch, os.listdir(self.out / ENTRIES)):
@@ -286,14 +294,15 @@ def finalize_data_set(out: Path, config: Config, kinds: Sequence[type[Exporter]]
         OutputError: A file cannot be written.
     """
     try:
-        shutil.rmtree(out / PARTIAL, ignore_errors=True)
+        remove_folder(out / PARTIAL, ignore_errors=True)
         (out / PARTIAL).mkdir()
-        paths = build_lists(out, config) + finalize(kinds, out, config, pool)
-        write_manifest_entry(out, INDICES, paths, {"episodes": committed_episodes(out)})
+        episodes = committed_episodes(out)
+        paths = build_lists(out, config) + finalize(kinds, out, config, pool, episodes)
+        write_manifest_entry(out, INDICES, paths, {"episodes": episodes})
     except OSError as error:
         raise output_error(out, error) from error
     finally:
-        shutil.rmtree(out / PARTIAL, ignore_errors=True)
+        remove_folder(out / PARTIAL, ignore_errors=True)
 
 
 def build_lists(out: Path, config: Config) -> list[Path]:
@@ -326,20 +335,27 @@ def _planned_end(out: Path) -> int:
     return 0
 
 
-def _check_links(out: Path, shared: SharedFiles) -> None:
-    """Reject symbolic links at paths that a bake writes or deletes, because they may point outside of the folder.
+def _check_kinds(out: Path, shared: SharedFiles) -> None:
+    """Reject what is no file or folder of a bake at the paths that it writes or deletes: symbolic links, which may point outside of the
+    data set, pipes and devices, files in place of folders, folders in place of files.
 
     Raises:
-        OutputError: A path is a symbolic link.
+        OutputError: A path is of another kind.
     """
-    names = [ENTRIES, PARTIAL, CONFIG_FILE, EPISODES_FILE, ATTEMPTS_FILE, *shared.constants, *shared.indices, *shared.folders]
-    links = [out / name for name in names if (out / name).is_symlink()]
-    for folder in shared.folders:
-        if (out / folder).is_dir() and not links:
-            with os.scandir(out / folder) as children:
-                links = [Path(child.path) for child in children if child.is_symlink()]
-    if links:
-        raise OutputError(f"{links[0]} is a symbolic link, through which a bake does not write; replace it by what it names")
+    folders = [out / name for name in (ENTRIES, PARTIAL, *list_folders(out, shared.folders))]
+    files = [out / name for name in (CONFIG_FILE, EPISODES_FILE, ATTEMPTS_FILE, *shared.indices)]
+    children = [Path(child.path) for folder in folders if is_folder(folder) for child in os.scandir(folder) if not is_litter(child.name)]
+    for path in (*folders, *files, *(out / name for name in shared.constants), *children):
+        if path.is_symlink():
+            raise OutputError(f"{path} is a symbolic link, through which a bake does not write; replace it by what it names")
+        if os.path.lexists(path) and not (path.is_dir() or path.is_file()):
+            raise OutputError(f"{path} is neither a file nor a folder, but a pipe, socket or device; remove it")
+    for path in folders:
+        if path.is_file():
+            raise OutputError(f"{path} is a file where a bake has a folder; move it away")
+    for path in files:
+        if path.is_dir():
+            raise OutputError(f"{path} is a folder where a bake has a file; move it away")
 
 
 def lock_folder(out: Path) -> int:
@@ -369,7 +385,4 @@ def lock_folder(out: Path) -> int:
 
 def _remove(path: Path) -> None:
     """Remove a file, or a folder with its content."""
-    if path.is_dir() and not path.is_symlink():
-        shutil.rmtree(path)
-    else:
-        path.unlink(missing_ok=True)
+    remove_folder(path) if is_folder(path) else path.unlink(missing_ok=True)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import re
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar, NamedTuple, Protocol
@@ -46,7 +47,20 @@ class SharedFiles(NamedTuple):
     indices: tuple[Path, ...] = ()
     """Files that span episodes."""
     folders: tuple[Path, ...] = ()
-    """Folders that hold episodes or constants, each after the folders within it."""
+    """Folders that hold episodes or constants, each after the folders within it. A last part that ends in `*` stands for all folders whose
+    names go on with a number: how many there are may follow from the number of episodes, which a file of settings can overstate."""
+
+
+def list_folders(out: Path, folders: Iterable[Path]) -> list[Path]:
+    """Names of `SharedFiles.folders`; in place of one with `*`, those that exist in the data set."""
+    found: list[Path] = []
+    for name in folders:
+        if not name.name.endswith("*"):
+            found.append(name)
+            continue
+        numbered = re.compile(re.escape(name.name.removesuffix("*")) + "[0-9]+").fullmatch
+        found += sorted(path.relative_to(out) for path in (out / name.parent).glob(name.name) if numbered(path.name))
+    return found
 
 
 class Exporter(Protocol):
@@ -87,8 +101,15 @@ class Exporter(Protocol):
         ...
 
     @staticmethod
-    def finalize(out: Path, config: Config, pool: WriterPool) -> list[Path]:
-        """Write the index files that span episodes from the committed episodes, and wait for them.
+    def finalize(out: Path, config: Config, pool: WriterPool, episodes: Sequence[int]) -> list[Path]:
+        """Write the index files that span episodes, and wait for them.
+
+        Args:
+            out: Folder of the data set.
+            config: Its settings.
+            pool: Writer processes.
+            episodes: The committed episodes, sorted; those that were given up have no files. Files of others, which nobody committed, are
+                in no index.
 
         Returns:
             These files, relative to the data set.

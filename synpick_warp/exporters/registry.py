@@ -7,7 +7,8 @@ How to add a format:
 2. Add a line to EXPORTERS: the format's name, the module and the class.
 3. Allow the name as a value of the setting `bake.formats`: `FORMATS` in configs/schema.py. Settings must not import exporters, so
    the name stands there once more; a test compares both.
-4. Let its test class inherit `ExporterContract` (tests/harness/exporter_contract.py): determinism, atomic commits, resuming.
+4. Add the names of its files to `dataset/file_names.py`: `merge`, `convert` and `verify` take no others.
+5. Let its test class inherit `ExporterContract` (tests/harness/exporter_contract.py): determinism, atomic commits, resuming.
 
 A new subpackage also goes into `packages` in pyproject.toml. Nothing else lists formats.
 """
@@ -16,7 +17,7 @@ from __future__ import annotations
 
 import contextlib
 import importlib
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 
 from synpick_warp.configs.schema import Config
@@ -137,6 +138,6 @@ def shared_files(classes: Iterable[type[Exporter]], config: Config) -> SharedFil
     return SharedFiles(constants, indices, folders)
 
 
-def finalize(classes: Iterable[type[Exporter]], out: Path, config: Config, pool: WriterPool) -> list[Path]:
-    """Write the index files that span episodes, of every format; returns them, relative to the data set."""
-    return sorted(path for exporter_class in classes for path in exporter_class.finalize(out, config, pool))
+def finalize(classes: Iterable[type[Exporter]], out: Path, config: Config, pool: WriterPool, episodes: Sequence[int]) -> list[Path]:
+    """Write the index files over the committed episodes, of every format; returns them, relative to the data set."""
+    return sorted(path for exporter_class in classes for path in exporter_class.finalize(out, config, pool, episodes))

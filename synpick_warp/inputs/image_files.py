@@ -19,6 +19,8 @@ MAX_SIDE = 8192
 """Largest width and height of an image [px]: the limit of cameras.resolution."""
 MAX_IMAGE_FILE = 2**29
 """Largest image file [bytes]: an image of MAX_SIDE with three channels of 16 bits, not compressed, has 384 MiB."""
+TEXTURE_KINDS = ("png", "jpg", "jpeg", "bmp", "tga", "tif", "tiff", "webp")
+"""Suffixes, without dot, that a texture's file may have in a data set; what it holds is decided by its content."""
 _PNG = b"\x89PNG\r\n\x1a\n"
 _JPEG = b"\xff\xd8\xff"
 _NO_FRAME = (0xC4, 0xC8, 0xCC)

@@ -1,4 +1,4 @@
-"""Graceful shutdown: the first SIGINT or SIGTERM requests a stop after the current tick, the second acts as usual.
+"""Interrupts: a KeyboardInterrupt that no library swallows, and graceful shutdown of a bake, whose first signal requests a stop.
 
 SIGTERM is the signal by which job schedulers announce the end of a job's time.
 """
@@ -8,6 +8,7 @@ from __future__ import annotations
 import contextlib
 import os
 import signal
+import sys
 import threading
 from types import FrameType
 from typing import Self
@@ -16,6 +17,78 @@ from synpick_warp.system.descriptors import STANDARD_ERROR
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
 _STOPPING = b"\nstopping after this tick; committed episodes stay, the same command resumes the bake; once more: stop at once\n"
+
+
+RETRY = 0.05
+"""Time after which an interrupt that waits, or that was swallowed, is raised again [s]."""
+_IMPORT_SYSTEM = "<frozen importlib._bootstrap"
+"""How the file names of the import system's frames begin."""
+
+
+class KeptInterrupt:
+    """Context manager in which SIGINT raises KeyboardInterrupt, as always, but neither within an import nor only once.
+
+    Libraries import others by `try: ... except BaseException`, as trimesh does, and take an interrupt there for a missing package. So it
+    waits until the import has ended; a second SIGINT does not wait. One that is swallowed elsewhere is raised again, until it
+    arrives here. `finally` blocks and handlers that it passes on its way are not disturbed.
+
+    Where SIGINT is ignored or handled otherwise, and in any thread but the main one, it does nothing.
+    """
+
+    def __init__(self) -> None:
+        self._count = 0
+        self._raised: KeyboardInterrupt | None = None
+        self._caller: FrameType | None = None
+        self._before: object = None
+
+    def __enter__(self) -> Self:
+        if threading.current_thread() is threading.main_thread() and signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+            self._caller = sys._getframe(1)
+            signal.signal(signal.SIGINT, self._handle)
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        if self._caller is None:
+            return
+        if self._count:
+            signal.setitimer(signal.ITIMER_REAL, 0.0)
+            signal.signal(signal.SIGALRM, self._before)  # type: ignore[arg-type]
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+        self._caller = None
+        # What a command returns or raises after an interrupt that it has swallowed means nothing.
+        if self._count and (kind is None or not issubclass(kind, KeyboardInterrupt)):
+            raise KeyboardInterrupt from None
+
+    def _handle(self, _: int, frame: FrameType | None) -> None:
+        self._count += 1
+        if self._count == 1:
+            self._before = signal.signal(signal.SIGALRM, self._retry)
+        signal.setitimer(signal.ITIMER_REAL, RETRY, RETRY)
+        self._raise(frame)
+
+    def _retry(self, _: int, frame: FrameType | None) -> None:
+        self._raise(frame)
+
+    def _raise(self, frame: FrameType | None) -> None:
+        """Raise the interrupt, unless an import runs or it is on its way."""
+        if self._is_on_its_way() or (self._count == 1 and self._is_importing(frame)):
+            return
+        self._raised = KeyboardInterrupt()
+        raise self._raised
+
+    def _is_importing(self, frame: FrameType | None) -> bool:
+        while frame is not None and frame is not self._caller:
+            if frame.f_code.co_filename.startswith(_IMPORT_SYSTEM):
+                return True
+            frame = frame.f_back
+        return False
+
+    def _is_on_its_way(self) -> bool:
+        """Whether a handler or a `finally` block of the raised interrupt is running."""
+        error = sys.exception()
+        while error is not None and error is not self._raised:
+            error = error.__context__
+        return error is not None
 
 
 class StopRequest:

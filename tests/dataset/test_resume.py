@@ -105,8 +105,8 @@ def test_killed_before_some_change_of_its_folder_a_bake_goes_on(server, expected
 
 def test_a_finished_bake_killed_before_it_removed_its_partial_files(server, expected, changes, tmp_path):
     out = tmp_path / "set"
-    # Before `.partial` is emptied; three changes would follow: two attempts to remove it, and one to remove the data set's folder.
-    assert server.bake(out, alone=True, kill_at=changes - 3) == -signal.SIGKILL
+    # Before `.partial` is emptied; two changes would follow: its removal, and an attempt to remove the data set's folder.
+    assert server.bake(out, alone=True, kill_at=changes - 2) == -signal.SIGKILL
     assert verify(out).finished
     assert digests(out) != expected
     assert server.bake(out) == 0

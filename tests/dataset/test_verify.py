@@ -32,12 +32,14 @@ def out(tmp_path, monkeypatch) -> Path:
     (tmp_path / "manifest").mkdir()
     write_files(tmp_path, manifest.CONSTANTS, ["models/obj_000001.ply"], {})
     for episode in range(EPISODES):
-        write_files(tmp_path, manifest.episode_entry(episode), [name(episode, each) for each in range(FILES)], episode_content(episode))
+        write_files(
+            tmp_path, manifest.episode_entry(episode), [name(episode, each) for each in range(FILES)], episode_content(episode, FILES)
+        )
     return tmp_path
 
 
 def name(episode: int, file: int) -> str:
-    return f"train/{episode:06d}/rgb/{file:06d}.jpg"
+    return f"train/{len(settings().cameras.positions) * episode:06d}/rgb/{file:06d}.jpg"
 
 
 def write_files(out: Path, entry: Path, names: list[str], content: dict) -> None:

@@ -99,7 +99,7 @@ def test_files_and_slot_size_combine_all_exporters():
     assert both.files(3) == [Path("a/3"), Path("b/3")]
     assert sorted(both.write_constants()) == [Path("a"), Path("b")]
     assert registry.slot_bytes((Fake, Other), None) == 9  # type: ignore[arg-type]
-    assert registry.finalize((Fake, Other), None, None, None) == [Path("a"), Path("b")]  # type: ignore[arg-type]
+    assert registry.finalize((Fake, Other), None, None, None, ()) == [Path("a"), Path("b")]  # type: ignore[arg-type]
 
 
 def test_views_and_physics_are_needed_if_one_exporter_needs_them():

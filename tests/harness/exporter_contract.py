@@ -28,6 +28,7 @@ from tests.worlds import box_views
 from tests.worlds.box_views import batches, cameras, catalog, ends, ticks
 
 FRAMES = 3
+MOST_EPISODES = 100
 LENSES = cameras()
 _IDAT = slice(41, -16)
 """Data of a PNG file with one chunk of it: behind signature, header and the chunk's own head, before its checksum and the end."""
@@ -122,7 +123,8 @@ def finish(exporter: Exporter) -> list[Path]:
     context = export_context(exporter)
     context.pool.wait()
     exporter.close()
-    return exporter.finalize(context.out, context.config, context.pool)
+    episodes = [index for index in range(MOST_EPISODES) if exporter.files(index)]
+    return exporter.finalize(context.out, context.config, context.pool, episodes)
 
 
 def export_context(exporter: Exporter) -> ExportContext:

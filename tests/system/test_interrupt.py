@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
+import contextlib
+import importlib
 import os
 import signal
+import subprocess
+import sys
 import threading
+import time
+from collections.abc import Callable
 
 import pytest
 
-from synpick_warp.system.interrupt import SIGNALS, StopRequest
+from synpick_warp.system.interrupt import RETRY, SIGNALS, KeptInterrupt, StopRequest
 
 
 @pytest.mark.parametrize("number", SIGNALS)
@@ -48,3 +54,105 @@ def test_other_threads_can_use_it():
     thread.start()
     thread.join()
     assert numbers == [0]
+
+
+# ---- interrupts that libraries swallow ----
+
+SWALLOWER = """
+import os, signal
+heard = False
+try:
+    os.kill(os.getpid(), signal.SIGINT)
+    import email.message
+except BaseException:
+    heard = True
+"""
+
+
+def interrupt() -> None:
+    os.kill(os.getpid(), signal.SIGINT)
+
+
+def swallow() -> None:
+    with contextlib.suppress(BaseException):
+        interrupt()
+        wait()
+
+
+def stopped(*parts: Callable[[], object]) -> None:
+    """The parts are ended by an interrupt, and the handlers are as before."""
+
+    def run() -> None:
+        with KeptInterrupt():
+            for part in parts:
+                part()
+
+    with pytest.raises(KeyboardInterrupt):
+        run()
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    assert signal.getitimer(signal.ITIMER_REAL) == (0.0, 0.0)
+
+
+def wait() -> None:
+    time.sleep(60)
+
+
+def test_an_import_is_not_interrupted_but_followed_by_the_interrupt(tmp_path, monkeypatch):
+    (tmp_path / "swallower.py").write_text(SWALLOWER)
+    monkeypatch.syspath_prepend(tmp_path)
+    stopped(lambda: importlib.import_module("swallower"), wait)
+    assert not sys.modules.pop("swallower").heard  # type: ignore[attr-defined]
+
+
+def test_a_second_interrupt_does_not_wait_for_the_import(tmp_path, monkeypatch):
+    twice = "import os, signal, time\nfor _ in 1, 2:\n    os.kill(os.getpid(), signal.SIGINT)\ntime.sleep(60)\n"
+    (tmp_path / "endless.py").write_text(twice)
+    monkeypatch.syspath_prepend(tmp_path)
+    stopped(lambda: importlib.import_module("endless"))
+
+
+@pytest.mark.parametrize("end", [wait, lambda: None, lambda: 1 / 0])
+def test_a_swallowed_interrupt_comes_again(end):
+    stopped(swallow, end)
+
+
+def test_what_cleans_up_after_an_interrupt_is_not_disturbed():
+    done = []
+
+    def clean_up() -> None:
+        try:
+            interrupt()
+        except BaseException:
+            time.sleep(3 * RETRY)
+            done.append("handler")
+            raise
+        finally:
+            with contextlib.suppress(ValueError):
+                raise ValueError
+            time.sleep(3 * RETRY)
+            done.append("finally")
+
+    stopped(clean_up)
+    assert done == ["handler", "finally"]
+
+
+def test_an_ignored_interrupt_stays_ignored():
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        with KeptInterrupt():
+            interrupt()
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+@pytest.mark.parametrize(
+    "arguments", [("merge", "NONE", "--out", "OUT"), ("convert", "NONE", "--to", "coco", "--out", "OUT"), ("stats", "NO")]
+)
+def test_a_command_that_is_interrupted_while_it_imports_says_so(tmp_path, arguments):
+    """The stand-in of NumPy takes the interrupt for a missing module, as trimesh does with SciPy."""
+    (tmp_path / "numpy.py").write_text(f"{SWALLOWER}\nraise ImportError('no module' if heard else 'not NumPy')\n")
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join((str(tmp_path), os.getcwd()))}
+    command = [sys.executable, "-m", "synpick_warp", *arguments]
+    run = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False)
+    assert (run.returncode, run.stderr, run.stdout) == (130, "synpick-warp: interrupted\n", "")
+    assert not (tmp_path / "OUT").exists()

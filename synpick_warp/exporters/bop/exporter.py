@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import os
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 from synpick_warp.configs.schema import MULTISENSOR, Config
-from synpick_warp.configs.splits import bop_folder, bop_folders, bop_scene
+from synpick_warp.configs.splits import bop_folder, bop_folders, bop_scene, scene_ids
 from synpick_warp.exporters.base import ExportContext, SharedFiles
 from synpick_warp.exporters.bop.keypoints import make_category_keys
 from synpick_warp.exporters.bop.scene import SceneSettings, commit_scenes, create_scene_folders
@@ -52,7 +52,7 @@ class BopExporter(SceneExporter):
         return SharedFiles(CONSTANTS, tuple(map(Path, target_files(config))), BopExporter.folders(config))
 
     @staticmethod
-    def finalize(out: Path, config: Config, pool: WriterPool) -> list[Path]:
+    def finalize(out: Path, config: Config, pool: WriterPool, episodes: Sequence[int]) -> list[Path]:
         """See `Exporter`: the lists of evaluation targets."""
         parts, names, sensors = out / PARTIAL / BopExporter.staging / "targets", target_files(config), sensor_suffixes(config)
         try:
@@ -62,7 +62,7 @@ class BopExporter(SceneExporter):
                 name.mkdir()
             for folder in bop_folders(config):
                 places = tuple(str(parts / name) for name in scene_target_files(config, folder))
-                for scene in find_scenes(out / folder):
+                for scene in find_scenes(out / folder, scene_ids(config, episodes)):
                     pool.submit(write_scene_targets, (), (scene, places, config.bop.target_visibility, sensors), path=scene)
             pool.wait()
             concatenate_targets(parts, out, names)

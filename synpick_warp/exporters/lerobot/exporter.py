@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from fractions import Fraction
 from functools import partial
@@ -14,7 +14,6 @@ import numpy as np
 
 from synpick_warp.codes import Ending, Task
 from synpick_warp.configs.schema import Config
-from synpick_warp.configs.splits import episodes_end
 from synpick_warp.exporters.base import ExportContext, SharedFiles
 from synpick_warp.exporters.lerobot.episode import (
     EpisodeContent,
@@ -102,15 +101,15 @@ class LerobotExporter:
     @staticmethod
     def shared_files(config: Config) -> SharedFiles:
         """See `Exporter`."""
-        videos = video_folders(len(config.cameras.positions), episodes_end(config))
+        videos = video_folders(len(config.cameras.positions))
         between = (EPISODES.parent, EPISODES.parent.parent, META, DATA.parent, DATA.parent.parent)
         return SharedFiles(note_files(config), (INFO, STATS, TASKS, EPISODES, DATA, CARD), (PARTS, *videos, *between, FOLDER))
 
     @staticmethod
-    def finalize(out: Path, config: Config, pool: WriterPool) -> list[Path]:
+    def finalize(out: Path, config: Config, pool: WriterPool, episodes: Sequence[int]) -> list[Path]:
         """See `Exporter`: the tables over all episodes."""
         try:
-            return write_indices(out, config)
+            return write_indices(out, config, episodes)
         except OSError as error:
             raise output_error(out / FOLDER, error) from error
 

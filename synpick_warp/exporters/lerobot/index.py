@@ -6,7 +6,9 @@ Parts are read one after the other, so memory does not grow with the number of f
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator
+import math
+import os
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -62,8 +64,8 @@ class _Totals:
     """Rows of the table of episodes."""
 
 
-def write_indices(out: Path, config: Config) -> list[Path]:
-    """Write the tables over all committed episodes; returns them, relative to the data set.
+def write_indices(out: Path, config: Config, episodes: Iterable[int]) -> list[Path]:
+    """Write the tables over the committed episodes, sorted; returns them, relative to the data set.
 
     Raises:
         DatasetError: A part is damaged.
@@ -72,7 +74,7 @@ def write_indices(out: Path, config: Config) -> list[Path]:
     cameras, totals = len(config.cameras.positions), _Totals()
     totals.levels = [np.zeros((3, 256), np.int64) for _ in range(cameras)]
     with pq.ParquetWriter(out / PARTIAL / "data.parquet", _data_schema(), compression="zstd") as writer:
-        for batch in _batch_tables(_read_tables(out, totals, config)):
+        for batch in _batch_tables(_read_tables(out, totals, config, episodes)):
             writer.write_table(batch)
     _place(out, DATA, lambda path: (out / PARTIAL / "data.parquet").replace(path))
     _place(
@@ -102,15 +104,17 @@ def _place(out: Path, name: Path, write: Callable[[Path], object]) -> None:
     sync_folder(place.parent)
 
 
-def _read_tables(out: Path, totals: _Totals, config: Config) -> Iterator[pa.Table]:
-    """Tables of the episodes, in order; adds them to the totals."""
-    folder, period = out / PARTS, 1.0 / frame_rate(config)
-    indices = sorted(int(path.stem) for path in folder.iterdir() if path.name.removesuffix(".json").isdecimal()) if folder.is_dir() else []
-    for source in indices:
+def _read_tables(out: Path, totals: _Totals, config: Config, episodes: Iterable[int]) -> Iterator[pa.Table]:
+    """Tables of the episodes, in order; adds them to the totals. Those that were given up have no part."""
+    period = 1.0 / frame_rate(config)
+    for source in (episode for episode in episodes if os.path.lexists(out / part_path(episode))):
         name = part_path(source)
         part = read_json(path_inside(out, str(name), out / PARTS, DatasetError), Part, DatasetError, _ADVICE)
         if len(part.levels) != len(totals.levels):
             raise DatasetError(f"{out / name} has {len(part.levels)} cameras, the settings {len(totals.levels)}; {_ADVICE}")
+        pixels = part.frames * math.prod(config.cameras.resolution)
+        if not all(part.frames <= sum(channel) <= pixels for camera in part.levels for channel in camera):
+            raise DatasetError(f"{out / name} has a histogram of no pixel a frame, or of more than {pixels:,} pixels; {_ADVICE}")
         columns = _make_columns(part, totals, period)
         _add_episode(source, part, columns, totals, period)
         totals.rows[-1]["source/split"] = split_name(config, source)

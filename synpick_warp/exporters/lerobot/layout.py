@@ -92,10 +92,10 @@ def video_path(camera: int, episode: int) -> Path:
     return VIDEOS / camera_key(camera) / f"{place}.mp4"
 
 
-def video_folders(cameras: int, episodes: int) -> list[Path]:
-    """Folders that hold the videos of episodes 0 to `episodes` - 1, each after the folders within it."""
+def video_folders(cameras: int) -> list[Path]:
+    """Folders that hold the videos, each after the folders within it; see `SharedFiles.folders`."""
     keys = [VIDEOS / camera_key(camera) for camera in range(cameras)]
-    return [*(key / f"chunk-{chunk:03d}" for key in keys for chunk in range(-(-episodes // CHUNK))), *keys, VIDEOS]
+    return [*(key / "chunk-*" for key in keys), *keys, VIDEOS]
 
 
 def frame_rate(config: Config) -> float | int:

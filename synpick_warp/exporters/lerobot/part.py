@@ -45,7 +45,10 @@ class Part(msgspec.Struct):
     def __post_init__(self) -> None:
         if len(self.rows) != self.frames * ROW.itemsize:
             raise ValueError(f"its rows have {len(self.rows)} bytes, but {self.frames} frames have {self.frames * ROW.itemsize}")
-        tasks = np.frombuffer(self.rows, ROW)["task"]
+        rows = np.frombuffer(self.rows, ROW)
+        if not all(np.isfinite(rows[name]).all() for name in ("state", "action", "reward")):
+            raise ValueError("a state, action or reward is not a finite number")
+        tasks = rows["task"]
         if tasks.min() < 0 or tasks.max() >= len(self.sentences):
             raise ValueError("a frame has a task without sentence")
 

@@ -88,7 +88,7 @@ class TrajectoryExporter:
         return SharedFiles(tuple(constant_places(STORE)), (), (STORE / EPISODES, STORE))
 
     @staticmethod
-    def finalize(out: Path, config: Config, pool: WriterPool) -> list[Path]:
+    def finalize(out: Path, config: Config, pool: WriterPool, episodes: Sequence[int]) -> list[Path]:
         """See `Exporter`: no index files."""
         return []
 

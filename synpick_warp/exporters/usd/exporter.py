@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import cached_property
 from pathlib import Path
 
@@ -52,7 +52,7 @@ class UsdExporter:
         return SharedFiles((LIBRARY,), (), (FOLDER,))
 
     @staticmethod
-    def finalize(out: Path, config: Config, pool: WriterPool) -> list[Path]:
+    def finalize(out: Path, config: Config, pool: WriterPool, episodes: Sequence[int]) -> list[Path]:
         """See `Exporter`: no index files."""
         return []
 

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from synpick_warp.errors import DatasetError
-from synpick_warp.exporters.writing.files import MANIFEST_FILE, PARTIAL, write_atomically
+from synpick_warp.exporters.writing.files import MANIFEST_FILE, PARTIAL, is_litter, write_atomically
 from synpick_warp.inputs.paths import path_inside
 
 _LINE = re.compile(r"([0-9a-f]{64})  (.+)")
@@ -43,9 +43,9 @@ def open_regular(path: Path | str) -> int:
     return handle
 
 
-def checksum(path: Path | str) -> str:
-    """SHA-256 of a regular file, in hexadecimal. Raises as `open_regular`."""
-    return _hash_file(path)[0]
+def checksum(path: Path | str, limit: int | None = None) -> str:
+    """SHA-256 of a regular file, in hexadecimal. Raises as `open_regular`, and OSError if it is larger than `limit` [bytes]."""
+    return _hash_file(path, limit)[0]
 
 
 def parse_checksums(lines: bytes, folder: Path, source: Path, advice: str) -> dict[str, str]:
@@ -95,19 +95,23 @@ def list_files(out: Path, paths: Sequence[Path]) -> list[str]:
 
 
 def _walk(folder: str, name: str) -> Iterator[str]:
-    """Yield the names of all files in a folder and its subfolders, with `name` in place of the folder's path."""
+    """Yield the names of all files in a folder and its subfolders but litter, with `name` in place of the folder's path."""
     with os.scandir(folder) as entries:
         for entry in entries:
+            if is_litter(entry.name):
+                continue
             if entry.is_dir():
                 yield from _walk(entry.path, f"{name}/{entry.name}")
             else:
                 yield f"{name}/{entry.name}"
 
 
-def _hash_file(path: Path | str) -> tuple[str, int]:
+def _hash_file(path: Path | str, limit: int | None = None) -> tuple[str, int]:
     """Hash a regular file; returns its SHA-256 in hexadecimal and its size [bytes]."""
     with open(open_regular(path), "rb", buffering=0) as file:
         size = os.fstat(file.fileno()).st_size
+        if limit is not None and size > limit:
+            raise OSError(0, "it is larger than all files of its entry together", str(path))
         digest = hashlib.sha256(file.read()) if size <= _WHOLE else hashlib.file_digest(file, "sha256")
         return digest.hexdigest(), size
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import shutil
 import uuid
 from pathlib import Path
 
@@ -17,6 +18,8 @@ The name is reserved beside a manifest, which is written first and removed last;
 is neither used nor removed."""
 MANIFEST_FILE = "manifest.json"
 """Marks a folder as a data set."""
+_LITTER = ("thumbs.db", "ehthumbs.db", "desktop.ini")
+"""What Windows leaves in folders, in lower case."""
 _ALLOWED = "--out takes a new or an empty folder"
 
 
@@ -30,13 +33,16 @@ def check_output_folder(out: Path) -> None:
     try:
         make_folder(out)
         # Other hidden names are never touched: what a bake leaves that was killed before its manifest, or the user's, such as .git.
-        names = [] if (out / MANIFEST_FILE).exists() else [name for name in os.listdir(out) if name == PARTIAL or not name.startswith(".")]
+        names = [] if (out / MANIFEST_FILE).exists() else [name for name in os.listdir(out) if name == PARTIAL or not is_litter(name)]
         if names:
-            reason = f": it has a folder {PARTIAL} of another program" if names == [PARTIAL] else ""
+            kind = "a folder" if (out / PARTIAL).is_dir() else "a file"
+            reason = f": it has {kind} {PARTIAL} of another program" if names == [PARTIAL] else ""
             raise OutputError(f"{out} is not empty{reason}; {_ALLOWED}, or a data set to resume")
         probe = out / f".{uuid.uuid4().hex}"
-        probe.write_bytes(b"\0")
-        probe.unlink()
+        try:
+            probe.write_bytes(b"\0")
+        finally:
+            probe.unlink(missing_ok=True)
     except FileExistsError:
         raise OutputError(f"{out} is a file; {_ALLOWED}") from None
     except OSError as error:
@@ -45,6 +51,27 @@ def check_output_folder(out: Path) -> None:
         for folder in created:
             with contextlib.suppress(OSError):
                 folder.rmdir()
+
+
+def is_litter(name: str) -> bool:
+    """Whether a name is one that file managers and editors leave in folders, or is hidden: `.DS_Store`, `._x`, `Thumbs.db`, `.x.swp`, `x~`.
+    No format has such names."""
+    return name.startswith(".") or name.endswith("~") or name.lower() in _LITTER
+
+
+def remove_folder(folder: Path, *, ignore_errors: bool = False) -> None:
+    """Remove a folder with its content, if it is one. `shutil.rmtree` would open a pipe of this name and wait for its other end.
+
+    Raises:
+        OSError: Something in it cannot be removed.
+    """
+    if is_folder(folder):
+        shutil.rmtree(folder, ignore_errors=ignore_errors)
+
+
+def is_folder(path: Path) -> bool:
+    """Whether a path is a folder, not a link to one."""
+    return path.is_dir() and not path.is_symlink()
 
 
 def output_error(path: Path | str, error: OSError) -> OutputError:

@@ -23,11 +23,12 @@ from synpick_warp.configs.write import config_to_toml
 from synpick_warp.dataset import view_files
 from synpick_warp.dataset.annotations import MASK_SCHEMA, SCENE_SCHEMAS, ModelInfo, check_json, read_checked
 from synpick_warp.dataset.manifest import CONFIG_FILE, CONSTANTS, ENTRIES, MANIFEST_FILE, encode_manifest
-from synpick_warp.dataset.view_files import SceneShards, list_members
+from synpick_warp.dataset.view_files import SceneShards
 from synpick_warp.errors import DatasetError
 from synpick_warp.exporters.bop.exporter import BopExporter
 from synpick_warp.exporters.bop.shards.exporter import ShardsExporter
 from synpick_warp.inputs.image_files import decode_image, image_size
+from synpick_warp.inputs.tar_files import list_members
 from tests.harness.exporter_contract import LENSES, export
 from tests.harness.fuzz import fuzz_examples
 from tests.harness.hostile import places, replaced

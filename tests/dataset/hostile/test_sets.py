@@ -300,7 +300,7 @@ def test_two_lists_that_name_the_same_file_are_refused_and_no_part_is_written_to
     copies = [Path(shutil.copytree(part, tmp_path / part.name)) for part in parts]
     relist(copies[1], "000001", (copies[0] / "manifest" / "000000.sha256").read_text())
     before = [snapshot(part) for part in copies]
-    refused(lambda: merge(copies, tmp_path / "merged"), r"as does manifest/000000\.sha256")
+    refused(lambda: merge(copies, tmp_path / "merged"), "which none of its formats writes")
     assert [snapshot(part) for part in copies] == before
 
 

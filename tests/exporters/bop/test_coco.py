@@ -126,4 +126,4 @@ def test_damaged_parts_are_one_error(tmp_path, name):
     (out / name).write_text("[}\n")
     (out / ".partial").mkdir()
     with pytest.raises(DatasetError, match=Path(name).name):
-        CocoExporter.finalize(out, config(), None)  # type: ignore[arg-type]
+        CocoExporter.finalize(out, config(), None, (0,))  # type: ignore[arg-type]

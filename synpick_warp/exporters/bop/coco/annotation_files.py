@@ -129,16 +129,18 @@ def commit_scenes(scenes: tuple[tuple[Path, int], ...], out: Path, frames: int) 
         sync_folder(out / folder)
 
 
-def write_annotation_files(out: Path, config: Config) -> list[Path]:
-    """Join the parts to an annotation file a split; images and annotations are numbered from 1 in each. Returns their names.
+def write_annotation_files(out: Path, config: Config, episodes: Iterable[int]) -> list[Path]:
+    """Join the episodes' parts to an annotation file a split; images and annotations are numbered from 1 in each. Returns their names.
 
     Raises:
         DatasetError: A part is damaged.
         OSError: A file cannot be written.
     """
     parts: dict[str, list[Path]] = {split: [] for split in bop_folders(config)}
-    for part in sorted((out / PARTS).glob("[0-9]*.jsonl"), key=lambda path: int(path.stem)):
-        parts[bop_folder(config, int(part.stem) // len(config.cameras.positions))].append(part)
+    cameras = len(config.cameras.positions)
+    for episode in episodes:
+        names = (out / PARTS / f"{scene:06d}.jsonl" for scene in range(cameras * episode, cameras * (episode + 1)))
+        parts[bop_folder(config, episode)] += filter(os.path.lexists, names)
     categories = read_json(path_inside(out, str(CATEGORIES), out, DatasetError), list[_Category], DatasetError, _ADVICE)
     return [_write_annotations(out, config, split, found, categories) for split, found in parts.items()]
 

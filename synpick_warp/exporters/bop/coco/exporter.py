@@ -5,7 +5,7 @@ Beside BOP's scene_gt_coco.json, which is a file a scene with amodal boxes: here
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -84,10 +84,10 @@ class CocoExporter(SceneExporter):
         return SharedFiles((CATEGORIES, *note_files(config)), places, (IMAGES, PARTS, places[0].parent, FOLDER))
 
     @staticmethod
-    def finalize(out: Path, config: Config, pool: WriterPool) -> list[Path]:
+    def finalize(out: Path, config: Config, pool: WriterPool, episodes: Sequence[int]) -> list[Path]:
         """See `Exporter`: the annotations of each split."""
         try:
-            return write_annotation_files(out, config)
+            return write_annotation_files(out, config, episodes)
         except OSError as error:
             raise output_error(out / FOLDER, error) from error
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +16,6 @@ from synpick_warp.exporters.bop.shards.tar_files import (
     commit_shards,
     find_shards,
     list_keys,
-    list_shards,
     shard_index,
     write_shard_layer,
     write_shard_view,
@@ -49,10 +48,13 @@ class ShardsExporter(SceneExporter):
         return SharedFiles(CONSTANTS, (*(split / KEYS_FILE for split in splits), Path(CARD_FILE)), splits)
 
     @staticmethod
-    def finalize(out: Path, config: Config, pool: WriterPool) -> list[Path]:
+    def finalize(out: Path, config: Config, pool: WriterPool, episodes: Sequence[int]) -> list[Path]:
         """See `Exporter`: the index of views and shards of each split, and the dataset card."""
+        cameras = len(config.cameras.positions)
+        scenes = [scene for episode in episodes for scene in range(cameras * episode, cameras * (episode + 1))]
         contents = [
-            _write_keys(out, name, split, pool) for name, split in zip(hub_splits(config), ShardsExporter.folders(config), strict=True)
+            _write_keys(out, name, split, pool, scenes)
+            for name, split in zip(hub_splits(config), ShardsExporter.folders(config), strict=True)
         ]
         try:
             write_atomically(out / CARD_FILE, make_card(_describe(config, contents)).encode())
@@ -89,14 +91,14 @@ def _describe(config: Config, splits: list[SplitContent]) -> CardContent:
     )
 
 
-def _write_keys(out: Path, name: str, split: Path, pool: WriterPool) -> SplitContent:
-    """Write the index of a split's views and shards; returns how many there are."""
+def _write_keys(out: Path, name: str, split: Path, pool: WriterPool, scenes: Sequence[int]) -> SplitContent:
+    """Write the index of the views and shards of those scenes that a split has; returns how many there are."""
     parts = out / PARTIAL / ShardsExporter.staging / "keys"
     try:
         parts.parent.mkdir(exist_ok=True)
         shutil.rmtree(parts, ignore_errors=True)
         parts.mkdir()
-        shards = list_shards(out / split)
+        shards = sorted(shard for scene in scenes for shard in find_shards(scene, out / split))
         for shard in shards:
             pool.submit(list_keys, (), (shard, parts), path=shard)
         pool.wait()

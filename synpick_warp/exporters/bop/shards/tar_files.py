@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import json
 import os
-import re
 import shutil
 import tarfile
 from collections.abc import Iterable, Iterator
@@ -16,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from synpick_warp.configs.splits import MAX_SHARD_SCENES
-from synpick_warp.errors import DatasetError, OutputError
+from synpick_warp.errors import OutputError
 from synpick_warp.exporters.bop.view import (
     ViewSettings,
     ViewTruth,
@@ -29,19 +28,17 @@ from synpick_warp.exporters.bop.view import (
     make_rle,
     to_json,
 )
-from synpick_warp.exporters.writing.checksums import open_regular
 from synpick_warp.exporters.writing.files import sync_folder
 from synpick_warp.exporters.writing.folder import Buffer, open_folder
 from synpick_warp.exporters.writing.png import encode_png
 from synpick_warp.exporters.writing.rle import Runs
+from synpick_warp.inputs.tar_files import list_members
 from synpick_warp.layer_codec import encode_layer
 
 MAX_SHARD_VIEWS = 1000
 """Maximum number of views in a shard, as in the toolkit (convert_imagewise_to_webdataset.py)."""
 END_OF_ARCHIVE = bytes(2 * tarfile.BLOCKSIZE)
 """End-of-archive marker of a tar file (POSIX.1-1988, section 10.1.1)."""
-_SHARD = re.compile(r"shard-[0-9]{6,18}\.tar")
-"""Name of a shard."""
 _ADVICE = "remove it and its episode's two files in manifest/, and resume the bake"
 _COPY_BYTES = 1 << 20
 """Size of a copy block [B]."""
@@ -156,18 +153,9 @@ def find_shards(scene: int, split: Path) -> Iterator[Path]:
         part += 1
 
 
-def list_shards(split: Path) -> list[Path]:
-    """Find all committed shards, sorted by name; other names are not ours."""
-    return sorted(path for path in split.iterdir() if _SHARD.fullmatch(path.name))
-
-
 def list_keys(shard: Path, folder: Path) -> None:
     """Task: write `"key": shard index` for each view of a shard, as lines of a JSON object, to a file of the shard's name in `folder`."""
-    try:
-        with open(open_regular(shard), "rb") as source, tarfile.open(fileobj=source, mode="r:") as file:
-            keys = dict.fromkeys(name.partition(".")[0] for name in file.getnames())
-    except (tarfile.TarError, ValueError, OverflowError, EOFError) as error:
-        raise DatasetError(f"{shard} is damaged: {' '.join(str(error).split())}; {_ADVICE}") from None
+    keys = dict.fromkeys(name.partition(".")[0] for name, _, _ in list_members(shard, _ADVICE))
     lines = (f"{json.dumps(key)}: {shard_index(shard)}\n" for key in keys)
     (folder / shard.name).write_text("".join(lines), encoding="ascii")
 

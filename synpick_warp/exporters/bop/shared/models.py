@@ -16,6 +16,7 @@ from synpick_warp.exporters.bop.shared.toolkit import describe_toolkit
 from synpick_warp.exporters.bop.view import MILLIMETERS
 from synpick_warp.exporters.writing.notes import CAMERA_FILE, write_camera
 from synpick_warp.exporters.writing.png import encode_png
+from synpick_warp.inputs.image_files import TEXTURE_KINDS
 from synpick_warp.inputs.paths import path_inside
 from synpick_warp.layer_codec import layer_notes
 from synpick_warp.scenes.assets.appearance import decode_texture, linear_to_srgb, srgb_to_linear
@@ -137,7 +138,10 @@ def _copy_model(entry: CatalogEntry, source: Path, path: Path) -> None:
         if not np.array_equal(decode_texture(image, str(source.parent / name)), np.asarray(entry.material.texture)):
             raise CatalogError(f"{source}: its texture {name} changed since it was read; start again")
         target = path_inside(path.parent, name, source, CatalogError)
-        if target.suffix.lower() in (".ply", ".json") or (target.exists() and target.read_bytes() != image):
+        if target.suffix[1:].lower() not in TEXTURE_KINDS or any(part.startswith(".") for part in Path(name).parts):
+            kinds = ", .".join(TEXTURE_KINDS)
+            raise CatalogError(f"{source} names the texture {name}; allowed: names without leading dots that end in .{kinds}; rename it")
+        if target.exists() and target.read_bytes() != image:
             raise CatalogError(f"{source} names the texture {name}, but the set has another file of that name; rename it")
         target.parent.mkdir(parents=True, exist_ok=True)
         target.write_bytes(image)

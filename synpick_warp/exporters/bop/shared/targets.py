@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 from collections import Counter
+from collections.abc import Collection
 from pathlib import Path
 from typing import Annotated, TypeVar
 
@@ -66,9 +67,10 @@ def target_files(config: Config) -> tuple[str, ...]:
     return tuple(dict.fromkeys((*_kinds(config), *(name for folder in bop_folders(config) for name in scene_target_files(config, folder)))))
 
 
-def find_scenes(split: Path) -> list[Path]:
-    """Find the scene folders of a split, sorted; other names, and links, are not ours."""
-    return sorted(path for path in split.iterdir() if _SCENE.fullmatch(path.name) and path.is_dir() and not path.is_symlink())
+def find_scenes(split: Path, scenes: Collection[int]) -> list[Path]:
+    """Find the folders of scenes in that of a split, sorted; other names, and links, are not ours."""
+    places = (path for path in split.iterdir() if _SCENE.fullmatch(path.name) and int(path.name) in scenes)
+    return sorted(path for path in places if path.is_dir() and not path.is_symlink())
 
 
 def write_scene_targets(scene: Path, folders: tuple[str, ...], visibility: float, sensors: tuple[str, ...] = ("",)) -> None:

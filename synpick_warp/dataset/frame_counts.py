@@ -1,0 +1,87 @@
+"""Plausibility of an episode's number of frames: no more than the sizes of its files allow.
+
+A record states how many frames an episode has, and may be edited or damaged; arrays, loops and tasks follow from the number. So it is
+compared with what is there before anything is made of it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from synpick_warp.configs.splits import bop_folder, bop_scene
+from synpick_warp.dataset.annotations import ADVICE
+from synpick_warp.errors import DatasetError
+from synpick_warp.exporters.trajectory.arrays import EPISODES, STORE
+from synpick_warp.inputs.files import describe_bytes
+
+if TYPE_CHECKING:
+    from synpick_warp.configs.schema import Config
+
+_HARMLESS = 1000
+"""Number of frames up to which nothing is compared: reading finds what is missing, and says so better."""
+_CAMERA, _COCO, _MEMBERS, _ROW = 40, 3, 5 * 1024, 64
+"""Least bytes that a frame takes in scene_camera.json ("0": {"cam_K": nine numbers}), in a line of COCO annotations ([] and its end), in a
+shard (five members with headers) and in a part of LeRobot (a row in base64)."""
+
+
+def check_frames(folder: Path, config: Config | None, episode: int, frames: int) -> None:
+    """Compare an episode's number of frames with the sizes of its files in every format.
+
+    Args:
+        folder: The data set.
+        config: Its settings; None: there are none, as in a lone trajectory store.
+        episode: Index of the episode.
+        frames: Number of frames that its record states.
+
+    Raises:
+        DatasetError: A file is too small for so many.
+    """
+    for path, size, least in _sizes(folder, config, episode) if frames > _HARMLESS else ():
+        if size // least < frames:
+            raise DatasetError(
+                f"the record of episode {episode} in {folder} counts {frames:,} frames, but {path.relative_to(folder)} has"
+                f" {describe_bytes(size)}, too little for them; {ADVICE}"
+            )
+
+
+def check_listed_frames(folder: Path, config: Config, row: Mapping[str, Any], names: Mapping[str, str]) -> None:
+    """Compare an episode's row with the images that its checksum list names.
+
+    Raises:
+        DatasetError: It counts more or fewer.
+    """
+    episode, frames = row["episode"], row["frames"]
+    scene, suffix = bop_scene(config, episode, 0)
+    for place in (f"{bop_folder(config, episode)}/{scene:06d}/rgb{suffix}/", f"coco/images/{scene:06d}/"):
+        count = sum(name.startswith(place) for name in names)
+        if count and count != frames:
+            raise DatasetError(f"the record of episode {episode} in {folder} counts {frames:,} frames, but {place} has {count:,}; {ADVICE}")
+
+
+def _sizes(folder: Path, config: Config | None, episode: int) -> Iterator[tuple[Path, int, int]]:
+    """File or folder that holds something of every frame, its size, and the least size of a frame [bytes]; only what is there."""
+    name = f"{episode:06d}"
+    times = folder / STORE / EPISODES / name / "ticks" / "time"
+    if times.is_dir():
+        yield times, sum(_size(path) for path in times.iterdir() if path.name.startswith("c")), 1
+    places = [(folder / "usd" / f"{name}.usdc", 1), (folder / "lerobot" / "parts" / f"{name}.json", _ROW)]
+    if config is not None:
+        cameras, (scene, sensor) = len(config.cameras.positions), bop_scene(config, episode, 0)
+        split = folder / bop_folder(config, episode)
+        places.append((split / f"{scene:06d}" / f"scene_camera{sensor}.json", _CAMERA))
+        places.append((folder / "coco" / "parts" / f"{cameras * episode:06d}.jsonl", _COCO))
+        first = split.with_name(f"{split.name}_web") / f"shard-{cameras * episode:06d}.tar"
+        if first.is_file():
+            shards = first.parent.glob(f"shard-*{cameras * episode:06d}.tar")
+            yield first, sum(map(_size, shards)), _MEMBERS
+    yield from ((path, _size(path), least) for path, least in places if path.is_file())
+
+
+def _size(path: Path) -> int:
+    """Size of a file [bytes]; 0: it cannot be looked at."""
+    try:
+        return path.stat().st_size
+    except OSError:
+        return 0

@@ -1,0 +1,45 @@
+"""Members of tar files (webdataset shards), listed by their headers alone."""
+
+from __future__ import annotations
+
+import tarfile
+from pathlib import Path
+
+from synpick_warp.errors import DatasetError
+from synpick_warp.inputs.files import check_regular_file, describe_bytes
+from synpick_warp.inputs.image_files import MAX_IMAGE_FILE
+
+MAX_SHARD = 2**44
+"""Largest shard [bytes]: the limit of a file on ext4."""
+_ADVICE = "restore the file, or bake the data set again"
+
+
+def list_members(shard: Path, advice: str = _ADVICE) -> list[tuple[str, int, int]]:
+    """List the members of a tar file: name, offset and size [B]. Only headers are read; members must be regular files, as in shards.
+
+    Python's tarfile calls itself for each extended header, and so ends in a RecursionError on a chain of them.
+
+    Raises:
+        DatasetError: The file cannot be read, is truncated, or has another member: a link, a device, a sparse file, an extended header.
+    """
+    check_regular_file(shard, MAX_SHARD, DatasetError)
+    members = []
+    try:
+        with shard.open("rb") as file:
+            end = shard.stat().st_size
+            while any(block := file.read(tarfile.BLOCKSIZE)):
+                info = tarfile.TarInfo.frombuf(block, "utf-8", "strict")
+                start = file.tell()
+                if info.type not in (tarfile.REGTYPE, tarfile.AREGTYPE):
+                    raise DatasetError(f"{shard} has a member at byte {start - len(block)} that is not a regular file; {advice}")
+                if not 0 <= info.size <= min(MAX_IMAGE_FILE, end - start):
+                    raise DatasetError(
+                        f"{shard} is damaged: the member at byte {start - len(block)} has {describe_bytes(info.size)}; {advice}"
+                    )
+                members.append((info.name, start, info.size))
+                file.seek(start + -(-info.size // tarfile.BLOCKSIZE) * tarfile.BLOCKSIZE)
+    except OSError as error:
+        raise DatasetError(f"{shard} cannot be read: {error.strerror}") from None
+    except (tarfile.TarError, ValueError) as error:  # Names that are not UTF-8 are ValueErrors.
+        raise DatasetError(f"{shard} is damaged: {error}; {advice}") from None
+    return members
