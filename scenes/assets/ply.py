@@ -17,6 +17,7 @@ from synpick_warp.scenes.assets.appearance import MAX_TEXTURE_FILE, FileMaterial
 from synpick_warp.scenes.assets.asset_files import MAX_MESH_FILE, MAX_ROWS, MAX_TEXT_MESH, describe_error, quiet_decoding, read_referred
 from synpick_warp.scenes.assets.mesh_parts import NO_MATERIAL, WHITE, MeshPart, Notes
 from synpick_warp.scenes.assets.ply_binary import read_binary
+from synpick_warp.scenes.assets.text import decode_text
 
 MAX_HEADER = 2**16
 """Longest header [bytes]; models have less than 1 kB."""
@@ -41,6 +42,10 @@ def read_ply_file(path: Path) -> bytes:
         CatalogError: It is not a PLY file, or exceeds a limit.
     """
     data = read_file(path, MAX_MESH_FILE, CatalogError)
+    if not data.startswith(b"ply"):
+        # Text with a byte order mark, or in UTF-16.
+        text = decode_text(data)
+        data = text.encode() if text.startswith("ply") else data
     lines, start = _header(data, path)
     _check_elements(lines, data, start, path)
     return data

@@ -14,6 +14,7 @@ from synpick_warp.scenes.assets.mesh_parts import NO_MATERIAL, MeshPart, Notes
 from synpick_warp.scenes.assets.text import decode_text
 
 _HEADER = 84
+_SAMPLE = 4096
 _TRIANGLE = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
 _VERTEX = re.compile(r"\bvertex\s+(\S+)\s+(\S+)\s+(\S+)", re.IGNORECASE)
 
@@ -26,8 +27,9 @@ def read_stl(path: Path, notes: Notes) -> list[MeshPart]:
     """
     data = read_file(path, MAX_MESH_FILE, CatalogError)
     count = int.from_bytes(data[80:_HEADER], "little")
-    # Text may begin with any word, and binary files with "solid": the announced size decides.
-    if len(data) >= _HEADER and (len(data) == _HEADER + count * _TRIANGLE.itemsize or b"\0" in data[:_HEADER].rstrip(b"\0")):
+    # Binary files may begin with "solid" as well, and text with any word: the announced size decides first.
+    exact = len(data) >= _HEADER and len(data) == _HEADER + count * _TRIANGLE.itemsize
+    if exact or (len(data) >= _HEADER and b"\0" in data[:_HEADER] and "vertex" not in decode_text(data[:_SAMPLE]).lower()):
         corners = _binary(data, count, path, notes)
     else:
         corners = _text(data, path)

@@ -202,6 +202,14 @@ def test_each_face_has_its_color_also_polygons(tmp_path):
         assert len(found) == len(sides)
 
 
+@pytest.mark.parametrize("encoding", ["utf-8-sig", "utf-16", "utf-16-be"])
+@pytest.mark.parametrize("kind", ["ply", "stl"])
+def test_text_of_any_encoding(tmp_path, encoding, kind):
+    text = trimesh.creation.box((1, 1, 1)).export(file_type=f"{kind}_ascii") if kind == "stl" else GOOD
+    (tmp_path / f"a.{kind}").write_bytes(str(text).encode(encoding))
+    assert len(read_mesh(tmp_path / f"a.{kind}", 1.0)[0].faces) == (12 if kind == "stl" else 4)
+
+
 def test_strips_of_triangles(tmp_path):
     text = ascii_ply(CORNERS, []).replace("face 0\nproperty list uchar", "tristrips 1\nproperty list int")
     (tmp_path / "a.ply").write_text(text + "8 0 2 1 3 -1 0 3 2\n")
@@ -209,10 +217,12 @@ def test_strips_of_triangles(tmp_path):
     assert np.array_equal(np.sort(mesh.faces), np.sort([(0, 2, 1), (1, 2, 3), (0, 3, 2)]))
 
 
-@pytest.mark.parametrize("kind", ["stl", "stl_ascii"])
+@pytest.mark.parametrize("kind", ["stl", "stl_ascii", "solid"])
 def test_an_stl_is_read_with_its_equal_corners_merged(tmp_path, kind):
     ball = trimesh.creation.icosphere(2, 0.1)
-    data = ball.export(file_type=kind)
+    data = ball.export(file_type="stl" if kind == "solid" else kind)
+    if kind == "solid":  # A binary file that begins like text, and has bytes behind its end.
+        data = b"solid".ljust(80, b"\0") + data[80:] + b"more"
     (tmp_path / "a.stl").write_bytes(data if isinstance(data, bytes) else (data + data).encode())
     mesh, finish = read_mesh(tmp_path / "a.stl", 1.0)
     assert len(mesh.vertices) == len(ball.vertices)
