@@ -148,8 +148,8 @@ def _find_elsewhere(folder: Path, name: str, root: Path) -> Path | None:
     whole = root.resolve()
     for base, names in places:
         path = _match_case(base, names)
-        if path is not None and path.is_file() and path.resolve().is_relative_to(whole):
-            return path
+        if path is not None and path.is_file():
+            return path if path.resolve().is_relative_to(whole) else None
     return None
 
 

@@ -6,7 +6,8 @@ import hashlib
 import importlib.metadata
 import os
 import tempfile
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -67,57 +68,60 @@ def collision_shapes(
     Returns:
         The shape of each mesh, or an error if it has none because it has no volume.
     """
-    files = [cache_dir / f"{_key(mesh, recipe)}.npz" for mesh, recipe in zip(meshes, recipes, strict=True)]
-    shapes: list[Shape | CatalogError | None] = [_load(file) for file in files]
+    jobs = [
+        _Job(name, mesh, recipe, cache_dir / f"{_key(mesh, recipe)}.npz") for name, mesh, recipe in zip(names, meshes, recipes, strict=True)
+    ]
+    shapes: list[Shape | CatalogError | None] = [_load(job.file) for job in jobs]
     save = _Saver(report)
-    slow = [index for index, shape in enumerate(shapes) if shape is None and recipes[index].concave]
-    for index, failure in _decompose_all(slow, names, meshes, recipes, files, shapes, report, save, seconds):
-        report(f"{names[index]}: its convex decomposition {failure.reason}; its convex hull is used instead: {_remedy(failure)}")
+    slow = {index: job for index, job in enumerate(jobs) if shapes[index] is None and job.recipe.concave}
+    for index, result in _decompose_all(slow, seconds, report):
+        job = jobs[index]
+        if not isinstance(result, Failure):
+            report(f"{job.name}: {len(result)} convex pieces")
+            shapes[index] = save(job.file, result)
+            continue
+        report(f"{job.name}: its convex decomposition {result.reason}; its convex hull is used instead: {_remedy(result)}")
         # A hull for lack of time is cached by that time, all others are not: the next bake may have another library, or more memory.
-        files[index] = _late_file(files[index], seconds) if failure.timed_out else Path(os.devnull)
-        shapes[index] = _load(files[index])
+        jobs[index] = replace(job, file=_late_file(job.file, seconds) if result.timed_out else Path(os.devnull))
+        shapes[index] = _load(jobs[index].file)
     missing = [index for index, shape in enumerate(shapes) if shape is None]
-    hulls = run_isolated(simplify_hull, [(meshes[index].vertices, recipes[index].hull_vertices) for index in missing], HULL_LIMITS)
-    for index, result in zip(missing, hulls, strict=True):
+    calls = [(jobs[index].mesh.vertices, jobs[index].recipe.hull_vertices) for index in missing]
+    for index, result in zip(missing, run_isolated(simplify_hull, calls, HULL_LIMITS), strict=True):
         if isinstance(result, ConvexPiece):
-            shapes[index] = save(files[index], (result,))
+            shapes[index] = save(jobs[index].file, (result,))
         else:
             said = f"its convex hull {result.reason}; repair the mesh" if isinstance(result, Failure) else str(result)
-            shapes[index] = CatalogError(f"{names[index]}: {said}")
+            shapes[index] = CatalogError(f"{jobs[index].name}: {said}")
     return [shape or () for shape in shapes]
 
 
-def _decompose_all(
-    slow: Sequence[int],
-    names: Sequence[str],
-    meshes: Sequence[TriangleMesh],
-    recipes: Sequence[ShapeRecipe],
-    files: Sequence[Path],
-    shapes: list[Shape | CatalogError | None],
-    report: Callable[[str], None],
-    save: _Saver,
-    seconds: float,
-) -> Iterator[tuple[int, Failure]]:
-    """Decompose the objects with the indices `slow` into `shapes`; yields the others of them, and why each has no decomposition.
+@dataclass(frozen=True, eq=False)
+class _Job:
+    """An object whose shape is wanted, and the file in which it is cached."""
 
-    Each shape is cached as soon as it is computed, so that a stopped bake need not repeat it. A decomposition that did not end within the
-    same time before is not tried again.
+    name: str
+    mesh: TriangleMesh
+    recipe: ShapeRecipe
+    file: Path
+
+
+def _decompose_all(jobs: Mapping[int, _Job], seconds: float, report: Callable[[str], None]) -> Iterator[tuple[int, Shape | Failure]]:
+    """Decompose objects; yields the pieces of each as soon as it and all before it are done, or why there are none.
+
+    A decomposition that did not end within the same time before is not tried again.
     """
-    late = [index for index in slow if _load(_late_file(files[index], seconds))]
+    late = [index for index, job in jobs.items() if _load(_late_file(job.file, seconds))]
     yield from ((index, Failure(f"took longer than {seconds:g} s before", timed_out=True)) for index in late)
-    fresh = [index for index in slow if index not in late]
+    fresh = {index: job for index, job in jobs.items() if index not in late}
     if fresh:
-        listed = ", ".join(names[index] for index in fresh)
+        listed = ", ".join(job.name for job in fresh.values())
         report(f"decomposing {len(fresh)} concave objects, once, mostly within a minute, at most {seconds:g} s each: {listed}")
-    results = run_isolated(decompose, [(meshes[index], recipes[index]) for index in fresh], Limits(seconds, DECOMPOSITION_MEMORY))
+    results = run_isolated(decompose, [(job.mesh, job.recipe) for job in fresh.values()], Limits(seconds, DECOMPOSITION_MEMORY))
     for index, result in zip(fresh, results, strict=True):
-        if isinstance(result, Failure):
-            yield index, result
-        elif isinstance(result, SynpickError) or not result:
-            yield index, Failure(f"failed ({result})" if result else "found no convex pieces")
+        if isinstance(result, SynpickError):
+            yield index, Failure(f"failed ({result})")
         else:
-            report(f"{names[index]}: {len(result)} convex pieces")
-            shapes[index] = save(files[index], result)
+            yield index, result or Failure("found no convex pieces")
 
 
 def _remedy(failure: Failure) -> str:

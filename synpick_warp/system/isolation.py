@@ -47,6 +47,8 @@ _REQUEST = struct.Struct("<dQQ")
 _END = struct.Struct("<i?")
 """Exit status, as of subprocess, and whether the time was over."""
 _STARTED = b"S"
+_ENVIRONMENT = {"OPENBLAS_NUM_THREADS": "1"}
+"""Calls are the parallelism, and their matrices small. CoACD keeps its OpenMP threads, as often there is a single slow object."""
 _BLOCK = 1 << 20
 _MAX_SHOWN = 200
 
@@ -95,7 +97,7 @@ class _Server:
             if fresh or self._worker is None or self._worker.process.poll() is not None:
                 self.stop()
                 program = f"from synpick_warp.system.isolation import main; main({MODULES!r})"
-                self._worker = start_process(program, has_threads=True)
+                self._worker = start_process(program, environment=_ENVIRONMENT, has_threads=True)
             with socket.socket(fileno=os.dup(self._worker.link.fileno())) as control, contextlib.suppress(OSError):
                 socket.send_fds(control, [b"r"], [theirs.fileno(), result])
         return ours

@@ -1,10 +1,17 @@
-"""Number of examples of fuzz tests: short in the suite, longer by SYNPICK_FUZZ_EXAMPLES."""
+"""Fuzz tests: number of examples, short in the suite, longer by SYNPICK_FUZZ_EXAMPLES; what does not count as an input's time."""
 
 from __future__ import annotations
 
 import os
 
+from synpick_warp.system.isolation import Limits, run_isolated
+
 
 def fuzz_examples(default: int) -> int:
     """Examples of a fuzz test: `default`, or the environment variable SYNPICK_FUZZ_EXAMPLES."""
     return int(os.environ.get("SYNPICK_FUZZ_EXAMPLES", default))
+
+
+def start_isolation() -> None:
+    """Start the server of isolated processes, if it does not run: its start does not count as time that an input takes."""
+    list(run_isolated(abs, [(1,)], Limits(60.0, 2**30)))

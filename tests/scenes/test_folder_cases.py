@@ -154,7 +154,7 @@ def test_a_bad_light_map_is_left_out(tmp_path):
 
 @pytest.mark.parametrize(
     "name",
-    ["SKIN.PNG", "Tex\\Skin.png", ".\\tex\\SKIN.png", "C:\\Users\\x\\skin.png", "/home/x/skin.png", "maps/skin.png"],
+    ["SKIN.PNG", "Tex\\Skin.png", ".\\tex\\SKIN.png", "C:\\Users\\x\\skin.png", "/data/x/skin.png", "maps/skin.png"],
 )
 def test_a_texture_is_found_by_names_of_other_systems(tmp_path, name):
     folder = write(tmp_path / "models", a_dot_obj=SMALL.replace("a.mtl", "A.MTL"), a_dot_mtl=f"newmtl skin\nmap_Kd {name}\n")

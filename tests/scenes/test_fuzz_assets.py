@@ -25,7 +25,7 @@ from synpick_warp.errors import CatalogError, LightError, SynpickError
 from synpick_warp.scenes.assets.meshes import read_mesh
 from synpick_warp.scenes.assets.models_info import read_models_info
 from synpick_warp.scenes.lights import MAX_RADIANCE, load_lights
-from tests.harness.fuzz import fuzz_examples
+from tests.harness.fuzz import fuzz_examples, start_isolation
 from tests.harness.hostile import LEAVES, places, removed, replaced
 
 SECONDS = 5.0
@@ -51,6 +51,7 @@ def read(name: str, content: bytes, more: dict[str, bytes], check: Callable[[Pat
         for each, data in {**more, name: content}.items():
             (folder / each).write_bytes(data)
         before = sorted(Path(parent).rglob("*"))
+        start_isolation()
         started, said = time.monotonic(), ""
         try:
             check(folder / name)

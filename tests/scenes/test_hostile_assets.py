@@ -27,6 +27,7 @@ from synpick_warp.scenes.collision.decomposition import ShapeRecipe
 from synpick_warp.scenes.collision.shapes import collision_shapes
 from synpick_warp.scenes.lights import MAX_MAP_PIXELS, MAX_RADIANCE, load_lights
 from synpick_warp.stages.render.light_tables import precompute_environment
+from tests.harness.fuzz import start_isolation
 from tests.scenes.test_fuzz_assets import BINARY, CORNERS, DOCUMENT, FACES, OBJ, glb, picture
 
 SECONDS = 5.0
@@ -53,6 +54,7 @@ def folder_of(parent: Path, *comments: str) -> Path:
 
 
 def refused(folder: Path, cache: Path, *words: str) -> str:
+    start_isolation()
     started = time.monotonic()
     with pytest.raises(CatalogError) as caught:
         load_catalog(Config(bake=Bake(models=str(folder))), cache)
@@ -276,9 +278,10 @@ def save(path: Path, image: np.ndarray) -> None:
 
 
 def lights_refused(folder: Path, pattern: str) -> None:
+    start_isolation()
     started = time.monotonic()
     with pytest.raises(LightError, match=pattern) as caught:
-        load_lights(str(folder))
+        load_lights(str(folder), strict=True)
     assert str(caught.value).isprintable()
     assert time.monotonic() - started < SECONDS
 
