@@ -58,7 +58,7 @@ def load_catalog(config: Config, cache_dir: Path | None = None, report: Callable
     """
     faults = _Faults(config, report)
     raws = _read_folder(config, report, faults) if config.bake.models else procedural_objects()
-    recipes = [_recipe(raw, config.objects) for raw in raws]
+    recipes = [shape_recipe(raw, config.objects) for raw in raws]
     names, meshes = [raw.name for raw in raws], [raw.mesh for raw in raws]
     seconds = config.objects.decomposition_time
     shapes = collision_shapes(names, meshes, recipes, cache_dir or default_cache_dir(), report, seconds)
@@ -257,7 +257,7 @@ def _report_undrawable(entries: list[CatalogEntry], budget: float, report: Calla
         report(f"never drawn, since larger than arrangement.volume, {budget:g} m³: {names}")
 
 
-def _recipe(raw: RawObject, objects: Objects) -> ShapeRecipe:
+def shape_recipe(raw: RawObject, objects: Objects) -> ShapeRecipe:
     concave = raw.concave
     if concave is None:
         concave = signed_volume(raw.mesh.vertices, raw.mesh.faces) < objects.concave_ratio * raw.hull.volume

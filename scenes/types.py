@@ -78,6 +78,10 @@ class ConvexPiece:
     """Vertex indices (F, 3) int32, counter-clockwise as seen from outside."""
 
 
+Shape = tuple[ConvexPiece, ...]
+"""Collision shape: one hull, or the pieces of a convex decomposition."""
+
+
 @dataclass(frozen=True, eq=False)
 class CatalogEntry:
     """An object of the catalog: visual mesh, material, collision shape, mass properties, symmetries."""

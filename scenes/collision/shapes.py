@@ -16,9 +16,10 @@ from synpick_warp.configs.schema import Objects
 from synpick_warp.errors import CatalogError, SynpickError
 from synpick_warp.inputs.files import check_regular_file
 from synpick_warp.scenes.collision.decomposition import ShapeRecipe, decompose
+from synpick_warp.scenes.collision.embedded_shapes import embedded_shape, pack_pieces, unpack_pieces
 from synpick_warp.scenes.collision.hulls import hull_volume
 from synpick_warp.scenes.collision.simplification import simplify_hull
-from synpick_warp.scenes.types import ConvexPiece, TriangleMesh
+from synpick_warp.scenes.types import ConvexPiece, Shape, TriangleMesh
 from synpick_warp.system.caches import USER_VARIABLE, user_cache
 from synpick_warp.system.isolation import Failure, Limits, run_isolated
 
@@ -33,9 +34,6 @@ HULL_LIMITS = Limits(120.0, 2**32)
 """Limits of the simplification of a convex hull: 120 s and 4 GiB; a scan with two million vertices takes seconds."""
 _REMEDY = "repair the mesh, or set concave = false"
 _LATE = "decimate the mesh, raise objects.decomposition_time, or set concave = false"
-
-Shape = tuple[ConvexPiece, ...]
-"""Collision shape: one hull, or the pieces of a decomposition."""
 
 
 def default_cache_dir() -> Path:
@@ -54,8 +52,8 @@ def collision_shapes(
 ) -> list[Shape | CatalogError]:
     """Compute the collision shape of each mesh (convex hull, or convex decomposition), or read it from the cache.
 
-    Both are computed in isolated processes (`system.isolation`). What CoACD crashes on, cannot decompose or does not finish in time gets
-    its convex hull instead, and a line says so.
+    Those of the embedded objects come with the program (`embedded_shapes`). Both are computed in isolated processes (`system.isolation`).
+    What CoACD crashes on, cannot decompose or does not finish in time gets its convex hull instead, and a line says so.
 
     Args:
         names: Names of the objects, for progress and errors.
@@ -71,7 +69,7 @@ def collision_shapes(
     jobs = [
         _Job(name, mesh, recipe, cache_dir / f"{_key(mesh, recipe)}.npz") for name, mesh, recipe in zip(names, meshes, recipes, strict=True)
     ]
-    shapes: list[Shape | CatalogError | None] = [_load(job.file) for job in jobs]
+    shapes: list[Shape | CatalogError | None] = [embedded_shape(job.mesh, job.recipe) or _load(job.file) for job in jobs]
     save = _Saver(report)
     slow = {index: job for index, job in enumerate(jobs) if shapes[index] is None and job.recipe.concave}
     for index, result in _decompose_all(slow, seconds, report):
@@ -163,10 +161,7 @@ def _load(file: Path) -> Shape | None:
         with file.open("rb") as stream, np.load(stream, allow_pickle=False) as data:
             if sum(item.file_size for item in data.zip.infolist()) > MAX_CACHE_FILE:
                 return None
-            vertices, faces, counts = data["vertices"], data["faces"], data["counts"]
-        ends = np.cumsum(counts, axis=0)[:-1]
-        pairs = zip(np.split(vertices, ends[:, 0]), np.split(faces, ends[:, 1]), strict=True)
-        pieces = tuple(ConvexPiece(np.ascontiguousarray(v, np.float32), np.ascontiguousarray(f, np.int32)) for v, f in pairs)
+            pieces = unpack_pieces(data["vertices"], data["faces"], data["counts"])
         valid = all(np.isfinite(p.vertices).all() and p.faces.min() >= 0 and p.faces.max() < len(p.vertices) for p in pieces)
         valid = valid and all(p.vertices.shape[1:] == p.faces.shape[1:] == (3,) and hull_volume(p.vertices) > 0.0 for p in pieces)
     except Exception:  # a damaged file raises nearly anything; whatever it is, the shape is computed again
@@ -176,14 +171,12 @@ def _load(file: Path) -> Shape | None:
 
 def _save(file: Path, pieces: Shape, report: Callable[[str], None]) -> bool:
     """Write a cache file atomically, since several bakes may share the folder. False if it cannot be written."""
-    vertices, faces = (np.concatenate(rows) for rows in zip(*((piece.vertices, piece.faces) for piece in pieces), strict=True))
-    counts = np.array([(len(piece.vertices), len(piece.faces)) for piece in pieces])
     try:
         file.parent.mkdir(parents=True, exist_ok=True)
         handle, temporary = tempfile.mkstemp(dir=file.parent, prefix=".", suffix=".tmp")
         try:
             with os.fdopen(handle, "wb") as stream:
-                np.savez(stream, vertices=vertices, faces=faces, counts=counts)
+                np.savez(stream, allow_pickle=False, **pack_pieces(pieces))
             os.replace(temporary, file)
         except BaseException:
             os.unlink(temporary)

@@ -1,0 +1,48 @@
+"""Shipped collision shapes: there is one for each embedded object, it is what is computed, and rounding does not hide it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from synpick_warp.configs.load import load_config
+from synpick_warp.scenes.catalog import shape_recipe
+from synpick_warp.scenes.collision import embedded_shapes
+from synpick_warp.scenes.collision.decomposition import decompose
+from synpick_warp.scenes.collision.embedded_shapes import embedded_shape
+from synpick_warp.scenes.collision.simplification import simplify_hull
+from synpick_warp.scenes.embedded.objects import procedural_objects
+
+OBJECTS = {raw.name: raw for raw in procedural_objects()}
+SETTINGS = load_config("synpick").objects
+
+
+def pieces_of(shape):
+    return [(piece.vertices.tolist(), piece.faces.tolist()) for piece in shape]
+
+
+@pytest.mark.parametrize("name", OBJECTS)
+def test_each_object_has_its_shape(name):
+    """`python -m tools.embedded_shapes` computes it again where an object has changed. The largest decompositions are not repeated here."""
+    raw, recipe = OBJECTS[name], shape_recipe(OBJECTS[name], SETTINGS)
+    shape = embedded_shape(raw.mesh, recipe)
+    assert shape is not None
+    if not recipe.concave:
+        assert pieces_of(shape) == pieces_of([simplify_hull(raw.mesh.vertices, recipe.hull_vertices)])
+    elif name == "drill":
+        assert pieces_of(shape) == pieces_of(decompose(raw.mesh, recipe))
+
+
+def test_rounding_errors_do_not_hide_shapes_and_changes_do():
+    raw = OBJECTS["mug"]
+    recipe = shape_recipe(raw, SETTINGS)
+    rounded = replace(raw.mesh, vertices=np.nextafter(raw.mesh.vertices, np.float32(1.0)))
+    assert embedded_shape(rounded, recipe) is not None
+    assert embedded_shape(replace(raw.mesh, vertices=raw.mesh.vertices * np.float32(1.01)), recipe) is None
+    assert embedded_shape(raw.mesh, replace(recipe, pieces=recipe.pieces - 1)) is None
+
+
+def test_the_file_has_no_other_shapes():
+    assert len(embedded_shapes._read_shapes()) == len(OBJECTS)
