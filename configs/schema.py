@@ -70,7 +70,7 @@ class Bake:
     seed: int = setting(0, "", "Random seed, from which every random number of the bake follows.", low=0, high=2**63 - 1)
     device: str = setting("auto", "", "Device: cpu, cuda:N, or auto (the first GPU if there is one).")
     models: str = setting(
-        "", "", "Folder of BOP models, of OBJ, GLB and PLY meshes, or of a folder per object; empty: the embedded procedural objects."
+        "", "", "Folder of BOP models, of PLY, OBJ, glTF and STL meshes, or of a folder per object; empty: the embedded procedural objects."
     )
     lights: str = setting("", "", "Folder of HDR environment maps (.hdr) and sIBL sets; empty: the embedded procedural maps.")
     formats: tuple[str, ...] = setting(
@@ -326,7 +326,7 @@ class Render:
         0,
         "px",
         "Mode fast: width of a coarse pixel, at whose centre paths start; 0: the widest with 384 per row, 480 with `history`. At full HD "
-        "5 px instead of these 4 px take 6 % less time, and PSNR is 0.2 to 0.7 dB lower. Shadow rays are spaced three quarters of it.",
+        "5 px instead of these 4 px take 6 % less time, and PSNR is 0.2 to 0.7 dB lower. Shadow rays are spaced as wide.",
         low=0,
         high=64,
     )

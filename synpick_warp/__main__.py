@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import sys
 
 from synpick_warp.system.interrupt import KeptInterrupt
@@ -15,7 +16,9 @@ def start() -> int:
     except KeyboardInterrupt:
         print("synpick-warp: interrupted", file=sys.stderr)
         return 130  # 128 + SIGINT, the shell convention
-    return main()
+    code = main()
+    gc.freeze()  # Otherwise the interpreter's last collection walks all that was imported, for some 2 s.
+    return code
 
 
 if __name__ == "__main__":

@@ -25,6 +25,7 @@ from synpick_warp.stages.render.denoised import (
     PATH_LISTS,
     PATH_QUEUES,
     RATIO_IMAGES,
+    EdgeLists,
     FootprintLists,
     ShadowRays,
     scratch_sizes,
@@ -43,7 +44,7 @@ from tests.worlds.small_worlds import settings
 
 NAMES = (
     "one world world_and_global instance body waypoint status measure fixture view row column count box side point kind subset tile "
-    "image field boundary cell_row cell_column shadow_row shadow_column chunk chunk_footprint block "
+    "image field boundary cell_row cell_column shadow_row shadow_column edge_chunk chunk_cell chunk chunk_footprint block "
     "world_camera view_instance one slot slot_word group depth_byte "
     "sample_row sample_block quad interval lane byte region rank path_kind record"
     " queue_view queue_region queue_stage stage_parity queue_slot path_record"
@@ -70,6 +71,7 @@ BASE = [
     RATIO_IMAGES,
     LAMP_SHADOWS,
     ShadowRays,
+    EdgeLists,
     FootprintLists,
     VISIBILITY_BUFFER,
     BORDER_BOXES,
@@ -172,7 +174,7 @@ def test_a_bakes_table_lists_every_array_with_its_copies():
 
 @pytest.mark.parametrize(
     ("cell", "width", "shape"),
-    [(0, 8, (6, 8, 6, 8)), (0, 960, (3, 480, 6, 960)), (0, 1920, (2, 384, 2, 640)), (3, 8, (2, 3, 3, 4)), (64, 8, (1,) * 4)],
+    [(0, 8, (6, 8, 6, 8)), (0, 960, (3, 480, 3, 480)), (0, 1920, (2, 384, 2, 384)), (3, 8, (2, 3, 2, 3)), (64, 8, (1,) * 4)],
 )
 def test_coarse_pixels_cover_the_image(cell, width, shape):
     sizes = scratch_sizes(settings(render__coarse_pixel=cell).render, width, 6)

@@ -56,7 +56,7 @@ def list_models(folder: Path, report: Say, fault: Fault) -> list[ModelFile]:
         CatalogError: The folder is missing, cannot be listed or contains no models.
     """
     if not folder.is_dir():
-        raise CatalogError(f"models folder {folder}: no such folder; give a BOP model folder, or a folder of OBJ, GLB or PLY meshes")
+        raise CatalogError(f"models folder {folder}: no such folder; give a BOP model folder, or a folder of PLY, OBJ, glTF or STL meshes")
     try:
         entries = sorted(entry for entry in folder.iterdir() if not entry.name.startswith("."))
         files = [entry for entry in entries if entry.suffix.lower() in SUFFIXES]
@@ -64,7 +64,7 @@ def list_models(folder: Path, report: Say, fault: Fault) -> list[ModelFile]:
     except OSError as error:
         raise CatalogError(f"models folder {folder}: cannot be listed ({error.strerror})") from error
     if not files and not found:
-        raise CatalogError(f"models folder {folder}: it contains no models; add obj_NNNNNN.ply files, or .obj, .glb or .ply meshes")
+        raise CatalogError(f"models folder {folder}: it contains no models; add obj_NNNNNN.ply files, or PLY, OBJ, glTF or STL meshes")
     if max(len(files), len(found)) > MAX_OBJECTS:
         raise CatalogError(f"models folder {folder}: more than {MAX_OBJECTS} meshes; bake a part of them")
     models, faults = _list_bop(files, folder, report)

@@ -344,7 +344,7 @@ def _check_inputs(config: Config) -> None:
     """
     models, lights = config.bake.models, config.bake.lights
     if models and not os.path.isdir(models):
-        raise CatalogError(f"there is no models folder {models}; --models takes a folder of BOP models or of OBJ, GLB or PLY meshes")
+        raise CatalogError(f"there is no models folder {models}; --models takes a folder of BOP models or of PLY, OBJ, glTF or STL meshes")
     if lights and not os.path.isdir(lights):
         raise LightError(f"there is no lights folder {lights}; --lights takes a folder of .hdr maps and sIBL sets")
 

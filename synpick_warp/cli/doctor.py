@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
 import importlib.metadata
-import math
 import os
 import platform
 from pathlib import Path
@@ -111,9 +111,13 @@ def _caches() -> list[tuple[str, str]]:
 def _describe_folder(folder: Path, noun: str) -> str:
     """Number of entries and size of a cache, and why it cannot be written, if so."""
     fault = find_fault(folder)
-    sizes = [path.stat().st_size for path in folder.rglob("*") if path.is_file()]
-    entries = len(list(folder.iterdir())) if folder.is_dir() else 0
-    return f"{entries} {noun}, {math.fsum(sizes) / MIB:.0f} MiB" + (f"; it cannot be written ({fault})" if fault else "")
+    size, entries = 0, 0
+    for parent, folders, names in os.walk(folder):  # Unlike rglob, it passes over folders that another process renames meanwhile.
+        entries += (len(folders) + len(names)) if parent == str(folder) else 0
+        for name in names:
+            with contextlib.suppress(OSError):
+                size += os.stat(os.path.join(parent, name)).st_size
+    return f"{entries} {noun}, {size / MIB:.0f} MiB" + (f"; it cannot be written ({fault})" if fault else "")
 
 
 def _dotted(version: tuple[int, int] | None) -> str:

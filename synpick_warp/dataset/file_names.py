@@ -22,7 +22,8 @@ _PLAIN = r"[^./][^/]*"
 """A part of a path that is not hidden."""
 _MODELS = rf"models(?:_eval)?/(?:models_info\.json|obj_{_INDEX}\.ply|(?:{_PLAIN}/)*{_PLAIN}\.(?i:{'|'.join(TEXTURE_KINDS)}))"
 """Models, and textures, whose names come from the models of the user."""
-_SCENE_CONSTANTS = rf"{_MODELS}|camera\.json|dataset_info\.md|bop_dataset_params\.py"
+_NOTES = r"camera\.json|dataset_info\.md"
+_SCENE_CONSTANTS = rf"{_MODELS}|{_NOTES}|bop_dataset_params\.py"
 _ZARR_ARRAY = r"[a-z_]+/(?:zarr\.json|c(?:\.[0-9]+)*)"
 _STORE = r"trajectory\.zarr"
 
@@ -66,8 +67,8 @@ _FORMATS: dict[str, tuple[str, Callable[[Config, int], str]]] = {
     "shards": (_SCENE_CONSTANTS, _shards),
     "usd": (r"usd/assets/(?:[a-z_0-9]+\.usdc|lights/light_[0-9]{3,6}\.exr|textures/[a-z_0-9]+\.png)", _usd),
     "zarr": (rf"{_STORE}/(?:(?:episodes/)?zarr\.json|(?:objects|cameras)/(?:zarr\.json|{_ZARR_ARRAY}))", _zarr),
-    "lerobot": ("(?!)", _lerobot),
-    "coco": (r"coco/categories\.json", _coco),
+    "lerobot": (_NOTES, _lerobot),
+    "coco": (rf"coco/categories\.json|{_NOTES}", _coco),
 }
 """Format -> names of its constants, and of an episode's files."""
 

@@ -196,9 +196,10 @@ class Compiler:
 
     def submit(self, builds: Iterable[ModuleBuild]) -> None:
         """Start to compile those modules that the kernel cache lacks, in this order."""
-        for build in builds:
-            if build not in self._tasks and build != self._last and not build.is_cached():
-                self._tasks[build] = self._pool.submit(self._load, build.module, build.device, build.block)
+        # All are looked up before the first is compiled: names of modules are hashes of kernels, and compiling threads change these.
+        missing = [build for build in builds if build not in self._tasks and build != self._last and not build.is_cached()]
+        for build in missing:
+            self._tasks[build] = self._pool.submit(self._load, build.module, build.device, build.block)
         self._say()
 
     def _await(self, build: ModuleBuild) -> None:

@@ -111,7 +111,10 @@ def test_bake_says_so_by_exit_code_if_episodes_are_missing(tmp_path, bakes, caps
         (["--mode", "mixed", "--set", "bake.mix=pick"], 'bake.mix is "pick" on the command line; allowed: 3 numbers in a list'),
         (["--set", "suction.poor_force=50"], "suction.poor_force is 50.0 on the command line; allowed: at most suction.good_force, 40 [N]"),
         (["--device", "tpu"], 'bake.device is "tpu"; allowed: cpu, cuda:N such as cuda:0, or auto'),
-        (["--models", "no-such"], "there is no models folder no-such; --models takes a folder of BOP models or of OBJ, GLB or PLY meshes"),
+        (
+            ["--models", "no-such"],
+            "there is no models folder no-such; --models takes a folder of BOP models or of PLY, OBJ, glTF",
+        ),
         (["--lights", "no-such"], "there is no lights folder no-such; --lights takes a folder of .hdr maps and sIBL sets"),
         (
             ["--config", "no-such.toml"],
@@ -362,12 +365,16 @@ def boxes(folder: Path, *sides: float) -> None:
         (folder / f"cube_{number}.obj").write_bytes(trimesh.creation.box((side, side, side)).export(file_type="obj").encode())
 
 
+STRICT = "[objects]\nstrict = true\n"
+"""Objects that cannot be used end a bake; by default they are left out."""
+
+
 @pytest.mark.parametrize(
     ("sides", "settings", "said"),
     [
         ((), "", "models folder {models}: it contains no models; "),
-        ((0.05, 0.6), "", "cube_1: too large for the tote: 0.6 x 0.6 x 0.6 m, diameter 1.039 m, but the tote's opening is "),
-        ((0.05, 50.0), "", "cube_1: too large for the tote: 50 x 50 x 50 m, "),
+        ((0.05, 0.6), STRICT, "cube_1: too large for the tote: 0.6 x 0.6 x 0.6 m, diameter 1.039 m, but the tote's opening is "),
+        ((0.05, 50.0), STRICT, "cube_1: too large for the tote: 50 x 50 x 50 m, "),
         ((0.25, 0.2), "", "arrangement.volume is 0.003 m³, but the smallest object, cube_1, takes 0.008 m³; make it larger"),
         ((0.05,), '[[object_rows]]\nid = 1\nname = "cube_0"\ndiameter = 0.0866\nmass = 0\n', "object_rows[0].mass is 0 in {file}; "),
         ((0.05,), '[[object_rows]]\nid = 1\nname = "cube_0"\ndiameter = 0.0866\nmass = 1e-30\n', "cube_0: mass 1e-30 kg in its row "),

@@ -3,8 +3,9 @@
 import warp as wp
 
 from synpick_warp.kernels.render.lighting.moving_bodies import world_box
-from synpick_warp.kernels.render.lighting.shadow_upsampling import TapVector, blend_bytes, divide_sums
-from synpick_warp.kernels.render.lighting.shadows import byte_of, lamp_fractions, meets_box, spread_bits
+from synpick_warp.kernels.render.lighting.shadow_filter import lamp_fractions, steepness_levels
+from synpick_warp.kernels.render.lighting.shadow_upsampling import TapVector, blend_bytes
+from synpick_warp.kernels.render.lighting.shadows import byte_of, meets_box, spread_bits
 from synpick_warp.kernels.render.visibility.gbuffer import Meshes
 
 wp.set_module_options({"enable_backward": False})
@@ -34,17 +35,16 @@ def blend_kernel(
 
 
 @wp.kernel
-def divide_kernel(
+def steepness_kernel(
     # In:
-    even: wp.array[wp.uint64],  # (sample)
-    odd: wp.array[wp.uint64],  # (sample)
-    total: wp.array[int],  # (sample)
+    share: float,
+    supported: bool,
     # Out:
-    quotient_out: wp.array[wp.uint64],  # (sample)
+    level_out: wp.array2d[int],  # (lowest, highest)
 ):
-    """Quotients of packed sums."""
-    i = wp.tid()
-    quotient_out[i] = divide_sums(even[i], odd[i], total[i])
+    """Steepness by the extremes of a visible fraction."""
+    lowest, highest = wp.tid()
+    level_out[lowest, highest] = steepness_levels(lowest, highest, share, supported)
 
 
 @wp.kernel
@@ -83,8 +83,9 @@ def world_box_kernel(
 @wp.kernel
 def fractions_kernel(
     # In:
-    free: wp.array[wp.uint64],  # (sample)
-    pixels: int,
+    even: wp.array[wp.uint64],  # (sample)
+    odd: wp.array[wp.uint64],  # (sample)
+    weight: int,
     lamps: int,
     rays: int,
     # Out:
@@ -92,4 +93,4 @@ def fractions_kernel(
 ):
     """Visible fractions of lamps."""
     i = wp.tid()
-    fractions_out[i] = lamp_fractions(free[i], pixels, lamps, rays)
+    fractions_out[i] = lamp_fractions(even[i], odd[i], weight, lamps, rays)

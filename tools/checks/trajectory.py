@@ -44,7 +44,7 @@ def check_labels(episode: zarr.Group, measures: dict[str, Measure], where: str) 
     """Check that every array has a unit, a description and dimension names."""
     arrays = [member for _, member in episode.members(max_depth=None) if isinstance(member, zarr.Array)]
     unlabelled = sum(
-        not (array.attrs.get("unit") and array.attrs.get("description") and all(array.metadata.dimension_names or [None]))  # type: ignore[union-attr]
+        not (array.attrs.get("units") and array.attrs.get("description") and all(array.metadata.dimension_names or [None]))  # type: ignore[union-attr]
         for array in arrays
     )
     measures["labels"].update_max(unlabelled, where)

@@ -10,6 +10,8 @@ wp.set_module_options({"enable_backward": False})
 PLANE_TOLERANCE = wp.constant(1.0)
 """Coarse pixels lie on one surface up to this distance from its tangent plane, in widths of a coarse pixel at their depth times the
 filter's stride."""
+NORMAL_STEPS = wp.constant(14)
+"""Steps of each coordinate of a packed normal; even, so that a normal towards the camera is exact."""
 MIN_WEIGHT = wp.constant(1.0e-4)
 """Joint bilateral upsampling: weight of a coarse pixel on another surface, which counts only where no other is left."""
 
@@ -20,11 +22,8 @@ class CoarseGrid:
 
     size: int
     """Width of a coarse pixel [px]; 0 in mode unoccluded, which has none."""
-    period: int
-    """Tile width of the shadow rays' sample pattern [coarse pixels], a power of two: any window of this width contains each of the period²
-    sample points once; an aligned window of half the width contains a stratified quarter of them."""
-    window: int
-    """Width of the shadow filter [coarse pixels], even, or 1."""
+    rays: int
+    """Shadow grid: rays to a lamp from each pixel at the steep edge of its shadow, 1 or 4."""
     image: ImageGrid
     """Full-resolution grid [px]."""
     grid: ImageGrid
@@ -74,6 +73,26 @@ def surface_normal(surface: wp.vec4) -> wp.vec3:
 
 
 @wp.func
+def pack_normal(normal: wp.vec3) -> int:
+    """Pack the unit normal of a visible surface in camera space into 8 bits: octahedral mapping (Meyer et al., 2010)."""
+    x = wp.where(normal[2] > 0.0, -normal[0], normal[0])
+    y = wp.where(normal[2] > 0.0, -normal[1], normal[1])
+    scale = 0.5 * float(NORMAL_STEPS) / (wp.abs(x) + wp.abs(y) + wp.abs(normal[2]))
+    half = 0.5 * float(NORMAL_STEPS) + 0.5
+    return (int(scale * (x + y) + half) << 4) | int(scale * (x - y) + half)
+
+
+@wp.func
+def unpack_normal(packed: int) -> wp.vec3:
+    """Unit vector that `pack_normal` rounded, up to 8° from the normal."""
+    p = 2.0 * float((packed >> 4) & 15) / float(NORMAL_STEPS) - 1.0
+    q = 2.0 * float(packed & 15) / float(NORMAL_STEPS) - 1.0
+    x = 0.5 * (p + q)
+    y = 0.5 * (p - q)
+    return wp.normalize(wp.vec3(x, y, wp.abs(x) + wp.abs(y) - 1.0))
+
+
+@wp.func
 def middle_pixel(coarse: CoarseGrid, row: int, column: int) -> wp.vec2i:
     """(row, column) of the pixel that represents a coarse pixel."""
     middle = coarse.size // 2
@@ -100,15 +119,6 @@ def morton_index(period: int, row: int, column: int) -> int:
 def coarse_coordinate(coarse: CoarseGrid, pixel: int) -> float:
     """Row or column of a pixel in coarse pixels, for interpolation between values at their middle pixels."""
     return float(pixel - coarse.size // 2) / float(coarse.size)
-
-
-@wp.func
-def window_coordinate(coarse: CoarseGrid, pixel: int) -> float:
-    """Row or column of a pixel in coarse pixels, for interpolation between means over windows of even width.
-
-    The centre of coarse pixel i's window lies half a coarse pixel before its middle, at coordinate i.
-    """
-    return coarse_coordinate(coarse, pixel) + 0.5
 
 
 @wp.func

@@ -36,7 +36,8 @@ class Lights:
     lamps: wp.array[int]
     """(map): number of lamps, at most MAX_LAMPS."""
     lamp: wp.array3d[wp.vec4]
-    """(map, lamp, 2): unit vector towards the lamp's center and tangent of its angular radius; irradiance on a surface that faces it."""
+    """(map, lamp, 2): unit vector towards the lamp's center and tangent of its angular radius; irradiance on a surface that faces it, and
+    its share in that of a surface that faces up."""
     lamp_point: wp.array3d[wp.vec3]
     """(map, lamp, point): unit vectors towards parts of the lamp of equal irradiance; see `scenes.lamps.stratify_light`."""
     lamp_rays: wp.array[int]
@@ -78,6 +79,12 @@ def lamp_irradiance(lights: Lights, light: int, lamp: int) -> wp.vec3:
     """Irradiance of a lamp on a surface that faces it."""
     record = read_record(lights.lamp, 2 * (light * MAX_LAMPS + lamp) + 1)
     return wp.vec3(record[0], record[1], record[2])
+
+
+@wp.func
+def lamp_share(lights: Lights, light: int, lamp: int) -> float:
+    """Share of a lamp in the irradiance of an open surface that faces up, without occlusion."""
+    return read_record(lights.lamp, 2 * (light * MAX_LAMPS + lamp) + 1)[3]
 
 
 @wp.func

@@ -27,7 +27,8 @@ from synpick_warp.kernels.render.lighting.materials import (
 )
 from synpick_warp.kernels.render.lighting.paths.tracing import PathScene
 from synpick_warp.kernels.render.lighting.plane_distance import tangent_plane
-from synpick_warp.kernels.render.lighting.shadow_upsampling import LampShadows, upsample_shadows
+from synpick_warp.kernels.render.lighting.shadow_filter import LampShadows
+from synpick_warp.kernels.render.lighting.shadow_upsampling import upsample_shadows
 from synpick_warp.kernels.render.lighting.shadows import byte_of
 from synpick_warp.kernels.render.lighting.unoccluded import unoccluded_light
 from synpick_warp.kernels.render.lighting.upsampling import RatioImages, Ratios, upsample_ratios
@@ -121,8 +122,9 @@ def gather_light(
     normal = wp.transpose(cameras.to_world[camera]) * face_normal
     plane = tangent_plane(cameras.intrinsics[camera], row, column, segment, gbuffer.depth[view, row, column], normal)
     result = PixelLight()
-    if scene.lights.lamps[sky.light] > 0:
-        result.lamps = upsample_shadows(shadows, shadow_grid, view, row, column, plane)
+    lamps = scene.lights.lamps[sky.light]
+    if lamps > 0:
+        result.lamps = upsample_shadows(shadows, shadow_grid, gbuffer, lamps, view, row, column, plane)
     result.ratios = upsample_ratios(ratios, coarse, view, row, column, plane)
     result.ratios.indirect = result.ratios.indirect / scene.lights.exposure[sky.light]
     return result

@@ -1,4 +1,7 @@
-"""Joint bilateral upsampling (Kopf et al., 2007) of lamp shadows, all lamps at once: eight bytes in a word (SIMD within a register)."""
+"""Lamp shadows of a pixel: joint bilateral upsampling (Kopf et al., 2007) from the shadow grid, and a filter of rays at steep edges.
+
+All lamps at once: eight bytes in a word (SIMD within a register).
+"""
 
 import warp as wp
 
@@ -6,26 +9,42 @@ from synpick_warp.kernels.render.lighting.coarse_grid import (
     MIN_WEIGHT,
     PLANE_TOLERANCE,
     CoarseGrid,
+    coarse_coordinate,
     flat_index,
     middle_pixel,
-    window_coordinate,
 )
 from synpick_warp.kernels.render.lighting.plane_distance import Plane, plane_distance
-from synpick_warp.kernels.render.lighting.shadows import LampShadows, shadow_depth, shadow_fractions, shadow_segment
-from synpick_warp.kernels.render.lighting.upsampling import RING
+from synpick_warp.kernels.render.lighting.shadow_filter import (
+    EVEN_BYTES,
+    STEEPNESS_BITS,
+    STEEPNESS_LEVELS,
+    LampShadows,
+    same_surface,
+    shadow_depth,
+    shadow_fractions,
+    shadow_normal,
+    shadow_segment,
+    shadow_steepness,
+)
+from synpick_warp.kernels.render.lighting.shadows import byte_of
 from synpick_warp.kernels.render.visibility.camera import clamp_index
+from synpick_warp.kernels.render.visibility.gbuffer import GBuffer
 from synpick_warp.kernels.render.visibility.records import read_record
 
 wp.set_module_options({"enable_backward": False, "fast_math": True})
 
-EVEN_BYTES = wp.constant(wp.uint64(0x00FF00FF00FF00FF))
-"""Bytes 0, 2, 4, 6, each with room for a sum in 16 bits."""
 WEIGHT_SUM = wp.constant(256)
 """Sum of the fixed-point weights; weighted sums of 8-bit values fit into 16 bits."""
 HALF_WEIGHTS = wp.constant(wp.uint64(0x0080008000800080))
 """Rounding term: half of WEIGHT_SUM in each 16 bits."""
+LOW_NIBBLES = wp.constant(wp.uint32(0x0F0F0F0F))
+"""Nibbles 0, 2, 4, 6, each with room for a sum in 8 bits: of weights of 64 and values of 2, or 16 and 5."""
+NIBBLE_ONES = wp.constant(wp.uint32(0x11111111))
+"""1 in each nibble."""
 TapVector = wp.types.vector(length=4, dtype=wp.uint64)
-"""Visible fractions of the lamps at the four nearest coarse pixels."""
+"""Visible fractions of the lamps at the four nearest pixels of the shadow grid."""
+LevelVector = wp.types.vector(length=4, dtype=wp.uint32)
+"""Steepness of the lamps' shadows there."""
 
 
 @wp.func
@@ -48,66 +67,29 @@ def blend_bytes(taps: TapVector, weights: wp.vec4) -> wp.uint64:
     return ((even >> wp.uint64(8)) & EVEN_BYTES) | (odd & ~EVEN_BYTES)
 
 
-@wp.func
-def on_plane(record: wp.vec4, coarse: CoarseGrid, row: int, column: int, plane: Plane, r: int, c: int) -> bool:
-    """Whether the coarse pixel (r, c), packed, shows the surface of the pixel (row, column), whose tangent plane is `plane`."""
-    pixel = middle_pixel(coarse, r, c)
-    distance = plane_distance(plane, pixel[0] - row, pixel[1] - column, shadow_depth(record))
-    return shadow_segment(record) == plane.segment and distance <= PLANE_TOLERANCE * float(coarse.size) * plane.width
+@wp.struct
+class ShadowTaps:
+    """The four nearest pixels of the shadow grid around a pixel."""
+
+    fractions: TapVector
+    """Visible fractions of the lamps."""
+    weights: wp.vec4
+    """Bilinear weights, tiny for pixels on other surfaces, above 0."""
+    steepness: LevelVector
+    """Steepness of the lamps' shadows; 0 on other surfaces."""
+    found: bool
+    """Whether any of them shows the pixel's surface."""
 
 
 @wp.func
-def sum_ring(
-    shadows: LampShadows, coarse: CoarseGrid, view: int, row: int, column: int, plane: Plane, top: int, left: int
-) -> tuple[wp.uint64, wp.uint64, int]:
-    """Sum the fractions over the 4 x 4 coarse pixels around (top, left) that show the surface of the pixel (row, column).
-
-    Returns the sums of the even bytes, those of the odd bytes, in 16 bits each, and the number of coarse pixels.
-    """
-    even = wp.uint64(0)
-    odd = wp.uint64(0)
-    total = int(0)
-    # Not unrolled: few pixels come here.
-    ring = int(RING)
-    for i in range(-ring, 2 + ring):
-        r = clamp_index(top + i, coarse.grid.height)
-        for j in range(-ring, 2 + ring):
-            c = clamp_index(left + j, coarse.grid.width)
-            record = read_record(shadows.record, flat_index(coarse.grid, view, r, c))
-            if on_plane(record, coarse, row, column, plane, r, c):
-                packed = shadow_fractions(record)
-                even += packed & EVEN_BYTES
-                odd += (packed >> wp.uint64(8)) & EVEN_BYTES
-                total += 1
-    return even, odd, total
-
-
-@wp.func
-def divide_sums(even: wp.uint64, odd: wp.uint64, total: int) -> wp.uint64:
-    """Divide sums of bytes by their number, rounded, and pack the quotients."""
-    result = wp.uint64(0)
-    for part in range(4):
-        shift = wp.uint64(16 * part)
-        lower = (int((even >> shift) & wp.uint64(0xFFFF)) + total // 2) // total
-        upper = (int((odd >> shift) & wp.uint64(0xFFFF)) + total // 2) // total
-        result |= wp.uint64((upper << 8) | lower) << shift
-    return result
-
-
-@wp.func
-def upsample_shadows(shadows: LampShadows, coarse: CoarseGrid, view: int, row: int, column: int, plane: Plane) -> wp.uint64:
-    """Visible fraction of each lamp at a pixel, as in `shadows.pack_shadows`, from the four nearest coarse pixels on its surface.
-
-    If all four are on other surfaces, the ring around them is searched too, as for visibility ratios: light of another surface would
-    show as bright pixels along the edge. If none there is on it either, the four are interpolated. `plane` is the pixel's tangent plane.
-    """
-    y = window_coordinate(coarse, row)
-    x = window_coordinate(coarse, column)
+def find_shadow_taps(shadows: LampShadows, coarse: CoarseGrid, view: int, row: int, column: int, plane: Plane) -> ShadowTaps:
+    """Look up the pixels of the shadow grid around the pixel (row, column), whose tangent plane is `plane`."""
+    y = coarse_coordinate(coarse, row)
+    x = coarse_coordinate(coarse, column)
     top = int(wp.floor(y))
     left = int(wp.floor(x))
-    weights = wp.vec4()
-    taps = TapVector()
-    found = bool(False)
+    result = ShadowTaps()
+    result.found = False
     for i in range(2):
         r = clamp_index(top + i, coarse.grid.height)
         vertical = 1.0 - wp.abs(y - float(top + i))
@@ -115,15 +97,116 @@ def upsample_shadows(shadows: LampShadows, coarse: CoarseGrid, view: int, row: i
             c = clamp_index(left + j, coarse.grid.width)
             weight = vertical * (1.0 - wp.abs(x - float(left + j))) + MIN_WEIGHT
             record = read_record(shadows.record, flat_index(coarse.grid, view, r, c))
-            if on_plane(record, coarse, row, column, plane, r, c):
-                found = True
+            pixel = middle_pixel(coarse, r, c)
+            steepness = shadow_steepness(record)
+            down = pixel[0] - row
+            right = pixel[1] - column
+            if same_surface(coarse, plane, down, right, shadow_depth(record), shadow_segment(record), shadow_normal(record)):
+                result.found = True
             else:
                 # Also against the MIN_WEIGHT of a tap on the surface.
                 weight *= MIN_WEIGHT * MIN_WEIGHT
-            weights[2 * i + j] = weight
-            taps[2 * i + j] = shadow_fractions(record)
-    if not found:
-        even, odd, total = sum_ring(shadows, coarse, view, row, column, plane, top, left)
-        if total > 0:
-            return divide_sums(even, odd, total)
-    return blend_bytes(taps, weights)
+                steepness = wp.uint32(0)
+            result.weights[2 * i + j] = weight
+            result.fractions[2 * i + j] = shadow_fractions(record)
+            result.steepness[2 * i + j] = steepness
+    return result
+
+
+@wp.func
+def all_steepness(taps: ShadowTaps) -> wp.uint32:
+    """Steepness of any of the taps, above 0 where one is steep; all bits if none shows the pixel's surface."""
+    steepness = taps.steepness[0] | taps.steepness[1] | taps.steepness[2] | taps.steepness[3]
+    return wp.where(taps.found, steepness, ~wp.uint32(0))
+
+
+@wp.func
+def lamp_steepness(taps: ShadowTaps, lamp: int) -> float:
+    """Interpolated steepness of a lamp's shadow, from 0 to 1."""
+    if not taps.found:
+        return 1.0
+    total = float(0.0)
+    weight = float(0.0)
+    for tap in range(4):
+        level = (taps.steepness[tap] >> wp.uint32(STEEPNESS_BITS * lamp)) & wp.uint32(STEEPNESS_LEVELS)
+        total += taps.weights[tap] * float(level)
+        weight += taps.weights[tap]
+    return total / (weight * float(STEEPNESS_LEVELS))
+
+
+@wp.func
+def edge_reach(rays: int) -> int:
+    """Largest offset of the edge filter's taps [px]: with one ray to a lamp from a pixel 5 x 5 pixels have all parts of the lamp, with
+    four 3 x 3, counting half at the border."""
+    return wp.where(rays == 1, 2, 1)
+
+
+@wp.struct
+class EdgeSums:
+    """Weighted sums of `LampShadows.edge` over a window, 8 bits for each lamp: even and odd lamps."""
+
+    even: wp.uint32
+    odd: wp.uint32
+    even_weight: wp.uint32
+    odd_weight: wp.uint32
+    """Weights of the pixels that traced rays to the lamp."""
+
+
+@wp.func
+def sum_edges(shadows: LampShadows, coarse: CoarseGrid, gbuffer: GBuffer, view: int, row: int, column: int, plane: Plane) -> EdgeSums:
+    """Sum traced visibility over the pixels around (row, column) on its surface, whose tangent plane is `plane`."""
+    result = EdgeSums()
+    reach = edge_reach(coarse.rays)
+    tolerance = PLANE_TOLERANCE * float(reach) * plane.width
+    for r in range(wp.max(row - reach, 0), wp.min(row + reach + 1, coarse.image.height)):
+        for c in range(wp.max(column - reach, 0), wp.min(column + reach + 1, coarse.image.width)):
+            word = shadows.edge[view, r, c]
+            if word != wp.uint32(0):
+                down = r - row
+                right = c - column
+                if (
+                    gbuffer.segment[view, r, c] == plane.segment
+                    and plane_distance(plane, down, right, gbuffer.depth[view, r, c]) <= tolerance
+                ):
+                    # Those at the border count half: so each part of a lamp has the same weight.
+                    weight = wp.uint32(wp.where(wp.abs(down) == reach, 1, 2) * wp.where(wp.abs(right) == reach, 1, 2))
+                    traced = (word | (word >> wp.uint32(1)) | (word >> wp.uint32(2))) & NIBBLE_ONES
+                    result.even += weight * (word & LOW_NIBBLES)
+                    result.odd += weight * ((word >> wp.uint32(4)) & LOW_NIBBLES)
+                    result.even_weight += weight * (traced & LOW_NIBBLES)
+                    result.odd_weight += weight * ((traced >> wp.uint32(4)) & LOW_NIBBLES)
+    return result
+
+
+@wp.func
+def edge_fraction(sums: EdgeSums, lamp: int, rays: int, fallback: float) -> float:
+    """Visible fraction of a lamp [1/255], of `rays` rays from each pixel; `fallback` where none was traced."""
+    shift = wp.uint32(8 * (lamp >> 1))
+    values = int((wp.where(lamp & 1 == 0, sums.even, sums.odd) >> shift) & wp.uint32(0xFF))
+    weight = int((wp.where(lamp & 1 == 0, sums.even_weight, sums.odd_weight) >> shift) & wp.uint32(0xFF))
+    if weight == 0:
+        return fallback
+    return 255.0 * float(values - weight) / float(rays * weight)
+
+
+@wp.func
+def upsample_shadows(
+    shadows: LampShadows, coarse: CoarseGrid, gbuffer: GBuffer, lamps: int, view: int, row: int, column: int, plane: Plane
+) -> wp.uint64:
+    """Visible fractions of the lamps at a pixel, byte k that of lamp k in 1/255.
+
+    Interpolated between the four nearest pixels of the shadow grid on the pixel's surface, whose tangent plane is `plane`; the steeper a
+    shadow, the more count the rays from pixels around it, and they alone where none of the four is on the surface.
+    """
+    taps = find_shadow_taps(shadows, coarse, view, row, column, plane)
+    wide = blend_bytes(taps.fractions, taps.weights)
+    steepness = all_steepness(taps)
+    if steepness == wp.uint32(0):
+        return wide
+    sums = sum_edges(shadows, coarse, gbuffer, view, row, column, plane)
+    result = wp.uint64(0)
+    for lamp in range(lamps):
+        value = float(byte_of(wide, lamp))
+        value += lamp_steepness(taps, lamp) * (edge_fraction(sums, lamp, coarse.rays, value) - value)
+        result |= wp.uint64(int(value + 0.5)) << wp.uint64(8 * lamp)
+    return result

@@ -1,18 +1,17 @@
-"""Lamp shadows: shadow rays to sample points of the lamps from the pixels of the shadow grid, filtered along surfaces.
+"""Lamp shadows: shadow rays to sample points of the lamps from the pixels of the shadow grid.
 
-The sample points of neighbouring coarse pixels are stratified, so that a small filter sees the whole lamp (soft shadows). On a resting
-surface a ray is traced again only if a moving body may block it now, or may have blocked it in the previous frame; and all of them every
-REFRESH_FRAMES frames.
+The sample points of neighbouring pixels are stratified, so that a filter sees the whole lamp (interleaved sampling; Keller and Heidrich,
+2001): `shadow_filter` filters wide penumbrae, and `shadow_edges` traces further rays in narrow ones. On a resting surface a ray is traced
+again only if a moving body may block it now, or may have blocked it in the previous frame; and all of them every REFRESH_FRAMES frames.
 """
 
 import warp as wp
 
 from synpick_warp.codes import Segment
-from synpick_warp.kernels.render.lighting.coarse_grid import PLANE_TOLERANCE, CoarseGrid, flat_index, middle_pixel, morton_index
+from synpick_warp.kernels.render.lighting.coarse_grid import CoarseGrid, middle_pixel, morton_index, pack_normal
 from synpick_warp.kernels.render.lighting.environment import Lights, lamp_direction, rotate_heading, unit_heading
 from synpick_warp.kernels.render.lighting.history import LightHistory
 from synpick_warp.kernels.render.lighting.moving_bodies import MovingBodies
-from synpick_warp.kernels.render.lighting.plane_distance import plane_distance, tangent_plane
 from synpick_warp.kernels.render.visibility.bvh_rays import RAY_OFFSET, is_blocked
 from synpick_warp.kernels.render.visibility.camera import (
     TILE_HEIGHT,
@@ -25,15 +24,21 @@ from synpick_warp.kernels.render.visibility.camera import (
     tile_pixel,
 )
 from synpick_warp.kernels.render.visibility.gbuffer import FAR, GBuffer, Hit, Meshes, Table, ViewBodies, body_of, face_normal, read_hit
-from synpick_warp.kernels.render.visibility.records import write_record
 from synpick_warp.kernels.tuning import RAY_REGISTERS
 
 wp.set_module_options({"enable_backward": False, "fast_math": True})
 
 ALL_RAYS = wp.constant(0xFF)
 """Bits of all shadow rays of a pixel, at most eight."""
-LAMP_POINTS = wp.constant(16)
-"""Number of a lamp's sample points."""
+LAMP_STRATA = wp.constant(16)
+"""Parts of a lamp, of equal irradiance; the pixels of a square of 4 x 4 send a ray to each."""
+POINT_BITS = wp.constant(2)
+"""Binary logarithm of the sample points of a part. A hash of the pixel picks one: with a single point, wide penumbrae show its shadow as a
+contour."""
+LAMP_POINTS = wp.constant(int(LAMP_STRATA) << int(POINT_BITS))
+"""Number of a lamp's sample points; the low bits of a point's index are that of its part."""
+STRATA_PERIOD = wp.constant(4)
+"""Period of the parts of a lamp to which pixels send rays [pixels of the shadow grid, or pixels]."""
 REFRESH_FRAMES = wp.constant(16)
 """Period in which all shadow rays are traced again [frames]: bodies that move by less than `moving_bodies.REST_DISPLACEMENT` a frame change
 shadows, too."""
@@ -52,14 +57,6 @@ CARRY_BITS = wp.constant(wp.uint64(0x7F7F7F7F7F7F7F7F))
 """Added to bytes of at most 0x80, this sets their highest bit if they are not 0."""
 
 
-@wp.struct
-class LampShadows:
-    """Shadows of the lamps on the shadow grid. Scratch."""
-
-    record: wp.array3d[wp.vec4]
-    """(view, shadow_row, shadow_column): packed by `pack_shadows`."""
-
-
 @wp.func
 def pack_last(segment: int, rays: int) -> wp.uint16:
     """Pack a segmentation id and the visibility bits of a pixel's shadow rays into the history."""
@@ -67,10 +64,10 @@ def pack_last(segment: int, rays: int) -> wp.uint16:
 
 
 @wp.func
-def pack_rays(rays: int, depth: float, segment: int) -> wp.uint64:
-    """Pack the bits of a pixel's shadow rays (1: free) with the surface's segmentation id and depth [m]; so the filter reads each neighbour
-    once. Ray j to lamp k has bit k * `Lights.lamp_rays` + j."""
-    return (wp.uint64(wp.cast(depth, wp.uint32)) << wp.uint64(32)) | wp.uint64((segment << 8) | rays)
+def pack_rays(rays: int, depth: float, segment: int, normal: int) -> wp.uint64:
+    """Pack the bits of a pixel's shadow rays (1: free) with the surface's segmentation id, depth [m] and packed normal;
+    so the filter reads each neighbour once. Ray j to lamp k has bit k * `Lights.lamp_rays` + j."""
+    return (wp.uint64(wp.cast(depth, wp.uint32)) << wp.uint64(32)) | wp.uint64((normal << 16) | (segment << 8) | rays)
 
 
 @wp.func
@@ -83,6 +80,12 @@ def rays_bits(packed: wp.uint64) -> int:
 def rays_segment(packed: wp.uint64) -> wp.uint8:
     """Segmentation id of packed shadow rays."""
     return wp.uint8(wp.uint32(packed) >> wp.uint32(8))
+
+
+@wp.func
+def rays_normal(packed: wp.uint64) -> int:
+    """Normal of packed shadow rays, as by `pack_normal`."""
+    return int((wp.uint32(packed) >> wp.uint32(16)) & wp.uint32(0xFF))
 
 
 @wp.func
@@ -105,44 +108,31 @@ def byte_of(packed: wp.uint64, index: int) -> int:
 
 
 @wp.func
-def ray_direction(lights: Lights, which: int, heading: wp.vec2, ray: int, pixel: int) -> wp.vec3:
-    """Unit vector, in the world, to the sample point of shadow ray `ray` from the pixel with Morton index `pixel`.
+def hash_pixel(row: int, column: int) -> wp.uint32:
+    """Hash of a pixel's position (multiply and xorshift), uniform in its upper bits."""
+    x = (wp.uint32(row) * wp.uint32(0x1E3779B1)) ^ (wp.uint32(column) * wp.uint32(0x35EBCA77))
+    x = (x ^ (x >> wp.uint32(15))) * wp.uint32(0x2C1B3C6D)
+    x = (x ^ (x >> wp.uint32(12))) * wp.uint32(0x297A2D39)
+    return x ^ (x >> wp.uint32(15))
 
-    Pixels that follow each other in Morton order take consecutive runs of `Lights.lamp_rays` points, so that a square of 4 x 4 of them,
+
+@wp.func
+def point_direction(lights: Lights, which: int, heading: wp.vec2, lamp: int, rays: int, ray: int, row: int, column: int) -> wp.vec3:
+    """Unit vector, in the world, to the sample point of the ray `ray` of `rays` from a pixel to a lamp.
+
+    Pixels that follow each other in Morton order take consecutive runs of `rays` parts of the lamp, so that a square of 4 x 4 of them,
     or of 2 x 2 with four rays each, takes all.
     """
+    part = (morton_index(STRATA_PERIOD, row, column) * rays + ray) % LAMP_STRATA
+    point = part + LAMP_STRATA * int(hash_pixel(row, column) >> wp.uint32(32 - POINT_BITS))
+    return rotate_heading(lights.lamp_point[which, lamp, point], heading)
+
+
+@wp.func
+def ray_direction(lights: Lights, which: int, heading: wp.vec2, ray: int, row: int, column: int) -> wp.vec3:
+    """`point_direction` of shadow ray `ray` from a pixel of the shadow grid; ray j to lamp k is ray k * `Lights.lamp_rays` + j."""
     rays = lights.lamp_rays[which]
-    point = (pixel * rays + ray % rays) % LAMP_POINTS
-    return rotate_heading(lights.lamp_point[which, ray // rays, point], heading)
-
-
-@wp.func
-def pack_shadows(fractions: wp.uint64, rays: wp.uint64) -> wp.vec4:
-    """Pack the visible fractions of the lamps, byte k that of lamp k in 1/255, with depth and segmentation id of packed shadow rays."""
-    return wp.vec4(
-        wp.cast(wp.uint32(fractions), wp.float32),
-        wp.cast(wp.uint32(fractions >> wp.uint64(32)), wp.float32),
-        rays_depth(rays),
-        wp.cast(wp.uint32(rays_segment(rays)), wp.float32),
-    )
-
-
-@wp.func
-def shadow_fractions(record: wp.vec4) -> wp.uint64:
-    """Visible fractions of the lamps in a record of `pack_shadows`."""
-    return (wp.uint64(wp.cast(record[1], wp.uint32)) << wp.uint64(32)) | wp.uint64(wp.cast(record[0], wp.uint32))
-
-
-@wp.func
-def shadow_depth(record: wp.vec4) -> float:
-    """Depth in a record of `pack_shadows` [m]."""
-    return record[2]
-
-
-@wp.func
-def shadow_segment(record: wp.vec4) -> wp.uint8:
-    """Segmentation id in a record of `pack_shadows`."""
-    return wp.uint8(wp.cast(record[3], wp.uint32))
+    return point_direction(lights, which, heading, ray // rays, rays, ray % rays, row, column)
 
 
 @wp.func
@@ -228,14 +218,14 @@ def last_rays(
 
 @wp.func
 def changed_rays(
-    lights: Lights, moving: MovingBodies, view: int, which: int, position: wp.vec3, heading: wp.vec2, rays: int, pixel: int
+    lights: Lights, moving: MovingBodies, view: int, which: int, position: wp.vec3, heading: wp.vec2, rays: int, row: int, column: int
 ) -> int:
     """Bits of those of the first `rays` shadow rays that a moving body may have changed; `position` is the surface's."""
     result = int(0)
     if moving.count[view] == 0:
         return result
     for ray in range(rays):
-        if may_change(moving, view, position, ray_direction(lights, which, heading, ray, pixel)):
+        if may_change(moving, view, position, ray_direction(lights, which, heading, ray, row, column)):
             result |= 1 << ray
     return result
 
@@ -277,105 +267,27 @@ def trace_shadow_rays_kernel(
     segment = int(gbuffer.segment[view, pixel[0], pixel[1]])
     depth = gbuffer.depth[view, pixel[0], pixel[1]]
     slot = world * history_inout.cameras + camera
-    free = int(ALL_RAYS)
+    free, packed_normal = int(ALL_RAYS), int(0)
     if segment != Segment.NOTHING:
         camera_direction = camera_ray(cameras.intrinsics[camera], pixel[0], pixel[1], wp.vec2(0.0, 0.0))
         position = hit_position(cameras, camera, camera_direction, depth)
-        heading, index = unit_heading(light_yaw[world]), morton_index(coarse.period, row, column)
+        heading = unit_heading(light_yaw[world])
+        hit = read_hit(gbuffer, view, pixel[0], pixel[1])
+        normal = visible_normal(meshes, bodies, view, hit, views.instances, cameras.to_world[camera] * camera_direction)
+        packed_normal = pack_normal(wp.transpose(cameras.to_world[camera]) * normal)
         known, last = last_rays(history_inout, moving, views, view, slot, row, column, segment)
         traced = int(ALL_RAYS)
         if known:
             free = last
-            traced = changed_rays(lights, moving, view, which, position, heading, rays, index)
-        if traced != 0:
-            hit = read_hit(gbuffer, view, pixel[0], pixel[1])
-            normal = visible_normal(meshes, bodies, view, hit, views.instances, cameras.to_world[camera] * camera_direction)
-            for ray in range(rays):
-                bit = 1 << ray
-                if traced & bit != 0:
-                    free |= bit
-                    if faces_lamp(lights, which, heading, ray, normal):
-                        direction = ray_direction(lights, which, heading, ray, index)
-                        if is_shadowed(meshes, table, bodies, view, views.instances, position, normal, direction):
-                            free -= bit
+            traced = changed_rays(lights, moving, view, which, position, heading, rays, row, column)
+        for ray in range(rays):
+            bit = 1 << ray
+            if traced & bit != 0:
+                free |= bit
+                if faces_lamp(lights, which, heading, ray, normal):
+                    direction = ray_direction(lights, which, heading, ray, row, column)
+                    if is_shadowed(meshes, table, bodies, view, views.instances, position, normal, direction):
+                        free -= bit
     if history_inout.max_paths > 0:
         history_inout.shadows[slot, row, column] = pack_last(segment, free)
-    rays_out[view, row, column] = pack_rays(free, depth, segment)
-
-
-@wp.func
-def lamp_fractions(free: wp.uint64, pixels: int, lamps: int, rays: int) -> wp.uint64:
-    """Visible fractions of the lamps, packed as for `pack_shadows`.
-
-    Byte r of `free` is the number of `pixels` whose shadow ray r is free; a pixel has `rays` rays to each lamp.
-    """
-    result = wp.uint64(0)
-    samples = pixels * rays
-    for lamp in range(lamps):
-        count = int(0)
-        for ray in range(rays):
-            count += byte_of(free, lamp * rays + ray)
-        result |= wp.uint64((255 * count + samples // 2) // samples) << wp.uint64(8 * lamp)
-    return result
-
-
-@wp.kernel
-def filter_shadows_kernel(
-    # Scene:
-    meshes: Meshes,
-    cameras: Cameras,
-    coarse: CoarseGrid,
-    lights: Lights,
-    # State: worlds
-    light: wp.array[int],  # (world)
-    # In:
-    bodies: ViewBodies,
-    gbuffer: GBuffer,
-    rays: wp.array3d[wp.uint64],  # (view, shadow_row, shadow_column)
-    views: Views,
-    first: int,
-    # Out:
-    shadows_out: LampShadows,
-):
-    """Visible fraction of each lamp: the mean over a window of coarse pixels on one body and near one tangent plane.
-
-    Every coarse pixel is written, except in views under a map without lamps.
-    """
-    view, row, column = tile_pixel(coarse.grid, wp.tid() + first)
-    if not in_image(coarse.grid, row, column):
-        return
-    which = light[views.world[view]]
-    if lights.lamps[which] == 0:
-        return
-    pixel = middle_pixel(coarse, row, column)
-    own = rays[view, row, column]
-    segment = rays_segment(own)
-    if int(segment) == Segment.NOTHING:
-        # Bodies smaller than a coarse pixel may have only background pixels to interpolate from.
-        write_record(shadows_out.record, flat_index(coarse.grid, view, row, column), pack_shadows(~wp.uint64(0), own))
-        return
-    camera = views.camera[view]
-    normal = wp.transpose(cameras.to_world[camera]) * face_normal(
-        meshes, bodies, view, read_hit(gbuffer, view, pixel[0], pixel[1]), views.instances
-    )
-    plane = tangent_plane(cameras.intrinsics[camera], pixel[0], pixel[1], segment, rays_depth(own), normal)
-    tolerance = PLANE_TOLERANCE * float(coarse.size) * plane.width
-    visible = wp.uint64(0)
-    total = int(0)
-    for i in range(coarse.window):
-        r = row + i - coarse.window // 2
-        if r >= 0 and r < coarse.grid.height:
-            for j in range(coarse.window):
-                c = column + j - coarse.window // 2
-                if c >= 0 and c < coarse.grid.width:
-                    packed = rays[view, r, c]
-                    if rays_segment(packed) == segment:
-                        other = middle_pixel(coarse, r, c)
-                        if plane_distance(plane, other[0] - pixel[0], other[1] - pixel[1], rays_depth(packed)) < tolerance:
-                            visible += spread_bits(rays_bits(packed))
-                            total += 1
-    if total == 0:
-        visible = spread_bits(rays_bits(own))
-        total = int(1)
-    fractions = lamp_fractions(visible, total, lights.lamps[which], lights.lamp_rays[which])
-    write_record(shadows_out.record, flat_index(coarse.grid, view, row, column), pack_shadows(fractions, own))
+    rays_out[view, row, column] = pack_rays(free, depth, segment, packed_normal)

@@ -5,7 +5,6 @@ Mode unoccluded leaves out the first two: no ambient occlusion, no indirect ligh
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -29,10 +28,13 @@ from synpick_warp.kernels.render.lighting.paths.lists import REGION_PIXELS, Path
 from synpick_warp.kernels.render.lighting.paths.queues import PATH_RECORDS, QUEUE_CAPACITY, PathQueues
 from synpick_warp.kernels.render.lighting.paths.reuse import reuse_histories_kernel
 from synpick_warp.kernels.render.lighting.shading import shade_kernel, shade_samples_kernel
-from synpick_warp.kernels.render.lighting.shadows import LAMP_POINTS, LampShadows, filter_shadows_kernel, trace_shadow_rays_kernel
+from synpick_warp.kernels.render.lighting.shadow_edges import CHUNK_TILES as EDGE_CHUNK_TILES
+from synpick_warp.kernels.render.lighting.shadow_edges import list_edges_kernel, trace_shadow_edges_kernel
+from synpick_warp.kernels.render.lighting.shadow_filter import LampShadows, filter_shadows_kernel, measure_steepness_kernel
+from synpick_warp.kernels.render.lighting.shadows import trace_shadow_rays_kernel
 from synpick_warp.kernels.render.lighting.upsampling import RatioImages
 from synpick_warp.kernels.render.visibility.camera import TILE_PIXELS
-from synpick_warp.kernels.tuning import CPU_FOOTPRINT_THREADS, FOOTPRINT_THREADS, PIXEL_BLOCK, VIEW_BLOCK
+from synpick_warp.kernels.tuning import CPU_EDGE_THREADS, CPU_FOOTPRINT_THREADS, EDGE_THREADS, FOOTPRINT_THREADS, PIXEL_BLOCK, VIEW_BLOCK
 from synpick_warp.stages.buffers import FIXTURES, Snapshot
 from synpick_warp.stages.launch import launch_pixels, launch_views
 from synpick_warp.stages.render.reference import make_path_rules
@@ -40,6 +42,7 @@ from synpick_warp.stages.render.sampling_rates import (
     accumulates,
     coarse_size,
     coverage_rays,
+    edge_rays,
     first_frame_paths,
     interleaved_threads,
     paths_per_coarse_pixel,
@@ -53,10 +56,6 @@ from synpick_warp.stages.timing import scope
 SINGLE_PATH_VARIANCE_SCALE = 2.0
 """Variance multiplier at one path per coarse pixel, where the sample variance underestimates bright small sources: few paths hit them, and
 those that do would look like a change of the light (on ten piles, 1 is 0.2 dB worse; 1.5 and 3 are nearly as good)."""
-SHADOW_PERIOD = math.isqrt(int(LAMP_POINTS))
-"""Period of the sample points of lamps [pixels of the shadow grid]."""
-SHADOW_WINDOW = 2
-"""Width of the shadow filter [pixels of the shadow grid]. At full HD 2 instead of 4 gain 0.1 dB in PSNR (tools/README.md, "Pictures")."""
 MIN_ROUGHNESS = 0.3
 """Path regularization: smallest roughness after the first surface (Kaplanyan and Dachsbacher, 2013). Caustics blur instead of sparkling."""
 FIREFLY_CLAMP = 32.0
@@ -76,7 +75,7 @@ of 12 GiB, which is better used for worlds."""
 
 GUIDE = struct_arrays(Guide, "view", "cell_row", "cell_column")
 COARSE_LIGHT = struct_arrays(CoarseLight, "view", "cell_row", "cell_column")
-LAMP_SHADOWS = struct_arrays(LampShadows, "view", "shadow_row", "shadow_column")
+LAMP_SHADOWS = struct_arrays(LampShadows, "view", "shadow_row", "shadow_column", edge=("view", "row", "column"))
 LIGHT_HISTORY = struct_arrays(
     LightHistory,
     "world_camera",
@@ -123,6 +122,16 @@ class FootprintLists:
     """Footprints in each list."""
 
 
+@dataclass(frozen=True, eq=False)
+class EdgeLists:
+    """Lists of the pixels of the shadow grid near edges of shadows, in which each pixel of the image may have shadow rays."""
+
+    cell: wp.array = device_array("view", "edge_chunk", "chunk_cell", dtype=wp.int32)
+    """Row * columns + column of each; a chunk is a run of tiles of the shadow grid with a list of its own."""
+    count: wp.array = device_array("view", "edge_chunk", dtype=wp.int32)
+    """Pixels of the shadow grid in each list."""
+
+
 DENOISED_SCRATCH = (
     (GUIDE, 1),
     (PATH_LISTS, 1),
@@ -130,6 +139,7 @@ DENOISED_SCRATCH = (
     (RATIO_IMAGES, 2),
     (ShadowRays, 1),
     (LAMP_SHADOWS, 1),
+    (EdgeLists, 1),
     (FootprintLists, 1),
 )
 """Arrays that `DenoisedRenderer` allocates, and how many of each."""
@@ -147,8 +157,12 @@ def scratch_sizes(render: Render, width: int, height: int, histories: int = 0) -
         "region": interleaved_threads(columns, rows) // int(REGION_PIXELS) if accumulates(render, histories) else 0,
         "rank": int(REGION_PIXELS),
         "path_kind": 2,
+        "row": height,
+        "column": width,
         "shadow_row": -(-height // shadow),
         "shadow_column": -(-width // shadow),
+        "edge_chunk": -(-build_grid(-(-width // shadow), -(-height // shadow)).tiles // int(EDGE_CHUNK_TILES)),
+        "chunk_cell": int(EDGE_CHUNK_TILES) * int(TILE_PIXELS),
         "chunk": chunks,
         "chunk_footprint": int(CHUNK_TILES) * int(TILE_PIXELS),
     }
@@ -185,12 +199,11 @@ def history_sizes(render: Render, width: int, height: int, histories: int) -> di
     return scratch_sizes(render, width, height, histories) | {"world_camera": histories if accumulates(render, histories) else 0}
 
 
-def build_coarse_grid(image: Any, size: int, window: int = 1, period: int = 1) -> Any:
-    """The struct `CoarseGrid` over an `ImageGrid`: coarse pixels of `size` x `size` px; see there for `window` and `period`."""
+def build_coarse_grid(image: Any, size: int, rays: int = 1) -> Any:
+    """The struct `CoarseGrid` over an `ImageGrid`: coarse pixels of `size` x `size` px; see there for `rays`."""
     coarse = CoarseGrid()
     coarse.size = size
-    coarse.period = period
-    coarse.window = window
+    coarse.rays = rays
     coarse.image = image
     coarse.grid = build_grid(-(-image.width // size), -(-image.height // size))
     return coarse
@@ -223,7 +236,7 @@ class DenoisedRenderer:
         self.coarse = build_coarse_grid(scene.grid, size)
         if not self.traces_paths:
             self.coarse.size = 0
-        self.shadow_grid = build_coarse_grid(scene.grid, shadow_size(size), SHADOW_WINDOW, SHADOW_PERIOD)
+        self.shadow_grid = build_coarse_grid(scene.grid, shadow_size(size), edge_rays(size))
         self.rules = make_path_rules(render, seed, paths_per_coarse_pixel(render, scene.width, histories), ROULETTE)
         self.rules.first_samples = first_frame_paths(render, scene.width, histories)
         self.rules.min_roughness = MIN_ROUGHNESS
@@ -241,6 +254,7 @@ class DenoisedRenderer:
         self.chosen, self.ratios = (allocate_struct(RATIO_IMAGES, sizes, scene.device) for _ in range(2))
         self.shadow_rays = allocate(ShadowRays, sizes, scene.device)
         self.shadows = allocate_struct(LAMP_SHADOWS, sizes, scene.device)
+        self.edge_lists = allocate(EdgeLists, sizes, scene.device)
         self.shade_kernel = shade_samples_kernel if supersamples(render, scene.width, histories) else shade_kernel
         self.antialias = render.antialias
         self.coverage_rays = coverage_rays(render, scene.width, histories)
@@ -322,12 +336,28 @@ class DenoisedRenderer:
         self._launch(smooth_ratios_kernel, self.coarse.grid, views, [*shared, self.chosen, views], [self.ratios])
 
     def trace_shadows(self, snapshot: Snapshot, bodies: Any, gbuffer: Any, views: Any) -> None:
-        """Visibility of the lamps on the shadow grid: shadow rays and filter."""
+        """Visibility of the lamps: shadow rays and filter on the shadow grid, rays from pixels at steep edges."""
         scene, coarse, rays = self.scene, self.shadow_grid, self.shadow_rays.packed
         inputs = [scene.meshes, scene.table, scene.cameras, coarse, scene.lights, snapshot.light, snapshot.light_yaw, bodies, gbuffer]
         self._launch(trace_shadow_rays_kernel, coarse.grid, views, [*inputs, views, self.moving], [self.history, rays])
-        inputs = [scene.meshes, scene.cameras, coarse, scene.lights, snapshot.light, bodies, gbuffer, rays]
-        self._launch(filter_shadows_kernel, coarse.grid, views, [*inputs, views], [self.shadows])
+        inputs = [scene.meshes, scene.cameras, coarse, scene.lights, snapshot.light, bodies, gbuffer, rays, views]
+        self._launch(filter_shadows_kernel, coarse.grid, views, inputs, [self.shadows])
+        self._launch(measure_steepness_kernel, coarse.grid, views, inputs, [self.shadows])
+        self.trace_shadow_edges(snapshot, bodies, gbuffer, views)
+
+    def trace_shadow_edges(self, snapshot: Snapshot, bodies: Any, gbuffer: Any, views: Any) -> None:
+        """Shadow rays from the pixels at steep edges."""
+        scene, lists, coarse, device = self.scene, self.edge_lists, self.shadow_grid, self.scene.device
+        lists.count.zero_()
+        self.shadows.edge.zero_()
+        # Atomics of a launch on the CPU hold in one thread alone, so these are not cut into pieces.
+        cells = views.count * coarse.grid.tiles * int(TILE_PIXELS)
+        outputs = [self.shadows, lists.cell, lists.count]
+        wp.launch(list_edges_kernel, dim=cells, inputs=[coarse, views], outputs=outputs, device=device, block_dim=PIXEL_BLOCK)
+        threads = EDGE_THREADS if device.is_cuda else CPU_EDGE_THREADS
+        inputs = [scene.meshes, scene.table, scene.cameras, coarse, scene.lights, snapshot.light, snapshot.light_yaw, bodies, gbuffer]
+        inputs += [lists.cell, lists.count, views, threads]
+        launch_pixels(trace_shadow_edges_kernel, views.count * lists.count.shape[1] * threads, inputs, [self.shadows], device)
 
     def shade_pixels(self, snapshot: Snapshot, bodies: Any, gbuffer: Any, views: Any, radiance: wp.array) -> None:
         """Deferred shading: radiance of each pixel."""

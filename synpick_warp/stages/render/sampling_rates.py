@@ -32,11 +32,16 @@ def coarse_size(render: Render, width: int, histories: int = 0) -> int:
 
 
 def shadow_size(size: int) -> int:
-    """Width of a shadow-grid pixel [px]: three quarters of the coarse-pixel width `size` [px], rounded down, at least 1.
+    """Width of a shadow-grid pixel [px] where coarse pixels are `size` px wide: the same."""
+    return size
 
-    At full HD, 3 px give the same PSNR as 2 px with less than half of the rays; 4 px lose 0.2 to 0.3 dB.
+
+def edge_rays(size: int) -> int:
+    """Shadow rays to a lamp from each pixel at a steep edge of its shadow, where coarse pixels are `size` px wide.
+
+    Four are filtered over 3 x 3 instead of 5 x 5 pixels, which in narrow images would blur shadows.
     """
-    return max(1, 3 * size // 4)
+    return 4 if size <= 2 else 1
 
 
 def traces_paths(render: Render) -> bool:

@@ -18,6 +18,7 @@ from synpick_warp.kernels.render.lighting.shadows import LAMP_POINTS
 from synpick_warp.kernels.render.visibility.camera import TILE_HEIGHT, TILE_PIXELS, TILE_WIDTH, Cameras, ImageGrid
 from synpick_warp.kernels.render.visibility.gbuffer import Meshes, Table
 from synpick_warp.scenes.assets.appearance import linear_to_srgb, srgb_to_linear
+from synpick_warp.scenes.environment import LUMINANCE
 from synpick_warp.scenes.tote import TABLE_ROUGHNESS
 from synpick_warp.scenes.types import Camera, Catalog, EnvironmentMap, Fixture, Interior, Material, TriangleMesh
 from synpick_warp.stages.render.light_tables import (
@@ -25,6 +26,7 @@ from synpick_warp.stages.render.light_tables import (
     build_environment_cdf,
     measure_albedo,
     precompute_environment,
+    sh_basis,
 )
 from synpick_warp.stages.render.wide_bvh import build_wide_bvh
 from synpick_warp.system.threads import map_in_threads
@@ -250,12 +252,20 @@ def build_lights(
     lights.lamps = wp.array([len(t.lamps) for t in tables], dtype=wp.int32, device=device)
     direction, irradiance = (lamp_table(tables, name, 3) for name in ("direction", "irradiance"))
     centers = np.concatenate([direction, lamp_table(tables, "radius_tangent", 1)], axis=-1)
-    lights.lamp = wp.array(np.stack([centers, np.pad(irradiance, [(0, 0)] * 2 + [(0, 1)])], axis=2), dtype=wp.vec4, device=device)
+    fluxes = np.concatenate([irradiance, lamp_shares(tables)], axis=-1)
+    lights.lamp = wp.array(np.stack([centers, fluxes], axis=2), dtype=wp.vec4, device=device)
     lights.lamp_point = wp.array(lamp_table(tables, "points", int(LAMP_POINTS), 3), dtype=wp.vec3, device=device)
     lights.lamp_rays = wp.array([rays_per_lamp(len(t.lamps)) for t in tables], dtype=wp.int32, device=device)
     lights.total_lamp_irradiance = wp.array(irradiance.sum(axis=1), dtype=wp.vec3, device=device)
     lights.exposure = wp.array([exposure * t.exposure for t in tables], dtype=wp.float32, device=device)
     return lights
+
+
+def lamp_shares(tables: list[EnvironmentTables]) -> np.ndarray:
+    """Share of each lamp in the irradiance of an open surface that faces up (map, lamp, 1), 0 where a map has fewer lamps."""
+    upward = (sh_basis(np.array([0.0, 0.0, 1.0])) @ np.stack([table.irradiance for table in tables])) @ LUMINANCE
+    lamps = lamp_table(tables, "irradiance", 3) @ LUMINANCE * lamp_table(tables, "direction", 3)[..., 2]
+    return (lamps / np.maximum(upward + lamps.sum(axis=1), 1e-9)[:, None])[..., None]
 
 
 def shadowed_lamps(settings: schema.Render) -> int:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from functools import cache
 from typing import Any, Protocol
 
 import newton
@@ -299,13 +300,17 @@ def slow_builds(device: wp.Device) -> list[ModuleBuild]:
 
     Kernels that are created twice are one: their modules have the same name, and the same source.
     """
+    return [ModuleBuild(kernel.module, device.alias, block) for kernel, block in _narrow_kernels(device.is_cuda)]
+
+
+@cache
+def _narrow_kernels(on_gpu: bool) -> list[tuple[Any, int]]:
+    """Kernels of the narrow phase as `make_pipeline` has them, and their block sizes. Cached, since modules refer to kernels weakly."""
     options: dict[str, Any] = {"support_func": narrow.support_map_lean, "post_process_contact": narrow.post_process_minkowski_only}
-    if not device.is_cuda:
-        kernel: Any = narrow.create_narrow_phase_kernel_gjk_mpr(True, collide.write_contact, **options)
-        return [ModuleBuild(kernel.module, device.alias, 1)]
+    if not on_gpu:
+        return [(narrow.create_narrow_phase_kernel_gjk_mpr(True, collide.write_contact, **options), 1)]
     mpr, gjk, refine, manifold = narrow.create_narrow_phase_kernels_gjk_mpr_split(True, collide.write_contact, **options)
-    blocks = {refine: REFINE_BLOCK, manifold: NARROW_PHASE_BLOCK, mpr: NARROW_PHASE_BLOCK, gjk: NARROW_PHASE_BLOCK}
-    return [ModuleBuild(kernel.module, device.alias, block) for kernel, block in blocks.items()]
+    return [(refine, REFINE_BLOCK), (manifold, NARROW_PHASE_BLOCK), (mpr, NARROW_PHASE_BLOCK), (gjk, NARROW_PHASE_BLOCK)]
 
 
 def make_solver(physics: PhysicsConfig, model: newton.Model, slots: int) -> newton.solvers.SolverSteel:

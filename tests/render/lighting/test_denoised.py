@@ -247,7 +247,8 @@ def test_scratch_has_the_size_of_the_scenes_images(device):
     )
     shading = make_renderer(config, scene, 1, 2).shading
     assert shading.guide.surface.shape == shading.ratios.record.shape == (2, 12, 16)
-    assert shading.shadow_rays.packed.shape == shading.shadows.record.shape == (2, 16, 22)
+    assert shading.shadow_rays.packed.shape == shading.shadows.record.shape == (2, 12, 16)
+    assert shading.shadows.edge.shape == (2, 48, 64)
 
 
 def test_light_does_not_leak_from_the_rim_of_a_pit_to_its_floor(device):

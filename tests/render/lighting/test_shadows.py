@@ -11,13 +11,14 @@ import warp as wp
 
 from synpick_warp.configs.schema import FAST, Config
 from synpick_warp.factory.assembly import make_renderer
+from synpick_warp.kernels.render.lighting.shadow_filter import FULL_SHARE, MAX_STEEPNESS, MIN_STEEPNESS, STEEPNESS_LEVELS
 from synpick_warp.kernels.render.lighting.shadows import REFRESH_FRAMES
 from synpick_warp.kernels.render.visibility.bvh_rays import RAY_OFFSET
 from synpick_warp.kernels.render.visibility.gbuffer import Meshes
 from synpick_warp.scenes.types import EnvironmentMap
 from synpick_warp.stages.render.renderer import Renderer
 from synpick_warp.stages.render.scene import rays_per_lamp
-from tests.harness.shadow_probe import blend_kernel, divide_kernel, fractions_kernel, slab_kernel, spread_kernel, world_box_kernel
+from tests.harness.shadow_probe import blend_kernel, fractions_kernel, slab_kernel, spread_kernel, steepness_kernel, world_box_kernel
 from tests.render.lighting.test_history import show
 from tests.worlds.toy_scene import UPRIGHT, ToyScene, ball, box, build_scene, camera, entry, sheet, sun
 
@@ -54,29 +55,35 @@ def test_blended_bytes_are_weighted_means(device):
     np.testing.assert_array_equal(blended[: SAMPLES // 4], as_bytes(taps[: SAMPLES // 4, 0]))
 
 
-def test_sums_are_divided_and_rounded_byte_by_byte(device):
-    random = np.random.default_rng(2)
-    total = random.integers(1, 17, SAMPLES).astype(np.int32)
-    sums = (random.random((SAMPLES, 8)) * (255 * total[:, None] + 1)).astype(np.uint64)
-    even, odd = ((sums[:, first::2] << np.arange(0, 64, 16, dtype=np.uint64)).sum(axis=1, dtype=np.uint64) for first in (0, 1))
-    result = wp.zeros(SAMPLES, dtype=wp.uint64, device=device)
-    inputs = [wp.array(even, dtype=wp.uint64, device=device), wp.array(odd, dtype=wp.uint64, device=device)]
-    wp.launch(divide_kernel, dim=SAMPLES, inputs=[*inputs, wp.array(total, device=device)], outputs=[result], device=device)
-    np.testing.assert_array_equal(as_bytes(result.numpy()), (sums.astype(int) + total[:, None] // 2) // total[:, None])
-
-
 @pytest.mark.parametrize(("lamps", "rays"), [(1, 4), (2, 4), (3, 2), (4, 2), (5, 1), (8, 1)])
-@pytest.mark.parametrize("pixels", [1, 3, 4])
-def test_fractions_count_the_free_rays_of_each_lamp(device, lamps, rays, pixels):
+@pytest.mark.parametrize("weight", [4, 19, 64])
+def test_fractions_count_the_free_rays_of_each_lamp(device, lamps, rays, weight):
     random = np.random.default_rng(5)
-    free = random.integers(0, pixels + 1, (SAMPLES, 8))
-    words = (free.astype(np.uint64) << np.arange(0, 64, 8, dtype=np.uint64)).sum(axis=1, dtype=np.uint64)
+    free = random.integers(0, weight + 1, (SAMPLES, 8))
+    shifts = np.arange(0, 64, 16, dtype=np.uint64)
+    sums = [(free[:, first::2].astype(np.uint64) << shifts).sum(axis=1, dtype=np.uint64) for first in (0, 1)]
     result = wp.zeros(SAMPLES, dtype=wp.uint64, device=device)
-    inputs = [wp.array(words, dtype=wp.uint64, device=device), pixels, lamps, rays]
+    inputs = [*(wp.array(each, dtype=wp.uint64, device=device) for each in sums), weight, lamps, rays]
     wp.launch(fractions_kernel, dim=SAMPLES, inputs=inputs, outputs=[result], device=device)
-    expected = free[:, : lamps * rays].reshape(SAMPLES, lamps, rays).sum(axis=2) / (pixels * rays)
+    expected = free[:, : lamps * rays].reshape(SAMPLES, lamps, rays).sum(axis=2) / (weight * rays)
     assert np.abs(as_bytes(result.numpy())[:, :lamps] / 255.0 - expected).max() <= 0.5 / 255.0 + 1e-12
     assert not as_bytes(result.numpy())[:, lamps:].any()
+
+
+@pytest.mark.parametrize(("share", "supported"), [(1.0, True), (0.16, True), (0.03, True), (1.0, False)])
+def test_shadows_are_steep_where_fractions_differ_and_where_few_rays_tell(device, share, supported):
+    result = wp.zeros((256, 256), dtype=wp.int32, device=device)
+    wp.launch(steepness_kernel, dim=result.shape, inputs=[share, supported], outputs=[result], device=device)
+    levels, top = result.numpy(), int(STEEPNESS_LEVELS)
+    assert levels[0, 0] == levels[255, 255] == 0
+    if supported:
+        difference = np.arange(256) / 255.0 * min(share / float(FULL_SHARE), 1.0)
+        slope = (difference - float(MIN_STEEPNESS)) / float(MAX_STEEPNESS - MIN_STEEPNESS)
+        assert np.abs(levels[0] - slope.clip(0.0, 1.0) * top).max() <= 0.5 + 1e-4
+        assert levels[0, 255] == (top if share == 1.0 else levels[0, 255])
+        assert (share > float(FULL_SHARE * MIN_STEEPNESS)) == (levels[0, 255] > 0)
+    else:
+        assert (levels[0, 1:] == top).all()
 
 
 @pytest.mark.parametrize(("lamps", "rays"), [(0, 4), (1, 4), (2, 4), (3, 2), (4, 2), (5, 1), (8, 1)])

@@ -1,0 +1,343 @@
+"""Report on the structure of denoised frames: PSNR, FLIP and the lattice of coarse pixels, by light map and size, against references.
+
+A frame of an episode is denoised as in a bake, with light histories, under every map of a folder and at several sizes, and path-traced
+twice with half of the paths each. Printed are, for each map and size:
+
+- PSNR, free of the references' noise (`Pair.quality`), and the mean of FLIP (Andersson et al., 2020; the package flip-evaluator) against
+  the mean of both references, beside half of the FLIP between these two, an upper bound of what their noise adds;
+- the lattice (`measure_lattice`): amplitude at the frequencies of coarse pixels and sample patterns over windows without objects,
+  relative to neighbouring frequencies; that of the reference beside it.
+
+With `--crops DIR` the worst part of each picture is written beside the reference, at 1:1. Exits with 1 if a bound is violated.
+
+    python -m tools.reports.lattice --models DIR --lights DIR --mode move --seed 4 --set move.rounds=1 --set move.speed=2 --crops DIR
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import sys
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import warp as wp
+from rich.console import Console
+
+from synpick_warp.arrays import allocate
+from synpick_warp.cli.doctor import describe_machine
+from synpick_warp.codes import Segment
+from synpick_warp.configs.schema import FAST, REFERENCE, Config
+from synpick_warp.errors import SynpickError
+from synpick_warp.factory.assembly import Stages, build_stages, make_renderer
+from synpick_warp.kernels.render.lighting.history import NEVER
+from synpick_warp.kernels.render.lighting.shadows import STRATA_PERIOD
+from synpick_warp.kernels.tuning import LANE_STRIDE
+from synpick_warp.progress import SilentProgress
+from synpick_warp.scenes.cameras import make_cameras
+from synpick_warp.scenes.fixtures import make_fixtures
+from synpick_warp.scheduling.sizes import fit_to_device
+from synpick_warp.stages.buffers import FIXTURES, Snapshot
+from synpick_warp.stages.render.sampling_rates import coarse_size, shadow_size
+from synpick_warp.stages.render.scene import build_render_scene
+from synpick_warp.stages.stream import TickReader
+from synpick_warp.system.device import pick_device
+from synpick_warp.viz.preview import write_picture
+from tools.options import Row, configure, fail, image_resolution, make_parser, positive_count, print_machine, print_rows, write_json
+from tools.reports.reference_store import existing_folder
+from tools.reports.render_checks import Shot, Studio, with_mode
+from tools.reports.render_piles import Pair
+
+MAX_FLIP = 0.05
+"""Bound of the mean FLIP under every map."""
+MAX_LATTICE = 1.5
+"""Bound of the lattice's amplitude relative to neighbouring frequencies."""
+WINDOW = 32
+"""Width of a window [px], or four periods if these are wider."""
+VISIBLE = 1.0
+"""Amplitude from which on a lattice counts as visible [grey levels]."""
+STRONG = 3.0
+"""Amplitude, relative to neighbouring frequencies, from which on a visible lattice counts."""
+FLOOR = 0.1
+"""Amplitude at one frequency that neighbours have at least [grey levels]: rounding to grey levels makes patterns as strong."""
+NOISE_RATIO = float(np.exp(np.euler_gamma))
+"""Ratio of arithmetic and geometric mean of the spectrum of noise. Neighbours count by their geometric mean, on which the low frequencies
+of edges have less weight."""
+CROP = 320
+"""Width of a crop [px]."""
+MAX_SAMPLES = 4096
+"""Largest number of paths per pixel of both references together: at 320x180 their noise is then far below the denoiser's error."""
+LUMINANCE = np.array([0.299, 0.587, 0.114])
+"""Weights of sRGB values in luma (Rec. 601)."""
+SIZES = "320x180,960x540,1920x1080"
+
+
+@dataclass(frozen=True)
+class Lattice:
+    """Lattice of an image: its strength over all windows, and where it is worst."""
+
+    ratio: float
+    """RMS amplitude at the lattice's frequencies over all windows, relative to that at neighbouring frequencies."""
+    share: float
+    """Share of windows with a lattice of at least VISIBLE grey levels and STRONG times the neighbouring frequencies [%]."""
+    amplitude: float
+    """Largest amplitude of a window at one frequency of the lattice [grey levels]."""
+    windows: int
+    """Number of windows."""
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run the command line; returns the exit code."""
+    options = _parse(arguments)
+    console = Console(highlight=False)
+    started = time.perf_counter()
+    rows: list[Row] = []
+    try:
+        config = _config(options, options.sizes[0])
+        device = pick_device(config.bake.device)
+        stages, snapshots = simulate_frames(config, options.frame, device)
+        for size in options.sizes:
+            for pair, periods in compare_maps(_config(options, size), stages, snapshots, options.paths, options.light):
+                rows += describe(pair, size, periods)
+                values = ", ".join(f"{row.name.partition(': ')[2]} {row.value:.3f}" for row in rows[-8:])
+                console.print(f"{time.perf_counter() - started:5.0f} s  {size[0]}x{size[1]} {pair.light}: {values}")
+                if options.crops:
+                    write_crops(pair, options.crops, f"{size[0]}x{size[1]}_{pair.light}", options.at)
+    except SynpickError as error:
+        return fail("reports.lattice", error)
+    machine = describe_machine(device)
+    print_machine(console, machine)
+    print_rows(console, "denoised frames", f"{config.bake.mode}, frame {options.frame}, {time.perf_counter() - started:.0f} s", rows)
+    write_json(options.json, {"machine": dict(machine), "rows": [row.to_dict() for row in rows]})
+    return 0 if all(row.holds for row in rows) else 1
+
+
+def simulate_frames(config: Config, last: int, device: wp.Device) -> tuple[Stages, list[dict[str, np.ndarray]]]:
+    """Simulate one episode; returns its stages, and the snapshots of the frames up to `last` on the host.
+
+    Raises:
+        SynpickError: The episode ends earlier.
+    """
+    config = fit_to_device(with_mode(config, FAST), device, 1)
+    stages = build_stages(config, device, SilentProgress(), range(1))
+    snapshots: list[dict[str, np.ndarray]] = []
+    while len(snapshots) <= last:
+        stages.simulation.tick()
+        reader = TickReader(stages.simulation.record)
+        reader.start()
+        report = reader.wait()
+        if report.column("live")[0] and report.column("frame")[0] == len(snapshots):
+            snapshot = stages.simulation.record.snapshot
+            snapshots.append({item.name: getattr(snapshot, item.name).numpy()[:1].copy() for item in fields(Snapshot)})
+        elif snapshots:
+            raise SynpickError(f"the episode has only {len(snapshots)} frames; name an earlier one than --frame {last}")
+    return stages, snapshots
+
+
+def compare_maps(
+    config: Config, stages: Stages, snapshots: list[dict[str, np.ndarray]], paths: int, light: str
+) -> Iterator[tuple[Pair, tuple[int, ...]]]:
+    """Render the last snapshot at the size of `config` under every map whose name contains `light`.
+
+    Args:
+        config: All settings.
+        stages: Objects and maps.
+        snapshots: Frames of an episode, from the first one on, which fill the light histories.
+        paths: Number of paths of a picture's two references together.
+        light: Part of the name of the maps.
+
+    Yields the denoised frame beside two references, and the periods of the lattice [px].
+    """
+    device, room = stages.renderer.scene.device, config.arrangement.max_objects
+    fixtures = make_fixtures(config.tote, config.gripper)
+    scene = build_render_scene(config.render, config.tote, stages.catalog, fixtures, make_cameras(config.cameras), stages.lights, device)
+    width, height = config.cameras.resolution
+    samples = min(MAX_SAMPLES, max(2, 1 << int(math.log2(paths / (width * height)))))
+    half = replace(config, render=replace(config.render, samples=samples // 2))
+    denoised = Studio(make_renderer(with_mode(config, FAST), scene, room, 1, 1))
+    references = [Studio(make_renderer(with_mode(half, REFERENCE, seed=config.bake.seed + each), scene, room, 1)) for each in (0, 1)]
+    sizes = {"world": 1, "instance": room, "fixture": len(FIXTURES)}
+    state = allocate(Snapshot, sizes, device)
+    for index, map_ in enumerate(stages.lights):
+        if light not in map_.name:
+            continue
+        history: Any = denoised.renderer.shading
+        history.history.frame.fill_(int(NEVER))
+        shots: list[Shot] = []
+        for content in snapshots:
+            for name, values in content.items():
+                getattr(state, name).assign(values)
+            state.light.fill_(index)
+            shots.append(denoised.render(state, 0, 0))
+        first, second = (each.render(state, 0, 0) for each in references)
+        yield Pair(map_.name, shots[-1], first, float(shots[-1].radiance.mean()), second), lattice_periods(config)
+
+
+def lattice_periods(config: Config) -> tuple[int, ...]:
+    """Periods of the patterns that a denoised frame could show [px]: of coarse pixels' order, and of the lamps' sample points."""
+    size = coarse_size(config.render, config.cameras.resolution[0], 1)
+    return tuple(sorted({size * int(LANE_STRIDE), shadow_size(size) * int(STRATA_PERIOD)}))
+
+
+def describe(pair: Pair, size: tuple[int, int], periods: tuple[int, ...]) -> list[Row]:
+    """Rows of a frame under one map."""
+    second = pair.second or pair.reference
+    mean = 0.5 * (pair.reference.color.astype(np.float32) + second.color)
+    flip = mean_flip(mean, pair.denoised.color)
+    noise = 0.5 * mean_flip(pair.reference.color, second.color)
+    lattice, other = (measure_lattice(image, pair.denoised.instance, periods) for image in (pair.denoised.color, mean))
+    name = f"{size[0]}x{size[1]}, {pair.light}"
+    return [
+        Row(f"{name}: PSNR", pair.quality, "dB"),
+        Row(f"{name}: FLIP", flip, "", f"< {MAX_FLIP:g}", flip < MAX_FLIP),
+        Row(f"{name}: FLIP by the reference's noise", noise),
+        Row(f"{name}: lattice", lattice.ratio, "", f"< {MAX_LATTICE:g}", lattice.ratio < MAX_LATTICE),
+        Row(f"{name}: lattice of the reference", other.ratio),
+        Row(f"{name}: windows with a lattice", lattice.share, "%"),
+        Row(f"{name}: windows with a lattice in the reference", other.share, "%"),
+        Row(f"{name}: largest amplitude of the lattice", lattice.amplitude, "grey"),
+    ]
+
+
+def mean_flip(reference: np.ndarray, image: np.ndarray) -> float:
+    """Mean FLIP of two images (H, W, 3) with grey levels from 0 to 255, at its default of 67 pixels per degree."""
+    return float(flip_map(reference, image).mean())
+
+
+def flip_map(reference: np.ndarray, image: np.ndarray) -> np.ndarray:
+    """FLIP of each pixel (H, W), from 0 to 1.
+
+    Raises:
+        SynpickError: The package is missing.
+    """
+    try:
+        import flip_evaluator  # pyright: ignore[reportMissingImports]
+    except ImportError as error:
+        raise SynpickError("this report needs the package flip-evaluator; pip install flip-evaluator") from error
+    first, second = (np.ascontiguousarray(each, dtype=np.float32) / 255.0 for each in (reference, image))
+    return flip_evaluator.evaluate(first, second, "LDR", applyMagma=False, computeMeanError=False)[0].reshape(image.shape[:2])
+
+
+def measure_lattice(image: np.ndarray, instance: np.ndarray, periods: tuple[int, ...]) -> Lattice:
+    """Compare the spectrum at the frequencies (i / P, j / P) with that at neighbouring ones, over windows on one surface.
+
+    Windows of several periods P, by half of their width apart, are multiplied by a Hann window. A frequency's neighbours lie two or three
+    bins from it; those of a frequency on an axis on the same axis, where walls and edges have most of their spectrum. In the ratio over all
+    windows each counts by the mean of its own neighbours, or those with strong edges would outweigh all others.
+
+    Args:
+        image: Grey levels (H, W, 3).
+        instance: Segmentation ids (H, W); windows that show more than the tote or the table alone are left out.
+        periods: Periods P [px]; the result is that of the one with the strongest lattice.
+    """
+    return max((_measure_period(image, instance, period) for period in periods), key=lambda lattice: lattice.ratio)
+
+
+def _measure_period(image: np.ndarray, instance: np.ndarray, period: int) -> Lattice:
+    lattice, near = _window_spectra(image, instance, period)
+    if not len(lattice):
+        return Lattice(0.0, 0.0, 0.0, 0)
+    near = near + FLOOR**2
+    strong = (lattice > VISIBLE**2) & (lattice > STRONG**2 * near)
+    weight = 1.0 / near.mean(axis=1, keepdims=True)
+    ratio = float(np.sqrt(((weight * lattice).sum(axis=0) / (weight * near).sum(axis=0)).max()))
+    return Lattice(ratio, 100.0 * float(strong.any(axis=1).mean()), float(np.sqrt(lattice.max())), len(lattice))
+
+
+def _window_spectra(image: np.ndarray, instance: np.ndarray, period: int) -> tuple[np.ndarray, np.ndarray]:
+    """Squared amplitudes [grey levels²] of windows (window, frequency): at the lattice's frequencies, and of neighbours."""
+    periods = max(4, round(WINDOW / period))
+    size, half = period * periods, period // 2
+    taper = np.outer(*2 * [np.hanning(size + 1)[:size]])
+    at = [(i, j) for i in range(half + 1) for j in range(-half, half + 1) if (i or j > 0) and -period < 2 * j]
+    near = [_neighbours(i * periods, j * periods, size, periods) for i, j in at]
+    rows, columns = (periods * np.array(each) % size for each in zip(*at, strict=True))
+    luma = image @ LUMINANCE
+    found: list[tuple[np.ndarray, list[float]]] = []
+    for top in range(0, luma.shape[0] - size + 1, size // 2):
+        for left in range(0, luma.shape[1] - size + 1, size // 2):
+            ids = instance[top : top + size, left : left + size]
+            if ids[0, 0] in (Segment.TABLE, Segment.TOTE) and (ids == ids[0, 0]).all():
+                window = luma[top : top + size, left : left + size]
+                # A sinusoid of amplitude a has the spectrum a / 2 times the window's sum at either of its two frequencies.
+                flat = taper * (window - (taper * window).sum() / taper.sum())
+                power = np.abs(np.fft.fft2(flat) * (2.0 / taper.sum())) ** 2
+                found.append((power[rows, columns], [NOISE_RATIO * float(np.exp(np.log(power[each] + 1e-12).mean())) for each in near]))
+    first, second = zip(*found, strict=True) if found else ((), ())
+    return np.array(first), np.array(second)
+
+
+def _neighbours(row: int, column: int, size: int, periods: int) -> tuple[np.ndarray, np.ndarray]:
+    """Rows and columns of the bins next to a bin (row, column) of a window's spectrum; none is next to another bin of the lattice."""
+    steps = [(i, j) for i in range(-3, 4) for j in range(-3, 4) if max(abs(i), abs(j)) >= 2]
+    if row == 0 or column == 0:
+        steps = [(i, j) for i, j in steps if (i == 0 if row == 0 else j == 0)]
+    bins = [(row + i, column + j) for i, j in steps]
+    bins = [(r, c) for r, c in bins if min(r % periods, -r % periods) + min(c % periods, -c % periods) >= 2]
+    bins = [(r, c) for r, c in bins if row == 0 or column == 0 or (abs(r % size) >= 2 and abs(c % size) >= 2)]
+    return np.array([r % size for r, _ in bins]), np.array([c % size for _, c in bins])
+
+
+def write_crops(pair: Pair, folder: Path, name: str, at: tuple[int, int] | None) -> None:
+    """Write the part of a frame with the largest FLIP, or that around the pixel `at` (column, row), beside the reference."""
+    second = pair.second or pair.reference
+    mean = 0.5 * (pair.reference.color.astype(np.float32) + second.color)
+    height, width = mean.shape[:2]
+    down, across = min(CROP, height), min(CROP, width)
+    if at is None:
+        sums = np.pad(flip_map(mean, pair.denoised.color).cumsum(axis=0).cumsum(axis=1), ((1, 0), (1, 0)))
+        boxes = sums[down:, across:] - sums[:-down, across:] - sums[down:, :-across] + sums[:-down, :-across]
+        top, left = (int(index) for index in np.unravel_index(boxes.argmax(), boxes.shape))
+    else:
+        top, left = (
+            max(0, min(middle - size // 2, limit - size))
+            for middle, size, limit in zip(at[::-1], (down, across), (height, width), strict=True)
+        )
+    parts = [each[top : top + down, left : left + across] for each in (pair.denoised.color, np.rint(mean).astype(np.uint8))]
+    write_picture(folder / f"{name}_{left}_{top}.png", np.concatenate(parts, axis=1)[..., ::-1])
+
+
+def _parse(arguments: list[str] | None) -> argparse.Namespace:
+    parser = make_parser(__doc__, "models", "lights", "device", "seed", "set", "json")
+    parser.add_argument("--mode", default="move", help="bake.mode (default: move)")
+    parser.add_argument(
+        "--sizes", type=_sizes, default=_sizes(SIZES), help=f"WIDTHxHEIGHT of the pictures, comma-separated (default: {SIZES})"
+    )
+    parser.add_argument("--frame", type=int, default=8, help="frame to compare (default: 8)")
+    parser.add_argument("--light", default="", help="part of the name of the maps to compare (default: all)")
+    parser.add_argument(
+        "--paths", type=positive_count, default=1 << 29, help="paths of a picture's two references together (default: 536870912)"
+    )
+    parser.add_argument("--crops", type=existing_folder, help="folder for crops at 1:1, the denoised picture beside the reference")
+    parser.add_argument("--at", type=_pixel, help="COLUMN,ROW in the middle of all crops (default: where FLIP is largest)")
+    return parser.parse_args(arguments)
+
+
+def _sizes(text: str) -> tuple[tuple[int, int], ...]:
+    """Type of an option: resolutions joined by commas."""
+    sizes = [image_resolution(part) for part in text.split(",")]
+    if not all(len(size) == 2 and all(isinstance(extent, int) for extent in size) for size in sizes):
+        raise argparse.ArgumentTypeError(f"{text} are no sizes; allowed: such as 320x180,1920x1080")
+    return tuple((int(width), int(height)) for width, height in sizes)
+
+
+def _pixel(text: str) -> tuple[int, int]:
+    """Type of an option: a pixel."""
+    parts = text.split(",")
+    if len(parts) != 2 or not all(part.isdecimal() for part in parts):
+        raise argparse.ArgumentTypeError(f"{text} is no pixel; allowed: COLUMN,ROW")
+    return int(parts[0]), int(parts[1])
+
+
+def _config(options: argparse.Namespace, size: tuple[int, int]) -> Config:
+    fixed = {"bake.mode": options.mode, "bake.episodes": 1, "bake.worlds": 1, "cameras.resolution": list(size)}
+    config = configure(options, fixed)
+    return replace(config, cameras=replace(config.cameras, positions=config.cameras.positions[:1], ups=config.cameras.ups[:1]))
+
+
+if __name__ == "__main__":
+    sys.exit(main())
