@@ -45,9 +45,10 @@ class ModuleBuild(NamedTuple):
     block: int
 
     def is_cached(self) -> bool:
-        """Whether the kernel cache has it."""
+        """Whether the kernel cache has it: its binary and, which Warp writes after that, its metadata."""
         name = self.module._get_compile_output_name(wp.get_device(self.device), block_dim=self.block)
-        return Path(wp.config.kernel_cache_dir or "", self.module.get_module_identifier(self.block), name).exists()
+        folder = Path(wp.config.kernel_cache_dir or "", self.module.get_module_identifier(self.block))
+        return (folder / name).exists() and (folder / self.module._get_meta_name(block_dim=self.block)).exists()
 
 
 @contextlib.contextmanager

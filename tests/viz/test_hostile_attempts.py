@@ -87,7 +87,8 @@ def test_a_graph_of_all_edges_ends(tmp_path):
     (tmp_path / "attempts.jsonl").write_text(json.dumps(record(pile[:32])))
     [attempt] = read_attempts(tmp_path, 0, None)
     started = time.monotonic()
-    lay_out(attempt, clutter_edges(attempt, 1.0), (500, 640))
+    with pytest.raises(DatasetError, match="has too many edges to be drawn"):
+        lay_out(attempt, clutter_edges(attempt, 1.0), (500, 640))
     assert time.monotonic() - started < SECONDS
 
 
