@@ -20,7 +20,7 @@ WORKERS := 2
 
 demo: $(VENV)/installed
 	rm -rf $(DEMO)
-	$(BIN)/synpick-warp bake --config smoke --devices cpu,cpu --out $(DEMO)
+	$(BIN)/synpick-warp bake --config smoke --episodes 1 --device cpu --out $(DEMO)
 	$(BIN)/synpick-warp preview $(DEMO) --out $(DEMO)/contact-sheet.png
 
 test: checks
