@@ -305,11 +305,15 @@ def slow_builds(device: wp.Device) -> list[ModuleBuild]:
 
 @cache
 def _narrow_kernels(on_gpu: bool) -> list[tuple[Any, int]]:
-    """Kernels of the narrow phase as `make_pipeline` has them, and their block sizes. Cached, since modules refer to kernels weakly."""
+    """Kernels of the narrow phase as `make_pipeline` has them, and their block sizes. Those that write contacts are generic."""
     options: dict[str, Any] = {"support_func": narrow.support_map_lean, "post_process_contact": narrow.post_process_minkowski_only}
+    writer = {"writer_data": collide.ContactWriterData}
     if not on_gpu:
-        return [(narrow.create_narrow_phase_kernel_gjk_mpr(True, collide.write_contact, **options), 1)]
+        kernel = narrow.create_narrow_phase_kernel_gjk_mpr(True, collide.write_contact, **options)
+        wp.overload(kernel, writer)
+        return [(kernel, 1)]
     mpr, gjk, refine, manifold = narrow.create_narrow_phase_kernels_gjk_mpr_split(True, collide.write_contact, **options)
+    wp.overload(manifold, writer)
     return [(refine, REFINE_BLOCK), (manifold, NARROW_PHASE_BLOCK), (mpr, NARROW_PHASE_BLOCK), (gjk, NARROW_PHASE_BLOCK)]
 
 
