@@ -96,7 +96,8 @@ def test_bad_options_are_one_line(good, capsys, options):
     assert (code, lines, len(err.splitlines())) == (2, [], 1)
 
 
-def test_a_folder_is_needed(capsys):
+def test_a_folder_is_needed(capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)  # A data set in the current folder would be taken.
     assert run(capsys)[0] == 2
 
 
