@@ -1,4 +1,4 @@
-"""Collision shapes of the embedded objects, computed once and shipped: a first bake need not wait for their convex decomposition.
+"""Collision shapes of the embedded objects, computed once and shipped, so that a first bake does not wait for convex decomposition.
 
 They are keyed by mesh and recipe, so that other settings, or objects that have changed, are decomposed as any others. The meshes follow
 from sines and cosines, whose last bits depend on NumPy and the processor; therefore vertices count to 10 micrometres.

@@ -91,7 +91,7 @@ def test_an_attempt_without_what_tasks_are_made_of_is_one_line(source, tmp_path,
 
 
 def test_setpoints_that_were_not_baked_are_named(tmp_path, assets, capsys):  # noqa: F811
-    """With trajectory.steps = false actions would be the places of the cup."""
+    """Without recorded setpoints (trajectory.steps = false) actions would repeat the cup's positions."""
     source = scripted(tmp_path / "source")
     shutil.rmtree(source / STORE / "episodes" / "000000" / "steps")
     line = refusal(source, tmp_path, "lerobot", capsys)

@@ -1,4 +1,4 @@
-"""Shipped collision shapes: there is one for each embedded object, it is what is computed, and rounding does not hide it."""
+"""Shipped collision shapes: each embedded object has one, equal to the computed one, and keys tolerate rounding of vertices."""
 
 from __future__ import annotations
 

@@ -38,7 +38,8 @@ WEIGHT_SUM = wp.constant(256)
 HALF_WEIGHTS = wp.constant(wp.uint64(0x0080008000800080))
 """Rounding term: half of WEIGHT_SUM in each 16 bits."""
 LOW_NIBBLES = wp.constant(wp.uint32(0x0F0F0F0F))
-"""Nibbles 0, 2, 4, 6, each with room for a sum in 8 bits: of weights of 64 and values of 2, or 16 and 5."""
+"""Mask of nibbles 0, 2, 4, 6. A weighted sum of such nibbles fits into 8 bits: weights add up to 64 where values are at most 2, to 16 where
+they are at most 5."""
 NIBBLE_ONES = wp.constant(wp.uint32(0x11111111))
 """1 in each nibble."""
 TapVector = wp.types.vector(length=4, dtype=wp.uint64)
