@@ -33,7 +33,7 @@ MAX_PARTS = 2**12
 MAX_SHOWN = 200
 """Length to which a library's message is cut."""
 
-# Where exporters put textures, below the folder of the mesh or of the object.
+# Texture folders of common exporters, relative to the folder of the mesh or of the object.
 _TEXTURE_FOLDERS = ((), ("textures",), ("texture",), ("materials", "textures"), ("materials",), ("maps",), ("images",), ("tex",))
 
 # Readers log what they leave out; without a handler, Python prints such lines to standard error.

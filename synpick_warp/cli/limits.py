@@ -35,7 +35,7 @@ def describe_limit(error: BaseException) -> str | None:
 
 
 def _chain(error: BaseException) -> Iterator[BaseException]:
-    """An error and those that it follows from."""
+    """Exception chain: an error, then its causes and contexts."""
     following: BaseException | None = error
     while following is not None:
         yield following

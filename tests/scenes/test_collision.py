@@ -206,7 +206,7 @@ def test_a_script_without_main_guard_can_decompose(tmp_path):
 
 
 def fall_back(tmp_path, monkeypatch, result, seconds=300.0):
-    """Collision shape and lines of a mug whose decomposition ends with `result`."""
+    """Collision shape of a mug, and the progress lines, where the decomposition returns or raises `result`."""
 
     def run(function, calls, limits):
         return [result if function is decompose else function(*call) for call in calls]

@@ -149,7 +149,7 @@ def test_the_legend_has_every_object_in_its_colour_or_counts_the_rest():
 
 
 def test_depth_has_one_scale_the_totes(dataset, tmp_path):
-    """From the rim, which has the corner nearest to a camera, to the floor's farthest corner, in all views and rows."""
+    """The depth range is one for all views: from the rim's corner nearest to a camera to the floor's farthest corner."""
     (dataset / "config.toml").write_text(config_to_toml(config()))
     views = sample(find_scenes(dataset), 6)
     records = [json.loads(scene.annotations().read_text())[str(frame)] for scene, frame in views]

@@ -57,7 +57,7 @@ def read_obj(path: Path, notes: Notes) -> list[MeshPart]:
 
 
 def _load(text: str, used: dict[str, None]) -> list[dict[str, Any]]:
-    """The reader's meshes, ordered by name, each with the name of its material as `material`."""
+    """Parse the text of an OBJ with trimesh. Returns its meshes as keyword arguments, sorted by name; `material` is a name."""
     # A library of names only: which mesh has which material; what the materials are is read here.
     table = {_LIBRARY: "\n".join(f"newmtl {name}" for name in used).encode()}
     content = load_obj(io.BytesIO(f"mtllib {_LIBRARY}\n{text}".encode()), resolver=table)

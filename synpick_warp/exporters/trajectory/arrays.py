@@ -52,7 +52,7 @@ class GroupSpec:
     description: str
     arrays: Mapping[str, ArraySpec] = field(default_factory=dict)
     coordinates: tuple[str, ...] = ()
-    """Arrays that xarray takes for coordinates of the others (CF conventions)."""
+    """Names of the group's coordinate variables, as in the attribute `coordinates` of the CF conventions, which xarray reads."""
 
 
 _GONE = " NaN: the instance is not in the scene."
