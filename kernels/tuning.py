@@ -48,8 +48,9 @@ BORDER_CHUNK = 8192
 """Pixels that a group takes at a time: 64 rays a thread, few enough that groups end together, many enough that their atomics are rare."""
 FOOTPRINT_THREADS, CPU_FOOTPRINT_THREADS = 128, 4
 """Number of threads that share a chunk's list of anti-aliasing footprints, on a GPU and on the CPU: a chunk has some hundred samples."""
-EDGE_THREADS, CPU_EDGE_THREADS = 256, 4
-"""Threads that share a chunk's list of pixels near edges of shadows, on a GPU and on the CPU: a chunk has up to 16,384."""
+EDGE_THREADS, CPU_EDGE_THREADS = 1024, 64
+"""Threads that share a chunk's list of pixels near edges of shadows, on a GPU and on the CPU: a chunk has up to 16,384, and a launch ends
+with its longest list."""
 CPU_PIECES = 8
 """Pieces per CPU core of a launch over pixels, so that cores finish together although some tiles cost more."""
 CPU_PIECE_PIXELS = 8192

@@ -18,6 +18,7 @@ from synpick_warp.stages.perception.plan import CYCLES, VoteArrays
 from synpick_warp.stages.render.annotate import BORDER_BOXES
 from synpick_warp.stages.render.denoised import (
     COARSE_LIGHT,
+    EDGE_LISTS,
     GUIDE,
     LAMP_SHADOWS,
     LIGHT_HISTORY,
@@ -25,7 +26,6 @@ from synpick_warp.stages.render.denoised import (
     PATH_LISTS,
     PATH_QUEUES,
     RATIO_IMAGES,
-    EdgeLists,
     FootprintLists,
     ShadowRays,
     scratch_sizes,
@@ -44,7 +44,8 @@ from tests.worlds.small_worlds import settings
 
 NAMES = (
     "one world world_and_global instance body waypoint status measure fixture view row column count box side point kind subset tile "
-    "image field boundary cell_row cell_column shadow_row shadow_column edge_chunk chunk_cell chunk chunk_footprint block "
+    "image field boundary cell_row cell_column shadow_row shadow_column edge_chunk chunk_cell chunk_pixel edge_counter "
+    "chunk chunk_footprint block "
     "world_camera view_instance one slot slot_word group depth_byte "
     "sample_row sample_block quad interval lane byte region rank path_kind record"
     " queue_view queue_region queue_stage stage_parity queue_slot path_record"
@@ -71,7 +72,7 @@ BASE = [
     RATIO_IMAGES,
     LAMP_SHADOWS,
     ShadowRays,
-    EdgeLists,
+    EDGE_LISTS,
     FootprintLists,
     VISIBILITY_BUFFER,
     BORDER_BOXES,

@@ -48,7 +48,7 @@ from synpick_warp.stages.stream import TickReader
 from synpick_warp.system.device import pick_device
 from synpick_warp.viz.preview import write_picture
 from tools.options import Row, configure, fail, image_resolution, make_parser, positive_count, print_machine, print_rows, write_json
-from tools.reports.reference_store import existing_folder
+from tools.reports.reference_store import ReferenceStore, existing_folder
 from tools.reports.render_checks import Shot, Studio, with_mode
 from tools.reports.render_piles import Pair
 
@@ -101,7 +101,7 @@ def main(arguments: list[str] | None = None) -> int:
         device = pick_device(config.bake.device)
         stages, snapshots = simulate_frames(config, options.frame, device)
         for size in options.sizes:
-            for pair, periods in compare_maps(_config(options, size), stages, snapshots, options.paths, options.light):
+            for pair, periods in compare_maps(_config(options, size), stages, snapshots, options):
                 rows += describe(pair, size, periods)
                 values = ", ".join(f"{row.name.partition(': ')[2]} {row.value:.3f}" for row in rows[-8:])
                 console.print(f"{time.perf_counter() - started:5.0f} s  {size[0]}x{size[1]} {pair.light}: {values}")
@@ -139,16 +139,15 @@ def simulate_frames(config: Config, last: int, device: wp.Device) -> tuple[Stage
 
 
 def compare_maps(
-    config: Config, stages: Stages, snapshots: list[dict[str, np.ndarray]], paths: int, light: str
+    config: Config, stages: Stages, snapshots: list[dict[str, np.ndarray]], options: argparse.Namespace
 ) -> Iterator[tuple[Pair, tuple[int, ...]]]:
-    """Render the last snapshot at the size of `config` under every map whose name contains `light`.
+    """Render the last snapshot at the size of `config` under every map whose name contains `options.light`.
 
     Args:
         config: All settings.
         stages: Objects and maps.
         snapshots: Frames of an episode, from the first one on, which fill the light histories.
-        paths: Number of paths of a picture's two references together.
-        light: Part of the name of the maps.
+        options: The command line: `light`, `paths` and `cache` are read.
 
     Yields the denoised frame beside two references, and the periods of the lattice [px].
     """
@@ -156,14 +155,15 @@ def compare_maps(
     fixtures = make_fixtures(config.tote, config.gripper)
     scene = build_render_scene(config.render, config.tote, stages.catalog, fixtures, make_cameras(config.cameras), stages.lights, device)
     width, height = config.cameras.resolution
-    samples = min(MAX_SAMPLES, max(2, 1 << int(math.log2(paths / (width * height)))))
+    samples = min(MAX_SAMPLES, max(2, 1 << int(math.log2(options.paths / (width * height)))))
     half = replace(config, render=replace(config.render, samples=samples // 2))
+    store = ReferenceStore(options.cache, half)
     denoised = Studio(make_renderer(with_mode(config, FAST), scene, room, 1, 1))
     references = [Studio(make_renderer(with_mode(half, REFERENCE, seed=config.bake.seed + each), scene, room, 1)) for each in (0, 1)]
     sizes = {"world": 1, "instance": room, "fixture": len(FIXTURES)}
     state = allocate(Snapshot, sizes, device)
     for index, map_ in enumerate(stages.lights):
-        if light not in map_.name:
+        if options.light not in map_.name:
             continue
         history: Any = denoised.renderer.shading
         history.history.frame.fill_(int(NEVER))
@@ -173,7 +173,7 @@ def compare_maps(
                 getattr(state, name).assign(values)
             state.light.fill_(index)
             shots.append(denoised.render(state, 0, 0))
-        first, second = (each.render(state, 0, 0) for each in references)
+        first, second = store.get(state, 0, lambda: (references[0].render(state, 0, 0), references[1].render(state, 0, 0)))
         yield Pair(map_.name, shots[-1], first, float(shots[-1].radiance.mean()), second), lattice_periods(config)
 
 
@@ -312,6 +312,7 @@ def _parse(arguments: list[str] | None) -> argparse.Namespace:
     parser.add_argument(
         "--paths", type=positive_count, default=1 << 29, help="paths of a picture's two references together (default: 536870912)"
     )
+    parser.add_argument("--cache", type=existing_folder, help="folder in which references are kept for further runs")
     parser.add_argument("--crops", type=existing_folder, help="folder for crops at 1:1, the denoised picture beside the reference")
     parser.add_argument("--at", type=_pixel, help="COLUMN,ROW in the middle of all crops (default: where FLIP is largest)")
     return parser.parse_args(arguments)

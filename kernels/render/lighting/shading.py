@@ -122,9 +122,8 @@ def gather_light(
     normal = wp.transpose(cameras.to_world[camera]) * face_normal
     plane = tangent_plane(cameras.intrinsics[camera], row, column, segment, gbuffer.depth[view, row, column], normal)
     result = PixelLight()
-    lamps = scene.lights.lamps[sky.light]
-    if lamps > 0:
-        result.lamps = upsample_shadows(shadows, shadow_grid, gbuffer, lamps, view, row, column, plane)
+    if scene.lights.lamps[sky.light] > 0:
+        result.lamps = upsample_shadows(shadows, shadow_grid, view, row, column, plane)
     result.ratios = upsample_ratios(ratios, coarse, view, row, column, plane)
     result.ratios.indirect = result.ratios.indirect / scene.lights.exposure[sky.light]
     return result

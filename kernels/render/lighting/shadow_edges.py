@@ -1,13 +1,17 @@
-"""Steep edges of lamp shadows: shadow rays from each pixel at them (adaptive sampling), to the lamps whose shadows are steep there."""
+"""Steep edges of lamp shadows: shadow rays from each pixel at them (adaptive sampling), to the lamps whose shadows are steep there.
+
+Four passes, so that warps are full of pixels with the same work: list the pixels of the shadow grid near edges, list the pixels of the
+image in them, trace their rays, and filter what these found.
+"""
 
 import warp as wp
 
 from synpick_warp.codes import Segment
 from synpick_warp.kernels.render.lighting.coarse_grid import CoarseGrid
 from synpick_warp.kernels.render.lighting.environment import Lights, lamp_direction, unit_heading
-from synpick_warp.kernels.render.lighting.plane_distance import tangent_plane
+from synpick_warp.kernels.render.lighting.plane_distance import Plane, tangent_plane
 from synpick_warp.kernels.render.lighting.shadow_filter import STEEPNESS_BITS, STEEPNESS_LEVELS, LampShadows
-from synpick_warp.kernels.render.lighting.shadow_upsampling import all_steepness, find_shadow_taps
+from synpick_warp.kernels.render.lighting.shadow_upsampling import all_steepness, filter_edge, find_shadow_taps
 from synpick_warp.kernels.render.lighting.shadows import is_shadowed, point_direction, visible_normal
 from synpick_warp.kernels.render.visibility.camera import Cameras, Views, camera_ray, hit_position, in_image, tile_of, tile_pixel
 from synpick_warp.kernels.render.visibility.gbuffer import GBuffer, Meshes, Table, ViewBodies, read_hit
@@ -15,32 +19,112 @@ from synpick_warp.kernels.tuning import RAY_REGISTERS
 
 wp.set_module_options({"enable_backward": False, "fast_math": True})
 
-
 CHUNK_TILES = wp.constant(32)
-"""Tiles of the shadow grid that share a list and its counter, as of anti-aliasing's footprints."""
+"""Tiles of the shadow grid that share lists and their counters, as of anti-aliasing's footprints."""
+CELLS, PIXELS = wp.constant(0), wp.constant(1)
+"""Counters of `EdgeLists`."""
+
+
+@wp.struct
+class EdgeLists:
+    """Lists of the pixels near steep edges of shadows. Scratch. A chunk is a run of tiles of the shadow grid with lists of its own."""
+
+    cell: wp.array3d[int]
+    """(view, edge_chunk, chunk_cell): row * columns + column of pixels of the shadow grid, in whose squares all pixels are examined."""
+    pixel: wp.array3d[int]
+    """(view, edge_chunk, chunk_pixel): row * columns + column of pixels of the image that trace rays."""
+    count: wp.array3d[int]
+    """(view, edge_chunk, edge_counter): lengths of both lists, at CELLS and PIXELS."""
+
+
+@wp.func
+def list_place(lists: EdgeLists, thread: int, threads: int) -> tuple[int, int, int]:
+    """(view, chunk, first entry) of a thread, of `threads` that share the list of a chunk."""
+    # Unsigned: cheaper to divide.
+    place = wp.uint32(thread) // wp.uint32(threads)
+    chunks = wp.uint32(lists.count.shape[1])
+    return int(place // chunks), int(place % chunks), int(wp.uint32(thread) % wp.uint32(threads))
+
+
+@wp.func
+def flat_pixel(flat: int, width: int) -> tuple[int, int]:
+    """(row, column) of row * `width` + column."""
+    return int(wp.uint32(flat) // wp.uint32(width)), int(wp.uint32(flat) % wp.uint32(width))
 
 
 @wp.kernel
-def list_edges_kernel(
+def list_edge_cells_kernel(
     # Scene:
     coarse: CoarseGrid,
     # In:
     views: Views,
+    first: int,
     # Out:
     shadows_inout: LampShadows,
-    cell_out: wp.array3d[int],  # (view, edge_chunk, chunk_cell)
-    count_inout: wp.array2d[int],  # (view, edge_chunk)
+    lists_inout: EdgeLists,
 ):
-    """List the pixels of the shadow grid that `near_edge` marks, by chunk of tiles, in any order (stream compaction), and clear the marks.
+    """List the pixels of the shadow grid that `near_edge` marks, in any order (stream compaction), and clear the marks.
 
-    `cell_out` receives row * columns + column, and `count_inout` is increased by their number.
+    Launched over the shadow grid in tile order. The counters, which must be 0, receive their number.
     """
-    view, row, column = tile_pixel(coarse.grid, wp.tid())
+    view, row, column = tile_pixel(coarse.grid, wp.tid() + first)
     if view < views.count and in_image(coarse.grid, row, column):
         if shadows_inout.near_edge[view, row, column] != wp.uint8(0):
             shadows_inout.near_edge[view, row, column] = wp.uint8(0)
             chunk = tile_of(coarse.grid, row, column) // CHUNK_TILES
-            cell_out[view, chunk, wp.atomic_add(count_inout, view, chunk, 1)] = row * coarse.grid.width + column
+            rank = wp.atomic_add(lists_inout.count, view, chunk, CELLS, 1)
+            lists_inout.cell[view, chunk, rank] = row * coarse.grid.width + column
+
+
+@wp.func
+def pixel_plane(
+    meshes: Meshes, cameras: Cameras, bodies: ViewBodies, gbuffer: GBuffer, views: Views, view: int, row: int, column: int
+) -> tuple[Plane, wp.vec3]:
+    """Tangent plane at a pixel that shows a surface, and the surface's geometric normal in the world."""
+    camera = views.camera[view]
+    outward = cameras.to_world[camera] * camera_ray(cameras.intrinsics[camera], row, column, wp.vec2(0.0, 0.0))
+    normal = visible_normal(meshes, bodies, view, read_hit(gbuffer, view, row, column), views.instances, outward)
+    local = wp.transpose(cameras.to_world[camera]) * normal
+    segment, depth = gbuffer.segment[view, row, column], gbuffer.depth[view, row, column]
+    return tangent_plane(cameras.intrinsics[camera], row, column, segment, depth, local), normal
+
+
+@wp.kernel
+def list_edge_pixels_kernel(
+    # Scene:
+    meshes: Meshes,
+    cameras: Cameras,
+    coarse: CoarseGrid,
+    # In:
+    bodies: ViewBodies,
+    gbuffer: GBuffer,
+    views: Views,
+    threads: int,
+    first: int,
+    # Out:
+    shadows_inout: LampShadows,
+    lists_inout: EdgeLists,
+):
+    """List the pixels at which a lamp's shadow is steep, in any order; their steepness is written to `edge`, which must be 0.
+
+    The host does not read the counts, so a fixed number of `threads` strides over the listed pixels of the shadow grid of each chunk.
+    """
+    view, chunk, start = list_place(lists_inout, wp.tid() + first, threads)
+    if view >= views.count:
+        return
+    square = coarse.size * coarse.size
+    for index in range(start, square * lists_inout.count[view, chunk, CELLS], threads):
+        top, left = flat_pixel(lists_inout.cell[view, chunk, index // square], coarse.grid.width)
+        row = top * coarse.size + index % square // coarse.size
+        column = left * coarse.size + index % coarse.size
+        if in_image(coarse.image, row, column):
+            if int(gbuffer.segment[view, row, column]) != Segment.NOTHING:
+                plane, _normal = pixel_plane(meshes, cameras, bodies, gbuffer, views, view, row, column)
+                steepness = all_steepness(find_shadow_taps(shadows_inout, coarse, view, row, column, plane))
+                if steepness != wp.uint32(0):
+                    shadows_inout.edge[view, row, column] = steepness
+                    rank = wp.atomic_add(lists_inout.count, view, chunk, PIXELS, 1)
+                    lists_inout.pixel[view, chunk, rank] = row * coarse.image.width + column
 
 
 @wp.func
@@ -55,24 +139,18 @@ def trace_pixel_edges(
     bodies: ViewBodies,
     gbuffer: GBuffer,
     views: Views,
-    shadows: LampShadows,
+    steepness: wp.uint32,
     view: int,
     row: int,
     column: int,
 ) -> wp.uint32:
-    """Trace the rays of a pixel that shows a surface; packed as in `LampShadows.edge`."""
+    """Trace the rays of a pixel to the lamps whose `steepness` is above 0; packed as in `LampShadows.edge`."""
     camera = views.camera[view]
-    depth = gbuffer.depth[view, row, column]
-    camera_direction = camera_ray(cameras.intrinsics[camera], row, column, wp.vec2(0.0, 0.0))
-    outward = cameras.to_world[camera] * camera_direction
+    direction_to_surface = camera_ray(cameras.intrinsics[camera], row, column, wp.vec2(0.0, 0.0))
+    outward = cameras.to_world[camera] * direction_to_surface
     normal = visible_normal(meshes, bodies, view, read_hit(gbuffer, view, row, column), views.instances, outward)
-    local = wp.transpose(cameras.to_world[camera]) * normal
-    plane = tangent_plane(cameras.intrinsics[camera], row, column, gbuffer.segment[view, row, column], depth, local)
-    steepness = all_steepness(find_shadow_taps(shadows, coarse, view, row, column, plane))
+    position = hit_position(cameras, camera, direction_to_surface, gbuffer.depth[view, row, column])
     result = wp.uint32(0)
-    if steepness == wp.uint32(0):
-        return result
-    position = hit_position(cameras, camera, camera_direction, depth)
     for lamp in range(lights.lamps[which]):
         if (steepness >> wp.uint32(STEEPNESS_BITS * lamp)) & wp.uint32(STEEPNESS_LEVELS) != wp.uint32(0):
             free = coarse.rays
@@ -99,40 +177,60 @@ def trace_shadow_edges_kernel(
     # In:
     bodies: ViewBodies,
     gbuffer: GBuffer,
-    cell: wp.array3d[int],  # (view, edge_chunk, chunk_cell)
-    count: wp.array2d[int],  # (view, edge_chunk)
+    lists: EdgeLists,
     views: Views,
     threads: int,
     first: int,
     # Out:
     shadows_inout: LampShadows,
 ):
-    """Trace `CoarseGrid.rays` rays from a pixel to each lamp whose shadow is steep, to all if no pixel of the shadow grid
-    around it is on its surface. `edge`, which must be 0, is written in the listed pixels of the shadow grid.
+    """Trace `CoarseGrid.rays` rays from each listed pixel to each lamp whose shadow is steep, to all if no pixel of the shadow grid
+    around it is on its surface; their results replace the steepness in `edge`.
 
-    The host does not read the counts, so a fixed number of `threads` strides over the pixels of a chunk. Rays to lamps behind the surface
-    count as free, as on the shadow grid.
+    Rays to lamps behind the surface count as free, as on the shadow grid. `threads` as in `list_edge_pixels_kernel`.
     """
-    # Unsigned: cheaper to divide.
-    thread = wp.uint32(wp.tid() + first)
-    place = thread // wp.uint32(threads)
-    chunks = wp.uint32(count.shape[1])
-    view = int(place // chunks)
+    view, chunk, start = list_place(lists, wp.tid() + first, threads)
     if view >= views.count:
         return
-    chunk = int(place % chunks)
     world = views.world[view]
-    size = wp.uint32(coarse.size)
-    for index in range(int(thread % wp.uint32(threads)), coarse.size * coarse.size * count[view, chunk], threads):
-        item = wp.uint32(index)
-        place_in_grid = wp.uint32(cell[view, chunk, int(item // (size * size))])
-        inside = item % (size * size)
-        row = int((place_in_grid // wp.uint32(coarse.grid.width)) * size + inside // size)
-        column = int((place_in_grid % wp.uint32(coarse.grid.width)) * size + inside % size)
-        if in_image(coarse.image, row, column):
-            if int(gbuffer.segment[view, row, column]) != Segment.NOTHING:
-                which = light[world]
-                heading = unit_heading(light_yaw[world])
-                shadows_inout.edge[view, row, column] = trace_pixel_edges(
-                    meshes, table, cameras, coarse, lights, which, heading, bodies, gbuffer, views, shadows_inout, view, row, column
-                )
+    which = light[world]
+    heading = unit_heading(light_yaw[world])
+    for index in range(start, lists.count[view, chunk, PIXELS], threads):
+        row, column = flat_pixel(lists.pixel[view, chunk, index], coarse.image.width)
+        steepness = shadows_inout.edge[view, row, column]
+        shadows_inout.edge[view, row, column] = trace_pixel_edges(
+            meshes, table, cameras, coarse, lights, which, heading, bodies, gbuffer, views, steepness, view, row, column
+        )
+
+
+@wp.kernel
+def filter_shadow_edges_kernel(
+    # Scene:
+    meshes: Meshes,
+    cameras: Cameras,
+    coarse: CoarseGrid,
+    lights: Lights,
+    # State: worlds
+    light: wp.array[int],  # (world)
+    # In:
+    bodies: ViewBodies,
+    gbuffer: GBuffer,
+    lists: EdgeLists,
+    views: Views,
+    threads: int,
+    first: int,
+    # Out:
+    shadows_inout: LampShadows,
+):
+    """Write `edge_fractions` of each listed pixel: visible fractions of the lamps by the rays of the pixels around it.
+
+    `threads` as in `list_edge_pixels_kernel`.
+    """
+    view, chunk, start = list_place(lists, wp.tid() + first, threads)
+    if view >= views.count:
+        return
+    lamps = lights.lamps[light[views.world[view]]]
+    for index in range(start, lists.count[view, chunk, PIXELS], threads):
+        row, column = flat_pixel(lists.pixel[view, chunk, index], coarse.image.width)
+        plane, _normal = pixel_plane(meshes, cameras, bodies, gbuffer, views, view, row, column)
+        shadows_inout.edge_fractions[view, row, column] = filter_edge(shadows_inout, coarse, gbuffer, lamps, view, row, column, plane)

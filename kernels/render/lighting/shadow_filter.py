@@ -33,6 +33,8 @@ from the pixels replace it. Between them both are blended."""
 FULL_SHARE = wp.constant(0.2)
 """Share of a lamp in the light of an open surface that faces up, below which its shadow counts as less steep: its edge is
 too faint to be missed."""
+MIN_SHARE = wp.constant(float(MIN_STEEPNESS) * float(FULL_SHARE))
+"""Share of a lamp below which none of its shadows is steep."""
 STEEPNESS_LEVELS = wp.constant(7)
 """Levels of steepness, STEEPNESS_BITS for each lamp; the highest: filtered fractions do not count."""
 STEEPNESS_BITS = wp.constant(3)
@@ -58,7 +60,10 @@ class LampShadows:
     near_edge: wp.array3d[wp.uint8]
     """(view, shadow_row, shadow_column): 1 in pixels around steep shadows and edges of surfaces, 0 elsewhere; between frames 0."""
     edge: wp.array3d[wp.uint32]
-    """(view, row, column): rays from the pixel itself at steep edges, 4 bits a lamp: 0, or 1 + the number of free rays."""
+    """(view, row, column): rays from the pixel itself at steep edges, 4 bits a lamp: 0, or 1 + the number of free rays. Before they are
+    traced: steepness as in `record`."""
+    edge_fractions: wp.array3d[wp.uint64]
+    """(view, row, column): as `fractions`, where `edge` is not 0; undefined elsewhere."""
 
 
 @wp.func
@@ -275,6 +280,8 @@ def steepness_levels(lowest: int, highest: int, share: float, supported: bool) -
         share: Share of the lamp, see FULL_SHARE.
         supported: Whether enough of what is around the pixel is on its surface.
     """
+    if share < MIN_SHARE:
+        return 0
     if not supported:
         return wp.where(lowest == highest and (lowest == 0 or lowest == 255), 0, STEEPNESS_LEVELS)
     difference = float(highest - lowest) / 255.0 * wp.min(share / FULL_SHARE, 1.0)

@@ -191,19 +191,16 @@ def edge_fraction(sums: EdgeSums, lamp: int, rays: int, fallback: float) -> floa
 
 
 @wp.func
-def upsample_shadows(
+def filter_edge(
     shadows: LampShadows, coarse: CoarseGrid, gbuffer: GBuffer, lamps: int, view: int, row: int, column: int, plane: Plane
 ) -> wp.uint64:
-    """Visible fractions of the lamps at a pixel, byte k that of lamp k in 1/255.
+    """Visible fractions of the lamps at a pixel that traced rays, byte k that of lamp k in 1/255.
 
-    Interpolated between the four nearest pixels of the shadow grid on the pixel's surface, whose tangent plane is `plane`; the steeper a
-    shadow, the more count the rays from pixels around it, and they alone where none of the four is on the surface.
+    The steeper a lamp's shadow, the more count the rays from pixels around it, on its surface, whose tangent plane is `plane`, instead of
+    what is interpolated; they alone where no pixel of the shadow grid around it is on its surface.
     """
     taps = find_shadow_taps(shadows, coarse, view, row, column, plane)
     wide = blend_bytes(taps.fractions, taps.weights)
-    steepness = all_steepness(taps)
-    if steepness == wp.uint32(0):
-        return wide
     sums = sum_edges(shadows, coarse, gbuffer, view, row, column, plane)
     result = wp.uint64(0)
     for lamp in range(lamps):
@@ -211,3 +208,13 @@ def upsample_shadows(
         value += lamp_steepness(taps, lamp) * (edge_fraction(sums, lamp, coarse.rays, value) - value)
         result |= wp.uint64(int(value + 0.5)) << wp.uint64(8 * lamp)
     return result
+
+
+@wp.func
+def upsample_shadows(shadows: LampShadows, coarse: CoarseGrid, view: int, row: int, column: int, plane: Plane) -> wp.uint64:
+    """Visible fractions of the lamps at a pixel, byte k that of lamp k in 1/255: from its rays and its neighbours' where it traced some,
+    else interpolated between the four nearest pixels of the shadow grid on its surface, whose tangent plane is `plane`."""
+    if shadows.edge[view, row, column] != wp.uint32(0):
+        return shadows.edge_fractions[view, row, column]
+    taps = find_shadow_taps(shadows, coarse, view, row, column, plane)
+    return blend_bytes(taps.fractions, taps.weights)

@@ -29,7 +29,13 @@ from synpick_warp.kernels.render.lighting.paths.queues import PATH_RECORDS, QUEU
 from synpick_warp.kernels.render.lighting.paths.reuse import reuse_histories_kernel
 from synpick_warp.kernels.render.lighting.shading import shade_kernel, shade_samples_kernel
 from synpick_warp.kernels.render.lighting.shadow_edges import CHUNK_TILES as EDGE_CHUNK_TILES
-from synpick_warp.kernels.render.lighting.shadow_edges import list_edges_kernel, trace_shadow_edges_kernel
+from synpick_warp.kernels.render.lighting.shadow_edges import (
+    EdgeLists,
+    filter_shadow_edges_kernel,
+    list_edge_cells_kernel,
+    list_edge_pixels_kernel,
+    trace_shadow_edges_kernel,
+)
 from synpick_warp.kernels.render.lighting.shadow_filter import LampShadows, filter_shadows_kernel, measure_steepness_kernel
 from synpick_warp.kernels.render.lighting.shadows import trace_shadow_rays_kernel
 from synpick_warp.kernels.render.lighting.upsampling import RatioImages
@@ -75,7 +81,17 @@ of 12 GiB, which is better used for worlds."""
 
 GUIDE = struct_arrays(Guide, "view", "cell_row", "cell_column")
 COARSE_LIGHT = struct_arrays(CoarseLight, "view", "cell_row", "cell_column")
-LAMP_SHADOWS = struct_arrays(LampShadows, "view", "shadow_row", "shadow_column", edge=("view", "row", "column"))
+LAMP_SHADOWS = struct_arrays(
+    LampShadows, "view", "shadow_row", "shadow_column", **dict.fromkeys(("edge", "edge_fractions"), ("view", "row", "column"))
+)
+EDGE_LISTS = struct_arrays(
+    EdgeLists,
+    "view",
+    "edge_chunk",
+    cell=("view", "edge_chunk", "chunk_cell"),
+    pixel=("view", "edge_chunk", "chunk_pixel"),
+    count=("view", "edge_chunk", "edge_counter"),
+)
 LIGHT_HISTORY = struct_arrays(
     LightHistory,
     "world_camera",
@@ -122,16 +138,6 @@ class FootprintLists:
     """Footprints in each list."""
 
 
-@dataclass(frozen=True, eq=False)
-class EdgeLists:
-    """Lists of the pixels of the shadow grid near edges of shadows, in which each pixel of the image may have shadow rays."""
-
-    cell: wp.array = device_array("view", "edge_chunk", "chunk_cell", dtype=wp.int32)
-    """Row * columns + column of each; a chunk is a run of tiles of the shadow grid with a list of its own."""
-    count: wp.array = device_array("view", "edge_chunk", dtype=wp.int32)
-    """Pixels of the shadow grid in each list."""
-
-
 DENOISED_SCRATCH = (
     (GUIDE, 1),
     (PATH_LISTS, 1),
@@ -139,7 +145,7 @@ DENOISED_SCRATCH = (
     (RATIO_IMAGES, 2),
     (ShadowRays, 1),
     (LAMP_SHADOWS, 1),
-    (EdgeLists, 1),
+    (EDGE_LISTS, 1),
     (FootprintLists, 1),
 )
 """Arrays that `DenoisedRenderer` allocates, and how many of each."""
@@ -163,6 +169,8 @@ def scratch_sizes(render: Render, width: int, height: int, histories: int = 0) -
         "shadow_column": -(-width // shadow),
         "edge_chunk": -(-build_grid(-(-width // shadow), -(-height // shadow)).tiles // int(EDGE_CHUNK_TILES)),
         "chunk_cell": int(EDGE_CHUNK_TILES) * int(TILE_PIXELS),
+        "chunk_pixel": int(EDGE_CHUNK_TILES) * int(TILE_PIXELS) * shadow * shadow,
+        "edge_counter": 2,
         "chunk": chunks,
         "chunk_footprint": int(CHUNK_TILES) * int(TILE_PIXELS),
     }
@@ -254,7 +262,7 @@ class DenoisedRenderer:
         self.chosen, self.ratios = (allocate_struct(RATIO_IMAGES, sizes, scene.device) for _ in range(2))
         self.shadow_rays = allocate(ShadowRays, sizes, scene.device)
         self.shadows = allocate_struct(LAMP_SHADOWS, sizes, scene.device)
-        self.edge_lists = allocate(EdgeLists, sizes, scene.device)
+        self.edge_lists = allocate_struct(EDGE_LISTS, sizes, scene.device)
         self.shade_kernel = shade_samples_kernel if supersamples(render, scene.width, histories) else shade_kernel
         self.antialias = render.antialias
         self.coverage_rays = coverage_rays(render, scene.width, histories)
@@ -346,18 +354,21 @@ class DenoisedRenderer:
         self.trace_shadow_edges(snapshot, bodies, gbuffer, views)
 
     def trace_shadow_edges(self, snapshot: Snapshot, bodies: Any, gbuffer: Any, views: Any) -> None:
-        """Shadow rays from the pixels at steep edges."""
+        """Shadow rays from the pixels at steep edges, and a filter of what they found."""
         scene, lists, coarse, device = self.scene, self.edge_lists, self.shadow_grid, self.scene.device
         lists.count.zero_()
         self.shadows.edge.zero_()
-        # Atomics of a launch on the CPU hold in one thread alone, so these are not cut into pieces.
-        cells = views.count * coarse.grid.tiles * int(TILE_PIXELS)
-        outputs = [self.shadows, lists.cell, lists.count]
-        wp.launch(list_edges_kernel, dim=cells, inputs=[coarse, views], outputs=outputs, device=device, block_dim=PIXEL_BLOCK)
+        outputs = [self.shadows, lists]
+        launch_views(list_edge_cells_kernel, views.count, coarse.grid.tiles * int(TILE_PIXELS), [coarse, views], outputs, device)
         threads = EDGE_THREADS if device.is_cuda else CPU_EDGE_THREADS
+        sharing = lists.count.shape[1] * threads
+        inputs = [scene.meshes, scene.cameras, coarse, bodies, gbuffer, views, threads]
+        launch_views(list_edge_pixels_kernel, views.count, sharing, inputs, outputs, device)
         inputs = [scene.meshes, scene.table, scene.cameras, coarse, scene.lights, snapshot.light, snapshot.light_yaw, bodies, gbuffer]
-        inputs += [lists.cell, lists.count, views, threads]
-        launch_pixels(trace_shadow_edges_kernel, views.count * lists.count.shape[1] * threads, inputs, [self.shadows], device)
+        inputs += [lists, views, threads]
+        launch_pixels(trace_shadow_edges_kernel, views.count * sharing, inputs, [self.shadows], device)
+        inputs = [scene.meshes, scene.cameras, coarse, scene.lights, snapshot.light, bodies, gbuffer, lists, views, threads]
+        launch_pixels(filter_shadow_edges_kernel, views.count * sharing, inputs, [self.shadows], device)
 
     def shade_pixels(self, snapshot: Snapshot, bodies: Any, gbuffer: Any, views: Any, radiance: wp.array) -> None:
         """Deferred shading: radiance of each pixel."""

@@ -67,10 +67,10 @@ def test_annotations_are_those_of_the_other_modes(device):
 def test_no_memory_for_paths_and_histories():
     unoccluded, fast = (settings(mode).render for mode in (UNOCCLUDED, FAST))
     of_unoccluded, of_fast = (scratch_sizes(render, 1920, 1080, 12) for render in (unoccluded, fast))
-    shadow_grid = {"shadow_row", "shadow_column", "edge_chunk"}  # As wide as coarse pixels are in images of their own.
+    shadow_grid = {"shadow_row", "shadow_column", "edge_chunk", "chunk_pixel"}  # As wide as coarse pixels are in images of their own.
     differing = {key for key, size in of_unoccluded.items() if size != of_fast[key]}
     assert differing - shadow_grid == {"cell_row", "cell_column", "region"}
-    assert all(of_unoccluded[key] <= of_fast[key] for key in differing)
+    assert all(of_unoccluded[key] <= of_fast[key] for key in differing - {"chunk_pixel"})  # Fewer chunks, of more pixels.
     assert of_unoccluded["cell_row"] == of_unoccluded["cell_column"] == of_unoccluded["region"] == 0
     assert history_sizes(unoccluded, 1920, 1080, 12)["world_camera"] == 0
     assert history_sizes(fast, 1920, 1080, 12)["world_camera"] == 12
