@@ -31,21 +31,27 @@ _RESULTS = re.compile(r"(<!-- results: (\w+) -->\n).*?(<!-- end of results -->)"
 
 
 def settings_reference() -> str:
-    """The settings reference as Markdown: the prose as committed, and a table for each section."""
+    """The settings reference as Markdown: the prose as committed; links to the sections, and a table of all settings by section."""
     head, begin, _ = SETTINGS_REFERENCE.read_text(encoding="utf-8").partition(_SETTINGS_BEGIN)
-    parts = [_section(f"[{name}]", kind, f"{name}.") for name, kind in sections().items()]
-    parts.append(_section(f"[[{ROWS}]]", ObjectRow, ""))
-    parts.append(_section(f"[{SPLITS}.NAME]", Split, ""))
-    return f"{head}{begin}\n" + "\n".join(parts)
+    parts = {f"[{name}]": (kind, f"{name}.") for name, kind in sections().items()}
+    parts |= {f"[[{ROWS}]]": (ObjectRow, ""), f"[{SPLITS}.NAME]": (Split, "")}
+    links = " · ".join(f"[{title.strip('[]')}](#{_anchor(title)})" for title in parts)
+    lines = ["| key | default | unit | allowed | meaning |", "|---|---|---|---|---|"]
+    lines += [line for title, (kind, prefix) in parts.items() for line in _section(title, kind, prefix)]
+    return f"{head}{begin}\n{links}\n\n" + "\n".join([*lines, ""])
 
 
-def _section(title: str, kind: type[Any], prefix: str) -> str:
-    meaning = "\n\n".join(" ".join(paragraph.split()) for paragraph in (kind.__doc__ or "").strip().split("\n\n"))
-    lines = [f"### `{title}`", meaning, "", "| key | default | unit | allowed | meaning |", "|---|---|---|---|---|"]
+def _anchor(title: str) -> str:
+    return f"section-{title.strip('[]').partition('.')[0].replace('_', '-')}"
+
+
+def _section(title: str, kind: type[Any], prefix: str) -> list[str]:
+    """Rows of a section: its title and meaning, then its settings."""
+    lines = [f'| <a id="{_anchor(title)}"></a>**`{title}`** | | | | **{" ".join((kind.__doc__ or "").split())}** |']
     for name, (item, annotation) in (split_settings() if kind is Split else settings_of(kind)).items():
         unit, rule = item.metadata["unit"], describe_allowed(item, annotation)
         lines.append(f"| `{prefix}{name}` | `{format_toml(item.default)}` | {unit} | {rule} | {item.metadata['doc']} |")
-    return "\n".join([*lines, ""])
+    return lines
 
 
 def validation_reference() -> str:

@@ -26,6 +26,7 @@ from tools.bench import cleaner as cleaner_module
 from tools.bench import growth, meter, physics, steady, whole
 from tools.bench.cleaner import Assignment, Cleaner, Tally, clean_episode
 from tools.bench.usage import Usage, measure_usage
+from tools.figures import read_runs
 
 TINY = ("--worlds", "2", "--resolution", "32x18", *FEW_STEPS, *SMALL_IMAGES, *SHORT_EPISODES)
 ANY_DEVICE = tuple(part for part in TINY if part not in ("--device", "cpu"))
@@ -262,7 +263,7 @@ def test_a_whole_bake_is_traced_from_start_to_exit(tmp_path):
     assert bench.main([*TINY, "--parts", "whole", "--episodes", "2", "--json", str(file)]) == 0
     record = json.loads(file.read_text())
     rows = {row["name"]: row["value"] for row in record["rows"]}
-    trace = record["more"]["whole"]
+    trace = read_runs(tmp_path)[file.name].more["whole"]
     assert record["machine"]["measured"] == "2 episodes, 2 worlds, 3 cameras, 32x18"
     assert rows["worlds"] == 2
     assert rows["ticks"] == len(trace["live"]) == len(trace["seconds"])

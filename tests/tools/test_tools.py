@@ -18,6 +18,7 @@ from synpick_warp.stages.stream import TickReport
 from tests.worlds.small_worlds import catalog
 from tools.bench import __main__ as bench
 from tools.bench import physics as bench_physics
+from tools.figures import read_runs
 from tools.reports import pick as pick_report
 from tools.reports import pick_tally
 from tools.reports import rest as rest_report
@@ -146,9 +147,9 @@ def test_transform_points_rotates_then_translates():
 def test_more_arrangements_than_worlds(tmp_path):
     file = tmp_path / "rest.json"
     code = rest_report.main(["--arrangements", "2", "--worlds", "1", "--seed", "1", "--json", str(file), *FEW_STEPS])
-    record = json.loads(file.read_text())["rows"]
-    rows = {row["name"]: row["value"] for row in record}
-    assert code == (0 if all(row["holds"] for row in record) else 1)
+    record = read_runs(tmp_path)[file.name].rows
+    rows = {row.name: row.value for row in record}
+    assert code == (0 if all(row.holds for row in record) else 1)
     assert rows["arrangements at rest"] == 2
     assert rows["objects"] == 2
     assert rows["objects inside the tote"] == 100.0
