@@ -12,8 +12,8 @@ best, fewer and more are slower."""
 COARSE_PATH_REGISTERS = 56
 """Register limit of kernels that trace paths from the camera to their last bounce. It is below RAY_REGISTERS, as they run fastest so."""
 SINGLE_PATH_REGISTERS = 72
-"""Register limit of kernels that trace one bounce of a path per launch. A full-HD view takes 0.991, 0.985 and 0.977 ms in all stages with a
-limit of 56, 64 and 72 registers, and with later changes 0.907 and 0.925 ms with 72 and 96 (H100)."""
+"""Register limit of kernels that trace one bounce of a path per launch. 56, 64 and 96 registers are 1 to 2 %
+slower in all stages of a full-HD view (H100)."""
 SHADE_REGISTERS = 80
 """Register limit of the shading kernel, which waits for memory less than ray tracing does, and keeps more values live."""
 SAMPLE_SHADE_REGISTERS = 128

@@ -218,8 +218,8 @@ def _check_size(raw: RawObject, origin: str, tote: Tote) -> None:
 def _check_fits_tote(vertices: np.ndarray, size: float, origin: str, tote: Tote) -> None:
     """Refuse an object of this diameter [m] that passes through the tote's opening in no orientation, or does not fit into the tote.
 
-    It passes if the two smaller sides of a bounding box are no longer than the opening's. The axis-aligned box is tried first, since the
-    minimum oriented bounding box takes long to compute for fine meshes.
+    It passes if the two smaller sides of a bounding box are at most as long as the opening's. The axis-aligned box is tried first, since
+    the minimum oriented bounding box takes long to compute for fine meshes.
     """
     inside = float(np.linalg.norm((*tote.rim_size, tote.outer_size[2] - tote.wall)))
     opening = sorted(tote.rim_size)

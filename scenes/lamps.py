@@ -16,12 +16,12 @@ from synpick_warp.scenes.sun import SUN_CONTRAST, disc_radius_tangent
 
 LAMP_RADIUS = np.radians(6.0)
 """Radius of the search window [rad]: light within this angle of a lamp's center belongs to it. Wider light is split into several lamps.
-Windows of 4 and 9 degrees cost 0.1 to 0.6 dB in PSNR (tools/README.md, "Pictures")."""
+Windows of 4 and 9 degrees cost 0.1 to 0.6 dB in PSNR."""
 LAMP_CONTRAST = SUN_CONTRAST
 """The part of a texel's luminance above this multiple of the map's mean belongs to a lamp, as to a sun."""
 MIN_LAMP_SHARE = 0.03
 """Minimum share of a lamp in the irradiance of a surface that faces up; weaker ones stay in the map, which paths sample. 1 %
-has 0.1 dB more in PSNR, with 1.6 times as many lamps (tools/README.md, "Pictures")."""
+has 0.1 dB more in PSNR, with 1.6 times as many lamps."""
 MIN_LAMP_HEIGHT = 0.15
 """Minimum z of the texel at which a search starts, and of a lamp's mean direction; light from lower ones does not reach the objects in a
 tote."""

@@ -6,8 +6,8 @@ import argparse
 import json
 import math
 import sys
-from collections.abc import Callable, Iterable, Mapping
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -91,11 +91,26 @@ class Row:
         return asdict(self) | {"value": self.value if math.isfinite(self.value) else None}
 
 
-def make_parser(doc: str | None, *shared: str) -> argparse.ArgumentParser:
-    """Argument parser with the shared options `shared`, described by the first line of the docstring `doc`."""
+def of_part(part: str, rows: Iterable[Row]) -> Iterator[Row]:
+    """The rows, those that belong to no group in the group `part`."""
+    return (row if row.part else replace(row, part=part) for row in rows)
+
+
+def make_parser(
+    doc: str | None, *shared: str, own: Mapping[str, Mapping[str, Any]] | None = None, **defaults: object
+) -> argparse.ArgumentParser:
+    """Argument parser, described by the first line of the docstring `doc`.
+
+    Args:
+        doc: Docstring.
+        shared: Options out of `OPTIONS`.
+        own: Further options, as there.
+        defaults: Defaults of shared options that differ from `OPTIONS`.
+    """
     parser = argparse.ArgumentParser(description=(doc or "").partition("\n")[0])
-    for name in shared:
-        parser.add_argument(f"--{name}", **OPTIONS[name])
+    for name, arguments in {**{name: OPTIONS[name] for name in shared}, **(own or {})}.items():
+        parser.add_argument(f"--{name}", **arguments)
+    parser.set_defaults(**defaults)
     return parser
 
 

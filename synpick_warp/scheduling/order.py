@@ -17,11 +17,11 @@ from synpick_warp.scenes.types import Catalog
 from synpick_warp.stages.sim.arrange import sample_episodes_ahead
 
 FRAMES_OF_MODE = {Mode.PICK: (60, 44, 102), Mode.TARGET: (81, 51, 75), Mode.MOVE: (409, 0, 33)}
-"""Frames of an episode: fixed part, part per object, and standard deviation. Least squares over 56 episodes of real objects; see
-tools/README.md, "Lengths of episodes"."""
+"""Frames of an episode: fixed part, part per object, and standard deviation. Least squares over 56 episodes of real objects
+(tools/results/episodes_lengths.json)."""
 DEVIATIONS = 2.0
-"""Standard deviations above the mean by which episodes are ordered, so that those that may become long start early, too. In a Monte Carlo
-of 150 mixed episodes in 100 worlds (tools/README.md, "Lengths of episodes") a bake is 1 % faster than in the order of the means."""
+"""Standard deviations above the mean by which episodes are ordered, so that those that may become long start early, too.
+In a Monte Carlo of 150 mixed episodes in 100 worlds a bake is 1 % faster than in the order of the means."""
 
 SORTED_EPISODES = 1024
 """Number of episodes at the end of the list that are sorted: two rounds of MAX_GPU_WORLDS. Before them modes stay mixed, which keeps

@@ -22,7 +22,7 @@ from synpick_warp.system.cores import count_cores
 from synpick_warp.system.device import ALL, pick_device, pick_devices
 
 HEADROOM = 1.5
-"""Safety factor on the memory plan, which is a lower bound. tools/README.md compares plans with the memory that bakes on a CPU used."""
+"""Safety factor on the memory plan, which is a lower bound. Bakes on a CPU take 0.6 to 0.7 GiB beyond it."""
 RUNTIME_BYTES = 1 << 30
 """Room for what no plan counts: CUDA's context and kernels; a process's libraries and objects, 0.7 GiB [bytes]."""
 WRITER_BYTES = 100 << 20

@@ -201,7 +201,7 @@ def test_a_list_that_does_not_fit_its_record(tmp_path):
 
 
 def test_data_sets_from_before_a_setting_are_read_with_what_held_then(tmp_path):
-    """Their manifest and config.toml lack arrangement.fill, which was within; the default is another now."""
+    """Their manifest and config.toml lack arrangement.fill, whose value then was `within`, not the default."""
     config = settings(arrangement__fill="within")
     content = manifest.make_manifest(config)
     assert "fill" not in content["settings"]["arrangement"]

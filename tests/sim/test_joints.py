@@ -21,7 +21,7 @@ STEPS = 250
 
 @pytest.fixture(scope="module")
 def turned(device) -> tuple[Physics, np.ndarray, np.ndarray]:
-    """Three grippers, turned between two steps; then tilted and pushed. Poses of finger and cup at first, position at last."""
+    """Three grippers, turned between two steps; then tilted and pushed. Poses of finger and cup in the beginning, position at the end."""
     config = settings(
         bake__worlds=3,
         arrangement__max_objects=1,

@@ -26,6 +26,7 @@ from tools.bench import cleaner as cleaner_module
 from tools.bench import growth, meter, physics, steady, whole
 from tools.bench.cleaner import Assignment, Cleaner, Tally, clean_episode
 from tools.bench.usage import Usage, measure_usage
+from tools.figures import read_runs
 
 TINY = ("--worlds", "2", "--resolution", "32x18", *FEW_STEPS, *SMALL_IMAGES, *SHORT_EPISODES)
 ANY_DEVICE = tuple(part for part in TINY if part not in ("--device", "cpu"))
@@ -141,7 +142,7 @@ def test_several_devices_are_steady_when_all_of_them_are(tmp_path):
         measured.append(len(found.readings))
     # Both devices deliver in the fifth and sixth tick together; then two ticks of each lead in.
     assert measured == [0] * 9 + [1, 2, 3]
-    row = {row.name: row.value for row in meter.summarize_rates("steady", "view", found)}
+    row = {row.name: row.value for row in meter.summarize_rates("view", found)}
     assert row["views to disk"] * row["a tick"] == pytest.approx(1e3 * 18)
 
 
@@ -176,7 +177,6 @@ def test_descendants_of_the_benchmark_are_counted_and_other_processes_are_not():
         (["--json", "/nowhere/x.json"], "there is no folder /nowhere"),
         (["--json", "/tmp"], "/tmp is a folder"),
         (["--parts", "steady", "--episodes", "7"], "--episodes needs the part whole"),
-        (["--parts", "steady", "--markdown", "x.md"], "--markdown needs the part growth"),
         (["--parts", "steady", "--devices", "cpu,cpu"], "--device and --devices are both given"),
     ],
 )
@@ -263,7 +263,7 @@ def test_a_whole_bake_is_traced_from_start_to_exit(tmp_path):
     assert bench.main([*TINY, "--parts", "whole", "--episodes", "2", "--json", str(file)]) == 0
     record = json.loads(file.read_text())
     rows = {row["name"]: row["value"] for row in record["rows"]}
-    trace = record["traces"]["whole"]
+    trace = read_runs(tmp_path)[file.name].more["whole"]
     assert record["machine"]["measured"] == "2 episodes, 2 worlds, 3 cameras, 32x18"
     assert rows["worlds"] == 2
     assert rows["ticks"] == len(trace["live"]) == len(trace["seconds"])
@@ -328,26 +328,15 @@ def test_more_cameras_are_turned_about_the_vertical():
     assert varied.cameras.ups == ((0.0, 0.0, 1.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 
 
-def test_growth_is_a_table_of_all_factors(tmp_path, monkeypatch):
+def test_growth_has_rows_of_all_factors(tmp_path, monkeypatch):
     monkeypatch.setattr(growth, "DROP_TICKS", 1)
     monkeypatch.setattr(growth, "BURST", 1)
     monkeypatch.setattr(growth, "PATHS", (4,))
     monkeypatch.setattr(growth, "FRACTIONS", {"worlds": (0.5, 0.4), "objects": (0.5,), "resolution": (0.5,), "cameras": (2.0,)})
     monkeypatch.setattr(physics, "MIN_REPEATS", 1)
-    file = tmp_path / "growth.md"
-    assert bench.main([*TINY, "--parts", "growth", "--seconds", "0", "--markdown", str(file)]) == 0
-    cells = [[cell.strip() for cell in line.strip("|").split("|")] for line in file.read_text().splitlines()]
-    assert {len(row) for row in cells} == {len(growth.COLUMNS)}
-    wanted = [("as set", "2 worlds, 32x18, 3 cameras"), ("worlds", "1"), ("objects", "0.5 l")]
-    wanted += [("resolution", "16x9"), ("paths", "4"), ("cameras", "6")]
-    assert [tuple(row[:2]) for row in cells[2:]] == wanted
-
-
-def test_a_missing_folder_of_the_table_is_said_at_once(tmp_path, capsys):
-    with pytest.raises(SystemExit, match="2"):
-        bench.main([*TINY, "--parts", "growth", "--markdown", str(tmp_path / "none" / "table.md")])
-    assert (
-        capsys.readouterr()
-        .err.splitlines()[-1]
-        .endswith(f"--markdown: there is no folder {tmp_path / 'none'}; name a file in a folder that exists")
-    )
+    file = tmp_path / "growth.json"
+    assert bench.main([*TINY, "--parts", "growth", "--seconds", "0", "--json", str(file)]) == 0
+    names = [row["name"] for row in json.loads(file.read_text())["rows"]]
+    wanted = ["as set", "worlds 1", "objects 0.5 l", "resolution 16x9", "paths 4", "cameras 6"]
+    assert [name for name in names if name.endswith("a view")] == [f"{point}: a view" for point in wanted]
+    assert [name for name in names if name.endswith("world-steps")] == [f"{point}: world-steps" for point in wanted[:3]]

@@ -17,7 +17,7 @@ from synpick_warp.stages.buffers import Snapshot
 from tests.worlds.small_worlds import catalog
 from tools.bench import __main__ as bench
 from tools.bench.compare import engines, peers, piles, rendering, simulation
-from tools.bench.physics import Row
+from tools.options import Row
 
 UPRIGHT = (0.0, 0.0, 0.0, 1.0)
 SMALL = (
@@ -33,7 +33,7 @@ def short(monkeypatch):
     """Minimum counts of ticks, steps and repetitions, for short tests."""
     for name in ("FALL_TICKS", "SETTLE_TICKS"):
         monkeypatch.setattr(f"tools.bench.physics.{name}", 1)
-    for target in ("physics.MIN_REPEATS", "sensor.BURST", "compare.rendering.BURST", "compare.rendering.SMALL_WORLDS_CPU"):
+    for target in ("physics.MIN_REPEATS", "compare.sensor.BURST", "compare.rendering.BURST", "compare.rendering.SMALL_WORLDS_CPU"):
         monkeypatch.setattr(f"tools.bench.{target}", 1)
     monkeypatch.setattr(rendering, "SMALL_SIZE", (16, 16))
     for name in ("FALL_STEPS", "LEAD_STEPS", "REST_STEPS"):
@@ -71,11 +71,11 @@ def test_unknown_peers_are_listed(capsys):
 
 def test_a_peer_that_fails_says_why_and_the_others_go_on(monkeypatch, tmp_path, capsys, short):
     def fail(*arguments: object):
-        yield Row("sensor", "first", 1.0, "")
+        yield Row("first", 1.0)
         raise RuntimeError("no rays today\nat all")
 
     monkeypatch.setattr(peers, "measure_sensor", fail)
-    monkeypatch.setattr(peers, "_measure_physics", lambda *arguments: iter([Row("ours", "next", 2.0, "")]))
+    monkeypatch.setattr(peers, "_measure_physics", lambda *arguments: iter([Row("next", 2.0, part="ours")]))
     monkeypatch.setattr(bench, "check_installed", lambda names: None)
     file = tmp_path / "bench.json"
     assert bench.main(["--compare", "sensor-camera,mujoco", "--json", str(file), *SMALL]) == 0

@@ -10,7 +10,7 @@ import pytest
 from synpick_warp.codes import Segment
 from synpick_warp.scenes.types import Catalog, Fixture
 from tests.worlds.toy_scene import GREY, UPRIGHT, ToyScene, ball, box, camera, entry, render, sheet, snapshot
-from tools.bench import sensor as bench_sensor
+from tools.bench.compare import sensor as bench_sensor
 
 OBLIQUE = np.array([[1.0, 0.0, 0.0], [0.0, -0.6, -0.8], [0.0, 0.8, -0.6]])
 """World-to-camera rotation of a camera that looks down and towards +y."""

@@ -52,7 +52,7 @@ def opened(data, monkeypatch) -> dict[str, np.ndarray]:
 
 def test_a_client_that_agrees(data, opened, tmp_path, capsys):
     assert tool.main([str(data), "--clients", "coco,xarray_store", "--json", str(tmp_path / "table.json")]) == 0
-    first, second = json.loads((tmp_path / "table.json").read_text())
+    first, second = json.loads((tmp_path / "table.json").read_text())["more"]["clients"]
     assert first["version"].startswith("pycocotools 2")
     assert first["agreement"] == f"{FRAMES} values equal"
     assert second["agreement"] == tool.NO_FORMAT

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import sys
 
 import pytest
@@ -29,8 +30,11 @@ def test_known_difficulty(tmp_path, monkeypatch, capsys):
                 "95th percentile of speed [m/s]": max(SPEED),
             }
         )
-    monkeypatch.setattr(sys, "argv", ["difficulty", str(folder)])
+    file = tmp_path / "run.json"
+    monkeypatch.setattr(sys, "argv", ["difficulty", str(folder), "--json", str(file)])
     assert difficulty.main() == 0
+    rows = {row["name"]: row["value"] for row in json.loads(file.read_text())["rows"]}
+    assert rows["move: instances a view"] == 4
     printed = capsys.readouterr().out
     assert "metallic 0.25, roughness 0.45 on average" in printed
     assert "median speed of these [m/s]" in printed

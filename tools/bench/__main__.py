@@ -2,9 +2,9 @@
 
 Measurements follow a warm-up and are medians of synchronised repetitions. Physics, perception and rendering use the same worlds, in
 mode pick; with `--set bake.mode=move`, piles are stirred instead. Writers get the same views repeatedly. Files are written to the
-system's temporary folder (TMPDIR) and removed. The part sensor renders the same views with Newton's SensorCamera for comparison.
-The part render renders one tick repeatedly; the part pictures renders successive ticks, with light histories as in a bake.
---compare measures other simulators and renderers beside ours, without any part unless --parts names some.
+system's temporary folder (TMPDIR) and removed. The part render renders one tick repeatedly; the part pictures renders successive ticks,
+with light histories as in a bake. --compare measures other simulators and renderers beside ours, without any part
+unless --parts names some.
 
     python -m tools.bench --device cuda:0 --worlds 512 --models DIR --lights DIR --json bench.json
     python -m tools.bench --compare mujoco-warp,mujoco,sensor-camera --models DIR --lights DIR
@@ -13,15 +13,11 @@ The part render renders one tick repeatedly; the part pictures renders successiv
 from __future__ import annotations
 
 import argparse
-import dataclasses
 import itertools
-import math
 import resource
 import sys
-import tempfile
 import time
 from collections.abc import Callable, Iterator
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -35,7 +31,6 @@ from synpick_warp.configs.schema import Config
 from synpick_warp.errors import SynpickError
 from synpick_warp.exporters.registry import load_exporter_classes
 from synpick_warp.factory.assembly import Factory, build_factory
-from synpick_warp.pipeline import run_bake
 from synpick_warp.progress import SilentProgress
 from synpick_warp.stages import timing
 from synpick_warp.stages.render.view_setup import make_views
@@ -46,29 +41,29 @@ from synpick_warp.system.device import pick_device
 from tools.bench.compare.peers import PEERS, check_installed, measure_peers
 from tools.bench.encode import measure_encoding
 from tools.bench.growth import measure_growth
-from tools.bench.physics import BURST, Row, measure_simulation, seconds_per_call
+from tools.bench.physics import BURST, measure_simulation, seconds_per_call
 from tools.bench.pictures import measure_pictures
-from tools.bench.sensor import measure_sensor
 from tools.bench.steady import measure_steady
 from tools.bench.stream import measure_stream
 from tools.bench.trajectories import measure_trajectories
 from tools.bench.whole import WholeBake, measure_whole
 from tools.bench.write import measure_writing
+from tools.figures import describe_run, write_run
 from tools.options import (
     INTERRUPTED,
+    Row,
     configure,
     fail,
     finite_seconds,
     make_names_parser,
     make_parser,
+    of_part,
     positive_count,
-    writable_file,
-    write_json,
 )
 
-DEFAULT_PARTS = ("physics", "perception", "render", "encode", "sensor", "write", "stream", "bake", "steady")
+DEFAULT_PARTS = ("physics", "perception", "render", "encode", "write", "stream", "steady")
 PARTS = (*DEFAULT_PARTS, "pictures", "whole", "trajectories", "growth")
-OWN_WORLDS = {"bake", "pictures", "steady", "whole", "trajectories", "growth"}
+OWN_WORLDS = {"pictures", "steady", "whole", "trajectories", "growth"}
 """Parts that build worlds of their own."""
 WORLDS = 512
 """Default number of worlds of all parts but `whole`."""
@@ -78,8 +73,6 @@ WRITE_VIEWS = 12
 """Number of views that are written over and over."""
 WHOLE_EPISODES = 150
 """Default number of episodes of the part `whole`."""
-BAKE_WORLDS, BAKE_ROUNDS, BAKE_SPEED = 16, 1, 0.4
-"""Limits of the part `bake`: maximum number of worlds; rounds and speed [m/s] of the gripper in mode move, for short episodes."""
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -100,7 +93,7 @@ def main(arguments: list[str] | None = None) -> int:
             console.print(f"{name:20} {value}")
         measured_peers = measure_peers(config, options.compare, options.seconds)
         bake = WholeBake(options.episodes, options.worlds or 0)
-        parts = measure(config, options.parts, options.seconds, traces, bake, options.markdown, options.devices, options.after)
+        parts = measure(config, options.parts, options.seconds, traces, bake, options.devices, options.after)
         for row in itertools.chain(parts, measured_peers):
             rows.append(row)
             console.print(f"{row.part:11} {row.name:52} {row.value:14,.3f} {row.unit}", soft_wrap=True)
@@ -110,8 +103,7 @@ def main(arguments: list[str] | None = None) -> int:
         print("bench: interrupted", file=sys.stderr)
         code = INTERRUPTED
     if rows:
-        record = {"machine": machine, "real_objects": bool(options.models), "rows": [_to_record(row) for row in rows]}
-        write_json(options.json, record | ({"traces": traces} if traces else {}))
+        write_run(options.json, describe_run("tools.bench", machine.items(), rows, **traces))
     return code
 
 
@@ -140,14 +132,12 @@ def _parse(arguments: list[str] | None) -> argparse.Namespace:
     devices_help = "several devices of the part steady, as of bake: cuda:0,cuda:1 or all; --worlds is the number of each"
     parser.add_argument("--devices", default="", help=devices_help)
     parser.add_argument("--seconds", type=finite_seconds, default=2.0, help="minimum time of a measurement [s] (default: 2)")
-    parser.add_argument("--markdown", type=writable_file, metavar="FILE", help="table of the part growth")
     options = parser.parse_args(arguments)
     if options.parts is None:
         options.parts = () if options.compare else DEFAULT_PARTS
     options.devices = tuple(name.strip() for name in options.devices.split(",")) if options.devices else ()
     for name, part, use in (
         ("devices", "steady", "several"),
-        ("markdown", "growth", "it"),
         ("episodes", "whole", "it"),
         ("after", "pictures", "it"),
     ):
@@ -159,18 +149,9 @@ def _parse(arguments: list[str] | None) -> argparse.Namespace:
     return options
 
 
-def _to_record(row: Row) -> dict[str, Any]:
-    """Fields for JSON; None for the value of what failed."""
-    return dataclasses.asdict(row) | {"value": row.value if math.isfinite(row.value) else None}
-
-
 def _config(options: argparse.Namespace) -> Config:
-    fixed = {
-        "bake.worlds": options.worlds or WORLDS,
-        "bake.episodes": options.worlds or WORLDS,
-        "cameras.resolution": parse_resolution(options.resolution),
-    }
-    return configure(options, fixed)
+    worlds, resolution = options.worlds or WORLDS, parse_resolution(options.resolution)
+    return configure(options, {"bake.worlds": worlds, "bake.episodes": worlds, "cameras.resolution": resolution})
 
 
 def measure(
@@ -179,7 +160,6 @@ def measure(
     min_seconds: float,
     traces: dict[str, Any],
     bake: WholeBake,
-    markdown: Path | None,
     devices: tuple[str, ...] = (),
     after: int = 0,
 ) -> Iterator[Row]:
@@ -191,7 +171,6 @@ def measure(
         min_seconds: Time for which a measurement is repeated, at least [s].
         traces: Receives what changes during a measurement, by part.
         bake: Size of the bake of the part whole.
-        markdown: File for the table of the part growth; None: none.
         devices: Devices of the part steady; empty: that of the settings.
         after: Ticks simulated before the part pictures.
     """
@@ -205,7 +184,7 @@ def measure(
             needs_images=any(kind.needs_images for kind in kinds),
         )
         wp.synchronize_device(factory.simulation.device)
-        yield Row("setup", "load and build", time.perf_counter() - started, "s")
+        yield Row("load and build", time.perf_counter() - started, "s", part="setup")
         values: dict[str, float] = {}
         for row in _measure_worlds(config, factory, min_seconds, parts):
             values[row.name] = row.value
@@ -213,39 +192,37 @@ def measure(
         yield from _perception_fraction(config, values)
         if "write" in parts:
             worlds = min(factory.simulation.layout.worlds, -(-WRITE_VIEWS // len(factory.cameras)))
-            yield from measure_writing(config, factory, _mark_live(factory.simulation, worlds), min_seconds)
+            yield from of_part("write", measure_writing(config, factory, _mark_live(factory.simulation, worlds), min_seconds))
         if "stream" in parts:
-            yield from measure_stream(config, factory, _mark_live(factory.simulation, factory.simulation.layout.worlds), min_seconds)
+            live = _mark_live(factory.simulation, factory.simulation.layout.worlds)
+            yield from of_part("stream", measure_stream(config, factory, live, min_seconds))
         yield _memory_in_use(factory.simulation.device)
-    if "bake" in parts:
-        yield from _measure_bake(config)
     if "pictures" in parts:
-        yield from measure_pictures(config, after)
+        yield from of_part("pictures", measure_pictures(config, after))
     steady_rate = 0.0
     if "steady" in parts:
-        for row in measure_steady(config, min_seconds, devices):
+        for row in of_part("steady", measure_steady(config, min_seconds, devices)):
             steady_rate = row.value if row.name == "views to disk" else steady_rate
             yield row
     if "whole" in parts:
-        yield from measure_whole(config, bake, steady_rate, traces)
+        yield from of_part("whole", measure_whole(config, bake, steady_rate, traces))
     if "trajectories" in parts:
-        yield from measure_trajectories(config, min_seconds)
+        yield from of_part("trajectories", measure_trajectories(config, min_seconds))
     if "growth" in parts:
-        yield from measure_growth(config, min_seconds, markdown)
+        yield from of_part("growth", measure_growth(config, min_seconds))
 
 
 def _measure_worlds(config: Config, factory: Factory, min_seconds: float, parts: tuple[str, ...]) -> Iterator[Row]:
     """Benchmark of simulation and perception, and then of rendering the same worlds."""
-    yield from measure_simulation(factory, min_seconds, parts)
+    yield from of_part("physics", measure_simulation(factory, min_seconds, parts))
     if "render" in parts:
-        yield from _measure_rendering(config, factory, min_seconds)
+        yield from of_part("render", _measure_rendering(factory, min_seconds))
     if "encode" in parts:
         count = min(factory.stream.batch, factory.simulation.layout.worlds * len(factory.cameras))
         images = factory.stream.buffers[0]
         factory.stream.renderer.render(factory.simulation.record.snapshot, _first_views(factory, count), images)
-        yield from measure_encoding(images, count, config.bop.jpeg_quality, factory.simulation.device, min_seconds)
-    if "sensor" in parts:
-        yield from measure_sensor(config, factory, min_seconds)
+        quality, device = config.bop.jpeg_quality, factory.simulation.device
+        yield from of_part("encode", measure_encoding(images, count, quality, device, min_seconds))
 
 
 def _perception_fraction(config: Config, values: dict[str, float]) -> Iterator[Row]:
@@ -256,14 +233,15 @@ def _perception_fraction(config: Config, values: dict[str, float]) -> Iterator[R
     if perceive is not None and step and rate:
         render = 1e3 * config.bake.worlds * len(config.cameras.positions) / rate
         fraction = perceive / (step * config.physics.steps_per_tick + render)
-        yield Row("perception", "perception and planning: fraction of simulation and rendering", 100.0 * fraction, "%")
+        yield Row("perception and planning: fraction of simulation and rendering", 100.0 * fraction, "%", part="perception")
 
 
 def _memory_in_use(device: wp.Device) -> Row:
     """Row of the device memory in use by all processes; on the CPU, of the process's peak memory."""
     if device.is_cuda:
-        return Row("setup", "device memory in use by all processes", (device.total_memory - device.free_memory) / GIB, "GiB")
-    return Row("setup", "peak memory of the process", resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024**2, "GiB")
+        return Row("device memory in use by all processes", (device.total_memory - device.free_memory) / GIB, "GiB", part="setup")
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return Row("peak memory of the process", peak / 1024**2, "GiB", part="setup")
 
 
 def _mark_live(simulation: Simulation, worlds: int) -> TickReport:
@@ -275,12 +253,12 @@ def _mark_live(simulation: Simulation, worlds: int) -> TickReport:
     return report
 
 
-def _measure_rendering(config: Config, factory: Factory, min_seconds: float) -> Iterator[Row]:
+def _measure_rendering(factory: Factory, min_seconds: float) -> Iterator[Row]:
     """Benchmark of rendering: each stage of a view, a whole batch, copies to the host, and batches with copies overlapped."""
     simulation, stream = factory.simulation, factory.stream
     device, cameras = simulation.device, len(factory.cameras)
     count = min(stream.batch, simulation.layout.worlds * cameras)
-    yield Row("render", "views in a batch", count, "")
+    yield Row("views in a batch", count, "")
     views, out, renderer = _first_views(factory, count), stream.buffers[0], stream.renderer
 
     def render() -> None:
@@ -289,9 +267,9 @@ def _measure_rendering(config: Config, factory: Factory, min_seconds: float) -> 
     spent = {name: seconds / count for name, seconds in _time_passes(render, device, min_seconds).items()}
     spent["all"] = seconds_per_call(render, device, min_seconds / 4, BURST) / count
     for name, seconds in spent.items():
-        yield Row("render", f"a view: {name}", 1e3 * seconds, "ms")
-    yield Row("render", "views, ground truth alone", 1.0 / (spent["set up views"] + spent["rasterize"] + spent["annotate"]), "1/s")
-    yield Row("render", "views, all stages", 1.0 / spent["all"], "1/s")
+        yield Row(f"a view: {name}", 1e3 * seconds, "ms")
+    yield Row("views, ground truth alone", 1.0 / (spent["set up views"] + spent["rasterize"] + spent["annotate"]), "1/s")
+    yield Row("views, all stages", 1.0 / spent["all"], "1/s")
     if device.is_cuda:
         size = sum(array.capacity for array in stream.copies[0].source)
 
@@ -300,12 +278,12 @@ def _measure_rendering(config: Config, factory: Factory, min_seconds: float) -> 
             stream.copies[0].wait()
 
         seconds = seconds_per_call(copy, device, min_seconds / 4)
-        yield Row("render", "copy to the host", 1e-9 * size / seconds, "GB/s")
-        yield Row("render", "views copied to the host", stream.batch / seconds, "1/s")
+        yield Row("copy to the host", 1e-9 * size / seconds, "GB/s")
+        yield Row("views copied to the host", stream.batch / seconds, "1/s")
     worlds = min(simulation.layout.worlds, -(-STREAM_BATCHES * stream.batch // cameras))
     report = _mark_live(simulation, worlds)
     seconds = seconds_per_call(lambda: [len(batch) for batch in stream.render(simulation.record.snapshot, report)], device, min_seconds)
-    yield Row("render", "views, all stages and copies", worlds * cameras / seconds, "1/s")
+    yield Row("views, all stages and copies", worlds * cameras / seconds, "1/s")
 
 
 def _first_views(factory: Factory, count: int) -> Any:
@@ -327,37 +305,6 @@ def _time_passes(render: Callable[[], None], device: wp.Device, min_seconds: flo
             wp.synchronize_device(device)
     times = recorder.times.items()
     return {": ".join(path): (stage.device if device.is_cuda else stage.host) / stage.calls for path, stage in times}
-
-
-class _StageTimes(SilentProgress):
-    """Progress reporter that records the start time of each stage of a bake."""
-
-    def __init__(self) -> None:
-        self.starts: list[tuple[str, float]] = []
-
-    def stage(self, text: str) -> None:
-        self.starts.append((text, time.perf_counter()))
-
-
-def _measure_bake(config: Config) -> Iterator[Row]:
-    """Benchmark of a small bake: time of each stage, and of the main process by timing scope (on the CPU with computation)."""
-    worlds = min(config.bake.worlds, BAKE_WORLDS)
-    small = dataclasses.replace(
-        config,
-        bake=dataclasses.replace(config.bake, mode="move", worlds=worlds, episodes=worlds),
-        move=dataclasses.replace(config.move, rounds=BAKE_ROUNDS, speed=BAKE_SPEED),
-    )
-    progress = _StageTimes()
-    with tempfile.TemporaryDirectory() as folder, timing.record() as recorder:
-        summary = run_bake(small, Path(folder) / "out", progress)
-        progress.stage("")
-    yield Row("bake", "worlds and episodes", worlds, "")
-    yield Row("bake", "views", summary.views, "")
-    yield Row("bake", "views", summary.views / summary.wall_seconds, "1/s")
-    for (text, started), (_, ended) in itertools.pairwise(progress.starts):
-        yield Row("bake", f"stage: {text}", ended - started, "s")
-    for path, stage in recorder.times.items():
-        yield Row("bake", f"main process: {': '.join(path)}", stage.host, "s")
 
 
 if __name__ == "__main__":

@@ -14,7 +14,8 @@ from synpick_warp.exporters.writing.png import encode_png
 from synpick_warp.stages.buffers import ViewBuffers
 from synpick_warp.stages.encoding.jpeg import JpegBuffers, JpegEncoder, jpeg_sizes
 from synpick_warp.stages.encoding.png import DepthBuffers, DepthEncoder, depth_sizes
-from tools.bench.physics import BURST, Row, seconds_per_call
+from tools.bench.physics import BURST, seconds_per_call
+from tools.options import Row
 
 CPU_VIEWS = 6
 """Views encoded on the CPU."""
@@ -50,11 +51,11 @@ def measure_encoding(images: ViewBuffers, count: int, quality: int, device: wp.D
     }
     colors, depths = (array[: min(count, CPU_VIEWS)].numpy() for array in (images.color, images.depth))
     for name, (run, sizes, capacity, encode) in runs.items():
-        yield Row("encode", f"a view: {name}", 1e3 * seconds_per_call(run, device, min_seconds, BURST) / count, "ms")
+        yield Row(f"a view: {name}", 1e3 * seconds_per_call(run, device, min_seconds, BURST) / count, "ms")
         bytes_ = sizes.numpy()[:count]
-        yield Row("encode", f"{name}: size", 1e-6 * float(bytes_.mean()), "MB")
-        yield Row("encode", f"{name}: largest size, of its capacity", 100.0 * float(bytes_.max()) / capacity, "%")
-        yield Row("encode", f"{name}: CPU time of a view by the CPU's encoder", 1e3 * _cpu_seconds(encode, len(depths)), "ms")
+        yield Row(f"{name}: size", 1e-6 * float(bytes_.mean()), "MB")
+        yield Row(f"{name}: largest size, of its capacity", 100.0 * float(bytes_.max()) / capacity, "%")
+        yield Row(f"{name}: CPU time of a view by the CPU's encoder", 1e3 * _cpu_seconds(encode, len(depths)), "ms")
 
 
 def _cpu_seconds(encode: Callable[[int], object], views: int) -> float:

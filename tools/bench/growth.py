@@ -10,7 +10,6 @@ import math
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
 import warp as wp
@@ -28,7 +27,8 @@ from synpick_warp.stages.sim.physics import with_enough_worlds
 from synpick_warp.stages.sim.simulate import Simulation
 from synpick_warp.stages.stream import view_sizes
 from synpick_warp.system.device import pick_device
-from tools.bench.physics import BURST, FOREVER, Row, seconds_per_call
+from tools.bench.physics import BURST, FOREVER, seconds_per_call
+from tools.options import Row
 
 DROP_TICKS = 24
 """Ticks from the drop to the measurement: 1.6 s, in which nearly all objects land."""
@@ -36,7 +36,6 @@ FRACTIONS = {"worlds": (0.125, 0.25, 0.5), "objects": (0.25, 0.5), "resolution":
 """Values of each factor, as multiples of the settings' own: worlds, volume of the objects, image width and height, cameras."""
 PATHS = (1, 2, 4)
 """Paths per coarse pixel."""
-COLUMNS = ("factor", "value", "objects a tote", "physics of a tick [ms]", "world-steps/s", "a view [ms]", "views/s", "views of a tick [ms]")
 
 
 @dataclass(frozen=True)
@@ -48,25 +47,6 @@ class Pile:
     """Mean objects of a world."""
     seconds: float
     """Physics of a tick [s]."""
-
-
-@dataclass(frozen=True)
-class Point:
-    """Measurement with one factor varied."""
-
-    factor: str
-    value: str
-    config: Config
-    pile: Pile
-    view: float
-    """Rendering of a view [s]."""
-
-    def cells(self) -> tuple[str, ...]:
-        """Cells of the table, by COLUMNS."""
-        bake, steps, seconds = self.config.bake, self.config.physics.steps_per_tick, self.pile.seconds
-        views = bake.worlds * len(self.config.cameras.positions)
-        numbers = f"{1e3 * seconds:.0f}", f"{steps * bake.worlds / seconds:,.0f}", f"{1e3 * self.view:.3g}", f"{1.0 / self.view:,.0f}"
-        return self.factor, self.value, f"{self.pile.objects:.1f}", *numbers, f"{1e3 * views * self.view:.0f}"
 
 
 class Assets:
@@ -151,42 +131,26 @@ VARIATIONS: dict[str, Callable[[Config, float], tuple[str, Config]]] = {
 }
 
 
-def measure_growth(config: Config, min_seconds: float, markdown: Path | None) -> Iterator[Row]:
-    """Measure the settings themselves, then each factor's values.
-
-    Args:
-        config: All settings.
-        min_seconds: Time for which a measurement is repeated, at least [s].
-        markdown: File that receives the table; None: none.
-    """
+def measure_growth(config: Config, min_seconds: float) -> Iterator[Row]:
+    """Measure the settings themselves, then each factor's values; a measurement is repeated for at least `min_seconds` [s]."""
     started = time.perf_counter()
     assets = Assets(config, min_seconds)
     scene = assets.build_scene(config)
     pile = assets.drop(config, scene)
-    width, height = config.cameras.resolution
-    here = f"{config.bake.worlds} worlds, {width}x{height}, {len(config.cameras.positions)} cameras"
-    points = [Point("as set", here, config, pile, assets.time_view(config, scene, pile))]
-    yield from _rows(points[-1])
+    yield from _rows("as set", config, pile, assets.time_view(config, scene, pile))
     for factor, vary in VARIATIONS.items():
         for value, varied in dict(vary(config, multiple) for multiple in FRACTIONS.get(factor, PATHS)).items():
             other = assets.build_scene(varied) if factor in ("resolution", "cameras") else scene
-            dropped = assets.drop(varied, scene) if factor in ("worlds", "objects") else pile
-            points.append(Point(factor, value, varied, dropped, assets.time_view(varied, other, dropped)))
-            yield from _rows(points[-1])
-    yield Row("growth", "all measurements", time.perf_counter() - started, "s")
-    if markdown is not None:
-        markdown.write_text(format_table(points))
+            dropped = assets.drop(varied, scene) if factor in ("worlds", "objects") else None
+            view = assets.time_view(varied, other, dropped or pile)
+            yield from _rows(f"{factor} {value}", varied, dropped, view)
+    yield Row("all measurements", time.perf_counter() - started, "s")
 
 
-def _rows(point: Point) -> Iterator[Row]:
-    name = f"{point.factor} {point.value}" if point.factor in VARIATIONS else point.factor
-    if point.factor in ("as set", "worlds", "objects"):
-        yield Row("growth", f"{name}: objects a tote", point.pile.objects, "")
-        yield Row("growth", f"{name}: physics of a tick", 1e3 * point.pile.seconds, "ms")
-    yield Row("growth", f"{name}: a view", 1e3 * point.view, "ms")
-
-
-def format_table(points: list[Point]) -> str:
-    """Format a Markdown table, one row a point."""
-    lines = [COLUMNS, ("---",) * len(COLUMNS), *(point.cells() for point in points)]
-    return "".join(f"| {' | '.join(cells)} |\n" for cells in lines)
+def _rows(name: str, config: Config, pile: Pile | None, view: float) -> Iterator[Row]:
+    """Rows of a point: of piles that were dropped for it, and of a view that takes `view` [s]."""
+    if pile is not None:
+        yield Row(f"{name}: objects a tote", pile.objects)
+        yield Row(f"{name}: physics of a tick", 1e3 * pile.seconds, "ms")
+        yield Row(f"{name}: world-steps", config.physics.steps_per_tick * config.bake.worlds / pile.seconds, "1/s")
+    yield Row(f"{name}: a view", 1e3 * view, "ms")

@@ -19,8 +19,8 @@ from synpick_warp.cli.doctor import GIB
 from synpick_warp.episodes import BakeSummary
 from synpick_warp.progress import SilentProgress
 from tools.bench.cleaner import Cleaner, Tally
-from tools.bench.physics import Row
 from tools.bench.usage import Usage, measure_usage
+from tools.options import Row
 
 LIVE_FRACTION = 0.9
 """Steady-state threshold: fraction of the worlds that must deliver frames in a tick. Before, worlds settle, and physics has a larger
@@ -141,35 +141,34 @@ def slice_rates(readings: Sequence[Reading], seconds: float) -> list[float]:
     return rates
 
 
-def summarize_rates(part: str, unit: str, meter: SteadyMeter) -> Iterator[Row]:
+def summarize_rates(unit: str, meter: SteadyMeter) -> Iterator[Row]:
     """Rows of a measurement: rate, its slices, CPU time, and memory at both ends.
 
     Args:
-        part: Part of the benchmark.
         unit: Name of what the readings count, in the singular.
         meter: Meter with at least two readings.
     """
     first, last = meter.readings[0], meter.readings[-1]
     count, seconds = last.count - first.count, last.time - first.time
-    yield Row(part, f"time to the first {unit}s", meter.first_count, "s")
-    yield Row(part, "measured", seconds, "s")
-    yield Row(part, "a tick", 1e3 * meter.devices * seconds / (len(meter.readings) - 1), "ms")
-    yield Row(part, f"{unit}s to disk", count / seconds, "1/s")
+    yield Row(f"time to the first {unit}s", meter.first_count, "s")
+    yield Row("measured", seconds, "s")
+    yield Row("a tick", 1e3 * meter.devices * seconds / (len(meter.readings) - 1), "ms")
+    yield Row(f"{unit}s to disk", count / seconds, "1/s")
     rates = slice_rates(meter.readings, SLICE_SECONDS)
     if rates:
-        yield Row(part, f"{unit}s to disk, median of {len(rates)} times {SLICE_SECONDS:.0f} s", statistics.median(rates), "1/s")
-        yield Row(part, f"{unit}s to disk, slowest {SLICE_SECONDS:.0f} s", min(rates), "1/s")
-        yield Row(part, f"{unit}s to disk, fastest {SLICE_SECONDS:.0f} s", max(rates), "1/s")
+        yield Row(f"{unit}s to disk, median of {len(rates)} times {SLICE_SECONDS:.0f} s", statistics.median(rates), "1/s")
+        yield Row(f"{unit}s to disk, slowest {SLICE_SECONDS:.0f} s", min(rates), "1/s")
+        yield Row(f"{unit}s to disk, fastest {SLICE_SECONDS:.0f} s", max(rates), "1/s")
     workers = "writers" if meter.devices == 1 else "writers and devices' processes"
     spent = {workers: last.writers.cpu - first.writers.cpu, "main process": last.main.cpu - first.main.cpu}
     if meter.cleaner:
         spent["verification and deletion"] = last.cleaner.cpu - first.cleaner.cpu
     for name, value in spent.items():
-        yield Row(part, f"CPU time of a {unit}, {name}", 1e3 * value / max(1, count), "ms")
-    yield Row(part, "cores busy", sum(spent.values()) / seconds, "")
+        yield Row(f"CPU time of a {unit}, {name}", 1e3 * value / max(1, count), "ms")
+    yield Row("cores busy", sum(spent.values()) / seconds, "")
     for when, reading in (("at the beginning", first), ("at the end", last)):
-        yield Row(part, f"resident memory of the main process, {when}", reading.main.resident / GIB, "GiB")
-        yield Row(part, f"resident memory of all {workers}, shared memory in each, {when}", reading.writers.resident / GIB, "GiB")
-        yield Row(part, f"memory of all {workers} without shared memory, {when}", reading.writers.anonymous / GIB, "GiB")
+        yield Row(f"resident memory of the main process, {when}", reading.main.resident / GIB, "GiB")
+        yield Row(f"resident memory of all {workers}, shared memory in each, {when}", reading.writers.resident / GIB, "GiB")
+        yield Row(f"memory of all {workers} without shared memory, {when}", reading.writers.anonymous / GIB, "GiB")
     if meter.device.is_cuda:
-        yield Row(part, "device memory in use by all processes, first device", last.device / GIB, "GiB")
+        yield Row("device memory in use by all processes, first device", last.device / GIB, "GiB")

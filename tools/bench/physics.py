@@ -7,7 +7,6 @@ import statistics
 import time
 from collections import defaultdict
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 from unittest import mock
 
 import newton
@@ -18,6 +17,7 @@ from synpick_warp.factory.assembly import Factory
 from synpick_warp.stages.sim.physics import may_capture
 from synpick_warp.stages.sim.simulate import Simulation
 from synpick_warp.stages.stream import TickReader
+from tools.options import Row, of_part
 
 FOREVER = 1 << 30
 """Tick count that no measurement reaches."""
@@ -31,16 +31,6 @@ MIN_REPEATS = 3
 """Repetitions of a measurement, at least."""
 BURST = 2
 """Ticks, or render passes, between two synchronisations: as in a bake, the device does not wait for the host."""
-
-
-@dataclass(frozen=True)
-class Row:
-    """Measured value of one part of the benchmark."""
-
-    part: str
-    name: str
-    value: float
-    unit: str
 
 
 def seconds_per_call(function: Callable[[], object], device: wp.Device, min_seconds: float, calls: int = 1) -> float:
@@ -126,7 +116,7 @@ def measure_simulation(factory: Factory, min_seconds: float, parts: tuple[str, .
     for _ in range(FALL_TICKS):
         tick()
     wp.synchronize_device(simulation.device)
-    yield Row("setup", f"load kernels, record the steps, first {FALL_TICKS} ticks", time.perf_counter() - started, "s")
+    yield Row(f"load kernels, record the steps, first {FALL_TICKS} ticks", time.perf_counter() - started, "s", part="setup")
     physics_measured = "physics" in parts
     if physics_measured:
         yield from _measure_ticks(simulation, tick, min_seconds, "falling and landing")
@@ -152,14 +142,14 @@ def measure_simulation(factory: Factory, min_seconds: float, parts: tuple[str, .
         for _ in range(LEAD_TICKS + 2 * rest_ticks):
             tick()
         if {"physics", "perception"} & set(parts):
-            yield from (row for row in _measure_picking(simulation, pile_seconds) if row.part in parts)
+            yield from (row for row in of_part("physics", _measure_picking(simulation, pile_seconds)) if row.part in parts)
     if physics_measured:
         acting = float((simulation.state.phase.numpy() == Phase.ACT).mean())
-        yield Row("physics", "worlds that act", 100.0 * acting, "%")
+        yield Row("worlds that act", 100.0 * acting, "%")
         contacts = int(simulation.physics.contacts.rigid_contact_count.numpy()[0])
-        yield Row("physics", "contacts per world", contacts / simulation.layout.worlds, "")
+        yield Row("contacts per world", contacts / simulation.layout.worlds, "")
     if simulation.perception is not None and "perception" in parts:
-        yield from _measure_perception(simulation, min_seconds)
+        yield from of_part("perception", _measure_perception(simulation, min_seconds))
 
 
 def _measure_ticks(simulation: Simulation, tick: Callable[[], None], min_seconds: float, state: str) -> Iterator[Row]:
@@ -170,8 +160,8 @@ def _measure_ticks(simulation: Simulation, tick: Callable[[], None], min_seconds
 def _tick_rates(simulation: Simulation, seconds: float, state: str) -> Iterator[Row]:
     """Rates of ticks that take `seconds` each."""
     physics = simulation.config.physics
-    yield Row("physics", f"{state}: world-steps", physics.steps_per_tick * simulation.layout.worlds / seconds, "1/s")
-    yield Row("physics", f"{state}: a step of all worlds", 1e3 * seconds / physics.steps_per_tick, "ms")
+    yield Row(f"{state}: world-steps", physics.steps_per_tick * simulation.layout.worlds / seconds, "1/s")
+    yield Row(f"{state}: a step of all worlds", 1e3 * seconds / physics.steps_per_tick, "ms")
 
 
 def _measure_tick_parts(simulation: Simulation, tick: Callable[[], None], min_seconds: float) -> Iterator[Row]:
@@ -188,10 +178,10 @@ def _measure_tick_parts(simulation: Simulation, tick: Callable[[], None], min_se
     with mock.patch.object(physics, "tick_parts", side_effect=lambda *_: iter(())):
         outside = seconds_per_call(tick, device, min_seconds / 4, BURST)
     collide = _capture_graph(lambda: physics.pipeline.collide(physics.state, physics.contacts), device)
-    yield Row("physics", "a tick: physics steps", 1e3 * watch.seconds("steps") / calls, "ms")
-    yield Row("physics", "a tick: everything but physics steps", 1e3 * outside, "ms")
-    yield Row("physics", "a tick: host time to launch it", 1e3 * host, "ms")
-    yield Row("physics", "a collision detection of all worlds", 1e3 * seconds_per_call(collide, device, min_seconds / 4, BURST), "ms")
+    yield Row("a tick: physics steps", 1e3 * watch.seconds("steps") / calls, "ms")
+    yield Row("a tick: everything but physics steps", 1e3 * outside, "ms")
+    yield Row("a tick: host time to launch it", 1e3 * host, "ms")
+    yield Row("a collision detection of all worlds", 1e3 * seconds_per_call(collide, device, min_seconds / 4, BURST), "ms")
 
 
 def _capture_graph(function: Callable[[], object], device: wp.Device) -> Callable[[], object]:
@@ -248,12 +238,12 @@ def _measure_picking(simulation: Simulation, pile_seconds: float) -> Iterator[Ro
     yield from _tick_rates(simulation, tick, "picking")
     yield from _tick_rates(simulation, steps, "picking, steps alone")
     if pile_seconds:
-        yield Row("physics", "picking, steps alone: rate relative to steps without gripper and seals", 100.0 * pile_seconds / steps, "%")
+        yield Row("picking, steps alone: rate relative to steps without gripper and seals", 100.0 * pile_seconds / steps, "%")
     for name, count in (("act", acting), ("have an object attached", attached)):
-        yield Row("physics", f"picking: worlds that {name}", 100.0 * count / (PICK_TICKS * worlds), "%")
-    yield Row("perception", "worlds perceived a tick", perceptions / PICK_TICKS, "")
-    yield Row("perception", "perception and planning, a tick", 1e3 * perceive, "ms")
-    yield Row("perception", "perception and planning: fraction of the simulation's time", 100.0 * perceive / tick, "%")
+        yield Row(f"picking: worlds that {name}", 100.0 * count / (PICK_TICKS * worlds), "%")
+    yield Row("worlds perceived a tick", perceptions / PICK_TICKS, part="perception")
+    yield Row("perception and planning, a tick", 1e3 * perceive, "ms", part="perception")
+    yield Row("perception and planning: fraction of the simulation's time", 100.0 * perceive / tick, "%", part="perception")
 
 
 def _measure_perception(simulation: Simulation, min_seconds: float) -> Iterator[Row]:
@@ -281,7 +271,7 @@ def _measure_perception(simulation: Simulation, min_seconds: float) -> Iterator[
             perceive_batch()
             calls += 1
     views = perception.images.views.count
-    yield Row("perception", "views in a batch", views, "")
+    yield Row("views in a batch", views, "")
     for _, _, name in stages:
-        yield Row("perception", f"a view: {name}", 1e3 * watch.seconds(name) / (calls * views), "ms")
-    yield Row("perception", "a view", 1e3 * sum(watch.seconds(name) for _, _, name in stages) / (calls * views), "ms")
+        yield Row(f"a view: {name}", 1e3 * watch.seconds(name) / (calls * views), "ms")
+    yield Row("a view", 1e3 * sum(watch.seconds(name) for _, _, name in stages) / (calls * views), "ms")

@@ -29,9 +29,9 @@ from synpick_warp.stages.render.denoised import LIGHT_HISTORY, DenoisedRenderer
 from synpick_warp.stages.render.renderer import Renderer
 from synpick_warp.stages.stream import FrameStream, TickReader, TickReport
 from tools.bench.meter import LIVE_FRACTION
-from tools.bench.physics import Row
 from tools.bench.steady import plan_spare_episodes
 from tools.bench.stream import batch_views, select_views
+from tools.options import Row
 
 HISTORY_TICKS = 24
 """Ticks rendered before the measurement. Where nothing moves, a coarse pixel traces its 2nd path in the next frame, 2 more in every second
@@ -98,27 +98,27 @@ def measure_pictures(config: Config, after: int = 0) -> Iterator[Row]:
     ticks = [keep_tick(factory) for _ in range(KEPT_TICKS)]
     views = sum(tick.views for tick in ticks)
     wp.synchronize_device(device)
-    yield Row("pictures", f"setup: load, drop objects, render {HISTORY_TICKS} ticks", time.perf_counter() - started, "s")
-    yield Row("pictures", "ticks in a pass", len(ticks), "")
-    yield Row("pictures", "views in a pass", views, "")
-    yield Row("pictures", "views in a batch", stream.batch, "")
+    yield Row(f"setup: load, drop objects, render {HISTORY_TICKS} ticks", time.perf_counter() - started, "s")
+    yield Row("ticks in a pass", len(ticks), "")
+    yield Row("views in a pass", views, "")
+    yield Row("views in a batch", stream.batch, "")
     if views == 0:
         return  # All episodes have ended.
     renderers = {"all stages": stream.renderer}
     history = light_history(stream.renderer)
     if history is not None:
         paths = history.paths.numpy()[history.frame.numpy() >= 0]  # NEVER, a negative index: no frame yet.
-        yield Row("pictures", "paths in a history before a pass, mean", float(paths.mean()), "")
+        yield Row("paths in a history before a pass, mean", float(paths.mean()), "")
         without = replace(config, render=replace(config.render, history=0))
         renderers["all stages, render.history=0"] = make_renderer(without, stream.renderer.scene, stream.instances, stream.batch)
     megapixels = 1e-6 * config.cameras.resolution[0] * config.cameras.resolution[1]
     for name, times in _time_passes(stream, renderers, ticks).items():
         rate = views / statistics.median(times)
-        yield Row("pictures", f"{name}: views, median of {len(times)} passes", rate, "1/s")
-        yield Row("pictures", f"{name}: views, slowest pass", views / max(times), "1/s")
-        yield Row("pictures", f"{name}: views, fastest pass", views / min(times), "1/s")
-        yield Row("pictures", f"{name}: pixels", megapixels * rate, "Mpx/s")
-        yield Row("pictures", f"{name}: a view", 1e3 / rate, "ms")
+        yield Row(f"{name}: views, median of {len(times)} passes", rate, "1/s")
+        yield Row(f"{name}: views, slowest pass", views / max(times), "1/s")
+        yield Row(f"{name}: views, fastest pass", views / min(times), "1/s")
+        yield Row(f"{name}: pixels", megapixels * rate, "Mpx/s")
+        yield Row(f"{name}: a view", 1e3 / rate, "ms")
 
 
 def simulate_until_live(factory: Factory) -> None:

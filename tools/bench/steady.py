@@ -20,7 +20,7 @@ from synpick_warp.scheduling.sizes import pick_processes
 from synpick_warp.system.device import pick_device
 from tools.bench.cleaner import Assignment, Cleaner
 from tools.bench.meter import LIVE_FRACTION, SteadyMeter, summarize_rates
-from tools.bench.physics import Row
+from tools.options import Row
 
 SPARE_EPISODES = 16
 """Episodes planned for each world, so that none runs out of them in the measurement."""
@@ -69,12 +69,12 @@ def measure_steady(config: Config, min_seconds: float, devices: Sequence[str] = 
 
 def _summarize(config: Config, meter: SteadyMeter) -> Iterator[Row]:
     """Rows of the rates, the verified scenes, and the space on disk."""
-    yield from summarize_rates("steady", "view", meter)
+    yield from summarize_rates("view", meter)
     first, last = meter.readings[0], meter.readings[-1]
     verified, deleted = last.tally.episodes - first.tally.episodes, last.tally.deleted - first.tally.deleted
-    yield Row("steady", "episodes that ended", last.episodes - first.episodes, "")
-    yield Row("steady", "episodes of which all files are verified and deleted", verified, "")
-    yield Row("steady", "files of these", last.tally.files - first.tally.files, "")
-    yield Row("steady", "errors found in them", int(bool(last.tally.problem)), "")
-    yield Row("steady", "size of a view on disk", 1e-6 * (last.disk + deleted - first.disk) / max(1, last.count - first.count), "MB")
-    yield Row("steady", "largest size on disk", 1e-9 * (max(reading.disk for reading in meter.readings) - meter.initial_disk), "GB")
+    yield Row("episodes that ended", last.episodes - first.episodes, "")
+    yield Row("episodes of which all files are verified and deleted", verified, "")
+    yield Row("files of these", last.tally.files - first.tally.files, "")
+    yield Row("errors found in them", int(bool(last.tally.problem)), "")
+    yield Row("size of a view on disk", 1e-6 * (last.disk + deleted - first.disk) / max(1, last.count - first.count), "MB")
+    yield Row("largest size on disk", 1e-9 * (max(reading.disk for reading in meter.readings) - meter.initial_disk), "GB")

@@ -23,7 +23,7 @@ from synpick_warp.stages.render.renderer import Renderer
 from synpick_warp.stages.render.view_setup import make_views, pair_views
 from synpick_warp.stages.stream import TickReport, view_sizes
 from synpick_warp.stages.ticks import TickLoop
-from tools.bench.physics import Row
+from tools.options import Row
 
 ROUNDS = 5
 """Alternations between the two loops of a comparison."""
@@ -64,7 +64,7 @@ def measure_stream(config: Config, factory: Factory, report: TickReport, min_sec
     )
     ring = BatchRing(sizes, config.render.layers, renderer, config.bop.depth_scale)
     parts = (stages, ring, Selection().resolve(config), BakeSummary(), SilentProgress())
-    yield Row("stream", "views in a batch", ring.views, "")
+    yield Row("views in a batch", ring.views, "")
     still = ViewStream(_StillProducer(report, *parts))
     sources = {"renderer alone": _render_loop(stages, ring, report), "stream of one tick": map(_consumer(device), still)}
     yield from _compare(sources, device, min_seconds)
@@ -92,9 +92,9 @@ def _compare(sources: dict[str, Iterator[int]], device: wp.Device, min_seconds: 
     if not all(rates.values()):
         return  # All episodes have ended.
     for name, rate in rates.items():
-        yield Row("stream", f"{name}, views", rate, "1/s")
+        yield Row(f"{name}, views", rate, "1/s")
     (alone, own), (name, rate) = rates.items()
-    yield Row("stream", f"{name}: of {alone}", 100.0 * rate / own, "%")
+    yield Row(f"{name}: of {alone}", 100.0 * rate / own, "%")
 
 
 def _render_loop(stages: Stages, ring: BatchRing, report: TickReport) -> Iterator[int]:

@@ -22,8 +22,8 @@ from synpick_warp.scenes.catalog import load_catalog
 from synpick_warp.scheduling.order import predict_frames
 from synpick_warp.system.device import pick_device
 from tools.bench.meter import LIVE_FRACTION, SteadyMeter, summarize_rates
-from tools.bench.physics import Row
 from tools.bench.steady import plan_spare_episodes
+from tools.options import Row
 
 FORMATS = ("usd", "zarr")
 """Formats without pictures."""
@@ -58,15 +58,15 @@ def _count_frames() -> Iterator[list[int]]:
 
 def _summarize(config: Config, meter: SteadyMeter) -> Iterator[Row]:
     """Rows: rates, world-steps of all worlds whether live or not, disk space, and episodes."""
-    yield Row("trajectories", "worlds", config.bake.worlds, "")
-    yield from summarize_rates("trajectories", "frame", meter)
+    yield Row("worlds", config.bake.worlds, "")
+    yield from summarize_rates("frame", meter)
     first, last, physics = meter.readings[0], meter.readings[-1], config.physics
     seconds, ticks, frames = last.time - first.time, len(meter.readings) - 1, last.count - first.count
     rate = ticks * physics.steps_per_tick * config.bake.worlds / seconds
     mean = float(np.mean(predict_frames(config, load_catalog(config), np.arange(config.bake.episodes, dtype=np.int32), meter.device)))
-    yield Row("trajectories", "world-steps", rate, "1/s")
-    yield Row("trajectories", "simulated time: multiple of real time", rate * physics.step, "")
-    yield Row("trajectories", "worlds with a frame in a tick", 100.0 * frames / (ticks * config.bake.worlds), "%")
-    yield Row("trajectories", "size of a frame on disk", 1e-3 * (last.disk - first.disk) / max(1, frames), "kB")
-    yield Row("trajectories", "episodes that ended", last.episodes - first.episodes, "")
-    yield Row("trajectories", f"episodes, if of {mean:.0f} frames as in tools/README.md", HOUR * frames / seconds / mean, "1/h")
+    yield Row("world-steps", rate, "1/s")
+    yield Row("simulated time: multiple of real time", rate * physics.step, "")
+    yield Row("worlds with a frame in a tick", 100.0 * frames / (ticks * config.bake.worlds), "%")
+    yield Row("size of a frame on disk", 1e-3 * (last.disk - first.disk) / max(1, frames), "kB")
+    yield Row("episodes that ended", last.episodes - first.episodes, "")
+    yield Row(f"episodes, if of {mean:.0f} frames as in tools/README.md", HOUR * frames / seconds / mean, "1/h")

@@ -23,8 +23,8 @@ from synpick_warp.pipeline import run_bake
 from synpick_warp.progress import SilentProgress
 from tools.bench.cleaner import Cleaner
 from tools.bench.meter import LIVE_FRACTION
-from tools.bench.physics import Row
 from tools.bench.steady import clean_up_behind
+from tools.options import Row
 
 PICTURES = (".jpg", ".png")
 """Suffixes of the images, which are deleted once verified."""
@@ -109,11 +109,11 @@ def measure_whole(config: Config, bake: WholeBake, steady_rate: float, traces: d
     traces["whole"] = describe_trace(trace.points, cameras)
     yield from summarize(trace.points, cameras, whole, steady_rate)
     for text, seconds in trace.stages:
-        yield Row("whole", f"begin of: {text}", seconds, "s")
-    yield Row("whole", "episodes of which all files are verified", tally.episodes, "")
-    yield Row("whole", "files of these", tally.files, "")
-    yield Row("whole", "start until all episodes are verified, at least until exit", verified, "s")
-    yield Row("whole", "largest size on disk, after a tick", 1e-9 * trace.disk, "GB")
+        yield Row(f"begin of: {text}", seconds, "s")
+    yield Row("episodes of which all files are verified", tally.episodes, "")
+    yield Row("files of these", tally.files, "")
+    yield Row("start until all episodes are verified, at least until exit", verified, "s")
+    yield Row("largest size on disk, after a tick", 1e-9 * trace.disk, "GB")
     if summary.stopped:
         raise KeyboardInterrupt
 
@@ -177,17 +177,17 @@ def summarize(points: Sequence[TracePoint], cameras: int, whole: Stretch, steady
         "tail": f"tail: after the last tick with {many} live",
         "finishing": "finishing: last files, indices",
     }
-    yield Row("whole", "worlds", max((point.active for point in points), default=0), "")
-    yield Row("whole", "ticks", len(points), "")
-    yield Row("whole", "views", whole.views, "")
-    yield Row("whole", "start to exit", whole.seconds, "s")
+    yield Row("worlds", max((point.active for point in points), default=0), "")
+    yield Row("ticks", len(points), "")
+    yield Row("views", whole.views, "")
+    yield Row("start to exit", whole.seconds, "s")
     for name, stretch in stretches.items():
-        yield Row("whole", titles[name], stretch.seconds, "s")
+        yield Row(titles[name], stretch.seconds, "s")
         if stretch.views:
-            yield Row("whole", f"{name}: views", stretch.views / stretch.seconds, "1/s")
-    yield Row("whole", "mean of the whole: views", mean, "1/s")
+            yield Row(f"{name}: views", stretch.views / stretch.seconds, "1/s")
+    yield Row("mean of the whole: views", mean, "1/s")
     steady = stretches["steady"]
     if steady.views:
-        yield Row("whole", "mean, of the rate of its own steady ticks", 100.0 * mean * steady.seconds / steady.views, "%")
+        yield Row("mean, of the rate of its own steady ticks", 100.0 * mean * steady.seconds / steady.views, "%")
     if steady_rate:
-        yield Row("whole", "mean, of the rate of the part steady", 100.0 * mean / steady_rate, "%")
+        yield Row("mean, of the rate of the part steady", 100.0 * mean / steady_rate, "%")

@@ -23,7 +23,7 @@ from synpick_warp.frames import EpisodeEnd, FrameBatch, TickBatch
 from synpick_warp.stages.host_copies import DeviceImages
 from synpick_warp.stages.stream import TickReport, tick_batch
 from synpick_warp.system.cores import count_cores
-from tools.bench.physics import Row
+from tools.options import Row
 
 COPIES = 8
 """Episodes written for each given one, so that files spread over as many folders as those of many worlds."""
@@ -69,7 +69,7 @@ def measure_writing(config: Config, factory: Factory, report: TickReport, min_se
     names = [name for name, array in vars(batches[0]).items() if isinstance(array, np.ndarray)]
     views = FrameBatch(**{name: np.concatenate([getattr(batch, name) for batch in batches]) for name in names}, layers=layers)
     frames = tick_batch(report, factory.log.object_ids, config.physics.step * config.physics.steps_per_tick)
-    yield Row("write", "objects per view", float((views.object_id >= 0).sum(axis=1).mean()), "")
+    yield Row("objects per view", float((views.object_id >= 0).sum(axis=1).mean()), "")
     # Files are kept until the end: some file systems create files more slowly after many deletions.
     with tempfile.TemporaryDirectory() as folder:
         for name in config.bake.formats:
@@ -84,14 +84,14 @@ def _measure_format(name: str, config: Config, factory: Factory, source: _Input,
     for processes in sorted({1, *(2**power for power in range(1, cores.bit_length())), cores}):
         result = _write(exporter_class, config, factory, source, processes, min_seconds, folder / str(processes))
         label = f"{name}, {processes} process{'es' if processes > 1 else ''}"
-        yield Row("write", f"{label}: views", result.rate, "1/s")
+        yield Row(f"{label}: views", result.rate, "1/s")
         for part, seconds in result.cpu.items():
-            yield Row("write", f"{label}: CPU time per view, {part}", 1e3 * seconds, "ms")
-        yield Row("write", f"{label}: cores in use", result.rate * sum(result.cpu.values()), "")
-    yield Row("write", f"{name}: time to finish an episode", 1e3 * result.finish, "ms")
-    yield Row("write", f"{name}: views, including finishing episodes of {result.frames} frames", result.committed_rate, "1/s")
-    yield Row("write", f"{name}: files per view", result.files, "")
-    yield Row("write", f"{name}: size of files per view", 1e-6 * result.size, "MB")
+            yield Row(f"{label}: CPU time per view, {part}", 1e3 * seconds, "ms")
+        yield Row(f"{label}: cores in use", result.rate * sum(result.cpu.values()), "")
+    yield Row(f"{name}: time to finish an episode", 1e3 * result.finish, "ms")
+    yield Row(f"{name}: views, including finishing episodes of {result.frames} frames", result.committed_rate, "1/s")
+    yield Row(f"{name}: files per view", result.files, "")
+    yield Row(f"{name}: size of files per view", 1e-6 * result.size, "MB")
 
 
 def _copy(batch: FrameBatch) -> FrameBatch:

@@ -28,7 +28,8 @@ from rich.table import Table
 import synpick_warp
 from synpick_warp.errors import SynpickError
 from tools.clients.base import CLIENTS, MISSING, PICTURE, PSNR, Sources
-from tools.options import fail, make_names_parser, writable_file, write_json
+from tools.figures import describe_run, write_run
+from tools.options import Row, fail, make_names_parser, writable_file
 
 ROOT = Path(__file__).resolve().parents[2]
 TIMEOUT = 900.0
@@ -150,16 +151,17 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--json", type=writable_file, metavar="FILE", help="also write the table to this file")
     given = parser.parse_args(arguments)
     try:
-        rows = list(interpreters(given.clients, given.python))
+        chosen = list(interpreters(given.clients, given.python))
         data_set = synpick_warp.open(given.data)
         if not data_set:
             raise SynpickError(f"{given.data} has no episode")
     except (SynpickError, ValueError) as error:
         return fail("clients", str(error))
     sources = Sources(str(Path(given.bop_toolkit).resolve()) if given.bop_toolkit else "")
-    results = [run_client(name, python, given.data.resolve(), data_set, sources) for name, python in rows]
+    results = [run_client(name, python, given.data.resolve(), data_set, sources) for name, python in chosen]
     print_table(Console(), results)
-    write_json(given.json, [asdict(result) for result in results])
+    rows = [Row(result.client, float(result.holds), bound="= 1", holds=result.holds) for result in results]
+    write_run(given.json, describe_run("tools.clients", [], rows, clients=[asdict(result) for result in results]))
     return 0 if all(result.holds for result in results) else 1
 
 

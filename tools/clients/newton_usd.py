@@ -38,6 +38,6 @@ def read(place: Path, data: Path, sources: Sources) -> Reading:
 
 
 def expect(data_set: Any) -> dict[str, np.ndarray]:
-    """Objects of the first frame; all are in the scene at first."""
+    """Objects of the first frame; all are in the scene then."""
     view = data_set[min(data_set)].view(0)
     return {"instance_id": view.instance_ids, "object_to_world": view.object_to_world}

@@ -5,7 +5,6 @@ python -m tools.reports.difficulty TEST HARD          # data sets of the format 
 
 from __future__ import annotations
 
-import argparse
 import sys
 from pathlib import Path
 
@@ -17,7 +16,8 @@ from rich.table import Table
 from synpick_warp.dataset.reading import DataSet, open_data_set
 from synpick_warp.errors import SynpickError
 from synpick_warp.evaluation.truth import Truth, read_truth
-from tools.options import fail
+from tools.figures import describe_run, write_run
+from tools.options import Row, fail, make_parser
 
 OCCLUDED = 0.5
 """Visible fraction below which an instance counts as occluded."""
@@ -60,10 +60,10 @@ def describe_materials(data_set: DataSet) -> str:
 
 def main() -> int:
     """Print a table for each data set."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n", 1)[0])
+    parser = make_parser(__doc__, "json")
     parser.add_argument("datasets", type=Path, nargs="+", metavar="DATA", help="folder of a data set, format bop or shards")
-    console = Console()
-    for folder in parser.parse_args().datasets:
+    options, console, rows = parser.parse_args(), Console(), list[Row]()
+    for folder in options.datasets:
         try:
             data_set = open_data_set(folder)
             found = measure_difficulty(read_truth(data_set))
@@ -74,7 +74,9 @@ def main() -> int:
         table = Table("", *found)
         for name in found[ALL]:
             table.add_row(escape(name), *(f"{values[name]:.4g}" for values in found.values()))
+            rows += [Row(f"{mode}: {name}", values[name], part=folder.name) for mode, values in found.items()]
         console.print(table)
+    write_run(options.json, describe_run("tools.reports.difficulty", [], rows))
     return 0
 
 

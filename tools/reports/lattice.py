@@ -29,7 +29,6 @@ import warp as wp
 from rich.console import Console
 
 from synpick_warp.arrays import allocate
-from synpick_warp.cli.doctor import describe_machine
 from synpick_warp.codes import Segment
 from synpick_warp.configs.schema import FAST, REFERENCE, Config
 from synpick_warp.errors import SynpickError
@@ -47,9 +46,10 @@ from synpick_warp.stages.render.scene import build_render_scene
 from synpick_warp.stages.stream import TickReader
 from synpick_warp.system.device import pick_device
 from synpick_warp.viz.preview import write_picture
-from tools.options import Row, configure, fail, image_resolution, make_parser, positive_count, print_machine, print_rows, write_json
+from tools.figures import finish_report
+from tools.options import Row, configure, fail, image_resolution, make_parser, positive_count
 from tools.reports.reference_store import ReferenceStore, existing_folder
-from tools.reports.render_checks import Shot, Studio, with_mode
+from tools.reports.render_checks import Shot, Studio, with_mode, with_one_camera
 from tools.reports.render_piles import Pair
 
 MAX_FLIP = 0.05
@@ -76,6 +76,35 @@ LUMINANCE = np.array([0.299, 0.587, 0.114])
 SIZES = "320x180,960x540,1920x1080"
 
 
+def _sizes(text: str) -> tuple[tuple[int, int], ...]:
+    """Type of an option: resolutions joined by commas."""
+    sizes = [image_resolution(part) for part in text.split(",")]
+    if not all(len(size) == 2 and all(isinstance(extent, int) for extent in size) for size in sizes):
+        raise argparse.ArgumentTypeError(f"{text} are no sizes; allowed: such as 320x180,1920x1080")
+    return tuple((int(width), int(height)) for width, height in sizes)
+
+
+def _pixel(text: str) -> tuple[int, int]:
+    """Type of an option: a pixel."""
+    parts = text.split(",")
+    if len(parts) != 2 or not all(part.isdecimal() for part in parts):
+        raise argparse.ArgumentTypeError(f"{text} is no pixel; allowed: COLUMN,ROW")
+    return int(parts[0]), int(parts[1])
+
+
+OWN = {
+    "mode": {"default": "move", "help": "bake.mode (default: move)"},
+    "sizes": {"type": _sizes, "default": _sizes(SIZES), "help": f"WIDTHxHEIGHT of the pictures, comma-separated (default: {SIZES})"},
+    "frame": {"type": int, "default": 8, "help": "frame to compare (default: 8)"},
+    "light": {"default": "", "help": "part of the name of the maps to compare (default: all)"},
+    "paths": {"type": positive_count, "default": 1 << 29, "help": "paths of a picture's two references together (default: 536870912)"},
+    "cache": {"type": existing_folder, "help": "folder in which references are kept for further runs"},
+    "crops": {"type": existing_folder, "help": "folder for crops at 1:1, the denoised picture beside the reference"},
+    "at": {"type": _pixel, "help": "COLUMN,ROW in the middle of all crops (default: where FLIP is largest)"},
+}
+"""Options of this report; see `tools.options.OPTIONS`."""
+
+
 @dataclass(frozen=True)
 class Lattice:
     """Lattice of an image: its strength over all windows, and where it is worst."""
@@ -92,16 +121,18 @@ class Lattice:
 
 def main(arguments: list[str] | None = None) -> int:
     """Run the command line; returns the exit code."""
-    options = _parse(arguments)
+    options = make_parser(__doc__, "models", "lights", "device", "seed", "set", "json", own=OWN).parse_args(arguments)
     console = Console(highlight=False)
     started = time.perf_counter()
     rows: list[Row] = []
     try:
-        config = _config(options, options.sizes[0])
+        fixed = {"bake.mode": options.mode, "bake.episodes": 1, "bake.worlds": 1}
+        configs = [with_one_camera(configure(options, fixed | {"cameras.resolution": list(size)})) for size in options.sizes]
+        config = configs[0]
         device = pick_device(config.bake.device)
         stages, snapshots = simulate_frames(config, options.frame, device)
-        for size in options.sizes:
-            for pair, periods in compare_maps(_config(options, size), stages, snapshots, options):
+        for size, sized in zip(options.sizes, configs, strict=True):
+            for pair, periods in compare_maps(sized, stages, snapshots, options):
                 rows += describe(pair, size, periods)
                 values = ", ".join(f"{row.name.partition(': ')[2]} {row.value:.3f}" for row in rows[-8:])
                 console.print(f"{time.perf_counter() - started:5.0f} s  {size[0]}x{size[1]} {pair.light}: {values}")
@@ -109,11 +140,8 @@ def main(arguments: list[str] | None = None) -> int:
                     write_crops(pair, options.crops, f"{size[0]}x{size[1]}_{pair.light}", options.at)
     except SynpickError as error:
         return fail("reports.lattice", error)
-    machine = describe_machine(device)
-    print_machine(console, machine)
-    print_rows(console, "denoised frames", f"{config.bake.mode}, frame {options.frame}, {time.perf_counter() - started:.0f} s", rows)
-    write_json(options.json, {"machine": dict(machine), "rows": [row.to_dict() for row in rows]})
-    return 0 if all(row.holds for row in rows) else 1
+    title = f"{config.bake.mode}, frame {options.frame}, {time.perf_counter() - started:.0f} s"
+    return finish_report("tools.reports.lattice", options.json, device, "denoised frames", title, rows)
 
 
 def simulate_frames(config: Config, last: int, device: wp.Device) -> tuple[Stages, list[dict[str, np.ndarray]]]:
@@ -299,45 +327,6 @@ def write_crops(pair: Pair, folder: Path, name: str, at: tuple[int, int] | None)
         )
     parts = [each[top : top + down, left : left + across] for each in (pair.denoised.color, np.rint(mean).astype(np.uint8))]
     write_picture(folder / f"{name}_{left}_{top}.png", np.concatenate(parts, axis=1)[..., ::-1])
-
-
-def _parse(arguments: list[str] | None) -> argparse.Namespace:
-    parser = make_parser(__doc__, "models", "lights", "device", "seed", "set", "json")
-    parser.add_argument("--mode", default="move", help="bake.mode (default: move)")
-    parser.add_argument(
-        "--sizes", type=_sizes, default=_sizes(SIZES), help=f"WIDTHxHEIGHT of the pictures, comma-separated (default: {SIZES})"
-    )
-    parser.add_argument("--frame", type=int, default=8, help="frame to compare (default: 8)")
-    parser.add_argument("--light", default="", help="part of the name of the maps to compare (default: all)")
-    parser.add_argument(
-        "--paths", type=positive_count, default=1 << 29, help="paths of a picture's two references together (default: 536870912)"
-    )
-    parser.add_argument("--cache", type=existing_folder, help="folder in which references are kept for further runs")
-    parser.add_argument("--crops", type=existing_folder, help="folder for crops at 1:1, the denoised picture beside the reference")
-    parser.add_argument("--at", type=_pixel, help="COLUMN,ROW in the middle of all crops (default: where FLIP is largest)")
-    return parser.parse_args(arguments)
-
-
-def _sizes(text: str) -> tuple[tuple[int, int], ...]:
-    """Type of an option: resolutions joined by commas."""
-    sizes = [image_resolution(part) for part in text.split(",")]
-    if not all(len(size) == 2 and all(isinstance(extent, int) for extent in size) for size in sizes):
-        raise argparse.ArgumentTypeError(f"{text} are no sizes; allowed: such as 320x180,1920x1080")
-    return tuple((int(width), int(height)) for width, height in sizes)
-
-
-def _pixel(text: str) -> tuple[int, int]:
-    """Type of an option: a pixel."""
-    parts = text.split(",")
-    if len(parts) != 2 or not all(part.isdecimal() for part in parts):
-        raise argparse.ArgumentTypeError(f"{text} is no pixel; allowed: COLUMN,ROW")
-    return int(parts[0]), int(parts[1])
-
-
-def _config(options: argparse.Namespace, size: tuple[int, int]) -> Config:
-    fixed = {"bake.mode": options.mode, "bake.episodes": 1, "bake.worlds": 1, "cameras.resolution": list(size)}
-    config = configure(options, fixed)
-    return replace(config, cameras=replace(config.cameras, positions=config.cameras.positions[:1], ups=config.cameras.ups[:1]))
 
 
 if __name__ == "__main__":

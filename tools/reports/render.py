@@ -8,7 +8,6 @@ nothing can be rendered.
 
 from __future__ import annotations
 
-import argparse
 import sys
 import time
 from pathlib import Path
@@ -16,28 +15,38 @@ from pathlib import Path
 import numpy as np
 from rich.console import Console
 
-from synpick_warp.cli.doctor import describe_machine
-from synpick_warp.configs.schema import Config
 from synpick_warp.errors import SynpickError
 from synpick_warp.system.device import pick_device
 from synpick_warp.viz.drawing import write_picture
-from tools.options import configure, fail, make_parser, print_machine, print_rows, write_json
+from tools.figures import finish_report
+from tools.options import configure, fail, make_parser
 from tools.reports.render_checks import measure_furnaces, measure_planes
 from tools.reports.render_piles import compare_piles
 from tools.reports.render_sheet import image_strip, write_sheets
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
+SHARED = ("models", "lights", "device", "seed", "set", "json", "size")
+OWN = {
+    "scenes": {"type": int, "default": 2, "help": "piles to compare (default: 2; 0: none)"},
+    "samples": {"type": int, "default": 64, "help": "paths per pixel of the reference (default: 64)"},
+    "out": {"type": Path, "help": "folder for images: denoised, reference, and five times their difference"},
+    "sheet": {"type": Path, "help": "contact sheet of piles under every light map, PNG or JPEG"},
+    "noise": {"action": "store_true", "help": "render a second reference, to measure its noise; doubles the time"},
+}
+"""Options of this report; see `tools.options.OPTIONS`."""
 
 
 def main(arguments: list[str] | None = None) -> int:
     """Run the command line; returns the exit code."""
-    options = _parse(arguments)
+    options = make_parser(__doc__, *SHARED, own=OWN, size="240x135").parse_args(arguments)
     console = Console(highlight=False)
     started = time.perf_counter()
     try:
         if options.sheet and options.sheet.suffix.lower() not in IMAGE_SUFFIXES:
             raise SynpickError(f"--sheet is {options.sheet}; its name must end in one of {', '.join(IMAGE_SUFFIXES)}")
-        config = _config(options)
+        piles = max(1, options.scenes)
+        fixed = {"bake.mode": "move", "bake.episodes": piles, "bake.worlds": piles, "render.samples": options.samples}
+        config = configure(options, fixed)
         device = pick_device(config.bake.device)
         rows = measure_furnaces(config, device) + measure_planes(config, device)
         if options.scenes:
@@ -49,43 +58,10 @@ def main(arguments: list[str] | None = None) -> int:
                 console.print(f"wrote {file}")
     except SynpickError as error:
         return fail("reports.render", error)
-    machine = describe_machine(device)
-    print_machine(console, machine)
     width, height = config.cameras.resolution
     seconds = time.perf_counter() - started
     title = f"{width} x {height}, {config.render.samples} paths per pixel, {config.render.bounces} bounces, {seconds:.0f} s"
-    print_rows(console, "renderer", title, rows)
-    record = {
-        "machine": dict(machine),
-        "samples": config.render.samples,
-        "bounces": config.render.bounces,
-        "real_objects": bool(options.models),
-        "real_lights": bool(options.lights),
-        "rows": [row.to_dict() for row in rows],
-    }
-    write_json(options.json, record)
-    return 0 if all(row.holds for row in rows) else 1
-
-
-def _parse(arguments: list[str] | None) -> argparse.Namespace:
-    parser = make_parser(__doc__, "models", "lights", "device", "seed", "set", "json", "size")
-    parser.set_defaults(size="240x135")
-    parser.add_argument("--scenes", type=int, default=2, help="piles to compare (default: 2; 0: none)")
-    parser.add_argument("--samples", type=int, default=64, help="paths per pixel of the reference (default: 64)")
-    parser.add_argument("--out", type=Path, help="folder for images: denoised, reference, and five times their difference")
-    parser.add_argument("--sheet", type=Path, help="contact sheet of piles under every light map, PNG or JPEG")
-    parser.add_argument("--noise", action="store_true", help="render a second reference, to measure its noise; doubles the time")
-    return parser.parse_args(arguments)
-
-
-def _config(options: argparse.Namespace) -> Config:
-    fixed = {
-        "bake.mode": "move",
-        "bake.episodes": max(1, options.scenes),
-        "bake.worlds": max(1, options.scenes),
-        "render.samples": options.samples,
-    }
-    return configure(options, fixed)
+    return finish_report("tools.reports.render", options.json, device, "renderer", title, rows)
 
 
 if __name__ == "__main__":

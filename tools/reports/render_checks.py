@@ -84,6 +84,12 @@ def with_mode(config: Config, mode: str, **bake: object) -> Config:
     return replace(config, render=replace(config.render, mode=mode), bake=replace(config.bake, **bake))  # pyright: ignore[reportArgumentType]
 
 
+def with_one_camera(config: Config) -> Config:
+    """Copy of the settings with the first camera alone."""
+    cameras = config.cameras
+    return replace(config, cameras=replace(cameras, positions=cameras.positions[:1], ups=cameras.ups[:1]))
+
+
 def measure_furnaces(config: Config, device: Any) -> list[Row]:
     """White furnace test: error of the mean radiance of white spheres under uniform light of radiance 1, by metallic and roughness."""
     sphere = trimesh.creation.icosphere(subdivisions=4, radius=0.1)

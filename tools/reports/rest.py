@@ -8,7 +8,6 @@ arrangement, so that there may be more arrangements than worlds. Exits with 1 if
 
 from __future__ import annotations
 
-import argparse
 import sys
 import time
 from collections import Counter
@@ -18,7 +17,6 @@ from dataclasses import dataclass, field
 import numpy as np
 from rich.console import Console
 
-from synpick_warp.cli.doctor import describe_machine
 from synpick_warp.codes import Ending, Phase
 from synpick_warp.configs.schema import Config
 from synpick_warp.errors import SynpickError
@@ -29,7 +27,8 @@ from synpick_warp.stages.sim.physics import with_enough_worlds
 from synpick_warp.stages.sim.simulate import Simulation
 from synpick_warp.stages.stream import TickReader, TickReport
 from synpick_warp.system.device import pick_device
-from tools.options import INTERRUPTED, Row, configure, fail, make_parser, print_machine, print_rows, write_json
+from tools.figures import finish_report
+from tools.options import INTERRUPTED, Row, configure, fail, make_parser
 
 MAX_SPEED = 0.2
 """Bound of the median speed of objects [mm/s]."""
@@ -45,6 +44,11 @@ PROGRESS_INTERVAL = 10.0
 """Time between two progress lines [s]."""
 ROUNDING = 1e-6
 """Relative error of a total volume that was summed in single precision."""
+OWN = {
+    "arrangements": {"type": int, "default": 64, "help": "count of arrangements to settle (default: 64)"},
+    "worlds": {"type": int, "help": "worlds simulated in parallel (default: one for each arrangement)"},
+}
+"""Options of this report; see `tools.options.OPTIONS`."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,10 +87,12 @@ class Results:
 
 def main(arguments: list[str] | None = None) -> int:
     """Run the command line; returns the exit code."""
-    options = _parse(arguments)
+    options = make_parser(__doc__, "models", "device", "seed", "set", "json", own=OWN).parse_args(arguments)
     console = Console(highlight=False)
     try:
-        config = _config(options)
+        # Mode move needs no perception; its arrangements may contain an object several times.
+        fixed = {"bake.episodes": options.arrangements, "bake.worlds": options.worlds or options.arrangements}
+        config = configure(options, {"bake.mode": "move"} | fixed)
         device = pick_device(config.bake.device)
         config = with_enough_worlds(config, device)
         catalog = load_catalog(config, report=console.print)
@@ -101,38 +107,11 @@ def main(arguments: list[str] | None = None) -> int:
     except KeyboardInterrupt:
         interrupted = True
         print(f"reports.rest: interrupted; {len(results.piles)} of {config.bake.episodes} arrangements are at rest", file=sys.stderr)
-    machine = describe_machine(device)
-    rows = report(results)
     wall = time.perf_counter() - started
-    print_machine(console, machine)
     objects = "the models folder's objects" if config.bake.models else "the embedded objects"
     title = f"{config.bake.episodes} arrangements of {objects} in {config.bake.worlds} worlds, seed {config.bake.seed}, {wall:.0f} s"
-    print_rows(console, "at rest", title, rows)
-    record = {
-        "machine": dict(machine),
-        "arrangements": config.bake.episodes,
-        "worlds": config.bake.worlds,
-        "seed": config.bake.seed,
-        "real_objects": bool(options.models),
-        "interrupted": interrupted,
-        "seconds": wall,
-        "rows": [row.to_dict() for row in rows],
-    }
-    write_json(options.json, record)
-    return INTERRUPTED if interrupted else 0 if all(row.holds for row in rows) else 1
-
-
-def _parse(arguments: list[str] | None) -> argparse.Namespace:
-    parser = make_parser(__doc__, "models", "device", "seed", "set", "json")
-    parser.add_argument("--arrangements", type=int, default=64, help="count of arrangements to settle (default: 64)")
-    parser.add_argument("--worlds", type=int, help="worlds simulated in parallel (default: one for each arrangement)")
-    return parser.parse_args(arguments)
-
-
-def _config(options: argparse.Namespace) -> Config:
-    # Mode move needs no perception; its arrangements may contain an object several times.
-    worlds = options.worlds or options.arrangements
-    return configure(options, {"bake.mode": "move", "bake.episodes": options.arrangements, "bake.worlds": worlds})
+    code = finish_report("tools.reports.rest", options.json, device, "at rest", title, report(results), interrupted=interrupted)
+    return INTERRUPTED if interrupted else code
 
 
 def settle(simulation: Simulation, catalog: Catalog, results: Results, report_progress: Callable[[str], None]) -> None:

@@ -23,7 +23,6 @@ from pathlib import Path
 import numpy as np
 from rich.console import Console
 
-from synpick_warp.cli.doctor import describe_machine
 from synpick_warp.codes import Phase
 from synpick_warp.configs.schema import FAST, REFERENCE, Config
 from synpick_warp.errors import SynpickError
@@ -34,9 +33,10 @@ from synpick_warp.scheduling.sizes import fit_to_device
 from synpick_warp.stages.buffers import Snapshot
 from synpick_warp.stages.stream import TickReader
 from synpick_warp.system.device import pick_device
-from tools.options import Row, configure, fail, make_parser, positive_count, print_machine, print_rows, writable_file, write_json
+from tools.figures import finish_report
+from tools.options import Row, configure, fail, make_parser, positive_count, writable_file
 from tools.reports.reference_store import ReferenceStore, existing_folder
-from tools.reports.render_checks import Shot, Studio, bounded_row, with_mode
+from tools.reports.render_checks import Shot, Studio, bounded_row, with_mode, with_one_camera
 from tools.reports.render_piles import MAX_BIAS, Pair
 from tools.reports.render_sheet import write_sheets
 
@@ -44,16 +44,37 @@ MIN_PSNR = 35.0
 """Bound of the mean PSNR over all compared frames [dB]."""
 
 
+def _frames(text: str) -> tuple[int, ...]:
+    """Type of an option: frame indices joined by commas."""
+    parts = text.split(",")
+    if not all(part.isdecimal() for part in parts):
+        raise argparse.ArgumentTypeError(f"{text} are no frames; allowed: numbers from 0 on, such as 0,8,30")
+    return tuple(sorted({int(part) for part in parts}))
+
+
+SHARED = ("models", "lights", "device", "seed", "set", "json", "size")
+OWN = {
+    "episodes": {"type": positive_count, "default": 1, "help": "episodes, each in a world of its own (default: 1)"},
+    "mode": {"default": "pick", "help": "bake.mode (default: pick)"},
+    "frames": {"type": _frames, "default": (0, 8, 30), "help": "frames to compare, comma-separated (default: 0,8,30)"},
+    "samples": {"type": positive_count, "default": 256, "help": "paths per pixel of both references together (default: 256)"},
+    "sheet": {"type": writable_file, "help": "contact sheet: denoised, reference, and five times their difference"},
+    "references": {"type": existing_folder, "help": "folder in which references are cached between runs"},
+}
+"""Options of this report; see `tools.options.OPTIONS`."""
+
+
 def main(arguments: list[str] | None = None) -> int:
     """Run the command line; returns the exit code."""
-    options = _parse(arguments)
+    options = make_parser(__doc__, *SHARED, own=OWN, size="480x270").parse_args(arguments)
     console = Console(highlight=False)
     started = time.perf_counter()
     rows: list[Row] = []
     pairs: list[Pair] = []
     missing = set(options.frames)
     try:
-        config = _config(options)
+        worlds = {"bake.episodes": options.episodes, "bake.worlds": options.episodes}
+        config = with_one_camera(configure(options, worlds | {"bake.mode": options.mode, "render.samples": options.samples}))
         device = pick_device(config.bake.device)
         for frame, pair in compare_frames(config, options.frames, options.references):
             pairs.append(pair)
@@ -70,13 +91,9 @@ def main(arguments: list[str] | None = None) -> int:
     except SynpickError as error:
         return fail("reports.sequence", error)
     rows += _summarize(pairs)
-    machine = describe_machine(device)
-    print_machine(console, machine)
     width, height = config.cameras.resolution
     title = f"{config.bake.mode}, {width} x {height}, {config.render.samples} paths per pixel, {time.perf_counter() - started:.0f} s"
-    print_rows(console, "frames of episodes", title, rows)
-    write_json(options.json, {"machine": dict(machine), "samples": config.render.samples, "rows": [row.to_dict() for row in rows]})
-    return 0 if all(row.holds for row in rows) else 1
+    return finish_report("tools.reports.sequence", options.json, device, "frames of episodes", title, rows)
 
 
 def compare_frames(config: Config, frames: tuple[int, ...], cache: Path | None = None) -> Iterator[tuple[int, Pair]]:
@@ -130,37 +147,6 @@ def _summarize(pairs: list[Pair]) -> list[Row]:
         Row("denoised against reference, min", min(pair.quality for pair in pairs), "dB"),
         bounded_row("bias of mean radiance, mean", float(np.mean([pair.bias for pair in pairs])), "%", MAX_BIAS),
     ]
-
-
-def _parse(arguments: list[str] | None) -> argparse.Namespace:
-    parser = make_parser(__doc__, "models", "lights", "device", "seed", "set", "json", "size")
-    parser.set_defaults(size="480x270")
-    parser.add_argument("--episodes", type=positive_count, default=1, help="episodes, each in a world of its own (default: 1)")
-    parser.add_argument("--mode", default="pick", help="bake.mode (default: pick)")
-    parser.add_argument("--frames", type=_frames, default=(0, 8, 30), help="frames to compare, comma-separated (default: 0,8,30)")
-    parser.add_argument("--samples", type=positive_count, default=256, help="paths per pixel of both references together (default: 256)")
-    parser.add_argument("--sheet", type=writable_file, help="contact sheet: denoised, reference, and five times their difference")
-    parser.add_argument("--references", type=existing_folder, help="folder in which references are cached between runs")
-    return parser.parse_args(arguments)
-
-
-def _frames(text: str) -> tuple[int, ...]:
-    """Type of an option: frame indices joined by commas."""
-    parts = text.split(",")
-    if not all(part.isdecimal() for part in parts):
-        raise argparse.ArgumentTypeError(f"{text} are no frames; allowed: numbers from 0 on, such as 0,8,30")
-    return tuple(sorted({int(part) for part in parts}))
-
-
-def _config(options: argparse.Namespace) -> Config:
-    fixed = {
-        "bake.mode": options.mode,
-        "bake.episodes": options.episodes,
-        "bake.worlds": options.episodes,
-        "render.samples": options.samples,
-    }
-    config = configure(options, fixed)
-    return replace(config, cameras=replace(config.cameras, positions=config.cameras.positions[:1], ups=config.cameras.ups[:1]))
 
 
 if __name__ == "__main__":

@@ -66,15 +66,15 @@ MIN_ROUGHNESS = 0.3
 """Path regularization: smallest roughness after the first surface (Kaplanyan and Dachsbacher, 2013). Caustics blur instead of sparkling."""
 FIREFLY_CLAMP = 32.0
 """Firefly clamp: a path counts with at most this many times the unoccluded light, or single paths would show as patches; light from
-surfaces that lamps light is added to the limit. The light cut off is a bias: in eight episodes under real maps 8, 16, 32, 64 give -1.0,
--0.5, -0.4, -0.3 % and 31.15, 31.20, 31.17, 31.15 dB (tools/README.md, "Pictures")."""
+surfaces that lamps light is added to the limit. The light cut off is a bias: in eight episodes under real maps -0.4 %; with 8 times -1.0,
+with 64 times -0.3 % (tools/DECISIONS.md)."""
 ROULETTE = 1
 """First bounce with Russian roulette: few paths are long, since many neighbours share them."""
 
 
 MAX_QUEUE_VIEWS = 32
 """Maximum number of views with path queues at a time; the views of a larger batch take turns. With 8 views of a batch of 25, launches wait
-for their longest path on a nearly idle GPU, and queues gain nothing (tools/README.md, "Path queues")."""
+for their longest path on a nearly idle GPU, and queues gain nothing."""
 MAX_QUEUE_FRACTION = 1 / 96
 """Maximum size of path queues as a fraction of the device's memory. At full HD, 42 views fit into that of an H100, and 6 into that of a GPU
 of 12 GiB, which is better used for worlds."""

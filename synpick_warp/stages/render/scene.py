@@ -220,7 +220,7 @@ def pack_half3_array(colors: np.ndarray) -> np.ndarray:
 
 
 MAX_RAYS_PER_LAMP = 4
-"""Maximum number of shadow rays per lamp and pixel of the shadow grid: 8 would gain 0.05 dB in PSNR (tools/README.md, "Pictures")."""
+"""Maximum number of shadow rays per lamp and pixel of the shadow grid: 8 would gain 0.05 dB in PSNR."""
 
 
 def lamp_table(tables: list[EnvironmentTables], name: str, *shape: int) -> np.ndarray:

@@ -36,15 +36,13 @@ ENDED = object()
 CONTACT_GAP = 0.1
 # Distance to a joint limit from which its constraint row is active [rad].
 JOINT_LIMIT_GAP = 0.2
-# Fraction of its speed limit from which a body has velocity limit rows. With rows for all bodies at all times, six each, every iteration
-# swept 162 idle rows a world one after the other, a third of the solver's time on a GPU.
+# Fraction of its speed limit from which a body has velocity limit rows. Six idle rows for each body at all times would take a third
+# of the solver's time on a GPU.
 VELOCITY_LIMIT_FRACTION = 0.5
 # Blocks of the narrow phase: one warp each, 8 for each multiprocessor of a GPU or 2 for each world, whichever is more. Newton has four
 # warps a block (one warp, if a hull has 256 or more vertices), 4 blocks a multiprocessor. A thread tests a pair of shapes for as long as it
-# takes, and a block holds the registers of all its threads until the last one is done. A world has some 60 pairs, about as many as its two
-# blocks have threads. On an H200, with two substeps a step, a tick of 16, 64, 150 worlds takes 0.131, 0.168, 0.201 instead of 0.141, 0.177,
-# 0.208 s; 512 worlds 0.254 instead of 0.269, in a second run 0.261 and 0.260. With one substep a tick of 2,048 worlds takes 0.313 s in one
-# block for each world, 0.301 in two, 0.299 in four.
+# takes, and a block holds the registers of all its threads until the last one is done: a tick of 16 to 150 worlds is 3 to 7 % shorter so. A
+# world has some 60 pairs, about as many as its two blocks have threads.
 NARROW_PHASE_BLOCK, NARROW_PHASE_BLOCKS, NARROW_PHASE_WORLD_BLOCKS = 32, 8, 2
 # Block size of the narrow phase's refinement in Newton; its kernel takes longer to compile than any other.
 REFINE_BLOCK = 32

@@ -20,9 +20,9 @@ from tools.bench import physics
 from tools.bench.compare.engines import CONES, Engine, MujocoEngine, make_mujoco_warp, make_ours
 from tools.bench.compare.piles import Pile, pick_pile
 from tools.bench.compare.rendering import measure_rendering
+from tools.bench.compare.sensor import measure_sensor
 from tools.bench.compare.simulation import measure_engine
-from tools.bench.physics import Row
-from tools.bench.sensor import measure_sensor
+from tools.options import Row, of_part
 
 PEERS = ("mujoco-warp", "mujoco", "sensor-camera")
 MODULES = {"mujoco-warp": ("mujoco", "mujoco_warp"), "mujoco": ("mujoco",)}
@@ -57,7 +57,7 @@ def measure_peers(config: Config, peers: tuple[str, ...], min_seconds: float) ->
     factory = build_factory(few, SilentProgress())
     _settle(factory.simulation)
     pile = pick_pile(factory.catalog, factory.simulation.record.snapshot)
-    yield Row("setup", f"build and settle {few.bake.worlds} worlds", time.perf_counter() - started, "s")
+    yield Row(f"build and settle {few.bake.worlds} worlds", time.perf_counter() - started, "s", part="setup")
     if "sensor-camera" in peers:
         yield from _guard("sensor", partial(measure_sensor, few, factory, min_seconds))
     if "mujoco-warp" in peers:
@@ -76,25 +76,25 @@ def _settle(simulation: Simulation) -> None:
 def _measure_physics(config: Config, pile: Pile, peers: tuple[str, ...], device: wp.Device) -> Iterator[Row]:
     """Benchmark of physics engines on one pile: ours, then each peer with each friction cone."""
 
-    def measure(part: str, make: Callable[[], Engine]) -> Iterator[Row]:
-        yield from measure_engine(part, make(), config, pile)
+    def measure(make: Callable[[], Engine]) -> Iterator[Row]:
+        yield from measure_engine(make(), config, pile)
 
     worlds = config.bake.worlds
     ours = make_ours(config, pile, worlds, device)
-    yield from measure("ours", lambda: ours)
+    yield from of_part("ours", measure(lambda: ours))
     if "mujoco" in peers:
         for cone in CONES:
-            yield from _guard("mujoco", partial(measure, "mujoco", partial(MujocoEngine, config, pile, cone)))
+            yield from _guard("mujoco", partial(measure, partial(MujocoEngine, config, pile, cone)))
     if "mujoco-warp" in peers:
         for cone in CONES:
             make = partial(make_mujoco_warp, config, pile, worlds, device, cone, ours.peak_contacts)
-            yield from _guard("mujoco-warp", partial(measure, "mujoco-warp", make))
+            yield from _guard("mujoco-warp", partial(measure, make))
 
 
 def _guard(part: str, measure: Callable[[], Iterator[Row]]) -> Iterator[Row]:
     """Rows of a peer; if it raises an exception, a last row with the reason."""
     try:
-        yield from measure()
+        yield from of_part(part, measure())
     except Exception as error:
         reason = (str(error).splitlines() or [""])[0]
-        yield Row(part, f"failed: {type(error).__name__}: {reason}", math.nan, "")
+        yield Row(f"failed: {type(error).__name__}: {reason}", math.nan, part=part)

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from synpick_warp.codes import Segment
 from synpick_warp.scenes.types import Camera, Fixture, Material, TriangleMesh
 from synpick_warp.stages.buffers import Snapshot
-from tools.bench.sensor import camera_to_world
+from tools.bench.compare.sensor import camera_to_world
 
 ABSENT = np.array([0.0, 0.0, 1e3, 0.0, 0.0, 0.0, 1.0])
 """Pose of a geom that its world lacks: above and behind all cameras, since a geom cannot be left out."""

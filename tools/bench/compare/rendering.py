@@ -18,10 +18,10 @@ from synpick_warp.stages.buffers import Snapshot, allocate_view_buffers
 from synpick_warp.stages.render.scene import build_cameras, build_grid
 from synpick_warp.stages.render.view_setup import make_views
 from tools.bench.compare.ray_scene import RayScene
-from tools.bench.physics import BURST, Row, seconds_per_call
-from tools.bench.sensor import CHECKED_VIEWS, compare_hits, rate_rows
+from tools.bench.compare.sensor import CHECKED_VIEWS, compare_hits, rate_rows
+from tools.bench.physics import BURST, seconds_per_call
+from tools.options import Row
 
-PART = "mujoco-warp"
 SMALL_SIZE = (64, 64)
 """Image size of policies that learn in many worlds [px]."""
 SMALL_WORLDS, SMALL_WORLDS_CPU = 2048, 8
@@ -45,7 +45,7 @@ def _measure_size(config: Config, factory: Factory, worlds: int, min_seconds: fl
     snapshot = tile_snapshot(factory.simulation.record.snapshot, worlds, device)
     count, pixels = worlds * len(cameras), cameras[0].width * cameras[0].height
     size = f"{cameras[0].width}x{cameras[0].height}, {worlds:,} world{'' if worlds == 1 else 's'}"
-    yield Row(PART, f"{size}: views in a batch", count, "")
+    yield Row(f"{size}: views in a batch", count, "")
     ours = OurViews(config, factory, cameras, snapshot, worlds)
     meshes = [(entry.mesh, entry.material) for entry in factory.catalog.entries]
     table = (float(scene.table.height), config.render.table_color) if config.render.table else None
@@ -61,7 +61,7 @@ def _measure_size(config: Config, factory: Factory, worlds: int, min_seconds: fl
     index, depth = theirs.read_hits(context, checked)
     segment, counts = (array[: len(index)].numpy() for array in (ours.out.instance, ours.out.depth))
     for row in compare_hits(theirs.segment, index, depth, segment, counts, config.bop.depth_scale):
-        yield replace(row, part=PART, name=f"{size}: {row.name}")
+        yield replace(row, name=f"{size}: {row.name}")
     yield from _pair(size, pixels, "depth, ids, amodal bits", "depth, ids", seconds)
     context = theirs.make_context(color=True)
     seconds = time_view(functools.partial(ours.render)), time_view(functools.partial(theirs.render, context))
@@ -77,9 +77,9 @@ def _measure_size(config: Config, factory: Factory, worlds: int, min_seconds: fl
 def _pair(size: str, pixels: int, ours: str, theirs: str, seconds: tuple[float, float]) -> Iterator[Row]:
     """Rows of the rates of both renderers, from the times of a view [s] by ours and theirs, and of their ratio."""
     our_seconds, their_seconds = seconds
-    yield from rate_rows(PART, f"{size}, ours: {ours}", our_seconds, pixels)
-    yield from rate_rows(PART, f"{size}, MuJoCo Warp: {theirs}", their_seconds, pixels)
-    yield Row(PART, f"{size}: rate of ours ({ours}) over MuJoCo Warp's ({theirs})", their_seconds / our_seconds, "")
+    yield from rate_rows(f"{size}, ours: {ours}", our_seconds, pixels)
+    yield from rate_rows(f"{size}, MuJoCo Warp: {theirs}", their_seconds, pixels)
+    yield Row(f"{size}: rate of ours ({ours}) over MuJoCo Warp's ({theirs})", their_seconds / our_seconds, "")
 
 
 def tile_snapshot(snapshot: Snapshot, worlds: int, device: wp.Device) -> Snapshot:

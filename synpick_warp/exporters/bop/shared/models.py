@@ -129,7 +129,7 @@ def _copy_model(entry: CatalogEntry, source: Path, path: Path) -> None:
     """Copy a PLY file, and the texture that its header names, under the same name inside the set.
 
     Raises:
-        CatalogError: The texture is no longer the one that was read, or has the name of another file of the set.
+        CatalogError: The texture has changed since it was read, or has the name of another file of the set.
     """
     data = read_ply_file(source)
     found = read_ply_texture(data, source)

@@ -23,7 +23,8 @@ from synpick_warp.scenes.types import Camera, Catalog, Fixture, Material, Triang
 from synpick_warp.stages.buffers import LayerBuffers, Snapshot
 from synpick_warp.stages.render.layers import LayerRenderer
 from synpick_warp.stages.render.view_setup import make_views
-from tools.bench.physics import BURST, Row, seconds_per_call
+from tools.bench.physics import BURST, seconds_per_call
+from tools.options import Row
 
 ORDERS = {
     "in default order": SensorCamera.RenderConfig(),
@@ -182,9 +183,9 @@ def compare_hits(ids: np.ndarray, index: np.ndarray, depth: np.ndarray, segment:
     close = same & (difference <= DEPTH_TOLERANCE)
     largest = float(difference[same].max()) * scale if same.any() else 0.0
     return [
-        Row("sensor", "pixels with the same instance in both", 100.0 * float(same.mean()), "%"),
-        Row("sensor", f"pixels with the same instance and depth within {DEPTH_TOLERANCE * scale:g} mm", 100.0 * float(close.mean()), "%"),
-        Row("sensor", "largest difference of depths of the same instance", largest, "mm"),
+        Row("pixels with the same instance in both", 100.0 * float(same.mean()), "%"),
+        Row(f"pixels with the same instance and depth within {DEPTH_TOLERANCE * scale:g} mm", 100.0 * float(close.mean()), "%"),
+        Row("largest difference of depths of the same instance", largest, "mm"),
     ]
 
 
@@ -204,8 +205,8 @@ def compare_surfaces(cameras: tuple[Camera, ...], normal: np.ndarray, albedo: np
     difference = np.abs(color.astype(np.int16) - layers["albedo"])
     same_normal = 100.0 * float((cosine >= np.cos(np.radians(NORMAL_TOLERANCE))).mean()) if cosine.size else 100.0
     return [
-        Row("sensor", f"surfaces with the same normal within {NORMAL_TOLERANCE:g}°", same_normal, "%"),
-        Row("sensor", "mean difference of base colors, the sensor's without texture minification", float(difference.mean()), "grey"),
+        Row(f"surfaces with the same normal within {NORMAL_TOLERANCE:g}°", same_normal, "%"),
+        Row("mean difference of base colors, the sensor's without texture minification", float(difference.mean()), "grey"),
     ]
 
 
@@ -223,8 +224,8 @@ def measure_sensor(config: Config, factory: Factory, min_seconds: float) -> Iter
     table = float(renderer.scene.table.height)
     scene = build_sensor_scene(config, factory.catalog, fixtures, factory.cameras, table, snapshot, count, device)
     wp.synchronize_device(device)
-    yield Row("sensor", "build a Newton model of the batch's worlds", time.perf_counter() - started, "s")
-    yield Row("sensor", "views in a batch", count, "")
+    yield Row("build a Newton model of the batch's worlds", time.perf_counter() - started, "s")
+    yield Row("views in a batch", count, "")
     ours = _OurRenderer(config, factory, count)
     hit_images = scene.allocate_outputs(forward_depth_image="depth_forward", shape_index_image="shape_index")
     surface_images = scene.allocate_outputs(normal_image="normal", albedo_image="albedo")
@@ -242,8 +243,8 @@ def measure_sensor(config: Config, factory: Factory, min_seconds: float) -> Iter
     index, depth, segment, counts = (array[:checked].numpy() for array in arrays)
     yield from compare_hits(scene.segment, index, depth, segment, counts, config.bop.depth_scale)
     for name, seconds in orders.items():
-        yield Row("sensor", f"SensorCamera, pixels {name}: depth, index", 1e3 * seconds, "ms")
-        yield Row("sensor", f"SensorCamera's time over ours: depth, index, pixels {name}", seconds / times[0], "")
+        yield Row(f"SensorCamera, pixels {name}: depth, index", 1e3 * seconds, "ms")
+        yield Row(f"SensorCamera's time over ours: depth, index, pixels {name}", seconds / times[0], "")
     pixels = factory.cameras[0].width * factory.cameras[0].height
     yield from _comparison_rows("depth, index", ", amodal bits", "", (times[0], orders[best]), pixels)
     textured = replace(ORDERS[best], enable_textures=True)
@@ -286,12 +287,12 @@ def _comparison_rows(outputs: str, our_extras: str, their_extras: str, times: tu
     """Rows of the times of a view [s] of `pixels` pixels by ours and theirs, of their rates, and of their ratio."""
     ours, theirs = times
     for name, seconds in ((f"ours: {outputs}{our_extras}", ours), (f"SensorCamera: {outputs}{their_extras}", theirs)):
-        yield Row("sensor", name, 1e3 * seconds, "ms")
-        yield from rate_rows("sensor", name, seconds, pixels)
-    yield Row("sensor", f"SensorCamera's time over ours: {outputs}", theirs / ours, "")
+        yield Row(name, 1e3 * seconds, "ms")
+        yield from rate_rows(name, seconds, pixels)
+    yield Row(f"SensorCamera's time over ours: {outputs}", theirs / ours, "")
 
 
-def rate_rows(part: str, name: str, seconds: float, pixels: int) -> Iterator[Row]:
+def rate_rows(name: str, seconds: float, pixels: int) -> Iterator[Row]:
     """Rates of a renderer that takes `seconds` for a view of `pixels` pixels."""
-    yield Row(part, f"{name}: views", 1.0 / seconds, "1/s")
-    yield Row(part, f"{name}: pixels", 1e-6 * pixels / seconds, "Mpx/s")
+    yield Row(f"{name}: views", 1.0 / seconds, "1/s")
+    yield Row(f"{name}: pixels", 1e-6 * pixels / seconds, "Mpx/s")
