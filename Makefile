@@ -32,6 +32,7 @@ checks: $(VENV)/installed-dev
 	$(BIN)/lint-imports --no-logo
 	$(BIN)/basedpyright
 	$(BIN)/python -m tools.checks.kernels
+	$(BIN)/python -m tools.checks.history
 
 clean:
 	rm -rf $(VENV) $(DEMO) build dist *.egg-info .pytest_cache .hypothesis .ruff_cache .import_linter_cache
