@@ -1,6 +1,7 @@
-# make demo    bakes a small data set on the processor and draws a contact sheet of it
-# make test    checks and tests
-# make clean   removes what these two made
+# make demo       bakes a small data set on the processor and draws a contact sheet of it
+# make test       checks, and all tests but the slow ones
+# make test-slow  the slow tests: killed and resumed bakes, soak, several devices, the lines of the README
+# make clean      removes what these made
 #
 # All that is needed is Python 3.11 or 3.12. PYTHON=... chooses the interpreter.
 
@@ -15,7 +16,7 @@ BIN := $(VENV)/bin
 DEMO := demo
 WORKERS := 2
 
-.PHONY: demo test checks clean
+.PHONY: demo test test-slow checks clean
 .DELETE_ON_ERROR:
 
 demo: $(VENV)/installed
@@ -24,7 +25,10 @@ demo: $(VENV)/installed
 	$(BIN)/synpick-warp preview $(DEMO) --out $(DEMO)/contact-sheet.png
 
 test: checks
-	$(BIN)/python -m pytest -n $(WORKERS)
+	$(BIN)/python -m pytest -n $(WORKERS) -m 'not slow'
+
+test-slow: $(VENV)/installed-dev
+	$(BIN)/python -m pytest -n $(WORKERS) -m slow
 
 checks: $(VENV)/installed-dev
 	$(BIN)/ruff check --quiet --output-format concise .

@@ -274,6 +274,7 @@ def test_attempts_are_the_same_in_any_number_of_worlds(picked, tmp_path):
     assert {name for name, _ in other.files().items() ^ picked.files().items()} == {"config.toml"}
 
 
+@pytest.mark.slow
 def test_a_bake_that_grows_lists_the_attempts_of_both(picked, tmp_path):
     """The first episode's attempts come from its record: by the second bake nobody remembers them."""
     Baked(tmp_path / "set", **PICKING | {"bake__episodes": 1, "bake__worlds": 1})

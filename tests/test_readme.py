@@ -49,6 +49,7 @@ def environment(folder) -> dict[str, str]:
     return checkout_environment(PYTHONPATH=os.pathsep.join([str(ROOT), paths]), PATH=f"{command.parent}:{os.environ['PATH']}")
 
 
+@pytest.mark.slow
 def test_the_lines_of_the_readme_run_as_written(folder, environment):
     assert [language for language, _ in blocks()].count("python") == 3
     for language, text in blocks():

@@ -30,6 +30,7 @@ SETTINGS = {key: value for key, value in (QUICK | TINY).items() if not key.start
     ],
     ids=["a litre", "twins", "3 mm", "the whole budget"],
 )
+@pytest.mark.slow
 def test_a_catalog_of_one_or_two_objects_gives_episodes(mode, sizes, tmp_path):
     """Fault 4: with cubes of 100 mm, all 20 arrangements needed more body slots than a world had."""
     (tmp_path / "models").mkdir()

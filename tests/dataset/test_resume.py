@@ -59,6 +59,7 @@ def expected(whole) -> dict[str, str]:
     return digests(whole)
 
 
+@pytest.mark.slow
 def test_killed_at_any_time_and_resumed_the_files_are_those_of_an_undisturbed_bake(server, expected, tmp_path):
     """The time of each kill is drawn anew, and whether it meets the bake or its writer; whenever a bake ends in between, another folder is
     begun. The longest time to a kill is at most twice the time of any bake that ends: a machine may be busy while the first is timed.
@@ -132,6 +133,7 @@ def splits(tmp_path) -> str:
     return str(path)
 
 
+@pytest.mark.slow
 def test_splits_fill_one_folder_in_any_order(server, splits, expected, tmp_path):
     """Split by split and shard by shard or all at once: the same files, and the episodes are those of the same indices without splits."""
     once, parts = tmp_path / "once", tmp_path / "parts"
@@ -173,6 +175,7 @@ def test_a_data_set_of_splits_grows_at_its_end_only(server, splits, tmp_path):
     assert "splits.train.episodes is 2, but" in log.read_text()
 
 
+@pytest.mark.slow
 def test_parts_of_splits_are_merged(server, splits, tmp_path):
     parts = [tmp_path / name for name in ("train", "test")]
     for part in parts:
@@ -205,6 +208,7 @@ def test_a_data_set_can_grow_with_other_worlds_and_writers(server, expected, tmp
     assert digests(out) == expected
 
 
+@pytest.mark.slow
 def test_shares_are_joined_to_what_one_bake_makes(server, expected, tmp_path):
     parts = [tmp_path / str(part) for part in range(3)]
     for part, folder in enumerate(parts):
@@ -268,6 +272,7 @@ def test_stopped_twice_it_ends_at_once(server, expected, tmp_path):
 # ---- when something fails ----
 
 
+@pytest.mark.slow
 def test_a_writer_that_is_killed(server, expected, tmp_path):
     out, log = tmp_path / "set", tmp_path / "log"
     process = server.start(out, log=str(log))
@@ -277,6 +282,7 @@ def test_a_writer_that_is_killed(server, expected, tmp_path):
     goes_on_after(server, out, log, expected, "a writer process was ended by SIGKILL")
 
 
+@pytest.mark.slow
 def test_the_folder_is_removed(server, expected, tmp_path):
     out, log = tmp_path / "set", tmp_path / "log"
     server.start(out, log=str(log))
@@ -289,6 +295,7 @@ def test_the_folder_is_removed(server, expected, tmp_path):
     assert digests(tmp_path / "moved") == expected
 
 
+@pytest.mark.slow
 def test_a_file_that_cannot_be_written(server, expected, tmp_path):
     """Files of so many bytes cannot be had, as on a full disk: pictures can, an episode's lists cannot."""
     out, log = tmp_path / "set", tmp_path / "log"
@@ -297,6 +304,7 @@ def test_a_file_that_cannot_be_written(server, expected, tmp_path):
     goes_on_after(server, out, log, expected, "cannot write ")
 
 
+@pytest.mark.slow
 def test_a_full_disk(server, expected, small_disk):
     out, log = small_disk / "set", small_disk.parent / "log"
     server.start(out, log=str(log))

@@ -29,6 +29,7 @@ def once(server, tmp_path_factory) -> Path:
     return out
 
 
+@pytest.mark.slow
 def test_scenes_are_whole_after_kills(server, once, tmp_path):
     """A scene brings the files of all cameras together by many renames, some of which a kill prevents."""
     count = tmp_path / "count"

@@ -281,6 +281,7 @@ def test_a_failure_while_a_batch_is_made_ends_the_stream(monkeypatch):
     assert next(stream, None) is None
 
 
+@pytest.mark.slow
 def test_a_script_needs_no_main_guard(tmp_path):
     """It leaves the loop early, and the process ends by itself, without children."""
     script = tmp_path / "train.py"

@@ -72,6 +72,7 @@ def scores(scene: Scene, found: dict[int, Estimates]) -> tuple[float, float]:
 
 
 @pytest.mark.parametrize("method", SCORES)
+@pytest.mark.slow
 def test_scores_are_those_of_the_first_day(scene, estimator, method):
     """The fixed set: two scenes of six instances, eight frames; clutter, cut-off objects, cans and cartons."""
     found = run(method, scene, estimator)

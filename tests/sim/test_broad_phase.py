@@ -98,6 +98,7 @@ def test_contacts_of_moving_and_jumping_bodies_are_those_of_newton(device, monke
     assert pairs[1] < 0.8 * pairs[0]
 
 
+@pytest.mark.slow
 def test_piles_move_as_with_the_broad_phase_of_newton(device, monkeypatch):
     """Piles that fall, rest and are stirred have bitwise identical trajectories; at least half the pairs without contacts are rejected."""
     worlds = 8 if device.is_cuda else 2

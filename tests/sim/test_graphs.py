@@ -65,6 +65,7 @@ def fall(
 
 
 @pytest.mark.parametrize(("steps", "substeps"), [(12, 1), (12, 2), (12, 3), (9, 1)])
+@pytest.mark.slow
 def test_replayed_ticks_are_those_of_single_launches(device, steps, substeps):
     replayed, launched = fall(device, True, steps, substeps), fall(device, False, steps, substeps)
     np.testing.assert_array_equal(replayed, launched)
@@ -86,6 +87,7 @@ def test_on_a_cpu_nothing_is_captured_while_another_thread_may_launch_kernels(mo
 
 
 @pytest.mark.parametrize("recorded", [True, False])
+@pytest.mark.slow
 def test_episodes_captured_from_a_later_tick_on_are_those_of_single_launches(monkeypatch, recorded):
     """Compare eager and replayed ticks on the CPU in two worlds of mode pick, until objects are lifted.
 

@@ -159,6 +159,7 @@ def test_a_report_of_a_sequence_compares_its_frames_with_references(tmp_path, ca
     assert "no episode has frame 100000" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_references_are_kept_for_other_settings_of_the_denoiser(tmp_path, monkeypatch, capsys):
     def run(*options: str) -> tuple[dict[str, float], int]:
         """Values, and the number of references that were rendered."""
@@ -185,6 +186,7 @@ def test_references_are_kept_for_other_settings_of_the_denoiser(tmp_path, monkey
     assert "there is no folder" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_histories_bring_frames_nearer_to_the_reference():
     """With histories later frames have more paths than single frames have; references of few paths suffice, as their noise cancels."""
     fixed = {"cameras.resolution": [64, 36], "bake.mode": "move", "bake.episodes": 1, "bake.worlds": 1, "render.samples": 64}

@@ -331,6 +331,7 @@ def test_at_the_time_limit_ended_sequences_are_reported(tmp_path, capsys):
     assert "time limit of" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_bench_measures_every_part_of_small_worlds(tmp_path, monkeypatch, capsys):
     for name in ("FALL_TICKS", "SETTLE_TICKS", "STIR_TICKS", "LEAD_TICKS", "PICK_TICKS", "MIN_REPEATS", "BURST"):
         monkeypatch.setattr(bench_physics, name, 1)

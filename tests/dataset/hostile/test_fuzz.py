@@ -132,6 +132,7 @@ def fix_digests(data_set: Path) -> None:
 
 @examples(max_examples=fuzz_examples(50), deadline=None, suppress_health_check=list(HealthCheck))
 @given(st.data())
+@pytest.mark.slow
 def test_resume_verify_and_merge_of_hostile_sets_end_in_one_line_and_stay_inside(ready, tmp_path_factory, data):
     root = tmp_path_factory.mktemp("hostile")
     victim = make_victim(root)

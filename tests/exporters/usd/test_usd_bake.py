@@ -58,6 +58,7 @@ def out(tmp_path_factory, picking) -> Path:
     return folder
 
 
+@pytest.mark.slow
 def test_bytes_do_not_depend_on_the_number_of_worlds(out):
     assert (out / "usd/000000.usdc").exists()
     assert digests(out / "usd") == digests(out.with_name("again") / "usd")
