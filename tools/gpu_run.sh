@@ -132,7 +132,7 @@ measure_render() {
 }
 
 measure_devices() {
-    step "two devices" "${DEVICES_LIMIT:-$1}" "$python" -m tools.checks.compare_pictures --devices "cpu,$device" "${models[@]}" "${lights[@]}"
+    step "two devices" "${DEVICES_LIMIT:-$1}" "$python" -m tools.compare pictures --devices "cpu,$device" "${models[@]}" "${lights[@]}"
 }
 
 # Determinism: bakes with the first and the last world count, compared byte by byte, and simulations with all world counts.
@@ -144,9 +144,9 @@ measure_sameness() {
             --worlds "$count" --episodes "${SAME_EPISODES:-8}" --resolution 320x180 --formats bop,shards,usd,zarr "${settings[@]}" \
             --set "render.layers=[normals,albedo,nocs,classes,flow,scene_flow,depth_sensor]" --out "$bakes/same-$count"
     done
-    step "both bakes" 60 "$python" -m tools.checks.compare_runs "$bakes/same-${worlds%%,*}" "$bakes/same-${worlds##*,}"
+    step "both bakes" 60 "$python" -m tools.compare runs "$bakes/same-${worlds%%,*}" "$bakes/same-${worlds##*,}"
     step "trajectories" 30 "$python" -m tools.checks.trajectory "$bakes/same-${worlds%%,*}"
-    step "world counts" "$((all / 2))" "$python" -m tools.checks.compare_worlds --device "$device" "${models[@]}" --worlds "$worlds" \
+    step "world counts" "$((all / 2))" "$python" -m tools.compare worlds --device "$device" "${models[@]}" --worlds "$worlds" \
         --episodes "${SAME_EPISODES:-8}" --ticks "${SAME_TICKS:-60}" --set bake.mode=mixed "${settings[@]}" --json "$results/worlds.json"
 }
 

@@ -1,0 +1,149 @@
+"""The guard of two checkouts: texts, files and kernels that differ are found, and what may differ is not."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import pytest
+
+from tests.harness.environment import ROOT
+from tools.compare import guard, guard_device, kernel_sources
+from tools.compare.__main__ import main
+from tools.compare.guard_steps import SETS, Step, cpu_steps
+
+SOURCE = """
+// scale: a comment
+#define float(x) cast_float(x)
+static CUDA_CALLABLE wp::float32 {scale}_0(
+    wp::float32 var_{factor})
+{{
+    if (true) {{ var_1 = wp::mul(var_{factor}, {two}); }}
+    return var_1;
+}}
+extern "C" __global__ void WP_MAXNREG(64) {kernel}_0123abcd_cuda_kernel_forward(
+    wp::launch_bounds_t<1> dim)
+{{
+    var_2 = {scale}_0(var_0);  // x = scale(y)  <L 7>
+}}
+"""
+NAMES = {"scale": "scale", "factor": "factor", "two": "2.0", "kernel": "scale_kernel"}
+
+
+def canonical(**changes: str) -> str:
+    definitions = kernel_sources.split_definitions(SOURCE.format_map(NAMES | changes))
+    (kernel,) = (name for name in definitions if name.endswith("_forward"))
+    return kernel_sources.canonical(kernel, definitions)
+
+
+def test_names_do_not_matter_to_a_kernels_source():
+    assert canonical() == canonical(scale="enlarge", factor="gain", kernel="enlarge_kernel")
+    assert "// " not in canonical()
+
+
+def test_values_matter_also_in_functions_that_a_kernel_calls():
+    assert kernel_sources.first_difference([canonical()], [canonical(two="3.0")]).endswith(
+        "wp::mul(p0, 2.0); } | if (true) { var_1 = wp::mul(p0, 3.0); }"
+    )
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "verdict", "detail"),
+    [
+        ({"a": ["x"]}, {"a": ["x"]}, "equal", "1 kernels"),
+        ({"a": ["x"]}, {"b": ["x"]}, "equal", "1 kernels; a is now b"),
+        ({"a": ["x"]}, {"a": ["y"]}, "different", "1 of 1 kernels; a: line 1: x | y"),
+        ({"a": ["x"]}, {"a": ["x"], "b": ["y"]}, "different", "1 kernels; only new: b"),
+        ({"a": ["x"], "b": ["y"]}, {"a": ["x"]}, "different", "2 kernels; only old: b"),
+    ],
+)
+def test_kernels_are_compared_by_source(tmp_path, old, new, verdict, detail):
+    files = [tmp_path / name for name in ("old.json", "new.json")]
+    for file, content in zip(files, (old, new), strict=True):
+        file.write_text(json.dumps(content))
+    line = guard._compare_kernels("modules", *files)
+    assert (line.verdict, line.detail) == (verdict, detail)
+
+
+def sides(tmp_path: Path) -> list[guard.Side]:
+    found = [guard.Side(ROOT, tmp_path / name) for name in ("old", "new")]
+    for side in found:
+        (side.folder / "text").mkdir(parents=True)
+    return found
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "verdict"),
+    [
+        ("3 views in 0:03 (15.6 views/s)", "3 views in 0:12 (3.1 views/s)", "equal"),
+        ("   0:05  views 3\n3 views", "   0:06  views 1\n   0:07  views 2\n3 views", "equal"),
+        ('"seconds_per_image": 0.25', '"seconds_per_image": 1.5e-05', "equal"),
+        ("3 views", "4 views", "different"),
+        ("3 views", "3 views\n1 warning", "different"),
+    ],
+)
+def test_texts_are_compared_without_times_and_progress(tmp_path, old, new, verdict):
+    step = Step("verify picks", ("verify", "picks"))
+    for side, text in zip(both := sides(tmp_path), (old, new), strict=True):
+        side.text_file(step).write_text(f"exit code 0\n{side.folder}/picks\n{text}\n")
+    (line,) = guard._compare_step(*both, step, ("commands",))
+    assert line.verdict == verdict
+
+
+def test_a_command_that_fails_in_both_is_not_equal(tmp_path):
+    step = Step("verify picks", ("verify", "picks"))
+    for side in (both := sides(tmp_path)):
+        side.text_file(step).write_text("exit code 2\nsynpick-warp: error: no\n")
+    (line,) = guard._compare_step(*both, step, ("commands",))
+    assert (line.verdict, line.detail) == ("failed", "old: exit code 2: synpick-warp: error: no")
+
+
+def test_estimates_are_compared_without_their_time(tmp_path):
+    files = [tmp_path / name for name in ("a.csv", "b.csv", "c.csv")]
+    for file, line in zip(files, ("0,1,2.5,0.1", "0,1,2.5,0.2", "0,1,2.6,0.1"), strict=True):
+        file.write_text(f"scene,image,score,time\n{line}\n")
+    assert guard._compare_output("commands", files[0], files[1]).verdict == "equal"
+    assert guard._compare_output("commands", files[0], files[2]).verdict == "different"
+
+
+def test_each_set_is_verified_and_every_format_and_layer_is_in_one():
+    names = [step.name for step in cpu_steps(guard.CPU_PARTS)]
+    assert len(SETS) == 6
+    assert {f"{command} {name}" for name in SETS for command in ("bake", "verify", "validate", "stats")} <= set(names)
+    assert len(set(names)) == len(names)
+
+
+def test_digests_leave_out_worlds_and_version(tmp_path):
+    for name, settings in (("a", "worlds = 8"), ("b", "worlds = 512")):
+        (tmp_path / name / "train").mkdir(parents=True)
+        (tmp_path / name / "config.toml").write_text(settings)
+        (tmp_path / name / "train" / "scene_gt.json").write_text("{}")
+    assert guard_device.digest_folder(tmp_path / "a") == guard_device.digest_folder(tmp_path / "b")
+    (tmp_path / "b" / "train" / "scene_gt.json").write_text("[]")
+    assert guard_device.digest_folder(tmp_path / "a") != guard_device.digest_folder(tmp_path / "b")
+
+
+def test_a_changed_kernel_is_named(tmp_path, capsys):
+    """The guard on this checkout and a copy of it with one other number in a device function."""
+    copy = tmp_path / "copy"
+    for name in guard.PACKAGE_FOLDERS:
+        shutil.copytree(ROOT / name, copy / name, symlinks=True, ignore=shutil.ignore_patterns("__pycache__"))
+    file = copy / "kernels" / "rng.py"
+    changed = file.read_text().replace("5.9604644775390625e-08", "5.9604644775390626e-07")
+    file.write_text(changed)
+    assert main(["guard", str(ROOT), str(copy), "--parts", "kernels"]) == 1
+    (line,) = (line for line in capsys.readouterr().out.splitlines() if line.startswith("different"))
+    assert "begin_moving_kernel: line" in line
+    assert line.count("kernel: line") <= guard.MAX_NAMED
+
+
+def test_a_folder_without_the_package_is_an_error(tmp_path, capsys):
+    assert main(["guard", str(ROOT), str(tmp_path)]) == 2
+    assert "is no checkout" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("arguments", [[], ["dance"]])
+def test_unknown_comparisons_are_one_line(arguments, capsys):
+    assert main(arguments) == 2
+    assert len(capsys.readouterr().err.splitlines()) == 1
