@@ -130,7 +130,8 @@ def check(dataset: Path, count: int) -> dict[str, Measure]:
         names = sorted(store["episodes"].group_keys())  # type: ignore[union-attr]
     except (OSError, KeyError, ValueError) as error:
         raise UnusableError(f"{dataset} has no trajectories and settings: {error}") from error
-    measures, root = make_measures(), dict(store.attrs)
+    measures: dict[str, Measure] = make_measures()
+    root: dict[str, Any] = dict(store.attrs)
     # The diameter bounds the distance of an object's origin from its centre of mass.
     radius = dict(zip(store["objects/object_id"][:].tolist(), store["objects/diameter"][:].tolist(), strict=True))  # type: ignore[index,union-attr]
     for index in np.unique(np.linspace(0, len(names) - 1, count).round().astype(int)) if names else ():
