@@ -5,9 +5,11 @@ from __future__ import annotations
 import json
 import shutil
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
+import synpick_warp
 from tests.harness.environment import ROOT
 from tools.compare import guard, guard_device, kernel_sources
 from tools.compare.__main__ import main
@@ -99,12 +101,43 @@ def test_a_command_that_fails_in_both_is_not_equal(tmp_path):
     assert (line.verdict, line.detail) == ("failed", "old: exit code 2: synpick-warp: error: no")
 
 
-def test_estimates_are_compared_without_their_time(tmp_path):
-    files = [tmp_path / name for name in ("a.csv", "b.csv", "c.csv")]
-    for file, line in zip(files, ("0,1,2.5,0.1", "0,1,2.5,0.2", "0,1,2.6,0.1"), strict=True):
-        file.write_text(f"scene,image,score,time\n{line}\n")
-    assert guard._compare_output("commands", files[0], files[1]).verdict == "equal"
-    assert guard._compare_output("commands", files[0], files[2]).verdict == "different"
+@pytest.mark.parametrize(
+    ("name", "old", "new", "verdict"),
+    [
+        ("single.csv", "image,score,time\n1,2.5,0.1\n", "image,score,time\n1,2.5,0.2\n", "equal"),
+        ("single.csv", "image,score,time\n1,2.5,0.1\n", "image,score,time\n1,2.6,0.1\n", "different"),
+        ("report.html", f"baked by {synpick_warp.__version__}", f"baked by {synpick_warp.__version__}", "equal"),
+        ("sheet.png", "a", "b", "different"),
+    ],
+)
+def test_files_are_compared_without_times(tmp_path, name, old, new, verdict):
+    for side, content in zip(both := sides(tmp_path), (old, new), strict=True):
+        (side.folder / name).write_text(content)
+    assert guard._compare_output("commands", *both, name).verdict == verdict
+
+
+@pytest.mark.parametrize("digests", [("a", "a"), ("a", "b")])
+def test_all_worlds_of_both_checkouts_have_one_digest(tmp_path, monkeypatch, digests):
+    options = SimpleNamespace(device="cuda:0", models="", lights="")
+    monkeypatch.setattr(guard_device, "_run", lambda *_: "")
+    monkeypatch.setattr(guard_device, "digest_folder", lambda folder: digests[folder.parent.name == "new"])
+    results = list(guard_device.compare_worlds(*sides(tmp_path), options))
+    assert len(results) >= 2 * len(guard_device.WORLDS)
+    assert [verdict for title, verdict, _ in results if title.startswith("old")] == ["equal"] * (len(results) // 2)
+    assert {verdict for title, verdict, _ in results if title.startswith("new")} == {"equal" if digests[0] == digests[1] else "different"}
+
+
+@pytest.mark.parametrize(("rates", "verdict"), [((1000.0, 995.0), "equal"), ((1000.0, 985.0), "different"), ((1000.0, 1100.0), "equal")])
+def test_pictures_may_be_one_percent_slower(tmp_path, monkeypatch, rates, verdict):
+    def measure(side: guard.Side, command: tuple[str, ...]) -> str:
+        rows = [{"name": "all stages: views, median of 5 passes", "unit": "1/s", "value": rates[side.folder.name == "new"]}]
+        (side.folder / command[-1]).write_text(json.dumps({"rows": rows}))
+        return ""
+
+    monkeypatch.setattr(guard_device, "_run", measure)
+    ((_, found, detail),) = guard_device.compare_pictures(*sides(tmp_path), SimpleNamespace(device="cuda:0", models="", lights=""))
+    assert found == verdict
+    assert detail.startswith("1000.0 and")
 
 
 def test_each_set_is_verified_and_every_format_and_layer_is_in_one():

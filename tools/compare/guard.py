@@ -127,6 +127,7 @@ def main(arguments: list[str] | None = None) -> int:
         sides = [Side(checkout, work / name) for checkout, name in zip(checkouts, _folder_names(checkouts), strict=True)]
         for side in sides:
             side.folder.mkdir(parents=True, exist_ok=True)
+            (side.folder / guard_steps.SPLITS_FILE).write_text(guard_steps.SPLITS)
         lines = []
         for line in compare(sides[0], sides[1], options):
             print(line, flush=True)
@@ -195,7 +196,7 @@ def _compare_step(old: Side, new: Side, step: Step, parts: tuple[str, ...]) -> I
             yield Line(part, step.name, "failed", f"{side}: {text.splitlines()[0]}: {text.splitlines()[-1]}")
             return
     if step.output and (part in parts):
-        yield _compare_output(part, old.folder / step.output, new.folder / step.output)
+        yield _compare_output(part, old, new, step.output)
     if "commands" in parts and step.arguments:
         difference = kernel_sources.first_difference([texts[0]], [texts[1]])
         yield Line("commands", f"text of {step.name}", "different" if difference else "equal", difference)
@@ -203,15 +204,21 @@ def _compare_step(old: Side, new: Side, step: Step, parts: tuple[str, ...]) -> I
         yield _compare_kernels(step.name, old.folder / step.kernels, new.folder / step.kernels)
 
 
-def _compare_output(part: str, old: Path, new: Path) -> Line:
-    """Line about a file or folder that a step has written."""
+def _compare_output(part: str, old_side: Side, new_side: Side, name: str) -> Line:
+    """Line about a file or folder that a step has written; estimates have no time, pages no version."""
+    old, new = old_side.folder / name, new_side.folder / name
     if old.suffix:
-        first, second = (_LAST_COLUMN.sub(b"", path.read_bytes()) if path.suffix == ".csv" else path.read_bytes() for path in (old, new))
-        return Line(part, old.name, "equal" if first == second else "different", f"{len(first):,} and {len(second):,} bytes")
+        contents = [path.read_bytes() for path in (old, new)]
+        if old.suffix == ".csv":
+            contents = [_LAST_COLUMN.sub(b"", content) for content in contents]
+        if old.suffix == ".html":
+            contents = [content.replace(side.version.encode(), b"") for content, side in zip(contents, (old_side, new_side), strict=True)]
+        verdict = "equal" if contents[0] == contents[1] else "different"
+        return Line(part, name, verdict, " and ".join(f"{len(content):,}" for content in contents) + " bytes")
     try:
         layers, difference = runs.compare(old, new)
     except runs.UnusableError as error:
-        return Line(part, old.name, "failed", str(error))
+        return Line(part, name, "failed", str(error))
     files, differing = (sum(getattr(layer, name) for layer in layers.values()) for name in ("files", "differing"))
     return Line(
         part,

@@ -23,8 +23,10 @@ WORLDS = (8, 512)
 """World counts in which the same episodes are baked."""
 ROUNDS = 2
 """Measurements of each checkout, in turns."""
+PICTURE_WORLDS = 128
+"""Worlds of these: four measurements take less than ten minutes."""
 TOLERANCE = 0.01
-"""Difference of the rates of pictures that passes."""
+"""How much slower pictures may become; they may become faster."""
 LEFT_OUT = ("config.toml", "manifest.json")
 """Files that differ with the number of worlds, or with the program's version."""
 
@@ -61,12 +63,24 @@ def digest_folder(folder: Path) -> str:
 def compare_pictures(old: Side, new: Side, options: argparse.Namespace) -> Iterator[Result]:
     """Measure the renderer's rate of both checkouts in turns, and compare the medians of all rows in views/s."""
     rates: dict[str, dict[str, list[float]]] = {"old": {}, "new": {}}
-    places = (("--models", options.models), ("--lights", options.lights))
-    inputs = [argument for name, value in places if value for argument in (name, value)]
+    fixed = ["--device", options.device, "--parts", "pictures", "--worlds", str(PICTURE_WORLDS)]
+    fixed += [argument for name in ("models", "lights") if (folder := getattr(options, name)) for argument in (f"--{name}", folder)]
     for turn in range(ROUNDS):
         for name, side in (("old", old), ("new", new)):
             file = f"pictures-{turn}.json"
-            command = ("-m", "tools.bench", "--device", options.device, "--parts", "pictures", *inputs, "--json", file)
+            command = (
+                "-m",
+                "tools.bench",
+                "--device",
+                options.device,
+                "--parts",
+                "pictures",
+                "--worlds",
+                str(PICTURE_WORLDS),
+                *inputs,
+                "--json",
+                file,
+            )
             if failure := _run(side, command):
                 yield f"{name}, turn {turn}", "failed", failure
                 return

@@ -48,10 +48,15 @@ SETS: dict[str, dict[str, object]] = {
     "picks": {**PICKING, "bake.formats": ["bop", "zarr"], "bop.keypoints": 4},
     "all": {**JPEG, "bake.formats": ["bop", "shards", "usd", "zarr", "lerobot", "coco"], "render.layers": LAYERS},
     "sensors": {**TINY, **JPEG, **EFFECTS, "bake.formats": ["bop", "zarr"], "bop.layout": "multisensor"},
-    "reference": {**TINY, "render.mode": "reference", "render.samples": 4, "arrangement.fill": "within"},
-    "unoccluded": {**TINY, "bake.formats": ["shards", "zarr"], "render.mode": "unoccluded", "bake.seed": 7},
+    "reference": {**TINY, "render.mode": "reference", "render.samples": 4, "bake.models": "smoke/models", "arrangement.fill": "within"},
+    "unoccluded": {**PICKING, **TINY, "bake.formats": ["shards", "zarr"], "render.mode": "unoccluded", "bake.seed": 7},
 }
 """Data set -> settings of its bake beside those of `SMALL`."""
+SPLITS_FILE = "splits.toml"
+"""File of settings that the guard writes before the bakes: `SPLITS`."""
+SPLITS = 'preset = "smoke"\n[splits.train]\nepisodes = 1\n[splits.test]\nepisodes = 1\nmode = "pick"\n'
+SPLIT_SET = "unoccluded"
+"""Data set that is baked with this file."""
 CONVERSIONS = {"picks": "shards,usd,lerobot,coco", "smoke": "shards,coco", "unoccluded": "bop,usd,lerobot,coco"}
 """Data set -> formats that it is converted to."""
 RECORDED = ("bake all", "bake reference", "bake unoccluded", "estimate refine")
@@ -80,7 +85,8 @@ def cpu_steps(parts: tuple[str, ...]) -> Iterator[Step]:
     if "kernels" in parts:
         yield Step("modules", ())
     for name, settings in SETS.items() if {"sets", "commands"} & set(parts) else ():
-        yield Step(f"bake {name}", ("bake", "--config", "smoke", *_assignments({**SMALL, **settings}), "--out", name), name)
+        preset = SPLITS_FILE if name == SPLIT_SET else "smoke"
+        yield Step(f"bake {name}", ("bake", "--config", preset, *_assignments({**SMALL, **settings}), "--out", name), name)
     if "commands" in parts:
         for name in SETS:
             yield Step(f"verify {name}", ("verify", name))
