@@ -19,6 +19,7 @@ With `--work DIR` results are kept, by the content of the checkout: the next run
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import hashlib
 import inspect
 import json
@@ -40,7 +41,7 @@ import warp as wp
 from tools.compare import guard_steps, kernel_sources, runs
 from tools.compare.guard_device import compare_pictures, compare_worlds
 from tools.compare.guard_steps import Step, cpu_steps
-from tools.options import fail, make_names_parser
+from tools.options import fail, make_names_parser, make_parser, write_json
 
 CPU_PARTS = ("sets", "commands", "kernels")
 GPU_PARTS = ("worlds", "pictures")
@@ -85,8 +86,9 @@ class Side:
         return match[1] if match else "unknown"
 
     def environment(self) -> dict[str, str]:
-        """Environment of its commands: its code, and a fixed width of text."""
-        fixed = {"PYTHONPATH": str(self.checkout), "COLUMNS": "160", "TERM": "dumb", "NO_COLOR": "1", "PYTHONUTF8": "1"}
+        """Environment of its commands: its code before all other places of packages, and a fixed width of text."""
+        places = [str(self.checkout), *filter(None, [os.environ.get("PYTHONPATH")])]
+        fixed = {"PYTHONPATH": os.pathsep.join(places), "COLUMNS": "160", "TERM": "dumb", "NO_COLOR": "1", "PYTHONUTF8": "1"}
         return os.environ | fixed
 
     def run(self, step: Step) -> None:
@@ -132,13 +134,14 @@ def main(arguments: list[str] | None = None) -> int:
         for line in compare(sides[0], sides[1], options):
             print(line, flush=True)
             lines.append(line)
+    write_json(options.json, [dataclasses.asdict(line) for line in lines])
     different = [line for line in lines if line.verdict != "equal"]
     print(f"{len(lines) - len(different)} of {len(lines)} equal: {sides[0].checkout} and {sides[1].checkout}")
     return int(bool(different))
 
 
 def _parse(arguments: list[str] | None) -> argparse.Namespace:
-    parser = argparse.ArgumentParser(prog="tools.compare guard", description=(__doc__ or "").partition("\n")[0])
+    parser = make_parser(__doc__, "models", "lights", "json")
     parser.add_argument("old", type=Path, metavar="OLD", help="folder of a checkout")
     parser.add_argument("new", type=Path, metavar="NEW", help="folder of another")
     parser.add_argument(
@@ -147,11 +150,11 @@ def _parse(arguments: list[str] | None) -> argparse.Namespace:
         help=f"any of {','.join(CPU_PARTS + GPU_PARTS)} (default: by --device)",
     )
     parser.add_argument("--device", default="cpu", help="cpu, or cuda:N for the parts worlds and pictures (default: cpu)")
-    parser.add_argument("--models", default="", help="folder of BOP models for worlds and pictures (default: the embedded objects)")
-    parser.add_argument("--lights", default="", help="folder of light maps for worlds and pictures (default: the embedded skies)")
     parser.add_argument("--work", type=Path, help="folder in which results are kept for the next run (default: a temporary one)")
     parser.add_argument("--jobs", type=int, choices=(1, 2), default=2, help="checkouts that run at a time (default: 2)")
     options = parser.parse_args(arguments)
+    for name in ("models", "lights"):
+        setattr(options, name, str(Path(folder).resolve()) if (folder := getattr(options, name)) else "")
     options.parts = options.parts or (CPU_PARTS if options.device == "cpu" else GPU_PARTS)
     return options
 

@@ -68,19 +68,7 @@ def compare_pictures(old: Side, new: Side, options: argparse.Namespace) -> Itera
     for turn in range(ROUNDS):
         for name, side in (("old", old), ("new", new)):
             file = f"pictures-{turn}.json"
-            command = (
-                "-m",
-                "tools.bench",
-                "--device",
-                options.device,
-                "--parts",
-                "pictures",
-                "--worlds",
-                str(PICTURE_WORLDS),
-                *inputs,
-                "--json",
-                file,
-            )
+            command = ("-m", "tools.bench", *fixed, "--json", file)
             if failure := _run(side, command):
                 yield f"{name}, turn {turn}", "failed", failure
                 return

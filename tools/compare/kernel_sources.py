@@ -77,18 +77,21 @@ def package_modules() -> Iterator[Any]:
 
 
 def composed_modules() -> Iterator[Any]:
-    """Warp modules of kernels that are composed for a GPU: the solver's iterations, and the narrow phase with our options."""
-    steel = importlib.import_module("newton._src.solvers.steel.solver_steel")
+    """Warp modules of kernels that are composed for a GPU: the solver's iterations, and the narrow phase with our options.
+
+    Their functions are found by name, wherever they lie; without one, its kernels are missing.
+    """
     import_all(f"{PACKAGE}.stages")
-    yield find("compose_kernel")(
-        steel._get_pgs_solve_mf_gs_kernel(
-            ROWS, ROWS, DOFS, ARCHITECTURE, has_dense_velocity_limit_rows=False, shared_metadata=True, row_phases=True
-        ),
-        steel._get_refresh_propagation_tree_body_qd_warp_kernel(4, 2, ARCHITECTURE),
-        find("compose_contacts")(ROWS, BODIES),
-        steel._get_propagate_tree_impulses_revolute_kernel(4, 2, ARCHITECTURE, has_free_root=True),
-    ).module
-    yield from (build.module for build in find("slow_builds")(SimpleNamespace(is_cuda=True, alias="cuda:0")))
+    compose_kernel, compose_contacts, slow_builds = (find(name) for name in ("compose_kernel", "compose_contacts", "slow_builds"))
+    if compose_kernel and compose_contacts:
+        steel = importlib.import_module("newton._src.solvers.steel.solver_steel")
+        phases = {"has_dense_velocity_limit_rows": False, "shared_metadata": True, "row_phases": True}
+        joint_rows = steel._get_pgs_solve_mf_gs_kernel(ROWS, ROWS, DOFS, ARCHITECTURE, **phases)
+        refresh = steel._get_refresh_propagation_tree_body_qd_warp_kernel(4, 2, ARCHITECTURE)
+        propagate = steel._get_propagate_tree_impulses_revolute_kernel(4, 2, ARCHITECTURE, has_free_root=True)
+        yield compose_kernel(joint_rows, refresh, compose_contacts(ROWS, BODIES), propagate).module
+    if slow_builds:
+        yield from (build.module for build in slow_builds(SimpleNamespace(is_cuda=True, alias="cuda:0")))
 
 
 def import_all(package: str) -> None:
@@ -99,8 +102,9 @@ def import_all(package: str) -> None:
 
 
 def find(name: str) -> Any:
-    """The object that a loaded module of the package calls `name`, wherever that module lies."""
-    return next(vars(module)[name] for key, module in sorted(sys.modules.items()) if key.startswith(PACKAGE) and name in vars(module))
+    """The object that a loaded module of the package calls `name`; None: no module does."""
+    found = (vars(module).get(name) for key, module in sorted(sys.modules.items()) if key.startswith(PACKAGE))
+    return next((each for each in found if each is not None), None)
 
 
 def kernels_of(module: Any) -> Iterator[tuple[str, str]]:
