@@ -51,8 +51,11 @@ PACKAGE_FOLDERS = ("synpick_warp", "kernels", "scenes", "configs")
 """Folders of a checkout on which results depend."""
 _PROGRESS = re.compile(r"^(?: +\d+:\d\d  .*|\w+ [\d,]+/[\d,]+)\n", re.MULTILINE)
 """Lines of progress, which come as time passes."""
-_TIMES = re.compile(r"\b\d+:\d\d(?::\d\d)?\b|\b[\d.,]+(?= (?:views/s|s\b))|(?<=\"seconds_per_image\": )[\d.e-]+|(?<= poses in )[^\n]*")
-"""Durations and rates."""
+_TIMES = re.compile(
+    r"\b\d+:\d\d(?::\d\d)?\b|\b[\d.,]+(?= (?:views/s|s\b))|(?<=\"seconds_per_image\": )[\d.e-]+|(?<= poses in )[^\n]*"
+    r"|(?<=peak memory )[\d,]+(?= MiB)"
+)
+"""Durations, rates and memory."""
 _LAST_COLUMN = re.compile(rb",[^,\n]*$", re.MULTILINE)
 """The time of a pose estimate."""
 _VERSION = re.compile(r'^__version__ = "([^"]+)"', re.MULTILINE)
