@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from synpick_warp.online.stream import ViewStream
     from synpick_warp.progress import Progress
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
 __all__ = [
     "CatalogError",
     "ConfigError",

@@ -28,8 +28,8 @@ Vector = tuple[float, ...]
 
 @dataclass(frozen=True)
 class InstanceObservation:
-    """Perception result of one instance, with the JSON keys as names: share is `Observation.visible_fraction`, middle `midpoint`,
-    suction `grasp_pixel`, all_above `ancestors`; see `stages.perception.arrays` for units and meaning. Pixels are column, row."""
+    """Perception result of one instance, with the JSON keys as names; see `stages.perception.arrays` for units and meaning. Pixels are
+    (column, row)."""
 
     instance: int
     object_id: int

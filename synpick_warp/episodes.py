@@ -67,9 +67,9 @@ class BakeSummary:
     """Views written by this run."""
     wall_seconds: float = 0.0
     """Time from the first tick to the last file [s]."""
-    redraws: int = 0
+    resampled: int = 0
     """Arrangements that ended without delivery and were resampled."""
-    redrawn: dict[Ending, int] = field(default_factory=dict)
+    resampled_by_ending: dict[Ending, int] = field(default_factory=dict)
     """These arrangements, by ending."""
     remedies: dict[Ending, str] = field(default_factory=dict)
     """Advice against these endings, where a setting cures them; see `remedy`."""
@@ -91,9 +91,9 @@ class BakeSummary:
         self.episodes += other.episodes
         self.episodes.sort()
         self.views += other.views
-        self.redraws += other.redraws
-        for ending, count in other.redrawn.items():
-            self.redrawn[ending] = self.redrawn.get(ending, 0) + count
+        self.resampled += other.resampled
+        for ending, count in other.resampled_by_ending.items():
+            self.resampled_by_ending[ending] = self.resampled_by_ending.get(ending, 0) + count
         self.remedies |= other.remedies
         self.outcomes.update(other.outcomes)
         self.stopped = self.stopped or other.stopped
@@ -101,8 +101,8 @@ class BakeSummary:
 
     def take_resample(self, ending: Ending) -> None:
         """Add an arrangement that ended without delivery and will be resampled."""
-        self.redraws += 1
-        self.redrawn[ending] = self.redrawn.get(ending, 0) + 1
+        self.resampled += 1
+        self.resampled_by_ending[ending] = self.resampled_by_ending.get(ending, 0) + 1
 
     def take_episode(self, row: EpisodeRow, record: EpisodeRecord) -> None:
         """Add an episode that has ended."""

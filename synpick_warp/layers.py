@@ -5,7 +5,7 @@ To add a layer:
 
 1. add a row to `LAYER_TABLE`, and an encoding to `layer_codec.CODECS` if none fits;
 2. write its kernel in `kernels/render/images/`, and name kernel and inputs in `LayerRenderer.render` (`stages/render/layers.py`);
-3. state the tolerance between CPU and GPU in `tools/checks/compare_pictures.py`, and a sample value in `tests/test_layer_codec.py`;
+3. state the tolerance between CPU and GPU in `tools/compare/pictures.py`, and a sample value in `tests/test_layer_codec.py`;
    tests fail until both are there. A drawing in `viz/preview_layers.py` is optional.
 """
 

@@ -339,7 +339,7 @@ def test_drawn_again_and_counted(tmp_path):
 
     config = tiny(settle__max_time=0.1, settle__tries=2, bake__episodes=1, bake__worlds=1)
     summary = run_bake(config, tmp_path / "set", Notes())
-    assert (summary.redraws, summary.redrawn) == (1, {Ending.UNSETTLED: 1})
+    assert (summary.resampled, summary.resampled_by_ending) == (1, {Ending.UNSETTLED: 1})
     assert [(row.episode, row.arrangement, row.ending) for row in summary.episodes] == [(0, 1, Ending.UNSETTLED)]
     advice = "raise settle.max_time (0.1) or settle.max_redrops (8)"
     assert noted == [f"episode 0, arrangement 1: {Ending.UNSETTLED.sentence}; {advice}"]

@@ -7,6 +7,7 @@ import os
 import re
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
 
 import pytest
@@ -16,13 +17,16 @@ from tests.harness.environment import checkout_environment
 ROOT = Path(__file__).resolve().parents[1]
 README = (ROOT / "README.md").read_text()
 BLOCK = re.compile(r"(?P<skipped><!-- not run: [^\n]* -->\n)?```(?P<language>bash|python)\n(?P<text>.*?)```\n", re.DOTALL)
-DOCUMENTS = [
-    *ROOT.glob("*.md"),
-    *ROOT.glob("*/README.md"),
-    ROOT / "synpick_warp" / "exporters" / "README.md",
-    ROOT / "synpick_warp" / "online" / "README.md",
-    ROOT / ".github" / "CONTRIBUTING.md",
-]
+FOLDERS = (".github", "configs", "kernels", "scenes", "synpick_warp", "tests", "tools")
+HISTORY = ROOT / "CHANGELOG.md"
+"""Its paths are those of their time."""
+DOCUMENTS = sorted({*ROOT.glob("*.md"), *(path.resolve() for folder in FOLDERS for path in (ROOT / folder).rglob("*.md"))})
+SOURCE = re.compile(r"`([\w.-]+(?:/[\w.*-]+)+)/?(?::[\w.]+)?`")
+"""A path in backticks, such as `stages/ticks:TickLoop.advance` or `tests/stubs/`."""
+BASES = ("", "synpick_warp", "synpick_warp/stages", "synpick_warp/exporters", "kernels", "kernels/render")
+"""Folders that paths in backticks leave out, besides that of their document."""
+DATA = {"SPLIT", "Shoe", "coco", "episodes", "manifest", "materials", "meta", "models", "source", "train_pbr_web", "usd"}
+"""First parts of paths in data sets and folders of models."""
 SECONDS = 600
 """Longest time that a block may take."""
 
@@ -65,6 +69,22 @@ def test_links_of_documents_lead_somewhere(document):
     links = re.findall(r"\]\(([^)#]+)(?:#[^)]*)?\)", document.read_text())
     missing = [link for link in links if not link.startswith("http") and not (document.parent / link).exists()]
     assert missing == []
+
+
+@pytest.mark.parametrize("document", [path for path in DOCUMENTS if path != HISTORY], ids=lambda path: path.relative_to(ROOT).as_posix())
+def test_paths_in_documents_exist(document):
+    named = {path for path in SOURCE.findall(document.read_text()) if path.partition("/")[0] not in DATA}
+    bases = (document.parent, *(ROOT / base for base in BASES))
+    missing = {path for path in named if not any(list(base.glob(path + suffix)) for base in bases for suffix in ("", ".py"))}
+    assert missing == set()
+
+
+def test_the_levels_of_contributing_are_those_of_the_import_contract():
+    layers = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["importlinter"]["contracts"][0]["layers"]
+    shown = re.search(r"^    cli .*?(?=\n\n)", (ROOT / ".github" / "CONTRIBUTING.md").read_text(), re.DOTALL | re.MULTILINE)
+    assert shown
+    levels = [re.findall(r"\w+", level) for level in shown[0].split("►")]
+    assert levels == [re.findall(r"\w+", layer) for layer in layers]
 
 
 def test_the_readme_is_short():

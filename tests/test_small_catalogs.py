@@ -39,7 +39,7 @@ def test_a_catalog_of_one_or_two_objects_gives_episodes(mode, sizes, tmp_path):
     config = load_config("smoke", SETTINGS | {"bake.mode": mode, "bake.models": str(tmp_path / "models")})
     summary = run_bake(config, tmp_path / "out", SilentProgress())
     assert [row.ending.delivers for row in summary.episodes] == [True]
-    assert summary.redraws == 0
+    assert summary.resampled == 0
     assert summary.views > 0
 
 

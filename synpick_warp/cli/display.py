@@ -154,7 +154,7 @@ def print_summary(console: Console, summary: BakeSummary, out: Path) -> None:
     before = f" ({summary.resumed:,} of them before)" if summary.resumed else ""
     console.print(
         f"{len(summary.episodes) - len(failed)} of {summary.total} episodes{before} and {summary.views:,} views"
-        f" in {_duration(summary.wall_seconds)} ({rate:.1f} views/s); arrangements drawn again: {summary.redraws}",
+        f" in {_duration(summary.wall_seconds)} ({rate:.1f} views/s); arrangements resampled: {summary.resampled}",
         markup=False,
         soft_wrap=True,
     )
@@ -191,7 +191,7 @@ def print_profile(console: Console, recorder: Recorder) -> None:
 
 def _listing(rows: Sequence[EpisodeRow]) -> Table:
     """Table with one line per episode."""
-    columns = ["episode", "mode", "ending", "redraws", "frames", "time"]
+    columns = ["episode", "mode", "ending", "resampled", "frames", "time"]
     cells = [
         [str(row.episode), row.mode, row.ending.sentence, str(row.arrangement), str(row.frames), _duration(row.seconds)] for row in rows
     ]

@@ -10,7 +10,8 @@ How to add a format:
 4. Add the names of its files to `dataset/file_names.py`: `merge`, `convert` and `verify` take no others.
 5. Let its test class inherit `ExporterContract` (tests/harness/exporter_contract.py): determinism, atomic commits, resuming.
 
-A new subpackage also goes into `packages` in pyproject.toml. Nothing else lists formats.
+That makes a format that is baked. For `convert`, it also needs a converter in `CONVERTERS` (conversion/converters.py); packages of its own
+stand in `FORMAT_PACKAGES` (dataset/manifest.py) and in `_EXTRAS` here; views are read from it where `dataset/scene_index.py` finds them.
 """
 
 from __future__ import annotations

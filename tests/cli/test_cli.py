@@ -26,7 +26,7 @@ from synpick_warp.stages import timing
 
 def finished(number: int) -> BakeSummary:
     rows = [EpisodeRow(episode, 0, Ending.FINISHED, 10, 1.0, "move", 9, 0, 0, 0, 9) for episode in range(number)]
-    return BakeSummary(number, rows, views=30 * number, wall_seconds=2.0, redraws=1)
+    return BakeSummary(number, rows, views=30 * number, wall_seconds=2.0, resampled=1)
 
 
 @pytest.fixture
@@ -79,7 +79,7 @@ def test_bake_passes_resolved_settings_on(tmp_path, bakes, capsys):
     printed = capsys.readouterr().out
     assert "building worlds\n" in printed
     assert "episodes 0/2 · worlds 2 · views 0" in printed
-    assert "4 of 4 episodes and 120 views in 0:02 (60.0 views/s); arrangements drawn again: 1" in printed
+    assert "4 of 4 episodes and 120 views in 0:02 (60.0 views/s); arrangements resampled: 1" in printed
 
 
 def test_bake_passes_devices_and_automatic_sizes_on(tmp_path, bakes):

@@ -11,7 +11,7 @@ import warp as wp
 
 from synpick_warp.configs.schema import FAST, LAYERS, REFERENCE, RENDER_MODES
 from synpick_warp.stages.buffers import ViewBuffers
-from tools.checks import compare_pictures as tool
+from tools.compare import pictures as tool
 
 FEW_STEPS = (
     "--set",
@@ -102,7 +102,7 @@ def test_a_device_equals_itself(tmp_path):
 def test_a_missing_gpu_is_an_error(capsys):
     assert tool.main([]) == 2
     (line,) = capsys.readouterr().err.splitlines()
-    assert line == "compare_pictures: cuda:0 was requested, but Warp finds no CUDA device here; use --device cpu"
+    assert line == "compare pictures: cuda:0 was requested, but Warp finds no CUDA device here; use --device cpu"
 
 
 @pytest.mark.parametrize("devices", ["cpu", "cpu,cpu,cpu", "cpu,tpu", ""])

@@ -17,7 +17,7 @@ from pxr import Usd, UsdGeom
 
 from synpick_warp.configs.load import load_config
 from synpick_warp.configs.write import config_to_toml
-from tools.checks import compare_runs as tool
+from tools.compare import runs as tool
 
 
 @pytest.fixture

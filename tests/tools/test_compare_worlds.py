@@ -7,7 +7,7 @@ import json
 import numpy as np
 import pytest
 
-from tools.checks import compare_worlds as tool
+from tools.compare import worlds as tool
 
 FEW_STEPS = (
     "--episodes",
@@ -75,4 +75,4 @@ def test_invalid_world_counts_are_errors(capsys, text):
 
 def test_a_missing_models_folder_is_an_error(capsys, tmp_path):
     assert tool.main(["--device", "cpu", "--models", str(tmp_path / "none")]) == 2
-    assert capsys.readouterr().err.startswith("compare_worlds: models folder")
+    assert capsys.readouterr().err.startswith("compare worlds: models folder")

@@ -22,6 +22,8 @@ import zarr
 from tools.checks.measures import Measure, UnusableError, print_measures
 
 STORE = "trajectory.zarr"
+MAX_SPEED = 5.0
+"""Bound of the speed of any object, by its displacement over a tick [m/s]."""
 MAX_SPEED_FRACTION = 0.95
 """Objects above this fraction of the solver's speed limit are not checked: the limit changes their momentum, too."""
 
@@ -31,6 +33,8 @@ def make_measures() -> dict[str, Measure]:
     return {
         "pose": Measure("objects: last step against frame", "m", 0.0),
         "labels": Measure("arrays without unit, description or dimension names", "", 0.0),
+        "finite": Measure("objects: poses that are not finite", "", 0.0),
+        "speed": Measure("objects: speed, by displacement over a tick", "m/s", MAX_SPEED),
         "momentum": Measure("objects: change of momentum against contacts and weight", "ratio", 1e-3),
         "rest": Measure("first frame: contacts of all objects against their weight", "ratio", 0.1),
         "displacement": Measure("objects: displacement in a step against speed", "m", 1e-4),
@@ -48,6 +52,14 @@ def check_labels(episode: zarr.Group, measures: dict[str, Measure], where: str) 
         for array in arrays
     )
     measures["labels"].update_max(unlabelled, where)
+
+
+def check_frames(ticks: dict[str, np.ndarray], tick: float, measures: dict[str, Measure], where: str) -> None:
+    """Check that objects have finite poses in all frames, `tick` [s] apart, and that none is flung."""
+    present, pose = ticks["object_id"] >= 0, ticks["pose"].astype(float)
+    measures["finite"].update_max((~np.isfinite(pose[present]).all(axis=1)).sum(), where)
+    displacement = np.linalg.norm(np.diff(pose[:, :, :3], axis=0), axis=2)[present[1:] & present[:-1]]
+    measures["speed"].update_max(displacement[np.isfinite(displacement)] / tick, where)
 
 
 def check_objects(
@@ -118,7 +130,8 @@ def check(dataset: Path, count: int) -> dict[str, Measure]:
         names = sorted(store["episodes"].group_keys())  # type: ignore[union-attr]
     except (OSError, KeyError, ValueError) as error:
         raise UnusableError(f"{dataset} has no trajectories and settings: {error}") from error
-    measures, root = make_measures(), dict(store.attrs)
+    measures: dict[str, Measure] = make_measures()
+    root: dict[str, Any] = dict(store.attrs)
     # The diameter bounds the distance of an object's origin from its centre of mass.
     radius = dict(zip(store["objects/object_id"][:].tolist(), store["objects/diameter"][:].tolist(), strict=True))  # type: ignore[index,union-attr]
     for index in np.unique(np.linspace(0, len(names) - 1, count).round().astype(int)) if names else ():
@@ -126,18 +139,22 @@ def check(dataset: Path, count: int) -> dict[str, Measure]:
         episode = store[f"episodes/{names[index]}"]
         assert isinstance(episode, zarr.Group)
         check_labels(episode, measures, where)
+        ticks = read_arrays(episode, "ticks")
+        check_frames(ticks, root["step"] * root["steps_per_tick"], measures, where)
         if "steps" not in episode:
             continue
-        steps, ticks, arrangement = (
-            {name: np.asarray(array[...]) for name, array in episode[group].arrays()}  # type: ignore[union-attr]
-            for group in ("steps", "ticks", "arrangement")
-        )
+        steps, arrangement = read_arrays(episode, "steps"), read_arrays(episode, "arrangement")
         steps["origin_radius"] = np.array([radius.get(int(object_id), 0.0) for object_id in arrangement["object_id"]])
         attempts = [json.loads(line) for line in np.asarray(episode["attempts/record"][...]).tobytes().splitlines()]  # type: ignore[index]
         check_objects(steps, ticks, arrangement["mass"], root, settings, measures, where)
         check_gripper(steps, root, settings, str(episode.attrs["mode"]), measures, where)
         check_seals(steps, ticks, attempts, measures, where)
     return measures
+
+
+def read_arrays(episode: zarr.Group, group: str) -> dict[str, np.ndarray]:
+    """All arrays of a group of an episode, by name."""
+    return {name: np.asarray(array[...]) for name, array in episode[group].arrays()}  # type: ignore[union-attr]
 
 
 def print_table(measures: dict[str, Measure]) -> bool:

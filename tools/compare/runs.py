@@ -1,9 +1,10 @@
 """Comparison of two data sets file by file: the first difference, and for every layer the differing files and the largest difference.
 
 A layer is the content of one type of file: rgb, depth, scene_gt.json, an array of the trajectories, ... Settings that no file depends
-on, such as the count of worlds, are ignored. Exits with 0 if the data sets are equal, 1 if not, 2 if there is nothing to compare.
+on, such as the count of worlds, and the program's version in the manifest are ignored. Exits with 0 if the data sets are equal, 1 if not,
+2 if there is nothing to compare.
 
-    python -m tools.checks.compare_runs A B
+    python -m tools.compare runs A B
 """
 
 from __future__ import annotations
@@ -15,7 +16,6 @@ import math
 import re
 import sys
 import tarfile
-import tempfile
 import tomllib
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -26,10 +26,12 @@ import cv2
 import numpy as np
 
 from synpick_warp.dataset.manifest import CONFIG_FILE, FREE_SETTINGS, MANIFEST_FILE
-from tools.checks.renamed import DERIVED, translate
+from tools.options import fail
 
 IMAGES = (".png", ".jpg")
 USD = (".usd", ".usdc", ".usda")
+IGNORED = {CONFIG_FILE: FREE_SETTINGS, MANIFEST_FILE: ("versions.synpick-warp",)}
+"""Keys of files that may differ."""
 SAME_CONTENT = "different bytes, equal content"
 CHUNK = 1 << 20
 """Bytes of a file compared at once."""
@@ -61,37 +63,18 @@ class UnusableError(Exception):
     """A folder is missing or empty."""
 
 
-def compare(first: Path, second: Path, renamed: bool = False) -> tuple[dict[str, Layer], str]:
+def compare(first: Path, second: Path) -> tuple[dict[str, Layer], str]:
     """Compare two folders; returns layers by name, and the first difference as one line (empty: none).
 
     Sources come before files derived from them: manifest and settings, then files by name, then manifest entries and lists.
-
-    Args:
-        first: Folder of a data set.
-        second: Folder of another.
-        renamed: Compare content under the new names of `tools.checks.renamed`, which the first data set does not have yet. Checksums of
-            files, which cannot be equal then, are left out.
     """
-    if renamed:
-        with tempfile.TemporaryDirectory() as folder:
-            copies = [Path(folder) / name for name in "ab"]
-            for source, copy in zip((first, second), copies, strict=True):
-                translate(source, copy)
-            return _compare_folders(*copies, content=True)
-    return _compare_folders(first, second, content=False)
-
-
-def _compare_folders(first: Path, second: Path, content: bool) -> tuple[dict[str, Layer], str]:
-    """See `compare`; `content`: files of different bytes and equal content are equal."""
-    names = [{name for name in _list_files(folder) if not (content and name.endswith(DERIVED))} for folder in (first, second)]
+    names = [_list_files(folder) for folder in (first, second)]
     layers: dict[str, Layer] = {}
     first_difference = ""
     for name in sorted(names[0] | names[1], key=_sort_key):
         layer = layers.setdefault(layer_of(name), Layer())
         layer.files += 1
         difference = _compare_file(first, second, name, names)
-        if content and difference is not None and difference.where == SAME_CONTENT:
-            difference = None
         if difference is not None:
             layer.differing += 1
             layer.largest = math.nan if math.isnan(difference.largest) else max(layer.largest, difference.largest)
@@ -134,7 +117,7 @@ def _compare_file(first: Path, second: Path, name: str, names: list[set[str]]) -
     if _same_bytes(first / name, second / name):
         return None
     difference = explain(first / name, second / name)
-    if difference is None and name != CONFIG_FILE:
+    if difference is None and name not in IGNORED:
         return Difference(SAME_CONTENT, 0.0)
     return difference
 
@@ -172,13 +155,13 @@ def compare_bytes(name: str, first: bytes, second: bytes) -> Difference | None:
             return Difference("not an image")
         return compare_arrays(one, other, names=("row", "column", "channel"))
     if suffix == ".json":
-        return _from_pairs(compare_values(json.loads(first), json.loads(second)))
+        return _from_pairs(_without_ignored(name, compare_values(json.loads(first), json.loads(second))))
     if suffix == ".jsonl":
         lines, others = ([json.loads(line) for line in data.splitlines()] for data in (first, second))
         return _from_pairs(compare_values(lines, others))
     if suffix == ".toml":
         pairs = compare_values(tomllib.loads(first.decode()), tomllib.loads(second.decode()))
-        return _from_pairs(pair for pair in pairs if pair[0].lstrip(".") not in FREE_SETTINGS)
+        return _from_pairs(_without_ignored(name, pairs))
     length = min(len(first), len(second))
     differs = np.flatnonzero(np.frombuffer(first[:length], np.uint8) != np.frombuffer(second[:length], np.uint8))
     offset = int(differs[0]) if differs.size else length
@@ -200,6 +183,10 @@ def compare_values(first: Any, second: Any, path: str = "") -> Iterator[tuple[st
         yield path, f"{len(first)} entries", f"{len(second)} entries"
     elif first != second:
         yield path, first, second
+
+
+def _without_ignored(name: str, pairs: Iterator[tuple[str, Any, Any]]) -> Iterator[tuple[str, Any, Any]]:
+    return (pair for pair in pairs if pair[0].lstrip(".") not in IGNORED.get(name, ()))
 
 
 def _from_pairs(pairs: Iterator[tuple[str, Any, Any]]) -> Difference | None:
@@ -295,13 +282,11 @@ def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
     parser.add_argument("first", type=Path, metavar="A")
     parser.add_argument("second", type=Path, metavar="B")
-    parser.add_argument("--renamed", action="store_true", help="A has the public names of before the change that the changelog lists")
     options = parser.parse_args(arguments)
     try:
-        layers, first_difference = compare(options.first, options.second, options.renamed)
+        layers, first_difference = compare(options.first, options.second)
     except (UnusableError, OSError, ValueError) as error:
-        print(f"compare_runs: {' '.join(str(error).split())}", file=sys.stderr)
-        return 2
+        return fail("compare runs", " ".join(str(error).split()))
     print_layers(layers)
     print(f"first difference: {first_difference}" if first_difference else "no difference")
     return 1 if first_difference else 0

@@ -5,7 +5,7 @@ runs of the first count and that of the last one are repeated without a fixed or
 measure its cost. A GPU simulates at least eight worlds; surplus ones are idle, as in a bake. Exits with 1 if episodes of
 deterministic runs differ, with 2 if nothing can be simulated.
 
-    python -m tools.checks.compare_worlds --device cuda:0 --models DIR --worlds 8,1,64,512 --episodes 8
+    python -m tools.compare worlds --device cuda:0 --models DIR --worlds 8,1,64,512 --episodes 8
 """
 
 from __future__ import annotations
@@ -69,7 +69,7 @@ def main(arguments: list[str] | None = None) -> int:
     try:
         runs = compare_worlds(_config(options), options.worlds, options.ticks, console)
     except SynpickError as error:
-        return fail("compare_worlds", error)
+        return fail("compare worlds", error)
     _print(console, runs)
     write_json(options.json, [dataclasses.asdict(run) for run in runs])
     return int(any(run.differing for run in runs if run.deterministic))

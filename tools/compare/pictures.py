@@ -3,7 +3,7 @@
 Piles settle once, on the first device; then objects are displaced by `CREEP`, so that flow is not zero. Exits with 1 if a difference
 exceeds its tolerance, with 2 if nothing can be compared.
 
-    python -m tools.checks.compare_pictures --devices cpu,cuda:0 --models DIR --lights DIR --scenes 3 --size 160x90
+    python -m tools.compare pictures --devices cpu,cuda:0 --models DIR --lights DIR --scenes 3 --size 160x90
 """
 
 from __future__ import annotations
@@ -137,7 +137,7 @@ def main(arguments: list[str] | None = None) -> int:
         config = _config(options, names[0])
         differences = compare_devices(config, devices, console)
     except SynpickError as error:
-        return fail("compare_pictures", error)
+        return fail("compare pictures", error)
     size = "{}x{}".format(*config.cameras.resolution)
     _print(console, differences, f"{names[0]} and {names[1]}, {options.scenes} piles, {size}, {options.samples} paths")
     rows = [dataclasses.asdict(row) | {"holds": row.holds} for row in differences]

@@ -1,0 +1,1 @@
+"""Comparisons: of data sets, world counts, devices, and of two checkouts in all that they write."""

@@ -1,0 +1,258 @@
+"""Guard of a refactoring: two checkouts write, read and compile the same.
+
+Each part runs the commands of both checkouts in processes of their own, in equal folders, and prints a line for everything compared: equal,
+different with the first difference, or failed. Exits with 0 if all is equal, with 1 if something differs or has failed, with 2 if nothing
+can be compared.
+
+    python -m tools.compare guard OLD NEW                              # on the CPU: sets, commands, kernels
+    python -m tools.compare guard OLD NEW --device cuda:0 --models DIR --lights DIR     # on a GPU: worlds, pictures
+
+- sets: six small data sets, every byte.
+- commands: what verifies, validates, counts, converts, estimates, scores and draws them: files and text, up to paths and times.
+- kernels: generated CUDA source of every kernel, up to its names, and of those of Newton that get our functions.
+- worlds: a digest of eight mixed episodes in 8 and in 512 worlds and, if there are two, on two GPUs.
+- pictures: the renderer's rate, in turns; the checkouts may differ by 1 %.
+
+With `--work DIR` results are kept, by the content of the checkout: the next run repeats only what it lacks. Neither checkout needs git.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import hashlib
+import inspect
+import json
+import os
+import re
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+
+import newton
+import numpy as np
+import warp as wp
+
+from tools.compare import guard_steps, kernel_sources, runs
+from tools.compare.guard_device import compare_pictures, compare_worlds
+from tools.compare.guard_steps import Step, cpu_steps
+from tools.options import fail, make_names_parser, make_parser, write_json
+
+CPU_PARTS = ("sets", "commands", "kernels")
+GPU_PARTS = ("worlds", "pictures")
+MAX_NAMED = 8
+"""Kernels that a line about different kernels shows."""
+PACKAGE_FOLDERS = ("synpick_warp", "kernels", "scenes", "configs")
+"""Folders of a checkout on which results depend."""
+_PROGRESS = re.compile(r"^(?: +\d+:\d\d  .*|\w+ [\d,]+/[\d,]+)\n", re.MULTILINE)
+"""Lines of progress, which come as time passes."""
+_TIMES = re.compile(
+    r"\b\d+:\d\d(?::\d\d)?\b|\b[\d.,]+(?= (?:views/s|s\b))|(?<=\"seconds_per_image\": )[\d.e-]+|(?<= poses in )[^\n]*"
+    r"|(?<=peak memory )[\d,]+(?= MiB)"
+)
+"""Durations, rates and memory."""
+_LAST_COLUMN = re.compile(rb",[^,\n]*$", re.MULTILINE)
+"""The time of a pose estimate."""
+_VERSION = re.compile(r'^__version__ = "([^"]+)"', re.MULTILINE)
+
+
+@dataclass(frozen=True)
+class Line:
+    """Result of one comparison."""
+
+    part: str
+    name: str
+    verdict: str
+    """equal, different or failed."""
+    detail: str = ""
+
+    def __str__(self) -> str:
+        return f"{self.verdict:10} {self.part}: {self.name}{': ' if self.detail else ''}{self.detail}"
+
+
+@dataclass(frozen=True)
+class Side:
+    """A checkout, and the folder of its results."""
+
+    checkout: Path
+    folder: Path
+
+    @property
+    def version(self) -> str:
+        """Version of the package in the checkout."""
+        match = _VERSION.search((self.checkout / "synpick_warp" / "__init__.py").read_text())
+        return match[1] if match else "unknown"
+
+    def environment(self) -> dict[str, str]:
+        """Environment of its commands: its code before all other places of packages, and a fixed width of text."""
+        places = [str(self.checkout), *filter(None, [os.environ.get("PYTHONPATH")])]
+        fixed = {"PYTHONPATH": os.pathsep.join(places), "COLUMNS": "160", "TERM": "dumb", "NO_COLOR": "1", "PYTHONUTF8": "1"}
+        return os.environ | fixed
+
+    def run(self, step: Step) -> None:
+        """Run a step, unless its text is there, which is written last: exit code, standard output and errors."""
+        text = self.text_file(step)
+        if text.exists():
+            return
+        script = [str(Path(kernel_sources.__file__).resolve()), step.kernels] if step.kernels else ["-m", "synpick_warp"]
+        command = [sys.executable, *script, *step.arguments]
+        done = subprocess.run(command, cwd=self.folder, env=self.environment(), capture_output=True, text=True, check=False)
+        text.parent.mkdir(exist_ok=True)
+        content = f"exit code {done.returncode}\n{done.stdout}{done.stderr}"
+        part = text.with_suffix(".part")
+        part.write_text(content)
+        part.rename(text)
+
+    def text_file(self, step: Step) -> Path:
+        """File of the text of a step."""
+        return self.folder / "text" / f"{step.name.replace(' ', '-')}.txt"
+
+    def text(self, step: Step) -> str:
+        """Text of a step without paths, times and version."""
+        text = _PROGRESS.sub("", self.text_file(step).read_text())
+        for path, name in ((self.folder, "<folder>"), (self.checkout, "<checkout>"), (self.version, "<version>")):
+            text = text.replace(str(path), name)
+        return _TIMES.sub("TIME", text)
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run the command line; returns the exit code."""
+    options = _parse(arguments)
+    checkouts = [folder.resolve() for folder in (options.old, options.new)]
+    for folder in checkouts:
+        if not (folder / "synpick_warp" / "__init__.py").is_file():
+            return fail("compare guard", f"{folder} is no checkout: it has no synpick_warp/__init__.py")
+    with tempfile.TemporaryDirectory(prefix="guard-") as temporary:
+        work = (options.work or Path(temporary)).resolve()
+        sides = [Side(checkout, work / name) for checkout, name in zip(checkouts, _folder_names(checkouts), strict=True)]
+        for side in sides:
+            side.folder.mkdir(parents=True, exist_ok=True)
+            (side.folder / guard_steps.SPLITS_FILE).write_text(guard_steps.SPLITS)
+        lines = []
+        for line in compare(sides[0], sides[1], options):
+            print(line, flush=True)
+            lines.append(line)
+    write_json(options.json, [dataclasses.asdict(line) for line in lines])
+    different = [line for line in lines if line.verdict != "equal"]
+    print(f"{len(lines) - len(different)} of {len(lines)} equal: {sides[0].checkout} and {sides[1].checkout}")
+    return int(bool(different))
+
+
+def _parse(arguments: list[str] | None) -> argparse.Namespace:
+    parser = make_parser(__doc__, "models", "lights", "json")
+    parser.add_argument("old", type=Path, metavar="OLD", help="folder of a checkout")
+    parser.add_argument("new", type=Path, metavar="NEW", help="folder of another")
+    parser.add_argument(
+        "--parts",
+        type=make_names_parser(CPU_PARTS + GPU_PARTS, "part"),
+        help=f"any of {','.join(CPU_PARTS + GPU_PARTS)} (default: by --device)",
+    )
+    parser.add_argument("--device", default="cpu", help="cpu, or cuda:N for the parts worlds and pictures (default: cpu)")
+    parser.add_argument("--work", type=Path, help="folder in which results are kept for the next run (default: a temporary one)")
+    parser.add_argument("--jobs", type=int, choices=(1, 2), default=2, help="checkouts that run at a time (default: 2)")
+    options = parser.parse_args(arguments)
+    for name in ("models", "lights"):
+        setattr(options, name, str(Path(folder).resolve()) if (folder := getattr(options, name)) else "")
+    options.parts = options.parts or (CPU_PARTS if options.device == "cpu" else GPU_PARTS)
+    return options
+
+
+def _folder_names(checkouts: list[Path]) -> list[str]:
+    """Names of folders for the results of both checkouts: digests of all that these depend on, made different if they are not."""
+    names = []
+    for checkout in checkouts:
+        digest = hashlib.sha256(repr((wp.__version__, newton.__version__, np.__version__, sys.version)).encode())
+        for module in (guard_steps, kernel_sources):
+            digest.update(inspect.getsource(module).encode())
+        for path in sorted(path for folder in PACKAGE_FOLDERS for path in (checkout / folder).rglob("*")):
+            if path.is_file() and path.suffix not in (".pyc", ".md"):
+                digest.update(f"{path.relative_to(checkout)}\0".encode() + path.read_bytes())
+        names.append(digest.hexdigest()[:16])
+    return names if names[0] != names[1] else [names[0], f"{names[1]}-again"]
+
+
+def compare(old: Side, new: Side, options: argparse.Namespace) -> Iterator[Line]:
+    """Run and compare all parts that the options name."""
+    if set(options.parts) & set(CPU_PARTS):
+        steps = list(cpu_steps(options.parts))
+        with ThreadPoolExecutor(options.jobs) as pool:
+            for step in steps:
+                started = time.perf_counter()
+                list(pool.map(lambda side, step=step: side.run(step), (old, new)))
+                print(f"           {step.name}: {time.perf_counter() - started:.1f} s", file=sys.stderr, flush=True)
+                yield from _compare_step(old, new, step, options.parts)
+    if "worlds" in options.parts:
+        yield from (Line("worlds", *result) for result in compare_worlds(old, new, options))
+    if "pictures" in options.parts:
+        yield from (Line("pictures", *result) for result in compare_pictures(old, new, options))
+
+
+def _compare_step(old: Side, new: Side, step: Step, parts: tuple[str, ...]) -> Iterator[Line]:
+    """Lines about a step that both checkouts have run."""
+    baked = step.arguments[:1] == ("bake",)
+    part = "sets" if baked else "commands" if step.arguments else "kernels"
+    texts = [side.text(step) for side in (old, new)]
+    for side, text in zip(("old", "new"), texts, strict=True):
+        if not text.startswith("exit code 0\n"):
+            yield Line(part, step.name, "failed", f"{side}: {text.splitlines()[0]}: {text.splitlines()[-1]}")
+            return
+    if step.output and (part in parts):
+        yield _compare_output(part, old, new, step.output)
+    if "commands" in parts and step.arguments:
+        difference = kernel_sources.first_difference([texts[0]], [texts[1]])
+        yield Line("commands", f"text of {step.name}", "different" if difference else "equal", difference)
+    if "kernels" in parts and step.kernels:
+        yield _compare_kernels(step.name, old.folder / step.kernels, new.folder / step.kernels)
+
+
+def _compare_output(part: str, old_side: Side, new_side: Side, name: str) -> Line:
+    """Line about a file or folder that a step has written; estimates have no time, pages no version."""
+    old, new = old_side.folder / name, new_side.folder / name
+    if old.suffix:
+        contents = [path.read_bytes() for path in (old, new)]
+        if old.suffix == ".csv":
+            contents = [_LAST_COLUMN.sub(b"", content) for content in contents]
+        if old.suffix == ".html":
+            contents = [content.replace(side.version.encode(), b"") for content, side in zip(contents, (old_side, new_side), strict=True)]
+        verdict = "equal" if contents[0] == contents[1] else "different"
+        return Line(part, name, verdict, " and ".join(f"{len(content):,}" for content in contents) + " bytes")
+    try:
+        layers, difference = runs.compare(old, new)
+    except runs.UnusableError as error:
+        return Line(part, name, "failed", str(error))
+    files, differing = (sum(getattr(layer, name) for layer in layers.values()) for name in ("files", "differing"))
+    return Line(
+        part,
+        old.name,
+        "different" if difference else "equal",
+        f"{differing} of {files:,} files; {difference}" if difference else f"{files:,} files",
+    )
+
+
+def _compare_kernels(name: str, old_file: Path, new_file: Path) -> Line:
+    """Line about the kernels of both checkouts, by key; a key that one of them lacks is looked for by its source."""
+    old, new = (json.loads(path.read_text()) for path in (old_file, new_file))
+    changed = [key for key in sorted(old.keys() & new.keys()) if old[key] != new[key]]
+    added = {key: new[key] for key in sorted(new.keys() - old.keys())}
+    renamed, missing = {}, []
+    for key in sorted(old.keys() - new.keys()):
+        partner = next((other for other, source in added.items() if source == old[key]), None)
+        if partner is None:
+            missing.append(key)
+        else:
+            renamed[key] = partner
+            del added[partner]
+    details = [f"{len(changed)} of {len(old)} kernels" if changed else f"{len(old)} kernels"]
+    details += [f"{key}: {kernel_sources.first_difference(old[key], new[key])}" for key in changed[:MAX_NAMED]]
+    details += [f"only old: {key}" for key in missing] + [f"only new: {key}" for key in added]
+    details += [f"{key} is now {partner}" for key, partner in renamed.items()]
+    return Line("kernels", name, "different" if changed or missing or added else "equal", "; ".join(details))
+
+
+if __name__ == "__main__":
+    sys.exit(main())
