@@ -146,6 +146,7 @@ def test_more_arrangements_than_worlds(tmp_path):
     assert rows["objects inside the tote"] == 100.0
 
 
+@pytest.mark.slow
 def test_bench_measures_every_part_of_small_worlds(tmp_path, monkeypatch, capsys):
     for name in ("FALL_TICKS", "SETTLE_TICKS", "STIR_TICKS", "LEAD_TICKS", "PICK_TICKS", "MIN_REPEATS", "BURST"):
         monkeypatch.setattr(bench_physics, name, 1)
