@@ -79,6 +79,8 @@ def sides(tmp_path: Path) -> list[guard.Side]:
     [
         ("3 views in 0:03 (15.6 views/s)", "3 views in 0:12 (3.1 views/s)", "equal"),
         ("   0:05  views 3\n3 views", "   0:06  views 1\n   0:07  views 2\n3 views", "equal"),
+        ("3 poses in 4.1 s (2 poses/s, waiting 2%)", "3 poses in 1.4 s (3 poses/s, waiting 3%)", "equal"),
+        ("3 poses in 4.1 s", "4 poses in 4.1 s", "different"),
         ("3 views; peak memory 277 MiB", "3 views; peak memory 1,278 MiB", "equal"),
         ('"seconds_per_image": 0.25', '"seconds_per_image": 1.5e-05', "equal"),
         ("3 views", "4 views", "different"),

@@ -52,7 +52,7 @@ PACKAGE_FOLDERS = ("synpick_warp", "kernels", "scenes", "configs")
 _PROGRESS = re.compile(r"^(?: +\d+:\d\d  .*|\w+ [\d,]+/[\d,]+)\n", re.MULTILINE)
 """Lines of progress, which come as time passes."""
 _TIMES = re.compile(
-    r"\b\d+:\d\d(?::\d\d)?\b|\b[\d.,]+(?= (?:views/s|s\b))|(?<=\"seconds_per_image\": )[\d.e-]+|(?<= poses in )[^\n]*"
+    r"(?<= poses in )[^\n]*|\b\d+:\d\d(?::\d\d)?\b|\b[\d.,]+(?= (?:views/s|s\b))|(?<=\"seconds_per_image\": )[\d.e-]+"
     r"|(?<=peak memory )[\d,]+(?= MiB)"
 )
 """Durations, rates and memory."""
