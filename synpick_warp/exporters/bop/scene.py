@@ -8,7 +8,6 @@ from __future__ import annotations
 import itertools
 import json
 import os
-import shutil
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -59,12 +58,6 @@ def commit_scenes(scenes: tuple[tuple[Path, Path], ...], settings: SceneSettings
         scene.rename(place)
     for folder in {place.parent for _, place in scenes}:
         sync_folder(folder)
-
-
-def discard_scenes(scenes: tuple[Path, ...]) -> None:
-    """Task: remove the staging folders of a discarded arrangement."""
-    for scene in scenes:
-        shutil.rmtree(scene)
 
 
 def complete_scene(scene: Path, settings: SceneSettings) -> None:

@@ -130,8 +130,6 @@ def commit_shards(scenes: tuple[tuple[Path, int], ...], split: Path, frames: int
     for shard, place in complete:
         shard.rename(place)
     sync_folder(split)
-    for scene, _ in scenes:
-        shutil.rmtree(scene)
 
 
 def _concatenate(shard: Path, pieces: list[Path]) -> None:
