@@ -14,11 +14,11 @@ import pytest
 from pycocotools.coco import COCO
 
 from synpick_warp.configs.schema import Split
-from synpick_warp.dataset.reading import COCO_PARTS
 from synpick_warp.errors import DatasetError, OutputError
 from synpick_warp.exporters.bop.coco.annotation_files import CATEGORIES, IMAGES, PARTS, commit_scenes, write_image
 from synpick_warp.exporters.bop.coco.exporter import CocoExporter
 from synpick_warp.exporters.bop.exporter import BopExporter
+from synpick_warp.exporters.formats import FORMAT_TABLE
 from tests.harness.exporter_contract import ExporterContract, export, exporting, finish
 from tests.worlds.box_views import batches, cameras, config, ends
 
@@ -92,7 +92,7 @@ def test_every_split_has_an_annotation_file(tmp_path):
         assert all((out / IMAGES / image["file_name"]).is_file() for image in found.imgs.values())
         assert found.dataset["info"]["description"] == f"synpick-warp, {split}"
     assert (len(read(out, "val_pbr").imgs), len(read(out, "val_pbr").cats)) == (0, 2)
-    assert PARTS == COCO_PARTS
+    assert str(PARTS) == FORMAT_TABLE["coco"].part.folder
 
 
 def test_scenes_are_checked_for_completeness(tmp_path):

@@ -17,9 +17,9 @@ import pytest
 from synpick_warp.codes import Outcome, Task
 from synpick_warp.configs.load import load_config
 from synpick_warp.configs.schema import Config, Split
-from synpick_warp.dataset.reading import LEROBOT_PARTS
 from synpick_warp.errors import ConfigError, DatasetError
 from synpick_warp.exporters.base import list_folders
+from synpick_warp.exporters.formats import FORMAT_TABLE
 from synpick_warp.exporters.lerobot import layout
 from synpick_warp.exporters.lerobot.exporter import LerobotExporter, video_rate
 from synpick_warp.exporters.lerobot.part import describe_tasks
@@ -192,7 +192,7 @@ def test_splits_are_ranges_of_episodes(tmp_path, dataset, episodes):
     chunk = layout.video_path(0, 1500).parent
     (out.parent / chunk).mkdir()
     assert chunk in list_folders(out.parent, LerobotExporter.shared_files(settings).folders)
-    assert layout.PARTS == LEROBOT_PARTS
+    assert str(layout.PARTS) == FORMAT_TABLE["lerobot"].part.folder
 
 
 def test_statistics_are_those_of_all_frames(dataset, data, episodes):
