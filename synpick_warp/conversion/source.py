@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 import shutil
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -13,7 +13,7 @@ from typing import Any
 
 from synpick_warp.codes import Ending
 from synpick_warp.configs.schema import Config
-from synpick_warp.conversion.scenes import SceneSource
+from synpick_warp.conversion.scenes import StoredSceneFiles
 from synpick_warp.conversion.trajectories import check_trajectory, read_ticks
 from synpick_warp.dataset.annotations import ADVICE, check_content
 from synpick_warp.dataset.file_names import check_file_names
@@ -30,8 +30,8 @@ from synpick_warp.dataset.manifest import (
 )
 from synpick_warp.dataset.reading import DataSet, Episode
 from synpick_warp.dataset.trajectory import GROUP_FILE, StoreAttributes
-from synpick_warp.dataset.view_files import SceneFolder, SceneShards
 from synpick_warp.errors import DatasetError
+from synpick_warp.exporters.formats import Content
 from synpick_warp.exporters.trajectory.arrays import STORE
 from synpick_warp.exporters.writing.checksums import open_regular
 from synpick_warp.exporters.writing.files import remove_folder
@@ -49,25 +49,15 @@ class SourceEpisode:
     end: EpisodeEnd
 
     @property
-    def frames(self) -> int:
-        """Number of frames."""
-        return self.end.frames
-
-    @property
     def data(self) -> Episode:
         """The episode as `synpick_warp.open` gives it."""
         return self.source.data[self.end.episode]
 
-    def scenes(self) -> list[SceneSource]:
+    def scenes(self) -> list[StoredSceneFiles]:
         """The scene of each camera."""
-        found, data, size = [], self.source.data, self.source.config.cameras.resolution
-        for camera in range(data.camera_count):
-            scene = data.camera_count * self.end.episode + camera
-            files = data.scene_files(self.end.episode, camera)
-            folder = files.folder if isinstance(files, SceneFolder) else None
-            shards = files.shards if isinstance(files, SceneShards) else ()
-            found.append(SceneSource(folder, shards, scene, size, self.frames))
-        return found
+        data, episode = self.source.data, self.end.episode
+        cameras = range(data.camera_count)
+        return [StoredSceneFiles(data.scene_files(episode, camera), len(cameras) * episode + camera, self.end.frames) for camera in cameras]
 
     def check_trajectory(self, *, gripper: bool) -> None:
         """See `trajectories.check_trajectory`."""
@@ -102,10 +92,18 @@ class Source:
         """Content digests of objects and lights."""
         return self._manifest.get(INPUTS, {})
 
-    @property
-    def has_images(self) -> bool:
-        """Whether it has views."""
-        return bool({"bop", "shards"} & set(self.config.bake.formats))
+    def check_contents(self, needed: Collection[Content]) -> None:
+        """Check that it has what formats are made of: all attributes and arrays of the trajectories, but of images only that there are any.
+
+        Raises:
+            DatasetError: It lacks something, or that is damaged.
+        """
+        if "poses" in needed:
+            self.check_trajectories(gripper="gripper" in needed)
+        if "views" in needed and not {"bop", "shards"} & set(self.config.bake.formats):
+            raise DatasetError(f"{self.folder} has no images; bake it with --formats bop or shards")
+        if "masks" in needed and not self.config.bop.masks:
+            raise DatasetError(f"{self.folder} has no masks, which COCO annotations need; bake it with bop.masks = true")
 
     @property
     def steps_per_tick(self) -> int:

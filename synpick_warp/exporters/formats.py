@@ -163,8 +163,10 @@ FORMAT_TABLE: dict[str, Format] = {
 }
 """Format -> its row."""
 
-CONVERTIBLE = tuple(name for name, row in FORMAT_TABLE.items() if row.sources is not None)
-"""Formats that `convert` writes."""
+
+def convertible() -> tuple[str, ...]:
+    """Formats that `convert` writes."""
+    return tuple(name for name, row in FORMAT_TABLE.items() if row.sources is not None)
 
 
 def part_files(cameras: int | None) -> list[PartFiles]:
@@ -172,3 +174,9 @@ def part_files(cameras: int | None) -> list[PartFiles]:
     parts = [row.part for row in FORMAT_TABLE.values() if row.part is not None]
     whole = [part for part in parts if not part.per_scene]
     return whole if cameras is None else whole + [part._replace(cameras=cameras) for part in parts if part.per_scene]
+
+
+def contents_of(name: str, config: Config) -> tuple[Content, ...]:
+    """What a stored data set with these settings must have for `convert` to make a format of it."""
+    sources = FORMAT_TABLE[name].sources
+    return () if sources is None else sources(config)

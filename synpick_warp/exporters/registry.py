@@ -9,7 +9,7 @@ from pathlib import Path
 
 from synpick_warp.configs.schema import Config
 from synpick_warp.errors import ConfigError
-from synpick_warp.exporters.base import ExportContext, Exporter, SharedFiles
+from synpick_warp.exporters.base import ExportContext, Exporter, SharedFiles, StoredScene
 from synpick_warp.exporters.formats import FORMAT_TABLE
 from synpick_warp.exporters.writing.pool import WriterPool
 from synpick_warp.frames import EpisodeEnd, FrameBatch, TickBatch
@@ -49,6 +49,11 @@ class Exporters:
         """See `Exporter`."""
         for exporter in self._all:
             exporter.write_views(batch)
+
+    def write_stored(self, episode: int, scenes: Sequence[StoredScene]) -> None:
+        """See `Exporter`."""
+        for exporter in self._all:
+            exporter.write_stored(episode, scenes)
 
     def write_ticks(self, batch: TickBatch) -> None:
         """See `Exporter`."""

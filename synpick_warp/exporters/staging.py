@@ -15,7 +15,7 @@ import numpy as np
 
 from synpick_warp.codes import Ending
 from synpick_warp.configs.schema import Config
-from synpick_warp.exporters.base import ExportContext
+from synpick_warp.exporters.base import ExportContext, StoredScene
 from synpick_warp.exporters.writing.files import PARTIAL, output_error
 from synpick_warp.exporters.writing.pool import WriterPool, WriteTask
 from synpick_warp.frames import EpisodeEnd, FrameBatch, TickBatch
@@ -80,6 +80,9 @@ class EpisodeExporter(ABC, Generic[_Content]):
         return []
 
     def write_views(self, batch: FrameBatch) -> None:
+        """See `Exporter`: no images."""
+
+    def write_stored(self, episode: int, scenes: Sequence[StoredScene]) -> None:
         """See `Exporter`: no images."""
 
     def write_ticks(self, batch: TickBatch) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar
@@ -11,11 +11,20 @@ from typing import Any, ClassVar
 from synpick_warp.configs.schema import Config
 from synpick_warp.configs.sensors import effect_ranges
 from synpick_warp.configs.splits import bop_folder, bop_folders
-from synpick_warp.exporters.base import ExportContext, view_bytes
+from synpick_warp.exporters.base import ExportContext, StoredScene, view_bytes
 from synpick_warp.exporters.bop.keypoints import sample_keypoints
 from synpick_warp.exporters.bop.shared.models import MODEL_FOLDERS, describe_dataset, write_constants
 from synpick_warp.exporters.bop.shared.toolkit import PARAMS_FILE, format_dataset_params
-from synpick_warp.exporters.bop.view import ViewSettings, make_camera_constants, make_view_task
+from synpick_warp.exporters.bop.view import (
+    ViewSettings,
+    WriteLayer,
+    WriteView,
+    make_camera_constants,
+    make_view_task,
+    write_rendered_layer,
+    write_rendered_view,
+    write_stored_views,
+)
 from synpick_warp.exporters.staging import EpisodeExporter, StagedEpisode
 from synpick_warp.exporters.writing.files import output_error
 from synpick_warp.exporters.writing.notes import CAMERA_FILE, NOTES_FILE
@@ -38,8 +47,9 @@ class SceneExporter(EpisodeExporter[tuple[Path, ...]]):
 
     needs_views = True
     writes_depth = True
-    write_view: ClassVar[Callable[..., None]]
-    """Task that writes a view: the arrays of `make_view_task`, staging folder of the scene, `ViewSettings`, `ViewTruth`."""
+    write_view: ClassVar[WriteView]
+    write_layer: ClassVar[WriteLayer | None] = None
+    """None: the format has no layers."""
 
     def __init__(self, context: ExportContext) -> None:
         """See `Exporter`."""
@@ -50,9 +60,9 @@ class SceneExporter(EpisodeExporter[tuple[Path, ...]]):
         self._cameras = context.cameras
         self._pool = context.pool
         self._suffix = f".{bop.color_format}"
-        self._layers = config.render.layers
+        self._layers = config.render.layers if self.write_layer else ()
         effects = tuple(name for name, limits in effect_ranges(config.effects).items() if any(limits))
-        entries = context.catalog.entries if bop.keypoints else ()
+        entries = context.catalog.entries if bop.keypoints and self.annotates(config) else ()
         self._keypoints = {entry.obj_id: sample_keypoints(entry.mesh.vertices, bop.keypoints) for entry in entries}
         self._views = tuple(
             ViewSettings(
@@ -75,6 +85,11 @@ class SceneExporter(EpisodeExporter[tuple[Path, ...]]):
         return tuple(Path(cls.folder_name(split)) for split in bop_folders(config))
 
     @staticmethod
+    def annotates(config: Config) -> bool:
+        """Whether it writes COCO annotations, which have keypoints."""
+        return False
+
+    @staticmethod
     @abstractmethod
     def folder_name(split: str) -> str:
         """Name of the folder that holds the scenes of a split, from its name in BOP."""
@@ -86,10 +101,6 @@ class SceneExporter(EpisodeExporter[tuple[Path, ...]]):
     @abstractmethod
     def _stage_scene(self, scene: Path) -> None:
         """Create the staging folder of a scene, and its subfolders."""
-
-    @abstractmethod
-    def _layer_task(self, scene: Path, scene_id: int, name: str, frame: int) -> tuple[Callable[..., None], tuple[Any, ...]]:
-        """Task that writes a layer of a view: its function, and the arguments after the image."""
 
     @abstractmethod
     def _commit_task(self, scenes: tuple[tuple[Path, int], ...], frames: int) -> tuple[Callable[..., None], tuple[Any, ...]]:
@@ -110,6 +121,8 @@ class SceneExporter(EpisodeExporter[tuple[Path, ...]]):
         try:
             for folder in self.folders(context.config):
                 (self._out / folder).mkdir(exist_ok=True)
+            if context.copy_constants(CONSTANTS):
+                return list(CONSTANTS)
             scene = context.config, context.catalog, self._cameras
             texts = {NOTES_FILE: describe_dataset(*scene), PARAMS_FILE: format_dataset_params(*scene)}
             return write_constants(self._out, context.catalog, self._cameras[0], self._bop.depth_scale, texts)
@@ -127,13 +140,19 @@ class SceneExporter(EpisodeExporter[tuple[Path, ...]]):
             episode = self._staged(index, partial(self._create_scenes, index))
             scene = episode.content[camera]
             images, truth = make_view_task(batch, view, self.scene_id(index, camera), self._views[camera])
-            tasks = [(type(self).write_view, images, (scene, self._views[camera], truth))]
-            for name in self._layers:
-                function, arguments = self._layer_task(scene, truth.scene, name, truth.frame)
-                tasks.append((function, (batch.layers[name][view],), arguments))
             place = self._folder(truth.scene) / scene.name
-            for function, arrays, arguments in tasks:
-                yield self._task((episode,), function, arrays, arguments, place)
+            arguments = (type(self).write_view, scene, self._views[camera], truth)
+            yield self._task((episode,), write_rendered_view, images, arguments, place)
+            for name in self._layers:
+                arguments = (type(self).write_layer, scene, truth.scene, name, truth.frame)
+                yield self._task((episode,), write_rendered_layer, (batch.layers[name][view],), arguments, place)
+
+    def write_stored(self, episode: int, scenes: Sequence[StoredScene]) -> None:
+        """See `Exporter`: one task for each scene."""
+        staged = self._staged(episode, partial(self._create_scenes, episode))
+        for stored, scene, settings in zip(scenes, staged.content, self._views, strict=True):
+            arguments = (stored, type(self).write_view, type(self).write_layer, self._layers, scene, settings)
+            self._pool.submit_all((self._task((staged,), write_stored_views, (), arguments, self._folder(int(scene.name)) / scene.name),))
 
     def scene_id(self, episode: int, camera: int) -> int:
         """BOP scene_id of an episode as seen by a camera."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from fractions import Fraction
 from functools import partial
@@ -14,7 +14,7 @@ import numpy as np
 
 from synpick_warp.codes import Ending, Task
 from synpick_warp.configs.schema import Config
-from synpick_warp.exporters.base import ExportContext, SharedFiles
+from synpick_warp.exporters.base import ExportContext, SharedFiles, StoredScene
 from synpick_warp.exporters.lerobot.episode import EpisodeContent, EpisodeSettings, commit_episode, frame_path, group_path
 from synpick_warp.exporters.lerobot.index import write_indices
 from synpick_warp.exporters.lerobot.layout import (
@@ -33,7 +33,7 @@ from synpick_warp.exporters.lerobot.layout import (
     video_path,
 )
 from synpick_warp.exporters.lerobot.part import TICK
-from synpick_warp.exporters.lerobot.video import GROUP, write_frame, write_spooled_group
+from synpick_warp.exporters.lerobot.video import GROUP, write_frame, write_spooled_group, write_stored_group
 from synpick_warp.exporters.staging import EpisodeExporter, StagedEpisode
 from synpick_warp.exporters.writing.files import output_error
 from synpick_warp.exporters.writing.notes import note_files, write_notes
@@ -74,8 +74,9 @@ class LerobotExporter(EpisodeExporter[_Content]):
     def __init__(self, context: ExportContext) -> None:
         """See `Exporter`."""
         super().__init__(context)
-        objects = {entry.obj_id: entry.name for entry in context.catalog.entries}
-        self._settings = episode_settings(context.config, context.out, objects)
+        config = context.config
+        cameras = len(config.cameras.positions)
+        self._settings = EpisodeSettings(context.out, cameras, config.cameras.resolution, video_rate(config), context.names)
 
     @staticmethod
     def slot_bytes(config: Config) -> int:
@@ -117,6 +118,15 @@ class LerobotExporter(EpisodeExporter[_Content]):
             tasks.append(self._task((episode,), write_frame, (batch.color[view],), (path,), path, then))
         self._context.pool.submit_all(tasks)
 
+    def write_stored(self, episode: int, scenes: Sequence[StoredScene]) -> None:
+        """See `Exporter`: a task for each group of pictures. Videos of JPEG images differ from a bake's, as they were compressed before."""
+        staged, tasks = self._staged(episode, _make_content), []
+        for camera, scene in enumerate(scenes):
+            for group in range(-(-scene.frames // GROUP)):
+                path = group_path(staged.folder, camera, group)
+                tasks.append(self._task((staged,), write_stored_group, (), (scene, group * GROUP, self._settings.rate, path), path))
+        self._context.pool.submit_all(tasks)
+
     def write_ticks(self, batch: TickBatch) -> None:
         """See `Exporter`."""
         for index, row in zip(batch.episode.tolist(), make_ticks(batch), strict=True):
@@ -124,7 +134,8 @@ class LerobotExporter(EpisodeExporter[_Content]):
 
     def files(self, episode: int) -> list[Path]:
         """See `Exporter`: part and videos."""
-        return episode_files(self._context.out, episode, self._settings.cameras)
+        places = [part_path(episode), *(video_path(camera, episode) for camera in range(self._settings.cameras))]
+        return sorted(place for place in places if os.path.lexists(self._context.out / place))
 
     def _finish(self, episode: _Staged, end: EpisodeEnd) -> None:
         for camera, group in list(episode.content.spooled):
@@ -147,9 +158,10 @@ class LerobotExporter(EpisodeExporter[_Content]):
 
     def _commit(self, episode: _Staged, end: EpisodeEnd) -> WriteTask:
         count = len(episode.content.ticks) // TICK.itemsize
-        if count != end.frames or episode.content.spooled:
-            views = f", with views missing in {len(episode.content.spooled)} groups" if episode.content.spooled else ""
-            raise ValueError(f"episode {end.episode} ended with {end.frames} frames, but {count} came{views}")
+        if count != end.frames:
+            raise ValueError(f"episode {end.episode} ended with {end.frames} frames, but {count} came")
+        if groups := len(episode.content.spooled):
+            raise ValueError(f"episode {end.episode} ended, but views of {groups} groups of pictures are missing")
         content = make_content(end, bytes(episode.content.ticks))
         place = self._context.out / part_path(end.episode)
         return WriteTask(commit_episode, (), (episode.folder, content, self._settings), place)
@@ -157,17 +169,6 @@ class LerobotExporter(EpisodeExporter[_Content]):
 
 def _make_content(_: Path) -> _Content:
     return _Content()
-
-
-def episode_settings(config: Config, out: Path, objects: Mapping[int, str]) -> EpisodeSettings:
-    """Settings of the tasks of all episodes; `objects`: obj_id -> name."""
-    return EpisodeSettings(out, len(config.cameras.positions), config.cameras.resolution, video_rate(config), objects)
-
-
-def episode_files(out: Path, episode: int, cameras: int) -> list[Path]:
-    """Committed files of an episode: part and videos, relative to the data set, sorted."""
-    places = [part_path(episode), *(video_path(camera, episode) for camera in range(cameras))]
-    return sorted(place for place in places if os.path.lexists(out / place))
 
 
 def make_content(end: EpisodeEnd, ticks: bytes) -> EpisodeContent:

@@ -98,6 +98,15 @@ def test_frames_without_setpoint_are_commanded_to_stay(tmp_path):
     assert table["action"][0][:3] == table["observation.state"][1][:3]
 
 
+def test_missing_views_are_an_error(tmp_path):
+    with exporting(LerobotExporter, tmp_path, trajectories.config(), 0) as exporter:
+        for tick in trajectories.ticks((0,), 2):
+            exporter.write_ticks(tick)
+        exporter.write_views(next(box_views.batches(2, (0,), 2, LENSES)))
+        with pytest.raises(ValueError, match="views of 2 groups of pictures are missing"):
+            exporter.end_episode(trajectories.ends((0,), 2)[0], lambda: None)
+
+
 def test_attempts_become_tasks_rewards_and_outcomes(data, dataset):
     first = slice(0, FRAMES)
     sentences = pq.read_table(dataset / "meta" / "tasks.parquet").to_pydict()["task"]
