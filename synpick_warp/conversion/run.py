@@ -86,14 +86,14 @@ def _convert_episodes(
 
     for index in output.remaining:
         pool.wait_until(lambda: working[0] < limit)
-        episode = source.episode(index)
+        end = source.episode_end(index)
         working[0] += 1
-        if Ending(episode.end.ending).delivers:
+        if Ending(end.ending).delivers:
             if "views" in contents:
-                exporters.write_stored(index, episode.scenes())
-            for batch in episode.ticks() if "poses" in contents else ():
+                exporters.write_stored(index, source.scenes(end))
+            for batch in source.ticks(end) if "poses" in contents else ():
                 exporters.write_ticks(batch)
-        exporters.end_episode(episode.end, partial(commit, episode.end))
+        exporters.end_episode(end, partial(commit, end))
 
 
 def check_formats(names: Sequence[str], config: Config, folder: Path) -> None:

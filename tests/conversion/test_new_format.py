@@ -1,75 +1,21 @@
-"""A format of a few lines, which nothing but the table of formats knows: bakes and `convert` write it, byte for byte the same."""
+"""A format that nothing but the table of formats knows: bakes and `convert` write it, byte for byte the same."""
 
 from __future__ import annotations
 
 import ast
-import json
-import os
 import sys
 from pathlib import Path
 
 import pytest
 
 import synpick_warp
-from synpick_warp.configs.schema import FORMATS, Config
+from synpick_warp.configs.schema import FORMATS
 from synpick_warp.conversion.run import convert
-from synpick_warp.exporters.base import EncodedView, SharedFiles
-from synpick_warp.exporters.bop.scene_exporter import SceneExporter
-from synpick_warp.exporters.bop.view import ViewSettings
 from synpick_warp.exporters.formats import FORMAT_TABLE, Format
-from synpick_warp.exporters.writing.folder import open_folder
 from tests.conversion.test_convert import settings
 from tests.harness import scripted_bake
 from tests.harness.scripted_bake import snapshot
-from tests.worlds import box_views
-
-FOLDER = Path("boxes")
-
-
-def write_view(view: EncodedView, scene: Path, _: ViewSettings) -> None:
-    """An image, and a line of what is on it, of every part that a view has."""
-    suffix, color = view.color
-    line = [*view.gt, *view.gt_info, view.camera["cam_K"], [mask.visible.count for mask in view.masks()], int(view.depth_image().max())]
-    with open_folder(scene) as folder:
-        folder.write(f"{view.frame:06d}{suffix}", color)
-        folder.write(f"{view.frame:06d}.json", json.dumps(line).encode())
-
-
-def write_layer(data, scene: Path, _: int, name: str, frame: int) -> None:
-    (scene / f"{frame:06d}_{name}.png").write_bytes(data)
-
-
-def move(scenes, out: Path) -> None:
-    for scene, scene_id in scenes:
-        scene.rename(out / FOLDER / f"{scene_id:06d}")
-
-
-class BoxesExporter(SceneExporter):
-    staging = "boxes"
-    write_view = staticmethod(write_view)
-    write_layer = staticmethod(write_layer)
-
-    @staticmethod
-    def folder_name(split: str) -> str:
-        return FOLDER.name
-
-    @staticmethod
-    def shared_files(config: Config) -> SharedFiles:
-        return SharedFiles((), (), (FOLDER,))
-
-    def write_constants(self) -> list[Path]:
-        (self._out / FOLDER).mkdir(exist_ok=True)
-        return []
-
-    def files(self, episode: int) -> list[Path]:
-        places = [FOLDER / f"{self.scene_id(episode, camera):06d}" for camera in range(len(self._cameras))]
-        return [place for place in places if os.path.lexists(self._out / place)]
-
-    def _stage_scene(self, scene: Path) -> None:
-        scene.mkdir()
-
-    def _commit_task(self, scenes, frames):
-        return move, (scenes, self._out)
+from tests.worlds import box_views, boxes_format
 
 
 @pytest.fixture
@@ -77,7 +23,7 @@ def boxes(monkeypatch) -> None:
     """All that makes it known to bakes, `convert`, manifest and reader: its row in the table of formats."""
     row = Format("boxes", "BoxesExporter", "", lambda _, episode: f"boxes/{episode:06d}/.*", sources=lambda _: ("views", "masks"))
     monkeypatch.setitem(FORMAT_TABLE, "boxes", row)
-    monkeypatch.setitem(sys.modules, "synpick_warp.exporters.boxes", sys.modules[__name__])
+    monkeypatch.setitem(sys.modules, "synpick_warp.exporters.boxes", boxes_format)
 
 
 def test_a_new_format_is_converted_for_free(tmp_path, boxes, monkeypatch):
