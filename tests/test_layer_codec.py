@@ -11,7 +11,8 @@ from hypothesis.extra import numpy as hnp
 
 from synpick_warp.configs.schema import LAYERS
 from synpick_warp.errors import DatasetError
-from synpick_warp.exporters.bop.view import write_layer
+from synpick_warp.exporters.bop.scene import write_layer
+from synpick_warp.exporters.bop.view import write_rendered_layer
 from synpick_warp.layer_codec import CODECS, decode_layer, encode_layer, layer_notes, layer_path, read_layer
 from synpick_warp.layers import LAYER_TABLE
 
@@ -97,7 +98,7 @@ VALUES = {
 @pytest.mark.parametrize("name", LAYERS)
 def test_layer_files_round_trip(tmp_path, name):
     (tmp_path / name).mkdir()
-    write_layer(VALUES[name], tmp_path, name, 12)
+    write_rendered_layer(VALUES[name], write_layer, tmp_path, 0, name, 12)
     assert layer_path(tmp_path, name, 12) == tmp_path / name / "000012.png"
     back = read_layer(tmp_path, name, 12)
     assert (back.shape, back.dtype) == (VALUES[name].shape, VALUES[name].dtype)

@@ -10,6 +10,7 @@ from cyclopts import Parameter
 from synpick_warp.cli.folders import beside, find_data_set
 from synpick_warp.cli.options import MAX_THREADS, WholeNumber, check_range
 from synpick_warp.configs.schema import FORMATS
+from synpick_warp.exporters.formats import convertible
 
 
 def convert(
@@ -19,7 +20,7 @@ def convert(
     ] = None,
     /,
     *,
-    to: Annotated[str, Parameter(help="Formats to write, joined by commas: bop, shards, usd, lerobot, coco.")],
+    to: Annotated[str, Parameter(help=f"Formats to write, joined by commas: {', '.join(convertible())}.")],
     out: Annotated[
         Path | None,
         Parameter(
@@ -30,8 +31,8 @@ def convert(
 ) -> int:
     """Convert a data set to other formats. After an interruption, the same command resumes with the remaining episodes.
 
-    Sources: shards and bop need the other of the two; usd needs zarr; coco needs bop or shards; lerobot needs zarr, and bop or shards.
-    Files are those that a bake would have written, but for LeRobot's videos from JPEG images. Exit codes: 0, converted; 2, an error.
+    Formats of images need bop or shards in the data set, those of motion alone (usd) zarr, and lerobot both. Files are those that a bake
+    would have written, but for LeRobot's videos from JPEG images. Exit codes: 0, converted; 2, an error.
     """
     check_range("--processes", processes, 0, MAX_THREADS)
     from synpick_warp.cli.display import CountProgress, make_console

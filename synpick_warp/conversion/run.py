@@ -3,18 +3,22 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Collection, Sequence
 from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
 from synpick_warp.codes import Ending
-from synpick_warp.conversion.converters import Converters, check_formats, check_trajectories
+from synpick_warp.configs.schema import CLASSIC, Config
+from synpick_warp.conversion.context import StoredContext
 from synpick_warp.conversion.source import Source
 from synpick_warp.dataset.writing import OutputFolder, finalize_data_set
-from synpick_warp.errors import DatasetError
-from synpick_warp.exporters.registry import load_exporter_classes
+from synpick_warp.errors import ConfigError, DatasetError
+from synpick_warp.exporters.formats import FORMAT_TABLE, Content, contents_of, convertible
+from synpick_warp.exporters.registry import Exporters, load_exporter_classes
 from synpick_warp.exporters.writing.pool import WriterPool
+from synpick_warp.frames import EpisodeEnd
+from synpick_warp.progress import Report
 from synpick_warp.system.cores import count_cores
 
 AHEAD = 2
@@ -30,7 +34,7 @@ class Converted(NamedTuple):
     """Those of earlier runs."""
 
 
-def convert(folder: Path, out: Path, formats: Sequence[str], processes: int, report: Callable[[str, int, int], None]) -> Converted:
+def convert(folder: Path, out: Path, formats: Sequence[str], processes: int, report: Report) -> Converted:
     """Convert the committed episodes of a data set to other formats, into a data set of its own.
 
     Args:
@@ -47,7 +51,8 @@ def convert(folder: Path, out: Path, formats: Sequence[str], processes: int, rep
     """
     source = Source(folder)
     check_formats(formats, source.config, folder)
-    check_trajectories(formats, source)
+    contents: set[Content] = {content for name in formats for content in contents_of(name, source.config)}
+    source.check_contents(contents)
     _check_apart(folder, out)
     config = dataclasses.replace(source.config, bake=dataclasses.replace(source.config.bake, formats=tuple(formats)))
     classes = load_exporter_classes(formats)
@@ -56,35 +61,60 @@ def convert(folder: Path, out: Path, formats: Sequence[str], processes: int, rep
         if output.is_finished:
             return Converted(resumed, resumed)
         with WriterPool(processes or count_cores(), 0, output.lock) as pool:
-            converters = Converters(source, out, config, pool)
-            output.prepare(converters, source.inputs, pool)
-            _convert_episodes(source, output, converters, pool, report)
+            exporters = Exporters(classes, StoredContext(source, out, config, pool))
+            output.prepare(exporters, source.inputs, pool)
+            _convert_episodes(source, output, exporters, pool, contents, report)
             pool.wait()
+            exporters.close()
             finalize_data_set(out, config, classes, pool)
     return Converted(len(source.episodes), resumed)
 
 
 def _convert_episodes(
-    source: Source, output: OutputFolder, converters: Converters, pool: WriterPool, report: Callable[[str, int, int], None]
+    source: Source, output: OutputFolder, exporters: Exporters, pool: WriterPool, contents: Collection[Content], report: Report
 ) -> None:
+    """Pass what formats are made of, the views and ticks of all remaining episodes, to their exporters."""
     total, working = len(output.episodes), [0]
     done = [len(output.committed)]
     limit = AHEAD * max(1, len(pool.pids()))
 
-    def commit(end) -> None:
-        output.commit(converters, pool, end)
+    def commit(end: EpisodeEnd) -> None:
+        output.commit(exporters, pool, end)
         working[0] -= 1
         done[0] += 1
         report("episodes", done[0], total)
 
     for index in output.remaining:
         pool.wait_until(lambda: working[0] < limit)
-        episode = source.episode(index)
+        end = source.episode_end(index)
         working[0] += 1
-        if Ending(episode.end.ending).delivers:
-            converters.convert(episode, partial(commit, episode.end))
-        else:
-            commit(episode.end)
+        if Ending(end.ending).delivers:
+            if "views" in contents:
+                exporters.write_stored(index, source.scenes(end))
+            for batch in source.ticks(end) if "poses" in contents else ():
+                exporters.write_ticks(batch)
+        exporters.end_episode(end, partial(commit, end))
+
+
+def check_formats(names: Sequence[str], config: Config, folder: Path) -> None:
+    """Check that a data set can be converted to these formats.
+
+    Args:
+        names: Names of formats.
+        config: Settings of the data set.
+        folder: Its folder.
+
+    Raises:
+        ConfigError: A format is unknown, cannot be converted to, or is there already; or the settings are those of a bake only.
+    """
+    if config.bop.layout != CLASSIC:
+        raise ConfigError(f'{folder} has bop.layout = "{config.bop.layout}", which convert does not read; bake the other formats')
+    for name in names:
+        if name not in convertible():
+            why = f"; no other format has the physics of {name}" if name in FORMAT_TABLE else ""
+            raise ConfigError(f"--to names {name}; allowed: {', '.join(convertible())}{why}")
+        if name in config.bake.formats:
+            raise ConfigError(f"--to names {name}, which {folder} has already; copy the folder")
 
 
 def _check_apart(folder: Path, out: Path) -> None:

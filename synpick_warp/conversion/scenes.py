@@ -1,177 +1,128 @@
-"""Tasks that convert one scene: to shards, to a scene folder, to videos. They run in writer processes.
-
-Images are copied as they are, never decoded and encoded again; annotations are read, checked, and written as a bake writes them.
-"""
+"""Views of a scene that is converted, as exporters take them: files as they are, annotations as they were read, masks as runs."""
 
 from __future__ import annotations
 
 import os
 from collections.abc import Iterator
-from dataclasses import dataclass, field
-from fractions import Fraction
-from pathlib import Path
-from typing import Any, BinaryIO
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
 
 import numpy as np
 
-from synpick_warp.conversion.masks import read_masks
-from synpick_warp.dataset.view_files import SceneFiles, SceneFolder, SceneShards, ViewRecords, check_planes
-from synpick_warp.errors import DatasetError, OutputError
-from synpick_warp.exporters.bop.coco.annotation_files import make_annotations, write_image
-from synpick_warp.exporters.bop.keypoints import Keypoints, project_keypoints
-from synpick_warp.exporters.bop.scene import create_scene_folders
-from synpick_warp.exporters.bop.shards.tar_files import END_OF_ARCHIVE, MAX_SHARD_VIEWS, mask_json, shard_name, tar_entry, view_key
-from synpick_warp.exporters.bop.view import (
-    ANNOTATIONS,
-    ViewTruth,
-    annotation_block,
-    encode_masks,
-    make_coco_annotations,
-    to_json,
-)
-from synpick_warp.exporters.writing.files import sync_folder
-from synpick_warp.exporters.writing.folder import Buffer, open_folder
+from synpick_warp.dataset.annotations import ADVICE
+from synpick_warp.dataset.view_files import SceneFiles, SceneFolder, ViewRecords, check_planes
+from synpick_warp.errors import DatasetError
+from synpick_warp.exporters.writing.rle import Masks, Runs, find_run_boundaries
+from synpick_warp.inputs.files import read_file_if_present
+from synpick_warp.inputs.image_files import MAX_IMAGE_FILE
+from synpick_warp.inputs.png_crop import decode_grey_crop
 
 
-@dataclass(frozen=True)
-class SceneSource:
-    """A scene of the source: its folder, or else its shards."""
+@dataclass(frozen=True, eq=False)
+class StoredSceneFiles:
+    """`StoredScene` of a scene folder or of shards."""
 
-    folder: Path | None
-    shards: tuple[Path, ...]
+    files: SceneFiles
+    """Of which nothing has been read, so that they are small when pickled."""
     scene: int
     """BOP scene_id."""
-    size: tuple[int, int]
-    """Width and height of the images [px]."""
     frames: int
 
-    def open(self) -> SceneFiles:
-        """The scene's files."""
-        return SceneFolder(self.folder, self.size) if self.folder is not None else SceneShards(self.shards, self.scene, self.size)
+    def views(self, frames: range) -> Iterator[StoredViewFiles]:
+        """See `StoredScene`."""
+        return (StoredViewFiles(self.files, self.scene, frame) for frame in frames)
 
 
-@dataclass(frozen=True)
-class SceneContent:
-    """Configured contents of a converted scene: masks, COCO annotations, layers and keypoints."""
+class StoredViewFiles:
+    """`StoredView` of these files."""
 
-    masks: bool
-    coco: bool
-    layers: tuple[str, ...]
-    keypoints: dict[int, Keypoints] = field(default_factory=dict)
-    """Keypoints in COCO annotations, by obj_id; empty: none."""
+    def __init__(self, files: SceneFiles, scene: int, frame: int) -> None:
+        """
+        Args:
+            files: Files of the scene.
+            scene: BOP scene_id.
+            frame: Index of the frame.
+        """
+        self.files, self.scene, self.frame = files, scene, frame
 
+    @cached_property
+    def _records(self) -> ViewRecords:
+        return self.files.records(self.frame)
 
-def write_shards(source: SceneSource, content: SceneContent, staging: Path) -> None:
-    """Task: write the shards of a scene to a staging folder, which exists."""
-    files = source.open()
-    for part, begin in enumerate(range(0, source.frames, MAX_SHARD_VIEWS)):
-        with (staging / shard_name(source.scene, part)).open("wb") as shard:
-            for frame in range(begin, min(begin + MAX_SHARD_VIEWS, source.frames)):
-                _write_view(shard, files, source, content, frame)
-            shard.write(END_OF_ARCHIVE)
-            shard.flush()
-            os.fsync(shard.fileno())
+    @property
+    def camera(self) -> dict[str, Any]:
+        """See `EncodedView`."""
+        return self._records.camera
 
+    @property
+    def gt(self) -> list[dict[str, Any]]:
+        """See `EncodedView`."""
+        return self._records.gt
 
-def _write_view(shard: BinaryIO, files: SceneFiles, source: SceneSource, content: SceneContent, frame: int) -> None:
-    key = view_key(source.scene, frame)
-    for name, data in _list_entries(files, source, content, frame):
-        shard.writelines(tar_entry(f"{key}.{name}", data))
+    @property
+    def gt_info(self) -> list[dict[str, Any]]:
+        """See `EncodedView`."""
+        return self._records.gt_info
 
+    @property
+    def color(self) -> tuple[str, bytes]:
+        """See `EncodedView`."""
+        return self.files.image_file("rgb", self.frame)
 
-def _list_entries(files: SceneFiles, source: SceneSource, content: SceneContent, frame: int) -> Iterator[tuple[str, Buffer]]:
-    """Entries of a view, in the order of a bake's."""
-    for name in ("rgb", "depth"):
-        suffix, data = files.image_file(name, frame)
-        yield f"{name}{suffix}", data
-    records = files.records(frame)
-    for name, record in (("camera", records.camera), ("gt", records.gt), ("gt_info", records.gt_info)):
-        yield f"{name}.json", to_json(record)
-    if content.masks:
-        masks = read_masks(files, frame, records.gt_info, source.size)
-        width, height = source.size
-        yield "mask.json", mask_json((mask.amodal for mask in masks), height, width)
-        yield "mask_visib.json", mask_json((mask.visible for mask in masks), height, width)
-    for name in content.layers:
-        suffix, data = files.image_file(name, frame)
-        yield f"{name}{suffix}", data
+    @property
+    def depth(self) -> bytes:
+        """See `EncodedView`."""
+        return self.layer("depth")
 
+    def layer(self, name: str) -> bytes:
+        """See `StoredView`."""
+        suffix, data = self.files.image_file(name, self.frame)
+        if suffix != ".png":
+            raise DatasetError(f"{name} of image {self.frame} in {self.files.place} is a {suffix} file, expected: .png; {ADVICE}")
+        return data
 
-def write_scene(source: SceneSource, content: SceneContent, staging: Path) -> None:
-    """Task: write the images and annotation blocks of a scene folder to a staging folder, which it creates."""
-    files = source.open()
-    create_scene_folders(staging, content.masks, content.layers)
-    width, height = source.size
-    with open_folder(staging) as folder:
-        for frame in range(source.frames):
-            for name in ("rgb", "depth", *content.layers):
-                suffix, data = files.image_file(name, frame)
-                folder.write(f"{name}/{frame:06d}{suffix}", data)
-            records = files.records(frame)
-            masks = read_masks(files, frame, records.gt_info, source.size) if content.masks or content.coco else []
-            if content.masks:
-                for index, mask in enumerate(masks):
-                    amodal, visible = encode_masks(mask, height, width)
-                    folder.write(f"mask/{frame:06d}_{index:06d}.png", amodal)
-                    folder.write(f"mask_visib/{frame:06d}_{index:06d}.png", visible)
-            entries: list[object] = [records.camera, records.gt, records.gt_info]
-            if content.coco:
-                truth, points = _make_truth(source, frame, records), _project_keypoints(files, frame, records, content)
-                entries += make_coco_annotations(truth, records.gt_info, masks, height, width, points)
-            folder.append(ANNOTATIONS, annotation_block(frame, map(to_json, entries)))
+    def color_image(self) -> np.ndarray:
+        """See `StoredView`."""
+        return np.ascontiguousarray(self._image("rgb", 3, "uint8")[..., ::-1])
 
+    def depth_image(self) -> np.ndarray:
+        """See `EncodedView`."""
+        return self._image("depth", None, "uint16")
 
-def _project_keypoints(files: SceneFiles, frame: int, records: ViewRecords, content: SceneContent) -> list[dict[str, Any]] | None:
-    """Keys of keypoints in the annotations of a view's instances; None: there are none."""
-    if not content.keypoints:
-        return None
-    if unknown := {row["obj_id"] for row in records.gt} - content.keypoints.keys():
-        raise DatasetError(f"image {frame} in {files.place} has obj_id {min(unknown)}, which is none of the bake's objects")
-    depth = check_planes(files.image("depth", frame), None, f"depth of image {frame} in {files.place}", "uint16")
-    return project_keypoints(records.gt, records.camera, depth, content.keypoints)
+    def _image(self, name: str, channels: int | None, dtype: str) -> np.ndarray:
+        return check_planes(self.files.image(name, self.frame), channels, f"{name} of image {self.frame} in {self.files.place}", dtype)
+
+    def masks(self) -> list[Masks]:
+        """See `EncodedView`: from crops of PNG files in scene folders, from run lengths in shards."""
+        files, infos = self.files, self.gt_info
+        if not isinstance(files, SceneFolder):
+            both = [files.masks(name, self.frame, len(infos)) for name in ("mask", "mask_visib")]
+            return [Masks(*(_find_runs(mask) for mask in pair)) for pair in zip(*both, strict=True)]
+        return [
+            Masks(
+                _read_runs(files, "mask", self.frame, index, info["bbox_obj"], info["px_count_valid"]),
+                _read_runs(files, "mask_visib", self.frame, index, info["bbox_visib"], info["px_count_visib"]),
+            )
+            for index, info in enumerate(infos)
+        ]
 
 
-def _make_truth(source: SceneSource, frame: int, records: ViewRecords) -> ViewTruth:
-    """Ground truth for COCO annotations, which take the frame and object ids from it."""
-    nothing = np.empty(0)
-    object_id = np.array([row["obj_id"] for row in records.gt], np.int64)
-    return ViewTruth(source.scene, frame, 0, {}, nothing, object_id, nothing, nothing, nothing, False, 0, 0)
+def _read_runs(files: SceneFolder, name: str, frame: int, index: int, box: list[int], count: int) -> Runs:
+    """Read a mask within its box, or the whole of it, if the box does not hold the pixels that the annotations count."""
+    width, height = files.size or (0, 0)
+    left, top = max(0, box[0]), max(0, box[1])
+    rows, columns = slice(top, max(top, min(height, box[1] + box[3] + 1))), slice(left, max(left, min(width, box[0] + box[2] + 1)))
+    if box[2] >= 0 and rows.stop > rows.start and columns.stop > columns.start:
+        path = f"{files.images(name)}{os.sep}{frame:06d}_{index:06d}.png"
+        data = read_file_if_present(path, MAX_IMAGE_FILE, DatasetError)
+        crop = None if data is None else decode_grey_crop(data, (width, height), rows, columns)
+        if crop is not None:
+            runs = _find_runs(crop > 0, top, left)
+            if runs.count == count:
+                return runs
+    return _find_runs(files.mask(name, frame, index))
 
 
-def write_video_group(source: SceneSource, first: int, rate: Fraction, path: Path) -> None:
-    """Task: encode a group of frames from the source's colour images."""
-    from synpick_warp.exporters.lerobot.video import GROUP, count_levels, split_planes, write_group
-
-    files = source.open()
-    planes, levels = [], np.zeros((3, 256), np.int64)
-    for frame in range(first, min(first + GROUP, source.frames)):
-        image = check_planes(files.image("rgb", frame), 3, f"rgb of image {frame} in {files.place}", "uint8")
-        color = np.ascontiguousarray(image[..., ::-1])
-        levels += count_levels(color)
-        planes.append(split_planes(color))
-    write_group(planes, levels, rate, path)
-
-
-def write_coco(source: SceneSource, content: SceneContent, staging: Path) -> None:
-    """Task: write the images and annotations of a COCO scene to a staging folder, which it creates."""
-    files = source.open()
-    staging.mkdir()
-    width, height = source.size
-    for frame in range(source.frames):
-        suffix, data = files.image_file("rgb", frame)
-        records = files.records(frame)
-        masks = read_masks(files, frame, records.gt_info, source.size)
-        points = _project_keypoints(files, frame, records, content)
-        write_image(staging, frame, suffix, data, make_annotations(records.gt, records.gt_info, masks, height, width, points))
-
-
-def place_shards(scenes: tuple[tuple[Path, int], ...], split: Path, frames: int) -> None:
-    """Task: rename the shards of an episode's scenes, (staging folder, scene_id), to their places."""
-    for staging, scene in scenes:
-        names = [shard_name(scene, part) for part in range(-(-frames // MAX_SHARD_VIEWS))]
-        if sorted(path.name for path in staging.iterdir()) != sorted(names):
-            raise OutputError(f"{staging} does not hold the shards of {frames} frames; this is an error of synpick-warp, please report it")
-        for name in names:
-            (staging / name).rename(split / name)
-        staging.rmdir()
-    sync_folder(split)
+def _find_runs(mask: np.ndarray, top: int = 0, left: int = 0) -> Runs:
+    return find_run_boundaries(mask.astype(np.uint8), top, left).runs_of(1)

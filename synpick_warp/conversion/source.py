@@ -5,15 +5,13 @@ from __future__ import annotations
 import json
 import os
 import shutil
-from collections.abc import Iterator
-from dataclasses import dataclass
-from functools import cached_property
+from collections.abc import Collection, Iterator
 from pathlib import Path
 from typing import Any
 
 from synpick_warp.codes import Ending
 from synpick_warp.configs.schema import Config
-from synpick_warp.conversion.scenes import SceneSource
+from synpick_warp.conversion.scenes import StoredSceneFiles
 from synpick_warp.conversion.trajectories import check_trajectory, read_ticks
 from synpick_warp.dataset.annotations import ADVICE, check_content
 from synpick_warp.dataset.file_names import check_file_names
@@ -28,10 +26,10 @@ from synpick_warp.dataset.manifest import (
     read_manifest,
     read_settings,
 )
-from synpick_warp.dataset.reading import DataSet, Episode
+from synpick_warp.dataset.reading import DataSet
 from synpick_warp.dataset.trajectory import GROUP_FILE, StoreAttributes
-from synpick_warp.dataset.view_files import SceneFolder, SceneShards
 from synpick_warp.errors import DatasetError
+from synpick_warp.exporters.formats import Content
 from synpick_warp.exporters.trajectory.arrays import STORE
 from synpick_warp.exporters.writing.checksums import open_regular
 from synpick_warp.exporters.writing.files import remove_folder
@@ -39,43 +37,6 @@ from synpick_warp.frames import EpisodeEnd, TickBatch
 
 _COPY_BYTES = 1 << 20
 """Size of a copy block [B]."""
-
-
-@dataclass(frozen=True, eq=False)
-class SourceEpisode:
-    """A committed episode of the source."""
-
-    source: Source
-    end: EpisodeEnd
-
-    @property
-    def frames(self) -> int:
-        """Number of frames."""
-        return self.end.frames
-
-    @property
-    def data(self) -> Episode:
-        """The episode as `synpick_warp.open` gives it."""
-        return self.source.data[self.end.episode]
-
-    def scenes(self) -> list[SceneSource]:
-        """The scene of each camera."""
-        found, data, size = [], self.source.data, self.source.config.cameras.resolution
-        for camera in range(data.camera_count):
-            scene = data.camera_count * self.end.episode + camera
-            files = data.scene_files(self.end.episode, camera)
-            folder = files.folder if isinstance(files, SceneFolder) else None
-            shards = files.shards if isinstance(files, SceneShards) else ()
-            found.append(SceneSource(folder, shards, scene, size, self.frames))
-        return found
-
-    def check_trajectory(self, *, gripper: bool) -> None:
-        """See `trajectories.check_trajectory`."""
-        check_trajectory(self.data, self.end, self.source.light_count, gripper=gripper)
-
-    def ticks(self) -> Iterator[TickBatch]:
-        """See `trajectories.read_ticks`."""
-        return read_ticks(self.data, self.source.steps_per_tick)
 
 
 class Source:
@@ -102,24 +63,18 @@ class Source:
         """Content digests of objects and lights."""
         return self._manifest.get(INPUTS, {})
 
-    @property
-    def has_images(self) -> bool:
-        """Whether it has views."""
-        return bool({"bop", "shards"} & set(self.config.bake.formats))
+    def check_contents(self, needed: Collection[Content]) -> None:
+        """Check that it has what formats are made of: all attributes and arrays of the trajectories, but of images only that there are any.
 
-    @property
-    def steps_per_tick(self) -> int:
-        """Physics steps of a frame."""
-        return self.config.physics.steps_per_tick
-
-    @property
-    def light_count(self) -> int:
-        """Number of environment maps that the trajectory store names."""
-        return len(self._store.lights)
-
-    @cached_property
-    def _store(self) -> StoreAttributes:
-        return check_content(self.data.attributes, StoreAttributes, self.data.folder / STORE / GROUP_FILE)
+        Raises:
+            DatasetError: It lacks something, or that is damaged.
+        """
+        if "poses" in needed:
+            self.check_trajectories(gripper="gripper" in needed)
+        if "views" in needed and not {"bop", "shards"} & set(self.config.bake.formats):
+            raise DatasetError(f"{self.folder} has no images; bake it with --formats bop or shards")
+        if "masks" in needed and not self.config.bop.masks:
+            raise DatasetError(f"{self.folder} has no masks, which COCO annotations need; bake it with bop.masks = true")
 
     def check_trajectories(self, *, gripper: bool) -> None:
         """Check that the trajectories of all episodes have what a format needs; `gripper`: states and commands of the gripper, too.
@@ -128,16 +83,27 @@ class Source:
             DatasetError: There are none, or an attribute or array is missing or damaged.
         """
         self.data.require_store()
-        if self._store.steps_per_tick != self.steps_per_tick:
-            there = f"steps_per_tick is {self._store.steps_per_tick}, the settings have {self.steps_per_tick}"
-            raise DatasetError(f"{self.data.folder / STORE / GROUP_FILE} is damaged: {there}; {ADVICE}")
-        for index in self.episodes:
-            episode = self.episode(index)
-            if Ending(episode.end.ending).delivers:
-                episode.check_trajectory(gripper=gripper)
+        place = self.data.folder / STORE / GROUP_FILE
+        store = check_content(self.data.attributes, StoreAttributes, place)
+        steps = self.config.physics.steps_per_tick
+        if store.steps_per_tick != steps:
+            there = f"steps_per_tick is {store.steps_per_tick}, the settings have {steps}"
+            raise DatasetError(f"{place} is damaged: {there}; {ADVICE}")
+        for end in map(self.episode_end, self.episodes):
+            if Ending(end.ending).delivers:
+                check_trajectory(self.data[end.episode], end, len(store.lights), gripper=gripper)
 
-    def episode(self, index: int) -> SourceEpisode:
-        """A committed episode.
+    def scenes(self, end: EpisodeEnd) -> list[StoredSceneFiles]:
+        """The scene of each camera in an episode."""
+        data, cameras = self.data, range(self.data.camera_count)
+        return [StoredSceneFiles(data.scene_files(end.episode, one), len(cameras) * end.episode + one, end.frames) for one in cameras]
+
+    def ticks(self, end: EpisodeEnd) -> Iterator[TickBatch]:
+        """See `trajectories.read_ticks`."""
+        return read_ticks(self.data[end.episode], self.config.physics.steps_per_tick)
+
+    def episode_end(self, index: int) -> EpisodeEnd:
+        """How a committed episode ended.
 
         Raises:
             DatasetError: Its manifest entry is missing or damaged.
@@ -148,7 +114,7 @@ class Source:
         row: dict[str, Any] = entry["row"]
         check_frames(self.folder, self.config, index, row["frames"])
         lines = tuple(json.dumps(attempt) + "\n" for attempt in entry["attempts"])
-        return SourceEpisode(self, EpisodeEnd(index, row["arrangement"], row["frames"], int(Ending[row["ending"].upper()]), row, lines))
+        return EpisodeEnd(index, row["arrangement"], row["frames"], int(Ending[row["ending"].upper()]), row, lines)
 
     def copy_constants(self, names: tuple[Path, ...], out: Path) -> None:
         """Copy files that all episodes share, and those in folders of these names, to another data set; replaces what is there.

@@ -1,82 +1,26 @@
-"""Names of a data set's files, as regular expressions for each format: what the checksum lists of constants and episodes may name.
+"""Check of the names in a data set's checksum lists, of constants and of episodes: only those that its formats write.
 
 A list in a folder that somebody else made could name `.git/hooks/post-checkout` or `Makefile`; files are copied by lists, so a list is
-compared with these names first. They follow from the settings alone.
+compared with the names in `FORMAT_TABLE` first. They follow from the settings alone.
 """
 
 from __future__ import annotations
 
 import functools
 import re
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from pathlib import Path
 
 from synpick_warp.configs.schema import Config
-from synpick_warp.configs.splits import bop_folder, bop_scene
 from synpick_warp.dataset.manifest import CONSTANTS, MAX_SHOWN, entry_advice
 from synpick_warp.errors import DatasetError
-from synpick_warp.inputs.image_files import TEXTURE_KINDS
-
-_INDEX = r"[0-9]{6,12}"
-_PLAIN = r"[^./][^/]*"
-"""A part of a path that is not hidden."""
-_MODELS = rf"models(?:_eval)?/(?:models_info\.json|obj_{_INDEX}\.ply|(?:{_PLAIN}/)*{_PLAIN}\.(?i:{'|'.join(TEXTURE_KINDS)}))"
-"""Models, and textures, whose names come from the models of the user."""
-_NOTES = r"camera\.json|dataset_info\.md"
-_SCENE_CONSTANTS = rf"{_MODELS}|{_NOTES}|bop_dataset_params\.py"
-_ZARR_ARRAY = r"[a-z_]+/(?:zarr\.json|c(?:\.[0-9]+)*)"
-_STORE = r"trajectory\.zarr"
-
-
-def _bop(config: Config, episode: int) -> str:
-    scenes = "|".join(dict.fromkeys(f"{bop_scene(config, episode, camera)[0]:06d}" for camera in range(len(config.cameras.positions))))
-    image = rf"[a-z_]+(?:_cam[0-9]+)?/{_INDEX}(?:_[0-9]{{6}})?\.(?:png|jpg)"
-    return rf"{re.escape(bop_folder(config, episode))}/(?:{scenes})/(?:scene_[a-z_]+(?:_cam[0-9]+)?\.json|{image})"
-
-
-def _shards(config: Config, episode: int) -> str:
-    # Further shards of a scene have its id plus a multiple of a million.
-    return rf"{re.escape(bop_folder(config, episode))}_web/shard-[0-9]{{0,12}}(?:{_scenes(config, episode)})\.tar"
-
-
-def _usd(_: Config, episode: int) -> str:
-    return rf"usd/{episode:06d}\.usdc"
-
-
-def _zarr(_: Config, episode: int) -> str:
-    return rf"{_STORE}/episodes/{episode:06d}/(?:zarr\.json|[a-z_]+/(?:zarr\.json|{_ZARR_ARRAY}))"
-
-
-def _lerobot(_: Config, episode: int) -> str:
-    video = rf"chunk-{episode // 1000:03d}/file-{episode % 1000:03d}\.mp4"
-    return rf"lerobot/(?:parts/{episode:06d}\.json|videos/observation\.images\.camera_[0-9]+/{video})"
-
-
-def _coco(config: Config, episode: int) -> str:
-    scenes = _scenes(config, episode)
-    return rf"coco/(?:parts/(?:{scenes})\.jsonl|images/(?:{scenes})/{_INDEX}\.(?:png|jpg))"
-
-
-def _scenes(config: Config, episode: int) -> str:
-    cameras = len(config.cameras.positions)
-    return "|".join(f"{scene:06d}" for scene in range(cameras * episode, cameras * (episode + 1)))
-
-
-_FORMATS: dict[str, tuple[str, Callable[[Config, int], str]]] = {
-    "bop": (_SCENE_CONSTANTS, _bop),
-    "shards": (_SCENE_CONSTANTS, _shards),
-    "usd": (r"usd/assets/(?:[a-z_0-9]+\.usdc|lights/light_[0-9]{3,6}\.exr|textures/[a-z_0-9]+\.png)", _usd),
-    "zarr": (rf"{_STORE}/(?:(?:episodes/)?zarr\.json|(?:objects|cameras)/(?:zarr\.json|{_ZARR_ARRAY}))", _zarr),
-    "lerobot": (_NOTES, _lerobot),
-    "coco": (rf"coco/categories\.json|{_NOTES}", _coco),
-}
-"""Format -> names of its constants, and of an episode's files."""
+from synpick_warp.exporters.formats import FORMAT_TABLE
 
 
 @functools.lru_cache(maxsize=4)
 def _pattern(config: Config, entry: Path) -> re.Pattern[str]:
-    formats = [_FORMATS[name] for name in dict.fromkeys(config.bake.formats)]
-    names = (constants if entry == CONSTANTS else episode(config, int(entry.name)) for constants, episode in formats)
+    formats = [FORMAT_TABLE[name] for name in dict.fromkeys(config.bake.formats)]
+    names = (row.constants if entry == CONSTANTS else row.episode(config, int(entry.name)) for row in formats)
     return re.compile("|".join(dict.fromkeys(names)))
 
 

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 from synpick_warp.configs.splits import bop_folder, bop_scene
 from synpick_warp.dataset.annotations import ADVICE
 from synpick_warp.errors import DatasetError
+from synpick_warp.exporters.formats import part_files
 from synpick_warp.exporters.trajectory.arrays import EPISODES, STORE
 from synpick_warp.inputs.files import describe_bytes
 
@@ -21,9 +22,8 @@ if TYPE_CHECKING:
 
 _HARMLESS = 1000
 """Number of frames up to which nothing is compared: reading finds what is missing, and says so better."""
-_CAMERA, _COCO, _MEMBERS, _ROW = 40, 3, 5 * 1024, 64
-"""Least bytes that a frame takes in scene_camera.json ("0": {"cam_K": nine numbers}), in a line of COCO annotations ([] and its end), in a
-shard (five members with headers) and in a part of LeRobot (a row in base64)."""
+_CAMERA, _MEMBERS = 40, 5 * 1024
+"""Least bytes that a frame takes in scene_camera.json ("0": {"cam_K": nine numbers}), and in a shard (five members with headers)."""
 
 
 def check_frames(folder: Path, config: Config | None, episode: int, frames: int) -> None:
@@ -66,12 +66,12 @@ def _sizes(folder: Path, config: Config | None, episode: int) -> Iterator[tuple[
     times = folder / STORE / EPISODES / name / "ticks" / "time"
     if times.is_dir():
         yield times, sum(_size(path) for path in times.iterdir() if path.name.startswith("c")), 1
-    places = [(folder / "usd" / f"{name}.usdc", 1), (folder / "lerobot" / "parts" / f"{name}.json", _ROW)]
+    parts = part_files(None if config is None else len(config.cameras.positions))
+    places = [(folder / part.file(episode), part.frame_bytes) for part in parts]
     if config is not None:
         cameras, (scene, sensor) = len(config.cameras.positions), bop_scene(config, episode, 0)
         split = folder / bop_folder(config, episode)
         places.append((split / f"{scene:06d}" / f"scene_camera{sensor}.json", _CAMERA))
-        places.append((folder / "coco" / "parts" / f"{cameras * episode:06d}.jsonl", _COCO))
         first = split.with_name(f"{split.name}_web") / f"shard-{cameras * episode:06d}.tar"
         if first.is_file():
             shards = first.parent.glob(f"shard-*{cameras * episode:06d}.tar")

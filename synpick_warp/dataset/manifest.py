@@ -29,6 +29,7 @@ from synpick_warp.configs.load import load_config, override_config
 from synpick_warp.configs.schema import CLASSIC, WITHIN, Config
 from synpick_warp.dataset.records import Entry, EpisodeEntry, IndicesEntry, Manifest, read_record
 from synpick_warp.errors import DatasetError
+from synpick_warp.exporters.formats import FORMAT_TABLE
 from synpick_warp.exporters.writing.checksums import parse_checksums
 from synpick_warp.exporters.writing.files import MANIFEST_FILE
 from synpick_warp.inputs.files import check_regular_file, read_file
@@ -65,9 +66,7 @@ YOUNGER_SETTINGS: dict[str, Any] = {"bop.layout": CLASSIC, "bop.keypoints": 0, "
 """Settings that older manifests lack, and what held before: left out where they have these values, so that older data sets can still be
 read, and resumed with them."""
 PACKAGES = ("warp-lang", "newton", "numpy", "scipy", "coacd", "opencv-python-headless", "isal", "orjson", "usd-core", "zarr")
-"""Packages whose versions the output depends on."""
-FORMAT_PACKAGES = {"lerobot": ("av", "pyarrow")}
-"""Further ones, of a format."""
+"""Packages whose versions the output of every format depends on; `FORMAT_TABLE` has those of single formats."""
 MAX_DIFFERENCES, MAX_SHOWN = 8, 80
 """Differences, and characters of a value, that an error message shows."""
 _EPISODE = re.compile(r"[0-9]{6,12}")
@@ -84,7 +83,8 @@ class _Format(msgspec.Struct):
 def make_manifest(config: Config) -> dict[str, Any]:
     """Build the manifest of a data set with these settings, in types of JSON."""
     settings = fixed_settings(config)
-    packages = (*PACKAGES, *(name for form in sorted(set(config.bake.formats)) for name in FORMAT_PACKAGES.get(form, ())))
+    rows = [row for form, row in sorted(FORMAT_TABLE.items()) if form in config.bake.formats]
+    packages = (*PACKAGES, *(name for row in rows for name in row.packages))
     content = {
         "format": FORMAT,
         "seed": config.bake.seed,

@@ -36,6 +36,7 @@ from synpick_warp.dataset.trajectory import (
     read_objects,
 )
 from synpick_warp.errors import DatasetError
+from synpick_warp.exporters.formats import PartFiles, part_files
 from synpick_warp.exporters.trajectory.arrays import EPISODE_GROUPS, EPISODES, STORE
 from synpick_warp.inputs.json import decode_json
 from synpick_warp.inputs.paths import path_inside
@@ -48,8 +49,6 @@ if TYPE_CHECKING:
 
 USD = Path("usd")
 """Folder of USD episodes in a data set."""
-LEROBOT_PARTS, COCO_PARTS = Path("lerobot/parts"), Path("coco/parts")
-"""Folders with a file per episode and per scene; these formats alone give rows and attempts, but no views."""
 
 
 class Episode:
@@ -340,6 +339,11 @@ class DataSet(Mapping[int, Episode]):
         """Where scenes are; None without settings."""
         return SceneIndex(self.folder, self.config) if (self.folder / CONFIG_FILE).exists() else None
 
+    @property
+    def _parts(self) -> list[PartFiles]:
+        """Files by which episodes are found in formats of which nothing else is read; none of scenes without settings."""
+        return part_files(None if self._scenes is None else self.camera_count)
+
     def scene_files(self, episode: int, camera: int) -> SceneFiles:
         """Files of the scene that a camera recorded in an episode: its folder, or else its shards.
 
@@ -350,19 +354,16 @@ class DataSet(Mapping[int, Episode]):
 
     def _has_files(self, index: int) -> bool:
         """Whether an episode has files in some format."""
-        name, folder = f"{index:06d}", self.folder
-        paths = [self._store / EPISODES / name / GROUP_FILE, folder / USD / f"{name}.usdc", folder / LEROBOT_PARTS / f"{name}.json"]
-        if self._scenes is not None:
-            paths.append(folder / COCO_PARTS / f"{self.camera_count * index:06d}.jsonl")
+        paths = [self._store / EPISODES / f"{index:06d}" / GROUP_FILE, *(self.folder / part.file(index) for part in self._parts)]
         return any(path.exists() for path in paths) or (self._scenes is not None and self._scenes.has(index))
 
     def _names(self) -> Iterator[int]:
         """Indices of the episodes that have files in some format; an index can occur several times."""
-        episodes = ((self._store / EPISODES, "[0-9]*"), (self.folder / USD, "[0-9]*.usdc"), (self.folder / LEROBOT_PARTS, "[0-9]*.json"))
-        yield from (index for folder, pattern in episodes for index in numbered(folder.glob(pattern)))
+        yield from numbered((self._store / EPISODES).glob("[0-9]*"))
+        for part in self._parts:
+            yield from (part.episode(number) for number in numbered(self.folder.glob(part.pattern)))
         if self._scenes is not None:
             yield from self._scenes.episodes()
-            yield from (scene // self.camera_count for scene in numbered((self.folder / COCO_PARTS).glob("[0-9]*.jsonl")))
 
     def _is_committed(self, index: int) -> bool:
         """Whether an episode is one of these and has its manifest entry; without manifest, as in a lone store, there is none to check."""

@@ -1,16 +1,19 @@
-"""Interface of all dataset writers: view and tick batches in, committed episodes on disk out."""
+"""Interface of all dataset writers: views and ticks of a bake or of a stored data set in, committed episodes on disk out."""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import ClassVar, NamedTuple, Protocol
+from typing import Any, ClassVar, NamedTuple, Protocol
+
+import numpy as np
 
 from synpick_warp.codecs.depth_png import max_data_bytes
 from synpick_warp.configs.schema import Config
+from synpick_warp.exporters.writing.folder import Buffer
 from synpick_warp.exporters.writing.pool import WriterPool
+from synpick_warp.exporters.writing.rle import Masks
 from synpick_warp.frames import EpisodeEnd, FrameBatch, TickBatch
 from synpick_warp.scenes.types import Camera, Catalog, EnvironmentMap
 from synpick_warp.system.shared_memory import shared_bytes
@@ -21,18 +24,127 @@ LAYER_BYTES = 12
 """Bytes of a pixel of the largest layer."""
 
 
-@dataclass(frozen=True, eq=False)
 class ExportContext:
-    """Constructor argument of every exporter: output folder, settings, scene assets and the writer pool."""
+    """Constructor argument of every exporter: output folder, settings, scene assets and the writer pool.
 
-    out: Path
-    """Folder of the data set. It exists and contains the folder `PARTIAL`."""
-    config: Config
-    catalog: Catalog
-    cameras: tuple[Camera, ...]
-    lights: tuple[EnvironmentMap, ...]
-    pool: WriterPool
-    """Writes all files of episodes. Exporters neither close nor abort it."""
+    This is the context of a bake; that of a conversion loads objects and lights when a format asks for them.
+    """
+
+    def __init__(
+        self,
+        out: Path,
+        config: Config,
+        catalog: Catalog,
+        cameras: tuple[Camera, ...],
+        lights: tuple[EnvironmentMap, ...],
+        pool: WriterPool,
+    ) -> None:
+        """
+        Args:
+            out: Folder of the data set. It exists and contains the folder `PARTIAL`.
+            config: All settings.
+            catalog: The objects.
+            cameras: The cameras.
+            lights: The environment maps.
+            pool: Writes all files of episodes. Exporters neither close nor abort it.
+        """
+        self.out, self.config, self.cameras, self.pool = out, config, cameras, pool
+        self._catalog, self._lights = catalog, lights
+
+    @property
+    def catalog(self) -> Catalog:
+        """The objects."""
+        return self._catalog
+
+    @property
+    def lights(self) -> tuple[EnvironmentMap, ...]:
+        """The environment maps."""
+        return self._lights
+
+    @property
+    def names(self) -> dict[int, str]:
+        """obj_id -> name of all objects, in this order."""
+        return {entry.obj_id: entry.name for entry in self.catalog.entries}
+
+    def copy_constants(self, names: tuple[Path, ...]) -> bool:
+        """Copy the files of these names, or those in folders, from the data set that is converted; returns whether there is one.
+
+        Raises:
+            OSError: A file cannot be written.
+        """
+        return False
+
+
+class EncodedView(Protocol):
+    """One view as files hold it. Each part is encoded, or read, when it is first used: in the process that writes it."""
+
+    @property
+    def scene(self) -> int:
+        """BOP scene_id."""
+        ...
+
+    @property
+    def frame(self) -> int:
+        """BOP im_id: index of the frame in its episode."""
+        ...
+
+    @property
+    def color(self) -> tuple[str, Buffer]:
+        """Suffix and content of the colour image's file."""
+        ...
+
+    @property
+    def depth(self) -> Buffer:
+        """PNG file of the depth image."""
+        ...
+
+    def depth_image(self) -> np.ndarray:
+        """Depth image, in units of `depth_scale` mm; 0: no surface (H, W) uint16."""
+        ...
+
+    @property
+    def camera(self) -> dict[str, Any]:
+        """Entry in scene_camera.json."""
+        ...
+
+    @property
+    def gt(self) -> list[dict[str, Any]]:
+        """Entry in scene_gt.json: one per instance."""
+        ...
+
+    @property
+    def gt_info(self) -> list[dict[str, Any]]:
+        """Entry in scene_gt_info.json: one per instance, in the same order."""
+        ...
+
+    def masks(self) -> list[Masks]:
+        """Masks of the instances, in the same order."""
+        ...
+
+
+class StoredView(EncodedView, Protocol):
+    """A view of a data set that is converted."""
+
+    def color_image(self) -> np.ndarray:
+        """Colour image, sRGB, RGB order (H, W, 3) uint8."""
+        ...
+
+    def layer(self, name: str) -> Buffer:
+        """PNG file of a layer."""
+        ...
+
+
+class StoredScene(Protocol):
+    """All views of one camera in an episode that is converted. Small when pickled; files are read by the task that asks for views."""
+
+    @property
+    def frames(self) -> int:
+        """Number of frames."""
+        ...
+
+    def views(self, frames: range) -> Iterator[StoredView]:
+        """The views of some frames, in order."""
+        ...
 
 
 class SharedFiles(NamedTuple):
@@ -130,6 +242,17 @@ class Exporter(Protocol):
         """Enqueue views; copies what it keeps. Blocks while the writers are behind (back-pressure).
 
         An episode's frames come in order, all before its end.
+        """
+        ...
+
+    def write_stored(self, episode: int, scenes: Sequence[StoredScene]) -> None:
+        """Enqueue all views of an episode of a data set that is converted, in place of `write_views`.
+
+        Files are those of a bake: images are copied where the format holds such, and annotations written as a bake writes them.
+
+        Args:
+            episode: Index of the episode.
+            scenes: The scene of each camera.
         """
         ...
 

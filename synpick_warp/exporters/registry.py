@@ -1,18 +1,4 @@
-"""Registry of dataset formats, and all exporters of a bake as one.
-
-How to add a format:
-
-1. Write a class that implements `Exporter` (`base.py`) in a module or subpackage of this package. Write episodes' files through the
-   writer pool, stage them in `PARTIAL`, and commit them by rename; `usd/exporter.py` is the shortest example.
-2. Add a line to EXPORTERS: the format's name, the module and the class.
-3. Allow the name as a value of the setting `bake.formats`: `FORMATS` in configs/schema.py. Settings must not import exporters, so
-   the name stands there once more; a test compares both.
-4. Add the names of its files to `dataset/file_names.py`: `merge`, `convert` and `verify` take no others.
-5. Let its test class inherit `ExporterContract` (tests/harness/exporter_contract.py): determinism, atomic commits, resuming.
-
-That makes a format that is baked. For `convert`, it also needs a converter in `CONVERTERS` (conversion/converters.py); packages of its own
-stand in `FORMAT_PACKAGES` (dataset/manifest.py) and in `_EXTRAS` here; views are read from it where `dataset/scene_index.py` finds them.
-"""
+"""Exporters of the formats in `formats.FORMAT_TABLE`, and all exporters of a bake as one."""
 
 from __future__ import annotations
 
@@ -23,42 +9,28 @@ from pathlib import Path
 
 from synpick_warp.configs.schema import Config
 from synpick_warp.errors import ConfigError
-from synpick_warp.exporters.base import ExportContext, Exporter, SharedFiles
+from synpick_warp.exporters.base import ExportContext, Exporter, SharedFiles, StoredScene
+from synpick_warp.exporters.formats import FORMAT_TABLE
 from synpick_warp.exporters.writing.pool import WriterPool
 from synpick_warp.frames import EpisodeEnd, FrameBatch, TickBatch
 
-EXPORTERS = {
-    "bop": ("bop.exporter", "BopExporter"),
-    "shards": ("bop.shards.exporter", "ShardsExporter"),
-    "usd": ("usd.exporter", "UsdExporter"),
-    "zarr": ("trajectory.exporter", "TrajectoryExporter"),
-    "lerobot": ("lerobot.exporter", "LerobotExporter"),
-    "coco": ("bop.coco.exporter", "CocoExporter"),
-}
-"""Format -> (module in this package, class in it). Modules are imported when their format is used."""
-
-_EXTRAS = {"lerobot": "install it by pip install 'synpick-warp[lerobot]'"}
-"""Formats that need packages which a plain installation lacks, and how to get them."""
-
 
 def load_exporter_classes(names: Iterable[str]) -> tuple[type[Exporter], ...]:
-    """Import the classes that write these formats, each once, in the order of EXPORTERS.
+    """Import the classes that write these formats, each once, in the order of FORMAT_TABLE.
 
     Raises:
         ConfigError: A format's module, or a package that it needs, is not installed.
     """
     wanted = set(names)
-    return tuple(_load(name) for name in EXPORTERS if name in wanted)
+    return tuple(_load(name) for name in FORMAT_TABLE if name in wanted)
 
 
 def _load(name: str) -> type[Exporter]:
-    module, class_name = EXPORTERS[name]
+    row = FORMAT_TABLE[name]
     try:
-        return getattr(importlib.import_module(f"{__package__}.{module}"), class_name)
+        return getattr(importlib.import_module(f"{__package__}.{row.module}"), row.exporter)
     except ImportError as error:
-        raise ConfigError(
-            f"bake.formats names {name}, but its writer cannot be loaded: {error}; {_EXTRAS.get(name, 'name other formats')}"
-        ) from None
+        raise ConfigError(f"bake.formats names {name}, but its writer cannot be loaded: {error}; {row.remedy}") from None
 
 
 class Exporters:
@@ -77,6 +49,11 @@ class Exporters:
         """See `Exporter`."""
         for exporter in self._all:
             exporter.write_views(batch)
+
+    def write_stored(self, episode: int, scenes: Sequence[StoredScene]) -> None:
+        """See `Exporter`."""
+        for exporter in self._all:
+            exporter.write_stored(episode, scenes)
 
     def write_ticks(self, batch: TickBatch) -> None:
         """See `Exporter`."""

@@ -13,8 +13,7 @@ import pytest
 
 from synpick_warp.cli.commands import EXIT_MISTAKE, main
 from synpick_warp.configs.schema import Config, Split
-from synpick_warp.conversion.converters import check_formats
-from synpick_warp.conversion.run import convert
+from synpick_warp.conversion.run import check_formats, convert
 from synpick_warp.dataset.verify import verify
 from synpick_warp.errors import ConfigError, DatasetError
 from synpick_warp.scenes.embedded.skies import skies

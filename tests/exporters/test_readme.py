@@ -10,7 +10,7 @@ import synpick_warp.exporters
 from synpick_warp.attempts import AttemptRecord, InstanceObservation
 from synpick_warp.codes import Effect, Outcome, names
 from synpick_warp.episodes import EpisodeRow
-from synpick_warp.exporters.registry import EXPORTERS
+from synpick_warp.exporters.formats import FORMAT_TABLE
 from synpick_warp.exporters.trajectory.arrays import CONSTANT_GROUPS, EPISODE_GROUPS
 from synpick_warp.layers import LAYER_TABLE
 
@@ -26,7 +26,7 @@ def described(section: str = "") -> set[str]:
 
 
 def test_formats_and_modules_are_described():
-    assert set(EXPORTERS) <= described()
+    assert set(FORMAT_TABLE) <= described()
     for package in ("bop/", "usd/", "trajectory/", "writing/"):
         assert f"`{package}`" in README.read_text(encoding="utf-8")
 

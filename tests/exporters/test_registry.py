@@ -10,6 +10,7 @@ from synpick_warp.configs.schema import FORMATS
 from synpick_warp.errors import ConfigError
 from synpick_warp.exporters import registry
 from synpick_warp.exporters.base import ExportContext
+from synpick_warp.exporters.formats import FORMAT_TABLE
 from synpick_warp.exporters.registry import Exporters, load_exporter_classes
 from synpick_warp.frames import EpisodeEnd
 
@@ -63,14 +64,14 @@ class Other(Fake):
 
 
 def test_every_format_has_one_class_in_a_fixed_order():
-    assert tuple(registry.EXPORTERS) == FORMATS
+    assert tuple(FORMAT_TABLE) == FORMATS
     classes = load_exporter_classes(("zarr", "bop", "zarr"))
     assert [one.__name__ for one in classes] == ["BopExporter", "TrajectoryExporter"]
     assert load_exporter_classes(FORMATS) == load_exporter_classes(FORMATS[::-1])
 
 
 def test_missing_package_of_a_format_is_a_configuration_error(monkeypatch):
-    monkeypatch.setitem(registry.EXPORTERS, "usd", ("none", "None"))
+    monkeypatch.setitem(FORMAT_TABLE, "usd", FORMAT_TABLE["usd"]._replace(module="none"))
     with pytest.raises(ConfigError, match=r"bake\.formats names usd, but its writer cannot be loaded: No module named .*none"):
         load_exporter_classes(("bop", "usd"))
 
@@ -108,5 +109,5 @@ def test_views_and_physics_are_needed_if_one_exporter_needs_them():
         (True, True),
     ]
     assert [one.needs_views for one in load_exporter_classes(FORMATS)] == [
-        name in ("bop", "shards", "lerobot", "coco") for name in registry.EXPORTERS
+        name in ("bop", "shards", "lerobot", "coco") for name in FORMAT_TABLE
     ]

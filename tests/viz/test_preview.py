@@ -16,7 +16,8 @@ from synpick_warp.cli.commands import main
 from synpick_warp.configs.write import config_to_toml
 from synpick_warp.errors import DatasetError, OutputError
 from synpick_warp.exporters.bop.exporter import BopExporter
-from synpick_warp.exporters.bop.view import write_layer
+from synpick_warp.exporters.bop.scene import write_layer
+from synpick_warp.exporters.bop.view import write_rendered_layer
 from synpick_warp.viz.depth_colors import color_depth, pooled_scale, tote_scale
 from synpick_warp.viz.drawing import instance_color, short_labels
 from synpick_warp.viz.preview import MAX_VIEWS, find_scenes, read_baked, sample, write_contact_sheet
@@ -70,7 +71,7 @@ def test_layers_get_columns_of_their_own(dataset, tmp_path):
         for name, layer in values.items():
             (scene / name).mkdir()
             for frame in range(FRAMES):
-                write_layer(layer, scene, name, frame)
+                write_rendered_layer(layer, write_layer, scene, 0, name, frame)
     sheet = cv2.imread(str(write_contact_sheet(dataset, tmp_path / "sheet.png", 1)))
     assert sheet.shape[1] == 10 * (480 + 4) + LEGEND
     panels = {name: sheet[20:380, LEGEND + 484 * (4 + i) : LEGEND + 484 * (4 + i) + 480] for i, name in enumerate(values)}

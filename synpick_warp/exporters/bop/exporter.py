@@ -12,7 +12,7 @@ from synpick_warp.configs.schema import MULTISENSOR, Config
 from synpick_warp.configs.splits import bop_folder, bop_folders, bop_scene, scene_ids
 from synpick_warp.exporters.base import ExportContext, SharedFiles
 from synpick_warp.exporters.bop.keypoints import make_category_keys
-from synpick_warp.exporters.bop.scene import SceneSettings, commit_scenes, create_scene_folders
+from synpick_warp.exporters.bop.scene import SceneSettings, commit_scenes, create_scene_folders, write_layer, write_view
 from synpick_warp.exporters.bop.scene_exporter import CONSTANTS, SceneExporter
 from synpick_warp.exporters.bop.sensors import commit_sensor_scene
 from synpick_warp.exporters.bop.shared.targets import (
@@ -23,7 +23,6 @@ from synpick_warp.exporters.bop.shared.targets import (
     target_files,
     write_scene_targets,
 )
-from synpick_warp.exporters.bop.view import write_layer, write_view
 from synpick_warp.exporters.writing.files import PARTIAL, output_error
 from synpick_warp.exporters.writing.pool import WriterPool
 
@@ -33,13 +32,19 @@ class BopExporter(SceneExporter):
 
     staging = "bop"
     write_view = staticmethod(write_view)
+    write_layer = staticmethod(write_layer)
 
     def __init__(self, context: ExportContext) -> None:
         """See `Exporter`."""
         super().__init__(context)
-        names = {entry.obj_id: {"id": entry.obj_id, "name": entry.name, "supercategory": "synpick"} for entry in context.catalog.entries}
         points = {obj_id: make_category_keys(keypoints) for obj_id, keypoints in self._keypoints.items()}
-        self._categories = tuple(category | points.get(obj_id, {}) for obj_id, category in names.items())
+        names = context.names.items()
+        self._categories = tuple({"id": index, "name": name, "supercategory": "synpick"} | points.get(index, {}) for index, name in names)
+
+    @staticmethod
+    def annotates(config: Config) -> bool:
+        """See `SceneExporter`."""
+        return config.bop.coco
 
     @staticmethod
     def folder_name(split: str) -> str:
@@ -77,9 +82,6 @@ class BopExporter(SceneExporter):
 
     def _stage_scene(self, scene: Path) -> None:
         create_scene_folders(scene, self._bop.masks, self._layers)
-
-    def _layer_task(self, scene: Path, scene_id: int, name: str, frame: int) -> tuple[Callable[..., None], tuple[Any, ...]]:
-        return write_layer, (scene, name, frame)
 
     def _commit_task(self, scenes: tuple[tuple[Path, int], ...], frames: int) -> tuple[Callable[..., None], tuple[Any, ...]]:
         settings = SceneSettings(

@@ -1,4 +1,4 @@
-"""Scene folders of BOP: assemble the JSON files of a scene from the annotation blocks of its views, and commit the scene.
+"""Scene folders of BOP: write views, assemble the JSON files of a scene from the annotation blocks of its views, commit the scene.
 
 Runs in writer processes, so it imports neither Warp nor Newton.
 """
@@ -8,16 +8,22 @@ from __future__ import annotations
 import itertools
 import json
 import os
-import shutil
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, BinaryIO
 
 from synpick_warp.errors import OutputError
-from synpick_warp.exporters.bop.view import ANNOTATIONS
+from synpick_warp.exporters.base import EncodedView
+from synpick_warp.exporters.bop.view import ANNOTATIONS, ViewSettings, annotation_block, make_keypoints, make_rle, to_json
 from synpick_warp.exporters.writing.files import sync_folder
+from synpick_warp.exporters.writing.folder import Buffer, open_folder
+from synpick_warp.exporters.writing.png import encode_mask_png
+from synpick_warp.exporters.writing.rle import Masks
+from synpick_warp.layer_codec import layer_path
 
+IGNORE_VISIBILITY = 0.1
+"""COCO annotations with a lower visible fraction are marked `ignore` (the toolkit's calc_gt_coco.py)."""
 DATE = "1970-01-01 00:00:00"
 """Value of COCO's date fields: constant, so that the same seed gives the same bytes."""
 
@@ -47,6 +53,57 @@ def create_scene_folders(scene: Path, masks: bool, layers: tuple[str, ...]) -> N
         (scene / name).mkdir()
 
 
+def write_view(view: EncodedView, scene: Path, settings: ViewSettings) -> None:
+    """Write a view's images into the folders of a staged scene, and append its annotation block to `ANNOTATIONS`.
+
+    The block holds the entries of scene_camera, scene_gt and scene_gt_info, then the COCO annotations, without their ids.
+    """
+    name = f"{view.frame:06d}"
+    with open_folder(scene) as folder:
+        suffix, color = view.color
+        folder.write(f"rgb/{name}{suffix}", color)
+        folder.write(f"depth/{name}.png", view.depth)
+        masks = view.masks() if settings.masks or settings.coco else []
+        for index, mask in enumerate(masks if settings.masks else ()):
+            amodal, visible = _encode_masks(mask, *settings.resolution)
+            folder.write(f"mask/{name}_{index:06d}.png", amodal)
+            folder.write(f"mask_visib/{name}_{index:06d}.png", visible)
+        annotations = _make_annotations(view, masks, settings) if settings.coco else ()
+        folder.append(ANNOTATIONS, annotation_block(view.frame, map(to_json, (view.camera, view.gt, view.gt_info, *annotations))))
+
+
+def write_layer(data: Buffer, scene: Path, _: int, name: str, frame: int) -> None:
+    """Write a view's layer into the folder of that name."""
+    layer_path(scene, name, frame).write_bytes(data)
+
+
+def _encode_masks(masks: Masks, width: int, height: int) -> tuple[bytes, bytes]:
+    """Encode an instance's amodal and visible mask as PNG. If nothing hides the instance they are equal, and are encoded once."""
+    amodal = encode_mask_png(masks.amodal, height, width)
+    return amodal, amodal if masks.amodal.count == masks.visible.count else encode_mask_png(masks.visible, height, width)
+
+
+def _make_annotations(view: EncodedView, masks: list[Masks], settings: ViewSettings) -> Iterator[dict[str, Any]]:
+    """COCO annotations of the visible instances, without ids: amodal box clipped to the image, visible mask, keys of keypoints."""
+    width, height = settings.resolution
+    for pose, info, mask, points in zip(view.gt, view.gt_info, masks, make_keypoints(view, settings.keypoints), strict=True):
+        box = mask.amodal.box()
+        area = mask.visible.count
+        if box is not None and area:
+            x_min, y_min, x_max, y_max = box
+            yield {
+                "image_id": view.frame,
+                "category_id": pose["obj_id"],
+                "iscrowd": 0,
+                "area": area,
+                "bbox": [x_min, y_min, x_max - x_min + 1, y_max - y_min + 1],
+                "segmentation": make_rle(mask.visible, height, width),
+                "width": width,
+                "height": height,
+                "ignore": info["visib_fract"] < IGNORE_VISIBILITY,
+            } | points
+
+
 def commit_scenes(scenes: tuple[tuple[Path, Path], ...], settings: SceneSettings) -> None:
     """Task: complete an episode's scenes, and rename each from its staging folder to its place: (from, to).
 
@@ -59,12 +116,6 @@ def commit_scenes(scenes: tuple[tuple[Path, Path], ...], settings: SceneSettings
         scene.rename(place)
     for folder in {place.parent for _, place in scenes}:
         sync_folder(folder)
-
-
-def discard_scenes(scenes: tuple[Path, ...]) -> None:
-    """Task: remove the staging folders of a discarded arrangement."""
-    for scene in scenes:
-        shutil.rmtree(scene)
 
 
 def complete_scene(scene: Path, settings: SceneSettings) -> None:

@@ -2,72 +2,67 @@
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from abc import abstractmethod
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar
 
-from synpick_warp.codes import Ending
 from synpick_warp.configs.schema import Config
 from synpick_warp.configs.sensors import effect_ranges
 from synpick_warp.configs.splits import bop_folder, bop_folders
-from synpick_warp.exporters.base import ExportContext, view_bytes
+from synpick_warp.exporters.base import ExportContext, StoredScene, view_bytes
 from synpick_warp.exporters.bop.keypoints import sample_keypoints
-from synpick_warp.exporters.bop.scene import discard_scenes
 from synpick_warp.exporters.bop.shared.models import MODEL_FOLDERS, describe_dataset, write_constants
 from synpick_warp.exporters.bop.shared.toolkit import PARAMS_FILE, format_dataset_params
-from synpick_warp.exporters.bop.view import ViewSettings, make_camera_constants, make_view_task
-from synpick_warp.exporters.writing.files import PARTIAL, output_error
+from synpick_warp.exporters.bop.view import (
+    ViewSettings,
+    WriteLayer,
+    WriteView,
+    make_camera_constants,
+    make_view_task,
+    write_rendered_layer,
+    write_rendered_view,
+    write_stored_views,
+)
+from synpick_warp.exporters.staging import EpisodeExporter, StagedEpisode
+from synpick_warp.exporters.writing.files import output_error
 from synpick_warp.exporters.writing.notes import CAMERA_FILE, NOTES_FILE
 from synpick_warp.exporters.writing.pool import WriteTask
-from synpick_warp.frames import EpisodeEnd, FrameBatch, TickBatch
+from synpick_warp.frames import EpisodeEnd, FrameBatch
 
 CONSTANTS = tuple(map(Path, (*MODEL_FOLDERS, CAMERA_FILE, NOTES_FILE, PARAMS_FILE)))
 """Names of the files that all scenes share."""
 
 
-@dataclass(eq=False)
-class _Episode:
-    """An arrangement of an episode whose files are being written."""
-
-    scenes: tuple[Path, ...]
-    """Staging folder of each camera's scene."""
-    pending: int = 0
-    """Number of unfinished tasks: views and layers of views."""
-    end: EpisodeEnd | None = None
-    on_committed: Callable[[], None] | None = None
-    """Set together with `end`."""
+_Staged = StagedEpisode[tuple[Path, ...]]
+"""Its content: the staging folder of each camera's scene, in that of the episode, named by scene_id."""
 
 
-class SceneExporter(ABC):
+class SceneExporter(EpisodeExporter[tuple[Path, ...]]):
     """Base of the `Exporter`s of BOP. Camera c of episode k is scene `cameras · k + c`.
 
     A scene is staged in a hidden folder and renamed to its place when it is complete: a killed bake leaves complete scenes only.
     """
 
-    needs_physics = False
     needs_views = True
-    needs_images = False
     writes_depth = True
-    staging: ClassVar[str]
-    """Name of the format's folder in `PARTIAL`."""
-    write_view: ClassVar[Callable[..., None]]
-    """Task that writes a view: the arrays of `make_view_task`, staging folder of the scene, `ViewSettings`, `ViewTruth`."""
+    write_view: ClassVar[WriteView]
+    write_layer: ClassVar[WriteLayer | None] = None
+    """None: the format has no layers."""
 
     def __init__(self, context: ExportContext) -> None:
         """See `Exporter`."""
+        super().__init__(context)
         config, bop = context.config, context.config.bop
-        self._context = context
         self._out = context.out
         self._bop = bop
         self._cameras = context.cameras
         self._pool = context.pool
         self._suffix = f".{bop.color_format}"
-        self._layers = config.render.layers
+        self._layers = config.render.layers if self.write_layer else ()
         effects = tuple(name for name, limits in effect_ranges(config.effects).items() if any(limits))
-        entries = context.catalog.entries if bop.keypoints else ()
+        entries = context.catalog.entries if bop.keypoints and self.annotates(config) else ()
         self._keypoints = {entry.obj_id: sample_keypoints(entry.mesh.vertices, bop.keypoints) for entry in entries}
         self._views = tuple(
             ViewSettings(
@@ -83,13 +78,16 @@ class SceneExporter(ABC):
             )
             for camera in context.cameras
         )
-        self._episodes: dict[int, _Episode] = {}
-        self._arrangements = 0
 
     @classmethod
     def folders(cls, config: Config) -> tuple[Path, ...]:
         """Folders of the splits' scenes, relative to the data set."""
         return tuple(Path(cls.folder_name(split)) for split in bop_folders(config))
+
+    @staticmethod
+    def annotates(config: Config) -> bool:
+        """Whether it writes COCO annotations, which have keypoints."""
+        return False
 
     @staticmethod
     @abstractmethod
@@ -103,10 +101,6 @@ class SceneExporter(ABC):
     @abstractmethod
     def _stage_scene(self, scene: Path) -> None:
         """Create the staging folder of a scene, and its subfolders."""
-
-    @abstractmethod
-    def _layer_task(self, scene: Path, scene_id: int, name: str, frame: int) -> tuple[Callable[..., None], tuple[Any, ...]]:
-        """Task that writes a layer of a view: its function, and the arguments after the image."""
 
     @abstractmethod
     def _commit_task(self, scenes: tuple[tuple[Path, int], ...], frames: int) -> tuple[Callable[..., None], tuple[Any, ...]]:
@@ -127,6 +121,8 @@ class SceneExporter(ABC):
         try:
             for folder in self.folders(context.config):
                 (self._out / folder).mkdir(exist_ok=True)
+            if context.copy_constants(CONSTANTS):
+                return list(CONSTANTS)
             scene = context.config, context.catalog, self._cameras
             texts = {NOTES_FILE: describe_dataset(*scene), PARAMS_FILE: format_dataset_params(*scene)}
             return write_constants(self._out, context.catalog, self._cameras[0], self._bop.depth_scale, texts)
@@ -141,70 +137,36 @@ class SceneExporter(ABC):
         """One task for each view, and one for each of its layers."""
         for view in range(len(batch)):
             index, camera = int(batch.episode[view]), int(batch.camera[view])
-            episode = self._episodes.get(index) or self._stage_episode(index)
-            scene = episode.scenes[camera]
+            episode = self._staged(index, partial(self._create_scenes, index))
+            scene = episode.content[camera]
             images, truth = make_view_task(batch, view, self.scene_id(index, camera), self._views[camera])
-            tasks = [(type(self).write_view, images, (scene, self._views[camera], truth))]
-            for name in self._layers:
-                function, arguments = self._layer_task(scene, truth.scene, name, truth.frame)
-                tasks.append((function, (batch.layers[name][view],), arguments))
-            episode.pending += len(tasks)
             place = self._folder(truth.scene) / scene.name
-            for function, arrays, arguments in tasks:
-                yield WriteTask(function, arrays, arguments, place, partial(self._task_done, index, episode))
+            arguments = (type(self).write_view, scene, self._views[camera], truth)
+            yield self._task((episode,), write_rendered_view, images, arguments, place)
+            for name in self._layers:
+                arguments = (type(self).write_layer, scene, truth.scene, name, truth.frame)
+                yield self._task((episode,), write_rendered_layer, (batch.layers[name][view],), arguments, place)
 
-    def write_ticks(self, batch: TickBatch) -> None:
-        """See `Exporter`. BOP takes everything from the views."""
-        return
-
-    def end_episode(self, end: EpisodeEnd, on_committed: Callable[[], None]) -> None:
-        """See `Exporter`."""
-        episode = self._episodes.pop(end.episode, None)
-        if episode is None:
-            on_committed()
-        else:
-            episode.end, episode.on_committed = end, on_committed
-            self._commit_if_complete(end.episode, episode)
-        self._pool.poll()
-
-    def close(self) -> None:
-        """See `Exporter`."""
-        self._episodes.clear()
-
-    def abort(self) -> None:
-        """See `Exporter`."""
-        self._episodes.clear()
+    def write_stored(self, episode: int, scenes: Sequence[StoredScene]) -> None:
+        """See `Exporter`: one task for each scene."""
+        staged = self._staged(episode, partial(self._create_scenes, episode))
+        for stored, scene, settings in zip(scenes, staged.content, self._views, strict=True):
+            arguments = (stored, type(self).write_view, type(self).write_layer, self._layers, scene, settings)
+            self._pool.submit_all((self._task((staged,), write_stored_views, (), arguments, self._folder(int(scene.name)) / scene.name),))
 
     def scene_id(self, episode: int, camera: int) -> int:
         """BOP scene_id of an episode as seen by a camera."""
         return len(self._cameras) * episode + camera
 
-    def _stage_episode(self, index: int) -> _Episode:
-        # A suffix unique to each arrangement: the discarded one's folders may not be removed yet.
-        self._arrangements += 1
-        staging = self._out / PARTIAL / self.staging
-        names = (f"{self.scene_id(index, camera):06d}-{self._arrangements}" for camera in range(len(self._cameras)))
-        episode = _Episode(tuple(staging / name for name in names))
-        try:
-            staging.mkdir(exist_ok=True)
-            for scene in episode.scenes:
-                self._stage_scene(scene)
-        except OSError as error:
-            raise output_error(episode.scenes[0], error) from error
-        self._episodes[index] = episode
-        return episode
+    def _create_scenes(self, index: int, folder: Path) -> tuple[Path, ...]:
+        scenes = tuple(folder / f"{self.scene_id(index, camera):06d}" for camera in range(len(self._cameras)))
+        for scene in scenes:
+            self._stage_scene(scene)
+        return scenes
 
-    def _task_done(self, index: int, episode: _Episode) -> None:
-        episode.pending -= 1
-        self._commit_if_complete(index, episode)
-
-    def _commit_if_complete(self, index: int, episode: _Episode) -> None:
-        if episode.end is None or episode.pending:
-            return
-        if Ending(episode.end.ending).delivers:
-            scenes = tuple((scene, self.scene_id(index, camera)) for camera, scene in enumerate(episode.scenes))
-            function, arguments = self._commit_task(scenes, episode.end.frames)
-        else:
-            function, arguments = discard_scenes, (episode.scenes,)
-        place = self._folder(self.scene_id(index, 0)) / f"{self.scene_id(index, 0):06d}"
-        self._pool.submit(function, (), arguments, path=place, on_done=episode.on_committed)
+    def _commit(self, episode: _Staged, end: EpisodeEnd) -> WriteTask:
+        first = self.scene_id(end.episode, 0)
+        function, arguments = self._commit_task(
+            tuple(zip(episode.content, range(first, first + len(self._cameras)), strict=True)), end.frames
+        )
+        return WriteTask(function, (), arguments, self._folder(first) / f"{first:06d}")

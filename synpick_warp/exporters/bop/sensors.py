@@ -31,7 +31,6 @@ def commit_sensor_scene(scenes: tuple[Path, ...], place: Path, settings: SceneSe
         complete_scene(scene, dataclasses.replace(settings, sensor=suffix))
         for path in sorted(scene.iterdir()):
             path.rename(whole / f"{path.stem}{suffix}{path.suffix}")
-        scene.rmdir()
     sync_folder(whole)
     whole.rename(place)
     sync_folder(place.parent)

@@ -1,11 +1,11 @@
-"""One view in BOP format: image files, and annotations (camera, poses, pixel counts, boxes, COCO masks).
+"""One view in BOP format: its files and annotations (camera, poses, pixel counts, boxes, masks), encoded from what was rendered.
 
 Runs in writer processes, so it imports neither Warp nor Newton. Only BOP's formats (bop, shards, coco) use millimetres.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -16,13 +16,14 @@ import orjson
 
 from synpick_warp.codecs.jpeg import encode_jpeg
 from synpick_warp.codes import Effect, names
-from synpick_warp.exporters.base import PIXEL_BYTES
+from synpick_warp.errors import DatasetError
+from synpick_warp.exporters.base import PIXEL_BYTES, EncodedView, StoredScene
 from synpick_warp.exporters.bop.keypoints import MILLIMETERS, Keypoints, project_keypoints
-from synpick_warp.exporters.writing.folder import Buffer, open_folder
-from synpick_warp.exporters.writing.png import encode_mask_png, encode_png, frame_depth_png
-from synpick_warp.exporters.writing.rle import Runs, find_run_boundaries, unpack_run_boundaries
+from synpick_warp.exporters.writing.folder import Buffer
+from synpick_warp.exporters.writing.png import encode_png, frame_depth_png
+from synpick_warp.exporters.writing.rle import Masks, Runs, find_run_boundaries, unpack_run_boundaries
 from synpick_warp.frames import FrameBatch
-from synpick_warp.layer_codec import encode_layer, layer_path
+from synpick_warp.layer_codec import encode_layer
 from synpick_warp.scenes.types import Camera
 
 ANNOTATIONS = "annotations"
@@ -30,8 +31,6 @@ ANNOTATIONS = "annotations"
 
 One file instead of one per view, because ext4 without a journal scans the inodes freed in the last minutes whenever it creates a file.
 """
-IGNORE_VISIBILITY = 0.1
-"""COCO annotations with a lower visible fraction are marked `ignore` (the toolkit's calc_gt_coco.py)."""
 NO_BOX = [-1, -1, -1, -1]
 """The toolkit's box of an instance without visible pixels (calc_gt_info.py)."""
 _ALL, _VALID, _VISIBLE = 0, 1, 2
@@ -97,14 +96,83 @@ class ViewTruth:
     """First column of the crops."""
 
 
-@dataclass(frozen=True, eq=False)
-class Masks:
-    """The two masks of an instance, both clipped to the image."""
+class RenderedView:
+    """`EncodedView` of a rendered view, from the arrays and the ground truth that `make_view_task` collects."""
 
-    amodal: Runs
-    """Silhouette, including hidden parts."""
-    visible: Runs
-    """Visible (modal) part."""
+    def __init__(self, images: Sequence[np.ndarray], settings: ViewSettings, truth: ViewTruth) -> None:
+        """
+        Args:
+            images: Colour, depth and the two mask sources.
+            settings: Settings of the camera's views.
+            truth: Ground truth of the view.
+        """
+        self._color, self._depth, self._visible, self._amodal = images
+        self._settings, self._truth = settings, truth
+        self.scene, self.frame = truth.scene, truth.frame
+        self.camera = settings.camera | truth.extras
+        self.gt, self.gt_info = make_gt_entries(truth, settings.camera), make_gt_info_entries(truth)
+
+    @property
+    def color(self) -> tuple[str, Buffer]:
+        """See `EncodedView`. A file (bytes) uint8 of the device stays as it is."""
+        color, suffix = self._color, self._settings.color_suffix
+        if color.ndim == 1:
+            return suffix, color.data
+        return suffix, encode_png(color) if suffix == ".png" else encode_jpeg(color, self._truth.jpeg_quality)
+
+    @property
+    def depth(self) -> bytes:
+        """See `EncodedView`. The data (bytes) uint8 of a file that the device has made gets its frame."""
+        depth = self._depth
+        return encode_png(depth) if depth.ndim > 1 else frame_depth_png(depth.data, *self._settings.resolution)
+
+    def depth_image(self) -> np.ndarray:
+        """See `EncodedView`."""
+        if self._depth.ndim > 1:
+            return self._depth
+        image = cv2.imdecode(np.frombuffer(self.depth, np.uint8), cv2.IMREAD_UNCHANGED)
+        if image is None:
+            raise ValueError("OpenCV cannot decode a depth image; this is an error of synpick-warp, please report it")
+        return image
+
+    def masks(self) -> list[Masks]:
+        """See `EncodedView`."""
+        return extract_masks(self._visible, self._amodal, self._truth, self._settings.resolution[1])
+
+
+WriteView = Callable[[EncodedView, Path, ViewSettings], None]
+"""Writes a view to the staging folder of its scene: a format's `write_view`."""
+WriteLayer = Callable[[Buffer, Path, int, str, int], None]
+"""Writes a layer, a PNG file, to the staging folder of a scene: a format's `write_layer` (file, folder, scene_id, name, frame)."""
+
+
+def write_rendered_view(
+    color: np.ndarray,
+    depth: np.ndarray,
+    visible_source: np.ndarray,
+    amodal_source: np.ndarray,
+    write: WriteView,
+    scene: Path,
+    settings: ViewSettings,
+    truth: ViewTruth,
+) -> None:
+    """Task: encode and write a rendered view."""
+    write(RenderedView((color, depth, visible_source, amodal_source), settings, truth), scene, settings)
+
+
+def write_rendered_layer(values: np.ndarray, write: WriteLayer, scene: Path, scene_id: int, name: str, frame: int) -> None:
+    """Task: encode and write a layer of a rendered view."""
+    write(encode_png(encode_layer(name, values)), scene, scene_id, name, frame)
+
+
+def write_stored_views(
+    stored: StoredScene, write: WriteView, write_layer: WriteLayer, layers: tuple[str, ...], scene: Path, settings: ViewSettings
+) -> None:
+    """Task: write all views of a stored scene with these layers."""
+    for view in stored.views(range(stored.frames)):
+        write(view, scene, settings)
+        for name in layers:
+            write_layer(view.layer(name), scene, view.scene, name, view.frame)
 
 
 def make_camera_constants(camera: Camera, depth_scale: float) -> dict[str, Any]:
@@ -190,87 +258,15 @@ def extract_masks(visible_source: np.ndarray, amodal_source: np.ndarray, truth: 
     return [Masks(*pair) for pair in zip(amodal.split_by_bit(instances), visible.split_by_value(instances), strict=True)]
 
 
-def write_view(
-    color: np.ndarray,
-    depth: np.ndarray,
-    visible_source: np.ndarray,
-    amodal_source: np.ndarray,
-    scene: Path,
-    settings: ViewSettings,
-    truth: ViewTruth,
-) -> None:
-    """Task: write a view's images into the folders of a staged scene, and append its annotation block to `ANNOTATIONS`.
-
-    The block holds the entries of scene_camera, scene_gt and scene_gt_info, then the COCO annotations, without their ids.
-    """
-    name = f"{truth.frame:06d}"
-    width, height = settings.resolution
-    with open_folder(scene) as folder:
-        folder.write(f"rgb/{name}{settings.color_suffix}", encode_color(color, settings, truth.jpeg_quality))
-        folder.write(f"depth/{name}.png", encode_depth(depth, settings))
-        masks = extract_masks(visible_source, amodal_source, truth, height) if settings.masks or settings.coco else []
-        if settings.masks:
-            for index, mask in enumerate(masks):
-                amodal, visible = encode_masks(mask, height, width)
-                folder.write(f"mask/{name}_{index:06d}.png", amodal)
-                folder.write(f"mask_visib/{name}_{index:06d}.png", visible)
-        infos = make_gt_info_entries(truth)
-        poses = make_gt_entries(truth, settings.camera)
-        entries = [make_camera_entry(truth, settings), poses, infos]
-        if settings.coco:
-            keypoints = settings.keypoints
-            points = project_keypoints(poses, settings.camera, read_depth(depth, settings), keypoints) if keypoints else None
-            entries += make_coco_annotations(truth, infos, masks, height, width, points)
-        folder.append(ANNOTATIONS, annotation_block(truth.frame, map(to_json, entries)))
-
-
 def annotation_block(frame: int, entries: Iterable[bytes]) -> bytes:
     """Format a view's block of `ANNOTATIONS`: a header line with the frame and the length of each entry [B], then one entry per line."""
     lines = tuple(entries)
     return b"\n".join((b" ".join(b"%d" % number for number in (frame, *map(len, lines))), *lines, b""))
 
 
-def write_layer(values: np.ndarray, scene: Path, name: str, frame: int) -> None:
-    """Task: write a view's layer into the folder of that name."""
-    layer_path(scene, name, frame).write_bytes(encode_png(encode_layer(name, values)))
-
-
-def encode_color(color: np.ndarray, settings: ViewSettings, jpeg_quality: int) -> Buffer:
-    """Encode an RGB image (H, W, 3) uint8 in the format that the settings name. A file (bytes) uint8 of the device stays as it is."""
-    if color.ndim == 1:
-        return color.data
-    return encode_png(color) if settings.color_suffix == ".png" else encode_jpeg(color, jpeg_quality)
-
-
-def encode_depth(depth: np.ndarray, settings: ViewSettings) -> bytes:
-    """Encode a depth image (H, W) uint16 as PNG, or frame the data (bytes) uint8 of a file that the device has made."""
-    return encode_png(depth) if depth.ndim > 1 else frame_depth_png(depth.data, *settings.resolution)
-
-
-def read_depth(depth: np.ndarray, settings: ViewSettings) -> np.ndarray:
-    """Depth image (H, W) uint16, decoded if `depth` is the data (bytes) uint8 of its file."""
-    if depth.ndim > 1:
-        return depth
-    image = cv2.imdecode(np.frombuffer(encode_depth(depth, settings), np.uint8), cv2.IMREAD_UNCHANGED)
-    if image is None:
-        raise ValueError("OpenCV cannot decode a depth image; this is an error of synpick-warp, please report it")
-    return image
-
-
-def encode_masks(masks: Masks, height: int, width: int) -> tuple[bytes, bytes]:
-    """Encode an instance's amodal and visible mask as PNG. If nothing hides the instance they are equal, and are encoded once."""
-    amodal = encode_mask_png(masks.amodal, height, width)
-    return amodal, amodal if masks.amodal.count == masks.visible.count else encode_mask_png(masks.visible, height, width)
-
-
 def to_json(content: object) -> bytes:
     """Serialise to one line of JSON; arrays become lists."""
     return orjson.dumps(content, option=orjson.OPT_SERIALIZE_NUMPY)
-
-
-def make_camera_entry(truth: ViewTruth, settings: ViewSettings) -> dict[str, Any]:
-    """The view's entry in scene_camera.json."""
-    return settings.camera | truth.extras
 
 
 def make_gt_entries(truth: ViewTruth, camera: dict[str, Any]) -> list[dict[str, Any]]:
@@ -318,32 +314,17 @@ def _bop_box(box: list[int]) -> list[int]:
     return [x_min, y_min, x_max - x_min, y_max - y_min]
 
 
-def make_coco_annotations(
-    truth: ViewTruth,
-    infos: list[dict[str, Any]],
-    masks: list[Masks],
-    height: int,
-    width: int,
-    points: list[dict[str, Any]] | None = None,
-) -> Iterator[dict[str, Any]]:
-    """COCO annotations of the visible instances, without ids: amodal box clipped to the image, visible mask, keys of keypoints."""
-    keys = points or [{} for _ in infos]
-    for object_id, info, mask, extra in zip(truth.object_id.tolist(), infos, masks, keys, strict=True):
-        box = mask.amodal.box()
-        area = mask.visible.count
-        if box is not None and area:
-            x_min, y_min, x_max, y_max = box
-            yield {
-                "image_id": truth.frame,
-                "category_id": object_id,
-                "iscrowd": 0,
-                "area": area,
-                "bbox": [x_min, y_min, x_max - x_min + 1, y_max - y_min + 1],
-                "segmentation": make_rle(mask.visible, height, width),
-                "width": width,
-                "height": height,
-                "ignore": info["visib_fract"] < IGNORE_VISIBILITY,
-            } | extra
+def make_keypoints(view: EncodedView, keypoints: Mapping[int, Keypoints]) -> list[dict[str, Any]]:
+    """Keys of keypoints in the COCO annotations of a view's instances, by `project_keypoints`; none without keypoints.
+
+    Raises:
+        DatasetError: A stored view has an object that the bake had not.
+    """
+    if not keypoints:
+        return [{} for _ in view.gt]
+    if unknown := {row["obj_id"] for row in view.gt} - keypoints.keys():
+        raise DatasetError(f"image {view.frame} of scene {view.scene} has obj_id {min(unknown)}, which is none of the bake's objects")
+    return project_keypoints(view.gt, view.camera, view.depth_image(), keypoints)
 
 
 def make_rle(runs: Runs, height: int, width: int) -> dict[str, Any]:

@@ -1,9 +1,8 @@
-"""Tasks that commit or discard an episode: its videos and its part. They run in writer processes."""
+"""Task that commits an episode: its videos and its part. It runs in writer processes."""
 
 from __future__ import annotations
 
 import json
-import shutil
 from collections.abc import Mapping
 from dataclasses import dataclass
 from fractions import Fraction
@@ -76,15 +75,9 @@ def commit_episode(folder: Path, content: EpisodeContent, settings: EpisodeSetti
         make_folders(settings.out, place.parent)
         source.rename(place)
         sync_folder(place.parent)
-    shutil.rmtree(folder)
 
 
 def make_folders(out: Path, folder: Path) -> None:
     """Create a folder below the data set, which must exist, and those between."""
     for parent in reversed([folder, *folder.parents][: len(folder.relative_to(out).parts)]):
         parent.mkdir(exist_ok=True)
-
-
-def discard_episode(folder: Path) -> None:
-    """Task: remove the staging folder of a discarded arrangement."""
-    shutil.rmtree(folder)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from fractions import Fraction
 from functools import partial
@@ -14,15 +14,8 @@ import numpy as np
 
 from synpick_warp.codes import Ending, Task
 from synpick_warp.configs.schema import Config
-from synpick_warp.exporters.base import ExportContext, SharedFiles
-from synpick_warp.exporters.lerobot.episode import (
-    EpisodeContent,
-    EpisodeSettings,
-    commit_episode,
-    discard_episode,
-    frame_path,
-    group_path,
-)
+from synpick_warp.exporters.base import ExportContext, SharedFiles, StoredScene
+from synpick_warp.exporters.lerobot.episode import EpisodeContent, EpisodeSettings, commit_episode, frame_path, group_path
 from synpick_warp.exporters.lerobot.index import write_indices
 from synpick_warp.exporters.lerobot.layout import (
     CARD,
@@ -40,8 +33,9 @@ from synpick_warp.exporters.lerobot.layout import (
     video_path,
 )
 from synpick_warp.exporters.lerobot.part import TICK
-from synpick_warp.exporters.lerobot.video import GROUP, write_frame, write_spooled_group
-from synpick_warp.exporters.writing.files import PARTIAL, output_error
+from synpick_warp.exporters.lerobot.video import GROUP, write_frame, write_spooled_group, write_stored_group
+from synpick_warp.exporters.staging import EpisodeExporter, StagedEpisode
+from synpick_warp.exporters.writing.files import output_error
 from synpick_warp.exporters.writing.notes import note_files, write_notes
 from synpick_warp.exporters.writing.pool import WriterPool, WriteTask
 from synpick_warp.frames import EpisodeEnd, FrameBatch, TickBatch
@@ -54,25 +48,19 @@ _MAX_DENOMINATOR = 100_000
 
 
 @dataclass(eq=False)
-class _Episode:
-    """An arrangement of an episode whose frames are being spooled and encoded."""
+class _Content:
+    """What is kept of an episode whose frames are being spooled and encoded."""
 
-    folder: Path
-    """Staging folder."""
     ticks: bytearray = field(default_factory=bytearray)
     """Rows of `TICK`: 50 bytes a frame."""
     spooled: Counter[tuple[int, int]] = field(default_factory=Counter)
     """Spooled frames of each (camera, group) that is not encoded yet."""
-    pending: int = 0
-    """Number of unfinished tasks."""
-    end: EpisodeEnd | None = None
-    on_committed: Callable[[], None] | None = None
-    """Set together with `end`."""
-    is_over: bool = False
-    """Whether the task that commits or discards it has been submitted."""
 
 
-class LerobotExporter:
+_Staged = StagedEpisode[_Content]
+
+
+class LerobotExporter(EpisodeExporter[_Content]):
     """`Exporter` of LeRobot v3. Episode k becomes a video a camera and a part, from which the tables of all episodes are made at the end.
 
     Views are spooled as planes; GROUP of them are encoded together, so that little disk space is used twice.
@@ -81,16 +69,14 @@ class LerobotExporter:
     needs_physics = True
     needs_views = True
     needs_images = True
-    writes_depth = False
+    staging = FOLDER.name
 
     def __init__(self, context: ExportContext) -> None:
         """See `Exporter`."""
-        self._context = context
-        self._staging = context.out / PARTIAL / FOLDER.name
-        self._episodes: dict[int, _Episode] = {}
-        self._arrangements = 0
-        objects = {entry.obj_id: entry.name for entry in context.catalog.entries}
-        self._settings = episode_settings(context.config, context.out, objects)
+        super().__init__(context)
+        config = context.config
+        cameras = len(config.cameras.positions)
+        self._settings = EpisodeSettings(context.out, cameras, config.cameras.resolution, video_rate(config), context.names)
 
     @staticmethod
     def slot_bytes(config: Config) -> int:
@@ -126,110 +112,63 @@ class LerobotExporter:
         tasks = []
         for view in range(len(batch)):
             index, camera, frame = (int(column[view]) for column in (batch.episode, batch.camera, batch.frame))
-            episode = self._episodes.get(index) or self._stage_episode(index)
-            episode.pending += 1
+            episode = self._staged(index, _make_content)
             path = frame_path(episode.folder, camera, frame)
-            done = partial(self._frame_spooled, index, episode, camera, frame // GROUP)
-            tasks.append(WriteTask(write_frame, (batch.color[view],), (path,), path, done))
+            then = partial(self._frame_spooled, episode, camera, frame // GROUP)
+            tasks.append(self._task((episode,), write_frame, (batch.color[view],), (path,), path, then))
+        self._context.pool.submit_all(tasks)
+
+    def write_stored(self, episode: int, scenes: Sequence[StoredScene]) -> None:
+        """See `Exporter`: a task for each group of pictures. Videos of JPEG images differ from a bake's, as they were compressed before."""
+        staged, tasks = self._staged(episode, _make_content), []
+        for camera, scene in enumerate(scenes):
+            for group in range(-(-scene.frames // GROUP)):
+                path = group_path(staged.folder, camera, group)
+                tasks.append(self._task((staged,), write_stored_group, (), (scene, group * GROUP, self._settings.rate, path), path))
         self._context.pool.submit_all(tasks)
 
     def write_ticks(self, batch: TickBatch) -> None:
         """See `Exporter`."""
         for index, row in zip(batch.episode.tolist(), make_ticks(batch), strict=True):
-            episode = self._episodes.get(index) or self._stage_episode(index)
-            episode.ticks += row.tobytes()
-
-    def end_episode(self, end: EpisodeEnd, on_committed: Callable[[], None]) -> None:
-        """See `Exporter`."""
-        episode = self._episodes.pop(end.episode, None)
-        if episode is None:
-            on_committed()
-        else:
-            episode.end, episode.on_committed = end, on_committed
-            for camera, group in list(episode.spooled):
-                self._encode_if_complete(end.episode, episode, camera, group)
-            self._commit_if_complete(end.episode, episode)
-        self._context.pool.poll()
+            self._staged(index, _make_content).content.ticks += row.tobytes()
 
     def files(self, episode: int) -> list[Path]:
         """See `Exporter`: part and videos."""
-        return episode_files(self._context.out, episode, self._settings.cameras)
+        places = [part_path(episode), *(video_path(camera, episode) for camera in range(self._settings.cameras))]
+        return sorted(place for place in places if os.path.lexists(self._context.out / place))
 
-    def close(self) -> None:
-        """See `Exporter`."""
-        self._episodes.clear()
+    def _finish(self, episode: _Staged, end: EpisodeEnd) -> None:
+        for camera, group in list(episode.content.spooled):
+            self._encode_if_complete(episode, camera, group)
 
-    def abort(self) -> None:
-        """See `Exporter`."""
-        self._episodes.clear()
+    def _frame_spooled(self, episode: _Staged, camera: int, group: int) -> None:
+        episode.content.spooled[camera, group] += 1
+        self._encode_if_complete(episode, camera, group)
 
-    def _stage_episode(self, index: int) -> _Episode:
-        # A suffix unique to each arrangement: the discarded one's folder may not be removed yet.
-        self._arrangements += 1
-        episode = _Episode(self._staging / f"{index:06d}-{self._arrangements}")
-        try:
-            self._staging.mkdir(exist_ok=True)
-            episode.folder.mkdir()
-        except OSError as error:
-            raise output_error(episode.folder, error) from error
-        self._episodes[index] = episode
-        return episode
-
-    def _frame_spooled(self, index: int, episode: _Episode, camera: int, group: int) -> None:
-        episode.pending -= 1
-        episode.spooled[camera, group] += 1
-        self._encode_if_complete(index, episode, camera, group)
-        self._commit_if_complete(index, episode)
-
-    def _encode_if_complete(self, index: int, episode: _Episode, camera: int, group: int) -> None:
+    def _encode_if_complete(self, episode: _Staged, camera: int, group: int) -> None:
         """Submit a group whose frames are all spooled; the last one of an episode may be shorter."""
         size = GROUP if episode.end is None else min(GROUP, episode.end.frames - group * GROUP)
-        if episode.spooled[camera, group] != size or (episode.end is not None and not Ending(episode.end.ending).delivers):
+        if episode.content.spooled[camera, group] != size or (episode.end is not None and not episode.delivers):
             return
-        del episode.spooled[camera, group]
-        episode.pending += 1
+        del episode.content.spooled[camera, group]
         frames = [frame_path(episode.folder, camera, frame) for frame in range(group * GROUP, group * GROUP + size)]
         path = group_path(episode.folder, camera, group)
         arguments = (frames, self._settings.size, self._settings.rate, path)
-        done = partial(self._group_encoded, index, episode)
-        self._context.pool.submit(write_spooled_group, (), arguments, path=path, on_done=done)
+        self._context.pool.submit_all((self._task((episode,), write_spooled_group, (), arguments, path),))
 
-    def _group_encoded(self, index: int, episode: _Episode) -> None:
-        episode.pending -= 1
-        self._commit_if_complete(index, episode)
-
-    def _commit_if_complete(self, index: int, episode: _Episode) -> None:
-        end, pool = episode.end, self._context.pool
-        if end is None or episode.pending or episode.is_over:
-            return
-        if Ending(end.ending).delivers and episode.spooled:
-            return
-        episode.is_over = True
-        if not Ending(end.ending).delivers:
-            pool.submit(discard_episode, (), (episode.folder,), path=episode.folder, on_done=episode.on_committed)
-            return
-        count = len(episode.ticks) // TICK.itemsize
+    def _commit(self, episode: _Staged, end: EpisodeEnd) -> WriteTask:
+        count = len(episode.content.ticks) // TICK.itemsize
         if count != end.frames:
-            raise ValueError(f"episode {index} ended with {end.frames} frames, but {count} came")
-        content = make_content(end, bytes(episode.ticks))
-        pool.submit(
-            commit_episode,
-            (),
-            (episode.folder, content, self._settings),
-            path=self._context.out / part_path(index),
-            on_done=episode.on_committed,
-        )
+            raise ValueError(f"episode {end.episode} ended with {end.frames} frames, but {count} came")
+        if groups := len(episode.content.spooled):
+            raise ValueError(f"episode {end.episode} ended, but views of {groups} groups of pictures are missing")
+        content = make_content(end, bytes(episode.content.ticks))
+        place = self._context.out / part_path(end.episode)
+        return WriteTask(commit_episode, (), (episode.folder, content, self._settings), place)
 
 
-def episode_settings(config: Config, out: Path, objects: Mapping[int, str]) -> EpisodeSettings:
-    """Settings of the tasks of all episodes; `objects`: obj_id -> name."""
-    return EpisodeSettings(out, len(config.cameras.positions), config.cameras.resolution, video_rate(config), objects)
-
-
-def episode_files(out: Path, episode: int, cameras: int) -> list[Path]:
-    """Committed files of an episode: part and videos, relative to the data set, sorted."""
-    places = [part_path(episode), *(video_path(camera, episode) for camera in range(cameras))]
-    return sorted(place for place in places if os.path.lexists(out / place))
+def _make_content(_: Path) -> _Content:
+    return _Content()
 
 
 def make_content(end: EpisodeEnd, ticks: bytes) -> EpisodeContent:

@@ -17,6 +17,7 @@ from av.codec.context import Flags
 from av.video.reformatter import ColorPrimaries, ColorRange, Colorspace, ColorTrc
 
 from synpick_warp.errors import OutputError
+from synpick_warp.exporters.base import StoredScene
 from synpick_warp.exporters.lerobot.layout import PIXEL_FORMAT
 
 GROUP = 8
@@ -75,6 +76,16 @@ def write_spooled_group(frames: Sequence[Path], size: tuple[int, int], rate: Fra
     write_group(planes, levels, rate, path)
     for frame in frames:
         frame.unlink()
+
+
+def write_stored_group(scene: StoredScene, first: int, rate: Fraction, path: Path) -> None:
+    """Task: encode a group of frames of a stored scene, from `first` on."""
+    planes, levels = [], np.zeros((3, LEVELS), np.int64)
+    for view in scene.views(range(first, min(first + GROUP, scene.frames))):
+        color = view.color_image()
+        levels += count_levels(color)
+        planes.append(split_planes(color))
+    write_group(planes, levels, rate, path)
 
 
 def write_group(planes: Sequence[np.ndarray], levels: np.ndarray, rate: Fraction, path: Path) -> None:

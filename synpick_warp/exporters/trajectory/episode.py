@@ -1,9 +1,8 @@
-"""Tasks that write or discard an episode's group in the zarr store. They run in writer processes."""
+"""Task that writes an episode's group in the zarr store. It runs in writer processes."""
 
 from __future__ import annotations
 
 import json
-import shutil
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -79,12 +78,6 @@ def write_episode(folder: Path, row: np.dtype, count: int, place: Path, content:
     sync_folder(folder / GROUP)
     (folder / GROUP).rename(place)
     sync_folder(place.parent)
-    shutil.rmtree(folder)
-
-
-def discard_episode(folder: Path) -> None:
-    """Task: remove the staging folder of a discarded arrangement."""
-    shutil.rmtree(folder)
 
 
 def _write_rows(group: zarr.Group, rows: np.ndarray, settings: EpisodeSettings) -> None:

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -14,27 +14,21 @@ import numpy as np
 from synpick_warp.codes import Ending, Mode
 from synpick_warp.configs.schema import Config
 from synpick_warp.exporters.base import ExportContext, SharedFiles
+from synpick_warp.exporters.staging import EpisodeExporter, StagedEpisode
 from synpick_warp.exporters.trajectory.arrays import EPISODES, STORE
-from synpick_warp.exporters.trajectory.episode import EpisodeContent, EpisodeSettings, discard_episode, write_episode
+from synpick_warp.exporters.trajectory.episode import EpisodeContent, EpisodeSettings, write_episode
 from synpick_warp.exporters.trajectory.spool import SPOOL_ROWS, Place, batch_type, count_instances, make_rows, spool_bytes, write_rows
 from synpick_warp.exporters.trajectory.store import constant_places, write_constants
-from synpick_warp.exporters.writing.files import PARTIAL, output_error
-from synpick_warp.exporters.writing.pool import WriterPool, WriteTask
-from synpick_warp.frames import EpisodeEnd, FrameBatch, TickBatch
+from synpick_warp.exporters.writing.files import output_error
+from synpick_warp.exporters.writing.pool import WriteTask
+from synpick_warp.frames import EpisodeEnd, TickBatch
 from synpick_warp.system.shared_memory import shared_bytes
-
-_FOLDER = "trajectory"
-"""Folder in `PARTIAL`."""
 
 
 @dataclass(eq=False)
-class _Episode:
-    """An arrangement of an episode whose ticks are being spooled."""
+class _Content:
+    """What is kept of an episode whose ticks are being spooled."""
 
-    folder: Path
-    """Staging folder."""
-    name: str
-    """Its name."""
     row: np.dtype
     """Type of a row of its spool file."""
     initial: dict[str, Any]
@@ -43,14 +37,12 @@ class _Episode:
     drop_pose: np.ndarray | None
     count: int = 0
     """Number of ticks so far."""
-    pending: int = 0
-    """Number of unfinished tasks."""
-    end: EpisodeEnd | None = field(default=None)
-    on_committed: Callable[[], None] | None = None
-    """Set together with `end`."""
 
 
-class TrajectoryExporter:
+_Staged = StagedEpisode[_Content]
+
+
+class TrajectoryExporter(EpisodeExporter[_Content]):
     """`Exporter` of zarr. Episode k becomes the group `episodes/k` of one store.
 
     Ticks are spooled to a hidden file, from which a writer process makes the group when the episode has ended. A task spools one tick of
@@ -58,17 +50,12 @@ class TrajectoryExporter:
     """
 
     needs_physics = True
-    needs_views = False
-    needs_images = False
-    writes_depth = False
+    staging = "trajectory"
 
     def __init__(self, context: ExportContext) -> None:
         """See `Exporter`."""
+        super().__init__(context)
         config = context.config
-        self._context = context
-        self._staging = context.out / PARTIAL / _FOLDER
-        self._episodes: dict[int, _Episode] = {}
-        self._arrangements = 0
         self._settings = EpisodeSettings(
             trajectory=config.trajectory,
             step=config.physics.step,
@@ -87,11 +74,6 @@ class TrajectoryExporter:
         """See `Exporter`."""
         return SharedFiles(tuple(constant_places(STORE)), (), (STORE / EPISODES, STORE))
 
-    @staticmethod
-    def finalize(out: Path, config: Config, pool: WriterPool, episodes: Sequence[int]) -> list[Path]:
-        """See `Exporter`: no index files."""
-        return []
-
     def write_constants(self) -> list[Path]:
         """See `Exporter`: the store with its groups of objects and cameras."""
         context, store = self._context, self._context.out / STORE
@@ -105,48 +87,19 @@ class TrajectoryExporter:
             raise output_error(store, error) from error
         return [path.relative_to(context.out) for path in written]
 
-    def write_views(self, batch: FrameBatch) -> None:
-        """See `Exporter`: trajectories hold no images."""
-
     def write_ticks(self, batch: TickBatch) -> None:
         """See `Exporter`."""
-        episodes = [
-            self._episodes.get(index) or self._stage_episode(index, batch, world) for world, index in enumerate(batch.episode.tolist())
-        ]
+        indices = batch.episode.tolist()
+        episodes = [self._staged(index, partial(self._make_content, batch, world)) for world, index in enumerate(indices)]
         self._context.pool.submit_all(self._spool(batch, episodes))
-
-    def end_episode(self, end: EpisodeEnd, on_committed: Callable[[], None]) -> None:
-        """See `Exporter`."""
-        episode = self._episodes.pop(end.episode, None)
-        if episode is None:
-            on_committed()
-        else:
-            episode.end, episode.on_committed = end, on_committed
-            self._commit_if_complete(episode)
-        self._context.pool.poll()
 
     def files(self, episode: int) -> list[Path]:
         """See `Exporter`: the group."""
         place = self._place(episode)
         return [place.relative_to(self._context.out)] if os.path.lexists(place) else []
 
-    def close(self) -> None:
-        """See `Exporter`."""
-        self._episodes.clear()
-
-    def abort(self) -> None:
-        """See `Exporter`."""
-        self._episodes.clear()
-
-    def _stage_episode(self, index: int, batch: TickBatch, world: int) -> _Episode:
-        # A suffix unique to each arrangement: the discarded one's folder may not be removed yet.
-        self._arrangements += 1
-        folder = self._staging / f"{index:06d}-{self._arrangements}"
-        try:
-            self._staging.mkdir(exist_ok=True)
-            folder.mkdir()
-        except OSError as error:
-            raise output_error(folder, error) from error
+    def _make_content(self, batch: TickBatch, world: int, _: Path) -> _Content:
+        """What the first tick of an episode tells, that of a world of a batch."""
         instances = count_instances(batch, world)
         light = int(batch.light[world])
         initial: dict[str, Any] = {
@@ -167,10 +120,9 @@ class TrajectoryExporter:
         if drop_pose is not None:
             drop_pose[object_id < 0] = np.nan
         row = batch_type(batch, instances, self._settings.steps_per_tick)
-        episode = self._episodes[index] = _Episode(folder, folder.name, row, initial, object_id, drop_pose)
-        return episode
+        return _Content(row, initial, object_id, drop_pose)
 
-    def _spool(self, batch: TickBatch, episodes: Sequence[_Episode]) -> Iterator[WriteTask]:
+    def _spool(self, batch: TickBatch, episodes: Sequence[_Staged]) -> Iterator[WriteTask]:
         """Tasks that spool a batch, each the frames of at most SPOOL_ROWS episodes whose rows have the same type.
 
         Args:
@@ -179,34 +131,22 @@ class TrajectoryExporter:
         """
         groups: dict[int, list[int]] = {}
         for frame, episode in enumerate(episodes):
-            groups.setdefault(len(episode.object_id), []).append(frame)
+            groups.setdefault(len(episode.content.object_id), []).append(frame)
         for instances, frames in groups.items():
             for first in range(0, len(frames), SPOOL_ROWS):
                 part = frames[first : first + SPOOL_ROWS]
                 owners = [episodes[frame] for frame in part]
-                rows = make_rows(batch.select(np.array(part)), owners[0].row, instances)
-                places = [Place(episode.name, episode.count * rows.itemsize) for episode in owners]
+                rows = make_rows(batch.select(np.array(part)), owners[0].content.row, instances)
+                places = [Place(episode.folder.name, episode.content.count * rows.itemsize) for episode in owners]
                 for episode in owners:
-                    episode.count += 1
-                    episode.pending += 1
+                    episode.content.count += 1
                 image = rows.view(np.uint8).reshape(len(rows), rows.itemsize)
-                done = partial(self._task_done, owners)
-                yield WriteTask(write_rows, (image,), (self._staging, places), self._staging, done)
+                yield self._task(owners, write_rows, (image,), (self._staging, places), self._staging)
 
-    def _task_done(self, episodes: Sequence[_Episode]) -> None:
-        for episode in episodes:
-            episode.pending -= 1
-            self._commit_if_complete(episode)
-
-    def _commit_if_complete(self, episode: _Episode) -> None:
-        end, pool = episode.end, self._context.pool
-        if end is None or episode.pending:
-            return
-        if not Ending(end.ending).delivers:
-            pool.submit(discard_episode, (), (episode.folder,), path=episode.folder, on_done=episode.on_committed)
-            return
-        if episode.count != end.frames:
-            raise ValueError(f"episode {end.episode} ended with {end.frames} frames, but {episode.count} came")
+    def _commit(self, episode: _Staged, end: EpisodeEnd) -> WriteTask:
+        kept = episode.content
+        if kept.count != end.frames:
+            raise ValueError(f"episode {end.episode} ended with {end.frames} frames, but {kept.count} came")
         ending = Ending(end.ending)
         attributes = {
             "episode": end.episode,
@@ -216,12 +156,11 @@ class TrajectoryExporter:
             "sentence": ending.sentence,
             "seed": self._context.config.bake.seed,
             **end.row,
-            **episode.initial,
+            **kept.initial,
         }
-        content = EpisodeContent(attributes, episode.object_id, episode.drop_pose, end.attempts)
+        content = EpisodeContent(attributes, kept.object_id, kept.drop_pose, end.attempts)
         place = self._place(end.episode)
-        arguments = (episode.folder, episode.row, episode.count, place, content, self._settings)
-        pool.submit(write_episode, (), arguments, path=place, on_done=episode.on_committed)
+        return WriteTask(write_episode, (), (episode.folder, kept.row, kept.count, place, content, self._settings), place)
 
     def _place(self, episode: int) -> Path:
         return self._context.out / STORE / EPISODES / f"{episode:06d}"

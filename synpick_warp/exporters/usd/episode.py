@@ -1,6 +1,6 @@
-"""Tasks that write or discard an episode's USD file.
+"""Task that writes an episode's USD file.
 
-They run in writer processes, so this module imports neither Warp nor Newton, and pxr only when there is an episode to write.
+It runs in writer processes, so this module imports neither Warp nor Newton, and pxr only when there is an episode to write.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from synpick_warp.exporters.writing.files import sync_file, sync_folder
 
 
 def write_episode(spool: Path, instances: int, place: Path, metadata: EpisodeMetadata, settings: EpisodeSettings) -> None:
-    """Task: write an episode's file beside its spool, rename it to its place, and remove the spool.
+    """Task: write an episode's file beside its spool, and rename it to its place.
 
     Args:
         spool: File of a `TickSpool`.
@@ -37,9 +37,3 @@ def write_episode(spool: Path, instances: int, place: Path, metadata: EpisodeMet
     sync_file(staged)
     staged.rename(place)
     sync_folder(place.parent)
-    spool.unlink()
-
-
-def discard_episode(spool: Path) -> None:
-    """Task: remove the spool of a discarded arrangement."""
-    spool.unlink(missing_ok=True)

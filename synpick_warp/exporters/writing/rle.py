@@ -58,6 +58,16 @@ class Runs:
 
 
 @dataclass(frozen=True, eq=False)
+class Masks:
+    """The two masks of an instance, both clipped to the image."""
+
+    amodal: Runs
+    """Silhouette, including hidden parts."""
+    visible: Runs
+    """Visible (modal) part."""
+
+
+@dataclass(frozen=True, eq=False)
 class RunBoundaries:
     """Column-wise run boundaries of an integer image: pairs of vertical neighbours whose values differ.
 

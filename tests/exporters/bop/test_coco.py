@@ -7,6 +7,7 @@ import dataclasses
 import io
 import json
 from pathlib import Path
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -14,11 +15,12 @@ import pytest
 from pycocotools.coco import COCO
 
 from synpick_warp.configs.schema import Split
-from synpick_warp.dataset.reading import COCO_PARTS
 from synpick_warp.errors import DatasetError, OutputError
-from synpick_warp.exporters.bop.coco.annotation_files import CATEGORIES, IMAGES, PARTS, commit_scenes, write_image
+from synpick_warp.exporters.bop.coco.annotation_files import CATEGORIES, IMAGES, PARTS, commit_scenes, write_view
 from synpick_warp.exporters.bop.coco.exporter import CocoExporter
 from synpick_warp.exporters.bop.exporter import BopExporter
+from synpick_warp.exporters.bop.view import ViewSettings
+from synpick_warp.exporters.formats import FORMAT_TABLE
 from tests.harness.exporter_contract import ExporterContract, export, exporting, finish
 from tests.worlds.box_views import batches, cameras, config, ends
 
@@ -92,19 +94,20 @@ def test_every_split_has_an_annotation_file(tmp_path):
         assert all((out / IMAGES / image["file_name"]).is_file() for image in found.imgs.values())
         assert found.dataset["info"]["description"] == f"synpick-warp, {split}"
     assert (len(read(out, "val_pbr").imgs), len(read(out, "val_pbr").cats)) == (0, 2)
-    assert PARTS == COCO_PARTS
+    assert str(PARTS) == FORMAT_TABLE["coco"].part.folder
 
 
 def test_scenes_are_checked_for_completeness(tmp_path):
-    scene = tmp_path / "hidden"
+    scene, settings = tmp_path / "hidden", ViewSettings(".jpg", 95, (), masks=True, coco=True, camera={}, resolution=(4, 3))
+    empty = {frame: SimpleNamespace(frame=frame, color=(".jpg", b"image"), gt=[], gt_info=[], masks=list) for frame in range(3)}
     scene.mkdir()
     for frame in (2, 0):
-        write_image(scene, frame, ".jpg", b"image", [])
+        write_view(empty[frame], scene, settings)
     for name in (IMAGES, PARTS):
         (tmp_path / name).mkdir(parents=True)
     with pytest.raises(OutputError, match="has 2 of 3 frames"):
         commit_scenes(((scene, 7),), tmp_path, 3)
-    write_image(scene, 1, ".jpg", b"image", [])
+    write_view(empty[1], scene, settings)
     commit_scenes(((scene, 7),), tmp_path, 3)
     assert sorted(path.name for path in (tmp_path / IMAGES / "000007").iterdir()) == ["000000.jpg", "000001.jpg", "000002.jpg"]
 

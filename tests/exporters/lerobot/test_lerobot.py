@@ -17,9 +17,9 @@ import pytest
 from synpick_warp.codes import Outcome, Task
 from synpick_warp.configs.load import load_config
 from synpick_warp.configs.schema import Config, Split
-from synpick_warp.dataset.reading import LEROBOT_PARTS
 from synpick_warp.errors import ConfigError, DatasetError
 from synpick_warp.exporters.base import list_folders
+from synpick_warp.exporters.formats import FORMAT_TABLE
 from synpick_warp.exporters.lerobot import layout
 from synpick_warp.exporters.lerobot.exporter import LerobotExporter, video_rate
 from synpick_warp.exporters.lerobot.part import describe_tasks
@@ -96,6 +96,15 @@ def test_frames_without_setpoint_are_commanded_to_stay(tmp_path):
         finish(exporter)
     table = pq.read_table(tmp_path / layout.DATA).to_pydict()
     assert table["action"][0][:3] == table["observation.state"][1][:3]
+
+
+def test_missing_views_are_an_error(tmp_path):
+    with exporting(LerobotExporter, tmp_path, trajectories.config(), 0) as exporter:
+        for tick in trajectories.ticks((0,), 2):
+            exporter.write_ticks(tick)
+        exporter.write_views(next(box_views.batches(2, (0,), 2, LENSES)))
+        with pytest.raises(ValueError, match="views of 2 groups of pictures are missing"):
+            exporter.end_episode(trajectories.ends((0,), 2)[0], lambda: None)
 
 
 def test_attempts_become_tasks_rewards_and_outcomes(data, dataset):
@@ -192,7 +201,7 @@ def test_splits_are_ranges_of_episodes(tmp_path, dataset, episodes):
     chunk = layout.video_path(0, 1500).parent
     (out.parent / chunk).mkdir()
     assert chunk in list_folders(out.parent, LerobotExporter.shared_files(settings).folders)
-    assert layout.PARTS == LEROBOT_PARTS
+    assert str(layout.PARTS) == FORMAT_TABLE["lerobot"].part.folder
 
 
 def test_statistics_are_those_of_all_frames(dataset, data, episodes):

@@ -8,7 +8,7 @@ from __future__ import annotations
 import json
 import os
 import shutil
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -17,9 +17,10 @@ import msgspec
 from synpick_warp.configs.schema import Config
 from synpick_warp.configs.splits import bop_folder, bop_folders
 from synpick_warp.errors import DatasetError
+from synpick_warp.exporters.base import EncodedView
 from synpick_warp.exporters.bop.keypoints import Keypoints, make_category_keys
 from synpick_warp.exporters.bop.scene import AnnotationBlocks
-from synpick_warp.exporters.bop.view import ANNOTATIONS, Masks, annotation_block, make_rle, to_json
+from synpick_warp.exporters.bop.view import ANNOTATIONS, ViewSettings, annotation_block, make_keypoints, make_rle, to_json
 from synpick_warp.exporters.writing.files import PARTIAL, output_error, sync_folder, write_synced
 from synpick_warp.exporters.writing.folder import open_folder
 from synpick_warp.inputs.files import read_file
@@ -65,27 +66,21 @@ def scene_files(out: Path, scenes: Iterable[int]) -> list[Path]:
     return sorted(place for place in places if os.path.lexists(out / place))
 
 
-def make_annotations(
-    poses: Sequence[dict[str, Any]],
-    infos: Sequence[dict[str, Any]],
-    masks: Sequence[Masks],
-    height: int,
-    width: int,
-    points: Sequence[dict[str, Any]] | None = None,
-) -> Iterator[dict[str, Any]]:
+def write_view(view: EncodedView, scene: Path, settings: ViewSettings) -> None:
+    """Write a view's image to the staging folder of its scene, and append its annotations there."""
+    suffix, color = view.color
+    with open_folder(scene) as folder:
+        folder.write(f"{view.frame:06d}{suffix}", color)
+        folder.append(ANNOTATIONS, annotation_block(view.frame, (to_json(list(_make_annotations(view, settings))),)))
+
+
+def _make_annotations(view: EncodedView, settings: ViewSettings) -> Iterator[dict[str, Any]]:
     """Annotations of a view's visible instances, without ids: box of the visible mask, its run lengths, extras of ours, keypoints.
 
     Widths and heights of both boxes count pixels (+ 1), unlike those of scene_gt_info.json; `bbox_amodal` may exceed the image.
-
-    Args:
-        poses: The view's entry in scene_gt.json.
-        infos: The view's entry in scene_gt_info.json.
-        masks: Masks of the instances.
-        height: Of the image [px].
-        width: Of the image [px].
-        points: Keys of keypoints by instance (`project_keypoints`); None: no keypoints.
     """
-    for pose, info, mask, extra in zip(poses, infos, masks, points or [{} for _ in infos], strict=True):
+    width, height = settings.resolution
+    for pose, info, mask, points in zip(view.gt, view.gt_info, view.masks(), make_keypoints(view, settings.keypoints), strict=True):
         box = mask.visible.box()
         if box is not None:
             left, top, right, bottom = box
@@ -98,14 +93,7 @@ def make_annotations(
                 "bbox_amodal": [*info["bbox_obj"][:2], *(size + 1 for size in info["bbox_obj"][2:])],
                 "visib_fract": info["visib_fract"],
                 "instance_id": pose["instance_id"],
-            } | extra
-
-
-def write_image(scene: Path, frame: int, suffix: str, data: Any, annotations: Iterable[dict[str, Any]]) -> None:
-    """Write a view's image to the staging folder of its scene, and append its annotations there."""
-    with open_folder(scene) as folder:
-        folder.write(f"{frame:06d}{suffix}", data)
-        folder.append(ANNOTATIONS, annotation_block(frame, (to_json(list(annotations)),)))
+            } | points
 
 
 def commit_scenes(scenes: tuple[tuple[Path, int], ...], out: Path, frames: int) -> None:

@@ -9,11 +9,9 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from synpick_warp.configs.schema import Config
 from synpick_warp.configs.splits import bop_folders
-from synpick_warp.exporters.base import ExportContext, SharedFiles
+from synpick_warp.exporters.base import SharedFiles
 from synpick_warp.exporters.bop.coco.annotation_files import (
     CATEGORIES,
     FOLDER,
@@ -21,23 +19,12 @@ from synpick_warp.exporters.bop.coco.annotation_files import (
     PARTS,
     annotation_file,
     commit_scenes,
-    make_annotations,
     scene_files,
     write_annotation_files,
     write_categories,
-    write_image,
+    write_view,
 )
-from synpick_warp.exporters.bop.keypoints import project_keypoints
 from synpick_warp.exporters.bop.scene_exporter import SceneExporter
-from synpick_warp.exporters.bop.view import (
-    ViewSettings,
-    ViewTruth,
-    encode_color,
-    extract_masks,
-    make_gt_entries,
-    make_gt_info_entries,
-    read_depth,
-)
 from synpick_warp.exporters.writing.files import output_error
 from synpick_warp.exporters.writing.notes import note_files, write_notes
 from synpick_warp.exporters.writing.pool import WriterPool
@@ -49,28 +36,12 @@ class CocoExporter(SceneExporter):
     writes_depth = False
     staging = "coco"
 
-    def __init__(self, context: ExportContext) -> None:
-        """See `Exporter`."""
-        super().__init__(context)
-        self._layers = ()
+    write_view = staticmethod(write_view)
 
     @staticmethod
-    def write_view(
-        color: np.ndarray,
-        depth: np.ndarray,
-        visible_source: np.ndarray,
-        amodal_source: np.ndarray,
-        scene: Path,
-        settings: ViewSettings,
-        truth: ViewTruth,
-    ) -> None:
+    def annotates(config: Config) -> bool:
         """See `SceneExporter`."""
-        width, height = settings.resolution
-        masks = extract_masks(visible_source, amodal_source, truth, height)
-        poses, keypoints = make_gt_entries(truth, settings.camera), settings.keypoints
-        points = project_keypoints(poses, settings.camera, read_depth(depth, settings), keypoints) if keypoints else None
-        annotations = make_annotations(poses, make_gt_info_entries(truth), masks, height, width, points)
-        write_image(scene, truth.frame, settings.color_suffix, encode_color(color, settings, truth.jpeg_quality), annotations)
+        return True
 
     @staticmethod
     def folder_name(split: str) -> str:
@@ -93,7 +64,7 @@ class CocoExporter(SceneExporter):
 
     def write_constants(self) -> list[Path]:
         """See `Exporter`: names and keypoints of the objects, camera and notes."""
-        names = {entry.obj_id: entry.name for entry in self._context.catalog.entries}
+        names = self._context.names
         write_categories(self._out, names, self._keypoints)
         try:
             return [CATEGORIES, *write_notes(self._out, self._context.config, names, self._cameras)]
@@ -106,9 +77,6 @@ class CocoExporter(SceneExporter):
 
     def _stage_scene(self, scene: Path) -> None:
         scene.mkdir()
-
-    def _layer_task(self, scene: Path, scene_id: int, name: str, frame: int) -> tuple[Callable[..., None], tuple[Any, ...]]:
-        raise NotImplementedError("COCO has no layers")
 
     def _commit_task(self, scenes: tuple[tuple[Path, int], ...], frames: int) -> tuple[Callable[..., None], tuple[Any, ...]]:
         return commit_scenes, (scenes, self._out, frames)

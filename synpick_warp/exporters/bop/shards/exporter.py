@@ -12,14 +12,7 @@ from synpick_warp.configs.sensors import effect_ranges
 from synpick_warp.exporters.base import SharedFiles
 from synpick_warp.exporters.bop.scene_exporter import CONSTANTS, SceneExporter
 from synpick_warp.exporters.bop.shards.card import CARD_FILE, CardContent, SplitContent, hub_splits, make_card
-from synpick_warp.exporters.bop.shards.tar_files import (
-    commit_shards,
-    find_shards,
-    list_keys,
-    shard_index,
-    write_shard_layer,
-    write_shard_view,
-)
+from synpick_warp.exporters.bop.shards.tar_files import commit_shards, find_shards, list_keys, shard_index, write_layer, write_view
 from synpick_warp.exporters.writing.files import PARTIAL, output_error, write_atomically
 from synpick_warp.exporters.writing.pool import WriterPool
 
@@ -34,7 +27,8 @@ class ShardsExporter(SceneExporter):
     """
 
     staging = "shards"
-    write_view = staticmethod(write_shard_view)
+    write_view = staticmethod(write_view)
+    write_layer = staticmethod(write_layer)
 
     @staticmethod
     def folder_name(split: str) -> str:
@@ -69,9 +63,6 @@ class ShardsExporter(SceneExporter):
 
     def _stage_scene(self, scene: Path) -> None:
         scene.mkdir()
-
-    def _layer_task(self, scene: Path, scene_id: int, name: str, frame: int) -> tuple[Callable[..., None], tuple[Any, ...]]:
-        return write_shard_layer, (scene, scene_id, name, frame)
 
     def _commit_task(self, scenes: tuple[tuple[Path, int], ...], frames: int) -> tuple[Callable[..., None], tuple[Any, ...]]:
         return commit_shards, (scenes, self._folder(scenes[0][1]), frames, self._layers)

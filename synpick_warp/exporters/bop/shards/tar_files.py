@@ -12,28 +12,14 @@ import tarfile
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 
-import numpy as np
-
 from synpick_warp.configs.splits import MAX_SHARD_SCENES
 from synpick_warp.errors import OutputError
-from synpick_warp.exporters.bop.view import (
-    ViewSettings,
-    ViewTruth,
-    encode_color,
-    encode_depth,
-    extract_masks,
-    make_camera_entry,
-    make_gt_entries,
-    make_gt_info_entries,
-    make_rle,
-    to_json,
-)
+from synpick_warp.exporters.base import EncodedView
+from synpick_warp.exporters.bop.view import ViewSettings, make_rle, to_json
 from synpick_warp.exporters.writing.files import sync_folder
 from synpick_warp.exporters.writing.folder import Buffer, open_folder
-from synpick_warp.exporters.writing.png import encode_png
 from synpick_warp.exporters.writing.rle import Runs
 from synpick_warp.inputs.tar_files import list_members
-from synpick_warp.layer_codec import encode_layer
 
 MAX_SHARD_VIEWS = 1000
 """Maximum number of views in a shard, as in the toolkit (convert_imagewise_to_webdataset.py)."""
@@ -51,41 +37,27 @@ def shard_name(scene: int, part: int) -> str:
     return f"shard-{scene + MAX_SHARD_SCENES * part:06d}.tar"
 
 
-def write_shard_view(
-    color: np.ndarray,
-    depth: np.ndarray,
-    visible_source: np.ndarray,
-    amodal_source: np.ndarray,
-    scene: Path,
-    settings: ViewSettings,
-    truth: ViewTruth,
-) -> None:
-    """Task: write a view as tar entries, without end-of-archive marker, to a file in the scene's staging folder named by its frame."""
-    width, height = settings.resolution
-    entries: list[tuple[str, Buffer]] = [
-        (f"rgb{settings.color_suffix}", encode_color(color, settings, truth.jpeg_quality)),
-        ("depth.png", encode_depth(depth, settings)),
-        ("camera.json", to_json(make_camera_entry(truth, settings))),
-        ("gt.json", to_json(make_gt_entries(truth, settings.camera))),
-        ("gt_info.json", to_json(make_gt_info_entries(truth))),
-    ]
+def write_view(view: EncodedView, scene: Path, settings: ViewSettings) -> None:
+    """Write a view as tar entries, without end-of-archive marker, to a file in the scene's staging folder named by its frame."""
+    suffix, color = view.color
+    entries: list[tuple[str, Buffer]] = [(f"rgb{suffix}", color), ("depth.png", view.depth)]
+    entries += [(f"{name}.json", to_json(record)) for name, record in (("camera", view.camera), ("gt", view.gt), ("gt_info", view.gt_info))]
     if settings.masks:
-        masks = extract_masks(visible_source, amodal_source, truth, height)
-        entries.append(("mask.json", mask_json((mask.amodal for mask in masks), height, width)))
-        entries.append(("mask_visib.json", mask_json((mask.visible for mask in masks), height, width)))
-    key = view_key(truth.scene, truth.frame)
+        masks = view.masks()
+        entries.append(("mask.json", _mask_json((mask.amodal for mask in masks), settings)))
+        entries.append(("mask_visib.json", _mask_json((mask.visible for mask in masks), settings)))
+    key = _view_key(view.scene, view.frame)
     with open_folder(scene) as folder:
-        folder.write(str(truth.frame), b"".join(part for name, data in entries for part in tar_entry(f"{key}.{name}", data)))
+        folder.write(str(view.frame), b"".join(part for name, data in entries for part in _tar_entry(f"{key}.{name}", data)))
 
 
-def write_shard_layer(values: np.ndarray, scene: Path, scene_id: int, name: str, frame: int) -> None:
-    """Task: write a view's layer as a tar entry, without end-of-archive marker, to a file in the scene's staging folder."""
-    entry = tar_entry(f"{view_key(scene_id, frame)}.{name}.png", encode_png(encode_layer(name, values)))
+def write_layer(data: Buffer, scene: Path, scene_id: int, name: str, frame: int) -> None:
+    """Write a view's layer as a tar entry, without end-of-archive marker, to a file in the scene's staging folder."""
     with open_folder(scene) as folder:
-        folder.write(_layer_file(frame, name), b"".join(entry))
+        folder.write(_layer_file(frame, name), b"".join(_tar_entry(f"{_view_key(scene_id, frame)}.{name}.png", data)))
 
 
-def view_key(scene: int, frame: int) -> str:
+def _view_key(scene: int, frame: int) -> str:
     """Key of a view."""
     return f"{scene:06d}_{frame:06d}"
 
@@ -94,12 +66,13 @@ def _layer_file(frame: int, name: str) -> str:
     return f"{frame}.{name}"
 
 
-def mask_json(masks: Iterable[Runs], height: int, width: int) -> bytes:
+def _mask_json(masks: Iterable[Runs], settings: ViewSettings) -> bytes:
     """Masks by ground-truth index, as run lengths."""
+    width, height = settings.resolution
     return to_json({str(index): make_rle(runs, height, width) for index, runs in enumerate(masks)})
 
 
-def tar_entry(name: str, data: Buffer) -> tuple[Buffer, ...]:
+def _tar_entry(name: str, data: Buffer) -> tuple[Buffer, ...]:
     """Reproducible tar entry: no owner, modification time 0."""
     info = tarfile.TarInfo(name)
     info.size = len(data)
@@ -130,8 +103,6 @@ def commit_shards(scenes: tuple[tuple[Path, int], ...], split: Path, frames: int
     for shard, place in complete:
         shard.rename(place)
     sync_folder(split)
-    for scene, _ in scenes:
-        shutil.rmtree(scene)
 
 
 def _concatenate(shard: Path, pieces: list[Path]) -> None:

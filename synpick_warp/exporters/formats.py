@@ -1,0 +1,181 @@
+"""Table of data set formats: which class writes each, how its files are called, and what of a data set it can be made of.
+
+How to add a format:
+
+1. Write a class that implements `Exporter` (`base.py`) in a module or subpackage of this package. `EpisodeExporter` (`staging.py`) stages
+   and commits for it, and `SceneExporter` (`bop/scene_exporter.py`) hands it encoded views; `usd/exporter.py` is the shortest example.
+2. Add a row to FORMAT_TABLE.
+3. Allow the name as a value of the setting `bake.formats`: `FORMATS` in configs/schema.py. Settings must not import exporters, so
+   the name stands there once more; a test compares both.
+4. Let its test class inherit `ExporterContract` (tests/harness/exporter_contract.py): determinism, atomic commits, resuming.
+
+Nothing else lists formats: bakes, `convert`, `merge`, `verify`, the manifest and the reader take them from here. Imports no format and no NumPy.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from typing import Literal, NamedTuple
+
+from synpick_warp.configs.schema import Config
+from synpick_warp.configs.splits import bop_folder, bop_scene
+from synpick_warp.inputs.image_files import TEXTURE_KINDS
+
+Content = Literal["views", "masks", "poses", "gripper"]
+"""Content of a stored data set: images with annotations, their masks, poses of a trajectory, states and commands of the gripper."""
+
+_INDEX = r"[0-9]{6,12}"
+_PLAIN = r"[^./][^/]*"
+"""A part of a path that is not hidden."""
+_MODELS = rf"models(?:_eval)?/(?:models_info\.json|obj_{_INDEX}\.ply|(?:{_PLAIN}/)*{_PLAIN}\.(?i:{'|'.join(TEXTURE_KINDS)}))"
+"""Models, and textures, whose names come from the models of the user."""
+_NOTES = r"camera\.json|dataset_info\.md"
+_SCENE_CONSTANTS = rf"{_MODELS}|{_NOTES}|bop_dataset_params\.py"
+_ZARR_ARRAY = r"[a-z_]+/(?:zarr\.json|c(?:\.[0-9]+)*)"
+_STORE = r"trajectory\.zarr"
+
+
+class PartFiles(NamedTuple):
+    """Files that a format has once an episode, or once a scene. By them the reader finds episodes in formats of which it reads no more."""
+
+    folder: str
+    """Folder of the files, relative to the data set."""
+    suffix: str
+    """Of their names, behind six digits: the episode's index, or the BOP scene_id of a scene."""
+    frame_bytes: int
+    """Least size of a frame in a file [B]."""
+    per_scene: bool = False
+    cameras: int = 1
+    """Number of scenes of an episode, if there is a file for each."""
+
+    def file(self, episode: int) -> str:
+        """File of an episode, or of its first scene, relative to the data set."""
+        return f"{self.folder}/{self.cameras * episode:06d}{self.suffix}"
+
+    @property
+    def pattern(self) -> str:
+        """Pattern of all of them."""
+        return f"{self.folder}/[0-9]*{self.suffix}"
+
+    def episode(self, number: int) -> int:
+        """Index of the episode from the number in a file's name."""
+        return number // self.cameras
+
+
+class Format(NamedTuple):
+    """A row of the table. Names of files are relative to the data set."""
+
+    module: str
+    """Module of its exporter, in this package; imported when the format is used."""
+    exporter: str
+    """Class in it."""
+    constants: str
+    """Names of the files that all episodes share, as a regular expression."""
+    episode: Callable[[Config, int], str]
+    """Names of the files of an episode, as a regular expression."""
+    sources: Callable[[Config], tuple[Content, ...]] | None = None
+    """What a stored data set must have for `convert` to make this format of it; None: no data set has it."""
+    part: PartFiles | None = None
+    """How its episodes are found; None: the reader reads the format (bop, shards, zarr), and finds them itself."""
+    packages: tuple[str, ...] = ()
+    """Packages of this format alone whose versions its output depends on."""
+    remedy: str = "name other formats"
+    """What to do if a package that it needs is not installed."""
+
+
+def _bop(config: Config, episode: int) -> str:
+    scenes = "|".join(dict.fromkeys(f"{bop_scene(config, episode, camera)[0]:06d}" for camera in range(len(config.cameras.positions))))
+    image = rf"[a-z_]+(?:_cam[0-9]+)?/{_INDEX}(?:_[0-9]{{6}})?\.(?:png|jpg)"
+    return rf"{re.escape(bop_folder(config, episode))}/(?:{scenes})/(?:scene_[a-z_]+(?:_cam[0-9]+)?\.json|{image})"
+
+
+def _shards(config: Config, episode: int) -> str:
+    # Further shards of a scene have its id plus a multiple of a million.
+    return rf"{re.escape(bop_folder(config, episode))}_web/shard-[0-9]{{0,12}}(?:{_scenes(config, episode)})\.tar"
+
+
+def _usd(_: Config, episode: int) -> str:
+    return rf"usd/{episode:06d}\.usdc"
+
+
+def _zarr(_: Config, episode: int) -> str:
+    return rf"{_STORE}/episodes/{episode:06d}/(?:zarr\.json|[a-z_]+/(?:zarr\.json|{_ZARR_ARRAY}))"
+
+
+def _lerobot(_: Config, episode: int) -> str:
+    video = rf"chunk-{episode // 1000:03d}/file-{episode % 1000:03d}\.mp4"
+    return rf"lerobot/(?:parts/{episode:06d}\.json|videos/observation\.images\.camera_[0-9]+/{video})"
+
+
+def _coco(config: Config, episode: int) -> str:
+    scenes = _scenes(config, episode)
+    return rf"coco/(?:parts/(?:{scenes})\.jsonl|images/(?:{scenes})/{_INDEX}\.(?:png|jpg))"
+
+
+def _scenes(config: Config, episode: int) -> str:
+    cameras = len(config.cameras.positions)
+    return "|".join(f"{scene:06d}" for scene in range(cameras * episode, cameras * (episode + 1)))
+
+
+FORMAT_TABLE: dict[str, Format] = {
+    "bop": Format(
+        "bop.exporter",
+        "BopExporter",
+        _SCENE_CONSTANTS,
+        _bop,
+        sources=lambda config: ("views", "masks") if config.bop.coco else ("views",),
+    ),
+    "shards": Format("bop.shards.exporter", "ShardsExporter", _SCENE_CONSTANTS, _shards, sources=lambda _: ("views",)),
+    "usd": Format(
+        "usd.exporter",
+        "UsdExporter",
+        r"usd/assets/(?:[a-z_0-9]+\.usdc|lights/light_[0-9]{3,6}\.exr|textures/[a-z_0-9]+\.png)",
+        _usd,
+        sources=lambda _: ("poses",),
+        part=PartFiles("usd", ".usdc", 1),
+    ),
+    "zarr": Format(
+        "trajectory.exporter",
+        "TrajectoryExporter",
+        rf"{_STORE}/(?:(?:episodes/)?zarr\.json|(?:objects|cameras)/(?:zarr\.json|{_ZARR_ARRAY}))",
+        _zarr,
+    ),
+    "lerobot": Format(
+        "lerobot.exporter",
+        "LerobotExporter",
+        _NOTES,
+        _lerobot,
+        sources=lambda _: ("views", "poses", "gripper"),
+        part=PartFiles("lerobot/parts", ".json", 64),  # A row in base64.
+        packages=("av", "pyarrow"),
+        remedy="install it by pip install 'synpick-warp[lerobot]'",
+    ),
+    "coco": Format(
+        "bop.coco.exporter",
+        "CocoExporter",
+        rf"coco/categories\.json|{_NOTES}",
+        _coco,
+        sources=lambda _: ("views", "masks"),
+        part=PartFiles("coco/parts", ".jsonl", 3, per_scene=True),  # A line: [] and its end.
+    ),
+}
+"""Format -> its row."""
+
+
+def convertible() -> tuple[str, ...]:
+    """Formats that `convert` writes."""
+    return tuple(name for name, row in FORMAT_TABLE.items() if row.sources is not None)
+
+
+def part_files(cameras: int | None) -> list[PartFiles]:
+    """Part files of all formats that have them; `cameras`: their number, None: unknown, and formats with a file per scene are left out."""
+    parts = [row.part for row in FORMAT_TABLE.values() if row.part is not None]
+    whole = [part for part in parts if not part.per_scene]
+    return whole if cameras is None else whole + [part._replace(cameras=cameras) for part in parts if part.per_scene]
+
+
+def contents_of(name: str, config: Config) -> tuple[Content, ...]:
+    """What a stored data set with these settings must have for `convert` to make a format of it."""
+    sources = FORMAT_TABLE[name].sources
+    return () if sources is None else sources(config)

@@ -1,0 +1,167 @@
+"""Staging of episodes: what all exporters do with an episode's files until it is committed or discarded."""
+
+from __future__ import annotations
+
+import dataclasses
+import shutil
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any, ClassVar, Generic, TypeVar
+
+import numpy as np
+
+from synpick_warp.codes import Ending
+from synpick_warp.configs.schema import Config
+from synpick_warp.exporters.base import ExportContext, StoredScene
+from synpick_warp.exporters.writing.files import PARTIAL, output_error
+from synpick_warp.exporters.writing.pool import WriterPool, WriteTask
+from synpick_warp.frames import EpisodeEnd, FrameBatch, TickBatch
+
+_Content = TypeVar("_Content")
+
+
+@dataclass(eq=False)
+class StagedEpisode(Generic[_Content]):
+    """An arrangement of an episode whose files are being written."""
+
+    index: int
+    """Episode index."""
+    folder: Path
+    """Staging folder, of this arrangement only."""
+    content: _Content
+    """What the format keeps of it."""
+    pending: int = 0
+    """Number of unfinished tasks."""
+    end: EpisodeEnd | None = None
+    on_committed: Callable[[], None] | None = None
+    """Set together with `end`."""
+
+    @property
+    def delivers(self) -> bool:
+        """Whether it has ended, and its files are committed."""
+        return self.end is not None and Ending(self.end.ending).delivers
+
+
+class EpisodeExporter(ABC, Generic[_Content]):
+    """Base of the `Exporter`s: each arrangement of an episode has a staging folder, which one task commits after all others are done.
+
+    A format makes its content of an episode (`_staged`), counts the tasks that write to its folder (`_task`), and names the task that
+    commits it (`_commit`). It overrides what else it needs: `write_views`, `write_ticks`, `finalize` and the flags are those of a format
+    that reads nothing and has no index files.
+    """
+
+    needs_physics: ClassVar[bool] = False
+    needs_views: ClassVar[bool] = False
+    needs_images: ClassVar[bool] = False
+    writes_depth: ClassVar[bool] = False
+    staging: ClassVar[str]
+    """Name of the format's folder in `PARTIAL`."""
+
+    def __init__(self, context: ExportContext) -> None:
+        """See `Exporter`."""
+        self._context = context
+        self._staging = context.out / PARTIAL / self.staging
+        self._episodes: dict[int, StagedEpisode[_Content]] = {}
+        self._arrangements = 0
+
+    @abstractmethod
+    def _commit(self, episode: StagedEpisode[_Content], end: EpisodeEnd) -> WriteTask:
+        """Task that completes an episode and renames its files to their places; the staging folder is removed after it."""
+
+    def _finish(self, episode: StagedEpisode[_Content], end: EpisodeEnd) -> None:
+        """Submit the tasks that wait for the end of an episode."""
+
+    @staticmethod
+    def finalize(out: Path, config: Config, pool: WriterPool, episodes: Sequence[int]) -> list[Path]:
+        """See `Exporter`: no index files."""
+        return []
+
+    def write_views(self, batch: FrameBatch) -> None:
+        """See `Exporter`: no images."""
+
+    def write_stored(self, episode: int, scenes: Sequence[StoredScene]) -> None:
+        """See `Exporter`: no images."""
+
+    def write_ticks(self, batch: TickBatch) -> None:
+        """See `Exporter`: nothing of the simulation."""
+
+    def end_episode(self, end: EpisodeEnd, on_committed: Callable[[], None]) -> None:
+        """See `Exporter`."""
+        episode = self._episodes.pop(end.episode, None)
+        if episode is None:
+            on_committed()
+        else:
+            episode.end, episode.on_committed = end, on_committed
+            episode.pending += 1
+            if episode.delivers:
+                self._finish(episode, end)
+            self._task_done((episode,), None)
+        self._context.pool.poll()
+
+    def close(self) -> None:
+        """See `Exporter`."""
+        self._episodes.clear()
+
+    def abort(self) -> None:
+        """See `Exporter`."""
+        self._episodes.clear()
+
+    def _staged(self, index: int, make_content: Callable[[Path], _Content]) -> StagedEpisode[_Content]:
+        """The current arrangement of an episode; a new one gets a staging folder, and its content by `make_content` of that folder."""
+        episode = self._episodes.get(index)
+        if episode is None:
+            # A suffix unique to each arrangement: the discarded one's folder may not be removed yet.
+            self._arrangements += 1
+            folder = self._staging / f"{index:06d}-{self._arrangements}"
+            try:
+                self._staging.mkdir(exist_ok=True)
+                folder.mkdir()
+                episode = self._episodes[index] = StagedEpisode(index, folder, make_content(folder))
+            except OSError as error:
+                raise output_error(folder, error) from error
+        return episode
+
+    def _task(
+        self,
+        episodes: Sequence[StagedEpisode[_Content]],
+        function: Callable[..., None],
+        images: Sequence[np.ndarray],
+        arguments: tuple[Any, ...],
+        path: Path,
+        then: Callable[[], None] | None = None,
+    ) -> WriteTask:
+        """A task that writes to the staging folders of episodes, which are committed after it; `then` runs first, and may submit others."""
+        for episode in episodes:
+            episode.pending += 1
+        return WriteTask(function, images, arguments, path, partial(self._task_done, episodes, then))
+
+    def _task_done(self, episodes: Sequence[StagedEpisode[_Content]], then: Callable[[], None] | None) -> None:
+        if then is not None:
+            then()
+        for episode in episodes:
+            episode.pending -= 1
+            if episode.end is not None and not episode.pending:
+                self._commit_or_discard(episode, episode.end)
+
+    def _commit_or_discard(self, episode: StagedEpisode[_Content], end: EpisodeEnd) -> None:
+        """Commit or discard an episode whose tasks are all done."""
+        if episode.delivers:
+            task = self._commit(episode, end)
+            task = dataclasses.replace(task, function=commit_staged, arguments=(episode.folder, task.function, *task.arguments))
+        else:
+            task = WriteTask(discard_staged, (), (episode.folder,), episode.folder)
+        self._context.pool.submit_all((dataclasses.replace(task, on_done=episode.on_committed),))
+
+
+def commit_staged(folder: Path, commit: Callable[..., None], *arguments: Any) -> None:
+    """Task: commit an episode, and remove its staging folder."""
+    commit(*arguments)
+    shutil.rmtree(folder)
+
+
+def discard_staged(folder: Path) -> None:
+    """Task: remove the staging folder of a discarded arrangement."""
+    shutil.rmtree(folder)
