@@ -9,7 +9,8 @@ How to add a format:
    the name stands there once more; a test compares both.
 4. Let its test class inherit `ExporterContract` (tests/harness/exporter_contract.py): determinism, atomic commits, resuming.
 
-Nothing else lists formats: bakes, `convert`, `merge`, `verify`, the manifest and the reader take them from here. Imports no format and no NumPy.
+Nothing else lists formats: bakes, `convert`, `merge`, `verify`, the manifest and the reader take them from here. Imports no format and
+no NumPy.
 """
 
 from __future__ import annotations
