@@ -10,8 +10,8 @@ import warp as wp
 from synpick_warp.cli.commands import main
 from synpick_warp.factory import assembly, warmup
 from synpick_warp.factory.compilation import launch_all
+from synpick_warp.newton_patches.narrow_phase import slow_builds
 from synpick_warp.progress import SilentProgress
-from synpick_warp.stages.sim.physics import slow_builds
 from synpick_warp.system.kernels import Compiler, DryLaunches, ModuleBuild
 from tests.worlds.small_worlds import catalog, settings
 

@@ -4,7 +4,7 @@ Kernels: named `foo_kernel`; at most 16 parameters, each annotated, none with a 
 `# State:`, `# In:`, `# Out:`, in this order (the owner may follow); `_out` or `_inout` ends the names of written arrays, and of no
 others; a comment behind every array names its dimensions; a docstring.
 Kernel modules: a docstring, no backward passes, no postponed annotations, no imports but Warp and other kernels.
-Everywhere: `wp.launch` in synpick_warp/stages only, with arguments named as the parameters (`tools.checks.launches`).
+Everywhere: `wp.launch` in synpick_warp/{stages,newton_patches} only, with arguments named as the parameters (`tools.checks.launches`).
 
     python -m tools.checks.kernels
 """
@@ -24,7 +24,7 @@ GROUPS = ("Scene", "State", "In", "Out")
 WRITTEN = ("_out", "_inout")
 KERNEL_PACKAGE = "synpick_warp.kernels"
 CODES = "synpick_warp.codes"
-LAUNCHING = "synpick_warp/stages"
+LAUNCHING = ("synpick_warp/stages", "synpick_warp/newton_patches")
 HOST_FOLDERS = ("synpick_warp", "scenes", "configs", "tools")
 _GROUP = re.compile(rf"\s*#\s*({'|'.join(GROUPS)}):")
 _ARRAY = re.compile(r"wp\.array(?:([234])d)?\[")
@@ -42,7 +42,7 @@ def main(root: Path) -> int:
     writes = function_writes(modules)
     faults = [fault for path, tree in modules.items() for fault in check_module(path, tree, writes)]
     faults += [fault for folder in HOST_FOLDERS for fault in check_launches(root, folder)]
-    launching = sorted((root / LAUNCHING).rglob("*.py"))
+    launching = sorted(path for folder in LAUNCHING for path in (root / folder).rglob("*.py"))
     faults += [fault for path in launching for fault in check_launch_arguments(path, kernel_parameters(modules))]
     for path, line, rule in faults:
         print(f"{path.relative_to(root)}:{line}: {rule}")
@@ -177,7 +177,7 @@ def check_launches(root: Path, folder: str) -> Iterator[Fault]:
             continue
         for node in ast.walk(ast.parse(path.read_text())):
             if isinstance(node, ast.Call) and re.fullmatch(r"(wp|warp)\.launch(_tiled)?", ast.unparse(node.func)):
-                yield path, node.lineno, f"kernels are launched in {LAUNCHING} only"
+                yield path, node.lineno, f"kernels are launched in {' and '.join(LAUNCHING)} only"
 
 
 def decorated(function: ast.FunctionDef, kind: str) -> bool:

@@ -5,31 +5,23 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable, Iterator
 from dataclasses import replace
-from functools import cache
 from typing import Any, Protocol
 
 import newton
 import numpy as np
 import warp as wp
-from newton._src.geometry import narrow_phase as narrow
-from newton._src.sim import collide
-from newton._src.sim import model as newton_model
 
 from synpick_warp.configs.schema import Config
 from synpick_warp.configs.schema import Physics as PhysicsConfig
 from synpick_warp.configs.splits import plan_episodes
 from synpick_warp.kernels.sim import gripper, rest
+from synpick_warp.newton_patches import KNOWN_NEWTON
+from synpick_warp.newton_patches.broad_phase import replace_broad_phase
+from synpick_warp.newton_patches.narrow_phase import resize_blocks
+from synpick_warp.newton_patches.solver import choose_solver
 from synpick_warp.scenes import build
-from synpick_warp.stages.sim.broad_phase import replace_broad_phase
-from synpick_warp.stages.sim.fused_solver import KNOWN_NEWTON, choose_solver
-from synpick_warp.system.kernels import ModuleBuild, split_modules
 from synpick_warp.system.threads import is_only_launcher
 
-# Of the kernels in these modules of Newton, a bake launches a fifth.
-split_modules(("newton._src.geometry.", "newton._src.sim.", "newton._src.solvers.solver", "newton._src.solvers.steel."))
-for _type in (bool, float, int, wp.uint64, wp.vec2i, wp.vec3, wp.vec3i, wp.vec4i, wp.transform):
-    # Newton adds these overloads one launch after the other, and each compiles all of them before it once more.
-    wp.overload(newton_model._copy_variant_shape_kernel, {"variant_values": wp.array(dtype=_type), "values": wp.array(dtype=_type)})
 # Sentinel: default of `next` for an exhausted iterator.
 ENDED = object()
 # Contacts with a larger gap get no constraint rows [m]. The collision pipeline finds none that far apart: a hook disables a contact so.
@@ -39,13 +31,6 @@ JOINT_LIMIT_GAP = 0.2
 # Fraction of its speed limit from which a body has velocity limit rows. Six idle rows for each body at all times would take a third
 # of the solver's time on a GPU.
 VELOCITY_LIMIT_FRACTION = 0.5
-# Blocks of the narrow phase: one warp each, 8 for each multiprocessor of a GPU or 2 for each world, whichever is more. Newton has four
-# warps a block (one warp, if a hull has 256 or more vertices), 4 blocks a multiprocessor. A thread tests a pair of shapes for as long as it
-# takes, and a block holds the registers of all its threads until the last one is done: a tick of 16 to 150 worlds is 3 to 7 % shorter so. A
-# world has some 60 pairs, about as many as its two blocks have threads.
-NARROW_PHASE_BLOCK, NARROW_PHASE_BLOCKS, NARROW_PHASE_WORLD_BLOCKS = 32, 8, 2
-# Block size of the narrow phase's refinement in Newton; its kernel takes longer to compile than any other.
-REFINE_BLOCK = 32
 # On an H200, models of one and two worlds round differently from those of 8, 64 and 512, which agree bit by bit.
 MIN_GPU_WORLDS = 8
 # Maximum worlds if `bake.worlds` is 0. On a GPU more worlds need memory and hide more of the latency of physics, which rendering hides as
@@ -285,34 +270,8 @@ def make_pipeline(physics: PhysicsConfig, model: newton.Model) -> newton.Collisi
     if newton.__version__ != KNOWN_NEWTON:
         return pipeline
     replace_broad_phase(pipeline)
-    if model.device.is_cuda:
-        narrow_phase = pipeline.narrow_phase
-        narrow_phase.split_convex_block_dim = NARROW_PHASE_BLOCK
-        blocks = max(NARROW_PHASE_BLOCKS * model.device.sm_count, NARROW_PHASE_WORLD_BLOCKS * model.world_count)
-        narrow_phase.split_convex_total_num_threads = NARROW_PHASE_BLOCK * blocks
+    resize_blocks(pipeline)
     return pipeline
-
-
-def slow_builds(device: wp.Device) -> list[ModuleBuild]:
-    """Modules that take longest to compile, and that every bake launches: Newton's narrow phase of convex shapes.
-
-    Kernels that are created twice are one: their modules have the same name, and the same source.
-    """
-    return [ModuleBuild(kernel.module, device.alias, block) for kernel, block in _narrow_kernels(device.is_cuda)]
-
-
-@cache
-def _narrow_kernels(on_gpu: bool) -> list[tuple[Any, int]]:
-    """Kernels of the narrow phase as `make_pipeline` has them, and their block sizes. Those that write contacts are generic."""
-    options: dict[str, Any] = {"support_func": narrow.support_map_lean, "post_process_contact": narrow.post_process_minkowski_only}
-    writer = {"writer_data": collide.ContactWriterData}
-    if not on_gpu:
-        kernel = narrow.create_narrow_phase_kernel_gjk_mpr(True, collide.write_contact, **options)
-        wp.overload(kernel, writer)
-        return [(kernel, 1)]
-    mpr, gjk, refine, manifold = narrow.create_narrow_phase_kernels_gjk_mpr_split(True, collide.write_contact, **options)
-    wp.overload(manifold, writer)
-    return [(refine, REFINE_BLOCK), (manifold, NARROW_PHASE_BLOCK), (mpr, NARROW_PHASE_BLOCK), (gjk, NARROW_PHASE_BLOCK)]
 
 
 def make_solver(physics: PhysicsConfig, model: newton.Model, slots: int) -> newton.solvers.SolverSteel:

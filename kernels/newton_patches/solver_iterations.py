@@ -1,6 +1,6 @@
 """Fused projected Gauss-Seidel (PGS) solver: one kernel runs all iterations of Newton's SolverSteel, with one warp per world.
 
-The device functions of an iteration are the solver's own, and `stages.sim.fused_solver` passes them in. This module has the arrays that
+The device functions of an iteration are the solver's own, and `newton_patches.solver` passes them in. This module has the arrays that
 they share, under the names of their parameters, and calls them in the order in which the solver launches them. Frames and units are the
 solver's; twists are at centers of mass.
 """

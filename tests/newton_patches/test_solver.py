@@ -14,10 +14,11 @@ from newton._src.solvers.steel import solver_steel as steel
 from newton._src.solvers.steel.kernels import accumulate_propagation_warmstart_body_impulses_ordered
 
 from synpick_warp.codes import Phase
-from synpick_warp.kernels.sim import contact_sweep, world_order
-from synpick_warp.kernels.sim.warm_start import apply_warm_start_kernel
+from synpick_warp.kernels.newton_patches import contact_sweep, world_order
+from synpick_warp.kernels.newton_patches.warm_start import apply_warm_start_kernel
+from synpick_warp.newton_patches import solver as fused_solver
 from synpick_warp.scenes import build
-from synpick_warp.stages.sim import fused_solver, physics
+from synpick_warp.stages.sim import physics
 from synpick_warp.stages.sim.simulate import Simulation
 from tests.worlds.cubes import place_cubes
 from tests.worlds.small_worlds import catalog, settings

@@ -12,7 +12,8 @@ import newton
 import numpy as np
 import warp as wp
 
-from synpick_warp.kernels.sim import contact_rows, contact_sweep, solver_iterations, warm_start, world_order
+from synpick_warp.kernels.newton_patches import contact_rows, contact_sweep, solver_iterations, warm_start, world_order
+from synpick_warp.newton_patches import KNOWN_NEWTON
 
 RESIDENT_WORLDS = 10
 """Worlds whose iterations a multiprocessor can run at a time: its 65,536 registers hold 10 warps with up to 200 a thread. Where there are
@@ -20,9 +21,6 @@ more worlds, those with the most contact colors start first, or they would run o
 PATCH_WARP_CONTACTS = 8
 """Number of contacts of two bodies above which a warp grows their friction patches, and not a thread; Newton's is 32. The patches are the
 same, in four fifths of the time (2,048 worlds, H200)."""
-KNOWN_NEWTON = "1.8.0"
-"""Version of Newton of which private parts are replaced or tuned on a GPU: the solver by `FusedSteel`, and the blocks of the narrow phase.
-Other versions are used as they are, slower."""
 
 steel: Any = sys.modules[newton.solvers.SolverSteel.__module__]
 """The solver's module, with the factories of its kernels."""

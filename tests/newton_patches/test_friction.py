@@ -8,7 +8,7 @@ import warp as wp
 from hypothesis import given
 from hypothesis import strategies as st
 
-from synpick_warp.kernels.sim.friction import solve_friction
+from synpick_warp.kernels.newton_patches.friction import solve_friction
 
 
 @wp.kernel(enable_backward=False)

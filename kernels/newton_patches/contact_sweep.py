@@ -8,7 +8,7 @@ next 32 are prefetched. The arithmetic is the solver's, bit by bit, but for the 
 
 import warp as wp
 
-from synpick_warp.kernels.sim.contact_rows import (
+from synpick_warp.kernels.newton_patches.contact_rows import (
     BODY_A,
     BODY_B,
     KIND,
@@ -23,8 +23,8 @@ from synpick_warp.kernels.sim.contact_rows import (
     ROW,
     WITH_FRICTION,
 )
-from synpick_warp.kernels.sim.friction import FRICTION_OPERATOR, SOLVE_FRICTION
-from synpick_warp.kernels.sim.solver_iterations import ContactRowData, IterationSettings
+from synpick_warp.kernels.newton_patches.friction import FRICTION_OPERATOR, SOLVE_FRICTION
+from synpick_warp.kernels.newton_patches.solver_iterations import ContactRowData, IterationSettings
 
 HAS_FRICTION = f"record[{KIND}] == {WITH_FRICTION}"
 """CUDA expression for whether a contact has friction rows."""

@@ -8,7 +8,7 @@ import newton
 import numpy as np
 import warp as wp
 
-from synpick_warp.kernels.sim import broad_phase
+from synpick_warp.kernels.newton_patches import broad_phase
 
 BLOCK = 128
 """Threads per world that list overlapping bounding boxes; on a CPU one."""

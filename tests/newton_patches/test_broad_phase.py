@@ -13,9 +13,10 @@ from hypothesis import strategies as st
 
 from synpick_warp.codes import Phase
 from synpick_warp.configs.schema import Config
-from synpick_warp.kernels.sim import broad_phase as kernels
+from synpick_warp.kernels.newton_patches import broad_phase as kernels
+from synpick_warp.newton_patches import broad_phase
 from synpick_warp.scenes import build
-from synpick_warp.stages.sim import broad_phase, physics
+from synpick_warp.stages.sim import physics
 from synpick_warp.stages.sim.simulate import Simulation
 from tests.worlds.small_worlds import CUBE, catalog, settings
 

@@ -1,0 +1,59 @@
+"""Narrow phase of collision detection: launch sizes on a GPU, and early compilation of its kernels, which take longest to compile."""
+
+from __future__ import annotations
+
+from functools import cache
+from typing import Any
+
+import newton
+import warp as wp
+from newton._src.geometry import narrow_phase as narrow
+from newton._src.sim import collide
+from newton._src.sim import model as newton_model
+
+from synpick_warp.system.kernels import ModuleBuild, split_modules
+
+# Of the kernels in these modules of Newton, a bake launches a fifth.
+split_modules(("newton._src.geometry.", "newton._src.sim.", "newton._src.solvers.solver", "newton._src.solvers.steel."))
+for _type in (bool, float, int, wp.uint64, wp.vec2i, wp.vec3, wp.vec3i, wp.vec4i, wp.transform):
+    # Newton adds these overloads one launch after the other, and each compiles all of them before it once more.
+    wp.overload(newton_model._copy_variant_shape_kernel, {"variant_values": wp.array(dtype=_type), "values": wp.array(dtype=_type)})
+
+BLOCK, BLOCKS, WORLD_BLOCKS = 32, 8, 2
+"""Blocks of the narrow phase: one warp each, 8 for each multiprocessor of a GPU or 2 for each world, whichever is more. Newton has four
+warps a block (one warp, if a hull has 256 or more vertices), 4 blocks a multiprocessor. A thread tests a pair of shapes for as long as it
+takes, and a block holds the registers of all its threads until the last one is done: a tick of 16 to 150 worlds is 3 to 7 % shorter so. A
+world has some 60 pairs, about as many as its two blocks have threads."""
+REFINE_BLOCK = 32
+"""Block size of the narrow phase's refinement in Newton; its kernel takes longer to compile than any other."""
+
+
+def resize_blocks(pipeline: newton.CollisionPipeline) -> None:
+    """Set the blocks of the narrow phase on a GPU."""
+    model = pipeline.model
+    if model.device.is_cuda:
+        blocks = max(BLOCKS * model.device.sm_count, WORLD_BLOCKS * model.world_count)
+        pipeline.narrow_phase.split_convex_block_dim = BLOCK
+        pipeline.narrow_phase.split_convex_total_num_threads = BLOCK * blocks
+
+
+def slow_builds(device: wp.Device) -> list[ModuleBuild]:
+    """Modules that take longest to compile, and that every bake launches: Newton's narrow phase of convex shapes.
+
+    Kernels that are created twice are one: their modules have the same name, and the same source.
+    """
+    return [ModuleBuild(kernel.module, device.alias, block) for kernel, block in _narrow_kernels(device.is_cuda)]
+
+
+@cache
+def _narrow_kernels(on_gpu: bool) -> list[tuple[Any, int]]:
+    """Kernels of the narrow phase as a collision pipeline has them, and their block sizes. Those that write contacts are generic."""
+    options: dict[str, Any] = {"support_func": narrow.support_map_lean, "post_process_contact": narrow.post_process_minkowski_only}
+    writer = {"writer_data": collide.ContactWriterData}
+    if not on_gpu:
+        kernel = narrow.create_narrow_phase_kernel_gjk_mpr(True, collide.write_contact, **options)
+        wp.overload(kernel, writer)
+        return [(kernel, 1)]
+    mpr, gjk, refine, manifold = narrow.create_narrow_phase_kernels_gjk_mpr_split(True, collide.write_contact, **options)
+    wp.overload(manifold, writer)
+    return [(refine, REFINE_BLOCK), (manifold, BLOCK), (mpr, BLOCK), (gjk, BLOCK)]
