@@ -72,7 +72,12 @@ def texture_name(data: bytes, path: Path) -> str | None:
 
 
 def read_ply_texture(data: bytes, path: Path) -> tuple[str, bytes] | None:
-    """Name and content of the texture that a PLY file names, inside the file's folder; None if there is none."""
+    """Name and content of the texture that a PLY file names, inside the file's folder; None if it names none.
+
+    Raises:
+        MissingFileError: There is no such file.
+        CatalogError: The file cannot be used.
+    """
     name = texture_name(data, path)
     return None if name is None else (name, read_referred(path.parent, name, path, MAX_TEXTURE_FILE)[1])
 
@@ -90,7 +95,7 @@ def read_ply(path: Path, notes: Notes) -> list[MeshPart]:
         raise
     except Exception as error:  # the reader raises nearly anything on damaged files
         raise CatalogError(f"{path}: not readable as PLY ({describe_error(error)})") from error
-    found = read_ply_texture(data, path)
+    found = notes.image(lambda: read_ply_texture(data, path))
     if found is None:
         return [replace(part, uv=None)]
     texture = decode_texture(found[1], str(path.parent / found[0]))

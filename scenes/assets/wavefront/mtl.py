@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -10,8 +9,8 @@ import numpy as np
 
 from synpick_warp.errors import CatalogError
 from synpick_warp.scenes.assets.appearance import MAX_TEXTURE_FILE, MAX_TEXTURE_PIXELS, FileMaterial, as_color, decode_texture
-from synpick_warp.scenes.assets.asset_files import read_referred
-from synpick_warp.scenes.assets.mesh_parts import GREY, WHITE, Notes
+from synpick_warp.scenes.assets.asset_files import is_missing, read_referred
+from synpick_warp.scenes.assets.mesh_parts import GREY, WHITE, Notes, plain_color
 
 # Options of a texture statement, with the largest number of arguments of each.
 _OPTIONS = {"-blendu": 1, "-blendv": 1, "-bm": 1, "-boost": 1, "-cc": 1, "-clamp": 1, "-imfchan": 1, "-mm": 2, "-o": 3, "-s": 3, "-t": 3}
@@ -35,6 +34,8 @@ class MtlMaterial:
     scale: tuple[float, float] = (1.0, 1.0)
     offset: tuple[float, float] = (0.0, 0.0)
     """Of the texture coordinates of map_Kd."""
+    clamp: bool = False
+    """Whether map_Kd does not repeat."""
     factors: dict[str, float] = field(default_factory=dict)
     """pm (metallic) and pr (roughness)."""
     ignored: list[str] = field(default_factory=list)
@@ -45,7 +46,7 @@ class MtlMaterial:
 
     def missing_images(self) -> list[str]:
         """Names of images that are not there."""
-        return [name for name in self.maps.values() if not os.path.lexists(self.library.parent / name.replace("\\", "/"))]
+        return [name for name in self.maps.values() if is_missing(self.library.parent, name, self.library)]
 
 
 @dataclass(eq=False)
@@ -123,6 +124,8 @@ def _parse_map(material: MtlMaterial, key: str, words: list[str], line: str) -> 
                 material.scale = (first, second)
             else:
                 material.offset = (first, second)
+        elif option == "-clamp" and key == "map_kd" and arguments[:1] and arguments[0].lower() in ("on", "off"):
+            material.clamp = arguments[0].lower() == "on"
         elif not _is_neutral(option, arguments):
             material.ignored.append(f"{ascii(words[0])[1:-1]} {option}")
         at = end
@@ -164,14 +167,14 @@ def read_material(material: MtlMaterial, pixels: TexturePixels, notes: Notes) ->
     """Convert a material, reading its images; of maps of metallic and roughness, the mean is used.
 
     Raises:
-        CatalogError: An image is missing or damaged.
+        CatalogError: An image is damaged, or missing and not replaced.
     """
     notes.ignored += material.ignored
-    texture = pixels.read(material.maps["map_kd"], material.library) if "map_kd" in material.maps else None
+    images = {key: notes.image(lambda name=name: pixels.read(name, material.library)) for key, name in material.maps.items()}
     factors = dict(material.factors)
-    for key in ("pm", "pr"):
-        if f"map_{key}" in material.maps:
-            factors[key] = float(pixels.read(material.maps[f"map_{key}"], material.library).mean() / 255.0)
+    factors |= {key[4:]: float(image.mean() / 255.0) for key, image in images.items() if key != "map_kd" and image is not None}
+    texture = images.get("map_kd")
     # With an image Kd is ignored: exporters leave 0.64, or 0, there.
-    color = WHITE if texture is not None else material.color or GREY
+    plain = plain_color(material.color) if "map_kd" in material.maps else material.color or GREY
+    color = WHITE if texture is not None else plain
     return FileMaterial(color, texture, factors.get("pm"), factors.get("pr"))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import os
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -14,9 +13,8 @@ from trimesh.geometry import triangulate_quads
 
 from synpick_warp.errors import CatalogError
 from synpick_warp.inputs.files import read_file
-from synpick_warp.inputs.paths import path_inside
-from synpick_warp.scenes.assets.appearance import FileMaterial
-from synpick_warp.scenes.assets.asset_files import MAX_PARTS, MAX_ROWS, MAX_TEXT_MESH, describe_error, read_referred
+from synpick_warp.scenes.assets.appearance import UV_TOLERANCE, FileMaterial, clamp_texture
+from synpick_warp.scenes.assets.asset_files import MAX_PARTS, MAX_ROWS, MAX_TEXT_MESH, MissingFileError, describe_error, read_referred
 from synpick_warp.scenes.assets.mesh_parts import NO_MATERIAL, WHITE, MeshPart, Notes
 from synpick_warp.scenes.assets.text import decode_text
 from synpick_warp.scenes.assets.wavefront.mtl import MtlMaterial, TexturePixels, parse_library, read_material
@@ -79,6 +77,9 @@ def _part(
         if uv is None or len(uv) != len(vertices):
             raise CatalogError(f"{path}: has a texture, but vertices without texture coordinates; unwrap it or remove the texture")
         uv = known[name].transform(np.asarray(uv, np.float64)[:, :2])
+        if known[name].clamp and len(uv) and (uv.min() < -UV_TOLERANCE or uv.max() > 1.0 + UV_TOLERANCE):
+            image, uv = clamp_texture(material.texture, uv, (True, True), notes.ignored)
+            material = replace(material, texture=image)
     if colors is not None:
         if len(colors) != len(vertices):
             raise CatalogError(f"{path}: {len(colors)} vertex colours for {len(vertices)} vertices; repair the mesh")
@@ -109,10 +110,7 @@ def _read_libraries(path: Path, lines: list[str], notes: Notes) -> dict[str, Mtl
     for name in dict.fromkeys(names):
         try:
             library, data = read_referred(path.parent, name, path, MAX_LIBRARY)
-        except CatalogError:
-            # Refused again if the name leads out of the folder; otherwise a library that was not shipped.
-            if os.path.lexists(path_inside(path.parent, name, path, CatalogError)):
-                raise
+        except MissingFileError:
             notes.said.append(f"there is no material library {ascii(name)[:80]}, the default material is used")
             continue
         known |= parse_library(decode_text(data), library)
