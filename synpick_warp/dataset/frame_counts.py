@@ -26,6 +26,10 @@ _CAMERA, _COCO, _MEMBERS, _ROW = 40, 3, 5 * 1024, 64
 shard (five members with headers) and in a part of LeRobot (a row in base64)."""
 
 
+_TIME = 0.125
+"""The same of the times in a trajectory: zstd's highest level makes one byte of five of these float64."""
+
+
 def check_frames(folder: Path, config: Config | None, episode: int, frames: int) -> None:
     """Compare an episode's number of frames with the sizes of its files in every format.
 
@@ -39,7 +43,7 @@ def check_frames(folder: Path, config: Config | None, episode: int, frames: int)
         DatasetError: A file is too small for so many.
     """
     for path, size, least in _sizes(folder, config, episode) if frames > _HARMLESS else ():
-        if size // least < frames:
+        if size / least < frames:
             raise DatasetError(
                 f"the record of episode {episode} in {folder} counts {frames:,} frames, but {path.relative_to(folder)} has"
                 f" {describe_bytes(size)}, too little for them; {ADVICE}"
@@ -60,12 +64,12 @@ def check_listed_frames(folder: Path, config: Config, row: Mapping[str, Any], na
             raise DatasetError(f"the record of episode {episode} in {folder} counts {frames:,} frames, but {place} has {count:,}; {ADVICE}")
 
 
-def _sizes(folder: Path, config: Config | None, episode: int) -> Iterator[tuple[Path, int, int]]:
+def _sizes(folder: Path, config: Config | None, episode: int) -> Iterator[tuple[Path, int, float]]:
     """File or folder that holds something of every frame, its size, and the least size of a frame [bytes]; only what is there."""
     name = f"{episode:06d}"
     times = folder / STORE / EPISODES / name / "ticks" / "time"
     if times.is_dir():
-        yield times, sum(_size(path) for path in times.iterdir() if path.name.startswith("c")), 1
+        yield times, sum(_size(path) for path in times.iterdir() if path.name.startswith("c")), _TIME
     places = [(folder / "usd" / f"{name}.usdc", 1), (folder / "lerobot" / "parts" / f"{name}.json", _ROW)]
     if config is not None:
         cameras, (scene, sensor) = len(config.cameras.positions), bop_scene(config, episode, 0)
