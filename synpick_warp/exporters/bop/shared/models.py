@@ -24,6 +24,7 @@ from synpick_warp.scenes.assets.asset_files import MissingFileError
 from synpick_warp.scenes.assets.models_info import corrected_entry, read_entries
 from synpick_warp.scenes.assets.ply import read_ply_file, read_ply_texture
 from synpick_warp.scenes.types import Camera, Catalog, CatalogEntry, Material
+from synpick_warp.system.folders import make_folder
 
 MODEL_FOLDERS = ("models", "models_eval")
 """The toolkit renders the first and evaluates with the second; ours are equal."""
@@ -150,7 +151,7 @@ def _copy_model(entry: CatalogEntry, source: Path, path: Path) -> None:
             raise CatalogError(f"{source} names the texture {name}; allowed: names without leading dots that end in .{kinds}; rename it")
         if target.exists() and target.read_bytes() != image:
             raise CatalogError(f"{source} names the texture {name}, but the set has another file of that name; rename it")
-        target.parent.mkdir(parents=True, exist_ok=True)
+        make_folder(target.parent)
         target.write_bytes(image)
     path.write_bytes(data)
 
