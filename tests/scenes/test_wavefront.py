@@ -150,7 +150,7 @@ def test_a_used_image_that_is_missing_is_replaced_by_a_colour(tmp_path, mtl, col
     assert re.fullmatch(r"the image '.*gone\.png' is missing, a plain colour is used", line)
 
 
-@pytest.mark.parametrize("name", ["MAPS\\Skin.PNG", "Grey.png", "/home/someone/skin.png"])
+@pytest.mark.parametrize("name", ["MAPS\\Skin.PNG", "Grey.png", "/data/tex/skin.png"])
 def test_an_image_of_an_unused_material_is_sought_as_that_of_a_used_one(tmp_path, name):
     _, _, line = read(tmp_path, RED + f"newmtl old\nmap_Kd {name}\n")
     assert not line

@@ -11,6 +11,7 @@ from synpick_warp.errors import CatalogError
 from synpick_warp.scenes.assets.appearance import MAX_TEXTURE_FILE, MAX_TEXTURE_PIXELS, FileMaterial, as_color, decode_texture
 from synpick_warp.scenes.assets.asset_files import is_missing, read_referred
 from synpick_warp.scenes.assets.mesh_parts import GREY, WHITE, Notes, plain_color
+from synpick_warp.scenes.assets.wavefront.obj_text import join_lines
 
 # Options of a texture statement, with the largest number of arguments of each.
 _OPTIONS = {"-blendu": 1, "-blendv": 1, "-bm": 1, "-boost": 1, "-cc": 1, "-clamp": 1, "-imfchan": 1, "-mm": 2, "-o": 3, "-s": 3, "-t": 3}
@@ -18,6 +19,7 @@ _OPTIONS |= {"-texres": 1, "-type": 1, "-colorspace": 1}
 # Options that, with these arguments, change nothing here.
 _NEUTRAL = {"-blendu": ("on",), "-blendv": ("on",), "-cc": ("off",), "-clamp": ("off",), "-mm": ("0", "1"), "-colorspace": ("srgb",)}
 _NEUTRAL |= {"-imfchan": ("m",), "-t": ("0", "0", "0"), "-boost": ("0",)}
+_TOLERANCE = 1e-3
 # Statements of the Phong model, which has no counterpart in the metallic-roughness model; every exporter writes them.
 _SILENT = {"ka", "ks", "ns", "ni", "illum", "tf", "d", "tr", "ke", "pcr", "aniso", "anisor", "sharpness", "ps", "pc", "xd"}
 
@@ -46,7 +48,7 @@ class MtlMaterial:
 
     def missing_images(self) -> list[str]:
         """Names of images that are not there."""
-        return [name for name in self.maps.values() if is_missing(self.library.parent, name, self.library)]
+        return [name for name in self.maps.values() if is_missing(self.library.parent, name.partition(" #")[0], self.library)]
 
 
 @dataclass(eq=False)
@@ -58,6 +60,8 @@ class TexturePixels:
 
     def read(self, name: str, library: Path) -> np.ndarray:
         """Decode an image (H, W, 3) uint8 that a library names."""
+        plain = name.partition(" #")[0].strip()
+        name = plain if plain and is_missing(library.parent, name, library) else name
         path, data = read_referred(library.parent, name, library, MAX_TEXTURE_FILE)
         if path not in self.images:
             self.images[path] = decode_texture(data, str(path))
@@ -74,7 +78,7 @@ def parse_library(text: str, library: Path) -> dict[str, MtlMaterial]:
     """
     materials: dict[str, MtlMaterial] = {}
     current: MtlMaterial | None = None
-    for line in text.replace("\\\n", " ").splitlines():
+    for line in join_lines(text).split("\n"):
         words = line.split()
         key = words[0].lower() if len(words) > 1 else ""
         if key == "newmtl":
@@ -86,6 +90,8 @@ def parse_library(text: str, library: Path) -> dict[str, MtlMaterial]:
 
 def _parse_statement(material: MtlMaterial, key: str, words: list[str], line: str) -> None:
     """Parse one statement of a material."""
+    if not key.startswith("map_"):
+        words = line.partition(" #")[0].split()
     if key == "kd":
         material.color = _color(words[1:], material)
     elif key in ("pm", "pr"):
@@ -160,7 +166,10 @@ def _color(words: list[str], material: MtlMaterial) -> tuple[float, float, float
     if not np.isfinite(values).all():
         shown = ascii(" ".join(words))[1:-1][:80]
         raise CatalogError(f"{material.library}: Kd {shown} is not finite; give red, green and blue from 0 to 1")
-    return as_color(np.clip((values if len(values) >= 3 else values[:1] * 3)[:3], 0.0, 1.0))
+    color = np.array((values if len(values) >= 3 else values[:1] * 3)[:3])
+    if color.max() > 1.0 + _TOLERANCE:
+        material.ignored.append(f"Kd beyond 1 ({' '.join(f'{value:g}' for value in color)})")
+    return as_color(np.clip(color, 0.0, 1.0))
 
 
 def read_material(material: MtlMaterial, pixels: TexturePixels, notes: Notes) -> FileMaterial:

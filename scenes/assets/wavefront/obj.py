@@ -14,10 +14,19 @@ from trimesh.geometry import triangulate_quads
 from synpick_warp.errors import CatalogError
 from synpick_warp.inputs.files import read_file
 from synpick_warp.scenes.assets.appearance import UV_TOLERANCE, FileMaterial, clamp_texture
-from synpick_warp.scenes.assets.asset_files import MAX_PARTS, MAX_ROWS, MAX_TEXT_MESH, MissingFileError, describe_error, read_referred
+from synpick_warp.scenes.assets.asset_files import (
+    MAX_PARTS,
+    MAX_ROWS,
+    MAX_TEXT_MESH,
+    MissingFileError,
+    describe_error,
+    is_missing,
+    read_referred,
+)
 from synpick_warp.scenes.assets.mesh_parts import NO_MATERIAL, WHITE, MeshPart, Notes
 from synpick_warp.scenes.assets.text import decode_text
 from synpick_warp.scenes.assets.wavefront.mtl import MtlMaterial, TexturePixels, parse_library, read_material
+from synpick_warp.scenes.assets.wavefront.obj_text import normalize_text
 
 MAX_LIBRARY = 2**22
 """Largest material library [bytes]: 4 MiB."""
@@ -33,13 +42,17 @@ def read_obj(path: Path, notes: Notes) -> list[MeshPart]:
     text = decode_text(read_file(path, MAX_TEXT_MESH, CatalogError))
     if text.count("\n") > 4 * MAX_ROWS:
         raise CatalogError(f"{path}: more than {4 * MAX_ROWS} lines; decimate the mesh")
+    text = normalize_text(text, path, notes.ignored)
     lines = text.split("\n")
     # As the reader takes them: the rest of the line behind the word.
     used = dict.fromkeys(line[line.index("usemtl ") + 7 :].strip() for line in lines if "usemtl " in line)
+    used.pop("", None)
     if len(used) > MAX_PARTS or text.count("usemtl ") > MAX_ROWS:
         raise CatalogError(f"{path}: more than {MAX_PARTS} materials; merge them")
     known = _read_libraries(path, lines, notes)
-    for name in known.keys() - used.keys():
+    known |= {name: known[other] for name in used if name not in known and (other := _similar_name(name, known))}
+    drawn = [known[name] for name in used if name in known]
+    for name in [name for name, material in known.items() if material not in drawn]:
         notes.said += [f"the image {ascii(image)[:80]} of an unused material is missing" for image in known[name].missing_images()]
     pixels = TexturePixels(path)
     materials = {name: read_material(known[name], pixels, notes) for name in used if name in known}
@@ -103,11 +116,27 @@ def _unit_colors(colors: np.ndarray) -> np.ndarray:
     return np.clip(colors / (255.0 if colors.size and colors.max() > 1.0 else 1.0), 0.0, 1.0)
 
 
+def _similar_name(name: str, known: dict[str, MtlMaterial]) -> str | None:
+    """Name of the material that another name means: without a comment behind it, or in other letter case."""
+    plain = name.partition(" #")[0].strip()
+    return plain if plain in known else next((other for other in known if other.casefold() == plain.casefold()), None)
+
+
+def _library_names(line: str, folder: Path, owner: Path) -> list[str]:
+    """Libraries that a line `mtllib` names: one whose name has blanks, if it is there, else one a word."""
+    name = line.partition(" ")[2].strip()
+    choices = (name, name.strip('"'), name.partition(" #")[0].strip())
+    whole = next((each for each in choices if each and not is_missing(folder, each, owner)), None)
+    words = name.partition(" #")[0].split()
+    several = len(words) > 1 and all(word.lower().endswith(".mtl") for word in words)
+    return [whole] if whole else words if several else [name]
+
+
 def _read_libraries(path: Path, lines: list[str], notes: Notes) -> dict[str, MtlMaterial]:
     """Materials of all libraries that an OBJ file names, by name; a library that is not there is noted."""
     known: dict[str, MtlMaterial] = {}
-    names = [line.strip().removeprefix("mtllib").strip() for line in lines if line.split(maxsplit=1)[:1] == ["mtllib"]]
-    for name in dict.fromkeys(names):
+    named = dict.fromkeys(line for line in lines if line.startswith("mtllib ") and line[7:].strip())
+    for name in dict.fromkeys(name for line in named for name in _library_names(line, path.parent, path)):
         try:
             library, data = read_referred(path.parent, name, path, MAX_LIBRARY)
         except MissingFileError:
