@@ -1,4 +1,6 @@
-"""MTL import: colours, textures with their options, and the metallic and roughness of MTL's PBR extension."""
+"""MTL material libraries: diffuse colour, textures with their options, and the PBR extension's metallic and roughness.
+
+The renderer's material model is metallic-roughness. Statements of MTL's Phong model have no counterpart in it and are left out."""
 
 from __future__ import annotations
 
@@ -13,53 +15,62 @@ from synpick_warp.scenes.assets.asset_files import is_missing, read_referred
 from synpick_warp.scenes.assets.mesh_parts import GREY, WHITE, Notes, plain_color
 from synpick_warp.scenes.assets.wavefront.obj_text import join_lines
 
-# Options of a texture statement, with the largest number of arguments of each.
+# Options of a texture statement and how many arguments each takes at most.
 _OPTIONS = {"-blendu": 1, "-blendv": 1, "-bm": 1, "-boost": 1, "-cc": 1, "-clamp": 1, "-imfchan": 1, "-mm": 2, "-o": 3, "-s": 3, "-t": 3}
 _OPTIONS |= {"-texres": 1, "-type": 1, "-colorspace": 1}
-# Options that, with these arguments, change nothing here.
+# Option values that match what the renderer does anyway; others are reported as ignored.
 _NEUTRAL = {"-blendu": ("on",), "-blendv": ("on",), "-cc": ("off",), "-clamp": ("off",), "-mm": ("0", "1"), "-colorspace": ("srgb",)}
 _NEUTRAL |= {"-imfchan": ("m",), "-t": ("0", "0", "0"), "-boost": ("0",)}
 _TOLERANCE = 1e-3
-# Statements of the Phong model, which has no counterpart in the metallic-roughness model; every exporter writes them.
+"""Amount by which a colour may exceed 1 through rounding."""
+# Statements that are left out without a report: most are of the Phong model, and nearly every exporter writes them.
 _SILENT = {"ka", "ks", "ns", "ni", "illum", "tf", "d", "tr", "ke", "pcr", "aniso", "anisor", "sharpness", "ps", "pc", "xd"}
 
 
 @dataclass(eq=False)
 class MtlMaterial:
-    """A material of a library, before its images are read."""
+    """Material as its library states it; images are named, not yet read."""
 
     library: Path
     color: tuple[float, float, float] | None = None
-    """Kd."""
+    """Diffuse colour (Kd), sRGB in 0..1; None: not stated."""
     maps: dict[str, str] = field(default_factory=dict)
-    """Image names of map_kd, map_pm and map_pr."""
+    """Image file names of the statements map_kd, map_pm and map_pr, by statement."""
     scale: tuple[float, float] = (1.0, 1.0)
     offset: tuple[float, float] = (0.0, 0.0)
-    """Of the texture coordinates of map_Kd."""
+    """Scale and offset of map_Kd's texture coordinates (options -s and -o)."""
     clamp: bool = False
-    """Whether map_Kd does not repeat."""
+    """Whether map_Kd is clamped to its edges instead of repeated (option -clamp)."""
     factors: dict[str, float] = field(default_factory=dict)
-    """pm (metallic) and pr (roughness)."""
+    """Metallic (pm) and roughness (pr) in 0..1, as far as they are stated."""
     ignored: list[str] = field(default_factory=list)
+    """Names of statements and options that are not used."""
 
     def transform(self, uv: np.ndarray) -> np.ndarray:
         """Apply the options -s and -o of map_Kd to texture coordinates (V, 2)."""
         return uv * self.scale + self.offset
 
     def missing_images(self) -> list[str]:
-        """Names of images that are not there."""
+        """Names of images of which there is no file."""
         return [name for name in self.maps.values() if is_missing(self.library.parent, name.partition(" #")[0], self.library)]
 
 
 @dataclass(eq=False)
 class TexturePixels:
-    """Decodes the images of an OBJ's materials, each once, up to the limit on their pixels together."""
+    """Image decoder of one OBJ file: decodes each image once, and limits the number of pixels of all together."""
 
     owner: Path
     images: dict[Path, np.ndarray] = field(default_factory=dict)
 
     def read(self, name: str, library: Path) -> np.ndarray:
-        """Decode an image (H, W, 3) uint8 that a library names."""
+        """Decode an image that a material library names.
+
+        Returns:
+            The image (H, W, 3) uint8.
+
+        Raises:
+            CatalogError: It is missing or damaged, or all images together have too many pixels.
+        """
         plain = name.partition(" #")[0].strip()
         name = plain if plain and is_missing(library.parent, name, library) else name
         path, data = read_referred(library.parent, name, library, MAX_TEXTURE_FILE)
@@ -110,7 +121,7 @@ def _parse_statement(material: MtlMaterial, key: str, words: list[str], line: st
 
 
 def _parse_map(material: MtlMaterial, key: str, words: list[str], line: str) -> None:
-    """Parse a texture statement: options, then the image's name, which may contain blanks."""
+    """Parse a texture statement: options with their arguments, then a file name, which may contain blanks."""
     at = 1
     while at < len(words) and words[at].lower() in _OPTIONS:
         option = words[at].lower()
@@ -141,6 +152,7 @@ def _parse_map(material: MtlMaterial, key: str, words: list[str], line: str) -> 
 
 
 def _is_neutral(option: str, arguments: list[str]) -> bool:
+    """Whether an option with these arguments changes nothing in how the renderer draws the texture."""
     expected = _NEUTRAL.get(option)
     if expected is None:
         return option in ("-texres", "-type", "-bm", "-o", "-s")
@@ -150,7 +162,7 @@ def _is_neutral(option: str, arguments: list[str]) -> bool:
 
 
 def _numbers(words: list[str]) -> list[float]:
-    """Words as numbers; none, if one is not a number."""
+    """Convert words to numbers; an empty list if any of them is not a number."""
     try:
         return [float(word) for word in words]
     except ValueError:
@@ -158,7 +170,7 @@ def _numbers(words: list[str]) -> list[float]:
 
 
 def _color(words: list[str], material: MtlMaterial) -> tuple[float, float, float] | None:
-    """A diffuse colour of one or three numbers; None if it is given as a spectrum, or in another colour space."""
+    """Parse a diffuse colour: one number for grey, or three. A colour given as a spectrum or in XYZ is reported as ignored."""
     values = _numbers(words)
     if not values:
         material.ignored.append(f"Kd {ascii(words[0])[1:-1][:20]}")
@@ -173,7 +185,7 @@ def _color(words: list[str], material: MtlMaterial) -> tuple[float, float, float
 
 
 def read_material(material: MtlMaterial, pixels: TexturePixels, notes: Notes) -> FileMaterial:
-    """Convert a material, reading its images; of maps of metallic and roughness, the mean is used.
+    """Read a material's images and convert it. The renderer takes one metallic and one roughness value: the means of their maps.
 
     Raises:
         CatalogError: An image is damaged, or missing and not replaced.

@@ -1,4 +1,4 @@
-"""OBJ import: text and material libraries are decoded and checked here, so that the reader (trimesh) opens no file by itself."""
+"""OBJ import with material libraries. The text is parsed by trimesh; all files are opened, limited and checked here, none by trimesh."""
 
 from __future__ import annotations
 
@@ -34,7 +34,10 @@ _LIBRARY = "library"
 
 
 def read_obj(path: Path, notes: Notes) -> list[MeshPart]:
-    """Read an OBJ file with its material libraries and the images of the materials that it uses: one part for each material.
+    """Read an OBJ file, its material libraries, and the images of the materials that its faces use.
+
+    Returns:
+        One part per material.
 
     Raises:
         CatalogError: The file or one that it refers to cannot be used.
@@ -68,7 +71,7 @@ def read_obj(path: Path, notes: Notes) -> list[MeshPart]:
 
 
 def _load(text: str, used: dict[str, None]) -> list[dict[str, Any]]:
-    """Parse the text of an OBJ with trimesh. Returns its meshes as keyword arguments, sorted by name; `material` is a name."""
+    """Parse OBJ text with trimesh. Returns one dictionary of arrays per material, sorted by name; `visual.material` has only a name."""
     # A library of names only: which mesh has which material; what the materials are is read here.
     table = {_LIBRARY: "\n".join(f"newmtl {name}" for name in used).encode()}
     content = load_obj(io.BytesIO(f"mtllib {_LIBRARY}\n{text}".encode()), resolver=table)
@@ -78,7 +81,7 @@ def _load(text: str, used: dict[str, None]) -> list[dict[str, Any]]:
 def _part(
     mesh: dict[str, Any], used: dict[str, None], known: dict[str, MtlMaterial], materials: dict[str, FileMaterial], path: Path, notes: Notes
 ) -> MeshPart:
-    """Convert one of the reader's meshes."""
+    """Convert one of trimesh's meshes to a part, with its material."""
     vertices, faces = np.asarray(mesh["vertices"], np.float64), triangulate_quads(mesh["faces"])
     normals, visual, colors = mesh.get("vertex_normals"), mesh.get("visual"), mesh.get("vertex_colors")
     if vertices.shape[1:] != (3,) or faces.shape[1:] != (3,) or (normals is not None and np.shape(normals) != vertices.shape):
@@ -111,19 +114,19 @@ def _part(
 
 
 def _unit_colors(colors: np.ndarray) -> np.ndarray:
-    """Colours in 0..1: of integers and of numbers beyond 1, 255 is the largest."""
+    """Scale colours to 0..1; if any value exceeds 1, they are taken as 0..255."""
     colors = np.nan_to_num(np.asarray(colors, np.float64))
     return np.clip(colors / (255.0 if colors.size and colors.max() > 1.0 else 1.0), 0.0, 1.0)
 
 
 def _similar_name(name: str, known: dict[str, MtlMaterial]) -> str | None:
-    """Name of the material that another name means: without a comment behind it, or in other letter case."""
+    """Find a material for a name that no library defines: without a trailing comment, or ignoring letter case. None: there is none."""
     plain = name.partition(" #")[0].strip()
     return plain if plain in known else next((other for other in known if other.casefold() == plain.casefold()), None)
 
 
 def _library_names(line: str, folder: Path, owner: Path) -> list[str]:
-    """Libraries that a line `mtllib` names: one whose name has blanks, if it is there, else one a word."""
+    """Libraries that an `mtllib` line names: the rest of the line if such a file exists, else one per word if all end in .mtl."""
     name = line.partition(" ")[2].strip()
     choices = (name, name.strip('"'), name.partition(" #")[0].strip())
     whole = next((each for each in choices if each and not is_missing(folder, each, owner)), None)
@@ -133,7 +136,7 @@ def _library_names(line: str, folder: Path, owner: Path) -> list[str]:
 
 
 def _read_libraries(path: Path, lines: list[str], notes: Notes) -> dict[str, MtlMaterial]:
-    """Materials of all libraries that an OBJ file names, by name; a library that is not there is noted."""
+    """Read all libraries that an OBJ file names. Returns materials by name; a missing library is noted, not an error."""
     known: dict[str, MtlMaterial] = {}
     named = dict.fromkeys(line for line in lines if line.startswith("mtllib ") and line[7:].strip())
     for name in dict.fromkeys(name for line in named for name in _library_names(line, path.parent, path)):
