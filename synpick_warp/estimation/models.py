@@ -48,7 +48,8 @@ def read_object_models(folder: Path, object_ids: Iterable[int]) -> list[ObjectMo
             raise CatalogError(f"{path}: the process that reads it {result.reason}; repair or simplify the file")
         if isinstance(result, SynpickError):
             raise result
-        models.append(_make_model(object_id, *result, infos[object_id]))
+        mesh, given = result
+        models.append(_make_model(object_id, mesh, given, infos[object_id]))
     return models
 
 
