@@ -137,7 +137,7 @@ def _read_model(model: ModelFile, info: ModelInfo, config: Config) -> tuple[RawO
     A BOP model has the row of the object table with its obj_id, others the row with their name, if the diameter agrees.
     """
     lines: list[str] = []
-    options = MeshOptions(config.objects.crease_angle, config.objects.center and not model.is_bop)
+    options = MeshOptions(config.objects.crease_angle, config.objects.center and not model.is_bop, not config.objects.strict)
     with asset_scope(model.root) as scope:
         mesh, material = read_mesh(model.path, _MILLIMETRE if model.is_bop else 1.0, options, lines.append)
     hull, tolerance = hull_size(mesh.vertices), config.objects.diameter_tolerance

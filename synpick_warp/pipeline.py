@@ -15,7 +15,8 @@ from synpick_warp.codes import Phase
 from synpick_warp.configs.schema import Config
 from synpick_warp.configs.splits import plan_shard
 from synpick_warp.dataset.digests import digest_inputs
-from synpick_warp.dataset.manifest import episode_entry, read_entry
+from synpick_warp.dataset.file_names import describe_strays
+from synpick_warp.dataset.manifest import committed_episodes, episode_entry, read_entry
 from synpick_warp.dataset.writing import OutputFolder, commit_episode, finalize_data_set
 from synpick_warp.episodes import BakeSummary, episode_end, episode_row, is_resampled, remedy
 from synpick_warp.errors import OutputError
@@ -124,6 +125,8 @@ def _fill(
             progress.stage("finishing files")
             with scope("finalize"):
                 finalize_data_set(output.out, config, kinds, pool)
+            if strays := describe_strays(output.out, config, committed_episodes(output.out)):
+                progress.note(strays)
         summary.wall_seconds += time.perf_counter() - started
 
 

@@ -169,6 +169,30 @@ def tile_texture(texture: np.ndarray, tiles: tuple[int, int], said: list[str]) -
     return np.tile(texture, (tiles[1], tiles[0], 1))
 
 
+def clamp_texture(texture: Any, uv: np.ndarray, axes: tuple[bool, bool], ignored: list[str]) -> tuple[np.ndarray, np.ndarray]:
+    """Extend a texture by its border texels as far as texture coordinates reach beyond it (clamp to edge), since textures repeat here.
+
+    Args:
+        texture: (H, W, 3) uint8.
+        uv: Texture coordinates (V, 2), v up.
+        axes: Whether u and v are clamped.
+        ignored: What is not done is added to it: an image that would exceed a quarter of the limit on pixels is not extended.
+
+    Returns:
+        The image, and coordinates in it.
+    """
+    sides = np.array(texture.shape[1::-1], np.float64)
+    low, high = np.minimum(uv.min(axis=0), 0.0), np.maximum(uv.max(axis=0), 1.0)
+    # One texel more, which filtering at the border reads.
+    before, after = (np.where(axes & (margin > 0.0), np.ceil(margin * sides) + 1.0, 0.0) for margin in (-low, high - 1.0))
+    larger = sides + before + after
+    if larger.prod() > MAX_TEXTURE_PIXELS / 4 or larger.max() > MAX_TEXTURE_SIDE:
+        ignored.append("clamping of a texture far beyond its borders")
+        return texture, uv
+    left, below, right, above = (int(count) for count in (*before, *after))
+    return np.pad(texture, ((above, below), (left, right), (0, 0)), mode="edge"), (uv * sides + before) / larger
+
+
 def join_textures(parts: list[tuple[np.ndarray | None, FileMaterial]], owner: str, said: list[str]) -> tuple[list[np.ndarray], np.ndarray]:
     """Merge the materials of several parts into one texture atlas, with base colour factors multiplied in.
 

@@ -40,6 +40,14 @@ _TEXTURE_FOLDERS = ((), ("textures",), ("texture",), ("materials", "textures"), 
 logging.getLogger("trimesh").addHandler(logging.NullHandler())
 
 
+class MissingFileError(CatalogError):
+    """A file that another one names is not there; `name` is the name."""
+
+    def __init__(self, message: str, name: str = "") -> None:
+        super().__init__(message)
+        self.name = name
+
+
 @contextmanager
 def quiet_decoding() -> Iterator[None]:
     """Silence warnings of NumPy and Pillow: whatever was decoded is validated afterwards. Text that is no number stays an error."""
@@ -100,15 +108,27 @@ def read_referred(folder: Path, name: str, owner: object, limit: int) -> tuple[P
         limit: Largest size [bytes].
 
     Raises:
-        CatalogError: The name leads out of the folder, or the file is missing, too large or not a regular file.
+        MissingFileError: There is no such file.
+        CatalogError: The name leads out of the folder, or the file is too large or not a regular file.
     """
     scope = _scope.get() or AssetScope(folder)
     path = locate(folder, name, owner, CatalogError, scope.root)
     if not os.path.lexists(path):
-        raise CatalogError(f"{owner} refers to {name!a}, but there is no file {path}; add it or remove the reference")
+        message = f"{owner} refers to {name!a}, but there is no file {path}; add it or remove the reference"
+        inside = (folder / name.replace("\\", "/")).resolve().is_relative_to(scope.root.resolve())
+        raise MissingFileError(message, name) if inside else CatalogError(message)
     if os.path.normpath(path) != os.path.normpath(folder / name):
         scope.moved.append(f"{owner} refers to {name!a}; {path} is read")
     return path, read_file(path, limit, CatalogError)
+
+
+def is_missing(folder: Path, name: str, owner: object) -> bool:
+    """Whether `read_referred` finds no file of this name in the object's folder."""
+    scope = _scope.get() or AssetScope(folder)
+    try:
+        return not os.path.lexists(locate(folder, name, owner, CatalogError, scope.root))
+    except CatalogError:
+        return True
 
 
 def locate(folder: Path, name: str, owner: object, error: type[SynpickError], root: Path | None = None) -> Path:

@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
+from typing import TypeVar
 
 import numpy as np
 
 from synpick_warp.scenes.assets.appearance import FileMaterial
+from synpick_warp.scenes.assets.asset_files import MissingFileError
+
+_Image = TypeVar("_Image")
 
 # Default base colour (sRGB): a light grey, since highlights do not show on pure white.
 GREY = (0.7, 0.7, 0.7)
@@ -14,6 +19,14 @@ WHITE = (1.0, 1.0, 1.0)
 NO_MATERIAL = FileMaterial(GREY, None, None, None)
 """Material of a part whose file has none: light grey, the rest by the settings."""
 
+
+def plain_color(color: tuple[float, float, float] | None) -> tuple[float, float, float]:
+    """Colour of a material whose image is not there: its own, unless it has none, or white or black, which exporters write beside an
+    image; then light grey."""
+    return GREY if color is None or all(value < _ROUNDING for value in color) or all(value > 1.0 - _ROUNDING for value in color) else color
+
+
+_ROUNDING = 1e-6
 # Longest list in a note; of more only the number is told.
 _MAX_LISTED = 8
 
@@ -39,10 +52,22 @@ class MeshPart:
 class Notes:
     """What a reader replaced or left out of a mesh file, told in one line per file."""
 
+    substitute: bool = False
+    """Whether an image that is not there is replaced by a colour, which is noted; otherwise it is an error."""
     said: list[str] = field(default_factory=list)
     """Warnings: what is missing and what is used instead."""
     ignored: list[str] = field(default_factory=list)
     """Names of features that the file has and that are not used."""
+
+    def image(self, read: Callable[[], _Image]) -> _Image | None:
+        """Result of `read`; None if the image is not there and is replaced by a colour."""
+        try:
+            return read()
+        except MissingFileError as error:
+            if not self.substitute:
+                raise
+            self.said.append(f"the image {ascii(error.name)[:80]} is missing, a plain colour is used")
+            return None
 
     def line(self, source: object) -> str | None:
         """All notes as one line; None: there are none."""

@@ -52,6 +52,8 @@ class MeshOptions:
     """Largest angle between two triangles that are smooth at a common vertex, in meshes without normals [°]."""
     center: bool = False
     """Move the centre of the mesh's bounding box to the origin."""
+    substitute: bool = False
+    """Replace images that are not there by a colour, with a warning."""
 
 
 def _ignore(line: str) -> None:
@@ -70,9 +72,9 @@ def read_mesh(
         report: Called with one line if features of the file are ignored or replaced.
 
     Raises:
-        CatalogError: The file cannot be read, has no triangles or invalid ones, or refers to a texture that is missing.
+        CatalogError: The file cannot be read, has no triangles or invalid ones, or refers to a texture that is missing and is not replaced.
     """
-    notes = Notes()
+    notes = Notes(options.substitute)
     with quiet_decoding():
         parts = [_clean(part, unit, path) for part in _READERS[path.suffix.lower()](path, notes) if len(part.faces)]
         parts = [part for part in parts if len(part.faces)]

@@ -17,6 +17,7 @@ from synpick_warp.scenes.assets.appearance import MAX_TEXTURE_FILE, FileMaterial
 from synpick_warp.scenes.assets.asset_files import MAX_MESH_FILE, MAX_ROWS, MAX_TEXT_MESH, describe_error, quiet_decoding, read_referred
 from synpick_warp.scenes.assets.mesh_parts import NO_MATERIAL, WHITE, MeshPart, Notes
 from synpick_warp.scenes.assets.ply_binary import read_binary
+from synpick_warp.scenes.assets.polygons import clip_ears, find_concave
 from synpick_warp.scenes.assets.text import decode_text
 
 MAX_HEADER = 2**16
@@ -42,6 +43,8 @@ def read_ply_file(path: Path) -> bytes:
         CatalogError: It is not a PLY file, or exceeds a limit.
     """
     data = read_file(path, MAX_MESH_FILE, CatalogError)
+    if data.startswith(b"ply\rformat ascii") and b"\n" not in data:
+        data = data.replace(b"\r", b"\n")
     if not data.startswith(b"ply"):
         # Text with a byte order mark, or in UTF-16.
         text = decode_text(data)
@@ -72,7 +75,12 @@ def texture_name(data: bytes, path: Path) -> str | None:
 
 
 def read_ply_texture(data: bytes, path: Path) -> tuple[str, bytes] | None:
-    """Name and content of the texture that a PLY file names, inside the file's folder; None if there is none."""
+    """Name and content of the texture that a PLY file names, inside the file's folder; None if it names none.
+
+    Raises:
+        MissingFileError: There is no such file.
+        CatalogError: The file cannot be used.
+    """
     name = texture_name(data, path)
     return None if name is None else (name, read_referred(path.parent, name, path, MAX_TEXTURE_FILE)[1])
 
@@ -90,7 +98,7 @@ def read_ply(path: Path, notes: Notes) -> list[MeshPart]:
         raise
     except Exception as error:  # the reader raises nearly anything on damaged files
         raise CatalogError(f"{path}: not readable as PLY ({describe_error(error)})") from error
-    found = read_ply_texture(data, path)
+    found = notes.image(lambda: read_ply_texture(data, path))
     if found is None:
         return [replace(part, uv=None)]
     texture = decode_texture(found[1], str(path.parent / found[0]))
@@ -193,9 +201,9 @@ def _check_ascii(data: bytes, start: int, rows: int, values: int, path: Path) ->
 def _ply_part(elements: dict[str, Any], path: Path, notes: Notes) -> MeshPart:
     """Convert the reader's elements; texture coordinates are None or (V, 2), with vertices split where faces carry them or colours."""
     vertex, face = elements.get("vertex", {}), elements.get("face", {})
-    corners, source = _triangles(face, elements.get("tristrips", {}), path)
     columns = [_columns(vertex, names) for names in (("x", "y", "z"), ("nx", "ny", "nz"))]
     columns += [next((rows for names in _UV_COLUMNS if (rows := _columns(vertex, names)) is not None), None), _colors(vertex)]
+    corners, source = _triangles(face, elements.get("tristrips", {}), columns[0], path, notes)
     if columns[0] is None:
         raise CatalogError(f"{path}: vertices without x, y and z")
     face_colors = _colors(face) if columns[3] is None and source is not None else None
@@ -222,8 +230,17 @@ def _ply_part(elements: dict[str, Any], path: Path, notes: Notes) -> MeshPart:
     return MeshPart(vertices, triangles, normals, uv, colors, NO_MATERIAL if colors is None else replace(NO_MATERIAL, color=WHITE))
 
 
-def _triangles(face: dict[str, Any], strips: dict[str, Any], path: Path) -> tuple[tuple[np.ndarray, np.ndarray], np.ndarray | None]:
-    """Triangulate polygons as fans, and strips.
+def _triangles(
+    face: dict[str, Any], strips: dict[str, Any], vertices: np.ndarray | None, path: Path, notes: Notes
+) -> tuple[tuple[np.ndarray, np.ndarray], np.ndarray | None]:
+    """Triangulate polygons, and strips.
+
+    Args:
+        face: The element of polygons.
+        strips: The element of strips.
+        vertices: Positions (V, 3); None: there are none.
+        path: The file, for errors.
+        notes: What is left out.
 
     Returns:
         The vertices of all corners (C,) and triangles of corners (F, 3); and the face of each triangle (F,), None for strips.
@@ -236,6 +253,8 @@ def _triangles(face: dict[str, Any], strips: dict[str, Any], path: Path) -> tupl
         step = np.arange(len(source)) - np.repeat(np.cumsum(count) - count, count)
         first = (np.cumsum(lengths) - lengths)[source]
         corners, source_faces = np.stack([first, first + step + 1, first + step + 2], axis=1), source
+        if vertices is not None and np.any(lengths > 3) and 0 <= flat.min() <= flat.max() < len(vertices):
+            _clip_concave(corners, source, flat.astype(np.int64), lengths, vertices, notes)
     elif strips.get("length"):
         flat, source_faces = np.concatenate([_lists(strips, next(iter(strips["properties"])))[0], [-1]]), None
         start = np.flatnonzero((flat[:-2] >= 0) & (flat[1:-1] >= 0) & (flat[2:] >= 0))
@@ -247,6 +266,16 @@ def _triangles(face: dict[str, Any], strips: dict[str, Any], path: Path) -> tupl
     if not len(corners):
         raise CatalogError(f"{path}: no triangles; a model needs a surface, a point cloud has none")
     return (flat.astype(np.int64), corners.astype(np.int64)), source_faces
+
+
+def _clip_concave(
+    corners: np.ndarray, source: np.ndarray, flat: np.ndarray, lengths: np.ndarray, vertices: np.ndarray, notes: Notes
+) -> None:
+    """Replace the fans of concave polygons among `corners` (F, 3), which are as many triangles."""
+    starts, first = np.cumsum(lengths) - lengths, np.searchsorted(source, np.arange(len(lengths)))
+    for index in find_concave(vertices, flat, lengths, notes.ignored):
+        start, count = starts[index], lengths[index]
+        corners[first[index] : first[index] + count - 2] = start + np.array(clip_ears(vertices[flat[start : start + count]]))
 
 
 def _lists(element: dict[str, Any], name: str) -> tuple[np.ndarray, np.ndarray]:

@@ -21,6 +21,7 @@ from synpick_warp.scenes.collision.hulls import hull_volume
 from synpick_warp.scenes.collision.simplification import simplify_hull
 from synpick_warp.scenes.types import ConvexPiece, Shape, TriangleMesh
 from synpick_warp.system.caches import USER_VARIABLE, user_cache
+from synpick_warp.system.folders import make_folder
 from synpick_warp.system.isolation import Failure, Limits, run_isolated
 
 MAX_CACHE_FILE = 2**26
@@ -172,7 +173,7 @@ def _load(file: Path) -> Shape | None:
 def _save(file: Path, pieces: Shape, report: Callable[[str], None]) -> bool:
     """Write a cache file atomically, since several bakes may share the folder. False if it cannot be written."""
     try:
-        file.parent.mkdir(parents=True, exist_ok=True)
+        make_folder(file.parent)
         handle, temporary = tempfile.mkstemp(dir=file.parent, prefix=".", suffix=".tmp")
         try:
             with os.fdopen(handle, "wb") as stream:

@@ -184,7 +184,7 @@ def merge(
     if not parts:
         raise ConfigError("merge needs data sets, and none is named; name the folders that `bake --shard` wrote")
     merged = merge_parts(parts, out)
-    print(f"data set: {out}, {merged.episodes:,} episodes")
+    print(f"data set: {out}, {merged.episodes:,} episodes", *merged.left_out, sep="\n")
     if merged.missing:
         shown = ", ".join(map(str, merged.missing[:MAX_LISTED])) + (", ..." if len(merged.missing) > MAX_LISTED else "")
         print(f"{len(merged.missing):,} are in no part: {shown}; `bake --out {out}` with the same settings generates them")

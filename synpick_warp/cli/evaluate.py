@@ -85,6 +85,8 @@ def evaluate(
     data = find_data_set(data, "synpick-warp eval --data DIR", has_images)
     if out is not None:
         check_output_file(out, "--out", data, [*results, *([] if targets is None else [targets])])
+    if plots is not None:
+        check_output_file(plots, "--plots", data, is_folder=True)
     weight = check_filter(filter_, alpha)
     chosen = check_plots(plots, track)
     from synpick_warp.dataset.reading import open_data_set

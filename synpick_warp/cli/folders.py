@@ -133,7 +133,7 @@ def _is_free(folder: Path) -> bool:
 
 def has_scenes(folder: Path) -> bool:
     """Whether a data set has BOP scenes."""
-    return next(folder.glob("*/*/scene_camera*.json"), None) is not None
+    return next(folder.glob("[!.]*/*/scene_camera*.json"), None) is not None
 
 
 def has_attempts(folder: Path) -> bool:
@@ -146,7 +146,7 @@ def has_attempts(folder: Path) -> bool:
 
 def has_images(folder: Path) -> bool:
     """Whether a data set has BOP scenes or shards."""
-    return has_scenes(folder) or next(folder.glob("*_web/*.tar"), None) is not None
+    return has_scenes(folder) or next(folder.glob("[!.]*_web/*.tar"), None) is not None
 
 
 _NEEDS: dict[Callable[[Path], bool], str] = {
@@ -203,7 +203,9 @@ def beside(folder: Path, ending: str) -> Path:
     return place.with_name(f"{place.name or 'data-set'}{ending}")
 
 
-def check_output_file(out: Path, option: str, data_set: Path | None = None, inputs: Sequence[Path] = ()) -> None:
+def check_output_file(
+    out: Path, option: str, data_set: Path | None = None, inputs: Sequence[Path] = (), *, is_folder: bool = False
+) -> None:
     """Check that an output replaces no file of a data set, nor one that the command reads; call it before anything is read.
 
     In the folder of a data set itself files may have the suffixes OWN_SUFFIXES; in its subfolders there are no outputs.
@@ -213,6 +215,7 @@ def check_output_file(out: Path, option: str, data_set: Path | None = None, inpu
         option: Option that names it.
         data_set: The data set that the command reads, which may be one of other programs.
         inputs: Other files that the command reads.
+        is_folder: Whether it is a folder, which none is in the folder of a data set itself, either.
 
     Raises:
         OutputError: It does.
@@ -228,5 +231,6 @@ def check_output_file(out: Path, option: str, data_set: Path | None = None, inpu
     if same is not None:
         raise OutputError(f"{option} is {out}, which the command reads; name another file")
     for root in roots:
-        if place.parent != root or place.suffix.lower() not in OWN_SUFFIXES:
-            raise OutputError(f"{option} is {out}, among the files of the data set {root}; name a file outside of it")
+        if is_folder or place.parent != root or place.suffix.lower() not in OWN_SUFFIXES:
+            kind = "folder" if is_folder else "file"
+            raise OutputError(f"{option} is {out}, among the files of the data set {root}; name a {kind} outside of it")

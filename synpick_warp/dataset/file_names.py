@@ -7,6 +7,7 @@ compared with the names in `FORMAT_TABLE` first. They follow from the settings a
 from __future__ import annotations
 
 import functools
+import os
 import re
 from collections.abc import Iterable
 from pathlib import Path
@@ -42,3 +43,31 @@ def check_file_names(folder: Path, entry: Path, names: Iterable[str], config: Co
         raise DatasetError(
             f'{folder / entry}.sha256 names "{foreign[:MAX_SHOWN]}", which none of its formats writes; {entry_advice(entry)}'
         )
+
+
+_PARTS = (("coco", "coco/parts"), ("lerobot", "lerobot/parts"))
+"""Formats whose indices are joined from a file an episode or scene, and the folder of these."""
+
+
+def describe_strays(folder: Path, config: Config, episodes: Iterable[int]) -> str:
+    """Name what lies beside the parts that indices are joined from and belongs to no committed episode.
+
+    Args:
+        folder: The data set.
+        config: Its settings.
+        episodes: Its committed episodes.
+
+    Returns:
+        A sentence; empty: there is nothing.
+    """
+    strays = []
+    cameras, known = len(config.cameras.positions), set(episodes)
+    for name, place in _PARTS:
+        if name in config.bake.formats and (folder / place).is_dir():
+            suffix, count = (".jsonl", cameras) if name == "coco" else (".json", 1)
+            parts = {f"{number:06d}{suffix}" for episode in known for number in range(count * episode, count * (episode + 1))}
+            strays += sorted(f"{place}/{entry.name}" for entry in os.scandir(folder / place) if entry.name not in parts)
+    if not strays:
+        return ""
+    more = f" and {len(strays) - 1} more" if len(strays) > 1 else ""
+    return f"left out: {folder}/{ascii(strays[0])[1:-1][:MAX_SHOWN]}{more}, of no committed episode"

@@ -24,6 +24,8 @@ _HARMLESS = 1000
 """Number of frames up to which nothing is compared: reading finds what is missing, and says so better."""
 _CAMERA, _MEMBERS = 40, 5 * 1024
 """Least bytes that a frame takes in scene_camera.json ("0": {"cam_K": nine numbers}), and in a shard (five members with headers)."""
+_TIME = 0.125
+"""The same of the times in a trajectory: zstd's highest level makes one byte of five of these float64."""
 
 
 def check_frames(folder: Path, config: Config | None, episode: int, frames: int) -> None:
@@ -39,7 +41,7 @@ def check_frames(folder: Path, config: Config | None, episode: int, frames: int)
         DatasetError: A file is too small for so many.
     """
     for path, size, least in _sizes(folder, config, episode) if frames > _HARMLESS else ():
-        if size // least < frames:
+        if size / least < frames:
             raise DatasetError(
                 f"the record of episode {episode} in {folder} counts {frames:,} frames, but {path.relative_to(folder)} has"
                 f" {describe_bytes(size)}, too little for them; {ADVICE}"
@@ -60,12 +62,12 @@ def check_listed_frames(folder: Path, config: Config, row: Mapping[str, Any], na
             raise DatasetError(f"the record of episode {episode} in {folder} counts {frames:,} frames, but {place} has {count:,}; {ADVICE}")
 
 
-def _sizes(folder: Path, config: Config | None, episode: int) -> Iterator[tuple[Path, int, int]]:
+def _sizes(folder: Path, config: Config | None, episode: int) -> Iterator[tuple[Path, int, float]]:
     """File or folder that holds something of every frame, its size, and the least size of a frame [bytes]; only what is there."""
     name = f"{episode:06d}"
     times = folder / STORE / EPISODES / name / "ticks" / "time"
     if times.is_dir():
-        yield times, sum(_size(path) for path in times.iterdir() if path.name.startswith("c")), 1
+        yield times, sum(_size(path) for path in times.iterdir() if path.name.startswith("c")), _TIME
     parts = part_files(None if config is None else len(config.cameras.positions))
     places = [(folder / part.file(episode), part.frame_bytes) for part in parts]
     if config is not None:

@@ -18,7 +18,7 @@ from typing import Any, BinaryIO, NamedTuple
 from synpick_warp.configs.schema import Config
 from synpick_warp.configs.splits import plan_episodes
 from synpick_warp.configs.write import config_to_toml
-from synpick_warp.dataset.file_names import check_file_names
+from synpick_warp.dataset.file_names import check_file_names, describe_strays
 from synpick_warp.dataset.manifest import (
     ATTEMPTS_FILE,
     CONFIG_FILE,
@@ -59,6 +59,8 @@ class Merged(NamedTuple):
     """Number of episodes."""
     missing: list[int]
     """Indices that no part has; a bake with the same settings generates them."""
+    left_out: list[str]
+    """Sentences on files of episodes that a part has not committed."""
 
 
 def merge(parts: Sequence[Path], out: Path) -> Merged:
@@ -94,7 +96,8 @@ def merge(parts: Sequence[Path], out: Path) -> Merged:
         for lock in locks:
             os.close(lock)
     there = set(committed_episodes(out))
-    return Merged(len(there), [index for each in plan_episodes(config) for index in each if index not in there])
+    missing = [index for each in plan_episodes(config) for index in each if index not in there]
+    return Merged(len(there), missing, [line for part in parts if (line := describe_strays(part, config, committed_episodes(part)))])
 
 
 def _check_folders(parts: Sequence[Path], out: Path) -> None:

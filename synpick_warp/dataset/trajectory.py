@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import os
 from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass
@@ -12,10 +11,10 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from msgspec import Meta, Struct
 
 from synpick_warp.dataset.annotations import ADVICE, check_content
-from synpick_warp.dataset.records import MAX_INSTANCES
+from synpick_warp.dataset.array_layout import MAX_STEPS_PER_TICK, ArrayMetadata, check_layout
 from synpick_warp.errors import DatasetError
-from synpick_warp.exporters.trajectory.arrays import CAMERAS, LABELS, OBJECTS, GroupSpec
-from synpick_warp.inputs.files import check_regular_file, describe_bytes, read_file
+from synpick_warp.exporters.trajectory.arrays import CAMERAS, OBJECTS, GroupSpec
+from synpick_warp.inputs.files import check_regular_file, read_file
 from synpick_warp.inputs.json import decode_json
 
 if TYPE_CHECKING:
@@ -24,10 +23,6 @@ if TYPE_CHECKING:
 
 GROUP_FILE = "zarr.json"
 """Metadata of a zarr group or array (zarr format 3)."""
-MAX_ARRAY = 2**36
-"""Largest array and chunk [bytes]: 64 GiB, the poses of 200 objects in 12 million steps."""
-_SMALL, _MAX_RATIO = 2**20, 1000
-"""Arrays whose shape nothing else tells: size that any may have [bytes], and most bytes for each byte that is stored."""
 _MAX_METADATA = 2**24
 """Largest zarr.json [bytes]; those of a bake have some kilobytes."""
 
@@ -65,30 +60,6 @@ class CameraInfo:
     """World to camera (3) float64 [m]."""
 
 
-class _ChunkShape(Struct):
-    chunk_shape: list[Annotated[int, Meta(ge=1, lt=2**40)]]
-
-
-class _ChunkGrid(Struct):
-    name: Literal["regular"]
-    configuration: _ChunkShape
-
-
-class _Codec(Struct):
-    name: Literal["bytes", "zstd", "crc32c", "sharding_indexed"]
-
-
-class _ArrayMetadata(Struct):
-    """The zarr.json of an array, as far as it decides on memory and code: other codecs and types are never loaded."""
-
-    zarr_format: Literal[3]
-    node_type: Literal["array"]
-    shape: Annotated[list[Annotated[int, Meta(ge=0, lt=2**40)]], Meta(max_length=8)]
-    data_type: Literal["bool", "int8", "int16", "int32", "int64", "uint8", "uint16", "uint32", "uint64", "float32", "float64"]
-    chunk_grid: _ChunkGrid
-    codecs: list[_Codec]
-
-
 class _GroupMetadata(Struct):
     """The zarr.json of a group."""
 
@@ -100,7 +71,7 @@ class _GroupMetadata(Struct):
 class StoreAttributes(Struct):
     """What the attributes of every trajectory store have, as far as it is used here."""
 
-    steps_per_tick: Annotated[int, Meta(ge=1, lt=2**20)]
+    steps_per_tick: Annotated[int, Meta(ge=1, le=MAX_STEPS_PER_TICK)]
     lights: Annotated[list[str], Meta(max_length=2**16)] = []
     """Names of the environment maps."""
 
@@ -136,52 +107,15 @@ class Arrays(Mapping[str, "zarr.Array"]):
             raise KeyError(f"{name}; there are {', '.join(self) or 'no arrays'}")
         folder = self._folder / name
         metadata = decode_json(
-            read_file(folder / GROUP_FILE, _MAX_METADATA, DatasetError), _ArrayMetadata, folder / GROUP_FILE, DatasetError, ADVICE
+            read_file(folder / GROUP_FILE, _MAX_METADATA, DatasetError), ArrayMetadata, folder / GROUP_FILE, DatasetError, ADVICE
         )
-        self._check_layout(folder, metadata)
-        self._check_files(folder)
+        self._check_files(folder, check_layout(folder, metadata, self._schema.arrays.get(name), self._context.sizes()))
         from synpick_warp.dataset.stored_array import open_stored_array
 
         return open_stored_array(folder)
 
-    def _check_layout(self, folder: Path, metadata: _ArrayMetadata) -> None:
-        """Check type and shape against the schema, and the size of the array."""
-        import numpy as np
-
-        shape, dtype = tuple(metadata.shape), np.dtype(metadata.data_type)
-        spec = self._schema.arrays.get(folder.name)
-        if spec is not None:
-            sizes = dict(self._context.sizes())
-            expected = tuple(len(LABELS[name]) if name in LABELS else sizes.get(name) for name in spec.dims)
-            fits = len(shape) == len(expected) and all(size in (None, given) for size, given in zip(expected, shape, strict=True))
-            if dtype != np.dtype(spec.dtype) or not fits:
-                wanted = " x ".join(name if size is None else str(size) for name, size in zip(spec.dims, expected, strict=True))
-                there = f"{dtype.name} of shape {' x '.join(map(str, shape))}"
-                raise DatasetError(f"the array {folder} is {there}; expected: {np.dtype(spec.dtype).name} of shape {wanted}; {ADVICE}")
-            free = {name: given for name, size, given in zip(spec.dims, expected, shape, strict=True) if size is None}
-            self._check_extent(folder, free, math.prod(shape) * dtype.itemsize, sizes.get("tick"))
-        chunk = metadata.chunk_grid.configuration.chunk_shape
-        if len(chunk) != len(shape) or max(math.prod(shape), math.prod(chunk)) * dtype.itemsize > MAX_ARRAY:
-            raise DatasetError(f"the array {folder} has chunks of another shape, or more than {describe_bytes(MAX_ARRAY)}; {ADVICE}")
-
-    def _check_extent(self, folder: Path, free: Mapping[str, int], size: int, ticks: int | None) -> None:
-        """Compare the sizes that an array states and nothing else determines with the largest possible, or with what is stored.
-
-        Args:
-            folder: The array.
-            free: These sizes, by dimension.
-            size: Size of the array [bytes].
-            ticks: Number of frames, if it is known.
-        """
-        most = {"instance": MAX_INSTANCES, "lift_tick": ticks}
-        stored = sum(entry.stat(follow_symlinks=False).st_size for entry in os.scandir(folder))
-        exceeds = any(given > (most.get(name) or given) for name, given in free.items())
-        if exceeds or (free.keys() - most.keys() and size > _SMALL + _MAX_RATIO * stored):
-            there = " and ".join(f"{given:,} as {name}" for name, given in free.items())
-            raise DatasetError(f"the array {folder} states {there}, more than its {describe_bytes(stored)} can hold; {ADVICE}")
-
-    def _check_files(self, folder: Path) -> None:
-        """Check that the chunk files that the manifest lists exist, and that all are regular files.
+    def _check_files(self, folder: Path, largest: int) -> None:
+        """Check that the chunk files that the manifest lists exist, and that all are regular files of up to `largest` bytes.
 
         Zarr takes a chunk without file for one without values, and those are not written: only the manifest tells a lost one.
         """
@@ -189,7 +123,7 @@ class Arrays(Mapping[str, "zarr.Array"]):
         for path in sorted(path for path in self._context.files() if path.parent == folder and path not in present):
             raise DatasetError(f"there is no {path}, which the manifest lists; {ADVICE}")
         for path in present:
-            check_regular_file(path, MAX_ARRAY, DatasetError)
+            check_regular_file(path, max(largest, _MAX_METADATA) if path.name == GROUP_FILE else largest, DatasetError)
 
     def __iter__(self) -> Iterator[str]:
         return iter(sorted(path.parent.name for path in self._folder.glob(f"*/{GROUP_FILE}")))

@@ -1,16 +1,22 @@
-"""Object models of a data set for pose estimation: textured meshes and symmetries from its models folder, in metres."""
+"""Object models of a data set for pose estimation: textured meshes and symmetries from its models folder, in metres.
+
+A data set may come from anywhere, so models and textures are read in isolated processes, as a bake reads them.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
 from pathlib import Path
 
-from synpick_warp.errors import DatasetError
+from synpick_warp.errors import CatalogError, DatasetError, SynpickError
 from synpick_warp.inputs.paths import path_inside
+from synpick_warp.scenes.assets.appearance import FileMaterial
 from synpick_warp.scenes.assets.meshes import read_mesh
 from synpick_warp.scenes.assets.models_info import ModelInfo, read_models_info
-from synpick_warp.scenes.types import Material
+from synpick_warp.scenes.catalog import READ_LIMITS
+from synpick_warp.scenes.types import Material, TriangleMesh
 from synpick_warp.stages.pose.batch import ObjectModel
+from synpick_warp.system.isolation import Failure, run_isolated
 
 _MILLIMETRE = 1e-3
 _METALLIC, _ROUGHNESS = 0.0, 0.5
@@ -33,15 +39,29 @@ def read_object_models(folder: Path, object_ids: Iterable[int]) -> list[ObjectMo
         raise DatasetError(f"{folder} has no models/models_info.json; poses are estimated with models: bake with --formats bop or shards")
     wanted = sorted(set(object_ids))
     infos = read_models_info(info_path, wanted)
-    return [_read_model(folder, object_id, infos[object_id]) for object_id in wanted]
+    paths = [_model_path(folder, object_id) for object_id in wanted]
+    models = []
+    for object_id, path, result in zip(
+        wanted, paths, run_isolated(read_mesh, [(path, _MILLIMETRE) for path in paths], READ_LIMITS), strict=True
+    ):
+        if isinstance(result, Failure):
+            raise CatalogError(f"{path}: the process that reads it {result.reason}; repair or simplify the file")
+        if isinstance(result, SynpickError):
+            raise result
+        mesh, given = result
+        models.append(_make_model(object_id, mesh, given, infos[object_id]))
+    return models
 
 
-def _read_model(folder: Path, object_id: int, info: ModelInfo) -> ObjectModel:
+def _model_path(folder: Path, object_id: int) -> Path:
     name = f"models/obj_{object_id:06d}.ply"
     path = path_inside(folder, name, folder, DatasetError)
     if not path.is_file():
         raise DatasetError(f"{folder} has no {name}, the model of an object in its ground truth; restore it, or bake the data set again")
-    mesh, given = read_mesh(path, _MILLIMETRE)
+    return path
+
+
+def _make_model(object_id: int, mesh: TriangleMesh, given: FileMaterial, info: ModelInfo) -> ObjectModel:
     return ObjectModel(
         object_id=object_id,
         mesh=mesh,

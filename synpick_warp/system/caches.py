@@ -106,6 +106,6 @@ def link_files(source: Path, target: Path) -> None:
     with contextlib.suppress(OSError):
         for parent, _, names in os.walk(source):
             folder = target / Path(parent).relative_to(source)
-            folder.mkdir(parents=True, exist_ok=True)
+            make_folder(folder)
             for name in names:
                 (folder / name).symlink_to(Path(parent, name))

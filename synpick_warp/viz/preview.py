@@ -133,14 +133,14 @@ def read_baked(dataset: Path, object_ids: set[int]) -> Baked:
 
 
 def find_scenes(dataset: Path) -> list[Scene]:
-    """Find the scenes of a data set, of each sensor, sorted.
+    """Find the scenes of a data set, of each sensor, sorted; not those in hidden folders, where a running bake has unfinished ones.
 
     Raises:
         DatasetError: There is none.
     """
     if not dataset.is_dir():
         raise DatasetError(f"there is no folder {dataset}; name the folder of a BOP data set")
-    files = [path for path in dataset.glob("*/*/scene_camera*.json") if path.parent.name.isdecimal()]
+    files = [path for path in dataset.glob("[!.]*/*/scene_camera*.json") if path.parent.name.isdecimal()]
     scenes = sorted(Scene(path.parent, sensor) for path in files if _SENSOR.fullmatch(sensor := path.stem.removeprefix("scene_camera")))
     if not scenes:
         raise DatasetError(f"{dataset} has no complete scene; a BOP data set has folders such as train_pbr/000000 with a scene_camera.json")

@@ -230,6 +230,19 @@ def test_no_output_replaces_or_adds_a_file_of_a_data_set(made, here, capsys, nam
     assert {path: path.read_bytes() for path in made.iterdir() if path.is_file()} == before
 
 
+def test_no_folder_is_made_in_a_data_set(made, here, capsys):
+    """Neither of pictures, nor of another data set."""
+    names = sorted(made.rglob("*"))
+    for name in ("plots", "plots.png", "train/plots"):
+        for arguments in (["eval", "--data", str(made), "--results", "a.csv", "--plots"], ["merge", str(here / "other"), "--out"]):
+            if arguments[0] == "merge" and not (here / "other").exists():
+                shutil.copytree(made, here / "other")
+            assert main([*arguments, str(made / name)]) == 2
+            said = f"{arguments[-1]} is {made / name}, among the files of the data set {made}; name a folder outside of it"
+            assert capsys.readouterr().err == f"synpick-warp: error: {said}\n"
+    assert sorted(made.rglob("*")) == names
+
+
 def test_a_picture_in_the_folder_of_a_data_set_is_a_file_of_nobody(made, capsys):
     assert main(["preview", str(made), "--out", str(made / "contact-sheet.png"), "--views", "1"]) == 0
     assert main(["preview", str(made), "--out", str(made / "contact-sheet.png"), "--views", "1"]) == 0

@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 import json
+import os
+import re
 import shutil
+import signal
 import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -207,6 +211,18 @@ def test_sets_without_models_or_textures_are_refused(bop, tmp_path, capsys):
     assert "has no episode to estimate poses in" in capsys.readouterr().err
     assert run(tmp_path, *arguments) == 2
     assert "is not a data set" in capsys.readouterr().err
+
+
+def crash(path: Path, unit: float) -> None:
+    """Stands in for a decoder of images that a model's texture crashes."""
+    os.kill(os.getpid(), signal.SIGSEGV)
+
+
+def test_a_model_whose_reader_crashes_is_one_line(bop, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr("synpick_warp.estimation.models.read_mesh", crash)
+    assert run(bop, "--method", "single", "--out", tmp_path / "out.csv") == 2
+    line = capsys.readouterr().err
+    assert re.search(r"obj_\d{6}\.ply: the process that reads it crashed \(SIGSEGV\); repair or simplify the file\n$", line)
 
 
 def test_a_missing_library_is_one_line(folder, tmp_path, capsys, monkeypatch):

@@ -15,7 +15,7 @@ from PIL import Image
 
 from synpick_warp.errors import CatalogError
 from synpick_warp.scenes.assets.appearance import linear_to_srgb, srgb_to_linear
-from synpick_warp.scenes.assets.meshes import read_mesh
+from synpick_warp.scenes.assets.meshes import MeshOptions, read_mesh
 
 CORNERS = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], np.float32)
 FACES = np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]], np.uint16)
@@ -169,6 +169,37 @@ def test_a_mirrored_texture_repeats_mirrored(tmp_path):
     rows = np.array([[255, 0], [0, 200]])
     mirrored = np.block([[rows[::-1], rows[::-1, ::-1]], [rows, rows[:, ::-1]]])
     assert np.array_equal(finish.texture[..., 0], mirrored)
+
+
+@pytest.mark.parametrize("wrap", [(33071, 33071), (33071, 10497), (10497, 33071), (33071, 33648)])
+def test_a_clamped_texture_has_its_border_beyond(tmp_path, wrap):
+    builder = Builder(**pbr(**TEXTURE)).image().attribute("TEXCOORD_0", 3.0 * UV - 1.25)
+    builder.content["samplers"] = [{"wrapS": wrap[0], "wrapT": wrap[1]}]
+    builder.content["textures"][0]["sampler"] = 0
+    mesh, finish, said = builder.read(tmp_path)
+    assert not said
+    height, width = finish.texture.shape[:2]
+    uv = at_corners(mesh, mesh.uv)
+    texel = finish.texture[np.floor((1.0 - uv[:, 1]) * height).astype(int) % height, np.floor(uv[:, 0] * width).astype(int) % width]
+    # In glTF v runs down. -1.25 and 1.75 are clamped to 0 and 1, repeat at 0.75, and mirrored lie at 0.75 and 0.25.
+    index = [{33071: (0, 1), 10497: (1, 1), 33648: (1, 0)}[mode] for mode in wrap]
+    image = np.array([[[255, 0, 0], [0, 255, 0]], [[0, 0, 255], [200, 100, 50]]])
+    assert texel.tolist() == [image[index[1][int(v)], index[0][int(u)]].tolist() for u, v in UV]
+
+
+def test_an_image_that_is_missing_is_replaced_by_a_colour(tmp_path):
+    for factor, color in (([1, 1, 1, 1], (0.7,) * 3), ([1, 0, 0, 1], (1.0, 0.0, 0.0))):
+        textures = {"baseColorTexture": {"index": 0}, "metallicRoughnessTexture": {"index": 0}}
+        builder = Builder(**pbr(baseColorFactor=factor, **textures))
+        builder.content |= {"images": [{"uri": "gone.png"}], "textures": [{"source": 0}]}
+        (tmp_path / "a.glb").write_bytes(builder.glb())
+        with pytest.raises(CatalogError, match=r"refers to 'gone\.png'"):
+            read_mesh(tmp_path / "a.glb", 1.0)
+        said: list[str] = []
+        _, finish = read_mesh(tmp_path / "a.glb", 1.0, MeshOptions(substitute=True), said.append)
+        assert said == [f"{tmp_path / 'a.glb'}: the image 'gone.png' is missing, a plain colour is used"]
+        assert (finish.texture, finish.metallic, finish.roughness) == (None, None, None)
+        assert finish.color == pytest.approx(color)
 
 
 # ---- geometry ----

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Any
 
@@ -10,8 +11,9 @@ import pytest
 from PIL import Image
 
 from synpick_warp.errors import CatalogError
-from synpick_warp.scenes.assets.meshes import read_mesh
+from synpick_warp.scenes.assets.meshes import MeshOptions, read_mesh
 
+STRICT = MeshOptions()
 RED = "newmtl skin\nKd 1 0 0\n"
 GREY = (0.7, 0.7, 0.7)
 UV = np.array([[0, 0], [1, 0], [1, 1], [0, 1]])
@@ -20,7 +22,7 @@ FACES = ("f 1/1 3/2 2/3\n", "f 1/1 2/2 4/3\n", "f 1/1 4/2 3/3\n", "f 2/1 3/2 4/3
 OBJ = HEAD + "usemtl skin\n" + "".join(FACES)
 
 
-def read(folder: Path, mtl: str | None, obj: str = OBJ, encoding: str = "utf-8") -> tuple[Any, Any, str]:
+def read(folder: Path, mtl: str | None, obj: str = OBJ, encoding: str = "utf-8", options: MeshOptions = STRICT) -> tuple[Any, Any, str]:
     """Read an OBJ with this library and two images; the last is the line without the file's name."""
     (folder / "a.obj").write_bytes(obj.encode(encoding))
     if mtl is not None:
@@ -28,7 +30,7 @@ def read(folder: Path, mtl: str | None, obj: str = OBJ, encoding: str = "utf-8")
     for name, color in (("skin.png", (200, 10, 30)), ("two words.png", (0, 255, 0)), ("grey.png", (51, 51, 51))):
         Image.new("RGB", (4, 2), color).save(folder / name)
     said: list[str] = []
-    mesh, finish = read_mesh(folder / "a.obj", 1.0, report=said.append)
+    mesh, finish = read_mesh(folder / "a.obj", 1.0, options, said.append)
     assert len(said) <= 1
     return mesh, finish, said[0].removeprefix(f"{folder / 'a.obj'}: ") if said else ""
 
@@ -42,7 +44,8 @@ def read(folder: Path, mtl: str | None, obj: str = OBJ, encoding: str = "utf-8")
         ("-s 2", (2, 1), (0, 0), ""),
         ("-O 0.5", (1, 1), (0.5, 0), ""),
         ("-clamp off -blendu on -mm 0 1 -s 2 2 2", (2, 2), (0, 0), ""),
-        ("-clamp on -s 2 2 2", (2, 2), (0, 0), "ignored: map_Kd -clamp"),
+        ("-clamp on -s 0.5 0.5", (0.5, 0.5), (0, 0), ""),
+        ("-clamp on -clamp off -s 2 2", (2, 2), (0, 0), ""),
         ("-mm 0.1 0.8 -cc on", (1, 1), (0, 0), "ignored: map_Kd -mm, map_Kd -cc"),
     ],
 )
@@ -126,6 +129,52 @@ def test_text_of_any_encoding(tmp_path, encoding):
 def test_a_used_image_that_is_missing_is_refused(tmp_path):
     with pytest.raises(CatalogError, match=r"refers to 'gone\.png', but there is no file"):
         read(tmp_path, "newmtl skin\nmap_Kd gone.png\n")
+
+
+@pytest.mark.parametrize(
+    ("mtl", "color", "roughness"),
+    [
+        ("map_Kd gone.png", GREY, None),
+        ("Kd 0.2 0.4 0.6\nmap_Kd maps\\gone.png\nPr 0.25", (0.2, 0.4, 0.6), 0.25),
+        ("Kd 1 1 1\nmap_Kd -s 2 2 gone.png", GREY, None),
+        ("Kd 0 0 0\nmap_Kd gone.png", GREY, None),
+        ("Kd 1 0 0\nmap_Pr gone.png\nPr 0.5", (1, 0, 0), 0.5),
+    ],
+)
+def test_a_used_image_that_is_missing_is_replaced_by_a_colour(tmp_path, mtl, color, roughness):
+    """As in bakes without objects.strict."""
+    _, finish, line = read(tmp_path, f"newmtl skin\n{mtl}\n", options=MeshOptions(substitute=True))
+    assert finish.texture is None
+    assert finish.color == pytest.approx(color)
+    assert finish.roughness == pytest.approx(roughness)
+    assert re.fullmatch(r"the image '.*gone\.png' is missing, a plain colour is used", line)
+
+
+@pytest.mark.parametrize("name", ["MAPS\\Skin.PNG", "Grey.png", "/data/tex/skin.png"])
+def test_an_image_of_an_unused_material_is_sought_as_that_of_a_used_one(tmp_path, name):
+    _, _, line = read(tmp_path, RED + f"newmtl old\nmap_Kd {name}\n")
+    assert not line
+
+
+@pytest.mark.parametrize(("low", "high"), [(-0.5, 1.0), (0.0, 2.5), (-1.25, 3.0)])
+def test_a_clamped_texture_has_its_border_beyond(tmp_path, low, high):
+    columns = np.array([[255, 0, 0], [0, 255, 0], [0, 0, 255], [200, 100, 50]], np.uint8)
+    obj = OBJ.replace("vt 0 0", f"vt {low} {low}").replace("vt 1 0", f"vt {high} 0.5").replace("vt 1 1", f"vt 0.375 {high}")
+    read(tmp_path, None)
+    Image.fromarray(np.tile(columns, (4, 1, 1))).save(tmp_path / "strip.png")
+    mesh, finish, line = read(tmp_path, "newmtl skin\nmap_Kd -clamp on strip.png\n", obj)
+    height, width = finish.texture.shape[:2]
+    assert not line
+    rows, places = ((1.0 - mesh.uv[:, 1]) * height).astype(int), (mesh.uv[:, 0] * width).astype(int)
+    texel = finish.texture[np.clip(rows, 0, height - 1), np.clip(places, 0, width - 1)]
+    for corner, column in ((0, 0), (1, 3), (2, 1)):
+        at = np.flatnonzero(np.abs(mesh.uv[:, 0] - np.unique(mesh.uv[:, 0])[(0, 2, 1)[corner]]) < 1e-6)
+        assert (texel[at] == columns[column]).all()
+
+
+def test_a_texture_that_is_clamped_far_beyond_its_border_is_told(tmp_path):
+    _, _, line = read(tmp_path, "newmtl skin\nmap_Kd -clamp on -s 9000 9000 skin.png\n")
+    assert line == "ignored: clamping of a texture far beyond its borders"
 
 
 @pytest.mark.parametrize(("low", "high"), [(0, 3), (-2, 1), (5, 6), (0, 200)])

@@ -6,12 +6,17 @@ import os
 import subprocess
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from synpick_warp.cli.commands import main
+from synpick_warp.scenes.collision.shapes import _save
+from synpick_warp.scenes.types import ConvexPiece
+from synpick_warp.system.caches import link_files
 from synpick_warp.system.folders import make_folder
 from tests.harness.scripted_bake import bake, settings
 
+FACES = np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]], np.int32)
 DEPTH = 1900
 """More than Python's stack has calls; the path is shorter than Linux allows, 4,096 bytes."""
 
@@ -49,6 +54,7 @@ def data(tmp_path_factory) -> Path:
         ("report {data} --views 1 --out", "page.html"),
         ("stats {data} --csv", "tables"),
         ("convert {data} --to coco --processes 1 --out", "set"),
+        ("convert {data} --to shards,lerobot --processes 1 --out", "set"),
         ("merge {data} --out", "set"),
     ],
 )
@@ -57,6 +63,29 @@ def test_outputs_lie_at_any_depth(data, here, command, output):
     out = "/".join(["d"] * DEPTH + [output])
     assert main([*command.format(data=data).split(), out]) == 0
     assert os.path.exists(out)
+
+
+def test_caches_and_textures_lie_at_any_depth(here):
+    deep = Path("/".join(["d"] * DEPTH))
+    lines: list[str] = []
+    assert _save(deep / "shape.npz", (ConvexPiece(np.eye(4, 3, dtype=np.float32), FACES),), lines.append)
+    assert not lines
+    source = here / "source"
+    source.mkdir()
+    link_files(source, deep / "kernels")
+    assert (deep / "kernels").is_dir()
+
+
+def test_a_path_that_is_too_long_with_a_file_is_one_line(data, here, capsys):
+    """4,096 bytes with the files of a data set; the folder alone is shorter."""
+    out = "/".join(["d"] * 2030)
+    for arguments in (
+        ["merge", str(data)],
+        *(["convert", str(data), "--to", to, "--processes", "1"] for to in ("shards", "lerobot", "coco")),
+    ):
+        assert main([*arguments, "--out", out]) == 2
+        assert capsys.readouterr().err.count("\n") == 1
+        assert list(here.iterdir()) == []
 
 
 def test_a_bake_is_refused_in_one_line_at_any_depth(here, capsys):

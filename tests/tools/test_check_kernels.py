@@ -113,6 +113,10 @@ OUTPUTS = "[self.out.sum, total, buffers['fields']]"
             ["2: add_kernel takes speed where place is given; place belongs elsewhere", "2: add_kernel takes place where speed is given; "],
         ),
         (f"wp.launch(add_kernel, dim=1, inputs=[scale, speed], outputs={OUTPUTS})", ["2: add_kernel takes 7 arguments, not 5"]),
+        (f"inputs = [*inputs, offset]\n    launch_pixels(add_kernel, 9, inputs, {OUTPUTS}, device)", []),
+        (f"a = [scale, speed]; a = [*a, place]; a = [*a, offset]\n    launch_pixels(add_kernel, 9, a, {OUTPUTS}, device)", []),
+        (f"a = [scale]; a = [*a, *a]\n    launch_pixels(add_kernel, 9, a, {OUTPUTS}, device)", ["3: add_kernel takes 7 arguments, not 5"]),
+        (f"a = [*b, scale]; b = [*a]; a = [*b]\n    launch_pixels(add_kernel, 9, a, {OUTPUTS}, device)", []),
         ("self._launch(add_kernel, [offset], [total, fields, sum])", ["2: add_kernel takes sum where total is given; total belongs"]),
     ],
 )

@@ -188,6 +188,14 @@ def test_mode_time_and_light_of_a_view_are_told(dataset, tmp_path):
     assert read_baked(dataset, set()).facts(find_scenes(dataset)[3], 1, {"light": 3}) == told[:1]
 
 
+def test_unfinished_scenes_of_a_running_bake_are_not_drawn(tmp_path):
+    bake(tmp_path / "set", settings(1, ("bop",)))
+    scenes = find_scenes(tmp_path / "set")
+    for name in ("000000", "000007"):
+        shutil.copytree(scenes[0].folder, tmp_path / "set" / ".partial" / name)
+    assert find_scenes(tmp_path / "set") == scenes
+
+
 def test_sets_of_several_sensors_are_drawn_as_the_classic_layout(tmp_path):
     sheets = []
     for layout in ("classic", "multisensor"):

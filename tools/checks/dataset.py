@@ -321,7 +321,7 @@ def check_coco(scene: Path, frame: str, view: View, report: Report) -> None:
 
 def check(dataset: Path, views: int) -> Report:
     """Check that all files of a data set exist, and check `views` views spread evenly over it."""
-    scenes = sorted(path.parent for path in dataset.glob("*/*/scene_camera.json"))
+    scenes = sorted(path.parent for path in dataset.glob("[!.]*/*/scene_camera.json"))
     if not scenes:
         raise UnusableError(f"{dataset} has no scene")
     report = Report()

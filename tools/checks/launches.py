@@ -21,8 +21,10 @@ SUFFIXES = ("_inout", "_out")
 Parameters = dict[str, list[str]]
 """Kernel name -> names of its parameters."""
 Fault = tuple[Path, int, str]
-Lists = dict[str, list[tuple[int, list[ast.expr], bool]]]
-"""Variable -> (line, elements, whether they are appended) of each list literal assigned to it."""
+Position = tuple[int, int]
+"""Line and column."""
+Lists = dict[str, list[tuple[Position, list[ast.expr], bool]]]
+"""Variable -> (position, elements, whether they are appended) of each list literal assigned to it."""
 
 
 def kernel_parameters(modules: dict[Path, ast.Module]) -> Parameters:
@@ -76,7 +78,7 @@ def _find_lists(function: ast.FunctionDef) -> Lists:
         appended = isinstance(node, ast.AugAssign)
         targets = [node.target] if isinstance(node, ast.AugAssign) else node.targets if isinstance(node, ast.Assign) else []
         if targets and isinstance(node.value, ast.List) and isinstance(targets[0], ast.Name):  # type: ignore[union-attr]
-            lists.setdefault(targets[0].id, []).append((node.lineno, node.value.elts, appended))  # type: ignore[union-attr]
+            lists.setdefault(targets[0].id, []).append(((node.lineno, node.col_offset), node.value.elts, appended))  # type: ignore[union-attr]
     return lists
 
 
@@ -88,28 +90,31 @@ def _arguments(call: ast.Call, lists: Lists) -> list[ast.expr] | None:
         positional.append(ast.List(elts=[call.args[-1]]))  # The only output of a class's launch method.
     elements: list[ast.expr] = []
     for value in named or positional:
-        expanded = _expand(value, call.lineno, lists)
+        expanded = _expand(value, (call.lineno, call.col_offset), lists)
         if expanded is None:
             return None
         elements += expanded
     return elements
 
 
-def _expand(value: ast.expr, line: int, lists: Lists) -> list[ast.expr] | None:
-    """Elements of a list literal, or of a variable with a list at `line`; None: unknown."""
+def _expand(value: ast.expr, at: Position, lists: Lists) -> list[ast.expr] | None:
+    """Elements of a list literal, or of a variable with a list before a position; None: unknown.
+
+    Lists within a list are those before its own assignment, as in `inputs = [*inputs, depth]`.
+    """
     if isinstance(value, ast.Name):
-        before = sorted((item for item in lists.get(value.id, []) if item[0] <= line), key=lambda item: item[0])
+        before = sorted((item for item in lists.get(value.id, []) if item[0] < at), key=lambda item: item[0])
         start = max((index for index, item in enumerate(before) if not item[2]), default=None)
         if start is None:
             return None
-        parts = [element for item in before[start:] for element in item[1]]
+        parts = [(element, item[0]) for item in before[start:] for element in item[1]]
     elif isinstance(value, ast.List):
-        parts = value.elts
+        parts = [(element, at) for element in value.elts]
     else:
         return None
     elements: list[ast.expr] = []
-    for part in parts:
-        expanded = _expand(part.value, line, lists) if isinstance(part, ast.Starred) else [part]
+    for part, place in parts:
+        expanded = _expand(part.value, place, lists) if isinstance(part, ast.Starred) else [part]
         if expanded is None:
             return None
         elements += expanded

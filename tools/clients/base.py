@@ -58,7 +58,7 @@ def sample_frames(count: int) -> list[int]:
 
 def first_scene(data: Path) -> Path | None:
     """Folder of the BOP scene with the lowest scene_id; None: the data set has none."""
-    scenes = [path.parent for path in data.glob("*/*/scene_camera.json") if path.parent.name.isdigit()]
+    scenes = [path.parent for path in data.glob("[!.]*/*/scene_camera.json") if path.parent.name.isdigit()]
     return min(scenes, key=lambda path: int(path.name), default=None)
 
 

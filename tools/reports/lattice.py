@@ -1,14 +1,16 @@
-"""Report on the structure of denoised frames: PSNR, FLIP and the lattice of coarse pixels, by light map and size, against references.
+"""Image quality report of the denoised renderer: PSNR, FLIP and periodic artefacts, per light map and image size, against references.
 
-A frame of an episode is denoised as in a bake, with light histories, under every map of a folder and at several sizes, and path-traced
-twice with half of the paths each. Printed are, for each map and size:
+The denoiser computes light and shadows on a coarse grid of pixels. Errors of upsampling then repeat with the grid's period, as a lattice
+that PSNR hardly shows. For each map and size, one frame of an episode is rendered as in a bake, with its light history, and path-traced
+twice. The report prints:
 
-- PSNR, free of the references' noise (`Pair.quality`), and the mean of FLIP (Andersson et al., 2020; the package flip-evaluator) against
-  the mean of both references, beside half of the FLIP between these two, an upper bound of what their noise adds;
-- the lattice (`measure_lattice`): amplitude at the frequencies of coarse pixels and sample patterns over windows without objects,
-  relative to neighbouring frequencies; that of the reference beside it.
+- PSNR, corrected for the references' noise (`Pair.quality`);
+- mean FLIP (Andersson et al., "FLIP: A Difference Evaluator for Alternating Images", 2020; package flip-evaluator) against the mean of
+  both references, and half of the FLIP between the two, an upper bound of what their noise contributes;
+- the lattice (`measure_lattice`): spectral amplitude at the grid's frequencies relative to neighbouring frequencies, in image windows
+  without objects, for the denoised frame and for the reference.
 
-With `--crops DIR` the worst part of each picture is written beside the reference, at 1:1. Exits with 1 if a bound is violated.
+`--crops DIR` writes the region with the largest FLIP of each frame beside the reference, unscaled. Exit code 1: a bound is violated.
 
     python -m tools.reports.lattice --models DIR --lights DIR --mode move --seed 4 --set move.rounds=1 --set move.speed=2 --crops DIR
 """
@@ -57,20 +59,20 @@ MAX_FLIP = 0.05
 MAX_LATTICE = 1.5
 """Bound of the lattice's amplitude relative to neighbouring frequencies."""
 WINDOW = 32
-"""Width of a window [px], or four periods if these are wider."""
+"""Least width of a window [px]; a window has at least four periods."""
 VISIBLE = 1.0
-"""Amplitude from which on a lattice counts as visible [grey levels]."""
+"""Least amplitude of a visible lattice [grey levels]."""
 STRONG = 3.0
-"""Amplitude, relative to neighbouring frequencies, from which on a visible lattice counts."""
+"""Least ratio of the amplitudes at a grid frequency and at its neighbours, for a window to count as one with a lattice."""
 FLOOR = 0.1
-"""Amplitude at one frequency that neighbours have at least [grey levels]: rounding to grey levels makes patterns as strong."""
+"""Amplitude that is added to the neighbours' [grey levels]: the amplitude that rounding to 8 bits causes at one frequency."""
 NOISE_RATIO = float(np.exp(np.euler_gamma))
-"""Ratio of arithmetic and geometric mean of the spectrum of noise. Neighbours count by their geometric mean, on which the low frequencies
-of edges have less weight."""
+"""Arithmetic over geometric mean of the power spectrum of white noise. Neighbours are averaged geometrically, so that a few strong edge
+frequencies do not dominate, and multiplied by this ratio."""
 CROP = 320
 """Width of a crop [px]."""
 MAX_SAMPLES = 4096
-"""Largest number of paths per pixel of both references together: at 320x180 their noise is then far below the denoiser's error."""
+"""Most paths per pixel of both references together: with these, at 320x180, their noise is far below the denoiser's error."""
 LUMINANCE = np.array([0.299, 0.587, 0.114])
 """Weights of sRGB values in luma (Rec. 601)."""
 SIZES = "320x180,960x540,1920x1080"
@@ -107,14 +109,14 @@ OWN = {
 
 @dataclass(frozen=True)
 class Lattice:
-    """Lattice of an image: its strength over all windows, and where it is worst."""
+    """Strength of periodic artefacts in an image."""
 
     ratio: float
-    """RMS amplitude at the lattice's frequencies over all windows, relative to that at neighbouring frequencies."""
+    """RMS amplitude at the strongest grid frequency over all windows, relative to neighbouring frequencies; 1: no lattice."""
     share: float
-    """Share of windows with a lattice of at least VISIBLE grey levels and STRONG times the neighbouring frequencies [%]."""
+    """Share of windows with an amplitude of at least VISIBLE and STRONG times that of neighbouring frequencies [%]."""
     amplitude: float
-    """Largest amplitude of a window at one frequency of the lattice [grey levels]."""
+    """Largest amplitude of any window at any grid frequency [grey levels]."""
     windows: int
     """Number of windows."""
 
@@ -206,7 +208,7 @@ def compare_maps(
 
 
 def lattice_periods(config: Config) -> tuple[int, ...]:
-    """Periods of the patterns that a denoised frame could show [px]: of coarse pixels' order, and of the lamps' sample points."""
+    """Periods of the denoiser's grids [px]: of the order in which coarse pixels are shaded, and of the shadow samples' strata."""
     size = coarse_size(config.render, config.cameras.resolution[0], 1)
     return tuple(sorted({size * int(LANE_STRIDE), shadow_size(size) * int(STRATA_PERIOD)}))
 
@@ -251,11 +253,12 @@ def flip_map(reference: np.ndarray, image: np.ndarray) -> np.ndarray:
 
 
 def measure_lattice(image: np.ndarray, instance: np.ndarray, periods: tuple[int, ...]) -> Lattice:
-    """Compare the spectrum at the frequencies (i / P, j / P) with that at neighbouring ones, over windows on one surface.
+    """Measure periodic artefacts: power spectra of image windows at the frequencies (i / P, j / P), relative to neighbouring frequencies.
 
-    Windows of several periods P, by half of their width apart, are multiplied by a Hann window. A frequency's neighbours lie two or three
-    bins from it; those of a frequency on an axis on the same axis, where walls and edges have most of their spectrum. In the ratio over all
-    windows each counts by the mean of its own neighbours, or those with strong edges would outweigh all others.
+    Windows are several periods P wide, overlap by half (Welch's method), and are tapered by a Hann window; only windows within one surface
+    count. Neighbours of a frequency lie two or three bins away, for a frequency on an axis along that axis, since straight edges have most
+    of their power there. The ratio over all windows weights each window by the inverse of its neighbours' power; otherwise the few
+    windows with strong edges would decide it.
 
     Args:
         image: Grey levels (H, W, 3).
@@ -266,6 +269,7 @@ def measure_lattice(image: np.ndarray, instance: np.ndarray, periods: tuple[int,
 
 
 def _measure_period(image: np.ndarray, instance: np.ndarray, period: int) -> Lattice:
+    """As `measure_lattice`, for one period."""
     lattice, near = _window_spectra(image, instance, period)
     if not len(lattice):
         return Lattice(0.0, 0.0, 0.0, 0)
@@ -277,7 +281,7 @@ def _measure_period(image: np.ndarray, instance: np.ndarray, period: int) -> Lat
 
 
 def _window_spectra(image: np.ndarray, instance: np.ndarray, period: int) -> tuple[np.ndarray, np.ndarray]:
-    """Squared amplitudes [grey levels²] of windows (window, frequency): at the lattice's frequencies, and of neighbours."""
+    """Squared amplitudes (window, frequency) [grey levels²]: at the grid's frequencies, and the mean of their neighbours."""
     periods = max(4, round(WINDOW / period))
     size, half = period * periods, period // 2
     taper = np.outer(*2 * [np.hanning(size + 1)[:size]])
@@ -300,7 +304,7 @@ def _window_spectra(image: np.ndarray, instance: np.ndarray, period: int) -> tup
 
 
 def _neighbours(row: int, column: int, size: int, periods: int) -> tuple[np.ndarray, np.ndarray]:
-    """Rows and columns of the bins next to a bin (row, column) of a window's spectrum; none is next to another bin of the lattice."""
+    """Rows and columns of the spectral bins that a bin (row, column) is compared with; none lies beside a bin of the grid's frequencies."""
     steps = [(i, j) for i in range(-3, 4) for j in range(-3, 4) if max(abs(i), abs(j)) >= 2]
     if row == 0 or column == 0:
         steps = [(i, j) for i, j in steps if (i == 0 if row == 0 else j == 0)]
@@ -311,7 +315,7 @@ def _neighbours(row: int, column: int, size: int, periods: int) -> tuple[np.ndar
 
 
 def write_crops(pair: Pair, folder: Path, name: str, at: tuple[int, int] | None) -> None:
-    """Write the part of a frame with the largest FLIP, or that around the pixel `at` (column, row), beside the reference."""
+    """Write a crop of the denoised frame beside the reference: the region with the largest FLIP, or around pixel `at` (column, row)."""
     second = pair.second or pair.reference
     mean = 0.5 * (pair.reference.color.astype(np.float32) + second.color)
     height, width = mean.shape[:2]

@@ -16,6 +16,7 @@ from synpick_warp.scenes.assets.appearance import (
     MAX_TEXTURE_PIXELS,
     FileMaterial,
     as_color,
+    clamp_texture,
     decode_texture,
     linear_to_srgb,
     srgb_to_linear,
@@ -43,7 +44,7 @@ from synpick_warp.scenes.assets.gltf.document import (
     read_document,
     read_uri,
 )
-from synpick_warp.scenes.assets.mesh_parts import NO_MATERIAL, WHITE, MeshPart, Notes
+from synpick_warp.scenes.assets.mesh_parts import NO_MATERIAL, WHITE, MeshPart, Notes, plain_color
 
 # Factors may exceed 0..1 by rounding.
 _FACTOR_TOLERANCE = 1e-3
@@ -200,37 +201,45 @@ class _Reader:
         metallic, roughness = pbr.metallicFactor, pbr.roughnessFactor
         if pbr.metallicRoughnessTexture is not None:
             # glTF 2.0, section 3.9.2: green is roughness, blue is metalness. The renderer takes one value per object: the mean.
-            mean = self.texture(pbr.metallicRoughnessTexture).reshape(-1, 3).mean(axis=0) / 255.0
+            image = self.texture(pbr.metallicRoughnessTexture)
+            mean = np.zeros(3) if image is None else image.reshape(-1, 3).mean(axis=0) / 255.0
             metallic, roughness = metallic * float(mean[2]), roughness * float(mean[1])
-        return self.base(pbr.baseColorFactor[:3], pbr.baseColorTexture, metallic, roughness, "baseColorFactor"), pbr.baseColorTexture
+            if image is None:
+                metallic = roughness = None
+        return self.base(pbr.baseColorFactor[:3], pbr.baseColorTexture, metallic, roughness, "baseColorFactor")
 
     def gloss(self, gloss: Glossiness) -> tuple[FileMaterial, TextureInfo | None]:
         """Convert specular-glossiness by its means: a metal has its specular colour, all else its diffuse colour."""
         specular, alpha = np.asarray(gloss.specularFactor), 1.0
         if gloss.specularGlossinessTexture is not None:
-            pixels = self.texture(gloss.specularGlossinessTexture).reshape(-1, 3)
-            specular = specular * srgb_to_linear(pixels.mean(axis=0) / 255.0)
-            alpha = _mean_alpha(self.files[self.source(gloss.specularGlossinessTexture)])
+            image = self.texture(gloss.specularGlossinessTexture)
+            if image is not None:
+                specular = specular * srgb_to_linear(image.reshape(-1, 3).mean(axis=0) / 255.0)
+                alpha = _mean_alpha(self.files[self.source(gloss.specularGlossinessTexture)])
         roughness = float(np.clip(1.0 - gloss.glossinessFactor * alpha, 0.0, 1.0))
         diffuse = np.asarray(gloss.diffuseFactor[:3])
-        if gloss.diffuseTexture is not None:
-            diffuse = diffuse * srgb_to_linear(self.texture(gloss.diffuseTexture).reshape(-1, 3).mean(axis=0) / 255.0)
+        image = None if gloss.diffuseTexture is None else self.texture(gloss.diffuseTexture)
+        if image is not None:
+            diffuse = diffuse * srgb_to_linear(image.reshape(-1, 3).mean(axis=0) / 255.0)
         # The quadratic equation of KHR_materials_pbrSpecularGlossiness, appendix "Best practices".
         bright, shiny = (float(np.sqrt(np.dot(color**2, (0.299, 0.587, 0.114)))) for color in (diffuse, specular))
         linear = bright * (1.0 - float(specular.max())) / (1.0 - _DIELECTRIC) + shiny - 2.0 * _DIELECTRIC
         root = np.sqrt(max(linear**2 - 4.0 * _DIELECTRIC * (_DIELECTRIC - shiny), 0.0))
         metallic = 0.0 if shiny < _DIELECTRIC else float(np.clip((root - linear) / (2.0 * _DIELECTRIC), 0.0, 1.0))
         if metallic > 0.5:
-            return self.base(specular, gloss.specularGlossinessTexture, metallic, roughness, GLOSSINESS), gloss.specularGlossinessTexture
-        return self.base(gloss.diffuseFactor[:3], gloss.diffuseTexture, metallic, roughness, GLOSSINESS), gloss.diffuseTexture
+            return self.base(specular, gloss.specularGlossinessTexture, metallic, roughness, GLOSSINESS)
+        return self.base(gloss.diffuseFactor[:3], gloss.diffuseTexture, metallic, roughness, GLOSSINESS)
 
-    def base(self, factor: object, info: TextureInfo | None, metallic: float, roughness: float, name: str) -> FileMaterial:
-        """Material of a linear base colour factor and a texture."""
+    def base(
+        self, factor: object, info: TextureInfo | None, metallic: float | None, roughness: float | None, name: str
+    ) -> tuple[FileMaterial, TextureInfo | None]:
+        """Material of a linear base colour factor and a texture, and the reference to the texture unless its image is missing."""
         linear = np.asarray(factor, dtype=np.float64)
         if linear.min() < -_FACTOR_TOLERANCE or linear.max() > 1.0 + _FACTOR_TOLERANCE:
             self.notes.said.append(f"{name} {' '.join(f'{value:g}' for value in linear)} is cut to 0..1")
-        texture = None if info is None else self.texture(info)
-        return FileMaterial(as_color(linear_to_srgb(linear)), texture, metallic, roughness)
+        texture, color = None if info is None else self.texture(info), as_color(linear_to_srgb(linear))
+        missing = info is not None and texture is None
+        return FileMaterial(plain_color(color) if missing else color, texture, metallic, roughness), None if missing else info
 
     def source(self, info: TextureInfo) -> int:
         """Index of a texture's image."""
@@ -242,13 +251,16 @@ class _Reader:
             raise CatalogError(f"{self.path}: texture {info.index} is of a format that cannot be read{ascii(known)[1:-1]}; use PNG or JPEG")
         return source
 
-    def texture(self, info: TextureInfo) -> np.ndarray:
-        """Decode the image of a texture (H, W, 3) uint8."""
+    def texture(self, info: TextureInfo) -> np.ndarray | None:
+        """Decode the image of a texture (H, W, 3) uint8; None: it is missing, and replaced by a colour."""
         source = self.source(info)
         if source not in self.images:
             image = item_at(self.gltf.images, source, "image", self.path)
             if image.uri is not None:
-                data = read_uri(image.uri, MAX_TEXTURE_FILE, self.path)
+                uri = image.uri
+                data = self.notes.image(lambda: read_uri(uri, MAX_TEXTURE_FILE, self.path))
+                if data is None:
+                    return None
             else:
                 index = len(self.gltf.bufferViews) if image.bufferView is None else image.bufferView
                 view = item_at(self.gltf.bufferViews, index, "buffer view", self.path)
@@ -260,19 +272,27 @@ class _Reader:
         return self.images[source]
 
     def wrapped(self, material: FileMaterial, uv: np.ndarray, info: TextureInfo) -> tuple[FileMaterial, np.ndarray]:
-        """Apply a sampler's wrap modes where coordinates leave 0..1: mirrored repetition as an image twice the size that repeats."""
+        """Apply a sampler's wrap modes where coordinates leave 0..1: mirrored repetition as an image twice the size that repeats, clamping
+        as a margin around the image."""
         texture = self.gltf.textures[info.index]
         if texture.sampler is None or material.texture is None or not len(uv) or (uv.min() >= -1e-3 and uv.max() <= 1.0 + 1e-3):
             return material, uv
         sampler = item_at(self.gltf.samplers, texture.sampler, "sampler", self.path)
-        if _CLAMP in (sampler.wrapS, sampler.wrapT):
-            self.notes.ignored.append("a texture's wrap mode CLAMP_TO_EDGE")
         mirror = sampler.wrapS == _MIRROR, sampler.wrapT == _MIRROR
-        if not any(mirror):
-            return material, uv
-        key = (self.source(info), *mirror)
+        if any(mirror):
+            material, uv = self.mirrored(material, uv, (self.source(info), *mirror))
+        clamp = sampler.wrapS == _CLAMP, sampler.wrapT == _CLAMP
+        if any(clamp):
+            image, uv = clamp_texture(material.texture, uv, clamp, self.notes.ignored)
+            material = replace(material, texture=image)
+        return material, uv
+
+    def mirrored(self, material: FileMaterial, uv: np.ndarray, key: tuple[int, bool, bool]) -> tuple[FileMaterial, np.ndarray]:
+        """Extend an image by its mirror image to the right, upwards, or both; `key`: its index and the two."""
+        mirror = key[1:]
         if key not in self.tiles:
             image = material.texture
+            assert image is not None
             image = np.concatenate([image, image[:, ::-1]], axis=1) if mirror[0] else image
             # The upper half of the image, v in 1..2 before scaling, is the mirrored one.
             self.tiles[key] = np.concatenate([image[::-1], image], axis=0) if mirror[1] else image

@@ -1,8 +1,9 @@
-"""MTL import: colours, textures with their options, and the metallic and roughness of MTL's PBR extension."""
+"""MTL material libraries: diffuse colour, textures with their options, and the PBR extension's metallic and roughness.
+
+The renderer's material model is metallic-roughness. Statements of MTL's Phong model have no counterpart in it and are left out."""
 
 from __future__ import annotations
 
-import os
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -10,53 +11,68 @@ import numpy as np
 
 from synpick_warp.errors import CatalogError
 from synpick_warp.scenes.assets.appearance import MAX_TEXTURE_FILE, MAX_TEXTURE_PIXELS, FileMaterial, as_color, decode_texture
-from synpick_warp.scenes.assets.asset_files import read_referred
-from synpick_warp.scenes.assets.mesh_parts import GREY, WHITE, Notes
+from synpick_warp.scenes.assets.asset_files import is_missing, read_referred
+from synpick_warp.scenes.assets.mesh_parts import GREY, WHITE, Notes, plain_color
+from synpick_warp.scenes.assets.wavefront.obj_text import join_lines
 
-# Options of a texture statement, with the largest number of arguments of each.
+# Options of a texture statement and how many arguments each takes at most.
 _OPTIONS = {"-blendu": 1, "-blendv": 1, "-bm": 1, "-boost": 1, "-cc": 1, "-clamp": 1, "-imfchan": 1, "-mm": 2, "-o": 3, "-s": 3, "-t": 3}
 _OPTIONS |= {"-texres": 1, "-type": 1, "-colorspace": 1}
-# Options that, with these arguments, change nothing here.
+# Option values that match what the renderer does anyway; others are reported as ignored.
 _NEUTRAL = {"-blendu": ("on",), "-blendv": ("on",), "-cc": ("off",), "-clamp": ("off",), "-mm": ("0", "1"), "-colorspace": ("srgb",)}
 _NEUTRAL |= {"-imfchan": ("m",), "-t": ("0", "0", "0"), "-boost": ("0",)}
-# Statements of the Phong model, which has no counterpart in the metallic-roughness model; every exporter writes them.
+_TOLERANCE = 1e-3
+"""Amount by which a colour may exceed 1 through rounding."""
+# Statements that are left out without a report: most are of the Phong model, and nearly every exporter writes them.
 _SILENT = {"ka", "ks", "ns", "ni", "illum", "tf", "d", "tr", "ke", "pcr", "aniso", "anisor", "sharpness", "ps", "pc", "xd"}
 
 
 @dataclass(eq=False)
 class MtlMaterial:
-    """A material of a library, before its images are read."""
+    """Material as its library states it; images are named, not yet read."""
 
     library: Path
     color: tuple[float, float, float] | None = None
-    """Kd."""
+    """Diffuse colour (Kd), sRGB in 0..1; None: not stated."""
     maps: dict[str, str] = field(default_factory=dict)
-    """Image names of map_kd, map_pm and map_pr."""
+    """Image file names of the statements map_kd, map_pm and map_pr, by statement."""
     scale: tuple[float, float] = (1.0, 1.0)
     offset: tuple[float, float] = (0.0, 0.0)
-    """Of the texture coordinates of map_Kd."""
+    """Scale and offset of map_Kd's texture coordinates (options -s and -o)."""
+    clamp: bool = False
+    """Whether map_Kd is clamped to its edges instead of repeated (option -clamp)."""
     factors: dict[str, float] = field(default_factory=dict)
-    """pm (metallic) and pr (roughness)."""
+    """Metallic (pm) and roughness (pr) in 0..1, as far as they are stated."""
     ignored: list[str] = field(default_factory=list)
+    """Names of statements and options that are not used."""
 
     def transform(self, uv: np.ndarray) -> np.ndarray:
         """Apply the options -s and -o of map_Kd to texture coordinates (V, 2)."""
         return uv * self.scale + self.offset
 
     def missing_images(self) -> list[str]:
-        """Names of images that are not there."""
-        return [name for name in self.maps.values() if not os.path.lexists(self.library.parent / name.replace("\\", "/"))]
+        """Names of images of which there is no file."""
+        return [name for name in self.maps.values() if is_missing(self.library.parent, name.partition(" #")[0], self.library)]
 
 
 @dataclass(eq=False)
 class TexturePixels:
-    """Decodes the images of an OBJ's materials, each once, up to the limit on their pixels together."""
+    """Image decoder of one OBJ file: decodes each image once, and limits the number of pixels of all together."""
 
     owner: Path
     images: dict[Path, np.ndarray] = field(default_factory=dict)
 
     def read(self, name: str, library: Path) -> np.ndarray:
-        """Decode an image (H, W, 3) uint8 that a library names."""
+        """Decode an image that a material library names.
+
+        Returns:
+            The image (H, W, 3) uint8.
+
+        Raises:
+            CatalogError: It is missing or damaged, or all images together have too many pixels.
+        """
+        plain = name.partition(" #")[0].strip()
+        name = plain if plain and is_missing(library.parent, name, library) else name
         path, data = read_referred(library.parent, name, library, MAX_TEXTURE_FILE)
         if path not in self.images:
             self.images[path] = decode_texture(data, str(path))
@@ -73,7 +89,7 @@ def parse_library(text: str, library: Path) -> dict[str, MtlMaterial]:
     """
     materials: dict[str, MtlMaterial] = {}
     current: MtlMaterial | None = None
-    for line in text.replace("\\\n", " ").splitlines():
+    for line in join_lines(text).split("\n"):
         words = line.split()
         key = words[0].lower() if len(words) > 1 else ""
         if key == "newmtl":
@@ -85,6 +101,8 @@ def parse_library(text: str, library: Path) -> dict[str, MtlMaterial]:
 
 def _parse_statement(material: MtlMaterial, key: str, words: list[str], line: str) -> None:
     """Parse one statement of a material."""
+    if not key.startswith("map_"):
+        words = line.partition(" #")[0].split()
     if key == "kd":
         material.color = _color(words[1:], material)
     elif key in ("pm", "pr"):
@@ -103,7 +121,7 @@ def _parse_statement(material: MtlMaterial, key: str, words: list[str], line: st
 
 
 def _parse_map(material: MtlMaterial, key: str, words: list[str], line: str) -> None:
-    """Parse a texture statement: options, then the image's name, which may contain blanks."""
+    """Parse a texture statement: options with their arguments, then a file name, which may contain blanks."""
     at = 1
     while at < len(words) and words[at].lower() in _OPTIONS:
         option = words[at].lower()
@@ -123,6 +141,8 @@ def _parse_map(material: MtlMaterial, key: str, words: list[str], line: str) -> 
                 material.scale = (first, second)
             else:
                 material.offset = (first, second)
+        elif option == "-clamp" and key == "map_kd" and arguments[:1] and arguments[0].lower() in ("on", "off"):
+            material.clamp = arguments[0].lower() == "on"
         elif not _is_neutral(option, arguments):
             material.ignored.append(f"{ascii(words[0])[1:-1]} {option}")
         at = end
@@ -132,6 +152,7 @@ def _parse_map(material: MtlMaterial, key: str, words: list[str], line: str) -> 
 
 
 def _is_neutral(option: str, arguments: list[str]) -> bool:
+    """Whether an option with these arguments changes nothing in how the renderer draws the texture."""
     expected = _NEUTRAL.get(option)
     if expected is None:
         return option in ("-texres", "-type", "-bm", "-o", "-s")
@@ -141,7 +162,7 @@ def _is_neutral(option: str, arguments: list[str]) -> bool:
 
 
 def _numbers(words: list[str]) -> list[float]:
-    """Words as numbers; none, if one is not a number."""
+    """Convert words to numbers; an empty list if any of them is not a number."""
     try:
         return [float(word) for word in words]
     except ValueError:
@@ -149,7 +170,7 @@ def _numbers(words: list[str]) -> list[float]:
 
 
 def _color(words: list[str], material: MtlMaterial) -> tuple[float, float, float] | None:
-    """A diffuse colour of one or three numbers; None if it is given as a spectrum, or in another colour space."""
+    """Parse a diffuse colour: one number for grey, or three. A colour given as a spectrum or in XYZ is reported as ignored."""
     values = _numbers(words)
     if not values:
         material.ignored.append(f"Kd {ascii(words[0])[1:-1][:20]}")
@@ -157,21 +178,24 @@ def _color(words: list[str], material: MtlMaterial) -> tuple[float, float, float
     if not np.isfinite(values).all():
         shown = ascii(" ".join(words))[1:-1][:80]
         raise CatalogError(f"{material.library}: Kd {shown} is not finite; give red, green and blue from 0 to 1")
-    return as_color(np.clip((values if len(values) >= 3 else values[:1] * 3)[:3], 0.0, 1.0))
+    color = np.array((values if len(values) >= 3 else values[:1] * 3)[:3])
+    if color.max() > 1.0 + _TOLERANCE:
+        material.ignored.append(f"Kd beyond 1 ({' '.join(f'{value:g}' for value in color)})")
+    return as_color(np.clip(color, 0.0, 1.0))
 
 
 def read_material(material: MtlMaterial, pixels: TexturePixels, notes: Notes) -> FileMaterial:
-    """Convert a material, reading its images; of maps of metallic and roughness, the mean is used.
+    """Read a material's images and convert it. The renderer takes one metallic and one roughness value: the means of their maps.
 
     Raises:
-        CatalogError: An image is missing or damaged.
+        CatalogError: An image is damaged, or missing and not replaced.
     """
     notes.ignored += material.ignored
-    texture = pixels.read(material.maps["map_kd"], material.library) if "map_kd" in material.maps else None
+    images = {key: notes.image(lambda name=name: pixels.read(name, material.library)) for key, name in material.maps.items()}
     factors = dict(material.factors)
-    for key in ("pm", "pr"):
-        if f"map_{key}" in material.maps:
-            factors[key] = float(pixels.read(material.maps[f"map_{key}"], material.library).mean() / 255.0)
+    factors |= {key[4:]: float(image.mean() / 255.0) for key, image in images.items() if key != "map_kd" and image is not None}
+    texture = images.get("map_kd")
     # With an image Kd is ignored: exporters leave 0.64, or 0, there.
-    color = WHITE if texture is not None else material.color or GREY
+    plain = plain_color(material.color) if "map_kd" in material.maps else material.color or GREY
+    color = WHITE if texture is not None else plain
     return FileMaterial(color, texture, factors.get("pm"), factors.get("pr"))

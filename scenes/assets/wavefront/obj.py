@@ -1,9 +1,8 @@
-"""OBJ import: text and material libraries are decoded and checked here, so that the reader (trimesh) opens no file by itself."""
+"""OBJ import with material libraries. The text is parsed by trimesh; all files are opened, limited and checked here, none by trimesh."""
 
 from __future__ import annotations
 
 import io
-import os
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -14,12 +13,20 @@ from trimesh.geometry import triangulate_quads
 
 from synpick_warp.errors import CatalogError
 from synpick_warp.inputs.files import read_file
-from synpick_warp.inputs.paths import path_inside
-from synpick_warp.scenes.assets.appearance import FileMaterial
-from synpick_warp.scenes.assets.asset_files import MAX_PARTS, MAX_ROWS, MAX_TEXT_MESH, describe_error, read_referred
+from synpick_warp.scenes.assets.appearance import UV_TOLERANCE, FileMaterial, clamp_texture
+from synpick_warp.scenes.assets.asset_files import (
+    MAX_PARTS,
+    MAX_ROWS,
+    MAX_TEXT_MESH,
+    MissingFileError,
+    describe_error,
+    is_missing,
+    read_referred,
+)
 from synpick_warp.scenes.assets.mesh_parts import NO_MATERIAL, WHITE, MeshPart, Notes
 from synpick_warp.scenes.assets.text import decode_text
 from synpick_warp.scenes.assets.wavefront.mtl import MtlMaterial, TexturePixels, parse_library, read_material
+from synpick_warp.scenes.assets.wavefront.obj_text import normalize_text
 
 MAX_LIBRARY = 2**22
 """Largest material library [bytes]: 4 MiB."""
@@ -27,7 +34,10 @@ _LIBRARY = "library"
 
 
 def read_obj(path: Path, notes: Notes) -> list[MeshPart]:
-    """Read an OBJ file with its material libraries and the images of the materials that it uses: one part for each material.
+    """Read an OBJ file, its material libraries, and the images of the materials that its faces use.
+
+    Returns:
+        One part per material.
 
     Raises:
         CatalogError: The file or one that it refers to cannot be used.
@@ -35,13 +45,17 @@ def read_obj(path: Path, notes: Notes) -> list[MeshPart]:
     text = decode_text(read_file(path, MAX_TEXT_MESH, CatalogError))
     if text.count("\n") > 4 * MAX_ROWS:
         raise CatalogError(f"{path}: more than {4 * MAX_ROWS} lines; decimate the mesh")
+    text = normalize_text(text, path, notes.ignored)
     lines = text.split("\n")
     # As the reader takes them: the rest of the line behind the word.
     used = dict.fromkeys(line[line.index("usemtl ") + 7 :].strip() for line in lines if "usemtl " in line)
+    used.pop("", None)
     if len(used) > MAX_PARTS or text.count("usemtl ") > MAX_ROWS:
         raise CatalogError(f"{path}: more than {MAX_PARTS} materials; merge them")
     known = _read_libraries(path, lines, notes)
-    for name in known.keys() - used.keys():
+    known |= {name: known[other] for name in used if name not in known and (other := _similar_name(name, known))}
+    drawn = [known[name] for name in used if name in known]
+    for name in [name for name, material in known.items() if material not in drawn]:
         notes.said += [f"the image {ascii(image)[:80]} of an unused material is missing" for image in known[name].missing_images()]
     pixels = TexturePixels(path)
     materials = {name: read_material(known[name], pixels, notes) for name in used if name in known}
@@ -57,7 +71,7 @@ def read_obj(path: Path, notes: Notes) -> list[MeshPart]:
 
 
 def _load(text: str, used: dict[str, None]) -> list[dict[str, Any]]:
-    """Parse the text of an OBJ with trimesh. Returns its meshes as keyword arguments, sorted by name; `material` is a name."""
+    """Parse OBJ text with trimesh. Returns one dictionary of arrays per material, sorted by name; `visual.material` has only a name."""
     # A library of names only: which mesh has which material; what the materials are is read here.
     table = {_LIBRARY: "\n".join(f"newmtl {name}" for name in used).encode()}
     content = load_obj(io.BytesIO(f"mtllib {_LIBRARY}\n{text}".encode()), resolver=table)
@@ -67,7 +81,7 @@ def _load(text: str, used: dict[str, None]) -> list[dict[str, Any]]:
 def _part(
     mesh: dict[str, Any], used: dict[str, None], known: dict[str, MtlMaterial], materials: dict[str, FileMaterial], path: Path, notes: Notes
 ) -> MeshPart:
-    """Convert one of the reader's meshes."""
+    """Convert one of trimesh's meshes to a part, with its material."""
     vertices, faces = np.asarray(mesh["vertices"], np.float64), triangulate_quads(mesh["faces"])
     normals, visual, colors = mesh.get("vertex_normals"), mesh.get("visual"), mesh.get("vertex_colors")
     if vertices.shape[1:] != (3,) or faces.shape[1:] != (3,) or (normals is not None and np.shape(normals) != vertices.shape):
@@ -79,6 +93,9 @@ def _part(
         if uv is None or len(uv) != len(vertices):
             raise CatalogError(f"{path}: has a texture, but vertices without texture coordinates; unwrap it or remove the texture")
         uv = known[name].transform(np.asarray(uv, np.float64)[:, :2])
+        if known[name].clamp and len(uv) and (uv.min() < -UV_TOLERANCE or uv.max() > 1.0 + UV_TOLERANCE):
+            image, uv = clamp_texture(material.texture, uv, (True, True), notes.ignored)
+            material = replace(material, texture=image)
     if colors is not None:
         if len(colors) != len(vertices):
             raise CatalogError(f"{path}: {len(colors)} vertex colours for {len(vertices)} vertices; repair the mesh")
@@ -97,22 +114,35 @@ def _part(
 
 
 def _unit_colors(colors: np.ndarray) -> np.ndarray:
-    """Colours in 0..1: of integers and of numbers beyond 1, 255 is the largest."""
+    """Scale colours to 0..1; if any value exceeds 1, they are taken as 0..255."""
     colors = np.nan_to_num(np.asarray(colors, np.float64))
     return np.clip(colors / (255.0 if colors.size and colors.max() > 1.0 else 1.0), 0.0, 1.0)
 
 
+def _similar_name(name: str, known: dict[str, MtlMaterial]) -> str | None:
+    """Find a material for a name that no library defines: without a trailing comment, or ignoring letter case. None: there is none."""
+    plain = name.partition(" #")[0].strip()
+    return plain if plain in known else next((other for other in known if other.casefold() == plain.casefold()), None)
+
+
+def _library_names(line: str, folder: Path, owner: Path) -> list[str]:
+    """Libraries that an `mtllib` line names: the rest of the line if such a file exists, else one per word if all end in .mtl."""
+    name = line.partition(" ")[2].strip()
+    choices = (name, name.strip('"'), name.partition(" #")[0].strip())
+    whole = next((each for each in choices if each and not is_missing(folder, each, owner)), None)
+    words = name.partition(" #")[0].split()
+    several = len(words) > 1 and all(word.lower().endswith(".mtl") for word in words)
+    return [whole] if whole else words if several else [name]
+
+
 def _read_libraries(path: Path, lines: list[str], notes: Notes) -> dict[str, MtlMaterial]:
-    """Materials of all libraries that an OBJ file names, by name; a library that is not there is noted."""
+    """Read all libraries that an OBJ file names. Returns materials by name; a missing library is noted, not an error."""
     known: dict[str, MtlMaterial] = {}
-    names = [line.strip().removeprefix("mtllib").strip() for line in lines if line.split(maxsplit=1)[:1] == ["mtllib"]]
-    for name in dict.fromkeys(names):
+    named = dict.fromkeys(line for line in lines if line.startswith("mtllib ") and line[7:].strip())
+    for name in dict.fromkeys(name for line in named for name in _library_names(line, path.parent, path)):
         try:
             library, data = read_referred(path.parent, name, path, MAX_LIBRARY)
-        except CatalogError:
-            # Refused again if the name leads out of the folder; otherwise a library that was not shipped.
-            if os.path.lexists(path_inside(path.parent, name, path, CatalogError)):
-                raise
+        except MissingFileError:
             notes.said.append(f"there is no material library {ascii(name)[:80]}, the default material is used")
             continue
         known |= parse_library(decode_text(data), library)

@@ -29,6 +29,7 @@ def check_output_folder(out: Path) -> None:
     Raises:
         OutputError: The folder holds something other than a data set, or cannot be created or written.
     """
+    _check_outside(out)
     created = [folder for folder in (out, *out.parents) if not os.path.lexists(folder)]
     try:
         make_folder(out)
@@ -51,6 +52,21 @@ def check_output_folder(out: Path) -> None:
         for folder in created:
             with contextlib.suppress(OSError):
                 folder.rmdir()
+
+
+def _check_outside(out: Path) -> None:
+    """Check that a data set does not lie in another one, whose files it would mix with.
+
+    Raises:
+        OutputError: It does.
+    """
+    try:
+        parents = out.resolve().parents
+        outer = next((each for each in parents if (each / MANIFEST_FILE).is_file() and (each / "manifest").is_dir()), None)
+    except (OSError, RuntimeError, ValueError) as error:
+        raise OutputError(f"--out is {out}: {getattr(error, 'strerror', None) or error}; {_ALLOWED}") from None
+    if outer is not None:
+        raise OutputError(f"--out is {out}, among the files of the data set {outer}; name a folder outside of it")
 
 
 def is_litter(name: str) -> bool:

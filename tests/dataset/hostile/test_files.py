@@ -333,6 +333,12 @@ def change(path: Path, place: tuple[object, ...], value: object) -> None:
         (("codecs", 0, "configuration"), None, "cannot be read: "),
         (("chunk_grid", "configuration", "chunk_shape", 0), 0, "expected int >= 1"),
         (("fill_value",), "x", "cannot be read: "),
+        (("chunk_grid", "configuration", "chunk_shape", 1), 2**33, "larger than its"),
+        (("chunk_grid", "configuration", "chunk_shape", 0), 2**33, "larger than its"),
+        (("codecs", 0, "configuration", "chunk_shape", 2), 2**33, "larger than its"),
+        (("codecs", 0, "configuration", "chunk_shape"), [2, 2], "chunks of another shape"),
+        (("codecs", 0, "configuration", "codecs", 1, "name"), "pickle", "invalid enum value 'pickle'"),
+        (("codecs", 0, "configuration", "index_codecs", 1, "name"), "zstd", "invalid enum value 'zstd'"),
     ],
 )
 def test_metadata_of_an_array_that_do_not_fit_are_named(store, place, value, said):

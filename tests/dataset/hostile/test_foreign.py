@@ -10,6 +10,7 @@ import hashlib
 import io
 import json
 import os
+import re
 import shutil
 import signal
 import socket
@@ -22,7 +23,7 @@ import pytest
 
 from synpick_warp.cli.commands import main
 from synpick_warp.conversion import run as conversion
-from synpick_warp.dataset.file_names import check_file_names
+from synpick_warp.dataset.file_names import check_file_names, describe_strays
 from synpick_warp.dataset.manifest import CONSTANTS, episode_entry, read_checksums
 from synpick_warp.dataset.merge import merge
 from synpick_warp.dataset.verify import verify
@@ -266,7 +267,8 @@ def test_litter_is_no_data(whole, tmp_path):
     """Merged and resumed sets are as without."""
     folder, clean = copied(whole, tmp_path / "set"), snapshot(whole)
     strew(folder)
-    merge([folder], tmp_path / "merged")
+    [said] = merge([folder], tmp_path / "merged").left_out
+    assert re.fullmatch(rf"left out: {folder}/coco/parts/\S+ and \d+ more, of no committed episode", said)
     assert snapshot(tmp_path / "merged") == clean
     for name in ("000001.json", "joined.json"):
         (folder / "manifest" / name).unlink()
@@ -274,6 +276,17 @@ def test_litter_is_no_data(whole, tmp_path):
     assert verify(folder).finished
     known = snapshot(folder)
     assert {name: known[name] for name in clean} == clean
+
+
+@pytest.mark.parametrize("place", ["coco/parts/000099.jsonl", "coco/parts/000000 (copy).jsonl", "lerobot/parts/000099.json"])
+def test_a_part_of_no_committed_episode_is_told(whole, tmp_path, place, capsys):
+    folder = copied(whole, tmp_path / "set")
+    assert describe_strays(folder, settings(), (0, 1)) == ""
+    (folder / place).write_text("[]\n")
+    line = f"left out: {folder}/{place}, of no committed episode"
+    assert describe_strays(folder, settings(), (0, 1)) == line
+    assert main(["merge", str(folder), "--out", str(tmp_path / "merged")]) == 0
+    assert line in capsys.readouterr().out.splitlines()
 
 
 def test_commands_pass_litter_over(narrow, tmp_path):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import gc
 import json
 import os
@@ -378,6 +379,11 @@ def test_bop_models_are_copied_byte_for_byte(tmp_path):
     (source / "models_info.json").write_text(json.dumps({"3": info}))
     with pytest.raises(CatalogError, match=r"refers to 'label\.png', but there is no file"):
         write_models(tmp_path / "without", catalog_from_file(source / "obj_000003.ply"))
+    # Read without its texture, which was missing: a copy would name it.
+    plain = catalog_from_file(source / "obj_000003.ply").entries[0]
+    plain = dataclasses.replace(plain, material=dataclasses.replace(plain.material, texture=None))
+    write_models(tmp_path / "plain", Catalog((plain,)))
+    assert b"TextureFile" not in (tmp_path / "plain" / "obj_000003.ply").read_bytes()
     label = encode_png(catalog().entries[0].material.texture)
     (source / "label.png").write_bytes(label)
     write_models(tmp_path / "models", catalog_from_file(source / "obj_000003.ply"))

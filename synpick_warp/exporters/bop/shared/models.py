@@ -20,9 +20,11 @@ from synpick_warp.inputs.image_files import TEXTURE_KINDS
 from synpick_warp.inputs.paths import path_inside
 from synpick_warp.layer_codec import layer_notes
 from synpick_warp.scenes.assets.appearance import decode_texture, linear_to_srgb, srgb_to_linear
+from synpick_warp.scenes.assets.asset_files import MissingFileError
 from synpick_warp.scenes.assets.models_info import corrected_entry, read_entries
 from synpick_warp.scenes.assets.ply import read_ply_file, read_ply_texture
 from synpick_warp.scenes.types import Camera, Catalog, CatalogEntry, Material
+from synpick_warp.system.folders import make_folder
 
 MODEL_FOLDERS = ("models", "models_eval")
 """The toolkit renders the first and evaluates with the second; ours are equal."""
@@ -126,13 +128,19 @@ def _read_source_info(entry: CatalogEntry) -> dict[str, Any] | None:
 
 
 def _copy_model(entry: CatalogEntry, source: Path, path: Path) -> None:
-    """Copy a PLY file, and the texture that its header names, under the same name inside the set.
+    """Copy a PLY file, and the texture that its header names, under the same name inside the set; without that texture, write the object.
 
     Raises:
         CatalogError: The texture has changed since it was read, or has the name of another file of the set.
     """
     data = read_ply_file(source)
-    found = read_ply_texture(data, source)
+    try:
+        found = read_ply_texture(data, source)
+    except MissingFileError:
+        if entry.material.texture is not None:
+            raise
+        path.write_bytes(encode_model(entry))  # The copy would name a texture that is not there.
+        return
     if found is not None:
         name, image = found
         if not np.array_equal(decode_texture(image, str(source.parent / name)), np.asarray(entry.material.texture)):
@@ -143,7 +151,7 @@ def _copy_model(entry: CatalogEntry, source: Path, path: Path) -> None:
             raise CatalogError(f"{source} names the texture {name}; allowed: names without leading dots that end in .{kinds}; rename it")
         if target.exists() and target.read_bytes() != image:
             raise CatalogError(f"{source} names the texture {name}, but the set has another file of that name; rename it")
-        target.parent.mkdir(parents=True, exist_ok=True)
+        make_folder(target.parent)
         target.write_bytes(image)
     path.write_bytes(data)
 
