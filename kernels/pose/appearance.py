@@ -16,7 +16,8 @@ DEADBAND = wp.constant(0.75)
 
 @wp.struct
 class SilhouetteResidual:
-    """Silhouette residual of a protruding sample: the shortest way back into the mask, at the sample's depth."""
+    """Silhouette residual of a protruding sample (free-space violation): the shortest way back into the mask, at the depth of the
+    sample."""
 
     distance: float
     """[m]; 0: it lies within the deadband."""
@@ -26,7 +27,7 @@ class SilhouetteResidual:
 
 @wp.func
 def silhouette_residual(observation: Observation, instance: int, sample: SampleView, intrinsics: wp.vec4) -> SilhouetteResidual:
-    """Shortest way of a sample back to the nearest crop pixel of the mask, by the feature transform, less the deadband."""
+    """Shortest way of a sample back to the nearest crop pixel of the mask, by the feature transform, minus the deadband."""
     column = wp.clamp(int(wp.round(sample.crop[0])), 0, CROP - 1)
     row = wp.clamp(int(wp.round(sample.crop[1])), 0, CROP - 1)
     target = observation.nearest[instance, row, column] + wp.vec2(float(column), float(row))
@@ -66,10 +67,11 @@ def accumulate_samples_kernel(
     # Out:
     sums_inout: Sums,
 ):
-    """Normal equations of silhouette (Huber) and photometric (Tukey) residuals; added to the sums of the points.
+    """Normal equations of silhouette (Huber) and photometric (Tukey) residuals: added to `sums_inout`, which holds those of the points.
 
     A protruding sample is pulled towards the nearest pixel of the mask. The colour residual of a visible one is intensity - base colour x
-    light, relative to the instance's mean intensity; its derivative is the image gradient.
+    light, relative to the instance's mean intensity; its derivative is the image gradient. `Sums.samples` is written. Launched over
+    hypothesis, lane.
     """
     index, lane = wp.tid()
     instance = index // hypotheses

@@ -25,7 +25,7 @@ COST_MEAN = wp.constant(0.2)
 
 @wp.struct
 class Track:
-    """State of the tracks, one per instance."""
+    """Pose, previous pose, centroid, and running means of cost and correlation of each tracked instance."""
 
     pose: wp.array[wp.transform]
     """(instance): last estimate, object to camera [m]."""
@@ -45,7 +45,7 @@ class Track:
 
 @wp.struct
 class TrackPolicy:
-    """Policy of accepting estimates into tracks."""
+    """Limits within which an estimate is accepted into a track: points, increase of the cost, patience."""
 
     min_points: int
     """Minimum observed points; with fewer an instance keeps its pose."""
@@ -59,7 +59,7 @@ class TrackPolicy:
 
 @wp.struct
 class Symmetries:
-    """Near-symmetries: rotations about an object's centre that change its shape little, by model. Constant."""
+    """Near-symmetries by model: rotations about the centre of an object that change its shape little. Constant."""
 
     rotation: wp.array2d[wp.quat]
     """(model, symmetry): in the model's axes; the first is the identity."""
@@ -71,7 +71,7 @@ class Symmetries:
 
 @wp.struct
 class Correlation:
-    """Partial sums of the zero-mean normalized cross-correlation between intensity and base colour."""
+    """Partial sums, by candidate pose and lane, of the zero-mean normalized cross-correlation between intensity and base colour."""
 
     intensity: wp.array2d[wp.vec3]
     """(candidate, lane): sum of the intensities."""
@@ -92,9 +92,9 @@ def propose_motions_kernel(
     # Out:
     pose_out: wp.array[wp.transform],  # (pose) [m]
 ):
-    """Motion hypotheses: at rest; constant velocity; displaced as the centroid of the observed points.
+    """Motion hypotheses: `pose_out` receives three poses per instance: at rest, at constant velocity, displaced as the observed centroid.
 
-    A track that starts begins anew at its start pose, so that nothing is left of another track.
+    A track that starts is reset to its start pose, so that nothing is left of another track. Launched over instance.
     """
     instance = wp.tid()
     if starting[instance] != 0:
@@ -129,7 +129,10 @@ def symmetric_poses_kernel(
     # Out:
     pose_out: wp.array[wp.transform],  # (candidate) [m]
 ):
-    """Poses rotated by each near-symmetry of their object, candidate = instance x capacity + symmetry."""
+    """Candidate poses: each pose rotated by each near-symmetry of its object.
+
+    Launched over candidate = instance x capacity + symmetry.
+    """
     index = wp.tid()
     instance = index // capacity
     symmetry = index % capacity
@@ -157,7 +160,7 @@ def correlate_symmetries_kernel(
     # Out:
     correlation_out: Correlation,
 ):
-    """Sums of intensity and base colour over the visible samples of each candidate pose."""
+    """Sums of intensity and base colour over the visible samples of each candidate pose. Launched over candidate, lane."""
     index, lane = wp.tid()
     instance = index // capacity
     model = targets.model[instance]
@@ -212,10 +215,11 @@ def choose_symmetry_kernel(
     # Out:
     pose_out: wp.array[wp.transform],  # (pose) [m]
 ):
-    """Two hypotheses per instance: the pose as it is, and its near-symmetry that correlates best.
+    """Two hypotheses per instance: `pose_out` receives the pose as it is, and its near-symmetry that correlates best.
 
-    One is considered only where colours fit by `gain` worse than they used to, and there by `gain` better than at the pose: light and
-    gloss alone make some symmetries of a still object fit better than the truth.
+    A near-symmetry is considered only where colours correlate worse than their running mean (`mean_inout`, updated) by `gain`, and only if
+    it correlates better than the pose by `gain`; else the pose is repeated. Light and gloss alone make some symmetries of a still object
+    fit better than the truth. Launched over instance.
     """
     instance = wp.tid()
     first = instance * capacity
@@ -250,7 +254,10 @@ def choose_poses_kernel(
     pose_out: wp.array[wp.transform],  # (instance) [m]
     cost_out: wp.array[float],  # (instance)
 ):
-    """The hypothesis of least cost; another than the first must be better by the factor 1 - `loyalty`."""
+    """Pose and cost of the hypothesis of least cost; another than the first must be better by the factor 1 - `loyalty`.
+
+    Launched over instance.
+    """
     instance = wp.tid()
     first = instance * hypotheses
     best = first
@@ -276,10 +283,10 @@ def update_tracks_kernel(
     # Out:
     track_out: Track,
 ):
-    """Accept new estimates into tracks; tracks that start get their start pose.
+    """Accept new estimates into tracks; tracks that start are reset to their start pose.
 
-    An instance keeps its pose, at rest, if it shows too few points, or if its estimate costs much more than its last ones: then its mask is
-    probably another's. After a few such frames the estimate counts nevertheless.
+    An instance keeps its pose, at rest, if it shows too few points, or if its estimate costs much more than the running mean: then its mask
+    probably shows another instance. After `TrackPolicy.patience` such frames the estimate is accepted nevertheless. Launched over instance.
     """
     instance = wp.tid()
     if starting[instance] != 0:

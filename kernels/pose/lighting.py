@@ -15,12 +15,15 @@ LIGHT_RIDGE = wp.constant(0.03)
 
 @wp.struct
 class Lighting:
-    """First-order spherical harmonics of the light on an instance: intensity = base colour (b₀ + b · normal), for each channel."""
+    """Normal equations and coefficients of the first-order spherical harmonics that light an instance, by channel.
+
+    The model is intensity = base colour (b₀ + b · normal).
+    """
 
     moments: wp.array3d[wp.mat44]
     """(pose, lane, channel): partial sums of the normal equations."""
     products: wp.array3d[wp.vec4]
-    """(pose, lane, channel): their right-hand sides."""
+    """(pose, lane, channel): partial sums of the right-hand sides."""
     coefficients: wp.array2d[wp.vec4]
     """(pose, channel): b, b₀."""
 
@@ -45,7 +48,10 @@ def accumulate_lighting_kernel(
     # Out:
     lighting_out: Lighting,
 ):
-    """Normal equations of the lighting: least squares of intensity against base colour times harmonics, over visible samples."""
+    """Normal equations of the lighting: least squares of intensity against base colour times harmonics, over visible samples.
+
+    Writes the partial sums `moments` and `products`. Launched over hypothesis, lane.
+    """
     index, lane = wp.tid()
     instance = index // hypotheses
     model = targets.model[instance]
@@ -82,7 +88,10 @@ def fit_lighting_kernel(
     # Out:
     lighting_inout: Lighting,
 ):
-    """Solve the normal equations of the lighting, with a ridge on the directional part."""
+    """Ridge regression of the lighting: solve the normal equations, with a ridge on the directional part, for `coefficients`.
+
+    Launched over hypothesis.
+    """
     index = wp.tid()
     for channel in range(CHANNELS):
         moments = wp.mat44()

@@ -62,10 +62,10 @@ def list_candidates_kernel(
     child_length_out: wp.array[int],  # (cell)
     child_candidate_out: wp.array[int],  # (child_entry)
 ):
-    """List the vertices of a parent's list that can be nearest to a point of its child cell; launched twice, to count and to fill.
+    """Nearest-vertex grid: list the vertices of a parent's list that can be nearest to a point of its child cell.
 
-    `edge` is that of a child. `child_length_out` receives the number of candidates; with `fill`, `child_candidate_out` receives them from
-    `child_start` on.
+    Launched twice over cell, from `first` on, to count and to fill. `edge` is that of a child. `child_length_out` receives the number of
+    candidates; with `fill`, `child_candidate_out` receives the candidates from `child_start` on.
     """
     cell = first + wp.tid()
     if cell >= child_length_out.shape[0]:
@@ -110,9 +110,9 @@ def sum_distances_kernel(
 ):
     """Sum the weighted distances from a model's vertices, moved by a pose, to its nearest vertex: a thread for a pose and BLOCK vertices.
 
-    `query` are the vertices in the model's axes, `vertex` the same from the grid's lower corner, as poses move them to. All moved ones
-    must be inside the grid. A node is the index of its first child node, or the complement of the start of its list in `candidate`, whose
-    last entry is the complement of a vertex.
+    `query` are the vertices in the model's axes, `vertex` the same from the grid's lower corner, as poses move them to. All moved ones must
+    be inside the grid. A node is the index of its first child node, or the complement of the start of its list in `candidate`, whose last
+    entry is the complement of a vertex. Launched over task, from `first` on: a pose and a block of vertices.
     """
     task = first + wp.tid()
     blocks = sum_out.shape[1]

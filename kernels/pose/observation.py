@@ -17,7 +17,7 @@ NO_INSTANCE = wp.constant(-1)
 
 @wp.struct
 class Images:
-    """RGB-D images and instance segmentation of a batch of views."""
+    """Depth and colour images, intrinsics and instance masks of a batch of views."""
 
     color: wp.array3d[wp.vec3ub]
     """(view, row, column): sRGB, red first."""
@@ -38,12 +38,12 @@ class Images:
 
 @wp.struct
 class Targets:
-    """Instances whose poses are estimated."""
+    """View, mask label and model of each instance whose pose is estimated, and the inverse of this table."""
 
     view: wp.array[int]
-    """(instance): view that shows it."""
+    """(instance): view that shows the instance."""
     label: wp.array[int]
-    """(instance): its label in that view."""
+    """(instance): label of the instance in that view."""
     model: wp.array[int]
     """(instance): row of `Models`."""
     row: wp.array2d[int]
@@ -52,7 +52,7 @@ class Targets:
 
 @wp.struct
 class Observation:
-    """What a batch of views shows of each instance."""
+    """Crop, mask, colours, surface points and normals of each instance, as a batch of views shows it."""
 
     box: wp.array2d[int]
     """(instance, side): bounding box of the visible mask: x_min, y_min, x_max, y_max [px], inclusive; x_max < x_min: not visible."""
@@ -118,7 +118,7 @@ def clear_boxes_kernel(
     box_out: wp.array2d[int],  # (instance, side) [px]
     pixels_out: wp.array[int],  # (instance) [px]
 ):
-    """Clear boxes and pixel counts, for `find_boxes_kernel`."""
+    """Set boxes to inverted ones and pixel counts to 0, for the atomics of `find_boxes_kernel`. Launched over instance."""
     instance = wp.tid()
     box_out[instance, 0] = images.width
     box_out[instance, 1] = images.height
@@ -136,7 +136,10 @@ def find_boxes_kernel(
     box_out: wp.array2d[int],  # (instance, side) [px]
     pixels_out: wp.array[int],  # (instance) [px]
 ):
-    """Bounding boxes and sizes of visible masks, by integer atomics for each run of equal labels in a row."""
+    """Bounding boxes and pixel counts of visible masks, by integer atomics for each run of equal labels in a row.
+
+    Launched over view, row.
+    """
     view, row = wp.tid()
     start = int(0)
     label = int(images.label[view, row, 0])
@@ -164,7 +167,10 @@ def place_crops_kernel(
     corner_out: wp.array[wp.vec2],  # (instance) [px]
     pitch_out: wp.array[float],  # (instance) [px]
 ):
-    """Square crop around the mask's box with a margin; a crop pixel is at least an image pixel wide, and then coincides with one."""
+    """Place the square crop of each instance: corner and pixel width (pitch) of the box around its mask, with a margin.
+
+    A crop pixel is at least an image pixel wide, and coincides with one where it is as wide. Launched over instance.
+    """
     instance = wp.tid()
     width = float(box[instance, 2] - box[instance, 0] + 1)
     height = float(box[instance, 3] - box[instance, 1] + 1)
@@ -187,7 +193,10 @@ def sample_crops_kernel(
     # Out:
     observation_out: Observation,
 ):
-    """Crops: whether a crop pixel's centre lies in the mask, and the mean colour of the mask in its footprint (linear light)."""
+    """Resample the crops: whether the centre of a crop pixel lies in the mask, and the mean colour of the mask in its footprint.
+
+    Colours are in linear light. Writes `inside` and `color`. Launched over instance, crop row, crop column.
+    """
     instance, row, column = wp.tid()
     if observation_out.pixels[instance] == 0:
         return
@@ -227,7 +236,10 @@ def find_row_nearest_kernel(
     # Out:
     row_nearest_out: wp.array3d[int],  # (instance, row, column)
 ):
-    """First pass of the feature transform: the nearest mask pixel within each row, by a sweep each way; -1: the row has none."""
+    """First pass of the feature transform: the nearest mask pixel within each row, by a sweep each way; -1: the row has none.
+
+    Launched over instance, crop row.
+    """
     instance, row = wp.tid()
     if pixels[instance] == 0:
         return
@@ -254,7 +266,10 @@ def find_nearest_kernel(
     # Out:
     nearest_out: wp.array3d[wp.vec2],  # (instance, row, column) [crop px]
 ):
-    """Second pass of the feature transform (Saito and Toriwaki, 1994): the nearest mask pixel over all rows."""
+    """Second pass of the feature transform (Saito and Toriwaki, 1994): the nearest mask pixel over all rows.
+
+    Launched over instance, crop row, crop column.
+    """
     instance, row, column = wp.tid()
     if pixels[instance] == 0:
         return

@@ -93,7 +93,7 @@ def count_points_kernel(
     # Out:
     observation_out: Observation,
 ):
-    """Mask pixels with depth in each row of the crops."""
+    """Count the mask pixels with depth in each row of the crops: writes `row_points`. Launched over instance, crop row."""
     instance, row = wp.tid()
     if observation_out.pixels[instance] == 0:
         observation_out.row_points[instance, row] = 0
@@ -114,7 +114,10 @@ def sample_points_kernel(
     # Out:
     observation_out: Observation,
 ):
-    """Surface points, evenly subsampled: of n mask pixels in scanline order, the first with each value of rank · min(n, capacity) // n."""
+    """Subsample the surface points evenly: of n mask pixels in scanline order, the first with each value of rank · min(n, capacity) // n.
+
+    Writes `points` (their number), `point`, `normal` and `gray` at these pixels. Launched over instance, crop row.
+    """
     instance, row = wp.tid()
     rank = int(0)
     total = int(0)
@@ -148,7 +151,10 @@ def summarize_points_kernel(
     # Out:
     observation_out: Observation,
 ):
-    """Centroid and mean intensity of an instance's points, and the area that one of them stands for."""
+    """Centroid and mean intensity of the points of each instance, and the area that one point stands for, that of the mask over the number.
+
+    Writes `centroid`, `intensity` and `area`. Launched over instance.
+    """
     instance = wp.tid()
     count = observation_out.points[instance]
     total = wp.vec3(0.0, 0.0, 0.0)

@@ -14,7 +14,7 @@ LANES = wp.constant(32)
 
 @wp.struct
 class Models:
-    """Object models: meshes for closest points, and samples evenly spread over the surface. Constant."""
+    """Meshes of the object models for closest-point queries, and samples with colours evenly spread over their surfaces. Constant."""
 
     mesh: wp.array[wp.uint64]
     """(model): handle of the `wp.Mesh`."""
@@ -32,7 +32,7 @@ class Models:
 
 @wp.struct
 class LossParameters:
-    """Parameters of the robust losses: cutoffs, weights, and the stride with which points and samples are taken."""
+    """Cutoffs and weights of the robust losses (Tukey, Huber, truncated), and the stride with which points and samples are taken."""
 
     cutoff: float
     """Distance from which a surface residual is an outlier (Tukey's biweight), and a silhouette residual grows linearly (Huber) [m]."""

@@ -12,12 +12,13 @@ MIN_FACING = wp.constant(0.1)
 HIDDEN = wp.constant(0)
 VISIBLE = wp.constant(1)
 PROTRUDING = wp.constant(2)
-"""States of a model sample: occluded, unknown or averted; in the instance's mask; in free space, where the mask should reach."""
+"""States of a model sample: occluded, unknown or averted; in the instance's mask; in free space, where the mask should reach
+(free-space violation)."""
 
 
 @wp.struct
 class SampleView:
-    """A model sample in a view."""
+    """Visibility state of a model sample in a view, with position, normal, crop coordinates, projected area and depth difference."""
 
     state: int
     """HIDDEN, VISIBLE or PROTRUDING."""
@@ -44,7 +45,11 @@ def view_sample(
     pose: wp.transform,
     sample: int,
 ) -> SampleView:
-    """Visibility test of a model sample against the label and depth of its pixel."""
+    """Visibility test of a model sample at a pose, against the label and depth of the pixel that it projects to.
+
+    VISIBLE: the pixel has the instance's label, and the sample lies at most `margin` behind its depth. PROTRUDING, a free-space violation:
+    the pixel shows something else that lies farther away by more than `margin`. Otherwise, and where the sample faces away: HIDDEN.
+    """
     result = SampleView()
     result.state = HIDDEN
     model = targets.model[instance]

@@ -17,7 +17,7 @@ UNSEEN = wp.constant(1.0e6)
 
 @wp.struct
 class StepLimits:
-    """Regularization and bounds of a step."""
+    """Damping, weight of the prior, and bounds of rotation and translation of a Gauss-Newton step."""
 
     prior: float
     """Weight of staying at the prior pose, relative to that of the observation."""
@@ -108,7 +108,10 @@ def step_poses_kernel(
     # Out:
     pose_inout: wp.array[wp.transform],  # (pose) [m]
 ):
-    """One Gauss-Newton step: (H + (λ + μ) A) s = g + μ A d, A the observed area, d the step to the prior, λ damping, μ prior."""
+    """One Gauss-Newton step: (H + (λ + μ) A) s = g + μ A d, A the observed area, d the step to the prior, λ damping, μ prior.
+
+    Launched over hypothesis.
+    """
     index = wp.tid()
     instance = index // hypotheses
     count = observation.points[instance]
@@ -144,7 +147,7 @@ def score_poses_kernel(
 ):
     """Cost of each hypothesis: truncated distances of points and protruding samples per observed area, + colour.
 
-    The colour term is between 0 and `color_cost`; where too few samples show colour it is `color_cost`.
+    The colour term is between 0 and `color_cost`; where too few samples show colour it is `color_cost`. Launched over hypothesis.
     """
     index = wp.tid()
     if observation.points[index // hypotheses] == 0:

@@ -15,7 +15,7 @@ MIN_DIRECTION = wp.constant(1.0e-6)
 
 @wp.struct
 class Match:
-    """Correspondence of an observed point on the mesh, in the model's frame."""
+    """Closest point of the mesh to an observed point and the normal there, in the frame of the model."""
 
     found: bool
     point: wp.vec3
@@ -76,7 +76,10 @@ def accumulate_points_kernel(
     # Out:
     sums_out: Sums,
 ):
-    """Distances r of observed points p from the mesh: r = |n · (p - q)|, with q and n of `match_point`; without a match at full cost."""
+    """Point-to-plane ICP: normal equations of distances r of observed points p from the mesh: r = |n · (p - q)|, q and n of `match_point`.
+
+    A point without a match has the full cost. Writes `sums_out` (all but `samples`). Launched over hypothesis, lane.
+    """
     index, lane = wp.tid()
     instance = index // hypotheses
     model = targets.model[instance]

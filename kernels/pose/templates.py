@@ -30,10 +30,10 @@ NO_COST = wp.constant(1.0e6)
 
 @wp.struct
 class Templates:
-    """Depth templates. Constant."""
+    """Depth images of the object models from all directions, with rotations and pixel widths. Constant."""
 
     depth: wp.array4d[float]
-    """(model, direction, row, column): depth of the surface less that of the object's centre [m]; `EMPTY`: beside the object."""
+    """(model, direction, row, column): depth of the surface minus that of the object's centre [m]; `EMPTY`: beside the object."""
     rotation: wp.array[wp.quat]
     """(direction): object to template camera."""
     width: wp.array[float]
@@ -42,16 +42,16 @@ class Templates:
 
 @wp.struct
 class Probes:
-    """Points that a template is compared at, in metres across and along the viewing direction of the centroid."""
+    """Points at which templates are compared with the observation: on the surface and beside the mask, in a frame at the centroid."""
 
     inside: wp.array2d[wp.vec3]
-    """(instance, probe): observed surface points: offset (x, y) from the centroid, and depth [m]."""
+    """(instance, probe): observed surface points: offset (x, y) from the centroid, and depth relative to it [m]."""
     insides: wp.array[int]
-    """(instance): number of them."""
+    """(instance): number of inside probes."""
     outside: wp.array2d[wp.vec3]
-    """(instance, probe): points beside the mask: offset (x, y) from the centroid, and the depth seen there [m]."""
+    """(instance, probe): points beside the mask: offset (x, y) from the centroid, and depth seen there, relative to it [m]."""
     outsides: wp.array[int]
-    """(instance): number of them."""
+    """(instance): number of outside probes."""
     weight: wp.array[float]
     """(instance): area that an outside probe stands for, relative to the visible mask's."""
     ray: wp.array[wp.quat]
@@ -60,7 +60,7 @@ class Probes:
 
 @wp.struct
 class Search:
-    """Search grid and loss."""
+    """Extent of the search grid over in-plane rotations and shifts, and the parameters of its truncated loss."""
 
     rotations: int
     """Number of in-plane rotations, about the optical axis."""
@@ -83,7 +83,11 @@ def sample_probes_kernel(
     # Out:
     probes_out: Probes,
 ):
-    """Probes: points of the observation at regular ranks, and pixels beside the mask on a regular grid around the crop."""
+    """Sample the probes of each instance: observed points at regular ranks, and pixels beside the mask on a regular grid.
+
+    The grid covers a square that contains the crop and is twice as wide (`PROBED`). Writes all members of `probes_out`; without observed
+    points the counts alone. Launched over instance.
+    """
     instance = wp.tid()
     count = observation.points[instance]
     centroid = observation.centroid[instance]
@@ -131,13 +135,13 @@ def sample_probes_kernel(
 
 @wp.struct
 class Placement:
-    """Alignment of a template: direction, in-plane rotation, and offset of the object's origin from the centroid."""
+    """Alignment of a template with the observation: model, direction, in-plane rotation, and shift of the origin from the centroid."""
 
     model: int
     direction: int
     cosine: float
     sine: float
-    """Of the in-plane rotation."""
+    """Cosine and sine of the in-plane rotation."""
     x: float
     y: float
     """Offset across the viewing direction [m]."""
@@ -161,7 +165,7 @@ def template_depth(templates: Templates, place: Placement, point: wp.vec3) -> fl
 def center_depth(
     templates: Templates, probes: Probes, place: Placement, instance: int, start: float, cutoff: float, min_hits: float
 ) -> float:
-    """Depth of the object's centre relative to the centroid: mean of observed less template depth over probes within `cutoff` of `start`.
+    """Depth of the object's centre relative to the centroid: mean of observed minus template depth over probes within `cutoff` of `start`.
 
     `EMPTY` if fewer than `min_hits` probes take part.
     """
@@ -180,7 +184,7 @@ def center_depth(
 
 @wp.func
 def unexplained(templates: Templates, probes: Probes, place: Placement, instance: int, depth: float, truncation: float) -> float:
-    """Mean truncated depth difference of the observed points, from 0 to 1; points beside the template count 1."""
+    """Cost of the observed points: mean truncated depth difference from the template, from 0 to 1; points beside the template count 1."""
     total = float(0.0)
     count = probes.insides[instance]
     for k in range(count):
@@ -191,7 +195,8 @@ def unexplained(templates: Templates, probes: Probes, place: Placement, instance
 
 @wp.func
 def protruding(templates: Templates, probes: Probes, place: Placement, instance: int, depth: float, margin: float) -> float:
-    """Area beside the mask in which the template lies in front of what is seen, relative to the mask's."""
+    """Free-space violation: area beside the mask in which the template lies in front of the observed depth by `margin`, over the area of
+    the mask."""
     count = float(0.0)
     for k in range(probes.outsides[instance]):
         point = probes.outside[instance, k]
@@ -214,7 +219,8 @@ def search_templates_kernel(
 ):
     """Cost of a direction and in-plane rotation at its best shift, and the object's centre there, relative to the centroid.
 
-    The centre's depth is a trimmed mean. At least half of the observed points must lie on the template.
+    The centre's depth is a trimmed mean. At least half of the observed points must lie on the template. Launched over instance, direction,
+    in-plane rotation.
     """
     instance, direction, inplane = wp.tid()
     count = probes.insides[instance]
@@ -250,7 +256,7 @@ def search_templates_kernel(
 
 
 @wp.kernel
-def choose_directions_kernel(
+def choose_placements_kernel(
     # Scene:
     templates: Templates,
     search: Search,
@@ -263,10 +269,11 @@ def choose_directions_kernel(
     cost_inout: wp.array3d[float],  # (instance, direction, rotation)
     pose_out: wp.array[wp.transform],  # (pose) [m]
 ):
-    """The best placements of an instance as poses, by greedy non-maximum suppression over in-plane rotations; used costs are overwritten.
+    """Choose the best placements of each instance as poses, by greedy non-maximum suppression over in-plane rotations.
 
-    A placement suppresses rotations of its direction within 60°. Where there are fewer, the best is repeated; without any, the pose is the
-    centroid without rotation.
+    A placement suppresses rotations of its direction within 60°, by overwriting their costs in `cost_inout`. `pose_out` receives
+    `hypotheses` poses: where there are fewer placements, the best is repeated; without any, the pose is the centroid without rotation.
+    Launched over instance.
     """
     instance = wp.tid()
     ray = probes.ray[instance]

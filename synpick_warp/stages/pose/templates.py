@@ -17,7 +17,7 @@ from synpick_warp.kernels.pose.templates import (
     Probes,
     Search,
     Templates,
-    choose_directions_kernel,
+    choose_placements_kernel,
     sample_probes_kernel,
     search_templates_kernel,
 )
@@ -92,7 +92,7 @@ class TemplateSearch:
         wp.launch(search_templates_kernel, dim=self.cost.shape, inputs=inputs, outputs=outputs, device=device)
         inputs = [self.templates, self.parameters, observer.observation, self.probes, self.offset, self.hypotheses]
         outputs = [self.cost, pose]
-        wp.launch(choose_directions_kernel, dim=observer.instances, inputs=inputs, outputs=outputs, device=device)
+        wp.launch(choose_placements_kernel, dim=observer.instances, inputs=inputs, outputs=outputs, device=device)
 
 
 def sphere_directions(count: int) -> np.ndarray:
