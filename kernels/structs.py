@@ -37,7 +37,7 @@ class LayoutData:
 
 @wp.struct
 class CatalogData:
-    """Properties of the catalog's objects; arrays are (entry)."""
+    """Volumes, masses and other properties of the objects in the catalog; arrays are (entry)."""
 
     count: int
     """Objects in the catalog."""
@@ -65,7 +65,7 @@ class CatalogData:
 
 @wp.struct
 class DropData:
-    """Parameters of sampling and dropping objects, and of sampling the light; see `configs.schema`."""
+    """Volume budget, heights and clearances of the drop, and the distribution of the light; see `configs.schema`."""
 
     volume: float
     """Budget for the total volume of an episode's objects [m³]."""
@@ -99,7 +99,7 @@ class DropData:
 
 @wp.struct
 class SettleData:
-    """When a pile counts as at rest, and what is dropped again; see `configs.schema.Settle`."""
+    """Thresholds and durations of rest, of deep penetration and of re-drops; see `configs.schema.Settle`."""
 
     min_ticks: int
     """Shortest time from drop to rest [ticks]."""
@@ -123,7 +123,7 @@ class SettleData:
 
 @wp.struct
 class ModeData:
-    """Distribution of the modes of a split's episodes."""
+    """First episode of a split, and the probabilities of the modes of its episodes."""
 
     first: int
     """Index of the split's first episode."""
@@ -137,7 +137,7 @@ class ModeData:
 
 @wp.struct
 class MoveData:
-    """Mode MOVE: parameters of setpoints and impedance control; mass, gravity, step and TCP offset serve the picking modes, too."""
+    """Waypoints, speed and impedance of mode MOVE; mass, gravity, step and TCP offset serve the picking modes, too."""
 
     stiffness: float
     """Stiffness [N/m]."""
@@ -165,7 +165,7 @@ class MoveData:
 
 @wp.struct
 class PickData:
-    """Picking modes: parameters of tasks and impedance control; see `configs.schema.Pick`."""
+    """Speeds, distances, tasks and impedance of the picking modes; see `configs.schema.Pick`."""
 
     stiffness: float
     """Stiffness [N/m]."""
@@ -201,7 +201,7 @@ class PickData:
 
 @wp.struct
 class PerceptionData:
-    """Parameters of perception and grasp planning, named as in configs.schema.Perception."""
+    """Thresholds, weights and windows of grasp points, occlusion votes and the clutter graph, named as in configs.schema.Perception."""
 
     center_fraction: float
     """Distance of centroid or midpoint to the contour, as a fraction of the pole's, from which it is the suction point."""
@@ -227,7 +227,7 @@ class PerceptionData:
 
 @wp.struct
 class SuctionData:
-    """The cup's rays and seals; see `configs.schema.Suction`."""
+    """Geometry of the cup's rays, and stiffness, damping, masses and break forces of the seals; see `configs.schema.Suction`."""
 
     rays: int
     """Rays on the ring."""

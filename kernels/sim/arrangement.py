@@ -71,9 +71,9 @@ def sample_modes_kernel(
 ):
     """Sample the mode of starting episodes: PICK if u < p, else TARGET if u < p + t, else MOVE, with fractions p and t of the modes.
 
-    The fractions are those of the episode's split; splits are sorted by first episode. u is the first sample of the stream (seed,
-    episode, 0, Stream.MODE): a resampled arrangement of the episode has the same mode. In a round robin of n episodes, episode i of the
-    split has the midpoint of stratum i mod n instead: u = (i mod n + 1/2) / n.
+    The fractions are those of the episode's split; splits are sorted by first episode. u is the first sample of the stream (seed, episode,
+    0, Stream.MODE): a resampled arrangement of the episode has the same mode. In a round robin of n episodes, episode i of the split has
+    the midpoint of stratum i mod n instead: u = (i mod n + 1/2) / n. Launched over world.
     """
     world = wp.tid()
     if phase[world] != Phase.START:
@@ -138,6 +138,7 @@ def sample_objects_kernel(
 
     An object larger than V is resampled; without `exceed`, after the first one, it ends the draw. `catalog_index` receives the objects (-1:
     none), `body_slot` the next free slot of their class, single or compound; without one the episode ends with ARRANGEMENT_OVERFLOW.
+    Launched over world.
     """
     world = wp.tid()
     phase = phase_inout[world]
@@ -197,7 +198,7 @@ def sample_lights_kernel(
     """Sample the environment map of starting episodes, its yaw [rad] and its exposure value [EV].
 
     With the samples u_i of the stream (seed, episode, arrangement, Stream.LIGHT): map by u_0, yaw = 2π u_1 or, without `random_yaw`, 0,
-    exposure = s (2 u_2 - 1) for a spread s.
+    exposure = s (2 u_2 - 1) for a spread s. Launched over world.
     """
     world = wp.tid()
     if phase[world] != Phase.START:
@@ -253,7 +254,7 @@ def reset_worlds_kernel(
     """Reset worlds in the phases START, IDLE and OVER: all body slots empty and parked, the gripper at home.
 
     `variant` receives each slot's empty variant, or -1 (no change) in other worlds; `restarted` is True for reset worlds. A force m g on
-    each parked body cancels its weight.
+    each parked body cancels its weight. Launched over world.
     """
     world = wp.tid()
     fresh = phase[world] == Phase.START or phase[world] == Phase.IDLE or phase[world] == Phase.OVER
@@ -306,7 +307,7 @@ def drop_objects_kernel(
 ):
     """Assign objects to their body slots and stack them above the tote in a column of bounding spheres, at rest; phase becomes SETTLE.
 
-    Height of sphere i: z_i = rim + r_i + Σ_{j<i} (2 r_j + clearance).
+    Height of sphere i: z_i = rim + r_i + Σ_{j<i} (2 r_j + clearance). Launched over world.
     """
     world = wp.tid()
     if phase_inout[world] != Phase.START:

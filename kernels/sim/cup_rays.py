@@ -16,7 +16,7 @@ CUP = wp.constant(1)
 
 @wp.struct
 class SurfaceData:
-    """Object surfaces for ray casts, by catalog index e: convex pieces as half-spaces, or triangle meshes."""
+    """Planes of the convex pieces, handles of the visual meshes and bounding spheres of the objects, for ray casts, by catalog index e."""
 
     first_piece: wp.array[int]
     """(entry + 1): convex pieces of object e are first_piece[e] to first_piece[e + 1] - 1."""
@@ -118,8 +118,8 @@ def count_seal_rays_kernel(
 ):
     """Cast the suction rays where suction is switched on: count the rays that hit, and set bit i for every instance i that is hit.
 
-    Rays run from a circle about the TCP along the cup's -z: x_k = tcp + r (cos a, sin a, 0), a = 2 π k / rays. Each engages the
-    nearest object within reach, the first of several at the same distance. Only the world's own objects are tested.
+    Rays run from a circle about the TCP along the cup's -z: x_k = tcp + r (cos a, sin a, 0), a = 2 π k / rays. Each engages the nearest
+    object within reach, the first of several at the same distance. Only the world's own objects are tested. Launched over world.
     """
     world = wp.tid()
     if not suction_begins(phase[world], task[world], steps[world], pick):
@@ -173,7 +173,8 @@ def engage_seals_kernel(
 ):
     """Attach every engaged object where suction is switched on, at its current pose: object_in_tcp = tcp_in_world⁻¹ object_in_world.
 
-    The break force is `good_force` if at most `tolerated_misses` rays miss, else `poor_force`; seal forces begin at 0.
+    The break force is `good_force` if at most `tolerated_misses` rays miss, else `poor_force`; seal forces begin at 0. Launched over world,
+    instance.
     """
     world, instance = wp.tid()
     if not suction_begins(phase[world], task[world], steps[world], pick):

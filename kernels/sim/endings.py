@@ -30,7 +30,10 @@ def judge_tasks_kernel(
     # Out:
     ending_out: wp.array[int],  # (world)
 ):
-    """Write the `Ending` of episodes that complete: all waypoints reached, no object left, or too many failed attempts."""
+    """Write the `Ending` of episodes that complete: all waypoints reached, no object left, or too many failed attempts.
+
+    Launched over world.
+    """
     world = wp.tid()
     if phase[world] != Phase.ACT:
         return
@@ -75,7 +78,7 @@ def judge_episodes_kernel(
     """Move worlds whose episode has an ending to phase OVER; failures override the endings of `judge_tasks_kernel`.
 
     Failures, each overriding those before it: not settled in time or within the allowed re-drops, an overflow of contour points in
-    perception, an overflow of contacts or constraint rows in the solver, a pose that is not finite.
+    perception, an overflow of contacts or constraint rows in the solver, a pose that is not finite. Launched over world.
     """
     world = wp.tid()
     phase = phase_inout[world]

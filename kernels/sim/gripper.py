@@ -49,6 +49,7 @@ def begin_moving_kernel(
     """Count frames; in the first frame of mode MOVE, sample the order of the corners and place the gripper above the first one.
 
     The order is a Fisher-Yates shuffle of the four corners for each round. `frame` is -1 outside of phase ACT, and counts from 0 in it.
+    Launched over world.
     """
     world = wp.tid()
     if phase[world] != Phase.ACT:
@@ -124,7 +125,7 @@ def advance_setpoints_kernel(
 
     Mode MOVE: towards the next corner; a reached one increments `waypoint`. Picking: APPROACH to `near` before the grasp point, then
     DESCEND along the normal, then PRESS without motion. The ends of PRESS and LIFT are detected once a tick, by
-    `tasks.advance_tasks_kernel`.
+    `tasks.advance_tasks_kernel`. Launched over world.
     """
     world = wp.tid()
     if phase[world] != Phase.ACT:
@@ -190,7 +191,7 @@ def drive_gripper_kernel(
 ):
     """Write the gripper's joint forces: impedance control plus gravity compensation m g; without a task, gravity compensation only.
 
-    Of `joint_f`, the gripper's x, y, z and tilt are written; the tilt joint has a drive of its own and receives 0.
+    Of `joint_f`, the gripper's x, y, z and tilt are written; the tilt joint has a drive of its own and receives 0. Launched over world.
     """
     world = wp.tid()
     q = world * layout.coords
@@ -220,7 +221,7 @@ def set_yaw_kernel(
 ):
     """Set the yaw ψ of every gripper shaft about z: the child frame of its joint is R_z(-ψ) in the shaft's frame.
 
-    Yaw is a property of the joint, not a degree of freedom, so that x, y and z of the joint stay the world's axes.
+    Yaw is a property of the joint, not a degree of freedom, so that x, y and z of the joint stay the world's axes. Launched over world.
     """
     world = wp.tid()
     rotation = wp.quat_from_axis_angle(wp.vec3(0.0, 0.0, 1.0), -yaw[world])

@@ -31,9 +31,9 @@ def measure_penetration_kernel(
     # Out:
     penetration_out: wp.array[float],  # (body) [m]
 ):
-    """Deepest penetration of each body [m]: max over its contacts of margin_0 + margin_1 - n·(p_1 - p_0).
+    """Deepest penetration of each body [m]: max over its contacts of margin_0 + margin_1 - n·(p_1 - p_0), by atomics.
 
-    One thread a contact; `penetration` must be cleared before.
+    `penetration` must be cleared before. Launched over contact.
     """
     contact = wp.tid()
     if contact >= contact_count[0]:
@@ -72,7 +72,8 @@ def measure_displacement_kernel(
 ):
     """Displacement of each object over the last tick [m]: the bound |Δp| + θ r on the motion of its points, with rotation angle θ.
 
-    r is the bounding radius. Over a tick instead of by velocity: a solver that has not converged makes a pile vibrate in place.
+    r is the bounding radius. Over a tick instead of by velocity: a solver that has not converged makes a pile vibrate in place. Launched
+    over world, instance.
     """
     world, instance = wp.tid()
     index = catalog_index[world, instance]
@@ -117,7 +118,7 @@ def redrop_objects_kernel(
     """Drop objects again that left the tote or were stuck, that is, in deep penetration for longer than `stuck_ticks`.
 
     They are stacked one above the other, and the guide walls return. `progress` holds ticks since the drop, ticks at rest, re-drops, and
-    whether the guide walls stand; `stuck` counts each instance's ticks in deep penetration.
+    whether the guide walls stand; `stuck` counts each instance's ticks in deep penetration. Launched over world.
     """
     world = wp.tid()
     if phase[world] != Phase.SETTLE:
@@ -157,7 +158,8 @@ def judge_rest_kernel(
 ):
     """Count ticks at rest; after `rest_ticks` of them remove the guide walls, after as many again begin phase ACT.
 
-    A pile is at rest if no object's displacement exceeds `rest_threshold`, or `relaxed_rest_threshold` after `late_ticks`.
+    A pile is at rest if no object's displacement exceeds `rest_threshold`, or `relaxed_rest_threshold` after `late_ticks`. Launched over
+    world.
     """
     world = wp.tid()
     if phase_inout[world] != Phase.SETTLE:
@@ -190,7 +192,10 @@ def flag_lost_pairs_kernel(
     # Out:
     overflow_out: wp.array[wp.bool],  # (world)
 ):
-    """Flag all worlds if the broad phase found more overlaps or shape pairs than its capacity: pairs of any world may be lost."""
+    """Flag all worlds if the broad phase found more overlaps or shape pairs than its capacity: pairs of any world may be lost.
+
+    Launched over world.
+    """
     world = wp.tid()
     if wp.max(overlap_count[0], pair_count[0]) > capacity:
         overflow_out[world] = True
@@ -218,6 +223,9 @@ def set_guides_kernel(
     # Out:
     shape_transform_out: wp.array[wp.transform],  # (shape) [m]
 ):
-    """Enable the guide walls of worlds whose `progress` says that they stand, and disable the others, by their shapes' poses."""
+    """Enable the guide walls of worlds whose `progress` says that they stand, and disable the others, by their shapes' poses.
+
+    Launched over world, guide wall.
+    """
     world, guide = wp.tid()
     shape_transform_out[world * layout.shapes + guide_shapes[guide]] = shape_pose(progress[world][3] == 1)

@@ -22,7 +22,7 @@ APART = wp.constant(1.0)
 
 @wp.struct
 class InverseMass:
-    """Inverse effective mass at the TCP: the 6 x 6 matrix W with acceleration = W wrench, symmetric, in blocks of 3 x 3.
+    """Blocks of 3 x 3 of the inverse effective mass at the TCP: the symmetric 6 x 6 matrix W with acceleration = W wrench.
 
     The operational-space inverse inertia J M⁻¹ Jᵀ (Khatib, 1987).
     """
@@ -37,7 +37,7 @@ class InverseMass:
 
 @wp.struct
 class RotationError:
-    """Elastic response of a seal to its rotation error: the rotation from the cup's axes to those of the grip frame."""
+    """Elastic torque and rotational stiffness of a seal, for the rotation from the cup's axes to those of the grip frame."""
 
     torque: wp.vec3
     """Elastic torque on the object, without damping, in the world's axes [N·m]."""
@@ -47,7 +47,7 @@ class RotationError:
 
 @wp.struct
 class Wrench:
-    """Wrench on the object at the TCP, in the world's axes."""
+    """Force and torque on the object at the TCP, in the world's axes."""
 
     force: wp.vec3
     """[N]"""
@@ -57,7 +57,7 @@ class Wrench:
 
 @wp.struct
 class TcpMotion:
-    """Pose and velocity of the tcp frame, in the world's axes."""
+    """Pose, axes and velocity of the tcp frame, in the world's axes."""
 
     position: wp.vec3
     """[m]"""
@@ -237,8 +237,8 @@ def apply_seal_forces_kernel(
 ):
     """Apply every seal's wrench to its object and the opposite to the gripper; break seals whose force exceeds the break force.
 
-    `seal_force` receives this step's force of each seal, that of a breaking one included, and 0 without a seal; `peak_force` its
-    maximum over seals and steps since it was cleared.
+    `seal_force` receives this step's force of each seal, that of a breaking one included, and 0 without a seal; `peak_force` its maximum
+    over seals and steps since it was cleared. Launched over world.
     """
     world = wp.tid()
     seals = int(0)
@@ -303,9 +303,9 @@ def ignore_attached_contacts_kernel(
 ):
     """Disable contacts between a cup and its attached objects, which would fight the seal: set their margin to -APART.
 
-    The solver makes no constraint rows for contacts that far apart. The collision pipeline writes all margins anew each time, after it
-    has stored what it matches the next step's contacts with. Disabling the shapes instead would put all such contacts of all worlds
-    into one pair of bodies, and the solver's time grows with the square of a pair's contacts.
+    The solver makes no constraint rows for contacts that far apart. The collision pipeline writes all margins anew each time, after it has
+    stored what it matches the next step's contacts with. Disabling the shapes instead would put all such contacts of all worlds into one
+    pair of bodies, and the solver's time grows with the square of a pair's contacts. Launched over contact.
     """
     contact = wp.tid()
     if contact >= contact_count[0] or shape0[contact] < 0 or shape1[contact] < 0:

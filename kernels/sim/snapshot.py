@@ -34,7 +34,7 @@ def take_snapshot_kernel(
     """Copy episode, frame, catalog indices and poses of objects and fixtures into the snapshot.
 
     `live` is 1 if the tick is a frame: in phase ACT, and in the tick in which a delivered episode ends. The gripper is invisible during
-    task LOOK, while it waits at home. Fixtures are tote, gripper shaft ("finger") and cup.
+    task LOOK, while it waits at home. Fixtures are tote, gripper shaft ("finger") and cup. Launched over world.
     """
     world = wp.tid()
     live = int(0)
@@ -58,7 +58,10 @@ def take_snapshot_kernel(
 
 @wp.struct
 class FramePoses:
-    """Part of a snapshot that the next one repeats as its previous frame; members as in `stages.buffers.LastFrame`."""
+    """Episode, frame, objects and poses of each world in one snapshot; the next snapshot repeats these as its previous frame.
+
+    Members are named as in `stages.buffers.LastFrame`.
+    """
 
     live: wp.array[int]
     """(world): 1 if the tick is a frame."""
@@ -90,7 +93,8 @@ def link_frames_kernel(
 ):
     """Copy the last tick's poses into this snapshot as its previous frame, for optical and scene flow, then store this tick's.
 
-    `follows` is 1 if the last tick was the preceding frame of the same episode; the first frame of an episode follows none.
+    `follows` is 1 if the last tick was the preceding frame of the same episode; the first frame of an episode follows none. Launched over
+    world.
     """
     world = wp.tid()
     follows = int(0)
@@ -134,7 +138,7 @@ def pack_status_kernel(
     status_out: wp.array2d[int],  # (world, status)
     measure_out: wp.array2d[float],  # (world, measure)
 ):
-    """Pack the columns of `Status` and `Measure` of each world, which the host reads after each tick."""
+    """Pack the columns of `Status` and `Measure` of each world, which the host reads after each tick. Launched over world."""
     world = wp.tid()
     status_out[world, Status.PHASE] = phase[world]
     status_out[world, Status.ENDING] = ending[world]

@@ -1,6 +1,6 @@
 """Step log: poses, velocities, contact and seal forces of every physics step, for trajectories.
 
-A "place" is an instance; the gripper shaft and the cup follow the instances.
+A row of the log, called "place", is an instance; the rows of the gripper shaft and the cup follow those of the instances.
 """
 
 import warp as wp
@@ -19,7 +19,7 @@ MAGNITUDE = wp.constant(3)
 
 @wp.func
 def body_of(layout: LayoutData, world: int, place: int, catalog_index: wp.array2d[int], body_slot: wp.array2d[int]) -> int:
-    """Body index of a place: of an instance, then of the gripper shaft and the cup; -1: no such instance."""
+    """Body index of row `place` of the step log: of an instance, then of the gripper shaft and the cup; -1: no such instance."""
     if place >= layout.instances:
         return world * layout.bodies + place - layout.instances
     if catalog_index[world, place] < 0:
@@ -48,7 +48,10 @@ def sum_contacts_kernel(
     # Out:
     total_inout: wp.array2d[wp.int64],  # (body, column)
 ):
-    """Sum contact forces by body: each contact's force acts on its first shape, the opposite on the second. One thread a contact."""
+    """Sum contact forces by body, in fixed point (`add_force`): each contact's force acts on its first shape, the opposite on the second.
+
+    Forces that are not finite are left out. Launched over contact.
+    """
     contact = wp.tid()
     if contact >= contact_count[0]:
         return
@@ -74,7 +77,10 @@ def save_impedance_force_kernel(
     # Out:
     force_out: wp.array[wp.vec3],  # (world) [N]
 ):
-    """Save the gripper's impedance force [N], before seal forces are added: its joint forces without gravity compensation."""
+    """Save the gripper's impedance force [N], before seal forces are added: its joint forces without gravity compensation.
+
+    Launched over world.
+    """
     world = wp.tid()
     first = world * layout.dofs
     force_out[world] = wp.vec3(joint_f[first], joint_f[first + 1], joint_f[first + 2] - weight)
@@ -95,7 +101,10 @@ def record_motion_kernel(
     velocity_out: wp.array3d[wp.vec3],  # (world, step, place) [m/s]
     angular_velocity_out: wp.array3d[wp.vec3],  # (world, step, place) [rad/s]
 ):
-    """Record poses and velocities of objects, gripper shaft and cup at the end of a step; NaN for instances that are not in the scene."""
+    """Record poses and velocities of objects, gripper shaft and cup at the end of a step; NaN for instances that are not in the scene.
+
+    Launched over world, place.
+    """
     world, place = wp.tid()
     body = body_of(layout, world, place, catalog_index, body_slot)
     if body < 0:
@@ -130,9 +139,9 @@ def record_forces_kernel(
 ):
     """Record contact and seal forces of a step; NaN for instances that are not in the scene.
 
-    `contact_force` receives the vector sum over a body's contacts, `contact_load` the sum of magnitudes; both are means over the
-    solver's substeps, whose forces `total` sums: `substep_fraction` is 1 / substeps. `attached` receives 1 if a seal holds the instance
-    at the step's end.
+    `contact_force` receives the vector sum over a body's contacts, `contact_load` the sum of magnitudes; both are means over the solver's
+    substeps, whose forces `total` sums: `substep_fraction` is 1 / substeps. `attached` receives 1 if a seal holds the instance at the
+    step's end. Launched over world, place.
     """
     world, place = wp.tid()
     body = body_of(layout, world, place, catalog_index, body_slot)
@@ -170,7 +179,7 @@ def record_gripper_kernel(
     force_out: wp.array2d[wp.vec3],  # (world, step) [N]
     task_out: wp.array2d[wp.int8],  # (world, step)
 ):
-    """Record the gripper's task, its setpoint (NaN without one) and its impedance force in a step."""
+    """Record the gripper's task, its setpoint (NaN without one) and its impedance force in a step. Launched over world."""
     world = wp.tid()
     current_task = int(Task.NONE)
     if phase[world] == Phase.ACT:
@@ -196,7 +205,7 @@ def save_drop_poses_kernel(
     # Out:
     drop_out: wp.array2d[wp.transform],  # (world, instance) [m]
 ):
-    """Save the drop poses of objects: their poses before the first tick of phase SETTLE."""
+    """Save the drop poses of objects: their poses before the first tick of phase SETTLE. Launched over world, instance."""
     world, instance = wp.tid()
     if phase[world] == Phase.SETTLE and progress[world][0] == 0 and catalog_index[world, instance] >= 0:
         drop_out[world, instance] = body_q[world * layout.bodies + layout.gripper_bodies + body_slot[world, instance]]

@@ -38,7 +38,7 @@ def begin_picking_kernel(
 ):
     """Reset the attempt state of worlds outside of phase ACT and in its first frame: there, a picking mode begins with task LOOK.
 
-    The outcome of every world becomes NONE: it is an event of one tick. `tilt` is the drive target of the tilt joint.
+    The outcome of every world becomes NONE: it is an event of one tick. `tilt` is the drive target of the tilt joint. Launched over world.
     """
     world = wp.tid()
     outcome_out[world] = Outcome.NONE
@@ -65,7 +65,7 @@ def clear_seals_kernel(
     # Out:
     attached_out: wp.array2d[int],  # (world, instance)
 ):
-    """Detach all objects of worlds outside of phase ACT: the last episode may have ended during a lift."""
+    """Detach all objects of worlds outside of phase ACT: the last episode may have ended during a lift. Launched over world, instance."""
     world, instance = wp.tid()
     if phase[world] != Phase.ACT:
         attached_out[world, instance] = 0
@@ -88,7 +88,7 @@ def remove_lost_kernel(
     removed_out: wp.array2d[int],  # (world, instance)
     attached_out: wp.array2d[int],  # (world, instance)
 ):
-    """Remove objects in phase ACT that fell below `pick.floor`, or are at rest outside of the tote: LOST."""
+    """Remove objects in phase ACT that fell below `pick.floor`, or are at rest outside of the tote: LOST. Launched over world, instance."""
     world, instance = wp.tid()
     if phase[world] != Phase.ACT or catalog_index_inout[world, instance] < 0:
         return
@@ -110,7 +110,7 @@ def pack_attached_kernel(
     # Out:
     attached_bits_out: wp.array[wp.uint32],  # (world)
 ):
-    """Pack the attached instances of each world into a bit mask: bit i is set if instance i is attached."""
+    """Pack the attached instances of each world into a bit mask: bit i is set if instance i is attached. Launched over world."""
     world = wp.tid()
     bits = wp.uint32(0)
     for instance in range(layout.instances):
@@ -163,7 +163,7 @@ def advance_tasks_kernel(
 ):
     """Task transitions at the end of a tick: PRESS to LIFT; LIFT to LOOK with an outcome; LOOK without a target to LOOK.
 
-    `outcome` is written in the tick in which an attempt ends.
+    `outcome` is written in the tick in which an attempt ends. Launched over world.
     """
     world = wp.tid()
     if phase[world] != Phase.ACT or mode[world] == Mode.MOVE:
@@ -204,7 +204,10 @@ def end_attempts_kernel(
     joint_qd_out: wp.array[float],  # (dof) [m/s, rad/s]
     tilt_out: wp.array[float],  # (coord) [rad]
 ):
-    """In worlds at task LOOK, remove attached objects (PICKED) and place the gripper at home, cup upright, out of view."""
+    """In worlds at task LOOK, remove attached objects (PICKED) and place the gripper at home, cup upright, out of view.
+
+    Launched over world.
+    """
     world = wp.tid()
     if phase[world] != Phase.ACT or task[world] != Task.LOOK:
         return
@@ -229,7 +232,10 @@ def park_removed_kernel(
     joint_qd_out: wp.array[float],  # (dof) [m/s, rad/s]
     joint_f_out: wp.array[float],  # (dof) [N, N·m]
 ):
-    """Park removed objects far below, each at its own position, in every tick; within a tick they fall by some centimetres."""
+    """Park removed objects far below, each at its own position, in every tick; within a tick they fall by some centimetres.
+
+    Launched over world, instance.
+    """
     world, instance = wp.tid()
     if removed[world, instance] == 0:
         return
@@ -254,7 +260,7 @@ def begin_attempts_kernel(
     hits_out: wp.array[int],  # (world)
     engaged_bits_out: wp.array[wp.uint32],  # (world)
 ):
-    """Begin an attempt in worlds at task LOOK after perception; those with a target change to APPROACH."""
+    """Begin an attempt in worlds at task LOOK after perception; those with a target change to APPROACH. Launched over world."""
     world = wp.tid()
     if phase[world] != Phase.ACT or task_inout[world] != Task.LOOK:
         return
@@ -285,7 +291,10 @@ def place_grippers_kernel(
     joint_qd_out: wp.array[float],  # (dof) [m/s, rad/s]
     tilt_out: wp.array[float],  # (coord) [rad]
 ):
-    """Place the gripper far above the grasp point, its cup tilted, where an APPROACH begins; the setpoint starts there."""
+    """Place the gripper far above the grasp point, its cup tilted, where an APPROACH begins; the setpoint starts there.
+
+    Launched over world.
+    """
     world = wp.tid()
     if phase[world] != Phase.ACT or task[world] != Task.APPROACH or steps[world] != 0:
         return
@@ -304,6 +313,9 @@ def set_shaft_collision_kernel(
     # Out:
     shape_transform_out: wp.array[wp.transform],  # (shape) [m]
 ):
-    """Enable collisions of the gripper shaft in mode MOVE, where the gripper is one rigid body, and disable them in picking modes."""
+    """Enable collisions of the gripper shaft in mode MOVE, where the gripper is one rigid body, and disable them in picking modes.
+
+    Launched over world.
+    """
     world = wp.tid()
     shape_transform_out[world * layout.shapes + layout.finger_shape] = shape_pose(mode[world] == Mode.MOVE)
