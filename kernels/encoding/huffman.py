@@ -28,7 +28,7 @@ ONE = wp.constant(wp.uint64(1))
 
 @wp.struct
 class HuffmanTables:
-    """Packed codes (`CODE_BITS`) by component (0: Y, 1: Cb and Cr) and symbol."""
+    """Huffman codes of the DC and the AC symbols, packed (`CODE_BITS`), by component (0: Y, 1: Cb and Cr) and symbol."""
 
     dc: wp.array2d[wp.uint32]
     """(component, symbol): code of a difference's number of bits."""
@@ -38,18 +38,18 @@ class HuffmanTables:
 
 @wp.struct
 class WordWriter:
-    """Bit writer of one block: its position in the slot, and the bits of the word begun."""
+    """Bit writer of one block: its position in the slot of the restart interval, and the bits of the unfinished word."""
 
     view: int
     interval: int
-    """Slot."""
+    """Restart interval, which is the index of the slot."""
 
     pending: wp.uint64
     """Bits that do not fill a word yet, at the low end; bits of earlier blocks in the word are 0."""
     bits: int
-    """Their number, with those of earlier blocks, below `WORD_BITS`."""
+    """Number of pending bits, with those of earlier blocks, below `WORD_BITS`."""
     word: int
-    """Index of the word that they belong to."""
+    """Index in the slot of the word that the pending bits belong to."""
     shared: bool
     """Whether the word begins with bits of an earlier block."""
 

@@ -33,10 +33,10 @@ history_vec = wp.types.vector(length=8, dtype=wp.int32)
 
 @wp.struct
 class Codes:
-    """Packed codes: value, and in the highest byte the number of bits."""
+    """Deflate codes of literals, runs and distances, packed: the value, and in the highest byte the number of bits."""
 
     literal: wp.array[wp.uint32]
-    """(byte)"""
+    """(byte): packed code of a literal."""
     run: wp.array[wp.uint32]
     """(length): packed code of a match length [samples]."""
     distance: wp.array[wp.uint32]
@@ -45,7 +45,7 @@ class Codes:
 
 @wp.struct
 class SlotWriter:
-    """State of a writer of bits to a slot."""
+    """Bit writer of one slot: its view and slot, the whole words written, and the bits of the unfinished word."""
 
     view: int
     slot: int
@@ -53,14 +53,14 @@ class SlotWriter:
     pending: wp.uint64
     """Bits that do not fill a word yet."""
     bits: int
-    """Their number, below `WORD_BITS`."""
+    """Number of pending bits, below `WORD_BITS`."""
     words: int
     """Words written."""
 
 
 @wp.struct
 class SlotSums:
-    """Sizes and partial Adler-32 sums of slots, or of groups of slots."""
+    """Size, byte sum and weighted byte sum (both parts of Adler-32) of each slot, or of each group of slots."""
 
     bits: wp.array2d[int]
     """(view, slot): size [bits]."""
@@ -123,7 +123,7 @@ def finish_slot(writer: SlotWriter, slot: wp.array3d[wp.uint32]) -> int:
 
 @wp.func
 def filter_sample(image: wp.array3d[wp.uint16], view: int, row: int, column: int) -> int:
-    """16-bit sample after the filter "up": each byte less the one above, modulo 256. Above the image there is 0."""
+    """16-bit sample after the PNG filter "up": each byte minus the one above, modulo 256. Above the image there is 0."""
     value, above = int(image[view, row, column]), int(0)
     if row > 0:
         above = int(image[view, row - 1, column])

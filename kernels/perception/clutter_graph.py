@@ -16,10 +16,11 @@ CERTAIN = wp.constant(1.0e30)
 
 @wp.struct
 class Cycles:
-    """Scratch: one strongly connected component at a time, per view."""
+    """Strongly connected component that is being ordered, with its edge weights, linear order and dynamic programming table, by view.
+    Scratch."""
 
     member: wp.array2d[int]
-    """Its instances, in ascending order (view, instance)."""
+    """Instances of the component, in ascending order (view, instance)."""
     weight: wp.array3d[float]
     """weight[a, b]: weight of the edge from member b, above, to member a; 0: no edge (view, instance, instance)."""
     rank: wp.array2d[int]
@@ -37,7 +38,10 @@ def bit(instance: int) -> wp.uint32:
 
 @wp.func
 def edge_weight(votes: wp.array3d[float], world: int, lower: int, upper: int, min_votes: float) -> float:
-    """Weight of the edge from `upper` to `lower`: its votes minus those of the opposite edge, at least 0; fewer than `min_votes` are 0."""
+    """Weight of the edge from `upper` to `lower`: its votes minus those of the opposite edge, at least 0.
+
+    Votes of either edge count as 0 below `min_votes`.
+    """
     votes_for = votes[world, lower, upper]
     votes_against = votes[world, upper, lower]
     if votes_for < min_votes:
@@ -164,8 +168,8 @@ def order_clutter_kernel(
 ):
     """Build the acyclic clutter graph of each view's world (`above`: bit masks of direct predecessors) and its closure (`ancestors`).
 
-    w(j → i) = max(v_ij - v_ji, 0) with votes v, 0 where they are fewer than `min_votes`. In every strongly connected component the
-    acyclic subset of maximum weight is kept; in components of more than `exact_cycle` objects a greedy one.
+    w(j → i) = max(v_ij - v_ji, 0), where votes v below `min_votes` count as 0. In every strongly connected component the acyclic subset of
+    maximum weight is kept; in components of more than `exact_cycle` objects a greedy one. Launched over view.
     """
     view = wp.tid()
     world = views.world[view]

@@ -62,9 +62,9 @@ def label_strips_kernel(
     component_out: wp.array2d[int],  # (view, pixel)
     area_out: wp.array2d[int],  # (view, pixel) [px]
 ):
-    """Initialize union-find: label each pixel by the first pixel of its run of equal ids in its strip, and set areas to 0.
+    """Initialize union-find: `component_out` receives the first pixel of each pixel's run of equal ids in its strip, or -1 off instances.
 
-    One thread a strip; -1 where there is no instance.
+    `area_out` is set to 0. Launched over view, row, strip (flat, from index `first` on).
     """
     view, row, strip = split_index(wp.tid() + first, height, strips)
     if views.world[view] < 0:
@@ -126,7 +126,11 @@ def merge_strips_kernel(
     # Out:
     component_inout: wp.array2d[int],  # (view, pixel)
 ):
-    """Unite runs of equal ids with the strip to the left and with the row above, including diagonals, once for every pair of runs."""
+    """Union pass: unite runs of equal ids with the strip to the left and with the row above, diagonals included, once for every pair of
+    runs.
+
+    `component_inout` receives the links between labels. Launched over view, row, strip.
+    """
     view, row, strip = wp.tid()
     if views.world[view] < 0:
         return
@@ -172,7 +176,10 @@ def measure_components_kernel(
     component_inout: wp.array2d[int],  # (view, pixel)
     area_out: wp.array2d[int],  # (view, pixel) [px]
 ):
-    """Path compression: replace each label by its root; and accumulate the component's size at the root, one atomic a run."""
+    """Path compression: replace each label by its root, and add the lengths of its runs to the component's size at the root.
+
+    Writes `component_inout` and `area_out`, with one atomic addition per run. Launched over view, row, strip.
+    """
     view, row, strip = wp.tid()
     if views.world[view] < 0:
         return
@@ -207,7 +214,8 @@ def find_largest_kernel(
     # Out:
     largest_key_out: wp.array2d[wp.int64],  # (view, instance)
 ):
-    """Argmax of the component size of each instance: max over its roots of pack_key(area, root). Keys must be 0 at the start."""
+    """Argmax of the component size of each instance: max over its roots of pack_key(area, root). Keys must be 0 before. Launched over view,
+    pixel."""
     view, pixel = wp.tid()
     if views.world[view] < 0:
         return
@@ -224,7 +232,7 @@ def unpack_largest_kernel(
     # Out:
     largest_out: wp.array2d[int],  # (view, instance)
 ):
-    """Label of each instance's largest component; -1: the instance is not visible, or the view is unused."""
+    """Label of each instance's largest component; -1: not visible, or the view is unused. Launched over view, instance."""
     view, instance = wp.tid()
     largest_out[view, instance] = NO_COMPONENT
     if views.world[view] >= 0 and largest_key[view, instance] > wp.int64(0):

@@ -85,10 +85,12 @@ def trace_contours_kernel(
     centroid_out: wp.array2d[wp.vec2],  # (world, instance) [px]
     overflow_out: wp.array[int],  # (world)
 ):
-    """Follow each outer border: from the previous pixel, turn counter-clockwise to the next pixel of the component.
+    """Border following (Moore neighbours): pixels of the outer contour of each instance's largest component, their number, and its
+    centroid.
 
-    It begins at the component's smallest index, which is the leftmost of its topmost pixels, and ends when the first step would repeat.
-    Every step reads one patch word. A contour longer than its capacity is truncated, and its world's overflow flag is set to 1.
+    From the previous pixel, turn counter-clockwise to the next pixel of the component. A contour begins at the component's smallest index,
+    which is the leftmost of its topmost pixels, and ends when the first step would repeat. Every step reads one patch word. A contour
+    longer than its capacity is truncated, and its world's overflow flag is set to 1. Launched over view, instance.
     """
     view, instance = wp.tid()
     world = views.world[view]

@@ -53,7 +53,10 @@ def mark_patches_kernel(
     # Out:
     patch_out: wp.array2d[wp.uint16],  # (view, pixel)
 ):
-    """Patch word of each pixel: 1 + instance, and a bit for each of the 8 neighbours in the same component; none beyond the border."""
+    """Patch word of each pixel: 1 + instance, and a bit for each of the 8 neighbours in the same component; none beyond the border.
+
+    Launched over view, pixel (tile order, from flat index `first` on).
+    """
     view, row, column = tile_pixel(grid, wp.tid() + first)
     if not in_image(grid, row, column) or views.world[view] < 0:
         return
@@ -85,7 +88,7 @@ def measure_columns_kernel(
 ):
     """First pass, down and up each column: 256 g + (1 + instance) in patches, else 0.
 
-    g [px] is the distance to the nearest pixel of the column outside the patch.
+    g [px] is the distance to the nearest pixel of the column outside the patch. Launched over view, column.
     """
     view, column = wp.tid()
     if views.world[view] < 0:
@@ -136,7 +139,10 @@ def measure_rows_kernel(
     # Out:
     distance_out: wp.array2d[float],  # (view, pixel) [px]
 ):
-    """Second pass: d = sqrt(min over x' of (x - x')² + g²(x')), searched outward until (x - x')² alone is as large; 0 outside patches."""
+    """Second pass: d = sqrt(min over x' of (x - x')² + g²(x')), searched outward until (x - x')² alone is as large; 0 outside patches.
+
+    Launched over view, pixel (tile order, from flat index `first` on).
+    """
     view, row, column = tile_pixel(grid, wp.tid() + first)
     if not in_image(grid, row, column) or views.world[view] < 0:
         return

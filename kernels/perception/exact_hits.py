@@ -40,8 +40,9 @@ def intersect_hits_kernel(
 ):
     """Replace depth and barycentric weights of each pixel's hit by those that a ray query of the body's mesh returns, to the last bit.
 
-    Rasterization and BVH traversal find the same triangles, but round differently, and a grasp plan amplifies the last bit of a depth
-    into another motion. Hits of the table, and rays that miss the triangle within rounding, keep their values.
+    Rasterization and BVH traversal find the same triangles, but round differently, and a grasp plan amplifies the last bit of a depth into
+    another motion. Hits of the table, and rays that miss the triangle within rounding, keep their values. Launched over view, pixel (tile
+    order, from flat index `first` on).
     """
     view, row, column = tile_pixel(grid, wp.tid() + first)
     if not in_image(grid, row, column) or views.world[view] < 0:

@@ -67,9 +67,10 @@ def smooth_normal_kernel(
     # Out:
     normal_out: wp.array[wp.vec3],  # (world)
 ):
-    """Sum n = Σ n_p over the pixels p of the target's largest component within `window` columns and rows of its grasp pixel.
+    """Smoothed surface normal of each target: n = Σ n_p over pixels p of its largest component, within `window` of its grasp pixel.
 
-    n_p is the interpolated unit shading normal, facing the camera. n is not normalized; the order of the sum is fixed.
+    n_p is the interpolated unit shading normal, facing the camera; the window counts columns and rows. n is not normalized; the order of
+    the sum is fixed. Launched over view.
     """
     view = wp.tid()
     world = views.world[view]
@@ -107,9 +108,10 @@ def frame_grasp_kernel(
     yaw_out: wp.array[float],  # (world) [rad]
     tilt_out: wp.array[float],  # (world) [rad]
 ):
-    """Grasp pose: point c + Rᵀ (d · ray) with planar depth d of the grasp pixel; unit normal within the tilt limit; its yaw and tilt.
+    """Grasp pose of each target: point c + Rᵀ (d · ray) with planar depth d of the grasp pixel; unit normal within the tilt limit; yaw,
+    tilt.
 
-    Worlds without a target keep their values.
+    Worlds without a target keep their values. Launched over view.
     """
     view = wp.tid()
     world = views.world[view]

@@ -23,7 +23,10 @@ def clear_sums_kernel(
     square_out: wp.array2d[wp.int64],  # (view, instance) [2⁻²⁴ m²]
     overflow_out: wp.array[int],  # (world)
 ):
-    """Reset the maxima and sums of every view and instance, and the contour overflow flags of the worlds in the batch, to 0."""
+    """Reset the maxima and sums of every view and instance, and the contour overflow flags of the worlds in the batch, to 0.
+
+    Launched over view, instance.
+    """
     view, instance = wp.tid()
     largest_key_out[view, instance] = wp.int64(0)
     pole_key_out[view, instance] = wp.int64(0)
@@ -47,6 +50,7 @@ def measure_patches_kernel(
     """Reduce each patch: pole of inaccessibility as max over its pixels of pack_key(d², pixel), and Σ z². Both must be 0 at the start.
 
     d² is an integer and is recovered exactly from its float32 root for d < 1600 px; beyond, neighbouring squares may compare as equal.
+    Launched over view, row, strip.
     """
     view, row, strip = wp.tid()
     if views.world[view] < 0:
@@ -115,7 +119,8 @@ def measure_points_kernel(
 ):
     """Visible pixels, visible fraction Σ (z / fx) (z / fy) / expected area, pole p, and distances to the contour at p, c and (p + c) / 2.
 
-    c is the centroid. Instances that are not visible get 0 pixels, fraction 0, distances 0, and points (-1, -1).
+    c is the centroid. Instances that are not visible get 0 pixels, fraction 0, distances 0, and points (-1, -1). Launched over view,
+    instance.
     """
     view, instance = wp.tid()
     world = views.world[view]
@@ -167,7 +172,8 @@ def choose_grasp_points_kernel(
     """Grasp point: of centroid and midpoint the one with the larger r = distance / pole's distance if r > center_fraction; else the pole.
 
     The centroid wins ties. For objects above heavy_mass [kg] the threshold is heavy_center_fraction (Periyasamy et al., 2021). Writes the
-    midpoint, the pixel of the grasp point and its planar depth; (-1, -1) and depth 0 for instances that are not visible.
+    midpoint, the pixel of the grasp point and its planar depth; (-1, -1) and depth 0 for instances that are not visible. Launched over
+    view, instance.
     """
     view, instance = wp.tid()
     world = views.world[view]

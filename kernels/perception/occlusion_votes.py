@@ -97,9 +97,9 @@ def bound_contours_kernel(
 ):
     """Bounding box of each contour, and reach of each instance.
 
-    extent_out[j] = max over the contour of (-column, -row, column, row), which must be NOWHERE at the start;
-    reach_out[j] = perception.reach · diagonal_j · f_x / depth_j [px], unwritten for instances without a catalog entry, which are never
-    visible.
+    extent_out[j] = max over the contour of (-column, -row, column, row), which must be NOWHERE at the start; reach_out[j] =
+    perception.reach · diagonal_j · f_x / depth_j [px], unwritten for instances without a catalog entry, which are never visible. Launched
+    over view, instance, lane.
     """
     view, instance, lane = wp.tid()
     world = views.world[view]
@@ -142,6 +142,7 @@ def count_votes_kernel(
     At a point p with normal n, the pixel p - o n must belong to the largest component of i, and q = p + o n to another instance j with a
     smaller depth; o is the contour offset. The vote is deep if j at q lies below i's grasp point by more than `deep_distance`. A vote is
     rejected if a point of j's contour is farther from q than j's reach: the mask is then too large for j, which true masks hardly ever are.
+    Launched over view, instance, lane: the lanes of an instance stride over its contour.
     """
     view, instance, lane = wp.tid()
     world = views.world[view]
@@ -174,7 +175,7 @@ def weigh_votes_kernel(
     # Out:
     votes_out: wp.array3d[float],  # (world, instance, instance)
 ):
-    """Weighted sum votes[i, j] = full + deep_weight · deep."""
+    """Weighted sum votes[i, j] = full + deep_weight · deep. Launched over view, instance, instance."""
     view, instance, neighbour = wp.tid()
     world = views.world[view]
     if world < 0:

@@ -71,10 +71,11 @@ def choose_target_kernel(
     # Out:
     target_out: wp.array[int],  # (world)
 ):
-    """Visible instance with the fewest ancestors, ties by the largest visible fraction; in mode TARGET the most, ties by the smallest.
+    """Choose a target: the visible instance with the fewest ancestors, ties by the largest visible fraction; -1: none is visible.
 
-    With `random_after_failure`, mode TARGET samples a visible instance uniformly after an attempt that failed in this tick; the index
-    of the coming attempt is the sample's index in the stream. -1: no instance is visible.
+    In mode TARGET the one with the most ancestors, ties by the smallest fraction. With `random_after_failure`, mode TARGET samples a
+    visible instance uniformly after an attempt that failed in this tick; the index of the coming attempt is the sample's index in the
+    stream. Launched over view.
     """
     view = wp.tid()
     world = views.world[view]

@@ -43,7 +43,7 @@ def take_batch_kernel(
     # Out:
     world_out: wp.array[int],  # (view)
 ):
-    """Assign the next worlds of the worklist to the views of a batch; -1: the view is unused."""
+    """Assign the next worlds of the worklist to the views of a batch; -1: the view is unused. Launched over view."""
     view = wp.tid()
     item = next_item[0] + view
     world_out[view] = -1
@@ -61,6 +61,6 @@ def advance_batch_kernel(
     next_inout: wp.array[int],  # (one)
     remaining_out: wp.array[int],  # (one)
 ):
-    """Advance the worklist by one batch; the loop ends when `remaining` is 0."""
+    """Advance the worklist by one batch; the loop ends when `remaining` is 0. Launched as one thread."""
     next_inout[0] = next_inout[0] + views
     remaining_out[0] = wp.max(length[0] - next_inout[0], 0)
