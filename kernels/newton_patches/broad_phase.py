@@ -22,7 +22,7 @@ DIRECTION_STEPS = wp.constant(32767.0)
 
 @wp.struct
 class ShapeData:
-    """Collision shapes of all worlds; arrays are (shape) unless named otherwise."""
+    """Type, mesh, gap and pair mask of the collision shapes of all worlds; arrays are (shape) unless named otherwise."""
 
     count: int
     """Shapes of a world."""
@@ -65,7 +65,7 @@ def boxes_overlap(lower: wp.array[wp.vec3], upper: wp.array[wp.vec3], a: int, b:
 
 @wp.func
 def append_pair(pair: wp.vec2i, pair_inout: wp.array[wp.vec2i], count_inout: wp.array[int]):
-    """Append to a list; the count keeps growing beyond its capacity."""
+    """Append a pair to a list, by an atomic counter; the counter keeps growing beyond the capacity of the list."""
     index = wp.atomic_add(count_inout, 0, 1)
     if index < pair_inout.shape[0]:
         pair_inout[index] = pair
@@ -84,9 +84,10 @@ def list_overlaps_kernel(
     pair_out: wp.array[wp.vec2i],  # (overlap)
     pair_count_inout: wp.array[int],  # (1)
 ):
-    """Find the pairs of shapes of each world whose bounding boxes, enlarged by gaps and margins, overlap; one block of threads per world.
+    """All-pairs broad phase: list the pairs of shapes of each world whose bounding boxes, enlarged by gaps and margins, overlap.
 
-    The block first compacts the shapes that are not empty, then tests all pairs of them. Pairs are listed in arbitrary order.
+    `pair_out` receives the pairs in arbitrary order, `pair_count_inout` is increased by their number, which may exceed the capacity. Shapes
+    that are not empty are first compacted to `occupied_out`. Launched over world, lane: one block of threads per world.
     """
     world, lane = wp.tid()
     first = world * shapes.count
@@ -197,11 +198,13 @@ def reject_separated_kernel(
     pair_out: wp.array[wp.vec2i],  # (pair)
     pair_count_inout: wp.array[int],  # (1)
 ):
-    """Filter the overlaps to candidate pairs: those whose cached axis does not separate the shapes by more than their gaps and margins.
+    """Separating-axis test with temporal coherence: keep the overlaps whose cached axis does not separate their shapes.
 
-    The axis of a pair is a unit vector in the frame of its first shape, kept from substep to substep: it still separates shapes that have
-    moved little since it did. A new pair starts with the axis between the centers of the bounding boxes; an axis that does not separate is
-    improved for the next substep. Whatever the axis, only pairs that can have no contact are rejected.
+    `pair_out` receives the candidate pairs in arbitrary order, `pair_count_inout` is increased by their number. Shapes are separated if
+    they are farther apart along the axis than their gaps and margins. The axis of a pair is a unit vector in the frame of its first shape,
+    kept from substep to substep: it still separates shapes that have moved little. A new pair starts with the axis between the centers of
+    the bounding boxes; an axis that does not separate is improved for the next substep. Whatever the axis, only pairs that can have no
+    contact are rejected. Launched over a fixed number of threads, which stride over the overlaps.
     """
     thread = wp.tid()
     for index in range(thread, wp.min(overlap_count[0], overlap.shape[0]), threads):

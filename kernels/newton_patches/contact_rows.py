@@ -53,7 +53,10 @@ def pack_rows_kernel(
     # Out:
     rows_out: wp.array3d[float],  # (world, row, ROW)
 ):
-    """Pack the constraint rows of contacts with one warp per contact: the normal row, and the friction rows of `WITH_FRICTION` contacts."""
+    """Gather the constraint rows of contacts into `rows_out`: the normal row, and the friction rows of `WITH_FRICTION` contacts.
+
+    Launched over world, thread: `THREADS` threads per world, of which a warp packs one contact at a time.
+    """
     world, thread = wp.tid()
     warp = thread // WARP
     word = thread - warp * WARP

@@ -63,7 +63,9 @@ def compose_contact_sweep(rows: int, bodies: int, offsets: int, friction: str = 
         contacts: ContactRowData,
         twist_inout: wp.array2d[float],
         impulse_inout: wp.array2d[float],
-    ): ...
+    ):
+        """Gauss-Seidel sweep over the contacts of a world: updates the impulses of rows and bodies, and the twists, by one warp."""
+        ...
 
     return sweep_contacts
 

@@ -21,10 +21,13 @@ VELOCITY_LIMITS = wp.constant(5)
 
 @wp.struct
 class JointRowData:
-    """Constraint rows in generalized coordinates: joint limits of the gripper (`world_...`), rows of free bodies (`mf_...`, matrix-free).
+    """Constraint rows that are solved in generalized coordinates: the gripper's joint limits (`world_...`) and the free bodies' rows
+    (`mf_...`).
 
-    Free bodies have contacts up to `mf_contact_rows_end`, none here, and then speed limits. Counts are (world), other arrays (world, row);
-    Jacobians J and responses Y = M⁻¹Jᵀ are (world, row, dof), those of free bodies (world, row, 6). Suffixes a, b: the bodies of a row.
+    Members are arrays of SolverSteel under the names of its parameters: number and type of rows, Jacobians J, responses Y = M⁻¹Jᵀ,
+    right-hand sides, impulses and friction coefficients. `mf` is matrix-free: rows of free bodies, first contacts, up to
+    `mf_contact_rows_end` (none here), then speed limits. Counts are (world), other arrays (world, row); J and Y are (world, row, dof),
+    those of free bodies (world, row, 6). Suffixes a, b: the bodies of a row.
     """
 
     world_constraint_count: wp.array[int]
@@ -61,10 +64,10 @@ class JointRowData:
 
 @wp.struct
 class ContactRowData:
-    """Contacts of bodies, in the order of their graph coloring, and their constraint rows.
+    """Contacts in the order of their graph coloring, and the constraint rows, impulses and friction operators of these contacts.
 
-    A contact has a normal row and friction rows. Contacts of one color share no body. Arrays are flat over all worlds, each of which has as
-    many places for contacts as for rows.
+    A contact has a normal row and friction rows. Contacts of one color share no body. Arrays are flat over all worlds, each of which has
+    capacity for as many contacts as rows.
     """
 
     row_count: wp.array[int]
@@ -80,7 +83,7 @@ class ContactRowData:
     bodies: wp.array2d[int]
     """Bodies with contacts (world, slot)."""
     body_count: wp.array[int]
-    """Their number (world)."""
+    """Number of bodies with contacts (world)."""
     records: wp.array[int]
     """Rows, bodies and friction patch of each contact (world, contact, `contact_rows.RECORD`)."""
     friction_operator: wp.array[float]
@@ -90,7 +93,7 @@ class ContactRowData:
     patch_lists: wp.array[int]
     """Rows of patches with more members than a record has (world, row)."""
     patch_list_length: wp.array[int]
-    """Their number (world)."""
+    """Number of words used in `patch_lists` (world)."""
     is_free: wp.array[bool]
     """Mask of the free bodies; the others are links of the gripper (body)."""
     overflow: wp.array[bool]
@@ -99,8 +102,11 @@ class ContactRowData:
 
 @wp.struct
 class BodyData:
-    """Bodies of all worlds: the gripper, an articulation (tree of joints) in each, with the factors S, U and D⁻¹ of its articulated-body
-    algorithm, and the free bodies. Arrays are (articulation), (world), (joint), (dof) or (body), as named."""
+    """Kinematic trees of the grippers, with the factors of the articulated-body algorithm (Featherstone, 2008), and indices of free bodies.
+
+    Members are arrays of SolverSteel under the names of its parameters. Every world has one articulation (tree of joints), its gripper,
+    with factors S, U and D⁻¹. Arrays are (articulation), (world), (joint), (dof) or (body), as their names say.
+    """
 
     group_to_art: wp.array[int]
     articulation_active: wp.array[int]
@@ -124,7 +130,8 @@ class BodyData:
 
 @wp.struct
 class IterationSettings:
-    """Settings of the iterations, as the solver's methods take them."""
+    """Number of iterations, relaxation factor, and switches of the projected Gauss-Seidel solver; those without a description are as in
+    SolverSteel."""
 
     iterations: int
     omega: float
@@ -162,7 +169,7 @@ def load_free_twists(world: int, lane: int, bodies: BodyData, v: wp.array[float]
 def store_free_twists(
     world: int, lane: int, bodies: BodyData, twist: wp.array2d[float], impulse_inout: wp.array2d[float], v_inout: wp.array[float]
 ):
-    """Copy the twists of the free bodies of a world to generalized velocities, and clear their impulses, by one warp."""
+    """Copy the twists of the free bodies of a world to generalized velocities, and set the impulses of these bodies to 0, by one warp."""
     for element in range(lane, bodies.free_bodies.shape[1] * TWIST, WARP):
         free = element // TWIST
         axis = element - TWIST * free
@@ -172,11 +179,14 @@ def store_free_twists(
 
 
 def bind_row_sweep(function: wp.Function) -> wp.Function:
-    """Wrap the solver's Gauss-Seidel sweep over the rows of `JointRowData` that a row phase names."""
+    """Wrap the solver's Gauss-Seidel sweep in a device function that takes the structs of this module, and return that function.
+
+    The row phase (INTERNAL_ROWS, CONTACT_ROWS or VELOCITY_LIMITS) selects the rows of `JointRowData` that a sweep solves.
+    """
 
     @wp.func
     def sweep_rows(world: int, row_phase: int, iteration: int, settings: IterationSettings, rows: JointRowData, v_inout: wp.array[float]):
-        """Sweep a world once over the rows of a row phase."""
+        """One Gauss-Seidel sweep over the rows of a world in a row phase: updates impulses, and the generalized velocities `v_inout`."""
         function(
             world, rows.world_constraint_count, rows.world_dof_indices, rows.rhs_bias, rows.world_diag, rows.world_impulses,
             rows.J_world, rows.Y_world, rows.world_row_type, rows.world_row_parent, rows.world_row_mu, rows.world_drive_target_vel_bias,
@@ -192,11 +202,12 @@ def bind_row_sweep(function: wp.Function) -> wp.Function:
 
 
 def bind_tree_refresh(function: wp.Function) -> wp.Function:
-    """Wrap the solver's forward pass over the gripper's joints: twists of its bodies from joint velocities."""
+    """Wrap the solver's forward kinematics of velocities in a device function that takes the structs of this module, and return that
+    function."""
 
     @wp.func
     def refresh_tree(world: int, bodies: BodyData, v: wp.array[float], twist_inout: wp.array2d[float]):
-        """Compute the twists of a gripper's bodies."""
+        """Forward kinematics of velocities: write the twists of a gripper's bodies from its joint velocities `v`."""
         function(
             world, bodies.group_to_art, bodies.articulation_active, bodies.art_to_world, bodies.dense_contact_world_flag, 1,
             bodies.articulation_start, bodies.joint_parent, bodies.joint_child, bodies.joint_qd_start, bodies.joint_parent_slot,
@@ -207,11 +218,13 @@ def bind_tree_refresh(function: wp.Function) -> wp.Function:
 
 
 def bind_propagation(function: wp.Function) -> wp.Function:
-    """Wrap the solver's articulated-body algorithm (Featherstone 2008): joint velocities and twists from the impulses on the gripper."""
+    """Wrap the solver's articulated-body algorithm (Featherstone, 2008) in a device function that takes these structs, and return that
+    function."""
 
     @wp.func
     def propagate(world: int, bodies: BodyData, impulse_inout: wp.array2d[float], twist_inout: wp.array2d[float], v_inout: wp.array[float]):
-        """Propagate the impulses on a gripper's bodies through its joints, and clear them."""
+        """Articulated-body algorithm: update joint velocities and twists by the impulses on a gripper's bodies, and set these impulses to
+        0."""
         function(
             world, bodies.group_to_art, bodies.articulation_active, bodies.art_to_world, bodies.cache_world_flag,
             bodies.articulation_start, bodies.joint_parent, bodies.joint_child, bodies.joint_qd_start, bodies.joint_parent_slot,
@@ -242,12 +255,12 @@ def compose_iterations(
         impulse_inout: wp.array2d[float],  # (body, 6) [N s, N m s]
         v_inout: wp.array[float],  # (dof) [m/s, rad/s]
     ):
-        """Run the projected Gauss-Seidel (PGS) iterations of each world, with one warp per world.
+        """Run all projected Gauss-Seidel (PGS) iterations of a substep: `v_inout` and `twist_inout` receive the solved velocities.
 
         An iteration sweeps joint limits, contacts in generalized coordinates, colored contacts, the response of the gripper to these, and
         speed limits; sweeps without rows are skipped. Velocities of free bodies exist twice: in `v`, generalized velocities, and as twists.
         They are copied between the two in every iteration if a sweep over `v` can change them, otherwise before the first and after the
-        last one. Blocks take the worlds in `order`.
+        last one. `impulse_inout` ends as 0. Launched over rank, lane: one warp per world, worlds in `order`.
         """
         rank, lane = wp.tid()
         world = order[rank]

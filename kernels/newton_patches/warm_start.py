@@ -21,10 +21,10 @@ def apply_warm_start_kernel(
     twist_inout: wp.array2d[float],  # (body, 6) [m/s, rad/s]
     body_impulse_inout: wp.array2d[float],  # (body, 6) [N s, N m s]
 ):
-    """Apply the impulses λ of the last substep: each body adds M⁻¹Jᵀλ of its rows to its twist and Jᵀλ to its impulse, in row order.
+    """Warm start: add the impulses λ of the last substep to the bodies, M⁻¹Jᵀλ of their rows to `twist_inout`, Jᵀλ to `body_impulse_inout`.
 
-    One thread for each world, body with contacts, and twist component. SolverSteel has one for each world and component, which walks all
-    rows and waits for each sum. Both sum in the same order, so that results are bitwise identical.
+    Launched over world, body with contacts, twist component; each thread sums its rows in their order. SolverSteel has one thread for each
+    world and component, which walks all rows and waits for each sum. Both sum in the same order, so that results are bitwise identical.
     """
     world, slot, axis = wp.tid()
     if slot >= body_count[world]:

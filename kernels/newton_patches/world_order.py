@@ -46,7 +46,7 @@ def bin_worlds_kernel(
     bin_out: wp.array[int],  # (world)
     place_out: wp.array[int],  # (world)
 ):
-    """Counting sort, first pass: bin of each world, its place in the bin, and the sizes of the bins."""
+    """Counting sort, first pass: bin of each world, its rank in the bin (`place_out`), and the sizes of the bins. Launched over world."""
     world = wp.tid()
     colors = wp.min(count_colors(color_offsets, world * entries, entries), COLOR_BINS - 1)
     bin = COLOR_BINS - 1 - colors
@@ -63,7 +63,10 @@ def order_worlds_kernel(
     # Out:
     order_out: wp.array[int],  # (rank)
 ):
-    """Counting sort, second pass: the worlds in order. Within a bin the order varies between runs; no result depends on it."""
+    """Counting sort, second pass: `order_out` receives the worlds in descending number of colors. Launched over world.
+
+    Within a bin the order varies between runs; no result depends on it.
+    """
     world = wp.tid()
     rank = place[world]
     for before in range(bin[world]):
