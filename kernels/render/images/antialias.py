@@ -50,7 +50,7 @@ which lies on both planes, would lend its colour to samples of the other face.""
 
 @wp.struct
 class ShadedImage:
-    """Linear images of a batch before post-processing."""
+    """Linear radiance of a batch of views before post-processing, and for each anti-aliased pixel the pixels whose radiance it averages."""
 
     radiance: wp.array3d[wp.vec3]
     """Linear radiance (view, row, column) before exposure; of anti-aliased pixels, that of the pixel's centre."""
@@ -203,9 +203,9 @@ def find_footprints_kernel(
 ):
     """Find footprints with a geometric discontinuity and visible contrast, and list them by chunk of tiles, in any order.
 
-    `footprint_out` receives row * columns + column of the grid `footprints`, `count_inout` is increased by the number of footprints,
-    and `resolve_out` is cleared to 0. Footprint (row, column) has pixel (row, column) as its lower right corner, and only one or two
-    corners at the image border.
+    `footprint_out` receives row * columns + column of the grid `footprints`, `count_inout` is increased by the number of footprints, and
+    `resolve_out` is cleared to 0. Footprint (row, column) has pixel (row, column) as its lower right corner, and only one or two corners at
+    the image border. Launched over view, footprint, in tile order.
     """
     view, row, column = tile_pixel(footprints, wp.tid())
     if not in_image(footprints, row, column):
@@ -330,7 +330,7 @@ def resolve_footprints_kernel(
 
     A footprint contains one quadrant of each of its corner pixels, with a quarter of that pixel's `samples`. `resolve_inout` receives the
     samples' source bits. The host does not read the counts, so a fixed number of `threads` strides over the samples of a chunk;
-    neighbouring threads take samples of one footprint, whose rays meet the same bodies.
+    neighbouring threads take samples of one footprint, whose rays meet the same bodies. Launched over view, chunk, thread.
     """
     # Unsigned: cheaper to divide.
     thread = wp.uint32(wp.tid())

@@ -28,7 +28,7 @@ def clear_boxes_counts_kernel(
     pixels_out: wp.array3d[int],  # (view, instance, count)
     boxes_out: wp.array4d[int],  # (view, instance, box, side)
 ):
-    """Set counts to zero and boxes to inverted ones, without pixels."""
+    """Set pixel counts to 0 and boxes to inverted ones, which hold no pixel. Launched over view, instance."""
     view, instance = wp.tid()
     for i in range(3):
         pixels_out[view, instance, i] = 0
@@ -76,8 +76,8 @@ def count_image_pixels_kernel(
 ):
     """Count an instance's pixels inside the image and extend its boxes: reduction in registers, then one atomic operation per thread.
 
-    `threads` threads stride over the instance's projected box. `pixels_inout` is increased by the three counts, `boxes_inout` is
-    extended by the amodal and the visible pixels.
+    `pixels_inout` is increased by the three counts, `boxes_inout` is extended by the amodal and the visible pixels. Launched over view,
+    instance, thread: `threads` threads stride over the projected box of an instance.
     """
     view, instance, thread = wp.tid()
     box = bodies.box[view, instance]
@@ -118,12 +118,12 @@ def count_image_pixels_kernel(
 
 @wp.struct
 class BorderBoxes:
-    """List of the projected boxes that reach beyond the image, cut into chunks of pixels that threads share. Scratch."""
+    """Work list of the projected boxes that reach beyond the image, cut into chunks of pixels that threads share. Scratch."""
 
     owner: wp.array[int]
-    """(listed): view * instances + instance."""
+    """(listed): view * instances + instance of each box."""
     first_chunk: wp.array[int]
-    """(listed): chunks of the boxes before; ascending."""
+    """(listed): index of the first chunk of each box, the number of chunks of the boxes before; ascending."""
     length: wp.array[wp.uint64]
     """(1): boxes in the upper 32 bits and chunks in the lower, so that one atomic addition reserves both in the same order."""
 
@@ -151,7 +151,10 @@ def list_border_boxes_kernel(
     # Out:
     boxes_inout: BorderBoxes,
 ):
-    """List the instances whose boxes reach beyond the image, in any order, with `chunk` pixels to a chunk. `length` starts at 0."""
+    """List the instances whose boxes reach beyond the image, in any order, with `chunk` pixels to a chunk. `length` starts at 0.
+
+    Launched over view, instance.
+    """
     view, instance = wp.tid()
     box = bodies.box[view, instance]
     if is_inside(grid, box):
@@ -197,7 +200,7 @@ def count_border_pixels_kernel(
     """Count amodal pixels outside the image, up to one image size beyond each border, by a ray per pixel of the listed boxes.
 
     Groups of `threads` threads stride over the chunks: one object near the camera has more pixels than all others of a batch.
-    `pixels_inout` is increased by the amodal count, `boxes_inout` is extended in its amodal box.
+    `pixels_inout` is increased by the amodal count, `boxes_inout` is extended in its amodal box. Launched over group, thread.
     """
     group, thread = wp.tid()
     length = border_boxes.length[0]
@@ -228,7 +231,7 @@ def reset_empty_boxes_kernel(
     # Out:
     boxes_inout: wp.array4d[int],  # (view, instance, box, side)
 ):
-    """Set boxes without pixels to (0, 0, -1, -1)."""
+    """Set boxes without pixels to (0, 0, -1, -1). Launched over view, instance, box."""
     view, instance, box = wp.tid()
     if boxes_inout[view, instance, box, 2] < boxes_inout[view, instance, box, 0]:
         boxes_inout[view, instance, box, 0] = 0

@@ -17,7 +17,7 @@ BLUR_REACH = wp.constant(3.0)
 
 @wp.struct
 class EffectRanges:
-    """Ranges from which effect parameters are sampled; see configs.sensors.Effects."""
+    """Lower and upper bound of each effect parameter, and the seed of the bake; see configs.sensors.Effects."""
 
     seed: wp.uint64
     """Seed of the bake."""
@@ -40,7 +40,8 @@ def sample_effects_kernel(
 ):
     """Sample the effect parameters of each view: low_i + (high_i - low_i) u_i, with u_i uniform in [0, 1).
 
-    u_i are those of the random number stream (seed, episode, frame, camera, EFFECTS). JPEG quality is a uniform integer.
+    u_i are those of the random number stream (seed, episode, frame, camera, EFFECTS). JPEG quality is a uniform integer. Launched over
+    view.
     """
     view = wp.tid()
     world = views.world[view]
@@ -62,7 +63,7 @@ def jpeg_quality_kernel(
     # Out:
     quality_out: wp.array[int],  # (view)
 ):
-    """JPEG quality of each view: the sampled one, or `fixed_quality` where there is none."""
+    """JPEG quality of each view: the sampled one, or `fixed_quality` where the effect is off (0). Launched over view."""
     view = wp.tid()
     sampled = int(effects[view][Effect.JPEG_QUALITY])
     quality_out[view] = wp.where(sampled > 0, sampled, fixed_quality)

@@ -21,7 +21,7 @@ MIN_DEPTH = wp.constant(1.0e-3)
 
 @wp.struct
 class SensorParameters:
-    """Parameters of the sensor model; see configs.sensors.DepthSensor."""
+    """Seed, geometry, noise and limits of the structured-light sensor model; see configs.sensors.DepthSensor."""
 
     seed: wp.uint64
     """Seed of the bake."""
@@ -96,7 +96,7 @@ def in_projector_shadow(
 ) -> bool:
     """Shadow test against the projector, to the camera's right: True if a surface in the same image row occludes it.
 
-    The projector column of a pixel is its own column less its disparity. A pixel k columns to the right whose disparity is larger by k
+    The projector column of a pixel is its own column minus its disparity. A pixel k columns to the right whose disparity is larger by k
     lies on the same projector ray and is nearer to the projector. The largest disparity of any body bounds the search.
     """
     here = disparity_at(gbuffer, focal_baseline, view, row, column)
@@ -152,7 +152,8 @@ def render_depth_sensor_kernel(
 
     z is the depth of a pixel displaced by lateral noise, σ its axial noise. `depth_sensor_out` receives f b / d in counts, 0 for invalid
     pixels (holes): no surface, grazing incidence, depth discontinuities, projector shadow, outside of the measuring range. n is of the
-    random number stream (seed, episode, frame, camera, DEPTH_NOISE) and the pixel, so each image has noise of its own.
+    random number stream (seed, episode, frame, camera, DEPTH_NOISE) and the pixel, so each image has noise of its own. Launched over view,
+    pixel (tile order, from flat index `first` on).
     """
     view, row, column = tile_pixel(grid, wp.tid() + first)
     if not in_image(grid, row, column):

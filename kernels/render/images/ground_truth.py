@@ -42,7 +42,7 @@ def gather_cameras_kernel(
     intrinsics_out: wp.array[wp.mat33],  # (view) [px]
     world_to_camera_out: wp.array[wp.mat44],  # (view) [m]
 ):
-    """Gather what belongs to a view as a whole: episode, camera and frame index, camera matrix and extrinsics."""
+    """Gather what belongs to a view as a whole: episode, camera and frame index, camera matrix and extrinsics. Launched over view."""
     view = wp.tid()
     world = views.world[view]
     camera = views.camera[view]
@@ -71,7 +71,7 @@ def gather_objects_kernel(
 ):
     """Gather obj_id and pose of each instance: object to world as simulated, object to camera computed in float64.
 
-    Instances that are not in the scene get obj_id -1 and the identity.
+    Instances that are not in the scene get obj_id -1 and the identity. Launched over view, instance.
     """
     view, instance = wp.tid()
     world = views.world[view]
@@ -99,7 +99,10 @@ def expand_masks_kernel(
     # Out:
     mask_out: wp.array4d[wp.bool],  # (view, instance, row, column)
 ):
-    """Make one binary mask per instance: visible masks from the id image or, if `is_amodal`, amodal masks from the bit field."""
+    """Make one binary mask per instance: visible masks from the id image or, if `is_amodal`, amodal masks from the bit field.
+
+    Launched over view, instance, row, column.
+    """
     view, index, row, column = wp.tid()
     if is_amodal:
         mask_out[view, index, row, column] = ((amodal[view, row, column] >> wp.uint32(index)) & wp.uint32(1)) != wp.uint32(0)

@@ -16,7 +16,7 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.struct
 class BodyMotions:
-    """Scratch, one row a view and body: rigid motion from this frame back to the previous one, in the camera's axes."""
+    """Rigid motion of each body from this frame back to the previous one, in the camera's axes, by view and body. Scratch."""
 
     known: wp.array2d[int]
     """1: the body was in the scene in the previous frame, of the same episode (view, body)."""
@@ -62,8 +62,8 @@ def compute_motions_kernel(
 ):
     """Relative rigid motion of each body: p_then - p = (R_then R⁻¹ - 1) (p - o) + (o_then - o), in float64, stored in float32.
 
-    `motions_out` receives R_then R⁻¹ - 1, o and o_then - o, rotated to the camera's axes. Differences are stored instead of poses, so
-    that small motions have small errors.
+    `motions_out` receives R_then R⁻¹ - 1, o and o_then - o, rotated to the camera's axes. Differences are stored instead of poses, so that
+    small motions have small errors. Launched over view, body.
     """
     view, body = wp.tid()
     world = views.world[view]
@@ -128,7 +128,10 @@ def render_normals_kernel(
     # Out:
     normals_out: wp.array3d[wp.vec3],  # (view, row, column)
 ):
-    """Normal map: the interpolated shading normal in the camera's axes; zero without surface."""
+    """Normal map: the interpolated shading normal in the camera's axes; zero without surface.
+
+    Launched over view, pixel (tile order, from flat index `first` on).
+    """
     view, row, column = tile_pixel(grid, wp.tid() + first)
     if not in_image(grid, row, column):
         return
@@ -155,7 +158,10 @@ def render_albedo_kernel(
     # Out:
     albedo_out: wp.array3d[wp.vec3ub],  # (view, row, column)
 ):
-    """Albedo map: base colour, material times texture filtered over the pixel, as sRGB bytes; black without surface."""
+    """Albedo map: base colour, material times texture filtered over the pixel, as sRGB bytes; black without surface.
+
+    Launched over view, pixel (tile order, from flat index `first` on).
+    """
     view, row, column = tile_pixel(grid, wp.tid() + first)
     if not in_image(grid, row, column):
         return
@@ -181,7 +187,8 @@ def render_nocs_kernel(
 ):
     """NOCS map, normalized object coordinates (Wang et al., 2019): (p - c) / |u - l| + 1/2, c = (l + u) / 2, l and u the mesh's bounds.
 
-    Zero stands for no instance: no point of an object with an extent has 0 in all three components.
+    Zero stands for no instance: no point of an object with an extent has 0 in all three components. Launched over view, pixel (tile order,
+    from flat index `first` on).
     """
     view, row, column = tile_pixel(grid, wp.tid() + first)
     if not in_image(grid, row, column):
@@ -211,7 +218,10 @@ def render_classes_kernel(
     # Out:
     classes_out: wp.array3d[wp.uint16],  # (view, row, column)
 ):
-    """Semantic segmentation: the class id, obj_id, of the visible instance; 0 without instance."""
+    """Semantic segmentation: the class id, obj_id, of the visible instance; 0 without instance.
+
+    Launched over view, pixel (tile order, from flat index `first` on).
+    """
     view, row, column = tile_pixel(grid, wp.tid() + first)
     if not in_image(grid, row, column):
         return
@@ -255,7 +265,10 @@ def render_scene_flow_kernel(
     # Out:
     scene_flow_out: wp.array3d[wp.vec3],  # (view, row, column) [m]
 ):
-    """Backward scene flow: displacement of the surface point to the previous frame, in the camera's axes [m]; NaN: unknown."""
+    """Backward scene flow: displacement of the surface point to the previous frame, in the camera's axes [m]; NaN: unknown.
+
+    Launched over view, pixel (tile order, from flat index `first` on).
+    """
     view, row, column = tile_pixel(grid, wp.tid() + first)
     if not in_image(grid, row, column):
         return
@@ -281,7 +294,8 @@ def render_flow_kernel(
 ):
     """Backward optical flow [px]: f_x ((x + d_x) / (z + d_z) - x / z) = f_x (d_x - (x / z) d_z) / (z + d_z), rows alike.
 
-    NaN where the displacement d is unknown, and where the point was behind the camera.
+    NaN where the displacement d is unknown, and where the point was behind the camera. Launched over view, pixel (tile order, from flat
+    index `first` on).
     """
     view, row, column = tile_pixel(grid, wp.tid() + first)
     if not in_image(grid, row, column):

@@ -40,6 +40,7 @@ def count_boundaries_kernel(
     """Count run boundaries per column: rows, from the first to the one below the image, whose value differs from the row above.
 
     First pass of a stream compaction; `column_count_out` receives each column's count, `list_boundaries_kernel` sums them to offsets.
+    Launched over view, image, column.
     """
     view, image, column = wp.tid()
     count = int(0)
@@ -64,9 +65,9 @@ def list_boundaries_kernel(
 ):
     """Write the run boundaries of an image as a list sorted by column, then row: second pass of a stream compaction.
 
-    `boundaries_out` receives three fields per boundary: position = column · (rows + 1) + row of the pixel below, the value above and
-    the value below. `boundary_count_out` receives the number of boundaries, including those beyond the list's capacity, which are
-    not written.
+    `boundaries_out` receives three fields per boundary: position = column · (rows + 1) + row of the pixel below, the value above and the
+    value below. `boundary_count_out` receives the number of boundaries, including those beyond the list's capacity, which are not written.
+    Launched over view, image, column.
     """
     view, image, column = wp.tid()
     rows = instance_image.shape[1]

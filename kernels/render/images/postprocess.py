@@ -68,7 +68,7 @@ def postprocess_kernel(
 ):
     """Radiance to sRGB without camera effects: exposure (the map's factor times 2 to the episode's exposure value), tone map, transfer.
 
-    `color_out` receives red, green, blue bytes. The thread's pixel index starts at `first`.
+    `color_out` receives red, green, blue bytes. Launched over view, pixel (tile order, from flat index `first` on).
     """
     view, row, column = tile_pixel(grid, wp.tid() + first)
     if not in_image(grid, row, column):
@@ -150,7 +150,7 @@ def filter_lens_rows_kernel(
 ):
     """First pass of the separable lens filter: resolve, vignette, then blur and chromatic aberration along rows; see `filter_lens`.
 
-    `radiance_out` receives linear radiance before exposure.
+    `radiance_out` receives linear radiance before exposure. Launched over view, pixel (tile order, from flat index `first` on).
     """
     view, row, column = tile_pixel(grid, wp.tid() + first)
     if not in_image(grid, row, column):
@@ -164,7 +164,7 @@ def filter_lens_rows_kernel(
 
 @wp.struct
 class PostProcessSettings:
-    """Settings of post-processing with camera effects."""
+    """Seed of the noise, tone map, and whether the lens filter has begun, for post-processing with camera effects."""
 
     seed: wp.uint64
     """Seed of the bake."""
@@ -196,9 +196,9 @@ def postprocess_effects_kernel(
 ):
     """Radiance to sRGB with camera effects: lens, exposure and white balance, sensor noise, tone map, transfer curve.
 
-    After `filter_lens_rows_kernel` the lens filter's second pass, along columns, reads `image.radiance` alone, else the vignette is
-    applied here. Noise is that of the random number stream (seed, episode, frame, camera, COLOR_NOISE). `color_out` receives red,
-    green, blue bytes.
+    After `filter_lens_rows_kernel` the lens filter's second pass, along columns, reads `image.radiance` alone, else the vignette is applied
+    here. Noise is that of the random number stream (seed, episode, frame, camera, COLOR_NOISE). `color_out` receives red, green, blue
+    bytes. Launched over view, pixel (tile order, from flat index `first` on).
     """
     view, row, column = tile_pixel(grid, wp.tid() + first)
     if not in_image(grid, row, column):

@@ -42,7 +42,7 @@ MIN_LOBE_PROBABILITY = wp.constant(0.25)
 
 @wp.struct
 class AlbedoTables:
-    """Directional albedo of the single-scattering GGX lobe: F₀ times the first component (a) plus the second (b)."""
+    """Precomputed directional albedo of the single-scattering GGX lobe: F₀ times the first component (a) plus the second (b)."""
 
     directional: wp.array2d[wp.vec2]
     """(roughness, √cosine)."""
@@ -379,7 +379,10 @@ def measure_albedo_kernel(
     # Out:
     albedo_out: wp.array2d[wp.vec2],  # (roughness, cosine)
 ):
-    """Measure the directional albedo table: the mean of (1 - s, s) G₂ / G₁ over sampled visible normals, s Schlick's weight."""
+    """Measure the directional albedo table: the mean of (1 - s, s) G₂ / G₁ over sampled visible normals, s Schlick's weight.
+
+    Launched over row (roughness), column (√cosine).
+    """
     row, column = wp.tid()
     roughness = float(row) / float(ALBEDO_ROWS - 1)
     root = float(column) / float(ALBEDO_COLUMNS - 1)

@@ -18,12 +18,12 @@ MIN_WEIGHT = wp.constant(1.0e-4)
 
 @wp.struct
 class CoarseGrid:
-    """Grid of coarse pixels over an image; the pixel in the middle of each represents it."""
+    """Grid of coarse pixels over an image: their size, both grids, and rays per lamp; the pixel in the middle of each represents it."""
 
     size: int
     """Width of a coarse pixel [px]; 0 in mode unoccluded, which has none."""
     rays: int
-    """Shadow grid: rays to a lamp from each pixel at the steep edge of its shadow, 1 or 4."""
+    """Shadow rays to a lamp from each full-resolution pixel at a steep edge of its shadow, 1 or 4; used by the shadow grid alone."""
     image: ImageGrid
     """Full-resolution grid [px]."""
     grid: ImageGrid
@@ -32,7 +32,7 @@ class CoarseGrid:
 
 @wp.struct
 class Guide:
-    """Guide image of the joint bilateral filters: a G-buffer at coarse resolution. Scratch."""
+    """Guide image of the joint bilateral filters: normal, depth and segmentation id at coarse resolution. Scratch."""
 
     surface: wp.array3d[wp.vec4]
     """(view, cell_row, cell_column): packed by `pack_surface`; 0, with the segmentation id NOTHING, where no surface is visible."""

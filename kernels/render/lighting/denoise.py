@@ -1,6 +1,6 @@
 """Variance-guided denoiser: the widest of three kernels (16², 8², 4² coarse pixels) whose mean agrees with the narrower ones within noise.
 
-It filters visibility ratios (see `paths.coarse`) in three passes: joint bilateral means over blocks, choice of the kernel, smoothing.
+Visibility ratios (see `paths.coarse`) are filtered in three passes: joint bilateral means over blocks, choice of the kernel, smoothing.
 `upsampling` then interpolates them at full resolution.
 """
 
@@ -174,6 +174,7 @@ def filter_blocks_kernel(
     """Narrow filter: bilateral mean over the block of 4 x 4 around each coarse pixel, and the variance of the mean visibility ratio.
 
     The variance of a mean is that of its samples over their effective number, (Σ w)² / Σ w². All members of `blocks_out` are written.
+    Launched over view, coarse pixel (tile order, from flat index `first` on).
     """
     view, row, column = tile_pixel(coarse.grid, wp.tid() + first)
     if not in_image(coarse.grid, row, column):
@@ -282,6 +283,7 @@ def choose_widths_kernel(
 
     Blocks of a kernel do not overlap, so the mean of n blocks has 1/n of a block's variance. A block's variance is its estimate, see
     `firefly_variance`, times `variance_scale`. Indirect light always takes the wide kernel. All members of `ratios_out` are written.
+    Launched over view, coarse pixel (tile order, from flat index `first` on).
     """
     view, row, column = tile_pixel(coarse.grid, wp.tid() + first)
     if not in_image(coarse.grid, row, column):
@@ -339,7 +341,10 @@ def smooth_ratios_kernel(
     # Out:
     ratios_out: RatioImages,
 ):
-    """Bilateral mean over 3 x 3 coarse pixels, which hides the borders between kernel widths. All members of `ratios_out` are written."""
+    """Bilateral mean over 3 x 3 coarse pixels, which hides the borders between kernel widths. All members of `ratios_out` are written.
+
+    Launched over view, coarse pixel (tile order, from flat index `first` on).
+    """
     view, row, column = tile_pixel(coarse.grid, wp.tid() + first)
     if not in_image(coarse.grid, row, column):
         return

@@ -18,9 +18,10 @@ SH_CONSTANT = wp.constant(0.282095)
 
 @wp.struct
 class Lights:
-    """Environment maps and their precomputed tables. Constant. A world rotates its map about +z by its yaw.
+    """Environment maps, their lamps, and precomputed tables (prefiltered maps, spherical harmonics of the irradiance). Constant.
 
-    A map's lamps are its small and bright lights, split off from the rest: see `scenes.lamps`. Directions are in the map's frame.
+    A map's lamps are its small and bright lights, split off from the rest: see `scenes.lamps`. Directions are in the map's frame; a world
+    rotates its map about +z by its yaw.
     """
 
     maps: int

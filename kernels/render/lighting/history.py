@@ -39,8 +39,11 @@ NEVER = wp.constant(-2)
 
 @wp.struct
 class LightHistory:
-    """Temporally accumulated light of the coarse pixels, and the previous frame's shadow rays, of each world and camera. Members as in
-    `CoarseLight`."""
+    """Temporal accumulation: averaged light of the coarse pixels, its history length, and the previous frame's shadow rays, by world and
+    camera.
+
+    Members are named as in `CoarseLight`; the unoccluded light is not accumulated.
+    """
 
     diffuse: wp.array3d[wp.uint64]
     specular: wp.array3d[wp.uint64]
@@ -73,7 +76,11 @@ def advance_history_kernel(
     history_inout: LightHistory,
     moving_out: MovingBodies,
 ):
-    """Write `holds`, and advance the history's frame index to this frame."""
+    """Write `holds` (the history contains the previous frame of the same episode), and set episode and frame of the history to this
+    frame's.
+
+    Launched over view.
+    """
     view = wp.tid()
     world = views.world[view]
     slot = world * history_inout.cameras + views.camera[view]

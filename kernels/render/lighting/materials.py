@@ -31,7 +31,10 @@ TRIANGLE_RECORDS = wp.constant(5)
 
 @wp.struct
 class Surfaces:
-    """Materials, textures and shading normals. Constant. Rows called mesh are those of `Meshes`, and a last one for the table."""
+    """Materials, textures and shading normals of all meshes. Constant.
+
+    Rows called mesh are those of `Meshes`, and a last one for the table.
+    """
 
     triangle: wp.array[wp.vec4]
     """(TRIANGLE_RECORDS x triangle): shading data, triangles in the order of `Meshes.corner`. Records 0 to 2: vertex normal and texture
@@ -57,7 +60,7 @@ class Surfaces:
 
 @wp.struct
 class Surface:
-    """Shading data at one hit."""
+    """Material row, geometric and interpolated normal, and texture coordinates with their footprint, at one hit."""
 
     row: int
     """Row of `Surfaces`."""

@@ -21,7 +21,7 @@ MAX_FRAMES = wp.constant(1 << 20)
 
 @wp.struct
 class MovingBodies:
-    """Motion of the bodies of each view since the previous frame. Scratch."""
+    """Bodies of each view that moved, appeared or disappeared since the previous frame: boxes, poses and displacements. Scratch."""
 
     holds: wp.array[int]
     """(view): 1: the history contains the previous frame of the same episode."""
@@ -129,7 +129,11 @@ def find_moving_bodies_kernel(
     # Out:
     moving_inout: MovingBodies,
 ):
-    """List the bodies of each view that moved since the previous frame, came or went, if the history holds that frame (`holds`)."""
+    """List the bodies of each view that moved, appeared or disappeared since the previous frame, if the history contains that frame
+    (`holds`).
+
+    Writes all members of `MovingBodies` but `holds`. Launched over view.
+    """
     view = wp.tid()
     if moving_inout.holds[view] == 0:
         return

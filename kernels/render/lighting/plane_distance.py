@@ -9,7 +9,7 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.struct
 class Plane:
-    """Tangent plane at a pixel or coarse pixel, in image space: n · ray is linear in row and column."""
+    """Tangent plane at a pixel or coarse pixel: segmentation id, normal, and n · ray as a linear function of row and column."""
 
     segment: wp.uint8
     """Segmentation id, as in `GBuffer`."""

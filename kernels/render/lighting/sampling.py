@@ -9,7 +9,8 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.struct
 class EnvironmentCdf:
-    """Importance sampling of environment maps (Pharr, Jakob and Humphreys, Physically Based Rendering): CDFs over texels.
+    """CDFs over the texels of the environment maps with guide tables, for importance sampling (Pharr, Jakob and Humphreys, Physically Based
+    Rendering).
 
     A texel's probability is the difference of neighbouring entries of `marginal` times that of `conditional`.
     """
@@ -27,7 +28,7 @@ class EnvironmentCdf:
 
 @wp.struct
 class EnvironmentSample:
-    """A direction towards the environment map, sampled for next-event estimation."""
+    """Direction sampled from the environment map for next-event estimation, with its density and weighted radiance."""
 
     direction: wp.vec3
     """Unit vector, in the map's frame or in the world."""

@@ -48,7 +48,7 @@ from a triangle that is narrower than a pixel would be meaningless. From 0.5 to 
 
 @wp.struct
 class Sky:
-    """Environment light of a world."""
+    """Environment map of a world, and the rotation of the map."""
 
     light: int
     """Index of the environment map."""
@@ -58,7 +58,7 @@ class Sky:
 
 @wp.struct
 class PixelLight:
-    """Light at a pixel's surface."""
+    """Upsampled lighting of a pixel: visibility ratios and indirect light of the environment, visible fractions of the lamps."""
 
     ratios: Ratios
     """Visibility ratios of the environment's diffuse and specular light, and indirect light, which is absolute."""
@@ -258,7 +258,10 @@ def shade_kernel(
     # Out:
     radiance_out: wp.array3d[wp.vec3],  # (view, row, column)
 ):
-    """Shade each pixel at its center, in the upsampled denoised light; background pixels show the environment map."""
+    """Shade each pixel at its center, in the upsampled denoised light; background pixels show the environment map.
+
+    Launched over view, pixel (tile order, from flat index `first` on).
+    """
     view, row, column = tile_pixel(coarse.image, wp.tid() + first)
     if in_image(coarse.image, row, column):
         sky = world_sky(light, light_yaw, views.world[view])
@@ -287,7 +290,10 @@ def shade_samples_kernel(
     # Out:
     radiance_out: wp.array3d[wp.vec3],  # (view, row, column)
 ):
-    """Shade each pixel as `shade_kernel`, but bodies with several shading samples a pixel."""
+    """Shade each pixel as `shade_kernel`, but bodies with several shading samples a pixel.
+
+    Launched over view, pixel (tile order, from flat index `first` on).
+    """
     view, row, column = tile_pixel(coarse.image, wp.tid() + first)
     if in_image(coarse.image, row, column):
         sky = world_sky(light, light_yaw, views.world[view])

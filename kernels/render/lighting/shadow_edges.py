@@ -27,7 +27,10 @@ CELLS, PIXELS = wp.constant(0), wp.constant(1)
 
 @wp.struct
 class EdgeLists:
-    """Lists of the pixels near steep edges of shadows. Scratch. A chunk is a run of tiles of the shadow grid with lists of its own."""
+    """Work lists of the shadow grid's pixels near shadow edges and of the image's pixels that trace rays, with their lengths. Scratch.
+
+    A chunk is a run of tiles of the shadow grid with lists of its own.
+    """
 
     cell: wp.array3d[int]
     """(view, edge_chunk, chunk_cell): row * columns + column of pixels of the shadow grid, in whose squares all pixels are examined."""
@@ -39,7 +42,7 @@ class EdgeLists:
 
 @wp.func
 def list_place(lists: EdgeLists, thread: int, threads: int) -> tuple[int, int, int]:
-    """(view, chunk, first entry) of a thread, of `threads` that share the list of a chunk."""
+    """View, chunk and first list entry of a thread, of the `threads` threads that share the list of a chunk."""
     # Unsigned: cheaper to divide.
     place = wp.uint32(thread) // wp.uint32(threads)
     chunks = wp.uint32(lists.count.shape[1])
@@ -63,9 +66,10 @@ def list_edge_cells_kernel(
     shadows_inout: LampShadows,
     lists_inout: EdgeLists,
 ):
-    """List the pixels of the shadow grid that `near_edge` marks, in any order (stream compaction), and clear the marks.
+    """Stream compaction: `cell` receives the pixels of the shadow grid that `near_edge` marks, in any order; the marks are cleared.
 
-    Launched over the shadow grid in tile order. The counters, which must be 0, receive their number.
+    `count`, which must be 0, receives the number at CELLS. Launched over view, pixel of the shadow grid (tile order, from flat index
+    `first` on).
     """
     view, row, column = tile_pixel(coarse.grid, wp.tid() + first)
     if view < views.count and in_image(coarse.grid, row, column):
@@ -105,9 +109,10 @@ def list_edge_pixels_kernel(
     shadows_inout: LampShadows,
     lists_inout: EdgeLists,
 ):
-    """List the pixels at which a lamp's shadow is steep, in any order; their steepness is written to `edge`, which must be 0.
+    """Stream compaction: `pixel` receives the pixels at which a lamp's shadow is steep, in any order; `count` their number at PIXELS.
 
-    The host does not read the counts, so a fixed number of `threads` strides over the listed pixels of the shadow grid of each chunk.
+    The steepness at these pixels is written to `edge`, which must be 0. Launched over view, chunk, thread (flat, from `first` on): the host
+    does not read the counts, so a fixed number of `threads` strides over the listed pixels of the shadow grid of each chunk.
     """
     view, chunk, start = list_place(lists_inout, wp.tid() + first, threads)
     if view >= views.count:
@@ -184,10 +189,12 @@ def trace_shadow_edges_kernel(
     # Out:
     shadows_inout: LampShadows,
 ):
-    """Trace `CoarseGrid.rays` rays from each listed pixel to each lamp whose shadow is steep, to all if no pixel of the shadow grid
-    around it is on its surface; their results replace the steepness in `edge`.
+    """Adaptive sampling: trace shadow rays from each listed pixel to each lamp whose shadow is steep; the results replace the steepness in
+    `edge`.
 
-    Rays to lamps behind the surface count as free, as on the shadow grid. `threads` as in `list_edge_pixels_kernel`.
+    There are `CoarseGrid.rays` rays to a lamp. Where no pixel of the shadow grid around a pixel is on its surface, all lamps count as
+    steep. Rays to lamps behind the surface count as unblocked, as on the shadow grid. Launched over view, chunk, thread (flat, from `first`
+    on); `threads` as in `list_edge_pixels_kernel`.
     """
     view, chunk, start = list_place(lists, wp.tid() + first, threads)
     if view >= views.count:
@@ -222,9 +229,9 @@ def filter_shadow_edges_kernel(
     # Out:
     shadows_inout: LampShadows,
 ):
-    """Write `edge_fractions` of each listed pixel: visible fractions of the lamps by the rays of the pixels around it.
+    """Filter the traced edges: `edge_fractions` of each listed pixel receives the visible fractions of the lamps, see `filter_edge`.
 
-    `threads` as in `list_edge_pixels_kernel`.
+    Launched over view, chunk, thread (flat, from `first` on); `threads` as in `list_edge_pixels_kernel`.
     """
     view, chunk, start = list_place(lists, wp.tid() + first, threads)
     if view >= views.count:

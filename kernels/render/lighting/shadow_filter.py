@@ -1,4 +1,4 @@
-"""Wide penumbrae: lamp shadows filtered on the shadow grid, and how steep they are.
+"""Filter of lamp shadows in wide penumbrae, on the shadow grid, and a measure of their steepness, where the filter would blur edges.
 
 The filter is centered, and has the same weight for each part of a lamp, wherever it lies: it leaves no pattern of the sample points. Where
 it would blur a shadow's edge, the shadow is steep, and `shadow_edges` traces rays from its pixels.
@@ -39,8 +39,8 @@ STEEPNESS_LEVELS = wp.constant(7)
 """Levels of steepness, STEEPNESS_BITS for each lamp; the highest: filtered fractions do not count."""
 STEEPNESS_BITS = wp.constant(3)
 MIN_COSINE = wp.constant(0.87)
-"""Minimum cosine of the angle between the normals of one surface. Lamps behind a surface count as free, and must not light one that bends
-towards them, such as the bevel between a wall and the floor."""
+"""Minimum cosine of the angle between the normals of one surface. Lamps behind a surface count as unblocked, and must not light one that
+bends towards them, such as the bevel between a wall and the floor."""
 MIN_SUPPORT = wp.constant(4)
 """Of the eight pixels around a pixel, REACH away, so many must lie on its surface, or its fractions are taken from too few rays."""
 EVEN_BYTES = wp.constant(wp.uint64(0x00FF00FF00FF00FF))
@@ -51,17 +51,19 @@ SEGMENT_BITS = wp.constant(wp.uint32(0xFF))
 
 @wp.struct
 class LampShadows:
-    """Shadows of the lamps. Scratch."""
+    """Visible fraction of each lamp and steepness of its shadow, on the shadow grid and at pixels that traced rays of their own.
+    Scratch."""
 
     fractions: wp.array3d[wp.uint64]
     """(view, shadow_row, shadow_column): filtered visible fractions of the lamps, byte k that of lamp k in 1/255."""
     record: wp.array3d[wp.vec4]
     """(view, shadow_row, shadow_column): the same with steepness, depth and segmentation id, packed by `pack_shadows`."""
     near_edge: wp.array3d[wp.uint8]
-    """(view, shadow_row, shadow_column): 1 in pixels around steep shadows and edges of surfaces, 0 elsewhere; between frames 0."""
+    """(view, shadow_row, shadow_column): 1 in pixels around steep shadows and edges of surfaces, 0 elsewhere; cleared to 0 when they
+    are listed."""
     edge: wp.array3d[wp.uint32]
-    """(view, row, column): rays from the pixel itself at steep edges, 4 bits a lamp: 0, or 1 + the number of free rays. Before they are
-    traced: steepness as in `record`."""
+    """(view, row, column): rays from the pixel itself at steep edges, 4 bits a lamp: 0, or 1 + the number of unblocked rays. Before
+    they are traced: steepness as in `record`."""
     edge_fractions: wp.array3d[wp.uint64]
     """(view, row, column): as `fractions`, where `edge` is not 0; undefined elsewhere."""
 
@@ -110,11 +112,11 @@ def shadow_segment(record: wp.vec4) -> wp.uint8:
 
 @wp.func
 def lamp_fractions(even: wp.uint64, odd: wp.uint64, weight: int, lamps: int, rays: int) -> wp.uint64:
-    """Visible fractions of the lamps, byte k that of lamp k in 1/255, from weighted sums of free rays.
+    """Visible fractions of the lamps, byte k that of lamp k in 1/255, from weighted sums of unblocked rays.
 
     Args:
         even: Sums of the rays with an even index, 16 bits each.
-        odd: Those of the rays with an odd index.
+        odd: Sums of the rays with an odd index, 16 bits each.
         weight: Sum of the weights.
         lamps: Number of lamps.
         rays: Rays to each lamp.
@@ -193,9 +195,10 @@ def filter_shadows_kernel(
     # Out:
     shadows_out: LampShadows,
 ):
-    """Visible fraction of each lamp: the mean over a window of 5 x 5 pixels on one body and near one tangent plane; `fractions` is written.
+    """Tent-edged mean filter of shadow rays: `fractions` receives the visible fraction of each lamp over 5 x 5 pixels on one surface.
 
-    Nothing is written in views under a map without lamps and where no surface is visible.
+    Pixels count if they are on the same body and near one tangent plane. Nothing is written in views under a map without lamps and where no
+    surface is visible. Launched over view, pixel of the shadow grid (tile order, from flat index `first` on).
     """
     view, row, column = tile_pixel(coarse.grid, wp.tid() + first)
     if not in_image(coarse.grid, row, column):
@@ -231,7 +234,7 @@ def filter_shadows_kernel(
     return result;
 """)
 def min_bytes(a: wp.uint32, b: wp.uint32) -> wp.uint32:
-    """Minimum of each byte."""
+    """Minimum of each of the four bytes of two words."""
     ...
 
 
@@ -244,13 +247,13 @@ def min_bytes(a: wp.uint32, b: wp.uint32) -> wp.uint32:
     return result;
 """)
 def max_bytes(a: wp.uint32, b: wp.uint32) -> wp.uint32:
-    """Maximum of each byte."""
+    """Maximum of each of the four bytes of two words."""
     ...
 
 
 @wp.struct
 class FractionRange:
-    """Minimum and maximum of packed fractions: lamps 0 to 3, and 4 to 7."""
+    """Minimum and maximum of the visible fractions of lamps 0 to 3 and of lamps 4 to 7, a byte for each lamp."""
 
     low_min: wp.uint32
     low_max: wp.uint32
@@ -273,12 +276,15 @@ def extend_range(range_: FractionRange, fractions: wp.uint64) -> FractionRange:
 
 @wp.func
 def steepness_levels(lowest: int, highest: int, share: float, supported: bool) -> int:
-    """Steepness of a lamp's shadow, from 0 to STEEPNESS_LEVELS.
+    """Steepness of a lamp's shadow at a pixel, from 0 to STEEPNESS_LEVELS.
+
+    It grows with the range of the visible fraction, weighted by the lamp's share. Without support it is STEEPNESS_LEVELS, unless the lamp
+    is entirely visible or entirely hidden around the pixel (0).
 
     Args:
-        lowest, highest: Extremes of its visible fraction around a pixel [1/255].
+        lowest, highest: Extremes of the visible fraction around the pixel [1/255].
         share: Share of the lamp, see FULL_SHARE.
-        supported: Whether enough of what is around the pixel is on its surface.
+        supported: Whether at least MIN_SUPPORT pixels around are on the pixel's surface.
     """
     if share < MIN_SHARE:
         return 0
@@ -304,7 +310,10 @@ def range_steepness(lights: Lights, which: int, extremes: FractionRange, support
 
 @wp.func
 def mark_edges(coarse: CoarseGrid, near_edge: wp.array3d[wp.uint8], view: int, row: int, column: int, reach: int):
-    """Mark the pixels of the grid from (row - `reach`, column - `reach`) to (row + 1, column + 1). All threads write the same value."""
+    """Set `near_edge` to 1 at the pixels of the shadow grid from (row - `reach`, column - `reach`) to (row + 1, column + 1).
+
+    All threads write the same value.
+    """
     for r in range(wp.max(row - reach, 0), wp.min(row + 2, coarse.grid.height)):
         for c in range(wp.max(column - reach, 0), wp.min(column + 2, coarse.grid.width)):
             near_edge[view, r, c] = wp.uint8(1)
@@ -328,10 +337,11 @@ def measure_steepness_kernel(
     # Out:
     shadows_inout: LampShadows,
 ):
-    """Steepness of each lamp's shadow: the range of its fractions over nine pixels, REACH apart, on one surface; `record` is written.
+    """Steepness of each lamp's shadow, the range of its fractions over nine pixels, REACH apart, on one surface: `record` is written.
 
-    Pixels of the image whose four nearest pixels of the grid are not all on one surface may be on none of theirs. `near_edge` marks where
-    such pixels are, and those around which a shadow is steep.
+    `near_edge` is set around pixels whose shadow is steep, and around those whose right and lower neighbours are not all on the same
+    surface: pixels of the image between them may find no pixel of the shadow grid on their own surface. Launched over view, pixel of the
+    shadow grid (tile order, from flat index `first` on).
     """
     view, row, column = tile_pixel(coarse.grid, wp.tid() + first)
     if not in_image(coarse.grid, row, column):

@@ -45,7 +45,7 @@ NIBBLE_ONES = wp.constant(wp.uint32(0x11111111))
 TapVector = wp.types.vector(length=4, dtype=wp.uint64)
 """Visible fractions of the lamps at the four nearest pixels of the shadow grid."""
 LevelVector = wp.types.vector(length=4, dtype=wp.uint32)
-"""Steepness of the lamps' shadows there."""
+"""Steepness of the lamps' shadows at the four nearest pixels of the shadow grid."""
 
 
 @wp.func
@@ -70,7 +70,7 @@ def blend_bytes(taps: TapVector, weights: wp.vec4) -> wp.uint64:
 
 @wp.struct
 class ShadowTaps:
-    """The four nearest pixels of the shadow grid around a pixel."""
+    """Fractions, weights and steepness at the four pixels of the shadow grid around a pixel, for bilinear interpolation."""
 
     fractions: TapVector
     """Visible fractions of the lamps."""
@@ -79,7 +79,7 @@ class ShadowTaps:
     steepness: LevelVector
     """Steepness of the lamps' shadows; 0 on other surfaces."""
     found: bool
-    """Whether any of them shows the pixel's surface."""
+    """Whether any of the four shows the surface of the pixel."""
 
 
 @wp.func
@@ -116,7 +116,10 @@ def find_shadow_taps(shadows: LampShadows, coarse: CoarseGrid, view: int, row: i
 
 @wp.func
 def all_steepness(taps: ShadowTaps) -> wp.uint32:
-    """Steepness of any of the taps, above 0 where one is steep; all bits if none shows the pixel's surface."""
+    """Bitwise union of the taps' steepness, STEEPNESS_BITS for each lamp: above 0 where the shadow is steep at any tap.
+
+    All bits are set if no tap shows the pixel's surface.
+    """
     steepness = taps.steepness[0] | taps.steepness[1] | taps.steepness[2] | taps.steepness[3]
     return wp.where(taps.found, steepness, ~wp.uint32(0))
 
@@ -144,7 +147,7 @@ def edge_reach(rays: int) -> int:
 
 @wp.struct
 class EdgeSums:
-    """Weighted sums of `LampShadows.edge` over a window, 8 bits for each lamp: even and odd lamps."""
+    """Weighted sums of unblocked rays in `LampShadows.edge` over a window, and of the weights, 8 bits for each lamp: even and odd lamps."""
 
     even: wp.uint32
     odd: wp.uint32
@@ -181,7 +184,10 @@ def sum_edges(shadows: LampShadows, coarse: CoarseGrid, gbuffer: GBuffer, view: 
 
 @wp.func
 def edge_fraction(sums: EdgeSums, lamp: int, rays: int, fallback: float) -> float:
-    """Visible fraction of a lamp [1/255], of `rays` rays from each pixel; `fallback` where none was traced."""
+    """Visible fraction of a lamp [1/255]: its weighted sum of unblocked rays over that of the `rays` rays of each pixel that traced any.
+
+    `fallback` where no pixel in the window traced a ray to the lamp.
+    """
     shift = wp.uint32(8 * (lamp >> 1))
     values = int((wp.where(lamp & 1 == 0, sums.even, sums.odd) >> shift) & wp.uint32(0xFF))
     weight = int((wp.where(lamp & 1 == 0, sums.even_weight, sums.odd_weight) >> shift) & wp.uint32(0xFF))
@@ -196,8 +202,8 @@ def filter_edge(
 ) -> wp.uint64:
     """Visible fractions of the lamps at a pixel that traced rays, byte k that of lamp k in 1/255.
 
-    The steeper a lamp's shadow, the more count the rays from pixels around it, on its surface, whose tangent plane is `plane`, instead of
-    what is interpolated; they alone where no pixel of the shadow grid around it is on its surface.
+    Blends, by steepness, from the fractions interpolated on the shadow grid to the mean over the rays of the pixels around, on the surface
+    whose tangent plane is `plane`. Where no pixel of the shadow grid around is on this surface, the rays alone count.
     """
     taps = find_shadow_taps(shadows, coarse, view, row, column, plane)
     wide = blend_bytes(taps.fractions, taps.weights)

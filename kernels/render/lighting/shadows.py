@@ -65,8 +65,10 @@ def pack_last(segment: int, rays: int) -> wp.uint16:
 
 @wp.func
 def pack_rays(rays: int, depth: float, segment: int, normal: int) -> wp.uint64:
-    """Pack the bits of a pixel's shadow rays (1: free) with the surface's segmentation id, depth [m] and packed normal;
-    so the filter reads each neighbour once. Ray j to lamp k has bit k * `Lights.lamp_rays` + j."""
+    """Pack the bits of a pixel's shadow rays (1: unblocked) with segmentation id, depth [m] and packed normal of the surface.
+
+    The filter thus reads each neighbour once. Ray j to lamp k has bit k * `Lights.lamp_rays` + j.
+    """
     return (wp.uint64(wp.cast(depth, wp.uint32)) << wp.uint64(32)) | wp.uint64((normal << 16) | (segment << 8) | rays)
 
 
@@ -164,14 +166,17 @@ def may_change(moving: MovingBodies, view: int, origin: wp.vec3, direction: wp.v
 
 @wp.func
 def is_refreshed(row: int, column: int, frame: int) -> bool:
-    """Whether a coarse pixel traces all its shadow rays in this frame anyway; by tiles, so that all threads of a warp do."""
+    """Whether a pixel of the shadow grid traces all its shadow rays in this frame, as in one of REFRESH_FRAMES frames.
+
+    The frame is chosen by tile, so that all threads of a warp refresh together.
+    """
     return (TILE_SHIFT * (row // TILE_HEIGHT) + column // TILE_WIDTH + frame) % REFRESH_FRAMES == 0
 
 
 @wp.func
 def is_calm(moving: MovingBodies, view: int, segment: int, instances: int) -> bool:
-    """Whether a visible body moved by at most MAX_DRIFT / CALM_FRAMES in this frame, so that its shadows may be reused; the table never
-    moves."""
+    """Whether the visible body moved by at most MAX_DRIFT / CALM_FRAMES in this frame, so that shadows on it may be reused; the table is
+    always calm."""
     if segment == Segment.TABLE:
         return True
     return moving.drift_frames[view, body_of(segment, instances)] >= CALM_FRAMES
@@ -204,9 +209,10 @@ def is_shadowed(
 def last_rays(
     history: LightHistory, moving: MovingBodies, views: Views, view: int, slot: int, row: int, column: int, segment: int
 ) -> tuple[bool, int]:
-    """(True, bits of a pixel's shadow rays in the previous frame) if they may be reused, else (False, 0).
+    """Temporal reuse: (True, bits of a pixel's shadow rays in the previous frame) if these may be reused, else (False, 0).
 
-    They may if the history holds that frame, the pixel showed the same body, which is calm, and it is not refreshed in this frame.
+    They may if the history contains that frame, the pixel showed the same body, the body is calm (`is_calm`), and the pixel is not
+    refreshed in this frame (`is_refreshed`).
     """
     if history.max_paths == 0 or moving.holds[view] == 0:
         return False, 0
@@ -251,9 +257,11 @@ def trace_shadow_rays_kernel(
     history_inout: LightHistory,
     rays_out: wp.array3d[wp.uint64],  # (view, shadow_row, shadow_column)
 ):
-    """Trace the shadow rays of a coarse pixel from its middle pixel, or reuse those of the previous frame; packed by `pack_rays`.
+    """Shadow rays from the middle pixel of each pixel of the shadow grid, traced or reused from the previous frame, packed by `pack_rays`.
 
-    Under a map without lamps nothing is written. Rays to lamps behind the surface count as free, so that the filter darkens no edges.
+    Writes `rays_out`, and the bits for the next frame into the history (`LightHistory.shadows`). Under a map without lamps nothing is
+    written. Rays to lamps behind the surface count as unblocked, so that the filter darkens no edges. Launched over view, pixel of the
+    shadow grid (tile order, from flat index `first` on).
     """
     view, row, column = tile_pixel(coarse.grid, wp.tid() + first)
     if not in_image(coarse.grid, row, column):

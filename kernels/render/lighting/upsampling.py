@@ -25,7 +25,7 @@ half of its depth and its segmentation id as tags. One look-up reads all that up
 
 @wp.struct
 class RatioImages:
-    """Denoised light of coarse pixels. Scratch."""
+    """Denoised visibility ratios and indirect light of the coarse pixels, with depth and segmentation id. Scratch."""
 
     record: wp.array3d[RatioRecord]
     """(view, cell_row, cell_column): 0, with the segmentation id NOTHING, where no surface is visible."""
@@ -33,7 +33,7 @@ class RatioImages:
 
 @wp.struct
 class Ratios:
-    """Denoised light of a coarse pixel, or a weighted sum of them."""
+    """Diffuse and specular visibility ratio (ratio estimator) and indirect light of a coarse pixel, or weighted sums of these."""
 
     diffuse: wp.vec3
     """Visibility ratio of diffuse light: a pixel multiplies its own unoccluded light by it."""
@@ -45,7 +45,7 @@ class Ratios:
 
 @wp.func
 def pack_ratios(diffuse: wp.vec3, specular: wp.vec3, indirect: wp.vec3, depth: float, segment: wp.uint8) -> RatioRecord:
-    """Pack the denoised light of a coarse pixel with its depth [m] and segmentation id."""
+    """Pack visibility ratios and indirect light of a coarse pixel with its depth [m] and segmentation id."""
     bits = wp.cast(depth, wp.uint32)
     return RatioRecord(
         tag_half3(pack_half3(diffuse), bits >> wp.uint32(16)),
@@ -68,7 +68,7 @@ def record_segment(record: RatioRecord) -> wp.uint8:
 
 @wp.func
 def add_ratios(total: Ratios, record: RatioRecord, weight: float) -> Ratios:
-    """Add one packed coarse pixel to a weighted sum."""
+    """Add the ratios and the indirect light of one packed coarse pixel to a weighted sum."""
     result = Ratios()
     result.diffuse = total.diffuse + weight * unpack_half3(record[0])
     result.specular = total.specular + weight * unpack_half3(record[1])
@@ -100,7 +100,7 @@ def unoccluded_ratios() -> Ratios:
 
 @wp.func
 def upsample_ratios(ratios: RatioImages, coarse: CoarseGrid, view: int, row: int, column: int, plane: Plane) -> Ratios:
-    """Joint bilateral upsampling: visibility ratios at a pixel from those of the four nearest coarse pixels on its surface.
+    """Joint bilateral upsampling: ratios and indirect light at a pixel from those of the four nearest coarse pixels on its surface.
 
     If all four are on other surfaces, the ring around them is searched too, because light changes less along a surface than between
     surfaces. `plane` is the pixel's tangent plane. Without coarse pixels all light is unoccluded.

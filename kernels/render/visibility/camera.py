@@ -18,7 +18,7 @@ NEAR_PLANE = wp.constant(1.0e-3)
 
 @wp.struct
 class Cameras:
-    """Intrinsics and extrinsics. Constant."""
+    """Intrinsics and extrinsics of the cameras. Constant."""
 
     intrinsics: wp.array[wp.vec4]
     """(camera): fx, fy, cx, cy [px]."""

@@ -35,7 +35,7 @@ class Interior:
 
 @wp.struct
 class Meshes:
-    """Triangle meshes and their BVHs, each in its own frame: the catalog's, then tote, gripper shaft, cup. Constant."""
+    """Triangle meshes, their BVHs and bounds, each in its own frame: the catalog's, then tote, gripper shaft, cup. Constant."""
 
     id: wp.array[wp.uint64]
     """(mesh): Warp's mesh handle."""
@@ -61,7 +61,7 @@ class Meshes:
 
 @wp.struct
 class Table:
-    """Horizontal plane below the tote."""
+    """Height and visibility of the horizontal plane below the tote."""
 
     visible: int
     """1: the scene has a table."""
@@ -71,7 +71,7 @@ class Table:
 
 @wp.struct
 class ViewBodies:
-    """Per-view setup of the bodies in front of the view's camera. Body b is instance b, or fixture b - instances."""
+    """Poses, bounds and drawing order of the bodies in front of each view's camera. Body b is instance b, or fixture b - instances."""
 
     mesh: wp.array2d[int]
     """(view, body): row of `Meshes`; -1: the body is absent."""
@@ -104,7 +104,7 @@ class ViewBodies:
 
 @wp.struct
 class GBuffer:
-    """Primary hits: what shading and annotation layers read."""
+    """Segmentation id, triangle, barycentric weights and depth of the primary hit of each pixel."""
 
     segment: wp.array3d[wp.uint8]
     """(view, row, column): segmentation id: 0 nothing, 1 + instance, or a member of `Segment`."""
@@ -118,7 +118,7 @@ class GBuffer:
 
 @wp.struct
 class Hit:
-    """Closest hit of one ray; the members of `GBuffer`."""
+    """Segmentation id, triangle, barycentric weights and depth of the closest hit of one ray."""
 
     segment: int
     triangle: int

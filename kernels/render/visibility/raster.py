@@ -44,7 +44,7 @@ BLOCK_COLUMNS = wp.constant(256)
 
 @wp.struct
 class VisibilityBuffer:
-    """Visibility buffer, and the work list of large triangles."""
+    """Visibility key of the nearest triangle of each pixel, and the work list of blocks of large triangles."""
 
     nearest: wp.array3d[wp.uint64]
     """(view, row, column): visibility key of the nearest triangle: float32 bits of the planar depth, body, triangle."""
@@ -153,7 +153,7 @@ def clear_visibility_kernel(
 ):
     """Clear visibility buffer, amodal bits (unless null) and the work list; unused views (camera -1) keep theirs.
 
-    One thread a pixel from flat index `first` on, in tile order.
+    Launched over view, pixel (tile order, from flat index `first` on).
     """
     view, row, column = tile_pixel(grid, wp.tid() + first)
     if not in_image(grid, row, column) or views.camera[view] < 0:
@@ -180,10 +180,10 @@ def rasterize_triangles_kernel(
     visibility_inout: VisibilityBuffer,
     amodal_inout: wp.array3d[wp.uint32],  # (view, row, column)
 ):
-    """Rasterize small triangles and list the blocks of large ones.
+    """Rasterize small triangles into visibility buffer and amodal bits, and list the blocks of large triangles.
 
-    Flat thread index, from `first` on: (view, rank, thread); the `threads` threads of a body stride over its triangles. A tote whose pose
-    is that of the static background is skipped.
+    A tote whose pose is that of the static background is skipped. Launched over view, rank, thread (flat, from `first` on): the `threads`
+    threads of a body stride over its triangles.
     """
     index = wp.tid() + first
     slots = bodies.mesh.shape[1]
@@ -230,8 +230,11 @@ def rasterize_blocks_kernel(
     visibility_inout: VisibilityBuffer,
     amodal_inout: wp.array3d[wp.uint32],  # (view, row, column)
 ):
-    """Rasterize the listed blocks of large triangles. Flat thread index, from `first` on: (view, thread); the `threads` threads of a view
-    stride over the rows of its blocks, whose number the host does not know."""
+    """Rasterize the listed blocks of large triangles into visibility buffer and amodal bits.
+
+    Launched over view, thread (flat, from `first` on): the `threads` threads of a view stride over the rows of its blocks, whose number the
+    host does not know.
+    """
     index = wp.tid() + first
     view = index // threads
     camera = views.camera[view]
@@ -287,9 +290,9 @@ def resolve_visibility_kernel(
 ):
     """Resolve the visibility buffer: G-buffer, segmentation ids, and planar depth rounded to counts (0: no surface, or above 65,535).
 
-    The nearest triangle competes with the cached static background, one G-buffer a camera (view: camera), or with the table where the
-    tote has another pose. Null images are not written; unused views (camera -1) keep their content. One thread a pixel from flat index
-    `first` on, in tile order.
+    The nearest triangle competes with the cached static background, one G-buffer a camera (view: camera), or with the table where the tote
+    has another pose. Null images are not written; unused views (camera -1) keep their content. Launched over view, pixel (tile order, from
+    flat index `first` on).
     """
     view, row, column = tile_pixel(grid, wp.tid() + first)
     if not in_image(grid, row, column):

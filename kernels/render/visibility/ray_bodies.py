@@ -15,7 +15,7 @@ row of the world-to-body rotation, and x, y or z of the body's position in the w
 
 @wp.struct
 class RayBody:
-    """Pose and BVH of a body, unpacked."""
+    """Pose, BVH root and row of a body, unpacked from its ray record."""
 
     rotation: wp.mat33
     """World to body frame."""
@@ -47,7 +47,7 @@ def write_ray_body(meshes: Meshes, bodies_inout: ViewBodies, view: int, rank: in
 
 @wp.func
 def read_ray_body(bodies: ViewBodies, first: int) -> RayBody:
-    """Unpack the pose and BVH of a body by its `first_ray_record`; the sphere is read by itself."""
+    """Unpack the pose and BVH of a body by its `first_ray_record`; record 0, the bounding sphere, is not read."""
     x = read_record(bodies.ray_record, first + 1)
     y = read_record(bodies.ray_record, first + 2)
     z = read_record(bodies.ray_record, first + 3)

@@ -21,14 +21,14 @@ CANCELLATION = wp.constant(1.0e-3)
 
 @wp.struct
 class Triangle:
-    """Triangle in the camera's axes [m]; depth is near + z, so that float32 keeps its precision far from the camera."""
+    """Corners of a triangle in the camera's axes [m]; depth is near + z, so that float32 keeps its precision far from the camera."""
 
     a: wp.vec3
     b: wp.vec3
     c: wp.vec3
     """Corners."""
     near: float
-    """Depth at which z is 0."""
+    """Depth at which z is 0 [m]."""
 
 
 @wp.struct

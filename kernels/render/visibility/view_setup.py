@@ -27,7 +27,7 @@ def aim_views_kernel(
     # Out:
     views_inout: Views,
 ):
-    """Set the camera of each view: 0, or -1 where the view is unused (world -1)."""
+    """Set the camera of each view: 0, or -1 where the view is unused (world -1). Launched over view."""
     view = wp.tid()
     views_inout.camera[view] = 0
     if views_inout.world[view] < 0:
@@ -53,6 +53,7 @@ def set_up_views_kernel(
     """Transform each body of a view's world into the view's camera, x_camera = R (x_world - c), in float64, stored in float32.
 
     Fills `ViewBodies` except `order`, `ray_record`, `present` and `body_mask`. Absent bodies, and all bodies of unused views, get mesh -1.
+    Launched over view, body.
     """
     view, body = wp.tid()
     world = views.world[view]
@@ -99,7 +100,8 @@ def set_up_views_kernel(
 
 @wp.func
 def rank_depth(bodies: ViewBodies, view: int, body: int) -> float:
-    """Sort key of a body: its near depth [m]; infinite for the tote, which a ray that hit an object in it can mostly skip."""
+    """Sort key of a body: its near depth [m]; FAR for the tote, so that the tote is tested last: a ray with a hit inside can mostly skip
+    it."""
     if body == bodies.mesh.shape[1] - FIXTURES:
         return FAR
     return bodies.near[view, body]
@@ -114,7 +116,7 @@ def sort_bodies_kernel(
 ):
     """Sort the present bodies of each view front to back, the tote last, by counting: a body's rank is the number of bodies before it.
 
-    Writes `order`, `ray_record` and `present`.
+    Writes `order`, `ray_record` and `present`. Launched over view, body.
     """
     view, body = wp.tid()
     bodies = bodies_inout.mesh.shape[1]
@@ -166,7 +168,7 @@ def bin_bodies_kernel(
     """Tile binning: `body_mask` of each tile, the bodies whose oriented bounding box the tile's central ray intersects.
 
     Boxes are enlarged by the tile's radius at the body's far side, so that the mask is conservative for all rays of the tile. A screen box
-    is tested first.
+    is tested first. Launched over view, tile.
     """
     view, tile = wp.tid()
     camera = views.camera[view]

@@ -34,7 +34,7 @@ FAR_SCALE = wp.constant(1.000001)
 
 @wp.struct
 class WideBvh:
-    """Wide BVHs of all meshes, each in its mesh's frame. Constant."""
+    """Quantized nodes, triangles and roots of the wide BVHs of all meshes, each in the frame of its mesh. Constant."""
 
     node: wp.array[wp.vec4ui]
     """(NODE_RECORDS x node): record 0: origin of the quantization grid (x, y, z) as float32 [m], and per axis the 8-bit exponent e of its
@@ -229,5 +229,6 @@ def read_binary_bvh_kernel(
     """Copy the binary BVH of a `wp.Mesh`: bounding boxes and child indices of its nodes, triangle indices in leaf order, root index.
 
     A leaf stores its range [begin, end) of `triangle_out` as children (-1 - begin, -1 - end). Rows past the last node are not written.
+    Launched over node of the binary BVH.
     """
     read_binary_node(mesh, wp.tid(), lower_out, upper_out, children_out, triangle_out, root_out)

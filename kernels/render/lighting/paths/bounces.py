@@ -43,9 +43,10 @@ def extend_queued_paths_kernel(
     history_inout: LightHistory,
     coarse_light_out: CoarseLight,
 ):
-    """Extend the paths in the queues of a stage by one bounce.
+    """Wavefront path tracing: extend the paths in the queues of a stage by one bounce.
 
-    A path that ends completes its coarse pixel, as in `trace_coarse_paths_kernel`; others are queued for the next stage.
+    A path that terminates completes its coarse pixel, as in `trace_coarse_paths_kernel`; others are queued for the next stage. Launched
+    over view, region, rank in the queue (flat, from `first` on).
     """
     index = wp.tid() + first
     rank = index % QUEUE_CAPACITY

@@ -68,10 +68,11 @@ def make_context(
     light: int,
     yaw: float,
 ) -> PathContext:
-    """Path-tracing context of a coarse pixel: stream of random numbers, rotation and map of the environment.
+    """Path-tracing context of a coarse pixel: its view, environment maps, random number stream and rotation of sample points.
 
-    All images of an episode use one stream; see `first_path_index`. The first surface is lit by the map without its lamps: row `light` +
-    number of maps of `Lights.radiance`. `yaw` is in radians.
+    `shift` is a Cranley-Patterson rotation of the sample sequence that grows with `row` and `column`. All images of an episode use one
+    stream; see `first_path_index`. The first surface is lit by the map without its lamps: row `light` + number of maps of
+    `Lights.radiance`. `yaw` is in radians.
     """
     context = PathContext()
     context.view = view
@@ -95,7 +96,7 @@ def average_paths(
     width: float,
     pixel: PathPixel,
 ) -> SplitRadiance:
-    """Monte Carlo mean of the reflected light over `samples` paths of a coarse pixel.
+    """Monte Carlo mean of the reflected light over `samples` paths of a coarse pixel, each limited by the firefly clamp (`clamp_path`).
 
     The paths start at the vertex `first`; `width` is their footprint there [m].
     """
@@ -123,8 +124,8 @@ def average_paths(
 def first_path_index(samples: int, row: int, column: int, number: int, has_history: bool) -> int:
     """Sobol' index of a coarse pixel's first path, in the sequence of its tile of SEQUENCE_PERIOD² coarse pixels.
 
-    A coarse pixel without a history takes its first `samples` points. One with a history takes a point, which `number` selects, see
-    `path_number`, behind the `samples` points with which a history may have begun.
+    A coarse pixel without a history takes its first `samples` points. One with a history takes one point, behind the `samples` points with
+    which a history may have begun; `number`, the `path_number`, says which.
     """
     index = morton_index(SEQUENCE_PERIOD, row, column)
     if has_history:
@@ -134,10 +135,10 @@ def first_path_index(samples: int, row: int, column: int, number: int, has_histo
 
 @wp.func
 def new_paths(rules: PathRules, history: LightHistory, slot: int, known: int) -> int:
-    """Number of paths that a coarse pixel traces, with `known` usable paths in its history.
+    """Number of paths that a coarse pixel traces in this frame; `known` is the number of paths of its history that are still valid.
 
-    One with a usable history; otherwise `rules.samples`, in the first frame of an episode `rules.first_samples`, since all histories begin
-    there and most persist.
+    1 if the history has any; otherwise `rules.samples`, or `rules.first_samples` in the first frame of an episode, since all histories
+    begin there and most persist.
     """
     if known > 0:
         return 1
@@ -160,9 +161,10 @@ def finish_pixel(
     paths: SplitRadiance,
     samples: int,
 ):
-    """Blend new light into the history of a coarse pixel, and write the result.
+    """Temporal accumulation: blend new light into the history of a coarse pixel, and store the result for the denoiser.
 
-    `paths` is the mean light of `samples` new paths, `cell` the pixel's `flat_index`, `slot` the row of its camera in the history.
+    `paths` is the mean light of `samples` new paths, `cell` the pixel's `flat_index`, `slot` the row of its camera in the history. The
+    light is multiplied by `exposure`, the map's; the unoccluded light, with which the denoiser forms ratios, is stored beside it.
     """
     mean = accumulate(history, slot, row, column, pixel.segment, scale_light(paths, exposure), pixel.known, samples)
     store_light(out, cell, mean, scale_light(pixel.unoccluded, exposure))
@@ -182,7 +184,10 @@ def finish_path(
     pixel: PathPixel,
     radiance: SplitRadiance,
 ):
-    """Finish a coarse pixel whose single path has terminated with this `radiance`; other parameters as of `finish_pixel`."""
+    """Finish a coarse pixel whose single path has terminated: firefly clamp of its `radiance`, then `finish_pixel`.
+
+    Parameters that are not named here are those of `finish_pixel`.
+    """
     lamplit = lamplit_radiance(scene.lights, context.light)
     light = clamp_path(radiance, pixel.unoccluded, lamplit, pixel.specular_limit, rules.firefly_clamp)
     finish_pixel(out, history, scene.lights.exposure[context.light], cell, slot, row, column, pixel, light, 1)
@@ -192,9 +197,13 @@ def finish_path(
 def make_path_pixel(
     scene: PathScene, rules: PathRules, context: PathContext, vertex: Vertex, index: int, segment: int, known: int, number: int
 ) -> PathPixel:
-    """Build the `PathPixel` of the coarse pixel with `index` in interleaved order.
+    """Data with which the light of a coarse pixel's paths is combined: unoccluded light, diffuse colour, firefly limit, history length.
 
-    `vertex` is its surface, with a segmentation id, `known` the usable paths of its history, `number` the Sobol' index of its first path.
+    Args:
+        vertex: The surface that the coarse pixel shows, with segmentation id `segment`.
+        index: Index of the coarse pixel in interleaved order.
+        known: Number of valid paths of its history.
+        number: Sobol' index of its first path, by `first_path_index`.
     """
     lamplit = lamplit_radiance(scene.lights, context.light)
     pixel = PathPixel()
@@ -228,9 +237,11 @@ def trace_pixel(
     coarse_light_out: CoarseLight,
     queued: bool,
 ):
-    """Trace the paths of a thread's coarse pixel, if it belongs to this kernel.
+    """Trace the paths of a thread's coarse pixel, if this kernel is responsible for it; writes the guide image and the light, or queues the
+    path.
 
-    With `queued`, those with one path do, if there are queues; else all others. A constant, so that the compiler removes the other case.
+    With `queued` the kernel is responsible for coarse pixels with one path, if there are queues; else for all others. `queued` is a
+    constant, so that the compiler removes the other case.
     """
     regions = queues.count.shape[1]
     index = thread
@@ -293,11 +304,11 @@ def trace_coarse_paths_kernel(
     guide_out: Guide,
     coarse_light_out: CoarseLight,
 ):
-    """Trace paths from the middle pixel of each coarse pixel: their mean light and the unoccluded light, and the guide image.
+    """Coarse path pass: paths from the middle pixel of each coarse pixel; their mean light, the unoccluded light, and the guide image.
 
-    With a history only those in `lists` are traced, with `new_paths` paths each; the path of a coarse pixel with a usable history is
-    blended into it. The lamps' direct light is left out, see `shadows`. Where there are queues, coarse pixels with a single path are left
-    to `start_paths_kernel`.
+    With a history only coarse pixels in `lists` are traced, with `new_paths` paths each, and their light is accumulated over frames. The
+    lamps' direct light is left out, see `shadows`. Where there are queues, coarse pixels with a single path are left to
+    `start_paths_kernel`. Launched over view, coarse pixel (interleaved or listed order, from flat index `first` on).
     """
     trace_pixel(
         scene,
@@ -343,9 +354,10 @@ def start_paths_kernel(
     guide_out: Guide,
     coarse_light_out: CoarseLight,
 ):
-    """Trace the first bounce of the path of each coarse pixel that has a single one, as in `trace_coarse_paths_kernel`.
+    """Wavefront path tracing, first stage: trace the first bounce of the path of each coarse pixel that has a single one.
 
-    Paths that go on are queued for `extend_queued_paths_kernel`.
+    Paths that terminate are stored as by `trace_coarse_paths_kernel`; others are queued for `extend_queued_paths_kernel`. Launched over
+    view, coarse pixel, as `trace_coarse_paths_kernel`.
     """
     trace_pixel(
         scene,

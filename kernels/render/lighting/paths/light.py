@@ -16,10 +16,10 @@ for unoccluded light. Few paths find surfaces that lamps light, so each of them 
 
 @wp.struct
 class CoarseLight:
-    """Reflected light of the coarse pixels; diffuse light is demodulated (without the surface's colour). Scratch.
+    """Reflected light of the coarse pixels, traced and unoccluded; diffuse light is demodulated (without the surface's colour). Scratch.
 
-    All arrays are (view, cell_row, cell_column). Light is pre-exposed: radiance multiplied by the map's exposure, so
-    that typical values are about 1.
+    All arrays are (view, cell_row, cell_column). Light is pre-exposed: radiance multiplied by the map's exposure, so that typical values
+    are about 1.
     """
 
     diffuse: wp.array3d[wp.vec4]

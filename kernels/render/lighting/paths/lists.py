@@ -14,7 +14,7 @@ wp.set_module_options({"enable_backward": False})
 REGION_PIXELS = wp.constant(int(LANE_STRIDE) * int(LANE_STRIDE) * int(TILE_PIXELS))
 """Coarse pixels of a region."""
 FRESH, AGED = wp.constant(0), wp.constant(1)
-"""Kinds of listed coarse pixels: without a usable history (`PathRules.samples` paths each), and with one (one path each)."""
+"""Kinds of listed coarse pixels: without a valid history (`PathRules.samples` paths each), and with one (one path each)."""
 KNOWN_BITS = wp.constant(8)
 """Bits of an entry for the paths of a history: `LightHistory.paths` is 8 bits wide."""
 _PERIOD_BITS = wp.constant(2)
@@ -23,7 +23,7 @@ _PERIOD_BITS = wp.constant(2)
 
 @wp.struct
 class PathLists:
-    """Coarse pixels that trace paths, listed by region. Scratch."""
+    """Coarse pixels that trace paths in this frame, listed by region and kind, and the lengths of the lists. Scratch."""
 
     count: wp.array3d[int]
     """(view, region, path_kind): number of FRESH and of AGED coarse pixels."""
@@ -33,7 +33,7 @@ class PathLists:
 
 @wp.func
 def pack_entry(offset: int, known: int, bits: int) -> int:
-    """Entry of a coarse pixel: its place in the region, and `usable_paths` of its history."""
+    """Entry of a coarse pixel: its index in the region, and `usable_paths` of its history."""
     return (((offset << KNOWN_BITS) | known) << _PERIOD_BITS) | bits
 
 

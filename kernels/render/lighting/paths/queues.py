@@ -24,7 +24,7 @@ _SEGMENT_BITS = wp.constant(8)
 
 @wp.struct
 class PathQueues:
-    """Queues of the paths that go on after a bounce. Scratch."""
+    """Wavefront queues of the paths that go on after a bounce: lengths, slots, and packed paths, by region and stage. Scratch."""
 
     count: wp.array3d[int]
     """(queue_view, region, stage): length of a queue. Stage s holds paths with `Path.bounce` = s + 1."""
@@ -37,22 +37,22 @@ class PathQueues:
 
 @wp.struct
 class PathPixel:
-    """Coarse pixel of a path: the data that its light is combined with when the path terminates."""
+    """Coarse pixel of a path: the data with which the light of the path is combined when it terminates."""
 
     offset: int
-    """Index in its region, in interleaved order."""
+    """Index of the coarse pixel in its region, in interleaved order."""
     segment: int
-    """Segmentation id of its surface."""
+    """Segmentation id of the surface of the coarse pixel."""
     known: int
-    """Usable paths of its history."""
+    """Number of valid paths of the history of the coarse pixel."""
     number: int
     """Sobol' index of the path; of the first one, if it has several."""
     diffuse: wp.vec3
-    """Diffuse colour of its surface."""
+    """Diffuse colour of the surface."""
     unoccluded: SplitRadiance
-    """Unoccluded light that its surface reflects."""
+    """Unoccluded light that the surface reflects."""
     specular_limit: float
-    """Firefly clamp of its specular light: limit of the largest channel."""
+    """Firefly clamp of specular light: limit of the largest channel."""
 
 
 @wp.func

@@ -50,7 +50,7 @@ def reuse_histories_kernel(
     """Temporal reuse: coarse pixels that trace no path in this frame (see `period_bits`) get the light of their history.
 
     All other coarse pixels are appended to the path lists; their light and history are left unchanged. Where no surface is visible, the
-    history is reset.
+    history is reset. Launched over view, coarse pixel (interleaved order, from flat index `first` on).
     """
     index = wp.tid() + first
     view, row, column = interleaved_pixel(coarse, index)

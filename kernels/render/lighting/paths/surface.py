@@ -12,7 +12,7 @@ wp.set_module_options({"enable_backward": False, "fast_math": True})
 
 @wp.struct
 class CoarseSurface:
-    """Surface at the middle pixel of a coarse pixel."""
+    """Hit, position, direction to the camera and footprint at the middle pixel of a coarse pixel."""
 
     hit: Hit
     position: wp.vec3

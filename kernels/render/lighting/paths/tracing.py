@@ -45,7 +45,7 @@ FOOTPRINT_GROWTH = wp.constant(0.1)
 
 @wp.struct
 class PathScene:
-    """The scene that rays intersect. Constant."""
+    """Geometry, materials and environment maps that paths interact with. Constant."""
 
     meshes: Meshes
     table: Table
@@ -57,7 +57,7 @@ class PathScene:
 
 @wp.struct
 class PathRules:
-    """Settings of the path tracer."""
+    """Numbers of paths and bounces, Russian roulette, sampling strategy, roughness and firefly limits, and the seed of the path tracer."""
 
     samples: int
     """Paths per pixel, or per coarse pixel."""
@@ -97,7 +97,10 @@ class PathContext:
 
 @wp.struct
 class Throughput:
-    """Product of BRDF, cosine and 1 / pdf along a path, split by the lobe of its first surface, without that surface's diffuse colour."""
+    """Path throughput: product of BRDF, cosine and 1 / pdf, split by the lobe of the first surface.
+
+    The diffuse part excludes the diffuse colour of that surface.
+    """
 
     diffuse: wp.vec3
     specular: wp.vec3
@@ -105,7 +108,7 @@ class Throughput:
 
 @wp.struct
 class Vertex:
-    """A path vertex: a surface that a path hit."""
+    """Path vertex: origin of the next rays, geometric normal and BRDF of a surface that a path hit."""
 
     origin: wp.vec3
     """Origin of rays that leave the surface, in the world [m]."""
@@ -116,7 +119,7 @@ class Vertex:
 
 @wp.struct
 class Path:
-    """State of a path between two bounces."""
+    """State of a path between two bounces: radiance so far, throughput, and the last hit."""
 
     radiance: SplitRadiance
     """Radiance collected so far."""
@@ -124,9 +127,9 @@ class Path:
     hit: Hit
     """Last hit, at which the path scatters next; not set before the first bounce."""
     position: wp.vec3
-    """Position of that hit, in the world [m]."""
+    """Position of the last hit, in the world [m]."""
     direction: wp.vec3
-    """Unit direction of the ray to that hit."""
+    """Unit direction of the ray to the last hit."""
     bounce: int
     """Bounces so far, or TERMINATED."""
     width: float
@@ -336,7 +339,8 @@ def trace_paths_kernel(
 ):
     """Path-traced reference: mean radiance of N paths per pixel, with stratified start points in the pixel (box filter).
 
-    Random numbers are addressed by (seed, episode; camera and pixel; path, dimension): a still scene gives the same image again.
+    Random numbers are addressed by (seed, episode; camera and pixel; path, dimension): a still scene gives the same image again. Launched
+    over view, pixel (tile order, from flat index `first` on).
     """
     view, row, column = tile_pixel(grid, wp.tid() + first)
     if not in_image(grid, row, column):
