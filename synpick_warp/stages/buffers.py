@@ -17,7 +17,8 @@ FIXTURES = ("tote", "finger", "cup")
 
 @dataclass(frozen=True, eq=False)
 class Snapshot:
-    """Visible state of every world at the end of a tick: the input of the renderer and of exporters."""
+    """Episode, objects, poses and light of every world at the end of a tick, and the poses of the previous frame: input of renderer and
+    exporters."""
 
     live: wp.array = device_array("world", dtype=wp.int32)
     """1: this tick is a frame of the world's episode."""
@@ -49,7 +50,10 @@ class Snapshot:
 
 @dataclass(frozen=True, eq=False)
 class LastFrame:
-    """Copy of each world's last snapshot, from which the next one gets its `last_` arrays; members as in `Snapshot` and `FramePoses`."""
+    """Episode, objects and poses of each world at the end of the last tick, from which the next snapshot gets its `last_` arrays.
+
+    Members are named as in `Snapshot` and `FramePoses`.
+    """
 
     live: wp.array = device_array("world", dtype=wp.int32)
     episode: wp.array = device_array("world", dtype=wp.int32)
@@ -91,6 +95,7 @@ def allocate_view_buffers(views: int, width: int, height: int, instances: int, d
 
 
 def _declare_layer(layer: Layer) -> Any:
+    """Declaration of the device array of a layer."""
     return device_array("view", "row", "column", dtype=_LAYER_DTYPES[layer.dtype, layer.components], unit=layer.unit)
 
 

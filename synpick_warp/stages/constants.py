@@ -23,8 +23,10 @@ GRIPPER_HOME = (3.0, 0.0, 1.0)
 
 @dataclass(frozen=True, eq=False)
 class SceneData:
-    """Constants for the kernels, one struct a subject; `modes` has one `ModeData` per split, `guide_shapes` the indices of a world's guide
-    walls among its shapes."""
+    """Constants of the kernels: one struct for each subject, the modes of the splits and the guide walls.
+
+    `modes` has one `ModeData` per split, `guide_shapes` the indices of a world's guide walls among its shapes.
+    """
 
     layout: structs.LayoutData
     catalog: structs.CatalogData
@@ -90,6 +92,7 @@ def make_scene_data(config: Config, catalog: Catalog, built: build.BuiltModel, l
 
 
 def _layout_data(layout: build.Layout) -> structs.LayoutData:
+    """Fill `LayoutData` from the layout of the model."""
     return fill(
         structs.LayoutData,
         layout,
@@ -103,6 +106,8 @@ def _layout_data(layout: build.Layout) -> structs.LayoutData:
 
 
 def _catalog_data(catalog: Catalog, built: build.BuiltModel, device: wp.Device) -> structs.CatalogData:
+    """Fill `CatalogData`: a column for each property of the entries of the catalog."""
+
     def column(values: list[float], dtype: type) -> wp.array:
         return wp.array(np.array(values), dtype=dtype, device=device)
 
@@ -148,6 +153,7 @@ def mode_rows(config: Config) -> list[tuple[int, float, float, int]]:
 
 
 def drop_data(config: Config, lights: int) -> structs.DropData:
+    """Fill `DropData` from the settings; `lights` is the number of environment maps."""
     tote = config.tote
     return fill(
         structs.DropData,
@@ -166,6 +172,7 @@ def drop_data(config: Config, lights: int) -> structs.DropData:
 
 
 def _settle_data(settle: Settle, tick: float) -> structs.SettleData:
+    """Fill `SettleData`; times become numbers of ticks of `tick` seconds."""
     return fill(
         structs.SettleData,
         settle,
@@ -179,6 +186,7 @@ def _settle_data(settle: Settle, tick: float) -> structs.SettleData:
 
 
 def _move_data(move: Move, tote: Tote, gripper: Gripper, physics: Physics) -> structs.MoveData:
+    """Fill `MoveData` from the settings."""
     length, width = tote.floor_size
     return fill(
         structs.MoveData,
@@ -192,6 +200,7 @@ def _move_data(move: Move, tote: Tote, gripper: Gripper, physics: Physics) -> st
 
 
 def _suction_data(suction: Suction, gripper: Gripper, step: float) -> structs.SuctionData:
+    """Fill `SuctionData` from the settings; `step` is the time step [s]."""
     return fill(
         structs.SuctionData,
         suction,

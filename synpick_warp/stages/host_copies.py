@@ -21,7 +21,7 @@ MAX_PAUSED_SECONDS = 0.5
 
 
 class DeviceImages:
-    """Images of a batch that stay on the device: `Images` of `frames`."""
+    """Images of a batch that stay on the device, as `Images` of `frames`."""
 
     def __init__(self, array: wp.array) -> None:
         self.array = array

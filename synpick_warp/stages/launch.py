@@ -28,11 +28,13 @@ def limit_threads(count: int) -> None:
 
 @functools.cache
 def _cores() -> int:
+    """Number of threads that render pixels on the CPU."""
     return _limit or count_cores()
 
 
 @functools.cache
 def _pool() -> ThreadPoolExecutor:
+    """Thread pool that launches on the CPU, started at the first call."""
     return ThreadPoolExecutor(_cores(), thread_name_prefix=PIXELS)
 
 

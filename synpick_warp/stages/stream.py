@@ -59,7 +59,7 @@ def view_sizes(config: Config, device: wp.Device) -> dict[str, int]:
 
 @dataclass(frozen=True, eq=False)
 class TickReport:
-    """Result of one tick on the host, one row a world."""
+    """Status, poses and perception results of one tick on the host, one row a world."""
 
     status: np.ndarray
     """Status rows (world, status) int32; columns: `Status`."""
@@ -213,14 +213,14 @@ def describe_views(
 
 @dataclass(eq=False)
 class _Launched:
-    """A batch in flight: rendered, encoded and copied by the device."""
+    """Ring slot, size and description of a batch in flight: rendered, encoded and copied by the device."""
 
     slot: int
-    """Its place in the ring."""
+    """Index of the slot of the batch in the ring."""
     count: int
-    """Its views."""
+    """Number of views in use."""
     description: dict[str, Any]
-    """Fields by `describe_views`."""
+    """Fields of `FrameBatch` by `describe_views`."""
     finished: Callable[[], None] | None = None
     """Called once the consumer is done with the batch."""
 
@@ -335,6 +335,7 @@ class FrameStream:
             launched.finished()
 
     def _launch(self, slot: int, snapshot: Snapshot, world: np.ndarray, camera: np.ndarray) -> None:
+        """Render the views (world, camera) of a snapshot into a slot of the ring, then start to encode and copy the images."""
         rows = self.lists[slot]
         padded = np.zeros((2, self.batch), dtype=np.int32)
         padded[:, : len(world)] = world, camera

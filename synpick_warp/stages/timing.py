@@ -38,7 +38,7 @@ Name = tuple[str, ...]
 
 @dataclass
 class StageTime:
-    """Accumulated time of all scopes of one name."""
+    """Accumulated host and device time, and number, of all scopes of one name."""
 
     calls: int = 0
     host: float = 0.0
@@ -48,7 +48,7 @@ class StageTime:
 
 
 class Span(NamedTuple):
-    """One scope in a trace."""
+    """Name, track, start and duration of one scope in a trace."""
 
     name: str
     track: int
@@ -111,6 +111,7 @@ class Recorder:
             self._add_span(Span(path[-1], DEVICE, offset + 1e-3 * wp.get_event_elapsed_time(base, begin), duration))
 
     def _add_span(self, span: Span) -> None:
+        """Append a span, up to MAX_SPANS."""
         if len(self._spans) < MAX_SPANS:
             self._spans.append(span)
 

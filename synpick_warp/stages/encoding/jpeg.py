@@ -63,7 +63,7 @@ HUFFMAN = struct_arrays(HuffmanTables, "component", "symbol")
 
 @dataclass(frozen=True, eq=False)
 class JpegBuffers:
-    """JPEG files of one batch of views."""
+    """JPEG files of one batch of views, and the sizes of the files."""
 
     jpeg_size: wp.array = device_array("view", dtype=wp.int32)
     """Size of each file [B]; above the capacity of `jpeg`: the file is incomplete."""
@@ -73,7 +73,7 @@ class JpegBuffers:
 
 @dataclass(frozen=True, eq=False)
 class JpegScratch:
-    """Scratch of the encoder."""
+    """Samples, DCT coefficients, bit strings and positions of one batch: scratch of the encoder."""
 
     sample: wp.array = device_array("view", "sample_row", "sample_block", dtype=wp.uint64)
     """Rows of eight samples: Y, below it Cb and Cr side by side, of whole MCUs."""

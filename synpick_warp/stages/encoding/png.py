@@ -46,17 +46,17 @@ GROUP_SUMS = struct_arrays(SlotSums, "view", "group")
 
 @dataclass(frozen=True, eq=False)
 class DepthBuffers:
-    """Data of the depth PNGs of one batch of views."""
+    """Compressed data (IDAT) of the depth PNGs of one batch of views, and the sizes of the data."""
 
     depth_idat_size: wp.array = device_array("view", dtype=wp.int32)
-    """Size of each [B]; above the capacity of `depth_idat`: it is incomplete."""
+    """Size of each stream [B]; above the capacity of `depth_idat`: the stream is incomplete."""
     depth_idat: wp.array = device_array("view", "depth_byte", dtype=wp.uint8)
     """zlib streams, from the first byte."""
 
 
 @dataclass(frozen=True, eq=False)
 class DepthScratch:
-    """Scratch of the encoder."""
+    """Bit strings (slots) of the segments of one batch, and positions of these: scratch of the encoder."""
 
     slot: wp.array = device_array("view", "slot", "slot_word", dtype=wp.uint32)
     """Bit strings of the header, of each segment of a row, and of the trailer; least significant bit first."""

@@ -23,7 +23,7 @@ GPU_RING = 3
 
 @dataclass(frozen=True, eq=False)
 class TruthBuffers:
-    """Ground truth of one batch of views that the renderer does not write; matrices are row by row."""
+    """Poses, camera matrices and indices of one batch of views, beside what the renderer writes; matrices are row by row."""
 
     episode: wp.array = device_array("view", dtype=wp.int32)
     """Episode index."""
@@ -45,14 +45,14 @@ class TruthBuffers:
 
 @dataclass(frozen=True, eq=False)
 class MaskBuffers:
-    """Masks of one batch of views: an image per instance, allocated when they are first asked for."""
+    """Visible and amodal masks of one batch of views, an image per instance; allocated when they are first asked for."""
 
     visible: wp.array = device_array("view", "instance", "row", "column", dtype=wp.bool)
     amodal: wp.array = device_array("view", "instance", "row", "column", dtype=wp.bool)
 
 
 class Slot:
-    """Buffers of one batch."""
+    """Images, layers, ground truth and masks of one batch in the ring, and the gate that orders the access to these."""
 
     def __init__(self, sizes: dict[str, int], layers: list[str], device: wp.Device) -> None:
         self.sizes, self.device = sizes, device
@@ -153,10 +153,12 @@ class ViewBatch:
         self._slot.gate.expire()
 
     def _masks(self, name: str) -> DeviceArray:
+        """Expand the masks of a kind (B, I, H, W), and export these."""
         self.color.check()
         return self._export(self._slot.expand_masks(name, self._count))
 
     def _export(self, array: wp.array) -> DeviceArray:
+        """Array of the views in use, which expires with the batch."""
         return DeviceArray(array[: self._count], self._slot.gate)
 
     def __len__(self) -> int:
@@ -208,6 +210,7 @@ class BatchRing:
         return ViewBatch(slot, count, self.depth_scale, host)
 
     def _gather(self, snapshot: Snapshot, views: Any, truth: TruthBuffers) -> None:
+        """Launch the kernels that write `truth` for a batch of views."""
         cameras, object_ids = self.renderer.scene.cameras, self.renderer.scene.obj_id
         wp.launch(
             gather_cameras_kernel,

@@ -152,6 +152,7 @@ class DeviceArray:
         self._valid()
 
     def _valid(self) -> wp.array:
+        """The array, if the batch has not expired; else raises BufferError."""
         if self._turn != self._gate.turn:
             raise BufferError(_EXPIRED)
         return self._array

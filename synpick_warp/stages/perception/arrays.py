@@ -14,7 +14,7 @@ from synpick_warp.arrays import device_array
 
 @dataclass(frozen=True, eq=False)
 class PerceptionArrays:
-    """Segmentation of a batch of views, each an image of one world."""
+    """Connected components, distance transforms and contours of a batch of views, each an image of one world."""
 
     component: wp.array = device_array("view", "row", "column", dtype=wp.int32)
     """Connected-component label (8-connectivity, within one instance): the smallest row-major index of its pixels; -1: no instance."""
@@ -33,7 +33,10 @@ class PerceptionArrays:
 
 @dataclass(frozen=True, eq=False)
 class SegmentationScratch:
-    """Intermediate images and sums of segmentation. A patch is the largest component of an instance."""
+    """Patches, column distances, packed maxima and sums of a batch of views: scratch of segmentation.
+
+    A patch is the largest component of an instance.
+    """
 
     patch: wp.array = device_array("view", "row", "column", dtype=wp.uint16)
     """Low byte: 1 + instance, 0: no patch; bit 8 + d: the neighbour in direction d belongs to the same patch."""
@@ -49,7 +52,10 @@ class SegmentationScratch:
 
 @dataclass(frozen=True, eq=False)
 class Observation:
-    """Perception result of each instance from the last time its world was observed. `attempts.InstanceObservation` maps it to JSON."""
+    """Visibility, grasp points, occlusion votes and clutter graph of each instance, from the last time its world was observed.
+
+    `attempts.InstanceObservation` maps it to JSON.
+    """
 
     visible: wp.array = device_array("world", "instance", dtype=wp.int32, unit="px")
     """Visible pixels: size of the largest component; 0: not visible."""
@@ -79,7 +85,7 @@ class Observation:
 
 @dataclass(frozen=True, eq=False)
 class Plan:
-    """Target and grasp pose chosen when the world was last observed. Frame: world."""
+    """Target and grasp pose of each world, chosen when the world was last observed. Frame: world."""
 
     target: wp.array = device_array("world", dtype=wp.int32)
     """Chosen instance; -1: none."""

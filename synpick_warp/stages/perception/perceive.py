@@ -82,6 +82,7 @@ class Perception:
         self.perceive_batch(snapshot)
 
     def _loop(self, snapshot: Snapshot) -> None:
+        """Process the worklist to its end: the loop is a conditional node of the graph that is captured."""
         self.list_worlds()
         wp.capture_while(self._remaining, self.perceive_batch, snapshot=snapshot)
 

@@ -28,7 +28,7 @@ from synpick_warp.stages.sim.worlds import AttemptState, WorldState
 
 @dataclass(frozen=True, eq=False)
 class VoteArrays:
-    """Scratch of the occlusion votes."""
+    """Vote counts, bounding boxes of contours and reaches of instances: scratch of the occlusion votes."""
 
     count: wp.array = device_array("view", "instance", "instance", "kind", dtype=wp.int32)
     """Number of votes by kind: full, deep."""

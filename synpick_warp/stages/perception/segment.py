@@ -141,6 +141,7 @@ class Segmenter:
         wp.launch(kernel, dim=(views.count, *dim), inputs=[views, *inputs], outputs=outputs, device=self.device)
 
     def _launch_pixels(self, kernel: wp.Kernel, inputs: list[Any], outputs: list[Any]) -> None:
+        """Launch a kernel over all pixels of the batch."""
         launch_pixels(kernel, self.pixels, inputs, outputs, self.device)
 
 

@@ -14,7 +14,7 @@ MAX_SLOTS = 255
 
 @dataclass(frozen=True, eq=False)
 class ObjectModel:
-    """Textured mesh of an object whose pose is estimated."""
+    """Textured mesh and symmetries of an object whose pose is estimated."""
 
     object_id: int
     """obj_id."""
@@ -24,12 +24,12 @@ class ObjectModel:
     symmetries_discrete: tuple[tuple[float, ...], ...]
     """Rigid transforms under which the object looks the same: row-major 4 x 4 matrices [m], without the identity."""
     symmetries_continuous: tuple[tuple[tuple[float, float, float], tuple[float, float, float]], ...]
-    """(unit axis, point on it [m])."""
+    """Axes of continuous rotational symmetry: (unit axis, point on the axis [m])."""
 
 
 @dataclass(frozen=True, eq=False)
 class RgbdBatch:
-    """RGB-D images of V views of equal size, with instance masks."""
+    """Colour, depth, intrinsics and instance masks of V RGB-D views of equal size."""
 
     color: np.ndarray
     """Colour, sRGB (V, H, W, 3) uint8, red first."""
@@ -49,7 +49,7 @@ class RgbdBatch:
 
 @dataclass(frozen=True, eq=False)
 class InstanceTable:
-    """Instances whose poses are estimated, one row each; rows stay the same for all frames of the views' scenes."""
+    """View, mask slot and model of each instance whose pose is estimated; rows stay the same for all frames of the views' scenes."""
 
     view: np.ndarray
     """Index of the view in the batch (N,) int32; every view has an instance."""
@@ -65,7 +65,7 @@ class InstanceTable:
 
 @dataclass(frozen=True, eq=False)
 class Estimates:
-    """Pose estimates of the N instances of a table in one frame."""
+    """Poses, scores and run times of the N instances of a table in one frame."""
 
     pose: np.ndarray
     """Object to camera (N, 7) float32: translation x, y, z [m], unit quaternion x, y, z, w."""

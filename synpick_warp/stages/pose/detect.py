@@ -21,7 +21,7 @@ FINE = Schedule(iterations=10, cutoffs=(0.012, 0.005), step=1, color=0.005)
 
 @dataclass(frozen=True)
 class DetectSettings:
-    """Settings of single-frame estimates."""
+    """Template search, refinement schedules and near-symmetry thresholds of single-frame estimates."""
 
     search: SearchSettings = field(default_factory=SearchSettings)
     hypotheses: int = 24

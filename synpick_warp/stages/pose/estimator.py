@@ -30,7 +30,7 @@ nine of ten points then count as if there were no noise."""
 
 @dataclass(frozen=True)
 class PoseSettings:
-    """Inputs and limits of an estimator."""
+    """Inputs (colour, depth noise) and numbers of points of an estimator."""
 
     color: bool = True
     """Use colour beside depth and masks."""
@@ -43,7 +43,7 @@ class PoseSettings:
 
 
 class EstimatorModels:
-    """Device data of the object models, shared by the estimators of all groups of scenes."""
+    """Object models, templates and settings on the device, shared by the estimators of all groups of scenes."""
 
     def __init__(self, objects: Sequence[ObjectModel], settings: PoseSettings, device: wp.Device) -> None:
         """
@@ -84,15 +84,18 @@ class PoseEstimator:
 
     @cached_property
     def _detector(self) -> Detector:
+        """Detector of the instances, built when first needed."""
         shared = self.shared
         return Detector(shared.models, shared.templates, self.observer, shared.detection, shared.scales)
 
     @cached_property
     def _refiner(self) -> Refiner:
+        """Refiner of one hypothesis per instance, built when first needed."""
         return Refiner(self.shared.models, self.observer, 1, self.shared.scales)
 
     @cached_property
     def _tracker(self) -> Tracker:
+        """Tracker of the instances, built when first needed."""
         return Tracker(self.shared.models, self.observer, self.shared.tracking, self.shared.scales)
 
     def estimate(self, batch: RgbdBatch) -> Estimates:

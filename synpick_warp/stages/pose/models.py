@@ -43,7 +43,7 @@ SYMMETRIES = struct_arrays(Symmetries, "model", rotation=("model", "symmetry"), 
 
 @dataclass(frozen=True, eq=False)
 class SurfaceSamples:
-    """Points evenly spread over a surface, in an order in which every prefix is evenly spread, too."""
+    """Positions, normals and colours of points evenly spread over a surface, in an order of which every prefix is evenly spread, too."""
 
     position: np.ndarray
     """(S, 3) float32 [m]."""
@@ -57,7 +57,7 @@ class SurfaceSamples:
 
 @dataclass(frozen=True, eq=False)
 class PoseModels:
-    """Device data of the object models."""
+    """Meshes, surface samples, near-symmetries and diameters of the object models, on the device."""
 
     models: Any
     """The struct `Models`."""

@@ -32,7 +32,7 @@ _SUMS = 2**20
 
 @dataclass(frozen=True, eq=False)
 class _Level:
-    """Cells of one size that are to be divided."""
+    """Corners and candidate lists of the cells of one size that are to be divided."""
 
     corner: np.ndarray
     """Lower corners (C, 3) [m]."""
@@ -45,7 +45,7 @@ class _Level:
 
 
 class NearestVertices:
-    """Search structure of a model's vertices."""
+    """Hierarchical grid over a model's vertices that finds the exact nearest vertex of a point, with a candidate list per leaf cell."""
 
     def __init__(self, vertices: np.ndarray, center: np.ndarray, reach: float, device: wp.Device) -> None:
         """Build the structure: about a second and 30 MB for 8,500 vertices on a CPU core.
@@ -139,6 +139,7 @@ class NearestVertices:
         return _Level(corner, starts, lengths, candidate.numpy())
 
     def _upload(self, values: np.ndarray, dtype: type) -> wp.array:
+        """Copy an array to the device."""
         return wp.array(values, dtype=dtype, device=self._device)
 
 

@@ -23,7 +23,7 @@ LIGHTING = struct_arrays(Lighting, "pose", "lane", "channel", coefficients=("pos
 
 @dataclass(frozen=True)
 class Schedule:
-    """Iterations of a refinement, from coarse to fine."""
+    """Number of iterations, outlier distances and weights of a refinement, from coarse to fine."""
 
     iterations: int
     cutoffs: tuple[float, float]
@@ -38,7 +38,7 @@ class Schedule:
 
 @dataclass(frozen=True)
 class LossScales:
-    """Scales of the residuals that do not change in the course of a refinement."""
+    """Cutoffs, weights and step bounds of the residuals that do not change in the course of a refinement."""
 
     truncation: float = 0.01
     """Distance at which costs are truncated [m]."""
@@ -59,7 +59,7 @@ class LossScales:
 
 
 class Refiner:
-    """Refines and scores pose hypotheses. Owns its sums; only launches kernels."""
+    """Gauss-Newton refinement and scoring of pose hypotheses. Owns its sums; only launches kernels."""
 
     def __init__(self, models: PoseModels, observer: Observer, hypotheses: int, scales: LossScales) -> None:
         """

@@ -20,7 +20,7 @@ CORRELATION = struct_arrays(Correlation, "candidate", "lane")
 
 
 class SymmetrySearch:
-    """Proposes the best near-symmetry of each instance as a second hypothesis. Owns its scratch.
+    """Search for the near-symmetry of each instance whose colours correlate best, as a second hypothesis. Owns its scratch.
 
     Attributes:
         hypotheses: Poses per instance that `propose` writes: the pose as it is, and its best near-symmetry.

@@ -40,7 +40,7 @@ PROBES = struct_arrays(
 
 @dataclass(frozen=True)
 class SearchSettings:
-    """Grid and costs of the template search."""
+    """Directions, rotations, shifts, numbers of probes and loss parameters of the template search."""
 
     directions: int = 96
     """Viewing directions, spread over the sphere: 20° apart."""

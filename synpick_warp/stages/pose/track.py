@@ -30,7 +30,7 @@ FINE = Schedule(iterations=8, cutoffs=(0.012, 0.005), step=1, color=0.005, prior
 
 @dataclass(frozen=True)
 class TrackSettings:
-    """Settings of the tracker."""
+    """Refinement schedules, near-symmetry thresholds and acceptance limits of the tracker."""
 
     coarse: Schedule = COARSE
     fine: Schedule = FINE

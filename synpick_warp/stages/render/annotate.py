@@ -63,6 +63,7 @@ class Annotator:
         wp.launch(reset_empty_boxes_kernel, dim=(views.count, instances, 2), outputs=[out.boxes], device=device)
 
     def _count_border_pixels(self, bodies: Any, views: Any, out: ViewBuffers) -> None:
+        """List the boxes that reach beyond the image, and count the pixels there by rays."""
         scene, device, instances = self.scene, self.scene.device, out.pixels.shape[1]
         groups, threads = (BORDER_GROUPS, BORDER_THREADS) if device.is_cuda else (1, 1)
         self.border_boxes.length.zero_()

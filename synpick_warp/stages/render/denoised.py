@@ -122,18 +122,18 @@ RATIO_IMAGES = struct_arrays(RatioImages, "view", "cell_row", "cell_column")
 
 @dataclass(frozen=True, eq=False)
 class ShadowRays:
-    """Shadow rays of the pixels of the shadow grid."""
+    """Visibility bits, depth, segmentation id and normal of the pixels of the shadow grid."""
 
     packed: wp.array = device_array("view", "shadow_row", "shadow_column", dtype=wp.uint64)
-    """As by `shadows.pack_rays`."""
+    """Packed by `shadows.pack_rays`."""
 
 
 @dataclass(frozen=True, eq=False)
 class FootprintLists:
-    """Lists of the AA footprints, squares between the centres of four pixels, that anti-aliasing resolves."""
+    """Work lists of the AA footprints, squares between the centres of four pixels, that anti-aliasing resolves."""
 
     footprint: wp.array = device_array("view", "chunk", "chunk_footprint", dtype=wp.int32)
-    """Row * columns + column of each; a chunk is a run of tiles of footprints with a list of its own."""
+    """Row * columns + column of each listed footprint; a chunk is a run of tiles of footprints with a list of its own."""
     count: wp.array = device_array("view", "chunk", dtype=wp.int32)
     """Footprints in each list."""
 
@@ -295,7 +295,11 @@ class DenoisedRenderer:
                 self.resolve_footprints(bodies, gbuffer, views, image)
 
     def find_moving_bodies(self, snapshot: Snapshot, views: Any) -> None:
-        """Compare the worlds with the previous frame, where a history holds it."""
+        """Find the bodies that moved since the previous frame, where the light history contains that frame; sets the history's frame to
+        this one.
+
+        Writes `moving` and the frame indices of `history`; nothing without temporal accumulation.
+        """
         if self.history.max_paths == 0:
             return
         options: dict[str, Any] = {"dim": views.count, "device": self.scene.device, "block_dim": VIEW_BLOCK}
@@ -307,7 +311,10 @@ class DenoisedRenderer:
         wp.launch(find_moving_bodies_kernel, inputs=inputs, outputs=[self.moving], **options)
 
     def trace_coarse_paths(self, snapshot: Snapshot, bodies: Any, gbuffer: Any, views: Any) -> None:
-        """Coarse path pass: guide image and light of coarse pixels."""
+        """Coarse path pass: guide image and light of coarse pixels, traced or taken from the history (temporal accumulation).
+
+        Wavefront path tracing where there are queues: one launch for the first bounce, then one for each further bounce.
+        """
         scene, threads = self.scene, interleaved_threads(self.coarse.grid.width, self.coarse.grid.height)
         if self.history.max_paths > 0:
             self.path_lists.count.zero_()
@@ -354,7 +361,7 @@ class DenoisedRenderer:
         self.trace_shadow_edges(snapshot, bodies, gbuffer, views)
 
     def trace_shadow_edges(self, snapshot: Snapshot, bodies: Any, gbuffer: Any, views: Any) -> None:
-        """Shadow rays from the pixels at steep edges, and a filter of what they found."""
+        """Adaptive sampling at steep shadow edges: list the pixels there, trace their shadow rays, and filter the visible fractions."""
         scene, lists, coarse, device = self.scene, self.edge_lists, self.shadow_grid, self.scene.device
         lists.count.zero_()
         self.shadows.edge.zero_()

@@ -114,4 +114,5 @@ class LayerRenderer:
         wp.launch(compute_motions_kernel, dim=dim, inputs=inputs, outputs=[self.motions], device=self.scene.device)
 
     def _launch(self, kernel: wp.Kernel, count: int, inputs: list[Any], output: wp.array) -> None:
+        """Launch a kernel over all pixels of `count` views."""
         launch_pixels(kernel, count * self.scene.grid.tiles * int(TILE_PIXELS), inputs, [output], self.scene.device)

@@ -32,14 +32,17 @@ MEAN_STEPS = 4096
 
 @dataclass(frozen=True, eq=False)
 class EnvironmentTables:
-    """Precomputed tables of one environment map; see `kernels.render.lighting.environment.Lights`."""
+    """Radiance, prefiltered radiance, SH irradiance, lamps and exposure of one environment map, precomputed.
+
+    See `kernels.render.lighting.environment.Lights`.
+    """
 
     radiance: np.ndarray
     """(BACKGROUND_ROWS, 2 BACKGROUND_ROWS, 3) float32: the whole map, with the sun of its sIBL set drawn as a disc."""
     lampless: np.ndarray
     """(BACKGROUND_ROWS, 2 BACKGROUND_ROWS, 3) float32: the map without its lamps."""
     prefiltered: np.ndarray
-    """(PREFILTER_LEVELS, PREFILTER_ROWS, 2 PREFILTER_ROWS, 3) float32."""
+    """(PREFILTER_LEVELS, PREFILTER_ROWS, 2 PREFILTER_ROWS, 3) float32: the map without its lamps, convolved with GGX lobes."""
     irradiance: np.ndarray
     """(9, 3) float32: coefficients of spherical harmonics."""
     lamps: list[Lamp]

@@ -18,17 +18,17 @@ IMAGES, FIELDS = 2, 3
 
 @dataclass(frozen=True, eq=False)
 class BoundaryBuffers:
-    """Run boundaries of one batch of views; see `FrameBatch`."""
+    """Run boundaries of the instance and amodal images of one batch of views, and the numbers of these; see `FrameBatch`."""
 
     boundary_count: wp.array = device_array("view", "image", dtype=wp.int32)
     """Run boundaries of the instance and the amodal image, including those beyond the capacity of `boundaries`."""
     boundaries: wp.array = device_array("view", "image", "field", "boundary", dtype=wp.uint32)
-    """Position, value above, value below of each."""
+    """Position, value above, value below of each run boundary."""
 
 
 @dataclass(frozen=True, eq=False)
 class BoundaryScratch:
-    """Scratch of the two passes over the images."""
+    """Run boundaries per column: scratch between the two passes over the images."""
 
     column_count: wp.array = device_array("view", "image", "column", dtype=wp.int32)
     """Run boundaries of each column."""

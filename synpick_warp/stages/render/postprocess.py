@@ -26,7 +26,7 @@ from synpick_warp.stages.render.scene import RenderScene
 
 @dataclass(frozen=True, eq=False)
 class LensArrays:
-    """Scratch of the lens filter, between its two passes."""
+    """Radiance between the two passes of the lens filter. Scratch."""
 
     radiance: wp.array = device_array("view", "row", "column", dtype=wp.vec3)
     """Resolved radiance after vignette, and after blur and chromatic aberration along rows."""
@@ -102,4 +102,5 @@ class PostProcessor:
         self._launch(postprocess_effects_kernel, views.count, inputs, out.color)
 
     def _launch(self, kernel: wp.Kernel, count: int, inputs: list[Any], output: wp.array) -> None:
+        """Launch a kernel over all pixels of `count` views."""
         launch_pixels(kernel, count * self.scene.grid.tiles * int(TILE_PIXELS), inputs, [output], self.scene.device)

@@ -34,7 +34,7 @@ from synpick_warp.system.threads import map_in_threads
 
 @dataclass(frozen=True, eq=False)
 class RenderScene:
-    """Constant scene data shared by all views, as kernel structs."""
+    """Meshes, materials, cameras, environment maps and table on the device, shared by all views, as kernel structs."""
 
     meshes: Any
     """The struct `Meshes`."""
@@ -59,10 +59,12 @@ class RenderScene:
 
     @property
     def width(self) -> int:
+        """Width of the images [px]."""
         return self.grid.width
 
     @property
     def height(self) -> int:
+        """Height of the images [px]."""
         return self.grid.height
 
 

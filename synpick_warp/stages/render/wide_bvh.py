@@ -29,7 +29,7 @@ ABSENT = -1
 
 @dataclass(frozen=True, eq=False)
 class BinaryBvh:
-    """Binary BVH of a mesh."""
+    """Bounding boxes, children and leaf triangles of the binary BVH of a mesh."""
 
     lower: np.ndarray
     upper: np.ndarray
@@ -52,7 +52,7 @@ class BinaryBvh:
 
 @dataclass(frozen=True, eq=False)
 class Level:
-    """Nodes of a wide BVH at one depth; levels are in breadth-first order."""
+    """Children of the nodes of a wide BVH at one depth; levels are in breadth-first order."""
 
     child: np.ndarray
     """(node, WIDTH) int64: children, as nodes of the binary BVH, or ABSENT."""

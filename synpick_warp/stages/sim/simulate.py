@@ -32,8 +32,11 @@ from synpick_warp.stages.timing import scope
 
 @dataclass(frozen=True, eq=False)
 class TickRecord:
-    """Output of the last tick, for rendering and for the host; the next tick overwrites it. `observation` and `plan` are those of the
-    simulation itself."""
+    """Snapshot, status, perception results and physics of the last tick, for rendering and for the host; the next tick overwrites the
+    arrays.
+
+    `observation` and `plan` are the arrays with which the simulation itself works, not copies.
+    """
 
     snapshot: Snapshot
     status: WorldStatus
@@ -183,6 +186,7 @@ class Simulation:
             self.suction.ignore_attached_contacts(self.scene, self.state, self.seals, self.physics)
 
     def _take_snapshot(self) -> None:
+        """Copy the state of the worlds into the snapshot of the record, with the previous frame beside it, and pack the status rows."""
         state, attempts, snapshot, status = self.state, self.attempts, self.record.snapshot, self.record.status
         device = self.device
         wp.launch(

@@ -20,7 +20,10 @@ from synpick_warp.stages.sim.worlds import AttemptState, SealState, WorldState
 
 @dataclass(frozen=True, eq=False)
 class StepArrays:
-    """Step log of a tick. A place is an instance; gripper shaft and cup follow the instances."""
+    """Poses, velocities and forces of each body in each physics step of a tick, and the gripper's task, setpoint and impedance force.
+
+    The dimension "place" holds the instances, then gripper shaft and cup.
+    """
 
     pose: wp.array = device_array("world", "step", "place", dtype=wp.transformf, unit="m")
     """Body to world at the step's end."""
@@ -46,7 +49,7 @@ class StepArrays:
 
 @dataclass(frozen=True, eq=False)
 class DropArrays:
-    """Start of each world's arrangement."""
+    """Drop poses of the objects of each world's arrangement, and progress of settling."""
 
     drop_pose: wp.array = device_array("world", "instance", dtype=wp.transformf, unit="m")
     """Object to world at its first drop."""
@@ -56,7 +59,7 @@ class DropArrays:
 
 @dataclass(frozen=True, eq=False)
 class PhysicsRecord:
-    """Physics of one tick, for the host."""
+    """Step log and drop poses of one tick, for the host."""
 
     steps: StepArrays | None
     """None: steps are not recorded."""

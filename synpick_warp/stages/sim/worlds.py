@@ -17,7 +17,7 @@ CORNERS = 4
 
 @dataclass(frozen=True, eq=False)
 class WorldState:
-    """State of the worlds and their objects."""
+    """Episode, phase, objects, progress of settling, waypoints and light of each world."""
 
     arrangement_id: wp.array = device_array("world", dtype=wp.vec2i)
     """Episode index, and index of the arrangement in it: 0, plus 1 for each resample. Episode -1: none."""
@@ -65,7 +65,7 @@ class WorldState:
 
 @dataclass(frozen=True, eq=False)
 class AttemptState:
-    """State of each world's attempt to pick."""
+    """Task, outcome and counters of each world's attempt to pick, and what its seals engaged."""
 
     task: wp.array = device_array("world", dtype=wp.int32)
     """`Task`."""
@@ -76,7 +76,7 @@ class AttemptState:
     outcome: wp.array = device_array("world", dtype=wp.int32)
     """`Outcome` of the attempt that ended in this tick."""
     failures: wp.array = device_array("world", dtype=wp.int32)
-    """Failed attempts that count."""
+    """Failed attempts that count towards the limit."""
     hits: wp.array = device_array("world", dtype=wp.int32)
     """Suction rays that hit an object when suction was switched on."""
     engaged_bits: wp.array = device_array("world", dtype=wp.uint32)
@@ -89,7 +89,7 @@ class AttemptState:
 
 @dataclass(frozen=True, eq=False)
 class SealState:
-    """State of the suction seals of each world's cup."""
+    """Attachments, grip poses and forces of the seals of each world's cup."""
 
     attached: wp.array = device_array("world", "instance", dtype=wp.int32)
     """1: a seal holds the instance."""
