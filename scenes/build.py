@@ -46,7 +46,7 @@ FREE_DOFS = 6
 
 @dataclass(frozen=True)
 class Layout:
-    """Offsets of bodies, joints and shapes in the model's arrays. World w starts at w times the count per world."""
+    """Counts and offsets of bodies, joints and shapes in the arrays of the model. World w starts at w times the count per world."""
 
     worlds: int
     instances: int
@@ -65,18 +65,22 @@ class Layout:
 
     @property
     def slots(self) -> int:
+        """Body slots of a world."""
         return self.single_slots + self.compound_slots
 
     @property
     def bodies_per_world(self) -> int:
+        """Bodies of a world: gripper and slots."""
         return GRIPPER_BODIES + self.slots
 
     @property
     def coords_per_world(self) -> int:
+        """Joint coordinates of a world: gripper and slots."""
         return GRIPPER_DOFS + FREE_COORDS * self.slots
 
     @property
     def dofs_per_world(self) -> int:
+        """Degrees of freedom of a world: gripper and slots."""
         return GRIPPER_DOFS + FREE_DOFS * self.slots
 
 
@@ -253,6 +257,7 @@ def oriented_sides(pieces: Sequence[ConvexPiece]) -> np.ndarray:
 
 
 def _hull(piece: ConvexPiece) -> newton.Mesh:
+    """Newton's mesh of a convex piece."""
     return newton.Mesh(piece.vertices, piece.faces.reshape(-1), compute_inertia=False)
 
 

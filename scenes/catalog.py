@@ -191,6 +191,7 @@ def _raw(model: ModelFile, mesh: TriangleMesh, hull: HullSize, given: FileMateri
 
 
 def _near(value: float, expected: float, tolerance: float) -> bool:
+    """Whether a value equals the expected one within a relative tolerance."""
     return abs(value - expected) < tolerance * expected
 
 
@@ -236,6 +237,7 @@ def _check_fits_tote(vertices: np.ndarray, size: float, origin: str, tote: Tote)
 
 
 def _by(sides: list[float]) -> str:
+    """Text of the sides of a box, for messages."""
     return " x ".join(f"{side:.3g}" for side in sides)
 
 
@@ -258,6 +260,7 @@ def _report_undrawable(entries: list[CatalogEntry], budget: float, report: Calla
 
 
 def shape_recipe(raw: RawObject, objects: Objects) -> ShapeRecipe:
+    """Parameters of an object's collision shape: concave if stated, or by the ratio of the volumes of mesh and convex hull."""
     concave = raw.concave
     if concave is None:
         concave = signed_volume(raw.mesh.vertices, raw.mesh.faces) < objects.concave_ratio * raw.hull.volume
@@ -265,6 +268,7 @@ def shape_recipe(raw: RawObject, objects: Objects) -> ShapeRecipe:
 
 
 def _entry(raw: RawObject, pieces: tuple[ConvexPiece, ...], mass: float) -> CatalogEntry:
+    """Build the catalog entry of an object from its collision shape and mass."""
     properties = mass_properties(pieces)
     return CatalogEntry(
         obj_id=raw.obj_id,

@@ -33,6 +33,7 @@ def finger_fixture(gripper: Gripper) -> Fixture:
     low, high, length = *_finger_radii(gripper), gripper.finger_length
 
     def radius(fraction: float) -> float:
+        """Radius of the cone at a fraction of the length [m]."""
         return low + fraction * (high - low)
 
     profile = [(0.7 * low, 0.0), (low, 0.3 * low)]
@@ -87,4 +88,5 @@ def rod_inertia(mass: float, length: float) -> tuple[float, float, float]:
 
 
 def _finger_radii(gripper: Gripper) -> tuple[float, float]:
+    """Radius of the shaft at the wrist axis and at its top [m]."""
     return min(FINGER_TIP, gripper.finger_width) / 2, gripper.finger_width / 2

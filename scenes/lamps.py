@@ -35,7 +35,8 @@ DISC_RINGS, DISC_SPOKES = 16, 64
 
 
 class Lamp(NamedTuple):
-    """A small and bright light of an environment map: the sun, a lamp, a window or a part of one."""
+    """Direction, irradiance, angular radius and sample points of a lamp: a small and bright light of an environment map, or a part of
+    one."""
 
     direction: np.ndarray
     """Unit direction to its center (3)."""

@@ -36,7 +36,7 @@ _FACE_AXES = {
 
 @dataclass(frozen=True, eq=False)
 class Patch:
-    """A triangle soup: triangles with their own corners, before vertices are merged."""
+    """Corner positions and texture coordinates of a triangle soup, before vertices are merged."""
 
     corners: np.ndarray
     """Positions (T, 3, 3) float64 [m], counter-clockwise as seen from outside."""
@@ -232,6 +232,7 @@ def _grid(points: np.ndarray, uv: np.ndarray) -> Patch:
     """Triangulate a grid of points (rows upward, columns to the right): two triangles per cell."""
 
     def triangles(grid: np.ndarray) -> np.ndarray:
+        """Two triangles for each cell of a grid of values (rows, columns, n): (2 cells, 3, n)."""
         a, b, c, d = grid[:-1, :-1], grid[:-1, 1:], grid[1:, 1:], grid[1:, :-1]
         cells = np.stack([np.stack([a, b, c], axis=2), np.stack([a, c, d], axis=2)], axis=2)
         return cells.reshape(-1, 3, grid.shape[2])

@@ -23,16 +23,16 @@ SOLAR_TANGENT = np.tan(np.radians(0.267))
 
 
 class ExtractedSun(NamedTuple):
-    """Sun of an environment map, and the map without it."""
+    """Sun of an environment map, and the map without the sun."""
 
     rest: np.ndarray
-    """The map without it (rows, 2 rows, 3)."""
+    """The map without the sun (rows, 2 rows, 3)."""
     direction: np.ndarray
-    """Unit direction to it (3)."""
+    """Unit direction to the sun (3)."""
     irradiance: np.ndarray
-    """Irradiance on a surface that faces it (3); zero if the map is not bright there."""
+    """Irradiance on a surface that faces the sun (3); zero if the map is not bright there."""
     radius_tangent: float
-    """Tangent of its angular radius."""
+    """Tangent of the angular radius of the sun."""
 
 
 def extract_sun(radiance: np.ndarray, direction: np.ndarray) -> ExtractedSun:

@@ -123,6 +123,7 @@ def guide_walls(tote: Tote, height: float) -> tuple[ConvexPiece, ...]:
 
 
 def _check(tote: Tote) -> None:
+    """Check that floor, rim and walls of the tote fit into one another; raises ConfigError."""
     for axis, name in enumerate(("length", "width")):
         outer, rim, floor = tote.outer_size[axis], tote.rim_size[axis], tote.floor_size[axis]
         if rim + 2 * tote.wall >= outer:
@@ -155,6 +156,7 @@ def _opening(tote: Tote, level: float) -> tuple[np.ndarray, float]:
 
 
 def _outer_ring(tote: Tote, z: float) -> np.ndarray:
+    """Outline (n, 3) of the outside of the tote at height z [m]."""
     outline = rounded_rectangle(tote.outer_size[0], tote.outer_size[1], CORNER_RADIUS + tote.wall, CORNER_SEGMENTS)
     return np.column_stack([outline, np.full(len(outline), z)])
 
@@ -180,8 +182,10 @@ def _ribs(tote: Tote) -> list[Patch]:
 
 
 def _box(low: tuple[float, float, float], high: tuple[float, float, float]) -> ConvexPiece:
+    """Box between two corners, as a convex piece."""
     return _piece([(x, y, z) for x in (low[0], high[0]) for y in (low[1], high[1]) for z in (low[2], high[2])])
 
 
 def _piece(points: list[tuple[float, float, float]]) -> ConvexPiece:
+    """Convex hull of points, as a convex piece."""
     return simplify_hull(np.array(points), len(points))

@@ -11,7 +11,7 @@ import numpy as np
 
 @dataclass(frozen=True, eq=False)
 class TriangleMesh:
-    """Indexed triangle mesh with outward orientation."""
+    """Vertices, faces, normals and texture coordinates of a triangle mesh with outward orientation."""
 
     vertices: np.ndarray
     """(V, 3) float32 [m]."""
@@ -48,7 +48,8 @@ class HullSize(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class RawObject:
-    """An object as read from a file or made procedurally, before collision shape and mass properties are computed."""
+    """Mesh, material and symmetries of an object as read from a file or made procedurally, before collision shape and mass properties are
+    computed."""
 
     obj_id: int
     """BOP's obj_id: class of the object."""
@@ -70,7 +71,7 @@ class RawObject:
 
 @dataclass(frozen=True, eq=False)
 class ConvexPiece:
-    """Convex polyhedron, as part of a collision shape, in the object's frame."""
+    """Vertices and faces of a convex polyhedron, as part of a collision shape, in the object's frame."""
 
     vertices: np.ndarray
     """(V, 3) float32 [m]."""
@@ -141,17 +142,17 @@ class Interior:
 
 @dataclass(frozen=True, eq=False)
 class Fixture:
-    """A visible part of the scene that is not an object: tote, gripper shaft, suction cup."""
+    """Mesh and material of a visible part of the scene that is not an object: tote, gripper shaft, suction cup."""
 
     mesh: TriangleMesh
     material: Material
     interior: Interior | None = None
-    """Its empty interior, if it is a container."""
+    """Empty interior of the fixture, if it is a container."""
 
 
 @dataclass(frozen=True, eq=False)
 class Sun:
-    """A directional light (sun) that an sIBL set names."""
+    """Direction and irradiance of a directional light (sun) that an sIBL set names."""
 
     direction: np.ndarray
     """Unit direction (3) float64 towards the sun, in the map's frame."""

@@ -75,7 +75,7 @@ def describe_error(error: BaseException) -> str:
 
 @dataclass(frozen=True)
 class AssetScope:
-    """What the files of one object may refer to, and which names were found elsewhere than they say."""
+    """Folder that the files of one object may refer to, and the names that were found elsewhere than stated."""
 
     root: Path
     """Folder of the object: names in its files may lead up to it, not out of it."""

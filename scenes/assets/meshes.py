@@ -134,6 +134,7 @@ def merge_positions(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray
 
 
 def _drop_degenerate(faces: np.ndarray) -> np.ndarray:
+    """Faces (F, 3) without those that name a vertex twice."""
     a, b, c = faces.T
     return faces[(a != b) & (b != c) & (c != a)]
 
@@ -247,5 +248,6 @@ def _unroll(part: MeshPart, notes: Notes) -> MeshPart:
 
 
 def _area(part: MeshPart) -> float:
+    """Surface area of a part, in the square of its unit."""
     corners = part.vertices[part.faces]
     return float(np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1).sum() / 2.0)

@@ -47,14 +47,14 @@ _Number = Annotated[float, msgspec.Meta(ge=-_MAX_NUMBER, le=_MAX_NUMBER)]
 
 
 class _Axis(msgspec.Struct):
-    """A continuous symmetry."""
+    """Axis and offset of a continuous symmetry, in the units of the file."""
 
     axis: tuple[_Number, _Number, _Number]
     offset: tuple[_Number, _Number, _Number] = (0.0, 0.0, 0.0)
 
 
 class _Entry(msgspec.Struct):
-    """What is read of an object's entry; other keys are copied as they are."""
+    """Diameter and symmetries of an object's entry; other keys are copied unread."""
 
     diameter: Annotated[float, msgspec.Meta(gt=0.0, le=1e9)] | None = None
     symmetries_discrete: list[Annotated[list[_Number], msgspec.Meta(min_length=16, max_length=16)]] = []
@@ -63,7 +63,7 @@ class _Entry(msgspec.Struct):
 
 @dataclass(frozen=True)
 class ModelInfo:
-    """An entry of models_info.json, converted to metres."""
+    """Diameter, symmetries and bounding box of an entry of models_info.json, converted to metres."""
 
     diameter: float | None = None
     """[m]"""
@@ -117,6 +117,7 @@ def read_models_info(path: Path, obj_ids: Iterable[int], fault: Callable[[Catalo
 
 
 def _convert(entry: Any, obj_id: int, path: Path) -> ModelInfo:
+    """Validate an entry and convert it to metres."""
     place = f"{path}: object {obj_id}"
     if not isinstance(entry, dict):
         raise CatalogError(f"{path}: no entry for object {obj_id}; add one, {_ADVICE}")
@@ -185,6 +186,7 @@ def corrected_entry(entry: Any, own: dict[str, Any]) -> dict[str, Any]:
 
 
 def _near(value: float, expected: float, tolerance: float) -> bool:
+    """Whether a value equals the expected one within a relative tolerance."""
     return abs(value - expected) <= tolerance * expected
 
 
@@ -253,6 +255,7 @@ def _depth(content: Any) -> int:
 
 
 def _info(entry: _Entry, place: str) -> ModelInfo:
+    """Convert a validated entry to metres; symmetries that are the identity are left out."""
     return ModelInfo(
         None if entry.diameter is None else entry.diameter * _MILLIMETRE,
         tuple(
@@ -265,6 +268,7 @@ def _info(entry: _Entry, place: str) -> ModelInfo:
 
 
 def _rigid(value: list[float], place: str) -> tuple[float, ...]:
+    """Validate a rigid 4 x 4 matrix, row by row [mm], and convert the translation to metres."""
     matrix = np.array(value, dtype=np.float64).reshape(4, 4)
     rotation = matrix[:3, :3]
     off = max(np.abs(rotation @ rotation.T - np.eye(3)).max(), np.abs(matrix[3] - (0, 0, 0, 1)).max(), abs(np.linalg.det(rotation) - 1.0))
@@ -280,6 +284,7 @@ def _is_identity(matrix: tuple[float, ...]) -> bool:
 
 
 def _axis(value: _Axis, place: str) -> tuple[tuple[float, float, float], tuple[float, float, float]]:
+    """Normalize the axis of a continuous symmetry, and convert the offset to metres."""
     axis, offset = np.array(value.axis, dtype=np.float64), np.array(value.offset, dtype=np.float64) * _MILLIMETRE
     length = float(np.linalg.norm(axis))
     if length == 0.0:

@@ -21,7 +21,7 @@ _RGBE, _XYZE = b"32-bit_rle_rgbe", b"32-bit_rle_xyze"
 
 @dataclass(frozen=True)
 class RadianceHeader:
-    """What a header says of its pixels."""
+    """Size, orientation and exposure of the pixels of a Radiance file, as its header states."""
 
     width: int
     """[px]"""

@@ -96,7 +96,7 @@ def collision_shapes(
 
 @dataclass(frozen=True, eq=False)
 class _Job:
-    """An object whose shape is wanted, and the file in which it is cached."""
+    """Name, mesh and recipe of an object whose shape is wanted, and the file in which the shape is cached."""
 
     name: str
     mesh: TriangleMesh
@@ -124,6 +124,7 @@ def _decompose_all(jobs: Mapping[int, _Job], seconds: float, report: Callable[[s
 
 
 def _remedy(failure: Failure) -> str:
+    """What to do about an object that was not decomposed, for messages."""
     return _LATE if failure.timed_out else _REMEDY
 
 
@@ -147,6 +148,7 @@ class _Saver:
 
 
 def _key(mesh: TriangleMesh, recipe: ShapeRecipe) -> str:
+    """Cache key of a collision shape: hash of recipe, version of CoACD, vertices and faces."""
     version = importlib.metadata.version("coacd") if recipe.concave else ""
     digest = hashlib.sha256(f"{_RECIPE} {recipe} {version} {mesh.vertices.shape} {mesh.faces.shape}".encode())
     digest.update(mesh.vertices.astype("<f4").tobytes())

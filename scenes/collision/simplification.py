@@ -212,6 +212,7 @@ def _fit_volume(facets: _Facets, chosen: Sequence[int], volume: float) -> np.nda
     """
 
     def excess(shift: float) -> float:
+        """Difference of the cube roots of the volumes of the shifted and of the wanted polyhedron [m]."""
         try:
             return float(np.cbrt(_intersect(facets, chosen, shift).volume) - np.cbrt(volume))
         except QhullError:  # moved so far that it is empty

@@ -138,6 +138,7 @@ def cleaner_bottle() -> Shape:
 
 
 def _beans(image: np.ndarray) -> None:
+    """Draw beans into a label."""
     for x, y in ((0.3, 0.62), (0.42, 0.72), (0.56, 0.6), (0.68, 0.72), (0.5, 0.82), (0.78, 0.6), (0.24, 0.76)):
         paint.dot(image, x, y, 0.062, (112, 66, 32))
         paint.dot(image, x - 0.008, y - 0.01, 0.045, (136, 84, 44))
@@ -145,6 +146,7 @@ def _beans(image: np.ndarray) -> None:
 
 
 def _crackers(image: np.ndarray) -> None:
+    """Draw crackers into a label."""
     for x, y in ((0.34, 0.6), (0.68, 0.58), (0.5, 0.72), (0.76, 0.78), (0.24, 0.78)):
         paint.dot(image, x, y, 0.155, (170, 110, 44))
         paint.dot(image, x, y, 0.143, (238, 196, 116))
@@ -153,12 +155,14 @@ def _crackers(image: np.ndarray) -> None:
 
 
 def _cubes(image: np.ndarray) -> None:
+    """Draw sugar cubes into a label."""
     for x, y in ((0.2, 0.66), (0.38, 0.7), (0.56, 0.64), (0.3, 0.58), (0.66, 0.74)):
         paint.fill(image, (x, y, x + 0.15, y + 0.085), (208, 208, 214))
         paint.fill(image, (x + 0.012, y + 0.006, x + 0.138, y + 0.07), WHITE)
 
 
 def _tomato(image: np.ndarray) -> None:
+    """Draw tomatoes into a label."""
     paint.fill(image, (0.0, 0.48, 1.0, 0.84), (248, 240, 222))
     for x in (0.28, 0.5, 0.72):
         paint.dot(image, x, 0.66, 0.14, (206, 40, 30))
@@ -167,6 +171,7 @@ def _tomato(image: np.ndarray) -> None:
 
 
 def _leaf(image: np.ndarray) -> None:
+    """Draw mustard flowers into a label."""
     paint.fill(image, (0.0, 0.48, 1.0, 0.84), (176, 32, 28))
     for x in (0.3, 0.5, 0.7):
         for angle in np.arange(6) * np.pi / 3:
@@ -175,6 +180,7 @@ def _leaf(image: np.ndarray) -> None:
 
 
 def _fish(image: np.ndarray) -> None:
+    """Draw a fish into a label."""
     paint.fill(image, (0.0, 0.5, 1.0, 0.84), (120, 186, 206))
     for x in np.linspace(-0.18, 0.18, 19):
         paint.dot(image, 0.48 + x, 0.67, 0.11 * float(np.sqrt(1 - (x / 0.2) ** 2)), (44, 66, 96))
@@ -184,6 +190,7 @@ def _fish(image: np.ndarray) -> None:
 
 
 def _swirl(image: np.ndarray) -> None:
+    """Draw a bowl of pudding into a label."""
     paint.dot(image, 0.5, 0.68, 0.19, (240, 232, 216))
     for radius in (0.16, 0.11, 0.06):
         paint.dot(image, 0.5, 0.68, radius, (116, 66, 40))
@@ -191,6 +198,7 @@ def _swirl(image: np.ndarray) -> None:
 
 
 def _cherries(image: np.ndarray) -> None:
+    """Draw cherries into a label."""
     for x, y in ((0.36, 0.7), (0.6, 0.74), (0.48, 0.64)):
         paint.dot(image, x, y, 0.13, (140, 10, 40))
         paint.dot(image, x - 0.035, y - 0.045, 0.03, (250, 170, 190))
@@ -198,6 +206,7 @@ def _cherries(image: np.ndarray) -> None:
 
 
 def _slices(image: np.ndarray) -> None:
+    """Draw slices of meat into a label."""
     paint.fill(image, (0.0, 0.5, 1.0, 0.84), (250, 202, 40))
     for x in (0.26, 0.42, 0.58, 0.74):
         paint.dot(image, x, 0.67, 0.15, (150, 60, 56))
@@ -206,6 +215,7 @@ def _slices(image: np.ndarray) -> None:
 
 
 def _bubbles(image: np.ndarray) -> None:
+    """Draw bubbles into a label."""
     for x, y, radius in ((0.3, 0.6, 0.08), (0.5, 0.72, 0.13), (0.72, 0.6, 0.1), (0.66, 0.8, 0.05), (0.28, 0.78, 0.06)):
         paint.dot(image, x, y, radius, (170, 214, 246))
         paint.dot(image, x, y, radius * 0.86, (70, 146, 220))

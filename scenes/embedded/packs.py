@@ -39,7 +39,7 @@ Motif = Callable[[np.ndarray], None]
 
 @dataclass(frozen=True)
 class Label:
-    """Content of a printed label: texts, colours, picture, and the seed of its random details."""
+    """Texts, colours and picture of a printed label, and the seed of its random details."""
 
     title: tuple[str, ...]
     subtitle: str
@@ -159,6 +159,7 @@ def tin(ring: np.ndarray, height: float, label_image: np.ndarray, ends: dict[str
     narrow = 1 - 0.0012 / np.abs(ring).max()
 
     def level(scale: float, z: float) -> np.ndarray:
+        """The ring, scaled, at a height [m]."""
         return at_height(ring * scale, z)
 
     lower = np.stack([level(0.93, -half + 0.002), level(0.95, -half), level(0.99, -half), level(1.0, -half + 0.001)])
@@ -211,12 +212,12 @@ def bottle(
 
 
 def tin_label_size(ring: np.ndarray, height: float) -> tuple[int, int]:
-    """Width and height of the label that wraps once around a tin [px]."""
+    """Width and height of a tin's label [px]: as wide as the texture atlas without padding, as high as the tin between its rims."""
     around = np.linalg.norm(np.roll(ring, -1, axis=0) - ring, axis=1).sum()
     width = SHEET - 2 * paint.PADDING
     return width, round(width * (height - 0.008) / around)
 
 
 def label_ring(width: float, depth: float, radius: float) -> np.ndarray:
-    """Ring of a tin with flat sides [m]."""
+    """Outline (n, 2) of a tin with flat sides, a rounded rectangle [m]."""
     return rounded_rectangle(width, depth, radius, 10)

@@ -113,4 +113,5 @@ def _direction(azimuth: float, elevation: float) -> np.ndarray:
 
 
 def _color(color: Rgb) -> np.ndarray:
+    """Convert a colour to an array (3)."""
     return np.array(color)

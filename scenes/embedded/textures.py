@@ -196,13 +196,16 @@ def peel(width: int, height: int, seed: int) -> np.ndarray:
 
 
 def _symmetrize(noise: np.ndarray) -> np.ndarray:
+    """Make noise symmetric under a half-turn."""
     return (noise + noise[::-1, ::-1]) / 2
 
 
 def _pixels(image: np.ndarray, box: Box) -> tuple[int, int, int, int]:
+    """Sides of a box in pixels: left, top, right, bottom."""
     high, wide = image.shape[:2]
     return round(box[0] * wide), round(box[1] * high), round(box[2] * wide), round(box[3] * high)
 
 
 def _to_uint8(image: np.ndarray) -> np.ndarray:
+    """Clip an image to 0..255, and convert it to bytes."""
     return np.clip(image, 0, 255).astype(np.uint8)

@@ -47,10 +47,14 @@ class _Struct(msgspec.Struct):
 
 
 class Buffer(_Struct):
+    """glTF buffer: bytes of a file, of a data URI, or of the binary chunk."""
+
     uri: str | None = None
 
 
 class View(_Struct):
+    """glTF buffer view: a range of bytes of a buffer."""
+
     buffer: Index
     byteLength: Index  # noqa: N815
     byteOffset: Index = 0  # noqa: N815
@@ -59,23 +63,31 @@ class View(_Struct):
 
 
 class SparseIndices(_Struct):
+    """Indices of the elements that a sparse accessor replaces."""
+
     bufferView: Index  # noqa: N815
     componentType: Literal[5121, 5123, 5125]  # noqa: N815
     byteOffset: Index = 0  # noqa: N815
 
 
 class SparseValues(_Struct):
+    """Values with which a sparse accessor replaces elements."""
+
     bufferView: Index  # noqa: N815
     byteOffset: Index = 0  # noqa: N815
 
 
 class Sparse(_Struct):
+    """Sparse part of an accessor: number, indices and values of the elements that it replaces."""
+
     count: Index
     indices: SparseIndices
     values: SparseValues
 
 
 class Accessor(_Struct):
+    """glTF accessor: type, number and location of the elements of an array."""
+
     componentType: Literal[5120, 5121, 5122, 5123, 5125, 5126]  # noqa: N815
     count: Index
     type: Literal["SCALAR", "VEC2", "VEC3", "VEC4", "MAT2", "MAT3", "MAT4"]
@@ -86,6 +98,8 @@ class Accessor(_Struct):
 
 
 class Primitive(_Struct):
+    """glTF mesh primitive: accessors of its attributes and indices, topology and material."""
+
     attributes: dict[str, Index]
     indices: Index | None = None
     mode: int = TRIANGLES
@@ -95,10 +109,14 @@ class Primitive(_Struct):
 
 
 class Mesh(_Struct):
+    """glTF mesh: its primitives."""
+
     primitives: list[Primitive]
 
 
 class Node(_Struct):
+    """glTF node: mesh, children and transform."""
+
     mesh: Index | None = None
     skin: Index | None = None
     children: list[Index] = []
@@ -109,26 +127,36 @@ class Node(_Struct):
 
 
 class Scene(_Struct):
+    """glTF scene: its root nodes."""
+
     nodes: list[Index] = []
 
 
 class Image(_Struct):
+    """glTF image: a file, a data URI, or a buffer view."""
+
     uri: str | None = None
     bufferView: Index | None = None  # noqa: N815
 
 
 class Sampler(_Struct):
+    """glTF sampler: wrap modes along both axes."""
+
     wrapS: int = 10497  # noqa: N815
     wrapT: int = 10497  # noqa: N815
 
 
 class Texture(_Struct):
+    """glTF texture: image, sampler and extensions."""
+
     source: Index | None = None
     sampler: Index | None = None
     extensions: dict[str, Any] = {}
 
 
 class Transform(_Struct):
+    """Offset, rotation and scale of texture coordinates (KHR_texture_transform)."""
+
     offset: tuple[float, float] = (0.0, 0.0)
     rotation: float = 0.0
     scale: tuple[float, float] = (1.0, 1.0)
@@ -136,16 +164,22 @@ class Transform(_Struct):
 
 
 class InfoExtensions(_Struct):
+    """Extensions of a texture reference that are read."""
+
     transform: Transform | None = msgspec.field(name=TRANSFORM, default=None)
 
 
 class TextureInfo(_Struct):
+    """Reference to a texture: its index, texture coordinate set and extensions."""
+
     index: Index
     texCoord: Index = 0  # noqa: N815
     extensions: InfoExtensions | None = None
 
 
 class Pbr(_Struct):
+    """Metallic-roughness parameters and textures of a material."""
+
     baseColorFactor: Four = (1.0, 1.0, 1.0, 1.0)  # noqa: N815
     metallicFactor: float = 1.0  # noqa: N815
     roughnessFactor: float = 1.0  # noqa: N815
@@ -154,6 +188,8 @@ class Pbr(_Struct):
 
 
 class Glossiness(_Struct):
+    """Specular-glossiness parameters and textures of a material (KHR_materials_pbrSpecularGlossiness)."""
+
     diffuseFactor: Four = (1.0, 1.0, 1.0, 1.0)  # noqa: N815
     specularFactor: Three = (1.0, 1.0, 1.0)  # noqa: N815
     glossinessFactor: float = 1.0  # noqa: N815
@@ -162,10 +198,14 @@ class Glossiness(_Struct):
 
 
 class MaterialExtensions(_Struct):
+    """Extensions of a material that are read."""
+
     glossiness: Glossiness | None = msgspec.field(name=GLOSSINESS, default=None)
 
 
 class Material(_Struct):
+    """glTF material: PBR parameters, extensions, and textures that are reported but not used."""
+
     pbrMetallicRoughness: Pbr | None = None  # noqa: N815
     extensions: MaterialExtensions | None = None
     normalTexture: Any = None  # noqa: N815
@@ -176,10 +216,14 @@ class Material(_Struct):
 
 
 class _Head(_Struct):
+    """Asset statement of a document, whose version is checked before the rest is read."""
+
     asset: Any = None
 
 
 class Gltf(_Struct):
+    """Arrays and default scene of a glTF document."""
+
     extensionsUsed: list[str] = []  # noqa: N815
     extensionsRequired: list[str] = []  # noqa: N815
     buffers: list[Buffer] = []

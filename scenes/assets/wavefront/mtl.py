@@ -29,7 +29,7 @@ _SILENT = {"ka", "ks", "ns", "ni", "illum", "tf", "d", "tr", "ke", "pcr", "aniso
 
 @dataclass(eq=False)
 class MtlMaterial:
-    """Material as its library states it; images are named, not yet read."""
+    """Colours, factors and image names of a material as its library states; the images are not yet read."""
 
     library: Path
     color: tuple[float, float, float] | None = None
