@@ -67,11 +67,10 @@ def accumulate_samples_kernel(
     # Out:
     sums_inout: Sums,
 ):
-    """Normal equations of silhouette (Huber) and photometric (Tukey) residuals: added to `sums_inout`, which holds those of the points.
+    """Normal equations of silhouette (Huber) and photometric (Tukey) residuals: added to `sums_inout`; `Sums.samples` is written.
 
     A protruding sample is pulled towards the nearest pixel of the mask. The colour residual of a visible one is intensity - base colour x
-    light, relative to the instance's mean intensity; its derivative is the image gradient. `Sums.samples` is written. Launched over
-    hypothesis, lane.
+    light, relative to the instance's mean; its derivative is the image gradient. Launched over hypothesis, lane.
     """
     index, lane = wp.tid()
     instance = index // hypotheses

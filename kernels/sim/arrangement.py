@@ -114,7 +114,8 @@ def is_sampled(catalog_index: wp.array2d[int], world: int, count: int, candidate
 
 @wp.func
 def fits_budget(total: float, volume: float, drop: DropData) -> bool:
-    """True if an object may be drawn after others of a total volume [m³]; with `exceed`, if it alone is within the budget."""
+    """True if an object of this volume may be drawn: with `exceed` if it alone is within the budget, else if it is with the total before it
+    [m³]."""
     return wp.where(drop.exceed == 1, volume, total + volume) <= drop.volume
 
 
@@ -134,11 +135,10 @@ def sample_objects_kernel(
     catalog_index_out: wp.array2d[int],  # (world, instance)
     body_slot_out: wp.array2d[int],  # (world, instance)
 ):
-    """Sample objects uniformly up to a volume budget V: with `exceed` until Σ volume ≥ V, else while Σ volume ≤ V.
+    """Sample objects up to a volume budget V: with `exceed` until Σ volume ≥ V, else while Σ volume ≤ V. Launched over world.
 
     An object larger than V is resampled; without `exceed`, after the first one, it ends the draw. `catalog_index` receives the objects (-1:
-    none), `body_slot` the next free slot of their class, single or compound; without one the episode ends with ARRANGEMENT_OVERFLOW.
-    Launched over world.
+    none), `body_slot` the next free slot of their class; without one the episode ends (ARRANGEMENT_OVERFLOW).
     """
     world = wp.tid()
     phase = phase_inout[world]

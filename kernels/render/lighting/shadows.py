@@ -257,11 +257,9 @@ def trace_shadow_rays_kernel(
     history_inout: LightHistory,
     rays_out: wp.array3d[wp.uint64],  # (view, shadow_row, shadow_column)
 ):
-    """Shadow rays from the middle pixel of each pixel of the shadow grid, traced or reused from the previous frame, packed by `pack_rays`.
+    """Shadow rays from the middle pixels of the shadow grid, traced or reused from the last frame; writes `rays_out` and the history.
 
-    Writes `rays_out`, and the bits for the next frame into the history (`LightHistory.shadows`). Under a map without lamps nothing is
-    written. Rays to lamps behind the surface count as unblocked, so that the filter darkens no edges. Launched over view, pixel of the
-    shadow grid (tile order, from flat index `first` on).
+    Nothing is written under a map without lamps. Rays to lamps behind the surface count as unblocked. Launched over view, grid pixel.
     """
     view, row, column = tile_pixel(coarse.grid, wp.tid() + first)
     if not in_image(coarse.grid, row, column):

@@ -50,10 +50,9 @@ def set_up_views_kernel(
     # Out:
     bodies_out: ViewBodies,
 ):
-    """Transform each body of a view's world into the view's camera, x_camera = R (x_world - c), in float64, stored in float32.
+    """Transform each body into a view's camera, x_camera = R (x_world - c), in float64, stored in float32. Launched over view, body.
 
     Fills `ViewBodies` except `order`, `ray_record`, `present` and `body_mask`. Absent bodies, and all bodies of unused views, get mesh -1.
-    Launched over view, body.
     """
     view, body = wp.tid()
     world = views.world[view]

@@ -237,11 +237,10 @@ def trace_pixel(
     coarse_light_out: CoarseLight,
     queued: bool,
 ):
-    """Trace the paths of a thread's coarse pixel, if this kernel is responsible for it; writes the guide image and the light, or queues the
-    path.
+    """Trace the paths of a thread's coarse pixel, if this kernel is responsible: writes guide image and light, or queues the path.
 
-    With `queued` the kernel is responsible for coarse pixels with one path, if there are queues; else for all others. `queued` is a
-    constant, so that the compiler removes the other case.
+    With `queued` (a constant, so that the compiler removes the other case) it is for pixels with one path, if there are queues; else for
+    others.
     """
     regions = queues.count.shape[1]
     index = thread
