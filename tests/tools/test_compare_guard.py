@@ -43,6 +43,13 @@ def test_names_do_not_matter_to_a_kernels_source():
     assert "// " not in canonical()
 
 
+def test_the_order_of_overloads_does_not_matter_and_all_of_them_count():
+    kinds = ("Sum_0123abcd", "Mean_4567ef01", "Peak_89abcdef")
+    first, second, third = (f"CUDA_CALLABLE {kind} add(const {kind}& a) {{ return a; }}\n" for kind in kinds)
+    one, other, more = (kernel_sources.split_definitions(text) for text in (first + second, second + first, first + second + third))
+    assert one == other != more
+
+
 def test_values_matter_also_in_functions_that_a_kernel_calls():
     assert kernel_sources.first_difference([canonical()], [canonical(two="3.0")]).endswith(
         "wp::mul(p0, 2.0); } | if (true) { var_1 = wp::mul(p0, 3.0); }"

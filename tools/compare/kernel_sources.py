@@ -20,6 +20,7 @@ import runpy
 import sys
 from collections import defaultdict
 from collections.abc import Iterable, Iterator
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -34,6 +35,7 @@ _DEFINITION = re.compile(r'^(?:extern "C" |(?:struct|static|CUDA_CALLABLE|templa
 _KERNEL = re.compile(r"(\w+)_cuda_kernel_(?:forward|backward)")
 _HASH = re.compile(r"_[0-9a-f]{8}$")
 _NAME = re.compile(r"[A-Za-z_]\w*")
+_HASHES = re.compile(r"_[0-9a-f]{8}\b")
 _PARAMETER = re.compile(r"\b(?:adj_|var_|ret_)+[A-Za-z]\w*")
 
 Sources = dict[str, list[str]]
@@ -125,9 +127,12 @@ def kernels_of(module: Any) -> Iterator[tuple[str, str]]:
 
 
 def split_definitions(source: str) -> dict[str, str]:
-    """Name -> text of each function and struct of a generated module, without comments and blank lines."""
+    """Name -> text of each function and struct of a generated module, without comments and blank lines.
+
+    Overloads, such as the sums of structs, are one text: sorted, as their order in a module follows hashes.
+    """
     text = "\n".join(line for line in _COMMENT.sub("", source).splitlines() if line.strip() and not line.startswith("#"))
-    definitions: dict[str, str] = {}
+    definitions: dict[str, list[str]] = {}
     position = 0
     while match := _DEFINITION.search(text, position):
         position = _end(text, match.start())
@@ -135,8 +140,8 @@ def split_definitions(source: str) -> dict[str, str]:
         head = definition.split("{", 1)[0]
         kernel = _KERNEL.search(head)
         name = kernel[0] if kernel else _NAME.findall(head.split("(", 1)[0])[-1]
-        definitions.setdefault(name, definition)
-    return definitions
+        definitions.setdefault(name, []).append(definition)
+    return {name: "\n".join(sorted(texts, key=partial(_HASHES.sub, ""))) for name, texts in definitions.items()}
 
 
 def _end(text: str, start: int) -> int:
