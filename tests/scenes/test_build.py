@@ -13,7 +13,7 @@ from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
 
 from synpick_warp.errors import ConfigError
-from synpick_warp.kernels.sim import contact_sweep
+from synpick_warp.kernels.newton_patches import contact_sweep
 from synpick_warp.scenes import build
 from synpick_warp.scenes.embedded.objects import procedural_objects
 from synpick_warp.scenes.tote import guide_walls
