@@ -129,4 +129,6 @@ def test_swapped_and_missing_arguments_are_found(tmp_path, capsys, body, faults)
 
 @pytest.mark.parametrize("call", ["wp.launch(add_kernel, dim=1)", "wp.launch_tiled(add_kernel, dim=[1])", "warp.launch(add_kernel, dim=1)"])
 def test_launches_outside_the_stages_are_found(tmp_path, capsys, call):
-    assert check(tmp_path, capsys, GOOD, elsewhere=f"\n{call}\n") == ["2: kernels are launched in synpick_warp/stages and synpick_warp/newton_patches only"]
+    assert check(tmp_path, capsys, GOOD, elsewhere=f"\n{call}\n") == [
+        "2: kernels are launched in synpick_warp/stages and synpick_warp/newton_patches only"
+    ]
