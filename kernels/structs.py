@@ -37,7 +37,7 @@ class LayoutData:
 
 @wp.struct
 class CatalogData:
-    """Volumes, masses and other properties of the objects in the catalog; arrays are (entry)."""
+    """Catalog of objects: volume, mass and other properties of each; arrays have one element per object."""
 
     count: int
     """Objects in the catalog."""

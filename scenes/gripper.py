@@ -88,5 +88,5 @@ def rod_inertia(mass: float, length: float) -> tuple[float, float, float]:
 
 
 def _finger_radii(gripper: Gripper) -> tuple[float, float]:
-    """Radius of the shaft at the wrist axis and at its top [m]."""
+    """Radii of the gripper shaft [m]: at the wrist joint, and at its upper end."""
     return min(FINGER_TIP, gripper.finger_width) / 2, gripper.finger_width / 2

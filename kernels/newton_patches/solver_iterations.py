@@ -202,8 +202,7 @@ def bind_row_sweep(function: wp.Function) -> wp.Function:
 
 
 def bind_tree_refresh(function: wp.Function) -> wp.Function:
-    """Wrap the solver's forward kinematics of velocities in a device function that takes the structs of this module, and return that
-    function."""
+    """Adapt the solver's forward kinematics of velocities to this module: returns a device function that takes its structs."""
 
     @wp.func
     def refresh_tree(world: int, bodies: BodyData, v: wp.array[float], twist_inout: wp.array2d[float]):

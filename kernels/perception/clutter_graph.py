@@ -40,7 +40,7 @@ def bit(instance: int) -> wp.uint32:
 def edge_weight(votes: wp.array3d[float], world: int, lower: int, upper: int, min_votes: float) -> float:
     """Weight of the edge from `upper` to `lower`: its votes minus those of the opposite edge, at least 0.
 
-    Votes of either edge count as 0 below `min_votes`.
+    Edges with fewer than `min_votes` votes are ignored.
     """
     votes_for = votes[world, lower, upper]
     votes_against = votes[world, upper, lower]

@@ -108,7 +108,9 @@ def step_poses_kernel(
     # Out:
     pose_inout: wp.array[wp.transform],  # (pose) [m]
 ):
-    """One Gauss-Newton step: (H + (λ + μ) A) s = g + μ A d, A the observed area, d the step to the prior, λ damping, μ prior.
+    """Damped Gauss-Newton step s with a prior: solves (H + (λ + μ) A) s = g + μ A d.
+
+    A is the observed area, d the step from the current pose to the prior, λ the damping and μ the weight of the prior.
 
     Launched over hypothesis.
     """

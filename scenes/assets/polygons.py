@@ -76,5 +76,5 @@ def _is_ear(flat: np.ndarray, left: list[int], place: int) -> bool:
 
 
 def _cross(a: np.ndarray, b: np.ndarray, point: np.ndarray) -> np.ndarray:
-    """Twice the signed area of the triangles a, b, point."""
+    """Twice the signed area of the triangle (a, b, point), for each of `point`: positive if counter-clockwise (orientation test)."""
     return (b[0] - a[0]) * (point[..., 1] - a[1]) - (b[1] - a[1]) * (point[..., 0] - a[0])

@@ -50,7 +50,7 @@ class Snapshot:
 
 @dataclass(frozen=True, eq=False)
 class LastFrame:
-    """Episode, objects and poses of each world at the end of the last tick, from which the next snapshot gets its `last_` arrays.
+    """State of each world at the end of the previous tick: episode, objects and poses. The next snapshot copies it to its `last_` arrays.
 
     Members are named as in `Snapshot` and `FramePoses`.
     """

@@ -77,7 +77,7 @@ class Line:
 
 @dataclass(frozen=True)
 class Side:
-    """A checkout, and the folder of its results."""
+    """One of the two compared versions: its source tree, and the folder to which its commands write."""
 
     checkout: Path
     folder: Path

@@ -84,7 +84,7 @@ def compare_pictures(old: Side, new: Side, options: argparse.Namespace) -> Itera
 
 
 def _run(side: Side, arguments: tuple[str, ...]) -> str:
-    """Run Python with a checkout's code in the folder of its results; returns why it failed, or nothing."""
+    """Run a Python command with the source tree of `side` in its result folder; returns the error message, empty on success."""
     command = [sys.executable, *arguments]
     done = subprocess.run(command, cwd=side.folder, env=side.environment(), capture_output=True, text=True, check=False)
     return f"exit code {done.returncode}: {(done.stderr.strip() or 'no message').splitlines()[-1]}" if done.returncode else ""

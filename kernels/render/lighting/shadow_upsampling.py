@@ -184,7 +184,7 @@ def sum_edges(shadows: LampShadows, coarse: CoarseGrid, gbuffer: GBuffer, view: 
 
 @wp.func
 def edge_fraction(sums: EdgeSums, lamp: int, rays: int, fallback: float) -> float:
-    """Visible fraction of a lamp [1/255]: its weighted sum of unblocked rays over that of the `rays` rays of each pixel that traced any.
+    """Visible fraction of a lamp [1/255]: weighted number of unblocked shadow rays divided by that of all; `rays` is the number per pixel.
 
     `fallback` where no pixel in the window traced a ray to the lamp.
     """
