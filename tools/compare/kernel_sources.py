@@ -33,9 +33,8 @@ PACKAGE = "synpick_warp"
 _COMMENT = re.compile(r"//[^\n]*|/\*.*?\*/", re.DOTALL)
 _DEFINITION = re.compile(r'^(?:extern "C" |(?:struct|static|CUDA_CALLABLE|template|inline)\b)', re.MULTILINE)
 _KERNEL = re.compile(r"(\w+)_cuda_kernel_(?:forward|backward)")
-_HASH = re.compile(r"_[0-9a-f]{8}$")
 _NAME = re.compile(r"[A-Za-z_]\w*")
-_HASHES = re.compile(r"_[0-9a-f]{8}\b")
+_HASH = re.compile(r"_[0-9a-f]{8}\b")
 _PARAMETER = re.compile(r"\b(?:adj_|var_|ret_)+[A-Za-z]\w*")
 
 Sources = dict[str, list[str]]
@@ -141,7 +140,7 @@ def split_definitions(source: str) -> dict[str, str]:
         kernel = _KERNEL.search(head)
         name = kernel[0] if kernel else _NAME.findall(head.split("(", 1)[0])[-1]
         definitions.setdefault(name, []).append(definition)
-    return {name: "\n".join(sorted(texts, key=partial(_HASHES.sub, ""))) for name, texts in definitions.items()}
+    return {name: "\n".join(sorted(texts, key=partial(_HASH.sub, ""))) for name, texts in definitions.items()}
 
 
 def _end(text: str, start: int) -> int:
