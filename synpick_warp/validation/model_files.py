@@ -13,6 +13,8 @@ from msgspec import UNSET, Struct, UnsetType
 from scipy.spatial import ConvexHull, QhullError
 
 from synpick_warp.dataset.annotations import ContinuousSymmetry, Length, Matrix4
+from synpick_warp.dataset.bop.folders import Listing
+from synpick_warp.dataset.bop.layout import MODEL_FILE
 from synpick_warp.errors import CatalogError, DatasetError
 from synpick_warp.inputs.json import decode_json
 from synpick_warp.low_discrepancy import sample_triangles
@@ -21,8 +23,6 @@ from synpick_warp.scenes.assets.meshes import read_mesh
 from synpick_warp.scenes.assets.models_info import MAX_INFO
 from synpick_warp.scenes.assets.ply import MAX_HEADER, read_ply_vertices
 from synpick_warp.scenes.types import TriangleMesh
-from synpick_warp.validation.folders import Listing
-from synpick_warp.validation.layout import MODEL_FILE
 from synpick_warp.validation.schemas import convert
 
 _CHUNK = 512

@@ -11,13 +11,13 @@ from typing import Any, Protocol
 
 import numpy as np
 
+from synpick_warp.dataset.bop.folders import Listing
+from synpick_warp.dataset.bop.layout import KEYED, Layout, SceneRef
 from synpick_warp.dataset.view_files import decode_run_lengths
 from synpick_warp.errors import DatasetError
 from synpick_warp.inputs.image_files import MAX_SIDE
 from synpick_warp.inputs.json import MAX_JSON, decode_json
 from synpick_warp.inputs.tar_files import list_members
-from synpick_warp.validation.folders import Listing
-from synpick_warp.validation.layout import KEYED, Layout, SceneRef
 from synpick_warp.validation.pictures import Mask, crop_mask, decode_mask
 from synpick_warp.validation.schemas import PLAIN_KEY, RECORDS, Coco, Segmentation, convert
 

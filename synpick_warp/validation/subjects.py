@@ -9,9 +9,9 @@ from typing import Any
 
 import numpy as np
 
+from synpick_warp.dataset.bop.layout import Layout
 from synpick_warp.errors import DatasetError
 from synpick_warp.inputs.image_files import MAX_IMAGE_FILE
-from synpick_warp.validation.layout import Layout
 from synpick_warp.validation.pictures import Mask, decode_picture, png_type
 from synpick_warp.validation.scene_files import RecordFile, SceneFiles
 from synpick_warp.validation.schemas import Annotation, Camera, Coco, Info, Truth

@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from functools import cached_property
 
+from synpick_warp.dataset.bop.layout import TARGETS, Layout, is_index
 from synpick_warp.errors import DatasetError
 from synpick_warp.inputs.json import MAX_JSON, decode_json
-from synpick_warp.validation.layout import TARGETS, Layout, is_index
 from synpick_warp.validation.schemas import Target
 
 

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 
+from synpick_warp.dataset.bop.folders import Listing, list_folder
 from synpick_warp.errors import DatasetError
-from synpick_warp.validation.folders import Listing, list_folder
 
 SPLIT = re.compile(r"(train|val|test)(_.*)?")
 MODELS = re.compile(r"models(_.*)?")
