@@ -51,6 +51,15 @@ class CameraEntry(Struct, gc=False):
     cam_t_w2c: Vector3 | UnsetType = UNSET
 
 
+class LenientCameraEntry(Struct, gc=False):
+    """A view's entry in scene_camera.json, as data sets of others have it: with a camera model instead of a matrix, without depth."""
+
+    cam_K: Matrix3 | UnsetType = UNSET  # noqa: N815
+    depth_scale: Annotated[float, Meta(gt=0.0, le=1e6)] | UnsetType = UNSET
+    cam_R_w2c: Rotation | UnsetType = UNSET  # noqa: N815
+    cam_t_w2c: Vector3 | UnsetType = UNSET
+
+
 class TruthEntry(Struct, gc=False):
     """An instance's entry in scene_gt.json [mm]."""
 
@@ -123,6 +132,9 @@ VIEW_SCHEMAS: dict[str, Any] = {"camera": CameraEntry, "gt": list[TruthEntry], "
 """Schema of a view's entry in scene_camera.json, scene_gt.json and scene_gt_info.json."""
 SCENE_SCHEMAS: dict[str, Any] = {name: dict[Key, schema] for name, schema in VIEW_SCHEMAS.items()}
 """Schema of these files: the entries by frame."""
+LENIENT_VIEW_SCHEMAS = VIEW_SCHEMAS | {"camera": LenientCameraEntry}
+LENIENT_SCENE_SCHEMAS: dict[str, Any] = {name: dict[Key, schema] for name, schema in LENIENT_VIEW_SCHEMAS.items()}
+"""The same for data sets that no bake wrote."""
 MASK_SCHEMA = dict[Key, RunLengths]
 """Schema of a view's run lengths in a shard: masks by instance index."""
 

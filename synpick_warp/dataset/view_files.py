@@ -42,8 +42,23 @@ class SceneFiles(Protocol):
         """Folder or first shard, for messages."""
         ...
 
+    lenient: bool
+    """Whether parts may be missing: the scene is of a data set that no bake wrote."""
+
+    def frames(self) -> tuple[int, ...]:
+        """BOP's im_id of each image, in order."""
+        ...
+
+    def has(self, name: str) -> bool:
+        """Whether there are images or annotations of a type: rgb, depth, mask, mask_visib, camera, gt, gt_info."""
+        ...
+
     def records(self, frame: int) -> ViewRecords:
         """Annotations of a frame."""
+        ...
+
+    def image_size(self, frame: int) -> tuple[int, int]:
+        """Width and height of a frame's images [px]."""
         ...
 
     def image(self, name: str, frame: int) -> np.ndarray:
@@ -65,6 +80,8 @@ class SceneFiles(Protocol):
 
 class SceneFolder:
     """`SceneFiles` of a BOP "scenewise" folder: one file per image and mask."""
+
+    lenient = False
 
     def __init__(self, folder: Path, size: tuple[int, int] | None = None, suffix: str = "") -> None:
         """
@@ -91,6 +108,18 @@ class SceneFolder:
     @cached_property
     def _records(self) -> list[dict[int, Any]]:
         return [read_checked(self.annotations(name), SCENE_SCHEMAS[name]) for name in RECORD_NAMES]
+
+    def frames(self) -> tuple[int, ...]:
+        """See `SceneFiles`."""
+        return tuple(sorted(self._records[0]))
+
+    def has(self, name: str) -> bool:
+        """See `SceneFiles`."""
+        return (self.annotations if name in RECORD_NAMES else self.images)(name).exists()
+
+    def image_size(self, frame: int) -> tuple[int, int]:
+        """See `SceneFiles`."""
+        return self.size or self.image("rgb", frame).shape[1::-1]
 
     def records(self, frame: int) -> ViewRecords:
         """See `SceneFiles`."""
@@ -129,12 +158,14 @@ class SceneFolder:
 class SceneShards:
     """`SceneFiles` of webdataset shards: tar files of whole views. The index of a tar file is read once, members by their offset."""
 
-    def __init__(self, shards: Sequence[Path], scene: int, size: tuple[int, int]) -> None:
+    lenient = False
+
+    def __init__(self, shards: Sequence[Path], scene: int, size: tuple[int, int] | None) -> None:
         """
         Args:
             shards: The scene's tar files.
             scene: Index of the scene, with which keys begin.
-            size: Width and height of the camera's images [px].
+            size: Width and height of the camera's images [px]; None: not checked.
         """
         self.shards, self.scene, self.size = tuple(shards), scene, size
 
@@ -147,6 +178,19 @@ class SceneShards:
     def _members(self) -> Mapping[str, tuple[Path, int, int]]:
         """Member name -> (shard, offset, size) [B]."""
         return {name: (shard, offset, size) for shard in self.shards for name, offset, size in list_members(shard)}
+
+    def frames(self) -> tuple[int, ...]:
+        """See `SceneFiles`."""
+        keys = (name.partition(".")[0] for name in self._members if name.endswith(".camera.json"))
+        return tuple(sorted(int(key.partition("_")[2]) for key in keys))
+
+    def has(self, name: str) -> bool:
+        """See `SceneFiles`."""
+        return any(each.partition(".")[2].partition(".")[0] == name for each in self._members)
+
+    def image_size(self, frame: int) -> tuple[int, int]:
+        """See `SceneFiles`."""
+        return self.size or self.image("rgb", frame).shape[1::-1]
 
     def records(self, frame: int) -> ViewRecords:
         """See `SceneFiles`."""
@@ -230,10 +274,10 @@ def _check_records(parts: list[Any], place: Path, frame: int) -> ViewRecords:
     return ViewRecords(camera, gt, info)
 
 
-def check_run_lengths(record: Mapping[str, Any], size: tuple[int, int], source: str) -> None:
+def check_run_lengths(record: Mapping[str, Any], size: tuple[int, int] | None, source: str) -> None:
     """Check that run lengths cover an image of that width and height exactly."""
     height, width = record["size"]
-    if (width, height) != size:
+    if size is not None and (width, height) != size:
         raise DatasetError(f"{source} has {width} x {height} pixels; the images of this camera have {size[0]} x {size[1]}")
     if sum(record["counts"]) != width * height:
         raise DatasetError(f"{source} is damaged: its runs have {sum(record['counts'])} of {width * height} pixels; {ADVICE}")

@@ -70,6 +70,9 @@ class DecodeJob:
         frame = scene.plan.frames[step]
         batch.intrinsics[view], batch.depth_scale[view] = scene.intrinsics[step], scene.depth_scale[step]
         color = _read_image(scene.files, "rgb", frame, 3, "uint8")
+        if color.shape[1::-1] != scene.size:
+            sizes = f"{color.shape[1]} x {color.shape[0]} pixels, the scene's first one {scene.size[0]} x {scene.size[1]}"
+            raise DatasetError(f"{scene.files.place}: image {frame} has {sizes}; poses are estimated in images of one size")
         cv2.cvtColor(color, cv2.COLOR_BGR2RGB, dst=batch.color[view])
         batch.depth[view] = _read_image(scene.files, self.depth, frame, None, "uint16")
         paint_label(scene, step, batch.label[view])

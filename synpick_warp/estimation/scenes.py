@@ -9,7 +9,7 @@ import numpy as np
 
 from synpick_warp.dataset.annotations import ADVICE
 from synpick_warp.dataset.reading import DataSet
-from synpick_warp.dataset.view_files import SceneFiles
+from synpick_warp.dataset.view_files import SceneFiles, ViewRecords
 from synpick_warp.errors import DatasetError
 from synpick_warp.stages.pose.batch import MAX_SLOTS
 
@@ -49,7 +49,7 @@ class Scene:
     poses: np.ndarray
     """Object to camera (F, S, 4, 4) float64 [m]; the identity where absent."""
     visibility: np.ndarray
-    """Visible fraction (F, S) float64; 0 where absent."""
+    """Visible fraction (F, S) float64; 0 where absent; NaN: it is not known."""
     boxes: np.ndarray
     """Visible box (F, S, 4) int64 [px]: x, y, width, height as BOP has them; -1: nothing is visible."""
     intrinsics: np.ndarray
@@ -74,6 +74,8 @@ def read_scene(data_set: DataSet, plan: ScenePlan) -> Scene:
     source = data_set.scene_files(plan.episode, plan.camera)
     place = source.place
     records = [source.records(frame) for frame in plan.frames]
+    if source.lenient:
+        _check_inputs(source, plan, records)
     known: dict[int, int] = {}
     for frame, record in zip(plan.frames, records, strict=True):
         for entry in record.gt:
@@ -105,7 +107,7 @@ def read_scene(data_set: DataSet, plan: ScenePlan) -> Scene:
     return Scene(
         plan=plan,
         files=data_set.scene_files(plan.episode, plan.camera),
-        size=data_set.config.cameras.resolution,
+        size=source.image_size(plan.frames[0]),
         instances=instances,
         object_ids=np.array([known[instance] for instance in instances.tolist()], np.int64),
         index=index,
@@ -116,6 +118,19 @@ def read_scene(data_set: DataSet, plan: ScenePlan) -> Scene:
         depth_scale=(_METERS * np.array([record.camera["depth_scale"] for record in records])).astype(np.float32),
         asked=index != ABSENT,
     )
+
+
+_INPUTS = {"gt": "ground truth (scene_gt.json)", "rgb": "colour images", "depth": "depth images", "mask_visib": "masks (mask_visib)"}
+
+
+def _check_inputs(source: SceneFiles, plan: ScenePlan, records: Sequence[ViewRecords]) -> None:
+    """Check that a scene of a data set that no bake wrote has what poses are estimated with."""
+    for name, what in _INPUTS.items():
+        if not source.has(name):
+            raise DatasetError(f"{source.place} has no {what}, which poses are estimated with")
+    for frame, record in zip(plan.frames, records, strict=True):
+        if missing := sorted({"cam_K", "depth_scale"} - record.camera.keys()):
+            raise DatasetError(f"{source.place}: the camera of image {frame} has no {missing[0]}, which poses are estimated with")
 
 
 def _check_rotations(rotations: np.ndarray, plan: ScenePlan, place: object) -> None:

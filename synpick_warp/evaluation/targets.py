@@ -15,8 +15,6 @@ import numpy as np
 from msgspec.structs import replace as replace_struct
 
 from synpick_warp.configs.check import format_value
-from synpick_warp.configs.schema import MULTISENSOR, Config
-from synpick_warp.configs.splits import sensor_name
 from synpick_warp.errors import ResultError
 from synpick_warp.evaluation.truth import Truth
 from synpick_warp.inputs.json import read_json
@@ -66,21 +64,25 @@ class TargetList:
                 known.add(target.obj_id)
         return {image: None if known is None else frozenset(known) for image, known in found.items()}
 
-    def in_classic_layout(self, config: Config) -> TargetList:
+    def in_classic_layout(self, sensors: Sequence[str]) -> TargetList:
         """The list with a scene for each camera, as result files have it; that of a data set of several sensors has one for all of them.
+
+        Args:
+            sensors: Names of the sensors; empty: each camera has scenes of its own.
 
         Raises:
             ResultError: It names a sensor that the data set does not have.
         """
-        cameras = len(config.cameras.positions)
-        known = {sensor_name(camera): camera for camera in range(cameras)} if config.bop.layout == MULTISENSOR else {}
+        known = {name: index for index, name in enumerate(sensors)}
         for target in self.targets:
             if target.sensor and target.sensor not in known:
                 found = f"sensors: {', '.join(known)}" if known else "it has a scene for each camera"
                 raise ResultError(f"{self.path} names the sensor {format_value(target.sensor)}, which the data set does not have; {found}")
         if not known:
             return self
-        classic = (replace_struct(each, scene_id=cameras * each.scene_id + known.get(each.sensor, 0), sensor="") for each in self.targets)
+        classic = (
+            replace_struct(each, scene_id=len(known) * each.scene_id + known.get(each.sensor, 0), sensor="") for each in self.targets
+        )
         return TargetList(self.path, tuple(classic))
 
 
@@ -101,12 +103,12 @@ def _read_entry(entry: _Entry) -> list[Target]:
     return [Target(entry.scene_id, image, entry.obj_id, entry.inst_count, sensor) for sensor, image in images]
 
 
-def in_layout(targets: Sequence[Target], config: Config) -> list[Target]:
+def in_layout(targets: Sequence[Target], sensors: Sequence[str]) -> list[Target]:
     """The inverse of `TargetList.in_classic_layout`: targets with a scene for each camera, as the data set's own lists have them."""
-    if config.bop.layout != MULTISENSOR:
+    if not sensors:
         return list(targets)
-    cameras = len(config.cameras.positions)
-    return [replace_struct(each, scene_id=each.scene_id // cameras, sensor=sensor_name(each.scene_id % cameras)) for each in targets]
+    count = len(sensors)
+    return [replace_struct(each, scene_id=each.scene_id // count, sensor=sensors[each.scene_id % count]) for each in targets]
 
 
 def encode_targets(targets: Sequence[Target]) -> bytes:

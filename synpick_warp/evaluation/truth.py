@@ -20,7 +20,7 @@ class Truth:
 
     poses: PoseTable
     visibility: np.ndarray
-    """Visible fraction of the silhouette (N,) float64."""
+    """Visible fraction of the silhouette (N,) float64; NaN: it is not known."""
     episode: np.ndarray
     """Index of the episode (N,) int64."""
     camera: np.ndarray
@@ -33,6 +33,10 @@ class Truth:
     images: np.ndarray
     """Scene and image index of all images (M, 2) int64, those without objects included, sorted."""
 
+    def shown(self, minimum: float) -> np.ndarray:
+        """Whether instances are at least so visible (N,) bool; also those of which it is not known."""
+        return ~(self.visibility < minimum)
+
     def __len__(self) -> int:
         return len(self.poses)
 
@@ -43,21 +47,21 @@ def read_truth(data_set: DataSet) -> Truth:
     Raises:
         DatasetError: The data set has no images or no episode, or a file is missing or damaged.
     """
-    period = data_set.config.physics.step * data_set.config.physics.steps_per_tick
-    count = data_set.camera_count
-    parts, images = [], []
+    parts, images, splits = [], [], dict[int, str]()
     for index, episode in data_set.items():
         mode = episode.row.get("mode")
         if not isinstance(mode, str):
             raise DatasetError(f"{data_set.folder}: the row of episode {index} has no mode; restore its manifest entry, or bake again")
-        for camera in range(count):
-            scene = count * index + camera
-            frames, rows = _read_scene(episode, camera)
-            images += [(scene, frame) for frame in frames]
+        for camera in episode.cameras:
+            scene, split = data_set.scene_id(index, camera), data_set.split_of(index)
+            if splits.setdefault(scene, split) != split:
+                raise DatasetError(f"{data_set.folder} has a scene {scene} in {splits[scene]} and in {split}; choose one by --split")
+            found, rows = _read_scene(episode, camera)
+            images += [(scene, image) for image in found]
             parts.append((rows, scene, index, camera, mode))
     if not parts:
         raise DatasetError(f"{data_set.folder} has no episode to evaluate on; finish the bake first")
-    return _assemble(parts, np.reshape(np.array(images, np.int64), (-1, 2)), period)
+    return _assemble(parts, np.reshape(np.array(images, np.int64), (-1, 2)), data_set.period)
 
 
 _Rows = list[tuple[int, int, int, list[float], list[float], float]]
@@ -65,18 +69,19 @@ _Rows = list[tuple[int, int, int, list[float], list[float], float]]
 
 
 def _read_scene(episode: Episode, camera: int) -> tuple[list[int], _Rows]:
-    """Frames of a scene, and its rows."""
-    frames, rows = [], []
+    """Images of a scene, and its rows."""
+    images, rows = [], []
     for view in episode.views(camera):
         records = view.records
-        frames.append(view.frame)
-        instances = view.instance_ids.tolist()
-        for instance, entry, info in zip(instances, records.gt, records.gt_info, strict=True):
-            rows.append((view.frame, entry["obj_id"], instance, entry["cam_R_m2c"], entry["cam_t_m2c"], info["visib_fract"]))
-    return frames, rows
+        if not images and not view.has("gt"):
+            raise DatasetError(f"{view.place} has no ground truth (scene_gt.json), which estimates are scored against")
+        images.append(view.image_id)
+        for instance, entry, info in zip(view.instance_ids.tolist(), records.gt, records.gt_info, strict=True):
+            rows.append((view.image_id, entry["obj_id"], instance, entry["cam_R_m2c"], entry["cam_t_m2c"], info["visib_fract"]))
+    return images, rows
 
 
-def _assemble(parts: list[tuple[_Rows, int, int, int, str]], images: np.ndarray, period: float) -> Truth:
+def _assemble(parts: list[tuple[_Rows, int, int, int, str]], images: np.ndarray, period: float | None) -> Truth:
     """Columns from the rows of all scenes, sorted by scene, image and object."""
     lengths = [len(rows) for rows, *_ in parts]
 
@@ -107,7 +112,8 @@ def _assemble(parts: list[tuple[_Rows, int, int, int, str]], images: np.ndarray,
         speed=np.empty(0),
         images=images[np.lexsort(images.T[::-1])],
     )
-    return replace(truth, speed=instance_speeds(truth.poses, period))
+    speed = np.full(len(truth), np.nan) if period is None else instance_speeds(truth.poses, period)
+    return replace(truth, speed=speed)
 
 
 def instance_speeds(poses: PoseTable, period: float) -> np.ndarray:

@@ -80,9 +80,9 @@ def _instance(view: View, index: int, names: Mapping[int, str]) -> dict[str, Any
     return {
         "name": names.get(object_id, "") or f"object {object_id}",
         "object": object_id,
-        "visible": round(float(info["visib_fract"]), 4),
+        "visible": None if np.isnan(info["visib_fract"]) else round(float(info["visib_fract"]), 4),
         "color": f"rgb({red} {green} {blue})",
-        "amodal": _box(info["bbox_obj"]) if seen else None,
+        "amodal": _box(info["bbox_obj"]) if seen and info["bbox_obj"][2] >= 0 else None,
         "modal": _box(info["bbox_visib"]) if seen else None,
     }
 

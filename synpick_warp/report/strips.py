@@ -69,13 +69,12 @@ def make_strip(data_set: DataSet, index: int, strips: int, album: Album, report:
     places = album.add(Section.EPISODES, [encode(frame, camera) for camera in cameras for frame in frames])
     if places is None:
         return None
-    physics = data_set.config.physics
     return {
         "episode": index,
         "mode": episode.row["mode"],
         "sentence": episode.row.get("sentence") or episode.row["ending"],
         "total": len(episode),
-        "period": physics.step * physics.steps_per_tick,
+        "period": data_set.period or 0.0,
         "frames": frames,
         "cameras": [places[camera * count : (camera + 1) * count] for camera in cameras],
         "attempts": _spans(episode),

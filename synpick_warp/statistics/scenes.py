@@ -27,15 +27,17 @@ class SceneTruth:
     object_id: np.ndarray
     """obj_id (N,) int64."""
     visibility: np.ndarray
-    """Visible fraction (N,) float64."""
+    """Visible fraction (N,) float64; NaN: it is not known."""
     direction: np.ndarray
     """Unit vector from the object's origin to the camera, in the object's frame (N, 3) float64."""
     light: Light | None
     """Light of the first frame; None: it is not told."""
     depth_scale: np.ndarray
-    """Depth scale of each frame (F,) float64 [mm per count]."""
+    """Depth scale of each frame (F,) float64 [mm per count]; NaN: it has no depth."""
     files: SceneFiles
     """Reader of the scene's images."""
+    images: Sequence[int] = ()
+    """BOP's im_id of each frame."""
 
 
 def read_scene(data_set: DataSet, episode: int, camera: int) -> SceneTruth:
@@ -45,8 +47,12 @@ def read_scene(data_set: DataSet, episode: int, camera: int) -> SceneTruth:
         DatasetError: The data set has no images of it, or a file is missing or damaged.
     """
     files = data_set.scene_files(episode, camera)
-    frames = len(data_set[episode])
-    cameras, truth, infos = _read_folder(files, frames) if isinstance(files, SceneFolder) else _read_shards(files, frames)
+    images = files.frames() if files.lenient else range(len(data_set[episode]))
+    frames = len(images)
+    if isinstance(files, SceneFolder) and not files.lenient:
+        cameras, truth, infos = _read_folder(files, frames)
+    else:
+        cameras, truth, infos = _read_views(files, images)
     for frame in range(frames):
         if len(truth[frame]) != len(infos[frame]):
             raise DatasetError(f"{files.place}: image {frame} has other instances in scene_gt than in scene_gt_info; {ADVICE}")
@@ -63,10 +69,11 @@ def read_scene(data_set: DataSet, episode: int, camera: int) -> SceneTruth:
         frames=frames,
         counts=np.array([len(each) for each in truth], np.int64),
         object_id=np.array([entry.obj_id for entry in entries], np.int64),
+        images=images,
         visibility=np.array([entry.visib_fract for each in infos for entry in each], np.float64),
         direction=direction / length,
         light=None if isinstance(light, UnsetType) else light,
-        depth_scale=np.array([entry.depth_scale for entry in cameras], np.float64),
+        depth_scale=np.array([np.nan if isinstance(entry.depth_scale, UnsetType) else entry.depth_scale for entry in cameras]),
         files=files,
     )
 
@@ -88,9 +95,13 @@ def _read_folder(files: SceneFolder, frames: int) -> _Parts:
     return tuple(parts)
 
 
-def _read_shards(files: SceneFiles, frames: int) -> _Parts:
-    """Entries of the views in shards."""
-    records = [files.records(frame) for frame in range(frames)]
+def _read_views(files: SceneFiles, images: Sequence[int]) -> _Parts:
+    """Entries of the views in shards, or of a data set that no bake wrote."""
+    records = [files.records(image) for image in images]
     cameras = [check_content(record.camera, LitCameraEntry, files.place) for record in records]
     truth = [msgspec.convert(record.gt, list[TruthEntry]) for record in records]
-    return cameras, truth, [msgspec.convert(record.gt_info, list[InfoEntry]) for record in records]
+    # What has been measured, or is not known, needs no check, and NaN would not pass it.
+    return cameras, truth, [[InfoEntry(**{key: entry[key] for key in _INFO}) for entry in record.gt_info] for record in records]
+
+
+_INFO = InfoEntry.__struct_fields__

@@ -17,10 +17,11 @@ import numpy as np
 from synpick_warp.configs.load import load_config
 from synpick_warp.configs.schema import Config
 from synpick_warp.configs.splits import scene_episode
-from synpick_warp.dataset.annotations import SCENE_SCHEMAS, read_checked
+from synpick_warp.dataset.bop.folders import list_folder
+from synpick_warp.dataset.bop.scenes import FoundFolder
 from synpick_warp.dataset.manifest import CONFIG_FILE, episode_entry, read_entry
 from synpick_warp.dataset.object_names import object_names
-from synpick_warp.dataset.view_files import SceneFolder, check_planes, read_image
+from synpick_warp.dataset.view_files import check_planes
 from synpick_warp.errors import DatasetError, OutputError, SynpickError
 from synpick_warp.viz.depth_colors import DepthScale, color_depth, describe_depth, pooled_scale, tote_scale
 from synpick_warp.viz.drawing import GOLDEN, Image, check_picture_name, instance_color, put_text, write_picture
@@ -58,6 +59,11 @@ class Scene(NamedTuple):
         """File of the cameras."""
         return self.folder / f"scene_camera{self.sensor}.json"
 
+    def files(self) -> FoundFolder:
+        """Its files; what others leave out may be missing."""
+        root = self.folder.parent.parent.resolve()
+        return FoundFolder(list_folder(root, f"{self.folder.parent.name}/{self.folder.name}"), self.sensor)
+
 
 @dataclass(frozen=True)
 class _View:
@@ -67,6 +73,7 @@ class _View:
     """Record of scene_camera."""
     truth: list[tuple[dict[str, Any], dict[str, Any]]]
     """Records of scene_gt and scene_gt_info, per instance."""
+    files: FoundFolder
 
 
 def write_contact_sheet(dataset: Path, out: Path, views: int) -> Path:
@@ -87,7 +94,7 @@ def write_contact_sheet(dataset: Path, out: Path, views: int) -> Path:
     shown = list(_read_views(sample(find_scenes(dataset), views)))
     baked = read_baked(dataset, {record["obj_id"] for view in shown for record, _ in view.truth})
     scale = tote_scale(baked.config, [view.camera for view in shown]) if baked.config else None
-    scale = scale or pooled_scale(_read_depth(view) for view in shown)
+    scale = scale or pooled_scale(depth for view in shown if (depth := _read_depth(view)) is not None)
     most = max(len(view.truth) for view in shown)
     rows = [_row(view, scale, baked, most) for view in shown]
     width = max(row.shape[1] for row in rows)
@@ -158,7 +165,8 @@ def sample(scenes: list[Scene], views: int) -> list[tuple[Scene, int]]:
     """
     by_camera: dict[tuple[float, ...], list[tuple[Scene, list[int]]]] = {}
     for scene in scenes:
-        cameras = read_checked(scene.annotations(), SCENE_SCHEMAS["camera"])
+        files = scene.files()
+        cameras = {frame: files.camera(frame) for frame in files.frames()}
         if cameras:
             first = cameras[min(cameras)]
             group = by_camera.setdefault((*first.get("cam_R_w2c", ()), *first.get("cam_t_w2c", ())), [])
@@ -183,29 +191,31 @@ def sample(scenes: list[Scene], views: int) -> list[tuple[Scene, int]]:
 def _read_views(samples: list[tuple[Scene, int]]) -> Iterator[_View]:
     """Read the annotations of views, which are sorted by scene: those of each scene once."""
     for scene, group in itertools.groupby(samples, key=lambda one: one[0]):
-        files = SceneFolder(scene.folder, suffix=scene.sensor)
+        files = scene.files()
         for _, frame in group:
             camera, truth, infos = files.records(frame)
-            yield _View(scene, frame, camera, list(zip(truth, infos, strict=True)))
+            yield _View(scene, frame, camera, list(zip(truth, infos, strict=True)), files)
 
 
-def _read_depth(view: _View, size: tuple[int, int] | None = None) -> np.ndarray:
-    """Depth image of a view [mm]; `size` is the width and height that it must have [px]."""
-    stem = f"{view.frame:06d}"
-    counts = read_image(view.scene.images("depth"), stem, cv2.IMREAD_UNCHANGED, size)
-    return check_planes(counts, None, f"{view.scene.images('depth') / stem}.png") * float(view.camera["depth_scale"])
+def _read_depth(view: _View) -> np.ndarray | None:
+    """Depth image of a view [mm]; None: it has none."""
+    if not view.files.has("depth") or "depth_scale" not in view.camera:
+        return None
+    counts = check_planes(view.files.image("depth", view.frame), None, f"{view.files.images('depth')}/{view.frame:06d}")
+    return counts * float(view.camera["depth_scale"])
 
 
 def _row(view: _View, depth_scale: DepthScale | None, baked: Baked, most: int) -> Image:
     """Draw all panels of a view side by side; `most` is the largest number of instances of all views."""
     folder, sensor = view.scene
-    color = read_image(view.scene.images("rgb"), f"{view.frame:06d}", cv2.IMREAD_COLOR)
+    color = view.files.image("rgb", view.frame)
     size = color.shape[1::-1]
-    depth = _read_depth(view, size)
+    depth = _read_depth(view)
+    colored = _placeholder(color, "no depth in this data set") if depth is None else color_depth(depth, depth_scale)
     facts = baked.facts(view.scene, view.frame, view.camera)
     panels: list[tuple[str, Callable[[float], Image]]] = [
         (facts[0], lambda scale: _fit(color, scale)),
-        (f"{describe_depth(depth_scale)}; one scale", lambda scale: _fit(color_depth(depth, depth_scale), scale, smooth=False)),
+        (f"{describe_depth(depth_scale)}; one scale", lambda scale: _fit(colored, scale, smooth=False)),
         (_instances_caption(view), lambda scale: _fit(_color_instances(view, color), scale, smooth=False)),
         ("boxes: amodal thin, visible thick", lambda scale: _draw_boxes(view, _fit(color, scale), scale)),
         (
@@ -213,7 +223,8 @@ def _row(view: _View, depth_scale: DepthScale | None, baked: Baked, most: int) -
             lambda scale: _draw_legend(view, facts[1:], baked, max(_MIN_LEGEND, round(size[1] * scale)), most),
         ),
     ]
-    counts = depth_scale and DepthScale(*(each / float(view.camera["depth_scale"]) for each in depth_scale))
+    count = float(view.camera.get("depth_scale", 1.0))
+    counts = depth_scale and DepthScale(*(each / count for each in depth_scale))
     layers = layer_pictures(folder, view.frame, size, sensor, counts)
     panels += [(caption, partial(_fit, picture, smooth=False)) for caption, picture in layers]
     scale = min(_PANEL_WIDTH / size[0], _MAX_PANEL_HEIGHT / size[1])
@@ -249,13 +260,17 @@ def _color_instances(view: _View, color: Image) -> Image:
     """Visible masks in their instances' colours over the darkened grey image."""
     grey = cv2.cvtColor(color, cv2.COLOR_BGR2GRAY) // 3
     drawn = np.repeat(grey[..., None], 3, axis=2)
-    folder = view.scene.images("mask_visib")
-    if not folder.is_dir():
-        put_text(drawn, "no masks in this data set", (8, 24), 0.5, (230, 230, 230))
-        return drawn
+    if not view.files.has("mask_visib"):
+        return _placeholder(color, "no masks in this data set")
     for index, (record, _) in enumerate(view.truth):
-        mask = read_image(folder, f"{view.frame:06d}_{index:06d}", cv2.IMREAD_GRAYSCALE, color.shape[1::-1])
-        drawn[mask > 0] = instance_color(record.get("instance_id", index))
+        drawn[view.files.mask("mask_visib", view.frame, index)] = instance_color(record.get("instance_id", index))
+    return drawn
+
+
+def _placeholder(color: Image, text: str) -> Image:
+    """The darkened grey image with a text, in the place of a picture."""
+    drawn = np.repeat(cv2.cvtColor(color, cv2.COLOR_BGR2GRAY)[..., None] // 3, 3, axis=2)
+    put_text(drawn, text, (8, 24), 0.5, (230, 230, 230))
     return drawn
 
 
@@ -268,6 +283,8 @@ def _draw_boxes(view: _View, image: Image, scale: float) -> Image:
         color = instance_color(record.get("instance_id", index))
         for name, thickness in (("bbox_obj", 1), ("bbox_visib", 2)):
             x, y, width, height = info[name]
+            if width < 0:
+                continue
             # BOP's boxes end with their last pixel; OpenCV takes corner coordinates, hence + 1.
             first, second = ((round(scale * u), round(scale * v)) for u, v in ((x, y), (x + width + 1, y + height + 1)))
             cv2.rectangle(image, first, second, color, thickness)
