@@ -42,7 +42,8 @@ def read_object_models(folder: Path, object_ids: Iterable[int]) -> list[ObjectMo
             raise CatalogError(f"{path}: the process that reads it {result.reason}; repair or simplify the file")
         if isinstance(result, SynpickError):
             raise result
-        models.append(_make_model(object_id, *result, info))
+        mesh, given = result
+        models.append(_make_model(object_id, mesh, given, info))
     return models
 
 
