@@ -9,6 +9,7 @@ import numpy as np
 
 from synpick_warp.dataset.annotations import ADVICE
 from synpick_warp.dataset.reading import DataSet
+from synpick_warp.dataset.view import instance_ids
 from synpick_warp.dataset.view_files import SceneFiles, ViewRecords
 from synpick_warp.errors import DatasetError
 from synpick_warp.stages.pose.batch import MAX_SLOTS
@@ -58,6 +59,8 @@ class Scene:
     """Depth of one count (F,) float32 [m]."""
     asked: np.ndarray
     """Whether the instance is estimated in the frame (F, S) bool."""
+    tracked: bool
+    """Whether the instances can be followed from frame to frame: the annotations have instance ids."""
 
     def __len__(self) -> int:
         """Number of frames F."""
@@ -77,12 +80,15 @@ def read_scene(data_set: DataSet, plan: ScenePlan) -> Scene:
     if source.lenient:
         _check_inputs(source, plan, records)
     known: dict[int, int] = {}
+    ids: list[list[int]] = []
     for frame, record in zip(plan.frames, records, strict=True):
-        for entry in record.gt:
-            if "instance_id" not in entry:
-                raise DatasetError(f"{place}: an instance of image {frame} has no instance_id; {ADVICE}")
-            if known.setdefault(entry["instance_id"], entry["obj_id"]) != entry["obj_id"]:
-                raise DatasetError(f"{place}: instance {entry['instance_id']} of image {frame} has another obj_id than before; {ADVICE}")
+        found = instance_ids(record.gt, source.lenient)
+        if found is None:
+            raise DatasetError(f"{place}: an instance of image {frame} has no instance_id; {ADVICE}")
+        ids.append(found)
+        for instance, entry in zip(found, record.gt, strict=True):
+            if known.setdefault(instance, entry["obj_id"]) != entry["obj_id"]:
+                raise DatasetError(f"{place}: instance {instance} of image {frame} has another obj_id than before; {ADVICE}")
     if len(known) > MAX_SLOTS:
         raise DatasetError(f"{place} has {len(known)} instances; allowed: {MAX_SLOTS}")
     instances = np.array(sorted(known), np.int64)
@@ -91,7 +97,7 @@ def read_scene(data_set: DataSet, plan: ScenePlan) -> Scene:
     index, visibility = np.full(shape, ABSENT, np.int32), np.zeros(shape)
     poses, boxes = np.tile(np.eye(4), (*shape, 1, 1)), np.full((*shape, 4), -1, np.int64)
     for row, (frame, record) in enumerate(zip(plan.frames, records, strict=True)):
-        order = [slots[entry["instance_id"]] for entry in record.gt]
+        order = [slots[instance] for instance in ids[row]]
         if len(set(order)) < len(order):
             raise DatasetError(f"{place}: image {frame} has an instance_id twice; {ADVICE}")
         if order:
@@ -117,6 +123,7 @@ def read_scene(data_set: DataSet, plan: ScenePlan) -> Scene:
         intrinsics=matrices[:, [0, 4, 2, 5]].astype(np.float32),
         depth_scale=(_METERS * np.array([record.camera["depth_scale"] for record in records])).astype(np.float32),
         asked=index != ABSENT,
+        tracked=all("instance_id" in entry for record in records for entry in record.gt),
     )
 
 

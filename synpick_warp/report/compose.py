@@ -26,7 +26,6 @@ from synpick_warp.report.page import Page, Part, read_vega, render, summary
 from synpick_warp.report.sampling import (
     SURVEY_VIEWS,
     Brightness,
-    Content,
     Episodes,
     find_content,
     measure_brightness,
@@ -112,11 +111,11 @@ def take_samples(data_set: DataSet, statistics: Statistics, episodes: Episodes, 
     """
     data: dict[str, list[dict[str, Any]]] = {"frames": [], "strips": [], "attempts": []}
     asked = dict.fromkeys(data, 0)
-    if not statistics.total.annotations.views:
+    views = sample_views(data_set, episodes, frames) if statistics.total.annotations.views else []
+    if not any(view.has(name) for view in views for name in ("rgb", "depth")):
         return Samples(data, [], asked)
     names = {each.object_id: each.name for each in statistics.objects}
-    views = sample_views(data_set, episodes, frames)
-    content = find_content(views[0]) if views else Content(False, False, False)
+    content = find_content(views[0])
     asked["frames"] = len(views)
     for done, view in enumerate(views):
         report("frames", done, len(views))
@@ -151,7 +150,7 @@ def _present(made: dict[str, Any] | None) -> list[dict[str, Any]]:
 
 def _measure(views: list[View], report: Report) -> list[Brightness]:
     measured = []
-    for done, view in enumerate(views):
+    for done, view in enumerate(view for view in views if view.has("rgb")):
         report("brightness", done, len(views))
         measured.append(measure_brightness(view))
     return measured

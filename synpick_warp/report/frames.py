@@ -39,7 +39,7 @@ def make_frame(
     Raises:
         DatasetError: A file is missing or damaged.
     """
-    color = view.rgb[..., ::-1]
+    color = show(view, scale)
     panels: list[tuple[str, str, Picture]] = [("rgb", "colour", encode_photo(shrink(color, WIDTH)))]
     ids = _instance_ids(view, content, color.shape[:2])
     if ids is not None:
@@ -69,6 +69,14 @@ def make_frame(
         "pictures": pictures,
         "instances": [_instance(view, index, names) for index in range(len(view))],
     }
+
+
+def show(view: View, scale: DepthScale | None = None) -> np.ndarray:
+    """Picture of a view (H, W, 3) uint8, blue first: its colour image, or else depth as false colour."""
+    if view.has("rgb") or not view.has("depth"):
+        return view.rgb[..., ::-1]
+    depth = view.depth * MILLIMETERS
+    return color_depth(depth, scale or pooled_scale([depth]))
 
 
 def _instance(view: View, index: int, names: Mapping[int, str]) -> dict[str, Any]:

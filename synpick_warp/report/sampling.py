@@ -57,8 +57,8 @@ class Content:
 
 
 def find_content(view: View) -> Content:
-    """Look whether a view's scene has masks of both kinds and depth."""
-    return Content(*(view.has(name) for name in ("mask_visib", "mask", "depth")))
+    """Look whether a view's scene has masks of both kinds and depth with its scale."""
+    return Content(view.has("mask_visib"), view.has("mask"), view.has("depth") and "depth_scale" in view.records.camera)
 
 
 def spread(items: Sequence[int], count: int) -> list[int]:

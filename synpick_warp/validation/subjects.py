@@ -13,7 +13,7 @@ from synpick_warp.dataset.bop.layout import Layout
 from synpick_warp.errors import DatasetError
 from synpick_warp.inputs.image_files import MAX_IMAGE_FILE, decode_picture
 from synpick_warp.validation.pictures import Mask, png_type
-from synpick_warp.validation.scene_files import RecordFile, SceneFiles
+from synpick_warp.validation.scene_files import CheckedScene, RecordFile
 from synpick_warp.validation.schemas import Annotation, Camera, Coco, Info, Truth
 
 COLOURS = ("rgb", "gray")
@@ -54,7 +54,7 @@ class SceneSubject:
     """A scene as one sensor sees it."""
 
     layout: Layout
-    files: SceneFiles
+    files: CheckedScene
     targets: Mapping[str, Mapping[int, Any]] = field(default_factory=dict)
     """Records of each target list about this scene: by image, its records."""
 

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import contextlib
 import itertools
-import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -17,8 +16,8 @@ import numpy as np
 from synpick_warp.configs.load import load_config
 from synpick_warp.configs.schema import Config
 from synpick_warp.configs.splits import scene_episode
-from synpick_warp.dataset.bop.folders import list_folder
-from synpick_warp.dataset.bop.scenes import FoundFolder
+from synpick_warp.dataset.bop.layout import NoLayoutError
+from synpick_warp.dataset.bop.scenes import FoundScene, FoundScenes
 from synpick_warp.dataset.manifest import CONFIG_FILE, episode_entry, read_entry
 from synpick_warp.dataset.object_names import object_names
 from synpick_warp.dataset.view_files import check_planes
@@ -40,29 +39,22 @@ _GAP = 4
 """Gap between images [px]."""
 _MIN_LEGEND = 120
 """Minimum height of a row without its caption [px], for the legend of low images."""
-_SENSOR = re.compile(r"(_[A-Za-z0-9_]+)?")
-"""Suffix of a sensor's files; empty: classic layout."""
 
 
-class Scene(NamedTuple):
-    """A scene as one camera sees it: a folder, or with several sensors the files of one of them."""
+@dataclass(frozen=True, order=True)
+class Scene:
+    """A scene as one camera sees it: a folder, with several sensors the files of one of them, or members of shards."""
 
     folder: Path
+    """Of members: SPLIT/SCENE, which does not exist."""
     sensor: str = ""
     """Suffix of the sensor's folders and files, such as "_cam1"; empty: classic layout."""
+    files: Callable[[], FoundScene] = field(compare=False, repr=False, kw_only=True)
+    """Opens it; what others leave out may be missing."""
 
     def images(self, name: str) -> Path:
         """Folder of one kind of images, such as "rgb"."""
         return self.folder / f"{name}{self.sensor}"
-
-    def annotations(self) -> Path:
-        """File of the cameras."""
-        return self.folder / f"scene_camera{self.sensor}.json"
-
-    def files(self) -> FoundFolder:
-        """Its files; what others leave out may be missing."""
-        root = self.folder.parent.parent.resolve()
-        return FoundFolder(list_folder(root, f"{self.folder.parent.name}/{self.folder.name}"), self.sensor)
 
 
 @dataclass(frozen=True)
@@ -73,7 +65,7 @@ class _View:
     """Record of scene_camera."""
     truth: list[tuple[dict[str, Any], dict[str, Any]]]
     """Records of scene_gt and scene_gt_info, per instance."""
-    files: FoundFolder
+    files: FoundScene
 
 
 def write_contact_sheet(dataset: Path, out: Path, views: int) -> Path:
@@ -145,13 +137,16 @@ def find_scenes(dataset: Path) -> list[Scene]:
     Raises:
         DatasetError: There is none.
     """
-    if not dataset.is_dir():
-        raise DatasetError(f"there is no folder {dataset}; name the folder of a BOP data set")
-    files = [path for path in dataset.glob("[!.]*/*/scene_camera*.json") if path.parent.name.isdecimal()]
-    scenes = sorted(Scene(path.parent, sensor) for path in files if _SENSOR.fullmatch(sensor := path.stem.removeprefix("scene_camera")))
-    if not scenes:
-        raise DatasetError(f"{dataset} has no complete scene; a BOP data set has folders such as train_pbr/000000 with a scene_camera.json")
-    return scenes
+    try:
+        found = FoundScenes(dataset)
+    except NoLayoutError:
+        if not dataset.is_dir():
+            raise
+        example = "a BOP data set has folders such as train_pbr/000000 with a scene_camera.json"
+        raise DatasetError(f"{dataset} has no complete scene; {example}") from None
+    return sorted(
+        Scene(dataset / ref.split / (ref.name or f"{ref.scene:06d}"), ref.sensor, files=partial(found.open, ref)) for ref in found.refs()
+    )
 
 
 def sample(scenes: list[Scene], views: int) -> list[tuple[Scene, int]]:
@@ -166,11 +161,11 @@ def sample(scenes: list[Scene], views: int) -> list[tuple[Scene, int]]:
     by_camera: dict[tuple[float, ...], list[tuple[Scene, list[int]]]] = {}
     for scene in scenes:
         files = scene.files()
-        cameras = {frame: files.camera(frame) for frame in files.frames()}
-        if cameras:
-            first = cameras[min(cameras)]
+        frames = files.frames()
+        if frames:
+            first = files.camera(frames[0])
             group = by_camera.setdefault((*first.get("cam_R_w2c", ()), *first.get("cam_t_w2c", ())), [])
-            group.append((scene, sorted(cameras)))
+            group.append((scene, list(frames)))
     groups = list(by_camera.values())
     if not groups:
         raise DatasetError(f"no scene in {scenes[0].folder.parent} has a view; bake the data set again")
@@ -201,17 +196,18 @@ def _read_depth(view: _View) -> np.ndarray | None:
     """Depth image of a view [mm]; None: it has none."""
     if not view.files.has("depth") or "depth_scale" not in view.camera:
         return None
-    counts = check_planes(view.files.image("depth", view.frame), None, f"{view.files.images('depth')}/{view.frame:06d}")
+    counts = check_planes(view.files.image("depth", view.frame), None, f"{view.scene.images('depth')}/{view.frame:06d}")
     return counts * float(view.camera["depth_scale"])
 
 
 def _row(view: _View, depth_scale: DepthScale | None, baked: Baked, most: int) -> Image:
     """Draw all panels of a view side by side; `most` is the largest number of instances of all views."""
-    folder, sensor = view.scene
-    color = view.files.image("rgb", view.frame)
-    size = color.shape[1::-1]
+    folder, sensor = view.scene.folder, view.scene.sensor
     depth = _read_depth(view)
-    colored = _placeholder(color, "no depth in this data set") if depth is None else color_depth(depth, depth_scale)
+    colored = None if depth is None else color_depth(depth, depth_scale)
+    color = view.files.image("rgb", view.frame) if view.files.has("rgb") or colored is None else colored
+    size = color.shape[1::-1]
+    colored = _placeholder(color, "no depth in this data set") if colored is None else colored
     facts = baked.facts(view.scene, view.frame, view.camera)
     panels: list[tuple[str, Callable[[float], Image]]] = [
         (facts[0], lambda scale: _fit(color, scale)),

@@ -2,146 +2,164 @@
 
 from __future__ import annotations
 
-import re
-from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator
 from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from synpick_warp.dataset.annotations import LENIENT_SCENE_SCHEMAS, LENIENT_VIEW_SCHEMAS, check_json, read_checked
-from synpick_warp.dataset.bop.folders import Listing
+from synpick_warp.dataset.annotations import LENIENT_SCENE_SCHEMAS, LENIENT_VIEW_SCHEMAS, MASK_SCHEMA, check_json, read_checked
+from synpick_warp.dataset.bop.images import FolderImages, KeyedImages
 from synpick_warp.dataset.bop.layout import KEYED, SHARD, Layout, NoLayoutError, SceneRef
 from synpick_warp.dataset.bop.measured import UNKNOWN, measure_info
-from synpick_warp.dataset.view_files import RECORD_NAMES, SceneFolder, SceneShards, ViewRecords
+from synpick_warp.dataset.view_files import RECORD_NAMES, ViewRecords, check_run_lengths, decode_run_lengths
 from synpick_warp.errors import DatasetError
-from synpick_warp.inputs.files import read_file_if_present
 from synpick_warp.inputs.image_files import MAX_IMAGE_FILE, decode_picture, image_size, tiff_size
+from synpick_warp.inputs.json import MAX_JSON
 from synpick_warp.inputs.tar_files import list_members
 
-SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff")
-"""File formats of images that BOP data sets have."""
 MASKS = ("mask", "mask_visib")
 COLOR = ("rgb", "gray")
 """Image types that show colour or brightness, the preferred one first."""
-_PER_OBJECT = 1000
-"""Ids of instances that are made up, per object."""
 _SCENE_OFFSET = 10**6
 """Between the episodes of splits that have scenes of the same index."""
 
 
-class _LenientImages:
-    """Images of a scene, which may be grey, and of any format that BOP data sets have."""
+class FoundScene:
+    """`SceneFiles` of a scene folder, of shards or of the imagewise layout; parts may be missing, and grey images stand in for colour."""
 
-    _known: tuple[int, tuple[int, int]] | None = None
-    """Frame, and the size of its images."""
+    lenient = True
+
+    def __init__(self, images: FolderImages | KeyedImages) -> None:
+        """
+        Args:
+            images: Where its images are.
+        """
+        self._images = images
+        self._known: tuple[int, tuple[int, int]] | None = None
+        self._runs: tuple[tuple[str, int], dict[int, Any]] | None = None
+
+    @property
+    def place(self) -> Path:
+        """See `SceneFiles`."""
+        images = self._images
+        return images.listing.path(next(iter(images.ref.shards), "")) if isinstance(images, KeyedImages) else images.listing.path("")
+
+    def _annotations(self, name: str) -> str:
+        """Annotation file, in messages."""
+        return f"scene_{name}{self._images.sensor}.json" if isinstance(self._images, FolderImages) else f"{name}.json"
+
+    @cached_property
+    def _parts(self) -> list[dict[int, Any] | None]:
+        """Annotations by image of each of RECORD_NAMES; None: there are none. Those of a folder only."""
+        images = self._images
+        assert isinstance(images, FolderImages)
+        files = {name: self._annotations(name) for name in RECORD_NAMES}
+        return [
+            read_checked(images.listing.path(file), LENIENT_SCENE_SCHEMAS[name]) if file in images.listing.files else None
+            for name, file in files.items()
+        ]
+
+    def _part(self, name: str, frame: int) -> Any:
+        """Annotations of a frame; None: there are none."""
+        images = self._images
+        if isinstance(images, FolderImages):
+            part = self._parts[RECORD_NAMES.index(name)]
+            return None if part is None else part.get(frame, None if name == "camera" else [])
+        member = images.members.get((frame, f"{name}.json"))
+        return None if member is None else check_json(images.content(member, MAX_JSON), LENIENT_VIEW_SCHEMAS[name], member.file)
+
+    def frames(self) -> tuple[int, ...]:
+        """See `SceneFiles`: those that scene_camera.json has, or else scene_gt.json, or else images."""
+        images = self._images
+        if isinstance(images, FolderImages):
+            named = next((part for part in self._parts[:2] if part is not None), None)
+        else:
+            named = [frame for frame, content in images.members if content == "camera.json"]
+            named = named or [frame for frame, content in images.members if content == "gt.json"] or None
+        kinds = (*COLOR, "depth")
+        return tuple(sorted({image for kind in kinds for image, _ in images.indices(kind)} if named is None else set(named)))
 
     def has(self, name: str) -> bool:
         """See `SceneFiles`."""
-        raise NotImplementedError
+        images = self._images
+        if name not in RECORD_NAMES:
+            return name in images.kinds or (name == "rgb" and "gray" in images.kinds)
+        if isinstance(images, FolderImages):
+            return self._annotations(name) in images.listing.files
+        return any(content == f"{name}.json" for _, content in images.members)
 
-    def _find(self, name: str, frame: int) -> tuple[str, bytes, str]:
-        """Suffix, content and source of an image."""
-        raise NotImplementedError
+    def camera(self, frame: int) -> dict[str, Any]:
+        """A frame's entry in scene_camera.json; empty: there is no such file."""
+        found = self._part("camera", frame)
+        if found is None and self.has("camera"):
+            raise DatasetError(f"{self.place}: {self._annotations('camera')} has no image {frame}")
+        return found or {}
+
+    def records(self, frame: int) -> ViewRecords:
+        """See `SceneFiles`; what a missing scene_gt_info would tell is measured from the masks, or else unknown."""
+        camera, gt, info = self.camera(frame), self._part("gt", frame), self._part("gt_info", frame)
+        if gt is None and info:
+            raise DatasetError(f"there is no file {self.place}/{self._annotations('gt')}, but a {self._annotations('gt_info')}")
+        gt = gt or []
+        if info is not None and len(info) != len(gt):
+            raise DatasetError(f"{self.place}: scene_gt.json and scene_gt_info.json do not agree about image {frame}")
+        if info is None and gt and self.has("mask_visib"):
+            amodal = self.masks("mask", frame, len(gt)) if self.has("mask") else None
+            info = measure_info(self.masks("mask_visib", frame, len(gt)), amodal)
+        return ViewRecords(camera, gt, [dict(UNKNOWN) for _ in gt] if info is None else info)
+
+    def _read(self, name: str, frame: int, index: int | None = None) -> tuple[str, bytes] | None:
+        """File and content of an image; None: there is none."""
+        for kind in COLOR if name == "rgb" else (name,):
+            data = self._images.read(kind, frame, index, MAX_IMAGE_FILE)
+            if data is not None:
+                return str(self._images.listing.root / self._images.file(kind, frame, index)), data
+        return None
+
+    def _need(self, name: str, frame: int, index: int | None = None) -> tuple[str, bytes]:
+        found = self._read(name, frame, index)
+        if found is None:
+            raise DatasetError(f"there is no {self._images.listing.root / self._images.file(name, frame, index)} or .jpg or .tif")
+        return found
 
     def image(self, name: str, frame: int) -> np.ndarray:
         """See `SceneFiles`; grey images are given as colour."""
-        _, data, source = self._find(name, frame)
+        source, data = self._need(name, frame)
         if name == "rgb":
             return to_color(decode_picture(data, source, DatasetError))
         return decode_picture(data, source, DatasetError, self.image_size(frame))
 
     def image_file(self, name: str, frame: int) -> tuple[str, bytes]:
         """See `SceneFiles`."""
-        suffix, data, _ = self._find(name, frame)
-        return suffix, data
+        source, data = self._need(name, frame)
+        return f".{source.rpartition('.')[2].lower()}", data
 
     def image_size(self, frame: int) -> tuple[int, int]:
-        """See `SceneFiles`: those of the frame's colour image, which others of the frame must have, too."""
+        """See `SceneFiles`: those of the frame's colour image, or else its depth image or first mask, which its others must have, too."""
         if self._known is None or self._known[0] != frame:
             self._known = frame, self._stated_size(frame)
         return self._known[1]
 
     def _stated_size(self, frame: int) -> tuple[int, int]:
-        name = "rgb" if self.has("rgb") else "depth"
-        _, data, source = self._find(name, frame)
-        stated = image_size(data) or tiff_size(data)
-        if stated is None:
-            raise DatasetError(f"{source} is not an image: neither PNG, JPEG nor TIFF")
-        return stated
+        for name in ("rgb", "depth", *MASKS):
+            if isinstance(self._images, KeyedImages) and name in MASKS:
+                size = next((entry["size"][::-1] for entry in self._read_runs(name, frame).values()), None)
+                if size is not None:
+                    return tuple(size)
+                continue
+            found = self._read(name, frame, 0 if name in MASKS else None)
+            if found is not None:
+                stated = image_size(found[1]) or tiff_size(found[1])
+                if stated is None:
+                    raise DatasetError(f"{found[0]} is not an image: neither PNG, JPEG nor TIFF")
+                return stated
+        raise DatasetError(f"{self.place} has neither colour nor depth of image {frame}")
 
     def layers(self) -> set[str]:
         """See `SceneFiles`: none, as folders of these names may have any content in data sets of others."""
         return set()
-
-
-class FoundFolder(_LenientImages, SceneFolder):
-    """`SceneFiles` of a scene folder; grey images stand in for colour, annotations may be missing."""
-
-    lenient = True
-
-    def __init__(self, listing: Listing, suffix: str) -> None:
-        """
-        Args:
-            listing: The scene folder.
-            suffix: Suffix of the sensor's files, such as "_cam1"; empty: the classic layout.
-        """
-        super().__init__(listing.root / listing.place, None, suffix)
-        self.listing = listing
-
-    def images(self, name: str) -> Path:
-        """Folder of one kind of images: KIND_SENSOR, or, where a modality has annotations of its own, the modality itself."""
-        return self.folder / self._folder(name)
-
-    def _folder(self, name: str) -> str:
-        modality = self.suffix[1:]
-        for kind in COLOR if name == "rgb" else (name,):
-            for folder in (f"{kind}{self.suffix}", *([modality] if re.fullmatch(rf"{kind}[0-9]*", modality) else [])):
-                if folder in self.listing.folders:
-                    return folder
-        return f"{name}{self.suffix}"
-
-    @cached_property
-    def _parts(self) -> list[dict[int, Any] | None]:
-        """Annotations by image of each of RECORD_NAMES; None: there is no such file."""
-        found = []
-        for name in RECORD_NAMES:
-            file = self.annotations(name).name
-            needed = name == "camera"
-            found.append(read_checked(self.folder / file, LENIENT_SCENE_SCHEMAS[name]) if needed or file in self.listing.files else None)
-        return found
-
-    def frames(self) -> tuple[int, ...]:
-        """See `SceneFiles`."""
-        return tuple(sorted(self._parts[0] or ()))
-
-    def has(self, name: str) -> bool:
-        """See `SceneFiles`."""
-        return self.annotations(name).name in self.listing.files if name in RECORD_NAMES else self._folder(name) in self.listing.folders
-
-    def camera(self, frame: int) -> dict[str, Any]:
-        """Entry of scene_camera.json."""
-        return (self._parts[0] or {})[frame]
-
-    def records(self, frame: int) -> ViewRecords:
-        """See `SceneFiles`."""
-        camera, gt, info = self._parts
-        truth = None if gt is None else gt.get(frame, [])
-        return _complete(self, [(camera or {}).get(frame), truth, None if info is None else info.get(frame, [])], frame)
-
-    def _find(self, name: str, frame: int) -> tuple[str, bytes, str]:
-        return self._find_file(name, f"{frame:06d}")
-
-    def _find_file(self, name: str, stem: str) -> tuple[str, bytes, str]:
-        folder = self._folder(name)
-        for suffix in SUFFIXES if folder in self.listing.folders else ():
-            path = self.folder / folder / f"{stem}{suffix}"
-            data = read_file_if_present(path, MAX_IMAGE_FILE, DatasetError)
-            if data is not None:
-                return suffix, data, str(path)
-        raise DatasetError(f"there is no {self.folder / folder / stem}.png or .jpg or .tif")
 
     def masks(self, name: str, frame: int, count: int) -> list[np.ndarray]:
         """See `SceneFiles`."""
@@ -149,76 +167,22 @@ class FoundFolder(_LenientImages, SceneFolder):
 
     def mask(self, name: str, frame: int, index: int) -> np.ndarray:
         """One of `masks`."""
-        _, data, source = self._find_file(name, f"{frame:06d}_{index:06d}")
+        if isinstance(self._images, KeyedImages):
+            runs = self._read_runs(name, frame).get(index)
+            if runs is None:
+                raise DatasetError(f"{self.place}: {self._images.file(name, frame)} has no mask {index}")
+            check_run_lengths(runs, self.image_size(frame), self._images.file(name, frame, index))
+            return decode_run_lengths(runs["counts"], runs["size"])
+        source, data = self._need(name, frame, index)
         mask = decode_picture(data, source, DatasetError, self.image_size(frame)) > 0
         return mask if mask.ndim == 2 else np.asarray(mask.any(axis=2))
 
-
-class FoundShards(_LenientImages, SceneShards):
-    """`SceneFiles` of views with a key each: members of shards, or files of the imagewise layout."""
-
-    lenient = True
-
-    def __init__(self, listing: Listing, ref: SceneRef) -> None:
-        """
-        Args:
-            listing: Folder of the shards or files.
-            ref: The scene.
-        """
-        super().__init__([listing.path(name) for name in ref.shards] or [listing.path("")], ref.scene, None)
-        self.listing, self._files = listing, not ref.shards
-
-    @cached_property
-    def _members(self) -> Mapping[str, tuple[Path, int, int]]:
-        if not self._files:
-            return {name: (shard, offset, size) for shard in self.shards for name, offset, size in list_members(shard)}
-        return {name: (self.listing.path(name), 0, -1) for name in self.listing.files if KEYED.fullmatch(name)}
-
-    @property
-    def place(self) -> Path:
-        """See `SceneFiles`."""
-        return self.shards[0]
-
-    @cached_property
-    def _contents(self) -> dict[int, set[str]]:
-        """Contents of each frame, such as "rgb.jpg"."""
-        found: dict[int, set[str]] = {}
-        for name in self._members:
-            match = KEYED.fullmatch(name)
-            if match and int(match[1]) == self.scene:
-                found.setdefault(int(match[2]), set()).add(match[3])
-        return found
-
-    def frames(self) -> tuple[int, ...]:
-        """See `SceneFiles`."""
-        return tuple(sorted(frame for frame, contents in self._contents.items() if "camera.json" in contents))
-
-    def has(self, name: str) -> bool:
-        """See `SceneFiles`."""
-        names = {content.partition(".")[0] for contents in self._contents.values() for content in contents}
-        return name in names or (name == "rgb" and "gray" in names)
-
-    def _read(self, frame: int, name: str) -> bytes | None:
-        if not self._files:
-            return super()._read(frame, name)
-        file = f"{self._key(frame)}.{name}"
-        return read_file_if_present(self.listing.path(file), MAX_IMAGE_FILE, DatasetError) if file in self.listing.files else None
-
-    def records(self, frame: int) -> ViewRecords:
-        """See `SceneFiles`."""
-        parts = []
-        for name in RECORD_NAMES:
-            data = self._read(frame, f"{name}.json")
-            parts.append(None if data is None else check_json(data, LENIENT_VIEW_SCHEMAS[name], self._source(frame, f"{name}.json")))
-        return _complete(self, parts, frame)
-
-    def _find(self, name: str, frame: int) -> tuple[str, bytes, str]:
-        for kind in COLOR if name == "rgb" else (name,):
-            for suffix in SUFFIXES:
-                data = self._read(frame, f"{kind}{suffix}")
-                if data is not None:
-                    return suffix, data, self._source(frame, f"{kind}{suffix}")
-        raise DatasetError(f"{self.shards[0].parent} has no {self._key(frame)}.{name}.png or .jpg or .tif")
+    def _read_runs(self, name: str, frame: int) -> dict[int, Any]:
+        """Run lengths of the masks of a frame by instance; empty: there are none."""
+        if self._runs is None or self._runs[0] != (name, frame):
+            data = self._images.read(name, frame, None, MAX_JSON)
+            self._runs = (name, frame), {} if data is None else check_json(data, MASK_SCHEMA, self._images.file(name, frame))
+        return self._runs[1]
 
 
 class FoundScenes:
@@ -246,11 +210,8 @@ class FoundScenes:
     def _scenes(self) -> dict[int, dict[str, SceneRef]]:
         """Episode -> suffix of the sensor -> scene."""
         by_split: dict[str, list[SceneRef]] = {}
-        for ref in [*self.layout.scenes(), *self._keyed()]:
+        for ref in self.refs():
             by_split.setdefault(ref.split, []).append(ref)
-        # A set that has both scene folders and shards of a split has the same views twice.
-        for name in [name for name in by_split if name.removesuffix("_web") != name and name.removesuffix("_web") in by_split]:
-            del by_split[name]
         indices = [ref.scene for refs in by_split.values() for ref in {ref.scene: ref for ref in refs}.values()]
         step = _SCENE_OFFSET if len(set(indices)) < len(indices) else 0
         found: dict[int, dict[str, SceneRef]] = {}
@@ -258,6 +219,12 @@ class FoundScenes:
             for ref in by_split[name] if self._split in (None, name) else ():
                 found.setdefault(ref.scene + number * step, {})[ref.sensor] = ref
         return dict(sorted(found.items()))
+
+    def refs(self) -> list[SceneRef]:
+        """All scenes of all sensors; where a split has both scene folders and shards, which show the same views, those of the folders."""
+        folders = self.layout.scenes()
+        splits = {ref.split for ref in folders}
+        return [*folders, *(ref for ref in self._keyed() if ref.split.removesuffix("_web") not in splits)]
 
     def _keyed(self) -> Iterator[SceneRef]:
         """Scenes of shards and of the imagewise layout."""
@@ -308,7 +275,7 @@ class FoundScenes:
         """Indices of the episodes, in order."""
         yield from self._scenes
 
-    def files(self, episode: int, camera: int) -> FoundFolder | FoundShards:
+    def files(self, episode: int, camera: int) -> FoundScene:
         """Files of the scene that a camera recorded.
 
         Raises:
@@ -320,40 +287,13 @@ class FoundScenes:
         ref = refs.get(suffix) or (refs.get("") if camera == 0 else None)
         if ref is None:
             raise DatasetError(f"{self._folder / next(iter(refs.values())).place} has no sensor {suffix[1:]}")
+        return self.open(ref)
+
+    def open(self, ref: SceneRef) -> FoundScene:
+        """Files of a scene."""
         if ref.name:
-            return FoundFolder(self.layout.splits[ref.split].enter(ref.name), ref.sensor)
-        return FoundShards(self.layout.keyed[ref.split], ref)
-
-
-def _complete(files: FoundFolder | FoundShards, parts: Sequence[Any], frame: int) -> ViewRecords:
-    """Records of a frame; what a missing scene_gt_info would tell is measured from the masks, or else unknown."""
-    camera, gt, info = parts
-    if camera is None:
-        raise DatasetError(f"{files.place}: scene_camera.json has no image {frame}")
-    if gt is None and info:
-        raise DatasetError(f"there is no file {files.place}/scene_gt.json, but a scene_gt_info.json")
-    gt = _with_instances(gt or [])
-    if info is not None and len(info) != len(gt):
-        raise DatasetError(f"{files.place}: scene_gt.json and scene_gt_info.json do not agree about image {frame}")
-    if info is None and gt and files.has("mask_visib"):
-        amodal = files.masks("mask", frame, len(gt)) if files.has("mask") else None
-        info = measure_info(files.masks("mask_visib", frame, len(gt)), amodal)
-    return ViewRecords(camera, gt, [dict(UNKNOWN) for _ in gt] if info is None else info)
-
-
-def _with_instances(gt: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Instances with ids: where they have none, 1000 times the object's and how many of it come before in the image.
-
-    So instances are the same through a scene if it has one of each object; of several, which is which is not known from image to image.
-    """
-    if all("instance_id" in entry for entry in gt):
-        return gt
-    seen: Counter[int] = Counter()
-    result = []
-    for entry in gt:
-        result.append(entry | {"instance_id": _PER_OBJECT * entry["obj_id"] + seen[entry["obj_id"]]})
-        seen[entry["obj_id"]] += 1
-    return result
+            return FoundScene(FolderImages(self.layout.splits[ref.split].enter(ref.name), ref.sensor))
+        return FoundScene(KeyedImages(self.layout.keyed[ref.split], ref))
 
 
 def to_color(image: np.ndarray) -> np.ndarray:
