@@ -138,8 +138,8 @@ def test_statistics_and_report_of_any_layout(folders, name, tmp_path, capsys):
     assert run(capsys, "report", folders[name], "--out", tmp_path / "page.html", "--views", 2, "--threads", 1)[0] == 0
 
 
-@pytest.mark.parametrize("name", ["tless", "ycbv", "itodd", "multisensor"])
-def test_a_contact_sheet_of_any_folders_of_scenes(folders, name, tmp_path, capsys):
+@pytest.mark.parametrize("name", LAYOUTS)
+def test_a_contact_sheet_of_any_layout(folders, name, tmp_path, capsys):
     assert run(capsys, "preview", folders[name], "--out", tmp_path / "sheet.png", "--views", 3)[0] == 0
     assert cv2.imread(str(tmp_path / "sheet.png")).std() > 10
 
@@ -190,6 +190,49 @@ def test_what_estimation_lacks_is_named(plain, tmp_path, capsys, file, said):
     assert code == 2
     assert said in line
     assert not (tmp_path / "out.csv").exists()
+
+
+def _four_digits(scene: Path) -> None:
+    for path in list(scene.glob("*/*.*")):
+        path.rename(path.with_name("_".join(part[2:] for part in path.stem.split("_")) + path.suffix))
+
+
+def _capitals(scene: Path) -> None:
+    for path in list(scene.glob("rgb/*")):
+        path.rename(path.with_suffix(path.suffix.upper()))
+
+
+@pytest.mark.parametrize("change", [_four_digits, _capitals])
+def test_names_of_images_may_be_written_otherwise(plain, change):
+    before = [(view.rgb, view.masks) for view in synpick_warp.open(plain).views()]
+    for scene in plain.glob("test/*"):
+        change(scene)
+    for (color, masks), view in zip(before, synpick_warp.open(plain).views(), strict=True):
+        np.testing.assert_array_equal(view.rgb, color)
+        np.testing.assert_array_equal(view.masks, masks)
+
+
+@pytest.mark.parametrize(
+    "missing",
+    [("scene_camera.json", "depth", "mask", "mask_visib"), ("rgb", "mask", "mask_visib", "scene_gt.json", "scene_gt_info.json")],
+    ids=["rgb_and_gt", "depth"],
+)
+def test_a_set_with_a_single_kind_of_images(plain, tmp_path, capsys, missing):
+    for path in [path for name in missing for path in plain.glob(f"test/*/{name}")]:
+        shutil.rmtree(path) if path.is_dir() else path.unlink()
+    shutil.rmtree(plain / "models")
+    assert len(list(synpick_warp.open(plain).views())) == 6
+    for words in (("stats", "--threads", 1), ("preview", "--out", tmp_path / "sheet.png"), ("report", "--out", tmp_path / "page.html")):
+        assert run(capsys, words[0], plain, *words[1:])[0] == 0
+    assert cv2.imread(str(tmp_path / "sheet.png"))[20:300, :480].std() > 10
+
+
+def test_tracking_needs_instance_ids(plain, tmp_path, capsys):
+    words = ("estimate", "--data", plain, "--method", "track", "--device", "cpu", "--out", tmp_path / "out.csv", "--threads", 1)
+    code, _, said = run(capsys, *words)
+    assert code == 2
+    assert "has no instance_id in its ground truth, by which instances are tracked; use another method" in said
+    assert said.count("\n") == 1
 
 
 def test_other_cameras_than_pinholes_are_named(plain):
