@@ -32,7 +32,8 @@ def convert(
     """Convert a data set to other formats. After an interruption, the same command resumes with the remaining episodes.
 
     Formats of images need bop or shards in the data set, those of motion alone (usd) zarr, and lerobot both. Files are those that a bake
-    would have written, but for LeRobot's videos from JPEG images. Exit codes: 0, converted; 2, an error.
+    would have written, but for LeRobot's videos from JPEG images. BOP data sets that no bake wrote become bop, shards or coco, with their
+    own ids, and not in parts. Exit codes: 0, converted; 2, an error.
     """
     check_range("--processes", processes, 0, MAX_THREADS)
     from synpick_warp.cli.display import CountProgress, make_console
@@ -44,6 +45,6 @@ def convert(
     with CountProgress(make_console()) as counter:
         converted = run_conversion(folder, out, names, processes, counter.report)
     before = f" ({converted.resumed:,} of them before)" if converted.resumed else ""
-    print(f"{converted.episodes:,} episodes converted to {', '.join(names)}{before}")
+    print(f"{converted.episodes:,} {converted.unit} converted to {', '.join(names)}{before}")
     print(f"data set: {out}")
     return 0

@@ -11,7 +11,9 @@ from typing import NamedTuple
 from synpick_warp.codes import Ending
 from synpick_warp.configs.schema import CLASSIC, Config
 from synpick_warp.conversion.context import StoredContext
+from synpick_warp.conversion.found import convert_found
 from synpick_warp.conversion.source import Source
+from synpick_warp.dataset.reading import open_data_set
 from synpick_warp.dataset.writing import OutputFolder, finalize_data_set
 from synpick_warp.errors import ConfigError, DatasetError
 from synpick_warp.exporters.formats import FORMAT_TABLE, Content, contents_of, convertible
@@ -32,10 +34,11 @@ class Converted(NamedTuple):
     """Episodes of the converted data set."""
     resumed: int
     """Those of earlier runs."""
+    unit: str = "episodes"
 
 
 def convert(folder: Path, out: Path, formats: Sequence[str], processes: int, report: Report) -> Converted:
-    """Convert the committed episodes of a data set to other formats, into a data set of its own.
+    """Convert the committed episodes of a data set to other formats, into a data set of its own; the scenes of one that no bake wrote.
 
     Args:
         folder: The data set.
@@ -49,6 +52,10 @@ def convert(folder: Path, out: Path, formats: Sequence[str], processes: int, rep
         DatasetError: The source is no data set, is damaged, or lacks what a format needs.
         OutputError: A file cannot be written.
     """
+    data = open_data_set(folder)
+    if data.found is not None:
+        _check_apart(folder, out)
+        return Converted(convert_found(data, out, formats, processes, report), 0, "scenes")
     source = Source(folder)
     check_formats(formats, source.config, folder)
     contents: set[Content] = {content for name in formats for content in contents_of(name, source.config)}

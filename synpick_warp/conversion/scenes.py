@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -27,11 +27,17 @@ class StoredSceneFiles:
     """Of which nothing has been read, so that they are small when pickled."""
     scene: int
     """BOP scene_id."""
-    frames: int
+    images: Sequence[int]
+    """BOP im_id of each frame."""
+
+    @property
+    def frames(self) -> int:
+        """See `StoredScene`."""
+        return len(self.images)
 
     def views(self, frames: range) -> Iterator[StoredViewFiles]:
         """See `StoredScene`."""
-        return (StoredViewFiles(self.files, self.scene, frame) for frame in frames)
+        return (StoredViewFiles(self.files, self.scene, self.images[frame]) for frame in frames)
 
 
 class StoredViewFiles:
@@ -42,7 +48,7 @@ class StoredViewFiles:
         Args:
             files: Files of the scene.
             scene: BOP scene_id.
-            frame: Index of the frame.
+            frame: BOP im_id.
         """
         self.files, self.scene, self.frame = files, scene, frame
 
@@ -98,7 +104,7 @@ class StoredViewFiles:
         files, infos = self.files, self.gt_info
         if not isinstance(files, SceneFolder):
             both = [files.masks(name, self.frame, len(infos)) for name in ("mask", "mask_visib")]
-            return [Masks(*(_find_runs(mask) for mask in pair)) for pair in zip(*both, strict=True)]
+            return [Masks(*(find_runs(mask) for mask in pair)) for pair in zip(*both, strict=True)]
         return [
             Masks(
                 _read_runs(files, "mask", self.frame, index, info["bbox_obj"], info["px_count_valid"]),
@@ -118,11 +124,12 @@ def _read_runs(files: SceneFolder, name: str, frame: int, index: int, box: list[
         data = read_file_if_present(path, MAX_IMAGE_FILE, DatasetError)
         crop = None if data is None else decode_grey_crop(data, (width, height), rows, columns)
         if crop is not None:
-            runs = _find_runs(crop > 0, top, left)
+            runs = find_runs(crop > 0, top, left)
             if runs.count == count:
                 return runs
-    return _find_runs(files.mask(name, frame, index))
+    return find_runs(files.mask(name, frame, index))
 
 
-def _find_runs(mask: np.ndarray, top: int = 0, left: int = 0) -> Runs:
+def find_runs(mask: np.ndarray, top: int = 0, left: int = 0) -> Runs:
+    """Runs of a mask (H, W), or of a crop of it that begins at a row and a column."""
     return find_run_boundaries(mask.astype(np.uint8), top, left).runs_of(1)

@@ -16,7 +16,7 @@ import numpy as np
 from synpick_warp.dataset.annotations import ADVICE, MASK_SCHEMA, SCENE_SCHEMAS, VIEW_SCHEMAS, check_json, read_checked
 from synpick_warp.errors import DatasetError
 from synpick_warp.inputs.files import read_file_if_present
-from synpick_warp.inputs.image_files import MAX_IMAGE_FILE, decode_image, image_size
+from synpick_warp.inputs.image_files import MAX_IMAGE_FILE, decode_image, image_size, tiff_size
 from synpick_warp.inputs.tar_files import list_members
 
 SUFFIXES = (".png", ".jpg")
@@ -135,7 +135,7 @@ class SceneFolder:
             path = self.images(name) / f"{frame:06d}{suffix}"
             data = read_file_if_present(path, MAX_IMAGE_FILE, DatasetError)
             if data is not None:
-                return suffix, _check_stated_size(data, self.size, path)
+                return suffix, check_stated_size(data, self.size, path)
         raise DatasetError(f"there is no {self.images(name) / f'{frame:06d}'}.png or .jpg; the data set is not complete")
 
     def masks(self, name: str, frame: int, count: int) -> list[np.ndarray]:
@@ -210,7 +210,7 @@ class SceneShards:
         for suffix in SUFFIXES:
             data = self._read(frame, f"{name}{suffix}")
             if data is not None:
-                return suffix, _check_stated_size(data, self.size, self._source(frame, f"{name}{suffix}"))
+                return suffix, check_stated_size(data, self.size, self._source(frame, f"{name}{suffix}"))
         raise DatasetError(f"{self.shards[0].parent} has no {self._key(frame)}.{name}{SUFFIXES[0]}; the data set is not complete")
 
     def masks(self, name: str, frame: int, count: int) -> list[np.ndarray]:
@@ -258,9 +258,9 @@ class SceneShards:
         return data
 
 
-def _check_stated_size(data: bytes, size: tuple[int, int] | None, source: object) -> bytes:
+def check_stated_size(data: bytes, size: tuple[int, int] | None, source: object) -> bytes:
     """Check the size that an image file states; returns its content."""
-    stated = image_size(data)
+    stated = image_size(data) or tiff_size(data)
     if stated is None or (size is not None and stated != size):
         there = "is not an image" if stated is None else f"has {stated[0]} x {stated[1]} pixels, not the camera's; {ADVICE}"
         raise DatasetError(f"{source} {there}")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 from pathlib import Path
 
@@ -15,7 +16,7 @@ from synpick_warp.cli.commands import main
 from synpick_warp.dataset.bop.measured import measure_info
 from synpick_warp.errors import DatasetError
 from tests.validation.conftest import good  # noqa: F401
-from tests.validation.layouts import LAYOUTS, _strip, tless
+from tests.validation.layouts import LAYOUTS, _rename_images, _strip, tless
 
 EPISODES = {
     "tless": [1, 2, 3],
@@ -225,6 +226,72 @@ def test_a_set_with_a_single_kind_of_images(plain, tmp_path, capsys, missing):
     for words in (("stats", "--threads", 1), ("preview", "--out", tmp_path / "sheet.png"), ("report", "--out", tmp_path / "page.html")):
         assert run(capsys, words[0], plain, *words[1:])[0] == 0
     assert cv2.imread(str(tmp_path / "sheet.png"))[20:300, :480].std() > 10
+
+
+def rows(view) -> dict:
+    return {"rgb": view.rgb, "depth": view.depth, "masks": view.masks, "poses": view.object_to_camera, "visibility": view.visibility}
+
+
+@pytest.mark.parametrize(("name", "to"), [("tless", "shards"), ("imagewise", "bop")])
+def test_converted_views_are_those_of_the_source(folders, tmp_path, capsys, name, to):
+    out = tmp_path / "new" / "out"
+    code, said, _ = run(capsys, "convert", folders[name], "--to", f"{to},coco", "--out", out, "--processes", 1)
+    assert code == 0
+    assert f"3 scenes converted to {to}, coco" in said
+    assert [path.name for path in out.parent.iterdir()] == ["out"]
+    source, made = synpick_warp.open(folders[name]), synpick_warp.open(out)
+    assert list(made) == list(source)
+    for theirs, ours in zip(source.views(), made.views(), strict=True):
+        assert (theirs.episode, theirs.image_id) == (ours.episode, ours.image_id)
+        for key, values in rows(theirs).items():
+            np.testing.assert_array_equal(values, rows(ours)[key], err_msg=key)
+    (file,) = (out / "coco" / "annotations").iterdir()
+    content = json.loads(file.read_text())
+    assert len(content["images"]) == 6
+    assert all((out / "coco" / "images" / image["file_name"]).is_file() for image in content["images"])
+    assert len(content["annotations"]) == sum(int(mask.any()) for view in source.views() for mask in view.masks)
+    assert run(capsys, "validate", out)[0] == 0
+
+
+def test_images_of_other_kinds_are_encoded_and_keep_their_ids(folders, tmp_path, capsys):
+    shutil.copytree(folders["itodd"] / "val", tmp_path / "set" / "val")
+    for scene in (tmp_path / "set/val").iterdir():
+        _rename_images(scene, {0: 1, 1: 36})
+    assert run(capsys, "convert", tmp_path / "set", "--to", "shards,coco", "--out", tmp_path / "out", "--processes", 1)[0] == 0
+    for theirs, ours in zip(synpick_warp.open(tmp_path / "set").views(), synpick_warp.open(tmp_path / "out").views(), strict=True):
+        assert ours.image_id in (1, 36)
+        np.testing.assert_array_equal(theirs.rgb, ours.rgb)
+        np.testing.assert_array_equal(theirs.depth, ours.depth)
+    content = json.loads((tmp_path / "out/coco/annotations/instances_val.json").read_text())
+    assert {image["file_name"][7:] for image in content["images"]} == {"000001.png", "000036.png"}
+
+
+@pytest.mark.parametrize(
+    ("name", "to", "said"),
+    [
+        ("tless", "usd", "--to names usd, which is made of trajectories"),
+        ("tless", "lerobot", "--to names lerobot, which is made of trajectories"),
+        ("tless", "bop", "--to names bop, which .* has already"),
+        ("tless", "nothing", "--to names nothing; allowed: coco, bop, shards"),
+        ("ycbv", "coco", "has the splits test, train_pbr; convert takes"),
+        ("multisensor", "coco", "has 3 sensors; convert takes"),
+    ],
+)
+def test_what_can_not_be_made_of_a_found_set_is_one_line(folders, tmp_path, capsys, name, to, said):
+    code, _, line = run(capsys, "convert", folders[name], "--to", to, "--out", tmp_path / "out", "--processes", 1)
+    assert code == 2
+    assert re.search(said, line)
+    assert line.count("\n") == 1
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_conversion_that_fails_leaves_nothing(plain, tmp_path, capsys):
+    sorted(plain.glob("test/000002/depth/*"))[-1].write_bytes(b"")
+    before = sorted(path.name for path in tmp_path.iterdir())
+    code, _, line = run(capsys, "convert", plain, "--to", "shards", "--out", tmp_path / "out", "--processes", 1)
+    assert code == 2
+    assert "is not an image" in line
+    assert sorted(path.name for path in tmp_path.iterdir()) == before
 
 
 def test_tracking_needs_instance_ids(plain, tmp_path, capsys):

@@ -13,7 +13,7 @@ from synpick_warp.dataset.annotations import LENIENT_SCENE_SCHEMAS, LENIENT_VIEW
 from synpick_warp.dataset.bop.images import FolderImages, KeyedImages
 from synpick_warp.dataset.bop.layout import KEYED, SHARD, Layout, NoLayoutError, SceneRef
 from synpick_warp.dataset.bop.measured import UNKNOWN, measure_info
-from synpick_warp.dataset.view_files import RECORD_NAMES, ViewRecords, check_run_lengths, decode_run_lengths
+from synpick_warp.dataset.view_files import RECORD_NAMES, ViewRecords, check_run_lengths, check_stated_size, decode_run_lengths
 from synpick_warp.errors import DatasetError
 from synpick_warp.inputs.image_files import MAX_IMAGE_FILE, decode_picture, image_size, tiff_size
 from synpick_warp.inputs.json import MAX_JSON
@@ -134,7 +134,7 @@ class FoundScene:
     def image_file(self, name: str, frame: int) -> tuple[str, bytes]:
         """See `SceneFiles`."""
         source, data = self._need(name, frame)
-        return f".{source.rpartition('.')[2].lower()}", data
+        return f".{source.rpartition('.')[2].lower()}", check_stated_size(data, self.image_size(frame), source)
 
     def image_size(self, frame: int) -> tuple[int, int]:
         """See `SceneFiles`: those of the frame's colour image, or else its depth image or first mask, which its others must have, too."""

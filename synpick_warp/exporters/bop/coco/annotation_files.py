@@ -6,9 +6,10 @@ Runs in writer processes, so it imports neither Warp nor Newton.
 from __future__ import annotations
 
 import json
+import math
 import os
 import shutil
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -31,6 +32,8 @@ FOLDER = Path("coco")
 """Folder in the data set."""
 IMAGES, PARTS, CATEGORIES = FOLDER / "images", FOLDER / "parts", FOLDER / "categories.json"
 """Images in a folder a scene, annotations of each scene, names of the objects. Splits share them, as scene ids are unique over all."""
+_DIGITS = 6
+"""Least number of digits of an image's name."""
 _ADVICE = "remove it and its episode's two files in manifest/, and resume the bake"
 
 
@@ -90,17 +93,23 @@ def _make_annotations(view: EncodedView, settings: ViewSettings) -> Iterator[dic
                 "area": mask.visible.count,
                 "iscrowd": 0,
                 "segmentation": make_rle(mask.visible, height, width),
-                "bbox_amodal": [*info["bbox_obj"][:2], *(size + 1 for size in info["bbox_obj"][2:])],
-                "visib_fract": info["visib_fract"],
-                "instance_id": pose["instance_id"],
+                **_make_extras(pose, info),
             } | points
 
 
-def commit_scenes(scenes: tuple[tuple[Path, int], ...], out: Path, frames: int) -> None:
+def _make_extras(pose: Mapping[str, Any], info: Mapping[str, Any]) -> dict[str, Any]:
+    """Keys of ours of an annotation; data sets of others may not know them."""
+    extras = {} if math.isnan(info["visib_fract"]) else {"visib_fract": info["visib_fract"]}
+    if extras:
+        extras = {"bbox_amodal": [*info["bbox_obj"][:2], *(size + 1 for size in info["bbox_obj"][2:])], **extras}
+    return extras | ({"instance_id": pose["instance_id"]} if "instance_id" in pose else {})
+
+
+def commit_scenes(scenes: tuple[tuple[Path, int], ...], out: Path, frames: Sequence[int]) -> None:
     """Task: complete an episode's scenes, (staging folder, scene_id): a line of annotations per frame, and rename all to their places.
 
     Raises:
-        OutputError: Fewer than `frames` frames of a scene have arrived.
+        OutputError: Not all `frames` (im_id) of a scene have arrived.
     """
     for scene, scene_id in scenes:
         with (scene / ANNOTATIONS).open("rb") as file:
@@ -142,7 +151,7 @@ def _write_annotations(out: Path, config: Config, split: str, parts: list[Path],
     images, annotations = 0, 0
     with (folder / "images").open("w", encoding="ascii") as image_file, (folder / "annotations").open("w", encoding="ascii") as file:
         for part in parts:
-            for frame, found in enumerate(_read_part(part, out)):
+            for frame, found in zip(_find_frames(out, part), _read_part(part, out), strict=False):
                 images += 1
                 row = {"id": images, **_describe_image(config, int(part.stem), frame)}
                 image_file.write((",\n" if images > 1 else "") + json.dumps(row))
@@ -164,6 +173,12 @@ def _write_annotations(out: Path, config: Config, split: str, parts: list[Path],
     sync_folder((out / place).parent)
     shutil.rmtree(folder)
     return place
+
+
+def _find_frames(out: Path, part: Path) -> list[int]:
+    """Images (im_id) of a scene, ascending, as those of the lines of its part."""
+    names = (path.stem for path in (out / IMAGES / part.stem).iterdir())
+    return sorted(int(name) for name in names if name.isascii() and name.isdecimal() and len(name) >= _DIGITS)
 
 
 def _read_part(part: Path, out: Path) -> Iterator[list[dict[str, Any]]]:
