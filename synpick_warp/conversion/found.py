@@ -20,15 +20,17 @@ from synpick_warp.configs.schema import Config
 from synpick_warp.conversion.scenes import StoredSceneFiles, StoredViewFiles, find_runs
 from synpick_warp.dataset.bop.layout import TARGETS
 from synpick_warp.dataset.bop.models import models_folder
-from synpick_warp.dataset.bop.scenes import FoundScene, FoundScenes
+from synpick_warp.dataset.bop.scenes import FoundScenes
 from synpick_warp.dataset.object_names import object_names
 from synpick_warp.dataset.reading import DataSet
+from synpick_warp.dataset.view_files import SceneFiles
 from synpick_warp.errors import ConfigError, DatasetError
 from synpick_warp.exporters.base import ExportContext
 from synpick_warp.exporters.bop.shared.models import MODEL_FOLDERS
 from synpick_warp.exporters.formats import convertible
 from synpick_warp.exporters.registry import Exporters, finalize, load_exporter_classes
 from synpick_warp.exporters.writing.files import PARTIAL, check_output_folder, output_error, write_atomically
+from synpick_warp.exporters.writing.folder import Buffer
 from synpick_warp.exporters.writing.notes import CAMERA_FILE, NOTES_FILE
 from synpick_warp.exporters.writing.png import encode_png
 from synpick_warp.exporters.writing.pool import WriterPool
@@ -61,7 +63,7 @@ class FoundViewFiles(StoredViewFiles):
     """Of all colour images; width and height [px]."""
 
     @property
-    def color(self) -> tuple[str, bytes]:
+    def color(self) -> tuple[str, Buffer]:
         """See `EncodedView`."""
         size = self.files.image_size(self.frame)
         if size != self.size:
@@ -73,7 +75,7 @@ class FoundViewFiles(StoredViewFiles):
         image = self.color_image()
         return self.suffix, encode_png(image) if self.suffix == ".png" else encode_jpeg(image, _JPEG_QUALITY)
 
-    def layer(self, name: str) -> bytes:
+    def layer(self, name: str) -> Buffer:
         """See `StoredView`."""
         suffix, data = self.files.image_file(name, self.frame)
         return data if suffix == ".png" else encode_png(self._image(name, None, "uint16"))
@@ -109,9 +111,13 @@ class _Context(ExportContext):
         super().__init__(out, config, Catalog(()), make_cameras(config.cameras), (), pool)
         self._data = data
 
-    @cached_property
+    @property
     def names(self) -> dict[int, str]:
         """See `ExportContext`."""
+        return self._names
+
+    @cached_property
+    def _names(self) -> dict[int, str]:
         found = {int(index) for view in self._data.views() for index in view.object_ids}
         folder = self._data.folder
         named = object_names(folder, None, found) if (folder / models_folder(folder) / "models_info.json").is_file() else {}
@@ -123,7 +129,7 @@ class _Context(ExportContext):
         for name in MODEL_FOLDERS:
             source = layout.models.get(name if name in layout.models else models_folder(layout.root))
             for file in sorted(source.files) if source is not None else ():
-                if file.rpartition(".")[2].lower() in ("ply", "json", *TEXTURE_KINDS):
+                if source is not None and file.rpartition(".")[2].lower() in ("ply", "json", *TEXTURE_KINDS):
                     make_folder(self.out / name)
                     (self.out / name / file).write_bytes(source.read(file, MAX_IMAGE_FILE))
         return True
@@ -151,7 +157,7 @@ def convert_found(data: DataSet, out: Path, formats: Sequence[str], processes: i
         OutputError: `out` cannot be used, or a file not be written.
     """
     first = next((data.scene_files(index, 0) for index, episode in data.items() if len(episode)), None)
-    if not isinstance(first, FoundScene):
+    if first is None:
         raise DatasetError(f"{data.folder} has no images")
     _check_formats(data, first, formats)
     check_output_folder(out)
@@ -174,7 +180,7 @@ def convert_found(data: DataSet, out: Path, formats: Sequence[str], processes: i
     return count
 
 
-def _check_formats(data: DataSet, first: FoundScene, formats: Sequence[str]) -> None:
+def _check_formats(data: DataSet, first: SceneFiles, formats: Sequence[str]) -> None:
     """Check that the formats can be made of what the first scene has."""
     found = _found(data)
     if len(found.splits) > 1 or data.camera_count > 1:
@@ -195,11 +201,11 @@ def _check_formats(data: DataSet, first: FoundScene, formats: Sequence[str]) -> 
             raise ConfigError(f"--to names {name}, which {data.folder} has already; copy the folder")
 
 
-def _has_masks(scene: FoundScene) -> bool:
+def _has_masks(scene: SceneFiles) -> bool:
     return scene.has("mask") and scene.has("mask_visib")
 
 
-def _make_config(data: DataSet, first: FoundScene, formats: Sequence[str]) -> Config:
+def _make_config(data: DataSet, first: SceneFiles, formats: Sequence[str]) -> Config:
     """Settings by which exporters name and lay out files; they are written nowhere."""
     base, frame = load_config(), first.frames()[0]
     suffix, _ = first.image_file("rgb", frame)

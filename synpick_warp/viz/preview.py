@@ -17,10 +17,10 @@ from synpick_warp.configs.load import load_config
 from synpick_warp.configs.schema import Config
 from synpick_warp.configs.splits import scene_episode
 from synpick_warp.dataset.bop.layout import NoLayoutError
-from synpick_warp.dataset.bop.scenes import FoundScene, FoundScenes
+from synpick_warp.dataset.bop.scenes import FoundScenes
 from synpick_warp.dataset.manifest import CONFIG_FILE, episode_entry, read_entry
 from synpick_warp.dataset.object_names import object_names
-from synpick_warp.dataset.view_files import check_planes
+from synpick_warp.dataset.view_files import SceneFiles, check_planes
 from synpick_warp.errors import DatasetError, OutputError, SynpickError
 from synpick_warp.viz.depth_colors import DepthScale, color_depth, describe_depth, pooled_scale, tote_scale
 from synpick_warp.viz.drawing import GOLDEN, Image, check_picture_name, instance_color, put_text, write_picture
@@ -49,7 +49,7 @@ class Scene:
     """Of members: SPLIT/SCENE, which does not exist."""
     sensor: str = ""
     """Suffix of the sensor's folders and files, such as "_cam1"; empty: classic layout."""
-    files: Callable[[], FoundScene] = field(compare=False, repr=False, kw_only=True)
+    files: Callable[[], SceneFiles] = field(compare=False, repr=False, kw_only=True)
     """Opens it; what others leave out may be missing."""
 
     def images(self, name: str) -> Path:
@@ -65,7 +65,7 @@ class _View:
     """Record of scene_camera."""
     truth: list[tuple[dict[str, Any], dict[str, Any]]]
     """Records of scene_gt and scene_gt_info, per instance."""
-    files: FoundScene
+    files: SceneFiles
 
 
 def write_contact_sheet(dataset: Path, out: Path, views: int) -> Path:

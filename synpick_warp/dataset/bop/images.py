@@ -8,15 +8,19 @@ from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 
+from synpick_warp.dataset.annotations import ADVICE
 from synpick_warp.dataset.bop.folders import Listing
 from synpick_warp.dataset.bop.layout import KEYED, SceneRef
 from synpick_warp.errors import DatasetError
 from synpick_warp.inputs.files import read_file
+from synpick_warp.inputs.image_files import MAX_IMAGE_FILE
 from synpick_warp.inputs.tar_files import list_members
 
 SUFFIXES = ("png", "jpg", "jpeg", "tif", "tiff")
 """File formats of images that BOP data sets have, the preferred one first."""
 KINDS = ("rgb", "gray", "depth", "mask", "mask_visib")
+COLOR = ("rgb", "gray")
+"""Those that show colour or brightness, the preferred one first."""
 _STEM = re.compile(r"([0-9]{1,9})(?:_([0-9]{1,9}))?\.(\w+)")
 
 Index = tuple[int, int | None]
@@ -78,6 +82,10 @@ class FolderImages:
             return None
         return read_file(self.listing.root / self.file(kind, image, index), limit, DatasetError)
 
+    def find(self, name: str, image: int, index: int | None = None) -> tuple[str, bytes, str] | None:
+        """Suffix, content and path of an image; "rgb" is grey where there is no colour. None: there is none."""
+        return _find(self, name, image, index)
+
 
 @dataclass(frozen=True)
 class Member:
@@ -134,7 +142,7 @@ class KeyedImages:
         except OSError as error:
             raise DatasetError(f"{member.path} cannot be read: {error.strerror}") from None
         if len(data) < min(member.size, limit):
-            raise DatasetError(f"{member.path} is damaged: it ends within {member.file.rpartition(':')[2]}")
+            raise DatasetError(f"{member.path} is damaged: it ends within {member.file.rpartition(':')[2]}; {ADVICE}")
         return data
 
     @cached_property
@@ -146,18 +154,31 @@ class KeyedImages:
         """See `FolderImages`; masks of a view are one file, without index."""
         return {(image, None): member.file for (image, content), member in self.members.items() if content.split(".")[0] == kind}
 
-    def find(self, kind: str, image: int) -> Member | None:
+    def member(self, kind: str, image: int) -> Member | None:
         """Member of an image, or of its masks."""
         suffixes = ("json",) if kind.startswith("mask") else SUFFIXES
         return next((member for suffix in suffixes if (member := self.members.get((image, f"{kind}.{suffix}")))), None)
 
     def file(self, kind: str, image: int, index: int | None = None) -> str:
         """See `FolderImages`."""
-        member = self.find(kind, image)
+        member = self.member(kind, image)
         part = "" if index is None else f", mask {index}"
         return f"{member.file}{part}" if member else f"{self.ref.place}/{self.ref.scene:06d}_{image:06d}.{kind}{part}"
 
     def read(self, kind: str, image: int, index: int | None, limit: int) -> bytes | None:
         """See `FolderImages`."""
-        member = self.find(kind, image)
+        member = self.member(kind, image)
         return None if member is None else self.content(member, limit)
+
+    def find(self, name: str, image: int, index: int | None = None) -> tuple[str, bytes, str] | None:
+        """See `FolderImages`."""
+        return _find(self, name, image, index)
+
+
+def _find(images: FolderImages | KeyedImages, name: str, image: int, index: int | None) -> tuple[str, bytes, str] | None:
+    for kind in COLOR if name == "rgb" else (name,):
+        data = images.read(kind, image, index, MAX_IMAGE_FILE)
+        if data is not None:
+            source = str(images.listing.root / images.file(kind, image, index))
+            return f".{source.rpartition('.')[2].lower()}", data, source
+    return None

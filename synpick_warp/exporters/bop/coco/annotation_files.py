@@ -32,8 +32,8 @@ FOLDER = Path("coco")
 """Folder in the data set."""
 IMAGES, PARTS, CATEGORIES = FOLDER / "images", FOLDER / "parts", FOLDER / "categories.json"
 """Images in a folder a scene, annotations of each scene, names of the objects. Splits share them, as scene ids are unique over all."""
-_DIGITS = 6
-"""Least number of digits of an image's name."""
+_Line: Any = list[dict[str, Any]] | None
+"""A line of a part."""
 _ADVICE = "remove it and its episode's two files in manifest/, and resume the bake"
 
 
@@ -106,7 +106,8 @@ def _make_extras(pose: Mapping[str, Any], info: Mapping[str, Any]) -> dict[str, 
 
 
 def commit_scenes(scenes: tuple[tuple[Path, int], ...], out: Path, frames: Sequence[int]) -> None:
-    """Task: complete an episode's scenes, (staging folder, scene_id): a line of annotations per frame, and rename all to their places.
+    """Task: complete an episode's scenes, (staging folder, scene_id): a line of annotations for each frame, null for im_ids that sets of
+    others leave out, and rename all to their places.
 
     Raises:
         OutputError: Not all `frames` (im_id) of a scene have arrived.
@@ -115,7 +116,8 @@ def commit_scenes(scenes: tuple[tuple[Path, int], ...], out: Path, frames: Seque
         with (scene / ANNOTATIONS).open("rb") as file:
             blocks = AnnotationBlocks(file)
             blocks.check_frames(scene, frames)
-            lines = [next(blocks.read(frame, 0, 1)) for frame in blocks.frames]
+            known = set(blocks.frames)
+            lines = [next(blocks.read(frame, 0, 1)) if frame in known else "null" for frame in range(max(known, default=-1) + 1)]
         part = scene.with_name(f"{scene.name}.part")
         write_synced(part, "".join(f"{line}\n" for line in lines).encode())
         (scene / ANNOTATIONS).unlink()
@@ -151,7 +153,9 @@ def _write_annotations(out: Path, config: Config, split: str, parts: list[Path],
     images, annotations = 0, 0
     with (folder / "images").open("w", encoding="ascii") as image_file, (folder / "annotations").open("w", encoding="ascii") as file:
         for part in parts:
-            for frame, found in zip(_find_frames(out, part), _read_part(part, out), strict=False):
+            for frame, found in enumerate(_read_part(part, out)):
+                if found is None:
+                    continue
                 images += 1
                 row = {"id": images, **_describe_image(config, int(part.stem), frame)}
                 image_file.write((",\n" if images > 1 else "") + json.dumps(row))
@@ -175,17 +179,11 @@ def _write_annotations(out: Path, config: Config, split: str, parts: list[Path],
     return place
 
 
-def _find_frames(out: Path, part: Path) -> list[int]:
-    """Images (im_id) of a scene, ascending, as those of the lines of its part."""
-    names = (path.stem for path in (out / IMAGES / part.stem).iterdir())
-    return sorted(int(name) for name in names if name.isascii() and name.isdecimal() and len(name) >= _DIGITS)
-
-
-def _read_part(part: Path, out: Path) -> Iterator[list[dict[str, Any]]]:
-    """Annotations of each frame of a scene."""
+def _read_part(part: Path, out: Path) -> Iterator[list[dict[str, Any]] | None]:
+    """Annotations of each frame of a scene; None: there is no such image (im_id)."""
     data = read_file(path_inside(out, str(part.relative_to(out)), out / PARTS, DatasetError), MAX_JSON, DatasetError)
     for number, line in enumerate(data.splitlines(), start=1):
-        yield decode_json(line, list[dict[str, Any]], f"{part}, line {number},", DatasetError, _ADVICE)
+        yield decode_json(line, _Line, f"{part}, line {number},", DatasetError, _ADVICE)
 
 
 def _describe_image(config: Config, scene: int, frame: int) -> dict[str, Any]:
