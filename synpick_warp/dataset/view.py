@@ -6,23 +6,21 @@ OpenCV's axes (x right, y down, z forward); `world`, the tote's axes (z up). The
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Mapping, Sequence
 from functools import cached_property
 from typing import Any
 
 import numpy as np
+from msgspec import UNSET
 
 from synpick_warp.configs.schema import LAYERS
 from synpick_warp.dataset.annotations import ADVICE
+from synpick_warp.dataset.bop.arrays import instance_ids
 from synpick_warp.dataset.view_files import SceneFiles, ViewRecords, check_planes
 from synpick_warp.errors import DatasetError
 from synpick_warp.layer_codec import decode_layer, image_format
 
 MILLIMETERS = 1000.0
 """In a metre: BOP's files are in millimetres, this module is in metres."""
-_IDS_PER_OBJECT = 1000
-"""Ids of instances that are made up, per object."""
 _ORTHOGONAL = 1e-3
 """Tolerance of R Rᵀ = 1 for a rotation that is read; files have at least six digits."""
 
@@ -146,7 +144,7 @@ class View:
     @cached_property
     def instance_ids(self) -> np.ndarray:
         """Track id of each instance (N) int64: the same object through its whole episode and in all cameras; see `instance_ids`."""
-        ids = instance_ids(self.records.gt, self._files.lenient)
+        ids = instance_ids([(row["obj_id"], row.get("instance_id", UNSET)) for row in self.records.gt], self._files.lenient)
         if ids is None:
             raise DatasetError(f"{self._files.place}: an instance of image {self.image_id} has no instance_id; {ADVICE}")
         return np.array(ids, np.int64)
@@ -191,24 +189,6 @@ class View:
 
     def __repr__(self) -> str:
         return f"View(episode {self.episode}, camera {self.camera}, frame {self.frame})"
-
-
-def instance_ids(truth: Sequence[Mapping[str, Any]], lenient: bool) -> list[int] | None:
-    """Ids of the instances of an image; None: they have none.
-
-    Of a lenient scene they are then 1000 times the object's and how many of it come before in the image: the same through a scene that has
-    one of each object; of several, which is which is not known from image to image.
-    """
-    if all("instance_id" in entry for entry in truth):
-        return [entry["instance_id"] for entry in truth]
-    if not lenient:
-        return None
-    seen: Counter[int] = Counter()
-    result = []
-    for entry in truth:
-        result.append(_IDS_PER_OBJECT * entry["obj_id"] + seen[entry["obj_id"]])
-        seen[entry["obj_id"]] += 1
-    return result
 
 
 def make_transform(rotation: Any, translation: Any) -> np.ndarray:
