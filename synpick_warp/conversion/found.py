@@ -23,11 +23,11 @@ from synpick_warp.dataset.bop.models import models_folder
 from synpick_warp.dataset.bop.scenes import FoundScenes
 from synpick_warp.dataset.object_names import object_names
 from synpick_warp.dataset.reading import DataSet
-from synpick_warp.dataset.view_files import SceneFiles
+from synpick_warp.dataset.view_files import SceneFiles, SceneFolder
 from synpick_warp.errors import ConfigError, DatasetError
 from synpick_warp.exporters.base import ExportContext
 from synpick_warp.exporters.bop.shared.models import MODEL_FOLDERS
-from synpick_warp.exporters.formats import convertible
+from synpick_warp.exporters.formats import contents_of, convertible
 from synpick_warp.exporters.registry import Exporters, finalize, load_exporter_classes
 from synpick_warp.exporters.writing.files import PARTIAL, check_output_folder, output_error, write_atomically
 from synpick_warp.exporters.writing.folder import Buffer
@@ -43,13 +43,12 @@ from synpick_warp.scenes.types import Catalog
 from synpick_warp.system.cores import count_cores
 from synpick_warp.system.folders import make_folder
 
+_IMAGES = {"views", "masks"}
+"""What a format may be made of here: of `formats.Content`, that of which no trajectory is needed."""
 _NEEDS = {"gt": "ground truth (scene_gt.json)", "rgb": "colour images"}
-"""What every format of images needs, by the names of `SceneFiles.has`."""
-_NEEDS_OF = {
-    "coco": {"mask_visib": "masks of visible parts (mask_visib)"},
-    "bop": {"camera": "cameras (scene_camera.json)", "depth": "depth images"},
-    "shards": {"camera": "cameras (scene_camera.json)", "depth": "depth images"},
-}
+_NEEDS_OF_MASKS = {"mask_visib": "masks of visible parts (mask_visib)"}
+_NEEDS_OF_DEPTH = {"camera": "cameras (scene_camera.json)", "depth": "depth images"}
+"""What formats need of a scene, by the names of `SceneFiles.has`."""
 _BAKED = (CAMERA_FILE, "README.md")
 """Files of exporters that describe a bake, its camera or its licence."""
 _JPEG_QUALITY = 95
@@ -183,22 +182,27 @@ def convert_found(data: DataSet, out: Path, formats: Sequence[str], processes: i
 def _check_formats(data: DataSet, first: SceneFiles, formats: Sequence[str]) -> None:
     """Check that the formats can be made of what the first scene has."""
     found = _found(data)
-    if len(found.splits) > 1 or data.camera_count > 1:
-        has = f"the splits {', '.join(found.splits)}" if data.camera_count == 1 else f"{data.camera_count} sensors"
-        raise ConfigError(f"{data.folder} has {has}; convert takes data sets of one split and one camera a scene")
-    ref = found.refs()[0]
+    if data.camera_count > 1:
+        raise ConfigError(f"{data.folder} has {data.camera_count} sensors; convert takes data sets of one camera a scene")
+    if len(found.splits) > 1:
+        raise ConfigError(f"{data.folder} has the splits {', '.join(found.splits)}; choose one by --split")
+    base = load_config()
+    base = dataclasses.replace(base, bop=dataclasses.replace(base.bop, coco=False))
+    contents = {name: set(contents_of(name, base)) for name in convertible()}
     for name in formats:
-        if name not in convertible():
-            raise ConfigError(f"--to names {name}; allowed: {', '.join(_NEEDS_OF)}")
-        if name not in _NEEDS_OF:
+        if name not in contents:
+            raise ConfigError(f"--to names {name}; allowed: {', '.join(each for each in contents if contents[each] <= _IMAGES)}")
+        if not contents[name] <= _IMAGES:
             raise ConfigError(f"--to names {name}, which is made of trajectories; {data.folder} has none, as no bake wrote it")
-        for part, what in (_NEEDS | _NEEDS_OF[name]).items():
+        if (name == "bop" and isinstance(first, SceneFolder)) or (name == "shards" and first.place.suffix == ".tar"):
+            raise ConfigError(f"--to names {name}, which {data.folder} has already; copy the folder")
+        (kind,) = load_exporter_classes([name])
+        needs = _NEEDS | (_NEEDS_OF_MASKS if "masks" in contents[name] else {}) | (_NEEDS_OF_DEPTH if kind.writes_depth else {})
+        for part, what in needs.items():
             if not first.has(part):
                 raise ConfigError(f"--to names {name}, but {first.place} has no {what}, which it needs")
-        if name != "coco" and not (first.has("gt_info") or _has_masks(first)):
+        if kind.writes_depth and not (first.has("gt_info") or _has_masks(first)):
             raise ConfigError(f"--to names {name}, but {first.place} has neither scene_gt_info.json nor amodal masks, of which it is made")
-        if {"bop": ref.name, "shards": ref.shards}.get(name):
-            raise ConfigError(f"--to names {name}, which {data.folder} has already; copy the folder")
 
 
 def _has_masks(scene: SceneFiles) -> bool:

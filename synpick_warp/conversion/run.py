@@ -34,10 +34,9 @@ class Converted(NamedTuple):
     """Episodes of the converted data set."""
     resumed: int
     """Those of earlier runs."""
-    unit: str = "episodes"
 
 
-def convert(folder: Path, out: Path, formats: Sequence[str], processes: int, report: Report) -> Converted:
+def convert(folder: Path, out: Path, formats: Sequence[str], processes: int, report: Report, split: str | None = None) -> Converted:
     """Convert the committed episodes of a data set to other formats, into a data set of its own; the scenes of one that no bake wrote.
 
     Args:
@@ -46,6 +45,7 @@ def convert(folder: Path, out: Path, formats: Sequence[str], processes: int, rep
         formats: Names of formats.
         processes: Number of processes; 0: one per core.
         report: Observer: unit, number done, total.
+        split: Split to convert, of a data set that no bake wrote; None: the only one.
 
     Raises:
         ConfigError: A format cannot be converted to, or `out` was started with other settings.
@@ -55,7 +55,9 @@ def convert(folder: Path, out: Path, formats: Sequence[str], processes: int, rep
     data = open_data_set(folder)
     if data.found is not None:
         _check_apart(folder, out)
-        return Converted(convert_found(data, out, formats, processes, report), 0, "scenes")
+        return Converted(convert_found(data if split is None else data.split(split), out, formats, processes, report), 0)
+    if split is not None:
+        raise ConfigError("--split is for data sets that no bake wrote; those of a bake are converted as a whole")
     source = Source(folder)
     check_formats(formats, source.config, folder)
     contents: set[Content] = {content for name in formats for content in contents_of(name, source.config)}

@@ -253,6 +253,14 @@ def test_converted_views_are_those_of_the_source(folders, tmp_path, capsys, name
     assert run(capsys, "validate", out)[0] == 0
 
 
+def test_a_split_is_converted(folders, tmp_path, capsys):
+    words = ("convert", folders["ycbv"], "--to", "shards", "--split", "test", "--out", tmp_path / "out", "--processes", 1)
+    assert run(capsys, *words)[0] == 0
+    assert [(view.episode, view.image_id) for view in synpick_warp.open(tmp_path / "out").views()] == [
+        (scene, image) for scene in (48, 49, 50) for image in (1, 36)
+    ]
+
+
 def test_images_of_other_kinds_are_encoded_and_keep_their_ids(folders, tmp_path, capsys):
     shutil.copytree(folders["itodd"] / "val", tmp_path / "set" / "val")
     for scene in (tmp_path / "set/val").iterdir():
@@ -272,8 +280,8 @@ def test_images_of_other_kinds_are_encoded_and_keep_their_ids(folders, tmp_path,
         ("tless", "usd", "--to names usd, which is made of trajectories"),
         ("tless", "lerobot", "--to names lerobot, which is made of trajectories"),
         ("tless", "bop", "--to names bop, which .* has already"),
-        ("tless", "nothing", "--to names nothing; allowed: coco, bop, shards"),
-        ("ycbv", "coco", "has the splits test, train_pbr; convert takes"),
+        ("tless", "nothing", "--to names nothing; allowed: bop, shards, coco"),
+        ("ycbv", "coco", "has the splits test, train_pbr; choose one by --split"),
         ("multisensor", "coco", "has 3 sensors; convert takes"),
     ],
 )
