@@ -114,6 +114,18 @@ class ModelInfo(ModelDiameter, gc=False):
     symmetries_continuous: Annotated[list[ContinuousSymmetry], Meta(max_length=MAX_SYMMETRIES)] | UnsetType = UNSET
 
 
+class TargetEntry(Struct, gc=False):
+    """A record of a target list, such as test_targets_bop19.json; those of 2024 have neither object nor count."""
+
+    scene_id: Index
+    im_id: Index | list[tuple[str, Index]]
+    """Several sensors: name of each, and its image (test_targets_multiview_bop25.json)."""
+    obj_id: Index | UnsetType | None = UNSET
+    inst_count: Index | UnsetType = UNSET
+    sensor: str = ""
+    """Camera of the image in a data set of several sensors, such as "cam1"; empty there: the first one, as BOP's lists have it."""
+
+
 class EpisodeRow(Struct, gc=False):
     """What every row of the episode list has."""
 
