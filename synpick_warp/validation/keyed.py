@@ -47,7 +47,7 @@ class KeyedFolder:
         found: dict[str, set[str] | str] = {}
         for shard in self.shards:
             try:
-                matches = (KEYED.fullmatch(name) for name, _, _ in list_members(self.listing.path(shard)))
+                matches = (KEYED.fullmatch(name) for name, _, _ in list_members(self.listing.path(shard), extended=True))
                 found[shard] = {f"{match[1]}_{match[2]}" for match in matches if match}
             except DatasetError as error:
                 found[shard] = str(error)

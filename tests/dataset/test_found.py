@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import io
 import json
 import re
 import shutil
+import tarfile
 from pathlib import Path
 
 import cv2
@@ -308,6 +310,28 @@ def test_tracking_needs_instance_ids(plain, tmp_path, capsys):
     assert code == 2
     assert "has no instance_id in its ground truth, by which instances are tracked; use another method" in said
     assert said.count("\n") == 1
+
+
+def test_shards_of_others_may_have_extended_headers(folders, tmp_path):
+    """Times of fractions of a second, as webdataset's writer makes them; files of another name or size are not taken."""
+    out = tmp_path / "set" / "train_web"
+    out.mkdir(parents=True)
+    files = sorted((folders["imagewise"]).glob("*/0*.*"))
+
+    def pack(**headers: str) -> None:
+        with tarfile.open(out / "shard-000000.tar", "w", format=tarfile.PAX_FORMAT) as shard:
+            for path in files:
+                info = tarfile.TarInfo(path.name)
+                info.size, info.mtime, info.pax_headers = path.stat().st_size, 1.5, headers
+                shard.addfile(info, io.BytesIO(path.read_bytes()))
+
+    pack()
+    for ours, theirs in zip(synpick_warp.open(out.parent).views(), synpick_warp.open(folders["imagewise"]).views(), strict=True):
+        np.testing.assert_array_equal(ours.rgb, theirs.rgb)
+        np.testing.assert_array_equal(ours.masks, theirs.masks)
+    pack(path="000000_000000.gt.json")
+    with pytest.raises(DatasetError, match="has a member at byte 0 that is not a regular file"):
+        list(synpick_warp.open(out.parent))
 
 
 def test_other_cameras_than_pinholes_are_named(plain):

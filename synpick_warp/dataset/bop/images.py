@@ -119,7 +119,7 @@ class KeyedImages:
         found: dict[tuple[int, str], Member] = {}
         for shard in self.ref.shards:
             path = self.listing.path(shard)
-            for name, offset, size in list_members(path):
+            for name, offset, size in list_members(path, extended=True):
                 self._add(found, name, Member(f"{self.listing.name(shard)}:{name}", path, offset, size))
         if not self.ref.shards:
             for name in self.listing.files:

@@ -62,7 +62,7 @@ class FoundScenes:
         for name, listing in self.layout.keyed.items():
             shards = sorted(filter(SHARD.fullmatch, listing.files))
             found: dict[int, set[str]] = {}
-            members = [(shard, each) for shard in shards for each, _, _ in list_members(listing.path(shard))]
+            members = [(shard, each) for shard in shards for each, _, _ in list_members(listing.path(shard), extended=True)]
             for shard, member in members if shards else [("", each) for each in listing.files]:
                 if match := KEYED.fullmatch(member):
                     found.setdefault(int(match[1]), set()).add(shard)
