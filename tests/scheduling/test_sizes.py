@@ -72,7 +72,7 @@ def test_batches_shrink_until_plan_and_headroom_fit(give, gpu, mode):
     # The larger part shrinks first: batches, or worlds where the light averaged over their frames is larger.
     assert config.bake.worlds >= min(512, 13 * gpu)
     if gpu >= 12.0:
-        assert views_per_batch(config, GPU) >= (12 if gpu > 12.0 else 7)  # Batches are halved until all fits.
+        assert views_per_batch(config, GPU) >= 12
     check_memory(config, GPU)
 
 
