@@ -35,7 +35,7 @@ EXCEED = "exceed"
 WITHIN = "within"
 FILLS = (EXCEED, WITHIN)
 """Rules that end the draw of an episode's objects at the volume budget."""
-FORMATS = ("bop", "shards", "usd", "zarr", "lerobot", "coco")
+FORMATS = ("bop", "shards", "usd", "zarr", "lerobot", "coco", "yolo")
 """Output formats."""
 
 
@@ -76,7 +76,7 @@ class Bake:
     formats: tuple[str, ...] = setting(
         ("bop",),
         "",
-        "Output formats: bop (scene folders), shards (webdataset), usd (a stage per episode), zarr (trajectories), lerobot (v3), coco.",
+        "Output formats: bop (scene folders), shards (webdataset), usd (a stage per episode), zarr (trajectories), lerobot, coco, yolo.",
         choices=FORMATS,
     )
     writers: int = setting(0, "", "Processes that write files, for all devices; 0: one per CPU core, if memory suffices.", low=0, high=1024)
@@ -379,6 +379,11 @@ class Bop:
     depth_scale: float = setting(0.1, "mm", "Depth of one count in 16-bit depth images; 0.1 mm reaches 6.5 m.", above=0.0, high=10.0)
     masks: bool = setting(True, "", "Write mask/ (amodal) and mask_visib/ (visible): one file per instance and view.")
     coco: bool = setting(True, "", "Write COCO annotations (scene_gt_coco.json).")
+    polygons: bool = setting(
+        False,
+        "",
+        "Segmentation in the format coco: polygons on the borders of pixels, exact, with holes, for tools that read no run lengths.",
+    )
     layout: str = setting(
         CLASSIC,
         "",

@@ -114,6 +114,11 @@ def _coco(config: Config, episode: int) -> str:
     return rf"coco/(?:parts/(?:{scenes})\.jsonl|images/(?:{scenes})/{_INDEX}\.(?:png|jpg))"
 
 
+def _yolo(config: Config, episode: int) -> str:
+    files = rf"(?:images|labels|boxes|oriented_boxes)/{re.escape(bop_folder(config, episode))}/(?:{{0}})/{_INDEX}_{_INDEX}\.(?:png|jpg|txt)"
+    return rf"yolo/(?:(?:{{0}})\.txt|{files})".replace("{0}", _scenes(config, episode))
+
+
 def _scenes(config: Config, episode: int) -> str:
     cameras = len(config.cameras.positions)
     return "|".join(f"{scene:06d}" for scene in range(cameras * episode, cameras * (episode + 1)))
@@ -159,6 +164,14 @@ FORMAT_TABLE: dict[str, Format] = {
         _coco,
         sources=lambda _: ("views", "masks"),
         part=PartFiles("coco/parts", ".jsonl", 3, per_scene=True),  # A line: [] and its end.
+    ),
+    "yolo": Format(
+        "bop.yolo.exporter",
+        "YoloExporter",
+        rf"yolo/data\.yaml|{_NOTES}",
+        _yolo,
+        sources=lambda _: ("views", "masks"),
+        part=PartFiles("yolo", ".txt", 35, per_scene=True),  # A line: an image's name.
     ),
 }
 """Format -> its row."""

@@ -109,5 +109,5 @@ def test_views_and_physics_are_needed_if_one_exporter_needs_them():
         (True, True),
     ]
     assert [one.needs_views for one in load_exporter_classes(FORMATS)] == [
-        name in ("bop", "shards", "lerobot", "coco") for name in FORMAT_TABLE
+        name in ("bop", "shards", "lerobot", "coco", "yolo") for name in FORMAT_TABLE
     ]

@@ -75,6 +75,7 @@ class SceneExporter(EpisodeExporter[tuple[Path, ...]]):
                 resolution=(camera.width, camera.height),
                 depth=self.writes_depth,
                 keypoints=self._keypoints,
+                polygons=bop.polygons,
             )
             for camera in context.cameras
         )

@@ -19,10 +19,12 @@ from synpick_warp.configs.splits import bop_folder, bop_folders
 from synpick_warp.errors import DatasetError
 from synpick_warp.exporters.base import EncodedView
 from synpick_warp.exporters.bop.keypoints import Keypoints, make_category_keys
+from synpick_warp.exporters.bop.outlines import trace_outlines
 from synpick_warp.exporters.bop.scene import AnnotationBlocks
 from synpick_warp.exporters.bop.view import ANNOTATIONS, ViewSettings, annotation_block, make_keypoints, make_rle, to_json
 from synpick_warp.exporters.writing.files import PARTIAL, output_error, sync_folder, write_synced
 from synpick_warp.exporters.writing.folder import open_folder
+from synpick_warp.exporters.writing.rle import Runs
 from synpick_warp.inputs.files import read_file
 from synpick_warp.inputs.json import MAX_JSON, decode_json, read_json
 from synpick_warp.inputs.paths import path_inside
@@ -75,7 +77,7 @@ def write_view(view: EncodedView, scene: Path, settings: ViewSettings) -> None:
 
 
 def _make_annotations(view: EncodedView, settings: ViewSettings) -> Iterator[dict[str, Any]]:
-    """Annotations of a view's visible instances, without ids: box of the visible mask, its run lengths, extras of ours, keypoints.
+    """Annotations of a view's visible instances, without ids: box of the visible mask, its segmentation, extras of ours, keypoints.
 
     Widths and heights of both boxes count pixels (+ 1), unlike those of scene_gt_info.json; `bbox_amodal` may exceed the image.
     """
@@ -89,11 +91,16 @@ def _make_annotations(view: EncodedView, settings: ViewSettings) -> Iterator[dic
                 "bbox": [left, top, right - left + 1, bottom - top + 1],
                 "area": mask.visible.count,
                 "iscrowd": 0,
-                "segmentation": make_rle(mask.visible, height, width),
+                "segmentation": _make_polygons(mask.visible) if settings.polygons else make_rle(mask.visible, height, width),
                 "bbox_amodal": [*info["bbox_obj"][:2], *(size + 1 for size in info["bbox_obj"][2:])],
                 "visib_fract": info["visib_fract"],
                 "instance_id": pose["instance_id"],
             } | points
+
+
+def _make_polygons(mask: Runs) -> list[list[float]]:
+    """Polygons of a mask as in COCO, x and y by turns [px]: one for each part."""
+    return [polygon.points.ravel().tolist() for polygon in trace_outlines(mask)]
 
 
 def commit_scenes(scenes: tuple[tuple[Path, int], ...], out: Path, frames: int) -> None:
