@@ -15,8 +15,7 @@ from typing import Any, Protocol, Self
 
 import cv2
 
-from synpick_warp.estimation.decoder import DecodeViews
-from synpick_warp.estimation.decoder_pool import DecoderPool, open_pool
+from synpick_warp.estimation.decoder_pool import DecoderPool, DecodeViews, open_pool
 from synpick_warp.estimation.decoding import DecodeJob
 from synpick_warp.estimation.scenes import Scene
 from synpick_warp.stages.pose.batch import RgbdBatch
@@ -71,7 +70,7 @@ class SceneReader:
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
         self._source.close()
         if self._own_pool is not None:
-            self._own_pool.close()
+            self._own_pool.kill()
 
     def __iter__(self) -> Iterator[RgbdBatch]:
         """Batches of step 0, 1, ...; view v shows the step's frame of scene v, or is zero in all images if that scene has ended.

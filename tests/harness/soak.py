@@ -73,7 +73,7 @@ def make_end(episode: int) -> EpisodeEnd:
 def sample(pool: WriterPool) -> tuple[int, int]:
     """Measure resident memory [B] and number of open files of the bake and its writers."""
     memory = files = 0
-    for process in (os.getpid(), *(worker.process.pid for worker in pool._workers)):
+    for process in (os.getpid(), *pool.pids()):
         memory += int(Path(f"/proc/{process}/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
         files += len(os.listdir(f"/proc/{process}/fd"))
     return memory, files
