@@ -7,17 +7,15 @@ from __future__ import annotations
 
 import mmap
 import os
-from concurrent.futures import Future
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import Any
 
 from synpick_warp.dataset.reading import DataSet
 from synpick_warp.estimation.decoding import DecodeJob
 from synpick_warp.estimation.scenes import Scene, ScenePlan, read_scene
 from synpick_warp.stages.pose.batch import RgbdBatch
-from synpick_warp.system.pool import WorkerPool, WorkerProgram
+from synpick_warp.system.pool import TaskFuture, WorkerPool, WorkerProgram
 from synpick_warp.system.processes import ProcessError
 from synpick_warp.system.shared_memory import allocate_shared_memory
 
@@ -96,7 +94,7 @@ class DecoderPool(WorkerPool):
         """
         super().__init__(WorkerProgram(Decoder, "process that reads images", environment=_ENVIRONMENT), processes)
 
-    def open_job(self, job: DecodeJob) -> tuple[list[RgbdBatch], list[Future[Any]]]:
+    def open_job(self, job: DecodeJob) -> tuple[list[RgbdBatch], list[TaskFuture]]:
         """Open a job in all processes; later tasks refer to it.
 
         Returns:

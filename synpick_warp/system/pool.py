@@ -13,11 +13,10 @@ import sys
 import traceback
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from concurrent.futures import Future
 from dataclasses import dataclass, field
 from multiprocessing.connection import Connection
 from multiprocessing.reduction import recv_handle, send_handle
-from typing import Any, NamedTuple, Self
+from typing import Any, Self
 
 from synpick_warp.errors import SynpickError
 from synpick_warp.system.descriptors import open_standard_descriptors
@@ -51,9 +50,33 @@ class DeadProcessError(ProcessError):
 
     def __init__(self, program: WorkerProgram, worker: WorkerProcess) -> None:
         self.how, self.remedy = worker.describe_end(program.setting)
-        self.task: Future[Any] | None = worker.tasks[0] if worker.tasks else None
+        self.task: TaskFuture | None = worker.tasks[0] if worker.tasks else None
         """Future of the task that it ran; None: it had none."""
         super().__init__(f"a {program.noun} {self.how}; {self.remedy}")
+
+
+@dataclass(eq=False, slots=True)
+class TaskFuture:
+    """Future of a task. It belongs to the thread that uses the pool, so it has no lock, unlike `concurrent.futures.Future`, whose lock
+    costs that thread some 10 us of 50 a task."""
+
+    is_done: bool = False
+    value: Any = None
+    error: Exception | None = None
+
+    def done(self) -> bool:
+        """Whether there is a result, or an error."""
+        return self.is_done
+
+    def set(self, value: Any, error: Exception | None) -> None:
+        """Set the result or the error."""
+        self.value, self.error, self.is_done = value, error, True
+
+    def result(self) -> Any:
+        """The result of a task that is done; raises its error."""
+        if self.error is not None:
+            raise self.error
+        return self.value
 
 
 class TaskError(RuntimeError):
@@ -108,35 +131,37 @@ class WorkerPool:
 
     def load(self) -> int:
         """Number of unanswered tasks of the least busy process."""
-        return min((len(worker.tasks) for worker in self._workers), default=0)
+        return min(map(_load, self._workers), default=0)
 
-    def submit(self, task: Callable[[Any], Any], affinity: int = 0) -> Future[Any]:
+    def submit(self, task: Callable[[Any], Any], affinity: int = 0, *, drain: bool = True) -> TaskFuture:
         """Send a task to the process with the fewest unanswered tasks; the future is set by later calls of `receive`, `wait` and `submit`.
 
         Args:
             task: The task; see `WorkerProgram`.
             affinity: Among several such processes, equal numbers choose the same.
+            drain: Receive available results first, so that a process that waits for its answer to be read takes the task. Needless if
+                the caller bounds the unanswered tasks, and both tasks and results are small.
 
         Raises:
             DeadProcessError: A process died.
         """
-        future: Future[Any] = Future()
+        future: TaskFuture = TaskFuture()
         if self._runs_here:
             try:
-                future.set_result(task(self._state))
+                future.set(task(self._state), None)
             except Exception as error:
-                future.set_exception(error)
+                future.set(None, error)
             return future
-        # Answers are taken first, so that a process that waits for its answer to be read takes the message.
-        self.receive(0.0)
-        count = len(self._workers)
-        worker = self._workers[min(range(count), key=lambda index: (len(self._workers[index].tasks), (index - affinity) % count))]
-        message = pickle.dumps(_Message(task))
+        message = pickle.dumps((task, False))
+        if drain:
+            self.receive(0.0)
+        first = affinity % len(self._workers)
+        worker = min(self._workers[first:] + self._workers[:first] if first else self._workers, key=_load)
         worker.tasks.append(future)
         self._send(worker, message)
         return future
 
-    def broadcast(self, task: Callable[..., Any], handle: int | None = None) -> list[Future[Any]]:
+    def broadcast(self, task: Callable[..., Any], handle: int | None = None) -> list[TaskFuture]:
         """Send a task to every process.
 
         Args:
@@ -148,35 +173,37 @@ class WorkerPool:
         """
         if self._runs_here:
             return [self.submit(task)]
-        message = pickle.dumps(_Message(task, handle is not None))
+        message = pickle.dumps((task, handle is not None))
         futures = []
         for worker in self._workers:
-            futures.append(Future())
+            futures.append(TaskFuture())
             worker.tasks.append(futures[-1])
             self._send(worker, message, handle)
         return futures
 
-    def receive(self, timeout: float | None) -> None:
+    def receive(self, timeout: float | None) -> list[TaskFuture]:
         """Receive available results; a timeout of None blocks until there is one, unless no task is unanswered.
+
+        Returns:
+            The futures that it has set.
 
         Raises:
             DeadProcessError: A process died.
         """
         if timeout is None and not any(worker.tasks for worker in self._workers):
             timeout = 0.0
+        received = []
         for key, _ in self._links.select(timeout):
             worker: WorkerProcess = key.data
             try:
-                answer: _Answer = worker.link.recv()
-            except (EOFError, OSError) as error:
-                raise DeadProcessError(self._program, worker) from error
-            future: Future[Any] = worker.tasks.popleft()
-            if answer.error is None:
-                future.set_result(answer.value)
-            else:
-                future.set_exception(answer.error)
+                value, error = worker.link.recv()
+            except (EOFError, OSError) as end:
+                raise DeadProcessError(self._program, worker) from end
+            received.append(future := worker.tasks.popleft())
+            future.set(value, error)
+        return received
 
-    def wait(self, future: Future[Any]) -> Any:
+    def wait(self, future: TaskFuture) -> Any:
         """Block until a task is done; returns its result.
 
         Raises:
@@ -200,7 +227,7 @@ class WorkerPool:
             Exception: Those of `wait`; other tasks go on.
         """
         limit = ahead * max(1, len(self))
-        pending: deque[Future[Any]] = deque()
+        pending: deque[TaskFuture] = deque()
         for task in tasks:
             pending.append(self.submit(task))
             while pending and (pending[0].done() or len(pending) >= limit or self.load() >= depth):
@@ -250,7 +277,7 @@ def map_ordered(program: WorkerProgram, tasks: Iterable[Callable[[Any], Any]], p
         yield from pool.map_ordered(tasks)
 
 
-def portable_error(error: BaseException) -> Exception:
+def portable_error(error: Exception) -> Exception:
     """Convert an error to one that can be pickled; its traceback becomes a note, for developers.
 
     Errors of users, of the operating system and of memory keep their type; others become a `TaskError` of one line.
@@ -269,21 +296,11 @@ def portable_error(error: BaseException) -> Exception:
     return result
 
 
+def _load(worker: WorkerProcess) -> int:
+    return len(worker.tasks)
+
+
 # ---- in the processes ----
-
-
-class _Message(NamedTuple):
-    """A task, and whether a file handle follows on the link."""
-
-    task: Callable[..., Any]
-    has_handle: bool = False
-
-
-class _Answer(NamedTuple):
-    """Result of a task."""
-
-    value: Any
-    error: Exception | None = None
 
 
 def main() -> None:
@@ -291,16 +308,18 @@ def main() -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     link = Connection(int(sys.argv[1]))
     try:
-        setup = _run(link.recv())
+        state, fault = _run(link.recv())
         while (message := link.recv()) is not None:
-            handles = (recv_handle(link),) if message.has_handle else ()
-            link.send(setup if setup.error else _run(message.task, setup.value, *handles))
+            task, has_handle = message
+            handles = (recv_handle(link),) if has_handle else ()
+            link.send((None, fault) if fault else _run(task, state, *handles))
     except (EOFError, ConnectionError):
         return  # The parent has ended; nobody is left to receive an answer.
 
 
-def _run(task: Callable[..., Any], *arguments: Any) -> _Answer:
+def _run(task: Callable[..., Any], *arguments: Any) -> tuple[Any, Exception | None]:
+    """Result of a task, or its error."""
     try:
-        return _Answer(task(*arguments))
+        return task(*arguments), None
     except Exception as error:
-        return _Answer(None, portable_error(error))
+        return None, portable_error(error)

@@ -17,7 +17,7 @@ import numpy as np
 
 from synpick_warp.errors import DatasetError, OutputError, SynpickError
 from synpick_warp.exporters.writing.files import output_error
-from synpick_warp.system.pool import DeadProcessError, TaskError, WorkerPool, WorkerProgram, portable_error
+from synpick_warp.system.pool import DeadProcessError, TaskError, TaskFuture, WorkerPool, WorkerProgram, portable_error
 from synpick_warp.system.processes import ProcessError
 from synpick_warp.system.shared_memory import SharedArray, SharedSlots
 
@@ -87,8 +87,8 @@ class WriterPool:
             OutputError: Memory or processes cannot be allocated.
         """
         self._waiting: deque[_QueuedTask] = deque()
-        self._running: dict[Future[Any], _QueuedTask] = {}
-        self._answered: deque[Future[Any]] = deque()
+        self._running: dict[TaskFuture, _QueuedTask] = {}
+        self._answered: deque[TaskFuture] = deque()
         self._failure: SynpickError | None = None
         self._ended = False
         self._finishing = False
@@ -203,7 +203,7 @@ class WriterPool:
             self._dispatch(blocking=timeout is None)
             if self._finishing:
                 return  # A call of `on_done`: the outer call goes on with the results.
-            self._pool.receive(0.0 if self._answered else timeout)
+            self._answered += self._pool.receive(0.0 if self._answered else timeout)
             self._finish_answered()
             self._dispatch(blocking=False)
         except DeadProcessError as death:
@@ -220,9 +220,10 @@ class WriterPool:
             if self._pool.load() >= QUEUE_DEPTH or not (blocking or copying is None or copying.done()):
                 return
             _await_copy(self._waiting[0])
-            future = self._pool.submit(self._waiting[0].call)
+            future = self._pool.submit(self._waiting[0].call, drain=False)
             self._running[future] = self._waiting.popleft()
-            future.add_done_callback(self._answered.append)
+            if future.done():  # A task of the calling process.
+                self._answered.append(future)
 
     def _finish_answered(self) -> None:
         self._finishing = True
@@ -230,8 +231,8 @@ class WriterPool:
             while self._answered:
                 future = self._answered.popleft()
                 queued = self._running.pop(future)
-                if (error := future.exception()) is not None:
-                    self._failure = _to_error(error, queued.path)
+                if future.error is not None:
+                    self._failure = _to_error(future.error, queued.path)
                     raise self._failure
                 if queued.slot is not None:
                     self._slots.free.append(queued.slot)
@@ -253,7 +254,7 @@ def _open_slots(handle: int, niceness: int) -> mmap.mmap:
     return mmap.mmap(handle, 0)
 
 
-def _to_error(error: BaseException, path: Path) -> SynpickError:
+def _to_error(error: Exception, path: Path) -> SynpickError:
     """Error of the pool for that of a task."""
     error = portable_error(error)
     if isinstance(error, DatasetError):
