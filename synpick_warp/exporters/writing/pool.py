@@ -101,7 +101,7 @@ class WriterPool:
         setup = partial(_open_slots, handle, NICENESS if processes else 0)
         try:
             self._pool = WorkerPool(WorkerProgram(setup, "writer process", "bake.writers", (handle,), inherited_handles), processes)
-        except ProcessError as error:
+        except (ProcessError, OSError) as error:
             self._slots.close()
             raise OutputError(str(error)) from error
         finally:
