@@ -280,6 +280,7 @@ def _run(arguments: list[str]) -> int:
     except StreamError:
         return EXIT_MISTAKE
     except (SynpickError, cyclopts.CycloptsError) as error:
+        print(*getattr(error, "__notes__", ()), sep="", end="", file=sys.stderr)  # The traceback of a fault of ours, see `TaskError`.
         print(f"{NAME}: error: {one_line(str(error))}", file=sys.stderr)
         return EXIT_MISTAKE
     except KeyboardInterrupt:

@@ -80,7 +80,7 @@ class TaskFuture:
 
 
 class TaskError(RuntimeError):
-    """Unexpected error of a task in another process: its type and text in one line."""
+    """Unexpected error of a task, a fault of ours: its type and text in one line, and its traceback as a note."""
 
 
 class WorkerPool:
@@ -278,21 +278,23 @@ def map_ordered(program: WorkerProgram, tasks: Iterable[Callable[[Any], Any]], p
 
 
 def portable_error(error: Exception) -> Exception:
-    """Convert an error to one that can be pickled; its traceback becomes a note, for developers.
+    """Convert an error to one that can be pickled.
 
-    Errors of users, of the operating system and of memory keep their type; others become a `TaskError` of one line.
+    Errors of users, of the operating system, of memory and of imports keep their type; others become a `TaskError` of one line. The
+    traceback of all but the first, which are about data, becomes a note: the caller's traceback ends where it waits for the task.
     """
     if isinstance(error, SynpickError | TaskError):
-        result = error
-    elif isinstance(error, OSError):
+        return error
+    if isinstance(error, OSError):
         name = (str(error.filename),) if error.filename else ()
         result = OSError(error.errno or 0, error.strerror or str(error), *name)
     elif isinstance(error, MemoryError):
         result = MemoryError(str(error))
+    elif isinstance(error, ImportError):
+        result = ImportError(str(error))
     else:
         result = TaskError(f"{type(error).__name__}: {' '.join(str(error).split())}")
-    if not hasattr(result, "__notes__"):
-        result.add_note("".join(traceback.format_exception(error)))
+    result.add_note("".join(traceback.format_exception(error)))
     return result
 
 

@@ -255,17 +255,17 @@ def _open_slots(handle: int, niceness: int) -> mmap.mmap:
 
 
 def _to_error(error: Exception, path: Path) -> SynpickError:
-    """Error of the pool for that of a task."""
+    """Error of the pool for that of a task; a fault of ours keeps its traceback as a note, which the command line shows."""
     error = portable_error(error)
     if isinstance(error, DatasetError):
         return error
     if isinstance(error, OSError):
-        result = output_error(path, error)
-    else:
-        kind = "" if isinstance(error, SynpickError | TaskError) else f"{type(error).__name__}: "
-        result = OutputError(f"cannot write {path}: {kind}{error}")
-    for note in getattr(error, "__notes__", ()):
-        result.add_note(note)
+        return output_error(path, error)
+    kind = "" if isinstance(error, SynpickError | TaskError) else f"{type(error).__name__}: "
+    result = OutputError(f"cannot write {path}: {kind}{error}")
+    if isinstance(error, TaskError):
+        for note in error.__notes__:
+            result.add_note(note)
     return result
 
 
