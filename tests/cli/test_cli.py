@@ -176,7 +176,10 @@ def test_splits_are_passed_on(bakes, tmp_path):
 @pytest.mark.parametrize(
     ("option", "said"),
     [
-        ("--formats=bop,obj", 'bake.formats is ["bop", "obj"] on the command line; allowed: any of bop, shards, usd, zarr, lerobot, coco, yolo'),
+        (
+            "--formats=bop,obj",
+            'bake.formats is ["bop", "obj"] on the command line; allowed: any of bop, shards, usd, zarr, lerobot, coco, yolo',
+        ),
         ("--shard=3", '--shard is "3"; allowed: i/n with i from 0 to n - 1, such as 0/4'),
         ("--shard=4/4", "--shard is 4/4; allowed: i/n with i from 0 to n - 1, such as 0/4"),
         ("--shard=4/8", "--shard 4/8 has none of 4 episodes; use fewer shards"),
