@@ -56,7 +56,7 @@ def load_catalog(config: Config, cache_dir: Path | None = None, report: Callable
         CatalogError: The folder cannot be used, or none of its objects: a file is damaged, an object does not fit into the tote or has an
             invalid mass.
     """
-    faults = _Faults(config, report)
+    faults = _Faults(config.objects.strict, config.bake.models, report)
     raws = _read_folder(config, report, faults) if config.bake.models else procedural_objects()
     recipes = [shape_recipe(raw, config.objects) for raw in raws]
     names, meshes = [raw.name for raw in raws], [raw.mesh for raw in raws]
@@ -67,7 +67,7 @@ def load_catalog(config: Config, cache_dir: Path | None = None, report: Callable
         if isinstance(shape, CatalogError):
             faults.add(shape)
         else:
-            entries.append(_entry(raw, shape, _checked_mass(raw, config)))
+            entries.append(_entry(raw, shape, _checked_mass(raw, config.objects.density)))
     if not entries:
         raise faults.summary()
     faults.tell()
@@ -78,13 +78,13 @@ def load_catalog(config: Config, cache_dir: Path | None = None, report: Callable
 class _Faults:
     """Objects that cannot be used: with `objects.strict`, or if there is no other object, the first one is an error."""
 
-    def __init__(self, config: Config, report: Callable[[str], None]) -> None:
-        self._config, self._report = config, report
+    def __init__(self, strict: bool, folder: str, report: Callable[[str], None]) -> None:
+        self._strict, self._folder, self._report = strict, folder, report
         self._errors: list[CatalogError] = []
 
     def add(self, error: CatalogError) -> None:
         """Take the error of an object; raises it if settings are strict."""
-        if self._config.objects.strict:
+        if self._strict:
             raise error
         self._errors.append(error)
 
@@ -97,8 +97,8 @@ class _Faults:
         """The error of a folder of which no object can be used."""
         if len(self._errors) == 1:
             return self._errors[0]
-        count, folder = len(self._errors), self._config.bake.models
-        return CatalogError(f"models folder {folder}: none of its {count} objects can be used; the first: {self._errors[0]}")
+        count = len(self._errors)
+        return CatalogError(f"models folder {self._folder}: none of its {count} objects can be used; the first: {self._errors[0]}")
 
 
 def _read_folder(config: Config, report: Callable[[str], None], faults: _Faults) -> list[RawObject]:
@@ -151,7 +151,7 @@ def _read_model(model: ModelFile, info: ModelInfo, config: Config) -> tuple[RawO
     if model.is_bop and not scope.moved:  # A copy of the file could not name its texture as it does.
         raw = replace(raw, source=model.path)
     _check_size(raw, str(model.path if model.is_bop else raw.name), config.tote)
-    _checked_mass(raw, config)
+    _checked_mass(raw, config.objects.density)
     return raw, [*scope.moved[:1], *lines]
 
 
@@ -241,10 +241,10 @@ def _by(sides: list[float]) -> str:
     return " x ".join(f"{side:.3g}" for side in sides)
 
 
-def _checked_mass(raw: RawObject, config: Config) -> float:
+def _checked_mass(raw: RawObject, density: float) -> float:
     """Mass [kg]: the object's own, or density times hull volume."""
     origin = raw.source or raw.name
-    mass = config.objects.density * raw.hull.volume if raw.mass is None else raw.mass
+    mass = density * raw.hull.volume if raw.mass is None else raw.mass
     if not _MASS_RANGE[0] <= mass <= _MASS_RANGE[1]:
         source = "by objects.density" if raw.mass is None else "in its row of the object table"
         raise CatalogError(f"{origin}: mass {mass:g} kg {source}; allowed: {_MASS_RANGE[0]:g} to {_MASS_RANGE[1]:g} kg")

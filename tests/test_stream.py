@@ -392,7 +392,7 @@ def test_files_and_lists_stand_for_images(device):
 )
 def test_what_is_copied_to_the_host(cuda, needs_images, settings_, expected):
     config = settings(**({"cameras__resolution": [640, 360]} | settings_))
-    assert host_copies.host_images(config, SimpleNamespace(is_cuda=cuda), needs_images, True) == expected  # type: ignore[arg-type]
+    assert host_copies.host_images(config.bop, config.cameras.resolution[1], SimpleNamespace(is_cuda=cuda), needs_images, True) == expected  # type: ignore[arg-type]
 
 
 def test_the_largest_lists_are_no_larger_than_images():

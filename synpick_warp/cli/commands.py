@@ -36,7 +36,7 @@ from synpick_warp.cli.verify import verify
 from synpick_warp.configs.check import describe_allowed
 from synpick_warp.configs.load import COMMAND_LINE, DEFAULT_PRESET, load_config, parse_assignment, preset_names, sections, settings_of
 from synpick_warp.configs.schema import Config
-from synpick_warp.configs.splits import plan_shard
+from synpick_warp.configs.splits import DataLayout
 from synpick_warp.configs.write import config_to_toml
 from synpick_warp.errors import CatalogError, ConfigError, LightError, SynpickError
 from synpick_warp.system.garbage import collection_paused
@@ -159,7 +159,7 @@ def bake(
     names = parse_splits(split)
     resolved = _resolve(config, given, resolution, set_, splits=split is not None)
     part = parse_shard(shard) if shard is not None else (0, 1)
-    plan_shard(resolved, names, part, "--shard")
+    DataLayout.of(resolved).plan_shard(names, part, "--shard")
     if out is None:
         out, choice = choose_output(resolved)
         print(choice, flush=True)

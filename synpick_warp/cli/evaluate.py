@@ -15,7 +15,7 @@ from synpick_warp.cli.folders import check_output_file, find_data_set, has_image
 from synpick_warp.cli.options import WholeNumber, check_range
 from synpick_warp.configs.check import escape, format_value
 from synpick_warp.configs.schema import MULTISENSOR
-from synpick_warp.configs.splits import bop_folders, split_kind
+from synpick_warp.configs.splits import DataLayout, split_kind
 from synpick_warp.errors import ConfigError, DatasetError, OutputError
 
 if TYPE_CHECKING:
@@ -311,7 +311,7 @@ def toolkit_name(data_set: DataSet) -> str:
 
 def toolkit_ending(data_set: DataSet) -> str:
     """Data set and split as in the names of BOP result files, such as "synpickdata-train-pbr"."""
-    folders = bop_folders(data_set.config)
+    folders = DataLayout.of(data_set.config).folders
     split, _, kind = next((name for name in folders if split_kind(name) == "test"), folders[0]).partition("_")
     return f"{toolkit_name(data_set)}-{split}{f'-{kind}' if kind else ''}"
 

@@ -51,7 +51,7 @@ def convert(folder: Path, out: Path, formats: Sequence[str], processes: int, rep
     """
     source = Source(folder)
     check_formats(formats, source.config, folder)
-    contents: set[Content] = {content for name in formats for content in contents_of(name, source.config)}
+    contents: set[Content] = {content for name in formats for content in contents_of(name, source.config.bop)}
     source.check_contents(contents)
     _check_apart(folder, out)
     config = dataclasses.replace(source.config, bake=dataclasses.replace(source.config.bake, formats=tuple(formats)))

@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from synpick_warp.configs.check import format_value
-from synpick_warp.configs.splits import episode_range, plan_episodes
+from synpick_warp.configs.splits import DataLayout, episode_range
 from synpick_warp.dataset.annotations import ADVICE, EpisodeEntry, EpisodeRow, Key, ModelInfo, check_content, read_checked
 from synpick_warp.dataset.frame_counts import check_frames
 from synpick_warp.dataset.manifest import CONFIG_FILE, CONSTANTS, ENTRIES, MANIFEST_FILE, episode_entry, read_checksums
@@ -101,7 +101,7 @@ class Episode:
         row = self.attributes if self._record is None else self._record["row"]
         frames = check_content(row, EpisodeRow, self.group / GROUP_FILE).frames
         data = self._data_set
-        check_frames(data.folder, data.config if (data.folder / CONFIG_FILE).exists() else None, self.index, frames)
+        check_frames(data.folder, DataLayout.of(data.config) if (data.folder / CONFIG_FILE).exists() else None, self.index, frames)
         return row
 
     @cached_property
@@ -332,7 +332,7 @@ class DataSet(Mapping[int, Episode]):
     @cached_property
     def planned(self) -> int:
         """Number of episodes that the settings plan."""
-        return sum(len(each) for each in plan_episodes(self.config) if self._only in (None, each))
+        return sum(len(each) for each in DataLayout.of(self.config).plan() if self._only in (None, each))
 
     @cached_property
     def _scenes(self) -> SceneIndex | None:

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from synpick_warp.configs.schema import Config
+from synpick_warp.configs.splits import DataLayout
 from synpick_warp.dataset.file_names import check_file_names
 from synpick_warp.dataset.frame_counts import check_frames, check_listed_frames
 from synpick_warp.dataset.manifest import (
@@ -155,7 +156,7 @@ def check_part(folder: Path, task: CheckPart, read: Callable[[Path, Path], dict[
     try:
         known = read(folder, task.entry)
         if task.part == 0 and task.entry != INDICES:
-            check_file_names(folder, task.entry, known, _read_config(folder))
+            check_file_names(folder, task.entry, known, DataLayout.of(_read_config(folder)))
     except (ConfigError, DatasetError) as error:
         return Checked(0, str(error))
     first, end = (len(known) * (task.part + step) // task.parts for step in (0, 1))
@@ -171,9 +172,9 @@ def _check_counts(folder: Path, entry: Path, known: Mapping[str, str]) -> str:
     if entry in (CONSTANTS, INDICES):
         return ""
     try:
-        config, row = _read_config(folder), (read_entry(folder, entry) or {})["row"]
-        check_listed_frames(folder, config, row, known)
-        check_frames(folder, config, row["episode"], row["frames"])
+        layout, row = DataLayout.of(_read_config(folder)), (read_entry(folder, entry) or {})["row"]
+        check_listed_frames(folder, layout, row, known)
+        check_frames(folder, layout, row["episode"], row["frames"])
     except DatasetError as error:
         return str(error)
     return ""

@@ -20,6 +20,7 @@ import warp as wp
 
 from synpick_warp.codes import Phase
 from synpick_warp.configs.schema import Config
+from synpick_warp.configs.splits import DataLayout
 from synpick_warp.episodes import BakeSummary, episode_row, is_resampled, remedy
 from synpick_warp.errors import ConfigError
 from synpick_warp.factory.assembly import Stages, build_stages, compiling_if_cold
@@ -160,10 +161,11 @@ class Producer:
     def _end_episodes(self, report: TickReport) -> None:
         """Add the episodes that ended in a tick to the summary."""
         config, records = self.stages.config, self.log.update(report)
+        layout = DataLayout.of(config)
         for world in np.flatnonzero(report.column("phase") == Phase.OVER).tolist():
             record = records[int(report.column("episode")[world])]
-            row = episode_row(config, report, world, record)
-            if is_resampled(config, row):
+            row = episode_row(layout, self.stages.tick_time, report, world, record)
+            if is_resampled(row, config.settle.tries):
                 self.summary.take_resample(row.ending)
                 self.progress.note(f"episode {row.episode}, arrangement {row.arrangement + 1}: {row.ending.sentence}")
             else:
@@ -186,7 +188,7 @@ def open_stream(
     if not indices:
         raise ConfigError(f"shard {shard[0]}/{shard[1]} has no episode; give more episodes, or fewer parts")
     device = pick_device(config.bake.device)
-    check_episodes(len(indices), config)
+    check_episodes(len(indices), config.bake.episodes)
     selection = selection.resolve(config)
     if selection.stride > 1:
         # A history holds the frame before, which is not rendered.

@@ -12,7 +12,7 @@ from collections.abc import Sequence
 import warp as wp
 
 from synpick_warp.configs.schema import Config
-from synpick_warp.exporters.registry import load_exporter_classes, slot_bytes
+from synpick_warp.exporters.registry import Needs
 from synpick_warp.exporters.writing.pool import QUEUE_DEPTH
 from synpick_warp.memory_plan import Term, free_memory, plan_memory
 from synpick_warp.stages.perception.images import count_views
@@ -36,7 +36,7 @@ _OPEN_SIZES = ("render.views_per_batch", "perception.views", "bake.worlds")
 
 def without_pictures(config: Config) -> Config:
     """Settings for a bake whose formats need no views: image buffers of one view a batch, no light histories; others are unchanged."""
-    if any(kind.needs_views for kind in load_exporter_classes(config.bake.formats)):
+    if Needs.of(config).views:
         return config
     return dataclasses.replace(config, render=dataclasses.replace(config.render, views_per_batch=1, history=0))
 
@@ -70,7 +70,7 @@ def count_writers(config: Config) -> int:
     """Writer processes of a bake: `bake.writers`, or one per usable CPU core, as far as the host's free memory has room for them."""
     if config.bake.writers:
         return config.bake.writers
-    each = WRITER_BYTES + QUEUE_DEPTH * slot_bytes(load_exporter_classes(config.bake.formats), config)
+    each = WRITER_BYTES + QUEUE_DEPTH * Needs.of(config).slot_bytes
     room = int(WRITERS_FRACTION * free_memory(None)) // each
     return max(1, min(count_cores(), room))
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, fields
 
 import numpy as np
 
-from synpick_warp.configs.splits import split_of
+from synpick_warp.configs.splits import DataLayout
 from synpick_warp.dataset.annotations import check_content
 from synpick_warp.dataset.manifest import episode_entry
 from synpick_warp.dataset.reading import DataSet
@@ -96,5 +96,5 @@ class Partial:
 
 def group_of(data_set: DataSet, episode: int, row: EpisodeFacts) -> Group:
     """Split and mode of an episode."""
-    split = split_of(data_set.config, episode)
+    split = DataLayout.of(data_set.config).split_of(episode)
     return Group(data_set.config.bop.split if split is None else split.name, row.mode)

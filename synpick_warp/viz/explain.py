@@ -15,7 +15,7 @@ import numpy as np
 from synpick_warp.codecs.charts import Spec, render_charts
 from synpick_warp.configs.load import load_config
 from synpick_warp.configs.schema import Config
-from synpick_warp.configs.splits import bop_folder, bop_scene
+from synpick_warp.configs.splits import DataLayout
 from synpick_warp.dataset.annotations import SCENE_SCHEMAS, read_checked
 from synpick_warp.dataset.object_names import object_names
 from synpick_warp.dataset.view_files import read_image
@@ -99,8 +99,9 @@ def write_explanation(dataset: Path, out: Path, episode: int | None, attempt: in
 
 
 def _read_scene(dataset: Path, config: Config, attempt: Attempt) -> _Scene:
-    split = path_inside(dataset, bop_folder(config, attempt.episode), dataset / "config.toml", DatasetError)
-    index, suffix = bop_scene(config, attempt.episode, 0)
+    layout = DataLayout.of(config)
+    split = path_inside(dataset, layout.folder(attempt.episode), dataset / "config.toml", DatasetError)
+    index, suffix = layout.scene(attempt.episode, 0)
     scene = split / f"{index:06d}"
     stem = f"{attempt.frame:06d}"
     truth = read_checked(scene / f"scene_gt{suffix}.json", SCENE_SCHEMAS["gt"]).get(attempt.frame)

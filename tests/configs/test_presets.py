@@ -42,7 +42,7 @@ def test_the_test_preset_differs_from_the_paper_in_exactly_this():
     test = load_config("synpick-test")
     assert test.object_rows == load_config("synpick").object_rows
     assert len(test.cameras.positions) == 3
-    assert len(set(mode_weights(test).values())) == 1
+    assert len(set(mode_weights(test.bake).values())) == 1
 
 
 def test_the_hard_preset_is_the_test_preset_with_fuller_faster_shinier_totes():

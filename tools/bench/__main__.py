@@ -29,7 +29,7 @@ from synpick_warp.cli.doctor import GIB, describe_machine
 from synpick_warp.codes import Status
 from synpick_warp.configs.schema import Config
 from synpick_warp.errors import SynpickError
-from synpick_warp.exporters.registry import load_exporter_classes
+from synpick_warp.exporters.registry import Needs
 from synpick_warp.factory.assembly import Factory, build_factory
 from synpick_warp.progress import SilentProgress
 from synpick_warp.stages import timing
@@ -176,12 +176,12 @@ def measure(
     """
     if set(parts) - OWN_WORLDS:
         started = time.perf_counter()
-        kinds = load_exporter_classes(config.bake.formats)
+        needs = Needs.of(config)
         factory = build_factory(
             config,
             SilentProgress(),
-            records_physics="write" in parts and any(kind.needs_physics for kind in kinds),
-            needs_images=any(kind.needs_images for kind in kinds),
+            records_physics="write" in parts and needs.physics,
+            needs_images=needs.images,
         )
         wp.synchronize_device(factory.simulation.device)
         yield Row("load and build", time.perf_counter() - started, "s", part="setup")

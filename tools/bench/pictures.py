@@ -20,7 +20,7 @@ import warp as wp
 
 from synpick_warp.codes import Phase
 from synpick_warp.configs.schema import Config
-from synpick_warp.exporters.registry import load_exporter_classes
+from synpick_warp.exporters.registry import Needs
 from synpick_warp.factory.assembly import Factory, build_factory, make_renderer
 from synpick_warp.kernels.render.lighting.history import MAX_PERIOD_BITS
 from synpick_warp.progress import SilentProgress
@@ -87,8 +87,8 @@ def measure_pictures(config: Config, after: int = 0) -> Iterator[Row]:
     """
     started = time.perf_counter()
     config = plan_spare_episodes(config)
-    kinds = load_exporter_classes(config.bake.formats)
-    factory = build_factory(config, SilentProgress(), needs_images=any(kind.needs_images for kind in kinds))
+    needs = Needs.of(config)
+    factory = build_factory(config, SilentProgress(), needs_images=needs.images)
     stream, device = factory.stream, factory.simulation.device
     simulate_until_live(factory)
     for _ in range(after):

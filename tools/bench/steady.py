@@ -13,6 +13,7 @@ from pathlib import Path
 
 from synpick_warp.configs.fields import INT32_MAX
 from synpick_warp.configs.schema import Config
+from synpick_warp.configs.splits import DataLayout
 from synpick_warp.errors import DatasetError
 from synpick_warp.exporters.registry import load_exporter_classes, shared_files
 from synpick_warp.pipeline import run_bake
@@ -39,7 +40,7 @@ def clean_up_behind(config: Config, out: Path, suffixes: tuple[str, ...] = ()) -
     Raises:
         DatasetError: An episode was damaged.
     """
-    folders = tuple(map(str, shared_files(load_exporter_classes(config.bake.formats), config).folders))
+    folders = tuple(map(str, shared_files(load_exporter_classes(config.bake.formats), DataLayout.of(config)).folders))
     with Cleaner(Assignment(out, folders, suffixes)) as cleaner:
         yield cleaner
         tally = cleaner.poll()

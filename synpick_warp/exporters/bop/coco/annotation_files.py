@@ -8,14 +8,15 @@ from __future__ import annotations
 import json
 import os
 import shutil
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import msgspec
 
 from synpick_warp.configs.schema import Config
-from synpick_warp.configs.splits import bop_folder, bop_folders
+from synpick_warp.configs.splits import DataLayout
 from synpick_warp.errors import DatasetError
 from synpick_warp.exporters.base import EncodedView
 from synpick_warp.exporters.bop.keypoints import Keypoints, make_category_keys
@@ -131,17 +132,21 @@ def write_annotation_files(out: Path, config: Config, episodes: Iterable[int]) -
         DatasetError: A part is damaged.
         OSError: A file cannot be written.
     """
-    parts: dict[str, list[Path]] = {split: [] for split in bop_folders(config)}
-    cameras = len(config.cameras.positions)
+    layout = DataLayout.of(config)
+    parts: dict[str, list[Path]] = {split: [] for split in layout.folders}
+    cameras = layout.cameras
     for episode in episodes:
         names = (out / PARTS / f"{scene:06d}.jsonl" for scene in range(cameras * episode, cameras * (episode + 1)))
-        parts[bop_folder(config, episode)] += filter(os.path.lexists, names)
+        parts[layout.folder(episode)] += filter(os.path.lexists, names)
     categories = read_json(path_inside(out, str(CATEGORIES), out, DatasetError), list[_Category], DatasetError, _ADVICE)
-    return [_write_annotations(out, config, split, found, categories) for split, found in parts.items()]
+    describe = partial(_describe_image, cameras, config.cameras.resolution, config.bop.color_format)
+    return [_write_annotations(out, describe, split, found, categories) for split, found in parts.items()]
 
 
-def _write_annotations(out: Path, config: Config, split: str, parts: list[Path], categories: list[_Category]) -> Path:
-    """Join parts to the annotation file of a split; returns its name."""
+def _write_annotations(
+    out: Path, describe: Callable[[int, int], dict[str, Any]], split: str, parts: list[Path], categories: list[_Category]
+) -> Path:
+    """Join parts to the annotation file of a split; returns its name. `describe`: entry of the image of a scene and frame."""
     place = annotation_file(split)
     folder = out / PARTIAL / "coco-index"
     shutil.rmtree(folder, ignore_errors=True)
@@ -151,7 +156,7 @@ def _write_annotations(out: Path, config: Config, split: str, parts: list[Path],
         for part in parts:
             for frame, found in enumerate(_read_part(part, out)):
                 images += 1
-                row = {"id": images, **_describe_image(config, int(part.stem), frame)}
+                row = {"id": images, **describe(int(part.stem), frame)}
                 image_file.write((",\n" if images > 1 else "") + json.dumps(row))
                 for annotation in found:
                     annotations += 1
@@ -180,8 +185,8 @@ def _read_part(part: Path, out: Path) -> Iterator[list[dict[str, Any]]]:
         yield decode_json(line, list[dict[str, Any]], f"{part}, line {number},", DatasetError, _ADVICE)
 
 
-def _describe_image(config: Config, scene: int, frame: int) -> dict[str, Any]:
-    width, height = config.cameras.resolution
-    episode, camera = divmod(scene, len(config.cameras.positions))
-    name = f"{scene:06d}/{frame:06d}.{config.bop.color_format}"
+def _describe_image(cameras: int, resolution: tuple[int, int], color_format: str, scene: int, frame: int) -> dict[str, Any]:
+    width, height = resolution
+    episode, camera = divmod(scene, cameras)
+    name = f"{scene:06d}/{frame:06d}.{color_format}"
     return {"file_name": name, "width": width, "height": height, "episode": episode, "camera": camera, "frame": frame}
