@@ -6,7 +6,9 @@ The defaults are the paper's values (preset `synpick`); where the paper names no
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any
 
 from synpick_warp.codes import Tone, names
 from synpick_warp.configs.fields import INT32_MAX, setting
@@ -463,3 +465,16 @@ class Config:
     object_rows: tuple[ObjectRow, ...] = ()
     splits: tuple[Split, ...] = ()
     """Resolved splits, by first episode; empty: one split, bop.split, of bake.episodes episodes."""
+
+    def value(self, key: str) -> Any:
+        """Value of a setting by its full key, such as "physics.step"."""
+        section, _, name = key.partition(".")
+        return getattr(getattr(self, section), name)
+
+    def with_values(self, values: Mapping[str, object]) -> Config:
+        """Copy with other values of settings, by full key. They are not validated; see `load.override_config`."""
+        parts: dict[str, Any] = {}
+        for key, value in values.items():
+            section, _, name = key.partition(".")
+            parts[section] = replace(parts.get(section, getattr(self, section)), **{name: value})
+        return replace(self, **parts)

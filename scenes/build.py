@@ -214,7 +214,7 @@ def with_repeats(config: Config, catalog: Catalog) -> Config:
     volumes = [entry.volume for entry in catalog.entries if entry.volume <= budget]
     if not config.arrangement.repeat_to_fill or sum(volumes) >= budget or len(volumes) >= config.arrangement.max_objects:
         return config
-    return replace(config, pick=replace(config.pick, repeats=True), move=replace(config.move, repeats=True))
+    return config.with_values({"pick.repeats": True, "move.repeats": True})
 
 
 def with_capacities(config: Config, catalog: Catalog) -> Config:

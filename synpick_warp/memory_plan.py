@@ -18,7 +18,7 @@ from synpick_warp.arrays import memory_table
 from synpick_warp.configs.check import format_value
 from synpick_warp.configs.fields import INT32_MAX
 from synpick_warp.configs.modes import may_pick
-from synpick_warp.configs.schema import REFERENCE, Config, Perception, Physics
+from synpick_warp.configs.schema import REFERENCE, Config, Perception, Physics, Trajectory
 from synpick_warp.errors import ConfigError, SynpickError
 from synpick_warp.exporters.registry import Needs
 from synpick_warp.scenes import build
@@ -111,7 +111,7 @@ def plan_memory(config: Config, device: wp.Device, writers: int = 1) -> list[Ter
     terms = _declared(config, needs, device, host)
     if not device.is_cuda:
         terms = [Term(term.name, term.rows, term.settings, False, term.indexed) for term in terms]
-    terms.append(_queued_reports(queue_slots(config, device), _world_sizes(config), _physics_kinds(config, needs)))
+    terms.append(_queued_reports(queue_slots(config, device), _world_sizes(config), _physics_kinds(config.trajectory, needs)))
     terms += _newton(config.physics, config.bake.worlds, device)
     if host is not None and device.is_cuda:
         terms.append(_pinned(view_sizes(config, device), config.render.layers, config.cameras.resolution, host))
@@ -124,7 +124,7 @@ def plan_memory(config: Config, device: wp.Device, writers: int = 1) -> list[Ter
 
 def _declared(config: Config, needs: Needs, device: wp.Device, host: HostImages | None) -> list[Term]:
     """Terms of all device arrays that a bake declares; `host`: what is copied to the host, None: nothing is written."""
-    sizes, recorded = _world_sizes(config), _physics_kinds(config, needs)
+    sizes, recorded = _world_sizes(config), _physics_kinds(config.trajectory, needs)
     slots = queue_slots(config, device)
     terms = [*_simulation(config.bake.worlds, sizes, recorded), _queue(slots, sizes), *_images(config, device, host)]
     if may_pick(config.bake, config.splits):
@@ -239,13 +239,14 @@ def _term(name: str, settings: tuple[str, ...], groups: list[tuple[Any, dict[str
 
 def _world_sizes(config: Config) -> dict[str, int]:
     """Extents of the dimensions of state and records."""
-    worlds = world_sizes(config, build.GRIPPER_BODIES + 2 * config.arrangement.max_objects)
+    objects = config.arrangement.max_objects
+    worlds = world_sizes(config.bake.worlds, objects, config.move.rounds, build.GRIPPER_BODIES + 2 * objects)
     return record_sizes(worlds, config.physics.steps_per_tick)
 
 
-def _physics_kinds(config: Config, needs: Needs) -> tuple[type, ...]:
+def _physics_kinds(trajectory: Trajectory, needs: Needs) -> tuple[type, ...]:
     """Declarations of a tick's physics, if a format needs it."""
-    return record_kinds(config.trajectory) if needs.physics else ()
+    return record_kinds(trajectory) if needs.physics else ()
 
 
 def _simulation(worlds: int, sizes: dict[str, int], recorded: tuple[type, ...]) -> Iterator[Term]:
@@ -258,7 +259,7 @@ def _simulation(worlds: int, sizes: dict[str, int], recorded: tuple[type, ...]) 
 
 def queue_slots(config: Config, device: wp.Device) -> int:
     """Ticks in the queue between physics and renderer, as `TickLoop` chooses them."""
-    kinds = (*_RECORD, *_physics_kinds(config, Needs.of(config)))
+    kinds = (*_RECORD, *_physics_kinds(config.trajectory, Needs.of(config)))
     rows = (row for kind in kinds for row in memory_table(kind, _world_sizes(config)))
     return 1 + queue_lead(sum(row[3] for row in rows), device)
 
@@ -358,16 +359,14 @@ def _host_images(config: Config, needs: Needs, device: wp.Device) -> HostImages:
 
 def _advice(term: Term, config: Config) -> str:
     """Advice to lower the setting that exceeds its default by the largest factor, with its value."""
-    key = max(term.settings, key=lambda name: _amount(name, config) / max(1, _amount(name, Config())))
-    section, _, name = key.partition(".")
-    value = getattr(getattr(config, section), name)
+    default = Config()
+    key = max(term.settings, key=lambda name: _amount(config.value(name)) / max(1, _amount(default.value(name))))
+    value = config.value(key)
     return f"lower {key} ({format_value(value) if not _is_list(value) else f'{len(value):,} cameras'})"
 
 
-def _amount(key: str, config: Config) -> int:
-    """Size of a setting: pixels of a resolution, count of cameras, the number itself."""
-    section, _, name = key.partition(".")
-    value = getattr(getattr(config, section), name)
+def _amount(value: Any) -> int:
+    """Size of a setting by its value: pixels of a resolution, count of cameras, the number itself."""
     return len(value) if _is_list(value) else math.prod(value) if isinstance(value, tuple) else value
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -71,7 +70,7 @@ def run_bake(
         SynpickError: An error that the user can correct; committed episodes stay, and the same bake resumes.
     """
     if devices:
-        config = replace(config, bake=replace(config.bake, device=pick_devices(devices)[0]))
+        config = config.with_values({"bake.device": pick_devices(devices)[0]})
     needs = Needs.of(config)
     planned = DataLayout.of(config).plan_shard(splits, shard)
     check_episodes(sum(map(len, planned)), config.bake.episodes)

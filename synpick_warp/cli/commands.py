@@ -225,7 +225,7 @@ def warmup(
     names = None if formats is None else [name.strip() for name in formats.split(",")]
     given = {"bake.mode": mode, "bake.device": device, "bake.models": models, "bake.lights": lights, "bake.formats": names}
     resolved = _resolve(config, given, resolution, set_)
-    _check_inputs(resolved)
+    _check_inputs(resolved.bake.models, resolved.bake.lights)
     from synpick_warp.cli.display import make_console, make_progress
     from synpick_warp.factory.warmup import check_caches, warm_up
 
@@ -336,14 +336,13 @@ def _bake_profiled(config: Config, out: Path, shard: tuple[int, int], splits: Se
     return code
 
 
-def _check_inputs(config: Config) -> None:
+def _check_inputs(models: str, lights: str) -> None:
     """Check that the folders of models and lights exist.
 
     Raises:
         CatalogError: There are no models.
         LightError: There are no lights.
     """
-    models, lights = config.bake.models, config.bake.lights
     if models and not os.path.isdir(models):
         raise CatalogError(f"there is no models folder {models}; --models takes a folder of BOP models or of PLY, OBJ, glTF or STL meshes")
     if lights and not os.path.isdir(lights):
@@ -361,7 +360,7 @@ def _bake(config: Config, out: Path, shard: tuple[int, int], splits: Sequence[st
         pick_devices(devices)
     else:
         pick_device(config.bake.device)
-    _check_inputs(config)
+    _check_inputs(config.bake.models, config.bake.lights)
     check_output_folder(out)
     with collection_paused():
         from synpick_warp.pipeline import run_bake

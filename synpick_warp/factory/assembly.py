@@ -8,7 +8,7 @@ from __future__ import annotations
 import contextlib
 import gc
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import warp as wp
@@ -138,7 +138,7 @@ def compiling_if_cold(
 
 def build_smallest(config: Config, device: wp.Device, progress: Progress, records_physics: bool, needs_images: bool) -> Factory:
     """Build a minimal factory, with as few worlds as the device allows. Other arguments and errors: `build_factory`."""
-    config = replace(config, bake=replace(config.bake, worlds=1), render=replace(config.render, views_per_batch=1))
+    config = config.with_values({"bake.worlds": 1, "render.views_per_batch": 1})
     config = fit_to_device(config, device, 1, count_writers(config))
     return _assemble(config, device, progress, [0], records_physics, needs_images)
 

@@ -11,7 +11,6 @@ from __future__ import annotations
 import gc
 import weakref
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
 from types import TracebackType
 from typing import Self
 
@@ -189,10 +188,10 @@ def open_stream(
         raise ConfigError(f"shard {shard[0]}/{shard[1]} has no episode; give more episodes, or fewer parts")
     device = pick_device(config.bake.device)
     check_episodes(len(indices), config.bake.episodes)
-    selection = selection.resolve(config)
+    selection = selection.resolve(len(config.cameras.positions))
     if selection.stride > 1:
         # A history holds the frame before, which is not rendered.
-        config = replace(config, render=replace(config.render, history=0))
+        config = config.with_values({"render.history": 0})
     config = fit_to_device(config, device, len(indices), DEVICE_ONLY)
     check_memory(config, device, DEVICE_ONLY)
     with explain_shortage(config):

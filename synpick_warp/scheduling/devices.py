@@ -16,7 +16,7 @@ import pickle
 import select
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import partial
 from multiprocessing.connection import wait
 from pathlib import Path
@@ -272,7 +272,7 @@ def bake_on_devices(
         dealt = deal_episodes(order_longest_first(with_repeats(config, catalog), catalog, output.remaining, pick_device("cpu")), len(names))
         writers = deal_writers(count_writers(config), len(names))
         shares = [
-            Share(output.out, replace(config, bake=replace(config.bake, device=name, writers=count)), episodes, len(names))
+            Share(output.out, config.with_values({"bake.device": name, "bake.writers": count}), episodes, len(names))
             for name, episodes, count in zip(names, dealt, writers, strict=True)
         ]
         lost = processes.run(shares, summary, progress)

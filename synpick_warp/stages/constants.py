@@ -142,9 +142,9 @@ def mode_data(rows: Sequence[tuple[int, float, float, int]], device: wp.Device) 
 
 def mode_rows(bake: Bake, splits: Sequence[Split]) -> list[tuple[int, float, float, int]]:
     """Members of `ModeData` of each split, or of the one range without splits."""
-    splits = [(split.first, split.mode) for split in splits] or [(0, bake.mode)]
+    ranges = [(split.first, split.mode) for split in splits] or [(0, bake.mode)]
     rows = []
-    for first, mode in splits:
+    for first, mode in ranges:
         weights = mode_weights(bake, mode)
         pick, target, move = weights["pick"], weights["target"], weights["move"]
         total = pick + target + move

@@ -13,7 +13,7 @@ from __future__ import annotations
 import statistics
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 from typing import Any
 
 import warp as wp
@@ -109,7 +109,7 @@ def measure_pictures(config: Config, after: int = 0) -> Iterator[Row]:
     if history is not None:
         paths = history.paths.numpy()[history.frame.numpy() >= 0]  # NEVER, a negative index: no frame yet.
         yield Row("paths in a history before a pass, mean", float(paths.mean()), "")
-        without = replace(config, render=replace(config.render, history=0))
+        without = config.with_values({"render.history": 0})
         renderers["all stages, render.history=0"] = make_renderer(without, stream.renderer.scene, stream.instances, stream.batch)
     megapixels = 1e-6 * config.cameras.resolution[0] * config.cameras.resolution[1]
     for name, times in _time_passes(stream, renderers, ticks).items():

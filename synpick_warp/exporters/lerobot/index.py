@@ -72,10 +72,10 @@ def write_indices(out: Path, config: Config, episodes: Iterable[int]) -> list[Pa
         DatasetError: A part is damaged.
         OSError: A file cannot be written.
     """
-    cameras, totals = len(config.cameras.positions), _Totals()
+    cameras, rate, totals = len(config.cameras.positions), frame_rate(config.physics), _Totals()
     totals.levels = [np.zeros((3, 256), np.int64) for _ in range(cameras)]
     with pq.ParquetWriter(out / PARTIAL / "data.parquet", _data_schema(), compression="zstd") as writer:
-        for batch in _batch_tables(_read_tables(out, totals, config, episodes)):
+        for batch in _batch_tables(_read_tables(out, totals, config.cameras.resolution, rate, DataLayout.of(config), episodes)):
             writer.write_table(batch)
     _place(out, DATA, lambda path: (out / PARTIAL / "data.parquet").replace(path))
     _place(
@@ -84,9 +84,8 @@ def write_indices(out: Path, config: Config, episodes: Iterable[int]) -> list[Pa
     _place(out, TASKS, lambda path: pq.write_table(_task_table(totals.tasks), path))
     videos = {camera_key(index): describe_levels(levels, totals.frames) for index, levels in enumerate(totals.levels) if levels.any()}
     statistics = {name: to_json(values) for name, values in (totals.statistics | videos).items()}
-    info = make_info(
-        config.cameras, frame_rate(config.physics), [row["source/split"] for row in totals.rows], totals.frames, len(totals.tasks)
-    )
+    splits = [row["source/split"] for row in totals.rows]
+    info = make_info(config.cameras, rate, splits, totals.frames, len(totals.tasks))
     info["features"]["attempt.outcome"]["info"] = {"codes": list(outcome_names())}
     for place, content in ((STATS, statistics), (INFO, info)):
         text = json.dumps(content, indent=2) + "\n"
@@ -107,15 +106,17 @@ def _place(out: Path, name: Path, write: Callable[[Path], object]) -> None:
     sync_folder(place.parent)
 
 
-def _read_tables(out: Path, totals: _Totals, config: Config, episodes: Iterable[int]) -> Iterator[pa.Table]:
+def _read_tables(
+    out: Path, totals: _Totals, resolution: tuple[int, int], rate: float, layout: DataLayout, episodes: Iterable[int]
+) -> Iterator[pa.Table]:
     """Tables of the episodes, in order; adds them to the totals. Those that were given up have no part."""
-    period, layout = 1.0 / frame_rate(config.physics), DataLayout.of(config)
+    period = 1.0 / rate
     for source in (episode for episode in episodes if os.path.lexists(out / part_path(episode))):
         name = part_path(source)
         part = read_json(path_inside(out, str(name), out / PARTS, DatasetError), Part, DatasetError, _ADVICE)
         if len(part.levels) != len(totals.levels):
             raise DatasetError(f"{out / name} has {len(part.levels)} cameras, the settings {len(totals.levels)}; {_ADVICE}")
-        pixels = part.frames * math.prod(config.cameras.resolution)
+        pixels = part.frames * math.prod(resolution)
         if not all(part.frames <= sum(channel) <= pixels for camera in part.levels for channel in camera):
             raise DatasetError(f"{out / name} has a histogram of no pixel a frame, or of more than {pixels:,} pixels; {_ADVICE}")
         columns = _make_columns(part, totals, period)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Iterator
-from dataclasses import replace
 from typing import Any, Protocol
 
 import newton
@@ -59,7 +58,7 @@ def with_enough_worlds(config: Config, device: wp.Device, episodes: int | None =
         count = sum(map(len, DataLayout.of(config).plan())) if episodes is None else episodes
         worlds = balance_worlds(count, MAX_GPU_WORLDS if device.is_cuda else MAX_CPU_WORLDS)
     worlds = max(worlds, MIN_GPU_WORLDS) if device.is_cuda else worlds
-    return config if worlds == config.bake.worlds else replace(config, bake=replace(config.bake, worlds=worlds))
+    return config if worlds == config.bake.worlds else config.with_values({"bake.worlds": worlds})
 
 
 class Watcher(Protocol):

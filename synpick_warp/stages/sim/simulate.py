@@ -82,7 +82,7 @@ class Simulation:
         planned = [index for each in DataLayout.of(config).plan() for index in each] if episodes is None else episodes
         indices = np.asarray(planned, np.int32)
         self.episodes = wp.array(indices, dtype=wp.int32, device=device)
-        sizes = world_sizes(config, built.layout.bodies_per_world)
+        sizes = world_sizes(config.bake.worlds, config.arrangement.max_objects, config.move.rounds, built.layout.bodies_per_world)
         self.state = allocate(WorldState, sizes, device)
         self.attempts = allocate(AttemptState, sizes, device)
         self.seals = allocate(SealState, sizes, device)

@@ -226,7 +226,7 @@ def measure_sensor(config: Config, factory: Factory, min_seconds: float) -> Iter
     wp.synchronize_device(device)
     yield Row("build a Newton model of the batch's worlds", time.perf_counter() - started, "s")
     yield Row("views in a batch", count, "")
-    ours = _OurRenderer(config, factory, count)
+    ours = _OurRenderer(factory, count)
     hit_images = scene.allocate_outputs(forward_depth_image="depth_forward", shape_index_image="shape_index")
     surface_images = scene.allocate_outputs(normal_image="normal", albedo_image="albedo")
     color_images = scene.allocate_outputs(color_image="color")
@@ -263,7 +263,7 @@ def measure_sensor(config: Config, factory: Factory, min_seconds: float) -> Iter
 class _OurRenderer:
     """Our renderer, for the first views of the last snapshot."""
 
-    def __init__(self, config: Config, factory: Factory, count: int) -> None:
+    def __init__(self, factory: Factory, count: int) -> None:
         self.renderer, self.out = factory.stream.renderer, factory.stream.buffers[0]
         self.snapshot = factory.simulation.record.snapshot
         scene, cameras, view = self.renderer.scene, len(factory.cameras), np.arange(count, dtype=np.int32)
