@@ -117,7 +117,7 @@ def _short_terms(config: Config, device: wp.Device, writers: int, processes: int
 def _amount(config: Config, key: str, device: wp.Device) -> int:
     """Number of views or worlds that a setting stands for."""
     if key == "render.views_per_batch":
-        return views_per_batch(config, device)
+        return views_per_batch(config.render, config.cameras, config.bake.worlds, device)
     if key == "perception.views":
         return count_views(config.perception, config.bake.worlds, config.arrangement.max_objects, device)
     return config.bake.worlds
