@@ -138,7 +138,7 @@ def aborting(pool: WriterPool, exporters: Exporters) -> Iterator[None]:
 
 def slot_bytes(classes: Iterable[type[Exporter]], sizes: TaskSizes) -> int:
     """Maximum size of the images of any task in the pool's shared memory [B]."""
-    return max(exporter_class.slot_bytes(sizes) for exporter_class in classes)
+    return max((exporter_class.slot_bytes(sizes) for exporter_class in classes), default=0)
 
 
 def shared_files(classes: Iterable[type[Exporter]], layout: DataLayout) -> SharedFiles:
