@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Collection, Sequence
 from functools import partial
 from pathlib import Path
@@ -54,7 +53,7 @@ def convert(folder: Path, out: Path, formats: Sequence[str], processes: int, rep
     contents: set[Content] = {content for name in formats for content in contents_of(name, source.config.bop)}
     source.check_contents(contents)
     _check_apart(folder, out)
-    config = dataclasses.replace(source.config, bake=dataclasses.replace(source.config.bake, formats=tuple(formats)))
+    config = source.config.with_values({"bake.formats": tuple(formats)})
     classes = load_exporter_classes(formats)
     with OutputFolder(out, config, source.episodes) as output:
         resumed = len(output.committed)

@@ -145,7 +145,7 @@ def _config(parts: Sequence[Path], manifest: Mapping[str, Any]) -> Config:
     episodes = sum(split.episodes for split in longest) or max(config.bake.episodes for config in configs)
     if episodes > MAX_EPISODES:
         raise DatasetError(f"bake.episodes is {episodes} in the {CONFIG_FILE} of a part; allowed: up to {MAX_EPISODES}; correct it there")
-    config = dataclasses.replace(configs[0], bake=dataclasses.replace(configs[0].bake, episodes=episodes), splits=tuple(longest))
+    config = dataclasses.replace(configs[0].with_values({"bake.episodes": episodes}), splits=tuple(longest))
     for before, after in itertools.pairwise(config.splits):
         if after.first < before.first + before.episodes:
             raise DatasetError(f"the split {before.name} of one part has episodes that the split {after.name} of another one has")
