@@ -98,16 +98,9 @@ def test_a_file_has_any_number_of_splits(load):
         Split("hard", 1, 103, "move", "test_hard_pbr"),
     )
     assert config.bake.episodes == 16
-    assert [DataLayout.of(config).is_planned(index) for index in (9, 11, 12, 99, 100, 103, 104)] == [
-        True,
-        True,
-        False,
-        False,
-        True,
-        True,
-        False,
-    ]
-    assert [DataLayout.of(config).folder(index) for index in (0, 9, 10, 50, 102, 103)] == [
+    layout = DataLayout.of(config)
+    assert [layout.is_planned(index) for index in (9, 11, 12, 99, 100, 103, 104)] == [True, True, False, False, True, True, False]
+    assert [layout.folder(index) for index in (0, 9, 10, 50, 102, 103)] == [
         "train_pbr",
         "train_pbr",
         "val_pbr",
@@ -147,14 +140,15 @@ def test_shards_divide_the_episodes_of_all_splits(lengths, gaps, count):
         splits.append(Split(f"s{index}", length, first + gap, "move", f"train_s{index}"))
         first += gap + length
     config = dataclasses.replace(load_config("smoke"), splits=tuple(splits))
-    planned = [index for each in DataLayout.of(config).plan() for index in each]
+    layout = DataLayout.of(config)
+    planned = [index for each in layout.plan() for index in each]
     assert sorted(planned) == planned
-    shards = [[index for each in DataLayout.of(config).plan((), (shard, count)) for index in each] for shard in range(count)]
+    shards = [[index for each in layout.plan((), (shard, count)) for index in each] for shard in range(count)]
     assert sorted(index for shard in shards for index in shard) == planned
     assert all(index % count == shard for shard, indices in enumerate(shards) for index in indices)
     for split in splits:
-        assert DataLayout.of(config).plan((split.name,)) == [episode_range(split)]
-        assert all(DataLayout.of(config).split_of(index) == split for index in episode_range(split))
+        assert layout.plan((split.name,)) == [episode_range(split)]
+        assert all(layout.split_of(index) == split for index in episode_range(split))
 
 
 @pytest.mark.parametrize(
