@@ -21,9 +21,9 @@ from synpick_warp.scheduling.sizes import (
     pick_processes,
     without_pictures,
 )
+from synpick_warp.stages import stream
 from synpick_warp.stages.perception.images import count_views
 from synpick_warp.stages.sim.physics import balance_worlds
-from synpick_warp.stages.stream import views_per_batch
 
 GIB = 1024**3
 CPU = SimpleNamespace(is_cuda=False, alias="cpu")
@@ -31,8 +31,8 @@ GPU = SimpleNamespace(is_cuda=True, alias="cuda:0", total_memory=64 * GIB)
 """Stand-ins for devices."""
 
 
-def batch_of(config: Config, device: Any) -> int:
-    return views_per_batch(config.render, config.cameras, config.bake.worlds, device)
+def views_per_batch(config: Config, device: Any) -> int:
+    return stream.views_per_batch(config.render, config.cameras, config.bake.worlds, device)
 
 
 @pytest.fixture
@@ -78,7 +78,7 @@ def test_batches_shrink_until_plan_and_headroom_fit(give, gpu, mode):
     # The larger part shrinks first: batches, or worlds where the light averaged over their frames is larger.
     assert config.bake.worlds >= min(512, 13 * gpu)
     if gpu >= 12.0:
-        assert batch_of(config, GPU) >= 12
+        assert views_per_batch(config, GPU) >= 12
     check_memory(config, GPU)
 
 
@@ -104,7 +104,7 @@ def test_processes_share_the_hosts_memory(give):
     give(host=4.0)
     config = load_config("synpick", {"bake.mode": "mixed", "cameras.resolution": [3840, 2160]})
     alone, shared = (fit_to_device(config, CPU, 4, processes=processes) for processes in (1, 4))
-    assert batch_of(shared, CPU) < batch_of(alone, CPU) or count_views(shared.perception, 4, 24, CPU) < count_views(
+    assert views_per_batch(shared, CPU) < views_per_batch(alone, CPU) or count_views(shared.perception, 4, 24, CPU) < count_views(
         alone.perception, 4, 24, CPU
     )
 

@@ -1,4 +1,6 @@
 """Ultralytics and supervision: labels of a split and of a scene, as masks, boxes and oriented boxes, through their own data set classes."""
+# The client is not a dependency.
+# pyright: reportMissingImports=false
 
 from __future__ import annotations
 

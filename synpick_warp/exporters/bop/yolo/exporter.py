@@ -8,8 +8,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from synpick_warp.configs.schema import Config
-from synpick_warp.configs.splits import bop_folder, bop_folders
+from synpick_warp.configs.splits import DataLayout
 from synpick_warp.exporters.base import ExportContext, SharedFiles
 from synpick_warp.exporters.bop.scene_exporter import SceneExporter
 from synpick_warp.exporters.bop.yolo.label_files import CONTENTS, DATA, FOLDER, commit_scenes, image_list, write_data_file, write_view
@@ -37,25 +36,25 @@ class YoloExporter(SceneExporter):
         return FOLDER.name
 
     @staticmethod
-    def shared_files(config: Config) -> SharedFiles:
+    def shared_files(layout: DataLayout) -> SharedFiles:
         """See `Exporter`."""
-        splits = tuple(FOLDER / kind / split for kind in CONTENTS for split in bop_folders(config))
-        return SharedFiles((DATA, *note_files(config)), (), (*splits, *(FOLDER / kind for kind in CONTENTS), FOLDER))
+        splits = tuple(FOLDER / kind / split for kind in CONTENTS for split in layout.folders)
+        return SharedFiles((DATA, *note_files(layout.formats)), (), (*splits, *(FOLDER / kind for kind in CONTENTS), FOLDER))
 
     def write_constants(self) -> list[Path]:
         """See `Exporter`: splits and names of the classes, camera and notes."""
         context = self._context
         try:
-            for folder in reversed(self.shared_files(context.config).folders):
+            for folder in reversed(self.shared_files(context.layout).folders):
                 (self._out / folder).mkdir(exist_ok=True)
-            write_data_file(self._out, context.names, bop_folders(context.config))
+            write_data_file(self._out, context.names, context.layout.folders)
             return [DATA, *write_notes(self._out, context.config, context.names, self._cameras)]
         except OSError as error:
             raise output_error(self._out, error) from error
 
     def files(self, episode: int) -> list[Path]:
         """See `Exporter`: lists of images, and folders of images and labels."""
-        split = bop_folder(self._context.config, episode)
+        split = self._context.layout.folder(episode)
         scenes = [self.scene_id(episode, camera) for camera in range(len(self._cameras))]
         folders = [FOLDER / kind / split / f"{scene:06d}" for scene in scenes for kind in CONTENTS]
         places = [*map(image_list, scenes), *folders]
@@ -67,5 +66,5 @@ class YoloExporter(SceneExporter):
             (scene / kind).mkdir()
 
     def _commit_task(self, scenes: tuple[tuple[Path, int], ...], frames: int) -> tuple[Callable[..., None], tuple[Any, ...]]:
-        split = bop_folder(self._context.config, scenes[0][1] // len(self._cameras))
+        split = self._context.layout.folder(scenes[0][1] // len(self._cameras))
         return commit_scenes, (scenes, self._out, split, frames)
