@@ -7,12 +7,30 @@ import itertools
 import math
 import re
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 from synpick_warp.configs.check import format_value
 from synpick_warp.configs.modes import bake_modes
-from synpick_warp.configs.schema import FORMATS, MIXED, Config
-from synpick_warp.configs.splits import MAX_SHARD_SCENES, scenes_end
+from synpick_warp.configs.schema import (
+    FORMATS,
+    MIXED,
+    Bake,
+    Bop,
+    Cameras,
+    Config,
+    DepthSensor,
+    Effects,
+    Gripper,
+    Move,
+    ObjectRow,
+    Physics,
+    Pick,
+    Settle,
+    Split,
+    Suction,
+    Tote,
+)
+from synpick_warp.configs.splits import MAX_SHARD_SCENES, DataLayout
 
 DEPTH_COUNTS = 65535
 """Maximum value of a 16-bit depth image."""
@@ -26,29 +44,34 @@ Conflict = tuple[str, str]
 
 def find_conflicts(config: Config) -> Iterator[Conflict]:
     """Find all violated constraints, the most basic first."""
-    yield from _mix(config)
-    yield from _tote(config)
-    yield from _cameras(config)
-    yield from _times(config)
-    yield from _pick(config)
-    yield from _suction(config)
-    yield from _render(config)
-    yield from _sensors(config)
-    yield from _bop(config)
-    yield from _object_rows(config)
+    bake, cameras, tote, bop = config.bake, config.cameras, config.tote, config.bop
+    yield from _mix(bake, config.splits, cameras)
+    yield from _tote(tote, config.move)
+    yield from _cameras(cameras, tote)
+    yield from _times(config.settle, config.physics)
+    yield from _pick(config.pick, tote)
+    yield from _suction(config.suction, config.gripper)
+    yield from _layers(config.render.layers)
+    yield from _ranges(config.effects, config.depth_sensor)
+    if "depth_sensor" in config.render.layers:
+        yield from _depth_sensor(config.depth_sensor, cameras, tote)
+    yield from _jpeg_quality(config.effects, bop)
+    yield from _split_folders(config.splits, bop)
+    yield from _scene_ids(DataLayout.of(config))
+    yield from _depth_scale(bop, cameras, tote)
+    yield from _object_rows(config.object_rows)
 
 
-def _mix(config: Config) -> Iterator[Conflict]:
-    if MIXED in bake_modes(config) and not any(config.bake.mix):
+def _mix(bake: Bake, splits: Sequence[Split], cameras: Cameras) -> Iterator[Conflict]:
+    if MIXED in bake_modes(bake, splits) and not any(bake.mix):
         yield "bake.mix", "at least one weight above 0, with the mode mixed"
-    if not config.bake.formats:
+    if not bake.formats:
         yield "bake.formats", f"at least one of {', '.join(FORMATS)}"
-    if "lerobot" in config.bake.formats and any(side % 2 for side in config.cameras.resolution):
+    if "lerobot" in bake.formats and any(side % 2 for side in cameras.resolution):
         yield "cameras.resolution", "even width and height with the format lerobot, whose videos have a colour for 2 x 2 pixels"
 
 
-def _tote(config: Config) -> Iterator[Conflict]:
-    tote = config.tote
+def _tote(tote: Tote, move: Move) -> Iterator[Conflict]:
     if any(rim < floor for rim, floor in zip(tote.rim_size, tote.floor_size, strict=True)):
         yield "tote.rim_size", f"at least tote.floor_size on both sides, {format_value(tote.floor_size)} [m]"
     if any(outer < rim + 2 * tote.wall for outer, rim in zip(tote.outer_size[:2], tote.rim_size, strict=True)):
@@ -56,12 +79,11 @@ def _tote(config: Config) -> Iterator[Conflict]:
         yield "tote.outer_size", f"at least tote.rim_size and two walls, {format_value(needed)} [m]"
     if tote.outer_size[2] <= tote.wall:
         yield "tote.wall", f"less than the tote's height, {tote.outer_size[2]:g} [m]"
-    if config.move.start_height < config.move.height:
-        yield "move.start_height", f"at least move.height, {config.move.height:g} [m]"
+    if move.start_height < move.height:
+        yield "move.start_height", f"at least move.height, {move.height:g} [m]"
 
 
-def _cameras(config: Config) -> Iterator[Conflict]:
-    cameras = config.cameras
+def _cameras(cameras: Cameras, tote: Tote) -> Iterator[Conflict]:
     if not cameras.positions:
         yield "cameras.positions", "at least one position"
     if len(cameras.ups) != len(cameras.positions):
@@ -75,21 +97,20 @@ def _cameras(config: Config) -> Iterator[Conflict]:
             yield "cameras.ups", f"up vectors that are not zero or parallel to the viewing direction, as that of camera {index} is"
         elif position[2] <= 0.0:
             yield "cameras.positions", f"positions above the tote's floor, z > 0, below which camera {index} sees no object [m]"
-        elif not _sees_tote(config, position):
+        elif not _sees_tote(cameras, tote, position):
             yield "cameras.target", f"a point that lets each camera see the tote, which lies outside of the images of camera {index} [m]"
 
 
-def _times(config: Config) -> Iterator[Conflict]:
-    settle = config.settle
-    rest = settle.rest_ticks * config.physics.steps_per_tick * config.physics.step
+def _times(settle: Settle, physics: Physics) -> Iterator[Conflict]:
+    rest = settle.rest_ticks * physics.steps_per_tick * physics.step
     if settle.max_time < settle.min_time:
         yield "settle.max_time", f"at least settle.min_time, {settle.min_time:g} [s]"
     if settle.max_time < rest:
         yield "settle.max_time", f"at least the time of settle.rest_ticks ticks, {rest:g} [s]"
 
 
-def _pick(config: Config) -> Iterator[Conflict]:
-    pick, height = config.pick, config.tote.outer_size[2] - config.tote.wall
+def _pick(pick: Pick, tote: Tote) -> Iterator[Conflict]:
+    height = tote.outer_size[2] - tote.wall
     if pick.appear_height < pick.near:
         yield "pick.appear_height", f"at least pick.near, {pick.near:g} [m]"
     if pick.speed < pick.near_speed:
@@ -98,8 +119,8 @@ def _pick(config: Config) -> Iterator[Conflict]:
         yield "pick.lift_height", f"at least the inner height of the tote, {height:g}: attached objects must leave the tote [m]"
 
 
-def _suction(config: Config) -> Iterator[Conflict]:
-    suction, max_radius = config.suction, config.gripper.cup_width / 2
+def _suction(suction: Suction, gripper: Gripper) -> Iterator[Conflict]:
+    max_radius = gripper.cup_width / 2
     if suction.radius > max_radius:
         yield "suction.radius", f"at most half of gripper.cup_width, {max_radius:g} [m]"
     if suction.tolerated_misses >= suction.rays:
@@ -108,34 +129,33 @@ def _suction(config: Config) -> Iterator[Conflict]:
         yield "suction.poor_force", f"at most suction.good_force, {suction.good_force:g} [N]"
 
 
-def _render(config: Config) -> Iterator[Conflict]:
-    layers = config.render.layers
+def _layers(layers: tuple[str, ...]) -> Iterator[Conflict]:
     if len(set(layers)) < len(layers):
         yield "render.layers", f"each layer once: {format_value(list(dict.fromkeys(layers)))}"
 
 
-def _sensors(config: Config) -> Iterator[Conflict]:
-    for section in ("effects", "depth_sensor"):
-        for item in dataclasses.fields(getattr(config, section)):
-            value = getattr(getattr(config, section), item.name)
+def _ranges(effects: Effects, depth_sensor: DepthSensor) -> Iterator[Conflict]:
+    for name, section in (("effects", effects), ("depth_sensor", depth_sensor)):
+        for item in dataclasses.fields(section):
+            value = getattr(section, item.name)
             if isinstance(value, tuple) and value[0] > value[1]:
-                yield f"{section}.{item.name}", f"minimum and maximum in this order: {format_value([value[1], value[0]])}"
-    yield from _depth_sensor(config)
-    low, high = config.effects.jpeg_quality
+                yield f"{name}.{item.name}", f"minimum and maximum in this order: {format_value([value[1], value[0]])}"
+
+
+def _jpeg_quality(effects: Effects, bop: Bop) -> Iterator[Conflict]:
+    low, high = effects.jpeg_quality
     if high and not low:
         yield "effects.jpeg_quality", f"from 1 to 100, or 0, 0: {format_value([1, high])}"
-    if high and config.bop.color_format != "jpg":
-        yield "effects.jpeg_quality", f"0, 0 with bop.color_format {config.bop.color_format}"
+    if high and bop.color_format != "jpg":
+        yield "effects.jpeg_quality", f"0, 0 with bop.color_format {bop.color_format}"
 
 
-def _depth_sensor(config: Config) -> Iterator[Conflict]:
+def _depth_sensor(sensor: DepthSensor, cameras: Cameras, tote: Tote) -> Iterator[Conflict]:
     """With the layer depth_sensor: the tote must lie within what the sensor measures, and its disparity be more than a step."""
-    if "depth_sensor" not in config.render.layers:
-        return
-    sensor, (width, _) = config.depth_sensor, config.cameras.resolution
-    focal = width / 2 / math.tan(math.radians(config.cameras.fov) / 2)
-    for index, position in enumerate(config.cameras.positions):
-        depths = _tote_depths(config, position)
+    width, _ = cameras.resolution
+    focal = width / 2 / math.tan(math.radians(cameras.fov) / 2)
+    for index, position in enumerate(cameras.positions):
+        depths = _tote_depths(cameras, tote, position)
         near, far = max(0.0, min(depths)), max(depths)
         if sensor.distances[1] < near or sensor.distances[0] > far:
             yield "depth_sensor.distances", f"a range that reaches the tote, {near:.3g} to {far:.3g} m from camera {index} [m]"
@@ -144,33 +164,32 @@ def _depth_sensor(config: Config) -> Iterator[Conflict]:
             yield "depth_sensor.baseline", f"at least {least:.3g}, so that the disparity of the tote is a disparity_step or more [m]"
 
 
-def _tote_depths(config: Config, position: tuple[float, ...]) -> list[float]:
+def _tote_depths(cameras: Cameras, tote: Tote, position: tuple[float, ...]) -> list[float]:
     """Planar depths of the corners of the tote's outer box in the image of a camera at `position`, which looks at cameras.target [m]."""
-    length, width, height = config.tote.outer_size
-    forward = [b - a for a, b in zip(position, config.cameras.target, strict=True)]
+    length, width, height = tote.outer_size
+    forward = [b - a for a, b in zip(position, cameras.target, strict=True)]
     size = math.hypot(*forward) or 1.0
-    corners = itertools.product((-length / 2, length / 2), (-width / 2, width / 2), (-config.tote.wall, height - config.tote.wall))
+    corners = itertools.product((-length / 2, length / 2), (-width / 2, width / 2), (-tote.wall, height - tote.wall))
     return [sum((c - a) * f for a, c, f in zip(position, corner, forward, strict=True)) / size for corner in corners]
 
 
-def _sees_tote(config: Config, position: tuple[float, ...]) -> bool:
+def _sees_tote(cameras: Cameras, tote: Tote, position: tuple[float, ...]) -> bool:
     """Whether the tote's bounding sphere meets the cone around a camera's view, which is wider than its image."""
-    length, width, height = config.tote.outer_size
-    center = (0.0, 0.0, height / 2 - config.tote.wall)
-    forward = [b - a for a, b in zip(position, config.cameras.target, strict=True)]
+    length, width, height = tote.outer_size
+    center = (0.0, 0.0, height / 2 - tote.wall)
+    forward = [b - a for a, b in zip(position, cameras.target, strict=True)]
     away, radius = [b - a for a, b in zip(position, center, strict=True)], math.hypot(length, width, height) / 2
     distance = math.hypot(*away)
     if distance <= radius:
         return True
     cosine = sum(a * b for a, b in zip(forward, away, strict=True)) / (math.hypot(*forward) * distance)
-    columns, rows = config.cameras.resolution
-    cone = math.atan(math.tan(math.radians(config.cameras.fov) / 2) * math.hypot(1.0, rows / columns))
+    columns, rows = cameras.resolution
+    cone = math.atan(math.tan(math.radians(cameras.fov) / 2) * math.hypot(1.0, rows / columns))
     return math.acos(max(-1.0, min(1.0, cosine))) <= cone + math.asin(radius / distance)
 
 
-def _bop(config: Config) -> Iterator[Conflict]:
-    bop = config.bop
-    folders = [(f"splits.{split.name}.folder", split.folder) for split in config.splits] or [("bop.split", bop.split)]
+def _split_folders(splits: Sequence[Split], bop: Bop) -> Iterator[Conflict]:
+    folders = [(f"splits.{split.name}.folder", split.folder) for split in splits] or [("bop.split", bop.split)]
     for key, folder in folders:
         if not _SPLIT.fullmatch(folder):
             yield key, "train, val or test, and after an underscore letters and digits, as in train_pbr"
@@ -178,18 +197,24 @@ def _bop(config: Config) -> Iterator[Conflict]:
             fitting = "png" if bop.color_format == "jpg" else "jpg"
             rule = "BOP's toolkit reads jpg from splits that end in _pbr, and png from all others"
             yield "bop.color_format", f"{fitting} with the split {folder}: {rule}"
-    if "shards" in config.bake.formats and scenes_end(config) > MAX_SHARD_SCENES:
-        most = MAX_SHARD_SCENES // len(config.cameras.positions)
-        long = next((split.name for split in config.splits if split.first + split.episodes > most), "")
+
+
+def _scene_ids(layout: DataLayout) -> Iterator[Conflict]:
+    if "shards" in layout.formats and layout.scenes_end > MAX_SHARD_SCENES:
+        most = MAX_SHARD_SCENES // layout.cameras
+        long = next((split.name for split in layout.splits if split.first + split.episodes > most), "")
         key = f"splits.{long}.episodes" if long else "bake.episodes"
         yield key, f"episode indices below {most} with the format shards, whose names hold no more scenes"
-    far = max((depth for position in config.cameras.positions for depth in _tote_depths(config, position)), default=0.0)
+
+
+def _depth_scale(bop: Bop, cameras: Cameras, tote: Tote) -> Iterator[Conflict]:
+    far = max((depth for position in cameras.positions for depth in _tote_depths(cameras, tote, position)), default=0.0)
     if bop.depth_scale * 1e-3 * DEPTH_COUNTS < far:
         yield "bop.depth_scale", f"at least {far * 1e3 / DEPTH_COUNTS:.3g}, so that 16 bits reach the tote at {far:.3g} m [mm]"
 
 
-def _object_rows(config: Config) -> Iterator[Conflict]:
-    counts = Counter(row.id for row in config.object_rows)
+def _object_rows(rows: Sequence[ObjectRow]) -> Iterator[Conflict]:
+    counts = Counter(row.id for row in rows)
     for repeated in sorted(row_id for row_id, count in counts.items() if count > 1):
         yield "object_rows", f"one row per id; {repeated} comes {counts[repeated]} times"
 

@@ -98,8 +98,7 @@ def override_config(config: Config, settings: Mapping[str, object], source: str 
         if section == SPLITS or (config.splits and key in _OF_SPLITS):
             raise ConfigError(f"{key} is set {source}, but the configuration has its splits already; pass it to load_config")
         values |= _section_values(section, {name: value}, source)
-        part = dataclasses.replace(getattr(config, section), **{name: values[key][0]})
-        config = dataclasses.replace(config, **{section: part})
+        config = config.with_values({key: values[key][0]})
     _check_conflicts(config, values)
     return config
 

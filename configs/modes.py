@@ -2,27 +2,29 @@
 
 from __future__ import annotations
 
-from synpick_warp.configs.schema import CYCLE, MIXED, MODES, Config
+from collections.abc import Sequence
+
+from synpick_warp.configs.schema import CYCLE, MIXED, MODES, Bake, Split
 
 
-def mode_weights(config: Config, mode: str | None = None) -> dict[str, float]:
+def mode_weights(bake: Bake, mode: str | None = None) -> dict[str, float]:
     """Unnormalized probability of each of MODES in a bake of mode `mode` (None: bake.mode); 0: never."""
-    mode = config.bake.mode if mode is None else mode
+    mode = bake.mode if mode is None else mode
     if mode == MIXED:
-        return dict(zip(MODES, config.bake.mix, strict=True))
+        return dict(zip(MODES, bake.mix, strict=True))
     return {name: float(mode in (name, CYCLE)) for name in MODES}
 
 
-def bake_modes(config: Config) -> tuple[str, ...]:
+def bake_modes(bake: Bake, splits: Sequence[Split]) -> tuple[str, ...]:
     """`bake.mode`, or the modes of the splits."""
-    return tuple(dict.fromkeys(split.mode for split in config.splits)) or (config.bake.mode,)
+    return tuple(dict.fromkeys(split.mode for split in splits)) or (bake.mode,)
 
 
-def possible_modes(config: Config) -> set[str]:
+def possible_modes(bake: Bake, splits: Sequence[Split]) -> set[str]:
     """Those of MODES that episodes of a bake can have."""
-    return {name for mode in bake_modes(config) for name, weight in mode_weights(config, mode).items() if weight > 0.0}
+    return {name for mode in bake_modes(bake, splits) for name, weight in mode_weights(bake, mode).items() if weight > 0.0}
 
 
-def may_pick(config: Config) -> bool:
+def may_pick(bake: Bake, splits: Sequence[Split]) -> bool:
     """Whether a bake can have episodes in mode pick or target."""
-    return not possible_modes(config).isdisjoint({"pick", "target"})
+    return not possible_modes(bake, splits).isdisjoint({"pick", "target"})

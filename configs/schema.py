@@ -6,7 +6,9 @@ The defaults are the paper's values (preset `synpick`); where the paper names no
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any
 
 from synpick_warp.codes import Tone, names
 from synpick_warp.configs.fields import INT32_MAX, setting
@@ -35,7 +37,7 @@ EXCEED = "exceed"
 WITHIN = "within"
 FILLS = (EXCEED, WITHIN)
 """Rules that end the draw of an episode's objects at the volume budget."""
-FORMATS = ("bop", "shards", "usd", "zarr", "lerobot", "coco")
+FORMATS = ("bop", "shards", "usd", "zarr", "lerobot", "coco", "yolo")
 """Output formats."""
 
 
@@ -76,7 +78,7 @@ class Bake:
     formats: tuple[str, ...] = setting(
         ("bop",),
         "",
-        "Output formats: bop (scene folders), shards (webdataset), usd (a stage per episode), zarr (trajectories), lerobot (v3), coco.",
+        "Output formats: bop (scene folders), shards (webdataset), usd (a stage per episode), zarr (trajectories), lerobot, coco, yolo.",
         choices=FORMATS,
     )
     writers: int = setting(0, "", "Processes that write files, for all devices; 0: one per CPU core, if memory suffices.", low=0, high=1024)
@@ -326,7 +328,7 @@ class Render:
         0,
         "px",
         "Mode fast: width of a coarse pixel, at whose centre paths start; 0: the widest with 384 per row, 480 with `history`. At full HD "
-        "5 px instead of these 4 px take 6 % less time, and PSNR is 0.2 to 0.7 dB lower. Shadow rays are spaced as wide.",
+        "5 px instead of these 4 px take 6 % less time, and PSNR is 0.2 to 0.7 dB lower. Shadow rays are spaced as wide, at most 32 px.",
         low=0,
         high=64,
     )
@@ -379,6 +381,11 @@ class Bop:
     depth_scale: float = setting(0.1, "mm", "Depth of one count in 16-bit depth images; 0.1 mm reaches 6.5 m.", above=0.0, high=10.0)
     masks: bool = setting(True, "", "Write mask/ (amodal) and mask_visib/ (visible): one file per instance and view.")
     coco: bool = setting(True, "", "Write COCO annotations (scene_gt_coco.json).")
+    polygons: bool = setting(
+        False,
+        "",
+        "Segmentation in the format coco: polygons on the borders of pixels, exact, with holes, for tools that read no run lengths.",
+    )
     layout: str = setting(
         CLASSIC,
         "",
@@ -458,3 +465,16 @@ class Config:
     object_rows: tuple[ObjectRow, ...] = ()
     splits: tuple[Split, ...] = ()
     """Resolved splits, by first episode; empty: one split, bop.split, of bake.episodes episodes."""
+
+    def value(self, key: str) -> Any:
+        """Value of a setting by its full key, such as "physics.step"."""
+        section, _, name = key.partition(".")
+        return getattr(getattr(self, section), name)
+
+    def with_values(self, values: Mapping[str, object]) -> Config:
+        """Copy with other values of settings, by full key. They are not validated; see `load.override_config`."""
+        parts: dict[str, Any] = {}
+        for key, value in values.items():
+            section, _, name = key.partition(".")
+            parts[section] = replace(parts.get(section, getattr(self, section)), **{name: value})
+        return replace(self, **parts)

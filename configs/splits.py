@@ -8,6 +8,7 @@ from 0 to `bake.episodes`, in the folder `bop.split`.
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 
 from synpick_warp.configs.check import format_value, suggest, to_index
 from synpick_warp.configs.schema import MULTISENSOR, Config, Split
@@ -22,7 +23,7 @@ def episode_range(split: Split) -> range:
     return range(split.first, split.first + split.episodes)
 
 
-def choose_splits(config: Config, names: Sequence[str]) -> tuple[Split, ...]:
+def choose_splits(splits: tuple[Split, ...], names: Sequence[str]) -> tuple[Split, ...]:
     """Return the splits with the given names, in the order of the settings, or all splits if `names` is empty.
 
     Raises:
@@ -31,35 +32,18 @@ def choose_splits(config: Config, names: Sequence[str]) -> tuple[Split, ...]:
     if isinstance(names, str) or not isinstance(names, Sequence):
         raise ConfigError(f'splits are {format_value(names)}; allowed: a list of names, such as ["train"]')
     if not names:
-        return config.splits
-    known = [split.name for split in config.splits]
+        return splits
+    known = [split.name for split in splits]
     if not known:
         raise ConfigError(f"there is no split {format_value(names[0])}: the settings have no splits; add tables such as [splits.train]")
     for name in names:
         if name not in known:
             raise ConfigError(f"there is no split {format_value(name)}; splits: {', '.join(known)}{suggest(name, known)}")
-    return tuple(split for split in config.splits if split.name in names)
-
-
-def plan_episodes(config: Config, names: Sequence[str] = (), shard: tuple[int, int] = (0, 1)) -> list[range]:
-    """Episode indices of a bake, ascending, one range per split.
-
-    Args:
-        config: All settings.
-        names: Splits; empty: all.
-        shard: (i, n): only indices with index % n == i.
-
-    Raises:
-        ConfigError: An unknown split.
-    """
-    index, count = shard
-    splits = choose_splits(config, names)
-    ranges = [episode_range(split) for split in splits] if splits else [range(config.bake.episodes)]
-    return [range(each.start + (index - each.start) % count, each.stop, count) for each in ranges]
+    return tuple(split for split in splits if split.name in names)
 
 
 def check_shard(shard: tuple[int, int], name: str = "shard") -> None:
-    """Validate a shard (i, n); arguments as in `plan_shard`.
+    """Validate a shard (i, n); arguments as in `DataLayout.plan_shard`.
 
     Raises:
         ConfigError: Not two whole numbers with 0 <= i < n.
@@ -71,80 +55,113 @@ def check_shard(shard: tuple[int, int], name: str = "shard") -> None:
         raise ConfigError(f"{name} is {index}/{count}; allowed: i/n with i from 0 to n - 1, such as 0/4")
 
 
-def plan_shard(config: Config, names: Sequence[str], shard: tuple[int, int], name: str = "shard") -> list[range]:
-    """Validate a shard and return its episode indices, ascending, one range per split.
+@dataclass(frozen=True)
+class DataLayout:
+    """Layout of a data set: the formats, episodes and cameras that it has, and the folders and ids of its BOP scenes."""
 
-    Args:
-        config: All settings.
-        names: Splits; empty: all.
-        shard: (i, n): only indices with index % n == i.
-        name: Name of the shard in messages, such as that of the option.
+    formats: tuple[str, ...]
+    splits: tuple[Split, ...]
+    """By first episode; empty: one range of episodes in one folder."""
+    episodes: int
+    """Number of episodes without splits."""
+    split: str
+    """BOP folder without splits."""
+    cameras: int
+    """Number of cameras."""
+    has_sensors: bool
+    """Whether the cameras of an episode share a scene, as its sensors; else each has a scene of its own."""
 
-    Raises:
-        ConfigError: An unknown split, an invalid shard, or a shard without episodes.
-    """
-    check_shard(shard, name)
-    planned = plan_episodes(config, names, shard)
-    if not any(planned):
-        total = sum(map(len, plan_episodes(config, names)))
-        raise ConfigError(f"{name} {shard[0]}/{shard[1]} has none of {total} episodes; use fewer shards")
-    return planned
+    @classmethod
+    def of(cls, config: Config) -> DataLayout:
+        """Layout by the settings of a bake."""
+        bake, bop = config.bake, config.bop
+        return cls(bake.formats, config.splits, bake.episodes, bop.split, len(config.cameras.positions), bop.layout == MULTISENSOR)
 
+    def plan(self, names: Sequence[str] = (), shard: tuple[int, int] = (0, 1)) -> list[range]:
+        """Episode indices of a bake, ascending, one range per split.
 
-def is_planned(config: Config, episode: int) -> bool:
-    """Whether an episode index belongs to the planned episodes."""
-    return any(episode in each for each in plan_episodes(config))
+        Args:
+            names: Splits; empty: all.
+            shard: (i, n): only indices with index % n == i.
 
+        Raises:
+            ConfigError: An unknown split.
+        """
+        index, count = shard
+        splits = choose_splits(self.splits, names)
+        ranges = [episode_range(split) for split in splits] if splits else [range(self.episodes)]
+        return [range(each.start + (index - each.start) % count, each.stop, count) for each in ranges]
 
-def episodes_end(config: Config) -> int:
-    """Exclusive upper bound of the planned episode indices, over all splits."""
-    return max(each.stop for each in plan_episodes(config))
+    def plan_shard(self, names: Sequence[str], shard: tuple[int, int], name: str = "shard") -> list[range]:
+        """Validate a shard and return its episode indices, ascending, one range per split.
 
+        Args:
+            names: Splits; empty: all.
+            shard: (i, n): only indices with index % n == i.
+            name: Name of the shard in messages, such as that of the option.
 
-def scenes_end(config: Config) -> int:
-    """Exclusive upper bound of the planned scene ids of the format shards, which has a scene per episode and camera."""
-    return episodes_end(config) * len(config.cameras.positions)
+        Raises:
+            ConfigError: An unknown split, an invalid shard, or a shard without episodes.
+        """
+        check_shard(shard, name)
+        planned = self.plan(names, shard)
+        if not any(planned):
+            total = sum(map(len, self.plan(names)))
+            raise ConfigError(f"{name} {shard[0]}/{shard[1]} has none of {total} episodes; use fewer shards")
+        return planned
 
+    def is_planned(self, episode: int) -> bool:
+        """Whether an episode index belongs to the planned episodes."""
+        return any(episode in each for each in self.plan())
 
-def split_of(config: Config, episode: int) -> Split | None:
-    """Split of an episode index; None if there are no splits.
+    @property
+    def episodes_end(self) -> int:
+        """Exclusive upper bound of the planned episode indices, over all splits."""
+        return max(each.stop for each in self.plan())
 
-    An index between two splits belongs to the earlier one, an index below all splits to the first.
-    """
-    return next((split for split in reversed(config.splits) if split.first <= episode), config.splits[0] if config.splits else None)
+    @property
+    def scenes_end(self) -> int:
+        """Exclusive upper bound of the planned scene ids of the format shards, which has a scene per episode and camera."""
+        return self.episodes_end * self.cameras
 
+    def split_of(self, episode: int) -> Split | None:
+        """Split of an episode index; None if there are no splits.
 
-def bop_folder(config: Config, episode: int) -> str:
-    """Name of the split folder with an episode's BOP scenes, such as "train_pbr"."""
-    split = split_of(config, episode)
-    return config.bop.split if split is None else split.folder
+        An index between two splits belongs to the earlier one, an index below all splits to the first.
+        """
+        return next((split for split in reversed(self.splits) if split.first <= episode), self.splits[0] if self.splits else None)
 
+    @property
+    def folders(self) -> tuple[str, ...]:
+        """Names of all split folders."""
+        return tuple(split.folder for split in self.splits) or (self.split,)
 
-def bop_scene(config: Config, episode: int, camera: int) -> tuple[int, str]:
-    """Scene id of a camera's images of an episode, and the suffix of their files: empty, or that of the sensor, such as "_cam1"."""
-    if config.bop.layout == MULTISENSOR:
-        return episode, f"_{sensor_name(camera)}"
-    return len(config.cameras.positions) * episode + camera, ""
+    def folder(self, episode: int) -> str:
+        """Name of the split folder with an episode's BOP scenes, such as "train_pbr"."""
+        split = self.split_of(episode)
+        return self.split if split is None else split.folder
 
+    def scene(self, episode: int, camera: int) -> tuple[int, str]:
+        """Scene id of a camera's images of an episode, and the suffix of their files: empty, or that of the sensor, such as "_cam1"."""
+        return (episode, f"_{sensor_name(camera)}") if self.has_sensors else (self.cameras * episode + camera, "")
 
-def scene_ids(config: Config, episodes: Iterable[int]) -> set[int]:
-    """Ids of all BOP scenes of episodes."""
-    return {bop_scene(config, episode, camera)[0] for episode in episodes for camera in range(len(config.cameras.positions))}
+    def scene_ids(self, episodes: Iterable[int]) -> set[int]:
+        """Ids of all BOP scenes of episodes."""
+        return {self.scene(episode, camera)[0] for episode in episodes for camera in range(self.cameras)}
 
+    def scene_episode(self, scene: int) -> int:
+        """Episode of a BOP scene."""
+        return scene if self.has_sensors else scene // self.cameras
 
-def scene_episode(config: Config, scene: int) -> int:
-    """Episode of a BOP scene."""
-    return scene if config.bop.layout == MULTISENSOR else scene // len(config.cameras.positions)
+    @property
+    def sensors(self) -> tuple[str, ...]:
+        """Names of the sensors of a scene; none if each camera has a scene of its own."""
+        return tuple(map(sensor_name, range(self.cameras))) if self.has_sensors else ()
 
 
 def sensor_name(camera: int) -> str:
     """Name of a camera among the sensors of a scene."""
     return f"cam{camera}"
-
-
-def bop_folders(config: Config) -> tuple[str, ...]:
-    """Names of all split folders."""
-    return tuple(split.folder for split in config.splits) or (config.bop.split,)
 
 
 def split_kind(folder: str) -> str:

@@ -16,7 +16,7 @@ import numpy as np
 import warp as wp
 
 from synpick_warp.configs.modes import mode_weights
-from synpick_warp.configs.schema import EXCEED, Arrangement, Config, Gripper, Physics
+from synpick_warp.configs.schema import EXCEED, Arrangement, Bake, Config, Gripper, Move, Physics, Pick
 from synpick_warp.errors import ConfigError
 from synpick_warp.scenes.gripper import cup_collider, finger_collider, rod_inertia
 from synpick_warp.scenes.tote import TABLE_SIZE, guide_walls, tote_colliders
@@ -117,7 +117,7 @@ def count_slots(config: Config, catalog: Catalog) -> tuple[int, int]:
             f"arrangement.volume is {budget:g} m³, but the smallest object, {smallest.name}, takes {smallest.volume:.3g} m³; make it larger"
         )
     needed = []
-    for repeats in find_repeat_rules(config):
+    for repeats in find_repeat_rules(config.bake, config.pick, config.move):
         slots = _slots_of_trials(_draw_trials(volume, budget, config.arrangement, repeats), compound, shortfall)
         # Where a sum of volumes meets the budget but for rounding, as of three cubes of a litre and three litres, 64-bit floats may
         # find room for one object fewer than the kernels do, in every draw. Other catalogs keep the count of the 64-bit draws.
@@ -142,10 +142,10 @@ def _slots_of_trials(drawn: np.ndarray, compound: np.ndarray, shortfall: float) 
     return int(np.quantile(np.where(compounds > limit, np.inf, singles), 1.0 - shortfall, method="higher")), int(limit)
 
 
-def find_repeat_rules(config: Config) -> set[bool]:
+def find_repeat_rules(bake: Bake, pick: Pick, move: Move) -> set[bool]:
     """Whether episodes may contain several instances of an object: the values in all modes that the bake's episodes can have."""
-    rules = {"pick": config.pick.repeats, "target": config.pick.repeats, "move": config.move.repeats}
-    return {rules[mode] for mode, weight in mode_weights(config).items() if weight > 0.0}
+    rules = {"pick": pick.repeats, "target": pick.repeats, "move": move.repeats}
+    return {rules[mode] for mode, weight in mode_weights(bake).items() if weight > 0.0}
 
 
 def _draw_trials(volume: np.ndarray, budget: float | np.float32, rule: Arrangement, repeats: bool) -> np.ndarray:
@@ -214,7 +214,7 @@ def with_repeats(config: Config, catalog: Catalog) -> Config:
     volumes = [entry.volume for entry in catalog.entries if entry.volume <= budget]
     if not config.arrangement.repeat_to_fill or sum(volumes) >= budget or len(volumes) >= config.arrangement.max_objects:
         return config
-    return replace(config, pick=replace(config.pick, repeats=True), move=replace(config.move, repeats=True))
+    return config.with_values({"pick.repeats": True, "move.repeats": True})
 
 
 def with_capacities(config: Config, catalog: Catalog) -> Config:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -56,8 +56,9 @@ def load_catalog(config: Config, cache_dir: Path | None = None, report: Callable
         CatalogError: The folder cannot be used, or none of its objects: a file is damaged, an object does not fit into the tote or has an
             invalid mass.
     """
-    faults = _Faults(config, report)
-    raws = _read_folder(config, report, faults) if config.bake.models else procedural_objects()
+    rules = _Rules(config.objects, config.object_rows, config.tote)
+    faults = _Faults(config.objects.strict, config.bake.models, report)
+    raws = _read_folder(Path(config.bake.models).expanduser(), rules, report, faults) if config.bake.models else procedural_objects()
     recipes = [shape_recipe(raw, config.objects) for raw in raws]
     names, meshes = [raw.name for raw in raws], [raw.mesh for raw in raws]
     seconds = config.objects.decomposition_time
@@ -67,7 +68,7 @@ def load_catalog(config: Config, cache_dir: Path | None = None, report: Callable
         if isinstance(shape, CatalogError):
             faults.add(shape)
         else:
-            entries.append(_entry(raw, shape, _checked_mass(raw, config)))
+            entries.append(_entry(raw, shape, _checked_mass(raw, config.objects.density)))
     if not entries:
         raise faults.summary()
     faults.tell()
@@ -78,13 +79,13 @@ def load_catalog(config: Config, cache_dir: Path | None = None, report: Callable
 class _Faults:
     """Objects that cannot be used: with `objects.strict`, or if there is no other object, the first one is an error."""
 
-    def __init__(self, config: Config, report: Callable[[str], None]) -> None:
-        self._config, self._report = config, report
+    def __init__(self, strict: bool, folder: str, report: Callable[[str], None]) -> None:
+        self._strict, self._folder, self._report = strict, folder, report
         self._errors: list[CatalogError] = []
 
     def add(self, error: CatalogError) -> None:
         """Take the error of an object; raises it if settings are strict."""
-        if self._config.objects.strict:
+        if self._strict:
             raise error
         self._errors.append(error)
 
@@ -97,24 +98,32 @@ class _Faults:
         """The error of a folder of which no object can be used."""
         if len(self._errors) == 1:
             return self._errors[0]
-        count, folder = len(self._errors), self._config.bake.models
-        return CatalogError(f"models folder {folder}: none of its {count} objects can be used; the first: {self._errors[0]}")
+        count = len(self._errors)
+        return CatalogError(f"models folder {self._folder}: none of its {count} objects can be used; the first: {self._errors[0]}")
 
 
-def _read_folder(config: Config, report: Callable[[str], None], faults: _Faults) -> list[RawObject]:
+@dataclass(frozen=True)
+class _Rules:
+    """Settings by which a model is read and checked."""
+
+    objects: Objects
+    rows: tuple[ObjectRow, ...]
+    tote: Tote
+
+
+def _read_folder(folder: Path, rules: _Rules, report: Callable[[str], None], faults: _Faults) -> list[RawObject]:
     """Read all models of a folder, ordered by obj_id."""
-    folder = Path(config.bake.models).expanduser()
     models = list_models(folder, report, faults.add)
     infos: dict[int, ModelInfo] = {}
     if models and models[0].is_bop:
 
         def without(error: CatalogError) -> None:
-            if config.objects.strict:
+            if rules.objects.strict:
                 raise error
             report(f"{error}; until then it has no symmetries")
 
         infos = read_models_info(folder / "models_info.json", [model.obj_id for model in models], without)
-    calls = [(model, infos.get(model.obj_id, ModelInfo()), config) for model in models]
+    calls = [(model, infos.get(model.obj_id, ModelInfo()), rules) for model in models]
     raws = []
     for model, result in zip(models, run_isolated(_read_model, calls, READ_LIMITS), strict=True):
         if isinstance(result, Failure):
@@ -131,27 +140,28 @@ def _read_folder(config: Config, report: Callable[[str], None], faults: _Faults)
     return raws
 
 
-def _read_model(model: ModelFile, info: ModelInfo, config: Config) -> tuple[RawObject, list[str]]:
+def _read_model(model: ModelFile, info: ModelInfo, rules: _Rules) -> tuple[RawObject, list[str]]:
     """Read and check a model; returns it with lines on what was corrected. Runs in an isolated process.
 
     A BOP model has the row of the object table with its obj_id, others the row with their name, if the diameter agrees.
     """
     lines: list[str] = []
-    options = MeshOptions(config.objects.crease_angle, config.objects.center and not model.is_bop, not config.objects.strict)
+    objects = rules.objects
+    options = MeshOptions(objects.crease_angle, objects.center and not model.is_bop, not objects.strict)
     with asset_scope(model.root) as scope:
         mesh, material = read_mesh(model.path, _MILLIMETRE if model.is_bop else 1.0, options, lines.append)
-    hull, tolerance = hull_size(mesh.vertices), config.objects.diameter_tolerance
+    hull, tolerance = hull_size(mesh.vertices), objects.diameter_tolerance
     if model.is_bop and hull.diameter > 0.0:
-        info, said = _check_info(info, mesh, hull, model, config.objects.strict)
+        info, said = _check_info(info, mesh, hull, model, objects.strict)
         lines += said
-    rows = (row for row in config.object_rows if (row.id == model.obj_id if model.is_bop else row.name == model.name))
+    rows = (row for row in rules.rows if (row.id == model.obj_id if model.is_bop else row.name == model.name))
     row = next((row for row in rows if _fits(row, hull.diameter, tolerance)), None)
-    raw = _raw(model, mesh, hull, material, row, config.objects)
+    raw = _raw(model, mesh, hull, material, row, objects)
     raw = replace(raw, symmetries_discrete=info.symmetries_discrete, symmetries_continuous=info.symmetries_continuous)
     if model.is_bop and not scope.moved:  # A copy of the file could not name its texture as it does.
         raw = replace(raw, source=model.path)
-    _check_size(raw, str(model.path if model.is_bop else raw.name), config.tote)
-    _checked_mass(raw, config)
+    _check_size(raw, str(model.path if model.is_bop else raw.name), rules.tote)
+    _checked_mass(raw, objects.density)
     return raw, [*scope.moved[:1], *lines]
 
 
@@ -241,10 +251,10 @@ def _by(sides: list[float]) -> str:
     return " x ".join(f"{side:.3g}" for side in sides)
 
 
-def _checked_mass(raw: RawObject, config: Config) -> float:
+def _checked_mass(raw: RawObject, density: float) -> float:
     """Mass [kg]: the object's own, or density times hull volume."""
     origin = raw.source or raw.name
-    mass = config.objects.density * raw.hull.volume if raw.mass is None else raw.mass
+    mass = density * raw.hull.volume if raw.mass is None else raw.mass
     if not _MASS_RANGE[0] <= mass <= _MASS_RANGE[1]:
         source = "by objects.density" if raw.mass is None else "in its row of the object table"
         raise CatalogError(f"{origin}: mass {mass:g} kg {source}; allowed: {_MASS_RANGE[0]:g} to {_MASS_RANGE[1]:g} kg")

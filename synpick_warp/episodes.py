@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 from synpick_warp.attempts import EpisodeRecord
 from synpick_warp.codes import Ending, Outcome
 from synpick_warp.configs.schema import Config
-from synpick_warp.configs.splits import split_of
+from synpick_warp.configs.splits import DataLayout
 from synpick_warp.frames import EpisodeEnd
 from synpick_warp.stages.stream import TickReport
 
@@ -111,17 +111,16 @@ class BakeSummary:
         self.outcomes.update(attempt.outcome for attempt in record.attempts)
 
 
-def episode_row(config: Config, report: TickReport, world: int, record: EpisodeRecord) -> EpisodeRow:
-    """Build the row of the episode that ended in a world."""
+def episode_row(layout: DataLayout, tick_time: float, report: TickReport, world: int, record: EpisodeRecord) -> EpisodeRow:
+    """Build the row of the episode that ended in a world. `tick_time`: time between two frames [s]."""
     episode, arrangement, frame, ending = (int(report.column(name)[world]) for name in ("episode", "arrangement", "frame", "ending"))
-    tick = config.physics.step * config.physics.steps_per_tick
-    split = split_of(config, episode)
+    split = layout.split_of(episode)
     return EpisodeRow(
         episode,
         arrangement,
         Ending(ending),
         frame + 1,
-        round(max(0, frame) * tick, PLACES),
+        round(max(0, frame) * tick_time, PLACES),
         record.mode,
         record.objects,
         len(record.attempts),
@@ -132,9 +131,9 @@ def episode_row(config: Config, report: TickReport, world: int, record: EpisodeR
     )
 
 
-def is_resampled(config: Config, row: EpisodeRow) -> bool:
-    """True if the episode will run again with a resampled arrangement."""
-    return not row.ending.delivers and row.arrangement + 1 < config.settle.tries
+def is_resampled(row: EpisodeRow, tries: int) -> bool:
+    """True if the episode will run again with a resampled arrangement; `tries`: `settle.tries`."""
+    return not row.ending.delivers and row.arrangement + 1 < tries
 
 
 def remedy(config: Config, ending: Ending) -> str:
@@ -152,9 +151,9 @@ def remedy(config: Config, ending: Ending) -> str:
     return ""
 
 
-def episode_end(config: Config, row: EpisodeRow, record: EpisodeRecord) -> EpisodeEnd:
-    """Build the end-of-episode message for exporters; a resampled episode has neither row nor attempts."""
-    if is_resampled(config, row):
+def episode_end(row: EpisodeRow, record: EpisodeRecord, tries: int) -> EpisodeEnd:
+    """Build the end-of-episode message for exporters; a resampled episode (`is_resampled`) has neither row nor attempts."""
+    if is_resampled(row, tries):
         return EpisodeEnd(row.episode, row.arrangement, row.frames, int(row.ending))
     return EpisodeEnd(
         row.episode, row.arrangement, row.frames, int(row.ending), row.as_json(), tuple(one.line() for one in record.attempts)

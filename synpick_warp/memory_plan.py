@@ -18,9 +18,9 @@ from synpick_warp.arrays import memory_table
 from synpick_warp.configs.check import format_value
 from synpick_warp.configs.fields import INT32_MAX
 from synpick_warp.configs.modes import may_pick
-from synpick_warp.configs.schema import REFERENCE, Config
+from synpick_warp.configs.schema import REFERENCE, Config, Perception, Physics, Trajectory
 from synpick_warp.errors import ConfigError, SynpickError
-from synpick_warp.exporters.registry import load_exporter_classes, slot_bytes
+from synpick_warp.exporters.registry import Needs
 from synpick_warp.scenes import build
 from synpick_warp.stages.buffers import LastFrame, LayerBuffers, Snapshot, ViewBuffers
 from synpick_warp.stages.encoding.jpeg import JpegBuffers, JpegScratch, jpeg_sizes
@@ -106,11 +106,30 @@ def plan_memory(config: Config, device: wp.Device, writers: int = 1) -> list[Ter
         device: Device of the simulation; on a GPU the plan is for `with_enough_worlds`.
         writers: Writer processes; 0: nothing is written, views stay on the device.
     """
-    config = with_enough_worlds(config, device)
-    terms = [*_simulation(config), *_queue(config, device), *_images(config, device, writers > 0), *_perception(config, device)]
+    config, needs = with_enough_worlds(config, device), Needs.of(config)
+    host = _host_images(config, needs, device) if writers else None
+    terms = _declared(config, needs, device, host)
     if not device.is_cuda:
         terms = [Term(term.name, term.rows, term.settings, False, term.indexed) for term in terms]
-    return [*terms, *_queued_reports(config, device), *_newton(config, device), *(_host(config, device, writers) if writers else ())]
+    terms.append(_queued_reports(queue_slots(config, device), _world_sizes(config), _physics_kinds(config.trajectory, needs)))
+    terms += _newton(config.physics, config.bake.worlds, device)
+    if host is not None and device.is_cuda:
+        terms.append(_pinned(view_sizes(config, device), config.render.layers, config.cameras.resolution, host))
+    if writers:
+        # A writer is counted with one slot of shared memory: those of its queue get memory only once they are used.
+        row = ("shared memory of writers", (writers, needs.slot_bytes), "", writers * needs.slot_bytes)
+        terms.append(Term(f"images in {writers:,} writers", (row,), ("cameras.resolution", "bake.writers"), False, False))
+    return terms
+
+
+def _declared(config: Config, needs: Needs, device: wp.Device, host: HostImages | None) -> list[Term]:
+    """Terms of all device arrays that a bake declares; `host`: what is copied to the host, None: nothing is written."""
+    sizes, recorded = _world_sizes(config), _physics_kinds(config.trajectory, needs)
+    slots = queue_slots(config, device)
+    terms = [*_simulation(config.bake.worlds, sizes, recorded), _queue(slots, sizes), *_images(config, device, host)]
+    if may_pick(config.bake, config.splits):
+        terms.append(_perception(config.perception, config.bake.worlds, config.arrangement.max_objects, device))
+    return terms
 
 
 def free_memory(device: wp.Device | None) -> int:
@@ -153,12 +172,12 @@ def check_memory(config: Config, device: wp.Device, writers: int = 1, processes:
                 raise ConfigError(f"{name} would have {extents} elements, more than 32-bit indices reach; {_advice(term, config)}")
 
 
-def check_episodes(count: int, config: Config) -> None:
+def check_episodes(count: int, planned: int) -> None:
     """Refuse more episodes than this machine can list, before they are listed.
 
     Args:
         count: Episodes of this bake, or of its shard.
-        config: All settings.
+        planned: `bake.episodes`.
 
     Raises:
         ConfigError: The lists alone exceed the free memory.
@@ -167,7 +186,7 @@ def check_episodes(count: int, config: Config) -> None:
     if needed > free:
         raise ConfigError(
             f"the lists of {count:,} episodes take at least {_gib(needed)} of memory, but this machine has {_gib(free)} free; "
-            f"lower bake.episodes ({config.bake.episodes}), or bake a part with --shard"
+            f"lower bake.episodes ({planned}), or bake a part with --shard"
         )
 
 
@@ -208,10 +227,9 @@ def describe_arrays(config: Config) -> list[Row]:
 
     Newton's own arrays are not included. Body slots are counted at their maximum: the object capacity for each slot type.
     """
-    device = pick_device(config.bake.device)
+    device, needs = pick_device(config.bake.device), Needs.of(config)
     config = with_enough_worlds(config, device)
-    terms = [*_simulation(config), *_queue(config, device), *_images(config, device), *_perception(config, device)]
-    return [row for term in terms for row in term.rows]
+    return [row for term in _declared(config, needs, device, _host_images(config, needs, device)) for row in term.rows]
 
 
 def _term(name: str, settings: tuple[str, ...], groups: list[tuple[Any, dict[str, int], int]]) -> Term:
@@ -221,45 +239,42 @@ def _term(name: str, settings: tuple[str, ...], groups: list[tuple[Any, dict[str
 
 def _world_sizes(config: Config) -> dict[str, int]:
     """Extents of the dimensions of state and records."""
-    worlds = world_sizes(config, build.GRIPPER_BODIES + 2 * config.arrangement.max_objects)
+    objects = config.arrangement.max_objects
+    worlds = world_sizes(config.bake.worlds, objects, config.move.rounds, build.GRIPPER_BODIES + 2 * objects)
     return record_sizes(worlds, config.physics.steps_per_tick)
 
 
-def _physics_kinds(config: Config) -> tuple[type, ...]:
+def _physics_kinds(trajectory: Trajectory, needs: Needs) -> tuple[type, ...]:
     """Declarations of a tick's physics, if a format needs it."""
-    needed = any(kind.needs_physics for kind in load_exporter_classes(config.bake.formats))
-    return record_kinds(config.trajectory) if needed else ()
+    return record_kinds(trajectory) if needs.physics else ()
 
 
-def _simulation(config: Config) -> Iterator[Term]:
+def _simulation(worlds: int, sizes: dict[str, int], recorded: tuple[type, ...]) -> Iterator[Term]:
     """State and record of the worlds."""
-    sizes = _world_sizes(config)
     kinds = (WorldState, AttemptState, SealState, LastFrame, *_RECORD)
-    yield _term(f"the state of {config.bake.worlds:,} worlds", _WORLDS, [(kind, sizes, 1) for kind in kinds])
-    if recorded := _physics_kinds(config):
+    yield _term(f"the state of {worlds:,} worlds", _WORLDS, [(kind, sizes, 1) for kind in kinds])
+    if recorded:
         yield _term("the record of physics steps", _STEPS, [(kind, sizes, 1) for kind in recorded])
 
 
 def queue_slots(config: Config, device: wp.Device) -> int:
     """Ticks in the queue between physics and renderer, as `TickLoop` chooses them."""
-    rows = (row for kind in (*_RECORD, *_physics_kinds(config)) for row in memory_table(kind, _world_sizes(config)))
+    kinds = (*_RECORD, *_physics_kinds(config.trajectory, Needs.of(config)))
+    rows = (row for kind in kinds for row in memory_table(kind, _world_sizes(config)))
     return 1 + queue_lead(sum(row[3] for row in rows), device)
 
 
-def _queue(config: Config, device: wp.Device) -> Iterator[Term]:
+def _queue(slots: int, sizes: dict[str, int]) -> Term:
     """Snapshots of the queued ticks: arrays of all slots. Kernels index the part of a slot."""
-    slots = queue_slots(config, device)
-    rows = _ring_rows("queued", Snapshot, _world_sizes(config), slots)
-    yield Term(f"a queue of {slots:,} ticks", tuple(rows), _WORLDS, indexed=False)
+    return Term(f"a queue of {slots:,} ticks", tuple(_ring_rows("queued", Snapshot, sizes, slots)), _WORLDS, indexed=False)
 
 
-def _queued_reports(config: Config, device: wp.Device) -> Iterator[Term]:
+def _queued_reports(slots: int, sizes: dict[str, int], recorded: tuple[type, ...]) -> Term:
     """Reports of the queued ticks, on the host."""
-    slots, sizes, recorded = queue_slots(config, device), _world_sizes(config), _physics_kinds(config)
     rows = _ring_rows("reported", Snapshot, sizes, slots, REPORTED_SNAPSHOT)
     for kind in (WorldStatus, Observation, Plan, *recorded):
         rows += _ring_rows("reported", kind, sizes, slots)
-    yield Term(f"reports of {slots:,} ticks", tuple(rows), _STEPS if recorded else _WORLDS, on_device=False, indexed=False)
+    return Term(f"reports of {slots:,} ticks", tuple(rows), _STEPS if recorded else _WORLDS, on_device=False, indexed=False)
 
 
 def _ring_rows(prefix: str, kind: type, sizes: dict[str, int], slots: int, only: Collection[str] | None = None) -> list[Row]:
@@ -268,14 +283,14 @@ def _ring_rows(prefix: str, kind: type, sizes: dict[str, int], slots: int, only:
     return [(f"{prefix} {name}", shape, unit, size) for name, shape, unit, size in rows]
 
 
-def _images(config: Config, device: wp.Device, written: bool = True) -> Iterator[Term]:
-    """Images of a batch of views, and scratch of the renderer; what only writers need if they are `written`."""
+def _images(config: Config, device: wp.Device, host: HostImages | None) -> Iterator[Term]:
+    """Images of a batch of views, and scratch of the renderer; `host`: what is copied to the host, None: nothing is written."""
     room, ring = config.arrangement.max_objects, RING if device.is_cuda else 1
     width, height = config.cameras.resolution
     views = view_sizes(config, device) | body_sizes(room, width, height)
     name = f"images of {views['view']:,} views of {width:,}x{height:,} px"
     groups: list[tuple[Any, dict[str, int], int]] = [(ViewBuffers, views, ring)]
-    if written:
+    if host is not None:
         boundaries = boundary_sizes(views)
         groups += [(BoundaryBuffers, boundaries, ring), (BoundaryScratch, boundaries, 1)]
     groups += [(kind, views, 1) for kind in (VIEW_BODIES, GBUFFER, SHADED_IMAGE)]
@@ -292,10 +307,10 @@ def _images(config: Config, device: wp.Device, written: bool = True) -> Iterator
         groups += [(PATH_QUEUES, queue_sizes(config.render, width, height, views["view"], histories, device), 1)]
         sizes = history_sizes(config.render, width, height, histories)
         yield _term("light averaged over frames", _HISTORY, [(LIGHT_HISTORY, sizes, 1)])
-    if written and _host_images(config, device).jpeg_quality:
+    if host is not None and host.jpeg_quality:
         files = jpeg_sizes(views["view"], width, height)
         groups += [(JpegBuffers, files, ring), (JpegScratch, files, 1)]
-    if written and _host_images(config, device).depth_files:
+    if host is not None and host.depth_files:
         data = depth_sizes(views["view"], width, height)
         groups += [(DepthBuffers, data, ring), *((kind, data, 1) for kind in DEPTH_SCRATCH)]
     term = _term(name, _VIEWS, groups)
@@ -306,67 +321,52 @@ def _images(config: Config, device: wp.Device, written: bool = True) -> Iterator
     yield _term(f"backgrounds of {cameras:,} cameras of {width:,}x{height:,} px", _CAMERAS, [(GBUFFER, background, 1)])
 
 
-def _perception(config: Config, device: wp.Device) -> Iterator[Term]:
-    """Images, contours and votes of a batch of worlds that plan grasps."""
-    if not may_pick(config):
-        return
-    settings, room = config.perception, config.arrangement.max_objects
-    count = count_views(settings, config.bake.worlds, room, device)
+def _perception(settings: Perception, worlds: int, room: int, device: wp.Device) -> Term:
+    """Images, contours and votes of a batch of worlds that plan grasps, with `room` objects each."""
+    count = count_views(settings, worlds, room, device)
     sizes = perception_sizes(settings, room, count)
     groups: list[tuple[Any, dict[str, int], int]] = [(kind, sizes, 1) for kind in SCRATCH] + [(GBUFFER, sizes | {"view": 1}, 1)]
     groups += [(kind, plan_sizes(settings, room, count), 1) for kind in (VoteArrays, CYCLES)]
     width, height = settings.resolution
-    yield _term(f"perception of {count:,} worlds at {width:,}x{height:,} px", _PERCEPTION, groups)
+    return _term(f"perception of {count:,} worlds at {width:,}x{height:,} px", _PERCEPTION, groups)
 
 
-def _newton(config: Config, device: wp.Device) -> Iterator[Term]:
+def _newton(physics: Physics, worlds: int, device: wp.Device) -> Iterator[Term]:
     """Contacts, pairs and constraint rows of Newton's collision pipeline and solver."""
-    worlds = config.bake.worlds
     for name, setting, cpu, gpu in _NEWTON:
-        capacity = getattr(config.physics, setting)
+        capacity = getattr(physics, setting)
         size = worlds * capacity * (gpu if device.is_cuda else cpu)
         yield Term(name, ((name, (worlds * capacity,), "", size),), (f"physics.{setting}", "bake.worlds"), device.is_cuda)
 
 
-def _host(config: Config, device: wp.Device, writers: int) -> Iterator[Term]:
-    """Host memory besides that of a CPU's arrays: pinned copies of images, shared memory of writers.
-
-    A writer is counted with one slot of shared memory: those of its queue get memory only once they are used.
-    """
-    if device.is_cuda:
-        views, host = view_sizes(config, device), _host_images(config, device)
-        copied = [item.name for item in fields(ViewBuffers) if item.name not in host.on_demand]
-        groups = memory_table(ViewBuffers, views, copied)
-        groups += memory_table(LayerBuffers, views, config.render.layers)
-        if host.jpeg_quality:
-            groups += memory_table(JpegBuffers, jpeg_sizes(views["view"], *config.cameras.resolution))
-        if host.depth_files:
-            groups += memory_table(DepthBuffers, depth_sizes(views["view"], *config.cameras.resolution))
-        rows = tuple((f"pinned {name}", shape, unit, size) for name, shape, unit, size in RING * groups)
-        yield Term(f"pinned copies of {views['view']:,} views", rows, _VIEWS, False)
-    size = slot_bytes(load_exporter_classes(config.bake.formats), config)
-    row = ("shared memory of writers", (writers, size), "", writers * size)
-    yield Term(f"images in {writers:,} writers", (row,), ("cameras.resolution", "bake.writers"), False, False)
+def _pinned(views: dict[str, int], layers: tuple[str, ...], resolution: tuple[int, int], host: HostImages) -> Term:
+    """Pinned copies of a GPU's images on the host, of `view_sizes`."""
+    copied = [item.name for item in fields(ViewBuffers) if item.name not in host.on_demand]
+    groups = memory_table(ViewBuffers, views, copied)
+    groups += memory_table(LayerBuffers, views, layers)
+    if host.jpeg_quality:
+        groups += memory_table(JpegBuffers, jpeg_sizes(views["view"], *resolution))
+    if host.depth_files:
+        groups += memory_table(DepthBuffers, depth_sizes(views["view"], *resolution))
+    rows = tuple((f"pinned {name}", shape, unit, size) for name, shape, unit, size in RING * groups)
+    return Term(f"pinned copies of {views['view']:,} views", rows, _VIEWS, False)
 
 
-def _host_images(config: Config, device: wp.Device) -> HostImages:
+def _host_images(config: Config, needs: Needs, device: wp.Device) -> HostImages:
     """What a bake copies to the host."""
-    kinds = load_exporter_classes(config.bake.formats)
-    return host_images(config, device, any(kind.needs_images for kind in kinds), any(kind.writes_depth for kind in kinds))
+    return host_images(config.bop, config.cameras.resolution[1], device, needs.images, needs.depth_files)
 
 
 def _advice(term: Term, config: Config) -> str:
     """Advice to lower the setting that exceeds its default by the largest factor, with its value."""
-    key = max(term.settings, key=lambda name: _amount(name, config) / max(1, _amount(name, Config())))
-    section, _, name = key.partition(".")
-    value = getattr(getattr(config, section), name)
+    default = Config()
+    key = max(term.settings, key=lambda name: _amount(config.value(name)) / max(1, _amount(default.value(name))))
+    value = config.value(key)
     return f"lower {key} ({format_value(value) if not _is_list(value) else f'{len(value):,} cameras'})"
 
 
-def _amount(key: str, config: Config) -> int:
-    """Size of a setting: pixels of a resolution, count of cameras, the number itself."""
-    section, _, name = key.partition(".")
-    value = getattr(getattr(config, section), name)
+def _amount(value: Any) -> int:
+    """Size of a setting by its value: pixels of a resolution, count of cameras, the number itself."""
     return len(value) if _is_list(value) else math.prod(value) if isinstance(value, tuple) else value
 
 

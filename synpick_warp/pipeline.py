@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -13,15 +12,15 @@ import numpy as np
 from synpick_warp.attempts import EpisodeRecord
 from synpick_warp.codes import Phase
 from synpick_warp.configs.schema import Config
-from synpick_warp.configs.splits import plan_shard
+from synpick_warp.configs.splits import DataLayout
 from synpick_warp.dataset.digests import digest_inputs
 from synpick_warp.dataset.file_names import describe_strays
 from synpick_warp.dataset.manifest import committed_episodes, episode_entry, read_entry
 from synpick_warp.dataset.writing import OutputFolder, commit_episode, finalize_data_set
 from synpick_warp.episodes import BakeSummary, episode_end, episode_row, is_resampled, remedy
 from synpick_warp.errors import OutputError
-from synpick_warp.exporters.base import ExportContext, Exporter
-from synpick_warp.exporters.registry import Exporters, aborting, load_exporter_classes, slot_bytes
+from synpick_warp.exporters.base import ExportContext
+from synpick_warp.exporters.registry import Exporters, Needs, aborting
 from synpick_warp.exporters.writing.pool import WriterPool
 from synpick_warp.factory.assembly import Factory, build_factory
 from synpick_warp.frames import EpisodeEnd, FrameBatch
@@ -71,10 +70,10 @@ def run_bake(
         SynpickError: An error that the user can correct; committed episodes stay, and the same bake resumes.
     """
     if devices:
-        config = replace(config, bake=replace(config.bake, device=pick_devices(devices)[0]))
-    kinds = load_exporter_classes(config.bake.formats)
-    planned = plan_shard(config, splits, shard)
-    check_episodes(sum(map(len, planned)), config)
+        config = config.with_values({"bake.device": pick_devices(devices)[0]})
+    needs = Needs.of(config)
+    planned = DataLayout.of(config).plan_shard(splits, shard)
+    check_episodes(sum(map(len, planned)), config.bake.episodes)
     with OutputFolder(out, config, [episode for each in planned for episode in each]) as output:
         summary = BakeSummary(len(output.episodes))
         for episode in output.committed:
@@ -89,7 +88,7 @@ def run_bake(
                 names = pick_processes(config, devices, len(output.remaining)) if devices else (config.bake.device,)
                 if advice := advise_processes(config, names, len(output.remaining)):
                     progress.note(advice)
-                _fill(config, output, kinds, names, summary, progress)
+                _fill(config, output, needs, names, summary, progress)
         except OutputError as error:
             if out.exists():
                 raise
@@ -97,24 +96,22 @@ def run_bake(
     return summary
 
 
-def _fill(
-    config: Config, output: OutputFolder, kinds: tuple[type[Exporter], ...], names: Sequence[str], summary: BakeSummary, progress: Progress
-) -> None:
+def _fill(config: Config, output: OutputFolder, needs: Needs, names: Sequence[str], summary: BakeSummary, progress: Progress) -> None:
     """Generate the remaining episodes, then the indices over all."""
     factory = None
     if len(names) > 1:
-        bake_on_devices(config, output, kinds, names, _DEVICE_PROGRAM, summary, progress)
+        bake_on_devices(config, output, needs, names, _DEVICE_PROGRAM, summary, progress)
     elif output.remaining:
         with scope("build"):
-            factory = build_factory(config, progress, output.remaining, *_needs(kinds), longest_first=True)
+            factory = build_factory(config, progress, output.remaining, needs.physics, needs.images, longest_first=True)
     else:
         prepare_folder(
-            output, kinds, load_catalog(config, report=progress.note), load_lights(config.bake.lights, progress.note, config.objects.strict)
+            output, needs, load_catalog(config, report=progress.note), load_lights(config.bake.lights, progress.note, config.objects.strict)
         )
-    with WriterPool(count_writers(config), slot_bytes(kinds, config), output.lock) as pool:
+    with WriterPool(count_writers(config), needs.slot_bytes, output.lock) as pool:
         started = time.perf_counter()
         if factory is not None:
-            exporters = Exporters(kinds, ExportContext(output.out, config, factory.catalog, factory.cameras, factory.lights, pool))
+            exporters = Exporters(needs.classes, ExportContext(output.out, config, factory.catalog, factory.cameras, factory.lights, pool))
             with aborting(pool, exporters):
                 output.prepare(exporters, digest_inputs(factory.catalog, factory.lights), pool)
                 _Run(config, factory, exporters, partial(output.commit, exporters, pool), summary, progress, StopRequest()).run()
@@ -124,15 +121,10 @@ def _fill(
         if not summary.stopped:
             progress.stage("finishing files")
             with scope("finalize"):
-                finalize_data_set(output.out, config, kinds, pool)
-            if strays := describe_strays(output.out, config, committed_episodes(output.out)):
+                finalize_data_set(output.out, config, needs.classes, pool)
+            if strays := describe_strays(output.out, DataLayout.of(config), committed_episodes(output.out)):
                 progress.note(strays)
         summary.wall_seconds += time.perf_counter() - started
-
-
-def _needs(kinds: Sequence[type[Exporter]]) -> tuple[bool, bool]:
-    """Whether any format needs physics, and images."""
-    return any(kind.needs_physics for kind in kinds), any(kind.needs_images for kind in kinds)
 
 
 def generate_share(share: Share, handles: Sequence[int], link: BakeLink) -> BakeSummary:
@@ -146,13 +138,13 @@ def generate_share(share: Share, handles: Sequence[int], link: BakeLink) -> Bake
     config, summary = share.config, BakeSummary(len(share.episodes))
     if config.bake.device == "cpu":
         limit_threads(max(1, count_cores() // share.processes))
-    kinds = load_exporter_classes(config.bake.formats)
+    needs = Needs.of(config)
     with explain_shortage(config):
-        factory = build_factory(config, link, share.episodes, *_needs(kinds), processes=share.processes)
-        with WriterPool(config.bake.writers, slot_bytes(kinds, config), *handles) as pool:
+        factory = build_factory(config, link, share.episodes, needs.physics, needs.images, processes=share.processes)
+        with WriterPool(config.bake.writers, needs.slot_bytes, *handles) as pool:
             link.writers = pool.pids()
             started = time.perf_counter()
-            exporters = Exporters(kinds, ExportContext(share.out, config, factory.catalog, factory.cameras, factory.lights, pool))
+            exporters = Exporters(needs.classes, ExportContext(share.out, config, factory.catalog, factory.cameras, factory.lights, pool))
             with aborting(pool, exporters):
                 _Run(config, factory, exporters, partial(commit_episode, share.out, exporters, pool), summary, link, link).run()
                 pool.wait()
@@ -177,7 +169,9 @@ class _Run:
         self.stop = stop
         self.config, self.factory, self.exporters = config, factory, exporters
         self.commit, self.summary, self.progress = commit, summary, progress
-        self.meter = ThroughputMeter(config, summary, progress)
+        self.meter = ThroughputMeter(len(config.cameras.positions), summary, progress)
+        self.layout = DataLayout.of(config)
+        self.tick_time = config.physics.step * config.physics.steps_per_tick
 
     def run(self) -> None:
         """Tick until no episode remains or a signal requests a stop."""
@@ -196,8 +190,7 @@ class _Run:
 
     def _hand_over(self, report: TickReport, snapshot: Snapshot, ticks: TickLoop) -> None:
         """Export a tick: write its frames, render its views, write views and episode ends; enqueue physics between parts of these."""
-        physics = self.config.physics
-        batch = tick_batch(report, self.factory.log.object_ids, physics.step * physics.steps_per_tick)
+        batch = tick_batch(report, self.factory.log.object_ids, self.tick_time)
         for first in range(0, len(batch), MAX_TICK_FRAMES):
             frames = np.arange(first, min(first + MAX_TICK_FRAMES, len(batch)))
             with scope("hand over ticks"):
@@ -227,12 +220,12 @@ class _Run:
                 self._end(report, world, records[int(report.column("episode")[world])])
 
     def _end(self, report: TickReport, world: int, record: EpisodeRecord) -> None:
-        row = episode_row(self.config, report, world, record)
-        end = episode_end(self.config, row, record)
+        row, tries = episode_row(self.layout, self.tick_time, report, world, record), self.config.settle.tries
+        end = episode_end(row, record, tries)
         advice = remedy(self.factory.simulation.config, row.ending)
         if advice:
             self.summary.remedies[row.ending] = advice
-        if is_resampled(self.config, row):
+        if is_resampled(row, tries):
             self.summary.take_resample(row.ending)
             note = f"episode {row.episode}, arrangement {row.arrangement + 1}: {row.ending.sentence}"
             self.progress.note(note + (f"; {advice}" if advice else ""))

@@ -257,4 +257,5 @@ def test_worlds_do_not_disturb_each_other(device, plans):
     ],
 )
 def test_which_bakes_may_pick(mode, mix, expected):
-    assert may_pick(settings(bake__mode=mode, bake__mix=mix)) is expected
+    config = settings(bake__mode=mode, bake__mix=mix)
+    assert may_pick(config.bake, config.splits) is expected

@@ -62,6 +62,10 @@ class FakeRenderer:
             array.assign(values)
 
 
+def batch_of(config: Config, device: Any) -> int:
+    return views_per_batch(config.render, config.cameras, config.bake.worlds, device)
+
+
 def config_of(**overrides: object):
     return settings(bake__worlds=WORLDS, arrangement__max_objects=ROOM, cameras__resolution=[8, 6], **overrides)
 
@@ -145,7 +149,7 @@ def test_layers_come_if_they_are_asked_for_each_with_its_views(device):
 def test_layers_make_batches_smaller():
     gpu = SimpleNamespace(is_cuda=True)
     large = {"bake__worlds": 1000, "cameras__resolution": [1920, 1080]}
-    count = views_per_batch(settings(**large, render__layers=list(LAYERS)), gpu)
+    count = batch_of(settings(**large, render__layers=list(LAYERS)), gpu)
     pixel = stream.PIXEL_BYTES + 12 + 3 + 12 + 2 + 8 + 12 + 2
     assert count * 1920 * 1080 * pixel <= stream.BATCH_BYTES < (count + 1) * 1920 * 1080 * pixel
 
@@ -249,18 +253,18 @@ def test_ticks_follow_each_other_without_a_gap(device):
 
 def test_batch_sizes():
     cpu = SimpleNamespace(is_cuda=False)
-    assert views_per_batch(config_of(), cpu) == 3
-    assert views_per_batch(config_of(render__views_per_batch=17), cpu) == 17
+    assert batch_of(config_of(), cpu) == 3
+    assert batch_of(config_of(render__views_per_batch=17), cpu) == 17
     gpu = SimpleNamespace(is_cuda=True)
-    assert views_per_batch(config_of(), gpu) == 3 * WORLDS
+    assert batch_of(config_of(), gpu) == 3 * WORLDS
     huge = settings(bake__worlds=1000, cameras__resolution=[1920, 1080])
-    count = views_per_batch(huge, gpu)
+    count = batch_of(huge, gpu)
     assert count * 1920 * 1080 * stream.PIXEL_BYTES <= stream.BATCH_BYTES < (count + 1) * 1920 * 1080 * stream.PIXEL_BYTES
-    assert views_per_batch(settings(cameras__resolution=[8192, 8192]), gpu) == 1
+    assert batch_of(settings(cameras__resolution=[8192, 8192]), gpu) == 1
 
 
 def test_view_sizes_are_those_of_the_buffers(device):
-    views = views_per_batch(config_of(), device)
+    views = batch_of(config_of(), device)
     buffers = allocate(ViewBuffers, view_sizes(config_of(), device), device)
     assert buffers.color.shape == (views, 6, 8)
     assert buffers.pixels.shape == (views, ROOM, 3)
@@ -284,7 +288,8 @@ def test_main_lights_are_told_in_the_world_and_maps_without_any_as_zero(device):
 
 
 def new_record(device) -> TickRecord:
-    sizes = worlds.world_sizes(config_of(), 4)
+    config = config_of()
+    sizes = worlds.world_sizes(config.bake.worlds, config.arrangement.max_objects, config.move.rounds, 4)
     return TickRecord(*(allocate(kind, sizes, device) for kind in (Snapshot, worlds.WorldStatus, Observation, Plan)))
 
 
@@ -392,7 +397,7 @@ def test_files_and_lists_stand_for_images(device):
 )
 def test_what_is_copied_to_the_host(cuda, needs_images, settings_, expected):
     config = settings(**({"cameras__resolution": [640, 360]} | settings_))
-    assert host_copies.host_images(config, SimpleNamespace(is_cuda=cuda), needs_images, True) == expected  # type: ignore[arg-type]
+    assert host_copies.host_images(config.bop, config.cameras.resolution[1], SimpleNamespace(is_cuda=cuda), needs_images, True) == expected  # type: ignore[arg-type]
 
 
 def test_the_largest_lists_are_no_larger_than_images():

@@ -36,7 +36,7 @@ from synpick_warp.cli.verify import verify
 from synpick_warp.configs.check import describe_allowed
 from synpick_warp.configs.load import COMMAND_LINE, DEFAULT_PRESET, load_config, parse_assignment, preset_names, sections, settings_of
 from synpick_warp.configs.schema import Config
-from synpick_warp.configs.splits import plan_shard
+from synpick_warp.configs.splits import DataLayout
 from synpick_warp.configs.write import config_to_toml
 from synpick_warp.errors import CatalogError, ConfigError, LightError, SynpickError
 from synpick_warp.system.garbage import collection_paused
@@ -159,7 +159,7 @@ def bake(
     names = parse_splits(split)
     resolved = _resolve(config, given, resolution, set_, splits=split is not None)
     part = parse_shard(shard) if shard is not None else (0, 1)
-    plan_shard(resolved, names, part, "--shard")
+    DataLayout.of(resolved).plan_shard(names, part, "--shard")
     if out is None:
         out, choice = choose_output(resolved)
         print(choice, flush=True)
@@ -225,7 +225,7 @@ def warmup(
     names = None if formats is None else [name.strip() for name in formats.split(",")]
     given = {"bake.mode": mode, "bake.device": device, "bake.models": models, "bake.lights": lights, "bake.formats": names}
     resolved = _resolve(config, given, resolution, set_)
-    _check_inputs(resolved)
+    _check_inputs(resolved.bake.models, resolved.bake.lights)
     from synpick_warp.cli.display import make_console, make_progress
     from synpick_warp.factory.warmup import check_caches, warm_up
 
@@ -280,6 +280,7 @@ def _run(arguments: list[str]) -> int:
     except StreamError:
         return EXIT_MISTAKE
     except (SynpickError, cyclopts.CycloptsError) as error:
+        print(*getattr(error, "__notes__", ()), sep="", end="", file=sys.stderr)  # The traceback of a fault of ours, see `TaskError`.
         print(f"{NAME}: error: {one_line(str(error))}", file=sys.stderr)
         return EXIT_MISTAKE
     except KeyboardInterrupt:
@@ -335,14 +336,13 @@ def _bake_profiled(config: Config, out: Path, shard: tuple[int, int], splits: Se
     return code
 
 
-def _check_inputs(config: Config) -> None:
+def _check_inputs(models: str, lights: str) -> None:
     """Check that the folders of models and lights exist.
 
     Raises:
         CatalogError: There are no models.
         LightError: There are no lights.
     """
-    models, lights = config.bake.models, config.bake.lights
     if models and not os.path.isdir(models):
         raise CatalogError(f"there is no models folder {models}; --models takes a folder of BOP models or of PLY, OBJ, glTF or STL meshes")
     if lights and not os.path.isdir(lights):
@@ -360,7 +360,7 @@ def _bake(config: Config, out: Path, shard: tuple[int, int], splits: Sequence[st
         pick_devices(devices)
     else:
         pick_device(config.bake.device)
-    _check_inputs(config)
+    _check_inputs(config.bake.models, config.bake.lights)
     check_output_folder(out)
     with collection_paused():
         from synpick_warp.pipeline import run_bake

@@ -14,7 +14,7 @@ from rich.table import Table
 
 from synpick_warp import __version__
 from synpick_warp.configs.schema import Config
-from synpick_warp.configs.splits import plan_episodes
+from synpick_warp.configs.splits import DataLayout
 from synpick_warp.errors import DeviceError
 from synpick_warp.scenes.collision.shapes import default_cache_dir
 from synpick_warp.system.caches import KERNEL_VARIABLE, USER_VARIABLE, find_fault
@@ -51,7 +51,7 @@ def memory_report(config: Config) -> Table:
     from synpick_warp.memory_plan import describe_memory
     from synpick_warp.scheduling.sizes import count_writers, fit_to_device, without_pictures
 
-    episodes = sum(map(len, plan_episodes(config)))
+    episodes = sum(map(len, DataLayout.of(config).plan()))
     config = fit_to_device(without_pictures(config), pick_device(config.bake.device), episodes, count_writers(config))
     rows = describe_memory(config)
     width, height = config.cameras.resolution

@@ -186,9 +186,8 @@ def _check_formats(data: DataSet, first: SceneFiles, formats: Sequence[str]) -> 
         raise ConfigError(f"{data.folder} has {data.camera_count} sensors; convert takes data sets of one camera a scene")
     if len(found.splits) > 1:
         raise ConfigError(f"{data.folder} has the splits {', '.join(found.splits)}; choose one by --split")
-    base = load_config()
-    base = dataclasses.replace(base, bop=dataclasses.replace(base.bop, coco=False))
-    contents = {name: set(contents_of(name, base)) for name in convertible()}
+    bop = dataclasses.replace(load_config().bop, coco=False)
+    contents = {name: set(contents_of(name, bop)) for name in convertible()}
     for name in formats:
         if name not in contents:
             raise ConfigError(f"--to names {name}; allowed: {', '.join(each for each in contents if contents[each] <= _IMAGES)}")

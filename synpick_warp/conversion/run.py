@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Collection, Sequence
 from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
 from synpick_warp.codes import Ending
-from synpick_warp.configs.schema import CLASSIC, Config
+from synpick_warp.configs.schema import CLASSIC
 from synpick_warp.conversion.context import StoredContext
 from synpick_warp.conversion.found import convert_found
 from synpick_warp.conversion.source import Source
@@ -59,11 +58,11 @@ def convert(folder: Path, out: Path, formats: Sequence[str], processes: int, rep
     if split is not None:
         raise ConfigError("--split is for data sets that no bake wrote; those of a bake are converted as a whole")
     source = Source(folder)
-    check_formats(formats, source.config, folder)
-    contents: set[Content] = {content for name in formats for content in contents_of(name, source.config)}
+    check_formats(formats, source.config.bop.layout, source.config.bake.formats, folder)
+    contents: set[Content] = {content for name in formats for content in contents_of(name, source.config.bop)}
     source.check_contents(contents)
     _check_apart(folder, out)
-    config = dataclasses.replace(source.config, bake=dataclasses.replace(source.config.bake, formats=tuple(formats)))
+    config = source.config.with_values({"bake.formats": tuple(formats)})
     classes = load_exporter_classes(formats)
     with OutputFolder(out, config, source.episodes) as output:
         resumed = len(output.committed)
@@ -105,24 +104,25 @@ def _convert_episodes(
         exporters.end_episode(end, partial(commit, end))
 
 
-def check_formats(names: Sequence[str], config: Config, folder: Path) -> None:
+def check_formats(names: Sequence[str], layout: str, present: Collection[str], folder: Path) -> None:
     """Check that a data set can be converted to these formats.
 
     Args:
         names: Names of formats.
-        config: Settings of the data set.
+        layout: `bop.layout` of the data set.
+        present: Its formats.
         folder: Its folder.
 
     Raises:
         ConfigError: A format is unknown, cannot be converted to, or is there already; or the settings are those of a bake only.
     """
-    if config.bop.layout != CLASSIC:
-        raise ConfigError(f'{folder} has bop.layout = "{config.bop.layout}", which convert does not read; bake the other formats')
+    if layout != CLASSIC:
+        raise ConfigError(f'{folder} has bop.layout = "{layout}", which convert does not read; bake the other formats')
     for name in names:
         if name not in convertible():
             why = f"; no other format has the physics of {name}" if name in FORMAT_TABLE else ""
             raise ConfigError(f"--to names {name}; allowed: {', '.join(convertible())}{why}")
-        if name in config.bake.formats:
+        if name in present:
             raise ConfigError(f"--to names {name}, which {folder} has already; copy the folder")
 
 

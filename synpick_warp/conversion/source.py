@@ -11,6 +11,7 @@ from typing import Any
 
 from synpick_warp.codes import Ending
 from synpick_warp.configs.schema import Config
+from synpick_warp.configs.splits import DataLayout
 from synpick_warp.conversion.scenes import StoredSceneFiles
 from synpick_warp.conversion.trajectories import check_trajectory, read_ticks
 from synpick_warp.dataset.annotations import ADVICE, check_content
@@ -112,7 +113,7 @@ class Source:
         if entry is None:
             raise DatasetError(f"{self.folder / episode_entry(index)}.json is missing; resume the bake")
         row: dict[str, Any] = entry["row"]
-        check_frames(self.folder, self.config, index, row["frames"])
+        check_frames(self.folder, DataLayout.of(self.config), index, row["frames"])
         lines = tuple(json.dumps(attempt) + "\n" for attempt in entry["attempts"])
         return EpisodeEnd(index, row["arrangement"], row["frames"], int(Ending[row["ending"].upper()]), row, lines)
 
@@ -124,7 +125,7 @@ class Source:
             OSError: A file cannot be written.
         """
         known = read_checksums(self.folder, CONSTANTS)
-        check_file_names(self.folder, CONSTANTS, known, self.config)
+        check_file_names(self.folder, CONSTANTS, known, DataLayout.of(self.config))
         listed = [Path(name) for name in known]
         for name in names:
             files = [path for path in listed if path == name or name in path.parents]

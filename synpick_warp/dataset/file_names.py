@@ -12,32 +12,32 @@ import re
 from collections.abc import Iterable
 from pathlib import Path
 
-from synpick_warp.configs.schema import Config
+from synpick_warp.configs.splits import DataLayout
 from synpick_warp.dataset.manifest import CONSTANTS, MAX_SHOWN, entry_advice
 from synpick_warp.errors import DatasetError
 from synpick_warp.exporters.formats import FORMAT_TABLE
 
 
 @functools.lru_cache(maxsize=4)
-def _pattern(config: Config, entry: Path) -> re.Pattern[str]:
-    formats = [FORMAT_TABLE[name] for name in dict.fromkeys(config.bake.formats)]
-    names = (row.constants if entry == CONSTANTS else row.episode(config, int(entry.name)) for row in formats)
+def _pattern(layout: DataLayout, entry: Path) -> re.Pattern[str]:
+    formats = [FORMAT_TABLE[name] for name in dict.fromkeys(layout.formats)]
+    names = (row.constants if entry == CONSTANTS else row.episode(layout, int(entry.name)) for row in formats)
     return re.compile("|".join(dict.fromkeys(names)))
 
 
-def check_file_names(folder: Path, entry: Path, names: Iterable[str], config: Config) -> None:
+def check_file_names(folder: Path, entry: Path, names: Iterable[str], layout: DataLayout) -> None:
     """Check that a checksum list names only files that the formats of a data set write.
 
     Args:
         folder: The data set.
         entry: Manifest entry of the list: of the constants, or of an episode.
         names: Names in the list, relative to the data set.
-        config: Settings of the data set.
+        layout: Layout of the data set.
 
     Raises:
         DatasetError: It names another file.
     """
-    matches = _pattern(config, entry).fullmatch
+    matches = _pattern(layout, entry).fullmatch
     foreign = next((name for name in names if not matches(name)), None)
     if foreign is not None:
         raise DatasetError(
@@ -49,22 +49,22 @@ _PARTS = (("coco", "coco/parts"), ("lerobot", "lerobot/parts"))
 """Formats whose indices are joined from a file an episode or scene, and the folder of these."""
 
 
-def describe_strays(folder: Path, config: Config, episodes: Iterable[int]) -> str:
+def describe_strays(folder: Path, layout: DataLayout, episodes: Iterable[int]) -> str:
     """Name what lies beside the parts that indices are joined from and belongs to no committed episode.
 
     Args:
         folder: The data set.
-        config: Its settings.
+        layout: Its layout.
         episodes: Its committed episodes.
 
     Returns:
         A sentence; empty: there is nothing.
     """
     strays = []
-    cameras, known = len(config.cameras.positions), set(episodes)
+    known = set(episodes)
     for name, place in _PARTS:
-        if name in config.bake.formats and (folder / place).is_dir():
-            suffix, count = (".jsonl", cameras) if name == "coco" else (".json", 1)
+        if name in layout.formats and (folder / place).is_dir():
+            suffix, count = (".jsonl", layout.cameras) if name == "coco" else (".json", 1)
             parts = {f"{number:06d}{suffix}" for episode in known for number in range(count * episode, count * (episode + 1))}
             strays += sorted(f"{place}/{entry.name}" for entry in os.scandir(folder / place) if entry.name not in parts)
     if not strays:

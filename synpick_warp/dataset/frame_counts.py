@@ -10,7 +10,6 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from synpick_warp.configs.splits import bop_folder, bop_scene
 from synpick_warp.dataset.annotations import ADVICE
 from synpick_warp.errors import DatasetError
 from synpick_warp.exporters.formats import part_files
@@ -18,7 +17,7 @@ from synpick_warp.exporters.trajectory.arrays import EPISODES, STORE
 from synpick_warp.inputs.files import describe_bytes
 
 if TYPE_CHECKING:
-    from synpick_warp.configs.schema import Config
+    from synpick_warp.configs.splits import DataLayout
 
 _HARMLESS = 1000
 """Number of frames up to which nothing is compared: reading finds what is missing, and says so better."""
@@ -28,19 +27,19 @@ _TIME = 0.125
 """The same of the times in a trajectory: zstd's highest level makes one byte of five of these float64."""
 
 
-def check_frames(folder: Path, config: Config | None, episode: int, frames: int) -> None:
+def check_frames(folder: Path, layout: DataLayout | None, episode: int, frames: int) -> None:
     """Compare an episode's number of frames with the sizes of its files in every format.
 
     Args:
         folder: The data set.
-        config: Its settings; None: there are none, as in a lone trajectory store.
+        layout: Its layout; None: it has no settings, as a lone trajectory store.
         episode: Index of the episode.
         frames: Number of frames that its record states.
 
     Raises:
         DatasetError: A file is too small for so many.
     """
-    for path, size, least in _sizes(folder, config, episode) if frames > _HARMLESS else ():
+    for path, size, least in _sizes(folder, layout, episode) if frames > _HARMLESS else ():
         if size / least < frames:
             raise DatasetError(
                 f"the record of episode {episode} in {folder} counts {frames:,} frames, but {path.relative_to(folder)} has"
@@ -48,31 +47,31 @@ def check_frames(folder: Path, config: Config | None, episode: int, frames: int)
             )
 
 
-def check_listed_frames(folder: Path, config: Config, row: Mapping[str, Any], names: Mapping[str, str]) -> None:
+def check_listed_frames(folder: Path, layout: DataLayout, row: Mapping[str, Any], names: Mapping[str, str]) -> None:
     """Compare an episode's row with the images that its checksum list names.
 
     Raises:
         DatasetError: It counts more or fewer.
     """
     episode, frames = row["episode"], row["frames"]
-    scene, suffix = bop_scene(config, episode, 0)
-    for place in (f"{bop_folder(config, episode)}/{scene:06d}/rgb{suffix}/", f"coco/images/{scene:06d}/"):
+    scene, suffix = layout.scene(episode, 0)
+    for place in (f"{layout.folder(episode)}/{scene:06d}/rgb{suffix}/", f"coco/images/{scene:06d}/"):
         count = sum(name.startswith(place) for name in names)
         if count and count != frames:
             raise DatasetError(f"the record of episode {episode} in {folder} counts {frames:,} frames, but {place} has {count:,}; {ADVICE}")
 
 
-def _sizes(folder: Path, config: Config | None, episode: int) -> Iterator[tuple[Path, int, float]]:
+def _sizes(folder: Path, layout: DataLayout | None, episode: int) -> Iterator[tuple[Path, int, float]]:
     """File or folder that holds something of every frame, its size, and the least size of a frame [bytes]; only what is there."""
     name = f"{episode:06d}"
     times = folder / STORE / EPISODES / name / "ticks" / "time"
     if times.is_dir():
         yield times, sum(_size(path) for path in times.iterdir() if path.name.startswith("c")), _TIME
-    parts = part_files(None if config is None else len(config.cameras.positions))
+    parts = part_files(None if layout is None else layout.cameras)
     places = [(folder / part.file(episode), part.frame_bytes) for part in parts]
-    if config is not None:
-        cameras, (scene, sensor) = len(config.cameras.positions), bop_scene(config, episode, 0)
-        split = folder / bop_folder(config, episode)
+    if layout is not None:
+        cameras, (scene, sensor) = layout.cameras, layout.scene(episode, 0)
+        split = folder / layout.folder(episode)
         places.append((split / f"{scene:06d}" / f"scene_camera{sensor}.json", _CAMERA))
         first = split.with_name(f"{split.name}_web") / f"shard-{cameras * episode:06d}.tar"
         if first.is_file():

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple
 
 from synpick_warp.configs.schema import Config
-from synpick_warp.configs.splits import plan_episodes
+from synpick_warp.configs.splits import DataLayout
 from synpick_warp.configs.write import config_to_toml
 from synpick_warp.dataset.file_names import check_file_names, describe_strays
 from synpick_warp.dataset.manifest import (
@@ -37,8 +37,8 @@ from synpick_warp.dataset.manifest import (
 )
 from synpick_warp.dataset.writing import finalize_data_set, lock_folder
 from synpick_warp.errors import DatasetError
-from synpick_warp.exporters.base import Exporter
-from synpick_warp.exporters.registry import load_exporter_classes, shared_files, slot_bytes
+from synpick_warp.exporters.base import SharedFiles
+from synpick_warp.exporters.registry import Needs, shared_files
 from synpick_warp.exporters.writing.checksums import open_regular
 from synpick_warp.exporters.writing.files import MANIFEST_FILE, check_output_folder, output_error, write_atomically
 from synpick_warp.exporters.writing.pool import WriterPool
@@ -81,7 +81,8 @@ def merge(parts: Sequence[Path], out: Path) -> Merged:
             raise DatasetError(f"{part} was made with other settings than {parts[0]}: {said}; only parts of one data set can be merged")
     _check_folders(parts, out)
     config = _config(parts, manifest)
-    sources = _sources(parts, config)
+    layout = DataLayout.of(config)
+    sources = _sources(parts, layout)
     check_output_folder(out)
     if (out / MANIFEST_FILE).exists():
         raise DatasetError(f"{out} is already a data set; --out takes a new or an empty folder")
@@ -96,8 +97,8 @@ def merge(parts: Sequence[Path], out: Path) -> Merged:
         for lock in locks:
             os.close(lock)
     there = set(committed_episodes(out))
-    missing = [index for each in plan_episodes(config) for index in each if index not in there]
-    return Merged(len(there), missing, [line for part in parts if (line := describe_strays(part, config, committed_episodes(part)))])
+    missing = [index for each in layout.plan() for index in each if index not in there]
+    return Merged(len(there), missing, [line for part in parts if (line := describe_strays(part, layout, committed_episodes(part)))])
 
 
 def _check_folders(parts: Sequence[Path], out: Path) -> None:
@@ -121,13 +122,13 @@ def _check_folders(parts: Sequence[Path], out: Path) -> None:
         raise DatasetError(f"a part or --out cannot be read: {getattr(error, 'strerror', None) or error}") from None
 
 
-def _sources(parts: Sequence[Path], config: Config) -> dict[Path, Path]:
+def _sources(parts: Sequence[Path], layout: DataLayout) -> dict[Path, Path]:
     """Choose the part that each manifest entry is taken from: entry -> part. Reads, and so validates, all entries and checksum lists."""
     sources: dict[Path, Path] = {}
     for part in parts:
         for entry in (CONSTANTS, *map(episode_entry, committed_episodes(part))):
             checksums, known = read_checksums(part, entry), sources.setdefault(entry, part)
-            check_file_names(part, entry, checksums, config)
+            check_file_names(part, entry, checksums, layout)
             if known is part:
                 continue
             if read_checksums(known, entry) != checksums or read_entry(known, entry) != read_entry(part, entry):
@@ -144,7 +145,7 @@ def _config(parts: Sequence[Path], manifest: Mapping[str, Any]) -> Config:
     episodes = sum(split.episodes for split in longest) or max(config.bake.episodes for config in configs)
     if episodes > MAX_EPISODES:
         raise DatasetError(f"bake.episodes is {episodes} in the {CONFIG_FILE} of a part; allowed: up to {MAX_EPISODES}; correct it there")
-    config = dataclasses.replace(configs[0], bake=dataclasses.replace(configs[0].bake, episodes=episodes), splits=tuple(longest))
+    config = dataclasses.replace(configs[0].with_values({"bake.episodes": episodes}), splits=tuple(longest))
     for before, after in itertools.pairwise(config.splits):
         if after.first < before.first + before.episodes:
             raise DatasetError(f"the split {before.name} of one part has episodes that the split {after.name} of another one has")
@@ -153,7 +154,7 @@ def _config(parts: Sequence[Path], manifest: Mapping[str, Any]) -> Config:
 
 def _fill(out: Path, sources: dict[Path, Path], config: Config, manifest: bytes) -> None:
     """Link all files, then all entries, and build the indices; an error removes all of it again."""
-    kinds = load_exporter_classes(config.bake.formats)
+    needs = Needs.of(config)
     added = _Added(out)
     lock = lock_folder(out)
     try:
@@ -164,11 +165,11 @@ def _fill(out: Path, sources: dict[Path, Path], config: Config, manifest: bytes)
                     added.link(part / name, out / name)
                 for suffix in (".sha256", ".json"):
                     added.link(part / f"{entry}{suffix}", out / f"{entry}{suffix}")
-            added.paths += _later_paths(out, kinds, config)
+            added.paths += _later_paths(out, shared_files(needs.classes, DataLayout.of(config)))
             write_atomically(out / CONFIG_FILE, config_to_toml(config).encode())
             write_atomically(out / MANIFEST_FILE, manifest)
-            with WriterPool(config.bake.writers or count_cores(), slot_bytes(kinds, config), lock) as pool:
-                finalize_data_set(out, config, kinds, pool)
+            with WriterPool(config.bake.writers or count_cores(), needs.slot_bytes, lock) as pool:
+                finalize_data_set(out, config, needs.classes, pool)
         except BaseException:
             added.remove()
             raise
@@ -176,9 +177,8 @@ def _fill(out: Path, sources: dict[Path, Path], config: Config, manifest: bytes)
         os.close(lock)
 
 
-def _later_paths(out: Path, kinds: Sequence[type[Exporter]], config: Config) -> list[Path]:
+def _later_paths(out: Path, shared: SharedFiles) -> list[Path]:
     """Files and folders that are not linked but written, folders before what is in them."""
-    shared = shared_files(kinds, config)
     entry = (INDICES.with_suffix(suffix) for suffix in (".json", ".sha256"))
     names = (*reversed(shared.folders), *shared.indices, EPISODES_FILE, ATTEMPTS_FILE, *entry, CONFIG_FILE, MANIFEST_FILE)
     return [out / name for name in names]

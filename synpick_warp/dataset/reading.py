@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from synpick_warp.configs.check import format_value
-from synpick_warp.configs.splits import episode_range, plan_episodes
+from synpick_warp.configs.splits import DataLayout, episode_range
 from synpick_warp.dataset.annotations import ADVICE, EpisodeEntry, EpisodeRow, Key, ModelInfo, check_content, read_checked
 from synpick_warp.dataset.frame_counts import check_frames
 from synpick_warp.dataset.manifest import CONFIG_FILE, CONSTANTS, ENTRIES, MANIFEST_FILE, episode_entry, read_checksums
@@ -106,7 +106,7 @@ class Episode:
         row = self.attributes if self._record is None else self._record["row"]
         frames = check_content(row, EpisodeRow, self.group / GROUP_FILE).frames
         data = self._data_set
-        check_frames(data.folder, data.config if (data.folder / CONFIG_FILE).exists() else None, self.index, frames)
+        check_frames(data.folder, DataLayout.of(data.config) if (data.folder / CONFIG_FILE).exists() else None, self.index, frames)
         return row
 
     @cached_property
@@ -337,10 +337,7 @@ class DataSet(Mapping[int, Episode]):
         """Names of the cameras as sensors of their scenes (BOP-Industrial); empty: each camera has scenes of its own."""
         if self.found is not None:
             return self.found.sensors
-        from synpick_warp.configs.schema import MULTISENSOR
-        from synpick_warp.configs.splits import sensor_name
-
-        return tuple(map(sensor_name, range(self.camera_count))) if self.config.bop.layout == MULTISENSOR else ()
+        return DataLayout.of(self.config).sensors
 
     @cached_property
     def period(self) -> float | None:
@@ -355,9 +352,7 @@ class DataSet(Mapping[int, Episode]):
         """Name of the split of an episode."""
         if self.found is not None:
             return self.found.split(episode)
-        from synpick_warp.configs.splits import split_of
-
-        split = split_of(self.config, episode)
+        split = DataLayout.of(self.config).split_of(episode)
         return self.config.bop.split if split is None else split.name
 
     @cached_property
@@ -425,7 +420,7 @@ class DataSet(Mapping[int, Episode]):
         """Number of episodes that the settings plan, or that are there if no bake wrote the data set."""
         if self.found is not None:
             return len(self)
-        return sum(len(each) for each in plan_episodes(self.config) if self._only in (None, each))
+        return sum(len(each) for each in DataLayout.of(self.config).plan() if self._only in (None, each))
 
     @cached_property
     def _scenes(self) -> SceneIndex | FoundScenes | None:

@@ -7,7 +7,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from synpick_warp.configs.splits import bop_folder, bop_folders, bop_scene, scene_episode
+from synpick_warp.configs.splits import DataLayout
 from synpick_warp.dataset.manifest import CONFIG_FILE
 from synpick_warp.errors import DatasetError
 from synpick_warp.inputs.paths import path_inside
@@ -26,13 +26,12 @@ class SceneIndex:
             folder: Folder of the data set.
             config: Its settings.
         """
-        self._folder, self._config = folder, config
-        self._cameras = len(config.cameras.positions)
+        self._folder, self._size, self._layout = folder, config.cameras.resolution, DataLayout.of(config)
 
     @cached_property
     def _folders(self) -> dict[str, tuple[Path, Path]]:
         """BOP name of each split -> folders of its scenes and of its webdataset shards, which need not exist."""
-        places = {name: path_inside(self._folder, name, self._folder / CONFIG_FILE, DatasetError) for name in bop_folders(self._config)}
+        places = {name: path_inside(self._folder, name, self._folder / CONFIG_FILE, DatasetError) for name in self._layout.folders}
         return {name: (place, place.with_name(f"{place.name}_web")) for name, place in places.items()}
 
     def files(self, episode: int, camera: int) -> SceneFiles:
@@ -44,27 +43,26 @@ class SceneIndex:
         from synpick_warp.dataset.view_files import SceneFolder, SceneShards
         from synpick_warp.exporters.bop.shards.tar_files import find_shards
 
-        size = self._config.cameras.resolution
-        folder, web = self._folders[bop_folder(self._config, episode)]
-        index, suffix = bop_scene(self._config, episode, camera)
+        folder, web = self._folders[self._layout.folder(episode)]
+        index, suffix = self._layout.scene(episode, camera)
         if (folder / f"{index:06d}").is_dir():
-            return SceneFolder(folder / f"{index:06d}", size, suffix)
-        scene = self._cameras * episode + camera
+            return SceneFolder(folder / f"{index:06d}", self._size, suffix)
+        scene = self._layout.cameras * episode + camera
         if shards := list(find_shards(scene, web)):
-            return SceneShards(shards, scene, size)
+            return SceneShards(shards, scene, self._size)
         raise DatasetError(f"{self._folder} has no images of episode {episode}; bake with --formats bop or shards")
 
     def has(self, episode: int) -> bool:
         """Whether an episode has a scene folder or a shard."""
-        folder, web = self._folders[bop_folder(self._config, episode)]
-        scene = folder / f"{bop_scene(self._config, episode, 0)[0]:06d}"
-        return scene.exists() or (web / f"shard-{self._cameras * episode:06d}.tar").exists()
+        folder, web = self._folders[self._layout.folder(episode)]
+        scene = folder / f"{self._layout.scene(episode, 0)[0]:06d}"
+        return scene.exists() or (web / f"shard-{self._layout.cameras * episode:06d}.tar").exists()
 
     def episodes(self) -> Iterator[int]:
         """Indices of the episodes that have scenes; an index can occur several times."""
         for folder, web in self._folders.values():
-            yield from (scene_episode(self._config, scene) for scene in numbered(folder.glob("[0-9]*")))
-            yield from (scene // self._cameras for scene in numbered(web.glob("shard-??????.tar")))
+            yield from (self._layout.scene_episode(scene) for scene in numbered(folder.glob("[0-9]*")))
+            yield from (scene // self._layout.cameras for scene in numbered(web.glob("shard-??????.tar")))
 
 
 def numbered(paths: Iterable[Path]) -> Iterator[int]:

@@ -6,12 +6,13 @@ Large data sets are verified by several processes; the result is the same for an
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from functools import lru_cache
+from functools import lru_cache, partial
 from itertools import islice
 from pathlib import Path
 from typing import NamedTuple
 
 from synpick_warp.configs.schema import Config
+from synpick_warp.configs.splits import DataLayout
 from synpick_warp.dataset.file_names import check_file_names
 from synpick_warp.dataset.frame_counts import check_frames, check_listed_frames
 from synpick_warp.dataset.manifest import (
@@ -28,7 +29,7 @@ from synpick_warp.errors import ConfigError, DatasetError
 from synpick_warp.exporters.writing.checksums import checksum
 from synpick_warp.progress import Report
 from synpick_warp.system.cores import count_cores
-from synpick_warp.system.ordered_pool import WorkerProgram, map_ordered, serve_tasks
+from synpick_warp.system.pool import WorkerProgram, map_ordered
 
 _FILES_PER_PROCESS, _BYTES_PER_PROCESS = 10_000, 1 << 28
 """Minimum amount of work per worker process, in files and in bytes; one of the two suffices. On a Xeon with cached files either takes about
@@ -37,7 +38,6 @@ _ENTRIES_PER_PROCESS = 4
 """Minimum number of manifest entries per process for which each entry is a single task; fewer entries are split for load balancing."""
 _PARTS_PER_PROCESS = 4
 """Number of tasks per process into which an entry is split."""
-_PROGRAM = "from synpick_warp.dataset.verify import main; main()"
 
 
 class Verdict(NamedTuple):
@@ -129,11 +129,20 @@ def _useful_processes(files: int, size: int) -> int:
 def _check_entries(folder: Path, entries: Sequence[Path], processes: int) -> Iterator[Checked]:
     """Check the files of manifest entries, in parallel if `processes` > 1; results are in the order of the files."""
     parts = 1 if processes == 1 or len(entries) >= _ENTRIES_PER_PROCESS * processes else _PARTS_PER_PROCESS * processes
-    tasks = (CheckPart(entry, part, parts) for entry in entries for part in range(parts))
-    if processes > 1:
-        yield from map_ordered(WorkerProgram(_PROGRAM, folder, "verifies"), tasks, processes)
-    else:
-        yield from (check_part(folder, task) for task in tasks)
+    tasks = (partial(_Checker.check, task=CheckPart(entry, part, parts)) for entry in entries for part in range(parts))
+    return map_ordered(WorkerProgram(partial(_Checker, folder), "process that verifies"), tasks, processes)
+
+
+class _Checker:
+    """State of a process: the data set's folder, and the checksum list that was read last; successive parts are usually of one entry."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        self._read = lru_cache(maxsize=1)(read_checksums)
+
+    def check(self, task: CheckPart) -> Checked:
+        """Task: see `check_part`."""
+        return check_part(self._folder, task, self._read)
 
 
 def check_part(folder: Path, task: CheckPart, read: Callable[[Path, Path], dict[str, str]] = read_checksums) -> Checked:
@@ -147,7 +156,7 @@ def check_part(folder: Path, task: CheckPart, read: Callable[[Path, Path], dict[
     try:
         known = read(folder, task.entry)
         if task.part == 0 and task.entry != INDICES:
-            check_file_names(folder, task.entry, known, _read_config(folder))
+            check_file_names(folder, task.entry, known, DataLayout.of(_read_config(folder)))
     except (ConfigError, DatasetError) as error:
         return Checked(0, str(error))
     first, end = (len(known) * (task.part + step) // task.parts for step in (0, 1))
@@ -163,9 +172,9 @@ def _check_counts(folder: Path, entry: Path, known: Mapping[str, str]) -> str:
     if entry in (CONSTANTS, INDICES):
         return ""
     try:
-        config, row = _read_config(folder), (read_entry(folder, entry) or {})["row"]
-        check_listed_frames(folder, config, row, known)
-        check_frames(folder, config, row["episode"], row["frames"])
+        layout, row = DataLayout.of(_read_config(folder)), (read_entry(folder, entry) or {})["row"]
+        check_listed_frames(folder, layout, row, known)
+        check_frames(folder, layout, row["episode"], row["frames"])
     except DatasetError as error:
         return str(error)
     return ""
@@ -198,9 +207,3 @@ def _check_file(path: str, expected: str, limit: int | None) -> str:
         return "is missing"
     except OSError as error:
         return f"cannot be read: {error.strerror}"
-
-
-def main() -> None:
-    """Main function of a worker process: checks parts of the data set whose folder is the setup message."""
-    read_once = lru_cache(maxsize=1)(read_checksums)  # Successive parts are usually of the same entry.
-    serve_tasks(Path, lambda folder, task: check_part(folder, task, read_once))

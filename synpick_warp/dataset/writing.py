@@ -21,7 +21,7 @@ from pathlib import Path
 from synpick_warp.configs.load import load_config
 from synpick_warp.configs.modes import may_pick
 from synpick_warp.configs.schema import Config
-from synpick_warp.configs.splits import episodes_end, is_planned, split_of
+from synpick_warp.configs.splits import DataLayout
 from synpick_warp.configs.write import config_to_toml
 from synpick_warp.dataset.manifest import (
     ATTEMPTS_FILE,
@@ -93,7 +93,8 @@ class OutputFolder:
         """
         self.out, self.config, self.episodes = out, config, list(episodes)
         self._manifest = make_manifest(config)
-        self._shared = shared_files(load_exporter_classes(config.bake.formats), config)
+        self._layout = DataLayout.of(config)
+        self._shared = shared_files(load_exporter_classes(config.bake.formats), self._layout)
         self._exporters: Exporters | None = None
         check_output_folder(out)
         self._created = [folder for folder in (out, *out.parents) if not os.path.lexists(folder)]
@@ -122,7 +123,7 @@ class OutputFolder:
 
     def _scan(self) -> None:
         """Validate an existing data set against the settings, and determine its complete and remaining episodes."""
-        out, config = self.out, self.config
+        out = self.out
         self._known = read_manifest(out) if os.path.lexists(out / MANIFEST_FILE) else None
         self._is_ours = self._known is not None
         if self._known:
@@ -131,10 +132,10 @@ class OutputFolder:
                 raise ConfigError(f"{out} was started with other settings: {said}; {_ADVICE}")
             _check_kinds(out, self._shared)
         entries = committed_episodes(out)
-        foreign = next((index for index in reversed(entries) if not is_planned(config, index)), None)
+        foreign = next((index for index in reversed(entries) if not self._layout.is_planned(index)), None)
         if foreign is not None:
-            split = split_of(config, foreign)
-            key, episodes = (f"splits.{split.name}.episodes", split.episodes) if split else ("bake.episodes", config.bake.episodes)
+            split = self._layout.split_of(foreign)
+            key, episodes = (f"splits.{split.name}.episodes", split.episodes) if split else ("bake.episodes", self.config.bake.episodes)
             raise ConfigError(f"{key} is {episodes}, but {out} has episode {foreign}; a data set can only grow")
         self._complete = {index for index in entries if is_complete(self.out, episode_entry(index))}
         self.committed = sorted(self._complete.intersection(self.episodes))
@@ -170,7 +171,7 @@ class OutputFolder:
             (self.out / ENTRIES).mkdir(exist_ok=True)
             self._remove_indices()
             if self._known:
-                self._remove_incomplete(max(episodes_end(self.config), _planned_end(self.out)))
+                self._remove_incomplete(max(self._layout.episodes_end, _planned_end(self.out)))
             write_atomically(self.out / CONFIG_FILE, config_to_toml(self.config).encode())
             (self.out / PARTIAL).mkdir()
             if not is_complete(self.out, CONSTANTS):
@@ -250,7 +251,7 @@ class OutputFolder:
         """Delete a data set without episodes. The manifest goes last, and is kept if other files remain, so that a bake can resume."""
         self._complete = set()
         if self._exporters is not None:
-            self._remove_incomplete(episodes_end(self.config))
+            self._remove_incomplete(self._layout.episodes_end)
         self._remove_indices()
         self._remove_constants()
         if any(os.path.lexists(self.out / folder) for folder in list_folders(self.out, self._shared.folders)):
@@ -297,7 +298,7 @@ def finalize_data_set(out: Path, config: Config, kinds: Sequence[type[Exporter]]
         remove_folder(out / PARTIAL, ignore_errors=True)
         (out / PARTIAL).mkdir()
         episodes = committed_episodes(out)
-        paths = build_lists(out, config) + finalize(kinds, out, config, pool, episodes)
+        paths = build_lists(out, may_pick(config.bake, config.splits)) + finalize(kinds, out, config, pool, episodes)
         write_manifest_entry(out, INDICES, paths, {"episodes": episodes})
     except OSError as error:
         raise output_error(out, error) from error
@@ -305,13 +306,13 @@ def finalize_data_set(out: Path, config: Config, kinds: Sequence[type[Exporter]]
         remove_folder(out / PARTIAL, ignore_errors=True)
 
 
-def build_lists(out: Path, config: Config) -> list[Path]:
-    """Write the list of episodes, and in modes with picking the list of attempts, from the manifest entries, sorted by episode.
+def build_lists(out: Path, picks: bool) -> list[Path]:
+    """Write the list of episodes, and if episodes can pick (`may_pick`) the list of attempts, from the manifest entries, sorted by episode.
 
     Returns:
         Paths of the lists, relative to the data set.
     """
-    paths = [Path(name) for name in (EPISODES_FILE, *((ATTEMPTS_FILE,) if may_pick(config) else ()))]
+    paths = [Path(name) for name in (EPISODES_FILE, *((ATTEMPTS_FILE,) if picks else ()))]
     for path in paths:
         with (out / PARTIAL / path).open("w", encoding="ascii") as file:
             for index in committed_episodes(out):
@@ -331,7 +332,7 @@ def _planned_end(out: Path) -> int:
     """Exclusive upper bound of the episode indices planned by the folder's own settings; 0 if they cannot be read."""
     with contextlib.suppress(ConfigError, DatasetError):
         check_regular_file(out / CONFIG_FILE, MAX_TOML, DatasetError)
-        return episodes_end(load_config(str(out / CONFIG_FILE), {}))
+        return DataLayout.of(load_config(str(out / CONFIG_FILE), {})).episodes_end
     return 0
 
 

@@ -15,11 +15,11 @@ from typing import Any, Protocol, Self
 
 import cv2
 
-from synpick_warp.estimation.decoder import DecodeViews
-from synpick_warp.estimation.decoder_pool import DecoderPool, open_pool
+from synpick_warp.estimation.decoder_pool import DecoderPool, DecodeViews, open_pool
 from synpick_warp.estimation.decoding import DecodeJob
 from synpick_warp.estimation.scenes import Scene
 from synpick_warp.stages.pose.batch import RgbdBatch
+from synpick_warp.system.pool import TaskFuture
 
 AHEAD = 2
 """Steps that are decoded ahead of the one in use."""
@@ -71,7 +71,7 @@ class SceneReader:
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
         self._source.close()
         if self._own_pool is not None:
-            self._own_pool.close()
+            self._own_pool.kill()
 
     def __iter__(self) -> Iterator[RgbdBatch]:
         """Batches of step 0, 1, ...; view v shows the step's frame of scene v, or is zero in all images if that scene has ended.
@@ -85,7 +85,7 @@ class SceneReader:
             ProcessError: A process died, or there is no memory.
         """
         batches = self._source.open()
-        pending: deque[list[Future[Any]]] = deque()
+        pending: deque[Sequence[_Future]] = deque()
         for step in range(self.steps):
             # The batch of the last step is free from now on.
             for ahead in range(step + len(pending), min(self.steps, step + len(batches))):
@@ -111,6 +111,10 @@ class SceneReader:
         self._job.fill_view(batch, view, step)
 
 
+_Future = Future[Any] | TaskFuture
+"""Result of a task to come."""
+
+
 class _Source(Protocol):
     """What decodes."""
 
@@ -118,11 +122,11 @@ class _Source(Protocol):
         """Allocate the batches."""
         ...
 
-    def submit(self, batch: int, step: int) -> list[Future[Any]]:
+    def submit(self, batch: int, step: int) -> Sequence[_Future]:
         """Begin to decode a step into a batch; returns the tasks' results to come."""
         ...
 
-    def wait(self, future: Future[Any]) -> None:
+    def wait(self, future: Any) -> None:
         """Block until a task is done; raises its error."""
         ...
 
@@ -149,7 +153,7 @@ class _Threads:
         """See `_Source`."""
         return [self._pool.submit(self._job.fill_view, self._batches[batch], view, step) for view in range(len(self._job.scenes))]
 
-    def wait(self, future: Future[Any]) -> None:
+    def wait(self, future: Any) -> None:
         """See `_Source`."""
         future.result()
 
@@ -163,14 +167,14 @@ class _Processes:
 
     def __init__(self, job: DecodeJob, pool: DecoderPool) -> None:
         self._job, self._pool = job, pool
-        self._opening: list[Future[Any]] = []
+        self._opening: list[TaskFuture] = []
 
     def open(self) -> list[RgbdBatch]:
         """See `_Source`."""
         batches, self._opening = self._pool.open_job(self._job)
         return batches
 
-    def submit(self, batch: int, step: int) -> list[Future[Any]]:
+    def submit(self, batch: int, step: int) -> list[TaskFuture]:
         """See `_Source`."""
         views = len(self._job.scenes)
         size = max(1, min(MAX_VIEWS_PER_TASK, -(-views // (_TASKS_PER_PROCESS * len(self._pool)))))
@@ -180,7 +184,7 @@ class _Processes:
             futures.append(self._pool.submit(DecodeViews(batch, step, first, min(views, first + size)), affinity=index))
         return futures
 
-    def wait(self, future: Future[Any]) -> None:
+    def wait(self, future: Any) -> None:
         """See `_Source`."""
         self._pool.wait(future)
 

@@ -10,8 +10,7 @@ import numpy as np
 
 from synpick_warp.dataset.reading import DataSet
 from synpick_warp.errors import DatasetError
-from synpick_warp.estimation.decoder import ReadScene
-from synpick_warp.estimation.decoder_pool import DecoderPool
+from synpick_warp.estimation.decoder_pool import SCENES_AHEAD, DecoderPool, ReadScene
 from synpick_warp.estimation.methods import TRACK, EstimatorFactory, Group, ask, estimate_frame, make_group, to_rotations
 from synpick_warp.estimation.reading import AHEAD, BYTES_PER_PIXEL, DEPTHS, SceneReader
 from synpick_warp.estimation.scenes import Scene, ScenePlan, group_scenes, read_scene
@@ -84,8 +83,10 @@ def read_scenes(
     """
     listed = None if targets is None else targets.objects
     scenes = []
-    messages = (ReadScene(data_set.folder, plan) for plan in plans)
-    read = (read_scene(data_set, plan) for plan in plans) if pool is None else pool.map_ordered(messages)
+    if pool is None:
+        read = (read_scene(data_set, plan) for plan in plans)
+    else:
+        read = pool.map_ordered((ReadScene(data_set.folder, plan) for plan in plans), depth=SCENES_AHEAD, ahead=SCENES_AHEAD)
     report("scenes", 0, len(plans))
     for plan, scene in zip(plans, read, strict=True):
         if options.method == TRACK and not scene.tracked:

@@ -19,8 +19,8 @@ import re
 from collections.abc import Callable
 from typing import Literal, NamedTuple
 
-from synpick_warp.configs.schema import Config
-from synpick_warp.configs.splits import bop_folder, bop_scene
+from synpick_warp.configs.schema import Bop
+from synpick_warp.configs.splits import DataLayout
 from synpick_warp.inputs.image_files import TEXTURE_KINDS
 
 Content = Literal["views", "masks", "poses", "gripper"]
@@ -73,9 +73,9 @@ class Format(NamedTuple):
     """Class in it."""
     constants: str
     """Names of the files that all episodes share, as a regular expression."""
-    episode: Callable[[Config, int], str]
+    episode: Callable[[DataLayout, int], str]
     """Names of the files of an episode, as a regular expression."""
-    sources: Callable[[Config], tuple[Content, ...]] | None = None
+    sources: Callable[[Bop], tuple[Content, ...]] | None = None
     """What a stored data set must have for `convert` to make this format of it; None: no data set has it."""
     part: PartFiles | None = None
     """How its episodes are found; None: the reader reads the format (bop, shards, zarr), and finds them itself."""
@@ -85,38 +85,43 @@ class Format(NamedTuple):
     """What to do if a package that it needs is not installed."""
 
 
-def _bop(config: Config, episode: int) -> str:
-    scenes = "|".join(dict.fromkeys(f"{bop_scene(config, episode, camera)[0]:06d}" for camera in range(len(config.cameras.positions))))
+def _bop(layout: DataLayout, episode: int) -> str:
+    scenes = "|".join(dict.fromkeys(f"{layout.scene(episode, camera)[0]:06d}" for camera in range(layout.cameras)))
     image = rf"[a-z_]+(?:_cam[0-9]+)?/{_INDEX}(?:_[0-9]{{6}})?\.(?:png|jpg)"
-    return rf"{re.escape(bop_folder(config, episode))}/(?:{scenes})/(?:scene_[a-z_]+(?:_cam[0-9]+)?\.json|{image})"
+    return rf"{re.escape(layout.folder(episode))}/(?:{scenes})/(?:scene_[a-z_]+(?:_cam[0-9]+)?\.json|{image})"
 
 
-def _shards(config: Config, episode: int) -> str:
+def _shards(layout: DataLayout, episode: int) -> str:
     # Further shards of a scene have its id plus a multiple of a million.
-    return rf"{re.escape(bop_folder(config, episode))}_web/shard-[0-9]{{0,12}}(?:{_scenes(config, episode)})\.tar"
+    return rf"{re.escape(layout.folder(episode))}_web/shard-[0-9]{{0,12}}(?:{_scenes(layout, episode)})\.tar"
 
 
-def _usd(_: Config, episode: int) -> str:
+def _usd(_: DataLayout, episode: int) -> str:
     return rf"usd/{episode:06d}\.usdc"
 
 
-def _zarr(_: Config, episode: int) -> str:
+def _zarr(_: DataLayout, episode: int) -> str:
     return rf"{_STORE}/episodes/{episode:06d}/(?:zarr\.json|[a-z_]+/(?:zarr\.json|{_ZARR_ARRAY}))"
 
 
-def _lerobot(_: Config, episode: int) -> str:
+def _lerobot(_: DataLayout, episode: int) -> str:
     video = rf"chunk-{episode // 1000:03d}/file-{episode % 1000:03d}\.mp4"
     return rf"lerobot/(?:parts/{episode:06d}\.json|videos/observation\.images\.camera_[0-9]+/{video})"
 
 
-def _coco(config: Config, episode: int) -> str:
-    scenes = _scenes(config, episode)
+def _coco(layout: DataLayout, episode: int) -> str:
+    scenes = _scenes(layout, episode)
     return rf"coco/(?:parts/(?:{scenes})\.jsonl|images/(?:{scenes})/{_INDEX}\.(?:png|jpg))"
 
 
-def _scenes(config: Config, episode: int) -> str:
-    cameras = len(config.cameras.positions)
-    return "|".join(f"{scene:06d}" for scene in range(cameras * episode, cameras * (episode + 1)))
+def _yolo(layout: DataLayout, episode: int) -> str:
+    split = re.escape(layout.folder(episode))
+    files = rf"(?:images|labels|boxes|oriented_boxes)/{split}/(?:{{0}})/{_INDEX}_{_INDEX}\.(?:png|jpg|txt)"
+    return rf"yolo/(?:(?:{{0}})\.txt|{files})".replace("{0}", _scenes(layout, episode))
+
+
+def _scenes(layout: DataLayout, episode: int) -> str:
+    return "|".join(f"{scene:06d}" for scene in range(layout.cameras * episode, layout.cameras * (episode + 1)))
 
 
 FORMAT_TABLE: dict[str, Format] = {
@@ -125,7 +130,7 @@ FORMAT_TABLE: dict[str, Format] = {
         "BopExporter",
         _SCENE_CONSTANTS,
         _bop,
-        sources=lambda config: ("views", "masks") if config.bop.coco else ("views",),
+        sources=lambda bop: ("views", "masks") if bop.coco else ("views",),
     ),
     "shards": Format("bop.shards.exporter", "ShardsExporter", _SCENE_CONSTANTS, _shards, sources=lambda _: ("views",)),
     "usd": Format(
@@ -160,6 +165,14 @@ FORMAT_TABLE: dict[str, Format] = {
         sources=lambda _: ("views", "masks"),
         part=PartFiles("coco/parts", ".jsonl", 3, per_scene=True),  # A line: [] and its end.
     ),
+    "yolo": Format(
+        "bop.yolo.exporter",
+        "YoloExporter",
+        rf"yolo/data\.yaml|{_NOTES}",
+        _yolo,
+        sources=lambda _: ("views", "masks"),
+        part=PartFiles("yolo", ".txt", 35, per_scene=True),  # A line: an image's name.
+    ),
 }
 """Format -> its row."""
 
@@ -176,7 +189,7 @@ def part_files(cameras: int | None) -> list[PartFiles]:
     return whole if cameras is None else whole + [part._replace(cameras=cameras) for part in parts if part.per_scene]
 
 
-def contents_of(name: str, config: Config) -> tuple[Content, ...]:
+def contents_of(name: str, bop: Bop) -> tuple[Content, ...]:
     """What a stored data set with these settings must have for `convert` to make a format of it."""
     sources = FORMAT_TABLE[name].sources
-    return () if sources is None else sources(config)
+    return () if sources is None else sources(bop)

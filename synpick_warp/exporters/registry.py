@@ -5,11 +5,13 @@ from __future__ import annotations
 import contextlib
 import importlib
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 from synpick_warp.configs.schema import Config
+from synpick_warp.configs.splits import DataLayout
 from synpick_warp.errors import ConfigError
-from synpick_warp.exporters.base import ExportContext, Exporter, SharedFiles, StoredScene
+from synpick_warp.exporters.base import ExportContext, Exporter, SharedFiles, StoredScene, TaskSizes
 from synpick_warp.exporters.formats import FORMAT_TABLE
 from synpick_warp.exporters.writing.pool import WriterPool
 from synpick_warp.frames import EpisodeEnd, FrameBatch, TickBatch
@@ -31,6 +33,42 @@ def _load(name: str) -> type[Exporter]:
         return getattr(importlib.import_module(f"{__package__}.{row.module}"), row.exporter)
     except ImportError as error:
         raise ConfigError(f"bake.formats names {name}, but its writer cannot be loaded: {error}; {row.remedy}") from None
+
+
+@dataclass(frozen=True)
+class Needs:
+    """What the formats of a bake need of it."""
+
+    classes: tuple[type[Exporter], ...]
+    """Their exporters, in the order of FORMAT_TABLE."""
+    slot_bytes: int
+    """Maximum size of the images of any task in the pool's shared memory [B]."""
+
+    @classmethod
+    def of(cls, config: Config) -> Needs:
+        """Needs by the settings of a bake. Errors: see `load_exporter_classes`."""
+        classes = load_exporter_classes(config.bake.formats)
+        return cls(classes, slot_bytes(classes, TaskSizes.of(config)))
+
+    @property
+    def physics(self) -> bool:
+        """Whether a format needs physics of ticks."""
+        return any(each.needs_physics for each in self.classes)
+
+    @property
+    def views(self) -> bool:
+        """Whether a format needs rendered views."""
+        return any(each.needs_views for each in self.classes)
+
+    @property
+    def images(self) -> bool:
+        """Whether a format reads all images of a batch."""
+        return any(each.needs_images for each in self.classes)
+
+    @property
+    def depth_files(self) -> bool:
+        """Whether a format writes depth files."""
+        return any(each.writes_depth for each in self.classes)
 
 
 class Exporters:
@@ -72,10 +110,6 @@ class Exporters:
         for exporter in self._all:
             exporter.end_episode(end, count_down)
 
-    def shared_files(self, config: Config) -> SharedFiles:
-        """See `Exporter`."""
-        return shared_files(map(type, self._all), config)
-
     def files(self, episode: int) -> list[Path]:
         """See `Exporter`."""
         return sorted(path for exporter in self._all for path in exporter.files(episode))
@@ -102,14 +136,14 @@ def aborting(pool: WriterPool, exporters: Exporters) -> Iterator[None]:
         raise
 
 
-def slot_bytes(classes: Iterable[type[Exporter]], config: Config) -> int:
+def slot_bytes(classes: Iterable[type[Exporter]], sizes: TaskSizes) -> int:
     """Maximum size of the images of any task in the pool's shared memory [B]."""
-    return max(exporter_class.slot_bytes(config) for exporter_class in classes)
+    return max((exporter_class.slot_bytes(sizes) for exporter_class in classes), default=0)
 
 
-def shared_files(classes: Iterable[type[Exporter]], config: Config) -> SharedFiles:
+def shared_files(classes: Iterable[type[Exporter]], layout: DataLayout) -> SharedFiles:
     """Names of constants, indices and folders of every format, each once."""
-    all_names = [exporter_class.shared_files(config) for exporter_class in classes]
+    all_names = [exporter_class.shared_files(layout) for exporter_class in classes]
     constants, indices, folders = (
         tuple(dict.fromkeys(name for names in group for name in names)) for group in zip(*all_names, strict=True)
     )

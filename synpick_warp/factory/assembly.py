@@ -8,15 +8,15 @@ from __future__ import annotations
 import contextlib
 import gc
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import warp as wp
 
 from synpick_warp.attempts import AttemptLog
 from synpick_warp.configs.schema import Config
-from synpick_warp.configs.splits import plan_episodes
-from synpick_warp.exporters.registry import load_exporter_classes
+from synpick_warp.configs.splits import DataLayout
+from synpick_warp.exporters.registry import Needs
 from synpick_warp.factory.compilation import is_cache_warm, make_compiler, sole_compiler, submit_launches, submit_slow
 from synpick_warp.memory_plan import check_memory
 from synpick_warp.progress import Progress, SilentProgress
@@ -99,12 +99,11 @@ def build_factory(
         SynpickError: The machine has too little memory, or device, models, lights, tote or cameras cannot be used.
     """
     device = pick_device(config.bake.device)
-    planned = sum(map(len, plan_episodes(config))) if episodes is None else len(episodes)
+    planned = sum(map(len, DataLayout.of(config).plan())) if episodes is None else len(episodes)
     writers = count_writers(config)
     config = fit_to_device(without_pictures(config), device, planned, writers, processes)
     check_memory(config, device, writers, processes)
-    renders = any(kind.needs_views for kind in load_exporter_classes(config.bake.formats))
-    with compiling_if_cold(config, device, progress, records_physics, needs_images, renders):
+    with compiling_if_cold(config, device, progress, records_physics, needs_images, Needs.of(config).views):
         return _assemble(config, device, progress, episodes, records_physics, needs_images, longest_first)
 
 
@@ -139,7 +138,7 @@ def compiling_if_cold(
 
 def build_smallest(config: Config, device: wp.Device, progress: Progress, records_physics: bool, needs_images: bool) -> Factory:
     """Build a minimal factory, with as few worlds as the device allows. Other arguments and errors: `build_factory`."""
-    config = replace(config, bake=replace(config.bake, worlds=1), render=replace(config.render, views_per_batch=1))
+    config = config.with_values({"bake.worlds": 1, "render.views_per_batch": 1})
     config = fit_to_device(config, device, 1, count_writers(config))
     return _assemble(config, device, progress, [0], records_physics, needs_images)
 
@@ -155,8 +154,7 @@ def _assemble(
 ) -> Factory:
     """Build a factory from settings whose sizes are resolved (see `fit_to_device`). Other arguments: `build_factory`."""
     stages = build_stages(config, device, progress, episodes, records_physics, longest_first)
-    depth_files = any(kind.writes_depth for kind in load_exporter_classes(config.bake.formats))
-    host = host_images(config, device, needs_images, depth_files)
+    host = host_images(config.bop, config.cameras.resolution[1], device, needs_images, Needs.of(config).depth_files)
     table, tick_time = stages.light_table, stages.tick_time
     layers, cameras, ids = config.render.layers, len(stages.cameras), stages.object_ids
     stream = FrameStream(stages.sizes, layers, cameras, tick_time, stages.renderer, ids, table, device, host)
@@ -199,7 +197,7 @@ def _fit_to_catalog(config: Config, catalog: Catalog, device: wp.Device, progres
         ConfigError: The capacities do not fit into the device's memory.
     """
     filled = with_repeats(config, catalog)
-    if find_repeat_rules(filled) != find_repeat_rules(config):
+    if find_repeat_rules(filled.bake, filled.pick, filled.move) != find_repeat_rules(config.bake, config.pick, config.move):
         total = sum(entry.volume for entry in catalog.entries)
         budget = config.arrangement.volume
         progress.note(f"{len(catalog)} objects take {total:.3g} of {budget:g} m³ together, so that they repeat in an episode")

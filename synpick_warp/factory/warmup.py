@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import warp as wp
 
 from synpick_warp.configs.schema import Config
-from synpick_warp.exporters.registry import load_exporter_classes
+from synpick_warp.exporters.registry import Needs
 from synpick_warp.factory.assembly import build_smallest
 from synpick_warp.factory.compilation import launch_all, make_compiler, sole_compiler, submit_launches, submit_slow
 from synpick_warp.kernels.render.images.ground_truth import gather_cameras_kernel
@@ -64,16 +64,15 @@ def warm_up(config: Config, progress: Progress) -> WarmUp:
         SynpickError: As `synpick_warp.bake`.
     """
     started = time.perf_counter()
-    kinds = load_exporter_classes(config.bake.formats)
+    needs = Needs.of(config)
     device = pick_device(config.bake.device)
-    needs = [any(getattr(kind, name) for kind in kinds) for name in ("needs_physics", "needs_images")]
     with sole_compiler(progress):
         before = list_binaries()
         with make_compiler(device, progress) as compiler:
             submit_slow(compiler, device)
             compiler.submit([build_of(gather_cameras_kernel, device)])  # The one module that only the online stream needs.
-            factory = build_smallest(config, device, progress, *needs)
-            stream = factory.stream if any(kind.needs_views for kind in kinds) else None
+            factory = build_smallest(config, device, progress, needs.physics, needs.images)
+            stream = factory.stream if needs.views else None
             submit_launches(compiler, factory.simulation, stream)
         launch_all(factory.simulation, stream)
     return WarmUp(len(list_binaries() - before), time.perf_counter() - started)

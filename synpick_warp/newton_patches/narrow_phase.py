@@ -10,6 +10,7 @@ import warp as wp
 from newton._src.geometry import narrow_phase as narrow
 from newton._src.sim import collide
 from newton._src.sim import model as newton_model
+from newton._src.solvers.steel import solver_steel  # noqa: F401  (Newton imports it late, and its modules are split below.)
 
 from synpick_warp.system.kernels import ModuleBuild, split_modules
 

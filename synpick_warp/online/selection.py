@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from synpick_warp.configs.check import to_index
 from synpick_warp.configs.fields import INT32_MAX
 from synpick_warp.configs.schema import Config
-from synpick_warp.configs.splits import check_shard, plan_episodes
+from synpick_warp.configs.splits import DataLayout, check_shard
 from synpick_warp.errors import ConfigError
 from synpick_warp.memory_plan import check_episodes
 
@@ -25,13 +25,12 @@ class Selection:
     stride: int = 1
     """Every n-th frame of an episode, from the first on."""
 
-    def resolve(self, config: Config) -> Selection:
-        """The selection with all its cameras named.
+    def resolve(self, count: int) -> Selection:
+        """The selection with all its cameras named, of `count` cameras.
 
         Raises:
             ConfigError: There is no such camera, or a value is out of range.
         """
-        count = len(config.cameras.positions)
         given = range(count) if self.cameras is None else self.cameras
         cameras = tuple(to_index(camera) for camera in given) if isinstance(given, Iterable) else ()
         if not cameras or len(set(cameras)) < len(cameras) or not set(cameras) <= set(range(count)):
@@ -62,13 +61,13 @@ def choose_episodes(
     check_shard(shard)
     index, count = shard
     if episodes is None:
-        return config, [episode for each in plan_episodes(config, splits, shard) for episode in each]
+        return config, [episode for each in DataLayout.of(config).plan(splits, shard) for episode in each]
     if splits or config.splits:
         raise ConfigError("episodes are given beside splits, which name their episodes; give one of both")
     chosen = range(episodes) if isinstance(episodes, int) else episodes
     # The ends of a range: min and max would go through all of it.
     if not isinstance(chosen, range) or not chosen or min(chosen[0], chosen[-1]) < 0 or max(chosen[0], chosen[-1]) >= INT32_MAX:
         raise ConfigError(f"episodes are {episodes!r}; allowed: how many, or a range of indices from 0 to {INT32_MAX - 1}")
-    config = replace(config, bake=replace(config.bake, episodes=max(chosen[0], chosen[-1]) + 1))
-    check_episodes(-(-len(chosen) // count), config)
+    config = config.with_values({"bake.episodes": max(chosen[0], chosen[-1]) + 1})
+    check_episodes(-(-len(chosen) // count), config.bake.episodes)
     return config, [episode for episode in chosen if episode % count == index]

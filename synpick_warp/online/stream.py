@@ -11,7 +11,6 @@ from __future__ import annotations
 import gc
 import weakref
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
 from types import TracebackType
 from typing import Self
 
@@ -20,6 +19,7 @@ import warp as wp
 
 from synpick_warp.codes import Phase
 from synpick_warp.configs.schema import Config
+from synpick_warp.configs.splits import DataLayout
 from synpick_warp.episodes import BakeSummary, episode_row, is_resampled, remedy
 from synpick_warp.errors import ConfigError
 from synpick_warp.factory.assembly import Stages, build_stages, compiling_if_cold
@@ -160,10 +160,11 @@ class Producer:
     def _end_episodes(self, report: TickReport) -> None:
         """Add the episodes that ended in a tick to the summary."""
         config, records = self.stages.config, self.log.update(report)
+        layout = DataLayout.of(config)
         for world in np.flatnonzero(report.column("phase") == Phase.OVER).tolist():
             record = records[int(report.column("episode")[world])]
-            row = episode_row(config, report, world, record)
-            if is_resampled(config, row):
+            row = episode_row(layout, self.stages.tick_time, report, world, record)
+            if is_resampled(row, config.settle.tries):
                 self.summary.take_resample(row.ending)
                 self.progress.note(f"episode {row.episode}, arrangement {row.arrangement + 1}: {row.ending.sentence}")
             else:
@@ -186,11 +187,11 @@ def open_stream(
     if not indices:
         raise ConfigError(f"shard {shard[0]}/{shard[1]} has no episode; give more episodes, or fewer parts")
     device = pick_device(config.bake.device)
-    check_episodes(len(indices), config)
-    selection = selection.resolve(config)
+    check_episodes(len(indices), config.bake.episodes)
+    selection = selection.resolve(len(config.cameras.positions))
     if selection.stride > 1:
         # A history holds the frame before, which is not rendered.
-        config = replace(config, render=replace(config.render, history=0))
+        config = config.with_values({"render.history": 0})
     config = fit_to_device(config, device, len(indices), DEVICE_ONLY)
     check_memory(config, device, DEVICE_ONLY)
     with explain_shortage(config):

@@ -81,7 +81,7 @@ def make_attempt(data_set: DataSet, found: Found, content: Content, names: Mappi
         "size": [picture.shape[1], picture.shape[0]],
         "words": [*choice_words(attempt, names, config), *seal_words(attempt, names, config)],
         "objects": _objects(attempt, names),
-        "graph": _graph(attempt, config),
+        "graph": _graph(attempt, config.perception.min_votes),
         "force": _force(attempt, config),
     }
 
@@ -112,11 +112,11 @@ def _objects(attempt: Attempt, names: Mapping[int, str]) -> list[dict[str, Any]]
     ]
 
 
-def _graph(attempt: Attempt, config: Config) -> dict[str, Any] | None:
+def _graph(attempt: Attempt, min_votes: float) -> dict[str, Any] | None:
     """Clutter graph: nodes and curves [px]; None: nothing was seen."""
     if not attempt.seen:
         return None
-    edges = clutter_edges(attempt, config.perception.min_votes)
+    edges = clutter_edges(attempt, min_votes)
     layout, short = lay_out(attempt, edges, GRAPH_SIZE), labels(attempt)
     nodes = [
         {

@@ -100,8 +100,9 @@ def changed_settings(config: Config) -> list[tuple[str, str, str, str]]:
     default, rows = load_config(), []
     for section, kind in sections().items():
         for name, (item, _) in settings_of(kind).items():
-            here, there = getattr(getattr(config, section), name), getattr(getattr(default, section), name)
+            key = f"{section}.{name}"
+            here, there = config.value(key), default.value(key)
             if here != there:
                 unit = f" [{item.metadata['unit']}]" if item.metadata["unit"] else ""
-                rows.append((f"{section}.{name}", format_toml(here), format_toml(there), f"{item.metadata['doc']}{unit}"))
+                rows.append((key, format_toml(here), format_toml(there), f"{item.metadata['doc']}{unit}"))
     return rows

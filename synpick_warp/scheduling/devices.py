@@ -16,7 +16,7 @@ import pickle
 import select
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import partial
 from multiprocessing.connection import wait
 from pathlib import Path
@@ -30,8 +30,8 @@ from synpick_warp.dataset.manifest import committed_episodes
 from synpick_warp.dataset.writing import OutputFolder
 from synpick_warp.episodes import BakeSummary
 from synpick_warp.errors import DeviceError
-from synpick_warp.exporters.base import ExportContext, Exporter
-from synpick_warp.exporters.registry import Exporters, aborting, slot_bytes
+from synpick_warp.exporters.base import ExportContext
+from synpick_warp.exporters.registry import Exporters, Needs, aborting
 from synpick_warp.exporters.writing.pool import WriterPool
 from synpick_warp.progress import Progress
 from synpick_warp.scenes.build import with_repeats
@@ -227,11 +227,11 @@ def _wait_for_hangup(pipes: Sequence[int], timeout: float) -> None:
             left -= 1
 
 
-def prepare_folder(output: OutputFolder, kinds: tuple[type[Exporter], ...], catalog: Catalog, lights: tuple[EnvironmentMap, ...]) -> None:
+def prepare_folder(output: OutputFolder, needs: Needs, catalog: Catalog, lights: tuple[EnvironmentMap, ...]) -> None:
     """Prepare the output folder (`OutputFolder.prepare`) in a process that generates no episodes itself."""
     config = output.config
-    with WriterPool(1, slot_bytes(kinds, config), output.lock) as pool:
-        exporters = Exporters(kinds, ExportContext(output.out, config, catalog, make_cameras(config.cameras), lights, pool))
+    with WriterPool(1, needs.slot_bytes, output.lock) as pool:
+        exporters = Exporters(needs.classes, ExportContext(output.out, config, catalog, make_cameras(config.cameras), lights, pool))
         with aborting(pool, exporters):
             output.prepare(exporters, digest_inputs(catalog, lights), pool)
             exporters.close()
@@ -240,7 +240,7 @@ def prepare_folder(output: OutputFolder, kinds: tuple[type[Exporter], ...], cata
 def bake_on_devices(
     config: Config,
     output: OutputFolder,
-    kinds: tuple[type[Exporter], ...],
+    needs: Needs,
     names: Sequence[str],
     program: str,
     summary: BakeSummary,
@@ -251,7 +251,7 @@ def bake_on_devices(
     Args:
         config: All settings; `bake.writers` are shared out among the devices.
         output: The folder.
-        kinds: Exporter classes.
+        needs: Needs of its formats.
         names: Devices.
         program: Python code that calls `worker.main`.
         summary: Receives the episodes.
@@ -268,11 +268,11 @@ def bake_on_devices(
         report("stage", "loading objects and lights")
         catalog = load_catalog(config, report=partial(report, "note"))
         lights = load_lights(config.bake.lights, partial(report, "note"), config.objects.strict)
-        prepare_folder(output, kinds, catalog, lights)
+        prepare_folder(output, needs, catalog, lights)
         dealt = deal_episodes(order_longest_first(with_repeats(config, catalog), catalog, output.remaining, pick_device("cpu")), len(names))
         writers = deal_writers(count_writers(config), len(names))
         shares = [
-            Share(output.out, replace(config, bake=replace(config.bake, device=name, writers=count)), episodes, len(names))
+            Share(output.out, config.with_values({"bake.device": name, "bake.writers": count}), episodes, len(names))
             for name, episodes, count in zip(names, dealt, writers, strict=True)
         ]
         lost = processes.run(shares, summary, progress)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 
-from synpick_warp.configs.schema import Config
 from synpick_warp.episodes import BakeSummary
 from synpick_warp.progress import Progress
 
@@ -12,10 +11,10 @@ from synpick_warp.progress import Progress
 class ThroughputMeter:
     """Throughput and remaining time, reported to the observer."""
 
-    def __init__(self, config: Config, summary: BakeSummary, progress: Progress) -> None:
+    def __init__(self, cameras: int, summary: BakeSummary, progress: Progress) -> None:
         self.summary, self.progress = summary, progress
         self.started: float | None = None
-        self.cameras = len(config.cameras.positions)
+        self.cameras = cameras
         self.counted = 0
         """Episodes of the summary of which `delivered` and `frames` are the sums."""
         self.delivered = self.frames = 0

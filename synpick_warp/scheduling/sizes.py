@@ -6,13 +6,12 @@ quarter, until the memory plan and its headroom fit.
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Sequence
 
 import warp as wp
 
 from synpick_warp.configs.schema import Config
-from synpick_warp.exporters.registry import load_exporter_classes, slot_bytes
+from synpick_warp.exporters.registry import Needs
 from synpick_warp.exporters.writing.pool import QUEUE_DEPTH
 from synpick_warp.memory_plan import Term, free_memory, plan_memory
 from synpick_warp.stages.perception.images import count_views
@@ -36,9 +35,9 @@ _OPEN_SIZES = ("render.views_per_batch", "perception.views", "bake.worlds")
 
 def without_pictures(config: Config) -> Config:
     """Settings for a bake whose formats need no views: image buffers of one view a batch, no light histories; others are unchanged."""
-    if any(kind.needs_views for kind in load_exporter_classes(config.bake.formats)):
+    if Needs.of(config).views:
         return config
-    return dataclasses.replace(config, render=dataclasses.replace(config.render, views_per_batch=1, history=0))
+    return config.with_values({"render.views_per_batch": 1, "render.history": 0})
 
 
 def fit_to_device(config: Config, device: wp.Device, episodes: int, writers: int = 1, processes: int = 1) -> Config:
@@ -51,7 +50,7 @@ def fit_to_device(config: Config, device: wp.Device, episodes: int, writers: int
         writers: Writer processes of the device.
         processes: Processes that share the host's memory.
     """
-    is_open = {key: _value(config, key) == 0 for key in _OPEN_SIZES}
+    is_open = {key: config.value(key) == 0 for key in _OPEN_SIZES}
     config = with_enough_worlds(config, device, episodes)
     while terms := _short_terms(config, device, writers, processes):
         for term in sorted(terms, key=lambda term: -term.size):
@@ -59,7 +58,7 @@ def fit_to_device(config: Config, device: wp.Device, episodes: int, writers: int
                 (key for key in is_open if is_open[key] and key in term.settings and _amount(config, key, device) > _least(key, device)), ""
             )
             if key:
-                config = _reduce(config, key, device)
+                config = config.with_values({key: _reduce(key, _amount(config, key, device), device)})
                 break
         else:
             return config
@@ -70,7 +69,7 @@ def count_writers(config: Config) -> int:
     """Writer processes of a bake: `bake.writers`, or one per usable CPU core, as far as the host's free memory has room for them."""
     if config.bake.writers:
         return config.bake.writers
-    each = WRITER_BYTES + QUEUE_DEPTH * slot_bytes(load_exporter_classes(config.bake.formats), config)
+    each = WRITER_BYTES + QUEUE_DEPTH * Needs.of(config).slot_bytes
     room = int(WRITERS_FRACTION * free_memory(None)) // each
     return max(1, min(count_cores(), room))
 
@@ -86,7 +85,8 @@ def pick_processes(config: Config, names: Sequence[str], episodes: int) -> tuple
     """
     picked = pick_devices(names)
     if list(names) == [ALL] and picked == ("cpu",):
-        needed = sum(term.size for term in plan_memory(_with_least_sizes(without_pictures(config)), pick_device("cpu")))
+        least = config.with_values({key: 1 for key in _OPEN_SIZES if not config.value(key)})
+        needed = sum(term.size for term in plan_memory(without_pictures(least), pick_device("cpu")))
         room = free_memory(None) // int(HEADROOM * needed + RUNTIME_BYTES)
         picked *= max(1, min(count_cores(), room))
     return picked[: max(1, episodes)]
@@ -103,13 +103,6 @@ def advise_processes(config: Config, names: Sequence[str], episodes: int) -> str
     return f"one process simulates on one CPU core; --devices all starts {processes}, which write the same bytes" if processes > 1 else ""
 
 
-def _with_least_sizes(config: Config) -> Config:
-    """Settings with one world, and one view or world in each batch, where they leave the number open."""
-    for key in _OPEN_SIZES:
-        config = config if _value(config, key) else _replace(config, key, 1)
-    return config
-
-
 def _short_terms(config: Config, device: wp.Device, writers: int, processes: int) -> Sequence[Term]:
     """Terms of the memory plan for the first memory, device or host, that is too small for them with HEADROOM; empty: all fit."""
     terms = plan_memory(config, device, writers)
@@ -124,7 +117,7 @@ def _short_terms(config: Config, device: wp.Device, writers: int, processes: int
 def _amount(config: Config, key: str, device: wp.Device) -> int:
     """Number of views or worlds that a setting stands for."""
     if key == "render.views_per_batch":
-        return views_per_batch(config, device)
+        return views_per_batch(config.render, config.cameras, config.bake.worlds, device)
     if key == "perception.views":
         return count_views(config.perception, config.bake.worlds, config.arrangement.max_objects, device)
     return config.bake.worlds
@@ -134,18 +127,7 @@ def _least(key: str, device: wp.Device) -> int:
     return MIN_GPU_WORLDS if key == "bake.worlds" and device.is_cuda else 1
 
 
-def _reduce(config: Config, key: str, device: wp.Device) -> Config:
-    """Reduce one setting: the views of a batch to a half, the worlds to three quarters, never below `_least`."""
-    amount = _amount(config, key, device)
+def _reduce(key: str, amount: int, device: wp.Device) -> int:
+    """Smaller value of a setting: a half of the views of a batch, three quarters of the worlds, never below `_least`."""
     kept = amount - max(1, amount // 4) if key == "bake.worlds" else -(-amount // 2)
-    return _replace(config, key, max(_least(key, device), kept))
-
-
-def _replace(config: Config, key: str, value: int) -> Config:
-    section, _, name = key.partition(".")
-    return dataclasses.replace(config, **{section: dataclasses.replace(getattr(config, section), **{name: value})})
-
-
-def _value(config: Config, key: str) -> int:
-    section, _, name = key.partition(".")
-    return getattr(getattr(config, section), name)
+    return max(_least(key, device), kept)

@@ -11,7 +11,7 @@ import numpy as np
 import warp as wp
 
 from synpick_warp.configs.modes import mode_weights
-from synpick_warp.configs.schema import CYCLE, EXCEED, MODES, Config, Gripper, Move, Physics, Settle, Suction, Tote
+from synpick_warp.configs.schema import CYCLE, EXCEED, MODES, Bake, Config, Gripper, Move, Physics, Settle, Split, Suction, Tote
 from synpick_warp.kernels import structs
 from synpick_warp.scenes import build
 from synpick_warp.scenes.types import Catalog, CatalogEntry
@@ -76,7 +76,7 @@ def make_scene_data(config: Config, catalog: Catalog, built: build.BuiltModel, l
         _catalog_data(catalog, built, device),
         drop_data(config, lights),
         _settle_data(config.settle, physics.step * physics.steps_per_tick),
-        mode_data(mode_rows(config), device),
+        mode_data(mode_rows(config.bake, config.splits), device),
         _move_data(config.move, config.tote, gripper, physics),
         fill(
             structs.PickData,
@@ -140,12 +140,12 @@ def mode_data(rows: Sequence[tuple[int, float, float, int]], device: wp.Device) 
     return wp.array([fill(structs.ModeData, **dict(zip(names, row, strict=True))) for row in rows], dtype=structs.ModeData, device=device)
 
 
-def mode_rows(config: Config) -> list[tuple[int, float, float, int]]:
+def mode_rows(bake: Bake, splits: Sequence[Split]) -> list[tuple[int, float, float, int]]:
     """Members of `ModeData` of each split, or of the one range without splits."""
-    splits = [(split.first, split.mode) for split in config.splits] or [(0, config.bake.mode)]
+    ranges = [(split.first, split.mode) for split in splits] or [(0, bake.mode)]
     rows = []
-    for first, mode in splits:
-        weights = mode_weights(config, mode)
+    for first, mode in ranges:
+        weights = mode_weights(bake, mode)
         pick, target, move = weights["pick"], weights["target"], weights["move"]
         total = pick + target + move
         rows.append((first, pick / total, (pick + target) / total, len(MODES) if mode == CYCLE else 0))

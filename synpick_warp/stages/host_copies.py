@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import warp as wp
 
-from synpick_warp.configs.schema import Config
+from synpick_warp.configs.schema import Bop
 
 # Image height from which the largest lists of run boundaries are no larger than the images [px].
 MIN_LISTED_ROWS = 288
@@ -43,7 +43,7 @@ class HostImages:
     """Whether data of PNG files (IDAT) is copied: instead of depth images, or beside them if these are needed, too."""
 
 
-def host_images(config: Config, device: wp.Device, needs_images: bool, depth_files: bool) -> HostImages:
+def host_images(bop: Bop, height: int, device: wp.Device, needs_images: bool, depth_files: bool) -> HostImages:
     """Choose which images of a batch are copied to the host and which stay on the device.
 
     On the CPU, or if an exporter needs all images, all are copied. Else files and run boundaries replace them; below MIN_LISTED_ROWS rows
@@ -51,7 +51,8 @@ def host_images(config: Config, device: wp.Device, needs_images: bool, depth_fil
     files are made on every device, so that their bytes do not depend on it.
 
     Args:
-        config: All settings.
+        bop: Settings of the files.
+        height: Rows of an image [px].
         device: Device of the rendering.
         needs_images: Whether an exporter reads all images.
         depth_files: Whether an exporter writes depth files.
@@ -59,12 +60,12 @@ def host_images(config: Config, device: wp.Device, needs_images: bool, depth_fil
     if not device.is_cuda or needs_images:
         return HostImages(depth_files=depth_files)
     # Without files, keypoints are the only ones to read depth.
-    depth = ("depth",) if depth_files or not config.bop.keypoints else ()
-    if config.cameras.resolution[1] < MIN_LISTED_ROWS:
+    depth = ("depth",) if depth_files or not bop.keypoints else ()
+    if height < MIN_LISTED_ROWS:
         return HostImages(depth, depth_files=depth_files)
-    if config.bop.color_format != "jpg":
+    if bop.color_format != "jpg":
         return HostImages((*depth, "instance", "amodal"), depth_files=depth_files)
-    return HostImages((*depth, "color", "instance", "amodal"), config.bop.jpeg_quality, depth_files)
+    return HostImages((*depth, "color", "instance", "amodal"), bop.jpeg_quality, depth_files)
 
 
 class HostCopy:

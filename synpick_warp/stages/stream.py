@@ -13,7 +13,7 @@ import warp as wp
 
 from synpick_warp.arrays import allocate, memory_table
 from synpick_warp.codes import Measure, Status, column_names
-from synpick_warp.configs.schema import Config
+from synpick_warp.configs.schema import Cameras, Config, Render
 from synpick_warp.frames import FrameBatch, SelectedRows, TickBatch
 from synpick_warp.stages.buffers import LayerBuffers, Snapshot, ViewBuffers, view_buffer_sizes
 from synpick_warp.stages.encoding.jpeg import Compressor
@@ -39,22 +39,23 @@ REPORTED_SNAPSHOT = ("catalog_index", "pose", *_SNAPSHOT)
 RING = 3
 
 
-def views_per_batch(config: Config, device: wp.Device) -> int:
+def views_per_batch(render: Render, cameras: Cameras, worlds: int, device: wp.Device) -> int:
     """Count of views rendered at once: `render.views_per_batch`, or chosen by device and resolution."""
-    views = len(config.cameras.positions)
-    if config.render.views_per_batch:
-        return config.render.views_per_batch
+    views = len(cameras.positions)
+    if render.views_per_batch:
+        return render.views_per_batch
     if not device.is_cuda:
         return views
-    width, height = config.cameras.resolution
+    width, height = cameras.resolution
     one = {"view": 1, "row": height, "column": width}
-    layers = sum(size for *_, size in memory_table(LayerBuffers, one, config.render.layers))
-    return max(1, min(BATCH_BYTES // (width * height * PIXEL_BYTES + layers), views * config.bake.worlds))
+    layers = sum(size for *_, size in memory_table(LayerBuffers, one, render.layers))
+    return max(1, min(BATCH_BYTES // (width * height * PIXEL_BYTES + layers), views * worlds))
 
 
 def view_sizes(config: Config, device: wp.Device) -> dict[str, int]:
     """Extents of the dimensions of `ViewBuffers` and `LayerBuffers`."""
-    return view_buffer_sizes(views_per_batch(config, device), *config.cameras.resolution, config.arrangement.max_objects)
+    views = views_per_batch(config.render, config.cameras, config.bake.worlds, device)
+    return view_buffer_sizes(views, *config.cameras.resolution, config.arrangement.max_objects)
 
 
 @dataclass(frozen=True, eq=False)

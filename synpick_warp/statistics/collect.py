@@ -3,25 +3,22 @@
 from __future__ import annotations
 
 import resource
-import sys
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
-from multiprocessing.connection import wait
+from functools import partial
 from pathlib import Path
-from typing import NamedTuple, NoReturn
+from typing import NamedTuple
 
 from synpick_warp.dataset.reading import DataSet
-from synpick_warp.errors import DatasetError, SynpickError
+from synpick_warp.errors import DatasetError
 from synpick_warp.progress import Report
 from synpick_warp.statistics.partial import Partial
-from synpick_warp.system.descriptors import open_standard_descriptors
-from synpick_warp.system.processes import ProcessError, WorkerProcess, send, serve, start_process
+from synpick_warp.system.pool import WorkerPool, WorkerProgram
 
 VIEWS_PER_PROCESS = 5000
 """Minimum number of views per process: starting one takes the time in which this one counts some 5,000 views."""
-_PROGRAM = "from synpick_warp.statistics.collect import main; main()"
-_AHEAD = 2
-"""Unanswered messages per process: one is worked on, the other waits."""
+_DEPTH = 2
+"""Unanswered tasks per process: one is worked on, the other waits."""
 _KIBIBYTE = 1024
 """Unit of `ru_maxrss` on Linux."""
 
@@ -33,10 +30,6 @@ class SceneTask(NamedTuple):
     camera: int
     frames: int
     depth_frames: tuple[int, ...] = ()
-
-
-class Finish(NamedTuple):
-    """Message: no task follows; the answer is `Finished`."""
 
 
 class Finished(NamedTuple):
@@ -93,11 +86,11 @@ def collect(data_set: DataSet, depth_views: int, threads: int, report: Report | 
         )
     total = sum(task.frames for task in tasks)
     processes = min(threads, total // VIEWS_PER_PROCESS, len(tasks))
-    parts = _spread if processes > 1 else _count_here
-    for part in parts(data_set, _sample_depth(tasks, depth_views), processes, lambda done: report and report("views", done, total)):
+    sampled = _sample_depth(tasks, depth_views)
+    for part in _count(data_set, sampled, processes, lambda done: report and report("views", done, total)):
         found.partial.merge(part.partial)
         found.memory += part.memory
-    found.memory += 0 if parts is _count_here else _peak_memory()
+    found.memory += _peak_memory() if processes > 1 else 0
     found.views = total
     return found
 
@@ -125,74 +118,15 @@ def _sample_depth(tasks: Sequence[SceneTask], count: int) -> list[SceneTask]:
     return result
 
 
-def _count_here(data_set: DataSet, tasks: Sequence[SceneTask], _: int, report: Callable[[int], None]) -> Iterator[Finished]:
-    """Count in this process."""
-    partial, done = Partial(), 0
-    for task in tasks:
-        partial.add_scene(data_set, task.episode, task.camera, task.depth_frames)
-        done += task.frames
-        report(done)
-    yield Finished(partial, _peak_memory())
-
-
-def _spread(data_set: DataSet, tasks: Sequence[SceneTask], processes: int, report: Callable[[int], None]) -> Iterator[Finished]:
-    """Count in several processes; gives what each one has counted."""
-    open_standard_descriptors()
-    workers: list[WorkerProcess] = []
-    try:
-        try:
-            workers += [start_process(_PROGRAM) for _ in range(processes)]
-        except OSError as error:
-            raise ProcessError(f"cannot start {processes} processes: {error}; set --threads lower") from error
-        for worker in workers:
-            _send(worker, data_set.folder)
-        done, left = 0, iter(tasks)
-        for worker in workers * _AHEAD:
-            _send_next(worker, left)
-        while busy := {worker.link: worker for worker in workers if worker.tasks}:
-            for link in wait(list(busy)):
-                worker = busy[link]  # type: ignore[index]
-                answer = _receive(worker)
-                if isinstance(answer, Finished):
-                    yield answer
-                    continue
-                done += answer
-                report(done)
-                _send_next(worker, left)
-    finally:
-        for worker in workers:
-            worker.kill()
-
-
-def _send_next(worker: WorkerProcess, tasks: Iterator[SceneTask]) -> None:
-    """Send the next task; after the last one, ask once for the counts."""
-    if Finish() not in worker.tasks:
-        _send(worker, next(tasks, Finish()))
-
-
-def _send(worker: WorkerProcess, message: object) -> None:
-    try:
-        send(worker.link, message)
-    except OSError:
-        _fail(worker)
-    worker.tasks.append(message)
-
-
-def _receive(worker: WorkerProcess) -> int | Finished:
-    """The next answer: the number of views of a task, or all counts."""
-    try:
-        answer = worker.link.recv()
-    except (EOFError, OSError):
-        _fail(worker)
-    worker.tasks.popleft()
-    if isinstance(answer, Exception):
-        raise answer
-    return answer
-
-
-def _fail(worker: WorkerProcess) -> NoReturn:
-    how, remedy = worker.describe_end("--threads")
-    raise ProcessError(f"a process that counts {how}; {remedy}")
+def _count(data_set: DataSet, tasks: Sequence[SceneTask], processes: int, report: Callable[[int], None]) -> Iterator[Finished]:
+    """Count scenes in several processes, or with one in the calling process; gives what each one has counted."""
+    setup = partial(_open_counter, data_set.folder) if processes > 1 else partial(_Counter, data_set)
+    with WorkerPool(WorkerProgram(setup, "process that counts"), processes if processes > 1 else 0) as pool:
+        done = 0
+        for views in pool.map_ordered((partial(_Counter.add, task=task) for task in tasks), depth=_DEPTH):
+            done += views
+            report(done)
+        yield from map(pool.wait, pool.broadcast(_Counter.finish))
 
 
 def _peak_memory() -> int:
@@ -200,30 +134,22 @@ def _peak_memory() -> int:
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * _KIBIBYTE
 
 
-class _Server:
-    """Answers of a process: first comes the folder of the data set, then tasks, then `Finish`."""
+class _Counter:
+    """State of a process: a data set, and what the process has counted of it."""
 
-    def __init__(self) -> None:
-        self._data_set: DataSet | None = None
+    def __init__(self, data_set: DataSet) -> None:
+        self._data_set = data_set
         self._partial = Partial()
 
-    def answer(self, message: Path | SceneTask | Finish) -> int | Finished | Exception:
-        """Number of views that a message has, the counts, or the error."""
-        if isinstance(message, Finish):
-            return Finished(self._partial, _peak_memory())
-        try:
-            if isinstance(message, Path):
-                self._data_set = DataSet(message)
-                return 0
-            assert self._data_set is not None
-            self._partial.add_scene(self._data_set, message.episode, message.camera, message.depth_frames)
-        except SynpickError as error:
-            return error
-        return message.frames
+    def add(self, task: SceneTask) -> int:
+        """Task: count a scene; returns its number of views."""
+        self._partial.add_scene(self._data_set, task.episode, task.camera, task.depth_frames)
+        return task.frames
+
+    def finish(self) -> Finished:
+        """Task: everything counted."""
+        return Finished(self._partial, _peak_memory())
 
 
-def main() -> None:
-    """Main function of a process."""
-    from multiprocessing.connection import Connection
-
-    serve(Connection(int(sys.argv[1])), _Server().answer)
+def _open_counter(folder: Path) -> _Counter:
+    return _Counter(DataSet(folder))

@@ -14,7 +14,7 @@ import socket
 import subprocess
 import sys
 from collections import deque
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from multiprocessing.connection import Connection
 from typing import Any
@@ -108,13 +108,3 @@ def send(link: Connection, message: Any) -> None:
     """Send a message as bytes: `Connection.send` keeps a view of a BytesIO, on which CPython 3.12.1 crashes in a garbage collection if
     the send fails and the error is part of a reference cycle."""
     link.send_bytes(pickle.dumps(message))
-
-
-def serve(link: Connection, answer: Callable[[Any], Any]) -> None:
-    """Main loop of a worker process: answer messages until `None` arrives or the parent exits. SIGINT is ignored; the parent handles it."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    try:
-        while (message := link.recv()) is not None:
-            link.send(answer(message))
-    except (EOFError, ConnectionError):
-        return  # The parent has ended; nobody is left to receive an answer.

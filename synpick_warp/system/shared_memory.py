@@ -1,14 +1,19 @@
-"""Anonymous shared memory (memfd) and the arrays in it: nothing leaks however the processes end."""
+"""Anonymous shared memory (memfd), the arrays in it, and slots for those of tasks: nothing leaks however the processes end."""
 
 from __future__ import annotations
 
+import contextlib
 import mmap
 import os
 import tempfile
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
+
+from synpick_warp.system.descriptors import open_standard_descriptors
+from synpick_warp.system.threads import COPIES
 
 _ALIGNMENT = 64
 """Arrays start at a multiple of a cache line [B]."""
@@ -41,6 +46,7 @@ def allocate_shared_memory(size: int) -> tuple[int, mmap.mmap]:
     Raises:
         OSError: Memory or descriptors are used up.
     """
+    open_standard_descriptors()
     if hasattr(os, "memfd_create"):
         handle = os.memfd_create("synpick-warp")
     else:
@@ -52,3 +58,51 @@ def allocate_shared_memory(size: int) -> tuple[int, mmap.mmap]:
     except OSError:
         os.close(handle)
         raise
+
+
+class SharedSlots:
+    """Slots of equal size in shared memory, each for the arrays of one task. The caller closes `handle` when it has been passed on."""
+
+    def __init__(self, count: int, slot_bytes: int, copy_threads: int = 0) -> None:
+        """
+        Args:
+            count: Number of slots.
+            slot_bytes: Maximum size of the arrays of one task, see `shared_bytes` [B].
+            copy_threads: Threads that copy arrays; 0: `put` itself does.
+
+        Raises:
+            OSError: Memory or descriptors are used up.
+        """
+        self._slot_bytes = -(-max(slot_bytes, 1) // mmap.PAGESIZE) * mmap.PAGESIZE
+        self.free = list(range(count))
+        """Indices of the slots that no task uses."""
+        self._threads = ThreadPoolExecutor(copy_threads, COPIES) if copy_threads else None
+        self.handle, self._memory = allocate_shared_memory(count * self._slot_bytes)
+
+    def put(self, arrays: Sequence[np.ndarray], slot: int) -> tuple[tuple[SharedArray, ...], Future[None] | None]:
+        """Copy arrays into a slot; returns their places, and the copy in progress if a thread makes it."""
+        if (size := shared_bytes(array.nbytes for array in arrays)) > self._slot_bytes:
+            raise ValueError(f"images of {size} bytes exceed the {self._slot_bytes} of a slot of this pool")
+        offset = slot * self._slot_bytes
+        places: list[SharedArray] = []
+        for array in arrays:
+            places.append(SharedArray(offset, array.shape, array.dtype.str))
+            offset += shared_bytes((array.nbytes,))
+        targets = [place.map(self._memory) for place in places]
+        if self._threads is None:
+            _copy(targets, arrays)
+            return tuple(places), None
+        return tuple(places), self._threads.submit(_copy, targets, arrays)
+
+    def close(self) -> None:
+        """Give the memory back. Never raises."""
+        if self._threads is not None:
+            self._threads.shutdown()
+        with contextlib.suppress(BufferError):
+            self._memory.close()
+
+
+def _copy(targets: Sequence[np.ndarray], arrays: Sequence[np.ndarray]) -> None:
+    """Copy arrays into shared memory; NumPy releases the interpreter lock meanwhile."""
+    for target, array in zip(targets, arrays, strict=True):
+        np.copyto(target, array)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -14,13 +15,13 @@ from synpick_warp.dataset.manifest import read_manifest, read_settings
 from synpick_warp.errors import DatasetError, SynpickError
 from synpick_warp.progress import Report
 from synpick_warp.system.cores import count_cores
+from synpick_warp.system.pool import WorkerProgram, map_ordered
 from synpick_warp.validation.model_files import ModelsFolder
-from synpick_warp.validation.pool import run_tasks
 from synpick_warp.validation.registry import Level, Violation, apply_rules
 from synpick_warp.validation.scene_files import FolderScene, open_scene
 from synpick_warp.validation.subjects import TreeSubject
 from synpick_warp.validation.target_lists import TargetLists
-from synpick_warp.validation.tasks import CheckModel, CheckRig, CheckScene, Task
+from synpick_warp.validation.tasks import CheckModel, CheckRig, CheckScene, State, Task
 
 DEFAULT_SAMPLE = 200
 """Views that are rendered again; some 30 a second on one core."""
@@ -80,7 +81,7 @@ def validate(folder: Path, options: Options, summary: Summary, report: Report = 
     models = list(_plan_models(layout, summary))
     tasks: list[Task] = [*models, *_plan_scenes(scenes, lists, options), *_plan_rigs(layout, scenes)]
     processes = max(1, min(options.threads, -(-total // VIEWS_PER_PROCESS) if options.images else 1, len(tasks)))
-    for checked in run_tasks(layout.root, tasks, processes):
+    for checked in map_ordered(WorkerProgram(partial(State, layout.root), "process that validates"), tasks, processes):
         summary.views += checked.views
         summary.rendered += checked.rendered
         report("views" if options.images else "scenes", summary.views, total)

@@ -9,7 +9,6 @@ from typing import Any, NamedTuple, Protocol
 
 from synpick_warp.dataset.bop.folders import Listing
 from synpick_warp.dataset.bop.layout import Layout, SceneRef
-from synpick_warp.errors import SynpickError
 from synpick_warp.validation.model_files import ModelsFolder, ModelSubject
 from synpick_warp.validation.registry import Violation, apply_rules
 from synpick_warp.validation.rules.rig import RigSubject
@@ -61,9 +60,9 @@ class State:
 
 
 class Task(Protocol):
-    """A message to a process."""
+    """A message to a process; see `WorkerProgram`."""
 
-    def run(self, state: State) -> Checked:
+    def __call__(self, state: State) -> Checked:
         """Check."""
         ...
 
@@ -75,7 +74,7 @@ class CheckModel:
     folder: str
     obj_id: int | None
 
-    def run(self, state: State) -> Checked:
+    def __call__(self, state: State) -> Checked:
         """See `Task`."""
         folder = state.models(self.folder)
         return Checked(list(apply_rules(folder if self.obj_id is None else ModelSubject(folder, self.obj_id))))
@@ -96,7 +95,7 @@ class CheckScene:
     """Images that are rendered again."""
     targets: dict[str, Any] = field(default_factory=dict)
 
-    def run(self, state: State) -> Checked:
+    def __call__(self, state: State) -> Checked:
         """See `Task`."""
         scene = state.scene(self.ref, self.targets)
         violations: list[Violation] = []
@@ -124,22 +123,7 @@ class CheckRig:
     refs: tuple[SceneRef, ...]
     cameras: int
 
-    def run(self, state: State) -> Checked:
+    def __call__(self, state: State) -> Checked:
         """See `Task`."""
         scenes = tuple(SceneSubject(state.layout, open_scene(state.layout, ref)) for ref in self.refs)
         return Checked(list(apply_rules(RigSubject(self.refs[0].place, scenes, self.cameras))))
-
-
-class Answer(NamedTuple):
-    """Result of a task, or its error."""
-
-    checked: Checked | None
-    error: str = ""
-
-
-def run_task(task: Task, state: State) -> Answer:
-    """Run a task; a user's error is returned as its text."""
-    try:
-        return Answer(task.run(state))
-    except SynpickError as error:
-        return Answer(None, str(error))

@@ -15,7 +15,7 @@ import numpy as np
 
 from synpick_warp.configs.load import load_config
 from synpick_warp.configs.schema import Config
-from synpick_warp.configs.splits import scene_episode
+from synpick_warp.configs.splits import DataLayout
 from synpick_warp.dataset.bop.layout import NoLayoutError
 from synpick_warp.dataset.bop.scenes import FoundScenes
 from synpick_warp.dataset.manifest import CONFIG_FILE, episode_entry, read_entry
@@ -106,7 +106,7 @@ class Baked(NamedTuple):
         """What is to be said of a view: scene, episode, mode, time, light."""
         lines = [f"{scene.folder.parent.name}/{scene.folder.name}{scene.sensor.replace('_', ' ', 1)}, image {frame}"]
         if self.config is not None:
-            episode, physics = scene_episode(self.config, int(scene.folder.name)), self.config.physics
+            episode, physics = DataLayout.of(self.config).scene_episode(int(scene.folder.name)), self.config.physics
             parts = [f"episode {episode}", f"{frame * physics.step * physics.steps_per_tick:.2f} s"]
             with contextlib.suppress(SynpickError):
                 entry = read_entry(self.dataset, episode_entry(episode))

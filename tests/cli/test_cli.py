@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import pickle
 import subprocess
 import sys
 import tomllib
@@ -20,13 +21,18 @@ from synpick_warp.cli.commands import main
 from synpick_warp.codes import Ending
 from synpick_warp.configs.load import load_config
 from synpick_warp.episodes import BakeSummary, EpisodeRow
-from synpick_warp.errors import DeviceError, OutputError
+from synpick_warp.errors import DatasetError, DeviceError, OutputError, SynpickError
+from synpick_warp.exporters.writing.pool import WriterPool
 from synpick_warp.stages import timing
 
 
 def finished(number: int) -> BakeSummary:
     rows = [EpisodeRow(episode, 0, Ending.FINISHED, 10, 1.0, "move", 9, 0, 0, 0, 9) for episode in range(number)]
     return BakeSummary(number, rows, views=30 * number, wall_seconds=2.0, resampled=1)
+
+
+def raise_error(error: Exception) -> None:
+    raise error
 
 
 @pytest.fixture
@@ -170,7 +176,10 @@ def test_splits_are_passed_on(bakes, tmp_path):
 @pytest.mark.parametrize(
     ("option", "said"),
     [
-        ("--formats=bop,obj", 'bake.formats is ["bop", "obj"] on the command line; allowed: any of bop, shards, usd, zarr, lerobot, coco'),
+        (
+            "--formats=bop,obj",
+            'bake.formats is ["bop", "obj"] on the command line; allowed: any of bop, shards, usd, zarr, lerobot, coco, yolo',
+        ),
         ("--shard=3", '--shard is "3"; allowed: i/n with i from 0 to n - 1, such as 0/4'),
         ("--shard=4/4", "--shard is 4/4; allowed: i/n with i from 0 to n - 1, such as 0/4"),
         ("--shard=4/8", "--shard 4/8 has none of 4 episodes; use fewer shards"),
@@ -264,6 +273,25 @@ def test_a_fault_of_ours_keeps_its_traceback(tmp_path, bakes):
     bakes.result = ZeroDivisionError()
     with pytest.raises(ZeroDivisionError):
         main(["bake", "--device", "cpu", "--out", str(tmp_path / "data")])
+
+
+def test_a_fault_of_ours_in_a_writer_process_shows_its_traceback(tmp_path, bakes, capsys):
+    with pytest.raises(OutputError) as caught, WriterPool(1, 1) as pool:
+        pool.submit(int, (), ("two\nlines",), path=tmp_path)
+    bakes.result = pickle.loads(pickle.dumps(caught.value))  # As a process of a device sends it.
+    assert main(["bake", "--device", "cpu", "--out", str(tmp_path / "data")]) == 2
+    lines = capsys.readouterr().err.splitlines()
+    assert lines[0].startswith("Traceback")
+    assert lines[-1].startswith(f"synpick-warp: error: cannot write {tmp_path}: ValueError: invalid literal for int()")
+
+
+@pytest.mark.parametrize("error", [OSError(28, "No space left on device"), MemoryError("x"), DatasetError("x is damaged")])
+@pytest.mark.parametrize("processes", [0, 1])
+def test_other_errors_in_a_writer_process_are_one_line(tmp_path, bakes, capsys, error, processes):
+    with pytest.raises(SynpickError) as caught, WriterPool(processes, 1) as pool:
+        pool.submit(raise_error, (), (error,), path=tmp_path)
+    bakes.result = caught.value
+    mistake(capsys, "bake", "--device", "cpu", "--out", str(tmp_path / "data"))
 
 
 def test_help_shows_units_and_defaults(capsys):

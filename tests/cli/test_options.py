@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from synpick_warp.cli.commands import main
 from synpick_warp.cli.options import MAX_LINE, one_line, parse_resolution, parse_shard
 from synpick_warp.configs.load import load_config
-from synpick_warp.configs.splits import plan_shard
+from synpick_warp.configs.splits import DataLayout
 from synpick_warp.errors import ConfigError
 from tests.harness.fuzz import fuzz_examples
 
@@ -54,7 +54,7 @@ TEXT = st.text(st.sampled_from("0123456789xX/.-+e_ ²٣\n")) | st.text(max_size=
 @settings(max_examples=fuzz_examples(100))
 @given(text=TEXT)
 def test_any_text_is_a_resolution_or_a_shard_or_one_line(text):
-    for parse in (parse_resolution, lambda shard: plan_shard(SMOKE, (), parse_shard(shard), "--shard")):
+    for parse in (parse_resolution, lambda shard: DataLayout.of(SMOKE).plan_shard((), parse_shard(shard), "--shard")):
         message = "accepted"
         try:
             parse(text)

@@ -428,3 +428,11 @@ def test_any_value_either_loads_or_is_a_config_error(key, value):
             load_config(None, {full: value})
         with contextlib.suppress(ConfigError):
             parse_assignment(f"{full}={value}")
+
+
+def test_values_by_key():
+    config = Config().with_values({"bake.worlds": 7, "physics.step": 0.5, "bake.seed": 3})
+    assert [config.value(key) for key in ("bake.worlds", "physics.step", "bake.seed")] == [7, 0.5, 3]
+    assert config.with_values({"bake.worlds": 0, "physics.step": Config().physics.step, "bake.seed": 0}) == Config()
+    with pytest.raises(TypeError):
+        config.with_values({"bake.world": 1})

@@ -15,7 +15,7 @@ from synpick_warp.codes import Stream
 from synpick_warp.configs.load import load_config
 from synpick_warp.configs.modes import may_pick
 from synpick_warp.configs.schema import Split
-from synpick_warp.configs.splits import bop_folder, episode_range, episodes_end, is_planned, plan_episodes, split_of
+from synpick_warp.configs.splits import DataLayout, episode_range
 from synpick_warp.configs.write import config_to_toml
 from synpick_warp.dataset.manifest import make_manifest
 from synpick_warp.errors import ConfigError
@@ -43,8 +43,8 @@ def test_the_paper_has_80_and_20_sequences_of_each_mode():
     assert train == Split("train", 3 * 80, 0, "cycle", "train_pbr")
     assert test == Split("test", 3 * 20, 240, "cycle", "test_pbr")
     assert len(config.cameras.positions) == 3
-    assert (config.bake.episodes, episodes_end(config)) == (300, 300)
-    assert may_pick(config)
+    assert (config.bake.episodes, DataLayout.of(config).episodes_end) == (300, 300)
+    assert may_pick(config.bake, config.splits)
 
 
 def test_without_splits_all_is_as_before():
@@ -54,8 +54,8 @@ def test_without_splits_all_is_as_before():
     assert config.splits == ()
     assert "splits" not in make_manifest(config)["settings"]
     assert "splits" not in config_to_toml(config)
-    assert plan_episodes(config) == [range(config.bake.episodes)]
-    assert bop_folder(config, 3) == "train_pbr"
+    assert DataLayout.of(config).plan() == [range(config.bake.episodes)]
+    assert DataLayout.of(config).folder(3) == "train_pbr"
 
 
 def test_no_stream_of_test_meets_one_of_train():
@@ -98,8 +98,9 @@ def test_a_file_has_any_number_of_splits(load):
         Split("hard", 1, 103, "move", "test_hard_pbr"),
     )
     assert config.bake.episodes == 16
-    assert [is_planned(config, index) for index in (9, 11, 12, 99, 100, 103, 104)] == [True, True, False, False, True, True, False]
-    assert [bop_folder(config, index) for index in (0, 9, 10, 50, 102, 103)] == [
+    layout = DataLayout.of(config)
+    assert [layout.is_planned(index) for index in (9, 11, 12, 99, 100, 103, 104)] == [True, True, False, False, True, True, False]
+    assert [layout.folder(index) for index in (0, 9, 10, 50, 102, 103)] == [
         "train_pbr",
         "train_pbr",
         "val_pbr",
@@ -139,14 +140,15 @@ def test_shards_divide_the_episodes_of_all_splits(lengths, gaps, count):
         splits.append(Split(f"s{index}", length, first + gap, "move", f"train_s{index}"))
         first += gap + length
     config = dataclasses.replace(load_config("smoke"), splits=tuple(splits))
-    planned = [index for each in plan_episodes(config) for index in each]
+    layout = DataLayout.of(config)
+    planned = [index for each in layout.plan() for index in each]
     assert sorted(planned) == planned
-    shards = [[index for each in plan_episodes(config, (), (shard, count)) for index in each] for shard in range(count)]
+    shards = [[index for each in layout.plan((), (shard, count)) for index in each] for shard in range(count)]
     assert sorted(index for shard in shards for index in shard) == planned
     assert all(index % count == shard for shard, indices in enumerate(shards) for index in indices)
     for split in splits:
-        assert plan_episodes(config, (split.name,)) == [episode_range(split)]
-        assert all(split_of(config, index) == split for index in episode_range(split))
+        assert layout.plan((split.name,)) == [episode_range(split)]
+        assert all(layout.split_of(index) == split for index in episode_range(split))
 
 
 @pytest.mark.parametrize(

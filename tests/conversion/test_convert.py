@@ -42,6 +42,7 @@ def sets(tmp_path_factory) -> dict[str, Path]:
         "lerobot": settings("lerobot"),
         "usd": settings("usd"),
         "coco": settings("coco"),
+        "yolo": settings("yolo"),
         "keypoints": settings("bop", keypoints=8),
         "keypoints shards": settings("shards", keypoints=8),
         "keypoints coco": settings("coco", keypoints=8),
@@ -75,6 +76,8 @@ def run(source: Path, out: Path, *formats: str, report=lambda *_: None):
         ("source", ("usd",), "usd"),
         ("source", ("coco",), "coco"),
         ("shards", ("coco",), "coco"),
+        ("source", ("yolo",), "yolo"),
+        ("shards", ("yolo",), "yolo"),
         ("keypoints", ("coco",), "keypoints coco"),
         ("keypoints shards", ("coco",), "keypoints coco"),
         ("keypoints shards", ("bop",), "keypoints"),
@@ -99,7 +102,7 @@ def test_several_formats_are_converted_at_once(sets, tmp_path):
         assert (tmp_path / "out" / name).read_bytes() == (baked / name).read_bytes()
 
 
-@pytest.mark.parametrize("name", ["lerobot", "coco"])
+@pytest.mark.parametrize("name", ["lerobot", "coco", "yolo"])
 def test_sets_without_views_have_episodes_and_attempts(sets, name, capsys):
     import synpick_warp
 
@@ -154,7 +157,7 @@ def test_episodes_that_delivered_nothing_stay_in_the_lists(sets, tmp_path):
 @pytest.mark.parametrize(
     ("source", "formats", "error", "message"),
     [
-        ("source", ("zarr",), ConfigError, "allowed: bop, shards, usd, lerobot, coco; no other format has the physics"),
+        ("source", ("zarr",), ConfigError, "allowed: bop, shards, usd, lerobot, coco, yolo; no other format has the physics"),
         ("source", ("hdf5",), ConfigError, "--to names hdf5; allowed"),
         ("source", ("bop",), ConfigError, "has already"),
         ("usd", ("shards",), DatasetError, "has no images"),
@@ -169,10 +172,8 @@ def test_what_cannot_be_converted_is_one_error_and_leaves_nothing(sets, tmp_path
 
 
 def test_sets_of_several_sensors_are_refused():
-    config = settings("bop", "zarr")
-    bop = dataclasses.replace(config.bop, layout="multisensor")
     with pytest.raises(ConfigError, match=r"has bop.layout = .*, which convert does not"):
-        check_formats(("shards",), dataclasses.replace(config, bop=bop), Path("DATA"))
+        check_formats(("shards",), "multisensor", ("bop", "zarr"), Path("DATA"))
 
 
 def test_keypoints_need_the_objects_of_the_bake(sets, tmp_path, assets, monkeypatch):

@@ -12,7 +12,7 @@ from synpick_warp.cli.commands import main
 from synpick_warp.configs.write import config_to_toml
 from synpick_warp.dataset import manifest, verify
 from synpick_warp.exporters.writing.checksums import write_manifest_entry
-from synpick_warp.system import ordered_pool
+from synpick_warp.system import pool
 from synpick_warp.system.processes import ProcessError
 from tests.harness.entries import episode_content
 from tests.worlds.small_worlds import settings
@@ -68,7 +68,7 @@ def test_several_processes_share_the_entries_or_their_parts(out, monkeypatch, sp
     verify.verify(out, 2)
     parts = 2 * verify._PARTS_PER_PROCESS if split else 1
     assert len(tasks) == (1 + EPISODES) * parts
-    names = [verify.check_part(out, task).files for task in tasks]
+    names = [task(verify._Checker(out)).files for task in tasks]
     assert sum(names) == TOTAL
     assert max(names) == (1 if split else FILES)
 
@@ -109,7 +109,7 @@ def test_a_link_is_no_file_of_a_data_set(out, threads):
 
 def test_few_small_files_are_read_by_the_calling_process(out, monkeypatch):
     monkeypatch.undo()
-    monkeypatch.setattr(verify, "map_ordered", None)
+    monkeypatch.setattr(pool, "start_process", None)
     assert verify.verify(out, 8).files == TOTAL
 
 
@@ -121,15 +121,15 @@ def test_few_large_files_are_read_by_several_processes():
 
 @pytest.mark.parametrize("moment", ["before the data set", "with a task"])
 def test_a_process_that_dies_is_one_line(out, monkeypatch, capfd, moment):
-    tell = ordered_pool._send
+    tell = pool.WorkerPool._send
 
-    def tell_and_kill(worker, message, program):
-        if isinstance(message, Path) == (moment == "before the data set"):
+    def tell_and_kill(self, worker, message, handle=None):
+        if (not worker.tasks) == (moment == "before the data set"):
             os.kill(worker.process.pid, signal.SIGKILL)
             worker.process.wait()
-        tell(worker, message, program)
+        tell(self, worker, message, handle)
 
-    monkeypatch.setattr(ordered_pool, "_send", tell_and_kill)
+    monkeypatch.setattr(pool.WorkerPool, "_send", tell_and_kill)
     with pytest.raises(ProcessError, match="a process that verifies was ended by SIGKILL; if memory ran out, set --threads"):
         verify.verify(out, 2)
     assert main(["verify", str(out), "--threads", "2"]) == 2

@@ -1,4 +1,4 @@
-"""Messages by which tests look into decoder processes, or end them. Imports nothing that a process would not import itself."""
+"""Tasks by which tests look into decoder processes, or end them. Imports nothing that a process would not import itself."""
 
 from __future__ import annotations
 
@@ -8,43 +8,43 @@ import sys
 import time
 from dataclasses import dataclass
 
-from synpick_warp.estimation.decoder import Decoder
+from synpick_warp.estimation.decoder_pool import Decoder
 
 
 @dataclass(frozen=True)
 class ListModules:
-    """Message: interrupt the process as Ctrl-C does, and list its modules if it goes on."""
+    """Task: interrupt the process as Ctrl-C does, and list its modules if it goes on."""
 
-    def run(self, decoder: Decoder) -> set[str]:
+    def __call__(self, decoder: Decoder) -> set[str]:
         os.kill(os.getpid(), signal.SIGINT)
         return set(sys.modules)
 
 
 @dataclass(frozen=True)
 class Stop:
-    """Message: end the process by a signal."""
+    """Task: end the process by a signal."""
 
     number: int
 
-    def run(self, decoder: Decoder) -> None:
+    def __call__(self, decoder: Decoder) -> None:
         os.kill(os.getpid(), self.number)
 
 
 @dataclass(frozen=True)
 class Sleep:
-    """Message: take a while; the answer has some size."""
+    """Task: take a while; the answer has some size."""
 
     seconds: float
     size: int = 0
 
-    def run(self, decoder: Decoder) -> bytes:
+    def __call__(self, decoder: Decoder) -> bytes:
         time.sleep(self.seconds)
         return bytes(self.size)
 
 
 @dataclass(frozen=True)
 class Divide:
-    """Message: fail as a programming error does."""
+    """Task: fail as a programming error does."""
 
-    def run(self, decoder: Decoder) -> float:
+    def __call__(self, decoder: Decoder) -> float:
         return 1 / 0

@@ -15,8 +15,7 @@ import pytest
 import synpick_warp
 from synpick_warp.errors import DatasetError
 from synpick_warp.estimation import decoder_pool, reading
-from synpick_warp.estimation.decoder import ReadScene
-from synpick_warp.estimation.decoder_pool import VIEWS_PER_PROCESS, DecoderPool, open_pool
+from synpick_warp.estimation.decoder_pool import VIEWS_PER_PROCESS, DecoderPool, ReadScene, open_pool
 from synpick_warp.estimation.reading import SceneReader
 from synpick_warp.estimation.scenes import Scene, ScenePlan, read_scene
 from synpick_warp.exporters.bop.exporter import BopExporter
@@ -59,7 +58,7 @@ def assert_same(item: object, other: object) -> None:
 
 
 def pids(pool: DecoderPool) -> list[int]:
-    return [worker.process.pid for worker in pool._workers]
+    return list(pool.pids())
 
 
 def collect(scenes: list[Scene], pool: DecoderPool | None, batches: list[RgbdBatch]) -> None:
@@ -170,7 +169,7 @@ def test_nothing_is_left_open(data):
     wait_until_gone(running, timeout=1.0)
     del reader
     assert sorted(os.listdir("/proc/self/fd")) == before
-    pool.close()
+    pool.kill()
 
 
 def test_few_views_or_threads_are_read_by_this_process(data, monkeypatch):
@@ -192,7 +191,7 @@ from tests.estimation.probes import Sleep
 print("imported", flush=True)
 with DecoderPool(2) as pool:
     pool.wait(pool.submit(Sleep(0.0)))
-    print(*(worker.process.pid for worker in pool._workers), flush=True)
+    print(*pool.pids(), flush=True)
     future = pool.submit(Sleep(float(sys.argv[2])))
     os.kill(os.getpid(), getattr(signal, sys.argv[1]))
     pool.wait(future)

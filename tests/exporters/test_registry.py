@@ -6,12 +6,12 @@ from pathlib import Path
 
 import pytest
 
-from synpick_warp.configs.schema import FORMATS
+from synpick_warp.configs.schema import FORMATS, Config
 from synpick_warp.errors import ConfigError
 from synpick_warp.exporters import registry
-from synpick_warp.exporters.base import ExportContext
+from synpick_warp.exporters.base import ExportContext, TaskSizes
 from synpick_warp.exporters.formats import FORMAT_TABLE
-from synpick_warp.exporters.registry import Exporters, load_exporter_classes
+from synpick_warp.exporters.registry import Exporters, Needs, load_exporter_classes
 from synpick_warp.frames import EpisodeEnd
 
 
@@ -109,5 +109,24 @@ def test_views_and_physics_are_needed_if_one_exporter_needs_them():
         (True, True),
     ]
     assert [one.needs_views for one in load_exporter_classes(FORMATS)] == [
-        name in ("bop", "shards", "lerobot", "coco") for name in FORMAT_TABLE
+        name in ("bop", "shards", "lerobot", "coco", "yolo") for name in FORMAT_TABLE
     ]
+
+
+@pytest.mark.parametrize(
+    ("formats", "physics", "views", "images", "depth_files"),
+    [
+        (("bop",), False, True, False, True),
+        (("coco",), False, True, False, False),
+        (("lerobot",), True, True, True, False),
+        (("usd",), False, False, False, False),
+        (("zarr", "usd"), True, False, False, False),
+        (("zarr", "shards"), True, True, False, True),
+    ],
+)
+def test_needs_are_those_of_all_formats(formats, physics, views, images, depth_files):
+    config = Config().with_values({"bake.formats": formats, "cameras.resolution": (64, 48)})
+    needs = Needs.of(config)
+    assert (needs.physics, needs.views, needs.images, needs.depth_files) == (physics, views, images, depth_files)
+    assert needs.slot_bytes == max(one.slot_bytes(TaskSizes.of(config)) for one in needs.classes)
+    assert (needs.slot_bytes == 0) == (formats == ("usd",))

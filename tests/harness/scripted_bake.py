@@ -9,12 +9,12 @@ from pathlib import Path
 
 from synpick_warp.codes import Ending
 from synpick_warp.configs.schema import FORMATS, Config
-from synpick_warp.configs.splits import plan_episodes, split_of
+from synpick_warp.configs.splits import DataLayout
 from synpick_warp.dataset.manifest import episode_entry, read_entry
 from synpick_warp.dataset.writing import OutputFolder, finalize_data_set
 from synpick_warp.episodes import BakeSummary, EpisodeRow
 from synpick_warp.exporters.base import ExportContext
-from synpick_warp.exporters.registry import Exporters, load_exporter_classes, slot_bytes
+from synpick_warp.exporters.registry import Exporters, Needs
 from synpick_warp.exporters.writing.pool import WriterPool
 from synpick_warp.frames import EpisodeEnd
 from synpick_warp.scenes.embedded.skies import skies
@@ -63,22 +63,22 @@ def small_settings() -> Config:
 
 def bake(out: Path, config: Config, shard: tuple[int, int] = (0, 1), stop_after: int | None = None) -> BakeSummary:
     """Write a data set, or the remaining episodes of one, as `pipeline.run_bake` does; `stop_after` episodes it is stopped."""
-    classes = load_exporter_classes(config.bake.formats)
-    with OutputFolder(out, config, [index for part in plan_episodes(config, (), shard) for index in part]) as output:
+    needs = Needs.of(config)
+    with OutputFolder(out, config, [index for part in DataLayout.of(config).plan((), shard) for index in part]) as output:
         summary = BakeSummary(len(output.episodes))
         for episode in output.committed:
             summary.take_record(read_entry(out, episode_entry(episode)) or {})
         if output.is_finished:
             return summary
-        with WriterPool(0, slot_bytes(classes, config), output.lock) as pool:
-            exporters = Exporters(classes, ExportContext(out, config, box_views.catalog(), _LENSES, skies(), pool))
+        with WriterPool(0, needs.slot_bytes, output.lock) as pool:
+            exporters = Exporters(needs.classes, ExportContext(out, config, box_views.catalog(), _LENSES, skies(), pool))
             output.prepare(exporters, INPUTS, pool)
             for episode in output.remaining[:stop_after]:
                 _write_episode(output, exporters, pool, episode)
             pool.wait()
             exporters.close()
             if stop_after is None:
-                finalize_data_set(out, config, classes, pool)
+                finalize_data_set(out, config, needs.classes, pool)
     return summary
 
 
@@ -87,7 +87,7 @@ def _write_episode(output: OutputFolder, exporters: Exporters, pool: WriterPool,
         exporters.write_ticks(batch)
     for batch in box_views.batches(len(_LENSES), (episode,), FRAMES, _LENSES):
         exporters.write_views(batch)
-    split = split_of(output.config, episode)
+    split = DataLayout.of(output.config).split_of(episode)
     row = EpisodeRow(episode, 0, Ending.FINISHED, FRAMES, 0.5, "pick", 3, 1, 1, 0, 2, split.name if split else "")
     end = EpisodeEnd(episode, 0, FRAMES, int(Ending.FINISHED), row.as_json(), (json.dumps(ATTEMPT | {"episode": episode}) + "\n",))
     exporters.end_episode(end, lambda: output.commit(exporters, pool, end))

@@ -26,7 +26,7 @@ from synpick_warp.dataset.manifest import episode_entry, read_entry
 from synpick_warp.dataset.writing import OutputFolder
 from synpick_warp.episodes import EpisodeRow
 from synpick_warp.exporters.base import ExportContext
-from synpick_warp.exporters.registry import Exporters, load_exporter_classes, slot_bytes
+from synpick_warp.exporters.registry import Exporters, Needs
 from synpick_warp.exporters.writing.pool import WriterPool
 from synpick_warp.frames import EpisodeEnd, FrameBatch, TickBatch
 from synpick_warp.scenes.embedded.skies import skies
@@ -73,7 +73,7 @@ def make_end(episode: int) -> EpisodeEnd:
 def sample(pool: WriterPool) -> tuple[int, int]:
     """Measure resident memory [B] and number of open files of the bake and its writers."""
     memory = files = 0
-    for process in (os.getpid(), *(worker.process.pid for worker in pool._workers)):
+    for process in (os.getpid(), *pool.pids()):
         memory += int(Path(f"/proc/{process}/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
         files += len(os.listdir(f"/proc/{process}/fd"))
     return memory, files
@@ -82,11 +82,11 @@ def sample(pool: WriterPool) -> tuple[int, int]:
 def soak(ticks: int, writers: int, out: Path) -> tuple[list[int], list[int]]:
     """Run the writers; returns samples of memory and of open files."""
     config, lenses = settings()
-    classes = load_exporter_classes(config.bake.formats)
+    needs = Needs.of(config)
     frames = make_frames(lenses)
     memory, files = [], []
-    with OutputFolder(out, config, ()) as output, WriterPool(writers, slot_bytes(classes, config), output.lock) as pool:
-        exporters = Exporters(classes, ExportContext(out, config, box_views.catalog(), lenses, skies(), pool))
+    with OutputFolder(out, config, ()) as output, WriterPool(writers, needs.slot_bytes, output.lock) as pool:
+        exporters = Exporters(needs.classes, ExportContext(out, config, box_views.catalog(), lenses, skies(), pool))
         output.prepare(exporters, {}, pool)
         for tick in range(ticks):
             first, frame = divmod(tick, FRAMES)

@@ -277,7 +277,7 @@ def test_the_first_object_is_redrawn_until_it_fits_and_the_next_that_does_not_fi
 )
 def test_repeat_rules_of_the_possible_modes(mode, mix, rules, expected):
     config = settings(bake__mode=mode, bake__mix=list(mix), pick__repeats=rules[0], move__repeats=rules[1])
-    assert build.find_repeat_rules(config) == expected
+    assert build.find_repeat_rules(config.bake, config.pick, config.move) == expected
 
 
 def test_mixed_modes_have_enough_slots_for_each_mode(objects):
@@ -409,5 +409,5 @@ def test_objects_repeat_where_all_of_them_stay_below_the_budget(overrides, shape
     """An object that alone exceeds the budget is never drawn, and does not count."""
     config = settings(bake__mode="pick", **{"arrangement__max_objects": 24} | overrides)
     filled = build.with_repeats(config, catalog(*shapes))
-    assert build.find_repeat_rules(filled) == {repeats}
+    assert build.find_repeat_rules(filled.bake, filled.pick, filled.move) == {repeats}
     assert (filled is config) == (not repeats)

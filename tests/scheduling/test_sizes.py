@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from types import SimpleNamespace
+from typing import Any
 
 import pytest
 
 from synpick_warp import memory_plan
 from synpick_warp.configs.load import load_config
+from synpick_warp.configs.schema import Config
 from synpick_warp.memory_plan import check_memory, plan_memory
 from synpick_warp.scheduling import sizes
 from synpick_warp.scheduling.sizes import (
@@ -19,14 +21,18 @@ from synpick_warp.scheduling.sizes import (
     pick_processes,
     without_pictures,
 )
+from synpick_warp.stages import stream
 from synpick_warp.stages.perception.images import count_views
 from synpick_warp.stages.sim.physics import balance_worlds
-from synpick_warp.stages.stream import views_per_batch
 
 GIB = 1024**3
 CPU = SimpleNamespace(is_cuda=False, alias="cpu")
 GPU = SimpleNamespace(is_cuda=True, alias="cuda:0", total_memory=64 * GIB)
 """Stand-ins for devices."""
+
+
+def views_per_batch(config: Config, device: Any) -> int:
+    return stream.views_per_batch(config.render, config.cameras, config.bake.worlds, device)
 
 
 @pytest.fixture
@@ -72,7 +78,7 @@ def test_batches_shrink_until_plan_and_headroom_fit(give, gpu, mode):
     # The larger part shrinks first: batches, or worlds where the light averaged over their frames is larger.
     assert config.bake.worlds >= min(512, 13 * gpu)
     if gpu >= 12.0:
-        assert views_per_batch(config, GPU) >= (12 if gpu > 12.0 else 7)  # Batches are halved until all fits.
+        assert views_per_batch(config, GPU) >= 12
     check_memory(config, GPU)
 
 

@@ -31,7 +31,8 @@ SOME_IDLE, ALL_IDLE = 8, 16
 
 
 def new_record(device: wp.Device) -> TickRecord:
-    sizes = world_sizes(settings(bake__worlds=WORLDS), bodies_per_world=1)
+    config = settings()
+    sizes = world_sizes(WORLDS, config.arrangement.max_objects, config.move.rounds, bodies_per_world=1)
     return TickRecord(*(allocate(kind, sizes, device) for kind in (Snapshot, WorldStatus, Observation, Plan)))
 
 

@@ -287,7 +287,8 @@ def test_a_whole_bake_is_traced_from_start_to_exit(tmp_path):
 )
 def test_the_setup_names_what_determines_the_worlds(arguments, expected):
     options = bench._parse(arguments)
-    assert bench._describe_setup(bench._config(options), options) == f"{expected}, 3 cameras, 1920x1080"
+    config = bench._config(options)
+    assert bench._describe_setup(config.bake.worlds, config.cameras, options) == f"{expected}, 3 cameras, 1920x1080"
 
 
 def test_trajectories_are_baked_without_rendering_views(tmp_path, monkeypatch):

@@ -111,7 +111,7 @@ def test_worlds_of_a_pile_are_equal_and_a_fall_starts_above(device):
     lifted = pile.lift()
     assert (lifted.pose[:, 2] > pile.pose[:, 2] + 0.99 * piles.LIFT).all()
     assert (lifted.pose[:, :2] == pile.pose[:, :2]).all()
-    model = piles.build_piles(config, pile, 3, device)
+    model = piles.build_piles(config.physics, config.tote, pile, 3, device)
     assert (model.world_count, model.body_count) == (3, 6)
     assert model.body_mass.numpy() == pytest.approx([few.entries[0].mass, few.entries[1].mass] * 3)
 
@@ -136,18 +136,18 @@ def check_engine(engine: engines.Engine, config: Config, pile: piles.Pile) -> No
 
 def test_our_engine_falls_and_rests(device):
     config = Config()
-    check_engine(engines.make_ours(config, boxes(config), 2, device), config, boxes(config))
+    check_engine(engines.make_ours(config.physics, config.tote, boxes(config), 2, device), config, boxes(config))
 
 
 @pytest.mark.parametrize("cone", engines.CONES)
 def test_mujoco_falls_and_rests(cone, mujoco):
     config = Config()
-    check_engine(engines.MujocoEngine(config, boxes(config), cone), config, boxes(config))
+    check_engine(engines.MujocoEngine(config.physics, config.tote, boxes(config), cone), config, boxes(config))
 
 
 def test_mujoco_warp_falls_and_rests(device, mujoco):
     config = Config()
-    check_engine(engines.make_mujoco_warp(config, boxes(config), 2, device, "pyramidal", 16), config, boxes(config))
+    check_engine(engines.make_mujoco_warp(config.physics, config.tote, boxes(config), 2, device, "pyramidal", 16), config, boxes(config))
 
 
 @pytest.mark.parametrize("cone", engines.CONES)
@@ -156,7 +156,7 @@ def test_mujoco_warp_in_graphs_takes_the_steps_of_single_launches(cone, mujoco, 
     config, found = Config(), []
     for captures in (False, True):
         monkeypatch.setattr(engines, "may_capture", lambda device, captures=captures: captures)
-        engine = engines.make_mujoco_warp(config, boxes(config), 2, wp.get_device("cpu"), cone, 16)
+        engine = engines.make_mujoco_warp(config.physics, config.tote, boxes(config), 2, wp.get_device("cpu"), cone, 16)
         engine.start(boxes(config))
         engine.run(4 * engines.GRAPH_STEPS)
         found.append(engine.bodies())

@@ -35,7 +35,7 @@ def views(device):
     )
     config = toy.settings()
     scene = bench_sensor.build_sensor_scene(
-        config, Catalog(tuple(toy.entries)), toy.fixtures, toy.cameras, -config.tote.wall, snapshot(toy, device), 4, device
+        config.render, Catalog(tuple(toy.entries)), toy.fixtures, toy.cameras, -config.tote.wall, snapshot(toy, device), 4, device
     )
     images = scene.allocate_outputs(shape_index_image="shape_index", forward_depth_image="depth_forward")
     scene.render(bench_sensor.SensorCamera.RenderConfig(), images)

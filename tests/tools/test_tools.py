@@ -124,7 +124,7 @@ def test_inside_is_within_the_rim_from_the_floor_to_the_heap_height():
             [np.nan, 0, 0.1],
         ]
     )
-    assert rest_report.is_inside(config, positions).tolist() == [True, False, True, False, False, True, False, False]
+    assert rest_report.is_inside(config.tote, positions).tolist() == [True, False, True, False, False, True, False, False]
 
 
 def test_transform_points_rotates_then_translates():

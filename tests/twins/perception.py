@@ -52,7 +52,9 @@ class SegmenterHarness:
             setattr(rules, name, getattr(self.config.perception, name))
         self.scene: Any = SimpleNamespace(catalog=catalog, perception=rules)
         self.catalog_index = wp.array(np.tile(np.arange(instances), (worlds, 1)), dtype=wp.int32, device=device)
-        self.observation = allocate(Observation, world_sizes(self.config, 0), device)
+        self.observation = allocate(
+            Observation, world_sizes(self.config.bake.worlds, self.config.arrangement.max_objects, self.config.move.rounds, 0), device
+        )
 
     def observe(self, *segments: np.ndarray, depth: np.ndarray | float = 2.0, worlds: list[int] | None = None) -> None:
         """Process images of segmentation ids (H, W), one a view, with a depth image or one depth [m]; by default of worlds 0, 1, ..."""

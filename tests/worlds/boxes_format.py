@@ -6,7 +6,7 @@ import json
 import os
 from pathlib import Path
 
-from synpick_warp.configs.schema import Config
+from synpick_warp.configs.splits import DataLayout
 from synpick_warp.exporters.base import EncodedView, SharedFiles
 from synpick_warp.exporters.bop.scene_exporter import SceneExporter
 from synpick_warp.exporters.bop.view import ViewSettings
@@ -43,7 +43,7 @@ class BoxesExporter(SceneExporter):
         return FOLDER.name
 
     @staticmethod
-    def shared_files(config: Config) -> SharedFiles:
+    def shared_files(layout: DataLayout) -> SharedFiles:
         return SharedFiles((), (), (FOLDER,))
 
     def write_constants(self) -> list[Path]:

@@ -47,7 +47,9 @@ class Hanging:
         built = build.build_model(self.config, objects, device)
         self.layout, self.physics = built.layout, EagerPhysics(self.config.physics, built)
         self.scene = make_scene_data(self.config, objects, built, 1, device)
-        extents = world_sizes(self.config, built.layout.bodies_per_world)
+        extents = world_sizes(
+            self.config.bake.worlds, self.config.arrangement.max_objects, self.config.move.rounds, built.layout.bodies_per_world
+        )
         self.state, self.attempts, self.seals = (allocate(kind, extents, device) for kind in (WorldState, AttemptState, SealState))
         meshes = SimpleNamespace(id=wp.zeros(1, dtype=wp.uint64, device=device))
         self.suction = Suction(self.config.suction, objects, SimpleNamespace(meshes=meshes, keep=()), device)

@@ -31,7 +31,7 @@ class World:
     """One world's rows of the reports. Observation and plan stay until the next perception, as on the device."""
 
     def __init__(self, config: Config, device: Any) -> None:
-        sizes = worlds.world_sizes(config, 1) | {"world": 1}
+        sizes = worlds.world_sizes(1, config.arrangement.max_objects, config.move.rounds, 1)
         self.room = sizes["instance"]
         self.observation, self.plan = (_host(allocate(kind, sizes, device)) for kind in (Observation, Plan))
         self.status = np.zeros((1, len(Status)), np.int32)

@@ -27,9 +27,9 @@ from rich.console import Console
 from synpick_warp.cli.commands import parse_resolution
 from synpick_warp.cli.doctor import GIB, describe_machine
 from synpick_warp.codes import Status
-from synpick_warp.configs.schema import Config
+from synpick_warp.configs.schema import Cameras, Config
 from synpick_warp.errors import SynpickError
-from synpick_warp.exporters.registry import load_exporter_classes
+from synpick_warp.exporters.registry import Needs
 from synpick_warp.factory.assembly import Factory, build_factory
 from synpick_warp.progress import SilentProgress
 from synpick_warp.stages import timing
@@ -88,7 +88,7 @@ def main(arguments: list[str] | None = None) -> int:
         config = _config(options)
         device = pick_device(config.bake.device)
         config = with_enough_worlds(config, device)
-        machine = dict([*describe_machine(device), ("measured", _describe_setup(config, options))])
+        machine = dict([*describe_machine(device), ("measured", _describe_setup(config.bake.worlds, config.cameras, options))])
         for name, value in machine.items():
             console.print(f"{name:20} {value}")
         measured_peers = measure_peers(config, options.compare, options.seconds)
@@ -107,13 +107,13 @@ def main(arguments: list[str] | None = None) -> int:
     return code
 
 
-def _describe_setup(config: Config, options: argparse.Namespace) -> str:
+def _describe_setup(count: int, cameras: Cameras, options: argparse.Namespace) -> str:
     """Worlds, cameras and resolution. If `whole` is the only part: also its episodes, and the worlds may be automatic."""
-    worlds = f"{config.bake.worlds} worlds"
+    worlds = f"{count} worlds"
     if set(options.parts) == {"whole"} and not options.compare:
         worlds = f"{options.episodes} episodes, " + (worlds if options.worlds else "automatic worlds")
-    width, height = config.cameras.resolution
-    return f"{worlds}, {len(config.cameras.positions)} cameras, {width}x{height}"
+    width, height = cameras.resolution
+    return f"{worlds}, {len(cameras.positions)} cameras, {width}x{height}"
 
 
 def _parse(arguments: list[str] | None) -> argparse.Namespace:
@@ -176,20 +176,20 @@ def measure(
     """
     if set(parts) - OWN_WORLDS:
         started = time.perf_counter()
-        kinds = load_exporter_classes(config.bake.formats)
+        needs = Needs.of(config)
         factory = build_factory(
             config,
             SilentProgress(),
-            records_physics="write" in parts and any(kind.needs_physics for kind in kinds),
-            needs_images=any(kind.needs_images for kind in kinds),
+            records_physics="write" in parts and needs.physics,
+            needs_images=needs.images,
         )
         wp.synchronize_device(factory.simulation.device)
         yield Row("load and build", time.perf_counter() - started, "s", part="setup")
         values: dict[str, float] = {}
-        for row in _measure_worlds(config, factory, min_seconds, parts):
+        for row in _measure_worlds(config.bop.jpeg_quality, factory, min_seconds, parts):
             values[row.name] = row.value
             yield row
-        yield from _perception_fraction(config, values)
+        yield from _perception_fraction(config.bake.worlds * len(config.cameras.positions), config.physics.steps_per_tick, values)
         if "write" in parts:
             worlds = min(factory.simulation.layout.worlds, -(-WRITE_VIEWS // len(factory.cameras)))
             yield from of_part("write", measure_writing(config, factory, _mark_live(factory.simulation, worlds), min_seconds))
@@ -212,7 +212,7 @@ def measure(
         yield from of_part("growth", measure_growth(config, min_seconds))
 
 
-def _measure_worlds(config: Config, factory: Factory, min_seconds: float, parts: tuple[str, ...]) -> Iterator[Row]:
+def _measure_worlds(quality: int, factory: Factory, min_seconds: float, parts: tuple[str, ...]) -> Iterator[Row]:
     """Benchmark of simulation and perception, and then of rendering the same worlds."""
     yield from of_part("physics", measure_simulation(factory, min_seconds, parts))
     if "render" in parts:
@@ -221,18 +221,18 @@ def _measure_worlds(config: Config, factory: Factory, min_seconds: float, parts:
         count = min(factory.stream.batch, factory.simulation.layout.worlds * len(factory.cameras))
         images = factory.stream.buffers[0]
         factory.stream.renderer.render(factory.simulation.record.snapshot, _first_views(factory, count), images)
-        quality, device = config.bop.jpeg_quality, factory.simulation.device
+        device = factory.simulation.device
         yield from of_part("encode", measure_encoding(images, count, quality, device, min_seconds))
 
 
-def _perception_fraction(config: Config, values: dict[str, float]) -> Iterator[Row]:
+def _perception_fraction(views: int, steps: int, values: dict[str, float]) -> Iterator[Row]:
     """Fraction of perception and planning in a tick in which all worlds pick and are rendered, if all of these were measured."""
     perceive, step, rate = (
         values.get(name) for name in ("perception and planning, a tick", "picking: a step of all worlds", "views, all stages")
     )
     if perceive is not None and step and rate:
-        render = 1e3 * config.bake.worlds * len(config.cameras.positions) / rate
-        fraction = perceive / (step * config.physics.steps_per_tick + render)
+        render = 1e3 * views / rate
+        fraction = perceive / (step * steps + render)
         yield Row("perception and planning: fraction of simulation and rendering", 100.0 * fraction, "%", part="perception")
 
 

@@ -87,25 +87,25 @@ class Assets:
 def vary_worlds(config: Config, factor: float) -> tuple[str, Config]:
     """Other number of worlds."""
     worlds = max(1, round(factor * config.bake.worlds))
-    config = with_enough_worlds(replace(config, bake=replace(config.bake, worlds=worlds)), pick_device(config.bake.device))
+    config = with_enough_worlds(config.with_values({"bake.worlds": worlds}), pick_device(config.bake.device))
     return str(config.bake.worlds), config
 
 
 def vary_objects(config: Config, factor: float) -> tuple[str, Config]:
     """Other volume of the objects."""
     volume = factor * config.arrangement.volume
-    return f"{1e3 * volume:.3g} l", replace(config, arrangement=replace(config.arrangement, volume=volume))
+    return f"{1e3 * volume:.3g} l", config.with_values({"arrangement.volume": volume})
 
 
 def vary_resolution(config: Config, factor: float) -> tuple[str, Config]:
     """Other image size of the same shape."""
     width, height = (max(1, round(factor * size)) for size in config.cameras.resolution)
-    return f"{width}x{height}", replace(config, cameras=replace(config.cameras, resolution=(width, height)))
+    return f"{width}x{height}", config.with_values({"cameras.resolution": (width, height)})
 
 
 def vary_paths(config: Config, paths: float) -> tuple[str, Config]:
     """Other number of paths per coarse pixel."""
-    return str(int(paths)), replace(config, render=replace(config.render, coarse_paths=int(paths)))
+    return str(int(paths)), config.with_values({"render.coarse_paths": int(paths)})
 
 
 def vary_cameras(config: Config, factor: float) -> tuple[str, Config]:
@@ -137,20 +137,20 @@ def measure_growth(config: Config, min_seconds: float) -> Iterator[Row]:
     assets = Assets(config, min_seconds)
     scene = assets.build_scene(config)
     pile = assets.drop(config, scene)
-    yield from _rows("as set", config, pile, assets.time_view(config, scene, pile))
+    yield from _rows("as set", config.physics.steps_per_tick * config.bake.worlds, pile, assets.time_view(config, scene, pile))
     for factor, vary in VARIATIONS.items():
         for value, varied in dict(vary(config, multiple) for multiple in FRACTIONS.get(factor, PATHS)).items():
             other = assets.build_scene(varied) if factor in ("resolution", "cameras") else scene
             dropped = assets.drop(varied, scene) if factor in ("worlds", "objects") else None
             view = assets.time_view(varied, other, dropped or pile)
-            yield from _rows(f"{factor} {value}", varied, dropped, view)
+            yield from _rows(f"{factor} {value}", varied.physics.steps_per_tick * varied.bake.worlds, dropped, view)
     yield Row("all measurements", time.perf_counter() - started, "s")
 
 
-def _rows(name: str, config: Config, pile: Pile | None, view: float) -> Iterator[Row]:
+def _rows(name: str, steps: int, pile: Pile | None, view: float) -> Iterator[Row]:
     """Rows of a point: of piles that were dropped for it, and of a view that takes `view` [s]."""
     if pile is not None:
         yield Row(f"{name}: objects a tote", pile.objects)
         yield Row(f"{name}: physics of a tick", 1e3 * pile.seconds, "ms")
-        yield Row(f"{name}: world-steps", config.physics.steps_per_tick * config.bake.worlds / pile.seconds, "1/s")
+        yield Row(f"{name}: world-steps", steps / pile.seconds, "1/s")
     yield Row(f"{name}: a view", 1e3 * view, "ms")

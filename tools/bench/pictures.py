@@ -13,14 +13,14 @@ from __future__ import annotations
 import statistics
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 from typing import Any
 
 import warp as wp
 
 from synpick_warp.codes import Phase
 from synpick_warp.configs.schema import Config
-from synpick_warp.exporters.registry import load_exporter_classes
+from synpick_warp.exporters.registry import Needs
 from synpick_warp.factory.assembly import Factory, build_factory, make_renderer
 from synpick_warp.kernels.render.lighting.history import MAX_PERIOD_BITS
 from synpick_warp.progress import SilentProgress
@@ -87,8 +87,8 @@ def measure_pictures(config: Config, after: int = 0) -> Iterator[Row]:
     """
     started = time.perf_counter()
     config = plan_spare_episodes(config)
-    kinds = load_exporter_classes(config.bake.formats)
-    factory = build_factory(config, SilentProgress(), needs_images=any(kind.needs_images for kind in kinds))
+    needs = Needs.of(config)
+    factory = build_factory(config, SilentProgress(), needs_images=needs.images)
     stream, device = factory.stream, factory.simulation.device
     simulate_until_live(factory)
     for _ in range(after):
@@ -109,7 +109,7 @@ def measure_pictures(config: Config, after: int = 0) -> Iterator[Row]:
     if history is not None:
         paths = history.paths.numpy()[history.frame.numpy() >= 0]  # NEVER, a negative index: no frame yet.
         yield Row("paths in a history before a pass, mean", float(paths.mean()), "")
-        without = replace(config, render=replace(config.render, history=0))
+        without = config.with_values({"render.history": 0})
         renderers["all stages, render.history=0"] = make_renderer(without, stream.renderer.scene, stream.instances, stream.batch)
     megapixels = 1e-6 * config.cameras.resolution[0] * config.cameras.resolution[1]
     for name, times in _time_passes(stream, renderers, ticks).items():

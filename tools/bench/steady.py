@@ -6,13 +6,13 @@ Background processes verify finished episodes and delete their files, so that th
 from __future__ import annotations
 
 import contextlib
-import dataclasses
 import tempfile
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from synpick_warp.configs.fields import INT32_MAX
 from synpick_warp.configs.schema import Config
+from synpick_warp.configs.splits import DataLayout
 from synpick_warp.errors import DatasetError
 from synpick_warp.exporters.registry import load_exporter_classes, shared_files
 from synpick_warp.pipeline import run_bake
@@ -29,7 +29,7 @@ SPARE_EPISODES = 16
 def plan_spare_episodes(config: Config, devices: int = 1) -> Config:
     """Settings with SPARE_EPISODES episodes for each world of each device."""
     episodes = SPARE_EPISODES * config.bake.worlds * devices
-    return dataclasses.replace(config, bake=dataclasses.replace(config.bake, episodes=episodes))
+    return config.with_values({"bake.episodes": episodes})
 
 
 @contextlib.contextmanager
@@ -39,7 +39,7 @@ def clean_up_behind(config: Config, out: Path, suffixes: tuple[str, ...] = ()) -
     Raises:
         DatasetError: An episode was damaged.
     """
-    folders = tuple(map(str, shared_files(load_exporter_classes(config.bake.formats), config).folders))
+    folders = tuple(map(str, shared_files(load_exporter_classes(config.bake.formats), DataLayout.of(config)).folders))
     with Cleaner(Assignment(out, folders, suffixes)) as cleaner:
         yield cleaner
         tally = cleaner.poll()
@@ -63,11 +63,11 @@ def measure_steady(config: Config, min_seconds: float, devices: Sequence[str] = 
         meter = SteadyMeter(min_seconds, Path(folder), live_views, config.bake.worlds, device, cleaner, devices=count)
         summary = run_bake(config, Path(folder) / "out", meter, devices=names)
     if len(meter.readings) > 1:
-        yield from _summarize(config, meter)
+        yield from _summarize(meter)
     meter.raise_interruption(summary)
 
 
-def _summarize(config: Config, meter: SteadyMeter) -> Iterator[Row]:
+def _summarize(meter: SteadyMeter) -> Iterator[Row]:
     """Rows of the rates, the verified scenes, and the space on disk."""
     yield from summarize_rates("view", meter)
     first, last = meter.readings[0], meter.readings[-1]

@@ -63,7 +63,7 @@ def measure_stream(config: Config, factory: Factory, report: TickReport, min_sec
         config, factory.catalog, factory.cameras, factory.lights, factory.simulation, renderer, sizes, ids, factory.stream.lights
     )
     ring = BatchRing(sizes, config.render.layers, renderer, config.bop.depth_scale)
-    parts = (stages, ring, Selection().resolve(config), BakeSummary(), SilentProgress())
+    parts = (stages, ring, Selection().resolve(len(config.cameras.positions)), BakeSummary(), SilentProgress())
     yield Row("views in a batch", ring.views, "")
     still = ViewStream(_StillProducer(report, *parts))
     sources = {"renderer alone": _render_loop(stages, ring, report), "stream of one tick": map(_consumer(device), still)}

@@ -6,7 +6,6 @@ Such a bake renders no views; worlds that pick still render the images of their 
 from __future__ import annotations
 
 import contextlib
-import dataclasses
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
@@ -33,7 +32,7 @@ HOUR = 3600.0
 
 def measure_trajectories(config: Config, min_seconds: float) -> Iterator[Row]:
     """Bake to the temporary folder (TMPDIR) until the steady state is measured for `min_seconds` [s]; the files are removed."""
-    config = plan_spare_episodes(dataclasses.replace(config, bake=dataclasses.replace(config.bake, formats=FORMATS)))
+    config = plan_spare_episodes(config.with_values({"bake.formats": FORMATS}))
     worlds, device = config.bake.worlds, pick_device(config.bake.device)
     with tempfile.TemporaryDirectory() as folder, _count_frames() as frames:
         meter = SteadyMeter(min_seconds, Path(folder), LIVE_FRACTION * worlds, worlds, device, counter=lambda: frames[0])

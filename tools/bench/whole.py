@@ -6,7 +6,6 @@ are kept, because the bake reads some of them at its end.
 
 from __future__ import annotations
 
-import dataclasses
 import itertools
 import os
 import shutil
@@ -98,7 +97,7 @@ def measure_whole(config: Config, bake: WholeBake, steady_rate: float, traces: d
         steady_rate: Views per second of the benchmark part `steady`, for comparison; 0: not measured.
         traces: Receives the columns of `describe_trace` under the key "whole".
     """
-    config = dataclasses.replace(config, bake=dataclasses.replace(config.bake, episodes=bake.episodes, worlds=bake.worlds))
+    config = config.with_values({"bake.episodes": bake.episodes, "bake.worlds": bake.worlds})
     with tempfile.TemporaryDirectory() as folder, clean_up_behind(config, Path(folder) / "out", PICTURES) as cleaner:
         trace = _Trace(Path(folder), cleaner)
         summary = run_bake(config, Path(folder) / "out", trace)

@@ -14,7 +14,7 @@ import numpy as np
 
 from synpick_warp.codes import Ending
 from synpick_warp.configs.schema import Config
-from synpick_warp.exporters.base import ExportContext, Exporter
+from synpick_warp.exporters.base import ExportContext, Exporter, TaskSizes
 from synpick_warp.exporters.registry import load_exporter_classes
 from synpick_warp.exporters.writing.files import PARTIAL
 from synpick_warp.exporters.writing.pool import QUEUE_DEPTH, WriterPool
@@ -128,7 +128,7 @@ def _write(
 ) -> _Result:
     """Write into the new folder `out` for at least `min_seconds` [s], or until episodes have `MAX_FRAMES` frames."""
     (out / PARTIAL).mkdir(parents=True)
-    with WriterPool(processes, exporter_class.slot_bytes(config)) as pool:
+    with WriterPool(processes, exporter_class.slot_bytes(TaskSizes.of(config))) as pool:
         exporter = exporter_class(ExportContext(out, config, factory.catalog, factory.cameras, factory.lights, pool))
         exporter.write_constants()
         for batch in (source.at(COPIES, 0)[0] for _ in range(-(-processes * QUEUE_DEPTH // len(source.views)))):

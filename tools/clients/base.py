@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-CLIENTS = ("bop_toolkit", "shards", "pytorch", "hugging_face", "coco", "xarray_store", "newton_usd", "blender", "lerobot")
+CLIENTS = ("bop_toolkit", "shards", "pytorch", "hugging_face", "coco", "yolo", "xarray_store", "newton_usd", "blender", "lerobot")
 """Client modules, in the order of the table's rows."""
 SAMPLES = 3
 """Number of frames read from an episode."""

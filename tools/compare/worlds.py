@@ -108,7 +108,7 @@ def compare_worlds(config: Config, worlds: tuple[int, ...], max_ticks: int, cons
     """
     runs = []
     for deterministic in (True, False) if pick_device(config.bake.device).is_cuda else (True,):
-        run_config = dataclasses.replace(config, physics=dataclasses.replace(config.physics, deterministic=deterministic))
+        run_config = config.with_values({"physics.deterministic": deterministic})
         reference: Ticks | None = None
         for count in (worlds[0], *(worlds if deterministic else worlds[:: max(1, len(worlds) - 1)])):
             ticks, tick_time = simulate(run_config, count, max_ticks)
@@ -124,7 +124,7 @@ def compare_worlds(config: Config, worlds: tuple[int, ...], max_ticks: int, cons
 
 def simulate(config: Config, worlds: int, max_ticks: int, records: bool = False) -> tuple[Ticks, float]:
     """Simulate all episodes; returns the state after each tick, and the median time of a tick [ms]."""
-    config = dataclasses.replace(config, bake=dataclasses.replace(config.bake, worlds=worlds))
+    config = config.with_values({"bake.worlds": worlds})
     simulation = build_factory(config, SilentProgress(), records_physics=records).simulation
     reader = TickReader(simulation.record)
     ticks: Ticks = defaultdict(list)

@@ -22,7 +22,7 @@ import math
 import sys
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -32,7 +32,7 @@ from rich.console import Console
 
 from synpick_warp.arrays import allocate
 from synpick_warp.codes import Segment
-from synpick_warp.configs.schema import FAST, REFERENCE, Config
+from synpick_warp.configs.schema import FAST, REFERENCE, Config, Render
 from synpick_warp.errors import SynpickError
 from synpick_warp.factory.assembly import Stages, build_stages, make_renderer
 from synpick_warp.kernels.render.lighting.history import NEVER
@@ -186,7 +186,7 @@ def compare_maps(
     scene = build_render_scene(config.render, config.tote, stages.catalog, fixtures, make_cameras(config.cameras), stages.lights, device)
     width, height = config.cameras.resolution
     samples = min(MAX_SAMPLES, max(2, 1 << int(math.log2(options.paths / (width * height)))))
-    half = replace(config, render=replace(config.render, samples=samples // 2))
+    half = config.with_values({"render.samples": samples // 2})
     store = ReferenceStore(options.cache, half)
     denoised = Studio(make_renderer(with_mode(config, FAST), scene, room, 1, 1))
     references = [Studio(make_renderer(with_mode(half, REFERENCE, seed=config.bake.seed + each), scene, room, 1)) for each in (0, 1)]
@@ -204,12 +204,12 @@ def compare_maps(
             state.light.fill_(index)
             shots.append(denoised.render(state, 0, 0))
         first, second = store.get(state, 0, lambda: (references[0].render(state, 0, 0), references[1].render(state, 0, 0)))
-        yield Pair(map_.name, shots[-1], first, float(shots[-1].radiance.mean()), second), lattice_periods(config)
+        yield Pair(map_.name, shots[-1], first, float(shots[-1].radiance.mean()), second), lattice_periods(config.render, width)
 
 
-def lattice_periods(config: Config) -> tuple[int, ...]:
+def lattice_periods(render: Render, width: int) -> tuple[int, ...]:
     """Periods of the denoiser's grids [px]: of the order in which coarse pixels are shaded, and of the shadow samples' strata."""
-    size = coarse_size(config.render, config.cameras.resolution[0], 1)
+    size = coarse_size(render, width, 1)
     return tuple(sorted({size * int(LANE_STRIDE), shadow_size(size) * int(STRATA_PERIOD)}))
 
 

@@ -81,13 +81,13 @@ def bounded_row(name: str, value: float, unit: str, bound: float) -> Row:
 
 def with_mode(config: Config, mode: str, **bake: object) -> Config:
     """Copy of the settings with another rendering mode, and other values of the section bake."""
-    return replace(config, render=replace(config.render, mode=mode), bake=replace(config.bake, **bake))  # pyright: ignore[reportArgumentType]
+    return config.with_values({"render.mode": mode, **{f"bake.{name}": value for name, value in bake.items()}})
 
 
 def with_one_camera(config: Config) -> Config:
     """Copy of the settings with the first camera alone."""
     cameras = config.cameras
-    return replace(config, cameras=replace(cameras, positions=cameras.positions[:1], ups=cameras.ups[:1]))
+    return config.with_values({"cameras.positions": cameras.positions[:1], "cameras.ups": cameras.ups[:1]})
 
 
 def measure_furnaces(config: Config, device: Any) -> list[Row]:
@@ -103,7 +103,7 @@ def measure_furnaces(config: Config, device: Any) -> list[Row]:
     rows = []
     for mode in (REFERENCE, FAST):
         studio = _probe_studio(with_mode(config, mode), mesh, surfaces, make_cameras(above), _uniform_light(), device)
-        snapshot = _probe_snapshot(config, len(surfaces), device)
+        snapshot = _probe_snapshot(config.arrangement.max_objects, len(surfaces), device)
         for world, (metallic, roughness) in enumerate(surfaces):
             shot = studio.render(snapshot, world, 0)
             error = 100.0 * float(shot.radiance[shot.instance == 1].mean() - 1.0)
@@ -138,7 +138,7 @@ def measure_planes(config: Config, device: Any) -> list[Row]:
     for height in LAMP_HEIGHTS:
         cosine = float(np.sin(np.radians(height)))
         studio = _probe_studio(with_mode(config, REFERENCE), mesh, [(0.0, 1.0)], make_cameras(around), _lamp_light(cosine), device)
-        snapshot = _probe_snapshot(config, 1, device)
+        snapshot = _probe_snapshot(config.arrangement.max_objects, 1, device)
         radiance = [float(studio.render(snapshot, 0, camera).radiance.mean()) for camera in range(len(positions))]
         error = 100.0 * (float(node_weights @ radiance) / (np.sin(LAMP_RADIUS) ** 2 * cosine) - 1.0)
         rows.append(bounded_row(f"reference: irradiance, lamp at {height:g}°", error, "%", MAX_ENERGY_ERROR))
@@ -162,7 +162,7 @@ def _probe_studio(
     config: Config, mesh: TriangleMesh, surfaces: list[tuple[float, float]], cameras: tuple[Camera, ...], light: EnvironmentMap, device: Any
 ) -> Studio:
     """Studio of a white mesh alone, with one catalog entry per surface (metallic, roughness)."""
-    config = replace(config, render=replace(config.render, table=False))
+    config = config.with_values({"render.table": False})
     white = [Material((1.0, 1.0, 1.0), None, metallic, roughness) for metallic, roughness in surfaces]
     # Volume, radius, mass and diameter do not affect rendering.
     entries = tuple(
@@ -171,9 +171,8 @@ def _probe_studio(
     return make_studio(config, Catalog(entries), cameras, (light,), device)
 
 
-def _probe_snapshot(config: Config, worlds: int, device: Any) -> Snapshot:
+def _probe_snapshot(capacity: int, worlds: int, device: Any) -> Snapshot:
     """Snapshot in which world w contains catalog entry w at the origin alone."""
-    capacity = config.arrangement.max_objects
     snapshot = allocate(Snapshot, {"world": worlds, "instance": capacity, "fixture": len(FIXTURES)}, device)
     catalog_index = np.full((worlds, capacity), -1)
     catalog_index[:, 0] = np.arange(worlds)

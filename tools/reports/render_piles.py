@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, fields
 from typing import Any
@@ -104,7 +105,7 @@ def compare_piles(
             for differences, displacement in ((static, 0.0), (displaced, CREEP)):
                 frame = denoised.render(next_frame(snapshot, displacement), world, 0)
                 differences.append(mean_difference(pair.denoised, frame))
-    return rows + _summarize(config, pairs, static, displaced), pairs
+    return rows + _summarize(math.prod(config.cameras.resolution) * config.render.samples, pairs, static, displaced), pairs
 
 
 def mean_radiance(studio: Studio, snapshot: Snapshot, world: int) -> float:
@@ -119,9 +120,8 @@ def mean_radiance(studio: Studio, snapshot: Snapshot, world: int) -> float:
     return float(np.mean(means))
 
 
-def _summarize(config: Config, pairs: list[Pair], static: list[float], displaced: list[float]) -> list[Row]:
-    """Rows over all pairs, and over the frame differences `static` and `displaced` of all piles [grey levels]."""
-    width, height = config.cameras.resolution
+def _summarize(paths: int, pairs: list[Pair], static: list[float], displaced: list[float]) -> list[Row]:
+    """Rows over all pairs, whose references have `paths` paths, and over the frame differences `static` and `displaced` [grey levels]."""
     seconds = float(np.median([pair.reference.seconds for pair in pairs]))
     mean = float(np.mean([pair.quality for pair in pairs]))
     return [
@@ -132,7 +132,7 @@ def _summarize(config: Config, pairs: list[Pair], static: list[float], displaced
         bounded_row("denoised: frames of a static scene, mean difference", float(np.mean(static)), "grey", MAX_FLICKER),
         Row(f"denoised: the same, objects displaced by {1e3 * CREEP:g} mm", float(np.mean(displaced)), "grey"),
         Row("reference: time per image", seconds, "s"),
-        Row("reference: paths", 1e-6 * width * height * config.render.samples / seconds, "million/s"),
+        Row("reference: paths", 1e-6 * paths / seconds, "million/s"),
     ]
 
 

@@ -16,7 +16,6 @@ import argparse
 import sys
 import time
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -111,7 +110,7 @@ def compare_frames(config: Config, frames: tuple[int, ...], cache: Path | None =
     with explain_shortage(config):
         stages = build_stages(config, device, SilentProgress(), range(config.bake.episodes))
     denoised = Studio(stages.renderer)
-    room, half = config.arrangement.max_objects, replace(config, render=replace(config.render, samples=max(1, config.render.samples // 2)))
+    room, half = config.arrangement.max_objects, config.with_values({"render.samples": max(1, config.render.samples // 2)})
     references = [
         Studio(make_renderer(with_mode(half, REFERENCE, seed=config.bake.seed + offset), stages.renderer.scene, room, 1))
         for offset in (0, 1)

@@ -111,19 +111,23 @@ def gather_light(
     gbuffer: GBuffer,
     ratios: RatioImages,
     shadows: LampShadows,
+    edges: wp.array3d[wp.vec3],
     camera: int,
     view: int,
     row: int,
     column: int,
     face_normal: wp.vec3,
 ) -> PixelLight:
-    """Upsample the denoised light and the lamps' shadows to a pixel whose surface has the geometric normal `face_normal`."""
+    """Upsample the denoised light and the lamps' shadows to a pixel whose surface has the geometric normal `face_normal`.
+
+    `edges` is that of `upsample_shadows`.
+    """
     segment = gbuffer.segment[view, row, column]
     normal = wp.transpose(cameras.to_world[camera]) * face_normal
     plane = tangent_plane(cameras.intrinsics[camera], row, column, segment, gbuffer.depth[view, row, column], normal)
     result = PixelLight()
     if scene.lights.lamps[sky.light] > 0:
-        result.lamps = upsample_shadows(shadows, shadow_grid, view, row, column, plane)
+        result.lamps = upsample_shadows(shadows, edges, shadow_grid, view, row, column, plane)
     result.ratios = upsample_ratios(ratios, coarse, view, row, column, plane)
     result.ratios.indirect = result.ratios.indirect / scene.lights.exposure[sky.light]
     return result
@@ -193,6 +197,7 @@ def shade_pixel(
     gbuffer: GBuffer,
     ratios: RatioImages,
     shadows: LampShadows,
+    edges: wp.array3d[wp.vec3],
     views: Views,
     view: int,
     row: int,
@@ -202,7 +207,7 @@ def shade_pixel(
     """Radiance of a pixel; background pixels show the environment map.
 
     A pixel of a body is the mean of `samples_per_axis`² shading samples of its triangle, all in the light at the pixel's center. Kernels
-    pass a constant, so that the compiler removes the loop if there is one sample.
+    pass a constant, so that the compiler removes the loop if there is one sample. `edges` is that of `upsample_shadows`.
     """
     camera = views.camera[view]
     intrinsics = cameras.intrinsics[camera]
@@ -218,7 +223,8 @@ def shade_pixel(
     surface = make_table_surface(scene.meshes, outgoing)
     if segment != Segment.TABLE:
         surface = interpolate_surface(scene.meshes, scene.surfaces, bodies, view, body, triangle, barycentric, outgoing, width)
-    light = gather_light(scene, cameras, coarse, shadow_grid, sky, gbuffer, ratios, shadows, camera, view, row, column, surface.face_normal)
+    normal = surface.face_normal
+    light = gather_light(scene, cameras, coarse, shadow_grid, sky, gbuffer, ratios, shadows, edges, camera, view, row, column, normal)
     if segment == Segment.TABLE or samples_per_axis == 1:
         return shade_point(scene, sky, surface, outgoing, light)
     corners = camera_triangle(scene.meshes, bodies, view, body, triangle)
@@ -256,17 +262,18 @@ def shade_kernel(
     views: Views,
     first: int,
     # Out:
-    radiance_out: wp.array3d[wp.vec3],  # (view, row, column)
+    radiance_inout: wp.array3d[wp.vec3],  # (view, row, column)
 ):
     """Shade each pixel at its center, in the upsampled denoised light; background pixels show the environment map.
 
-    Launched over view, pixel (tile order, from flat index `first` on).
+    Before, `radiance` holds the visible fractions of lamps at shadow edges, see `filter_shadow_edges_kernel`. Launched over view, pixel
+    (tile order, from flat index `first` on).
     """
     view, row, column = tile_pixel(coarse.image, wp.tid() + first)
     if in_image(coarse.image, row, column):
         sky = world_sky(light, light_yaw, views.world[view])
-        radiance_out[view, row, column] = shade_pixel(
-            scene, cameras, coarse, shadow_grid, sky, bodies, gbuffer, ratios, shadows, views, view, row, column, 1
+        radiance_inout[view, row, column] = shade_pixel(
+            scene, cameras, coarse, shadow_grid, sky, bodies, gbuffer, ratios, shadows, radiance_inout, views, view, row, column, 1
         )
 
 
@@ -288,7 +295,7 @@ def shade_samples_kernel(
     views: Views,
     first: int,
     # Out:
-    radiance_out: wp.array3d[wp.vec3],  # (view, row, column)
+    radiance_inout: wp.array3d[wp.vec3],  # (view, row, column)
 ):
     """Shade each pixel as `shade_kernel`, but bodies with several shading samples a pixel.
 
@@ -297,6 +304,20 @@ def shade_samples_kernel(
     view, row, column = tile_pixel(coarse.image, wp.tid() + first)
     if in_image(coarse.image, row, column):
         sky = world_sky(light, light_yaw, views.world[view])
-        radiance_out[view, row, column] = shade_pixel(
-            scene, cameras, coarse, shadow_grid, sky, bodies, gbuffer, ratios, shadows, views, view, row, column, SAMPLES_PER_AXIS
+        radiance_inout[view, row, column] = shade_pixel(
+            scene,
+            cameras,
+            coarse,
+            shadow_grid,
+            sky,
+            bodies,
+            gbuffer,
+            ratios,
+            shadows,
+            radiance_inout,
+            views,
+            view,
+            row,
+            column,
+            SAMPLES_PER_AXIS,
         )

@@ -11,16 +11,27 @@ from synpick_warp.kernels.render.lighting.coarse_grid import CoarseGrid
 from synpick_warp.kernels.render.lighting.environment import Lights, lamp_direction, unit_heading
 from synpick_warp.kernels.render.lighting.plane_distance import Plane, tangent_plane
 from synpick_warp.kernels.render.lighting.shadow_filter import STEEPNESS_BITS, STEEPNESS_LEVELS, LampShadows
-from synpick_warp.kernels.render.lighting.shadow_upsampling import all_steepness, filter_edge, find_shadow_taps
+from synpick_warp.kernels.render.lighting.shadow_upsampling import all_steepness, filter_edge, find_shadow_taps, pack_fractions
 from synpick_warp.kernels.render.lighting.shadows import is_shadowed, point_direction, visible_normal
-from synpick_warp.kernels.render.visibility.camera import Cameras, Views, camera_ray, hit_position, in_image, tile_of, tile_pixel
+from synpick_warp.kernels.render.visibility.camera import (
+    TILE_PIXELS,
+    Cameras,
+    Views,
+    camera_ray,
+    hit_position,
+    in_image,
+    tile_of,
+    tile_pixel,
+)
 from synpick_warp.kernels.render.visibility.gbuffer import GBuffer, Meshes, Table, ViewBodies, read_hit
 from synpick_warp.kernels.tuning import RAY_REGISTERS
 
 wp.set_module_options({"enable_backward": False, "fast_math": True})
 
 CHUNK_TILES = wp.constant(32)
-"""Tiles of the shadow grid that share lists and their counters, as of anti-aliasing's footprints."""
+"""Maximum number of tiles of the shadow grid that share lists and their counters, as of anti-aliasing's footprints."""
+MAX_CHUNK_PIXELS = 1 << 16
+"""Maximum number of the image's pixels in a chunk: entries of `EdgeLists.pixel` have 16 bits."""
 CELLS, PIXELS = wp.constant(0), wp.constant(1)
 """Counters of `EdgeLists`."""
 
@@ -29,13 +40,13 @@ CELLS, PIXELS = wp.constant(0), wp.constant(1)
 class EdgeLists:
     """Work lists of the shadow grid's pixels near shadow edges and of the image's pixels that trace rays, with their lengths. Scratch.
 
-    A chunk is a run of tiles of the shadow grid with lists of its own.
+    A chunk is a run of tiles of the shadow grid with lists of its own, which hold all of its pixels.
     """
 
     cell: wp.array3d[int]
     """(view, edge_chunk, chunk_cell): row * columns + column of pixels of the shadow grid, in whose squares all pixels are examined."""
-    pixel: wp.array3d[int]
-    """(view, edge_chunk, chunk_pixel): row * columns + column of pixels of the image that trace rays."""
+    pixel: wp.array3d[wp.uint16]
+    """(view, edge_chunk, chunk_pixel): pixels of the image that trace rays, as `listed_pixel` reads them."""
     count: wp.array3d[int]
     """(view, edge_chunk, edge_counter): lengths of both lists, at CELLS and PIXELS."""
 
@@ -50,9 +61,15 @@ def list_place(lists: EdgeLists, thread: int, threads: int) -> tuple[int, int, i
 
 
 @wp.func
-def flat_pixel(flat: int, width: int) -> tuple[int, int]:
-    """(row, column) of row * `width` + column."""
-    return int(wp.uint32(flat) // wp.uint32(width)), int(wp.uint32(flat) % wp.uint32(width))
+def listed_pixel(coarse: CoarseGrid, cell: wp.array3d[int], view: int, chunk: int, index: int) -> tuple[int, int]:
+    """(row, column) of a pixel of the image, `index` in the squares of the pixels of the shadow grid that `cell` lists."""
+    # Unsigned: cheaper to divide.
+    square = wp.uint32(coarse.size * coarse.size)
+    flat = wp.uint32(cell[view, chunk, int(wp.uint32(index) // square)])
+    offset = wp.uint32(index) % square
+    top, left = flat // wp.uint32(coarse.grid.width), flat % wp.uint32(coarse.grid.width)
+    down, right = offset // wp.uint32(coarse.size), offset % wp.uint32(coarse.size)
+    return int(top) * coarse.size + int(down), int(left) * coarse.size + int(right)
 
 
 @wp.kernel
@@ -75,7 +92,7 @@ def list_edge_cells_kernel(
     if view < views.count and in_image(coarse.grid, row, column):
         if shadows_inout.near_edge[view, row, column] != wp.uint8(0):
             shadows_inout.near_edge[view, row, column] = wp.uint8(0)
-            chunk = tile_of(coarse.grid, row, column) // CHUNK_TILES
+            chunk = tile_of(coarse.grid, row, column) // (lists_inout.cell.shape[2] // TILE_PIXELS)
             rank = wp.atomic_add(lists_inout.count, view, chunk, CELLS, 1)
             lists_inout.cell[view, chunk, rank] = row * coarse.grid.width + column
 
@@ -119,9 +136,7 @@ def list_edge_pixels_kernel(
         return
     square = coarse.size * coarse.size
     for index in range(start, square * lists_inout.count[view, chunk, CELLS], threads):
-        top, left = flat_pixel(lists_inout.cell[view, chunk, index // square], coarse.grid.width)
-        row = top * coarse.size + index % square // coarse.size
-        column = left * coarse.size + index % coarse.size
+        row, column = listed_pixel(coarse, lists_inout.cell, view, chunk, index)
         if in_image(coarse.image, row, column):
             if int(gbuffer.segment[view, row, column]) != Segment.NOTHING:
                 plane, _normal = pixel_plane(meshes, cameras, bodies, gbuffer, views, view, row, column)
@@ -129,7 +144,7 @@ def list_edge_pixels_kernel(
                 if steepness != wp.uint32(0):
                     shadows_inout.edge[view, row, column] = steepness
                     rank = wp.atomic_add(lists_inout.count, view, chunk, PIXELS, 1)
-                    lists_inout.pixel[view, chunk, rank] = row * coarse.image.width + column
+                    lists_inout.pixel[view, chunk, rank] = wp.uint16(index)
 
 
 @wp.func
@@ -203,7 +218,7 @@ def trace_shadow_edges_kernel(
     which = light[world]
     heading = unit_heading(light_yaw[world])
     for index in range(start, lists.count[view, chunk, PIXELS], threads):
-        row, column = flat_pixel(lists.pixel[view, chunk, index], coarse.image.width)
+        row, column = listed_pixel(coarse, lists.cell, view, chunk, int(lists.pixel[view, chunk, index]))
         steepness = shadows_inout.edge[view, row, column]
         shadows_inout.edge[view, row, column] = trace_pixel_edges(
             meshes, table, cameras, coarse, lights, which, heading, bodies, gbuffer, views, steepness, view, row, column
@@ -223,13 +238,15 @@ def filter_shadow_edges_kernel(
     bodies: ViewBodies,
     gbuffer: GBuffer,
     lists: EdgeLists,
+    shadows: LampShadows,
     views: Views,
     threads: int,
     first: int,
     # Out:
-    shadows_inout: LampShadows,
+    radiance_out: wp.array3d[wp.vec3],  # (view, row, column)
 ):
-    """Filter the traced edges: `edge_fractions` of each listed pixel receives the visible fractions of the lamps, see `filter_edge`.
+    """Filter the traced edges: each listed pixel of `radiance` receives the visible fractions of the lamps, see `filter_edge`, packed by
+    `pack_fractions`; they lie there until the pixel is shaded, which saves memory.
 
     Launched over view, chunk, thread (flat, from `first` on); `threads` as in `list_edge_pixels_kernel`.
     """
@@ -238,6 +255,7 @@ def filter_shadow_edges_kernel(
         return
     lamps = lights.lamps[light[views.world[view]]]
     for index in range(start, lists.count[view, chunk, PIXELS], threads):
-        row, column = flat_pixel(lists.pixel[view, chunk, index], coarse.image.width)
+        row, column = listed_pixel(coarse, lists.cell, view, chunk, int(lists.pixel[view, chunk, index]))
         plane, _normal = pixel_plane(meshes, cameras, bodies, gbuffer, views, view, row, column)
-        shadows_inout.edge_fractions[view, row, column] = filter_edge(shadows_inout, coarse, gbuffer, lamps, view, row, column, plane)
+        fractions = filter_edge(shadows, coarse, gbuffer, lamps, view, row, column, plane)
+        radiance_out[view, row, column] = pack_fractions(fractions)

@@ -64,8 +64,6 @@ class LampShadows:
     edge: wp.array3d[wp.uint32]
     """(view, row, column): rays from the pixel itself at steep edges, 4 bits a lamp: 0, or 1 + the number of unblocked rays. Before
     they are traced: steepness as in `record`."""
-    edge_fractions: wp.array3d[wp.uint64]
-    """(view, row, column): as `fractions`, where `edge` is not 0; undefined elsewhere."""
 
 
 @wp.func

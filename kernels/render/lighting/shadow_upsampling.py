@@ -217,10 +217,25 @@ def filter_edge(
 
 
 @wp.func
-def upsample_shadows(shadows: LampShadows, coarse: CoarseGrid, view: int, row: int, column: int, plane: Plane) -> wp.uint64:
+def pack_fractions(fractions: wp.uint64) -> wp.vec3:
+    """Store the bits of the lamps' visible fractions as those of two floats."""
+    return wp.vec3(wp.cast(wp.uint32(fractions), wp.float32), wp.cast(wp.uint32(fractions >> wp.uint64(32)), wp.float32), 0.0)
+
+
+@wp.func
+def unpack_fractions(packed: wp.vec3) -> wp.uint64:
+    """Inverse of `pack_fractions`."""
+    return (wp.uint64(wp.cast(packed[1], wp.uint32)) << wp.uint64(32)) | wp.uint64(wp.cast(packed[0], wp.uint32))
+
+
+@wp.func
+def upsample_shadows(
+    shadows: LampShadows, edges: wp.array3d[wp.vec3], coarse: CoarseGrid, view: int, row: int, column: int, plane: Plane
+) -> wp.uint64:
     """Visible fractions of the lamps at a pixel, byte k that of lamp k in 1/255: from its rays and its neighbours' where it traced some,
-    else interpolated between the four nearest pixels of the shadow grid on its surface, whose tangent plane is `plane`."""
+    which `edges` holds, packed by `pack_fractions`, else interpolated between the four nearest pixels of the shadow grid on its surface,
+    whose tangent plane is `plane`."""
     if shadows.edge[view, row, column] != wp.uint32(0):
-        return shadows.edge_fractions[view, row, column]
+        return unpack_fractions(edges[view, row, column])
     taps = find_shadow_taps(shadows, coarse, view, row, column, plane)
     return blend_bytes(taps.fractions, taps.weights)

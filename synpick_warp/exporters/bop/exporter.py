@@ -8,8 +8,8 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from synpick_warp.configs.schema import MULTISENSOR, Config
-from synpick_warp.configs.splits import bop_folder, bop_folders, bop_scene, scene_ids
+from synpick_warp.configs.schema import Bop, Config
+from synpick_warp.configs.splits import DataLayout
 from synpick_warp.exporters.base import ExportContext, SharedFiles
 from synpick_warp.exporters.bop.keypoints import make_category_keys
 from synpick_warp.exporters.bop.scene import SceneSettings, commit_scenes, create_scene_folders, write_layer, write_view
@@ -42,9 +42,9 @@ class BopExporter(SceneExporter):
         self._categories = tuple({"id": index, "name": name, "supercategory": "synpick"} | points.get(index, {}) for index, name in names)
 
     @staticmethod
-    def annotates(config: Config) -> bool:
+    def annotates(bop: Bop) -> bool:
         """See `SceneExporter`."""
-        return config.bop.coco
+        return bop.coco
 
     @staticmethod
     def folder_name(split: str) -> str:
@@ -52,22 +52,23 @@ class BopExporter(SceneExporter):
         return split
 
     @staticmethod
-    def shared_files(config: Config) -> SharedFiles:
+    def shared_files(layout: DataLayout) -> SharedFiles:
         """See `Exporter`."""
-        return SharedFiles(CONSTANTS, tuple(map(Path, target_files(config))), BopExporter.folders(config))
+        return SharedFiles(CONSTANTS, tuple(map(Path, target_files(layout))), BopExporter.folders(layout))
 
     @staticmethod
     def finalize(out: Path, config: Config, pool: WriterPool, episodes: Sequence[int]) -> list[Path]:
         """See `Exporter`: the lists of evaluation targets."""
-        parts, names, sensors = out / PARTIAL / BopExporter.staging / "targets", target_files(config), sensor_suffixes(config)
+        layout = DataLayout.of(config)
+        parts, names, sensors = out / PARTIAL / BopExporter.staging / "targets", target_files(layout), sensor_suffixes(layout)
         try:
             parts.parent.mkdir(exist_ok=True)
             shutil.rmtree(parts, ignore_errors=True)
             for name in (parts, *(parts / name for name in names)):
                 name.mkdir()
-            for folder in bop_folders(config):
-                places = tuple(str(parts / name) for name in scene_target_files(config, folder))
-                for scene in find_scenes(out / folder, scene_ids(config, episodes)):
+            for folder in layout.folders:
+                places = tuple(str(parts / name) for name in scene_target_files(layout, folder))
+                for scene in find_scenes(out / folder, layout.scene_ids(episodes)):
                     pool.submit(write_scene_targets, (), (scene, places, config.bop.target_visibility, sensors), path=scene)
             pool.wait()
             concatenate_targets(parts, out, names)
@@ -85,7 +86,7 @@ class BopExporter(SceneExporter):
 
     def _commit_task(self, scenes: tuple[tuple[Path, int], ...], images: Sequence[int]) -> tuple[Callable[..., None], tuple[Any, ...]]:
         settings = SceneSettings(
-            split=bop_folder(self._context.config, scenes[0][1] // len(self._cameras)),
+            split=self._context.layout.folder(scenes[0][1] // len(self._cameras)),
             images=images,
             width=self._cameras[0].width,
             height=self._cameras[0].height,
@@ -93,11 +94,11 @@ class BopExporter(SceneExporter):
             coco=self._bop.coco,
             categories=self._categories,
         )
-        if self._bop.layout == MULTISENSOR:
+        if self._context.layout.has_sensors:
             return commit_sensor_scene, (tuple(scene for scene, _ in scenes), self._place(scenes[0][1]), settings)
         return commit_scenes, (tuple((scene, self._place(scene_id)) for scene, scene_id in scenes), settings)
 
     def _place(self, scene_id: int) -> Path:
         """Folder of the scene that holds what the staged one of this id does."""
         episode, camera = divmod(scene_id, len(self._cameras))
-        return self._folder(scene_id) / f"{bop_scene(self._context.config, episode, camera)[0]:06d}"
+        return self._folder(scene_id) / f"{self._context.layout.scene(episode, camera)[0]:06d}"

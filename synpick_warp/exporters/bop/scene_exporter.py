@@ -8,10 +8,10 @@ from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar
 
-from synpick_warp.configs.schema import Config
+from synpick_warp.configs.schema import Bop
 from synpick_warp.configs.sensors import effect_ranges
-from synpick_warp.configs.splits import bop_folder, bop_folders
-from synpick_warp.exporters.base import ExportContext, StoredScene, view_bytes
+from synpick_warp.configs.splits import DataLayout
+from synpick_warp.exporters.base import ExportContext, StoredScene, TaskSizes, view_bytes
 from synpick_warp.exporters.bop.keypoints import sample_keypoints
 from synpick_warp.exporters.bop.shared.models import MODEL_FOLDERS, describe_dataset, write_constants
 from synpick_warp.exporters.bop.shared.toolkit import PARAMS_FILE, format_dataset_params
@@ -62,7 +62,7 @@ class SceneExporter(EpisodeExporter[tuple[Path, ...]]):
         self._suffix = f".{bop.color_format}"
         self._layers = config.render.layers if self.write_layer else ()
         effects = tuple(name for name, limits in effect_ranges(config.effects).items() if any(limits))
-        entries = context.catalog.entries if bop.keypoints and self.annotates(config) else ()
+        entries = context.catalog.entries if bop.keypoints and self.annotates(bop) else ()
         self._keypoints = {entry.obj_id: sample_keypoints(entry.mesh.vertices, bop.keypoints) for entry in entries}
         self._views = tuple(
             ViewSettings(
@@ -75,17 +75,18 @@ class SceneExporter(EpisodeExporter[tuple[Path, ...]]):
                 resolution=(camera.width, camera.height),
                 depth=self.writes_depth,
                 keypoints=self._keypoints,
+                polygons=bop.polygons,
             )
             for camera in context.cameras
         )
 
     @classmethod
-    def folders(cls, config: Config) -> tuple[Path, ...]:
+    def folders(cls, layout: DataLayout) -> tuple[Path, ...]:
         """Folders of the splits' scenes, relative to the data set."""
-        return tuple(Path(cls.folder_name(split)) for split in bop_folders(config))
+        return tuple(Path(cls.folder_name(split)) for split in layout.folders)
 
     @staticmethod
-    def annotates(config: Config) -> bool:
+    def annotates(bop: Bop) -> bool:
         """Whether it writes COCO annotations, which have keypoints."""
         return False
 
@@ -96,7 +97,7 @@ class SceneExporter(EpisodeExporter[tuple[Path, ...]]):
 
     def _folder(self, scene_id: int) -> Path:
         """Folder of a scene's split."""
-        return self._out / self.folder_name(bop_folder(self._context.config, scene_id // len(self._cameras)))
+        return self._out / self.folder_name(self._context.layout.folder(scene_id // len(self._cameras)))
 
     @abstractmethod
     def _stage_scene(self, scene: Path) -> None:
@@ -111,20 +112,22 @@ class SceneExporter(EpisodeExporter[tuple[Path, ...]]):
         """See `Exporter`."""
 
     @staticmethod
-    def slot_bytes(config: Config) -> int:
+    def slot_bytes(sizes: TaskSizes) -> int:
         """See `Exporter`."""
-        return view_bytes(config.cameras.resolution, bool(config.render.layers))
+        return view_bytes(sizes.resolution, sizes.has_layers)
 
     def write_constants(self) -> list[Path]:
         """See `Exporter`: models, camera and notes."""
         context = self._context
         try:
-            for folder in self.folders(context.config):
+            for folder in self.folders(context.layout):
                 (self._out / folder).mkdir(exist_ok=True)
             if context.copy_constants(CONSTANTS):
                 return list(CONSTANTS)
-            scene = context.config, context.catalog, self._cameras
-            texts = {NOTES_FILE: describe_dataset(*scene), PARAMS_FILE: format_dataset_params(*scene)}
+            texts = {
+                NOTES_FILE: describe_dataset(context.config, context.catalog, self._cameras),
+                PARAMS_FILE: format_dataset_params(context.layout, self._bop.color_format, context.catalog, self._cameras),
+            }
             return write_constants(self._out, context.catalog, self._cameras[0], self._bop.depth_scale, texts)
         except OSError as error:
             raise output_error(self._out, error) from error

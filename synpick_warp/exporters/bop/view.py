@@ -65,6 +65,10 @@ class ViewSettings:
     """Whether depth files are written."""
     keypoints: dict[int, Keypoints] = field(default_factory=dict)
     """Keypoints in COCO annotations, by obj_id; empty: none."""
+    polygons: bool = False
+    """Whether the format coco has polygons instead of run lengths."""
+    classes: tuple[int, ...] = ()
+    """obj_id of each class of the format yolo."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,8 +13,9 @@ from pathlib import Path
 import numpy as np
 
 from synpick_warp.codes import Ending, Task
-from synpick_warp.configs.schema import Config
-from synpick_warp.exporters.base import ExportContext, SharedFiles, StoredScene
+from synpick_warp.configs.schema import Config, Physics
+from synpick_warp.configs.splits import DataLayout
+from synpick_warp.exporters.base import ExportContext, SharedFiles, StoredScene, TaskSizes
 from synpick_warp.exporters.lerobot.episode import EpisodeContent, EpisodeSettings, commit_episode, frame_path, group_path
 from synpick_warp.exporters.lerobot.index import write_indices
 from synpick_warp.exporters.lerobot.layout import (
@@ -76,20 +77,20 @@ class LerobotExporter(EpisodeExporter[_Content]):
         super().__init__(context)
         config = context.config
         cameras = len(config.cameras.positions)
-        self._settings = EpisodeSettings(context.out, cameras, config.cameras.resolution, video_rate(config), context.names)
+        self._settings = EpisodeSettings(context.out, cameras, config.cameras.resolution, video_rate(config.physics), context.names)
 
     @staticmethod
-    def slot_bytes(config: Config) -> int:
+    def slot_bytes(sizes: TaskSizes) -> int:
         """See `Exporter`: a colour image."""
-        width, height = config.cameras.resolution
+        width, height = sizes.resolution
         return shared_bytes((height * width * 3,))
 
     @staticmethod
-    def shared_files(config: Config) -> SharedFiles:
+    def shared_files(layout: DataLayout) -> SharedFiles:
         """See `Exporter`."""
-        videos = video_folders(len(config.cameras.positions))
+        videos = video_folders(layout.cameras)
         between = (EPISODES.parent, EPISODES.parent.parent, META, DATA.parent, DATA.parent.parent)
-        return SharedFiles(note_files(config), (INFO, STATS, TASKS, EPISODES, DATA, CARD), (PARTS, *videos, *between, FOLDER))
+        return SharedFiles(note_files(layout.formats), (INFO, STATS, TASKS, EPISODES, DATA, CARD), (PARTS, *videos, *between, FOLDER))
 
     @staticmethod
     def finalize(out: Path, config: Config, pool: WriterPool, episodes: Sequence[int]) -> list[Path]:
@@ -189,6 +190,6 @@ def make_ticks(batch: TickBatch) -> np.ndarray:
     return rows
 
 
-def video_rate(config: Config) -> Fraction:
+def video_rate(physics: Physics) -> Fraction:
     """Frames per second as a fraction."""
-    return Fraction(frame_rate(config)).limit_denominator(_MAX_DENOMINATOR)
+    return Fraction(frame_rate(physics)).limit_denominator(_MAX_DENOMINATOR)

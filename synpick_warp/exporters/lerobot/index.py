@@ -17,7 +17,8 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from synpick_warp.configs.schema import Config
+from synpick_warp.configs.schema import Bake, Config
+from synpick_warp.configs.splits import DataLayout
 from synpick_warp.errors import DatasetError
 from synpick_warp.exporters.lerobot.episode import make_folders
 from synpick_warp.exporters.lerobot.layout import (
@@ -71,10 +72,10 @@ def write_indices(out: Path, config: Config, episodes: Iterable[int]) -> list[Pa
         DatasetError: A part is damaged.
         OSError: A file cannot be written.
     """
-    cameras, totals = len(config.cameras.positions), _Totals()
+    cameras, rate, totals = len(config.cameras.positions), frame_rate(config.physics), _Totals()
     totals.levels = [np.zeros((3, 256), np.int64) for _ in range(cameras)]
     with pq.ParquetWriter(out / PARTIAL / "data.parquet", _data_schema(), compression="zstd") as writer:
-        for batch in _batch_tables(_read_tables(out, totals, config, episodes)):
+        for batch in _batch_tables(_read_tables(out, totals, config.cameras.resolution, rate, DataLayout.of(config), episodes)):
             writer.write_table(batch)
     _place(out, DATA, lambda path: (out / PARTIAL / "data.parquet").replace(path))
     _place(
@@ -83,12 +84,13 @@ def write_indices(out: Path, config: Config, episodes: Iterable[int]) -> list[Pa
     _place(out, TASKS, lambda path: pq.write_table(_task_table(totals.tasks), path))
     videos = {camera_key(index): describe_levels(levels, totals.frames) for index, levels in enumerate(totals.levels) if levels.any()}
     statistics = {name: to_json(values) for name, values in (totals.statistics | videos).items()}
-    info = make_info(config, [row["source/split"] for row in totals.rows], totals.frames, len(totals.tasks))
+    splits = [row["source/split"] for row in totals.rows]
+    info = make_info(config.cameras, rate, splits, totals.frames, len(totals.tasks))
     info["features"]["attempt.outcome"]["info"] = {"codes": list(outcome_names())}
     for place, content in ((STATS, statistics), (INFO, info)):
         text = json.dumps(content, indent=2) + "\n"
         _place(out, place, lambda path, text=text: path.write_text(text, encoding="ascii"))
-    _place(out, CARD, lambda path: path.write_text(_make_card(config, totals), encoding="utf-8"))
+    _place(out, CARD, lambda path: path.write_text(_make_card(config.bake, bool(config.splits), totals), encoding="utf-8"))
     return [INFO, STATS, TASKS, EPISODES, DATA, CARD]
 
 
@@ -104,20 +106,22 @@ def _place(out: Path, name: Path, write: Callable[[Path], object]) -> None:
     sync_folder(place.parent)
 
 
-def _read_tables(out: Path, totals: _Totals, config: Config, episodes: Iterable[int]) -> Iterator[pa.Table]:
+def _read_tables(
+    out: Path, totals: _Totals, resolution: tuple[int, int], rate: float, layout: DataLayout, episodes: Iterable[int]
+) -> Iterator[pa.Table]:
     """Tables of the episodes, in order; adds them to the totals. Those that were given up have no part."""
-    period = 1.0 / frame_rate(config)
+    period = 1.0 / rate
     for source in (episode for episode in episodes if os.path.lexists(out / part_path(episode))):
         name = part_path(source)
         part = read_json(path_inside(out, str(name), out / PARTS, DatasetError), Part, DatasetError, _ADVICE)
         if len(part.levels) != len(totals.levels):
             raise DatasetError(f"{out / name} has {len(part.levels)} cameras, the settings {len(totals.levels)}; {_ADVICE}")
-        pixels = part.frames * math.prod(config.cameras.resolution)
+        pixels = part.frames * math.prod(resolution)
         if not all(part.frames <= sum(channel) <= pixels for camera in part.levels for channel in camera):
             raise DatasetError(f"{out / name} has a histogram of no pixel a frame, or of more than {pixels:,} pixels; {_ADVICE}")
         columns = _make_columns(part, totals, period)
         _add_episode(source, part, columns, totals, period)
-        totals.rows[-1]["source/split"] = split_name(config, source)
+        totals.rows[-1]["source/split"] = split_name(layout, source)
         yield pa.table({name: _to_array(columns[name], feature) for name, feature in FRAME_FEATURES.items()}, _data_schema())
 
 
@@ -238,13 +242,13 @@ def _task_table(tasks: dict[str, int]) -> pa.Table:
     return table.replace_schema_metadata({"pandas": json.dumps(notes)})
 
 
-def _make_card(config: Config, totals: _Totals) -> str:
+def _make_card(bake: Bake, has_splits: bool, totals: _Totals) -> str:
     """Dataset card for the Hugging Face hub, whose visualizer of LeRobot data sets goes by the tag."""
-    licence = "unknown" if config.bake.models or config.bake.lights else "mit"
+    licence = "unknown" if bake.models or bake.lights else "mit"
     names = list(dict.fromkeys(row["source/split"] for row in totals.rows))
     only = "validation" if names == ["val"] else names[0] if names else "train"
-    files = " data/*/*.parquet" if config.splits else f"\n  - split: {only}\n    path: data/*/*.parquet"
-    splits = f"\nSplits (ranges of episodes in `meta/info.json`): {', '.join(names)}.\n" if config.splits else ""
+    files = " data/*/*.parquet" if has_splits else f"\n  - split: {only}\n    path: data/*/*.parquet"
+    splits = f"\nSplits (ranges of episodes in `meta/info.json`): {', '.join(names)}.\n" if has_splits else ""
     return f"""---
 license: {licence}
 task_categories: [robotics]

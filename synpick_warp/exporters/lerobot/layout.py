@@ -14,8 +14,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from synpick_warp.configs.schema import Config
-from synpick_warp.configs.splits import split_kind, split_of
+from synpick_warp.configs.schema import Cameras, Physics
+from synpick_warp.configs.splits import DataLayout, split_kind
 
 FOLDER = Path("lerobot")
 """Folder of the LeRobot data set, in ours."""
@@ -98,16 +98,16 @@ def video_folders(cameras: int) -> list[Path]:
     return [*(key / "chunk-*" for key in keys), *keys, VIDEOS]
 
 
-def frame_rate(config: Config) -> float | int:
+def frame_rate(physics: Physics) -> float | int:
     """Frames per second of simulated time [Hz]; whole numbers as integers."""
-    rate = 1.0 / (config.physics.step * config.physics.steps_per_tick)
+    rate = 1.0 / (physics.step * physics.steps_per_tick)
     return round(rate) if abs(rate - round(rate)) < 1e-9 else rate
 
 
-def split_name(config: Config, episode: int) -> str:
+def split_name(layout: DataLayout, episode: int) -> str:
     """Name of the split of an episode of the bake; without splits, BOP's kind of the one: train, val or test."""
-    split = split_of(config, episode)
-    return split_kind(config.bop.split) if split is None else split.name
+    split = layout.split_of(episode)
+    return split_kind(layout.split) if split is None else split.name
 
 
 def split_ranges(names: Sequence[str]) -> dict[str, str]:
@@ -117,10 +117,9 @@ def split_ranges(names: Sequence[str]) -> dict[str, str]:
     return {name: f"{end - count}:{end}" for (name, count), end in zip(counts.items(), ends, strict=True)}
 
 
-def make_info(config: Config, splits: Sequence[str], frames: int, tasks: int) -> dict[str, Any]:
-    """Content of meta/info.json; `splits`: name of the split of each episode."""
-    width, height = config.cameras.resolution
-    rate = frame_rate(config)
+def make_info(cameras: Cameras, rate: float, splits: Sequence[str], frames: int, tasks: int) -> dict[str, Any]:
+    """Content of meta/info.json; `rate`: see `frame_rate`; `splits`: name of the split of each episode."""
+    width, height = cameras.resolution
     video = {
         "dtype": "video",
         "shape": [height, width, 3],
@@ -152,5 +151,5 @@ def make_info(config: Config, splits: Sequence[str], frames: int, tasks: int) ->
         "splits": split_ranges(splits),
         "data_path": f"data/{_CHUNKED}.parquet",
         "video_path": f"videos/{{video_key}}/{_CHUNKED}.mp4",
-        "features": {**{camera_key(camera): video for camera in range(len(config.cameras.positions))}, **columns},
+        "features": {**{camera_key(camera): video for camera in range(len(cameras.positions))}, **columns},
     }

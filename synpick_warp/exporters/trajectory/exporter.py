@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 
 from synpick_warp.codes import Ending, Mode
-from synpick_warp.configs.schema import Config
-from synpick_warp.exporters.base import ExportContext, SharedFiles
+from synpick_warp.configs.splits import DataLayout
+from synpick_warp.exporters.base import ExportContext, SharedFiles, TaskSizes
 from synpick_warp.exporters.staging import EpisodeExporter, StagedEpisode
 from synpick_warp.exporters.trajectory.arrays import EPISODES, STORE
 from synpick_warp.exporters.trajectory.episode import EpisodeContent, EpisodeSettings, write_episode
@@ -64,13 +64,13 @@ class TrajectoryExporter(EpisodeExporter[_Content]):
         )
 
     @staticmethod
-    def slot_bytes(config: Config) -> int:
+    def slot_bytes(sizes: TaskSizes) -> int:
         """See `Exporter`: a tick of some episodes."""
-        size = spool_bytes(config.arrangement.max_objects, config.physics.steps_per_tick, config.trajectory.steps)
+        size = spool_bytes(sizes.objects, sizes.steps_per_tick, sizes.stores_steps)
         return shared_bytes((size,))
 
     @staticmethod
-    def shared_files(config: Config) -> SharedFiles:
+    def shared_files(layout: DataLayout) -> SharedFiles:
         """See `Exporter`."""
         return SharedFiles(tuple(constant_places(STORE)), (), (STORE / EPISODES, STORE))
 

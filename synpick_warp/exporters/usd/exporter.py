@@ -6,8 +6,8 @@ import os
 from functools import cached_property, partial
 from pathlib import Path
 
-from synpick_warp.configs.schema import Config
-from synpick_warp.exporters.base import SharedFiles
+from synpick_warp.configs.splits import DataLayout
+from synpick_warp.exporters.base import SharedFiles, TaskSizes
 from synpick_warp.exporters.staging import EpisodeExporter, StagedEpisode
 from synpick_warp.exporters.usd.episode import write_episode
 from synpick_warp.exporters.usd.lights import make_stage_light
@@ -33,12 +33,12 @@ class UsdExporter(EpisodeExporter[TickSpool]):
     staging = FOLDER.name
 
     @staticmethod
-    def slot_bytes(config: Config) -> int:
+    def slot_bytes(sizes: TaskSizes) -> int:
         """See `Exporter`: tasks have no images."""
         return 0
 
     @staticmethod
-    def shared_files(config: Config) -> SharedFiles:
+    def shared_files(layout: DataLayout) -> SharedFiles:
         """See `Exporter`."""
         return SharedFiles((LIBRARY,), (), (FOLDER,))
 

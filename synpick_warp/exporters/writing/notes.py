@@ -3,19 +3,19 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from pathlib import Path
 
 from synpick_warp.configs.modes import bake_modes
-from synpick_warp.configs.schema import Config
+from synpick_warp.configs.schema import Bake, Config
 from synpick_warp.scenes.types import Camera
 
 CAMERA_FILE, NOTES_FILE = "camera.json", "dataset_info.md"
 
 
-def note_files(config: Config) -> tuple[Path, ...]:
+def note_files(formats: Collection[str]) -> tuple[Path, ...]:
     """Files that `write_notes` writes, relative to the data set; none where bop or shards write theirs."""
-    return () if {"bop", "shards"} & set(config.bake.formats) else (Path(CAMERA_FILE), Path(NOTES_FILE))
+    return () if {"bop", "shards"} & set(formats) else (Path(CAMERA_FILE), Path(NOTES_FILE))
 
 
 def write_camera(path: Path, camera: Camera, depth_scale: float) -> None:
@@ -37,22 +37,25 @@ def write_notes(out: Path, config: Config, names: Mapping[int, str], cameras: tu
     Raises:
         OSError: A file cannot be written.
     """
-    places = note_files(config)
+    places = note_files(config.bake.formats)
     if places:
+        period = config.physics.step * config.physics.steps_per_tick
         write_camera(out / CAMERA_FILE, cameras[0], config.bop.depth_scale)
-        (out / NOTES_FILE).write_text(_describe(config, names, cameras), encoding="utf-8", newline="\n")
+        (out / NOTES_FILE).write_text(
+            _describe(config.bake, bake_modes(config.bake, config.splits), period, names, cameras), encoding="utf-8", newline="\n"
+        )
     return list(places)
 
 
-def _describe(config: Config, names: Mapping[int, str], cameras: tuple[Camera, ...]) -> str:
-    """Text of dataset_info.md: conventions, cameras and objects."""
-    camera, period = cameras[0], config.physics.step * config.physics.steps_per_tick
+def _describe(bake: Bake, modes: tuple[str, ...], period: float, names: Mapping[int, str], cameras: tuple[Camera, ...]) -> str:
+    """Text of dataset_info.md: conventions, cameras and objects; `period`: time between frames [s]."""
+    camera = cameras[0]
     objects = "\n".join(f"| {index} | {name} |" for index, name in sorted(names.items()))
     poses = "\n".join(f"| {index} | {_row(one.rotation.ravel())} | {_row(one.translation)} |" for index, one in enumerate(cameras))
     return f"""# A SynPick data set
 
-Made by synpick-warp (mode {", ".join(bake_modes(config))}, seed {config.bake.seed}, {len(cameras)} cameras, formats
-{", ".join(sorted(config.bake.formats))}). Frames are {period:g} s apart.
+Made by synpick-warp (mode {", ".join(modes)}, seed {bake.seed}, {len(cameras)} cameras, formats
+{", ".join(sorted(bake.formats))}). Frames are {period:g} s apart.
 
 - Pictures have {camera.width} x {camera.height} pixels and no lens distortion; `camera.json` has the intrinsics of all cameras.
   The centre of pixel (row, column) is (column + 0.5, row + 0.5): for OpenCV and Open3D, whose pixel centres have whole

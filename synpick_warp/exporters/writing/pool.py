@@ -2,30 +2,27 @@
 
 from __future__ import annotations
 
-import contextlib
 import mmap
 import os
-import selectors
 import subprocess
 from collections import deque
 from collections.abc import Callable, Iterable, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import Future
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any
 
 import numpy as np
 
 from synpick_warp.errors import DatasetError, OutputError, SynpickError
 from synpick_warp.exporters.writing.files import output_error
-from synpick_warp.exporters.writing.worker import Failure, TaskMessage, run_task
-from synpick_warp.system.descriptors import open_standard_descriptors
-from synpick_warp.system.processes import END_TIMEOUT, WorkerProcess, send, start_process
-from synpick_warp.system.shared_memory import SharedArray, allocate_shared_memory, shared_bytes
-from synpick_warp.system.threads import COPIES
+from synpick_warp.system.pool import DeadProcessError, TaskError, TaskFuture, WorkerPool, WorkerProgram, portable_error
+from synpick_warp.system.processes import ProcessError
+from synpick_warp.system.shared_memory import SharedArray, SharedSlots
 
-_WORKER = "from synpick_warp.exporters.writing.worker import main; main()"
-"""Program of a writer process."""
+NICENESS = 10
+"""Increment of the processes' niceness (nice(2)): when they keep all cores busy, the bake, which feeds them and the GPU, has priority."""
 QUEUE_DEPTH = 4
 """Tasks in flight per process, including the running one: enough to bridge the time in which the bake prepares the next batch."""
 PROCESSES_PER_COPY_THREAD = 4
@@ -48,11 +45,23 @@ class WriteTask:
     """Callback after success, run in the caller's thread by a later call of the pool. It may submit tasks without images."""
 
 
+@dataclass(frozen=True)
+class _Call:
+    """Task of a process: the call `function(*images, *arguments)`. Functions are pickled by name, so they are top-level ones."""
+
+    function: Callable[..., None]
+    images: tuple[SharedArray, ...]
+    arguments: tuple[Any, ...]
+
+    def __call__(self, memory: mmap.mmap) -> None:
+        self.function(*(image.map(memory) for image in self.images), *self.arguments)
+
+
 @dataclass(eq=False)
 class _QueuedTask:
     """A submitted task with its slot of shared memory."""
 
-    message: TaskMessage
+    call: _Call
     path: Path
     on_done: Callable[[], None] | None
     slot: int | None
@@ -77,30 +86,24 @@ class WriterPool:
         Raises:
             OutputError: Memory or processes cannot be allocated.
         """
-        open_standard_descriptors()
-        self._slot_bytes = -(-max(slot_bytes, 1) // mmap.PAGESIZE) * mmap.PAGESIZE
-        slots = max(1, processes * QUEUE_DEPTH)
-        self._free = list(range(slots))
         self._waiting: deque[_QueuedTask] = deque()
-        self._workers: list[WorkerProcess] = []
-        self._links = selectors.DefaultSelector()
+        self._running: dict[TaskFuture, _QueuedTask] = {}
+        self._answered: deque[TaskFuture] = deque()
         self._failure: SynpickError | None = None
         self._ended = False
-        self._receiving = False
-        self._copy_threads = ThreadPoolExecutor(max(1, processes // PROCESSES_PER_COPY_THREAD), COPIES)
-        self._copies_inline = processes < 2 * PROCESSES_PER_COPY_THREAD
+        self._finishing = False
+        copy_threads = processes // PROCESSES_PER_COPY_THREAD
         try:
-            handle, self._memory = allocate_shared_memory(slots * self._slot_bytes)
+            self._slots = SharedSlots(max(1, processes * QUEUE_DEPTH), slot_bytes, copy_threads if copy_threads > 1 else 0)
         except OSError as error:
             raise OutputError(f"no shared memory for {processes} writer processes: {error}; set bake.writers lower") from error
+        handle = self._slots.handle
+        setup = partial(_open_slots, handle, NICENESS if processes else 0)
         try:
-            for _ in range(processes):
-                worker = start_process(_WORKER, (handle,), inherited_handles)
-                self._workers.append(worker)
-                self._links.register(worker.link, selectors.EVENT_READ, worker)
-        except OSError as error:
-            self.abort()
-            raise OutputError(f"cannot start {processes} writer processes: {error}; set bake.writers lower") from error
+            self._pool = WorkerPool(WorkerProgram(setup, "writer process", "bake.writers", (handle,), inherited_handles), processes)
+        except (ProcessError, OSError) as error:
+            self._slots.close()
+            raise OutputError(str(error)) from error
         finally:
             os.close(handle)
 
@@ -129,9 +132,8 @@ class WriterPool:
         submitted: list[_QueuedTask] = []
         for task in tasks:
             slot = self._take_slot() if task.images else None
-            places, copying = self._copy_to_slot(task.images, slot)
-            message = TaskMessage(task.function, places, task.arguments)
-            submitted.append(_QueuedTask(message, task.path, task.on_done, slot, copying))
+            images, copying = ((), None) if slot is None else self._slots.put(task.images, slot)
+            submitted.append(_QueuedTask(_Call(task.function, images, task.arguments), task.path, task.on_done, slot, copying))
             self._waiting.append(submitted[-1])
             self._progress(0.0)
         for queued in submitted:
@@ -140,7 +142,7 @@ class WriterPool:
 
     def pids(self) -> tuple[int, ...]:
         """Process ids of the writers."""
-        return tuple(worker.process.pid for worker in self._workers)
+        return self._pool.pids()
 
     def poll(self) -> None:
         """Dispatch tasks and process results without blocking. Raises like `submit`."""
@@ -151,13 +153,13 @@ class WriterPool:
         """Block until every task is done. Raises like `submit`."""
         self._check()
         self._progress(0.0)
-        while self._waiting or any(worker.tasks for worker in self._workers):
+        while self._waiting or self._running:
             self._progress(None)
 
     def wait_until(self, condition: Callable[[], bool]) -> None:
         """Block until a condition holds that callbacks make true, or no task is left. Raises like `submit`."""
         self._check()
-        while not condition() and (self._waiting or any(worker.tasks for worker in self._workers)):
+        while not condition() and (self._waiting or self._running):
             self._progress(None)
 
     def close(self) -> None:
@@ -166,10 +168,7 @@ class WriterPool:
             return
         try:
             self.wait()
-            for worker in self._workers:
-                send(worker.link, None)
-            for worker in self._workers:
-                worker.process.wait(END_TIMEOUT)
+            self._pool.end()
         except (OSError, subprocess.TimeoutExpired) as error:
             raise OutputError(f"a writer process did not end: {error}") from error
         finally:
@@ -178,14 +177,11 @@ class WriterPool:
     def abort(self) -> None:
         """Kill the processes. Never raises."""
         self._ended = True
-        for worker in self._workers:
-            worker.kill()
-        self._workers.clear()
+        self._pool.kill()
         self._waiting.clear()
-        self._links.close()
-        self._copy_threads.shutdown()
-        with contextlib.suppress(BufferError):
-            self._memory.close()
+        self._running.clear()
+        self._answered.clear()
+        self._slots.close()
 
     def __enter__(self) -> WriterPool:
         return self
@@ -197,90 +193,53 @@ class WriterPool:
             self.abort()
 
     def _take_slot(self) -> int:
-        while not self._free:
+        while not self._slots.free:
             self._progress(None)
-        return self._free.pop()
-
-    def _copy_to_slot(self, images: Sequence[np.ndarray], slot: int | None) -> tuple[tuple[SharedArray, ...], Future[None] | None]:
-        """Copy images into a slot of shared memory; returns their places, and the copy in progress if a thread makes it."""
-        if slot is None:
-            return (), None
-        if (size := shared_bytes(image.nbytes for image in images)) > self._slot_bytes:
-            raise ValueError(f"images of {size} bytes exceed the {self._slot_bytes} of a slot of this pool")
-        offset = slot * self._slot_bytes
-        places: list[SharedArray] = []
-        for image in images:
-            places.append(SharedArray(offset, image.shape, image.dtype.str))
-            offset += shared_bytes((image.nbytes,))
-        targets = [place.map(self._memory) for place in places]
-        if self._copies_inline:
-            _copy(targets, images)
-            return tuple(places), None
-        return tuple(places), self._copy_threads.submit(_copy, targets, images)
+        return self._slots.free.pop()
 
     def _progress(self, timeout: float | None) -> None:
         """Dispatch tasks and process results; a timeout of None blocks until at least one result arrives."""
-        if not self._workers:
-            self._run_inline()
-            return
-        self._dispatch(blocking=timeout is None)
-        if self._receiving:
-            # Reentrant call from `on_done`: the outer call has yet to receive one result from each link it found ready.
-            return
-        self._receiving = True
         try:
-            self._receive_results(timeout)
-        finally:
-            self._receiving = False
-        self._dispatch(blocking=False)
-
-    def _receive_results(self, timeout: float | None) -> None:
-        for key, _ in self._links.select(timeout):
-            worker: WorkerProcess = key.data
-            try:
-                failure: Failure | None = worker.link.recv()
-            except (EOFError, OSError):
-                self._fail_dead_worker(worker)
-            self._finish(worker.tasks.popleft(), failure)
+            self._dispatch(blocking=timeout is None)
+            if self._finishing:
+                return  # A call of `on_done`: the outer call goes on with the results.
+            self._answered += self._pool.receive(0.0 if self._answered else timeout)
+            self._finish_answered()
+            self._dispatch(blocking=False)
+        except DeadProcessError as death:
+            activity = "while it had nothing to do"
+            if death.task is not None:  # The task that could not be sent still waits.
+                activity = f"while it wrote {(self._running.get(death.task) or self._waiting[0]).path}"
+            self._failure = OutputError(f"a writer process {death.how} {activity}; {death.remedy}")
+            raise self._failure from death
 
     def _dispatch(self, blocking: bool) -> None:
         """Send tasks, in order, while a process has queue capacity; `blocking`: wait for images that are still being copied."""
         while self._waiting:
-            worker = min(self._workers, key=lambda candidate: len(candidate.tasks))
             copying = self._waiting[0].copying
-            if len(worker.tasks) == QUEUE_DEPTH or not (blocking or copying is None or copying.done()):
+            if self._pool.load() >= QUEUE_DEPTH or not (blocking or copying is None or copying.done()):
                 return
-            queued = self._waiting.popleft()
-            _await_copy(queued)
-            worker.tasks.append(queued)
-            try:
-                send(worker.link, queued.message)
-            except OSError:
-                self._fail_dead_worker(worker)
+            _await_copy(self._waiting[0])
+            future = self._pool.submit(self._waiting[0].call, drain=False)
+            self._running[future] = self._waiting.popleft()
+            if future.done():  # A task of the calling process.
+                self._answered.append(future)
 
-    def _run_inline(self) -> None:
-        while self._waiting:
-            queued = self._waiting.popleft()
-            self._finish(queued, run_task(queued.message, self._memory))
-
-    def _finish(self, queued: _QueuedTask, failure: Failure | None) -> None:
-        if failure is not None:
-            self._fail(_to_error(failure, queued.path), failure.trace)
-        if queued.slot is not None:
-            self._free.append(queued.slot)
-        if queued.on_done is not None:
-            queued.on_done()
-
-    def _fail_dead_worker(self, worker: WorkerProcess) -> NoReturn:
-        how, remedy = worker.describe_end("bake.writers")
-        activity = f"while it wrote {worker.tasks[0].path}" if worker.tasks else "while it had nothing to do"
-        self._fail(OutputError(f"a writer process {how} {activity}; {remedy}"), "")
-
-    def _fail(self, error: SynpickError, trace: str) -> NoReturn:
-        if trace:
-            error.add_note(trace)
-        self._failure = error
-        raise error
+    def _finish_answered(self) -> None:
+        self._finishing = True
+        try:
+            while self._answered:
+                future = self._answered.popleft()
+                queued = self._running.pop(future)
+                if future.error is not None:
+                    self._failure = _to_error(future.error, queued.path)
+                    raise self._failure
+                if queued.slot is not None:
+                    self._slots.free.append(queued.slot)
+                if queued.on_done is not None:
+                    queued.on_done()
+        finally:
+            self._finishing = False
 
     def _check(self) -> None:
         if self._failure is not None:
@@ -289,19 +248,25 @@ class WriterPool:
             raise OutputError("the writer processes have ended; make a new pool")
 
 
-def _to_error(failure: Failure, path: Path) -> SynpickError:
-    if failure.is_input:
-        return DatasetError(failure.error)
-    if failure.system is None:
-        return OutputError(f"cannot write {path}: {failure.error}")
-    code, reason, name = failure.system
-    return output_error(path, OSError(code, reason, name or str(path)))
+def _open_slots(handle: int, niceness: int) -> mmap.mmap:
+    """Set up a process: it gives way to the bake, and maps the images."""
+    os.nice(niceness)
+    return mmap.mmap(handle, 0)
 
 
-def _copy(targets: Sequence[np.ndarray], images: Sequence[np.ndarray]) -> None:
-    """Copy images into shared memory; NumPy releases the interpreter lock meanwhile."""
-    for target, image in zip(targets, images, strict=True):
-        np.copyto(target, image)
+def _to_error(error: Exception, path: Path) -> SynpickError:
+    """Error of the pool for that of a task; a fault of ours keeps its traceback as a note, which the command line shows."""
+    error = portable_error(error)
+    if isinstance(error, DatasetError):
+        return error
+    if isinstance(error, OSError):
+        return output_error(path, error)
+    kind = "" if isinstance(error, SynpickError | TaskError) else f"{type(error).__name__}: "
+    result = OutputError(f"cannot write {path}: {kind}{error}")
+    if isinstance(error, TaskError):
+        for note in error.__notes__:
+            result.add_note(note)
+    return result
 
 
 def _await_copy(queued: _QueuedTask) -> None:

@@ -30,6 +30,7 @@ from synpick_warp.kernels.render.lighting.paths.reuse import reuse_histories_ker
 from synpick_warp.kernels.render.lighting.shading import shade_kernel, shade_samples_kernel
 from synpick_warp.kernels.render.lighting.shadow_edges import CHUNK_TILES as EDGE_CHUNK_TILES
 from synpick_warp.kernels.render.lighting.shadow_edges import (
+    MAX_CHUNK_PIXELS,
     EdgeLists,
     filter_shadow_edges_kernel,
     list_edge_cells_kernel,
@@ -81,9 +82,7 @@ of 12 GiB, which is better used for worlds."""
 
 GUIDE = struct_arrays(Guide, "view", "cell_row", "cell_column")
 COARSE_LIGHT = struct_arrays(CoarseLight, "view", "cell_row", "cell_column")
-LAMP_SHADOWS = struct_arrays(
-    LampShadows, "view", "shadow_row", "shadow_column", **dict.fromkeys(("edge", "edge_fractions"), ("view", "row", "column"))
-)
+LAMP_SHADOWS = struct_arrays(LampShadows, "view", "shadow_row", "shadow_column", edge=("view", "row", "column"))
 EDGE_LISTS = struct_arrays(
     EdgeLists,
     "view",
@@ -155,6 +154,8 @@ def scratch_sizes(render: Render, width: int, height: int, histories: int = 0) -
     """Extents of the dimensions of `DENOISED_SCRATCH` other than the view, for images of `width` x `height` px."""
     size = coarse_size(render, width, histories)
     shadow = shadow_size(size)
+    tile_pixels = int(TILE_PIXELS) * shadow**2
+    edge_tiles = min(int(EDGE_CHUNK_TILES), MAX_CHUNK_PIXELS // tile_pixels)
     chunks = -(-footprint_grid(width, height).tiles // int(CHUNK_TILES)) if render.antialias else 0
     columns, rows = (-(-width // size), -(-height // size)) if traces_paths(render) else (0, 0)
     return {
@@ -167,9 +168,9 @@ def scratch_sizes(render: Render, width: int, height: int, histories: int = 0) -
         "column": width,
         "shadow_row": -(-height // shadow),
         "shadow_column": -(-width // shadow),
-        "edge_chunk": -(-build_grid(-(-width // shadow), -(-height // shadow)).tiles // int(EDGE_CHUNK_TILES)),
-        "chunk_cell": int(EDGE_CHUNK_TILES) * int(TILE_PIXELS),
-        "chunk_pixel": int(EDGE_CHUNK_TILES) * int(TILE_PIXELS) * shadow * shadow,
+        "edge_chunk": -(-build_grid(-(-width // shadow), -(-height // shadow)).tiles // edge_tiles),
+        "chunk_cell": edge_tiles * int(TILE_PIXELS),
+        "chunk_pixel": edge_tiles * tile_pixels,
         "edge_counter": 2,
         "chunk": chunks,
         "chunk_footprint": int(CHUNK_TILES) * int(TILE_PIXELS),
@@ -287,7 +288,7 @@ class DenoisedRenderer:
             with scope("denoise", device):
                 self.denoise(views)
         with scope("lamp shadows", device):
-            self.trace_shadows(snapshot, bodies, gbuffer, views)
+            self.trace_shadows(snapshot, bodies, gbuffer, views, image.radiance)
         with scope("shade pixels", device):
             self.shade_pixels(snapshot, bodies, gbuffer, views, image.radiance)
         if self.antialias:
@@ -350,18 +351,19 @@ class DenoisedRenderer:
         self._launch(choose_widths_kernel, self.coarse.grid, views, [*shared, self.blocks, views, self.variance_scale], [self.chosen])
         self._launch(smooth_ratios_kernel, self.coarse.grid, views, [*shared, self.chosen, views], [self.ratios])
 
-    def trace_shadows(self, snapshot: Snapshot, bodies: Any, gbuffer: Any, views: Any) -> None:
-        """Visibility of the lamps: shadow rays and filter on the shadow grid, rays from pixels at steep edges."""
+    def trace_shadows(self, snapshot: Snapshot, bodies: Any, gbuffer: Any, views: Any, radiance: wp.array) -> None:
+        """Visibility of the lamps: shadow rays and filter on the shadow grid, rays from pixels at steep edges; see `trace_shadow_edges`."""
         scene, coarse, rays = self.scene, self.shadow_grid, self.shadow_rays.packed
         inputs = [scene.meshes, scene.table, scene.cameras, coarse, scene.lights, snapshot.light, snapshot.light_yaw, bodies, gbuffer]
         self._launch(trace_shadow_rays_kernel, coarse.grid, views, [*inputs, views, self.moving], [self.history, rays])
         inputs = [scene.meshes, scene.cameras, coarse, scene.lights, snapshot.light, bodies, gbuffer, rays, views]
         self._launch(filter_shadows_kernel, coarse.grid, views, inputs, [self.shadows])
         self._launch(measure_steepness_kernel, coarse.grid, views, inputs, [self.shadows])
-        self.trace_shadow_edges(snapshot, bodies, gbuffer, views)
+        self.trace_shadow_edges(snapshot, bodies, gbuffer, views, radiance)
 
-    def trace_shadow_edges(self, snapshot: Snapshot, bodies: Any, gbuffer: Any, views: Any) -> None:
-        """Adaptive sampling at steep shadow edges: list the pixels there, trace their shadow rays, and filter the visible fractions."""
+    def trace_shadow_edges(self, snapshot: Snapshot, bodies: Any, gbuffer: Any, views: Any, radiance: wp.array) -> None:
+        """Adaptive sampling at steep shadow edges: list the pixels there, trace their shadow rays, and filter the visible fractions, which
+        lie in `radiance` until the pixels are shaded."""
         scene, lists, coarse, device = self.scene, self.edge_lists, self.shadow_grid, self.scene.device
         lists.count.zero_()
         self.shadows.edge.zero_()
@@ -374,8 +376,9 @@ class DenoisedRenderer:
         inputs = [scene.meshes, scene.table, scene.cameras, coarse, scene.lights, snapshot.light, snapshot.light_yaw, bodies, gbuffer]
         inputs += [lists, views, threads]
         launch_pixels(trace_shadow_edges_kernel, views.count * sharing, inputs, [self.shadows], device)
-        inputs = [scene.meshes, scene.cameras, coarse, scene.lights, snapshot.light, bodies, gbuffer, lists, views, threads]
-        launch_pixels(filter_shadow_edges_kernel, views.count * sharing, inputs, [self.shadows], device)
+        inputs = [scene.meshes, scene.cameras, coarse, scene.lights, snapshot.light, bodies, gbuffer, lists, self.shadows]
+        inputs += [views, threads]
+        launch_pixels(filter_shadow_edges_kernel, views.count * sharing, inputs, [radiance], device)
 
     def shade_pixels(self, snapshot: Snapshot, bodies: Any, gbuffer: Any, views: Any, radiance: wp.array) -> None:
         """Deferred shading: radiance of each pixel."""

@@ -71,7 +71,7 @@ def sample_episodes_ahead(config: Config, catalog: Catalog, episodes: np.ndarray
     wp.launch(
         arrangement.sample_modes_kernel,
         dim=count,
-        inputs=[seed, mode_data(mode_rows(config), device), identity, phase],
+        inputs=[seed, mode_data(mode_rows(config.bake, config.splits), device), identity, phase],
         outputs=[mode],
         device=device,
     )

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Iterator
-from dataclasses import replace
 from typing import Any, Protocol
 
 import newton
@@ -13,7 +12,7 @@ import warp as wp
 
 from synpick_warp.configs.schema import Config
 from synpick_warp.configs.schema import Physics as PhysicsConfig
-from synpick_warp.configs.splits import plan_episodes
+from synpick_warp.configs.splits import DataLayout
 from synpick_warp.kernels.sim import gripper, rest
 from synpick_warp.newton_patches import KNOWN_NEWTON
 from synpick_warp.newton_patches.broad_phase import replace_broad_phase
@@ -56,10 +55,10 @@ def with_enough_worlds(config: Config, device: wp.Device, episodes: int | None =
     """
     worlds = config.bake.worlds
     if not worlds:
-        count = sum(map(len, plan_episodes(config))) if episodes is None else episodes
+        count = sum(map(len, DataLayout.of(config).plan())) if episodes is None else episodes
         worlds = balance_worlds(count, MAX_GPU_WORLDS if device.is_cuda else MAX_CPU_WORLDS)
     worlds = max(worlds, MIN_GPU_WORLDS) if device.is_cuda else worlds
-    return config if worlds == config.bake.worlds else replace(config, bake=replace(config.bake, worlds=worlds))
+    return config if worlds == config.bake.worlds else config.with_values({"bake.worlds": worlds})
 
 
 class Watcher(Protocol):

@@ -13,7 +13,7 @@ import warp as wp
 from synpick_warp.arrays import allocate
 from synpick_warp.configs.modes import may_pick
 from synpick_warp.configs.schema import Config
-from synpick_warp.configs.splits import plan_episodes
+from synpick_warp.configs.splits import DataLayout
 from synpick_warp.kernels.sim import snapshot as pack
 from synpick_warp.scenes.build import build_model
 from synpick_warp.scenes.types import Catalog
@@ -79,10 +79,10 @@ class Simulation:
         self.layout = built.layout
         self.physics = Physics(config.physics, built)
         self.scene: SceneData = make_scene_data(config, catalog, built, lights, device)
-        planned = [index for each in plan_episodes(config) for index in each] if episodes is None else episodes
+        planned = [index for each in DataLayout.of(config).plan() for index in each] if episodes is None else episodes
         indices = np.asarray(planned, np.int32)
         self.episodes = wp.array(indices, dtype=wp.int32, device=device)
-        sizes = world_sizes(config, built.layout.bodies_per_world)
+        sizes = world_sizes(config.bake.worlds, config.arrangement.max_objects, config.move.rounds, built.layout.bodies_per_world)
         self.state = allocate(WorldState, sizes, device)
         self.attempts = allocate(AttemptState, sizes, device)
         self.seals = allocate(SealState, sizes, device)
@@ -99,7 +99,7 @@ class Simulation:
         self.record = TickRecord(snapshot, status, self.observation, self.plan, physics)
         self.suction: Suction | None = None
         self.perception: Perception | None = None
-        if may_pick(config):
+        if may_pick(config.bake, config.splits):
             if render_scene is None:
                 raise ValueError("episodes that pick need a render_scene for perception")
             self.suction = Suction(config.suction, catalog, render_scene, device)

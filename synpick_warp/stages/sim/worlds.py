@@ -8,7 +8,6 @@ import warp as wp
 
 from synpick_warp.arrays import device_array
 from synpick_warp.codes import Measure, Status
-from synpick_warp.configs.schema import Config
 from synpick_warp.stages.buffers import FIXTURES
 
 # Waypoints of a round of moving: the corners of the tote.
@@ -113,16 +112,15 @@ class WorldStatus:
     """Columns: `Measure`."""
 
 
-def world_sizes(config: Config, bodies_per_world: int) -> dict[str, int]:
+def world_sizes(worlds: int, objects: int, rounds: int, bodies_per_world: int) -> dict[str, int]:
     """Extents of the dimensions of the dataclasses here, and of `Snapshot` and `Observation`."""
-    worlds = config.bake.worlds
     return {
         "one": 1,
         "world": worlds,
         "world_and_global": worlds + 1,
-        "instance": config.arrangement.max_objects,
+        "instance": objects,
         "body": worlds * bodies_per_world,
-        "waypoint": CORNERS * config.move.rounds,
+        "waypoint": CORNERS * rounds,
         "status": len(Status),
         "measure": len(Measure),
         "fixture": len(FIXTURES),

@@ -22,6 +22,7 @@ import numpy as np
 import pytest
 
 from synpick_warp.cli.commands import main
+from synpick_warp.configs.splits import DataLayout
 from synpick_warp.conversion import run as conversion
 from synpick_warp.dataset.file_names import check_file_names, describe_strays
 from synpick_warp.dataset.manifest import CONSTANTS, episode_entry, read_checksums
@@ -131,7 +132,7 @@ def commands(folder: Path, scratch: Path) -> Iterator[tuple[str, tuple[int, str]
 def test_the_names_that_formats_write_are_known(whole, narrow):
     for folder, config in ((whole, settings()), (narrow, settings(formats=("bop", "zarr")))):
         for entry in (CONSTANTS, episode_entry(0), episode_entry(1)):
-            check_file_names(folder, entry, read_checksums(folder, entry), config)
+            check_file_names(folder, entry, read_checksums(folder, entry), DataLayout.of(config))
 
 
 @pytest.mark.parametrize("entry", [CONSTANTS, episode_entry(1)])
@@ -281,10 +282,10 @@ def test_litter_is_no_data(whole, tmp_path):
 @pytest.mark.parametrize("place", ["coco/parts/000099.jsonl", "coco/parts/000000 (copy).jsonl", "lerobot/parts/000099.json"])
 def test_a_part_of_no_committed_episode_is_told(whole, tmp_path, place, capsys):
     folder = copied(whole, tmp_path / "set")
-    assert describe_strays(folder, settings(), (0, 1)) == ""
+    assert describe_strays(folder, DataLayout.of(settings()), (0, 1)) == ""
     (folder / place).write_text("[]\n")
     line = f"left out: {folder}/{place}, of no committed episode"
-    assert describe_strays(folder, settings(), (0, 1)) == line
+    assert describe_strays(folder, DataLayout.of(settings()), (0, 1)) == line
     assert main(["merge", str(folder), "--out", str(tmp_path / "merged")]) == 0
     assert line in capsys.readouterr().out.splitlines()
 
@@ -330,7 +331,7 @@ def test_episodes_in_the_settings_are_not_believed(narrow, tmp_path):
     folder = copied(narrow, tmp_path / "set")
     text = (folder / "config.toml").read_text()
     replace(folder / "config.toml", text.replace("episodes = 2", f"episodes = {2**31 - 1}").encode())
-    shared = LerobotExporter.shared_files(dataclasses.replace(settings(), bake=dataclasses.replace(settings().bake, episodes=2**31 - 1)))
+    shared = LerobotExporter.shared_files(dataclasses.replace(DataLayout.of(settings()), episodes=2**31 - 1))
     assert len(shared.folders) < 20
     assert run("convert", folder, "--to", "lerobot", "--processes", 1, "--out", tmp_path / "new") == (0, "")
     assert run("stats", folder)[0] == 0

@@ -13,6 +13,7 @@ from pathlib import Path
 
 import pytest
 
+from synpick_warp.configs.splits import DataLayout
 from synpick_warp.dataset.manifest import episode_entry, read_checksums
 from synpick_warp.dataset.merge import merge
 from synpick_warp.dataset.verify import verify
@@ -145,7 +146,7 @@ def test_a_bake_without_an_episode_removes_all_that_it_wrote(tmp_path):
 
 
 def test_the_names_that_formats_declare_are_those_that_they_write(ready):
-    shared = shared_files(load_exporter_classes(CONFIG.bake.formats), CONFIG)
+    shared = shared_files(load_exporter_classes(CONFIG.bake.formats), DataLayout.of(CONFIG))
     for name in (*shared.constants, *shared.indices, *shared.folders):
         assert (ready / name).exists()
     listed = set(read_checksums(ready, Path("manifest/joined")))

@@ -274,7 +274,7 @@ def kill_a_writer(out: Path) -> None:
         pool = export_context(exporter).pool
         feed(exporter, (0,))
         pool.wait()
-        os.kill(pool._workers[0].process.pid, signal.SIGKILL)
+        os.kill(pool.pids()[0], signal.SIGKILL)
         for _ in range(100):
             feed(exporter, (1,))
 

@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 
 from synpick_warp.configs.schema import Config, Split
+from synpick_warp.configs.splits import DataLayout
 from synpick_warp.exporters.bop.shards.card import CARD_FILE, CardContent, SplitContent, hub_splits, make_card, size_category
 from synpick_warp.exporters.bop.shards.exporter import ShardsExporter
 from tests.harness.exporter_contract import export
@@ -118,13 +119,13 @@ def test_size_categories_are_those_of_the_hub(views, category):
 
 def test_splits_are_named_as_on_the_hub():
     config = Config()
-    assert hub_splits(config) == ("train",)
-    assert hub_splits(dataclasses.replace(config, bop=dataclasses.replace(config.bop, split="val_pbr"))) == ("validation",)
-    assert hub_splits(dataclasses.replace(config, splits=SPLITS)) == ("train", "test", "validation")
+    assert hub_splits(DataLayout.of(config)) == ("train",)
+    assert hub_splits(DataLayout.of(dataclasses.replace(config, bop=dataclasses.replace(config.bop, split="val_pbr")))) == ("validation",)
+    assert hub_splits(DataLayout.of(dataclasses.replace(config, splits=SPLITS))) == ("train", "test", "validation")
     taken = Split("validation", 1, 20, "pick", "val_b_pbr")
-    assert hub_splits(dataclasses.replace(config, splits=(*SPLITS, taken))) == ("train", "test", "val", "validation")
+    assert hub_splits(DataLayout.of(dataclasses.replace(config, splits=(*SPLITS, taken)))) == ("train", "test", "val", "validation")
 
 
 def test_card_is_an_index_of_the_data_set(dataset):
-    assert Path(CARD_FILE) in ShardsExporter.shared_files(Config()).indices
+    assert Path(CARD_FILE) in ShardsExporter.shared_files(DataLayout.of(Config())).indices
     assert (dataset / CARD_FILE).read_text().isascii()

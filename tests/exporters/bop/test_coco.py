@@ -15,6 +15,7 @@ import pytest
 from pycocotools.coco import COCO
 
 from synpick_warp.configs.schema import Split
+from synpick_warp.configs.splits import DataLayout
 from synpick_warp.errors import DatasetError, OutputError
 from synpick_warp.exporters.bop.coco.annotation_files import CATEGORIES, IMAGES, PARTS, commit_scenes, write_view
 from synpick_warp.exporters.bop.coco.exporter import CocoExporter
@@ -85,7 +86,9 @@ def test_every_split_has_an_annotation_file(tmp_path):
     settings = dataclasses.replace(config(), splits=SPLITS)
     out = export(CocoExporter, tmp_path / "set", settings, (0, 2), processes=0)
     assert sorted(path.name for path in (out / IMAGES).iterdir()) == [f"{scene:06d}" for scene in (0, 1, 2, 6, 7, 8)]
-    assert {out / name for name in CocoExporter.shared_files(settings).indices} == set((out / "coco" / "annotations").iterdir())
+    assert {out / name for name in CocoExporter.shared_files(DataLayout.of(settings)).indices} == set(
+        (out / "coco" / "annotations").iterdir()
+    )
     for split, episode in (("train_pbr", 0), ("test_pbr", 2)):
         found = read(out, split)
         assert sorted(found.imgs) == list(range(1, 10))

@@ -17,6 +17,7 @@ import pytest
 from synpick_warp.codes import Outcome, Task
 from synpick_warp.configs.load import load_config
 from synpick_warp.configs.schema import Config, Split
+from synpick_warp.configs.splits import DataLayout
 from synpick_warp.errors import ConfigError, DatasetError
 from synpick_warp.exporters.base import list_folders
 from synpick_warp.exporters.formats import FORMAT_TABLE
@@ -160,10 +161,10 @@ def test_videos_show_the_views_at_exact_times(dataset, episodes):
             truth = [one.color[0] for one in box_views.batches(1, (episode,), FRAMES, LENSES) if int(one.camera[0]) == camera]
             with av.open(str(dataset / "videos" / key / "chunk-000" / f"file-{episode:03d}.mp4")) as container:
                 stream = container.streams.video[0]
-                assert (stream.codec_context.name, stream.average_rate) == ("h264", video_rate(trajectories.config()))
+                assert (stream.codec_context.name, stream.average_rate) == ("h264", video_rate(trajectories.config().physics))
                 shown = list(container.decode(stream))
             assert [frame.pts * frame.time_base for frame in shown] == [
-                frame / video_rate(trajectories.config()) for frame in range(FRAMES)
+                frame / video_rate(trajectories.config().physics) for frame in range(FRAMES)
             ]
             assert [frame.key_frame for frame in shown] == [index % GROUP == 0 for index in range(FRAMES)]
             errors = [
@@ -200,7 +201,7 @@ def test_splits_are_ranges_of_episodes(tmp_path, dataset, episodes):
     assert "in `meta/info.json`): train, test.\n" in (out / "README.md").read_text()
     chunk = layout.video_path(0, 1500).parent
     (out.parent / chunk).mkdir()
-    assert chunk in list_folders(out.parent, LerobotExporter.shared_files(settings).folders)
+    assert chunk in list_folders(out.parent, LerobotExporter.shared_files(DataLayout.of(settings)).folders)
     assert str(layout.PARTS) == FORMAT_TABLE["lerobot"].part.folder
 
 

@@ -17,8 +17,7 @@ import pytest
 
 from synpick_warp.errors import OutputError
 from synpick_warp.exporters.writing import pool as pool_module
-from synpick_warp.exporters.writing.pool import QUEUE_DEPTH, WriterPool, WriteTask
-from synpick_warp.exporters.writing.worker import NICENESS
+from synpick_warp.exporters.writing.pool import NICENESS, QUEUE_DEPTH, WriterPool, WriteTask
 from synpick_warp.system.shared_memory import shared_bytes
 from tests.harness.environment import checkout_environment
 from tests.harness.processes import wait_until_gone
@@ -90,7 +89,7 @@ def kill_one(path: Path) -> None:
 
 
 def processes(pool: WriterPool) -> list[subprocess.Popen[bytes]]:
-    return [worker.process for worker in pool._workers]
+    return [worker.process for worker in pool._pool._workers]
 
 
 @pytest.mark.parametrize("count", [0, 1, 2])
@@ -295,7 +294,7 @@ def test_processes_exit_when_the_bake_is_killed(tmp_path):
 import os, signal
 from synpick_warp.exporters.writing.pool import WriterPool
 pool = WriterPool(2, 1 << 16)
-print(*(worker.process.pid for worker in pool._workers), flush=True)
+print(*pool.pids(), flush=True)
 os.kill(os.getpid(), signal.SIGKILL)
 """
     killed = subprocess.run([sys.executable, "-c", script], cwd=tmp_path, capture_output=True, text=True, timeout=60)

@@ -12,6 +12,8 @@ from synpick_warp.codes import Segment
 from synpick_warp.configs.schema import FAST, Config
 from synpick_warp.scenes.environment import map_directions
 from synpick_warp.scenes.types import EnvironmentMap
+from synpick_warp.stages.render.denoised import scratch_sizes
+from synpick_warp.stages.render.sampling_rates import shadow_size
 from tests.render.lighting.test_denoised import lamp
 from tests.worlds.toy_scene import UPRIGHT, ToyScene, camera, entry, flat_shaded, render, sheet
 from tools.reports.lattice import measure_lattice
@@ -123,3 +125,12 @@ def test_a_bevel_in_the_shadow_of_a_wall_is_dark(device, size):
     lit = value[:, column[-0.1] : column[0.1]]
     assert lit.min() > 0.85 * lit.max()
     assert value[:, column[0.175] : column[0.21]].max() < 0.05 * lit.mean()
+
+
+@pytest.mark.parametrize("size", [1, 2, 3, 4, 8, 9, 32, 33, 64])
+def test_lists_of_edges_index_all_pixels_of_their_chunk(size):
+    width, height = 1920, 1080
+    sizes = scratch_sizes(replace(Config().render, mode=FAST, coarse_pixel=size), width, height)
+    assert sizes["chunk_pixel"] <= np.iinfo(np.uint16).max + 1
+    assert sizes["chunk_cell"] * shadow_size(size) ** 2 == sizes["chunk_pixel"]
+    assert sizes["edge_chunk"] * sizes["chunk_pixel"] >= width * height

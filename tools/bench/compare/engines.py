@@ -11,7 +11,7 @@ import newton
 import numpy as np
 import warp as wp
 
-from synpick_warp.configs.schema import Config
+from synpick_warp.configs.schema import Physics, Tote
 from synpick_warp.stages.sim.physics import make_pipeline, make_solver, may_capture
 from synpick_warp.system.cores import count_cores
 from tools.bench.compare.piles import Pile, build_piles
@@ -58,7 +58,8 @@ class NewtonEngine:
     def __init__(
         self,
         name: str,
-        config: Config,
+        physics: Physics,
+        tote: Tote,
         pile: Pile,
         worlds: int,
         device: wp.Device,
@@ -67,13 +68,13 @@ class NewtonEngine:
     ) -> None:
         """Build the model, and the solver by `make`; `substeps` solver steps, each after a collision detection, are a time step."""
         self.name, self.worlds, self.device = name, worlds, device
-        self.model = build_piles(config, pile, worlds, device)
-        self.pipeline = make_pipeline(config.physics, self.model)
+        self.model = build_piles(physics, tote, pile, worlds, device)
+        self.pipeline = make_pipeline(physics, self.model)
         self.contacts = self.pipeline.contacts()
         self.solver = make(self.model)
         self.state: Any = self.model.state()
         self._other, self.control = self.model.state(), self.model.control()
-        self.substeps, self.dt = substeps, config.physics.step / substeps
+        self.substeps, self.dt = substeps, physics.step / substeps
         self.peak_contacts = 0
         self._graph: wp.Graph | None = None
         # The first steps run eagerly: they load kernels and trigger late allocations.
@@ -122,15 +123,16 @@ class NewtonEngine:
         return pose[..., LINEAR], velocity[..., LINEAR]
 
 
-def make_ours(config: Config, pile: Pile, worlds: int, device: wp.Device) -> NewtonEngine:
+def make_ours(physics: Physics, tote: Tote, pile: Pile, worlds: int, device: wp.Device) -> NewtonEngine:
     """Our solver, with the settings of a bake."""
-    physics = config.physics
     name = f"SolverSteel ({physics.substeps} x {physics.iterations} iterations)"
     slots = len(pile.entries)
-    return NewtonEngine(name, config, pile, worlds, device, lambda model: make_solver(physics, model, slots), physics.substeps)
+    return NewtonEngine(name, physics, tote, pile, worlds, device, lambda model: make_solver(physics, model, slots), physics.substeps)
 
 
-def make_mujoco_warp(config: Config, pile: Pile, worlds: int, device: wp.Device, cone: str, peak_contacts: int) -> NewtonEngine:
+def make_mujoco_warp(
+    physics: Physics, tote: Tote, pile: Pile, worlds: int, device: wp.Device, cone: str, peak_contacts: int
+) -> NewtonEngine:
     """MuJoCo Warp with the contacts of our collision pipeline; memory for `CONTACT_ROOM` times `peak_contacts` contacts a world."""
     contacts = max(MIN_CONTACTS, -(-int(CONTACT_ROOM * peak_contacts) // CAPACITY_STEP) * CAPACITY_STEP)
 
@@ -150,15 +152,15 @@ def make_mujoco_warp(config: Config, pile: Pile, worlds: int, device: wp.Device,
         return solver
 
     name = f"MuJoCo Warp ({cone} cone, {CONES[cone]} iterations)"
-    return NewtonEngine(name, config, pile, worlds, device, make)
+    return NewtonEngine(name, physics, tote, pile, worlds, device, make)
 
 
 class MujocoEngine:
     """MuJoCo's engine in C with its own collision detection: `WORLDS_PER_THREAD` worlds for each of the process's CPU cores."""
 
-    def __init__(self, config: Config, pile: Pile, cone: str) -> None:
+    def __init__(self, physics: Physics, tote: Tote, pile: Pile, cone: str) -> None:
         self.mujoco, self.rollout = importlib.import_module("mujoco"), importlib.import_module("mujoco.rollout")
-        self.config, self.cone = config, cone
+        self.physics, self.tote, self.cone = physics, tote, cone
         self.threads = count_cores()
         self.worlds = WORLDS_PER_THREAD * self.threads
         self.name = f"MuJoCo ({cone} cone, {CONES[cone]} iterations, {self.threads} threads)"
@@ -166,13 +168,13 @@ class MujocoEngine:
         self.start(pile)
 
     def start(self, pile: Pile) -> None:
-        model = build_piles(self.config, pile, 1, wp.get_device("cpu"))
+        model = build_piles(self.physics, self.tote, pile, 1, wp.get_device("cpu"))
         # A single contact for two hulls, MuJoCo's default, lets a pile sink 15 mm into the floor.
         solver = newton.solvers.SolverMuJoCo(
             model, use_mujoco_cpu=True, enable_multiccd=True, solver="newton", cone=self.cone, iterations=CONES[self.cone]
         )
         self.model, data = solver.mj_model, solver.mj_data
-        self.model.opt.timestep = self.config.physics.step
+        self.model.opt.timestep = self.physics.step
         state = np.zeros(self.mujoco.mj_stateSize(self.model, self._spec))
         self.mujoco.mj_getState(self.model, data, state, self._spec)
         self.state = np.tile(state, (self.worlds, 1))

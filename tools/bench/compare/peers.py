@@ -6,12 +6,11 @@ import importlib.util
 import math
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import replace
 from functools import partial
 
 import warp as wp
 
-from synpick_warp.configs.schema import Config
+from synpick_warp.configs.schema import Config, Physics, Tote
 from synpick_warp.errors import SynpickError
 from synpick_warp.factory.assembly import build_factory
 from synpick_warp.progress import SilentProgress
@@ -53,7 +52,7 @@ def measure_peers(config: Config, peers: tuple[str, ...], min_seconds: float) ->
     if not peers:
         return
     started = time.perf_counter()
-    few = replace(config, bake=replace(config.bake, worlds=min(config.bake.worlds, PILE_WORLDS)))
+    few = config.with_values({"bake.worlds": min(config.bake.worlds, PILE_WORLDS)})
     factory = build_factory(few, SilentProgress())
     _settle(factory.simulation)
     pile = pick_pile(factory.catalog, factory.simulation.record.snapshot)
@@ -63,7 +62,7 @@ def measure_peers(config: Config, peers: tuple[str, ...], min_seconds: float) ->
     if "mujoco-warp" in peers:
         yield from _guard("mujoco-warp", partial(measure_rendering, few, factory, min_seconds))
     if {"mujoco-warp", "mujoco"} & set(peers):
-        yield from _measure_physics(config, pile, peers, factory.simulation.device)
+        yield from _measure_physics(config.physics, config.tote, config.bake.worlds, pile, peers, factory.simulation.device)
 
 
 def _settle(simulation: Simulation) -> None:
@@ -73,21 +72,20 @@ def _settle(simulation: Simulation) -> None:
         simulation.tick()
 
 
-def _measure_physics(config: Config, pile: Pile, peers: tuple[str, ...], device: wp.Device) -> Iterator[Row]:
+def _measure_physics(physics: Physics, tote: Tote, worlds: int, pile: Pile, peers: tuple[str, ...], device: wp.Device) -> Iterator[Row]:
     """Benchmark of physics engines on one pile: ours, then each peer with each friction cone."""
 
     def measure(make: Callable[[], Engine]) -> Iterator[Row]:
-        yield from measure_engine(make(), config, pile)
+        yield from measure_engine(make(), tote, pile)
 
-    worlds = config.bake.worlds
-    ours = make_ours(config, pile, worlds, device)
+    ours = make_ours(physics, tote, pile, worlds, device)
     yield from of_part("ours", measure(lambda: ours))
     if "mujoco" in peers:
         for cone in CONES:
-            yield from _guard("mujoco", partial(measure, partial(MujocoEngine, config, pile, cone)))
+            yield from _guard("mujoco", partial(measure, partial(MujocoEngine, physics, tote, pile, cone)))
     if "mujoco-warp" in peers:
         for cone in CONES:
-            make = partial(make_mujoco_warp, config, pile, worlds, device, cone, ours.peak_contacts)
+            make = partial(make_mujoco_warp, physics, tote, pile, worlds, device, cone, ours.peak_contacts)
             yield from _guard("mujoco-warp", partial(measure, make))
 
 

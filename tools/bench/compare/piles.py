@@ -9,7 +9,7 @@ import newton
 import numpy as np
 import warp as wp
 
-from synpick_warp.configs.schema import Config
+from synpick_warp.configs.schema import Physics, Tote
 from synpick_warp.scenes.tote import TABLE_SIZE, guide_walls, tote_colliders
 from synpick_warp.scenes.types import Catalog, CatalogEntry, ConvexPiece
 from synpick_warp.stages.buffers import Snapshot
@@ -42,18 +42,17 @@ def pick_pile(catalog: Catalog, snapshot: Snapshot) -> Pile:
     return Pile(tuple(catalog.entries[index] for index in indices[world][present]), poses[world][present].astype(np.float64))
 
 
-def build_piles(config: Config, pile: Pile, worlds: int, device: wp.Device) -> newton.Model:
+def build_piles(physics: Physics, tote: Tote, pile: Pile, worlds: int, device: wp.Device) -> newton.Model:
     """Build `worlds` equal worlds of tote, table, guide walls and the pile; no gripper, no empty body slots.
 
     Shapes, masses, friction and damping are those of a bake. Joint coordinates are the pile's poses, object by object.
     """
-    physics = config.physics
     world = newton.ModelBuilder(gravity=(0.0, 0.0, -physics.gravity))
     newton.solvers.SolverSteel.register_custom_attributes(world)
     shape = newton.ModelBuilder.ShapeConfig(density=0.0, mu=physics.friction, gap=physics.gap, restitution=0.0)
-    for piece in (*tote_colliders(config.tote), *guide_walls(config.tote, physics.guide_height)):
+    for piece in (*tote_colliders(tote), *guide_walls(tote, physics.guide_height)):
         world.add_shape_convex_hull(-1, mesh=_hull(piece), cfg=shape)
-    table = wp.transform(wp.vec3(0.0, 0.0, -config.tote.wall - TABLE_SIZE[2]), wp.quat_identity())
+    table = wp.transform(wp.vec3(0.0, 0.0, -tote.wall - TABLE_SIZE[2]), wp.quat_identity())
     world.add_shape_box(-1, xform=table, hx=TABLE_SIZE[0], hy=TABLE_SIZE[1], hz=TABLE_SIZE[2], cfg=shape)
     damping = {
         "steel:rigid_body_angular_damping": physics.angular_damping,

@@ -35,7 +35,7 @@ def measure_rendering(config: Config, factory: Factory, min_seconds: float) -> I
     """
     cameras, device = len(factory.cameras), factory.simulation.device
     yield from _measure_size(config, factory, max(1, factory.stream.batch // cameras), min_seconds)
-    small = replace(config, cameras=replace(config.cameras, resolution=SMALL_SIZE))
+    small = config.with_values({"cameras.resolution": SMALL_SIZE})
     yield from _measure_size(small, factory, SMALL_WORLDS if device.is_cuda else SMALL_WORLDS_CPU, min_seconds)
 
 
@@ -68,7 +68,7 @@ def _measure_size(config: Config, factory: Factory, worlds: int, min_seconds: fl
     everything = "color by light maps with indirect light and anti-aliasing, depth, ids, amodal bits, counts, boxes"
     theirs_colored = "color by one light with shadows, depth, ids"
     yield from _pair(size, pixels, everything, theirs_colored, seconds)
-    unoccluded = OurViews(replace(config, render=replace(config.render, mode=UNOCCLUDED)), factory, cameras, snapshot, worlds)
+    unoccluded = OurViews(config.with_values({"render.mode": UNOCCLUDED}), factory, cameras, snapshot, worlds)
     seconds = time_view(functools.partial(unoccluded.render)), seconds[1]
     plain = "render.mode unoccluded, color by light maps with shadows of one lamp and anti-aliasing, depth, ids, amodal bits, counts, boxes"
     yield from _pair(size, pixels, plain, theirs_colored, seconds)

@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from synpick_warp.arrays import allocate
 from synpick_warp.codes import Segment
-from synpick_warp.configs.schema import Config
+from synpick_warp.configs.schema import Config, Render
 from synpick_warp.factory.assembly import Factory
 from synpick_warp.scenes.fixtures import make_fixtures
 from synpick_warp.scenes.types import Camera, Catalog, Fixture, Material, TriangleMesh
@@ -71,7 +71,7 @@ class SensorScene:
 
 
 def build_sensor_scene(
-    config: Config,
+    render: Render,
     catalog: Catalog,
     fixtures: tuple[Fixture, ...],
     cameras: tuple[Camera, ...],
@@ -92,7 +92,7 @@ def build_sensor_scene(
         count: Count of views.
         device: Device of both renderers.
     """
-    model, segment = _build_model(config, catalog, fixtures, table, snapshot, -(-count // len(cameras)), device)
+    model, segment = _build_model(render, catalog, fixtures, table, snapshot, -(-count // len(cameras)), device)
     sensor = SensorCamera(model)
     sensor.create_default_light()
     width, height, matrix = cameras[0].width, cameras[0].height, cameras[0].matrix
@@ -113,7 +113,7 @@ def build_sensor_scene(
 
 
 def _build_model(
-    config: Config, catalog: Catalog, fixtures: tuple[Fixture, ...], table: float, snapshot: Snapshot, worlds: int, device: Any
+    render: Render, catalog: Catalog, fixtures: tuple[Fixture, ...], table: float, snapshot: Snapshot, worlds: int, device: Any
 ) -> tuple[newton.Model, list[int]]:
     """Build the Newton model of the first worlds; returns it with the segmentation id of each shape."""
     objects = [_newton_mesh(entry.mesh, entry.material) for entry in catalog.entries]
@@ -134,8 +134,8 @@ def _build_model(
             if visible:
                 _add_body(builder, fixture_meshes[index], fixtures[index].material, host["fixture_pose"][world, index], shape)
                 segment.append(Segment.TOTE + index)
-        if config.render.table:
-            builder.add_shape_plane((0.0, 0.0, 1.0, -table), width=0.0, length=0.0, cfg=shape, color=config.render.table_color)
+        if render.table:
+            builder.add_shape_plane((0.0, 0.0, 1.0, -table), width=0.0, length=0.0, cfg=shape, color=render.table_color)
             segment.append(Segment.TABLE)
         builder.end_world()
     return builder.finalize(device=device), segment
@@ -222,11 +222,11 @@ def measure_sensor(config: Config, factory: Factory, min_seconds: float) -> Iter
     started = time.perf_counter()
     fixtures = make_fixtures(config.tote, config.gripper)
     table = float(renderer.scene.table.height)
-    scene = build_sensor_scene(config, factory.catalog, fixtures, factory.cameras, table, snapshot, count, device)
+    scene = build_sensor_scene(config.render, factory.catalog, fixtures, factory.cameras, table, snapshot, count, device)
     wp.synchronize_device(device)
     yield Row("build a Newton model of the batch's worlds", time.perf_counter() - started, "s")
     yield Row("views in a batch", count, "")
-    ours = _OurRenderer(config, factory, count)
+    ours = _OurRenderer(factory, count)
     hit_images = scene.allocate_outputs(forward_depth_image="depth_forward", shape_index_image="shape_index")
     surface_images = scene.allocate_outputs(normal_image="normal", albedo_image="albedo")
     color_images = scene.allocate_outputs(color_image="color")
@@ -263,7 +263,7 @@ def measure_sensor(config: Config, factory: Factory, min_seconds: float) -> Iter
 class _OurRenderer:
     """Our renderer, for the first views of the last snapshot."""
 
-    def __init__(self, config: Config, factory: Factory, count: int) -> None:
+    def __init__(self, factory: Factory, count: int) -> None:
         self.renderer, self.out = factory.stream.renderer, factory.stream.buffers[0]
         self.snapshot = factory.simulation.record.snapshot
         scene, cameras, view = self.renderer.scene, len(factory.cameras), np.arange(count, dtype=np.int32)

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from synpick_warp.configs.schema import Config
+from synpick_warp.configs.schema import Tote
 from tools.bench.compare.engines import Engine
 from tools.bench.compare.piles import Pile
 from tools.options import Row
@@ -16,7 +16,7 @@ FALL_STEPS, LEAD_STEPS, REST_STEPS = 250, 500, 250
 """Time steps of a fall, of settling from our pile at rest into the engine's, and of the measurement at rest."""
 
 
-def measure_engine(engine: Engine, config: Config, pile: Pile) -> Iterator[Row]:
+def measure_engine(engine: Engine, tote: Tote, pile: Pile) -> Iterator[Row]:
     """Benchmark of an engine. A world-step is `physics.step` of simulated time for all engines."""
     engine.start(pile.lift())
     worlds = f"{engine.worlds} worlds of {len(pile.entries)} objects"
@@ -30,7 +30,7 @@ def measure_engine(engine: Engine, config: Config, pile: Pile) -> Iterator[Row]:
     yield Row(f"{engine.name}, at rest: median speed", float(np.median(speed)), "mm/s")
     moved = np.linalg.norm(position - pile.pose[:, :3], axis=-1)
     yield Row(f"{engine.name}, at rest: mean distance from the start", 1e3 * float(moved.mean()), "mm")
-    yield Row(f"{engine.name}, at rest: objects in the tote", 100.0 * float(is_inside(config, position.reshape(-1, 3)).mean()), "%")
+    yield Row(f"{engine.name}, at rest: objects in the tote", 100.0 * float(is_inside(tote, position.reshape(-1, 3)).mean()), "%")
 
 
 def _rate(engine: Engine, steps: int) -> float:

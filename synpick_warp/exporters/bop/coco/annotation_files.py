@@ -9,21 +9,24 @@ import json
 import math
 import os
 import shutil
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import msgspec
 
 from synpick_warp.configs.schema import Config
-from synpick_warp.configs.splits import bop_folder, bop_folders
+from synpick_warp.configs.splits import DataLayout
 from synpick_warp.errors import DatasetError
 from synpick_warp.exporters.base import EncodedView
 from synpick_warp.exporters.bop.keypoints import Keypoints, make_category_keys
+from synpick_warp.exporters.bop.outlines import trace_outlines
 from synpick_warp.exporters.bop.scene import AnnotationBlocks
 from synpick_warp.exporters.bop.view import ANNOTATIONS, ViewSettings, annotation_block, make_keypoints, make_rle, to_json
 from synpick_warp.exporters.writing.files import PARTIAL, output_error, sync_folder, write_synced
 from synpick_warp.exporters.writing.folder import open_folder
+from synpick_warp.exporters.writing.rle import Runs
 from synpick_warp.inputs.files import read_file
 from synpick_warp.inputs.json import MAX_JSON, decode_json, read_json
 from synpick_warp.inputs.paths import path_inside
@@ -78,7 +81,7 @@ def write_view(view: EncodedView, scene: Path, settings: ViewSettings) -> None:
 
 
 def _make_annotations(view: EncodedView, settings: ViewSettings) -> Iterator[dict[str, Any]]:
-    """Annotations of a view's visible instances, without ids: box of the visible mask, its run lengths, extras of ours, keypoints.
+    """Annotations of a view's visible instances, without ids: box of the visible mask, its segmentation, extras of ours, keypoints.
 
     Widths and heights of both boxes count pixels (+ 1), unlike those of scene_gt_info.json; `bbox_amodal` may exceed the image.
     """
@@ -92,7 +95,7 @@ def _make_annotations(view: EncodedView, settings: ViewSettings) -> Iterator[dic
                 "bbox": [left, top, right - left + 1, bottom - top + 1],
                 "area": mask.visible.count,
                 "iscrowd": 0,
-                "segmentation": make_rle(mask.visible, height, width),
+                "segmentation": _make_polygons(mask.visible) if settings.polygons else make_rle(mask.visible, height, width),
                 **_make_extras(pose, info),
             } | points
 
@@ -103,6 +106,11 @@ def _make_extras(pose: Mapping[str, Any], info: Mapping[str, Any]) -> dict[str, 
     if extras:
         extras = {"bbox_amodal": [*info["bbox_obj"][:2], *(size + 1 for size in info["bbox_obj"][2:])], **extras}
     return extras | ({"instance_id": pose["instance_id"]} if "instance_id" in pose else {})
+
+
+def _make_polygons(mask: Runs) -> list[list[float]]:
+    """Polygons of a mask as in COCO, x and y by turns [px]: one for each part."""
+    return [polygon.points.ravel().tolist() for polygon in trace_outlines(mask)]
 
 
 def commit_scenes(scenes: tuple[tuple[Path, int], ...], out: Path, frames: Sequence[int]) -> None:
@@ -135,17 +143,21 @@ def write_annotation_files(out: Path, config: Config, episodes: Iterable[int]) -
         DatasetError: A part is damaged.
         OSError: A file cannot be written.
     """
-    parts: dict[str, list[Path]] = {split: [] for split in bop_folders(config)}
-    cameras = len(config.cameras.positions)
+    layout = DataLayout.of(config)
+    parts: dict[str, list[Path]] = {split: [] for split in layout.folders}
+    cameras = layout.cameras
     for episode in episodes:
         names = (out / PARTS / f"{scene:06d}.jsonl" for scene in range(cameras * episode, cameras * (episode + 1)))
-        parts[bop_folder(config, episode)] += filter(os.path.lexists, names)
+        parts[layout.folder(episode)] += filter(os.path.lexists, names)
     categories = read_json(path_inside(out, str(CATEGORIES), out, DatasetError), list[_Category], DatasetError, _ADVICE)
-    return [_write_annotations(out, config, split, found, categories) for split, found in parts.items()]
+    describe = partial(_describe_image, cameras, config.cameras.resolution, config.bop.color_format)
+    return [_write_annotations(out, describe, split, found, categories) for split, found in parts.items()]
 
 
-def _write_annotations(out: Path, config: Config, split: str, parts: list[Path], categories: list[_Category]) -> Path:
-    """Join parts to the annotation file of a split; returns its name."""
+def _write_annotations(
+    out: Path, describe: Callable[[int, int], dict[str, Any]], split: str, parts: list[Path], categories: list[_Category]
+) -> Path:
+    """Join parts to the annotation file of a split; returns its name. `describe`: entry of the image of a scene and frame."""
     place = annotation_file(split)
     folder = out / PARTIAL / "coco-index"
     shutil.rmtree(folder, ignore_errors=True)
@@ -157,7 +169,7 @@ def _write_annotations(out: Path, config: Config, split: str, parts: list[Path],
                 if found is None:
                     continue
                 images += 1
-                row = {"id": images, **_describe_image(config, int(part.stem), frame)}
+                row = {"id": images, **describe(int(part.stem), frame)}
                 image_file.write((",\n" if images > 1 else "") + json.dumps(row))
                 for annotation in found:
                     annotations += 1
@@ -186,8 +198,8 @@ def _read_part(part: Path, out: Path) -> Iterator[list[dict[str, Any]] | None]:
         yield decode_json(line, _Line, f"{part}, line {number},", DatasetError, _ADVICE)
 
 
-def _describe_image(config: Config, scene: int, frame: int) -> dict[str, Any]:
-    width, height = config.cameras.resolution
-    episode, camera = divmod(scene, len(config.cameras.positions))
-    name = f"{scene:06d}/{frame:06d}.{config.bop.color_format}"
+def _describe_image(cameras: int, resolution: tuple[int, int], color_format: str, scene: int, frame: int) -> dict[str, Any]:
+    width, height = resolution
+    episode, camera = divmod(scene, cameras)
+    name = f"{scene:06d}/{frame:06d}.{color_format}"
     return {"file_name": name, "width": width, "height": height, "episode": episode, "camera": camera, "frame": frame}

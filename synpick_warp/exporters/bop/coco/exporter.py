@@ -9,8 +9,8 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from synpick_warp.configs.schema import Config
-from synpick_warp.configs.splits import bop_folders
+from synpick_warp.configs.schema import Bop, Config
+from synpick_warp.configs.splits import DataLayout
 from synpick_warp.exporters.base import SharedFiles
 from synpick_warp.exporters.bop.coco.annotation_files import (
     CATEGORIES,
@@ -39,7 +39,7 @@ class CocoExporter(SceneExporter):
     write_view = staticmethod(write_view)
 
     @staticmethod
-    def annotates(config: Config) -> bool:
+    def annotates(bop: Bop) -> bool:
         """See `SceneExporter`."""
         return True
 
@@ -49,10 +49,10 @@ class CocoExporter(SceneExporter):
         return FOLDER.name
 
     @staticmethod
-    def shared_files(config: Config) -> SharedFiles:
+    def shared_files(layout: DataLayout) -> SharedFiles:
         """See `Exporter`."""
-        places = tuple(map(annotation_file, bop_folders(config)))
-        return SharedFiles((CATEGORIES, *note_files(config)), places, (IMAGES, PARTS, places[0].parent, FOLDER))
+        places = tuple(map(annotation_file, layout.folders))
+        return SharedFiles((CATEGORIES, *note_files(layout.formats)), places, (IMAGES, PARTS, places[0].parent, FOLDER))
 
     @staticmethod
     def finalize(out: Path, config: Config, pool: WriterPool, episodes: Sequence[int]) -> list[Path]:

@@ -9,8 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
-from synpick_warp.configs.schema import Config
-from synpick_warp.configs.splits import split_kind
+from synpick_warp.configs.splits import DataLayout, split_kind
 
 CARD_FILE = "README.md"
 """Name that the hub gives the card."""
@@ -59,9 +58,9 @@ class CardContent:
     """Names of the active camera effects."""
 
 
-def hub_splits(config: Config) -> tuple[str, ...]:
-    """Names of the splits on the hub, for each of `bop_folders`: val is called validation there, unless another split is."""
-    names = [split.name for split in config.splits] or [split_kind(config.bop.split)]
+def hub_splits(layout: DataLayout) -> tuple[str, ...]:
+    """Names of the splits on the hub, for each of `DataLayout.folders`: val is called validation there, unless another split is."""
+    names = [split.name for split in layout.splits] or [split_kind(layout.split)]
     return tuple("validation" if name == "val" and "validation" not in names else name for name in names)
 
 

@@ -9,6 +9,7 @@ from typing import Any
 
 from synpick_warp.configs.schema import Config
 from synpick_warp.configs.sensors import effect_ranges
+from synpick_warp.configs.splits import DataLayout
 from synpick_warp.exporters.base import SharedFiles
 from synpick_warp.exporters.bop.scene_exporter import CONSTANTS, SceneExporter
 from synpick_warp.exporters.bop.shards.card import CARD_FILE, CardContent, SplitContent, hub_splits, make_card
@@ -36,19 +37,20 @@ class ShardsExporter(SceneExporter):
         return f"{split}_web"
 
     @staticmethod
-    def shared_files(config: Config) -> SharedFiles:
+    def shared_files(layout: DataLayout) -> SharedFiles:
         """See `Exporter`."""
-        splits = ShardsExporter.folders(config)
+        splits = ShardsExporter.folders(layout)
         return SharedFiles(CONSTANTS, (*(split / KEYS_FILE for split in splits), Path(CARD_FILE)), splits)
 
     @staticmethod
     def finalize(out: Path, config: Config, pool: WriterPool, episodes: Sequence[int]) -> list[Path]:
         """See `Exporter`: the index of views and shards of each split, and the dataset card."""
-        cameras = len(config.cameras.positions)
+        layout = DataLayout.of(config)
+        cameras = layout.cameras
         scenes = [scene for episode in episodes for scene in range(cameras * episode, cameras * (episode + 1))]
         contents = [
             _write_keys(out, name, split, pool, scenes)
-            for name, split in zip(hub_splits(config), ShardsExporter.folders(config), strict=True)
+            for name, split in zip(hub_splits(layout), ShardsExporter.folders(layout), strict=True)
         ]
         try:
             write_atomically(out / CARD_FILE, make_card(_describe(config, contents)).encode())

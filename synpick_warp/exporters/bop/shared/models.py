@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 
 from synpick_warp.configs.modes import bake_modes
-from synpick_warp.configs.schema import MULTISENSOR, Config
+from synpick_warp.configs.schema import Config
+from synpick_warp.configs.splits import DataLayout
 from synpick_warp.errors import CatalogError
 from synpick_warp.exporters.bop.shared.toolkit import describe_toolkit
 from synpick_warp.exporters.bop.view import MILLIMETERS
@@ -170,29 +171,29 @@ def _write_json(path: Path, content: object) -> None:
     path.write_text(json.dumps(content, indent=2) + "\n", encoding="ascii")
 
 
-def _describe_folders(config: Config) -> str:
+def _describe_folders(layout: DataLayout) -> str:
     """Folders of the scenes, and where each split begins."""
-    if not config.splits:
-        return f"`{config.bop.split}/`"
-    return ", ".join(f"`{split.folder}/` (k from {split.first} on)" for split in config.splits)
+    if not layout.splits:
+        return f"`{layout.split}/`"
+    return ", ".join(f"`{split.folder}/` (k from {split.first} on)" for split in layout.splits)
 
 
-def _describe_scenes(config: Config, count: int) -> str:
+def _describe_scenes(layout: DataLayout) -> str:
     """Which scene has what."""
-    if config.bop.layout == MULTISENSOR:
-        return f"Episode k is scene k, with files of the sensors cam0 to cam{count - 1},"
-    return f"Camera c of episode k is scene {count} · k + c"
+    if layout.has_sensors:
+        return f"Episode k is scene k, with files of the sensors cam0 to cam{layout.cameras - 1},"
+    return f"Camera c of episode k is scene {layout.cameras} · k + c"
 
 
 def describe_dataset(config: Config, catalog: Catalog, cameras: tuple[Camera, ...]) -> str:
     """Text of dataset_info.md: conventions of the ground truth, and the objects."""
-    camera, count = cameras[0], len(cameras)
+    camera, layout, modes = cameras[0], DataLayout.of(config), ", ".join(bake_modes(config.bake, config.splits))
     period = config.physics.step * config.physics.steps_per_tick
     objects = "\n".join(f"| {entry.obj_id} | {entry.name} | {entry.mass:g} |" for entry in catalog.entries)
     return f"""# A SynPick data set
 
-Made by synpick-warp (mode {", ".join(bake_modes(config))}, seed {config.bake.seed}, {count} cameras), in the format of the
-BOP challenge (scenewise). {_describe_scenes(config, count)} of {_describe_folders(config)}. Frames are {period:g} s apart.
+Made by synpick-warp (mode {modes}, seed {config.bake.seed}, {layout.cameras} cameras), in the format of the
+BOP challenge (scenewise). {_describe_scenes(layout)} of {_describe_folders(layout)}. Frames are {period:g} s apart.
 
 - Lengths are in millimetres. A depth image's count times `depth_scale` ({config.bop.depth_scale:g}) is the planar depth, along the
   optical axis; 0: no surface.
@@ -211,4 +212,4 @@ BOP challenge (scenewise). {_describe_scenes(config, count)} of {_describe_folde
 | obj_id | name | mass [kg] |
 |---|---|---|
 {objects}
-{describe_toolkit(config)}"""
+{describe_toolkit(layout)}"""

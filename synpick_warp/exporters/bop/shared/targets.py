@@ -11,8 +11,7 @@ from typing import Annotated, TypeVar
 
 import msgspec
 
-from synpick_warp.configs.schema import MULTISENSOR, Config
-from synpick_warp.configs.splits import bop_folders, bop_scene, split_kind
+from synpick_warp.configs.splits import DataLayout, split_kind
 from synpick_warp.errors import DatasetError
 from synpick_warp.exporters.writing.files import write_atomically
 from synpick_warp.inputs.json import read_json
@@ -38,33 +37,29 @@ class _Info(msgspec.Struct):
     visib_fract: float
 
 
-def sensor_suffixes(config: Config) -> tuple[str, ...]:
+def sensor_suffixes(layout: DataLayout) -> tuple[str, ...]:
     """Suffixes of the sensors' files in a scene; one empty string in the classic layout."""
-    return tuple(bop_scene(config, 0, camera)[1] for camera in range(len(config.cameras.positions))) if _is_multisensor(config) else ("",)
+    return tuple(layout.scene(0, camera)[1] for camera in range(layout.cameras)) if layout.has_sensors else ("",)
 
 
-def _is_multisensor(config: Config) -> bool:
-    return config.bop.layout == MULTISENSOR
+def _kinds(layout: DataLayout) -> tuple[str, ...]:
+    return (*KINDS, *((MULTIVIEW,) if layout.has_sensors else ()))
 
 
-def _kinds(config: Config) -> tuple[str, ...]:
-    return (*KINDS, *((MULTIVIEW,) if _is_multisensor(config) else ()))
-
-
-def scene_target_files(config: Config, folder: str) -> tuple[str, ...]:
+def scene_target_files(layout: DataLayout, folder: str) -> tuple[str, ...]:
     """Names of a split's target lists (BOP19, BOP24, and MULTIVIEW with several sensors), by the split's kind.
 
     Without splits, all scenes are in the lists named test, which the toolkit's scripts open for any split.
 
     Lists begin with the kind of their splits, as in val_targets_bop19.json; splits of one kind share them, as scene ids are unique.
     """
-    kind = split_kind(folder) if config.splits else "test"
-    return tuple(name.replace("test", kind, 1) for name in _kinds(config))
+    kind = split_kind(folder) if layout.splits else "test"
+    return tuple(name.replace("test", kind, 1) for name in _kinds(layout))
 
 
-def target_files(config: Config) -> tuple[str, ...]:
+def target_files(layout: DataLayout) -> tuple[str, ...]:
     """All files that list targets. Those named test always exist, as BOP's toolkit opens them for any split."""
-    return tuple(dict.fromkeys((*_kinds(config), *(name for folder in bop_folders(config) for name in scene_target_files(config, folder)))))
+    return tuple(dict.fromkeys((*_kinds(layout), *(name for folder in layout.folders for name in scene_target_files(layout, folder)))))
 
 
 def find_scenes(split: Path, scenes: Collection[int]) -> list[Path]:

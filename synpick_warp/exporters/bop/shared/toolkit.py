@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from synpick_warp.configs.schema import MULTISENSOR, Config
-from synpick_warp.configs.splits import bop_folders, sensor_name
+from synpick_warp.configs.splits import DataLayout
 from synpick_warp.scenes.types import Camera, Catalog
 
 PARAMS_FILE = "bop_dataset_params.py"
@@ -106,37 +105,31 @@ toolkit.get_camera_params = extend(toolkit.get_camera_params, lambda datasets_pa
 '''
 
 
-def format_dataset_params(config: Config, catalog: Catalog, cameras: tuple[Camera, ...]) -> str:
+def format_dataset_params(layout: DataLayout, color_format: str, catalog: Catalog, cameras: tuple[Camera, ...]) -> str:
     """Text of bop_dataset_params.py: Python that adds the data set to the toolkit's functions."""
     entries = catalog.entries
     values: dict[str, Any] = {
-        "SPLITS": list(bop_folders(config)),
-        "SENSORS": list(sensors(config)),
+        "SPLITS": list(layout.folders),
+        "SENSORS": list(layout.sensors),
         "OBJ_IDS": [entry.obj_id for entry in entries],
         "SYMMETRIC_OBJ_IDS": [entry.obj_id for entry in entries if entry.symmetries_discrete or entry.symmetries_continuous],
         "IM_SIZE": (cameras[0].width, cameras[0].height),
-        "RGB_EXT": f".{config.bop.color_format}",
+        "RGB_EXT": f".{color_format}",
     }
     return _HEAD + "\n".join(f"{name} = {value!r}" for name, value in values.items()) + "\n" + _BODY
 
 
-def sensors(config: Config) -> tuple[str, ...]:
-    """Names of the sensors of a scene; none in the classic layout."""
-    return tuple(sensor_name(camera) for camera in range(len(config.cameras.positions))) if config.bop.layout == MULTISENSOR else ()
-
-
-def describe_toolkit(config: Config) -> str:
+def describe_toolkit(layout: DataLayout) -> str:
     """Section of dataset_info.md: how to use the toolkit's scripts with this data set."""
-    folders = bop_folders(config)
-    folder = next((name for name in folders if name.startswith("test")), folders[0])
+    folder = next((name for name in layout.folders if name.startswith("test")), layout.folders[0])
     split, _, kind = folder.partition("_")
     options = f"--dataset synpick --dataset_split {split}" + (f" --dataset_split_type {kind}" if kind else "")
     ending = f"{split}-{kind}" if kind else split
     meaning = f"`{split}`" + (f" of the type `{kind}`" if kind else "")
-    layout = (
+    sensors = (
         "\nScripts evaluate the sensor cam0; for another one, put it first in `SENSORS` of `bop_dataset_params.py`. VSD, and so\n"
         "`eval_bop19_pose.py`, is not computed for data sets of several sensors; `eval_bop24_pose.py` is.\n"
-        if sensors(config)
+        if layout.has_sensors
         else ""
     )
     return f"""
@@ -159,4 +152,4 @@ python scripts/eval_bop24_pose.py --renderer_type=vispy --result_filenames=METHO
 
 A result file is called METHOD_synpick-{ending}.csv: BOP's folder `{folder}` is the split {meaning}, joined by
 hyphens there. `--targets_filename` names another list than that of the test split.
-{layout}"""
+{sensors}"""

@@ -1,0 +1,1 @@
+"""YOLO labels: boxes, oriented boxes and segments of the visible masks."""

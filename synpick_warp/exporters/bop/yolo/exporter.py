@@ -1,0 +1,70 @@
+"""Exporter of YOLO's text labels, as Ultralytics reads them: segments, boxes and oriented boxes of the visible masks."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+from synpick_warp.configs.splits import DataLayout
+from synpick_warp.exporters.base import ExportContext, SharedFiles
+from synpick_warp.exporters.bop.scene_exporter import SceneExporter
+from synpick_warp.exporters.bop.yolo.label_files import CONTENTS, DATA, FOLDER, commit_scenes, image_list, write_data_file, write_view
+from synpick_warp.exporters.writing.files import output_error
+from synpick_warp.exporters.writing.notes import note_files, write_notes
+
+
+class YoloExporter(SceneExporter):
+    """`Exporter` of YOLO labels. A scene is a folder of images, one of each kind of labels, and a list of its images."""
+
+    writes_depth = False
+    staging = "yolo"
+
+    write_view = staticmethod(write_view)
+
+    def __init__(self, context: ExportContext) -> None:
+        """See `Exporter`."""
+        super().__init__(context)
+        classes = tuple(sorted(context.names))
+        self._views = tuple(dataclasses.replace(view, classes=classes) for view in self._views)
+
+    @staticmethod
+    def folder_name(split: str) -> str:
+        """See `SceneExporter`: one for all splits."""
+        return FOLDER.name
+
+    @staticmethod
+    def shared_files(layout: DataLayout) -> SharedFiles:
+        """See `Exporter`."""
+        splits = tuple(FOLDER / kind / split for kind in CONTENTS for split in layout.folders)
+        return SharedFiles((DATA, *note_files(layout.formats)), (), (*splits, *(FOLDER / kind for kind in CONTENTS), FOLDER))
+
+    def write_constants(self) -> list[Path]:
+        """See `Exporter`: splits and names of the classes, camera and notes."""
+        context = self._context
+        try:
+            for folder in reversed(self.shared_files(context.layout).folders):
+                (self._out / folder).mkdir(exist_ok=True)
+            write_data_file(self._out, context.names, context.layout.folders)
+            return [DATA, *write_notes(self._out, context.config, context.names, self._cameras)]
+        except OSError as error:
+            raise output_error(self._out, error) from error
+
+    def files(self, episode: int) -> list[Path]:
+        """See `Exporter`: lists of images, and folders of images and labels."""
+        split = self._context.layout.folder(episode)
+        scenes = [self.scene_id(episode, camera) for camera in range(len(self._cameras))]
+        folders = [FOLDER / kind / split / f"{scene:06d}" for scene in scenes for kind in CONTENTS]
+        places = [*map(image_list, scenes), *folders]
+        return sorted(place for place in places if os.path.lexists(self._out / place))
+
+    def _stage_scene(self, scene: Path) -> None:
+        scene.mkdir()
+        for kind in CONTENTS:
+            (scene / kind).mkdir()
+
+    def _commit_task(self, scenes: tuple[tuple[Path, int], ...], images: Sequence[int]) -> tuple[Callable[..., None], tuple[Any, ...]]:
+        split = self._context.layout.folder(scenes[0][1] // len(self._cameras))
+        return commit_scenes, (scenes, self._out, split, len(images))

@@ -1,0 +1,327 @@
+"""Worker process pool: tasks go to the least busy process, results are futures, and errors are raised in the caller.
+
+The one pool of the package: files are written, images decoded, and data sets verified, validated and counted by it. Processes are fresh
+interpreters (see `processes`), so Python's global lock is no limit, and nothing of them outlives this one.
+"""
+
+from __future__ import annotations
+
+import pickle
+import selectors
+import signal
+import sys
+import traceback
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass, field
+from multiprocessing.connection import Connection
+from multiprocessing.reduction import recv_handle, send_handle
+from typing import Any, Self
+
+from synpick_warp.errors import SynpickError
+from synpick_warp.system.descriptors import open_standard_descriptors
+from synpick_warp.system.processes import END_TIMEOUT, ProcessError, WorkerProcess, send, start_process
+
+_PROGRAM = "from synpick_warp.system.pool import main; main()"
+_AHEAD = 8
+"""Size of the reorder buffer of an ordered map [results per process]: while it is full, no further task is started."""
+
+
+@dataclass(frozen=True)
+class WorkerProgram:
+    """Program of a pool's processes. A task is a picklable callable; it is called with the state of the process that runs it."""
+
+    setup: Callable[[], Any]
+    """Picklable; makes the state that the tasks of a process share. If it raises, each task raises its error."""
+    noun: str
+    """Name of a process in error messages, such as "process that validates"."""
+    setting: str = "--threads"
+    """Name of the setting that has the number of processes."""
+    handles: tuple[int, ...] = ()
+    """File handles that the setup uses, by the same numbers."""
+    inherited: tuple[int, ...] = ()
+    """File handles that the processes keep open until they exit, such as one that holds a lock."""
+    environment: Mapping[str, str] = field(default_factory=dict)
+    """Environment variables that they have besides those of this process."""
+
+
+class DeadProcessError(ProcessError):
+    """A process of a pool has died."""
+
+    def __init__(self, program: WorkerProgram, worker: WorkerProcess) -> None:
+        self.how, self.remedy = worker.describe_end(program.setting)
+        self.task: TaskFuture | None = worker.tasks[0] if worker.tasks else None
+        """Future of the task that it ran; None: it had none."""
+        super().__init__(f"a {program.noun} {self.how}; {self.remedy}")
+
+
+@dataclass(eq=False, slots=True)
+class TaskFuture:
+    """Future of a task. It belongs to the thread that uses the pool, so it has no lock, unlike `concurrent.futures.Future`, whose lock
+    costs that thread some 10 us of 50 a task."""
+
+    is_done: bool = False
+    value: Any = None
+    error: Exception | None = None
+
+    def done(self) -> bool:
+        """Whether there is a result, or an error."""
+        return self.is_done
+
+    def set(self, value: Any, error: Exception | None) -> None:
+        """Set the result or the error."""
+        self.value, self.error, self.is_done = value, error, True
+
+    def result(self) -> Any:
+        """The result of a task that is done; raises its error."""
+        if self.error is not None:
+            raise self.error
+        return self.value
+
+
+class TaskError(RuntimeError):
+    """Unexpected error of a task, a fault of ours: its type and text in one line, and its traceback as a note."""
+
+
+class WorkerPool:
+    """Pool of worker processes. As a context manager it kills them."""
+
+    def __init__(self, program: WorkerProgram, processes: int) -> None:
+        """
+        Args:
+            program: Program of the processes.
+            processes: Number of processes; 0: tasks run in the calling process, at once.
+
+        Raises:
+            ProcessError: Processes cannot be started.
+        """
+        open_standard_descriptors()
+        self._program = program
+        self._workers: list[WorkerProcess] = []
+        self._links = selectors.DefaultSelector()
+        self._runs_here = processes == 0
+        self._state = program.setup() if self._runs_here else None
+        try:
+            for _ in range(processes):
+                worker = start_process(_PROGRAM, program.handles, program.inherited, program.environment)
+                self._workers.append(worker)
+                self._links.register(worker.link, selectors.EVENT_READ, worker)
+            for worker in self._workers:
+                self._send(worker, pickle.dumps(program.setup))
+        except OSError as error:
+            self.kill()
+            raise ProcessError(f"cannot start a {program.noun}: {error}; set {program.setting} lower") from error
+        except BaseException:
+            self.kill()
+            raise
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.kill()
+
+    def __len__(self) -> int:
+        """Number of processes."""
+        return len(self._workers)
+
+    def pids(self) -> tuple[int, ...]:
+        """Process ids."""
+        return tuple(worker.process.pid for worker in self._workers)
+
+    def load(self) -> int:
+        """Number of unanswered tasks of the least busy process."""
+        return min(map(_load, self._workers), default=0)
+
+    def submit(self, task: Callable[[Any], Any], affinity: int = 0, *, drain: bool = True) -> TaskFuture:
+        """Send a task to the process with the fewest unanswered tasks; the future is set by later calls of `receive`, `wait` and `submit`.
+
+        Args:
+            task: The task; see `WorkerProgram`.
+            affinity: Among several such processes, equal numbers choose the same.
+            drain: Receive available results first, so that a process that waits for its answer to be read takes the task. Needless if
+                the caller bounds the unanswered tasks, and both tasks and results are small.
+
+        Raises:
+            DeadProcessError: A process died.
+        """
+        future: TaskFuture = TaskFuture()
+        if self._runs_here:
+            try:
+                future.set(task(self._state), None)
+            except Exception as error:
+                future.set(None, error)
+            return future
+        message = pickle.dumps((task, False))
+        if drain:
+            self.receive(0.0)
+        first = affinity % len(self._workers)
+        worker = min(self._workers[first:] + self._workers[:first] if first else self._workers, key=_load)
+        worker.tasks.append(future)
+        self._send(worker, message)
+        return future
+
+    def broadcast(self, task: Callable[..., Any], handle: int | None = None) -> list[TaskFuture]:
+        """Send a task to every process.
+
+        Args:
+            task: The task; see `WorkerProgram`.
+            handle: Open file that the task receives besides the state, as a handle of its own process, which the task closes.
+
+        Raises:
+            DeadProcessError: A process died.
+        """
+        if self._runs_here:
+            return [self.submit(task)]
+        message = pickle.dumps((task, handle is not None))
+        futures = []
+        for worker in self._workers:
+            futures.append(TaskFuture())
+            worker.tasks.append(futures[-1])
+            self._send(worker, message, handle)
+        return futures
+
+    def receive(self, timeout: float | None) -> list[TaskFuture]:
+        """Receive available results; a timeout of None blocks until there is one, unless no task is unanswered.
+
+        Returns:
+            The futures that it has set.
+
+        Raises:
+            DeadProcessError: A process died.
+        """
+        if timeout is None and not any(worker.tasks for worker in self._workers):
+            timeout = 0.0
+        received = []
+        for key, _ in self._links.select(timeout):
+            worker: WorkerProcess = key.data
+            try:
+                value, error = worker.link.recv()
+            except (EOFError, OSError) as end:
+                raise DeadProcessError(self._program, worker) from end
+            received.append(future := worker.tasks.popleft())
+            future.set(value, error)
+        return received
+
+    def wait(self, future: TaskFuture) -> Any:
+        """Block until a task is done; returns its result.
+
+        Raises:
+            SynpickError: What the task raised; so are OSError and MemoryError.
+            TaskError: The task raised another error.
+            DeadProcessError: A process died.
+        """
+        while not future.done():
+            self.receive(None)
+        return future.result()
+
+    def map_ordered(self, tasks: Iterable[Callable[[Any], Any]], *, depth: int = 1, ahead: int = _AHEAD) -> Iterator[Any]:
+        """Results of tasks, in order.
+
+        Args:
+            tasks: The tasks, taken lazily as processes become idle.
+            depth: Unanswered tasks per process.
+            ahead: Unanswered tasks and results that wait for an earlier one, per process.
+
+        Raises:
+            Exception: Those of `wait`; other tasks go on.
+        """
+        limit = ahead * max(1, len(self))
+        pending: deque[TaskFuture] = deque()
+        for task in tasks:
+            pending.append(self.submit(task))
+            while pending and (pending[0].done() or len(pending) >= limit or self.load() >= depth):
+                if pending[0].done():
+                    yield pending.popleft().result()
+                else:
+                    self.receive(None)
+        while pending:
+            yield self.wait(pending.popleft())
+
+    def end(self) -> None:
+        """Let idle processes exit.
+
+        Raises:
+            OSError: One has died.
+            subprocess.TimeoutExpired: One did not exit.
+        """
+        for worker in self._workers:
+            send(worker.link, None)
+        for worker in self._workers:
+            worker.process.wait(END_TIMEOUT)
+
+    def kill(self) -> None:
+        """Kill the processes, also in the middle of a task. Never raises."""
+        for worker in self._workers:
+            worker.kill()
+        self._workers.clear()
+        self._links.close()
+        self._state = None
+
+    def _send(self, worker: WorkerProcess, message: bytes, handle: int | None = None) -> None:
+        try:
+            worker.link.send_bytes(message)
+            if handle is not None:
+                send_handle(worker.link, handle, None)
+        except OSError as error:
+            raise DeadProcessError(self._program, worker) from error
+
+
+def map_ordered(program: WorkerProgram, tasks: Iterable[Callable[[Any], Any]], processes: int) -> Iterator[Any]:
+    """Results of tasks, in order, in a pool of their own, or with one process in the calling one; see `WorkerPool.map_ordered`.
+
+    Raises:
+        ProcessError: Processes cannot be started, or one died.
+    """
+    with WorkerPool(program, processes if processes > 1 else 0) as pool:
+        yield from pool.map_ordered(tasks)
+
+
+def portable_error(error: Exception) -> Exception:
+    """Convert an error to one that can be pickled.
+
+    Errors of users, of the operating system, of memory and of imports keep their type; others become a `TaskError` of one line. The
+    traceback of all but the first, which are about data, becomes a note: the caller's traceback ends where it waits for the task.
+    """
+    if isinstance(error, SynpickError | TaskError):
+        return error
+    if isinstance(error, OSError):
+        name = (str(error.filename),) if error.filename else ()
+        result = OSError(error.errno or 0, error.strerror or str(error), *name)
+    elif isinstance(error, MemoryError):
+        result = MemoryError(str(error))
+    elif isinstance(error, ImportError):
+        result = ImportError(str(error))
+    else:
+        result = TaskError(f"{type(error).__name__}: {' '.join(str(error).split())}")
+    result.add_note("".join(traceback.format_exception(error)))
+    return result
+
+
+def _load(worker: WorkerProcess) -> int:
+    return len(worker.tasks)
+
+
+# ---- in the processes ----
+
+
+def main() -> None:
+    """Main function of a process: run tasks until `None` arrives or the parent exits. SIGINT is ignored; the parent handles it."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    link = Connection(int(sys.argv[1]))
+    try:
+        state, fault = _run(link.recv())
+        while (message := link.recv()) is not None:
+            task, has_handle = message
+            handles = (recv_handle(link),) if has_handle else ()
+            link.send((None, fault) if fault else _run(task, state, *handles))
+    except (EOFError, ConnectionError):
+        return  # The parent has ended; nobody is left to receive an answer.
+
+
+def _run(task: Callable[..., Any], *arguments: Any) -> tuple[Any, Exception | None]:
+    """Result of a task, or its error."""
+    try:
+        return task(*arguments), None
+    except Exception as error:
+        return None, portable_error(error)
