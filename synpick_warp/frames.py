@@ -5,7 +5,7 @@ A tick is one output frame of simulated time (`physics.steps_per_tick` physics s
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from typing import Any, Protocol
 
@@ -183,3 +183,10 @@ class EpisodeEnd:
     """The episode's row of episodes.jsonl; empty if the arrangement will be resampled."""
     attempts: tuple[str, ...] = ()
     """The episode's lines of attempts.jsonl: JSON, each with its newline."""
+    image_ids: tuple[int, ...] | None = None
+    """BOP's im_id of each frame, ascending; None: the frame's index."""
+
+    @property
+    def images(self) -> Sequence[int]:
+        """BOP's im_id of each frame."""
+        return range(self.frames) if self.image_ids is None else self.image_ids

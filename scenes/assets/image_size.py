@@ -4,19 +4,16 @@ from __future__ import annotations
 
 import io
 import re
-import struct
 
 from PIL import Image
 
+from synpick_warp.inputs.image_files import tiff_size
 from synpick_warp.scenes.assets.asset_files import quiet_decoding
 
 MAX_HEADER = 2**16
 """Longest header of a Radiance file [bytes]."""
 _FORMATS = ("PNG", "JPEG", "WEBP", "BMP", "PPM", "JPEG2000")
 _RESOLUTION = re.compile(rb"[-+]([XY])\s*\+?(\d{1,9})\s*[-+]([XY])\s*\+?(\d{1,9})")
-_WIDTH, _HEIGHT = 256, 257
-"""TIFF tags."""
-_TIFF_TYPES = {3: "H", 4: "I"}
 
 
 def image_size(data: bytes) -> tuple[int, int] | None:
@@ -24,7 +21,7 @@ def image_size(data: bytes) -> tuple[int, int] | None:
     if data[:2] == b"#?":
         return _radiance_size(data)
     if data[:4] in (b"II*\0", b"MM\0*"):
-        return _tiff_size(data)
+        return tiff_size(data)
     with quiet_decoding():
         try:
             with Image.open(io.BytesIO(data), formats=_FORMATS) as image:
@@ -48,20 +45,3 @@ def _radiance_size(data: bytes) -> tuple[int, int] | None:
     found = ((int(first), int(second), axis) for _, first, axis, second in _RESOLUTION.findall(header))
     sizes = [(second, first) if axis == b"X" else (first, second) for first, second, axis in found]
     return max(sizes, key=lambda size: size[0] * size[1], default=None)
-
-
-def _tiff_size(data: bytes) -> tuple[int, int] | None:
-    """Size in the first directory of a TIFF file."""
-    order = "<" if data[:2] == b"II" else ">"
-    try:
-        (start,) = struct.unpack_from(f"{order}I", data, 4)
-        (count,) = struct.unpack_from(f"{order}H", data, start)
-        found = {}
-        for entry in range(start + 2, start + 2 + 12 * count, 12):
-            tag, kind = struct.unpack_from(f"{order}HH", data, entry)
-            if tag in (_WIDTH, _HEIGHT) and kind in _TIFF_TYPES:
-                (value,) = struct.unpack_from(f"{order}{_TIFF_TYPES[kind]}", data, entry + 8)
-                found[tag] = max(value, found.get(tag, 0))
-        return (found[_WIDTH], found[_HEIGHT]) if len(found) == 2 else None
-    except struct.error:
-        return None

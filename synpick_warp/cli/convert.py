@@ -27,23 +27,27 @@ def convert(
             help="Folder of the converted data set: new, empty, or of an interrupted conversion (default DIR-FORMATS, beside the data set)."
         ),
     ] = None,
+    split: Annotated[str | None, Parameter(help="Split to convert, of a BOP data set that no bake wrote (default: the only one).")] = None,
     processes: Annotated[WholeNumber, Parameter(help="Processes that convert; 0: one per core.")] = 0,
 ) -> int:
     """Convert a data set to other formats. After an interruption, the same command resumes with the remaining episodes.
 
     Formats of images need bop or shards in the data set, those of motion alone (usd) zarr, and lerobot both. Files are those that a bake
-    would have written, but for LeRobot's videos from JPEG images. Exit codes: 0, converted; 2, an error.
+    would have written, but for LeRobot's videos from JPEG images. BOP data sets that no bake wrote become bop, shards or coco, with their
+    own ids, and not in parts. Exit codes: 0, converted; 2, an error.
     """
     check_range("--processes", processes, 0, MAX_THREADS)
     from synpick_warp.cli.display import CountProgress, make_console
     from synpick_warp.conversion.run import convert as run_conversion
+    from synpick_warp.dataset.manifest import MANIFEST_FILE
 
     names = [name.strip() for name in to.split(",")]
     folder = find_data_set(folder, "synpick-warp convert DIR")
     out = out or beside(folder, f"-{'-'.join(name for name in names if name in FORMATS) or 'converted'}")
     with CountProgress(make_console()) as counter:
-        converted = run_conversion(folder, out, names, processes, counter.report)
+        converted = run_conversion(folder, out, names, processes, counter.report, split)
+    unit = "episodes" if (folder / MANIFEST_FILE).exists() else "scenes"
     before = f" ({converted.resumed:,} of them before)" if converted.resumed else ""
-    print(f"{converted.episodes:,} episodes converted to {', '.join(names)}{before}")
+    print(f"{converted.episodes:,} {unit} converted to {', '.join(names)}{before}")
     print(f"data set: {out}")
     return 0

@@ -120,7 +120,7 @@ def run_method(
     if split is not None:
         data_set = data_set.split(split)
     if selection.targets is not None:
-        selection = replace(selection, targets=selection.targets.in_classic_layout(data_set.config))
+        selection = replace(selection, targets=selection.targets.in_classic_layout(data_set.sensors))
     plans, complete = plan_scenes(data_set, selection)
     processes = open_pool(options.threads, sum(len(plan.frames) for plan in plans))
     with processes or nullcontext() as pool, CountProgress(make_console()) as counter:
@@ -133,7 +133,7 @@ def run_method(
     listed = None if complete and split is None else targets_file(out)
     if listed is not None:
         try:
-            write_atomically(listed, encode_targets(in_layout(list_targets(scenes), data_set.config)))
+            write_atomically(listed, encode_targets(in_layout(list_targets(scenes), data_set.sensors)))
         except OSError as error:
             raise output_error(listed, error) from error
     write_results(out, run.poses)

@@ -14,8 +14,7 @@ from cyclopts import Parameter
 from synpick_warp.cli.folders import check_output_file, find_data_set, has_images
 from synpick_warp.cli.options import WholeNumber, check_range
 from synpick_warp.configs.check import escape, format_value
-from synpick_warp.configs.schema import MULTISENSOR
-from synpick_warp.configs.splits import DataLayout, split_kind
+from synpick_warp.configs.splits import split_kind
 from synpick_warp.errors import ConfigError, DatasetError, OutputError
 
 if TYPE_CHECKING:
@@ -150,7 +149,7 @@ def make_table(
     from synpick_warp.evaluation.models import read_models
     from synpick_warp.evaluation.results import check_results, read_results
     from synpick_warp.evaluation.scoring import score
-    from synpick_warp.evaluation.tables import render, summarize
+    from synpick_warp.evaluation.tables import GROUPS, render, summarize
     from synpick_warp.evaluation.targets import read_targets, select_targets
     from synpick_warp.evaluation.truth import read_truth
 
@@ -162,12 +161,14 @@ def make_table(
     for file in files:
         check_results(file, truth, known)
     if targets is not None:
-        truth = select_targets(truth, read_targets(targets).in_classic_layout(data_set.config))
-    if not (truth.visibility >= visib_min).any():
+        truth = select_targets(truth, read_targets(targets).in_classic_layout(data_set.sensors))
+    if not truth.shown(visib_min).any():
         raise ConfigError(f"--visib-min is {visib_min:g}; no instance of {data_set.folder} is as visible as that; lower it")
     methods = make_methods(results, files, alpha)
     scores = [score(label, truth, poses, models, visib_min, top) for method in methods for label, poses in method.variants()]
-    table = render(summarize(truth, scores, object_names(data_set)), truth, scores, style, convention)
+    # Modes are those of a bake.
+    groups = [group for group in GROUPS if group != "mode" or data_set.found is None]
+    table = render(summarize(truth, scores, object_names(data_set), groups), truth, scores, style, convention)
     if plots is None:
         return table, {}
     pictures = draw_figures(truth, methods, scores, Settings(models, visib_min, top), track, attempt_frames(data_set))
@@ -311,7 +312,7 @@ def toolkit_name(data_set: DataSet) -> str:
 
 def toolkit_ending(data_set: DataSet) -> str:
     """Data set and split as in the names of BOP result files, such as "synpickdata-train-pbr"."""
-    folders = DataLayout.of(data_set.config).folders
+    folders = tuple(data_set.split_folders.values())
     split, _, kind = next((name for name in folders if split_kind(name) == "test"), folders[0]).partition("_")
     return f"{toolkit_name(data_set)}-{split}{f'-{kind}' if kind else ''}"
 
@@ -321,7 +322,7 @@ def toolkit_command(data_set: DataSet, results: Sequence[Path]) -> str:
 
     For several sensors, results of the first one get the data set's scene ids, and VSD, which the toolkit does not compute, is left out.
     """
-    cameras = len(data_set.config.cameras.positions) if data_set.config.bop.layout == MULTISENSOR else 0
+    cameras = len(data_set.sensors)
     folder = data_set.folder.absolute()
     name, ending = toolkit_name(data_set), toolkit_ending(data_set)
     lines = [f"# BOP scores by the BOP toolkit, once `{name}` is in its dataset_params.py:"]

@@ -44,7 +44,7 @@ def write_page(
     from synpick_warp.dataset.reading import open_data_set
 
     data_set = open_data_set(folder)
-    if not (folder / "config.toml").exists():
+    if data_set.found is None and not (folder / "config.toml").exists():
         raise DatasetError(f"{folder} has no config.toml; name the folder of a data set that synpick-warp baked")
     if split is not None:
         data_set = data_set.split(split)

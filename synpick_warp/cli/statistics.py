@@ -52,7 +52,7 @@ def show_statistics(
     from synpick_warp.system.cores import count_cores
 
     data_set = open_data_set(folder)
-    if not (folder / "config.toml").exists():
+    if data_set.found is None and not (folder / "config.toml").exists():
         raise DatasetError(f"{folder} has no config.toml; name the folder of a data set that synpick-warp baked")
     if split is not None:
         data_set = data_set.split(split)

@@ -10,7 +10,9 @@ from typing import NamedTuple
 from synpick_warp.codes import Ending
 from synpick_warp.configs.schema import CLASSIC
 from synpick_warp.conversion.context import StoredContext
+from synpick_warp.conversion.found import convert_found
 from synpick_warp.conversion.source import Source
+from synpick_warp.dataset.reading import open_data_set
 from synpick_warp.dataset.writing import OutputFolder, finalize_data_set
 from synpick_warp.errors import ConfigError, DatasetError
 from synpick_warp.exporters.formats import FORMAT_TABLE, Content, contents_of, convertible
@@ -33,8 +35,8 @@ class Converted(NamedTuple):
     """Those of earlier runs."""
 
 
-def convert(folder: Path, out: Path, formats: Sequence[str], processes: int, report: Report) -> Converted:
-    """Convert the committed episodes of a data set to other formats, into a data set of its own.
+def convert(folder: Path, out: Path, formats: Sequence[str], processes: int, report: Report, split: str | None = None) -> Converted:
+    """Convert the committed episodes of a data set to other formats, into a data set of its own; the scenes of one that no bake wrote.
 
     Args:
         folder: The data set.
@@ -42,12 +44,19 @@ def convert(folder: Path, out: Path, formats: Sequence[str], processes: int, rep
         formats: Names of formats.
         processes: Number of processes; 0: one per core.
         report: Observer: unit, number done, total.
+        split: Split to convert, of a data set that no bake wrote; None: the only one.
 
     Raises:
         ConfigError: A format cannot be converted to, or `out` was started with other settings.
         DatasetError: The source is no data set, is damaged, or lacks what a format needs.
         OutputError: A file cannot be written.
     """
+    data = open_data_set(folder)
+    if data.found is not None:
+        _check_apart(folder, out)
+        return Converted(convert_found(data if split is None else data.split(split), out, formats, processes, report), 0)
+    if split is not None:
+        raise ConfigError("--split is for data sets that no bake wrote; those of a bake are converted as a whole")
     source = Source(folder)
     check_formats(formats, source.config.bop.layout, source.config.bake.formats, folder)
     contents: set[Content] = {content for name in formats for content in contents_of(name, source.config.bop)}

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -11,12 +10,10 @@ from typing import Any
 import numpy as np
 
 from synpick_warp.dataset.annotations import ADVICE
-from synpick_warp.dataset.view_files import SceneFiles, SceneFolder, ViewRecords, check_planes
+from synpick_warp.dataset.view_files import SceneFiles, ViewRecords, check_planes
 from synpick_warp.errors import DatasetError
+from synpick_warp.exporters.writing.folder import Buffer
 from synpick_warp.exporters.writing.rle import Masks, Runs, find_run_boundaries
-from synpick_warp.inputs.files import read_file_if_present
-from synpick_warp.inputs.image_files import MAX_IMAGE_FILE
-from synpick_warp.inputs.png_crop import decode_grey_crop
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,11 +24,17 @@ class StoredSceneFiles:
     """Of which nothing has been read, so that they are small when pickled."""
     scene: int
     """BOP scene_id."""
-    frames: int
+    images: Sequence[int]
+    """BOP im_id of each frame."""
+
+    @property
+    def frames(self) -> int:
+        """See `StoredScene`."""
+        return len(self.images)
 
     def views(self, frames: range) -> Iterator[StoredViewFiles]:
         """See `StoredScene`."""
-        return (StoredViewFiles(self.files, self.scene, frame) for frame in frames)
+        return (StoredViewFiles(self.files, self.scene, self.images[frame]) for frame in frames)
 
 
 class StoredViewFiles:
@@ -42,7 +45,7 @@ class StoredViewFiles:
         Args:
             files: Files of the scene.
             scene: BOP scene_id.
-            frame: Index of the frame.
+            frame: BOP im_id.
         """
         self.files, self.scene, self.frame = files, scene, frame
 
@@ -66,16 +69,16 @@ class StoredViewFiles:
         return self._records.gt_info
 
     @property
-    def color(self) -> tuple[str, bytes]:
+    def color(self) -> tuple[str, Buffer]:
         """See `EncodedView`."""
         return self.files.image_file("rgb", self.frame)
 
     @property
-    def depth(self) -> bytes:
+    def depth(self) -> Buffer:
         """See `EncodedView`."""
         return self.layer("depth")
 
-    def layer(self, name: str) -> bytes:
+    def layer(self, name: str) -> Buffer:
         """See `StoredView`."""
         suffix, data = self.files.image_file(name, self.frame)
         if suffix != ".png":
@@ -94,35 +97,27 @@ class StoredViewFiles:
         return check_planes(self.files.image(name, self.frame), channels, f"{name} of image {self.frame} in {self.files.place}", dtype)
 
     def masks(self) -> list[Masks]:
-        """See `EncodedView`: from crops of PNG files in scene folders, from run lengths in shards."""
-        files, infos = self.files, self.gt_info
-        if not isinstance(files, SceneFolder):
-            both = [files.masks(name, self.frame, len(infos)) for name in ("mask", "mask_visib")]
-            return [Masks(*(_find_runs(mask) for mask in pair)) for pair in zip(*both, strict=True)]
+        """See `EncodedView`."""
         return [
             Masks(
-                _read_runs(files, "mask", self.frame, index, info["bbox_obj"], info["px_count_valid"]),
-                _read_runs(files, "mask_visib", self.frame, index, info["bbox_visib"], info["px_count_visib"]),
+                self._read_runs("mask", index, info["bbox_obj"], info["px_count_valid"]),
+                self._read_runs("mask_visib", index, info["bbox_visib"], info["px_count_visib"]),
             )
-            for index, info in enumerate(infos)
+            for index, info in enumerate(self.gt_info)
         ]
 
-
-def _read_runs(files: SceneFolder, name: str, frame: int, index: int, box: list[int], count: int) -> Runs:
-    """Read a mask within its box, or the whole of it, if the box does not hold the pixels that the annotations count."""
-    width, height = files.size or (0, 0)
-    left, top = max(0, box[0]), max(0, box[1])
-    rows, columns = slice(top, max(top, min(height, box[1] + box[3] + 1))), slice(left, max(left, min(width, box[0] + box[2] + 1)))
-    if box[2] >= 0 and rows.stop > rows.start and columns.stop > columns.start:
-        path = f"{files.images(name)}{os.sep}{frame:06d}_{index:06d}.png"
-        data = read_file_if_present(path, MAX_IMAGE_FILE, DatasetError)
-        crop = None if data is None else decode_grey_crop(data, (width, height), rows, columns)
-        if crop is not None:
-            runs = _find_runs(crop > 0, top, left)
+    def _read_runs(self, name: str, index: int, box: list[int], count: int) -> Runs:
+        """Read a mask within its box, or the whole of it, if the box does not hold the pixels that the annotations count."""
+        width, height = self.files.image_size(self.frame)
+        left, top = max(0, box[0]), max(0, box[1])
+        rows, columns = slice(top, max(top, min(height, box[1] + box[3] + 1))), slice(left, max(left, min(width, box[0] + box[2] + 1)))
+        if box[2] >= 0 and rows.stop > rows.start and columns.stop > columns.start:
+            runs = find_runs(self.files.mask_crop(name, self.frame, index, rows, columns), top, left)
             if runs.count == count:
                 return runs
-    return _find_runs(files.mask(name, frame, index))
+        return find_runs(self.files.mask(name, self.frame, index))
 
 
-def _find_runs(mask: np.ndarray, top: int = 0, left: int = 0) -> Runs:
+def find_runs(mask: np.ndarray, top: int = 0, left: int = 0) -> Runs:
+    """Runs of a mask (H, W), or of a crop of it that begins at a row and a column."""
     return find_run_boundaries(mask.astype(np.uint8), top, left).runs_of(1)

@@ -97,7 +97,7 @@ class Source:
     def scenes(self, end: EpisodeEnd) -> list[StoredSceneFiles]:
         """The scene of each camera in an episode."""
         data, cameras = self.data, range(self.data.camera_count)
-        return [StoredSceneFiles(data.scene_files(end.episode, one), len(cameras) * end.episode + one, end.frames) for one in cameras]
+        return [StoredSceneFiles(data.scene_files(end.episode, one), len(cameras) * end.episode + one, end.images) for one in cameras]
 
     def ticks(self, end: EpisodeEnd) -> Iterator[TickBatch]:
         """See `trajectories.read_ticks`."""

@@ -51,6 +51,15 @@ class CameraEntry(Struct, gc=False):
     cam_t_w2c: Vector3 | UnsetType = UNSET
 
 
+class LenientCameraEntry(Struct, gc=False):
+    """A view's entry in scene_camera.json, as data sets of others have it: with a camera model instead of a matrix, without depth."""
+
+    cam_K: Matrix3 | UnsetType = UNSET  # noqa: N815
+    depth_scale: Annotated[float, Meta(gt=0.0, le=1e6)] | UnsetType = UNSET
+    cam_R_w2c: Rotation | UnsetType = UNSET  # noqa: N815
+    cam_t_w2c: Vector3 | UnsetType = UNSET
+
+
 class TruthEntry(Struct, gc=False):
     """An instance's entry in scene_gt.json [mm]."""
 
@@ -105,6 +114,18 @@ class ModelInfo(ModelDiameter, gc=False):
     symmetries_continuous: Annotated[list[ContinuousSymmetry], Meta(max_length=MAX_SYMMETRIES)] | UnsetType = UNSET
 
 
+class TargetEntry(Struct, gc=False):
+    """A record of a target list, such as test_targets_bop19.json; those of 2024 have neither object nor count."""
+
+    scene_id: Index
+    im_id: Index | list[tuple[str, Index]]
+    """Several sensors: name of each, and its image (test_targets_multiview_bop25.json)."""
+    obj_id: Index | UnsetType | None = UNSET
+    inst_count: Index | UnsetType = UNSET
+    sensor: str = ""
+    """Camera of the image in a data set of several sensors, such as "cam1"; empty there: the first one, as BOP's lists have it."""
+
+
 class EpisodeRow(Struct, gc=False):
     """What every row of the episode list has."""
 
@@ -123,6 +144,9 @@ VIEW_SCHEMAS: dict[str, Any] = {"camera": CameraEntry, "gt": list[TruthEntry], "
 """Schema of a view's entry in scene_camera.json, scene_gt.json and scene_gt_info.json."""
 SCENE_SCHEMAS: dict[str, Any] = {name: dict[Key, schema] for name, schema in VIEW_SCHEMAS.items()}
 """Schema of these files: the entries by frame."""
+LENIENT_VIEW_SCHEMAS = VIEW_SCHEMAS | {"camera": LenientCameraEntry}
+LENIENT_SCENE_SCHEMAS: dict[str, Any] = {name: dict[Key, schema] for name, schema in LENIENT_VIEW_SCHEMAS.items()}
+"""The same for data sets that no bake wrote."""
 MASK_SCHEMA = dict[Key, RunLengths]
 """Schema of a view's run lengths in a shard: masks by instance index."""
 

@@ -7,6 +7,7 @@ from pathlib import Path
 
 from synpick_warp.configs.schema import Config
 from synpick_warp.dataset.annotations import Key, ModelDiameter, read_checked
+from synpick_warp.dataset.bop.models import INFO, models_folder
 from synpick_warp.errors import DatasetError
 from synpick_warp.inputs.files import check_regular_file
 
@@ -18,19 +19,21 @@ _MAX_MODEL = 2**40
 """Largest PLY file [B]; only its head is read."""
 
 
-def object_names(dataset: Path, config: Config, object_ids: set[int]) -> dict[int, str]:
+def object_names(dataset: Path, config: Config | None, object_ids: set[int]) -> dict[int, str]:
     """Names of objects (obj_id -> name): from the exported model's comment, else from the settings' object table; some have none."""
-    infos = read_checked(dataset / "models" / "models_info.json", dict[Key, ModelDiameter])
+    folder = dataset / models_folder(dataset)
+    infos = read_checked(folder / INFO, dict[Key, ModelDiameter])
     names = {}
     for object_id in object_ids:
-        path = dataset / "models" / f"obj_{object_id:06d}.ply"
+        path = folder / f"obj_{object_id:06d}.ply"
         comment = None
         if path.exists():
             check_regular_file(path, _MAX_MODEL, DatasetError)
             with path.open("rb") as file:
                 comment = _MODEL_NAME.search(file.read(_PLY_HEAD))
         size = float(infos.get(object_id, {}).get("diameter", 0.0)) / 1000.0
-        fits = (row.name for row in config.object_rows if row.id == object_id and _fits(row.diameter, size, config))
+        rows = () if config is None else config.object_rows
+        fits = (row.name for row in rows if config and row.id == object_id and _fits(row.diameter, size, config))
         name = comment[1].decode(errors="replace") if comment else next(fits, "")
         if name:
             names[object_id] = name

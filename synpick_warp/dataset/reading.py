@@ -12,7 +12,7 @@ needs no simulator; zarr, NumPy and OpenCV are imported when arrays or images ar
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -43,12 +43,15 @@ from synpick_warp.inputs.paths import path_inside
 
 if TYPE_CHECKING:
     from synpick_warp.configs.schema import Config
+    from synpick_warp.dataset.bop.scenes import FoundScenes
     from synpick_warp.dataset.tracks import Track, Tracks
     from synpick_warp.dataset.view import View
     from synpick_warp.dataset.view_files import SceneFiles
 
 USD = Path("usd")
 """Folder of USD episodes in a data set."""
+UNKNOWN = "unknown"
+"""Mode and ending of an episode that no bake has described."""
 
 
 class Episode:
@@ -97,7 +100,9 @@ class Episode:
 
     @cached_property
     def row(self) -> dict[str, Any]:
-        """The episode's line of episodes.jsonl: mode, ending, frames, seconds, counts of objects and attempts."""
+        """The episode's line of episodes.jsonl: mode, ending, frames, seconds, counts of objects and attempts; or what is known of it."""
+        if self._data_set.found is not None:
+            return {"episode": self.index, "frames": len(self.image_ids), "mode": UNKNOWN, "ending": UNKNOWN}
         row = self.attributes if self._record is None else self._record["row"]
         frames = check_content(row, EpisodeRow, self.group / GROUP_FILE).frames
         data = self._data_set
@@ -135,8 +140,23 @@ class Episode:
         return self._arrays("attempts")
 
     @cached_property
+    def image_ids(self) -> Sequence[int]:
+        """BOP's im_id of each frame: the frame's index, but in a data set that no bake wrote any numbers, with gaps."""
+        if self._data_set.found is None:
+            return range(len(self))
+        return sorted({image for camera in self.cameras for image in self._files_of(camera).frames()})
+
+    @property
+    def cameras(self) -> Sequence[int]:
+        """Indices of the cameras that have recorded the episode: all, but in a data set that no bake wrote."""
+        found = self._data_set.found
+        return range(self._data_set.camera_count) if found is None else found.cameras_of(self.index)
+
+    @cached_property
     def attempts(self) -> tuple[dict[str, Any], ...]:
-        """Pick attempts in order; each is a line of attempts.jsonl."""
+        """Pick attempts in order; each is a line of attempts.jsonl. None in a data set that no bake wrote."""
+        if self._data_set.found is not None:
+            return ()
         if self._record is not None:
             return tuple(self._record.get("attempts", ()))
         if "record" not in self.attempt_arrays:
@@ -165,7 +185,7 @@ class Episode:
         """One rendered view.
 
         Args:
-            frame: Index of the frame; negative: from the end.
+            frame: Index of the frame among `image_ids`; negative: from the end.
             camera: Index of the camera.
 
         Raises:
@@ -179,13 +199,17 @@ class Episode:
             raise IndexError(f"episode {self.index} has no frame {frame}; it has {frames} frames")
         if not 0 <= camera < cameras:
             raise IndexError(f"there is no camera {camera}; there are {cameras} cameras")
+        return View(self._files_of(camera), self.index, camera, frame % frames, self.image_ids[frame % frames])
+
+    def _files_of(self, camera: int) -> SceneFiles:
+        """Files of the scene that a camera recorded."""
         if camera not in self._scenes:
             self._scenes[camera] = self._data_set.scene_files(self.index, camera)
-        return View(self._scenes[camera], self.index, camera, frame % frames)
+        return self._scenes[camera]
 
     def views(self, camera: int | None = None) -> Iterator[View]:
         """Iterate over the views frame by frame, of one camera or of all."""
-        cameras = range(self._data_set.camera_count) if camera is None else (camera,)
+        cameras = self.cameras if camera is None else (camera,)
         for frame in range(len(self)):
             for each in cameras:
                 yield self.view(frame, each)
@@ -199,17 +223,40 @@ class Episode:
 
 
 class DataSet(Mapping[int, Episode]):
-    """Episodes of a data set by index, and what they share. Episodes that another bake commits meanwhile appear on the next access."""
+    """Episodes of a data set by index, and what they share. Episodes that another bake commits meanwhile appear on the next access.
 
-    def __init__(self, folder: Path, episodes: range | None = None) -> None:
+    Of a BOP data set that no bake wrote, each scene is an episode with the scene's index, each sensor a camera; see `FoundScenes`.
+    """
+
+    def __init__(self, folder: Path, episodes: range | None = None, split: str | None = None) -> None:
         """
         Args:
             folder: Folder of the data set.
             episodes: Indices of the episodes to show; None: all.
+            split: Split to show, of a data set that no bake wrote; None: all.
         """
         self.folder = folder
         self._store = folder / STORE
         self._only = episodes
+        self._found_split = split
+
+    @cached_property
+    def found(self) -> FoundScenes | None:
+        """Scenes as the folder shows them; None: a bake wrote the data set.
+
+        Raises:
+            DatasetError: Neither did a bake write it nor has it BOP scenes.
+        """
+        if (self.folder / MANIFEST_FILE).is_file() or self.has_store:
+            return None
+        from synpick_warp.dataset.bop.layout import NoLayoutError
+        from synpick_warp.dataset.bop.scenes import FoundScenes
+
+        try:
+            return FoundScenes(self.folder, self._found_split)
+        except NoLayoutError:
+            has = f"it has neither {MANIFEST_FILE} nor {STORE} nor BOP scenes, such as test/000001 with a scene_camera.json"
+            raise DatasetError(f"{self.folder} is not a data set: {has}; name the folder of one") from None
 
     @cached_property
     def config(self) -> Config:
@@ -217,7 +264,10 @@ class DataSet(Mapping[int, Episode]):
 
         Raises:
             ConfigError: They are missing, or this version cannot read them.
+            DatasetError: No bake wrote the data set.
         """
+        if self.found is not None:
+            raise DatasetError(f"{self.folder} has no settings: no bake of synpick-warp wrote it")
         from synpick_warp.configs.load import load_config
 
         return load_config(str(self.folder / CONFIG_FILE), {})
@@ -266,11 +316,13 @@ class DataSet(Mapping[int, Episode]):
         Raises:
             DatasetError: The data set has no models, as it has neither the format bop nor shards.
         """
-        return read_checked(self.folder / "models" / "models_info.json", dict[Key, ModelInfo])
+        from synpick_warp.dataset.bop.models import INFO, models_folder
+
+        return read_checked(self.folder / models_folder(self.folder) / INFO, dict[Key, ModelInfo])
 
     @cached_property
     def cameras(self) -> tuple[CameraInfo, ...]:
-        """The cameras by index."""
+        """The cameras by index. Raises DatasetError if no bake wrote the data set: each of its views has a camera of its own."""
         if self.has_store:
             return read_cameras(self._store, self.camera_count if (self.folder / CONFIG_FILE).exists() else None, self._constants)
         import numpy as np
@@ -281,8 +333,43 @@ class DataSet(Mapping[int, Episode]):
         return tuple(CameraInfo(np.array((c.width, c.height), np.int32), c.matrix, c.rotation, c.translation) for c in cameras)
 
     @cached_property
+    def sensors(self) -> tuple[str, ...]:
+        """Names of the cameras as sensors of their scenes (BOP-Industrial); empty: each camera has scenes of its own."""
+        if self.found is not None:
+            return self.found.sensors
+        from synpick_warp.configs.schema import MULTISENSOR
+        from synpick_warp.configs.splits import sensor_name
+
+        return tuple(map(sensor_name, range(self.camera_count))) if self.config.bop.layout == MULTISENSOR else ()
+
+    @cached_property
+    def period(self) -> float | None:
+        """Time from frame to frame [s]; None: it is not known, as no bake wrote the data set."""
+        return None if self.found is not None else self.config.physics.step * self.config.physics.steps_per_tick
+
+    def scene_id(self, episode: int, camera: int) -> int:
+        """BOP's scene_id of a camera's images of an episode, as result files have it; of several sensors each counts as a scene."""
+        return self.camera_count * (episode if self.found is None else self.found.scene(episode)) + camera
+
+    def split_of(self, episode: int) -> str:
+        """Name of the split of an episode."""
+        if self.found is not None:
+            return self.found.split(episode)
+        split = DataLayout.of(self.config).split_of(episode)
+        return self.config.bop.split if split is None else split.name
+
+    @cached_property
+    def split_folders(self) -> dict[str, str]:
+        """Name of each split -> its folder of BOP scenes, such as "train_pbr"."""
+        if self.found is not None:
+            return {name: name for name in self.found.splits}
+        return {split.name: split.folder for split in self.config.splits} or {self.config.bop.split: self.config.bop.split}
+
+    @cached_property
     def camera_count(self) -> int:
         """Number of cameras."""
+        if self.found is not None:
+            return self.found.cameras
         return len(self.config.cameras.positions)
 
     @property
@@ -314,6 +401,8 @@ class DataSet(Mapping[int, Episode]):
     def splits(self) -> dict[str, DataSet]:
         """Splits by name, each a data set of its episodes. Without [splits] in the settings, the one of the name `bop.split`; none
         without settings, as in a lone trajectory store."""
+        if self.found is not None:
+            return {name: DataSet(self.folder, split=name) for name in self.found.splits}
         if not (self.folder / CONFIG_FILE).exists():
             return {}
         named = {split.name: DataSet(self.folder, episode_range(split)) for split in self.config.splits}
@@ -331,18 +420,22 @@ class DataSet(Mapping[int, Episode]):
 
     @cached_property
     def planned(self) -> int:
-        """Number of episodes that the settings plan."""
+        """Number of episodes that the settings plan, or that are there if no bake wrote the data set."""
+        if self.found is not None:
+            return len(self)
         return sum(len(each) for each in DataLayout.of(self.config).plan() if self._only in (None, each))
 
     @cached_property
-    def _scenes(self) -> SceneIndex | None:
+    def _scenes(self) -> SceneIndex | FoundScenes | None:
         """Where scenes are; None without settings."""
+        if self.found is not None:
+            return self.found
         return SceneIndex(self.folder, self.config) if (self.folder / CONFIG_FILE).exists() else None
 
     @property
     def _parts(self) -> list[PartFiles]:
         """Files by which episodes are found in formats of which nothing else is read; none of scenes without settings."""
-        return part_files(None if self._scenes is None else self.camera_count)
+        return [] if self.found is not None else part_files(None if self._scenes is None else self.camera_count)
 
     def scene_files(self, episode: int, camera: int) -> SceneFiles:
         """Files of the scene that a camera recorded in an episode: its folder, or else its shards.
@@ -369,7 +462,7 @@ class DataSet(Mapping[int, Episode]):
         """Whether an episode is one of these and has its manifest entry; without manifest, as in a lone store, there is none to check."""
         if self._only is not None and index not in self._only:
             return False
-        return not (self.folder / ENTRIES).is_dir() or (self.folder / f"{episode_entry(index)}.json").is_file()
+        return self.found is not None or not (self.folder / ENTRIES).is_dir() or (self.folder / f"{episode_entry(index)}.json").is_file()
 
     def __getitem__(self, index: int) -> Episode:
         if not (self._is_committed(index) and self._has_files(index)):
@@ -387,15 +480,14 @@ class DataSet(Mapping[int, Episode]):
 
 
 def open_data_set(folder: Path | str) -> DataSet:
-    """Open a data set; reads nothing yet.
+    """Open a data set; reads nothing yet, but the names of splits and scenes where there is no manifest.
 
     Args:
-        folder: Folder that a bake wrote, or is still writing.
+        folder: Folder that a bake wrote, or is still writing, or any BOP data set.
 
     Raises:
         DatasetError: The folder is not a data set.
     """
     data_set = DataSet(Path(folder))
-    if not (data_set.folder / MANIFEST_FILE).is_file() and not data_set.has_store:
-        raise DatasetError(f"{folder} is not a data set: it has neither {MANIFEST_FILE} nor {STORE}; name a folder that a bake wrote")
+    data_set.found  # noqa: B018
     return data_set

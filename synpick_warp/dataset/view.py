@@ -10,9 +10,11 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
+from msgspec import UNSET
 
 from synpick_warp.configs.schema import LAYERS
 from synpick_warp.dataset.annotations import ADVICE
+from synpick_warp.dataset.bop.arrays import instance_ids
 from synpick_warp.dataset.view_files import SceneFiles, ViewRecords, check_planes
 from synpick_warp.errors import DatasetError
 from synpick_warp.layer_codec import decode_layer, image_format
@@ -26,21 +28,32 @@ _ORTHOGONAL = 1e-3
 class View:
     """One camera image with its ground truth. Arrays with N rows have one per instance, in BOP's order of ground-truth indices."""
 
-    def __init__(self, files: SceneFiles, episode: int, camera: int, frame: int) -> None:
+    def __init__(self, files: SceneFiles, episode: int, camera: int, frame: int, image_id: int | None = None) -> None:
         """
         Args:
             files: The scene's files.
             episode: Index of the episode.
             camera: Index of the camera.
             frame: Index of the frame in the episode.
+            image_id: BOP's im_id; None: the same.
         """
         self._files = files
         self.episode, self.camera, self.frame = episode, camera, frame
+        self.image_id = frame if image_id is None else image_id
+
+    @property
+    def place(self) -> str:
+        """Where its files are, for messages."""
+        return str(self._files.place)
+
+    def has(self, name: str) -> bool:
+        """Whether its scene has images or annotations of a type: rgb, depth, mask, mask_visib, gt, gt_info; those of a bake have all."""
+        return self._files.has(name)
 
     @cached_property
     def records(self) -> ViewRecords:
         """Annotations as the files have them: BOP's keys, millimetres; `records.camera` has light and camera effects, too."""
-        return self._files.records(self.frame)
+        return self._files.records(self.image_id)
 
     @cached_property
     def rgb(self) -> np.ndarray:
@@ -50,12 +63,20 @@ class View:
     @cached_property
     def depth(self) -> np.ndarray:
         """Planar depth (z in the camera frame) (H, W) float32 [m]; 0: no surface."""
-        scale = np.float32(self.records.camera["depth_scale"] / MILLIMETERS)
+        scale = np.float32(self._camera_value("depth_scale") / MILLIMETERS)
         return self._image("depth", None, "uint16") * scale
+
+    def _camera_value(self, key: str) -> Any:
+        """Value of the image's camera, which data sets of others may lack."""
+        if key not in self.records.camera:
+            raise DatasetError(f"{self._files.place}: the camera of image {self.image_id} has no {key}")
+        return self.records.camera[key]
 
     def _image(self, name: str, channels: int | None, dtype: str) -> np.ndarray:
         """An image of the camera's size, with these channels."""
-        return check_planes(self._files.image(name, self.frame), channels, f"{name} of image {self.frame} in {self._files.place}", dtype)
+        return check_planes(
+            self._files.image(name, self.image_id), channels, f"{name} of image {self.image_id} in {self._files.place}", dtype
+        )
 
     @cached_property
     def masks(self) -> np.ndarray:
@@ -68,8 +89,8 @@ class View:
         return self._masks("mask")
 
     def _masks(self, name: str) -> np.ndarray:
-        masks = self._files.masks(name, self.frame, len(self))
-        return np.stack(masks) if masks else np.zeros((0, *self.depth.shape), bool)
+        masks = self._files.masks(name, self.image_id, len(self))
+        return np.stack(masks) if masks else np.zeros((0, *self._files.image_size(self.image_id)[::-1]), bool)
 
     @cached_property
     def layers(self) -> tuple[str, ...]:
@@ -92,12 +113,12 @@ class View:
     @cached_property
     def intrinsics(self) -> np.ndarray:
         """Camera matrix K (3, 3) float64 [px]."""
-        return np.reshape(np.asarray(self.records.camera["cam_K"], np.float64), (3, 3))
+        return np.reshape(np.asarray(self._camera_value("cam_K"), np.float64), (3, 3))
 
     @cached_property
     def world_to_camera(self) -> np.ndarray:
         """Camera extrinsics (4, 4) float64 [m]."""
-        camera, place = self.records.camera, f"{self._files.place}: the camera of image {self.frame}"
+        camera, place = self.records.camera, f"{self._files.place}: the camera of image {self.image_id}"
         if not {"cam_R_w2c", "cam_t_w2c"} <= camera.keys():
             raise DatasetError(f"{place} has no cam_R_w2c and cam_t_w2c; {ADVICE}")
         transform = make_transform(camera["cam_R_w2c"], camera["cam_t_w2c"])
@@ -122,10 +143,11 @@ class View:
 
     @cached_property
     def instance_ids(self) -> np.ndarray:
-        """Track id of each instance (N) int64: the same object through its whole episode and in all cameras."""
-        if not all("instance_id" in row for row in self.records.gt):
-            raise DatasetError(f"{self._files.place}: an instance of image {self.frame} has no instance_id; {ADVICE}")
-        return self._column("gt", "instance_id", np.int64)
+        """Track id of each instance (N) int64: the same object through its whole episode and in all cameras; see `instance_ids`."""
+        ids = instance_ids([(row["obj_id"], row.get("instance_id", UNSET)) for row in self.records.gt], self._files.lenient)
+        if ids is None:
+            raise DatasetError(f"{self._files.place}: an instance of image {self.image_id} has no instance_id; {ADVICE}")
+        return np.array(ids, np.int64)
 
     @cached_property
     def visibility(self) -> np.ndarray:

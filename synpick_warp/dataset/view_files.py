@@ -1,4 +1,4 @@
-"""Image and annotation files of rendered views: BOP scene folders and webdataset shards behind one interface.
+"""Image and annotation files of rendered views: scene folders, shards and the imagewise layout of BOP behind one interface.
 
 What is read is checked once: annotations against their schemas, images against the camera's resolution.
 """
@@ -6,18 +6,33 @@ What is read is checked once: annotations against their schemas, images against 
 from __future__ import annotations
 
 import os
+from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from synpick_warp.dataset.annotations import ADVICE, MASK_SCHEMA, SCENE_SCHEMAS, VIEW_SCHEMAS, check_json, read_checked
+from synpick_warp.dataset.annotations import (
+    ADVICE,
+    LENIENT_SCENE_SCHEMAS,
+    LENIENT_VIEW_SCHEMAS,
+    MASK_SCHEMA,
+    SCENE_SCHEMAS,
+    VIEW_SCHEMAS,
+    check_json,
+    read_checked,
+)
+from synpick_warp.dataset.bop.folders import Listing
+from synpick_warp.dataset.bop.images import COLOR, FolderImages, KeyedImages
+from synpick_warp.dataset.bop.layout import SceneRef
+from synpick_warp.dataset.bop.measured import UNKNOWN, measure_info
 from synpick_warp.errors import DatasetError
 from synpick_warp.inputs.files import read_file_if_present
-from synpick_warp.inputs.image_files import MAX_IMAGE_FILE, decode_image, image_size
-from synpick_warp.inputs.tar_files import list_members
+from synpick_warp.inputs.image_files import MAX_IMAGE_FILE, decode_image, decode_picture, image_size, tiff_size
+from synpick_warp.inputs.json import MAX_JSON
+from synpick_warp.inputs.png_crop import decode_grey_crop
 
 SUFFIXES = (".png", ".jpg")
 """File formats of images; colour may be either."""
@@ -34,46 +49,140 @@ class ViewRecords(NamedTuple):
     """One per instance, in the same order."""
 
 
-class SceneFiles(Protocol):
-    """Files of one scene: all frames of one camera in one episode."""
+class SceneFiles(ABC):
+    """Files of one scene: all frames of one camera in one episode.
+
+    Those of a bake have all parts, and images of one size. Of a lenient scene, which no bake wrote, parts may be missing, and images be of
+    any format that BOP data sets have; grey ones stand in for colour.
+    """
+
+    def __init__(self, size: tuple[int, int] | None, lenient: bool = False) -> None:
+        """
+        Args:
+            size: Width and height of the camera's images [px]; None: not checked.
+            lenient: Whether parts may be missing.
+        """
+        self.size, self.lenient = size, lenient
+        self._frame_size: tuple[int, tuple[int, int]] | None = None
 
     @property
+    @abstractmethod
     def place(self) -> Path:
         """Folder or first shard, for messages."""
-        ...
 
-    def records(self, frame: int) -> ViewRecords:
-        """Annotations of a frame."""
-        ...
+    @abstractmethod
+    def frames(self) -> tuple[int, ...]:
+        """BOP's im_id of each image, in order: those of scene_camera.json, or else of scene_gt.json, or else of images."""
 
-    def image(self, name: str, frame: int) -> np.ndarray:
-        """An image, decoded by OpenCV without conversion (H, W[, 3]), blue first; `name` is "rgb", "depth" or a layer."""
-        ...
+    @abstractmethod
+    def has(self, name: str) -> bool:
+        """Whether there are images or annotations of a type: rgb, depth, mask, mask_visib, camera, gt, gt_info."""
 
-    def image_file(self, name: str, frame: int) -> tuple[str, bytes]:
-        """Suffix and content of an image's file, which states the scene's size; `name` as for `image`."""
-        ...
+    @abstractmethod
+    def layers(self) -> set[str]:
+        """Names of image types besides colour, depth and masks; none of a lenient scene, where such folders may have any content."""
+
+    @abstractmethod
+    def _part(self, name: str, frame: int) -> Any:
+        """Annotations of a frame, one of RECORD_NAMES; None: there are none."""
+
+    @abstractmethod
+    def _find(self, name: str, frame: int, index: int | None = None) -> tuple[str, bytes, str] | None:
+        """Suffix, content and source of an image file; None: there is none."""
+
+    @abstractmethod
+    def _missing(self, name: str, frame: int, index: int | None = None) -> str:
+        """Message: there is no such image."""
+
+    @abstractmethod
+    def mask(self, name: str, frame: int, index: int) -> np.ndarray:
+        """One of `masks`."""
+
+    @abstractmethod
+    def mask_crop(self, name: str, frame: int, index: int, rows: slice, columns: slice) -> np.ndarray:
+        """Rows and columns of one of `masks`; most of the image is not decoded if it is a PNG file."""
 
     def masks(self, name: str, frame: int, count: int) -> list[np.ndarray]:
         """Masks (H, W) bool of the frame's `count` instances; `name` is "mask" (amodal) or "mask_visib" (modal)."""
-        ...
+        return [self.mask(name, frame, index) for index in range(count)]
 
-    def layers(self) -> set[str]:
-        """Names of image types besides colour, depth and masks."""
-        ...
+    def camera(self, frame: int) -> dict[str, Any]:
+        """A frame's entry in scene_camera.json; empty: there is no such file."""
+        found = self._part("camera", frame)
+        if found is None and self.has("camera"):
+            raise DatasetError(f"{self.place}: scene_camera.json has no image {frame}")
+        return found or {}
+
+    def records(self, frame: int) -> ViewRecords:
+        """Annotations of a frame. Of a lenient scene, what a missing scene_gt_info would tell is measured from the masks, or unknown."""
+        camera, gt, info = (self._part(name, frame) for name in RECORD_NAMES)
+        if not self.lenient:
+            if camera is None or gt is None or info is None or len(gt) != len(info):
+                names = "scene_camera.json, scene_gt.json and scene_gt_info.json"
+                raise DatasetError(f"{self.place}: {names} do not agree about image {frame}")
+            return ViewRecords(camera, gt, info)
+        if gt is None and info:
+            raise DatasetError(f"there is no scene_gt.json in {self.place}, but a scene_gt_info.json")
+        gt = gt or []
+        if info is not None and len(info) != len(gt):
+            raise DatasetError(f"{self.place}: scene_gt.json and scene_gt_info.json do not agree about image {frame}")
+        if info is None and gt and self.has("mask_visib"):
+            amodal = self.masks("mask", frame, len(gt)) if self.has("mask") else None
+            info = measure_info(self.masks("mask_visib", frame, len(gt)), amodal)
+        return ViewRecords(self.camera(frame), gt, [dict(UNKNOWN) for _ in gt] if info is None else info)
+
+    def _need(self, name: str, frame: int, index: int | None = None) -> tuple[str, bytes, str]:
+        found = self._find(name, frame, index)
+        if found is None:
+            raise DatasetError(self._missing(name, frame, index))
+        return found
+
+    def image(self, name: str, frame: int) -> np.ndarray:
+        """An image, decoded by OpenCV without conversion (H, W[, 3]), blue first; `name` is "rgb", "depth" or a layer."""
+        _, data, source = self._need(name, frame)
+        if not self.lenient:
+            return decode_image(data, source, DatasetError, size=self.size)
+        if name == "rgb":
+            return to_color(decode_picture(data, source, DatasetError))
+        return decode_picture(data, source, DatasetError, self.image_size(frame))
+
+    def image_file(self, name: str, frame: int) -> tuple[str, bytes]:
+        """Suffix and content of an image's file, which states the scene's size; `name` as for `image`."""
+        suffix, data, source = self._need(name, frame)
+        return suffix, check_stated_size(data, self.image_size(frame) if self.lenient else self.size, source)
+
+    def image_size(self, frame: int) -> tuple[int, int]:
+        """Width and height of a frame's images [px]: of colour, or else depth, or else the first mask."""
+        if self.size is not None:
+            return self.size
+        if self._frame_size is None or self._frame_size[0] != frame:
+            self._frame_size = frame, self._read_size(frame)
+        return self._frame_size[1]
+
+    def _read_size(self, frame: int) -> tuple[int, int]:
+        for name, index in (("rgb", None), ("depth", None), ("mask", 0), ("mask_visib", 0)):
+            found = self._find(name, frame, index)
+            if found is not None:
+                stated = image_size(found[1]) or tiff_size(found[1])
+                if stated is None:
+                    raise DatasetError(f"{found[2]} is not an image: neither PNG, JPEG nor TIFF")
+                return stated
+        raise DatasetError(f"{self.place} has no image {frame} in colour, depth or masks")
 
 
-class SceneFolder:
-    """`SceneFiles` of a BOP "scenewise" folder: one file per image and mask."""
+class SceneFolder(SceneFiles):
+    """A BOP "scenewise" folder: one file per image and mask."""
 
-    def __init__(self, folder: Path, size: tuple[int, int] | None = None, suffix: str = "") -> None:
+    def __init__(self, folder: Path, size: tuple[int, int] | None = None, suffix: str = "", images: FolderImages | None = None) -> None:
         """
         Args:
             folder: Scene folder, such as DATA/train_pbr/000000.
             size: Width and height of the camera's images [px]; None: not checked.
             suffix: Suffix of the files of one sensor, such as "_cam1"; empty: the classic layout.
+            images: Names of files that may be written otherwise; None: the scene is not lenient.
         """
-        self.folder, self.size, self.suffix = folder, size, suffix
+        super().__init__(size, images is not None)
+        self.folder, self.suffix, self._images = folder, suffix, images
 
     @property
     def place(self) -> Path:
@@ -82,158 +191,202 @@ class SceneFolder:
 
     def images(self, name: str) -> Path:
         """Folder of one kind of images, such as "rgb"."""
-        return self.folder / f"{name}{self.suffix}"
+        return self.folder / (f"{name}{self.suffix}" if self._images is None else self._images.folder(name))
 
     def annotations(self, name: str) -> Path:
         """Annotation file: "camera", "gt" or "gt_info"."""
         return self.folder / f"scene_{name}{self.suffix}.json"
 
     @cached_property
-    def _records(self) -> list[dict[int, Any]]:
-        return [read_checked(self.annotations(name), SCENE_SCHEMAS[name]) for name in RECORD_NAMES]
+    def _records(self) -> list[dict[int, Any] | None]:
+        """Annotations by image of each of RECORD_NAMES; None: there is no such file."""
+        schemas = LENIENT_SCENE_SCHEMAS if self.lenient else SCENE_SCHEMAS
+        return [
+            read_checked(self.annotations(name), schemas[name]) if not self.lenient or self.has(name) else None for name in RECORD_NAMES
+        ]
 
-    def records(self, frame: int) -> ViewRecords:
+    def _part(self, name: str, frame: int) -> Any:
         """See `SceneFiles`."""
-        return _check_records([part.get(frame) for part in self._records], self.folder, frame)
+        part = self._records[RECORD_NAMES.index(name)]
+        return None if part is None else part.get(frame, [] if self.lenient and name != "camera" else None)
 
-    def image(self, name: str, frame: int) -> np.ndarray:
+    def frames(self) -> tuple[int, ...]:
         """See `SceneFiles`."""
-        return read_image(self.images(name), f"{frame:06d}", size=self.size)
+        named = next((part for part in self._records[:2] if part is not None), None)
+        if named is None and self._images is not None:
+            named = {image for kind in (*COLOR, "depth") for image, _ in self._images.indices(kind)}
+        return tuple(sorted(named or ()))
 
-    def image_file(self, name: str, frame: int) -> tuple[str, bytes]:
+    def has(self, name: str) -> bool:
         """See `SceneFiles`."""
+        if name in RECORD_NAMES:
+            return self.annotations(name).exists()
+        return any(self.images(kind).exists() for kind in (COLOR if self.lenient and name == "rgb" else (name,)))
+
+    def _find(self, name: str, frame: int, index: int | None = None) -> tuple[str, bytes, str] | None:
+        """See `SceneFiles`."""
+        if self._images is not None:
+            return self._images.find(name, frame, index)
+        base = f"{self.folder}{os.sep}{name}{self.suffix}{os.sep}{_stem(frame, index)}"
         for suffix in SUFFIXES:
-            path = self.images(name) / f"{frame:06d}{suffix}"
-            data = read_file_if_present(path, MAX_IMAGE_FILE, DatasetError)
+            data = read_file_if_present(f"{base}{suffix}", MAX_IMAGE_FILE, DatasetError)
             if data is not None:
-                return suffix, _check_stated_size(data, self.size, path)
-        raise DatasetError(f"there is no {self.images(name) / f'{frame:06d}'}.png or .jpg; the data set is not complete")
+                return suffix, data, f"{base}{suffix}"
+        return None
 
-    def masks(self, name: str, frame: int, count: int) -> list[np.ndarray]:
+    def _missing(self, name: str, frame: int, index: int | None = None) -> str:
         """See `SceneFiles`."""
-        if not self.images(name).is_dir():
-            raise DatasetError(f"{self.folder} has no {name}{self.suffix}; bake with bop.masks = true")
-        return [self.mask(name, frame, index) for index in range(count)]
+        base, folder = self.images(name) / _stem(frame, index), self.images(name)
+        if self.lenient:
+            return f"there is no {base}.png or .jpg or .tif"
+        if index is not None and not folder.is_dir():
+            return f"{self.folder} has no {folder.name}; bake with bop.masks = true"
+        return f"there is no {base}.png or .jpg; the data set is not complete"
 
     def mask(self, name: str, frame: int, index: int) -> np.ndarray:
-        """One of `masks`."""
-        stem = f"{frame:06d}_{index:06d}"
-        return check_planes(read_image(self.images(name), stem, size=self.size), None, f"{self.images(name) / stem}.png") > 0
+        """See `SceneFiles`."""
+        _, data, source = self._need(name, frame, index)
+        if not self.lenient:
+            return check_planes(decode_image(data, source, DatasetError, size=self.size), None, source) > 0
+        mask = decode_picture(data, source, DatasetError, self.image_size(frame)) > 0
+        return mask if mask.ndim == 2 else np.asarray(mask.any(axis=2))
+
+    def mask_crop(self, name: str, frame: int, index: int, rows: slice, columns: slice) -> np.ndarray:
+        """See `SceneFiles`."""
+        suffix, data, _ = self._need(name, frame, index)
+        crop = decode_grey_crop(data, self.image_size(frame), rows, columns) if suffix == ".png" else None
+        return self.mask(name, frame, index)[rows, columns] if crop is None else crop > 0
 
     def layers(self) -> set[str]:
         """See `SceneFiles`."""
         names = {path.name for path in self.folder.iterdir() if path.is_dir() and path.name.endswith(self.suffix)}
-        return {name.removesuffix(self.suffix) for name in names} - {"rgb", "depth", "mask", "mask_visib"}
+        return set() if self.lenient else {name.removesuffix(self.suffix) for name in names} - {"rgb", "depth", "mask", "mask_visib"}
 
 
-class SceneShards:
-    """`SceneFiles` of webdataset shards: tar files of whole views. The index of a tar file is read once, members by their offset."""
+class SceneShards(SceneFiles):
+    """Views with a key each: members of webdataset shards, whose index is read once, or files of the imagewise layout."""
 
-    def __init__(self, shards: Sequence[Path], scene: int, size: tuple[int, int]) -> None:
+    def __init__(self, shards: Sequence[Path], scene: int, size: tuple[int, int] | None = None, images: KeyedImages | None = None) -> None:
         """
         Args:
-            shards: The scene's tar files.
+            shards: The scene's tar files; of the imagewise layout its folder.
             scene: Index of the scene, with which keys begin.
-            size: Width and height of the camera's images [px].
+            size: Width and height of the camera's images [px]; None: not checked.
+            images: Members that may be missing, or of other formats; None: the scene is not lenient.
         """
-        self.shards, self.scene, self.size = tuple(shards), scene, size
+        super().__init__(size, images is not None)
+        self.shards, self.scene = tuple(shards), scene
+        names = tuple(shard.name for shard in shards)
+        self._images = images or KeyedImages(Listing(self.shards[0].parent, ""), SceneRef("", scene, "", "", names))
+        self._runs: tuple[tuple[str, int], dict[int, Any] | None] | None = None
 
     @property
     def place(self) -> Path:
         """See `SceneFiles`."""
         return self.shards[0]
 
-    @cached_property
-    def _members(self) -> Mapping[str, tuple[Path, int, int]]:
-        """Member name -> (shard, offset, size) [B]."""
-        return {name: (shard, offset, size) for shard in self.shards for name, offset, size in list_members(shard)}
-
-    def records(self, frame: int) -> ViewRecords:
+    def frames(self) -> tuple[int, ...]:
         """See `SceneFiles`."""
-        parts = [self._json(frame, name, VIEW_SCHEMAS[name]) for name in RECORD_NAMES]
-        return _check_records(parts, self.shards[0], frame)
+        for name in ("camera.json", "gt.json"):
+            if found := [frame for frame, content in self._images.members if content == name]:
+                return tuple(sorted(found))
+        return tuple(sorted({image for kind in (*COLOR, "depth") for image, _ in self._images.indices(kind)} if self.lenient else ()))
 
-    def image(self, name: str, frame: int) -> np.ndarray:
+    def has(self, name: str) -> bool:
         """See `SceneFiles`."""
-        for suffix in SUFFIXES:
-            data = self._read(frame, f"{name}{suffix}")
-            if data is not None:
-                return decode_image(data, self._source(frame, f"{name}{suffix}"), DatasetError, size=self.size)
-        raise DatasetError(f"{self.shards[0].parent} has no {self._key(frame)}.{name}{SUFFIXES[0]}; the data set is not complete")
+        kinds = COLOR if self.lenient and name == "rgb" else (name,)
+        return any(content.partition(".")[0] in kinds for _, content in self._images.members)
 
-    def image_file(self, name: str, frame: int) -> tuple[str, bytes]:
+    def _part(self, name: str, frame: int) -> Any:
         """See `SceneFiles`."""
-        for suffix in SUFFIXES:
-            data = self._read(frame, f"{name}{suffix}")
-            if data is not None:
-                return suffix, _check_stated_size(data, self.size, self._source(frame, f"{name}{suffix}"))
-        raise DatasetError(f"{self.shards[0].parent} has no {self._key(frame)}.{name}{SUFFIXES[0]}; the data set is not complete")
+        return self._json(frame, name, (LENIENT_VIEW_SCHEMAS if self.lenient else VIEW_SCHEMAS)[name])
+
+    def _find(self, name: str, frame: int, index: int | None = None) -> tuple[str, bytes, str] | None:
+        """See `SceneFiles`; masks are no images here."""
+        return None if name.startswith("mask") else self._images.find(name, frame, index)
+
+    def _missing(self, name: str, frame: int, index: int | None = None) -> str:
+        """See `SceneFiles`."""
+        advice = " or .jpg or .tif" if self.lenient else "; the data set is not complete"
+        return f"{self.shards[0].parent} has no {self.scene:06d}_{frame:06d}.{name}.png{advice}"
 
     def masks(self, name: str, frame: int, count: int) -> list[np.ndarray]:
         """See `SceneFiles`."""
-        records = self._json(frame, name, MASK_SCHEMA)
-        if records is None:
+        if (runs := self._read_runs(name, frame)) is None:
             raise DatasetError(f"{self.shards[0]} has no {name}; bake with bop.masks = true")
-        source = self._source(frame, f"{name}.json")
-        if missing := set(range(count)) - set(records):
+        if missing := set(range(count)) - set(runs):
+            source = self._source(self._images.file(name, frame))
             raise DatasetError(f"{source} has no mask {min(missing)}, but there are {count} instances; {ADVICE}")
-        for index in range(count):
-            check_run_lengths(records[index], self.size, f"{source}, mask {index},")
-        return [decode_run_lengths(records[index]["counts"], records[index]["size"]) for index in range(count)]
+        return super().masks(name, frame, count)
+
+    def mask(self, name: str, frame: int, index: int) -> np.ndarray:
+        """See `SceneFiles`."""
+        runs = (self._read_runs(name, frame) or {}).get(index)
+        if runs is None:
+            raise DatasetError(f"{self.shards[0]} has no {name} of instance {index} in image {frame}; bake with bop.masks = true")
+        size = self.image_size(frame) if self.lenient else self.size
+        check_run_lengths(runs, size, f"{self._source(self._images.file(name, frame, index))},")
+        return decode_run_lengths(runs["counts"], runs["size"])
+
+    def mask_crop(self, name: str, frame: int, index: int, rows: slice, columns: slice) -> np.ndarray:
+        """See `SceneFiles`."""
+        return self.mask(name, frame, index)[rows, columns]
+
+    def _read_runs(self, name: str, frame: int) -> dict[int, Any] | None:
+        """Run lengths of the masks of a frame by instance; None: there are none."""
+        if self._runs is None or self._runs[0] != (name, frame):
+            self._runs = (name, frame), self._json(frame, name, MASK_SCHEMA)
+        return self._runs[1]
+
+    def _read_size(self, frame: int) -> tuple[int, int]:
+        """See `SceneFiles`."""
+        for name in ("mask", "mask_visib") if not (self.has("rgb") or self.has("depth")) else ():
+            for runs in (self._read_runs(name, frame) or {}).values():
+                return tuple(runs["size"][::-1])
+        return super()._read_size(frame)
 
     def layers(self) -> set[str]:
         """See `SceneFiles`."""
-        names = {name.partition(".")[2] for name in self._members}
-        return {Path(name).stem for name in names if name.endswith(SUFFIXES)} - {"rgb", "depth"}
-
-    def _key(self, frame: int) -> str:
-        return f"{self.scene:06d}_{frame:06d}"
-
-    def _source(self, frame: int, name: str) -> str:
-        """A member in messages."""
-        return f"{self._key(frame)}.{name} in {self.shards[0].parent}"
+        names = {content for _, content in self._images.members}
+        return set() if self.lenient else {Path(name).stem for name in names if name.endswith(SUFFIXES)} - {"rgb", "depth"}
 
     def _json(self, frame: int, name: str, schema: Any) -> Any:
         """Checked content of a JSON member; None: there is none."""
-        data = self._read(frame, f"{name}.json")
-        return None if data is None else check_json(data, schema, self._source(frame, f"{name}.json"))
+        member = self._images.members.get((frame, f"{name}.json"))
+        return None if member is None else check_json(self._images.content(member, MAX_JSON), schema, self._source(member.file))
 
-    def _read(self, frame: int, name: str) -> bytes | None:
-        """Content of a member; None: there is none."""
-        shard, offset, size = self._members.get(f"{self._key(frame)}.{name}", (None, 0, 0))
-        if shard is None:
-            return None
-        try:
-            with shard.open("rb") as file:
-                file.seek(offset)
-                data = file.read(size)
-        except OSError as error:
-            raise DatasetError(f"{shard} cannot be read: {error.strerror}") from None
-        if len(data) < size:
-            raise DatasetError(f"{shard} is damaged: it ends within {self._key(frame)}.{name}; {ADVICE}")
-        return data
+    def _source(self, file: str) -> Path:
+        """A member in messages."""
+        return self._images.listing.root / file
 
 
-def _check_stated_size(data: bytes, size: tuple[int, int] | None, source: object) -> bytes:
+def _stem(frame: int, index: int | None) -> str:
+    """Name of an image, or of a mask, without suffix."""
+    return f"{frame:06d}" if index is None else f"{frame:06d}_{index:06d}"
+
+
+def to_color(image: np.ndarray) -> np.ndarray:
+    """An image (H, W[, C]) as colour (H, W, 3) uint8: grey in all channels, without alpha, of 16 bits the upper 8."""
+    if image.dtype == np.uint16:
+        image = (image >> 8).astype(np.uint8)
+    if image.ndim == 2:
+        return np.repeat(image[..., None], 3, axis=2)
+    return np.ascontiguousarray(image[..., :3]) if image.shape[2] == 4 else image
+
+
+def check_stated_size(data: bytes, size: tuple[int, int] | None, source: object) -> bytes:
     """Check the size that an image file states; returns its content."""
-    stated = image_size(data)
+    stated = image_size(data) or tiff_size(data)
     if stated is None or (size is not None and stated != size):
         there = "is not an image" if stated is None else f"has {stated[0]} x {stated[1]} pixels, not the camera's; {ADVICE}"
         raise DatasetError(f"{source} {there}")
     return data
 
 
-def _check_records(parts: list[Any], place: Path, frame: int) -> ViewRecords:
-    camera, gt, info = parts
-    if camera is None or gt is None or info is None or len(gt) != len(info):
-        raise DatasetError(f"{place}: scene_camera.json, scene_gt.json and scene_gt_info.json do not agree about image {frame}")
-    return ViewRecords(camera, gt, info)
-
-
-def check_run_lengths(record: Mapping[str, Any], size: tuple[int, int], source: str) -> None:
+def check_run_lengths(record: Mapping[str, Any], size: tuple[int, int] | None, source: str) -> None:
     """Check that run lengths cover an image of that width and height exactly."""
     height, width = record["size"]
-    if (width, height) != size:
+    if size is not None and (width, height) != size:
         raise DatasetError(f"{source} has {width} x {height} pixels; the images of this camera have {size[0]} x {size[1]}")
     if sum(record["counts"]) != width * height:
         raise DatasetError(f"{source} is damaged: its runs have {sum(record['counts'])} of {width * height} pixels; {ADVICE}")

@@ -3,20 +3,16 @@
 from __future__ import annotations
 
 import mmap
-import os
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
 
-from synpick_warp.dataset.view_files import SceneFiles, SceneFolder, check_planes
+from synpick_warp.dataset.view_files import SceneFiles, check_planes
 from synpick_warp.errors import DatasetError
 from synpick_warp.estimation.mask_errors import disturb_labels
 from synpick_warp.estimation.scenes import ABSENT, Scene
-from synpick_warp.inputs.files import read_file_if_present
-from synpick_warp.inputs.image_files import MAX_IMAGE_FILE
-from synpick_warp.inputs.png_crop import decode_grey_crop
 from synpick_warp.stages.pose.batch import RgbdBatch
 from synpick_warp.system.shared_memory import SharedArray, shared_bytes
 
@@ -70,6 +66,9 @@ class DecodeJob:
         frame = scene.plan.frames[step]
         batch.intrinsics[view], batch.depth_scale[view] = scene.intrinsics[step], scene.depth_scale[step]
         color = _read_image(scene.files, "rgb", frame, 3, "uint8")
+        if color.shape[1::-1] != scene.size:
+            sizes = f"{color.shape[1]} x {color.shape[0]} pixels, the scene's first one {scene.size[0]} x {scene.size[1]}"
+            raise DatasetError(f"{scene.files.place}: image {frame} has {sizes}; poses are estimated in images of one size")
         cv2.cvtColor(color, cv2.COLOR_BGR2RGB, dst=batch.color[view])
         batch.depth[view] = _read_image(scene.files, self.depth, frame, None, "uint16")
         paint_label(scene, step, batch.label[view])
@@ -116,22 +115,10 @@ def paint_label(scene: Scene, step: int, label: np.ndarray) -> None:
     label[:] = 0
     shown = np.flatnonzero((scene.index[step] != ABSENT) & (scene.boxes[step, :, 2] >= 0))
     frame = scene.plan.frames[step]
-    if isinstance(scene.files, SceneFolder):
-        folder = str(scene.files.images("mask_visib"))
-        if not os.path.isdir(folder):
-            raise DatasetError(f"{scene.files.folder} has no {os.path.basename(folder)}; bake with bop.masks = true")
-        for slot in shown.tolist():
-            rows, columns = _crop(scene.boxes[step, slot], scene.size)
-            index = int(scene.index[step, slot])
-            data = read_file_if_present(f"{folder}{os.sep}{frame:06d}_{index:06d}.png", MAX_IMAGE_FILE, DatasetError)
-            crop = None if data is None else decode_grey_crop(data, scene.size, rows, columns)
-            mask = scene.files.mask("mask_visib", frame, index)[rows, columns] if crop is None else crop
-            label[rows, columns][mask > 0] = 1 + slot
-        return
-    masks = scene.files.masks("mask_visib", frame, int((scene.index[step] != ABSENT).sum()))
     for slot in shown.tolist():
         rows, columns = _crop(scene.boxes[step, slot], scene.size)
-        label[rows, columns][masks[scene.index[step, slot]][rows, columns]] = 1 + slot
+        crop = scene.files.mask_crop("mask_visib", frame, int(scene.index[step, slot]), rows, columns)
+        label[rows, columns][crop] = 1 + slot
 
 
 def _hide(label: np.ndarray, slots: np.ndarray) -> None:

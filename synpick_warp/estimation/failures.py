@@ -178,11 +178,14 @@ def describe_failure(truth: Truth, failure: Failure, view: View, names: Mapping[
         error = f"missed (above {1e3 * LIMIT:.0f} mm)"
     speed = truth.speed[failure.truth]
     moving = f", {speed:.2f} m/s" if np.isfinite(speed) else ""
-    return f"{name}: {error}", f"{place}; {100 * truth.visibility[failure.truth]:.0f} % visible{moving}"
+    visibility = truth.visibility[failure.truth]
+    seen = f"; {100 * visibility:.0f} % visible" if np.isfinite(visibility) else ""
+    return f"{name}: {error}", f"{place}{seen}{moving}"
 
 
 def _open_view(data_set: DataSet, truth: Truth, row: int) -> View:
-    return data_set[int(truth.episode[row])].view(int(truth.poses.image[row]), int(truth.camera[row]))
+    episode = data_set[int(truth.episode[row])]
+    return episode.view(episode.image_ids.index(int(truth.poses.image[row])), int(truth.camera[row]))
 
 
 def _pose_of(poses: PoseTable, row: int) -> np.ndarray | None:

@@ -117,7 +117,7 @@ def ask(scene: Scene, method: str, min_visibility: float, objects: Sequence[froz
         objects: obj_ids that count in each planned frame; None: all.
     """
     present = scene.index != ABSENT
-    asked = present & (scene.visibility >= min_visibility) & (scene.boxes[..., 2] >= 0)
+    asked = present & ~(scene.visibility < min_visibility) & (scene.boxes[..., 2] >= 0)
     if method == TRACK:
         return replace(scene, asked=present & np.logical_or.accumulate(asked, axis=0))
     for row, known in enumerate(objects):

@@ -8,11 +8,11 @@ from __future__ import annotations
 from collections.abc import Iterable
 from pathlib import Path
 
-from synpick_warp.errors import CatalogError, DatasetError, SynpickError
-from synpick_warp.inputs.paths import path_inside
+from synpick_warp.dataset.bop.models import find_models
+from synpick_warp.errors import CatalogError, SynpickError
 from synpick_warp.scenes.assets.appearance import FileMaterial
 from synpick_warp.scenes.assets.meshes import read_mesh
-from synpick_warp.scenes.assets.models_info import ModelInfo, read_models_info
+from synpick_warp.scenes.assets.models_info import ModelInfo
 from synpick_warp.scenes.catalog import READ_LIMITS
 from synpick_warp.scenes.types import Material, TriangleMesh
 from synpick_warp.stages.pose.batch import ObjectModel
@@ -34,31 +34,17 @@ def read_object_models(folder: Path, object_ids: Iterable[int]) -> list[ObjectMo
         DatasetError: The data set has no models, or an object has none.
         CatalogError: A model or its texture is missing or damaged.
     """
-    info_path = folder / "models" / "models_info.json"
-    if not info_path.is_file():
-        raise DatasetError(f"{folder} has no models/models_info.json; poses are estimated with models: bake with --formats bop or shards")
-    wanted = sorted(set(object_ids))
-    infos = read_models_info(info_path, wanted)
-    paths = [_model_path(folder, object_id) for object_id in wanted]
+    found = find_models(folder, object_ids, "poses are estimated")
+    results = run_isolated(read_mesh, [(path, _MILLIMETRE) for path, _ in found.values()], READ_LIMITS)
     models = []
-    for object_id, path, result in zip(
-        wanted, paths, run_isolated(read_mesh, [(path, _MILLIMETRE) for path in paths], READ_LIMITS), strict=True
-    ):
+    for (object_id, (path, info)), result in zip(found.items(), results, strict=True):
         if isinstance(result, Failure):
             raise CatalogError(f"{path}: the process that reads it {result.reason}; repair or simplify the file")
         if isinstance(result, SynpickError):
             raise result
         mesh, given = result
-        models.append(_make_model(object_id, mesh, given, infos[object_id]))
+        models.append(_make_model(object_id, mesh, given, info))
     return models
-
-
-def _model_path(folder: Path, object_id: int) -> Path:
-    name = f"models/obj_{object_id:06d}.ply"
-    path = path_inside(folder, name, folder, DatasetError)
-    if not path.is_file():
-        raise DatasetError(f"{folder} has no {name}, the model of an object in its ground truth; restore it, or bake the data set again")
-    return path
 
 
 def _make_model(object_id: int, mesh: TriangleMesh, given: FileMaterial, info: ModelInfo) -> ObjectModel:

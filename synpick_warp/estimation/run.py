@@ -11,7 +11,7 @@ import numpy as np
 from synpick_warp.dataset.reading import DataSet
 from synpick_warp.errors import DatasetError
 from synpick_warp.estimation.decoder_pool import SCENES_AHEAD, DecoderPool, ReadScene
-from synpick_warp.estimation.methods import EstimatorFactory, Group, ask, estimate_frame, make_group, to_rotations
+from synpick_warp.estimation.methods import TRACK, EstimatorFactory, Group, ask, estimate_frame, make_group, to_rotations
 from synpick_warp.estimation.reading import AHEAD, BYTES_PER_PIXEL, DEPTHS, SceneReader
 from synpick_warp.estimation.scenes import Scene, ScenePlan, group_scenes, read_scene
 from synpick_warp.evaluation.poses import PoseTable
@@ -89,6 +89,9 @@ def read_scenes(
         read = pool.map_ordered((ReadScene(data_set.folder, plan) for plan in plans), depth=SCENES_AHEAD, ahead=SCENES_AHEAD)
     report("scenes", 0, len(plans))
     for plan, scene in zip(plans, read, strict=True):
+        if options.method == TRACK and not scene.tracked:
+            place = scene.files.place
+            raise DatasetError(f"{place} has no instance_id in its ground truth, by which instances are tracked; use another method")
         objects = [None if listed is None else listed[plan.scene, frame] for frame in plan.frames]
         scenes.append(ask(scene, options.method, options.min_visibility, objects))
         report("scenes", len(scenes), len(plans))

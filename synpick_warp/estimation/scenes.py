@@ -6,8 +6,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from msgspec import UNSET
 
 from synpick_warp.dataset.annotations import ADVICE
+from synpick_warp.dataset.bop.arrays import SceneArrays, read_arrays
 from synpick_warp.dataset.reading import DataSet
 from synpick_warp.dataset.view_files import SceneFiles
 from synpick_warp.errors import DatasetError
@@ -49,7 +51,7 @@ class Scene:
     poses: np.ndarray
     """Object to camera (F, S, 4, 4) float64 [m]; the identity where absent."""
     visibility: np.ndarray
-    """Visible fraction (F, S) float64; 0 where absent."""
+    """Visible fraction (F, S) float64; 0 where absent; NaN: it is not known."""
     boxes: np.ndarray
     """Visible box (F, S, 4) int64 [px]: x, y, width, height as BOP has them; -1: nothing is visible."""
     intrinsics: np.ndarray
@@ -58,6 +60,8 @@ class Scene:
     """Depth of one count (F,) float32 [m]."""
     asked: np.ndarray
     """Whether the instance is estimated in the frame (F, S) bool."""
+    tracked: bool
+    """Whether the instances can be followed from frame to frame: the annotations have instance ids."""
 
     def __len__(self) -> int:
         """Number of frames F."""
@@ -73,49 +77,67 @@ def read_scene(data_set: DataSet, plan: ScenePlan) -> Scene:
     # Records stay in memory as long as the object that has read them: images get another one.
     source = data_set.scene_files(plan.episode, plan.camera)
     place = source.place
-    records = [source.records(frame) for frame in plan.frames]
-    known: dict[int, int] = {}
-    for frame, record in zip(plan.frames, records, strict=True):
-        for entry in record.gt:
-            if "instance_id" not in entry:
-                raise DatasetError(f"{place}: an instance of image {frame} has no instance_id; {ADVICE}")
-            if known.setdefault(entry["instance_id"], entry["obj_id"]) != entry["obj_id"]:
-                raise DatasetError(f"{place}: instance {entry['instance_id']} of image {frame} has another obj_id than before; {ADVICE}")
-    if len(known) > MAX_SLOTS:
-        raise DatasetError(f"{place} has {len(known)} instances; allowed: {MAX_SLOTS}")
-    instances = np.array(sorted(known), np.int64)
-    slots = {instance: slot for slot, instance in enumerate(instances.tolist())}
-    shape = len(records), len(instances)
+    if source.lenient:
+        _check_inputs(source)
+    truth = read_arrays(source, plan.frames)
+    truth.require_instances(place)
+    instances, first, slot = np.unique(truth.instance, return_index=True, return_inverse=True)
+    object_ids, frames = truth.object_id[first], truth.images[truth.row]
+    other = np.flatnonzero(object_ids[slot] != truth.object_id)
+    if len(other):
+        instance, frame = truth.instance[other[0]], frames[other[0]]
+        raise DatasetError(f"{place}: instance {instance} of image {frame} has another obj_id than before; {ADVICE}")
+    if len(instances) > MAX_SLOTS:
+        raise DatasetError(f"{place} has {len(instances)} instances; allowed: {MAX_SLOTS}")
+    counts = truth.counts
+    shape = len(counts), len(instances)
     index, visibility = np.full(shape, ABSENT, np.int32), np.zeros(shape)
     poses, boxes = np.tile(np.eye(4), (*shape, 1, 1)), np.full((*shape, 4), -1, np.int64)
-    for row, (frame, record) in enumerate(zip(plan.frames, records, strict=True)):
-        order = [slots[entry["instance_id"]] for entry in record.gt]
-        if len(set(order)) < len(order):
-            raise DatasetError(f"{place}: image {frame} has an instance_id twice; {ADVICE}")
-        if order:
-            index[row, order] = np.arange(len(order))
-            visibility[row, order] = [info["visib_fract"] for info in record.gt_info]
-            boxes[row, order] = [info["bbox_visib"] for info in record.gt_info]
-            poses[row, order, :3, :3] = np.reshape([entry["cam_R_m2c"] for entry in record.gt], (-1, 3, 3))
-            poses[row, order, :3, 3] = _METERS * np.array([entry["cam_t_m2c"] for entry in record.gt])
+    cells = truth.row, slot
+    twice = np.flatnonzero(np.bincount(np.ravel_multi_index(cells, shape), minlength=1) > 1)
+    if len(twice):
+        raise DatasetError(f"{place}: image {plan.frames[twice[0] // shape[1]]} has an instance_id twice; {ADVICE}")
+    index[cells] = np.arange(len(truth)) - np.repeat(np.cumsum(counts) - counts, counts)
+    visibility[cells], boxes[cells] = truth.visibility, truth.box
+    poses[..., :3, :3][cells], poses[..., :3, 3][cells] = truth.rotation, _METERS * truth.translation
     _check_rotations(poses[..., :3, :3], plan, place)
-    matrices = np.reshape([record.camera["cam_K"] for record in records], (-1, 9))
-    if not (matrices[:, [0, 4]] > 0.0).all():
-        raise DatasetError(f"{place}: a focal length in cam_K is not above 0; {ADVICE}")
+    matrices, scales = _read_cameras(truth, place)
     return Scene(
         plan=plan,
         files=data_set.scene_files(plan.episode, plan.camera),
-        size=data_set.config.cameras.resolution,
+        size=source.image_size(plan.frames[0]),
         instances=instances,
-        object_ids=np.array([known[instance] for instance in instances.tolist()], np.int64),
+        object_ids=object_ids,
         index=index,
         poses=poses,
         visibility=visibility,
         boxes=boxes,
         intrinsics=matrices[:, [0, 4, 2, 5]].astype(np.float32),
-        depth_scale=(_METERS * np.array([record.camera["depth_scale"] for record in records])).astype(np.float32),
+        depth_scale=(_METERS * scales).astype(np.float32),
         asked=index != ABSENT,
+        tracked=truth.tracked,
     )
+
+
+_INPUTS = {"gt": "ground truth (scene_gt.json)", "rgb": "colour images", "depth": "depth images", "mask_visib": "masks (mask_visib)"}
+
+
+def _check_inputs(source: SceneFiles) -> None:
+    """Check that a scene of a data set that no bake wrote has what poses are estimated with."""
+    for name, what in _INPUTS.items():
+        if not source.has(name):
+            raise DatasetError(f"{source.place} has no {what}, which poses are estimated with")
+
+
+def _read_cameras(truth: SceneArrays, place: object) -> tuple[np.ndarray, np.ndarray]:
+    """Camera matrices (F, 9) [px] and depth scales (F,) [mm]."""
+    for image, camera in zip(truth.images, truth.cameras, strict=True):
+        if missing := [key for key in ("cam_K", "depth_scale") if getattr(camera, key) is UNSET]:
+            raise DatasetError(f"{place}: the camera of image {image} has no {missing[0]}, which poses are estimated with")
+    matrices = np.reshape([camera.cam_K for camera in truth.cameras], (-1, 9))
+    if not (matrices[:, [0, 4]] > 0.0).all():
+        raise DatasetError(f"{place}: a focal length in cam_K is not above 0; {ADVICE}")
+    return matrices, np.array([camera.depth_scale for camera in truth.cameras])
 
 
 def _check_rotations(rotations: np.ndarray, plan: ScenePlan, place: object) -> None:

@@ -51,23 +51,24 @@ def plan_scenes(data_set: DataSet, selection: Selection) -> tuple[list[ScenePlan
         listed = {}
         for scene, image in sorted(selection.targets.objects):
             listed.setdefault(scene, []).append(image)
-        if missing := sorted(listed.keys() - {cameras * episode + camera for episode in known for camera in range(cameras)}):
+        scenes = {data_set.scene_id(episode, camera) for episode in known for camera in range(cameras)}
+        if missing := sorted(listed.keys() - scenes):
             raise ResultError(f"{selection.targets.path}: the data set has no scene {missing[0]}")
     plans, total = [], 0
     for index in known:
         episode = data_set[index]
-        frames = len(episode)
-        total += frames * cameras
+        images = episode.image_ids
+        total += len(images) * len(episode.cameras)
         if selection.episodes is not None and index not in selection.episodes:
             continue
         if selection.modes is not None and episode.row.get("mode") not in selection.modes:
             continue
-        for camera in range(cameras) if selection.cameras is None else sorted(set(selection.cameras)):
-            scene = cameras * index + camera
-            chosen = range(0, frames, selection.every) if listed is None else listed.get(scene, [])
-            if chosen and chosen[-1] >= frames:
+        for camera in episode.cameras if selection.cameras is None else sorted(set(selection.cameras) & set(episode.cameras)):
+            scene = data_set.scene_id(index, camera)
+            chosen = images[:: selection.every] if listed is None else listed.get(scene, [])
+            if unknown := set(chosen) - set(images):
                 path = selection.targets.path if selection.targets else data_set.folder
-                raise ResultError(f"{path}: scene {scene} has no image {chosen[-1]}; its images are 0 to {frames - 1}")
+                raise ResultError(f"{path}: scene {scene} has no image {max(unknown)}; its images are {images[0]} to {images[-1]}")
             if chosen:
                 plans.append(ScenePlan(scene, index, camera, tuple(chosen)))
     if not plans:

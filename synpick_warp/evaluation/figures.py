@@ -85,7 +85,8 @@ def draw_figures(
         attempts: Episode -> frames of its pick attempts.
 
     Returns:
-        File name -> PNG file. There is no trajectory if no track has two images, and no error by speed if no speed is known.
+        File name -> PNG file. There is no trajectory if no track has two images, and no error by visibility
+        or speed if none is known.
 
     Raises:
         ConfigError: The track is not in the ground truth, or a method has no estimate of it.
@@ -110,12 +111,14 @@ def _draw_errors(truth: Truth, scores: Sequence[Scores]) -> dict[str, Spec]:
     """Pictures of the errors of all methods together."""
     target = scores[0].target
     visibility, speed = truth.visibility[target], truth.speed[target]
-    known = np.isfinite(speed)
+    known, rated = np.isfinite(speed), np.isfinite(visibility)
     pictures = {}
     for metric in METRICS:
         errors = {each.name: each.errors[metric] for each in scores}
         pictures[f"recall_{_FILES[metric]}.png"] = plot_recall(errors, metric=metric)
-        pictures[f"error_by_visibility_{_FILES[metric]}.png"] = plot_error_by_visibility(visibility, errors, metric=metric)
+        if rated.any():
+            shown = {name: values[rated] for name, values in errors.items()}
+            pictures[f"error_by_visibility_{_FILES[metric]}.png"] = plot_error_by_visibility(visibility[rated], shown, metric=metric)
         if known.any():
             moving = {name: values[known] for name, values in errors.items()}
             pictures[f"error_by_speed_{_FILES[metric]}.png"] = plot_error_by_speed(speed[known], moving, metric=metric)
@@ -153,7 +156,7 @@ def _farthest_track(truth: Truth, methods: Sequence[Method], min_visibility: flo
     Images count in which the instance is visible enough, so that what falls out of sight is no motion. If no track is known so well, it is
     the first that all methods have at all.
     """
-    seen = np.flatnonzero(truth.visibility >= min_visibility)
+    seen = np.flatnonzero(truth.shown(min_visibility))
     keys = np.stack((truth.poses.scene[seen], truth.poses.instance[seen]), axis=1)
     tracks, index, count = np.unique(keys, axis=0, return_inverse=True, return_counts=True)
     order = seen[np.argsort(index.ravel(), kind="stable")]
@@ -174,7 +177,7 @@ def _farthest_track(truth: Truth, methods: Sequence[Method], min_visibility: flo
 def _sweep(truth: Truth, method: Method, settings: Settings) -> AlphaSweep:
     """ADD-S AUC of each mode for each weight of the filter."""
     thinned = {object_id: model.thinned(SWEEP_VERTICES) for object_id, model in settings.models.items()}
-    target = truth.visibility >= settings.min_visibility
+    target = truth.shown(settings.min_visibility)
     seen = set(truth.mode[target].tolist())
     modes = {int(scene): str(mode) for scene, mode in zip(truth.poses.scene, truth.mode, strict=True) if mode in seen}
     poses = method.poses.select(np.isin(method.poses.scene, list(modes)))

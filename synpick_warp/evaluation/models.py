@@ -10,13 +10,12 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from synpick_warp.errors import CatalogError, DatasetError
+from synpick_warp.dataset.bop.models import find_models
+from synpick_warp.errors import CatalogError
 from synpick_warp.evaluation.nearest import VertexSearch
-from synpick_warp.inputs.paths import path_inside
-from synpick_warp.scenes.assets.models_info import ModelInfo, read_models_info
+from synpick_warp.scenes.assets.models_info import ModelInfo
 from synpick_warp.scenes.assets.ply import read_ply_vertices
 
-MODELS, INFO = "models", "models_info.json"
 _METERS = 1e-3
 """In a millimetre."""
 _MAX_STEP = 0.01
@@ -61,19 +60,11 @@ def read_models(folder: Path, object_ids: Iterable[int], vertices: int = 0) -> d
         DatasetError: The data set has no models, or an object has none.
         CatalogError: A file of the models is damaged.
     """
-    path = folder / MODELS / INFO
-    if not path.is_file():
-        raise DatasetError(f"{folder} has no {MODELS}/{INFO}, which poses are evaluated with; bake with --formats bop or shards")
-    wanted = sorted(set(object_ids))
-    infos = read_models_info(path, wanted)
-    return {object_id: _read_model(folder, object_id, infos[object_id], vertices) for object_id in wanted}
+    found = find_models(folder, object_ids, "poses are evaluated")
+    return {object_id: _read_model(*pair, object_id, vertices) for object_id, pair in found.items()}
 
 
-def _read_model(folder: Path, object_id: int, info: ModelInfo, count: int) -> Model:
-    name = f"{MODELS}/obj_{object_id:06d}.ply"
-    path = path_inside(folder, name, folder, DatasetError)
-    if not path.is_file():
-        raise DatasetError(f"{folder} has no {name}, the model of an object in its ground truth; restore it, or bake the data set again")
+def _read_model(path: Path, info: ModelInfo, object_id: int, count: int) -> Model:
     points = _METERS * read_ply_vertices(path)
     if np.abs(points).max() > 1e6:
         raise CatalogError(f"{path}: a vertex is more than 1e9 mm from the origin; repair the mesh")

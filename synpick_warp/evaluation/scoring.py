@@ -67,7 +67,7 @@ def score(
     """
     for step in steps:
         estimates = step(estimates)
-    target = truth.visibility >= min_visibility
+    target = truth.shown(min_visibility)
     pairs = make_pairs(truth.poses, target, estimates, top)
     pair_errors = _pair_errors(truth.poses, estimates, pairs, models)
     matches = {metric: match(pairs, pair_errors[metric], LIMIT, len(truth)) for metric in METRICS}

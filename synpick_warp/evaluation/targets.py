@@ -8,43 +8,30 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Annotated
 
 import msgspec
 import numpy as np
 from msgspec.structs import replace as replace_struct
 
 from synpick_warp.configs.check import format_value
-from synpick_warp.configs.schema import MULTISENSOR, Config
-from synpick_warp.configs.splits import sensor_name
+from synpick_warp.dataset.annotations import TargetEntry
 from synpick_warp.errors import ResultError
 from synpick_warp.evaluation.truth import Truth
 from synpick_warp.inputs.json import read_json
 
 _FORMAT = "a target list has objects with scene_id, im_id, obj_id and inst_count, as BOP's test_targets_bop19.json"
-_Index = Annotated[int, msgspec.Meta(ge=0, lt=2**31)]
 
 
 class Target(msgspec.Struct, frozen=True, order=True, omit_defaults=True):
     """Entry of a target list. `inst_count` is written but not read, since the ground truth has it."""
 
-    scene_id: _Index
-    im_id: _Index
-    obj_id: _Index | None = None
+    scene_id: int
+    im_id: int
+    obj_id: int | None = None
     """None: all objects of the image, as in test_targets_bop24.json."""
-    inst_count: _Index = 0
+    inst_count: int = 0
     sensor: str = ""
-    """Camera of the image in a data set of several sensors, such as "cam1"; empty there: the first one, as BOP's lists have it."""
-
-
-class _Entry(msgspec.Struct):
-    """Entry of a file; im_id names images of several sensors in test_targets_multiview_bop25.json."""
-
-    scene_id: _Index
-    im_id: _Index | list[tuple[str, _Index]]
-    obj_id: _Index | None = None
-    inst_count: _Index = 0
-    sensor: str = ""
+    """See `TargetEntry`."""
 
 
 @dataclass(frozen=True)
@@ -66,21 +53,25 @@ class TargetList:
                 known.add(target.obj_id)
         return {image: None if known is None else frozenset(known) for image, known in found.items()}
 
-    def in_classic_layout(self, config: Config) -> TargetList:
+    def in_classic_layout(self, sensors: Sequence[str]) -> TargetList:
         """The list with a scene for each camera, as result files have it; that of a data set of several sensors has one for all of them.
+
+        Args:
+            sensors: Names of the sensors; empty: each camera has scenes of its own.
 
         Raises:
             ResultError: It names a sensor that the data set does not have.
         """
-        cameras = len(config.cameras.positions)
-        known = {sensor_name(camera): camera for camera in range(cameras)} if config.bop.layout == MULTISENSOR else {}
+        known = {name: index for index, name in enumerate(sensors)}
         for target in self.targets:
             if target.sensor and target.sensor not in known:
                 found = f"sensors: {', '.join(known)}" if known else "it has a scene for each camera"
                 raise ResultError(f"{self.path} names the sensor {format_value(target.sensor)}, which the data set does not have; {found}")
         if not known:
             return self
-        classic = (replace_struct(each, scene_id=cameras * each.scene_id + known.get(each.sensor, 0), sensor="") for each in self.targets)
+        classic = (
+            replace_struct(each, scene_id=len(known) * each.scene_id + known.get(each.sensor, 0), sensor="") for each in self.targets
+        )
         return TargetList(self.path, tuple(classic))
 
 
@@ -90,23 +81,24 @@ def read_targets(path: Path) -> TargetList:
     Raises:
         ResultError: In one line: it cannot be read, is damaged, or is empty.
     """
-    entries = read_json(path, list[_Entry], ResultError, _FORMAT)
+    entries = read_json(path, list[TargetEntry], ResultError, _FORMAT)
     if not entries:
         raise ResultError(f"{path} lists no images; {_FORMAT}")
     return TargetList(path, tuple(target for entry in entries for target in _read_entry(entry)))
 
 
-def _read_entry(entry: _Entry) -> list[Target]:
+def _read_entry(entry: TargetEntry) -> list[Target]:
     images = [(entry.sensor, entry.im_id)] if isinstance(entry.im_id, int) else entry.im_id
-    return [Target(entry.scene_id, image, entry.obj_id, entry.inst_count, sensor) for sensor, image in images]
+    object_id, count = entry.obj_id if isinstance(entry.obj_id, int) else None, entry.inst_count or 0
+    return [Target(entry.scene_id, image, object_id, count, sensor) for sensor, image in images]
 
 
-def in_layout(targets: Sequence[Target], config: Config) -> list[Target]:
+def in_layout(targets: Sequence[Target], sensors: Sequence[str]) -> list[Target]:
     """The inverse of `TargetList.in_classic_layout`: targets with a scene for each camera, as the data set's own lists have them."""
-    if config.bop.layout != MULTISENSOR:
+    if not sensors:
         return list(targets)
-    cameras = len(config.cameras.positions)
-    return [replace_struct(each, scene_id=each.scene_id // cameras, sensor=sensor_name(each.scene_id % cameras)) for each in targets]
+    count = len(sensors)
+    return [replace_struct(each, scene_id=each.scene_id // count, sensor=sensors[each.scene_id % count]) for each in targets]
 
 
 def encode_targets(targets: Sequence[Target]) -> bytes:

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from synpick_warp.dataset.reading import DataSet, Episode
+from synpick_warp.dataset.bop.arrays import SceneArrays, read_arrays
+from synpick_warp.dataset.reading import DataSet
 from synpick_warp.errors import DatasetError
 from synpick_warp.evaluation.poses import PoseTable
 
@@ -20,7 +22,7 @@ class Truth:
 
     poses: PoseTable
     visibility: np.ndarray
-    """Visible fraction of the silhouette (N,) float64."""
+    """Visible fraction of the silhouette (N,) float64; NaN: it is not known."""
     episode: np.ndarray
     """Index of the episode (N,) int64."""
     camera: np.ndarray
@@ -33,6 +35,10 @@ class Truth:
     images: np.ndarray
     """Scene and image index of all images (M, 2) int64, those without objects included, sorted."""
 
+    def shown(self, minimum: float) -> np.ndarray:
+        """Whether instances are at least so visible (N,) bool; also those of which it is not known."""
+        return ~(self.visibility < minimum)
+
     def __len__(self) -> int:
         return len(self.poses)
 
@@ -43,71 +49,64 @@ def read_truth(data_set: DataSet) -> Truth:
     Raises:
         DatasetError: The data set has no images or no episode, or a file is missing or damaged.
     """
-    period = data_set.config.physics.step * data_set.config.physics.steps_per_tick
-    count = data_set.camera_count
-    parts, images = [], []
+    parts, splits = [], dict[int, str]()
     for index, episode in data_set.items():
         mode = episode.row.get("mode")
         if not isinstance(mode, str):
             raise DatasetError(f"{data_set.folder}: the row of episode {index} has no mode; restore its manifest entry, or bake again")
-        for camera in range(count):
-            scene = count * index + camera
-            frames, rows = _read_scene(episode, camera)
-            images += [(scene, frame) for frame in frames]
-            parts.append((rows, scene, index, camera, mode))
+        for camera in episode.cameras:
+            scene, split = data_set.scene_id(index, camera), data_set.split_of(index)
+            if splits.setdefault(scene, split) != split:
+                raise DatasetError(f"{data_set.folder} has a scene {scene} in {splits[scene]} and in {split}; choose one by --split")
+            files = data_set.scene_files(index, camera)
+            if not files.has("gt"):
+                raise DatasetError(f"{files.place} has no ground truth (scene_gt.json), which estimates are scored against")
+            arrays = read_arrays(files, episode.image_ids)
+            arrays.require_instances(files.place)
+            parts.append((arrays, scene, index, camera, mode))
     if not parts:
         raise DatasetError(f"{data_set.folder} has no episode to evaluate on; finish the bake first")
-    return _assemble(parts, np.reshape(np.array(images, np.int64), (-1, 2)), period)
+    return _assemble(parts, data_set.period)
 
 
-_Rows = list[tuple[int, int, int, list[float], list[float], float]]
-"""(frame, obj_id, instance, rotation, translation, visibility) of a scene."""
+def _assemble(parts: list[tuple[SceneArrays, int, int, int, str]], period: float | None) -> Truth:
+    """Columns from the arrays of all scenes, sorted by scene, image and object."""
+    lengths = [len(arrays) for arrays, *_ in parts]
 
+    def repeat(values: Iterable[int | str]) -> np.ndarray:
+        return np.repeat(list(values), lengths)
 
-def _read_scene(episode: Episode, camera: int) -> tuple[list[int], _Rows]:
-    """Frames of a scene, and its rows."""
-    frames, rows = [], []
-    for view in episode.views(camera):
-        records = view.records
-        frames.append(view.frame)
-        instances = view.instance_ids.tolist()
-        for instance, entry, info in zip(instances, records.gt, records.gt_info, strict=True):
-            rows.append((view.frame, entry["obj_id"], instance, entry["cam_R_m2c"], entry["cam_t_m2c"], info["visib_fract"]))
-    return frames, rows
+    def stack(get: Callable[[SceneArrays], np.ndarray]) -> np.ndarray:
+        return np.concatenate([get(arrays) for arrays, *_ in parts])
 
-
-def _assemble(parts: list[tuple[_Rows, int, int, int, str]], images: np.ndarray, period: float) -> Truth:
-    """Columns from the rows of all scenes, sorted by scene, image and object."""
-    lengths = [len(rows) for rows, *_ in parts]
-
-    def repeat(column: int) -> np.ndarray:
-        return np.repeat([part[column] for part in parts], lengths)
-
-    def stack(column: int, dtype: type) -> np.ndarray:
-        return np.array([row[column] for rows, *_ in parts for row in rows], dtype)
-
-    scene, image, object_id = repeat(1).astype(np.int64), stack(0, np.int64), stack(1, np.int64)
+    images = np.concatenate([np.stack((np.full(len(part[0].images), part[1]), part[0].images), axis=1) for part in parts])
+    scene, image, object_id = (
+        repeat(part[1] for part in parts).astype(np.int64),
+        stack(lambda one: one.images[one.row]),
+        stack(lambda one: one.object_id),
+    )
     poses = PoseTable(
         scene=scene,
         image=image,
         object_id=object_id,
-        rotation=stack(3, np.float64).reshape(-1, 3, 3),
-        translation=_METERS * stack(4, np.float64).reshape(-1, 3),
+        rotation=stack(lambda one: one.rotation),
+        translation=_METERS * stack(lambda one: one.translation),
         score=np.ones(len(scene)),
         seconds=np.full(len(scene), -1.0),
-        instance=stack(2, np.int64),
+        instance=stack(lambda one: one.instance),
     )
     order = np.lexsort((object_id, image, scene))
     truth = Truth(
         poses=poses.select(order),
-        visibility=stack(5, np.float64)[order],
-        episode=repeat(2).astype(np.int64)[order],
-        camera=repeat(3).astype(np.int64)[order],
-        mode=repeat(4).astype(str)[order],
+        visibility=stack(lambda one: one.visibility)[order],
+        episode=repeat(part[2] for part in parts).astype(np.int64)[order],
+        camera=repeat(part[3] for part in parts).astype(np.int64)[order],
+        mode=repeat(part[4] for part in parts).astype(str)[order],
         speed=np.empty(0),
         images=images[np.lexsort(images.T[::-1])],
     )
-    return replace(truth, speed=instance_speeds(truth.poses, period))
+    speed = np.full(len(truth), np.nan) if period is None else instance_speeds(truth.poses, period)
+    return replace(truth, speed=speed)
 
 
 def instance_speeds(poses: PoseTable, period: float) -> np.ndarray:

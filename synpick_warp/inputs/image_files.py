@@ -1,6 +1,7 @@
-"""Bounded image decoding: PNG and JPEG, whose stated size is checked before a pixel is decoded (prevention of decompression bombs).
+"""Bounded image decoding: PNG and JPEG, and TIFF in the data sets of others, whose stated size is checked before a pixel is decoded
+(prevention of decompression bombs).
 
-Other formats that OpenCV could read are refused: a data set has none. NumPy and OpenCV are imported when the first image is decoded.
+Other formats that OpenCV could read are refused. NumPy and OpenCV are imported when the first image is decoded.
 """
 
 from __future__ import annotations
@@ -27,6 +28,12 @@ _NO_FRAME = (0xC4, 0xC8, 0xCC)
 """JPEG markers between SOF0 and SOF15 that begin no frame: Huffman tables, extension, arithmetic conditioning."""
 _BARE = (0x01, *range(0xD0, 0xD9))
 """JPEG markers without length."""
+_TIFF = {b"II*\0": "<", b"MM\0*": ">"}
+"""Byte order of a TIFF file by its signature (TIFF 6.0, section 2)."""
+_WIDTH, _HEIGHT = 256, 257
+"""Tags ImageWidth and ImageLength."""
+_TYPES = {3: "H", 4: "I"}
+"""Field types SHORT and LONG."""
 
 
 def image_size(data: bytes) -> tuple[int, int] | None:
@@ -85,6 +92,46 @@ def decode_image(
         raise error(f"{source} is not an image that OpenCV can decode")
     if size is not None and image.shape[1::-1] != size:
         raise error(f"{source} has {_show(image.shape[1::-1])} pixels; the images of this camera have {_show(size)}")
+    return image
+
+
+def tiff_size(data: bytes) -> tuple[int, int] | None:
+    """Width and height [px] in the first directory of a TIFF file, the largest where there are several; None: it is none, or damaged."""
+    order = _TIFF.get(data[:4])
+    if order is None:
+        return None
+    try:
+        (start,) = struct.unpack_from(f"{order}I", data, 4)
+        (count,) = struct.unpack_from(f"{order}H", data, start)
+        found: dict[int, int] = {}
+        for entry in range(start + 2, start + 2 + 12 * count, 12):
+            tag, kind = struct.unpack_from(f"{order}HH", data, entry)
+            if tag in (_WIDTH, _HEIGHT) and kind in _TYPES:
+                (value,) = struct.unpack_from(f"{order}{_TYPES[kind]}", data, entry + 8)
+                found[tag] = max(value, found.get(tag, 0))
+    except struct.error:
+        return None
+    return (found[_WIDTH], found[_HEIGHT]) if len(found) == 2 else None
+
+
+def decode_picture(data: bytes, source: object, error: type[SynpickError], size: tuple[int, int] | None = None) -> np.ndarray:
+    """Decode a PNG, JPEG or TIFF file without conversion; arguments, result and errors as `decode_image`."""
+    if data[:4] not in _TIFF:
+        return decode_image(data, source, error, size=size)
+    import cv2
+    import numpy as np
+
+    stated = tiff_size(data)
+    if stated is None or not (min(stated) > 0 and max(stated) <= MAX_SIDE):
+        raise error(f"{source} is not a TIFF image of up to {MAX_SIDE} x {MAX_SIDE} pixels")
+    if size is not None and stated != size:
+        raise error(f"{source} has {_show(stated)} pixels; the images of this camera have {_show(size)}")
+    try:
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+    except cv2.error:
+        image = None
+    if image is None or image.shape[1::-1] != stated:
+        raise error(f"{source} is not an image that OpenCV can decode")
     return image
 
 

@@ -52,7 +52,8 @@ class Source:
 
     statistics: Statistics
     brightness: Sequence[Brightness]
-    config: Config
+    config: Config | None
+    """None: no bake wrote the data set."""
     durations: Mapping[str, float] = field(default_factory=dict)
     """Mode -> time from the first frame to the end of the last, of its longest episode [s]."""
 
@@ -219,6 +220,8 @@ def _visibility(source: Source) -> Chart | None:
     if not rows:
         return None
     mean = source.statistics.total.annotations.visibility
+    if mean is None:
+        return None
     caption = f"Visible fraction of each instance's silhouette; the mean is {mean:.3f}. Invisible instances are in the first bar."
     return Chart(
         "visibility", "Visibility", caption, _histogram(rows, 1 / VISIBILITY_BINS, ("visible fraction", "instances"), ".0%", top=1.0)
@@ -251,7 +254,7 @@ def _endings(source: Source) -> Chart | None:
 def _forces(source: Source) -> Chart | None:
     groups = [(group.mode, dict(enumerate(group.episodes.force_histogram))) for group in source.statistics.groups]
     rows = [row for mode, bins in _sum_modes(groups).items() for row in _bins(list(bins.values()), FORCE_BIN, mode)]
-    if not rows:
+    if not rows or source.config is None:
         return None
     suction = source.config.suction
     rules = [_limit(suction.poor_force, "poor seal breaks", "left"), _limit(suction.good_force, "good seal breaks", "right")]

@@ -26,7 +26,6 @@ from synpick_warp.report.page import Page, Part, read_vega, render, summary
 from synpick_warp.report.sampling import (
     SURVEY_VIEWS,
     Brightness,
-    Content,
     Episodes,
     find_content,
     measure_brightness,
@@ -88,6 +87,7 @@ def write_report(
     findings = [*remarks, *find(Figures(statistics, episodes, samples.brightness, data_set.planned))]
     findings.sort(key=lambda finding: finding.level != WARNING)
     shown = statistics if (statistics.has_paper_objects if paper is None else paper) else replace(statistics, paper=())
+    config = data_set.config if data_set.found is None else None
     page = Page(
         title=data_set.folder.resolve().name or "data set",
         lead=_lead(data_set, statistics, findings),
@@ -95,7 +95,7 @@ def write_report(
         parts=_parts(data_set, shown, samples, findings, versions),
         findings=findings,
         data=samples.data,
-        charts=make_charts(Source(statistics, samples.brightness, data_set.config, _durations(data_set, episodes))),
+        charts=make_charts(Source(statistics, samples.brightness, config, _durations(data_set, episodes))),
         album=album,
         footer=f"synpick-warp {__version__}, report of {data_set.folder.resolve().name}. The page loads nothing from anywhere.",
     )
@@ -111,15 +111,15 @@ def take_samples(data_set: DataSet, statistics: Statistics, episodes: Episodes, 
     """
     data: dict[str, list[dict[str, Any]]] = {"frames": [], "strips": [], "attempts": []}
     asked = dict.fromkeys(data, 0)
-    if not statistics.total.annotations.views:
+    views = sample_views(data_set, episodes, frames) if statistics.total.annotations.views else []
+    if not any(view.has(name) for view in views for name in ("rgb", "depth")):
         return Samples(data, [], asked)
     names = {each.object_id: each.name for each in statistics.objects}
-    views = sample_views(data_set, episodes, frames)
-    content = find_content(data_set, views[0]) if views else Content(False, False, False)
+    content = find_content(views[0])
     asked["frames"] = len(views)
     for done, view in enumerate(views):
         report("frames", done, len(views))
-        scale = tote_scale(data_set.config, [view.records.camera])
+        scale = None if data_set.found else tote_scale(data_set.config, [view.records.camera])
         data["frames"] += _present(make_frame(view, content, names, episodes.rows[view.episode].mode, album, scale))
     chosen = choose_episodes(episodes)
     asked["strips"] = len(chosen)
@@ -138,10 +138,10 @@ def take_samples(data_set: DataSet, statistics: Statistics, episodes: Episodes, 
 
 def _durations(data_set: DataSet, episodes: Episodes) -> dict[str, float]:
     """Time of the longest episode of each mode [s]."""
-    physics, longest = data_set.config.physics, dict[str, int]()
+    longest = dict[str, int]()
     for row in episodes.rows.values():
         longest[row.mode] = max(longest.get(row.mode, 0), row.frames)
-    return {mode: frames * physics.step * physics.steps_per_tick for mode, frames in longest.items()}
+    return {} if data_set.period is None else {mode: frames * data_set.period for mode, frames in longest.items()}
 
 
 def _present(made: dict[str, Any] | None) -> list[dict[str, Any]]:
@@ -150,7 +150,7 @@ def _present(made: dict[str, Any] | None) -> list[dict[str, Any]]:
 
 def _measure(views: list[View], report: Report) -> list[Brightness]:
     measured = []
-    for done, view in enumerate(views):
+    for done, view in enumerate(view for view in views if view.has("rgb")):
         report("brightness", done, len(views))
         measured.append(measure_brightness(view))
     return measured
@@ -158,6 +158,8 @@ def _measure(views: list[View], report: Report) -> list[Brightness]:
 
 def _versions(data_set: DataSet) -> tuple[Mapping[str, str], list[Finding]]:
     """Versions of the packages that baked the set; a damaged manifest is a finding, as everything else can still be shown."""
+    if data_set.found is not None:
+        return {}, []
     try:
         return read_manifest(data_set.folder)["versions"], []
     except DatasetError as error:
@@ -165,11 +167,13 @@ def _versions(data_set: DataSet) -> tuple[Mapping[str, str], list[Finding]]:
 
 
 def _lead(data_set: DataSet, statistics: Statistics, findings: list[Finding]) -> Html:
-    config = data_set.config
     modes = ", ".join(dict.fromkeys(group.mode for group in statistics.groups))
     splits = ", ".join(dict.fromkeys(group.split for group in statistics.groups))
-    width, height = config.cameras.resolution
-    said = f"Modes {modes}; splits {splits}; images of {width} x {height} pixels; seed {config.bake.seed}. "
+    if data_set.found is not None:
+        said = f"No bake of synpick-warp wrote this data set; splits {splits}. "
+    else:
+        width, height = data_set.config.cameras.resolution
+        said = f"Modes {modes}; splits {splits}; images of {width} x {height} pixels; seed {data_set.config.bake.seed}. "
     return join([said, element("a", f"Findings: {summary(findings)}", href="#findings"), "."])
 
 
@@ -202,11 +206,12 @@ def _parts(data_set: DataSet, statistics: Statistics, samples: Samples, findings
             "settings",
             "Configuration",
             "Settings that differ from the preset synpick, which has the paper's values.",
-            settings_tables(data_set.config, versions),
+            settings_tables(data_set.config, versions) if data_set.found is None else element("p", _NO_SETTINGS, class_="empty"),
         ),
     ]
 
 
+_NO_SETTINGS = "No bake of synpick-warp wrote this data set: there are no settings."
 _EMPTY = {
     "frames": "This data set has no images.",
     "strips": "This data set has no images.",

@@ -39,7 +39,7 @@ def make_frame(
     Raises:
         DatasetError: A file is missing or damaged.
     """
-    color = view.rgb[..., ::-1]
+    color = show(view, scale)
     panels: list[tuple[str, str, Picture]] = [("rgb", "colour", encode_photo(shrink(color, WIDTH)))]
     ids = _instance_ids(view, content, color.shape[:2])
     if ids is not None:
@@ -71,6 +71,14 @@ def make_frame(
     }
 
 
+def show(view: View, scale: DepthScale | None = None) -> np.ndarray:
+    """Picture of a view (H, W, 3) uint8, blue first: its colour image, or else depth as false colour."""
+    if view.has("rgb") or not view.has("depth"):
+        return view.rgb[..., ::-1]
+    depth = view.depth * MILLIMETERS
+    return color_depth(depth, scale or pooled_scale([depth]))
+
+
 def _instance(view: View, index: int, names: Mapping[int, str]) -> dict[str, Any]:
     """An instance: the masks have the id index + 1. Boxes: x, y, width, height [px]; None: nothing is visible."""
     truth, info = view.records.gt[index], view.records.gt_info[index]
@@ -80,9 +88,9 @@ def _instance(view: View, index: int, names: Mapping[int, str]) -> dict[str, Any
     return {
         "name": names.get(object_id, "") or f"object {object_id}",
         "object": object_id,
-        "visible": round(float(info["visib_fract"]), 4),
+        "visible": None if np.isnan(info["visib_fract"]) else round(float(info["visib_fract"]), 4),
         "color": f"rgb({red} {green} {blue})",
-        "amodal": _box(info["bbox_obj"]) if seen else None,
+        "amodal": _box(info["bbox_obj"]) if seen and info["bbox_obj"][2] >= 0 else None,
         "modal": _box(info["bbox_visib"]) if seen else None,
     }
 

@@ -11,7 +11,6 @@ from synpick_warp.dataset.annotations import check_content
 from synpick_warp.dataset.manifest import episode_entry
 from synpick_warp.dataset.reading import DataSet
 from synpick_warp.dataset.view import View
-from synpick_warp.dataset.view_files import SceneFolder
 from synpick_warp.low_discrepancy import r2_points
 from synpick_warp.scenes.environment import LUMINANCE
 from synpick_warp.statistics.records import EpisodeFacts
@@ -57,13 +56,9 @@ class Content:
     depth: bool
 
 
-def find_content(data_set: DataSet, view: View) -> Content:
-    """Look whether a view has masks of both kinds and depth: folders of its scene; shards always have depth."""
-    files = data_set.scene_files(view.episode, view.camera)
-    if isinstance(files, SceneFolder):
-        visible, amodal, depth = (files.images(name).is_dir() for name in ("mask_visib", "mask", "depth"))
-        return Content(visible, amodal, depth)
-    return Content(data_set.config.bop.masks, data_set.config.bop.masks, True)
+def find_content(view: View) -> Content:
+    """Look whether a view's scene has masks of both kinds and depth with its scale."""
+    return Content(view.has("mask_visib"), view.has("mask"), view.has("depth") and "depth_scale" in view.records.camera)
 
 
 def spread(items: Sequence[int], count: int) -> list[int]:

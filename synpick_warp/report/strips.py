@@ -8,6 +8,7 @@ from typing import Any
 from synpick_warp.codes import Outcome
 from synpick_warp.dataset.reading import DataSet, Episode
 from synpick_warp.report.album import Album, Picture, Section, encode_photo, shrink
+from synpick_warp.report.frames import show
 from synpick_warp.report.sampling import Episodes, spread
 
 MAX_STRIPS = 4
@@ -55,7 +56,7 @@ def make_strip(data_set: DataSet, index: int, strips: int, album: Album, report:
 
     def encode(frame: int, camera: int) -> Picture:
         if (frame, camera) not in cache:
-            cache[frame, camera] = encode_photo(shrink(episode.view(frame, camera).rgb[..., ::-1], WIDTH), QUALITY)
+            cache[frame, camera] = encode_photo(shrink(show(episode.view(frame, camera)), WIDTH), QUALITY)
             report(len(cache), most)
         return cache[frame, camera]
 
@@ -69,13 +70,12 @@ def make_strip(data_set: DataSet, index: int, strips: int, album: Album, report:
     places = album.add(Section.EPISODES, [encode(frame, camera) for camera in cameras for frame in frames])
     if places is None:
         return None
-    physics = data_set.config.physics
     return {
         "episode": index,
         "mode": episode.row["mode"],
         "sentence": episode.row.get("sentence") or episode.row["ending"],
         "total": len(episode),
-        "period": physics.step * physics.steps_per_tick,
+        "period": data_set.period or 0.0,
         "frames": frames,
         "cameras": [places[camera * count : (camera + 1) * count] for camera in cameras],
         "attempts": _spans(episode),

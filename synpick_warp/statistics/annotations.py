@@ -25,7 +25,7 @@ class Annotations:
     instances: int
     """Annotated instances, the invisible ones included."""
     visibility: float | None
-    """Mean visible fraction of all instances; None: no instance."""
+    """Mean visible fraction of all instances of which it is known; None: there is none."""
     invisible: int
     """Instances without a visible pixel."""
     histogram: tuple[int, ...]
@@ -44,6 +44,8 @@ class AnnotationCounts(Counts):
     """Accumulator of `Annotations`."""
 
     views: Counter[Group] = field(default_factory=Counter)
+    known: Counter[Group] = field(default_factory=Counter)
+    """Instances whose visible fraction is known: in a data set of a bake, all."""
     visibility: Counter[Group] = field(default_factory=Counter)
     """Sum of the visible fractions [1e-9]."""
     invisible: Counter[Group] = field(default_factory=Counter)
@@ -55,9 +57,11 @@ class AnnotationCounts(Counts):
     def add_scene(self, group: Group, scene: SceneTruth) -> None:
         """Count a scene's views and instances."""
         self.views[group] += scene.frames
-        self.visibility[group] += int(np.rint(scene.visibility * _UNIT).astype(np.int64).sum())
-        self.invisible[group] += int((scene.visibility == 0.0).sum())
-        add_bins(self.bins, group, np.minimum((scene.visibility * VISIBILITY_BINS).astype(np.int64), VISIBILITY_BINS - 1))
+        visibility = scene.visibility[~np.isnan(scene.visibility)]
+        self.known[group] += len(visibility)
+        self.visibility[group] += int(np.rint(visibility * _UNIT).astype(np.int64).sum())
+        self.invisible[group] += int((visibility == 0.0).sum())
+        add_bins(self.bins, group, np.minimum((visibility * VISIBILITY_BINS).astype(np.int64), VISIBILITY_BINS - 1))
         add_bins(self.objects, group, scene.object_id)
 
     def result(self, groups: Iterable[Group]) -> Annotations:
@@ -69,7 +73,8 @@ class AnnotationCounts(Counts):
             if group in groups:
                 objects[object_id] += count
         instances = objects.total()
-        visibility = sum(self.visibility[group] for group in groups) / (_UNIT * instances) if instances else None
+        known = sum(self.known[group] for group in groups)
+        visibility = sum(self.visibility[group] for group in groups) / (_UNIT * known) if known else None
         return Annotations(
             views=sum(self.views[group] for group in groups),
             instances=instances,

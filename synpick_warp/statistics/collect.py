@@ -71,7 +71,7 @@ def collect(data_set: DataSet, depth_views: int, threads: int, report: Report | 
     for episode in data_set:
         row = found.partial.add_episode(data_set, episode)
         if _has_images(data_set, episode):
-            tasks += [SceneTask(episode, camera, row.frames) for camera in range(data_set.camera_count)]
+            tasks += [SceneTask(episode, camera, row.frames) for camera in data_set[episode].cameras]
         else:
             without += 1
     episodes = found.partial.episodes.groups()
@@ -97,7 +97,7 @@ def collect(data_set: DataSet, depth_views: int, threads: int, report: Report | 
 
 def _has_images(data_set: DataSet, episode: int) -> bool:
     try:
-        data_set.scene_files(episode, 0)
+        data_set.scene_files(episode, data_set[episode].cameras[0])
     except DatasetError:
         return False
     return True

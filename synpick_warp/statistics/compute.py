@@ -22,6 +22,8 @@ from synpick_warp.system.cores import count_cores
 
 OTHER_OBJECTS = "the objects are not those of the paper, so their distributions are not compared"
 """What is missing of data sets of other objects."""
+NOT_BAKED = "no bake wrote this data set: its scenes count as episodes, without modes, endings, attempts and times"
+"""What is missing of data sets of other programs."""
 DEPTH_VIEWS = 64
 """Views whose depth image is read."""
 
@@ -110,9 +112,7 @@ def assemble(data_set: DataSet, collected: Collected) -> Statistics:
     rows = tuple(figures(*group, [group]) for group in groups)
     total = figures("", "", groups)
     objects = _objects(data_set, collected, total.annotations)
-    kinds = {split.name: split_kind(split.folder) for split in data_set.config.splits} or {
-        data_set.config.bop.split: split_kind(data_set.config.bop.split)
-    }
+    kinds = {name: split_kind(folder) for name, folder in data_set.split_folders.items()}
     paper = compare(
         {group: row.annotations for group, row in zip(groups, rows, strict=True)},
         {group: row.episodes.episodes for group, row in zip(groups, rows, strict=True)},
@@ -128,7 +128,9 @@ def assemble(data_set: DataSet, collected: Collected) -> Statistics:
     else:
         missing += ["no depth images: no depth range"] if depth is None else []
         missing += ["scene_camera.json names no light maps"] if lights is None else []
-    if not total.episodes.attempts:
+    if data_set.found is not None:
+        missing.append(NOT_BAKED)
+    elif not total.episodes.attempts:
         missing.append("no attempts: no episode picks, so there are neither outcomes nor seal forces")
     if any(row.distance is None for row in paper):
         missing.append(OTHER_OBJECTS)
@@ -144,7 +146,7 @@ def _objects(data_set: DataSet, collected: Collected, total: Annotations) -> tup
     object_ids = sorted(known | set(total.objects))
     names: dict[int, str] = {}
     if known:
-        names = object_names(data_set.folder, data_set.config, set(object_ids))
+        names = object_names(data_set.folder, None if data_set.found else data_set.config, set(object_ids))
     elif data_set.has_store:
         names = {each.object_id: each.name for each in data_set.objects}
     return tuple(

@@ -45,7 +45,8 @@ class CoverageCounts(Counts):
 
     def add_scene(self, scene: SceneTruth) -> None:
         """Count the viewing directions of a scene's visible instances."""
-        seen = scene.visibility >= MIN_VISIBILITY
+        # Instances of which it is not known count as seen.
+        seen = ~(scene.visibility < MIN_VISIBILITY)
         code = scene.object_id[seen] * BINS + direction_bins(scene.direction[seen])
         found: Counter[tuple[int, int]] = Counter()
         add_bins(found, 0, code)

@@ -7,11 +7,10 @@ from dataclasses import dataclass, field, fields
 
 import numpy as np
 
-from synpick_warp.configs.splits import DataLayout
 from synpick_warp.dataset.annotations import check_content
 from synpick_warp.dataset.manifest import episode_entry
 from synpick_warp.dataset.reading import DataSet
-from synpick_warp.dataset.view_files import SceneFolder, check_planes
+from synpick_warp.dataset.view_files import check_planes
 from synpick_warp.errors import DatasetError
 from synpick_warp.statistics.annotations import AnnotationCounts
 from synpick_warp.statistics.attempts import EpisodeCounts
@@ -79,8 +78,8 @@ class Partial:
         self.annotations.add_scene(group, scene)
         self.coverage.add_scene(scene)
         if camera == 0:
-            physics = data_set.config.physics
-            self.timeline.add_scene(group, scene, physics.step * physics.steps_per_tick)
+            if data_set.period is not None:
+                self.timeline.add_scene(group, scene, data_set.period)
             if scene.light is not None:
                 self.lights.add_episode(scene.light)
         for frame in depth_frames:
@@ -88,13 +87,14 @@ class Partial:
 
     def _add_depth(self, scene: SceneTruth, frame: int) -> None:
         """Accumulate the histogram of a depth image; scenes without depth images are skipped."""
-        if isinstance(scene.files, SceneFolder) and not scene.files.images("depth").is_dir():
+        if not scene.files.has("depth") or np.isnan(scene.depth_scale[frame]):
             return
-        image = check_planes(scene.files.image("depth", frame), None, f"{scene.files.place}, depth of image {frame},", np.uint16.__name__)
+        image_id = scene.images[frame]
+        source = f"{scene.files.place}, depth of image {image_id},"
+        image = check_planes(scene.files.image("depth", image_id), None, source, np.uint16.__name__)
         self.depth.add_image(image, float(scene.depth_scale[frame]))
 
 
 def group_of(data_set: DataSet, episode: int, row: EpisodeFacts) -> Group:
     """Split and mode of an episode."""
-    split = DataLayout.of(data_set.config).split_of(episode)
-    return Group(data_set.config.bop.split if split is None else split.name, row.mode)
+    return Group(data_set.split_of(episode), row.mode)

@@ -7,7 +7,7 @@ from typing import Annotated
 import msgspec
 from msgspec import UNSET, Meta, UnsetType
 
-from synpick_warp.dataset.annotations import CameraEntry, Index, Length
+from synpick_warp.dataset.annotations import Index, Length, LenientCameraEntry
 
 MAX_NAME = 256
 """Longest name of a mode, an ending, an outcome, a split or a light map."""
@@ -43,7 +43,7 @@ class Light(msgspec.Struct, gc=False):
     exposure: Length
 
 
-class LitCameraEntry(CameraEntry, gc=False):
+class LitCameraEntry(LenientCameraEntry, gc=False):
     """A view's entry in scene_camera.json, with the light that data sets of others lack."""
 
     light: Light | UnsetType = UNSET

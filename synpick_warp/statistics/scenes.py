@@ -5,15 +5,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import msgspec
 import numpy as np
-from msgspec import UnsetType
+from msgspec import UNSET, UnsetType
 
-from synpick_warp.dataset.annotations import ADVICE, InfoEntry, Key, TruthEntry, check_content
+from synpick_warp.dataset.annotations import ADVICE
+from synpick_warp.dataset.bop.arrays import read_arrays
 from synpick_warp.dataset.reading import DataSet
-from synpick_warp.dataset.view_files import SceneFiles, SceneFolder
+from synpick_warp.dataset.view_files import SceneFiles
 from synpick_warp.errors import DatasetError
-from synpick_warp.inputs.json import read_json
 from synpick_warp.statistics.records import Light, LitCameraEntry
 
 
@@ -27,15 +26,17 @@ class SceneTruth:
     object_id: np.ndarray
     """obj_id (N,) int64."""
     visibility: np.ndarray
-    """Visible fraction (N,) float64."""
+    """Visible fraction (N,) float64; NaN: it is not known."""
     direction: np.ndarray
     """Unit vector from the object's origin to the camera, in the object's frame (N, 3) float64."""
     light: Light | None
     """Light of the first frame; None: it is not told."""
     depth_scale: np.ndarray
-    """Depth scale of each frame (F,) float64 [mm per count]."""
+    """Depth scale of each frame (F,) float64 [mm per count]; NaN: it has no depth."""
     files: SceneFiles
     """Reader of the scene's images."""
+    images: Sequence[int] = ()
+    """BOP's im_id of each frame."""
 
 
 def read_scene(data_set: DataSet, episode: int, camera: int) -> SceneTruth:
@@ -45,52 +46,22 @@ def read_scene(data_set: DataSet, episode: int, camera: int) -> SceneTruth:
         DatasetError: The data set has no images of it, or a file is missing or damaged.
     """
     files = data_set.scene_files(episode, camera)
-    frames = len(data_set[episode])
-    cameras, truth, infos = _read_folder(files, frames) if isinstance(files, SceneFolder) else _read_shards(files, frames)
-    for frame in range(frames):
-        if len(truth[frame]) != len(infos[frame]):
-            raise DatasetError(f"{files.place}: image {frame} has other instances in scene_gt than in scene_gt_info; {ADVICE}")
-    entries = [entry for each in truth for entry in each]
-    rotation = np.reshape(np.array([entry.cam_R_m2c for entry in entries], np.float64), (-1, 3, 3))
-    translation = np.reshape(np.array([entry.cam_t_m2c for entry in entries], np.float64), (-1, 3))
+    images = files.frames() if files.lenient else range(len(data_set[episode]))
+    arrays = read_arrays(files, images, LitCameraEntry, whole=True)
     # The camera is at the origin: R d = -t.
-    direction = -np.einsum("nji,nj->ni", rotation, translation)
+    direction = -np.einsum("nji,nj->ni", arrays.rotation, arrays.translation)
     length = np.linalg.norm(direction, axis=1, keepdims=True)
     if not (length > 0.0).all():
         raise DatasetError(f"{files.place}: an instance is at the camera, or its cam_R_m2c is no rotation; {ADVICE}")
-    light = cameras[0].light if cameras else None
+    light = arrays.cameras[0].light if arrays.cameras else UNSET
     return SceneTruth(
-        frames=frames,
-        counts=np.array([len(each) for each in truth], np.int64),
-        object_id=np.array([entry.obj_id for entry in entries], np.int64),
-        visibility=np.array([entry.visib_fract for each in infos for entry in each], np.float64),
+        frames=len(images),
+        counts=arrays.counts,
+        object_id=arrays.object_id,
+        images=images,
+        visibility=arrays.visibility,
         direction=direction / length,
         light=None if isinstance(light, UnsetType) else light,
-        depth_scale=np.array([entry.depth_scale for entry in cameras], np.float64),
+        depth_scale=np.array([np.nan if entry.depth_scale is UNSET else entry.depth_scale for entry in arrays.cameras]),
         files=files,
     )
-
-
-_Parts = tuple[Sequence[LitCameraEntry], Sequence[Sequence[TruthEntry]], Sequence[Sequence[InfoEntry]]]
-"""Entries of each frame in scene_camera.json, scene_gt.json and scene_gt_info.json."""
-
-
-def _read_folder(files: SceneFolder, frames: int) -> _Parts:
-    """Entries of a BOP folder, each file decoded once."""
-    schemas = {"camera": LitCameraEntry, "gt": list[TruthEntry], "gt_info": list[InfoEntry]}
-    parts = []
-    for name, schema in schemas.items():
-        path = files.annotations(name)
-        content = read_json(path, dict[Key, schema], DatasetError, ADVICE)  # type: ignore[valid-type]
-        if content.keys() != set(range(frames)):
-            raise DatasetError(f"{path} does not have the images 0 to {frames - 1} of its episode; {ADVICE}")
-        parts.append([content[frame] for frame in range(frames)])
-    return tuple(parts)
-
-
-def _read_shards(files: SceneFiles, frames: int) -> _Parts:
-    """Entries of the views in shards."""
-    records = [files.records(frame) for frame in range(frames)]
-    cameras = [check_content(record.camera, LitCameraEntry, files.place) for record in records]
-    truth = [msgspec.convert(record.gt, list[TruthEntry]) for record in records]
-    return cameras, truth, [msgspec.convert(record.gt_info, list[InfoEntry]) for record in records]

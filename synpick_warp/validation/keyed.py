@@ -6,11 +6,11 @@ import re
 from dataclasses import dataclass
 from functools import cached_property
 
+from synpick_warp.dataset.bop.folders import Listing
+from synpick_warp.dataset.bop.layout import KEYED, KEYS, SHARD, SceneRef
 from synpick_warp.errors import DatasetError
 from synpick_warp.inputs.json import MAX_JSON, decode_json
 from synpick_warp.inputs.tar_files import list_members
-from synpick_warp.validation.folders import Listing
-from synpick_warp.validation.layout import KEYED, KEYS, SHARD, SceneRef
 
 KEY = re.compile(r"([0-9]{6,9})_([0-9]{6,9})")
 
@@ -47,7 +47,7 @@ class KeyedFolder:
         found: dict[str, set[str] | str] = {}
         for shard in self.shards:
             try:
-                matches = (KEYED.fullmatch(name) for name, _, _ in list_members(self.listing.path(shard)))
+                matches = (KEYED.fullmatch(name) for name, _, _ in list_members(self.listing.path(shard), extended=True))
                 found[shard] = {f"{match[1]}_{match[2]}" for match in matches if match}
             except DatasetError as error:
                 found[shard] = str(error)

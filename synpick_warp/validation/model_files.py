@@ -5,14 +5,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Annotated, Any
+from typing import Any
 
-import msgspec
 import numpy as np
-from msgspec import UNSET, Struct, UnsetType
 from scipy.spatial import ConvexHull, QhullError
 
-from synpick_warp.dataset.annotations import ContinuousSymmetry, Length, Matrix4
+from synpick_warp.dataset.annotations import ModelInfo
+from synpick_warp.dataset.bop.folders import Listing
+from synpick_warp.dataset.bop.layout import MODEL_FILE
 from synpick_warp.errors import CatalogError, DatasetError
 from synpick_warp.inputs.json import decode_json
 from synpick_warp.low_discrepancy import sample_triangles
@@ -21,27 +21,11 @@ from synpick_warp.scenes.assets.meshes import read_mesh
 from synpick_warp.scenes.assets.models_info import MAX_INFO
 from synpick_warp.scenes.assets.ply import MAX_HEADER, read_ply_vertices
 from synpick_warp.scenes.types import TriangleMesh
-from synpick_warp.validation.folders import Listing
-from synpick_warp.validation.layout import MODEL_FILE
 from synpick_warp.validation.schemas import convert
 
 _CHUNK = 512
 """Points whose distances to all others are computed at a time."""
 _MILLIMETRE = 1e-3
-
-
-class InfoEntry(Struct, gc=False):
-    """An object's entry in models_info.json [mm]."""
-
-    diameter: Annotated[float, msgspec.Meta(gt=0.0, le=1e9)]
-    min_x: Length
-    min_y: Length
-    min_z: Length
-    size_x: Length
-    size_y: Length
-    size_z: Length
-    symmetries_discrete: list[Matrix4] | UnsetType = UNSET
-    symmetries_continuous: list[ContinuousSymmetry] | UnsetType = UNSET
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,13 +74,13 @@ class ModelSubject:
         return self.folder.listing.name("models_info.json")
 
     @cached_property
-    def entry(self) -> tuple[InfoEntry | None, str]:
+    def entry(self) -> tuple[ModelInfo | None, str]:
         """Entry in models_info.json, and what is wrong with it."""
         found = self.folder.info[0].get(str(self.obj_id))
         if found is None:
             return None, "no entry" if self.folder.info[0] else ""
         try:
-            return convert(found, InfoEntry), ""
+            return convert(found, ModelInfo), ""
         except ValueError as fault:
             return None, str(fault)
 

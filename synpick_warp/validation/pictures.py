@@ -1,64 +1,18 @@
-"""Image decoding for validation: PNG, JPEG and TIFF, with the bit depth and colour type that the file states; masks as crops."""
+"""Masks for validation, as crops, with the bit depth and colour type that the file states."""
 
 from __future__ import annotations
 
-import struct
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
 
 from synpick_warp.errors import DatasetError
-from synpick_warp.inputs.image_files import MAX_SIDE, decode_image
+from synpick_warp.inputs.image_files import decode_picture
 
 _PNG = b"\x89PNG\r\n\x1a\n"
-_TIFF = {b"II*\0": "<", b"MM\0*": ">"}
-"""Byte order of a TIFF file by its signature (TIFF 6.0, section 2)."""
-_WIDTH, _HEIGHT = 256, 257
-"""Tags ImageWidth and ImageLength."""
-_TYPES = {3: "H", 4: "I"}
-"""Field types SHORT and LONG."""
 _COLOUR_TYPES = {0: "greyscale", 2: "RGB", 3: "palette", 4: "greyscale with alpha", 6: "RGB with alpha"}
 """PNG specification, table 11.1."""
-
-
-def tiff_size(data: bytes) -> tuple[int, int] | None:
-    """Width and height [px] that the first image of a TIFF file states; None: it is no TIFF file, or damaged."""
-    order = _TIFF.get(data[:4])
-    if order is None or len(data) < 8:
-        return None
-    start = struct.unpack_from(f"{order}I", data, 4)[0]
-    if start + 2 > len(data):
-        return None
-    found: dict[int, int] = {}
-    for index in range(struct.unpack_from(f"{order}H", data, start)[0]):
-        place = start + 2 + 12 * index
-        if place + 12 > len(data):
-            return None
-        tag, kind, count = struct.unpack_from(f"{order}HHI", data, place)
-        if tag in (_WIDTH, _HEIGHT) and kind in _TYPES and count == 1:
-            found[tag] = struct.unpack_from(f"{order}{_TYPES[kind]}", data, place + 8)[0]
-    return (found[_WIDTH], found[_HEIGHT]) if len(found) == 2 else None
-
-
-def decode_picture(data: bytes, source: str) -> np.ndarray:
-    """Decode a PNG, JPEG or TIFF file without conversion (H, W[, C]), blue first.
-
-    Raises:
-        DatasetError: It is not such an image, or larger than MAX_SIDE.
-    """
-    if data[:4] not in _TIFF:
-        return decode_image(data, source, DatasetError)
-    size = tiff_size(data)
-    if size is None or not (min(size) > 0 and max(size) <= MAX_SIDE):
-        raise DatasetError(f"{source} is not a TIFF image of up to {MAX_SIDE} x {MAX_SIDE} pixels")
-    try:
-        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
-    except cv2.error:
-        image = None
-    if image is None or image.shape[1::-1] != size:
-        raise DatasetError(f"{source} is not an image that OpenCV can decode")
-    return image
 
 
 def png_type(data: bytes) -> tuple[int, str] | None:
@@ -109,7 +63,7 @@ class Mask:
 
 def decode_mask(data: bytes, file: str) -> Mask:
     """Decode a mask; raises as `decode_picture`."""
-    image = decode_picture(data, file)
+    image = decode_picture(data, file, DatasetError)
     size, kind = (image.shape[1], image.shape[0]), png_type(data)
     if image.ndim != 2 or image.dtype != np.uint8:
         flat = np.asarray(image.reshape(*image.shape[:2], -1).any(axis=2))

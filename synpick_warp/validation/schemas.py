@@ -87,15 +87,6 @@ class Coco(Struct, gc=False):
     categories: list[Category]
 
 
-class Target(Struct, gc=False):
-    """A record of a target list; those of 2024 have neither object nor count."""
-
-    scene_id: Index
-    im_id: Index | list[Any]
-    obj_id: Index | UnsetType = UNSET
-    inst_count: Index | UnsetType = UNSET
-
-
 RECORDS: dict[str, Any] = {"camera": Camera, "gt": list[Truth], "gt_info": list[Info]}
 """Schema of an image's entry by file."""
 

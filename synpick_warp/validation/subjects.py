@@ -9,11 +9,11 @@ from typing import Any
 
 import numpy as np
 
+from synpick_warp.dataset.bop.layout import Layout
 from synpick_warp.errors import DatasetError
-from synpick_warp.inputs.image_files import MAX_IMAGE_FILE
-from synpick_warp.validation.layout import Layout
-from synpick_warp.validation.pictures import Mask, decode_picture, png_type
-from synpick_warp.validation.scene_files import RecordFile, SceneFiles
+from synpick_warp.inputs.image_files import MAX_IMAGE_FILE, decode_picture
+from synpick_warp.validation.pictures import Mask, png_type
+from synpick_warp.validation.scene_files import CheckedScene, RecordFile
 from synpick_warp.validation.schemas import Annotation, Camera, Coco, Info, Truth
 
 COLOURS = ("rgb", "gray")
@@ -54,7 +54,7 @@ class SceneSubject:
     """A scene as one sensor sees it."""
 
     layout: Layout
-    files: SceneFiles
+    files: CheckedScene
     targets: Mapping[str, Mapping[int, Any]] = field(default_factory=dict)
     """Records of each target list about this scene: by image, its records."""
 
@@ -186,7 +186,7 @@ class ViewSubject:
 
     def _decode(self, file: str, data: bytes) -> np.ndarray | None:
         try:
-            return decode_picture(data, file)
+            return decode_picture(data, file, DatasetError)
         except DatasetError as error:
             self.faults.append((file, str(error)))
             return None

@@ -5,17 +5,17 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from functools import cached_property
 
+from synpick_warp.dataset.annotations import TargetEntry
+from synpick_warp.dataset.bop.layout import TARGETS, Layout, is_index
 from synpick_warp.errors import DatasetError
 from synpick_warp.inputs.json import MAX_JSON, decode_json
-from synpick_warp.validation.layout import TARGETS, Layout, is_index
-from synpick_warp.validation.schemas import Target
 
 
 @dataclass(frozen=True)
 class TargetList:
     """A target list."""
 
-    scenes: dict[int, dict[int, list[Target]]] = field(default_factory=dict)
+    scenes: dict[int, dict[int, list[TargetEntry]]] = field(default_factory=dict)
     """Records by scene and image. Records of several views, as in multi-view lists, are under no image."""
     fault: str = ""
     """What is wrong with the file."""
@@ -35,10 +35,10 @@ class TargetLists:
 
     def _read(self, name: str) -> TargetList:
         try:
-            records = decode_json(self.layout.listing.read(name, MAX_JSON), list[Target], name, DatasetError)
+            records = decode_json(self.layout.listing.read(name, MAX_JSON), list[TargetEntry], name, DatasetError)
         except DatasetError as error:
             return TargetList(fault=str(error))
-        scenes: dict[int, dict[int, list[Target]]] = {}
+        scenes: dict[int, dict[int, list[TargetEntry]]] = {}
         for record in records:
             images = scenes.setdefault(record.scene_id, {})
             if isinstance(record.im_id, int):
@@ -63,6 +63,6 @@ class TargetLists:
             return set(self.lists[name].scenes)
         return {int(folder) for split in splits for folder in self.layout.splits[split].folders if folder.isdecimal()}
 
-    def of_scene(self, split: str, scene: int) -> dict[str, dict[int, list[Target]]]:
+    def of_scene(self, split: str, scene: int) -> dict[str, dict[int, list[TargetEntry]]]:
         """Records about a scene: by list and image."""
         return {name: found.scenes[scene] for name, found in self.lists.items() if scene in found.scenes and split in self.splits(name)}

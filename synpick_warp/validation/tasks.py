@@ -7,8 +7,8 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
-from synpick_warp.validation.folders import Listing
-from synpick_warp.validation.layout import Layout, SceneRef
+from synpick_warp.dataset.bop.folders import Listing
+from synpick_warp.dataset.bop.layout import Layout, SceneRef
 from synpick_warp.validation.model_files import ModelsFolder, ModelSubject
 from synpick_warp.validation.registry import Violation, apply_rules
 from synpick_warp.validation.rules.rig import RigSubject

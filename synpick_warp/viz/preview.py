@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import contextlib
 import itertools
-import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -17,10 +16,11 @@ import numpy as np
 from synpick_warp.configs.load import load_config
 from synpick_warp.configs.schema import Config
 from synpick_warp.configs.splits import DataLayout
-from synpick_warp.dataset.annotations import SCENE_SCHEMAS, read_checked
+from synpick_warp.dataset.bop.layout import NoLayoutError
+from synpick_warp.dataset.bop.scenes import FoundScenes
 from synpick_warp.dataset.manifest import CONFIG_FILE, episode_entry, read_entry
 from synpick_warp.dataset.object_names import object_names
-from synpick_warp.dataset.view_files import SceneFolder, check_planes, read_image
+from synpick_warp.dataset.view_files import SceneFiles, check_planes
 from synpick_warp.errors import DatasetError, OutputError, SynpickError
 from synpick_warp.viz.depth_colors import DepthScale, color_depth, describe_depth, pooled_scale, tote_scale
 from synpick_warp.viz.drawing import GOLDEN, Image, check_picture_name, instance_color, put_text, write_picture
@@ -39,24 +39,22 @@ _GAP = 4
 """Gap between images [px]."""
 _MIN_LEGEND = 120
 """Minimum height of a row without its caption [px], for the legend of low images."""
-_SENSOR = re.compile(r"(_[A-Za-z0-9_]+)?")
-"""Suffix of a sensor's files; empty: classic layout."""
 
 
-class Scene(NamedTuple):
-    """A scene as one camera sees it: a folder, or with several sensors the files of one of them."""
+@dataclass(frozen=True, order=True)
+class Scene:
+    """A scene as one camera sees it: a folder, with several sensors the files of one of them, or members of shards."""
 
     folder: Path
+    """Of members: SPLIT/SCENE, which does not exist."""
     sensor: str = ""
     """Suffix of the sensor's folders and files, such as "_cam1"; empty: classic layout."""
+    files: Callable[[], SceneFiles] = field(compare=False, repr=False, kw_only=True)
+    """Opens it; what others leave out may be missing."""
 
     def images(self, name: str) -> Path:
         """Folder of one kind of images, such as "rgb"."""
         return self.folder / f"{name}{self.sensor}"
-
-    def annotations(self) -> Path:
-        """File of the cameras."""
-        return self.folder / f"scene_camera{self.sensor}.json"
 
 
 @dataclass(frozen=True)
@@ -67,6 +65,7 @@ class _View:
     """Record of scene_camera."""
     truth: list[tuple[dict[str, Any], dict[str, Any]]]
     """Records of scene_gt and scene_gt_info, per instance."""
+    files: SceneFiles
 
 
 def write_contact_sheet(dataset: Path, out: Path, views: int) -> Path:
@@ -87,7 +86,7 @@ def write_contact_sheet(dataset: Path, out: Path, views: int) -> Path:
     shown = list(_read_views(sample(find_scenes(dataset), views)))
     baked = read_baked(dataset, {record["obj_id"] for view in shown for record, _ in view.truth})
     scale = tote_scale(baked.config, [view.camera for view in shown]) if baked.config else None
-    scale = scale or pooled_scale(_read_depth(view) for view in shown)
+    scale = scale or pooled_scale(depth for view in shown if (depth := _read_depth(view)) is not None)
     most = max(len(view.truth) for view in shown)
     rows = [_row(view, scale, baked, most) for view in shown]
     width = max(row.shape[1] for row in rows)
@@ -138,13 +137,16 @@ def find_scenes(dataset: Path) -> list[Scene]:
     Raises:
         DatasetError: There is none.
     """
-    if not dataset.is_dir():
-        raise DatasetError(f"there is no folder {dataset}; name the folder of a BOP data set")
-    files = [path for path in dataset.glob("[!.]*/*/scene_camera*.json") if path.parent.name.isdecimal()]
-    scenes = sorted(Scene(path.parent, sensor) for path in files if _SENSOR.fullmatch(sensor := path.stem.removeprefix("scene_camera")))
-    if not scenes:
-        raise DatasetError(f"{dataset} has no complete scene; a BOP data set has folders such as train_pbr/000000 with a scene_camera.json")
-    return scenes
+    try:
+        found = FoundScenes(dataset)
+    except NoLayoutError:
+        if not dataset.is_dir():
+            raise
+        example = "a BOP data set has folders such as train_pbr/000000 with a scene_camera.json"
+        raise DatasetError(f"{dataset} has no complete scene; {example}") from None
+    return sorted(
+        Scene(dataset / ref.split / (ref.name or f"{ref.scene:06d}"), ref.sensor, files=partial(found.open, ref)) for ref in found.refs()
+    )
 
 
 def sample(scenes: list[Scene], views: int) -> list[tuple[Scene, int]]:
@@ -158,11 +160,12 @@ def sample(scenes: list[Scene], views: int) -> list[tuple[Scene, int]]:
     """
     by_camera: dict[tuple[float, ...], list[tuple[Scene, list[int]]]] = {}
     for scene in scenes:
-        cameras = read_checked(scene.annotations(), SCENE_SCHEMAS["camera"])
-        if cameras:
-            first = cameras[min(cameras)]
+        files = scene.files()
+        frames = files.frames()
+        if frames:
+            first = files.camera(frames[0])
             group = by_camera.setdefault((*first.get("cam_R_w2c", ()), *first.get("cam_t_w2c", ())), [])
-            group.append((scene, sorted(cameras)))
+            group.append((scene, list(frames)))
     groups = list(by_camera.values())
     if not groups:
         raise DatasetError(f"no scene in {scenes[0].folder.parent} has a view; bake the data set again")
@@ -183,29 +186,32 @@ def sample(scenes: list[Scene], views: int) -> list[tuple[Scene, int]]:
 def _read_views(samples: list[tuple[Scene, int]]) -> Iterator[_View]:
     """Read the annotations of views, which are sorted by scene: those of each scene once."""
     for scene, group in itertools.groupby(samples, key=lambda one: one[0]):
-        files = SceneFolder(scene.folder, suffix=scene.sensor)
+        files = scene.files()
         for _, frame in group:
             camera, truth, infos = files.records(frame)
-            yield _View(scene, frame, camera, list(zip(truth, infos, strict=True)))
+            yield _View(scene, frame, camera, list(zip(truth, infos, strict=True)), files)
 
 
-def _read_depth(view: _View, size: tuple[int, int] | None = None) -> np.ndarray:
-    """Depth image of a view [mm]; `size` is the width and height that it must have [px]."""
-    stem = f"{view.frame:06d}"
-    counts = read_image(view.scene.images("depth"), stem, cv2.IMREAD_UNCHANGED, size)
-    return check_planes(counts, None, f"{view.scene.images('depth') / stem}.png") * float(view.camera["depth_scale"])
+def _read_depth(view: _View) -> np.ndarray | None:
+    """Depth image of a view [mm]; None: it has none."""
+    if not view.files.has("depth") or "depth_scale" not in view.camera:
+        return None
+    counts = check_planes(view.files.image("depth", view.frame), None, f"{view.scene.images('depth')}/{view.frame:06d}")
+    return counts * float(view.camera["depth_scale"])
 
 
 def _row(view: _View, depth_scale: DepthScale | None, baked: Baked, most: int) -> Image:
     """Draw all panels of a view side by side; `most` is the largest number of instances of all views."""
-    folder, sensor = view.scene
-    color = read_image(view.scene.images("rgb"), f"{view.frame:06d}", cv2.IMREAD_COLOR)
+    folder, sensor = view.scene.folder, view.scene.sensor
+    depth = _read_depth(view)
+    colored = None if depth is None else color_depth(depth, depth_scale)
+    color = view.files.image("rgb", view.frame) if view.files.has("rgb") or colored is None else colored
     size = color.shape[1::-1]
-    depth = _read_depth(view, size)
+    colored = _placeholder(color, "no depth in this data set") if colored is None else colored
     facts = baked.facts(view.scene, view.frame, view.camera)
     panels: list[tuple[str, Callable[[float], Image]]] = [
         (facts[0], lambda scale: _fit(color, scale)),
-        (f"{describe_depth(depth_scale)}; one scale", lambda scale: _fit(color_depth(depth, depth_scale), scale, smooth=False)),
+        (f"{describe_depth(depth_scale)}; one scale", lambda scale: _fit(colored, scale, smooth=False)),
         (_instances_caption(view), lambda scale: _fit(_color_instances(view, color), scale, smooth=False)),
         ("boxes: amodal thin, visible thick", lambda scale: _draw_boxes(view, _fit(color, scale), scale)),
         (
@@ -213,7 +219,8 @@ def _row(view: _View, depth_scale: DepthScale | None, baked: Baked, most: int) -
             lambda scale: _draw_legend(view, facts[1:], baked, max(_MIN_LEGEND, round(size[1] * scale)), most),
         ),
     ]
-    counts = depth_scale and DepthScale(*(each / float(view.camera["depth_scale"]) for each in depth_scale))
+    count = float(view.camera.get("depth_scale", 1.0))
+    counts = depth_scale and DepthScale(*(each / count for each in depth_scale))
     layers = layer_pictures(folder, view.frame, size, sensor, counts)
     panels += [(caption, partial(_fit, picture, smooth=False)) for caption, picture in layers]
     scale = min(_PANEL_WIDTH / size[0], _MAX_PANEL_HEIGHT / size[1])
@@ -249,13 +256,17 @@ def _color_instances(view: _View, color: Image) -> Image:
     """Visible masks in their instances' colours over the darkened grey image."""
     grey = cv2.cvtColor(color, cv2.COLOR_BGR2GRAY) // 3
     drawn = np.repeat(grey[..., None], 3, axis=2)
-    folder = view.scene.images("mask_visib")
-    if not folder.is_dir():
-        put_text(drawn, "no masks in this data set", (8, 24), 0.5, (230, 230, 230))
-        return drawn
+    if not view.files.has("mask_visib"):
+        return _placeholder(color, "no masks in this data set")
     for index, (record, _) in enumerate(view.truth):
-        mask = read_image(folder, f"{view.frame:06d}_{index:06d}", cv2.IMREAD_GRAYSCALE, color.shape[1::-1])
-        drawn[mask > 0] = instance_color(record.get("instance_id", index))
+        drawn[view.files.mask("mask_visib", view.frame, index)] = instance_color(record.get("instance_id", index))
+    return drawn
+
+
+def _placeholder(color: Image, text: str) -> Image:
+    """The darkened grey image with a text, in the place of a picture."""
+    drawn = np.repeat(cv2.cvtColor(color, cv2.COLOR_BGR2GRAY)[..., None] // 3, 3, axis=2)
+    put_text(drawn, text, (8, 24), 0.5, (230, 230, 230))
     return drawn
 
 
@@ -268,6 +279,8 @@ def _draw_boxes(view: _View, image: Image, scale: float) -> Image:
         color = instance_color(record.get("instance_id", index))
         for name, thickness in (("bbox_obj", 1), ("bbox_visib", 2)):
             x, y, width, height = info[name]
+            if width < 0:
+                continue
             # BOP's boxes end with their last pixel; OpenCV takes corner coordinates, hence + 1.
             first, second = ((round(scale * u), round(scale * v)) for u, v in ((x, y), (x + width + 1, y + height + 1)))
             cv2.rectangle(image, first, second, color, thickness)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
@@ -147,7 +148,7 @@ def draw_legend(
     for row, fact in enumerate(facts):
         put_text(panel, shorten(fact, size[0] - 12, _TEXT), (6, LINE * (row + 1) - 3), _TEXT, PAPER)
     texts = label_texts(truth)
-    order = sorted(range(len(truth)), key=lambda index: (-truth[index][1]["visib_fract"], index))
+    order = sorted(range(len(truth)), key=lambda index: (-np.nan_to_num(truth[index][1]["visib_fract"]), index))
     top, rows, columns = LINE * len(facts) + _SPACE, _rows(size[1], len(facts)), size[0] // COLUMN
     shown = order if len(order) <= rows * columns else order[: rows * columns - 1]
     for place, index in enumerate(shown):
@@ -157,7 +158,8 @@ def draw_legend(
         _put_label(panel, texts[index], Box(x, y, max(_SWATCH, text_size(texts[index], LABEL)[0] + 2 * _PAD), LINE - 3), color)
         name = names.get(record["obj_id"], "") or f"object {record['obj_id']}"
         hidden = info["px_count_visib"] == 0
-        seen = "hidden" if hidden else f"{info['visib_fract']:.2f}"
+        unknown = math.isnan(info["visib_fract"])
+        seen = "" if unknown else "hidden" if hidden else f"{info['visib_fract']:.2f}"
         put_text(panel, seen, (x + _SWATCH + 8, y + LINE - 6), _TEXT, SOFT)
         put_text(panel, shorten(name, COLUMN - _SWATCH - 58, _TEXT), (x + _SWATCH + 48, y + LINE - 6), _TEXT, SOFT if hidden else PAPER)
     if len(shown) < len(order):

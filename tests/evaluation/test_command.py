@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import json
 import shlex
 import shutil
@@ -103,9 +102,9 @@ def test_the_toolkits_command_has_the_names_that_the_toolkit_parses(folder, file
 
 def test_the_toolkit_gets_results_of_the_first_sensor_with_the_ids_of_its_scenes(folder, files, tmp_path):
     data = synpick_warp.open(folder)
-    config = dataclasses.replace(data.config, bop=dataclasses.replace(data.config.bop, layout="multisensor"))
     source = shutil.copy(files[0], tmp_path / "icg.csv")
-    lines = toolkit_command(SimpleNamespace(folder=folder, config=config), [source]).splitlines()
+    several = SimpleNamespace(folder=folder, sensors=("cam0", "cam1", "cam2"), split_folders=data.split_folders)
+    lines = toolkit_command(several, [source]).splitlines()
     assert "scripts/eval_bop24_pose.py" in lines[-1]
     assert lines[-1].endswith("--result_filenames=icg_synpick-train-pbr.csv --targets_filename=test_targets_bop24.json")
     subprocess.run(["bash", "-c", lines[-2]], check=True)

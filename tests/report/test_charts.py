@@ -121,5 +121,5 @@ def test_views_are_sampled_evenly_and_distinct(data):
     assert sorted(frame * 24 // 100 for _, frame, _ in many) == list(range(24))
     assert np.bincount([camera for _, _, camera in many]).tolist() == [8, 8, 8]
     view = opened[0].view(0)
-    assert find_content(opened, view).masks
+    assert find_content(view).masks
     assert measure_brightness(view).mean == pytest.approx(float((view.rgb[::4, ::4] @ [0.2126, 0.7152, 0.0722]).mean()) / 255, abs=1e-4)

@@ -174,9 +174,8 @@ def test_a_damaged_file_is_named_in_one_line(copy, tmp_path, capsys, file, conte
 
 def test_folders_that_are_no_data_set_are_named_in_one_line(copy, tmp_path, capsys):
     assert refused(capsys, tmp_path / "gone").startswith(f"{tmp_path / 'gone'} is not a data set")
-    (copy / "manifest.json").unlink()
-    shutil.rmtree(copy / "trajectory.zarr")
-    assert refused(capsys, copy).startswith(f"{copy} is not a data set: it has neither manifest.json nor")
+    (tmp_path / "empty").mkdir()
+    assert refused(capsys, tmp_path / "empty").startswith(f"{tmp_path / 'empty'} is not a data set: it has neither manifest.json nor")
 
 
 def test_wrong_options_are_named_in_one_line(folder, tmp_path, capsys):

@@ -10,9 +10,10 @@ from hypothesis import strategies as st
 from scipy.spatial.distance import pdist
 
 from synpick_warp.errors import DatasetError
+from synpick_warp.inputs.image_files import decode_picture, tiff_size
 from synpick_warp.validation.comparison import best_shift, fit_masks, moved
 from synpick_warp.validation.model_files import diameter, sample_area, turn_about
-from synpick_warp.validation.pictures import crop_mask, decode_mask, decode_picture, png_type, tiff_size
+from synpick_warp.validation.pictures import crop_mask, decode_mask, png_type
 from synpick_warp.validation.rules.coco import run_lengths
 
 masks = st.integers(0, 2**32 - 1).map(lambda seed: np.random.default_rng(seed).random((7, 9)) < 0.3)
@@ -88,9 +89,9 @@ def test_tiff_images_decode_and_state_their_size(dtype):
     image = np.random.default_rng(0).integers(0, np.iinfo(dtype).max, (31, 47)).astype(dtype)
     data = cv2.imencode(".tif", image)[1].tobytes()
     assert tiff_size(data) == (47, 31)
-    np.testing.assert_array_equal(decode_picture(data, "x.tif"), image)
+    np.testing.assert_array_equal(decode_picture(data, "x.tif", DatasetError), image)
     with pytest.raises(DatasetError):
-        decode_picture(data[:40], "x.tif")
+        decode_picture(data[:40], "x.tif", DatasetError)
 
 
 def test_types_of_masks():

@@ -67,7 +67,7 @@ def test_layers_get_columns_of_their_own(dataset, tmp_path):
         "flow": flow,
         "scene_flow": np.full((*shape, 3), np.nan, np.float32),
     }
-    for scene, _ in find_scenes(dataset):
+    for scene in (each.folder for each in find_scenes(dataset)):
         for name, layer in values.items():
             (scene / name).mkdir()
             for frame in range(FRAMES):
@@ -153,7 +153,7 @@ def test_depth_has_one_scale_the_totes(dataset, tmp_path):
     """The depth range is one for all views: from the rim's corner nearest to a camera to the floor's farthest corner."""
     (dataset / "config.toml").write_text(config_to_toml(config()))
     views = sample(find_scenes(dataset), 6)
-    records = [json.loads(scene.annotations().read_text())[str(frame)] for scene, frame in views]
+    records = [scene.files().camera(frame) for scene, frame in views]
     near, far = tote_scale(read_baked(dataset, set()).config, records)
     tote = config().tote
     heights = {"near": tote.outer_size[2] - tote.wall, "far": 0.0}
@@ -227,7 +227,7 @@ def test_folders_that_are_no_data_set(tmp_path):
             r"scene_gt_info\.json is damaged: input data was truncated; restore the file",
         ),
         (lambda scene: (scene / "scene_gt.json").write_text(json.dumps({"0": []})), "do not agree about image"),
-        (lambda scene: shutil.rmtree(scene / "rgb"), r"there is no .*rgb/.*\.png or \.jpg"),
+        (lambda scene: [shutil.rmtree(scene / name) for name in ("rgb", "depth")], r"there is no .*rgb/.*\.png or \.jpg"),
         (lambda scene: [path.write_bytes(b"") for path in (scene / "depth").iterdir()], "is not an image"),
     ],
 )

@@ -84,10 +84,10 @@ class BopExporter(SceneExporter):
     def _stage_scene(self, scene: Path) -> None:
         create_scene_folders(scene, self._bop.masks, self._layers)
 
-    def _commit_task(self, scenes: tuple[tuple[Path, int], ...], frames: int) -> tuple[Callable[..., None], tuple[Any, ...]]:
+    def _commit_task(self, scenes: tuple[tuple[Path, int], ...], images: Sequence[int]) -> tuple[Callable[..., None], tuple[Any, ...]]:
         settings = SceneSettings(
             split=self._context.layout.folder(scenes[0][1] // len(self._cameras)),
-            frames=frames,
+            images=images,
             width=self._cameras[0].width,
             height=self._cameras[0].height,
             color_suffix=self._suffix,

@@ -8,7 +8,7 @@ from __future__ import annotations
 import itertools
 import json
 import os
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -34,8 +34,8 @@ class SceneSettings:
 
     split: str
     """Name of the split's folder."""
-    frames: int
-    """Number of frames that each scene must have."""
+    images: Sequence[int]
+    """Images (im_id) that each scene must have, ascending."""
     width: int
     height: int
     color_suffix: str
@@ -122,7 +122,7 @@ def complete_scene(scene: Path, settings: SceneSettings) -> None:
     """Write the JSON files of a staged scene from its annotation blocks, and sync its folders to disk."""
     with (scene / ANNOTATIONS).open("rb") as file:
         blocks = AnnotationBlocks(file)
-        blocks.check_frames(scene, settings.frames)
+        blocks.check_frames(scene, settings.images)
         names = ("scene_camera.json", "scene_gt.json", "scene_gt_info.json")
         for index, name in enumerate(names):
             _write_lines(scene / name, _format_keyed(blocks, index))
@@ -150,14 +150,14 @@ class AnnotationBlocks:
             file.seek(end)
         self.frames.sort()
 
-    def check_frames(self, scene: Path, frames: int) -> None:
-        """Check that there is one block of each frame.
+    def check_frames(self, scene: Path, images: Sequence[int]) -> None:
+        """Check that there is one block of each image.
 
         Raises:
             OutputError: There is not.
         """
-        if self.frames != list(range(frames)):
-            raise OutputError(f"{scene} has {len(self.frames)} of {frames} frames; this is an error of synpick-warp, please report it")
+        if self.frames != list(images):
+            raise OutputError(f"{scene} has {len(self.frames)} of {len(images)} frames; this is an error of synpick-warp, please report it")
 
     def read(self, frame: int, begin: int, end: int | None) -> Iterator[str]:
         """Read entries `begin` to `end`, exclusive, of a frame."""

@@ -104,8 +104,8 @@ class SceneExporter(EpisodeExporter[tuple[Path, ...]]):
         """Create the staging folder of a scene, and its subfolders."""
 
     @abstractmethod
-    def _commit_task(self, scenes: tuple[tuple[Path, int], ...], frames: int) -> tuple[Callable[..., None], tuple[Any, ...]]:
-        """Task that completes scenes of `frames` frames, given as (staging folder, scene_id), and moves them to their places."""
+    def _commit_task(self, scenes: tuple[tuple[Path, int], ...], images: Sequence[int]) -> tuple[Callable[..., None], tuple[Any, ...]]:
+        """Task that completes scenes of these images (im_id), given as (staging folder, scene_id), and moves them to their places."""
 
     @abstractmethod
     def files(self, episode: int) -> list[Path]:
@@ -170,6 +170,6 @@ class SceneExporter(EpisodeExporter[tuple[Path, ...]]):
     def _commit(self, episode: _Staged, end: EpisodeEnd) -> WriteTask:
         first = self.scene_id(end.episode, 0)
         function, arguments = self._commit_task(
-            tuple(zip(episode.content, range(first, first + len(self._cameras)), strict=True)), end.frames
+            tuple(zip(episode.content, range(first, first + len(self._cameras)), strict=True)), end.images
         )
         return WriteTask(function, (), arguments, self._folder(first) / f"{first:06d}")

@@ -8,7 +8,7 @@ const cards = [];
 
 function frameCaption(frame) {
   const light = frame.light ? `, light ${frame.light}` : "";
-  const visible = frame.instances.filter((one) => one.visible > 0).length;
+  const visible = frame.instances.filter((one) => one.visible !== 0).length;
   return el("figcaption", {}, el("b", {}, `Episode ${frame.episode} (${frame.mode}), frame ${frame.frame}, camera ${frame.camera}`),
     `${light}. ${visible} of ${frame.instances.length} instances visible. `, el("span", { class: "shown" }));
 }
@@ -58,7 +58,7 @@ function frameCard(frame, opened) {
     const row = Math.min(canvas.height - 1, Math.max(0, Math.floor((event.clientY - place.top) / place.height * canvas.height)));
     const id = card.ids.ids[row * canvas.width + column];
     const one = frame.instances[id - 1];
-    showTip(one ? `${one.name}: ${(100 * one.visible).toFixed(0)} % visible` : null, event);
+    showTip(one && (one.visible === null ? one.name : `${one.name}: ${(100 * one.visible).toFixed(0)} % visible`), event);
     if (id !== card.hovered) { card.hovered = id; card.drawMasks(); }
   });
   stage.addEventListener("pointerleave", () => { showTip(null); card.hovered = 0; card.drawMasks(); });

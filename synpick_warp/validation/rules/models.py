@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 from scipy.spatial import KDTree
 
-from synpick_warp.validation.layout import MODEL_FILE
+from synpick_warp.dataset.bop.layout import MODEL_FILE
 from synpick_warp.validation.model_files import ModelsFolder, ModelSubject, diameter, sample_area, turn_about
 from synpick_warp.validation.registry import Level, rule
 

@@ -6,9 +6,10 @@ Runs in writer processes, so it imports neither Warp nor Newton.
 from __future__ import annotations
 
 import json
+import math
 import os
 import shutil
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -34,6 +35,8 @@ FOLDER = Path("coco")
 """Folder in the data set."""
 IMAGES, PARTS, CATEGORIES = FOLDER / "images", FOLDER / "parts", FOLDER / "categories.json"
 """Images in a folder a scene, annotations of each scene, names of the objects. Splits share them, as scene ids are unique over all."""
+_Line: Any = list[dict[str, Any]] | None
+"""A line of a part."""
 _ADVICE = "remove it and its episode's two files in manifest/, and resume the bake"
 
 
@@ -93,9 +96,7 @@ def _make_annotations(view: EncodedView, settings: ViewSettings) -> Iterator[dic
                 "area": mask.visible.count,
                 "iscrowd": 0,
                 "segmentation": _make_polygons(mask.visible) if settings.polygons else make_rle(mask.visible, height, width),
-                "bbox_amodal": [*info["bbox_obj"][:2], *(size + 1 for size in info["bbox_obj"][2:])],
-                "visib_fract": info["visib_fract"],
-                "instance_id": pose["instance_id"],
+                **_make_extras(pose, info),
             } | points
 
 
@@ -104,17 +105,27 @@ def _make_polygons(mask: Runs) -> list[list[float]]:
     return [polygon.points.ravel().tolist() for polygon in trace_outlines(mask)]
 
 
-def commit_scenes(scenes: tuple[tuple[Path, int], ...], out: Path, frames: int) -> None:
-    """Task: complete an episode's scenes, (staging folder, scene_id): a line of annotations per frame, and rename all to their places.
+def _make_extras(pose: Mapping[str, Any], info: Mapping[str, Any]) -> dict[str, Any]:
+    """Keys of ours of an annotation; data sets of others may not know them."""
+    extras = {} if math.isnan(info["visib_fract"]) else {"visib_fract": info["visib_fract"]}
+    if extras:
+        extras = {"bbox_amodal": [*info["bbox_obj"][:2], *(size + 1 for size in info["bbox_obj"][2:])], **extras}
+    return extras | ({"instance_id": pose["instance_id"]} if "instance_id" in pose else {})
+
+
+def commit_scenes(scenes: tuple[tuple[Path, int], ...], out: Path, frames: Sequence[int]) -> None:
+    """Task: complete an episode's scenes, (staging folder, scene_id): a line of annotations for each frame, null for im_ids that sets of
+    others leave out, and rename all to their places.
 
     Raises:
-        OutputError: Fewer than `frames` frames of a scene have arrived.
+        OutputError: Not all `frames` (im_id) of a scene have arrived.
     """
     for scene, scene_id in scenes:
         with (scene / ANNOTATIONS).open("rb") as file:
             blocks = AnnotationBlocks(file)
             blocks.check_frames(scene, frames)
-            lines = [next(blocks.read(frame, 0, 1)) for frame in blocks.frames]
+            known = set(blocks.frames)
+            lines = [next(blocks.read(frame, 0, 1)) if frame in known else "null" for frame in range(max(known, default=-1) + 1)]
         part = scene.with_name(f"{scene.name}.part")
         write_synced(part, "".join(f"{line}\n" for line in lines).encode())
         (scene / ANNOTATIONS).unlink()
@@ -155,6 +166,8 @@ def _write_annotations(
     with (folder / "images").open("w", encoding="ascii") as image_file, (folder / "annotations").open("w", encoding="ascii") as file:
         for part in parts:
             for frame, found in enumerate(_read_part(part, out)):
+                if found is None:
+                    continue
                 images += 1
                 row = {"id": images, **describe(int(part.stem), frame)}
                 image_file.write((",\n" if images > 1 else "") + json.dumps(row))
@@ -178,11 +191,11 @@ def _write_annotations(
     return place
 
 
-def _read_part(part: Path, out: Path) -> Iterator[list[dict[str, Any]]]:
-    """Annotations of each frame of a scene."""
+def _read_part(part: Path, out: Path) -> Iterator[list[dict[str, Any]] | None]:
+    """Annotations of each frame of a scene; None: there is no such image (im_id)."""
     data = read_file(path_inside(out, str(part.relative_to(out)), out / PARTS, DatasetError), MAX_JSON, DatasetError)
     for number, line in enumerate(data.splitlines(), start=1):
-        yield decode_json(line, list[dict[str, Any]], f"{part}, line {number},", DatasetError, _ADVICE)
+        yield decode_json(line, _Line, f"{part}, line {number},", DatasetError, _ADVICE)
 
 
 def _describe_image(cameras: int, resolution: tuple[int, int], color_format: str, scene: int, frame: int) -> dict[str, Any]:

@@ -78,5 +78,5 @@ class CocoExporter(SceneExporter):
     def _stage_scene(self, scene: Path) -> None:
         scene.mkdir()
 
-    def _commit_task(self, scenes: tuple[tuple[Path, int], ...], frames: int) -> tuple[Callable[..., None], tuple[Any, ...]]:
-        return commit_scenes, (scenes, self._out, frames)
+    def _commit_task(self, scenes: tuple[tuple[Path, int], ...], images: Sequence[int]) -> tuple[Callable[..., None], tuple[Any, ...]]:
+        return commit_scenes, (scenes, self._out, images)

@@ -66,8 +66,8 @@ class ShardsExporter(SceneExporter):
     def _stage_scene(self, scene: Path) -> None:
         scene.mkdir()
 
-    def _commit_task(self, scenes: tuple[tuple[Path, int], ...], frames: int) -> tuple[Callable[..., None], tuple[Any, ...]]:
-        return commit_shards, (scenes, self._folder(scenes[0][1]), frames, self._layers)
+    def _commit_task(self, scenes: tuple[tuple[Path, int], ...], images: Sequence[int]) -> tuple[Callable[..., None], tuple[Any, ...]]:
+        return commit_shards, (scenes, self._folder(scenes[0][1]), images, self._layers)
 
 
 def _describe(config: Config, splits: list[SplitContent]) -> CardContent:

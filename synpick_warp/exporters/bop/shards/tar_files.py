@@ -9,7 +9,7 @@ import json
 import os
 import shutil
 import tarfile
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 
 from synpick_warp.configs.splits import MAX_SHARD_SCENES
@@ -79,7 +79,7 @@ def _tar_entry(name: str, data: Buffer) -> tuple[Buffer, ...]:
     return info.tobuf(tarfile.USTAR_FORMAT), data, bytes(-len(data) % tarfile.BLOCKSIZE)
 
 
-def commit_shards(scenes: tuple[tuple[Path, int], ...], split: Path, frames: int, layers: tuple[str, ...]) -> None:
+def commit_shards(scenes: tuple[tuple[Path, int], ...], split: Path, images: Sequence[int], layers: tuple[str, ...]) -> None:
     """Task: concatenate an episode's views and layers into shards, and rename these to their places.
 
     Shards are synced to disk before the rename.
@@ -87,16 +87,16 @@ def commit_shards(scenes: tuple[tuple[Path, int], ...], split: Path, frames: int
     Args:
         scenes: (staging folder, scene_id) of each scene.
         split: Folder of the shards.
-        frames: Number of frames that each scene must have.
+        images: Images (im_id) that each scene must have, ascending.
         layers: Names of the layers of each view.
     """
     complete: list[tuple[Path, Path]] = []
     for scene, scene_id in scenes:
-        views = [[str(frame), *(_layer_file(frame, name) for name in layers)] for frame in range(frames)]
+        views = [[str(frame), *(_layer_file(frame, name) for name in layers)] for frame in images]
         names = {path.name for path in scene.iterdir()}
         if names != {name for view in views for name in view}:
-            raise OutputError(f"{scene} does not have {frames} whole frames; this is an error of synpick-warp, please report it")
-        for part, begin in enumerate(range(0, frames, MAX_SHARD_VIEWS)):
+            raise OutputError(f"{scene} does not have {len(images)} whole frames; this is an error of synpick-warp, please report it")
+        for part, begin in enumerate(range(0, len(images), MAX_SHARD_VIEWS)):
             shard = scene / shard_name(scene_id, part)
             _concatenate(shard, [scene / name for view in views[begin : begin + MAX_SHARD_VIEWS] for name in view])
             complete.append((shard, split / shard.name))

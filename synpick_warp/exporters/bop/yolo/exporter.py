@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -65,6 +65,6 @@ class YoloExporter(SceneExporter):
         for kind in CONTENTS:
             (scene / kind).mkdir()
 
-    def _commit_task(self, scenes: tuple[tuple[Path, int], ...], frames: int) -> tuple[Callable[..., None], tuple[Any, ...]]:
+    def _commit_task(self, scenes: tuple[tuple[Path, int], ...], images: Sequence[int]) -> tuple[Callable[..., None], tuple[Any, ...]]:
         split = self._context.layout.folder(scenes[0][1] // len(self._cameras))
-        return commit_scenes, (scenes, self._out, split, frames)
+        return commit_scenes, (scenes, self._out, split, images)

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 
+from synpick_warp.dataset.bop.folders import Listing, list_folder
 from synpick_warp.errors import DatasetError
-from synpick_warp.validation.folders import Listing, list_folder
 
 SPLIT = re.compile(r"(train|val|test)(_.*)?")
 MODELS = re.compile(r"models(_.*)?")
@@ -20,8 +20,12 @@ SHARD = re.compile(r"shard-[0-9]+\.tar")
 KEYED = re.compile(r"([0-9]{6,9})_([0-9]{6,9})\.(.+)")
 """File of the imagewise layout, and member of a shard: scene, image, content."""
 _ANNOTATION = re.compile(r"scene_(?:camera|gt)(?:_(?!info(?:_|\.)|coco(?:_|\.)|world(?:_|\.))(\w+))?\.json")
-_RENDERING_MODELS = ("models", "models_cad", "models_eval", "models_reconst")
+RENDERING_MODELS = ("models", "models_cad", "models_eval", "models_reconst")
 """Models folders in the order in which poses are checked with them: the first is what ground truth is rendered with."""
+
+
+class NoLayoutError(DatasetError):
+    """A folder that is no BOP data set, nor a part of one."""
 
 
 @dataclass(frozen=True)
@@ -52,7 +56,7 @@ class Layout:
             DatasetError: The folder does not exist, cannot be listed, or has nothing of a BOP data set.
         """
         if not folder.is_dir():
-            raise DatasetError(f"there is no folder {folder}; name the folder of a BOP data set")
+            raise NoLayoutError(f"there is no folder {folder}; name the folder of a BOP data set")
         self.root = folder.resolve()
         self.listing = list_folder(self.root)
         self._refuse_parts(folder)
@@ -64,7 +68,7 @@ class Layout:
         self.keyed = {name: listing for name, listing in listings.items() if _is_keyed(listing)}
         self.splits = {name: self.splits[name] for name in sorted(self.splits)}
         if not self.splits and not self.keyed:
-            raise DatasetError(
+            raise NoLayoutError(
                 f"{folder} is not a BOP data set: it has no split (train_pbr, test, ...) of scenes; name the folder that contains them"
             )
 
@@ -87,9 +91,7 @@ class Layout:
     @cached_property
     def model_files(self) -> dict[int, tuple[str, str]]:
         """Model by obj_id, as (models folder, file name): those that ground truth is rendered with."""
-        order = [name for name in _RENDERING_MODELS if name in self.models] + [
-            name for name in self.models if name not in _RENDERING_MODELS
-        ]
+        order = [name for name in RENDERING_MODELS if name in self.models] + [name for name in self.models if name not in RENDERING_MODELS]
         for folder in order:
             found = {int(match[1]): (folder, match[0]) for name in self.models[folder].files if (match := MODEL_FILE.fullmatch(name))}
             if found:

@@ -1,0 +1,1 @@
+"""BOP folders as anybody writes them: listings that stay inside, layout, scenes."""

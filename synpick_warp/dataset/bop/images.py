@@ -1,0 +1,184 @@
+"""Images of a scene by type, image and ground-truth index: files of a scene folder, or members of shards and of the imagewise layout."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+from synpick_warp.dataset.annotations import ADVICE
+from synpick_warp.dataset.bop.folders import Listing
+from synpick_warp.dataset.bop.layout import KEYED, SceneRef
+from synpick_warp.errors import DatasetError
+from synpick_warp.inputs.files import read_file
+from synpick_warp.inputs.image_files import MAX_IMAGE_FILE
+from synpick_warp.inputs.tar_files import list_members
+
+SUFFIXES = ("png", "jpg", "jpeg", "tif", "tiff")
+"""File formats of images that BOP data sets have, the preferred one first."""
+KINDS = ("rgb", "gray", "depth", "mask", "mask_visib")
+COLOR = ("rgb", "gray")
+"""Those that show colour or brightness, the preferred one first."""
+_STEM = re.compile(r"([0-9]{1,9})(?:_([0-9]{1,9}))?\.(\w+)")
+
+Index = tuple[int, int | None]
+"""Image, and ground-truth index of a mask."""
+
+
+class FolderImages:
+    """Images of one sensor in a scene folder."""
+
+    def __init__(self, listing: Listing, sensor: str, digits: int = 1) -> None:
+        """
+        Args:
+            listing: The scene folder.
+            sensor: Suffix of the sensor's files, such as "_cam1"; empty: the classic layout.
+            digits: Least number of digits of indices in file names; BOP has six.
+        """
+        self.listing, self.sensor, self._digits = listing, sensor, digits
+        self._indices: dict[str, dict[Index, str]] = {}
+
+    def folder(self, kind: str) -> str:
+        """Folder of a type: KIND_SENSOR, or, where a modality has annotations of its own (scene_gt_gray1.json), the modality itself."""
+        modality = self.sensor[1:]
+        if kind in ("rgb", "gray", "depth") and re.fullmatch(rf"{kind}[0-9]*", modality) and modality in self.listing.folders:
+            return modality
+        return f"{kind}{self.sensor}"
+
+    @property
+    def kinds(self) -> set[str]:
+        """Types of images that the scene has, of KINDS."""
+        return {kind for kind in KINDS if self.folder(kind) in self.listing.folders}
+
+    @cached_property
+    def listings(self) -> dict[str, Listing]:
+        """Listings of the folders of images by type."""
+        return {kind: self.listing.enter(self.folder(kind)) for kind in KINDS if kind in self.kinds}
+
+    def indices(self, kind: str) -> dict[Index, str]:
+        """File of each image of a type."""
+        if kind not in self._indices:
+            self._indices[kind] = self._index(self.listing.enter(self.folder(kind)), kind.startswith("mask"))
+        return self._indices[kind]
+
+    def _index(self, listing: Listing, paired: bool) -> dict[Index, str]:
+        found: dict[Index, str] = {}
+        matches = [match for name in listing.files if (match := _STEM.fullmatch(name)) and match[3].lower() in SUFFIXES]
+        for match in sorted(matches, key=lambda match: SUFFIXES.index(match[3].lower())):
+            if bool(match[2]) == paired and min(map(len, filter(None, match.group(1, 2)))) >= self._digits:
+                found.setdefault((int(match[1]), int(match[2]) if match[2] else None), match[0])
+        return found
+
+    def file(self, kind: str, image: int, index: int | None = None) -> str:
+        """Path of an image relative to the data set, whether it exists or not."""
+        default = f"{image:06d}.png" if index is None else f"{image:06d}_{index:06d}.png"
+        return self.listing.name(f"{self.folder(kind)}/{self.indices(kind).get((image, index), default)}")
+
+    def read(self, kind: str, image: int, index: int | None, limit: int) -> bytes | None:
+        """Read an image of at most `limit` bytes; None: there is none. Raises DatasetError if it cannot be read."""
+        if (image, index) not in self.indices(kind):
+            return None
+        return read_file(self.listing.root / self.file(kind, image, index), limit, DatasetError)
+
+    def find(self, name: str, image: int, index: int | None = None) -> tuple[str, bytes, str] | None:
+        """Suffix, content and path of an image; "rgb" is grey where there is no colour. None: there is none."""
+        return _find(self, name, image, index)
+
+
+@dataclass(frozen=True)
+class Member:
+    """Content of a key: a file, or a part of a shard."""
+
+    file: str
+    path: Path
+    offset: int = 0
+    size: int | None = None
+    """[B]; None: the whole file."""
+
+
+class KeyedImages:
+    """Images of a scene with a key each. All masks of an image are one member, of run lengths."""
+
+    def __init__(self, listing: Listing, ref: SceneRef) -> None:
+        """
+        Args:
+            listing: Folder of the shards or files.
+            ref: The scene.
+        """
+        self.listing, self.ref = listing, ref
+
+    @cached_property
+    def members(self) -> Mapping[tuple[int, str], Member]:
+        """Members of the scene by (image, content), such as (3, "rgb.jpg").
+
+        Raises:
+            DatasetError: A shard is damaged.
+        """
+        found: dict[tuple[int, str], Member] = {}
+        for shard in self.ref.shards:
+            path = self.listing.path(shard)
+            for name, offset, size in list_members(path, extended=True):
+                self._add(found, name, Member(f"{self.listing.name(shard)}:{name}", path, offset, size))
+        if not self.ref.shards:
+            for name in self.listing.files:
+                self._add(found, name, Member(self.listing.name(name), self.listing.path(name)))
+        return found
+
+    def _add(self, found: dict[tuple[int, str], Member], name: str, member: Member) -> None:
+        match = KEYED.fullmatch(name)
+        if match and int(match[1]) == self.ref.scene:
+            found[int(match[2]), match[3]] = member
+
+    def content(self, member: Member, limit: int) -> bytes:
+        """Content of a member of at most `limit` bytes. Raises DatasetError if it cannot be read."""
+        if member.size is None:
+            return self.listing.read(member.path.name, limit)
+        try:
+            with member.path.open("rb") as file:
+                file.seek(member.offset)
+                data = file.read(min(member.size, limit))
+        except OSError as error:
+            raise DatasetError(f"{member.path} cannot be read: {error.strerror}") from None
+        if len(data) < min(member.size, limit):
+            raise DatasetError(f"{member.path} is damaged: it ends within {member.file.rpartition(':')[2]}; {ADVICE}")
+        return data
+
+    @cached_property
+    def kinds(self) -> set[str]:
+        """See `FolderImages`."""
+        return {content.split(".")[0] for _, content in self.members} & set(KINDS)
+
+    def indices(self, kind: str) -> dict[Index, str]:
+        """See `FolderImages`; masks of a view are one file, without index."""
+        return {(image, None): member.file for (image, content), member in self.members.items() if content.split(".")[0] == kind}
+
+    def member(self, kind: str, image: int) -> Member | None:
+        """Member of an image, or of its masks."""
+        suffixes = ("json",) if kind.startswith("mask") else SUFFIXES
+        return next((member for suffix in suffixes if (member := self.members.get((image, f"{kind}.{suffix}")))), None)
+
+    def file(self, kind: str, image: int, index: int | None = None) -> str:
+        """See `FolderImages`."""
+        member = self.member(kind, image)
+        part = "" if index is None else f", mask {index}"
+        return f"{member.file}{part}" if member else f"{self.ref.place}/{self.ref.scene:06d}_{image:06d}.{kind}{part}"
+
+    def read(self, kind: str, image: int, index: int | None, limit: int) -> bytes | None:
+        """See `FolderImages`."""
+        member = self.member(kind, image)
+        return None if member is None else self.content(member, limit)
+
+    def find(self, name: str, image: int, index: int | None = None) -> tuple[str, bytes, str] | None:
+        """See `FolderImages`."""
+        return _find(self, name, image, index)
+
+
+def _find(images: FolderImages | KeyedImages, name: str, image: int, index: int | None) -> tuple[str, bytes, str] | None:
+    for kind in COLOR if name == "rgb" else (name,):
+        data = images.read(kind, image, index, MAX_IMAGE_FILE)
+        if data is not None:
+            source = str(images.listing.root / images.file(kind, image, index))
+            return f".{source.rpartition('.')[2].lower()}", data, source
+    return None

@@ -1,0 +1,360 @@
+"""BOP folders that no bake wrote: every command that reads takes them with what they have, and says in one line what they lack."""
+
+from __future__ import annotations
+
+import io
+import json
+import re
+import shutil
+import tarfile
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+import synpick_warp
+from synpick_warp.cli.commands import main
+from synpick_warp.dataset.bop.measured import measure_info
+from synpick_warp.errors import DatasetError
+from tests.validation.conftest import good  # noqa: F401
+from tests.validation.layouts import LAYOUTS, _rename_images, _strip, tless
+
+EPISODES = {
+    "tless": [1, 2, 3],
+    "ycbv": [0, 1, 2, 48, 49, 50],
+    "itodd": [0, 1_000_000, 1_000_001, 1_000_002],
+    "multisensor": [0],
+    "imagewise": [0, 1, 2],
+}
+
+
+@pytest.fixture(scope="module")
+def folders(good, tmp_path_factory) -> dict[str, Path]:  # noqa: F811
+    """Each layout of others. Read only."""
+    out = tmp_path_factory.mktemp("found")
+    return {name: make(good, out / name) for name, make in LAYOUTS.items()}
+
+
+@pytest.fixture
+def plain(good, tmp_path) -> Path:  # noqa: F811
+    """A classic set without manifest, with one split of three scenes, to be changed."""
+    out = _strip(good, tmp_path / "plain")
+    (out / "train").rename(out / "test")
+    return out
+
+
+def run(capsys, *words: object) -> tuple[int, str, str]:
+    code = main([str(word) for word in words])
+    said = capsys.readouterr()
+    return code, said.out, said.err
+
+
+@pytest.mark.parametrize("name", LAYOUTS)
+def test_scenes_are_episodes_and_sensors_are_cameras(folders, name):
+    data = synpick_warp.open(folders[name])
+    assert list(data) == EPISODES[name]
+    assert data.camera_count == (3 if name == "multisensor" else 1)
+    views = list(data.views())
+    assert len(views) == sum(len(episode) * len(episode.cameras) for episode in data.values())
+    for view in views:
+        assert view.rgb.shape == (150, 200, 3)
+        assert view.depth.shape == (150, 200)
+
+
+@pytest.mark.parametrize(("name", "first"), [("tless", 1), ("ycbv", 48), ("multisensor", 0), ("imagewise", 0)])
+def test_what_is_read_is_what_was_baked(good, folders, name, first):  # noqa: F811
+    """Pixels, masks and poses of the first image, which all layouts share."""
+    mine, theirs = synpick_warp.open(good)[0].view(0), synpick_warp.open(folders[name])[first].view(0)
+    np.testing.assert_array_equal(mine.rgb, theirs.rgb)
+    np.testing.assert_array_equal(mine.masks, theirs.masks)
+    np.testing.assert_array_equal(mine.amodal_masks, theirs.amodal_masks)
+    np.testing.assert_array_equal(mine.object_to_camera, theirs.object_to_camera)
+    np.testing.assert_array_equal(mine.visibility, theirs.visibility)
+    assert (mine.intrinsics == theirs.intrinsics).all()
+
+
+def test_images_keep_their_ids(folders):
+    episode = synpick_warp.open(folders["ycbv"])[49]
+    assert list(episode.image_ids) == [1, 36]
+    assert [view.image_id for view in episode.views()] == [1, 36]
+    assert episode.view(-1).image_id == 36
+
+
+def test_grey_tiff_images_and_missing_truth(folders):
+    data = synpick_warp.open(folders["itodd"])
+    hidden = next(iter(data.split("test").views()))
+    assert len(hidden) == 0
+    assert (hidden.rgb[..., 0] == hidden.rgb[..., 2]).all()
+    shown = next(iter(data.split("val").views()))
+    assert len(shown) > 0
+    assert shown.masks.any()
+
+
+def test_what_scene_gt_info_would_tell_is_measured_or_unknown(plain):
+    told = [(view.visible_boxes, view.visibility) for view in synpick_warp.open(plain).views()]
+    for path in plain.glob("test/*/scene_gt_info.json"):
+        path.unlink()
+    for (boxes, visibility), view in zip(told, synpick_warp.open(plain).views(), strict=True):
+        np.testing.assert_array_equal(view.visible_boxes, boxes)
+        np.testing.assert_allclose(view.visibility, visibility, atol=0.02)
+    for scene in plain.glob("test/*"):
+        shutil.rmtree(scene / "mask")
+    view = synpick_warp.open(plain)[0].view(0)
+    assert np.isnan(view.visibility).all()
+    np.testing.assert_array_equal(view.visible_boxes, told[0][0])
+
+
+def test_measured_boxes_end_with_the_last_pixel():
+    mask = np.zeros((6, 8), bool)
+    mask[2:4, 3:7] = True
+    visible = mask & (np.arange(8) < 5)
+    (entry,) = measure_info([visible], [mask])
+    assert entry == {
+        "bbox_obj": [3, 2, 3, 1],
+        "bbox_visib": [3, 2, 1, 1],
+        "px_count_all": 8,
+        "px_count_valid": 8,
+        "px_count_visib": 4,
+        "visib_fract": 0.5,
+    }
+
+
+def test_scenes_of_the_same_index_are_told_apart(good, tmp_path):  # noqa: F811
+    folder = tless(good, tmp_path / "set")
+    shutil.copytree(folder / "test_primesense", folder / "train_primesense")
+    data = synpick_warp.open(folder)
+    assert list(data) == [1, 2, 3, 1_000_001, 1_000_002, 1_000_003]
+    assert list(data.splits) == ["test_primesense", "train_primesense"]
+    assert list(data.split("train_primesense")) == [1_000_001, 1_000_002, 1_000_003]
+    assert data.scene_id(1_000_002, 0) == 2
+
+
+@pytest.mark.parametrize("name", LAYOUTS)
+def test_statistics_and_report_of_any_layout(folders, name, tmp_path, capsys):
+    data = synpick_warp.open(folders[name])
+    views = sum(len(episode) * len(episode.cameras) for episode in data.values())
+    code, out, _ = run(capsys, "stats", folders[name], "--threads", 1)
+    assert code == 0
+    assert f"{views} views in " in out
+    assert "missing: no bake wrote this data set" in out
+    assert run(capsys, "report", folders[name], "--out", tmp_path / "page.html", "--views", 2, "--threads", 1)[0] == 0
+
+
+@pytest.mark.parametrize("name", LAYOUTS)
+def test_a_contact_sheet_of_any_layout(folders, name, tmp_path, capsys):
+    assert run(capsys, "preview", folders[name], "--out", tmp_path / "sheet.png", "--views", 3)[0] == 0
+    assert cv2.imread(str(tmp_path / "sheet.png")).std() > 10
+
+
+def test_estimates_are_made_and_scored(plain, tmp_path, capsys):
+    """Without models a line says so; without masks, too."""
+    results = tmp_path / "refine_plain-test.csv"
+    words = ("estimate", "--data", plain, "--method", "refine", "--every", 1, "--device", "cpu", "--out", results, "--threads", 1)
+    assert run(capsys, *words)[0] == 0
+    assert {line.split(",")[0] for line in results.read_text().splitlines()[1:]} == {"0", "1", "2"}
+    code, out, _ = run(capsys, "eval", "--data", plain, "--results", results)
+    assert code == 0
+    assert "unknown" not in out
+    listed = ("eval", "--data", plain, "--results", results, "--targets", plain / "test_targets_bop19.json")
+    assert run(capsys, *listed)[0] == 0
+    (plain / "models").rename(plain / "models_cad")
+    assert run(capsys, "eval", "--data", plain, "--results", results)[0] == 0
+    shutil.rmtree(plain / "models_cad")
+    shutil.rmtree(plain / "models_eval")
+    code, _, said = run(capsys, "eval", "--data", plain, "--results", results)
+    assert code == 2
+    assert "has no models/models_info.json, which poses are evaluated with" in said
+    for scene in plain.glob("test/*"):
+        shutil.rmtree(scene / "mask_visib")
+    code, _, said = run(capsys, *words)
+    assert code == 2
+    assert "has no masks (mask_visib), which poses are estimated with" in said
+    assert said.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    ("file", "said"),
+    [
+        ("scene_gt.json", "has no ground truth (scene_gt.json), which poses are estimated with"),
+        ("rgb", "has no colour images, which poses are estimated with"),
+        ("depth", "has no depth images, which poses are estimated with"),
+    ],
+)
+def test_what_estimation_lacks_is_named(plain, tmp_path, capsys, file, said):
+    for scene in plain.glob("test/*"):
+        path = scene / file
+        shutil.rmtree(path) if path.is_dir() else path.unlink()
+        if file == "scene_gt.json":
+            (scene / "scene_gt_info.json").unlink()
+    code, _, line = run(
+        capsys, "estimate", "--data", plain, "--method", "refine", "--device", "cpu", "--out", tmp_path / "out.csv", "--threads", 1
+    )
+    assert code == 2
+    assert said in line
+    assert not (tmp_path / "out.csv").exists()
+
+
+def _four_digits(scene: Path) -> None:
+    for path in list(scene.glob("*/*.*")):
+        path.rename(path.with_name("_".join(part[2:] for part in path.stem.split("_")) + path.suffix))
+
+
+def _capitals(scene: Path) -> None:
+    for path in list(scene.glob("rgb/*")):
+        path.rename(path.with_suffix(path.suffix.upper()))
+
+
+@pytest.mark.parametrize("change", [_four_digits, _capitals])
+def test_names_of_images_may_be_written_otherwise(plain, change):
+    before = [(view.rgb, view.masks) for view in synpick_warp.open(plain).views()]
+    for scene in plain.glob("test/*"):
+        change(scene)
+    for (color, masks), view in zip(before, synpick_warp.open(plain).views(), strict=True):
+        np.testing.assert_array_equal(view.rgb, color)
+        np.testing.assert_array_equal(view.masks, masks)
+
+
+@pytest.mark.parametrize(
+    "missing",
+    [("scene_camera.json", "depth", "mask", "mask_visib"), ("rgb", "mask", "mask_visib", "scene_gt.json", "scene_gt_info.json")],
+    ids=["rgb_and_gt", "depth"],
+)
+def test_a_set_with_a_single_kind_of_images(plain, tmp_path, capsys, missing):
+    for path in [path for name in missing for path in plain.glob(f"test/*/{name}")]:
+        shutil.rmtree(path) if path.is_dir() else path.unlink()
+    shutil.rmtree(plain / "models")
+    assert len(list(synpick_warp.open(plain).views())) == 6
+    for words in (("stats", "--threads", 1), ("preview", "--out", tmp_path / "sheet.png"), ("report", "--out", tmp_path / "page.html")):
+        assert run(capsys, words[0], plain, *words[1:])[0] == 0
+    assert cv2.imread(str(tmp_path / "sheet.png"))[20:300, :480].std() > 10
+
+
+def rows(view) -> dict:
+    return {"rgb": view.rgb, "depth": view.depth, "masks": view.masks, "poses": view.object_to_camera, "visibility": view.visibility}
+
+
+@pytest.mark.parametrize(("name", "to"), [("tless", "shards"), ("imagewise", "bop")])
+def test_converted_views_are_those_of_the_source(folders, tmp_path, capsys, name, to):
+    out = tmp_path / "new" / "out"
+    code, said, _ = run(capsys, "convert", folders[name], "--to", f"{to},coco", "--out", out, "--processes", 1)
+    assert code == 0
+    assert f"3 scenes converted to {to}, coco" in said
+    assert [path.name for path in out.parent.iterdir()] == ["out"]
+    source, made = synpick_warp.open(folders[name]), synpick_warp.open(out)
+    assert list(made) == list(source)
+    for theirs, ours in zip(source.views(), made.views(), strict=True):
+        assert (theirs.episode, theirs.image_id) == (ours.episode, ours.image_id)
+        for key, values in rows(theirs).items():
+            np.testing.assert_array_equal(values, rows(ours)[key], err_msg=key)
+    (file,) = (out / "coco" / "annotations").iterdir()
+    content = json.loads(file.read_text())
+    assert len(content["images"]) == 6
+    assert all((out / "coco" / "images" / image["file_name"]).is_file() for image in content["images"])
+    assert len(content["annotations"]) == sum(int(mask.any()) for view in source.views() for mask in view.masks)
+    assert run(capsys, "validate", out)[0] == 0
+
+
+def test_a_split_is_converted(folders, tmp_path, capsys):
+    words = ("convert", folders["ycbv"], "--to", "shards", "--split", "test", "--out", tmp_path / "out", "--processes", 1)
+    assert run(capsys, *words)[0] == 0
+    assert [(view.episode, view.image_id) for view in synpick_warp.open(tmp_path / "out").views()] == [
+        (scene, image) for scene in (48, 49, 50) for image in (1, 36)
+    ]
+
+
+def test_images_of_other_kinds_are_encoded_and_keep_their_ids(folders, tmp_path, capsys):
+    shutil.copytree(folders["itodd"] / "val", tmp_path / "set" / "val")
+    for scene in (tmp_path / "set/val").iterdir():
+        _rename_images(scene, {0: 1, 1: 36})
+    assert run(capsys, "convert", tmp_path / "set", "--to", "shards,coco", "--out", tmp_path / "out", "--processes", 1)[0] == 0
+    for theirs, ours in zip(synpick_warp.open(tmp_path / "set").views(), synpick_warp.open(tmp_path / "out").views(), strict=True):
+        assert ours.image_id in (1, 36)
+        np.testing.assert_array_equal(theirs.rgb, ours.rgb)
+        np.testing.assert_array_equal(theirs.depth, ours.depth)
+    content = json.loads((tmp_path / "out/coco/annotations/instances_val.json").read_text())
+    assert {image["file_name"][7:] for image in content["images"]} == {"000001.png", "000036.png"}
+
+
+@pytest.mark.parametrize(
+    ("name", "to", "said"),
+    [
+        ("tless", "usd", "--to names usd, which is made of trajectories"),
+        ("tless", "lerobot", "--to names lerobot, which is made of trajectories"),
+        ("tless", "bop", "--to names bop, which .* has already"),
+        ("tless", "nothing", "--to names nothing; allowed: bop, shards, coco"),
+        ("ycbv", "coco", "has the splits test, train_pbr; choose one by --split"),
+        ("multisensor", "coco", "has 3 sensors; convert takes"),
+    ],
+)
+def test_what_can_not_be_made_of_a_found_set_is_one_line(folders, tmp_path, capsys, name, to, said):
+    code, _, line = run(capsys, "convert", folders[name], "--to", to, "--out", tmp_path / "out", "--processes", 1)
+    assert code == 2
+    assert re.search(said, line)
+    assert line.count("\n") == 1
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_conversion_that_fails_leaves_nothing(plain, tmp_path, capsys):
+    sorted(plain.glob("test/000002/depth/*"))[-1].write_bytes(b"")
+    before = sorted(path.name for path in tmp_path.iterdir())
+    code, _, line = run(capsys, "convert", plain, "--to", "shards", "--out", tmp_path / "out", "--processes", 1)
+    assert code == 2
+    assert "is not an image" in line
+    assert sorted(path.name for path in tmp_path.iterdir()) == before
+
+
+def test_tracking_needs_instance_ids(plain, tmp_path, capsys):
+    words = ("estimate", "--data", plain, "--method", "track", "--device", "cpu", "--out", tmp_path / "out.csv", "--threads", 1)
+    code, _, said = run(capsys, *words)
+    assert code == 2
+    assert "has no instance_id in its ground truth, by which instances are tracked; use another method" in said
+    assert said.count("\n") == 1
+
+
+def test_shards_of_others_may_have_extended_headers(folders, tmp_path):
+    """Times of fractions of a second, as webdataset's writer makes them; files of another name or size are not taken."""
+    out = tmp_path / "set" / "train_web"
+    out.mkdir(parents=True)
+    files = sorted((folders["imagewise"]).glob("*/0*.*"))
+
+    def pack(**headers: str) -> None:
+        with tarfile.open(out / "shard-000000.tar", "w", format=tarfile.PAX_FORMAT) as shard:
+            for path in files:
+                info = tarfile.TarInfo(path.name)
+                info.size, info.mtime, info.pax_headers = path.stat().st_size, 1.5, headers
+                shard.addfile(info, io.BytesIO(path.read_bytes()))
+
+    pack()
+    for ours, theirs in zip(synpick_warp.open(out.parent).views(), synpick_warp.open(folders["imagewise"]).views(), strict=True):
+        np.testing.assert_array_equal(ours.rgb, theirs.rgb)
+        np.testing.assert_array_equal(ours.masks, theirs.masks)
+    pack(path="000000_000000.gt.json")
+    with pytest.raises(DatasetError, match="has a member at byte 0 that is not a regular file"):
+        list(synpick_warp.open(out.parent))
+
+
+def test_other_cameras_than_pinholes_are_named(plain):
+    path = plain / "test/000000/scene_camera.json"
+    content = json.loads(path.read_text())
+    for entry in content.values():
+        entry["cam_model"] = {"projection_model_type": "CameraModelType.FISHEYE624"}
+        del entry["cam_K"], entry["depth_scale"]
+    path.write_text(json.dumps(content))
+    view = synpick_warp.open(plain)[0].view(0)
+    assert view.rgb.any()
+    with pytest.raises(DatasetError, match="the camera of image 0 has no cam_K"):
+        _ = view.intrinsics
+    with pytest.raises(DatasetError, match="the camera of image 0 has no depth_scale"):
+        _ = view.depth
+
+
+def test_folders_that_are_no_data_set_say_so(tmp_path, plain):
+    with pytest.raises(DatasetError, match="is not a data set: it has neither"):
+        synpick_warp.open(tmp_path / "gone")
+    with pytest.raises(DatasetError, match="is a split; name the data set, the folder above"):
+        synpick_warp.open(plain / "test")
+    with pytest.raises(DatasetError, match="is a scene; name the data set, two folders above"):
+        synpick_warp.open(plain / "test/000000")
+    with pytest.raises(DatasetError, match="has no settings: no bake of synpick-warp wrote it"):
+        _ = synpick_warp.open(plain).config
