@@ -20,7 +20,6 @@ from synpick_warp.errors import ConfigError, DatasetError, OutputError
 
 if TYPE_CHECKING:
     from synpick_warp.dataset.reading import DataSet
-    from synpick_warp.evaluation.charts import Image
     from synpick_warp.evaluation.figures import Method
     from synpick_warp.evaluation.results import ResultFile
     from synpick_warp.evaluation.scoring import Scores
@@ -105,7 +104,7 @@ def evaluate(
     return 0
 
 
-def show_rest(command: str, plots: Path | None, pictures: Mapping[str, Image], stream: TextIO) -> None:
+def show_rest(command: str, plots: Path | None, pictures: Mapping[str, bytes], stream: TextIO) -> None:
     """Write the pictures, and print their paths and the toolkit's command, where they don't mix with a table for a program."""
     if plots is not None:
         from synpick_warp.evaluation.figures import write_figures
@@ -128,7 +127,7 @@ def make_table(
     targets: Path | None = None,
     plots: Path | None = None,
     track: tuple[int, int] | None = None,
-) -> tuple[str, dict[str, Image]]:
+) -> tuple[str, dict[str, bytes]]:
     """Score result files, write the table and draw the pictures.
 
     Args:
@@ -145,7 +144,7 @@ def make_table(
         track: Scene and instance of the trajectory; None: the one that moves farthest.
 
     Returns:
-        The table, and file name -> picture.
+        The table, and file name -> PNG file.
     """
     from synpick_warp.evaluation.figures import Settings, draw_figures
     from synpick_warp.evaluation.models import read_models
@@ -184,11 +183,12 @@ def make_methods(results: Sequence[Path], files: Sequence[ResultFile], alpha: fl
     return [Method(name, file.poses, None if alpha is None else filter_poses(file.poses, alpha), alpha) for name, file in named]
 
 
-def draw_failure_sheets(data_set: DataSet, truth: Truth, methods: Sequence[Method], scores: Sequence[Scores]) -> dict[str, Image]:
-    """Sheets of the worst estimate of each object, one for each method: file name -> picture. None without the images they need."""
+def draw_failure_sheets(data_set: DataSet, truth: Truth, methods: Sequence[Method], scores: Sequence[Scores]) -> dict[str, bytes]:
+    """Sheets of the worst estimate of each object, one for each method: file name -> PNG file. None without the images they need."""
     from synpick_warp.estimation.failures import draw_failures, find_failures
     from synpick_warp.estimation.models import read_object_models
     from synpick_warp.evaluation.figures import file_names
+    from synpick_warp.exporters.writing.png import encode_png
     from synpick_warp.system.device import pick_device
 
     by_name = {each.name: each for each in scores}
@@ -201,7 +201,7 @@ def draw_failure_sheets(data_set: DataSet, truth: Truth, methods: Sequence[Metho
         except DatasetError as error:
             print(f"no pictures of the worst estimates: {error}", file=sys.stderr)
             return {}
-        pictures[f"failures_{name}.png"] = sheet
+        pictures[f"failures_{name}.png"] = encode_png(sheet)
     return pictures
 
 

@@ -1,1 +1,1 @@
-"""File formats that host and device encode to the same bytes: JPEG, and depth as PNG."""
+"""File formats: JPEG and depth as PNG, which host and device encode to the same bytes, and charts by Vega-Lite."""

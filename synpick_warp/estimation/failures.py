@@ -12,10 +12,10 @@ from PIL import Image as PillowImage
 from PIL import ImageDraw, ImageFont
 from scipy.spatial.transform import Rotation
 
+from synpick_warp.codecs.charts import INK, SOFT, printable
 from synpick_warp.dataset.reading import DataSet
 from synpick_warp.dataset.view import View
 from synpick_warp.evaluation.auc import LIMIT
-from synpick_warp.evaluation.charts import INK, SOFT, Color, Image, printable
 from synpick_warp.evaluation.poses import PoseTable
 from synpick_warp.evaluation.scoring import Scores
 from synpick_warp.evaluation.truth import Truth
@@ -24,6 +24,10 @@ from synpick_warp.stages.pose.batch import ObjectModel
 from synpick_warp.stages.pose.render import object_scene, render_object
 from synpick_warp.stages.render.scene import build_meshes
 
+Color = tuple[int, int, int]
+"""Red, green, blue."""
+Image = np.ndarray
+"""(H, W, 3) uint8, red first."""
 METRIC = "ADD-S"
 """Metric by which estimates are the worst: it forgives turns that the shape does not show."""
 PANEL = 260

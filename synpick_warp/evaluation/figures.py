@@ -13,8 +13,8 @@ from pathlib import Path
 
 import numpy as np
 
+from synpick_warp.codecs.charts import Spec, render_charts
 from synpick_warp.errors import ConfigError, OutputError
-from synpick_warp.evaluation.charts import Image, write_chart
 from synpick_warp.evaluation.models import Model
 from synpick_warp.evaluation.plots import plot_error_by_speed, plot_error_by_visibility, plot_recall, plot_sweep, plot_trajectory
 from synpick_warp.evaluation.poses import PoseTable
@@ -23,6 +23,8 @@ from synpick_warp.evaluation.tables import summarize
 from synpick_warp.evaluation.tracking.sweep import AlphaSweep, split_by_mode, sweep_alpha
 from synpick_warp.evaluation.tracking.tracks import find_tracks, track_of_instance
 from synpick_warp.evaluation.truth import Truth
+from synpick_warp.exporters.writing.files import output_error, write_atomically
+from synpick_warp.system.folders import make_folder
 
 Track = tuple[int, int]
 """Scene and instance."""
@@ -71,7 +73,7 @@ def draw_figures(
     settings: Settings,
     track: Track | None = None,
     attempts: Mapping[int, Sequence[int]] | None = None,
-) -> dict[str, Image]:
+) -> dict[str, bytes]:
     """Draw all pictures.
 
     Args:
@@ -83,12 +85,13 @@ def draw_figures(
         attempts: Episode -> frames of its pick attempts.
 
     Returns:
-        File name -> picture. There is no trajectory if no track has two images, and no error by speed if no speed is known.
+        File name -> PNG file. There is no trajectory if no track has two images, and no error by speed if no speed is known.
 
     Raises:
         ConfigError: The track is not in the ground truth, or a method has no estimate of it.
+        MissingVegaError: The plots' library is not installed, or does not run.
     """
-    pictures = _draw_errors(truth, scores)
+    charts = _draw_errors(truth, scores)
     chosen = _farthest_track(truth, methods, settings.min_visibility) if track is None else track
     names = file_names([method.name for method in methods])
     if chosen is not None:
@@ -96,14 +99,14 @@ def draw_figures(
         frames = (attempts or {}).get(int(truth.episode[rows[0]]), ())
         for method, name in zip(methods, names, strict=True):
             ending = f"scene_{chosen[0]:06d}_instance_{chosen[1]}"
-            pictures[f"trajectory_{name}_{ending}.png"] = _draw_trajectory(truth.poses.select(rows), method, chosen, frames)
+            charts[f"trajectory_{name}_{ending}.png"] = _draw_trajectory(truth.poses.select(rows), method, chosen, frames)
     for method, name in zip(methods, names, strict=True):
         if method.filtered is not None:
-            pictures[f"alpha_sweep_{name}.png"] = plot_sweep(_sweep(truth, method, settings), score="ADD-S AUC [%]")
-    return pictures
+            charts[f"alpha_sweep_{name}.png"] = plot_sweep(_sweep(truth, method, settings), score="ADD-S AUC [%]")
+    return dict(zip(charts, render_charts(list(charts.values()), "eval --plots"), strict=True))
 
 
-def _draw_errors(truth: Truth, scores: Sequence[Scores]) -> dict[str, Image]:
+def _draw_errors(truth: Truth, scores: Sequence[Scores]) -> dict[str, Spec]:
     """Pictures of the errors of all methods together."""
     target = scores[0].target
     visibility, speed = truth.visibility[target], truth.speed[target]
@@ -119,7 +122,7 @@ def _draw_errors(truth: Truth, scores: Sequence[Scores]) -> dict[str, Image]:
     return pictures
 
 
-def _draw_trajectory(truth: PoseTable, method: Method, track: Track, attempts: Sequence[int]) -> Image:
+def _draw_trajectory(truth: PoseTable, method: Method, track: Track, attempts: Sequence[int]) -> Spec:
     """Trajectory plot of one method."""
     rows = _estimated_rows(truth, method)
     if not len(rows):
@@ -213,11 +216,16 @@ def check_folder(folder: Path) -> None:
         raise OutputError(f"--plots is {folder}, but {parent} is a file; name another folder")
 
 
-def write_figures(folder: Path, pictures: Mapping[str, Image]) -> Iterator[Path]:
-    """Write pictures to a folder, which is created; gives the path of each once it is written.
+def write_figures(folder: Path, pictures: Mapping[str, bytes]) -> Iterator[Path]:
+    """Write PNG files to a folder, which is created; gives the path of each once it is written.
 
     Raises:
         OutputError: A file cannot be written.
     """
     for name, picture in pictures.items():
-        yield write_chart(folder / name, picture)
+        try:
+            make_folder(folder)
+            write_atomically(folder / name, picture)
+        except OSError as error:
+            raise output_error(folder / name, error) from error
+        yield folder / name

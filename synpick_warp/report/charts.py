@@ -7,6 +7,8 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
+from synpick_warp.codecs.charts import Spec, limit
+from synpick_warp.codecs.charts import field as _field
 from synpick_warp.configs.schema import Config
 from synpick_warp.report.sampling import Brightness
 from synpick_warp.statistics import ObjectStatistics, Statistics
@@ -29,7 +31,6 @@ HEIGHT = 220
 """Height of the other plots [px]."""
 TURN, HALF_TURN = 360.0, 180.0
 """[°]."""
-Spec = dict[str, Any]
 Rows = list[dict[str, Any]]
 
 
@@ -80,10 +81,6 @@ def object_labels(objects: Sequence[ObjectStatistics]) -> dict[int, str]:
         each.object_id: each.name if each.name and names.count(each.name) == 1 else f"{each.name or 'object'} ({each.object_id})"
         for each in objects
     }
-
-
-def _field(name: str, kind: str, title: str | None, **more: Any) -> Spec:
-    return {"field": name, "type": kind, "title": title, **more}
 
 
 def _stack(rows: Rows, category: str, value: str, order: Sequence[str], titles: tuple[str, str]) -> Spec:
@@ -270,17 +267,9 @@ _FORCE = "largest seal force [N]"
 
 def _limit(force: float, text: str, side: str) -> Spec:
     """Dashed rule at a force [N] with a label; `side` is how the label is aligned to the rule."""
-    return {
-        "data": {"values": [{"limit": force, "what": text}]},
-        "encoding": {"x": _field("limit", "quantitative", _FORCE)},
-        "layer": [
-            {"mark": {"type": "rule", "strokeDash": [4, 3], "color": "gray"}},
-            {
-                "mark": {"type": "text", "align": side, "dx": 5 if side == "left" else -5, "baseline": "bottom", "y": -4},
-                "encoding": {"text": {"field": "what"}},
-            },
-        ],
-    }
+    label = {"align": side, "dx": 5 if side == "left" else -5, "baseline": "bottom", "y": -4}
+    encoding = {"x": _field("limit", "quantitative", _FORCE)}
+    return limit(encoding, force, text, {"strokeDash": [4, 3], "color": "gray"}, label)
 
 
 def _timeline(source: Source) -> Chart | None:

@@ -3,17 +3,13 @@
 from __future__ import annotations
 
 import functools
-import importlib.util
-import signal
-import subprocess
-import sys
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from string import Template
 from typing import Any
 
-from synpick_warp.errors import SynpickError
+from synpick_warp.codecs.charts import MissingVegaError, read_bundle
 from synpick_warp.report.album import Album
 from synpick_warp.report.charts import Chart
 from synpick_warp.report.findings import NOTE, WARNING, Finding, count_levels
@@ -22,18 +18,6 @@ from synpick_warp.report.markup import Html, content_hash, element, embed_json, 
 FOLDER = Path(__file__).parent / "page"
 SCRIPTS = ("base.js", "frames.js", "strips.js", "attempts.js", "charts.js")
 """Joined in this order to one script."""
-VEGA_LITE = "6.4"
-"""Version of Vega-Lite in the page: fixed, so that a page looks the same whatever vl-convert offers."""
-
-
-_BUNDLE = "import sys, vl_convert; sys.stdout.buffer.write(vl_convert.javascript_bundle(vl_version=sys.argv[1]).encode())"
-_BUNDLE_TIMEOUT = 120.0
-"""Longest time that the library may take [s]; it takes one."""
-_LIMITS = "free memory, or raise the limits of memory and open files (ulimit -v, ulimit -n), or install the package again"
-
-
-class MissingVegaError(SynpickError):
-    """Vega's bundle is not installed."""
 
 
 @dataclass(frozen=True)
@@ -70,25 +54,11 @@ def read_vega() -> str:
     Raises:
         MissingVegaError: The package vl-convert-python is not installed, or does not run.
     """
-    if importlib.util.find_spec("vl_convert") is None:
-        raise MissingVegaError("report needs the package vl-convert-python for its plots; pip install 'synpick-warp[report]'")
-    # In a process of its own: the library is a browser's engine, which reserves much memory, and aborts where it does not get it.
-    try:
-        done = subprocess.run([sys.executable, "-c", _BUNDLE, VEGA_LITE], capture_output=True, check=False, timeout=_BUNDLE_TIMEOUT)
-    except (OSError, subprocess.TimeoutExpired) as error:
-        raise MissingVegaError(f"the process of the plots' library cannot be run: {error}; {_LIMITS}") from None
-    script = done.stdout.decode(errors="replace")
-    if done.returncode or not script:
-        raise MissingVegaError(f"the plots' library vl-convert-python {describe_end(done.returncode)}; {_LIMITS}")
+    script = read_bundle("report")
     # Neither an end of the element nor the states of HTML's parser that hide one can stand in the script, as its hash would not match.
     if any(text in script.lower() for text in ("</script", "<script", "<!--")):
         raise MissingVegaError("the installed vl-convert-python has a script that cannot be inlined; install another version")
     return script
-
-
-def describe_end(code: int) -> str:
-    """How a process ended by its return code: a signal's number is negative."""
-    return f"was ended by {signal.Signals(-code).name}" if code < 0 else f"ended with exit code {code}"
 
 
 def render(page: Page) -> Iterator[str]:

@@ -12,6 +12,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from synpick_warp.codecs.charts import Spec, render_charts
 from synpick_warp.configs.load import load_config
 from synpick_warp.configs.schema import Config
 from synpick_warp.configs.splits import bop_folder, bop_scene
@@ -32,7 +33,7 @@ from synpick_warp.viz.explain_graph import (
     fixed,
     put_boxed,
 )
-from synpick_warp.viz.explain_panels import GREEN, LINE, PLOT_HEIGHT, SMALL, SOFT, TEXT, WORDS_WIDTH, draw_load, draw_words
+from synpick_warp.viz.explain_panels import GREEN, LINE, PLOT_HEIGHT, SMALL, SOFT, TEXT, WORDS_WIDTH, draw_words, load_chart
 from synpick_warp.viz.explain_record import MODE_WORDS, Attempt, Pixel, choose_attempts, labels, read_attempts
 
 DEFAULT_ATTEMPTS = 3
@@ -78,6 +79,7 @@ def write_explanation(dataset: Path, out: Path, episode: int | None, attempt: in
         ConfigError: The data set's config.toml is damaged.
         DatasetError: There is no such attempt, or a file is missing or damaged.
         OutputError: The image cannot be written.
+        MissingVegaError: The plots' library is not installed, or does not run.
     """
     check_picture_name(out)
     if not dataset.is_dir():
@@ -89,7 +91,11 @@ def write_explanation(dataset: Path, out: Path, episode: int | None, attempt: in
     config = load_config(str(path), {})
     names = object_names(dataset, config, {one.object_id for each in attempts for one in each.seen})
     rows = [_row(each, _read_scene(dataset, config, each), names, config) for each in attempts]
-    return write_picture(out, np.concatenate(rows))
+    plots = render_charts([plot for _, plot in rows], "explain", scale=1.0)
+    for (sheet, _), data in zip(rows, plots, strict=True):
+        plot = np.asarray(cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR))
+        _paste(sheet, plot, MARGIN, len(sheet) - MARGIN - len(plot))
+    return write_picture(out, np.concatenate([sheet for sheet, _ in rows]))
 
 
 def _read_scene(dataset: Path, config: Config, attempt: Attempt) -> _Scene:
@@ -133,8 +139,8 @@ def image_scale(size: tuple[int, int]) -> float:
     return min(IMAGE_WIDTH / size[0], _MAX_IMAGE_HEIGHT / size[1])
 
 
-def _row(attempt: Attempt, scene: _Scene, names: Mapping[int, str], config: Config) -> Image:
-    """Draw one attempt: image and force plot, clutter graph, text and table."""
+def _row(attempt: Attempt, scene: _Scene, names: Mapping[int, str], config: Config) -> tuple[Image, Spec]:
+    """Draw one attempt: image, clutter graph, text and table, with room at the lower left for the force's plot, which is the second."""
     image = draw_observation(attempt, scene.color, scene.masks)
     words = draw_words(attempt, names, config)
     left = image.shape[0] + 2 * LINE + MARGIN + PLOT_HEIGHT
@@ -144,8 +150,7 @@ def _row(attempt: Attempt, scene: _Scene, names: Mapping[int, str], config: Conf
     top = MARGIN + HEAD
     _paste(sheet, image, columns[0], top)
     _draw_key(sheet, columns[0], top + image.shape[0] + 24)
-    plot = draw_load(attempt, config, IMAGE_WIDTH, height - image.shape[0] - 2 * LINE - MARGIN)
-    _paste(sheet, plot, columns[0], top + height - plot.shape[0])
+    plot = load_chart(attempt, config, IMAGE_WIDTH, height - image.shape[0] - 2 * LINE - MARGIN)
     states = {edge.state for edge in clutter_edges(attempt, config.perception.min_votes)}
     foot = _graph_foot(states) if attempt.seen else []
     _paste(sheet, draw_graph(attempt, config.perception.min_votes, (_GRAPH_WIDTH, height - LINE * len(foot))), columns[1], top)
@@ -160,7 +165,7 @@ def _row(attempt: Attempt, scene: _Scene, names: Mapping[int, str], config: Conf
     for text, column in zip(captions, columns, strict=True):
         put_text(sheet, text, (column, top - 9), TEXT, SOFT)
     sheet[-1] = GREY
-    return sheet
+    return sheet, plot
 
 
 def _paste(sheet: Image, picture: Image, column: int, row: int) -> None:

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 
 import cv2
 import numpy as np
 
+from synpick_warp.codecs.charts import Spec, axis, limit, line, points, theme
 from synpick_warp.configs.schema import Config
 from synpick_warp.viz.drawing import FONT, INK, Image, instance_color, put_text
-from synpick_warp.viz.explain_graph import GREY, RED, disc, fixed
+from synpick_warp.viz.explain_graph import GREY, RED, disc
 from synpick_warp.viz.explain_record import Attempt, break_force, choice_words, labels, seal_words, suction_kind
 
 WORDS_WIDTH = 470
@@ -24,7 +25,14 @@ TEXT = 0.46
 SMALL = 0.42
 GREEN = (60, 130, 30)
 SOFT = (110, 110, 110)
-_BLUE = (170, 90, 20)
+_BLUE, _RED, _SOFT = "#145aaa", "#c83c3c", "#6e6e6e"
+"""Colours of the plot."""
+_FONT = 13
+"""Font size of the plot [px]."""
+_DOT = 28.0
+"""Area of a tick's disc [px²]."""
+_MAX_DOTS = 200
+"""Fewest ticks of a lift whose curve has no dots, which would hide it."""
 _COLUMNS = ((0, "object"), (236, "above"), (296, "share"), (356, "pixels"), (416, "point"))
 """Position [px] and heading of the table's columns."""
 
@@ -86,47 +94,28 @@ def fitted(text: str, size: float, width: int) -> str:
     return text + ".."
 
 
-def draw_load(attempt: Attempt, config: Config, width: int, height: int) -> Image:
-    """Plot the seal force over time, with the break force."""
+def load_chart(attempt: Attempt, config: Config, width: int, height: int) -> Spec:
+    """Chart of the seal force over time, with the break force; size in pixels, whose height is kept in its limits."""
     height = max(PLOT_HEIGHT, min(height, _MAX_PLOT_HEIGHT))
-    canvas = np.full((height, width, 3), 255, np.uint8)
-    left, right, top, bottom = 52, width - 12, 26, height - 40
-    put_text(canvas, "seal force [N] (the largest, if several)", (0, 14), TEXT, SOFT)
-    cv2.line(canvas, (left, bottom), (right, bottom), INK, 1)
-    cv2.line(canvas, (left, top), (left, bottom), INK, 1)
+    size = {"width": width, "height": height, "autosize": {"type": "fit", "contains": "padding"}, "padding": 2, "background": "white"}
+    text = {"color": _SOFT, "fontSize": _FONT}
+    title = {**text, "text": "seal force [N] (the largest, if several)", "anchor": "start", "fontWeight": "normal"}
+    breaks = break_force(attempt, config)
     if not attempt.peak_force or not attempt.hits:
-        put_text(canvas, "no force: nothing was engaged", (left + 20, (top + bottom) // 2), TEXT, SOFT)
-        return canvas
-    tick = config.physics.step * config.physics.steps_per_tick
-    limit = break_force(attempt, config)
-    span, peak = tick * max(1, len(attempt.peak_force) - 1), 1.12 * max(limit, *attempt.peak_force)
-
-    def place(time: float, load: float) -> tuple[float, float]:
-        return left + (right - left) * time / span, bottom - (bottom - top) * load / peak
-
-    for value in ticks(peak, 4):
-        x, y = place(0.0, value)
-        cv2.line(canvas, (round(x) - 4, round(y)), (right, round(y)), (228, 228, 228) if value else INK, 1)
-        text = f"{value:g}"
-        put_text(canvas, text, (left - 9 - cv2.getTextSize(text, FONT, SMALL, 1)[0][0], round(y) + 5), SMALL, INK)
-    for value in ticks(span, 8):
-        x, _ = place(value, 0.0)
-        cv2.line(canvas, (round(x), bottom), (round(x), bottom + 4), INK, 1)
-        put_text(canvas, f"{value:g}", (round(x) - 8, bottom + 18), SMALL, INK)
-    put_text(canvas, "time since the suction was switched on [s]", (left + 4, height - 6), SMALL, SOFT)
-    y = round(place(0.0, limit)[1])
-    cv2.line(canvas, (left, y), (right, y), RED, 2)
-    put_text(canvas, f"breaks at {limit:g} N", (left + 8, y - 6), SMALL, RED)
-    points = [place(tick * number, load) for number, load in enumerate(attempt.peak_force)]
-    cv2.polylines(canvas, [fixed(np.array(points))], False, _BLUE, 2, cv2.LINE_AA, 4)
-    for point in points:
-        disc(canvas, point, 3, _BLUE)
-    return canvas
-
-
-def ticks(maximum: float, count: int) -> Sequence[float]:
-    """Axis ticks from 0 to `maximum`, about `count`, at steps of 1, 2 or 5 times a power of ten."""
-    raw = maximum / count
-    power = 10.0 ** np.floor(np.log10(raw))
-    step = next(factor * power for factor in (1, 2, 5, 10) if factor * power >= raw)
-    return [float(round(step * number, 9)) for number in range(int(maximum / step + 1e-9) + 1)]
+        said = {"type": "text", "text": "no force: nothing was engaged", **text}
+        return {**size, "title": title, "data": {"values": [{}]}, "mark": said, "config": theme(_FONT)}
+    span = config.physics.step * config.physics.steps_per_tick * max(1, len(attempt.peak_force) - 1)
+    peak = 1.12 * max(breaks, *attempt.peak_force)
+    y = axis("y", None, 0.0, peak, tickCount=4)
+    times = np.linspace(0.0, span, max(2, len(attempt.peak_force)))[: len(attempt.peak_force)]
+    label = {"align": "left", "baseline": "bottom", "x": 8, "dy": -3, "color": _RED, "fontSize": _FONT}
+    rule = limit({"y": {**y, "field": "limit"}, "x": None}, breaks, f"breaks at {breaks:g} N", {"color": _RED, "strokeWidth": 2}, label)
+    curve = line(2.0, {"value": _BLUE}, dots=_DOT if len(times) < _MAX_DOTS else 0.0)
+    x = axis("x", "time since the suction was switched on [s]", 0.0, 1.01 * span, tickCount=8)
+    return {
+        **size,
+        "title": title,
+        "config": theme(_FONT),
+        "encoding": {"x": x, "y": y},
+        "layer": [rule, points(curve, 0.0, peak, attempt.peak_force, x=times)],
+    }

@@ -16,7 +16,7 @@ import pytest
 import synpick_warp
 from synpick_warp.cli.commands import main
 from synpick_warp.cli.evaluate import method_names, toolkit_command
-from synpick_warp.evaluation.charts import WIDTH
+from synpick_warp.codecs.charts import SCALE, WIDTH
 from synpick_warp.evaluation.results import write_results
 from synpick_warp.evaluation.truth import read_truth
 from tests.worlds.evaluation_set import moved, write_evaluation_set
@@ -210,7 +210,7 @@ def test_plots_are_written_to_a_new_or_empty_folder(folder, files, tmp_path, cap
         }
         assert lines[-1].startswith("BOP_PATH=")
         for each in found:
-            assert cv2.imread(str(tmp_path / name / each)).shape[1] == WIDTH
+            assert cv2.imread(str(tmp_path / name / each)).shape[1] == SCALE * WIDTH
 
 
 def test_plots_with_a_filter_have_a_sweep_of_each_method(folder, files, tmp_path, capsys):

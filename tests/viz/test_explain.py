@@ -11,6 +11,8 @@ import cv2
 import numpy as np
 import pytest
 
+pytest.importorskip("vl_convert")
+
 from synpick_warp.cli.commands import main
 from synpick_warp.configs.schema import Config, Perception, Target
 from synpick_warp.configs.write import config_to_toml
@@ -19,9 +21,9 @@ from synpick_warp.exporters.bop.exporter import BopExporter
 from synpick_warp.viz import explain
 from synpick_warp.viz.drawing import FONT, instance_color
 from synpick_warp.viz.explain import object_names, to_color_image, write_explanation
-from synpick_warp.viz.explain_graph import RED
-from synpick_warp.viz.explain_panels import draw_load, fitted, ticks, wrapped
+from synpick_warp.viz.explain_panels import fitted, load_chart, wrapped
 from synpick_warp.viz.explain_record import choice_words, labels, seal_words
+from tests.harness.charts import near, picture_of
 from tests.harness.exporter_contract import export
 from tests.worlds.attempt_records import attempt, nothing_seen, record, seen, seen_object
 from tests.worlds.box_views import config
@@ -227,17 +229,17 @@ def test_what_the_seal_bore():
 
 
 def test_a_load_of_half_the_limit_lies_half_way_below_it():
-    plot = draw_load(attempt((FIRST,), {}, 0, peak_force=(20.0,) * 9), Config(), 400, 200)
-    limit = np.flatnonzero((plot[:, 200] == RED).all(axis=1))
-    curve = np.flatnonzero((plot[:, 300, 0] > 120) & (plot[:, 300, 2] < 60))
-    axis = np.flatnonzero((plot[:, 53] < 80).all(axis=1))
+    plot = picture_of(load_chart(attempt((FIRST,), {}, 0, peak_force=(20.0,) * 9), Config(), 400, 200), 1.0)
+    limit, curve = (np.flatnonzero(near(plot, color, 30)[:, 300]) for color in ("#c83c3c", "#145aaa"))
+    axis = np.flatnonzero(near(plot, "#1e1e1e", 30)[:, 300:303].all(axis=1))[:1]
+    assert plot.shape == (200, 400, 3)
     assert abs(curve.mean() - (limit.mean() + axis.mean()) / 2) < 1
 
 
-def test_ticks():
-    assert ticks(44.8, 4) == [0, 20, 40]
-    assert ticks(2.24, 4) == [0, 1, 2]
-    assert ticks(0.33, 8) == pytest.approx([0, 0.05, 0.1, 0.15, 0.2, 0.25, 0.3])
+def test_a_lift_without_a_seal_says_so():
+    nothing = load_chart(attempt((FIRST,), {}, 0, hits=0), Config(), 400, 100)
+    assert "nothing was engaged" in str(nothing)
+    assert picture_of(nothing, 1.0).shape == (190, 400, 3)
 
 
 def test_text_fits():

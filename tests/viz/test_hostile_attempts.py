@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from synpick_warp.configs.load import load_config
 from synpick_warp.errors import DatasetError
 from synpick_warp.viz.explain_graph import clutter_edges, draw_graph, lay_out
-from synpick_warp.viz.explain_panels import draw_load, draw_words
+from synpick_warp.viz.explain_panels import draw_words, load_chart
 from synpick_warp.viz.explain_record import MAX_ATTEMPTS, Attempt, read_attempts
 from tests.harness.fuzz import fuzz_examples
 from tests.harness.hostile import LEAVES, hostile_contents, places, removed, replaced
@@ -32,7 +32,7 @@ VALUES = (
 def draw(attempt: Attempt) -> None:
     """Draw all panels that need no image."""
     draw_words(attempt, {7: "tin"}, CONFIG)
-    draw_load(attempt, CONFIG, 800, 200)
+    json.dumps(load_chart(attempt, CONFIG, 800, 200), allow_nan=False)
     draw_graph(attempt, CONFIG.perception.min_votes, (500, 640))
 
 

@@ -1,0 +1,21 @@
+"""Pictures of charts, rendered in this process: a process of its own for each would take a second."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+
+from synpick_warp.codecs.charts import SCALE, VEGA_LITE, Spec
+
+
+def picture_of(spec: Spec, scale: float = SCALE) -> np.ndarray:
+    """RGB image (H, W, 3) uint8 of a chart."""
+    import vl_convert
+
+    data = vl_convert.vegalite_to_png(spec, vl_version=VEGA_LITE, scale=scale)
+    return cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)[..., ::-1]
+
+
+def near(picture: np.ndarray, color: str, tolerance: int = 40) -> np.ndarray:
+    """Pixels of about a colour #rrggbb (H, W) bool."""
+    return (np.abs(picture.astype(int) - list(bytes.fromhex(color[1:]))) <= tolerance).all(axis=2)
