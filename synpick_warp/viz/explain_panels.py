@@ -29,7 +29,7 @@ _BLUE, _RED, _SOFT = "#145aaa", "#c83c3c", "#6e6e6e"
 """Colours of the plot."""
 _FONT = 13
 """Font size of the plot [px]."""
-_DOT = 28.0
+_DOT = 40.0
 """Area of a tick's disc [px²]."""
 _MAX_DOTS = 200
 """Fewest ticks of a lift whose curve has no dots, which would hide it."""
@@ -110,7 +110,7 @@ def load_chart(attempt: Attempt, config: Config, width: int, height: int) -> Spe
     times = np.linspace(0.0, span, max(2, len(attempt.peak_force)))[: len(attempt.peak_force)]
     label = {"align": "left", "baseline": "bottom", "x": 8, "dy": -3, "color": _RED, "fontSize": _FONT}
     rule = limit({"y": {**y, "field": "limit"}, "x": None}, breaks, f"breaks at {breaks:g} N", {"color": _RED, "strokeWidth": 2}, label)
-    curve = line(2.0, {"value": _BLUE}, dots=_DOT if len(times) < _MAX_DOTS else 0.0)
+    curve = line(2.5, {"value": _BLUE}, dots=_DOT if len(times) < _MAX_DOTS else 0.0)
     x = axis("x", "time since the suction was switched on [s]", 0.0, 1.01 * span, tickCount=8)
     return {
         **size,
