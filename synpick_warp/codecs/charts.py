@@ -6,7 +6,6 @@ only, never fields, expressions or titles.
 
 from __future__ import annotations
 
-import importlib.util
 import json
 import signal
 import struct
@@ -38,8 +37,9 @@ for spec in json.load(sys.stdin):
     sys.stdout.buffer.write(struct.pack("<q", len(picture)) + picture)"""
 MAX_LABEL = 36
 """Maximum number of letters of a legend entry."""
-_WIDE, _WIDTHS, _SYMBOL = "MW@mw%", (16.5, 12.5, 9.4), 50.0
-"""Widest letters; upper limits of the widths of those, of other capitals and of the rest, and width of a symbol with its gaps [px]."""
+_WIDTHS = {**dict.fromkeys("MW@mw%", 16.5), **dict.fromkeys(" !'()-,./:;I[]fijlrt|", 5.4)}
+_CAPITAL, _LETTER, _SYMBOL = 12.5, 9.4, 50.0
+"""Widths of wide and narrow letters, upper limits of those of other capitals and of the rest, and width of a symbol with its gaps [px]."""
 WIDTH = 700
 """Width of a chart [px]."""
 _PANEL, _LEFT, _GAP = 605, 56, 16
@@ -48,42 +48,38 @@ _TEXT = 16
 """Font size [px]: at a width of 3.5 inches, a column of a paper, some 6 points."""
 _FAR = 20.0
 """How far beyond its axis a value may lie before it is clamped, in lengths of the axis."""
-
-
 _STROKE = {"symbolType": "stroke", "symbolStrokeWidth": 3, "symbolSize": 500, "symbolOpacity": 1}
 """Symbols of the legend: a piece of each line."""
+_DISC = {"symbolType": ("'circle'", _STROKE["symbolType"]), "symbolSize": (110, _STROKE["symbolSize"])}
+"""Symbol of an entry with a disc, and of the others."""
 
 
-class MissingVegaError(SynpickError):
-    """Vega is not installed, or does not run."""
+class ChartError(SynpickError):
+    """The charts' library cannot run."""
 
 
-def read_bundle(user: str) -> str:
+def read_bundle() -> str:
     """Vega, Vega-Lite and Vega-Embed as one script, which sets `vegaEmbed`.
 
-    Args:
-        user: What needs it, for the message.
-
     Raises:
-        MissingVegaError: The package vl-convert-python is not installed, or does not run.
+        ChartError: The library cannot run.
     """
-    return _run(_BUNDLE, user).decode(errors="replace")
+    return _run(_BUNDLE).decode(errors="replace")
 
 
-def render_charts(specs: Sequence[Spec], user: str, scale: float = SCALE) -> list[bytes]:
+def render_charts(specs: Sequence[Spec], scale: float = SCALE) -> list[bytes]:
     """Render charts in one process: a PNG file of each.
 
     Args:
         specs: The charts.
-        user: What needs them, for the message.
         scale: Pixels of the picture per pixel of the specification.
 
     Raises:
-        MissingVegaError: The package vl-convert-python is not installed, or does not run.
+        ChartError: The library cannot run.
     """
     if not specs:
         return []
-    data = _run(_RENDER, user, json.dumps([{**spec, "usermeta": {"scale": scale}} for spec in specs], allow_nan=False).encode())
+    data = _run(_RENDER, json.dumps([{**spec, "usermeta": {"scale": scale}} for spec in specs], allow_nan=False).encode())
     pictures, start = [], 0
     for _ in specs:
         (size,) = struct.unpack_from("<q", data, start)
@@ -92,23 +88,23 @@ def render_charts(specs: Sequence[Spec], user: str, scale: float = SCALE) -> lis
     return pictures
 
 
-def _run(code: str, user: str, data: bytes = b"") -> bytes:
+def _run(code: str, data: bytes = b"") -> bytes:
     """Standard output of a script that uses vl_convert.
 
     It runs in a process of its own: the library is a browser's engine, which reserves much memory, and aborts where it does not get it.
     """
-    if importlib.util.find_spec("vl_convert") is None:
-        raise MissingVegaError(f"{user} needs the package vl-convert-python for its plots; pip install 'synpick-warp[report]'")
+    # Without -P, a json.py in the current folder would be imported in place of Python's.
+    command = [sys.executable, "-P", "-c", code, VEGA_LITE]
     try:
-        done = subprocess.run([sys.executable, "-c", code, VEGA_LITE], input=data, capture_output=True, check=False, timeout=_TIMEOUT)
+        done = subprocess.run(command, input=data, capture_output=True, check=False, timeout=_TIMEOUT)
     except (OSError, subprocess.TimeoutExpired) as error:
-        raise MissingVegaError(f"the process of the plots' library cannot be run: {error}; {_LIMITS}") from None
+        raise ChartError(f"the process of the charts' library cannot be run: {error}; {_LIMITS}") from None
     if done.returncode or not done.stdout:
-        raise MissingVegaError(f"the plots' library vl-convert-python {describe_end(done.returncode)}; {_LIMITS}")
+        raise ChartError(f"the charts' library vl-convert-python {_describe_end(done.returncode)}; {_LIMITS}")
     return done.stdout
 
 
-def describe_end(code: int) -> str:
+def _describe_end(code: int) -> str:
     """How a process ended by its return code: a signal's number is negative."""
     return f"was ended by {signal.Signals(-code).name}" if code < 0 else f"ended with exit code {code}"
 
@@ -152,25 +148,32 @@ def limit(encoding: Spec, place: float, text: str, mark: Spec, label: Spec) -> S
 
 
 class Legend:
-    """Legend above a chart: names, made printable and distinct, with their colours."""
+    """Legend above a chart: names, made printable and distinct, with a piece of each line, or a disc."""
 
-    def __init__(self, colors: Mapping[str, str]) -> None:
+    def __init__(self, colors: Mapping[str, str], disc: str | None = None) -> None:
+        """Colours by name; `disc` is the name that has a disc."""
         self._shown: dict[str, str] = {}
-        for name in colors:
+        self._symbols: Spec = {}
+        for name, color in colors.items():
             shown, number = printable(name), 2
             while shown in self._shown.values():
                 shown, number = f"{printable(name)} ({number})", number + 1
             self._shown[name] = shown
+            if name == disc:
+                symbols = _DISC | {"symbolFillColor": (f"'{color}'", None)}
+                chosen = f"datum.index === {len(self._shown) - 1}"
+                self._symbols = {key: {"expr": f"{chosen} ? {one} : {json.dumps(other)}"} for key, (one, other) in symbols.items()}
         self._scale = {"domain": list(self._shown.values()), "range": list(colors.values())}
 
     def color(self, name: str) -> Spec:
         """Colour channel of the entry `name`."""
-        return {"datum": self._shown[name], "type": "nominal", "scale": self._scale, "legend": {"columns": self._columns()}}
+        legend = {"columns": self._columns(), **self._symbols}
+        return {"datum": self._shown[name], "type": "nominal", "scale": self._scale, "legend": legend}
 
     def _columns(self) -> int:
         """Number of columns, each as wide as its widest entry, that fit above a panel."""
         widths = [
-            _SYMBOL + sum(_WIDTHS[0 if letter in _WIDE or ord(letter) > 127 else 1 if letter.isupper() else 2] for letter in shown)
+            _SYMBOL + sum(_WIDTHS.get(letter, _CAPITAL if letter.isupper() or ord(letter) > 127 else _LETTER) for letter in shown)
             for shown in self._shown.values()
         ]
         fit = [count for count in range(1, len(widths) + 1) if sum(max(widths[at::count]) for at in range(count)) <= _PANEL]

@@ -89,7 +89,7 @@ def draw_figures(
 
     Raises:
         ConfigError: The track is not in the ground truth, or a method has no estimate of it.
-        MissingVegaError: The plots' library is not installed, or does not run.
+        ChartError: The charts' library cannot run.
     """
     charts = _draw_errors(truth, scores)
     chosen = _farthest_track(truth, methods, settings.min_visibility) if track is None else track
@@ -103,7 +103,7 @@ def draw_figures(
     for method, name in zip(methods, names, strict=True):
         if method.filtered is not None:
             charts[f"alpha_sweep_{name}.png"] = plot_sweep(_sweep(truth, method, settings), score="ADD-S AUC [%]")
-    return dict(zip(charts, render_charts(list(charts.values()), "eval --plots"), strict=True))
+    return dict(zip(charts, render_charts(list(charts.values())), strict=True))
 
 
 def _draw_errors(truth: Truth, scores: Sequence[Scores]) -> dict[str, Spec]:

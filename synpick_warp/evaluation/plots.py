@@ -63,7 +63,7 @@ def plot_trajectory(
     order = [method, *filtered, "Ground truth"]
     colors = {"Ground truth": INK, method: _RAW, **dict(zip(filtered, _colors(len(filtered)), strict=True))}
     event = next(name for name in ("Pick attempt", "Pick attempt ", "Pick attempt  ") if name not in colors)
-    legend = Legend(colors | ({event: _EVENT} if len(attempts) else {}))
+    legend = Legend(colors | ({event: _EVENT} if len(attempts) else {}), disc=event)
     images = np.concatenate([table.image for table in named.values()])
     first, last = int(images.min()), int(images.max())
     at = [frame for frame in attempts if first <= frame <= last]
@@ -133,7 +133,7 @@ def plot_sweep(sweep: AlphaSweep, *, score: str = "ADD-S AUC") -> Spec:
         for raw, color in zip(sweep.unfiltered, colors, strict=True)
     ]
     for mode, scores in zip(sweep.modes, sweep.scores, strict=True):
-        ring = {"mark": {"type": "point", "size": 160, "strokeWidth": 1.5, "opacity": 1}, "encoding": {"color": legend.color(names[mode])}}
+        ring = {"mark": {"type": "point", "size": 200, "strokeWidth": 1.5, "opacity": 1}, "encoding": {"color": legend.color(names[mode])}}
         best, score_there = sweep.best(mode)
         layers += [points(line(_CURVE, legend.color(names[mode]), dots=_DOT), low, high, scores, x=alphas)]
         layers += [points(ring, low, high, [score_there], x=[best])]

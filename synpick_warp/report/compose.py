@@ -74,7 +74,7 @@ def write_report(
     Raises:
         ConfigError: The settings are damaged.
         DatasetError: There is no episode, or a file is missing or damaged.
-        MissingVegaError: The plots' library is not installed.
+        ChartError: The charts' library cannot run.
         OutputError: The file cannot be written.
     """
     check_out(out)

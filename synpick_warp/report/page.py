@@ -9,7 +9,7 @@ from pathlib import Path
 from string import Template
 from typing import Any
 
-from synpick_warp.codecs.charts import MissingVegaError, read_bundle
+from synpick_warp.codecs.charts import ChartError, read_bundle
 from synpick_warp.report.album import Album
 from synpick_warp.report.charts import Chart
 from synpick_warp.report.findings import NOTE, WARNING, Finding, count_levels
@@ -52,12 +52,12 @@ def read_vega() -> str:
     """Vega, Vega-Lite and Vega-Embed as one script, which sets `vegaEmbed`.
 
     Raises:
-        MissingVegaError: The package vl-convert-python is not installed, or does not run.
+        ChartError: The charts' library cannot run, or its script cannot stand in a page.
     """
-    script = read_bundle("report")
+    script = read_bundle()
     # Neither an end of the element nor the states of HTML's parser that hide one can stand in the script, as its hash would not match.
     if any(text in script.lower() for text in ("</script", "<script", "<!--")):
-        raise MissingVegaError("the installed vl-convert-python has a script that cannot be inlined; install another version")
+        raise ChartError("the installed vl-convert-python has a script that cannot be inlined; install another version")
     return script
 
 

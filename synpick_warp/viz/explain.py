@@ -79,7 +79,7 @@ def write_explanation(dataset: Path, out: Path, episode: int | None, attempt: in
         ConfigError: The data set's config.toml is damaged.
         DatasetError: There is no such attempt, or a file is missing or damaged.
         OutputError: The image cannot be written.
-        MissingVegaError: The plots' library is not installed, or does not run.
+        ChartError: The charts' library cannot run.
     """
     check_picture_name(out)
     if not dataset.is_dir():
@@ -91,7 +91,7 @@ def write_explanation(dataset: Path, out: Path, episode: int | None, attempt: in
     config = load_config(str(path), {})
     names = object_names(dataset, config, {one.object_id for each in attempts for one in each.seen})
     rows = [_row(each, _read_scene(dataset, config, each), names, config) for each in attempts]
-    plots = render_charts([plot for _, plot in rows], "explain", scale=1.0)
+    plots = render_charts([plot for _, plot in rows], scale=1.0)
     for (sheet, _), data in zip(rows, plots, strict=True):
         plot = np.asarray(cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR))
         _paste(sheet, plot, MARGIN, len(sheet) - MARGIN - len(plot))

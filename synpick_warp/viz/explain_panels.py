@@ -105,13 +105,13 @@ def load_chart(attempt: Attempt, config: Config, width: int, height: int) -> Spe
         said = {"type": "text", "text": "no force: nothing was engaged", **text}
         return {**size, "title": title, "data": {"values": [{}]}, "mark": said, "config": theme(_FONT)}
     span = config.physics.step * config.physics.steps_per_tick * max(1, len(attempt.peak_force) - 1)
-    peak = 1.12 * max(breaks, *attempt.peak_force)
+    peak = 1.25 * max(breaks, *attempt.peak_force)
     y = axis("y", None, 0.0, peak, tickCount=4)
     times = np.linspace(0.0, span, max(2, len(attempt.peak_force)))[: len(attempt.peak_force)]
     label = {"align": "left", "baseline": "bottom", "x": 8, "dy": -3, "color": _RED, "fontSize": _FONT}
     rule = limit({"y": {**y, "field": "limit"}, "x": None}, breaks, f"breaks at {breaks:g} N", {"color": _RED, "strokeWidth": 2}, label)
     curve = line(2.5, {"value": _BLUE}, dots=_DOT if len(times) < _MAX_DOTS else 0.0)
-    x = axis("x", "time since the suction was switched on [s]", 0.0, 1.01 * span, tickCount=8)
+    x = axis("x", "time since the suction was switched on [s]", -0.01 * span, 1.01 * span, tickCount=8)
     return {
         **size,
         "title": title,

@@ -11,9 +11,10 @@ import pytest
 
 from synpick_warp.cli import commands
 from synpick_warp.cli.commands import main
+from synpick_warp.dataset.reading import open_data_set
+from synpick_warp.evaluation.results import write_results
+from synpick_warp.evaluation.truth import read_truth
 from tests.harness.scripted_bake import bake, settings
-
-pytest.importorskip("vl_convert")
 
 
 @pytest.mark.parametrize(
@@ -54,17 +55,27 @@ def test_other_faults_keep_their_traceback(monkeypatch, error):
 def data(tmp_path_factory) -> Path:
     out = tmp_path_factory.mktemp("limits") / "set"
     bake(out, settings(1, ("bop",)))
+    write_results(out.parent / "exact.csv", read_truth(open_data_set(out)).poses)
     return out
 
 
 @pytest.mark.parametrize(("limit", "value"), [(resource.RLIMIT_AS, 3 << 30), (resource.RLIMIT_AS, 6 << 28), (resource.RLIMIT_NOFILE, 8)])
-def test_a_report_under_limits_is_a_page_or_one_line(data, tmp_path, limit, value):
-    """The plots' library, a browser's engine, aborted with its stack, or panicked."""
-    command = [sys.executable, "-m", "synpick_warp", "report", str(data), "--views", "1", "--out", str(tmp_path / "page.html")]
+@pytest.mark.parametrize(
+    ("name", "arguments"),
+    [
+        ("page.html", "report {data} --views 1 --out {out}"),
+        ("picture.png", "explain {data} --out {out}"),
+        ("plots", "eval --data {data} --results {data}/../exact.csv --visib-min 0 --plots {out}"),
+    ],
+)
+def test_charts_under_limits_are_drawn_or_one_line(data, tmp_path, limit, value, name, arguments):
+    """The charts' library, a browser's engine, aborted with its stack, or panicked."""
+    out = tmp_path / name
+    command = [sys.executable, "-m", "synpick_warp", *(part.format(data=data, out=out) for part in arguments.split())]
     done = subprocess.run(
         command, capture_output=True, text=True, check=False, preexec_fn=lambda: resource.setrlimit(limit, (value, value))
     )
     lines = done.stderr.splitlines()
     assert done.returncode in (0, 2), done.stderr
-    assert (tmp_path / "page.html").exists() == (done.returncode == 0)
+    assert out.exists() == (done.returncode == 0)
     assert not done.returncode or (len(lines) == 1 and lines[0].startswith("synpick-warp: error: ")), done.stderr

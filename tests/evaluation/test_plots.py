@@ -2,22 +2,18 @@
 
 from __future__ import annotations
 
-import sys
-
 import cv2
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-pytest.importorskip("vl_convert")
-
-from synpick_warp.codecs.charts import INK, PALETTE, Legend, MissingVegaError, axis, chart, line, panel, points, printable, render_charts
+from synpick_warp.codecs.charts import INK, PALETTE, SCALE, ChartError, Legend, axis, chart, line, panel, points, printable, render_charts
 from synpick_warp.errors import DatasetError, OutputError
 from synpick_warp.evaluation import filter_poses, sweep_alpha
 from synpick_warp.evaluation.figures import write_figures
 from synpick_warp.evaluation.plots import plot_error_by_speed, plot_error_by_visibility, plot_recall, plot_sweep, plot_trajectory
-from tests.harness.charts import near, picture_of
+from tests.harness.charts import near, picture_of, tick_texts
 from tests.harness.fuzz import fuzz_examples
 from tests.worlds.noisy_tracks import Motion, estimates, true_poses
 
@@ -32,9 +28,9 @@ def rows_at(picture: np.ndarray, column: float, color: str, panel: int) -> np.nd
     return (len(picture) - BOTTOM - 0.5 - rows) / panel
 
 
-def one_line(x: np.ndarray, y: np.ndarray, end: float, low: float, high: float) -> np.ndarray:
+def one_line(x: np.ndarray, y: np.ndarray, end: float, low: float, high: float, width: float = 2.0) -> np.ndarray:
     """Picture of a red line on axes from 0 to `end` and from `low` to `high`, in a panel of 400 px."""
-    layer = points(line(2.0, {"value": RED}), low, high, y, x=x)
+    layer = points(line(width, {"value": RED}), low, high, y, x=x)
     return picture_of(chart(axis("x", "x", 0.0, end), [panel(axis("y", "y", low, high), 200, [layer])]))
 
 
@@ -56,8 +52,25 @@ def test_nan_breaks_a_line_and_what_is_outside_is_clipped():
 
 
 def test_a_single_point_between_breaks_is_a_dot():
-    picture = one_line(np.arange(3.0), np.array([np.nan, 0.5, np.nan]), 2.0, 0.0, 1.0)
-    assert near(picture, RED)[:, (LEFT + RIGHT) // 2].sum() >= 3
+    picture = one_line(np.arange(3.0), np.array([np.nan, 0.5, np.nan]), 2.0, 0.0, 1.0, width=3.0)
+    assert near(picture, RED)[:, (LEFT + RIGHT) // 2].sum() >= 5
+
+
+@given(st.floats(-1e6, 1e6), st.floats(1e-4, 1e6), st.integers(2, 12))
+@settings(max_examples=fuzz_examples(30), deadline=None)
+def test_fuzz_ticks_are_few_round_and_inside(low, span, count):
+    high = low + span
+    if high - low < 1e-6 * max(abs(low), abs(high)):
+        return
+    layer = points(line(1.0, {"value": RED}), low, high, [low], x=[0.0])
+    y = axis("y", None, low, high, tickCount=count)
+    texts = tick_texts(chart(axis("x", None, 0.0, 1.0, labels=False), [panel(y, 600, [layer])]))
+    values = np.array([float(text.replace(",", "").replace("−", "-")) for text in texts])
+    assert len(texts) <= 1.6 * count + 1
+    assert (values >= low - 1e-5 * span).all()
+    assert (values <= high + 1e-5 * span).all()
+    assert len(set(texts)) == len(texts)
+    assert not {"−0", "−0.0", "−0.00"} & set(texts)
 
 
 def test_recall_is_the_fraction_of_errors_up_to_the_threshold():
@@ -86,7 +99,7 @@ def test_pick_attempts_are_marked_in_red_and_the_legend_names_all():
     marked = picture_of(plot_trajectory(truth, truth, {}, attempts=[25, 75]))
     red = "#c82828"
     assert not near(plain, red).any()
-    # One disc for each attempt in the upper panel, and a line in the legend.
+    # One disc for each attempt in the upper panel, and one in the legend.
     count, _ = cv2.connectedComponents(near(marked, red).astype(np.uint8))
     assert count - 1 == 3
 
@@ -119,7 +132,7 @@ def test_sweeps_ring_the_optimum():
     x = np.log([0.1 / 1.2, 0.5, 1.2])
     column = round(LEFT + (x[1] - x[0]) / (x[2] - x[0]) * (RIGHT - LEFT))
     drawn = near(picture, PALETTE[0])[80:-BOTTOM]
-    assert np.ptp(np.flatnonzero(drawn[:, column])) >= 26
+    assert np.ptp(np.flatnonzero(drawn[:, column])) >= 28
 
 
 def test_long_and_strange_names_are_shortened_and_stay_distinct():
@@ -144,20 +157,23 @@ def test_names_stand_in_values_only():
     assert evil not in str(drop(rest))
 
 
-def test_written_charts_read_back(tmp_path):
+def test_written_charts_read_back(tmp_path, monkeypatch):
     spec = plot_recall({"method": np.array([0.01, 0.05])})
-    first, second = render_charts([spec, spec], "eval --plots")
+    (tmp_path / "json.py").write_text("raise ImportError('of the current folder')")
+    monkeypatch.chdir(tmp_path)
+    first, second = render_charts([spec, spec])
     assert first == second
     [written] = write_figures(tmp_path / "new", {"recall.png": first})
     np.testing.assert_array_equal(cv2.imread(str(written))[..., ::-1], picture_of(spec))
     assert [path.name for path in written.parent.iterdir()] == ["recall.png"]
-    assert render_charts([], "eval --plots") == []
+    assert render_charts([]) == []
 
 
-def test_without_the_library_one_line_says_so(monkeypatch):
-    monkeypatch.setitem(sys.modules, "vl_convert", None)
-    with pytest.raises(MissingVegaError, match=r"^eval --plots needs the package vl-convert-python for its plots; pip install "):
-        render_charts([plot_recall({"method": np.array([0.01])})], "eval --plots")
+def test_a_library_that_cannot_run_is_one_line(tmp_path, monkeypatch):
+    (tmp_path / "vl_convert.py").write_text("raise ImportError")
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    with pytest.raises(ChartError, match=r"^the charts' library vl-convert-python ended with exit code 1; .* install the package again$"):
+        render_charts([plot_recall({"method": np.array([0.01])})])
 
 
 def test_a_file_that_cannot_be_written_is_refused_and_leaves_nothing(tmp_path):
@@ -211,6 +227,6 @@ def test_fuzz_no_data_and_no_name_breaks_a_drawing(data):
     alphas = data.draw(st.lists(st.floats(1e-6, 1.0), min_size=1, max_size=4))
     functions = {name: lambda _, score=score: score for name, score in scores.items()}
     pictures.append(plot_sweep(sweep_alpha(dict.fromkeys(scores, truth), functions, alphas)))
-    for picture in map(picture_of, pictures):
-        assert picture.shape[1] >= WIDTH - 4  # Labels of large numbers widen it, and bounds are rounded.
+    for picture in (picture_of(each, 1.0) for each in pictures):
+        assert WIDTH - 4 <= SCALE * picture.shape[1] <= 1.2 * WIDTH  # Labels of large numbers widen it, and bounds are rounded.
         assert near(picture, INK).any()

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 import cv2
 import numpy as np
 
@@ -14,6 +16,14 @@ def picture_of(spec: Spec, scale: float = SCALE) -> np.ndarray:
 
     data = vl_convert.vegalite_to_png(spec, vl_version=VEGA_LITE, scale=scale)
     return cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)[..., ::-1]
+
+
+def tick_texts(spec: Spec) -> list[str]:
+    """Texts of the ticks of a chart's axes."""
+    import vl_convert
+
+    groups = re.findall(r'role-axis-label".*?</g>', vl_convert.vegalite_to_svg(spec, vl_version=VEGA_LITE))
+    return [text for group in groups for text in re.findall("<text[^>]*>([^<]*)</text>", group)]
 
 
 def near(picture: np.ndarray, color: str, tolerance: int = 40) -> np.ndarray:

@@ -9,7 +9,6 @@ from pathlib import Path
 import pytest
 
 playwright = pytest.importorskip("playwright.sync_api")
-pytest.importorskip("vl_convert")
 
 BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
 SECTIONS = ("frames", "strips", "attempts", "figures", "findings", "settings")

@@ -8,8 +8,6 @@ from types import SimpleNamespace as Namespace
 import numpy as np
 import pytest
 
-pytest.importorskip("vl_convert")
-
 import synpick_warp
 from synpick_warp.codecs.charts import VEGA_LITE
 from synpick_warp.configs.load import load_config

@@ -11,8 +11,6 @@ import cv2
 import numpy as np
 import pytest
 
-pytest.importorskip("vl_convert")
-
 from synpick_warp.cli.commands import main
 from synpick_warp.configs.schema import Config, Perception, Target
 from synpick_warp.configs.write import config_to_toml

@@ -16,6 +16,7 @@ from synpick_warp.errors import DatasetError
 from synpick_warp.viz.explain_graph import clutter_edges, draw_graph, lay_out
 from synpick_warp.viz.explain_panels import draw_words, load_chart
 from synpick_warp.viz.explain_record import MAX_ATTEMPTS, Attempt, read_attempts
+from tests.harness.charts import picture_of
 from tests.harness.fuzz import fuzz_examples
 from tests.harness.hostile import LEAVES, hostile_contents, places, removed, replaced
 from tests.worlds.attempt_records import record, seen_object
@@ -32,7 +33,7 @@ VALUES = (
 def draw(attempt: Attempt) -> None:
     """Draw all panels that need no image."""
     draw_words(attempt, {7: "tin"}, CONFIG)
-    json.dumps(load_chart(attempt, CONFIG, 800, 200), allow_nan=False)
+    assert picture_of(load_chart(attempt, CONFIG, 800, 200), 1.0).shape == (200, 800, 3)
     draw_graph(attempt, CONFIG.perception.min_votes, (500, 640))
 
 
