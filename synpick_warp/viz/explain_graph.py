@@ -16,9 +16,10 @@ import numpy as np
 from scipy.interpolate import PchipInterpolator
 from scipy.optimize import isotonic_regression
 
+from synpick_warp.dataset.records import InstanceObservation
 from synpick_warp.errors import DatasetError
 from synpick_warp.viz.drawing import FONT, INK, WHITE, Image, instance_color, put_text, readable_on
-from synpick_warp.viz.explain_record import Attempt, SeenObject, labels
+from synpick_warp.viz.explain_record import Attempt, labels
 
 RADIUS = 20
 """Radius of a node [px]."""
@@ -75,7 +76,7 @@ def clutter_edges(attempt: Attempt, min_votes: float) -> list[Edge]:
     edges = []
     for lower, one in sorted(attempt.objects.items()):
         voted = {upper for (at, upper), votes in attempt.votes.items() if at == lower and votes >= min_votes}
-        for upper in sorted((one.above | voted) & attempt.objects.keys()):
+        for upper in sorted(voted.union(one.above) & attempt.objects.keys()):
             votes, opposite = attempt.votes.get((lower, upper), 0.0), attempt.votes.get((upper, lower), 0.0)
             opposite = opposite if opposite >= min_votes else 0.0
             if upper in one.above:
@@ -98,10 +99,10 @@ def lay_out(attempt: Attempt, edges: Sequence[Edge], size: tuple[int, int]) -> L
     """
     width, height = size
     kept = [(edge.upper, edge.lower) for edge in edges if edge.state == KEPT]
-    place: dict[Key, float] = {one.instance: one.grasp_pixel[0] / attempt.resolution[0] for one in attempt.seen}
+    place: dict[Key, float] = {one.instance: one.grasp_pixel[0] / attempt.observation.resolution[0] for one in attempt.seen}
     depth = _assign_layers(attempt, kept, place, max(1, int((width - 2 * _MARGIN) // (2 * RADIUS + _MIN_GAP)) + 1))
     if sum(depth[lower] - depth[upper] for upper, lower in kept) > _MAX_PIECES:
-        raise DatasetError(f"the clutter graph of attempt {attempt.number} of episode {attempt.episode} has too many edges to be drawn")
+        raise DatasetError(f"the clutter graph of attempt {attempt.attempt} of episode {attempt.episode} has too many edges to be drawn")
     graph = nx.Graph()
     graph.add_nodes_from(depth)
     layers: dict[Key, int] = {**depth}
@@ -129,7 +130,7 @@ def _assign_layers(attempt: Attempt, kept: list[tuple[int, int]], place: Mapping
             sorted(layer, key=lambda instance: (graph.degree(instance) > 0, place[instance])) for layer in nx.topological_generations(graph)
         ]
     except nx.NetworkXUnfeasible as error:
-        raise DatasetError(f"the clutter graph of attempt {attempt.number} of episode {attempt.episode} has a cycle") from error
+        raise DatasetError(f"the clutter graph of attempt {attempt.attempt} of episode {attempt.episode} has a cycle") from error
     rows = [layer[start : start + capacity] for layer in generations for start in range(0, len(layer), capacity)]
     return {instance: number for number, row in enumerate(rows) for instance in row}
 
@@ -199,7 +200,7 @@ def draw_graph(attempt: Attempt, min_votes: float, size: tuple[int, int]) -> Ima
     return canvas
 
 
-def _draw_node(canvas: Image, place: tuple[float, float], label: str, one: SeenObject, target: bool) -> None:
+def _draw_node(canvas: Image, place: tuple[float, float], label: str, one: InstanceObservation, target: bool) -> None:
     """Draw a node with its label, and a badge with the number of its ancestors."""
     x, y = place
     color = instance_color(one.instance)
