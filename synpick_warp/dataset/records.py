@@ -101,7 +101,14 @@ class InstanceObservation(msgspec.Struct):
     grasp_pixel: tuple[Number, Number]
     depth: float
     above: Instances
+    """Parents: instances with an edge of the clutter graph to this one."""
     ancestors: Instances
+    """Instances with a path to this one (transitive closure)."""
+
+    @property
+    def candidates(self) -> tuple[Pixel, Pixel, Pixel]:
+        """Candidates of the suction point, in the order of `distances`."""
+        return self.pole, self.centroid, self.midpoint
 
 
 class Observation(msgspec.Struct):

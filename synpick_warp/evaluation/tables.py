@@ -6,17 +6,16 @@ all instances. Areas and recalls are in percent.
 
 from __future__ import annotations
 
-import csv
-import io
 import json
 import math
 import statistics
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
 
+from synpick_warp.codecs.tables import Column, Table, to_csv, to_latex, to_text
 from synpick_warp.evaluation.auc import CONVENTIONS, LIMIT, band_indices, error_bands, recall_curve
 from synpick_warp.evaluation.scoring import METRICS, Scores
 from synpick_warp.evaluation.truth import Truth
@@ -125,86 +124,51 @@ def render(rows: Sequence[Row], truth: Truth, scores: Sequence[Scores], style: s
         convention: Convention of the areas in text and LaTeX.
     """
     if style == "csv":
-        return _csv(rows, scores)
+        return to_csv(_long(rows, scores), exact=True)
     if style == "json":
         return _json(rows, truth, scores)
-    return (_text if style == "text" else _latex)(rows, [each.name for each in scores], convention)
-
-
-def _text(rows: Sequence[Row], names: Sequence[str], convention: str) -> str:
-    """Aligned columns, a block for each method."""
-    columns = [f"{metric} {convention}" for metric in METRICS]
-    extra = ("recall", "rotation", "translation")
-    heads = [*METRICS, "recall", "°", "mm"]
-    lines = [["", "targets"] + heads * len(names)]
-    for row in rows:
-        values = [cells[column] for cells in row.cells for column in (*columns, *extra)]
-        lines.append([row.label, f"{row.targets:,}", *("-" if math.isnan(value) else f"{value:.1f}" for value in values)])
-    widths = [max(len(line[column]) for line in lines) for column in range(len(lines[0]))]
-    for index, name in enumerate(names):  # A method's name must fit above its columns.
-        first = 2 + index * len(heads)
-        room = sum(widths[first : first + len(heads)]) + 2 * (len(heads) - 1)
-        widths[first] += max(0, len(name) - room)
-    start = sum(widths[:2]) + 2
-    spans = [sum(widths[2 + i * len(heads) : 2 + (i + 1) * len(heads)]) + 2 * (len(heads) - 1) for i in range(len(names))]
-    head = " " * start + "".join(f"  {name:<{span}}" for name, span in zip(names, spans, strict=True))
-    output, previous = [head.rstrip()], ""
-    for row, line in zip([None, *rows], lines, strict=True):
-        if row is not None and row.group != previous:
-            output.append("")
-            previous = row.group
-        cells = [f"{line[0]:<{widths[0]}}", *(f"{cell:>{width}}" for cell, width in zip(line[1:], widths[1:], strict=True))]
-        output.append("  ".join(cells).rstrip())
-    output += [
+    names, areas = [each.name for each in scores], {f"{metric} {convention}": metric for metric in METRICS}
+    if style == "latex":
+        said = f"% AUC to {LIMIT:g} m [%], convention {convention}; needs \\usepackage{{booktabs}}\n"
+        return said + to_latex(_wide([replace(row, label="Mean") if row.group == "mean" else row for row in rows], names, areas, "Object"))
+    [lines] = to_text(_wide(rows, names, areas | {"recall": "recall", "rotation": "°", "translation": "mm"}, "", targets=True))
+    lines += [
         "",
         f"AUC of ADD, ADD-S and ADD(-S) to {LIMIT:g} m [%], convention {convention}; a group's is the mean over its objects; recall",
     ]
-    output += ["of ADD(-S) below it [%]; medians of rotation and translation error of what was found"]
-    return "\n".join(output) + "\n"
+    return "\n".join([*lines, "of ADD(-S) below it [%]; medians of rotation and translation error of what was found"]) + "\n"
 
 
-def _latex(rows: Sequence[Row], names: Sequence[str], convention: str) -> str:
-    """The paper's table: booktabs, ADD, ADD-S and ADD(-S) of each method."""
-    columns, width = [f"{metric} {convention}" for metric in METRICS], len(METRICS)
-    heads = " & ".join(f"\\multicolumn{{{width}}}{{c}}{{{_escape(name)}}}" for name in names)
-    rules = "".join(f"\\cmidrule(lr){{{2 + width * index}-{1 + width * (index + 1)}}}" for index in range(len(names)))
-    lines = [
-        f"% AUC to {LIMIT:g} m [%], convention {convention}; needs \\usepackage{{booktabs}}",
-        f"\\begin{{tabular}}{{l{'r' * width * len(names)}}}",
-        "\\toprule",
-        f" & {heads} \\\\",
-        rules,
-        f"Object & {' & '.join([*METRICS] * len(names))} \\\\",
-    ]
-    previous = ""
+def _wide(rows: Sequence[Row], names: Sequence[str], shown: Mapping[str, str], label: str, targets: bool = False) -> Table:
+    """A row for each group, in which methods stand beside each other; `shown` are columns with their labels."""
+    keys = (Column("label", label=label), *([Column("targets", ",")] if targets else []))
+    columns = (*keys, *(Column(name, ".1f", each) for _ in names for name, each in shown.items()))
+    spans = ((name, range(at, at + len(shown))) for name, at in zip(names, range(len(keys), len(columns), len(shown)), strict=True))
+    starts = (number for number, row in enumerate(rows) if not number or row.group != rows[number - 1].group)
+    table = Table("scores", "", columns, spans=tuple(spans), sections=frozenset(starts))
     for row in rows:
-        if row.group != previous:
-            lines.append("\\midrule")
-            previous = row.group
-        values = ["--" if math.isnan(cells[column]) else f"{cells[column]:.1f}" for cells in row.cells for column in columns]
-        lines.append(f"{_escape('Mean' if row.group == 'mean' else row.label)} & {' & '.join(values)} \\\\")
-    return "\n".join([*lines, "\\bottomrule", "\\end{tabular}"]) + "\n"
+        head = (row.label, row.targets) if targets else (row.label,)
+        table.rows.append((*head, *(_known(cells[name]) for cells in row.cells for name in shown)))
+    return table
 
 
-_LATEX = {"\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}"} | {sign: f"\\{sign}" for sign in "&%$#_{}"}
+def _long(rows: Sequence[Row], scores: Sequence[Scores]) -> Table:
+    """A row for each group and method, with all columns."""
+    columns = [Column(name) for name in ("group", "label", "targets", "method")] + [Column(name, digits=".6g") for name in rows[0].cells[0]]
+    return Table(
+        "scores",
+        "",
+        tuple(columns),
+        [
+            (row.group, row.label, row.targets, each.name, *map(_known, cells.values()))
+            for row in rows
+            for each, cells in zip(scores, row.cells, strict=True)
+        ],
+    )
 
 
-def _escape(text: str) -> str:
-    """Text of any characters as LaTeX."""
-    return "".join(_LATEX.get(sign, sign) for sign in text)
-
-
-def _csv(rows: Sequence[Row], scores: Sequence[Scores]) -> str:
-    """One line per group and method."""
-    output = io.StringIO()
-    writer = csv.writer(output, lineterminator="\n")
-    columns = list(rows[0].cells[0])
-    writer.writerow(["group", "label", "targets", "method", *columns])
-    for row in rows:
-        for each, cells in zip(scores, row.cells, strict=True):
-            values = ["" if math.isnan(cells[column]) else f"{cells[column]:.6g}" for column in columns]
-            writer.writerow([row.group, row.label, row.targets, each.name, *values])
-    return output.getvalue()
+def _known(value: float) -> float | None:
+    return None if math.isnan(value) else value
 
 
 def _json(rows: Sequence[Row], truth: Truth, scores: Sequence[Scores]) -> str:

@@ -63,7 +63,7 @@ def make_attempt(data_set: DataSet, found: Found, content: Content, names: Mappi
     config, episode = data_set.config, data_set[found.episode]
     attempt = parse_attempt(episode.attempts[found.place], f"{data_set.folder / episode_entry(found.episode)}.json")
     if not attempt.frame < len(episode):
-        raise DatasetError(f"attempt {attempt.number} of episode {found.episode} begins in frame {attempt.frame}; it has {len(episode)}")
+        raise DatasetError(f"attempt {attempt.attempt} of episode {found.episode} begins in frame {attempt.frame}; it has {len(episode)}")
     view = episode.view(attempt.frame)
     picture = draw_observation(attempt, view.rgb[..., ::-1], _masks(attempt, view) if content.masks else None)
     places = album.add(Section.ATTEMPTS, [encode_photo(picture)])
@@ -71,7 +71,7 @@ def make_attempt(data_set: DataSet, found: Found, content: Content, names: Mappi
         return None
     return {
         "episode": attempt.episode,
-        "attempt": attempt.number,
+        "attempt": attempt.attempt,
         "mode": attempt.mode,
         "outcome": found.outcome.replace("_", " "),
         "success": Outcome[found.outcome.upper()].succeeded,

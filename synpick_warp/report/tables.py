@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 
+from synpick_warp.codecs.tables import Table
 from synpick_warp.codes import Outcome
 from synpick_warp.configs.load import load_config, sections, settings_of
 from synpick_warp.configs.schema import Config
@@ -11,7 +12,7 @@ from synpick_warp.configs.write import config_to_toml, format_toml
 from synpick_warp.report.findings import WARNING, Finding
 from synpick_warp.report.markup import Html, element, join
 from synpick_warp.statistics import Statistics
-from synpick_warp.statistics.tables import Table, make_tables
+from synpick_warp.statistics.tables import make_tables
 
 SHOWN_TABLES = ("groups", "paper", "attempts", "depth")
 """Tables of `statistics.tables` that are shown as they are."""
@@ -47,15 +48,7 @@ def statistics_tables(statistics: Statistics) -> Html:
 
 def _table(table: Table) -> Html:
     classes = ["num" if column.style else "" for column in table.columns]
-    names = [column.name.replace("_", " ") if column.label is None else column.label for column in table.columns]
-    rows = [
-        [
-            UNKNOWN if value is None else value if isinstance(value, str) else format(value, column.style)
-            for value, column in zip(row, table.columns, strict=True)
-        ]
-        for row in table.rows
-    ]
-    return element("div", element("h3", table.title), plain_table(names, rows, classes), class_="scroll")
+    return element("div", element("h3", table.title), plain_table(table.labels(), table.cells(UNKNOWN), classes), class_="scroll")
 
 
 def plain_table(names: Sequence[str], rows: Iterable[Sequence[str]], classes: Sequence[str]) -> Html:

@@ -2,35 +2,25 @@
 
 from __future__ import annotations
 
-import csv
 import dataclasses
-import io
 import json
 import os
 import shutil
-from collections.abc import Iterable, Iterator, Sequence
-from itertools import takewhile
 from pathlib import Path
-from typing import Any
 
-from rich.cells import cell_len
 from rich.console import Console
-from rich.markup import escape as escape_markup
-from rich.table import Table as TextTable
+from rich.text import Text
 
+from synpick_warp.codecs.tables import Table, to_csv, to_text
 from synpick_warp.configs.check import escape
 from synpick_warp.errors import OutputError
 from synpick_warp.exporters.writing.files import output_error
 from synpick_warp.statistics.compute import OTHER_OBJECTS, Statistics
-from synpick_warp.statistics.tables import PAPER, TIMELINE, Table, Value, make_tables
+from synpick_warp.statistics.tables import PAPER, TIMELINE, make_tables
 from synpick_warp.system.folders import make_folder
 
 MAX_TEXT_ROWS = 24
 """Rows of objects over time in text: of a longer table, evenly spread rows are shown."""
-_COLUMN_GAP = 2
-"""Space between columns of text [characters]."""
-_FORMULA = ("=", "+", "-", "@")
-"""First characters of a text that spreadsheets take for a formula (OWASP, CSV injection)."""
 
 
 def to_json(statistics: Statistics) -> str:
@@ -41,22 +31,6 @@ def to_json(statistics: Statistics) -> str:
         row["annotations"]["instances_per_view"] = group.annotations.instances_per_view
         row["objects_over_time"] = [point._asdict() for point in group.objects_over_time]
     return json.dumps(content, allow_nan=False)
-
-
-def to_csv(table: Table) -> str:
-    """Serialize a table as CSV with a header."""
-    stream = io.StringIO()
-    writer = csv.writer(stream, lineterminator="\n")
-    writer.writerow([column.name for column in table.columns])
-    writer.writerows([_plain(value) for value in row] for row in table.rows)
-    return stream.getvalue()
-
-
-def _plain(value: Value) -> Value:
-    """A value for CSV; names cannot become formulas."""
-    if isinstance(value, str):
-        return f"'{escape(value)}" if value.startswith(_FORMULA) else escape(value)
-    return value
 
 
 def write_csv(statistics: Statistics, folder: Path) -> list[Path]:
@@ -119,35 +93,7 @@ def _print_table(console: Console, table: Table) -> None:
     rows = table.rows
     if table.name == TIMELINE and len(rows) > MAX_TEXT_ROWS:
         rows = [rows[index * (len(rows) - 1) // (MAX_TEXT_ROWS - 1)] for index in range(MAX_TEXT_ROWS)]
-    labels = [escape(column.name.replace("_", " ") if column.label is None else column.label) for column in table.columns]
-    cells = [_cells(row, [column.style for column in table.columns]) for row in rows]
-    widths = [max(map(cell_len, column)) + _COLUMN_GAP for column in zip(labels, *cells, strict=True)]
     console.print(table.title, style="bold", markup=False, soft_wrap=True)
-    for block in _blocks(table, widths, console.width + _COLUMN_GAP):
-        text = TextTable(box=None, header_style="dim", pad_edge=False)
-        for index in block:
-            text.add_column(escape_markup(labels[index]), justify="right" if table.columns[index].style else "left", no_wrap=True)
-        for row in cells:
-            text.add_row(*(escape_markup(row[index]) for index in block))
-        # A single column may be wider than the console.
-        console.print(text, width=max(console.width, sum(widths[index] for index in block)), soft_wrap=True, crop=False)
-        console.print()
-
-
-def _blocks(table: Table, widths: Sequence[int], width: int) -> Iterator[list[int]]:
-    """Split a table's columns into blocks that fit a width; each begins with the columns that say what a row is, which are left-aligned."""
-    keys = list(takewhile(lambda index: not table.columns[index].style, range(len(widths))))[: len(widths) - 1]
-    block: list[int] = []
-    for index in range(len(keys), len(widths)):
-        if block and sum(widths[each] for each in (*keys, *block, index)) > width:
-            yield [*keys, *block]
-            block = []
-        block.append(index)
-    yield [*keys, *block]
-
-
-def _cells(row: Iterable[Any], styles: list[str]) -> list[str]:
-    return [
-        "-" if value is None else escape(str(value)) if isinstance(value, str) else format(value, style)
-        for value, style in zip(row, styles, strict=True)
-    ]
+    for head, *lines in to_text(dataclasses.replace(table, rows=rows), console.width):
+        console.print(Text(head, "dim"), soft_wrap=True)
+        console.print(Text("\n".join([*lines, ""])), soft_wrap=True)

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, field
 from itertools import pairwise
-from typing import NamedTuple
 
+from synpick_warp.codecs.tables import Column, Table, Value
 from synpick_warp.statistics.annotations import VISIBILITY_BINS
 from synpick_warp.statistics.attempts import FORCE_BIN, FORCE_BINS
 from synpick_warp.statistics.compute import GroupStatistics, Statistics
@@ -20,33 +19,8 @@ PAPER = "paper"
 """Name of the table beside the paper's numbers."""
 TIMELINE = "objects_over_time"
 """Name of the table of objects over time."""
-Value = int | float | str | None
 TURN = 360.0
 """A full turn [°]."""
-
-
-class Column(NamedTuple):
-    """A column of a table."""
-
-    name: str
-    """Header in CSV."""
-    style: str = ""
-    """Format of the values in text, such as ",", ".2f" or ".1%"."""
-    label: str | None = None
-    """Header in text; None: the name, with spaces for underscores."""
-
-
-@dataclass(frozen=True)
-class Table:
-    """A table of values."""
-
-    name: str
-    """Name of the CSV file, without suffix."""
-    title: str
-    columns: tuple[Column, ...]
-    rows: list[tuple[Value, ...]] = field(default_factory=list)
-    in_text: bool = True
-    """Whether it is short enough for text."""
 
 
 GROUP_COLUMNS = (Column("split"), Column("mode"))

@@ -18,6 +18,7 @@ from synpick_warp.configs.schema import Config
 from synpick_warp.configs.splits import DataLayout
 from synpick_warp.dataset.annotations import SCENE_SCHEMAS, read_checked
 from synpick_warp.dataset.object_names import object_names
+from synpick_warp.dataset.records import Pixel
 from synpick_warp.dataset.view_files import read_image
 from synpick_warp.errors import DatasetError
 from synpick_warp.inputs.paths import path_inside
@@ -34,7 +35,7 @@ from synpick_warp.viz.explain_graph import (
     put_boxed,
 )
 from synpick_warp.viz.explain_panels import GREEN, LINE, PLOT_HEIGHT, SMALL, SOFT, TEXT, WORDS_WIDTH, draw_words, load_chart
-from synpick_warp.viz.explain_record import MODE_WORDS, Attempt, Pixel, choose_attempts, labels, read_attempts
+from synpick_warp.viz.explain_record import MODE_WORDS, Attempt, choose_attempts, labels, read_attempts
 
 DEFAULT_ATTEMPTS = 3
 """Attempts that are drawn if none is named."""
@@ -158,7 +159,7 @@ def _row(attempt: Attempt, scene: _Scene, names: Mapping[int, str], config: Conf
     for number, (text, color) in enumerate(foot):
         put_text(sheet, text, (columns[1], top + height - LINE * (len(foot) - 1 - number) - 6), SMALL, color)
     _paste(sheet, words, columns[2], top)
-    head = f"Episode {attempt.episode}, attempt {attempt.number} ({MODE_WORDS[attempt.mode]}): {attempt.sentence}"
+    head = f"Episode {attempt.episode}, attempt {attempt.attempt} ({MODE_WORDS[attempt.mode]}): {attempt.sentence}"
     put_text(sheet, head, (MARGIN, MARGIN + 20), 0.68, GREEN if attempt.picked else RED, 2)
     captions = [f"camera 0: {scene.place}", "clutter graph", "choice and outcome"]
     if scene.masks is None:
@@ -193,7 +194,7 @@ def draw_observation(attempt: Attempt, color: Image, masks: Mapping[int, np.ndar
         _draw_contours(drawn, color, mask, instance, instance == attempt.target)
     short = labels(attempt)
     for one in attempt.seen:
-        places = [to_color_image(point, attempt.resolution, (width, height)) for point in (*one.candidates, one.grasp_pixel)]
+        places = [to_color_image(point, attempt.observation.resolution, (width, height)) for point in (*one.candidates, one.grasp_pixel)]
         points = [(scale * (x + 0.5) - 0.5, scale * (y + 0.5) - 0.5) for x, y in places]
         target = one.instance == attempt.target
         for kind, point in enumerate(points[:-1]):

@@ -1,11 +1,11 @@
 """Layered graph drawing (Sugiyama et al., 1981) of the clutter graph: arrows run downward, from the object on top to the one below.
 
-Layers by longest path, crossing reduction by barycentres, x coordinates by isotonic least squares, long edges as splines.
+Layers by longest path, order and columns by barycentres under the nodes' widths, long edges as splines. networkx' `multipartite_layout` is
+not used: it keeps the order of its input and spaces all layers evenly, so edges cross, and the nodes of wide layers overlap.
 """
 
 from __future__ import annotations
 
-import itertools
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -13,11 +13,13 @@ from dataclasses import dataclass
 import cv2
 import networkx as nx
 import numpy as np
+from scipy.interpolate import PchipInterpolator
 from scipy.optimize import isotonic_regression
 
+from synpick_warp.dataset.records import InstanceObservation
 from synpick_warp.errors import DatasetError
 from synpick_warp.viz.drawing import FONT, INK, WHITE, Image, instance_color, put_text, readable_on
-from synpick_warp.viz.explain_record import Attempt, SeenObject, labels
+from synpick_warp.viz.explain_record import Attempt, labels
 
 RADIUS = 20
 """Radius of a node [px]."""
@@ -32,9 +34,9 @@ _MAX_LAYER_GAP = 150
 _MARGIN = 38
 """Distance from the border to the outermost nodes' centres [px]."""
 _SWEEPS = 8
-"""Number of downward and upward sweeps; more change nothing in graphs of this size."""
+"""Number of downward and upward sweeps, of each kind; more change nothing in graphs of this size."""
 _MAX_PIECES = 1000
-"""Maximum number of edges between neighbouring layers, whose crossings are counted pair by pair; those of 100 objects are some 200."""
+"""Maximum number of edges between neighbouring layers; those of 100 objects are some 200."""
 _BEND = 0.32
 """Offset of the control point of a removed edge's curve, as a fraction of its length; the curve deviates by half of it."""
 _SAMPLES = 12
@@ -74,7 +76,7 @@ def clutter_edges(attempt: Attempt, min_votes: float) -> list[Edge]:
     edges = []
     for lower, one in sorted(attempt.objects.items()):
         voted = {upper for (at, upper), votes in attempt.votes.items() if at == lower and votes >= min_votes}
-        for upper in sorted((one.above | voted) & attempt.objects.keys()):
+        for upper in sorted(voted.union(one.above) & attempt.objects.keys()):
             votes, opposite = attempt.votes.get((lower, upper), 0.0), attempt.votes.get((upper, lower), 0.0)
             opposite = opposite if opposite >= min_votes else 0.0
             if upper in one.above:
@@ -97,25 +99,24 @@ def lay_out(attempt: Attempt, edges: Sequence[Edge], size: tuple[int, int]) -> L
     """
     width, height = size
     kept = [(edge.upper, edge.lower) for edge in edges if edge.state == KEPT]
-    place: dict[Key, float] = {one.instance: one.grasp_pixel[0] / attempt.resolution[0] for one in attempt.seen}
+    place: dict[Key, float] = {one.instance: one.grasp_pixel[0] / attempt.observation.resolution[0] for one in attempt.seen}
     depth = _assign_layers(attempt, kept, place, max(1, int((width - 2 * _MARGIN) // (2 * RADIUS + _MIN_GAP)) + 1))
-    layers: list[list[Key]] = [[] for _ in range(1 + max(depth.values(), default=-1))]
-    for instance, layer in depth.items():
-        layers[layer].append(instance)
-    chains: dict[tuple[int, int], list[Key]] = {}
     if sum(depth[lower] - depth[upper] for upper, lower in kept) > _MAX_PIECES:
-        raise DatasetError(f"the clutter graph of attempt {attempt.number} of episode {attempt.episode} has too many edges to be drawn")
+        raise DatasetError(f"the clutter graph of attempt {attempt.attempt} of episode {attempt.episode} has too many edges to be drawn")
+    graph = nx.Graph()
+    graph.add_nodes_from(depth)
+    layers: dict[Key, int] = {**depth}
+    chains: dict[tuple[int, int], list[Key]] = {}
     for upper, lower in kept:
-        passed: list[Key] = [(upper, lower, layer) for layer in range(depth[upper] + 1, depth[lower])]
-        for step, key in enumerate(passed, start=1):
-            layers[depth[upper] + step].append(key)
-            place[key] = place[upper] + (place[lower] - place[upper]) * step / (len(passed) + 1)
-        chains[upper, lower] = [upper, *passed, lower]
-    pairs = [pair for chain in chains.values() for pair in itertools.pairwise(chain)]
-    seeds: dict[Key, float] = {key: _MARGIN + x * (width - 2 * _MARGIN) for key, x in place.items()}
-    column = _widen(_align_columns(_order_layers(layers, pairs, place), pairs, seeds, width), width)
-    gap = min(_MAX_LAYER_GAP, (height - 2 * _MARGIN) / max(1, len(layers) - 1))
-    point = {key: (column[key], _MARGIN + gap * layer) for layer, keys in enumerate(layers) for key in keys}
+        chain: list[Key] = [upper, *((upper, lower, layer) for layer in range(depth[upper] + 1, depth[lower])), lower]
+        for step, key in enumerate(chain[1:-1], start=1):
+            layers[key] = depth[upper] + step
+            place[key] = place[upper] + (place[lower] - place[upper]) * step / (len(chain) - 1)
+        nx.add_path(graph, chain)
+        chains[upper, lower] = chain
+    column = _widen(_place_columns(graph, layers, {key: _MARGIN + x * (width - 2 * _MARGIN) for key, x in place.items()}, width), width)
+    gap = min(_MAX_LAYER_GAP, (height - 2 * _MARGIN) / max([1, *depth.values()]))
+    point = {key: (column[key], _MARGIN + gap * layer) for key, layer in layers.items()}
     routes = {edge: _curve(np.array([point[key] for key in chain])) for edge, chain in chains.items()}
     return Layout({instance: point[instance] for instance in depth}, routes)
 
@@ -129,57 +130,32 @@ def _assign_layers(attempt: Attempt, kept: list[tuple[int, int]], place: Mapping
             sorted(layer, key=lambda instance: (graph.degree(instance) > 0, place[instance])) for layer in nx.topological_generations(graph)
         ]
     except nx.NetworkXUnfeasible as error:
-        raise DatasetError(f"the clutter graph of attempt {attempt.number} of episode {attempt.episode} has a cycle") from error
+        raise DatasetError(f"the clutter graph of attempt {attempt.attempt} of episode {attempt.episode} has a cycle") from error
     rows = [layer[start : start + capacity] for layer in generations for start in range(0, len(layer), capacity)]
     return {instance: number for number, row in enumerate(rows) for instance in row}
 
 
-def _order_layers(layers: list[list[Key]], pairs: list[tuple[Key, Key]], place: Mapping[Key, float]) -> list[list[Key]]:
-    """Crossing reduction: sort each layer by the barycentre of its neighbours, downward and upward in turn; returns the best order seen."""
-    above: dict[Key, list[Key]] = {key: [] for layer in layers for key in layer}
-    below: dict[Key, list[Key]] = {key: [] for layer in layers for key in layer}
-    for upper, lower in pairs:
-        above[lower].append(upper)
-        below[upper].append(lower)
-    best = current = [sorted(layer, key=lambda key: place[key]) for layer in layers]
-    for sweep in range(2 * _SWEEPS):
-        neighbours, order = (above, range(1, len(layers))) if sweep % 2 == 0 else (below, range(len(layers) - 2, -1, -1))
-        current = [list(layer) for layer in current]
-        for number in order:
-            rank = {key: (index + 0.5) / len(layer) for layer in current for index, key in enumerate(layer)}
-            means = {key: float(np.mean([rank[other] for other in neighbours[key] or [key]])) for key in current[number]}
-            current[number].sort(key=means.__getitem__)
-        if _count_crossings(current, pairs) < _count_crossings(best, pairs):
-            best = current
-    return best
+def _place_columns(graph: nx.Graph, layers: Mapping[Key, int], place: Mapping[Key, float], width: int) -> dict[Key, float]:
+    """x of each node [px], from a first one: sweeps draw each layer to the means (barycentres) of its neighbours, in their order.
 
-
-def _count_crossings(layers: list[list[Key]], pairs: list[tuple[Key, Key]]) -> int:
-    """Number of crossing pairs of edge segments."""
-    layer_of = {key: number for number, layer in enumerate(layers) for key in layer}
-    rank = {key: index for layer in layers for index, key in enumerate(layer)}
-    return sum(
-        (rank[first[0]] - rank[second[0]]) * (rank[first[1]] - rank[second[1]]) < 0
-        for first, second in itertools.combinations(pairs, 2)
-        if layer_of[first[0]] == layer_of[second[0]]
-    )
-
-
-def _align_columns(layers: list[list[Key]], pairs: list[tuple[Key, Key]], place: Mapping[Key, float], width: int) -> dict[Key, float]:
-    """x of each node [px]: least squares to the mean of its neighbours under order and gaps, by isotonic regression."""
-    near: dict[Key, list[Key]] = {key: [] for layer in layers for key in layer}
-    for upper, lower in pairs:
-        near[lower].append(upper)
-        near[upper].append(lower)
+    A layer's x are the nearest to these means, in least squares, that leave room for its nodes (isotonic regression). The first sweeps look
+    at the layer before, downward and upward in turn, which finds the order; the others at both sides.
+    """
+    rows: list[list[Key]] = [[] for _ in range(1 + max(layers.values(), default=-1))]
+    for key, layer in layers.items():
+        rows[layer].append(key)
     x = dict(place)
-    for sweep in range(2 * _SWEEPS):
-        for layer in layers if sweep % 2 == 0 else layers[::-1]:
-            wanted = np.array([np.mean([x[other] for other in near[key] or [key]]) for key in layer])
-            half = np.array([RADIUS + _MIN_GAP / 2 if isinstance(key, int) else _ROUTE for key in layer])
+    for sweep in range(4 * _SWEEPS):
+        step = 1 if sweep % 2 == 0 else -1
+        for row in rows[::step]:
+            seen = {key: [x[other] for other in graph[key] if sweep >= 2 * _SWEEPS or layers[other] == layers[key] - step] for key in row}
+            means = {key: float(np.mean(near or [x[key]])) for key, near in seen.items()}
+            row.sort(key=means.__getitem__)
+            half = np.array([RADIUS + _MIN_GAP / 2 if isinstance(key, int) else _ROUTE for key in row])
             apart = np.concatenate(([0.0], np.cumsum(half[1:] + half[:-1])))
             apart *= min(1.0, (width - 2 * _MARGIN) / max(apart[-1], 1.0))
-            free = np.asarray(isotonic_regression(wanted - apart).x)
-            x.update(zip(layer, np.clip(free, _MARGIN, width - _MARGIN - apart[-1]) + apart, strict=True))
+            free = np.asarray(isotonic_regression(np.array([means[key] for key in row]) - apart).x)
+            x.update(zip(row, np.clip(free, _MARGIN, width - _MARGIN - apart[-1]) + apart, strict=True))
     return x
 
 
@@ -193,14 +169,8 @@ def _widen(column: Mapping[Key, float], width: int) -> dict[Key, float]:
 
 
 def _curve(points: np.ndarray) -> np.ndarray:
-    """Catmull-Rom spline through points (Catmull and Rom, 1974); two points give a straight line."""
-    padded = np.concatenate((2 * points[:1] - points[1:2], points, 2 * points[-1:] - points[-2:-1]))
-    t = np.linspace(0.0, 1.0, _SAMPLES)[:, None]
-    parts = [
-        (2 * b + (c - a) * t + (2 * a - 5 * b + 4 * c - d) * t**2 + (3 * b - a - 3 * c + d) * t**3) / 2
-        for a, b, c, d in zip(padded, padded[1:], padded[2:], padded[3:], strict=False)
-    ]
-    return np.concatenate(parts)
+    """Monotone cubic spline through points (Fritsch and Butland, 1984), so that it never rises; two points give a straight line."""
+    return PchipInterpolator(range(len(points)), points)(np.linspace(0, len(points) - 1, _SAMPLES * (len(points) - 1)))
 
 
 def draw_graph(attempt: Attempt, min_votes: float, size: tuple[int, int]) -> Image:
@@ -230,7 +200,7 @@ def draw_graph(attempt: Attempt, min_votes: float, size: tuple[int, int]) -> Ima
     return canvas
 
 
-def _draw_node(canvas: Image, place: tuple[float, float], label: str, one: SeenObject, target: bool) -> None:
+def _draw_node(canvas: Image, place: tuple[float, float], label: str, one: InstanceObservation, target: bool) -> None:
     """Draw a node with its label, and a badge with the number of its ancestors."""
     x, y = place
     color = instance_color(one.instance)

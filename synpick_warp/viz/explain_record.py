@@ -1,10 +1,10 @@
-"""Records of pick attempts: parsed and validated from attempts.jsonl, and explained in sentences."""
+"""Records of pick attempts: read from attempts.jsonl, and explained in sentences."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +12,7 @@ from synpick_warp.configs.schema import Config
 from synpick_warp.dataset import records
 from synpick_warp.dataset.annotations import ADVICE, check_content
 from synpick_warp.dataset.manifest import ATTEMPTS_FILE
-from synpick_warp.dataset.records import Pixel
+from synpick_warp.dataset.records import InstanceObservation
 from synpick_warp.errors import DatasetError
 from synpick_warp.inputs.files import read_file
 from synpick_warp.inputs.json import MAX_JSON, decode_json
@@ -20,7 +20,7 @@ from synpick_warp.viz.drawing import short_labels
 
 MODE_WORDS = {"pick": "untargeted", "target": "targeted"}
 CANDIDATES = ("pole", "centroid", "midpoint")
-"""Candidates of the suction point, in the order of `SeenObject.distances`."""
+"""Candidates of the suction point, in the order of `InstanceObservation.candidates`."""
 
 MAX_ATTEMPTS = 100
 """Most attempts of one figure."""
@@ -30,61 +30,34 @@ MAX_RUNS = 20
 """Most ranges of numbers that a message lists."""
 
 
-@dataclass(frozen=True)
-class SeenObject:
-    """Observation of one visible instance."""
+class Attempt(records.Attempt, dict=True):
+    """Pick attempt as its record, of which the target was visible, and all suction points are in the image."""
 
-    instance: int
-    object_id: int
-    visible: int
-    """Pixel count of its largest connected component."""
-    visible_fraction: float
-    """Visible fraction of the expected area."""
-    candidates: tuple[Pixel, Pixel, Pixel]
-    """Positions of `CANDIDATES`."""
-    distances: tuple[float, float, float]
-    """Distance of each candidate to the contour [px]."""
-    grasp_pixel: Pixel
-    above: frozenset[int]
-    """Parents: instances with an edge of the clutter graph to this one."""
-    ancestors: frozenset[int]
-    """Ancestors: instances with a path to this one (transitive closure)."""
+    def __post_init__(self) -> None:
+        records.Attempt.__post_init__(self)
+        width, height = self.observation.resolution
+        if self.target is not None and self.target not in self.objects:
+            raise ValueError(f"target is {self.target}, which was not visible")
+        for one in self.seen:
+            if not all(-1.0 <= column <= width and -1.0 <= row <= height for column, row in (*one.candidates, one.grasp_pixel)):
+                raise ValueError(f"a point of instance {one.instance} is not in the image of {width} x {height}")
 
+    @cached_property
+    def seen(self) -> list[InstanceObservation]:
+        """Observations of the visible instances."""
+        return [one for one in self.observation.instances if one.visible > 0]
 
-@dataclass(frozen=True)
-class Attempt:
-    """One pick attempt."""
-
-    episode: int
-    number: int
-    mode: str
-    frame: int
-    """Frame of the observation."""
-    end_frame: int
-    sentence: str
-    """The outcome in words."""
-    target: int | None
-    tilt: float | None
-    """Tilt of the cup about the wrist axis [rad]; None: nothing was chosen."""
-    rays: int
-    hits: int
-    good_seal: bool
-    engaged: tuple[int, ...]
-    picked: tuple[int, ...]
-    peak_force: tuple[float, ...]
-    """Largest seal force in each tick of the lift [N]; the suction is switched on at the end of the first."""
-    resolution: tuple[int, int]
-    """Width and height of the perception image [px]."""
-    seen: tuple[SeenObject, ...]
-    votes: dict[tuple[int, int], float]
-    """(lower, upper) -> occlusion votes along the contour of the lower that the upper lies above it."""
+    @cached_property
+    def votes(self) -> dict[tuple[int, int], float]:
+        """(lower, upper) -> occlusion votes along the contour of the lower that the upper lies above it."""
+        return {(lower, upper): votes for lower, upper, votes in self.observation.votes}
 
     @property
-    def objects(self) -> dict[int, SeenObject]:
+    def objects(self) -> dict[int, InstanceObservation]:
         """Instance id -> its observation."""
         return {one.instance: one for one in self.seen}
 
-    def ranked(self) -> list[SeenObject]:
+    def ranked(self) -> list[InstanceObservation]:
         """Rank by the choice rule: fewest ancestors, then largest visible fraction; in targeted picking the reverse."""
         sign = -1 if self.mode == "target" else 1
         return sorted(self.seen, key=lambda one: (sign * len(one.ancestors), -sign * one.visible_fraction, one.instance))
@@ -109,11 +82,7 @@ def read_attempts(dataset: Path, episode: int, number: int | None) -> list[Attem
         raise DatasetError(
             f"{path} has {len(rows)} attempts of episode {episode}; a figure has at most {MAX_ATTEMPTS}: name one by --attempt"
         )
-    return [
-        _attempt(decode_json(lines[row], records.Attempt, _line(path, row), DatasetError, ADVICE), _line(path, row))
-        for count, row in rows
-        if number in (None, count)
-    ]
+    return [decode_json(lines[row], Attempt, _line(path, row), DatasetError, ADVICE) for count, row in rows if number in (None, count)]
 
 
 def choose_attempts(dataset: Path, count: int) -> list[Attempt]:
@@ -128,7 +97,7 @@ def choose_attempts(dataset: Path, count: int) -> list[Attempt]:
     worthy: dict[int, Attempt] = {}
     others: dict[int, Attempt] = {}
     for row, line in enumerate(lines):
-        attempt = _attempt(decode_json(line, records.Attempt, _line(path, row), DatasetError, ADVICE), _line(path, row))
+        attempt = decode_json(line, Attempt, _line(path, row), DatasetError, ADVICE)
         chosen = attempt.target is not None and len(attempt.seen) >= MIN_CHOICE and any(one.above for one in attempt.seen)
         if chosen and attempt.engaged:
             worthy[row] = attempt
@@ -162,7 +131,7 @@ def parse_attempt(content: Mapping[str, Any], source: str) -> Attempt:
     Raises:
         DatasetError: It is damaged.
     """
-    return _attempt(check_content(content, records.Attempt, source), source)
+    return check_content(content, Attempt, source)
 
 
 def _line(path: Path, row: int) -> str:
@@ -182,53 +151,6 @@ def _which(what: str, numbers: list[int]) -> str:
     return f"{what}: {', '.join(shown) or 'none'}"
 
 
-def _attempt(record: records.Attempt, source: str) -> Attempt:
-    """Check the record of an attempt for consistency, and convert it."""
-    width, height = record.observation.resolution
-    visible = [one for one in record.observation.instances if one.visible > 0]
-    if record.target is not None and record.target not in {one.instance for one in visible}:
-        raise DatasetError(f"{source} is damaged: target is {record.target}, which was not visible; {ADVICE}")
-    for one in visible:
-        points = (one.pole, one.centroid, one.midpoint, one.grasp_pixel)
-        if not all(-1.0 <= column <= width and -1.0 <= row <= height for column, row in points):
-            raise DatasetError(
-                f"{source} is damaged: a point of instance {one.instance} is not in the image of {width} x {height}; {ADVICE}"
-            )
-    return Attempt(
-        episode=record.episode,
-        number=record.attempt,
-        mode=record.mode,
-        frame=record.frame,
-        end_frame=record.end_frame,
-        sentence=record.sentence,
-        target=record.target,
-        tilt=record.tilt,
-        rays=record.rays,
-        hits=record.hits,
-        good_seal=record.good_seal,
-        engaged=tuple(record.engaged),
-        picked=tuple(record.picked),
-        peak_force=tuple(record.peak_force),
-        resolution=(width, height),
-        seen=tuple(map(_seen, visible)),
-        votes={(lower, upper): votes for lower, upper, votes in record.observation.votes},
-    )
-
-
-def _seen(record: records.InstanceObservation) -> SeenObject:
-    return SeenObject(
-        instance=record.instance,
-        object_id=record.object_id,
-        visible=record.visible,
-        visible_fraction=record.visible_fraction,
-        candidates=(record.pole, record.centroid, record.midpoint),
-        distances=record.distances,
-        grasp_pixel=record.grasp_pixel,
-        above=frozenset(record.above),
-        ancestors=frozenset(record.ancestors),
-    )
-
-
 def labels(attempt: Attempt) -> dict[int, str]:
     """Short label of every visible instance, see `short_labels`."""
     return short_labels((one.instance, one.object_id) for one in attempt.seen)
@@ -240,7 +162,7 @@ def full_names(attempt: Attempt, names: Mapping[int, str]) -> dict[int, str]:
     return {one.instance: f"{short[one.instance]} {names.get(one.object_id, '')}".rstrip() for one in attempt.seen}
 
 
-def suction_kind(one: SeenObject) -> int:
+def suction_kind(one: InstanceObservation) -> int:
     """Index of the candidate that became the suction point: the nearest, as the point is rounded to a pixel."""
     return min(range(len(CANDIDATES)), key=lambda kind: math.dist(one.candidates[kind], one.grasp_pixel))
 
@@ -258,7 +180,7 @@ def choice_words(attempt: Attempt, names: Mapping[int, str], config: Config) -> 
     return [f"target: {full[attempt.target]}: {_reason(attempt, one, full, config)}", f"suction point: {where}{tilt}"]
 
 
-def _reason(attempt: Attempt, one: SeenObject, full: Mapping[int, str], config: Config) -> str:
+def _reason(attempt: Attempt, one: InstanceObservation, full: Mapping[int, str], config: Config) -> str:
     targeted = attempt.mode == "target"
     count = len(one.ancestors)
     above = f"{count} object{'' if count == 1 else 's'} above"
@@ -294,6 +216,6 @@ def break_force(attempt: Attempt, config: Config) -> float:
     return config.suction.good_force if attempt.good_seal else config.suction.poor_force
 
 
-def _listed(instances: tuple[int, ...], full: Mapping[int, str]) -> str:
+def _listed(instances: Sequence[int], full: Mapping[int, str]) -> str:
     """List names of instances; an engaged object can be invisible to camera 0."""
     return ", ".join(full.get(instance, f"instance {instance}, unseen") for instance in instances) or "nothing"

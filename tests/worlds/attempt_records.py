@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
-from synpick_warp.viz.explain_record import Attempt, SeenObject
+from synpick_warp.dataset.records import InstanceObservation, Observation
+from synpick_warp.viz.explain_record import Attempt
 
 
 def seen_object(instance: int, object_id: int, suction: tuple[float, float], **other: Any) -> dict[str, Any]:
@@ -68,36 +69,14 @@ def nothing_seen(**other: Any) -> dict[str, Any]:
     return record([]) | gone | other
 
 
-def attempt(seen: tuple[SeenObject, ...], votes: dict[tuple[int, int], float], target: int | None = None, **other: Any) -> Attempt:
+def attempt(seen: tuple[InstanceObservation, ...], votes: dict[tuple[int, int], float], target: int | None = None, **other: Any) -> Attempt:
     """An attempt as `read_attempts` returns it, with the graph that is given."""
-    values: dict[str, Any] = {
-        "episode": 0,
-        "number": 0,
-        "mode": "pick",
-        "frame": 0,
-        "end_frame": 4,
-        "sentence": "s",
-        "target": target,
-        "tilt": None,
-        "rays": 10,
-        "hits": 10,
-        "good_seal": True,
-        "engaged": (),
-        "picked": (),
-        "peak_force": (),
-        "resolution": (96, 72),
-    }
-    return Attempt(**(values | other), seen=seen, votes=votes)
+    observation = Observation((96, 72), list(seen), [(*edge, number) for edge, number in votes.items()])
+    values: dict[str, Any] = {"sentence": "s", "target": target, "tilt": None, "hits": 10, "good_seal": True}
+    return Attempt(**record([], **values | other, observation=observation))
 
 
-def seen(instance: int, above: frozenset[int] = frozenset(), ancestors: frozenset[int] | None = None, **other: Any) -> SeenObject:
+def seen(instance: int, above: frozenset[int] = frozenset(), ancestors: frozenset[int] | None = None, **other: Any) -> InstanceObservation:
     """A seen object as `read_attempts` returns it; its obj_id is its instance plus 1."""
-    values: dict[str, Any] = {
-        "object_id": instance + 1,
-        "visible": 100,
-        "visible_fraction": 0.5,
-        "candidates": ((10.0, 10.0), (18.0, 10.0), (14.0, 10.0)),
-        "distances": (6.0, 3.0, 5.1),
-        "grasp_pixel": (10.0, 10.0),
-    }
-    return SeenObject(instance=instance, above=above, ancestors=above if ancestors is None else ancestors, **(values | other))
+    graph = {"above": sorted(above), "ancestors": sorted(above if ancestors is None else ancestors)}
+    return InstanceObservation(**seen_object(instance, instance + 1, (10.0, 10.0)) | graph | other)

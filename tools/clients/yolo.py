@@ -1,5 +1,6 @@
 """Ultralytics and supervision: labels of a split and of a scene, as masks, boxes and oriented boxes, through their own data set classes."""
-# The client is not a dependency.
+
+# Runs where the packages are, which the type checker may not see.
 # pyright: reportMissingImports=false
 
 from __future__ import annotations

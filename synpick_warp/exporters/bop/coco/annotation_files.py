@@ -100,17 +100,17 @@ def _make_annotations(view: EncodedView, settings: ViewSettings) -> Iterator[dic
             } | points
 
 
+def _make_polygons(mask: Runs) -> list[list[float]]:
+    """Polygons of a mask as in COCO, x and y by turns [px]: one for each part."""
+    return [polygon.points.ravel().tolist() for polygon in trace_outlines(mask)]
+
+
 def _make_extras(pose: Mapping[str, Any], info: Mapping[str, Any]) -> dict[str, Any]:
     """Keys of ours of an annotation; data sets of others may not know them."""
     extras = {} if math.isnan(info["visib_fract"]) else {"visib_fract": info["visib_fract"]}
     if extras:
         extras = {"bbox_amodal": [*info["bbox_obj"][:2], *(size + 1 for size in info["bbox_obj"][2:])], **extras}
     return extras | ({"instance_id": pose["instance_id"]} if "instance_id" in pose else {})
-
-
-def _make_polygons(mask: Runs) -> list[list[float]]:
-    """Polygons of a mask as in COCO, x and y by turns [px]: one for each part."""
-    return [polygon.points.ravel().tolist() for polygon in trace_outlines(mask)]
 
 
 def commit_scenes(scenes: tuple[tuple[Path, int], ...], out: Path, frames: Sequence[int]) -> None:

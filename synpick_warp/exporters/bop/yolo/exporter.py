@@ -67,4 +67,4 @@ class YoloExporter(SceneExporter):
 
     def _commit_task(self, scenes: tuple[tuple[Path, int], ...], images: Sequence[int]) -> tuple[Callable[..., None], tuple[Any, ...]]:
         split = self._context.layout.folder(scenes[0][1] // len(self._cameras))
-        return commit_scenes, (scenes, self._out, split, len(images))
+        return commit_scenes, (scenes, self._out, split, images)

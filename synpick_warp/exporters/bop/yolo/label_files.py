@@ -34,6 +34,11 @@ def image_list(scene: int) -> Path:
     return FOLDER / f"{scene:06d}.txt"
 
 
+def image_name(scene: int, frame: int) -> str:
+    """Name of an image and its labels, unique in a data set."""
+    return f"{scene:06d}_{frame:06d}"
+
+
 def write_data_file(out: Path, names: Mapping[int, str], splits: Sequence[str]) -> None:
     """Write data.yaml: folders of images for training, validation and tests, and the objects' names in the order of obj_id.
 
@@ -51,7 +56,7 @@ def write_data_file(out: Path, names: Mapping[int, str], splits: Sequence[str]) 
 def write_view(view: EncodedView, scene: Path, settings: ViewSettings) -> None:
     """Write a view's image and labels to the staging folder of its scene."""
     suffix, color = view.color
-    name = f"{view.scene:06d}_{view.frame:06d}"
+    name = image_name(view.scene, view.frame)
     rows = list(_make_rows(view, settings))
     with open_folder(scene) as folder:
         folder.write(f"{IMAGES}/{name}{suffix}", color)
@@ -84,16 +89,16 @@ def _format_row(index: int, points: np.ndarray) -> str:
     return f"{index} {' '.join(f'{value:.6f}' for value in points.ravel().tolist())}\n"
 
 
-def commit_scenes(scenes: tuple[tuple[Path, int], ...], out: Path, split: str, frames: int) -> None:
+def commit_scenes(scenes: tuple[tuple[Path, int], ...], out: Path, split: str, frames: Sequence[int]) -> None:
     """Task: complete an episode's scenes, (staging folder, scene_id): list their images, and rename all to their places in a split.
 
     Raises:
-        OutputError: Fewer than `frames` frames of a scene have arrived.
+        OutputError: Not all `frames` (im_id) of a scene have arrived.
     """
     for scene, scene_id in scenes:
         images = sorted(os.listdir(scene / IMAGES))
-        if len(images) != frames:
-            raise OutputError(f"{scene} has {len(images)} of {frames} frames; this is an error of synpick-warp, please report it")
+        if [image_name(scene_id, frame) for frame in frames] != [name.partition(".")[0] for name in images]:
+            raise OutputError(f"{scene} has {len(images)} of {len(frames)} frames; this is an error of synpick-warp, please report it")
         lines = "".join(f"./{IMAGES}/{split}/{scene_id:06d}/{name}\n" for name in images)
         write_synced(scene / "list", lines.encode())
         (scene / "list").rename(out / image_list(scene_id))
