@@ -33,8 +33,8 @@ def convert(
     """Convert a data set to other formats. After an interruption, the same command resumes with the remaining episodes.
 
     Formats of images need bop or shards in the data set, those of motion alone (usd) zarr, and lerobot both. Files are those that a bake
-    would have written, but for LeRobot's videos from JPEG images. BOP data sets that no bake wrote become bop, shards or coco, with their
-    own ids, and not in parts. Exit codes: 0, converted; 2, an error.
+    would have written, but for LeRobot's videos from JPEG images. BOP data sets that no bake wrote become bop, shards, coco or yolo, with
+    their own ids, and not in parts. Exit codes: 0, converted; 2, an error.
     """
     check_range("--processes", processes, 0, MAX_THREADS)
     from synpick_warp.cli.display import CountProgress, make_console

@@ -337,10 +337,7 @@ class DataSet(Mapping[int, Episode]):
         """Names of the cameras as sensors of their scenes (BOP-Industrial); empty: each camera has scenes of its own."""
         if self.found is not None:
             return self.found.sensors
-        from synpick_warp.configs.schema import MULTISENSOR
-        from synpick_warp.configs.splits import sensor_name
-
-        return tuple(map(sensor_name, range(self.camera_count))) if self.config.bop.layout == MULTISENSOR else ()
+        return DataLayout.of(self.config).sensors
 
     @cached_property
     def period(self) -> float | None:

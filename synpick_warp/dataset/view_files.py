@@ -122,7 +122,7 @@ class SceneFiles(ABC):
                 raise DatasetError(f"{self.place}: {names} do not agree about image {frame}")
             return ViewRecords(camera, gt, info)
         if gt is None and info:
-            raise DatasetError(f"there is no scene_gt.json in {self.place}, but a scene_gt_info.json")
+            raise DatasetError(f"there is no file {self.place}/scene_gt.json, but a scene_gt_info.json")
         gt = gt or []
         if info is not None and len(info) != len(gt):
             raise DatasetError(f"{self.place}: scene_gt.json and scene_gt_info.json do not agree about image {frame}")

@@ -7,10 +7,10 @@ from functools import cached_property
 from pathlib import Path
 
 from synpick_warp.dataset.bop.images import FolderImages, KeyedImages
-from synpick_warp.dataset.bop.layout import KEYED, SHARD, Layout, NoLayoutError, SceneRef
+from synpick_warp.dataset.bop.keyed import KeyedFolder
+from synpick_warp.dataset.bop.layout import Layout, NoLayoutError, SceneRef
 from synpick_warp.dataset.view_files import SceneFiles, SceneFolder, SceneShards
 from synpick_warp.errors import DatasetError
-from synpick_warp.inputs.tar_files import list_members
 
 _SCENE_OFFSET = 10**6
 """Between the episodes of splits that have scenes of the same index."""
@@ -59,15 +59,10 @@ class FoundScenes:
 
     def _keyed(self) -> Iterator[SceneRef]:
         """Scenes of shards and of the imagewise layout."""
-        for name, listing in self.layout.keyed.items():
-            shards = sorted(filter(SHARD.fullmatch, listing.files))
-            found: dict[int, set[str]] = {}
-            members = [(shard, each) for shard in shards for each, _, _ in list_members(listing.path(shard), extended=True)]
-            for shard, member in members if shards else [("", each) for each in listing.files]:
-                if match := KEYED.fullmatch(member):
-                    found.setdefault(int(match[1]), set()).add(shard)
-            for scene in sorted(found):
-                yield SceneRef(name, scene, "", "", tuple(sorted(found[scene])) if shards else ())
+        for folder in map(KeyedFolder, self.layout.keyed.values()):
+            if fault := next((keys for keys in folder.members.values() if isinstance(keys, str)), None):
+                raise DatasetError(fault)
+            yield from (ref for ref, _ in folder.scenes())
 
     @cached_property
     def sensors(self) -> tuple[str, ...]:

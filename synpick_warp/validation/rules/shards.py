@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
+from synpick_warp.dataset.bop.keyed import KEY, KeyedFolder
 from synpick_warp.dataset.bop.layout import KEYED, KEYS
-from synpick_warp.validation.keyed import KEY, KeyedFolder
 from synpick_warp.validation.registry import rule
 from synpick_warp.validation.scene_files import KeyedScene
 from synpick_warp.validation.subjects import ViewSubject
