@@ -3,10 +3,12 @@
 The choices of `render.layers`, the device buffers, the PNG codec and the notes in a data set derive from this table. Imports nothing.
 To add a layer:
 
-1. add a row to `LAYER_TABLE`, and an encoding to `layer_codec.CODECS` if none fits;
+1. add a row to `LAYER_TABLE`, and an encoding to `layer_codec.CODECS` if none fits: "raw" is for integers, which files hold as they are;
+   files of all others are RGB with 16 bits. A constant that kernel and encoding share stands in `codes.py`;
 2. write its kernel in `kernels/render/images/`, and name kernel and inputs in `LayerRenderer.render` (`stages/render/layers.py`);
 3. state the tolerance between CPU and GPU in `tools/compare/pictures.py`, and a sample value in `tests/test_layer_codec.py`;
-   tests fail until both are there. A drawing in `viz/preview_layers.py` is optional.
+   tests fail until both are there. Known answers belong in `tests/render/images/test_layers.py`, a row in the table of
+   `exporters/README.md`; `tests/dataset/test_layer_bake.py` bakes it by itself. A drawing in `viz/preview_layers.py` is optional.
 """
 
 from __future__ import annotations

@@ -45,10 +45,6 @@ def check_file_names(folder: Path, entry: Path, names: Iterable[str], layout: Da
         )
 
 
-_PARTS = (("coco", "coco/parts"), ("lerobot", "lerobot/parts"))
-"""Formats whose indices are joined from a file an episode or scene, and the folder of these."""
-
-
 def describe_strays(folder: Path, layout: DataLayout, episodes: Iterable[int]) -> str:
     """Name what lies beside the parts that indices are joined from and belongs to no committed episode.
 
@@ -62,11 +58,12 @@ def describe_strays(folder: Path, layout: DataLayout, episodes: Iterable[int]) -
     """
     strays = []
     known = set(episodes)
-    for name, place in _PARTS:
-        if name in layout.formats and (folder / place).is_dir():
-            suffix, count = (".jsonl", layout.cameras) if name == "coco" else (".json", 1)
-            parts = {f"{number:06d}{suffix}" for episode in known for number in range(count * episode, count * (episode + 1))}
-            strays += sorted(f"{place}/{entry.name}" for entry in os.scandir(folder / place) if entry.name not in parts)
+    for name, row in FORMAT_TABLE.items():
+        part = row.part
+        if part is not None and part.joined and name in layout.formats and (folder / part.folder).is_dir():
+            count = layout.cameras if part.per_scene else 1
+            parts = {f"{number:06d}{part.suffix}" for episode in known for number in range(count * episode, count * (episode + 1))}
+            strays += sorted(f"{part.folder}/{entry.name}" for entry in os.scandir(folder / part.folder) if entry.name not in parts)
     if not strays:
         return ""
     more = f" and {len(strays) - 1} more" if len(strays) > 1 else ""

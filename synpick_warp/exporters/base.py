@@ -256,7 +256,8 @@ class Exporter(Protocol):
     def write_constants(self) -> list[Path]:
         """Write the files that all episodes share, such as models; replaces what a killed bake may have left.
 
-        Called at most once, before all other calls. Needs no atomic rename: the bake commits them with a manifest entry.
+        Called at most once, before all other calls. Needs no atomic rename: the bake commits them with a manifest entry. Formats of views
+        without BOP's notes write those of `writing/notes.py`.
 
         Returns:
             These files, or folders that hold nothing else, relative to the data set.

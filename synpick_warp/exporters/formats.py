@@ -2,15 +2,17 @@
 
 How to add a format:
 
-1. Write a class that implements `Exporter` (`base.py`) in a module or subpackage of this package. `EpisodeExporter` (`staging.py`) stages
-   and commits for it, and `SceneExporter` (`bop/scene_exporter.py`) hands it encoded views; `usd/exporter.py` is the shortest example.
+1. Write a class that implements `Exporter` (`base.py`). `EpisodeExporter` (`staging.py`) stages and commits for it. A format of views is a
+   `SceneExporter` (`bop/scene_exporter.py`), which hands it encoded views, in a subpackage of `bop/`: follow `bop/yolo/`. A format of ticks
+   is a subpackage beside it: follow `usd/exporter.py`. Name the subpackage in the import contract of its folder in pyproject.toml.
 2. Add a row to FORMAT_TABLE.
 3. Allow the name as a value of the setting `bake.formats`: `FORMATS` in configs/schema.py. Settings must not import exporters, so
    the name stands there once more; a test compares both.
 4. Let its test class inherit `ExporterContract` (tests/harness/exporter_contract.py): determinism, atomic commits, resuming.
 
-Nothing else lists formats: bakes, `convert`, `merge`, `verify`, the manifest and the reader take them from here. Imports no format and
-no NumPy.
+Nothing else in the package lists formats: bakes, `convert`, `merge`, `verify`, the manifest and the reader take them from here. Tests of
+the table, of conversion and of the command line name what they expect, and `tools/compare/guard_steps.py` what it bakes. Imports no
+format and no NumPy.
 """
 
 from __future__ import annotations
@@ -45,8 +47,10 @@ class PartFiles(NamedTuple):
     suffix: str
     """Of their names, behind six digits: the episode's index, or the BOP scene_id of a scene."""
     frame_bytes: int
-    """Least size of a frame in a file [B]."""
+    """Least size of a frame in a file [B], 1 or more: numbers of frames are checked against the sizes of files."""
     per_scene: bool = False
+    joined: bool = False
+    """Whether an index is joined from them; those of no committed episode are then left out, with a note."""
     cameras: int = 1
     """Number of scenes of an episode, if there is a file for each."""
 
@@ -153,7 +157,7 @@ FORMAT_TABLE: dict[str, Format] = {
         _NOTES,
         _lerobot,
         sources=lambda _: ("views", "poses", "gripper"),
-        part=PartFiles("lerobot/parts", ".json", 64),  # A row in base64.
+        part=PartFiles("lerobot/parts", ".json", 64, joined=True),  # A row in base64.
         packages=("av", "pyarrow"),
         remedy="install it by pip install 'synpick-warp[lerobot]'",
     ),
@@ -163,7 +167,7 @@ FORMAT_TABLE: dict[str, Format] = {
         rf"coco/categories\.json|{_NOTES}",
         _coco,
         sources=lambda _: ("views", "masks"),
-        part=PartFiles("coco/parts", ".jsonl", 3, per_scene=True),  # A line: [] and its end.
+        part=PartFiles("coco/parts", ".jsonl", 3, per_scene=True, joined=True),  # A line: [] and its end.
     ),
     "yolo": Format(
         "bop.yolo.exporter",

@@ -99,7 +99,14 @@ def _declare_layer(layer: Layer) -> Any:
     return device_array("view", "row", "column", dtype=_LAYER_DTYPES[layer.dtype, layer.components], unit=layer.unit)
 
 
-_LAYER_DTYPES = {("float32", 2): wp.vec2, ("float32", 3): wp.vec3, ("uint8", 3): wp.vec3ub, ("uint16", 1): wp.uint16}
+_LAYER_DTYPES = {
+    ("uint8", 1): wp.uint8,
+    ("uint8", 3): wp.vec3ub,
+    ("uint16", 1): wp.uint16,
+    ("float32", 1): wp.float32,
+    ("float32", 2): wp.vec2,
+    ("float32", 3): wp.vec3,
+}
 _LAYER_FIELDS = [(name, wp.array, _declare_layer(layer)) for name, layer in LAYER_TABLE.items()]
 
 

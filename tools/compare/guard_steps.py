@@ -46,7 +46,7 @@ JPEG: dict[str, object] = {"bop.color_format": "jpg", "bop.split": "train_pbr"}
 SETS: dict[str, dict[str, object]] = {
     "smoke": {},
     "picks": {**PICKING, "bake.formats": ["bop", "zarr"], "bop.keypoints": 4},
-    "all": {**JPEG, "bake.formats": ["bop", "shards", "usd", "zarr", "lerobot", "coco"], "render.layers": LAYERS},
+    "all": {**JPEG, "bake.formats": ["bop", "shards", "usd", "zarr", "lerobot", "coco", "yolo"], "render.layers": LAYERS},
     "sensors": {**TINY, **JPEG, **EFFECTS, "bake.formats": ["bop", "zarr"], "bop.layout": "multisensor"},
     "reference": {**TINY, "render.mode": "reference", "render.samples": 4, "bake.models": "smoke/models", "arrangement.fill": "within"},
     "unoccluded": {**PICKING, **TINY, "bake.formats": ["shards", "zarr"], "render.mode": "unoccluded", "bake.seed": 7},
@@ -57,7 +57,7 @@ SPLITS_FILE = "splits.toml"
 SPLITS = 'preset = "smoke"\n[splits.train]\nepisodes = 1\n[splits.test]\nepisodes = 1\nmode = "pick"\n'
 SPLIT_SET = "unoccluded"
 """Data set that is baked with this file."""
-CONVERSIONS = {"picks": "shards,usd,lerobot,coco", "smoke": "shards,coco", "unoccluded": "bop,usd,lerobot,coco"}
+CONVERSIONS = {"picks": "shards,usd,lerobot,coco,yolo", "smoke": "shards,coco", "unoccluded": "bop,usd,lerobot,coco"}
 """Data set -> formats that it is converted to."""
 RECORDED = ("bake all", "bake reference", "bake unoccluded", "estimate refine")
 """Steps of which the kernels that they have loaded are compared."""
@@ -123,7 +123,7 @@ def mixed_episodes(device: str, worlds: int, out: str, models: str, lights: str)
         "bake.mode": "mixed",
         "bake.episodes": 8,
         "bake.worlds": worlds,
-        "bake.formats": ["bop", "shards", "usd", "zarr", "coco"],
+        "bake.formats": ["bop", "shards", "usd", "zarr", "coco", "yolo"],
         "bake.models": models,
         "bake.lights": lights,
         "cameras.resolution": [320, 180],
