@@ -269,7 +269,7 @@ def test_litter_is_no_data(whole, tmp_path):
     folder, clean = copied(whole, tmp_path / "set"), snapshot(whole)
     strew(folder)
     [said] = merge([folder], tmp_path / "merged").left_out
-    assert re.fullmatch(rf"left out: {folder}/coco/parts/\S+ and \d+ more, of no committed episode", said)
+    assert re.fullmatch(rf"left out: {folder}/lerobot/parts/\S+ and \d+ more, of no committed episode", said)
     assert snapshot(tmp_path / "merged") == clean
     for name in ("000001.json", "joined.json"):
         (folder / "manifest" / name).unlink()
