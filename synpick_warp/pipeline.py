@@ -114,7 +114,9 @@ def _fill(config: Config, output: OutputFolder, needs: Needs, names: Sequence[st
             exporters = Exporters(needs.classes, ExportContext(output.out, config, factory.catalog, factory.cameras, factory.lights, pool))
             with aborting(pool, exporters):
                 output.prepare(exporters, digest_inputs(factory.catalog, factory.lights), pool)
-                _Run(config, factory, exporters, partial(output.commit, exporters, pool), summary, progress, StopRequest()).run()
+                _Run(
+                    config, factory, exporters, needs.views, partial(output.commit, exporters, pool), summary, progress, StopRequest()
+                ).run()
                 with scope("wait for writers"):
                     pool.wait()
                 exporters.close()
@@ -146,7 +148,9 @@ def generate_share(share: Share, handles: Sequence[int], link: BakeLink) -> Bake
             started = time.perf_counter()
             exporters = Exporters(needs.classes, ExportContext(share.out, config, factory.catalog, factory.cameras, factory.lights, pool))
             with aborting(pool, exporters):
-                _Run(config, factory, exporters, partial(commit_episode, share.out, exporters, pool), summary, link, link).run()
+                _Run(
+                    config, factory, exporters, needs.views, partial(commit_episode, share.out, exporters, pool), summary, link, link
+                ).run()
                 pool.wait()
                 exporters.close()
             summary.wall_seconds = time.perf_counter() - started
@@ -161,13 +165,14 @@ class _Run:
         config: Config,
         factory: Factory,
         exporters: Exporters,
+        writes_views: bool,
         commit: Callable[[EpisodeEnd], None],
         summary: BakeSummary,
         progress: Progress,
         stop: StopRequest | BakeLink,
     ) -> None:
         self.stop = stop
-        self.config, self.factory, self.exporters = config, factory, exporters
+        self.config, self.factory, self.exporters, self.writes_views = config, factory, exporters, writes_views
         self.commit, self.summary, self.progress = commit, summary, progress
         self.meter = ThroughputMeter(len(config.cameras.positions), summary, progress)
         self.layout = DataLayout.of(config)
@@ -197,7 +202,7 @@ class _Run:
                 self.exporters.write_ticks(batch.select(frames))
             ticks.enqueue()
         records = self.factory.log.update(report)
-        if self.exporters.needs_views:
+        if self.writes_views:
             streams = self.factory.stream.streams
             streams.confine(ticks.reserved_share)
             ticks.confine_solver(streams.solver if len(batch) else None)

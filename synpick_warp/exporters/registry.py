@@ -76,8 +76,6 @@ class Exporters:
 
     def __init__(self, classes: Iterable[type[Exporter]], context: ExportContext) -> None:
         self._all = tuple(exporter_class(context) for exporter_class in classes)
-        self.needs_physics = any(exporter.needs_physics for exporter in self._all)
-        self.needs_views = any(exporter.needs_views for exporter in self._all)
 
     def write_constants(self) -> list[Path]:
         """See `Exporter`. Formats may share files, which are then identical."""

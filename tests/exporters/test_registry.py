@@ -79,7 +79,6 @@ def test_missing_package_of_a_format_is_a_configuration_error(monkeypatch):
 def test_episode_is_committed_when_the_last_exporter_has_committed_it():
     both = Exporters((Fake, Other), None)  # type: ignore[arg-type]
     first, second = both._all
-    assert both.needs_physics
     both.write_views("views")
     both.write_ticks("tick")
     assert first.calls == second.calls == ["views", "tick"]
@@ -104,7 +103,7 @@ def test_files_and_slot_size_combine_all_exporters():
 
 
 def test_views_and_physics_are_needed_if_one_exporter_needs_them():
-    assert [(together.needs_physics, together.needs_views) for together in (Exporters((Fake,), None), Exporters((Fake, Other), None))] == [
+    assert [(needs.physics, needs.views) for needs in (Needs((Fake,), 0), Needs((Fake, Other), 0))] == [  # type: ignore[arg-type]
         (False, False),
         (True, True),
     ]

@@ -86,15 +86,10 @@ def _read_supervision(copy: Path, split: str, scene: str, frames: list[int]) -> 
                 low, high = detections.xyxy[:, :2], detections.xyxy[:, 2:]
                 values[f"box {frame}"] = np.concatenate(((low + high) / 2, high - low), axis=1)
             else:
-                (x, y), (ahead_x, ahead_y) = (np.moveaxis(part, 2, 0) for part in _corners(detections))
-                values[f"oriented_area {frame}"] = np.abs((x * ahead_y - ahead_x * y).sum(axis=1)) / 2
+                x, y = np.moveaxis(detections.data["xyxyxyxy"].astype(float), 2, 0)
+                crosses = x * np.roll(y, -1, axis=1) - np.roll(x, -1, axis=1) * y
+                values[f"oriented_area {frame}"] = np.abs(crosses.sum(axis=1)) / 2
     return values
-
-
-def _corners(detections: Any) -> tuple[np.ndarray, np.ndarray]:
-    """Corners of oriented boxes (N, 4, 2) [px], and those that follow."""
-    corners = detections.data["xyxyxyxy"].astype(float)
-    return corners, np.roll(corners, -1, axis=1)
 
 
 def expect(data_set: Any) -> dict[str, np.ndarray]:
