@@ -54,7 +54,7 @@ class _Axis(msgspec.Struct):
 
 
 class _Entry(msgspec.Struct):
-    """Diameter and symmetries of an object's entry; other keys are copied unread."""
+    """Schema of an object's entry: diameter and symmetries. Other keys are copied without validation."""
 
     diameter: Annotated[float, msgspec.Meta(gt=0.0, le=1e9)] | None = None
     symmetries_discrete: list[Annotated[list[_Number], msgspec.Meta(min_length=16, max_length=16)]] = []

@@ -96,7 +96,7 @@ def collision_shapes(
 
 @dataclass(frozen=True, eq=False)
 class _Job:
-    """Name, mesh and recipe of an object whose shape is wanted, and the file in which the shape is cached."""
+    """Convex decomposition to compute: the object's name and mesh, the recipe, and the cache file of the result."""
 
     name: str
     mesh: TriangleMesh

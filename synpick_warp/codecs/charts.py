@@ -181,7 +181,7 @@ class Legend:
 
 
 def panel(y: Spec, height: int, layers: Sequence[Spec]) -> Spec:
-    """Panel: y axis, height [px] and layers, drawn in their order."""
+    """Panel of a chart: layers with a common y axis, drawn in order, of this height [px]."""
     return {"height": height, "width": _PANEL, "encoding": {"y": y}, "layer": list(layers)}
 
 

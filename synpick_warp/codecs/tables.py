@@ -32,7 +32,7 @@ class Column(NamedTuple):
     label: str | None = None
     """Header in text and LaTeX; None: the name, with spaces for underscores."""
     digits: str = ""
-    """Format of the values in CSV; empty: all digits."""
+    """Format specification of the values in CSV; empty: full precision."""
 
 
 @dataclass(frozen=True)

@@ -1,7 +1,7 @@
-"""Conversion of a BOP data set that no bake wrote to formats of images: its scenes with their own ids, files as they are where a format
-holds such, annotations as they were read.
+"""Conversion of a BOP data set from another source to formats of images. Scene and image ids are kept; images are copied without decoding
+where the format has the same file type; annotations are written as they were read.
 
-What is written is again a data set without settings and manifest. It is written beside its place, and appears there when it is complete.
+The result has no settings and no manifest either. It is written to a temporary folder and renamed when it is complete.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ from synpick_warp.system.cores import count_cores
 from synpick_warp.system.folders import make_folder
 
 _IMAGES = {"views", "masks"}
-"""What a format may be made of here: of `formats.Content`, that of which no trajectory is needed."""
+"""Kinds of `formats.Content` that these data sets have."""
 _NEEDS = {"gt": "ground truth (scene_gt.json)", "rgb": "colour images"}
 _NEEDS_OF_MASKS = {"mask_visib": "masks of visible parts (mask_visib)"}
 _NEEDS_OF_DEPTH = {"camera": "cameras (scene_camera.json)", "depth": "depth images"}
@@ -52,7 +52,7 @@ _NEEDS_OF_DEPTH = {"camera": "cameras (scene_camera.json)", "depth": "depth imag
 _BAKED = (CAMERA_FILE, "README.md")
 """Files of exporters that describe a bake, its camera or its licence."""
 _JPEG_QUALITY = 95
-"""Of colour images that are neither PNG nor JPEG, or not what the first one is."""
+"""JPEG quality of colour images that are encoded again: they are neither PNG nor JPEG, or differ in type from the first one."""
 
 
 class FoundViewFiles(StoredViewFiles):
@@ -135,13 +135,13 @@ class _Context(ExportContext):
 
 
 def _found(data: DataSet) -> FoundScenes:
-    """Its scenes, which no bake wrote."""
+    """The scenes of a data set from another source."""
     assert data.found is not None
     return data.found
 
 
 def convert_found(data: DataSet, out: Path, formats: Sequence[str], processes: int, report: Report) -> int:
-    """Convert all scenes of a data set that no bake wrote; returns their number.
+    """Convert all scenes of a data set from another source; returns their number.
 
     Args:
         data: The data set.

@@ -141,20 +141,20 @@ class Episode:
 
     @cached_property
     def image_ids(self) -> Sequence[int]:
-        """BOP's im_id of each frame: the frame's index, but in a data set that no bake wrote any numbers, with gaps."""
+        """BOP's im_id of each frame: the frame's index; in a data set from another source, numbers that may have gaps."""
         if self._data_set.found is None:
             return range(len(self))
         return sorted({image for camera in self.cameras for image in self._files_of(camera).frames()})
 
     @property
     def cameras(self) -> Sequence[int]:
-        """Indices of the cameras that have recorded the episode: all, but in a data set that no bake wrote."""
+        """Indices of the cameras that have recorded the episode: all; in a data set from another source, possibly fewer."""
         found = self._data_set.found
         return range(self._data_set.camera_count) if found is None else found.cameras_of(self.index)
 
     @cached_property
     def attempts(self) -> tuple[dict[str, Any], ...]:
-        """Pick attempts in order; each is a line of attempts.jsonl. None in a data set that no bake wrote."""
+        """Pick attempts in order; each is a line of attempts.jsonl. Empty for a data set from another source."""
         if self._data_set.found is not None:
             return ()
         if self._record is not None:
@@ -225,7 +225,7 @@ class Episode:
 class DataSet(Mapping[int, Episode]):
     """Episodes of a data set by index, and what they share. Episodes that another bake commits meanwhile appear on the next access.
 
-    Of a BOP data set that no bake wrote, each scene is an episode with the scene's index, each sensor a camera; see `FoundScenes`.
+    In a BOP data set from another source, an episode is a scene, with the scene's index, and a camera is a sensor; see `FoundScenes`.
     """
 
     def __init__(self, folder: Path, episodes: range | None = None, split: str | None = None) -> None:
@@ -233,7 +233,7 @@ class DataSet(Mapping[int, Episode]):
         Args:
             folder: Folder of the data set.
             episodes: Indices of the episodes to show; None: all.
-            split: Split to show, of a data set that no bake wrote; None: all.
+            split: Split to show, of a data set from another source; None: all.
         """
         self.folder = folder
         self._store = folder / STORE
@@ -242,7 +242,7 @@ class DataSet(Mapping[int, Episode]):
 
     @cached_property
     def found(self) -> FoundScenes | None:
-        """Scenes as the folder shows them; None: a bake wrote the data set.
+        """Scenes that were found in the folder of a data set from another source; None: the data set is of a bake.
 
         Raises:
             DatasetError: Neither did a bake write it nor has it BOP scenes.
@@ -322,7 +322,7 @@ class DataSet(Mapping[int, Episode]):
 
     @cached_property
     def cameras(self) -> tuple[CameraInfo, ...]:
-        """The cameras by index. Raises DatasetError if no bake wrote the data set: each of its views has a camera of its own."""
+        """The cameras by index. Raises DatasetError for a data set from another source, whose views have cameras of their own."""
         if self.has_store:
             return read_cameras(self._store, self.camera_count if (self.folder / CONFIG_FILE).exists() else None, self._constants)
         import numpy as np
@@ -341,7 +341,7 @@ class DataSet(Mapping[int, Episode]):
 
     @cached_property
     def period(self) -> float | None:
-        """Time from frame to frame [s]; None: it is not known, as no bake wrote the data set."""
+        """Time from frame to frame [s]; None: unknown, in a data set from another source."""
         return None if self.found is not None else self.config.physics.step * self.config.physics.steps_per_tick
 
     def scene_id(self, episode: int, camera: int) -> int:
@@ -417,7 +417,7 @@ class DataSet(Mapping[int, Episode]):
 
     @cached_property
     def planned(self) -> int:
-        """Number of episodes that the settings plan, or that are there if no bake wrote the data set."""
+        """Number of episodes that the settings plan, or that were found in a data set from another source."""
         if self.found is not None:
             return len(self)
         return sum(len(each) for each in DataLayout.of(self.config).plan() if self._only in (None, each))

@@ -115,7 +115,7 @@ def tiff_size(data: bytes) -> tuple[int, int] | None:
 
 
 def decode_picture(data: bytes, source: object, error: type[SynpickError], size: tuple[int, int] | None = None) -> np.ndarray:
-    """Decode a PNG, JPEG or TIFF file without conversion; arguments, result and errors as `decode_image`."""
+    """Decode a PNG, JPEG or TIFF file, keeping its channels and bit depth. Arguments, result and errors are those of `decode_image`."""
     if data[:4] not in _TIFF:
         return decode_image(data, source, error, size=size)
     import cv2

@@ -34,7 +34,7 @@ _MAX_LAYER_GAP = 150
 _MARGIN = 38
 """Distance from the border to the outermost nodes' centres [px]."""
 _SWEEPS = 8
-"""Number of downward and upward sweeps, of each kind; more change nothing in graphs of this size."""
+"""Number of downward and of upward barycentre sweeps; graphs of this size converge within them."""
 _MAX_PIECES = 1000
 """Maximum number of edges between neighbouring layers; those of 100 objects are some 200."""
 _BEND = 0.32

@@ -13,7 +13,7 @@ from synpick_warp.estimation.decoder_pool import Decoder
 
 @dataclass(frozen=True)
 class ListModules:
-    """Task: interrupt the process as Ctrl-C does, and list its modules if it goes on."""
+    """Task: send SIGINT to the process, and return the names of its imported modules if it survives."""
 
     def __call__(self, decoder: Decoder) -> set[str]:
         os.kill(os.getpid(), signal.SIGINT)

@@ -249,7 +249,7 @@ class WriterPool:
 
 
 def _open_slots(handle: int, niceness: int) -> mmap.mmap:
-    """Set up a process: it gives way to the bake, and maps the images."""
+    """Set up a writer process: lower its scheduling priority, and map the shared memory of the images."""
     os.nice(niceness)
     return mmap.mmap(handle, 0)
 

@@ -52,7 +52,7 @@ class BinaryBvh:
 
 @dataclass(frozen=True, eq=False)
 class Level:
-    """Children of the nodes of a wide BVH at one depth; levels are in breadth-first order."""
+    """One level of a wide BVH in breadth-first order: the children of each of its nodes."""
 
     child: np.ndarray
     """(node, WIDTH) int64: children, as nodes of the binary BVH, or ABSENT."""
