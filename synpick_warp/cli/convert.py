@@ -27,14 +27,14 @@ def convert(
             help="Folder of the converted data set: new, empty, or of an interrupted conversion (default DIR-FORMATS, beside the data set)."
         ),
     ] = None,
-    split: Annotated[str | None, Parameter(help="Split to convert, of a BOP data set that no bake wrote (default: the only one).")] = None,
+    split: Annotated[str | None, Parameter(help="Split to convert, of a BOP data set from another source (default: the only one).")] = None,
     processes: Annotated[WholeNumber, Parameter(help="Processes that convert; 0: one per core.")] = 0,
 ) -> int:
     """Convert a data set to other formats. After an interruption, the same command resumes with the remaining episodes.
 
     Formats of images need bop or shards in the data set, those of motion alone (usd) zarr, and lerobot both. Files are those that a bake
-    would have written, but for LeRobot's videos from JPEG images. BOP data sets that no bake wrote become bop, shards, coco or yolo, with
-    their own ids, and not in parts. Exit codes: 0, converted; 2, an error.
+    would have written, but for LeRobot's videos from JPEG images. BOP data sets from other sources become bop, shards, coco or yolo, with
+    their own ids; interrupted, they are converted again from the start. Exit codes: 0, converted; 2, an error.
     """
     check_range("--processes", processes, 0, MAX_THREADS)
     from synpick_warp.cli.display import CountProgress, make_console

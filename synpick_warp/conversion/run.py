@@ -36,7 +36,7 @@ class Converted(NamedTuple):
 
 
 def convert(folder: Path, out: Path, formats: Sequence[str], processes: int, report: Report, split: str | None = None) -> Converted:
-    """Convert the committed episodes of a data set to other formats, into a data set of its own; the scenes of one that no bake wrote.
+    """Convert the committed episodes of a data set to other formats, into a data set of its own; the scenes of one from another source.
 
     Args:
         folder: The data set.
@@ -44,7 +44,7 @@ def convert(folder: Path, out: Path, formats: Sequence[str], processes: int, rep
         formats: Names of formats.
         processes: Number of processes; 0: one per core.
         report: Observer: unit, number done, total.
-        split: Split to convert, of a data set that no bake wrote; None: the only one.
+        split: Split to convert, of a data set from another source; None: the only one.
 
     Raises:
         ConfigError: A format cannot be converted to, or `out` was started with other settings.

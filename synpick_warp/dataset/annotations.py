@@ -146,7 +146,7 @@ SCENE_SCHEMAS: dict[str, Any] = {name: dict[Key, schema] for name, schema in VIE
 """Schema of these files: the entries by frame."""
 LENIENT_VIEW_SCHEMAS = VIEW_SCHEMAS | {"camera": LenientCameraEntry}
 LENIENT_SCENE_SCHEMAS: dict[str, Any] = {name: dict[Key, schema] for name, schema in LENIENT_VIEW_SCHEMAS.items()}
-"""The same for data sets that no bake wrote."""
+"""The same for data sets from other sources."""
 MASK_SCHEMA = dict[Key, RunLengths]
 """Schema of a view's run lengths in a shard: masks by instance index."""
 

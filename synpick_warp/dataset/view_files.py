@@ -52,7 +52,7 @@ class ViewRecords(NamedTuple):
 class SceneFiles(ABC):
     """Files of one scene: all frames of one camera in one episode.
 
-    Those of a bake have all parts, and images of one size. Of a lenient scene, which no bake wrote, parts may be missing, and images be of
+    Those of a bake have all parts, and images of one size. Of a lenient scene, from another source, parts may be missing, and images be of
     any format that BOP data sets have; grey ones stand in for colour.
     """
 

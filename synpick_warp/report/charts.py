@@ -53,7 +53,7 @@ class Source:
     statistics: Statistics
     brightness: Sequence[Brightness]
     config: Config | None
-    """None: no bake wrote the data set."""
+    """None: the data set is from another source."""
     durations: Mapping[str, float] = field(default_factory=dict)
     """Mode -> time from the first frame to the end of the last, of its longest episode [s]."""
 

@@ -1,4 +1,4 @@
-"""BOP folders that no bake wrote: every command that reads takes them with what they have, and says in one line what they lack."""
+"""BOP folders from other sources: every command that reads takes them with what they have, and says in one line what they lack."""
 
 from __future__ import annotations
 
