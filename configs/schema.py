@@ -14,7 +14,7 @@ from synpick_warp.codes import Tone, names
 from synpick_warp.configs.fields import INT32_MAX, setting
 from synpick_warp.configs.manipulation import Move, Perception, Pick, Suction, Target
 from synpick_warp.configs.sensors import DepthSensor, Effects
-from synpick_warp.layers import LAYER_TABLE
+from synpick_warp.views.layers import LAYER_TABLE
 
 MODES = ("pick", "target", "move")
 """Tasks of the gripper in an episode."""
@@ -28,7 +28,7 @@ UNOCCLUDED = "unoccluded"
 RENDER_MODES = (FAST, REFERENCE, UNOCCLUDED)
 """Colour renderers."""
 LAYERS = tuple(LAYER_TABLE)
-"""Annotation layers (AOVs) that a view can have besides colour, depth and masks; see `synpick_warp.layers`."""
+"""Annotation layers (AOVs) that a view can have besides colour, depth and masks; see `synpick_warp.views.layers`."""
 CLASSIC = "classic"
 MULTISENSOR = "multisensor"
 LAYOUTS = (CLASSIC, MULTISENSOR)

@@ -11,8 +11,8 @@ from synpick_warp.attempts import EpisodeRecord
 from synpick_warp.codes import Ending, Outcome
 from synpick_warp.configs.schema import Config
 from synpick_warp.configs.splits import DataLayout
-from synpick_warp.frames import EpisodeEnd
 from synpick_warp.stages.stream import TickReport
+from synpick_warp.views.frames import EpisodeEnd
 
 PLACES = 6
 """Decimal places of a time [s]; more would be noise."""

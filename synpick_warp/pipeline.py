@@ -23,7 +23,6 @@ from synpick_warp.exporters.base import ExportContext
 from synpick_warp.exporters.registry import Exporters, Needs, aborting
 from synpick_warp.exporters.writing.pool import WriterPool
 from synpick_warp.factory.assembly import Factory, build_factory
-from synpick_warp.frames import EpisodeEnd, FrameBatch
 from synpick_warp.memory_plan import check_episodes, explain_shortage
 from synpick_warp.progress import Progress
 from synpick_warp.scenes.catalog import load_catalog
@@ -40,6 +39,7 @@ from synpick_warp.stages.timing import scope
 from synpick_warp.system.cores import count_cores
 from synpick_warp.system.device import pick_devices
 from synpick_warp.system.interrupt import StopRequest
+from synpick_warp.views.frames import EpisodeEnd, FrameBatch
 
 _DEVICE_PROGRAM = "from synpick_warp.pipeline import generate_share; from synpick_warp.scheduling.worker import main; main(generate_share)"
 """Program of a device's process, where a bake uses several."""

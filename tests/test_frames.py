@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from synpick_warp.frames import SelectedRows
+from synpick_warp.views.frames import SelectedRows
 from tests.worlds.trajectories import ticks
 
 EPISODES = (0, 2, 4, 6)

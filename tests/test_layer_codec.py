@@ -13,8 +13,8 @@ from synpick_warp.configs.schema import LAYERS
 from synpick_warp.errors import DatasetError
 from synpick_warp.exporters.bop.scene import write_layer
 from synpick_warp.exporters.bop.view import write_rendered_layer
-from synpick_warp.layer_codec import CODECS, decode_layer, encode_layer, layer_notes, layer_path, read_layer
-from synpick_warp.layers import LAYER_TABLE
+from synpick_warp.views.layer_codec import CODECS, decode_layer, encode_layer, layer_notes, layer_path, read_layer
+from synpick_warp.views.layers import LAYER_TABLE
 
 SIDES = st.tuples(st.integers(1, 6), st.integers(1, 6))
 

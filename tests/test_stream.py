@@ -18,7 +18,6 @@ from synpick_warp.codecs.jpeg import encode_jpeg
 from synpick_warp.codes import Effect, Measure, Phase, Status
 from synpick_warp.configs.schema import LAYERS, Config
 from synpick_warp.exporters.writing.rle import find_run_boundaries, unpack_run_boundaries
-from synpick_warp.frames import FrameBatch
 from synpick_warp.stages import host_copies, stream
 from synpick_warp.stages.buffers import Snapshot, ViewBuffers
 from synpick_warp.stages.host_copies import HostCopy
@@ -37,6 +36,7 @@ from synpick_warp.stages.stream import (
     view_sizes,
     views_per_batch,
 )
+from synpick_warp.views.frames import FrameBatch
 from tests.twins.depth_png import encode_depth
 from tests.worlds.small_worlds import settings
 from tests.worlds.toy_scene import even_light, sun

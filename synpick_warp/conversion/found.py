@@ -35,13 +35,13 @@ from synpick_warp.exporters.writing.notes import CAMERA_FILE, NOTES_FILE
 from synpick_warp.exporters.writing.png import encode_png
 from synpick_warp.exporters.writing.pool import WriterPool
 from synpick_warp.exporters.writing.rle import Masks, Runs
-from synpick_warp.frames import EpisodeEnd
 from synpick_warp.inputs.image_files import MAX_IMAGE_FILE, TEXTURE_KINDS
 from synpick_warp.progress import Report
 from synpick_warp.scenes.cameras import make_cameras
 from synpick_warp.scenes.types import Catalog
 from synpick_warp.system.cores import count_cores
 from synpick_warp.system.folders import make_folder
+from synpick_warp.views.frames import EpisodeEnd
 
 _IMAGES = {"views", "masks"}
 """Kinds of `formats.Content` that these data sets have."""

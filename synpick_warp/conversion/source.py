@@ -34,7 +34,7 @@ from synpick_warp.exporters.formats import Content
 from synpick_warp.exporters.trajectory.arrays import STORE
 from synpick_warp.exporters.writing.checksums import open_regular
 from synpick_warp.exporters.writing.files import remove_folder
-from synpick_warp.frames import EpisodeEnd, TickBatch
+from synpick_warp.views.frames import EpisodeEnd, TickBatch
 
 _COPY_BYTES = 1 << 20
 """Size of a copy block [B]."""

@@ -13,7 +13,7 @@ from synpick_warp.dataset.annotations import ADVICE, Index, check_content
 from synpick_warp.dataset.reading import Episode
 from synpick_warp.dataset.trajectory import GROUP_FILE, Arrays, read_array
 from synpick_warp.errors import DatasetError
-from synpick_warp.frames import EpisodeEnd, TickBatch
+from synpick_warp.views.frames import EpisodeEnd, TickBatch
 
 POSES = ("time", "object_id", "pose", "fixture_pose", "fixture_visible")
 """Arrays of `ticks` that every format needs."""

@@ -17,7 +17,7 @@ from synpick_warp.dataset.annotations import ADVICE
 from synpick_warp.dataset.bop.arrays import instance_ids
 from synpick_warp.dataset.view_files import SceneFiles, ViewRecords, check_planes
 from synpick_warp.errors import DatasetError
-from synpick_warp.layer_codec import decode_layer, image_format
+from synpick_warp.views.layer_codec import decode_layer, image_format
 
 MILLIMETERS = 1000.0
 """In a metre: BOP's files are in millimetres, this module is in metres."""
@@ -99,7 +99,7 @@ class View:
         return tuple(name for name in LAYERS if name in present)
 
     def layer(self, name: str) -> np.ndarray:
-        """Decode a layer; units and shapes as in `synpick_warp.layer_codec.decode_layer`.
+        """Decode a layer; units and shapes as in `synpick_warp.views.layer_codec.decode_layer`.
 
         Raises:
             DatasetError: The data set has no such layer.

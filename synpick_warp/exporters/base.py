@@ -16,9 +16,9 @@ from synpick_warp.configs.splits import DataLayout
 from synpick_warp.exporters.writing.folder import Buffer
 from synpick_warp.exporters.writing.pool import WriterPool
 from synpick_warp.exporters.writing.rle import Masks
-from synpick_warp.frames import EpisodeEnd, FrameBatch, TickBatch
 from synpick_warp.scenes.types import Camera, Catalog, EnvironmentMap
 from synpick_warp.system.shared_memory import shared_bytes
+from synpick_warp.views.frames import EpisodeEnd, FrameBatch, TickBatch
 
 PIXEL_BYTES = (3, 2, 1, 4)
 """Bytes of a pixel of `FrameBatch`'s color, depth, instance and amodal."""

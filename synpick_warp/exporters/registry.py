@@ -14,7 +14,7 @@ from synpick_warp.errors import ConfigError
 from synpick_warp.exporters.base import ExportContext, Exporter, SharedFiles, StoredScene, TaskSizes
 from synpick_warp.exporters.formats import FORMAT_TABLE
 from synpick_warp.exporters.writing.pool import WriterPool
-from synpick_warp.frames import EpisodeEnd, FrameBatch, TickBatch
+from synpick_warp.views.frames import EpisodeEnd, FrameBatch, TickBatch
 
 
 def load_exporter_classes(names: Iterable[str]) -> tuple[type[Exporter], ...]:

@@ -18,7 +18,7 @@ from synpick_warp.configs.schema import Config
 from synpick_warp.exporters.base import ExportContext, StoredScene
 from synpick_warp.exporters.writing.files import PARTIAL, output_error
 from synpick_warp.exporters.writing.pool import WriterPool, WriteTask
-from synpick_warp.frames import EpisodeEnd, FrameBatch, TickBatch
+from synpick_warp.views.frames import EpisodeEnd, FrameBatch, TickBatch
 
 _Content = TypeVar("_Content")
 

@@ -9,7 +9,7 @@ import warp as wp
 
 from synpick_warp.arrays import allocate, device_array
 from synpick_warp.kernels.render.images.camera_effects import EffectParameters
-from synpick_warp.layers import LAYER_TABLE, Layer
+from synpick_warp.views.layers import LAYER_TABLE, Layer
 
 FIXTURES = ("tote", "finger", "cup")
 """Order of the dimension "fixture"; finger: the gripper shaft."""

@@ -14,7 +14,6 @@ import warp as wp
 from synpick_warp.arrays import allocate, memory_table
 from synpick_warp.codes import Measure, Status, column_names
 from synpick_warp.configs.schema import Cameras, Config, Render
-from synpick_warp.frames import FrameBatch, SelectedRows, TickBatch
 from synpick_warp.stages.buffers import LayerBuffers, Snapshot, ViewBuffers, view_buffer_sizes
 from synpick_warp.stages.encoding.jpeg import Compressor
 from synpick_warp.stages.encoding.png import DepthBuffers, DepthEncoder, depth_sizes
@@ -26,6 +25,7 @@ from synpick_warp.stages.render_streams import RenderStreams
 from synpick_warp.stages.sim.simulate import TickRecord
 from synpick_warp.stages.sim.step_log import host_record, record_arrays, tick_measures
 from synpick_warp.stages.timing import scope
+from synpick_warp.views.frames import FrameBatch, SelectedRows, TickBatch
 
 # Size of one batch's images on a GPU [bytes]: large enough to fill the GPU, small enough for several batches in flight.
 BATCH_BYTES = 512 << 20

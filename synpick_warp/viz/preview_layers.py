@@ -8,7 +8,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from synpick_warp.layer_codec import read_layer
+from synpick_warp.views.layer_codec import read_layer
 from synpick_warp.viz.depth_colors import DepthScale, color_depth
 from synpick_warp.viz.drawing import GOLDEN, Image
 
@@ -19,12 +19,12 @@ _GREY = 64
 
 
 def color_layer(name: str, values: np.ndarray) -> Image:
-    """One layer as colours, from its values as `synpick_warp.layer_codec.read_layer` returns them."""
+    """One layer as colours, from its values as `synpick_warp.views.layer_codec.read_layer` returns them."""
     return draw_layer(name, values)[1]
 
 
 def draw_layer(name: str, values: np.ndarray, depth_scale: DepthScale | None = None) -> tuple[str, Image]:
-    """Caption and colours of one layer, from its values as `synpick_warp.layer_codec.read_layer` returns them.
+    """Caption and colours of one layer, from its values as `synpick_warp.views.layer_codec.read_layer` returns them.
 
     `depth_scale` is that of depth images beside it, in the unit of the values; None: the image's own.
     """

@@ -22,9 +22,9 @@ from synpick_warp.errors import DatasetError
 from synpick_warp.exporters.writing.checksums import list_files, write_manifest_entry
 from synpick_warp.exporters.writing.files import PARTIAL
 from synpick_warp.exporters.writing.pool import WriterPool
-from synpick_warp.frames import EpisodeEnd
 from synpick_warp.scenes.embedded.skies import skies
 from synpick_warp.scenes.types import CatalogEntry, ConvexPiece, EnvironmentMap, Material, Sun, TriangleMesh
+from synpick_warp.views.frames import EpisodeEnd
 from tests.harness.entries import episode_content
 from tests.worlds.small_worlds import catalog, settings
 

@@ -11,7 +11,7 @@ from synpick_warp.dataset.view_files import decode_run_lengths
 from synpick_warp.errors import DatasetError
 from synpick_warp.exporters.bop.exporter import BopExporter
 from synpick_warp.exporters.bop.shards.exporter import ShardsExporter
-from synpick_warp.frames import FrameBatch
+from synpick_warp.views.frames import FrameBatch
 from tests.harness.exporter_contract import FRAMES, LENSES
 from tests.worlds.box_sets import ATTEMPT, EPISODES, LAYERS, write_set
 from tests.worlds.box_views import OBJECT_IDS, SIZES, batches

@@ -12,7 +12,7 @@ from synpick_warp.codes import Effect, Outcome, names
 from synpick_warp.episodes import EpisodeRow
 from synpick_warp.exporters.formats import FORMAT_TABLE
 from synpick_warp.exporters.trajectory.arrays import CONSTANT_GROUPS, EPISODE_GROUPS
-from synpick_warp.layers import LAYER_TABLE
+from synpick_warp.views.layers import LAYER_TABLE
 
 README = Path(synpick_warp.exporters.__file__).with_name("README.md")
 

@@ -12,7 +12,7 @@ from synpick_warp.exporters import registry
 from synpick_warp.exporters.base import ExportContext, TaskSizes
 from synpick_warp.exporters.formats import FORMAT_TABLE
 from synpick_warp.exporters.registry import Exporters, Needs, load_exporter_classes
-from synpick_warp.frames import EpisodeEnd
+from synpick_warp.views.frames import EpisodeEnd
 
 
 class Fake:

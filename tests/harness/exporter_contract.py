@@ -21,9 +21,9 @@ from synpick_warp.exporters.base import ExportContext, Exporter, TaskSizes
 from synpick_warp.exporters.writing.files import PARTIAL
 from synpick_warp.exporters.writing.png import encode_png
 from synpick_warp.exporters.writing.pool import WriterPool
-from synpick_warp.frames import EpisodeEnd, FrameBatch, TickBatch
 from synpick_warp.scenes.embedded.skies import skies
 from synpick_warp.scenes.types import Camera
+from synpick_warp.views.frames import EpisodeEnd, FrameBatch, TickBatch
 from tests.worlds import box_views
 from tests.worlds.box_views import batches, cameras, catalog, ends, ticks
 

@@ -16,8 +16,8 @@ from synpick_warp.episodes import BakeSummary, EpisodeRow
 from synpick_warp.exporters.base import ExportContext
 from synpick_warp.exporters.registry import Exporters, Needs
 from synpick_warp.exporters.writing.pool import WriterPool
-from synpick_warp.frames import EpisodeEnd
 from synpick_warp.scenes.embedded.skies import skies
+from synpick_warp.views.frames import EpisodeEnd
 from tests.worlds import box_views, trajectories
 
 FRAMES = 2

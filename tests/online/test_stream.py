@@ -19,10 +19,10 @@ import synpick_warp
 from synpick_warp.configs.schema import LAYERS
 from synpick_warp.errors import ConfigError
 from synpick_warp.factory import assembly
-from synpick_warp.layer_codec import decode_layer, encode_layer
 from synpick_warp.online import stream as online
 from synpick_warp.stages.sim.simulate import Simulation
 from synpick_warp.stages.stream import TickReader
+from synpick_warp.views.layer_codec import decode_layer, encode_layer
 from tests.harness.environment import checkout_environment
 from tests.online.conftest import LAYERED, tiny
 from tests.worlds.small_worlds import QUICK, settings

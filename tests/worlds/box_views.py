@@ -9,8 +9,8 @@ import trimesh
 
 from synpick_warp.codes import Effect, Ending, Segment
 from synpick_warp.configs.schema import Bop, Cameras, Config, Render
-from synpick_warp.frames import EpisodeEnd, FrameBatch, TickBatch
 from synpick_warp.scenes.types import Camera, Catalog, CatalogEntry, Material, TriangleMesh
+from synpick_warp.views.frames import EpisodeEnd, FrameBatch, TickBatch
 
 ROOM = 5
 """Instance capacity of a world; instances 1 and 4 do not exist."""

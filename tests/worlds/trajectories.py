@@ -14,7 +14,7 @@ from synpick_warp.codes import Ending
 from synpick_warp.configs.schema import Config, Trajectory
 from synpick_warp.exporters.trajectory.arrays import STEPS, TICKS, ArraySpec
 from synpick_warp.exporters.trajectory.exporter import TrajectoryExporter
-from synpick_warp.frames import EpisodeEnd, TickBatch
+from synpick_warp.views.frames import EpisodeEnd, TickBatch
 from tests.harness.exporter_contract import exporting, finish
 from tests.worlds import box_views
 

@@ -15,10 +15,10 @@ from synpick_warp.exporters.base import ExportContext
 from synpick_warp.exporters.usd.exporter import UsdExporter
 from synpick_warp.exporters.writing.files import PARTIAL
 from synpick_warp.exporters.writing.pool import WriterPool
-from synpick_warp.frames import EpisodeEnd, TickBatch
 from synpick_warp.scenes.cameras import make_cameras
 from synpick_warp.scenes.embedded.skies import skies
 from synpick_warp.scenes.types import Catalog, EnvironmentMap, Material
+from synpick_warp.views.frames import EpisodeEnd, TickBatch
 
 FRAMES = 70
 """More than the spool buffers in memory."""

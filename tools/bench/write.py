@@ -19,10 +19,10 @@ from synpick_warp.exporters.registry import load_exporter_classes
 from synpick_warp.exporters.writing.files import PARTIAL
 from synpick_warp.exporters.writing.pool import QUEUE_DEPTH, WriterPool
 from synpick_warp.factory.assembly import Factory
-from synpick_warp.frames import EpisodeEnd, FrameBatch, TickBatch
 from synpick_warp.stages.host_copies import DeviceImages
 from synpick_warp.stages.stream import TickReport, tick_batch
 from synpick_warp.system.cores import count_cores
+from synpick_warp.views.frames import EpisodeEnd, FrameBatch, TickBatch
 from tools.options import Row
 
 COPIES = 8

@@ -1,6 +1,6 @@
 """Annotation layers (AOVs) computed from the G-buffer: normals, albedo, NOCS, class ids, optical flow and scene flow.
 
-`synpick_warp.layers` has the table of layers, and says what to touch to add one.
+`synpick_warp.views.layers` has the table of layers, and says what to touch to add one.
 """
 
 import warp as wp

@@ -20,7 +20,7 @@ from synpick_warp.exporters.writing.files import sync_folder
 from synpick_warp.exporters.writing.folder import Buffer, open_folder
 from synpick_warp.exporters.writing.png import encode_mask_png
 from synpick_warp.exporters.writing.rle import Masks
-from synpick_warp.layer_codec import layer_path
+from synpick_warp.views.layer_codec import layer_path
 
 IGNORE_VISIBILITY = 0.1
 """COCO annotations with a lower visible fraction are marked `ignore` (the toolkit's calc_gt_coco.py)."""

@@ -29,7 +29,7 @@ from synpick_warp.exporters.staging import EpisodeExporter, StagedEpisode
 from synpick_warp.exporters.writing.files import output_error
 from synpick_warp.exporters.writing.notes import CAMERA_FILE, NOTES_FILE
 from synpick_warp.exporters.writing.pool import WriteTask
-from synpick_warp.frames import EpisodeEnd, FrameBatch
+from synpick_warp.views.frames import EpisodeEnd, FrameBatch
 
 CONSTANTS = tuple(map(Path, (*MODEL_FOLDERS, CAMERA_FILE, NOTES_FILE, PARAMS_FILE)))
 """Names of the files that all scenes share."""

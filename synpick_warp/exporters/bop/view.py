@@ -22,9 +22,9 @@ from synpick_warp.exporters.bop.keypoints import MILLIMETERS, Keypoints, project
 from synpick_warp.exporters.writing.folder import Buffer
 from synpick_warp.exporters.writing.png import encode_png, frame_depth_png
 from synpick_warp.exporters.writing.rle import Masks, Runs, find_run_boundaries, unpack_run_boundaries
-from synpick_warp.frames import FrameBatch
-from synpick_warp.layer_codec import encode_layer
 from synpick_warp.scenes.types import Camera
+from synpick_warp.views.frames import FrameBatch
+from synpick_warp.views.layer_codec import encode_layer
 
 ANNOTATIONS = "annotations"
 """Spool file of a staged scene: the annotation blocks of its views, in order of arrival; see `annotation_block`.

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from synpick_warp.exporters.trajectory.arrays import STEPS, TICKS, ArraySpec
-from synpick_warp.frames import TickBatch
+from synpick_warp.views.frames import TickBatch
 
 SPOOL_ROWS = 32
 """Maximum number of rows of a write task, each of another episode: about 2 MB with 24 instances."""

@@ -15,7 +15,7 @@ from synpick_warp.exporters.usd.spool import TickSpool, tick_rows
 from synpick_warp.exporters.usd.types import EpisodeMetadata, EpisodeSettings
 from synpick_warp.exporters.writing.files import output_error
 from synpick_warp.exporters.writing.pool import WriteTask
-from synpick_warp.frames import EpisodeEnd, TickBatch
+from synpick_warp.views.frames import EpisodeEnd, TickBatch
 
 FOLDER = Path("usd")
 """Folder in the data set."""

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from synpick_warp.frames import TickBatch
+from synpick_warp.views.frames import TickBatch
 
 TICKS = 64
 """Number of ticks that are buffered in memory: about 50 kB per world."""

@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from synpick_warp.codes import Ending
-from synpick_warp.frames import EpisodeEnd
 from synpick_warp.scenes.types import Camera
+from synpick_warp.views.frames import EpisodeEnd
 
 
 @dataclass(frozen=True)

@@ -98,7 +98,7 @@ class ViewBatch:
         instance: Segmentation id of the nearest surface: 0 none, 1 + instance_id, 252 to 255 table and fixtures (`Segment`)
             (B, H, W) uint8.
         amodal: Amodal masks as a bit field: bit i is set where the pixel's ray hits instance i, hidden or not (B, H, W) uint32.
-        layers: Layers (AOVs) that `render.layers` names, as they are before quantization (B, H, W[, C]); see `synpick_warp.layers`.
+        layers: Layers (AOVs) that `render.layers` names, as they are before quantization (B, H, W[, C]); see `synpick_warp.views.layers`.
         object_id: obj_id of each instance; -1: the instance is not in the scene (B, I) int32.
         pose: Object to world: x, y, z [m], quaternion x, y, z, w (B, I, 7) float32.
         object_to_camera: The same in the camera's frame, as matrices (B, I, 4, 4) float32 [m].
@@ -113,7 +113,7 @@ class ViewBatch:
         depth_scale: Millimetres per count of `depth`.
         host: The numbers of the views that the host knows anyway, as NumPy arrays that stay valid, by name: episode, arrangement (how
             often the episode's arrangement was resampled), camera, frame, time [s], object_id, pose, light_name, light_yaw,
-            light_exposure, light_direction; see `synpick_warp.frames.FrameBatch`.
+            light_exposure, light_direction; see `synpick_warp.views.frames.FrameBatch`.
     """
 
     color: DeviceArray

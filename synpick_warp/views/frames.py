@@ -63,7 +63,7 @@ class FrameBatch:
     light_direction: np.ndarray
     """Unit vector towards the sun or strongest lamp of the map, in the world frame; zero: the map has none (B, 3) float32."""
     layers: dict[str, np.ndarray] = field(default_factory=dict)
-    """Layers (AOVs) that `render.layers` names, each (B, H, W[, C]); see `synpick_warp.layer_codec`."""
+    """Layers (AOVs) that `render.layers` names, each (B, H, W[, C]); see `synpick_warp.views.layer_codec`."""
     boundary_count: np.ndarray | None = None
     """Number of run boundaries (value changes down a column) of `instance` and `amodal` (B, 2) int32; above R: `boundaries` is cut."""
     boundaries: np.ndarray | None = None
