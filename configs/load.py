@@ -15,7 +15,7 @@ from synpick_warp.configs.consistency import find_conflicts
 from synpick_warp.configs.schema import Bake, Bop, Config, ObjectRow
 from synpick_warp.configs.split_tables import SPLITS, override_table, read_tables, resolve_splits, split_settings
 from synpick_warp.errors import ConfigError
-from synpick_warp.inputs.toml import decode_toml, read_toml
+from synpick_warp.system.inputs.toml import decode_toml, read_toml
 
 DEFAULT_PRESET = "synpick"
 COMMAND_LINE = "on the command line"

@@ -21,7 +21,7 @@ from synpick_warp.scenes.collision.hulls import hull_size, mass_properties
 from synpick_warp.scenes.collision.shapes import collision_shapes, default_cache_dir
 from synpick_warp.scenes.embedded.objects import procedural_objects
 from synpick_warp.scenes.types import Catalog, CatalogEntry, ConvexPiece, HullSize, Material, RawObject, TriangleMesh
-from synpick_warp.system.isolation import Failure, Limits, run_isolated
+from synpick_warp.system.processes.isolation import Failure, Limits, run_isolated
 
 _MILLIMETRE = 1e-3
 # Minimum diameter [m]: smaller bodies vanish in the contact margin, and come from files in another unit than expected.

@@ -12,7 +12,6 @@ import cv2
 import numpy as np
 
 from synpick_warp.errors import LightError, SynpickError
-from synpick_warp.inputs.files import read_file
 from synpick_warp.scenes.assets.appearance import srgb_to_linear
 from synpick_warp.scenes.assets.asset_files import check_file_name, locate
 from synpick_warp.scenes.assets.image_size import image_size
@@ -20,7 +19,8 @@ from synpick_warp.scenes.assets.radiance import canonical_radiance, orient_radia
 from synpick_warp.scenes.embedded.skies import skies
 from synpick_warp.scenes.environment import LUMINANCE, map_directions
 from synpick_warp.scenes.types import EnvironmentMap, Sun
-from synpick_warp.system.isolation import Failure, Limits, run_isolated
+from synpick_warp.system.inputs.files import read_file
+from synpick_warp.system.processes.isolation import Failure, Limits, run_isolated
 
 READ_LIMITS = Limits(300.0, 2**32)
 """Limits of a map: 5 min and 4 GiB; the largest takes some seconds and 1.2 GB."""

@@ -17,14 +17,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from synpick_warp.errors import CatalogError, ConfigError, DatasetError, DeviceError, LightError, OutputError, SynpickError
-from synpick_warp.system.garbage import collection_paused
+from synpick_warp.system.processes.garbage import collection_paused
 
 if TYPE_CHECKING:
     from synpick_warp.configs.schema import Config
     from synpick_warp.dataset.reading import DataSet
     from synpick_warp.episodes import BakeSummary
     from synpick_warp.online.stream import ViewStream
-    from synpick_warp.progress import Progress
+    from synpick_warp.system.progress import Progress
 
 __version__ = "0.2.0"
 __all__ = [
@@ -63,7 +63,7 @@ def bake(
         splits: Only episodes of these splits of the settings, such as ("train",) of the preset "synpick"; empty: all.
         devices: Devices with a process each: GPUs such as ("cuda:0", "cuda:1"), or "cpu" once per process, or "all": every GPU, or
             without one a process per CPU core. The bytes are those of one device. Empty: `bake.device` alone.
-        progress: Receives stages, counts and notes; None: silent. See `synpick_warp.progress`.
+        progress: Receives stages, counts and notes; None: silent. See `synpick_warp.system.progress`.
 
     Returns:
         How every episode and attempt ended, and how long it took.
@@ -75,7 +75,7 @@ def bake(
     with collection_paused():
         from synpick_warp.configs.schema import Config
         from synpick_warp.pipeline import run_bake
-        from synpick_warp.progress import SilentProgress
+        from synpick_warp.system.progress import SilentProgress
 
     if not isinstance(config, Config):
         config = load_config(config, settings, splits=bool(splits))
@@ -134,7 +134,7 @@ def stream(
     with collection_paused():
         from synpick_warp.online.settings import resolve_settings
         from synpick_warp.online.stream import Selection, open_stream
-        from synpick_warp.progress import SilentProgress
+        from synpick_warp.system.progress import SilentProgress
 
     given = {"worlds": worlds, "device": device, "seed": seed, "mode": mode, "models": models, "lights": lights}
     given |= {"resolution": resolution, "layers": layers, "batch": batch}

@@ -5,7 +5,7 @@ from __future__ import annotations
 import gc
 import sys
 
-from synpick_warp.system.interrupt import KeptInterrupt
+from synpick_warp.system.processes.interrupt import KeptInterrupt
 
 
 def start() -> int:

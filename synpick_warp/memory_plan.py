@@ -50,8 +50,8 @@ from synpick_warp.stages.sim.step_log import record_kinds, record_sizes
 from synpick_warp.stages.sim.worlds import AttemptState, SealState, WorldState, WorldStatus, world_sizes
 from synpick_warp.stages.stream import REPORTED_SNAPSHOT, RING, view_sizes
 from synpick_warp.stages.tick_queue import queue_lead
-from synpick_warp.system.device import pick_device
-from synpick_warp.system.free_memory import free_device_memory, free_host_memory
+from synpick_warp.system.hardware.device import pick_device
+from synpick_warp.system.hardware.free_memory import free_device_memory, free_host_memory
 
 Row = tuple[str, tuple[int, ...], str, int]
 """Name, shape, unit and size [bytes] of an array."""

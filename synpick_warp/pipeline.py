@@ -24,7 +24,6 @@ from synpick_warp.exporters.registry import Exporters, Needs, aborting
 from synpick_warp.exporters.writing.pool import WriterPool
 from synpick_warp.factory.assembly import Factory, build_factory
 from synpick_warp.memory_plan import check_episodes, explain_shortage
-from synpick_warp.progress import Progress
 from synpick_warp.scenes.catalog import load_catalog
 from synpick_warp.scenes.lights import load_lights
 from synpick_warp.scheduling.devices import Share, bake_on_devices, prepare_folder
@@ -36,9 +35,10 @@ from synpick_warp.stages.launch import limit_threads
 from synpick_warp.stages.stream import TickReport, tick_batch
 from synpick_warp.stages.ticks import TickLoop
 from synpick_warp.stages.timing import scope
-from synpick_warp.system.cores import count_cores
-from synpick_warp.system.device import pick_devices
-from synpick_warp.system.interrupt import StopRequest
+from synpick_warp.system.hardware.cores import count_cores
+from synpick_warp.system.hardware.device import pick_devices
+from synpick_warp.system.processes.interrupt import StopRequest
+from synpick_warp.system.progress import Progress
 from synpick_warp.views.frames import EpisodeEnd, FrameBatch
 
 _DEVICE_PROGRAM = "from synpick_warp.pipeline import generate_share; from synpick_warp.scheduling.worker import main; main(generate_share)"

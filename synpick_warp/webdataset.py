@@ -12,7 +12,7 @@ from synpick_warp.dataset.annotations import MASK_SCHEMA, check_json
 from synpick_warp.dataset.records import MAX_INSTANCES
 from synpick_warp.dataset.view_files import check_run_lengths, decode_run_lengths
 from synpick_warp.errors import DatasetError
-from synpick_warp.inputs.image_files import decode_image
+from synpick_warp.system.inputs.image_files import decode_image
 from synpick_warp.views.layer_codec import decode_layer
 from synpick_warp.views.layers import LAYER_TABLE
 

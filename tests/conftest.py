@@ -10,7 +10,7 @@ import pytest
 import warp as wp
 from hypothesis import settings
 
-from synpick_warp.system.device import pick_device, start_warp
+from synpick_warp.system.hardware.device import pick_device, start_warp
 from tests.harness.devices import VARIABLE
 
 ROOT = Path(__file__).resolve().parent.parent

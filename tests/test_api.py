@@ -12,7 +12,7 @@ import pytest
 
 import synpick_warp
 from synpick_warp.configs.load import load_config
-from synpick_warp.progress import SilentProgress
+from synpick_warp.system.progress import SilentProgress
 
 ROOT = Path(__file__).resolve().parent.parent
 HEAVY = ("warp", "newton", "numpy", "cv2", "zarr", "pxr", "trimesh", "scipy", "coacd", "rich", "cyclopts")

@@ -39,7 +39,7 @@ from synpick_warp.stages.render.view_setup import GBUFFER, VIEW_BODIES, VIEWS
 from synpick_warp.stages.sim.physics import MIN_GPU_WORLDS
 from synpick_warp.stages.sim.worlds import AttemptState, SealState, WorldState, WorldStatus
 from synpick_warp.stages.stream import RING
-from synpick_warp.system.device import pick_device
+from synpick_warp.system.hardware.device import pick_device
 from tests.worlds.small_worlds import settings
 
 NAMES = (

@@ -21,9 +21,9 @@ from synpick_warp.exporters.bop.exporter import BopExporter
 from synpick_warp.exporters.writing.png import frame_depth_png
 from synpick_warp.factory import assembly
 from synpick_warp.pipeline import run_bake
-from synpick_warp.progress import SilentProgress
 from synpick_warp.stages import ticks, timing
 from synpick_warp.stages.ticks import TickLoop
+from synpick_warp.system.progress import SilentProgress
 from tests.twins.depth_png import encode_depth
 from tests.worlds.sights import SHORT
 from tests.worlds.small_worlds import QUICK, catalog, settings

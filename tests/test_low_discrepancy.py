@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from synpick_warp.low_discrepancy import r2_points, sample_triangles
+from synpick_warp.system.low_discrepancy import r2_points, sample_triangles
 
 
 def test_first_points_of_r2():

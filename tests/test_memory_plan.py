@@ -17,8 +17,8 @@ from synpick_warp.configs.schema import FAST, REFERENCE, UNOCCLUDED, Config, Phy
 from synpick_warp.errors import ConfigError, SynpickError
 from synpick_warp.factory import assembly
 from synpick_warp.memory_plan import check_memory, describe_memory, plan_memory
-from synpick_warp.progress import SilentProgress
-from synpick_warp.system.free_memory import free_host_memory
+from synpick_warp.system.hardware.free_memory import free_host_memory
+from synpick_warp.system.progress import SilentProgress
 from tests.harness.fuzz import fuzz_examples
 from tests.harness.kernel_files import write
 from tests.worlds.small_worlds import settings

@@ -19,7 +19,7 @@ import synpick_warp
 from synpick_warp.exporters.bop.exporter import BopExporter
 from synpick_warp.factory import assembly
 from synpick_warp.pipeline import run_bake
-from synpick_warp.progress import SilentProgress
+from synpick_warp.system.progress import SilentProgress
 from tests.harness.exporter_contract import export
 from tests.test_bake import tiny
 from tests.worlds import box_views

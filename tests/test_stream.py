@@ -14,7 +14,6 @@ import pytest
 import warp as wp
 
 from synpick_warp.arrays import allocate
-from synpick_warp.codecs.jpeg import encode_jpeg
 from synpick_warp.codes import Effect, Measure, Phase, Status
 from synpick_warp.configs.schema import LAYERS, Config
 from synpick_warp.exporters.writing.rle import find_run_boundaries, unpack_run_boundaries
@@ -36,6 +35,7 @@ from synpick_warp.stages.stream import (
     view_sizes,
     views_per_batch,
 )
+from synpick_warp.system.codecs.jpeg import encode_jpeg
 from synpick_warp.views.frames import FrameBatch
 from tests.twins.depth_png import encode_depth
 from tests.worlds.small_worlds import settings

@@ -11,8 +11,8 @@ from synpick_warp.cli.commands import main
 from synpick_warp.factory import assembly, warmup
 from synpick_warp.factory.compilation import launch_all
 from synpick_warp.newton_patches.narrow_phase import slow_builds
-from synpick_warp.progress import SilentProgress
-from synpick_warp.system.kernels import Compiler, DryLaunches, ModuleBuild
+from synpick_warp.system.hardware.kernels import Compiler, DryLaunches, ModuleBuild
+from synpick_warp.system.progress import SilentProgress
 from tests.worlds.small_worlds import catalog, settings
 
 

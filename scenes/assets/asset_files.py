@@ -19,8 +19,8 @@ from pathlib import Path
 import numpy as np
 
 from synpick_warp.errors import CatalogError, SynpickError
-from synpick_warp.inputs.files import read_file
-from synpick_warp.inputs.paths import MAX_NAME, path_inside
+from synpick_warp.system.inputs.files import read_file
+from synpick_warp.system.inputs.paths import MAX_NAME, path_inside
 
 MAX_MESH_FILE = 2**28
 """Largest binary mesh file [bytes]: 256 MiB, some 2 million triangles with their textures."""

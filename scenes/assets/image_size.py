@@ -7,8 +7,8 @@ import re
 
 from PIL import Image
 
-from synpick_warp.inputs.image_files import tiff_size
 from synpick_warp.scenes.assets.asset_files import quiet_decoding
+from synpick_warp.system.inputs.image_files import tiff_size
 
 MAX_HEADER = 2**16
 """Longest header of a Radiance file [bytes]."""

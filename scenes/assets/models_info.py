@@ -13,7 +13,7 @@ import msgspec
 import numpy as np
 
 from synpick_warp.errors import CatalogError
-from synpick_warp.inputs.json import read_json
+from synpick_warp.system.inputs.json import read_json
 
 MAX_OBJ_ID = 2**31 - 1
 """Largest obj_id: data sets keep them in 32 bits."""

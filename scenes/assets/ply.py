@@ -12,13 +12,13 @@ import numpy as np
 from trimesh.exchange.ply import load_ply
 
 from synpick_warp.errors import CatalogError
-from synpick_warp.inputs.files import read_file
 from synpick_warp.scenes.assets.appearance import MAX_TEXTURE_FILE, FileMaterial, decode_texture
 from synpick_warp.scenes.assets.asset_files import MAX_MESH_FILE, MAX_ROWS, MAX_TEXT_MESH, describe_error, quiet_decoding, read_referred
 from synpick_warp.scenes.assets.mesh_parts import NO_MATERIAL, WHITE, MeshPart, Notes
 from synpick_warp.scenes.assets.ply_binary import read_binary
 from synpick_warp.scenes.assets.polygons import clip_ears, find_concave
 from synpick_warp.scenes.assets.text import decode_text
+from synpick_warp.system.inputs.files import read_file
 
 MAX_HEADER = 2**16
 """Longest header [bytes]; models have less than 1 kB."""

@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 
 from synpick_warp.errors import CatalogError
-from synpick_warp.inputs.files import read_file
 from synpick_warp.scenes.assets.asset_files import MAX_MESH_FILE, MAX_ROWS, MAX_TEXT_MESH
 from synpick_warp.scenes.assets.mesh_parts import NO_MATERIAL, MeshPart, Notes
 from synpick_warp.scenes.assets.text import decode_text
+from synpick_warp.system.inputs.files import read_file
 
 _HEADER = 84
 _SAMPLE = 4096

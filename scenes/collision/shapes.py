@@ -14,15 +14,15 @@ import numpy as np
 
 from synpick_warp.configs.schema import Objects
 from synpick_warp.errors import CatalogError, SynpickError
-from synpick_warp.inputs.files import check_regular_file
 from synpick_warp.scenes.collision.decomposition import ShapeRecipe, decompose
 from synpick_warp.scenes.collision.embedded_shapes import embedded_shape, pack_pieces, unpack_pieces
 from synpick_warp.scenes.collision.hulls import hull_volume
 from synpick_warp.scenes.collision.simplification import simplify_hull
 from synpick_warp.scenes.types import ConvexPiece, Shape, TriangleMesh
-from synpick_warp.system.caches import USER_VARIABLE, user_cache
 from synpick_warp.system.folders import make_folder
-from synpick_warp.system.isolation import Failure, Limits, run_isolated
+from synpick_warp.system.hardware.caches import USER_VARIABLE, user_cache
+from synpick_warp.system.inputs.files import check_regular_file
+from synpick_warp.system.processes.isolation import Failure, Limits, run_isolated
 
 MAX_CACHE_FILE = 2**26
 """Largest cache file [bytes]: 64 MiB; a decomposition has some 10 kB."""

@@ -39,8 +39,8 @@ from synpick_warp.configs.schema import Config
 from synpick_warp.configs.splits import DataLayout
 from synpick_warp.configs.write import config_to_toml
 from synpick_warp.errors import CatalogError, ConfigError, LightError, SynpickError
-from synpick_warp.system.garbage import collection_paused
-from synpick_warp.system.interrupt import KeptInterrupt
+from synpick_warp.system.processes.garbage import collection_paused
+from synpick_warp.system.processes.interrupt import KeptInterrupt
 
 NAME = "synpick-warp"
 EXIT_MISTAKE = 2
@@ -354,7 +354,7 @@ def _bake(config: Config, out: Path, shard: tuple[int, int], splits: Sequence[st
     with collection_paused():
         from synpick_warp.cli.display import make_console, make_progress, print_summary
         from synpick_warp.exporters.writing.files import check_output_folder
-        from synpick_warp.system.device import pick_device, pick_devices
+        from synpick_warp.system.hardware.device import pick_device, pick_devices
 
     if devices:
         pick_devices(devices)

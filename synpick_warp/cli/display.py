@@ -14,7 +14,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeElapsed
 from rich.progress import Progress as Bar
 from rich.table import Table
 
-from synpick_warp.progress import Progress
+from synpick_warp.system.progress import Progress
 
 if TYPE_CHECKING:
     from synpick_warp.codes import Ending, Outcome

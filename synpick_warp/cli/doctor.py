@@ -17,10 +17,10 @@ from synpick_warp.configs.schema import Config
 from synpick_warp.configs.splits import DataLayout
 from synpick_warp.errors import DeviceError
 from synpick_warp.scenes.collision.shapes import default_cache_dir
-from synpick_warp.system.caches import KERNEL_VARIABLE, USER_VARIABLE, find_fault
-from synpick_warp.system.cores import count_cores
-from synpick_warp.system.device import pick_device
-from synpick_warp.system.green_contexts import SmPartition, count_reserved
+from synpick_warp.system.hardware.caches import KERNEL_VARIABLE, USER_VARIABLE, find_fault
+from synpick_warp.system.hardware.cores import count_cores
+from synpick_warp.system.hardware.device import pick_device
+from synpick_warp.system.hardware.green_contexts import SmPartition, count_reserved
 
 _PACKAGES = ("warp-lang", "newton", "numpy")
 MIB = 1024**2

@@ -190,7 +190,7 @@ def draw_failure_sheets(data_set: DataSet, truth: Truth, methods: Sequence[Metho
     from synpick_warp.estimation.models import read_object_models
     from synpick_warp.evaluation.figures import file_names
     from synpick_warp.exporters.writing.png import encode_png
-    from synpick_warp.system.device import pick_device
+    from synpick_warp.system.hardware.device import pick_device
 
     by_name = {each.name: each for each in scores}
     pictures, objects = {}, object_names(data_set)

@@ -49,7 +49,7 @@ def show_statistics(
     from synpick_warp.dataset.reading import open_data_set
     from synpick_warp.statistics.collect import collect
     from synpick_warp.statistics.compute import assemble
-    from synpick_warp.system.cores import count_cores
+    from synpick_warp.system.hardware.cores import count_cores
 
     data_set = open_data_set(folder)
     if data_set.found is None and not (folder / "config.toml").exists():

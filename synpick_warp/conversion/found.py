@@ -13,7 +13,6 @@ from collections.abc import Iterator, Sequence
 from functools import cached_property
 from pathlib import Path
 
-from synpick_warp.codecs.jpeg import encode_jpeg
 from synpick_warp.codes import Ending
 from synpick_warp.configs.load import load_config
 from synpick_warp.configs.schema import Config
@@ -35,12 +34,13 @@ from synpick_warp.exporters.writing.notes import CAMERA_FILE, NOTES_FILE
 from synpick_warp.exporters.writing.png import encode_png
 from synpick_warp.exporters.writing.pool import WriterPool
 from synpick_warp.exporters.writing.rle import Masks, Runs
-from synpick_warp.inputs.image_files import MAX_IMAGE_FILE, TEXTURE_KINDS
-from synpick_warp.progress import Report
 from synpick_warp.scenes.cameras import make_cameras
 from synpick_warp.scenes.types import Catalog
-from synpick_warp.system.cores import count_cores
+from synpick_warp.system.codecs.jpeg import encode_jpeg
 from synpick_warp.system.folders import make_folder
+from synpick_warp.system.hardware.cores import count_cores
+from synpick_warp.system.inputs.image_files import MAX_IMAGE_FILE, TEXTURE_KINDS
+from synpick_warp.system.progress import Report
 from synpick_warp.views.frames import EpisodeEnd
 
 _IMAGES = {"views", "masks"}

@@ -18,8 +18,8 @@ from synpick_warp.errors import ConfigError, DatasetError
 from synpick_warp.exporters.formats import FORMAT_TABLE, Content, contents_of, convertible
 from synpick_warp.exporters.registry import Exporters, load_exporter_classes
 from synpick_warp.exporters.writing.pool import WriterPool
-from synpick_warp.progress import Report
-from synpick_warp.system.cores import count_cores
+from synpick_warp.system.hardware.cores import count_cores
+from synpick_warp.system.progress import Report
 from synpick_warp.views.frames import EpisodeEnd
 
 AHEAD = 2

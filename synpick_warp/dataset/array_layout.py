@@ -16,7 +16,7 @@ from msgspec import Meta, Struct
 from synpick_warp.dataset.annotations import ADVICE
 from synpick_warp.errors import DatasetError
 from synpick_warp.exporters.trajectory.arrays import LABELS, ArraySpec
-from synpick_warp.inputs.files import describe_bytes
+from synpick_warp.system.inputs.files import describe_bytes
 
 if TYPE_CHECKING:
     import numpy as np

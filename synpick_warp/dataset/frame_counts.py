@@ -14,7 +14,7 @@ from synpick_warp.dataset.annotations import ADVICE
 from synpick_warp.errors import DatasetError
 from synpick_warp.exporters.formats import part_files
 from synpick_warp.exporters.trajectory.arrays import EPISODES, STORE
-from synpick_warp.inputs.files import describe_bytes
+from synpick_warp.system.inputs.files import describe_bytes
 
 if TYPE_CHECKING:
     from synpick_warp.configs.splits import DataLayout

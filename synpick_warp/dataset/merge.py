@@ -42,7 +42,7 @@ from synpick_warp.exporters.registry import Needs, shared_files
 from synpick_warp.exporters.writing.checksums import open_regular
 from synpick_warp.exporters.writing.files import MANIFEST_FILE, check_output_folder, output_error, write_atomically
 from synpick_warp.exporters.writing.pool import WriterPool
-from synpick_warp.system.cores import count_cores
+from synpick_warp.system.hardware.cores import count_cores
 
 MAX_EPISODES = 10_000_000
 """Most episodes of a merged data set: its missing ones are listed."""

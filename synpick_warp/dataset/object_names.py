@@ -9,7 +9,7 @@ from synpick_warp.configs.schema import Config
 from synpick_warp.dataset.annotations import Key, ModelDiameter, read_checked
 from synpick_warp.dataset.bop.models import INFO, models_folder
 from synpick_warp.errors import DatasetError
-from synpick_warp.inputs.files import check_regular_file
+from synpick_warp.system.inputs.files import check_regular_file
 
 _MODEL_NAME = re.compile(rb"^comment (.+), millimetres\r?$", re.MULTILINE)
 """Comment in a PLY file that the BOP exporter wrote: the object's name."""

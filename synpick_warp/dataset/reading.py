@@ -38,8 +38,8 @@ from synpick_warp.dataset.trajectory import (
 from synpick_warp.errors import DatasetError
 from synpick_warp.exporters.formats import PartFiles, part_files
 from synpick_warp.exporters.trajectory.arrays import EPISODE_GROUPS, EPISODES, STORE
-from synpick_warp.inputs.json import decode_json
-from synpick_warp.inputs.paths import path_inside
+from synpick_warp.system.inputs.json import decode_json
+from synpick_warp.system.inputs.paths import path_inside
 
 if TYPE_CHECKING:
     from synpick_warp.configs.schema import Config

@@ -13,8 +13,8 @@ import msgspec
 from synpick_warp.codes import Ending, Mode, Outcome, names
 from synpick_warp.dataset.annotations import Index, Side
 from synpick_warp.errors import DatasetError
-from synpick_warp.inputs.files import read_file
-from synpick_warp.inputs.json import MAX_JSON, decode_json
+from synpick_warp.system.inputs.files import read_file
+from synpick_warp.system.inputs.json import MAX_JSON, decode_json
 
 Number = Annotated[int, msgspec.Meta(ge=-(2**31), le=2**31 - 1)]
 """32-bit integer."""

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 from synpick_warp.configs.splits import DataLayout
 from synpick_warp.dataset.manifest import CONFIG_FILE
 from synpick_warp.errors import DatasetError
-from synpick_warp.inputs.paths import path_inside
+from synpick_warp.system.inputs.paths import path_inside
 
 if TYPE_CHECKING:
     from synpick_warp.configs.schema import Config

@@ -21,7 +21,7 @@ from zarr.codecs import ShardingCodec, ZstdCodec
 
 from synpick_warp.dataset.annotations import ADVICE
 from synpick_warp.errors import DatasetError
-from synpick_warp.system.threads import ZARR_THREADS
+from synpick_warp.system.processes.threads import ZARR_THREADS
 
 zarr.config.set(ZARR_THREADS)
 

@@ -14,8 +14,8 @@ from synpick_warp.dataset.annotations import ADVICE, check_content
 from synpick_warp.dataset.array_layout import MAX_STEPS_PER_TICK, ArrayMetadata, check_layout
 from synpick_warp.errors import DatasetError
 from synpick_warp.exporters.trajectory.arrays import CAMERAS, OBJECTS, GroupSpec
-from synpick_warp.inputs.files import check_regular_file, read_file
-from synpick_warp.inputs.json import decode_json
+from synpick_warp.system.inputs.files import check_regular_file, read_file
+from synpick_warp.system.inputs.json import decode_json
 
 if TYPE_CHECKING:
     import numpy as np

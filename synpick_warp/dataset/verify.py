@@ -27,9 +27,9 @@ from synpick_warp.dataset.manifest import (
 )
 from synpick_warp.errors import ConfigError, DatasetError
 from synpick_warp.exporters.writing.checksums import checksum
-from synpick_warp.progress import Report
-from synpick_warp.system.cores import count_cores
-from synpick_warp.system.pool import WorkerProgram, map_ordered
+from synpick_warp.system.hardware.cores import count_cores
+from synpick_warp.system.processes.pool import WorkerProgram, map_ordered
+from synpick_warp.system.progress import Report
 
 _FILES_PER_PROCESS, _BYTES_PER_PROCESS = 10_000, 1 << 28
 """Minimum amount of work per worker process, in files and in bytes; one of the two suffices. On a Xeon with cached files either takes about

@@ -29,10 +29,10 @@ from synpick_warp.dataset.bop.images import COLOR, FolderImages, KeyedImages
 from synpick_warp.dataset.bop.layout import SceneRef
 from synpick_warp.dataset.bop.measured import UNKNOWN, measure_info
 from synpick_warp.errors import DatasetError
-from synpick_warp.inputs.files import read_file_if_present
-from synpick_warp.inputs.image_files import MAX_IMAGE_FILE, decode_image, decode_picture, image_size, tiff_size
-from synpick_warp.inputs.json import MAX_JSON
-from synpick_warp.inputs.png_crop import decode_grey_crop
+from synpick_warp.system.inputs.files import read_file_if_present
+from synpick_warp.system.inputs.image_files import MAX_IMAGE_FILE, decode_image, decode_picture, image_size, tiff_size
+from synpick_warp.system.inputs.json import MAX_JSON
+from synpick_warp.system.inputs.png_crop import decode_grey_crop
 
 SUFFIXES = (".png", ".jpg")
 """File formats of images; colour may be either."""

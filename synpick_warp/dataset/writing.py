@@ -56,9 +56,9 @@ from synpick_warp.exporters.writing.files import (
     write_atomically,
 )
 from synpick_warp.exporters.writing.pool import WriterPool
-from synpick_warp.inputs.files import check_regular_file
-from synpick_warp.inputs.toml import MAX_TOML
 from synpick_warp.system.folders import make_folder
+from synpick_warp.system.inputs.files import check_regular_file
+from synpick_warp.system.inputs.toml import MAX_TOML
 from synpick_warp.views.frames import EpisodeEnd
 
 LOCK_TIMEOUT = 20.0

@@ -15,9 +15,9 @@ from synpick_warp.dataset.reading import DataSet
 from synpick_warp.estimation.decoding import DecodeJob
 from synpick_warp.estimation.scenes import Scene, ScenePlan, read_scene
 from synpick_warp.stages.pose.batch import RgbdBatch
-from synpick_warp.system.pool import TaskFuture, WorkerPool, WorkerProgram
-from synpick_warp.system.processes import ProcessError
-from synpick_warp.system.shared_memory import allocate_shared_memory
+from synpick_warp.system.processes.pool import TaskFuture, WorkerPool, WorkerProgram
+from synpick_warp.system.processes.shared_memory import allocate_shared_memory
+from synpick_warp.system.processes.worker import ProcessError
 
 _ENVIRONMENT = {"MALLOC_TRIM_THRESHOLD_": str(64 << 20), "MALLOC_MMAP_THRESHOLD_": str(32 << 20)}
 """glibc's allocator keeps the memory of freed images up to these sizes [B] (mallopt(3)). Otherwise the kernel takes it back, and clears it

@@ -14,7 +14,7 @@ from synpick_warp.errors import DatasetError
 from synpick_warp.estimation.mask_errors import disturb_labels
 from synpick_warp.estimation.scenes import ABSENT, Scene
 from synpick_warp.stages.pose.batch import RgbdBatch
-from synpick_warp.system.shared_memory import SharedArray, shared_bytes
+from synpick_warp.system.processes.shared_memory import SharedArray, shared_bytes
 
 _MARGIN = 2
 """Pixels around a visible box that are searched for its mask: conventions of boxes differ by one."""

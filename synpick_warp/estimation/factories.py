@@ -34,7 +34,7 @@ def make_factory(
 
         return lambda instances, height, width: GicpEstimator(models, instances, threads)
     from synpick_warp.stages.pose.estimator import EstimatorModels, PoseEstimator, PoseSettings
-    from synpick_warp.system.device import pick_device
+    from synpick_warp.system.hardware.device import pick_device
 
     shared = EstimatorModels(models, PoseSettings(color=color, depth_noise=depth_noise), pick_device(device))
     return lambda instances, height, width: PoseEstimator(shared, instances, height, width)

@@ -12,7 +12,6 @@ from PIL import Image as PillowImage
 from PIL import ImageDraw, ImageFont
 from scipy.spatial.transform import Rotation
 
-from synpick_warp.codecs.charts import INK, SOFT, printable
 from synpick_warp.dataset.reading import DataSet
 from synpick_warp.dataset.view import View
 from synpick_warp.evaluation.auc import LIMIT
@@ -23,6 +22,7 @@ from synpick_warp.scenes.types import Camera
 from synpick_warp.stages.pose.batch import ObjectModel
 from synpick_warp.stages.pose.render import object_scene, render_object
 from synpick_warp.stages.render.scene import build_meshes
+from synpick_warp.system.codecs.charts import INK, SOFT, printable
 
 Color = tuple[int, int, int]
 """Red, green, blue."""

@@ -16,7 +16,7 @@ from synpick_warp.scenes.assets.models_info import ModelInfo
 from synpick_warp.scenes.catalog import READ_LIMITS
 from synpick_warp.scenes.types import Material, TriangleMesh
 from synpick_warp.stages.pose.batch import ObjectModel
-from synpick_warp.system.isolation import Failure, run_isolated
+from synpick_warp.system.processes.isolation import Failure, run_isolated
 
 _MILLIMETRE = 1e-3
 _METALLIC, _ROUGHNESS = 0.0, 0.5

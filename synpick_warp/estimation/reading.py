@@ -19,7 +19,7 @@ from synpick_warp.estimation.decoder_pool import DecoderPool, DecodeViews, open_
 from synpick_warp.estimation.decoding import DecodeJob
 from synpick_warp.estimation.scenes import Scene
 from synpick_warp.stages.pose.batch import RgbdBatch
-from synpick_warp.system.pool import TaskFuture
+from synpick_warp.system.processes.pool import TaskFuture
 
 AHEAD = 2
 """Steps that are decoded ahead of the one in use."""

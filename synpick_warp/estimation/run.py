@@ -16,10 +16,10 @@ from synpick_warp.estimation.reading import AHEAD, BYTES_PER_PIXEL, DEPTHS, Scen
 from synpick_warp.estimation.scenes import Scene, ScenePlan, group_scenes, read_scene
 from synpick_warp.evaluation.poses import PoseTable
 from synpick_warp.evaluation.targets import Target, TargetList, count_targets
-from synpick_warp.progress import Report
 from synpick_warp.stages.pose.batch import Estimates
-from synpick_warp.system.cores import count_cores
-from synpick_warp.system.free_memory import free_host_memory
+from synpick_warp.system.hardware.cores import count_cores
+from synpick_warp.system.hardware.free_memory import free_host_memory
+from synpick_warp.system.progress import Report
 
 MAX_VIEWS = 128
 """Views that are estimated at a time, if their number is left open: enough to fill a GPU."""

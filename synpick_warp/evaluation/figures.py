@@ -13,7 +13,6 @@ from pathlib import Path
 
 import numpy as np
 
-from synpick_warp.codecs.charts import Spec, render_charts
 from synpick_warp.errors import ConfigError, OutputError
 from synpick_warp.evaluation.models import Model
 from synpick_warp.evaluation.plots import plot_error_by_speed, plot_error_by_visibility, plot_recall, plot_sweep, plot_trajectory
@@ -24,6 +23,7 @@ from synpick_warp.evaluation.tracking.sweep import AlphaSweep, split_by_mode, sw
 from synpick_warp.evaluation.tracking.tracks import find_tracks, track_of_instance
 from synpick_warp.evaluation.truth import Truth
 from synpick_warp.exporters.writing.files import output_error, write_atomically
+from synpick_warp.system.codecs.charts import Spec, render_charts
 from synpick_warp.system.folders import make_folder
 
 Track = tuple[int, int]

@@ -10,7 +10,7 @@ from scipy.spatial import KDTree
 
 from synpick_warp.evaluation.auc import LIMIT
 from synpick_warp.stages.pose.nearest import NearestVertices
-from synpick_warp.system.device import pick_device
+from synpick_warp.system.hardware.device import pick_device
 
 MANY = 2**22
 """Queries from which on the subdivision pays for being built: as many take the k-d tree some two seconds."""

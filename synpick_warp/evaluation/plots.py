@@ -10,11 +10,11 @@ from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 
-from synpick_warp.codecs.charts import INK, PALETTE, SOFT, Legend, Spec, axis, chart, line, panel, points
 from synpick_warp.errors import DatasetError
 from synpick_warp.evaluation.auc import LIMIT
 from synpick_warp.evaluation.poses import PoseTable
 from synpick_warp.evaluation.tracking.sweep import AlphaSweep
+from synpick_warp.system.codecs.charts import INK, PALETTE, SOFT, Legend, Spec, axis, chart, line, panel, points
 
 _CENTIMETERS = 100.0
 _RAW = "#aab2bc"

@@ -18,7 +18,7 @@ from synpick_warp.errors import OutputError, ResultError
 from synpick_warp.evaluation.poses import PoseTable
 from synpick_warp.evaluation.truth import Truth
 from synpick_warp.exporters.writing.files import output_error, write_atomically
-from synpick_warp.inputs.files import read_file
+from synpick_warp.system.inputs.files import read_file
 
 HEADER = "scene_id,im_id,obj_id,score,R,t,time"
 FORMAT = f"{HEADER}, with 9 numbers in R and 3 in t [mm], separated by spaces"

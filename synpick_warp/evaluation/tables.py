@@ -15,10 +15,10 @@ from itertools import pairwise
 
 import numpy as np
 
-from synpick_warp.codecs.tables import Column, Table, to_csv, to_latex, to_text
 from synpick_warp.evaluation.auc import CONVENTIONS, LIMIT, band_indices, error_bands, recall_curve
 from synpick_warp.evaluation.scoring import METRICS, Scores
 from synpick_warp.evaluation.truth import Truth
+from synpick_warp.system.codecs.tables import Column, Table, to_csv, to_latex, to_text
 
 FORMATS = ("text", "latex", "csv", "json")
 GROUPS = ("object", "mode", "camera", "visibility", "speed")

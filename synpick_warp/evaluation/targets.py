@@ -17,7 +17,7 @@ from synpick_warp.configs.check import format_value
 from synpick_warp.dataset.annotations import TargetEntry
 from synpick_warp.errors import ResultError
 from synpick_warp.evaluation.truth import Truth
-from synpick_warp.inputs.json import read_json
+from synpick_warp.system.inputs.json import read_json
 
 _FORMAT = "a target list has objects with scene_id, im_id, obj_id and inst_count, as BOP's test_targets_bop19.json"
 

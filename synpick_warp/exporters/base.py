@@ -10,14 +10,14 @@ from typing import Any, ClassVar, NamedTuple, Protocol
 
 import numpy as np
 
-from synpick_warp.codecs.depth_png import max_data_bytes
 from synpick_warp.configs.schema import Config
 from synpick_warp.configs.splits import DataLayout
 from synpick_warp.exporters.writing.folder import Buffer
 from synpick_warp.exporters.writing.pool import WriterPool
 from synpick_warp.exporters.writing.rle import Masks
 from synpick_warp.scenes.types import Camera, Catalog, EnvironmentMap
-from synpick_warp.system.shared_memory import shared_bytes
+from synpick_warp.system.codecs.depth_png import max_data_bytes
+from synpick_warp.system.processes.shared_memory import shared_bytes
 from synpick_warp.views.frames import EpisodeEnd, FrameBatch, TickBatch
 
 PIXEL_BYTES = (3, 2, 1, 4)

@@ -23,7 +23,7 @@ from typing import Literal, NamedTuple
 
 from synpick_warp.configs.schema import Bop
 from synpick_warp.configs.splits import DataLayout
-from synpick_warp.inputs.image_files import TEXTURE_KINDS
+from synpick_warp.system.inputs.image_files import TEXTURE_KINDS
 
 Content = Literal["views", "masks", "poses", "gripper"]
 """Content of a stored data set: images with annotations, their masks, poses of a trajectory, states and commands of the gripper."""

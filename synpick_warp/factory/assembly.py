@@ -19,7 +19,6 @@ from synpick_warp.configs.splits import DataLayout
 from synpick_warp.exporters.registry import Needs
 from synpick_warp.factory.compilation import is_cache_warm, make_compiler, sole_compiler, submit_launches, submit_slow
 from synpick_warp.memory_plan import check_memory
-from synpick_warp.progress import Progress, SilentProgress
 from synpick_warp.scenes.build import find_repeat_rules, with_capacities, with_repeats
 from synpick_warp.scenes.cameras import make_cameras
 from synpick_warp.scenes.catalog import load_catalog
@@ -33,8 +32,9 @@ from synpick_warp.stages.render.renderer import Renderer
 from synpick_warp.stages.render.scene import RenderScene, build_render_scene
 from synpick_warp.stages.sim.simulate import Simulation
 from synpick_warp.stages.stream import FrameStream, LightTable, name_lights, view_sizes
-from synpick_warp.system.device import pick_device
-from synpick_warp.system.garbage import collection_paused
+from synpick_warp.system.hardware.device import pick_device
+from synpick_warp.system.processes.garbage import collection_paused
+from synpick_warp.system.progress import Progress, SilentProgress
 
 
 @dataclass(frozen=True, eq=False)

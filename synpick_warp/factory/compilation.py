@@ -10,10 +10,10 @@ from synpick_warp.codes import Status
 from synpick_warp.kernels.render.visibility.wide_bvh import read_binary_bvh_kernel
 from synpick_warp.kernels.sim.snapshot import take_snapshot_kernel
 from synpick_warp.newton_patches.narrow_phase import slow_builds
-from synpick_warp.progress import Progress
 from synpick_warp.stages.sim.simulate import Simulation
 from synpick_warp.stages.stream import FrameStream, TickReader
-from synpick_warp.system.kernels import Compiler, DryLaunches, build_of, compilation_lock
+from synpick_warp.system.hardware.kernels import Compiler, DryLaunches, build_of, compilation_lock
+from synpick_warp.system.progress import Progress
 
 
 def is_cache_warm(device: wp.Device) -> bool:

@@ -15,11 +15,11 @@ from synpick_warp.exporters.registry import Needs
 from synpick_warp.factory.assembly import build_smallest
 from synpick_warp.factory.compilation import launch_all, make_compiler, sole_compiler, submit_launches, submit_slow
 from synpick_warp.kernels.render.images.ground_truth import gather_cameras_kernel
-from synpick_warp.progress import Progress
 from synpick_warp.scenes.collision.shapes import default_cache_dir
-from synpick_warp.system.caches import KERNEL_VARIABLE, USER_VARIABLE, CacheError, find_fault, kernel_cache, user_cache
-from synpick_warp.system.device import pick_device
-from synpick_warp.system.kernels import build_of, list_binaries
+from synpick_warp.system.hardware.caches import KERNEL_VARIABLE, USER_VARIABLE, CacheError, find_fault, kernel_cache, user_cache
+from synpick_warp.system.hardware.device import pick_device
+from synpick_warp.system.hardware.kernels import build_of, list_binaries
+from synpick_warp.system.progress import Progress
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@ from newton._src.sim import collide
 from newton._src.sim import model as newton_model
 from newton._src.solvers.steel import solver_steel  # noqa: F401  (Newton imports it late, and its modules are split below.)
 
-from synpick_warp.system.kernels import ModuleBuild, split_modules
+from synpick_warp.system.hardware.kernels import ModuleBuild, split_modules
 
 # Of the kernels in these modules of Newton, a bake launches a fifth.
 split_modules(("newton._src.geometry.", "newton._src.sim.", "newton._src.solvers.solver", "newton._src.solvers.steel."))

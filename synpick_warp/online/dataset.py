@@ -24,9 +24,9 @@ from synpick_warp.errors import ConfigError
 from synpick_warp.online.selection import Selection, choose_episodes
 from synpick_warp.online.settings import ARGUMENTS, resolve_settings
 from synpick_warp.online.stream import open_stream
-from synpick_warp.progress import SilentProgress
 from synpick_warp.stages.online.batches import ViewBatch
-from synpick_warp.system.device import pick_device
+from synpick_warp.system.hardware.device import pick_device
+from synpick_warp.system.progress import SilentProgress
 
 Sample = dict[str, Any]
 ALL, VISIBLE = 0, 2

@@ -25,14 +25,14 @@ from synpick_warp.errors import ConfigError
 from synpick_warp.factory.assembly import Stages, build_stages, compiling_if_cold
 from synpick_warp.memory_plan import check_episodes, check_memory, explain_shortage
 from synpick_warp.online.selection import Selection, choose_episodes
-from synpick_warp.progress import Progress
 from synpick_warp.scheduling.sizes import fit_to_device
 from synpick_warp.stages.buffers import Snapshot
 from synpick_warp.stages.online.batches import BatchRing, ViewBatch
 from synpick_warp.stages.render.view_setup import pair_views
 from synpick_warp.stages.stream import TickReport, describe_views
 from synpick_warp.stages.ticks import TickLoop
-from synpick_warp.system.device import pick_device
+from synpick_warp.system.hardware.device import pick_device
+from synpick_warp.system.progress import Progress
 
 DEVICE_ONLY = 0
 """Writer processes in the memory plan of a stream: none, as views stay on the device."""

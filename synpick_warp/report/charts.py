@@ -7,8 +7,6 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from synpick_warp.codecs.charts import Spec, limit
-from synpick_warp.codecs.charts import field as _field
 from synpick_warp.configs.schema import Config
 from synpick_warp.report.sampling import Brightness
 from synpick_warp.statistics import ObjectStatistics, Statistics
@@ -17,6 +15,8 @@ from synpick_warp.statistics.attempts import FORCE_BIN
 from synpick_warp.statistics.coverage import BANDS, MIN_VISIBILITY, SECTORS
 from synpick_warp.statistics.lights import EXPOSURE_BIN
 from synpick_warp.statistics.timeline import TIME_BIN
+from synpick_warp.system.codecs.charts import Spec, limit
+from synpick_warp.system.codecs.charts import field as _field
 
 MODES = ("pick", "target", "move")
 """Order of the modes in legends and stacks."""

@@ -15,7 +15,6 @@ from synpick_warp.dataset.reading import DataSet
 from synpick_warp.dataset.view import View
 from synpick_warp.errors import DatasetError, OutputError
 from synpick_warp.exporters.writing.files import output_error
-from synpick_warp.progress import Report
 from synpick_warp.report.album import Album
 from synpick_warp.report.charts import Source, make_charts
 from synpick_warp.report.explained import choose_attempts, make_attempt
@@ -36,6 +35,7 @@ from synpick_warp.report.strips import choose_episodes, make_strip
 from synpick_warp.report.tables import findings_list, settings_tables, statistics_tables, tiles
 from synpick_warp.statistics import Statistics, compute_statistics
 from synpick_warp.system.folders import make_folder
+from synpick_warp.system.progress import Report
 from synpick_warp.viz.depth_colors import tote_scale
 
 SUFFIXES = (".html", ".htm")

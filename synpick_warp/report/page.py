@@ -9,11 +9,11 @@ from pathlib import Path
 from string import Template
 from typing import Any
 
-from synpick_warp.codecs.charts import ChartError, read_bundle
 from synpick_warp.report.album import Album
 from synpick_warp.report.charts import Chart
 from synpick_warp.report.findings import NOTE, WARNING, Finding, count_levels
 from synpick_warp.report.markup import Html, content_hash, element, embed_json, join
+from synpick_warp.system.codecs.charts import ChartError, read_bundle
 
 FOLDER = Path(__file__).parent / "page"
 SCRIPTS = ("base.js", "frames.js", "strips.js", "attempts.js", "charts.js")

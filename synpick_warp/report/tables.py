@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 
-from synpick_warp.codecs.tables import Table
 from synpick_warp.codes import Outcome
 from synpick_warp.configs.load import load_config, sections, settings_of
 from synpick_warp.configs.schema import Config
@@ -13,6 +12,7 @@ from synpick_warp.report.findings import WARNING, Finding
 from synpick_warp.report.markup import Html, element, join
 from synpick_warp.statistics import Statistics
 from synpick_warp.statistics.tables import make_tables
+from synpick_warp.system.codecs.tables import Table
 
 SHOWN_TABLES = ("groups", "paper", "attempts", "depth")
 """Tables of `statistics.tables` that are shown as they are."""

@@ -33,7 +33,6 @@ from synpick_warp.errors import DeviceError
 from synpick_warp.exporters.base import ExportContext
 from synpick_warp.exporters.registry import Exporters, Needs, aborting
 from synpick_warp.exporters.writing.pool import WriterPool
-from synpick_warp.progress import Progress
 from synpick_warp.scenes.build import with_repeats
 from synpick_warp.scenes.cameras import make_cameras
 from synpick_warp.scenes.catalog import load_catalog
@@ -41,11 +40,12 @@ from synpick_warp.scenes.lights import load_lights
 from synpick_warp.scenes.types import Catalog, EnvironmentMap
 from synpick_warp.scheduling.order import deal_episodes, deal_writers, order_longest_first
 from synpick_warp.scheduling.sizes import count_writers
-from synpick_warp.system.caches import KERNEL_VARIABLE
 from synpick_warp.system.descriptors import duplicate_above_streams, open_standard_descriptors
-from synpick_warp.system.device import describe_kinds, pick_device
-from synpick_warp.system.interrupt import StopRequest
-from synpick_warp.system.processes import END_TIMEOUT, WorkerProcess, send, start_process
+from synpick_warp.system.hardware.caches import KERNEL_VARIABLE
+from synpick_warp.system.hardware.device import describe_kinds, pick_device
+from synpick_warp.system.processes.interrupt import StopRequest
+from synpick_warp.system.processes.worker import END_TIMEOUT, WorkerProcess, send, start_process
+from synpick_warp.system.progress import Progress
 
 _INTERVAL = 0.1
 """Polling interval of the stop request, at most [s]."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 
 from synpick_warp.episodes import BakeSummary
-from synpick_warp.progress import Progress
+from synpick_warp.system.progress import Progress
 
 
 class ThroughputMeter:

@@ -17,8 +17,8 @@ from synpick_warp.memory_plan import Term, free_memory, plan_memory
 from synpick_warp.stages.perception.images import count_views
 from synpick_warp.stages.sim.physics import MIN_GPU_WORLDS, with_enough_worlds
 from synpick_warp.stages.stream import views_per_batch
-from synpick_warp.system.cores import count_cores
-from synpick_warp.system.device import ALL, pick_device, pick_devices
+from synpick_warp.system.hardware.cores import count_cores
+from synpick_warp.system.hardware.device import ALL, pick_device, pick_devices
 
 HEADROOM = 1.5
 """Safety factor on the memory plan, which is a lower bound. Bakes on a CPU take 0.6 to 0.7 GiB beyond it."""

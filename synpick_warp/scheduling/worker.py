@@ -14,8 +14,8 @@ from types import FrameType, TracebackType
 from typing import TYPE_CHECKING, Self
 
 from synpick_warp.errors import SynpickError
-from synpick_warp.system.processes import send
-from synpick_warp.system.threads import LINK
+from synpick_warp.system.processes.threads import LINK
+from synpick_warp.system.processes.worker import send
 
 if TYPE_CHECKING:
     from synpick_warp.episodes import BakeSummary

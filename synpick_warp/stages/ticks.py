@@ -19,7 +19,7 @@ from synpick_warp.stages.sim.simulate import Simulation
 from synpick_warp.stages.stream import TickReport
 from synpick_warp.stages.tick_queue import TickQueue, queue_lead, record_bytes
 from synpick_warp.stages.timing import scope
-from synpick_warp.system.green_contexts import count_reserved
+from synpick_warp.system.hardware.green_contexts import count_reserved
 
 PARTS_IN_FLIGHT = 24
 """Maximum number of parts of ticks, usually substeps, that are enqueued and not yet done. Some 40 parts fill the launch queue of a CUDA

@@ -11,9 +11,9 @@ from typing import NamedTuple
 
 from synpick_warp.dataset.reading import DataSet
 from synpick_warp.errors import DatasetError
-from synpick_warp.progress import Report
 from synpick_warp.statistics.partial import Partial
-from synpick_warp.system.pool import WorkerPool, WorkerProgram
+from synpick_warp.system.processes.pool import WorkerPool, WorkerProgram
+from synpick_warp.system.progress import Report
 
 VIEWS_PER_PROCESS = 5000
 """Minimum number of views per process: starting one takes the time in which this one counts some 5,000 views."""

@@ -18,7 +18,7 @@ from synpick_warp.statistics.depth import Depth
 from synpick_warp.statistics.lights import Lights
 from synpick_warp.statistics.paper import Comparison, compare
 from synpick_warp.statistics.timeline import TimePoint
-from synpick_warp.system.cores import count_cores
+from synpick_warp.system.hardware.cores import count_cores
 
 OTHER_OBJECTS = "the objects are not those of the paper, so their distributions are not compared"
 """What is missing of data sets of other objects."""

@@ -11,12 +11,12 @@ from pathlib import Path
 from rich.console import Console
 from rich.text import Text
 
-from synpick_warp.codecs.tables import Table, to_csv, to_text
 from synpick_warp.configs.check import escape
 from synpick_warp.errors import OutputError
 from synpick_warp.exporters.writing.files import output_error
 from synpick_warp.statistics.compute import OTHER_OBJECTS, Statistics
 from synpick_warp.statistics.tables import PAPER, TIMELINE, make_tables
+from synpick_warp.system.codecs.tables import Table, to_csv, to_text
 from synpick_warp.system.folders import make_folder
 
 MAX_TEXT_ROWS = 24

@@ -12,9 +12,9 @@ from typing import Annotated
 import msgspec
 
 from synpick_warp.errors import DatasetError
-from synpick_warp.inputs.toml import read_toml
 from synpick_warp.statistics.annotations import Annotations
 from synpick_warp.statistics.counting import Group
+from synpick_warp.system.inputs.toml import read_toml
 
 _NAME = re.compile(r"[0-9]{3}_(.+)")
 """Name of an object in the YCB set; the paper's plot leaves the number out."""

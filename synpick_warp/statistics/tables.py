@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Sequence
 from itertools import pairwise
 
-from synpick_warp.codecs.tables import Column, Table, Value
 from synpick_warp.statistics.annotations import VISIBILITY_BINS
 from synpick_warp.statistics.attempts import FORCE_BIN, FORCE_BINS
 from synpick_warp.statistics.compute import GroupStatistics, Statistics
 from synpick_warp.statistics.coverage import BANDS, SECTORS
 from synpick_warp.statistics.lights import YAW_BINS
 from synpick_warp.statistics.paper import read_paper
+from synpick_warp.system.codecs.tables import Column, Table, Value
 
 ALL = "all"
 """Label of the row over all splits or modes."""

@@ -14,13 +14,13 @@ from synpick_warp.dataset.annotations import ModelInfo
 from synpick_warp.dataset.bop.folders import Listing
 from synpick_warp.dataset.bop.layout import MODEL_FILE
 from synpick_warp.errors import CatalogError, DatasetError
-from synpick_warp.inputs.json import decode_json
-from synpick_warp.low_discrepancy import sample_triangles
 from synpick_warp.scenes.assets.asset_files import MAX_MESH_FILE
 from synpick_warp.scenes.assets.meshes import read_mesh
 from synpick_warp.scenes.assets.models_info import MAX_INFO
 from synpick_warp.scenes.assets.ply import MAX_HEADER, read_ply_vertices
 from synpick_warp.scenes.types import TriangleMesh
+from synpick_warp.system.inputs.json import decode_json
+from synpick_warp.system.low_discrepancy import sample_triangles
 from synpick_warp.validation.schemas import convert
 
 _CHUNK = 512

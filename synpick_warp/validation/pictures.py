@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 
 from synpick_warp.errors import DatasetError
-from synpick_warp.inputs.image_files import decode_picture
+from synpick_warp.system.inputs.image_files import decode_picture
 
 _PNG = b"\x89PNG\r\n\x1a\n"
 _COLOUR_TYPES = {0: "greyscale", 2: "RGB", 3: "palette", 4: "greyscale with alpha", 6: "RGB with alpha"}

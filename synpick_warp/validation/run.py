@@ -13,9 +13,9 @@ from synpick_warp.dataset.bop.keyed import KeyedFolder
 from synpick_warp.dataset.bop.layout import Layout, SceneRef
 from synpick_warp.dataset.manifest import read_manifest, read_settings
 from synpick_warp.errors import DatasetError, SynpickError
-from synpick_warp.progress import Report
-from synpick_warp.system.cores import count_cores
-from synpick_warp.system.pool import WorkerProgram, map_ordered
+from synpick_warp.system.hardware.cores import count_cores
+from synpick_warp.system.processes.pool import WorkerProgram, map_ordered
+from synpick_warp.system.progress import Report
 from synpick_warp.validation.model_files import ModelsFolder
 from synpick_warp.validation.registry import Level, Violation, apply_rules
 from synpick_warp.validation.scene_files import FolderScene, open_scene

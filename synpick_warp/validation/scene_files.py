@@ -12,8 +12,8 @@ from synpick_warp.dataset.bop.images import FolderImages, KeyedImages
 from synpick_warp.dataset.bop.layout import Layout, SceneRef
 from synpick_warp.dataset.view_files import decode_run_lengths
 from synpick_warp.errors import DatasetError
-from synpick_warp.inputs.image_files import MAX_SIDE
-from synpick_warp.inputs.json import MAX_JSON, decode_json
+from synpick_warp.system.inputs.image_files import MAX_SIDE
+from synpick_warp.system.inputs.json import MAX_JSON, decode_json
 from synpick_warp.validation.pictures import Mask, crop_mask, decode_mask
 from synpick_warp.validation.schemas import PLAIN_KEY, RECORDS, Coco, Segmentation, convert
 

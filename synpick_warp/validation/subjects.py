@@ -11,7 +11,7 @@ import numpy as np
 
 from synpick_warp.dataset.bop.layout import Layout
 from synpick_warp.errors import DatasetError
-from synpick_warp.inputs.image_files import MAX_IMAGE_FILE, decode_picture
+from synpick_warp.system.inputs.image_files import MAX_IMAGE_FILE, decode_picture
 from synpick_warp.validation.pictures import Mask, png_type
 from synpick_warp.validation.scene_files import CheckedScene, RecordFile
 from synpick_warp.validation.schemas import Annotation, Camera, Coco, Info, Truth

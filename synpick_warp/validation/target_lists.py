@@ -8,7 +8,7 @@ from functools import cached_property
 from synpick_warp.dataset.annotations import TargetEntry
 from synpick_warp.dataset.bop.layout import TARGETS, Layout, is_index
 from synpick_warp.errors import DatasetError
-from synpick_warp.inputs.json import MAX_JSON, decode_json
+from synpick_warp.system.inputs.json import MAX_JSON, decode_json
 
 
 @dataclass(frozen=True)

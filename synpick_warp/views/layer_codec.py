@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 
 from synpick_warp.errors import DatasetError
-from synpick_warp.inputs.image_files import read_image_file
+from synpick_warp.system.inputs.image_files import read_image_file
 from synpick_warp.views.layers import FLOW_STEPS, LAYER_TABLE, MAX_CODE, NORMAL_STEPS, SCENE_FLOW_STEP, ZERO_CODE
 
 

@@ -12,7 +12,6 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from synpick_warp.codecs.charts import Spec, render_charts
 from synpick_warp.configs.load import load_config
 from synpick_warp.configs.schema import Config
 from synpick_warp.configs.splits import DataLayout
@@ -21,7 +20,8 @@ from synpick_warp.dataset.object_names import object_names
 from synpick_warp.dataset.records import Pixel
 from synpick_warp.dataset.view_files import read_image
 from synpick_warp.errors import DatasetError
-from synpick_warp.inputs.paths import path_inside
+from synpick_warp.system.codecs.charts import Spec, render_charts
+from synpick_warp.system.inputs.paths import path_inside
 from synpick_warp.viz.drawing import FONT, INK, WHITE, Image, check_picture_name, instance_color, put_text, readable_on, write_picture
 from synpick_warp.viz.explain_graph import (
     CYCLIC,

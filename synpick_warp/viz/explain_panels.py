@@ -7,8 +7,8 @@ from collections.abc import Mapping
 import cv2
 import numpy as np
 
-from synpick_warp.codecs.charts import Spec, axis, limit, line, points, theme
 from synpick_warp.configs.schema import Config
+from synpick_warp.system.codecs.charts import Spec, axis, limit, line, points, theme
 from synpick_warp.viz.drawing import FONT, INK, Image, instance_color, put_text
 from synpick_warp.viz.explain_graph import GREY, RED, disc
 from synpick_warp.viz.explain_record import Attempt, break_force, choice_words, labels, seal_words, suction_kind

@@ -14,8 +14,8 @@ from synpick_warp.dataset.annotations import ADVICE, check_content
 from synpick_warp.dataset.manifest import ATTEMPTS_FILE
 from synpick_warp.dataset.records import InstanceObservation
 from synpick_warp.errors import DatasetError
-from synpick_warp.inputs.files import read_file
-from synpick_warp.inputs.json import MAX_JSON, decode_json
+from synpick_warp.system.inputs.files import read_file
+from synpick_warp.system.inputs.json import MAX_JSON, decode_json
 from synpick_warp.viz.drawing import short_labels
 
 MODE_WORDS = {"pick": "untargeted", "target": "targeted"}

@@ -13,7 +13,7 @@ from synpick_warp.cli import display
 from synpick_warp.cli.display import CountProgress, LiveProgress, PlainProgress, print_summary
 from synpick_warp.codes import Ending, Outcome
 from synpick_warp.episodes import BakeSummary, EpisodeRow
-from synpick_warp.progress import Progress, SilentProgress
+from synpick_warp.system.progress import Progress, SilentProgress
 
 
 def row(episode: int, arrangement: int, ending: Ending, frames: int, seconds: float, mode: str = "move", *counts: int) -> EpisodeRow:

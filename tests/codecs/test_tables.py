@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from synpick_warp.codecs.tables import Column, Table, to_csv, to_latex, to_text
+from synpick_warp.system.codecs.tables import Column, Table, to_csv, to_latex, to_text
 
 TABLE = Table(
     "t",

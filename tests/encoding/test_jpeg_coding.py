@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 import warp as wp
 
-from synpick_warp.codecs import jpeg
 from synpick_warp.kernels.encoding import huffman, stuffing
 from synpick_warp.kernels.encoding.dct import quantize
 from synpick_warp.stages.encoding.jpeg import upload_huffman
+from synpick_warp.system.codecs import jpeg
 from tests.encoding.test_jpeg import encode
 from tests.twins.jpeg_entropy import code_blocks, code_interval
 

@@ -21,7 +21,7 @@ from synpick_warp.estimation.scenes import Scene, ScenePlan, read_scene
 from synpick_warp.exporters.bop.exporter import BopExporter
 from synpick_warp.exporters.bop.shards.exporter import ShardsExporter
 from synpick_warp.stages.pose.batch import RgbdBatch
-from synpick_warp.system.processes import ProcessError
+from synpick_warp.system.processes.worker import ProcessError
 from tests.estimation.probes import Divide, ListModules, Sleep, Stop
 from tests.harness.environment import checkout_environment
 from tests.harness.processes import wait_until_gone

@@ -13,7 +13,7 @@ from synpick_warp.evaluation.results import write_results
 from synpick_warp.evaluation.truth import read_truth
 from synpick_warp.factory import assembly
 from synpick_warp.pipeline import run_bake
-from synpick_warp.progress import SilentProgress
+from synpick_warp.system.progress import SilentProgress
 from tests.harness.bake_server import TINY
 from tests.worlds.small_worlds import catalog, settings
 

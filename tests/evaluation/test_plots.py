@@ -8,11 +8,24 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from synpick_warp.codecs.charts import INK, PALETTE, SCALE, ChartError, Legend, axis, chart, line, panel, points, printable, render_charts
 from synpick_warp.errors import DatasetError, OutputError
 from synpick_warp.evaluation import filter_poses, sweep_alpha
 from synpick_warp.evaluation.figures import write_figures
 from synpick_warp.evaluation.plots import plot_error_by_speed, plot_error_by_visibility, plot_recall, plot_sweep, plot_trajectory
+from synpick_warp.system.codecs.charts import (
+    INK,
+    PALETTE,
+    SCALE,
+    ChartError,
+    Legend,
+    axis,
+    chart,
+    line,
+    panel,
+    points,
+    printable,
+    render_charts,
+)
 from tests.harness.charts import near, picture_of, tick_texts
 from tests.harness.fuzz import fuzz_examples
 from tests.worlds.noisy_tracks import Motion, estimates, true_poses

@@ -7,7 +7,7 @@ import re
 import cv2
 import numpy as np
 
-from synpick_warp.codecs.charts import SCALE, VEGA_LITE, Spec
+from synpick_warp.system.codecs.charts import SCALE, VEGA_LITE, Spec
 
 
 def picture_of(spec: Spec, scale: float = SCALE) -> np.ndarray:

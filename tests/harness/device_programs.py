@@ -11,7 +11,7 @@ from types import SimpleNamespace
 
 from synpick_warp.errors import OutputError
 from synpick_warp.scheduling.worker import BakeLink
-from synpick_warp.system.processes import start_process
+from synpick_warp.system.processes.worker import start_process
 
 FOREVER = 60.0
 """Longer than any test waits [s]."""

@@ -13,7 +13,6 @@ from typing import ClassVar
 import numpy as np
 import pytest
 
-from synpick_warp.codecs.jpeg import encode_jpeg
 from synpick_warp.codes import Ending
 from synpick_warp.configs.schema import Config
 from synpick_warp.errors import OutputError
@@ -23,6 +22,7 @@ from synpick_warp.exporters.writing.png import encode_png
 from synpick_warp.exporters.writing.pool import WriterPool
 from synpick_warp.scenes.embedded.skies import skies
 from synpick_warp.scenes.types import Camera
+from synpick_warp.system.codecs.jpeg import encode_jpeg
 from synpick_warp.views.frames import EpisodeEnd, FrameBatch, TickBatch
 from tests.worlds import box_views
 from tests.worlds.box_views import batches, cameras, catalog, ends, ticks

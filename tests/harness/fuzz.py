@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 
-from synpick_warp.system.isolation import Limits, run_isolated
+from synpick_warp.system.processes.isolation import Limits, run_isolated
 
 
 def fuzz_examples(default: int) -> int:

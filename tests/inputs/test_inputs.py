@@ -16,10 +16,10 @@ from hypothesis import strategies as st
 from synpick_warp.configs.load import load_config
 from synpick_warp.configs.write import config_to_toml
 from synpick_warp.errors import DatasetError
-from synpick_warp.inputs.files import check_regular_file, read_file
-from synpick_warp.inputs.json import decode_json, read_json_lines
-from synpick_warp.inputs.paths import path_inside
-from synpick_warp.inputs.toml import MAX_TOML, decode_toml, read_toml
+from synpick_warp.system.inputs.files import check_regular_file, read_file
+from synpick_warp.system.inputs.json import decode_json, read_json_lines
+from synpick_warp.system.inputs.paths import path_inside
+from synpick_warp.system.inputs.toml import MAX_TOML, decode_toml, read_toml
 
 SECONDS = 5.0
 """Longest time that any input may take."""

@@ -12,8 +12,8 @@ import pytest
 from synpick_warp.errors import DatasetError
 from synpick_warp.exporters.writing.png import encode_mask_png, encode_png
 from synpick_warp.exporters.writing.rle import find_run_boundaries
-from synpick_warp.inputs.image_files import decode_image
-from synpick_warp.inputs.png_crop import _WIDE, decode_grey_crop
+from synpick_warp.system.inputs.image_files import decode_image
+from synpick_warp.system.inputs.png_crop import _WIDE, decode_grey_crop
 
 SIZE = 70, 50
 """Width and height."""

@@ -9,7 +9,7 @@ from synpick_warp.evaluation.errors import add_errors, adds_errors
 from synpick_warp.stages.pose.batch import Estimates, InstanceTable
 from synpick_warp.stages.pose.estimator import EstimatorModels, PoseEstimator, PoseSettings, adapt_schedule
 from synpick_warp.stages.pose.refine import Schedule
-from synpick_warp.system.device import pick_device
+from synpick_warp.system.hardware.device import pick_device
 from tests.worlds.pose_scenes import SET_INSTANCES, Scene, fixed_set, select, without
 from tests.worlds.pose_views import disturbed, pose_errors
 

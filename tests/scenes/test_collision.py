@@ -22,7 +22,7 @@ from synpick_warp.scenes.collision.hulls import hull_volume, mass_properties
 from synpick_warp.scenes.collision.shapes import collision_shapes, default_cache_dir
 from synpick_warp.scenes.collision.simplification import simplify_hull
 from synpick_warp.scenes.types import ConvexPiece, TriangleMesh
-from synpick_warp.system.isolation import Failure
+from synpick_warp.system.processes.isolation import Failure
 from tests.harness.environment import checkout_environment
 from tests.harness.pieces import assert_valid
 

@@ -67,7 +67,7 @@ def test_where_coacd_crashes_the_hull_stands(tmp_path, monkeypatch, case, names)
 
 
 def restart_server() -> None:
-    from synpick_warp.system import isolation
+    from synpick_warp.system.processes import isolation
 
     isolation._server.stop()
 

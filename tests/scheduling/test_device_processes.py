@@ -14,8 +14,8 @@ import pytest
 
 from synpick_warp.errors import DeviceError, OutputError
 from synpick_warp.scheduling.devices import DeviceProcesses
-from synpick_warp.system import device as devices
-from synpick_warp.system.device import describe_kinds, pick_devices
+from synpick_warp.system.hardware import device as devices
+from synpick_warp.system.hardware.device import describe_kinds, pick_devices
 from tests.harness.device_programs import program
 from tests.harness.processes import wait_until_gone
 

@@ -17,7 +17,7 @@ from synpick_warp.codes import Task
 from synpick_warp.scenes import build
 from synpick_warp.stages.sim import physics as physics_module
 from synpick_warp.stages.sim.step_log import record_arrays
-from synpick_warp.system.green_contexts import SmPartition
+from synpick_warp.system.hardware.green_contexts import SmPartition
 from tests.worlds.cubes import place_cubes
 from tests.worlds.sights import SHORT, picking
 from tests.worlds.small_worlds import BOX, CUBE, catalog, report, settings

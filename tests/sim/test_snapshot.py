@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from synpick_warp.arrays import allocate
 from synpick_warp.kernels.sim import snapshot
 from synpick_warp.stages.buffers import LastFrame, Snapshot
-from synpick_warp.system.device import pick_device
+from synpick_warp.system.hardware.device import pick_device
 from tests.harness.devices import default_device
 from tests.worlds.kernel_worlds import filled
 

@@ -11,8 +11,8 @@ from pathlib import Path
 import pytest
 
 from synpick_warp.scenes.collision.shapes import default_cache_dir
-from synpick_warp.system import caches
-from synpick_warp.system.caches import CacheError, find_fault, kernel_cache, usable_kernel_cache, user_cache
+from synpick_warp.system.hardware import caches
+from synpick_warp.system.hardware.caches import CacheError, find_fault, kernel_cache, usable_kernel_cache, user_cache
 
 HANG = 60.0
 
@@ -95,7 +95,7 @@ def test_no_temporary_folder_either_is_one_line(home, monkeypatch):
         raise OSError(28, "No space left on device")
 
     home.write_text("")
-    monkeypatch.setattr("synpick_warp.system.caches.tempfile.mkdtemp", full)
+    monkeypatch.setattr("synpick_warp.system.hardware.caches.tempfile.mkdtemp", full)
     with pytest.raises(CacheError, match=r"^the kernel cache cannot be used \([^\n]*; set WARP_CACHE_PATH to a folder [^\n]*$"):
         usable_kernel_cache("1.0")
 
@@ -103,7 +103,7 @@ def test_no_temporary_folder_either_is_one_line(home, monkeypatch):
 def test_warp_starts_without_a_home_and_its_cache_is_removed(home):
     """Fault 6, in a real process: a traceback before."""
     home.write_text("")
-    code = "from synpick_warp.system.device import start_warp; import warp as wp; start_warp(); print(wp.config.kernel_cache_dir)"
+    code = "from synpick_warp.system.hardware.device import start_warp; import warp as wp; start_warp(); print(wp.config.kernel_cache_dir)"
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=HANG, check=False, env=dict(os.environ))
     assert (result.returncode, len(result.stderr.splitlines())) == (0, 1), result.stderr
     folder = Path(result.stdout.strip())

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
 
-from synpick_warp.system.cores import count_cores
+from synpick_warp.system.hardware.cores import count_cores
 from tests.harness.fuzz import fuzz_examples
 from tests.harness.kernel_files import write
 

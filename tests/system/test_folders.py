@@ -12,8 +12,8 @@ import pytest
 from synpick_warp.cli.commands import main
 from synpick_warp.scenes.collision.shapes import _save
 from synpick_warp.scenes.types import ConvexPiece
-from synpick_warp.system.caches import link_files
 from synpick_warp.system.folders import make_folder
+from synpick_warp.system.hardware.caches import link_files
 from tests.harness.scripted_bake import bake, settings
 
 FACES = np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]], np.int32)

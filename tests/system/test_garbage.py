@@ -7,7 +7,7 @@ import gc
 
 import pytest
 
-from synpick_warp.system.garbage import collection_paused
+from synpick_warp.system.processes.garbage import collection_paused
 
 
 @pytest.mark.parametrize("before", [True, False])

@@ -9,8 +9,8 @@ import pytest
 import warp as wp
 
 from synpick_warp.errors import DeviceError
-from synpick_warp.system import green_contexts
-from synpick_warp.system.green_contexts import SmPartition
+from synpick_warp.system.hardware import green_contexts
+from synpick_warp.system.hardware.green_contexts import SmPartition
 
 BLOCKS, SPINS = 4096, 2000
 GPU = SimpleNamespace(alias="cuda:0", ordinal=0, sm_count=132)

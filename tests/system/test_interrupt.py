@@ -14,7 +14,7 @@ from collections.abc import Callable
 
 import pytest
 
-from synpick_warp.system.interrupt import RETRY, SIGNALS, KeptInterrupt, StopRequest
+from synpick_warp.system.processes.interrupt import RETRY, SIGNALS, KeptInterrupt, StopRequest
 
 
 @pytest.mark.parametrize("number", SIGNALS)

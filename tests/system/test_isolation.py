@@ -12,8 +12,8 @@ import time
 import pytest
 
 from synpick_warp.errors import CatalogError
-from synpick_warp.system import isolation
-from synpick_warp.system.isolation import Failure, Limits, run_isolated
+from synpick_warp.system.processes import isolation
+from synpick_warp.system.processes.isolation import Failure, Limits, run_isolated
 from tests.harness.environment import checkout_environment
 
 LIMITS = Limits(60.0, 2**30)
@@ -74,7 +74,7 @@ def test_a_server_that_has_ended_is_started_again():
 
 PROGRAM = """
 import sys, time
-from synpick_warp.system.isolation import Limits, run_isolated
+from synpick_warp.system.processes.isolation import Limits, run_isolated
 print("started", flush=True)
 list(run_isolated(time.sleep, [(600.0,)] * int(sys.argv[1]), Limits(600.0, 2**30)))
 """

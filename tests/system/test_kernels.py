@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 import warp as wp
 
-from synpick_warp.system import kernels
-from synpick_warp.system.kernels import Compiler, DryLaunches, ModuleBuild, build_of, compilation_lock, split_modules
+from synpick_warp.system.hardware import kernels
+from synpick_warp.system.hardware.kernels import Compiler, DryLaunches, ModuleBuild, build_of, compilation_lock, split_modules
 
 MODULES = 3
 
@@ -135,7 +135,7 @@ def test_kernels_of_a_library_get_modules_of_their_own(device, empty_cache):
 
 HOLDER = """
 import sys, warp as wp
-from synpick_warp.system.kernels import compilation_lock
+from synpick_warp.system.hardware.kernels import compilation_lock
 wp.config.kernel_cache_dir = sys.argv[1]
 with compilation_lock(lambda: None):
     print("locked", flush=True)

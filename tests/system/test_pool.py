@@ -9,7 +9,7 @@ from functools import partial
 import pytest
 
 from synpick_warp.errors import DatasetError
-from synpick_warp.system.pool import TaskError, WorkerPool, WorkerProgram, map_ordered
+from synpick_warp.system.processes.pool import TaskError, WorkerPool, WorkerProgram, map_ordered
 
 
 def make_list() -> list[int]:
@@ -131,7 +131,7 @@ def test_processes_that_cannot_start_are_one_line(monkeypatch):
         started.append(real(program, *rest))
         return started[0]
 
-    from synpick_warp.system import pool as module
+    from synpick_warp.system.processes import pool as module
 
     real = module.start_process
     monkeypatch.setattr(module, "start_process", start)

@@ -12,7 +12,7 @@ import rich.progress
 import zarr
 
 from synpick_warp.dataset.stored_array import open_stored_array
-from synpick_warp.system import threads
+from synpick_warp.system.processes import threads
 
 
 @pytest.fixture(autouse=True)

@@ -1,4 +1,4 @@
-"""Depth PNG data in NumPy and whole numbers, from the laws in `synpick_warp.codecs.depth_png` and kernels.encoding.png's docstrings."""
+"""Depth PNG data in NumPy and whole numbers, from the laws in `synpick_warp.system.codecs.depth_png` and kernels.encoding.png's docstrings."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import zlib
 
 import numpy as np
 
-from synpick_warp.codecs.depth_png import (
+from synpick_warp.system.codecs.depth_png import (
     MAX_DISTANCE,
     MAX_RUN,
     MIN_RUN,

@@ -1,10 +1,10 @@
-"""Entropy-coded segments of baseline JPEG in whole numbers, from ITU-T T.81, annex F, and the tables of `synpick_warp.codecs.jpeg`."""
+"""Entropy-coded segments of baseline JPEG in whole numbers, from ITU-T T.81, annex F, and the tables of `synpick_warp.system.codecs.jpeg`."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from synpick_warp.codecs.jpeg import AC_COUNTS, AC_SYMBOLS, DC_COUNTS, DC_SYMBOLS, huffman_codes
+from synpick_warp.system.codecs.jpeg import AC_COUNTS, AC_SYMBOLS, DC_COUNTS, DC_SYMBOLS, huffman_codes
 
 _DC = [huffman_codes(*table) for table in zip(DC_COUNTS, DC_SYMBOLS, strict=True)]
 _AC = [huffman_codes(*table) for table in zip(AC_COUNTS, AC_SYMBOLS, strict=True)]

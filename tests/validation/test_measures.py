@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from scipy.spatial.distance import pdist
 
 from synpick_warp.errors import DatasetError
-from synpick_warp.inputs.image_files import decode_picture, tiff_size
+from synpick_warp.system.inputs.image_files import decode_picture, tiff_size
 from synpick_warp.validation.comparison import best_shift, fit_masks, moved
 from synpick_warp.validation.model_files import diameter, sample_area, turn_about
 from synpick_warp.validation.pictures import crop_mask, decode_mask, png_type

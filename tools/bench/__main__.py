@@ -31,13 +31,13 @@ from synpick_warp.configs.schema import Cameras, Config
 from synpick_warp.errors import SynpickError
 from synpick_warp.exporters.registry import Needs
 from synpick_warp.factory.assembly import Factory, build_factory
-from synpick_warp.progress import SilentProgress
 from synpick_warp.stages import timing
 from synpick_warp.stages.render.view_setup import make_views
 from synpick_warp.stages.sim.physics import with_enough_worlds
 from synpick_warp.stages.sim.simulate import Simulation
 from synpick_warp.stages.stream import TickReader, TickReport
-from synpick_warp.system.device import pick_device
+from synpick_warp.system.hardware.device import pick_device
+from synpick_warp.system.progress import SilentProgress
 from tools.bench.compare.peers import PEERS, check_installed, measure_peers
 from tools.bench.encode import measure_encoding
 from tools.bench.growth import measure_growth

@@ -22,8 +22,8 @@ from typing import Self
 from synpick_warp.dataset.manifest import committed_episodes, episode_entry, read_checksums
 from synpick_warp.dataset.verify import check_files
 from synpick_warp.errors import SynpickError
-from synpick_warp.system.cores import count_cores
-from synpick_warp.system.processes import END_TIMEOUT, WorkerProcess, send, start_process
+from synpick_warp.system.hardware.cores import count_cores
+from synpick_warp.system.processes.worker import END_TIMEOUT, WorkerProcess, send, start_process
 
 INTERVAL = 0.5
 """Polling interval for committed episodes [s]."""

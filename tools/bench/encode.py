@@ -9,11 +9,11 @@ import numpy as np
 import warp as wp
 
 from synpick_warp.arrays import allocate
-from synpick_warp.codecs.jpeg import encode_jpeg
 from synpick_warp.exporters.writing.png import encode_png
 from synpick_warp.stages.buffers import ViewBuffers
 from synpick_warp.stages.encoding.jpeg import JpegBuffers, JpegEncoder, jpeg_sizes
 from synpick_warp.stages.encoding.png import DepthBuffers, DepthEncoder, depth_sizes
+from synpick_warp.system.codecs.jpeg import encode_jpeg
 from tools.bench.physics import BURST, seconds_per_call
 from tools.options import Row
 

@@ -23,11 +23,11 @@ from synpick_warp.configs.schema import Config
 from synpick_warp.exporters.registry import Needs
 from synpick_warp.factory.assembly import Factory, build_factory, make_renderer
 from synpick_warp.kernels.render.lighting.history import MAX_PERIOD_BITS
-from synpick_warp.progress import SilentProgress
 from synpick_warp.stages.buffers import Snapshot
 from synpick_warp.stages.render.denoised import LIGHT_HISTORY, DenoisedRenderer
 from synpick_warp.stages.render.renderer import Renderer
 from synpick_warp.stages.stream import FrameStream, TickReader, TickReport
+from synpick_warp.system.progress import SilentProgress
 from tools.bench.meter import LIVE_FRACTION
 from tools.bench.steady import plan_spare_episodes
 from tools.bench.stream import batch_views, select_views

@@ -17,7 +17,7 @@ from synpick_warp.errors import DatasetError
 from synpick_warp.exporters.registry import load_exporter_classes, shared_files
 from synpick_warp.pipeline import run_bake
 from synpick_warp.scheduling.sizes import pick_processes
-from synpick_warp.system.device import pick_device
+from synpick_warp.system.hardware.device import pick_device
 from tools.bench.cleaner import Assignment, Cleaner
 from tools.bench.meter import LIVE_FRACTION, SteadyMeter, summarize_rates
 from tools.options import Row

@@ -16,13 +16,13 @@ from synpick_warp.episodes import BakeSummary
 from synpick_warp.factory.assembly import Factory, Stages
 from synpick_warp.online.selection import Selection
 from synpick_warp.online.stream import Producer, ViewStream
-from synpick_warp.progress import SilentProgress
 from synpick_warp.stages.buffers import Snapshot
 from synpick_warp.stages.online.batches import BatchRing, ViewBatch
 from synpick_warp.stages.render.renderer import Renderer
 from synpick_warp.stages.render.view_setup import make_views, pair_views
 from synpick_warp.stages.stream import TickReport, view_sizes
 from synpick_warp.stages.ticks import TickLoop
+from synpick_warp.system.progress import SilentProgress
 from tools.options import Row
 
 ROUNDS = 5

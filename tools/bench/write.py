@@ -21,7 +21,7 @@ from synpick_warp.exporters.writing.pool import QUEUE_DEPTH, WriterPool
 from synpick_warp.factory.assembly import Factory
 from synpick_warp.stages.host_copies import DeviceImages
 from synpick_warp.stages.stream import TickReport, tick_batch
-from synpick_warp.system.cores import count_cores
+from synpick_warp.system.hardware.cores import count_cores
 from synpick_warp.views.frames import EpisodeEnd, FrameBatch, TickBatch
 from tools.options import Row
 

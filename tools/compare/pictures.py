@@ -30,7 +30,7 @@ from synpick_warp.scenes.lights import load_lights
 from synpick_warp.stages.buffers import LayerBuffers, Snapshot, ViewBuffers, view_buffer_sizes
 from synpick_warp.stages.render.scene import build_render_scene
 from synpick_warp.stages.render.view_setup import make_views
-from synpick_warp.system.device import pick_device
+from synpick_warp.system.hardware.device import pick_device
 from tools.options import configure, fail, make_parser, write_json
 from tools.reports.render_checks import with_mode
 from tools.reports.render_piles import next_frame, settle_piles

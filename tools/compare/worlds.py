@@ -27,9 +27,9 @@ from synpick_warp.codes import Phase
 from synpick_warp.configs.schema import Config
 from synpick_warp.errors import SynpickError
 from synpick_warp.factory.assembly import build_factory
-from synpick_warp.progress import SilentProgress
 from synpick_warp.stages.stream import TickReader
-from synpick_warp.system.device import pick_device
+from synpick_warp.system.hardware.device import pick_device
+from synpick_warp.system.progress import SilentProgress
 from tools.options import configure, fail, make_parser, write_json
 
 WARM_TICKS = 3

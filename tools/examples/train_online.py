@@ -26,7 +26,7 @@ from synpick_warp.cli.commands import parse_resolution
 from synpick_warp.configs.schema import Config
 from synpick_warp.errors import ConfigError, SynpickError
 from synpick_warp.online.dataset import FIELDS, StreamDataset
-from synpick_warp.system.device import pick_device
+from synpick_warp.system.hardware.device import pick_device
 from tools.options import configure, fail, make_parser, positive_count
 
 TRAINING, HELD_OUT = range(100_000), range(100_000, 101_000)

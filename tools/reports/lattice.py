@@ -38,7 +38,6 @@ from synpick_warp.factory.assembly import Stages, build_stages, make_renderer
 from synpick_warp.kernels.render.lighting.history import NEVER
 from synpick_warp.kernels.render.lighting.shadows import STRATA_PERIOD
 from synpick_warp.kernels.tuning import LANE_STRIDE
-from synpick_warp.progress import SilentProgress
 from synpick_warp.scenes.cameras import make_cameras
 from synpick_warp.scenes.fixtures import make_fixtures
 from synpick_warp.scheduling.sizes import fit_to_device
@@ -46,7 +45,8 @@ from synpick_warp.stages.buffers import FIXTURES, Snapshot
 from synpick_warp.stages.render.sampling_rates import coarse_size, shadow_size
 from synpick_warp.stages.render.scene import build_render_scene
 from synpick_warp.stages.stream import TickReader
-from synpick_warp.system.device import pick_device
+from synpick_warp.system.hardware.device import pick_device
+from synpick_warp.system.progress import SilentProgress
 from synpick_warp.viz.preview import write_picture
 from tools.figures import finish_report
 from tools.options import Row, configure, fail, image_resolution, make_parser, positive_count

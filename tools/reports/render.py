@@ -16,7 +16,7 @@ import numpy as np
 from rich.console import Console
 
 from synpick_warp.errors import SynpickError
-from synpick_warp.system.device import pick_device
+from synpick_warp.system.hardware.device import pick_device
 from synpick_warp.viz.drawing import write_picture
 from tools.figures import finish_report
 from tools.options import configure, fail, make_parser

@@ -26,7 +26,7 @@ from synpick_warp.scenes.types import Catalog
 from synpick_warp.stages.sim.physics import with_enough_worlds
 from synpick_warp.stages.sim.simulate import Simulation
 from synpick_warp.stages.stream import TickReader, TickReport
-from synpick_warp.system.device import pick_device
+from synpick_warp.system.hardware.device import pick_device
 from tools.figures import finish_report
 from tools.options import INTERRUPTED, Row, configure, fail, make_parser
 

@@ -27,11 +27,11 @@ from synpick_warp.configs.schema import FAST, REFERENCE, Config
 from synpick_warp.errors import SynpickError
 from synpick_warp.factory.assembly import build_stages, make_renderer
 from synpick_warp.memory_plan import check_memory, explain_shortage
-from synpick_warp.progress import SilentProgress
 from synpick_warp.scheduling.sizes import fit_to_device
 from synpick_warp.stages.buffers import Snapshot
 from synpick_warp.stages.stream import TickReader
-from synpick_warp.system.device import pick_device
+from synpick_warp.system.hardware.device import pick_device
+from synpick_warp.system.progress import SilentProgress
 from tools.figures import finish_report
 from tools.options import Row, configure, fail, make_parser, positive_count, writable_file
 from tools.reports.reference_store import ReferenceStore, existing_folder

@@ -17,10 +17,10 @@ from urllib.parse import unquote, unquote_to_bytes
 import msgspec
 
 from synpick_warp.errors import CatalogError
-from synpick_warp.inputs.files import read_file
-from synpick_warp.inputs.json import decode_json
 from synpick_warp.scenes.assets.asset_files import MAX_MESH_FILE, MAX_PARTS, MAX_ROWS, read_referred
 from synpick_warp.scenes.assets.mesh_parts import Notes
+from synpick_warp.system.inputs.files import read_file
+from synpick_warp.system.inputs.json import decode_json
 
 MAX_DEPTH = 256
 """Maximum depth of the tree of nodes."""

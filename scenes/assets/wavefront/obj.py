@@ -12,7 +12,6 @@ from trimesh.exchange.obj import load_obj
 from trimesh.geometry import triangulate_quads
 
 from synpick_warp.errors import CatalogError
-from synpick_warp.inputs.files import read_file
 from synpick_warp.scenes.assets.appearance import UV_TOLERANCE, FileMaterial, clamp_texture
 from synpick_warp.scenes.assets.asset_files import (
     MAX_PARTS,
@@ -27,6 +26,7 @@ from synpick_warp.scenes.assets.mesh_parts import NO_MATERIAL, WHITE, MeshPart, 
 from synpick_warp.scenes.assets.text import decode_text
 from synpick_warp.scenes.assets.wavefront.mtl import MtlMaterial, TexturePixels, parse_library, read_material
 from synpick_warp.scenes.assets.wavefront.obj_text import normalize_text
+from synpick_warp.system.inputs.files import read_file
 
 MAX_LIBRARY = 2**22
 """Largest material library [bytes]: 4 MiB."""

@@ -14,7 +14,7 @@ from msgspec import UNSET
 from synpick_warp.dataset.annotations import ADVICE, CameraEntry, InfoEntry, Key, LenientCameraEntry, TruthEntry, check_content
 from synpick_warp.dataset.view_files import SceneFiles, SceneFolder
 from synpick_warp.errors import DatasetError
-from synpick_warp.inputs.json import read_json
+from synpick_warp.system.inputs.json import read_json
 
 _PER_OBJECT = 1000
 """Ids of instances that are made up, per object."""

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from synpick_warp.errors import DatasetError
-from synpick_warp.inputs.files import read_file
+from synpick_warp.system.inputs.files import read_file
 
 
 @dataclass(frozen=True)

@@ -12,9 +12,9 @@ from synpick_warp.dataset.annotations import ADVICE
 from synpick_warp.dataset.bop.folders import Listing
 from synpick_warp.dataset.bop.layout import KEYED, SceneRef
 from synpick_warp.errors import DatasetError
-from synpick_warp.inputs.files import read_file
-from synpick_warp.inputs.image_files import MAX_IMAGE_FILE
-from synpick_warp.inputs.tar_files import list_members
+from synpick_warp.system.inputs.files import read_file
+from synpick_warp.system.inputs.image_files import MAX_IMAGE_FILE
+from synpick_warp.system.inputs.tar_files import list_members
 
 SUFFIXES = ("png", "jpg", "jpeg", "tif", "tiff")
 """File formats of images that BOP data sets have, the preferred one first."""

@@ -9,8 +9,8 @@ from functools import cached_property
 from synpick_warp.dataset.bop.folders import Listing
 from synpick_warp.dataset.bop.layout import KEYED, KEYS, SHARD, SceneRef
 from synpick_warp.errors import DatasetError
-from synpick_warp.inputs.json import MAX_JSON, decode_json
-from synpick_warp.inputs.tar_files import list_members
+from synpick_warp.system.inputs.json import MAX_JSON, decode_json
+from synpick_warp.system.inputs.tar_files import list_members
 
 KEY = re.compile(r"([0-9]{6,9})_([0-9]{6,9})")
 

@@ -7,8 +7,8 @@ from pathlib import Path
 
 from synpick_warp.dataset.bop.layout import RENDERING_MODELS
 from synpick_warp.errors import DatasetError
-from synpick_warp.inputs.paths import path_inside
 from synpick_warp.scenes.assets.models_info import ModelInfo, read_models_info
+from synpick_warp.system.inputs.paths import path_inside
 
 INFO = "models_info.json"
 

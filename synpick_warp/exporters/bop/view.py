@@ -14,7 +14,6 @@ import cv2
 import numpy as np
 import orjson
 
-from synpick_warp.codecs.jpeg import encode_jpeg
 from synpick_warp.codes import Effect, names
 from synpick_warp.errors import DatasetError
 from synpick_warp.exporters.base import PIXEL_BYTES, EncodedView, StoredScene
@@ -23,6 +22,7 @@ from synpick_warp.exporters.writing.folder import Buffer
 from synpick_warp.exporters.writing.png import encode_png, frame_depth_png
 from synpick_warp.exporters.writing.rle import Masks, Runs, find_run_boundaries, unpack_run_boundaries
 from synpick_warp.scenes.types import Camera
+from synpick_warp.system.codecs.jpeg import encode_jpeg
 from synpick_warp.views.frames import FrameBatch
 from synpick_warp.views.layer_codec import encode_layer
 

@@ -39,7 +39,7 @@ from synpick_warp.exporters.staging import EpisodeExporter, StagedEpisode
 from synpick_warp.exporters.writing.files import output_error
 from synpick_warp.exporters.writing.notes import note_files, write_notes
 from synpick_warp.exporters.writing.pool import WriterPool, WriteTask
-from synpick_warp.system.shared_memory import shared_bytes
+from synpick_warp.system.processes.shared_memory import shared_bytes
 from synpick_warp.views.frames import EpisodeEnd, FrameBatch, TickBatch
 
 _CUP = 2

@@ -43,8 +43,8 @@ from synpick_warp.exporters.lerobot.layout import (
 from synpick_warp.exporters.lerobot.part import Part, outcome_names
 from synpick_warp.exporters.lerobot.statistics import Statistics, describe_levels, describe_numbers, merge_numbers, to_json
 from synpick_warp.exporters.writing.files import PARTIAL, sync_file, sync_folder
-from synpick_warp.inputs.json import read_json
-from synpick_warp.inputs.paths import path_inside
+from synpick_warp.system.inputs.json import read_json
+from synpick_warp.system.inputs.paths import path_inside
 
 ROW_GROUP = 20_000
 """Frames of a row group of the data: about 2 MB."""

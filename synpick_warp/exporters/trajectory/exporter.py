@@ -21,7 +21,7 @@ from synpick_warp.exporters.trajectory.spool import SPOOL_ROWS, Place, batch_typ
 from synpick_warp.exporters.trajectory.store import constant_places, write_constants
 from synpick_warp.exporters.writing.files import output_error
 from synpick_warp.exporters.writing.pool import WriteTask
-from synpick_warp.system.shared_memory import shared_bytes
+from synpick_warp.system.processes.shared_memory import shared_bytes
 from synpick_warp.views.frames import EpisodeEnd, TickBatch
 
 

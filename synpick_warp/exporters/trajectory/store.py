@@ -14,7 +14,7 @@ from zarr.codecs import ZstdCodec
 from synpick_warp.configs.schema import Physics, Trajectory
 from synpick_warp.exporters.trajectory.arrays import CAMERAS, CONSTANT_GROUPS, EPISODES, FORMAT, LABELS, OBJECTS, ArraySpec, GroupSpec
 from synpick_warp.scenes.types import Camera, Catalog, EnvironmentMap
-from synpick_warp.system.threads import ZARR_THREADS
+from synpick_warp.system.processes.threads import ZARR_THREADS
 
 zarr.config.set(ZARR_THREADS)
 

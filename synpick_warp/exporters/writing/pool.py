@@ -17,9 +17,9 @@ import numpy as np
 
 from synpick_warp.errors import DatasetError, OutputError, SynpickError
 from synpick_warp.exporters.writing.files import output_error
-from synpick_warp.system.pool import DeadProcessError, TaskError, TaskFuture, WorkerPool, WorkerProgram, portable_error
-from synpick_warp.system.processes import ProcessError
-from synpick_warp.system.shared_memory import SharedArray, SharedSlots
+from synpick_warp.system.processes.pool import DeadProcessError, TaskError, TaskFuture, WorkerPool, WorkerProgram, portable_error
+from synpick_warp.system.processes.shared_memory import SharedArray, SharedSlots
+from synpick_warp.system.processes.worker import ProcessError
 
 NICENESS = 10
 """Increment of the processes' niceness (nice(2)): when they keep all cores busy, the bake, which feeds them and the GPU, has priority."""

@@ -1,6 +1,6 @@
 """Baseline JPEG encoder on the device, with 4:2:0 chroma subsampling and restart intervals.
 
-Its files equal libjpeg's (`synpick_warp.codecs.jpeg.encode_jpeg`) byte for byte. Only the files are copied to the host; at quality 95 they
+Its files equal libjpeg's (`synpick_warp.system.codecs.jpeg.encode_jpeg`) byte for byte. Only the files are copied to the host; at quality 95 they
 have a tenth of the image's size.
 """
 
@@ -13,19 +13,6 @@ import numpy as np
 import warp as wp
 
 from synpick_warp.arrays import allocate, allocate_struct, device_array, struct_arrays
-from synpick_warp.codecs.jpeg import (
-    AC_COUNTS,
-    AC_SYMBOLS,
-    DC_COUNTS,
-    DC_SYMBOLS,
-    DIVISOR_SCALE,
-    QUALITIES,
-    RESTART_INTERVAL,
-    huffman_codes,
-    make_header,
-    quantization,
-    reciprocals,
-)
 from synpick_warp.kernels.encoding.dct import convert_colors_kernel, transform_blocks_kernel
 from synpick_warp.kernels.encoding.huffman import (
     CODE_BITS,
@@ -45,6 +32,19 @@ from synpick_warp.kernels.encoding.tables import BLOCK, BLOCK_SIZE, BLOCKS_PER_M
 from synpick_warp.kernels.render.images.camera_effects import jpeg_quality_kernel
 from synpick_warp.kernels.tuning import JPEG_THREADS
 from synpick_warp.stages.buffers import ViewBuffers
+from synpick_warp.system.codecs.jpeg import (
+    AC_COUNTS,
+    AC_SYMBOLS,
+    DC_COUNTS,
+    DC_SYMBOLS,
+    DIVISOR_SCALE,
+    QUALITIES,
+    RESTART_INTERVAL,
+    huffman_codes,
+    make_header,
+    quantization,
+    reciprocals,
+)
 
 SLOT_BYTES_PER_PIXEL = 1.0
 """Capacity of a restart interval: nearly four times the mean at quality 95 (568 kB for a full-HD view of a tote)."""

@@ -1,6 +1,6 @@
 """Depth PNG encoder on the device: compressed data (IDAT) of 16-bit greyscale PNG files, to which writers add the other chunks.
 
-See `synpick_warp.codecs.depth_png` for the format. The bytes depend on the image alone, not on the device: all arithmetic is in integers.
+See `synpick_warp.system.codecs.depth_png` for the format. The bytes depend on the image alone, not on the device: all arithmetic is in integers.
 """
 
 from __future__ import annotations
@@ -12,7 +12,16 @@ import numpy as np
 import warp as wp
 
 from synpick_warp.arrays import allocate, allocate_struct, device_array, struct_arrays
-from synpick_warp.codecs.depth_png import (
+from synpick_warp.kernels.encoding.png import (
+    GROUP,
+    Codes,
+    SlotSums,
+    close_streams_kernel,
+    encode_segments_kernel,
+    join_slots_kernel,
+    sum_groups_kernel,
+)
+from synpick_warp.system.codecs.depth_png import (
     MAX_RUN,
     distance_codes,
     end_code,
@@ -22,15 +31,6 @@ from synpick_warp.codecs.depth_png import (
     pack_codes,
     pack_words,
     run_codes,
-)
-from synpick_warp.kernels.encoding.png import (
-    GROUP,
-    Codes,
-    SlotSums,
-    close_streams_kernel,
-    encode_segments_kernel,
-    join_slots_kernel,
-    sum_groups_kernel,
 )
 
 SEGMENT = 2 * MAX_RUN

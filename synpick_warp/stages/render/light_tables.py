@@ -18,7 +18,7 @@ from synpick_warp.scenes.environment import BACKGROUND_ROWS, LUMINANCE, WHITE_VA
 from synpick_warp.scenes.lamps import Lamp, extract_lamps, sample_disc
 from synpick_warp.scenes.sun import MAX_SUN_TANGENT, draw_sun_disc, replace_sun
 from synpick_warp.scenes.types import EnvironmentMap
-from synpick_warp.system.threads import map_in_threads
+from synpick_warp.system.processes.threads import map_in_threads
 
 PREFILTER_ROWS = 32
 """Rows of the prefiltered specular map: its sharpest lobe is wider than a texel of 5.6°."""

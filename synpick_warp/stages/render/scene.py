@@ -29,7 +29,7 @@ from synpick_warp.stages.render.light_tables import (
     sh_basis,
 )
 from synpick_warp.stages.render.wide_bvh import build_wide_bvh
-from synpick_warp.system.threads import map_in_threads
+from synpick_warp.system.processes.threads import map_in_threads
 
 
 @dataclass(frozen=True, eq=False)

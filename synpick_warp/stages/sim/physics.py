@@ -19,7 +19,7 @@ from synpick_warp.newton_patches.broad_phase import replace_broad_phase
 from synpick_warp.newton_patches.narrow_phase import resize_blocks
 from synpick_warp.newton_patches.solver import choose_solver
 from synpick_warp.scenes import build
-from synpick_warp.system.threads import is_only_launcher
+from synpick_warp.system.processes.threads import is_only_launcher
 
 # Sentinel: default of `next` for an exhausted iterator.
 ENDED = object()

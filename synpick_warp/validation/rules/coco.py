@@ -8,7 +8,7 @@ import numpy as np
 from msgspec import UNSET
 
 from synpick_warp.exporters.writing.rle import find_run_boundaries
-from synpick_warp.inputs.image_files import MAX_SIDE
+from synpick_warp.system.inputs.image_files import MAX_SIDE
 from synpick_warp.validation.pictures import Mask
 from synpick_warp.validation.registry import rule
 from synpick_warp.validation.schemas import Annotation

@@ -11,7 +11,7 @@ import msgspec
 from synpick_warp.dataset.bop.images import SUFFIXES
 from synpick_warp.dataset.bop.layout import is_index
 from synpick_warp.errors import DatasetError
-from synpick_warp.inputs.json import decode_json
+from synpick_warp.system.inputs.json import decode_json
 from synpick_warp.validation.registry import Level, rule
 from synpick_warp.validation.scene_files import FolderScene
 from synpick_warp.validation.subjects import MASKS, SceneSubject, TreeSubject

@@ -25,7 +25,7 @@ from synpick_warp.evaluation.results import write_results
 from synpick_warp.evaluation.truth import read_truth
 from synpick_warp.factory import assembly
 from synpick_warp.pipeline import run_bake
-from synpick_warp.progress import SilentProgress
+from synpick_warp.system.progress import SilentProgress
 from tests.estimation.fakes import FakeEstimator
 from tests.harness.fuzz import fuzz_examples
 from tests.harness.hostile import LEAVES, WHOLE, places, removed, replaced

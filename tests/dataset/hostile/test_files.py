@@ -27,8 +27,8 @@ from synpick_warp.dataset.view_files import SceneShards
 from synpick_warp.errors import DatasetError
 from synpick_warp.exporters.bop.exporter import BopExporter
 from synpick_warp.exporters.bop.shards.exporter import ShardsExporter
-from synpick_warp.inputs.image_files import decode_image, image_size
-from synpick_warp.inputs.tar_files import list_members
+from synpick_warp.system.inputs.image_files import decode_image, image_size
+from synpick_warp.system.inputs.tar_files import list_members
 from tests.harness.exporter_contract import LENSES, export
 from tests.harness.fuzz import fuzz_examples
 from tests.harness.hostile import places, replaced

@@ -18,7 +18,6 @@ import numpy as np
 import pytest
 import trimesh
 
-from synpick_warp.codecs.jpeg import encode_jpeg
 from synpick_warp.configs.schema import Config
 from synpick_warp.configs.sensors import Effects
 from synpick_warp.errors import CatalogError, OutputError
@@ -30,6 +29,7 @@ from synpick_warp.exporters.writing.files import check_output_folder
 from synpick_warp.exporters.writing.folder import open_folder
 from synpick_warp.exporters.writing.png import encode_png
 from synpick_warp.scenes.types import Catalog
+from synpick_warp.system.codecs.jpeg import encode_jpeg
 from tests.exporters.writing.test_rle import decode
 from tests.harness.exporter_contract import ExporterContract, digests, export, export_context, exporting, feed, finish, with_files
 from tests.worlds.box_views import OBJECT_IDS, SIZES, batches, cameras, catalog, config, ends, poses

@@ -18,9 +18,9 @@ from synpick_warp import memory_plan
 from synpick_warp.configs.schema import Config
 from synpick_warp.factory import assembly
 from synpick_warp.pipeline import run_bake
-from synpick_warp.progress import SilentProgress
 from synpick_warp.stages import ticks
 from synpick_warp.stages.stream import FrameStream
+from synpick_warp.system.progress import SilentProgress
 from tests.harness.exporter_contract import digests
 from tests.worlds.sights import SHORT
 from tests.worlds.small_worlds import catalog, settings

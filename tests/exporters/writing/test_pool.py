@@ -18,7 +18,7 @@ import pytest
 from synpick_warp.errors import OutputError
 from synpick_warp.exporters.writing import pool as pool_module
 from synpick_warp.exporters.writing.pool import NICENESS, QUEUE_DEPTH, WriterPool, WriteTask
-from synpick_warp.system.shared_memory import shared_bytes
+from synpick_warp.system.processes.shared_memory import shared_bytes
 from tests.harness.environment import checkout_environment
 from tests.harness.processes import wait_until_gone
 

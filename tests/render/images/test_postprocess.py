@@ -25,7 +25,7 @@ from synpick_warp.scenes.assets.appearance import linear_to_srgb, srgb_to_linear
 from synpick_warp.stages.render.postprocess import PostProcessor
 from synpick_warp.stages.render.scene import build_cameras, build_grid
 from synpick_warp.stages.render.view_setup import make_views
-from synpick_warp.system.device import pick_device
+from synpick_warp.system.hardware.device import pick_device
 from tests.harness.devices import default_device
 from tests.worlds.toy_scene import UPRIGHT, ToyScene, box, camera, entry, render
 

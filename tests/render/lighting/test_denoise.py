@@ -8,7 +8,7 @@ import warp as wp
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from synpick_warp.system.device import pick_device
+from synpick_warp.system.hardware.device import pick_device
 from tests.harness.denoise_probe import FlatDenoiser, shrink_kernel, surface_kernel
 from tests.harness.devices import default_device
 

@@ -17,7 +17,7 @@ from synpick_warp.scenes.types import Fixture, TriangleMesh
 from synpick_warp.stages.launch import launch_pixels
 from synpick_warp.stages.render import raster
 from synpick_warp.stages.render.view_setup import make_views
-from synpick_warp.system.device import pick_device
+from synpick_warp.system.hardware.device import pick_device
 from tests.harness.devices import default_device
 from tests.harness.trace_probe import trace_gbuffer_kernel
 from tests.worlds.toy_scene import GREY, UPRIGHT, ToyScene, ball, box, camera, entry, flat_shaded, render, render_gbuffer, sheet

@@ -19,7 +19,7 @@ from synpick_warp.stages.render.wide_bvh import (
     build_wide_bvh,
     needed_stack,
 )
-from synpick_warp.system.device import pick_device
+from synpick_warp.system.hardware.device import pick_device
 from tests.harness.bvh_probe import count_visits_kernel, hit_every_triangle_kernel, query_kernel
 from tests.harness.devices import default_device
 from tests.worlds.toy_scene import ball, box

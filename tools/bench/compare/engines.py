@@ -13,7 +13,7 @@ import warp as wp
 
 from synpick_warp.configs.schema import Physics, Tote
 from synpick_warp.stages.sim.physics import make_pipeline, make_solver, may_capture
-from synpick_warp.system.cores import count_cores
+from synpick_warp.system.hardware.cores import count_cores
 from tools.bench.compare.piles import Pile, build_piles
 
 WARM_STEPS = 2

@@ -13,8 +13,8 @@ import warp as wp
 from synpick_warp.configs.schema import Config, Physics, Tote
 from synpick_warp.errors import SynpickError
 from synpick_warp.factory.assembly import build_factory
-from synpick_warp.progress import SilentProgress
 from synpick_warp.stages.sim.simulate import Simulation
+from synpick_warp.system.progress import SilentProgress
 from tools.bench import physics
 from tools.bench.compare.engines import CONES, Engine, MujocoEngine, make_mujoco_warp, make_ours
 from tools.bench.compare.piles import Pile, pick_pile

@@ -27,9 +27,9 @@ from synpick_warp.exporters.bop.view import ANNOTATIONS, ViewSettings, annotatio
 from synpick_warp.exporters.writing.files import PARTIAL, output_error, sync_folder, write_synced
 from synpick_warp.exporters.writing.folder import open_folder
 from synpick_warp.exporters.writing.rle import Runs
-from synpick_warp.inputs.files import read_file
-from synpick_warp.inputs.json import MAX_JSON, decode_json, read_json
-from synpick_warp.inputs.paths import path_inside
+from synpick_warp.system.inputs.files import read_file
+from synpick_warp.system.inputs.json import MAX_JSON, decode_json, read_json
+from synpick_warp.system.inputs.paths import path_inside
 
 FOLDER = Path("coco")
 """Folder in the data set."""

@@ -19,7 +19,7 @@ from synpick_warp.exporters.bop.view import ViewSettings, make_rle, to_json
 from synpick_warp.exporters.writing.files import sync_folder
 from synpick_warp.exporters.writing.folder import Buffer, open_folder
 from synpick_warp.exporters.writing.rle import Runs
-from synpick_warp.inputs.tar_files import list_members
+from synpick_warp.system.inputs.tar_files import list_members
 
 MAX_SHARD_VIEWS = 1000
 """Maximum number of views in a shard, as in the toolkit (convert_imagewise_to_webdataset.py)."""

@@ -17,14 +17,14 @@ from synpick_warp.exporters.bop.shared.toolkit import describe_toolkit
 from synpick_warp.exporters.bop.view import MILLIMETERS
 from synpick_warp.exporters.writing.notes import CAMERA_FILE, write_camera
 from synpick_warp.exporters.writing.png import encode_png
-from synpick_warp.inputs.image_files import TEXTURE_KINDS
-from synpick_warp.inputs.paths import path_inside
 from synpick_warp.scenes.assets.appearance import decode_texture, linear_to_srgb, srgb_to_linear
 from synpick_warp.scenes.assets.asset_files import MissingFileError
 from synpick_warp.scenes.assets.models_info import corrected_entry, read_entries
 from synpick_warp.scenes.assets.ply import read_ply_file, read_ply_texture
 from synpick_warp.scenes.types import Camera, Catalog, CatalogEntry, Material
 from synpick_warp.system.folders import make_folder
+from synpick_warp.system.inputs.image_files import TEXTURE_KINDS
+from synpick_warp.system.inputs.paths import path_inside
 from synpick_warp.views.layer_codec import layer_notes
 
 MODEL_FOLDERS = ("models", "models_eval")

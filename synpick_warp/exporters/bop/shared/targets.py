@@ -14,8 +14,8 @@ import msgspec
 from synpick_warp.configs.splits import DataLayout, split_kind
 from synpick_warp.errors import DatasetError
 from synpick_warp.exporters.writing.files import write_atomically
-from synpick_warp.inputs.json import read_json
-from synpick_warp.inputs.paths import path_inside
+from synpick_warp.system.inputs.json import read_json
+from synpick_warp.system.inputs.paths import path_inside
 
 BOP19, BOP24 = "test_targets_bop19.json", "test_targets_bop24.json"
 

@@ -12,7 +12,7 @@ from typing import Any, TypeVar
 import msgspec
 
 from synpick_warp.errors import SynpickError
-from synpick_warp.inputs.files import read_file
+from synpick_warp.system.inputs.files import read_file
 
 MAX_JSON = 2**29
 """Largest JSON file [bytes]; the annotations of a long episode at full HD have some 10 MB."""

@@ -31,10 +31,10 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 from synpick_warp.errors import SynpickError
-from synpick_warp.inputs.files import describe_bytes
-from synpick_warp.system.cores import count_cores
-from synpick_warp.system.processes import ProcessError, WorkerProcess, start_process
-from synpick_warp.system.threads import SETUP
+from synpick_warp.system.hardware.cores import count_cores
+from synpick_warp.system.inputs.files import describe_bytes
+from synpick_warp.system.processes.threads import SETUP
+from synpick_warp.system.processes.worker import ProcessError, WorkerProcess, start_process
 
 MODULES = ("synpick_warp.scenes.catalog", "synpick_warp.scenes.lights")
 """What the server imports before it forks; functions of other modules work too, but import theirs in each call."""
@@ -96,7 +96,7 @@ class _Server:
         with theirs, self._lock:
             if fresh or self._worker is None or self._worker.process.poll() is not None:
                 self.stop()
-                program = f"from synpick_warp.system.isolation import main; main({MODULES!r})"
+                program = f"from synpick_warp.system.processes.isolation import main; main({MODULES!r})"
                 self._worker = start_process(program, environment=_ENVIRONMENT, has_threads=True)
             with socket.socket(fileno=os.dup(self._worker.link.fileno())) as control, contextlib.suppress(OSError):
                 socket.send_fds(control, [b"r"], [theirs.fileno(), result])

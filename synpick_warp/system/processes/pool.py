@@ -20,9 +20,9 @@ from typing import Any, Self
 
 from synpick_warp.errors import SynpickError
 from synpick_warp.system.descriptors import open_standard_descriptors
-from synpick_warp.system.processes import END_TIMEOUT, ProcessError, WorkerProcess, send, start_process
+from synpick_warp.system.processes.worker import END_TIMEOUT, ProcessError, WorkerProcess, send, start_process
 
-_PROGRAM = "from synpick_warp.system.pool import main; main()"
+_PROGRAM = "from synpick_warp.system.processes.pool import main; main()"
 _AHEAD = 8
 """Size of the reorder buffer of an ordered map [results per process]: while it is full, no further task is started."""
 

@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import BinaryIO
 
 from synpick_warp.errors import DatasetError
-from synpick_warp.inputs.files import check_regular_file, describe_bytes
-from synpick_warp.inputs.image_files import MAX_IMAGE_FILE
+from synpick_warp.system.inputs.files import check_regular_file, describe_bytes
+from synpick_warp.system.inputs.image_files import MAX_IMAGE_FILE
 
 MAX_SHARD = 2**44
 """Largest shard [bytes]: the limit of a file on ext4."""

@@ -19,7 +19,7 @@ from typing import Any, NamedTuple, Self
 import warp as wp
 from warp._src import context
 
-from synpick_warp.system.cores import count_cores
+from synpick_warp.system.hardware.cores import count_cores
 
 MAX_COMPILERS = 16
 """Maximum number of compiling threads: the longest module of a bake takes as long as 16 threads need for all others."""

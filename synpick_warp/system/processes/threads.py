@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from typing import TypeVar
 
-from synpick_warp.system.cores import count_cores
+from synpick_warp.system.hardware.cores import count_cores
 
 PIXELS, COPIES, LINK, SETUP = "pixels", "copies", "bake link", "setup"
 """Name prefixes of this package's threads. PIXELS threads launch kernels only while the caller waits; the others never do."""

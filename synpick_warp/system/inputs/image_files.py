@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from synpick_warp.errors import SynpickError
-from synpick_warp.inputs.files import read_file
+from synpick_warp.system.inputs.files import read_file
 
 if TYPE_CHECKING:
     import numpy as np
@@ -137,7 +137,7 @@ def decode_picture(data: bytes, source: object, error: type[SynpickError], size:
 
 def _decode_grey(data: bytes, size: tuple[int, int]) -> np.ndarray | None:
     """Greyscale image of a PNG file by `inputs.png_crop`; None: it is left to OpenCV."""
-    from synpick_warp.inputs.png_crop import decode_grey_crop
+    from synpick_warp.system.inputs.png_crop import decode_grey_crop
 
     if data[24:25] not in (b"\x08", b"\x10"):
         return None

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from synpick_warp.errors import SynpickError
-from synpick_warp.inputs.files import read_file
+from synpick_warp.system.inputs.files import read_file
 
 MAX_TOML = 2**20
 """Largest TOML file [bytes]; all settings with comments have 30 kB."""

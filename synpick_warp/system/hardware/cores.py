@@ -7,7 +7,7 @@ import os
 from collections.abc import Iterator
 from pathlib import Path
 
-from synpick_warp.system.control_groups import list_control_groups, read_text
+from synpick_warp.system.hardware.control_groups import list_control_groups, read_text
 
 
 def count_cores(root: Path = Path("/")) -> int:
