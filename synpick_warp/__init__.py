@@ -22,7 +22,7 @@ from synpick_warp.system.processes.garbage import collection_paused
 if TYPE_CHECKING:
     from synpick_warp.configs.schema import Config
     from synpick_warp.dataset.reading import DataSet
-    from synpick_warp.episodes import BakeSummary
+    from synpick_warp.factory.episodes import BakeSummary
     from synpick_warp.online.stream import ViewStream
     from synpick_warp.system.progress import Progress
 
@@ -74,7 +74,7 @@ def bake(
     """
     with collection_paused():
         from synpick_warp.configs.schema import Config
-        from synpick_warp.pipeline import run_bake
+        from synpick_warp.factory.pipeline import run_bake
         from synpick_warp.system.progress import SilentProgress
 
     if not isinstance(config, Config):

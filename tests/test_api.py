@@ -21,9 +21,9 @@ HEAVY = ("warp", "newton", "numpy", "cv2", "zarr", "pxr", "trimesh", "scipy", "c
 @pytest.fixture
 def calls(monkeypatch) -> list:
     """A stand-in for the pipeline collects the arguments of each bake."""
-    module, calls = types.ModuleType("synpick_warp.pipeline"), []
+    module, calls = types.ModuleType("synpick_warp.factory.pipeline"), []
     module.run_bake = lambda *arguments: calls.append(arguments)
-    monkeypatch.setitem(sys.modules, "synpick_warp.pipeline", module)
+    monkeypatch.setitem(sys.modules, "synpick_warp.factory.pipeline", module)
     return calls
 
 

@@ -20,7 +20,7 @@ from synpick_warp.errors import OutputError
 from synpick_warp.exporters.bop.exporter import BopExporter
 from synpick_warp.exporters.writing.png import frame_depth_png
 from synpick_warp.factory import assembly
-from synpick_warp.pipeline import run_bake
+from synpick_warp.factory.pipeline import run_bake
 from synpick_warp.stages import ticks, timing
 from synpick_warp.stages.ticks import TickLoop
 from synpick_warp.system.progress import SilentProgress

@@ -8,7 +8,7 @@ import pytest
 
 from synpick_warp.codes import Ending
 from synpick_warp.configs.schema import Config
-from synpick_warp.episodes import remedy
+from synpick_warp.factory.episodes import remedy
 
 CURED = {Ending.UNSETTLED, Ending.ARRANGEMENT_OVERFLOW, Ending.SOLVER_OVERFLOW, Ending.PERCEPTION_OVERFLOW}
 

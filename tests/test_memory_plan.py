@@ -10,13 +10,12 @@ from hypothesis import given
 from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
 
-from synpick_warp import memory_plan, pipeline
 from synpick_warp.configs.fields import INT32_MAX
 from synpick_warp.configs.load import load_config, sections, settings_of
 from synpick_warp.configs.schema import FAST, REFERENCE, UNOCCLUDED, Config, Physics, Settle
 from synpick_warp.errors import ConfigError, SynpickError
-from synpick_warp.factory import assembly
-from synpick_warp.memory_plan import check_memory, describe_memory, plan_memory
+from synpick_warp.factory import assembly, memory_plan, pipeline
+from synpick_warp.factory.memory_plan import check_memory, describe_memory, plan_memory
 from synpick_warp.system.hardware.free_memory import free_host_memory
 from synpick_warp.system.progress import SilentProgress
 from tests.harness.fuzz import fuzz_examples

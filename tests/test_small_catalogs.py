@@ -6,7 +6,7 @@ import pytest
 import trimesh
 
 from synpick_warp.configs.load import load_config
-from synpick_warp.pipeline import run_bake
+from synpick_warp.factory.pipeline import run_bake
 from synpick_warp.system.progress import SilentProgress
 from tests.harness.bake_server import TINY
 from tests.worlds.small_worlds import QUICK

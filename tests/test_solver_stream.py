@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from synpick_warp.factory import assembly
-from synpick_warp.pipeline import run_bake
+from synpick_warp.factory.pipeline import run_bake
 from synpick_warp.stages.render_streams import RenderStreams
 from synpick_warp.stages.sim.physics import Physics
 from synpick_warp.system.progress import SilentProgress

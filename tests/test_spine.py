@@ -18,7 +18,7 @@ import warp as wp
 import synpick_warp
 from synpick_warp.exporters.bop.exporter import BopExporter
 from synpick_warp.factory import assembly
-from synpick_warp.pipeline import run_bake
+from synpick_warp.factory.pipeline import run_bake
 from synpick_warp.system.progress import SilentProgress
 from tests.harness.exporter_contract import export
 from tests.test_bake import tiny

@@ -363,7 +363,7 @@ def _bake(config: Config, out: Path, shard: tuple[int, int], splits: Sequence[st
     _check_inputs(config.bake.models, config.bake.lights)
     check_output_folder(out)
     with collection_paused():
-        from synpick_warp.pipeline import run_bake
+        from synpick_warp.factory.pipeline import run_bake
 
     console = make_console()
     with make_progress(console) as progress:

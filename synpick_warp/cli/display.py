@@ -18,7 +18,7 @@ from synpick_warp.system.progress import Progress
 
 if TYPE_CHECKING:
     from synpick_warp.codes import Ending, Outcome
-    from synpick_warp.episodes import BakeSummary, EpisodeRow
+    from synpick_warp.factory.episodes import BakeSummary, EpisodeRow
     from synpick_warp.stages.timing import Recorder
 
 PLAIN_WIDTH = 120

@@ -48,8 +48,8 @@ def describe_machine(device: wp.Device) -> list[tuple[str, str]]:
 
 def memory_report(config: Config) -> Table:
     """Table of shape, unit and size of every array in the memory plan of a bake with these settings, and their sum."""
-    from synpick_warp.memory_plan import describe_memory
-    from synpick_warp.scheduling.sizes import count_writers, fit_to_device, without_pictures
+    from synpick_warp.factory.memory_plan import describe_memory
+    from synpick_warp.factory.sizes import count_writers, fit_to_device, without_pictures
 
     episodes = sum(map(len, DataLayout.of(config).plan()))
     config = fit_to_device(without_pictures(config), pick_device(config.bake.device), episodes, count_writers(config))

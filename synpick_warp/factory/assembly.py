@@ -13,20 +13,20 @@ from dataclasses import dataclass
 import numpy as np
 import warp as wp
 
-from synpick_warp.attempts import AttemptLog
 from synpick_warp.configs.schema import Config
 from synpick_warp.configs.splits import DataLayout
 from synpick_warp.exporters.registry import Needs
+from synpick_warp.factory.attempts import AttemptLog
 from synpick_warp.factory.compilation import is_cache_warm, make_compiler, sole_compiler, submit_launches, submit_slow
-from synpick_warp.memory_plan import check_memory
+from synpick_warp.factory.memory_plan import check_memory
+from synpick_warp.factory.order import order_longest_first
+from synpick_warp.factory.sizes import count_writers, fit_to_device, without_pictures
 from synpick_warp.scenes.build import find_repeat_rules, with_capacities, with_repeats
 from synpick_warp.scenes.cameras import make_cameras
 from synpick_warp.scenes.catalog import load_catalog
 from synpick_warp.scenes.fixtures import make_fixtures
 from synpick_warp.scenes.lights import load_lights
 from synpick_warp.scenes.types import Camera, Catalog, EnvironmentMap
-from synpick_warp.scheduling.order import order_longest_first
-from synpick_warp.scheduling.sizes import count_writers, fit_to_device, without_pictures
 from synpick_warp.stages.host_copies import host_images
 from synpick_warp.stages.render.renderer import Renderer
 from synpick_warp.stages.render.scene import RenderScene, build_render_scene

@@ -10,7 +10,7 @@ from synpick_warp.configs.fields import INT32_MAX
 from synpick_warp.configs.schema import Config
 from synpick_warp.configs.splits import DataLayout, check_shard
 from synpick_warp.errors import ConfigError
-from synpick_warp.memory_plan import check_episodes
+from synpick_warp.factory.memory_plan import check_episodes
 
 
 @dataclass(frozen=True)

@@ -20,12 +20,12 @@ import warp as wp
 from synpick_warp.codes import Phase
 from synpick_warp.configs.schema import Config
 from synpick_warp.configs.splits import DataLayout
-from synpick_warp.episodes import BakeSummary, episode_row, is_resampled, remedy
 from synpick_warp.errors import ConfigError
 from synpick_warp.factory.assembly import Stages, build_stages, compiling_if_cold
-from synpick_warp.memory_plan import check_episodes, check_memory, explain_shortage
+from synpick_warp.factory.episodes import BakeSummary, episode_row, is_resampled, remedy
+from synpick_warp.factory.memory_plan import check_episodes, check_memory, explain_shortage
+from synpick_warp.factory.sizes import fit_to_device
 from synpick_warp.online.selection import Selection, choose_episodes
-from synpick_warp.scheduling.sizes import fit_to_device
 from synpick_warp.stages.buffers import Snapshot
 from synpick_warp.stages.online.batches import BatchRing, ViewBatch
 from synpick_warp.stages.render.view_setup import pair_views

@@ -20,9 +20,9 @@ from synpick_warp.cli import doctor
 from synpick_warp.cli.commands import main
 from synpick_warp.codes import Ending
 from synpick_warp.configs.load import load_config
-from synpick_warp.episodes import BakeSummary, EpisodeRow
 from synpick_warp.errors import DatasetError, DeviceError, OutputError, SynpickError
 from synpick_warp.exporters.writing.pool import WriterPool
+from synpick_warp.factory.episodes import BakeSummary, EpisodeRow
 from synpick_warp.stages import timing
 
 
@@ -38,7 +38,7 @@ def raise_error(error: Exception) -> None:
 @pytest.fixture
 def bakes(monkeypatch):
     """Stand-in for pipeline.py; collects the arguments of each call. `result` may be set to a summary or an error."""
-    module = types.ModuleType("synpick_warp.pipeline")
+    module = types.ModuleType("synpick_warp.factory.pipeline")
     calls = []
 
     def run_bake(config, out, progress, shard, splits, devices):
@@ -54,13 +54,13 @@ def bakes(monkeypatch):
     module.result = finished(4)
     module.calls = calls
     module.run_bake = run_bake
-    monkeypatch.setitem(sys.modules, "synpick_warp.pipeline", module)
-    plan = types.ModuleType("synpick_warp.memory_plan")
+    monkeypatch.setitem(sys.modules, "synpick_warp.factory.pipeline", module)
+    plan = types.ModuleType("synpick_warp.factory.memory_plan")
     plan.describe_memory = lambda config: [("Snapshot.pose", (config.bake.worlds, 24), "m", 2 * 1024**2), ("Goals.goal", (4,), "", 0)]
-    monkeypatch.setitem(sys.modules, "synpick_warp.memory_plan", plan)
-    sizes = types.ModuleType("synpick_warp.scheduling.sizes")
+    monkeypatch.setitem(sys.modules, "synpick_warp.factory.memory_plan", plan)
+    sizes = types.ModuleType("synpick_warp.factory.sizes")
     sizes.fit_to_device, sizes.without_pictures, sizes.count_writers = lambda config, *_: config, lambda config: config, lambda _: 1
-    monkeypatch.setitem(sys.modules, "synpick_warp.scheduling.sizes", sizes)
+    monkeypatch.setitem(sys.modules, "synpick_warp.factory.sizes", sizes)
     return module
 
 

@@ -12,7 +12,7 @@ from rich.console import Console
 from synpick_warp.cli import display
 from synpick_warp.cli.display import CountProgress, LiveProgress, PlainProgress, print_summary
 from synpick_warp.codes import Ending, Outcome
-from synpick_warp.episodes import BakeSummary, EpisodeRow
+from synpick_warp.factory.episodes import BakeSummary, EpisodeRow
 from synpick_warp.system.progress import Progress, SilentProgress
 
 

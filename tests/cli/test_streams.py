@@ -97,7 +97,7 @@ def test_rich_prints_into_an_ascii_stream(tmp_path, monkeypatch):
 
 
 BAKE_ON_FULL_DEVICE = """
-import sys, synpick_warp.pipeline as pipeline
+import sys, synpick_warp.factory.pipeline as pipeline
 from synpick_warp.cli.commands import main
 def build(*_, **__): raise AssertionError("the bake goes on")
 # No kernels are compiled or loaded, whatever the load of the machine: the first line comes before, and ends the bake.

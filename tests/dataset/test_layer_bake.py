@@ -13,7 +13,7 @@ import pytest
 from synpick_warp.configs.schema import LAYERS
 from synpick_warp.dataset.manifest import episode_entry, read_checksums
 from synpick_warp.factory import assembly
-from synpick_warp.pipeline import run_bake
+from synpick_warp.factory.pipeline import run_bake
 from synpick_warp.system.progress import SilentProgress
 from synpick_warp.views.layer_codec import read_layer
 from tests.worlds.sights import SHORT

@@ -12,7 +12,7 @@ from synpick_warp.cli.commands import main
 from synpick_warp.evaluation.results import write_results
 from synpick_warp.evaluation.truth import read_truth
 from synpick_warp.factory import assembly
-from synpick_warp.pipeline import run_bake
+from synpick_warp.factory.pipeline import run_bake
 from synpick_warp.system.progress import SilentProgress
 from tests.harness.bake_server import TINY
 from tests.worlds.small_worlds import catalog, settings

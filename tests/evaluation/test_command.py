@@ -175,9 +175,7 @@ def test_visibility_that_no_instance_has_is_refused(folder, files, tmp_path, cap
 
 
 def test_a_bake_does_not_import_the_evaluation():
-    program = (
-        "import sys, synpick_warp.cli.commands, synpick_warp.pipeline; print([n for n in sys.modules if n.startswith('synpick_warp.eval')])"
-    )
+    program = "import sys, synpick_warp.cli.commands, synpick_warp.factory.pipeline; print([n for n in sys.modules if n.startswith('synpick_warp.eval')])"
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=120, check=True)
     assert done.stdout.strip().splitlines()[-1] == "[]"
 

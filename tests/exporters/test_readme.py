@@ -7,11 +7,11 @@ import re
 from pathlib import Path
 
 import synpick_warp.exporters
-from synpick_warp.attempts import AttemptRecord, InstanceObservation
 from synpick_warp.codes import Effect, Outcome, names
-from synpick_warp.episodes import EpisodeRow
 from synpick_warp.exporters.formats import FORMAT_TABLE
 from synpick_warp.exporters.trajectory.arrays import CONSTANT_GROUPS, EPISODE_GROUPS
+from synpick_warp.factory.attempts import AttemptRecord, InstanceObservation
+from synpick_warp.factory.episodes import EpisodeRow
 from synpick_warp.views.layers import LAYER_TABLE
 
 README = Path(synpick_warp.exporters.__file__).with_name("README.md")

@@ -103,9 +103,8 @@ def arguments(request: dict) -> list[str]:
 
 
 def _serve() -> None:
-    from synpick_warp import pipeline
     from synpick_warp.cli import commands
-    from synpick_warp.factory import assembly
+    from synpick_warp.factory import assembly, pipeline
 
     assembly.load_catalog = pipeline.load_catalog = lambda config, report: catalog()
     answer = os.dup(1)
@@ -133,8 +132,8 @@ def _serve() -> None:
 
 def _prepare(request: dict) -> None:
     """Inject the faults that a request names."""
-    from synpick_warp import pipeline
     from synpick_warp.exporters.writing.pool import WriterPool
+    from synpick_warp.factory import pipeline
 
     if "alone" in request:
         # Write files in the bake's own process.

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from types import SimpleNamespace
 
 from synpick_warp.errors import OutputError
-from synpick_warp.scheduling.worker import BakeLink
+from synpick_warp.factory.worker import BakeLink
 from synpick_warp.system.processes.worker import start_process
 
 FOREVER = 60.0
@@ -20,7 +20,7 @@ _SLEEPER = f"import time; time.sleep({FOREVER})"
 
 def program(behaviour: str) -> str:
     """Program of a process that behaves as the function of this module with that name."""
-    return f"from synpick_warp.scheduling.worker import main; from {__name__} import {behaviour}; main({behaviour})"
+    return f"from synpick_warp.factory.worker import main; from {__name__} import {behaviour}; main({behaviour})"
 
 
 def finish(share: SimpleNamespace, _: Sequence[int], link: BakeLink) -> SimpleNamespace:

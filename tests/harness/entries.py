@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from synpick_warp.codes import Ending
-from synpick_warp.episodes import EpisodeRow
+from synpick_warp.factory.episodes import EpisodeRow
 
 
 def episode_content(episode: int, frames: int = 3, attempts: Sequence[dict[str, Any]] = ()) -> dict[str, Any]:

@@ -12,10 +12,10 @@ from synpick_warp.configs.schema import FORMATS, Config
 from synpick_warp.configs.splits import DataLayout
 from synpick_warp.dataset.manifest import episode_entry, read_entry
 from synpick_warp.dataset.writing import OutputFolder, finalize_data_set
-from synpick_warp.episodes import BakeSummary, EpisodeRow
 from synpick_warp.exporters.base import ExportContext
 from synpick_warp.exporters.registry import Exporters, Needs
 from synpick_warp.exporters.writing.pool import WriterPool
+from synpick_warp.factory.episodes import BakeSummary, EpisodeRow
 from synpick_warp.scenes.embedded.skies import skies
 from synpick_warp.views.frames import EpisodeEnd
 from tests.worlds import box_views, trajectories

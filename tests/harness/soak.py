@@ -24,10 +24,10 @@ from synpick_warp.codes import Ending
 from synpick_warp.configs.schema import FORMATS, Config
 from synpick_warp.dataset.manifest import episode_entry, read_entry
 from synpick_warp.dataset.writing import OutputFolder
-from synpick_warp.episodes import EpisodeRow
 from synpick_warp.exporters.base import ExportContext
 from synpick_warp.exporters.registry import Exporters, Needs
 from synpick_warp.exporters.writing.pool import WriterPool
+from synpick_warp.factory.episodes import EpisodeRow
 from synpick_warp.scenes.embedded.skies import skies
 from synpick_warp.views.frames import EpisodeEnd, FrameBatch, TickBatch
 from tests.worlds import box_views, trajectories

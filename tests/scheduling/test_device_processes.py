@@ -13,7 +13,7 @@ from types import SimpleNamespace
 import pytest
 
 from synpick_warp.errors import DeviceError, OutputError
-from synpick_warp.scheduling.devices import DeviceProcesses
+from synpick_warp.factory.devices import DeviceProcesses
 from synpick_warp.system.hardware import device as devices
 from synpick_warp.system.hardware.device import describe_kinds, pick_devices
 from tests.harness.device_programs import program
@@ -138,7 +138,7 @@ def pids(reports: Reports) -> list[int]:
 PARENT = """
 import os, sys
 from types import SimpleNamespace
-from synpick_warp.scheduling.devices import DeviceProcesses
+from synpick_warp.factory.devices import DeviceProcesses
 from tests.harness.device_programs import program
 reports = SimpleNamespace(note=lambda text: print(text, flush=True))
 with DeviceProcesses(["cuda:0", "cuda:1"], program("wait_for_stop"), os.open("/", os.O_RDONLY)) as processes:

@@ -7,12 +7,11 @@ from typing import Any
 
 import pytest
 
-from synpick_warp import memory_plan
 from synpick_warp.configs.load import load_config
 from synpick_warp.configs.schema import Config
-from synpick_warp.memory_plan import check_memory, plan_memory
-from synpick_warp.scheduling import sizes
-from synpick_warp.scheduling.sizes import (
+from synpick_warp.factory import memory_plan, sizes
+from synpick_warp.factory.memory_plan import check_memory, plan_memory
+from synpick_warp.factory.sizes import (
     HEADROOM,
     RUNTIME_BYTES,
     advise_processes,

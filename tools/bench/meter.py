@@ -16,7 +16,7 @@ from pathlib import Path
 import warp as wp
 
 from synpick_warp.cli.doctor import GIB
-from synpick_warp.episodes import BakeSummary
+from synpick_warp.factory.episodes import BakeSummary
 from synpick_warp.system.progress import SilentProgress
 from tools.bench.cleaner import Cleaner, Tally
 from tools.bench.usage import Usage, measure_usage

@@ -15,8 +15,8 @@ from synpick_warp.configs.schema import Config
 from synpick_warp.configs.splits import DataLayout
 from synpick_warp.errors import DatasetError
 from synpick_warp.exporters.registry import load_exporter_classes, shared_files
-from synpick_warp.pipeline import run_bake
-from synpick_warp.scheduling.sizes import pick_processes
+from synpick_warp.factory.pipeline import run_bake
+from synpick_warp.factory.sizes import pick_processes
 from synpick_warp.system.hardware.device import pick_device
 from tools.bench.cleaner import Assignment, Cleaner
 from tools.bench.meter import LIVE_FRACTION, SteadyMeter, summarize_rates

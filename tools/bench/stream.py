@@ -12,8 +12,8 @@ import warp as wp
 
 from synpick_warp.codes import Phase
 from synpick_warp.configs.schema import Config
-from synpick_warp.episodes import BakeSummary
 from synpick_warp.factory.assembly import Factory, Stages
+from synpick_warp.factory.episodes import BakeSummary
 from synpick_warp.online.selection import Selection
 from synpick_warp.online.stream import Producer, ViewStream
 from synpick_warp.stages.buffers import Snapshot

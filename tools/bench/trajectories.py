@@ -15,9 +15,9 @@ import numpy as np
 
 from synpick_warp.configs.schema import Config
 from synpick_warp.exporters.registry import Exporters
-from synpick_warp.pipeline import run_bake
+from synpick_warp.factory.order import predict_frames
+from synpick_warp.factory.pipeline import run_bake
 from synpick_warp.scenes.catalog import load_catalog
-from synpick_warp.scheduling.order import predict_frames
 from synpick_warp.system.hardware.device import pick_device
 from synpick_warp.views.frames import TickBatch
 from tools.bench.meter import LIVE_FRACTION, SteadyMeter, summarize_rates

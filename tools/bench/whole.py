@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 
 from synpick_warp.configs.schema import Config
 from synpick_warp.dataset.manifest import committed_episodes
-from synpick_warp.pipeline import run_bake
+from synpick_warp.factory.pipeline import run_bake
 from synpick_warp.system.progress import SilentProgress
 from tools.bench.cleaner import Cleaner
 from tools.bench.meter import LIVE_FRACTION

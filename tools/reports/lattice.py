@@ -35,12 +35,12 @@ from synpick_warp.codes import Segment
 from synpick_warp.configs.schema import FAST, REFERENCE, Config, Render
 from synpick_warp.errors import SynpickError
 from synpick_warp.factory.assembly import Stages, build_stages, make_renderer
+from synpick_warp.factory.sizes import fit_to_device
 from synpick_warp.kernels.render.lighting.history import NEVER
 from synpick_warp.kernels.render.lighting.shadows import STRATA_PERIOD
 from synpick_warp.kernels.tuning import LANE_STRIDE
 from synpick_warp.scenes.cameras import make_cameras
 from synpick_warp.scenes.fixtures import make_fixtures
-from synpick_warp.scheduling.sizes import fit_to_device
 from synpick_warp.stages.buffers import FIXTURES, Snapshot
 from synpick_warp.stages.render.sampling_rates import coarse_size, shadow_size
 from synpick_warp.stages.render.scene import build_render_scene

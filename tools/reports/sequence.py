@@ -26,8 +26,8 @@ from synpick_warp.codes import Phase
 from synpick_warp.configs.schema import FAST, REFERENCE, Config
 from synpick_warp.errors import SynpickError
 from synpick_warp.factory.assembly import build_stages, make_renderer
-from synpick_warp.memory_plan import check_memory, explain_shortage
-from synpick_warp.scheduling.sizes import fit_to_device
+from synpick_warp.factory.memory_plan import check_memory, explain_shortage
+from synpick_warp.factory.sizes import fit_to_device
 from synpick_warp.stages.buffers import Snapshot
 from synpick_warp.stages.stream import TickReader
 from synpick_warp.system.hardware.device import pick_device

@@ -24,7 +24,7 @@ from synpick_warp.estimation import factories
 from synpick_warp.evaluation.results import write_results
 from synpick_warp.evaluation.truth import read_truth
 from synpick_warp.factory import assembly
-from synpick_warp.pipeline import run_bake
+from synpick_warp.factory.pipeline import run_bake
 from synpick_warp.system.progress import SilentProgress
 from tests.estimation.fakes import FakeEstimator
 from tests.harness.fuzz import fuzz_examples

@@ -221,7 +221,7 @@ def test_attempts_of_any_content_are_refused_in_one_line_or_valid(entry, tmp_pat
 
 def check_entry(folder: Path) -> None:
     """Read an entry as a resumed bake does."""
-    from synpick_warp.episodes import BakeSummary
+    from synpick_warp.factory.episodes import BakeSummary
 
     content = read_entry(folder, episode_entry(0))
     assert content is not None

@@ -14,10 +14,9 @@ import pytest
 import zarr
 
 import synpick_warp
-from synpick_warp import memory_plan
 from synpick_warp.configs.schema import Config
-from synpick_warp.factory import assembly
-from synpick_warp.pipeline import run_bake
+from synpick_warp.factory import assembly, memory_plan
+from synpick_warp.factory.pipeline import run_bake
 from synpick_warp.stages import ticks
 from synpick_warp.stages.stream import FrameStream
 from synpick_warp.system.progress import SilentProgress

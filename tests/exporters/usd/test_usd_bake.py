@@ -14,7 +14,7 @@ from scipy.spatial import ConvexHull
 
 from synpick_warp.configs.schema import Config
 from synpick_warp.factory import assembly
-from synpick_warp.pipeline import run_bake
+from synpick_warp.factory.pipeline import run_bake
 from synpick_warp.system.progress import SilentProgress
 from tests.exporters.usd.test_usd import validation_errors
 from tests.harness.exporter_contract import digests

@@ -17,10 +17,10 @@ from synpick_warp.configs.load import load_config
 from synpick_warp.configs.schema import Config
 from synpick_warp.configs.sensors import Effects, effect_ranges
 from synpick_warp.errors import ConfigError
+from synpick_warp.factory.memory_plan import describe_arrays
 from synpick_warp.kernels.render.images.antialias import ShadedImage
 from synpick_warp.kernels.render.images.camera_effects import EffectParameters
 from synpick_warp.kernels.render.lighting.environment import Lights
-from synpick_warp.memory_plan import describe_arrays
 from synpick_warp.scenes.assets.appearance import linear_to_srgb, srgb_to_linear
 from synpick_warp.stages.render.postprocess import PostProcessor
 from synpick_warp.stages.render.scene import build_cameras, build_grid

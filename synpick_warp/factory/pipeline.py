@@ -9,7 +9,6 @@ from pathlib import Path
 
 import numpy as np
 
-from synpick_warp.attempts import EpisodeRecord
 from synpick_warp.codes import Phase
 from synpick_warp.configs.schema import Config
 from synpick_warp.configs.splits import DataLayout
@@ -17,19 +16,20 @@ from synpick_warp.dataset.digests import digest_inputs
 from synpick_warp.dataset.file_names import describe_strays
 from synpick_warp.dataset.manifest import committed_episodes, episode_entry, read_entry
 from synpick_warp.dataset.writing import OutputFolder, commit_episode, finalize_data_set
-from synpick_warp.episodes import BakeSummary, episode_end, episode_row, is_resampled, remedy
 from synpick_warp.errors import OutputError
 from synpick_warp.exporters.base import ExportContext
 from synpick_warp.exporters.registry import Exporters, Needs, aborting
 from synpick_warp.exporters.writing.pool import WriterPool
 from synpick_warp.factory.assembly import Factory, build_factory
-from synpick_warp.memory_plan import check_episodes, explain_shortage
+from synpick_warp.factory.attempts import EpisodeRecord
+from synpick_warp.factory.devices import Share, bake_on_devices, prepare_folder
+from synpick_warp.factory.episodes import BakeSummary, episode_end, episode_row, is_resampled, remedy
+from synpick_warp.factory.memory_plan import check_episodes, explain_shortage
+from synpick_warp.factory.meter import ThroughputMeter
+from synpick_warp.factory.sizes import advise_processes, count_writers, pick_processes
+from synpick_warp.factory.worker import BakeLink
 from synpick_warp.scenes.catalog import load_catalog
 from synpick_warp.scenes.lights import load_lights
-from synpick_warp.scheduling.devices import Share, bake_on_devices, prepare_folder
-from synpick_warp.scheduling.meter import ThroughputMeter
-from synpick_warp.scheduling.sizes import advise_processes, count_writers, pick_processes
-from synpick_warp.scheduling.worker import BakeLink
 from synpick_warp.stages.buffers import Snapshot
 from synpick_warp.stages.launch import limit_threads
 from synpick_warp.stages.stream import TickReport, tick_batch
@@ -41,7 +41,9 @@ from synpick_warp.system.processes.interrupt import StopRequest
 from synpick_warp.system.progress import Progress
 from synpick_warp.views.frames import EpisodeEnd, FrameBatch
 
-_DEVICE_PROGRAM = "from synpick_warp.pipeline import generate_share; from synpick_warp.scheduling.worker import main; main(generate_share)"
+_DEVICE_PROGRAM = (
+    "from synpick_warp.factory.pipeline import generate_share; from synpick_warp.factory.worker import main; main(generate_share)"
+)
 """Program of a device's process, where a bake uses several."""
 MAX_TICK_FRAMES = 256
 """Maximum number of a tick's frames that are handed over before more physics is enqueued: some 30 ms of CPU time. The parts of physics in

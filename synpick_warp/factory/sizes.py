@@ -13,7 +13,7 @@ import warp as wp
 from synpick_warp.configs.schema import Config
 from synpick_warp.exporters.registry import Needs
 from synpick_warp.exporters.writing.pool import QUEUE_DEPTH
-from synpick_warp.memory_plan import Term, free_memory, plan_memory
+from synpick_warp.factory.memory_plan import Term, free_memory, plan_memory
 from synpick_warp.stages.perception.images import count_views
 from synpick_warp.stages.sim.physics import MIN_GPU_WORLDS, with_enough_worlds
 from synpick_warp.stages.stream import views_per_batch

@@ -7,10 +7,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
-from synpick_warp.attempts import EpisodeRecord
 from synpick_warp.codes import Ending, Outcome
 from synpick_warp.configs.schema import Config
 from synpick_warp.configs.splits import DataLayout
+from synpick_warp.factory.attempts import EpisodeRecord
 from synpick_warp.stages.stream import TickReport
 from synpick_warp.views.frames import EpisodeEnd
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 
-from synpick_warp.episodes import BakeSummary
+from synpick_warp.factory.episodes import BakeSummary
 from synpick_warp.system.progress import Progress
 
 

@@ -18,8 +18,8 @@ from synpick_warp.system.processes.threads import LINK
 from synpick_warp.system.processes.worker import send
 
 if TYPE_CHECKING:
-    from synpick_warp.episodes import BakeSummary
-    from synpick_warp.scheduling.devices import Share
+    from synpick_warp.factory.devices import Share
+    from synpick_warp.factory.episodes import BakeSummary
 
 _MAX_FAULT = 200
 """Longest description of an unexpected error [characters]; the standard error stream has its traceback."""

@@ -28,18 +28,18 @@ from synpick_warp.configs.schema import Config
 from synpick_warp.dataset.digests import digest_inputs
 from synpick_warp.dataset.manifest import committed_episodes
 from synpick_warp.dataset.writing import OutputFolder
-from synpick_warp.episodes import BakeSummary
 from synpick_warp.errors import DeviceError
 from synpick_warp.exporters.base import ExportContext
 from synpick_warp.exporters.registry import Exporters, Needs, aborting
 from synpick_warp.exporters.writing.pool import WriterPool
+from synpick_warp.factory.episodes import BakeSummary
+from synpick_warp.factory.order import deal_episodes, deal_writers, order_longest_first
+from synpick_warp.factory.sizes import count_writers
 from synpick_warp.scenes.build import with_repeats
 from synpick_warp.scenes.cameras import make_cameras
 from synpick_warp.scenes.catalog import load_catalog
 from synpick_warp.scenes.lights import load_lights
 from synpick_warp.scenes.types import Catalog, EnvironmentMap
-from synpick_warp.scheduling.order import deal_episodes, deal_writers, order_longest_first
-from synpick_warp.scheduling.sizes import count_writers
 from synpick_warp.system.descriptors import duplicate_above_streams, open_standard_descriptors
 from synpick_warp.system.hardware.caches import KERNEL_VARIABLE
 from synpick_warp.system.hardware.device import describe_kinds, pick_device
