@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 
 import synpick_warp
+from synpick_warp.dataset.pytorch import FIELDS, Views, collate
 from synpick_warp.errors import DatasetError
 from synpick_warp.exporters.bop.exporter import BopExporter
 from synpick_warp.exporters.bop.shards.exporter import ShardsExporter
-from synpick_warp.pytorch import FIELDS, Views, collate
 from tests.harness.exporter_contract import FRAMES
 from tests.worlds.box_sets import EPISODES, write_set
 

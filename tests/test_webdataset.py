@@ -10,10 +10,10 @@ import cv2
 import numpy as np
 import pytest
 
+from synpick_warp.dataset.webdataset import decode_view
 from synpick_warp.errors import DatasetError
 from synpick_warp.exporters.bop.shards.exporter import ShardsExporter
 from synpick_warp.views.layer_codec import decode_layer, encode_layer
-from synpick_warp.webdataset import decode_view
 from tests.harness.exporter_contract import export
 from tests.worlds.box_views import batches, cameras, config
 

@@ -179,7 +179,7 @@ def merge(
 
     Exit codes: 0, all episodes are there; 1, some are in no part; 2, the parts do not match.
     """
-    from synpick_warp.dataset.merge import merge as merge_parts
+    from synpick_warp.dataset.commit.merge import merge as merge_parts
 
     if not parts:
         raise ConfigError("merge needs data sets, and none is named; name the folders that `bake --shard` wrote")

@@ -39,7 +39,7 @@ def convert(
     check_range("--processes", processes, 0, MAX_THREADS)
     from synpick_warp.cli.display import CountProgress, make_console
     from synpick_warp.conversion.run import convert as run_conversion
-    from synpick_warp.dataset.manifest import MANIFEST_FILE
+    from synpick_warp.dataset.commit.manifest import MANIFEST_FILE
 
     names = [name.strip() for name in to.split(",")]
     folder = find_data_set(folder, "synpick-warp convert DIR")

@@ -86,7 +86,7 @@ def choose_output(config: Config) -> tuple[Path, str]:
 
 
 def _is_same_bake(folder: Path, config: Config) -> bool:
-    from synpick_warp.dataset.manifest import CONFIG_FILE, INPUTS, describe_differences, make_manifest, read_manifest, read_settings
+    from synpick_warp.dataset.commit.manifest import CONFIG_FILE, INPUTS, describe_differences, make_manifest, read_manifest, read_settings
 
     if not is_data_set(folder):
         return False

@@ -26,7 +26,7 @@ def verify(
     from rich.console import Console
 
     from synpick_warp.cli.display import CountProgress
-    from synpick_warp.dataset.verify import verify as check
+    from synpick_warp.dataset.commit.verify import verify as check
 
     with CountProgress(Console(stderr=True, highlight=False)) as counter:
         verdict = check(folder, threads or None, counter.report)

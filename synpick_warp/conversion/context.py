@@ -37,7 +37,7 @@ class StoredContext(ExportContext):
         Raises:
             DatasetError: They are not those that it was baked from.
         """
-        from synpick_warp.dataset.digests import digest_inputs
+        from synpick_warp.dataset.commit.digests import digest_inputs
         from synpick_warp.scenes.catalog import load_catalog
         from synpick_warp.scenes.lights import load_lights
 

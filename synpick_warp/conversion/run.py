@@ -12,8 +12,8 @@ from synpick_warp.configs.schema import CLASSIC
 from synpick_warp.conversion.context import StoredContext
 from synpick_warp.conversion.found import convert_found
 from synpick_warp.conversion.source import Source
+from synpick_warp.dataset.commit.writing import OutputFolder, finalize_data_set
 from synpick_warp.dataset.reading import open_data_set
-from synpick_warp.dataset.writing import OutputFolder, finalize_data_set
 from synpick_warp.errors import ConfigError, DatasetError
 from synpick_warp.exporters.formats import FORMAT_TABLE, Content, contents_of, convertible
 from synpick_warp.exporters.registry import Exporters, load_exporter_classes

@@ -15,9 +15,9 @@ from synpick_warp.configs.splits import DataLayout
 from synpick_warp.conversion.scenes import StoredSceneFiles
 from synpick_warp.conversion.trajectories import check_trajectory, read_ticks
 from synpick_warp.dataset.annotations import ADVICE, check_content
-from synpick_warp.dataset.file_names import check_file_names
-from synpick_warp.dataset.frame_counts import check_frames
-from synpick_warp.dataset.manifest import (
+from synpick_warp.dataset.commit.file_names import check_file_names
+from synpick_warp.dataset.commit.frame_counts import check_frames
+from synpick_warp.dataset.commit.manifest import (
     CONSTANTS,
     INPUTS,
     committed_episodes,

@@ -20,8 +20,8 @@ from typing import TYPE_CHECKING, Any
 from synpick_warp.configs.check import format_value
 from synpick_warp.configs.splits import DataLayout, episode_range
 from synpick_warp.dataset.annotations import ADVICE, EpisodeEntry, EpisodeRow, Key, ModelInfo, check_content, read_checked
-from synpick_warp.dataset.frame_counts import check_frames
-from synpick_warp.dataset.manifest import CONFIG_FILE, CONSTANTS, ENTRIES, MANIFEST_FILE, episode_entry, read_checksums
+from synpick_warp.dataset.commit.frame_counts import check_frames
+from synpick_warp.dataset.commit.manifest import CONFIG_FILE, CONSTANTS, ENTRIES, MANIFEST_FILE, episode_entry, read_checksums
 from synpick_warp.dataset.scene_index import SceneIndex, numbered
 from synpick_warp.dataset.trajectory import (
     GROUP_FILE,

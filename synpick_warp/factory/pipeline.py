@@ -12,10 +12,10 @@ import numpy as np
 from synpick_warp.codes import Phase
 from synpick_warp.configs.schema import Config
 from synpick_warp.configs.splits import DataLayout
-from synpick_warp.dataset.digests import digest_inputs
-from synpick_warp.dataset.file_names import describe_strays
-from synpick_warp.dataset.manifest import committed_episodes, episode_entry, read_entry
-from synpick_warp.dataset.writing import OutputFolder, commit_episode, finalize_data_set
+from synpick_warp.dataset.commit.digests import digest_inputs
+from synpick_warp.dataset.commit.file_names import describe_strays
+from synpick_warp.dataset.commit.manifest import committed_episodes, episode_entry, read_entry
+from synpick_warp.dataset.commit.writing import OutputFolder, commit_episode, finalize_data_set
 from synpick_warp.errors import OutputError
 from synpick_warp.exporters.base import ExportContext
 from synpick_warp.exporters.registry import Exporters, Needs, aborting

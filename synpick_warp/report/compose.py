@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from synpick_warp import __version__
-from synpick_warp.dataset.manifest import read_manifest
+from synpick_warp.dataset.commit.manifest import read_manifest
 from synpick_warp.dataset.reading import DataSet
 from synpick_warp.dataset.view import View
 from synpick_warp.errors import DatasetError, OutputError

@@ -10,7 +10,7 @@ import numpy as np
 
 from synpick_warp.codes import Outcome
 from synpick_warp.configs.schema import Config
-from synpick_warp.dataset.manifest import episode_entry
+from synpick_warp.dataset.commit.manifest import episode_entry
 from synpick_warp.dataset.reading import DataSet
 from synpick_warp.dataset.view import View
 from synpick_warp.errors import DatasetError

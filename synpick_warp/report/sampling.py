@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from synpick_warp.dataset.annotations import check_content
-from synpick_warp.dataset.manifest import episode_entry
+from synpick_warp.dataset.commit.manifest import episode_entry
 from synpick_warp.dataset.reading import DataSet
 from synpick_warp.dataset.view import View
 from synpick_warp.scenes.environment import LUMINANCE

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, fields
 import numpy as np
 
 from synpick_warp.dataset.annotations import check_content
-from synpick_warp.dataset.manifest import episode_entry
+from synpick_warp.dataset.commit.manifest import episode_entry
 from synpick_warp.dataset.reading import DataSet
 from synpick_warp.dataset.view_files import check_planes
 from synpick_warp.errors import DatasetError

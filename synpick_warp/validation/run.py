@@ -11,7 +11,7 @@ import numpy as np
 
 from synpick_warp.dataset.bop.keyed import KeyedFolder
 from synpick_warp.dataset.bop.layout import Layout, SceneRef
-from synpick_warp.dataset.manifest import read_manifest, read_settings
+from synpick_warp.dataset.commit.manifest import read_manifest, read_settings
 from synpick_warp.errors import DatasetError, SynpickError
 from synpick_warp.system.hardware.cores import count_cores
 from synpick_warp.system.processes.pool import WorkerProgram, map_ordered

@@ -11,7 +11,7 @@ from typing import Any
 from synpick_warp.configs.schema import Config
 from synpick_warp.dataset import records
 from synpick_warp.dataset.annotations import ADVICE, check_content
-from synpick_warp.dataset.manifest import ATTEMPTS_FILE
+from synpick_warp.dataset.commit.manifest import ATTEMPTS_FILE
 from synpick_warp.dataset.records import InstanceObservation
 from synpick_warp.errors import DatasetError
 from synpick_warp.system.inputs.files import read_file

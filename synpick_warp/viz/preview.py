@@ -18,7 +18,7 @@ from synpick_warp.configs.schema import Config
 from synpick_warp.configs.splits import DataLayout
 from synpick_warp.dataset.bop.layout import NoLayoutError
 from synpick_warp.dataset.bop.scenes import FoundScenes
-from synpick_warp.dataset.manifest import CONFIG_FILE, episode_entry, read_entry
+from synpick_warp.dataset.commit.manifest import CONFIG_FILE, episode_entry, read_entry
 from synpick_warp.dataset.object_names import object_names
 from synpick_warp.dataset.view_files import SceneFiles, check_planes
 from synpick_warp.errors import DatasetError, OutputError, SynpickError

@@ -17,7 +17,7 @@ from synpick_warp.configs.modes import may_pick
 from synpick_warp.configs.schema import Split
 from synpick_warp.configs.splits import DataLayout, episode_range
 from synpick_warp.configs.write import config_to_toml
-from synpick_warp.dataset.manifest import make_manifest
+from synpick_warp.dataset.commit.manifest import make_manifest
 from synpick_warp.errors import ConfigError
 from tests.twins import rng
 

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from synpick_warp.configs.schema import LAYERS
-from synpick_warp.dataset.manifest import episode_entry, read_checksums
+from synpick_warp.dataset.commit.manifest import episode_entry, read_checksums
 from synpick_warp.factory import assembly
 from synpick_warp.factory.pipeline import run_bake
 from synpick_warp.system.progress import SilentProgress

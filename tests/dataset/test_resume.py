@@ -17,10 +17,10 @@ import pytest
 
 import synpick_warp
 from synpick_warp.cli.commands import EXIT_MISTAKE, main
-from synpick_warp.dataset import writing
-from synpick_warp.dataset.manifest import CONSTANTS, INDICES, committed_episodes, episode_entry, read_checksums
-from synpick_warp.dataset.merge import merge
-from synpick_warp.dataset.verify import verify
+from synpick_warp.dataset.commit import writing
+from synpick_warp.dataset.commit.manifest import CONSTANTS, INDICES, committed_episodes, episode_entry, read_checksums
+from synpick_warp.dataset.commit.merge import merge
+from synpick_warp.dataset.commit.verify import verify
 from synpick_warp.errors import DatasetError, OutputError
 from synpick_warp.exporters.writing.files import PARTIAL
 from tests.harness.bake_server import TINY, BakeServer

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from synpick_warp.dataset.merge import merge
+from synpick_warp.dataset.commit.merge import merge
 from tests.dataset.test_resume import digests
 from tests.harness.bake_server import BakeServer
 

@@ -10,7 +10,7 @@ import pytest
 
 from synpick_warp.cli.commands import main
 from synpick_warp.configs.write import config_to_toml
-from synpick_warp.dataset import manifest, verify
+from synpick_warp.dataset.commit import manifest, verify
 from synpick_warp.exporters.writing.checksums import write_manifest_entry
 from synpick_warp.system.processes import pool
 from synpick_warp.system.processes.worker import ProcessError

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import synpick_warp
-from synpick_warp.dataset.manifest import episode_entry
+from synpick_warp.dataset.commit.manifest import episode_entry
 from synpick_warp.dataset.view_files import decode_run_lengths
 from synpick_warp.errors import DatasetError
 from synpick_warp.exporters.bop.exporter import BopExporter

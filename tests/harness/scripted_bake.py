@@ -10,8 +10,8 @@ from pathlib import Path
 from synpick_warp.codes import Ending
 from synpick_warp.configs.schema import FORMATS, Config
 from synpick_warp.configs.splits import DataLayout
-from synpick_warp.dataset.manifest import episode_entry, read_entry
-from synpick_warp.dataset.writing import OutputFolder, finalize_data_set
+from synpick_warp.dataset.commit.manifest import episode_entry, read_entry
+from synpick_warp.dataset.commit.writing import OutputFolder, finalize_data_set
 from synpick_warp.exporters.base import ExportContext
 from synpick_warp.exporters.registry import Exporters, Needs
 from synpick_warp.exporters.writing.pool import WriterPool

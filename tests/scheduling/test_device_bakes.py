@@ -13,8 +13,8 @@ from pathlib import Path
 import pytest
 
 from synpick_warp.cli.commands import EXIT_MISTAKE, main
-from synpick_warp.dataset.manifest import committed_episodes
-from synpick_warp.dataset.verify import verify
+from synpick_warp.dataset.commit.manifest import committed_episodes
+from synpick_warp.dataset.commit.verify import verify
 from synpick_warp.exporters.writing.files import PARTIAL
 from tests.harness.bake_server import TINY
 from tests.worlds.small_worlds import QUICK

@@ -14,8 +14,8 @@ import pytest
 
 import synpick_warp
 from synpick_warp.configs.load import load_config
+from synpick_warp.dataset.webdataset import decode_view
 from synpick_warp.factory import assembly
-from synpick_warp.webdataset import decode_view
 from tests.worlds.sights import SHORT
 from tests.worlds.small_worlds import catalog, settings
 from tools.examples import bake_and_show, read_trajectory, train_loop

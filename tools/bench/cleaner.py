@@ -19,8 +19,8 @@ from pathlib import Path
 from types import TracebackType
 from typing import Self
 
-from synpick_warp.dataset.manifest import committed_episodes, episode_entry, read_checksums
-from synpick_warp.dataset.verify import check_files
+from synpick_warp.dataset.commit.manifest import committed_episodes, episode_entry, read_checksums
+from synpick_warp.dataset.commit.verify import check_files
 from synpick_warp.errors import SynpickError
 from synpick_warp.system.hardware.cores import count_cores
 from synpick_warp.system.processes.worker import END_TIMEOUT, WorkerProcess, send, start_process

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from synpick_warp.configs.schema import Config
-from synpick_warp.dataset.manifest import committed_episodes
+from synpick_warp.dataset.commit.manifest import committed_episodes
 from synpick_warp.factory.pipeline import run_bake
 from synpick_warp.system.progress import SilentProgress
 from tools.bench.cleaner import Cleaner

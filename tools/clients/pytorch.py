@@ -1,4 +1,4 @@
-"""PyTorch: batches of its DataLoader with two workers, from `synpick_warp.pytorch.Views`."""
+"""PyTorch: batches of its DataLoader with two workers, from `synpick_warp.dataset.pytorch.Views`."""
 
 # Runs where torch is, which the type checker may not see.
 # pyright: reportMissingImports=false
@@ -27,7 +27,7 @@ def read(place: Path, data: Path, sources: Sources) -> Reading:
     """Sampled views of the first camera of the first episode, out of batches of all its frames."""
     import torch
 
-    from synpick_warp.pytorch import Views, collate
+    from synpick_warp.dataset.pytorch import Views, collate
 
     entry = first_episode(data)
     views = Views(data, cameras=[0], fields=FIELDS, min_visibility=0.0)

@@ -30,7 +30,7 @@ def read(place: Path, data: Path, sources: Sources) -> Reading:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # Its import looks for torch.
         import webdataset
-    from synpick_warp.webdataset import decode_view
+    from synpick_warp.dataset.webdataset import decode_view
 
     frames = set(sample_frames(first_episode(data)["frames"]))
     values: dict[str, np.ndarray] = {}

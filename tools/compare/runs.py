@@ -25,7 +25,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from synpick_warp.dataset.manifest import CONFIG_FILE, FREE_SETTINGS, MANIFEST_FILE
+from synpick_warp.dataset.commit.manifest import CONFIG_FILE, FREE_SETTINGS, MANIFEST_FILE
 from tools.options import fail
 
 IMAGES = (".png", ".jpg")

@@ -17,7 +17,7 @@ import numpy as np
 import webdataset
 
 import synpick_warp
-from synpick_warp.webdataset import decode_view
+from synpick_warp.dataset.webdataset import decode_view
 
 SETTINGS = {"bake.episodes": 1, "bake.worlds": 1, "bake.formats": ["shards"]}
 BATCH_SIZE = 8

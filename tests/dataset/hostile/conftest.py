@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from synpick_warp.dataset import merge as merging
+from synpick_warp.dataset.commit import merge as merging
 from synpick_warp.exporters.writing.pool import WriterPool
 from tests.harness.scripted_bake import bake, small_settings
 

@@ -22,7 +22,7 @@ import synpick_warp
 from synpick_warp.configs.write import config_to_toml
 from synpick_warp.dataset import view_files
 from synpick_warp.dataset.annotations import MASK_SCHEMA, SCENE_SCHEMAS, ModelInfo, check_json, read_checked
-from synpick_warp.dataset.manifest import CONFIG_FILE, CONSTANTS, ENTRIES, MANIFEST_FILE, encode_manifest
+from synpick_warp.dataset.commit.manifest import CONFIG_FILE, CONSTANTS, ENTRIES, MANIFEST_FILE, encode_manifest
 from synpick_warp.dataset.view_files import SceneShards
 from synpick_warp.errors import DatasetError
 from synpick_warp.exporters.bop.exporter import BopExporter

@@ -24,10 +24,10 @@ import pytest
 from synpick_warp.cli.commands import main
 from synpick_warp.configs.splits import DataLayout
 from synpick_warp.conversion import run as conversion
-from synpick_warp.dataset.file_names import check_file_names, describe_strays
-from synpick_warp.dataset.manifest import CONSTANTS, episode_entry, read_checksums
-from synpick_warp.dataset.merge import merge
-from synpick_warp.dataset.verify import verify
+from synpick_warp.dataset.commit.file_names import check_file_names, describe_strays
+from synpick_warp.dataset.commit.manifest import CONSTANTS, episode_entry, read_checksums
+from synpick_warp.dataset.commit.merge import merge
+from synpick_warp.dataset.commit.verify import verify
 from synpick_warp.errors import DatasetError, OutputError, SynpickError
 from synpick_warp.exporters.bop.shards.tar_files import list_keys
 from synpick_warp.exporters.lerobot.exporter import LerobotExporter

@@ -14,9 +14,9 @@ from hypothesis import HealthCheck, given
 from hypothesis import settings as examples
 from hypothesis import strategies as st
 
-from synpick_warp.dataset.manifest import episode_entry, read_entry
-from synpick_warp.dataset.merge import merge
-from synpick_warp.dataset.verify import verify
+from synpick_warp.dataset.commit.manifest import episode_entry, read_entry
+from synpick_warp.dataset.commit.merge import merge
+from synpick_warp.dataset.commit.verify import verify
 from synpick_warp.errors import DatasetError, SynpickError
 from synpick_warp.exporters.bop.shards.tar_files import list_keys
 from synpick_warp.exporters.bop.shared import targets

@@ -14,9 +14,9 @@ from pathlib import Path
 import pytest
 
 from synpick_warp.configs.splits import DataLayout
-from synpick_warp.dataset.manifest import episode_entry, read_checksums
-from synpick_warp.dataset.merge import merge
-from synpick_warp.dataset.verify import verify
+from synpick_warp.dataset.commit.manifest import episode_entry, read_checksums
+from synpick_warp.dataset.commit.merge import merge
+from synpick_warp.dataset.commit.verify import verify
 from synpick_warp.errors import DatasetError, OutputError, SynpickError
 from synpick_warp.exporters.registry import load_exporter_classes, shared_files
 from synpick_warp.exporters.writing.checksums import checksum, parse_checksums

@@ -1,7 +1,7 @@
 """PyTorch dataset (map style): views of a data set as dictionaries of arrays, and the collate function for batches of them.
 
-    views = synpick_warp.pytorch.Views("DATA", fields=("rgb", "boxes", "object_ids"))
-    loader = torch.utils.data.DataLoader(views, batch_size=8, shuffle=True, num_workers=4, collate_fn=synpick_warp.pytorch.collate)
+    views = synpick_warp.dataset.pytorch.Views("DATA", fields=("rgb", "boxes", "object_ids"))
+    loader = torch.utils.data.DataLoader(views, batch_size=8, shuffle=True, num_workers=4, collate_fn=synpick_warp.dataset.pytorch.collate)
 
 PyTorch is imported when a batch is collated, or by its own DataLoader; without it, samples are the same NumPy arrays. A view depends on its
 index alone, so the order is that of the sampler. What is pickled for a worker is the folder and the index; files are opened there.

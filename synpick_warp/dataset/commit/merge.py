@@ -18,8 +18,8 @@ from typing import Any, BinaryIO, NamedTuple
 from synpick_warp.configs.schema import Config
 from synpick_warp.configs.splits import DataLayout
 from synpick_warp.configs.write import config_to_toml
-from synpick_warp.dataset.file_names import check_file_names, describe_strays
-from synpick_warp.dataset.manifest import (
+from synpick_warp.dataset.commit.file_names import check_file_names, describe_strays
+from synpick_warp.dataset.commit.manifest import (
     ATTEMPTS_FILE,
     CONFIG_FILE,
     CONSTANTS,
@@ -35,7 +35,7 @@ from synpick_warp.dataset.manifest import (
     read_manifest,
     read_settings,
 )
-from synpick_warp.dataset.writing import finalize_data_set, lock_folder
+from synpick_warp.dataset.commit.writing import finalize_data_set, lock_folder
 from synpick_warp.errors import DatasetError
 from synpick_warp.exporters.base import SharedFiles
 from synpick_warp.exporters.registry import Needs, shared_files

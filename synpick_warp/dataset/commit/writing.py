@@ -23,7 +23,7 @@ from synpick_warp.configs.modes import may_pick
 from synpick_warp.configs.schema import Config
 from synpick_warp.configs.splits import DataLayout
 from synpick_warp.configs.write import config_to_toml
-from synpick_warp.dataset.manifest import (
+from synpick_warp.dataset.commit.manifest import (
     ATTEMPTS_FILE,
     CONFIG_FILE,
     CONSTANTS,
