@@ -7,8 +7,8 @@ from dataclasses import dataclass, fields
 import pytest
 import warp as wp
 
-from synpick_warp.arrays import StructArrays, allocate, allocate_struct, device_array, memory_table, struct_arrays
 from synpick_warp.factory.memory_plan import Row, describe_arrays, queue_slots
+from synpick_warp.stages.arrays import StructArrays, allocate, allocate_struct, device_array, memory_table, struct_arrays
 from synpick_warp.stages.buffers import LastFrame, LayerBuffers, Snapshot, ViewBuffers
 from synpick_warp.stages.encoding.jpeg import JpegBuffers, JpegScratch
 from synpick_warp.stages.encoding.png import DEPTH_SCRATCH, DepthBuffers

@@ -14,7 +14,6 @@ from typing import Any
 
 import warp as wp
 
-from synpick_warp.arrays import memory_table
 from synpick_warp.configs.check import format_value
 from synpick_warp.configs.fields import INT32_MAX
 from synpick_warp.configs.modes import may_pick
@@ -22,6 +21,7 @@ from synpick_warp.configs.schema import REFERENCE, Config, Perception, Physics, 
 from synpick_warp.errors import ConfigError, SynpickError
 from synpick_warp.exporters.registry import Needs
 from synpick_warp.scenes import build
+from synpick_warp.stages.arrays import memory_table
 from synpick_warp.stages.buffers import LastFrame, LayerBuffers, Snapshot, ViewBuffers
 from synpick_warp.stages.encoding.jpeg import JpegBuffers, JpegScratch, jpeg_sizes
 from synpick_warp.stages.encoding.png import DEPTH_SCRATCH, DepthBuffers, depth_sizes

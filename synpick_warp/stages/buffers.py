@@ -7,8 +7,8 @@ from typing import Any
 
 import warp as wp
 
-from synpick_warp.arrays import allocate, device_array
 from synpick_warp.kernels.render.images.camera_effects import EffectParameters
+from synpick_warp.stages.arrays import allocate, device_array
 from synpick_warp.views.layers import LAYER_TABLE, Layer
 
 FIXTURES = ("tote", "finger", "cup")

@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from synpick_warp.arrays import allocate, memory_table
 from synpick_warp.codes import Measure, Status, column_names
 from synpick_warp.configs.schema import Cameras, Config, Render
+from synpick_warp.stages.arrays import allocate, memory_table
 from synpick_warp.stages.buffers import LayerBuffers, Snapshot, ViewBuffers, view_buffer_sizes
 from synpick_warp.stages.encoding.jpeg import Compressor
 from synpick_warp.stages.encoding.png import DepthBuffers, DepthEncoder, depth_sizes

@@ -15,7 +15,6 @@ from PIL import Image
 from trimesh.visual import TextureVisuals
 from trimesh.visual.material import PBRMaterial
 
-from synpick_warp.arrays import allocate
 from synpick_warp.cli.commands import main
 from synpick_warp.configs.load import load_config
 from synpick_warp.configs.schema import Config
@@ -24,6 +23,7 @@ from synpick_warp.scenes.assets.appearance import decode_texture
 from synpick_warp.scenes.catalog import load_catalog
 from synpick_warp.scenes.lights import MAX_RADIANCE
 from synpick_warp.scenes.types import Material
+from synpick_warp.stages.arrays import allocate
 from synpick_warp.stages.buffers import LayerBuffers, ViewBuffers, view_buffer_sizes
 from synpick_warp.stages.render.scene import build_render_scene, pack_texels
 from synpick_warp.stages.render.view_setup import make_views

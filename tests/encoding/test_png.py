@@ -13,10 +13,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import Image
 
-from synpick_warp.arrays import allocate
 from synpick_warp.errors import DatasetError
 from synpick_warp.exporters.writing.png import frame_depth_png
 from synpick_warp.kernels.encoding import png as kernels
+from synpick_warp.stages.arrays import allocate
 from synpick_warp.stages.encoding import png
 from synpick_warp.stages.encoding.png import DepthBuffers, DepthEncoder, depth_sizes
 from synpick_warp.system.codecs import depth_png

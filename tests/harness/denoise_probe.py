@@ -5,7 +5,6 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from synpick_warp.arrays import allocate_struct
 from synpick_warp.kernels.render.lighting.coarse_grid import (
     CoarseGrid,
     interleaved_pixel,
@@ -22,6 +21,7 @@ from synpick_warp.kernels.render.visibility.camera import in_image
 from synpick_warp.kernels.render.visibility.records import read_record, write_record
 from synpick_warp.scenes.environment import LUMINANCE
 from synpick_warp.scenes.types import Camera
+from synpick_warp.stages.arrays import allocate_struct
 from synpick_warp.stages.render.denoised import COARSE_LIGHT, GUIDE, RATIO_IMAGES, build_coarse_grid
 from synpick_warp.stages.render.scene import build_cameras, build_grid, pack_half3_array
 from synpick_warp.stages.render.view_setup import make_views

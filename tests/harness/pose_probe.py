@@ -5,7 +5,6 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from synpick_warp.arrays import allocate_struct
 from synpick_warp.kernels.pose.appearance import accumulate_samples_kernel, intensity_gradient, silhouette_residual
 from synpick_warp.kernels.pose.lighting import CHANNELS
 from synpick_warp.kernels.pose.observation import Images, Observation, Targets
@@ -13,6 +12,7 @@ from synpick_warp.kernels.pose.residuals import LANES, LossParameters, Models, j
 from synpick_warp.kernels.pose.samples import VISIBLE, has_color, interpolate_color, view_sample
 from synpick_warp.kernels.pose.solve import StepLimits, apply_step, pose_difference, rotation_vector, solve_cholesky, step_poses_kernel
 from synpick_warp.kernels.pose.surface import accumulate_points_kernel
+from synpick_warp.stages.arrays import allocate_struct
 from synpick_warp.stages.pose.models import PoseModels
 from synpick_warp.stages.pose.observe import Observer
 from synpick_warp.stages.pose.refine import LIGHTING, SUMS

@@ -11,9 +11,9 @@ import warp as wp
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
-from synpick_warp.arrays import allocate
 from synpick_warp.codes import Mode
 from synpick_warp.factory.assembly import make_renderer
+from synpick_warp.stages.arrays import allocate
 from synpick_warp.stages.buffers import ViewBuffers, view_buffer_sizes
 from synpick_warp.stages.perception.arrays import Observation, PerceptionArrays, Plan
 from synpick_warp.stages.perception.plan import GraspPlanner

@@ -5,7 +5,6 @@ import pytest
 import warp as wp
 from scipy.spatial.transform import Rotation
 
-from synpick_warp.arrays import allocate_struct
 from synpick_warp.kernels.pose.hypotheses import (
     CORRELATION_LANES,
     FAST_MEAN,
@@ -20,6 +19,7 @@ from synpick_warp.kernels.pose.hypotheses import (
     symmetric_poses_kernel,
     update_tracks_kernel,
 )
+from synpick_warp.stages.arrays import allocate_struct
 from synpick_warp.stages.pose.models import SYMMETRIES, build_models
 from synpick_warp.stages.pose.refine import LossScales, make_loss
 from synpick_warp.stages.pose.symmetries import CORRELATION

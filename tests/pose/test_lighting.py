@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 import warp as wp
 
-from synpick_warp.arrays import allocate_struct
 from synpick_warp.kernels.pose.lighting import CHANNELS, LIGHT_RIDGE, accumulate_lighting_kernel, fit_lighting_kernel
 from synpick_warp.kernels.pose.residuals import LANES
+from synpick_warp.stages.arrays import allocate_struct
 from synpick_warp.stages.pose.models import build_models
 from synpick_warp.stages.pose.refine import LIGHTING, LossScales, make_loss
 from tests.harness.pose_probe import view_samples

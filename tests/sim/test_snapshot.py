@@ -9,8 +9,8 @@ import warp as wp
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from synpick_warp.arrays import allocate
 from synpick_warp.kernels.sim import snapshot
+from synpick_warp.stages.arrays import allocate
 from synpick_warp.stages.buffers import LastFrame, Snapshot
 from synpick_warp.system.hardware.device import pick_device
 from tests.harness.devices import default_device

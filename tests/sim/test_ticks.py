@@ -9,10 +9,10 @@ from types import SimpleNamespace
 import pytest
 import warp as wp
 
-from synpick_warp.arrays import allocate
 from synpick_warp.codes import Phase, Status, column_names
 from synpick_warp.factory import memory_plan
 from synpick_warp.stages import tick_queue, ticks
+from synpick_warp.stages.arrays import allocate
 from synpick_warp.stages.buffers import Snapshot
 from synpick_warp.stages.perception.arrays import Observation, Plan
 from synpick_warp.stages.sim.simulate import Simulation, TickRecord

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 import warp as wp
 
-from synpick_warp.arrays import allocate
 from synpick_warp.configs.schema import Config
+from synpick_warp.stages.arrays import allocate
 from synpick_warp.stages.buffers import Snapshot
 from tests.worlds.small_worlds import catalog
 from tools.bench import __main__ as bench

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 import warp as wp
 
-from synpick_warp.arrays import allocate
 from synpick_warp.configs.load import load_config
+from synpick_warp.stages.arrays import allocate
 from synpick_warp.stages.buffers import Snapshot
 from tools.reports import render as render_report
 from tools.reports import render_checks, render_piles, render_sheet

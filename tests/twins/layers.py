@@ -7,10 +7,10 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 import warp as wp
 
-from synpick_warp.arrays import allocate
 from synpick_warp.configs.schema import LAYERS
 from synpick_warp.factory.assembly import make_renderer
 from synpick_warp.scenes.types import Camera
+from synpick_warp.stages.arrays import allocate
 from synpick_warp.stages.buffers import LayerBuffers, ViewBuffers, view_buffer_sizes
 from synpick_warp.stages.render.view_setup import make_views
 from tests.twins.raycast import rotation_of

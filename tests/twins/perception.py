@@ -10,10 +10,10 @@ import cv2
 import numpy as np
 import warp as wp
 
-from synpick_warp.arrays import allocate, allocate_struct
 from synpick_warp.configs.schema import Config, Perception
 from synpick_warp.kernels import structs
 from synpick_warp.scenes.cameras import make_cameras
+from synpick_warp.stages.arrays import allocate, allocate_struct
 from synpick_warp.stages.perception.arrays import Observation
 from synpick_warp.stages.perception.images import perception_sizes
 from synpick_warp.stages.perception.segment import Segmenter

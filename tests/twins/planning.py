@@ -10,9 +10,9 @@ import cv2
 import numpy as np
 import warp as wp
 
-from synpick_warp.arrays import allocate, allocate_struct
 from synpick_warp.configs.schema import Perception
 from synpick_warp.scenes.types import Camera
+from synpick_warp.stages.arrays import allocate, allocate_struct
 from synpick_warp.stages.perception.arrays import Observation, PerceptionArrays, Plan
 from synpick_warp.stages.perception.plan import GraspPlanner
 from synpick_warp.stages.render.scene import build_cameras, build_grid

@@ -9,9 +9,9 @@ from types import SimpleNamespace
 import numpy as np
 import warp as wp
 
-from synpick_warp.arrays import allocate
 from synpick_warp.scenes import build
 from synpick_warp.scenes.types import Catalog
+from synpick_warp.stages.arrays import allocate
 from synpick_warp.stages.constants import make_scene_data
 from synpick_warp.stages.sim.suction import Suction
 from synpick_warp.stages.sim.worlds import AttemptState, SealState, WorldState, world_sizes

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from synpick_warp.arrays import allocate
 from synpick_warp.kernels import structs
+from synpick_warp.stages.arrays import allocate
 from synpick_warp.stages.constants import SceneData, fill, mode_data
 from synpick_warp.stages.perception.arrays import Observation, Plan
 from synpick_warp.stages.sim.worlds import AttemptState, SealState, WorldState

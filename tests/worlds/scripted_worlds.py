@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 
-from synpick_warp.arrays import allocate
 from synpick_warp.codes import Ending, Measure, Mode, Outcome, Phase, Status, Task, column_names
 from synpick_warp.configs.schema import Config
 from synpick_warp.factory.attempts import AttemptLog, EpisodeRecord
+from synpick_warp.stages.arrays import allocate
 from synpick_warp.stages.perception.arrays import Observation, Plan
 from synpick_warp.stages.sim import worlds
 from synpick_warp.stages.stream import TickReport

@@ -8,8 +8,8 @@ from collections.abc import Callable, Iterator
 import numpy as np
 import warp as wp
 
-from synpick_warp.arrays import allocate
 from synpick_warp.exporters.writing.png import encode_png
+from synpick_warp.stages.arrays import allocate
 from synpick_warp.stages.buffers import ViewBuffers
 from synpick_warp.stages.encoding.jpeg import JpegBuffers, JpegEncoder, jpeg_sizes
 from synpick_warp.stages.encoding.png import DepthBuffers, DepthEncoder, depth_sizes

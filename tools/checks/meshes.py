@@ -20,7 +20,6 @@ import numpy as np
 import warp as wp
 from rich.console import Console
 
-from synpick_warp.arrays import allocate
 from synpick_warp.configs.load import load_config
 from synpick_warp.errors import SynpickError
 from synpick_warp.factory.assembly import make_renderer
@@ -29,6 +28,7 @@ from synpick_warp.scenes.cameras import make_cameras
 from synpick_warp.scenes.fixtures import make_fixtures
 from synpick_warp.scenes.lights import load_lights
 from synpick_warp.scenes.types import Catalog, CatalogEntry, Material, TriangleMesh
+from synpick_warp.stages.arrays import allocate
 from synpick_warp.stages.buffers import Snapshot, allocate_view_buffers
 from synpick_warp.stages.render.scene import build_render_scene
 from synpick_warp.stages.render.view_setup import make_views

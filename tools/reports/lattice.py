@@ -30,7 +30,6 @@ import numpy as np
 import warp as wp
 from rich.console import Console
 
-from synpick_warp.arrays import allocate
 from synpick_warp.codes import Segment
 from synpick_warp.configs.schema import FAST, REFERENCE, Config, Render
 from synpick_warp.errors import SynpickError
@@ -41,6 +40,7 @@ from synpick_warp.kernels.render.lighting.shadows import STRATA_PERIOD
 from synpick_warp.kernels.tuning import LANE_STRIDE
 from synpick_warp.scenes.cameras import make_cameras
 from synpick_warp.scenes.fixtures import make_fixtures
+from synpick_warp.stages.arrays import allocate
 from synpick_warp.stages.buffers import FIXTURES, Snapshot
 from synpick_warp.stages.render.sampling_rates import coarse_size, shadow_size
 from synpick_warp.stages.render.scene import build_render_scene

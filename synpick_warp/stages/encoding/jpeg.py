@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from synpick_warp.arrays import allocate, allocate_struct, device_array, struct_arrays
 from synpick_warp.kernels.encoding.dct import convert_colors_kernel, transform_blocks_kernel
 from synpick_warp.kernels.encoding.huffman import (
     CODE_BITS,
@@ -31,6 +30,7 @@ from synpick_warp.kernels.encoding.stuffing import (
 from synpick_warp.kernels.encoding.tables import BLOCK, BLOCK_SIZE, BLOCKS_PER_MCU, MCU
 from synpick_warp.kernels.render.images.camera_effects import jpeg_quality_kernel
 from synpick_warp.kernels.tuning import JPEG_THREADS
+from synpick_warp.stages.arrays import allocate, allocate_struct, device_array, struct_arrays
 from synpick_warp.stages.buffers import ViewBuffers
 from synpick_warp.system.codecs.jpeg import (
     AC_COUNTS,

@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from synpick_warp.arrays import allocate, allocate_struct, device_array, struct_arrays
 from synpick_warp.kernels.encoding.png import (
     GROUP,
     Codes,
@@ -21,6 +20,7 @@ from synpick_warp.kernels.encoding.png import (
     join_slots_kernel,
     sum_groups_kernel,
 )
+from synpick_warp.stages.arrays import allocate, allocate_struct, device_array, struct_arrays
 from synpick_warp.system.codecs.depth_png import (
     MAX_RUN,
     distance_codes,

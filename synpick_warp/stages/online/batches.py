@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from synpick_warp.arrays import allocate, device_array
 from synpick_warp.kernels.render.images.ground_truth import expand_masks_kernel, gather_cameras_kernel, gather_objects_kernel
+from synpick_warp.stages.arrays import allocate, device_array
 from synpick_warp.stages.buffers import LayerBuffers, Snapshot, ViewBuffers
 from synpick_warp.stages.online.exchange import DeviceArray, Gate
 from synpick_warp.stages.render.renderer import Renderer

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import warp as wp
 
-from synpick_warp.arrays import device_array
+from synpick_warp.stages.arrays import device_array
 
 
 @dataclass(frozen=True, eq=False)

@@ -7,13 +7,13 @@ from typing import Any
 
 import warp as wp
 
-from synpick_warp.arrays import allocate_struct, memory_table
 from synpick_warp.configs import schema
 from synpick_warp.errors import ConfigError
 from synpick_warp.kernels.perception.exact_hits import intersect_hits_kernel
 from synpick_warp.kernels.render.visibility.camera import TILE_PIXELS
 from synpick_warp.kernels.render.visibility.view_setup import aim_views_kernel
 from synpick_warp.scenes.cameras import make_cameras
+from synpick_warp.stages.arrays import allocate_struct, memory_table
 from synpick_warp.stages.buffers import Snapshot
 from synpick_warp.stages.launch import launch_pixels
 from synpick_warp.stages.perception.arrays import PerceptionArrays, SegmentationScratch

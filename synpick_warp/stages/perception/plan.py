@@ -7,7 +7,6 @@ from typing import Any
 
 import warp as wp
 
-from synpick_warp.arrays import allocate, allocate_struct, device_array, struct_arrays
 from synpick_warp.configs import schema
 from synpick_warp.kernels.perception.clutter_graph import Cycles, order_clutter_kernel
 from synpick_warp.kernels.perception.grasp import frame_grasp_kernel, smooth_normal_kernel
@@ -20,6 +19,7 @@ from synpick_warp.kernels.perception.occlusion_votes import (
 )
 from synpick_warp.kernels.perception.target import choose_target_kernel
 from synpick_warp.kernels.tuning import VIEW_BLOCK
+from synpick_warp.stages.arrays import allocate, allocate_struct, device_array, struct_arrays
 from synpick_warp.stages.constants import SceneData
 from synpick_warp.stages.perception.arrays import Observation, PerceptionArrays, Plan
 from synpick_warp.stages.perception.images import PerceptionImages

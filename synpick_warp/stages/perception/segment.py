@@ -7,9 +7,9 @@ from typing import Any
 
 import warp as wp
 
-from synpick_warp.arrays import allocate
 from synpick_warp.kernels.perception import components, contours, distance_transform, grasp_points
 from synpick_warp.kernels.render.visibility.camera import TILE_PIXELS
+from synpick_warp.stages.arrays import allocate
 from synpick_warp.stages.constants import SceneData
 from synpick_warp.stages.launch import launch_pixels
 from synpick_warp.stages.perception.arrays import Observation, PerceptionArrays, SegmentationScratch

@@ -11,11 +11,11 @@ import warp as wp
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
-from synpick_warp.arrays import allocate_struct, struct_arrays
 from synpick_warp.kernels.pose.hypotheses import Symmetries
 from synpick_warp.kernels.pose.residuals import Models
 from synpick_warp.scenes.assets.appearance import srgb_to_linear
 from synpick_warp.scenes.types import Material, TriangleMesh
+from synpick_warp.stages.arrays import allocate_struct, struct_arrays
 from synpick_warp.stages.pose.batch import ObjectModel
 from synpick_warp.stages.render.scene import mip_levels
 from synpick_warp.system.low_discrepancy import sample_triangles

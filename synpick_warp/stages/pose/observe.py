@@ -7,7 +7,6 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from synpick_warp.arrays import allocate_struct, struct_arrays
 from synpick_warp.kernels.pose.observation import (
     CROP,
     Images,
@@ -22,6 +21,7 @@ from synpick_warp.kernels.pose.observation import (
 )
 from synpick_warp.kernels.pose.points import count_points_kernel, sample_points_kernel, summarize_points_kernel
 from synpick_warp.scenes.assets.appearance import srgb_to_linear
+from synpick_warp.stages.arrays import allocate_struct, struct_arrays
 from synpick_warp.stages.pose.batch import InstanceTable, RgbdBatch
 
 LABELS = 256

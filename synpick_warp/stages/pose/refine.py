@@ -7,13 +7,13 @@ from typing import Any
 
 import warp as wp
 
-from synpick_warp.arrays import allocate_struct, struct_arrays
 from synpick_warp.kernels.pose.appearance import accumulate_samples_kernel
 from synpick_warp.kernels.pose.hypotheses import choose_poses_kernel
 from synpick_warp.kernels.pose.lighting import CHANNELS, Lighting, accumulate_lighting_kernel, fit_lighting_kernel
 from synpick_warp.kernels.pose.residuals import LANES, LossParameters, Sums
 from synpick_warp.kernels.pose.solve import StepLimits, score_poses_kernel, step_poses_kernel
 from synpick_warp.kernels.pose.surface import accumulate_points_kernel
+from synpick_warp.stages.arrays import allocate_struct, struct_arrays
 from synpick_warp.stages.pose.models import PoseModels
 from synpick_warp.stages.pose.observe import Observer
 

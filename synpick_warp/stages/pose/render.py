@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from synpick_warp.arrays import allocate, allocate_struct
 from synpick_warp.kernels.render.visibility.gbuffer import Table
 from synpick_warp.scenes.types import Camera
+from synpick_warp.stages.arrays import allocate, allocate_struct
 from synpick_warp.stages.buffers import FIXTURES, Snapshot
 from synpick_warp.stages.render.raster import Rasterizer
 from synpick_warp.stages.render.scene import RenderScene, build_cameras, build_grid

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import warp as wp
 
-from synpick_warp.arrays import allocate_struct, struct_arrays
 from synpick_warp.kernels.pose.hypotheses import (
     CORRELATION_LANES,
     Correlation,
@@ -12,6 +11,7 @@ from synpick_warp.kernels.pose.hypotheses import (
     correlate_symmetries_kernel,
     symmetric_poses_kernel,
 )
+from synpick_warp.stages.arrays import allocate_struct, struct_arrays
 from synpick_warp.stages.pose.models import PoseModels
 from synpick_warp.stages.pose.observe import Observer
 from synpick_warp.stages.pose.refine import LossScales, make_loss

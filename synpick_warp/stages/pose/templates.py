@@ -9,7 +9,6 @@ import numpy as np
 import warp as wp
 from scipy.spatial.transform import Rotation
 
-from synpick_warp.arrays import allocate_struct, struct_arrays
 from synpick_warp.kernels.pose.templates import (
     EMPTY,
     TEMPLATE,
@@ -22,6 +21,7 @@ from synpick_warp.kernels.pose.templates import (
     search_templates_kernel,
 )
 from synpick_warp.scenes.types import Camera
+from synpick_warp.stages.arrays import allocate_struct, struct_arrays
 from synpick_warp.stages.pose.models import PoseModels
 from synpick_warp.stages.pose.observe import Observer
 from synpick_warp.stages.pose.render import object_scene, render_object

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 import numpy as np
 import warp as wp
 
-from synpick_warp.arrays import allocate_struct, struct_arrays
 from synpick_warp.kernels.pose.hypotheses import (
     MOTIONS,
     Track,
@@ -15,6 +14,7 @@ from synpick_warp.kernels.pose.hypotheses import (
     propose_motions_kernel,
     update_tracks_kernel,
 )
+from synpick_warp.stages.arrays import allocate_struct, struct_arrays
 from synpick_warp.stages.pose.models import PoseModels
 from synpick_warp.stages.pose.observe import Observer
 from synpick_warp.stages.pose.refine import LossScales, Refiner, Schedule, choose_poses

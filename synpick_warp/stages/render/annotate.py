@@ -6,7 +6,6 @@ from typing import Any
 
 import warp as wp
 
-from synpick_warp.arrays import allocate_struct, struct_arrays
 from synpick_warp.kernels.render.images.boxes_counts import (
     BorderBoxes,
     clear_boxes_counts_kernel,
@@ -16,6 +15,7 @@ from synpick_warp.kernels.render.images.boxes_counts import (
     reset_empty_boxes_kernel,
 )
 from synpick_warp.kernels.tuning import BORDER_CHUNK, BORDER_GROUPS, BORDER_THREADS, COUNT_THREADS
+from synpick_warp.stages.arrays import allocate_struct, struct_arrays
 from synpick_warp.stages.buffers import ViewBuffers
 from synpick_warp.stages.render.scene import RenderScene
 

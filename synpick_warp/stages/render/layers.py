@@ -7,7 +7,6 @@ from typing import Any
 
 import warp as wp
 
-from synpick_warp.arrays import allocate_struct, struct_arrays
 from synpick_warp.configs.sensors import DepthSensor
 from synpick_warp.errors import CatalogError
 from synpick_warp.kernels.render.images.depth_sensor import SensorParameters, render_depth_sensor_kernel
@@ -22,6 +21,7 @@ from synpick_warp.kernels.render.images.layers import (
     render_scene_flow_kernel,
 )
 from synpick_warp.kernels.render.visibility.camera import TILE_PIXELS
+from synpick_warp.stages.arrays import allocate_struct, struct_arrays
 from synpick_warp.stages.buffers import FIXTURES, LayerBuffers, Snapshot
 from synpick_warp.stages.launch import launch_pixels
 from synpick_warp.stages.render.scene import RenderScene

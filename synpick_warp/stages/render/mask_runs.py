@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import warp as wp
 
-from synpick_warp.arrays import device_array
 from synpick_warp.kernels.render.images.mask_runs import count_boundaries_kernel, list_boundaries_kernel
+from synpick_warp.stages.arrays import device_array
 from synpick_warp.stages.buffers import ViewBuffers
 
 BOUNDARIES_PER_COLUMN = 24

@@ -7,7 +7,6 @@ from typing import Any
 
 import warp as wp
 
-from synpick_warp.arrays import allocate, device_array
 from synpick_warp.codes import Tone
 from synpick_warp.configs.sensors import Effects, effect_ranges
 from synpick_warp.kernels.render.images.antialias import ShadedImage
@@ -19,6 +18,7 @@ from synpick_warp.kernels.render.images.postprocess import (
     postprocess_kernel,
 )
 from synpick_warp.kernels.render.visibility.camera import TILE_PIXELS
+from synpick_warp.stages.arrays import allocate, device_array
 from synpick_warp.stages.buffers import Snapshot, ViewBuffers
 from synpick_warp.stages.launch import launch_pixels
 from synpick_warp.stages.render.scene import RenderScene

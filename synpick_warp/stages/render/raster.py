@@ -6,7 +6,6 @@ from typing import Any
 
 import warp as wp
 
-from synpick_warp.arrays import allocate, allocate_struct, struct_arrays
 from synpick_warp.errors import CatalogError
 from synpick_warp.kernels.render.visibility.camera import TILE_PIXELS
 from synpick_warp.kernels.render.visibility.raster import (
@@ -18,6 +17,7 @@ from synpick_warp.kernels.render.visibility.raster import (
     resolve_visibility_kernel,
 )
 from synpick_warp.kernels.tuning import BLOCK_THREADS, TRIANGLE_THREADS
+from synpick_warp.stages.arrays import allocate, allocate_struct, struct_arrays
 from synpick_warp.stages.buffers import FIXTURES, Snapshot, ViewBuffers
 from synpick_warp.stages.launch import launch_pixels, launch_views
 from synpick_warp.stages.render.scene import RenderScene

@@ -7,11 +7,11 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from synpick_warp.arrays import struct_arrays
 from synpick_warp.kernels.render.visibility.camera import Views
 from synpick_warp.kernels.render.visibility.gbuffer import GBuffer, ViewBodies
 from synpick_warp.kernels.render.visibility.ray_bodies import RAY_RECORDS
 from synpick_warp.kernels.render.visibility.view_setup import bin_bodies_kernel, set_up_views_kernel, sort_bodies_kernel
+from synpick_warp.stages.arrays import struct_arrays
 from synpick_warp.stages.buffers import FIXTURES, Snapshot
 from synpick_warp.stages.render.scene import RenderScene, build_grid
 

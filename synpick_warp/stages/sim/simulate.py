@@ -10,13 +10,13 @@ import newton
 import numpy as np
 import warp as wp
 
-from synpick_warp.arrays import allocate
 from synpick_warp.configs.modes import may_pick
 from synpick_warp.configs.schema import Config
 from synpick_warp.configs.splits import DataLayout
 from synpick_warp.kernels.sim import snapshot as pack
 from synpick_warp.scenes.build import build_model
 from synpick_warp.scenes.types import Catalog
+from synpick_warp.stages.arrays import allocate
 from synpick_warp.stages.buffers import LastFrame, Snapshot
 from synpick_warp.stages.constants import SceneData, fill, make_scene_data
 from synpick_warp.stages.perception.arrays import Observation, Plan

@@ -9,10 +9,10 @@ import newton
 import numpy as np
 import warp as wp
 
-from synpick_warp.arrays import allocate, device_array
 from synpick_warp.configs.schema import Gripper, Trajectory
 from synpick_warp.kernels.sim import step_log
 from synpick_warp.scenes import build
+from synpick_warp.stages.arrays import allocate, device_array
 from synpick_warp.stages.constants import SceneData
 from synpick_warp.stages.sim.physics import Physics
 from synpick_warp.stages.sim.worlds import AttemptState, SealState, WorldState

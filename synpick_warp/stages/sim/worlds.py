@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import warp as wp
 
-from synpick_warp.arrays import device_array
 from synpick_warp.codes import Measure, Status
+from synpick_warp.stages.arrays import device_array
 from synpick_warp.stages.buffers import FIXTURES
 
 # Waypoints of a round of moving: the corners of the tote.

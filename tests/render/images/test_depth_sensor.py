@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 import warp as wp
 
-from synpick_warp.arrays import allocate
 from synpick_warp.configs.schema import Config
 from synpick_warp.configs.sensors import DepthSensor
 from synpick_warp.factory.assembly import make_renderer
+from synpick_warp.stages.arrays import allocate
 from synpick_warp.stages.buffers import LayerBuffers, ViewBuffers, view_buffer_sizes
 from synpick_warp.stages.render.view_setup import make_views
 from tests.worlds.toy_scene import UPRIGHT, ToyScene, box, build_scene, camera, entry, sheet, snapshot

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 import warp as wp
 
-from synpick_warp.arrays import allocate
 from synpick_warp.exporters.bop.view import rotation_matrices
 from synpick_warp.kernels.render.images.ground_truth import expand_masks_kernel, gather_cameras_kernel, gather_objects_kernel
 from synpick_warp.kernels.render.visibility.camera import Cameras
+from synpick_warp.stages.arrays import allocate
 from synpick_warp.stages.online.batches import TruthBuffers
 from synpick_warp.stages.render.view_setup import make_views
 

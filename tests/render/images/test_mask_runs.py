@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 import warp as wp
 
-from synpick_warp.arrays import allocate
 from synpick_warp.exporters.bop.exporter import BopExporter
 from synpick_warp.exporters.bop.shards.exporter import ShardsExporter
 from synpick_warp.exporters.bop.view import ViewSettings, extract_masks, make_view_task
 from synpick_warp.exporters.writing.rle import find_run_boundaries, unpack_run_boundaries
+from synpick_warp.stages.arrays import allocate
 from synpick_warp.stages.buffers import ViewBuffers, view_buffer_sizes
 from synpick_warp.stages.render import mask_runs
 from synpick_warp.stages.render.mask_runs import BoundaryBuffers, BoundaryScratch, boundary_sizes, list_boundaries

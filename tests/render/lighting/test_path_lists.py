@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import warp as wp
 
-from synpick_warp.arrays import allocate_struct
 from synpick_warp.kernels.render.lighting.paths.lists import AGED, FRESH, REGION_PIXELS
+from synpick_warp.stages.arrays import allocate_struct
 from synpick_warp.stages.render.denoised import PATH_LISTS
 from tests.harness.path_list_probe import append_kernel, read_kernel
 

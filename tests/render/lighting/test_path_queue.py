@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 import warp as wp
 
-from synpick_warp.arrays import allocate_struct
 from synpick_warp.configs.schema import FAST, Config
 from synpick_warp.factory.assembly import make_renderer
 from synpick_warp.kernels.render.lighting.paths.lists import REGION_PIXELS
 from synpick_warp.kernels.render.lighting.paths.queues import QUEUE_CAPACITY
 from synpick_warp.scenes.types import EnvironmentMap
+from synpick_warp.stages.arrays import allocate_struct
 from synpick_warp.stages.buffers import allocate_view_buffers
 from synpick_warp.stages.render.denoised import PATH_QUEUES, queue_sizes, queue_views
 from synpick_warp.stages.render.renderer import Renderer

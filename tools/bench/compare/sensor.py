@@ -14,12 +14,12 @@ import warp as wp
 from newton.sensors import SensorCamera
 from scipy.spatial.transform import Rotation
 
-from synpick_warp.arrays import allocate
 from synpick_warp.codes import Segment
 from synpick_warp.configs.schema import Config, Render
 from synpick_warp.factory.assembly import Factory
 from synpick_warp.scenes.fixtures import make_fixtures
 from synpick_warp.scenes.types import Camera, Catalog, Fixture, Material, TriangleMesh
+from synpick_warp.stages.arrays import allocate
 from synpick_warp.stages.buffers import LayerBuffers, Snapshot
 from synpick_warp.stages.render.layers import LayerRenderer
 from synpick_warp.stages.render.view_setup import make_views
