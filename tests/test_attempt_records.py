@@ -7,9 +7,9 @@ import json
 import numpy as np
 import pytest
 
+from synpick_warp.apps.viz.explain_record import read_attempts
 from synpick_warp.codes import Ending, Mode, Outcome
 from synpick_warp.factory.attempts import AttemptRecord, EpisodeRecord, InstanceObservation, ObservationRecord
-from synpick_warp.viz.explain_record import read_attempts
 from tests.worlds.scripted_worlds import RAYS, ROOM, Ticks, World, bits, new_world, run
 
 

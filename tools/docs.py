@@ -1,6 +1,6 @@
 """Generate the tables of READMEs that follow from code and results; the prose around them is as committed.
 
-configs/README.md: the settings; synpick_warp/validation/README.md: the rules; tools/README.md: the figures in tools/results.
+configs/README.md: the settings; synpick_warp/apps/validation/README.md: the rules; tools/README.md: the figures in tools/results.
 
     python -m tools.docs          # writes them
 """
@@ -13,12 +13,12 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from synpick_warp.apps.validation.registry import load_rules
 from synpick_warp.configs.check import describe_allowed
 from synpick_warp.configs.load import ROWS, sections, settings_of
 from synpick_warp.configs.schema import ObjectRow, Split
 from synpick_warp.configs.split_tables import SPLITS, split_settings
 from synpick_warp.configs.write import format_toml
-from synpick_warp.validation.registry import load_rules
 from tools.figures import figures_tables, read_runs
 
 ROOT = Path(__file__).resolve().parents[1]

@@ -17,12 +17,12 @@ import numpy as np
 from PIL import Image as PillowImage
 
 import synpick_warp
+from synpick_warp.apps.viz.depth_colors import color_depth
+from synpick_warp.apps.viz.drawing import FONT, instance_color, put_text, write_picture
+from synpick_warp.apps.viz.preview_layers import color_layer
 from synpick_warp.dataset.reading import Episode
 from synpick_warp.dataset.view import View
 from synpick_warp.errors import SynpickError
-from synpick_warp.viz.depth_colors import color_depth
-from synpick_warp.viz.drawing import FONT, instance_color, put_text, write_picture
-from synpick_warp.viz.preview_layers import color_layer
 from tools.options import fail, make_parser
 
 PICTURES = Path(__file__).resolve().parent / "pictures"

@@ -37,8 +37,8 @@ def convert(
     their own ids; interrupted, they are converted again from the start. Exit codes: 0, converted; 2, an error.
     """
     check_range("--processes", processes, 0, MAX_THREADS)
+    from synpick_warp.apps.conversion.run import convert as run_conversion
     from synpick_warp.cli.display import CountProgress, make_console
-    from synpick_warp.conversion.run import convert as run_conversion
     from synpick_warp.dataset.commit.manifest import MANIFEST_FILE
 
     names = [name.strip() for name in to.split(",")]

@@ -16,8 +16,8 @@ from synpick_warp.configs.check import escape, format_value
 from synpick_warp.errors import ConfigError, OutputError
 
 if TYPE_CHECKING:
-    from synpick_warp.estimation.run import Options, Run
-    from synpick_warp.estimation.selection import Selection
+    from synpick_warp.apps.estimation.run import Options, Run
+    from synpick_warp.apps.estimation.selection import Selection
 
 DEFAULT_VISIBILITY = 0.1
 """As in `eval` and in BOP."""
@@ -90,7 +90,7 @@ def estimate(
     check_output(out, selection)
     check_output_file(out, "--out", data)
     if options.method == "gicp":
-        from synpick_warp.estimation.gicp import load_small_gicp
+        from synpick_warp.apps.estimation.gicp import load_small_gicp
 
         load_small_gicp()
     run, listed = run_method(data, selection, options, device, out, color=color, split=split)
@@ -105,15 +105,15 @@ def run_method(
     data: Path, selection: Selection, options: Options, device: str, out: Path, *, color: bool, split: str | None = None
 ) -> tuple[Run, Path | None]:
     """Estimate, and write the files; returns the run, and the file of targets if it was written."""
+    from synpick_warp.apps.estimation import factories
+    from synpick_warp.apps.estimation.decoder_pool import open_pool
+    from synpick_warp.apps.estimation.models import read_object_models
+    from synpick_warp.apps.estimation.run import list_targets, read_scenes, run_estimation
+    from synpick_warp.apps.estimation.selection import plan_scenes
+    from synpick_warp.apps.evaluation.results import write_results
+    from synpick_warp.apps.evaluation.targets import encode_targets, in_layout
     from synpick_warp.cli.display import CountProgress, make_console
     from synpick_warp.dataset.reading import open_data_set
-    from synpick_warp.estimation import factories
-    from synpick_warp.estimation.decoder_pool import open_pool
-    from synpick_warp.estimation.models import read_object_models
-    from synpick_warp.estimation.run import list_targets, read_scenes, run_estimation
-    from synpick_warp.estimation.selection import plan_scenes
-    from synpick_warp.evaluation.results import write_results
-    from synpick_warp.evaluation.targets import encode_targets, in_layout
     from synpick_warp.exporters.writing.files import output_error, write_atomically
 
     data_set = open_data_set(data)
@@ -149,9 +149,9 @@ def make_selection(
         ConfigError: A value is not allowed, or two exclude each other.
         ResultError: The target list cannot be read.
     """
-    from synpick_warp.estimation.methods import METHODS, SPARSE, TRACK
-    from synpick_warp.estimation.selection import Selection
-    from synpick_warp.evaluation.targets import read_targets
+    from synpick_warp.apps.estimation.methods import METHODS, SPARSE, TRACK
+    from synpick_warp.apps.estimation.selection import Selection
+    from synpick_warp.apps.evaluation.targets import read_targets
 
     if method not in METHODS:
         raise ConfigError(f"--method is {format_value(method)}; allowed: {', '.join(METHODS)}")
@@ -176,8 +176,8 @@ def make_options(method: str, depth: str, masks: str, visib_min: float, seed: in
     Raises:
         ConfigError: A value is not allowed.
     """
-    from synpick_warp.estimation.reading import DEPTHS
-    from synpick_warp.estimation.run import Options
+    from synpick_warp.apps.estimation.reading import DEPTHS
+    from synpick_warp.apps.estimation.run import Options
 
     for option, value, allowed in (("--depth", depth, tuple(DEPTHS)), ("--masks", masks, _MASKS)):
         if value not in allowed:

@@ -18,11 +18,11 @@ from synpick_warp.configs.splits import split_kind
 from synpick_warp.errors import ConfigError, DatasetError, OutputError
 
 if TYPE_CHECKING:
+    from synpick_warp.apps.evaluation.figures import Method
+    from synpick_warp.apps.evaluation.results import ResultFile
+    from synpick_warp.apps.evaluation.scoring import Scores
+    from synpick_warp.apps.evaluation.truth import Truth
     from synpick_warp.dataset.reading import DataSet
-    from synpick_warp.evaluation.figures import Method
-    from synpick_warp.evaluation.results import ResultFile
-    from synpick_warp.evaluation.scoring import Scores
-    from synpick_warp.evaluation.truth import Truth
 
 FILTER = "ema"
 """Exponential moving average: the only filter."""
@@ -106,7 +106,7 @@ def evaluate(
 def show_rest(command: str, plots: Path | None, pictures: Mapping[str, bytes], stream: TextIO) -> None:
     """Write the pictures, and print their paths and the toolkit's command, where they don't mix with a table for a program."""
     if plots is not None:
-        from synpick_warp.evaluation.figures import write_figures
+        from synpick_warp.apps.evaluation.figures import write_figures
 
         for path in write_figures(plots, pictures):
             print(f"picture: {escape(str(path))}", file=stream)
@@ -145,13 +145,13 @@ def make_table(
     Returns:
         The table, and file name -> PNG file.
     """
-    from synpick_warp.evaluation.figures import Settings, draw_figures
-    from synpick_warp.evaluation.models import read_models
-    from synpick_warp.evaluation.results import check_results, read_results
-    from synpick_warp.evaluation.scoring import score
-    from synpick_warp.evaluation.tables import GROUPS, render, summarize
-    from synpick_warp.evaluation.targets import read_targets, select_targets
-    from synpick_warp.evaluation.truth import read_truth
+    from synpick_warp.apps.evaluation.figures import Settings, draw_figures
+    from synpick_warp.apps.evaluation.models import read_models
+    from synpick_warp.apps.evaluation.results import check_results, read_results
+    from synpick_warp.apps.evaluation.scoring import score
+    from synpick_warp.apps.evaluation.tables import GROUPS, render, summarize
+    from synpick_warp.apps.evaluation.targets import read_targets, select_targets
+    from synpick_warp.apps.evaluation.truth import read_truth
 
     # Result files first: their mistakes are the likely ones, and quick to find.
     files = [read_results(path) for path in results]
@@ -177,8 +177,8 @@ def make_table(
 
 def make_methods(results: Sequence[Path], files: Sequence[ResultFile], alpha: float | None) -> list[Method]:
     """Named estimates of each file, with the filtered ones if there is a weight `alpha`."""
-    from synpick_warp.evaluation.figures import Method
-    from synpick_warp.evaluation.tracking.filtering import filter_poses
+    from synpick_warp.apps.evaluation.figures import Method
+    from synpick_warp.apps.evaluation.tracking.filtering import filter_poses
 
     named = zip(method_names(results), files, strict=True)
     return [Method(name, file.poses, None if alpha is None else filter_poses(file.poses, alpha), alpha) for name, file in named]
@@ -186,9 +186,9 @@ def make_methods(results: Sequence[Path], files: Sequence[ResultFile], alpha: fl
 
 def draw_failure_sheets(data_set: DataSet, truth: Truth, methods: Sequence[Method], scores: Sequence[Scores]) -> dict[str, bytes]:
     """Sheets of the worst estimate of each object, one for each method: file name -> PNG file. None without the images they need."""
-    from synpick_warp.estimation.failures import draw_failures, find_failures
-    from synpick_warp.estimation.models import read_object_models
-    from synpick_warp.evaluation.figures import file_names
+    from synpick_warp.apps.estimation.failures import draw_failures, find_failures
+    from synpick_warp.apps.estimation.models import read_object_models
+    from synpick_warp.apps.evaluation.figures import file_names
     from synpick_warp.exporters.writing.png import encode_png
     from synpick_warp.system.hardware.device import pick_device
 
@@ -220,7 +220,7 @@ def check_plots(folder: Path | None, track: str | None) -> tuple[int, int] | Non
         ConfigError: The track has another form, or there are no plots.
         OutputError: The folder of the plots is neither new nor empty.
     """
-    from synpick_warp.evaluation.figures import check_folder
+    from synpick_warp.apps.evaluation.figures import check_folder
 
     match = None if track is None else _TRACK.fullmatch(track)
     if track is not None and match is None:
@@ -241,8 +241,8 @@ def check_options(
         ConfigError: A value is not allowed.
         OutputError: The output's folder does not exist, or it is a folder itself.
     """
-    from synpick_warp.evaluation.auc import CONVENTIONS
-    from synpick_warp.evaluation.tables import FORMATS
+    from synpick_warp.apps.evaluation.auc import CONVENTIONS
+    from synpick_warp.apps.evaluation.tables import FORMATS
 
     for option, value, allowed in (("--format", style, FORMATS), ("--convention", convention, CONVENTIONS)):
         if value not in allowed:
@@ -264,7 +264,7 @@ def check_filter(name: str | None, alpha: float | None) -> float | None:
     Raises:
         ConfigError: There is no such filter, or the weight is out of range or without one.
     """
-    from synpick_warp.evaluation.tracking.filtering import PAPER_ALPHAS, check_alpha
+    from synpick_warp.apps.evaluation.tracking.filtering import PAPER_ALPHAS, check_alpha
 
     if name is None:
         if alpha is not None:

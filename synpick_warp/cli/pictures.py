@@ -25,7 +25,7 @@ def preview(
         raise ConfigError(f"--views is {views}; allowed: at least 1")
     folder = find_data_set(folder, "synpick-warp preview DIR", has_scenes)
     sheet = out or beside(folder, "-contact-sheet.png")
-    from synpick_warp.viz.preview import check_picture_name, write_contact_sheet
+    from synpick_warp.apps.viz.preview import check_picture_name, write_contact_sheet
 
     check_picture_name(sheet)
     check_output_file(sheet, "--out", folder)
@@ -58,7 +58,7 @@ def explain(
     folder = find_data_set(folder, "synpick-warp explain DIR", has_attempts)
     ending = "" if episode is None else f"-{episode:06d}" if attempt is None else f"-{episode:06d}-{attempt:03d}"
     picture = out or beside(folder, f"-explain{ending}.png")
-    from synpick_warp.viz.explain import check_picture_name, write_explanation
+    from synpick_warp.apps.viz.explain import check_picture_name, write_explanation
 
     check_picture_name(picture)
     check_output_file(picture, "--out", folder)

@@ -32,7 +32,7 @@ def write_page(
     The page needs no network and no other file; its pictures have at most 25 MB. Exit codes: 0; 2, the folder is not a data set, a file
     of it is damaged, or the page cannot be written.
     """
-    from synpick_warp.report.compose import MAX_FRAMES, check_out, write_report
+    from synpick_warp.apps.report.compose import MAX_FRAMES, check_out, write_report
 
     check_range("--views", views, 1, MAX_FRAMES)
     check_range("--threads", threads, 0, MAX_THREADS)

@@ -40,15 +40,15 @@ def show_statistics(
     check_range("--depth-views", depth_views, 0, MAX_DEPTH_VIEWS)
     check_range("--threads", threads, 0, MAX_THREADS)
     folder = find_data_set(folder, "synpick-warp stats DIR")
-    from synpick_warp.statistics.output import check_csv_folder, print_statistics, to_json, write_csv
+    from synpick_warp.apps.statistics.output import check_csv_folder, print_statistics, to_json, write_csv
 
     if csv is not None:
         check_csv_folder(csv)
         check_output_file(csv, "--csv", folder)
+    from synpick_warp.apps.statistics.collect import collect
+    from synpick_warp.apps.statistics.compute import assemble
     from synpick_warp.cli.display import CountProgress, make_console
     from synpick_warp.dataset.reading import open_data_set
-    from synpick_warp.statistics.collect import collect
-    from synpick_warp.statistics.compute import assemble
     from synpick_warp.system.hardware.cores import count_cores
 
     data_set = open_data_set(folder)

@@ -14,8 +14,8 @@ from synpick_warp.cli.options import MAX_THREADS, WholeNumber, check_range, one_
 from synpick_warp.errors import ConfigError
 
 if TYPE_CHECKING:
-    from synpick_warp.validation.registry import Violation
-    from synpick_warp.validation.run import Options, Summary
+    from synpick_warp.apps.validation.registry import Violation
+    from synpick_warp.apps.validation.run import Options, Summary
 
 EXIT_VIOLATIONS = 1
 _MAX_SAMPLE = 10**9
@@ -56,9 +56,9 @@ def validate(
     folder = find_data_set(folder, "synpick-warp validate DIR", has_scenes)
     from rich.console import Console
 
+    from synpick_warp.apps.validation.run import Summary
+    from synpick_warp.apps.validation.run import validate as check
     from synpick_warp.cli.display import CountProgress
-    from synpick_warp.validation.run import Summary
-    from synpick_warp.validation.run import validate as check
 
     summary, counts = Summary(), Counter()
     with CountProgress(Console(stderr=True, highlight=False)) as counter:
@@ -76,7 +76,7 @@ def _make_options(sample: int | None, threads: int, *, poses: bool, fast: bool) 
     Raises:
         ConfigError: A value is not allowed, or two options exclude each other.
     """
-    from synpick_warp.validation.run import DEFAULT_SAMPLE, Options
+    from synpick_warp.apps.validation.run import DEFAULT_SAMPLE, Options
 
     if fast and (poses or sample):
         raise ConfigError("--fast reads no images, so it renders none; drop it, or --sample and --poses")
@@ -90,7 +90,7 @@ def _make_options(sample: int | None, threads: int, *, poses: bool, fast: bool) 
 
 def _describe(violation: Violation) -> str:
     """A violation in one line."""
-    from synpick_warp.validation.registry import load_rules
+    from synpick_warp.apps.validation.registry import load_rules
 
     cure = load_rules()[violation.rule].cure
     return one_line(f"{violation.level} {violation.file}: {violation.rule}: {violation.text}. To mend it: {cure}.")
@@ -98,7 +98,7 @@ def _describe(violation: Violation) -> str:
 
 def _encode(violation: Violation) -> str:
     """A violation as a JSON object."""
-    from synpick_warp.validation.registry import load_rules
+    from synpick_warp.apps.validation.registry import load_rules
 
     return _dump({**violation._asdict(), "cure": load_rules()[violation.rule].cure})
 
@@ -111,7 +111,7 @@ def _dump(record: object) -> str:
 
 
 def _print_rules(*, as_json: bool) -> None:
-    from synpick_warp.validation.registry import load_rules
+    from synpick_warp.apps.validation.registry import load_rules
 
     for item in load_rules().values():
         record = {"rule": item.name, "level": item.level, "sentence": item.sentence, "cure": item.cure}

@@ -9,11 +9,11 @@ from pathlib import Path
 
 import pytest
 
+from synpick_warp.apps.evaluation.results import write_results
+from synpick_warp.apps.evaluation.truth import read_truth
 from synpick_warp.cli import commands
 from synpick_warp.cli.commands import main
 from synpick_warp.dataset.reading import open_data_set
-from synpick_warp.evaluation.results import write_results
-from synpick_warp.evaluation.truth import read_truth
 from tests.harness.scripted_bake import bake, settings
 
 

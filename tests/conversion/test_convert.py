@@ -11,9 +11,9 @@ import cv2
 import numpy as np
 import pytest
 
+from synpick_warp.apps.conversion.run import check_formats, convert
 from synpick_warp.cli.commands import EXIT_MISTAKE, main
 from synpick_warp.configs.schema import Config, Split
-from synpick_warp.conversion.run import check_formats, convert
 from synpick_warp.dataset.commit.verify import verify
 from synpick_warp.errors import ConfigError, DatasetError
 from synpick_warp.scenes.embedded.skies import skies

@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 
 import synpick_warp
+from synpick_warp.apps.conversion.run import convert
 from synpick_warp.configs.schema import FORMATS
-from synpick_warp.conversion.run import convert
 from synpick_warp.exporters.formats import FORMAT_TABLE, Format
 from tests.conversion.test_convert import settings
 from tests.harness import scripted_bake

@@ -8,7 +8,7 @@ import sys
 import time
 from dataclasses import dataclass
 
-from synpick_warp.estimation.decoder_pool import Decoder
+from synpick_warp.apps.estimation.decoder_pool import Decoder
 
 
 @dataclass(frozen=True)

@@ -14,10 +14,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from synpick_warp.apps.estimation import decoder_pool, factories
 from synpick_warp.cli.commands import main
 from synpick_warp.cli.estimate import parse_indices
 from synpick_warp.errors import ConfigError
-from synpick_warp.estimation import decoder_pool, factories
 from synpick_warp.exporters.bop.exporter import BopExporter
 from synpick_warp.exporters.bop.shards.exporter import ShardsExporter
 from synpick_warp.exporters.writing.png import encode_png
@@ -219,7 +219,7 @@ def crash(path: Path, unit: float) -> None:
 
 
 def test_a_model_whose_reader_crashes_is_one_line(bop, tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr("synpick_warp.estimation.models.read_mesh", crash)
+    monkeypatch.setattr("synpick_warp.apps.estimation.models.read_mesh", crash)
     assert run(bop, "--method", "single", "--out", tmp_path / "out.csv") == 2
     line = capsys.readouterr().err
     assert re.search(r"obj_\d{6}\.ply: the process that reads it crashed \(SIGSEGV\); repair or simplify the file\n$", line)

@@ -13,11 +13,11 @@ import numpy as np
 import pytest
 
 import synpick_warp
+from synpick_warp.apps.estimation import decoder_pool, reading
+from synpick_warp.apps.estimation.decoder_pool import VIEWS_PER_PROCESS, DecoderPool, ReadScene, open_pool
+from synpick_warp.apps.estimation.reading import SceneReader
+from synpick_warp.apps.estimation.scenes import Scene, ScenePlan, read_scene
 from synpick_warp.errors import DatasetError
-from synpick_warp.estimation import decoder_pool, reading
-from synpick_warp.estimation.decoder_pool import VIEWS_PER_PROCESS, DecoderPool, ReadScene, open_pool
-from synpick_warp.estimation.reading import SceneReader
-from synpick_warp.estimation.scenes import Scene, ScenePlan, read_scene
 from synpick_warp.exporters.bop.exporter import BopExporter
 from synpick_warp.exporters.bop.shards.exporter import ShardsExporter
 from synpick_warp.stages.pose.batch import RgbdBatch
@@ -186,7 +186,7 @@ def test_few_views_or_threads_are_read_by_this_process(data, monkeypatch):
 
 SCRIPT = """
 import os, signal, sys
-from synpick_warp.estimation.decoder_pool import DecoderPool
+from synpick_warp.apps.estimation.decoder_pool import DecoderPool
 from tests.estimation.probes import Sleep
 print("imported", flush=True)
 with DecoderPool(2) as pool:

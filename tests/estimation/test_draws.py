@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from synpick_warp.apps.estimation.disturbance import OFFSET, TURN, disturb_poses, unit_vectors
+from synpick_warp.apps.estimation.draws import Draw, sample_uniform
 from synpick_warp.codes import Stream
-from synpick_warp.estimation.disturbance import OFFSET, TURN, disturb_poses, unit_vectors
-from synpick_warp.estimation.draws import Draw, sample_uniform
 from tests.twins import rng
 
 

@@ -9,13 +9,13 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import synpick_warp
+from synpick_warp.apps.estimation.gicp import GicpEstimator, load_small_gicp, observed_points
+from synpick_warp.apps.estimation.methods import REFINE, make_group
+from synpick_warp.apps.estimation.models import read_object_models
+from synpick_warp.apps.estimation.reading import SceneReader
+from synpick_warp.apps.estimation.run import Options, read_scenes, run_estimation
+from synpick_warp.apps.estimation.scenes import ScenePlan
 from synpick_warp.errors import ConfigError
-from synpick_warp.estimation.gicp import GicpEstimator, load_small_gicp, observed_points
-from synpick_warp.estimation.methods import REFINE, make_group
-from synpick_warp.estimation.models import read_object_models
-from synpick_warp.estimation.reading import SceneReader
-from synpick_warp.estimation.run import Options, read_scenes, run_estimation
-from synpick_warp.estimation.scenes import ScenePlan
 from synpick_warp.exporters.bop.exporter import BopExporter
 from tests.worlds.box_sets import write_set
 from tests.worlds.box_views import SIZES

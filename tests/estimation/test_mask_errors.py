@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from synpick_warp.estimation.draws import Draw, sample_uniform
-from synpick_warp.estimation.mask_errors import FRACTION, disturb_labels, neighbours, resize_mask, swap_masks
+from synpick_warp.apps.estimation.draws import Draw, sample_uniform
+from synpick_warp.apps.estimation.mask_errors import FRACTION, disturb_labels, neighbours, resize_mask, swap_masks
 
 
 def square(side: int, size: int = 160, at: int = 20, slot: int = 0) -> np.ndarray:

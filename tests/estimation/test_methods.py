@@ -9,14 +9,23 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import synpick_warp
+from synpick_warp.apps.estimation.disturbance import disturb_poses
+from synpick_warp.apps.estimation.factories import sensor_noise
+from synpick_warp.apps.estimation.methods import GICP, REFINE, SINGLE, TRACK, ask, make_group, to_rotations, to_transforms
+from synpick_warp.apps.estimation.run import (
+    AHEAD,
+    BYTES_PER_PIXEL,
+    MAX_VIEWS,
+    Options,
+    count_views,
+    list_targets,
+    read_scenes,
+    run_estimation,
+)
+from synpick_warp.apps.estimation.scenes import ABSENT, ScenePlan, read_scene
+from synpick_warp.apps.evaluation.truth import read_truth
 from synpick_warp.configs.sensors import DepthSensor
 from synpick_warp.errors import DatasetError
-from synpick_warp.estimation.disturbance import disturb_poses
-from synpick_warp.estimation.factories import sensor_noise
-from synpick_warp.estimation.methods import GICP, REFINE, SINGLE, TRACK, ask, make_group, to_rotations, to_transforms
-from synpick_warp.estimation.run import AHEAD, BYTES_PER_PIXEL, MAX_VIEWS, Options, count_views, list_targets, read_scenes, run_estimation
-from synpick_warp.estimation.scenes import ABSENT, ScenePlan, read_scene
-from synpick_warp.evaluation.truth import read_truth
 from synpick_warp.exporters.bop.exporter import BopExporter
 from tests.estimation.fakes import FakeEstimator
 from tests.worlds.box_sets import write_set

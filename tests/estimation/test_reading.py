@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 import synpick_warp
+from synpick_warp.apps.estimation.mask_errors import disturb_labels
+from synpick_warp.apps.estimation.reading import SceneReader
+from synpick_warp.apps.estimation.scenes import ABSENT, Scene, ScenePlan, group_scenes, read_scene
 from synpick_warp.errors import DatasetError
-from synpick_warp.estimation.mask_errors import disturb_labels
-from synpick_warp.estimation.reading import SceneReader
-from synpick_warp.estimation.scenes import ABSENT, Scene, ScenePlan, group_scenes, read_scene
 from synpick_warp.exporters.bop.exporter import BopExporter
 from synpick_warp.exporters.bop.shards.exporter import ShardsExporter
 from tests.worlds.box_sets import HOLE, add_sensor_depth, write_set

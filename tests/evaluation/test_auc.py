@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from synpick_warp.evaluation.auc import LIMIT, band_indices, error_bands, exact_auc, recall_curve, vocap_auc
+from synpick_warp.apps.evaluation.auc import LIMIT, band_indices, error_bands, exact_auc, recall_curve, vocap_auc
 from tests.harness.fuzz import fuzz_examples
 from tests.twins import pose_errors as twin
 

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 import synpick_warp
+from synpick_warp.apps.evaluation.results import write_results
+from synpick_warp.apps.evaluation.truth import read_truth
 from synpick_warp.cli.commands import main
-from synpick_warp.evaluation.results import write_results
-from synpick_warp.evaluation.truth import read_truth
 from synpick_warp.factory import assembly
 from synpick_warp.factory.pipeline import run_bake
 from synpick_warp.system.progress import SilentProgress

@@ -13,10 +13,10 @@ import cv2
 import pytest
 
 import synpick_warp
+from synpick_warp.apps.evaluation.results import write_results
+from synpick_warp.apps.evaluation.truth import read_truth
 from synpick_warp.cli.commands import main
 from synpick_warp.cli.evaluate import method_names, toolkit_command
-from synpick_warp.evaluation.results import write_results
-from synpick_warp.evaluation.truth import read_truth
 from synpick_warp.system.codecs.charts import SCALE, WIDTH
 from tests.worlds.evaluation_set import moved, write_evaluation_set
 

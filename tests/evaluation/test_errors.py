@@ -8,9 +8,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from synpick_warp.evaluation.errors import add_errors, adds_errors, rotation_errors, translation_errors
-from synpick_warp.evaluation.models import expand_symmetries
-from synpick_warp.evaluation.nearest import VertexSearch
+from synpick_warp.apps.evaluation.errors import add_errors, adds_errors, rotation_errors, translation_errors
+from synpick_warp.apps.evaluation.models import expand_symmetries
+from synpick_warp.apps.evaluation.nearest import VertexSearch
 from synpick_warp.scenes.assets.models_info import ModelInfo
 from tests.harness.fuzz import fuzz_examples
 from tests.twins import pose_errors as twin
@@ -67,7 +67,7 @@ def test_errors_of_many_pairs_are_those_of_each_pair(monkeypatch):
     pairs = random_pairs(2, 23)
     whole = add_errors(*pairs, vertices), adds_errors(*pairs, vertices)
     for module in ("errors", "nearest"):
-        monkeypatch.setattr(f"synpick_warp.evaluation.{module}._CHUNK", 20)
+        monkeypatch.setattr(f"synpick_warp.apps.evaluation.{module}._CHUNK", 20)
     for function, expected in zip((add_errors, adds_errors), whole, strict=True):
         np.testing.assert_allclose(function(*pairs, vertices), expected, rtol=1e-12, atol=1e-15)
 

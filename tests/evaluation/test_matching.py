@@ -8,8 +8,8 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from synpick_warp.evaluation.matching import ALL, PER_INSTANCE, make_pairs, match
-from synpick_warp.evaluation.poses import PoseTable
+from synpick_warp.apps.evaluation.matching import ALL, PER_INSTANCE, make_pairs, match
+from synpick_warp.apps.evaluation.poses import PoseTable
 from tests.harness.fuzz import fuzz_examples
 from tests.twins import pose_errors as twin
 

@@ -8,9 +8,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from synpick_warp.evaluation import nearest
-from synpick_warp.evaluation.errors import adds_errors
-from synpick_warp.evaluation.nearest import VertexSearch
+from synpick_warp.apps.evaluation import nearest
+from synpick_warp.apps.evaluation.errors import adds_errors
+from synpick_warp.apps.evaluation.nearest import VertexSearch
 from tests.harness.fuzz import fuzz_examples
 from tests.twins import pose_errors as twin
 

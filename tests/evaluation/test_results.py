@@ -9,11 +9,11 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 import synpick_warp
+from synpick_warp.apps.evaluation import results
+from synpick_warp.apps.evaluation.poses import PoseTable
+from synpick_warp.apps.evaluation.results import HEADER, check_results, encode_results, read_results, write_results
+from synpick_warp.apps.evaluation.truth import read_truth
 from synpick_warp.errors import OutputError, ResultError
-from synpick_warp.evaluation import results
-from synpick_warp.evaluation.poses import PoseTable
-from synpick_warp.evaluation.results import HEADER, check_results, encode_results, read_results, write_results
-from synpick_warp.evaluation.truth import read_truth
 from tests.harness.fuzz import fuzz_examples
 from tests.worlds.evaluation_set import moved, write_evaluation_set
 

@@ -14,13 +14,13 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 import synpick_warp
-from synpick_warp.evaluation import scoring
-from synpick_warp.evaluation.matching import ALL
-from synpick_warp.evaluation.models import read_models
-from synpick_warp.evaluation.poses import PoseTable
-from synpick_warp.evaluation.scoring import METRICS, score
-from synpick_warp.evaluation.tables import FORMATS, render, summarize
-from synpick_warp.evaluation.truth import read_truth
+from synpick_warp.apps.evaluation import scoring
+from synpick_warp.apps.evaluation.matching import ALL
+from synpick_warp.apps.evaluation.models import read_models
+from synpick_warp.apps.evaluation.poses import PoseTable
+from synpick_warp.apps.evaluation.scoring import METRICS, score
+from synpick_warp.apps.evaluation.tables import FORMATS, render, summarize
+from synpick_warp.apps.evaluation.truth import read_truth
 from tests.harness.fuzz import fuzz_examples
 from tests.twins import pose_errors as twin
 from tests.worlds.evaluation_set import BOX, BRICK, OBJECTS, PRISM, SIDES, VISIBILITY, moved, write_evaluation_set

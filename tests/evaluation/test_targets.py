@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 import synpick_warp
+from synpick_warp.apps.evaluation.targets import Target, count_targets, encode_targets, in_layout, read_targets, select_targets
+from synpick_warp.apps.evaluation.truth import read_truth
 from synpick_warp.errors import ResultError
-from synpick_warp.evaluation.targets import Target, count_targets, encode_targets, in_layout, read_targets, select_targets
-from synpick_warp.evaluation.truth import read_truth
 from tests.worlds.evaluation_set import BOX, BRICK, write_evaluation_set
 
 

@@ -11,10 +11,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import synpick_warp
+from synpick_warp.apps.evaluation.models import read_models
+from synpick_warp.apps.evaluation.poses import PoseTable
+from synpick_warp.apps.evaluation.truth import instance_speeds, read_truth
 from synpick_warp.errors import CatalogError, DatasetError
-from synpick_warp.evaluation.models import read_models
-from synpick_warp.evaluation.poses import PoseTable
-from synpick_warp.evaluation.truth import instance_speeds, read_truth
 from synpick_warp.scenes.assets.ply import read_ply_vertices
 from tests.harness.fuzz import fuzz_examples
 from tests.worlds.evaluation_set import (

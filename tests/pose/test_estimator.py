@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from synpick_warp.evaluation.auc import exact_auc
-from synpick_warp.evaluation.errors import add_errors, adds_errors
+from synpick_warp.apps.evaluation.auc import exact_auc
+from synpick_warp.apps.evaluation.errors import add_errors, adds_errors
 from synpick_warp.stages.pose.batch import Estimates, InstanceTable
 from synpick_warp.stages.pose.estimator import EstimatorModels, PoseEstimator, PoseSettings, adapt_schedule
 from synpick_warp.stages.pose.refine import Schedule

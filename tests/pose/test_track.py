@@ -5,7 +5,7 @@ import pytest
 import warp as wp
 from scipy.spatial.transform import Rotation
 
-from synpick_warp.evaluation.errors import add_errors
+from synpick_warp.apps.evaluation.errors import add_errors
 from synpick_warp.stages.pose.estimator import EstimatorModels, PoseEstimator, PoseSettings
 from tests.worlds.pose_scenes import DRILL, MOVING, MUG, TIN, Scene, moving_scene, without
 from tests.worlds.pose_views import pose_errors

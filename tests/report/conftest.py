@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 import synpick_warp
-from synpick_warp.report import write_report
+from synpick_warp.apps.report import write_report
 from tests.harness.scripted_bake import bake, settings
 
 EVIL = "</script><script>window.ran=1</script><img src=x onerror=window.ran=2><!--<script>\"'`${window.ran=3}"

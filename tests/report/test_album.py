@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from synpick_warp.report.album import BUDGET, Album, Picture, Section, encode_ids, encode_photo, shrink
+from synpick_warp.apps.report.album import BUDGET, Album, Picture, Section, encode_ids, encode_photo, shrink
 
 
 def test_ids_are_exact_and_photos_similar():

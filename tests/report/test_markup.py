@@ -6,7 +6,7 @@ import json
 
 import pytest
 
-from synpick_warp.report.markup import Html, content_hash, element, embed_json, join, printable
+from synpick_warp.apps.report.markup import Html, content_hash, element, embed_json, join, printable
 
 NAMES = [
     "</script><script>alert(1)</script>",

@@ -15,11 +15,11 @@ import numpy as np
 import pytest
 
 import synpick_warp
+from synpick_warp.apps.report import album, compose, write_report
+from synpick_warp.apps.report import page as page_module
+from synpick_warp.apps.report.markup import content_hash
 from synpick_warp.cli.commands import main
 from synpick_warp.errors import OutputError
-from synpick_warp.report import album, compose, write_report
-from synpick_warp.report import page as page_module
-from synpick_warp.report.markup import content_hash
 from tests.harness import scripted_bake
 from tests.report.conftest import EVIL
 

@@ -12,10 +12,10 @@ import pytest
 from rich.console import Console
 
 import synpick_warp
+from synpick_warp.apps.statistics import Statistics, compute_statistics
+from synpick_warp.apps.statistics.tables import make_tables
 from synpick_warp.cli.commands import main
 from synpick_warp.configs.schema import Split
-from synpick_warp.statistics import Statistics, compute_statistics
-from synpick_warp.statistics.tables import make_tables
 from synpick_warp.system.codecs.tables import Column, Table, to_csv
 from tests.harness.scripted_bake import bake, settings
 from tests.worlds.evaluation_set import CAMERAS, FRAMES, write_evaluation_set

@@ -15,22 +15,22 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import synpick_warp
+from synpick_warp.apps.statistics import collect as collecting
+from synpick_warp.apps.statistics import partial as partials
+from synpick_warp.apps.statistics.annotations import VISIBILITY_BINS, AnnotationCounts
+from synpick_warp.apps.statistics.attempts import FORCE_BIN
+from synpick_warp.apps.statistics.collect import SceneTask, collect
+from synpick_warp.apps.statistics.compute import assemble, compute_statistics
+from synpick_warp.apps.statistics.counting import Group
+from synpick_warp.apps.statistics.coverage import BANDS, BINS, MIN_VISIBILITY, SECTORS, CoverageCounts, direction_bins
+from synpick_warp.apps.statistics.depth import DEPTH_BIN, QUANTILES, DepthCounts
+from synpick_warp.apps.statistics.lights import LightCounts
+from synpick_warp.apps.statistics.partial import Partial
+from synpick_warp.apps.statistics.records import Light
+from synpick_warp.apps.statistics.scenes import SceneTruth
+from synpick_warp.apps.statistics.timeline import TIME_BIN, TimelineCounts
 from synpick_warp.dataset.reading import DataSet
 from synpick_warp.errors import DatasetError
-from synpick_warp.statistics import collect as collecting
-from synpick_warp.statistics import partial as partials
-from synpick_warp.statistics.annotations import VISIBILITY_BINS, AnnotationCounts
-from synpick_warp.statistics.attempts import FORCE_BIN
-from synpick_warp.statistics.collect import SceneTask, collect
-from synpick_warp.statistics.compute import assemble, compute_statistics
-from synpick_warp.statistics.counting import Group
-from synpick_warp.statistics.coverage import BANDS, BINS, MIN_VISIBILITY, SECTORS, CoverageCounts, direction_bins
-from synpick_warp.statistics.depth import DEPTH_BIN, QUANTILES, DepthCounts
-from synpick_warp.statistics.lights import LightCounts
-from synpick_warp.statistics.partial import Partial
-from synpick_warp.statistics.records import Light
-from synpick_warp.statistics.scenes import SceneTruth
-from synpick_warp.statistics.timeline import TIME_BIN, TimelineCounts
 from tests.worlds.evaluation_set import BOX, BRICK, CAMERAS, FRAMES, MODES, PERIOD, PRISM, VISIBILITY, write_evaluation_set
 
 ATTEMPTS = [

@@ -6,9 +6,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from synpick_warp.statistics.annotations import Annotations
-from synpick_warp.statistics.counting import Group
-from synpick_warp.statistics.paper import compare, object_distance, read_paper, total_variation
+from synpick_warp.apps.statistics.annotations import Annotations
+from synpick_warp.apps.statistics.counting import Group
+from synpick_warp.apps.statistics.paper import compare, object_distance, read_paper, total_variation
 
 COUNTS = st.dictionaries(st.sampled_from("abcdef"), st.integers(0, 1000)).filter(lambda counts: sum(counts.values()) > 0)
 

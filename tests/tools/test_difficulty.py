@@ -7,8 +7,8 @@ import sys
 
 import pytest
 
+from synpick_warp.apps.evaluation.truth import read_truth
 from synpick_warp.dataset.reading import open_data_set
-from synpick_warp.evaluation.truth import read_truth
 from tests.worlds.evaluation_set import SPEED, VISIBILITY, write_evaluation_set
 from tools.reports import difficulty
 

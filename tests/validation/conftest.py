@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from synpick_warp.validation.registry import Violation
-from synpick_warp.validation.run import Options, Summary, validate
+from synpick_warp.apps.validation.registry import Violation
+from synpick_warp.apps.validation.run import Options, Summary, validate
 from tests.harness import scripted_bake
 from tests.worlds import box_views
 

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from synpick_warp.validation.rules.masks import wrong_sides
+from synpick_warp.apps.validation.rules.masks import wrong_sides
 
 LEFT, TOP, RIGHT, BOTTOM = range(4)
 SIZE = (100, 60)

@@ -6,9 +6,9 @@ import json
 
 import pytest
 
+from synpick_warp.apps.validation import run as running
+from synpick_warp.apps.validation.registry import load_rules
 from synpick_warp.cli.commands import main
-from synpick_warp.validation import run as running
-from synpick_warp.validation.registry import load_rules
 from tests.validation.planting import SCENE, edit_entry
 from tools.docs import VALIDATION, validation_reference
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from synpick_warp.validation.registry import load_rules
+from synpick_warp.apps.validation.registry import load_rules
 from tests.validation import faults_annotations, faults_images, faults_models
 from tests.validation.planting import FAULTS
 

@@ -7,9 +7,9 @@ import json
 import numpy as np
 import pytest
 
+from synpick_warp.apps.validation.registry import Level
+from synpick_warp.apps.validation.run import Options, Summary, validate
 from synpick_warp.dataset.bop.layout import Layout
-from synpick_warp.validation.registry import Level
-from synpick_warp.validation.run import Options, Summary, validate
 from tests.validation.layouts import LAYOUTS, imagewise, itodd, multisensor, tless, ycbv
 from tests.validation.planting import read, write
 

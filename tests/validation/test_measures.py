@@ -9,12 +9,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.distance import pdist
 
+from synpick_warp.apps.validation.comparison import best_shift, fit_masks, moved
+from synpick_warp.apps.validation.model_files import diameter, sample_area, turn_about
+from synpick_warp.apps.validation.pictures import crop_mask, decode_mask, png_type
+from synpick_warp.apps.validation.rules.coco import run_lengths
 from synpick_warp.errors import DatasetError
 from synpick_warp.system.inputs.image_files import decode_picture, tiff_size
-from synpick_warp.validation.comparison import best_shift, fit_masks, moved
-from synpick_warp.validation.model_files import diameter, sample_area, turn_about
-from synpick_warp.validation.pictures import crop_mask, decode_mask, png_type
-from synpick_warp.validation.rules.coco import run_lengths
 
 masks = st.integers(0, 2**32 - 1).map(lambda seed: np.random.default_rng(seed).random((7, 9)) < 0.3)
 

@@ -11,16 +11,16 @@ import cv2
 import numpy as np
 import pytest
 
+from synpick_warp.apps.viz import explain
+from synpick_warp.apps.viz.drawing import FONT, instance_color
+from synpick_warp.apps.viz.explain import object_names, to_color_image, write_explanation
+from synpick_warp.apps.viz.explain_panels import fitted, load_chart, wrapped
+from synpick_warp.apps.viz.explain_record import choice_words, labels, seal_words
 from synpick_warp.cli.commands import main
 from synpick_warp.configs.schema import Config, Perception, Target
 from synpick_warp.configs.write import config_to_toml
 from synpick_warp.errors import DatasetError, OutputError
 from synpick_warp.exporters.bop.exporter import BopExporter
-from synpick_warp.viz import explain
-from synpick_warp.viz.drawing import FONT, instance_color
-from synpick_warp.viz.explain import object_names, to_color_image, write_explanation
-from synpick_warp.viz.explain_panels import fitted, load_chart, wrapped
-from synpick_warp.viz.explain_record import choice_words, labels, seal_words
 from tests.harness.charts import near, picture_of
 from tests.harness.exporter_contract import export
 from tests.worlds.attempt_records import attempt, nothing_seen, record, seen, seen_object

@@ -9,9 +9,9 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from synpick_warp.viz.drawing import instance_color
-from synpick_warp.viz.explain_graph import CYCLIC, KEPT, OUTVOTED, RADIUS, Edge, clutter_edges, draw_graph, lay_out
-from synpick_warp.viz.explain_record import Attempt
+from synpick_warp.apps.viz.drawing import instance_color
+from synpick_warp.apps.viz.explain_graph import CYCLIC, KEPT, OUTVOTED, RADIUS, Edge, clutter_edges, draw_graph, lay_out
+from synpick_warp.apps.viz.explain_record import Attempt
 from tests.worlds.attempt_records import attempt, seen
 
 SIZE = (500, 600)

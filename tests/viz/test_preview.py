@@ -12,16 +12,16 @@ import cv2
 import numpy as np
 import pytest
 
+from synpick_warp.apps.viz.depth_colors import color_depth, pooled_scale, tote_scale
+from synpick_warp.apps.viz.drawing import instance_color, short_labels
+from synpick_warp.apps.viz.preview import MAX_VIEWS, find_scenes, read_baked, sample, write_contact_sheet
+from synpick_warp.apps.viz.preview_legend import COLUMN, LINE, Box, draw_legend, legend_width, place_labels
 from synpick_warp.cli.commands import main
 from synpick_warp.configs.write import config_to_toml
 from synpick_warp.errors import DatasetError, OutputError
 from synpick_warp.exporters.bop.exporter import BopExporter
 from synpick_warp.exporters.bop.scene import write_layer
 from synpick_warp.exporters.bop.view import write_rendered_layer
-from synpick_warp.viz.depth_colors import color_depth, pooled_scale, tote_scale
-from synpick_warp.viz.drawing import instance_color, short_labels
-from synpick_warp.viz.preview import MAX_VIEWS, find_scenes, read_baked, sample, write_contact_sheet
-from synpick_warp.viz.preview_legend import COLUMN, LINE, Box, draw_legend, legend_width, place_labels
 from tests.harness.exporter_contract import export
 from tests.harness.hostile import replaced
 from tests.harness.scripted_bake import bake, settings

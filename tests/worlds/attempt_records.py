@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
+from synpick_warp.apps.viz.explain_record import Attempt
 from synpick_warp.dataset.records import InstanceObservation, Observation
-from synpick_warp.viz.explain_record import Attempt
 
 
 def seen_object(instance: int, object_id: int, suction: tuple[float, float], **other: Any) -> dict[str, Any]:

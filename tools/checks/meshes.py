@@ -20,6 +20,7 @@ import numpy as np
 import warp as wp
 from rich.console import Console
 
+from synpick_warp.apps.viz.preview import put_text, write_picture
 from synpick_warp.configs.load import load_config
 from synpick_warp.errors import SynpickError
 from synpick_warp.factory.assembly import make_renderer
@@ -32,7 +33,6 @@ from synpick_warp.stages.arrays import allocate
 from synpick_warp.stages.buffers import Snapshot, allocate_view_buffers
 from synpick_warp.stages.render.scene import build_render_scene
 from synpick_warp.stages.render.view_setup import make_views
-from synpick_warp.viz.preview import put_text, write_picture
 
 LOADS, WARNS, REFUSES, FAILS = "loads", "warns", "refuses", "fails"
 """Outcomes; the last is a fault of the program: a traceback, a crash or a time-out."""

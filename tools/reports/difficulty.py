@@ -13,9 +13,9 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from synpick_warp.apps.evaluation.truth import Truth, read_truth
 from synpick_warp.dataset.reading import DataSet, open_data_set
 from synpick_warp.errors import SynpickError
-from synpick_warp.evaluation.truth import Truth, read_truth
 from tools.figures import describe_run, write_run
 from tools.options import Row, fail, make_parser
 

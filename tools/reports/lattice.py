@@ -30,6 +30,7 @@ import numpy as np
 import warp as wp
 from rich.console import Console
 
+from synpick_warp.apps.viz.preview import write_picture
 from synpick_warp.codes import Segment
 from synpick_warp.configs.schema import FAST, REFERENCE, Config, Render
 from synpick_warp.errors import SynpickError
@@ -47,7 +48,6 @@ from synpick_warp.stages.render.scene import build_render_scene
 from synpick_warp.stages.stream import TickReader
 from synpick_warp.system.hardware.device import pick_device
 from synpick_warp.system.progress import SilentProgress
-from synpick_warp.viz.preview import write_picture
 from tools.figures import finish_report
 from tools.options import Row, configure, fail, image_resolution, make_parser, positive_count
 from tools.reports.reference_store import ReferenceStore, existing_folder

@@ -15,9 +15,9 @@ from pathlib import Path
 import numpy as np
 from rich.console import Console
 
+from synpick_warp.apps.viz.drawing import write_picture
 from synpick_warp.errors import SynpickError
 from synpick_warp.system.hardware.device import pick_device
-from synpick_warp.viz.drawing import write_picture
 from tools.figures import finish_report
 from tools.options import configure, fail, make_parser
 from tools.reports.render_checks import measure_furnaces, measure_planes

@@ -7,7 +7,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from synpick_warp.viz.drawing import FONT, put_text, write_picture
+from synpick_warp.apps.viz.drawing import FONT, put_text, write_picture
 from tools.reports.render_piles import Pair
 
 CELL_WIDTH = 640

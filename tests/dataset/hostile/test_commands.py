@@ -16,13 +16,13 @@ from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 
 import synpick_warp
+from synpick_warp.apps.estimation import factories
+from synpick_warp.apps.evaluation.results import write_results
+from synpick_warp.apps.evaluation.truth import read_truth
 from synpick_warp.cli.commands import main
 from synpick_warp.configs.load import load_config
 from synpick_warp.dataset.reading import DataSet
 from synpick_warp.errors import SynpickError
-from synpick_warp.estimation import factories
-from synpick_warp.evaluation.results import write_results
-from synpick_warp.evaluation.truth import read_truth
 from synpick_warp.factory import assembly
 from synpick_warp.factory.pipeline import run_bake
 from synpick_warp.system.progress import SilentProgress

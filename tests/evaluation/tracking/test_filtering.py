@@ -10,8 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation, Slerp
 
+from synpick_warp.apps.evaluation import PAPER_ALPHAS, PoseTable, filter_poses
 from synpick_warp.errors import ConfigError, DatasetError
-from synpick_warp.evaluation import PAPER_ALPHAS, PoseTable, filter_poses
 from tests.harness.fuzz import fuzz_examples
 from tests.worlds.noisy_tracks import FRAME, Motion, estimates, noisy_tables, true_poses
 

@@ -7,9 +7,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from synpick_warp.apps.evaluation import PoseTable, filter_poses, split_by_mode, sweep_alpha
+from synpick_warp.apps.evaluation.tracking.sweep import SWEEP_ALPHAS, AlphaSweep
 from synpick_warp.errors import ConfigError, DatasetError
-from synpick_warp.evaluation import PoseTable, filter_poses, split_by_mode, sweep_alpha
-from synpick_warp.evaluation.tracking.sweep import SWEEP_ALPHAS, AlphaSweep
 from tests.harness.fuzz import fuzz_examples
 from tests.worlds.noisy_tracks import FRAME, Motion, estimates, true_poses
 

@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given, settings
 from scipy.spatial.transform import Rotation
 
+from synpick_warp.apps.evaluation import PoseTable, find_tracks, track_of_instance
 from synpick_warp.errors import ConfigError, DatasetError
-from synpick_warp.evaluation import PoseTable, find_tracks, track_of_instance
 from tests.harness.fuzz import fuzz_examples
 from tests.worlds.noisy_tracks import Motion, estimates, noisy_tables, true_poses
 

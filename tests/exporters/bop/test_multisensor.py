@@ -9,9 +9,9 @@ from typing import ClassVar
 import pytest
 
 import synpick_warp
+from synpick_warp.apps.validation.run import Options, Summary, validate
 from synpick_warp.configs.schema import Config
 from synpick_warp.exporters.bop.exporter import BopExporter
-from synpick_warp.validation.run import Options, Summary, validate
 from tests.harness.exporter_contract import FRAMES, ExporterContract
 from tests.worlds import box_views
 from tests.worlds.box_sets import EPISODES, write_set

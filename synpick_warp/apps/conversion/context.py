@@ -1,0 +1,74 @@
+"""Context of the exporters of a conversion: objects and lights are loaded again if a format needs them, and models copied."""
+
+from __future__ import annotations
+
+from functools import cached_property
+from pathlib import Path
+
+from synpick_warp.apps.conversion.source import Source
+from synpick_warp.configs.schema import Config
+from synpick_warp.dataset.object_names import object_names
+from synpick_warp.errors import DatasetError
+from synpick_warp.exporters.base import ExportContext
+from synpick_warp.exporters.writing.pool import WriterPool
+from synpick_warp.scenes.types import Catalog, EnvironmentMap
+
+
+class StoredContext(ExportContext):
+    """Context of the exporters that write a converted data set."""
+
+    def __init__(self, source: Source, out: Path, config: Config, pool: WriterPool) -> None:
+        """
+        Args:
+            source: The data set that is converted.
+            out: See `ExportContext`.
+            config: Settings of the converted data set.
+            pool: See `ExportContext`.
+        """
+        from synpick_warp.scenes.cameras import make_cameras
+
+        super().__init__(out, config, Catalog(()), make_cameras(config.cameras), (), pool)
+        self._source = source
+
+    @cached_property
+    def _assets(self) -> tuple[Catalog, tuple[EnvironmentMap, ...]]:
+        """Objects and lights of the source, loaded again: its models are rounded to millimetres in single precision.
+
+        Raises:
+            DatasetError: They are not those that it was baked from.
+        """
+        from synpick_warp.dataset.commit.digests import digest_inputs
+        from synpick_warp.scenes.catalog import load_catalog
+        from synpick_warp.scenes.lights import load_lights
+
+        source = self._source
+        catalog, lights = load_catalog(source.config), load_lights(source.config.bake.lights)
+        if digest_inputs(catalog, lights) != source.inputs:
+            raise DatasetError(f"the objects or lights of {source.folder} have changed since its bake, but are needed; restore them")
+        return catalog, lights
+
+    @property
+    def catalog(self) -> Catalog:
+        """See `ExportContext`."""
+        return self._assets[0]
+
+    @property
+    def lights(self) -> tuple[EnvironmentMap, ...]:
+        """See `ExportContext`."""
+        return self._assets[1]
+
+    @property
+    def names(self) -> dict[int, str]:
+        """See `ExportContext`: from the store; without one from models and settings, where some may have none."""
+        data = self._source.data
+        if data.has_store:
+            found = {item.object_id: item.name for item in data.objects}
+        else:
+            known = object_names(self._source.folder, self._source.config, set(data.models_info))
+            found = {index: known.get(index, f"obj_{index:06d}") for index in data.models_info}
+        return dict(sorted(found.items()))
+
+    def copy_constants(self, names: tuple[Path, ...]) -> bool:
+        """See `ExportContext`."""
+        self._source.copy_constants(names, self.out)
+        return True

@@ -1,0 +1,266 @@
+"""Conversion of a BOP data set from another source to formats of images. Scene and image ids are kept; images are copied without decoding
+where the format has the same file type; annotations are written as they were read.
+
+The result has no settings and no manifest either. It is written to a temporary folder and renamed when it is complete.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import shutil
+import tempfile
+from collections.abc import Iterator, Sequence
+from functools import cached_property
+from pathlib import Path
+
+from synpick_warp.apps.conversion.scenes import StoredSceneFiles, StoredViewFiles, find_runs
+from synpick_warp.codes import Ending
+from synpick_warp.configs.load import load_config
+from synpick_warp.configs.schema import Config
+from synpick_warp.dataset.bop.layout import TARGETS
+from synpick_warp.dataset.bop.models import models_folder
+from synpick_warp.dataset.bop.scenes import FoundScenes
+from synpick_warp.dataset.object_names import object_names
+from synpick_warp.dataset.reading import DataSet
+from synpick_warp.dataset.view_files import SceneFiles, SceneFolder
+from synpick_warp.errors import ConfigError, DatasetError
+from synpick_warp.exporters.base import ExportContext
+from synpick_warp.exporters.bop.shared.models import MODEL_FOLDERS
+from synpick_warp.exporters.formats import contents_of, convertible
+from synpick_warp.exporters.registry import Exporters, finalize, load_exporter_classes
+from synpick_warp.exporters.writing.files import PARTIAL, check_output_folder, output_error, write_atomically
+from synpick_warp.exporters.writing.folder import Buffer
+from synpick_warp.exporters.writing.notes import CAMERA_FILE, NOTES_FILE
+from synpick_warp.exporters.writing.png import encode_png
+from synpick_warp.exporters.writing.pool import WriterPool
+from synpick_warp.exporters.writing.rle import Masks, Runs
+from synpick_warp.scenes.cameras import make_cameras
+from synpick_warp.scenes.types import Catalog
+from synpick_warp.system.codecs.jpeg import encode_jpeg
+from synpick_warp.system.folders import make_folder
+from synpick_warp.system.hardware.cores import count_cores
+from synpick_warp.system.inputs.image_files import MAX_IMAGE_FILE, TEXTURE_KINDS
+from synpick_warp.system.progress import Report
+from synpick_warp.views.frames import EpisodeEnd
+
+_IMAGES = {"views", "masks"}
+"""Kinds of `formats.Content` that these data sets have."""
+_NEEDS = {"gt": "ground truth (scene_gt.json)", "rgb": "colour images"}
+_NEEDS_OF_MASKS = {"mask_visib": "masks of visible parts (mask_visib)"}
+_NEEDS_OF_DEPTH = {"camera": "cameras (scene_camera.json)", "depth": "depth images"}
+"""What formats need of a scene, by the names of `SceneFiles.has`."""
+_BAKED = (CAMERA_FILE, "README.md")
+"""Files of exporters that describe a bake, its camera or its licence."""
+_JPEG_QUALITY = 95
+"""JPEG quality of colour images that are encoded again: they are neither PNG nor JPEG, or differ in type from the first one."""
+
+
+class FoundViewFiles(StoredViewFiles):
+    """`StoredView` of any BOP scene: images of other formats and sizes are encoded or refused, amodal masks may be missing."""
+
+    suffix, size = "", (0, 0)
+    """Of all colour images; width and height [px]."""
+
+    @property
+    def color(self) -> tuple[str, Buffer]:
+        """See `EncodedView`."""
+        size = self.files.image_size(self.frame)
+        if size != self.size:
+            shown, first = (f"{width} x {height}" for width, height in (size, self.size))
+            raise DatasetError(f"{self.files.place}: image {self.frame} has {shown} pixels, the first one {first}; formats have one size")
+        suffix, data = self.files.image_file("rgb", self.frame)
+        if suffix.replace("jpeg", "jpg") == self.suffix:
+            return self.suffix, data
+        image = self.color_image()
+        return self.suffix, encode_png(image) if self.suffix == ".png" else encode_jpeg(image, _JPEG_QUALITY)
+
+    def layer(self, name: str) -> Buffer:
+        """See `StoredView`."""
+        suffix, data = self.files.image_file(name, self.frame)
+        return data if suffix == ".png" else encode_png(self._image(name, None, "uint16"))
+
+    def masks(self) -> list[Masks]:
+        """See `EncodedView`; where there are no amodal masks, COCO's formats need none."""
+        visible = self._runs("mask_visib")
+        return [Masks(*pair) for pair in zip(self._runs("mask") if self.files.has("mask") else visible, visible, strict=True)]
+
+    def _runs(self, name: str) -> list[Runs]:
+        return [find_runs(mask) for mask in self.files.masks(name, self.frame, len(self.gt))]
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class FoundSceneFiles(StoredSceneFiles):
+    """`StoredScene` of any BOP scene."""
+
+    suffix: str
+    size: tuple[int, int]
+
+    def views(self, frames: range) -> Iterator[StoredViewFiles]:
+        """See `StoredScene`."""
+        for frame in frames:
+            view = FoundViewFiles(self.files, self.scene, self.images[frame])
+            view.suffix, view.size = self.suffix, self.size
+            yield view
+
+
+class _Context(ExportContext):
+    """Context of the exporters: names from models, or else numbers; models are copied."""
+
+    def __init__(self, data: DataSet, out: Path, config: Config, pool: WriterPool) -> None:
+        super().__init__(out, config, Catalog(()), make_cameras(config.cameras), (), pool)
+        self._data = data
+
+    @property
+    def names(self) -> dict[int, str]:
+        """See `ExportContext`."""
+        return self._names
+
+    @cached_property
+    def _names(self) -> dict[int, str]:
+        found = {int(index) for view in self._data.views() for index in view.object_ids}
+        folder = self._data.folder
+        named = object_names(folder, None, found) if (folder / models_folder(folder) / "models_info.json").is_file() else {}
+        return {index: named.get(index, f"obj_{index:06d}") for index in sorted(found)}
+
+    def copy_constants(self, names: tuple[Path, ...]) -> bool:
+        """See `ExportContext`: what there is of models."""
+        layout = _found(self._data).layout
+        for name in MODEL_FOLDERS:
+            source = layout.models.get(name if name in layout.models else models_folder(layout.root))
+            for file in sorted(source.files) if source is not None else ():
+                if source is not None and file.rpartition(".")[2].lower() in ("ply", "json", *TEXTURE_KINDS):
+                    make_folder(self.out / name)
+                    (self.out / name / file).write_bytes(source.read(file, MAX_IMAGE_FILE))
+        return True
+
+
+def _found(data: DataSet) -> FoundScenes:
+    """The scenes of a data set from another source."""
+    assert data.found is not None
+    return data.found
+
+
+def convert_found(data: DataSet, out: Path, formats: Sequence[str], processes: int, report: Report) -> int:
+    """Convert all scenes of a data set from another source; returns their number.
+
+    Args:
+        data: The data set.
+        out: Folder of the converted one: new or empty.
+        formats: Names of formats.
+        processes: Number of processes; 0: one per core.
+        report: Observer: unit, number done, total.
+
+    Raises:
+        ConfigError: A format cannot be made of it.
+        DatasetError: A file is missing or damaged.
+        OutputError: `out` cannot be used, or a file not be written.
+    """
+    first = next((data.scene_files(index, 0) for index, episode in data.items() if len(episode)), None)
+    if first is None:
+        raise DatasetError(f"{data.folder} has no images")
+    _check_formats(data, first, formats)
+    check_output_folder(out)
+    if out.is_dir() and any(out.iterdir()):
+        raise ConfigError(f"--out is {out}, which is not empty; name a new folder: data sets that no bake wrote are converted as a whole")
+    config = _make_config(data, first, formats)
+    try:
+        make_folder(out.parent)
+        work = Path(tempfile.mkdtemp(prefix=f".{out.name}.", dir=out.parent))
+    except OSError as error:
+        raise output_error(out, error) from error
+    try:
+        count = _write(data, work, config, processes, report)
+        work.chmod(0o755)
+        work.rename(out)
+    except OSError as error:
+        raise output_error(out, error) from error
+    finally:
+        shutil.rmtree(work, ignore_errors=True)
+    return count
+
+
+def _check_formats(data: DataSet, first: SceneFiles, formats: Sequence[str]) -> None:
+    """Check that the formats can be made of what the first scene has."""
+    found = _found(data)
+    if data.camera_count > 1:
+        raise ConfigError(f"{data.folder} has {data.camera_count} sensors; convert takes data sets of one camera a scene")
+    if len(found.splits) > 1:
+        raise ConfigError(f"{data.folder} has the splits {', '.join(found.splits)}; choose one by --split")
+    bop = dataclasses.replace(load_config().bop, coco=False)
+    contents = {name: set(contents_of(name, bop)) for name in convertible()}
+    for name in formats:
+        if name not in contents:
+            raise ConfigError(f"--to names {name}; allowed: {', '.join(each for each in contents if contents[each] <= _IMAGES)}")
+        if not contents[name] <= _IMAGES:
+            raise ConfigError(f"--to names {name}, which is made of trajectories; {data.folder} has none, as no bake wrote it")
+        if (name == "bop" and isinstance(first, SceneFolder)) or (name == "shards" and first.place.suffix == ".tar"):
+            raise ConfigError(f"--to names {name}, which {data.folder} has already; copy the folder")
+        (kind,) = load_exporter_classes([name])
+        needs = _NEEDS | (_NEEDS_OF_MASKS if "masks" in contents[name] else {}) | (_NEEDS_OF_DEPTH if kind.writes_depth else {})
+        for part, what in needs.items():
+            if not first.has(part):
+                raise ConfigError(f"--to names {name}, but {first.place} has no {what}, which it needs")
+        if kind.writes_depth and not (first.has("gt_info") or _has_masks(first)):
+            raise ConfigError(f"--to names {name}, but {first.place} has neither scene_gt_info.json nor amodal masks, of which it is made")
+
+
+def _has_masks(scene: SceneFiles) -> bool:
+    return scene.has("mask") and scene.has("mask_visib")
+
+
+def _make_config(data: DataSet, first: SceneFiles, formats: Sequence[str]) -> Config:
+    """Settings by which exporters name and lay out files; they are written nowhere."""
+    base, frame = load_config(), first.frames()[0]
+    suffix, _ = first.image_file("rgb", frame)
+    return dataclasses.replace(
+        base,
+        bake=dataclasses.replace(base.bake, formats=tuple(formats), mode="move"),
+        bop=dataclasses.replace(
+            base.bop,
+            split=_found(data).splits[0].removesuffix("_web"),
+            masks=_has_masks(first),
+            coco="bop" in formats and _has_masks(first),
+            keypoints=0,
+            color_format="jpg" if suffix in (".jpg", ".jpeg") else "png",
+        ),
+        cameras=dataclasses.replace(
+            base.cameras, positions=base.cameras.positions[:1], ups=base.cameras.ups[:1], resolution=first.image_size(frame)
+        ),
+        splits=(),
+        render=dataclasses.replace(base.render, layers=()),
+    )
+
+
+def _write(data: DataSet, work: Path, config: Config, processes: int, report: Report) -> int:
+    """Write a data set into a new folder; returns the number of scenes."""
+    classes = load_exporter_classes(config.bake.formats)
+    scenes = [data.scene_id(index, 0) for index in data]
+    done: list[int] = []
+
+    def commit(scene: int) -> None:
+        done.append(scene)
+        report("scenes", len(done), len(scenes))
+
+    (work / PARTIAL).mkdir()
+    with WriterPool(processes or count_cores(), 0) as pool:
+        exporters = Exporters(classes, _Context(data, work, config, pool))
+        exporters.write_constants()
+        for episode, scene in zip(data.values(), scenes, strict=True):
+            images = tuple(episode.image_ids)
+            files = data.scene_files(episode.index, 0)
+            suffix = f".{config.bop.color_format}"
+            exporters.write_stored(scene, [FoundSceneFiles(files, scene, images, suffix, config.cameras.resolution)])
+            end = EpisodeEnd(scene, 0, len(images), int(Ending.FINISHED), image_ids=images)
+            exporters.end_episode(end, lambda scene=scene: commit(scene))
+        pool.wait()
+        exporters.close()
+        finalize(classes, work, config, pool, sorted(done))
+    shutil.rmtree(work / PARTIAL)
+    for name in _BAKED:
+        (work / name).unlink(missing_ok=True)
+    listing = _found(data).layout.listing
+    for name in sorted(name for name in listing.files if name == CAMERA_FILE or ("bop" in config.bake.formats and TARGETS.fullmatch(name))):
+        (work / name).write_bytes(listing.read(name, MAX_IMAGE_FILE))
+    text = f"Converted by synpick-warp from the BOP data set {data.folder.resolve().name}: {len(scenes):,} scenes with their own ids.\n"
+    write_atomically(work / NOTES_FILE, text.encode())
+    return len(scenes)

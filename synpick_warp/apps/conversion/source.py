@@ -1,0 +1,145 @@
+"""Source of a conversion: a baked data set with its manifest, episodes, scenes and trajectories."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+from collections.abc import Collection, Iterator
+from pathlib import Path
+from typing import Any
+
+from synpick_warp.apps.conversion.scenes import StoredSceneFiles
+from synpick_warp.apps.conversion.trajectories import check_trajectory, read_ticks
+from synpick_warp.codes import Ending
+from synpick_warp.configs.schema import Config
+from synpick_warp.configs.splits import DataLayout
+from synpick_warp.dataset.annotations import ADVICE, check_content
+from synpick_warp.dataset.commit.file_names import check_file_names
+from synpick_warp.dataset.commit.frame_counts import check_frames
+from synpick_warp.dataset.commit.manifest import (
+    CONSTANTS,
+    INPUTS,
+    committed_episodes,
+    episode_entry,
+    read_checksums,
+    read_entry,
+    read_manifest,
+    read_settings,
+)
+from synpick_warp.dataset.reading import DataSet
+from synpick_warp.dataset.trajectory import GROUP_FILE, StoreAttributes
+from synpick_warp.errors import DatasetError
+from synpick_warp.exporters.formats import Content
+from synpick_warp.exporters.trajectory.arrays import STORE
+from synpick_warp.exporters.writing.checksums import open_regular
+from synpick_warp.exporters.writing.files import remove_folder
+from synpick_warp.views.frames import EpisodeEnd, TickBatch
+
+_COPY_BYTES = 1 << 20
+"""Size of a copy block [B]."""
+
+
+class Source:
+    """A baked data set that is converted. Reads its manifest and settings, and checks them."""
+
+    def __init__(self, folder: Path) -> None:
+        """
+        Args:
+            folder: Folder of the data set.
+
+        Raises:
+            DatasetError: It is not a data set, or has no episode.
+        """
+        self.folder = folder
+        self._manifest = read_manifest(folder)
+        self.config: Config = read_settings(folder, self._manifest)
+        self.data = DataSet(folder)
+        self.episodes = committed_episodes(folder)
+        if not self.episodes:
+            raise DatasetError(f"{folder} has no committed episode; finish its bake")
+
+    @property
+    def inputs(self) -> dict[str, str]:
+        """Content digests of objects and lights."""
+        return self._manifest.get(INPUTS, {})
+
+    def check_contents(self, needed: Collection[Content]) -> None:
+        """Check that it has what formats are made of: all attributes and arrays of the trajectories, but of images only that there are any.
+
+        Raises:
+            DatasetError: It lacks something, or that is damaged.
+        """
+        if "poses" in needed:
+            self.check_trajectories(gripper="gripper" in needed)
+        if "views" in needed and not {"bop", "shards"} & set(self.config.bake.formats):
+            raise DatasetError(f"{self.folder} has no images; bake it with --formats bop or shards")
+        if "masks" in needed and not self.config.bop.masks:
+            raise DatasetError(f"{self.folder} has no masks, which COCO annotations need; bake it with bop.masks = true")
+
+    def check_trajectories(self, *, gripper: bool) -> None:
+        """Check that the trajectories of all episodes have what a format needs; `gripper`: states and commands of the gripper, too.
+
+        Raises:
+            DatasetError: There are none, or an attribute or array is missing or damaged.
+        """
+        self.data.require_store()
+        place = self.data.folder / STORE / GROUP_FILE
+        store = check_content(self.data.attributes, StoreAttributes, place)
+        steps = self.config.physics.steps_per_tick
+        if store.steps_per_tick != steps:
+            there = f"steps_per_tick is {store.steps_per_tick}, the settings have {steps}"
+            raise DatasetError(f"{place} is damaged: {there}; {ADVICE}")
+        for end in map(self.episode_end, self.episodes):
+            if Ending(end.ending).delivers:
+                check_trajectory(self.data[end.episode], end, len(store.lights), gripper=gripper)
+
+    def scenes(self, end: EpisodeEnd) -> list[StoredSceneFiles]:
+        """The scene of each camera in an episode."""
+        data, cameras = self.data, range(self.data.camera_count)
+        return [StoredSceneFiles(data.scene_files(end.episode, one), len(cameras) * end.episode + one, end.images) for one in cameras]
+
+    def ticks(self, end: EpisodeEnd) -> Iterator[TickBatch]:
+        """See `trajectories.read_ticks`."""
+        return read_ticks(self.data[end.episode], self.config.physics.steps_per_tick)
+
+    def episode_end(self, index: int) -> EpisodeEnd:
+        """How a committed episode ended.
+
+        Raises:
+            DatasetError: Its manifest entry is missing or damaged.
+        """
+        entry = read_entry(self.folder, episode_entry(index))
+        if entry is None:
+            raise DatasetError(f"{self.folder / episode_entry(index)}.json is missing; resume the bake")
+        row: dict[str, Any] = entry["row"]
+        check_frames(self.folder, DataLayout.of(self.config), index, row["frames"])
+        lines = tuple(json.dumps(attempt) + "\n" for attempt in entry["attempts"])
+        return EpisodeEnd(index, row["arrangement"], row["frames"], int(Ending[row["ending"].upper()]), row, lines)
+
+    def copy_constants(self, names: tuple[Path, ...], out: Path) -> None:
+        """Copy files that all episodes share, and those in folders of these names, to another data set; replaces what is there.
+
+        Raises:
+            DatasetError: A file is missing or no regular file, or the source has none of a name.
+            OSError: A file cannot be written.
+        """
+        known = read_checksums(self.folder, CONSTANTS)
+        check_file_names(self.folder, CONSTANTS, known, DataLayout.of(self.config))
+        listed = [Path(name) for name in known]
+        for name in names:
+            files = [path for path in listed if path == name or name in path.parents]
+            if not files:
+                raise DatasetError(f"{self.folder} has no {name}; bake it with --formats bop or shards")
+            remove_folder(out / name)
+            for path in files:
+                (out / path).parent.mkdir(exist_ok=True)
+                self._copy(path, out / path)
+
+    def _copy(self, path: Path, target: Path) -> None:
+        try:
+            handle = open_regular(self.folder / path)
+        except OSError as error:
+            raise DatasetError(f"{self.folder / path} cannot be read: {error.strerror}; run `synpick-warp verify`") from None
+        with os.fdopen(handle, "rb") as source, target.open("wb") as file:
+            shutil.copyfileobj(source, file, _COPY_BYTES)

@@ -1,0 +1,256 @@
+"""BOP result files: CSV of pose estimates, version bop19 of the BOP toolkit, read with checks and written.
+
+A line is `scene_id,im_id,obj_id,score,R,t,time`: R has 9 numbers row by row, t has 3 in millimetres, both separated by spaces, time is in
+seconds for the image, -1 if unknown. The header may be missing. Angles and units are those of scene_gt.json: object to camera.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Collection
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from synpick_warp.apps.evaluation.poses import PoseTable
+from synpick_warp.apps.evaluation.truth import Truth
+from synpick_warp.errors import OutputError, ResultError
+from synpick_warp.exporters.writing.files import output_error, write_atomically
+from synpick_warp.system.inputs.files import read_file
+
+HEADER = "scene_id,im_id,obj_id,score,R,t,time"
+FORMAT = f"{HEADER}, with 9 numbers in R and 3 in t [mm], separated by spaces"
+MAX_RESULTS = 2**30
+"""Largest result file [bytes]: some seven million rows."""
+MAX_INDEX = 2**31 - 1
+"""Largest scene, image or object index: data sets keep them in 32 bits."""
+MAX_NUMBER = 1e9
+"""Largest coordinate [mm], score or time: larger ones are mistakes, whose squares overflow."""
+TOLERANCE = 1e-3
+"""Of R Rᵀ = 1 in each element: three decimals of the matrix are enough."""
+_BLOCK = 2**15
+"""Lines that are converted at once."""
+_UNITS = 100.0
+"""Factor between the distances of estimates and truth from which on the unit is wrong, as objects lie at nearly the same distance."""
+_NAMES = ("scene_id", "im_id", "obj_id")
+_FIELDS = 7
+_WHOLE = re.compile(rb"\s*[+-]?[0-9]{1,18}\s*")
+_CHARACTERS = b"0123456789+-.eEnNaAiIfFtTyY, \t\r"
+
+
+@dataclass(frozen=True, eq=False)
+class ResultFile:
+    """Pose estimates of one file."""
+
+    path: Path
+    poses: PoseTable
+    lines: np.ndarray
+    """Line of each row in the file (N,) int64, from 1."""
+
+
+def read_results(path: Path) -> ResultFile:
+    """Read a BOP result file; rows of equal scene, image and object keep their order.
+
+    Raises:
+        ResultError: In one line with the line's number: wrong columns, a number that is none, not finite or out of range, a matrix that is
+            no rotation, a row that is there twice; or the file is empty, too large or cannot be read.
+    """
+    lines = read_file(path, MAX_RESULTS, ResultError).removeprefix(b"\xef\xbb\xbf").split(b"\n")
+    while lines and not lines[-1].strip():
+        lines.pop()
+    first = 1 if lines and HEADER.encode() in lines[0] else 0
+    if len(lines) <= first:
+        raise ResultError(f"{path} has no pose estimates; each line is {FORMAT}")
+    blocks = [_convert(lines[start : start + _BLOCK], path, start + 1) for start in range(first, len(lines), _BLOCK)]
+    indices, reals = (np.concatenate(columns) for columns in zip(*blocks, strict=True))
+    numbers = np.arange(first + 1, len(lines) + 1)
+    _check_rows(indices, reals, numbers, path)
+    order = np.lexsort(indices.T[::-1])
+    indices, reals = indices[order], reals[order]
+    poses = PoseTable(
+        scene=indices[:, 0],
+        image=indices[:, 1],
+        object_id=indices[:, 2],
+        rotation=reals[:, 1:10].reshape(-1, 3, 3),
+        translation=1e-3 * reals[:, 10:13],
+        score=reals[:, 0],
+        seconds=np.where(reals[:, 13] < 0.0, -1.0, reals[:, 13]),
+        instance=np.full(len(indices), -1, np.int64),
+    )
+    return ResultFile(path, poses, numbers[order])
+
+
+def _convert(lines: list[bytes], path: Path, start: int) -> tuple[np.ndarray, np.ndarray]:
+    """Indices (N, 3) int64, and score, R, t and time (N, 14) float64 of lines from line `start` on."""
+    rows = [line.split(b",") for line in lines]
+    for number, (line, row) in enumerate(zip(lines, rows, strict=True), start):
+        # Cheap checks of every line, which make the conversion below fit; the messages are composed only if one fails.
+        if len(row) != _FIELDS or len(row[4].split()) != 9 or len(row[5].split()) != 3 or line.translate(None, _CHARACTERS):
+            raise ResultError(_describe_line(line, path, number))
+    try:
+        indices = np.array([[int(text) for text in row[:3]] for row in rows], np.int64)
+        reals = np.array(
+            [[float(row[3]), *map(float, row[4].split()), *map(float, row[5].split()), float(row[6])] for row in rows], np.float64
+        )
+        return indices, reals
+    except (ValueError, OverflowError):
+        for number, line in enumerate(lines, start):
+            if message := _describe_numbers(line, path, number):
+                raise ResultError(message) from None
+        raise
+
+
+def _describe_line(line: bytes, path: Path, number: int) -> str:
+    """Message about a line with wrong columns."""
+    place, row = f"{path}, line {number}", line.split(b",")
+    if not line.strip():
+        return f"{place} is empty; each line is {FORMAT}"
+    if len(row) != _FIELDS:
+        return f"{place} has {len(row)} columns; allowed: {_FIELDS} separated by commas, {FORMAT}"
+    for name, part, count in (("R", row[4], 9), ("t", row[5], 3)):
+        if len(part.split()) != count:
+            return f"{place} has {len(part.split())} numbers in {name}; allowed: {count} separated by spaces"
+    return _describe_numbers(line, path, number) or f"{place} has a character that is not part of a number: {_show(line)}"
+
+
+def _describe_numbers(line: bytes, path: Path, number: int) -> str:
+    """Message about the first text that is no number; empty if all are."""
+    row = line.split(b",")
+    for name, text in zip(_NAMES, row, strict=False):
+        if _WHOLE.fullmatch(text) is None:
+            return f"{path}, line {number}: {name} is {_show(text)}; allowed: a whole number from 0 to {MAX_INDEX}"
+    for name, part in zip(("score", "R", "t", "time"), row[3:], strict=True):
+        for text in part.split() or [b""]:
+            try:
+                float(text)
+            except ValueError:
+                return f"{path}, line {number}: {name} has {_show(text)}, which is no number"
+        if name in ("score", "time") and len(part.split()) != 1:
+            return f"{path}, line {number}: {name} is {_show(part)}; allowed: one number"
+    return ""
+
+
+def _show(text: bytes) -> str:
+    """Text of a file in a message."""
+    shown = text.strip().decode("utf-8", "replace")
+    return f'"{shown if len(shown) <= 40 else shown[:39] + "…"}"'
+
+
+def _check_rows(indices: np.ndarray, reals: np.ndarray, numbers: np.ndarray, path: Path) -> None:
+    """Check ranges, rotations and duplicates; names the first line at fault."""
+
+    def refuse(bad: Any, text: str) -> None:
+        if bad.any():
+            raise ResultError(f"{path}, line {numbers[np.argmax(bad)]}: {text}")
+
+    for column, name in enumerate(_NAMES):
+        values = indices[:, column]
+        bad = (values < 0) | (values > MAX_INDEX)
+        refuse(bad, f"{name} is {values[np.argmax(bad)]}; allowed: 0 to {MAX_INDEX}")
+    for name, part in (("score", slice(0, 1)), ("R", slice(1, 10)), ("t", slice(10, 13)), ("time", slice(13, 14))):
+        refuse(np.any(~np.isfinite(reals[:, part]), axis=1), f"{name} is not finite; leave out rows without a pose")
+        refuse(np.any(np.abs(reals[:, part]) > MAX_NUMBER, axis=1), f"{name} has a number above {MAX_NUMBER:g}")
+    rotation = reals[:, 1:10].reshape(-1, 3, 3)
+    off = np.abs(rotation @ rotation.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2))
+    worst = off[np.argmax(off > TOLERANCE)]
+    refuse(off > TOLERANCE, f"R is no rotation: R Rᵀ differs from 1 by {worst:.2g}; allowed: {TOLERANCE:g}")
+    refuse(np.linalg.det(rotation) < 0.0, "R is a reflection, its determinant is -1; allowed: rotations")
+    _check_duplicates(indices, reals, numbers, path)
+
+
+def _check_duplicates(indices: np.ndarray, reals: np.ndarray, numbers: np.ndarray, path: Path) -> None:
+    """Refuse a row whose scene, image, object and pose another row has."""
+    columns = np.concatenate((indices, reals[:, 1:13]), axis=1) + 0.0  # -0 becomes 0.
+    order = np.lexsort(columns.T)
+    same = np.flatnonzero((np.diff(columns[order], axis=0) == 0.0).all(axis=1))
+    if len(same):
+        lines = np.sort(numbers[order[same[:, None] + (0, 1)]], axis=1)
+        first, second = lines[np.argmin(lines[:, 1])]
+        raise ResultError(f"{path}, line {second} has the object and the pose of line {first}; keep one of them")
+
+
+def check_results(results: ResultFile, truth: Truth, object_ids: Collection[int]) -> None:
+    """Check estimates against a data set: scenes, images and objects exist, and lengths are in millimetres.
+
+    Args:
+        results: The estimates.
+        truth: Ground truth of the data set.
+        object_ids: Objects of the data set.
+
+    Raises:
+        ResultError: In one line, with the line's number.
+    """
+    poses = results.poses
+    scenes = np.unique(truth.images[:, 0])
+    _refuse_unknown(results, poses.scene, scenes, "scene")
+    _refuse_unknown(results, poses.object_id, np.unique(np.array(sorted(object_ids), np.int64)), "object")
+    images = truth.images[:, 0] * (MAX_INDEX + 1) + truth.images[:, 1]
+    unknown = ~np.isin(poses.scene * (MAX_INDEX + 1) + poses.image, images)
+    if unknown.any():
+        row = _first(results, unknown)
+        scene = poses.scene[row]
+        known = truth.images[truth.images[:, 0] == scene, 1]
+        raise ResultError(
+            f"{results.path}, line {results.lines[row]}: scene {scene} has no image {poses.image[row]};"
+            f" its images are {known.min()} to {known.max()}"
+        )
+    _check_units(results, truth)
+
+
+def _refuse_unknown(results: ResultFile, values: np.ndarray, known: np.ndarray, what: str) -> None:
+    unknown = ~np.isin(values, known)
+    if unknown.any():
+        row = _first(results, unknown)
+        shown = ", ".join(map(str, known[:10].tolist())) + (", ..." if len(known) > 10 else "")
+        raise ResultError(f"{results.path}, line {results.lines[row]}: the data set has no {what} {values[row]}; its {what}s: {shown}")
+
+
+def _first(results: ResultFile, bad: np.ndarray) -> int:
+    """Row of the first line at fault."""
+    rows = np.flatnonzero(bad)
+    return int(rows[np.argmin(results.lines[rows])])
+
+
+def _check_units(results: ResultFile, truth: Truth) -> None:
+    """Compare the median distances from the camera, which a wrong unit changes by a factor of 1000."""
+    if not len(truth):
+        return
+    estimated, true = (float(np.median(np.linalg.norm(poses.translation, axis=1))) for poses in (results.poses, truth.poses))
+    if estimated * _UNITS < true:
+        reason = "t seems to be in metres; BOP result files have millimetres: multiply t by 1000"
+    elif estimated > true * _UNITS:
+        reason = "t seems to be 1000 times too large; BOP result files have millimetres: divide t by 1000"
+    else:
+        return
+    line = int(results.lines.min())
+    raise ResultError(
+        f"{results.path}, line {line}: {reason}"
+        f" (median distance from the camera {1e3 * estimated:.4g} mm, in the data set {1e3 * true:.4g} mm)"
+    )
+
+
+def encode_results(poses: PoseTable) -> bytes:
+    """Encode pose estimates as a BOP result file; numbers have all of their digits."""
+    lines = [HEADER]
+    for row in range(len(poses)):
+        rotation = " ".join(map(repr, poses.rotation[row].reshape(-1).tolist()))
+        translation = " ".join(map(repr, (1e3 * poses.translation[row]).tolist()))
+        key = f"{poses.scene[row]},{poses.image[row]},{poses.object_id[row]}"
+        lines.append(f"{key},{float(poses.score[row])!r},{rotation},{translation},{float(poses.seconds[row])!r}")
+    return ("\n".join(lines) + "\n").encode("ascii")
+
+
+def write_results(path: Path, poses: PoseTable) -> None:
+    """Write pose estimates as a BOP result file, atomically.
+
+    Raises:
+        OutputError: The file cannot be written.
+    """
+    if path.is_dir():
+        raise OutputError(f"{path} is a folder; name a file")
+    try:
+        write_atomically(path, encode_results(poses))
+    except OSError as error:
+        raise output_error(path, error) from error

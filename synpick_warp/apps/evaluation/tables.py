@@ -1,0 +1,197 @@
+"""Evaluation tables: AUC per object, mode, camera, visibility and speed band, several methods side by side, as text, LaTeX, CSV or JSON.
+
+A row for a group of instances is the mean over its objects of each object's area, as in the paper (class-wise average); `mean` is that of
+all instances. Areas and recalls are in percent.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import statistics
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+
+import numpy as np
+
+from synpick_warp.apps.evaluation.auc import CONVENTIONS, LIMIT, band_indices, error_bands, recall_curve
+from synpick_warp.apps.evaluation.scoring import METRICS, Scores
+from synpick_warp.apps.evaluation.truth import Truth
+from synpick_warp.system.codecs.tables import Column, Table, to_csv, to_latex, to_text
+
+FORMATS = ("text", "latex", "csv", "json")
+GROUPS = ("object", "mode", "camera", "visibility", "speed")
+VISIBILITY_EDGES = (0.0, 0.1, 0.25, 0.5, 0.75, 1.0)
+"""Limits of the bands of the visible fraction."""
+SPEED_EDGES = (0.0, 0.01, 0.05, 0.1, 0.25, 0.5, math.inf)
+"""Limits of the bands of the object's speed [m/s]; the first holds what rests."""
+THRESHOLDS = np.linspace(0.0, LIMIT, 51)
+"""Thresholds of the recall curves [m]."""
+COLUMNS = tuple(f"{metric} {convention}" for metric in METRICS for convention in CONVENTIONS)
+_PERCENT = 100.0
+
+
+@dataclass(frozen=True)
+class Row:
+    """Scores of all methods for a group of instances."""
+
+    group: str
+    """What instances are grouped by: one of GROUPS, or "mean"."""
+    label: str
+    """The group's name in the table."""
+    targets: int
+    """Number of instances to be found."""
+    cells: tuple[dict[str, float], ...]
+    """For each method: column -> value. AUC by metric and convention [%], `recall` (ADD(-S) below 0.1 m) [%], and the medians of the found
+    instances `rotation` [°] and `translation` [mm]; NaN: nothing found."""
+
+
+def summarize(truth: Truth, scores: Sequence[Scores], names: Mapping[int, str], groups: Sequence[str] = GROUPS) -> list[Row]:
+    """Rows of the table; groups without instances are left out.
+
+    Args:
+        truth: Ground truth.
+        scores: Scores of the methods, all with the same targets.
+        names: Names of objects by obj_id.
+        groups: What instances are grouped by, in order.
+    """
+    target = scores[0].target
+    object_ids = truth.poses.object_id[target]
+    rows = []
+    for group in groups:
+        for label, inside in _labels(group, truth, target, names):
+            if inside.any():
+                rows.append(_row(group, label, inside, object_ids, scores))
+    return [*rows, _row("mean", "mean", np.ones(len(target), bool), object_ids, scores)]
+
+
+def _labels(group: str, truth: Truth, target: np.ndarray, names: Mapping[int, str]) -> list[tuple[str, np.ndarray]]:
+    """Name and mask (T,) of every group of instances."""
+    if group == "object":
+        values = truth.poses.object_id[target]
+        return [(names.get(int(value), f"obj_{value:06d}"), values == value) for value in np.unique(values)]
+    if group == "mode":
+        return [(str(value), truth.mode[target] == value) for value in np.unique(truth.mode[target])]
+    if group == "camera":
+        return [(f"camera {value}", truth.camera[target] == value) for value in np.unique(truth.camera[target])]
+    edges, values, unit = (
+        (VISIBILITY_EDGES, truth.visibility[target], "visible") if group == "visibility" else (SPEED_EDGES, truth.speed[target], "m/s")
+    )
+    index = band_indices(values, edges)
+    return [(f"{_interval(low, high)} {unit}", index == band) for band, (low, high) in enumerate(pairwise(edges))]
+
+
+def _interval(low: float, high: float) -> str:
+    return f"over {low:g}" if math.isinf(high) else f"{low:g} to {high:g}"
+
+
+def _row(group: str, label: str, inside: np.ndarray, object_ids: np.ndarray, scores: Sequence[Scores]) -> Row:
+    return Row(group, label, int(inside.sum()), tuple(_cells(inside, object_ids, each) for each in scores))
+
+
+def _cells(inside: np.ndarray, object_ids: np.ndarray, scores: Scores) -> dict[str, float]:
+    """Columns of one method for the instances of a mask (T,)."""
+    members = [inside & (object_ids == object_id) for object_id in np.unique(object_ids[inside])]
+    cells = {}
+    for metric in METRICS:
+        for convention, area in CONVENTIONS.items():
+            cells[f"{metric} {convention}"] = _PERCENT * _mean([area(scores.errors[metric][rows]) for rows in members])
+    cells["recall"] = _PERCENT * _mean([float(np.isfinite(scores.errors["ADD(-S)"][rows]).mean()) for rows in members])
+    cells["rotation"] = _median(scores.rotation[inside])
+    cells["translation"] = 1e3 * _median(scores.translation[inside])
+    return cells
+
+
+def _mean(values: list[float]) -> float:
+    return statistics.fmean(values) if values else math.nan
+
+
+def _median(values: np.ndarray) -> float:
+    """Median of the finite values; NaN without."""
+    found = values[np.isfinite(values)]
+    return float(np.median(found)) if len(found) else math.nan
+
+
+def render(rows: Sequence[Row], truth: Truth, scores: Sequence[Scores], style: str, convention: str = "exact") -> str:
+    """Write the table.
+
+    Args:
+        rows: From `summarize`.
+        truth: Ground truth.
+        scores: Scores of the methods.
+        style: One of FORMATS. CSV and JSON have both conventions, JSON recall curves and bands of each object, too.
+        convention: Convention of the areas in text and LaTeX.
+    """
+    if style == "csv":
+        return to_csv(_long(rows, scores), exact=True)
+    if style == "json":
+        return _json(rows, truth, scores)
+    names, areas = [each.name for each in scores], {f"{metric} {convention}": metric for metric in METRICS}
+    if style == "latex":
+        said = f"% AUC to {LIMIT:g} m [%], convention {convention}; needs \\usepackage{{booktabs}}\n"
+        return said + to_latex(_wide([replace(row, label="Mean") if row.group == "mean" else row for row in rows], names, areas, "Object"))
+    [lines] = to_text(_wide(rows, names, areas | {"recall": "recall", "rotation": "°", "translation": "mm"}, "", targets=True))
+    lines += [
+        "",
+        f"AUC of ADD, ADD-S and ADD(-S) to {LIMIT:g} m [%], convention {convention}; a group's is the mean over its objects; recall",
+    ]
+    return "\n".join([*lines, "of ADD(-S) below it [%]; medians of rotation and translation error of what was found"]) + "\n"
+
+
+def _wide(rows: Sequence[Row], names: Sequence[str], shown: Mapping[str, str], label: str, targets: bool = False) -> Table:
+    """A row for each group, in which methods stand beside each other; `shown` are columns with their labels."""
+    keys = (Column("label", label=label), *([Column("targets", ",")] if targets else []))
+    columns = (*keys, *(Column(name, ".1f", each) for _ in names for name, each in shown.items()))
+    spans = ((name, range(at, at + len(shown))) for name, at in zip(names, range(len(keys), len(columns), len(shown)), strict=True))
+    starts = (number for number, row in enumerate(rows) if not number or row.group != rows[number - 1].group)
+    table = Table("scores", "", columns, spans=tuple(spans), sections=frozenset(starts))
+    for row in rows:
+        head = (row.label, row.targets) if targets else (row.label,)
+        table.rows.append((*head, *(_known(cells[name]) for cells in row.cells for name in shown)))
+    return table
+
+
+def _long(rows: Sequence[Row], scores: Sequence[Scores]) -> Table:
+    """A row for each group and method, with all columns."""
+    columns = [Column(name) for name in ("group", "label", "targets", "method")] + [Column(name, digits=".6g") for name in rows[0].cells[0]]
+    return Table(
+        "scores",
+        "",
+        tuple(columns),
+        [
+            (row.group, row.label, row.targets, each.name, *map(_known, cells.values()))
+            for row in rows
+            for each, cells in zip(scores, row.cells, strict=True)
+        ],
+    )
+
+
+def _known(value: float) -> float | None:
+    return None if math.isnan(value) else value
+
+
+def _json(rows: Sequence[Row], truth: Truth, scores: Sequence[Scores]) -> str:
+    """Everything: both conventions, recall curves, error bands by visibility and speed."""
+    methods = []
+    for index, each in enumerate(scores):
+        table = [{"group": row.group, "label": row.label, "targets": row.targets, **row.cells[index]} for row in rows]
+        curves = {metric: recall_curve(errors, THRESHOLDS).tolist() for metric, errors in each.errors.items()}
+        bands = {
+            name: {
+                metric: [vars(band) for band in error_bands(errors, values[each.target], edges)] for metric, errors in each.errors.items()
+            }
+            for name, values, edges in (("visibility", truth.visibility, VISIBILITY_EDGES), ("speed", truth.speed, SPEED_EDGES))
+        }
+        methods.append({"method": each.name, "seconds_per_image": each.seconds, "rows": table, "recall": curves, "bands": bands})
+    content = {"limit": LIMIT, "thresholds": THRESHOLDS.tolist(), "methods": methods}
+    return json.dumps(_finite(content), indent=1) + "\n"
+
+
+def _finite(content: object) -> object:
+    """The same content with null for numbers that JSON lacks."""
+    if isinstance(content, dict):
+        return {key: _finite(value) for key, value in content.items()}
+    if isinstance(content, list):
+        return [_finite(value) for value in content]
+    return None if isinstance(content, float) and not math.isfinite(content) else content

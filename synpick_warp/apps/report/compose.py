@@ -1,0 +1,260 @@
+"""Report of a data set: reads figures and samples, and writes one HTML file."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from synpick_warp import __version__
+from synpick_warp.apps.report.album import Album
+from synpick_warp.apps.report.charts import Source, make_charts
+from synpick_warp.apps.report.explained import choose_attempts, make_attempt
+from synpick_warp.apps.report.findings import WARNING, Figures, Finding, find
+from synpick_warp.apps.report.frames import make_frame
+from synpick_warp.apps.report.markup import Html, element, join
+from synpick_warp.apps.report.page import Page, Part, read_vega, render, summary
+from synpick_warp.apps.report.sampling import (
+    SURVEY_VIEWS,
+    Brightness,
+    Episodes,
+    find_content,
+    measure_brightness,
+    read_episodes,
+    sample_views,
+)
+from synpick_warp.apps.report.strips import choose_episodes, make_strip
+from synpick_warp.apps.report.tables import findings_list, settings_tables, statistics_tables, tiles
+from synpick_warp.apps.statistics import Statistics, compute_statistics
+from synpick_warp.apps.viz.depth_colors import tote_scale
+from synpick_warp.dataset.commit.manifest import read_manifest
+from synpick_warp.dataset.reading import DataSet
+from synpick_warp.dataset.view import View
+from synpick_warp.errors import DatasetError, OutputError
+from synpick_warp.exporters.writing.files import output_error
+from synpick_warp.system.folders import make_folder
+from synpick_warp.system.progress import Report
+
+SUFFIXES = (".html", ".htm")
+FRAMES = 12
+"""Sampled frames on the page."""
+MAX_FRAMES = 200
+
+
+@dataclass(frozen=True)
+class Samples:
+    """Pictures and measurements of a data set."""
+
+    data: dict[str, list[dict[str, Any]]]
+    """Frames, strips and attempts, as the page's scripts expect them."""
+    brightness: list[Brightness]
+    asked: dict[str, int]
+    """Number of frames, strips and attempts that were to be shown; fewer are if the pictures' budget is spent."""
+
+
+def write_report(
+    data_set: DataSet, out: Path, *, frames: int = FRAMES, paper: bool | None = None, threads: int = 0, report: Report | None = None
+) -> Path:
+    """Write the report of a data set, or of one of its splits.
+
+        write_report(synpick_warp.open("DATA"), Path("report.html"))
+
+    Args:
+        data_set: The data set; with settings.
+        out: HTML file to write; its folder is created. A file is replaced, a link never followed.
+        frames: Number of sampled frames.
+        paper: Whether the paper's numbers stand beside; None: if the objects are the paper's.
+        threads: Maximum number of processes that count; 0: one per core.
+        report: Receives the progress.
+
+    Raises:
+        ConfigError: The settings are damaged.
+        DatasetError: There is no episode, or a file is missing or damaged.
+        ChartError: The charts' library cannot run.
+        OutputError: The file cannot be written.
+    """
+    check_out(out)
+    read_vega()
+    progress = report or (lambda _unit, _done, _total: None)
+    statistics = compute_statistics(data_set, threads=threads, report=report)
+    episodes = read_episodes(data_set)
+    album = Album()
+    samples = take_samples(data_set, statistics, episodes, album, frames, progress)
+    versions, remarks = _versions(data_set)
+    findings = [*remarks, *find(Figures(statistics, episodes, samples.brightness, data_set.planned))]
+    findings.sort(key=lambda finding: finding.level != WARNING)
+    shown = statistics if (statistics.has_paper_objects if paper is None else paper) else replace(statistics, paper=())
+    config = data_set.config if data_set.found is None else None
+    page = Page(
+        title=data_set.folder.resolve().name or "data set",
+        lead=_lead(data_set, statistics, findings),
+        tiles=tiles(statistics),
+        parts=_parts(data_set, shown, samples, findings, versions),
+        findings=findings,
+        data=samples.data,
+        charts=make_charts(Source(statistics, samples.brightness, config, _durations(data_set, episodes))),
+        album=album,
+        footer=f"synpick-warp {__version__}, report of {data_set.folder.resolve().name}. The page loads nothing from anywhere.",
+    )
+    write_text(out, render(page))
+    return out
+
+
+def take_samples(data_set: DataSet, statistics: Statistics, episodes: Episodes, album: Album, frames: int, report: Report) -> Samples:
+    """Read all pictures of a report; none if the data set has no images.
+
+    Raises:
+        DatasetError: A file is missing or damaged.
+    """
+    data: dict[str, list[dict[str, Any]]] = {"frames": [], "strips": [], "attempts": []}
+    asked = dict.fromkeys(data, 0)
+    views = sample_views(data_set, episodes, frames) if statistics.total.annotations.views else []
+    if not any(view.has(name) for view in views for name in ("rgb", "depth")):
+        return Samples(data, [], asked)
+    names = {each.object_id: each.name for each in statistics.objects}
+    content = find_content(views[0])
+    asked["frames"] = len(views)
+    for done, view in enumerate(views):
+        report("frames", done, len(views))
+        scale = None if data_set.found else tote_scale(data_set.config, [view.records.camera])
+        data["frames"] += _present(make_frame(view, content, names, episodes.rows[view.episode].mode, album, scale))
+    chosen = choose_episodes(episodes)
+    asked["strips"] = len(chosen)
+    for place, index in enumerate(chosen):
+        strip = make_strip(
+            data_set, index, len(chosen) - place, album, lambda done, most, place=place: report(f"film strip {place + 1}", done, most)
+        )
+        data["strips"] += _present(strip)
+    attempts = choose_attempts(data_set, episodes)
+    asked["attempts"] = len(attempts)
+    for done, found in enumerate(attempts):
+        report("attempts", done, len(attempts))
+        data["attempts"] += _present(make_attempt(data_set, found, content, names, album))
+    return Samples(data, _measure(sample_views(data_set, episodes, SURVEY_VIEWS), report), asked)
+
+
+def _durations(data_set: DataSet, episodes: Episodes) -> dict[str, float]:
+    """Time of the longest episode of each mode [s]."""
+    longest = dict[str, int]()
+    for row in episodes.rows.values():
+        longest[row.mode] = max(longest.get(row.mode, 0), row.frames)
+    return {} if data_set.period is None else {mode: frames * data_set.period for mode, frames in longest.items()}
+
+
+def _present(made: dict[str, Any] | None) -> list[dict[str, Any]]:
+    return [] if made is None else [made]
+
+
+def _measure(views: list[View], report: Report) -> list[Brightness]:
+    measured = []
+    for done, view in enumerate(view for view in views if view.has("rgb")):
+        report("brightness", done, len(views))
+        measured.append(measure_brightness(view))
+    return measured
+
+
+def _versions(data_set: DataSet) -> tuple[Mapping[str, str], list[Finding]]:
+    """Versions of the packages that baked the set; a damaged manifest is a finding, as everything else can still be shown."""
+    if data_set.found is not None:
+        return {}, []
+    try:
+        return read_manifest(data_set.folder)["versions"], []
+    except DatasetError as error:
+        return {}, [Finding(WARNING, "The manifest cannot be read", f"{error}.")]
+
+
+def _lead(data_set: DataSet, statistics: Statistics, findings: list[Finding]) -> Html:
+    modes = ", ".join(dict.fromkeys(group.mode for group in statistics.groups))
+    splits = ", ".join(dict.fromkeys(group.split for group in statistics.groups))
+    if data_set.found is not None:
+        said = f"No bake of synpick-warp wrote this data set; splits {splits}. "
+    else:
+        width, height = data_set.config.cameras.resolution
+        said = f"Modes {modes}; splits {splits}; images of {width} x {height} pixels; seed {data_set.config.bake.seed}. "
+    return join([said, element("a", f"Findings: {summary(findings)}", href="#findings"), "."])
+
+
+def _parts(data_set: DataSet, statistics: Statistics, samples: Samples, findings: list[Finding], versions: Mapping[str, str]) -> list[Part]:
+    views, shown = statistics.total.annotations.views, {name: len(made) for name, made in samples.data.items()}
+    leads = {
+        "frames": ("Frames", f"{shown['frames']} of {views:,} views, evenly spread over episodes, cameras and time."),
+        "strips": ("Episodes", "One episode of each mode, of median length, from its first frame to its last."),
+        "attempts": ("Attempts", "What was perceived, chosen and engaged, and why: attempts of every outcome."),
+    }
+    parts = []
+    for name, (title, lead) in leads.items():
+        cut = samples.asked[name] - shown[name]
+        lead += f" {cut} more did not fit the {samples_budget()} of pictures." if cut else ""
+        empty = element("p", _EMPTY[name], class_="empty") if not shown[name] else element("div", id=f"{name}-host")
+        parts.append(Part(name, title, lead, empty))
+    figures = join([element("div", id="charts-host"), statistics_tables(statistics)])
+    return [
+        *parts,
+        Part(
+            "figures",
+            "Figures",
+            "Counts of all episodes and annotations; point at a mark for its numbers, click a mode to single it out.",
+            figures,
+        ),
+        Part(
+            "findings", "Findings", "What a person who looks through the figures would raise. A note may be meant.", findings_list(findings)
+        ),
+        Part(
+            "settings",
+            "Configuration",
+            "Settings that differ from the preset synpick, which has the paper's values.",
+            settings_tables(data_set.config, versions) if data_set.found is None else element("p", _NO_SETTINGS, class_="empty"),
+        ),
+    ]
+
+
+_NO_SETTINGS = "No bake of synpick-warp wrote this data set: there are no settings."
+_EMPTY = {
+    "frames": "This data set has no images.",
+    "strips": "This data set has no images.",
+    "attempts": "No attempts can be shown: no episode picks, or there are no images.",
+}
+
+
+def samples_budget() -> str:
+    """The budget of the pictures in words."""
+    return f"{Album().budget / 1e6:.0f} MB"
+
+
+def check_out(out: Path) -> None:
+    """Check the name of the file.
+
+    Raises:
+        OutputError: It is not that of an HTML file, or it is a folder.
+    """
+    if out.suffix.lower() not in SUFFIXES:
+        raise OutputError(f"{out} is not an HTML file; its name must end in {', '.join(SUFFIXES)}")
+    if out.is_dir() and not out.is_symlink():
+        raise OutputError(f"cannot write {out}: it is a folder")
+
+
+def write_text(out: Path, pieces: Iterable[str]) -> None:
+    """Write a file that appears with all of its content or not at all.
+
+    Raises:
+        OutputError: It cannot be written.
+    """
+    partial = out.with_name(f".{out.name}.{os.getpid()}")
+    try:
+        make_folder(out.parent)
+        try:
+            # A link of the name is replaced, never followed.
+            with open(partial, "x", encoding="utf-8", newline="\n") as file:
+                file.writelines(pieces)
+            partial.replace(out)
+        except BaseException:
+            with contextlib.suppress(OSError):
+                partial.unlink(missing_ok=True)
+            raise
+    except OSError as error:
+        raise output_error(out, error) from error
+    except ValueError as error:
+        raise OutputError(f"cannot write {out}: {error}") from error

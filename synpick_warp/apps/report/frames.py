@@ -1,0 +1,131 @@
+"""Sampled frames for a page: colour, visible and amodal masks as ids, boxes, depth and layers, with a line per instance."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from synpick_warp.apps.report.album import Album, Picture, Section, encode_ids, encode_photo, shrink
+from synpick_warp.apps.report.sampling import Content
+from synpick_warp.apps.statistics.records import MAX_NAME
+from synpick_warp.apps.viz.depth_colors import DepthScale, color_depth, describe_depth, pooled_scale
+from synpick_warp.apps.viz.drawing import instance_color
+from synpick_warp.apps.viz.preview_layers import draw_layer
+from synpick_warp.dataset.view import MILLIMETERS, View
+
+WIDTH = 960
+"""Largest width of a frame on the page [px]."""
+MAX_IDS = 255
+"""Most instances whose masks are shown: ids are bytes, and 0 is none."""
+LAYER_WIDTH = 640
+"""Largest width of depth and of layers [px]."""
+
+
+def make_frame(
+    view: View, content: Content, names: Mapping[int, str], mode: str, album: Album, scale: DepthScale | None
+) -> dict[str, Any] | None:
+    """JSON of a frame, whose pictures are added to the album; None: they exceed the budget.
+
+    Args:
+        view: The view.
+        content: What the data set has of it.
+        names: Object id -> name; it may lack some.
+        mode: Mode of the episode.
+        album: Receives the pictures.
+        scale: Of the depth images of its scene; None: that of the image itself.
+
+    Raises:
+        DatasetError: A file is missing or damaged.
+    """
+    color = show(view, scale)
+    panels: list[tuple[str, str, Picture]] = [("rgb", "colour", encode_photo(shrink(color, WIDTH)))]
+    ids = _instance_ids(view, content, color.shape[:2])
+    if ids is not None:
+        panels.append(("ids", "visible masks", encode_ids(shrink(ids, WIDTH, smooth=False))))
+        if content.amodal:
+            planes = [shrink(plane, WIDTH, smooth=False) for plane in _amodal_planes(view, color.shape[:2])]
+            panels.append(("amodal", "amodal masks", encode_ids(np.concatenate(planes))))
+    if content.depth:
+        depth = view.depth * MILLIMETERS
+        scale = scale or pooled_scale([depth])
+        panels.append(("depth", describe_depth(scale), encode_photo(shrink(color_depth(depth, scale), LAYER_WIDTH))))
+    counts = scale and DepthScale(*(each / float(view.records.camera["depth_scale"]) for each in scale))
+    for name in view.layers:
+        caption, picture = draw_layer(name, view.layer(name), counts)
+        panels.append((name, caption, encode_photo(shrink(picture, LAYER_WIDTH))))
+    places = album.add(Section.FRAMES, [picture for _, _, picture in panels])
+    if places is None:
+        return None
+    pictures = {name: {"picture": place, "caption": caption} for (name, caption, _), place in zip(panels, places, strict=True)}
+    return {
+        "episode": view.episode,
+        "frame": view.frame,
+        "camera": view.camera,
+        "mode": mode,
+        "size": [color.shape[1], color.shape[0]],
+        "light": _light(view),
+        "pictures": pictures,
+        "instances": [_instance(view, index, names) for index in range(len(view))],
+    }
+
+
+def show(view: View, scale: DepthScale | None = None) -> np.ndarray:
+    """Picture of a view (H, W, 3) uint8, blue first: its colour image, or else depth as false colour."""
+    if view.has("rgb") or not view.has("depth"):
+        return view.rgb[..., ::-1]
+    depth = view.depth * MILLIMETERS
+    return color_depth(depth, scale or pooled_scale([depth]))
+
+
+def _instance(view: View, index: int, names: Mapping[int, str]) -> dict[str, Any]:
+    """An instance: the masks have the id index + 1. Boxes: x, y, width, height [px]; None: nothing is visible."""
+    truth, info = view.records.gt[index], view.records.gt_info[index]
+    seen = info["px_count_visib"] > 0
+    object_id = int(truth["obj_id"])
+    blue, green, red = instance_color(int(truth.get("instance_id", index)) % 256)
+    return {
+        "name": names.get(object_id, "") or f"object {object_id}",
+        "object": object_id,
+        "visible": None if np.isnan(info["visib_fract"]) else round(float(info["visib_fract"]), 4),
+        "color": f"rgb({red} {green} {blue})",
+        "amodal": _box(info["bbox_obj"]) if seen and info["bbox_obj"][2] >= 0 else None,
+        "modal": _box(info["bbox_visib"]) if seen else None,
+    }
+
+
+def _box(box: list[int]) -> list[int]:
+    """Convert a BOP box (x, y, width, height) [px], whose width is x_max - x_min, to one whose width and height count the last pixel."""
+    x, y, width, height = box
+    return [x, y, width + 1, height + 1]
+
+
+def _instance_ids(view: View, content: Content, size: tuple[int, ...]) -> np.ndarray | None:
+    """Index + 1 of the instance that each pixel shows (H, W) uint8; 0: none. None: the data set has no masks."""
+    if not content.masks:
+        return None
+    ids = np.zeros(size, np.uint8)
+    for index, mask in enumerate(view.masks[:MAX_IDS]):
+        ids[mask] = index + 1
+    return ids
+
+
+def _amodal_planes(view: View, size: tuple[int, ...]) -> list[np.ndarray]:
+    """Index + 1 of the instance whose silhouette covers each pixel (H, W) uint8; 0: none.
+
+    Silhouettes overlap, so there are planes: each instance is in the first one where it overlaps no other (greedy colouring).
+    """
+    planes = [np.zeros(size, np.uint8)]
+    for index, mask in enumerate(view.amodal_masks[:MAX_IDS]):
+        plane = next((plane for plane in planes if not plane[mask].any()), None)
+        if plane is None:
+            planes.append(plane := np.zeros(size, np.uint8))
+        plane[mask] = index + 1
+    return planes
+
+
+def _light(view: View) -> str:
+    light = view.records.camera.get("light")
+    name = light.get("map") if isinstance(light, dict) else None
+    return name[:MAX_NAME] if isinstance(name, str) else ""

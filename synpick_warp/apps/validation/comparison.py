@@ -1,0 +1,220 @@
+"""Comparison of a view with its re-rendered instances, in one window of the image for each instance."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from msgspec import UNSET
+from scipy.signal import fftconvolve
+
+from synpick_warp.apps.validation.pictures import Mask, crop_mask
+from synpick_warp.apps.validation.subjects import ViewSubject
+
+if TYPE_CHECKING:
+    from synpick_warp.apps.validation.rendering import ObjectRenderer, Patch
+
+EXACT_DEPTH, MEASURED_DEPTH = 1.0, 15.0
+"""Largest difference of depth from the model [mm]: of rendered depth, and of a sensor's (BOP's tolerance of visibility)."""
+MIN_PIXELS = 40
+"""Smallest silhouette or mask that is compared [px]: smaller ones consist of their border."""
+EXACT_AREA, EXACT_OUTLINE = 0.002, 0.1
+"""Mask tolerance in data sets that this package baked: EXACT_AREA x area + EXACT_OUTLINE x length of the outline [px] may differ, plus a
+few. A shift by 1 px exceeds it."""
+AREA, OUTLINE = 0.02, 0.4
+"""Mask tolerance for data sets of other origin, by the same formula. It admits the half-pixel shift of sampling at pixel corners, but no
+shift by 2 px."""
+MARGIN = 24
+"""Search range of a mask's shift [px]."""
+
+
+@dataclass(eq=False)
+class Instance:
+    """An instance in its window: all arrays are crops (h, w) of the image at (left, top)."""
+
+    index: int
+    obj_id: int
+    left: int
+    top: int
+    rendered: np.ndarray
+    """Depth of the object alone [mm]; inf: beside its silhouette."""
+    mask: np.ndarray | None
+    """Amodal mask; None: the data set has none."""
+    visible: np.ndarray | None
+    """Visible mask."""
+    depth: np.ndarray | None
+    """Depth of the image [mm]; 0: unknown."""
+    nearest: np.ndarray
+    """Depth of the nearest of all rendered instances [mm]."""
+    translation: np.ndarray
+    """Of the pose (3) [mm]."""
+
+    @property
+    def silhouette(self) -> np.ndarray:
+        """Rendered silhouette."""
+        return np.isfinite(self.rendered)
+
+    @cached_property
+    def seen(self) -> np.ndarray:
+        """Pixels with depth in both the visible mask and the silhouette."""
+        if self.depth is None or self.visible is None:
+            return np.zeros(self.rendered.shape, bool)
+        return self.visible & self.silhouette & (self.depth > 0.0)
+
+    def visible_part(self, tolerance: float) -> np.ndarray:
+        """Silhouette where no other instance, and nothing else in the depth image, is nearer by more than a tolerance [mm]."""
+        part = self.silhouette & (self.rendered <= self.nearest + np.float32(0.01))
+        if self.depth is not None:
+            part &= ~((self.depth > 0.0) & (self.depth < self.rendered - np.float32(tolerance)))
+        return part
+
+
+@dataclass(frozen=True)
+class Fit:
+    """How well two masks agree."""
+
+    differing: int
+    """Pixels of one only."""
+    iou: float
+    good: bool
+    """Whether the difference is explained by their outlines."""
+
+
+class RenderedView:
+    """A view with its re-rendered instances: those with a model, and with a mask or silhouette that is large enough."""
+
+    def __init__(self, view: ViewSubject, renderer: ObjectRenderer) -> None:
+        self.view, self.renderer, self.place = view, renderer, view.place
+
+    @property
+    def tolerance(self) -> float:
+        """Largest difference of depth [mm]; at least one and a half counts."""
+        scale = self.view.camera.depth_scale if self.view.camera is not None else UNSET
+        count = scale if isinstance(scale, float | int) else 0.0
+        return max(EXACT_DEPTH if self.view.scene.exact else MEASURED_DEPTH, 1.5 * count)
+
+    @property
+    def exact_masks(self) -> bool:
+        """Whether masks are those of the bake's rasterizer."""
+        return self.view.scene.layout.ours
+
+    @cached_property
+    def matrix(self) -> np.ndarray | None:
+        """Intrinsics (3, 3); None: the image has none, or another camera model."""
+        camera = self.view.camera
+        if camera is None or not isinstance(camera.cam_K, list) or not (camera.cam_K[0] > 0.0 and camera.cam_K[4] > 0.0):
+            return None
+        return np.reshape(np.array(camera.cam_K, np.float64), (3, 3))
+
+    @cached_property
+    def depth(self) -> np.ndarray | None:
+        """Depth (H, W) float32 [mm]; None: unknown."""
+        view = self.view
+        scale = view.camera.depth_scale if view.camera is not None else UNSET
+        if view.depth is None or view.depth.shape[::-1] != view.size or not isinstance(scale, float | int):
+            return None
+        return view.depth.astype(np.float32) * np.float32(scale)
+
+    @cached_property
+    def instances(self) -> list[Instance]:
+        """Instances that can be compared."""
+        view, matrix = self.view, self.matrix
+        if matrix is None or view.size is None:
+            return []
+        patches: list[Patch | None] = []
+        for item in view.truths:
+            rotation, translation = np.reshape(np.array(item.cam_R_m2c, np.float64), (3, 3)), np.array(item.cam_t_m2c, np.float64)
+            usable = self.renderer.has(item.obj_id) and abs(np.linalg.det(rotation) - 1.0) < 0.01
+            patches.append(self.renderer.render(item.obj_id, rotation, translation, matrix, view.size) if usable else None)
+        nearest = np.full((view.size[1], view.size[0]), np.inf, np.float32)
+        for patch in patches:
+            if patch is not None:
+                height, width = patch.depth.shape
+                part = nearest[patch.top : patch.top + height, patch.left : patch.left + width]
+                np.minimum(part, patch.depth, out=part)
+        found = [self._instance(index, patch, nearest) for index, patch in enumerate(patches) if patch is not None]
+        return [item for item in found if item is not None]
+
+    def render_other(self, item: Instance, obj_id: int) -> np.ndarray:
+        """Silhouette of another object at the pose of an instance, in its window (h, w)."""
+        truth: Any = self.view.truths[item.index]
+        result = np.zeros(item.rendered.shape, bool)
+        if self.matrix is None or self.view.size is None or not self.renderer.has(obj_id):
+            return result
+        rotation = np.reshape(np.array(truth.cam_R_m2c, np.float64), (3, 3))
+        patch = self.renderer.render(obj_id, rotation, item.translation, self.matrix, self.view.size)
+        shown = crop_mask(np.isfinite(patch.depth), "") if patch.depth.size else None
+        if shown is None:
+            return result
+        moved_mask = replace(shown, left=shown.left + patch.left, top=shown.top + patch.top)
+        return moved_mask.window(item.left, item.top, result.shape[1], result.shape[0])
+
+    def _instance(self, index: int, patch: Patch, nearest: np.ndarray) -> Instance | None:
+        """Cut an instance's window; None: too few pixels, or nothing to compare them with."""
+        masks = [self._mask(kind, index) for kind in ("mask", "mask_visib")]
+        present = [mask for mask in masks if mask is not None]
+        rows, columns = patch.depth.shape
+        boxes = [mask.box for mask in present if mask.box is not None] + (
+            [(patch.left, patch.top, columns, rows)] if patch.depth.size else []
+        )
+        if not boxes or not present:
+            return None
+        left, top = min(box[0] for box in boxes), min(box[1] for box in boxes)
+        width, height = max(box[0] + box[2] for box in boxes) - left, max(box[1] + box[3] for box in boxes) - top
+        rendered = np.full((height, width), np.inf, np.float32)
+        rendered[patch.top - top : patch.top - top + rows, patch.left - left : patch.left - left + columns] = patch.depth
+        window = slice(top, top + height), slice(left, left + width)
+        mask, visible = (None if found is None else found.window(left, top, width, height) for found in masks)
+        largest = max(np.count_nonzero(part) for part in (mask, visible) if part is not None)
+        if max(largest, np.count_nonzero(np.isfinite(rendered))) < MIN_PIXELS:
+            return None
+        item: Any = self.view.truths[index]
+        depth = None if self.depth is None else self.depth[window]
+        return Instance(index, item.obj_id, left, top, rendered, mask, visible, depth, nearest[window], np.array(item.cam_t_m2c))
+
+    def _mask(self, kind: str, index: int) -> Mask | None:
+        masks = self.view.masks.get(kind)
+        found = None if masks is None else masks[index]
+        return found if found is not None and found.size == self.view.size else None
+
+
+def fit_masks(one: np.ndarray, other: np.ndarray, *, exact: bool = False) -> Fit:
+    """Compare two masks (h, w); `exact`: with the bounds of data sets of ours."""
+    differing = int(np.count_nonzero(one ^ other))
+    union = int(np.count_nonzero(one | other))
+    outline = max(_outline(one), _outline(other))
+    area, line = (EXACT_AREA, EXACT_OUTLINE) if exact else (AREA, OUTLINE)
+    return Fit(differing, 1.0 - differing / max(union, 1), differing <= area * union + line * outline + 4)
+
+
+def _outline(mask: np.ndarray) -> int:
+    """Number of pixels of a mask with a neighbour outside of it, or at the border of the window."""
+    padded = np.pad(mask, 1)
+    inner = padded[:-2, 1:-1] & padded[2:, 1:-1] & padded[1:-1, :-2] & padded[1:-1, 2:]
+    return int(np.count_nonzero(mask & ~inner))
+
+
+def best_shift(mask: np.ndarray, silhouette: np.ndarray) -> tuple[int, int]:
+    """Columns and rows by which a mask (h, w) is shifted from a silhouette: where their overlap is largest (cross-correlation by FFT)."""
+    overlap = fftconvolve(mask.astype(np.float32), silhouette[::-1, ::-1].astype(np.float32), mode="full")
+    height, width = mask.shape
+    rows = slice(max(0, height - 1 - MARGIN), height + MARGIN)
+    columns = slice(max(0, width - 1 - MARGIN), width + MARGIN)
+    part = np.rint(overlap[rows, columns])
+    # Of equal overlaps the smallest shift.
+    down, right = np.nonzero(part == part.max())
+    down, right = down + rows.start - (height - 1), right + columns.start - (width - 1)
+    nearest = int(np.argmin(down**2 + right**2))
+    return int(right[nearest]), int(down[nearest])
+
+
+def moved(mask: np.ndarray, columns: int, rows: int) -> np.ndarray:
+    """A mask moved right and down; what leaves the window is lost."""
+    height, width = mask.shape
+    result = np.zeros_like(mask)
+    target = slice(max(0, rows), min(height, height + rows)), slice(max(0, columns), min(width, width + columns))
+    source = slice(max(0, -rows), min(height, height - rows)), slice(max(0, -columns), min(width, width - columns))
+    result[target] = mask[source]
+    return result

@@ -1,0 +1,94 @@
+"""Registry of validation rules: a rule is a function with a name, a description and advice, declared by the decorator `rule`."""
+
+from __future__ import annotations
+
+import enum
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from functools import cache
+from importlib import import_module
+from typing import Any, NamedTuple, TypeVar
+
+from synpick_warp.errors import SynpickError
+
+MODULES = ("tree", "records", "info", "images", "masks", "coco", "models", "targets", "rig", "shards", "poses")
+"""Modules in `validation.rules`, in the order of their rules."""
+_Check = TypeVar("_Check", bound=Callable[[Any], Iterator[Any]])
+
+
+class Level(enum.StrEnum):
+    """Whether a violation makes a data set wrong, or only matters to some of its users."""
+
+    ERROR = "error"
+    WARNING = "warning"
+
+
+class Violation(NamedTuple):
+    """A violation of a rule."""
+
+    level: Level
+    file: str
+    """Path relative to the data set; a member of a shard follows after a colon."""
+    rule: str
+    text: str
+    """What is wrong."""
+
+
+@dataclass(frozen=True)
+class Rule:
+    """A rule about one type of subject."""
+
+    name: str
+    subject: type
+    """Type of what the rule is about: the folder, a model, a scene, a view, ..."""
+    level: Level
+    sentence: str
+    """What holds in a correct data set."""
+    cure: str
+    """How to mend a violation."""
+    check: Callable[[Any], Iterator[tuple[str, str]]]
+    """Yields (file, what is wrong) for each violation."""
+
+
+RULES: dict[str, Rule] = {}
+"""Declared rules by name, in the order of imports; see `load_rules`."""
+
+
+def rule(subject: type, name: str, sentence: str, cure: str, level: Level = Level.ERROR) -> Callable[[_Check], _Check]:
+    """Declare the decorated function as the check of a rule.
+
+    Args:
+        subject: Type of the function's argument; the rule is applied to each such subject of a data set.
+        name: Name of the rule: words joined by hyphens.
+        sentence: What holds in a correct data set.
+        cure: How to mend a violation.
+        level: Level of its violations.
+    """
+
+    def declare(check: _Check) -> _Check:
+        assert name not in RULES, name
+        RULES[name] = Rule(name, subject, level, sentence, cure, check)
+        return check
+
+    return declare
+
+
+@cache
+def load_rules() -> dict[str, Rule]:
+    """Import the modules of the rules; returns all rules by name, in the order of MODULES and of the declarations in each."""
+    names = [f"synpick_warp.apps.validation.rules.{module}" for module in MODULES]
+    for name in names:
+        import_module(name)
+    return dict(sorted(RULES.items(), key=lambda item: names.index(item[1].check.__module__)))
+
+
+def apply_rules(subject: object) -> Iterator[Violation]:
+    """Check a subject by all rules for its type. A rule that meets unreadable data ends with a violation about it."""
+    for item in load_rules().values():
+        if item.subject is not type(subject):
+            continue
+        try:
+            for file, text in item.check(subject):
+                yield Violation(item.level, file, item.name, text)
+        except SynpickError as error:
+            yield Violation(Level.ERROR, getattr(subject, "place", "."), item.name, f"cannot be checked: {error}")

@@ -1,0 +1,218 @@
+"""Rules about masks, and about counts and boxes of scene_gt_info.json against them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from synpick_warp.apps.validation.pictures import Mask
+from synpick_warp.apps.validation.registry import rule
+from synpick_warp.apps.validation.rules.info import EMPTY
+from synpick_warp.apps.validation.schemas import Info
+from synpick_warp.apps.validation.subjects import ViewSubject
+
+COUNT_SLACK, COUNT_FRACTION = 2, 1e-3
+"""Largest difference of a count from the mask's: pixels, or a fraction of them (the acceptance bound of reference renderers)."""
+_Finding = Iterator[tuple[str, str]]
+
+
+def _all_masks(view: ViewSubject, kind: str) -> Iterator[tuple[int, Mask]]:
+    """(index, mask) of those that exist and have the view's size."""
+    for index, mask in enumerate(view.masks.get(kind, ())):
+        if mask is not None and mask.size == view.size:
+            yield index, mask
+
+
+def _pairs(view: ViewSubject, kind: str) -> Iterator[tuple[int, Mask, Info]]:
+    """(index, mask, info)."""
+    for index, mask in _all_masks(view, kind) if view.infos else ():
+        yield index, mask, view.infos[index]
+
+
+def _file(view: ViewSubject) -> str:
+    return view.scene.record("gt_info").where(view.image)
+
+
+@rule(
+    ViewSubject,
+    "mask-type",
+    "Masks are 8-bit greyscale images of 0 and 255 alone.",
+    "write uint8 masks of one channel, 255 where the instance is",
+)
+def check_type(view: ViewSubject) -> _Finding:
+    """Type and values of masks."""
+    for masks in view.masks.values():
+        for mask in masks:
+            if mask is not None and mask.kind not in (None, (8, "greyscale")):
+                yield mask.file, f"{mask.kind[0]} bits {mask.kind[1]}" if mask.kind else "another type"
+            elif mask is not None and not mask.binary:
+                yield mask.file, "values besides 0 and 255"
+
+
+@rule(
+    ViewSubject,
+    "mask-inside-mask",
+    "mask_visib is a part of mask.",
+    "cut mask_visib from mask; check that both have the same index",
+)
+def check_inside(view: ViewSubject) -> _Finding:
+    """Visible pixels outside of the silhouette."""
+    amodal = dict(_all_masks(view, "mask"))
+    for index, visible in _all_masks(view, "mask_visib"):
+        if index in amodal and visible.box is not None:
+            outside = np.count_nonzero(visible.crop & ~amodal[index].window(*visible.box))
+            if outside:
+                yield visible.file, f"{outside} of {visible.count} visible pixels are outside of the silhouette in mask"
+
+
+@rule(
+    ViewSubject,
+    "mask-overlap",
+    "Visible masks of an image do not overlap. Checked where masks are exact: the toolkit's, made from depth with a tolerance, do.",
+    "give each pixel to the nearest instance",
+)
+def check_overlap(view: ViewSubject) -> _Finding:
+    """Pixels of two visible masks."""
+    if not view.scene.layout.ours or view.size is None:
+        return
+    taken = np.zeros((view.size[1], view.size[0]), bool)
+    for _, mask in _all_masks(view, "mask_visib"):
+        if mask.box is not None:
+            left, top, width, height = mask.box
+            part = taken[top : top + height, left : left + width]
+            shared = np.count_nonzero(part & mask.crop)
+            if shared:
+                yield mask.file, f"{shared} pixels belong to another instance as well"
+            part |= mask.crop
+
+
+@rule(
+    ViewSubject,
+    "visible-count",
+    "px_count_visib is the number of pixels of mask_visib.",
+    "count the mask's pixels",
+)
+def check_visible_count(view: ViewSubject) -> _Finding:
+    """Counts of visible pixels."""
+    for index, mask, info in _pairs(view, "mask_visib"):
+        if _differ(info.px_count_visib, mask.count):
+            yield (
+                _file(view),
+                f"image {view.image}, instance {index}: px_count_visib is {info.px_count_visib}, {mask.file} has {mask.count}",
+            )
+
+
+@rule(
+    ViewSubject,
+    "valid-count",
+    "px_count_valid is the number of pixels of mask that have depth.",
+    "count the pixels of mask whose depth is not 0",
+)
+def check_valid_count(view: ViewSubject) -> _Finding:
+    """Counts of pixels with depth."""
+    depth = view.depth
+    if depth is None or depth.shape[::-1] != view.size:
+        return
+    for index, mask, info in _pairs(view, "mask"):
+        count = 0
+        if mask.box is not None:
+            left, top, width, height = mask.box
+            count = int(np.count_nonzero(mask.crop & (depth[top : top + height, left : left + width] > 0)))
+        if _differ(info.px_count_valid, count):
+            yield (
+                _file(view),
+                f"image {view.image}, instance {index}: px_count_valid is {info.px_count_valid}; in {mask.file} {count} have depth",
+            )
+
+
+@rule(
+    ViewSubject,
+    "amodal-count",
+    "px_count_all is the number of pixels of mask, or more if the silhouette touches the image's border.",
+    "count the silhouette in the image and up to one image size beyond each border",
+)
+def check_amodal_count(view: ViewSubject) -> _Finding:
+    """Counts of silhouettes."""
+    for index, mask, info in _pairs(view, "mask"):
+        inside = not _touched_sides(mask)
+        if (inside and _differ(info.px_count_all, mask.count)) or info.px_count_all + COUNT_SLACK < mask.count * (1.0 - COUNT_FRACTION):
+            yield _file(view), f"image {view.image}, instance {index}: px_count_all is {info.px_count_all}, {mask.file} has {mask.count}"
+
+
+@rule(
+    ViewSubject,
+    "visible-box",
+    "bbox_visib is the tight box of mask_visib: x_min, y_min, x_max - x_min, y_max - y_min, without + 1.",
+    "compute the box from the mask; COCO's boxes have + 1, these do not",
+)
+def check_visible_box(view: ViewSubject) -> _Finding:
+    """Visible boxes."""
+    for index, mask, info in _pairs(view, "mask_visib"):
+        if mask.box is not None and info.bbox_visib != EMPTY and info.bbox_visib != bop_box(mask.box):
+            yield _file(view), f"image {view.image}, instance {index}: bbox_visib is {_describe(info.bbox_visib, mask.box)}"
+
+
+@rule(
+    ViewSubject,
+    "amodal-box",
+    "bbox_obj is the tight box of the whole silhouette, without + 1; beyond the image where the silhouette is.",
+    "compute the box from the whole silhouette; COCO's boxes have + 1, these do not",
+)
+def check_amodal_box(view: ViewSubject) -> _Finding:
+    """Amodal boxes."""
+    for index, mask, info in _pairs(view, "mask"):
+        if mask.box is None or info.bbox_obj == EMPTY:
+            continue
+        box, wrong = info.bbox_obj, wrong_sides(info.bbox_obj, mask)
+        if wrong and not _touched_sides(mask):
+            yield _file(view), f"image {view.image}, instance {index}: bbox_obj is {_describe(box, mask.box)}"
+        elif wrong:
+            yield _file(view), f"image {view.image}, instance {index}: bbox_obj {box}, cut at the border, is not the box of {mask.file}"
+
+
+def wrong_sides(box: list[int], mask: Mask) -> list[int]:
+    """Sides, as in `_sides`, on which the box of a silhouette contradicts its mask, the part of it inside the image.
+
+    A silhouette that ends inside the image must agree on all sides. Of one that is cut, only the side opposite to the border is known, and
+    only if its box stays within the image on the others: around a corner of the image it may reach farther than inside.
+
+    Args:
+        box: Amodal box in BOP's convention.
+        mask: Mask that is not empty.
+    """
+    if mask.box is None:
+        return []
+    stated, seen, touched = _sides(box), _sides(bop_box(mask.box)), _touched_sides(mask)
+    image = _sides([0, 0, mask.size[0] - 1, mask.size[1] - 1])
+    beyond = {side for side in range(4) if touched and stated[side] > image[side]}
+    known = [side for side in range(4) if touched | beyond <= {(side + 2) % 4}]
+    return [side for side in range(4) if stated[side] < seen[side] or (side in known and stated[side] != seen[side])]
+
+
+def bop_box(box: tuple[int, int, int, int]) -> list[int]:
+    """Box in BOP's convention from one with pixel counts as sizes."""
+    return [box[0], box[1], box[2] - 1, box[3] - 1]
+
+
+def _sides(box: list[int]) -> tuple[int, int, int, int]:
+    """How far a box reaches to the left, top, right and bottom."""
+    return -box[0], -box[1], box[0] + box[2], box[1] + box[3]
+
+
+def _touched_sides(mask: Mask) -> set[int]:
+    """Borders of the image that a silhouette reaches, as in `_sides`; all, if it is empty and may lie outside."""
+    if mask.box is None:
+        return {0, 1, 2, 3}
+    left, top, width, height = mask.box
+    reached = left == 0, top == 0, left + width == mask.size[0], top + height == mask.size[1]
+    return {side for side, reaches in enumerate(reached) if reaches}
+
+
+def _differ(count: int, expected: int) -> bool:
+    return abs(count - expected) > max(COUNT_SLACK, COUNT_FRACTION * expected)
+
+
+def _describe(stated: list[int], box: tuple[int, int, int, int]) -> str:
+    hint = "; width and height have + 1" if stated == list(box) else ""
+    return f"{stated}, the mask's is {bop_box(box)}{hint}"

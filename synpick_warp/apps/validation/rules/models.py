@@ -1,0 +1,238 @@
+"""Rules about models folders: PLY dialect, geometry against models_info.json, symmetries."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+from scipy.spatial import KDTree
+
+from synpick_warp.apps.validation.model_files import ModelsFolder, ModelSubject, diameter, sample_area, turn_about
+from synpick_warp.apps.validation.registry import Level, rule
+from synpick_warp.dataset.bop.layout import MODEL_FILE
+
+LENGTH_TOLERANCE = 1e-3
+"""Largest error of diameter, minimum and size, as a fraction of the diameter; published values have 0.1 % of a small object."""
+SYMMETRY_DISTANCE, SYMMETRY_FRACTION = 15.0, 0.1
+"""Largest distance of a surface from itself after a symmetry: max(15 mm, 0.1 diameters), by which BOP identifies symmetries (Hodaň et al.,
+BOP Challenge 2020)."""
+SAMPLES, PROBES = 20_000, 500
+"""Points of the surface, and those that are moved."""
+ANGLES = (0.7, 1.9, 3.3)
+"""Angles by which continuous symmetries are tried [rad]."""
+TINY = 3.0
+"""Diameter of a model that looks like metres [mm]: BOP's smallest object has 24 mm, and 3 m is larger than any."""
+RIGID_TOLERANCE = 1e-3
+_NUMBERS = {"float", "double", "int", "uint", "uchar"}
+"""Types that the toolkit's reader knows in binary files."""
+_VERTEX = {"x", "y", "z", "nx", "ny", "nz", "red", "green", "blue", "alpha", "texture_u", "texture_v"}
+_Finding = Iterator[tuple[str, str]]
+
+
+@rule(
+    ModelsFolder,
+    "model-files",
+    "A models folder has models obj_NNNNNN.ply, and models_info.json has an entry for each of them and for no others.",
+    "name models by obj_id with six digits; calc_model_info.py makes models_info.json",
+)
+def check_files(folder: ModelsFolder) -> _Finding:
+    """Names, and keys of models_info.json."""
+    for name in sorted(folder.listing.files):
+        if name.lower().endswith(".ply") and not MODEL_FILE.fullmatch(name):
+            yield folder.listing.name(name), "a model whose name is not obj_NNNNNN.ply"
+    for name in (*folder.listing.outside, *folder.listing.special):
+        yield folder.listing.name(name), "leads out of the data set, or is no regular file; it is not read"
+    entries, fault = folder.info
+    if fault:
+        yield folder.listing.name("models_info.json"), fault
+    for key in sorted(set(entries) - set(map(str, folder.files))):
+        yield folder.listing.name("models_info.json"), f'entry "{key[:40]}" has no model'
+
+
+@rule(
+    ModelSubject,
+    "model-dialect",
+    "PLY files are ascii or binary_little_endian, of triangles, with the property names and types that the toolkit's reader knows.",
+    "export with float, double, int, uint, uchar and vertex_indices; texture_u, texture_v for texture coordinates",
+)
+def check_dialect(model: ModelSubject) -> _Finding:
+    """Header of a PLY file, by the rules of `inout.load_ply`."""
+    element = ""
+    for line in model.header:
+        words = line.split()
+        if words[:1] == ["format"] and words[1:2] not in (["ascii"], ["binary_little_endian"]):
+            yield model.place, f"format {' '.join(words[1:2])}; the toolkit reads bytes in the machine's own order"
+        elif words[:1] == ["element"]:
+            element = " ".join(words[1:2])
+        elif words[:1] == ["property"]:
+            kinds, name = (words[2:4] if words[1:2] == ["list"] else words[1:2]), words[-1]
+            unknown = sorted(set(kinds) - _NUMBERS)
+            if unknown and model.header[1:2] != ["format ascii 1.0"]:
+                yield model.place, f"property {name} of type {unknown[0][:40]}; known: {', '.join(sorted(_NUMBERS))}"
+            if element == "vertex" and name not in _VERTEX:
+                yield model.place, f"vertex property {name[:40]!a}, which the toolkit does not know"
+            if element == "face" and words[1:2] == ["list"] and name not in ("vertex_indices", "vertex_index", "texcoord"):
+                yield model.place, f"face property {name[:40]!a}; expected: vertex_indices"
+
+
+@rule(
+    ModelSubject,
+    "model-mesh",
+    "A model can be read: triangles whose vertices exist, finite numbers, and its texture is there.",
+    "repair or restore the mesh",
+)
+def check_mesh(model: ModelSubject) -> _Finding:
+    """Geometry and texture."""
+    if model.mesh[0] is None:
+        yield model.place, model.mesh[1]
+
+
+@rule(
+    ModelSubject,
+    "model-units",
+    "Models are in millimetres.",
+    "multiply the vertices by 1000 if they are in metres",
+)
+def check_units(model: ModelSubject) -> _Finding:
+    """Size of the mesh."""
+    if model.vertices is not None and (size := diameter(model.vertices)) < TINY:
+        yield model.place, f"the diameter is {size:.3g} mm; it looks like metres"
+
+
+@rule(
+    ModelSubject,
+    "model-entry",
+    "An entry of models_info.json has diameter, min_x to min_z, size_x to size_z, and symmetries as 16 numbers, or axis and offset.",
+    "make it again with calc_model_info.py, and add the symmetries by hand",
+)
+def check_entry(model: ModelSubject) -> _Finding:
+    """Schema of the entry."""
+    if model.entry[1]:
+        yield model.info_file, f"object {model.obj_id}: {model.entry[1]}"
+
+
+@rule(
+    ModelSubject,
+    "model-diameter",
+    "diameter is the largest distance between two vertices [mm].",
+    "compute it from the model's vertices (calc_model_info.py)",
+)
+def check_diameter(model: ModelSubject) -> _Finding:
+    """Diameter against the mesh."""
+    entry = model.entry[0]
+    if entry is not None and model.vertices is not None:
+        expected = diameter(model.vertices)
+        if abs(entry.diameter - expected) > LENGTH_TOLERANCE * expected:
+            hint = "; it looks like metres" if abs(1e3 * entry.diameter - expected) < 0.01 * expected else ""
+            yield model.info_file, f"object {model.obj_id}: diameter is {entry.diameter:g} mm, that of the mesh {expected:.6g}{hint}"
+
+
+@rule(
+    ModelSubject,
+    "model-box",
+    "min_x, min_y, min_z and size_x, size_y, size_z are the bounding box of the vertices [mm].",
+    "compute them from the model's vertices (calc_model_info.py)",
+)
+def check_box(model: ModelSubject) -> _Finding:
+    """Bounding box against the mesh."""
+    entry = model.entry[0]
+    if entry is None or model.vertices is None:
+        return
+    lower, size = model.vertices.min(axis=0), np.ptp(model.vertices, axis=0)
+    slack = LENGTH_TOLERANCE * max(float(np.linalg.norm(size)), 1e-9)
+    for axis, name in enumerate("xyz"):
+        for kind, expected in (("min", lower[axis]), ("size", size[axis])):
+            stated = getattr(entry, f"{kind}_{name}")
+            if abs(stated - expected) > slack:
+                yield model.info_file, f"object {model.obj_id}: {kind}_{name} is {stated:g} mm, that of the mesh {expected:.6g}"
+
+
+@rule(
+    ModelSubject,
+    "model-origin",
+    "The origin of a model is the centre of its bounding box.",
+    "move the mesh, and all poses with it; tools that crop by the origin and the diameter expect it",
+    level=Level.WARNING,
+)
+def check_origin(model: ModelSubject) -> _Finding:
+    """Centre of the bounding box."""
+    if model.vertices is not None:
+        center = (model.vertices.min(axis=0) + model.vertices.max(axis=0)) / 2.0
+        off, size = float(np.linalg.norm(center)), float(np.linalg.norm(np.ptp(model.vertices, axis=0)))
+        if off > 0.1 * size:
+            yield model.place, f"the box's centre is {off:.4g} mm from the origin"
+
+
+@rule(
+    ModelSubject,
+    "symmetry-identity",
+    "symmetries_discrete does not list the identity: the toolkit adds it.",
+    "remove the identity",
+)
+def check_identity(model: ModelSubject) -> _Finding:
+    """Discrete symmetries that are the identity."""
+    for index, matrix in _discrete(model):
+        if np.abs(matrix - np.eye(4)).max() <= RIGID_TOLERANCE:
+            yield model.info_file, f"object {model.obj_id}: symmetries_discrete[{index}] is the identity"
+
+
+@rule(
+    ModelSubject,
+    "symmetry-rigid",
+    "Symmetries are rigid: a rotation and a translation [mm], row by row; axes are not 0.",
+    "write a proper 4 x 4 matrix; mirror images are no symmetries",
+)
+def check_rigid(model: ModelSubject) -> _Finding:
+    """Matrices and axes."""
+    for index, matrix in _discrete(model):
+        if not _is_rigid(matrix):
+            hint = "; it looks column by column" if np.abs(matrix[3, :3]).max() > 0.0 and not matrix[:3, 3].any() else ""
+            yield model.info_file, f"object {model.obj_id}: symmetries_discrete[{index}] is not rigid{hint}"
+    for index, (axis, _) in _continuous(model):
+        if not np.linalg.norm(axis) > 0.0:
+            yield model.info_file, f"object {model.obj_id}: symmetries_continuous[{index}].axis is 0"
+
+
+@rule(
+    ModelSubject,
+    "symmetry-maps",
+    "Symmetries map the model onto itself: no point moves away from the surface by more than 15 mm and a tenth of the diameter.",
+    "remove the symmetry, or correct its axis, offset or translation",
+)
+def check_symmetries(model: ModelSubject) -> _Finding:
+    """Symmetries against the surface."""
+    transforms = [(f"symmetries_discrete[{index}]", matrix) for index, matrix in _discrete(model) if _is_rigid(matrix)]
+    for index, (axis, offset) in _continuous(model):
+        if np.linalg.norm(axis) > 0.0:
+            transforms += [(f"symmetries_continuous[{index}]", turn_about(axis, offset, angle)) for angle in ANGLES]
+    mesh = model.mesh[0]
+    if not transforms or mesh is None:
+        return
+    points = 1e3 * sample_area(mesh.vertices, mesh.faces, SAMPLES)
+    tree, probes = KDTree(points), points[:PROBES]
+    bound = max(SYMMETRY_DISTANCE, SYMMETRY_FRACTION * float(np.linalg.norm(np.ptp(points, axis=0))))
+    farthest: dict[str, float] = {}
+    for name, matrix in transforms:
+        distance = float(tree.query(probes @ matrix[:3, :3].T + matrix[:3, 3])[0].max())
+        farthest[name] = max(farthest.get(name, 0.0), distance)
+    for name, distance in farthest.items():
+        if distance > bound:
+            yield model.info_file, f"object {model.obj_id}: {name} moves a point {distance:.3g} mm off the surface; allowed: {bound:.3g} mm"
+
+
+def _is_rigid(matrix: np.ndarray) -> bool:
+    rotation = matrix[:3, :3]
+    off = max(np.abs(rotation @ rotation.T - np.eye(3)).max(), np.abs(matrix[3] - (0, 0, 0, 1)).max(), abs(np.linalg.det(rotation) - 1.0))
+    return bool(off <= RIGID_TOLERANCE)
+
+
+def _discrete(model: ModelSubject) -> Iterator[tuple[int, np.ndarray]]:
+    entry = model.entry[0]
+    if entry is not None and isinstance(entry.symmetries_discrete, list):
+        yield from ((index, np.reshape(np.array(values, np.float64), (4, 4))) for index, values in enumerate(entry.symmetries_discrete))
+
+
+def _continuous(model: ModelSubject) -> Iterator[tuple[int, tuple[list[float], list[float]]]]:
+    entry = model.entry[0]
+    if entry is not None and isinstance(entry.symmetries_continuous, list):
+        yield from ((index, (item.axis, item.offset)) for index, item in enumerate(entry.symmetries_continuous))

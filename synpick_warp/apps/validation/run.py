@@ -1,0 +1,172 @@
+"""Validation of a data set: plans its tasks, runs them in parallel over parts of scenes, and yields violations in a fixed order."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+from synpick_warp.apps.validation.model_files import ModelsFolder
+from synpick_warp.apps.validation.registry import Level, Violation, apply_rules
+from synpick_warp.apps.validation.scene_files import FolderScene, open_scene
+from synpick_warp.apps.validation.subjects import TreeSubject
+from synpick_warp.apps.validation.target_lists import TargetLists
+from synpick_warp.apps.validation.tasks import CheckModel, CheckRig, CheckScene, State, Task
+from synpick_warp.dataset.bop.keyed import KeyedFolder
+from synpick_warp.dataset.bop.layout import Layout, SceneRef
+from synpick_warp.dataset.commit.manifest import read_manifest, read_settings
+from synpick_warp.errors import DatasetError, SynpickError
+from synpick_warp.system.hardware.cores import count_cores
+from synpick_warp.system.processes.pool import WorkerProgram, map_ordered
+from synpick_warp.system.progress import Report
+
+DEFAULT_SAMPLE = 200
+"""Views that are rendered again; some 30 a second on one core."""
+PART = 100
+"""Views of a task."""
+VIEWS_PER_PROCESS = 100
+"""Minimum number of views per process: starting one takes a second."""
+
+
+@dataclass(frozen=True)
+class Options:
+    """What is checked."""
+
+    sample: int | None = DEFAULT_SAMPLE
+    """Views that are rendered again, spread over all views; None: all."""
+    images: bool = True
+    """Whether images are read; otherwise only files, annotations, models and lists are checked."""
+    threads: int = field(default_factory=count_cores)
+
+
+@dataclass
+class Summary:
+    """Totals of a validation."""
+
+    scenes: int = 0
+    views: int = 0
+    """Views whose images were checked."""
+    rendered: int = 0
+    """Views that were rendered again."""
+    models: int = 0
+    errors: int = 0
+    warnings: int = 0
+
+
+def validate(folder: Path, options: Options, summary: Summary, report: Report = lambda unit, done, total: None) -> Iterator[Violation]:
+    """Check a data set by all rules.
+
+    Args:
+        folder: A BOP data set, from `bake` or anybody else.
+        options: What is checked.
+        summary: Totals; written.
+        report: Called with the progress.
+
+    Yields:
+        Violations, in an order that does not depend on the number of processes.
+
+    Raises:
+        DatasetError: The folder is no BOP data set.
+    """
+    layout = Layout(folder)
+    lists = TargetLists(layout)
+    scenes = _list_scenes(layout)
+    summary.scenes = len(scenes)
+    total = sum(len(images) for _, images in scenes)
+    for violation in _check_folders(layout, lists):
+        yield _finish(violation, layout, summary)
+    models = list(_plan_models(layout, summary))
+    tasks: list[Task] = [*models, *_plan_scenes(scenes, lists, options), *_plan_rigs(layout, scenes)]
+    processes = max(1, min(options.threads, -(-total // VIEWS_PER_PROCESS) if options.images else 1, len(tasks)))
+    for checked in map_ordered(WorkerProgram(partial(State, layout.root), "process that validates"), tasks, processes):
+        summary.views += checked.views
+        summary.rendered += checked.rendered
+        report("views" if options.images else "scenes", summary.views, total)
+        for violation in checked.violations:
+            yield _finish(violation, layout, summary)
+
+
+def _finish(violation: Violation, layout: Layout, summary: Summary) -> Violation:
+    """Count a violation, and shorten its text: paths relative to the data set, and the file's own name not twice."""
+    if violation.level is Level.ERROR:
+        summary.errors += 1
+    else:
+        summary.warnings += 1
+    text = violation.text.replace(f"{layout.root}/", "").removeprefix(violation.file).lstrip(" :,")
+    return violation._replace(text=text)
+
+
+def _check_folders(layout: Layout, lists: TargetLists) -> Iterator[Violation]:
+    """Rules about the whole data set."""
+    yield from apply_rules(TreeSubject(layout))
+    yield from apply_rules(lists)
+    for listing in layout.keyed.values():
+        yield from apply_rules(KeyedFolder(listing))
+
+
+def _list_scenes(layout: Layout) -> list[tuple[SceneRef, np.ndarray]]:
+    """All scenes, with the indices of their images by the files' names."""
+    found = []
+    for ref in layout.scenes():
+        files = open_scene(layout, ref)
+        assert isinstance(files, FolderScene)
+        kind = next((kind for kind in ("rgb", "gray", "depth") if kind in files.kinds), "")
+        found.append((ref, np.array(sorted(image for image, _ in files.indices(kind)), np.int32)))
+    for listing in layout.keyed.values():
+        found += [(ref, np.array(images, np.int32)) for ref, images in KeyedFolder(listing).scenes()]
+    return found
+
+
+def _plan_models(layout: Layout, summary: Summary) -> Iterator[Task]:
+    for name, listing in layout.models.items():
+        yield CheckModel(name, None)
+        for obj_id in ModelsFolder(listing).files:
+            summary.models += 1
+            yield CheckModel(name, obj_id)
+
+
+def _plan_scenes(scenes: list[tuple[SceneRef, np.ndarray]], lists: TargetLists, options: Options) -> Iterator[Task]:
+    """Parts of scenes, with the views that are rendered again: evenly spread over the views of all scenes."""
+    total = sum(len(images) for _, images in scenes)
+    sample = total if options.sample is None else min(options.sample, total)
+    # Views in the middle of `sample` equal parts.
+    chosen = np.floor((np.arange(sample) + 0.5) * total / max(sample, 1)).astype(np.int64) if options.images else np.zeros(0, np.int64)
+    start = 0
+    for ref, images in scenes:
+        low, high = np.searchsorted(chosen, (start, start + len(images)))
+        poses = images[chosen[low:high] - start]
+        parts = max(1, -(-len(images) // PART)) if options.images else 1
+        targets = lists.of_scene(ref.split, ref.scene) if ref.name and not ref.sensor else {}
+        for part in range(parts):
+            last = None if part == parts - 1 else (part + 1) * PART
+            yield CheckScene(ref, part * PART, last, options.images, frozenset(poses.tolist()), targets if part == 0 else {})
+        start += len(images)
+
+
+def _plan_rigs(layout: Layout, scenes: list[tuple[SceneRef, np.ndarray]]) -> Iterator[Task]:
+    """Scenes that belong together: of the cameras of an episode of ours, of the sensors of a scene of others."""
+    cameras = _count_cameras(layout)
+    groups: dict[tuple[str, int], list[SceneRef]] = {}
+    sensors: dict[tuple[str, int], list[SceneRef]] = {}
+    for ref, _ in scenes:
+        sensors.setdefault((ref.split, ref.scene), []).append(ref)
+        groups.setdefault((ref.split, ref.scene // cameras), []).append(ref)
+    for refs in sensors.values():
+        if len(refs) > 1:
+            yield CheckRig(tuple(refs), len(refs))
+    for refs in groups.values() if cameras > 1 else ():
+        if not any(ref.sensor for ref in refs):
+            yield CheckRig(tuple(refs), cameras)
+
+
+def _count_cameras(layout: Layout) -> int:
+    """Number of cameras of a data set of ours; 1 for others."""
+    if not layout.ours:
+        return 1
+    try:
+        return max(1, len(read_settings(layout.root, read_manifest(layout.root)).cameras.positions))
+    except (SynpickError, DatasetError):
+        return 1

@@ -1,0 +1,161 @@
+"""Files of a scene behind one interface: scene folders (classic, one per sensor), webdataset shards, and the imagewise layout."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from synpick_warp.apps.validation.pictures import Mask, crop_mask, decode_mask
+from synpick_warp.apps.validation.schemas import PLAIN_KEY, RECORDS, Coco, Segmentation, convert
+from synpick_warp.dataset.bop.images import FolderImages, KeyedImages
+from synpick_warp.dataset.bop.layout import Layout, SceneRef
+from synpick_warp.dataset.view_files import decode_run_lengths
+from synpick_warp.errors import DatasetError
+from synpick_warp.system.inputs.image_files import MAX_SIDE
+from synpick_warp.system.inputs.json import MAX_JSON, decode_json
+
+_DIGITS = 6
+"""Least number of digits of indices in file names."""
+
+
+@dataclass(eq=False)
+class RecordFile:
+    """Parsed annotation file (scene_camera, scene_gt or scene_gt_info), by image."""
+
+    file: str
+    """Path relative to the data set."""
+    present: bool = True
+    raw: dict[int, Any] = field(default_factory=dict)
+    """Decoded JSON entries, not checked."""
+    entries: dict[int, Any] = field(default_factory=dict)
+    """Entries that fit the schema, as its types."""
+    faults: list[tuple[str, str]] = field(default_factory=list)
+    """(file, what does not fit the schema)."""
+    keys: list[str] = field(default_factory=list)
+    """Keys that are no plain indices."""
+    sources: dict[int, str] = field(default_factory=dict)
+    """File of an entry, where each has its own."""
+
+    def add(self, image: int, content: Any, name: str, source: str = "") -> None:
+        """Add an entry, and check it."""
+        self.raw[image] = content
+        if source:
+            self.sources[image] = source
+        try:
+            self.entries[image] = convert(content, RECORDS[name])
+        except ValueError as fault:
+            self.faults.append((source or self.file, f"image {image}: {fault}"))
+
+    def where(self, image: int) -> str:
+        """File of an entry."""
+        return self.sources.get(image, self.file)
+
+
+class FolderScene(FolderImages):
+    """Scene folder: annotations with their faults, and a file per image and mask."""
+
+    def __init__(self, layout: Layout, ref: SceneRef) -> None:
+        super().__init__(layout.splits[ref.split].enter(ref.name), ref.sensor, _DIGITS)
+        self.ref = ref
+        self._records: dict[str, RecordFile] = {}
+
+    def record(self, name: str) -> RecordFile:
+        """Entries of "camera", "gt" or "gt_info"."""
+        if name not in self._records:
+            self._records[name] = self._read_record(name)
+        return self._records[name]
+
+    def _read_record(self, name: str) -> RecordFile:
+        file = f"scene_{name}{self.ref.sensor}.json"
+        record = RecordFile(self.listing.name(file), file in self.listing.files)
+        if not record.present:
+            return record
+        try:
+            content = decode_json(self.listing.read(file, MAX_JSON), dict[str, Any], record.file, DatasetError)
+        except DatasetError as error:
+            record.faults.append((record.file, str(error)))
+            return record
+        for key, entry in content.items():
+            if PLAIN_KEY.fullmatch(key):
+                record.add(int(key), entry, name)
+            else:
+                record.keys.append(key)
+        return record
+
+    def coco(self, name: str) -> tuple[str, Any] | None:
+        """File and content of scene_gt_coco.json, or with `name` "_modal" of that file; None: there is none."""
+        for file in (f"scene_gt_coco{self.ref.sensor}{name}.json", f"scene_gt_coco{name}{self.ref.sensor}.json"):
+            if file in self.listing.files:
+                place = self.listing.name(file)
+                return place, decode_json(self.listing.read(file, MAX_JSON), Coco, place, DatasetError)
+        return None
+
+    def mask(self, kind: str, image: int, index: int) -> Mask | None:
+        """Decode a mask; None: there is none. Raises DatasetError if it cannot be decoded."""
+        data = self.read(kind, image, index, MAX_JSON)
+        return None if data is None else decode_mask(data, self.file(kind, image, index))
+
+
+class KeyedScene(KeyedImages):
+    """Views with a key each: members of shards, or files of the imagewise layout. Masks are run lengths."""
+
+    def __init__(self, layout: Layout, ref: SceneRef) -> None:
+        super().__init__(layout.keyed[ref.split], ref)
+        self._masks: tuple[tuple[str, int], Any] | None = None
+
+    @cached_property
+    def _records(self) -> dict[str, RecordFile]:
+        records = {name: RecordFile(self.ref.place) for name in RECORDS}
+        for (image, content), member in sorted(self.members.items()):
+            name = content.removesuffix(".json")
+            if name not in records or name == content:
+                continue
+            try:
+                entry: Any = decode_json(self.content(member, MAX_JSON), object, member.file, DatasetError)
+            except DatasetError as error:
+                records[name].faults.append((member.file, str(error)))
+                continue
+            records[name].add(image, entry, name, member.file)
+        return records
+
+    def record(self, name: str) -> RecordFile:
+        """See `FolderScene`."""
+        return self._records[name]
+
+    def coco(self, name: str) -> tuple[str, Any] | None:
+        """See `FolderScene`: keyed layouts have no COCO file."""
+        return None
+
+    def mask(self, kind: str, image: int, index: int) -> Mask | None:
+        """See `FolderScene`."""
+        if self._masks is None or self._masks[0] != (kind, image):
+            data = self.read(kind, image, None, MAX_JSON)
+            file = self.file(kind, image)
+            runs = {} if data is None else decode_json(data, dict[str, Segmentation], file, DatasetError)
+            self._masks = (kind, image), runs
+        runs = self._masks[1].get(str(index))
+        return None if runs is None else crop_mask(decode_runs(runs, self.file(kind, image, index)), self.file(kind, image, index))
+
+
+CheckedScene = FolderScene | KeyedScene
+"""Files of one scene of one sensor, as validation reads them: what does not fit a schema is a fault, not an error."""
+
+
+def decode_runs(runs: Segmentation, file: str) -> np.ndarray:
+    """Decode run lengths (H, W) bool.
+
+    Raises:
+        DatasetError: They are compressed, or do not cover the image.
+    """
+    height, width = runs.size
+    if isinstance(runs.counts, str) or max(runs.size) > MAX_SIDE or sum(runs.counts) != height * width:
+        raise DatasetError(f"{file}: the runs do not cover the image of {width} x {height} pixels")
+    return decode_run_lengths(runs.counts, runs.size)
+
+
+def open_scene(layout: Layout, ref: SceneRef) -> CheckedScene:
+    """Files of a scene."""
+    return FolderScene(layout, ref) if ref.name else KeyedScene(layout, ref)

@@ -1,0 +1,129 @@
+"""Tasks of a validation: pickled messages that check a model, the views of a scene, or a rig, in this process or in another."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import Any, NamedTuple, Protocol
+
+from synpick_warp.apps.validation.model_files import ModelsFolder, ModelSubject
+from synpick_warp.apps.validation.registry import Violation, apply_rules
+from synpick_warp.apps.validation.rules.rig import RigSubject
+from synpick_warp.apps.validation.scene_files import open_scene
+from synpick_warp.apps.validation.subjects import SceneSubject, ViewSubject
+from synpick_warp.dataset.bop.folders import Listing
+from synpick_warp.dataset.bop.layout import Layout, SceneRef
+
+
+class Checked(NamedTuple):
+    """Result of a task."""
+
+    violations: list[Violation]
+    views: int = 0
+    """Views whose images were checked."""
+    rendered: int = 0
+    """Views that were rendered again."""
+
+
+class State:
+    """What a process keeps between tasks: the layout, the scene that was read last, and the renderer."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self._scene: tuple[tuple[SceneRef, int], SceneSubject] | None = None
+        self._models: tuple[str, ModelsFolder] | None = None
+
+    @cached_property
+    def layout(self) -> Layout:
+        """Layout of the data set."""
+        return Layout(self.folder)
+
+    @cached_property
+    def renderer(self) -> Any:
+        """The `ObjectRenderer`; Warp is imported when the first view is rendered."""
+        from synpick_warp.apps.validation.rendering import ObjectRenderer
+
+        return ObjectRenderer(self.layout)
+
+    def scene(self, ref: SceneRef, targets: dict[str, Any]) -> SceneSubject:
+        """A scene; the one that was read last stays in memory."""
+        if self._scene is None or self._scene[0] != (ref, id(targets)):
+            self._scene = (ref, id(targets)), SceneSubject(self.layout, open_scene(self.layout, ref), targets)
+        return self._scene[1]
+
+    def models(self, name: str) -> ModelsFolder:
+        """A models folder."""
+        if self._models is None or self._models[0] != name:
+            self._models = name, ModelsFolder(self.layout.models.get(name, Listing(self.layout.root, name)))
+        return self._models[1]
+
+
+class Task(Protocol):
+    """A message to a process; see `WorkerProgram`."""
+
+    def __call__(self, state: State) -> Checked:
+        """Check."""
+        ...
+
+
+@dataclass(frozen=True)
+class CheckModel:
+    """Check a model; without an object, the folder."""
+
+    folder: str
+    obj_id: int | None
+
+    def __call__(self, state: State) -> Checked:
+        """See `Task`."""
+        folder = state.models(self.folder)
+        return Checked(list(apply_rules(folder if self.obj_id is None else ModelSubject(folder, self.obj_id))))
+
+
+@dataclass(frozen=True)
+class CheckScene:
+    """Check a part of a scene's views, and with the first part the scene itself."""
+
+    ref: SceneRef
+    first: int
+    """Position of the part's first view in the sorted list of images."""
+    last: int | None
+    """Position after its last view; None: to the end."""
+    images: bool
+    """Whether images are checked, not only annotations."""
+    poses: frozenset[int] = frozenset()
+    """Images that are rendered again."""
+    targets: dict[str, Any] = field(default_factory=dict)
+
+    def __call__(self, state: State) -> Checked:
+        """See `Task`."""
+        scene = state.scene(self.ref, self.targets)
+        violations: list[Violation] = []
+        if self.first == 0:
+            violations += apply_rules(scene)
+        if not self.images:
+            return Checked(violations)
+        images = scene.images[self.first : self.last]
+        rendered = 0
+        for image in images:
+            view = ViewSubject(scene, image)
+            violations += apply_rules(view)
+            if image in self.poses and view.truths:
+                from synpick_warp.apps.validation.diagnosis import DiagnosedView
+
+                rendered += 1
+                violations += apply_rules(DiagnosedView(view, state.renderer))
+        return Checked(violations, len(images), rendered)
+
+
+@dataclass(frozen=True)
+class CheckRig:
+    """Check the scenes of the cameras of one episode, or of the sensors of one scene, against each other."""
+
+    refs: tuple[SceneRef, ...]
+    cameras: int
+
+    def __call__(self, state: State) -> Checked:
+        """See `Task`."""
+        scenes = tuple(SceneSubject(state.layout, open_scene(state.layout, ref)) for ref in self.refs)
+        return Checked(list(apply_rules(RigSubject(self.refs[0].place, scenes, self.cameras))))

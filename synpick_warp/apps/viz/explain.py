@@ -1,0 +1,256 @@
+"""Figure of a pick attempt, from a data set's files: image with contours and suction points, clutter graph, choice, seal force.
+
+The layout follows the figure of the paper (Periyasamy et al., SynPick, 2021).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from synpick_warp.apps.viz.drawing import FONT, INK, WHITE, Image, check_picture_name, instance_color, put_text, readable_on, write_picture
+from synpick_warp.apps.viz.explain_graph import CYCLIC, GREY, OUTVOTED, RED, clutter_edges, disc, draw_graph, fixed, put_boxed
+from synpick_warp.apps.viz.explain_panels import GREEN, LINE, PLOT_HEIGHT, SMALL, SOFT, TEXT, WORDS_WIDTH, draw_words, load_chart
+from synpick_warp.apps.viz.explain_record import MODE_WORDS, Attempt, choose_attempts, labels, read_attempts
+from synpick_warp.configs.load import load_config
+from synpick_warp.configs.schema import Config
+from synpick_warp.configs.splits import DataLayout
+from synpick_warp.dataset.annotations import SCENE_SCHEMAS, read_checked
+from synpick_warp.dataset.object_names import object_names
+from synpick_warp.dataset.records import Pixel
+from synpick_warp.dataset.view_files import read_image
+from synpick_warp.errors import DatasetError
+from synpick_warp.system.codecs.charts import Spec, render_charts
+from synpick_warp.system.inputs.paths import path_inside
+
+DEFAULT_ATTEMPTS = 3
+"""Attempts that are drawn if none is named."""
+MARGIN = 20
+"""Margin of the sheet, and gap between columns [px]."""
+HEAD = 64
+"""Height of the headline and the captions below it [px]."""
+IMAGE_WIDTH = 880
+"""Width of the colour image on the sheet [px]."""
+_MAX_IMAGE_HEIGHT = 880
+"""Maximum height of the colour image [px]."""
+_GRAPH_WIDTH = 500
+"""Width of the clutter graph [px]."""
+_MIN_ROW_HEIGHT = 640
+"""Minimum height of a row without its headline [px]."""
+_LABEL = 0.5
+"""Font scale of an object's label on the image; the target's is larger."""
+_HALO = 3
+"""Width of the dark outline around bright lines on the image [px]."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Scene:
+    """Images of camera 0 at the time of an attempt's observation."""
+
+    place: str
+    color: Image
+    masks: dict[int, np.ndarray] | None
+    """Instance id -> modal mask; None: the data set has no masks."""
+
+
+def write_explanation(dataset: Path, out: Path, episode: int | None, attempt: int | None = None) -> Path:
+    """Draw one attempt of an episode, all of them, or the first ones worth seeing, below each other, and write the image file.
+
+    Args:
+        dataset: Folder of the data set.
+        out: PNG or JPEG file to write; its folder is created.
+        episode: Index of the episode; None: the first DEFAULT_ATTEMPTS worth seeing, of any.
+        attempt: Index of the attempt in the episode; None: all.
+
+    Raises:
+        ConfigError: The data set's config.toml is damaged.
+        DatasetError: There is no such attempt, or a file is missing or damaged.
+        OutputError: The image cannot be written.
+        ChartError: The charts' library cannot run.
+    """
+    check_picture_name(out)
+    if not dataset.is_dir():
+        raise DatasetError(f"there is no folder {dataset}; name the folder of a BOP data set")
+    attempts = choose_attempts(dataset, DEFAULT_ATTEMPTS) if episode is None else read_attempts(dataset, episode, attempt)
+    path = dataset / "config.toml"
+    if not path.exists():
+        raise DatasetError(f"{dataset} has no config.toml; the settings of the bake are needed to explain what it did")
+    config = load_config(str(path), {})
+    names = object_names(dataset, config, {one.object_id for each in attempts for one in each.seen})
+    rows = [_row(each, _read_scene(dataset, config, each), names, config) for each in attempts]
+    plots = render_charts([plot for _, plot in rows], scale=1.0)
+    for (sheet, _), data in zip(rows, plots, strict=True):
+        plot = np.asarray(cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR))
+        _paste(sheet, plot, MARGIN, len(sheet) - MARGIN - len(plot))
+    return write_picture(out, np.concatenate([sheet for sheet, _ in rows]))
+
+
+def _read_scene(dataset: Path, config: Config, attempt: Attempt) -> _Scene:
+    layout = DataLayout.of(config)
+    split = path_inside(dataset, layout.folder(attempt.episode), dataset / "config.toml", DatasetError)
+    index, suffix = layout.scene(attempt.episode, 0)
+    scene = split / f"{index:06d}"
+    stem = f"{attempt.frame:06d}"
+    truth = read_checked(scene / f"scene_gt{suffix}.json", SCENE_SCHEMAS["gt"]).get(attempt.frame)
+    if truth is None:
+        raise DatasetError(f"{scene}/scene_gt{suffix}.json has no image {attempt.frame}, which {dataset}/attempts.jsonl names")
+    color = read_image(scene / f"rgb{suffix}", stem, cv2.IMREAD_COLOR, config.cameras.resolution)
+    masks = None
+    folder = scene / f"mask_visib{suffix}"
+    if folder.is_dir():
+        seen = attempt.objects
+        masks = {
+            record["instance_id"]: read_image(folder, f"{stem}_{index:06d}", cv2.IMREAD_GRAYSCALE, color.shape[1::-1])
+            for index, record in enumerate(truth)
+            if record.get("instance_id") in seen
+        }
+    return _Scene(f"{scene.parent.name}/{scene.name}, image {attempt.frame}", color, masks)
+
+
+def to_color_image(pixel: Pixel, resolution: tuple[int, int], size: tuple[int, int]) -> tuple[float, float]:
+    """Map a pixel of the perception image to the colour image (column, row); in both, integers are pixel centres.
+
+    Both images have the same camera, principal point in the middle and horizontal field of view; their aspect ratios may differ.
+
+    Args:
+        pixel: Column and row in the perception image.
+        resolution: Width and height of the perception image [px].
+        size: Width and height of the colour image [px].
+    """
+    scale = size[0] / resolution[0]
+    column, row = ((value + 0.5 - old / 2) * scale + new / 2 - 0.5 for value, old, new in zip(pixel, resolution, size, strict=True))
+    return column, row
+
+
+def image_scale(size: tuple[int, int]) -> float:
+    """Scale of a colour image of that width and height [px] on the sheet."""
+    return min(IMAGE_WIDTH / size[0], _MAX_IMAGE_HEIGHT / size[1])
+
+
+def _row(attempt: Attempt, scene: _Scene, names: Mapping[int, str], config: Config) -> tuple[Image, Spec]:
+    """Draw one attempt: image, clutter graph, text and table, with room at the lower left for the force's plot, which is the second."""
+    image = draw_observation(attempt, scene.color, scene.masks)
+    words = draw_words(attempt, names, config)
+    left = image.shape[0] + 2 * LINE + MARGIN + PLOT_HEIGHT
+    height = max(left, words.shape[0], _MIN_ROW_HEIGHT)
+    sheet = np.full((HEAD + height + 2 * MARGIN, IMAGE_WIDTH + _GRAPH_WIDTH + WORDS_WIDTH + 4 * MARGIN, 3), 255, np.uint8)
+    columns = MARGIN, 2 * MARGIN + IMAGE_WIDTH, 3 * MARGIN + IMAGE_WIDTH + _GRAPH_WIDTH
+    top = MARGIN + HEAD
+    _paste(sheet, image, columns[0], top)
+    _draw_key(sheet, columns[0], top + image.shape[0] + 24)
+    plot = load_chart(attempt, config, IMAGE_WIDTH, height - image.shape[0] - 2 * LINE - MARGIN)
+    states = {edge.state for edge in clutter_edges(attempt, config.perception.min_votes)}
+    foot = _graph_foot(states) if attempt.seen else []
+    _paste(sheet, draw_graph(attempt, config.perception.min_votes, (_GRAPH_WIDTH, height - LINE * len(foot))), columns[1], top)
+    for number, (text, color) in enumerate(foot):
+        put_text(sheet, text, (columns[1], top + height - LINE * (len(foot) - 1 - number) - 6), SMALL, color)
+    _paste(sheet, words, columns[2], top)
+    head = f"Episode {attempt.episode}, attempt {attempt.attempt} ({MODE_WORDS[attempt.mode]}): {attempt.sentence}"
+    put_text(sheet, head, (MARGIN, MARGIN + 20), 0.68, GREEN if attempt.picked else RED, 2)
+    captions = [f"camera 0: {scene.place}", "clutter graph", "choice and outcome"]
+    if scene.masks is None:
+        captions[0] += "; no contours: this data set has no masks"
+    for text, column in zip(captions, columns, strict=True):
+        put_text(sheet, text, (column, top - 9), TEXT, SOFT)
+    sheet[-1] = GREY
+    return sheet, plot
+
+
+def _paste(sheet: Image, picture: Image, column: int, row: int) -> None:
+    sheet[row : row + picture.shape[0], column : column + picture.shape[1]] = picture
+
+
+def draw_observation(attempt: Attempt, color: Image, masks: Mapping[int, np.ndarray] | None) -> Image:
+    """Draw contours and suction points on the colour image, which is darkened except for the target.
+
+    Args:
+        attempt: The attempt.
+        color: Image of camera 0 at the observation (H, W, 3) uint8, blue first.
+        masks: Instance id -> modal mask (H, W) uint8, of visible instances; None: the data set has no masks.
+    """
+    masks = masks or {}
+    height, width = color.shape[:2]
+    scale = image_scale((width, height))
+    size = (max(1, round(scale * width)), max(1, round(scale * height)))
+    color = cv2.resize(color, size, interpolation=cv2.INTER_AREA if scale < 1 else cv2.INTER_CUBIC)
+    drawn = (0.62 * color).astype(np.uint8)
+    order = sorted(masks, key=lambda instance: instance == attempt.target)
+    for instance in order:
+        mask = cv2.resize(np.minimum(masks[instance], 1) * 255, size, interpolation=cv2.INTER_LINEAR) > 127
+        _draw_contours(drawn, color, mask, instance, instance == attempt.target)
+    short = labels(attempt)
+    for one in attempt.seen:
+        places = [to_color_image(point, attempt.observation.resolution, (width, height)) for point in (*one.candidates, one.grasp_pixel)]
+        points = [(scale * (x + 0.5) - 0.5, scale * (y + 0.5) - 0.5) for x, y in places]
+        target = one.instance == attempt.target
+        for kind, point in enumerate(points[:-1]):
+            draw_mark(drawn, kind, point)
+        draw_chosen(drawn, points[-1], instance_color(one.instance), target)
+        _put_label(drawn, short[one.instance], points[-1], instance_color(one.instance), 1.3 * _LABEL if target else _LABEL)
+    return drawn
+
+
+def _draw_contours(drawn: Image, color: Image, mask: np.ndarray, instance: int, target: bool) -> None:
+    """Draw contours of a mask's components and holes, in place; the target keeps its brightness, with tint and white outline."""
+    lines = cv2.findContours(mask.astype(np.uint8), cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)[0]
+    shade = instance_color(instance)
+    if target:
+        drawn[mask] = (0.72 * color[mask] + 0.28 * np.array(shade)).astype(np.uint8)
+        cv2.drawContours(drawn, lines, -1, WHITE, 3 * _HALO, cv2.LINE_AA)
+        cv2.drawContours(drawn, lines, -1, shade, _HALO + 1, cv2.LINE_AA)
+    else:
+        cv2.drawContours(drawn, lines, -1, INK, _HALO + 1, cv2.LINE_AA)
+        cv2.drawContours(drawn, lines, -1, shade, 2, cv2.LINE_AA)
+
+
+def draw_mark(picture: Image, kind: int, place: tuple[float, float]) -> None:
+    """Draw a suction point candidate, white with a dark outline: pole of inaccessibility, ring; centroid, cross; half-way, diamond."""
+    x, y = place
+    reach = 5.0
+    shapes = {
+        1: [[(x - reach, y), (x + reach, y)], [(x, y - reach), (x, y + reach)]],
+        2: [[(x - reach, y), (x, y - reach), (x + reach, y), (x, y + reach), (x - reach, y)]],
+    }
+    for color, thickness in ((INK, 4), (WHITE, 2)):
+        if kind == 0:
+            disc(picture, place, reach, color, thickness)
+        else:
+            for line in shapes[kind]:
+                cv2.polylines(picture, [fixed(np.array(line))], False, color, thickness, cv2.LINE_AA, 4)
+
+
+def draw_chosen(picture: Image, place: tuple[float, float], color: tuple[int, int, int], target: bool) -> None:
+    """Draw a suction point: a disc in the object's colour; the target's has a ring."""
+    if target:
+        disc(picture, place, 14, INK, 5)
+        disc(picture, place, 14, WHITE, 3)
+    disc(picture, place, 5.5, INK)
+    disc(picture, place, 4.0, color)
+
+
+def _put_label(picture: Image, text: str, point: tuple[float, float], color: tuple[int, int, int], size: float) -> None:
+    (width, height), _ = cv2.getTextSize(text, FONT, size, 1)
+    place = (point[0] + (22 if size > _LABEL else 13) + width / 2, point[1] - 8 - height / 2)
+    put_boxed(picture, text, place, size, readable_on(color), color)
+
+
+def _draw_key(sheet: Image, x: int, y: int) -> None:
+    """Draw the legend of the image's markers."""
+    for kind, text in enumerate(("pole of inaccessibility", "centroid", "half-way", "suction point", "that of the target")):
+        place = (x + (17.0 if kind == 4 else 8.0), y - 4.5)
+        if kind < 3:
+            draw_mark(sheet, kind, place)
+        else:
+            draw_chosen(sheet, place, (200, 200, 200), kind == 4)
+        put_text(sheet, text, (round(place[0]) + (26 if kind == 4 else 14), y), SMALL, SOFT)
+        x += 44 + cv2.getTextSize(text, FONT, SMALL, 1)[0][0]
+
+
+def _graph_foot(states: set[str]) -> Sequence[tuple[str, tuple[int, int, int]]]:
+    lines = [("arrow: from the object on top to the one below, with its votes", SOFT), ("badge: number of objects above", SOFT)]
+    lines += [(f"dashed: {OUTVOTED}", GREY)] if OUTVOTED in states else []
+    return lines + ([(f"dashed: {CYCLIC}", RED)] if CYCLIC in states else [])

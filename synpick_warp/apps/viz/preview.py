@@ -1,0 +1,291 @@
+"""Contact sheet of a BOP data set, from its files: colour, depth colour map, instance masks, bounding boxes and layers of sampled views."""
+
+from __future__ import annotations
+
+import contextlib
+import itertools
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import cv2
+import numpy as np
+
+from synpick_warp.apps.viz.depth_colors import DepthScale, color_depth, describe_depth, pooled_scale, tote_scale
+from synpick_warp.apps.viz.drawing import GOLDEN, Image, check_picture_name, instance_color, put_text, write_picture
+from synpick_warp.apps.viz.preview_layers import layer_pictures
+from synpick_warp.apps.viz.preview_legend import PAPER, Box, draw_labels, draw_legend, label_texts, legend_width
+from synpick_warp.configs.load import load_config
+from synpick_warp.configs.schema import Config
+from synpick_warp.configs.splits import DataLayout
+from synpick_warp.dataset.bop.layout import NoLayoutError
+from synpick_warp.dataset.bop.scenes import FoundScenes
+from synpick_warp.dataset.commit.manifest import CONFIG_FILE, episode_entry, read_entry
+from synpick_warp.dataset.object_names import object_names
+from synpick_warp.dataset.view_files import SceneFiles, check_planes
+from synpick_warp.errors import DatasetError, OutputError, SynpickError
+
+_PANEL_WIDTH = 480
+"""Width of one image on the sheet [px]."""
+_MAX_PANEL_HEIGHT = 1920
+"""Maximum height of one image on the sheet [px]: tall images become narrower."""
+MAX_VIEWS = 200
+"""Maximum number of views on a sheet: some 76,000 rows of pixels."""
+_CAPTION = 20
+"""Height of the caption above an image [px]."""
+_GAP = 4
+"""Gap between images [px]."""
+_MIN_LEGEND = 120
+"""Minimum height of a row without its caption [px], for the legend of low images."""
+
+
+@dataclass(frozen=True, order=True)
+class Scene:
+    """A scene as one camera sees it: a folder, with several sensors the files of one of them, or members of shards."""
+
+    folder: Path
+    """Of members: SPLIT/SCENE, which does not exist."""
+    sensor: str = ""
+    """Suffix of the sensor's folders and files, such as "_cam1"; empty: classic layout."""
+    files: Callable[[], SceneFiles] = field(compare=False, repr=False, kw_only=True)
+    """Opens it; what others leave out may be missing."""
+
+    def images(self, name: str) -> Path:
+        """Folder of one kind of images, such as "rgb"."""
+        return self.folder / f"{name}{self.sensor}"
+
+
+@dataclass(frozen=True)
+class _View:
+    scene: Scene
+    frame: int
+    camera: dict[str, Any]
+    """Record of scene_camera."""
+    truth: list[tuple[dict[str, Any], dict[str, Any]]]
+    """Records of scene_gt and scene_gt_info, per instance."""
+    files: SceneFiles
+
+
+def write_contact_sheet(dataset: Path, out: Path, views: int) -> Path:
+    """Draw sampled views of a data set, one per row, and write the image file.
+
+    Args:
+        dataset: Folder of the data set; all its splits are sampled.
+        out: PNG or JPEG file to write; its folder is created.
+        views: Maximum number of views, spread over cameras, scenes and time; the sheet has no more than the data set.
+
+    Raises:
+        DatasetError: The folder is not a data set, or a file is missing or damaged.
+        OutputError: The image cannot be written, or has more than MAX_VIEWS views.
+    """
+    check_picture_name(out)
+    if views < 1:
+        raise OutputError(f"{views} views requested; a contact sheet has at least 1")
+    shown = list(_read_views(sample(find_scenes(dataset), views)))
+    baked = read_baked(dataset, {record["obj_id"] for view in shown for record, _ in view.truth})
+    scale = tote_scale(baked.config, [view.camera for view in shown]) if baked.config else None
+    scale = scale or pooled_scale(depth for view in shown if (depth := _read_depth(view)) is not None)
+    most = max(len(view.truth) for view in shown)
+    rows = [_row(view, scale, baked, most) for view in shown]
+    width = max(row.shape[1] for row in rows)
+    sheet = np.concatenate([np.pad(row, ((0, 0), (0, width - row.shape[1]), (0, 0))) for row in rows])
+    return write_picture(out, sheet)
+
+
+class Baked(NamedTuple):
+    """What is known of the bake behind a data set; nothing of data sets of other programs."""
+
+    dataset: Path
+    config: Config | None
+    names: dict[int, str]
+    """obj_id -> name of an object."""
+
+    def facts(self, scene: Scene, frame: int, camera: Mapping[str, Any]) -> list[str]:
+        """What is to be said of a view: scene, episode, mode, time, light."""
+        lines = [f"{scene.folder.parent.name}/{scene.folder.name}{scene.sensor.replace('_', ' ', 1)}, image {frame}"]
+        if self.config is not None:
+            episode, physics = DataLayout.of(self.config).scene_episode(int(scene.folder.name)), self.config.physics
+            parts = [f"episode {episode}", f"{frame * physics.step * physics.steps_per_tick:.2f} s"]
+            with contextlib.suppress(SynpickError):
+                entry = read_entry(self.dataset, episode_entry(episode))
+                parts += [f"mode {entry['row']['mode']}"] if entry is not None else []
+            lines.append(", ".join(parts))
+        light = camera.get("light")
+        if isinstance(light, dict) and isinstance(light.get("map"), str):
+            lines.append(f"light {light['map']}")
+        return lines
+
+
+def read_baked(dataset: Path, object_ids: set[int]) -> Baked:
+    """Read settings and names of a data set, as far as it has them.
+
+    Raises:
+        ConfigError: Its settings are damaged.
+        DatasetError: Its models_info.json is.
+    """
+    path = dataset / CONFIG_FILE
+    config = load_config(str(path), {}) if path.exists() else None
+    named = (dataset / "models" / "models_info.json").exists()
+    return Baked(dataset, config, object_names(dataset, config or load_config(), object_ids) if named else {})
+
+
+def find_scenes(dataset: Path) -> list[Scene]:
+    """Find the scenes of a data set, of each sensor, sorted; not those in hidden folders, where a running bake has unfinished ones.
+
+    Raises:
+        DatasetError: There is none.
+    """
+    try:
+        found = FoundScenes(dataset)
+    except NoLayoutError:
+        if not dataset.is_dir():
+            raise
+        example = "a BOP data set has folders such as train_pbr/000000 with a scene_camera.json"
+        raise DatasetError(f"{dataset} has no complete scene; {example}") from None
+    return sorted(
+        Scene(dataset / ref.split / (ref.name or f"{ref.scene:06d}"), ref.sensor, files=partial(found.open, ref)) for ref in found.refs()
+    )
+
+
+def sample(scenes: list[Scene], views: int) -> list[tuple[Scene, int]]:
+    """Sample views: (scene, frame), sorted and distinct; all views if no more are there than asked for.
+
+    Cameras in turn; a camera's scenes evenly; within a scene at frames of a low-discrepancy sequence.
+
+    Raises:
+        DatasetError: A file is damaged, or no scene has a view.
+        OutputError: More views are there and asked for than a sheet shows.
+    """
+    by_camera: dict[tuple[float, ...], list[tuple[Scene, list[int]]]] = {}
+    for scene in scenes:
+        files = scene.files()
+        frames = files.frames()
+        if frames:
+            first = files.camera(frames[0])
+            group = by_camera.setdefault((*first.get("cam_R_w2c", ()), *first.get("cam_t_w2c", ())), [])
+            group.append((scene, list(frames)))
+    groups = list(by_camera.values())
+    if not groups:
+        raise DatasetError(f"no scene in {scenes[0].folder.parent} has a view; bake the data set again")
+    present = sum(len(frames) for group in groups for _, frames in group)
+    if min(views, present) > MAX_VIEWS:
+        raise OutputError(f"{views} views requested, and the data set has {present}; a contact sheet has at most {MAX_VIEWS}")
+    if views >= present:
+        return sorted((scene, frame) for group in groups for scene, frames in group for frame in frames)
+    samples = set()
+    for number in range(views):
+        group = groups[number % len(groups)]
+        in_group = -(-(views - number % len(groups)) // len(groups))
+        scene, frames = group[number // len(groups) * len(group) // in_group]
+        samples.add((scene, frames[int((0.5 + number * GOLDEN) % 1.0 * len(frames))]))
+    return sorted(samples)
+
+
+def _read_views(samples: list[tuple[Scene, int]]) -> Iterator[_View]:
+    """Read the annotations of views, which are sorted by scene: those of each scene once."""
+    for scene, group in itertools.groupby(samples, key=lambda one: one[0]):
+        files = scene.files()
+        for _, frame in group:
+            camera, truth, infos = files.records(frame)
+            yield _View(scene, frame, camera, list(zip(truth, infos, strict=True)), files)
+
+
+def _read_depth(view: _View) -> np.ndarray | None:
+    """Depth image of a view [mm]; None: it has none."""
+    if not view.files.has("depth") or "depth_scale" not in view.camera:
+        return None
+    counts = check_planes(view.files.image("depth", view.frame), None, f"{view.scene.images('depth')}/{view.frame:06d}")
+    return counts * float(view.camera["depth_scale"])
+
+
+def _row(view: _View, depth_scale: DepthScale | None, baked: Baked, most: int) -> Image:
+    """Draw all panels of a view side by side; `most` is the largest number of instances of all views."""
+    folder, sensor = view.scene.folder, view.scene.sensor
+    depth = _read_depth(view)
+    colored = None if depth is None else color_depth(depth, depth_scale)
+    color = view.files.image("rgb", view.frame) if view.files.has("rgb") or colored is None else colored
+    size = color.shape[1::-1]
+    colored = _placeholder(color, "no depth in this data set") if colored is None else colored
+    facts = baked.facts(view.scene, view.frame, view.camera)
+    panels: list[tuple[str, Callable[[float], Image]]] = [
+        (facts[0], lambda scale: _fit(color, scale)),
+        (f"{describe_depth(depth_scale)}; one scale", lambda scale: _fit(colored, scale, smooth=False)),
+        (_instances_caption(view), lambda scale: _fit(_color_instances(view, color), scale, smooth=False)),
+        ("boxes: amodal thin, visible thick", lambda scale: _draw_boxes(view, _fit(color, scale), scale)),
+        (
+            "object: label, visible fraction, name",
+            lambda scale: _draw_legend(view, facts[1:], baked, max(_MIN_LEGEND, round(size[1] * scale)), most),
+        ),
+    ]
+    count = float(view.camera.get("depth_scale", 1.0))
+    counts = depth_scale and DepthScale(*(each / count for each in depth_scale))
+    layers = layer_pictures(folder, view.frame, size, sensor, counts)
+    panels += [(caption, partial(_fit, picture, smooth=False)) for caption, picture in layers]
+    scale = min(_PANEL_WIDTH / size[0], _MAX_PANEL_HEIGHT / size[1])
+    drawn = [(caption, draw(scale)) for caption, draw in panels]
+    height = max(image.shape[0] for _, image in drawn)
+    return np.concatenate([_captioned(image, caption, height) for caption, image in drawn], axis=1)
+
+
+def _draw_legend(view: _View, facts: Sequence[str], baked: Baked, height: int, most: int) -> Image:
+    return draw_legend((legend_width(height, most), height), facts, view.truth, baked.names)
+
+
+def _fit(image: Image, scale: float, smooth: bool = True) -> Image:
+    """Scale an image to the panel's width; nearest neighbour for ids, masks and colour maps."""
+    size = (max(1, round(image.shape[1] * scale)), max(1, round(image.shape[0] * scale)))
+    fitted = cv2.resize(image, size, interpolation=cv2.INTER_AREA if smooth and scale < 1 else cv2.INTER_NEAREST)
+    return np.pad(fitted, ((0, 0), (0, _PANEL_WIDTH - size[0]), (0, 0)))
+
+
+def _captioned(image: Image, caption: str, height: int) -> Image:
+    """Add a caption above an image, gaps around it, and space below it up to a height [px]."""
+    head = np.zeros((_CAPTION, image.shape[1], 3), np.uint8)
+    put_text(head, caption, (4, 14), 0.42, PAPER)
+    return np.pad(np.concatenate((head, image)), ((0, height - image.shape[0] + _GAP), (0, _GAP), (0, 0)))
+
+
+def _instances_caption(view: _View) -> str:
+    seen = sum(info["px_count_visib"] > 0 for _, info in view.truth)
+    return f"instances: {len(view.truth)}, of which {seen} seen"
+
+
+def _color_instances(view: _View, color: Image) -> Image:
+    """Visible masks in their instances' colours over the darkened grey image."""
+    grey = cv2.cvtColor(color, cv2.COLOR_BGR2GRAY) // 3
+    drawn = np.repeat(grey[..., None], 3, axis=2)
+    if not view.files.has("mask_visib"):
+        return _placeholder(color, "no masks in this data set")
+    for index, (record, _) in enumerate(view.truth):
+        drawn[view.files.mask("mask_visib", view.frame, index)] = instance_color(record.get("instance_id", index))
+    return drawn
+
+
+def _placeholder(color: Image, text: str) -> Image:
+    """The darkened grey image with a text, in the place of a picture."""
+    drawn = np.repeat(cv2.cvtColor(color, cv2.COLOR_BGR2GRAY)[..., None] // 3, 3, axis=2)
+    put_text(drawn, text, (8, 24), 0.5, (230, 230, 230))
+    return drawn
+
+
+def _draw_boxes(view: _View, image: Image, scale: float) -> Image:
+    """Draw amodal and visible bounding boxes with labels, in place."""
+    texts, boxes, labels, colors = label_texts(view.truth), [], [], []
+    for index, (record, info) in enumerate(view.truth):
+        if info["px_count_visib"] == 0:
+            continue
+        color = instance_color(record.get("instance_id", index))
+        for name, thickness in (("bbox_obj", 1), ("bbox_visib", 2)):
+            x, y, width, height = info[name]
+            if width < 0:
+                continue
+            # BOP's boxes end with their last pixel; OpenCV takes corner coordinates, hence + 1.
+            first, second = ((round(scale * u), round(scale * v)) for u, v in ((x, y), (x + width + 1, y + height + 1)))
+            cv2.rectangle(image, first, second, color, thickness)
+        boxes.append(Box(*(scale * value for value in info["bbox_visib"])))
+        labels.append(texts[index])
+        colors.append(color)
+    draw_labels(image, boxes, labels, colors)
+    return image

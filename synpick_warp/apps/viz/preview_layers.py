@@ -1,0 +1,117 @@
+"""False-colour images of layers (AOVs): normals, coordinates, classes, optical flow, scene flow, sensor depth."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from synpick_warp.apps.viz.depth_colors import DepthScale, color_depth
+from synpick_warp.apps.viz.drawing import GOLDEN, Image
+from synpick_warp.views.layer_codec import read_layer
+
+_MOTION_RANGE = 99.0
+"""Percentile of an image's motions that maps to full colour."""
+_GREY = 64
+"""Grey level of unknown pixels, which differ from static ones."""
+
+
+def color_layer(name: str, values: np.ndarray) -> Image:
+    """One layer as colours, from its values as `synpick_warp.views.layer_codec.read_layer` returns them."""
+    return draw_layer(name, values)[1]
+
+
+def draw_layer(name: str, values: np.ndarray, depth_scale: DepthScale | None = None) -> tuple[str, Image]:
+    """Caption and colours of one layer, from its values as `synpick_warp.views.layer_codec.read_layer` returns them.
+
+    `depth_scale` is that of depth images beside it, in the unit of the values; None: the image's own.
+    """
+    return _draw_depth_sensor(values, depth_scale) if name == "depth_sensor" else _DRAW[name](values)
+
+
+def layer_pictures(
+    scene: Path, frame: int, size: tuple[int, int], sensor: str = "", depth_scale: DepthScale | None = None
+) -> list[tuple[str, Image]]:
+    """Draw each layer of a scene that can be drawn: caption and image, whose width and height must be `size` [px].
+
+    `sensor` is the suffix of the folders of one sensor, such as "_cam1"; empty: classic layout.
+
+    Raises:
+        DatasetError: The scene has a layer, but not for this frame, or not of this size.
+    """
+    present = [name for name in (*_DRAW, "depth_sensor") if (scene / f"{name}{sensor}").is_dir()]
+    return [draw_layer(name, read_layer(scene, name, frame, size, sensor), depth_scale) for name in present]
+
+
+def _draw_normals(values: np.ndarray) -> tuple[str, Image]:
+    """Normal map in OpenGL's convention: red right, green up, blue towards the camera."""
+    colors = (values * np.array([1.0, -1.0, -1.0], np.float32) + 1.0) / 2.0
+    colors[~values.any(axis=-1)] = 0.0
+    return "normals: red right, green up, blue to the camera", _bytes(colors)
+
+
+def _draw_albedo(values: np.ndarray) -> tuple[str, Image]:
+    return "albedo", np.ascontiguousarray(values[..., ::-1])
+
+
+def _draw_nocs(values: np.ndarray) -> tuple[str, Image]:
+    return "nocs: red x, green y, blue z of the object", _bytes(values)
+
+
+def _draw_classes(values: np.ndarray) -> tuple[str, Image]:
+    present = np.unique(values[values > 0])
+    hue = (values * GOLDEN) % 1.0
+    return f"classes: {len(present)} present", _from_hsv(hue, np.where(values > 0, 1.0, 0.0))
+
+
+def _draw_flow(values: np.ndarray) -> tuple[str, Image]:
+    size = np.hypot(values[..., 0], values[..., 1])
+    full = _full_scale(size)
+    colors = _from_hsv(np.arctan2(values[..., 1], values[..., 0]) / (2 * np.pi) % 1.0, size / full)
+    return f"flow to the image before: up to {full:.1f} px; grey: unknown", _with_unknown(colors, size)
+
+
+def _draw_scene_flow(values: np.ndarray) -> tuple[str, Image]:
+    size = np.linalg.norm(values, axis=-1)
+    full = _full_scale(size)
+    colors = _bytes((values / full + 1.0) / 2.0)
+    return f"scene flow: x, y, z as red, green, blue, up to {1e3 * full:.1f} mm", _with_unknown(colors, size)
+
+
+def _draw_depth_sensor(values: np.ndarray, scale: DepthScale | None) -> tuple[str, Image]:
+    """Depth as a TURBO colour map; holes are black."""
+    return f"depth sensor: {100.0 * (values == 0).mean():.1f} % holes, black", color_depth(values, scale)
+
+
+def _full_scale(size: np.ndarray) -> float:
+    """Motion that maps to full colour; 1 if nothing moves."""
+    known = size[np.isfinite(size) & (size > 0.0)]
+    return float(np.percentile(known, _MOTION_RANGE)) if known.size else 1.0
+
+
+def _with_unknown(colors: Image, size: np.ndarray) -> Image:
+    """Replace pixels of unknown motion (NaN) by grey."""
+    return np.where(np.isfinite(size)[..., None], colors, np.uint8(_GREY))
+
+
+def _bytes(colors: np.ndarray) -> Image:
+    """Convert red, green, blue from 0 to 1 to bytes, blue first."""
+    return np.rint(255.0 * np.clip(np.nan_to_num(colors[..., ::-1]), 0.0, 1.0)).astype(np.uint8)
+
+
+def _from_hsv(hue: np.ndarray, value: np.ndarray) -> Image:
+    """Saturated colours of a hue and a value from 0 to 1."""
+    planes = (360.0 * np.nan_to_num(hue), np.ones_like(value), np.clip(np.nan_to_num(value), 0.0, 1.0))
+    return _bytes(cv2.cvtColor(np.stack(planes, axis=-1).astype(np.float32), cv2.COLOR_HSV2RGB))
+
+
+_DRAW: dict[str, Callable[[np.ndarray], tuple[str, Image]]] = {
+    "normals": _draw_normals,
+    "albedo": _draw_albedo,
+    "nocs": _draw_nocs,
+    "classes": _draw_classes,
+    "flow": _draw_flow,
+    "scene_flow": _draw_scene_flow,
+}
