@@ -12,7 +12,7 @@ def start() -> int:
     """Run the command line; an interrupt while its modules are imported is one line, too."""
     try:
         with KeptInterrupt():
-            from synpick_warp.cli.commands import main
+            from synpick_warp.cli.main import main
     except KeyboardInterrupt:
         print("synpick-warp: interrupted", file=sys.stderr)
         return 130  # 128 + SIGINT, the shell convention

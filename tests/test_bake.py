@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 import pytest
 
-from synpick_warp.cli import commands
+from synpick_warp.cli import main as commands
 from synpick_warp.codes import Ending, Outcome
 from synpick_warp.configs.load import load_config
 from synpick_warp.errors import OutputError

@@ -18,7 +18,7 @@ from typing import Any
 import msgspec
 from rich.console import Console
 
-from synpick_warp.cli.doctor import describe_machine
+from synpick_warp.cli.commands.doctor import describe_machine
 from tools.options import Row, print_machine, print_rows
 
 ROOT = Path(__file__).resolve().parents[1]

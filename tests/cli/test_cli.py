@@ -16,8 +16,8 @@ import trimesh
 import warp as wp
 
 from synpick_warp import __version__
-from synpick_warp.cli import doctor
-from synpick_warp.cli.commands import main
+from synpick_warp.cli.commands import doctor
+from synpick_warp.cli.main import main
 from synpick_warp.codes import Ending
 from synpick_warp.configs.load import load_config
 from synpick_warp.errors import DatasetError, DeviceError, OutputError, SynpickError

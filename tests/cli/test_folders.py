@@ -11,8 +11,8 @@ from pathlib import Path
 
 import pytest
 
-from synpick_warp.cli.commands import main
 from synpick_warp.cli.folders import beside, choose_output
+from synpick_warp.cli.main import main
 from synpick_warp.configs.load import load_config
 from synpick_warp.configs.schema import Config
 from synpick_warp.configs.write import config_to_toml

@@ -11,8 +11,8 @@ import pytest
 
 from synpick_warp.apps.evaluation.results import write_results
 from synpick_warp.apps.evaluation.truth import read_truth
-from synpick_warp.cli import commands
-from synpick_warp.cli.commands import main
+from synpick_warp.cli import main as commands
+from synpick_warp.cli.main import main
 from synpick_warp.dataset.reading import open_data_set
 from tests.harness.scripted_bake import bake, settings
 

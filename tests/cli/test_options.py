@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from synpick_warp.cli.commands import main
+from synpick_warp.cli.main import main
 from synpick_warp.cli.options import MAX_LINE, one_line, parse_resolution, parse_shard
 from synpick_warp.configs.load import load_config
 from synpick_warp.configs.splits import DataLayout
@@ -77,7 +77,7 @@ WORDS = st.sampled_from(["bake", "config", "verify", "merge", "preview", "explai
 @given(arguments=st.lists(WORDS | st.text(st.characters(exclude_characters="\0"), max_size=6), max_size=6))
 def test_any_command_line_ends_with_an_exit_code(tmp_path_factory, arguments):
     with contextlib.chdir(tmp_path_factory.mktemp("empty")), pytest.MonkeyPatch.context() as patch:
-        patch.setattr("synpick_warp.cli.commands._bake", lambda *_: 0)
+        patch.setattr("synpick_warp.cli.main._bake", lambda *_: 0)
         assert main(arguments) in (0, 1, 2)
 
 

@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from rich.console import Console
 
-from synpick_warp.cli.commands import main
+from synpick_warp.cli.main import main
 from synpick_warp.cli.streams import MAX_COLUMNS, MIN_COLUMNS, SafeStreams, clamp_columns
 from tests.harness.fuzz import fuzz_examples
 
@@ -98,7 +98,7 @@ def test_rich_prints_into_an_ascii_stream(tmp_path, monkeypatch):
 
 BAKE_ON_FULL_DEVICE = """
 import sys, synpick_warp.factory.pipeline as pipeline
-from synpick_warp.cli.commands import main
+from synpick_warp.cli.main import main
 def build(*_, **__): raise AssertionError("the bake goes on")
 # No kernels are compiled or loaded, whatever the load of the machine: the first line comes before, and ends the bake.
 pipeline.build_factory = build

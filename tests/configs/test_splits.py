@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from synpick_warp.cli.commands import main
+from synpick_warp.cli.main import main
 from synpick_warp.codes import Stream
 from synpick_warp.configs.load import load_config
 from synpick_warp.configs.modes import may_pick

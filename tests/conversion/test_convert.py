@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from synpick_warp.apps.conversion.run import check_formats, convert
-from synpick_warp.cli.commands import EXIT_MISTAKE, main
+from synpick_warp.cli.main import EXIT_MISTAKE, main
 from synpick_warp.configs.schema import Config, Split
 from synpick_warp.dataset.commit.verify import verify
 from synpick_warp.errors import ConfigError, DatasetError

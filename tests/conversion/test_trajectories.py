@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from synpick_warp.cli.commands import EXIT_MISTAKE, main
+from synpick_warp.cli.main import EXIT_MISTAKE, main
 from synpick_warp.exporters.trajectory.arrays import OBJECTS, STORE
 from tests.conversion.test_convert import assets, settings  # noqa: F401  (a fixture)
 from tests.harness import scripted_bake

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 import synpick_warp
-from synpick_warp.cli.commands import main
+from synpick_warp.cli.main import main
 from synpick_warp.dataset.bop.measured import measure_info
 from synpick_warp.errors import DatasetError
 from tests.validation.conftest import good  # noqa: F401

@@ -16,7 +16,7 @@ from pathlib import Path
 import pytest
 
 import synpick_warp
-from synpick_warp.cli.commands import EXIT_MISTAKE, main
+from synpick_warp.cli.main import EXIT_MISTAKE, main
 from synpick_warp.dataset.commit import writing
 from synpick_warp.dataset.commit.manifest import CONSTANTS, INDICES, committed_episodes, episode_entry, read_checksums
 from synpick_warp.dataset.commit.merge import merge

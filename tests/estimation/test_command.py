@@ -15,8 +15,8 @@ import numpy as np
 import pytest
 
 from synpick_warp.apps.estimation import decoder_pool, factories
-from synpick_warp.cli.commands import main
-from synpick_warp.cli.estimate import parse_indices
+from synpick_warp.cli.commands.estimate import parse_indices
+from synpick_warp.cli.main import main
 from synpick_warp.errors import ConfigError
 from synpick_warp.exporters.bop.exporter import BopExporter
 from synpick_warp.exporters.bop.shards.exporter import ShardsExporter
@@ -246,7 +246,7 @@ def test_lists_that_do_not_fit_the_data_set_are_refused_by_eval(folder, tmp_path
 
 def test_a_bake_does_not_import_the_estimation():
     program = (
-        "import sys, synpick_warp.cli.commands, synpick_warp.factory.pipeline;"
+        "import sys, synpick_warp.cli.main, synpick_warp.factory.pipeline;"
         "print([name for name in sys.modules if 'synpick_warp.estim' in name or 'stages.pose' in name])"
     )
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=120, check=True)

@@ -10,7 +10,7 @@ import pytest
 import synpick_warp
 from synpick_warp.apps.evaluation.results import write_results
 from synpick_warp.apps.evaluation.truth import read_truth
-from synpick_warp.cli.commands import main
+from synpick_warp.cli.main import main
 from synpick_warp.factory import assembly
 from synpick_warp.factory.pipeline import run_bake
 from synpick_warp.system.progress import SilentProgress

@@ -15,8 +15,8 @@ import pytest
 import synpick_warp
 from synpick_warp.apps.evaluation.results import write_results
 from synpick_warp.apps.evaluation.truth import read_truth
-from synpick_warp.cli.commands import main
-from synpick_warp.cli.evaluate import method_names, toolkit_command
+from synpick_warp.cli.commands.evaluate import method_names, toolkit_command
+from synpick_warp.cli.main import main
 from synpick_warp.system.codecs.charts import SCALE, WIDTH
 from tests.worlds.evaluation_set import moved, write_evaluation_set
 
@@ -175,7 +175,7 @@ def test_visibility_that_no_instance_has_is_refused(folder, files, tmp_path, cap
 
 
 def test_a_bake_does_not_import_the_evaluation():
-    program = "import sys, synpick_warp.cli.commands, synpick_warp.factory.pipeline; print([n for n in sys.modules if n.startswith('synpick_warp.eval')])"
+    program = "import sys, synpick_warp.cli.main, synpick_warp.factory.pipeline; print([n for n in sys.modules if n.startswith('synpick_warp.eval')])"
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=120, check=True)
     assert done.stdout.strip().splitlines()[-1] == "[]"
 

@@ -103,7 +103,7 @@ def arguments(request: dict) -> list[str]:
 
 
 def _serve() -> None:
-    from synpick_warp.cli import commands
+    from synpick_warp.cli import main as commands
     from synpick_warp.factory import assembly, pipeline
 
     assembly.load_catalog = pipeline.load_catalog = lambda config, report: catalog()

@@ -18,7 +18,7 @@ import synpick_warp
 from synpick_warp.apps.report import album, compose, write_report
 from synpick_warp.apps.report import page as page_module
 from synpick_warp.apps.report.markup import content_hash
-from synpick_warp.cli.commands import main
+from synpick_warp.cli.main import main
 from synpick_warp.errors import OutputError
 from tests.harness import scripted_bake
 from tests.report.conftest import EVIL

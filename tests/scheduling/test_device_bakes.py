@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from synpick_warp.cli.commands import EXIT_MISTAKE, main
+from synpick_warp.cli.main import EXIT_MISTAKE, main
 from synpick_warp.dataset.commit.manifest import committed_episodes
 from synpick_warp.dataset.commit.verify import verify
 from synpick_warp.exporters.writing.files import PARTIAL

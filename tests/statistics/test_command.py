@@ -14,7 +14,7 @@ from rich.console import Console
 import synpick_warp
 from synpick_warp.apps.statistics import Statistics, compute_statistics
 from synpick_warp.apps.statistics.tables import make_tables
-from synpick_warp.cli.commands import main
+from synpick_warp.cli.main import main
 from synpick_warp.configs.schema import Split
 from synpick_warp.system.codecs.tables import Column, Table, to_csv
 from tests.harness.scripted_bake import bake, settings

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from synpick_warp.cli.commands import main
+from synpick_warp.cli.main import main
 from synpick_warp.scenes.collision.shapes import _save
 from synpick_warp.scenes.types import ConvexPiece
 from synpick_warp.system.folders import make_folder

@@ -8,7 +8,7 @@ import pytest
 
 from synpick_warp.apps.validation import run as running
 from synpick_warp.apps.validation.registry import load_rules
-from synpick_warp.cli.commands import main
+from synpick_warp.cli.main import main
 from tests.validation.planting import SCENE, edit_entry
 from tools.docs import VALIDATION, validation_reference
 

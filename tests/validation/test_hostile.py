@@ -11,7 +11,7 @@ from itertools import islice
 
 import pytest
 
-from synpick_warp.cli.commands import main
+from synpick_warp.cli.main import main
 from synpick_warp.system.inputs.json import MAX_JSON
 from tests.harness.hostile import hostile_contents
 from tests.harness.scripted_bake import make_victim, snapshot

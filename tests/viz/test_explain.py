@@ -16,7 +16,7 @@ from synpick_warp.apps.viz.drawing import FONT, instance_color
 from synpick_warp.apps.viz.explain import object_names, to_color_image, write_explanation
 from synpick_warp.apps.viz.explain_panels import fitted, load_chart, wrapped
 from synpick_warp.apps.viz.explain_record import choice_words, labels, seal_words
-from synpick_warp.cli.commands import main
+from synpick_warp.cli.main import main
 from synpick_warp.configs.schema import Config, Perception, Target
 from synpick_warp.configs.write import config_to_toml
 from synpick_warp.errors import DatasetError, OutputError

@@ -16,7 +16,7 @@ from synpick_warp.apps.viz.depth_colors import color_depth, pooled_scale, tote_s
 from synpick_warp.apps.viz.drawing import instance_color, short_labels
 from synpick_warp.apps.viz.preview import MAX_VIEWS, find_scenes, read_baked, sample, write_contact_sheet
 from synpick_warp.apps.viz.preview_legend import COLUMN, LINE, Box, draw_legend, legend_width, place_labels
-from synpick_warp.cli.commands import main
+from synpick_warp.cli.main import main
 from synpick_warp.configs.write import config_to_toml
 from synpick_warp.errors import DatasetError, OutputError
 from synpick_warp.exporters.bop.exporter import BopExporter

@@ -24,8 +24,8 @@ import numpy as np
 import warp as wp
 from rich.console import Console
 
-from synpick_warp.cli.commands import parse_resolution
-from synpick_warp.cli.doctor import GIB, describe_machine
+from synpick_warp.cli.commands.doctor import GIB, describe_machine
+from synpick_warp.cli.main import parse_resolution
 from synpick_warp.codes import Status
 from synpick_warp.configs.schema import Cameras, Config
 from synpick_warp.errors import SynpickError

@@ -15,7 +15,7 @@ from pathlib import Path
 
 import warp as wp
 
-from synpick_warp.cli.doctor import GIB
+from synpick_warp.cli.commands.doctor import GIB
 from synpick_warp.factory.episodes import BakeSummary
 from synpick_warp.system.progress import SilentProgress
 from tools.bench.cleaner import Cleaner, Tally

@@ -19,7 +19,7 @@ import synpick_warp
 from synpick_warp.apps.estimation import factories
 from synpick_warp.apps.evaluation.results import write_results
 from synpick_warp.apps.evaluation.truth import read_truth
-from synpick_warp.cli.commands import main
+from synpick_warp.cli.main import main
 from synpick_warp.configs.load import load_config
 from synpick_warp.dataset.reading import DataSet
 from synpick_warp.errors import SynpickError

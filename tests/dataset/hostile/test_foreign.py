@@ -22,7 +22,7 @@ import numpy as np
 import pytest
 
 from synpick_warp.apps.conversion import run as conversion
-from synpick_warp.cli.commands import main
+from synpick_warp.cli.main import main
 from synpick_warp.configs.splits import DataLayout
 from synpick_warp.dataset.commit.file_names import check_file_names, describe_strays
 from synpick_warp.dataset.commit.manifest import CONSTANTS, episode_entry, read_checksums

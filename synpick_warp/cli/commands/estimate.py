@@ -80,7 +80,7 @@ def estimate(
 
     Unless all images of the data set are estimated, their list is written beside it as OUT-targets.json, for `eval --targets`.
     """
-    from synpick_warp.cli.evaluate import toolkit_ending
+    from synpick_warp.cli.commands.evaluate import toolkit_ending
     from synpick_warp.dataset.reading import open_data_set
 
     selection = make_selection(method, every, targets, modes, cameras, episodes)

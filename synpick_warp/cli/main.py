@@ -12,9 +12,14 @@ import cyclopts
 from cyclopts import App, Parameter
 
 from synpick_warp import __version__
-from synpick_warp.cli.convert import convert
-from synpick_warp.cli.estimate import estimate
-from synpick_warp.cli.evaluate import evaluate
+from synpick_warp.cli.commands.convert import convert
+from synpick_warp.cli.commands.estimate import estimate
+from synpick_warp.cli.commands.evaluate import evaluate
+from synpick_warp.cli.commands.pictures import explain, preview
+from synpick_warp.cli.commands.report import write_page
+from synpick_warp.cli.commands.statistics import show_statistics
+from synpick_warp.cli.commands.validate import validate
+from synpick_warp.cli.commands.verify import verify
 from synpick_warp.cli.folders import DEFAULT_NAME, check_output_file, choose_output
 from synpick_warp.cli.limits import describe_limit
 from synpick_warp.cli.options import (
@@ -27,12 +32,7 @@ from synpick_warp.cli.options import (
     parse_shard,
     parse_splits,
 )
-from synpick_warp.cli.pictures import explain, preview
-from synpick_warp.cli.report import write_page
-from synpick_warp.cli.statistics import show_statistics
 from synpick_warp.cli.streams import SafeStreams, StreamError, describe_fault
-from synpick_warp.cli.validate import validate
-from synpick_warp.cli.verify import verify
 from synpick_warp.configs.check import describe_allowed
 from synpick_warp.configs.load import COMMAND_LINE, DEFAULT_PRESET, load_config, parse_assignment, preset_names, sections, settings_of
 from synpick_warp.configs.schema import Config
@@ -202,8 +202,8 @@ def doctor(
 ) -> int:
     """Show device, versions, kernel cache, and the memory of a bake's device arrays."""
     resolved = _resolve(config, {"bake.worlds": worlds, "bake.device": device}, resolution, set_)
+    from synpick_warp.cli.commands.doctor import examine
     from synpick_warp.cli.display import make_console
-    from synpick_warp.cli.doctor import examine
 
     examine(resolved, make_console())
     return 0
