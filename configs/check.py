@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
-import difflib
-import json
 import math
 import operator
 import typing
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from typing import Any
 
-from synpick_warp.errors import ConfigError
+from synpick_warp.errors import ConfigError, format_value, suggest
 
 _NAMES = {
     float: ("a finite number", "numbers"),
@@ -20,8 +18,6 @@ _NAMES = {
     str: ("a string", "strings"),
 }
 _BOUNDS = (("above", "above"), ("low", "at least"), ("high", "at most"))
-_SHOWN = 60
-"""Length to which values are truncated in messages."""
 
 
 class _MismatchError(Exception):
@@ -84,41 +80,6 @@ def describe_type(annotation: Any, *, plural: bool = False) -> str:
     if plural:
         return f"lists of {len(parts)} {describe_type(parts[0], plural=True)}"
     return f"{len(parts)} {describe_type(parts[0], plural=True)} in a list"
-
-
-def format_value(value: object) -> str:
-    """Format a value as TOML writes it, truncated, on one line."""
-    try:
-        text = json.dumps(value, ensure_ascii=False)
-    except (TypeError, ValueError, RecursionError):
-        text = _describe(value)
-    return shorten(text)
-
-
-def shorten(text: str) -> str:
-    """Truncate a text for a message, and escape what does not print."""
-    return escape(text if len(text) <= _SHOWN else f"{text[: _SHOWN - 1]}…")
-
-
-def escape(text: str) -> str:
-    """Escape what does not print, such as line breaks and terminal sequences."""
-    if text.isprintable():
-        return text
-    return "".join(letter if letter.isprintable() else letter.encode("unicode_escape").decode() for letter in text)
-
-
-def suggest(word: str, known: Sequence[str]) -> str:
-    """Suggest the most similar known word, as the end of a message; empty if none is similar."""
-    near = difflib.get_close_matches(word[:_SHOWN], known, n=1)
-    return f"; did you mean {near[0]}?" if near else ""
-
-
-def _describe(value: object) -> str:
-    """Describe a value that JSON lacks: a date, a circle, or a number with more digits than Python prints."""
-    try:
-        return str(value)
-    except (ValueError, RecursionError):
-        return "a number of thousands of digits" if isinstance(value, int) else f"a {type(value).__name__}"
 
 
 def _convert(value: object, annotation: Any) -> Any:

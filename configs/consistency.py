@@ -9,7 +9,6 @@ import re
 from collections import Counter
 from collections.abc import Iterator, Sequence
 
-from synpick_warp.configs.check import format_value
 from synpick_warp.configs.modes import bake_modes
 from synpick_warp.configs.schema import (
     FORMATS,
@@ -31,6 +30,7 @@ from synpick_warp.configs.schema import (
     Tote,
 )
 from synpick_warp.configs.splits import MAX_SHARD_SCENES, DataLayout
+from synpick_warp.errors import format_value
 
 DEPTH_COUNTS = 65535
 """Maximum value of a 16-bit depth image."""

@@ -10,11 +10,11 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from synpick_warp.configs.check import check_value, format_value, shorten, suggest
+from synpick_warp.configs.check import check_value
 from synpick_warp.configs.consistency import find_conflicts
 from synpick_warp.configs.schema import Bake, Bop, Config, ObjectRow
 from synpick_warp.configs.split_tables import SPLITS, override_table, read_tables, resolve_splits, split_settings
-from synpick_warp.errors import ConfigError
+from synpick_warp.errors import ConfigError, format_value, shorten, suggest
 from synpick_warp.system.inputs.toml import decode_toml, read_toml
 
 DEFAULT_PRESET = "synpick"

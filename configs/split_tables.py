@@ -9,10 +9,10 @@ import typing
 from collections.abc import Mapping
 from typing import Any
 
-from synpick_warp.configs.check import check_value, format_value, shorten, suggest
+from synpick_warp.configs.check import check_value
 from synpick_warp.configs.fields import INT32_MAX
 from synpick_warp.configs.schema import Split
-from synpick_warp.errors import ConfigError
+from synpick_warp.errors import ConfigError, format_value, shorten, suggest
 
 SPLITS = "splits"
 MAX_SPLITS = 64

@@ -10,9 +10,9 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
-from synpick_warp.configs.check import format_value, suggest, to_index
+from synpick_warp.configs.check import to_index
 from synpick_warp.configs.schema import MULTISENSOR, Config, Split
-from synpick_warp.errors import ConfigError
+from synpick_warp.errors import ConfigError, format_value, suggest
 
 MAX_SHARD_SCENES = 1_000_000
 """Scene ids that the names of shards (format shards) tell apart: part p of a scene is shard scene_id + p · this."""

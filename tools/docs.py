@@ -23,7 +23,7 @@ from tools.figures import figures_tables, read_runs
 
 ROOT = Path(__file__).resolve().parents[1]
 SETTINGS_REFERENCE = ROOT / "configs" / "README.md"
-VALIDATION = ROOT / "synpick_warp" / "validation" / "README.md"
+VALIDATION = ROOT / "synpick_warp" / "apps" / "validation" / "README.md"
 FIGURES = ROOT / "tools" / "README.md"
 _SETTINGS_BEGIN = "from the schema in this folder; edit the help texts there. -->\n"
 _RULES_BEGIN, _RULES_END = "from the rules' declarations. -->\n", "<!-- End. -->"

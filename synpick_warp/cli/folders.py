@@ -16,9 +16,8 @@ from pathlib import Path
 from typing import NamedTuple
 
 from synpick_warp.cli.options import one_line
-from synpick_warp.configs.check import escape
 from synpick_warp.configs.schema import Config
-from synpick_warp.errors import DatasetError, OutputError, SynpickError
+from synpick_warp.errors import DatasetError, OutputError, SynpickError, escape
 
 DEFAULT_NAME = "synpick-data"
 """Folder of a bake without --out; its neighbours are synpick-data-2, synpick-data-3, ..."""

@@ -8,8 +8,7 @@ from typing import Annotated, Any
 
 from cyclopts import Parameter, Token
 
-from synpick_warp.configs.check import escape, format_value
-from synpick_warp.errors import ConfigError
+from synpick_warp.errors import ConfigError, escape, format_value
 
 EXIT_INCOMPLETE = 1
 """Exit code if a data set is incomplete or damaged."""

@@ -1,1 +1,1 @@
-"""Data sets on disk: manifest, commit and resume, merge, verification, reading."""
+"""Data sets on disk: BOP folders, trajectories, tracks, and doors to PyTorch and webdataset; what a bake commits is in `commit`."""

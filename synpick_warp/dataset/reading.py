@@ -17,7 +17,6 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from synpick_warp.configs.check import format_value
 from synpick_warp.configs.splits import DataLayout, episode_range
 from synpick_warp.dataset.annotations import ADVICE, EpisodeEntry, EpisodeRow, Key, ModelInfo, check_content, read_checked
 from synpick_warp.dataset.commit.frame_counts import check_frames
@@ -35,7 +34,7 @@ from synpick_warp.dataset.trajectory import (
     read_cameras,
     read_objects,
 )
-from synpick_warp.errors import DatasetError
+from synpick_warp.errors import DatasetError, format_value
 from synpick_warp.exporters.formats import PartFiles, part_files
 from synpick_warp.exporters.trajectory.arrays import EPISODE_GROUPS, EPISODES, STORE
 from synpick_warp.system.inputs.json import decode_json

@@ -88,7 +88,7 @@ class Row(msgspec.Struct):
 
 
 class InstanceObservation(msgspec.Struct):
-    """Perception result of an instance, see `attempts.InstanceObservation`."""
+    """Perception result of an instance, see `factory.attempts.InstanceObservation`."""
 
     instance: Index
     object_id: Index
@@ -112,7 +112,7 @@ class InstanceObservation(msgspec.Struct):
 
 
 class Observation(msgspec.Struct):
-    """Perception result of an attempt, see `attempts.ObservationRecord`."""
+    """Perception result of an attempt, see `factory.attempts.ObservationRecord`."""
 
     resolution: tuple[Side, Side]
     instances: Annotated[list[InstanceObservation], msgspec.Meta(max_length=MAX_OBSERVED)]
@@ -127,7 +127,7 @@ class AttemptKey(msgspec.Struct):
 
 
 class Attempt(AttemptKey):
-    """Line of attempts.jsonl, see `attempts.AttemptRecord`."""
+    """Line of attempts.jsonl, see `factory.attempts.AttemptRecord`."""
 
     mode: Literal["pick", "target"]
     frame: Index

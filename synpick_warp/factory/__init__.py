@@ -1,1 +1,1 @@
-"""Assembly of the stages on a device from all settings, and ahead-of-time compilation of their kernels."""
+"""The bake: assembly and compilation of its stages, memory plan, order of episodes, device processes, pipeline from ticks to files."""

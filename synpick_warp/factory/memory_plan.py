@@ -14,11 +14,10 @@ from typing import Any
 
 import warp as wp
 
-from synpick_warp.configs.check import format_value
 from synpick_warp.configs.fields import INT32_MAX
 from synpick_warp.configs.modes import may_pick
 from synpick_warp.configs.schema import REFERENCE, Config, Perception, Physics, Trajectory
-from synpick_warp.errors import ConfigError, SynpickError
+from synpick_warp.errors import ConfigError, SynpickError, format_value
 from synpick_warp.exporters.registry import Needs
 from synpick_warp.scenes import build
 from synpick_warp.stages.arrays import memory_table

@@ -1,1 +1,1 @@
-"""Online generator: the views of a bake as batches on the device, for training without files."""
+"""Online generator: views of a bake as batches that stay on the device, for training without files."""

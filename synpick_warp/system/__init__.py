@@ -1,1 +1,1 @@
-"""The machine: devices, memory, caches, descriptors, signals."""
+"""The machine and files: hardware, processes, untrusted input, codecs; folders, descriptors, progress lines, low-discrepancy points."""

@@ -247,7 +247,7 @@ def test_lists_that_do_not_fit_the_data_set_are_refused_by_eval(folder, tmp_path
 def test_a_bake_does_not_import_the_estimation():
     program = (
         "import sys, synpick_warp.cli.main, synpick_warp.factory.pipeline;"
-        "print([name for name in sys.modules if 'synpick_warp.estim' in name or 'stages.pose' in name])"
+        "print([name for name in sys.modules if 'synpick_warp.apps.estim' in name or 'stages.pose' in name])"
     )
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=120, check=True)
     assert done.stdout.strip().splitlines()[-1] == "[]"

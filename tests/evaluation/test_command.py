@@ -175,7 +175,8 @@ def test_visibility_that_no_instance_has_is_refused(folder, files, tmp_path, cap
 
 
 def test_a_bake_does_not_import_the_evaluation():
-    program = "import sys, synpick_warp.cli.main, synpick_warp.factory.pipeline; print([n for n in sys.modules if n.startswith('synpick_warp.eval')])"
+    modules = "[name for name in sys.modules if name.startswith('synpick_warp.apps')]"
+    program = f"import sys, synpick_warp.cli.main, synpick_warp.factory.pipeline; print({modules})"
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=120, check=True)
     assert done.stdout.strip().splitlines()[-1] == "[]"
 

@@ -1,4 +1,4 @@
-"""Stand-ins for the processes of devices: they speak the protocol of `scheduling.worker`, and simulate nothing."""
+"""Stand-ins for the processes of devices: they speak the protocol of `factory.worker`, and simulate nothing."""
 
 from __future__ import annotations
 

@@ -62,7 +62,7 @@ def small_settings() -> Config:
 
 
 def bake(out: Path, config: Config, shard: tuple[int, int] = (0, 1), stop_after: int | None = None) -> BakeSummary:
-    """Write a data set, or the remaining episodes of one, as `pipeline.run_bake` does; `stop_after` episodes it is stopped."""
+    """Write a data set, or the remaining episodes of one, as `factory.pipeline.run_bake` does; `stop_after` episodes it is stopped."""
     needs = Needs.of(config)
     with OutputFolder(out, config, [index for part in DataLayout.of(config).plan((), shard) for index in part]) as output:
         summary = BakeSummary(len(output.episodes))

@@ -1,4 +1,4 @@
-"""Depth PNG data in NumPy and whole numbers, from the laws in `synpick_warp.system.codecs.depth_png` and kernels.encoding.png's docstrings."""
+"""Depth PNG data in NumPy and whole numbers, from the laws in `system.codecs.depth_png` and kernels.encoding.png's docstrings."""
 
 from __future__ import annotations
 

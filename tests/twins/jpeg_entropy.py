@@ -1,4 +1,4 @@
-"""Entropy-coded segments of baseline JPEG in whole numbers, from ITU-T T.81, annex F, and the tables of `synpick_warp.system.codecs.jpeg`."""
+"""Entropy-coded segments of baseline JPEG in whole numbers, from ITU-T T.81, annex F, and the tables of `system.codecs.jpeg`."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
 """Plots of the evaluation: the paper's trajectory plot, recall curves, error against visibility and speed, sweep curves.
 
-Each function returns a chart as `codecs.charts` renders it. Lengths are in metres, as everywhere in the evaluation; axes say what they
-show. A missed detection has the error infinity.
+Each function returns a chart as `system.codecs.charts` renders it. Lengths are in metres, as everywhere in the evaluation; axes say what
+they show. A missed detection has the error infinity.
 """
 
 from __future__ import annotations

@@ -14,9 +14,8 @@ import numpy as np
 from msgspec.structs import replace as replace_struct
 
 from synpick_warp.apps.evaluation.truth import Truth
-from synpick_warp.configs.check import format_value
 from synpick_warp.dataset.annotations import TargetEntry
-from synpick_warp.errors import ResultError
+from synpick_warp.errors import ResultError, format_value
 from synpick_warp.system.inputs.json import read_json
 
 _FORMAT = "a target list has objects with scene_id, im_id, obj_id and inst_count, as BOP's test_targets_bop19.json"

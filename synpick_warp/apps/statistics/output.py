@@ -13,8 +13,7 @@ from rich.text import Text
 
 from synpick_warp.apps.statistics.compute import OTHER_OBJECTS, Statistics
 from synpick_warp.apps.statistics.tables import PAPER, TIMELINE, make_tables
-from synpick_warp.configs.check import escape
-from synpick_warp.errors import OutputError
+from synpick_warp.errors import OutputError, escape
 from synpick_warp.exporters.writing.files import output_error
 from synpick_warp.system.codecs.tables import Table, to_csv, to_text
 from synpick_warp.system.folders import make_folder

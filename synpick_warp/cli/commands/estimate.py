@@ -12,8 +12,7 @@ from cyclopts import Parameter
 
 from synpick_warp.cli.folders import check_output_file, find_data_set, has_images
 from synpick_warp.cli.options import MAX_THREADS, WholeNumber, check_range
-from synpick_warp.configs.check import escape, format_value
-from synpick_warp.errors import ConfigError, OutputError
+from synpick_warp.errors import ConfigError, OutputError, escape, format_value
 
 if TYPE_CHECKING:
     from synpick_warp.apps.estimation.run import Options, Run

@@ -9,8 +9,7 @@ from cyclopts import Parameter
 
 from synpick_warp.cli.folders import beside, check_output_file, find_data_set, has_attempts, has_scenes
 from synpick_warp.cli.options import WholeNumber
-from synpick_warp.configs.check import escape
-from synpick_warp.errors import ConfigError
+from synpick_warp.errors import ConfigError, escape
 
 
 def preview(

@@ -10,8 +10,7 @@ from rich.console import Console
 
 from synpick_warp.cli.folders import beside, check_output_file, find_data_set
 from synpick_warp.cli.options import MAX_THREADS, PaperOption, WholeNumber, check_range
-from synpick_warp.configs.check import escape
-from synpick_warp.errors import DatasetError
+from synpick_warp.errors import DatasetError, escape
 
 MEGABYTE = 1e6
 """Bytes."""

@@ -12,8 +12,7 @@ from rich.console import Console
 
 from synpick_warp.cli.folders import check_output_file, find_data_set
 from synpick_warp.cli.options import MAX_THREADS, PaperOption, WholeNumber, check_range
-from synpick_warp.configs.check import escape
-from synpick_warp.errors import DatasetError
+from synpick_warp.errors import DatasetError, escape
 
 MAX_DEPTH_VIEWS = 100_000
 MEBIBYTE = 2**20

@@ -1,7 +1,7 @@
 """Baseline JPEG encoder on the device, with 4:2:0 chroma subsampling and restart intervals.
 
-Its files equal libjpeg's (`synpick_warp.system.codecs.jpeg.encode_jpeg`) byte for byte. Only the files are copied to the host; at quality 95 they
-have a tenth of the image's size.
+Its files equal libjpeg's (`system.codecs.jpeg.encode_jpeg`) byte for byte. Only the files are copied to the host; at quality 95 they have a
+tenth of the image's size.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Depth PNG encoder on the device: compressed data (IDAT) of 16-bit greyscale PNG files, to which writers add the other chunks.
 
-See `synpick_warp.system.codecs.depth_png` for the format. The bytes depend on the image alone, not on the device: all arithmetic is in integers.
+See `system.codecs.depth_png` for the format. The bytes depend on the image alone, not on the device: all arithmetic is in integers.
 """
 
 from __future__ import annotations

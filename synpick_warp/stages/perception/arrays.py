@@ -54,7 +54,7 @@ class SegmentationScratch:
 class Observation:
     """Visibility, grasp points, occlusion votes and clutter graph of each instance, from the last time its world was observed.
 
-    `attempts.InstanceObservation` maps it to JSON.
+    `factory.attempts.InstanceObservation` maps it to JSON.
     """
 
     visible: wp.array = device_array("world", "instance", dtype=wp.int32, unit="px")

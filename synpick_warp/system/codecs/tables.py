@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 from rich.cells import cell_len
 
-from synpick_warp.configs.check import escape
+from synpick_warp.errors import escape
 
 Value = int | float | str | None
 """Value of a cell; None: unknown."""

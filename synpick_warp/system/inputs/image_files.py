@@ -136,7 +136,7 @@ def decode_picture(data: bytes, source: object, error: type[SynpickError], size:
 
 
 def _decode_grey(data: bytes, size: tuple[int, int]) -> np.ndarray | None:
-    """Greyscale image of a PNG file by `inputs.png_crop`; None: it is left to OpenCV."""
+    """Greyscale image of a PNG file by `system.inputs.png_crop`; None: it is left to OpenCV."""
     from synpick_warp.system.inputs.png_crop import decode_grey_crop
 
     if data[24:25] not in (b"\x08", b"\x10"):

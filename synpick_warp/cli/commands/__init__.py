@@ -1,0 +1,1 @@
+"""The commands beside `bake`: options and calls of each."""

@@ -1,0 +1,1 @@
+"""Processes: workers, pools of them, isolation of native libraries, shared memory, signals."""
