@@ -35,7 +35,7 @@ def to_index(value: object) -> int | None:
 
 
 def check_value(key: str, value: object, item: dataclasses.Field[Any], annotation: Any, source: str) -> Any:
-    """Validate a value, and convert it to the type of its setting, for instance a list to a tuple.
+    """Validate a value; returns it in the type of its setting, for instance a list as a tuple.
 
     Args:
         key: Full key of the setting, for messages.
@@ -83,6 +83,7 @@ def describe_type(annotation: Any, *, plural: bool = False) -> str:
 
 
 def _convert(value: object, annotation: Any) -> Any:
+    """Value as the annotated type (int becomes float, lists tuples); raises _MismatchError if it does not fit."""
     if typing.get_origin(annotation) is tuple:
         return _convert_tuple(value, typing.get_args(annotation))
     if annotation is float:
@@ -97,6 +98,7 @@ def _convert(value: object, annotation: Any) -> Any:
 
 
 def _convert_tuple(value: object, parts: tuple[Any, ...]) -> tuple[Any, ...]:
+    """List as a tuple of converted values; raises _MismatchError for a wrong length or kind."""
     if not isinstance(value, list | tuple):
         raise _MismatchError
     if parts[-1] is Ellipsis:
@@ -127,6 +129,7 @@ def _encodable(text: str) -> bool:
 
 
 def _leaves(value: Any) -> Iterator[Any]:
+    """Yield the single values of nested tuples."""
     if isinstance(value, tuple):
         for one in value:
             yield from _leaves(one)
@@ -135,6 +138,7 @@ def _leaves(value: Any) -> Iterator[Any]:
 
 
 def _inside(leaf: Any, item: dataclasses.Field[Any]) -> bool:
+    """Whether a value is one of the choices, or within the bounds, of its setting."""
     rules = item.metadata
     if rules["choices"]:
         return leaf in rules["choices"]
@@ -148,8 +152,10 @@ def _inside(leaf: Any, item: dataclasses.Field[Any]) -> bool:
 
 
 def _unit(item: dataclasses.Field[Any]) -> str:
+    """Unit of a setting in brackets, after a space; empty without one."""
     return f" [{item.metadata['unit']}]" if item.metadata["unit"] else ""
 
 
 def _number(value: float) -> str:
+    """Number as short text."""
     return str(value) if isinstance(value, int) else f"{value:g}"

@@ -63,6 +63,7 @@ def find_conflicts(config: Config) -> Iterator[Conflict]:
 
 
 def _mix(bake: Bake, splits: Sequence[Split], cameras: Cameras) -> Iterator[Conflict]:
+    """Yield conflicts of modes, formats and resolution."""
     if MIXED in bake_modes(bake, splits) and not any(bake.mix):
         yield "bake.mix", "at least one weight above 0, with the mode mixed"
     if not bake.formats:
@@ -72,6 +73,7 @@ def _mix(bake: Bake, splits: Sequence[Split], cameras: Cameras) -> Iterator[Conf
 
 
 def _tote(tote: Tote, move: Move) -> Iterator[Conflict]:
+    """Yield conflicts of the tote's sizes, and a height at which the gripper starts below that at which it moves."""
     if any(rim < floor for rim, floor in zip(tote.rim_size, tote.floor_size, strict=True)):
         yield "tote.rim_size", f"at least tote.floor_size on both sides, {format_value(tote.floor_size)} [m]"
     if any(outer < rim + 2 * tote.wall for outer, rim in zip(tote.outer_size[:2], tote.rim_size, strict=True)):
@@ -84,6 +86,7 @@ def _tote(tote: Tote, move: Move) -> Iterator[Conflict]:
 
 
 def _cameras(cameras: Cameras, tote: Tote) -> Iterator[Conflict]:
+    """Yield conflicts of camera positions, up vectors and target: degenerate, below the floor, or not showing the tote."""
     if not cameras.positions:
         yield "cameras.positions", "at least one position"
     if len(cameras.ups) != len(cameras.positions):
@@ -102,6 +105,7 @@ def _cameras(cameras: Cameras, tote: Tote) -> Iterator[Conflict]:
 
 
 def _times(settle: Settle, physics: Physics) -> Iterator[Conflict]:
+    """Yield conflicts of the times of settling."""
     rest = settle.rest_ticks * physics.steps_per_tick * physics.step
     if settle.max_time < settle.min_time:
         yield "settle.max_time", f"at least settle.min_time, {settle.min_time:g} [s]"
@@ -110,6 +114,7 @@ def _times(settle: Settle, physics: Physics) -> Iterator[Conflict]:
 
 
 def _pick(pick: Pick, tote: Tote) -> Iterator[Conflict]:
+    """Yield conflicts of the heights and speeds of picking."""
     height = tote.outer_size[2] - tote.wall
     if pick.appear_height < pick.near:
         yield "pick.appear_height", f"at least pick.near, {pick.near:g} [m]"
@@ -120,6 +125,7 @@ def _pick(pick: Pick, tote: Tote) -> Iterator[Conflict]:
 
 
 def _suction(suction: Suction, gripper: Gripper) -> Iterator[Conflict]:
+    """Yield conflicts of cup, rays and break forces."""
     max_radius = gripper.cup_width / 2
     if suction.radius > max_radius:
         yield "suction.radius", f"at most half of gripper.cup_width, {max_radius:g} [m]"
@@ -130,11 +136,13 @@ def _suction(suction: Suction, gripper: Gripper) -> Iterator[Conflict]:
 
 
 def _layers(layers: tuple[str, ...]) -> Iterator[Conflict]:
+    """Yield layers that are named twice."""
     if len(set(layers)) < len(layers):
         yield "render.layers", f"each layer once: {format_value(list(dict.fromkeys(layers)))}"
 
 
 def _ranges(effects: Effects, depth_sensor: DepthSensor) -> Iterator[Conflict]:
+    """Yield ranges of effects and depth sensor whose minimum exceeds the maximum."""
     for name, section in (("effects", effects), ("depth_sensor", depth_sensor)):
         for item in dataclasses.fields(section):
             value = getattr(section, item.name)
@@ -143,6 +151,7 @@ def _ranges(effects: Effects, depth_sensor: DepthSensor) -> Iterator[Conflict]:
 
 
 def _jpeg_quality(effects: Effects, bop: Bop) -> Iterator[Conflict]:
+    """Yield a JPEG quality that begins at 0 or that the colour format has no use for."""
     low, high = effects.jpeg_quality
     if high and not low:
         yield "effects.jpeg_quality", f"from 1 to 100, or 0, 0: {format_value([1, high])}"
@@ -189,6 +198,7 @@ def _sees_tote(cameras: Cameras, tote: Tote, position: tuple[float, ...]) -> boo
 
 
 def _split_folders(splits: Sequence[Split], bop: Bop) -> Iterator[Conflict]:
+    """Yield folders of splits with names that BOP does not allow, or that do not fit the colour format."""
     folders = [(f"splits.{split.name}.folder", split.folder) for split in splits] or [("bop.split", bop.split)]
     for key, folder in folders:
         if not _SPLIT.fullmatch(folder):
@@ -200,6 +210,7 @@ def _split_folders(splits: Sequence[Split], bop: Bop) -> Iterator[Conflict]:
 
 
 def _scene_ids(layout: DataLayout) -> Iterator[Conflict]:
+    """Yield the number of episodes if shards have no names for so many scenes."""
     if "shards" in layout.formats and layout.scenes_end > MAX_SHARD_SCENES:
         most = MAX_SHARD_SCENES // layout.cameras
         long = next((split.name for split in layout.splits if split.first + split.episodes > most), "")
@@ -208,16 +219,19 @@ def _scene_ids(layout: DataLayout) -> Iterator[Conflict]:
 
 
 def _depth_scale(bop: Bop, cameras: Cameras, tote: Tote) -> Iterator[Conflict]:
+    """Yield the depth scale if 16 bits do not reach the farthest corner of the tote."""
     far = max((depth for position in cameras.positions for depth in _tote_depths(cameras, tote, position)), default=0.0)
     if bop.depth_scale * 1e-3 * DEPTH_COUNTS < far:
         yield "bop.depth_scale", f"at least {far * 1e3 / DEPTH_COUNTS:.3g}, so that 16 bits reach the tote at {far:.3g} m [mm]"
 
 
 def _object_rows(rows: Sequence[ObjectRow]) -> Iterator[Conflict]:
+    """Yield ids that several object rows have."""
     counts = Counter(row.id for row in rows)
     for repeated in sorted(row_id for row_id, count in counts.items() if count > 1):
         yield "object_rows", f"one row per id; {repeated} comes {counts[repeated]} times"
 
 
 def _cross(a: tuple[float, ...], b: tuple[float, ...]) -> tuple[float, float, float]:
+    """Cross product of two vectors."""
     return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]

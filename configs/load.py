@@ -145,7 +145,7 @@ def parse_assignment(text: str) -> tuple[str, object]:
 
 
 def sections() -> dict[str, type[Any]]:
-    """Name -> dataclass of every section, in order."""
+    """Dataclass of every section by its name, in their order."""
     hints = typing.get_type_hints(Config)
     return {item.name: hints[item.name] for item in dataclasses.fields(Config) if item.name not in (ROWS, SPLITS)}
 
@@ -158,10 +158,12 @@ def settings_of(section: type[Any]) -> dict[str, tuple[dataclasses.Field[Any], A
 
 
 def _folder() -> Path:
+    """Folder of the presets."""
     return Path(__file__).parent
 
 
 def _read(preset_or_file: str) -> Values:
+    """Values of a preset or a .toml file over the preset it is based on, with the source of each."""
     if preset_or_file.endswith(".toml"):
         document = _parse(Path(preset_or_file))
         base = document.pop(_BASE, DEFAULT_PRESET)
@@ -177,6 +179,7 @@ def _offer_splits(values: Values) -> Values:
 
 
 def _read_preset(name: str, source: str) -> Values:
+    """Values of a preset over the one it is based on, with their sources; raises ConfigError if there is none of the name."""
     names = preset_names()
     if name not in names:
         known = f"presets: {', '.join(names)}; a file's name ends in .toml"
@@ -187,6 +190,7 @@ def _read_preset(name: str, source: str) -> Values:
 
 
 def _parse(path: Path) -> dict[str, Any]:
+    """Content of a .toml file; raises ConfigError."""
     if not os.path.lexists(path):
         raise ConfigError(f"there is no file {path}; give a .toml file or a preset: {', '.join(preset_names())}")
     return read_toml(path, ConfigError)
@@ -213,6 +217,7 @@ def _override(base: Values, document: Mapping[str, Any], source: str) -> Values:
 
 
 def _section_values(section: str, content: Mapping[str, Any], source: str) -> Values:
+    """Checked values of a section by key, with their source."""
     _check_section(section, source)
     values: Values = {}
     for name, value in content.items():
@@ -223,6 +228,7 @@ def _section_values(section: str, content: Mapping[str, Any], source: str) -> Va
 
 
 def _check_section(section: str, source: str) -> None:
+    """Raise ConfigError if there is no section of this name, with a hint."""
     known = sections()
     if section == ROWS:
         raise ConfigError(f"{ROWS} cannot be set {source}; write [[{ROWS}]] tables into a file")
@@ -234,6 +240,7 @@ def _check_section(section: str, source: str) -> None:
 
 
 def _setting(section: str, name: str, source: str) -> tuple[dataclasses.Field[Any], Any]:
+    """Field and type of a setting; raises ConfigError if there is none of the name, with a hint."""
     _check_section(section, source)
     known = settings_of(sections()[section])
     if name not in known:
@@ -246,6 +253,7 @@ def _setting(section: str, name: str, source: str) -> tuple[dataclasses.Field[An
 
 
 def _rows(content: Any, source: str) -> tuple[ObjectRow, ...]:
+    """Object rows of [[object_rows]] tables; raises ConfigError."""
     if not isinstance(content, list) or not all(isinstance(row, dict) for row in content):
         raise ConfigError(f"{ROWS} is {format_value(content)} {source}; allowed: [[{ROWS}]] tables")
     return tuple(_row(f"{ROWS}[{index}]", row, source) for index, row in enumerate(content))
@@ -263,6 +271,7 @@ def _changed_rows(rows: tuple[ObjectRow, ...], changes: Mapping[str, Any], sourc
 
 
 def _row(key: str, content: Mapping[str, Any], source: str) -> ObjectRow:
+    """Object row of a table; raises ConfigError for unknown or missing keys."""
     known = settings_of(ObjectRow)
     for name in content:
         if name not in known:
@@ -301,6 +310,7 @@ def _build(values: Values, override: str) -> Config:
 
 
 def _value_of(config: Config, key: str) -> Any:
+    """Value of a setting by its key, "section.name" or "splits.split.name"."""
     if key.startswith(f"{SPLITS}."):
         _, name, item = key.split(".")
         return next(getattr(split, item) for split in config.splits if split.name == name)

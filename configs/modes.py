@@ -16,12 +16,12 @@ def mode_weights(bake: Bake, mode: str | None = None) -> dict[str, float]:
 
 
 def bake_modes(bake: Bake, splits: Sequence[Split]) -> tuple[str, ...]:
-    """`bake.mode`, or the modes of the splits."""
+    """Modes of the settings, each once: those of the splits, or without splits `bake.mode`."""
     return tuple(dict.fromkeys(split.mode for split in splits)) or (bake.mode,)
 
 
 def possible_modes(bake: Bake, splits: Sequence[Split]) -> set[str]:
-    """Those of MODES that episodes of a bake can have."""
+    """Modes of MODES that episodes of a data set with these settings can have."""
     return {name for mode in bake_modes(bake, splits) for name, weight in mode_weights(bake, mode).items() if weight > 0.0}
 
 

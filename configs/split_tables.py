@@ -34,7 +34,7 @@ def split_settings() -> dict[str, tuple[Any, Any]]:
 
 
 def read_tables(content: Any, source: str) -> Tables:
-    """Validate the content of `splits`: a table of tables.
+    """Validate the content of `splits`, a table of tables; returns the values of each split.
 
     Raises:
         ConfigError: It is something else, a name or a key is wrong, or a value is not allowed.
@@ -50,7 +50,7 @@ def read_tables(content: Any, source: str) -> Tables:
 
 
 def check_setting(name: str, key: str, value: Any, source: str) -> Any:
-    """Validate one setting of a split.
+    """Validate one setting of a split; returns its value.
 
     Raises:
         ConfigError: There is no such setting, or the value is not allowed.

@@ -15,7 +15,7 @@ _DELETE = "\x7f"
 
 
 def config_to_toml(config: Config, *, comments: bool = False) -> str:
-    """Write all settings as TOML, including defaults.
+    """All settings as TOML text, including defaults.
 
     Args:
         config: The configuration.
@@ -34,6 +34,7 @@ def config_to_toml(config: Config, *, comments: bool = False) -> str:
 
 
 def _table(values: Any, kind: type[Any], comments: bool) -> list[str]:
+    """Lines of a TOML table; `comments`: each setting with meaning, unit and allowed values above it."""
     lines = []
     for name, (item, annotation) in (split_settings() if kind is Split else settings_of(kind)).items():
         if comments:

@@ -28,7 +28,7 @@ def mix(x: wp.uint64) -> wp.uint64:
 
 @wp.func
 def stream_key(seed: wp.uint64, episode: int, arrangement: int, stream: int) -> wp.uint64:
-    """Key of the `Stream` of an episode's arrangement."""
+    """Key of a stream of random numbers: of this purpose (`Stream`), in an arrangement of an episode."""
     key = mix(seed + GAMMA)
     key = mix((key ^ wp.uint64(episode)) + GAMMA)
     key = mix((key ^ wp.uint64(arrangement)) + GAMMA)

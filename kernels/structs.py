@@ -11,7 +11,9 @@ TILT = wp.constant(3)
 
 @wp.struct
 class LayoutData:
-    """Sizes and offsets of one world in the model's flat arrays; see `scenes.build.Layout`."""
+    """Sizes and offsets of one world in the model's flat arrays: capacity for instances, body slots, bodies, coordinates, degrees of
+    freedom and shapes; see `scenes.build.Layout`.
+    """
 
     instances: int
     """Capacity for objects of an episode."""
@@ -37,7 +39,9 @@ class LayoutData:
 
 @wp.struct
 class CatalogData:
-    """Catalog of objects: volume, mass and other properties of each; arrays have one element per object."""
+    """Catalog of objects, an element per object: collision volume [m³], bounding radius about the origin [m], mass [kg], area of the box's
+    larger sides, diagonal, body variant; and variants and mass of empty slots.
+    """
 
     count: int
     """Objects in the catalog."""
@@ -99,7 +103,9 @@ class DropData:
 
 @wp.struct
 class SettleData:
-    """Thresholds and durations of rest, of deep penetration and of re-drops; see `configs.schema.Settle`."""
+    """Rest and re-drops: least and longest time to rest and time in penetration [ticks], displacement of an object at rest in a tick and
+    penetration of a stuck one [m], number of re-drops; see `configs.schema.Settle`.
+    """
 
     min_ticks: int
     """Shortest time from drop to rest [ticks]."""
@@ -123,7 +129,7 @@ class SettleData:
 
 @wp.struct
 class ModeData:
-    """First episode of a split, and the probabilities of the modes of its episodes."""
+    """First episode of a split, probabilities of PICK and of PICK or TARGET, and the period of a round robin over modes (0: random)."""
 
     first: int
     """Index of the split's first episode."""

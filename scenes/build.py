@@ -86,7 +86,7 @@ class Layout:
 
 @dataclass(frozen=True, eq=False)
 class BuiltModel:
-    """The finalized model, its layout, and the body variants of its slots."""
+    """Finalized Newton model, its layout, and the body variants of its slots: of each catalog entry, and of empty slots."""
 
     model: newton.Model
     layout: Layout
@@ -130,7 +130,7 @@ def count_slots(config: Config, catalog: Catalog) -> tuple[int, int]:
 
 
 def _count_by_type(drawn: np.ndarray, compound: np.ndarray) -> np.ndarray:
-    """Count drawn objects by slot type, single and compound (trial, 2), of catalog indices (trial, capacity), -1: none."""
+    """Numbers of drawn objects by slot type, single and compound (trial, 2), from catalog indices (trial, capacity), -1: none."""
     return np.stack([((drawn >= 0) & (compound[drawn] == is_compound)).sum(axis=1) for is_compound in (False, True)], axis=1)
 
 

@@ -59,5 +59,5 @@ def _look_at(index: int, position: np.ndarray, target: np.ndarray, up: np.ndarra
 
 
 def _plain(vector: np.ndarray) -> str:
-    """Text of a vector, for messages."""
+    """Vector as text, for messages."""
     return "(" + ", ".join(f"{value:g}" for value in vector) + ")"

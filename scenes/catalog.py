@@ -37,7 +37,7 @@ _UNITS = "files named obj_NNNNNN.ply are read in millimetres, all others in metr
 
 
 def _ignore(line: str) -> None:
-    """Default for `report`."""
+    """Default for `report`: drops the line."""
 
 
 def load_catalog(config: Config, cache_dir: Path | None = None, report: Callable[[str], None] = _ignore) -> Catalog:
@@ -84,7 +84,7 @@ class _Faults:
         self._errors: list[CatalogError] = []
 
     def add(self, error: CatalogError) -> None:
-        """Take the error of an object; raises it if settings are strict."""
+        """Collect the error of an object; raises it if settings are strict."""
         if self._strict:
             raise error
         self._errors.append(error)
@@ -95,7 +95,7 @@ class _Faults:
             self._report(f"left out: {error}")
 
     def summary(self) -> CatalogError:
-        """The error of a folder of which no object can be used."""
+        """Error to raise for a folder of which no object can be used."""
         if len(self._errors) == 1:
             return self._errors[0]
         count = len(self._errors)
@@ -104,7 +104,7 @@ class _Faults:
 
 @dataclass(frozen=True)
 class _Rules:
-    """Settings by which a model is read and checked."""
+    """Settings by which a model is read and checked: objects, rows of the object table, tote."""
 
     objects: Objects
     rows: tuple[ObjectRow, ...]
@@ -247,7 +247,7 @@ def _check_fits_tote(vertices: np.ndarray, size: float, origin: str, tote: Tote)
 
 
 def _by(sides: list[float]) -> str:
-    """Text of the sides of a box, for messages."""
+    """Text of the sides of a box, such as "1 x 2 x 3", for messages."""
     return " x ".join(f"{side:.3g}" for side in sides)
 
 

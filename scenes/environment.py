@@ -27,7 +27,7 @@ def map_directions(rows: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _compute_directions(rows: int) -> tuple[np.ndarray, np.ndarray]:
-    """Uncached implementation of `map_directions`."""
+    """Directions (rows, 2 rows, 3) and solid angles of an equirectangular map's pixels, read-only; uncached `map_directions`."""
     polar = (np.arange(rows) + 0.5) / rows * np.pi
     azimuth = ((np.arange(2 * rows) + 0.5) / (2 * rows) - 0.5) * 2.0 * np.pi
     polar, azimuth = np.meshgrid(polar, azimuth, indexing="ij")

@@ -35,8 +35,9 @@ DISC_RINGS, DISC_SPOKES = 16, 64
 
 
 class Lamp(NamedTuple):
-    """Direction, irradiance, angular radius and sample points of a lamp: a small and bright light of an environment map, or a part of
-    one."""
+    """Lamp: a small and bright light of an environment map, or a part of one. Unit direction towards its centre, irradiance on a surface
+    that faces it, tangent of its angular radius, and unit directions towards sample points.
+    """
 
     direction: np.ndarray
     """Unit direction to its center (3)."""

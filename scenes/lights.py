@@ -51,7 +51,7 @@ MIN_RADIANCE = 1e-6
 
 
 def _ignore(line: str) -> None:
-    """Default for `report`."""
+    """Default for `report`: drops the line."""
 
 
 def load_lights(folder: str, report: Callable[[str], None] = _ignore, strict: bool = False) -> tuple[EnvironmentMap, ...]:
@@ -288,7 +288,7 @@ def _decode(path: Path) -> np.ndarray | None:
 
 
 def _validate(image: np.ndarray, path: Path, max_height: int) -> np.ndarray:
-    """Validate radiance, limit its resolution, and convert it to this project's orientation."""
+    """Radiance of an image file, validated, limited in resolution, and in this project's orientation."""
     height, width = image.shape[:2]
     if width != 2 * height:
         raise LightError(f"{path} is {width} x {height} pixels; an equirectangular map must be twice as wide as high")

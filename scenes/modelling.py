@@ -36,7 +36,7 @@ _FACE_AXES = {
 
 @dataclass(frozen=True, eq=False)
 class Patch:
-    """Corner positions and texture coordinates of a triangle soup, before vertices are merged."""
+    """Triangle soup before vertices are merged: corner positions [m], counter-clockwise from outside, and texture coordinates."""
 
     corners: np.ndarray
     """Positions (T, 3, 3) float64 [m], counter-clockwise as seen from outside."""
@@ -44,7 +44,7 @@ class Patch:
     """Texture coordinates (T, 3, 2) float64."""
 
     def translate(self, x: float, y: float, z: float) -> Patch:
-        """Translate the patch [m]."""
+        """Patch moved by (x, y, z) [m]."""
         return Patch(self.corners + np.array([x, y, z]), self.uv)
 
     def rotate(self, axis: str, angle: float) -> Patch:
@@ -64,7 +64,7 @@ def rotation(axis: str, angle: float) -> np.ndarray:
 
 
 def join(*patches: Patch) -> Patch:
-    """Concatenate patches."""
+    """Concatenate patches to one."""
     return Patch(np.concatenate([patch.corners for patch in patches]), np.concatenate([patch.uv for patch in patches]))
 
 

@@ -23,7 +23,9 @@ SOLAR_TANGENT = np.tan(np.radians(0.267))
 
 
 class ExtractedSun(NamedTuple):
-    """Sun of an environment map, and the map without the sun."""
+    """Sun of an environment map: unit direction towards it, irradiance on a surface that faces it (zero: no sun there), tangent of its
+    angular radius; and the map without it.
+    """
 
     rest: np.ndarray
     """The map without the sun (rows, 2 rows, 3)."""

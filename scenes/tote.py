@@ -65,7 +65,9 @@ def tote_fixture(tote: Tote) -> Fixture:
 
 
 def tote_interior(tote: Tote) -> Interior:
-    """The empty convex interior of the visual mesh, INTERIOR_MARGIN off its faces; chords cut its rounded corners."""
+    """Empty convex interior of the visual mesh: INTERIOR_MARGIN inside its walls and floor; each rounded corner is cut off by its chord at
+    45°.
+    """
     top = rim_height(tote)
     half = []
     for level in (0.0, top):
@@ -142,7 +144,9 @@ def _check(tote: Tote) -> None:
 
 
 def _ring(tote: Tote, level: float, offset: float, z: float) -> np.ndarray:
-    """Inner outline (n, 3) at a level above the floor, offset outward, at height z [m]."""
+    """Rounded-rectangle outline (n, 3) at height z [m]: the inner outline of the tote at `level` [m] above the floor, moved outward by
+    `offset` [m].
+    """
     (length, width), radius = _opening(tote, level)
     outline = rounded_rectangle(2 * (length + offset), 2 * (width + offset), radius + offset, CORNER_SEGMENTS)
     return np.column_stack([outline, np.full(len(outline), z)])
@@ -156,7 +160,7 @@ def _opening(tote: Tote, level: float) -> tuple[np.ndarray, float]:
 
 
 def _outer_ring(tote: Tote, z: float) -> np.ndarray:
-    """Outline (n, 3) of the outside of the tote at height z [m]."""
+    """Outline (n, 3) of the outer edge of the flange, a rounded rectangle of `tote.outer_size`, at height z [m]."""
     outline = rounded_rectangle(tote.outer_size[0], tote.outer_size[1], CORNER_RADIUS + tote.wall, CORNER_SEGMENTS)
     return np.column_stack([outline, np.full(len(outline), z)])
 

@@ -11,7 +11,9 @@ import numpy as np
 
 @dataclass(frozen=True, eq=False)
 class TriangleMesh:
-    """Vertices, faces, normals and texture coordinates of a triangle mesh with outward orientation."""
+    """Triangle mesh with outward orientation: vertices [m], vertex indices of the faces, and per vertex unit normals and texture
+    coordinates (v up).
+    """
 
     vertices: np.ndarray
     """(V, 3) float32 [m]."""
@@ -85,7 +87,9 @@ Shape = tuple[ConvexPiece, ...]
 
 @dataclass(frozen=True, eq=False)
 class CatalogEntry:
-    """An object of the catalog: visual mesh, material, collision shape, mass properties, symmetries."""
+    """Catalog object: visual mesh, material, convex collision pieces and their volume, mass properties, bounding radius about the object's
+    origin, diameter, symmetries.
+    """
 
     obj_id: int
     name: str
@@ -115,7 +119,7 @@ class CatalogEntry:
 
 @dataclass(frozen=True, eq=False)
 class Catalog:
-    """The object set of a bake, ordered by obj_id. A catalog index is an index into `entries`."""
+    """Objects of a data set, ordered by obj_id. A catalog index is an index into `entries`."""
 
     entries: tuple[CatalogEntry, ...]
 
@@ -152,7 +156,7 @@ class Fixture:
 
 @dataclass(frozen=True, eq=False)
 class Sun:
-    """Direction and irradiance of a directional light (sun) that an sIBL set names."""
+    """Directional light that an sIBL set names: unit direction towards the sun in the map's frame, and RGB irradiance."""
 
     direction: np.ndarray
     """Unit direction (3) float64 towards the sun, in the map's frame."""
@@ -173,7 +177,9 @@ class EnvironmentMap:
 
 @dataclass(frozen=True, eq=False)
 class Camera:
-    """Pinhole camera in OpenCV's convention: x right, y down, z forward; the centre of pixel (row, column) is (column + 0.5, row + 0.5)."""
+    """Pinhole camera: image size, intrinsic matrix K, world-to-camera rotation and translation [m]. OpenCV's axes (x right, y down, z
+    forward); the centre of pixel (row, column) is (column + 0.5, row + 0.5).
+    """
 
     width: int
     height: int

@@ -26,7 +26,7 @@ class _Described(enum.IntEnum):
 
 
 class Phase(enum.IntEnum):
-    """Phase of a world."""
+    """Phase of a world: from no episode, by drop, settling and action, to none left."""
 
     EMPTY = 0
     """No episode assigned yet."""
@@ -172,7 +172,7 @@ class Segment(enum.IntEnum):
 
 
 class Tone(enum.IntEnum):
-    """Tone curve."""
+    """Tone curve of the camera: shoulder, linear or filmic."""
 
     SHOULDER = 0
     """Linear up to 0.6, highlights compressed."""

@@ -42,6 +42,7 @@ def settings_reference() -> str:
 
 
 def _anchor(title: str) -> str:
+    """Anchor of a section's heading in the generated page."""
     return f"section-{title.strip('[]').partition('.')[0].replace('_', '-')}"
 
 
@@ -81,7 +82,7 @@ REFERENCES: dict[Path, Callable[[], str]] = {
 
 
 def main() -> None:
-    """Write the generated files."""
+    """Write all generated documentation."""
     argparse.ArgumentParser(description="Generate the documentation that follows from code.").parse_args()
     for path, make in REFERENCES.items():
         path.write_text(make(), encoding="utf-8")

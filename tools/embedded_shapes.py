@@ -21,7 +21,7 @@ from synpick_warp.scenes.embedded.objects import procedural_objects
 
 
 def main() -> None:
-    """Write the file."""
+    """Compute the collision shapes of all embedded objects, and write their file."""
     objects = load_config("synpick").objects
     raws = procedural_objects()
     names, meshes, recipes = [raw.name for raw in raws], [raw.mesh for raw in raws], [shape_recipe(raw, objects) for raw in raws]

@@ -113,6 +113,7 @@ def figures_tables(runs: Mapping[str, Run]) -> dict[str, str]:
 
 
 def _table(runs: Mapping[str, Run]) -> str:
+    """Markdown table of the runs, with their conditions as numbered notes."""
     lines = ["| what | figures | measured on | limited by | command |", "|---|---|---|---|---|"]
     notes: dict[str, int] = {}
     for name, run in runs.items():
@@ -125,11 +126,13 @@ def _table(runs: Mapping[str, Run]) -> str:
 
 
 def _show(row: Row) -> str:
+    """Name and value of a row in Markdown."""
     unit = {"1/s": "/s", "1/h": "/h", "%": " %", "": ""}.get(row.unit, f" {row.unit}")
     return f"{row.name} **{row.value:,.10g}{unit}**".strip()
 
 
 def _shorten(command: str) -> str:
+    """Command line with long names abbreviated."""
     for name, words in SHORT.items():
         command = command.replace(words, name)
     return command

@@ -33,7 +33,7 @@ def writable_file(text: str) -> Path:
 
 
 def positive_count(text: str) -> int:
-    """Argument type of an option: a positive integer."""
+    """Argument type of an option: an integer above 0."""
     if not text.isdecimal() or not 0 < int(text) <= INT32_MAX:
         raise argparse.ArgumentTypeError(f"{text} is no count; allowed: 1 to {INT32_MAX}")
     return int(text)
@@ -71,7 +71,7 @@ SETTINGS = {"device": "bake.device", "models": "bake.models", "lights": "bake.li
 
 @dataclass(frozen=True)
 class Row:
-    """Row of a report: a measured value, and its bound if it has one."""
+    """Row of a report: measured value with unit, its bound (empty: none) and whether that holds."""
 
     name: str
     value: float
@@ -92,7 +92,7 @@ class Row:
 
 
 def of_part(part: str, rows: Iterable[Row]) -> Iterator[Row]:
-    """The rows, those that belong to no group in the group `part`."""
+    """Rows with `part` as the group of those that belong to none."""
     return (row if row.part else replace(row, part=part) for row in rows)
 
 

@@ -28,7 +28,9 @@ ONE = wp.constant(wp.uint64(1))
 
 @wp.struct
 class HuffmanTables:
-    """Huffman codes of the DC and the AC symbols, packed (`CODE_BITS`), by component (0: Y, 1: Cb and Cr) and symbol."""
+    """Huffman codes of the DC and the AC symbols, packed (`CODE_BITS`), by component (0: Y, 1: Cb and Cr) and symbol: of DC the number of
+    bits of the difference, of AC 16 x zeros before the coefficient + its number of bits.
+    """
 
     dc: wp.array2d[wp.uint32]
     """(component, symbol): code of a difference's number of bits."""
@@ -107,7 +109,9 @@ def dc_difference(
     block: int,
     interval_blocks: int,
 ) -> int:
-    """DC coefficient of a block less that of the block before it of the same component in the restart interval, or less 0."""
+    """DC coefficient of a block minus that of the block before it of the same component in the restart interval; minus 0 for
+    the first one.
+    """
     part = block % BLOCKS_PER_MCU
     previous = block - BLOCKS_PER_MCU
     if part == 0:
@@ -185,7 +189,7 @@ def place_blocks_kernel(
 
 @wp.func
 def put_bits(writer: WordWriter, slot: wp.array3d[wp.uint32], value: wp.uint32, count: int) -> WordWriter:
-    """Append `count` bits, at most 32. Full words are written, if the slot has space for them."""
+    """Append `count` bits, at most 32; returns the writer. Full words are written, if the slot has space for them."""
     writer.pending = (writer.pending << wp.uint64(count)) | wp.uint64(value)
     writer.bits += count
     if writer.bits >= WORD_BITS:
@@ -211,7 +215,7 @@ def finish_words(writer: WordWriter, slot: wp.array3d[wp.uint32]):
 
 @wp.func
 def put_value(writer: WordWriter, slot: wp.array3d[wp.uint32], code: wp.uint32, value: int, count: int) -> WordWriter:
-    """Append a packed code of at most 16 bits and the `count` magnitude bits of a value, at most 11."""
+    """Append a packed code of at most 16 bits and the `count` magnitude bits of a value, at most 11; returns the writer."""
     symbol = (code & wp.uint32((1 << CODE_BITS) - 1)) << wp.uint32(count)
     return put_bits(writer, slot, symbol | signed_bits(value, count), code_length(code) + count)
 

@@ -33,7 +33,9 @@ history_vec = wp.types.vector(length=8, dtype=wp.int32)
 
 @wp.struct
 class Codes:
-    """Deflate codes of literals, runs and distances, packed: the value, and in the highest byte the number of bits."""
+    """Deflate codes of bytes (literals), match lengths (runs) and match distances - 1, packed: the value, in the highest byte the number of
+    bits.
+    """
 
     literal: wp.array[wp.uint32]
     """(byte): packed code of a literal."""
@@ -45,7 +47,7 @@ class Codes:
 
 @wp.struct
 class SlotWriter:
-    """Bit writer of one slot: its view and slot, the whole words written, and the bits of the unfinished word."""
+    """Bit writer of one slot: view and slot, unfinished word with its number of bits (below WORD_BITS), and number of words written."""
 
     view: int
     slot: int
@@ -60,7 +62,9 @@ class SlotWriter:
 
 @wp.struct
 class SlotSums:
-    """Size, byte sum and weighted byte sum (both parts of Adler-32) of each slot, or of each group of slots."""
+    """Size [bits], sum of the filtered bytes, and sum of position times byte modulo ADLER (both for Adler-32), of each slot or group of
+    slots.
+    """
 
     bits: wp.array2d[int]
     """(view, slot): size [bits]."""
@@ -72,7 +76,7 @@ class SlotSums:
 
 @wp.func
 def put_bits(writer: SlotWriter, slot: wp.array3d[wp.uint32], value: wp.uint32, count: int) -> SlotWriter:
-    """Append `count` bits, at most 32."""
+    """Append the low `count` bits of `value`, at most 32; writes a word to the slot whenever 32 bits are complete."""
     writer.pending = writer.pending | (wp.uint64(value) << wp.uint64(writer.bits))
     writer.bits += count
     if writer.bits >= WORD_BITS:
@@ -85,7 +89,7 @@ def put_bits(writer: SlotWriter, slot: wp.array3d[wp.uint32], value: wp.uint32, 
 
 @wp.func
 def put_code(writer: SlotWriter, slot: wp.array3d[wp.uint32], code: wp.uint32) -> SlotWriter:
-    """Append a packed code."""
+    """Append a packed code: its value in the low 24 bits, its number of bits in the highest byte."""
     return put_bits(writer, slot, code & wp.uint32((1 << CODE_BITS) - 1), int(code >> wp.uint32(CODE_BITS)))
 
 
@@ -98,9 +102,8 @@ def put_sample(writer: SlotWriter, slot: wp.array3d[wp.uint32], codes: Codes, sa
 
 @wp.func
 def put_run(writer: SlotWriter, slot: wp.array3d[wp.uint32], codes: Codes, count: int, matches: int, last: int) -> SlotWriter:
-    """Append `count` samples that repeat earlier ones: a match at the shortest distance of those in `matches`, or one sample, `last`.
-
-    `matches` is a bit field: bit d - 1 is set if all samples equal those at distance d.
+    """Append a run of `count` samples that repeat earlier ones: none (0); one, as the literals of `last`, the newest sample; or more, as a
+    match at the shortest distance in `matches` (bit d - 1 is set if all samples equal those at distance d).
     """
     if count == 1:
         return put_sample(writer, slot, codes, last)
@@ -132,7 +135,7 @@ def filter_sample(image: wp.array3d[wp.uint16], view: int, row: int, column: int
 
 @wp.func
 def find_matches(history: history_vec, sample: int) -> int:
-    """Bit field of the distances at which there is the same sample."""
+    """Bit field of the distances at which the history has the same sample: bit d - 1 is set if the sample d places back equals this one."""
     matches = int(0)
     for k in range(MAX_DISTANCE):
         matches = matches | wp.where(history[k] == sample, 1 << k, 0)
@@ -141,7 +144,7 @@ def find_matches(history: history_vec, sample: int) -> int:
 
 @wp.func
 def push_sample(history: history_vec, sample: int) -> history_vec:
-    """The history after a sample."""
+    """History shifted by one place, with this sample as the newest."""
     for k in range(MAX_DISTANCE - 1):
         history[MAX_DISTANCE - 1 - k] = history[MAX_DISTANCE - 2 - k]
     history[0] = sample
@@ -278,7 +281,7 @@ def close_streams_kernel(
 
 @wp.func
 def read_bits(slot: wp.array3d[wp.uint32], view: int, index: int, first: int) -> wp.uint32:
-    """32 bits of a slot from bit `first` on; those beyond its last word are 0."""
+    """32 bits of a slot from bit `first` on, which need not begin a word; 0 beyond the end of the array."""
     word, shift = first // WORD_BITS, first % WORD_BITS
     value = slot[view, index, word] >> wp.uint32(shift)
     if shift > 0 and word + 1 < slot.shape[2]:
@@ -297,7 +300,8 @@ def join_slots_kernel(
     # Out:
     data_out: wp.array2d[wp.uint8],  # (view, byte)
 ):
-    """Join the slots of a view. Launched over view, slot, lane: `lanes` threads write the words of the data that begin in a slot.
+    """Concatenate the bit strings of a view's slots to its bytes, `data_out`. Launched over view, slot, lane: `lanes` threads write the
+    words of the data that begin in a slot.
 
     Bytes beyond the capacity of `data_out` are left out.
     """

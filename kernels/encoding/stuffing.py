@@ -45,7 +45,9 @@ def count_stuffing_kernel(
     stuffing_out: wp.array3d[int],  # (view, interval, lane) [B]
     size_inout: wp.array2d[int],  # (view, interval) [B]
 ):
-    """Count the bytes 0 that each lane adds to its chunk, and add them to the size of the interval. Launched over view, interval, lane."""
+    """Count the bytes 0 to be stuffed into each lane's chunk of an interval of `coded` bytes: writes them to `stuffing_out`, and adds them
+    to `size_inout`, the size of the interval with its marker. Launched over view, interval, lane.
+    """
     view, interval, lane = wp.tid()
     chunk = chunk_words(coded[view, interval], slot.shape[2], stuffing_out.shape[2])
     # Behind the last byte of the bit string, its last word is 0.
@@ -70,10 +72,11 @@ def place_intervals_kernel(
     begin_out: wp.array2d[int],  # (view, interval) [B]
     total_out: wp.array[int],  # (view) [B]
 ):
-    """Prefix sum over the intervals of a view: `begin_out` receives their positions in the file. Launched over view.
+    """Place the restart intervals of each view in its file: prefix sum over `size`, the bytes of an interval with stuffing and closing
+    marker.
 
-    `total_out` receives the size of the file. If it exceeds its `capacity` or an interval its slot, the file is incomplete, and the size is
-    above the capacity.
+    Writes `begin_out`, the first byte of each interval, and `total_out`, the size of the file: above `capacity` if the file does not fit,
+    or if a bit string (`coded`) did not fit its slot. Launched over view.
     """
     view = wp.tid()
     begin = int(header_bytes)
@@ -107,7 +110,8 @@ def join_intervals_kernel(
     # Out:
     file_out: wp.array2d[wp.uint8],  # (view, byte)
 ):
-    """Join header and intervals, with stuffed bytes and closing markers (RST, or EOI after the last one), to a file for each view.
+    """Write the file of each view: the header of its `quality` (row of `header`), then the intervals with stuffed bytes, each closed by a
+    marker (RST, or EOI after the last one).
 
     Launched over view, interval, lane. Bytes beyond the capacity of `file_out` are left out.
     """

@@ -22,7 +22,9 @@ DIRECTION_STEPS = wp.constant(32767.0)
 
 @wp.struct
 class ShapeData:
-    """Type, mesh, gap and pair mask of the collision shapes of all worlds; arrays are (shape) unless named otherwise."""
+    """Collision shapes of all worlds: shapes per world, Newton's codes of boxes and hulls; by shape its type, hull mesh and contact gap
+    [m]; by pair of shapes in a world, whether they may collide.
+    """
 
     count: int
     """Shapes of a world."""
@@ -149,7 +151,7 @@ def pack_direction(direction: wp.vec3) -> wp.uint32:
 
 @wp.func
 def unpack_direction(packed: wp.uint32) -> wp.vec3:
-    """Unit vector of `pack_direction`."""
+    """Unpack a unit vector from its octahedral 2 x 16 bits. Inverse of `pack_direction`."""
     x = float(int(packed >> wp.uint32(16)) - int(DIRECTION_STEPS) - 1) / DIRECTION_STEPS
     y = float(int(packed & wp.uint32(0xFFFF)) - int(DIRECTION_STEPS) - 1) / DIRECTION_STEPS
     z = 1.0 - wp.abs(x) - wp.abs(y)

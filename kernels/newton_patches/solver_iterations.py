@@ -130,8 +130,9 @@ class BodyData:
 
 @wp.struct
 class IterationSettings:
-    """Number of iterations, relaxation factor, and switches of the projected Gauss-Seidel solver; those without a description are as in
-    SolverSteel."""
+    """Settings of the projected Gauss-Seidel solver: iterations, relaxation factor `omega`, and switches (1: on); those without a
+    description are as in SolverSteel.
+    """
 
     iterations: int
     omega: float

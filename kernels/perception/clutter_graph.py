@@ -16,8 +16,9 @@ CERTAIN = wp.constant(1.0e30)
 
 @wp.struct
 class Cycles:
-    """Strongly connected component that is being ordered, with its edge weights, linear order and dynamic programming table, by view.
-    Scratch."""
+    """Strongly connected component that is being ordered, by view: its members, weight[a, b] of the edge from b, above, to a (0: none),
+    rank of each member (0: uppermost), and dynamic programming table by set of members.
+    """
 
     member: wp.array2d[int]
     """Instances of the component, in ascending order (view, instance)."""
@@ -32,7 +33,7 @@ class Cycles:
 
 @wp.func
 def bit(instance: int) -> wp.uint32:
-    """Bit mask of one instance."""
+    """Bit field in which only this instance's bit is set."""
     return wp.uint32(1) << wp.uint32(instance)
 
 
@@ -40,7 +41,7 @@ def bit(instance: int) -> wp.uint32:
 def edge_weight(votes: wp.array3d[float], world: int, lower: int, upper: int, min_votes: float) -> float:
     """Weight of the edge from `upper` to `lower`: its votes minus those of the opposite edge, at least 0.
 
-    Edges with fewer than `min_votes` votes are ignored.
+    0 below `min_votes` votes; opposite votes below it count as 0.
     """
     votes_for = votes[world, lower, upper]
     votes_against = votes[world, upper, lower]

@@ -22,7 +22,7 @@ PIXEL_BITS = wp.constant(wp.int64(31))
 
 @wp.func
 def split_index(index: int, height: int, strips: int) -> tuple[int, int, int]:
-    """(view, row, strip) of a flat index."""
+    """(view, row, strip) of a thread's flat index."""
     line = index // strips
     view = line // height
     return view, line - view * height, index - line * strips
@@ -36,7 +36,7 @@ def pack_key(value: wp.int64, pixel: int) -> wp.int64:
 
 @wp.func
 def unpack_pixel(key: wp.int64) -> int:
-    """Pixel index of a key of `pack_key`."""
+    """Row-major pixel index of a key made by `pack_key`."""
     return int(LAST_PIXEL - (key & LAST_PIXEL))
 
 

@@ -16,7 +16,9 @@ CLOCKWISE = wp.constant(-1)
 
 @wp.struct
 class PolygonMoments:
-    """Exact integer moments of a closed polygon (Green's theorem), for vertices (u, v) [px] relative to its first vertex."""
+    """Exact integer sums over the edges of a closed polygon, for its area and centroid (Green's theorem), with sums, last and number of its
+    vertices; (u, v) [px] are relative to the first vertex.
+    """
 
     cross: wp.int64
     """Twice the signed area: sum of c = u₁ v₂ - u₂ v₁ over the edges."""
@@ -38,7 +40,7 @@ class PolygonMoments:
 
 @wp.func
 def add_vertex(polygon: PolygonMoments, u: int, v: int) -> PolygonMoments:
-    """Moments with one more vertex. Edges from and to the first vertex contribute nothing because it is the origin."""
+    """Sums with one more vertex. Edges from and to the first vertex contribute nothing because it is the origin."""
     result = polygon
     cross = wp.int64(polygon.last_u) * wp.int64(v) - wp.int64(u) * wp.int64(polygon.last_v)
     result.cross += cross
@@ -54,7 +56,9 @@ def add_vertex(polygon: PolygonMoments, u: int, v: int) -> PolygonMoments:
 
 @wp.func
 def polygon_centroid(polygon: PolygonMoments) -> wp.vec2d:
-    """Centroid Σ c (p₁ + p₂) / (3 Σ c); the mean of the vertices where the area is zero."""
+    """Centroid Σ c (p₁ + p₂) / (3 Σ c) over the edges, relative to the first vertex [px]; the mean of the vertices where the
+    area is zero.
+    """
     if polygon.cross != wp.int64(0):
         whole = wp.float64(3.0) * wp.float64(polygon.cross)
         return wp.vec2d(wp.float64(polygon.cross_u) / whole, wp.float64(polygon.cross_v) / whole)

@@ -21,7 +21,7 @@ DEEP = wp.constant(1)
 
 @wp.func
 def visible_instance(gbuffer: GBuffer, view: int, row: int, column: int, instances: int) -> int:
-    """Instance visible at a pixel; -1: none."""
+    """Instance that the G-buffer shows at a pixel; -1: none."""
     segment = int(gbuffer.segment[view, row, column])
     if segment < 1 or segment > instances:
         return -1
@@ -175,7 +175,9 @@ def weigh_votes_kernel(
     # Out:
     votes_out: wp.array3d[float],  # (world, instance, instance)
 ):
-    """Weighted sum votes[i, j] = full + deep_weight · deep. Launched over view, instance, instance."""
+    """Write the occlusion votes votes[i, j] = full + deep_weight · deep, that j lies above i, from the counts by kind. Launched over view,
+    instance, instance.
+    """
     view, instance, neighbour = wp.tid()
     world = views.world[view]
     if world < 0:

@@ -20,7 +20,7 @@ def list_worlds_kernel(
     next_out: wp.array[int],  # (one)
     remaining_out: wp.array[int],  # (one)
 ):
-    """Stream compaction: list the acting worlds whose task is LOOK, in order, by a single thread.
+    """Stream compaction: list the acting worlds whose task is LOOK, in order, in `worklist_out`. Launched as one thread.
 
     `length` receives the length of the worklist, `next` the index of its first unprocessed item (0), `remaining` the number of these.
     """

@@ -25,7 +25,9 @@ COST_MEAN = wp.constant(0.2)
 
 @wp.struct
 class Track:
-    """Pose, previous pose, centroid, and running means of cost and correlation of each tracked instance."""
+    """State of each tracked instance: last pose and the one before (object to camera), centroid [m], frames with an estimate, frames since
+    the last accepted one, and running means of cost and colour correlation (NO_CORRELATION: none yet).
+    """
 
     pose: wp.array[wp.transform]
     """(instance): last estimate, object to camera [m]."""
@@ -45,7 +47,9 @@ class Track:
 
 @wp.struct
 class TrackPolicy:
-    """Limits within which an estimate is accepted into a track: points, increase of the cost, patience."""
+    """Limits of acceptance into a track: least number of points, increase of the cost above which an estimate is rejected, frames without
+    an estimate after which any is taken (patience), and first running mean of the cost.
+    """
 
     min_points: int
     """Minimum observed points; with fewer an instance keeps its pose."""
@@ -59,7 +63,9 @@ class TrackPolicy:
 
 @wp.struct
 class Symmetries:
-    """Near-symmetries by model: rotations about the centre of an object that change its shape little. Constant."""
+    """Near-symmetries by model: rotations (the first is the identity) about a centre [m] that change the object's shape little.
+    Constant.
+    """
 
     rotation: wp.array2d[wp.quat]
     """(model, symmetry): in the model's axes; the first is the identity."""

@@ -15,9 +15,8 @@ LIGHT_RIDGE = wp.constant(0.03)
 
 @wp.struct
 class Lighting:
-    """Normal equations and coefficients of the first-order spherical harmonics that light an instance, by channel.
-
-    The model is intensity = base colour (b₀ + b · normal).
+    """First-order spherical harmonics that light an instance, by pose and colour channel: partial sums of the normal equations by lane, and
+    the solved coefficients.
     """
 
     moments: wp.array3d[wp.mat44]

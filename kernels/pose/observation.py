@@ -17,7 +17,9 @@ NO_INSTANCE = wp.constant(-1)
 
 @wp.struct
 class Images:
-    """Depth and colour images, intrinsics and instance masks of a batch of views."""
+    """Input images of a batch of RGB-D views: sRGB colour, depth in counts with the metres per count, instance labels, intrinsics (fx, fy,
+    cx, cy), image size, and the lookup table from sRGB bytes to linear light.
+    """
 
     color: wp.array3d[wp.vec3ub]
     """(view, row, column): sRGB, red first."""
@@ -38,7 +40,7 @@ class Images:
 
 @wp.struct
 class Targets:
-    """View, mask label and model of each instance whose pose is estimated, and the inverse of this table."""
+    """Instances whose pose is estimated: view, mask label and model of each, and `row`, the instance by view and label (-1: none)."""
 
     view: wp.array[int]
     """(instance): view that shows the instance."""
@@ -52,7 +54,9 @@ class Targets:
 
 @wp.struct
 class Observation:
-    """Crop, mask, colours, surface points and normals of each instance, as a batch of views shows it."""
+    """Observation of each instance: box and pixel count of the visible mask; square crop with mask, linear colour and feature transform;
+    surface points with normals, grey values, mean, and the area [m²] that one point stands for. `row_*` are scratch.
+    """
 
     box: wp.array2d[int]
     """(instance, side): bounding box of the visible mask: x_min, y_min, x_max, y_max [px], inclusive; x_max < x_min: not visible."""
@@ -266,9 +270,8 @@ def find_nearest_kernel(
     # Out:
     nearest_out: wp.array3d[wp.vec2],  # (instance, row, column) [crop px]
 ):
-    """Second pass of the feature transform (Saito and Toriwaki, 1994): the nearest mask pixel over all rows.
-
-    Launched over instance, crop row, crop column.
+    """Second pass of the feature transform (Saito and Toriwaki, 1994): writes to `nearest_out` the offset (columns, rows) [crop px] from
+    each crop pixel to the nearest one of the mask. Launched over instance, crop row, crop column.
     """
     instance, row, column = wp.tid()
     if pixels[instance] == 0:

@@ -14,7 +14,9 @@ LANES = wp.constant(32)
 
 @wp.struct
 class Models:
-    """Meshes of the object models for closest-point queries, and samples with colours evenly spread over their surfaces. Constant."""
+    """Object models, in their own frames: mesh for closest-point queries, bounding radius [m], and samples evenly spread over the surface
+    with outward normal, linear base colour and the area [m²] one stands for. Constant.
+    """
 
     mesh: wp.array[wp.uint64]
     """(model): handle of the `wp.Mesh`."""
@@ -32,7 +34,9 @@ class Models:
 
 @wp.struct
 class LossParameters:
-    """Cutoffs and weights of the robust losses (Tukey, Huber, truncated), and the stride with which points and samples are taken."""
+    """Robust losses: outlier distance (Tukey, Huber) and truncation of costs [m], depth margin [m], weights of silhouette and colour
+    residuals, colour outliers, and the stride with which points and samples are taken.
+    """
 
     cutoff: float
     """Distance from which a surface residual is an outlier (Tukey's biweight), and a silhouette residual grows linearly (Huber) [m]."""
@@ -54,7 +58,7 @@ class LossParameters:
 
 @wp.struct
 class Sums:
-    """Partial sums of the normal equations H s = g and of the costs, per hypothesis and lane."""
+    """Partial sums, by hypothesis and lane, of the normal equations H s = g, and of costs and areas [m²] of points and samples."""
 
     hessian: wp.array2d[wp.spatial_matrix]
     """(pose, lane): [m²]."""

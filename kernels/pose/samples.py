@@ -18,7 +18,9 @@ PROTRUDING = wp.constant(2)
 
 @wp.struct
 class SampleView:
-    """Visibility state of a model sample in a view, with position, normal, crop coordinates, projected area and depth difference."""
+    """Model sample in a view: state (HIDDEN, VISIBLE, PROTRUDING), position [m] and normal in the camera frame, crop coordinates, area
+    across the ray [m²], depth by which it lies in front of what is seen there [m].
+    """
 
     state: int
     """HIDDEN, VISIBLE or PROTRUDING."""

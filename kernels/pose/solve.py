@@ -17,7 +17,9 @@ UNSEEN = wp.constant(1.0e6)
 
 @wp.struct
 class StepLimits:
-    """Damping, weight of the prior, and bounds of rotation and translation of a Gauss-Newton step."""
+    """Gauss-Newton step: weights of the prior pose and of damping relative to the observation, largest translation [m] and
+    rotation [rad].
+    """
 
     prior: float
     """Weight of staying at the prior pose, relative to that of the observation."""

@@ -15,7 +15,9 @@ MIN_DIRECTION = wp.constant(1.0e-6)
 
 @wp.struct
 class Match:
-    """Closest point of the mesh to an observed point and the normal there, in the frame of the model."""
+    """Closest point of the mesh to an observed point, in the model's frame: whether found, point and distance [m], unit direction from the
+    mesh to the observed point.
+    """
 
     found: bool
     point: wp.vec3

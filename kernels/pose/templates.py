@@ -30,7 +30,9 @@ NO_COST = wp.constant(1.0e6)
 
 @wp.struct
 class Templates:
-    """Depth images of the object models from all directions, with rotations and pixel widths. Constant."""
+    """Depth images of each object model from all directions: depth relative to the object's centre [m] (EMPTY: beside the object), rotation
+    from object to template camera by direction, pixel width [m] by model. Constant.
+    """
 
     depth: wp.array4d[float]
     """(model, direction, row, column): depth of the surface minus that of the object's centre [m]; `EMPTY`: beside the object."""
@@ -42,7 +44,9 @@ class Templates:
 
 @wp.struct
 class Probes:
-    """Points at which templates are compared with the observation: on the surface and beside the mask, in a frame at the centroid."""
+    """Points at which templates are compared with the observation, as offset (x, y) from the instance's centroid and depth relative to it
+    [m]: on the visible surface (inside), and beside the mask (outside), with weight and viewing direction.
+    """
 
     inside: wp.array2d[wp.vec3]
     """(instance, probe): observed surface points: offset (x, y) from the centroid, and depth relative to it [m]."""
@@ -60,7 +64,9 @@ class Probes:
 
 @wp.struct
 class Search:
-    """Extent of the search grid over in-plane rotations and shifts, and the parameters of its truncated loss."""
+    """Template search: number of in-plane rotations, of shifts to each side and their step (of the diameter), truncation of depth
+    differences and tolerance in front of the background [m].
+    """
 
     rotations: int
     """Number of in-plane rotations, about the optical axis."""

@@ -30,7 +30,7 @@ def assign_episodes_kernel(
     ending_inout: wp.array[int],  # (world)
     next_episode_inout: wp.array[int],  # (one)
 ):
-    """Assign episodes to free worlds in order: the next of `episodes`, or the same one again if it ended without delivery.
+    """Assign episodes to free worlds in order: the next of `episodes`, or the same one again if its arrangement is to be resampled.
 
     `arrangement_id` receives (episode index, arrangement index): the arrangement index counts the resamples of an episode, up to
     `tries` - 1; -1, 0 stands for no episode. Phases become START or IDLE. A single thread (dim 1) loops over the worlds, so that

@@ -47,7 +47,7 @@ class RotationError:
 
 @wp.struct
 class Wrench:
-    """Force and torque on the object at the TCP, in the world's axes."""
+    """Force [N] and torque [N·m] on the object at the TCP, in the world's axes."""
 
     force: wp.vec3
     """[N]"""
@@ -57,7 +57,9 @@ class Wrench:
 
 @wp.struct
 class TcpMotion:
-    """Pose, axes and velocity of the tcp frame, in the world's axes."""
+    """Motion of the TCP frame, in the world's axes: position [m], rotation to the world, unit axes of cup and wrist, moment arm from the
+    wrist to the TCP [m], velocity [m/s], angular velocity [rad/s].
+    """
 
     position: wp.vec3
     """[m]"""

@@ -33,8 +33,9 @@ def take_snapshot_kernel(
 ):
     """Copy episode, frame, catalog indices and poses of objects and fixtures into the snapshot.
 
-    `live` is 1 if the tick is a frame: in phase ACT, and in the tick in which a delivered episode ends. The gripper is invisible during
-    task LOOK, while it waits at home. Fixtures are tote, gripper shaft ("finger") and cup. Launched over world.
+    `live` is 1 if the tick is a frame: in phase ACT, and in the tick in which an episode ends that becomes part of the data set
+    (`delivers`). The gripper is invisible during task LOOK, in which it waits at home. Fixtures are tote, gripper shaft ("finger") and cup.
+    Launched over world.
     """
     world = wp.tid()
     live = int(0)
@@ -58,7 +59,8 @@ def take_snapshot_kernel(
 
 @wp.struct
 class FramePoses:
-    """Episode, frame, objects and poses of each world in one snapshot; the next snapshot repeats these as its previous frame.
+    """State of each world in one snapshot: whether the tick is a frame, episode and frame index, objects (-1: none) and poses to the world
+    of instances and fixtures; the next snapshot repeats these as its previous frame.
 
     Members are named as in `stages.buffers.LastFrame`.
     """

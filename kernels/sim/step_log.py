@@ -29,7 +29,7 @@ def body_of(layout: LayoutData, world: int, place: int, catalog_index: wp.array2
 
 @wp.func
 def add_force(body: int, force: wp.vec3, total: wp.array2d[wp.int64]):
-    """Add a contact force [N] to a body's fixed-point sums."""
+    """Add a contact force [N] to a body's fixed-point sums by atomics: its components to columns 0 to 2, its magnitude to column 3."""
     for axis in range(3):
         wp.atomic_add(total, body, axis, wp.int64(wp.rint(force[axis] * COUNTS_PER_NEWTON)))
     wp.atomic_add(total, body, MAGNITUDE, wp.int64(wp.rint(wp.length(force) * COUNTS_PER_NEWTON)))
@@ -77,9 +77,8 @@ def save_impedance_force_kernel(
     # Out:
     force_out: wp.array[wp.vec3],  # (world) [N]
 ):
-    """Save the gripper's impedance force [N], before seal forces are added: its joint forces without gravity compensation.
-
-    Launched over world.
+    """Save the force of the gripper's impedance control [N] to `force_out`: its x, y, z joint forces minus `weight` [N], the gravity
+    compensation in z, before seal forces are added. Launched over world.
     """
     world = wp.tid()
     first = world * layout.dofs
@@ -137,7 +136,7 @@ def record_forces_kernel(
     seal_force_out: wp.array3d[float],  # (world, step, instance) [N]
     attached_out: wp.array3d[wp.uint8],  # (world, step, instance)
 ):
-    """Record contact and seal forces of a step; NaN for instances that are not in the scene.
+    """Record contact and seal forces of a step; instances that are not in the scene have NaN, and 0 in `attached`.
 
     `contact_force` receives the vector sum over a body's contacts, `contact_load` the sum of magnitudes; both are means over the solver's
     substeps, whose forces `total` sums: `substep_fraction` is 1 / substeps. `attached` receives 1 if a seal holds the instance at the

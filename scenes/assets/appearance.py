@@ -30,7 +30,7 @@ _LINEAR_TOE = 0.0031308
 
 @dataclass(frozen=True, eq=False)
 class FileMaterial:
-    """Base colour, texture, metallic and roughness that a mesh file contains; None for those that it lacks."""
+    """Material as a mesh file states it: base colour (sRGB, 0 to 1), texture, metallic, roughness; None: not stated."""
 
     color: tuple[float, float, float]
     """Base colour factor, sRGB in 0..1; multiplies the texture in linear light."""

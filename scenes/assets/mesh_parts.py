@@ -33,7 +33,9 @@ _MAX_LISTED = 8
 
 @dataclass(frozen=True, eq=False)
 class MeshPart:
-    """A part of a mesh file: not yet validated, in the file's unit."""
+    """Part of a mesh file, not yet validated, in the file's unit: vertices, faces, material; normals, texture coordinates and vertex
+    colours (None: not stated).
+    """
 
     vertices: np.ndarray
     """(V, 3) float64."""
@@ -50,7 +52,7 @@ class MeshPart:
 
 @dataclass(eq=False)
 class Notes:
-    """What a reader replaced or left out of a mesh file, told in one line per file."""
+    """Notes of a reader on a mesh file: warnings on what was replaced, and features that are not used; told in one line per file."""
 
     substitute: bool = False
     """Whether an image that is not there is replaced by a colour, which is noted; otherwise it is an error."""

@@ -46,7 +46,7 @@ _MAX_UV = 1e4
 
 @dataclass(frozen=True)
 class MeshOptions:
-    """How meshes are completed: settings of the section objects."""
+    """Options by which meshes are completed: crease angle [°] of missing normals, centring, replacement of missing images."""
 
     crease_angle: float = DEFAULT_CREASE
     """Largest angle between two triangles that are smooth at a common vertex, in meshes without normals [°]."""
@@ -57,7 +57,7 @@ class MeshOptions:
 
 
 def _ignore(line: str) -> None:
-    """Default for `report`."""
+    """Default for `report`: drops the line."""
 
 
 def read_mesh(
@@ -152,7 +152,9 @@ def _orient_outward(vertices: np.ndarray, faces: np.ndarray, normals: np.ndarray
 
 
 def _clean(part: MeshPart, unit: float, path: Path) -> MeshPart:
-    """Validate a part, and drop degenerate triangles and unused vertices."""
+    """Part without degenerate triangles and unused vertices, still in its own unit (`unit` metres); raises CatalogError if it
+    is invalid.
+    """
     if not np.isfinite(part.vertices).all():
         raise CatalogError(f"{path}: {int((~np.isfinite(part.vertices)).any(axis=1).sum())} vertices are not finite; repair the mesh")
     wrong = part.faces[(part.faces < 0) | (part.faces >= len(part.vertices))]

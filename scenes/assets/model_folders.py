@@ -32,7 +32,7 @@ Fault = Callable[[CatalogError], None]
 
 @dataclass(frozen=True)
 class ModelFile:
-    """A mesh file that is an object."""
+    """Mesh file of an object: obj_id, name, folder that its references must not leave, and whether it is a BOP model (in millimetres)."""
 
     obj_id: int
     path: Path

@@ -47,7 +47,7 @@ _Number = Annotated[float, msgspec.Meta(ge=-_MAX_NUMBER, le=_MAX_NUMBER)]
 
 
 class _Axis(msgspec.Struct):
-    """Axis and offset of a continuous symmetry, in the units of the file."""
+    """Schema of a continuous symmetry: axis and a point on it, in the units of the file."""
 
     axis: tuple[_Number, _Number, _Number]
     offset: tuple[_Number, _Number, _Number] = (0.0, 0.0, 0.0)
@@ -90,7 +90,7 @@ def bop_obj_id(file: Path) -> int | None:
 
 
 def _raise(error: CatalogError) -> None:
-    """Default for `fault`."""
+    """Default for `fault`: raises the error."""
     raise error
 
 
@@ -191,7 +191,7 @@ def _near(value: float, expected: float, tolerance: float) -> bool:
 
 
 def _scaled(info: ModelInfo, factor: float) -> ModelInfo:
-    """The entry with all lengths multiplied."""
+    """Entry with all lengths multiplied by a factor."""
     return ModelInfo(
         None if info.diameter is None else factor * info.diameter,
         tuple(tuple(value * factor if at in (3, 7, 11) else value for at, value in enumerate(row)) for row in info.symmetries_discrete),
@@ -246,7 +246,7 @@ def read_entries(path: Path) -> dict[str, Any] | None:
 
 
 def _depth(content: Any) -> int:
-    """Depth of nested objects and lists; ends a level below MAX_DEPTH."""
+    """Depth of nested objects and lists, counted up to one level below MAX_DEPTH."""
     level, depth = [content], 0
     while level and depth <= MAX_DEPTH:
         level = [item for each in level if isinstance(each, dict | list) for item in (each.values() if isinstance(each, dict) else each)]

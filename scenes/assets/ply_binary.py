@@ -68,7 +68,7 @@ def _read_rows(count: int, properties: dict[str, str], data: bytes, start: int) 
 
 
 def _read_ragged(count: int, properties: dict[str, str], data: bytes, start: int) -> tuple[dict[str, np.ndarray], int]:
-    """As `_read_rows`, row by row."""
+    """Read the rows of an element with lists of several lengths, one by one; returns as `_read_rows`."""
     values: dict[str, list[Any]] = {name: [] for name in properties}
     codes = {"i1": "b", "u1": "B", "i2": "h", "u2": "H", "i4": "i", "u4": "I", "f4": "f", "f8": "d"}
     plan = []

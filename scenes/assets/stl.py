@@ -40,7 +40,7 @@ def read_stl(path: Path, notes: Notes) -> list[MeshPart]:
 
 
 def _binary(data: bytes, count: int, path: Path, notes: Notes) -> np.ndarray:
-    """Corners of a binary file (F, 3, 3) float64."""
+    """Triangle corners (F, 3, 3) float64 of a binary STL file."""
     if count > MAX_ROWS:
         raise CatalogError(f"{path}: announces {count} triangles; allowed: at most {MAX_ROWS}; decimate the mesh")
     if len(data) < _HEADER + count * _TRIANGLE.itemsize:
@@ -52,7 +52,7 @@ def _binary(data: bytes, count: int, path: Path, notes: Notes) -> np.ndarray:
 
 
 def _text(data: bytes, path: Path) -> np.ndarray:
-    """Corners of a text file (F, 3, 3) float64, of all its solids together."""
+    """Triangle corners (F, 3, 3) float64 of a text STL file, of all its solids together."""
     if len(data) > MAX_TEXT_MESH:
         raise CatalogError(f"{path}: too large for a text file; save it as binary STL")
     text = decode_text(data)

@@ -31,7 +31,7 @@ def pack_pieces(pieces: Shape) -> dict[str, np.ndarray]:
 
 
 def unpack_pieces(vertices: np.ndarray, faces: np.ndarray, counts: np.ndarray) -> Shape:
-    """Convex pieces from the arrays of `pack_pieces`."""
+    """Convex pieces of a shape from the arrays of `pack_pieces`."""
     ends = np.cumsum(counts, axis=0)[:-1]
     pairs = zip(np.split(vertices, ends[:, 0]), np.split(faces, ends[:, 1]), strict=True)
     return tuple(ConvexPiece(np.ascontiguousarray(v, np.float32), np.ascontiguousarray(f, np.int32)) for v, f in pairs)
@@ -46,13 +46,13 @@ def shape_key(mesh: TriangleMesh, recipe: ShapeRecipe) -> str:
 
 
 def embedded_shape(mesh: TriangleMesh, recipe: ShapeRecipe) -> Shape | None:
-    """The shape of an embedded object; None for other meshes and recipes."""
+    """Collision shape of an embedded object, from the file of the package; None for other meshes and recipes."""
     return _read_shapes().get(shape_key(mesh, recipe))
 
 
 @cache
 def _read_shapes() -> dict[str, Shape]:
-    """All shapes by their keys."""
+    """Read the embedded collision shapes, by their keys."""
     with np.load(FILE, allow_pickle=False) as data:
         keys = {name.partition(".")[0] for name in data.files}
         return {key: unpack_pieces(*(data[f"{key}.{name}"] for name in ("vertices", "faces", "counts"))) for key in keys}

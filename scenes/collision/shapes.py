@@ -124,7 +124,7 @@ def _decompose_all(jobs: Mapping[int, _Job], seconds: float, report: Callable[[s
 
 
 def _remedy(failure: Failure) -> str:
-    """What to do about an object that was not decomposed, for messages."""
+    """Advice for messages about an object that was not decomposed."""
     return _LATE if failure.timed_out else _REMEDY
 
 

@@ -61,7 +61,9 @@ _COPLANAR_ANGLE = 1e-3
 
 @dataclass(frozen=True)
 class _Facets:
-    """Half-spaces n·x ≤ d relative to a hull's centroid: of clusters of its triangles, largest area first, then of sides of a box."""
+    """Half-spaces n·x ≤ d relative to a hull's centroid, with the mean gap to its surface: those of clusters of its triangles, largest area
+    first, then sides of a box along the principal axes.
+    """
 
     normal: np.ndarray
     """Outward unit normal n (facet, 3)."""

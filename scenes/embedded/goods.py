@@ -13,7 +13,7 @@ WHITE = (250, 250, 247)
 
 
 def coffee_tin() -> Shape:
-    """A large tin with a plastic lid; the same label in front and behind."""
+    """Shape of a large tin with a plastic lid; the same label in front and behind."""
     label = Label(("COFFEE",), "GROUND DARK ROAST", "NET 410 g", (24, 40, 92), (196, 150, 60), WHITE, _beans, 100)
     ring, height = ellipse(0.1016, 0.1016, packs.SIDES), 0.140
     ends = {
@@ -25,19 +25,19 @@ def coffee_tin() -> Shape:
 
 
 def cracker_carton() -> Shape:
-    """A tall carton."""
+    """Shape of a tall carton of crackers, with a printed label."""
     label = Label(("GOLDEN", "CRACKERS"), "BAKED WITH SEA SALT", "NET 411 g", (190, 28, 34), (240, 190, 60), WHITE, _crackers, 200)
     return packs.carton((0.062, 0.159, 0.212), label)
 
 
 def sugar_carton() -> Shape:
-    """A slim carton."""
+    """Shape of a slim carton of sugar, with a printed label."""
     label = Label(("FINE", "SUGAR"), "PURE CANE", "NET 514 g", (246, 214, 70), (30, 74, 152), (22, 48, 110), _cubes, 300)
     return packs.carton((0.041, 0.091, 0.175), label)
 
 
 def soup_tin() -> Shape:
-    """A small tin with a paper label."""
+    """Shape of a small soup tin with a paper label."""
     label = Label(("TOMATO", "SOUP"), "READY IN 5 MINUTES", "NET 305 g", (200, 34, 30), (248, 240, 222), WHITE, _tomato, 400)
     ring, height = ellipse(0.0676, 0.0676, packs.SIDES), 0.1018
     ends = {"top": packs.stamped_end(256, packs.SILVER, 409, "BEST 2030"), "bottom": packs.stamped_end(256, packs.SILVER, 410, "")}
@@ -45,7 +45,7 @@ def soup_tin() -> Shape:
 
 
 def squeeze_bottle() -> Shape:
-    """A flat bottle with a nozzle."""
+    """Shape of a flat mustard bottle with a nozzle."""
     label = Label(("MUSTARD",), "MILD & YELLOW", "NET 550 g", (244, 200, 32), (170, 30, 26), (150, 24, 22), _leaf, 500)
     levels = [
         (0.080, 0.050, 2.6, -0.0955),
@@ -80,7 +80,7 @@ def squeeze_bottle() -> Shape:
 
 
 def fish_tin() -> Shape:
-    """A flat tin, printed on its lid."""
+    """Shape of a flat tin, printed on its lid."""
     label = Label(("TUNA", "CHUNKS"), "IN SPRING WATER", "NET 171 g", (20, 96, 128), (240, 168, 40), WHITE, _fish, 600)
     ring, height = ellipse(0.0855, 0.0855, packs.SIDES), 0.0335
     width, high = packs.tin_label_size(ring, height)
@@ -91,19 +91,19 @@ def fish_tin() -> Shape:
 
 
 def dessert_carton() -> Shape:
-    """A flat carton."""
+    """Shape of a flat carton of pudding, with a printed label."""
     label = Label(("CHOCOLATE", "PUDDING"), "JUST ADD MILK", "NET 187 g", (92, 52, 34), (236, 220, 190), WHITE, _swirl, 700)
     return packs.carton((0.111, 0.089, 0.0365), label)
 
 
 def jelly_carton() -> Shape:
-    """A small flat carton."""
+    """Shape of a small flat carton of jelly, with a printed label."""
     label = Label(("CHERRY", "JELLY"), "DESSERT POWDER", "NET 97 g", (206, 30, 80), (250, 214, 60), WHITE, _cherries, 800)
     return packs.carton((0.073, 0.086, 0.029), label)
 
 
 def meat_tin() -> Shape:
-    """A tin with flat sides."""
+    """Shape of a tin with flat sides."""
     label = Label(("POTTED", "MEAT"), "SLICED & SMOKED", "NET 370 g", (28, 52, 122), (250, 202, 40), (252, 224, 90), _slices, 900)
     ring, height = packs.label_ring(0.1005, 0.0580, 0.021), 0.0832
     ends = {"top": packs.stamped_end(256, packs.SILVER, 909, "PULL TO OPEN"), "bottom": packs.stamped_end(256, packs.SILVER, 910, "")}
@@ -111,7 +111,7 @@ def meat_tin() -> Shape:
 
 
 def cleaner_bottle() -> Shape:
-    """A large flat bottle with a blue screw cap."""
+    """Shape of a large flat bottle with a blue screw cap."""
     label = Label(("SURFACE", "CLEANER"), "FRESH SCENT", "1 litre", (30, 104, 188), (250, 236, 70), WHITE, _bubbles, 1200, food=False)
     levels = [
         (0.086, 0.054, 2.6, -0.1252),

@@ -112,7 +112,7 @@ def other_side(width: int, height: int, label: Label) -> np.ndarray:
 
 
 def end(width: int, height: int, label: Label) -> np.ndarray:
-    """Draw the top or bottom of a carton: title."""
+    """Draw the top or bottom panel of a carton, with the title."""
     image = paint.blank(width, height, label.color)
     paint.fill(image, (0.0, 0.0, 1.0, 0.1), label.accent)
     paint.fill(image, (0.0, 0.9, 1.0, 1.0), label.accent)

@@ -44,7 +44,7 @@ def _low_sun(view: np.ndarray) -> np.ndarray:
 
 
 def _softboxes(view: np.ndarray) -> np.ndarray:
-    """A dim studio with two large panels overhead and a small one behind."""
+    """Radiance of a dim studio with two large panels overhead and a small one behind."""
     room = _room(view, (0.16, 0.16, 0.17), (0.10, 0.10, 0.10))
     room += _color((15.0, 14.6, 14.0)) * _panel(view, (0.9, 0.2), (0.42, 0.62), 0.06)
     room += _color((8.5, 8.9, 9.6)) * _panel(view, (-0.9, -0.3), (0.38, 0.55), 0.06)
@@ -52,7 +52,7 @@ def _softboxes(view: np.ndarray) -> np.ndarray:
 
 
 def _warehouse(view: np.ndarray) -> np.ndarray:
-    """A hall with five rows of ceiling lamps."""
+    """Radiance of a hall with five rows of ceiling lamps."""
     hall = _room(view, (0.34, 0.35, 0.35), (0.22, 0.21, 0.20))
     for row in np.linspace(-2.0, 2.0, 5):
         for place in np.linspace(-2.4, 2.4, 7):
@@ -82,7 +82,7 @@ def _mixed_lamps(view: np.ndarray) -> np.ndarray:
 
 
 def _room(view: np.ndarray, walls: Rgb, floor: Rgb) -> np.ndarray:
-    """A plain room: walls that get brighter upward, over a floor."""
+    """Radiance of a plain room: walls that get brighter upward, over a floor."""
     return _ground(view, _color(walls) * (0.7 + 0.6 * np.clip(view[..., 2:], 0, 1)), floor)
 
 

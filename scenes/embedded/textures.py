@@ -23,7 +23,7 @@ PADDING = 3
 
 
 def blank(width: int, height: int, color: Color) -> np.ndarray:
-    """Make an image of one colour."""
+    """Image of one colour."""
     return np.full((height, width, 3), color, np.uint8)
 
 
@@ -58,7 +58,7 @@ def pack(images: dict[str, np.ndarray], width: int) -> tuple[np.ndarray, dict[st
 
 
 def fill(image: np.ndarray, box: Box, color: Color) -> None:
-    """Fill a rectangle."""
+    """Fill a rectangle of a texture with a colour."""
     left, top, right, bottom = _pixels(image, box)
     image[top:bottom, left:right] = color
 
@@ -132,20 +132,20 @@ def grain(width: int, height: int, scale: tuple[float, float], seed: int) -> np.
 
 
 def plain(color: Color, seed: int, roughness: float = 0.04) -> np.ndarray:
-    """Moulded plastic: one colour with faint specks."""
+    """Texture of moulded plastic: one colour with faint specks."""
     size = 128
     noise = 0.6 * grain(size, size, (2, 2), seed) + 0.4 * grain(size, size, (24, 24), seed + 1) - 0.5
     return _to_uint8(np.array(color, np.float32) * (1 + 2 * roughness * noise[..., None]))
 
 
 def brushed(width: int, height: int, color: Color, seed: int) -> np.ndarray:
-    """Brushed metal: fine horizontal scratches."""
+    """Texture of brushed metal: fine horizontal scratches."""
     noise = 0.7 * grain(width, height, (60, 1.5), seed) + 0.3 * grain(width, height, (width / 2, 6), seed + 1) - 0.5
     return _to_uint8(np.array(color, np.float32) * (1 + 0.3 * noise[..., None]))
 
 
 def rings(size: int, colors: tuple[Color, Color], count: float) -> np.ndarray:
-    """Concentric grooves of two colours, rotationally symmetric."""
+    """Texture of concentric grooves of two colours, rotationally symmetric."""
     axis = (np.arange(size) + 0.5) / size * 2 - 1
     radius = np.hypot(*np.meshgrid(axis, axis))
     wave = (0.5 + 0.5 * np.cos(radius * 2 * np.pi * count))[..., None]
@@ -163,7 +163,7 @@ def wood(width: int, height: int, seed: int) -> np.ndarray:
 
 
 def end_grain(size: int, seed: int) -> np.ndarray:
-    """Wood across the grain: growth rings around the centre, symmetric under rotation by 90°."""
+    """Texture of wood across the grain: growth rings around the centre, symmetric under rotation by 90°."""
     axis = np.linspace(-1.0, 1.0, size, dtype=np.float32)
     radius = np.hypot(*np.meshgrid(axis, axis))
     warp = grain(size, size, (size / 4, size / 4), seed)
@@ -173,7 +173,7 @@ def end_grain(size: int, seed: int) -> np.ndarray:
 
 
 def foam(width: int, height: int, color: Color, seed: int) -> np.ndarray:
-    """Fine-pored foam, symmetric under rotation by 180°."""
+    """Texture of fine-pored foam, symmetric under rotation by 180°."""
     pores = _symmetrize(grain(width, height, (3, 3), seed))
     blotch = _symmetrize(grain(width, height, (30, 30), seed + 1)) - 0.5
     tone = 1 - np.clip(0.42 - pores, 0, 1) + 0.12 * blotch
@@ -196,7 +196,7 @@ def peel(width: int, height: int, seed: int) -> np.ndarray:
 
 
 def _symmetrize(noise: np.ndarray) -> np.ndarray:
-    """Make noise symmetric under a half-turn."""
+    """Noise made symmetric under a half-turn."""
     return (noise + noise[::-1, ::-1]) / 2
 
 

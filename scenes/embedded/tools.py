@@ -31,7 +31,7 @@ STEEL = (186, 189, 194)
 
 
 def banana() -> Shape:
-    """A banana, lying flat."""
+    """Shape of a banana, lying flat: a tube of pentagonal section along an arc."""
     angle = np.radians(np.linspace(-62, 62, 33))
     bend_radius = 0.1065
     path = np.stack([bend_radius * np.cos(angle), bend_radius * np.sin(angle), np.zeros_like(angle)], axis=1)
@@ -47,7 +47,7 @@ def banana() -> Shape:
 
 
 def drill() -> Shape:
-    """A cordless drill, lying on its side."""
+    """Shape of a cordless drill, lying on its side."""
     images = {
         "motor": _drill_label(),
         "black": paint.plain(BLACK, 1501),
@@ -86,14 +86,14 @@ def drill() -> Shape:
 
 
 def wood_block() -> Shape:
-    """A square block with four equal sides and two equal ends, so that it is symmetric."""
+    """Shape of a square block with four equal sides and two equal ends, so that it is symmetric."""
     texture, at = paint.pack({"side": paint.wood(300, 706, 1600), "end": paint.end_grain(300, 1602)}, 624)
     rects = {name: at["end" if name[1] == "z" else "side"] for name in BOX_FACES}
     return rounded_box((0.0875, 0.0875, 0.206), 0.002, rects), texture
 
 
 def foam_block() -> Shape:
-    """A brick of foam; opposite faces are equal, so that it is symmetric."""
+    """Shape of a foam brick; opposite faces are equal, so that it is symmetric."""
     color = (178, 66, 44)
     images = {"x": paint.foam(312, 202, color, 2100), "y": paint.foam(208, 202, color, 2102), "z": paint.foam(208, 312, color, 2104)}
     texture, at = paint.pack(images, 540)
@@ -101,7 +101,7 @@ def foam_block() -> Shape:
 
 
 def scissors() -> Shape:
-    """Scissors, nearly closed, with one larger loop."""
+    """Shape of scissors, nearly closed, with one larger loop."""
     images = {
         "steel": paint.brushed(256, 64, STEEL, 1700),
         "grip": paint.plain((36, 78, 160), 1701),
@@ -122,7 +122,7 @@ def scissors() -> Shape:
 
 
 def marker() -> Shape:
-    """A thick marker along y; with bands of colour and no print, so that it is symmetric about its axis."""
+    """Shape of a thick marker along y; with bands of colour and no print, so that it is symmetric about its axis."""
     bands = paint.blank(16, 256, (240, 240, 236))
     paint.fill(bands, (0.0, 0.0, 1.0, 0.06), (200, 30, 36))
     paint.fill(bands, (0.0, 0.30, 1.0, 0.34), (28, 28, 32))
@@ -145,18 +145,18 @@ def marker() -> Shape:
 
 
 def clamp() -> Shape:
-    """A spring clamp along y."""
+    """Shape of a spring clamp along y."""
     return _clamp(0.171, 0.120, 0.0380, 1900)
 
 
 def large_clamp() -> Shape:
-    """A larger spring clamp, along x."""
+    """Shape of a larger spring clamp, along x."""
     patch, texture = _clamp(0.210, 0.164, 0.0345, 2000)
     return patch.rotate("z", -90.0), texture
 
 
 def _clamp(length: float, width: float, depth: float, seed: int) -> Shape:
-    """A spring clamp along y, symmetric under a rotation by 180° about y."""
+    """Shape of a spring clamp along y, symmetric under a rotation by 180° about y."""
     images = {"black": paint.plain(BLACK, seed), "orange": paint.plain(ORANGE, seed + 1), "steel": paint.plain(STEEL, seed + 2)}
     texture, at = paint.pack(images, 512)
     points = ((-0.445, -0.48), (-0.40, -0.40), (-0.30, -0.20), (-0.13, 0.02), (-0.095, 0.13), (-0.125, 0.26), (-0.09, 0.39), (-0.035, 0.48))
@@ -189,7 +189,7 @@ def _bar_rings(spine: Points, z: float, depths: list[float], widths: list[float]
 
 
 def _bar(spine: Points, z: float, depths: list[float], widths: list[float], rect: Rect) -> Patch:
-    """Closed bar; see `_bar_rings`."""
+    """Closed bar along a spine, as a patch with texture coordinates in `rect`. See `_bar_rings`."""
     return solid(_bar_rings(spine, z, depths, widths), rect)
 
 

@@ -13,7 +13,7 @@ SIDES = 48
 
 
 def bowl() -> Shape:
-    """A bowl of enamel: red outside, cream inside, a dark rim; symmetric about its axis."""
+    """Shape of an enamel bowl: red outside, cream inside, a dark rim; symmetric about its axis."""
     outside = [
         (0.032, -0.0275),
         (0.034, -0.0275),
@@ -42,7 +42,7 @@ def bowl() -> Shape:
 
 
 def mug() -> Shape:
-    """A mug with a print in front and a handle to the right of it."""
+    """Shape of a mug with a print in front and a handle to the right of it."""
     outside = [(0.0465, -0.0385), (0.0465, -0.02), (0.0465, 0.0), (0.0465, 0.02), (0.0465, 0.0365)]
     foot = [(0.0400, -0.0392), (0.0405, -0.0407), (0.0440, -0.0407), (0.0457, -0.0400), (0.0465, -0.0385)]
     rim = [(0.0465, 0.0365), (0.0465, 0.0395), (0.0458, 0.0405), (0.0438, 0.0405), (0.0430, 0.0395)]
@@ -63,7 +63,7 @@ def mug() -> Shape:
 
 
 def pitcher() -> Shape:
-    """An open pitcher with spout, handle and a scale."""
+    """Shape of an open pitcher with spout, handle and a scale."""
     outside = [(0.054, -0.1190), (0.0555, -0.1170), (0.0580, -0.06), (0.0605, 0.0), (0.0628, 0.05), (0.0648, 0.09), (0.0660, 0.1195)]
     foot = [(0.0500, -0.1205), (0.0505, -0.1212), (0.0530, -0.1212), (0.0540, -0.1190)]
     rim = [(0.0660, 0.1195), (0.0658, 0.1212), (0.0640, 0.1212), (0.0632, 0.1195)]
@@ -86,7 +86,7 @@ def pitcher() -> Shape:
 
 
 def _handle(reach: tuple[float, float, float], section: tuple[float, float], rect: Rect) -> Patch:
-    """A handle towards +x, swept along a superellipse, whose ends lie inside the wall.
+    """Handle towards +x, swept along a superellipse, whose ends lie inside the wall.
 
     Args:
         reach: x of its ends, its extent from there, and half the distance between its ends.
@@ -111,7 +111,7 @@ def _add_spout(rings: np.ndarray) -> np.ndarray:
 
 
 def _mug_print(width: int, height: int, color: paint.Color) -> np.ndarray:
-    """Draw the print of a mug."""
+    """Texture of a mug's outside, with its print."""
     image = paint.blank(width, height, color)
     paint.fill(image, (0.0, 0.0, 1.0, 0.08), (240, 236, 224))
     paint.fill(image, (0.0, 0.92, 1.0, 1.0), (240, 236, 224))
@@ -124,7 +124,7 @@ def _mug_print(width: int, height: int, color: paint.Color) -> np.ndarray:
 
 
 def _pitcher_scale(width: int, height: int, color: paint.Color) -> np.ndarray:
-    """Draw the measuring scale of a pitcher."""
+    """Texture of a pitcher's outside, with the measuring scale."""
     image = paint.plain(color, 1102)[:64, :64]
     image = np.tile(image, (height // 64 + 1, width // 64 + 1, 1))[:height, :width].copy()
     pale = (222, 232, 248)

@@ -57,18 +57,18 @@ class LiveProgress:
         self._bar.stop()
 
     def stage(self, text: str) -> None:
-        """Show the stage's name."""
+        """Show the stage's name beside the bar."""
         self._bar.update(self._task, description=text, detail="")
 
     def update(
         self, *, episodes_done: int, episodes: int, worlds_active: int, views: int, views_per_s: float, seconds_left: float | None
     ) -> None:
-        """Update the bar."""
+        """Set the bar to the episodes done, with worlds, views and time left [s] beside it. See `Progress`."""
         detail = _detail(worlds_active, views, views_per_s, seconds_left)
         self._bar.update(self._task, completed=episodes_done, total=episodes, detail=detail)
 
     def note(self, text: str) -> None:
-        """Print a line above the bar."""
+        """Print a note as a line above the bar."""
         self._bar.console.print(text, markup=False)
 
 
@@ -87,7 +87,7 @@ class PlainProgress:
         return None
 
     def stage(self, text: str) -> None:
-        """Print the stage."""
+        """Print the stage's name as a line."""
         self.note(text)
 
     def update(
@@ -130,7 +130,7 @@ class CountProgress:
         self._bar.stop()
 
     def report(self, unit: str, done: int, total: int) -> None:
-        """See `progress.Report`."""
+        """Set the bar; without a terminal print a line, at most every PLAIN_INTERVAL. See `progress.Report`."""
         self._bar.update(self._task, description=unit, completed=done, total=total)
         now = time.monotonic()
         if not self._console.is_terminal and now - self._printed_at >= PLAIN_INTERVAL:
@@ -190,7 +190,7 @@ def print_profile(console: Console, recorder: Recorder) -> None:
 
 
 def _listing(rows: Sequence[EpisodeRow]) -> Table:
-    """Table with one line per episode."""
+    """Table of episodes, one line each: mode, ending, resamples, frames, time, and attempts if there are any."""
     columns = ["episode", "mode", "ending", "resampled", "frames", "time"]
     cells = [
         [str(row.episode), row.mode, row.ending.sentence, str(row.arrangement), str(row.frames), _duration(row.seconds)] for row in rows

@@ -43,6 +43,7 @@ def is_data_set(folder: Path | str) -> bool:
 
 
 def _has(path: str, kind: Callable[[int], bool]) -> bool:
+    """Whether there is an entry at the path, links not followed, whose mode is of this kind."""
     try:
         return kind(os.lstat(path).st_mode)
     except (OSError, ValueError):
@@ -85,6 +86,7 @@ def choose_output(config: Config) -> tuple[Path, str]:
 
 
 def _is_same_bake(folder: Path, config: Config) -> bool:
+    """Whether a folder is a data set of these settings, inputs (models, lights) left out; False if it cannot be read."""
     from synpick_warp.dataset.commit.manifest import CONFIG_FILE, INPUTS, describe_differences, make_manifest, read_manifest, read_settings
 
     if not is_data_set(folder):
@@ -100,7 +102,7 @@ def _is_same_bake(folder: Path, config: Config) -> bool:
 
 
 def _extent(config: Config) -> tuple[object, ...]:
-    """Episodes and folders, which the manifest does not have."""
+    """What the manifest does not have of a bake: numbers of episodes, absolute folders of models and lights."""
     folders = (os.path.abspath(path) if path else "" for path in (config.bake.models, config.bake.lights))
     return (config.bake.episodes, *(split.episodes for split in config.splits), *folders)
 
@@ -185,7 +187,7 @@ def find_data_set(named: Path | None, usage: str, suits: Callable[[Path], bool] 
 
 
 def _list_data_sets() -> Iterator[_Found]:
-    """Data sets in the current folder."""
+    """Yield the data sets among the folders in the current one."""
     with os.scandir() as entries:
         for entry in entries:
             if not entry.name.startswith(".") and entry.is_dir() and is_data_set(entry.name):

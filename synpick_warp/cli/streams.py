@@ -41,6 +41,7 @@ class _StandardOutput(io.FileIO):
         self._raised = False
 
     def write(self, data: ReadableBuffer, /) -> int:
+        """Write to the stream; a fault is raised once as StreamError in the main thread, later text is dropped."""
         if self.fault is None:
             try:
                 return _write_all(super().write, self, data)
@@ -59,6 +60,7 @@ class _StandardError(io.FileIO):
         super().__init__(2, "wb", closefd=False)
 
     def write(self, data: ReadableBuffer, /) -> int:
+        """Write to the stream; faults are ignored."""
         try:
             return _write_all(super().write, self, data)
         except OSError:

@@ -43,7 +43,9 @@ MAX_SYMMETRIES = 1024
 
 
 class CameraEntry(Struct, gc=False):
-    """A view's entry in scene_camera.json [mm]. Data sets of others may lack the extrinsics."""
+    """Schema of a view's entry in scene_camera.json: K [px], depth scale, world-to-camera rotation and translation [mm], which data sets of
+    other programs may lack.
+    """
 
     cam_K: Matrix3  # noqa: N815
     depth_scale: Annotated[float, Meta(gt=0.0, le=1e6)]
@@ -52,7 +54,9 @@ class CameraEntry(Struct, gc=False):
 
 
 class LenientCameraEntry(Struct, gc=False):
-    """A view's entry in scene_camera.json, as data sets of others have it: with a camera model instead of a matrix, without depth."""
+    """Schema of a view's entry in scene_camera.json as other programs write it: any of K (camera model instead), depth scale and extrinsics
+    may be missing.
+    """
 
     cam_K: Matrix3 | UnsetType = UNSET  # noqa: N815
     depth_scale: Annotated[float, Meta(gt=0.0, le=1e6)] | UnsetType = UNSET
@@ -61,7 +65,7 @@ class LenientCameraEntry(Struct, gc=False):
 
 
 class TruthEntry(Struct, gc=False):
-    """An instance's entry in scene_gt.json [mm]."""
+    """Schema of an instance's entry in scene_gt.json: object-to-camera rotation and translation [mm], obj_id, instance_id if known."""
 
     cam_R_m2c: Rotation  # noqa: N815
     cam_t_m2c: Vector3
@@ -70,7 +74,7 @@ class TruthEntry(Struct, gc=False):
 
 
 class InfoEntry(Struct, gc=False):
-    """An instance's entry in scene_gt_info.json [px]."""
+    """Schema of an instance's entry in scene_gt_info.json: boxes and pixel counts [px], visible fraction."""
 
     bbox_obj: Box
     bbox_visib: Box
@@ -81,7 +85,7 @@ class InfoEntry(Struct, gc=False):
 
 
 class RunLengths(Struct, gc=False):
-    """A mask in COCO's uncompressed run-length encoding."""
+    """Schema of a mask in COCO's uncompressed run-length encoding; size is height, width."""
 
     counts: list[Index]
     size: tuple[Side, Side]
@@ -89,20 +93,20 @@ class RunLengths(Struct, gc=False):
 
 
 class ContinuousSymmetry(Struct, gc=False):
-    """Axis of rotation of an object and a point on it [mm]."""
+    """Schema of a continuous symmetry: axis of rotation in the object's frame, and a point on it [mm]."""
 
     axis: Vector3
     offset: Vector3
 
 
 class ModelDiameter(Struct, gc=False):
-    """The part of an object's entry in models_info.json that names are found by [mm]."""
+    """Schema of an object's entry in models_info.json, reduced to the diameter [mm], by which names are found."""
 
     diameter: Annotated[float, Meta(gt=0.0, le=1e9)]
 
 
 class ModelInfo(ModelDiameter, gc=False):
-    """An object's entry in models_info.json [mm]."""
+    """Schema of an object's entry in models_info.json: diameter, bounding box and symmetries [mm]."""
 
     min_x: Length
     min_y: Length
@@ -115,7 +119,7 @@ class ModelInfo(ModelDiameter, gc=False):
 
 
 class TargetEntry(Struct, gc=False):
-    """A record of a target list, such as test_targets_bop19.json; those of 2024 have neither object nor count."""
+    """Schema of a record of a target list, such as test_targets_bop19.json; those of 2024 have neither object nor count."""
 
     scene_id: Index
     im_id: Index | list[tuple[str, Index]]
@@ -127,14 +131,14 @@ class TargetEntry(Struct, gc=False):
 
 
 class EpisodeRow(Struct, gc=False):
-    """What every row of the episode list has."""
+    """Schema of a row of the episode list: frames and ending, which every row has."""
 
     frames: Index
     ending: str
 
 
 class EpisodeEntry(Struct, gc=False):
-    """An episode's manifest entry, as far as it is read back."""
+    """Schema of an episode's manifest entry, as far as it is read back: row and attempts."""
 
     row: EpisodeRow
     attempts: list[dict[str, Any]] = []
@@ -170,7 +174,7 @@ def read_checked(path: Path, schema: Any) -> Any:
 
 
 def check_content(content: Any, schema: type[_Content], source: object) -> _Content:
-    """Check decoded JSON against a schema.
+    """Check decoded JSON against a schema; returns it as the schema's types.
 
     Raises:
         DatasetError: In one line: it is not of this schema.

@@ -39,20 +39,26 @@ _Sizes = list[Annotated[int, Meta(ge=1, lt=2**40)]]
 
 
 class _ChunkShape(Struct):
+    """Schema of a chunk grid's configuration in zarr.json."""
+
     chunk_shape: _Sizes
 
 
 class _ChunkGrid(Struct):
+    """Schema of a regular chunk grid in zarr.json."""
+
     name: Literal["regular"]
     configuration: _ChunkShape
 
 
 class _IndexCodec(Struct):
+    """Schema of a codec of a shard's index in zarr.json."""
+
     name: Literal["bytes", "crc32c"]
 
 
 class _CodecSettings(Struct):
-    """Configuration of a codec; only `sharding_indexed` has these keys."""
+    """Schema of a codec's configuration; only `sharding_indexed` has these keys."""
 
     chunk_shape: _Sizes | None = None
     codecs: list[_Codec] = []
@@ -60,12 +66,14 @@ class _CodecSettings(Struct):
 
 
 class _Codec(Struct):
+    """Schema of a codec in zarr.json, with its configuration."""
+
     name: Literal["bytes", "zstd", "crc32c", "sharding_indexed"]
     configuration: _CodecSettings | None = None
 
 
 class ArrayMetadata(Struct):
-    """The zarr.json of an array, as far as it decides on memory and code: other codecs and types are never loaded."""
+    """Schema of an array's zarr.json: shape, type, chunks and codecs; others than these codecs and types are never loaded."""
 
     zarr_format: Literal[3]
     node_type: Literal["array"]

@@ -70,11 +70,12 @@ class Episode:
 
     @property
     def number(self) -> int:
-        """Same as `index`."""
+        """Index of the episode, the same as `index`."""
         return self.index
 
     @cached_property
     def _record(self) -> dict[str, Any] | None:
+        """Entry of the episode in the manifest; None: the data set has none."""
         path = self._data_set.folder / f"{episode_entry(self.index)}.json"
         return read_checked(path, EpisodeEntry) if path.exists() else None
 
@@ -85,16 +86,18 @@ class Episode:
 
     @cached_property
     def _sizes(self) -> dict[str, int]:
-        """Sizes of the arrays' dimensions."""
+        """Sizes of the dimensions of the episode's arrays, by name."""
         store = check_content(self._data_set.attributes, StoreAttributes, self._data_set.folder / STORE)
         attempts = {} if self._record is None else {"attempt": len(self.attempts)}
         return {"tick": len(self), "step": len(self) * store.steps_per_tick} | attempts
 
     @cached_property
     def _files(self) -> frozenset[Path]:
+        """Paths of the episode's files, relative to the data set."""
         return self._data_set.listed_files(episode_entry(self.index))
 
     def _arrays(self, name: str) -> Arrays:
+        """Arrays of a group of the episode in the zarr store."""
         return Arrays(self.group / name, EPISODE_GROUPS[name], self._context)
 
     @cached_property
@@ -135,7 +138,7 @@ class Episode:
 
     @property
     def attempt_arrays(self) -> Arrays:
-        """`attempts` as arrays, with one row per attempt."""
+        """Attempts of the episode as arrays of the zarr store, one row per attempt."""
         return self._arrays("attempts")
 
     @cached_property
@@ -181,16 +184,7 @@ class Episode:
         return self._data_set.folder / USD / f"{self.index:06d}.usdc"
 
     def view(self, frame: int, camera: int = 0) -> View:
-        """One rendered view.
-
-        Args:
-            frame: Index of the frame among `image_ids`; negative: from the end.
-            camera: Index of the camera.
-
-        Raises:
-            IndexError: There is no such frame or camera.
-            DatasetError: The data set has no images.
-        """
+        """View of a frame and camera."""
         from synpick_warp.dataset.view import View
 
         frames, cameras = len(self), self._data_set.camera_count
@@ -363,14 +357,14 @@ class DataSet(Mapping[int, Episode]):
 
     @cached_property
     def camera_count(self) -> int:
-        """Number of cameras."""
+        """Number of cameras: found in files, or of the settings."""
         if self.found is not None:
             return self.found.cameras
         return len(self.config.cameras.positions)
 
     @property
     def attempts(self) -> Iterator[dict[str, Any]]:
-        """Pick attempts of all episodes, in order."""
+        """Yield the attempts to pick of all episodes, in order: dictionaries with the keys of attempts.jsonl."""
         return (attempt for episode in self.values() for attempt in episode.attempts)
 
     @property
@@ -405,7 +399,7 @@ class DataSet(Mapping[int, Episode]):
         return named or {self.config.bop.split: self}
 
     def split(self, name: str) -> DataSet:
-        """The episodes of one split.
+        """Data set reduced to the episodes of one split.
 
         Raises:
             DatasetError: There is no such split.
@@ -423,7 +417,7 @@ class DataSet(Mapping[int, Episode]):
 
     @cached_property
     def _scenes(self) -> SceneIndex | FoundScenes | None:
-        """Where scenes are; None without settings."""
+        """Locations of the scenes' files; None: without settings they are not known."""
         if self.found is not None:
             return self.found
         return SceneIndex(self.folder, self.config) if (self.folder / CONFIG_FILE).exists() else None
@@ -442,7 +436,7 @@ class DataSet(Mapping[int, Episode]):
         return SceneIndex(self.folder, self.config).files(episode, camera) if self._scenes is None else self._scenes.files(episode, camera)
 
     def _has_files(self, index: int) -> bool:
-        """Whether an episode has files in some format."""
+        """Whether an episode has files in any format."""
         paths = [self._store / EPISODES / f"{index:06d}" / GROUP_FILE, *(self.folder / part.file(index) for part in self._parts)]
         return any(path.exists() for path in paths) or (self._scenes is not None and self._scenes.has(index))
 
@@ -455,7 +449,7 @@ class DataSet(Mapping[int, Episode]):
             yield from self._scenes.episodes()
 
     def _is_committed(self, index: int) -> bool:
-        """Whether an episode is one of these and has its manifest entry; without manifest, as in a lone store, there is none to check."""
+        """Whether an episode belongs to this selection and has a manifest entry; always, without manifest, as in a lone store."""
         if self._only is not None and index not in self._only:
             return False
         return self.found is not None or not (self.folder / ENTRIES).is_dir() or (self.folder / f"{episode_entry(index)}.json").is_file()

@@ -37,7 +37,7 @@ _Schema = TypeVar("_Schema", bound=msgspec.Struct)
 
 
 class Manifest(msgspec.Struct):
-    """Content of manifest.json."""
+    """Schema of manifest.json: format version, seed, package versions, settings with checksum, digests of the inputs."""
 
     format: int
     seed: int
@@ -48,7 +48,7 @@ class Manifest(msgspec.Struct):
 
 
 class Entry(msgspec.Struct):
-    """Entry of constants: what every entry has."""
+    """Schema of a manifest entry: number and size [B] of its files, and SHA-256 of its checksum list."""
 
     files: Index
     """Number of files."""
@@ -59,14 +59,14 @@ class Entry(msgspec.Struct):
 
 
 class IndicesEntry(Entry):
-    """Entry of the indices over all episodes."""
+    """Schema of the manifest entry of files over all episodes, with the episodes that they cover, sorted."""
 
     episodes: list[Index]
     """Episodes that the indices cover, sorted."""
 
 
 class Row(msgspec.Struct):
-    """Line of episodes.jsonl, see `episodes.EpisodeRow`."""
+    """Schema of a line of episodes.jsonl; see `episodes.EpisodeRow`."""
 
     episode: Index
     arrangement: Index
@@ -88,7 +88,7 @@ class Row(msgspec.Struct):
 
 
 class InstanceObservation(msgspec.Struct):
-    """Perception result of an instance, see `factory.attempts.InstanceObservation`."""
+    """Schema of the perception result of an instance; see `factory.attempts.InstanceObservation`."""
 
     instance: Index
     object_id: Index
@@ -112,7 +112,9 @@ class InstanceObservation(msgspec.Struct):
 
 
 class Observation(msgspec.Struct):
-    """Perception result of an attempt, see `factory.attempts.ObservationRecord`."""
+    """Schema of the perception result of an attempt: instances and votes (lower, upper, votes); see
+    `factory.attempts.ObservationRecord`.
+    """
 
     resolution: tuple[Side, Side]
     instances: Annotated[list[InstanceObservation], msgspec.Meta(max_length=MAX_OBSERVED)]
@@ -120,14 +122,14 @@ class Observation(msgspec.Struct):
 
 
 class AttemptKey(msgspec.Struct):
-    """What a line of attempts.jsonl is found by."""
+    """Schema of what a line of attempts.jsonl is found by: episode and index of the attempt."""
 
     episode: Index
     attempt: Index
 
 
 class Attempt(AttemptKey):
-    """Line of attempts.jsonl, see `factory.attempts.AttemptRecord`."""
+    """Schema of a line of attempts.jsonl; target and grasp None: nothing was seen. See `factory.attempts.AttemptRecord`."""
 
     mode: Literal["pick", "target"]
     frame: Index
@@ -153,7 +155,7 @@ class Attempt(AttemptKey):
 
 
 class EpisodeEntry(Entry):
-    """Entry of a committed episode."""
+    """Schema of the manifest entry of a committed episode: its line of episodes.jsonl, and its attempts."""
 
     episode: Index
     row: Row
@@ -167,6 +169,7 @@ class EpisodeEntry(Entry):
 
 
 def _check_name(key: str, value: str, allowed: tuple[str, ...]) -> None:
+    """Raise ValueError if a value is not one of the allowed names."""
     if value not in allowed:
         raise ValueError(f"the {key} is {msgspec.json.encode(value[:40]).decode()}, allowed: {', '.join(allowed)}")
 

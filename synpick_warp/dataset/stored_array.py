@@ -62,6 +62,7 @@ class _BoundedZstd(ZstdCodec):
 
 
 def _decompress(chunk: Any, spec: Any) -> Any:
+    """Decompress a zstd chunk; raises ValueError if its size is not that of the array's chunk."""
     frame, dtype = chunk.as_numpy_array(), spec.dtype
     size = math.prod(spec.shape) * (dtype.itemsize if isinstance(dtype, np.dtype) else dtype.item_size)
     stated = _content_size(frame[:_MAX_HEADER].tobytes())
@@ -100,6 +101,7 @@ def _bound_codecs(codecs: Iterable[Any]) -> tuple[Any, ...]:
 
 
 def _guard(name: str) -> Callable[..., Any]:
+    """Method of `zarr.Array` that raises DatasetError for any fault but IndexError."""
     method = getattr(zarr.Array, name)
 
     @functools.wraps(method)
@@ -119,5 +121,6 @@ for _name in _SELECTIONS:
 
 
 def _dataset_error(folder: Path, error: Exception) -> DatasetError:
+    """DatasetError on an array that cannot be read, with the error's first 200 characters."""
     text = " ".join(str(error).split())[:200] or type(error).__name__
     return DatasetError(f"the array {folder} cannot be read: {text}; {ADVICE}")

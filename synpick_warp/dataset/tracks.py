@@ -12,7 +12,9 @@ from synpick_warp.dataset.view import View
 
 @dataclass(frozen=True, eq=False)
 class Track:
-    """One instance over C cameras and the F frames of its episode. Where it is not in the scene, poses are NaN, boxes -1, the rest 0."""
+    """Poses, visibility and boxes of one instance over C cameras and the F frames of its episode; where it is not in the scene, poses are
+    NaN, boxes -1, the rest 0. Poses: object to tote, object to camera [m].
+    """
 
     instance_id: int
     object_id: int
@@ -73,6 +75,7 @@ class Tracks(Mapping[int, Track]):
                 track.object_to_world[view.frame] = worlds[row]
 
     def _make(self, instance: int, object_id: int) -> Track:
+        """Empty track of an instance: absent in all frames, poses NaN, visibility and pixels 0."""
         cameras, frames = self._size
         return Track(
             instance_id=instance,

@@ -29,7 +29,9 @@ _MAX_METADATA = 2**24
 
 @dataclass(frozen=True, eq=False)
 class ObjectInfo:
-    """Physical properties of one object of the catalog."""
+    """Physical properties of a catalog object, in its frame: mass [kg], centre of mass [m], inertia about it [kg·m²], diameter [m], volume
+    [m³].
+    """
 
     object_id: int
     """BOP object id."""
@@ -48,7 +50,9 @@ class ObjectInfo:
 
 @dataclass(frozen=True, eq=False)
 class CameraInfo:
-    """Pinhole camera in OpenCV's convention: x right, y down, z forward; pixel centres at + 0.5."""
+    """Pinhole camera: resolution and K [px], world-to-camera rotation and translation [m]. OpenCV's axes (x right, y down, z forward);
+    pixel centres at + 0.5.
+    """
 
     resolution: np.ndarray
     """Width and height (2) int32 [px]."""
@@ -61,7 +65,7 @@ class CameraInfo:
 
 
 class _GroupMetadata(Struct):
-    """The zarr.json of a group."""
+    """Schema of the zarr.json of a group: its attributes."""
 
     zarr_format: Literal[3]
     node_type: Literal["group"]
@@ -69,7 +73,7 @@ class _GroupMetadata(Struct):
 
 
 class StoreAttributes(Struct):
-    """What the attributes of every trajectory store have, as far as it is used here."""
+    """Schema of the attributes of a trajectory store, as far as they are used: steps per tick, names of environment maps."""
 
     steps_per_tick: Annotated[int, Meta(ge=1, le=MAX_STEPS_PER_TICK)]
     lights: Annotated[list[str], Meta(max_length=2**16)] = []
@@ -77,12 +81,14 @@ class StoreAttributes(Struct):
 
 
 class _ObjectsAttributes(Struct):
+    """Schema of the attributes of the store's group of objects."""
+
     names: Annotated[list[str], Meta(max_length=2**16)]
 
 
 @dataclass(frozen=True)
 class GroupContext:
-    """What the arrays of a group must agree with; computed when the first array is opened."""
+    """Sizes of dimensions and listed files that the arrays of a group must agree with; computed when the first array is opened."""
 
     sizes: Callable[[], Mapping[str, int]] = dict
     """Sizes of dimensions by name, such as that of `tick`; others can have any."""
@@ -172,7 +178,7 @@ def read_attributes(group: Path) -> dict[str, Any]:
 
 
 def read_array(array: zarr.Array) -> np.ndarray:
-    """Read a whole array."""
+    """Read a whole array into memory."""
     import numpy as np
 
     return np.asarray(array[...])

@@ -43,7 +43,7 @@ class View:
 
     @property
     def place(self) -> str:
-        """Where its files are, for messages."""
+        """Folder or shard of the view, for messages."""
         return str(self._files.place)
 
     def has(self, name: str) -> bool:
@@ -67,7 +67,7 @@ class View:
         return self._image("depth", None, "uint16") * scale
 
     def _camera_value(self, key: str) -> Any:
-        """Value of the image's camera, which data sets of others may lack."""
+        """Value of the view's entry in scene_camera.json; raises DatasetError if it is missing, as in some data sets of other programs."""
         if key not in self.records.camera:
             raise DatasetError(f"{self._files.place}: the camera of image {self.image_id} has no {key}")
         return self.records.camera[key]
@@ -89,6 +89,7 @@ class View:
         return self._masks("mask")
 
     def _masks(self, name: str) -> np.ndarray:
+        """Masks (N, H, W) bool of one kind."""
         masks = self._files.masks(name, self.image_id, len(self))
         return np.stack(masks) if masks else np.zeros((0, *self._files.image_size(self.image_id)[::-1]), bool)
 
@@ -117,7 +118,7 @@ class View:
 
     @cached_property
     def world_to_camera(self) -> np.ndarray:
-        """Camera extrinsics (4, 4) float64 [m]."""
+        """World-to-camera transform (4, 4) float64 [m], OpenCV's axes."""
         camera, place = self.records.camera, f"{self._files.place}: the camera of image {self.image_id}"
         if not {"cam_R_w2c", "cam_t_w2c"} <= camera.keys():
             raise DatasetError(f"{place} has no cam_R_w2c and cam_t_w2c; {ADVICE}")
@@ -165,6 +166,7 @@ class View:
         return self._column("gt_info", "bbox_visib", np.int64).reshape(-1, 4)
 
     def _column(self, record: str, key: str, dtype: type) -> np.ndarray:
+        """Array of one key over the entries of `gt` or `gt_info`."""
         return np.array([row[key] for row in getattr(self.records, record)], dtype=dtype)
 
     def project(self, points: np.ndarray, transform: np.ndarray | None = None) -> np.ndarray:

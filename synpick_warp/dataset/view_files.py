@@ -40,7 +40,7 @@ RECORD_NAMES = ("camera", "gt", "gt_info")
 
 
 class ViewRecords(NamedTuple):
-    """Annotations of one image, as BOP's scene_camera.json, scene_gt.json and scene_gt_info.json have them [mm]."""
+    """Entries of one image in BOP's scene_camera.json, scene_gt.json and scene_gt_info.json [mm]; the last two have one per instance."""
 
     camera: dict[str, Any]
     gt: list[dict[str, Any]]
@@ -68,7 +68,7 @@ class SceneFiles(ABC):
     @property
     @abstractmethod
     def place(self) -> Path:
-        """Folder or first shard, for messages."""
+        """Folder or first shard of the scene, for messages."""
 
     @abstractmethod
     def frames(self) -> tuple[int, ...]:
@@ -92,11 +92,11 @@ class SceneFiles(ABC):
 
     @abstractmethod
     def _missing(self, name: str, frame: int, index: int | None = None) -> str:
-        """Message: there is no such image."""
+        """Message that there is no such image."""
 
     @abstractmethod
     def mask(self, name: str, frame: int, index: int) -> np.ndarray:
-        """One of `masks`."""
+        """One mask of `masks` (H, W) bool."""
 
     @abstractmethod
     def mask_crop(self, name: str, frame: int, index: int, rows: slice, columns: slice) -> np.ndarray:
@@ -132,6 +132,7 @@ class SceneFiles(ABC):
         return ViewRecords(self.camera(frame), gt, [dict(UNKNOWN) for _ in gt] if info is None else info)
 
     def _need(self, name: str, frame: int, index: int | None = None) -> tuple[str, bytes, str]:
+        """(suffix, content, source) of an image; raises DatasetError if there is none."""
         found = self._find(name, frame, index)
         if found is None:
             raise DatasetError(self._missing(name, frame, index))
@@ -160,6 +161,7 @@ class SceneFiles(ABC):
         return self._frame_size[1]
 
     def _read_size(self, frame: int) -> tuple[int, int]:
+        """Width and height of a view [px], from the head of its first image; raises DatasetError without one."""
         for name, index in (("rgb", None), ("depth", None), ("mask", 0), ("mask_visib", 0)):
             found = self._find(name, frame, index)
             if found is not None:
@@ -186,7 +188,7 @@ class SceneFolder(SceneFiles):
 
     @property
     def place(self) -> Path:
-        """See `SceneFiles`."""
+        """The scene's folder. See `SceneFiles`."""
         return self.folder
 
     def images(self, name: str) -> Path:
@@ -194,7 +196,7 @@ class SceneFolder(SceneFiles):
         return self.folder / (f"{name}{self.suffix}" if self._images is None else self._images.folder(name))
 
     def annotations(self, name: str) -> Path:
-        """Annotation file: "camera", "gt" or "gt_info"."""
+        """Path of an annotation file: "camera", "gt" or "gt_info"."""
         return self.folder / f"scene_{name}{self.suffix}.json"
 
     @cached_property
@@ -206,25 +208,25 @@ class SceneFolder(SceneFiles):
         ]
 
     def _part(self, name: str, frame: int) -> Any:
-        """See `SceneFiles`."""
+        """Record of a frame by name; None: there is none; lenient: an empty list where only the annotation lacks it. See `SceneFiles`."""
         part = self._records[RECORD_NAMES.index(name)]
         return None if part is None else part.get(frame, [] if self.lenient and name != "camera" else None)
 
     def frames(self) -> tuple[int, ...]:
-        """See `SceneFiles`."""
+        """Sorted im_ids of the annotations, or without these of images. See `SceneFiles`."""
         named = next((part for part in self._records[:2] if part is not None), None)
         if named is None and self._images is not None:
             named = {image for kind in (*COLOR, "depth") for image, _ in self._images.indices(kind)}
         return tuple(sorted(named or ()))
 
     def has(self, name: str) -> bool:
-        """See `SceneFiles`."""
+        """Whether there is an annotation file or image folder of this name. See `SceneFiles`."""
         if name in RECORD_NAMES:
             return self.annotations(name).exists()
         return any(self.images(kind).exists() for kind in (COLOR if self.lenient and name == "rgb" else (name,)))
 
     def _find(self, name: str, frame: int, index: int | None = None) -> tuple[str, bytes, str] | None:
-        """See `SceneFiles`."""
+        """(suffix, content, source) of an image; None: there is none. See `SceneFiles`."""
         if self._images is not None:
             return self._images.find(name, frame, index)
         base = f"{self.folder}{os.sep}{name}{self.suffix}{os.sep}{_stem(frame, index)}"
@@ -235,7 +237,7 @@ class SceneFolder(SceneFiles):
         return None
 
     def _missing(self, name: str, frame: int, index: int | None = None) -> str:
-        """See `SceneFiles`."""
+        """Message on a missing image. See `SceneFiles`."""
         base, folder = self.images(name) / _stem(frame, index), self.images(name)
         if self.lenient:
             return f"there is no {base}.png or .jpg or .tif"
@@ -244,7 +246,7 @@ class SceneFolder(SceneFiles):
         return f"there is no {base}.png or .jpg; the data set is not complete"
 
     def mask(self, name: str, frame: int, index: int) -> np.ndarray:
-        """See `SceneFiles`."""
+        """Decoded mask (H, W) bool; lenient: of any channels. See `SceneFiles`."""
         _, data, source = self._need(name, frame, index)
         if not self.lenient:
             return check_planes(decode_image(data, source, DatasetError, size=self.size), None, source) > 0
@@ -252,13 +254,13 @@ class SceneFolder(SceneFiles):
         return mask if mask.ndim == 2 else np.asarray(mask.any(axis=2))
 
     def mask_crop(self, name: str, frame: int, index: int, rows: slice, columns: slice) -> np.ndarray:
-        """See `SceneFiles`."""
+        """Part of a mask, bool; of a PNG only these rows are decoded. See `SceneFiles`."""
         suffix, data, _ = self._need(name, frame, index)
         crop = decode_grey_crop(data, self.image_size(frame), rows, columns) if suffix == ".png" else None
         return self.mask(name, frame, index)[rows, columns] if crop is None else crop > 0
 
     def layers(self) -> set[str]:
-        """See `SceneFiles`."""
+        """Names of the scene's layer folders; lenient: none. See `SceneFiles`."""
         names = {path.name for path in self.folder.iterdir() if path.is_dir() and path.name.endswith(self.suffix)}
         return set() if self.lenient else {name.removesuffix(self.suffix) for name in names} - {"rgb", "depth", "mask", "mask_visib"}
 
@@ -282,36 +284,36 @@ class SceneShards(SceneFiles):
 
     @property
     def place(self) -> Path:
-        """See `SceneFiles`."""
+        """The first shard. See `SceneFiles`."""
         return self.shards[0]
 
     def frames(self) -> tuple[int, ...]:
-        """See `SceneFiles`."""
+        """Sorted im_ids of the views' records, or if lenient of images. See `SceneFiles`."""
         for name in ("camera.json", "gt.json"):
             if found := [frame for frame, content in self._images.members if content == name]:
                 return tuple(sorted(found))
         return tuple(sorted({image for kind in (*COLOR, "depth") for image, _ in self._images.indices(kind)} if self.lenient else ()))
 
     def has(self, name: str) -> bool:
-        """See `SceneFiles`."""
+        """Whether any view has a member of this name. See `SceneFiles`."""
         kinds = COLOR if self.lenient and name == "rgb" else (name,)
         return any(content.partition(".")[0] in kinds for _, content in self._images.members)
 
     def _part(self, name: str, frame: int) -> Any:
-        """See `SceneFiles`."""
+        """Record of a frame by name, checked by its schema; None: there is none. See `SceneFiles`."""
         return self._json(frame, name, (LENIENT_VIEW_SCHEMAS if self.lenient else VIEW_SCHEMAS)[name])
 
     def _find(self, name: str, frame: int, index: int | None = None) -> tuple[str, bytes, str] | None:
-        """See `SceneFiles`; masks are no images here."""
+        """(suffix, content, source) of an image; None for masks, which are run lengths here. See `SceneFiles`."""
         return None if name.startswith("mask") else self._images.find(name, frame, index)
 
     def _missing(self, name: str, frame: int, index: int | None = None) -> str:
-        """See `SceneFiles`."""
+        """Message on a missing image. See `SceneFiles`."""
         advice = " or .jpg or .tif" if self.lenient else "; the data set is not complete"
         return f"{self.shards[0].parent} has no {self.scene:06d}_{frame:06d}.{name}.png{advice}"
 
     def masks(self, name: str, frame: int, count: int) -> list[np.ndarray]:
-        """See `SceneFiles`."""
+        """Decoded masks of all instances; raises DatasetError unless they are numbered from 0 to count - 1. See `SceneFiles`."""
         if (runs := self._read_runs(name, frame)) is None:
             raise DatasetError(f"{self.shards[0]} has no {name}; bake with bop.masks = true")
         if missing := set(range(count)) - set(runs):
@@ -320,7 +322,7 @@ class SceneShards(SceneFiles):
         return super().masks(name, frame, count)
 
     def mask(self, name: str, frame: int, index: int) -> np.ndarray:
-        """See `SceneFiles`."""
+        """Mask (H, W) bool, decoded from run lengths. See `SceneFiles`."""
         runs = (self._read_runs(name, frame) or {}).get(index)
         if runs is None:
             raise DatasetError(f"{self.shards[0]} has no {name} of instance {index} in image {frame}; bake with bop.masks = true")
@@ -329,7 +331,7 @@ class SceneShards(SceneFiles):
         return decode_run_lengths(runs["counts"], runs["size"])
 
     def mask_crop(self, name: str, frame: int, index: int, rows: slice, columns: slice) -> np.ndarray:
-        """See `SceneFiles`."""
+        """Part of a mask, bool; the whole mask is decoded. See `SceneFiles`."""
         return self.mask(name, frame, index)[rows, columns]
 
     def _read_runs(self, name: str, frame: int) -> dict[int, Any] | None:
@@ -339,14 +341,14 @@ class SceneShards(SceneFiles):
         return self._runs[1]
 
     def _read_size(self, frame: int) -> tuple[int, int]:
-        """See `SceneFiles`."""
+        """Width and height of a view [px]; without images those of its first mask. See `SceneFiles`."""
         for name in ("mask", "mask_visib") if not (self.has("rgb") or self.has("depth")) else ():
             for runs in (self._read_runs(name, frame) or {}).values():
                 return tuple(runs["size"][::-1])
         return super()._read_size(frame)
 
     def layers(self) -> set[str]:
-        """See `SceneFiles`."""
+        """Names of layers by the members' suffixes; lenient: none. See `SceneFiles`."""
         names = {content for _, content in self._images.members}
         return set() if self.lenient else {Path(name).stem for name in names if name.endswith(SUFFIXES)} - {"rgb", "depth"}
 
@@ -356,7 +358,7 @@ class SceneShards(SceneFiles):
         return None if member is None else check_json(self._images.content(member, MAX_JSON), schema, self._source(member.file))
 
     def _source(self, file: str) -> Path:
-        """A member in messages."""
+        """Path of a member, for messages."""
         return self._images.listing.root / file
 
 

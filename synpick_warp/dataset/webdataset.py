@@ -46,6 +46,7 @@ def decode_view(key: str, data: bytes) -> np.ndarray | None:
 
 
 def _decode_masks(data: bytes, key: str) -> np.ndarray:
+    """Decode the masks (N, H, W) bool of a view from run lengths; raises DatasetError unless they are numbered from 0 on."""
     records = check_json(data, MASK_SCHEMA, key)
     if len(records) > MAX_INSTANCES or sorted(records) != list(range(len(records))):
         raise DatasetError(f"{key} does not number its masks from 0 on, or has more than {MAX_INSTANCES}")

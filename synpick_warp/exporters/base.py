@@ -56,12 +56,12 @@ class ExportContext:
 
     @property
     def catalog(self) -> Catalog:
-        """The objects."""
+        """Objects of the data set: meshes, materials, mass properties."""
         return self._catalog
 
     @property
     def lights(self) -> tuple[EnvironmentMap, ...]:
-        """The environment maps."""
+        """Environment maps of the data set."""
         return self._lights
 
     @property
@@ -83,7 +83,7 @@ class EncodedView(Protocol):
 
     @property
     def scene(self) -> int:
-        """BOP scene_id."""
+        """BOP scene_id of the view."""
         ...
 
     @property
@@ -98,7 +98,7 @@ class EncodedView(Protocol):
 
     @property
     def depth(self) -> Buffer:
-        """PNG file of the depth image."""
+        """PNG file of the depth image, 16 bits in counts."""
         ...
 
     def depth_image(self) -> np.ndarray:
@@ -107,7 +107,7 @@ class EncodedView(Protocol):
 
     @property
     def camera(self) -> dict[str, Any]:
-        """Entry in scene_camera.json."""
+        """Entry of the view in scene_camera.json."""
         ...
 
     @property
@@ -121,19 +121,19 @@ class EncodedView(Protocol):
         ...
 
     def masks(self) -> list[Masks]:
-        """Masks of the instances, in the same order."""
+        """Run lengths of the amodal and visible mask of each instance, in the order of `gt`."""
         ...
 
 
 class StoredView(EncodedView, Protocol):
-    """A view of a data set that is converted."""
+    """Encoded view of a data set that is converted: also gives the decoded colour image, and layers as PNG files."""
 
     def color_image(self) -> np.ndarray:
         """Colour image, sRGB, RGB order (H, W, 3) uint8."""
         ...
 
     def layer(self, name: str) -> Buffer:
-        """PNG file of a layer."""
+        """PNG file of a layer, by its name."""
         ...
 
 
@@ -142,17 +142,19 @@ class StoredScene(Protocol):
 
     @property
     def frames(self) -> int:
-        """Number of frames."""
+        """Number of frames of the scene."""
         ...
 
     def views(self, frames: range) -> Iterator[StoredView]:
-        """The views of some frames, in order."""
+        """Views of these frames (indices), in order."""
         ...
 
 
 @dataclass(frozen=True)
 class TaskSizes:
-    """What the size of a task's images follows from."""
+    """Sizes from which the shared memory of a task follows: resolution [px], layers or none, objects, steps per tick, steps
+    stored or not.
+    """
 
     resolution: tuple[int, int]
     """Width and height of a view [px]."""
@@ -167,7 +169,7 @@ class TaskSizes:
 
     @classmethod
     def of(cls, config: Config) -> TaskSizes:
-        """Sizes by the settings of a bake."""
+        """Task sizes that follow from the settings of a bake."""
         steps_per_tick, has_layers = config.physics.steps_per_tick, bool(config.render.layers)
         return cls(config.cameras.resolution, has_layers, config.arrangement.max_objects, steps_per_tick, config.trajectory.steps)
 
@@ -234,7 +236,7 @@ class Exporter(Protocol):
 
     @staticmethod
     def shared_files(layout: DataLayout) -> SharedFiles:
-        """Names of constants, indices and folders. Looks at nothing."""
+        """Names of constants, indices and folders, from the settings alone; no file is looked at."""
         ...
 
     @staticmethod

@@ -40,7 +40,9 @@ _STORE = r"trajectory\.zarr"
 
 
 class PartFiles(NamedTuple):
-    """Files that a format has once an episode, or once a scene. By them the reader finds episodes in formats of which it reads no more."""
+    """Files that a format has once an episode or once a scene, by which the reader finds the episodes of formats that it reads
+    no further.
+    """
 
     folder: str
     """Folder of the files, relative to the data set."""
@@ -60,7 +62,7 @@ class PartFiles(NamedTuple):
 
     @property
     def pattern(self) -> str:
-        """Pattern of all of them."""
+        """Glob pattern of all these files, relative to the data set."""
         return f"{self.folder}/[0-9]*{self.suffix}"
 
     def episode(self, number: int) -> int:
@@ -69,7 +71,9 @@ class PartFiles(NamedTuple):
 
 
 class Format(NamedTuple):
-    """A row of the table. Names of files are relative to the data set."""
+    """Row of the table of formats: exporter class, regular expressions of its file names (relative to the data set), what `convert` and the
+    reader need, and packages.
+    """
 
     module: str
     """Module of its exporter, in this package; imported when the format is used."""
@@ -90,41 +94,49 @@ class Format(NamedTuple):
 
 
 def _bop(layout: DataLayout, episode: int) -> str:
+    """Regular expression of an episode's files in scene folders."""
     scenes = "|".join(dict.fromkeys(f"{layout.scene(episode, camera)[0]:06d}" for camera in range(layout.cameras)))
     image = rf"[a-z_]+(?:_cam[0-9]+)?/{_INDEX}(?:_[0-9]{{6}})?\.(?:png|jpg)"
     return rf"{re.escape(layout.folder(episode))}/(?:{scenes})/(?:scene_[a-z_]+(?:_cam[0-9]+)?\.json|{image})"
 
 
 def _shards(layout: DataLayout, episode: int) -> str:
+    """Regular expression of an episode's shards."""
     # Further shards of a scene have its id plus a multiple of a million.
     return rf"{re.escape(layout.folder(episode))}_web/shard-[0-9]{{0,12}}(?:{_scenes(layout, episode)})\.tar"
 
 
 def _usd(_: DataLayout, episode: int) -> str:
+    """Regular expression of an episode's USD file."""
     return rf"usd/{episode:06d}\.usdc"
 
 
 def _zarr(_: DataLayout, episode: int) -> str:
+    """Regular expression of an episode's files in the zarr store."""
     return rf"{_STORE}/episodes/{episode:06d}/(?:zarr\.json|[a-z_]+/(?:zarr\.json|{_ZARR_ARRAY}))"
 
 
 def _lerobot(_: DataLayout, episode: int) -> str:
+    """Regular expression of an episode's part and videos in the LeRobot folder."""
     video = rf"chunk-{episode // 1000:03d}/file-{episode % 1000:03d}\.mp4"
     return rf"lerobot/(?:parts/{episode:06d}\.json|videos/observation\.images\.camera_[0-9]+/{video})"
 
 
 def _coco(layout: DataLayout, episode: int) -> str:
+    """Regular expression of an episode's images and parts in the COCO folder."""
     scenes = _scenes(layout, episode)
     return rf"coco/(?:parts/(?:{scenes})\.jsonl|images/(?:{scenes})/{_INDEX}\.(?:png|jpg))"
 
 
 def _yolo(layout: DataLayout, episode: int) -> str:
+    """Regular expression of an episode's images, labels and lists in the YOLO folder."""
     split = re.escape(layout.folder(episode))
     files = rf"(?:images|labels|boxes|oriented_boxes)/{split}/(?:{{0}})/{_INDEX}_{_INDEX}\.(?:png|jpg|txt)"
     return rf"yolo/(?:(?:{{0}})\.txt|{files})".replace("{0}", _scenes(layout, episode))
 
 
 def _scenes(layout: DataLayout, episode: int) -> str:
+    """Alternatives of an episode's scene_ids, one per camera, for a regular expression."""
     return "|".join(f"{scene:06d}" for scene in range(layout.cameras * episode, layout.cameras * (episode + 1)))
 
 
@@ -182,7 +194,7 @@ FORMAT_TABLE: dict[str, Format] = {
 
 
 def convertible() -> tuple[str, ...]:
-    """Formats that `convert` writes."""
+    """Names of the formats that `convert` writes."""
     return tuple(name for name, row in FORMAT_TABLE.items() if row.sources is not None)
 
 
@@ -194,6 +206,6 @@ def part_files(cameras: int | None) -> list[PartFiles]:
 
 
 def contents_of(name: str, bop: Bop) -> tuple[Content, ...]:
-    """What a stored data set with these settings must have for `convert` to make a format of it."""
+    """Content that a stored data set with these settings must have for `convert` to make a format of it."""
     sources = FORMAT_TABLE[name].sources
     return () if sources is None else sources(bop)

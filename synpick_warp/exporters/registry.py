@@ -28,6 +28,7 @@ def load_exporter_classes(names: Iterable[str]) -> tuple[type[Exporter], ...]:
 
 
 def _load(name: str) -> type[Exporter]:
+    """Import the exporter class of a format; raises ConfigError with a remedy if a package is missing."""
     row = FORMAT_TABLE[name]
     try:
         return getattr(importlib.import_module(f"{__package__}.{row.module}"), row.exporter)
@@ -37,7 +38,7 @@ def _load(name: str) -> type[Exporter]:
 
 @dataclass(frozen=True)
 class Needs:
-    """What the formats of a bake need of it."""
+    """Needs of a bake's formats: their exporter classes, in the order of FORMAT_TABLE, and the largest size of a task's images [B]."""
 
     classes: tuple[type[Exporter], ...]
     """Their exporters, in the order of FORMAT_TABLE."""
@@ -78,26 +79,26 @@ class Exporters:
         self._all = tuple(exporter_class(context) for exporter_class in classes)
 
     def write_constants(self) -> list[Path]:
-        """See `Exporter`. Formats may share files, which are then identical."""
+        """Write the constant files of all formats; files that formats share are identical and listed once. See `Exporter`."""
         return list(dict.fromkeys(path for exporter in self._all for path in exporter.write_constants()))
 
     def write_views(self, batch: FrameBatch) -> None:
-        """See `Exporter`."""
+        """Pass a batch of views to all formats. See `Exporter`."""
         for exporter in self._all:
             exporter.write_views(batch)
 
     def write_stored(self, episode: int, scenes: Sequence[StoredScene]) -> None:
-        """See `Exporter`."""
+        """Pass an episode's stored scenes to all formats. See `Exporter`."""
         for exporter in self._all:
             exporter.write_stored(episode, scenes)
 
     def write_ticks(self, batch: TickBatch) -> None:
-        """See `Exporter`."""
+        """Pass a batch of ticks to all formats. See `Exporter`."""
         for exporter in self._all:
             exporter.write_ticks(batch)
 
     def end_episode(self, end: EpisodeEnd, on_committed: Callable[[], None]) -> None:
-        """See `Exporter`; `on_committed` is called when the last exporter has committed the episode."""
+        """End an episode in all formats; `on_committed` is called when the last one has committed it. See `Exporter`."""
         pending = [len(self._all)]
 
         def count_down() -> None:
@@ -109,23 +110,23 @@ class Exporters:
             exporter.end_episode(end, count_down)
 
     def files(self, episode: int) -> list[Path]:
-        """See `Exporter`."""
+        """Existing paths of an episode in all formats, sorted. See `Exporter`."""
         return sorted(path for exporter in self._all for path in exporter.files(episode))
 
     def close(self) -> None:
-        """See `Exporter`."""
+        """Close all formats. See `Exporter`."""
         for exporter in self._all:
             exporter.close()
 
     def abort(self) -> None:
-        """See `Exporter`."""
+        """Abort all formats. See `Exporter`."""
         for exporter in self._all:
             exporter.abort()
 
 
 @contextlib.contextmanager
 def aborting(pool: WriterPool, exporters: Exporters) -> Iterator[None]:
-    """End writers and exporters after an error."""
+    """Context manager that ends writers and exporters if an error leaves it."""
     try:
         yield
     except BaseException:

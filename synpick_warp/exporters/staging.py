@@ -25,7 +25,9 @@ _Content = TypeVar("_Content")
 
 @dataclass(eq=False)
 class StagedEpisode(Generic[_Content]):
-    """An arrangement of an episode whose files are being written."""
+    """Arrangement of an episode whose files are being written: staging folder, content kept in memory, unfinished tasks, and its end (None:
+    still running).
+    """
 
     index: int
     """Episode index."""
@@ -41,7 +43,7 @@ class StagedEpisode(Generic[_Content]):
 
     @property
     def delivers(self) -> bool:
-        """Whether it has ended, and its files are committed."""
+        """Whether the episode has ended and becomes part of the data set."""
         return self.end is not None and Ending(self.end.ending).delivers
 
 
@@ -76,20 +78,20 @@ class EpisodeExporter(ABC, Generic[_Content]):
 
     @staticmethod
     def finalize(out: Path, config: Config, pool: WriterPool, episodes: Sequence[int]) -> list[Path]:
-        """See `Exporter`: no index files."""
+        """Write nothing: there are no index files unless a format overrides this; returns an empty list. See `Exporter`."""
         return []
 
     def write_views(self, batch: FrameBatch) -> None:
-        """See `Exporter`: no images."""
+        """Ignore views: no images unless a format overrides this. See `Exporter`."""
 
     def write_stored(self, episode: int, scenes: Sequence[StoredScene]) -> None:
-        """See `Exporter`: no images."""
+        """Ignore stored scenes: no images unless a format overrides this. See `Exporter`."""
 
     def write_ticks(self, batch: TickBatch) -> None:
-        """See `Exporter`: nothing of the simulation."""
+        """Ignore ticks: nothing of the simulation unless a format overrides this. See `Exporter`."""
 
     def end_episode(self, end: EpisodeEnd, on_committed: Callable[[], None]) -> None:
-        """See `Exporter`."""
+        """Commit or discard an episode once all its tasks are done; at once if nothing was staged of it. See `Exporter`."""
         episode = self._episodes.pop(end.episode, None)
         if episode is None:
             on_committed()
@@ -102,15 +104,15 @@ class EpisodeExporter(ABC, Generic[_Content]):
         self._context.pool.poll()
 
     def close(self) -> None:
-        """See `Exporter`."""
+        """Forget all episodes in progress. See `Exporter`."""
         self._episodes.clear()
 
     def abort(self) -> None:
-        """See `Exporter`."""
+        """Forget all episodes in progress; staged files remain. See `Exporter`."""
         self._episodes.clear()
 
     def _staged(self, index: int, make_content: Callable[[Path], _Content]) -> StagedEpisode[_Content]:
-        """The current arrangement of an episode; a new one gets a staging folder, and its content by `make_content` of that folder."""
+        """Current arrangement of an episode; a new one gets a staging folder, and its content by `make_content` of that folder."""
         episode = self._episodes.get(index)
         if episode is None:
             # A suffix unique to each arrangement: the discarded one's folder may not be removed yet.
@@ -139,6 +141,7 @@ class EpisodeExporter(ABC, Generic[_Content]):
         return WriteTask(function, images, arguments, path, partial(self._task_done, episodes, then))
 
     def _task_done(self, episodes: Sequence[StagedEpisode[_Content]], then: Callable[[], None] | None) -> None:
+        """Count a finished task of these episodes, after calling `then`; commits or discards those that have ended and wait for none."""
         if then is not None:
             then()
         for episode in episodes:

@@ -39,7 +39,7 @@ from synpick_warp.system.progress import Progress, SilentProgress
 
 @dataclass(frozen=True, eq=False)
 class Factory:
-    """A bake's assets and stages on a device: simulation, rendering with copies to the host, and the attempt log."""
+    """Factory of a bake on a device: assets, simulation, rendering with copies to the host, and the attempt log."""
 
     catalog: Catalog
     cameras: tuple[Camera, ...]
@@ -72,7 +72,7 @@ class Stages:
         return self.config.physics.step * self.config.physics.steps_per_tick
 
     def make_log(self) -> AttemptLog:
-        """A new attempt log."""
+        """Create an empty attempt log."""
         return AttemptLog(self.config.suction, self.config.perception.resolution, self.object_ids)
 
 
@@ -209,7 +209,8 @@ def _fit_to_catalog(config: Config, catalog: Catalog, device: wp.Device, progres
 
 
 def make_renderer(config: Config, scene: RenderScene, instances: int, views: int, histories: int = 0) -> Renderer:
-    """The renderer of a bake: its sections of the settings, for `instances` instances of a world and at most `views` views of a batch.
+    """Create the renderer of a bake from its sections of the settings, for `instances` instances of a world and at most `views` views of a
+    batch.
 
     `histories` as in `Renderer`.
     """

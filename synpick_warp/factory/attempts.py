@@ -49,7 +49,7 @@ class InstanceObservation:
 
 @dataclass(frozen=True)
 class ObservationRecord:
-    """Perception result on which an attempt is based."""
+    """Perception result on which an attempt is based: image size, instances, and votes (i, j, votes): evidence that j lies above i."""
 
     resolution: tuple[int, int]
     """Width and height of the perception image [px]."""
@@ -61,7 +61,9 @@ class ObservationRecord:
 
 @dataclass(frozen=True)
 class AttemptRecord:
-    """One attempt to pick. Target and grasp are None if perception found no visible object."""
+    """Attempt to pick: its frames, outcome, target and grasp in the world (None: no object was visible), rays that hit, engaged and picked
+    instances, seal force by tick of the lift [N], and what perception saw.
+    """
 
     episode: int
     attempt: int
@@ -113,7 +115,7 @@ class AttemptRecord:
 
 @dataclass(frozen=True)
 class EpisodeRecord:
-    """Attempts and object counts of an episode; empty if the episode ended without delivery."""
+    """Attempts and object counts (first and last frame) of an episode; empty if it is not part of the data set."""
 
     mode: str
     objects: int = 0
@@ -129,13 +131,13 @@ class EpisodeRecord:
 
     @property
     def lost(self) -> int:
-        """Instances that left the scene otherwise."""
+        """Instances that left the scene in another way than on the cup."""
         return self.objects - self.left - self.picked
 
 
 @dataclass
 class _Running:
-    """Episode in phase ACT."""
+    """Episode in phase ACT: its attempts so far, and the running one as far as it is known."""
 
     episode: int
     objects: int
@@ -231,6 +233,7 @@ class AttemptLog:
         return record | grasp
 
     def _end_attempt(self, running: _Running, report: TickReport, world: int, outcome: Outcome) -> None:
+        """Complete the running attempt of a world with its outcome and seal forces; raises ValueError if it has no begin."""
         planned, attempt = running.planned, _status(report, "attempt", world)
         if planned is None or planned["attempt"] != attempt:
             raise ValueError(f"attempt {attempt} of episode {running.episode} ends, but its begin is not in the log")
@@ -252,6 +255,7 @@ class AttemptLog:
         running.planned = None
 
     def _observation(self, report: TickReport, world: int) -> ObservationRecord:
+        """Record of what perception saw in a world: its present instances, and who lies above whom with votes."""
         present = np.flatnonzero(report.catalog_index[world] >= 0)
         votes = report.observation.votes[world][np.ix_(present, present)]
         lower, upper = np.nonzero(votes)
@@ -263,6 +267,7 @@ class AttemptLog:
         return ObservationRecord(self.resolution, instances, tuple(pairs))
 
     def _object_id(self, report: TickReport, world: int, instance: int) -> int:
+        """obj_id of an instance in a world."""
         return int(self.object_ids[report.catalog_index[world, instance]])
 
 
@@ -285,12 +290,12 @@ def _instance(row: Mapping[str, Any]) -> InstanceObservation:
 
 
 def _status(report: TickReport, name: str, world: int) -> int:
-    """Column of a world's status row."""
+    """Value of a named column of a world's status row."""
     return int(report.column(name)[world])
 
 
 def _instances(bits: int) -> tuple[int, ...]:
-    """Unpack a mask of MASK_BITS bits, signed or not, to the indices of set bits."""
+    """Indices of the bits set in a mask of MASK_BITS bits, which may be signed."""
     bits &= (1 << MASK_BITS) - 1
     return tuple(instance for instance in range(bits.bit_length()) if bits >> instance & 1)
 
@@ -301,4 +306,5 @@ def _round(value: float) -> float:
 
 
 def _round_vector(values: Sequence[float]) -> Vector:
+    """Tuple of rounded numbers."""
     return tuple(map(_round, values))

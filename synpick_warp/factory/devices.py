@@ -54,7 +54,7 @@ _NONE = {"episodes_done": 0, "worlds_active": 0, "views": 0, "views_per_s": 0.0,
 
 @dataclass(frozen=True)
 class Share:
-    """What a device's process receives first: its part of a bake."""
+    """Part of a bake that a device's process receives first: output folder, settings, episodes in the order of their start."""
 
     out: Path
     config: Config
@@ -67,7 +67,7 @@ class Share:
 
 @dataclass(eq=False)
 class _Device:
-    """A device's process. Everything that it sends is a pair: kind of message, content."""
+    """Device's process, with its last counts and fault (empty: none). Everything that it sends is a pair: kind of message, content."""
 
     name: str
     worker: WorkerProcess
@@ -149,7 +149,7 @@ class DeviceProcesses:
         return f"lost {' and '.join(device.name for device in lost)}: {lost[0].fault}" if lost else ""
 
     def _receive(self, device: _Device, summary: BakeSummary, progress: Progress) -> None:
-        """Receive a message of a device's process."""
+        """Receive one message of a device's process, and pass it to summary and progress."""
         content: Any
         try:
             kind, content = device.worker.link.recv()
@@ -196,6 +196,7 @@ class DeviceProcesses:
 
 
 def _start(name: str, program: str, lock: int) -> _Device:
+    """Start the bake process of a device, which inherits the lock, and a pipe by whose end this process sees that all of it has ended."""
     with contextlib.ExitStack() as closing:
         lifeline, held = os.pipe()
         closing.callback(os.close, held)

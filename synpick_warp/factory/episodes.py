@@ -19,7 +19,7 @@ PLACES = 6
 
 
 class EpisodeRow(NamedTuple):
-    """One line of episodes.jsonl and of the summary; the fields are the JSON keys. Counts are 0 if the episode ended without delivery."""
+    """Line of episodes.jsonl and of the summary; the fields are the JSON keys. Counts are 0 if the episode is not part of the data set."""
 
     episode: int
     arrangement: int
@@ -42,7 +42,7 @@ class EpisodeRow(NamedTuple):
     """Name of the episode's split; empty, and no key: the settings have no splits."""
 
     def as_json(self) -> dict[str, Any]:
-        """Convert to a line of episodes.jsonl."""
+        """Row as the dictionary of a line of episodes.jsonl."""
         row = {**self._asdict(), "ending": self.ending.name.lower()}
         if not self.split:
             del row["split"]
@@ -50,7 +50,7 @@ class EpisodeRow(NamedTuple):
 
     @classmethod
     def from_json(cls, row: Mapping[str, Any]) -> EpisodeRow:
-        """Convert from a line of episodes.jsonl."""
+        """Row from the dictionary of a line of episodes.jsonl."""
         values: dict[str, Any] = {name: row[name] for name in cls._fields if name != "split" or name in row}
         values["ending"] = Ending[row["ending"].upper()]
         return cls(**values)
@@ -58,7 +58,9 @@ class EpisodeRow(NamedTuple):
 
 @dataclass
 class BakeSummary:
-    """Totals of a bake, committed episodes of earlier runs included."""
+    """Totals of a bake, committed episodes of earlier runs included: episodes, views and time of this run, resampled arrangements,
+    outcomes, and the signal that stopped it (0: none).
+    """
 
     total: int = 0
     """Episodes of the complete data set."""
@@ -81,7 +83,7 @@ class BakeSummary:
     """Signal that stopped the bake before its end; 0: none."""
 
     def take_record(self, record: Mapping[str, Any]) -> None:
-        """Add an episode that an earlier run committed."""
+        """Count an episode that an earlier run committed."""
         self.episodes.append(EpisodeRow.from_json(record["row"]))
         self.outcomes.update(Outcome[attempt["outcome"].upper()] for attempt in record["attempts"])
         self.resumed += 1
@@ -105,7 +107,7 @@ class BakeSummary:
         self.resampled_by_ending[ending] = self.resampled_by_ending.get(ending, 0) + 1
 
     def take_episode(self, row: EpisodeRow, record: EpisodeRecord) -> None:
-        """Add an episode that has ended."""
+        """Count an episode that has ended in this run."""
         self.episodes.append(row)
         self.episodes.sort()
         self.outcomes.update(attempt.outcome for attempt in record.attempts)

@@ -79,7 +79,7 @@ _PERCEPTION = ("perception.resolution", "perception.contour_points", "perception
 
 @dataclass(frozen=True)
 class Term:
-    """A part of a bake's memory: arrays that grow with the same settings."""
+    """Part of a bake's memory plan: arrays that grow with the same settings, on the device or the host."""
 
     name: str
     rows: tuple[Row, ...]
@@ -93,7 +93,7 @@ class Term:
 
     @property
     def size(self) -> int:
-        """Size [bytes]."""
+        """Size of all rows [bytes]."""
         return sum(row[3] for row in self.rows)
 
 
@@ -249,7 +249,7 @@ def _physics_kinds(trajectory: Trajectory, needs: Needs) -> tuple[type, ...]:
 
 
 def _simulation(worlds: int, sizes: dict[str, int], recorded: tuple[type, ...]) -> Iterator[Term]:
-    """State and record of the worlds."""
+    """Yield the memory of the worlds: state, and records of ticks."""
     kinds = (WorldState, AttemptState, SealState, LastFrame, *_RECORD)
     yield _term(f"the state of {worlds:,} worlds", _WORLDS, [(kind, sizes, 1) for kind in kinds])
     if recorded:
@@ -269,7 +269,7 @@ def _queue(slots: int, sizes: dict[str, int]) -> Term:
 
 
 def _queued_reports(slots: int, sizes: dict[str, int], recorded: tuple[type, ...]) -> Term:
-    """Reports of the queued ticks, on the host."""
+    """Memory of the reports of queued ticks, on the host."""
     rows = _ring_rows("reported", Snapshot, sizes, slots, REPORTED_SNAPSHOT)
     for kind in (WorldStatus, Observation, Plan, *recorded):
         rows += _ring_rows("reported", kind, sizes, slots)
@@ -352,7 +352,7 @@ def _pinned(views: dict[str, int], layers: tuple[str, ...], resolution: tuple[in
 
 
 def _host_images(config: Config, needs: Needs, device: wp.Device) -> HostImages:
-    """What a bake copies to the host."""
+    """Which images and files a bake copies to the host."""
     return host_images(config.bop, config.cameras.resolution[1], device, needs.images, needs.depth_files)
 
 

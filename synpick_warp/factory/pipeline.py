@@ -227,6 +227,7 @@ class _Run:
                 self._end(report, world, records[int(report.column("episode")[world])])
 
     def _end(self, report: TickReport, world: int, record: EpisodeRecord) -> None:
+        """End an episode: count it, and commit it, or resample its arrangement, by its ending."""
         row, tries = episode_row(self.layout, self.tick_time, report, world, record), self.config.settle.tries
         end = episode_end(row, record, tries)
         advice = remedy(self.factory.simulation.config, row.ending)

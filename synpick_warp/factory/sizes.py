@@ -115,7 +115,7 @@ def _short_terms(config: Config, device: wp.Device, writers: int, processes: int
 
 
 def _amount(config: Config, key: str, device: wp.Device) -> int:
-    """Number of views or worlds that a setting stands for."""
+    """Number of views in a batch, or of worlds, that a setting stands for."""
     if key == "render.views_per_batch":
         return views_per_batch(config.render, config.cameras, config.bake.worlds, device)
     if key == "perception.views":
@@ -124,6 +124,7 @@ def _amount(config: Config, key: str, device: wp.Device) -> int:
 
 
 def _least(key: str, device: wp.Device) -> int:
+    """Least value that automatic sizing chooses for a setting."""
     return MIN_GPU_WORLDS if key == "bake.worlds" and device.is_cuda else 1
 
 

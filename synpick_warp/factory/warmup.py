@@ -24,7 +24,7 @@ from synpick_warp.system.progress import Progress
 
 @dataclass(frozen=True)
 class WarmUp:
-    """Result of a warm-up."""
+    """Result of a warm-up: number of modules compiled (the others were in the cache), and duration [s]."""
 
     compiled: int
     """Modules that were compiled; the others were in the cache."""

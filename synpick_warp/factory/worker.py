@@ -50,26 +50,27 @@ class BakeLink:
         return None
 
     def stage(self, text: str) -> None:
-        """Forward a stage."""
+        """Send the stage's name to the main process."""
         self.report("stage", text)
 
     def update(
         self, *, episodes_done: int, episodes: int, worlds_active: int, views: int, views_per_s: float, seconds_left: float | None
     ) -> None:
-        """Forward counts."""
+        """Send the counts of progress to the main process."""
         counts = {"episodes_done": episodes_done, "worlds_active": worlds_active, "views": views}
         self.report("update", counts | {"views_per_s": views_per_s, "seconds_left": seconds_left})
 
     def note(self, text: str) -> None:
-        """Forward a note."""
+        """Send a note to the main process."""
         self.report("note", text)
 
     def report(self, kind: str, content: object) -> None:
-        """Send a message; see `devices.DeviceProcesses`."""
+        """Send a message (kind, content) to the main process; see `devices.DeviceProcesses`."""
         with contextlib.suppress(OSError):  # The main process is gone: the thread ends this one.
             send(self._link, (kind, content))
 
     def _listen(self) -> None:
+        """Receive stop requests (thread); if the main process ends, kill the writers and exit."""
         with contextlib.suppress(EOFError, OSError):
             while True:
                 self.number = self._link.recv()
@@ -79,6 +80,7 @@ class BakeLink:
         os._exit(1)
 
     def _stop(self, number: int, _: FrameType | None) -> None:
+        """Signal handler: keep the signal's number, so that the bake stops."""
         self.number = number
 
 

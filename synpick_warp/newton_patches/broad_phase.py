@@ -57,7 +57,7 @@ class SeparatingBroadPhase(newton.geometry.BroadPhaseAllPairs):
         candidate_pair_count: wp.array,
         **options: Any,
     ) -> None:
-        """Write the candidate pairs of the narrow phase.
+        """Launch the broad phase: write the candidate pairs of shapes for the narrow phase.
 
         Args:
             shape_lower, shape_upper: Bounding boxes, already enlarged by the shapes' gaps and margins (shape) [m].

@@ -30,7 +30,7 @@ REFINE_BLOCK = 32
 
 
 def resize_blocks(pipeline: newton.CollisionPipeline) -> None:
-    """Set the blocks of the narrow phase on a GPU."""
+    """Set the block size and number of threads of Newton's narrow phase, on a GPU."""
     model = pipeline.model
     if model.device.is_cuda:
         blocks = max(BLOCKS * model.device.sm_count, WORLD_BLOCKS * model.world_count)

@@ -170,11 +170,11 @@ class FusedSteel(newton.solvers.SolverSteel):
         return order, bins, places, wp.zeros(int(world_order.COLOR_BINS), dtype=wp.int32, device=device)
 
     def _joint_rows(self, rhs: wp.array) -> Any:
-        """Rows in joint space and of free bodies."""
+        """Struct of the solver's rows in joint space and of free bodies; `rhs`: right-hand sides."""
         return fill(solver_iterations.JointRowData(), self._mf_gs_inputs(rhs))
 
     def _contact_rows(self, rhs: wp.array) -> Any:
-        """Contacts with their coloring."""
+        """Struct of the solver's contact rows with their graph coloring; `rhs`: right-hand sides."""
         return fill(
             solver_iterations.ContactRowData(),
             [
@@ -196,7 +196,7 @@ class FusedSteel(newton.solvers.SolverSteel):
         )
 
     def _bodies(self) -> Any:
-        """The gripper's tree and the free bodies of all worlds."""
+        """Struct of the grippers' kinematic trees and the free bodies of all worlds."""
         model = self.model
         return fill(
             solver_iterations.BodyData(),
@@ -298,6 +298,6 @@ def compose_contacts(rows: int, bodies: int) -> wp.Function:
 
 
 def device_function(kernel: wp.Kernel) -> wp.Function:
-    """The device function that a kernel of the solver wraps."""
+    """Device function that a kernel of the solver wraps."""
     (function,) = (value for value in inspect.getclosurevars(kernel.func).nonlocals.values() if isinstance(value, wp.Function))
     return function

@@ -51,6 +51,7 @@ def _corners(batch: ViewBatch, kind: int) -> Any:
 
 
 def _visibility(batch: ViewBatch) -> Any:
+    """Visible fraction of each instance's silhouette, float; 0 for none."""
     pixels = torch.from_dlpack(batch.pixels)
     return pixels[..., VISIBLE].float() / pixels[..., ALL].clamp(min=1).float()
 
@@ -168,6 +169,7 @@ class StreamDataset(IterableDataset):
         yield from samples if self.transform is None else map(self.transform, samples)
 
     def _samples(self, episodes: range | None, shard: tuple[int, int], copy: bool) -> Iterator[Sample]:
+        """Yield samples of a stream of these episodes (None: all) and shard; `copy`: tensors that outlive the batch."""
         stream = open_stream(self.config, SilentProgress(), episodes=episodes, shard=shard, splits=self.splits, selection=self.selection)
         with stream:
             for batch in stream:
@@ -182,7 +184,7 @@ class StreamDataset(IterableDataset):
 
 
 def _shuffle(samples: Iterator[Sample], size: int, generator: random.Random) -> Iterator[Sample]:
-    """The samples in an order drawn from a buffer of `size` of them."""
+    """Yield the samples in an order drawn from a shuffle buffer of `size` samples."""
     buffer: list[Sample] = []
     for sample in samples:
         if len(buffer) < size:

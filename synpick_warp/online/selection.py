@@ -26,7 +26,7 @@ class Selection:
     """Every n-th frame of an episode, from the first on."""
 
     def resolve(self, count: int) -> Selection:
-        """The selection with all its cameras named, of `count` cameras.
+        """Selection with all its cameras named, out of `count` cameras.
 
         Raises:
             ConfigError: There is no such camera, or a value is out of range.

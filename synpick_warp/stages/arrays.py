@@ -18,7 +18,7 @@ Arrays = TypeVar("Arrays")
 
 @dataclass(frozen=True)
 class ArraySpec:
-    """Dimension names, Warp type and unit of one device array."""
+    """Specification of one device array: dimension names, Warp type and unit."""
 
     shape: tuple[str, ...]
     dtype: Any
@@ -32,7 +32,7 @@ def device_array(*shape: str, dtype: Any, unit: str = "") -> Any:
 
 @dataclass(frozen=True, eq=False)
 class StructArrays:
-    """Dimensions of the arrays of a Warp struct; see `struct_arrays`."""
+    """Specifications of the arrays of a Warp struct, by member; see `struct_arrays`."""
 
     struct: Any
     specs: Mapping[str, ArraySpec]
@@ -100,11 +100,13 @@ def memory_table(
 
 
 def _specs(kind: Any, only: Collection[str] | None) -> dict[str, ArraySpec]:
+    """Specifications of the arrays of a class or struct by name, all or `only` some."""
     specs = kind.specs if isinstance(kind, StructArrays) else {item.name: item.metadata["array"] for item in fields(kind)}
     return {name: spec for name, spec in specs.items() if only is None or name in only}
 
 
 def _allocate_arrays(kind: Any, sizes: dict[str, int], device: wp.Device, only: Collection[str] | None) -> dict[str, wp.array]:
+    """Allocate the arrays of a class or struct by name, zero; `sizes` gives the extents of their dimensions."""
     return {
         name: wp.zeros(tuple(sizes[dimension] for dimension in spec.shape), dtype=spec.dtype, device=device)
         for name, spec in _specs(kind, only).items()

@@ -17,8 +17,9 @@ FIXTURES = ("tote", "finger", "cup")
 
 @dataclass(frozen=True, eq=False)
 class Snapshot:
-    """Episode, objects, poses and light of every world at the end of a tick, and the poses of the previous frame: input of renderer and
-    exporters."""
+    """Snapshot of every world at the end of a tick: episode, frame, objects (-1: none), poses to the world, light, and the poses of the
+    previous frame (`last_`); input of renderer and exporters.
+    """
 
     live: wp.array = device_array("world", dtype=wp.int32)
     """1: this tick is a frame of the world's episode."""
@@ -66,7 +67,9 @@ class LastFrame:
 
 @dataclass(frozen=True, eq=False)
 class ViewBuffers:
-    """Images, boxes and pixel counts of one batch of views."""
+    """Output of the renderer for one batch of views: colour, depth in counts (0: none), instance and amodal images, pixel counts, boxes,
+    effects.
+    """
 
     color: wp.array = device_array("view", "row", "column", dtype=wp.vec3ub)
     """sRGB, red first."""
@@ -95,7 +98,7 @@ def allocate_view_buffers(views: int, width: int, height: int, instances: int, d
 
 
 def _declare_layer(layer: Layer) -> Any:
-    """Declaration of the device array of a layer."""
+    """Declaration of the device array that a layer is rendered to."""
     return device_array("view", "row", "column", dtype=_LAYER_DTYPES[layer.dtype, layer.components], unit=layer.unit)
 
 

@@ -60,7 +60,9 @@ def view_sizes(config: Config, device: wp.Device) -> dict[str, int]:
 
 @dataclass(frozen=True, eq=False)
 class TickReport:
-    """Status, poses and perception results of one tick on the host, one row a world."""
+    """Results of one tick on the host, one row a world: status, measures, objects (-1: none), object-to-world poses [m], perception, and
+    recorded physics (empty: not recorded).
+    """
 
     status: np.ndarray
     """Status rows (world, status) int32; columns: `Status`."""
@@ -92,7 +94,9 @@ class TickReport:
 
 @dataclass(frozen=True, eq=False)
 class LightTable:
-    """Names of the environment maps, and directions of their first lamps."""
+    """Environment maps: name, and unit direction towards the first lamp (the sun, or else the strongest light) before the map is rotated;
+    zero: the map has none.
+    """
 
     name: np.ndarray
     """Name (light) str."""
@@ -126,7 +130,7 @@ class TickReader:
 
     @staticmethod
     def reported(record: TickRecord) -> list[wp.array]:
-        """Arrays of a record that a report copies."""
+        """Arrays of a record that a report copies to the host."""
         first = [record.status.table, record.status.measures, record.snapshot.catalog_index, record.snapshot.pose]
         arrays = first + [getattr(part, name) for part, names in _reported_parts(record) for name in names]
         return arrays + (record_arrays(record.physics) if record.physics is not None else [])
@@ -140,8 +144,11 @@ class TickReader:
         return self.copy.target[0].numpy()[:, column_names(Status)["phase"]] if self.copy.is_done else None
 
     def wait(self) -> TickReport:
-        """Wait for the copy and return the report. It owns its arrays, except `tick` and `steps`: valid until the next copy begins, and on
-        a CPU without `target` until the next tick."""
+        """Wait for the copy; returns the report.
+
+        It owns its arrays, except `tick` and `steps`, which are overwritten when the next copy begins (on a CPU without host arrays
+        `target` there is no copy: when the next tick runs).
+        """
         copied = self.copy.wait()
         last = len(copied) - len(self.physics)
         arrays = iter([array.copy() for array in copied[:last]])
@@ -186,7 +193,8 @@ def tick_batch(report: TickReport, object_ids: np.ndarray, tick_time: float) -> 
 def describe_views(
     report: TickReport, world: np.ndarray, camera: np.ndarray, tick_time: float, object_ids: np.ndarray, lights: LightTable
 ) -> dict[str, Any]:
-    """Fields of `FrameBatch` that follow from the report of a tick, by name.
+    """Fields of `FrameBatch` for B views, without images: episode, camera, frame, time [s], object ids, poses; name, yaw, exposure and
+    direction of the light.
 
     Args:
         report: Report of the tick.
@@ -214,7 +222,9 @@ def describe_views(
 
 @dataclass(eq=False)
 class _Launched:
-    """Ring slot, size and description of a batch in flight: rendered, encoded and copied by the device."""
+    """Batch in flight, which the device renders, encodes and copies: ring slot, number of views, description, and what to call when it is
+    consumed.
+    """
 
     slot: int
     """Index of the slot of the batch in the ring."""
@@ -294,7 +304,8 @@ class FrameStream:
         yield from self.drain()
 
     def advance(self, snapshot: Snapshot, report: TickReport, finished: Callable[[], None] = lambda: None) -> Iterator[FrameBatch]:
-        """Launch the tick's views; yield batches, oldest first: where the ring is full, and then all that are left of earlier ticks.
+        """Render a tick's views in batches; yield finished batches, oldest first: one whenever no slot of the ring is free, and after the
+        last launch all of earlier ticks.
 
         On a GPU the tick's last batches stay in flight, so that the device has work between ticks; `drain` yields them. A batch is valid
         until the next one is requested.
@@ -329,7 +340,7 @@ class FrameStream:
             yield from self._deliver()
 
     def _deliver(self) -> Iterator[FrameBatch]:
-        """Yield the oldest batch in flight."""
+        """Wait for the oldest batch in flight, yield it, and call its `finished` afterwards."""
         launched = self.in_flight.popleft()
         yield self._collect(launched)
         if launched.finished is not None:
@@ -350,7 +361,8 @@ class FrameStream:
             self.copies[slot].start(self.streams.copy)
 
     def _encode(self, slot: int, count: int) -> None:
-        """Encode `count` views: run boundaries and files, which are copied instead of images.
+        """Encode `count` views of a slot, on the device: run boundaries of the instance and amodal images, and JPEG and PNG data where
+        these are enabled. Starts no copy; `_launch` does.
 
         Runs on the copy stream: after these views are rendered, beside the rendering of the next batch. Batches share one scratch; the
         order of this stream protects it.
@@ -363,7 +375,7 @@ class FrameStream:
             self.depth_encoder.encode(buffers.depth, count, self.depth_files[slot])
 
     def _collect(self, launched: _Launched) -> FrameBatch:
-        """Wait for a batch's copies."""
+        """Wait for a batch's copies; returns the batch."""
         slot = launched.slot
         with scope("wait for images"):
             copied = self.copies[slot].wait()

@@ -149,7 +149,7 @@ class TickLoop:
                 self.lead = self.max_lead
 
     def _may_begin(self) -> bool:
-        """Whether physics may begin another tick within its lead."""
+        """Whether physics may begin another tick: a world is busy, and the renderer is at most `lead` ticks behind."""
         return self._busy_worlds > 0 and self._enqueued < self._taken + self.lead
 
     @contextlib.contextmanager

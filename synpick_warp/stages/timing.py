@@ -38,7 +38,7 @@ Name = tuple[str, ...]
 
 @dataclass
 class StageTime:
-    """Accumulated host and device time, and number, of all scopes of one name."""
+    """Accumulated number of calls and host and device time [s] (0: not measured) of all scopes of one name."""
 
     calls: int = 0
     host: float = 0.0
@@ -48,7 +48,7 @@ class StageTime:
 
 
 class Span(NamedTuple):
-    """Name, track, start and duration of one scope in a trace."""
+    """Scope in a trace: name, track, start since the recorder started, and duration [s]."""
 
     name: str
     track: int
@@ -163,7 +163,7 @@ def scope(name: str, device: wp.Device | None = None) -> contextlib.AbstractCont
 
 @contextlib.contextmanager
 def record() -> Iterator[Recorder]:
-    """Record all scopes in this block; blocks do not nest.
+    """Context manager: record all scopes in this block; blocks do not nest.
 
     Raises:
         RuntimeError: A recorder is active already.

@@ -42,12 +42,12 @@ class SilentProgress:
         return None
 
     def stage(self, text: str) -> None:
-        """Ignored."""
+        """Do nothing."""
 
     def update(
         self, *, episodes_done: int, episodes: int, worlds_active: int, views: int, views_per_s: float, seconds_left: float | None
     ) -> None:
-        """Ignored."""
+        """Do nothing."""
 
     def note(self, text: str) -> None:
-        """Ignored."""
+        """Do nothing."""

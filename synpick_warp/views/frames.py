@@ -169,7 +169,9 @@ class TickBatch:
 
 @dataclass(frozen=True)
 class EpisodeEnd:
-    """Result of an episode. Exporters commit its files, or discard them if the ending delivers nothing."""
+    """End of an episode: indices, frames, `Ending`, and its lines of episodes.jsonl (empty: the arrangement will be resampled) and
+    attempts.jsonl. Exporters commit its files, or discard them if the ending delivers nothing.
+    """
 
     episode: int
     """Episode index."""

@@ -21,7 +21,7 @@ from synpick_warp.views.layers import FLOW_STEPS, LAYER_TABLE, MAX_CODE, NORMAL_
 
 
 class Codec(NamedTuple):
-    """Encoding of values as pixels of an image, and its inverse."""
+    """Codec of a layer: encoding of values as pixels of an image, and its inverse."""
 
     encode: Callable[[np.ndarray], np.ndarray]
     decode: Callable[[np.ndarray], np.ndarray]
@@ -86,6 +86,7 @@ def image_format(name: str) -> tuple[str, int | None]:
 
 
 def _keep(values: np.ndarray) -> np.ndarray:
+    """Values as they are: a layer that is stored without encoding."""
     return values
 
 
@@ -111,36 +112,44 @@ def _quantize_signed(values: np.ndarray, scale: float, min_code: int) -> tuple[n
 
 
 def _encode_unit_vector(values: np.ndarray) -> np.ndarray:
+    """Encode unit vectors as signed codes around ZERO_CODE; zero vectors, nothing there, become 0."""
     return _quantize_signed(values, NORMAL_STEPS, 1)[0] * _any_channel(values)
 
 
 def _decode_unit_vector(image: np.ndarray) -> np.ndarray:
+    """Inverse of `_encode_unit_vector`, as float32."""
     values = (image.astype(np.float32) - ZERO_CODE) / NORMAL_STEPS
     return np.where(_any_channel(image), values, np.float32(0.0))
 
 
 def _encode_fraction(values: np.ndarray) -> np.ndarray:
+    """Encode fractions 0 to 1, clipped, as 16-bit codes."""
     return np.rint(np.clip(MAX_CODE * values, 0, MAX_CODE)).astype(np.uint16)
 
 
 def _decode_fraction(image: np.ndarray) -> np.ndarray:
+    """Inverse of `_encode_fraction`, as float32."""
     return image.astype(np.float32) / MAX_CODE
 
 
 def _encode_flow(values: np.ndarray) -> np.ndarray:
+    """Encode flow [px] as two 16-bit channels, and a third that is above 0 where it is known."""
     return np.concatenate(_quantize_signed(values, FLOW_STEPS, 0), axis=-1, dtype=np.uint16)
 
 
 def _decode_flow(image: np.ndarray) -> np.ndarray:
+    """Inverse of `_encode_flow`, as float32; NaN: unknown."""
     values = (image[..., :2].astype(np.float32) - ZERO_CODE) / FLOW_STEPS
     return np.where(image[..., 2:] > 0, values, np.float32(np.nan))
 
 
 def _encode_displacement(values: np.ndarray) -> np.ndarray:
+    """Encode displacements in steps of SCENE_FLOW_STEP; all channels 0: unknown."""
     return _quantize_signed(values, 1.0 / SCENE_FLOW_STEP, 1)[0]
 
 
 def _decode_displacement(image: np.ndarray) -> np.ndarray:
+    """Inverse of `_encode_displacement`, as float32; NaN: unknown."""
     values = np.float32(SCENE_FLOW_STEP) * (image.astype(np.float32) - ZERO_CODE)
     return np.where(_any_channel(image), values, np.float32(np.nan))
 

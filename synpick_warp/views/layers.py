@@ -29,7 +29,9 @@ SCENE_FLOW_STEP = 2e-5
 
 @dataclass(frozen=True)
 class Layer:
-    """An annotation layer: its values in memory, and their encoding in PNG files."""
+    """Annotation layer (AOV): type, components and unit of its values, meaning of the value that stands for none, and encoding in PNG
+    files.
+    """
 
     dtype: str
     """Type of the values, in device buffers, in `FrameBatch.layers` and as decoded: a NumPy name."""

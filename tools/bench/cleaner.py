@@ -37,7 +37,7 @@ _PROGRAM = "from tools.bench.cleaner import main; main()"
 
 @dataclass(frozen=True)
 class Assignment:
-    """Task of a process: a data set, the episodes to verify, and the files to delete."""
+    """Task of a cleaner's process: data set, share of the episodes to verify, and suffixes of the files to delete (empty: all)."""
 
     out: Path
     """Folder of the data set."""
@@ -51,7 +51,7 @@ class Assignment:
 
 @dataclass(frozen=True)
 class Tally:
-    """Counters of a cleaner, or of one of its processes."""
+    """Counters of a cleaner, or of one of its processes: verified episodes and files, bytes deleted, first problem (empty: none)."""
 
     episodes: int = 0
     """Number of verified episodes."""
@@ -80,7 +80,7 @@ class Cleaner:
 
     @property
     def pids(self) -> list[int]:
-        """Process ids."""
+        """Ids of the worker processes."""
         return [worker.process.pid for worker in self._workers]
 
     def poll(self) -> Tally:

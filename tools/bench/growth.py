@@ -40,7 +40,9 @@ PATHS = (1, 2, 4)
 
 @dataclass(frozen=True)
 class Pile:
-    """Worlds after the drop."""
+    """Worlds DROP_TICKS ticks after the drop: snapshot, mean number of objects in a world, and time of the physics of a tick of all worlds
+    together [s].
+    """
 
     snapshot: Snapshot
     objects: float
@@ -57,12 +59,12 @@ class Assets:
         self.catalog, self.lights = load_catalog(config), load_lights(config.bake.lights)
 
     def build_scene(self, config: Config) -> RenderScene:
-        """Renderer's scene of these settings."""
+        """Build the renderer's scene of these settings."""
         fixtures, cameras = make_fixtures(config.tote, config.gripper), make_cameras(config.cameras)
         return build_render_scene(config.render, config.tote, self.catalog, fixtures, cameras, self.lights, self.device)
 
     def drop(self, config: Config, scene: RenderScene) -> Pile:
-        """Drop piles and time ticks of their physics."""
+        """Drop piles, and measure ticks of their physics."""
         simulation = Simulation(config, self.catalog, len(self.lights), self.device, scene, range(config.bake.worlds))
         simulation.scene.settle.rest_ticks = simulation.scene.settle.max_ticks = FOREVER
         tick = simulation.tick
@@ -73,7 +75,7 @@ class Assets:
         return Pile(snapshot, float((snapshot.catalog_index.numpy() >= 0).sum(axis=1).mean()), seconds)
 
     def time_view(self, config: Config, scene: RenderScene, pile: Pile) -> float:
-        """Time of a view [s], in full batches."""
+        """Time to render a view [s], measured in full batches."""
         cameras, sizes = len(config.cameras.positions), view_sizes(config, self.device)
         count = min(sizes["view"], config.bake.worlds * cameras)
         histories = config.bake.worlds * cameras
@@ -85,31 +87,33 @@ class Assets:
 
 
 def vary_worlds(config: Config, factor: float) -> tuple[str, Config]:
-    """Other number of worlds."""
+    """Settings with `factor` times as many worlds, at least as many as a GPU takes, and their label."""
     worlds = max(1, round(factor * config.bake.worlds))
     config = with_enough_worlds(config.with_values({"bake.worlds": worlds}), pick_device(config.bake.device))
     return str(config.bake.worlds), config
 
 
 def vary_objects(config: Config, factor: float) -> tuple[str, Config]:
-    """Other volume of the objects."""
+    """Settings with `factor` times the total volume of the objects (arrangement.volume), and their label."""
     volume = factor * config.arrangement.volume
     return f"{1e3 * volume:.3g} l", config.with_values({"arrangement.volume": volume})
 
 
 def vary_resolution(config: Config, factor: float) -> tuple[str, Config]:
-    """Other image size of the same shape."""
+    """Settings with the width and height of images times `factor`, and their label."""
     width, height = (max(1, round(factor * size)) for size in config.cameras.resolution)
     return f"{width}x{height}", config.with_values({"cameras.resolution": (width, height)})
 
 
 def vary_paths(config: Config, paths: float) -> tuple[str, Config]:
-    """Other number of paths per coarse pixel."""
+    """Settings with this number of paths per coarse pixel, of the low-resolution lighting pass (render.coarse_paths), and their label."""
     return str(int(paths)), config.with_values({"render.coarse_paths": int(paths)})
 
 
 def vary_cameras(config: Config, factor: float) -> tuple[str, Config]:
-    """Other number of cameras: the first ones, or all, and then these turned by 180° about the vertical."""
+    """Settings with `factor` times as many cameras, and their label: the first ones, or all, and then these turned by 180° about the
+    vertical.
+    """
     cameras, present = config.cameras, len(config.cameras.positions)
     count = max(1, round(factor * present))
     chosen = replace(cameras, positions=_turn(cameras, "positions", count), ups=_turn(cameras, "ups", count))
@@ -117,6 +121,9 @@ def vary_cameras(config: Config, factor: float) -> tuple[str, Config]:
 
 
 def _turn(cameras: Cameras, name: str, count: int) -> tuple[tuple[float, float, float], ...]:
+    """First `count` vectors of the cameras' member `name`, repeated as needed; every second repetition is turned by 180° about the
+    vertical.
+    """
     vectors = getattr(cameras, name)
     repeats = math.ceil(count / len(vectors))
     return tuple(((-1) ** turn * x, (-1) ** turn * y, z) for turn in range(repeats) for x, y, z in vectors)[:count]
@@ -148,7 +155,11 @@ def measure_growth(config: Config, min_seconds: float) -> Iterator[Row]:
 
 
 def _rows(name: str, steps: int, pile: Pile | None, view: float) -> Iterator[Row]:
-    """Rows of a point: of piles that were dropped for it, and of a view that takes `view` [s]."""
+    """Rows of one measurement: objects, physics time and world-steps per second if a pile was dropped for it (else None), and time of a
+    view.
+
+    `steps`: physics steps of a tick, of all worlds together; `view` [s].
+    """
     if pile is not None:
         yield Row(f"{name}: objects a tote", pile.objects)
         yield Row(f"{name}: physics of a tick", 1e3 * pile.seconds, "ms")

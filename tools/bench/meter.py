@@ -33,7 +33,9 @@ SLICE_SECONDS = 20.0
 
 @dataclass(frozen=True)
 class Reading:
-    """State of a bake after a tick."""
+    """Reading of a bake after a tick: time [s], views or frames so far, episodes, resources of its processes, disk and device memory in use
+    [B].
+    """
 
     time: float
     """[s]"""
@@ -98,7 +100,7 @@ class SteadyMeter(SilentProgress):
     def update(
         self, *, episodes_done: int, episodes: int, worlds_active: int, views: int, views_per_s: float, seconds_left: float | None
     ) -> None:
-        """Take a reading after each tick of the measurement."""
+        """Take a reading after each tick from the steady state on; interrupts the bake when it has measured long enough."""
         count = self.counter() if self.counter else views
         tally = self.cleaner.poll() if self.cleaner else Tally()
         if count:
@@ -118,11 +120,13 @@ class SteadyMeter(SilentProgress):
             raise KeyboardInterrupt
 
     def _stop(self) -> None:
+        """Interrupt the bake in this process, once."""
         if not self.is_stopped:
             self.is_stopped = True
             os.kill(os.getpid(), signal.SIGINT)
 
     def _read(self, count: int, episodes: int, tally: Tally) -> Reading:
+        """Reading of this moment: time, counts, CPU and memory of the processes, cleaner apart, disk, device memory."""
         now, disk, usages = time.perf_counter(), shutil.disk_usage(self.folder).used, measure_usage()
         main, pids = usages.pop(os.getpid(), Usage()), self.cleaner.pids if self.cleaner else ()
         cleaner = reduce(Usage.plus, [usages.pop(pid, Usage()) for pid in pids], Usage())

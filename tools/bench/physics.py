@@ -69,7 +69,7 @@ class Stopwatch:
         return mock.patch.object(owner, method, timed)
 
     def time_generator(self, owner: object, method: str, name: str) -> contextlib.AbstractContextManager[object]:
-        """The same for a generator, from its first to its last part, with what its consumer does between."""
+        """Context manager that times a generator method, from its first to its last part, with what its consumer does between."""
         function = getattr(owner, method)
 
         def timed(*arguments: object, **options: object) -> Iterator[object]:
@@ -80,6 +80,7 @@ class Stopwatch:
 
     @contextlib.contextmanager
     def _time(self, name: str) -> Iterator[None]:
+        """Add the time of the block to what `name` has spent: on a GPU by events, on a CPU by the clock."""
         if not self.device.is_cuda:
             started = time.perf_counter()
             yield
@@ -153,12 +154,12 @@ def measure_simulation(factory: Factory, min_seconds: float, parts: tuple[str, .
 
 
 def _measure_ticks(simulation: Simulation, tick: Callable[[], None], min_seconds: float, state: str) -> Iterator[Row]:
-    """Benchmark of whole ticks."""
+    """Measure whole ticks in a state of the worlds; yields rows of time and rates."""
     yield from _tick_rates(simulation, seconds_per_call(tick, simulation.device, min_seconds, BURST), state)
 
 
 def _tick_rates(simulation: Simulation, seconds: float, state: str) -> Iterator[Row]:
-    """Rates of ticks that take `seconds` each."""
+    """Rows of time and rates of ticks that take `seconds` each."""
     physics = simulation.config.physics
     yield Row(f"{state}: world-steps", physics.steps_per_tick * simulation.layout.worlds / seconds, "1/s")
     yield Row(f"{state}: a step of all worlds", 1e3 * seconds / physics.steps_per_tick, "ms")

@@ -45,7 +45,7 @@ ROUNDS = 5
 
 @dataclass(frozen=True, eq=False)
 class KeptTick:
-    """Copy of a tick that stays valid while the simulation goes on."""
+    """Copy of a tick's snapshot and batches of views, which stays valid while the simulation goes on."""
 
     snapshot: Snapshot
     batches: list[Any]
@@ -53,7 +53,7 @@ class KeptTick:
 
     @property
     def views(self) -> int:
-        """Number of views."""
+        """Number of views of all batches."""
         return sum(batch.count for batch in self.batches)
 
 
@@ -66,7 +66,7 @@ class SavedHistory:
         self._pairs = [(array, wp.clone(array)) for array in arrays]
 
     def restore(self) -> None:
-        """Write the copy back to the renderer."""
+        """Write the saved copy back to the renderer's history."""
         for array, saved in self._pairs:
             wp.copy(array, saved)
 

@@ -34,7 +34,7 @@ def plan_spare_episodes(config: Config, devices: int = 1) -> Config:
 
 @contextlib.contextmanager
 def clean_up_behind(config: Config, out: Path, suffixes: tuple[str, ...] = ()) -> Iterator[Cleaner]:
-    """Verify the episodes of a bake to `out` while it runs, and delete their files with these suffixes (empty: all).
+    """Context manager: verify the episodes of a bake to `out` while it runs, and delete their files with these suffixes (empty: all).
 
     Raises:
         DatasetError: An episode was damaged.

@@ -37,6 +37,7 @@ class _StillProducer(Producer):
         self.still = still
 
     def batches(self) -> Iterator[ViewBatch]:
+        """Yield batches of the same, kept tick without end."""
         while True:
             yield from self.render(self.still, self.stages.simulation.record.snapshot)
 
@@ -45,6 +46,7 @@ class _UnloggedProducer(Producer):
     """Producer without the log of episodes: attempts may have begun before the benchmark."""
 
     def _end_episodes(self, report: TickReport) -> None:
+        """Do nothing: no episode is logged."""
         return
 
 
@@ -105,6 +107,7 @@ def _render_loop(stages: Stages, ring: BatchRing, report: TickReport) -> Iterato
 
 
 def _render_all(stages: Stages, ring: BatchRing, snapshot: Snapshot, world: np.ndarray, camera: np.ndarray) -> Iterator[int]:
+    """Render the views in batches into one slot of the ring; yields the number of views of each."""
     slot = ring.slots[0]
     for views in batch_views(world, camera, ring.views, stages.renderer):
         stages.renderer.render(snapshot, views, slot.images, slot.layers)

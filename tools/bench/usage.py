@@ -13,7 +13,7 @@ memory [pages]."""
 
 
 class Usage(NamedTuple):
-    """Resources of processes."""
+    """Resources of processes: CPU time [s], resident memory and its part without shared memory and files [bytes]."""
 
     cpu: float = 0.0
     """CPU time in user mode and in the kernel [s]."""
@@ -23,7 +23,7 @@ class Usage(NamedTuple):
     """Resident memory of the process's own [bytes]: without shared memory and files."""
 
     def plus(self, other: Usage) -> Usage:
-        """Sum of two."""
+        """Sum of the resources of two."""
         return Usage(self.cpu + other.cpu, self.resident + other.resident, self.anonymous + other.anonymous)
 
 

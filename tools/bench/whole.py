@@ -30,7 +30,7 @@ PICTURES = (".jpg", ".png")
 
 
 class WholeBake(NamedTuple):
-    """Size of a bake."""
+    """Size of a bake to measure: episodes, and worlds (0: automatic)."""
 
     episodes: int
     worlds: int = 0
@@ -38,7 +38,7 @@ class WholeBake(NamedTuple):
 
 
 class TracePoint(NamedTuple):
-    """State of a bake after a tick."""
+    """State of a bake after a tick: time since the start [s], views, worlds at work, ended episodes."""
 
     seconds: float
     """Time since the start [s]."""
@@ -50,13 +50,13 @@ class TracePoint(NamedTuple):
 
 
 class Stretch(NamedTuple):
-    """Time and views of one stretch of a bake, such as settling or the tail."""
+    """Time [s] and views of one stretch of a bake, such as settling or the tail."""
 
     seconds: float = 0.0
     views: int = 0
 
     def plus(self, seconds: float, views: int) -> Stretch:
-        """Return the sum with one tick."""
+        """Sum with one more tick."""
         return Stretch(self.seconds + seconds, self.views + views)
 
 
@@ -80,7 +80,7 @@ class _Trace(SilentProgress):
     def update(
         self, *, episodes_done: int, episodes: int, worlds_active: int, views: int, views_per_s: float, seconds_left: float | None
     ) -> None:
-        """Record a point."""
+        """Record a point of progress and the disk used; interrupts the bake if the cleaner has a problem."""
         if self.cleaner.poll().problem and not self._is_stopped:
             self._is_stopped = True
             os.kill(os.getpid(), signal.SIGINT)
@@ -118,7 +118,7 @@ def measure_whole(config: Config, bake: WholeBake, steady_rate: float, traces: d
 
 
 def count_live(points: Sequence[TracePoint], cameras: int) -> list[int]:
-    """Worlds that delivered views in each tick."""
+    """Worlds that delivered views in each tick, from the points of progress."""
     frames = [0, *(point.views // cameras for point in points)]
     return [now - before for before, now in itertools.pairwise(frames)]
 

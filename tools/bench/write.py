@@ -33,7 +33,7 @@ MAX_FRAMES = 600
 
 @dataclass(frozen=True)
 class _Input:
-    """Input of the writers: views and frames of the same worlds, reused for every copy and frame."""
+    """Input of the writers: views and ticks of the same worlds, reused for every copy and frame."""
 
     views: FrameBatch
     frames: TickBatch
@@ -51,6 +51,7 @@ class _Input:
 
     @staticmethod
     def _episodes(episode: np.ndarray, copy: int) -> np.ndarray:
+        """Indices (int32) of a copy of these episodes, different for each copy."""
         return ((COPIES + 1) * episode + copy).astype(np.int32)
 
 
@@ -105,7 +106,9 @@ def _copy(batch: FrameBatch) -> FrameBatch:
 
 @dataclass(frozen=True)
 class _Result:
-    """Measured values of one format with one process count."""
+    """Result of one format with one process count: views written [1/s], CPU time per view [s], time to commit an episode [s], files and
+    bytes per view.
+    """
 
     rate: float
     """Views written [1/s]."""
@@ -126,7 +129,9 @@ class _Result:
 def _write(
     exporter_class: type[Exporter], config: Config, factory: Factory, source: _Input, processes: int, min_seconds: float, out: Path
 ) -> _Result:
-    """Write into the new folder `out` for at least `min_seconds` [s], or until episodes have `MAX_FRAMES` frames."""
+    """Write into the new folder `out` for at least `min_seconds` [s], or until episodes have `MAX_FRAMES` frames; returns the measured
+    values.
+    """
     (out / PARTIAL).mkdir(parents=True)
     with WriterPool(processes, exporter_class.slot_bytes(TaskSizes.of(config))) as pool:
         exporter = exporter_class(ExportContext(out, config, factory.catalog, factory.cameras, factory.lights, pool))

@@ -34,7 +34,7 @@ CHUNK = 2_000_000
 
 @dataclass
 class Report:
-    """All bounded quantities of the check."""
+    """Measures of the check, one for each bounded quantity."""
 
     missing: Measure = field(default_factory=lambda: Measure("missing files, and lists of different length", "", 0))
     rotation: Measure = field(default_factory=lambda: Measure("rotations: deviation from orthonormal", "", 1e-9))
@@ -67,7 +67,7 @@ class Silhouette:
     """Image row of the window's first row, likewise."""
 
     def crop(self, height: int, width: int) -> np.ndarray:
-        """Depth within the image (height, width)."""
+        """Depth within the image (height, width), without the parts beyond its borders."""
         image = np.full((height, width), np.inf)
         rows = slice(max(self.top, 0), max(min(self.top + self.depth.shape[0], height), 0))
         columns = slice(max(self.left, 0), max(min(self.left + self.depth.shape[1], width), 0))
@@ -218,7 +218,7 @@ class View:
 
 
 def read_view(scene: Path, frame: str) -> View:
-    """Read one view and cast rays at its instances."""
+    """Read one view, and cast rays at its instances."""
     camera = read_json(scene / "scene_camera.json")[frame]
     stem = f"{int(frame):06d}"
     counts = read_image(scene / "depth" / f"{stem}.png")
@@ -320,7 +320,7 @@ def check_coco(scene: Path, frame: str, view: View, report: Report) -> None:
 
 
 def check(dataset: Path, views: int) -> Report:
-    """Check that all files of a data set exist, and check `views` views spread evenly over it."""
+    """Check that all files of a data set exist, and `views` views spread evenly over it; returns all measures."""
     scenes = sorted(path.parent for path in dataset.glob("[!.]*/*/scene_camera.json"))
     if not scenes:
         raise UnusableError(f"{dataset} has no scene")

@@ -56,7 +56,7 @@ PATTERNS = {
 
 
 class Finding(NamedTuple):
-    """Words of a text that tell history."""
+    """Place in a text whose words tell history: file, line, kind of words, text."""
 
     path: Path
     line: int
@@ -65,7 +65,7 @@ class Finding(NamedTuple):
 
 
 def find_history(path: Path, text: str) -> list[Finding]:
-    """Findings in a file's documentation, by line."""
+    """Find words that tell history in a file's documentation, by line."""
     found = [
         Finding(path, start + prose[: match.start()].count("\n"), kind, " ".join(match[0].split()))
         for start, prose in _passages(path, text)
@@ -76,6 +76,7 @@ def find_history(path: Path, text: str) -> list[Finding]:
 
 
 def _name(path: Path) -> str:
+    """Path relative to the repository, or else its name."""
     return path.relative_to(ROOT).as_posix() if path.is_relative_to(ROOT) else path.name
 
 
@@ -92,11 +93,12 @@ def _passages(path: Path, text: str) -> Iterator[tuple[int, str]]:
 
 
 def _paragraphs(text: str) -> Iterator[tuple[int, str]]:
+    """Yield (line, text) of each paragraph of a text."""
     yield from _blocks((number, line) for number, line in enumerate(text.splitlines(), 1) if line.strip())
 
 
 def _blocks(lines: Iterator[tuple[int, str]]) -> Iterator[tuple[int, str]]:
-    """Join lines that follow each other."""
+    """Yield (first line, text) of lines that follow each other."""
     first, block = 0, []
     for number, line in lines:
         if block and number != first + len(block):
@@ -116,12 +118,13 @@ def _docstrings(text: str) -> Iterator[tuple[int, str]]:
 
 
 def _comments(text: str) -> Iterator[tuple[int, str]]:
+    """Yield (line, text) of each block of comments in Python source."""
     tokens = tokenize.generate_tokens(io.StringIO(text).readline)
     yield from _blocks((token.start[0], token.string.lstrip("#")) for token in tokens if token.type == tokenize.COMMENT)
 
 
 def documents() -> Iterator[Path]:
-    """Files with documentation, each once."""
+    """Yield the files with documentation, each once."""
     paths = [*ROOT.glob("*.md"), ROOT / "Makefile", ROOT / "pyproject.toml"]
     for folder in FOLDERS:
         paths += [path for suffix in ("py", "md", "toml", "sh", "yml") for path in sorted((ROOT / folder).rglob(f"*.{suffix}"))]

@@ -50,7 +50,7 @@ def main(root: Path) -> int:
 
 
 def check_module(path: Path, tree: ast.Module, writes: Writes) -> Iterator[Fault]:
-    """Faults of one kernel module."""
+    """Yield the faults of one kernel module."""
     if ast.get_docstring(tree) is None:
         yield path, 1, "a kernel module needs a docstring"
     functions = [node for node in ast.walk(tree) if isinstance(node, ast.FunctionDef)]
@@ -72,7 +72,7 @@ def check_module(path: Path, tree: ast.Module, writes: Writes) -> Iterator[Fault
 
 
 def check_kernel(kernel: ast.FunctionDef, lines: list[str], writes: Writes) -> Iterator[tuple[int, str]]:
-    """Faults of one kernel as (line, rule)."""
+    """Yield the faults of one kernel as (line, rule)."""
     parameters = kernel.args.args
     if not kernel.name.endswith("_kernel"):
         yield kernel.lineno, f"the kernel {kernel.name} must end in _kernel"
@@ -171,7 +171,7 @@ def function_writes(modules: dict[Path, ast.Module]) -> Writes:
 
 
 def check_launches(root: Path, folder: str) -> Iterator[Fault]:
-    """Faults of host modules in `folder`: kernel launches outside the stages."""
+    """Yield the faults of host modules in `folder`: kernel launches outside the stages."""
     for path in sorted((root / folder).rglob("*.py")):
         if path.relative_to(root).as_posix().startswith(LAUNCHING) or path.is_relative_to(root / "synpick_warp" / "kernels"):
             continue
@@ -197,7 +197,7 @@ def disables_backward(node: ast.stmt) -> bool:
 
 
 def imports(tree: ast.Module) -> Iterator[tuple[int, str]]:
-    """(line, full name) of each import."""
+    """Yield (line, full name) of each import."""
     for node in ast.walk(tree):
         if isinstance(node, ast.Import):
             yield from ((node.lineno, name.name) for name in node.names)

@@ -34,7 +34,7 @@ def kernel_parameters(modules: dict[Path, ast.Module]) -> Parameters:
 
 
 def check_launch_arguments(path: Path, kernels: Parameters) -> Iterator[Fault]:
-    """Faults of one host module: launches whose arguments contradict the kernel's parameter names."""
+    """Yield the faults of one host module: launches whose arguments contradict the kernel's parameter names."""
     for function in ast.walk(ast.parse(path.read_text())):
         if not isinstance(function, ast.FunctionDef):
             continue
@@ -133,5 +133,5 @@ def _argument_name(argument: ast.expr) -> str:
 
 
 def _base(name: str) -> str:
-    """Parameter name without its suffix."""
+    """Parameter name without "_out" or "_inout"."""
     return next((name.removesuffix(suffix) for suffix in SUFFIXES if name.endswith(suffix)), name)

@@ -48,7 +48,7 @@ class Measure:
 
     @property
     def holds(self) -> bool:
-        """Whether the bound holds."""
+        """Whether the worst value is within the bound."""
         return self.worst <= self.allowed
 
 

@@ -44,7 +44,7 @@ SIZE, TILT = 0.15, (-0.28, 0.12, 0.35, 0.88)
 
 @dataclass(frozen=True)
 class Outcome:
-    """What became of a file."""
+    """Outcome of reading a mesh file: its kind, the message, and the mesh (None: refused, or not kept)."""
 
     file: Path
     kind: str
@@ -53,7 +53,7 @@ class Outcome:
 
 
 def read(file: Path) -> Outcome:
-    """Read a file as the catalog does, in metres."""
+    """Read a mesh file as the catalog does, in metres and centred; returns whether it loads, warns, is refused or fails."""
     said: list[str] = []
     try:
         mesh, given = read_mesh(file, 1.0, MeshOptions(center=True), said.append)
@@ -67,6 +67,7 @@ def read(file: Path) -> Outcome:
 
 
 def _send(file: Path, pipe: Any, keep: bool) -> None:
+    """Read a mesh file in a process, and send the outcome through a pipe; `keep`: with the mesh."""
     outcome = read(file)
     pipe.send(outcome if keep else Outcome(outcome.file, outcome.kind, outcome.text))
 
@@ -111,6 +112,7 @@ def draw(outcomes: list[Outcome], device: str) -> np.ndarray:
 
 
 def _label(picture: np.ndarray, file: Path) -> np.ndarray:
+    """Picture below a line with the file's name."""
     canvas = np.concatenate([np.full((LINE, CELL, 3), 255, np.uint8), picture[..., :3]])
     put_text(canvas, f"{file.parent.name}/{file.name}"[-34:], (2, LINE - 4), 0.38, (30, 30, 30))
     return canvas

@@ -29,7 +29,7 @@ MAX_SPEED_FRACTION = 0.95
 
 
 def make_measures() -> dict[str, Measure]:
-    """All bounded quantities, without values."""
+    """Make the measures of all bounded quantities, without values."""
     return {
         "pose": Measure("objects: last step against frame", "m", 0.0),
         "labels": Measure("arrays without unit, description or dimension names", "", 0.0),
@@ -153,7 +153,7 @@ def check(dataset: Path, count: int) -> dict[str, Measure]:
 
 
 def read_arrays(episode: zarr.Group, group: str) -> dict[str, np.ndarray]:
-    """All arrays of a group of an episode, by name."""
+    """Read all arrays of a group of an episode, by name."""
     return {name: np.asarray(array[...]) for name, array in episode[group].arrays()}  # type: ignore[union-attr]
 
 

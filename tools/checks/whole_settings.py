@@ -26,7 +26,7 @@ class Finding(NamedTuple):
 
 
 def find_functions(path: Path, text: str) -> Iterator[Finding]:
-    """Functions and methods of a module that take all settings."""
+    """Yield the functions and methods of a module that take all settings."""
     for node in ast.walk(ast.parse(text)):
         if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
             arguments = node.args.posonlyargs + node.args.args + node.args.kwonlyargs
@@ -41,7 +41,7 @@ def find_all() -> list[Finding]:
 
 
 def main() -> None:
-    """Print all findings."""
+    """Print every function that takes a whole Config, and their number by folder."""
     findings = find_all()
     for finding in findings:
         print(f"{finding.path}:{finding.line}: {finding.function}")

@@ -39,7 +39,7 @@ EQUAL, NOT_INSTALLED, NO_FORMAT = "equal", "not installed", "not in this data se
 
 @dataclass
 class Result:
-    """Row of the table."""
+    """Row of the table of clients: name, version, what it read, agreement, remarks, and whether the check holds."""
 
     client: str
     version: str
@@ -50,7 +50,7 @@ class Result:
 
 
 def run_client(name: str, python: str, data: Path, data_set: Any, sources: Sources) -> Result:
-    """Let one client read, and compare."""
+    """Let one client read in its interpreter, and compare with the expected values; returns its row."""
     module = importlib.import_module(f"tools.clients.{name}")
     place = module.find(data, sources)
     if place is None:

@@ -33,7 +33,7 @@ MILLIMETERS = 1000.0
 
 @dataclass
 class Reading:
-    """What a client has read."""
+    """Values that a client has read, by name, with remarks and versions for the table."""
 
     what: str
     """For the table."""
@@ -45,7 +45,7 @@ class Reading:
 
 @dataclass(frozen=True)
 class Sources:
-    """Options that lead to clients which no package index has."""
+    """Options that name folders of clients which no package index has."""
 
     bop_toolkit: str = ""
     """Folder of a copy of the BOP toolkit."""

@@ -29,7 +29,7 @@ SHOULDER_START = 0.6
 
 
 def find(data: Path, sources: Sources) -> Path | None:
-    """USD file of the first episode."""
+    """USD file of the first episode; None: there is none."""
     file = data / "usd" / f"{first_episode(data)['episode']:06d}.usdc"
     return file if file.is_file() else None
 
@@ -105,7 +105,9 @@ def _silent() -> Iterator[None]:
 
 
 def expect(data_set: Any) -> dict[str, np.ndarray]:
-    """The same from the views in memory; OpenCV's camera axes turned to those of USD (y up, looking along -z)."""
+    """Values that `read` must return, from the views of the data set in memory; camera axes of OpenCV turned to those of USD (y up, looking
+    along -z).
+    """
     import cv2
 
     values: dict[str, np.ndarray] = {}
@@ -127,7 +129,9 @@ def expect(data_set: Any) -> dict[str, np.ndarray]:
 
 
 def develop(name: str, value: np.ndarray) -> np.ndarray:
-    """Our tone curve ("shoulder") and sRGB's transfer curve, of what Cycles has in linear light."""
+    """Cycles' linear radiance as an sRGB picture like ours: our tone curve ("shoulder"), then sRGB's transfer curve. Called for pictures
+    only, so `name` is not used.
+    """
     linear = np.maximum(value.astype(np.float64), 0.0)
     rest = 1.0 - SHOULDER_START
     bent = SHOULDER_START + rest * (1.0 - np.exp(np.minimum(SHOULDER_START - linear, 0.0) / rest))

@@ -21,7 +21,7 @@ BOUNDS = {"depth": 1e-5, "world_to_camera": 1e-12, "object_to_camera": 1e-12, "m
 
 
 def find(data: Path, sources: Sources) -> Path | None:
-    """First scene."""
+    """Folder of the first scene; None: there is none."""
     return first_scene(data)
 
 
@@ -78,11 +78,12 @@ def _read_version(folder: Path) -> dict[str, str]:
 
 
 def _first_model(data: Path) -> int:
+    """Lowest obj_id of models_info.json."""
     return min(int(key) for key in json.loads((data / "models" / "models_info.json").read_text()))
 
 
 def expect(data_set: Any) -> dict[str, np.ndarray]:
-    """The same from the views in memory; every object has at least one symmetry transformation, the identity."""
+    """Values that `read` must return, from the views in memory; every object has at least one symmetry transformation, the identity."""
     import trimesh
 
     values: dict[str, np.ndarray] = {}

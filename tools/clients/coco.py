@@ -20,11 +20,13 @@ def find(data: Path, sources: Sources) -> Path | None:
 
 
 def _scene_file(data: Path) -> Path | None:
+    """COCO file of the first scene; None: there is none."""
     scene = first_scene(data)
     return scene / "scene_gt_coco.json" if scene is not None and (scene / "scene_gt_coco.json").is_file() else None
 
 
 def _split_file(data: Path) -> Path | None:
+    """COCO file of the first split; None: there is none."""
     return min(data.glob("coco/annotations/instances_*.json"), default=None)
 
 
@@ -55,7 +57,7 @@ def read(place: Path, data: Path, sources: Sources) -> Reading:
 
 
 def expect(data_set: Any) -> dict[str, np.ndarray]:
-    """Visible instances of the views in memory."""
+    """Values that `read` must return, from the views in memory: visible instances."""
     values: dict[str, np.ndarray] = {}
     for frame, view in sampled_views(data_set).items():
         seen = view.masks.any(axis=(1, 2))

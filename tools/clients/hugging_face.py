@@ -18,7 +18,7 @@ PACKAGES = ("datasets", "pillow")
 
 
 def find(data: Path, sources: Sources) -> Path | None:
-    """Folder of the first shard."""
+    """Folder of the first shard; None: there is none."""
     shard = first_shard(data)
     return None if shard is None else shard.parent
 
@@ -46,7 +46,7 @@ def read(place: Path, data: Path, sources: Sources) -> Reading:
 
 
 def expect(data_set: Any) -> dict[str, np.ndarray]:
-    """The same from the views in memory; depth as counts, which are integers."""
+    """Values that `read` must return, from the views in memory; depth as counts, which are integers."""
     values: dict[str, np.ndarray] = {}
     for frame, view in sampled_views(data_set).items():
         scale = np.float32(view.records.camera["depth_scale"] / 1000.0)

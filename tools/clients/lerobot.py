@@ -21,7 +21,7 @@ CAMERA = "observation.images.camera_0"
 
 
 def find(data: Path, sources: Sources) -> Path | None:
-    """Folder of the LeRobot data set."""
+    """Folder of the LeRobot data set; None: there is none."""
     place = data / "lerobot"
     return place if (place / "meta" / "info.json").is_file() else None
 
@@ -71,7 +71,7 @@ def read_split(place: Path, name: str, episodes: list[int], frames: list[int]) -
 
 
 def expect(data_set: Any) -> dict[str, np.ndarray]:
-    """Cup and pictures in memory; the cup needs the trajectories (zarr)."""
+    """Values that `read` must return, from memory: cup poses, which need the trajectories (zarr), and pictures."""
     episode = data_set[min(data_set)]
     values = {"frames": np.array([len(episode), len(episode)])}
     views = sampled_views(data_set)

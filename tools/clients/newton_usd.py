@@ -18,7 +18,7 @@ BOUNDS = {"object_to_world": 1e-6}
 
 
 def find(data: Path, sources: Sources) -> Path | None:
-    """USD file of the first episode."""
+    """USD file of the first episode; None: there is none."""
     file = data / "usd" / f"{first_episode(data)['episode']:06d}.usdc"
     return file if file.is_file() else None
 
@@ -38,6 +38,6 @@ def read(place: Path, data: Path, sources: Sources) -> Reading:
 
 
 def expect(data_set: Any) -> dict[str, np.ndarray]:
-    """Objects of the first frame; all are in the scene then."""
+    """Values that `read` must return, from the views in memory: the objects of the first frame, in which all are in the scene."""
     view = data_set[min(data_set)].view(0)
     return {"instance_id": view.instance_ids, "object_to_world": view.object_to_world}

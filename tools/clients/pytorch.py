@@ -19,7 +19,7 @@ BATCH, WORKERS = 2, 2
 
 
 def find(data: Path, sources: Sources) -> Path | None:
-    """The data set, if it has views."""
+    """The data set, if it has views; else None."""
     return data if first_scene(data) or first_shard(data) else None
 
 
@@ -43,7 +43,7 @@ def read(place: Path, data: Path, sources: Sources) -> Reading:
 
 
 def expect(data_set: Any) -> dict[str, np.ndarray]:
-    """The same from the views in memory: instances with visible pixels."""
+    """Values that `read` must return, from the views in memory: instances with visible pixels."""
     values: dict[str, np.ndarray] = {}
     for frame, view in sampled_views(data_set).items():
         seen = view.visible_boxes[:, 2] >= 0

@@ -21,7 +21,7 @@ BATCH = 2
 
 
 def find(data: Path, sources: Sources) -> Path | None:
-    """First shard."""
+    """First shard; None: there is none."""
     return first_shard(data)
 
 
@@ -55,7 +55,7 @@ def read(place: Path, data: Path, sources: Sources) -> Reading:
 
 
 def expect(data_set: Any) -> dict[str, np.ndarray]:
-    """The same from the views in memory."""
+    """Values that `read` must return, from the views in memory: colour, depth, masks, obj_ids."""
     values: dict[str, np.ndarray] = {}
     for frame, view in sampled_views(data_set).items():
         values |= {f"rgb {frame}": view.rgb, f"depth {frame}": view.depth, f"mask_visib {frame}": view.masks}

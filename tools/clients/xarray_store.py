@@ -17,7 +17,7 @@ ARRAYS = ("time", "object_id", "pose", "fixture_pose", "fixture_visible", "attac
 
 
 def find(data: Path, sources: Sources) -> Path | None:
-    """The store."""
+    """Folder of the zarr store; None: there is none."""
     store = data / "trajectory.zarr"
     return store if store.is_dir() else None
 
@@ -39,7 +39,7 @@ def read(place: Path, data: Path, sources: Sources) -> Reading:
 
 
 def expect(data_set: Any) -> dict[str, np.ndarray]:
-    """The same by plain zarr."""
+    """Values that `read` must return, read by plain zarr: arrays at the sampled frames, and masses."""
     episode = data_set[min(data_set)]
     frames = sample_frames(len(episode))
     values = {name: np.asarray(episode.ticks[name][:])[frames] for name in ARRAYS}

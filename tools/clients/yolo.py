@@ -21,7 +21,7 @@ BOUNDS = {"box": 1e-3, "box_of_segment": 0.61, "oriented_area": 0.02}
 
 
 def find(data: Path, sources: Sources) -> Path | None:
-    """data.yaml."""
+    """Path of data.yaml; None: there is none."""
     place = data / "yolo" / "data.yaml"
     return place if place.is_file() else None
 
@@ -93,7 +93,7 @@ def _read_supervision(copy: Path, split: str, scene: str, frames: list[int]) -> 
 
 
 def expect(data_set: Any) -> dict[str, np.ndarray]:
-    """Visible instances of the views in memory; masks of several parts with bridges between them."""
+    """Values that `read` must return, from the views in memory: visible instances; masks of several parts have bridges between them."""
     import cv2
 
     from synpick_warp.exporters.bop.outlines import join_parts, trace_outlines

@@ -63,7 +63,7 @@ _VERSION = re.compile(r'^__version__ = "([^"]+)"', re.MULTILINE)
 
 @dataclass(frozen=True)
 class Line:
-    """Result of one comparison."""
+    """Result of one comparison: part, name, verdict (equal, different or failed), detail."""
 
     part: str
     name: str
@@ -84,7 +84,7 @@ class Side:
 
     @property
     def version(self) -> str:
-        """Version of the package in the checkout."""
+        """Version of the package in this checkout."""
         match = _VERSION.search((self.checkout / "synpick_warp" / "__init__.py").read_text())
         return match[1] if match else "unknown"
 
@@ -109,11 +109,11 @@ class Side:
         part.rename(text)
 
     def text_file(self, step: Step) -> Path:
-        """File of the text of a step."""
+        """File that keeps the text a step printed."""
         return self.folder / "text" / f"{step.name.replace(' ', '-')}.txt"
 
     def text(self, step: Step) -> str:
-        """Text of a step without paths, times and version."""
+        """Text that a step printed, without paths, times and version."""
         text = _PROGRESS.sub("", self.text_file(step).read_text())
         for path, name in ((self.folder, "<folder>"), (self.checkout, "<checkout>"), (self.version, "<version>")):
             text = text.replace(str(path), name)
@@ -144,6 +144,7 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def _parse(arguments: list[str] | None) -> argparse.Namespace:
+    """Parse the command line."""
     parser = make_parser(__doc__, "models", "lights", "json")
     parser.add_argument("old", type=Path, metavar="OLD", help="folder of a checkout")
     parser.add_argument("new", type=Path, metavar="NEW", help="folder of another")
@@ -177,7 +178,7 @@ def _folder_names(checkouts: list[Path]) -> list[str]:
 
 
 def compare(old: Side, new: Side, options: argparse.Namespace) -> Iterator[Line]:
-    """Run and compare all parts that the options name."""
+    """Run and compare all parts that the options name; yields the results."""
     if set(options.parts) & set(CPU_PARTS):
         steps = list(cpu_steps(options.parts))
         with ThreadPoolExecutor(options.jobs) as pool:
@@ -193,7 +194,7 @@ def compare(old: Side, new: Side, options: argparse.Namespace) -> Iterator[Line]
 
 
 def _compare_step(old: Side, new: Side, step: Step, parts: tuple[str, ...]) -> Iterator[Line]:
-    """Lines about a step that both checkouts have run."""
+    """Compare what both checkouts wrote and printed in a step; yields the results."""
     baked = step.arguments[:1] == ("bake",)
     part = "sets" if baked else "commands" if step.arguments else "kernels"
     texts = [side.text(step) for side in (old, new)]

@@ -81,7 +81,7 @@ class Step:
 
 
 def cpu_steps(parts: tuple[str, ...]) -> Iterator[Step]:
-    """Steps on the CPU that the given parts need, in order."""
+    """Yield the steps on the CPU that the given parts need, in order."""
     if "kernels" in parts:
         yield Step("modules", ())
     for name, settings in SETS.items() if {"sets", "commands"} & set(parts) else ():
@@ -100,7 +100,7 @@ def cpu_steps(parts: tuple[str, ...]) -> Iterator[Step]:
 
 
 def _readers() -> Iterator[Step]:
-    """Commands that read a data set for people and for estimates."""
+    """Yield the steps that read a data set, for people and for estimates."""
     device = ("--device", "cpu", "--threads", "1")
     yield Step("stats tables", ("stats", "picks", "--threads", "1", "--paper"))
     yield Step(
@@ -138,5 +138,5 @@ def mixed_episodes(device: str, worlds: int, out: str, models: str, lights: str)
 
 
 def _assignments(settings: dict[str, object]) -> tuple[str, ...]:
-    """Options that make settings."""
+    """Command-line options (--set NAME=VALUE) that make settings."""
     return tuple(part for name, value in settings.items() for part in ("--set", f"{name}={json.dumps(value)}"))

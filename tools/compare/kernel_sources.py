@@ -42,7 +42,7 @@ Sources = dict[str, list[str]]
 
 
 def main() -> None:
-    """Run the command line."""
+    """Write the generated sources of all kernels as JSON to the first argument; further ones are a command whose modules are taken."""
     out, *command = sys.argv[1:]
     modules = list(run_command(command)) if command else [*package_modules(), *composed_modules()]
     sources: Sources = defaultdict(list)
@@ -70,7 +70,7 @@ def run_command(arguments: list[str]) -> Iterator[Any]:
 
 
 def package_modules() -> Iterator[Any]:
-    """All Warp modules of the package's device code."""
+    """Yield all Warp modules of the package's device code."""
     from warp._src import context
 
     import_all(f"{PACKAGE}.kernels")

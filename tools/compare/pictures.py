@@ -1,4 +1,4 @@
-"""Comparison of rendered outputs between two devices: every image and layer of the same piles, in both rendering modes.
+"""Comparison of rendered outputs between two devices: every image and layer of the same piles, in all three rendering modes.
 
 Piles settle once, on the first device; then objects are displaced by `CREEP`, so that flow is not zero. Exits with 1 if a difference
 exceeds its tolerance, with 2 if nothing can be compared.
@@ -41,7 +41,9 @@ CREEP = 1e-3
 
 @dataclass(frozen=True)
 class Tolerance:
-    """Tolerance of one output: a difference per pixel, and the fraction of pixels that may exceed it."""
+    """Tolerance of one output: difference up to which a pixel counts as equal (None: labels, which are equal or not), and the percentage of
+    pixels that may differ by more.
+    """
 
     difference: float | None
     """Largest difference that counts as equal [the output's unit]; None: labels, which are equal or not."""
@@ -95,7 +97,8 @@ class Difference:
 
 
 def compare(mode: str, output: str, a: np.ndarray, b: np.ndarray) -> Difference:
-    """Compare one output of two devices.
+    """Difference of one output between two devices: percentage of pixels that differ at all and beyond the tolerance, mean and largest
+    absolute difference. Labels (a tolerance of None) are equal or not, 0 or 1.
 
     Args:
         mode: Rendering mode.
@@ -146,6 +149,7 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def _parse(arguments: list[str] | None) -> argparse.Namespace:
+    """Parse the command line."""
     parser = make_parser(__doc__, "models", "lights", "seed", "set", "json", "size")
     parser.set_defaults(size="160x90")
     parser.add_argument("--devices", default="cpu,cuda:0", help="two devices, comma-separated (default: cpu,cuda:0)")
@@ -155,6 +159,7 @@ def _parse(arguments: list[str] | None) -> argparse.Namespace:
 
 
 def _config(options: argparse.Namespace, device: str) -> Config:
+    """Settings of the options: one world for each pile, all layers, on `device`."""
     fixed = {
         "bake.mode": "move",
         "bake.episodes": options.scenes,
@@ -167,7 +172,7 @@ def _config(options: argparse.Namespace, device: str) -> Config:
 
 
 def compare_devices(config: Config, devices: list[Any], console: Console) -> list[Difference]:
-    """Render settled piles on both devices and compare all outputs; first those of the denoised mode.
+    """Render settled piles on both devices in each mode of COLORS, the denoised one first; returns the differences of all outputs.
 
     Raises:
         SynpickError: Models or lights cannot be used, or a pile does not come to rest.
@@ -208,6 +213,7 @@ def render_views(config: Config, scene: Any, snapshot: Snapshot) -> dict[str, np
 
 
 def _print(console: Console, differences: list[Difference], title: str) -> None:
+    """Print a table of the differences, and whether each is within its tolerance."""
     table = Table("mode", "output", "differ %", "mean", "largest", "unit", "tolerance", "beyond %", "max %", title=title)
     table.add_column("", min_width=len("VIOLATED"), no_wrap=True)
     for row in differences:

@@ -41,7 +41,7 @@ _INDICES = re.compile(r"\d{6,}(_\d{6,})*")
 
 @dataclass
 class Difference:
-    """First difference of two files, and the largest one."""
+    """First difference of two files (where, with both values), and the largest one (NaN: something other than numbers differs)."""
 
     where: str
     """Key path, pixel, index or byte, with both values."""
@@ -51,7 +51,9 @@ class Difference:
 
 @dataclass
 class Layer:
-    """Comparison result of all files of one type."""
+    """Comparison of all files of one type: their number, how many differ, largest difference (NaN: something other than numbers
+    differs).
+    """
 
     files: int = 0
     differing: int = 0
@@ -60,7 +62,7 @@ class Layer:
 
 
 class UnusableError(Exception):
-    """A folder is missing or empty."""
+    """Error: a folder is missing or empty."""
 
 
 def compare(first: Path, second: Path) -> tuple[dict[str, Layer], str]:
@@ -123,6 +125,7 @@ def _compare_file(first: Path, second: Path, name: str, names: list[set[str]]) -
 
 
 def _same_bytes(first: Path, second: Path) -> bool:
+    """Whether two files have the same content."""
     if first.stat().st_size != second.stat().st_size:
         return False
     with first.open("rb") as one, second.open("rb") as other:
@@ -186,6 +189,7 @@ def compare_values(first: Any, second: Any, path: str = "") -> Iterator[tuple[st
 
 
 def _without_ignored(name: str, pairs: Iterator[tuple[str, Any, Any]]) -> Iterator[tuple[str, Any, Any]]:
+    """Drop the differing pairs whose key is ignored in files of this name."""
     return (pair for pair in pairs if pair[0].lstrip(".") not in IGNORED.get(name, ()))
 
 
@@ -227,7 +231,7 @@ def _array_folder(path: Path) -> Path | None:
 
 
 def compare_zarr(first: Path, second: Path) -> Difference | None:
-    """First difference of two zarr arrays."""
+    """First difference of two zarr arrays; None: they are equal."""
     import zarr
 
     one, other = (np.asarray(zarr.open_array(folder, mode="r")[...]) for folder in (first, second))
@@ -235,7 +239,7 @@ def compare_zarr(first: Path, second: Path) -> Difference | None:
 
 
 def compare_tars(first: Path, second: Path) -> Difference | None:
-    """First difference of two tar archives, member by member."""
+    """First difference of two tar archives, member by member; None: they are equal."""
     with tarfile.open(first) as one, tarfile.open(second) as other:
         members = (one.getmembers(), other.getmembers())
         named = [[member.name for member in own] for own in members]
@@ -252,7 +256,7 @@ def compare_tars(first: Path, second: Path) -> Difference | None:
 
 
 def compare_usd(first: Path, second: Path) -> Difference | None:
-    """First differing line of two USD layers as text."""
+    """First differing line of two USD layers as text; None: they are equal."""
     from pxr import Sdf
 
     layers = (Sdf.Layer.OpenAsAnonymous(str(path)) for path in (first, second))  # type: ignore[attr-defined]
@@ -264,6 +268,7 @@ def compare_usd(first: Path, second: Path) -> Difference | None:
 
 
 def _line(data: bytes, index: int) -> str:
+    """Line of a text by index; "nothing" beyond its end."""
     lines = data.splitlines()
     return lines[index].decode(errors="replace") if index < len(lines) else "nothing"
 

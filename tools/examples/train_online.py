@@ -63,6 +63,7 @@ class Network(nn.Module):
 
 
 def _convolutions(before: int, after: int) -> nn.Sequential:
+    """Two 3 x 3 convolutions with batch normalization and ReLU, from `before` to `after` channels."""
     pairs = [(nn.Conv2d(count, after, 3, padding=1, bias=False), nn.BatchNorm2d(after), nn.ReLU()) for count in (before, after)]
     return nn.Sequential(*itertools.chain.from_iterable(pairs))
 

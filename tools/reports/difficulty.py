@@ -34,6 +34,7 @@ def measure_difficulty(truth: Truth) -> dict[str, dict[str, float]]:
 
 
 def _statistics(truth: Truth, rows: np.ndarray) -> dict[str, float]:
+    """Difficulty of a selection of rows: episodes, instances a view, visibility and speed, by name."""
     visibility, speed = truth.visibility[rows], truth.speed[rows]
     # An object that is in a single frame has no speed.
     speed = speed[np.isfinite(speed)]

@@ -109,7 +109,9 @@ OWN = {
 
 @dataclass(frozen=True)
 class Lattice:
-    """Strength of periodic artefacts in an image."""
+    """Strength of periodic artefacts in an image: amplitude relative to neighbouring frequencies (1: none), share of windows [%], largest
+    amplitude [grey levels].
+    """
 
     ratio: float
     """RMS amplitude at the strongest grid frequency over all windows, relative to neighbouring frequencies; 1: no lattice."""
@@ -214,7 +216,7 @@ def lattice_periods(render: Render, width: int) -> tuple[int, ...]:
 
 
 def describe(pair: Pair, size: tuple[int, int], periods: tuple[int, ...]) -> list[Row]:
-    """Rows of a frame under one map."""
+    """Rows on the artefacts in a frame under one map."""
     second = pair.second or pair.reference
     mean = 0.5 * (pair.reference.color.astype(np.float32) + second.color)
     flip = mean_flip(mean, pair.denoised.color)
@@ -269,7 +271,7 @@ def measure_lattice(image: np.ndarray, instance: np.ndarray, periods: tuple[int,
 
 
 def _measure_period(image: np.ndarray, instance: np.ndarray, period: int) -> Lattice:
-    """As `measure_lattice`, for one period."""
+    """Measure the artefacts of one period; see `measure_lattice`."""
     lattice, near = _window_spectra(image, instance, period)
     if not len(lattice):
         return Lattice(0.0, 0.0, 0.0, 0)

@@ -68,6 +68,7 @@ class ReferenceStore:
         return shots
 
     def _digest(self, snapshot: Snapshot, world: int) -> str:
+        """SHA-256 of the settings and a world's snapshot, the key of its reference."""
         state = hashlib.sha256(self._settings)
         for item in dataclasses.fields(snapshot):
             state.update(getattr(snapshot, item.name).numpy()[world].tobytes())
@@ -75,6 +76,7 @@ class ReferenceStore:
 
 
 def _read(path: Path) -> tuple[Shot, Shot]:
+    """Two reference renderings from a file; their times are not kept (0)."""
     with np.load(path) as content:
         first, second = (Shot(*(content[f"{name}{index}"] for name in _ARRAYS), seconds=0.0) for index in (0, 1))
     return first, second

@@ -38,7 +38,7 @@ QUADRATURE = 4
 
 @dataclass(frozen=True, eq=False)
 class Shot:
-    """One rendered image with its radiance and instances."""
+    """Rendered view: sRGB image, linear radiance before exposure, segmentation ids, and time [s]."""
 
     color: np.ndarray
     """Image (H, W, 3) uint8, sRGB."""

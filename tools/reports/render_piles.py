@@ -39,7 +39,7 @@ MAX_TICKS = 400
 
 @dataclass(frozen=True, eq=False)
 class Pair:
-    """Denoised image and reference of one pile under one light map."""
+    """Denoised image and reference of one pile under one light map, mean radiance over seeds, and a second reference (None: none)."""
 
     light: str
     denoised: Shot

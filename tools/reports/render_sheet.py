@@ -52,7 +52,7 @@ def image_strip(pair: Pair) -> list[np.ndarray]:
 
 
 def _scale(image: np.ndarray) -> np.ndarray:
-    """Shrink or enlarge an image to the cells' width."""
+    """Image scaled to the cells' width."""
     height, width = image.shape[:2]
     if width > CELL_WIDTH:
         return cv2.resize(image, (CELL_WIDTH, round(height * CELL_WIDTH / width)), interpolation=cv2.INTER_AREA)

@@ -53,7 +53,9 @@ OWN = {
 
 @dataclass(frozen=True, eq=False)
 class Pile:
-    """Measured values of one arrangement at rest. Arrays have one value per object."""
+    """Measures of one arrangement at rest: ticks, re-drops, volume [l], energy [J]; per object speeds [mm/s], penetration [mm], inside or
+    not.
+    """
 
     episode: int
     ticks: int
@@ -76,7 +78,7 @@ class Pile:
 
 @dataclass
 class Results:
-    """Results of all arrangements."""
+    """Results of all arrangements: piles at rest, failed arrangements by ending, episodes given up."""
 
     piles: list[Pile] = field(default_factory=list)
     resampled: Counter[str] = field(default_factory=Counter)
@@ -241,10 +243,12 @@ def report(results: Results) -> list[Row]:
 
 
 def _bounded(name: str, value: float, unit: str, limit: float, bound: str) -> Row:
+    """Row of a value that must be below `limit`; NaN violates it."""
     return Row(name, value, unit, bound, value < limit)  # NaN violates it.
 
 
 def _percentiles(name: str, values: np.ndarray, unit: str, which: tuple[int, ...], max_median: float | None = None) -> list[Row]:
+    """Rows of percentiles of values; with `max_median` the first one, the median, must be below it."""
     names = {50: "median", 100: "max"}
     rows = [Row(f"{name}, {names.get(level, f'{level} %')}", float(np.percentile(values, level)), unit) for level in which]
     if max_median is not None:

@@ -135,11 +135,13 @@ def compare_frames(config: Config, frames: tuple[int, ...], cache: Path | None =
 
 
 def _render_both(references: Sequence[Studio], snapshot: Snapshot, world: int) -> tuple[Shot, Shot]:
+    """Render a world by two references with different samples."""
     first, second = (each.render(snapshot, world, 0) for each in references)
     return first, second
 
 
 def _summarize(pairs: list[Pair]) -> list[Row]:
+    """Rows of image quality (PSNR, denoised against reference) and bias over all pairs."""
     mean = float(np.mean([pair.quality for pair in pairs]))
     return [
         Row("denoised against reference, mean", mean, "dB", f">= {MIN_PSNR:g}", mean >= MIN_PSNR),

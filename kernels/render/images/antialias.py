@@ -50,7 +50,9 @@ which lies on both planes, would lend its colour to samples of the other face.""
 
 @wp.struct
 class ShadedImage:
-    """Linear radiance of a batch of views before post-processing, and for each anti-aliased pixel the pixels whose radiance it averages."""
+    """Linear radiance of a batch of views before post-processing, and for each pixel a resolve code: 0, it keeps its radiance, else packed
+    selectors of the pixels whose radiance its samples average.
+    """
 
     radiance: wp.array3d[wp.vec3]
     """Linear radiance (view, row, column) before exposure; of anti-aliased pixels, that of the pixel's centre."""
@@ -251,7 +253,7 @@ def visible_bodies(gbuffer: GBuffer, grid: ImageGrid, view: int, row: int, colum
 
 @wp.func
 def filter_body_mask(bodies: ViewBodies, view: int, tile: int, visible: wp.uint64) -> wp.uint64:
-    """The tile's body mask, without bodies that have no bit in `visible`: rays test no others."""
+    """Body mask of a tile without the bodies that have no bit in `visible`: rays test no others."""
     body_mask = bodies.body_mask[view, tile]
     result = wp.uint64(0)
     rank = int(0)

@@ -136,7 +136,7 @@ def is_inside(grid: ImageGrid, box: wp.vec4i) -> bool:
 
 @wp.func
 def box_pixels(box: wp.vec4i) -> int:
-    """Pixels of a box with inclusive sides."""
+    """Number of pixels of a box with inclusive sides."""
     return (box[2] - box[0] + 1) * (box[3] - box[1] + 1)
 
 

@@ -21,7 +21,9 @@ MIN_DEPTH = wp.constant(1.0e-3)
 
 @wp.struct
 class SensorParameters:
-    """Seed, geometry, noise and limits of the structured-light sensor model; see configs.sensors.DepthSensor."""
+    """Structured-light sensor model: seed, baseline [m], disparity quantization [px], range [m], axial and lateral noise, grazing limit,
+    matching window, and whether projector shadows are invalid; see configs.sensors.DepthSensor.
+    """
 
     seed: wp.uint64
     """Seed of the bake."""

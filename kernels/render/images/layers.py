@@ -16,7 +16,9 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.struct
 class BodyMotions:
-    """Rigid motion of each body from this frame back to the previous one, in the camera's axes, by view and body. Scratch."""
+    """Motion of each body from this frame back to the previous one, in the camera's axes: whether known, rotation minus identity, current
+    origin, and displacement to the previous origin [m]; by view and body. Scratch.
+    """
 
     known: wp.array2d[int]
     """1: the body was in the scene in the previous frame, of the same episode (view, body)."""

@@ -96,7 +96,7 @@ def directional_albedo(tables: AlbedoTables, roughness: float, cosine: float) ->
 
 @wp.func
 def mean_albedo_at(tables: AlbedoTables, roughness: float) -> wp.vec2:
-    """Mean albedo at a roughness."""
+    """Cosine-weighted mean of the directional albedo at a roughness, interpolated from the table."""
     y = wp.clamp(roughness, 0.0, 1.0) * float(ALBEDO_ROWS - 1)
     row = int(wp.min(wp.uint32(y), wp.uint32(ALBEDO_ROWS - 2)))
     return wp.lerp(tables.mean[row], tables.mean[row + 1], y - float(row))
@@ -268,7 +268,7 @@ class Angles:
 
 @wp.func
 def measure_angles(brdf: Brdf, incoming: wp.vec3) -> Angles:
-    """Angles for light from `incoming`."""
+    """Cosines between light direction `incoming`, view direction, half vector and normal."""
     angles = Angles()
     angles.incoming = wp.dot(incoming, brdf.normal)
     angles.outgoing = wp.dot(brdf.outgoing, brdf.normal)
@@ -294,7 +294,7 @@ class ViewFactors:
 
 @wp.func
 def view_factors(brdf: Brdf) -> ViewFactors:
-    """Factors of a BRDF for its view direction."""
+    """Factors of the BRDF that several lights share: masking, multiple scattering and diffuse term of its view direction."""
     factors = ViewFactors()
     factors.smith = smith_term(wp.dot(brdf.outgoing, brdf.normal), brdf.alpha)
     lost = wp.max(1.0 - brdf.mean_albedo[0] - brdf.mean_albedo[1], MIN_LOST_ALBEDO)

@@ -32,7 +32,9 @@ class CoarseGrid:
 
 @wp.struct
 class Guide:
-    """Guide image of the joint bilateral filters: normal, depth and segmentation id at coarse resolution. Scratch."""
+    """Guide image of the joint bilateral filters at coarse resolution: normal, depth and segmentation id of each coarse pixel, packed;
+    segmentation id NOTHING where no surface is visible. Scratch.
+    """
 
     surface: wp.array3d[wp.vec4]
     """(view, cell_row, cell_column): packed by `pack_surface`; 0, with the segmentation id NOTHING, where no surface is visible."""
@@ -55,19 +57,19 @@ def pack_surface(segment: int, depth: float, normal: wp.vec3) -> wp.vec4:
 
 @wp.func
 def surface_segment(surface: wp.vec4) -> wp.uint8:
-    """Segmentation id of a packed surface, as in `GBuffer`."""
+    """Segmentation id in a surface of `pack_surface`, as in `GBuffer`."""
     return wp.uint8(int(wp.abs(surface[3])))
 
 
 @wp.func
 def surface_depth(surface: wp.vec4) -> float:
-    """Planar depth of a packed surface [m]."""
+    """Planar depth in a surface of `pack_surface` [m]."""
     return surface[2]
 
 
 @wp.func
 def surface_normal(surface: wp.vec4) -> wp.vec3:
-    """Shading normal of a packed surface in camera space."""
+    """Shading normal in a surface of `pack_surface`, in camera space."""
     z = wp.sqrt(wp.max(1.0 - surface[0] * surface[0] - surface[1] * surface[1], 0.0))
     return wp.vec3(surface[0], surface[1], wp.where(surface[3] < 0.0, z, -z))
 

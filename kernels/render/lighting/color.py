@@ -39,7 +39,7 @@ def pack_half3(color: wp.vec3) -> wp.uint64:
 
 @wp.func
 def unpack_half3(packed: wp.uint64) -> wp.vec3:
-    """Unpack the values of `pack_half3`."""
+    """Three values in half precision, packed by `pack_half3`, as float32."""
     # Two words: shorter than shifts of 64 bits.
     lower = wp.cast(wp.uint32(packed), wp.vec2h)
     upper = wp.cast(wp.uint32(packed >> wp.uint64(32)), wp.vec2h)
@@ -54,5 +54,5 @@ def tag_half3(packed: wp.uint64, tag: wp.uint32) -> wp.uint64:
 
 @wp.func
 def half3_tag(packed: wp.uint64) -> wp.uint32:
-    """The 16 bits of `tag_half3`."""
+    """Lowest 16 bits of the tag that `tag_half3` stored."""
     return wp.uint32(packed >> wp.uint64(48))

@@ -77,7 +77,9 @@ def bilateral_weight(surface: wp.vec4, plane: Plane, down: int, right: int, stri
 
 @wp.struct
 class KernelSum:
-    """Weighted sums of `CoarseLight` over a filter kernel."""
+    """Weighted sums of `CoarseLight` over a filter kernel: occluded and unoccluded light, statistics for the noise of the
+    ratios, weights.
+    """
 
     diffuse: wp.vec3
     specular: wp.vec3
@@ -109,7 +111,7 @@ def read_light(light: CoarseLight, index: int) -> KernelSum:
 
 @wp.func
 def add_light(total: KernelSum, one: KernelSum, weight: float) -> KernelSum:
-    """Add a coarse pixel to weighted sums."""
+    """Add a coarse pixel's sums, times `weight`, to weighted sums."""
     result = KernelSum()
     result.diffuse = total.diffuse + weight * one.diffuse
     result.specular = total.specular + weight * one.specular

@@ -18,10 +18,8 @@ SH_CONSTANT = wp.constant(0.282095)
 
 @wp.struct
 class Lights:
-    """Environment maps, their lamps, and precomputed tables (prefiltered maps, spherical harmonics of the irradiance). Constant.
-
-    A map's lamps are its small and bright lights, split off from the rest: see `scenes.lamps`. Directions are in the map's frame; a world
-    rotates its map about +z by its yaw.
+    """Environment maps: radiance with and without lamps, prefiltered maps and irradiance coefficients (SH) without lamps; lamps with unit
+    directions towards them, irradiance, sample points and numbers of shadow rays; exposure factor. Constant.
     """
 
     maps: int
@@ -134,7 +132,7 @@ def find_taps(direction: wp.vec3, rows: int, columns: int) -> BilinearTaps:
 
 @wp.func
 def bilinear(taps: BilinearTaps, upper_west: wp.vec3, upper_east: wp.vec3, lower_west: wp.vec3, lower_east: wp.vec3) -> wp.vec3:
-    """Bilinear interpolation of four texels."""
+    """Bilinear interpolation of four texels at the position of `taps`."""
     return wp.lerp(wp.lerp(upper_west, upper_east, taps.right), wp.lerp(lower_west, lower_east, taps.right), taps.down)
 
 

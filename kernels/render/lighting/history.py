@@ -201,7 +201,7 @@ def update_frame(row: int, column: int, bits: int) -> int:
 
 @wp.func
 def scale_light(light: SplitRadiance, factor: float) -> SplitRadiance:
-    """Multiply all members by a factor."""
+    """Light with all members multiplied by a factor."""
     result = SplitRadiance()
     result.diffuse = factor * light.diffuse
     result.specular = factor * light.specular
@@ -229,7 +229,7 @@ def read_history(history: LightHistory, slot: int, row: int, column: int) -> Spl
 
 @wp.func
 def blend_light(history: SplitRadiance, light: SplitRadiance, weight: float) -> SplitRadiance:
-    """Exponential moving average: `light` counts with `weight`."""
+    """Exponential moving average: (1 - weight) times the history plus `weight` times `light`."""
     result = SplitRadiance()
     result.diffuse = wp.lerp(history.diffuse, light.diffuse, weight)
     result.specular = wp.lerp(history.specular, light.specular, weight)

@@ -28,7 +28,9 @@ class EnvironmentCdf:
 
 @wp.struct
 class EnvironmentSample:
-    """Direction sampled from the environment map for next-event estimation, with its density and weighted radiance."""
+    """Direction sampled from the environment map for next-event estimation: unit vector towards the light, density [1/sr], and radiance
+    divided by density, MIS-weighted.
+    """
 
     direction: wp.vec3
     """Unit vector, in the map's frame or in the world."""
@@ -150,7 +152,7 @@ def invert_marginal(cdf: EnvironmentCdf, light: int, u: float) -> int:
 
 @wp.func
 def invert_conditional(cdf: EnvironmentCdf, light: int, row: int, u: float) -> int:
-    """Invert a row's conditional CDF likewise: the column c with conditional[c] <= u < conditional[c + 1]."""
+    """Invert a row's conditional CDF, as `invert_marginal`: the column c with conditional[c] <= u < conditional[c + 1]."""
     cell = int(u * float(cdf.conditional_guide.shape[2] - 1))
     low = int(cdf.conditional_guide[light, row, cell])
     high = int(cdf.conditional_guide[light, row, cell + 1]) + 1

@@ -152,7 +152,7 @@ def sample_offset(sample: int, samples_per_axis: int) -> wp.vec2:
 
 @wp.func
 def sum_of(values: wp.vec3) -> float:
-    """Sum of the components."""
+    """Sum of a vector's three components."""
     return values[0] + values[1] + values[2]
 
 

@@ -92,13 +92,13 @@ def shadow_steepness(record: wp.vec4) -> wp.uint32:
 
 @wp.func
 def shadow_normal(record: wp.vec4) -> int:
-    """Normal in a record of `pack_shadows`, as by `pack_normal`."""
+    """Normal in a record of `pack_shadows`, packed in 8 bits by `pack_normal`."""
     return int(wp.cast(record[2], wp.uint32) >> wp.uint32(24))
 
 
 @wp.func
 def shadow_depth(record: wp.vec4) -> float:
-    """Depth in a record of `pack_shadows` [m]."""
+    """Planar depth in a record of `pack_shadows` [m]."""
     return wp.cast(wp.cast(record[3], wp.uint32) & ~SEGMENT_BITS, wp.float32)
 
 
@@ -261,7 +261,7 @@ class FractionRange:
 
 @wp.func
 def extend_range(range_: FractionRange, fractions: wp.uint64) -> FractionRange:
-    """Include packed fractions in a range."""
+    """Range extended, lamp by lamp, to include packed visible fractions."""
     low = wp.uint32(fractions)
     high = wp.uint32(fractions >> wp.uint64(32))
     result = FractionRange()

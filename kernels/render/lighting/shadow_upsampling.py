@@ -224,7 +224,7 @@ def pack_fractions(fractions: wp.uint64) -> wp.vec3:
 
 @wp.func
 def unpack_fractions(packed: wp.vec3) -> wp.uint64:
-    """Inverse of `pack_fractions`."""
+    """Packed visible fractions of the lamps, as one 64-bit word, from the vector of `pack_fractions`."""
     return (wp.uint64(wp.cast(packed[1], wp.uint32)) << wp.uint64(32)) | wp.uint64(wp.cast(packed[0], wp.uint32))
 
 

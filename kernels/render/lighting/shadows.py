@@ -74,25 +74,25 @@ def pack_rays(rays: int, depth: float, segment: int, normal: int) -> wp.uint64:
 
 @wp.func
 def rays_bits(packed: wp.uint64) -> int:
-    """Bits of packed shadow rays."""
+    """Visibility bits of packed shadow rays (`pack_rays`)."""
     return int(wp.uint32(packed)) & ALL_RAYS
 
 
 @wp.func
 def rays_segment(packed: wp.uint64) -> wp.uint8:
-    """Segmentation id of packed shadow rays."""
+    """Segmentation id of packed shadow rays (`pack_rays`)."""
     return wp.uint8(wp.uint32(packed) >> wp.uint32(8))
 
 
 @wp.func
 def rays_normal(packed: wp.uint64) -> int:
-    """Normal of packed shadow rays, as by `pack_normal`."""
+    """Normal of packed shadow rays (`pack_rays`), packed in 8 bits by `pack_normal`."""
     return int((wp.uint32(packed) >> wp.uint32(16)) & wp.uint32(0xFF))
 
 
 @wp.func
 def rays_depth(packed: wp.uint64) -> float:
-    """Depth of packed shadow rays [m]."""
+    """Planar depth of packed shadow rays (`pack_rays`) [m]."""
     return wp.cast(wp.uint32(packed >> wp.uint64(32)), wp.float32)
 
 
@@ -105,7 +105,7 @@ def spread_bits(bits: int) -> wp.uint64:
 
 @wp.func
 def byte_of(packed: wp.uint64, index: int) -> int:
-    """Byte of a word, from the lowest on."""
+    """Byte `index` of a word, 0 the lowest."""
     return int(packed >> wp.uint64(8 * index)) & 0xFF
 
 

@@ -18,7 +18,7 @@ MIN_EXPOSED = wp.constant(1.0e-3)
 
 @wp.func
 def max_channels(a: wp.vec3, b: wp.vec3) -> wp.vec3:
-    """Maximum of each channel."""
+    """Component-wise maximum of two colours."""
     return wp.vec3(wp.max(a[0], b[0]), wp.max(a[1], b[1]), wp.max(a[2], b[2]))
 
 

@@ -56,13 +56,13 @@ def pack_ratios(diffuse: wp.vec3, specular: wp.vec3, indirect: wp.vec3, depth: f
 
 @wp.func
 def record_depth(record: RatioRecord) -> float:
-    """Depth of a packed coarse pixel [m]."""
+    """Planar depth in a record of `pack_ratios` [m]."""
     return wp.cast((half3_tag(record[0]) << wp.uint32(16)) | half3_tag(record[1]), wp.float32)
 
 
 @wp.func
 def record_segment(record: RatioRecord) -> wp.uint8:
-    """Segmentation id of a packed coarse pixel."""
+    """Segmentation id in a record of `pack_ratios`."""
     return wp.uint8(half3_tag(record[2]))
 
 

@@ -18,7 +18,9 @@ NEAR_PLANE = wp.constant(1.0e-3)
 
 @wp.struct
 class Cameras:
-    """Intrinsics and extrinsics of the cameras. Constant."""
+    """Pinhole cameras: intrinsics (fx, fy, cx, cy) [px], world-to-camera rotation, optical centre in the world [m], and camera-to-world
+    rotation in float32. Constant.
+    """
 
     intrinsics: wp.array[wp.vec4]
     """(camera): fx, fy, cx, cy [px]."""
@@ -32,7 +34,7 @@ class Cameras:
 
 @wp.struct
 class ImageGrid:
-    """Size of an image and of its grid of tiles."""
+    """Size of an image [px], tiles in a row of its grid, and tiles in the image."""
 
     width: int
     height: int
@@ -45,7 +47,9 @@ class ImageGrid:
 
 @wp.struct
 class Views:
-    """Views of a batch: which camera shows which world. Rows from `count` on are not read."""
+    """Views of a batch: world and camera of each (-1: not in use), number of views, instances per world. Rows from `count` on
+    are not read.
+    """
 
     world: wp.array[int]
     """(view); -1: the view is not in use."""

@@ -35,7 +35,9 @@ class Interior:
 
 @wp.struct
 class Meshes:
-    """Triangle meshes, their BVHs and bounds, each in its own frame: the catalog's, then tote, gripper shaft, cup. Constant."""
+    """Triangle meshes of the catalog, then tote, gripper shaft, cup, each in its own frame: handle, BVH, box and sphere [m], corners [m]
+    and unit normals of all triangles, empty interior of the tote. Constant.
+    """
 
     id: wp.array[wp.uint64]
     """(mesh): Warp's mesh handle."""
@@ -61,7 +63,7 @@ class Meshes:
 
 @wp.struct
 class Table:
-    """Height and visibility of the horizontal plane below the tote."""
+    """Horizontal plane below the tote: whether it is visible (1), and its z in the world [m]."""
 
     visible: int
     """1: the scene has a table."""
@@ -104,7 +106,9 @@ class ViewBodies:
 
 @wp.struct
 class GBuffer:
-    """Segmentation id, triangle, barycentric weights and depth of the primary hit of each pixel."""
+    """Primary hit of each pixel: segmentation id (0: nothing, 1 + instance, or a `Segment`), triangle within the body's mesh, barycentric
+    weights of its first two corners, planar depth [m].
+    """
 
     segment: wp.array3d[wp.uint8]
     """(view, row, column): segmentation id: 0 nothing, 1 + instance, or a member of `Segment`."""
@@ -118,7 +122,9 @@ class GBuffer:
 
 @wp.struct
 class Hit:
-    """Segmentation id, triangle, barycentric weights and depth of the closest hit of one ray."""
+    """Closest hit of one ray: segmentation id (0: nothing), triangle, barycentric weights, and depth [m], planar of a camera ray, along the
+    ray of any other.
+    """
 
     segment: int
     triangle: int
@@ -137,7 +143,7 @@ def body_of(segment: int, instances: int) -> int:
 
 @wp.func
 def segment_of(body: int, instances: int) -> int:
-    """Segmentation id of a row of `ViewBodies`."""
+    """Segmentation id of a body: 1 + instance, or the fixture's `Segment`; `body` is a row of `ViewBodies`."""
     if body >= instances:
         return Segment.TOTE + body - instances
     return body + 1

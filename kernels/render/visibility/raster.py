@@ -44,7 +44,9 @@ BLOCK_COLUMNS = wp.constant(256)
 
 @wp.struct
 class VisibilityBuffer:
-    """Visibility key of the nearest triangle of each pixel, and the work list of blocks of large triangles."""
+    """Visibility key (depth, body, triangle) of the nearest triangle of each pixel, and the work list of blocks of large triangles with its
+    length, which may exceed its capacity.
+    """
 
     nearest: wp.array3d[wp.uint64]
     """(view, row, column): visibility key of the nearest triangle: float32 bits of the planar depth, body, triangle."""

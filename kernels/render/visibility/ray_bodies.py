@@ -15,7 +15,7 @@ row of the world-to-body rotation, and x, y or z of the body's position in the w
 
 @wp.struct
 class RayBody:
-    """Pose, BVH root and row of a body, unpacked from its ray record."""
+    """Body as a ray needs it: world-to-body rotation, origin in the world [m], BVH root, and row in `ViewBodies`."""
 
     rotation: wp.mat33
     """World to body frame."""
@@ -35,7 +35,7 @@ def first_ray_record(bodies: ViewBodies, view: int, rank: int) -> int:
 
 @wp.func
 def write_ray_body(meshes: Meshes, bodies_inout: ViewBodies, view: int, rank: int, body: int):
-    """Pack a body: sphere, pose and BVH."""
+    """Pack bounding sphere, pose and BVH of a body into its ray records, for `read_ray_body`."""
     rotation = bodies_inout.world_rotation[view, body]
     position = bodies_inout.position[view, body]
     root = meshes.bvh.root[bodies_inout.mesh[view, body]]

@@ -32,7 +32,7 @@ def write_record(records: wp.array3d[wp.vec4], index: int, record: wp.vec4):
 
 @wp.func_native(_READ_RECORD)
 def read_flat_record(records: wp.array[wp.vec4], index: int) -> wp.vec4:
-    """`read_record` for one-dimensional arrays."""
+    """Load a record of 16 bytes from a one-dimensional array by one instruction, as `read_record`."""
     ...
 
 
@@ -40,7 +40,7 @@ def read_flat_record(records: wp.array[wp.vec4], index: int) -> wp.vec4:
     return words.data[index];
 """)
 def read_uint64(words: wp.array3d[wp.uint64], index: int) -> wp.uint64:
-    """Load an element."""
+    """Load the element at this flat index by one instruction."""
     ...
 
 
@@ -48,5 +48,5 @@ def read_uint64(words: wp.array3d[wp.uint64], index: int) -> wp.uint64:
     words.data[index] = word;
 """)
 def write_uint64(words: wp.array3d[wp.uint64], index: int, word: wp.uint64):
-    """Store an element."""
+    """Store an element at this flat index by one instruction."""
     ...

@@ -109,7 +109,7 @@ class Primitive(_Struct):
 
 
 class Mesh(_Struct):
-    """glTF mesh: its primitives."""
+    """glTF mesh: list of primitives, each with a material."""
 
     primitives: list[Primitive]
 
@@ -222,7 +222,7 @@ class _Head(_Struct):
 
 
 class Gltf(_Struct):
-    """Arrays and default scene of a glTF document."""
+    """Schema of a glTF document's JSON: arrays of its elements, which refer to one another by index, and the default scene."""
 
     extensionsUsed: list[str] = []  # noqa: N815
     extensionsRequired: list[str] = []  # noqa: N815
@@ -243,7 +243,7 @@ class Gltf(_Struct):
 
 @dataclass(frozen=True, eq=False)
 class Document:
-    """A validated glTF document."""
+    """Validated glTF document: its path, JSON content, and the bytes of its buffers."""
 
     path: Path
     gltf: Gltf

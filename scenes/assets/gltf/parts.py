@@ -80,7 +80,7 @@ class _Reader:
         self.pixels = 0
 
     def parts(self) -> list[MeshPart]:
-        """All parts of the default scene, depth first; without scenes, of all nodes."""
+        """Mesh parts of the default scene, depth first; without scenes, of all nodes."""
         nodes, scenes = self.gltf.nodes, self.gltf.scenes
         children = {child for node in nodes for child in node.children}
         roots = [number for number in range(len(nodes)) if number not in children]
@@ -97,7 +97,7 @@ class _Reader:
         return parts
 
     def part(self, primitive: Primitive) -> MeshPart:
-        """Geometry and material of a primitive."""
+        """Geometry and material of a primitive as a mesh part."""
         attributes = primitive.attributes
         vertices = self.values(attributes["POSITION"], "POSITION", (3,))
         count = len(vertices)
@@ -177,7 +177,7 @@ class _Reader:
         return np.ndarray((count, width), kind, self.buffers[view.buffer], view.byteOffset + offset, (stride, kind.itemsize))
 
     def material(self, index: int) -> tuple[FileMaterial, TextureInfo | None]:
-        """A material and its reference to a base colour texture."""
+        """Material of a primitive, and the reference to its base colour texture (None: it has none)."""
         if index not in self.materials:
             material = item_at(self.gltf.materials, index, "material", self.path)
             self.note_ignored(material)
@@ -186,7 +186,7 @@ class _Reader:
         return self.materials[index]
 
     def note_ignored(self, material: Material) -> None:
-        """Note what a material has beyond base colour, metallic and roughness."""
+        """Note the features of a material beyond base colour, metallic and roughness, which are not used."""
         self.notes.ignored += [name for name in ("normalTexture", "occlusionTexture") if getattr(material, name) is not None]
         if material.emissiveTexture is not None or any(material.emissiveFactor):
             self.notes.ignored.append("emission")
@@ -194,7 +194,7 @@ class _Reader:
             self.notes.ignored.append("transparency")
 
     def pbr(self, pbr: Pbr) -> tuple[FileMaterial, TextureInfo | None]:
-        """Convert metallic-roughness; of the metallic-roughness texture, the mean is used."""
+        """Convert a metallic-roughness material: (material, base colour texture); of the metallic-roughness texture, the mean is used."""
         for name, value in (("metallicFactor", pbr.metallicFactor), ("roughnessFactor", pbr.roughnessFactor)):
             if not -_FACTOR_TOLERANCE <= value <= 1.0 + _FACTOR_TOLERANCE:
                 raise CatalogError(f"{self.path}: {name} is {value:g}; allowed: 0 to 1; correct the material")
@@ -242,7 +242,7 @@ class _Reader:
         return FileMaterial(plain_color(color) if missing else color, texture, metallic, roughness), None if missing else info
 
     def source(self, info: TextureInfo) -> int:
-        """Index of a texture's image."""
+        """Index of the image of a texture; raises CatalogError for image formats that cannot be read."""
         texture = item_at(self.gltf.textures, info.index, "texture", self.path)
         webp = texture.extensions.get(WEBP)
         source = webp.get("source") if isinstance(webp, dict) else texture.source
@@ -272,8 +272,9 @@ class _Reader:
         return self.images[source]
 
     def wrapped(self, material: FileMaterial, uv: np.ndarray, info: TextureInfo) -> tuple[FileMaterial, np.ndarray]:
-        """Apply a sampler's wrap modes where coordinates leave 0..1: mirrored repetition as an image twice the size that repeats, clamping
-        as a margin around the image."""
+        """Material and coordinates with a sampler's wrap modes applied where coordinates leave 0..1: mirrored repetition as an image twice
+        the size that repeats, clamping as a margin around the image.
+        """
         texture = self.gltf.textures[info.index]
         if texture.sampler is None or material.texture is None or not len(uv) or (uv.min() >= -1e-3 and uv.max() <= 1.0 + 1e-3):
             return material, uv
@@ -320,7 +321,7 @@ def _triangles(corners: np.ndarray, mode: int) -> np.ndarray:
 
 
 def _transform_uv(uv: np.ndarray, info: TextureInfo) -> np.ndarray:
-    """Apply KHR_texture_transform, and turn v up."""
+    """Texture coordinates after KHR_texture_transform, with v turned up."""
     transform = info.extensions.transform if info.extensions else None
     if transform is not None:
         cosine, sine = np.cos(transform.rotation), np.sin(transform.rotation)

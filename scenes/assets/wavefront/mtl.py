@@ -47,11 +47,11 @@ class MtlMaterial:
     """Names of statements and options that are not used."""
 
     def transform(self, uv: np.ndarray) -> np.ndarray:
-        """Apply the options -s and -o of map_Kd to texture coordinates (V, 2)."""
+        """Texture coordinates (V, 2) with the options -s and -o of map_Kd applied."""
         return uv * self.scale + self.offset
 
     def missing_images(self) -> list[str]:
-        """Names of images of which there is no file."""
+        """Names of the images that the material refers to and that do not exist."""
         return [name for name in self.maps.values() if is_missing(self.library.parent, name.partition(" #")[0], self.library)]
 
 

@@ -49,17 +49,17 @@ class StoredContext(ExportContext):
 
     @property
     def catalog(self) -> Catalog:
-        """See `ExportContext`."""
+        """Objects of the data set, loaded on first use. See `ExportContext`."""
         return self._assets[0]
 
     @property
     def lights(self) -> tuple[EnvironmentMap, ...]:
-        """See `ExportContext`."""
+        """Environment maps of the data set, loaded on first use. See `ExportContext`."""
         return self._assets[1]
 
     @property
     def names(self) -> dict[int, str]:
-        """See `ExportContext`: from the store; without one from models and settings, where some may have none."""
+        """Names by obj_id, sorted: from the zarr store; without one from models and settings, else "obj_NNNNNN". See `ExportContext`."""
         data = self._source.data
         if data.has_store:
             found = {item.object_id: item.name for item in data.objects}
@@ -69,6 +69,6 @@ class StoredContext(ExportContext):
         return dict(sorted(found.items()))
 
     def copy_constants(self, names: tuple[Path, ...]) -> bool:
-        """See `ExportContext`."""
+        """Copy these files and folders from the source to the output folder; returns True. See `ExportContext`."""
         self._source.copy_constants(names, self.out)
         return True

@@ -63,7 +63,10 @@ class FoundViewFiles(StoredViewFiles):
 
     @property
     def color(self) -> tuple[str, Buffer]:
-        """See `EncodedView`."""
+        """Suffix and encoded colour image: the stored bytes if they have the format of the scene's first image, else encoded again.
+
+        See `EncodedView`. Raises DatasetError if the image's size is not that of the first one.
+        """
         size = self.files.image_size(self.frame)
         if size != self.size:
             shown, first = (f"{width} x {height}" for width, height in (size, self.size))
@@ -75,28 +78,31 @@ class FoundViewFiles(StoredViewFiles):
         return self.suffix, encode_png(image) if self.suffix == ".png" else encode_jpeg(image, _JPEG_QUALITY)
 
     def layer(self, name: str) -> Buffer:
-        """See `StoredView`."""
+        """Encoded layer as PNG: the stored bytes, or encoded again if they are of another format. See `StoredView`."""
         suffix, data = self.files.image_file(name, self.frame)
         return data if suffix == ".png" else encode_png(self._image(name, None, "uint16"))
 
     def masks(self) -> list[Masks]:
-        """See `EncodedView`; where there are no amodal masks, COCO's formats need none."""
+        """Run lengths of the amodal and visible mask of each instance; without amodal masks the visible ones stand for both. See
+        `EncodedView`.
+        """
         visible = self._runs("mask_visib")
         return [Masks(*pair) for pair in zip(self._runs("mask") if self.files.has("mask") else visible, visible, strict=True)]
 
     def _runs(self, name: str) -> list[Runs]:
+        """Run lengths of one kind of masks, in the order of instances."""
         return [find_runs(mask) for mask in self.files.masks(name, self.frame, len(self.gt))]
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class FoundSceneFiles(StoredSceneFiles):
-    """`StoredScene` of any BOP scene."""
+    """Scene of any BOP data set as a `StoredScene`: its views in the colour format and size of its first image."""
 
     suffix: str
     size: tuple[int, int]
 
     def views(self, frames: range) -> Iterator[StoredViewFiles]:
-        """See `StoredScene`."""
+        """Yield the views of these frames (indices, not im_ids), with the colour format and size of the first. See `StoredScene`."""
         for frame in frames:
             view = FoundViewFiles(self.files, self.scene, self.images[frame])
             view.suffix, view.size = self.suffix, self.size
@@ -112,18 +118,22 @@ class _Context(ExportContext):
 
     @property
     def names(self) -> dict[int, str]:
-        """See `ExportContext`."""
+        """Names by obj_id, sorted, of the objects that occur in views. See `ExportContext`."""
         return self._names
 
     @cached_property
     def _names(self) -> dict[int, str]:
+        """Names by obj_id of all objects in views, from the models folder; "obj_NNNNNN" where there is none. Cached."""
         found = {int(index) for view in self._data.views() for index in view.object_ids}
         folder = self._data.folder
         named = object_names(folder, None, found) if (folder / models_folder(folder) / "models_info.json").is_file() else {}
         return {index: named.get(index, f"obj_{index:06d}") for index in sorted(found)}
 
     def copy_constants(self, names: tuple[Path, ...]) -> bool:
-        """See `ExportContext`: what there is of models."""
+        """Copy meshes, textures and JSON files of the models folders to the output folder, whatever `names` says; returns True.
+
+        See `ExportContext`.
+        """
         layout = _found(self._data).layout
         for name in MODEL_FOLDERS:
             source = layout.models.get(name if name in layout.models else models_folder(layout.root))
@@ -135,7 +145,7 @@ class _Context(ExportContext):
 
 
 def _found(data: DataSet) -> FoundScenes:
-    """The scenes of a data set from another source."""
+    """Found scenes of a data set of another program."""
     assert data.found is not None
     return data.found
 
@@ -205,6 +215,7 @@ def _check_formats(data: DataSet, first: SceneFiles, formats: Sequence[str]) -> 
 
 
 def _has_masks(scene: SceneFiles) -> bool:
+    """Whether a scene has both amodal and visible masks."""
     return scene.has("mask") and scene.has("mask_visib")
 
 

@@ -27,7 +27,7 @@ AHEAD = 2
 
 
 class Converted(NamedTuple):
-    """Result of a conversion."""
+    """Result of a conversion: number of all episodes of the converted data set, and how many of them earlier runs had converted."""
 
     episodes: int
     """Episodes of the converted data set."""
@@ -127,7 +127,7 @@ def check_formats(names: Sequence[str], layout: str, present: Collection[str], f
 
 
 def _check_apart(folder: Path, out: Path) -> None:
-    """Check that neither folder holds the other."""
+    """Raise DatasetError if the data set and the output folder are the same, or one lies in the other."""
     try:
         source, target = folder.resolve(), out.resolve()
     except (OSError, RuntimeError, ValueError) as error:

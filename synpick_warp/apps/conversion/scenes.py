@@ -29,16 +29,16 @@ class StoredSceneFiles:
 
     @property
     def frames(self) -> int:
-        """See `StoredScene`."""
+        """Number of frames. See `StoredScene`."""
         return len(self.images)
 
     def views(self, frames: range) -> Iterator[StoredViewFiles]:
-        """See `StoredScene`."""
+        """Views of these frames (indices, not im_ids). See `StoredScene`."""
         return (StoredViewFiles(self.files, self.scene, self.images[frame]) for frame in frames)
 
 
 class StoredViewFiles:
-    """`StoredView` of these files."""
+    """Files of one stored view as a `StoredView`: bytes, records, images and run lengths of masks."""
 
     def __init__(self, files: SceneFiles, scene: int, frame: int) -> None:
         """
@@ -51,53 +51,55 @@ class StoredViewFiles:
 
     @cached_property
     def _records(self) -> ViewRecords:
+        """Annotation records of the view: camera, gt, gt_info. Cached."""
         return self.files.records(self.frame)
 
     @property
     def camera(self) -> dict[str, Any]:
-        """See `EncodedView`."""
+        """Entry in scene_camera.json. See `EncodedView`."""
         return self._records.camera
 
     @property
     def gt(self) -> list[dict[str, Any]]:
-        """See `EncodedView`."""
+        """Entries in scene_gt.json, one per instance. See `EncodedView`."""
         return self._records.gt
 
     @property
     def gt_info(self) -> list[dict[str, Any]]:
-        """See `EncodedView`."""
+        """Entries in scene_gt_info.json, one per instance. See `EncodedView`."""
         return self._records.gt_info
 
     @property
     def color(self) -> tuple[str, Buffer]:
-        """See `EncodedView`."""
+        """Suffix and bytes of the colour file, as stored. See `EncodedView`."""
         return self.files.image_file("rgb", self.frame)
 
     @property
     def depth(self) -> Buffer:
-        """See `EncodedView`."""
+        """Bytes of the depth file (PNG), as stored. See `EncodedView`."""
         return self.layer("depth")
 
     def layer(self, name: str) -> Buffer:
-        """See `StoredView`."""
+        """Bytes of a layer's file, as stored; raises DatasetError if it is no PNG. See `StoredView`."""
         suffix, data = self.files.image_file(name, self.frame)
         if suffix != ".png":
             raise DatasetError(f"{name} of image {self.frame} in {self.files.place} is a {suffix} file, expected: .png; {ADVICE}")
         return data
 
     def color_image(self) -> np.ndarray:
-        """See `StoredView`."""
+        """Decoded colour image, sRGB, RGB order (H, W, 3) uint8. See `StoredView`."""
         return np.ascontiguousarray(self._image("rgb", 3, "uint8")[..., ::-1])
 
     def depth_image(self) -> np.ndarray:
-        """See `EncodedView`."""
+        """Decoded depth image (H, W) uint16 in counts. See `EncodedView`."""
         return self._image("depth", None, "uint16")
 
     def _image(self, name: str, channels: int | None, dtype: str) -> np.ndarray:
+        """Decoded image of a kind; raises DatasetError unless it has these channels (None: one plane) and this dtype."""
         return check_planes(self.files.image(name, self.frame), channels, f"{name} of image {self.frame} in {self.files.place}", dtype)
 
     def masks(self) -> list[Masks]:
-        """See `EncodedView`."""
+        """Run lengths of the amodal and visible mask of each instance, read within their boxes. See `EncodedView`."""
         return [
             Masks(
                 self._read_runs("mask", index, info["bbox_obj"], info["px_count_valid"]),

@@ -61,7 +61,7 @@ class Source:
 
     @property
     def inputs(self) -> dict[str, str]:
-        """Content digests of objects and lights."""
+        """Content digests of objects and lights, as the manifest records them."""
         return self._manifest.get(INPUTS, {})
 
     def check_contents(self, needed: Collection[Content]) -> None:
@@ -95,12 +95,12 @@ class Source:
                 check_trajectory(self.data[end.episode], end, len(store.lights), gripper=gripper)
 
     def scenes(self, end: EpisodeEnd) -> list[StoredSceneFiles]:
-        """The scene of each camera in an episode."""
+        """Files of the scene of each camera in an episode, in the order of cameras."""
         data, cameras = self.data, range(self.data.camera_count)
         return [StoredSceneFiles(data.scene_files(end.episode, one), len(cameras) * end.episode + one, end.images) for one in cameras]
 
     def ticks(self, end: EpisodeEnd) -> Iterator[TickBatch]:
-        """See `trajectories.read_ticks`."""
+        """Yield the ticks of an episode's stored trajectory. See `trajectories.read_ticks`."""
         return read_ticks(self.data[end.episode], self.config.physics.steps_per_tick)
 
     def episode_end(self, index: int) -> EpisodeEnd:
@@ -137,6 +137,7 @@ class Source:
                 self._copy(path, out / path)
 
     def _copy(self, path: Path, target: Path) -> None:
+        """Copy a regular file of the data set to `target`; raises DatasetError if it cannot be read."""
         try:
             handle = open_regular(self.folder / path)
         except OSError as error:

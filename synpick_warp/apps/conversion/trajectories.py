@@ -25,19 +25,21 @@ _OUTCOMES = tuple(name.lower() for name in names(Outcome))
 
 
 class _Light(msgspec.Struct):
+    """Schema of an episode's light: index of the environment map, yaw [rad], exposure compensation [EV]."""
+
     map: Index
     yaw: float
     exposure: float
 
 
 class _Attributes(msgspec.Struct):
-    """Attributes of an episode's group, as far as they are converted."""
+    """Schema of the attributes of an episode's group, as far as they are converted."""
 
     light: _Light
 
 
 class _Attempt(msgspec.Struct):
-    """A line of the attempts, as far as tasks and rewards are made of it."""
+    """Schema of a line of attempts.jsonl, as far as tasks and rewards are made of it; object None: nothing was seen."""
 
     frame: Index
     end_frame: Index
@@ -79,6 +81,7 @@ def check_trajectory(data: Episode, end: EpisodeEnd, lights: int, *, gripper: bo
 
 
 def _check_attempts(end: EpisodeEnd) -> None:
+    """Check the attempts of an episode's manifest entry against their schema; raises DatasetError."""
     source = f"the manifest entry of episode {end.episode}"
     for line in end.attempts:
         check_content(msgspec.json.decode(line), _Attempt, source)
@@ -92,12 +95,14 @@ def _require(data: Episode, arrays: Arrays, group: str, wanted: tuple[str, ...])
 
 
 def _read_light(data: Episode) -> _Light:
+    """Light of an episode, from the attributes of its group in the store; raises DatasetError for a schema that does not fit."""
     return check_content(data.attributes, _Attributes, data.group / GROUP_FILE).light
 
 
 def read_ticks(data: Episode, steps_per_tick: int) -> Iterator[TickBatch]:
-    """The frames of an episode, as they came from the simulation, with gripper state and setpoints if there are any; poses of absent
-    instances are NaN."""
+    """Yield the frames of an episode, as they came from the simulation, with gripper state and setpoints if there are any; poses of absent
+    instances are NaN.
+    """
     arrays = {name: read_array(data.ticks[name]) for name in POSES}
     state = {name: read_array(data.ticks[name]) for name in GRIPPER if name in data.ticks}
     setpoint = read_array(data.steps[SETPOINT]).reshape(len(data), steps_per_tick, 3) if SETPOINT in data.steps else None

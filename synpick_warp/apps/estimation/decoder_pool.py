@@ -78,6 +78,7 @@ class ReadScene:
 
 @cache
 def _open(folder: Path) -> DataSet:
+    """Open the data set in a worker process, once for all tasks."""
     return DataSet(folder)
 
 

@@ -22,7 +22,9 @@ _MARGIN = 2
 
 @dataclass(frozen=True, eq=False)
 class DecodeJob:
-    """Scenes of equal image size that are read side by side, into batches that are used in turn."""
+    """Job of decoding scenes of equal image size side by side: depth folder, seed of mask errors (None: exact masks), and number of batches
+    that are filled in turn.
+    """
 
     scenes: tuple[Scene, ...]
     depth: str
@@ -33,12 +35,12 @@ class DecodeJob:
     """Number of batches."""
 
     def without_truth(self) -> DecodeJob:
-        """The same without the ground truth that decoding does not need, which is most of it."""
+        """Job without the parts of the ground truth that decoding does not need, which are most of its bytes."""
         nothing = np.empty(0)
         return replace(self, scenes=tuple(replace(scene, poses=nothing, visibility=nothing) for scene in self.scenes))
 
     def memory_bytes(self) -> int:
-        """Size of the memory of all batches [B]."""
+        """Size of the shared memory of all batches [B]."""
         return max(1, self.batches * self._batch_bytes())
 
     def new_batches(self, memory: mmap.mmap) -> list[RgbdBatch]:
@@ -49,7 +51,7 @@ class DecodeJob:
         return batches
 
     def map_batches(self, memory: mmap.mmap) -> list[RgbdBatch]:
-        """The batches as views of a memory of `memory_bytes`."""
+        """Batches whose arrays are views of a memory of `memory_bytes`."""
         return [self._map_batch(memory, index * self._batch_bytes()) for index in range(self.batches)]
 
     def fill_view(self, batch: RgbdBatch, view: int, step: int) -> None:
@@ -77,6 +79,7 @@ class DecodeJob:
         _hide(batch.label[view], np.flatnonzero((scene.index[step] != ABSENT) & ~scene.asked[step]))
 
     def _map_batch(self, memory: mmap.mmap, offset: int) -> RgbdBatch:
+        """Batch whose arrays are views of shared memory from `offset` [B] on."""
         arrays = {}
         for name, shape, dtype in self._layout():
             arrays[name] = SharedArray(offset, shape, dtype).map(memory)
@@ -84,10 +87,11 @@ class DecodeJob:
         return RgbdBatch(**arrays)
 
     def _batch_bytes(self) -> int:
+        """Size of a batch in shared memory [B]."""
         return shared_bytes(int(np.prod(shape)) * np.dtype(dtype).itemsize for _, shape, dtype in self._layout())
 
     def _layout(self) -> Iterator[tuple[str, tuple[int, ...], str]]:
-        """Name, shape and type of a batch's arrays."""
+        """Yield name, shape and type of each array of a batch."""
         views = len(self.scenes)
         width, height = self.scenes[0].size if views else (0, 0)
         yield "color", (views, height, width, 3), "uint8"
@@ -98,6 +102,7 @@ class DecodeJob:
 
 
 def _read_image(files: SceneFiles, name: str, frame: int, channels: int | None, dtype: str) -> np.ndarray:
+    """Decoded image of a kind; raises DatasetError unless it has these channels (None: one plane) and this dtype."""
     return check_planes(files.image(name, frame), channels, f"{name} of image {frame} in {files.place}", dtype)
 
 
@@ -122,7 +127,7 @@ def paint_label(scene: Scene, step: int, label: np.ndarray) -> None:
 
 
 def _hide(label: np.ndarray, slots: np.ndarray) -> None:
-    """Set the labels of slots to 0, in place."""
+    """Set the labels of slots to 0 in a label image: their instances are not observed."""
     if len(slots):
         table = np.arange(256, dtype=np.uint8)
         table[1 + slots] = 0

@@ -48,7 +48,9 @@ _HEADINGS = ("observed, with its mask", "estimate (red), truth (green)", "estima
 
 @dataclass(frozen=True, eq=False)
 class Failure:
-    """An instance and the estimate that was meant for it."""
+    """Row of an instance in the ground truth, row of the nearest estimate of its object in the image (-1: none), its error (infinity:
+    missed) and distance [m].
+    """
 
     truth: int
     """Row of the ground truth."""
@@ -63,7 +65,7 @@ class Failure:
 
 @dataclass(frozen=True, eq=False)
 class _Window:
-    """Square part of an image, resampled to a panel."""
+    """Square part of an image (left, top, size [px]), which is resampled to a panel."""
 
     left: float
     top: float
@@ -164,7 +166,7 @@ def draw_failures(
 
 
 def describe_failure(truth: Truth, failure: Failure, view: View, names: Mapping[int, str]) -> tuple[str, str]:
-    """Two lines of caption: object and place, error and visibility."""
+    """Caption of two lines: object and error; location in the data set, visibility and speed."""
     object_id = int(truth.poses.object_id[failure.truth])
     name = printable(names.get(object_id, f"object {object_id}"))
     place = f"{truth.mode[failure.truth]}, episode {view.episode}, camera {view.camera}, frame {view.frame}"
@@ -184,6 +186,7 @@ def describe_failure(truth: Truth, failure: Failure, view: View, names: Mapping[
 
 
 def _open_view(data_set: DataSet, truth: Truth, row: int) -> View:
+    """View of the data set that a row of the ground truth belongs to."""
     episode = data_set[int(truth.episode[row])]
     return episode.view(episode.image_ids.index(int(truth.poses.image[row])), int(truth.camera[row]))
 
@@ -278,7 +281,7 @@ def _resample(image: Image, window: _Window) -> Image:
 
 
 def _outline(image: Image, mask: np.ndarray, color: Color) -> None:
-    """Draw the contours of a mask, in place."""
+    """Draw the contours of a mask into the image."""
     contours, _ = cv2.findContours(mask.astype(np.uint8), cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
     cv2.drawContours(image, contours, -1, color, 2, cv2.LINE_AA)
 

@@ -66,7 +66,7 @@ class GicpEstimator:
         return self._gicp.preprocess_points(points, SPACING, NEIGHBORS, 1)
 
     def refine(self, batch: RgbdBatch, pose: np.ndarray) -> Estimates:
-        """See `Estimator`."""
+        """Align each instance's points from its start pose, in threads; not valid where it has too few points. See `Estimator`."""
         begin = time.perf_counter()
         rotations, count = to_rotations(pose), len(self._instances)
         starts = np.tile(np.eye(4), (count, 1, 1))
@@ -104,15 +104,15 @@ class GicpEstimator:
         return matrix, result.num_inliers / max(1, source.size())
 
     def estimate(self, batch: RgbdBatch) -> Estimates:
-        """GICP needs a start."""
+        """Not implemented (NotImplementedError): GICP needs a start pose."""
         raise NotImplementedError
 
     def start(self, pose: np.ndarray, rows: np.ndarray) -> None:
-        """GICP does not track."""
+        """Not implemented (NotImplementedError): GICP does not track."""
         raise NotImplementedError
 
     def track(self, batch: RgbdBatch) -> Estimates:
-        """GICP does not track."""
+        """Not implemented (NotImplementedError): GICP does not track."""
         raise NotImplementedError
 
 

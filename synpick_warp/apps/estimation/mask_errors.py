@@ -53,7 +53,7 @@ def neighbours(boxes: np.ndarray, slot: int) -> np.ndarray:
 
 
 def swap_masks(label: np.ndarray, first: int, second: int) -> None:
-    """Exchange the masks of two slots, in place."""
+    """Exchange the masks of two slots in a label image, in place."""
     table = np.arange(256, dtype=np.uint8)
     table[[1 + first, 1 + second]] = 1 + second, 1 + first
     cv2.LUT(label, table, dst=label)

@@ -27,7 +27,7 @@ class Estimator(Protocol):
     """Pose estimator of an `InstanceTable`: `estimate` serves single, `refine` refine and gicp, `start` and `track` track."""
 
     def estimate(self, batch: RgbdBatch) -> Estimates:
-        """Estimate poses from one frame."""
+        """Estimate the pose of each instance from a single frame, without a start."""
         ...
 
     def refine(self, batch: RgbdBatch, pose: np.ndarray) -> Estimates:
@@ -39,7 +39,7 @@ class Estimator(Protocol):
         ...
 
     def track(self, batch: RgbdBatch) -> Estimates:
-        """Update all started tracks with the next frame."""
+        """Update all started tracks with the next frame; returns their poses."""
         ...
 
 
@@ -49,7 +49,9 @@ EstimatorFactory = Callable[[InstanceTable, int, int], Estimator]
 
 @dataclass(frozen=True, eq=False)
 class FrameTruth:
-    """Ground truth of the N instances of a group in one step."""
+    """Ground truth of the N instances of a group in one step: which are asked for, which tracks start, and poses from object to
+    camera [m].
+    """
 
     asked: np.ndarray
     """Mask of the instances to estimate (N,) bool."""
@@ -61,13 +63,13 @@ class FrameTruth:
 
 @dataclass(frozen=True, eq=False)
 class Group:
-    """Scenes that are estimated side by side, and their instances."""
+    """Scenes that are estimated side by side, and the table of their instances."""
 
     scenes: tuple[Scene, ...]
     table: InstanceTable
 
     def truth(self, step: int) -> FrameTruth:
-        """Ground truth of a step."""
+        """Ground truth of the group's instances in a step."""
         rows = len(self.table)
         asked, starting, poses = np.zeros(rows, bool), np.zeros(rows, bool), np.tile(np.eye(4), (rows, 1, 1))
         begin = 0

@@ -48,6 +48,7 @@ def read_object_models(folder: Path, object_ids: Iterable[int]) -> list[ObjectMo
 
 
 def _make_model(object_id: int, mesh: TriangleMesh, given: FileMaterial, info: ModelInfo) -> ObjectModel:
+    """Build the model of an object from mesh, material and models_info; metallic and roughness have defaults."""
     return ObjectModel(
         object_id=object_id,
         mesh=mesh,

@@ -105,9 +105,11 @@ class SceneReader:
             self._fill(batch, view, step)
 
     def _allocate(self) -> RgbdBatch:
+        """Allocate a batch in ordinary memory."""
         return _allocate(self._job)[0]
 
     def _fill(self, batch: RgbdBatch, view: int, step: int) -> None:
+        """Decode view `view` of a step into a batch."""
         self._job.fill_view(batch, view, step)
 
 
@@ -116,10 +118,10 @@ _Future = Future[Any] | TaskFuture
 
 
 class _Source(Protocol):
-    """What decodes."""
+    """Protocol of a decoder that fills batches in the background: threads, or processes over shared memory."""
 
     def open(self) -> list[RgbdBatch]:
-        """Allocate the batches."""
+        """Allocate the batches of the ring, and return them."""
         ...
 
     def submit(self, batch: int, step: int) -> Sequence[_Future]:
@@ -131,7 +133,7 @@ class _Source(Protocol):
         ...
 
     def close(self) -> None:
-        """Stop."""
+        """Stop, and give back what it holds; batches must not be used after it."""
         ...
 
 
@@ -145,20 +147,20 @@ class _Threads:
         cv2.setNumThreads(1)
 
     def open(self) -> list[RgbdBatch]:
-        """See `_Source`."""
+        """Allocate the batches in ordinary memory. See `_Source`."""
         self._batches = _allocate(self._job)
         return self._batches
 
     def submit(self, batch: int, step: int) -> list[Future[Any]]:
-        """See `_Source`."""
+        """Begin to decode a step, a task for each view. See `_Source`."""
         return [self._pool.submit(self._job.fill_view, self._batches[batch], view, step) for view in range(len(self._job.scenes))]
 
     def wait(self, future: Any) -> None:
-        """See `_Source`."""
+        """Block until a task is done; raises its error. See `_Source`."""
         future.result()
 
     def close(self) -> None:
-        """See `_Source`."""
+        """Drop the tasks that have not begun, and wait for the others. See `_Source`."""
         self._pool.shutdown(wait=True, cancel_futures=True)
 
 
@@ -170,12 +172,12 @@ class _Processes:
         self._opening: list[TaskFuture] = []
 
     def open(self) -> list[RgbdBatch]:
-        """See `_Source`."""
+        """Map the batches in shared memory, and announce the job to the workers. See `_Source`."""
         batches, self._opening = self._pool.open_job(self._job)
         return batches
 
     def submit(self, batch: int, step: int) -> list[TaskFuture]:
-        """See `_Source`."""
+        """Begin to decode a step, in tasks of several neighbouring views; returns also what `open` left to wait for. See `_Source`."""
         views = len(self._job.scenes)
         size = max(1, min(MAX_VIEWS_PER_TASK, -(-views // (_TASKS_PER_PROCESS * len(self._pool)))))
         futures, self._opening = self._opening, []
@@ -185,11 +187,11 @@ class _Processes:
         return futures
 
     def wait(self, future: Any) -> None:
-        """See `_Source`."""
+        """Block until a task is done, while other answers are taken in; raises its error. See `_Source`."""
         self._pool.wait(future)
 
     def close(self) -> None:
-        """See `_Source`. The pool goes on; what it still decodes is left to it."""
+        """Leave the pool running; tasks that it still decodes are not waited for. See `_Source`."""
 
 
 def _allocate(job: DecodeJob) -> list[RgbdBatch]:

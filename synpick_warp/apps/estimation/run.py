@@ -29,7 +29,7 @@ MEMORY_FRACTION = 0.25
 
 @dataclass(frozen=True)
 class Options:
-    """What an estimation is asked for."""
+    """Options of an estimation: method, kind of depth, mask errors, least visibility, seed, views at a time (0: automatic), processes."""
 
     method: str
     depth: str = "clean"
@@ -46,7 +46,9 @@ class Options:
 
 @dataclass(frozen=True, eq=False)
 class Run:
-    """Result of an estimation."""
+    """Result of an estimation: table of the finite estimates, numbers of views and of dropped estimates, and wall, reading and estimator
+    time [s].
+    """
 
     poses: PoseTable
     views: int
@@ -108,7 +110,7 @@ def read_scenes(
 
 
 def list_targets(scenes: Sequence[Scene]) -> list[Target]:
-    """Targets of the instances that are asked."""
+    """Target list of the instances that are asked for: scene, frame, object and number of instances."""
     rows = []
     for scene in scenes:
         for step, slot in zip(*np.nonzero(scene.asked), strict=True):
@@ -140,7 +142,7 @@ def run_estimation(
     report: Report = lambda *_: None,
     pool: DecoderPool | None = None,
 ) -> Run:
-    """Estimate the poses of all instances that are asked.
+    """Estimate the poses of all instances that are asked for; returns the table of poses, with times.
 
     Args:
         scenes: The scenes.
@@ -179,7 +181,7 @@ def run_estimation(
 
 
 class _Collector:
-    """Rows of the pose table, and times."""
+    """Collects the rows of the pose table, and the times of an estimation."""
 
     def __init__(self) -> None:
         self._parts: list[PoseTable] = []
@@ -187,7 +189,7 @@ class _Collector:
         self.reading = self.estimating = 0.0
 
     def add(self, estimates: Estimates, group: Group, step: int) -> None:
-        """Add the valid estimates of a step."""
+        """Add the valid estimates of a step, and its times."""
         showing = [step < len(scene) for scene in group.scenes]
         self.views += sum(showing)
         # A quaternion that cannot be normalised is no rotation.
@@ -215,7 +217,7 @@ class _Collector:
         )
 
     def finish(self, wall: float) -> Run:
-        """The table, sorted by scene, image, object and instance."""
+        """Result with the table sorted by scene, image, object and instance."""
         names = PoseTable.__dataclass_fields__
         ints, reals = np.empty(0, np.int64), np.empty(0)
         empty = PoseTable(ints, ints, ints, np.empty((0, 3, 3)), np.empty((0, 3)), reals, reals, ints)

@@ -24,7 +24,7 @@ ABSENT = -1
 
 @dataclass(frozen=True)
 class ScenePlan:
-    """Frames of a scene that are read, in order."""
+    """Scene, episode and camera to read, and its frames in order."""
 
     scene: int
     """Index of the scene."""
@@ -35,7 +35,9 @@ class ScenePlan:
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """A scene's F planned frames and S instances, its slots in the order of instance indices."""
+    """Scene to estimate: F planned frames and S instances (slots, by instance index), with object-to-camera poses [m], visible fraction
+    (NaN: not known), visible boxes, intrinsics [px], depth scale [m], and which instances are asked for.
+    """
 
     plan: ScenePlan
     files: SceneFiles

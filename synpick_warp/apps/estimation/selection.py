@@ -17,7 +17,9 @@ MAX_LISTED = 10
 
 @dataclass(frozen=True)
 class Selection:
-    """Filters of the images to estimate; None: no filter."""
+    """Filters of the images to estimate: modes, cameras, episodes (None: all), every n-th frame, or the images and objects of a target
+    list.
+    """
 
     modes: tuple[str, ...] | None = None
     cameras: tuple[int, ...] | None = None
@@ -77,6 +79,7 @@ def plan_scenes(data_set: DataSet, selection: Selection) -> tuple[list[ScenePlan
 
 
 def _check(option: str, values: Sequence[object] | None, allowed: Sequence[object]) -> None:
+    """Raise ConfigError for the first of an option's values (None: not given) that is not in `allowed`."""
     for value in values or ():
         if value not in allowed:
             shown = ", ".join(map(str, allowed[:MAX_LISTED])) + (", ..." if len(allowed) > MAX_LISTED else "")

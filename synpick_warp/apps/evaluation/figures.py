@@ -38,7 +38,9 @@ _KNOWN = 0.5
 
 @dataclass(frozen=True, eq=False)
 class Method:
-    """Estimates of one method."""
+    """Estimates of one method: name, pose table as it came, and the same through the tracking filter of weight `alpha` (None:
+    no filter).
+    """
 
     name: str
     poses: PoseTable
@@ -48,18 +50,18 @@ class Method:
     """The filter's weight."""
 
     def variants(self) -> list[tuple[str, PoseTable]]:
-        """Names and estimates: as they came, and filtered."""
+        """(name, pose table) of the estimates as they came, and filtered if there is a filter."""
         return [(self.name, self.poses)] + ([] if self.filtered is None else [(self.filtered_name, self.filtered)])
 
     @property
     def filtered_name(self) -> str:
-        """Name of the filtered estimates."""
+        """Name of the filtered estimates in figures: name and alpha."""
         return f"{self.name} + EMA {self.alpha:g}"
 
 
 @dataclass(frozen=True, eq=False)
 class Settings:
-    """How the methods were scored."""
+    """Settings by which the methods were scored: models by obj_id, least visible fraction, number of failures shown."""
 
     models: Mapping[int, Model]
     min_visibility: float
@@ -108,7 +110,7 @@ def draw_figures(
 
 
 def _draw_errors(truth: Truth, scores: Sequence[Scores]) -> dict[str, Spec]:
-    """Pictures of the errors of all methods together."""
+    """Specifications of the error figures, of all methods together, by file name."""
     target = scores[0].target
     visibility, speed = truth.visibility[target], truth.speed[target]
     known, rated = np.isfinite(speed), np.isfinite(visibility)
@@ -126,7 +128,7 @@ def _draw_errors(truth: Truth, scores: Sequence[Scores]) -> dict[str, Spec]:
 
 
 def _draw_trajectory(truth: PoseTable, method: Method, track: Track, attempts: Sequence[int]) -> Spec:
-    """Trajectory plot of one method."""
+    """Specification of the figure of a method's estimates along one track."""
     rows = _estimated_rows(truth, method)
     if not len(rows):
         raise ConfigError(f"--track is {track[0]}:{track[1]}; {method.name} has no estimate of it; choose another one")
@@ -192,7 +194,7 @@ def _sweep(truth: Truth, method: Method, settings: Settings) -> AlphaSweep:
 
 
 def _part(truth: Truth, rows: np.ndarray) -> Truth:
-    """Ground truth of a mask of rows."""
+    """Ground truth reduced to the rows that a mask selects."""
     names = ("visibility", "episode", "camera", "mode", "speed")
     return replace(truth, poses=truth.poses.select(rows), **{name: getattr(truth, name)[rows] for name in names})
 
@@ -220,7 +222,7 @@ def check_folder(folder: Path) -> None:
 
 
 def write_figures(folder: Path, pictures: Mapping[str, bytes]) -> Iterator[Path]:
-    """Write PNG files to a folder, which is created; gives the path of each once it is written.
+    """Write PNG files to a folder, which is created; yields the path of each once it is written.
 
     Raises:
         OutputError: A file cannot be written.

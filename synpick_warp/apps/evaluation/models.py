@@ -24,7 +24,9 @@ _MAX_STEP = 0.01
 
 @dataclass(frozen=True, eq=False)
 class Model:
-    """Vertices and symmetries of an object."""
+    """Object model for evaluation: vertices [m], rotational symmetries (the first is the identity), and whether
+    models_info.json lists any.
+    """
 
     object_id: int
     vertices: np.ndarray
@@ -36,11 +38,11 @@ class Model:
 
     @cached_property
     def search(self) -> VertexSearch:
-        """Search of nearest vertices."""
+        """Nearest-vertex search over the model's vertices, built on first use."""
         return VertexSearch(self.vertices)
 
     def thinned(self, count: int) -> Model:
-        """The model with at most so many vertices, evenly in their order; 0: all."""
+        """Model with at most `count` vertices, taken evenly in their order; 0: all."""
         if not 0 < count < len(self.vertices):
             return self
         rows = np.linspace(0, len(self.vertices) - 1, count).round().astype(np.int64)
@@ -65,6 +67,7 @@ def read_models(folder: Path, object_ids: Iterable[int], vertices: int = 0) -> d
 
 
 def _read_model(path: Path, info: ModelInfo, object_id: int, count: int) -> Model:
+    """Read a model, from mm to m, thinned to at most `count` vertices (0: all); raises CatalogError if a vertex lies absurdly far out."""
     points = _METERS * read_ply_vertices(path)
     if np.abs(points).max() > 1e6:
         raise CatalogError(f"{path}: a vertex is more than 1e9 mm from the origin; repair the mesh")

@@ -43,14 +43,16 @@ class VertexSearch:
 
     @cached_property
     def _tree(self) -> KDTree:
+        """k-d tree of the vertices (SciPy), for searches on the CPU. Built on first use."""
         return KDTree(self._vertices, leafsize=LEAF_SIZE)
 
     @cached_property
     def _subdivision(self) -> NearestVertices:
+        """Exact grid of nearest vertices on a GPU, over the space in which poses are close. Built on first use."""
         return NearestVertices(self._vertices, self.center, LIMIT + 2.0 * NEAR * self.radius, pick_device("auto"))
 
     def mean_distances(self, rotation: np.ndarray, translation: np.ndarray) -> np.ndarray:
-        """Mean distance from the vertices, moved by each pose, to the nearest vertex of the model as it is.
+        """Mean distance from the vertices, moved by each pose, to the nearest vertex of the model in its own frame (ADD-S).
 
         Args:
             rotation: (P, 3, 3).

@@ -185,7 +185,7 @@ def _quartiles(errors: np.ndarray, index: np.ndarray, count: int) -> Iterator[np
 
 
 def _checked(name: str, errors: np.ndarray) -> np.ndarray:
-    """Check errors (N,): at least one, none negative or NaN."""
+    """Errors (N,) as an array; raises unless there is at least one, and none negative or NaN."""
     errors = np.asarray(errors)
     if errors.ndim != 1 or not len(errors) or not (errors >= 0.0).all():
         raise DatasetError(f"errors of {name} have shape {errors.shape} or a value that is no error; give one number >= 0 an instance")
@@ -224,5 +224,5 @@ def _colors(count: int) -> list[str]:
 
 
 def _legend(names: Mapping[str, object]) -> Legend:
-    """Legend of curves."""
+    """Legend that gives each name its own colour, in their order."""
     return Legend(dict(zip(names, _colors(len(names)), strict=True)))

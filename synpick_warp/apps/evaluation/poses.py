@@ -32,5 +32,5 @@ class PoseTable:
         return len(self.scene)
 
     def select(self, rows: np.ndarray) -> PoseTable:
-        """Rows by mask or index."""
+        """Table of the rows that a mask or an index array selects."""
         return PoseTable(*(getattr(self, name)[rows] for name in self.__dataclass_fields__))

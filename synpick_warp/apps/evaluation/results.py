@@ -42,7 +42,7 @@ _CHARACTERS = b"0123456789+-.eEnNaAiIfFtTyY, \t\r"
 
 @dataclass(frozen=True, eq=False)
 class ResultFile:
-    """Pose estimates of one file."""
+    """Pose estimates of one BOP result file, with the line number of each."""
 
     path: Path
     poses: PoseTable
@@ -103,7 +103,7 @@ def _convert(lines: list[bytes], path: Path, start: int) -> tuple[np.ndarray, np
 
 
 def _describe_line(line: bytes, path: Path, number: int) -> str:
-    """Message about a line with wrong columns."""
+    """Error message on a line with a wrong number of columns."""
     place, row = f"{path}, line {number}", line.split(b",")
     if not line.strip():
         return f"{place} is empty; each line is {FORMAT}"
@@ -133,7 +133,7 @@ def _describe_numbers(line: bytes, path: Path, number: int) -> str:
 
 
 def _show(text: bytes) -> str:
-    """Text of a file in a message."""
+    """Text of a file for a message, cut and printable."""
     shown = text.strip().decode("utf-8", "replace")
     return f'"{shown if len(shown) <= 40 else shown[:39] + "…"}"'
 
@@ -200,6 +200,7 @@ def check_results(results: ResultFile, truth: Truth, object_ids: Collection[int]
 
 
 def _refuse_unknown(results: ResultFile, values: np.ndarray, known: np.ndarray, what: str) -> None:
+    """Raise ResultError for the first row whose value (scene, image, object) is not in `known`; the message lists these."""
     unknown = ~np.isin(values, known)
     if unknown.any():
         row = _first(results, unknown)
@@ -208,7 +209,7 @@ def _refuse_unknown(results: ResultFile, values: np.ndarray, known: np.ndarray, 
 
 
 def _first(results: ResultFile, bad: np.ndarray) -> int:
-    """Row of the first line at fault."""
+    """Row of the bad entry that comes first in the file."""
     rows = np.flatnonzero(bad)
     return int(rows[np.argmin(results.lines[rows])])
 

@@ -29,7 +29,9 @@ PoseStep = Callable[[PoseTable], PoseTable]
 
 @dataclass(frozen=True, eq=False)
 class Scores:
-    """Errors of one method; arrays have one entry per target, the T true instances that are visible enough."""
+    """Errors of one method for the T true instances that are visible enough: by metric [m] (infinity: missed), rotation [°] and translation
+    [m] (NaN: missed); mean time per image [s] (NaN: unknown).
+    """
 
     name: str
     """Name of the method."""

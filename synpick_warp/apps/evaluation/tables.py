@@ -34,7 +34,7 @@ _PERCENT = 100.0
 
 @dataclass(frozen=True)
 class Row:
-    """Scores of all methods for a group of instances."""
+    """Row of a table: group of instances, their number, and each method's scores by column."""
 
     group: str
     """What instances are grouped by: one of GROUPS, or "mean"."""
@@ -67,7 +67,7 @@ def summarize(truth: Truth, scores: Sequence[Scores], names: Mapping[int, str], 
 
 
 def _labels(group: str, truth: Truth, target: np.ndarray, names: Mapping[int, str]) -> list[tuple[str, np.ndarray]]:
-    """Name and mask (T,) of every group of instances."""
+    """(name, mask (T,)) of each group of instances."""
     if group == "object":
         values = truth.poses.object_id[target]
         return [(names.get(int(value), f"obj_{value:06d}"), values == value) for value in np.unique(values)]
@@ -83,10 +83,12 @@ def _labels(group: str, truth: Truth, target: np.ndarray, names: Mapping[int, st
 
 
 def _interval(low: float, high: float) -> str:
+    """Label of an interval: "0.1 to 0.3", or "over 0.3" if it has no upper bound."""
     return f"over {low:g}" if math.isinf(high) else f"{low:g} to {high:g}"
 
 
 def _row(group: str, label: str, inside: np.ndarray, object_ids: np.ndarray, scores: Sequence[Scores]) -> Row:
+    """Row of a table: the number of rows selected by `inside` (N,) bool, and each method's scores over them."""
     return Row(group, label, int(inside.sum()), tuple(_cells(inside, object_ids, each) for each in scores))
 
 
@@ -104,6 +106,7 @@ def _cells(inside: np.ndarray, object_ids: np.ndarray, scores: Scores) -> dict[s
 
 
 def _mean(values: list[float]) -> float:
+    """Mean of values; NaN if there are none."""
     return statistics.fmean(values) if values else math.nan
 
 
@@ -114,7 +117,7 @@ def _median(values: np.ndarray) -> float:
 
 
 def render(rows: Sequence[Row], truth: Truth, scores: Sequence[Scores], style: str, convention: str = "exact") -> str:
-    """Write the table.
+    """Write the table as text, in one of FORMATS.
 
     Args:
         rows: From `summarize`.
@@ -153,7 +156,7 @@ def _wide(rows: Sequence[Row], names: Sequence[str], shown: Mapping[str, str], l
 
 
 def _long(rows: Sequence[Row], scores: Sequence[Scores]) -> Table:
-    """A row for each group and method, with all columns."""
+    """Table with a row for each group and method, and all columns."""
     columns = [Column(name) for name in ("group", "label", "targets", "method")] + [Column(name, digits=".6g") for name in rows[0].cells[0]]
     return Table(
         "scores",
@@ -168,11 +171,12 @@ def _long(rows: Sequence[Row], scores: Sequence[Scores]) -> Table:
 
 
 def _known(value: float) -> float | None:
+    """Value for JSON: NaN becomes None."""
     return None if math.isnan(value) else value
 
 
 def _json(rows: Sequence[Row], truth: Truth, scores: Sequence[Scores]) -> str:
-    """Everything: both conventions, recall curves, error bands by visibility and speed."""
+    """JSON of all results: both conventions, recall curves, error bands by visibility and speed."""
     methods = []
     for index, each in enumerate(scores):
         table = [{"group": row.group, "label": row.label, "targets": row.targets, **row.cells[index]} for row in rows]
@@ -189,7 +193,7 @@ def _json(rows: Sequence[Row], truth: Truth, scores: Sequence[Scores]) -> str:
 
 
 def _finite(content: object) -> object:
-    """The same content with null for numbers that JSON lacks."""
+    """Content with null for numbers that JSON lacks (NaN, infinity)."""
     if isinstance(content, dict):
         return {key: _finite(value) for key, value in content.items()}
     if isinstance(content, list):

@@ -35,7 +35,7 @@ class Target(msgspec.Struct, frozen=True, order=True, omit_defaults=True):
 
 @dataclass(frozen=True)
 class TargetList:
-    """Target list read from a file."""
+    """Target list read from a file: its entries in order."""
 
     path: Path
     targets: tuple[Target, ...]
@@ -87,6 +87,7 @@ def read_targets(path: Path) -> TargetList:
 
 
 def _read_entry(entry: TargetEntry) -> list[Target]:
+    """Targets of an entry, one per image, as it may list several; object None: any object; count 0: not given."""
     images = [(entry.sensor, entry.im_id)] if isinstance(entry.im_id, int) else entry.im_id
     object_id, count = entry.obj_id if isinstance(entry.obj_id, int) else None, entry.inst_count or 0
     return [Target(entry.scene_id, image, object_id, count, sensor) for sensor, image in images]
@@ -106,7 +107,7 @@ def encode_targets(targets: Sequence[Target]) -> bytes:
 
 
 def count_targets(rows: Sequence[tuple[int, int, int]]) -> list[Target]:
-    """Count instances, given as (scene, image, obj_id), per target."""
+    """Targets with their numbers of instances, from instances given as (scene, image, obj_id)."""
     return [Target(scene, image, object_id, count) for (scene, image, object_id), count in Counter(rows).items()]
 
 

@@ -18,7 +18,9 @@ _METERS = 1e-3
 
 @dataclass(frozen=True, eq=False)
 class Truth:
-    """True poses and what they are grouped by; arrays with N entries have one per row of `poses`."""
+    """Ground-truth poses (N rows) with visibility, episode, camera, mode and speed of each row, and the list of all images, also those
+    without objects.
+    """
 
     poses: PoseTable
     visibility: np.ndarray
@@ -70,7 +72,9 @@ def read_truth(data_set: DataSet) -> Truth:
 
 
 def _assemble(parts: list[tuple[SceneArrays, int, int, int, str]], period: float | None) -> Truth:
-    """Columns from the arrays of all scenes, sorted by scene, image and object."""
+    """Build the table from `parts`: (arrays, scene_id, episode, camera, mode) of each scene, sorted by scene, image and object. Without a
+    frame `period` [s], speeds are NaN.
+    """
     lengths = [len(arrays) for arrays, *_ in parts]
 
     def repeat(values: Iterable[int | str]) -> np.ndarray:

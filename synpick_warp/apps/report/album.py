@@ -29,7 +29,7 @@ class Section(enum.Enum):
 
 
 class Picture(NamedTuple):
-    """An encoded image."""
+    """Encoded image (WebP or PNG) of a report."""
 
     kind: str
     """webp or png."""
@@ -37,13 +37,13 @@ class Picture(NamedTuple):
 
     @property
     def size(self) -> int:
-        """Bytes in Base64."""
+        """Bytes that the image takes in Base64."""
         return 4 * -(-len(self.data) // 3)
 
 
 @dataclass
 class Album:
-    """All pictures of a page, by the order in which they were added."""
+    """Encoded pictures of a page in the order in which they were added, within a budget of bytes."""
 
     budget: int = BUDGET
     pictures: list[Picture] = field(default_factory=list)
@@ -51,7 +51,7 @@ class Album:
     """Bytes of each section."""
 
     def left(self, section: Section) -> int:
-        """Bytes that a section may still add."""
+        """Bytes that a section may still add to the album's budget."""
         return int(section.value * self.budget) - self.spent[section]
 
     def add(self, section: Section, pictures: Sequence[Picture]) -> list[int] | None:
@@ -65,7 +65,7 @@ class Album:
         return list(range(first, len(self.pictures)))
 
     def encoded(self) -> list[tuple[str, str]]:
-        """Kind and Base64 of each picture."""
+        """(kind, Base64 text) of each picture, in order."""
         return [(picture.kind, base64.b64encode(picture.data).decode("ascii")) for picture in self.pictures]
 
 
@@ -88,6 +88,7 @@ def encode_ids(image: np.ndarray) -> Picture:
 
 
 def _encode(suffix: str, image: np.ndarray, options: list[int]) -> bytes:
+    """Encode an image by OpenCV; raises OutputError if it cannot."""
     try:
         encoded, data = cv2.imencode(suffix, image, options)
     except cv2.error:

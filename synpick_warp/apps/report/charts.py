@@ -36,7 +36,7 @@ Rows = list[dict[str, Any]]
 
 @dataclass(frozen=True)
 class Chart:
-    """A plot with what it shows."""
+    """Vega-Lite chart of the report: name, title, caption, specification, and whether it takes the page's width."""
 
     name: str
     title: str
@@ -48,7 +48,9 @@ class Chart:
 
 @dataclass(frozen=True)
 class Source:
-    """Input data of the charts."""
+    """Data that the charts show: statistics, brightness of views, settings (None: the data set is of another program), duration by mode
+    [s].
+    """
 
     statistics: Statistics
     brightness: Sequence[Brightness]
@@ -59,7 +61,7 @@ class Source:
 
 
 def make_charts(source: Source) -> list[Chart]:
-    """All plots that have data."""
+    """Make all charts of the report that have data."""
     makers: tuple[Callable[[Source], Chart | None], ...] = (
         _objects,
         _visibility,
@@ -133,7 +135,7 @@ def _by_mode(counts: Mapping[str, Mapping[Any, int]], key: str, value: str) -> R
 
 
 def _sum_modes(groups: Sequence[tuple[str, Mapping[Any, int]]]) -> dict[str, dict[Any, int]]:
-    """Mode -> category -> count, over all splits."""
+    """Counts by mode and category, summed over splits."""
     summed: dict[str, dict[Any, int]] = {}
     for mode, counts in groups:
         for key, count in counts.items():
@@ -151,6 +153,7 @@ def _ranked(counts: Mapping[str, Mapping[Any, int]]) -> list[Any]:
 
 
 def _objects(source: Source) -> Chart | None:
+    """Chart of annotated instances by object and mode, the most frequent objects first; None: no instance."""
     names = object_labels(source.statistics.objects)
     groups = [
         (group.mode, {names.get(key, str(key)): count for key, count in group.annotations.objects.items()})
@@ -207,6 +210,7 @@ def _histogram(rows: Rows, width: float, titles: tuple[str, str], labels: str, c
 
 
 def _bins(counts: Sequence[int], width: float, mode: str = "") -> Rows:
+    """Rows of the non-empty bins of a histogram: low and high edge, count, mode; bins are `width` wide and begin at 0."""
     return [
         {"low": round(index * width, 6), "high": round((index + 1) * width, 6), "count": count, "mode": mode}
         for index, count in enumerate(counts)
@@ -215,6 +219,7 @@ def _bins(counts: Sequence[int], width: float, mode: str = "") -> Rows:
 
 
 def _visibility(source: Source) -> Chart | None:
+    """Histogram of the visible fraction of instances, by mode; None: no instance with a known fraction."""
     groups = [(group.mode, dict(enumerate(group.annotations.histogram))) for group in source.statistics.groups]
     rows = [row for mode, bins in _sum_modes(groups).items() for row in _bins(list(bins.values()), 1 / VISIBILITY_BINS, mode)]
     if not rows:
@@ -235,6 +240,7 @@ def _named(source: Source, counts: dict[str, dict[Any, int]], value: str) -> tup
 
 
 def _outcomes(source: Source) -> Chart | None:
+    """Chart of attempts by outcome and mode; None: no attempt."""
     rows, order = _named(source, _sum_modes([(group.mode, group.episodes.outcomes) for group in source.statistics.groups]), "attempts")
     if not rows:
         return None
@@ -244,6 +250,7 @@ def _outcomes(source: Source) -> Chart | None:
 
 
 def _endings(source: Source) -> Chart | None:
+    """Chart of episodes by ending and mode; None: no ending."""
     rows, order = _named(source, _sum_modes([(group.mode, group.episodes.endings) for group in source.statistics.groups]), "episodes")
     caption = "Why the episodes ended: tote empty, corners visited, or too many failures."
     return (
@@ -252,6 +259,7 @@ def _endings(source: Source) -> Chart | None:
 
 
 def _forces(source: Source) -> Chart | None:
+    """Histogram of the largest seal force of attempts [N], with the break forces of the settings; None: no seal, or no settings."""
     groups = [(group.mode, dict(enumerate(group.episodes.force_histogram))) for group in source.statistics.groups]
     rows = [row for mode, bins in _sum_modes(groups).items() for row in _bins(list(bins.values()), FORCE_BIN, mode)]
     if not rows or source.config is None:
@@ -276,6 +284,7 @@ def _limit(force: float, text: str, side: str) -> Spec:
 
 
 def _timeline(source: Source) -> Chart | None:
+    """Chart of the mean number of objects over time, by mode; None: no frame."""
     sums: dict[tuple[str, float], tuple[int, float]] = {}
     for group in source.statistics.groups:
         for point in group.objects_over_time:
@@ -314,6 +323,7 @@ def _timeline(source: Source) -> Chart | None:
 
 
 def _coverage(source: Source) -> Chart | None:
+    """Heat map of viewing directions, for an object that the reader selects; None: no object was seen."""
     seen = sorted((each for each in source.statistics.objects if each.coverage.views), key=lambda each: -each.coverage.views)[:MAX_LINES]
     if not seen:
         return None
@@ -366,7 +376,7 @@ def _coverage(source: Source) -> Chart | None:
 
 
 def _bars(rows: Rows, order: Sequence[str], titles: tuple[str, str]) -> Spec:
-    """Horizontal bars in the accent colour."""
+    """Specification of a horizontal bar chart in the accent colour."""
     return {
         "data": {"values": rows},
         "height": ROW * len(order),
@@ -380,6 +390,7 @@ def _bars(rows: Rows, order: Sequence[str], titles: tuple[str, str]) -> Spec:
 
 
 def _lights(source: Source) -> Chart | None:
+    """Chart of episodes by environment map, the most frequent maps; None: lights are not known."""
     lights = source.statistics.lights
     if lights is None:
         return None
@@ -389,6 +400,7 @@ def _lights(source: Source) -> Chart | None:
 
 
 def _exposure(source: Source) -> Chart | None:
+    """Histogram of the episodes' exposure compensation [EV]; None: fewer than two bins have episodes."""
     lights = source.statistics.lights
     if lights is None or len(lights.exposure) < 2:
         return None
@@ -398,6 +410,7 @@ def _exposure(source: Source) -> Chart | None:
 
 
 def _luma(source: Source) -> Chart | None:
+    """Histogram of the mean luma of views; None: no view was measured."""
     counts = [0] * BRIGHTNESS_BINS
     for view in source.brightness:
         counts[min(int(view.mean * BRIGHTNESS_BINS), BRIGHTNESS_BINS - 1)] += 1

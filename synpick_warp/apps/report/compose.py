@@ -46,7 +46,7 @@ MAX_FRAMES = 200
 
 @dataclass(frozen=True)
 class Samples:
-    """Pictures and measurements of a data set."""
+    """Frames, strips and attempts that the page shows, how many were asked for, and measured brightness of views."""
 
     data: dict[str, list[dict[str, Any]]]
     """Frames, strips and attempts, as the page's scripts expect them."""
@@ -145,10 +145,12 @@ def _durations(data_set: DataSet, episodes: Episodes) -> dict[str, float]:
 
 
 def _present(made: dict[str, Any] | None) -> list[dict[str, Any]]:
+    """Optional item as a list: empty for None."""
     return [] if made is None else [made]
 
 
 def _measure(views: list[View], report: Report) -> list[Brightness]:
+    """Brightness of each view with a colour image; reports progress."""
     measured = []
     for done, view in enumerate(view for view in views if view.has("rgb")):
         report("brightness", done, len(views))
@@ -167,6 +169,7 @@ def _versions(data_set: DataSet) -> tuple[Mapping[str, str], list[Finding]]:
 
 
 def _lead(data_set: DataSet, statistics: Statistics, findings: list[Finding]) -> Html:
+    """Opening sentence of the report: modes, splits, resolution and seed, and a link to the findings."""
     modes = ", ".join(dict.fromkeys(group.mode for group in statistics.groups))
     splits = ", ".join(dict.fromkeys(group.split for group in statistics.groups))
     if data_set.found is not None:
@@ -178,6 +181,7 @@ def _lead(data_set: DataSet, statistics: Statistics, findings: list[Finding]) ->
 
 
 def _parts(data_set: DataSet, statistics: Statistics, samples: Samples, findings: list[Finding], versions: Mapping[str, str]) -> list[Part]:
+    """Sections of the report in order: frames, episodes, attempts (each says what did not fit the budget), figures, findings, settings."""
     views, shown = statistics.total.annotations.views, {name: len(made) for name, made in samples.data.items()}
     leads = {
         "frames": ("Frames", f"{shown['frames']} of {views:,} views, evenly spread over episodes, cameras and time."),
@@ -220,7 +224,7 @@ _EMPTY = {
 
 
 def samples_budget() -> str:
-    """The budget of the pictures in words."""
+    """Budget of the pictures as text, in MB."""
     return f"{Album().budget / 1e6:.0f} MB"
 
 
@@ -237,7 +241,7 @@ def check_out(out: Path) -> None:
 
 
 def write_text(out: Path, pieces: Iterable[str]) -> None:
-    """Write a file that appears with all of its content or not at all.
+    """Write a file atomically.
 
     Raises:
         OutputError: It cannot be written.

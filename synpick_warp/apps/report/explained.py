@@ -40,7 +40,7 @@ GRAPH_SIZE = (440, 420)
 
 @dataclass(frozen=True)
 class Found:
-    """Reference to a chosen attempt."""
+    """Reference to a chosen attempt: episode, position in the episode's list, outcome."""
 
     episode: int
     place: int
@@ -104,7 +104,7 @@ def _masks(attempt: Attempt, view: View) -> dict[int, np.ndarray]:
 
 
 def _objects(attempt: Attempt, names: Mapping[int, str]) -> list[dict[str, Any]]:
-    """Observed instances, ranked by the choice rule."""
+    """Observed instances for the page, in the order in which the choice rule ranks them."""
     short = labels(attempt)
     return [
         {
@@ -155,9 +155,11 @@ def _force(attempt: Attempt, config: Config) -> dict[str, Any] | None:
 
 
 def _color(instance: int) -> str:
+    """CSS colour of an instance, as in preview pictures."""
     blue, green, red = instance_color(instance % 256)
     return f"rgb({red} {green} {blue})"
 
 
 def _rounded(point: Any) -> list[float]:
+    """Coordinates as floats rounded to 0.1, for JSON."""
     return [round(float(value), 1) for value in point]

@@ -42,7 +42,7 @@ MAX_NAMED = 6
 
 
 class Finding(NamedTuple):
-    """Remark of the report on the quality of a data set."""
+    """Finding of the report on the quality of a data set: level (WARNING, or NOTE: may be meant), title, detail."""
 
     level: str
     """WARNING, or NOTE: may be meant."""
@@ -52,7 +52,7 @@ class Finding(NamedTuple):
 
 @dataclass(frozen=True)
 class Figures:
-    """What findings are derived from."""
+    """Figures that findings are derived from: statistics, sampled episodes, brightness, number of planned episodes."""
 
     statistics: Statistics
     episodes: Episodes
@@ -62,7 +62,7 @@ class Figures:
 
 
 def find(figures: Figures) -> list[Finding]:
-    """All findings, warnings first."""
+    """Apply all rules to the figures; returns the findings, warnings first."""
     rules: tuple[Callable[[Figures], Iterable[Finding]], ...] = (
         _unfinished,
         _never_drawn,
@@ -83,6 +83,7 @@ def find(figures: Figures) -> list[Finding]:
 
 
 def _unfinished(figures: Figures) -> Iterator[Finding]:
+    """Warn of planned episodes that are missing."""
     present = figures.episodes.total
     if present < figures.planned:
         yield Finding(
@@ -93,6 +94,7 @@ def _unfinished(figures: Figures) -> Iterator[Finding]:
 
 
 def _never_drawn(figures: Figures) -> Iterator[Finding]:
+    """Warn of objects that have a model but occur in no view."""
     never = [each for each in figures.statistics.objects if not each.instances]
     if never and figures.statistics.total.annotations.views:
         listed = _listed(each.name or f"object {each.object_id}" for each in never)
@@ -105,6 +107,7 @@ def _never_drawn(figures: Figures) -> Iterator[Finding]:
 
 
 def _rare(figures: Figures) -> Iterator[Finding]:
+    """Note objects with fewer annotations than RARE times the median."""
     counts = [each.instances for each in figures.statistics.objects if each.instances]
     if len(counts) < 3:
         return
@@ -118,6 +121,7 @@ def _rare(figures: Figures) -> Iterator[Finding]:
 
 
 def _failures(figures: Figures) -> Iterator[Finding]:
+    """Warn of each failed outcome that makes up FAILURE_SHARE of the attempts or more."""
     episodes = figures.statistics.total.episodes
     sentences = {outcome.name.lower(): outcome for outcome in Outcome}
     for name, count in episodes.outcomes.items():
@@ -135,6 +139,7 @@ def _failures(figures: Figures) -> Iterator[Finding]:
 
 
 def _without_attempt(figures: Figures) -> Iterator[Finding]:
+    """Warn of picking episodes without an attempt."""
     rows = figures.episodes.rows
     idle = [index for index, row in rows.items() if row.mode in ("pick", "target") and not figures.episodes.attempts[index]]
     if idle:
@@ -145,6 +150,7 @@ def _without_attempt(figures: Figures) -> Iterator[Finding]:
 
 
 def _endings(figures: Figures) -> Iterator[Finding]:
+    """Warn if GIVEN_UP_SHARE of the picking episodes or more were given up, and of episodes of one frame."""
     endings = figures.statistics.total.episodes.endings
     given_up = endings.get(Ending.GAVE_UP.name.lower(), 0)
     picking = sum(group.episodes.episodes for group in figures.statistics.groups if group.mode != "move")
@@ -160,6 +166,7 @@ def _endings(figures: Figures) -> Iterator[Finding]:
 
 
 def _lost(figures: Figures) -> Iterator[Finding]:
+    """Warn if LOST_SHARE of the objects or more fell out of the scene."""
     episodes = figures.statistics.total.episodes
     if episodes.objects and episodes.lost / episodes.objects >= LOST_SHARE:
         share = episodes.lost / episodes.objects
@@ -167,6 +174,7 @@ def _lost(figures: Figures) -> Iterator[Finding]:
 
 
 def _brightness(figures: Figures) -> Iterator[Finding]:
+    """Warn if EXTREME_SHARE of the measured views or more are too dark, or too bright."""
     views = figures.brightness
     extremes = (("dark", [each for each in views if each.mean < DARK]), ("bright", [each for each in views if each.mean > BRIGHT]))
     for word, found in extremes:
@@ -181,6 +189,7 @@ def _brightness(figures: Figures) -> Iterator[Finding]:
 
 
 def _invisible(figures: Figures) -> Iterator[Finding]:
+    """Note if INVISIBLE_SHARE of the instances or more have no visible pixel."""
     counted = figures.statistics.total.annotations
     if counted.instances and counted.invisible / counted.instances >= INVISIBLE_SHARE:
         share = counted.invisible / counted.instances
@@ -192,12 +201,14 @@ def _invisible(figures: Figures) -> Iterator[Finding]:
 
 
 def _depth(figures: Figures) -> Iterator[Finding]:
+    """Warn if MISSING_DEPTH of the depth pixels or more have no measurement."""
     depth = figures.statistics.depth
     if depth is not None and depth.missing >= MISSING_DEPTH:
         yield Finding(WARNING, f"{depth.missing:.0%} of the depth pixels have no measurement", f"In {depth.views:,} sampled views.")
 
 
 def _lights(figures: Figures) -> Iterator[Finding]:
+    """Note if one environment map lights more than ONE_MAP_SHARE of the episodes."""
     lights = figures.statistics.lights
     if lights is None or lights.episodes < MIN_EPISODES:
         return
@@ -209,6 +220,7 @@ def _lights(figures: Figures) -> Iterator[Finding]:
 
 
 def _coverage(figures: Figures) -> Iterator[Finding]:
+    """Note objects that were often seen, but from less than COVERED of the sphere of viewing directions."""
     poor = [each for each in figures.statistics.objects if each.coverage.views >= MIN_COVERED_VIEWS and each.coverage.occupied < COVERED]
     if poor:
         listed = _listed(f"{each.name or f'object {each.object_id}'} ({each.coverage.occupied:.0%})" for each in poor)
@@ -218,12 +230,14 @@ def _coverage(figures: Figures) -> Iterator[Finding]:
 
 
 def _missing(figures: Figures) -> Iterator[Finding]:
+    """Note what the statistics could not read."""
     for sentence in figures.statistics.missing:
         title, _, detail = sentence.partition(": ")
         yield Finding(NOTE, title[:1].upper() + title[1:], f"{detail[:1].upper()}{detail[1:]}." if detail else "")
 
 
 def _number(count: int, noun: str) -> str:
+    """Count with its noun, in the plural unless it is 1."""
     return f"{count:,} {noun}{'' if count == 1 else 's'}"
 
 

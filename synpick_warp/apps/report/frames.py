@@ -126,6 +126,7 @@ def _amodal_planes(view: View, size: tuple[int, ...]) -> list[np.ndarray]:
 
 
 def _light(view: View) -> str:
+    """Name of the view's environment map, cut to MAX_NAME; empty: not recorded."""
     light = view.records.camera.get("light")
     name = light.get("map") if isinstance(light, dict) else None
     return name[:MAX_NAME] if isinstance(name, str) else ""

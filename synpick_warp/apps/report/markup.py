@@ -31,11 +31,12 @@ def element(tag: str, *children: str | Iterable[str], **attributes: str) -> Html
 
 
 def join(parts: Iterable[str]) -> Html:
-    """Markup and texts one after the other."""
+    """Concatenate markup and texts (escaped)."""
     return Html("".join(map(_markup, parts)))
 
 
 def _markup(child: str | Iterable[str]) -> str:
+    """HTML of a child: text is escaped, HTML stays as it is, iterables are joined."""
     if isinstance(child, Html):
         return child
     return html.escape(printable(child)) if isinstance(child, str) else join(child)

@@ -22,7 +22,7 @@ SCRIPTS = ("base.js", "frames.js", "strips.js", "attempts.js", "charts.js")
 
 @dataclass(frozen=True)
 class Part:
-    """A section of the page."""
+    """Section of the page: name, title, lead (a sentence or two), body."""
 
     name: str
     title: str
@@ -33,7 +33,9 @@ class Part:
 
 @dataclass(frozen=True)
 class Page:
-    """Content of a page."""
+    """Content of a report's page: title, lead, key figures (tiles), sections, findings, data and charts for the scripts,
+    pictures, footer.
+    """
 
     title: str
     lead: str
@@ -62,7 +64,7 @@ def read_vega() -> str:
 
 
 def render(page: Page) -> Iterator[str]:
-    """The page's text in pieces; each picture is a piece, so that all of them are never in memory twice."""
+    """Yield the page's text in pieces; each picture is a piece, so that all of them are never in memory twice."""
     vega = read_vega()
     style, boot = _read("style.css"), _read("boot.js")
     # Vega's script has global functions; those of the page must not replace them.
@@ -92,21 +94,24 @@ def render(page: Page) -> Iterator[str]:
 
 
 def _read(name: str) -> str:
+    """Text of a file that comes with the page: template, style or script."""
     return (FOLDER / name).read_text(encoding="utf-8")
 
 
 def _navigation(page: Page) -> Html:
+    """Links to the sections; that to the findings has a badge with the number of warnings."""
     warnings = count_levels(page.findings)[WARNING]
     badge = [element("span", str(warnings), class_="count", title=f"{warnings} warnings")] if warnings else []
     return join(element("a", part.title, badge if part.name == "findings" else "", href=f"#{part.name}") for part in page.parts)
 
 
 def _section(part: Part) -> Html:
+    """Section of the page: heading, lead, body."""
     return element("section", element("h2", part.title), element("p", part.lead), part.body, id=part.name)
 
 
 def summary(findings: Sequence[Finding]) -> str:
-    """Number of warnings and notes in words."""
+    """Numbers of warnings and notes, in words."""
     counts = count_levels(findings)
     words = [f"{counts[level]} {level}{'' if counts[level] == 1 else 's'}" for level in (WARNING, NOTE) if counts[level]]
     return " and ".join(words) or "no warnings"

@@ -25,7 +25,7 @@ _WEIGHTS = LUMINANCE.astype(np.float32)
 
 @dataclass(frozen=True)
 class Episodes:
-    """Manifest rows of the sampled episodes."""
+    """Manifest rows and numbers of attempts of the sampled episodes, by index, and the number of all episodes."""
 
     rows: dict[int, EpisodeFacts]
     """Row of each episode by its index."""
@@ -37,7 +37,7 @@ class Episodes:
 
 @dataclass(frozen=True)
 class Brightness:
-    """Mean luma of one view."""
+    """Mean luma of one view, from 0 to 1, of the sRGB values."""
 
     episode: int
     camera: int
@@ -48,7 +48,7 @@ class Brightness:
 
 @dataclass(frozen=True)
 class Content:
-    """Images that the data set has beside colour."""
+    """Whether the data set has visible masks, amodal masks and depth beside colour."""
 
     masks: bool
     """Visible masks."""
@@ -108,7 +108,7 @@ def sample_views(data_set: DataSet, episodes: Episodes, count: int) -> list[View
 
 
 def _middles(points: np.ndarray) -> np.ndarray:
-    """Move points (N, 2) to the middles of N equal parts of each axis, in their order along it."""
+    """Points (N, 2) moved to the middles of N equal parts of each axis, in their order along it."""
     return (np.argsort(np.argsort(points, axis=0), axis=0) + 0.5) / max(1, len(points))
 
 

@@ -20,7 +20,7 @@ UNKNOWN = "–"
 
 
 def tiles(statistics: Statistics) -> Html:
-    """Headline figures: terms and values."""
+    """HTML of the key figures: terms and values."""
     total = statistics.total
     episodes, counted = total.episodes, total.annotations
     drawn = sum(1 for each in statistics.objects if each.instances)
@@ -47,6 +47,7 @@ def statistics_tables(statistics: Statistics) -> Html:
 
 
 def _table(table: Table) -> Html:
+    """HTML of a table below its title, numbers aligned at the right."""
     classes = ["num" if column.style else "" for column in table.columns]
     return element("div", element("h3", table.title), plain_table(table.labels(), table.cells(UNKNOWN), classes), class_="scroll")
 
@@ -59,7 +60,7 @@ def plain_table(names: Sequence[str], rows: Iterable[Sequence[str]], classes: Se
 
 
 def findings_list(findings: Sequence[Finding]) -> Html:
-    """All findings, a line each."""
+    """HTML list of all findings."""
     if not findings:
         return element("p", "Nothing was found that a person would raise.", class_="empty")
     items = [

@@ -19,7 +19,9 @@ _UNIT = 10**9
 
 @dataclass(frozen=True)
 class Annotations:
-    """Annotations of a group of views."""
+    """Statistics of a group's annotations: views, instances, mean visible fraction (None: not known), invisible instances, histogram of the
+    visible fraction, instances by obj_id.
+    """
 
     views: int
     instances: int
@@ -41,7 +43,7 @@ class Annotations:
 
 @dataclass
 class AnnotationCounts(Counts):
-    """Accumulator of `Annotations`."""
+    """Accumulator of `Annotations`: integer counts by group (split, mode), so that counters of processes add up exactly."""
 
     views: Counter[Group] = field(default_factory=Counter)
     known: Counter[Group] = field(default_factory=Counter)
@@ -55,7 +57,7 @@ class AnnotationCounts(Counts):
     """Instances by obj_id."""
 
     def add_scene(self, group: Group, scene: SceneTruth) -> None:
-        """Count a scene's views and instances."""
+        """Count the views and instances of a scene for its group."""
         self.views[group] += scene.frames
         visibility = scene.visibility[~np.isnan(scene.visibility)]
         self.known[group] += len(visibility)
@@ -65,7 +67,7 @@ class AnnotationCounts(Counts):
         add_bins(self.objects, group, scene.object_id)
 
     def result(self, groups: Iterable[Group]) -> Annotations:
-        """Annotations of the groups together."""
+        """Statistics of the annotations of these groups together."""
         groups = tuple(groups)
         bins = np.sum([histogram(self.bins, group, VISIBILITY_BINS) for group in groups], axis=0, dtype=object).tolist() if groups else []
         objects: Counter[int] = Counter()

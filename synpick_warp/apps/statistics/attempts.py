@@ -46,7 +46,7 @@ class Episodes:
 
 @dataclass
 class EpisodeCounts(Counts):
-    """Accumulator of `Episodes`."""
+    """Accumulator of `Episodes`: counts by group (split, mode) of episodes, endings, outcomes and bins of the largest seal force."""
 
     totals: Counter[tuple[Group, str]] = field(default_factory=Counter)
     """Sums by name of the field."""
@@ -56,7 +56,7 @@ class EpisodeCounts(Counts):
     """Attempts by bin of the largest seal force."""
 
     def add_episode(self, group: Group, row: EpisodeFacts, attempts: Sequence[AttemptFacts]) -> None:
-        """Count an episode and its attempts."""
+        """Count an episode, its ending, objects and attempts, for its group."""
         counted = {"episodes": 1, "frames": row.frames, "objects": row.objects, "picked": row.picked, "lost": row.lost}
         for name, count in {**counted, "attempts": len(attempts)}.items():
             self.totals[group, name] += count
@@ -75,7 +75,7 @@ class EpisodeCounts(Counts):
         return sorted({group for group, name in self.totals if name == "episodes"})
 
     def result(self, groups: Iterable[Group]) -> Episodes:
-        """Episodes of the groups together."""
+        """Statistics of the episodes of these groups together."""
         groups = tuple(groups)
 
         def total(name: str) -> int:

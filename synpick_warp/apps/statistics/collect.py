@@ -24,7 +24,7 @@ _KIBIBYTE = 1024
 
 
 class SceneTask(NamedTuple):
-    """A scene to count."""
+    """Task of a worker: a scene (episode, camera) with its number of frames, and the frames whose depth image is read."""
 
     episode: int
     camera: int
@@ -33,7 +33,7 @@ class SceneTask(NamedTuple):
 
 
 class Finished(NamedTuple):
-    """What a process has counted, and its peak memory [B]."""
+    """Counts of a process, and its peak memory [B]."""
 
     partial: Partial
     memory: int
@@ -41,7 +41,7 @@ class Finished(NamedTuple):
 
 @dataclass
 class Collected:
-    """Counts of a data set."""
+    """All counts of a data set, views that were counted, sentences on what is missing, and peak memory [B]."""
 
     partial: Partial = field(default_factory=Partial)
     views: int = 0
@@ -96,6 +96,7 @@ def collect(data_set: DataSet, depth_views: int, threads: int, report: Report | 
 
 
 def _has_images(data_set: DataSet, episode: int) -> bool:
+    """Whether an episode has files of its first camera."""
     try:
         data_set.scene_files(episode, data_set[episode].cameras[0])
     except DatasetError:
@@ -119,7 +120,7 @@ def _sample_depth(tasks: Sequence[SceneTask], count: int) -> list[SceneTask]:
 
 
 def _count(data_set: DataSet, tasks: Sequence[SceneTask], processes: int, report: Callable[[int], None]) -> Iterator[Finished]:
-    """Count scenes in several processes, or with one in the calling process; gives what each one has counted."""
+    """Count scenes in several processes, or with one in the calling process; yields the counts of each."""
     setup = partial(_open_counter, data_set.folder) if processes > 1 else partial(_Counter, data_set)
     with WorkerPool(WorkerProgram(setup, "process that counts"), processes if processes > 1 else 0) as pool:
         done = 0
@@ -147,9 +148,10 @@ class _Counter:
         return task.frames
 
     def finish(self) -> Finished:
-        """Task: everything counted."""
+        """Task: return all that was counted, and the peak memory of the process."""
         return Finished(self._partial, _peak_memory())
 
 
 def _open_counter(folder: Path) -> _Counter:
+    """Open the data set in a worker process, with empty counters."""
     return _Counter(DataSet(folder))

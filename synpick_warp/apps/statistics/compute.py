@@ -30,7 +30,7 @@ DEPTH_VIEWS = 64
 
 @dataclass(frozen=True)
 class GroupStatistics:
-    """Statistics of the episodes of a split and a mode, or of all."""
+    """Statistics of the episodes of a split and a mode (empty: all): episodes, annotations, objects over time."""
 
     split: str
     """Name of the split; empty: all."""
@@ -43,7 +43,7 @@ class GroupStatistics:
 
 @dataclass(frozen=True)
 class ObjectStatistics:
-    """Statistics of one object."""
+    """Statistics of one object: obj_id, name, annotated instances, coverage of viewing directions."""
 
     object_id: int
     name: str
@@ -55,7 +55,9 @@ class ObjectStatistics:
 
 @dataclass(frozen=True)
 class Statistics:
-    """Statistics of a data set."""
+    """Statistics of a data set: groups and total, objects, depth, lights (None: not read), comparison with the paper, and what
+    is missing.
+    """
 
     cameras: int
     groups: tuple[GroupStatistics, ...]
@@ -99,7 +101,7 @@ def compute_statistics(data_set: DataSet, *, depth_views: int = DEPTH_VIEWS, thr
 
 
 def assemble(data_set: DataSet, collected: Collected) -> Statistics:
-    """Compute all figures from the counts."""
+    """Compute the statistics of a data set from the counts."""
     partial, missing = collected.partial, list(collected.missing)
     order = {name: index for index, name in enumerate(data_set.splits)}
     groups = sorted(partial.episodes.groups(), key=lambda group: (order.get(group.split, len(order)), group.mode))
@@ -138,7 +140,7 @@ def assemble(data_set: DataSet, collected: Collected) -> Statistics:
 
 
 def _objects(data_set: DataSet, collected: Collected, total: Annotations) -> tuple[ObjectStatistics, ...]:
-    """Statistics of all objects."""
+    """Statistics of each object that has a model or an annotation, by obj_id."""
     try:
         known = set(data_set.models_info)
     except DatasetError:

@@ -10,7 +10,7 @@ import numpy as np
 
 
 class Group(NamedTuple):
-    """Episodes that are counted together."""
+    """Split and mode whose episodes are counted together."""
 
     split: str
     mode: str

@@ -24,7 +24,9 @@ MIN_VISIBILITY = 0.1
 
 @dataclass(frozen=True)
 class Coverage:
-    """Viewing directions of one object."""
+    """Viewing directions of one object, in its frame: views, fraction of bins of the sphere that have any, evenness (0 to 1),
+    views by bin.
+    """
 
     views: int
     """Instances of which at least MIN_VISIBILITY is visible."""
@@ -38,7 +40,7 @@ class Coverage:
 
 @dataclass
 class CoverageCounts(Counts):
-    """Accumulator of `Coverage` by object."""
+    """Accumulator of `Coverage`: views by obj_id and bin of the viewing direction."""
 
     bins: Counter[tuple[int, int]] = field(default_factory=Counter)
     """Views by obj_id and bin."""
@@ -54,7 +56,7 @@ class CoverageCounts(Counts):
             self.bins[divmod(each, BINS)] += count
 
     def result(self, object_id: int) -> Coverage:
-        """Coverage of an object."""
+        """Coverage of an object: number of views, fraction of bins seen, evenness (entropy over its maximum, 0 to 1), views by bin."""
         bins = tuple(self.bins[object_id, index] for index in range(BINS))
         total = sum(bins)
         shares = [count / total for count in bins if count]

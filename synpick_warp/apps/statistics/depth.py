@@ -18,7 +18,7 @@ _LEVELS = 2**16
 
 @dataclass(frozen=True)
 class Depth:
-    """Depth of all pixels of the sampled views."""
+    """Depth of all pixels of the sampled views: their numbers, fraction without measurement, and quantiles [mm] (empty: none measured)."""
 
     views: int
     pixels: int
@@ -30,7 +30,7 @@ class Depth:
 
 @dataclass
 class DepthCounts(Counts):
-    """Accumulator of `Depth`."""
+    """Accumulator of `Depth`: counts of views, pixels, pixels without measurement, and pixels by bin of depth."""
 
     totals: Counter[str] = field(default_factory=Counter)
     bins: Counter[tuple[str, int]] = field(default_factory=Counter)
@@ -48,7 +48,7 @@ class DepthCounts(Counts):
         self.bins.update({("depth", index): count for index, count in found.items()})
 
     def result(self) -> Depth | None:
-        """Depth of all images; None: there is none."""
+        """Depth statistics of all images; None: no depth image was read."""
         pixels = self.totals["pixels"]
         if not pixels:
             return None

@@ -17,7 +17,7 @@ EXPOSURE_BIN = 0.1
 
 @dataclass(frozen=True)
 class Lights:
-    """Light of the episodes."""
+    """Light of the episodes: their number by environment map, bin of yaw, and bin of exposure compensation [EV]."""
 
     episodes: int
     maps: dict[str, int]
@@ -30,14 +30,14 @@ class Lights:
 
 @dataclass
 class LightCounts(Counts):
-    """Accumulator of `Lights`."""
+    """Accumulator of `Lights`: episodes by map, bin of yaw and bin of exposure compensation."""
 
     maps: Counter[str] = field(default_factory=Counter)
     yaw: Counter[tuple[str, int]] = field(default_factory=Counter)
     exposure: Counter[int] = field(default_factory=Counter)
 
     def add_episode(self, light: Light) -> None:
-        """Count an episode's light."""
+        """Count the environment map, yaw [rad] and exposure compensation [EV] of an episode."""
         self.maps[light.map] += 1
         self.yaw["yaw", math.floor(light.yaw / math.tau * YAW_BINS) % YAW_BINS] += 1
         self.exposure[math.floor(light.exposure / EXPOSURE_BIN)] += 1

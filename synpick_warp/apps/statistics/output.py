@@ -89,6 +89,7 @@ def print_statistics(console: Console, statistics: Statistics, paper: bool | Non
 
 
 def _print_table(console: Console, table: Table) -> None:
+    """Print a table with its title, in blocks as wide as the terminal; a long timeline is thinned to MAX_TEXT_ROWS rows."""
     rows = table.rows
     if table.name == TIMELINE and len(rows) > MAX_TEXT_ROWS:
         rows = [rows[index * (len(rows) - 1) // (MAX_TEXT_ROWS - 1)] for index in range(MAX_TEXT_ROWS)]

@@ -22,7 +22,7 @@ _Count = Annotated[int, msgspec.Meta(ge=1)]
 
 
 class PaperGroup(msgspec.Struct, frozen=True):
-    """A row of the paper's table, with its part of the bar chart."""
+    """Row of the paper's table, of a split and mode: sequences, views, mean visible fraction, annotated instances by object."""
 
     split: str
     mode: str
@@ -35,12 +35,12 @@ class PaperGroup(msgspec.Struct, frozen=True):
 
     @property
     def instances(self) -> int:
-        """Annotated instances."""
+        """Annotated instances of all objects."""
         return sum(self.objects.values())
 
 
 class Paper(msgspec.Struct, frozen=True):
-    """Content of paper.toml."""
+    """Numbers of the paper's data set: cameras, views and mean visibility in all, and a row for each split and mode."""
 
     cameras: int
     total_views: int
@@ -48,13 +48,13 @@ class Paper(msgspec.Struct, frozen=True):
     groups: list[PaperGroup]
 
     def group(self, split: str, mode: str) -> PaperGroup | None:
-        """The row of a split and mode."""
+        """Row of a split and mode in the paper's table; None: it has none."""
         return next((each for each in self.groups if (each.split, each.mode) == (split, mode)), None)
 
 
 @dataclass(frozen=True)
 class Numbers:
-    """The numbers that are compared."""
+    """Numbers compared with the paper: sequences, views, frames of a sequence, visible fraction, instances a view (None: not known)."""
 
     sequences: int
     views: int
@@ -66,7 +66,9 @@ class Numbers:
 
 @dataclass(frozen=True)
 class Comparison:
-    """One group of the data set beside that of the paper."""
+    """Group of the data set beside that of the paper, with the total variation distance of their instances over objects (None: other
+    names), and that between the paper's own train and test.
+    """
 
     split: str
     mode: str
@@ -80,7 +82,7 @@ class Comparison:
 
 @functools.cache
 def read_paper() -> Paper:
-    """The paper's numbers."""
+    """Read the paper's numbers from paper.toml."""
     return msgspec.convert(read_toml(Path(__file__).with_name("paper.toml"), DatasetError), Paper)
 
 
@@ -91,7 +93,7 @@ def compare(
     names: Mapping[int, str],
     cameras: int,
 ) -> tuple[Comparison, ...]:
-    """Compare every group that the paper has, too.
+    """Compare every group that the paper has, too, with the paper's numbers; one comparison each.
 
     Args:
         annotations: Annotations of each group.
@@ -121,6 +123,7 @@ def compare(
 
 
 def _numbers(group: PaperGroup, cameras: int) -> Numbers:
+    """Numbers of a row of the paper, to stand beside ours; frames are those of a sequence."""
     frames = group.views / (group.sequences * cameras)
     return Numbers(group.sequences, group.views, frames, group.visibility, group.instances / group.views)
 

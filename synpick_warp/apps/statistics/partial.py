@@ -28,7 +28,7 @@ MAX_OBJECTS = 65_536
 
 @dataclass
 class Partial:
-    """Counts of some episodes and scenes."""
+    """Accumulators of all statistics, over some episodes and scenes; partial counts of processes are added up."""
 
     annotations: AnnotationCounts = field(default_factory=AnnotationCounts)
     episodes: EpisodeCounts = field(default_factory=EpisodeCounts)

@@ -26,7 +26,7 @@ class EpisodeFacts(msgspec.Struct):
 
 
 class AttemptFacts(msgspec.Struct):
-    """An attempt to pick."""
+    """Attempt to pick, as the manifest records it: outcome, whether the seal was good, engaged instances, seal force by tick [N]."""
 
     outcome: Name
     good_seal: bool = False
@@ -44,6 +44,6 @@ class Light(msgspec.Struct, gc=False):
 
 
 class LitCameraEntry(LenientCameraEntry, gc=False):
-    """A view's entry in scene_camera.json, with the light that data sets of others lack."""
+    """Schema of a view's entry in scene_camera.json with its light, which only data sets of this program have."""
 
     light: Light | UnsetType = UNSET

@@ -18,7 +18,9 @@ from synpick_warp.errors import DatasetError
 
 @dataclass(frozen=True, eq=False)
 class SceneTruth:
-    """A scene of F frames and N instances in all of them together."""
+    """Annotations of a scene of F frames with N instances in all: obj_id, visible fraction (NaN: not known), unit direction from object to
+    camera in the object's frame, light (None: not told), depth scales [mm], files.
+    """
 
     frames: int
     counts: np.ndarray

@@ -27,7 +27,7 @@ GROUP_COLUMNS = (Column("split"), Column("mode"))
 
 
 def make_tables(statistics: Statistics) -> list[Table]:
-    """All tables that have rows."""
+    """Make all tables of the statistics that have rows."""
     makers: tuple[Callable[[Statistics], Table], ...] = (
         _groups,
         _paper,
@@ -49,6 +49,7 @@ def make_tables(statistics: Statistics) -> list[Table]:
 
 
 def _label(row: GroupStatistics) -> tuple[str, str]:
+    """First cells of a group's row: split and mode; `ALL` where the row sums over them."""
     return row.split or ALL, row.mode or ALL
 
 
@@ -58,6 +59,7 @@ def _rows(statistics: Statistics) -> tuple[GroupStatistics, ...]:
 
 
 def _groups(statistics: Statistics) -> Table:
+    """Table of views, instances and mean visibility, by split and mode."""
     columns = (
         *GROUP_COLUMNS,
         Column("episodes", ","),
@@ -77,6 +79,7 @@ def _groups(statistics: Statistics) -> Table:
 
 
 def _paper(statistics: Statistics) -> Table:
+    """Table of the paper's numbers beside those of the data set, by split and mode."""
     paper = read_paper()
     columns = (
         *GROUP_COLUMNS,
@@ -111,6 +114,7 @@ def _paper(statistics: Statistics) -> Table:
 
 
 def _objects(statistics: Statistics) -> Table:
+    """Table of annotated instances by object and mode, with the coverage of viewing directions."""
     modes = list(dict.fromkeys(row.mode for row in statistics.groups))
     columns = (
         Column("object_id"),
@@ -132,6 +136,7 @@ def _objects(statistics: Statistics) -> Table:
 
 
 def _annotations(statistics: Statistics) -> Table:
+    """Table of annotated instances by split, mode and object; not printed as text."""
     columns = (*GROUP_COLUMNS, Column("object_id"), Column("name"), Column("instances", ","))
     rows: list[tuple[Value, ...]] = [
         (*_label(row), each.object_id, each.name, row.annotations.objects.get(each.object_id, 0))
@@ -143,6 +148,7 @@ def _annotations(statistics: Statistics) -> Table:
 
 
 def _visibility(statistics: Statistics) -> Table:
+    """Histogram of the visible fraction of instances, a column for each group."""
     columns = (Column("from", ".2f"), Column("to", ".2f"), *_group_columns(statistics))
     table = Table("visibility", "Instances by visible fraction", columns)
     for index in range(VISIBILITY_BINS) if statistics.total.annotations.instances else ():
@@ -152,15 +158,18 @@ def _visibility(statistics: Statistics) -> Table:
 
 
 def _group_columns(statistics: Statistics, style: str = ",") -> Iterable[Column]:
+    """One column for each group (split and mode, and all), in the number format `style`."""
     return (Column(" ".join(dict.fromkeys(_label(row))), style) for row in _rows(statistics))
 
 
 def _endings(statistics: Statistics) -> Table:
+    """Table of episodes by ending, by split and mode."""
     columns = (*GROUP_COLUMNS, Column("ending"), Column("episodes", ","), Column("fraction", ".1%"))
     return Table("endings", "Endings of episodes", columns, _by_name(statistics, lambda row: row.episodes.endings))
 
 
 def _outcomes(statistics: Statistics) -> Table:
+    """Table of attempts by outcome, by split and mode."""
     columns = (*GROUP_COLUMNS, Column("outcome"), Column("attempts", ","), Column("fraction", ".1%"))
     return Table("outcomes", "Outcomes of attempts to pick", columns, _by_name(statistics, lambda row: row.episodes.outcomes))
 
@@ -175,6 +184,7 @@ def _by_name(statistics: Statistics, counts: Callable[[GroupStatistics], dict[st
 
 
 def _seals(statistics: Statistics) -> Table:
+    """Table of objects, attempts and seals, by split and mode."""
     columns = (
         *GROUP_COLUMNS,
         Column("objects", ","),
@@ -196,6 +206,7 @@ def _seals(statistics: Statistics) -> Table:
 
 
 def _forces(statistics: Statistics) -> Table:
+    """Histogram of the largest seal force of attempts [N], a column for each group; the last bin has no upper end (None)."""
     columns = (Column("from_N", ".0f"), Column("to_N", ".0f"), *_group_columns(statistics))
     table = Table("seal_forces", "Attempts by largest seal force [N]", columns)
     last = max((index for index, count in enumerate(statistics.total.episodes.force_histogram) if count), default=-1)
@@ -207,6 +218,7 @@ def _forces(statistics: Statistics) -> Table:
 
 
 def _timeline(statistics: Statistics) -> Table:
+    """Table of the mean number of objects in the scene by time [s], a column for each group; None: no frame at that time."""
     columns = (Column("time_s", ".0f"), *_group_columns(statistics, ".2f"))
     table = Table(TIMELINE, "Mean number of objects in the scene, by time since the first frame [s]", columns)
     groups = [{point.time: point.objects for point in row.objects_over_time} for row in _rows(statistics)]
@@ -216,6 +228,7 @@ def _timeline(statistics: Statistics) -> Table:
 
 
 def _depth(statistics: Statistics) -> Table:
+    """Table of depth quantiles [mm] over the sampled views; empty without depth."""
     depth = statistics.depth
     views = f"{depth.views:,} sampled views, {depth.missing:.2%} of the pixels without measurement" if depth else ""
     rows: list[tuple[Value, ...]] = list(depth.quantiles.items()) if depth else []
@@ -223,12 +236,14 @@ def _depth(statistics: Statistics) -> Table:
 
 
 def _lights(statistics: Statistics) -> Table:
+    """Table of episodes by environment map; empty if lights are not known."""
     lights = statistics.lights
     rows: list[tuple[Value, ...]] = [(name, count, count / lights.episodes) for name, count in lights.maps.items()] if lights else []
     return Table("lights", "Environment maps", (Column("map"), Column("episodes", ","), Column("fraction", ".1%")), rows)
 
 
 def _yaw(statistics: Statistics) -> Table:
+    """Histogram of the environment map's yaw [°] over episodes; not printed as text."""
     step = TURN / YAW_BINS
     counts: Sequence[int] = statistics.lights.yaw if statistics.lights else ()
     rows: list[tuple[Value, ...]] = [(index * step, (index + 1) * step, count) for index, count in enumerate(counts)]
@@ -237,12 +252,14 @@ def _yaw(statistics: Statistics) -> Table:
 
 
 def _exposure(statistics: Statistics) -> Table:
+    """Histogram of exposure compensation [EV] over episodes; not printed as text."""
     rows: list[tuple[Value, ...]] = list(statistics.lights.exposure.items()) if statistics.lights else []
     columns = (Column("from_EV", ".1f"), Column("episodes", ","))
     return Table("light_exposure", "Episodes by exposure compensation [EV]", columns, rows, in_text=False)
 
 
 def _coverage(statistics: Statistics) -> Table:
+    """Table of views by object and bin of the viewing direction in its frame, without empty bins; not printed as text."""
     columns = (Column("object_id"), Column("z_from"), Column("z_to"), Column("longitude_from"), Column("longitude_to"), Column("views"))
     table = Table("coverage", "Views by object and viewing direction in its frame", columns, in_text=False)
     heights = [2.0 * index / BANDS - 1.0 for index in range(BANDS + 1)]

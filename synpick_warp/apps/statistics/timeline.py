@@ -17,7 +17,7 @@ TIME_BIN = 2.0
 
 
 class TimePoint(NamedTuple):
-    """A bin of time."""
+    """Bin of time since the first frame: its start [s], its frames over all episodes, and the mean number of objects in them."""
 
     time: float
     """Start of the bin since the first frame [s]."""
@@ -29,7 +29,7 @@ class TimePoint(NamedTuple):
 
 @dataclass
 class TimelineCounts(Counts):
-    """Accumulator of `TimePoint`s, from one camera of each episode."""
+    """Accumulator of `TimePoint`s: frames and objects by group and bin of time, from one camera of each episode."""
 
     frames: Counter[tuple[Group, int]] = field(default_factory=Counter)
     objects: Counter[tuple[Group, int]] = field(default_factory=Counter)
@@ -42,7 +42,7 @@ class TimelineCounts(Counts):
             self.objects[group, index] += int(scene.counts[bins == index].sum())
 
     def result(self, groups: Iterable[Group]) -> tuple[TimePoint, ...]:
-        """Objects over time in the groups together."""
+        """Mean number of objects over time in these groups together."""
         groups = tuple(groups)
         bins = sorted({index for group, index in self.frames if group in groups})
         points = []

@@ -32,7 +32,9 @@ MARGIN = 24
 
 @dataclass(eq=False)
 class Instance:
-    """An instance in its window: all arrays are crops (h, w) of the image at (left, top)."""
+    """Instance with crops (h, w) at (left, top): rendered depth alone (inf: beside) and of all, both masks and stored depth (None: the data
+    set has none), depths in mm; and the translation of its pose [mm].
+    """
 
     index: int
     obj_id: int
@@ -53,7 +55,7 @@ class Instance:
 
     @property
     def silhouette(self) -> np.ndarray:
-        """Rendered silhouette."""
+        """Rendered silhouette (bool): pixels at which the object alone has depth."""
         return np.isfinite(self.rendered)
 
     @cached_property
@@ -73,7 +75,7 @@ class Instance:
 
 @dataclass(frozen=True)
 class Fit:
-    """How well two masks agree."""
+    """Agreement of two masks: pixels of one only, IoU, and whether their outlines explain the difference."""
 
     differing: int
     """Pixels of one only."""
@@ -90,14 +92,14 @@ class RenderedView:
 
     @property
     def tolerance(self) -> float:
-        """Largest difference of depth [mm]; at least one and a half counts."""
+        """Difference of depth up to which two depths count as equal [mm], at least one and a half counts."""
         scale = self.view.camera.depth_scale if self.view.camera is not None else UNSET
         count = scale if isinstance(scale, float | int) else 0.0
         return max(EXACT_DEPTH if self.view.scene.exact else MEASURED_DEPTH, 1.5 * count)
 
     @property
     def exact_masks(self) -> bool:
-        """Whether masks are those of the bake's rasterizer."""
+        """Whether the data set is of this program, so that its masks are exactly those of the same rasterizer."""
         return self.view.scene.layout.ours
 
     @cached_property
@@ -110,7 +112,7 @@ class RenderedView:
 
     @cached_property
     def depth(self) -> np.ndarray | None:
-        """Depth (H, W) float32 [mm]; None: unknown."""
+        """Depth image (H, W) float32 [mm]; None: the view has none."""
         view = self.view
         scale = view.camera.depth_scale if view.camera is not None else UNSET
         if view.depth is None or view.depth.shape[::-1] != view.size or not isinstance(scale, float | int):
@@ -119,7 +121,7 @@ class RenderedView:
 
     @cached_property
     def instances(self) -> list[Instance]:
-        """Instances that can be compared."""
+        """Instances with rendered and stored crops, those that can be compared. Cached."""
         view, matrix = self.view, self.matrix
         if matrix is None or view.size is None:
             return []
@@ -175,13 +177,14 @@ class RenderedView:
         return Instance(index, item.obj_id, left, top, rendered, mask, visible, depth, nearest[window], np.array(item.cam_t_m2c))
 
     def _mask(self, kind: str, index: int) -> Mask | None:
+        """Mask of an instance; None: it is missing, or of another size than the image."""
         masks = self.view.masks.get(kind)
         found = None if masks is None else masks[index]
         return found if found is not None and found.size == self.view.size else None
 
 
 def fit_masks(one: np.ndarray, other: np.ndarray, *, exact: bool = False) -> Fit:
-    """Compare two masks (h, w); `exact`: with the bounds of data sets of ours."""
+    """Compare two masks (h, w); `exact`: with the narrower bounds for data sets of this program."""
     differing = int(np.count_nonzero(one ^ other))
     union = int(np.count_nonzero(one | other))
     outline = max(_outline(one), _outline(other))
@@ -211,7 +214,7 @@ def best_shift(mask: np.ndarray, silhouette: np.ndarray) -> tuple[int, int]:
 
 
 def moved(mask: np.ndarray, columns: int, rows: int) -> np.ndarray:
-    """A mask moved right and down; what leaves the window is lost."""
+    """Mask shifted right by `columns` and down by `rows`; pixels that leave the window are lost."""
     height, width = mask.shape
     result = np.zeros_like(mask)
     target = slice(max(0, rows), min(height, height + rows)), slice(max(0, columns), min(width, width + columns))

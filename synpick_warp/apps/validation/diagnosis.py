@@ -51,7 +51,7 @@ class Kind(StrEnum):
 
 @dataclass(frozen=True)
 class Finding:
-    """A contradiction."""
+    """Contradiction between a rendered view and its files: kind, instance (None: the whole image), and text."""
 
     kind: Kind
     index: int | None
@@ -64,12 +64,12 @@ class DiagnosedView(RenderedView):
 
     @cached_property
     def findings(self) -> list[Finding]:
-        """All contradictions; found once for all rules."""
+        """All contradictions between rendering and files; found once for all rules."""
         return diagnose(self)
 
 
 def diagnose(rendered: RenderedView) -> list[Finding]:
-    """All contradictions of a view."""
+    """Find all contradictions between the rendering of a view and its files."""
     instances = rendered.instances
     fits = {item.index: _outline_fits(item, rendered) for item in instances}
     findings, ratio = _check_depth(rendered, [item for item in instances if fits[item.index]])
@@ -136,7 +136,7 @@ def _check_depth(rendered: RenderedView, instances: list[Instance]) -> tuple[lis
 
 
 def _ray(item: Instance, matrix: np.ndarray) -> np.ndarray:
-    """Length of the ray per planar depth at the pixels of a window (h, w)."""
+    """Ratio of ray length to planar depth at the pixels of an instance's window (h, w)."""
     height, width = item.rendered.shape
     x = (item.left + np.arange(width) + 0.5 - matrix[0, 2]) / matrix[0, 0]
     y = (item.top + np.arange(height) + 0.5 - matrix[1, 2]) / matrix[1, 1]
@@ -144,7 +144,7 @@ def _ray(item: Instance, matrix: np.ndarray) -> np.ndarray:
 
 
 def _find_swapped(item: Instance, others: list[Instance]) -> Instance | None:
-    """The instance whose mask fits this silhouette, and whose silhouette fits this mask."""
+    """Instance whose mask fits this silhouette and whose silhouette fits this mask; None: there is none."""
     return next((other for other in others if min(_overlap(item, other), _overlap(other, item)) > SWAPPED), None)
 
 
@@ -198,7 +198,7 @@ def _find_shift(mask: np.ndarray, silhouette: np.ndarray) -> tuple[int, int] | N
 
 
 def _find_object(item: Instance, mask: np.ndarray, rendered: RenderedView) -> int | None:
-    """Another object of the view whose silhouette at this pose is the mask."""
+    """obj_id of another object of the view whose silhouette at this pose fits the mask; None: there is none."""
     if item.mask is None:
         return None
     others = dict.fromkeys(truth.obj_id for truth in rendered.view.truths if truth.obj_id != item.obj_id)
@@ -248,12 +248,12 @@ def _describe_offset(item: Instance, rendered: RenderedView, shift: tuple[int, i
 
 
 def _spread(errors: np.ndarray) -> float:
-    """Upper quartile of the distance from the median."""
+    """Robust spread: upper quartile of the distances from the median."""
     return float(np.percentile(np.abs(errors - np.median(errors)), 75))
 
 
 def _moved_depth(depth: np.ndarray, columns: int, rows: int) -> np.ndarray:
-    """Depth moved right and down; inf where nothing has moved to."""
+    """Depth shifted right by `columns` and down by `rows`; inf where nothing has moved to."""
     result = np.roll(depth, (rows, columns), (0, 1))
     return np.where(moved(np.isfinite(depth), columns, rows), result, np.float32(np.inf))
 

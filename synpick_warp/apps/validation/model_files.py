@@ -30,7 +30,7 @@ _MILLIMETRE = 1e-3
 
 @dataclass(frozen=True, eq=False)
 class ModelsFolder:
-    """A models folder: models, models_eval, models_cad, ..."""
+    """Folder of models, such as models, models_eval or models_cad, with its models_info.json."""
 
     listing: Listing
 
@@ -41,12 +41,12 @@ class ModelsFolder:
 
     @cached_property
     def files(self) -> dict[int, str]:
-        """PLY file by obj_id."""
+        """Names of the PLY files by obj_id."""
         return {int(match[1]): match[0] for name in sorted(self.listing.files) if (match := MODEL_FILE.fullmatch(name))}
 
     @cached_property
     def info(self) -> tuple[dict[str, Any], str]:
-        """Entries of models_info.json as they are, and what is wrong with the file."""
+        """(entries of models_info.json, not checked; fault of the file, empty: none)."""
         if "models_info.json" not in self.listing.files:
             return {}, ""
         try:
@@ -58,7 +58,7 @@ class ModelsFolder:
 
 @dataclass(frozen=True, eq=False)
 class ModelSubject:
-    """A model, and its entry in models_info.json."""
+    """Subject of rules about a model: its mesh, and its entry in models_info.json."""
 
     folder: ModelsFolder
     obj_id: int
@@ -75,7 +75,7 @@ class ModelSubject:
 
     @cached_property
     def entry(self) -> tuple[ModelInfo | None, str]:
-        """Entry in models_info.json, and what is wrong with it."""
+        """(entry of models_info.json, fault): None and the reason if it is missing or damaged; None and no reason without that file."""
         found = self.folder.info[0].get(str(self.obj_id))
         if found is None:
             return None, "no entry" if self.folder.info[0] else ""
@@ -86,14 +86,14 @@ class ModelSubject:
 
     @cached_property
     def header(self) -> list[str]:
-        """Lines of the PLY header."""
+        """Lines of the PLY file's header."""
         data = self.folder.listing.read(self.folder.files[self.obj_id], MAX_MESH_FILE)[:MAX_HEADER]
         head, _, _ = data.partition(b"end_header")
         return [line.strip() for line in head.decode("utf-8", "replace").splitlines()]
 
     @cached_property
     def mesh(self) -> tuple[TriangleMesh | None, str]:
-        """Triangles [m], and why they cannot be read."""
+        """(triangle mesh [m], fault): None and the reason if it cannot be read, else the mesh and an empty text."""
         try:
             return read_mesh(self.folder.listing.path(self.folder.files[self.obj_id]), _MILLIMETRE)[0], ""
         except CatalogError as error:

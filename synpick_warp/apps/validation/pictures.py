@@ -24,7 +24,7 @@ def png_type(data: bytes) -> tuple[int, str] | None:
 
 @dataclass(frozen=True, eq=False)
 class Mask:
-    """A mask as the crop that contains all of its pixels."""
+    """Mask of an instance as the crop (at left, top) that contains all of its pixels, with the image size, and how the file was encoded."""
 
     file: str
     size: tuple[int, int]
@@ -40,7 +40,7 @@ class Mask:
 
     @property
     def count(self) -> int:
-        """Number of pixels."""
+        """Number of pixels that are set."""
         return int(np.count_nonzero(self.crop))
 
     @property

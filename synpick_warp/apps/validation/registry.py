@@ -24,7 +24,7 @@ class Level(enum.StrEnum):
 
 
 class Violation(NamedTuple):
-    """A violation of a rule."""
+    """Violation of a rule: level, file, rule, and what is wrong."""
 
     level: Level
     file: str
@@ -36,7 +36,9 @@ class Violation(NamedTuple):
 
 @dataclass(frozen=True)
 class Rule:
-    """A rule about one type of subject."""
+    """Rule about one type of subject: name, level, what holds in a correct data set, how to mend a violation, and the check that yields
+    (file, what is wrong).
+    """
 
     name: str
     subject: type
@@ -83,7 +85,7 @@ def load_rules() -> dict[str, Rule]:
 
 
 def apply_rules(subject: object) -> Iterator[Violation]:
-    """Check a subject by all rules for its type. A rule that meets unreadable data ends with a violation about it."""
+    """Check a subject by all rules for its type; yields violations. A rule that meets unreadable data ends with a violation about it."""
     for item in load_rules().values():
         if item.subject is not type(subject):
             continue

@@ -80,6 +80,9 @@ class ObjectRenderer:
         return obj_id not in self._damaged
 
     def _load(self, obj_id: int) -> tuple[TriangleMesh, Any, tuple[wp.Mesh, ...]]:
+        """Load a model, or take it from a cache of MAX_MODELS models, least recently used first out; raises if there is none, or no
+        triangles.
+        """
         found = self._models.pop(obj_id, None)
         if found is None:
             if obj_id not in self.layout.model_files:

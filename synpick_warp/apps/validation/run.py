@@ -33,7 +33,7 @@ VIEWS_PER_PROCESS = 100
 
 @dataclass(frozen=True)
 class Options:
-    """What is checked."""
+    """What is checked: number of views that are rendered again (None: all), whether images are read, number of processes."""
 
     sample: int | None = DEFAULT_SAMPLE
     """Views that are rendered again, spread over all views; None: all."""
@@ -44,7 +44,7 @@ class Options:
 
 @dataclass
 class Summary:
-    """Totals of a validation."""
+    """Totals of a validation: scenes, views checked, views rendered again, models, errors, warnings."""
 
     scenes: int = 0
     views: int = 0
@@ -90,7 +90,9 @@ def validate(folder: Path, options: Options, summary: Summary, report: Report = 
 
 
 def _finish(violation: Violation, layout: Layout, summary: Summary) -> Violation:
-    """Count a violation, and shorten its text: paths relative to the data set, and the file's own name not twice."""
+    """Count a violation in the summary; returns it with a shorter text: paths relative to the data set, and the file's own name
+    not twice.
+    """
     if violation.level is Level.ERROR:
         summary.errors += 1
     else:
@@ -100,7 +102,7 @@ def _finish(violation: Violation, layout: Layout, summary: Summary) -> Violation
 
 
 def _check_folders(layout: Layout, lists: TargetLists) -> Iterator[Violation]:
-    """Rules about the whole data set."""
+    """Apply the rules about whole folders: data set, target lists, shards; yields violations."""
     yield from apply_rules(TreeSubject(layout))
     yield from apply_rules(lists)
     for listing in layout.keyed.values():
@@ -108,7 +110,7 @@ def _check_folders(layout: Layout, lists: TargetLists) -> Iterator[Violation]:
 
 
 def _list_scenes(layout: Layout) -> list[tuple[SceneRef, np.ndarray]]:
-    """All scenes, with the indices of their images by the files' names."""
+    """List all scenes, each with the im_ids that its files have."""
     found = []
     for ref in layout.scenes():
         files = open_scene(layout, ref)
@@ -121,6 +123,7 @@ def _list_scenes(layout: Layout) -> list[tuple[SceneRef, np.ndarray]]:
 
 
 def _plan_models(layout: Layout, summary: Summary) -> Iterator[Task]:
+    """Yield a task for each models folder, and one for each of its models; counts these."""
     for name, listing in layout.models.items():
         yield CheckModel(name, None)
         for obj_id in ModelsFolder(listing).files:
@@ -147,7 +150,7 @@ def _plan_scenes(scenes: list[tuple[SceneRef, np.ndarray]], lists: TargetLists, 
 
 
 def _plan_rigs(layout: Layout, scenes: list[tuple[SceneRef, np.ndarray]]) -> Iterator[Task]:
-    """Scenes that belong together: of the cameras of an episode of ours, of the sensors of a scene of others."""
+    """Yield tasks for scenes that belong together: those of the cameras of an episode, or of the sensors of one scene."""
     cameras = _count_cameras(layout)
     groups: dict[tuple[str, int], list[SceneRef]] = {}
     sensors: dict[tuple[str, int], list[SceneRef]] = {}
@@ -163,7 +166,7 @@ def _plan_rigs(layout: Layout, scenes: list[tuple[SceneRef, np.ndarray]]) -> Ite
 
 
 def _count_cameras(layout: Layout) -> int:
-    """Number of cameras of a data set of ours; 1 for others."""
+    """Number of cameras of a data set of this program; 1 for other data sets."""
     if not layout.ours:
         return 1
     try:

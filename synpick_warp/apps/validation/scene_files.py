@@ -40,7 +40,7 @@ class RecordFile:
     """File of an entry, where each has its own."""
 
     def add(self, image: int, content: Any, name: str, source: str = "") -> None:
-        """Add an entry, and check it."""
+        """Add an image's decoded entry; a part that does not fit the schema becomes a fault."""
         self.raw[image] = content
         if source:
             self.sources[image] = source
@@ -50,7 +50,7 @@ class RecordFile:
             self.faults.append((source or self.file, f"image {image}: {fault}"))
 
     def where(self, image: int) -> str:
-        """File of an entry."""
+        """Name of the file that holds an image's entry, for messages."""
         return self.sources.get(image, self.file)
 
 
@@ -69,6 +69,7 @@ class FolderScene(FolderImages):
         return self._records[name]
 
     def _read_record(self, name: str) -> RecordFile:
+        """Read an annotation file: entries by image; what cannot be read becomes a fault or a bad key, nothing is raised."""
         file = f"scene_{name}{self.ref.sensor}.json"
         record = RecordFile(self.listing.name(file), file in self.listing.files)
         if not record.present:
@@ -108,6 +109,7 @@ class KeyedScene(KeyedImages):
 
     @cached_property
     def _records(self) -> dict[str, RecordFile]:
+        """Annotation files gathered from those of the views, by kind; what cannot be read becomes a fault."""
         records = {name: RecordFile(self.ref.place) for name in RECORDS}
         for (image, content), member in sorted(self.members.items()):
             name = content.removesuffix(".json")
@@ -122,15 +124,15 @@ class KeyedScene(KeyedImages):
         return records
 
     def record(self, name: str) -> RecordFile:
-        """See `FolderScene`."""
+        """Entries of one kind ("camera", "gt", "gt_info") of all views. See `FolderScene`."""
         return self._records[name]
 
     def coco(self, name: str) -> tuple[str, Any] | None:
-        """See `FolderScene`: keyed layouts have no COCO file."""
+        """None: keyed layouts have no COCO file. See `FolderScene`."""
         return None
 
     def mask(self, kind: str, image: int, index: int) -> Mask | None:
-        """See `FolderScene`."""
+        """Mask of an instance, decoded from the view's run lengths; None: there is none. See `FolderScene`."""
         if self._masks is None or self._masks[0] != (kind, image):
             data = self.read(kind, image, None, MAX_JSON)
             file = self.file(kind, image)
@@ -157,5 +159,5 @@ def decode_runs(runs: Segmentation, file: str) -> np.ndarray:
 
 
 def open_scene(layout: Layout, ref: SceneRef) -> CheckedScene:
-    """Files of a scene."""
+    """Open the files of a scene: a folder, or views in shards or of key names."""
     return FolderScene(layout, ref) if ref.name else KeyedScene(layout, ref)

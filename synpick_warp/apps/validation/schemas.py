@@ -15,7 +15,9 @@ PLAIN_KEY = re.compile(r"0|[1-9][0-9]{0,8}")
 
 
 class Camera(Struct, gc=False):
-    """Entry of scene_camera.json: intrinsics [px], depth scale [mm per unit], pose of the world in the camera [mm]."""
+    """Schema of an entry of scene_camera.json: intrinsics [px], depth scale [mm per count], world-to-camera rotation and translation [mm];
+    UNSET: missing.
+    """
 
     cam_K: Matrix3 | UnsetType = UNSET  # noqa: N815
     cam_model: dict[str, Any] | UnsetType = UNSET
@@ -25,7 +27,7 @@ class Camera(Struct, gc=False):
 
 
 class Truth(Struct, gc=False):
-    """An instance's entry in scene_gt.json [mm]."""
+    """Schema of an instance's entry in scene_gt.json: object-to-camera rotation and translation [mm], obj_id."""
 
     cam_R_m2c: Matrix3  # noqa: N815
     cam_t_m2c: Vector3
@@ -34,7 +36,7 @@ class Truth(Struct, gc=False):
 
 
 class Info(Struct, gc=False):
-    """An instance's entry in scene_gt_info.json [px]."""
+    """Schema of an instance's entry in scene_gt_info.json: boxes and pixel counts [px], visible fraction."""
 
     bbox_obj: Box
     bbox_visib: Box
@@ -53,7 +55,7 @@ class Segmentation(Struct, gc=False):
 
 
 class Annotation(Struct, gc=False):
-    """An instance's entry in scene_gt_coco.json [px]."""
+    """Schema of an annotation in scene_gt_coco.json: ids, box [px], run lengths; UNSET: missing."""
 
     id: Index
     image_id: Index
@@ -65,7 +67,7 @@ class Annotation(Struct, gc=False):
 
 
 class CocoImage(Struct, gc=False):
-    """An image's entry in scene_gt_coco.json."""
+    """Schema of an image in scene_gt_coco.json."""
 
     id: Index
     file_name: str
@@ -74,13 +76,13 @@ class CocoImage(Struct, gc=False):
 
 
 class Category(Struct, gc=False):
-    """An object's entry in scene_gt_coco.json."""
+    """Schema of a category, an object, in scene_gt_coco.json."""
 
     id: Index
 
 
 class Coco(Struct, gc=False):
-    """scene_gt_coco.json."""
+    """Schema of scene_gt_coco.json: images, annotations, categories."""
 
     images: list[CocoImage]
     annotations: list[Annotation]
@@ -92,7 +94,7 @@ RECORDS: dict[str, Any] = {"camera": Camera, "gt": list[Truth], "gt_info": list[
 
 
 def convert(content: Any, schema: Any) -> Any:
-    """Check decoded JSON against a schema.
+    """Check decoded JSON against a schema; returns it as the schema's types.
 
     Raises:
         ValueError: In few words, with the place in `content`.

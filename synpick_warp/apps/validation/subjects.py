@@ -23,7 +23,7 @@ MASKS = ("mask", "mask_visib")
 
 @dataclass(frozen=True, eq=False)
 class CocoFile:
-    """scene_gt_coco.json, or scene_gt_coco_modal.json."""
+    """COCO file of a scene: name, content (None: it does not fit the schema), fault, and whether its boxes are those of visible masks."""
 
     file: str
     content: Coco | None
@@ -43,7 +43,7 @@ class CocoFile:
 
 @dataclass(frozen=True, eq=False)
 class TreeSubject:
-    """The data set's folders."""
+    """Subject of rules about the folders of a whole data set."""
 
     layout: Layout
     place: str = "."
@@ -51,7 +51,7 @@ class TreeSubject:
 
 @dataclass(frozen=True, eq=False)
 class SceneSubject:
-    """A scene as one sensor sees it."""
+    """Subject of rules about a scene as one sensor sees it: its files, and the target lists' records about it."""
 
     layout: Layout
     files: CheckedScene
@@ -65,7 +65,7 @@ class SceneSubject:
 
     @property
     def exact(self) -> bool:
-        """Whether depth and masks are exact."""
+        """Whether depth and masks of the scene's split were rendered, not measured by a real camera."""
         return self.layout.is_rendered(self.files.ref.split)
 
     def record(self, name: str) -> RecordFile:
@@ -74,17 +74,17 @@ class SceneSubject:
 
     @property
     def cameras(self) -> dict[int, Camera]:
-        """Well-formed camera entries by image."""
+        """Entries of scene_camera.json by image, those that fit the schema."""
         return self.record("camera").entries
 
     @property
     def truths(self) -> dict[int, list[Truth]]:
-        """Well-formed ground truth by image."""
+        """Entries of scene_gt.json by image, those that fit the schema."""
         return self.record("gt").entries
 
     @property
     def infos(self) -> dict[int, list[Info]]:
-        """Well-formed infos by image."""
+        """Entries of scene_gt_info.json by image, those that fit the schema."""
         return self.record("gt_info").entries
 
     @cached_property
@@ -94,7 +94,7 @@ class SceneSubject:
 
     @cached_property
     def cocos(self) -> list[CocoFile]:
-        """COCO files of the scene."""
+        """COCO files of the scene: scene_gt_coco.json, scene_gt_coco_modal.json, those that exist."""
         found = []
         for name in ("", "_modal"):
             try:
@@ -133,6 +133,7 @@ class ViewSubject:
 
     @cached_property
     def _depth(self) -> tuple[str, np.ndarray, tuple[int, str] | None] | None:
+        """(file, image, type of the PNG) of the depth image; None: missing, or a fault."""
         found = self._read("depth", None)
         if found is None:
             return None
@@ -163,6 +164,7 @@ class ViewSubject:
         return next((mask.size for masks in self.masks.values() for mask in masks if mask is not None), None)
 
     def _mask(self, kind: str, index: int) -> Mask | None:
+        """Mask of an instance; None: missing, or not readable, which becomes a fault."""
         try:
             return self.scene.files.mask(kind, self.image, index)
         except DatasetError as error:
@@ -170,6 +172,7 @@ class ViewSubject:
             return None
 
     def _picture(self, kind: str) -> tuple[str, np.ndarray] | None:
+        """(file, image) of the image of a kind; None: missing, or a fault."""
         found = self._read(kind, None)
         image = None if found is None else self._decode(*found)
         return None if found is None or image is None else (found[0], image)
@@ -185,6 +188,7 @@ class ViewSubject:
         return None if data is None else (file, data)
 
     def _decode(self, file: str, data: bytes) -> np.ndarray | None:
+        """Decode an image; None if that fails, which becomes a fault."""
         try:
             return decode_picture(data, file, DatasetError)
         except DatasetError as error:

@@ -13,7 +13,7 @@ from synpick_warp.system.inputs.json import MAX_JSON, decode_json
 
 @dataclass(frozen=True)
 class TargetList:
-    """A target list."""
+    """Target list: records by scene and image (none of several views), and what is wrong with the file (empty: nothing)."""
 
     scenes: dict[int, dict[int, list[TargetEntry]]] = field(default_factory=dict)
     """Records by scene and image. Records of several views, as in multi-view lists, are under no image."""
@@ -23,17 +23,18 @@ class TargetList:
 
 @dataclass(frozen=True, eq=False)
 class TargetLists:
-    """All target lists of a data set."""
+    """Subject of rules about all target lists of a data set."""
 
     layout: Layout
     place: str = "."
 
     @cached_property
     def lists(self) -> dict[str, TargetList]:
-        """Lists by name."""
+        """Target lists by file name. Cached."""
         return {name: self._read(name) for name in sorted(filter(TARGETS.fullmatch, self.layout.listing.files))}
 
     def _read(self, name: str) -> TargetList:
+        """Read a target list; one that does not fit the schema has a fault instead of records."""
         try:
             records = decode_json(self.layout.listing.read(name, MAX_JSON), list[TargetEntry], name, DatasetError)
         except DatasetError as error:

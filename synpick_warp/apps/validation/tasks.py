@@ -17,7 +17,7 @@ from synpick_warp.dataset.bop.layout import Layout, SceneRef
 
 
 class Checked(NamedTuple):
-    """Result of a task."""
+    """Result of a task: violations, views whose images were checked, views that were rendered again."""
 
     violations: list[Violation]
     views: int = 0
@@ -27,7 +27,7 @@ class Checked(NamedTuple):
 
 
 class State:
-    """What a process keeps between tasks: the layout, the scene that was read last, and the renderer."""
+    """State that a process keeps between tasks: layout, scene that was read last, renderer."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -47,13 +47,13 @@ class State:
         return ObjectRenderer(self.layout)
 
     def scene(self, ref: SceneRef, targets: dict[str, Any]) -> SceneSubject:
-        """A scene; the one that was read last stays in memory."""
+        """Subject of a scene; the last one is cached."""
         if self._scene is None or self._scene[0] != (ref, id(targets)):
             self._scene = (ref, id(targets)), SceneSubject(self.layout, open_scene(self.layout, ref), targets)
         return self._scene[1]
 
     def models(self, name: str) -> ModelsFolder:
-        """A models folder."""
+        """Models folder by name; the last one is cached, a missing one is empty."""
         if self._models is None or self._models[0] != name:
             self._models = name, ModelsFolder(self.layout.models.get(name, Listing(self.layout.root, name)))
         return self._models[1]
@@ -69,7 +69,7 @@ class Task(Protocol):
 
 @dataclass(frozen=True)
 class CheckModel:
-    """Check a model; without an object, the folder."""
+    """Task: check a model by all rules about models; without an obj_id (None), the models folder."""
 
     folder: str
     obj_id: int | None
@@ -82,7 +82,9 @@ class CheckModel:
 
 @dataclass(frozen=True)
 class CheckScene:
-    """Check a part of a scene's views, and with the first part the scene itself."""
+    """Task: check views `first` to `last` - 1 of a scene (None: to the end), and with the first part the scene itself; `poses`: images that
+    are rendered again.
+    """
 
     ref: SceneRef
     first: int
@@ -118,7 +120,7 @@ class CheckScene:
 
 @dataclass(frozen=True)
 class CheckRig:
-    """Check the scenes of the cameras of one episode, or of the sensors of one scene, against each other."""
+    """Task: check the scenes of the cameras of one episode, or of the sensors of one scene, against each other."""
 
     refs: tuple[SceneRef, ...]
     cameras: int

@@ -21,7 +21,7 @@ MM = 1000.0
 
 
 class DepthScale(NamedTuple):
-    """Depths that map to the first and the last colour [mm]."""
+    """Colour scale of depth: the depths of the first (near) and the last colour (far) [mm]."""
 
     near: float
     far: float

@@ -31,7 +31,7 @@ def check_picture_name(out: Path) -> None:
 
 
 def write_picture(out: Path, picture: Image) -> Path:
-    """Write an image in the format of its suffix; its folder is created.
+    """Write an image in the format of its suffix; its folder is created. Returns the path.
 
     Raises:
         OutputError: It cannot be written.
@@ -100,4 +100,5 @@ def short_labels(objects: Iterable[tuple[int, int]]) -> dict[int, str]:
 
 
 def _letters(place: int) -> str:
+    """Letters that number a place: a, b, ..., z, aa, ab, ..."""
     return (_letters(place // 26 - 1) if place >= 26 else "") + chr(ord("a") + place % 26)

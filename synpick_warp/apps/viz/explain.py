@@ -49,7 +49,7 @@ _HALO = 3
 
 @dataclass(frozen=True, eq=False)
 class _Scene:
-    """Images of camera 0 at the time of an attempt's observation."""
+    """Colour image of camera 0 in the frame of an attempt, and visible masks by instance (None: the data set has none)."""
 
     place: str
     color: Image
@@ -90,6 +90,7 @@ def write_explanation(dataset: Path, out: Path, episode: int | None, attempt: in
 
 
 def _read_scene(dataset: Path, config: Config, attempt: Attempt) -> _Scene:
+    """Read colour image, visible masks and ground truth of the attempt's frame by camera 0; raises DatasetError."""
     layout = DataLayout.of(config)
     split = path_inside(dataset, layout.folder(attempt.episode), dataset / "config.toml", DatasetError)
     index, suffix = layout.scene(attempt.episode, 0)
@@ -132,7 +133,9 @@ def image_scale(size: tuple[int, int]) -> float:
 
 
 def _row(attempt: Attempt, scene: _Scene, names: Mapping[int, str], config: Config) -> tuple[Image, Spec]:
-    """Draw one attempt: image, clutter graph, text and table, with room at the lower left for the force's plot, which is the second."""
+    """Draw one attempt: (picture of image, clutter graph, text and table with room at the lower left for a plot; specification of that
+    plot, of the seal force).
+    """
     image = draw_observation(attempt, scene.color, scene.masks)
     words = draw_words(attempt, names, config)
     left = image.shape[0] + 2 * LINE + MARGIN + PLOT_HEIGHT
@@ -161,6 +164,7 @@ def _row(attempt: Attempt, scene: _Scene, names: Mapping[int, str], config: Conf
 
 
 def _paste(sheet: Image, picture: Image, column: int, row: int) -> None:
+    """Copy a picture into the sheet, its corner at (row, column)."""
     sheet[row : row + picture.shape[0], column : column + picture.shape[1]] = picture
 
 
@@ -233,13 +237,14 @@ def draw_chosen(picture: Image, place: tuple[float, float], color: tuple[int, in
 
 
 def _put_label(picture: Image, text: str, point: tuple[float, float], color: tuple[int, int, int], size: float) -> None:
+    """Draw a label beside a point, on a box of the colour."""
     (width, height), _ = cv2.getTextSize(text, FONT, size, 1)
     place = (point[0] + (22 if size > _LABEL else 13) + width / 2, point[1] - 8 - height / 2)
     put_boxed(picture, text, place, size, readable_on(color), color)
 
 
 def _draw_key(sheet: Image, x: int, y: int) -> None:
-    """Draw the legend of the image's markers."""
+    """Draw the legend of the markers: pole, centroid, half-way point, suction point, target."""
     for kind, text in enumerate(("pole of inaccessibility", "centroid", "half-way", "suction point", "that of the target")):
         place = (x + (17.0 if kind == 4 else 8.0), y - 4.5)
         if kind < 3:
@@ -251,6 +256,7 @@ def _draw_key(sheet: Image, x: int, y: int) -> None:
 
 
 def _graph_foot(states: set[str]) -> Sequence[tuple[str, tuple[int, int, int]]]:
+    """Lines of the legend with their colours: arrows, badges, and the kinds of removed edges that occur."""
     lines = [("arrow: from the object on top to the one below, with its votes", SOFT), ("badge: number of objects above", SOFT)]
     lines += [(f"dashed: {OUTVOTED}", GREY)] if OUTVOTED in states else []
     return lines + ([(f"dashed: {CYCLIC}", RED)] if CYCLIC in states else [])

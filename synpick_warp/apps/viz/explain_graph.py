@@ -53,7 +53,9 @@ Key = int | tuple[int, int, int]
 
 @dataclass(frozen=True)
 class Edge:
-    """Directed edge between two instances."""
+    """Edge of the clutter graph, from the upper to the lower instance: its votes (of a kept edge minus those for the opposite one), and
+    whether it was kept or why it was removed.
+    """
 
     upper: int
     lower: int
@@ -64,7 +66,7 @@ class Edge:
 
 @dataclass(frozen=True)
 class Layout:
-    """Positions in the image [px]."""
+    """Layout of the graph in the image [px]: position of each node, and polyline of each kept edge (upper, lower)."""
 
     nodes: dict[int, tuple[float, float]]
     routes: dict[tuple[int, int], np.ndarray]
@@ -72,7 +74,9 @@ class Layout:
 
 
 def clutter_edges(attempt: Attempt, min_votes: float) -> list[Edge]:
-    """All edges with at least `min_votes`, sorted by instance: those kept in the acyclic graph, and those removed from it."""
+    """Edges of the clutter graph, sorted by lower, then upper instance: all that are kept in the acyclic graph, and of at least `min_votes`
+    those removed, since the opposite has as many votes or to break a cycle.
+    """
     edges = []
     for lower, one in sorted(attempt.objects.items()):
         voted = {upper for (at, upper), votes in attempt.votes.items() if at == lower and votes >= min_votes}
@@ -136,10 +140,10 @@ def _assign_layers(attempt: Attempt, kept: list[tuple[int, int]], place: Mapping
 
 
 def _place_columns(graph: nx.Graph, layers: Mapping[Key, int], place: Mapping[Key, float], width: int) -> dict[Key, float]:
-    """x of each node [px], from a first one: sweeps draw each layer to the means (barycentres) of its neighbours, in their order.
+    """x of each node [px], by barycentre sweeps from the first x in `place`: each layer is ordered by the mean x of its nodes' neighbours,
+    and moved as near to these means (least squares, isotonic regression) as the widths of its nodes allow.
 
-    A layer's x are the nearest to these means, in least squares, that leave room for its nodes (isotonic regression). The first sweeps look
-    at the layer before, downward and upward in turn, which finds the order; the others at both sides.
+    The first sweeps use the layer before, downward and upward in turn, which finds the order; the others use both sides.
     """
     rows: list[list[Key]] = [[] for _ in range(1 + max(layers.values(), default=-1))]
     for key, layer in layers.items():
@@ -169,7 +173,9 @@ def _widen(column: Mapping[Key, float], width: int) -> dict[Key, float]:
 
 
 def _curve(points: np.ndarray) -> np.ndarray:
-    """Monotone cubic spline through points (Fritsch and Butland, 1984), so that it never rises; two points give a straight line."""
+    """Polyline (N, 2) along a monotone cubic spline (PCHIP; Fritsch and Butland, 1984) of x and y over the index of the points: y never
+    turns back. Two points give a straight line.
+    """
     return PchipInterpolator(range(len(points)), points)(np.linspace(0, len(points) - 1, _SAMPLES * (len(points) - 1)))
 
 
@@ -234,7 +240,9 @@ def _draw_arrow(canvas: Image, route: np.ndarray, color: tuple[int, int, int], t
 
 
 def _draw_bent(canvas: Image, edge: Edge, layout: Layout) -> None:
-    """Draw a removed edge as a dashed curve beside the straight line, on which its opposite runs."""
+    """Draw a removed edge as a dashed arc, so that it does not cover the straight line between its nodes, where the opposite
+    edge may run.
+    """
     start, end = (np.array(layout.nodes[node]) for node in (edge.upper, edge.lower))
     bend = (start + end) / 2 + _BEND * np.array([end[1] - start[1], start[0] - end[0]])
     t = np.linspace(0.0, 1.0, 3 * _SAMPLES)[:, None]

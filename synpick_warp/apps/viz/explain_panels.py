@@ -86,7 +86,7 @@ def wrapped(text: str, size: float, width: int) -> list[str]:
 
 
 def fitted(text: str, size: float, width: int) -> str:
-    """Truncate text to that width [px]."""
+    """Text truncated to a width [px]."""
     if cv2.getTextSize(text, FONT, size, 2)[0][0] <= width:
         return text
     while text and cv2.getTextSize(text + "..", FONT, size, 2)[0][0] > width:

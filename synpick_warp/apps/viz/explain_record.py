@@ -44,7 +44,7 @@ class Attempt(records.Attempt, dict=True):
 
     @cached_property
     def seen(self) -> list[InstanceObservation]:
-        """Observations of the visible instances."""
+        """Observations of the visible instances, in the order of instances."""
         return [one for one in self.observation.instances if one.visible > 0]
 
     @cached_property
@@ -135,7 +135,7 @@ def parse_attempt(content: Mapping[str, Any], source: str) -> Attempt:
 
 
 def _line(path: Path, row: int) -> str:
-    """A line of a file, in messages."""
+    """Name of a line of a file, for messages."""
     return f"{path}, line {row + 1},"
 
 
@@ -181,6 +181,7 @@ def choice_words(attempt: Attempt, names: Mapping[int, str], config: Config) -> 
 
 
 def _reason(attempt: Attempt, one: InstanceObservation, full: Mapping[int, str], config: Config) -> str:
+    """Clause on why an object was chosen: number of objects above it, and its visible fraction if several have as many."""
     targeted = attempt.mode == "target"
     count = len(one.ancestors)
     above = f"{count} object{'' if count == 1 else 's'} above"

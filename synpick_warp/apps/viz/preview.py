@@ -59,6 +59,8 @@ class Scene:
 
 @dataclass(frozen=True)
 class _View:
+    """View to draw: scene, frame, its annotation records, and the files of its images."""
+
     scene: Scene
     frame: int
     camera: dict[str, Any]
@@ -95,7 +97,7 @@ def write_contact_sheet(dataset: Path, out: Path, views: int) -> Path:
 
 
 class Baked(NamedTuple):
-    """What is known of the bake behind a data set; nothing of data sets of other programs."""
+    """Settings and object names of the bake behind a data set; None and empty for data sets of other programs."""
 
     dataset: Path
     config: Config | None
@@ -103,7 +105,7 @@ class Baked(NamedTuple):
     """obj_id -> name of an object."""
 
     def facts(self, scene: Scene, frame: int, camera: Mapping[str, Any]) -> list[str]:
-        """What is to be said of a view: scene, episode, mode, time, light."""
+        """Facts on a view for its legend: scene, episode, mode, time, light."""
         lines = [f"{scene.folder.parent.name}/{scene.folder.name}{scene.sensor.replace('_', ' ', 1)}, image {frame}"]
         if self.config is not None:
             episode, physics = DataLayout.of(self.config).scene_episode(int(scene.folder.name)), self.config.physics
@@ -230,6 +232,7 @@ def _row(view: _View, depth_scale: DepthScale | None, baked: Baked, most: int) -
 
 
 def _draw_legend(view: _View, facts: Sequence[str], baked: Baked, height: int, most: int) -> Image:
+    """Draw the legend: facts of the view and a line for each object; `most` lines at most fill `height` [px]."""
     return draw_legend((legend_width(height, most), height), facts, view.truth, baked.names)
 
 
@@ -248,6 +251,7 @@ def _captioned(image: Image, caption: str, height: int) -> Image:
 
 
 def _instances_caption(view: _View) -> str:
+    """Caption with the number of instances, and of those seen."""
     seen = sum(info["px_count_visib"] > 0 for _, info in view.truth)
     return f"instances: {len(view.truth)}, of which {seen} seen"
 
@@ -264,7 +268,7 @@ def _color_instances(view: _View, color: Image) -> Image:
 
 
 def _placeholder(color: Image, text: str) -> Image:
-    """The darkened grey image with a text, in the place of a picture."""
+    """Picture of a text on the darkened grey image, where a panel has no picture."""
     drawn = np.repeat(cv2.cvtColor(color, cv2.COLOR_BGR2GRAY)[..., None] // 3, 3, axis=2)
     put_text(drawn, text, (8, 24), 0.5, (230, 230, 230))
     return drawn

@@ -53,20 +53,24 @@ def _draw_normals(values: np.ndarray) -> tuple[str, Image]:
 
 
 def _draw_albedo(values: np.ndarray) -> tuple[str, Image]:
+    """Caption and picture of layer albedo, as it is."""
     return "albedo", np.ascontiguousarray(values[..., ::-1])
 
 
 def _draw_nocs(values: np.ndarray) -> tuple[str, Image]:
+    """Caption and picture of normalized object coordinates, x, y, z as red, green, blue."""
     return "nocs: red x, green y, blue z of the object", _bytes(values)
 
 
 def _draw_classes(values: np.ndarray) -> tuple[str, Image]:
+    """Caption and picture of class ids, a hue each; 0, nothing, is black."""
     present = np.unique(values[values > 0])
     hue = (values * GOLDEN) % 1.0
     return f"classes: {len(present)} present", _from_hsv(hue, np.where(values > 0, 1.0, 0.0))
 
 
 def _draw_flow(values: np.ndarray) -> tuple[str, Image]:
+    """Caption and picture of optical flow: hue is direction, saturation length; unknown (NaN) is grey."""
     size = np.hypot(values[..., 0], values[..., 1])
     full = _full_scale(size)
     colors = _from_hsv(np.arctan2(values[..., 1], values[..., 0]) / (2 * np.pi) % 1.0, size / full)
@@ -74,6 +78,7 @@ def _draw_flow(values: np.ndarray) -> tuple[str, Image]:
 
 
 def _draw_scene_flow(values: np.ndarray) -> tuple[str, Image]:
+    """Caption and picture of scene flow: x, y, z as red, green, blue around grey; unknown is marked."""
     size = np.linalg.norm(values, axis=-1)
     full = _full_scale(size)
     colors = _bytes((values / full + 1.0) / 2.0)

@@ -37,7 +37,7 @@ PAPER, SOFT = (230, 230, 230), (150, 150, 150)
 
 
 class Box(NamedTuple):
-    """A rectangle: left upper corner, width and height [px]."""
+    """Rectangle: left upper corner, width and height [px]."""
 
     x: float
     y: float
@@ -45,7 +45,7 @@ class Box(NamedTuple):
     height: float
 
     def meets(self, other: Box) -> bool:
-        """Whether two rectangles overlap."""
+        """Whether two rectangles overlap; common edges do not count."""
         return (
             self.x < other.x + other.width
             and other.x < self.x + self.width
@@ -109,11 +109,13 @@ def draw_labels(image: Image, boxes: Sequence[Box], texts: Sequence[str], colors
 
 
 def _ground(color: tuple[int, int, int]) -> tuple[int, int, int]:
+    """Darkened colour (BGR), as ground of a label."""
     blue, green, red = (round(_SHADE * value) for value in color)
     return blue, green, red
 
 
 def _put_label(image: Image, text: str, place: Box, color: tuple[int, int, int]) -> None:
+    """Draw text into a box of the darkened colour."""
     low = round(place.x), round(place.y)
     high = round(place.x + place.width) - 1, round(place.y + place.height) - 1
     cv2.rectangle(image, low, high, _ground(color), -1)
@@ -126,7 +128,7 @@ def legend_width(height: int, instances: int) -> int:
 
 
 def _rows(height: int, facts: int) -> int:
-    """Number of instances below each other."""
+    """Number of instances that the legend's height has space for, below the facts."""
     return max(1, (height - LINE * facts - _SPACE) // LINE)
 
 

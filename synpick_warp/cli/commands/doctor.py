@@ -65,11 +65,13 @@ def memory_report(config: Config) -> Table:
 
 
 def _software() -> list[tuple[str, str]]:
+    """Rows (name, value) of versions: this program, Python, packages."""
     versions = [("synpick-warp", __version__), ("python", f"{platform.python_version()} on {platform.platform()}")]
     return versions + [(name, importlib.metadata.version(name)) for name in _PACKAGES]
 
 
 def _host() -> list[tuple[str, str]]:
+    """Rows (name, value) of the host: usable cores and memory."""
     rows = [("CPU cores", f"{count_cores()} usable of {os.cpu_count()}")]
     if hasattr(os, "sysconf"):
         rows.append(("memory", f"{os.sysconf('SC_PAGE_SIZE') * os.sysconf('SC_PHYS_PAGES') / GIB:.1f} GiB"))
@@ -77,6 +79,7 @@ def _host() -> list[tuple[str, str]]:
 
 
 def _device(device: wp.Device) -> list[tuple[str, str]]:
+    """Rows (name, value) of the device: name, memory, compute capability, multiprocessors, CUDA versions."""
     rows = [("device", f"{device.alias}: {device.name}")]
     if device.is_cuda:
         rows.append(("device memory", f"{device.free_memory / GIB:.1f} of {device.total_memory / GIB:.1f} GiB free"))
@@ -101,6 +104,7 @@ def _describe_partition(device: wp.Device) -> str:
 
 
 def _caches() -> list[tuple[str, str]]:
+    """Rows (name, value) of the kernel cache and the shape cache: folder, content, variable that moves it."""
     kernels, shapes = Path(wp.config.kernel_cache_dir or ""), default_cache_dir()
     return [
         ("kernel cache", f"{kernels}: {_describe_folder(kernels, 'modules')}; {KERNEL_VARIABLE} moves it"),
@@ -121,4 +125,5 @@ def _describe_folder(folder: Path, noun: str) -> str:
 
 
 def _dotted(version: tuple[int, int] | None) -> str:
+    """Version as text with dots; None: "not found"."""
     return "not found" if version is None else ".".join(map(str, version))

@@ -142,7 +142,7 @@ def run_method(
 def make_selection(
     method: str, every: int | None, targets: Path | None, modes: str | None, cameras: str | None, episodes: str | None
 ) -> Selection:
-    """Check the options that choose images.
+    """Make the selection of images from the command's options, which are checked.
 
     Raises:
         ConfigError: A value is not allowed, or two exclude each other.
@@ -170,7 +170,7 @@ def make_selection(
 
 
 def make_options(method: str, depth: str, masks: str, visib_min: float, seed: int, batch: int, threads: int) -> Options:
-    """Check the other options.
+    """Make the options of the estimation from the command's options, which are checked.
 
     Raises:
         ConfigError: A value is not allowed.
@@ -224,7 +224,7 @@ def check_output(out: Path, selection: Selection) -> None:
 
 
 def describe_run(run: Run) -> str:
-    """Summary in one line."""
+    """One line on a run: views, poses, rates, shares of the time, estimates left out."""
     wall = max(run.wall, 1e-9)
     rate = f"{len(run.poses) / wall:,.0f} poses/s, {run.views / wall:,.0f} views/s"
     parts = f"waiting for images {run.reading / wall:.0%}, estimating {run.estimating / wall:.0%}"

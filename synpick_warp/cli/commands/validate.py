@@ -71,7 +71,7 @@ def validate(
 
 
 def _make_options(sample: int | None, threads: int, *, poses: bool, fast: bool) -> Options:
-    """Check the options.
+    """Make the options of the validation from the command's options, which are checked.
 
     Raises:
         ConfigError: A value is not allowed, or two options exclude each other.
@@ -89,7 +89,7 @@ def _make_options(sample: int | None, threads: int, *, poses: bool, fast: bool) 
 
 
 def _describe(violation: Violation) -> str:
-    """A violation in one line."""
+    """Violation as one line of text."""
     from synpick_warp.apps.validation.registry import load_rules
 
     cure = load_rules()[violation.rule].cure
@@ -97,7 +97,7 @@ def _describe(violation: Violation) -> str:
 
 
 def _encode(violation: Violation) -> str:
-    """A violation as a JSON object."""
+    """Violation as one line of JSON."""
     from synpick_warp.apps.validation.registry import load_rules
 
     return _dump({**violation._asdict(), "cure": load_rules()[violation.rule].cure})
@@ -111,6 +111,7 @@ def _dump(record: object) -> str:
 
 
 def _print_rules(*, as_json: bool) -> None:
+    """Print all rules, as lines or JSON lines."""
     from synpick_warp.apps.validation.registry import load_rules
 
     for item in load_rules().values():
@@ -119,6 +120,7 @@ def _print_rules(*, as_json: bool) -> None:
 
 
 def _print_summary(summary: Summary, counts: Counter, limit: int, *, as_json: bool) -> None:
+    """Print how many violations were held back by rule (limit 0: none), and the totals; or the totals as JSON."""
     if as_json:
         print(_dump({"totals": vars(summary)}))
         return

@@ -12,7 +12,9 @@ from synpick_warp.system.inputs.files import read_file
 
 @dataclass(frozen=True)
 class Listing:
-    """Names in a folder. Whatever is read of a data set has been listed before, folder by folder from its root on."""
+    """Names of the files and folders in a folder of a data set, links that lead out of it apart. Whatever is read has been listed before,
+    folder by folder from the root on.
+    """
 
     root: Path
     """The data set, resolved."""
@@ -30,7 +32,7 @@ class Listing:
         return f"{self.place}/{entry}" if self.place else entry
 
     def path(self, entry: str) -> Path:
-        """Path of an entry."""
+        """Path of an entry, from the root of the data set."""
         return self.root / self.name(entry)
 
     def read(self, entry: str, limit: int) -> bytes:

@@ -54,16 +54,17 @@ class FolderImages:
 
     @cached_property
     def listings(self) -> dict[str, Listing]:
-        """Listings of the folders of images by type."""
+        """Listings of the scene's image folders by kind."""
         return {kind: self.listing.enter(self.folder(kind)) for kind in KINDS if kind in self.kinds}
 
     def indices(self, kind: str) -> dict[Index, str]:
-        """File of each image of a type."""
+        """File names of a kind by (image, instance or None)."""
         if kind not in self._indices:
             self._indices[kind] = self._index(self.listing.enter(self.folder(kind)), kind.startswith("mask"))
         return self._indices[kind]
 
     def _index(self, listing: Listing, paired: bool) -> dict[Index, str]:
+        """File names by (image, instance or None); `paired`: names with an instance (masks). Of several files one suffix wins."""
         found: dict[Index, str] = {}
         matches = [match for name in listing.files if (match := _STEM.fullmatch(name)) and match[3].lower() in SUFFIXES]
         for match in sorted(matches, key=lambda match: SUFFIXES.index(match[3].lower())):
@@ -89,7 +90,7 @@ class FolderImages:
 
 @dataclass(frozen=True)
 class Member:
-    """Content of a key: a file, or a part of a shard."""
+    """Location of an image or record: a file, or `size` bytes at `offset` of a shard."""
 
     file: str
     path: Path
@@ -127,6 +128,7 @@ class KeyedImages:
         return found
 
     def _add(self, found: dict[tuple[int, str], Member], name: str, member: Member) -> None:
+        """Add a file or member by (image, content), if its name is KEY.CONTENT and of this scene."""
         match = KEYED.fullmatch(name)
         if match and int(match[1]) == self.ref.scene:
             found[int(match[2]), match[3]] = member
@@ -147,35 +149,36 @@ class KeyedImages:
 
     @cached_property
     def kinds(self) -> set[str]:
-        """See `FolderImages`."""
+        """Kinds of images that the scene has. See `FolderImages`."""
         return {content.split(".")[0] for _, content in self.members} & set(KINDS)
 
     def indices(self, kind: str) -> dict[Index, str]:
-        """See `FolderImages`; masks of a view are one file, without index."""
+        """Files of a kind by (image, None): the masks of a view are one file. See `FolderImages`."""
         return {(image, None): member.file for (image, content), member in self.members.items() if content.split(".")[0] == kind}
 
     def member(self, kind: str, image: int) -> Member | None:
-        """Member of an image, or of its masks."""
+        """File or shard member of an image, or of all masks of a view; None: there is none."""
         suffixes = ("json",) if kind.startswith("mask") else SUFFIXES
         return next((member for suffix in suffixes if (member := self.members.get((image, f"{kind}.{suffix}")))), None)
 
     def file(self, kind: str, image: int, index: int | None = None) -> str:
-        """See `FolderImages`."""
+        """Name of the image's member, for messages, also of one that is missing. See `FolderImages`."""
         member = self.member(kind, image)
         part = "" if index is None else f", mask {index}"
         return f"{member.file}{part}" if member else f"{self.ref.place}/{self.ref.scene:06d}_{image:06d}.{kind}{part}"
 
     def read(self, kind: str, image: int, index: int | None, limit: int) -> bytes | None:
-        """See `FolderImages`."""
+        """Content of the image's member, at most `limit` bytes; None: there is none. `index` is not used. See `FolderImages`."""
         member = self.member(kind, image)
         return None if member is None else self.content(member, limit)
 
     def find(self, name: str, image: int, index: int | None = None) -> tuple[str, bytes, str] | None:
-        """See `FolderImages`."""
+        """(suffix, content, source) of an image; None: there is none. See `FolderImages`."""
         return _find(self, name, image, index)
 
 
 def _find(images: FolderImages | KeyedImages, name: str, image: int, index: int | None) -> tuple[str, bytes, str] | None:
+    """(suffix, content, source) of an image, "rgb" also as its grey kind; None: there is none."""
     for kind in COLOR if name == "rgb" else (name,):
         data = images.read(kind, image, index, MAX_IMAGE_FILE)
         if data is not None:

@@ -17,7 +17,7 @@ KEY = re.compile(r"([0-9]{6,9})_([0-9]{6,9})")
 
 @dataclass(frozen=True, eq=False)
 class KeyedFolder:
-    """A folder of shards or of the imagewise layout."""
+    """Folder of shards, or of the imagewise layout (files KEY.CONTENT), with the keys found in it."""
 
     listing: Listing
 
@@ -33,7 +33,7 @@ class KeyedFolder:
 
     @cached_property
     def keys(self) -> tuple[dict[str, int] | None, str]:
-        """Index of the shard by key, and what is wrong with key_to_shard.json; None: there is no such file, or it is damaged."""
+        """(shard index by key, fault) of key_to_shard.json; None: there is no such file, or it is damaged."""
         if KEYS not in self.listing.files:
             return None, f"there is no {KEYS}" if self.shards else ""
         try:
@@ -43,7 +43,7 @@ class KeyedFolder:
 
     @cached_property
     def members(self) -> dict[str, set[str] | str]:
-        """Keys in each shard, or why it cannot be read."""
+        """Keys in each shard, or the reason why it cannot be read."""
         found: dict[str, set[str] | str] = {}
         for shard in self.shards:
             try:

@@ -35,6 +35,7 @@ def measure_info(visible: Sequence[np.ndarray], amodal: Sequence[np.ndarray] | N
 
 
 def _measure(visible: np.ndarray, amodal: np.ndarray | None) -> dict[str, Any]:
+    """Record of scene_gt_info.json from masks (H, W) bool; without an amodal one (None) only what is visible is known."""
     seen = int(np.count_nonzero(visible))
     entry = UNKNOWN | {"bbox_visib": _box(visible), "px_count_visib": seen}
     if amodal is None:

@@ -14,7 +14,7 @@ INFO = "models_info.json"
 
 
 def models_folder(folder: Path) -> str:
-    """Name of a data set's folder of models: "models", or what takes its place (T-LESS: models_cad); "models", too, if there is none."""
+    """Name of a data set's folder of models: "models", or another where there is none (T-LESS: models_cad); "models" if there are none."""
     return next((name for name in RENDERING_MODELS if (folder / name).is_dir()), RENDERING_MODELS[0])
 
 

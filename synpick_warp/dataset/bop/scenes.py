@@ -39,7 +39,7 @@ class FoundScenes:
 
     @cached_property
     def _scenes(self) -> dict[int, dict[str, SceneRef]]:
-        """Episode -> suffix of the sensor -> scene."""
+        """Scenes by episode and sensor suffix."""
         by_split: dict[str, list[SceneRef]] = {}
         for ref in self.refs():
             by_split.setdefault(ref.split, []).append(ref)
@@ -58,7 +58,7 @@ class FoundScenes:
         return [*folders, *(ref for ref in self._keyed() if ref.split.removesuffix("_web") not in splits)]
 
     def _keyed(self) -> Iterator[SceneRef]:
-        """Scenes of shards and of the imagewise layout."""
+        """Yield the scenes of shards and of the imagewise layout."""
         for folder in map(KeyedFolder, self.layout.keyed.values()):
             if fault := next((keys for keys in folder.members.values() if isinstance(keys, str)), None):
                 raise DatasetError(fault)
@@ -81,7 +81,7 @@ class FoundScenes:
         return tuple(sorted({ref.split for refs in self._scenes.values() for ref in refs.values()}))
 
     def scene(self, episode: int) -> int:
-        """Index of an episode's scene."""
+        """BOP scene_id of an episode."""
         return next(iter(self._scenes[episode].values())).scene
 
     def split(self, episode: int) -> str:
@@ -116,7 +116,7 @@ class FoundScenes:
         return self.open(ref)
 
     def open(self, ref: SceneRef) -> SceneFiles:
-        """Files of a scene."""
+        """Open the files of a scene: of a folder, or of shards or key names."""
         if ref.name:
             listing = self.layout.splits[ref.split].enter(ref.name)
             return SceneFolder(listing.path(""), None, ref.sensor, FolderImages(listing, ref.sensor))

@@ -21,6 +21,7 @@ def digest_inputs(catalog: Catalog, lights: tuple[EnvironmentMap, ...]) -> dict[
 
 
 def _digest_data(value: object) -> str:
+    """SHA-256 of nested data, by type and content."""
     state = hashlib.sha256()
     for part in _parts(value):
         state.update(part)

@@ -20,6 +20,7 @@ from synpick_warp.exporters.formats import FORMAT_TABLE
 
 @functools.lru_cache(maxsize=4)
 def _pattern(layout: DataLayout, entry: Path) -> re.Pattern[str]:
+    """Regular expression of the file names that the formats write in an entry: of an episode, or the constants."""
     formats = [FORMAT_TABLE[name] for name in dict.fromkeys(layout.formats)]
     names = (row.constants if entry == CONSTANTS else row.episode(layout, int(entry.name)) for row in formats)
     return re.compile("|".join(dict.fromkeys(names)))

@@ -117,6 +117,7 @@ def fixed_settings(config: Config) -> dict[str, Any]:
 
 
 def _version(name: str) -> str:
+    """Version of an installed package; empty: not installed."""
     try:
         return importlib.metadata.version(name)
     except importlib.metadata.PackageNotFoundError:
@@ -124,11 +125,12 @@ def _version(name: str) -> str:
 
 
 def _digest(content: object) -> str:
+    """SHA-256 of content as JSON with sorted keys."""
     return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
 
 
 def encode_manifest(content: Mapping[str, Any]) -> bytes:
-    """Serialize a manifest."""
+    """Serialize a manifest as indented JSON."""
     return (json.dumps(content, indent=2) + "\n").encode()
 
 
@@ -172,7 +174,7 @@ def read_settings(folder: Path, manifest: Mapping[str, Any]) -> Config:
 
 
 def differences(here: Mapping[str, Any], there: Mapping[str, Any], path: str = "") -> Iterator[tuple[str, Any, Any]]:
-    """Compare two manifests: (key, value here, value there) of each difference; None: no such key."""
+    """Compare two manifests: yields (key, value here, value there) of each difference; None: no such key."""
     for name in [*here, *(name for name in there if name not in here)]:
         first, second = here.get(name), there.get(name)
         if isinstance(first, Mapping) and isinstance(second, Mapping):
@@ -192,11 +194,13 @@ def describe_differences(here: Mapping[str, Any], there: Mapping[str, Any]) -> s
 
 
 def _show(value: object) -> str:
+    """Value as JSON for a message, cut to MAX_SHOWN characters."""
     text = json.dumps(value)
     return text if len(text) <= MAX_SHOWN else f"{text[:MAX_SHOWN]}…"
 
 
 def _show_key(key: str) -> str:
+    """Key for a message: as it is if printable and short, else quoted and cut."""
     return key if key.isprintable() and len(key) <= MAX_SHOWN else _show(key)
 
 
@@ -233,7 +237,7 @@ def read_entry(folder: Path, entry: Path) -> dict[str, Any] | None:
 
 
 def entry_advice(entry: Path) -> str:
-    """What to do about a damaged manifest entry."""
+    """Advice for messages about a damaged manifest entry."""
     return f"remove {entry}.json and {entry}.sha256, and resume the bake: it makes their files again"
 
 

@@ -53,7 +53,7 @@ _COPY_BYTES = 1 << 20
 
 
 class Merged(NamedTuple):
-    """Result of a merge."""
+    """Result of a merge: number of episodes, indices of missing ones, sentences on files that were left out."""
 
     episodes: int
     """Number of episodes."""
@@ -227,7 +227,9 @@ class _Added:
 
     @contextlib.contextmanager
     def _noted(self, path: Path) -> Iterator[None]:
-        """Note a path before it is created, as an interrupt may follow at once; what exists already is not ours."""
+        """Context manager that notes a path for removal while it is created, as an interrupt may follow at once; not if
+        creating it fails.
+        """
         self.paths.append(path)
         try:
             yield
@@ -236,6 +238,7 @@ class _Added:
             raise
 
     def _copy(self, source: BinaryIO, target: Path) -> None:
+        """Copy an open file to a new path, with its mode (not executable) and times; remembers the path for removal."""
         with open(target, "xb") as file:
             self.paths.append(target)
             try:
@@ -249,7 +252,7 @@ class _Added:
                 raise OSError(error.errno, error.strerror, str(target)) from error
 
     def remove(self) -> None:
-        """Remove all that was added."""
+        """Remove all files and folders that the merge has added."""
         for path in reversed(self.paths):
             with contextlib.suppress(OSError):
                 path.rmdir() if path.is_dir() and not path.is_symlink() else path.unlink()
@@ -267,6 +270,7 @@ def _hard_link(source: Path, target: Path) -> bool:
 
 
 def _read_blocks(source: BinaryIO) -> Iterator[bytes]:
+    """Yield a file's content in blocks; raises DatasetError if it cannot be read."""
     while True:
         try:
             block = source.read(_COPY_BYTES)

@@ -41,7 +41,7 @@ _PARTS_PER_PROCESS = 4
 
 
 class Verdict(NamedTuple):
-    """Result of a verification."""
+    """Result of a verification: first problem (empty: none), committed episodes, checked files, whether the bake finished."""
 
     problem: str
     """First file that is missing or damaged, and how; empty: none."""
@@ -54,7 +54,7 @@ class Verdict(NamedTuple):
 
 
 class CheckPart(NamedTuple):
-    """Task: check a contiguous part of the files that a manifest entry lists."""
+    """Task: check part `part` of `parts` of the files that a manifest entry lists."""
 
     entry: Path
     part: int = 0
@@ -64,7 +64,7 @@ class CheckPart(NamedTuple):
 
 
 class Checked(NamedTuple):
-    """Result of a task."""
+    """Result of a task: number of checked files, and the first problem (empty: none)."""
 
     files: int
     """Number of checked files, including the damaged one."""
@@ -127,7 +127,7 @@ def _useful_processes(files: int, size: int) -> int:
 
 
 def _check_entries(folder: Path, entries: Sequence[Path], processes: int) -> Iterator[Checked]:
-    """Check the files of manifest entries, in parallel if `processes` > 1; results are in the order of the files."""
+    """Check the files of manifest entries, in parallel if `processes` > 1; yields the results in the order of the files."""
     parts = 1 if processes == 1 or len(entries) >= _ENTRIES_PER_PROCESS * processes else _PARTS_PER_PROCESS * processes
     tasks = (partial(_Checker.check, task=CheckPart(entry, part, parts)) for entry in entries for part in range(parts))
     return map_ordered(WorkerProgram(partial(_Checker, folder), "process that verifies"), tasks, processes)
@@ -141,12 +141,12 @@ class _Checker:
         self._read = lru_cache(maxsize=1)(read_checksums)
 
     def check(self, task: CheckPart) -> Checked:
-        """Task: see `check_part`."""
+        """Task: check a part of the files. See `check_part`."""
         return check_part(self._folder, task, self._read)
 
 
 def check_part(folder: Path, task: CheckPart, read: Callable[[Path, Path], dict[str, str]] = read_checksums) -> Checked:
-    """Check a part of a manifest entry's files, up to the first problem.
+    """Check a part of a manifest entry's files, up to the first problem; returns their number and the problem.
 
     Args:
         folder: The data set.
@@ -182,11 +182,12 @@ def _check_counts(folder: Path, entry: Path, known: Mapping[str, str]) -> str:
 
 @lru_cache(maxsize=1)
 def _read_config(folder: Path) -> Config:
+    """Read the settings of a data set, checked against its manifest."""
     return read_settings(folder, read_manifest(folder))
 
 
 def check_files(folder: Path, known: Mapping[str, str], limit: int | None = None) -> Checked:
-    """Check files in the given order, up to the first problem.
+    """Check files in the given order, up to the first problem; returns their number and the problem.
 
     Args:
         folder: The data set.

@@ -192,6 +192,7 @@ class OutputFolder:
             raise
 
     def _remove_indices(self) -> None:
+        """Remove the files that list all episodes, and their entry in the manifest."""
         for name in (EPISODES_FILE, ATTEMPTS_FILE, *self._shared.indices):
             (self.out / name).unlink(missing_ok=True)
         self._remove_entry(INDICES)
@@ -224,11 +225,12 @@ class OutputFolder:
         return found
 
     def _remove_entry(self, entry: Path) -> None:
+        """Remove an entry of the manifest and its digests, if there."""
         for suffix in (".json", ".sha256"):
             (self.out / f"{entry}{suffix}").unlink(missing_ok=True)
 
     def commit(self, exporters: Exporters, pool: WriterPool, end: EpisodeEnd) -> None:
-        """See `commit_episode`."""
+        """Commit an episode to the folder. See `commit_episode`."""
         commit_episode(self.out, exporters, pool, end)
 
     def _clean_up(self) -> None:

@@ -28,7 +28,7 @@ from synpick_warp.exporters.writing.pool import WriterPool
 
 
 class BopExporter(SceneExporter):
-    """`Exporter` of scene folders."""
+    """Exporter of BOP scene folders: images, masks, layers and annotations, with lists of evaluation targets."""
 
     staging = "bop"
     write_view = staticmethod(write_view)
@@ -43,22 +43,22 @@ class BopExporter(SceneExporter):
 
     @staticmethod
     def annotates(bop: Bop) -> bool:
-        """See `SceneExporter`."""
+        """Whether COCO annotations are written (`bop.coco`). See `SceneExporter`."""
         return bop.coco
 
     @staticmethod
     def folder_name(split: str) -> str:
-        """See `SceneExporter`."""
+        """Folder of a split: its name. See `SceneExporter`."""
         return split
 
     @staticmethod
     def shared_files(layout: DataLayout) -> SharedFiles:
-        """See `Exporter`."""
+        """Names of what is written beside episodes: models, camera and notes, target lists, and the folders of splits. See `Exporter`."""
         return SharedFiles(CONSTANTS, tuple(map(Path, target_files(layout))), BopExporter.folders(layout))
 
     @staticmethod
     def finalize(out: Path, config: Config, pool: WriterPool, episodes: Sequence[int]) -> list[Path]:
-        """See `Exporter`: the lists of evaluation targets."""
+        """Write the lists of evaluation targets over all episodes; returns their paths. See `Exporter`."""
         layout = DataLayout.of(config)
         parts, names, sensors = out / PARTIAL / BopExporter.staging / "targets", target_files(layout), sensor_suffixes(layout)
         try:
@@ -77,14 +77,16 @@ class BopExporter(SceneExporter):
         return [Path(name) for name in names]
 
     def files(self, episode: int) -> list[Path]:
-        """See `Exporter`: the scene folders."""
+        """Existing scene folders of an episode, relative to the data set. See `Exporter`."""
         places = dict.fromkeys(self._place(self.scene_id(episode, camera)) for camera in range(len(self._cameras)))
         return [place.relative_to(self._out) for place in places if os.path.lexists(place)]
 
     def _stage_scene(self, scene: Path) -> None:
+        """Create the staging folder of a scene, with a folder for each kind of images."""
         create_scene_folders(scene, self._bop.masks, self._layers)
 
     def _commit_task(self, scenes: tuple[tuple[Path, int], ...], images: Sequence[int]) -> tuple[Callable[..., None], tuple[Any, ...]]:
+        """Task that completes an episode: writes the annotation files of its scenes, and renames the folders to their places."""
         settings = SceneSettings(
             split=self._context.layout.folder(scenes[0][1] // len(self._cameras)),
             images=images,
@@ -99,6 +101,6 @@ class BopExporter(SceneExporter):
         return commit_scenes, (tuple((scene, self._place(scene_id)) for scene, scene_id in scenes), settings)
 
     def _place(self, scene_id: int) -> Path:
-        """Folder of the scene that holds what the staged one of this id does."""
+        """Folder of a scene in the data set; with several sensors the folder that the scenes of an episode share."""
         episode, camera = divmod(scene_id, len(self._cameras))
         return self._folder(scene_id) / f"{self._context.layout.scene(episode, camera)[0]:06d}"

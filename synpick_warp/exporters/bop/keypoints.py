@@ -29,7 +29,9 @@ _POSITION_DECIMALS = 4
 
 @dataclass(frozen=True, eq=False)
 class Keypoints:
-    """Keypoints of one object, in the order in which they were sampled."""
+    """Keypoints of one object: positions in the model's frame [mm], in the order in which they were sampled, and skeleton edges (pairs of
+    indices).
+    """
 
     positions: np.ndarray
     """In the model's frame (K, 3) float64 [mm]."""
@@ -85,6 +87,7 @@ def project_keypoints(
 
 
 def _project(entry: dict[str, Any], matrix: np.ndarray, depth: np.ndarray, scale: float, positions: np.ndarray) -> dict[str, Any]:
+    """Project an instance's keypoints into the image: COCO's (x, y, visibility) for each; 0, 0, 0 outside of the image."""
     points = positions @ np.reshape(entry["cam_R_m2c"], (3, 3)).T + entry["cam_t_m2c"]
     z = points[:, 2]
     with np.errstate(divide="ignore", invalid="ignore"):

@@ -17,7 +17,7 @@ _OFFSETS = np.array([-0.1, 0.05, -0.55])
 
 
 class Polygon(NamedTuple):
-    """A closed polygon."""
+    """Closed polygon around a mask: vertices on the borders of pixels [px], and on which side of each the mask lies."""
 
     points: np.ndarray
     """Vertices (x, y) on the borders of pixels; bridges begin in the middle of a pixel's side (N, 2) float64 [px]."""
@@ -112,17 +112,18 @@ def _find_corners(image: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray
 
 
 def _part(polygon: Polygon, corner: int) -> Polygon:
+    """Polygon of one vertex of a polygon."""
     return Polygon(polygon.points[corner : corner + 1], polygon.inward[corner : corner + 1])
 
 
 def _closed(polygon: Polygon, start: int) -> Polygon:
-    """The vertices from `start` around to `start` again."""
+    """Polygon with its vertices from `start` around to `start` again."""
     order = np.append(np.roll(np.arange(len(polygon.points)), -start), start)
     return Polygon(polygon.points[order], polygon.inward[order])
 
 
 def _insert(polygon: Polygon, at: int, *parts: Polygon) -> Polygon:
-    """Insert vertices before index `at`."""
+    """Polygon with further vertices before index `at`."""
     points = (polygon.points[:at], *(part.points for part in parts), polygon.points[at:])
     inward = (polygon.inward[:at], *(part.inward for part in parts), polygon.inward[at:])
     return Polygon(np.concatenate(points), np.concatenate(inward))
@@ -152,6 +153,7 @@ def _cut_hole(parts: list[Polygon], hole: Polygon) -> None:
 
 
 def _bridge_end(x: float, y: float, side: int) -> Polygon:
+    """Polygon of one vertex, the end of a bridge; `side`: direction along x in which the mask lies."""
     return Polygon(np.array([[x, y]]), np.array([[side, 0]], np.int8))
 
 

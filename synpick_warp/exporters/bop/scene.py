@@ -30,7 +30,7 @@ DATE = "1970-01-01 00:00:00"
 
 @dataclass(frozen=True)
 class SceneSettings:
-    """Settings common to all scenes of an episode."""
+    """Settings common to all scenes of an episode: folder of the split, im_ids, image size [px], suffixes, COCO annotations or not."""
 
     split: str
     """Name of the split's folder."""
@@ -200,6 +200,7 @@ def _format_coco(blocks: AnnotationBlocks, first: int, settings: SceneSettings) 
 
 
 def _coco_image(frame: int, settings: SceneSettings) -> dict[str, object]:
+    """Entry of an image in scene_gt_coco.json."""
     return {
         "id": frame,
         "file_name": f"rgb{settings.sensor}/{frame:06d}{settings.color_suffix}",
@@ -213,6 +214,7 @@ def _coco_image(frame: int, settings: SceneSettings) -> dict[str, object]:
 
 
 def _write_lines(path: Path, parts: Iterable[str]) -> None:
+    """Write text parts to an ASCII file, and sync it to the disk."""
     with path.open("w", encoding="ascii", newline="\n") as file:
         file.writelines(parts)
         file.flush()

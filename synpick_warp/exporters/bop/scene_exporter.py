@@ -87,7 +87,7 @@ class SceneExporter(EpisodeExporter[tuple[Path, ...]]):
 
     @staticmethod
     def annotates(bop: Bop) -> bool:
-        """Whether it writes COCO annotations, which have keypoints."""
+        """Whether this format writes COCO annotations, which need keypoints, with these settings."""
         return False
 
     @staticmethod
@@ -96,7 +96,7 @@ class SceneExporter(EpisodeExporter[tuple[Path, ...]]):
         """Name of the folder that holds the scenes of a split, from its name in BOP."""
 
     def _folder(self, scene_id: int) -> Path:
-        """Folder of a scene's split."""
+        """Folder of the split that a scene belongs to."""
         return self._out / self.folder_name(self._context.layout.folder(scene_id // len(self._cameras)))
 
     @abstractmethod
@@ -109,15 +109,15 @@ class SceneExporter(EpisodeExporter[tuple[Path, ...]]):
 
     @abstractmethod
     def files(self, episode: int) -> list[Path]:
-        """See `Exporter`."""
+        """Existing paths of an episode, relative to the data set. See `Exporter`."""
 
     @staticmethod
     def slot_bytes(sizes: TaskSizes) -> int:
-        """See `Exporter`."""
+        """Bytes of a view's images in shared memory. See `Exporter`."""
         return view_bytes(sizes.resolution, sizes.has_layers)
 
     def write_constants(self) -> list[Path]:
-        """See `Exporter`: models, camera and notes."""
+        """Create the folders, and write models, camera and notes, or copy them when converting; returns their paths. See `Exporter`."""
         context = self._context
         try:
             for folder in self.folders(context.layout):
@@ -133,7 +133,7 @@ class SceneExporter(EpisodeExporter[tuple[Path, ...]]):
             raise output_error(self._out, error) from error
 
     def write_views(self, batch: FrameBatch) -> None:
-        """See `Exporter`."""
+        """Submit a task for each view of a batch. See `Exporter`."""
         self._pool.submit_all(self._make_tasks(batch))
 
     def _make_tasks(self, batch: FrameBatch) -> Iterator[WriteTask]:
@@ -151,7 +151,7 @@ class SceneExporter(EpisodeExporter[tuple[Path, ...]]):
                 yield self._task((episode,), write_rendered_layer, (batch.layers[name][view],), arguments, place)
 
     def write_stored(self, episode: int, scenes: Sequence[StoredScene]) -> None:
-        """See `Exporter`: one task for each scene."""
+        """Submit one task for each stored scene of an episode. See `Exporter`."""
         staged = self._staged(episode, partial(self._create_scenes, episode))
         for stored, scene, settings in zip(scenes, staged.content, self._views, strict=True):
             arguments = (stored, type(self).write_view, type(self).write_layer, self._layers, scene, settings)
@@ -162,12 +162,14 @@ class SceneExporter(EpisodeExporter[tuple[Path, ...]]):
         return len(self._cameras) * episode + camera
 
     def _create_scenes(self, index: int, folder: Path) -> tuple[Path, ...]:
+        """Create the staging folders of an episode's scenes, one per camera, in this folder; returns them."""
         scenes = tuple(folder / f"{self.scene_id(index, camera):06d}" for camera in range(len(self._cameras)))
         for scene in scenes:
             self._stage_scene(scene)
         return scenes
 
     def _commit(self, episode: _Staged, end: EpisodeEnd) -> WriteTask:
+        """Task that moves an episode's scenes to their places."""
         first = self.scene_id(end.episode, 0)
         function, arguments = self._commit_task(
             tuple(zip(episode.content, range(first, first + len(self._cameras)), strict=True)), end.images

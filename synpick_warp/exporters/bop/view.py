@@ -45,7 +45,9 @@ JPEG_QUALITY = "jpeg_quality"
 
 @dataclass(frozen=True)
 class ViewSettings:
-    """Settings common to all views of a camera."""
+    """Settings common to all views of a camera: which files are written, image size and formats, keypoints, constant part of the camera
+    entry.
+    """
 
     color_suffix: str
     """.jpg or .png."""
@@ -73,7 +75,9 @@ class ViewSettings:
 
 @dataclass(frozen=True, eq=False)
 class ViewTruth:
-    """Ground truth of a view: its row of `FrameBatch`, reduced to the `N` instances that are in the scene."""
+    """Ground truth of a view: its row of `FrameBatch`, reduced to the N instances in the scene: ids, object-to-world poses [m], pixel
+    counts, boxes [px]; and where its crops lie in the image.
+    """
 
     scene: int
     """BOP scene_id."""
@@ -118,7 +122,7 @@ class RenderedView:
 
     @property
     def color(self) -> tuple[str, Buffer]:
-        """See `EncodedView`. A file (bytes) uint8 of the device stays as it is."""
+        """Suffix and encoded colour image; a file that the device has encoded (bytes,) uint8 stays as it is. See `EncodedView`."""
         color, suffix = self._color, self._settings.color_suffix
         if color.ndim == 1:
             return suffix, color.data
@@ -126,12 +130,12 @@ class RenderedView:
 
     @property
     def depth(self) -> bytes:
-        """See `EncodedView`. The data (bytes) uint8 of a file that the device has made gets its frame."""
+        """PNG file of the depth image; the compressed data (bytes,) uint8 that the device has made get their frame. See `EncodedView`."""
         depth = self._depth
         return encode_png(depth) if depth.ndim > 1 else frame_depth_png(depth.data, *self._settings.resolution)
 
     def depth_image(self) -> np.ndarray:
-        """See `EncodedView`."""
+        """Depth image (H, W) uint16 in counts, decoded if the device has encoded it. See `EncodedView`."""
         if self._depth.ndim > 1:
             return self._depth
         image = cv2.imdecode(np.frombuffer(self.depth, np.uint8), cv2.IMREAD_UNCHANGED)
@@ -140,7 +144,7 @@ class RenderedView:
         return image
 
     def masks(self) -> list[Masks]:
-        """See `EncodedView`."""
+        """Run lengths of the amodal and visible mask of each instance. See `EncodedView`."""
         return extract_masks(self._visible, self._amodal, self._truth, self._settings.resolution[1])
 
 
@@ -301,6 +305,7 @@ def make_gt_info_entries(truth: ViewTruth) -> list[dict[str, Any]]:
 
 
 def _make_gt_info(pixels: list[int], boxes: list[list[int]]) -> dict[str, Any]:
+    """Record of scene_gt_info.json from an instance's pixel counts and boxes; invisible ones have no boxes (`NO_BOX`)."""
     total, valid, visible = (pixels[column] for column in (_ALL, _VALID, _VISIBLE))
     return {
         "bbox_obj": _bop_box(boxes[_AMODAL_BOX]) if visible else NO_BOX,
@@ -332,5 +337,5 @@ def make_keypoints(view: EncodedView, keypoints: Mapping[int, Keypoints]) -> lis
 
 
 def make_rle(runs: Runs, height: int, width: int) -> dict[str, Any]:
-    """A mask as COCO's uncompressed RLE, which BOP uses as well."""
+    """Mask in COCO's uncompressed run-length encoding, which BOP uses as well."""
     return {"counts": runs.counts(height, width), "size": [height, width]}

@@ -19,7 +19,7 @@ from synpick_warp.exporters.writing.files import sync_file, sync_folder, write_s
 
 @dataclass(frozen=True)
 class EpisodeSettings:
-    """Settings common to all episodes."""
+    """Settings common to all episodes: data set, cameras, image size [px], frame rate [1/s], object names by obj_id."""
 
     out: Path
     """The data set."""
@@ -34,7 +34,7 @@ class EpisodeSettings:
 
 @dataclass(frozen=True)
 class EpisodeContent:
-    """Content of an episode besides its videos."""
+    """Content of an episode besides its videos: mode, ending, objects picked, rows of `TICK`, lines of attempts.jsonl."""
 
     episode: int
     mode: str

@@ -50,7 +50,7 @@ _MAX_DENOMINATOR = 100_000
 
 @dataclass(eq=False)
 class _Content:
-    """What is kept of an episode whose frames are being spooled and encoded."""
+    """Content of an episode in progress: rows of `TICK` so far, and spooled frames of each (camera, group) that is not encoded yet."""
 
     ticks: bytearray = field(default_factory=bytearray)
     """Rows of `TICK`: 50 bytes a frame."""
@@ -81,27 +81,27 @@ class LerobotExporter(EpisodeExporter[_Content]):
 
     @staticmethod
     def slot_bytes(sizes: TaskSizes) -> int:
-        """See `Exporter`: a colour image."""
+        """Bytes of a colour image in shared memory. See `Exporter`."""
         width, height = sizes.resolution
         return shared_bytes((height * width * 3,))
 
     @staticmethod
     def shared_files(layout: DataLayout) -> SharedFiles:
-        """See `Exporter`."""
+        """Names of what is written beside episodes: notes, the tables and card over all episodes, and the folders. See `Exporter`."""
         videos = video_folders(layout.cameras)
         between = (EPISODES.parent, EPISODES.parent.parent, META, DATA.parent, DATA.parent.parent)
         return SharedFiles(note_files(layout.formats), (INFO, STATS, TASKS, EPISODES, DATA, CARD), (PARTS, *videos, *between, FOLDER))
 
     @staticmethod
     def finalize(out: Path, config: Config, pool: WriterPool, episodes: Sequence[int]) -> list[Path]:
-        """See `Exporter`: the tables over all episodes."""
+        """Write the tables over all episodes from their parts; returns their paths. See `Exporter`."""
         try:
             return write_indices(out, config, episodes)
         except OSError as error:
             raise output_error(out / FOLDER, error) from error
 
     def write_constants(self) -> list[Path]:
-        """See `Exporter`: camera and notes."""
+        """Write camera file and notes; returns their paths. See `Exporter`."""
         context = self._context
         try:
             return write_notes(context.out, context.config, self._settings.objects, context.cameras)
@@ -109,7 +109,7 @@ class LerobotExporter(EpisodeExporter[_Content]):
             raise output_error(context.out, error) from error
 
     def write_views(self, batch: FrameBatch) -> None:
-        """See `Exporter`."""
+        """Submit a task for each view, which spools its colour image. See `Exporter`."""
         tasks = []
         for view in range(len(batch)):
             index, camera, frame = (int(column[view]) for column in (batch.episode, batch.camera, batch.frame))
@@ -120,7 +120,10 @@ class LerobotExporter(EpisodeExporter[_Content]):
         self._context.pool.submit_all(tasks)
 
     def write_stored(self, episode: int, scenes: Sequence[StoredScene]) -> None:
-        """See `Exporter`: a task for each group of pictures. Videos of JPEG images differ from a bake's, as they were compressed before."""
+        """Submit a task for each group of pictures of a stored episode. See `Exporter`.
+
+        Videos of JPEG images differ from a bake's, as they were compressed before.
+        """
         staged, tasks = self._staged(episode, _make_content), []
         for camera, scene in enumerate(scenes):
             for group in range(-(-scene.frames // GROUP)):
@@ -129,20 +132,22 @@ class LerobotExporter(EpisodeExporter[_Content]):
         self._context.pool.submit_all(tasks)
 
     def write_ticks(self, batch: TickBatch) -> None:
-        """See `Exporter`."""
+        """Append the frame's row of state and action to each episode, in memory. See `Exporter`."""
         for index, row in zip(batch.episode.tolist(), make_ticks(batch), strict=True):
             self._staged(index, _make_content).content.ticks += row.tobytes()
 
     def files(self, episode: int) -> list[Path]:
-        """See `Exporter`: part and videos."""
+        """Existing paths of an episode, sorted: its part and videos. See `Exporter`."""
         places = [part_path(episode), *(video_path(camera, episode) for camera in range(self._settings.cameras))]
         return sorted(place for place in places if os.path.lexists(self._context.out / place))
 
     def _finish(self, episode: _Staged, end: EpisodeEnd) -> None:
+        """Encode the last, incomplete groups of pictures of an episode that has ended."""
         for camera, group in list(episode.content.spooled):
             self._encode_if_complete(episode, camera, group)
 
     def _frame_spooled(self, episode: _Staged, camera: int, group: int) -> None:
+        """Count a frame that was spooled; encodes its group of pictures if it is complete."""
         episode.content.spooled[camera, group] += 1
         self._encode_if_complete(episode, camera, group)
 
@@ -158,6 +163,7 @@ class LerobotExporter(EpisodeExporter[_Content]):
         self._context.pool.submit_all((self._task((episode,), write_spooled_group, (), arguments, path),))
 
     def _commit(self, episode: _Staged, end: EpisodeEnd) -> WriteTask:
+        """Task that joins an episode's videos and writes its part; raises ValueError if frames are missing."""
         count = len(episode.content.ticks) // TICK.itemsize
         if count != end.frames:
             raise ValueError(f"episode {end.episode} ended with {end.frames} frames, but {count} came")
@@ -169,11 +175,12 @@ class LerobotExporter(EpisodeExporter[_Content]):
 
 
 def _make_content(_: Path) -> _Content:
+    """Empty content of a staged episode."""
     return _Content()
 
 
 def make_content(end: EpisodeEnd, ticks: bytes) -> EpisodeContent:
-    """What the part of an episode is made of."""
+    """Content of an episode's part, from its end and the rows of its ticks."""
     row = end.row
     return EpisodeContent(
         end.episode, str(row.get("mode", "")), Ending(end.ending).name.lower(), int(row.get("picked", 0)), ticks, end.attempts
@@ -191,5 +198,5 @@ def make_ticks(batch: TickBatch) -> np.ndarray:
 
 
 def video_rate(physics: Physics) -> Fraction:
-    """Frames per second as a fraction."""
+    """Frames per second, as an exact fraction."""
     return Fraction(frame_rate(physics)).limit_denominator(_MAX_DENOMINATOR)

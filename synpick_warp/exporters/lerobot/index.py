@@ -53,7 +53,9 @@ _ADVICE = "remove it, its episode's videos and two files in manifest/, and resum
 
 @dataclass(eq=False)
 class _Totals:
-    """What is known of all episodes read so far."""
+    """Totals over all episodes read so far: sentences with their index, statistics, colour histograms, frames, rows of the table of
+    episodes.
+    """
 
     tasks: dict[str, int] = field(default_factory=dict)
     """Sentence -> index, in order of appearance."""
@@ -95,7 +97,7 @@ def write_indices(out: Path, config: Config, episodes: Iterable[int]) -> list[Pa
 
 
 def _place(out: Path, name: Path, write: Callable[[Path], object]) -> None:
-    """Write a file beside its place, sync it, and rename it."""
+    """Write a file atomically: beside its place, synced, then renamed."""
     place = out / name
     make_folders(out, place.parent)
     temporary = out / PARTIAL / "lerobot-index"
@@ -109,7 +111,7 @@ def _place(out: Path, name: Path, write: Callable[[Path], object]) -> None:
 def _read_tables(
     out: Path, totals: _Totals, resolution: tuple[int, int], rate: float, layout: DataLayout, episodes: Iterable[int]
 ) -> Iterator[pa.Table]:
-    """Tables of the episodes, in order; adds them to the totals. Those that were given up have no part."""
+    """Yield the tables of the episodes' frames, in order, and add them to the totals; episodes that were given up have no part."""
     period = 1.0 / rate
     for source in (episode for episode in episodes if os.path.lexists(out / part_path(episode))):
         name = part_path(source)
@@ -198,6 +200,7 @@ def _to_array(values: np.ndarray, feature: Feature) -> pa.Array:
 
 
 def _data_schema() -> pa.Schema:
+    """Arrow schema of the table of frames."""
     fields = []
     for name, feature in FRAME_FEATURES.items():
         kind = pa.from_numpy_dtype(np.dtype(feature.dtype))
@@ -206,7 +209,7 @@ def _data_schema() -> pa.Schema:
 
 
 def _episode_schema(cameras: int) -> pa.Schema:
-    """Columns of the table of episodes."""
+    """Arrow schema of the table of episodes."""
     integers = ("episode_index", "length", "dataset_from_index", "dataset_to_index", "data/chunk_index", "data/file_index")
     fields: dict[str, pa.DataType] = dict.fromkeys(integers, pa.int64()) | {"tasks": pa.list_(pa.string())}
     fields |= dict.fromkeys(("meta/episodes/chunk_index", "meta/episodes/file_index"), pa.int64())

@@ -38,7 +38,7 @@ ACTION = ("x", "y", "z", "suction")
 
 
 class Feature(NamedTuple):
-    """A column of the data: its NumPy type, and the names of its components."""
+    """Column of the table of frames: its NumPy type, and the names of its components (empty: a single number)."""
 
     dtype: str
     names: tuple[str, ...] = ()

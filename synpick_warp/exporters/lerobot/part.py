@@ -28,7 +28,7 @@ TICK = np.dtype(
 
 
 class Part(msgspec.Struct):
-    """Content of a part."""
+    """Schema of an episode's part: its frames, mode, ending, attempts and sentences, until the tables over all episodes are written."""
 
     frames: Annotated[int, msgspec.Meta(ge=1, lt=2**31)]
     mode: str
@@ -116,5 +116,5 @@ def speak(name: str) -> str:
 
 
 def outcome_names() -> tuple[str, ...]:
-    """Names of the codes of `attempt.outcome`."""
+    """Names of the codes of `attempt.outcome`, in their order."""
     return names(Outcome)

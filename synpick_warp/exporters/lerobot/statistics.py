@@ -64,5 +64,5 @@ def describe_levels(levels: np.ndarray, frames: int) -> Statistics:
 
 
 def to_json(statistics: Statistics) -> dict[str, Any]:
-    """Statistics as lists."""
+    """Statistics as lists, for JSON."""
     return {name: value.tolist() for name, value in statistics.items()}

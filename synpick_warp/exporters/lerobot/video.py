@@ -130,6 +130,7 @@ def join_groups(groups: Sequence[Path], size: tuple[int, int], rate: Fraction, p
 
 
 def _split_packets(data: bytes) -> Iterator[bytes]:
+    """Yield the packets of an encoded group of pictures: their count and sizes (uint32) come first."""
     count = int(np.frombuffer(data, np.uint32, 1)[0])
     sizes = np.frombuffer(data, np.uint32, count, offset=4).tolist()
     place = 4 * (1 + count)

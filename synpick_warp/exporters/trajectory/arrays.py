@@ -29,7 +29,7 @@ LABELS = {
 
 @dataclass(frozen=True)
 class ArraySpec:
-    """Schema of one array."""
+    """Schema of one array of the store: dimensions, type, unit (1: none), description, names of the values of an enumeration."""
 
     dims: tuple[str, ...]
     """Names of its dimensions."""
@@ -47,7 +47,7 @@ class ArraySpec:
 
 @dataclass(frozen=True)
 class GroupSpec:
-    """Schema of a group of arrays."""
+    """Schema of a group of arrays: description, arrays by name, and which of them are coordinates (CF conventions)."""
 
     description: str
     arrays: Mapping[str, ArraySpec] = field(default_factory=dict)

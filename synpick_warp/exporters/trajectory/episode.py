@@ -24,7 +24,7 @@ GROUP = "group"
 
 @dataclass(frozen=True)
 class EpisodeSettings:
-    """Settings common to all episodes."""
+    """Settings common to all episodes: trajectory settings, duration of a step [s], steps per tick, masses [kg] by obj_id."""
 
     trajectory: Trajectory
     step: float
@@ -36,7 +36,7 @@ class EpisodeSettings:
 
 @dataclass(frozen=True, eq=False)
 class EpisodeContent:
-    """Content of an episode's group besides the spooled ticks."""
+    """Content of an episode's group besides the spooled ticks: attributes, obj_ids, drop poses (None: not recorded), attempts."""
 
     attributes: Mapping[str, Any]
     """Attributes of its group."""
@@ -118,6 +118,7 @@ class _FlattenedSteps:
 
 
 def _write_arrangement(group: zarr.Group, content: EpisodeContent, settings: EpisodeSettings) -> None:
+    """Write the group of an episode's objects: obj_id, mass and drop pose; NaN where unknown."""
     arrangement = add_group(group, "arrangement", ARRANGEMENT)
     drop_pose = content.drop_pose
     values = {

@@ -25,12 +25,12 @@ _COMPUTED = "steps/time"
 
 
 def field_name(group: str, name: str) -> str:
-    """Name of an array's field in a row."""
+    """Name of the field of an array in a spool row's structured type."""
     return f"{group}/{name}"
 
 
 class Place(NamedTuple):
-    """Location of a row on disk."""
+    """Location of a row on disk: staging folder of the episode, and byte offset in its spool file."""
 
     folder: str
     """Name of the episode's staging folder."""
@@ -105,6 +105,7 @@ def make_rows(batch: TickBatch, row: np.dtype, instances: int) -> np.ndarray:
 
 
 def _has_instances(quantity: ArraySpec) -> bool:
+    """Whether the second dimension of an array is the instance."""
     return quantity.dims[1:2] == ("instance",)
 
 
@@ -121,6 +122,7 @@ def write_rows(rows: np.ndarray, staging: Path, places: Sequence[Place]) -> None
 
 
 def _write_row(row: np.ndarray, path: str, offset: int) -> None:
+    """Write a row of bytes to a file at `offset` [B]; raises OSError that names the file."""
     handle = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_CLOEXEC, 0o666)
     try:
         rest = memoryview(row.data)

@@ -57,10 +57,12 @@ def write_library(library: Path, config: Config, catalog: Catalog, lights: tuple
 
 
 def _save(library: Path, name: str, stage: Usd.Stage) -> None:
+    """Save a stage as an asset of the library, NAME.usdc."""
     save_layer(stage.GetRootLayer(), library / f"{name}.usdc")
 
 
 def _write_object(library: Path, physics: Physics, entry: CatalogEntry) -> None:
+    """Write an object's asset: mesh, material, collision shapes and mass properties, as a dynamic rigid body."""
     name = object_asset(entry.obj_id)
     stage = new_asset(name, entry.name)
     root = stage.GetDefaultPrim()
@@ -72,6 +74,7 @@ def _write_object(library: Path, physics: Physics, entry: CatalogEntry) -> None:
 
 
 def _make_fixture(library: Path, physics: Physics, name: str, fixture: Fixture, pieces: tuple[ConvexPiece, ...]) -> Usd.Stage:
+    """Stage of a fixture's asset: mesh, material and collision shapes; not saved."""
     stage = new_asset(name, name)
     _add_shapes(stage, physics, fixture.mesh, fixture.material, write_texture(library, name, fixture.material), pieces)
     return stage

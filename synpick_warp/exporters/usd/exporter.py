@@ -34,16 +34,16 @@ class UsdExporter(EpisodeExporter[TickSpool]):
 
     @staticmethod
     def slot_bytes(sizes: TaskSizes) -> int:
-        """See `Exporter`: tasks have no images."""
+        """0: tasks have no images. See `Exporter`."""
         return 0
 
     @staticmethod
     def shared_files(layout: DataLayout) -> SharedFiles:
-        """See `Exporter`."""
+        """Names of what is written beside episodes: the asset library, no index files, and the folder. See `Exporter`."""
         return SharedFiles((LIBRARY,), (), (FOLDER,))
 
     def write_constants(self) -> list[Path]:
-        """See `Exporter`: the asset library."""
+        """Write the asset library; returns its path. See `Exporter`."""
         from synpick_warp.exporters.usd.assets import write_library  # pxr loads slowly, and only this method needs it.
 
         context = self._context
@@ -57,7 +57,7 @@ class UsdExporter(EpisodeExporter[TickSpool]):
         return [LIBRARY]
 
     def write_ticks(self, batch: TickBatch) -> None:
-        """See `Exporter`."""
+        """Append the tick's row to the spool of each episode. See `Exporter`."""
         make_spool = partial(_make_spool, batch.object_id.shape[1])
         for index, row in zip(batch.episode.tolist(), tick_rows(batch), strict=True):
             spool = self._staged(index, make_spool).content
@@ -67,6 +67,7 @@ class UsdExporter(EpisodeExporter[TickSpool]):
                 raise output_error(spool.path, error) from error
 
     def _commit(self, episode: StagedEpisode[TickSpool], end: EpisodeEnd) -> WriteTask:
+        """Task that writes an episode's USD file from its spool."""
         spool, place = episode.content, self._place(end.episode)
         try:
             spool.flush()
@@ -75,15 +76,17 @@ class UsdExporter(EpisodeExporter[TickSpool]):
         return WriteTask(write_episode, (), (spool.path, spool.instances, place, EpisodeMetadata.from_end(end), self._settings), place)
 
     def files(self, episode: int) -> list[Path]:
-        """See `Exporter`: the one file."""
+        """The USD file of an episode, if it exists, relative to the data set. See `Exporter`."""
         place = self._place(episode)
         return [place.relative_to(self._context.out)] if os.path.lexists(place) else []
 
     def _place(self, episode: int) -> Path:
+        """Path of an episode's USD file."""
         return self._context.out / FOLDER / f"{episode:06d}.usdc"
 
     @cached_property
     def _settings(self) -> EpisodeSettings:
+        """Settings of all episodes: tick rate, gravity, cameras, lights, names."""
         context = self._context
         config = context.config
         return EpisodeSettings(
@@ -96,4 +99,5 @@ class UsdExporter(EpisodeExporter[TickSpool]):
 
 
 def _make_spool(instances: int, folder: Path) -> TickSpool:
+    """Spool of an episode in its staging folder."""
     return TickSpool(folder / _SPOOL, instances)

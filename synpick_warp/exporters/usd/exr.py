@@ -37,6 +37,7 @@ def encode_exr(image: np.ndarray) -> bytes:
 
 
 def _header(width: int, height: int) -> bytes:
+    """Header of an OpenEXR file: latitude-longitude map of float channels, ZIP compression."""
     window = struct.pack("<4i", 0, 0, width - 1, height - 1)
     channels = b"".join(name + b"\0" + struct.pack("<iB3xii", _FLOAT, 0, 1, 1) for name in (b"B", b"G", b"R"))
     attributes = (

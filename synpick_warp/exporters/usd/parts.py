@@ -80,7 +80,7 @@ def add_label(prim: Usd.Prim, taxonomy: str, label: str) -> None:
 
 
 def add_property(prim: Usd.Prim, name: str, value: int | float | str) -> None:
-    """Add a fact of ours as a custom attribute in the namespace USER."""
+    """Add a custom attribute in the namespace USER."""
     prim.CreateAttribute(f"{USER}{name}", _PROPERTY_TYPES[type(value)]).Set(value)
 
 
@@ -194,10 +194,12 @@ def add_body(prim: Usd.Prim, mass: float, center: np.ndarray, inertia: np.ndarra
 
 
 def _add_shader(stage: Usd.Stage, path: str, shader_id: str) -> UsdShade.Shader:
+    """Define a shader of this id in the stage."""
     shader = UsdShade.Shader.Define(stage, path)
     shader.CreateIdAttr(shader_id)
     return shader
 
 
 def _vectors(rows: np.ndarray) -> Vt.Vec3fArray:
+    """Rows (N, 3) as a USD array of float vectors."""
     return Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(rows, np.float32))

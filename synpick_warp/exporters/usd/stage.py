@@ -137,10 +137,12 @@ def _add_moving(stage: Usd.Stage, path: str, poses: np.ndarray, visible: np.ndar
 
 
 def _position(pose: np.ndarray) -> Gf.Vec3d:
+    """Position of a pose, in double precision."""
     return Gf.Vec3d(*pose[:3].astype(np.float64).tolist())
 
 
 def _visibility(visible: bool) -> str:
+    """USD visibility token: inherited or invisible."""
     return UsdGeom.Tokens.inherited if visible else UsdGeom.Tokens.invisible
 
 

@@ -11,7 +11,9 @@ from synpick_warp.views.frames import EpisodeEnd
 
 @dataclass(frozen=True)
 class StageLight:
-    """Environment map as a dome light, and its sun as a distant light."""
+    """Environment map as a dome light, and its sun as a distant light: direction towards the sun in the map's frame [°], irradiance (None:
+    no sun), angular diameter [°].
+    """
 
     name: str
     file: str
@@ -30,7 +32,7 @@ class StageLight:
 
 @dataclass(frozen=True)
 class EpisodeSettings:
-    """Settings common to all episodes."""
+    """Settings common to all episodes: tick rate [1/s], gravity [m/s²], cameras, lights, object names by obj_id."""
 
     tick_rate: float
     """Frames per second of simulated time [1/s]."""
@@ -44,7 +46,7 @@ class EpisodeSettings:
 
 @dataclass(frozen=True)
 class EpisodeMetadata:
-    """Properties of an episode's root prim."""
+    """Properties of an episode's root prim: episode, discarded arrangements before, frames, ending, split (empty: none)."""
 
     episode: int
     arrangement: int

@@ -28,6 +28,7 @@ class Folder:
         self._write(name, data, os.O_APPEND)
 
     def _write(self, name: str, data: Buffer, flag: int) -> None:
+        """Write all of a file of this folder, opened with `flag`; raises OSError that names it."""
         try:
             handle = os.open(name, _FLAGS | flag, 0o666, dir_fd=self._handle)
             try:

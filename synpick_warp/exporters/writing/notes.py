@@ -74,4 +74,5 @@ Made by synpick-warp (mode {", ".join(modes)}, seed {bake.seed}, {len(cameras)} 
 
 
 def _row(values: object) -> str:
+    """Numbers as text, rounded to 1e-9 and without -0."""
     return ", ".join(f"{value:.9g}" for value in (0.0 + round(float(value), 9) for value in values))  # type: ignore[attr-defined]

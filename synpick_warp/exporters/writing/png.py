@@ -121,6 +121,7 @@ def _blank_rows(rows: int, stride: int) -> bytes:
 
 @functools.cache
 def _zero_rows(rows: int, stride: int) -> bytes:
+    """Deflated bytes of rows of zeros that end at a byte, so that other data can follow."""
     stream = Deflater(-isal_zlib.MAX_WBITS)
     return stream.compress(bytes(rows * stride)) + stream.flush(isal_zlib.Z_FULL_FLUSH)
 
@@ -132,16 +133,18 @@ def _adler32(count: int, total: int, moment: int) -> bytes:
 
 
 def _assemble(width: int, height: int, bits: int, color_type: int, data: Buffer) -> bytes:
+    """PNG file of compressed image data."""
     return b"".join((_head(width, height, bits, color_type), *_chunk(b"IDAT", data), _END))
 
 
 @functools.cache
 def _head(width: int, height: int, bits: int, color_type: int) -> bytes:
-    """Signature and header chunk."""
+    """Signature and header chunk (IHDR) of a PNG file."""
     return b"".join((_SIGNATURE, *_chunk(b"IHDR", struct.pack(">IIBBBBB", width, height, bits, color_type, 0, 0, 0))))
 
 
 def _chunk(kind: bytes, data: Buffer) -> tuple[bytes, bytes, Buffer, bytes]:
+    """Parts of a PNG chunk: length, kind, data, CRC."""
     return struct.pack(">I", len(data)), kind, data, struct.pack(">I", isal_zlib.crc32(data, isal_zlib.crc32(kind)))
 
 

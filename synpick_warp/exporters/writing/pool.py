@@ -59,7 +59,7 @@ class _Call:
 
 @dataclass(eq=False)
 class _QueuedTask:
-    """A submitted task with its slot of shared memory."""
+    """Submitted task with its slot of shared memory (None: it has no images), and the copy into it in progress (None: done)."""
 
     call: _Call
     path: Path
@@ -193,6 +193,7 @@ class WriterPool:
             self.abort()
 
     def _take_slot(self) -> int:
+        """Take a free slot of shared memory; waits for a task to end if none is free."""
         while not self._slots.free:
             self._progress(None)
         return self._slots.free.pop()
@@ -226,6 +227,7 @@ class WriterPool:
                 self._answered.append(future)
 
     def _finish_answered(self) -> None:
+        """Finish the answered tasks in order: their slots become free, callbacks are called; the first error is kept and raised."""
         self._finishing = True
         try:
             while self._answered:
@@ -242,6 +244,7 @@ class WriterPool:
             self._finishing = False
 
     def _check(self) -> None:
+        """Raise the pool's error, or OutputError after its end."""
         if self._failure is not None:
             raise self._failure
         if self._ended:
@@ -249,13 +252,13 @@ class WriterPool:
 
 
 def _open_slots(handle: int, niceness: int) -> mmap.mmap:
-    """Set up a writer process: lower its scheduling priority, and map the shared memory of the images."""
+    """Set up a writer process: lower its scheduling priority, and map the shared memory of the images, which is returned."""
     os.nice(niceness)
     return mmap.mmap(handle, 0)
 
 
 def _to_error(error: Exception, path: Path) -> SynpickError:
-    """Error of the pool for that of a task; a fault of ours keeps its traceback as a note, which the command line shows."""
+    """Pool's error for that of a task; of a programming error, its traceback is kept as a note, which the command line shows."""
     error = portable_error(error)
     if isinstance(error, DatasetError):
         return error
@@ -270,5 +273,6 @@ def _to_error(error: Exception, path: Path) -> SynpickError:
 
 
 def _await_copy(queued: _QueuedTask) -> None:
+    """Wait until a task's images are copied into shared memory."""
     if queued.copying is not None:
         queued.copying.result()

@@ -13,7 +13,8 @@ MAX_INSTANCES = 32
 
 @dataclass(eq=False, slots=True)
 class Runs:
-    """True pixels of a binary mask as vertical runs within single columns.
+    """Run-length encoding of a binary mask: vertical runs of true pixels, from row `first` to before `past`; with pixel count and rows
+    spanned.
 
     Sorted by column, then row. Two runs of a column are separated by at least one False pixel.
     """
@@ -59,7 +60,7 @@ class Runs:
 
 @dataclass(frozen=True, eq=False)
 class Masks:
-    """The two masks of an instance, both clipped to the image."""
+    """Amodal (silhouette, hidden parts included) and visible mask of an instance, as runs clipped to the image."""
 
     amodal: Runs
     """Silhouette, including hidden parts."""

@@ -63,7 +63,7 @@ HUFFMAN = struct_arrays(HuffmanTables, "component", "symbol")
 
 @dataclass(frozen=True, eq=False)
 class JpegBuffers:
-    """JPEG files of one batch of views, and the sizes of the files."""
+    """JPEG files of one batch of views, and their sizes [B]; above the capacity: the file is incomplete."""
 
     jpeg_size: wp.array = device_array("view", dtype=wp.int32)
     """Size of each file [B]; above the capacity of `jpeg`: the file is incomplete."""
@@ -154,7 +154,7 @@ class JpegEncoder:
         self._join(quality, count, out)
 
     def _join(self, quality: wp.array, count: int, out: JpegBuffers) -> None:
-        """Stuff bytes, and join the intervals to files."""
+        """Launch the last passes: stuff bytes, and join the restart intervals to files."""
         scratch = self.scratch
         lanes, slot_bytes = (count, *scratch.stuffing.shape[1:]), int(WORD_BYTES) * scratch.slot.shape[2]
         self._launch(count_stuffing_kernel, lanes, [scratch.slot, scratch.coded], [scratch.stuffing, scratch.interval_size])

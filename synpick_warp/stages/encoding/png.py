@@ -46,7 +46,7 @@ GROUP_SUMS = struct_arrays(SlotSums, "view", "group")
 
 @dataclass(frozen=True, eq=False)
 class DepthBuffers:
-    """Compressed data (IDAT) of the depth PNGs of one batch of views, and the sizes of the data."""
+    """Compressed data (IDAT) of the depth PNGs of one batch of views, and their sizes [B]; above the capacity: the data is incomplete."""
 
     depth_idat_size: wp.array = device_array("view", dtype=wp.int32)
     """Size of each stream [B]; above the capacity of `depth_idat`: the stream is incomplete."""

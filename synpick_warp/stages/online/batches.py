@@ -23,7 +23,9 @@ GPU_RING = 3
 
 @dataclass(frozen=True, eq=False)
 class TruthBuffers:
-    """Poses, camera matrices and indices of one batch of views, beside what the renderer writes; matrices are row by row."""
+    """Ground truth of one batch of views, beside what the renderer writes: indices, obj_ids (-1: not in the scene), object-to-world and
+    object-to-camera poses, K, world-to-camera matrices (OpenCV's axes), row by row.
+    """
 
     episode: wp.array = device_array("view", dtype=wp.int32)
     """Episode index."""
@@ -145,7 +147,7 @@ class ViewBatch:
         return self._masks("visible")
 
     def amodal_masks(self) -> DeviceArray:
-        """Amodal mask of each instance, visible or hidden (B, I, H, W) bool, likewise."""
+        """Amodal mask of each instance, hidden parts included (B, I, H, W) bool, valid as long as the batch."""
         return self._masks("amodal")
 
     def expire(self) -> None:

@@ -14,7 +14,9 @@ from synpick_warp.stages.arrays import device_array
 
 @dataclass(frozen=True, eq=False)
 class PerceptionArrays:
-    """Connected components, distance transforms and contours of a batch of views, each an image of one world."""
+    """Segmentation of a batch of views, each an image of one world: connected components (-1: no instance), largest one of each instance,
+    distance transform [px], outer contours.
+    """
 
     component: wp.array = device_array("view", "row", "column", dtype=wp.int32)
     """Connected-component label (8-connectivity, within one instance): the smallest row-major index of its pixels; -1: no instance."""
@@ -52,7 +54,8 @@ class SegmentationScratch:
 
 @dataclass(frozen=True, eq=False)
 class Observation:
-    """Visibility, grasp points, occlusion votes and clutter graph of each instance, from the last time its world was observed.
+    """Perception result of each instance, when its world was last observed: visible pixels and fraction, grasp point candidates [px], depth
+    [m], votes[i, j] for j lying above i, clutter graph as bit fields of the instances above.
 
     `factory.attempts.InstanceObservation` maps it to JSON.
     """
@@ -85,7 +88,9 @@ class Observation:
 
 @dataclass(frozen=True, eq=False)
 class Plan:
-    """Target and grasp pose of each world, chosen when the world was last observed. Frame: world."""
+    """Plan of each world, from when it was last observed: target instance (-1: none), grasp point [m] and outward normal in the world, yaw
+    of the shaft and tilt of the cup [rad].
+    """
 
     target: wp.array = device_array("world", dtype=wp.int32)
     """Chosen instance; -1: none."""

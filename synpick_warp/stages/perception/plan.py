@@ -100,7 +100,7 @@ class GraspPlanner:
         self._launch_contours(count_votes_kernel, inputs, [voting.count])
 
     def weigh_votes(self, scene: SceneData, observation: Observation) -> None:
-        """Sum the votes by weight."""
+        """Sum the counted votes by their weights: writes the observation's `votes`."""
         inputs = [scene.perception, self.images.views, self.voting.count]
         dim = (self.views, self.instances, self.instances)
         wp.launch(weigh_votes_kernel, dim=dim, inputs=inputs, outputs=[observation.votes], device=self.device)
@@ -113,7 +113,7 @@ class GraspPlanner:
     def choose_target(
         self, scene: SceneData, state: WorldState, attempts: AttemptState, observation: Observation, plan: Plan, seed: int
     ) -> None:
-        """Choose the instance to pick."""
+        """Choose the instance to pick in each world: writes the plan's `target`."""
         inputs = [wp.uint64(seed), scene.pick, state.arrangement_id, state.mode, attempts.attempt, attempts.outcome]
         inputs += [self.images.views, observation.visible, observation.visible_fraction, observation.ancestors]
         self._launch_views(choose_target_kernel, inputs, [plan.target])

@@ -64,13 +64,13 @@ class Segmenter:
         self._launch(grasp_points.clear_sums_kernel, (self.instances,), [], outputs)
 
     def label_strips(self) -> None:
-        """Label the runs of each strip."""
+        """Label the runs of equal segmentation ids within each strip."""
         flat, count = self.flat, self.images.views.count * self.height * self.strips
         inputs = [self.images.views, flat["segment"], self.width, self.height, self.strips]
         launch_pixels(components.label_strips_kernel, count, inputs, [flat["component"], flat["area"]], self.device)
 
     def merge_strips(self) -> None:
-        """Unite runs that touch."""
+        """Unite runs of one segment that touch across the borders of strips (connected components)."""
         inputs = [self.flat["segment"], self.width]
         self._launch(components.merge_strips_kernel, (self.height, self.strips), inputs, [self.flat["component"]])
 
@@ -80,12 +80,12 @@ class Segmenter:
         self._launch(components.measure_components_kernel, (self.height, self.strips), [self.width], outputs)
 
     def find_largest(self) -> None:
-        """Find the keys of the largest components."""
+        """Find the largest component of each instance, as a packed key."""
         inputs = [self.flat["segment"], self.flat["area"]]
         self._launch(components.find_largest_kernel, (self.height * self.width,), inputs, [self.scratch.largest_key])
 
     def unpack_largest(self) -> None:
-        """Unpack the labels of the largest components."""
+        """Unpack the labels of the largest components from their keys."""
         self._launch(components.unpack_largest_kernel, (self.instances,), [self.scratch.largest_key], [self.arrays.largest])
 
     def mark_patches(self) -> None:

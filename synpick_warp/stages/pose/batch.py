@@ -14,7 +14,9 @@ MAX_SLOTS = 255
 
 @dataclass(frozen=True, eq=False)
 class ObjectModel:
-    """Textured mesh and symmetries of an object whose pose is estimated."""
+    """Textured mesh [m] and symmetries of an object whose pose is estimated: rigid transforms (4 x 4, row by row) and axes (direction,
+    point [m]).
+    """
 
     object_id: int
     """obj_id."""
@@ -29,7 +31,9 @@ class ObjectModel:
 
 @dataclass(frozen=True, eq=False)
 class RgbdBatch:
-    """Colour, depth, intrinsics and instance masks of V RGB-D views of equal size."""
+    """RGB-D views of equal size (V): sRGB colour, depth in counts (0: none) with the metres of a count, label image of visible masks (0:
+    nothing, 1 + slot), intrinsics (fx, fy, cx, cy) [px].
+    """
 
     color: np.ndarray
     """Colour, sRGB (V, H, W, 3) uint8, red first."""
@@ -49,7 +53,9 @@ class RgbdBatch:
 
 @dataclass(frozen=True, eq=False)
 class InstanceTable:
-    """View, mask slot and model of each instance whose pose is estimated; rows stay the same for all frames of the views' scenes."""
+    """Instances whose pose is estimated: view, slot (mask label - 1) and model of each; rows stay the same for all frames of the views'
+    scenes.
+    """
 
     view: np.ndarray
     """Index of the view in the batch (N,) int32; every view has an instance."""
@@ -65,7 +71,9 @@ class InstanceTable:
 
 @dataclass(frozen=True, eq=False)
 class Estimates:
-    """Poses, scores and run times of the N instances of a table in one frame."""
+    """Estimates of the N instances of a table in one frame: pose from object to camera [m], score (higher is better), whether there is one,
+    and time [s].
+    """
 
     pose: np.ndarray
     """Object to camera (N, 7) float32: translation x, y, z [m], unit quaternion x, y, z, w."""

@@ -21,7 +21,9 @@ FINE = Schedule(iterations=10, cutoffs=(0.012, 0.005), step=1, color=0.005)
 
 @dataclass(frozen=True)
 class DetectSettings:
-    """Template search, refinement schedules and near-symmetry thresholds of single-frame estimates."""
+    """Settings of single-frame pose estimation: template search, number of its poses that are refined, coarse and fine schedule, use of
+    colour; how much better a near-symmetry must correlate in colour to be tried, and how much lower its cost must be to be chosen.
+    """
 
     search: SearchSettings = field(default_factory=SearchSettings)
     hypotheses: int = 24

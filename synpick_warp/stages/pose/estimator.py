@@ -30,7 +30,7 @@ nine of ten points then count as if there were no noise."""
 
 @dataclass(frozen=True)
 class PoseSettings:
-    """Inputs (colour, depth noise) and numbers of points of an estimator."""
+    """Settings of an estimator: use of colour, depth noise [m], maximum points of an instance, and least points for an estimate."""
 
     color: bool = True
     """Use colour beside depth and masks."""
@@ -99,12 +99,12 @@ class PoseEstimator:
         return Tracker(self.shared.models, self.observer, self.shared.tracking, self.shared.scales)
 
     def estimate(self, batch: RgbdBatch) -> Estimates:
-        """Estimate poses from one frame."""
+        """Estimate the pose of each instance from a single frame."""
         detector = self._detector
         return self._run(batch, detector.detect, lambda: (detector.best, detector.cost))
 
     def refine(self, batch: RgbdBatch, pose: np.ndarray) -> Estimates:
-        """Refine poses (N, 7) float32 as in `Estimates`."""
+        """Refine start poses (N, 7) float32, object to camera as in `Estimates`; returns the estimates."""
         refiner, settings = self._refiner, self.shared.settings
         poses = wp.array(pose, dtype=wp.transform, device=self.device)
 
@@ -130,7 +130,7 @@ class PoseEstimator:
         return replace(result, valid=result.valid & (tracker.track_state.frames.numpy() > 0))
 
     def _run(self, batch: RgbdBatch, launch: Callable[[], None], read: Callable[[], tuple[wp.array, wp.array]]) -> Estimates:
-        """Observe a batch, estimate, and bring the result to the host."""
+        """Observe a batch, launch an estimation (`launch`), and return its result (`read`) on the host."""
         begin = time.perf_counter()
         self.observer.observe(batch)
         launch()
@@ -148,7 +148,7 @@ def adapt(settings: Any, given: PoseSettings) -> Any:
 
 
 def adapt_schedule(schedule: Schedule, given: PoseSettings) -> Schedule:
-    """A schedule for the noise of the depth, with or without colour."""
+    """Schedule adapted to the noise of the depth, with or without colour."""
     first, last = schedule.cutoffs
     last = min(last + _NOISE_CUTOFF * given.depth_noise, first)
     return replace(schedule, cutoffs=(first, last), color=schedule.color if given.color else 0.0)

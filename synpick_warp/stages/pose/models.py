@@ -43,7 +43,9 @@ SYMMETRIES = struct_arrays(Symmetries, "model", rotation=("model", "symmetry"), 
 
 @dataclass(frozen=True, eq=False)
 class SurfaceSamples:
-    """Positions, normals and colours of points evenly spread over a surface, in an order of which every prefix is evenly spread, too."""
+    """Samples of a surface: positions [m], outward normals, linear base colours, in an order of which every prefix is evenly spread; and
+    the surface's area [m²].
+    """
 
     position: np.ndarray
     """(S, 3) float32 [m]."""

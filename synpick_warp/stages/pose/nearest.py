@@ -32,7 +32,7 @@ _SUMS = 2**20
 
 @dataclass(frozen=True, eq=False)
 class _Level:
-    """Corners and candidate lists of the cells of one size that are to be divided."""
+    """Cells of one size that are to be divided: lower corners [m], and the candidate vertices of each as ranges of a list."""
 
     corner: np.ndarray
     """Lower corners (C, 3) [m]."""
@@ -68,7 +68,7 @@ class NearestVertices:
         self._node, self._candidate = self._upload(nodes, wp.int32), self._upload(candidates, wp.int32)
 
     def mean_distances(self, rotation: np.ndarray, translation: np.ndarray) -> np.ndarray:
-        """Mean distance from the vertices, moved by each pose, to the nearest vertex of the model as it is.
+        """Mean distance from the vertices, moved by each pose, to the nearest vertex of the model in its own frame (ADD-S).
 
         Args:
             rotation: (P, 3, 3).
@@ -92,7 +92,7 @@ class NearestVertices:
         return result
 
     def _build(self, count: int) -> tuple[np.ndarray, np.ndarray]:
-        """Nodes and candidates, as the kernel reads them."""
+        """(nodes, candidates): the arrays of the grid, as the kernel reads them."""
         level = _Level(np.zeros((1, 3)), np.zeros(1, np.int64), np.full(1, count), np.arange(count))
         edge = 2.0 * self._half
         nodes, candidates, nodes_before, entries_before = [], [], 0, 0
@@ -144,7 +144,7 @@ class NearestVertices:
 
 
 def _longest(length: np.ndarray) -> np.ndarray:
-    """Whether a cell's list is so long that it is divided (C,) bool."""
+    """Mask of the cells whose list is so long that they are divided (C,) bool."""
     limit = _MAX_LIST
     if len(length) > _MAX_DIVIDED:
         limit = max(limit, int(np.partition(length, -_MAX_DIVIDED)[-_MAX_DIVIDED]))
@@ -152,7 +152,7 @@ def _longest(length: np.ndarray) -> np.ndarray:
 
 
 def _rows_first(level: _Level, edge: float) -> _Level:
-    """Root cells sorted by z, y and x, so that a cell's index follows from its place; their lists with them."""
+    """Root cells and their lists sorted by z, y and x, so that a cell's index follows from its position."""
     place = np.rint(level.corner / edge).astype(np.int64)
     order = np.lexsort(place.T)
     length = level.length[order]

@@ -83,7 +83,7 @@ class Observer:
         self.observation = allocate_struct(OBSERVATION, sizes, device)
 
     def observe(self, batch: RgbdBatch) -> None:
-        """Upload a batch and compute its observation."""
+        """Upload a batch, and launch the kernels that compute its observation."""
         images, targets, observation, device = self.images, self.targets, self.observation, self.device
         images.color.assign(batch.color)
         images.depth.assign(batch.depth)
@@ -108,7 +108,7 @@ class Observer:
 
 
 def make_targets(table: InstanceTable, views: int, device: wp.Device) -> Any:
-    """The struct `Targets` of an instance table."""
+    """Build the struct `Targets` of an instance table."""
     targets = allocate_struct(TARGETS, {"instance": len(table.view), "view": views, "label": LABELS}, device)
     row = np.full((views, LABELS), -1, np.int32)
     row[table.view, table.slot + 1] = np.arange(len(table.view))

@@ -23,7 +23,9 @@ LIGHTING = struct_arrays(Lighting, "pose", "lane", "channel", coefficients=("pos
 
 @dataclass(frozen=True)
 class Schedule:
-    """Number of iterations, outlier distances and weights of a refinement, from coarse to fine."""
+    """Schedule of a refinement: iterations, outlier distances of the first and the last [m], stride of the points, colour weight [m],
+    weight of the start.
+    """
 
     iterations: int
     cutoffs: tuple[float, float]
@@ -38,7 +40,7 @@ class Schedule:
 
 @dataclass(frozen=True)
 class LossScales:
-    """Cutoffs, weights and step bounds of the residuals that do not change in the course of a refinement."""
+    """Constants of a refinement: cutoffs [m], weights of silhouette and colour residuals, damping, largest step [m, rad]."""
 
     truncation: float = 0.01
     """Distance at which costs are truncated [m]."""
@@ -101,7 +103,7 @@ class Refiner:
         return self.cost
 
     def _accumulate(self, pose: wp.array, loss: Any, *, fit_light: bool) -> None:
-        """Normal equations and costs of all residuals."""
+        """Launch the kernels that sum normal equations and costs of all residuals."""
         observer, models, device = self.observer, self.models.models, self.device
         images, targets, observation = observer.images, observer.targets, observer.observation
         dim, hypotheses = (len(pose), int(LANES)), self.hypotheses

@@ -40,7 +40,9 @@ PROBES = struct_arrays(
 
 @dataclass(frozen=True)
 class SearchSettings:
-    """Directions, rotations, shifts, numbers of probes and loss parameters of the template search."""
+    """Settings of the template search: viewing directions, in-plane rotations, shifts (of the diameter), numbers of compared points inside
+    and beside the mask, tolerances in depth [m].
+    """
 
     directions: int = 96
     """Viewing directions, spread over the sphere: 20° apart."""

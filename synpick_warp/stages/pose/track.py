@@ -30,7 +30,9 @@ FINE = Schedule(iterations=8, cutoffs=(0.012, 0.005), step=1, color=0.005, prior
 
 @dataclass(frozen=True)
 class TrackSettings:
-    """Refinement schedules, near-symmetry thresholds and acceptance limits of the tracker."""
+    """Settings of the tracker: refinement schedules, use of colour, how much better a motion or near-symmetry must be to be taken, and
+    limits of acceptance (`TrackPolicy`).
+    """
 
     coarse: Schedule = COARSE
     fine: Schedule = FINE

@@ -121,7 +121,7 @@ RATIO_IMAGES = struct_arrays(RatioImages, "view", "cell_row", "cell_column")
 
 @dataclass(frozen=True, eq=False)
 class ShadowRays:
-    """Visibility bits, depth, segmentation id and normal of the pixels of the shadow grid."""
+    """Traced shadow rays on the shadow grid: per pixel the lamps' visibility bits, depth, segmentation id and normal, packed."""
 
     packed: wp.array = device_array("view", "shadow_row", "shadow_column", dtype=wp.uint64)
     """Packed by `shadows.pack_rays`."""
@@ -129,7 +129,9 @@ class ShadowRays:
 
 @dataclass(frozen=True, eq=False)
 class FootprintLists:
-    """Work lists of the AA footprints, squares between the centres of four pixels, that anti-aliasing resolves."""
+    """Work lists for anti-aliasing: the squares between four pixel centres (footprints) to resolve, by chunk of tiles, and
+    their numbers.
+    """
 
     footprint: wp.array = device_array("view", "chunk", "chunk_footprint", dtype=wp.int32)
     """Row * columns + column of each listed footprint; a chunk is a run of tiles of footprints with a list of its own."""

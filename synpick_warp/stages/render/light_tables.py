@@ -32,7 +32,8 @@ MEAN_STEPS = 4096
 
 @dataclass(frozen=True, eq=False)
 class EnvironmentTables:
-    """Radiance, prefiltered radiance, SH irradiance, lamps and exposure of one environment map, precomputed.
+    """Precomputed tables of one environment map: radiance with and without lamps, prefiltered by GGX lobes, SH irradiance, lamps, exposure
+    factor.
 
     See `kernels.render.lighting.environment.Lights`.
     """
@@ -209,7 +210,7 @@ def measure_albedo(device: wp.Device) -> Any:
 
 @functools.cache
 def _measure_albedo(alias: str) -> Any:
-    """Devices have no hash; their aliases do."""
+    """Measure the albedo tables on a device, given by its alias: devices have no hash, so results are cached by alias."""
     device: wp.Device = wp.get_device(alias)
     tables = AlbedoTables()
     tables.directional = wp.empty((int(ALBEDO_ROWS), int(ALBEDO_COLUMNS)), dtype=wp.vec2, device=device)

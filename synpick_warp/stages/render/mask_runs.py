@@ -18,7 +18,9 @@ IMAGES, FIELDS = 2, 3
 
 @dataclass(frozen=True, eq=False)
 class BoundaryBuffers:
-    """Run boundaries of the instance and amodal images of one batch of views, and the numbers of these; see `FrameBatch`."""
+    """Run boundaries of the instance and amodal images of one batch of views (position, value above, value below), and their numbers, which
+    may exceed the capacity; see `FrameBatch`.
+    """
 
     boundary_count: wp.array = device_array("view", "image", dtype=wp.int32)
     """Run boundaries of the instance and the amodal image, including those beyond the capacity of `boundaries`."""

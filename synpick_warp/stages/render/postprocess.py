@@ -43,7 +43,7 @@ def has_lens_filter(effects: Effects) -> bool:
 
 
 def make_effect_ranges(effects: Effects, seed: int) -> Any:
-    """The struct `EffectRanges`."""
+    """Build the struct `EffectRanges`: lowest and highest value of each camera effect, and the seed."""
     low, high = zip(*effect_ranges(effects).values(), strict=True)
     result = EffectRanges()
     result.seed = seed

@@ -34,7 +34,9 @@ from synpick_warp.system.processes.threads import map_in_threads
 
 @dataclass(frozen=True, eq=False)
 class RenderScene:
-    """Meshes, materials, cameras, environment maps and table on the device, shared by all views, as kernel structs."""
+    """Scene on the device, shared by all views, as kernel structs: meshes, surfaces, cameras, environment maps, table; and obj_id of each
+    catalog mesh.
+    """
 
     meshes: Any
     """The struct `Meshes`."""
@@ -192,7 +194,7 @@ def normal_gradient(mesh: TriangleMesh) -> np.ndarray:
 
 
 def build_cameras(cameras: tuple[Camera, ...], device: wp.Device) -> Any:
-    """The struct `Cameras`."""
+    """Build the struct `Cameras` on the device: intrinsics, rotations both ways, centres."""
     rotation = np.array([camera.rotation for camera in cameras], dtype=np.float64)
     translation = np.array([camera.translation for camera in cameras], dtype=np.float64)
     matrices = [camera.matrix for camera in cameras]

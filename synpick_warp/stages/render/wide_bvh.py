@@ -29,7 +29,7 @@ ABSENT = -1
 
 @dataclass(frozen=True, eq=False)
 class BinaryBvh:
-    """Bounding boxes, children and leaf triangles of the binary BVH of a mesh."""
+    """Binary BVH of a mesh: boxes [m] and children of each node; a leaf has a range of triangles in their place, as negative numbers."""
 
     lower: np.ndarray
     upper: np.ndarray

@@ -114,7 +114,7 @@ def drive_gripper(scene: SceneData, state: WorldState, attempts: AttemptState, p
 
 
 def remove_lost(scene: SceneData, state: WorldState, attempts: AttemptState, seals: SealState, physics: Physics) -> None:
-    """Remove objects that have left the tote."""
+    """Remove objects that have left the tote from the scene, and break their seals."""
     wp.launch(
         tasks.remove_lost_kernel,
         dim=state.catalog_index.shape,
@@ -182,7 +182,7 @@ def advance_tasks(scene: SceneData, state: WorldState, attempts: AttemptState, s
 
 
 def park_removed(scene: SceneData, state: WorldState, attempts: AttemptState, physics: Physics) -> None:
-    """Park removed objects."""
+    """Move the bodies of removed objects to their parking places, at rest."""
     wp.launch(
         tasks.park_removed_kernel,
         dim=state.catalog_index.shape,

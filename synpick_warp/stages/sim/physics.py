@@ -65,7 +65,7 @@ class Watcher(Protocol):
     """Observer of the steps of a tick. Its launches are captured in graphs, as those of the hooks of `Physics.tick`."""
 
     def begin_step(self) -> None:
-        """Called before a step."""
+        """Called before a physics step."""
 
     def after_solve(self, contact_f: wp.array) -> None:
         """Called after each solver substep; `contact_f` holds each contact's force on its first shape (contact) spatial vector [N]."""

@@ -32,8 +32,8 @@ from synpick_warp.stages.timing import scope
 
 @dataclass(frozen=True, eq=False)
 class TickRecord:
-    """Snapshot, status, perception results and physics of the last tick, for rendering and for the host; the next tick overwrites the
-    arrays.
+    """Results of the last tick on the device: snapshot, status, perception, recorded physics (None: not recorded); the next tick overwrites
+    the arrays.
 
     `observation` and `plan` are the arrays with which the simulation itself works, not copies.
     """
@@ -181,7 +181,7 @@ class Simulation:
             self.suction.apply_seal_forces(self.scene, self.state, self.seals, self.physics, current)
 
     def _ignore_contacts(self) -> None:
-        """Hook after collision detection: contacts that seals replace."""
+        """Hook after collision detection: disable contacts between cup and attached objects, which seals replace."""
         if self.suction is not None:
             self.suction.ignore_attached_contacts(self.scene, self.state, self.seals, self.physics)
 

@@ -20,7 +20,8 @@ from synpick_warp.stages.sim.worlds import AttemptState, SealState, WorldState
 
 @dataclass(frozen=True, eq=False)
 class StepArrays:
-    """Poses, velocities and forces of each body in each physics step of a tick, and the gripper's task, setpoint and impedance force.
+    """Step log of a tick: pose, velocities [m/s, rad/s] and contact forces [N] of each body, seal forces [N] (0: no seal), and the
+    gripper's task, setpoint (NaN: none) and impedance force.
 
     The dimension "place" holds the instances, then gripper shaft and cup.
     """

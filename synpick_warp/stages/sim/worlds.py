@@ -16,7 +16,9 @@ CORNERS = 4
 
 @dataclass(frozen=True, eq=False)
 class WorldState:
-    """Episode, phase, objects, progress of settling, waypoints and light of each world."""
+    """State of each world: episode (-1: none), phase, mode, objects (-1: none) and their body slots, progress of settling, frame, waypoints
+    and setpoint [m], light.
+    """
 
     arrangement_id: wp.array = device_array("world", dtype=wp.vec2i)
     """Episode index, and index of the arrangement in it: 0, plus 1 for each resample. Episode -1: none."""
@@ -64,7 +66,9 @@ class WorldState:
 
 @dataclass(frozen=True, eq=False)
 class AttemptState:
-    """Task, outcome and counters of each world's attempt to pick, and what its seals engaged."""
+    """Attempt to pick of each world: task, its duration [steps], outcome, failures, rays that hit, engaged and attached instances as bit
+    fields, and why instances have left the scene.
+    """
 
     task: wp.array = device_array("world", dtype=wp.int32)
     """`Task`."""
@@ -88,7 +92,9 @@ class AttemptState:
 
 @dataclass(frozen=True, eq=False)
 class SealState:
-    """Attachments, grip poses and forces of the seals of each world's cup."""
+    """Seals of each world's cup: which instances are attached, their poses in the TCP frame at engagement, seal forces (0: none), break
+    force and peak force [N].
+    """
 
     attached: wp.array = device_array("world", "instance", dtype=wp.int32)
     """1: a seal holds the instance."""
@@ -104,7 +110,7 @@ class SealState:
 
 @dataclass(frozen=True, eq=False)
 class WorldStatus:
-    """Status rows of the worlds, read by the host after each tick."""
+    """Status rows of the worlds, integers (`Status`) and real numbers (`Measure`), which the host reads after each tick."""
 
     table: wp.array = device_array("world", "status", dtype=wp.int32)
     """Columns: `Status`."""

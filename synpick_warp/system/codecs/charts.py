@@ -55,7 +55,7 @@ _DISC = {"symbolType": ("'circle'", _STROKE["symbolType"]), "symbolSize": (110, 
 
 
 class ChartError(SynpickError):
-    """The charts' library cannot run."""
+    """Error: the charts' library cannot run."""
 
 
 def read_bundle() -> str:
@@ -166,7 +166,7 @@ class Legend:
         self._scale = {"domain": list(self._shown.values()), "range": list(colors.values())}
 
     def color(self, name: str) -> Spec:
-        """Colour channel of the entry `name`."""
+        """Vega-Lite colour channel of the entry `name`."""
         legend = {"columns": self._columns(), **self._symbols}
         return {"datum": self._shown[name], "type": "nominal", "scale": self._scale, "legend": legend}
 

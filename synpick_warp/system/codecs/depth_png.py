@@ -54,7 +54,9 @@ Bits = tuple[int, int]
 
 
 def code_lengths() -> list[int]:
-    """Bits of each symbol's code; 0: the symbol is not used."""
+    """Code lengths [bits] of the literal/length alphabet: the 256 bytes, the end of the block, the length symbols; 0: not used. Distance
+    symbols are apart (`_DISTANCE_LENGTHS`).
+    """
     return [int(digit, 16) for digit in _CODE_LENGTHS]
 
 
@@ -71,12 +73,12 @@ def huffman_codes(lengths: list[int]) -> list[Bits]:
 
 
 def literal_codes() -> list[Bits]:
-    """Codes of the bytes."""
+    """Huffman codes of the 256 byte values, in their order."""
     return huffman_codes(code_lengths())[:END_OF_BLOCK]
 
 
 def end_code() -> Bits:
-    """Code of the end of the block."""
+    """Huffman code of the end of the block."""
     return huffman_codes(code_lengths())[END_OF_BLOCK]
 
 
@@ -101,7 +103,7 @@ def _with_extra(value: int, bases: tuple[int, ...], extra: tuple[int, ...], code
 
 
 def join_bits(parts: list[Bits]) -> Bits:
-    """Concatenate strings of bits."""
+    """Concatenate strings of bits in their order."""
     value, count = 0, 0
     for part, bits in parts:
         value |= part << count
@@ -121,7 +123,7 @@ def make_prefix() -> Bits:
 
 
 def pack_words(bits: Bits) -> np.ndarray:
-    """A string of bits as words (N) uint32, the first bit lowest."""
+    """String of bits as words (N) uint32, the first bit lowest."""
     value, count = bits
     return np.frombuffer(value.to_bytes(4 * -(-count // 32), "little"), "<u4")
 
@@ -132,8 +134,8 @@ def pack_codes(codes: list[Bits]) -> np.ndarray:
 
 
 def max_data_bytes(width: int, height: int) -> int:
-    """Capacity for the data (IDAT) of an image of that size [px]: nearly four times the mean of full-HD views of a tote (0.29 MB).
+    """Capacity of the compressed data (IDAT) of an image [B]: 64 KiB and half a byte a pixel, at most the largest size that is possible.
 
-    Noise exceeds it, but not in images of up to 10,000 pixels.
+    Full HD: 1.1 MB, nearly four times the mean of views of a tote. Noise fits only up to some 10,000 pixels.
     """
     return min(_MIN_CAPACITY + width * height // 2, _FRAME_BYTES + _PIXEL_BYTES * width * height)

@@ -117,4 +117,5 @@ def make_header(width: int, height: int, quality: int) -> bytes:
 
 
 def _segment(marker: int, payload: bytes) -> bytes:
+    """JPEG segment: marker, length, payload."""
     return struct.pack(">BBH", 0xFF, marker, len(payload) + 2) + payload

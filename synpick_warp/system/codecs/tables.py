@@ -23,7 +23,9 @@ _LATEX = {"\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasci
 
 
 class Column(NamedTuple):
-    """A column of a table."""
+    """Column of a table: header in CSV, format of the values in text and LaTeX (empty: text, at the left), header there, and
+    format in CSV.
+    """
 
     name: str
     """Header in CSV."""
@@ -37,7 +39,9 @@ class Column(NamedTuple):
 
 @dataclass(frozen=True)
 class Table:
-    """A table of values."""
+    """Table for text, CSV and LaTeX: name of its CSV file, title, columns, rows of values; whether it is printed as text; headers above
+    several columns (`spans`); rows that begin a section.
+    """
 
     name: str
     """Name of the CSV file, without suffix."""
@@ -52,15 +56,16 @@ class Table:
     """Rows above which text has a gap, and LaTeX a rule."""
 
     def labels(self) -> list[str]:
-        """Headers of the columns."""
+        """Headers of the columns in text and LaTeX."""
         return [column.name.replace("_", " ") if column.label is None else column.label for column in self.columns]
 
     def cells(self, unknown: str) -> list[list[str]]:
-        """Formatted values, with a text for unknown ones."""
+        """Values as text, in the format of their column; a missing value (None) becomes the text `unknown`."""
         return [[_format(value, column.style, unknown) for value, column in zip(row, self.columns, strict=True)] for row in self.rows]
 
 
 def _format(value: Value, style: str, unknown: str) -> str:
+    """Format a number by the specification `style`; text stays as it is, None becomes `unknown`."""
     return unknown if value is None else value if isinstance(value, str) else format(value, style)
 
 
@@ -75,13 +80,18 @@ def to_csv(table: Table, exact: bool = False) -> str:
 
 
 def _plain(value: Value, digits: str, exact: bool) -> Value:
+    """Value of a CSV cell: a number in the format `digits` (empty: unchanged), text escaped and no formula unless `exact`, None
+    as it is.
+    """
     if isinstance(value, str):
         return value if exact else f"'{escape(value)}" if value.startswith(_FORMULA) else escape(value)
     return value if value is None or not digits else format(value, digits)
 
 
 def to_latex(table: Table) -> str:
-    """A table in the style of booktabs, whose first column is of text, and whose others are below `spans`."""
+    """LaTeX table in the style of booktabs: text in the first column, numbers in the others, which are grouped below the headers of
+    `spans`.
+    """
     heads = " & ".join(f"\\multicolumn{{{len(below)}}}{{c}}{{{_escape_latex(name)}}}" for name, below in table.spans)
     rules = "".join(f"\\cmidrule(lr){{{below[0] + 1}-{below[-1] + 1}}}" for _, below in table.spans)
     lines = [f"\\begin{{tabular}}{{l{'r' * (len(table.columns) - 1)}}}", "\\toprule", f" & {heads} \\\\", rules]
@@ -93,7 +103,7 @@ def to_latex(table: Table) -> str:
 
 
 def _escape_latex(text: str) -> str:
-    """Text of any characters as LaTeX."""
+    """Escape the ten special characters of LaTeX; all others, non-ASCII too, stay as they are."""
     return "".join(_LATEX.get(sign, sign) for sign in text)
 
 
@@ -122,12 +132,13 @@ def _span(widths: Sequence[int], columns: range) -> int:
 
 
 def _padded(text: str, width: int, right: bool = False) -> str:
+    """Pad text with spaces to `width` terminal cells; `right`: align it at the right."""
     space = " " * (width - cell_len(text))
     return space + text if right else text + space
 
 
 def _blocks(table: Table, widths: Sequence[int], width: int) -> Iterator[list[int]]:
-    """Split a table's columns into blocks that fit a width; each begins with the columns that say what a row is, which are left-aligned."""
+    """Split a table's columns into blocks of at most `width` characters; each repeats the text columns on the left, which name the row."""
     keys = list(takewhile(lambda index: not table.columns[index].style, range(len(widths))))[: len(widths) - 1]
     block: list[int] = []
     for index in range(len(keys), len(widths)):

@@ -91,7 +91,7 @@ def count_reserved(device: wp.Device, fraction: float) -> int:
 
 @cache
 def _load_driver() -> ctypes.CDLL:
-    """The driver's library, already loaded by Warp."""
+    """Load the CUDA driver's library, which Warp has loaded already."""
     try:
         return ctypes.CDLL("libcuda.so.1")
     except OSError as error:

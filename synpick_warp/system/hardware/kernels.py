@@ -38,7 +38,7 @@ def list_binaries() -> set[tuple[Path, int]]:
 
 
 class ModuleBuild(NamedTuple):
-    """Build of a Warp module: one device and one block size."""
+    """Build of a Warp module for one device and one block size."""
 
     module: wp.Module
     device: str
@@ -77,7 +77,7 @@ def compilation_lock(wait: Callable[[], None]) -> Iterator[None]:
 
 
 def _lock(handle: int, flags: int = 0) -> bool:
-    """Take a lock; False: another process has it, and `flags` says not to wait."""
+    """Take a lock on a file; False: another process has it, and `flags` says not to wait."""
     try:
         fcntl.flock(handle, fcntl.LOCK_EX | flags)
     except BlockingIOError:
@@ -88,7 +88,7 @@ def _lock(handle: int, flags: int = 0) -> bool:
 
 
 def build_of(kernel: Any, device: wp.Device) -> ModuleBuild:
-    """The build that a launch of a kernel with the default block size loads."""
+    """Identify the build that a launch of a kernel with the default block size loads."""
     return ModuleBuild(kernel.module, device.alias, kernel.module.options["block_dim"] if device.is_cuda else 1)
 
 
@@ -117,7 +117,7 @@ def split_modules(prefixes: tuple[str, ...]) -> None:
 
 
 def make_build(module: wp.Module, device: Any, block: int | None) -> ModuleBuild:
-    """The build that `wp.Module.load` with these arguments loads."""
+    """Identify the build that `wp.Module.load` with these arguments loads."""
     return ModuleBuild(module, wp.get_device(device).alias, module.options["block_dim"] if block is None else block)
 
 
@@ -214,7 +214,7 @@ class Compiler:
                 self._extra += 1
 
     def _wait(self, tasks: Collection[Future[Any]]) -> None:
-        """Wait for tasks, and report their progress."""
+        """Wait for compile tasks, and report their progress."""
         pending = {task for task in tasks if not task.done()}
         while pending:
             _, pending = wait(pending, REPORT_INTERVAL, FIRST_COMPLETED)
@@ -223,7 +223,7 @@ class Compiler:
             task.result()
 
     def _say(self, begun: int = 0) -> None:
-        """Report; `begun` modules are about to be compiled by a launch."""
+        """Report progress; `begun` modules are about to be compiled by a launch."""
         self.compiled = self._extra + sum(task.done() for task in self._tasks.values())
         total = self._extra + begun + len(self._tasks)
         if total:

@@ -151,4 +151,5 @@ def read_image_file(path: Path, error: type[SynpickError], flags: int = -1, size
 
 
 def _show(size: tuple[int, ...]) -> str:
+    """Size as text, such as "640 x 480"."""
     return f"{size[0]} x {size[1]}"

@@ -52,5 +52,6 @@ def read_json_lines(
 
 
 def _describe(fault: Exception) -> str:
+    """Text of a decoding error for a message, as part of a sentence."""
     text: Any = "nested too deeply" if isinstance(fault, RecursionError) else str(fault).replace("`", "")
     return text if text.startswith("JSON") else f"{text[:1].lower()}{text[1:]}"

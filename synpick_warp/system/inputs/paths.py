@@ -41,5 +41,6 @@ def path_inside(folder: Path, name: str, source: object, error: type[SynpickErro
 
 
 def _quote(name: str) -> str:
+    """Name in quotes for a message: cut to 80 characters, unprintable ones escaped."""
     shown = name if len(name) <= 80 else f"{name[:79]}…"
     return f'"{shown.encode("unicode_escape").decode() if not shown.isprintable() else shown}"'

@@ -66,5 +66,5 @@ def list_members(shard: Path, advice: str = _ADVICE, *, extended: bool = False) 
 
 
 def _read_blocks(file: BinaryIO, size: int) -> bytes:
-    """Read the content of a member, and what fills its last block."""
+    """Read the content of a tar member, and the padding of its last block."""
     return file.read(-(-size // tarfile.BLOCKSIZE) * tarfile.BLOCKSIZE)

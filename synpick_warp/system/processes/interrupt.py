@@ -60,6 +60,7 @@ class KeptInterrupt:
             raise KeyboardInterrupt from None
 
     def _handle(self, _: int, frame: FrameType | None) -> None:
+        """Handler of SIGINT: count it, raise, and start the timer that raises again until it is taken."""
         self._count += 1
         if self._count == 1:
             self._before = signal.signal(signal.SIGALRM, self._retry)
@@ -67,6 +68,7 @@ class KeptInterrupt:
         self._raise(frame)
 
     def _retry(self, _: int, frame: FrameType | None) -> None:
+        """Handler of the timer: raise again, if the interrupt was lost."""
         self._raise(frame)
 
     def _raise(self, frame: FrameType | None) -> None:
@@ -77,6 +79,7 @@ class KeptInterrupt:
         raise self._raised
 
     def _is_importing(self, frame: FrameType | None) -> bool:
+        """Whether the interrupted code is within an import, which must not be broken off."""
         while frame is not None and frame is not self._caller:
             if frame.f_code.co_filename.startswith(_IMPORT_SYSTEM):
                 return True
@@ -84,7 +87,7 @@ class KeptInterrupt:
         return False
 
     def _is_on_its_way(self) -> bool:
-        """Whether a handler or a `finally` block of the raised interrupt is running."""
+        """Whether a handler or a `finally` block of the raised interrupt is running, so that it must not be raised again."""
         error = sys.exception()
         while error is not None and error is not self._raised:
             error = error.__context__
@@ -111,6 +114,7 @@ class StopRequest:
         self._restore()
 
     def _handle(self, number: int, _: FrameType | None) -> None:
+        """Handler of the first signal: keep its number, say so, and restore the handlers, so that a second one ends the process."""
         self.number = number
         self._restore()
         # os.write, not print: a signal handler can interrupt buffered output.
@@ -118,6 +122,7 @@ class StopRequest:
             os.write(STANDARD_ERROR, _STOPPING)
 
     def _restore(self) -> None:
+        """Restore the handlers from before."""
         for number, handler in self._before.items():
             signal.signal(number, handler)  # type: ignore[arg-type]
         self._before = {}

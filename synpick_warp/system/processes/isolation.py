@@ -55,7 +55,7 @@ _MAX_SHOWN = 200
 
 @dataclass(frozen=True)
 class Limits:
-    """Limits of a call."""
+    """Limits of an isolated call: wall time [s], and address space beyond the interpreter's [bytes]."""
 
     seconds: float
     """Wall time [s]."""
@@ -65,7 +65,7 @@ class Limits:
 
 @dataclass(frozen=True)
 class Failure:
-    """Why a call has no result."""
+    """Why an isolated call has no result: a predicate such as "crashed (SIGSEGV)", and whether it timed out."""
 
     reason: str
     """Predicate, such as "crashed (SIGSEGV)"."""
@@ -148,7 +148,7 @@ class _Links:
         self._closed = False
 
     def call(self, request: bytes, limits: Limits) -> Any:
-        """Run a call and wait for its end."""
+        """Run a call in an isolated process within its limits; returns its result, or a `Failure` (too slow, too much memory, a crash)."""
         with _open_scratch() as result:
             for attempt in range(2):
                 try:
@@ -198,7 +198,7 @@ def _open_scratch() -> BinaryIO:
 
 
 def _exchange(link: socket.socket, request: bytes, limits: Limits) -> bytes:
-    """Send a request, and receive its end."""
+    """Send a request to an isolated process; returns the header of its answer."""
     with contextlib.suppress(OSError):
         link.sendall(_REQUEST.pack(limits.seconds, limits.memory, len(request)))
         link.sendall(request)

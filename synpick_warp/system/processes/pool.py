@@ -57,8 +57,11 @@ class DeadProcessError(ProcessError):
 
 @dataclass(eq=False, slots=True)
 class TaskFuture:
-    """Future of a task. It belongs to the thread that uses the pool, so it has no lock, unlike `concurrent.futures.Future`, whose lock
-    costs that thread some 10 us of 50 a task."""
+    """Future of a task of a pool: its value or error, once done.
+
+    It belongs to the thread that uses the pool, so it has no lock, unlike `concurrent.futures.Future`, whose lock costs that thread some 10
+    us of 50 a task.
+    """
 
     is_done: bool = False
     value: Any = None
@@ -80,7 +83,7 @@ class TaskFuture:
 
 
 class TaskError(RuntimeError):
-    """Unexpected error of a task, a fault of ours: its type and text in one line, and its traceback as a note."""
+    """Unexpected error of a task, a programming error: its type and text in one line, its traceback as a note."""
 
 
 class WorkerPool:
@@ -126,7 +129,7 @@ class WorkerPool:
         return len(self._workers)
 
     def pids(self) -> tuple[int, ...]:
-        """Process ids."""
+        """Ids of the worker processes."""
         return tuple(worker.process.pid for worker in self._workers)
 
     def load(self) -> int:
@@ -134,7 +137,8 @@ class WorkerPool:
         return min(map(_load, self._workers), default=0)
 
     def submit(self, task: Callable[[Any], Any], affinity: int = 0, *, drain: bool = True) -> TaskFuture:
-        """Send a task to the process with the fewest unanswered tasks; the future is set by later calls of `receive`, `wait` and `submit`.
+        """Send a task to the process with the fewest unanswered tasks; returns its future, which later calls of `receive`, `wait` and
+        `submit` set.
 
         Args:
             task: The task; see `WorkerProgram`.
@@ -162,7 +166,7 @@ class WorkerPool:
         return future
 
     def broadcast(self, task: Callable[..., Any], handle: int | None = None) -> list[TaskFuture]:
-        """Send a task to every process.
+        """Send a task to every process; returns their futures.
 
         Args:
             task: The task; see `WorkerProgram`.
@@ -259,6 +263,7 @@ class WorkerPool:
         self._state = None
 
     def _send(self, worker: WorkerProcess, message: bytes, handle: int | None = None) -> None:
+        """Send a message to a worker, and a file handle; raises DeadProcessError if it has ended."""
         try:
             worker.link.send_bytes(message)
             if handle is not None:
@@ -299,6 +304,7 @@ def portable_error(error: Exception) -> Exception:
 
 
 def _load(worker: WorkerProcess) -> int:
+    """Number of tasks that a worker has not answered."""
     return len(worker.tasks)
 
 
@@ -320,7 +326,7 @@ def main() -> None:
 
 
 def _run(task: Callable[..., Any], *arguments: Any) -> tuple[Any, Exception | None]:
-    """Result of a task, or its error."""
+    """Run a task: (result, None), or (None, error)."""
     try:
         return task(*arguments), None
     except Exception as error:

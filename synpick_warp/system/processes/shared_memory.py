@@ -21,7 +21,7 @@ _ALIGNMENT = 64
 
 @dataclass(frozen=True)
 class SharedArray:
-    """Descriptor of an array in shared memory."""
+    """Descriptor of an array in shared memory: offset [B], shape and type."""
 
     offset: int
     """First byte [B]."""

@@ -34,7 +34,7 @@ class ProcessError(SynpickError):
 
 @dataclass(eq=False)
 class WorkerProcess:
-    """Handle of a running worker process."""
+    """Handle of a running worker process: process, connection, and the requests that it has not answered, oldest first."""
 
     process: subprocess.Popen[bytes]
     link: Connection

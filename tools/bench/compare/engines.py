@@ -35,7 +35,7 @@ LINEAR = slice(0, 3)
 
 
 class Engine(Protocol):
-    """A physics engine with a pile in each of its worlds."""
+    """Protocol of a physics engine with a pile in each of its worlds."""
 
     name: str
     worlds: int
@@ -86,6 +86,7 @@ class NewtonEngine:
             self._graph = capture.graph
 
     def start(self, pile: Pile) -> None:
+        """Set all worlds to the poses of a pile, at rest."""
         pose = np.tile(pile.pose.astype(np.float32).reshape(-1), self.worlds)
         assert self.model.joint_q is not None  # Models with rigid bodies have it.
         for values in (self.model.joint_q, self.state.joint_q):
@@ -96,6 +97,7 @@ class NewtonEngine:
         newton.eval_fk(self.model, self.state.joint_q, self.state.joint_qd, self.state)
 
     def run(self, steps: int) -> float:
+        """Simulate this many steps of all worlds; returns the time taken [s]."""
         wp.synchronize_device(self.device)
         started = time.perf_counter()
         if self._graph is not None:
@@ -110,6 +112,7 @@ class NewtonEngine:
         return seconds
 
     def _advance(self, steps: int) -> None:
+        """Launch steps, each of `substeps` collisions and solves; the result is in `state`."""
         current, following = self.state, self._other
         for _ in range(steps * self.substeps):
             self.pipeline.collide(current, self.contacts)
@@ -119,12 +122,13 @@ class NewtonEngine:
             self.state.assign(current)
 
     def bodies(self) -> tuple[np.ndarray, np.ndarray]:
+        """Positions [m] and linear velocities [m/s] of all bodies (world, body, 3)."""
         pose, velocity = (array.numpy().reshape(self.worlds, -1, size) for array, size in ((self.state.body_q, 7), (self.state.body_qd, 6)))
         return pose[..., LINEAR], velocity[..., LINEAR]
 
 
 def make_ours(physics: Physics, tote: Tote, pile: Pile, worlds: int, device: wp.Device) -> NewtonEngine:
-    """Our solver, with the settings of a bake."""
+    """Engine with our solver, and the settings of a bake."""
     name = f"SolverSteel ({physics.substeps} x {physics.iterations} iterations)"
     slots = len(pile.entries)
     return NewtonEngine(name, physics, tote, pile, worlds, device, lambda model: make_solver(physics, model, slots), physics.substeps)
@@ -168,6 +172,7 @@ class MujocoEngine:
         self.start(pile)
 
     def start(self, pile: Pile) -> None:
+        """Build MuJoCo's model of a pile, and set all worlds to its poses, at rest."""
         model = build_piles(self.physics, self.tote, pile, 1, wp.get_device("cpu"))
         # A single contact for two hulls, MuJoCo's default, lets a pile sink 15 mm into the floor.
         solver = newton.solvers.SolverMuJoCo(
@@ -182,9 +187,11 @@ class MujocoEngine:
 
     @property
     def _spec(self) -> int:
+        """MuJoCo's code of the full physics state."""
         return int(self.mujoco.mjtState.mjSTATE_FULLPHYSICS)
 
     def run(self, steps: int) -> float:
+        """Simulate this many steps of all worlds in threads; returns the time taken [s]."""
         started = time.perf_counter()
         states, _ = self.rollout.rollout(self.model, self.data, self.state, nstep=steps)
         seconds = time.perf_counter() - started
@@ -192,6 +199,7 @@ class MujocoEngine:
         return seconds
 
     def bodies(self) -> tuple[np.ndarray, np.ndarray]:
+        """Positions [m] and linear velocities [m/s] of all bodies (world, body, 3)."""
         positions, end = 1 + self.model.nq, 1 + self.model.nq + self.model.nv
         coordinates, velocities = self.state[:, 1:positions], self.state[:, positions:end]
         return coordinates.reshape(self.worlds, -1, 7)[..., LINEAR], velocities.reshape(self.worlds, -1, 6)[..., LINEAR]

@@ -20,7 +20,7 @@ LIFT, SPREAD = 0.1, 2.0
 
 @dataclass(frozen=True, eq=False)
 class Pile:
-    """Objects of one world, and where they are."""
+    """Objects of one world with their object-to-world poses [m]."""
 
     entries: tuple[CatalogEntry, ...]
     pose: np.ndarray
@@ -79,4 +79,5 @@ def build_piles(physics: Physics, tote: Tote, pile: Pile, worlds: int, device: w
 
 
 def _hull(piece: ConvexPiece) -> newton.Mesh:
+    """Newton mesh of a convex piece, without inertia."""
     return newton.Mesh(piece.vertices, piece.faces.reshape(-1), compute_inertia=False)

@@ -141,6 +141,7 @@ class RayScene:
 
 @wp.func
 def _find_root(bvh: wp.uint64, world: wp.int32):
+    """Root of a world's group in a grouped BVH."""
     return wp.bvh_get_group_root(bvh, world)
 
 

@@ -75,7 +75,7 @@ def _measure_size(config: Config, factory: Factory, worlds: int, min_seconds: fl
 
 
 def _pair(size: str, pixels: int, ours: str, theirs: str, seconds: tuple[float, float]) -> Iterator[Row]:
-    """Rows of the rates of both renderers, from the times of a view [s] by ours and theirs, and of their ratio."""
+    """Rows of the rates of both renderers and of their ratio, from the times of a view [s]."""
     our_seconds, their_seconds = seconds
     yield from rate_rows(f"{size}, ours: {ours}", our_seconds, pixels)
     yield from rate_rows(f"{size}, MuJoCo Warp: {theirs}", their_seconds, pixels)
@@ -103,9 +103,9 @@ class OurViews:
         self.views = make_views(world, camera, count, instances)
 
     def render_gbuffer(self) -> None:
-        """Depth, ids and amodal bits alone."""
+        """Render depth, ids and amodal bits alone."""
         self.renderer.render_gbuffer(self.snapshot, self.views, self.out)
 
     def render(self) -> None:
-        """All stages."""
+        """Render the views by all stages of our renderer."""
         self.renderer.render(self.snapshot, self.views, self.out)

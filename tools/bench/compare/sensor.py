@@ -45,7 +45,9 @@ CHECKED_VIEWS = 6
 
 @dataclass(frozen=True, eq=False)
 class SensorScene:
-    """Newton model of the worlds of a snapshot's first views, and the inputs with which the sensor renders them."""
+    """Newton model of the worlds of a snapshot's first views, and the sensor's inputs: pixel rays in the camera frame, camera-to-world
+    transforms, segmentation id of each shape.
+    """
 
     model: newton.Model
     state: newton.State
@@ -146,6 +148,7 @@ class _Mesh(newton.Mesh):
 
     @property
     def texture_hash(self) -> int:
+        """Identity of the texture, as Newton's sensor asks for it."""
         return id(self.texture)
 
 
@@ -273,18 +276,21 @@ class _OurRenderer:
         self.layers = allocate(LayerBuffers, {"view": count, "row": scene.height, "column": scene.width}, scene.device, LAYERS)
 
     def render_gbuffer(self) -> None:
+        """Render the G-buffer alone."""
         self.renderer.render_gbuffer(self.snapshot, self.views, self.out)
 
     def render_layers(self) -> None:
+        """Render the G-buffer and the layers."""
         self.render_gbuffer()
         self.layer_renderer.render(self.snapshot, self.renderer.bodies, self.renderer.gbuffer, self.views, self.layers)
 
     def render_color(self) -> None:
+        """Render all images, colour included."""
         self.renderer.render(self.snapshot, self.views, self.out)
 
 
 def _comparison_rows(outputs: str, our_extras: str, their_extras: str, times: tuple[float, float], pixels: int) -> Iterator[Row]:
-    """Rows of the times of a view [s] of `pixels` pixels by ours and theirs, of their rates, and of their ratio."""
+    """Rows of both renderers' times of a view and their rates, and of the ratio of the times; `times` [s], ours first."""
     ours, theirs = times
     for name, seconds in ((f"ours: {outputs}{our_extras}", ours), (f"SensorCamera: {outputs}{their_extras}", theirs)):
         yield Row(name, 1e3 * seconds, "ms")

@@ -73,7 +73,7 @@ def pack_half2(a: float, b: float) -> float:
 
 @wp.func
 def unpack_half2(packed: float) -> wp.vec2:
-    """Unpack the values of `pack_half2`."""
+    """Two values in half precision, packed by `pack_half2`, as float32."""
     halves = wp.cast(packed, wp.vec2h)
     return wp.vec2(float(halves[0]), float(halves[1]))
 

@@ -39,7 +39,7 @@ def pack_entry(offset: int, known: int, bits: int) -> int:
 
 @wp.func
 def unpack_entry(entry: int) -> tuple[int, int, int]:
-    """(offset, known, bits) of `pack_entry`."""
+    """(index in the region, valid paths of the history, period bits) of an entry of `pack_entry`."""
     offset = entry >> (KNOWN_BITS + _PERIOD_BITS)
     known = (entry >> _PERIOD_BITS) & ((1 << KNOWN_BITS) - 1)
     return offset, known, entry & ((1 << _PERIOD_BITS) - 1)

@@ -24,7 +24,9 @@ _SEGMENT_BITS = wp.constant(8)
 
 @wp.struct
 class PathQueues:
-    """Wavefront queues of the paths that go on after a bounce: lengths, slots, and packed paths, by region and stage. Scratch."""
+    """Wavefront queues of the paths that go on after a bounce, by region and stage: lengths, slots of the queued paths (double-buffered),
+    and paths packed into records. Scratch.
+    """
 
     count: wp.array3d[int]
     """(queue_view, region, stage): length of a queue. Stage s holds paths with `Path.bounce` = s + 1."""
@@ -37,7 +39,9 @@ class PathQueues:
 
 @wp.struct
 class PathPixel:
-    """Coarse pixel of a path: the data with which the light of the path is combined when it terminates."""
+    """Coarse pixel of a path: what its light is combined with when it terminates: index in the region, segmentation id, valid paths of the
+    history, Sobol' index, diffuse colour, unoccluded light, firefly limit.
+    """
 
     offset: int
     """Index of the coarse pixel in its region, in interleaved order."""
@@ -69,13 +73,13 @@ def first_record(queues: PathQueues, view: int, region: int, slot: int) -> int:
 
 @wp.func
 def record_of(values: wp.vec3, last: float) -> wp.vec4:
-    """Record of a vector and one more value."""
+    """Record of 16 bytes of a vector and one more value."""
     return wp.vec4(values[0], values[1], values[2], last)
 
 
 @wp.func
 def vector_of(record: wp.vec4) -> wp.vec3:
-    """Vector of a record of `record_of`."""
+    """First three values of a record, the vector of `record_of`."""
     return wp.vec3(record[0], record[1], record[2])
 
 
@@ -100,7 +104,7 @@ def write_path(queues: PathQueues, first: int, path: Path, pixel: PathPixel):
 
 @wp.func
 def read_path(queues: PathQueues, first: int) -> tuple[Path, PathPixel]:
-    """Unpack the records of `write_path`."""
+    """Unpack a path and its coarse pixel from the records of `write_path`, from flat index `first` on."""
     origin = read_record(queues.record, first)
     ray = read_record(queues.record, first + QUEUE_CAPACITY)
     hit = read_record(queues.record, first + 2 * QUEUE_CAPACITY)

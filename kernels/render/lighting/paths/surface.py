@@ -25,7 +25,9 @@ class CoarseSurface:
 
 @wp.func
 def coarse_surface(cameras: Cameras, coarse: CoarseGrid, gbuffer: GBuffer, view: int, camera: int, row: int, column: int) -> CoarseSurface:
-    """Read a coarse pixel's surface from the G-buffer."""
+    """Surface that a coarse pixel shows: hit, position, direction to the camera and footprint, read from the G-buffer at its
+    middle pixel.
+    """
     pixel = middle_pixel(coarse, row, column)
     ray = camera_ray(cameras.intrinsics[camera], pixel[0], pixel[1], wp.vec2(0.0, 0.0))
     surface = CoarseSurface()

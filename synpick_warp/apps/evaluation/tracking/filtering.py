@@ -136,7 +136,7 @@ def _run_filter(
 
 
 class _Symmetries:
-    """Equivalent poses of symmetric objects."""
+    """Equivalent poses of symmetric objects: for each obj_id the rigid transforms under which it looks the same."""
 
     def __init__(self, table: PoseTable, symmetries: Mapping[int, np.ndarray]) -> None:
         self._object_id = table.object_id

@@ -24,7 +24,7 @@ SWEEP_ALPHAS = (0.01, 0.02, 0.05, 0.1, 0.2, 0.3, 0.5, 0.7, 1.0)
 
 @dataclass(frozen=True, eq=False)
 class AlphaSweep:
-    """Scores of a sweep."""
+    """Scores of a sweep over the tracking filter's weight alpha, by mode (M) and alpha (A), and unfiltered by mode."""
 
     modes: tuple[str, ...]
     """Names of the rows, in the order given."""
@@ -42,7 +42,7 @@ class AlphaSweep:
         return self.alphas[column], float(row[column])
 
     def rows(self) -> list[dict[str, str | float | bool]]:
-        """The table in long form: mode, alpha, score, gain over the unfiltered score, and whether this alpha is the mode's best."""
+        """Rows of the table in long form: mode, alpha, score, gain over the unfiltered score, and whether this alpha is the mode's best."""
         return [
             {"mode": mode, "alpha": alpha, "score": float(score), "gain": float(score - raw), "best": alpha == self.best(mode)[0]}
             for mode, scores, raw in zip(self.modes, self.scores, self.unfiltered, strict=True)

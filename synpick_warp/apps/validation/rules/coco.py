@@ -28,7 +28,7 @@ _Finding = Iterator[tuple[str, str]]
     "make the file again with calc_gt_coco.py",
 )
 def check_schema(scene: SceneSubject) -> _Finding:
-    """COCO files that do not fit."""
+    """Yield COCO files that do not fit the schema."""
     for coco in scene.cocos:
         if coco.content is None:
             yield coco.file, coco.fault
@@ -41,7 +41,7 @@ def check_schema(scene: SceneSubject) -> _Finding:
     "number the annotations from 1 on: pycocotools takes 0 for 'no match'",
 )
 def check_ids(scene: SceneSubject) -> _Finding:
-    """Ids of annotations."""
+    """Yield the first annotation of a file whose id is not its place in the list plus 1."""
     for coco in scene.cocos:
         ids = [annotation.id for annotation in coco.content.annotations] if coco.content else []
         wrong = next((place for place, number in enumerate(ids) if number != place + 1), None)
@@ -56,7 +56,7 @@ def check_ids(scene: SceneSubject) -> _Finding:
     "list every image once, file_name relative to the scene's folder",
 )
 def check_images(scene: SceneSubject) -> _Finding:
-    """Images of a COCO file."""
+    """Yield images that the COCO file lacks or has alone, and those whose file_name is not that of the colour image."""
     kind = scene.colour
     for coco in scene.cocos:
         listed = {image.id: image for image in coco.content.images} if coco.content else {}
@@ -79,7 +79,7 @@ def check_images(scene: SceneSubject) -> _Finding:
     "use obj_id as the id of categories, also where ids have gaps",
 )
 def check_categories(scene: SceneSubject) -> _Finding:
-    """Categories of a COCO file."""
+    """Yield category_ids of annotations and obj_ids of instances that are not in `categories`."""
     for coco in scene.cocos:
         if coco.content is not None:
             known = {category.id for category in coco.content.categories}
@@ -96,7 +96,7 @@ def check_categories(scene: SceneSubject) -> _Finding:
     "leave out instances whose mask_visib is empty, and no others",
 )
 def check_instances(view: ViewSubject) -> _Finding:
-    """Number and categories of annotations."""
+    """Yield views whose annotations do not have the obj_ids of the visible instances, in their order."""
     for coco in view.scene.cocos if _has_masks(view) else ():
         given = [annotation.category_id for annotation in coco.by_image.get(view.image, ())]
         expected = [view.truths[index].obj_id for index, _, _ in _visible(view)]
@@ -111,7 +111,7 @@ def check_instances(view: ViewSubject) -> _Finding:
     "encode mask_visib column by column, starting with the number of zeros (pass bool, not 0/255, to the toolkit's encoder)",
 )
 def check_masks(view: ViewSubject) -> _Finding:
-    """Run lengths and areas."""
+    """Yield annotations whose run lengths or area differ from those of the visible mask, or are compressed."""
     for coco, annotation, _, visible, _ in _matched(view):
         place = f"image {view.image}, annotation {annotation.id}"
         runs = annotation.segmentation
@@ -133,7 +133,7 @@ def check_masks(view: ViewSubject) -> _Finding:
     "compute the box from the mask with + 1; scene_gt_info.json has none",
 )
 def check_boxes(view: ViewSubject) -> _Finding:
-    """Boxes of annotations."""
+    """Yield annotations whose bbox is not the box of the mask: of the visible one in the modal file, else of the amodal one."""
     for coco, annotation, amodal, visible, _ in _matched(view):
         mask = visible if coco.modal else amodal
         if mask is not None and mask.box is not None and annotation.bbox != list(mask.box):
@@ -152,7 +152,7 @@ def check_boxes(view: ViewSubject) -> _Finding:
     "set ignore by visib_fract",
 )
 def check_ignore(view: ViewSubject) -> _Finding:
-    """Flag `ignore`."""
+    """Yield annotations whose `ignore` is not (visib_fract below IGNORED_VISIBILITY); fractions close to it are left out."""
     for coco, annotation, _, _, index in _matched(view):
         fraction = view.infos[index].visib_fract if view.infos else IGNORED_VISIBILITY
         clear = annotation.ignore is not UNSET and abs(fraction - IGNORED_VISIBILITY) > FRACTION_SLACK
@@ -162,12 +162,13 @@ def check_ignore(view: ViewSubject) -> _Finding:
 
 
 def run_lengths(mask: Mask) -> list[int]:
-    """Column-major run lengths of a mask, False first."""
+    """Run lengths of a mask in COCO's order: by columns, false pixels first."""
     runs = find_run_boundaries(mask.crop.view(np.uint8), mask.top, mask.left).runs_of(1)
     return runs.counts(mask.size[1], mask.size[0]).tolist()
 
 
 def _has_masks(view: ViewSubject) -> bool:
+    """Whether the scene has COCO files, and all visible masks of the view could be read."""
     return "mask_visib" in view.masks and None not in view.masks["mask_visib"] and bool(view.scene.cocos)
 
 
@@ -189,7 +190,7 @@ def _matched(view: ViewSubject) -> Iterator[tuple[CocoFile, Annotation, Mask | N
 
 
 def _explain(counts: list[int], mask: Mask) -> str:
-    """How run lengths differ from a mask's."""
+    """Text on how run lengths differ from those of the mask: size, order, inversion, or number of pixels."""
     width, height = mask.size
     if sum(counts) != width * height or max(mask.size) > MAX_SIDE:
         return f"has runs of {sum(counts)} pixels, the image has {width * height}"
@@ -204,4 +205,5 @@ def _explain(counts: list[int], mask: Mask) -> str:
 
 
 def _shorten(values: list[int]) -> str:
+    """List as text; beyond 12 values their number."""
     return str(values) if len(values) <= 12 else f"[{', '.join(map(str, values[:12]))}, ...] ({len(values)})"

@@ -21,7 +21,7 @@ _Finding = Iterator[tuple[str, str]]
     "restore the file: it is damaged, empty or of another format",
 )
 def check_decodes(view: ViewSubject) -> _Finding:
-    """Colour, depth and masks."""
+    """Yield colour, depth and mask files that cannot be decoded."""
     _ = view.colour, view.depth, view.masks
     yield from dict.fromkeys(view.faults)
 
@@ -33,7 +33,7 @@ def check_decodes(view: ViewSubject) -> _Finding:
     "write them at the resolution of the camera",
 )
 def check_sizes(view: ViewSubject) -> _Finding:
-    """Sizes in a view."""
+    """Yield masks and depth images that have another size than the colour image."""
     if view.size is None:
         return
     sizes = [(mask.file, mask.size) for masks in view.masks.values() for mask in masks if mask is not None]
@@ -51,7 +51,7 @@ def check_sizes(view: ViewSubject) -> _Finding:
     "convert the image; put greyscale images into gray",
 )
 def check_colour(view: ViewSubject) -> _Finding:
-    """Type of the colour image."""
+    """Yield a colour image that is not 3 x 8 bits, or a grey one that is not grey of 8 or 16 bits."""
     if view.colour is None:
         return
     file, image = view.colour
@@ -70,7 +70,7 @@ def check_colour(view: ViewSubject) -> _Finding:
     "write uint16 counts, clamped to 65535; 0 is no measurement",
 )
 def check_depth_type(view: ViewSubject) -> _Finding:
-    """Type of the depth image."""
+    """Yield a depth image that is not of one channel of 16 bits."""
     if view.depth_file is None:
         return
     file, image, kind = view.depth_file
@@ -87,7 +87,7 @@ def check_depth_type(view: ViewSubject) -> _Finding:
     level=Level.WARNING,
 )
 def check_depth_known(view: ViewSubject) -> _Finding:
-    """Images that are nearly all 0."""
+    """Yield a depth image in which fewer than MIN_KNOWN_DEPTH of the pixels have depth."""
     if view.depth is not None and view.depth_file is not None:
         known = np.count_nonzero(view.depth) / view.depth.size
         if known < MIN_KNOWN_DEPTH:

@@ -21,7 +21,7 @@ _Finding = Iterator[tuple[str, str]]
     "make scene_gt_info.json again from scene_gt.json (calc_gt_info.py)",
 )
 def check_lengths(scene: SceneSubject) -> _Finding:
-    """Lengths of the lists."""
+    """Yield images that have another number of infos than of instances."""
     record = scene.record("gt_info")
     for image, infos in scene.infos.items():
         truths = scene.truths.get(image)
@@ -36,7 +36,7 @@ def check_lengths(scene: SceneSubject) -> _Finding:
     "compute it from the two counts",
 )
 def check_fraction(scene: SceneSubject) -> _Finding:
-    """Visible fractions."""
+    """Yield infos whose visib_fract is not px_count_visib / px_count_all (0 for none)."""
     for file, place, info in _infos(scene):
         expected = info.px_count_visib / info.px_count_all if info.px_count_all else 0.0
         if abs(info.visib_fract - expected) > FRACTION_TOLERANCE:
@@ -50,7 +50,7 @@ def check_fraction(scene: SceneSubject) -> _Finding:
     "count px_count_all over the whole silhouette, up to one image size beyond each border",
 )
 def check_order(scene: SceneSubject) -> _Finding:
-    """Counts."""
+    """Yield infos whose px_count_visib or px_count_valid exceeds px_count_all."""
     for file, place, info in _infos(scene):
         for name in ("px_count_visib", "px_count_valid"):
             if getattr(info, name) > info.px_count_all:
@@ -64,7 +64,7 @@ def check_order(scene: SceneSubject) -> _Finding:
     "write four times -1 for instances of which no pixel is visible, and boxes for all others",
 )
 def check_hidden_boxes(scene: SceneSubject) -> _Finding:
-    """Boxes of hidden and of visible instances."""
+    """Yield infos with a box although no pixel is visible, without one although some are, or with a box of negative size."""
     for file, place, info in _infos(scene):
         for name in ("bbox_obj", "bbox_visib"):
             box = getattr(info, name)
@@ -81,7 +81,7 @@ def check_hidden_boxes(scene: SceneSubject) -> _Finding:
     "compute both from the masks: x_min, y_min, x_max - x_min, y_max - y_min",
 )
 def check_nested_boxes(scene: SceneSubject) -> _Finding:
-    """Boxes of visible instances."""
+    """Yield infos whose bbox_visib reaches out of bbox_obj."""
     for file, place, info in _infos(scene):
         outer, inner = info.bbox_obj, info.bbox_visib
         if EMPTY in (outer, inner):
@@ -91,7 +91,7 @@ def check_nested_boxes(scene: SceneSubject) -> _Finding:
 
 
 def _infos(scene: SceneSubject) -> Iterator[tuple[str, str, Info]]:
-    """(file, place in it, entry) of all infos."""
+    """Yield (file, place for messages, entry) of each instance in scene_gt_info.json."""
     record = scene.record("gt_info")
     for image, infos in scene.infos.items():
         for index, info in enumerate(infos):

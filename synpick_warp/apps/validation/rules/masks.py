@@ -18,19 +18,20 @@ _Finding = Iterator[tuple[str, str]]
 
 
 def _all_masks(view: ViewSubject, kind: str) -> Iterator[tuple[int, Mask]]:
-    """(index, mask) of those that exist and have the view's size."""
+    """Yield (index, mask) of the masks that exist and have the view's size."""
     for index, mask in enumerate(view.masks.get(kind, ())):
         if mask is not None and mask.size == view.size:
             yield index, mask
 
 
 def _pairs(view: ViewSubject, kind: str) -> Iterator[tuple[int, Mask, Info]]:
-    """(index, mask, info)."""
+    """Yield (index, mask, info) of each instance whose mask of this kind could be read; nothing without infos."""
     for index, mask in _all_masks(view, kind) if view.infos else ():
         yield index, mask, view.infos[index]
 
 
 def _file(view: ViewSubject) -> str:
+    """File that holds the infos of the view, for messages."""
     return view.scene.record("gt_info").where(view.image)
 
 
@@ -41,7 +42,7 @@ def _file(view: ViewSubject) -> str:
     "write uint8 masks of one channel, 255 where the instance is",
 )
 def check_type(view: ViewSubject) -> _Finding:
-    """Type and values of masks."""
+    """Yield masks that are not greyscale of 8 bits, or have values besides 0 and 255."""
     for masks in view.masks.values():
         for mask in masks:
             if mask is not None and mask.kind not in (None, (8, "greyscale")):
@@ -57,7 +58,7 @@ def check_type(view: ViewSubject) -> _Finding:
     "cut mask_visib from mask; check that both have the same index",
 )
 def check_inside(view: ViewSubject) -> _Finding:
-    """Visible pixels outside of the silhouette."""
+    """Yield visible masks with pixels outside of the amodal mask."""
     amodal = dict(_all_masks(view, "mask"))
     for index, visible in _all_masks(view, "mask_visib"):
         if index in amodal and visible.box is not None:
@@ -73,7 +74,7 @@ def check_inside(view: ViewSubject) -> _Finding:
     "give each pixel to the nearest instance",
 )
 def check_overlap(view: ViewSubject) -> _Finding:
-    """Pixels of two visible masks."""
+    """Yield visible masks that share pixels with that of an earlier instance; only in data sets of this program."""
     if not view.scene.layout.ours or view.size is None:
         return
     taken = np.zeros((view.size[1], view.size[0]), bool)
@@ -94,7 +95,7 @@ def check_overlap(view: ViewSubject) -> _Finding:
     "count the mask's pixels",
 )
 def check_visible_count(view: ViewSubject) -> _Finding:
-    """Counts of visible pixels."""
+    """Yield instances whose px_count_visib differs from the count of the visible mask."""
     for index, mask, info in _pairs(view, "mask_visib"):
         if _differ(info.px_count_visib, mask.count):
             yield (
@@ -110,7 +111,7 @@ def check_visible_count(view: ViewSubject) -> _Finding:
     "count the pixels of mask whose depth is not 0",
 )
 def check_valid_count(view: ViewSubject) -> _Finding:
-    """Counts of pixels with depth."""
+    """Yield instances whose px_count_valid differs from the count of amodal mask pixels with depth."""
     depth = view.depth
     if depth is None or depth.shape[::-1] != view.size:
         return
@@ -133,7 +134,7 @@ def check_valid_count(view: ViewSubject) -> _Finding:
     "count the silhouette in the image and up to one image size beyond each border",
 )
 def check_amodal_count(view: ViewSubject) -> _Finding:
-    """Counts of silhouettes."""
+    """Yield instances whose px_count_all differs from the count of the amodal mask, or is below it where the image cuts the mask."""
     for index, mask, info in _pairs(view, "mask"):
         inside = not _touched_sides(mask)
         if (inside and _differ(info.px_count_all, mask.count)) or info.px_count_all + COUNT_SLACK < mask.count * (1.0 - COUNT_FRACTION):
@@ -147,7 +148,7 @@ def check_amodal_count(view: ViewSubject) -> _Finding:
     "compute the box from the mask; COCO's boxes have + 1, these do not",
 )
 def check_visible_box(view: ViewSubject) -> _Finding:
-    """Visible boxes."""
+    """Yield instances whose bbox_visib is not the box of the visible mask."""
     for index, mask, info in _pairs(view, "mask_visib"):
         if mask.box is not None and info.bbox_visib != EMPTY and info.bbox_visib != bop_box(mask.box):
             yield _file(view), f"image {view.image}, instance {index}: bbox_visib is {_describe(info.bbox_visib, mask.box)}"
@@ -160,7 +161,7 @@ def check_visible_box(view: ViewSubject) -> _Finding:
     "compute the box from the whole silhouette; COCO's boxes have + 1, these do not",
 )
 def check_amodal_box(view: ViewSubject) -> _Finding:
-    """Amodal boxes."""
+    """Yield instances whose bbox_obj is not the box of the amodal mask; sides at the image border may lie outside."""
     for index, mask, info in _pairs(view, "mask"):
         if mask.box is None or info.bbox_obj == EMPTY:
             continue
@@ -196,7 +197,7 @@ def bop_box(box: tuple[int, int, int, int]) -> list[int]:
 
 
 def _sides(box: list[int]) -> tuple[int, int, int, int]:
-    """How far a box reaches to the left, top, right and bottom."""
+    """Extents of a box to the left, top, right and bottom, each the larger the farther the box reaches: -x, -y, x + width, y + height."""
     return -box[0], -box[1], box[0] + box[2], box[1] + box[3]
 
 
@@ -210,9 +211,11 @@ def _touched_sides(mask: Mask) -> set[int]:
 
 
 def _differ(count: int, expected: int) -> bool:
+    """Whether a count is off by more than the slack (COUNT_SLACK pixels or COUNT_FRACTION)."""
     return abs(count - expected) > max(COUNT_SLACK, COUNT_FRACTION * expected)
 
 
 def _describe(stated: list[int], box: tuple[int, int, int, int]) -> str:
+    """Stated and expected box as text, with a hint if width and height are too large by 1."""
     hint = "; width and height have + 1" if stated == list(box) else ""
     return f"{stated}, the mask's is {bop_box(box)}{hint}"

@@ -36,7 +36,7 @@ _Finding = Iterator[tuple[str, str]]
     "name models by obj_id with six digits; calc_model_info.py makes models_info.json",
 )
 def check_files(folder: ModelsFolder) -> _Finding:
-    """Names, and keys of models_info.json."""
+    """Yield models of another name than obj_NNNNNN.ply, links out of the data set, and entries of models_info.json without a model."""
     for name in sorted(folder.listing.files):
         if name.lower().endswith(".ply") and not MODEL_FILE.fullmatch(name):
             yield folder.listing.name(name), "a model whose name is not obj_NNNNNN.ply"
@@ -56,7 +56,7 @@ def check_files(folder: ModelsFolder) -> _Finding:
     "export with float, double, int, uint, uchar and vertex_indices; texture_u, texture_v for texture coordinates",
 )
 def check_dialect(model: ModelSubject) -> _Finding:
-    """Header of a PLY file, by the rules of `inout.load_ply`."""
+    """Yield headers of PLY files that `inout.load_ply` of BOP's toolkit would not read, or read wrongly."""
     element = ""
     for line in model.header:
         words = line.split()
@@ -82,7 +82,7 @@ def check_dialect(model: ModelSubject) -> _Finding:
     "repair or restore the mesh",
 )
 def check_mesh(model: ModelSubject) -> _Finding:
-    """Geometry and texture."""
+    """Yield models whose geometry or texture cannot be read."""
     if model.mesh[0] is None:
         yield model.place, model.mesh[1]
 
@@ -94,7 +94,7 @@ def check_mesh(model: ModelSubject) -> _Finding:
     "multiply the vertices by 1000 if they are in metres",
 )
 def check_units(model: ModelSubject) -> _Finding:
-    """Size of the mesh."""
+    """Yield models whose diameter is below TINY [mm]: they are probably in metres."""
     if model.vertices is not None and (size := diameter(model.vertices)) < TINY:
         yield model.place, f"the diameter is {size:.3g} mm; it looks like metres"
 
@@ -106,7 +106,7 @@ def check_units(model: ModelSubject) -> _Finding:
     "make it again with calc_model_info.py, and add the symmetries by hand",
 )
 def check_entry(model: ModelSubject) -> _Finding:
-    """Schema of the entry."""
+    """Yield entries of models_info.json that do not fit the schema."""
     if model.entry[1]:
         yield model.info_file, f"object {model.obj_id}: {model.entry[1]}"
 
@@ -118,7 +118,7 @@ def check_entry(model: ModelSubject) -> _Finding:
     "compute it from the model's vertices (calc_model_info.py)",
 )
 def check_diameter(model: ModelSubject) -> _Finding:
-    """Diameter against the mesh."""
+    """Yield entries whose diameter is not that of the mesh."""
     entry = model.entry[0]
     if entry is not None and model.vertices is not None:
         expected = diameter(model.vertices)
@@ -134,7 +134,7 @@ def check_diameter(model: ModelSubject) -> _Finding:
     "compute them from the model's vertices (calc_model_info.py)",
 )
 def check_box(model: ModelSubject) -> _Finding:
-    """Bounding box against the mesh."""
+    """Yield entries whose min_x .. size_z are not those of the mesh's bounding box."""
     entry = model.entry[0]
     if entry is None or model.vertices is None:
         return
@@ -155,7 +155,7 @@ def check_box(model: ModelSubject) -> _Finding:
     level=Level.WARNING,
 )
 def check_origin(model: ModelSubject) -> _Finding:
-    """Centre of the bounding box."""
+    """Yield models whose bounding box is centred further from the origin than a tenth of its diagonal."""
     if model.vertices is not None:
         center = (model.vertices.min(axis=0) + model.vertices.max(axis=0)) / 2.0
         off, size = float(np.linalg.norm(center)), float(np.linalg.norm(np.ptp(model.vertices, axis=0)))
@@ -170,7 +170,7 @@ def check_origin(model: ModelSubject) -> _Finding:
     "remove the identity",
 )
 def check_identity(model: ModelSubject) -> _Finding:
-    """Discrete symmetries that are the identity."""
+    """Yield discrete symmetries that are the identity."""
     for index, matrix in _discrete(model):
         if np.abs(matrix - np.eye(4)).max() <= RIGID_TOLERANCE:
             yield model.info_file, f"object {model.obj_id}: symmetries_discrete[{index}] is the identity"
@@ -183,7 +183,7 @@ def check_identity(model: ModelSubject) -> _Finding:
     "write a proper 4 x 4 matrix; mirror images are no symmetries",
 )
 def check_rigid(model: ModelSubject) -> _Finding:
-    """Matrices and axes."""
+    """Yield discrete symmetries that are no rigid transform, and continuous ones whose axis is 0."""
     for index, matrix in _discrete(model):
         if not _is_rigid(matrix):
             hint = "; it looks column by column" if np.abs(matrix[3, :3]).max() > 0.0 and not matrix[:3, 3].any() else ""
@@ -200,7 +200,7 @@ def check_rigid(model: ModelSubject) -> _Finding:
     "remove the symmetry, or correct its axis, offset or translation",
 )
 def check_symmetries(model: ModelSubject) -> _Finding:
-    """Symmetries against the surface."""
+    """Yield symmetries that move points of the surface away from it, by more than the bound."""
     transforms = [(f"symmetries_discrete[{index}]", matrix) for index, matrix in _discrete(model) if _is_rigid(matrix)]
     for index, (axis, offset) in _continuous(model):
         if np.linalg.norm(axis) > 0.0:
@@ -221,18 +221,21 @@ def check_symmetries(model: ModelSubject) -> _Finding:
 
 
 def _is_rigid(matrix: np.ndarray) -> bool:
+    """Whether a 4 x 4 matrix is a rotation and translation, with determinant +1."""
     rotation = matrix[:3, :3]
     off = max(np.abs(rotation @ rotation.T - np.eye(3)).max(), np.abs(matrix[3] - (0, 0, 0, 1)).max(), abs(np.linalg.det(rotation) - 1.0))
     return bool(off <= RIGID_TOLERANCE)
 
 
 def _discrete(model: ModelSubject) -> Iterator[tuple[int, np.ndarray]]:
+    """Yield (index, 4 x 4 matrix) of each discrete symmetry; nothing if the entry is damaged."""
     entry = model.entry[0]
     if entry is not None and isinstance(entry.symmetries_discrete, list):
         yield from ((index, np.reshape(np.array(values, np.float64), (4, 4))) for index, values in enumerate(entry.symmetries_discrete))
 
 
 def _continuous(model: ModelSubject) -> Iterator[tuple[int, tuple[list[float], list[float]]]]:
+    """Yield (index, (axis, offset)) of each continuous symmetry; nothing if the entry is damaged."""
     entry = model.entry[0]
     if entry is not None and isinstance(entry.symmetries_continuous, list):
         yield from ((index, (item.axis, item.offset)) for index, item in enumerate(entry.symmetries_continuous))

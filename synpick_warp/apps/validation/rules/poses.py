@@ -32,7 +32,7 @@ def _found(rendered: DiagnosedView, *kinds: Kind) -> _Finding:
     "divide depth_scale in scene_camera.json, or the counts, by the factor",
 )
 def check_scale(rendered: DiagnosedView) -> _Finding:
-    """Depth with another scale."""
+    """Yield views whose depth agrees with the rendering after a change of scale."""
     yield from _found(rendered, Kind.SCALE)
 
 
@@ -43,7 +43,7 @@ def check_scale(rendered: DiagnosedView) -> _Finding:
     "multiply each pixel's depth by the cosine of its ray's angle",
 )
 def check_planar(rendered: DiagnosedView) -> _Finding:
-    """Lengths of rays."""
+    """Yield views whose depth is the length of rays instead of planar depth."""
     yield from _found(rendered, Kind.RAY)
 
 
@@ -54,7 +54,7 @@ def check_planar(rendered: DiagnosedView) -> _Finding:
     "move the masks back, or check how the writer crops or flips them",
 )
 def check_shift(rendered: DiagnosedView) -> _Finding:
-    """Masks beside their objects, where depth says that the pose is right."""
+    """Yield masks that lie beside the rendered object, although depth says that the pose is right."""
     yield from _found(rendered, Kind.SHIFT, Kind.SHIFT_VISIBLE)
 
 
@@ -65,7 +65,7 @@ def check_shift(rendered: DiagnosedView) -> _Finding:
     "exchange the masks or the entries in scene_gt.json; the ground-truth index is the position in the list",
 )
 def check_swapped(rendered: DiagnosedView) -> _Finding:
-    """Pairs of instances with each other's masks."""
+    """Yield pairs of instances that have each other's masks."""
     yield from _found(rendered, Kind.SWAP)
 
 
@@ -76,7 +76,7 @@ def check_swapped(rendered: DiagnosedView) -> _Finding:
     "correct obj_id in scene_gt.json",
 )
 def check_object(rendered: DiagnosedView) -> _Finding:
-    """Masks that another object of the view fits at the same pose."""
+    """Yield masks that another object of the view fits at the same pose."""
     yield from _found(rendered, Kind.OBJECT)
 
 
@@ -87,7 +87,7 @@ def check_object(rendered: DiagnosedView) -> _Finding:
     "correct cam_R_m2c and cam_t_m2c (model to camera, mm); check obj_id and the model's origin",
 )
 def check_pose(rendered: DiagnosedView) -> _Finding:
-    """Poses that neither the mask nor depth agree with."""
+    """Yield poses that neither the mask nor depth agree with."""
     yield from _found(rendered, Kind.POSE)
 
 
@@ -98,7 +98,7 @@ def check_pose(rendered: DiagnosedView) -> _Finding:
     "make the mask again from model and pose (calc_gt_masks.py)",
 )
 def check_mask(rendered: DiagnosedView) -> _Finding:
-    """Masks of another shape, where depth says that the pose is right."""
+    """Yield masks of another shape than the rendered one, although depth says that the pose is right."""
     yield from _found(rendered, Kind.MASK)
 
 
@@ -109,7 +109,7 @@ def check_mask(rendered: DiagnosedView) -> _Finding:
     "make mask_visib again from the instance image, or from model, pose and depth",
 )
 def check_visible(rendered: DiagnosedView) -> _Finding:
-    """Visible pixels that the mask leaves out."""
+    """Yield visible masks that leave out pixels at which the object is rendered in front."""
     yield from _found(rendered, Kind.VISIBLE)
 
 
@@ -120,5 +120,5 @@ def check_visible(rendered: DiagnosedView) -> _Finding:
     "check the mask of what lies in front, and the depth image",
 )
 def check_depth(rendered: DiagnosedView) -> _Finding:
-    """Visible masks that show something else."""
+    """Yield visible masks that cover pixels whose depth is not the object's."""
     yield from _found(rendered, Kind.DEPTH)

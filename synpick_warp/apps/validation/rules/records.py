@@ -28,7 +28,7 @@ _KEY = re.compile(r"-?[0-9]+")
     "write the file again in BOP's format: lists of numbers, matrices row by row",
 )
 def check_schema(scene: SceneSubject) -> _Finding:
-    """Files and entries that do not fit."""
+    """Yield files and entries that lack one of BOP's keys or have a value of another type or length."""
     for name in ("camera", "gt", "gt_info"):
         yield from scene.record(name).faults
 
@@ -40,7 +40,7 @@ def check_schema(scene: SceneSubject) -> _Finding:
     "write the key without leading zeros or other characters",
 )
 def check_keys(scene: SceneSubject) -> _Finding:
-    """Keys of the annotation files."""
+    """Yield keys of the annotation files that are not plain decimal integers."""
     for name in ("camera", "gt", "gt_info"):
         for key in scene.record(name).keys:
             shown = key if len(key) <= 40 else f"{key[:39]}…"
@@ -54,7 +54,7 @@ def check_keys(scene: SceneSubject) -> _Finding:
     "add the missing entry: an empty list for an image without instances",
 )
 def check_same_images(scene: SceneSubject) -> _Finding:
-    """Images that a file lacks."""
+    """Yield images that one of the three annotation files has and another lacks."""
     camera = scene.record("camera")
     for name in ("gt", "gt_info"):
         record = scene.record(name)
@@ -72,7 +72,7 @@ def check_same_images(scene: SceneSubject) -> _Finding:
     "write a proper rotation, row by row; a determinant of -1 is a mirrored axis, other matrices are scaled or cut short",
 )
 def check_rotations(scene: SceneSubject) -> _Finding:
-    """Rotations of cameras and instances."""
+    """Yield rotations of cameras and instances that are not orthonormal with determinant +1."""
     camera, truth = scene.record("camera"), scene.record("gt")
     places, matrices = [], []
     for image, entry in scene.cameras.items():
@@ -100,7 +100,7 @@ def check_rotations(scene: SceneSubject) -> _Finding:
     "keep one of the two; cam_K is fx s cx 0 fy cy 0 0 1 in pixels",
 )
 def check_camera_model(scene: SceneSubject) -> _Finding:
-    """Intrinsics of each image."""
+    """Yield images that have neither or both of cam_K and cam_model, or a cam_K that is no intrinsic matrix."""
     record = scene.record("camera")
     for image, entry in scene.cameras.items():
         has_matrix, has_model = entry.cam_K is not UNSET, entry.cam_model is not UNSET
@@ -123,7 +123,7 @@ def check_camera_model(scene: SceneSubject) -> _Finding:
     "add depth_scale: the toolkit's calc_gt_info.py, calc_gt_masks.py and VSD read it",
 )
 def check_depth_scale(scene: SceneSubject) -> _Finding:
-    """Depth scale of each image."""
+    """Yield images of a scene with depth whose depth_scale is missing, not above 0, or above MAX_DEPTH_SCALE."""
     record = scene.record("camera")
     for image, entry in scene.cameras.items() if "depth" in scene.files.kinds else ():
         if entry.depth_scale is UNSET:
@@ -139,7 +139,7 @@ def check_depth_scale(scene: SceneSubject) -> _Finding:
     "write the pose, also of hidden instances, or leave the instance out",
 )
 def check_skip_translation(scene: SceneSubject) -> _Finding:
-    """Translations of -1."""
+    """Yield instances with the translation (-1, -1, -1)."""
     record = scene.record("gt")
     for image, entries in scene.truths.items():
         for index, item in enumerate(entries):
@@ -154,7 +154,7 @@ def check_skip_translation(scene: SceneSubject) -> _Finding:
     "multiply cam_t_m2c by 1000 if it is in metres",
 )
 def check_units(scene: SceneSubject) -> _Finding:
-    """Objects whose origin is nearer than any camera could be."""
+    """Yield instances whose translation is shorter than NEAR [mm]: it is probably in metres."""
     record = scene.record("gt")
     for image, entries in scene.truths.items():
         for index, item in enumerate(entries):
@@ -171,7 +171,7 @@ def check_units(scene: SceneSubject) -> _Finding:
     level=Level.WARNING,
 )
 def check_camera_units(scene: SceneSubject) -> _Finding:
-    """World origins that are nearer than any camera could be, in all images of the scene."""
+    """Yield the scene if all its camera translations are shorter than NEAR [mm]: they are probably in metres."""
     lengths = [float(np.linalg.norm(entry.cam_t_w2c)) for entry in scene.cameras.values() if isinstance(entry.cam_t_w2c, list)]
     if lengths and 0.0 < max(lengths) < NEAR:
         yield scene.record("camera").file, f"the world's origin is at most {max(lengths):.3g} mm from the camera; it looks like metres"
@@ -184,7 +184,7 @@ def check_camera_units(scene: SceneSubject) -> _Finding:
     "add the missing one, or remove the other",
 )
 def check_extrinsics(scene: SceneSubject) -> _Finding:
-    """Extrinsics of each image."""
+    """Yield images that have only one of cam_R_w2c and cam_t_w2c."""
     record = scene.record("camera")
     for image, entry in scene.cameras.items():
         if (entry.cam_R_w2c is UNSET) != (entry.cam_t_w2c is UNSET):
@@ -198,7 +198,7 @@ def check_extrinsics(scene: SceneSubject) -> _Finding:
     "convert poses of an OpenGL camera by diag(1, -1, -1)",
 )
 def check_in_front(scene: SceneSubject) -> _Finding:
-    """Depth of origins."""
+    """Yield instances with visible pixels whose origin is not in front of the camera (z of cam_t_m2c not above 0)."""
     record = scene.record("gt")
     for image, entries in scene.truths.items():
         infos = scene.infos.get(image, [])
@@ -215,7 +215,7 @@ def check_in_front(scene: SceneSubject) -> _Finding:
     "write the identity of each object over the scene; BOP's ground-truth index is only a list position",
 )
 def check_instance_ids(scene: SceneSubject) -> _Finding:
-    """Identities of instances."""
+    """Yield instance_ids that occur twice in an image, or belong to more than one object over the scene."""
     record, known = scene.record("gt"), {}
     for image, entries in scene.truths.items():
         present = [(item.instance_id, item.obj_id) for item in entries if item.instance_id is not UNSET]
@@ -234,7 +234,7 @@ def check_instance_ids(scene: SceneSubject) -> _Finding:
     "add the model, or correct obj_id",
 )
 def check_object_models(scene: SceneSubject) -> _Finding:
-    """Objects without a model, once each."""
+    """Yield obj_ids without a model, once each."""
     models, reported = scene.layout.model_files, set()
     for image, entries in scene.truths.items() if models else ():
         for index, item in enumerate(entries):

@@ -34,7 +34,7 @@ class RigSubject:
     "restore the scene, or bake again: the same command resumes",
 )
 def check_complete(rig: RigSubject) -> _Finding:
-    """Number of scenes."""
+    """Yield episodes of a multi-sensor rig that have fewer scenes than the rig has cameras."""
     if len(rig.scenes) < rig.cameras:
         yield rig.place, f"{len(rig.scenes)} scenes of {rig.cameras} cameras"
 
@@ -46,7 +46,7 @@ def check_complete(rig: RigSubject) -> _Finding:
     "check the extrinsics' unit and direction (world to camera) and the pose of the instance",
 )
 def check_world_poses(rig: RigSubject) -> _Finding:
-    """World poses, each against the first camera's."""
+    """Yield instances whose world pose, by one camera, differs from that by the first camera that shows them."""
     known: dict[tuple[int, int], tuple[str, np.ndarray]] = {}
     for scene in rig.scenes:
         record = scene.record("gt")
@@ -70,6 +70,7 @@ def check_world_poses(rig: RigSubject) -> _Finding:
 
 
 def _transform(rotation: Any, translation: Any) -> np.ndarray:
+    """Rigid transform (4, 4) from a rotation (9 values, row by row) and a translation."""
     matrix = np.eye(4)
     matrix[:3, :3], matrix[:3, 3] = np.reshape(rotation, (3, 3)), translation
     return matrix

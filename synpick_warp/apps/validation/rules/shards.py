@@ -22,7 +22,7 @@ _Finding = Iterator[tuple[str, str]]
     "list the keys of each shard again, or restore the shard",
 )
 def check_index(folder: KeyedFolder) -> _Finding:
-    """key_to_shard.json against the members of shards."""
+    """Yield keys of key_to_shard.json whose view is in no or another shard, and views in shards that it does not name."""
     keys, fault = folder.keys
     if fault:
         yield folder.listing.name(KEYS), fault
@@ -49,7 +49,7 @@ def check_index(folder: KeyedFolder) -> _Finding:
     "write the shard again, without links or other files",
 )
 def check_shards(folder: KeyedFolder) -> _Finding:
-    """Shards and names of files."""
+    """Yield shards that cannot be read or hold more than MAX_VIEWS views, and files of other names than KEY.CONTENT."""
     for shard, found in folder.members.items():
         if isinstance(found, str):
             yield folder.listing.name(shard), found
@@ -67,7 +67,7 @@ def check_shards(folder: KeyedFolder) -> _Finding:
     "write one entry for each ground-truth index",
 )
 def check_entries(view: ViewSubject) -> _Finding:
-    """Masks of keyed views."""
+    """Yield instances of a keyed view whose mask is missing."""
     if isinstance(view.scene.files, KeyedScene):
         for kind, masks in view.masks.items():
             faults = {file for file, _ in view.faults}

@@ -25,7 +25,7 @@ _Finding = Iterator[tuple[str, str]]
     "make it again with enumerate_test_targets.py",
 )
 def check_schema(lists: TargetLists) -> _Finding:
-    """Lists that do not fit."""
+    """Yield target lists that do not fit the schema."""
     for name, found in lists.lists.items():
         if found.fault:
             yield name, found.fault
@@ -38,7 +38,7 @@ def check_schema(lists: TargetLists) -> _Finding:
     "remove its records, or restore the scene",
 )
 def check_scenes(lists: TargetLists) -> _Finding:
-    """Scenes of each list."""
+    """Yield scenes that a target list names and no split has."""
     for name, found in lists.lists.items():
         known = lists.scene_ids(name)
         for scene in sorted(set(found.scenes) - known):
@@ -52,7 +52,7 @@ def check_scenes(lists: TargetLists) -> _Finding:
     "remove the record, or restore the image",
 )
 def check_images(scene: SceneSubject) -> _Finding:
-    """Images and objects of records."""
+    """Yield targets whose image does not exist, whose object is not in it, or that occur twice."""
     for name, by_image in scene.targets.items():
         for image, records in by_image.items():
             place = f"scene {scene.files.ref.scene}, image {image}"
@@ -75,7 +75,7 @@ def check_images(scene: SceneSubject) -> _Finding:
     "make the list again with enumerate_test_targets.py",
 )
 def check_counts(scene: SceneSubject) -> _Finding:
-    """Numbers of instances."""
+    """Yield targets whose inst_count is not the number of instances visible by at least MIN_VISIBILITY."""
     for name, by_image in scene.targets.items():
         for image, records in by_image.items():
             truths, infos = scene.truths.get(image), scene.infos.get(image)

@@ -26,7 +26,7 @@ _Positive = Annotated[float, msgspec.Meta(gt=0.0, le=1e6)]
 
 
 class _CameraFile(msgspec.Struct):
-    """camera.json."""
+    """Schema of camera.json: image size, intrinsics [px], depth scale [mm per count]."""
 
     width: Annotated[int, msgspec.Meta(ge=1, le=2**16)]
     height: Annotated[int, msgspec.Meta(ge=1, le=2**16)]
@@ -44,7 +44,7 @@ class _CameraFile(msgspec.Struct):
     "replace the link by a copy of what it names",
 )
 def check_links(tree: TreeSubject) -> _Finding:
-    """Root, splits and models folders."""
+    """Yield links that lead out of the data set or nowhere, and entries that are neither file nor folder, outside of scenes."""
     layout = tree.layout
     for listing in (layout.listing, *layout.models.values(), *layout.splits.values(), *layout.keyed.values()):
         for name in listing.outside:
@@ -60,7 +60,7 @@ def check_links(tree: TreeSubject) -> _Finding:
     "rename the folder to its scene index with six digits, or move it out of the split",
 )
 def check_split_folders(tree: TreeSubject) -> _Finding:
-    """Folders of each split."""
+    """Yield folders of a split that are no scenes or whose name has not six digits, and splits without a scene."""
     for listing in tree.layout.splits.values():
         for name in sorted(listing.folders):
             if not is_index(name):
@@ -79,7 +79,7 @@ def check_split_folders(tree: TreeSubject) -> _Finding:
     "write the intrinsics of the split's camera, in pixels",
 )
 def check_camera_file(tree: TreeSubject) -> _Finding:
-    """Every camera file."""
+    """Yield camera files that cannot be read or do not fit the schema."""
     listing = tree.layout.listing
     for name in sorted(filter(_CAMERA.fullmatch, listing.files)):
         try:
@@ -96,7 +96,7 @@ def check_camera_file(tree: TreeSubject) -> _Finding:
     level=Level.WARNING,
 )
 def check_set_files(tree: TreeSubject) -> _Finding:
-    """Files that BOP's toolkit opens unconditionally."""
+    """Yield camera file, models, models_info.json and target list that are missing although BOP's tools open them unconditionally."""
     layout = tree.layout
     if not any(map(_CAMERA.fullmatch, layout.listing.files)):
         yield "camera.json", "missing; BlenderProc and render_train_imgs.py read it"
@@ -122,7 +122,7 @@ def check_set_files(tree: TreeSubject) -> _Finding:
     level=Level.WARNING,
 )
 def check_finished(tree: TreeSubject) -> _Finding:
-    """The manifest's last entry."""
+    """Yield the manifest's last entry if it is missing: the bake has not finished."""
     if tree.layout.ours and "joined.json" not in tree.layout.listing.enter("manifest").files:
         yield "manifest/joined.json", "missing: the bake was interrupted, so lists and episodes are missing"
 
@@ -134,7 +134,7 @@ def check_finished(tree: TreeSubject) -> _Finding:
     "replace the link by a copy of what it names",
 )
 def check_scene_links(scene: SceneSubject) -> _Finding:
-    """Scene folder and image folders."""
+    """Yield links out of the data set and special files, in the scene's folder and its image folders."""
     if isinstance(scene.files, FolderScene):
         for listing in (scene.files.listing, *scene.files.listings.values()):
             for name in (*listing.outside, *listing.special):
@@ -148,7 +148,7 @@ def check_scene_links(scene: SceneSubject) -> _Finding:
     "restore the file; without it no tool can read the scene",
 )
 def check_scene_files(scene: SceneSubject) -> _Finding:
-    """Files without which a scene cannot be used."""
+    """Yield a missing or empty scene_camera.json, and a scene without any colour or depth image."""
     camera = scene.record("camera")
     if not camera.present or not (camera.raw or camera.faults or camera.keys):
         yield camera.file, "missing or empty"
@@ -164,7 +164,7 @@ def check_scene_files(scene: SceneSubject) -> _Finding:
     level=Level.WARNING,
 )
 def check_ground_truth(scene: SceneSubject) -> _Finding:
-    """Annotations, which public test scenes may lack."""
+    """Yield missing annotation files and mask folders, which public test scenes may lack."""
     for name in ("gt", "gt_info"):
         if not scene.record(name).present:
             yield scene.record(name).file, "missing"
@@ -181,7 +181,7 @@ def check_ground_truth(scene: SceneSubject) -> _Finding:
     "rename the file, or move it out of the folder",
 )
 def check_image_names(scene: SceneSubject) -> _Finding:
-    """Names in the folders of images."""
+    """Yield files that no tool expects, second files of an image, and folders, in image folders."""
     if not isinstance(scene.files, FolderScene):
         return
     for kind, listing in scene.files.listings.items():
@@ -205,7 +205,7 @@ def check_image_names(scene: SceneSubject) -> _Finding:
     "restore the image, or remove its entries from the scene's JSON files",
 )
 def check_images_present(scene: SceneSubject) -> _Finding:
-    """Images of each annotated index."""
+    """Yield colour, depth and mask files that an annotated image lacks."""
     for kind in (scene.colour, "depth"):
         if kind is not None and (kind == scene.colour or kind in scene.files.kinds):
             known = scene.files.indices(kind)
@@ -227,7 +227,7 @@ def check_images_present(scene: SceneSubject) -> _Finding:
     "add the entry, or remove the file",
 )
 def check_images_extra(scene: SceneSubject) -> _Finding:
-    """Images that no annotation names."""
+    """Yield images and masks that no annotation names."""
     cameras, truths = scene.record("camera"), scene.record("gt")
     for kind in sorted(scene.files.kinds):
         for (image, index), name in sorted(scene.files.indices(kind).items(), key=_order):
@@ -239,8 +239,10 @@ def check_images_extra(scene: SceneSubject) -> _Finding:
 
 
 def _has(entries: Any, index: int) -> bool:
+    """Whether there is an entry `index` in a list of annotations, which may be damaged."""
     return isinstance(entries, list) and index < len(entries)
 
 
 def _order(item: tuple[tuple[int, int | None], str]) -> tuple[int, int]:
+    """Sort key: image, then instance; without instance first."""
     return item[0][0], -1 if item[0][1] is None else item[0][1]

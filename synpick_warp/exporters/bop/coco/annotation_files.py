@@ -41,6 +41,8 @@ _ADVICE = "remove it and its episode's two files in manifest/, and resume the ba
 
 
 class _Category(msgspec.Struct):
+    """Schema of a category in the categories file: obj_id, name, and keypoints with their positions, if there are any."""
+
     id: int
     name: str
     keypoints: list[str] | msgspec.UnsetType = msgspec.UNSET
@@ -81,10 +83,7 @@ def write_view(view: EncodedView, scene: Path, settings: ViewSettings) -> None:
 
 
 def _make_annotations(view: EncodedView, settings: ViewSettings) -> Iterator[dict[str, Any]]:
-    """Annotations of a view's visible instances, without ids: box of the visible mask, its segmentation, extras of ours, keypoints.
-
-    Widths and heights of both boxes count pixels (+ 1), unlike those of scene_gt_info.json; `bbox_amodal` may exceed the image.
-    """
+    """Annotations of a view's visible instances, without ids: box of the visible mask, segmentation, extra keys, keypoints."""
     width, height = settings.resolution
     for pose, info, mask, points in zip(view.gt, view.gt_info, view.masks(), make_keypoints(view, settings.keypoints), strict=True):
         box = mask.visible.box()
@@ -106,7 +105,7 @@ def _make_polygons(mask: Runs) -> list[list[float]]:
 
 
 def _make_extras(pose: Mapping[str, Any], info: Mapping[str, Any]) -> dict[str, Any]:
-    """Keys of ours of an annotation; data sets of others may not know them."""
+    """Extra keys of an annotation beside COCO's; data sets of other programs may lack them."""
     extras = {} if math.isnan(info["visib_fract"]) else {"visib_fract": info["visib_fract"]}
     if extras:
         extras = {"bbox_amodal": [*info["bbox_obj"][:2], *(size + 1 for size in info["bbox_obj"][2:])], **extras}
@@ -199,6 +198,7 @@ def _read_part(part: Path, out: Path) -> Iterator[list[dict[str, Any]] | None]:
 
 
 def _describe_image(cameras: int, resolution: tuple[int, int], color_format: str, scene: int, frame: int) -> dict[str, Any]:
+    """Entry of an image in COCO's list, but for its id: file name, size, episode, camera, frame."""
     width, height = resolution
     episode, camera = divmod(scene, cameras)
     name = f"{scene:06d}/{frame:06d}.{color_format}"

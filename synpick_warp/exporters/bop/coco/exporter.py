@@ -40,30 +40,32 @@ class CocoExporter(SceneExporter):
 
     @staticmethod
     def annotates(bop: Bop) -> bool:
-        """See `SceneExporter`."""
+        """True: COCO annotations are this format. See `SceneExporter`."""
         return True
 
     @staticmethod
     def folder_name(split: str) -> str:
-        """See `SceneExporter`: one for all splits."""
+        """Folder "coco", for all splits. See `SceneExporter`."""
         return FOLDER.name
 
     @staticmethod
     def shared_files(layout: DataLayout) -> SharedFiles:
-        """See `Exporter`."""
+        """Names of what is written beside episodes: categories and notes, an annotation file for each split, and the folders. See
+        `Exporter`.
+        """
         places = tuple(map(annotation_file, layout.folders))
         return SharedFiles((CATEGORIES, *note_files(layout.formats)), places, (IMAGES, PARTS, places[0].parent, FOLDER))
 
     @staticmethod
     def finalize(out: Path, config: Config, pool: WriterPool, episodes: Sequence[int]) -> list[Path]:
-        """See `Exporter`: the annotations of each split."""
+        """Write the annotation file of each split from the parts of all episodes; returns their paths. See `Exporter`."""
         try:
             return write_annotation_files(out, config, episodes)
         except OSError as error:
             raise output_error(out / FOLDER, error) from error
 
     def write_constants(self) -> list[Path]:
-        """See `Exporter`: names and keypoints of the objects, camera and notes."""
+        """Write names and keypoints of the objects, camera file and notes; returns their paths. See `Exporter`."""
         names = self._context.names
         write_categories(self._out, names, self._keypoints)
         try:
@@ -72,11 +74,13 @@ class CocoExporter(SceneExporter):
             raise output_error(self._out, error) from error
 
     def files(self, episode: int) -> list[Path]:
-        """See `Exporter`: folders of images, and parts."""
+        """Existing paths of an episode: folders of images, and parts of annotations. See `Exporter`."""
         return scene_files(self._out, [self.scene_id(episode, camera) for camera in range(len(self._cameras))])
 
     def _stage_scene(self, scene: Path) -> None:
+        """Create the staging folder of a scene."""
         scene.mkdir()
 
     def _commit_task(self, scenes: tuple[tuple[Path, int], ...], images: Sequence[int]) -> tuple[Callable[..., None], tuple[Any, ...]]:
+        """Task that completes an episode: renames its staged images and annotation parts to their places (`commit_scenes`)."""
         return commit_scenes, (scenes, self._out, images)

@@ -27,7 +27,7 @@ _FOREIGN = "\nObjects or light maps are not synpick-warp's own: set `license` to
 
 @dataclass(frozen=True)
 class SplitContent:
-    """What a card says of a split."""
+    """What the dataset card says of a split: names, numbers of views and shards, size [B]."""
 
     name: str
     """Name on the hub."""
@@ -41,7 +41,7 @@ class SplitContent:
 
 @dataclass(frozen=True)
 class CardContent:
-    """What a card says of a data set."""
+    """What the dataset card says of a data set: its splits, origin of the objects, image formats, masks, layers and effects."""
 
     splits: tuple[SplitContent, ...]
     """At least one."""
@@ -118,12 +118,12 @@ def size_category(views: int) -> str:
 
 
 def _count(power: int) -> str:
-    """A power of ten, as in 10K."""
+    """Power of ten in short form, such as 10K."""
     return f"{10 ** (power % 3)}{_SIZES[power // 3 - 1]}"
 
 
 def _features(content: CardContent) -> dict[str, object]:
-    """Columns and their types: a name, or a structure, or a list."""
+    """Columns of the card's table with their types: a type's name, a structure or a list."""
     camera = {"cam_K": _NUMBERS, "cam_R_w2c": _NUMBERS, "cam_t_w2c": _NUMBERS, "depth_scale": "float64", "light": _LIGHT}
     if content.effects:
         camera["effects"] = dict.fromkeys(content.effects, "float64")
@@ -142,13 +142,14 @@ def _features(content: CardContent) -> dict[str, object]:
 
 
 def _list_features(features: dict[str, object], indent: str) -> Iterator[str]:
-    """Lines of YAML, as `datasets.Features` reads them."""
+    """Yield lines of YAML of the features, as `datasets.Features` reads them."""
     for name, kind in features.items():
         yield f'{indent}- name: "{name}"'
         yield from _describe_type(kind, f"{indent}  ")
 
 
 def _describe_type(kind: object, indent: str) -> Iterable[str]:
+    """YAML lines of a feature's type in the dataset card: plain, struct or list."""
     if not isinstance(kind, dict):
         return (f"{indent}dtype: {kind}",)
     if set(kind) != {"list"}:

@@ -33,18 +33,20 @@ class ShardsExporter(SceneExporter):
 
     @staticmethod
     def folder_name(split: str) -> str:
-        """See `SceneExporter`: the toolkit's name."""
+        """Folder of a split: its name and "_web", as BOP's toolkit calls it. See `SceneExporter`."""
         return f"{split}_web"
 
     @staticmethod
     def shared_files(layout: DataLayout) -> SharedFiles:
-        """See `Exporter`."""
+        """Names of what is written beside episodes: models, camera and notes, key_to_shard.json of each split and the card. See
+        `Exporter`.
+        """
         splits = ShardsExporter.folders(layout)
         return SharedFiles(CONSTANTS, (*(split / KEYS_FILE for split in splits), Path(CARD_FILE)), splits)
 
     @staticmethod
     def finalize(out: Path, config: Config, pool: WriterPool, episodes: Sequence[int]) -> list[Path]:
-        """See `Exporter`: the index of views and shards of each split, and the dataset card."""
+        """Write the index of views and shards of each split, and the dataset card; returns their paths. See `Exporter`."""
         layout = DataLayout.of(config)
         cameras = layout.cameras
         scenes = [scene for episode in episodes for scene in range(cameras * episode, cameras * (episode + 1))]
@@ -59,19 +61,21 @@ class ShardsExporter(SceneExporter):
         return [*(Path(split.folder) / KEYS_FILE for split in contents), Path(CARD_FILE)]
 
     def files(self, episode: int) -> list[Path]:
-        """See `Exporter`: the shards of its scenes."""
+        """Existing shards of an episode's scenes, sorted, relative to the data set. See `Exporter`."""
         scenes = (self.scene_id(episode, camera) for camera in range(len(self._cameras)))
         return sorted(path.relative_to(self._out) for scene in scenes for path in find_shards(scene, self._folder(scene)))
 
     def _stage_scene(self, scene: Path) -> None:
+        """Create the staging folder of a scene."""
         scene.mkdir()
 
     def _commit_task(self, scenes: tuple[tuple[Path, int], ...], images: Sequence[int]) -> tuple[Callable[..., None], tuple[Any, ...]]:
+        """Task that completes an episode: packs its staged views into tar shards (`commit_shards`)."""
         return commit_shards, (scenes, self._folder(scenes[0][1]), images, self._layers)
 
 
 def _describe(config: Config, splits: list[SplitContent]) -> CardContent:
-    """What the card of a data set says."""
+    """Content of a data set's card, from its settings and splits."""
     bake, bop = config.bake, config.bop
     return CardContent(
         splits=tuple(splits),

@@ -58,11 +58,12 @@ def write_layer(data: Buffer, scene: Path, scene_id: int, name: str, frame: int)
 
 
 def _view_key(scene: int, frame: int) -> str:
-    """Key of a view."""
+    """Key of a view in shards: scene_id and im_id, of six digits each."""
     return f"{scene:06d}_{frame:06d}"
 
 
 def _layer_file(frame: int, name: str) -> str:
+    """File name of a layer in the staging folder."""
     return f"{frame}.{name}"
 
 
@@ -132,5 +133,5 @@ def list_keys(shard: Path, folder: Path) -> None:
 
 
 def shard_index(shard: Path) -> int:
-    """Parse the index in a shard's name."""
+    """Index in a shard's file name."""
     return int(shard.stem.removeprefix("shard-"))

@@ -103,7 +103,7 @@ def encode_model(entry: CatalogEntry) -> bytes:
 
 
 def make_model_info(entry: CatalogEntry) -> dict[str, Any]:
-    """An object's entry in models_info.json [mm]."""
+    """Entry of an object in models_info.json [mm]."""
     low, high = (MILLIMETERS * extremum(entry.mesh.vertices.astype(np.float64), axis=0) for extremum in (np.min, np.max))
     info: dict[str, Any] = {"diameter": MILLIMETERS * entry.diameter}
     info |= {f"min_{axis}": float(value) for axis, value in zip("xyz", low, strict=True)}
@@ -118,7 +118,7 @@ def make_model_info(entry: CatalogEntry) -> dict[str, Any]:
 
 
 def _to_millimeters(matrix: tuple[float, ...]) -> list[float]:
-    """Scale the translation of a row-major 4 x 4 matrix."""
+    """Row-major 4 x 4 matrix with the translation turned from m to mm."""
     return [MILLIMETERS * value if index in (3, 7, 11) else value for index, value in enumerate(matrix)]
 
 
@@ -168,18 +168,19 @@ def _tint_texture(material: Material) -> np.ndarray:
 
 
 def _write_json(path: Path, content: object) -> None:
+    """Write content as an indented JSON file."""
     path.write_text(json.dumps(content, indent=2) + "\n", encoding="ascii")
 
 
 def _describe_folders(layout: DataLayout) -> str:
-    """Folders of the scenes, and where each split begins."""
+    """Sentence for the notes on the folders of scenes, and where each split begins."""
     if not layout.splits:
         return f"`{layout.split}/`"
     return ", ".join(f"`{split.folder}/` (k from {split.first} on)" for split in layout.splits)
 
 
 def _describe_scenes(layout: DataLayout) -> str:
-    """Which scene has what."""
+    """Sentence for the notes on which scene has which episode and camera."""
     if layout.has_sensors:
         return f"Episode k is scene k, with files of the sensors cam0 to cam{layout.cameras - 1},"
     return f"Camera c of episode k is scene {layout.cameras} · k + c"

@@ -30,10 +30,14 @@ _ADVICE = "remove the scene and its episode's two files in manifest/, and resume
 
 
 class _Truth(msgspec.Struct):
+    """Schema of an instance in scene_gt.json, as far as targets need it: obj_id."""
+
     obj_id: Annotated[int, msgspec.Meta(ge=0, le=2**63 - 1)]
 
 
 class _Info(msgspec.Struct):
+    """Schema of an instance in scene_gt_info.json, as far as targets need it: visible fraction."""
+
     visib_fract: float
 
 
@@ -43,6 +47,7 @@ def sensor_suffixes(layout: DataLayout) -> tuple[str, ...]:
 
 
 def _kinds(layout: DataLayout) -> tuple[str, ...]:
+    """Kinds of target lists; the multi-view one only with several sensors in a scene."""
     return (*KINDS, *((MULTIVIEW,) if layout.has_sensors else ()))
 
 
@@ -63,7 +68,7 @@ def target_files(layout: DataLayout) -> tuple[str, ...]:
 
 
 def find_scenes(split: Path, scenes: Collection[int]) -> list[Path]:
-    """Find the folders of scenes in that of a split, sorted; other names, and links, are not ours."""
+    """Find the scene folders in a split's folder, sorted; other names and links are left out."""
     places = (path for path in split.iterdir() if _SCENE.fullmatch(path.name) and int(path.name) in scenes)
     return sorted(path for path in places if path.is_dir() and not path.is_symlink())
 
@@ -91,6 +96,7 @@ def write_scene_targets(scene: Path, folders: tuple[str, ...], visibility: float
 
 
 def _read(scene: Path, name: str, schema: type[_Content]) -> _Content:
+    """Read an annotation file of a scene; raises DatasetError."""
     return read_json(path_inside(scene, name, scene, DatasetError), schema, DatasetError, _ADVICE)
 
 

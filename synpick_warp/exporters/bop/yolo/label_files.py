@@ -86,6 +86,7 @@ def _make_rows(view: EncodedView, settings: ViewSettings) -> Iterator[tuple[str,
 
 
 def _format_row(index: int, points: np.ndarray) -> str:
+    """Line of a label file: class index and coordinates, relative to the image size."""
     return f"{index} {' '.join(f'{value:.6f}' for value in points.ravel().tolist())}\n"
 
 
