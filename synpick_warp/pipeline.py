@@ -11,6 +11,7 @@ import numpy as np
 
 from synpick_warp.attempts import EpisodeRecord
 from synpick_warp.codes import Phase
+from synpick_warp.configs.export import ExportSettings
 from synpick_warp.configs.schema import Config
 from synpick_warp.configs.splits import DataLayout
 from synpick_warp.dataset.digests import digest_inputs
@@ -114,16 +115,14 @@ def _fill(config: Config, output: OutputFolder, needs: Needs, names: Sequence[st
             exporters = Exporters(needs.classes, ExportContext(output.out, config, factory.catalog, factory.cameras, factory.lights, pool))
             with aborting(pool, exporters):
                 output.prepare(exporters, digest_inputs(factory.catalog, factory.lights), pool)
-                _Run(
-                    config, factory, exporters, needs.views, partial(output.commit, exporters, pool), summary, progress, StopRequest()
-                ).run()
+                _Run(factory, exporters, needs.views, partial(output.commit, exporters, pool), summary, progress, StopRequest()).run()
                 with scope("wait for writers"):
                     pool.wait()
                 exporters.close()
         if not summary.stopped:
             progress.stage("finishing files")
             with scope("finalize"):
-                finalize_data_set(output.out, config, needs.classes, pool)
+                finalize_data_set(output.out, ExportSettings.of(config), needs.classes, pool)
             if strays := describe_strays(output.out, DataLayout.of(config), committed_episodes(output.out)):
                 progress.note(strays)
         summary.wall_seconds += time.perf_counter() - started
@@ -148,9 +147,7 @@ def generate_share(share: Share, handles: Sequence[int], link: BakeLink) -> Bake
             started = time.perf_counter()
             exporters = Exporters(needs.classes, ExportContext(share.out, config, factory.catalog, factory.cameras, factory.lights, pool))
             with aborting(pool, exporters):
-                _Run(
-                    config, factory, exporters, needs.views, partial(commit_episode, share.out, exporters, pool), summary, link, link
-                ).run()
+                _Run(factory, exporters, needs.views, partial(commit_episode, share.out, exporters, pool), summary, link, link).run()
                 pool.wait()
                 exporters.close()
             summary.wall_seconds = time.perf_counter() - started
@@ -162,7 +159,6 @@ class _Run:
 
     def __init__(
         self,
-        config: Config,
         factory: Factory,
         exporters: Exporters,
         writes_views: bool,
@@ -172,11 +168,12 @@ class _Run:
         stop: StopRequest | BakeLink,
     ) -> None:
         self.stop = stop
-        self.config, self.factory, self.exporters, self.writes_views = config, factory, exporters, writes_views
+        self.factory, self.exporters, self.writes_views = factory, exporters, writes_views
         self.commit, self.summary, self.progress = commit, summary, progress
-        self.meter = ThroughputMeter(len(config.cameras.positions), summary, progress)
-        self.layout = DataLayout.of(config)
-        self.tick_time = config.physics.step * config.physics.steps_per_tick
+        self.meter = ThroughputMeter(len(factory.cameras), summary, progress)
+        self.config = factory.simulation.config
+        self.layout = DataLayout.of(self.config)
+        self.tick_time = self.config.physics.tick_time
 
     def run(self) -> None:
         """Tick until no episode remains or a signal requests a stop."""
@@ -225,9 +222,10 @@ class _Run:
                 self._end(report, world, records[int(report.column("episode")[world])])
 
     def _end(self, report: TickReport, world: int, record: EpisodeRecord) -> None:
-        row, tries = episode_row(self.layout, self.tick_time, report, world, record), self.config.settle.tries
+        config, tries = self.config, self.config.settle.tries
+        row = episode_row(self.layout, self.tick_time, report, world, record)
         end = episode_end(row, record, tries)
-        advice = remedy(self.factory.simulation.config, row.ending)
+        advice = remedy(row.ending, config.physics, config.perception, config.arrangement, config.settle)
         if advice:
             self.summary.remedies[row.ending] = advice
         if is_resampled(row, tries):

@@ -9,7 +9,6 @@ import platform
 from pathlib import Path
 
 import warp as wp
-from rich.console import Console
 from rich.table import Table
 
 from synpick_warp import __version__
@@ -27,18 +26,12 @@ MIB = 1024**2
 GIB = 1024**3
 
 
-def examine(config: Config, console: Console) -> None:
-    """Print device, versions, caches and the memory of every array of a bake with these settings.
-
-    Raises:
-        DeviceError: The configured device does not exist.
-    """
-    device = pick_device(config.bake.device)
+def machine_report(device: wp.Device) -> Table:
+    """Table of device, versions and caches."""
     table = Table(show_header=False, box=None)
     for name, value in [*describe_machine(device), *_caches()]:
         table.add_row(name, value)
-    console.print(table)
-    console.print(memory_report(config))
+    return table
 
 
 def describe_machine(device: wp.Device) -> list[tuple[str, str]]:

@@ -64,7 +64,8 @@ class StoredContext(ExportContext):
         if data.has_store:
             found = {item.object_id: item.name for item in data.objects}
         else:
-            known = object_names(self._source.folder, self._source.config, set(data.models_info))
+            config, found = self._source.config, set(data.models_info)
+            known = object_names(self._source.folder, found, config.object_rows, config.objects.diameter_tolerance)
             found = {index: known.get(index, f"obj_{index:06d}") for index in data.models_info}
         return dict(sorted(found.items()))
 

@@ -119,7 +119,7 @@ class _Context(ExportContext):
     def _names(self) -> dict[int, str]:
         found = {int(index) for view in self._data.views() for index in view.object_ids}
         folder = self._data.folder
-        named = object_names(folder, None, found) if (folder / models_folder(folder) / "models_info.json").is_file() else {}
+        named = object_names(folder, found) if (folder / models_folder(folder) / "models_info.json").is_file() else {}
         return {index: named.get(index, f"obj_{index:06d}") for index in sorted(found)}
 
     def copy_constants(self, names: tuple[Path, ...]) -> bool:
@@ -243,7 +243,8 @@ def _write(data: DataSet, work: Path, config: Config, processes: int, report: Re
 
     (work / PARTIAL).mkdir()
     with WriterPool(processes or count_cores(), 0) as pool:
-        exporters = Exporters(classes, _Context(data, work, config, pool))
+        context = _Context(data, work, config, pool)
+        exporters = Exporters(classes, context)
         exporters.write_constants()
         for episode, scene in zip(data.values(), scenes, strict=True):
             images = tuple(episode.image_ids)
@@ -254,7 +255,7 @@ def _write(data: DataSet, work: Path, config: Config, processes: int, report: Re
             exporters.end_episode(end, lambda scene=scene: commit(scene))
         pool.wait()
         exporters.close()
-        finalize(classes, work, config, pool, sorted(done))
+        finalize(classes, work, context.settings, pool, sorted(done))
     shutil.rmtree(work / PARTIAL)
     for name in _BAKED:
         (work / name).unlink(missing_ok=True)

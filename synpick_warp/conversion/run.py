@@ -69,12 +69,13 @@ def convert(folder: Path, out: Path, formats: Sequence[str], processes: int, rep
         if output.is_finished:
             return Converted(resumed, resumed)
         with WriterPool(processes or count_cores(), 0, output.lock) as pool:
-            exporters = Exporters(classes, StoredContext(source, out, config, pool))
+            context = StoredContext(source, out, config, pool)
+            exporters = Exporters(classes, context)
             output.prepare(exporters, source.inputs, pool)
             _convert_episodes(source, output, exporters, pool, contents, report)
             pool.wait()
             exporters.close()
-            finalize_data_set(out, config, classes, pool)
+            finalize_data_set(out, context.settings, classes, pool)
     return Converted(len(source.episodes), resumed)
 
 

@@ -18,6 +18,7 @@ from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 
+from synpick_warp.configs.export import ExportSettings
 from synpick_warp.configs.load import load_config
 from synpick_warp.configs.modes import may_pick
 from synpick_warp.configs.schema import Config
@@ -288,7 +289,7 @@ def commit_episode(out: Path, exporters: Exporters, pool: WriterPool, end: Episo
         submit_entry()
 
 
-def finalize_data_set(out: Path, config: Config, kinds: Sequence[type[Exporter]], pool: WriterPool) -> None:
+def finalize_data_set(out: Path, settings: ExportSettings, kinds: Sequence[type[Exporter]], pool: WriterPool) -> None:
     """Write and commit the indices of the data set: lists of episodes, attempts and evaluation targets over all committed episodes.
 
     Raises:
@@ -298,7 +299,7 @@ def finalize_data_set(out: Path, config: Config, kinds: Sequence[type[Exporter]]
         remove_folder(out / PARTIAL, ignore_errors=True)
         (out / PARTIAL).mkdir()
         episodes = committed_episodes(out)
-        paths = build_lists(out, may_pick(config.bake, config.splits)) + finalize(kinds, out, config, pool, episodes)
+        paths = build_lists(out, may_pick(settings.bake, settings.layout.splits)) + finalize(kinds, out, settings, pool, episodes)
         write_manifest_entry(out, INDICES, paths, {"episodes": episodes})
     except OSError as error:
         raise output_error(out, error) from error

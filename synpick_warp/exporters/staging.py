@@ -14,7 +14,7 @@ from typing import Any, ClassVar, Generic, TypeVar
 import numpy as np
 
 from synpick_warp.codes import Ending
-from synpick_warp.configs.schema import Config
+from synpick_warp.configs.export import ExportSettings
 from synpick_warp.exporters.base import ExportContext, StoredScene
 from synpick_warp.exporters.writing.files import PARTIAL, output_error
 from synpick_warp.exporters.writing.pool import WriterPool, WriteTask
@@ -75,7 +75,7 @@ class EpisodeExporter(ABC, Generic[_Content]):
         """Submit the tasks that wait for the end of an episode."""
 
     @staticmethod
-    def finalize(out: Path, config: Config, pool: WriterPool, episodes: Sequence[int]) -> list[Path]:
+    def finalize(out: Path, settings: ExportSettings, pool: WriterPool, episodes: Sequence[int]) -> list[Path]:
         """See `Exporter`: no index files."""
         return []
 

@@ -7,8 +7,9 @@ from __future__ import annotations
 
 import contextlib
 import gc
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 import warp as wp
@@ -20,7 +21,7 @@ from synpick_warp.exporters.registry import Needs
 from synpick_warp.factory.compilation import is_cache_warm, make_compiler, sole_compiler, submit_launches, submit_slow
 from synpick_warp.memory_plan import check_memory
 from synpick_warp.progress import Progress, SilentProgress
-from synpick_warp.scenes.build import find_repeat_rules, with_capacities, with_repeats
+from synpick_warp.scenes.build import REPEATS, find_repeat_rules, must_repeat, with_capacities
 from synpick_warp.scenes.cameras import make_cameras
 from synpick_warp.scenes.catalog import load_catalog
 from synpick_warp.scenes.fixtures import make_fixtures
@@ -69,7 +70,7 @@ class Stages:
     @property
     def tick_time(self) -> float:
         """Time between two frames [s]."""
-        return self.config.physics.step * self.config.physics.steps_per_tick
+        return self.config.physics.tick_time
 
     def make_log(self) -> AttemptLog:
         """A new attempt log."""
@@ -103,20 +104,23 @@ def build_factory(
     writers = count_writers(config)
     config = fit_to_device(without_pictures(config), device, planned, writers, processes)
     check_memory(config, device, writers, processes)
-    with compiling_if_cold(config, device, progress, records_physics, needs_images, Needs.of(config).views):
-        return _assemble(config, device, progress, episodes, records_physics, needs_images, longest_first)
+    needs = Needs.of(config)
+    smallest = partial(build_smallest, config, device, SilentProgress(), records_physics, needs_images)
+    with compiling_if_cold(smallest, device, progress, needs.views):
+        stages = build_stages(config, device, progress, episodes, records_physics, longest_first)
+        return _add_stream(stages, device, needs_images, needs.depth_files)
 
 
 @contextlib.contextmanager
-def compiling_if_cold(
-    config: Config, device: wp.Device, progress: Progress, records_physics: bool = False, needs_images: bool = True, renders: bool = True
-) -> Iterator[None]:
+def compiling_if_cold(smallest: Callable[[], Factory], device: wp.Device, progress: Progress, renders: bool = True) -> Iterator[None]:
     """Compile the kernels of a bake in parallel if the kernel cache is cold, while the body of the context builds worlds.
 
     A minimal factory, which is freed again, shows which kernels there are. They are ready when the context is left.
 
     Args:
-        config, device, progress, records_physics, needs_images: As of `build_factory`.
+        smallest: Builds the minimal factory, silently.
+        device: The device.
+        progress: Observer.
         renders: Whether views are rendered.
     """
     if is_cache_warm(device):
@@ -129,7 +133,7 @@ def compiling_if_cold(
         progress.stage("compiling kernels, once")
         with make_compiler(device, progress) as compiler:
             submit_slow(compiler, device)
-            factory = build_smallest(config, device, SilentProgress(), records_physics, needs_images)
+            factory = smallest()
             submit_launches(compiler, factory.simulation, factory.stream if renders else None)
             del factory
             gc.collect()  # Tracebacks that Warp's code generation leaves hold frames, and these its arrays.
@@ -140,22 +144,14 @@ def build_smallest(config: Config, device: wp.Device, progress: Progress, record
     """Build a minimal factory, with as few worlds as the device allows. Other arguments and errors: `build_factory`."""
     config = config.with_values({"bake.worlds": 1, "render.views_per_batch": 1})
     config = fit_to_device(config, device, 1, count_writers(config))
-    return _assemble(config, device, progress, [0], records_physics, needs_images)
+    stages = build_stages(config, device, progress, [0], records_physics)
+    return _add_stream(stages, device, needs_images, Needs.of(config).depth_files)
 
 
-def _assemble(
-    config: Config,
-    device: wp.Device,
-    progress: Progress,
-    episodes: Sequence[int] | None,
-    records_physics: bool,
-    needs_images: bool,
-    longest_first: bool = False,
-) -> Factory:
-    """Build a factory from settings whose sizes are resolved (see `fit_to_device`). Other arguments: `build_factory`."""
-    stages = build_stages(config, device, progress, episodes, records_physics, longest_first)
-    host = host_images(config.bop, config.cameras.resolution[1], device, needs_images, Needs.of(config).depth_files)
-    table, tick_time = stages.light_table, stages.tick_time
+def _add_stream(stages: Stages, device: wp.Device, needs_images: bool, depth_files: bool) -> Factory:
+    """Add a stream of views to stages; arguments as of `host_images`."""
+    config, table, tick_time = stages.config, stages.light_table, stages.tick_time
+    host = host_images(config.bop, config.cameras.resolution[1], device, needs_images, depth_files)
     layers, cameras, ids = config.render.layers, len(stages.cameras), stages.object_ids
     stream = FrameStream(stages.sizes, layers, cameras, tick_time, stages.renderer, ids, table, device, host)
     return Factory(stages.catalog, stages.cameras, stages.lights, stages.simulation, stream, stages.make_log())
@@ -196,15 +192,17 @@ def _fit_to_catalog(config: Config, catalog: Catalog, device: wp.Device, progres
     Raises:
         ConfigError: The capacities do not fit into the device's memory.
     """
-    filled = with_repeats(config, catalog)
+    filled = config.with_values(REPEATS) if must_repeat(config.arrangement, catalog) else config
     if find_repeat_rules(filled.bake, filled.pick, filled.move) != find_repeat_rules(config.bake, config.pick, config.move):
         total = sum(entry.volume for entry in catalog.entries)
         budget = config.arrangement.volume
         progress.note(f"{len(catalog)} objects take {total:.3g} of {budget:g} m³ together, so that they repeat in an episode")
-    fitted = with_capacities(filled, catalog)
-    if fitted.physics != config.physics:
-        progress.note(f"thin objects: capacity for {fitted.physics.contacts_per_world:,} contacts a world")
-        check_memory(fitted, device, 0)
+    physics = with_capacities(filled.physics, filled.arrangement.max_objects, catalog)
+    if physics is filled.physics:
+        return filled
+    progress.note(f"thin objects: capacity for {physics.contacts_per_world:,} contacts a world")
+    fitted = replace(filled, physics=physics)
+    check_memory(fitted, device, 0)
     return fitted
 
 

@@ -11,6 +11,7 @@ from __future__ import annotations
 import gc
 import weakref
 from collections.abc import Iterator, Sequence
+from functools import partial
 from types import TracebackType
 from typing import Self
 
@@ -22,10 +23,10 @@ from synpick_warp.configs.schema import Config
 from synpick_warp.configs.splits import DataLayout
 from synpick_warp.episodes import BakeSummary, episode_row, is_resampled, remedy
 from synpick_warp.errors import ConfigError
-from synpick_warp.factory.assembly import Stages, build_stages, compiling_if_cold
+from synpick_warp.factory.assembly import Stages, build_smallest, build_stages, compiling_if_cold
 from synpick_warp.memory_plan import check_episodes, check_memory, explain_shortage
 from synpick_warp.online.selection import Selection, choose_episodes
-from synpick_warp.progress import Progress
+from synpick_warp.progress import Progress, SilentProgress
 from synpick_warp.scheduling.sizes import fit_to_device
 from synpick_warp.stages.buffers import Snapshot
 from synpick_warp.stages.online.batches import BatchRing, ViewBatch
@@ -169,7 +170,7 @@ class Producer:
                 self.progress.note(f"episode {row.episode}, arrangement {row.arrangement + 1}: {row.ending.sentence}")
             else:
                 self.summary.take_episode(row, record)
-            if advice := remedy(config, row.ending):
+            if advice := remedy(row.ending, config.physics, config.perception, config.arrangement, config.settle):
                 self.summary.remedies[row.ending] = advice
 
 
@@ -195,7 +196,8 @@ def open_stream(
     config = fit_to_device(config, device, len(indices), DEVICE_ONLY)
     check_memory(config, device, DEVICE_ONLY)
     with explain_shortage(config):
-        with compiling_if_cold(config, device, progress):
+        smallest = partial(build_smallest, config, device, SilentProgress(), False, True)
+        with compiling_if_cold(smallest, device, progress):
             stages = build_stages(config, device, progress, indices)
         ring = BatchRing(stages.sizes, config.render.layers, stages.renderer, config.bop.depth_scale)
     return ViewStream(Producer(stages, ring, selection, BakeSummary(len(indices)), progress))

@@ -34,7 +34,7 @@ from synpick_warp.exporters.base import ExportContext
 from synpick_warp.exporters.registry import Exporters, Needs, aborting
 from synpick_warp.exporters.writing.pool import WriterPool
 from synpick_warp.progress import Progress
-from synpick_warp.scenes.build import with_repeats
+from synpick_warp.scenes.build import REPEATS, must_repeat
 from synpick_warp.scenes.cameras import make_cameras
 from synpick_warp.scenes.catalog import load_catalog
 from synpick_warp.scenes.lights import load_lights
@@ -269,7 +269,8 @@ def bake_on_devices(
         catalog = load_catalog(config, report=partial(report, "note"))
         lights = load_lights(config.bake.lights, partial(report, "note"), config.objects.strict)
         prepare_folder(output, needs, catalog, lights)
-        dealt = deal_episodes(order_longest_first(with_repeats(config, catalog), catalog, output.remaining, pick_device("cpu")), len(names))
+        filled = config.with_values(REPEATS) if must_repeat(config.arrangement, catalog) else config
+        dealt = deal_episodes(order_longest_first(filled, catalog, output.remaining, pick_device("cpu")), len(names))
         writers = deal_writers(count_writers(config), len(names))
         shares = [
             Share(output.out, config.with_values({"bake.device": name, "bake.writers": count}), episodes, len(names))

@@ -75,7 +75,7 @@ def make_scene_data(config: Config, catalog: Catalog, built: build.BuiltModel, l
         _layout_data(built.layout),
         _catalog_data(catalog, built, device),
         drop_data(config, lights),
-        _settle_data(config.settle, physics.step * physics.steps_per_tick),
+        _settle_data(config.settle, physics.tick_time),
         mode_data(mode_rows(config.bake, config.splits), device),
         _move_data(config.move, config.tote, gripper, physics),
         fill(

@@ -8,6 +8,7 @@ import os
 from pathlib import Path
 
 from synpick_warp.codes import Ending
+from synpick_warp.configs.export import ExportSettings
 from synpick_warp.configs.schema import FORMATS, Config
 from synpick_warp.configs.splits import DataLayout
 from synpick_warp.dataset.manifest import episode_entry, read_entry
@@ -78,7 +79,7 @@ def bake(out: Path, config: Config, shard: tuple[int, int] = (0, 1), stop_after:
             pool.wait()
             exporters.close()
             if stop_after is None:
-                finalize_data_set(out, config, needs.classes, pool)
+                finalize_data_set(out, ExportSettings.of(config), needs.classes, pool)
     return summary
 
 

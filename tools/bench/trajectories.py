@@ -19,6 +19,7 @@ from synpick_warp.frames import TickBatch
 from synpick_warp.pipeline import run_bake
 from synpick_warp.scenes.catalog import load_catalog
 from synpick_warp.scheduling.order import predict_frames
+from synpick_warp.stages.sim.arrange import sample_episodes_ahead
 from synpick_warp.system.device import pick_device
 from tools.bench.meter import LIVE_FRACTION, SteadyMeter, summarize_rates
 from tools.bench.steady import plan_spare_episodes
@@ -62,7 +63,8 @@ def _summarize(config: Config, meter: SteadyMeter) -> Iterator[Row]:
     first, last, physics = meter.readings[0], meter.readings[-1], config.physics
     seconds, ticks, frames = last.time - first.time, len(meter.readings) - 1, last.count - first.count
     rate = ticks * physics.steps_per_tick * config.bake.worlds / seconds
-    mean = float(np.mean(predict_frames(config, load_catalog(config), np.arange(config.bake.episodes, dtype=np.int32), meter.device)))
+    sampled = sample_episodes_ahead(config, load_catalog(config), np.arange(config.bake.episodes, dtype=np.int32), meter.device)
+    mean = float(np.mean(predict_frames(*sampled)))
     yield Row("world-steps", rate, "1/s")
     yield Row("simulated time: multiple of real time", rate * physics.step, "")
     yield Row("worlds with a frame in a tick", 100.0 * frames / (ticks * config.bake.worlds), "%")

@@ -13,8 +13,9 @@ from pathlib import Path
 import numpy as np
 
 from synpick_warp.codes import Ending
+from synpick_warp.configs.export import ExportSettings
 from synpick_warp.configs.schema import Config
-from synpick_warp.exporters.base import ExportContext, Exporter, TaskSizes
+from synpick_warp.exporters.base import ExportContext, Exporter
 from synpick_warp.exporters.registry import load_exporter_classes
 from synpick_warp.exporters.writing.files import PARTIAL
 from synpick_warp.exporters.writing.pool import QUEUE_DEPTH, WriterPool
@@ -68,7 +69,7 @@ def measure_writing(config: Config, factory: Factory, report: TickReport, min_se
     layers = {name: np.concatenate([batch.layers[name] for batch in batches]) for name in batches[0].layers}
     names = [name for name, array in vars(batches[0]).items() if isinstance(array, np.ndarray)]
     views = FrameBatch(**{name: np.concatenate([getattr(batch, name) for batch in batches]) for name in names}, layers=layers)
-    frames = tick_batch(report, factory.log.object_ids, config.physics.step * config.physics.steps_per_tick)
+    frames = tick_batch(report, factory.log.object_ids, config.physics.tick_time)
     yield Row("objects per view", float((views.object_id >= 0).sum(axis=1).mean()), "")
     # Files are kept until the end: some file systems create files more slowly after many deletions.
     with tempfile.TemporaryDirectory() as folder:
@@ -128,7 +129,7 @@ def _write(
 ) -> _Result:
     """Write into the new folder `out` for at least `min_seconds` [s], or until episodes have `MAX_FRAMES` frames."""
     (out / PARTIAL).mkdir(parents=True)
-    with WriterPool(processes, exporter_class.slot_bytes(TaskSizes.of(config))) as pool:
+    with WriterPool(processes, exporter_class.slot_bytes(ExportSettings.of(config))) as pool:
         exporter = exporter_class(ExportContext(out, config, factory.catalog, factory.cameras, factory.lights, pool))
         exporter.write_constants()
         for batch in (source.at(COPIES, 0)[0] for _ in range(-(-processes * QUEUE_DEPTH // len(source.views)))):

@@ -12,8 +12,9 @@ from typing import Any
 import numpy as np
 
 from synpick_warp.codes import Ending, Mode
+from synpick_warp.configs.export import ExportSettings
 from synpick_warp.configs.splits import DataLayout
-from synpick_warp.exporters.base import ExportContext, SharedFiles, TaskSizes
+from synpick_warp.exporters.base import ExportContext, SharedFiles
 from synpick_warp.exporters.staging import EpisodeExporter, StagedEpisode
 from synpick_warp.exporters.trajectory.arrays import EPISODES, STORE
 from synpick_warp.exporters.trajectory.episode import EpisodeContent, EpisodeSettings, write_episode
@@ -64,9 +65,9 @@ class TrajectoryExporter(EpisodeExporter[_Content]):
         )
 
     @staticmethod
-    def slot_bytes(sizes: TaskSizes) -> int:
+    def slot_bytes(settings: ExportSettings) -> int:
         """See `Exporter`: a tick of some episodes."""
-        size = spool_bytes(sizes.objects, sizes.steps_per_tick, sizes.stores_steps)
+        size = spool_bytes(settings.objects, settings.physics.steps_per_tick, settings.stores_steps)
         return shared_bytes((size,))
 
     @staticmethod

@@ -6,8 +6,9 @@ import os
 from functools import cached_property, partial
 from pathlib import Path
 
+from synpick_warp.configs.export import ExportSettings
 from synpick_warp.configs.splits import DataLayout
-from synpick_warp.exporters.base import SharedFiles, TaskSizes
+from synpick_warp.exporters.base import SharedFiles
 from synpick_warp.exporters.staging import EpisodeExporter, StagedEpisode
 from synpick_warp.exporters.usd.episode import write_episode
 from synpick_warp.exporters.usd.lights import make_stage_light
@@ -33,7 +34,7 @@ class UsdExporter(EpisodeExporter[TickSpool]):
     staging = FOLDER.name
 
     @staticmethod
-    def slot_bytes(sizes: TaskSizes) -> int:
+    def slot_bytes(settings: ExportSettings) -> int:
         """See `Exporter`: tasks have no images."""
         return 0
 
@@ -51,7 +52,9 @@ class UsdExporter(EpisodeExporter[TickSpool]):
         try:
             for folder in (library.parent, library):
                 folder.mkdir(exist_ok=True)
-            write_library(library, context.config, context.catalog, context.lights)
+            config = context.config
+            color = config.render.table_color if config.render.table else None
+            write_library(library, config.tote, config.gripper, config.physics, color, context.catalog, context.lights)
         except OSError as error:
             raise output_error(library, error) from error
         return [LIBRARY]
@@ -87,7 +90,7 @@ class UsdExporter(EpisodeExporter[TickSpool]):
         context = self._context
         config = context.config
         return EpisodeSettings(
-            tick_rate=1.0 / (config.physics.step * config.physics.steps_per_tick),
+            tick_rate=1.0 / config.physics.tick_time,
             gravity=config.physics.gravity,
             cameras=context.cameras,
             lights=tuple(make_stage_light(index, light, config.render.exposure) for index, light in enumerate(context.lights)),

@@ -16,8 +16,7 @@ from typing import Any
 
 import msgspec
 
-from synpick_warp.configs.schema import Config
-from synpick_warp.configs.splits import DataLayout
+from synpick_warp.configs.export import ExportSettings
 from synpick_warp.errors import DatasetError
 from synpick_warp.exporters.base import EncodedView
 from synpick_warp.exporters.bop.keypoints import Keypoints, make_category_keys
@@ -136,21 +135,21 @@ def commit_scenes(scenes: tuple[tuple[Path, int], ...], out: Path, frames: Seque
         sync_folder(out / folder)
 
 
-def write_annotation_files(out: Path, config: Config, episodes: Iterable[int]) -> list[Path]:
+def write_annotation_files(out: Path, settings: ExportSettings, episodes: Iterable[int]) -> list[Path]:
     """Join the episodes' parts to an annotation file a split; images and annotations are numbered from 1 in each. Returns their names.
 
     Raises:
         DatasetError: A part is damaged.
         OSError: A file cannot be written.
     """
-    layout = DataLayout.of(config)
+    layout = settings.layout
     parts: dict[str, list[Path]] = {split: [] for split in layout.folders}
     cameras = layout.cameras
     for episode in episodes:
         names = (out / PARTS / f"{scene:06d}.jsonl" for scene in range(cameras * episode, cameras * (episode + 1)))
         parts[layout.folder(episode)] += filter(os.path.lexists, names)
     categories = read_json(path_inside(out, str(CATEGORIES), out, DatasetError), list[_Category], DatasetError, _ADVICE)
-    describe = partial(_describe_image, cameras, config.cameras.resolution, config.bop.color_format)
+    describe = partial(_describe_image, cameras, settings.cameras.resolution, settings.bop.color_format)
     return [_write_annotations(out, describe, split, found, categories) for split, found in parts.items()]
 
 

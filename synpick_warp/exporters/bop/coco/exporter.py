@@ -9,7 +9,8 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from synpick_warp.configs.schema import Bop, Config
+from synpick_warp.configs.export import ExportSettings
+from synpick_warp.configs.schema import Bop
 from synpick_warp.configs.splits import DataLayout
 from synpick_warp.exporters.base import SharedFiles
 from synpick_warp.exporters.bop.coco.annotation_files import (
@@ -55,10 +56,10 @@ class CocoExporter(SceneExporter):
         return SharedFiles((CATEGORIES, *note_files(layout.formats)), places, (IMAGES, PARTS, places[0].parent, FOLDER))
 
     @staticmethod
-    def finalize(out: Path, config: Config, pool: WriterPool, episodes: Sequence[int]) -> list[Path]:
+    def finalize(out: Path, settings: ExportSettings, pool: WriterPool, episodes: Sequence[int]) -> list[Path]:
         """See `Exporter`: the annotations of each split."""
         try:
-            return write_annotation_files(out, config, episodes)
+            return write_annotation_files(out, settings, episodes)
         except OSError as error:
             raise output_error(out / FOLDER, error) from error
 
@@ -67,7 +68,7 @@ class CocoExporter(SceneExporter):
         names = self._context.names
         write_categories(self._out, names, self._keypoints)
         try:
-            return [CATEGORIES, *write_notes(self._out, self._context.config, names, self._cameras)]
+            return [CATEGORIES, *write_notes(self._out, self._context.settings, names, self._cameras)]
         except OSError as error:
             raise output_error(self._out, error) from error
 

@@ -7,8 +7,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from synpick_warp.configs.schema import Config
-from synpick_warp.configs.sensors import effect_ranges
+from synpick_warp.configs.export import ExportSettings
 from synpick_warp.configs.splits import DataLayout
 from synpick_warp.exporters.base import SharedFiles
 from synpick_warp.exporters.bop.scene_exporter import CONSTANTS, SceneExporter
@@ -43,9 +42,9 @@ class ShardsExporter(SceneExporter):
         return SharedFiles(CONSTANTS, (*(split / KEYS_FILE for split in splits), Path(CARD_FILE)), splits)
 
     @staticmethod
-    def finalize(out: Path, config: Config, pool: WriterPool, episodes: Sequence[int]) -> list[Path]:
+    def finalize(out: Path, settings: ExportSettings, pool: WriterPool, episodes: Sequence[int]) -> list[Path]:
         """See `Exporter`: the index of views and shards of each split, and the dataset card."""
-        layout = DataLayout.of(config)
+        layout = settings.layout
         cameras = layout.cameras
         scenes = [scene for episode in episodes for scene in range(cameras * episode, cameras * (episode + 1))]
         contents = [
@@ -53,7 +52,7 @@ class ShardsExporter(SceneExporter):
             for name, split in zip(hub_splits(layout), ShardsExporter.folders(layout), strict=True)
         ]
         try:
-            write_atomically(out / CARD_FILE, make_card(_describe(config, contents)).encode())
+            write_atomically(out / CARD_FILE, make_card(_describe(settings, contents)).encode())
         except OSError as error:
             raise output_error(out / CARD_FILE, error) from error
         return [*(Path(split.folder) / KEYS_FILE for split in contents), Path(CARD_FILE)]
@@ -70,17 +69,17 @@ class ShardsExporter(SceneExporter):
         return commit_shards, (scenes, self._folder(scenes[0][1]), images, self._layers)
 
 
-def _describe(config: Config, splits: list[SplitContent]) -> CardContent:
+def _describe(settings: ExportSettings, splits: list[SplitContent]) -> CardContent:
     """What the card of a data set says."""
-    bake, bop = config.bake, config.bop
+    bake, bop = settings.bake, settings.bop
     return CardContent(
         splits=tuple(splits),
         embedded=not (bake.models or bake.lights),
         color_suffix=f".{bop.color_format}",
         masks=bop.masks,
-        instances=config.arrangement.max_objects,
-        layers=config.render.layers,
-        effects=tuple(name for name, limits in effect_ranges(config.effects).items() if any(limits)),
+        instances=settings.objects,
+        layers=settings.layers,
+        effects=settings.effects,
     )
 
 

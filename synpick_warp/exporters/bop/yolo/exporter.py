@@ -48,7 +48,7 @@ class YoloExporter(SceneExporter):
             for folder in reversed(self.shared_files(context.layout).folders):
                 (self._out / folder).mkdir(exist_ok=True)
             write_data_file(self._out, context.names, context.layout.folders)
-            return [DATA, *write_notes(self._out, context.config, context.names, self._cameras)]
+            return [DATA, *write_notes(self._out, context.settings, context.names, self._cameras)]
         except OSError as error:
             raise output_error(self._out, error) from error
 
