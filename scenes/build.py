@@ -224,7 +224,7 @@ def must_repeat(arrangement: Arrangement, catalog: Catalog) -> bool:
 
 
 def with_capacities(physics: Physics, count: int, catalog: Catalog) -> Physics:
-    """Raise the capacities of a world of at most `count` objects if some are thinner than the contact margin: they touch through each other.
+    """Raise the capacities of a world of at most `count` objects if some are thinner than the contact margin, so touch through others.
 
     The margin of two shapes is twice `physics.gap`. Within a margin m of an object of side lengths a, b, c there is room for about
     (a + 2 m)(b + 2 m)(c + 2 m) / (a b c) - 1 others of its kind: 23 for plates of 100 x 80 x 1 mm. Piles of objects that are thicker than

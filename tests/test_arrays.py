@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import contextlib
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, fields
+from typing import Any
 
 import pytest
 import warp as wp
 
-from synpick_warp.arrays import StructArrays, allocate, allocate_struct, device_array, memory_table, struct_arrays
-from synpick_warp.memory_plan import Row, describe_arrays, queue_slots
+from synpick_warp.arrays import Row, StructArrays, allocate, allocate_struct, device_array, dry_run, struct_arrays
 from synpick_warp.stages.buffers import LastFrame, LayerBuffers, Snapshot, ViewBuffers
 from synpick_warp.stages.encoding.jpeg import JpegBuffers, JpegScratch
-from synpick_warp.stages.encoding.png import DEPTH_SCRATCH, DepthBuffers
+from synpick_warp.stages.encoding.png import GROUP_SUMS, SLOT_SUMS, DepthBuffers, DepthScratch
 from synpick_warp.stages.perception.arrays import Observation, PerceptionArrays, Plan, SegmentationScratch
 from synpick_warp.stages.perception.images import count_views
 from synpick_warp.stages.perception.plan import CYCLES, VoteArrays
@@ -40,6 +43,7 @@ from synpick_warp.stages.sim.physics import MIN_GPU_WORLDS
 from synpick_warp.stages.sim.worlds import AttemptState, SealState, WorldState, WorldStatus
 from synpick_warp.stages.stream import RING
 from synpick_warp.system.device import pick_device
+from tests.harness.memory_tables import device_arrays, queued_ticks
 from tests.worlds.small_worlds import settings
 
 NAMES = (
@@ -81,7 +85,9 @@ BASE = [
     PATH_LISTS,
     PATH_QUEUES,
     DepthBuffers,
-    *DEPTH_SCRATCH,
+    DepthScratch,
+    SLOT_SUMS,
+    GROUP_SUMS,
 ]
 PERCEPTION = [VIEWS, PerceptionArrays, SegmentationScratch, VoteArrays, CYCLES]
 LAYERS = [LayerBuffers, BODY_MOTIONS]
@@ -95,6 +101,14 @@ class Sample:
     flag: wp.array = device_array("cup", "cup", "world", dtype=wp.uint8)
 
 
+def table_of(kind: Any, sizes: dict[str, int], only: Sequence[str] | None = None) -> list[Row]:
+    """Rows of a dry run."""
+    nowhere: Any = None
+    with dry_run() as arrays:
+        allocate_struct(kind, sizes, nowhere) if isinstance(kind, StructArrays) else allocate(kind, sizes, nowhere, only)
+    return [array.row for array in arrays]
+
+
 def test_allocated_arrays_have_declared_shapes_and_types_and_are_zero(device):
     made = allocate(Sample, {"world": 3, "cup": 2}, device)
     assert [made.gap.shape, made.pose.shape, made.flag.shape] == [(3, 2), (3,), (2, 2, 3)]
@@ -102,11 +116,22 @@ def test_allocated_arrays_have_declared_shapes_and_types_and_are_zero(device):
     assert all(array.device == device and not array.numpy().any() for array in (made.gap, made.pose, made.flag))
 
 
-def test_the_table_counts_bytes_and_allocates_nothing():
-    rows = memory_table(Sample, {"world": 3, "cup": 2})
+def test_a_dry_run_counts_bytes_and_allocates_nothing():
+    rows = table_of(Sample, {"world": 3, "cup": 2})
     assert rows == [("Sample.gap", (3, 2), "m", 24), ("Sample.pose", (3,), "", 84), ("Sample.flag", (2, 2, 3), "", 12)]
-    huge = memory_table(Sample, {"world": 10**9, "cup": 1000})
+    huge = table_of(Sample, {"world": 10**9, "cup": 1000})
     assert huge[0][3] == 4 * 10**12
+
+
+def test_a_dry_run_is_that_of_its_thread_and_ends(device):
+    """A stream of another thread allocates meanwhile; after an error, too, arrays are allocated again."""
+    sizes = {"world": 3, "cup": 2}
+    with contextlib.suppress(ZeroDivisionError), ThreadPoolExecutor(1) as other, dry_run() as arrays:
+        assert isinstance(other.submit(allocate, Sample, sizes, device).result().pose, wp.array)
+        assert not arrays
+        raise ZeroDivisionError
+    assert isinstance(allocate(Sample, sizes, device).pose, wp.array)
+    assert not arrays
 
 
 def test_a_missing_extent_is_an_error(device):
@@ -119,7 +144,7 @@ def test_the_memory_table_of_every_declaration_matches_its_allocation(device, ki
     is_struct = isinstance(kind, StructArrays)
     arrays = allocate_struct(kind, SIZES, device) if is_struct else allocate(kind, SIZES, device)
     names = [name for name in kind.struct.vars if wp.types.is_array(getattr(arrays, name))] if is_struct else [f.name for f in fields(kind)]
-    rows = {name: (shape, size) for name, shape, _, size in memory_table(kind, SIZES)}
+    rows = {name: (shape, size) for name, shape, _, size in table_of(kind, SIZES)}
     assert len(rows) == len(names)
     for name in names:
         array = getattr(arrays, name)
@@ -138,7 +163,7 @@ def test_struct_arrays_have_the_types_of_the_struct_and_declared_dimensions(devi
     struct = allocate_struct(declared, {"world": 3, "cup": 2}, device)
     assert (struct.gap.shape, struct.pose.shape, struct.count) == ((3, 2), (3,), 0)
     assert (struct.gap.dtype, struct.pose.dtype) == (wp.float32, wp.transformf)
-    assert memory_table(declared, {"world": 3, "cup": 2}) == [("SampleStruct.gap", (3, 2), "m", 24), ("SampleStruct.pose", (3,), "", 84)]
+    assert table_of(declared, {"world": 3, "cup": 2}) == [("SampleStruct.gap", (3, 2), "m", 24), ("SampleStruct.pose", (3,), "", 84)]
 
 
 @pytest.mark.parametrize(
@@ -160,7 +185,7 @@ def kinds_of(rows: list[Row]) -> set[str]:
 
 def test_a_bakes_table_lists_every_array_with_its_copies():
     config = settings(bake__worlds=WORLDS, cameras__resolution=[8, 6], render__views_per_batch=3)
-    rows = describe_arrays(config)
+    rows = device_arrays(config)
     names = [name for name, *_ in rows]
     assert kinds_of(rows) == {kind.__name__ for kind in BASE}
     assert names.count("Observation.votes") == names.count("Plan.target") == names.count("WorldStatus.table") == 1
@@ -168,8 +193,7 @@ def test_a_bakes_table_lists_every_array_with_its_copies():
     assert names.count("ViewBuffers.color") == (RING if pick_device(config.bake.device).is_cuda else 1)
     by_name = {name: (shape, unit, size) for name, shape, unit, size in rows}
     assert by_name["Snapshot.pose"] == ((WORLDS, config.arrangement.max_objects), "m", 28 * WORLDS * config.arrangement.max_objects)
-    queued = queue_slots(config, pick_device(config.bake.device)) * WORLDS
-    assert by_name["queued Snapshot.pose"][0] == (queued, config.arrangement.max_objects)
+    assert by_name["queued Snapshot.pose"][0] == (queued_ticks(config) * WORLDS, config.arrangement.max_objects)
     assert by_name["ViewBuffers.color"] == ((3, 6, 8), "", 3 * 6 * 8 * 3)
 
 
@@ -212,7 +236,7 @@ def test_first_frames_trace_no_more_paths_than_a_history_counts():
 
 
 def test_the_path_traced_reference_has_no_coarse_grid():
-    names = {name.split(".")[0] for name, *_ in describe_arrays(settings(render__mode="reference"))}
+    names = {name.split(".")[0] for name, *_ in device_arrays(settings(render__mode="reference"))}
     assert "ShadedImage" in names
     assert not names & {"Guide", "CoarseLight", "RatioImages", "LampShadows"}
 
@@ -222,7 +246,7 @@ def test_a_bake_that_may_pick_has_the_arrays_of_perception(mode):
     config = settings(bake__worlds=WORLDS, perception__resolution=[64, 48], **mode)
     room = config.arrangement.max_objects
     looks = count_views(config.perception, config.bake.worlds, room, pick_device(config.bake.device))
-    rows = describe_arrays(config)
+    rows = device_arrays(config)
     assert kinds_of(rows) == {kind.__name__ for kind in BASE + PERCEPTION}
     shapes = {name: shape for name, shape, _, _ in rows if name.split(".")[0] in {kind.__name__ for kind in PERCEPTION}}
     assert shapes["PerceptionArrays.component"] == shapes["SegmentationScratch.gap"] == (looks, 48, 64)
@@ -232,19 +256,19 @@ def test_a_bake_that_may_pick_has_the_arrays_of_perception(mode):
 
 def test_a_mixture_without_picking_has_no_arrays_of_perception():
     config = settings(bake__mode="mixed", bake__mix=[0, 0, 1])
-    assert kinds_of(describe_arrays(config)) == {kind.__name__ for kind in BASE}
+    assert kinds_of(device_arrays(config)) == {kind.__name__ for kind in BASE}
 
 
 def test_fields_left_out_are_neither_allocated_nor_counted(device):
     made = allocate(Sample, {"world": 3, "cup": 2}, device, only=("pose",))
     assert (made.gap, made.flag) == (None, None)
     assert made.pose.shape == (3,)
-    assert memory_table(Sample, {"world": 3}, only=("pose",)) == [("Sample.pose", (3,), "", 84)]
+    assert table_of(Sample, {"world": 3}, only=("pose",)) == [("Sample.pose", (3,), "", 84)]
 
 
 def test_the_memory_table_lists_the_layers_of_the_settings():
-    rows = {name: (shape, unit, size) for name, shape, unit, size in describe_arrays(settings(render__layers=["flow", "nocs"]))}
+    rows = {name: (shape, unit, size) for name, shape, unit, size in device_arrays(settings(render__layers=["flow", "nocs"]))}
     assert {name for name in rows if name.startswith("LayerBuffers")} == {"LayerBuffers.flow", "LayerBuffers.nocs"}
     assert rows["LayerBuffers.flow"][1] == "px"
     assert "BodyMotions.rotation" in rows
-    assert not any(name.startswith("BodyMotions") for name, *_ in describe_arrays(settings(render__layers=["nocs"])))
+    assert not any(name.startswith("BodyMotions") for name, *_ in device_arrays(settings(render__layers=["nocs"])))

@@ -41,12 +41,12 @@ def describe_machine(device: wp.Device) -> list[tuple[str, str]]:
 
 def memory_report(config: Config) -> Table:
     """Table of shape, unit and size of every array in the memory plan of a bake with these settings, and their sum."""
-    from synpick_warp.memory_plan import describe_memory
+    from synpick_warp.memory_plan import plan_memory
     from synpick_warp.scheduling.sizes import count_writers, fit_to_device, without_pictures
 
-    episodes = sum(map(len, DataLayout.of(config).plan()))
-    config = fit_to_device(without_pictures(config), pick_device(config.bake.device), episodes, count_writers(config))
-    rows = describe_memory(config)
+    device, episodes = pick_device(config.bake.device), DataLayout.of(config).planned
+    config = fit_to_device(without_pictures(config), device, episodes, count_writers(config))
+    rows = [row for term in plan_memory(config, device) for row in term.rows]
     width, height = config.cameras.resolution
     table = Table("array", "shape", "unit", "MiB", title=f"{config.bake.worlds} worlds, {width}x{height}", show_footer=True)
     table.columns[3].justify = "right"

@@ -100,7 +100,7 @@ def build_factory(
         SynpickError: The machine has too little memory, or device, models, lights, tote or cameras cannot be used.
     """
     device = pick_device(config.bake.device)
-    planned = sum(map(len, DataLayout.of(config).plan())) if episodes is None else len(episodes)
+    planned = DataLayout.of(config).planned if episodes is None else len(episodes)
     writers = count_writers(config)
     config = fit_to_device(without_pictures(config), device, planned, writers, processes)
     check_memory(config, device, writers, processes)
@@ -178,7 +178,7 @@ def build_stages(
     progress.stage(f"building {config.bake.worlds} worlds of {len(catalog)} objects on {device.alias}")
     scene = build_render_scene(config.render, config.tote, catalog, fixtures, cameras, lights, device)
     simulation = Simulation(config, catalog, len(lights), device, scene, episodes, records_physics)
-    sizes = view_sizes(config, device)
+    sizes = view_sizes(config.render, config.cameras, config.bake.worlds, config.arrangement.max_objects, device)
     histories = simulation.layout.worlds * len(cameras)
     renderer = make_renderer(config, scene, config.arrangement.max_objects, sizes["view"], histories)
     object_ids = np.array([entry.obj_id for entry in catalog.entries], dtype=np.int32)

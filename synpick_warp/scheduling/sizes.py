@@ -52,13 +52,18 @@ def fit_to_device(config: Config, device: wp.Device, episodes: int, writers: int
     """
     is_open = {key: config.value(key) == 0 for key in _OPEN_SIZES}
     config = with_enough_worlds(config, device, episodes)
-    while terms := _short_terms(config, device, writers, processes):
+    while terms := _short_terms(plan_memory(config, device, writers), device, processes):
+        worlds, objects = config.bake.worlds, config.arrangement.max_objects
+        amounts = {
+            "render.views_per_batch": views_per_batch(config.render, config.cameras, worlds, device),
+            "perception.views": count_views(config.perception, worlds, objects, device),
+            "bake.worlds": worlds,
+        }
+        lowered = [key for key in _OPEN_SIZES if is_open[key] and amounts[key] > _least(key, device)]
         for term in sorted(terms, key=lambda term: -term.size):
-            key = next(
-                (key for key in is_open if is_open[key] and key in term.settings and _amount(config, key, device) > _least(key, device)), ""
-            )
+            key = next((key for key in lowered if key in term.settings), "")
             if key:
-                config = config.with_values({key: _reduce(key, _amount(config, key, device), device)})
+                config = config.with_values({key: _reduce(key, amounts[key], device)})
                 break
         else:
             return config
@@ -103,24 +108,14 @@ def advise_processes(config: Config, names: Sequence[str], episodes: int) -> str
     return f"one process simulates on one CPU core; --devices all starts {processes}, which write the same bytes" if processes > 1 else ""
 
 
-def _short_terms(config: Config, device: wp.Device, writers: int, processes: int) -> Sequence[Term]:
-    """Terms of the memory plan for the first memory, device or host, that is too small for them with HEADROOM; empty: all fit."""
-    terms = plan_memory(config, device, writers)
+def _short_terms(terms: Sequence[Term], device: wp.Device, processes: int) -> Sequence[Term]:
+    """Terms of a memory plan for the first memory, device or host, that is too small for them with HEADROOM; empty: all fit."""
     for on_device in (True, False):
         part = [term for term in terms if term.on_device == on_device]
         free = free_memory(device) if on_device and device.is_cuda else free_memory(None) // processes
         if part and HEADROOM * sum(term.size for term in part) + RUNTIME_BYTES > free:
             return part
     return ()
-
-
-def _amount(config: Config, key: str, device: wp.Device) -> int:
-    """Number of views or worlds that a setting stands for."""
-    if key == "render.views_per_batch":
-        return views_per_batch(config.render, config.cameras, config.bake.worlds, device)
-    if key == "perception.views":
-        return count_views(config.perception, config.bake.worlds, config.arrangement.max_objects, device)
-    return config.bake.worlds
 
 
 def _least(key: str, device: wp.Device) -> int:

@@ -219,7 +219,7 @@ def _measure_worlds(quality: int, factory: Factory, min_seconds: float, parts: t
         yield from of_part("render", _measure_rendering(factory, min_seconds))
     if "encode" in parts:
         count = min(factory.stream.batch, factory.simulation.layout.worlds * len(factory.cameras))
-        images = factory.stream.buffers[0]
+        images = factory.stream.ring[0].images
         factory.stream.renderer.render(factory.simulation.record.snapshot, _first_views(factory, count), images)
         device = factory.simulation.device
         yield from of_part("encode", measure_encoding(images, count, quality, device, min_seconds))
@@ -259,7 +259,7 @@ def _measure_rendering(factory: Factory, min_seconds: float) -> Iterator[Row]:
     device, cameras = simulation.device, len(factory.cameras)
     count = min(stream.batch, simulation.layout.worlds * cameras)
     yield Row("views in a batch", count, "")
-    views, out, renderer = _first_views(factory, count), stream.buffers[0], stream.renderer
+    views, out, renderer = _first_views(factory, count), stream.ring[0].images, stream.renderer
 
     def render() -> None:
         renderer.render(simulation.record.snapshot, views, out)

@@ -74,10 +74,10 @@ class Assets:
 
     def time_view(self, config: Config, scene: RenderScene, pile: Pile) -> float:
         """Time of a view [s], in full batches."""
-        cameras, sizes = len(config.cameras.positions), view_sizes(config, self.device)
-        count = min(sizes["view"], config.bake.worlds * cameras)
-        histories = config.bake.worlds * cameras
-        renderer = make_renderer(config, scene, config.arrangement.max_objects, sizes["view"], histories)
+        cameras, worlds, objects = len(config.cameras.positions), config.bake.worlds, config.arrangement.max_objects
+        sizes = view_sizes(config.render, config.cameras, worlds, objects, self.device)
+        count = min(sizes["view"], worlds * cameras)
+        renderer = make_renderer(config, scene, objects, sizes["view"], worlds * cameras)
         images, view = allocate(ViewBuffers, sizes, self.device), np.arange(count, dtype=np.int32)
         rows = [wp.array(values, dtype=wp.int32, device=self.device) for values in (view // cameras, view % cameras)]
         views = make_views(rows[0], rows[1], count, renderer.instances)

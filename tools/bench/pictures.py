@@ -150,8 +150,8 @@ def render_ticks(stream: FrameStream, renderer: Renderer, ticks: list[KeptTick])
     slot = 0
     for tick in ticks:
         for views in tick.batches:
-            renderer.render(tick.snapshot, views, stream.buffers[slot], stream.layer_buffers[slot])
-            slot = (slot + 1) % len(stream.buffers)
+            renderer.render(tick.snapshot, views, stream.ring[slot].images, stream.ring[slot].layers)
+            slot = (slot + 1) % len(stream.ring)
 
 
 def _time_passes(stream: FrameStream, renderers: dict[str, Renderer], ticks: list[KeptTick]) -> dict[str, list[float]]:

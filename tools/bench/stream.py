@@ -21,7 +21,7 @@ from synpick_warp.stages.buffers import Snapshot
 from synpick_warp.stages.online.batches import BatchRing, ViewBatch
 from synpick_warp.stages.render.renderer import Renderer
 from synpick_warp.stages.render.view_setup import make_views, pair_views
-from synpick_warp.stages.stream import TickReport, view_sizes
+from synpick_warp.stages.stream import TickReport
 from synpick_warp.stages.ticks import TickLoop
 from tools.options import Row
 
@@ -58,7 +58,7 @@ def measure_stream(config: Config, factory: Factory, report: TickReport, min_sec
         min_seconds: Time for which a measurement is repeated, at least [s].
     """
     device = factory.simulation.device
-    sizes, renderer, ids = view_sizes(config, device), factory.stream.renderer, factory.log.object_ids
+    sizes, renderer, ids = factory.stream.sizes, factory.stream.renderer, factory.log.object_ids
     stages = Stages(
         config, factory.catalog, factory.cameras, factory.lights, factory.simulation, renderer, sizes, ids, factory.stream.lights
     )

@@ -27,6 +27,7 @@ VIEW_BODIES = struct_arrays(
 )
 VIEWS = struct_arrays(Views, "view")
 GBUFFER = struct_arrays(GBuffer, "view", "row", "column", units={"depth": "m"})
+BACKGROUND = struct_arrays(GBuffer, "camera", "row", "column", units={"depth": "m"})
 
 
 def pair_views(worlds: np.ndarray, cameras: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

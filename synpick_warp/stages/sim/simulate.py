@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import newton
@@ -46,6 +46,25 @@ class TickRecord:
     """None: physics is not recorded."""
 
 
+@dataclass(frozen=True, eq=False)
+class WorldArrays:
+    """State and record of all worlds."""
+
+    state: WorldState
+    attempts: AttemptState
+    seals: SealState
+    last: LastFrame
+    record: TickRecord
+    """Without physics, which `StepRecorder` allocates."""
+
+
+def allocate_worlds(sizes: dict[str, int], device: wp.Device) -> WorldArrays:
+    """Allocate state and record of all worlds; `sizes`: extents by `world_sizes`."""
+    state, attempts, seals, last = (allocate(kind, sizes, device) for kind in (WorldState, AttemptState, SealState, LastFrame))
+    record = TickRecord(*(allocate(kind, sizes, device) for kind in (Snapshot, WorldStatus, Observation, Plan)))
+    return WorldArrays(state, attempts, seals, last, record)
+
+
 class Simulation:
     """N worlds that run the episodes of a list until none is left."""
 
@@ -83,20 +102,15 @@ class Simulation:
         indices = np.asarray(planned, np.int32)
         self.episodes = wp.array(indices, dtype=wp.int32, device=device)
         sizes = world_sizes(config.bake.worlds, config.arrangement.max_objects, config.move.rounds, built.layout.bodies_per_world)
-        self.state = allocate(WorldState, sizes, device)
-        self.attempts = allocate(AttemptState, sizes, device)
-        self.seals = allocate(SealState, sizes, device)
-        self.observation = allocate(Observation, sizes, device)
-        self.plan = allocate(Plan, sizes, device)
-        self.last = allocate(LastFrame, sizes, device)
+        worlds = allocate_worlds(sizes, device)
+        self.state, self.attempts, self.seals, self.last = worlds.state, worlds.attempts, worlds.seals, worlds.last
+        self.observation, self.plan = worlds.record.observation, worlds.record.plan
         self.recorder: StepRecorder | None = None
         if records_physics:
             self.recorder = StepRecorder(
                 config.trajectory, config.gripper, self.scene, self.state, self.attempts, self.seals, self.physics, sizes
             )
-        physics = self.recorder.record if self.recorder is not None else None
-        snapshot, status = allocate(Snapshot, sizes, device), allocate(WorldStatus, sizes, device)
-        self.record = TickRecord(snapshot, status, self.observation, self.plan, physics)
+        self.record = replace(worlds.record, physics=self.recorder.record if self.recorder is not None else None)
         self.suction: Suction | None = None
         self.perception: Perception | None = None
         if may_pick(config.bake, config.splits):

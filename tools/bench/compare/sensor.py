@@ -264,7 +264,7 @@ class _OurRenderer:
     """Our renderer, for the first views of the last snapshot."""
 
     def __init__(self, factory: Factory, count: int) -> None:
-        self.renderer, self.out = factory.stream.renderer, factory.stream.buffers[0]
+        self.renderer, self.out = factory.stream.renderer, factory.stream.ring[0].images
         self.snapshot = factory.simulation.record.snapshot
         scene, cameras, view = self.renderer.scene, len(factory.cameras), np.arange(count, dtype=np.int32)
         world, camera = (wp.array(v, dtype=wp.int32, device=scene.device) for v in (view // cameras, view % cameras))
