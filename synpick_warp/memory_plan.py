@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import math
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any
 
@@ -117,19 +117,17 @@ def free_memory(device: wp.Device | None) -> int:
     return free_device_memory(device) if device is not None and device.is_cuda else free_host_memory()
 
 
-def check_memory(config: Config, device: wp.Device, writers: int = 1, processes: int = 1) -> None:
+def check_memory(terms: Sequence[Term], device: wp.Device, processes: int = 1) -> None:
     """Refuse a bake that certainly exceeds the memory of this machine, or the 32-bit indices of kernels.
 
     Args:
-        config: All settings.
+        terms: The plan by `plan_memory`.
         device: Device of the simulation.
-        writers: Writer processes of the device.
         processes: Processes, such as one per device, that share the host's memory.
 
     Raises:
         ConfigError: One line with the largest term, its size, what is available, and the setting to lower.
     """
-    terms = plan_memory(config, device, writers)
     shared = "this machine" if processes == 1 else f"each of {processes} processes"
     for on_device, place in ((True, device.alias), (False, shared)):
         part = [term for term in terms if term.on_device == on_device]

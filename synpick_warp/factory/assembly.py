@@ -19,7 +19,7 @@ from synpick_warp.configs.schema import Config
 from synpick_warp.configs.splits import DataLayout
 from synpick_warp.exporters.registry import Needs
 from synpick_warp.factory.compilation import is_cache_warm, make_compiler, sole_compiler, submit_launches, submit_slow
-from synpick_warp.memory_plan import check_memory
+from synpick_warp.memory_plan import check_memory, plan_memory
 from synpick_warp.progress import Progress, SilentProgress
 from synpick_warp.scenes.build import REPEATS, find_repeat_rules, must_repeat, with_capacities
 from synpick_warp.scenes.cameras import make_cameras
@@ -103,7 +103,7 @@ def build_factory(
     planned = DataLayout.of(config).planned if episodes is None else len(episodes)
     writers = count_writers(config)
     config = fit_to_device(without_pictures(config), device, planned, writers, processes)
-    check_memory(config, device, writers, processes)
+    check_memory(plan_memory(config, device, writers), device, processes)
     needs = Needs.of(config)
     smallest = partial(build_smallest, config, device, SilentProgress(), records_physics, needs_images)
     with compiling_if_cold(smallest, device, progress, needs.views):
@@ -202,7 +202,7 @@ def _fit_to_catalog(config: Config, catalog: Catalog, device: wp.Device, progres
         return filled
     progress.note(f"thin objects: capacity for {physics.contacts_per_world:,} contacts a world")
     fitted = replace(filled, physics=physics)
-    check_memory(fitted, device, 0)
+    check_memory(plan_memory(fitted, device, 0), device)
     return fitted
 
 

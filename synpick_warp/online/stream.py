@@ -24,7 +24,7 @@ from synpick_warp.configs.splits import DataLayout
 from synpick_warp.episodes import BakeSummary, episode_row, is_resampled, remedy
 from synpick_warp.errors import ConfigError
 from synpick_warp.factory.assembly import Stages, build_smallest, build_stages, compiling_if_cold
-from synpick_warp.memory_plan import check_episodes, check_memory, explain_shortage
+from synpick_warp.memory_plan import check_episodes, check_memory, explain_shortage, plan_memory
 from synpick_warp.online.selection import Selection, choose_episodes
 from synpick_warp.progress import Progress, SilentProgress
 from synpick_warp.scheduling.sizes import fit_to_device
@@ -194,7 +194,7 @@ def open_stream(
         # A history holds the frame before, which is not rendered.
         config = config.with_values({"render.history": 0})
     config = fit_to_device(config, device, len(indices), DEVICE_ONLY)
-    check_memory(config, device, DEVICE_ONLY)
+    check_memory(plan_memory(config, device, DEVICE_ONLY), device)
     with explain_shortage(config):
         smallest = partial(build_smallest, config, device, SilentProgress(), False, True)
         with compiling_if_cold(smallest, device, progress):

@@ -10,8 +10,24 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from synpick_warp.configs.manipulation import Pick
 from synpick_warp.configs.modes import mode_weights
-from synpick_warp.configs.schema import CYCLE, EXCEED, MODES, Bake, Config, Gripper, Move, Physics, Settle, Split, Suction, Tote
+from synpick_warp.configs.schema import (
+    CYCLE,
+    EXCEED,
+    MODES,
+    Arrangement,
+    Bake,
+    Config,
+    Gripper,
+    Move,
+    Physics,
+    Render,
+    Settle,
+    Split,
+    Suction,
+    Tote,
+)
 from synpick_warp.kernels import structs
 from synpick_warp.scenes import build
 from synpick_warp.scenes.types import Catalog, CatalogEntry
@@ -74,7 +90,7 @@ def make_scene_data(config: Config, catalog: Catalog, built: build.BuiltModel, l
     return SceneData(
         _layout_data(built.layout),
         _catalog_data(catalog, built, device),
-        drop_data(config, lights),
+        drop_data(config.arrangement, config.render, config.tote, config.pick, config.move, physics.gravity, lights),
         _settle_data(config.settle, physics.tick_time),
         mode_data(mode_rows(config.bake, config.splits), device),
         _move_data(config.move, config.tote, gripper, physics),
@@ -152,20 +168,21 @@ def mode_rows(bake: Bake, splits: Sequence[Split]) -> list[tuple[int, float, flo
     return rows
 
 
-def drop_data(config: Config, lights: int) -> structs.DropData:
+def drop_data(
+    arrangement: Arrangement, render: Render, tote: Tote, pick: Pick, move: Move, gravity: float, lights: int
+) -> structs.DropData:
     """Fill `DropData` from the settings; `lights` is the number of environment maps."""
-    tote = config.tote
     return fill(
         structs.DropData,
-        config.arrangement,
-        config.render,
-        exceed=config.arrangement.fill == EXCEED,
-        move_repeats=config.move.repeats,
-        pick_repeats=config.pick.repeats,
+        arrangement,
+        render,
+        exceed=arrangement.fill == EXCEED,
+        move_repeats=move.repeats,
+        pick_repeats=pick.repeats,
         rim_length=tote.rim_size[0],
         rim_width=tote.rim_size[1],
         rim_height=tote.outer_size[2] - tote.wall,
-        gravity=config.physics.gravity,
+        gravity=gravity,
         gripper_home=wp.vec3(*GRIPPER_HOME),
         lights=lights,
     )

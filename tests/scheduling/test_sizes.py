@@ -79,7 +79,7 @@ def test_batches_shrink_until_plan_and_headroom_fit(give, gpu, mode):
     assert config.bake.worlds >= min(512, 13 * gpu)
     if gpu >= 12.0:
         assert views_per_batch(config, GPU) >= 12
-    check_memory(config, GPU)
+    check_memory(plan_memory(config, GPU), GPU)
 
 
 def test_trajectories_alone_need_no_image_buffers(give):

@@ -192,10 +192,10 @@ def measure(
         yield from _perception_fraction(config.bake.worlds * len(config.cameras.positions), config.physics.steps_per_tick, values)
         if "write" in parts:
             worlds = min(factory.simulation.layout.worlds, -(-WRITE_VIEWS // len(factory.cameras)))
-            yield from of_part("write", measure_writing(config, factory, _mark_live(factory.simulation, worlds), min_seconds))
+            yield from of_part("write", measure_writing(factory, _mark_live(factory.simulation, worlds), min_seconds))
         if "stream" in parts:
             live = _mark_live(factory.simulation, factory.simulation.layout.worlds)
-            yield from of_part("stream", measure_stream(config, factory, live, min_seconds))
+            yield from of_part("stream", measure_stream(factory, live, min_seconds))
         yield _memory_in_use(factory.simulation.device)
     if "pictures" in parts:
         yield from of_part("pictures", measure_pictures(config, after))

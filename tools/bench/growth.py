@@ -9,12 +9,13 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import warp as wp
 
-from synpick_warp.configs.schema import Cameras, Config
+from synpick_warp.configs.schema import Arrangement, Bake, Cameras, Config, Render
 from synpick_warp.factory.assembly import make_renderer
 from synpick_warp.scenes.cameras import make_cameras
 from synpick_warp.scenes.catalog import load_catalog
@@ -23,7 +24,7 @@ from synpick_warp.scenes.lights import load_lights
 from synpick_warp.stages.buffers import Snapshot, ViewBuffers, allocate
 from synpick_warp.stages.render.scene import RenderScene, build_render_scene
 from synpick_warp.stages.render.view_setup import make_views
-from synpick_warp.stages.sim.physics import with_enough_worlds
+from synpick_warp.stages.sim.physics import MIN_GPU_WORLDS
 from synpick_warp.stages.sim.simulate import Simulation
 from synpick_warp.stages.stream import view_sizes
 from synpick_warp.system.device import pick_device
@@ -36,6 +37,8 @@ FRACTIONS = {"worlds": (0.125, 0.25, 0.5), "objects": (0.25, 0.5), "resolution":
 """Values of each factor, as multiples of the settings' own: worlds, volume of the objects, image width and height, cameras."""
 PATHS = (1, 2, 4)
 """Paths per coarse pixel."""
+Variation = tuple[str, dict[str, object]]
+"""Value of a factor as a text, and the settings that differ."""
 
 
 @dataclass(frozen=True)
@@ -50,70 +53,80 @@ class Pile:
 
 
 class Assets:
-    """Objects and lights, loaded once, and measurements of worlds with them."""
+    """Objects and lights, loaded once."""
 
     def __init__(self, config: Config, min_seconds: float) -> None:
         self.device, self.min_seconds = pick_device(config.bake.device), min_seconds
         self.catalog, self.lights = load_catalog(config), load_lights(config.bake.lights)
 
-    def build_scene(self, config: Config) -> RenderScene:
-        """Renderer's scene of these settings."""
-        fixtures, cameras = make_fixtures(config.tote, config.gripper), make_cameras(config.cameras)
-        return build_render_scene(config.render, config.tote, self.catalog, fixtures, cameras, self.lights, self.device)
 
-    def drop(self, config: Config, scene: RenderScene) -> Pile:
+class Variant:
+    """Measurements of worlds with some settings."""
+
+    def __init__(self, assets: Assets, config: Config) -> None:
+        self.assets, self.config = assets, config
+        self.steps = config.physics.steps_per_tick * config.bake.worlds
+        """Steps of all worlds in a tick."""
+
+    def build_scene(self) -> RenderScene:
+        """Renderer's scene."""
+        config, assets = self.config, self.assets
+        fixtures, cameras = make_fixtures(config.tote, config.gripper), make_cameras(config.cameras)
+        return build_render_scene(config.render, config.tote, assets.catalog, fixtures, cameras, assets.lights, assets.device)
+
+    def drop(self, scene: RenderScene) -> Pile:
         """Drop piles and time ticks of their physics."""
-        simulation = Simulation(config, self.catalog, len(self.lights), self.device, scene, range(config.bake.worlds))
+        config, assets = self.config, self.assets
+        simulation = Simulation(config, assets.catalog, len(assets.lights), assets.device, scene, range(config.bake.worlds))
         simulation.scene.settle.rest_ticks = simulation.scene.settle.max_ticks = FOREVER
         tick = simulation.tick
         for _ in range(DROP_TICKS):
             tick()
-        seconds = seconds_per_call(tick, self.device, self.min_seconds, BURST)
+        seconds = seconds_per_call(tick, assets.device, assets.min_seconds, BURST)
         snapshot = simulation.record.snapshot
         return Pile(snapshot, float((snapshot.catalog_index.numpy() >= 0).sum(axis=1).mean()), seconds)
 
-    def time_view(self, config: Config, scene: RenderScene, pile: Pile) -> float:
+    def time_view(self, scene: RenderScene, pile: Pile) -> float:
         """Time of a view [s], in full batches."""
-        cameras, worlds, objects = len(config.cameras.positions), config.bake.worlds, config.arrangement.max_objects
-        sizes = view_sizes(config.render, config.cameras, worlds, objects, self.device)
+        config, device, worlds = self.config, self.assets.device, self.config.bake.worlds
+        cameras, objects = len(config.cameras.positions), config.arrangement.max_objects
+        sizes = view_sizes(config.render, config.cameras, worlds, objects, device)
         count = min(sizes["view"], worlds * cameras)
         renderer = make_renderer(config, scene, objects, sizes["view"], worlds * cameras)
-        images, view = allocate(ViewBuffers, sizes, self.device), np.arange(count, dtype=np.int32)
-        rows = [wp.array(values, dtype=wp.int32, device=self.device) for values in (view // cameras, view % cameras)]
+        images, view = allocate(ViewBuffers, sizes, device), np.arange(count, dtype=np.int32)
+        rows = [wp.array(values, dtype=wp.int32, device=device) for values in (view // cameras, view % cameras)]
         views = make_views(rows[0], rows[1], count, renderer.instances)
-        return seconds_per_call(lambda: renderer.render(pile.snapshot, views, images), self.device, self.min_seconds, BURST) / count
+        return seconds_per_call(lambda: renderer.render(pile.snapshot, views, images), device, self.assets.min_seconds, BURST) / count
 
 
-def vary_worlds(config: Config, factor: float) -> tuple[str, Config]:
+def vary_worlds(bake: Bake, factor: float) -> Variation:
     """Other number of worlds."""
-    worlds = max(1, round(factor * config.bake.worlds))
-    config = with_enough_worlds(config.with_values({"bake.worlds": worlds}), pick_device(config.bake.device))
-    return str(config.bake.worlds), config
+    least = MIN_GPU_WORLDS if pick_device(bake.device).is_cuda else 1
+    worlds = max(least, round(factor * bake.worlds))
+    return str(worlds), {"bake.worlds": worlds}
 
 
-def vary_objects(config: Config, factor: float) -> tuple[str, Config]:
+def vary_objects(arrangement: Arrangement, factor: float) -> Variation:
     """Other volume of the objects."""
-    volume = factor * config.arrangement.volume
-    return f"{1e3 * volume:.3g} l", config.with_values({"arrangement.volume": volume})
+    volume = factor * arrangement.volume
+    return f"{1e3 * volume:.3g} l", {"arrangement.volume": volume}
 
 
-def vary_resolution(config: Config, factor: float) -> tuple[str, Config]:
+def vary_resolution(cameras: Cameras, factor: float) -> Variation:
     """Other image size of the same shape."""
-    width, height = (max(1, round(factor * size)) for size in config.cameras.resolution)
-    return f"{width}x{height}", config.with_values({"cameras.resolution": (width, height)})
+    width, height = (max(1, round(factor * size)) for size in cameras.resolution)
+    return f"{width}x{height}", {"cameras.resolution": (width, height)}
 
 
-def vary_paths(config: Config, paths: float) -> tuple[str, Config]:
+def vary_paths(_: Render, paths: float) -> Variation:
     """Other number of paths per coarse pixel."""
-    return str(int(paths)), config.with_values({"render.coarse_paths": int(paths)})
+    return str(int(paths)), {"render.coarse_paths": int(paths)}
 
 
-def vary_cameras(config: Config, factor: float) -> tuple[str, Config]:
+def vary_cameras(cameras: Cameras, factor: float) -> Variation:
     """Other number of cameras: the first ones, or all, and then these turned by 180° about the vertical."""
-    cameras, present = config.cameras, len(config.cameras.positions)
-    count = max(1, round(factor * present))
-    chosen = replace(cameras, positions=_turn(cameras, "positions", count), ups=_turn(cameras, "ups", count))
-    return str(count), replace(config, cameras=chosen)
+    count = max(1, round(factor * len(cameras.positions)))
+    return str(count), {f"cameras.{name}": _turn(cameras, name, count) for name in ("positions", "ups")}
 
 
 def _turn(cameras: Cameras, name: str, count: int) -> tuple[tuple[float, float, float], ...]:
@@ -122,28 +135,31 @@ def _turn(cameras: Cameras, name: str, count: int) -> tuple[tuple[float, float, 
     return tuple(((-1) ** turn * x, (-1) ** turn * y, z) for turn in range(repeats) for x, y, z in vectors)[:count]
 
 
-VARIATIONS: dict[str, Callable[[Config, float], tuple[str, Config]]] = {
-    "worlds": vary_worlds,
-    "objects": vary_objects,
-    "resolution": vary_resolution,
-    "paths": vary_paths,
-    "cameras": vary_cameras,
+VARIATIONS: dict[str, tuple[str, Callable[[Any, float], Variation]]] = {
+    "worlds": ("bake", vary_worlds),
+    "objects": ("arrangement", vary_objects),
+    "resolution": ("cameras", vary_resolution),
+    "paths": ("render", vary_paths),
+    "cameras": ("cameras", vary_cameras),
 }
+"""Section of the settings that a factor changes, and its variation."""
 
 
 def measure_growth(config: Config, min_seconds: float) -> Iterator[Row]:
     """Measure the settings themselves, then each factor's values; a measurement is repeated for at least `min_seconds` [s]."""
     started = time.perf_counter()
     assets = Assets(config, min_seconds)
-    scene = assets.build_scene(config)
-    pile = assets.drop(config, scene)
-    yield from _rows("as set", config.physics.steps_per_tick * config.bake.worlds, pile, assets.time_view(config, scene, pile))
-    for factor, vary in VARIATIONS.items():
-        for value, varied in dict(vary(config, multiple) for multiple in FRACTIONS.get(factor, PATHS)).items():
-            other = assets.build_scene(varied) if factor in ("resolution", "cameras") else scene
-            dropped = assets.drop(varied, scene) if factor in ("worlds", "objects") else None
-            view = assets.time_view(varied, other, dropped or pile)
-            yield from _rows(f"{factor} {value}", varied.physics.steps_per_tick * varied.bake.worlds, dropped, view)
+    own = Variant(assets, config)
+    scene = own.build_scene()
+    pile = own.drop(scene)
+    yield from _rows("as set", own.steps, pile, own.time_view(scene, pile))
+    for factor, (section, vary) in VARIATIONS.items():
+        for value, values in dict(vary(getattr(config, section), multiple) for multiple in FRACTIONS.get(factor, PATHS)).items():
+            varied = Variant(assets, config.with_values(values))
+            other = varied.build_scene() if factor in ("resolution", "cameras") else scene
+            dropped = varied.drop(scene) if factor in ("worlds", "objects") else None
+            view = varied.time_view(other, dropped or pile)
+            yield from _rows(f"{factor} {value}", varied.steps, dropped, view)
     yield Row("all measurements", time.perf_counter() - started, "s")
 
 

@@ -29,7 +29,7 @@ from synpick_warp.stages.render.denoised import LIGHT_HISTORY, DenoisedRenderer
 from synpick_warp.stages.render.renderer import Renderer
 from synpick_warp.stages.stream import FrameStream, TickReader, TickReport
 from tools.bench.meter import LIVE_FRACTION
-from tools.bench.steady import plan_spare_episodes
+from tools.bench.steady import SPARE_EPISODES
 from tools.bench.stream import batch_views, select_views
 from tools.options import Row
 
@@ -86,7 +86,7 @@ def measure_pictures(config: Config, after: int = 0) -> Iterator[Row]:
         after: Ticks simulated before the histories begin; just after the drop little moves.
     """
     started = time.perf_counter()
-    config = plan_spare_episodes(config)
+    config = config.with_values({"bake.episodes": SPARE_EPISODES * config.bake.worlds})
     needs = Needs.of(config)
     factory = build_factory(config, SilentProgress(), needs_images=needs.images)
     stream, device = factory.stream, factory.simulation.device

@@ -11,7 +11,6 @@ import numpy as np
 import warp as wp
 
 from synpick_warp.codes import Phase
-from synpick_warp.configs.schema import Config
 from synpick_warp.episodes import BakeSummary
 from synpick_warp.factory.assembly import Factory, Stages
 from synpick_warp.online.selection import Selection
@@ -48,16 +47,15 @@ class _UnloggedProducer(Producer):
         return
 
 
-def measure_stream(config: Config, factory: Factory, report: TickReport, min_seconds: float) -> Iterator[Row]:
+def measure_stream(factory: Factory, report: TickReport, min_seconds: float) -> Iterator[Row]:
     """Benchmark of batches of one tick, and of ticks.
 
     Args:
-        config: Settings.
         factory: Worlds in the middle of acting, and renderer.
         report: Report of the last tick, with the worlds that are rendered marked as live.
         min_seconds: Time for which a measurement is repeated, at least [s].
     """
-    device = factory.simulation.device
+    device, config = factory.simulation.device, factory.simulation.config
     sizes, renderer, ids = factory.stream.sizes, factory.stream.renderer, factory.log.object_ids
     stages = Stages(
         config, factory.catalog, factory.cameras, factory.lights, factory.simulation, renderer, sizes, ids, factory.stream.lights

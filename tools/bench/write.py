@@ -14,7 +14,6 @@ import numpy as np
 
 from synpick_warp.codes import Ending
 from synpick_warp.configs.export import ExportSettings
-from synpick_warp.configs.schema import Config
 from synpick_warp.exporters.base import ExportContext, Exporter
 from synpick_warp.exporters.registry import load_exporter_classes
 from synpick_warp.exporters.writing.files import PARTIAL
@@ -55,16 +54,15 @@ class _Input:
         return ((COPIES + 1) * episode + copy).astype(np.int32)
 
 
-def measure_writing(config: Config, factory: Factory, report: TickReport, min_seconds: float) -> Iterator[Row]:
+def measure_writing(factory: Factory, report: TickReport, min_seconds: float) -> Iterator[Row]:
     """Benchmark of each format alone.
 
     Args:
-        config: Settings, with the formats.
-        factory: Worlds and renderer that provide the input.
+        factory: Worlds and renderer that provide the input; its settings name the formats.
         report: Selects the worlds whose views are written.
         min_seconds: Time of a measurement, at least [s].
     """
-    snapshot = factory.simulation.record.snapshot
+    config, snapshot = factory.simulation.config, factory.simulation.record.snapshot
     batches = [_copy(batch) for batch in factory.stream.render(snapshot, report)]
     layers = {name: np.concatenate([batch.layers[name] for batch in batches]) for name in batches[0].layers}
     names = [name for name, array in vars(batches[0]).items() if isinstance(array, np.ndarray)]
@@ -74,16 +72,16 @@ def measure_writing(config: Config, factory: Factory, report: TickReport, min_se
     # Files are kept until the end: some file systems create files more slowly after many deletions.
     with tempfile.TemporaryDirectory() as folder:
         for name in config.bake.formats:
-            yield from _measure_format(name, config, factory, _Input(views, frames), min_seconds, Path(folder) / name)
+            yield from _measure_format(name, factory, _Input(views, frames), min_seconds, Path(folder) / name)
 
 
-def _measure_format(name: str, config: Config, factory: Factory, source: _Input, min_seconds: float, folder: Path) -> Iterator[Row]:
+def _measure_format(name: str, factory: Factory, source: _Input, min_seconds: float, folder: Path) -> Iterator[Row]:
     """Benchmark of one format for 1, 2, 4, ... processes up to one per core; finishing episodes is measured with the last count."""
     (exporter_class,) = load_exporter_classes((name,))
     cores = count_cores()
     result = _Result(0.0, {}, 0.0, 0, 0.0, 0.0, 0.0)
     for processes in sorted({1, *(2**power for power in range(1, cores.bit_length())), cores}):
-        result = _write(exporter_class, config, factory, source, processes, min_seconds, folder / str(processes))
+        result = _write(exporter_class, factory, source, processes, min_seconds, folder / str(processes))
         label = f"{name}, {processes} process{'es' if processes > 1 else ''}"
         yield Row(f"{label}: views", result.rate, "1/s")
         for part, seconds in result.cpu.items():
@@ -124,11 +122,10 @@ class _Result:
     """Size of files per view [B]."""
 
 
-def _write(
-    exporter_class: type[Exporter], config: Config, factory: Factory, source: _Input, processes: int, min_seconds: float, out: Path
-) -> _Result:
+def _write(exporter_class: type[Exporter], factory: Factory, source: _Input, processes: int, min_seconds: float, out: Path) -> _Result:
     """Write into the new folder `out` for at least `min_seconds` [s], or until episodes have `MAX_FRAMES` frames."""
     (out / PARTIAL).mkdir(parents=True)
+    config = factory.simulation.config
     with WriterPool(processes, exporter_class.slot_bytes(ExportSettings.of(config))) as pool:
         exporter = exporter_class(ExportContext(out, config, factory.catalog, factory.cameras, factory.lights, pool))
         exporter.write_constants()

@@ -26,7 +26,7 @@ from synpick_warp.codes import Phase
 from synpick_warp.configs.schema import FAST, REFERENCE, Config
 from synpick_warp.errors import SynpickError
 from synpick_warp.factory.assembly import build_stages, make_renderer
-from synpick_warp.memory_plan import check_memory, explain_shortage
+from synpick_warp.memory_plan import check_memory, explain_shortage, plan_memory
 from synpick_warp.progress import SilentProgress
 from synpick_warp.scheduling.sizes import fit_to_device
 from synpick_warp.stages.buffers import Snapshot
@@ -35,7 +35,7 @@ from synpick_warp.system.device import pick_device
 from tools.figures import finish_report
 from tools.options import Row, configure, fail, make_parser, positive_count, writable_file
 from tools.reports.reference_store import ReferenceStore, existing_folder
-from tools.reports.render_checks import Shot, Studio, bounded_row, with_mode, with_one_camera
+from tools.reports.render_checks import Shot, Studio, bounded_row, first_camera
 from tools.reports.render_piles import MAX_BIAS, Pair
 from tools.reports.render_sheet import write_sheets
 
@@ -73,7 +73,8 @@ def main(arguments: list[str] | None = None) -> int:
     missing = set(options.frames)
     try:
         worlds = {"bake.episodes": options.episodes, "bake.worlds": options.episodes}
-        config = with_one_camera(configure(options, worlds | {"bake.mode": options.mode, "render.samples": options.samples}))
+        config = configure(options, worlds | {"bake.mode": options.mode, "render.samples": options.samples})
+        config = config.with_values(first_camera(config.cameras))
         device = pick_device(config.bake.device)
         for frame, pair in compare_frames(config, options.frames, options.references):
             pairs.append(pair)
@@ -105,16 +106,14 @@ def compare_frames(config: Config, frames: tuple[int, ...], cache: Path | None =
     """
     store = ReferenceStore(cache, config)
     device = pick_device(config.bake.device)
-    config = fit_to_device(with_mode(config, FAST), device, config.bake.episodes)
-    check_memory(config, device)
+    config = fit_to_device(config.with_values({"render.mode": FAST}), device, config.bake.episodes)
+    check_memory(plan_memory(config, device), device)
     with explain_shortage(config):
         stages = build_stages(config, device, SilentProgress(), range(config.bake.episodes))
     denoised = Studio(stages.renderer)
     room, half = config.arrangement.max_objects, config.with_values({"render.samples": max(1, config.render.samples // 2)})
-    references = [
-        Studio(make_renderer(with_mode(half, REFERENCE, seed=config.bake.seed + offset), stages.renderer.scene, room, 1))
-        for offset in (0, 1)
-    ]
+    seeds = ({"render.mode": REFERENCE, "bake.seed": config.bake.seed + offset} for offset in (0, 1))
+    references = [Studio(make_renderer(half.with_values(each), stages.renderer.scene, room, 1)) for each in seeds]
     simulation, names = stages.simulation, stages.light_table.name
     while True:
         simulation.tick()

@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from synpick_warp.arrays import allocate
 from synpick_warp.codes import Segment
-from synpick_warp.configs.schema import Config, Render
+from synpick_warp.configs.schema import Render
 from synpick_warp.factory.assembly import Factory
 from synpick_warp.scenes.fixtures import make_fixtures
 from synpick_warp.scenes.types import Camera, Catalog, Fixture, Material, TriangleMesh
@@ -210,13 +210,13 @@ def compare_surfaces(cameras: tuple[Camera, ...], normal: np.ndarray, albedo: np
     ]
 
 
-def measure_sensor(config: Config, factory: Factory, min_seconds: float) -> Iterator[Row]:
+def measure_sensor(factory: Factory, min_seconds: float) -> Iterator[Row]:
     """Benchmark of both renderers for three sets of outputs.
 
     Both update poses and render a batch of views. On CUDA both launch without waiting, so that launch overhead is hidden. The
     sensor has no light maps, amodal bits, counts, boxes, or texture minification.
     """
-    simulation, renderer = factory.simulation, factory.stream.renderer
+    simulation, renderer, config = factory.simulation, factory.stream.renderer, factory.simulation.config
     device, snapshot = simulation.device, simulation.record.snapshot
     count = min(factory.stream.batch, simulation.layout.worlds * len(factory.cameras))
     started = time.perf_counter()
