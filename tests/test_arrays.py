@@ -5,93 +5,43 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Any
 
 import pytest
 import warp as wp
 
 from synpick_warp.arrays import Row, StructArrays, allocate, allocate_struct, device_array, dry_run, struct_arrays
-from synpick_warp.stages.buffers import LastFrame, LayerBuffers, Snapshot, ViewBuffers
-from synpick_warp.stages.encoding.jpeg import JpegBuffers, JpegScratch
-from synpick_warp.stages.encoding.png import GROUP_SUMS, SLOT_SUMS, DepthBuffers, DepthScratch
-from synpick_warp.stages.perception.arrays import Observation, PerceptionArrays, Plan, SegmentationScratch
-from synpick_warp.stages.perception.images import count_views
-from synpick_warp.stages.perception.plan import CYCLES, VoteArrays
-from synpick_warp.stages.render.annotate import BORDER_BOXES
+from synpick_warp.configs.schema import LAYERS
+from synpick_warp.stages.buffers import view_buffer_sizes
+from synpick_warp.stages.host_copies import HostImages
+from synpick_warp.stages.online.batches import allocate_slot
+from synpick_warp.stages.perception.images import allocate_batch, count_views
+from synpick_warp.stages.perception.plan import allocate_votes
 from synpick_warp.stages.render.denoised import (
-    COARSE_LIGHT,
-    EDGE_LISTS,
-    GUIDE,
-    LAMP_SHADOWS,
-    LIGHT_HISTORY,
-    MOVING_BODIES,
-    PATH_LISTS,
-    PATH_QUEUES,
-    RATIO_IMAGES,
-    FootprintLists,
-    ShadowRays,
     scratch_sizes,
 )
-from synpick_warp.stages.render.layers import BODY_MOTIONS
-from synpick_warp.stages.render.mask_runs import BoundaryBuffers, BoundaryScratch
-from synpick_warp.stages.render.raster import VISIBILITY_BUFFER
-from synpick_warp.stages.render.renderer import SHADED_IMAGE
+from synpick_warp.stages.render.renderer import Renderer
 from synpick_warp.stages.render.sampling_rates import FIRST_FRAME_PATHS, first_frame_paths, paths_per_coarse_pixel
-from synpick_warp.stages.render.view_setup import GBUFFER, VIEW_BODIES, VIEWS
+from synpick_warp.stages.render.scene import blank_scene
 from synpick_warp.stages.sim.physics import MIN_GPU_WORLDS
-from synpick_warp.stages.sim.worlds import AttemptState, SealState, WorldState, WorldStatus
-from synpick_warp.stages.stream import RING
+from synpick_warp.stages.sim.simulate import allocate_worlds
+from synpick_warp.stages.sim.step_log import allocate_record, record_sizes
+from synpick_warp.stages.sim.worlds import world_sizes
+from synpick_warp.stages.stream import RING, allocate_ring
 from synpick_warp.system.device import pick_device
 from tests.harness.memory_tables import device_arrays, queued_ticks
 from tests.worlds.small_worlds import settings
 
-NAMES = (
-    "one world world_and_global instance body waypoint status measure fixture view row column count box side point kind subset tile "
-    "image field boundary cell_row cell_column shadow_row shadow_column edge_chunk chunk_cell chunk_pixel edge_counter "
-    "chunk chunk_footprint block "
-    "world_camera view_instance one slot slot_word group depth_byte "
-    "sample_row sample_block quad interval lane byte region rank path_kind record"
-    " queue_view queue_region queue_stage stage_parity queue_slot path_record"
-)
 WORLDS = MIN_GPU_WORLDS + 1
-SIZES = {name: 2 + number for number, name in enumerate(NAMES.split())}
-BASE = [
-    WorldState,
-    AttemptState,
-    SealState,
-    LastFrame,
-    Observation,
-    Plan,
-    WorldStatus,
-    Snapshot,
-    ViewBuffers,
-    VIEW_BODIES,
-    GBUFFER,
-    SHADED_IMAGE,
-    BoundaryBuffers,
-    BoundaryScratch,
-    GUIDE,
-    COARSE_LIGHT,
-    RATIO_IMAGES,
-    LAMP_SHADOWS,
-    ShadowRays,
-    EDGE_LISTS,
-    FootprintLists,
-    VISIBILITY_BUFFER,
-    BORDER_BOXES,
-    LIGHT_HISTORY,
-    MOVING_BODIES,
-    PATH_LISTS,
-    PATH_QUEUES,
-    DepthBuffers,
-    DepthScratch,
-    SLOT_SUMS,
-    GROUP_SUMS,
-]
-PERCEPTION = [VIEWS, PerceptionArrays, SegmentationScratch, VoteArrays, CYCLES]
-LAYERS = [LayerBuffers, BODY_MOTIONS]
-DECLARED = BASE + PERCEPTION + LAYERS
+NAMES = (
+    "WorldState AttemptState SealState LastFrame Observation Plan WorldStatus Snapshot ViewBuffers ViewBodies GBuffer ShadedImage "
+    "BoundaryBuffers BoundaryScratch Guide CoarseLight RatioImages LampShadows ShadowRays EdgeLists FootprintLists VisibilityBuffer "
+    "BorderBoxes LightHistory MovingBodies PathLists PathQueues DepthBuffers DepthScratch SlotSums"
+)
+BASE = set(NAMES.split())
+"""Declarations of which every bake has arrays."""
+PERCEPTION = {"Views", "PerceptionArrays", "SegmentationScratch", "VoteArrays", "Cycles"}
 
 
 @dataclass(frozen=True, eq=False)
@@ -139,16 +89,30 @@ def test_a_missing_extent_is_an_error(device):
         allocate(Sample, {"world": 3}, device)
 
 
-@pytest.mark.parametrize("kind", [*DECLARED, JpegBuffers, JpegScratch], ids=lambda kind: kind.__name__)
-def test_the_memory_table_of_every_declaration_matches_its_allocation(device, kind):
-    is_struct = isinstance(kind, StructArrays)
-    arrays = allocate_struct(kind, SIZES, device) if is_struct else allocate(kind, SIZES, device)
-    names = [name for name in kind.struct.vars if wp.types.is_array(getattr(arrays, name))] if is_struct else [f.name for f in fields(kind)]
-    rows = {name: (shape, size) for name, shape, _, size in table_of(kind, SIZES)}
-    assert len(rows) == len(names)
-    for name in names:
-        array = getattr(arrays, name)
-        assert rows[f"{kind.__name__}.{name}"] == (array.shape, array.numpy().nbytes)
+def test_a_dry_run_lists_what_the_same_calls_allocate(device, monkeypatch):
+    """Shapes and sizes of the arrays of all stages, in small."""
+    config = settings(render__layers=list(LAYERS), effects__blur=[0.0, 1.0], bake__worlds=2)
+    rooms, layers, room = config.perception, config.render.layers, config.arrangement.max_objects
+
+    def build() -> None:
+        sizes = record_sizes(world_sizes(2, room, 3, 4), 5)
+        allocate_worlds(sizes, device)
+        allocate_record(True, sizes, device)
+        sections = (config.render, config.effects, config.depth_sensor)
+        Renderer(blank_scene(3, 40, 24, device), *sections, seed=0, depth_scale=0.1, instances=room, views=4, histories=6)
+        allocate_ring(view_buffer_sizes(4, 40, 24, room), layers, HostImages(jpeg_quality=95, depth_files=True), device)
+        allocate_slot(view_buffer_sizes(4, 40, 24, room), layers, device)
+        allocate_batch(rooms, room, 2, device)
+        allocate_votes(rooms, room, 2, device)
+
+    with dry_run() as arrays:
+        build()
+    made: list[wp.array] = []
+    zeros = wp.zeros
+    monkeypatch.setattr(wp, "zeros", lambda *shape, **rest: made.append(zeros(*shape, **rest)) or made[-1])
+    build()
+    assert {array.name.split(".")[0] for array in arrays} > BASE | PERCEPTION | {"LayerBuffers", "BodyMotions", "LensArrays", "JpegScratch"}
+    assert [(array.shape, array.row[3]) for array in arrays] == [(array.shape, array.numpy().nbytes) for array in made]
 
 
 @wp.struct
@@ -187,7 +151,7 @@ def test_a_bakes_table_lists_every_array_with_its_copies():
     config = settings(bake__worlds=WORLDS, cameras__resolution=[8, 6], render__views_per_batch=3)
     rows = device_arrays(config)
     names = [name for name, *_ in rows]
-    assert kinds_of(rows) == {kind.__name__ for kind in BASE}
+    assert kinds_of(rows) == BASE
     assert names.count("Observation.votes") == names.count("Plan.target") == names.count("WorldStatus.table") == 1
     assert names.count("Snapshot.pose") == names.count("queued Snapshot.pose") == names.count("WorldState.phase") == 1
     assert names.count("ViewBuffers.color") == (RING if pick_device(config.bake.device).is_cuda else 1)
@@ -247,8 +211,8 @@ def test_a_bake_that_may_pick_has_the_arrays_of_perception(mode):
     room = config.arrangement.max_objects
     looks = count_views(config.perception, config.bake.worlds, room, pick_device(config.bake.device))
     rows = device_arrays(config)
-    assert kinds_of(rows) == {kind.__name__ for kind in BASE + PERCEPTION}
-    shapes = {name: shape for name, shape, _, _ in rows if name.split(".")[0] in {kind.__name__ for kind in PERCEPTION}}
+    assert kinds_of(rows) == BASE | PERCEPTION
+    shapes = {name: shape for name, shape, _, _ in rows if name.split(".")[0] in PERCEPTION}
     assert shapes["PerceptionArrays.component"] == shapes["SegmentationScratch.gap"] == (looks, 48, 64)
     assert shapes["VoteArrays.count"] == (looks, room, room, 2)
     assert [name for name, *_ in rows].count("GBuffer.depth") == 4
@@ -256,7 +220,7 @@ def test_a_bake_that_may_pick_has_the_arrays_of_perception(mode):
 
 def test_a_mixture_without_picking_has_no_arrays_of_perception():
     config = settings(bake__mode="mixed", bake__mix=[0, 0, 1])
-    assert kinds_of(device_arrays(config)) == {kind.__name__ for kind in BASE}
+    assert kinds_of(device_arrays(config)) == BASE
 
 
 def test_fields_left_out_are_neither_allocated_nor_counted(device):

@@ -227,19 +227,13 @@ class BatchBuffers:
         return {name: array for name, array in arrays.items() if name not in on_demand and array is not None}
 
 
-@dataclass(frozen=True, eq=False)
-class EncodingScratch:
-    """Scratch of run boundaries and encoders, which all batches of the ring share."""
-
-    boundaries: BoundaryScratch
-    jpeg: JpegScratch | None
-    depth: tuple[DepthScratch, Any, Any] | None
-    """By `allocate_depth_scratch`."""
+Scratch = tuple[BoundaryScratch, JpegScratch | None, tuple[DepthScratch, Any, Any] | None]
+"""Scratch of run boundaries and encoders (see `allocate_depth_scratch`), which all batches of the ring share."""
 
 
 def allocate_ring(
     sizes: dict[str, int], layers: Collection[str], host: HostImages, device: wp.Device
-) -> tuple[list[BatchBuffers], EncodingScratch]:
+) -> tuple[list[BatchBuffers], Scratch]:
     """Allocate a ring of batches, on a CPU a single one, and the scratch of encoding; arguments as of `FrameStream`."""
     frame, boundaries = (sizes["view"], sizes["column"], sizes["row"]), boundary_sizes(sizes)
     ring = [
@@ -254,7 +248,7 @@ def allocate_ring(
     ]
     jpeg = allocate(JpegScratch, jpeg_sizes(*frame), device) if host.jpeg_quality else None
     depth = allocate_depth_scratch(*frame, device) if host.depth_files else None
-    return ring, EncodingScratch(allocate(BoundaryScratch, boundaries, device), jpeg, depth)
+    return ring, (allocate(BoundaryScratch, boundaries, device), jpeg, depth)
 
 
 @dataclass(eq=False)
@@ -310,11 +304,10 @@ class FrameStream:
         self.device = device
         self.streams = RenderStreams(device)
         self.layers = [item.name for item in fields(LayerBuffers) if item.name in layers]
-        self.ring, scratch = allocate_ring(sizes, layers, self.host, device)
+        self.ring, (self.boundary_scratch, jpeg, depth) = allocate_ring(sizes, layers, self.host, device)
         frame = (sizes["column"], sizes["row"])
-        self.boundary_scratch = scratch.boundaries
-        self.compressor = Compressor(scratch.jpeg, *frame, self.host.jpeg_quality) if scratch.jpeg is not None else None
-        self.depth_encoder = DepthEncoder(scratch.depth, *frame) if scratch.depth is not None else None
+        self.compressor = Compressor(jpeg, *frame, self.host.jpeg_quality) if jpeg is not None else None
+        self.depth_encoder = DepthEncoder(depth, *frame) if depth is not None else None
         copied = [batch.copied(self.host.on_demand) for batch in self.ring]
         self.images = [name for name in copied[0] if name not in self.layers]
         self.copies = [HostCopy(list(arrays.values())) for arrays in copied]

@@ -12,9 +12,6 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
-import warp as wp
-
 from synpick_warp.configs.schema import Arrangement, Bake, Cameras, Config, Render
 from synpick_warp.factory.assembly import make_renderer
 from synpick_warp.scenes.cameras import make_cameras
@@ -23,7 +20,7 @@ from synpick_warp.scenes.fixtures import make_fixtures
 from synpick_warp.scenes.lights import load_lights
 from synpick_warp.stages.buffers import Snapshot, ViewBuffers, allocate
 from synpick_warp.stages.render.scene import RenderScene, build_render_scene
-from synpick_warp.stages.render.view_setup import make_views
+from synpick_warp.stages.render.view_setup import first_views
 from synpick_warp.stages.sim.physics import MIN_GPU_WORLDS
 from synpick_warp.stages.sim.simulate import Simulation
 from synpick_warp.stages.stream import view_sizes
@@ -93,9 +90,7 @@ class Variant:
         sizes = view_sizes(config.render, config.cameras, worlds, objects, device)
         count = min(sizes["view"], worlds * cameras)
         renderer = make_renderer(config, scene, objects, sizes["view"], worlds * cameras)
-        images, view = allocate(ViewBuffers, sizes, device), np.arange(count, dtype=np.int32)
-        rows = [wp.array(values, dtype=wp.int32, device=device) for values in (view // cameras, view % cameras)]
-        views = make_views(rows[0], rows[1], count, renderer.instances)
+        images, views = allocate(ViewBuffers, sizes, device), first_views(count, cameras, objects, device)
         return seconds_per_call(lambda: renderer.render(pile.snapshot, views, images), device, self.assets.min_seconds, BURST) / count
 
 

@@ -30,7 +30,7 @@ from synpick_warp.scenes.lights import load_lights
 from synpick_warp.stages.buffers import LayerBuffers, Snapshot, ViewBuffers, view_buffer_sizes
 from synpick_warp.stages.render.renderer import Renderer
 from synpick_warp.stages.render.scene import build_render_scene
-from synpick_warp.stages.render.view_setup import make_views
+from synpick_warp.stages.render.view_setup import first_views
 from synpick_warp.system.device import pick_device
 from tools.options import configure, fail, make_parser, write_json
 from tools.reports.render_piles import make_piles, next_frame, settle_piles
@@ -197,13 +197,10 @@ def copy_snapshot(snapshot: Snapshot, device: Any) -> Snapshot:
 
 def render_views(renderer: Renderer, snapshot: Snapshot) -> dict[str, np.ndarray]:
     """Render all worlds by all cameras, whose views are a full batch; returns all images and layers by name."""
-    scene = renderer.scene
-    cameras, device = scene.camera_count, scene.device
+    scene, device = renderer.scene, renderer.scene.device
     sizes = view_buffer_sizes(renderer.views, scene.width, scene.height, renderer.instances)
     out, layers = allocate(ViewBuffers, sizes, device), allocate(LayerBuffers, sizes, device, LAYERS)
-    view = np.arange(renderer.views, dtype=np.int32)
-    world, camera = (wp.array(values, dtype=wp.int32, device=device) for values in (view // cameras, view % cameras))
-    renderer.render(snapshot, make_views(world, camera, len(view), renderer.instances), out, layers)
+    renderer.render(snapshot, first_views(renderer.views, scene.camera_count, renderer.instances, device), out, layers)
     images = {item.name: getattr(out, item.name).numpy() for item in fields(ViewBuffers)}
     return images | {name: getattr(layers, name).numpy() for name in LAYERS}
 

@@ -21,7 +21,7 @@ from synpick_warp.kernels.tuning import BLOCK_THREADS, TRIANGLE_THREADS
 from synpick_warp.stages.buffers import FIXTURES, Snapshot, ViewBuffers
 from synpick_warp.stages.launch import launch_pixels, launch_views
 from synpick_warp.stages.render.scene import RenderScene
-from synpick_warp.stages.render.view_setup import BACKGROUND, VIEW_BODIES, body_sizes, make_views, set_up_views
+from synpick_warp.stages.render.view_setup import BACKGROUND, VIEW_BODIES, body_sizes, first_views, set_up_views
 
 BLOCKS = 32768
 """Capacity for pixel blocks of large triangles per view. A full-HD view filled by thirteen low-polygon objects (hundreds to thousands of
@@ -91,8 +91,7 @@ def render_background(scene: RenderScene, gbuffer: Any) -> None:
     world = allocate(Snapshot, {"world": 1, "instance": 0, "fixture": len(FIXTURES)}, device)
     world.fixture_pose.fill_(wp.transform_identity())
     tote = wp.array([[1, 0, 0]], dtype=wp.int32, device=device)
-    first_world = wp.zeros(cameras, dtype=wp.int32, device=device)
-    views = make_views(first_world, wp.array(range(cameras), dtype=wp.int32, device=device), cameras, 0)
+    views = first_views(cameras, cameras, 0, device)
     bodies = allocate_struct(VIEW_BODIES, sizes, device)
     set_up_views(scene, scene.cameras, scene.grid, world, tote, views, bodies)
     # The background itself must be rasterized.

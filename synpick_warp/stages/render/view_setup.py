@@ -49,6 +49,13 @@ def make_views(world: wp.array, camera: wp.array, count: int, instances: int) ->
     return views
 
 
+def first_views(count: int, cameras: int, instances: int, device: wp.Device) -> Any:
+    """The struct `Views` of the first views, world by world and camera by camera; arguments as of `make_views`, and number of cameras."""
+    view = np.arange(count, dtype=np.int32)
+    world, camera = (wp.array(values, dtype=wp.int32, device=device) for values in (view // cameras, view % cameras))
+    return make_views(world, camera, count, instances)
+
+
 def body_sizes(instances: int, width: int, height: int) -> dict[str, int]:
     """Extents of the dimensions that `VIEW_BODIES` names beside the view, for images of `width` x `height` px."""
     return {"body": instances + len(FIXTURES), "tile": build_grid(width, height).tiles, "record": int(RAY_RECORDS)}
