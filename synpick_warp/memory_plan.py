@@ -117,24 +117,32 @@ def free_memory(device: wp.Device | None) -> int:
     return free_device_memory(device) if device is not None and device.is_cuda else free_host_memory()
 
 
+def split_memories(terms: Sequence[Term], device: wp.Device, processes: int) -> Iterator[tuple[list[Term], int]]:
+    """Terms of a plan that lie in the device's memory, and in the host's, each with the memory free for them [bytes]; none without terms.
+
+    `processes`: processes, such as one per device, that share the host's memory.
+    """
+    for on_device in (True, False):
+        if part := [term for term in terms if term.on_device == on_device]:
+            yield part, free_memory(device) if on_device else free_memory(None) // processes
+
+
 def check_memory(terms: Sequence[Term], device: wp.Device, processes: int = 1) -> None:
     """Refuse a bake that certainly exceeds the memory of this machine, or the 32-bit indices of kernels.
 
     Args:
         terms: The plan by `plan_memory`.
         device: Device of the simulation.
-        processes: Processes, such as one per device, that share the host's memory.
+        processes: As of `split_memories`.
 
     Raises:
         ConfigError: One line with the largest term, its size, what is available, and the setting to lower.
     """
     shared = "this machine" if processes == 1 else f"each of {processes} processes"
-    for on_device, place in ((True, device.alias), (False, shared)):
-        part = [term for term in terms if term.on_device == on_device]
-        needed = sum(term.size for term in part)
-        free = free_memory(device) if on_device else free_memory(None) // processes
+    for part, free in split_memories(terms, device, processes):
+        needed, largest = sum(term.size for term in part), max(part, key=lambda term: term.size)
         if needed > free:
-            largest = max(part, key=lambda term: term.size)
+            place = device.alias if largest.on_device else shared
             raise ConfigError(
                 f"a bake with these settings takes at least {_gib(needed)} of memory, {_gib(largest.size)} of them for {largest.name}, "
                 f"but {place} has {_gib(free)} free; {_advice(largest)}"
@@ -207,7 +215,7 @@ def _simulation(sizes: dict[str, int], stores_steps: bool | None, device: wp.Dev
         device: Device of the simulation.
     """
     with dry_run() as state:
-        record = allocate_worlds(sizes, device).record
+        *_, record = allocate_worlds(sizes, device)
     yield _term(f"the state of {sizes['world']:,} worlds", state, _WORLDS)
     if stores_steps is not None:
         with dry_run() as steps:

@@ -171,9 +171,7 @@ class _Run:
         self.factory, self.exporters, self.writes_views = factory, exporters, writes_views
         self.commit, self.summary, self.progress = commit, summary, progress
         self.meter = ThroughputMeter(len(factory.cameras), summary, progress)
-        self.config = factory.simulation.config
-        self.layout = DataLayout.of(self.config)
-        self.tick_time = self.config.physics.tick_time
+        self.layout = DataLayout.of(factory.config)
 
     def run(self) -> None:
         """Tick until no episode remains or a signal requests a stop."""
@@ -192,7 +190,7 @@ class _Run:
 
     def _hand_over(self, report: TickReport, snapshot: Snapshot, ticks: TickLoop) -> None:
         """Export a tick: write its frames, render its views, write views and episode ends; enqueue physics between parts of these."""
-        batch = tick_batch(report, self.factory.log.object_ids, self.tick_time)
+        batch = tick_batch(report, self.factory.object_ids, self.factory.tick_time)
         for first in range(0, len(batch), MAX_TICK_FRAMES):
             frames = np.arange(first, min(first + MAX_TICK_FRAMES, len(batch)))
             with scope("hand over ticks"):
@@ -222,8 +220,8 @@ class _Run:
                 self._end(report, world, records[int(report.column("episode")[world])])
 
     def _end(self, report: TickReport, world: int, record: EpisodeRecord) -> None:
-        config, tries = self.config, self.config.settle.tries
-        row = episode_row(self.layout, self.tick_time, report, world, record)
+        config, tries = self.factory.config, self.factory.config.settle.tries
+        row = episode_row(self.layout, self.factory.tick_time, report, world, record)
         end = episode_end(row, record, tries)
         advice = remedy(row.ending, config.physics, config.perception, config.arrangement, config.settle)
         if advice:

@@ -30,9 +30,9 @@ from synpick_warp.stages.sim.simulate import TickRecord
 from synpick_warp.stages.stream import (
     FrameStream,
     LightTable,
-    TickReader,
     TickReport,
     name_lights,
+    read_tick,
     tick_batch,
     view_sizes,
     views_per_batch,
@@ -301,9 +301,7 @@ def test_a_report_outlives_the_next_tick(device):
     record = new_record(device)
     record.snapshot.catalog_index.fill_(2)
     record.status.table.fill_(Phase.ACT)
-    reader = TickReader(record)
-    reader.start()
-    report = reader.wait()
+    report = read_tick(record)
     everything = (record.snapshot.catalog_index, record.status.table, record.status.measures, *vars(record.observation).values())
     for array in (*everything, *vars(record.plan).values()):
         array.fill_(5)
@@ -327,9 +325,7 @@ def test_a_report_has_every_array_under_its_name(device):
         values = record.status.measures.numpy()
         values[:, index] = np.arange(WORLDS) + 10 * index
         record.status.measures.assign(values)
-    reader = TickReader(record)
-    reader.start()
-    report = reader.wait()
+    report = read_tick(record)
     for (part, name), number in given.items():
         array = getattr(getattr(report, part), name)
         assert (array == number).all(), name

@@ -39,20 +39,8 @@ from synpick_warp.system.garbage import collection_paused
 
 
 @dataclass(frozen=True, eq=False)
-class Factory:
-    """A bake's assets and stages on a device: simulation, rendering with copies to the host, and the attempt log."""
-
-    catalog: Catalog
-    cameras: tuple[Camera, ...]
-    lights: tuple[EnvironmentMap, ...]
-    simulation: Simulation
-    stream: FrameStream
-    log: AttemptLog
-
-
-@dataclass(frozen=True, eq=False)
 class Stages:
-    """Assets, simulation and renderer on a device, shared by bakes and online streams; `Factory` adds encoding and copies to the host."""
+    """Assets, simulation and renderer on a device, shared by bakes and online streams."""
 
     config: Config
     """The settings; `bake.worlds` is the actual number."""
@@ -75,6 +63,14 @@ class Stages:
     def make_log(self) -> AttemptLog:
         """A new attempt log."""
         return AttemptLog(self.config.suction, self.config.perception.resolution, self.object_ids)
+
+
+@dataclass(frozen=True, eq=False)
+class Factory(Stages):
+    """The stages of a bake, with copies of views to the host, and the attempt log."""
+
+    stream: FrameStream
+    log: AttemptLog
 
 
 def build_factory(
@@ -154,7 +150,7 @@ def _add_stream(stages: Stages, device: wp.Device, needs_images: bool, depth_fil
     host = host_images(config.bop, config.cameras.resolution[1], device, needs_images, depth_files)
     layers, cameras, ids = config.render.layers, len(stages.cameras), stages.object_ids
     stream = FrameStream(stages.sizes, layers, cameras, tick_time, stages.renderer, ids, table, device, host)
-    return Factory(stages.catalog, stages.cameras, stages.lights, stages.simulation, stream, stages.make_log())
+    return Factory(**vars(stages), stream=stream, log=stages.make_log())
 
 
 @collection_paused()

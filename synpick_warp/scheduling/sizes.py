@@ -6,14 +6,14 @@ quarter, until the memory plan and its headroom fit.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 import warp as wp
 
 from synpick_warp.configs.schema import Config
 from synpick_warp.exporters.registry import Needs
 from synpick_warp.exporters.writing.pool import QUEUE_DEPTH
-from synpick_warp.memory_plan import Term, free_memory, plan_memory
+from synpick_warp.memory_plan import Term, free_memory, plan_memory, split_memories
 from synpick_warp.stages.perception.images import count_views
 from synpick_warp.stages.sim.physics import MIN_GPU_WORLDS, with_enough_worlds
 from synpick_warp.stages.stream import views_per_batch
@@ -52,7 +52,7 @@ def fit_to_device(config: Config, device: wp.Device, episodes: int, writers: int
     """
     is_open = {key: config.value(key) == 0 for key in _OPEN_SIZES}
     config = with_enough_worlds(config, device, episodes)
-    while terms := _short_terms(plan_memory(config, device, writers), device, processes):
+    while terms := _short_terms(split_memories(plan_memory(config, device, writers), device, processes)):
         worlds, objects = config.bake.worlds, config.arrangement.max_objects
         amounts = {
             "render.views_per_batch": views_per_batch(config.render, config.cameras, worlds, device),
@@ -91,8 +91,7 @@ def pick_processes(config: Config, names: Sequence[str], episodes: int) -> tuple
     picked = pick_devices(names)
     if list(names) == [ALL] and picked == ("cpu",):
         least = config.with_values({key: 1 for key in _OPEN_SIZES if not config.value(key)})
-        needed = sum(term.size for term in plan_memory(without_pictures(least), pick_device("cpu")))
-        room = free_memory(None) // int(HEADROOM * needed + RUNTIME_BYTES)
+        room = free_memory(None) // _planned(plan_memory(without_pictures(least), pick_device("cpu")))
         picked *= max(1, min(count_cores(), room))
     return picked[: max(1, episodes)]
 
@@ -108,14 +107,14 @@ def advise_processes(config: Config, names: Sequence[str], episodes: int) -> str
     return f"one process simulates on one CPU core; --devices all starts {processes}, which write the same bytes" if processes > 1 else ""
 
 
-def _short_terms(terms: Sequence[Term], device: wp.Device, processes: int) -> Sequence[Term]:
-    """Terms of a memory plan for the first memory, device or host, that is too small for them with HEADROOM; empty: all fit."""
-    for on_device in (True, False):
-        part = [term for term in terms if term.on_device == on_device]
-        free = free_memory(device) if on_device and device.is_cuda else free_memory(None) // processes
-        if part and HEADROOM * sum(term.size for term in part) + RUNTIME_BYTES > free:
-            return part
-    return ()
+def _short_terms(memories: Iterable[tuple[list[Term], int]]) -> Sequence[Term]:
+    """Terms in the first memory that is too small for them with HEADROOM, of those by `split_memories`; empty: all fit."""
+    return next((terms for terms, free in memories if _planned(terms) > free), ())
+
+
+def _planned(terms: Sequence[Term]) -> int:
+    """Memory that terms of a plan take with HEADROOM [bytes]."""
+    return int(HEADROOM * sum(term.size for term in terms)) + RUNTIME_BYTES
 
 
 def _least(key: str, device: wp.Device) -> int:

@@ -153,6 +153,13 @@ class TickReader:
         return replace(report, tick=tick | tick_measures(columns, report.catalog_index.shape[1]), steps=steps)
 
 
+def read_tick(record: TickRecord) -> TickReport:
+    """Copy the results of a tick to the host, and wait for them."""
+    reader = TickReader(record)
+    reader.start()
+    return reader.wait()
+
+
 def _reported_parts(record: TickRecord) -> list[tuple[Any, list[str]]]:
     """Parts of a record that become namespaces of a report, each with the names of the arrays that are copied."""
     parts: list[tuple[Any, list[str]]] = [(part, [item.name for item in fields(part)]) for part in (record.observation, record.plan)]
@@ -299,7 +306,6 @@ class FrameStream:
         self.lights = lights
         self.cameras = cameras
         self.tick_time = tick_time
-        self.sizes = sizes
         self.batch, self.instances = sizes["view"], sizes["instance"]
         self.device = device
         self.streams = RenderStreams(device)

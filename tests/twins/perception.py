@@ -34,12 +34,13 @@ class SegmenterHarness:
         )
         camera = make_cameras(replace(config.cameras, resolution=(width, height)))[0]
         self.focal = camera.matrix[[0, 1], [0, 1]]
-        batch = allocate_batch(self.config.perception, instances, worlds, device)
+        views, _, gbuffer, arrays, scratch = allocate_batch(self.config.perception, instances, worlds, device)
         self.images: Any = SimpleNamespace(
             scene=SimpleNamespace(device=device, cameras=build_cameras((camera,), device), grid=build_grid(width, height)),
-            views=batch.views,
-            gbuffer=batch.gbuffer,
-            batch=batch,
+            views=views,
+            gbuffer=gbuffer,
+            arrays=arrays,
+            scratch=scratch,
         )
         self.images.views.count, self.images.views.instances = worlds, instances
         self.segmenter = Segmenter(self.images)

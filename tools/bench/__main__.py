@@ -36,7 +36,7 @@ from synpick_warp.stages import timing
 from synpick_warp.stages.render.view_setup import first_views
 from synpick_warp.stages.sim.physics import with_enough_worlds
 from synpick_warp.stages.sim.simulate import Simulation
-from synpick_warp.stages.stream import TickReader, TickReport
+from synpick_warp.stages.stream import TickReport, read_tick
 from synpick_warp.system.device import pick_device
 from tools.bench.compare.peers import PEERS, check_installed, measure_peers
 from tools.bench.encode import measure_encoding
@@ -246,9 +246,7 @@ def _memory_in_use(device: wp.Device) -> Row:
 
 def _mark_live(simulation: Simulation, worlds: int) -> TickReport:
     """Report of the last tick, marked as a frame of the first `worlds` worlds alone."""
-    reader = TickReader(simulation.record)
-    reader.start()
-    report = reader.wait()
+    report = read_tick(simulation.record)
     report.status[:, Status.LIVE] = np.arange(simulation.layout.worlds) < worlds
     return report
 

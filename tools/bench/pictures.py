@@ -27,7 +27,7 @@ from synpick_warp.progress import SilentProgress
 from synpick_warp.stages.buffers import Snapshot
 from synpick_warp.stages.render.denoised import LIGHT_HISTORY, DenoisedRenderer
 from synpick_warp.stages.render.renderer import Renderer
-from synpick_warp.stages.stream import FrameStream, TickReader, TickReport
+from synpick_warp.stages.stream import FrameStream, TickReport, read_tick
 from tools.bench.meter import LIVE_FRACTION
 from tools.bench.steady import SPARE_EPISODES
 from tools.bench.stream import batch_views, select_views
@@ -140,9 +140,7 @@ def keep_tick(factory: Factory) -> KeptTick:
 def _tick(factory: Factory) -> TickReport:
     """Simulate a tick, and wait for its report."""
     factory.simulation.tick()
-    reader = TickReader(factory.simulation.record)
-    reader.start()
-    return reader.wait()
+    return read_tick(factory.simulation.record)
 
 
 def render_ticks(stream: FrameStream, renderer: Renderer, ticks: list[KeptTick]) -> None:

@@ -55,19 +55,15 @@ def measure_stream(factory: Factory, report: TickReport, min_seconds: float) -> 
         report: Report of the last tick, with the worlds that are rendered marked as live.
         min_seconds: Time for which a measurement is repeated, at least [s].
     """
-    device, config = factory.simulation.device, factory.simulation.config
-    sizes, renderer, ids = factory.stream.sizes, factory.stream.renderer, factory.log.object_ids
-    stages = Stages(
-        config, factory.catalog, factory.cameras, factory.lights, factory.simulation, renderer, sizes, ids, factory.stream.lights
-    )
-    ring = BatchRing(sizes, config.render.layers, renderer, config.bop.depth_scale)
-    parts = (stages, ring, Selection().resolve(len(config.cameras.positions)), BakeSummary(), SilentProgress())
+    device, config = factory.simulation.device, factory.config
+    ring = BatchRing(factory.sizes, config.render.layers, factory.renderer, config.bop.depth_scale)
+    parts = (factory, ring, Selection().resolve(len(factory.cameras)), BakeSummary(), SilentProgress())
     yield Row("views in a batch", ring.views, "")
     still = ViewStream(_StillProducer(report, *parts))
-    sources = {"renderer alone": _render_loop(stages, ring, report), "stream of one tick": map(_consumer(device), still)}
+    sources = {"renderer alone": _render_loop(factory, ring, report), "stream of one tick": map(_consumer(device), still)}
     yield from _compare(sources, device, min_seconds)
     sources = {
-        "simulation and renderer alone": _tick_loop(stages, ring),
+        "simulation and renderer alone": _tick_loop(factory, ring),
         "stream of ticks": map(_consumer(device), ViewStream(_UnloggedProducer(*parts))),
     }
     yield from _compare(sources, device, min_seconds)

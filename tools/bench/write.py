@@ -62,12 +62,12 @@ def measure_writing(factory: Factory, report: TickReport, min_seconds: float) ->
         report: Selects the worlds whose views are written.
         min_seconds: Time of a measurement, at least [s].
     """
-    config, snapshot = factory.simulation.config, factory.simulation.record.snapshot
+    config, snapshot = factory.config, factory.simulation.record.snapshot
     batches = [_copy(batch) for batch in factory.stream.render(snapshot, report)]
     layers = {name: np.concatenate([batch.layers[name] for batch in batches]) for name in batches[0].layers}
     names = [name for name, array in vars(batches[0]).items() if isinstance(array, np.ndarray)]
     views = FrameBatch(**{name: np.concatenate([getattr(batch, name) for batch in batches]) for name in names}, layers=layers)
-    frames = tick_batch(report, factory.log.object_ids, config.physics.tick_time)
+    frames = tick_batch(report, factory.object_ids, factory.tick_time)
     yield Row("objects per view", float((views.object_id >= 0).sum(axis=1).mean()), "")
     # Files are kept until the end: some file systems create files more slowly after many deletions.
     with tempfile.TemporaryDirectory() as folder:
@@ -125,7 +125,7 @@ class _Result:
 def _write(exporter_class: type[Exporter], factory: Factory, source: _Input, processes: int, min_seconds: float, out: Path) -> _Result:
     """Write into the new folder `out` for at least `min_seconds` [s], or until episodes have `MAX_FRAMES` frames."""
     (out / PARTIAL).mkdir(parents=True)
-    config = factory.simulation.config
+    config = factory.config
     with WriterPool(processes, exporter_class.slot_bytes(ExportSettings.of(config))) as pool:
         exporter = exporter_class(ExportContext(out, config, factory.catalog, factory.cameras, factory.lights, pool))
         exporter.write_constants()

@@ -45,7 +45,7 @@ from synpick_warp.stages.buffers import FIXTURES, Snapshot
 from synpick_warp.stages.render.sampling_rates import coarse_size, shadow_size
 from synpick_warp.stages.render.scene import build_render_scene
 from synpick_warp.stages.sim.simulate import Simulation
-from synpick_warp.stages.stream import TickReader
+from synpick_warp.stages.stream import read_tick
 from synpick_warp.system.device import pick_device
 from synpick_warp.viz.preview import write_picture
 from tools.figures import finish_report
@@ -158,9 +158,7 @@ def simulate_frames(simulation: Simulation, last: int) -> list[dict[str, np.ndar
     snapshots: list[dict[str, np.ndarray]] = []
     while len(snapshots) <= last:
         simulation.tick()
-        reader = TickReader(simulation.record)
-        reader.start()
-        report = reader.wait()
+        report = read_tick(simulation.record)
         if report.column("live")[0] and report.column("frame")[0] == len(snapshots):
             snapshot = simulation.record.snapshot
             snapshots.append({item.name: getattr(snapshot, item.name).numpy()[:1].copy() for item in fields(Snapshot)})

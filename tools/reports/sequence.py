@@ -30,7 +30,7 @@ from synpick_warp.memory_plan import check_memory, explain_shortage, plan_memory
 from synpick_warp.progress import SilentProgress
 from synpick_warp.scheduling.sizes import fit_to_device
 from synpick_warp.stages.buffers import Snapshot
-from synpick_warp.stages.stream import TickReader
+from synpick_warp.stages.stream import read_tick
 from synpick_warp.system.device import pick_device
 from tools.figures import finish_report
 from tools.options import Row, configure, fail, make_parser, positive_count, writable_file
@@ -117,9 +117,7 @@ def compare_frames(config: Config, frames: tuple[int, ...], cache: Path | None =
     simulation, names = stages.simulation, stages.light_table.name
     while True:
         simulation.tick()
-        reader = TickReader(simulation.record)
-        reader.start()
-        report = reader.wait()
+        report = read_tick(simulation.record)
         snapshot, shown = simulation.record.snapshot, report.column("frame")
         for world in np.flatnonzero(report.column("live")).tolist():
             if shown[world] <= max(frames):

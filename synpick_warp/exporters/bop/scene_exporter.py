@@ -98,9 +98,9 @@ class SceneExporter(EpisodeExporter[tuple[Path, ...]]):
         """Folder of a scene's split."""
         return self._out / self.folder_name(self._context.layout.folder(scene_id // len(self._cameras)))
 
-    @abstractmethod
     def _stage_scene(self, scene: Path) -> None:
         """Create the staging folder of a scene, and its subfolders."""
+        scene.mkdir()
 
     @abstractmethod
     def _commit_task(self, scenes: tuple[tuple[Path, int], ...], images: Sequence[int]) -> tuple[Callable[..., None], tuple[Any, ...]]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import warp as wp
@@ -28,28 +28,18 @@ CPU_VIEWS = 4
 """Maximum number of views on the CPU in that case: larger batches gain nothing there, and unused views still cost a little."""
 
 
-@dataclass(frozen=True, eq=False)
-class PerceptionBatch:
-    """Arrays of a batch of worlds: views, G-buffers and their segmentation."""
-
-    views: Any
-    """The struct `Views`."""
-    bodies: Any
-    """The struct `ViewBodies`."""
-    gbuffer: Any
-    """The struct `GBuffer`."""
-    arrays: PerceptionArrays
-    scratch: SegmentationScratch
+Batch = tuple[Any, Any, Any, PerceptionArrays, SegmentationScratch]
+"""Arrays of a batch of worlds: the structs `Views`, `ViewBodies` and `GBuffer`, and the arrays of their segmentation."""
 
 
-def allocate_batch(settings: schema.Perception, instances: int, views: int, device: wp.Device) -> PerceptionBatch:
+def allocate_batch(settings: schema.Perception, instances: int, views: int, device: wp.Device) -> Batch:
     """Allocate the arrays of a batch of `views` worlds with `instances` instances each."""
     width, height = settings.resolution
     sizes = {"view": views, "row": height, "column": width, "instance": instances, "point": settings.contour_points}
     sizes |= body_sizes(instances, width, height)
     views_of_worlds, bodies, gbuffer = (allocate_struct(kind, sizes, device) for kind in (VIEWS, VIEW_BODIES, GBUFFER))
     arrays, scratch = allocate(PerceptionArrays, sizes, device), allocate(SegmentationScratch, sizes, device)
-    return PerceptionBatch(views_of_worlds, bodies, gbuffer, arrays, scratch)
+    return views_of_worlds, bodies, gbuffer, arrays, scratch
 
 
 def view_bytes(settings: schema.Perception, instances: int, device: wp.Device) -> int:
@@ -77,7 +67,7 @@ class PerceptionImages:
         views: The struct `Views` of the batch. The caller fills `views.world` (view): each world once; -1: the view is unused.
         bodies: The struct `ViewBodies` of the batch.
         gbuffer: The struct `GBuffer` of the batch.
-        batch: Arrays of the batch, with those of `Segmenter`.
+        arrays, scratch: Arrays of `Segmenter`.
     """
 
     def __init__(
@@ -104,8 +94,7 @@ class PerceptionImages:
             raise ConfigError(f"perception.views is {count}; of {width} x {height} px that is more than 2³¹ pixels; take fewer")
         camera = make_cameras(replace(cameras, resolution=settings.resolution))[:1]
         self.scene = replace(render_scene, cameras=build_cameras(camera, device), grid=grid, camera_count=1)
-        self.batch = allocate_batch(settings, instances, count, device)
-        self.views, self.bodies, self.gbuffer = self.batch.views, self.batch.bodies, self.batch.gbuffer
+        self.views, self.bodies, self.gbuffer, self.arrays, self.scratch = allocate_batch(settings, instances, count, device)
         self.views.world.fill_(-1)
         self.views.count, self.views.instances = count, instances
         self.fixture_visible = wp.array([[1, 0, 0]] * worlds, dtype=wp.int32, device=device)

@@ -29,7 +29,7 @@ class Segmenter:
         self.width, self.height, self.instances = self.grid.width, self.grid.height, images.views.instances
         self.pixels = images.views.count * self.grid.tiles * int(TILE_PIXELS)
         self.strips = -(-self.width // int(components.STRIP))
-        self.arrays, self.scratch = images.batch.arrays, images.batch.scratch
+        self.arrays, self.scratch = images.arrays, images.scratch
         self.flat = _flatten_images(self.arrays, self.scratch)
         self.flat |= {name: _flatten(getattr(images.gbuffer, name)) for name in ("segment", "depth")}
 

@@ -46,23 +46,11 @@ class TickRecord:
     """None: physics is not recorded."""
 
 
-@dataclass(frozen=True, eq=False)
-class WorldArrays:
-    """State and record of all worlds."""
-
-    state: WorldState
-    attempts: AttemptState
-    seals: SealState
-    last: LastFrame
-    record: TickRecord
-    """Without physics, which `StepRecorder` allocates."""
-
-
-def allocate_worlds(sizes: dict[str, int], device: wp.Device) -> WorldArrays:
-    """Allocate state and record of all worlds; `sizes`: extents by `world_sizes`."""
-    state, attempts, seals, last = (allocate(kind, sizes, device) for kind in (WorldState, AttemptState, SealState, LastFrame))
+def allocate_worlds(sizes: dict[str, int], device: wp.Device) -> tuple[WorldState, AttemptState, SealState, LastFrame, TickRecord]:
+    """Allocate state and record of all worlds, but for physics, see `StepRecorder`; `sizes`: extents by `world_sizes`."""
     record = TickRecord(*(allocate(kind, sizes, device) for kind in (Snapshot, WorldStatus, Observation, Plan)))
-    return WorldArrays(state, attempts, seals, last, record)
+    state, attempts, seals = allocate(WorldState, sizes, device), allocate(AttemptState, sizes, device), allocate(SealState, sizes, device)
+    return state, attempts, seals, allocate(LastFrame, sizes, device), record
 
 
 class Simulation:
@@ -102,15 +90,14 @@ class Simulation:
         indices = np.asarray(planned, np.int32)
         self.episodes = wp.array(indices, dtype=wp.int32, device=device)
         sizes = world_sizes(config.bake.worlds, config.arrangement.max_objects, config.move.rounds, built.layout.bodies_per_world)
-        worlds = allocate_worlds(sizes, device)
-        self.state, self.attempts, self.seals, self.last = worlds.state, worlds.attempts, worlds.seals, worlds.last
-        self.observation, self.plan = worlds.record.observation, worlds.record.plan
+        self.state, self.attempts, self.seals, self.last, record = allocate_worlds(sizes, device)
+        self.observation, self.plan = record.observation, record.plan
         self.recorder: StepRecorder | None = None
         if records_physics:
             self.recorder = StepRecorder(
                 config.trajectory, config.gripper, self.scene, self.state, self.attempts, self.seals, self.physics, sizes
             )
-        self.record = replace(worlds.record, physics=self.recorder.record if self.recorder is not None else None)
+        self.record = replace(record, physics=self.recorder.record if self.recorder is not None else None)
         self.suction: Suction | None = None
         self.perception: Perception | None = None
         if may_pick(config.bake, config.splits):

@@ -35,13 +35,13 @@ def measure_rendering(factory: Factory, min_seconds: float) -> Iterator[Row]:
     """
     cameras, device = factory.cameras, factory.simulation.device
     yield from _measure_size(factory, cameras, max(1, factory.stream.batch // len(cameras)), min_seconds)
-    small = make_cameras(replace(factory.simulation.config.cameras, resolution=SMALL_SIZE))
+    small = make_cameras(replace(factory.config.cameras, resolution=SMALL_SIZE))
     yield from _measure_size(factory, small, SMALL_WORLDS if device.is_cuda else SMALL_WORLDS_CPU, min_seconds)
 
 
 def _measure_size(factory: Factory, cameras: tuple[Camera, ...], worlds: int, min_seconds: float) -> Iterator[Row]:
     """Benchmark of both renderers with images of these cameras in `worlds` worlds."""
-    device, scene, config = factory.simulation.device, factory.stream.renderer.scene, factory.simulation.config
+    device, scene, config = factory.simulation.device, factory.stream.renderer.scene, factory.config
     snapshot = tile_snapshot(factory.simulation.record.snapshot, worlds, device)
     count, pixels = worlds * len(cameras), cameras[0].width * cameras[0].height
     size = f"{cameras[0].width}x{cameras[0].height}, {worlds:,} world{'' if worlds == 1 else 's'}"
@@ -97,7 +97,7 @@ class OurViews:
         width, height = cameras[0].width, cameras[0].height
         scene = replace(scene, cameras=build_cameras(cameras, scene.device), grid=build_grid(width, height))
         self.snapshot = snapshot
-        config = factory.simulation.config.with_values({"render.mode": mode})
+        config = factory.config.with_values({"render.mode": mode})
         self.renderer = make_renderer(config, scene, instances, count, histories=count)
         self.out = allocate_view_buffers(count, width, height, instances, scene.device)
         self.views = first_views(count, len(cameras), instances, scene.device)

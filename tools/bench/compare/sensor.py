@@ -216,7 +216,7 @@ def measure_sensor(factory: Factory, min_seconds: float) -> Iterator[Row]:
     Both update poses and render a batch of views. On CUDA both launch without waiting, so that launch overhead is hidden. The
     sensor has no light maps, amodal bits, counts, boxes, or texture minification.
     """
-    simulation, renderer, config = factory.simulation, factory.stream.renderer, factory.simulation.config
+    simulation, renderer, config = factory.simulation, factory.stream.renderer, factory.config
     device, snapshot = simulation.device, simulation.record.snapshot
     count = min(factory.stream.batch, simulation.layout.worlds * len(factory.cameras))
     started = time.perf_counter()

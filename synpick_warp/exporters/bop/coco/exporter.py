@@ -76,8 +76,5 @@ class CocoExporter(SceneExporter):
         """See `Exporter`: folders of images, and parts."""
         return scene_files(self._out, [self.scene_id(episode, camera) for camera in range(len(self._cameras))])
 
-    def _stage_scene(self, scene: Path) -> None:
-        scene.mkdir()
-
     def _commit_task(self, scenes: tuple[tuple[Path, int], ...], images: Sequence[int]) -> tuple[Callable[..., None], tuple[Any, ...]]:
         return commit_scenes, (scenes, self._out, images)

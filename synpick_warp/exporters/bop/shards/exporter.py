@@ -62,9 +62,6 @@ class ShardsExporter(SceneExporter):
         scenes = (self.scene_id(episode, camera) for camera in range(len(self._cameras)))
         return sorted(path.relative_to(self._out) for scene in scenes for path in find_shards(scene, self._folder(scene)))
 
-    def _stage_scene(self, scene: Path) -> None:
-        scene.mkdir()
-
     def _commit_task(self, scenes: tuple[tuple[Path, int], ...], images: Sequence[int]) -> tuple[Callable[..., None], tuple[Any, ...]]:
         return commit_shards, (scenes, self._folder(scenes[0][1]), images, self._layers)
 
