@@ -109,7 +109,7 @@ def _fill(config: Config, output: OutputFolder, needs: Needs, names: Sequence[st
         prepare_folder(
             output, needs, load_catalog(config, report=progress.note), load_lights(config.bake.lights, progress.note, config.objects.strict)
         )
-    with WriterPool(count_writers(config), needs.slot_bytes, output.lock) as pool:
+    with WriterPool(count_writers(config.bake.writers, needs.slot_bytes), needs.slot_bytes, output.lock) as pool:
         started = time.perf_counter()
         if factory is not None:
             exporters = Exporters(needs.classes, ExportContext(output.out, config, factory.catalog, factory.cameras, factory.lights, pool))

@@ -41,11 +41,13 @@ def describe_machine(device: wp.Device) -> list[tuple[str, str]]:
 
 def memory_report(config: Config) -> Table:
     """Table of shape, unit and size of every array in the memory plan of a bake with these settings, and their sum."""
+    from synpick_warp.exporters.registry import Needs
     from synpick_warp.memory_plan import plan_memory
     from synpick_warp.scheduling.sizes import count_writers, fit_to_device, without_pictures
 
     device, episodes = pick_device(config.bake.device), DataLayout.of(config).planned
-    config = fit_to_device(without_pictures(config), device, episodes, count_writers(config))
+    writers = count_writers(config.bake.writers, Needs.of(config).slot_bytes)
+    config = fit_to_device(without_pictures(config), device, episodes, writers)
     rows = [row for term in plan_memory(config, device) for row in term.rows]
     width, height = config.cameras.resolution
     table = Table("array", "shape", "unit", "MiB", title=f"{config.bake.worlds} worlds, {width}x{height}", show_footer=True)

@@ -97,10 +97,10 @@ def build_factory(
     """
     device = pick_device(config.bake.device)
     planned = DataLayout.of(config).planned if episodes is None else len(episodes)
-    writers = count_writers(config)
+    needs = Needs.of(config)
+    writers = count_writers(config.bake.writers, needs.slot_bytes)
     config = fit_to_device(without_pictures(config), device, planned, writers, processes)
     check_memory(plan_memory(config, device, writers), device, processes)
-    needs = Needs.of(config)
     smallest = partial(build_smallest, config, device, SilentProgress(), records_physics, needs_images)
     with compiling_if_cold(smallest, device, progress, needs.views):
         stages = build_stages(config, device, progress, episodes, records_physics, longest_first)
@@ -139,9 +139,10 @@ def compiling_if_cold(smallest: Callable[[], Factory], device: wp.Device, progre
 def build_smallest(config: Config, device: wp.Device, progress: Progress, records_physics: bool, needs_images: bool) -> Factory:
     """Build a minimal factory, with as few worlds as the device allows. Other arguments and errors: `build_factory`."""
     config = config.with_values({"bake.worlds": 1, "render.views_per_batch": 1})
-    config = fit_to_device(config, device, 1, count_writers(config))
+    needs = Needs.of(config)
+    config = fit_to_device(config, device, 1, count_writers(config.bake.writers, needs.slot_bytes))
     stages = build_stages(config, device, progress, [0], records_physics)
-    return _add_stream(stages, device, needs_images, Needs.of(config).depth_files)
+    return _add_stream(stages, device, needs_images, needs.depth_files)
 
 
 def _add_stream(stages: Stages, device: wp.Device, needs_images: bool, depth_files: bool) -> Factory:

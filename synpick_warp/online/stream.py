@@ -184,7 +184,8 @@ def open_stream(
     selection: Selection,
 ) -> ViewStream:
     """Build worlds and renderer, and open a stream of their views; arguments and errors as of `synpick_warp.stream`."""
-    config, indices = choose_episodes(config, episodes, shard, splits)
+    planned, indices = choose_episodes(DataLayout.of(config), episodes, shard, splits)
+    config = config.with_values({"bake.episodes": planned})
     if not indices:
         raise ConfigError(f"shard {shard[0]}/{shard[1]} has no episode; give more episodes, or fewer parts")
     device = pick_device(config.bake.device)

@@ -271,7 +271,7 @@ def bake_on_devices(
         prepare_folder(output, needs, catalog, lights)
         filled = config.with_values(REPEATS) if must_repeat(config.arrangement, catalog) else config
         dealt = deal_episodes(order_longest_first(filled, catalog, output.remaining, pick_device("cpu")), len(names))
-        writers = deal_writers(count_writers(config), len(names))
+        writers = deal_writers(count_writers(config.bake.writers, needs.slot_bytes), len(names))
         shares = [
             Share(output.out, config.with_values({"bake.device": name, "bake.writers": count}), episodes, len(names))
             for name, episodes, count in zip(names, dealt, writers, strict=True)

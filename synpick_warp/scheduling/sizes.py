@@ -70,11 +70,12 @@ def fit_to_device(config: Config, device: wp.Device, episodes: int, writers: int
     return config
 
 
-def count_writers(config: Config) -> int:
-    """Writer processes of a bake: `bake.writers`, or one per usable CPU core, as far as the host's free memory has room for them."""
-    if config.bake.writers:
-        return config.bake.writers
-    each = WRITER_BYTES + QUEUE_DEPTH * Needs.of(config).slot_bytes
+def count_writers(writers: int, slot_bytes: int) -> int:
+    """Writer processes of a bake: `bake.writers`, or if it is 0, one per usable CPU core, as far as the host's free memory has room for
+    them and their slots of `slot_bytes` (see `Needs`)."""
+    if writers:
+        return writers
+    each = WRITER_BYTES + QUEUE_DEPTH * slot_bytes
     room = int(WRITERS_FRACTION * free_memory(None)) // each
     return max(1, min(count_cores(), room))
 

@@ -10,6 +10,7 @@ import pytest
 from synpick_warp import memory_plan
 from synpick_warp.configs.load import load_config
 from synpick_warp.configs.schema import Config
+from synpick_warp.exporters.registry import Needs
 from synpick_warp.memory_plan import check_memory, plan_memory
 from synpick_warp.scheduling import sizes
 from synpick_warp.scheduling.sizes import (
@@ -152,12 +153,16 @@ def test_a_bake_on_one_of_several_cores_is_told_of_the_others(give, cores, monke
     assert advise_processes(config, ["auto"], 3) == ""
 
 
+def writers_of(config: Config) -> int:
+    return count_writers(config.bake.writers, Needs.of(config).slot_bytes)
+
+
 def test_writers_are_as_many_as_cores_if_memory_suffices(give, monkeypatch):
     monkeypatch.setattr(sizes, "count_cores", lambda: 64)
     config = load_config("synpick", {})
-    assert count_writers(config) == 64
+    assert writers_of(config) == 64
     give(host=8.0)
-    assert 1 < count_writers(config) < 64
+    assert 1 < writers_of(config) < 64
     give(host=0.1)
-    assert count_writers(config) == 1
-    assert count_writers(load_config("synpick", {"bake.writers": 99})) == 99
+    assert writers_of(config) == 1
+    assert writers_of(load_config("synpick", {"bake.writers": 99})) == 99
