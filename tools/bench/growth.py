@@ -9,8 +9,10 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
+
+import warp as wp
 
 from synpick_warp.configs.schema import Arrangement, Bake, Cameras, Config, Render
 from synpick_warp.factory.assembly import make_renderer
@@ -18,6 +20,7 @@ from synpick_warp.scenes.cameras import make_cameras
 from synpick_warp.scenes.catalog import load_catalog
 from synpick_warp.scenes.fixtures import make_fixtures
 from synpick_warp.scenes.lights import load_lights
+from synpick_warp.scenes.types import Catalog, EnvironmentMap
 from synpick_warp.stages.buffers import Snapshot, ViewBuffers, allocate
 from synpick_warp.stages.render.scene import RenderScene, build_render_scene
 from synpick_warp.stages.render.view_setup import first_views
@@ -49,49 +52,48 @@ class Pile:
     """Physics of a tick [s]."""
 
 
-class Assets:
-    """Objects and lights, loaded once."""
-
-    def __init__(self, config: Config, min_seconds: float) -> None:
-        self.device, self.min_seconds = pick_device(config.bake.device), min_seconds
-        self.catalog, self.lights = load_catalog(config), load_lights(config.bake.lights)
-
-
+@dataclass(frozen=True, eq=False)
 class Variant:
     """Measurements of worlds with some settings."""
 
-    def __init__(self, assets: Assets, config: Config) -> None:
-        self.assets, self.config = assets, config
-        self.steps = config.physics.steps_per_tick * config.bake.worlds
+    config: Config
+    catalog: Catalog
+    lights: tuple[EnvironmentMap, ...]
+    device: wp.Device
+    min_seconds: float
+
+    @property
+    def steps(self) -> int:
         """Steps of all worlds in a tick."""
+        return self.config.physics.steps_per_tick * self.config.bake.worlds
 
     def build_scene(self) -> RenderScene:
         """Renderer's scene."""
-        config, assets = self.config, self.assets
+        config = self.config
         fixtures, cameras = make_fixtures(config.tote, config.gripper), make_cameras(config.cameras)
-        return build_render_scene(config.render, config.tote, assets.catalog, fixtures, cameras, assets.lights, assets.device)
+        return build_render_scene(config.render, config.tote, self.catalog, fixtures, cameras, self.lights, self.device)
 
     def drop(self, scene: RenderScene) -> Pile:
         """Drop piles and time ticks of their physics."""
-        config, assets = self.config, self.assets
-        simulation = Simulation(config, assets.catalog, len(assets.lights), assets.device, scene, range(config.bake.worlds))
+        worlds = range(self.config.bake.worlds)
+        simulation = Simulation(self.config, self.catalog, len(self.lights), self.device, scene, worlds)
         simulation.scene.settle.rest_ticks = simulation.scene.settle.max_ticks = FOREVER
         tick = simulation.tick
         for _ in range(DROP_TICKS):
             tick()
-        seconds = seconds_per_call(tick, assets.device, assets.min_seconds, BURST)
+        seconds = seconds_per_call(tick, self.device, self.min_seconds, BURST)
         snapshot = simulation.record.snapshot
         return Pile(snapshot, float((snapshot.catalog_index.numpy() >= 0).sum(axis=1).mean()), seconds)
 
     def time_view(self, scene: RenderScene, pile: Pile) -> float:
         """Time of a view [s], in full batches."""
-        config, device, worlds = self.config, self.assets.device, self.config.bake.worlds
+        config, device, worlds = self.config, self.device, self.config.bake.worlds
         cameras, objects = len(config.cameras.positions), config.arrangement.max_objects
         sizes = view_sizes(config.render, config.cameras, worlds, objects, device)
         count = min(sizes["view"], worlds * cameras)
         renderer = make_renderer(config, scene, objects, sizes["view"], worlds * cameras)
         images, views = allocate(ViewBuffers, sizes, device), first_views(count, cameras, objects, device)
-        return seconds_per_call(lambda: renderer.render(pile.snapshot, views, images), device, self.assets.min_seconds, BURST) / count
+        return seconds_per_call(lambda: renderer.render(pile.snapshot, views, images), device, self.min_seconds, BURST) / count
 
 
 def vary_worlds(bake: Bake, factor: float) -> Variation:
@@ -143,14 +145,13 @@ VARIATIONS: dict[str, tuple[str, Callable[[Any, float], Variation]]] = {
 def measure_growth(config: Config, min_seconds: float) -> Iterator[Row]:
     """Measure the settings themselves, then each factor's values; a measurement is repeated for at least `min_seconds` [s]."""
     started = time.perf_counter()
-    assets = Assets(config, min_seconds)
-    own = Variant(assets, config)
+    own = Variant(config, load_catalog(config), load_lights(config.bake.lights), pick_device(config.bake.device), min_seconds)
     scene = own.build_scene()
     pile = own.drop(scene)
     yield from _rows("as set", own.steps, pile, own.time_view(scene, pile))
     for factor, (section, vary) in VARIATIONS.items():
         for value, values in dict(vary(getattr(config, section), multiple) for multiple in FRACTIONS.get(factor, PATHS)).items():
-            varied = Variant(assets, config.with_values(values))
+            varied = replace(own, config=config.with_values(values))
             other = varied.build_scene() if factor in ("resolution", "cameras") else scene
             dropped = varied.drop(scene) if factor in ("worlds", "objects") else None
             view = varied.time_view(other, dropped or pile)

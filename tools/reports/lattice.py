@@ -31,7 +31,7 @@ from rich.console import Console
 
 from synpick_warp.arrays import allocate
 from synpick_warp.codes import Segment
-from synpick_warp.configs.schema import FAST, REFERENCE, Config, Render
+from synpick_warp.configs.schema import FAST, Config, Render
 from synpick_warp.errors import SynpickError
 from synpick_warp.factory.assembly import Stages, build_stages, make_renderer
 from synpick_warp.kernels.render.lighting.history import NEVER
@@ -185,11 +185,8 @@ def compare_maps(
     scene = build_render_scene(config.render, config.tote, stages.catalog, fixtures, make_cameras(config.cameras), stages.lights, device)
     width, height = config.cameras.resolution
     samples = min(MAX_SAMPLES, max(2, 1 << int(math.log2(options.paths / (width * height)))))
-    half = config.with_values({"render.samples": samples // 2})
-    store = ReferenceStore(options.cache, half)
+    store = ReferenceStore(options.cache, config.with_values({"render.samples": samples}), scene)
     denoised = Studio(make_renderer(config.with_values({"render.mode": FAST}), scene, room, 1, 1))
-    seeds = ({"render.mode": REFERENCE, "bake.seed": config.bake.seed + each} for each in (0, 1))
-    references = [Studio(make_renderer(half.with_values(each), scene, room, 1)) for each in seeds]
     sizes = {"world": 1, "instance": room, "fixture": len(FIXTURES)}
     state = allocate(Snapshot, sizes, device)
     for index, map_ in enumerate(stages.lights):
@@ -203,7 +200,7 @@ def compare_maps(
                 getattr(state, name).assign(values)
             state.light.fill_(index)
             shots.append(denoised.render(state, 0, 0))
-        first, second = store.get(state, 0, lambda: (references[0].render(state, 0, 0), references[1].render(state, 0, 0)))
+        first, second = store.get(state, 0)
         yield Pair(map_.name, shots[-1], first, float(shots[-1].radiance.mean()), second), lattice_periods(config.render, width)
 
 

@@ -14,11 +14,10 @@ from synpick_warp.factory.assembly import Factory, make_renderer
 from synpick_warp.scenes.cameras import make_cameras
 from synpick_warp.scenes.fixtures import make_fixtures
 from synpick_warp.scenes.types import Camera
-from synpick_warp.stages.buffers import Snapshot, allocate_view_buffers
+from synpick_warp.stages.buffers import Snapshot
 from synpick_warp.stages.render.scene import build_cameras, build_grid
-from synpick_warp.stages.render.view_setup import first_views
 from tools.bench.compare.ray_scene import RayScene
-from tools.bench.compare.sensor import CHECKED_VIEWS, compare_hits, rate_rows
+from tools.bench.compare.sensor import CHECKED_VIEWS, OurViews, compare_hits, rate_rows
 from tools.bench.physics import BURST, seconds_per_call
 from tools.options import Row
 
@@ -46,7 +45,7 @@ def _measure_size(factory: Factory, cameras: tuple[Camera, ...], worlds: int, mi
     count, pixels = worlds * len(cameras), cameras[0].width * cameras[0].height
     size = f"{cameras[0].width}x{cameras[0].height}, {worlds:,} world{'' if worlds == 1 else 's'}"
     yield Row(f"{size}: views in a batch", count, "")
-    ours = OurViews(factory, config.render.mode, cameras, snapshot, worlds)
+    ours = make_views_of(factory, config.render.mode, cameras, snapshot, worlds)
     meshes = [(entry.mesh, entry.material) for entry in factory.catalog.entries]
     table = (float(scene.table.height), config.render.table_color) if config.render.table else None
     theirs = RayScene(meshes, make_fixtures(config.tote, config.gripper), cameras, table, snapshot, worlds, device)
@@ -68,7 +67,7 @@ def _measure_size(factory: Factory, cameras: tuple[Camera, ...], worlds: int, mi
     everything = "color by light maps with indirect light and anti-aliasing, depth, ids, amodal bits, counts, boxes"
     theirs_colored = "color by one light with shadows, depth, ids"
     yield from _pair(size, pixels, everything, theirs_colored, seconds)
-    unoccluded = OurViews(factory, UNOCCLUDED, cameras, snapshot, worlds)
+    unoccluded = make_views_of(factory, UNOCCLUDED, cameras, snapshot, worlds)
     seconds = time_view(functools.partial(unoccluded.render)), seconds[1]
     plain = "render.mode unoccluded, color by light maps with shadows of one lamp and anti-aliasing, depth, ids, amodal bits, counts, boxes"
     yield from _pair(size, pixels, plain, theirs_colored, seconds)
@@ -89,23 +88,9 @@ def tile_snapshot(snapshot: Snapshot, worlds: int, device: wp.Device) -> Snapsho
     return Snapshot(**{name: wp.array(array.numpy()[chosen], dtype=array.dtype, device=device) for name, array in arrays.items()})
 
 
-class OurViews:
-    """Our renderer at the image size of `cameras`, for all cameras of the first worlds of a snapshot."""
-
-    def __init__(self, factory: Factory, mode: str, cameras: tuple[Camera, ...], snapshot: Snapshot, worlds: int) -> None:
-        scene, count, instances = factory.stream.renderer.scene, worlds * len(cameras), factory.stream.renderer.instances
-        width, height = cameras[0].width, cameras[0].height
-        scene = replace(scene, cameras=build_cameras(cameras, scene.device), grid=build_grid(width, height))
-        self.snapshot = snapshot
-        config = factory.config.with_values({"render.mode": mode})
-        self.renderer = make_renderer(config, scene, instances, count, histories=count)
-        self.out = allocate_view_buffers(count, width, height, instances, scene.device)
-        self.views = first_views(count, len(cameras), instances, scene.device)
-
-    def render_gbuffer(self) -> None:
-        """Depth, ids and amodal bits alone."""
-        self.renderer.render_gbuffer(self.snapshot, self.views, self.out)
-
-    def render(self) -> None:
-        """All stages."""
-        self.renderer.render(self.snapshot, self.views, self.out)
+def make_views_of(factory: Factory, mode: str, cameras: tuple[Camera, ...], snapshot: Snapshot, worlds: int) -> OurViews:
+    """Our renderer in a mode and at the image size of `cameras`, for all cameras of the first worlds of a snapshot."""
+    count, scene = worlds * len(cameras), factory.renderer.scene
+    scene = replace(scene, cameras=build_cameras(cameras, scene.device), grid=build_grid(cameras[0].width, cameras[0].height))
+    config = factory.config.with_values({"render.mode": mode})
+    return OurViews(make_renderer(config, scene, factory.renderer.instances, count, histories=count), snapshot, count)
