@@ -8,13 +8,12 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from typing import Any
 
 import warp as wp
 
-from synpick_warp.configs.schema import Arrangement, Bake, Cameras, Config, Render
+from synpick_warp.configs.schema import Cameras, Config
 from synpick_warp.factory.assembly import make_renderer
 from synpick_warp.scenes.cameras import make_cameras
 from synpick_warp.scenes.catalog import load_catalog
@@ -24,7 +23,7 @@ from synpick_warp.scenes.types import Catalog, EnvironmentMap
 from synpick_warp.stages.buffers import Snapshot, ViewBuffers, allocate
 from synpick_warp.stages.render.scene import RenderScene, build_render_scene
 from synpick_warp.stages.render.view_setup import first_views
-from synpick_warp.stages.sim.physics import MIN_GPU_WORLDS
+from synpick_warp.stages.sim.physics import with_enough_worlds
 from synpick_warp.stages.sim.simulate import Simulation
 from synpick_warp.stages.stream import view_sizes
 from synpick_warp.system.device import pick_device
@@ -33,12 +32,9 @@ from tools.options import Row
 
 DROP_TICKS = 24
 """Ticks from the drop to the measurement: 1.6 s, in which nearly all objects land."""
-FRACTIONS = {"worlds": (0.125, 0.25, 0.5), "objects": (0.25, 0.5), "resolution": (1 / 3, 2 / 3), "cameras": (1 / 3, 2.0)}
-"""Values of each factor, as multiples of the settings' own: worlds, volume of the objects, image width and height, cameras."""
-PATHS = (1, 2, 4)
-"""Paths per coarse pixel."""
-Variation = tuple[str, dict[str, object]]
-"""Value of a factor as a text, and the settings that differ."""
+FACTORS = {"worlds": (0.125, 0.25, 0.5), "objects": (0.25, 0.5), "resolution": (1 / 3, 2 / 3), "paths": (1, 2, 4), "cameras": (1 / 3, 2.0)}
+"""Values of each factor: paths per coarse pixel, and multiples of the settings' own worlds, volume of the objects, image width and height,
+cameras."""
 
 
 @dataclass(frozen=True)
@@ -96,50 +92,32 @@ class Variant:
         return seconds_per_call(lambda: renderer.render(pile.snapshot, views, images), device, self.min_seconds, BURST) / count
 
 
-def vary_worlds(bake: Bake, factor: float) -> Variation:
-    """Other number of worlds."""
-    least = MIN_GPU_WORLDS if pick_device(bake.device).is_cuda else 1
-    worlds = max(least, round(factor * bake.worlds))
-    return str(worlds), {"bake.worlds": worlds}
+def vary(config: Config, factor: str, value: float) -> tuple[str, Config]:
+    """The settings with one factor changed, and its new value in words; `value` is a multiple of the old one, or the number of paths.
 
-
-def vary_objects(arrangement: Arrangement, factor: float) -> Variation:
-    """Other volume of the objects."""
-    volume = factor * arrangement.volume
-    return f"{1e3 * volume:.3g} l", {"arrangement.volume": volume}
-
-
-def vary_resolution(cameras: Cameras, factor: float) -> Variation:
-    """Other image size of the same shape."""
-    width, height = (max(1, round(factor * size)) for size in cameras.resolution)
-    return f"{width}x{height}", {"cameras.resolution": (width, height)}
-
-
-def vary_paths(_: Render, paths: float) -> Variation:
-    """Other number of paths per coarse pixel."""
-    return str(int(paths)), {"render.coarse_paths": int(paths)}
-
-
-def vary_cameras(cameras: Cameras, factor: float) -> Variation:
-    """Other number of cameras: the first ones, or all, and then these turned by 180° about the vertical."""
-    count = max(1, round(factor * len(cameras.positions)))
-    return str(count), {f"cameras.{name}": _turn(cameras, name, count) for name in ("positions", "ups")}
+    More cameras than there are are these again, turned by 180° about the vertical.
+    """
+    if factor == "worlds":
+        worlds = max(1, round(value * config.bake.worlds))
+        config = with_enough_worlds(config.with_values({"bake.worlds": worlds}), pick_device(config.bake.device))
+        return str(config.bake.worlds), config
+    if factor == "objects":
+        volume = value * config.arrangement.volume
+        return f"{1e3 * volume:.3g} l", config.with_values({"arrangement.volume": volume})
+    if factor == "resolution":
+        width, height = (max(1, round(value * size)) for size in config.cameras.resolution)
+        return f"{width}x{height}", config.with_values({"cameras.resolution": (width, height)})
+    if factor == "paths":
+        return str(int(value)), config.with_values({"render.coarse_paths": int(value)})
+    cameras = config.cameras
+    count = max(1, round(value * len(cameras.positions)))
+    return str(count), replace(config, cameras=replace(cameras, **{name: _turn(cameras, name, count) for name in ("positions", "ups")}))
 
 
 def _turn(cameras: Cameras, name: str, count: int) -> tuple[tuple[float, float, float], ...]:
     vectors = getattr(cameras, name)
     repeats = math.ceil(count / len(vectors))
     return tuple(((-1) ** turn * x, (-1) ** turn * y, z) for turn in range(repeats) for x, y, z in vectors)[:count]
-
-
-VARIATIONS: dict[str, tuple[str, Callable[[Any, float], Variation]]] = {
-    "worlds": ("bake", vary_worlds),
-    "objects": ("arrangement", vary_objects),
-    "resolution": ("cameras", vary_resolution),
-    "paths": ("render", vary_paths),
-    "cameras": ("cameras", vary_cameras),
-}
-"""Section of the settings that a factor changes, and its variation."""
 
 
 def measure_growth(config: Config, min_seconds: float) -> Iterator[Row]:
@@ -149,9 +127,9 @@ def measure_growth(config: Config, min_seconds: float) -> Iterator[Row]:
     scene = own.build_scene()
     pile = own.drop(scene)
     yield from _rows("as set", own.steps, pile, own.time_view(scene, pile))
-    for factor, (section, vary) in VARIATIONS.items():
-        for value, values in dict(vary(getattr(config, section), multiple) for multiple in FRACTIONS.get(factor, PATHS)).items():
-            varied = replace(own, config=config.with_values(values))
+    for factor, values in FACTORS.items():
+        for value, changed in dict(vary(config, factor, each) for each in values).items():
+            varied = replace(own, config=changed)
             other = varied.build_scene() if factor in ("resolution", "cameras") else scene
             dropped = varied.drop(scene) if factor in ("worlds", "objects") else None
             view = varied.time_view(other, dropped or pile)
