@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from synpick_warp.configs.modes import bake_modes
-from synpick_warp.configs.schema import Bake, Bop, Cameras, Config, Physics
+from synpick_warp.configs.schema import Bake, Bop, Cameras, Config, Gripper, Physics, Render, Tote, Trajectory
 from synpick_warp.configs.sensors import effect_ranges
 from synpick_warp.configs.splits import DataLayout
 
@@ -19,21 +19,32 @@ class ExportSettings:
     bop: Bop
     cameras: Cameras
     physics: Physics
-    layers: tuple[str, ...]
-    """Names of the layers of a view."""
+    render: Render
+    trajectory: Trajectory
+    tote: Tote
+    gripper: Gripper
     effects: tuple[str, ...]
     """Names of the camera effects that are on."""
     objects: int
     """Maximum number of objects of an episode."""
-    stores_steps: bool
-    """Whether each physics step is stored, not only each tick."""
 
     @classmethod
     def of(cls, config: Config) -> ExportSettings:
         """Those of all settings."""
         effects = tuple(name for name, limits in effect_ranges(config.effects).items() if any(limits))
-        layout, objects, layers = DataLayout.of(config), config.arrangement.max_objects, config.render.layers
-        return cls(layout, config.bake, config.bop, config.cameras, config.physics, layers, effects, objects, config.trajectory.steps)
+        return cls(
+            DataLayout.of(config),
+            config.bake,
+            config.bop,
+            config.cameras,
+            config.physics,
+            config.render,
+            config.trajectory,
+            config.tote,
+            config.gripper,
+            effects,
+            config.arrangement.max_objects,
+        )
 
     @property
     def modes(self) -> tuple[str, ...]:

@@ -99,7 +99,7 @@ def run_bake(
 
 def _fill(config: Config, output: OutputFolder, needs: Needs, names: Sequence[str], summary: BakeSummary, progress: Progress) -> None:
     """Generate the remaining episodes, then the indices over all."""
-    factory = None
+    factory, settings = None, ExportSettings.of(config)
     if len(names) > 1:
         bake_on_devices(config, output, needs, names, _DEVICE_PROGRAM, summary, progress)
     elif output.remaining:
@@ -112,7 +112,8 @@ def _fill(config: Config, output: OutputFolder, needs: Needs, names: Sequence[st
     with WriterPool(count_writers(config.bake.writers, needs.slot_bytes), needs.slot_bytes, output.lock) as pool:
         started = time.perf_counter()
         if factory is not None:
-            exporters = Exporters(needs.classes, ExportContext(output.out, config, factory.catalog, factory.cameras, factory.lights, pool))
+            context = ExportContext(output.out, settings, factory.catalog, factory.cameras, factory.lights, pool)
+            exporters = Exporters(needs.classes, context)
             with aborting(pool, exporters):
                 output.prepare(exporters, digest_inputs(factory.catalog, factory.lights), pool)
                 _Run(factory, exporters, needs.views, partial(output.commit, exporters, pool), summary, progress, StopRequest()).run()
@@ -122,8 +123,8 @@ def _fill(config: Config, output: OutputFolder, needs: Needs, names: Sequence[st
         if not summary.stopped:
             progress.stage("finishing files")
             with scope("finalize"):
-                finalize_data_set(output.out, ExportSettings.of(config), needs.classes, pool)
-            if strays := describe_strays(output.out, DataLayout.of(config), committed_episodes(output.out)):
+                finalize_data_set(output.out, settings, needs.classes, pool)
+            if strays := describe_strays(output.out, settings.layout, committed_episodes(output.out)):
                 progress.note(strays)
         summary.wall_seconds += time.perf_counter() - started
 
@@ -145,7 +146,9 @@ def generate_share(share: Share, handles: Sequence[int], link: BakeLink) -> Bake
         with WriterPool(config.bake.writers, needs.slot_bytes, *handles) as pool:
             link.writers = pool.pids()
             started = time.perf_counter()
-            exporters = Exporters(needs.classes, ExportContext(share.out, config, factory.catalog, factory.cameras, factory.lights, pool))
+            settings = ExportSettings.of(config)
+            context = ExportContext(share.out, settings, factory.catalog, factory.cameras, factory.lights, pool)
+            exporters = Exporters(needs.classes, context)
             with aborting(pool, exporters):
                 _Run(factory, exporters, needs.views, partial(commit_episode, share.out, exporters, pool), summary, link, link).run()
                 pool.wait()

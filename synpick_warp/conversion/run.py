@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from synpick_warp.codes import Ending
+from synpick_warp.configs.export import ExportSettings
 from synpick_warp.configs.schema import CLASSIC
 from synpick_warp.conversion.context import StoredContext
 from synpick_warp.conversion.found import convert_found
@@ -69,13 +70,13 @@ def convert(folder: Path, out: Path, formats: Sequence[str], processes: int, rep
         if output.is_finished:
             return Converted(resumed, resumed)
         with WriterPool(processes or count_cores(), 0, output.lock) as pool:
-            context = StoredContext(source, out, config, pool)
-            exporters = Exporters(classes, context)
+            settings = ExportSettings.of(config)
+            exporters = Exporters(classes, StoredContext(source, out, settings, pool))
             output.prepare(exporters, source.inputs, pool)
             _convert_episodes(source, output, exporters, pool, contents, report)
             pool.wait()
             exporters.close()
-            finalize_data_set(out, context.settings, classes, pool)
+            finalize_data_set(out, settings, classes, pool)
     return Converted(len(source.episodes), resumed)
 
 

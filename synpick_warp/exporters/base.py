@@ -11,7 +11,6 @@ import numpy as np
 
 from synpick_warp.codecs.depth_png import max_data_bytes
 from synpick_warp.configs.export import ExportSettings
-from synpick_warp.configs.schema import Config
 from synpick_warp.configs.splits import DataLayout
 from synpick_warp.exporters.writing.folder import Buffer
 from synpick_warp.exporters.writing.pool import WriterPool
@@ -35,7 +34,7 @@ class ExportContext:
     def __init__(
         self,
         out: Path,
-        config: Config,
+        settings: ExportSettings,
         catalog: Catalog,
         cameras: tuple[Camera, ...],
         lights: tuple[EnvironmentMap, ...],
@@ -44,15 +43,14 @@ class ExportContext:
         """
         Args:
             out: Folder of the data set. It exists and contains the folder `PARTIAL`.
-            config: All settings.
+            settings: Settings of the data set.
             catalog: The objects.
             cameras: The cameras.
             lights: The environment maps.
             pool: Writes all files of episodes. Exporters neither close nor abort it.
         """
-        self.out, self.config, self.cameras, self.pool = out, config, cameras, pool
-        self.settings = ExportSettings.of(config)
-        self.layout = self.settings.layout
+        self.out, self.settings, self.cameras, self.pool = out, settings, cameras, pool
+        self.layout = settings.layout
         self._catalog, self._lights = catalog, lights
 
     @property

@@ -24,6 +24,7 @@ from typing import Any, Self
 
 import warp as wp
 
+from synpick_warp.configs.export import ExportSettings
 from synpick_warp.configs.schema import Config
 from synpick_warp.dataset.digests import digest_inputs
 from synpick_warp.dataset.manifest import committed_episodes
@@ -231,7 +232,8 @@ def prepare_folder(output: OutputFolder, needs: Needs, catalog: Catalog, lights:
     """Prepare the output folder (`OutputFolder.prepare`) in a process that generates no episodes itself."""
     config = output.config
     with WriterPool(1, needs.slot_bytes, output.lock) as pool:
-        exporters = Exporters(needs.classes, ExportContext(output.out, config, catalog, make_cameras(config.cameras), lights, pool))
+        context = ExportContext(output.out, ExportSettings.of(config), catalog, make_cameras(config.cameras), lights, pool)
+        exporters = Exporters(needs.classes, context)
         with aborting(pool, exporters):
             output.prepare(exporters, digest_inputs(catalog, lights), pool)
             exporters.close()

@@ -50,7 +50,7 @@ def exporting(
     (out / PARTIAL).mkdir(parents=True, exist_ok=True)
     with WriterPool(processes, exporter_class.slot_bytes(ExportSettings.of(config))) as pool:
         try:
-            yield exporter_class(ExportContext(out, config, catalog(), lenses, skies(), pool))
+            yield exporter_class(ExportContext(out, ExportSettings.of(config), catalog(), lenses, skies(), pool))
         finally:
             shutil.rmtree(out / PARTIAL, ignore_errors=True)
 

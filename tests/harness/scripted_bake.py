@@ -72,7 +72,7 @@ def bake(out: Path, config: Config, shard: tuple[int, int] = (0, 1), stop_after:
         if output.is_finished:
             return summary
         with WriterPool(0, needs.slot_bytes, output.lock) as pool:
-            exporters = Exporters(needs.classes, ExportContext(out, config, box_views.catalog(), _LENSES, skies(), pool))
+            exporters = Exporters(needs.classes, ExportContext(out, ExportSettings.of(config), box_views.catalog(), _LENSES, skies(), pool))
             output.prepare(exporters, INPUTS, pool)
             for episode in output.remaining[:stop_after]:
                 _write_episode(output, exporters, pool, episode)

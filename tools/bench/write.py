@@ -125,9 +125,9 @@ class _Result:
 def _write(exporter_class: type[Exporter], factory: Factory, source: _Input, processes: int, min_seconds: float, out: Path) -> _Result:
     """Write into the new folder `out` for at least `min_seconds` [s], or until episodes have `MAX_FRAMES` frames."""
     (out / PARTIAL).mkdir(parents=True)
-    config = factory.config
-    with WriterPool(processes, exporter_class.slot_bytes(ExportSettings.of(config))) as pool:
-        exporter = exporter_class(ExportContext(out, config, factory.catalog, factory.cameras, factory.lights, pool))
+    settings = ExportSettings.of(factory.config)
+    with WriterPool(processes, exporter_class.slot_bytes(settings)) as pool:
+        exporter = exporter_class(ExportContext(out, settings, factory.catalog, factory.cameras, factory.lights, pool))
         exporter.write_constants()
         for batch in (source.at(COPIES, 0)[0] for _ in range(-(-processes * QUEUE_DEPTH // len(source.views)))):
             exporter.write_views(batch)

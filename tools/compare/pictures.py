@@ -31,9 +31,11 @@ from synpick_warp.stages.buffers import LayerBuffers, Snapshot, ViewBuffers, vie
 from synpick_warp.stages.render.renderer import Renderer
 from synpick_warp.stages.render.scene import build_render_scene
 from synpick_warp.stages.render.view_setup import first_views
+from synpick_warp.stages.sim.physics import with_enough_worlds
+from synpick_warp.stages.sim.simulate import Simulation
 from synpick_warp.system.device import pick_device
 from tools.options import configure, fail, make_parser, write_json
-from tools.reports.render_piles import make_piles, next_frame, settle_piles
+from tools.reports.render_piles import next_frame, settle_piles
 
 CREEP = 1e-3
 """Displacement of objects since the frame before [m]."""
@@ -174,7 +176,8 @@ def compare_devices(config: Config, devices: list[Any], console: Console) -> lis
     """
     catalog = load_catalog(config, report=console.print)
     lights = load_lights(config.bake.lights)
-    snapshot = next_frame(settle_piles(make_piles(config, catalog, len(lights), devices[0]), config.bake.worlds), CREEP)
+    simulation = Simulation(with_enough_worlds(config, devices[0]), catalog, len(lights), devices[0])
+    snapshot = next_frame(settle_piles(simulation, config.bake.worlds), CREEP)
     cameras = make_cameras(config.cameras)
     fixtures = make_fixtures(config.tote, config.gripper)
     differences = []

@@ -16,7 +16,6 @@ from synpick_warp.errors import SynpickError
 from synpick_warp.scenes.cameras import make_cameras
 from synpick_warp.scenes.catalog import load_catalog
 from synpick_warp.scenes.lights import load_lights
-from synpick_warp.scenes.types import Catalog
 from synpick_warp.stages.buffers import Snapshot
 from synpick_warp.stages.sim.physics import with_enough_worlds
 from synpick_warp.stages.sim.simulate import Simulation
@@ -80,7 +79,7 @@ def compare_piles(
     """
     catalog = load_catalog(config, report=report)
     lights = load_lights(config.bake.lights)
-    snapshot = settle_piles(make_piles(config, catalog, len(lights), device), config.bake.worlds)
+    snapshot = settle_piles(Simulation(with_enough_worlds(config, device), catalog, len(lights), device), config.bake.worlds)
     cameras = make_cameras(config.cameras)[:1]
     values: list[dict[str, object]] = [{"render.mode": FAST}, {"render.mode": REFERENCE}]
     if noise:
@@ -151,11 +150,6 @@ def next_frame(snapshot: Snapshot, displacement: float) -> Snapshot:
 def mean_difference(a: Shot, b: Shot) -> float:
     """Mean absolute difference of two images [grey levels]."""
     return float(np.abs(a.color.astype(np.int16) - b.color).mean())
-
-
-def make_piles(config: Config, catalog: Catalog, lights: int, device: Any) -> Simulation:
-    """Worlds of piles, at least `bake.worlds`; `lights`: number of light maps."""
-    return Simulation(with_enough_worlds(config, device), catalog, lights, device)
 
 
 def settle_piles(simulation: Simulation, count: int) -> Snapshot:

@@ -60,7 +60,7 @@ class SceneExporter(EpisodeExporter[tuple[Path, ...]]):
         self._cameras = context.cameras
         self._pool = context.pool
         self._suffix = f".{bop.color_format}"
-        self._layers = settings.layers if self.write_layer else ()
+        self._layers = settings.render.layers if self.write_layer else ()
         entries = context.catalog.entries if bop.keypoints and self.annotates(bop) else ()
         self._keypoints = {entry.obj_id: sample_keypoints(entry.mesh.vertices, bop.keypoints) for entry in entries}
         self._views = tuple(
@@ -113,7 +113,7 @@ class SceneExporter(EpisodeExporter[tuple[Path, ...]]):
     @staticmethod
     def slot_bytes(settings: ExportSettings) -> int:
         """See `Exporter`."""
-        return view_bytes(settings.cameras.resolution, bool(settings.layers))
+        return view_bytes(settings.cameras.resolution, bool(settings.render.layers))
 
     def write_constants(self) -> list[Path]:
         """See `Exporter`: models, camera and notes."""

@@ -56,18 +56,18 @@ class TrajectoryExporter(EpisodeExporter[_Content]):
     def __init__(self, context: ExportContext) -> None:
         """See `Exporter`."""
         super().__init__(context)
-        config = context.config
+        settings = context.settings
         self._settings = EpisodeSettings(
-            trajectory=config.trajectory,
-            step=config.physics.step,
-            steps_per_tick=config.physics.steps_per_tick,
+            trajectory=settings.trajectory,
+            step=settings.physics.step,
+            steps_per_tick=settings.physics.steps_per_tick,
             masses={entry.obj_id: entry.mass for entry in context.catalog.entries},
         )
 
     @staticmethod
     def slot_bytes(settings: ExportSettings) -> int:
         """See `Exporter`: a tick of some episodes."""
-        size = spool_bytes(settings.objects, settings.physics.steps_per_tick, settings.stores_steps)
+        size = spool_bytes(settings.objects, settings.physics.steps_per_tick, settings.trajectory.steps)
         return shared_bytes((size,))
 
     @staticmethod
@@ -81,9 +81,9 @@ class TrajectoryExporter(EpisodeExporter[_Content]):
         with output_errors(store):
             store.mkdir(exist_ok=True)
             (store / EPISODES).mkdir(exist_ok=True)
-            config, level = context.config, context.config.trajectory.level
+            settings, level = context.settings, context.settings.trajectory.level
             assets = (context.catalog, context.cameras, context.lights)
-            written = write_constants(store, config.bake.seed, config.physics, level, *assets)
+            written = write_constants(store, settings.bake.seed, settings.physics, level, *assets)
         return [path.relative_to(context.out) for path in written]
 
     def write_ticks(self, batch: TickBatch) -> None:
@@ -153,7 +153,7 @@ class TrajectoryExporter(EpisodeExporter[_Content]):
             "frames": end.frames,
             "ending": ending.name.lower(),
             "sentence": ending.sentence,
-            "seed": self._context.config.bake.seed,
+            "seed": self._context.settings.bake.seed,
             **end.row,
             **kept.initial,
         }

@@ -52,9 +52,9 @@ class UsdExporter(EpisodeExporter[TickSpool]):
         with output_errors(library):
             for folder in (library.parent, library):
                 folder.mkdir(exist_ok=True)
-            config = context.config
-            color = config.render.table_color if config.render.table else None
-            write_library(library, config.tote, config.gripper, config.physics, color, context.catalog, context.lights)
+            settings, render = context.settings, context.settings.render
+            color = render.table_color if render.table else None
+            write_library(library, settings.tote, settings.gripper, settings.physics, color, context.catalog, context.lights)
         return [LIBRARY]
 
     def write_ticks(self, batch: TickBatch) -> None:
@@ -82,12 +82,12 @@ class UsdExporter(EpisodeExporter[TickSpool]):
     @cached_property
     def _settings(self) -> EpisodeSettings:
         context = self._context
-        config = context.config
+        settings = context.settings
         return EpisodeSettings(
-            tick_rate=1.0 / config.physics.tick_time,
-            gravity=config.physics.gravity,
+            tick_rate=1.0 / settings.physics.tick_time,
+            gravity=settings.physics.gravity,
             cameras=context.cameras,
-            lights=tuple(make_stage_light(index, light, config.render.exposure) for index, light in enumerate(context.lights)),
+            lights=tuple(make_stage_light(index, light, settings.render.exposure) for index, light in enumerate(context.lights)),
             names={entry.obj_id: entry.name for entry in context.catalog.entries},
         )
 

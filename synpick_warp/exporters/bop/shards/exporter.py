@@ -73,7 +73,7 @@ def _describe(settings: ExportSettings, splits: list[SplitContent]) -> CardConte
         color_suffix=f".{bop.color_format}",
         masks=bop.masks,
         instances=settings.objects,
-        layers=settings.layers,
+        layers=settings.render.layers,
         effects=settings.effects,
     )
 

@@ -205,7 +205,7 @@ BOP challenge (scenewise). {_describe_scenes(layout)} of {_describe_folders(layo
   in an image's list.
 - `mask_visib` is exact: what the ray through the pixel's centre meets first. The masks of an image do not overlap.
 - `px_count_all` and `bbox_obj` count what lies outside of the picture too, up to one picture's size beyond each border.
-{layer_notes(settings.layers)}- `models_eval/` equals `models/`.
+{layer_notes(settings.render.layers)}- `models_eval/` equals `models/`.
 
 | obj_id | name | mass [kg] |
 |---|---|---|
