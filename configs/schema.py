@@ -301,6 +301,11 @@ class Physics:
     deterministic: bool = setting(True, "", "On a GPU, sort contact rows, so that a bake can be reproduced bit for bit.")
     guide_height: float = setting(8.0, "m", "Height of the temporary walls on the rim that guide the drop.", above=0.0, high=100.0)
 
+    @property
+    def tick_time(self) -> float:
+        """Time between two frames [s]."""
+        return self.step * self.steps_per_tick
+
 
 @dataclass(frozen=True)
 class Render:

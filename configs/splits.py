@@ -92,6 +92,11 @@ class DataLayout:
         ranges = [episode_range(split) for split in splits] if splits else [range(self.episodes)]
         return [range(each.start + (index - each.start) % count, each.stop, count) for each in ranges]
 
+    @property
+    def planned(self) -> int:
+        """Number of episodes, of all splits."""
+        return sum(map(len, self.plan()))
+
     def plan_shard(self, names: Sequence[str], shard: tuple[int, int], name: str = "shard") -> list[range]:
         """Validate a shard and return its episode indices, ascending, one range per split.
 

@@ -8,7 +8,7 @@ largest variant, and every shape costs time in the broad phase.
 from __future__ import annotations
 
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import newton
@@ -96,7 +96,11 @@ class BuiltModel:
     """Index of the empty variant in single and in compound slots."""
 
 
-def count_slots(config: Config, catalog: Catalog) -> tuple[int, int]:
+REPEATS: Mapping[str, object] = {"pick.repeats": True, "move.repeats": True}
+"""Settings by which objects repeat in an episode, in every mode."""
+
+
+def count_slots(arrangement: Arrangement, rules: Iterable[bool], catalog: Catalog) -> tuple[int, int]:
     """Determine the body slots (single, compound) that suffice for all draws but a fraction `slot_shortfall`, in each possible mode.
 
     The object that exceeds the budget, if `fill` keeps it, has its slot as well.
@@ -104,10 +108,15 @@ def count_slots(config: Config, catalog: Catalog) -> tuple[int, int]:
     A Monte Carlo estimate: the volume budget couples how many objects are drawn with which ones, so there is no simple formula.
     Slots cost time whether used or not, and compound ones most: their count is minimized first, then that of single slots.
 
+    Args:
+        arrangement: Settings of the draw.
+        rules: Whether objects repeat in an episode: the values by `find_repeat_rules`.
+        catalog: The objects.
+
     Raises:
         ConfigError: No object fits into the volume budget.
     """
-    budget, shortfall = config.arrangement.volume, config.arrangement.slot_shortfall
+    budget, shortfall = arrangement.volume, arrangement.slot_shortfall
     compound = np.array([len(entry.pieces) > 1 for entry in catalog.entries])
     volume = np.array([entry.volume for entry in catalog.entries])
     # The kernels sample in 32-bit floats: an object of exactly the budget fits there.
@@ -117,11 +126,11 @@ def count_slots(config: Config, catalog: Catalog) -> tuple[int, int]:
             f"arrangement.volume is {budget:g} m³, but the smallest object, {smallest.name}, takes {smallest.volume:.3g} m³; make it larger"
         )
     needed = []
-    for repeats in find_repeat_rules(config.bake, config.pick, config.move):
-        slots = _slots_of_trials(_draw_trials(volume, budget, config.arrangement, repeats), compound, shortfall)
+    for repeats in rules:
+        slots = _slots_of_trials(_draw_trials(volume, budget, arrangement, repeats), compound, shortfall)
         # Where a sum of volumes meets the budget but for rounding, as of three cubes of a litre and three litres, 64-bit floats may
         # find room for one object fewer than the kernels do, in every draw. Other catalogs keep the count of the 64-bit draws.
-        rounded = _draw_trials(volume.astype(np.float32), np.float32(budget), config.arrangement, repeats)
+        rounded = _draw_trials(volume.astype(np.float32), np.float32(budget), arrangement, repeats)
         noise = 4.0 * np.sqrt(shortfall / SLOT_TRIALS)
         if (_count_by_type(rounded, compound) > slots).any(axis=1).mean() > shortfall + noise:
             slots = _slots_of_trials(rounded, compound, shortfall)
@@ -184,7 +193,7 @@ def build_model(config: Config, catalog: Catalog, device: wp.Device) -> BuiltMod
         catalog: The objects.
         device: Device of the model's arrays.
     """
-    single, compound = count_slots(config, catalog)
+    single, compound = count_slots(config.arrangement, find_repeat_rules(config.bake, config.pick, config.move), catalog)
     world = newton.ModelBuilder(gravity=(0.0, 0.0, -config.physics.gravity))
     newton.solvers.SolverSteel.register_custom_attributes(world)
     shape = newton.ModelBuilder.ShapeConfig(density=0.0, mu=config.physics.friction, gap=config.physics.gap, restitution=0.0)
@@ -208,24 +217,20 @@ def build_model(config: Config, catalog: Catalog, device: wp.Device) -> BuiltMod
     return BuiltModel(model, layout, variant, empty)
 
 
-def with_repeats(config: Config, catalog: Catalog) -> Config:
-    """Let objects repeat in an episode if all together stay below the volume budget: a catalog of one object fills the tote, too."""
-    budget = config.arrangement.volume
-    volumes = [entry.volume for entry in catalog.entries if entry.volume <= budget]
-    if not config.arrangement.repeat_to_fill or sum(volumes) >= budget or len(volumes) >= config.arrangement.max_objects:
-        return config
-    return config.with_values({"pick.repeats": True, "move.repeats": True})
+def must_repeat(arrangement: Arrangement, catalog: Catalog) -> bool:
+    """Whether objects repeat in an episode since all together stay below the volume budget: a catalog of one object fills the tote, too."""
+    volumes = [entry.volume for entry in catalog.entries if entry.volume <= arrangement.volume]
+    return arrangement.repeat_to_fill and sum(volumes) < arrangement.volume and len(volumes) < arrangement.max_objects
 
 
-def with_capacities(config: Config, catalog: Catalog) -> Config:
-    """Raise the capacities of the section physics for objects thinner than the contact margin, which touch others through each other.
+def with_capacities(physics: Physics, count: int, catalog: Catalog) -> Physics:
+    """Raise the capacities of a world of at most `count` objects if some are thinner than the contact margin, so touch through others.
 
     The margin of two shapes is twice `physics.gap`. Within a margin m of an object of side lengths a, b, c there is room for about
     (a + 2 m)(b + 2 m)(c + 2 m) / (a b c) - 1 others of its kind: 23 for plates of 100 x 80 x 1 mm. Piles of objects that are thicker than
     the margin keep the capacities of the settings.
     """
-    physics, count, margin = config.physics, config.arrangement.max_objects, 2.0 * config.physics.gap
-    needed = 0.0
+    margin, needed = 2.0 * physics.gap, 0.0
     for entry in catalog.entries:
         sides = np.sort(oriented_sides(entry.pieces))
         if sides[0] >= margin:
@@ -234,18 +239,15 @@ def with_capacities(config: Config, catalog: Catalog) -> Config:
         pairs = min(count * neighbors, count * (count - 1)) / 2.0 + _FIXTURES * count
         needed = max(needed, _PAIR_CONTACTS * pairs * len(entry.pieces))
     if needed <= physics.contacts_per_world:
-        return config
+        return physics
     contacts = min(int(np.ceil(needed)), max(MAX_CONTACTS, physics.contacts_per_world))
     share = contacts / physics.contacts_per_world
     return replace(
-        config,
-        physics=replace(
-            physics,
-            contacts_per_world=contacts,
-            pairs_per_world=round(share * physics.pairs_per_world),
-            rows_per_world=max(physics.rows_per_world, min(3 * contacts, MAX_ROWS)),
-            gripper_rows_per_world=round(share * physics.gripper_rows_per_world),
-        ),
+        physics,
+        contacts_per_world=contacts,
+        pairs_per_world=round(share * physics.pairs_per_world),
+        rows_per_world=max(physics.rows_per_world, min(3 * contacts, MAX_ROWS)),
+        gripper_rows_per_world=round(share * physics.gripper_rows_per_world),
     )
 
 

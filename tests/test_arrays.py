@@ -2,90 +2,46 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+import contextlib
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from typing import Any
 
 import pytest
 import warp as wp
 
-from synpick_warp.factory.memory_plan import Row, describe_arrays, queue_slots
-from synpick_warp.stages.arrays import StructArrays, allocate, allocate_struct, device_array, memory_table, struct_arrays
-from synpick_warp.stages.buffers import LastFrame, LayerBuffers, Snapshot, ViewBuffers
-from synpick_warp.stages.encoding.jpeg import JpegBuffers, JpegScratch
-from synpick_warp.stages.encoding.png import DEPTH_SCRATCH, DepthBuffers
-from synpick_warp.stages.perception.arrays import Observation, PerceptionArrays, Plan, SegmentationScratch
-from synpick_warp.stages.perception.images import count_views
-from synpick_warp.stages.perception.plan import CYCLES, VoteArrays
-from synpick_warp.stages.render.annotate import BORDER_BOXES
+from synpick_warp.configs.schema import LAYERS
+from synpick_warp.stages.arrays import Row, StructArrays, allocate, allocate_struct, device_array, dry_run, struct_arrays
+from synpick_warp.stages.buffers import view_buffer_sizes
+from synpick_warp.stages.host_copies import HostImages
+from synpick_warp.stages.online.batches import allocate_slot
+from synpick_warp.stages.perception.images import allocate_batch, count_views
+from synpick_warp.stages.perception.plan import allocate_votes
 from synpick_warp.stages.render.denoised import (
-    COARSE_LIGHT,
-    EDGE_LISTS,
-    GUIDE,
-    LAMP_SHADOWS,
-    LIGHT_HISTORY,
-    MOVING_BODIES,
-    PATH_LISTS,
-    PATH_QUEUES,
-    RATIO_IMAGES,
-    FootprintLists,
-    ShadowRays,
     scratch_sizes,
 )
-from synpick_warp.stages.render.layers import BODY_MOTIONS
-from synpick_warp.stages.render.mask_runs import BoundaryBuffers, BoundaryScratch
-from synpick_warp.stages.render.raster import VISIBILITY_BUFFER
-from synpick_warp.stages.render.renderer import SHADED_IMAGE
+from synpick_warp.stages.render.renderer import Renderer
 from synpick_warp.stages.render.sampling_rates import FIRST_FRAME_PATHS, first_frame_paths, paths_per_coarse_pixel
-from synpick_warp.stages.render.view_setup import GBUFFER, VIEW_BODIES, VIEWS
+from synpick_warp.stages.render.scene import blank_scene
 from synpick_warp.stages.sim.physics import MIN_GPU_WORLDS
-from synpick_warp.stages.sim.worlds import AttemptState, SealState, WorldState, WorldStatus
-from synpick_warp.stages.stream import RING
+from synpick_warp.stages.sim.simulate import allocate_worlds
+from synpick_warp.stages.sim.step_log import allocate_record, record_sizes
+from synpick_warp.stages.sim.worlds import world_sizes
+from synpick_warp.stages.stream import RING, allocate_ring
 from synpick_warp.system.hardware.device import pick_device
+from tests.harness.memory_tables import device_arrays, queued_ticks
 from tests.worlds.small_worlds import settings
 
-NAMES = (
-    "one world world_and_global instance body waypoint status measure fixture view row column count box side point kind subset tile "
-    "image field boundary cell_row cell_column shadow_row shadow_column edge_chunk chunk_cell chunk_pixel edge_counter "
-    "chunk chunk_footprint block "
-    "world_camera view_instance one slot slot_word group depth_byte "
-    "sample_row sample_block quad interval lane byte region rank path_kind record"
-    " queue_view queue_region queue_stage stage_parity queue_slot path_record"
-)
 WORLDS = MIN_GPU_WORLDS + 1
-SIZES = {name: 2 + number for number, name in enumerate(NAMES.split())}
-BASE = [
-    WorldState,
-    AttemptState,
-    SealState,
-    LastFrame,
-    Observation,
-    Plan,
-    WorldStatus,
-    Snapshot,
-    ViewBuffers,
-    VIEW_BODIES,
-    GBUFFER,
-    SHADED_IMAGE,
-    BoundaryBuffers,
-    BoundaryScratch,
-    GUIDE,
-    COARSE_LIGHT,
-    RATIO_IMAGES,
-    LAMP_SHADOWS,
-    ShadowRays,
-    EDGE_LISTS,
-    FootprintLists,
-    VISIBILITY_BUFFER,
-    BORDER_BOXES,
-    LIGHT_HISTORY,
-    MOVING_BODIES,
-    PATH_LISTS,
-    PATH_QUEUES,
-    DepthBuffers,
-    *DEPTH_SCRATCH,
-]
-PERCEPTION = [VIEWS, PerceptionArrays, SegmentationScratch, VoteArrays, CYCLES]
-LAYERS = [LayerBuffers, BODY_MOTIONS]
-DECLARED = BASE + PERCEPTION + LAYERS
+NAMES = (
+    "WorldState AttemptState SealState LastFrame Observation Plan WorldStatus Snapshot ViewBuffers ViewBodies GBuffer ShadedImage "
+    "BoundaryBuffers BoundaryScratch Guide CoarseLight RatioImages LampShadows ShadowRays EdgeLists FootprintLists VisibilityBuffer "
+    "BorderBoxes LightHistory MovingBodies PathLists PathQueues DepthBuffers DepthScratch SlotSums"
+)
+BASE = set(NAMES.split())
+"""Declarations of which every bake has arrays."""
+PERCEPTION = {"Views", "PerceptionArrays", "SegmentationScratch", "VoteArrays", "Cycles"}
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,6 +51,14 @@ class Sample:
     flag: wp.array = device_array("cup", "cup", "world", dtype=wp.uint8)
 
 
+def table_of(kind: Any, sizes: dict[str, int], only: Sequence[str] | None = None) -> list[Row]:
+    """Rows of a dry run."""
+    nowhere: Any = None
+    with dry_run() as arrays:
+        allocate_struct(kind, sizes, nowhere) if isinstance(kind, StructArrays) else allocate(kind, sizes, nowhere, only)
+    return [array.row for array in arrays]
+
+
 def test_allocated_arrays_have_declared_shapes_and_types_and_are_zero(device):
     made = allocate(Sample, {"world": 3, "cup": 2}, device)
     assert [made.gap.shape, made.pose.shape, made.flag.shape] == [(3, 2), (3,), (2, 2, 3)]
@@ -102,11 +66,22 @@ def test_allocated_arrays_have_declared_shapes_and_types_and_are_zero(device):
     assert all(array.device == device and not array.numpy().any() for array in (made.gap, made.pose, made.flag))
 
 
-def test_the_table_counts_bytes_and_allocates_nothing():
-    rows = memory_table(Sample, {"world": 3, "cup": 2})
+def test_a_dry_run_counts_bytes_and_allocates_nothing():
+    rows = table_of(Sample, {"world": 3, "cup": 2})
     assert rows == [("Sample.gap", (3, 2), "m", 24), ("Sample.pose", (3,), "", 84), ("Sample.flag", (2, 2, 3), "", 12)]
-    huge = memory_table(Sample, {"world": 10**9, "cup": 1000})
+    huge = table_of(Sample, {"world": 10**9, "cup": 1000})
     assert huge[0][3] == 4 * 10**12
+
+
+def test_a_dry_run_is_that_of_its_thread_and_ends(device):
+    """A stream of another thread allocates meanwhile; after an error, too, arrays are allocated again."""
+    sizes = {"world": 3, "cup": 2}
+    with contextlib.suppress(ZeroDivisionError), ThreadPoolExecutor(1) as other, dry_run() as arrays:
+        assert isinstance(other.submit(allocate, Sample, sizes, device).result().pose, wp.array)
+        assert not arrays
+        raise ZeroDivisionError
+    assert isinstance(allocate(Sample, sizes, device).pose, wp.array)
+    assert not arrays
 
 
 def test_a_missing_extent_is_an_error(device):
@@ -114,16 +89,30 @@ def test_a_missing_extent_is_an_error(device):
         allocate(Sample, {"world": 3}, device)
 
 
-@pytest.mark.parametrize("kind", [*DECLARED, JpegBuffers, JpegScratch], ids=lambda kind: kind.__name__)
-def test_the_memory_table_of_every_declaration_matches_its_allocation(device, kind):
-    is_struct = isinstance(kind, StructArrays)
-    arrays = allocate_struct(kind, SIZES, device) if is_struct else allocate(kind, SIZES, device)
-    names = [name for name in kind.struct.vars if wp.types.is_array(getattr(arrays, name))] if is_struct else [f.name for f in fields(kind)]
-    rows = {name: (shape, size) for name, shape, _, size in memory_table(kind, SIZES)}
-    assert len(rows) == len(names)
-    for name in names:
-        array = getattr(arrays, name)
-        assert rows[f"{kind.__name__}.{name}"] == (array.shape, array.numpy().nbytes)
+def test_a_dry_run_lists_what_the_same_calls_allocate(device, monkeypatch):
+    """Shapes and sizes of the arrays of all stages, in small."""
+    config = settings(render__layers=list(LAYERS), effects__blur=[0.0, 1.0], bake__worlds=2)
+    rooms, layers, room = config.perception, config.render.layers, config.arrangement.max_objects
+
+    def build() -> None:
+        sizes = record_sizes(world_sizes(2, room, 3, 4), 5)
+        allocate_worlds(sizes, device)
+        allocate_record(True, sizes, device)
+        sections = (config.render, config.effects, config.depth_sensor)
+        Renderer(blank_scene(3, 40, 24, device), *sections, seed=0, depth_scale=0.1, instances=room, views=4, histories=6)
+        allocate_ring(view_buffer_sizes(4, 40, 24, room), layers, HostImages(jpeg_quality=95, depth_files=True), device)
+        allocate_slot(view_buffer_sizes(4, 40, 24, room), layers, device)
+        allocate_batch(rooms, room, 2, device)
+        allocate_votes(rooms, room, 2, device)
+
+    with dry_run() as arrays:
+        build()
+    made: list[wp.array] = []
+    zeros = wp.zeros
+    monkeypatch.setattr(wp, "zeros", lambda *shape, **rest: made.append(zeros(*shape, **rest)) or made[-1])
+    build()
+    assert {array.name.split(".")[0] for array in arrays} > BASE | PERCEPTION | {"LayerBuffers", "BodyMotions", "LensArrays", "JpegScratch"}
+    assert [(array.shape, array.row[3]) for array in arrays] == [(array.shape, array.numpy().nbytes) for array in made]
 
 
 @wp.struct
@@ -138,7 +127,7 @@ def test_struct_arrays_have_the_types_of_the_struct_and_declared_dimensions(devi
     struct = allocate_struct(declared, {"world": 3, "cup": 2}, device)
     assert (struct.gap.shape, struct.pose.shape, struct.count) == ((3, 2), (3,), 0)
     assert (struct.gap.dtype, struct.pose.dtype) == (wp.float32, wp.transformf)
-    assert memory_table(declared, {"world": 3, "cup": 2}) == [("SampleStruct.gap", (3, 2), "m", 24), ("SampleStruct.pose", (3,), "", 84)]
+    assert table_of(declared, {"world": 3, "cup": 2}) == [("SampleStruct.gap", (3, 2), "m", 24), ("SampleStruct.pose", (3,), "", 84)]
 
 
 @pytest.mark.parametrize(
@@ -160,16 +149,15 @@ def kinds_of(rows: list[Row]) -> set[str]:
 
 def test_a_bakes_table_lists_every_array_with_its_copies():
     config = settings(bake__worlds=WORLDS, cameras__resolution=[8, 6], render__views_per_batch=3)
-    rows = describe_arrays(config)
+    rows = device_arrays(config)
     names = [name for name, *_ in rows]
-    assert kinds_of(rows) == {kind.__name__ for kind in BASE}
+    assert kinds_of(rows) == BASE
     assert names.count("Observation.votes") == names.count("Plan.target") == names.count("WorldStatus.table") == 1
     assert names.count("Snapshot.pose") == names.count("queued Snapshot.pose") == names.count("WorldState.phase") == 1
     assert names.count("ViewBuffers.color") == (RING if pick_device(config.bake.device).is_cuda else 1)
     by_name = {name: (shape, unit, size) for name, shape, unit, size in rows}
     assert by_name["Snapshot.pose"] == ((WORLDS, config.arrangement.max_objects), "m", 28 * WORLDS * config.arrangement.max_objects)
-    queued = queue_slots(config, pick_device(config.bake.device)) * WORLDS
-    assert by_name["queued Snapshot.pose"][0] == (queued, config.arrangement.max_objects)
+    assert by_name["queued Snapshot.pose"][0] == (queued_ticks(config) * WORLDS, config.arrangement.max_objects)
     assert by_name["ViewBuffers.color"] == ((3, 6, 8), "", 3 * 6 * 8 * 3)
 
 
@@ -212,7 +200,7 @@ def test_first_frames_trace_no_more_paths_than_a_history_counts():
 
 
 def test_the_path_traced_reference_has_no_coarse_grid():
-    names = {name.split(".")[0] for name, *_ in describe_arrays(settings(render__mode="reference"))}
+    names = {name.split(".")[0] for name, *_ in device_arrays(settings(render__mode="reference"))}
     assert "ShadedImage" in names
     assert not names & {"Guide", "CoarseLight", "RatioImages", "LampShadows"}
 
@@ -222,9 +210,9 @@ def test_a_bake_that_may_pick_has_the_arrays_of_perception(mode):
     config = settings(bake__worlds=WORLDS, perception__resolution=[64, 48], **mode)
     room = config.arrangement.max_objects
     looks = count_views(config.perception, config.bake.worlds, room, pick_device(config.bake.device))
-    rows = describe_arrays(config)
-    assert kinds_of(rows) == {kind.__name__ for kind in BASE + PERCEPTION}
-    shapes = {name: shape for name, shape, _, _ in rows if name.split(".")[0] in {kind.__name__ for kind in PERCEPTION}}
+    rows = device_arrays(config)
+    assert kinds_of(rows) == BASE | PERCEPTION
+    shapes = {name: shape for name, shape, _, _ in rows if name.split(".")[0] in PERCEPTION}
     assert shapes["PerceptionArrays.component"] == shapes["SegmentationScratch.gap"] == (looks, 48, 64)
     assert shapes["VoteArrays.count"] == (looks, room, room, 2)
     assert [name for name, *_ in rows].count("GBuffer.depth") == 4
@@ -232,19 +220,19 @@ def test_a_bake_that_may_pick_has_the_arrays_of_perception(mode):
 
 def test_a_mixture_without_picking_has_no_arrays_of_perception():
     config = settings(bake__mode="mixed", bake__mix=[0, 0, 1])
-    assert kinds_of(describe_arrays(config)) == {kind.__name__ for kind in BASE}
+    assert kinds_of(device_arrays(config)) == BASE
 
 
 def test_fields_left_out_are_neither_allocated_nor_counted(device):
     made = allocate(Sample, {"world": 3, "cup": 2}, device, only=("pose",))
     assert (made.gap, made.flag) == (None, None)
     assert made.pose.shape == (3,)
-    assert memory_table(Sample, {"world": 3}, only=("pose",)) == [("Sample.pose", (3,), "", 84)]
+    assert table_of(Sample, {"world": 3}, only=("pose",)) == [("Sample.pose", (3,), "", 84)]
 
 
 def test_the_memory_table_lists_the_layers_of_the_settings():
-    rows = {name: (shape, unit, size) for name, shape, unit, size in describe_arrays(settings(render__layers=["flow", "nocs"]))}
+    rows = {name: (shape, unit, size) for name, shape, unit, size in device_arrays(settings(render__layers=["flow", "nocs"]))}
     assert {name for name in rows if name.startswith("LayerBuffers")} == {"LayerBuffers.flow", "LayerBuffers.nocs"}
     assert rows["LayerBuffers.flow"][1] == "px"
     assert "BodyMotions.rotation" in rows
-    assert not any(name.startswith("BodyMotions") for name, *_ in describe_arrays(settings(render__layers=["nocs"])))
+    assert not any(name.startswith("BodyMotions") for name, *_ in device_arrays(settings(render__layers=["nocs"])))

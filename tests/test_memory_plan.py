@@ -15,7 +15,7 @@ from synpick_warp.configs.load import load_config, sections, settings_of
 from synpick_warp.configs.schema import FAST, REFERENCE, UNOCCLUDED, Config, Physics, Settle
 from synpick_warp.errors import ConfigError, SynpickError
 from synpick_warp.factory import assembly, memory_plan, pipeline
-from synpick_warp.factory.memory_plan import check_memory, describe_memory, plan_memory
+from synpick_warp.factory.memory_plan import check_memory, plan_memory
 from synpick_warp.system.hardware.free_memory import free_host_memory
 from synpick_warp.system.progress import SilentProgress
 from tests.harness.fuzz import fuzz_examples
@@ -177,18 +177,19 @@ def test_other_runtime_errors_stay_what_they_are(tmp_path, monkeypatch):
 @pytest.mark.parametrize("preset", ["smoke", "synpick", "synpick-released"])
 @pytest.mark.parametrize("machine_device", [CPU, GPU], ids=["cpu", "gpu"])
 def test_presets_fit_into_a_common_machine(preset, machine_device):
-    check_memory(load_config(preset, {"bake.mode": "mixed", "bake.worlds": 32}), machine_device, writers=16)
+    config = load_config(preset, {"bake.mode": "mixed", "bake.worlds": 32})
+    check_memory(plan_memory(config, machine_device, 16), machine_device)
 
 
 def test_512_worlds_are_not_refused_on_a_gpu_of_80_gib():
     """With the paper's settings, beside 64 GiB of host memory. The plan is a lower bound: that it accepts them does not say they fit."""
-    check_memory(load_config("synpick", {"bake.mode": "mixed", "bake.worlds": 512}), GPU, writers=16)
+    check_memory(plan_memory(load_config("synpick", {"bake.mode": "mixed", "bake.worlds": 512}), GPU, 16), GPU)
 
 
 def test_the_gpus_memory_is_its_own(monkeypatch):
     monkeypatch.setattr(memory_plan, "free_device_memory", lambda device: GIB // 8)
     with pytest.raises(ConfigError, match=r"for .*, but cuda:0 has 0\.2 GiB free; lower cameras\.resolution|lower bake\.worlds"):
-        check_memory(load_config("synpick", {"bake.worlds": 64}), GPU)
+        check_memory(plan_memory(load_config("synpick", {"bake.worlds": 64}), GPU), GPU)
 
 
 def test_the_plan_is_below_what_a_small_bake_allocates(device):
@@ -222,11 +223,9 @@ def test_without_paths_images_need_less():
     assert sizes[REFERENCE] < sizes[UNOCCLUDED] < sizes[FAST]
 
 
-def test_the_memory_table_has_the_terms_of_the_plan():
-    rows = describe_memory(settings(bake__device="cpu"))
-    names = [name for name, *_ in rows]
-    assert {"WorldState.phase", "ViewBuffers.color", "Newton's contacts", "shared memory of writers"} <= set(names)
-    assert {row[:3] for row in memory_plan.describe_arrays(settings(bake__device="cpu"))} <= {row[:3] for row in rows}
+def test_the_plan_has_the_arrays_of_all_stages_and_its_estimates():
+    names = {name for term in plan_memory(settings(), CPU) for name, *_ in term.rows}
+    assert {"WorldState.phase", "ViewBuffers.color", "Newton's contacts", "shared memory of writers"} <= names
 
 
 # ---- free memory ----
@@ -303,13 +302,14 @@ def test_extreme_settings_give_a_plan_or_one_line(data, cuda, mode, cameras):
     try:
         config = load_config("smoke", values)
         device = GPU if cuda else CPU
-        for term in plan_memory(config, device, writers=config.bake.writers or 2):
+        terms = plan_memory(config, device, writers=config.bake.writers or 2)
+        for term in terms:
             for _, shape, _, size in term.rows:
                 assert type(size) is int
                 assert size >= 0
                 assert all(type(extent) is int and extent >= 0 for extent in shape)
             # Without history, or without images, there is nothing to hold.
             assert term.size > 0 or term.name.startswith(("images in", "light averaged over frames"))
-        check_memory(config, device, config.bake.writers or 2)
+        check_memory(terms, device)
     except SynpickError as error:
         assert "\n" not in str(error)  # noqa: PT017 - most examples are errors, some are none

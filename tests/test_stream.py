@@ -28,9 +28,9 @@ from synpick_warp.stages.sim.simulate import TickRecord
 from synpick_warp.stages.stream import (
     FrameStream,
     LightTable,
-    TickReader,
     TickReport,
     name_lights,
+    read_tick,
     tick_batch,
     view_sizes,
     views_per_batch,
@@ -83,8 +83,12 @@ def report_of(live: list[int]) -> TickReport:
     return TickReport(status, measures, entry, pose, SimpleNamespace(), SimpleNamespace(), light)
 
 
+def sizes_of(config: Config, device: wp.Device) -> dict[str, int]:
+    return view_sizes(config.render, config.cameras, config.bake.worlds, config.arrangement.max_objects, device)
+
+
 def frame_stream(config: Config, renderer: FakeRenderer, device) -> FrameStream:
-    sizes, layers, cameras = view_sizes(config, device), config.render.layers, len(config.cameras.positions)
+    sizes, layers, cameras = sizes_of(config, device), config.render.layers, len(config.cameras.positions)
     tick_time = config.physics.step * config.physics.steps_per_tick
     return FrameStream(sizes, layers, cameras, tick_time, renderer, OBJECT_IDS, LIGHTS, device)  # type: ignore[arg-type]
 
@@ -265,7 +269,7 @@ def test_batch_sizes():
 
 def test_view_sizes_are_those_of_the_buffers(device):
     views = batch_of(config_of(), device)
-    buffers = allocate(ViewBuffers, view_sizes(config_of(), device), device)
+    buffers = allocate(ViewBuffers, sizes_of(config_of(), device), device)
     assert buffers.color.shape == (views, 6, 8)
     assert buffers.pixels.shape == (views, ROOM, 3)
     pixel = sum(wp.types.type_size_in_bytes(getattr(buffers, name).dtype) for name in ("color", "depth", "instance", "amodal"))
@@ -297,9 +301,7 @@ def test_a_report_outlives_the_next_tick(device):
     record = new_record(device)
     record.snapshot.catalog_index.fill_(2)
     record.status.table.fill_(Phase.ACT)
-    reader = TickReader(record)
-    reader.start()
-    report = reader.wait()
+    report = read_tick(record)
     everything = (record.snapshot.catalog_index, record.status.table, record.status.measures, *vars(record.observation).values())
     for array in (*everything, *vars(record.plan).values()):
         array.fill_(5)
@@ -323,9 +325,7 @@ def test_a_report_has_every_array_under_its_name(device):
         values = record.status.measures.numpy()
         values[:, index] = np.arange(WORLDS) + 10 * index
         record.status.measures.assign(values)
-    reader = TickReader(record)
-    reader.start()
-    report = reader.wait()
+    report = read_tick(record)
     for (part, name), number in given.items():
         array = getattr(getattr(report, part), name)
         assert (array == number).all(), name
@@ -363,7 +363,7 @@ def test_run_boundaries_are_those_of_the_batchs_own_images(device):
 def test_files_and_lists_stand_for_images(device):
     """JPEG and depth files equal the encoded images; images that stay on the device are copied on demand, one at a time."""
     renderer, config = FakeRenderer([]), config_of(render__views_per_batch=4)
-    sizes, tick_time = view_sizes(config, device), config.physics.step * config.physics.steps_per_tick
+    sizes, tick_time = sizes_of(config, device), config.physics.step * config.physics.steps_per_tick
     host = host_copies.HostImages(("color", "depth", "instance", "amodal"), 90, depth_files=True)
     frames = FrameStream(sizes, (), 3, tick_time, renderer, OBJECT_IDS, LIGHTS, device, host)  # type: ignore[arg-type]
     code = iter([11, 12, 13, 41, 42, 43])

@@ -13,10 +13,10 @@ import stat
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from synpick_warp.cli.options import one_line
-from synpick_warp.configs.schema import Config
+from synpick_warp.configs.schema import Bake, Config, Split
 from synpick_warp.errors import DatasetError, OutputError, SynpickError, escape
 
 DEFAULT_NAME = "synpick-data"
@@ -71,8 +71,10 @@ def choose_output(config: Config) -> tuple[Path, str]:
         raise OutputError(f"the current folder cannot be read: {error.strerror}; name the data set's folder with --out") from None
     if inside is not None:
         raise OutputError(f"the current folder is in the data set {inside}; name the new data set's folder with --out")
-    known = {number: Path(name) for number, name in names}
-    own = next((folder for folder in known.values() if _is_same_bake(folder, config)), None)
+    from synpick_warp.dataset.commit.manifest import make_manifest
+
+    known, manifest = {number: Path(name) for number, name in names}, make_manifest(config)
+    own = next((folder for folder in known.values() if _is_same_bake(folder, manifest, _extent(config.bake, config.splits))), None)
     if own is not None:
         return own, f"data set: ./{own}, which the same bake has started"
     number = 1
@@ -85,26 +87,29 @@ def choose_output(config: Config) -> tuple[Path, str]:
     return folder, f"data set: ./{folder} (--out names another folder{reason})"
 
 
-def _is_same_bake(folder: Path, config: Config) -> bool:
-    """Whether a folder is a data set of these settings, inputs (models, lights) left out; False if it cannot be read."""
-    from synpick_warp.dataset.commit.manifest import CONFIG_FILE, INPUTS, describe_differences, make_manifest, read_manifest, read_settings
+def _is_same_bake(folder: Path, wanted: dict[str, Any], extent: tuple[object, ...]) -> bool:
+    """Whether a folder is of a bake with this manifest and extent."""
+    from synpick_warp.dataset.commit.manifest import CONFIG_FILE, INPUTS, describe_differences, read_manifest, read_settings
 
     if not is_data_set(folder):
         return False
     try:
         manifest = read_manifest(folder)
-        if describe_differences(make_manifest(config), {name: manifest[name] for name in manifest if name != INPUTS}):
+        if describe_differences(wanted, {name: manifest[name] for name in manifest if name != INPUTS}):
             return False
         # Without settings it was killed before its first episode.
-        return not os.path.lexists(folder / CONFIG_FILE) or _extent(read_settings(folder, manifest)) == _extent(config)
+        if not os.path.lexists(folder / CONFIG_FILE):
+            return True
+        settings = read_settings(folder, manifest)
+        return _extent(settings.bake, settings.splits) == extent
     except (SynpickError, OSError):
         return False
 
 
-def _extent(config: Config) -> tuple[object, ...]:
+def _extent(bake: Bake, splits: Sequence[Split]) -> tuple[object, ...]:
     """What the manifest does not have of a bake: numbers of episodes, absolute folders of models and lights."""
-    folders = (os.path.abspath(path) if path else "" for path in (config.bake.models, config.bake.lights))
-    return (config.bake.episodes, *(split.episodes for split in config.splits), *folders)
+    folders = (os.path.abspath(path) if path else "" for path in (bake.models, bake.lights))
+    return (bake.episodes, *(split.episodes for split in splits), *folders)
 
 
 def _is_free(folder: Path) -> bool:

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -167,7 +168,7 @@ def bake(
         return _bake(resolved, out, part, names, several)
     trace = profile_out or out.with_name(f"{out.name}-profile.json")
     check_trace_file(trace, out)
-    return _bake_profiled(resolved, out, part, names, trace)
+    return _profiled(partial(_bake, resolved, out, part, names), trace)
 
 
 @app.command
@@ -202,10 +203,12 @@ def doctor(
 ) -> int:
     """Show device, versions, kernel cache, and the memory of a bake's device arrays."""
     resolved = _resolve(config, {"bake.worlds": worlds, "bake.device": device}, resolution, set_)
-    from synpick_warp.cli.commands.doctor import examine
+    from synpick_warp.cli.commands.doctor import machine_report, memory_report
     from synpick_warp.cli.display import make_console
+    from synpick_warp.system.hardware.device import pick_device
 
-    examine(resolved, make_console())
+    for table in (machine_report(pick_device(resolved.bake.device)), memory_report(resolved)):
+        make_console().print(table)
     return 0
 
 
@@ -319,19 +322,17 @@ def check_trace_file(trace: Path, out: Path) -> None:
         raise ConfigError(f"--profile-out is {trace}; allowed: a file in an existing folder")
 
 
-def _bake_profiled(config: Config, out: Path, shard: tuple[int, int], splits: Sequence[str], trace: Path) -> int:
+def _profiled(bake: Callable[[], int], trace: Path) -> int:
     """Bake with the profiler on; print the table and write the trace."""
     from synpick_warp.cli.display import make_console, print_profile
-    from synpick_warp.exporters.writing.files import output_error
+    from synpick_warp.exporters.writing.files import output_errors
     from synpick_warp.stages.timing import record
 
     with record() as recorder:
-        code = _bake(config, out, shard, splits)
+        code = bake()
     print_profile(make_console(), recorder)
-    try:
+    with output_errors(trace):
         recorder.write_trace(trace)
-    except OSError as error:
-        raise output_error(trace, error) from error
     print(f"trace: {trace}")
     return code
 

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from pathlib import Path
 
-from synpick_warp.configs.schema import Config
+from synpick_warp.configs.schema import ObjectRow
 from synpick_warp.dataset.annotations import Key, ModelDiameter, read_checked
 from synpick_warp.dataset.bop.models import INFO, models_folder
 from synpick_warp.errors import DatasetError
@@ -19,8 +20,15 @@ _MAX_MODEL = 2**40
 """Largest PLY file [B]; only its head is read."""
 
 
-def object_names(dataset: Path, config: Config | None, object_ids: set[int]) -> dict[int, str]:
-    """Names of objects (obj_id -> name): from the exported model's comment, else from the settings' object table; some have none."""
+def object_names(dataset: Path, object_ids: set[int], rows: Sequence[ObjectRow] = (), tolerance: float = 0.0) -> dict[int, str]:
+    """Names of objects (obj_id -> name): from the exported model's comment, else from the object table; some have none.
+
+    Args:
+        dataset: Folder of the data set.
+        object_ids: The objects.
+        rows: The settings' object table.
+        tolerance: `objects.diameter_tolerance`.
+    """
     folder = dataset / models_folder(dataset)
     infos = read_checked(folder / INFO, dict[Key, ModelDiameter])
     names = {}
@@ -32,14 +40,13 @@ def object_names(dataset: Path, config: Config | None, object_ids: set[int]) -> 
             with path.open("rb") as file:
                 comment = _MODEL_NAME.search(file.read(_PLY_HEAD))
         size = float(infos.get(object_id, {}).get("diameter", 0.0)) / 1000.0
-        rows = () if config is None else config.object_rows
-        fits = (row.name for row in rows if config and row.id == object_id and _fits(row.diameter, size, config))
+        fits = (row.name for row in rows if row.id == object_id and _fits(row.diameter, size, tolerance))
         name = comment[1].decode(errors="replace") if comment else next(fits, "")
         if name:
             names[object_id] = name
     return names
 
 
-def _fits(expected: float, size: float, config: Config) -> bool:
+def _fits(expected: float, size: float, tolerance: float) -> bool:
     """Whether a model's diameter matches that of a row in the object table [m]; a row without one matches any."""
-    return expected == 0.0 or abs(size - expected) <= config.objects.diameter_tolerance * expected
+    return expected == 0.0 or abs(size - expected) <= tolerance * expected

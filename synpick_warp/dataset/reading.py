@@ -335,7 +335,7 @@ class DataSet(Mapping[int, Episode]):
     @cached_property
     def period(self) -> float | None:
         """Time from frame to frame [s]; None: unknown, in a data set from another source."""
-        return None if self.found is not None else self.config.physics.step * self.config.physics.steps_per_tick
+        return None if self.found is not None else self.config.physics.tick_time
 
     def scene_id(self, episode: int, camera: int) -> int:
         """BOP's scene_id of a camera's images of an episode, as result files have it; of several sensors each counts as a scene."""
@@ -420,7 +420,10 @@ class DataSet(Mapping[int, Episode]):
         """Locations of the scenes' files; None: without settings they are not known."""
         if self.found is not None:
             return self.found
-        return SceneIndex(self.folder, self.config) if (self.folder / CONFIG_FILE).exists() else None
+        return self._index() if (self.folder / CONFIG_FILE).exists() else None
+
+    def _index(self) -> SceneIndex:
+        return SceneIndex(self.folder, DataLayout.of(self.config), self.config.cameras.resolution)
 
     @property
     def _parts(self) -> list[PartFiles]:
@@ -433,7 +436,7 @@ class DataSet(Mapping[int, Episode]):
         Raises:
             DatasetError: The data set has no images.
         """
-        return SceneIndex(self.folder, self.config).files(episode, camera) if self._scenes is None else self._scenes.files(episode, camera)
+        return self._index().files(episode, camera) if self._scenes is None else self._scenes.files(episode, camera)
 
     def _has_files(self, index: int) -> bool:
         """Whether an episode has files in any format."""

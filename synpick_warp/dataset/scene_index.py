@@ -13,20 +13,20 @@ from synpick_warp.errors import DatasetError
 from synpick_warp.system.inputs.paths import path_inside
 
 if TYPE_CHECKING:
-    from synpick_warp.configs.schema import Config
     from synpick_warp.dataset.view_files import SceneFiles
 
 
 class SceneIndex:
     """Scene folders and shards of a data set by episode and camera."""
 
-    def __init__(self, folder: Path, config: Config) -> None:
+    def __init__(self, folder: Path, layout: DataLayout, resolution: tuple[int, int]) -> None:
         """
         Args:
             folder: Folder of the data set.
-            config: Its settings.
+            layout: Its layout.
+            resolution: Width and height of its images [px].
         """
-        self._folder, self._size, self._layout = folder, config.cameras.resolution, DataLayout.of(config)
+        self._folder, self._size, self._layout = folder, resolution, layout
 
     @cached_property
     def _folders(self) -> dict[str, tuple[Path, Path]]:

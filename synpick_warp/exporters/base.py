@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar, NamedTuple, Protocol
 
 import numpy as np
 
-from synpick_warp.configs.schema import Config
+from synpick_warp.configs.export import ExportSettings
 from synpick_warp.configs.splits import DataLayout
 from synpick_warp.exporters.writing.folder import Buffer
 from synpick_warp.exporters.writing.pool import WriterPool
@@ -35,7 +34,7 @@ class ExportContext:
     def __init__(
         self,
         out: Path,
-        config: Config,
+        settings: ExportSettings,
         catalog: Catalog,
         cameras: tuple[Camera, ...],
         lights: tuple[EnvironmentMap, ...],
@@ -44,14 +43,14 @@ class ExportContext:
         """
         Args:
             out: Folder of the data set. It exists and contains the folder `PARTIAL`.
-            config: All settings.
+            settings: Settings of the data set.
             catalog: The objects.
             cameras: The cameras.
             lights: The environment maps.
             pool: Writes all files of episodes. Exporters neither close nor abort it.
         """
-        self.out, self.config, self.cameras, self.pool = out, config, cameras, pool
-        self.layout = DataLayout.of(config)
+        self.out, self.settings, self.cameras, self.pool = out, settings, cameras, pool
+        self.layout = settings.layout
         self._catalog, self._lights = catalog, lights
 
     @property
@@ -150,30 +149,6 @@ class StoredScene(Protocol):
         ...
 
 
-@dataclass(frozen=True)
-class TaskSizes:
-    """Sizes from which the shared memory of a task follows: resolution [px], layers or none, objects, steps per tick, steps
-    stored or not.
-    """
-
-    resolution: tuple[int, int]
-    """Width and height of a view [px]."""
-    has_layers: bool
-    """Whether layers are rendered."""
-    objects: int
-    """Maximum number of objects of an episode."""
-    steps_per_tick: int
-    """Physics steps of a tick."""
-    stores_steps: bool
-    """Whether each physics step is stored, not only each tick."""
-
-    @classmethod
-    def of(cls, config: Config) -> TaskSizes:
-        """Task sizes that follow from the settings of a bake."""
-        steps_per_tick, has_layers = config.physics.steps_per_tick, bool(config.render.layers)
-        return cls(config.cameras.resolution, has_layers, config.arrangement.max_objects, steps_per_tick, config.trajectory.steps)
-
-
 class SharedFiles(NamedTuple):
     """Names that a format gives to what it writes beside episodes, relative to the data set.
 
@@ -230,7 +205,7 @@ class Exporter(Protocol):
         ...
 
     @staticmethod
-    def slot_bytes(sizes: TaskSizes) -> int:
+    def slot_bytes(settings: ExportSettings) -> int:
         """Maximum size of the images of one task in the pool's shared memory [B]."""
         ...
 
@@ -240,12 +215,12 @@ class Exporter(Protocol):
         ...
 
     @staticmethod
-    def finalize(out: Path, config: Config, pool: WriterPool, episodes: Sequence[int]) -> list[Path]:
+    def finalize(out: Path, settings: ExportSettings, pool: WriterPool, episodes: Sequence[int]) -> list[Path]:
         """Write the index files that span episodes, and wait for them.
 
         Args:
             out: Folder of the data set.
-            config: Its settings.
+            settings: Its settings.
             pool: Writer processes.
             episodes: The committed episodes, sorted; those that were given up have no files. Files of others, which nobody committed, are
                 in no index.

@@ -8,10 +8,11 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from synpick_warp.configs.export import ExportSettings
 from synpick_warp.configs.schema import Config
 from synpick_warp.configs.splits import DataLayout
 from synpick_warp.errors import ConfigError
-from synpick_warp.exporters.base import ExportContext, Exporter, SharedFiles, StoredScene, TaskSizes
+from synpick_warp.exporters.base import ExportContext, Exporter, SharedFiles, StoredScene
 from synpick_warp.exporters.formats import FORMAT_TABLE
 from synpick_warp.exporters.writing.pool import WriterPool
 from synpick_warp.views.frames import EpisodeEnd, FrameBatch, TickBatch
@@ -49,7 +50,7 @@ class Needs:
     def of(cls, config: Config) -> Needs:
         """Needs by the settings of a bake. Errors: see `load_exporter_classes`."""
         classes = load_exporter_classes(config.bake.formats)
-        return cls(classes, slot_bytes(classes, TaskSizes.of(config)))
+        return cls(classes, slot_bytes(classes, ExportSettings.of(config)))
 
     @property
     def physics(self) -> bool:
@@ -135,9 +136,9 @@ def aborting(pool: WriterPool, exporters: Exporters) -> Iterator[None]:
         raise
 
 
-def slot_bytes(classes: Iterable[type[Exporter]], sizes: TaskSizes) -> int:
+def slot_bytes(classes: Iterable[type[Exporter]], settings: ExportSettings) -> int:
     """Maximum size of the images of any task in the pool's shared memory [B]."""
-    return max((exporter_class.slot_bytes(sizes) for exporter_class in classes), default=0)
+    return max((exporter_class.slot_bytes(settings) for exporter_class in classes), default=0)
 
 
 def shared_files(classes: Iterable[type[Exporter]], layout: DataLayout) -> SharedFiles:
@@ -149,6 +150,8 @@ def shared_files(classes: Iterable[type[Exporter]], layout: DataLayout) -> Share
     return SharedFiles(constants, indices, folders)
 
 
-def finalize(classes: Iterable[type[Exporter]], out: Path, config: Config, pool: WriterPool, episodes: Sequence[int]) -> list[Path]:
+def finalize(
+    classes: Iterable[type[Exporter]], out: Path, settings: ExportSettings, pool: WriterPool, episodes: Sequence[int]
+) -> list[Path]:
     """Write the index files over the committed episodes, of every format; returns them, relative to the data set."""
-    return sorted(path for exporter_class in classes for path in exporter_class.finalize(out, config, pool, episodes))
+    return sorted(path for exporter_class in classes for path in exporter_class.finalize(out, settings, pool, episodes))

@@ -7,8 +7,9 @@ from __future__ import annotations
 
 import contextlib
 import gc
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 import warp as wp
@@ -18,10 +19,10 @@ from synpick_warp.configs.splits import DataLayout
 from synpick_warp.exporters.registry import Needs
 from synpick_warp.factory.attempts import AttemptLog
 from synpick_warp.factory.compilation import is_cache_warm, make_compiler, sole_compiler, submit_launches, submit_slow
-from synpick_warp.factory.memory_plan import check_memory
+from synpick_warp.factory.memory_plan import check_memory, plan_memory
 from synpick_warp.factory.order import order_longest_first
 from synpick_warp.factory.sizes import count_writers, fit_to_device, without_pictures
-from synpick_warp.scenes.build import find_repeat_rules, with_capacities, with_repeats
+from synpick_warp.scenes.build import REPEATS, find_repeat_rules, must_repeat, with_capacities
 from synpick_warp.scenes.cameras import make_cameras
 from synpick_warp.scenes.catalog import load_catalog
 from synpick_warp.scenes.fixtures import make_fixtures
@@ -38,20 +39,8 @@ from synpick_warp.system.progress import Progress, SilentProgress
 
 
 @dataclass(frozen=True, eq=False)
-class Factory:
-    """Factory of a bake on a device: assets, simulation, rendering with copies to the host, and the attempt log."""
-
-    catalog: Catalog
-    cameras: tuple[Camera, ...]
-    lights: tuple[EnvironmentMap, ...]
-    simulation: Simulation
-    stream: FrameStream
-    log: AttemptLog
-
-
-@dataclass(frozen=True, eq=False)
 class Stages:
-    """Assets, simulation and renderer on a device, shared by bakes and online streams; `Factory` adds encoding and copies to the host."""
+    """Assets, simulation and renderer on a device, shared by bakes and online streams."""
 
     config: Config
     """The settings; `bake.worlds` is the actual number."""
@@ -69,11 +58,19 @@ class Stages:
     @property
     def tick_time(self) -> float:
         """Time between two frames [s]."""
-        return self.config.physics.step * self.config.physics.steps_per_tick
+        return self.config.physics.tick_time
 
     def make_log(self) -> AttemptLog:
         """Create an empty attempt log."""
         return AttemptLog(self.config.suction, self.config.perception.resolution, self.object_ids)
+
+
+@dataclass(frozen=True, eq=False)
+class Factory(Stages):
+    """The stages of a bake, with copies of views to the host, and the attempt log."""
+
+    stream: FrameStream
+    log: AttemptLog
 
 
 def build_factory(
@@ -99,24 +96,27 @@ def build_factory(
         SynpickError: The machine has too little memory, or device, models, lights, tote or cameras cannot be used.
     """
     device = pick_device(config.bake.device)
-    planned = sum(map(len, DataLayout.of(config).plan())) if episodes is None else len(episodes)
-    writers = count_writers(config)
+    planned = DataLayout.of(config).planned if episodes is None else len(episodes)
+    needs = Needs.of(config)
+    writers = count_writers(config.bake.writers, needs.slot_bytes)
     config = fit_to_device(without_pictures(config), device, planned, writers, processes)
-    check_memory(config, device, writers, processes)
-    with compiling_if_cold(config, device, progress, records_physics, needs_images, Needs.of(config).views):
-        return _assemble(config, device, progress, episodes, records_physics, needs_images, longest_first)
+    check_memory(plan_memory(config, device, writers), device, processes)
+    smallest = partial(build_smallest, config, device, SilentProgress(), records_physics, needs_images)
+    with compiling_if_cold(smallest, device, progress, needs.views):
+        stages = build_stages(config, device, progress, episodes, records_physics, longest_first)
+        return _add_stream(stages, device, needs_images, needs.depth_files)
 
 
 @contextlib.contextmanager
-def compiling_if_cold(
-    config: Config, device: wp.Device, progress: Progress, records_physics: bool = False, needs_images: bool = True, renders: bool = True
-) -> Iterator[None]:
+def compiling_if_cold(smallest: Callable[[], Factory], device: wp.Device, progress: Progress, renders: bool = True) -> Iterator[None]:
     """Compile the kernels of a bake in parallel if the kernel cache is cold, while the body of the context builds worlds.
 
     A minimal factory, which is freed again, shows which kernels there are. They are ready when the context is left.
 
     Args:
-        config, device, progress, records_physics, needs_images: As of `build_factory`.
+        smallest: Builds the minimal factory, silently.
+        device: The device.
+        progress: Observer.
         renders: Whether views are rendered.
     """
     if is_cache_warm(device):
@@ -129,7 +129,7 @@ def compiling_if_cold(
         progress.stage("compiling kernels, once")
         with make_compiler(device, progress) as compiler:
             submit_slow(compiler, device)
-            factory = build_smallest(config, device, SilentProgress(), records_physics, needs_images)
+            factory = smallest()
             submit_launches(compiler, factory.simulation, factory.stream if renders else None)
             del factory
             gc.collect()  # Tracebacks that Warp's code generation leaves hold frames, and these its arrays.
@@ -139,26 +139,19 @@ def compiling_if_cold(
 def build_smallest(config: Config, device: wp.Device, progress: Progress, records_physics: bool, needs_images: bool) -> Factory:
     """Build a minimal factory, with as few worlds as the device allows. Other arguments and errors: `build_factory`."""
     config = config.with_values({"bake.worlds": 1, "render.views_per_batch": 1})
-    config = fit_to_device(config, device, 1, count_writers(config))
-    return _assemble(config, device, progress, [0], records_physics, needs_images)
+    needs = Needs.of(config)
+    config = fit_to_device(config, device, 1, count_writers(config.bake.writers, needs.slot_bytes))
+    stages = build_stages(config, device, progress, [0], records_physics)
+    return _add_stream(stages, device, needs_images, needs.depth_files)
 
 
-def _assemble(
-    config: Config,
-    device: wp.Device,
-    progress: Progress,
-    episodes: Sequence[int] | None,
-    records_physics: bool,
-    needs_images: bool,
-    longest_first: bool = False,
-) -> Factory:
-    """Build a factory from settings whose sizes are resolved (see `fit_to_device`). Other arguments: `build_factory`."""
-    stages = build_stages(config, device, progress, episodes, records_physics, longest_first)
-    host = host_images(config.bop, config.cameras.resolution[1], device, needs_images, Needs.of(config).depth_files)
-    table, tick_time = stages.light_table, stages.tick_time
+def _add_stream(stages: Stages, device: wp.Device, needs_images: bool, depth_files: bool) -> Factory:
+    """Add a stream of views to stages; arguments as of `host_images`."""
+    config, table, tick_time = stages.config, stages.light_table, stages.tick_time
+    host = host_images(config.bop, config.cameras.resolution[1], device, needs_images, depth_files)
     layers, cameras, ids = config.render.layers, len(stages.cameras), stages.object_ids
     stream = FrameStream(stages.sizes, layers, cameras, tick_time, stages.renderer, ids, table, device, host)
-    return Factory(stages.catalog, stages.cameras, stages.lights, stages.simulation, stream, stages.make_log())
+    return Factory(**vars(stages), stream=stream, log=stages.make_log())
 
 
 @collection_paused()
@@ -182,7 +175,7 @@ def build_stages(
     progress.stage(f"building {config.bake.worlds} worlds of {len(catalog)} objects on {device.alias}")
     scene = build_render_scene(config.render, config.tote, catalog, fixtures, cameras, lights, device)
     simulation = Simulation(config, catalog, len(lights), device, scene, episodes, records_physics)
-    sizes = view_sizes(config, device)
+    sizes = view_sizes(config.render, config.cameras, config.bake.worlds, config.arrangement.max_objects, device)
     histories = simulation.layout.worlds * len(cameras)
     renderer = make_renderer(config, scene, config.arrangement.max_objects, sizes["view"], histories)
     object_ids = np.array([entry.obj_id for entry in catalog.entries], dtype=np.int32)
@@ -196,15 +189,17 @@ def _fit_to_catalog(config: Config, catalog: Catalog, device: wp.Device, progres
     Raises:
         ConfigError: The capacities do not fit into the device's memory.
     """
-    filled = with_repeats(config, catalog)
+    filled = config.with_values(REPEATS) if must_repeat(config.arrangement, catalog) else config
     if find_repeat_rules(filled.bake, filled.pick, filled.move) != find_repeat_rules(config.bake, config.pick, config.move):
         total = sum(entry.volume for entry in catalog.entries)
         budget = config.arrangement.volume
         progress.note(f"{len(catalog)} objects take {total:.3g} of {budget:g} m³ together, so that they repeat in an episode")
-    fitted = with_capacities(filled, catalog)
-    if fitted.physics != config.physics:
-        progress.note(f"thin objects: capacity for {fitted.physics.contacts_per_world:,} contacts a world")
-        check_memory(fitted, device, 0)
+    physics = with_capacities(filled.physics, filled.arrangement.max_objects, catalog)
+    if physics is filled.physics:
+        return filled
+    progress.note(f"thin objects: capacity for {physics.contacts_per_world:,} contacts a world")
+    fitted = replace(filled, physics=physics)
+    check_memory(plan_memory(fitted, device, 0), device)
     return fitted
 
 

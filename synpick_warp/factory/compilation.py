@@ -11,7 +11,7 @@ from synpick_warp.kernels.render.visibility.wide_bvh import read_binary_bvh_kern
 from synpick_warp.kernels.sim.snapshot import take_snapshot_kernel
 from synpick_warp.newton_patches.narrow_phase import slow_builds
 from synpick_warp.stages.sim.simulate import Simulation
-from synpick_warp.stages.stream import FrameStream, TickReader
+from synpick_warp.stages.stream import FrameStream, read_tick
 from synpick_warp.system.hardware.kernels import Compiler, DryLaunches, build_of, compilation_lock
 from synpick_warp.system.progress import Progress
 
@@ -61,9 +61,7 @@ def launch_all(simulation: Simulation, stream: FrameStream | None) -> None:
         simulation.tick()
     if simulation.perception is not None:
         simulation.perception.load_kernels(record.snapshot)
-    reader = TickReader(record)
-    reader.start()
-    report = reader.wait()
+    report = read_tick(record)
     if stream is not None:
         report.status[:, Status.LIVE] = 1
         for views in stream.render(record.snapshot, report):

@@ -24,6 +24,7 @@ from typing import Any, Self
 
 import warp as wp
 
+from synpick_warp.configs.export import ExportSettings
 from synpick_warp.configs.schema import Config
 from synpick_warp.dataset.commit.digests import digest_inputs
 from synpick_warp.dataset.commit.manifest import committed_episodes
@@ -35,7 +36,7 @@ from synpick_warp.exporters.writing.pool import WriterPool
 from synpick_warp.factory.episodes import BakeSummary
 from synpick_warp.factory.order import deal_episodes, deal_writers, order_longest_first
 from synpick_warp.factory.sizes import count_writers
-from synpick_warp.scenes.build import with_repeats
+from synpick_warp.scenes.build import REPEATS, must_repeat
 from synpick_warp.scenes.cameras import make_cameras
 from synpick_warp.scenes.catalog import load_catalog
 from synpick_warp.scenes.lights import load_lights
@@ -232,7 +233,8 @@ def prepare_folder(output: OutputFolder, needs: Needs, catalog: Catalog, lights:
     """Prepare the output folder (`OutputFolder.prepare`) in a process that generates no episodes itself."""
     config = output.config
     with WriterPool(1, needs.slot_bytes, output.lock) as pool:
-        exporters = Exporters(needs.classes, ExportContext(output.out, config, catalog, make_cameras(config.cameras), lights, pool))
+        context = ExportContext(output.out, ExportSettings.of(config), catalog, make_cameras(config.cameras), lights, pool)
+        exporters = Exporters(needs.classes, context)
         with aborting(pool, exporters):
             output.prepare(exporters, digest_inputs(catalog, lights), pool)
             exporters.close()
@@ -270,8 +272,9 @@ def bake_on_devices(
         catalog = load_catalog(config, report=partial(report, "note"))
         lights = load_lights(config.bake.lights, partial(report, "note"), config.objects.strict)
         prepare_folder(output, needs, catalog, lights)
-        dealt = deal_episodes(order_longest_first(with_repeats(config, catalog), catalog, output.remaining, pick_device("cpu")), len(names))
-        writers = deal_writers(count_writers(config), len(names))
+        filled = config.with_values(REPEATS) if must_repeat(config.arrangement, catalog) else config
+        dealt = deal_episodes(order_longest_first(filled, catalog, output.remaining, pick_device("cpu")), len(names))
+        writers = deal_writers(count_writers(config.bake.writers, needs.slot_bytes), len(names))
         shares = [
             Share(output.out, config.with_values({"bake.device": name, "bake.writers": count}), episodes, len(names))
             for name, episodes, count in zip(names, dealt, writers, strict=True)

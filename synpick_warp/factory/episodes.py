@@ -8,7 +8,8 @@ from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 from synpick_warp.codes import Ending, Outcome
-from synpick_warp.configs.schema import Config
+from synpick_warp.configs.manipulation import Perception
+from synpick_warp.configs.schema import Arrangement, Physics, Settle
 from synpick_warp.configs.splits import DataLayout
 from synpick_warp.factory.attempts import EpisodeRecord
 from synpick_warp.stages.stream import TickReport
@@ -138,16 +139,15 @@ def is_resampled(row: EpisodeRow, tries: int) -> bool:
     return not row.ending.delivers and row.arrangement + 1 < tries
 
 
-def remedy(config: Config, ending: Ending) -> str:
+def remedy(ending: Ending, physics: Physics, perception: Perception, arrangement: Arrangement, settle: Settle) -> str:
     """Advice against an ending that is caused by a setting, with the current values; empty: no setting cures it."""
-    physics, perception, settle = config.physics, config.perception, config.settle
     if ending is Ending.SOLVER_OVERFLOW:
         capacities = ("contacts_per_world", "pairs_per_world", "rows_per_world", "gripper_rows_per_world")
         return "raise " + " or ".join(f"physics.{name} ({getattr(physics, name)})" for name in capacities)
     if ending is Ending.PERCEPTION_OVERFLOW:
         return f"raise perception.contour_points ({perception.contour_points})"
     if ending is Ending.ARRANGEMENT_OVERFLOW:
-        return f"lower arrangement.slot_shortfall ({config.arrangement.slot_shortfall:g})"
+        return f"lower arrangement.slot_shortfall ({arrangement.slot_shortfall:g})"
     if ending is Ending.UNSETTLED:
         return f"raise settle.max_time ({settle.max_time:g}) or settle.max_redrops ({settle.max_redrops})"
     return ""

@@ -28,12 +28,8 @@ SORTED_EPISODES = 1024
 progress and load even."""
 
 
-def predict_frames(config: Config, catalog: Catalog, episodes: np.ndarray, device: wp.Device, deviations: float = 0.0) -> np.ndarray:
-    """Predicted frames of episodes (episode), from their modes and numbers of objects: the mean plus `deviations` standard deviations.
-
-    Other arguments as of `sample_episodes_ahead`.
-    """
-    modes, objects = sample_episodes_ahead(config, catalog, episodes, device)
+def predict_frames(modes: np.ndarray, objects: np.ndarray, deviations: float = 0.0) -> np.ndarray:
+    """Predicted frames of episodes (episode), from their modes and numbers of objects: the mean plus `deviations` standard deviations."""
     fixed, each, deviation = np.array([FRAMES_OF_MODE[Mode(mode)] for mode in modes.tolist()]).reshape(-1, 3).T
     return fixed + each * objects + deviations * deviation
 
@@ -51,7 +47,7 @@ def order_longest_first(config: Config, catalog: Catalog, episodes: Sequence[int
     if not len(indices):
         return []
     first, last = indices[:-SORTED_EPISODES], indices[-SORTED_EPISODES:]
-    frames = predict_frames(config, catalog, last, device, DEVIATIONS)
+    frames = predict_frames(*sample_episodes_ahead(config, catalog, last, device), DEVIATIONS)
     return [*first.tolist(), *last[np.argsort(-frames, kind="stable")].tolist()]
 
 

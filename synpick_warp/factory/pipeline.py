@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from synpick_warp.codes import Phase
+from synpick_warp.configs.export import ExportSettings
 from synpick_warp.configs.schema import Config
 from synpick_warp.configs.splits import DataLayout
 from synpick_warp.dataset.commit.digests import digest_inputs
@@ -100,7 +101,7 @@ def run_bake(
 
 def _fill(config: Config, output: OutputFolder, needs: Needs, names: Sequence[str], summary: BakeSummary, progress: Progress) -> None:
     """Generate the remaining episodes, then the indices over all."""
-    factory = None
+    factory, settings = None, ExportSettings.of(config)
     if len(names) > 1:
         bake_on_devices(config, output, needs, names, _DEVICE_PROGRAM, summary, progress)
     elif output.remaining:
@@ -110,23 +111,22 @@ def _fill(config: Config, output: OutputFolder, needs: Needs, names: Sequence[st
         prepare_folder(
             output, needs, load_catalog(config, report=progress.note), load_lights(config.bake.lights, progress.note, config.objects.strict)
         )
-    with WriterPool(count_writers(config), needs.slot_bytes, output.lock) as pool:
+    with WriterPool(count_writers(config.bake.writers, needs.slot_bytes), needs.slot_bytes, output.lock) as pool:
         started = time.perf_counter()
         if factory is not None:
-            exporters = Exporters(needs.classes, ExportContext(output.out, config, factory.catalog, factory.cameras, factory.lights, pool))
+            context = ExportContext(output.out, settings, factory.catalog, factory.cameras, factory.lights, pool)
+            exporters = Exporters(needs.classes, context)
             with aborting(pool, exporters):
                 output.prepare(exporters, digest_inputs(factory.catalog, factory.lights), pool)
-                _Run(
-                    config, factory, exporters, needs.views, partial(output.commit, exporters, pool), summary, progress, StopRequest()
-                ).run()
+                _Run(factory, exporters, needs.views, partial(output.commit, exporters, pool), summary, progress, StopRequest()).run()
                 with scope("wait for writers"):
                     pool.wait()
                 exporters.close()
         if not summary.stopped:
             progress.stage("finishing files")
             with scope("finalize"):
-                finalize_data_set(output.out, config, needs.classes, pool)
-            if strays := describe_strays(output.out, DataLayout.of(config), committed_episodes(output.out)):
+                finalize_data_set(output.out, settings, needs.classes, pool)
+            if strays := describe_strays(output.out, settings.layout, committed_episodes(output.out)):
                 progress.note(strays)
         summary.wall_seconds += time.perf_counter() - started
 
@@ -148,11 +148,11 @@ def generate_share(share: Share, handles: Sequence[int], link: BakeLink) -> Bake
         with WriterPool(config.bake.writers, needs.slot_bytes, *handles) as pool:
             link.writers = pool.pids()
             started = time.perf_counter()
-            exporters = Exporters(needs.classes, ExportContext(share.out, config, factory.catalog, factory.cameras, factory.lights, pool))
+            settings = ExportSettings.of(config)
+            context = ExportContext(share.out, settings, factory.catalog, factory.cameras, factory.lights, pool)
+            exporters = Exporters(needs.classes, context)
             with aborting(pool, exporters):
-                _Run(
-                    config, factory, exporters, needs.views, partial(commit_episode, share.out, exporters, pool), summary, link, link
-                ).run()
+                _Run(factory, exporters, needs.views, partial(commit_episode, share.out, exporters, pool), summary, link, link).run()
                 pool.wait()
                 exporters.close()
             summary.wall_seconds = time.perf_counter() - started
@@ -164,7 +164,6 @@ class _Run:
 
     def __init__(
         self,
-        config: Config,
         factory: Factory,
         exporters: Exporters,
         writes_views: bool,
@@ -174,11 +173,10 @@ class _Run:
         stop: StopRequest | BakeLink,
     ) -> None:
         self.stop = stop
-        self.config, self.factory, self.exporters, self.writes_views = config, factory, exporters, writes_views
+        self.factory, self.exporters, self.writes_views = factory, exporters, writes_views
         self.commit, self.summary, self.progress = commit, summary, progress
-        self.meter = ThroughputMeter(len(config.cameras.positions), summary, progress)
-        self.layout = DataLayout.of(config)
-        self.tick_time = config.physics.step * config.physics.steps_per_tick
+        self.meter = ThroughputMeter(len(factory.cameras), summary, progress)
+        self.layout = DataLayout.of(factory.config)
 
     def run(self) -> None:
         """Tick until no episode remains or a signal requests a stop."""
@@ -197,7 +195,7 @@ class _Run:
 
     def _hand_over(self, report: TickReport, snapshot: Snapshot, ticks: TickLoop) -> None:
         """Export a tick: write its frames, render its views, write views and episode ends; enqueue physics between parts of these."""
-        batch = tick_batch(report, self.factory.log.object_ids, self.tick_time)
+        batch = tick_batch(report, self.factory.object_ids, self.factory.tick_time)
         for first in range(0, len(batch), MAX_TICK_FRAMES):
             frames = np.arange(first, min(first + MAX_TICK_FRAMES, len(batch)))
             with scope("hand over ticks"):
@@ -228,9 +226,10 @@ class _Run:
 
     def _end(self, report: TickReport, world: int, record: EpisodeRecord) -> None:
         """End an episode: count it, and commit it, or resample its arrangement, by its ending."""
-        row, tries = episode_row(self.layout, self.tick_time, report, world, record), self.config.settle.tries
+        config, tries = self.factory.config, self.factory.config.settle.tries
+        row = episode_row(self.layout, self.factory.tick_time, report, world, record)
         end = episode_end(row, record, tries)
-        advice = remedy(self.factory.simulation.config, row.ending)
+        advice = remedy(row.ending, config.physics, config.perception, config.arrangement, config.settle)
         if advice:
             self.summary.remedies[row.ending] = advice
         if is_resampled(row, tries):

@@ -6,14 +6,14 @@ quarter, until the memory plan and its headroom fit.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 import warp as wp
 
 from synpick_warp.configs.schema import Config
 from synpick_warp.exporters.registry import Needs
 from synpick_warp.exporters.writing.pool import QUEUE_DEPTH
-from synpick_warp.factory.memory_plan import Term, free_memory, plan_memory
+from synpick_warp.factory.memory_plan import Term, free_memory, plan_memory, split_memories
 from synpick_warp.stages.perception.images import count_views
 from synpick_warp.stages.sim.physics import MIN_GPU_WORLDS, with_enough_worlds
 from synpick_warp.stages.stream import views_per_batch
@@ -52,24 +52,30 @@ def fit_to_device(config: Config, device: wp.Device, episodes: int, writers: int
     """
     is_open = {key: config.value(key) == 0 for key in _OPEN_SIZES}
     config = with_enough_worlds(config, device, episodes)
-    while terms := _short_terms(config, device, writers, processes):
+    while terms := _short_terms(split_memories(plan_memory(config, device, writers), device, processes)):
+        worlds, objects = config.bake.worlds, config.arrangement.max_objects
+        amounts = {
+            "render.views_per_batch": views_per_batch(config.render, config.cameras, worlds, device),
+            "perception.views": count_views(config.perception, worlds, objects, device),
+            "bake.worlds": worlds,
+        }
+        lowered = [key for key in _OPEN_SIZES if is_open[key] and amounts[key] > _least(key, device)]
         for term in sorted(terms, key=lambda term: -term.size):
-            key = next(
-                (key for key in is_open if is_open[key] and key in term.settings and _amount(config, key, device) > _least(key, device)), ""
-            )
+            key = next((key for key in lowered if key in term.settings), "")
             if key:
-                config = config.with_values({key: _reduce(key, _amount(config, key, device), device)})
+                config = config.with_values({key: _reduce(key, amounts[key], device)})
                 break
         else:
             return config
     return config
 
 
-def count_writers(config: Config) -> int:
-    """Writer processes of a bake: `bake.writers`, or one per usable CPU core, as far as the host's free memory has room for them."""
-    if config.bake.writers:
-        return config.bake.writers
-    each = WRITER_BYTES + QUEUE_DEPTH * Needs.of(config).slot_bytes
+def count_writers(writers: int, slot_bytes: int) -> int:
+    """Writer processes of a bake: `bake.writers`, or if it is 0, one per usable CPU core, as far as the host's free memory has room for
+    them and their slots of `slot_bytes` (see `Needs`)."""
+    if writers:
+        return writers
+    each = WRITER_BYTES + QUEUE_DEPTH * slot_bytes
     room = int(WRITERS_FRACTION * free_memory(None)) // each
     return max(1, min(count_cores(), room))
 
@@ -86,8 +92,7 @@ def pick_processes(config: Config, names: Sequence[str], episodes: int) -> tuple
     picked = pick_devices(names)
     if list(names) == [ALL] and picked == ("cpu",):
         least = config.with_values({key: 1 for key in _OPEN_SIZES if not config.value(key)})
-        needed = sum(term.size for term in plan_memory(without_pictures(least), pick_device("cpu")))
-        room = free_memory(None) // int(HEADROOM * needed + RUNTIME_BYTES)
+        room = free_memory(None) // _planned(plan_memory(without_pictures(least), pick_device("cpu")))
         picked *= max(1, min(count_cores(), room))
     return picked[: max(1, episodes)]
 
@@ -103,24 +108,14 @@ def advise_processes(config: Config, names: Sequence[str], episodes: int) -> str
     return f"one process simulates on one CPU core; --devices all starts {processes}, which write the same bytes" if processes > 1 else ""
 
 
-def _short_terms(config: Config, device: wp.Device, writers: int, processes: int) -> Sequence[Term]:
-    """Terms of the memory plan for the first memory, device or host, that is too small for them with HEADROOM; empty: all fit."""
-    terms = plan_memory(config, device, writers)
-    for on_device in (True, False):
-        part = [term for term in terms if term.on_device == on_device]
-        free = free_memory(device) if on_device and device.is_cuda else free_memory(None) // processes
-        if part and HEADROOM * sum(term.size for term in part) + RUNTIME_BYTES > free:
-            return part
-    return ()
+def _short_terms(memories: Iterable[tuple[list[Term], int]]) -> Sequence[Term]:
+    """Terms in the first memory that is too small for them with HEADROOM, of those by `split_memories`; empty: all fit."""
+    return next((terms for terms, free in memories if _planned(terms) > free), ())
 
 
-def _amount(config: Config, key: str, device: wp.Device) -> int:
-    """Number of views in a batch, or of worlds, that a setting stands for."""
-    if key == "render.views_per_batch":
-        return views_per_batch(config.render, config.cameras, config.bake.worlds, device)
-    if key == "perception.views":
-        return count_views(config.perception, config.bake.worlds, config.arrangement.max_objects, device)
-    return config.bake.worlds
+def _planned(terms: Sequence[Term]) -> int:
+    """Memory that terms of a plan take with HEADROOM [bytes]."""
+    return int(HEADROOM * sum(term.size for term in terms)) + RUNTIME_BYTES
 
 
 def _least(key: str, device: wp.Device) -> int:

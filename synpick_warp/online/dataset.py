@@ -19,6 +19,7 @@ from torch.utils.data import IterableDataset, get_worker_info  # pyright: ignore
 
 from synpick_warp.configs.check import to_index
 from synpick_warp.configs.schema import Config
+from synpick_warp.configs.splits import DataLayout
 from synpick_warp.dataset.view import MILLIMETERS
 from synpick_warp.errors import ConfigError
 from synpick_warp.online.selection import Selection, choose_episodes
@@ -138,7 +139,7 @@ class StreamDataset(IterableDataset):
         self.episodes = range(episodes) if isinstance(episodes, int) else episodes
         self.fresh, self.shard, self.splits = fresh, shard, tuple(splits)
         self.selection = Selection(cameras, stride).resolve(len(self.config.cameras.positions))
-        choose_episodes(self.config, self.episodes, shard, self.splits)
+        choose_episodes(DataLayout.of(self.config), self.episodes, shard, self.splits)
         self._epoch = torch.zeros((), dtype=torch.int64).share_memory_()  # Workers that live through all epochs see it change.
 
     def set_epoch(self, epoch: int) -> None:
@@ -161,7 +162,7 @@ class StreamDataset(IterableDataset):
         if episodes is not None and self.fresh:
             span = episodes.step * len(episodes)
             episodes = range(episodes.start + epoch * span, episodes.stop + epoch * span, episodes.step)
-        if not choose_episodes(self.config, episodes, (index, count), self.splits)[1]:
+        if not choose_episodes(DataLayout.of(self.config), episodes, (index, count), self.splits)[1]:
             return
         samples = self._samples(episodes, (index, count), copy=info is not None or not self.batched)
         if self.shuffle:

@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 
 from synpick_warp.configs.check import to_index
 from synpick_warp.configs.fields import INT32_MAX
-from synpick_warp.configs.schema import Config
 from synpick_warp.configs.splits import DataLayout, check_shard
 from synpick_warp.errors import ConfigError
 from synpick_warp.factory.memory_plan import check_episodes
@@ -42,18 +41,18 @@ class Selection:
 
 
 def choose_episodes(
-    config: Config, episodes: int | range | None, shard: tuple[int, int], splits: Sequence[str]
-) -> tuple[Config, list[int]]:
+    layout: DataLayout, episodes: int | range | None, shard: tuple[int, int], splits: Sequence[str]
+) -> tuple[int, list[int]]:
     """Choose the episode indices of a stream, in order.
 
     Args:
-        config: All settings.
+        layout: Layout by the settings.
         episodes: How many, from 0 on, or their indices; None: those that the settings plan.
         shard: (i, n): only indices with index % n == i.
         splits: Only episodes of these splits; empty: all.
 
     Returns:
-        The settings, which plan these episodes, and the indices.
+        `bake.episodes` of settings that plan these episodes, and the indices.
 
     Raises:
         ConfigError: There is no such split, an index is out of range, or `episodes` are given beside splits.
@@ -61,13 +60,13 @@ def choose_episodes(
     check_shard(shard)
     index, count = shard
     if episodes is None:
-        return config, [episode for each in DataLayout.of(config).plan(splits, shard) for episode in each]
-    if splits or config.splits:
+        return layout.episodes, [episode for each in layout.plan(splits, shard) for episode in each]
+    if splits or layout.splits:
         raise ConfigError("episodes are given beside splits, which name their episodes; give one of both")
     chosen = range(episodes) if isinstance(episodes, int) else episodes
     # The ends of a range: min and max would go through all of it.
     if not isinstance(chosen, range) or not chosen or min(chosen[0], chosen[-1]) < 0 or max(chosen[0], chosen[-1]) >= INT32_MAX:
         raise ConfigError(f"episodes are {episodes!r}; allowed: how many, or a range of indices from 0 to {INT32_MAX - 1}")
-    config = config.with_values({"bake.episodes": max(chosen[0], chosen[-1]) + 1})
-    check_episodes(-(-len(chosen) // count), config.bake.episodes)
-    return config, [episode for episode in chosen if episode % count == index]
+    planned = max(chosen[0], chosen[-1]) + 1
+    check_episodes(-(-len(chosen) // count), planned)
+    return planned, [episode for episode in chosen if episode % count == index]

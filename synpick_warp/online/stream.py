@@ -11,6 +11,7 @@ from __future__ import annotations
 import gc
 import weakref
 from collections.abc import Iterator, Sequence
+from functools import partial
 from types import TracebackType
 from typing import Self
 
@@ -21,9 +22,9 @@ from synpick_warp.codes import Phase
 from synpick_warp.configs.schema import Config
 from synpick_warp.configs.splits import DataLayout
 from synpick_warp.errors import ConfigError
-from synpick_warp.factory.assembly import Stages, build_stages, compiling_if_cold
+from synpick_warp.factory.assembly import Stages, build_smallest, build_stages, compiling_if_cold
 from synpick_warp.factory.episodes import BakeSummary, episode_row, is_resampled, remedy
-from synpick_warp.factory.memory_plan import check_episodes, check_memory, explain_shortage
+from synpick_warp.factory.memory_plan import check_episodes, check_memory, explain_shortage, plan_memory
 from synpick_warp.factory.sizes import fit_to_device
 from synpick_warp.online.selection import Selection, choose_episodes
 from synpick_warp.stages.buffers import Snapshot
@@ -32,7 +33,7 @@ from synpick_warp.stages.render.view_setup import pair_views
 from synpick_warp.stages.stream import TickReport, describe_views
 from synpick_warp.stages.ticks import TickLoop
 from synpick_warp.system.hardware.device import pick_device
-from synpick_warp.system.progress import Progress
+from synpick_warp.system.progress import Progress, SilentProgress
 
 DEVICE_ONLY = 0
 """Writer processes in the memory plan of a stream: none, as views stay on the device."""
@@ -169,7 +170,7 @@ class Producer:
                 self.progress.note(f"episode {row.episode}, arrangement {row.arrangement + 1}: {row.ending.sentence}")
             else:
                 self.summary.take_episode(row, record)
-            if advice := remedy(config, row.ending):
+            if advice := remedy(row.ending, config.physics, config.perception, config.arrangement, config.settle):
                 self.summary.remedies[row.ending] = advice
 
 
@@ -183,7 +184,8 @@ def open_stream(
     selection: Selection,
 ) -> ViewStream:
     """Build worlds and renderer, and open a stream of their views; arguments and errors as of `synpick_warp.stream`."""
-    config, indices = choose_episodes(config, episodes, shard, splits)
+    planned, indices = choose_episodes(DataLayout.of(config), episodes, shard, splits)
+    config = config.with_values({"bake.episodes": planned})
     if not indices:
         raise ConfigError(f"shard {shard[0]}/{shard[1]} has no episode; give more episodes, or fewer parts")
     device = pick_device(config.bake.device)
@@ -193,9 +195,10 @@ def open_stream(
         # A history holds the frame before, which is not rendered.
         config = config.with_values({"render.history": 0})
     config = fit_to_device(config, device, len(indices), DEVICE_ONLY)
-    check_memory(config, device, DEVICE_ONLY)
+    check_memory(plan_memory(config, device, DEVICE_ONLY), device)
     with explain_shortage(config):
-        with compiling_if_cold(config, device, progress):
+        smallest = partial(build_smallest, config, device, SilentProgress(), False, True)
+        with compiling_if_cold(smallest, device, progress):
             stages = build_stages(config, device, progress, indices)
         ring = BatchRing(stages.sizes, config.render.layers, stages.renderer, config.bop.depth_scale)
     return ViewStream(Producer(stages, ring, selection, BakeSummary(len(indices)), progress))

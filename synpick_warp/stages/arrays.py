@@ -2,18 +2,26 @@
 
 Two forms: a dataclass whose fields are declared by `device_array`, for the host; and `struct_arrays`, for the members of a Warp struct,
 whose types and numbers of dimensions come from the struct itself.
+
+In a dry run (`dry_run`) the same calls allocate nothing: they return stand-ins and list them, by which the memory plan counts what the
+constructors of the stages would allocate.
 """
 
 from __future__ import annotations
 
+import contextlib
 import math
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterator, Mapping
+from contextvars import ContextVar
 from dataclasses import dataclass, field, fields
+from types import SimpleNamespace
 from typing import Any, TypeVar
 
 import warp as wp
 
 Arrays = TypeVar("Arrays")
+Row = tuple[str, tuple[int, ...], str, int]
+"""Name, shape, unit and size [bytes] of an array."""
 
 
 @dataclass(frozen=True)
@@ -66,6 +74,58 @@ def struct_arrays(struct: Any, *shape: str, units: Mapping[str, str] | None = No
     return StructArrays(struct, specs)
 
 
+@dataclass(frozen=True, eq=False)
+class DryArray:
+    """Stand-in for an array in a dry run: what is asked of arrays before kernels run."""
+
+    name: str
+    spec: ArraySpec
+    shape: tuple[int, ...]
+    device: wp.Device
+
+    @property
+    def dtype(self) -> Any:
+        """Warp type."""
+        return self.spec.dtype
+
+    @property
+    def size(self) -> int:
+        """Number of elements."""
+        return math.prod(self.shape)
+
+    @property
+    def row(self) -> Row:
+        """Row of a memory table."""
+        return (self.name, self.shape, self.spec.unit, self.size * wp.types.type_size_in_bytes(self.dtype))
+
+    def fill_(self, value: Any) -> None:
+        """Nothing is filled."""
+
+
+_dry: ContextVar[list[DryArray] | None] = ContextVar("dry", default=None)
+"""Stand-ins of the dry run of this thread; None: arrays are allocated."""
+
+
+@contextlib.contextmanager
+def dry_run() -> Iterator[list[DryArray]]:
+    """Dry run: within, `allocate`, `allocate_struct` and `allocate_like` allocate nothing in this thread; the list gets their stand-ins."""
+    arrays: list[DryArray] = []
+    token = _dry.set(arrays)
+    try:
+        yield arrays
+    finally:
+        _dry.reset(token)
+
+
+def _zeros(name: str, spec: ArraySpec, shape: tuple[int, ...], device: wp.Device, pinned: bool = False) -> Any:
+    """Zeroed array; its stand-in in a dry run."""
+    arrays = _dry.get()
+    if arrays is None:
+        return wp.zeros(shape, dtype=spec.dtype, device=device, pinned=pinned)
+    arrays.append(DryArray(name, spec, shape, device))
+    return arrays[-1]
+
+
 def allocate(kind: type[Arrays], sizes: dict[str, int], device: wp.Device, only: Collection[str] | None = None) -> Arrays:
     """Instance of the dataclass `kind` with zeroed arrays on `device`.
 
@@ -75,39 +135,27 @@ def allocate(kind: type[Arrays], sizes: dict[str, int], device: wp.Device, only:
         device: Where to allocate.
         only: Fields to allocate, the others become None; None: all.
     """
-    names = [item.name for item in fields(kind)]  # type: ignore[arg-type]
-    arrays = _allocate_arrays(kind, sizes, device, only)
-    return kind(**{name: arrays.get(name) for name in names})
+    specs = {item.name: item.metadata["array"] for item in fields(kind)}  # type: ignore[arg-type]
+    made = _allocate(kind.__name__, {name: spec for name, spec in specs.items() if only is None or name in only}, sizes, device)
+    return kind(**{name: made.get(name) for name in specs})
 
 
 def allocate_struct(declaration: StructArrays, sizes: dict[str, int], device: wp.Device) -> Any:
     """Instance of a Warp struct with zeroed arrays on `device`; `sizes` has the extent of every named dimension."""
-    result = declaration.struct()
-    for name, array in _allocate_arrays(declaration, sizes, device, None).items():
+    result = declaration.struct() if _dry.get() is None else SimpleNamespace()
+    for name, array in _allocate(declaration.__name__, declaration.specs, sizes, device).items():
         setattr(result, name, array)
     return result
 
 
-def memory_table(
-    kind: type | StructArrays, sizes: dict[str, int], only: Collection[str] | None = None
-) -> list[tuple[str, tuple[int, ...], str, int]]:
-    """Rows (name, shape, unit, bytes) of the arrays that `allocate` or `allocate_struct` would allocate; nothing is allocated."""
-    rows = []
-    for name, spec in _specs(kind, only).items():
-        shape = tuple(sizes[dimension] for dimension in spec.shape)
-        rows.append((f"{kind.__name__}.{name}", shape, spec.unit, math.prod(shape) * wp.types.type_size_in_bytes(spec.dtype)))
-    return rows
+def allocate_like(array: wp.array, length: int, device: wp.Device, pinned: bool = False) -> wp.array:
+    """Zeroed array on `device` like another but for the length of its first dimension; `pinned`: in pinned memory of the host."""
+    name, spec = (array.name, array.spec) if isinstance(array, DryArray) else ("", ArraySpec((), array.dtype, ""))
+    return _zeros(name, spec, (length, *array.shape[1:]), device, pinned)
 
 
-def _specs(kind: Any, only: Collection[str] | None) -> dict[str, ArraySpec]:
-    """Specifications of the arrays of a class or struct by name, all or `only` some."""
-    specs = kind.specs if isinstance(kind, StructArrays) else {item.name: item.metadata["array"] for item in fields(kind)}
-    return {name: spec for name, spec in specs.items() if only is None or name in only}
-
-
-def _allocate_arrays(kind: Any, sizes: dict[str, int], device: wp.Device, only: Collection[str] | None) -> dict[str, wp.array]:
-    """Allocate the arrays of a class or struct by name, zero; `sizes` gives the extents of their dimensions."""
+def _allocate(owner: str, specs: Mapping[str, ArraySpec], sizes: dict[str, int], device: wp.Device) -> dict[str, Any]:
+    """Arrays by name."""
     return {
-        name: wp.zeros(tuple(sizes[dimension] for dimension in spec.shape), dtype=spec.dtype, device=device)
-        for name, spec in _specs(kind, only).items()
+        name: _zeros(f"{owner}.{name}", spec, tuple(sizes[dimension] for dimension in spec.shape), device) for name, spec in specs.items()
     }

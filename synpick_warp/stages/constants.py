@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from synpick_warp.configs import schema
 from synpick_warp.configs.modes import mode_weights
-from synpick_warp.configs.schema import CYCLE, EXCEED, MODES, Bake, Config, Gripper, Move, Physics, Settle, Split, Suction, Tote
 from synpick_warp.kernels import structs
 from synpick_warp.scenes import build
 from synpick_warp.scenes.types import Catalog, CatalogEntry
@@ -68,14 +68,14 @@ def fill(kind: Any, *sections: Any, **derived: Any) -> Any:
     return result
 
 
-def make_scene_data(config: Config, catalog: Catalog, built: build.BuiltModel, lights: int, device: wp.Device) -> SceneData:
+def make_scene_data(config: schema.Config, catalog: Catalog, built: build.BuiltModel, lights: int, device: wp.Device) -> SceneData:
     """Fill the structs that kernels take from settings, catalog and model; `lights` is the count of environment maps."""
     physics, gripper = config.physics, config.gripper
     return SceneData(
         _layout_data(built.layout),
         _catalog_data(catalog, built, device),
-        drop_data(config, lights),
-        _settle_data(config.settle, physics.step * physics.steps_per_tick),
+        drop_data(config.arrangement, config.render, config.tote, config.pick, config.move, physics.gravity, lights),
+        _settle_data(config.settle, physics.tick_time),
         mode_data(mode_rows(config.bake, config.splits), device),
         _move_data(config.move, config.tote, gripper, physics),
         fill(
@@ -140,7 +140,7 @@ def mode_data(rows: Sequence[tuple[int, float, float, int]], device: wp.Device) 
     return wp.array([fill(structs.ModeData, **dict(zip(names, row, strict=True))) for row in rows], dtype=structs.ModeData, device=device)
 
 
-def mode_rows(bake: Bake, splits: Sequence[Split]) -> list[tuple[int, float, float, int]]:
+def mode_rows(bake: schema.Bake, splits: Sequence[schema.Split]) -> list[tuple[int, float, float, int]]:
     """Members of `ModeData` of each split, or of the one range without splits."""
     ranges = [(split.first, split.mode) for split in splits] or [(0, bake.mode)]
     rows = []
@@ -148,30 +148,37 @@ def mode_rows(bake: Bake, splits: Sequence[Split]) -> list[tuple[int, float, flo
         weights = mode_weights(bake, mode)
         pick, target, move = weights["pick"], weights["target"], weights["move"]
         total = pick + target + move
-        rows.append((first, pick / total, (pick + target) / total, len(MODES) if mode == CYCLE else 0))
+        rows.append((first, pick / total, (pick + target) / total, len(schema.MODES) if mode == schema.CYCLE else 0))
     return rows
 
 
-def drop_data(config: Config, lights: int) -> structs.DropData:
+def drop_data(
+    arrangement: schema.Arrangement,
+    render: schema.Render,
+    tote: schema.Tote,
+    pick: schema.Pick,
+    move: schema.Move,
+    gravity: float,
+    lights: int,
+) -> structs.DropData:
     """Fill `DropData` from the settings; `lights` is the number of environment maps."""
-    tote = config.tote
     return fill(
         structs.DropData,
-        config.arrangement,
-        config.render,
-        exceed=config.arrangement.fill == EXCEED,
-        move_repeats=config.move.repeats,
-        pick_repeats=config.pick.repeats,
+        arrangement,
+        render,
+        exceed=arrangement.fill == schema.EXCEED,
+        move_repeats=move.repeats,
+        pick_repeats=pick.repeats,
         rim_length=tote.rim_size[0],
         rim_width=tote.rim_size[1],
         rim_height=tote.outer_size[2] - tote.wall,
-        gravity=config.physics.gravity,
+        gravity=gravity,
         gripper_home=wp.vec3(*GRIPPER_HOME),
         lights=lights,
     )
 
 
-def _settle_data(settle: Settle, tick: float) -> structs.SettleData:
+def _settle_data(settle: schema.Settle, tick: float) -> structs.SettleData:
     """Fill `SettleData`; times become numbers of ticks of `tick` seconds."""
     return fill(
         structs.SettleData,
@@ -185,7 +192,7 @@ def _settle_data(settle: Settle, tick: float) -> structs.SettleData:
     )
 
 
-def _move_data(move: Move, tote: Tote, gripper: Gripper, physics: Physics) -> structs.MoveData:
+def _move_data(move: schema.Move, tote: schema.Tote, gripper: schema.Gripper, physics: schema.Physics) -> structs.MoveData:
     """Fill `MoveData` from the settings."""
     length, width = tote.floor_size
     return fill(
@@ -199,7 +206,7 @@ def _move_data(move: Move, tote: Tote, gripper: Gripper, physics: Physics) -> st
     )
 
 
-def _suction_data(suction: Suction, gripper: Gripper, step: float) -> structs.SuctionData:
+def _suction_data(suction: schema.Suction, gripper: schema.Gripper, step: float) -> structs.SuctionData:
     """Fill `SuctionData` from the settings; `step` is the time step [s]."""
     return fill(
         structs.SuctionData,

@@ -12,11 +12,11 @@ import numpy as np
 import warp as wp
 
 from synpick_warp.codes import Measure, Status, column_names
-from synpick_warp.configs.schema import Cameras, Config, Render
-from synpick_warp.stages.arrays import allocate, memory_table
+from synpick_warp.configs.schema import Cameras, Render
+from synpick_warp.stages.arrays import allocate, dry_run
 from synpick_warp.stages.buffers import LayerBuffers, Snapshot, ViewBuffers, view_buffer_sizes
-from synpick_warp.stages.encoding.jpeg import Compressor
-from synpick_warp.stages.encoding.png import DepthBuffers, DepthEncoder, depth_sizes
+from synpick_warp.stages.encoding.jpeg import Compressor, JpegBuffers, JpegScratch, jpeg_sizes
+from synpick_warp.stages.encoding.png import DepthBuffers, DepthEncoder, DepthScratch, allocate_depth_scratch, depth_sizes
 from synpick_warp.stages.host_copies import DeviceImages, HostCopy, HostImages
 from synpick_warp.stages.render.mask_runs import BoundaryBuffers, BoundaryScratch, boundary_sizes, list_boundaries
 from synpick_warp.stages.render.renderer import Renderer
@@ -33,8 +33,6 @@ BATCH_BYTES = 512 << 20
 PIXEL_BYTES = 3 + 2 + 1 + 4
 # Names of the snapshot's arrays that are copied to `TickReport.snapshot`.
 _SNAPSHOT = ("fixture_pose", "fixture_visible", "light", "light_yaw", "light_exposure")
-# Names of all arrays of a snapshot that are copied to a report.
-REPORTED_SNAPSHOT = ("catalog_index", "pose", *_SNAPSHOT)
 # Ring size of view batches: one is read while another is copied and a third is rendered.
 RING = 3
 
@@ -47,15 +45,15 @@ def views_per_batch(render: Render, cameras: Cameras, worlds: int, device: wp.De
     if not device.is_cuda:
         return views
     width, height = cameras.resolution
-    one = {"view": 1, "row": height, "column": width}
-    layers = sum(size for *_, size in memory_table(LayerBuffers, one, render.layers))
-    return max(1, min(BATCH_BYTES // (width * height * PIXEL_BYTES + layers), views * worlds))
+    with dry_run() as layers:
+        allocate(LayerBuffers, {"view": 1, "row": height, "column": width}, device, render.layers)
+    each = width * height * PIXEL_BYTES + sum(layer.row[3] for layer in layers)
+    return max(1, min(BATCH_BYTES // each, views * worlds))
 
 
-def view_sizes(config: Config, device: wp.Device) -> dict[str, int]:
-    """Extents of the dimensions of `ViewBuffers` and `LayerBuffers`."""
-    views = views_per_batch(config.render, config.cameras, config.bake.worlds, device)
-    return view_buffer_sizes(views, *config.cameras.resolution, config.arrangement.max_objects)
+def view_sizes(render: Render, cameras: Cameras, worlds: int, objects: int, device: wp.Device) -> dict[str, int]:
+    """Extents of the dimensions of `ViewBuffers` and `LayerBuffers`, for `worlds` worlds of at most `objects` objects."""
+    return view_buffer_sizes(views_per_batch(render, cameras, worlds, device), *cameras.resolution, objects)
 
 
 @dataclass(frozen=True, eq=False)
@@ -162,6 +160,13 @@ class TickReader:
         return replace(report, tick=tick | tick_measures(columns, report.catalog_index.shape[1]), steps=steps)
 
 
+def read_tick(record: TickRecord) -> TickReport:
+    """Copy the results of a tick to the host, and wait for them."""
+    reader = TickReader(record)
+    reader.start()
+    return reader.wait()
+
+
 def _reported_parts(record: TickRecord) -> list[tuple[Any, list[str]]]:
     """Parts of a record that become namespaces of a report, each with the names of the arrays that are copied."""
     parts: list[tuple[Any, list[str]]] = [(part, [item.name for item in fields(part)]) for part in (record.observation, record.plan)]
@@ -220,6 +225,47 @@ def describe_views(
     }
 
 
+@dataclass(frozen=True, eq=False)
+class BatchBuffers:
+    """Device arrays of a batch of views in the ring: images, layers, and what is encoded of them."""
+
+    images: ViewBuffers
+    boundaries: BoundaryBuffers
+    layers: LayerBuffers
+    jpeg: JpegBuffers | None
+    depth: DepthBuffers | None
+
+    def copied(self, on_demand: Collection[str]) -> dict[str, wp.array]:
+        """Arrays that are copied to the host, by name: all but `on_demand`."""
+        parts = [part for part in (self.images, self.boundaries, self.jpeg, self.depth, self.layers) if part is not None]
+        arrays = {item.name: getattr(part, item.name) for part in parts for item in fields(part)}
+        return {name: array for name, array in arrays.items() if name not in on_demand and array is not None}
+
+
+Scratch = tuple[BoundaryScratch, JpegScratch | None, tuple[DepthScratch, Any, Any] | None]
+"""Scratch of run boundaries and encoders (see `allocate_depth_scratch`), which all batches of the ring share."""
+
+
+def allocate_ring(
+    sizes: dict[str, int], layers: Collection[str], host: HostImages, device: wp.Device
+) -> tuple[list[BatchBuffers], Scratch]:
+    """Allocate a ring of batches, on a CPU a single one, and the scratch of encoding; arguments as of `FrameStream`."""
+    frame, boundaries = (sizes["view"], sizes["column"], sizes["row"]), boundary_sizes(sizes)
+    ring = [
+        BatchBuffers(
+            allocate(ViewBuffers, sizes, device),
+            allocate(BoundaryBuffers, boundaries, device),
+            allocate(LayerBuffers, sizes, device, layers),
+            allocate(JpegBuffers, jpeg_sizes(*frame), device) if host.jpeg_quality else None,
+            allocate(DepthBuffers, depth_sizes(*frame), device) if host.depth_files else None,
+        )
+        for _ in range(RING if device.is_cuda else 1)
+    ]
+    jpeg = allocate(JpegScratch, jpeg_sizes(*frame), device) if host.jpeg_quality else None
+    depth = allocate_depth_scratch(*frame, device) if host.depth_files else None
+    return ring, (allocate(BoundaryScratch, boundaries, device), jpeg, depth)
+
+
 @dataclass(eq=False)
 class _Launched:
     """Batch in flight, which the device renders, encodes and copies: ring slot, number of views, description, and what to call when it is
@@ -274,24 +320,14 @@ class FrameStream:
         self.device = device
         self.streams = RenderStreams(device)
         self.layers = [item.name for item in fields(LayerBuffers) if item.name in layers]
-        ring = range(RING if device.is_cuda else 1)
-        self.buffers = [allocate(ViewBuffers, sizes, device) for _ in ring]
-        self.boundaries = [allocate(BoundaryBuffers, boundary_sizes(sizes), device) for _ in ring]
-        self.boundary_scratch = allocate(BoundaryScratch, boundary_sizes(sizes), device)
-        self.layer_buffers = [allocate(LayerBuffers, sizes, device, self.layers) for _ in ring]
-        self.compressor = Compressor(sizes, self.host.jpeg_quality, len(ring), device) if self.host.jpeg_quality else None
-        self.depth_encoder = DepthEncoder(self.batch, sizes["column"], sizes["row"], device) if self.host.depth_files else None
-        files = depth_sizes(self.batch, sizes["column"], sizes["row"])
-        self.depth_files = [allocate(DepthBuffers, files, device) for _ in ring] if self.depth_encoder else []
-        self.copies = []
-        for slot in ring:
-            parts = [self.buffers[slot], self.boundaries[slot], *([self.compressor.out[slot]] if self.compressor else [])]
-            parts += self.depth_files[slot : slot + 1]
-            arrays = {item.name: getattr(part, item.name) for part in parts for item in fields(part)}
-            copied = {name: array for name, array in arrays.items() if name not in self.host.on_demand}
-            self.images = list(copied)
-            self.copies.append(HostCopy([*copied.values(), *(getattr(self.layer_buffers[slot], name) for name in self.layers)]))
-        self.lists = [wp.zeros((2, self.batch), dtype=wp.int32, device=device) for _ in self.buffers]
+        self.ring, (self.boundary_scratch, jpeg, depth) = allocate_ring(sizes, layers, self.host, device)
+        frame = (sizes["column"], sizes["row"])
+        self.compressor = Compressor(jpeg, *frame, self.host.jpeg_quality) if jpeg is not None else None
+        self.depth_encoder = DepthEncoder(depth, *frame) if depth is not None else None
+        copied = [batch.copied(self.host.on_demand) for batch in self.ring]
+        self.images = [name for name in copied[0] if name not in self.layers]
+        self.copies = [HostCopy(list(arrays.values())) for arrays in copied]
+        self.lists = [wp.zeros((2, self.batch), dtype=wp.int32, device=device) for _ in self.ring]
         self.in_flight: deque[_Launched] = deque()
         self.next_slot = 0
 
@@ -319,13 +355,13 @@ class FrameStream:
         world, camera = pair_views(live, np.arange(self.cameras))
         ahead = 0
         for first in range(0, len(world), self.batch):
-            if len(self.in_flight) == len(self.buffers):
+            if len(self.in_flight) == len(self.ring):
                 yield from self._deliver()
             part = slice(first, min(first + self.batch, len(world)))
             self._launch(self.next_slot, snapshot, world[part], camera[part])
             description = describe_views(report, world[part], camera[part], self.tick_time, self.object_ids, self.lights)
             self.in_flight.append(_Launched(self.next_slot, part.stop - first, description))
-            self.next_slot = (self.next_slot + 1) % len(self.buffers)
+            self.next_slot = (self.next_slot + 1) % len(self.ring)
             ahead += int(self.device.is_cuda)
         if len(world):
             self.in_flight[-1].finished = finished
@@ -354,7 +390,7 @@ class FrameStream:
         rows.assign(padded)
         views = make_views(rows[0], rows[1], len(world), self.instances)
         with wp.ScopedStream(self.streams.render, sync_exit=True), scope("render", self.device):
-            self.renderer.render(snapshot, views, self.buffers[slot], self.layer_buffers[slot])
+            self.renderer.render(snapshot, views, self.ring[slot].images, self.ring[slot].layers)
         with wp.ScopedStream(self.streams.copy):
             with scope("encode", self.device):
                 self._encode(slot, len(world))
@@ -367,12 +403,12 @@ class FrameStream:
         Runs on the copy stream: after these views are rendered, beside the rendering of the next batch. Batches share one scratch; the
         order of this stream protects it.
         """
-        buffers = self.buffers[slot]
-        list_boundaries(self.boundary_scratch, count, buffers, self.boundaries[slot])
-        if self.compressor is not None:
-            self.compressor.compress(slot, count, buffers)
-        if self.depth_encoder is not None:
-            self.depth_encoder.encode(buffers.depth, count, self.depth_files[slot])
+        batch = self.ring[slot]
+        list_boundaries(self.boundary_scratch, count, batch.images, batch.boundaries)
+        if self.compressor is not None and batch.jpeg is not None:
+            self.compressor.compress(count, batch.images, batch.jpeg)
+        if self.depth_encoder is not None and batch.depth is not None:
+            self.depth_encoder.encode(batch.images.depth, count, batch.depth)
 
     def _collect(self, launched: _Launched) -> FrameBatch:
         """Wait for a batch's copies; returns the batch."""
@@ -383,6 +419,6 @@ class FrameStream:
         return FrameBatch(
             **launched.description,
             **{name: arrays[name] for name in self.images},
-            **{name: DeviceImages(getattr(self.buffers[slot], name)) for name in self.host.on_demand},
+            **{name: DeviceImages(getattr(self.ring[slot].images, name)) for name in self.host.on_demand},
             layers={name: arrays[name] for name in self.layers},
         )

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from synpick_warp.stages.arrays import allocate_like
 from synpick_warp.stages.buffers import Snapshot
 from synpick_warp.stages.sim.simulate import TickRecord
 from synpick_warp.stages.sim.step_log import record_arrays
@@ -104,9 +105,11 @@ def allocate_slots(arrays: Sequence[wp.array], slots: int, device: wp.Device, pi
         device: Where to allocate.
         pinned: Whether to pin memory of the host.
     """
+    rings: list[Any] = allocate_rings(arrays, slots, device, pinned)
     rows = [array.shape[0] for array in arrays]
-    shapes = [(slots * array.shape[0], *array.shape[1:]) for array in arrays]
-    rings: list[Any] = [
-        wp.zeros(shape, dtype=array.dtype, device=device, pinned=pinned) for shape, array in zip(shapes, arrays, strict=True)
-    ]
     return [[ring[slot * count : (slot + 1) * count] for ring, count in zip(rings, rows, strict=True)] for slot in range(slots)]
+
+
+def allocate_rings(arrays: Sequence[wp.array], slots: int, device: wp.Device, pinned: bool = False) -> list[wp.array]:
+    """The allocations of `allocate_slots`: each array has the rows of all slots."""
+    return [allocate_like(array, slots * array.shape[0], device, pinned) for array in arrays]

@@ -56,10 +56,14 @@ def bakes(monkeypatch):
     module.run_bake = run_bake
     monkeypatch.setitem(sys.modules, "synpick_warp.factory.pipeline", module)
     plan = types.ModuleType("synpick_warp.factory.memory_plan")
-    plan.describe_memory = lambda config: [("Snapshot.pose", (config.bake.worlds, 24), "m", 2 * 1024**2), ("Goals.goal", (4,), "", 0)]
+
+    def plan_memory(config, device):
+        return [types.SimpleNamespace(rows=[("Snapshot.pose", (config.bake.worlds, 24), "m", 2 * 1024**2), ("Goals.goal", (4,), "", 0)])]
+
+    plan.plan_memory = plan_memory
     monkeypatch.setitem(sys.modules, "synpick_warp.factory.memory_plan", plan)
     sizes = types.ModuleType("synpick_warp.factory.sizes")
-    sizes.fit_to_device, sizes.without_pictures, sizes.count_writers = lambda config, *_: config, lambda config: config, lambda _: 1
+    sizes.fit_to_device, sizes.without_pictures, sizes.count_writers = lambda config, *_: config, lambda config: config, lambda *_: 1
     monkeypatch.setitem(sys.modules, "synpick_warp.factory.sizes", sizes)
     return module
 

@@ -16,7 +16,7 @@ from PIL import Image
 from synpick_warp.kernels.encoding.dct import block_vec, transform_block
 from synpick_warp.kernels.encoding.tables import ZIGZAG
 from synpick_warp.stages.arrays import allocate
-from synpick_warp.stages.encoding.jpeg import JpegBuffers, JpegEncoder, jpeg_sizes
+from synpick_warp.stages.encoding.jpeg import JpegBuffers, JpegEncoder, JpegScratch, jpeg_sizes
 from synpick_warp.system.codecs import jpeg
 
 wp.set_module_options({"enable_backward": False})
@@ -27,7 +27,7 @@ def encode(images: np.ndarray, qualities: list[int], device) -> list[bytes | Non
     views, height, width = images.shape[:3]
     out = allocate(JpegBuffers, jpeg_sizes(views, width, height), device)
     image, quality = wp.array(images, dtype=wp.vec3ub, device=device), wp.array(qualities, dtype=wp.int32, device=device)
-    JpegEncoder(views, width, height, device).encode(image, quality, views, out)
+    JpegEncoder(allocate(JpegScratch, jpeg_sizes(views, width, height), device), width, height).encode(image, quality, views, out)
     files, sizes = out.jpeg.numpy(), out.jpeg_size.numpy()
     return [data[:size].tobytes() if size <= len(data) else None for data, size in zip(files, sizes, strict=True)]
 

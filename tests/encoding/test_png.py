@@ -18,7 +18,7 @@ from synpick_warp.exporters.writing.png import frame_depth_png
 from synpick_warp.kernels.encoding import png as kernels
 from synpick_warp.stages.arrays import allocate
 from synpick_warp.stages.encoding import png
-from synpick_warp.stages.encoding.png import DepthBuffers, DepthEncoder, depth_sizes
+from synpick_warp.stages.encoding.png import DepthBuffers, DepthEncoder, allocate_depth_scratch, depth_sizes
 from synpick_warp.system.codecs import depth_png
 from synpick_warp.system.inputs.image_files import decode_image
 from tests.harness.fuzz import fuzz_examples
@@ -29,7 +29,7 @@ def encode(images: np.ndarray, device) -> list[bytes | None]:
     """Data of images (view, row, column); None: it exceeds the capacity."""
     views, height, width = images.shape
     out = allocate(DepthBuffers, depth_sizes(views, width, height), device)
-    encoder = DepthEncoder(views, width, height, device)
+    encoder = DepthEncoder(allocate_depth_scratch(views, width, height, device), width, height)
     for _ in range(2):
         # Scratch is used again.
         encoder.encode(wp.array(images, dtype=wp.uint16, device=device), views, out)

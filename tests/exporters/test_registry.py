@@ -6,10 +6,11 @@ from pathlib import Path
 
 import pytest
 
+from synpick_warp.configs.export import ExportSettings
 from synpick_warp.configs.schema import FORMATS, Config
 from synpick_warp.errors import ConfigError
 from synpick_warp.exporters import registry
-from synpick_warp.exporters.base import ExportContext, TaskSizes
+from synpick_warp.exporters.base import ExportContext
 from synpick_warp.exporters.formats import FORMAT_TABLE
 from synpick_warp.exporters.registry import Exporters, Needs, load_exporter_classes
 from synpick_warp.views.frames import EpisodeEnd
@@ -127,5 +128,5 @@ def test_needs_are_those_of_all_formats(formats, physics, views, images, depth_f
     config = Config().with_values({"bake.formats": formats, "cameras.resolution": (64, 48)})
     needs = Needs.of(config)
     assert (needs.physics, needs.views, needs.images, needs.depth_files) == (physics, views, images, depth_files)
-    assert needs.slot_bytes == max(one.slot_bytes(TaskSizes.of(config)) for one in needs.classes)
+    assert needs.slot_bytes == max(one.slot_bytes(ExportSettings.of(config)) for one in needs.classes)
     assert (needs.slot_bytes == 0) == (formats == ("usd",))

@@ -14,9 +14,10 @@ import numpy as np
 import pytest
 
 from synpick_warp.codes import Ending
+from synpick_warp.configs.export import ExportSettings
 from synpick_warp.configs.schema import Config
 from synpick_warp.errors import OutputError
-from synpick_warp.exporters.base import ExportContext, Exporter, TaskSizes
+from synpick_warp.exporters.base import ExportContext, Exporter
 from synpick_warp.exporters.writing.files import PARTIAL
 from synpick_warp.exporters.writing.png import encode_png
 from synpick_warp.exporters.writing.pool import WriterPool
@@ -47,9 +48,9 @@ def exporting(
     resolution = (lenses[0].width, lenses[0].height)
     config = dataclasses.replace(config, cameras=dataclasses.replace(config.cameras, resolution=resolution))
     (out / PARTIAL).mkdir(parents=True, exist_ok=True)
-    with WriterPool(processes, exporter_class.slot_bytes(TaskSizes.of(config))) as pool:
+    with WriterPool(processes, exporter_class.slot_bytes(ExportSettings.of(config))) as pool:
         try:
-            yield exporter_class(ExportContext(out, config, catalog(), lenses, skies(), pool))
+            yield exporter_class(ExportContext(out, ExportSettings.of(config), catalog(), lenses, skies(), pool))
         finally:
             shutil.rmtree(out / PARTIAL, ignore_errors=True)
 
@@ -124,7 +125,7 @@ def finish(exporter: Exporter) -> list[Path]:
     context.pool.wait()
     exporter.close()
     episodes = [index for index in range(MOST_EPISODES) if exporter.files(index)]
-    return exporter.finalize(context.out, context.config, context.pool, episodes)
+    return exporter.finalize(context.out, context.settings, context.pool, episodes)
 
 
 def export_context(exporter: Exporter) -> ExportContext:

@@ -8,6 +8,7 @@ import os
 from pathlib import Path
 
 from synpick_warp.codes import Ending
+from synpick_warp.configs.export import ExportSettings
 from synpick_warp.configs.schema import FORMATS, Config
 from synpick_warp.configs.splits import DataLayout
 from synpick_warp.dataset.commit.manifest import episode_entry, read_entry
@@ -71,14 +72,14 @@ def bake(out: Path, config: Config, shard: tuple[int, int] = (0, 1), stop_after:
         if output.is_finished:
             return summary
         with WriterPool(0, needs.slot_bytes, output.lock) as pool:
-            exporters = Exporters(needs.classes, ExportContext(out, config, box_views.catalog(), _LENSES, skies(), pool))
+            exporters = Exporters(needs.classes, ExportContext(out, ExportSettings.of(config), box_views.catalog(), _LENSES, skies(), pool))
             output.prepare(exporters, INPUTS, pool)
             for episode in output.remaining[:stop_after]:
                 _write_episode(output, exporters, pool, episode)
             pool.wait()
             exporters.close()
             if stop_after is None:
-                finalize_data_set(out, config, needs.classes, pool)
+                finalize_data_set(out, ExportSettings.of(config), needs.classes, pool)
     return summary
 
 

@@ -21,6 +21,7 @@ from typing import Any
 import numpy as np
 
 from synpick_warp.codes import Ending
+from synpick_warp.configs.export import ExportSettings
 from synpick_warp.configs.schema import FORMATS, Config
 from synpick_warp.dataset.commit.manifest import episode_entry, read_entry
 from synpick_warp.dataset.commit.writing import OutputFolder
@@ -86,7 +87,7 @@ def soak(ticks: int, writers: int, out: Path) -> tuple[list[int], list[int]]:
     frames = make_frames(lenses)
     memory, files = [], []
     with OutputFolder(out, config, ()) as output, WriterPool(writers, needs.slot_bytes, output.lock) as pool:
-        exporters = Exporters(needs.classes, ExportContext(out, config, box_views.catalog(), lenses, skies(), pool))
+        exporters = Exporters(needs.classes, ExportContext(out, ExportSettings.of(config), box_views.catalog(), lenses, skies(), pool))
         output.prepare(exporters, {}, pool)
         for tick in range(ticks):
             first, frame = divmod(tick, FRAMES)

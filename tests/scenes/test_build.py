@@ -12,6 +12,7 @@ from hypothesis import given
 from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
 
+from synpick_warp.configs.schema import Config, Physics
 from synpick_warp.errors import ConfigError
 from synpick_warp.kernels.newton_patches import contact_sweep
 from synpick_warp.scenes import build
@@ -27,6 +28,14 @@ WORLDS = 3
 
 def config_of(**overrides: object):
     return settings(bake__worlds=WORLDS, **overrides)
+
+
+def count_slots(config: Config, objects: Catalog) -> tuple[int, int]:
+    return build.count_slots(config.arrangement, build.find_repeat_rules(config.bake, config.pick, config.move), objects)
+
+
+def with_capacities(config: Config, objects: Catalog) -> Physics:
+    return build.with_capacities(config.physics, config.arrangement.max_objects, objects)
 
 
 @pytest.fixture(scope="module")
@@ -208,7 +217,7 @@ def test_slots_suffice_for_all_but_the_accepted_fraction_of_draws(seed, size, sh
     shortfall, episodes = 0.05, 400
     limits = {"arrangement__volume": 3e-3, "arrangement__max_objects": 20, "arrangement__slot_shortfall": shortfall}
     config = settings(bake__mode=mode, arrangement__fill=fill, **limits)
-    slots = build.count_slots(config, fake(volume, compound, objects))
+    slots = count_slots(config, fake(volume, compound, objects))
     taken = needs(config, volume, compound, episodes, repeats=mode == "move")
     # Four standard deviations of the brute force.
     margin = 4 * np.sqrt(shortfall / episodes)
@@ -227,13 +236,13 @@ def test_the_accepted_fraction_is_that_of_both_slot_types_together(objects):
     halves = fake(np.full(2, 1e-4), np.array([0, 1]), objects)
     for shortfall, slots in ((0.3, (2, 1)), (0.2, (2, 2))):
         config = settings(bake__mode="move", arrangement__max_objects=2, arrangement__volume=1.0, arrangement__slot_shortfall=shortfall)
-        assert build.count_slots(config, halves) == slots
+        assert count_slots(config, halves) == slots
 
 
 def test_with_a_budget_for_everything_and_no_repeats_every_object_has_a_slot(objects):
     five = fake(np.full(5, 1e-4), np.array([0, 1, 1, 0, 0]), objects)
     for room, slots in ((8, (3, 2)), (2, (2, 2))):
-        assert build.count_slots(settings(bake__mode="pick", arrangement__max_objects=room, arrangement__volume=1.0), five) == slots
+        assert count_slots(settings(bake__mode="pick", arrangement__max_objects=room, arrangement__volume=1.0), five) == slots
 
 
 def test_without_repeats_a_budget_for_few_needs_few_slots(objects):
@@ -241,8 +250,8 @@ def test_without_repeats_a_budget_for_few_needs_few_slots(objects):
     thirty = fake(np.full(30, 1e-4), np.array([0] * 28 + [1] * 2), objects)
     for fill, count in (("within", 7), ("exceed", 8)):
         config = {"arrangement__volume": 7.5e-4, "arrangement__max_objects": 32, "arrangement__fill": fill}
-        assert build.count_slots(settings(bake__mode="pick", **config), thirty) == (count, 2)
-        single, compound = build.count_slots(settings(bake__mode="move", **config), thirty)
+        assert count_slots(settings(bake__mode="pick", **config), thirty) == (count, 2)
+        single, compound = count_slots(settings(bake__mode="move", **config), thirty)
         assert single == count
         assert compound > 2
 
@@ -255,10 +264,10 @@ def test_the_first_object_is_redrawn_until_it_fits_and_the_next_that_does_not_fi
     # A second object fits in one draw of a hundred with repeats, and never without.
     for mode, shortfall, most in (("move", 0.02, 1), ("move", 0.005, 2), ("pick", 0.005, 1)):
         limits = {"arrangement__volume": 2.5e-4, "arrangement__slot_shortfall": shortfall, "arrangement__max_objects": 2}
-        assert build.count_slots(settings(bake__mode=mode, arrangement__fill="within", **limits), rare) == (0, most)
+        assert count_slots(settings(bake__mode=mode, arrangement__fill="within", **limits), rare) == (0, most)
         # Drawing on until the budget is exceeded, the other 99 are passed over.
         both = (0, 2 if mode == "move" else 1)
-        assert build.count_slots(settings(bake__mode=mode, arrangement__fill="exceed", **limits), rare) == both
+        assert count_slots(settings(bake__mode=mode, arrangement__fill="exceed", **limits), rare) == both
 
 
 @pytest.mark.parametrize(
@@ -284,28 +293,28 @@ def test_mixed_modes_have_enough_slots_for_each_mode(objects):
     """For each slot type: picking may need more of one and moving more of the other."""
     some = fake(np.full(6, 1e-4), np.array([0, 0, 0, 0, 1, 1]), objects)
     config = {"arrangement__volume": 5.5e-4, "arrangement__max_objects": 12, "arrangement__fill": "within"}
-    single = [build.count_slots(settings(bake__mode=mode, **config), some) for mode in ("pick", "target", "move")]
-    assert build.count_slots(settings(bake__mode="mixed", **config), some) == tuple(np.max(single, axis=0))
-    assert build.count_slots(settings(bake__mode="mixed", bake__mix=[1, 1, 0], **config), some) == single[0] == single[1] != single[2]
+    single = [count_slots(settings(bake__mode=mode, **config), some) for mode in ("pick", "target", "move")]
+    assert count_slots(settings(bake__mode="mixed", **config), some) == tuple(np.max(single, axis=0))
+    assert count_slots(settings(bake__mode="mixed", bake__mix=[1, 1, 0], **config), some) == single[0] == single[1] != single[2]
 
 
 def test_no_slot_type_exceeds_the_maximum_of_objects(objects):
     config = settings(arrangement__max_objects=4, arrangement__volume=1.0)
-    single, compound = build.count_slots(config, fake(np.full(4, 1e-5), np.array([0, 0, 1, 1]), objects))
+    single, compound = count_slots(config, fake(np.full(4, 1e-5), np.array([0, 0, 1, 1]), objects))
     assert (single, compound) == (4, 4)
-    assert build.count_slots(config, fake(np.full(2, 1e-5), np.zeros(2), objects)) == (4, 0)
+    assert count_slots(config, fake(np.full(2, 1e-5), np.zeros(2), objects)) == (4, 0)
 
 
 @pytest.mark.parametrize("mode", ["move", "pick"])
 def test_a_budget_below_the_smallest_object_is_an_error(objects, mode):
     config = settings(arrangement__volume=1e-4, bake__mode=mode)
     with pytest.raises(ConfigError, match=r"volume is 0\.0001 m³, but the smallest object, boxes_3, takes 0\.000125 m³; make it larger"):
-        build.count_slots(config, objects)
+        count_slots(config, objects)
 
 
 def test_slot_counts_are_deterministic(objects):
     config = config_of(arrangement__max_objects=12, arrangement__volume=3e-3)
-    assert build.count_slots(config, objects) == build.count_slots(config, objects)
+    assert count_slots(config, objects) == count_slots(config, objects)
 
 
 # ---- small catalogs ----
@@ -316,7 +325,7 @@ def test_slot_counts_are_deterministic(objects):
 def test_three_cubes_of_a_litre_meet_a_budget_of_three_litres(objects, mode, count):
     """Fault 4: the volume of a cube of 100 mm comes as 1.0000000000000002e-3 m³, with which 64-bit floats found room for two."""
     config = settings(bake__mode=mode, arrangement__volume=3e-3, arrangement__max_objects=24)
-    slots = build.count_slots(config, fake(np.full(count, np.nextafter(1e-3, 1.0)), np.zeros(count), objects))
+    slots = count_slots(config, fake(np.full(count, np.nextafter(1e-3, 1.0)), np.zeros(count), objects))
     assert slots == (3 if mode in ("move", "mixed") else count, 0)
 
 
@@ -324,7 +333,7 @@ def test_three_cubes_of_a_litre_meet_a_budget_of_three_litres(objects, mode, cou
 def test_an_object_of_the_whole_budget_is_drawn(objects, mode):
     """But for rounding: the kernels compare in 32-bit floats."""
     config = settings(bake__mode=mode, arrangement__volume=1e-3)
-    assert build.count_slots(config, fake(np.full(1, np.nextafter(1e-3, 1.0)), np.zeros(1), objects)) == (1, 0)
+    assert count_slots(config, fake(np.full(1, np.nextafter(1e-3, 1.0)), np.zeros(1), objects)) == (1, 0)
 
 
 def sizes_of_boxes(budget: float) -> st.SearchStrategy[float]:
@@ -358,9 +367,9 @@ def test_any_catalog_of_one_to_three_objects_gets_arrangements(data, budget, roo
     )
     if np.float32(volume.min()) > np.float32(budget):
         with pytest.raises(ConfigError, match=r"\Aarrangement\.volume is .*, but the smallest object, .*; make it larger\Z"):
-            build.count_slots(config, fake(volume, compound, objects))
+            count_slots(config, fake(volume, compound, objects))
         return
-    slots = build.count_slots(config, fake(volume, compound, objects))
+    slots = count_slots(config, fake(volume, compound, objects))
     taken = needs(config, volume, compound, 40, repeats=repeats)
     assert (taken.sum(axis=1) >= 1).all()
     # More than three of 40 with a chance of 1e-3 each: less than once in ten million.
@@ -372,16 +381,16 @@ def test_any_catalog_of_one_to_three_objects_gets_arrangements(data, budget, roo
 
 def test_only_objects_thinner_than_the_contact_margin_raise_capacities():
     config = settings(bake__mode="move", arrangement__max_objects=24)
-    assert build.with_capacities(config, catalog(BOX, CUBE, ANGLE)) is config
+    assert with_capacities(config, catalog(BOX, CUBE, ANGLE)) is config.physics
     for size, least in (((0.1, 0.08, 0.001), 1300), ((0.002, 0.002, 0.1), 1300), ((0.3, 0.2, 0.0005), 1300), ((0.2, 0.2, 0.0079), 512)):
-        physics = build.with_capacities(config, catalog(BOX, (size,))).physics
+        physics = with_capacities(config, catalog(BOX, (size,)))
         assert least <= physics.contacts_per_world <= build.MAX_CONTACTS
         assert physics.rows_per_world in (1536, build.MAX_ROWS)
         assert physics.pairs_per_world >= 1024
     few = settings(bake__mode="move", arrangement__max_objects=3)
-    assert build.with_capacities(few, catalog(((0.1, 0.08, 0.001),))) is few
+    assert with_capacities(few, catalog(((0.1, 0.08, 0.001),))) is few.physics
     roomy = settings(arrangement__max_objects=24, physics__contacts_per_world=8192)
-    assert build.with_capacities(roomy, catalog(((0.1, 0.08, 0.001),))) is roomy
+    assert with_capacities(roomy, catalog(((0.1, 0.08, 0.001),))) is roomy.physics
 
 
 def test_rows_stay_in_shared_memory():
@@ -408,6 +417,6 @@ def test_the_embedded_objects_keep_the_capacities():
 def test_objects_repeat_where_all_of_them_stay_below_the_budget(overrides, shapes, repeats):
     """An object that alone exceeds the budget is never drawn, and does not count."""
     config = settings(bake__mode="pick", **{"arrangement__max_objects": 24} | overrides)
-    filled = build.with_repeats(config, catalog(*shapes))
-    assert build.find_repeat_rules(filled.bake, filled.pick, filled.move) == {repeats}
-    assert (filled is config) == (not repeats)
+    assert build.must_repeat(config.arrangement, catalog(*shapes)) is repeats
+    filled = config.with_values(build.REPEATS)
+    assert build.find_repeat_rules(filled.bake, filled.pick, filled.move) == {True}

@@ -9,6 +9,7 @@ import pytest
 
 from synpick_warp.configs.load import load_config
 from synpick_warp.configs.schema import Config
+from synpick_warp.exporters.registry import Needs
 from synpick_warp.factory import memory_plan, sizes
 from synpick_warp.factory.memory_plan import check_memory, plan_memory
 from synpick_warp.factory.sizes import (
@@ -78,7 +79,7 @@ def test_batches_shrink_until_plan_and_headroom_fit(give, gpu, mode):
     assert config.bake.worlds >= min(512, 13 * gpu)
     if gpu >= 12.0:
         assert views_per_batch(config, GPU) >= 12
-    check_memory(config, GPU)
+    check_memory(plan_memory(config, GPU), GPU)
 
 
 def test_trajectories_alone_need_no_image_buffers(give):
@@ -151,12 +152,16 @@ def test_a_bake_on_one_of_several_cores_is_told_of_the_others(give, cores, monke
     assert advise_processes(config, ["auto"], 3) == ""
 
 
+def writers_of(config: Config) -> int:
+    return count_writers(config.bake.writers, Needs.of(config).slot_bytes)
+
+
 def test_writers_are_as_many_as_cores_if_memory_suffices(give, monkeypatch):
     monkeypatch.setattr(sizes, "count_cores", lambda: 64)
     config = load_config("synpick", {})
-    assert count_writers(config) == 64
+    assert writers_of(config) == 64
     give(host=8.0)
-    assert 1 < count_writers(config) < 64
+    assert 1 < writers_of(config) < 64
     give(host=0.1)
-    assert count_writers(config) == 1
-    assert count_writers(load_config("synpick", {"bake.writers": 99})) == 99
+    assert writers_of(config) == 1
+    assert writers_of(load_config("synpick", {"bake.writers": 99})) == 99

@@ -255,7 +255,7 @@ def test_counted_slots_hold_the_draws_of_all_modes(device, mix, fill, slots):
         arrangement__fill=fill,
     )
     objects = small_worlds.catalog()
-    single, compound = build.count_slots(config, objects)
+    single, compound = build.count_slots(config.arrangement, build.find_repeat_rules(config.bake, config.pick, config.move), objects)
     worlds = arrangement_worlds(
         device,
         episodes,

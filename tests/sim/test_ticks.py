@@ -19,6 +19,7 @@ from synpick_warp.stages.sim.simulate import Simulation, TickRecord
 from synpick_warp.stages.sim.worlds import WorldStatus, world_sizes
 from synpick_warp.stages.stream import TickReader
 from synpick_warp.stages.tick_queue import MAX_LEAD, QUEUE_BYTES, QUEUE_PART, TickQueue, queue_lead, record_bytes
+from tests.harness.memory_tables import queued_ticks
 from tests.harness.spin import SPINS, spin_kernel
 from tests.worlds.small_worlds import catalog, settings
 
@@ -174,10 +175,10 @@ def test_the_memory_plan_counts_the_queue(device, monkeypatch, formats):
     monkeypatch.setattr(tick_queue, "QUEUE_PART", 1)
     monkeypatch.setattr(tick_queue, "QUEUE_BYTES", 200 * record_bytes(record))
     gpu = SimpleNamespace(is_cuda=True, total_memory=QUEUE_BYTES)
-    assert memory_plan.queue_slots(config, gpu) == 200
+    assert queued_ticks(config, gpu) == 200
     monkeypatch.setattr(tick_queue, "QUEUE_BYTES", 200 * record_bytes(record) - 1)
-    assert memory_plan.queue_slots(config, gpu) == 199
-    slots = memory_plan.queue_slots(config, device)
+    assert queued_ticks(config, gpu) == 199
+    slots = queued_ticks(config, device)
     planned = {term.name: term.size for term in memory_plan.plan_memory(config, device)}
     assert planned[f"a queue of {slots} ticks"] == slots * size_of(vars(record.snapshot).values())
     assert planned[f"reports of {slots} ticks"] == slots * size_of(TickReader.reported(record))

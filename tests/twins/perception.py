@@ -13,12 +13,11 @@ import warp as wp
 from synpick_warp.configs.schema import Config, Perception
 from synpick_warp.kernels import structs
 from synpick_warp.scenes.cameras import make_cameras
-from synpick_warp.stages.arrays import allocate, allocate_struct
+from synpick_warp.stages.arrays import allocate
 from synpick_warp.stages.perception.arrays import Observation
-from synpick_warp.stages.perception.images import perception_sizes
+from synpick_warp.stages.perception.images import allocate_batch
 from synpick_warp.stages.perception.segment import Segmenter
 from synpick_warp.stages.render.scene import build_cameras, build_grid
-from synpick_warp.stages.render.view_setup import GBUFFER, VIEWS
 from synpick_warp.stages.sim.worlds import world_sizes
 
 
@@ -35,12 +34,13 @@ class SegmenterHarness:
         )
         camera = make_cameras(replace(config.cameras, resolution=(width, height)))[0]
         self.focal = camera.matrix[[0, 1], [0, 1]]
-        sizes = perception_sizes(self.config.perception, instances, worlds)
+        views, _, gbuffer, arrays, scratch = allocate_batch(self.config.perception, instances, worlds, device)
         self.images: Any = SimpleNamespace(
             scene=SimpleNamespace(device=device, cameras=build_cameras((camera,), device), grid=build_grid(width, height)),
-            views=allocate_struct(VIEWS, sizes, device),
-            gbuffer=allocate_struct(GBUFFER, sizes, device),
-            sizes=sizes,
+            views=views,
+            gbuffer=gbuffer,
+            arrays=arrays,
+            scratch=scratch,
         )
         self.images.views.count, self.images.views.instances = worlds, instances
         self.segmenter = Segmenter(self.images)

@@ -162,12 +162,13 @@ def test_a_target_that_is_not_in_the_ground_truth_of_the_image_is_drawn_without_
 
 
 def test_names_come_from_the_models_or_from_the_object_table(dataset):
-    assert object_names(dataset, Config(), {3, 7}) == {3: "box 3", 7: "box 7"}
-    assert object_names(dataset, Config(), {5}) == {}
+    assert object_names(dataset, {3, 7}) == {3: "box 3", 7: "box 7"}
+    assert object_names(dataset, {5}) == {}
     from synpick_warp.configs.load import load_config
 
     (dataset / "models" / "models_info.json").write_text(json.dumps({"2": {"diameter": 269.6}, "4": {"diameter": 60.0}}))
-    assert object_names(dataset, load_config("synpick", {}), {2, 4}) == {2: "003_cracker_box"}
+    config = load_config("synpick", {})
+    assert object_names(dataset, {2, 4}, config.object_rows, config.objects.diameter_tolerance) == {2: "003_cracker_box"}
 
 
 def test_objects_that_come_twice_get_letters():
@@ -190,13 +191,13 @@ FIRST, SECOND, THIRD = seen(0, visible_fraction=0.4), seen(1, visible_fraction=0
     ],
 )
 def test_why_it_was_chosen(objects, target, mode, said):
-    assert choice_words(attempt(objects, {}, target, mode=mode), NAMES, Config())[0] == said
+    assert choice_words(attempt(objects, {}, target, mode=mode), NAMES, Config().target)[0] == said
 
 
 def test_a_draw_after_a_failure_is_named_where_the_settings_have_it():
     drawn_one = attempt((FIRST, SECOND, THIRD), {}, 0, mode="target")
     released = Config(target=Target(random_after_failure=True))
-    assert choice_words(drawn_one, NAMES, released)[0] == "target: 1 tin: 0 objects above; chosen at random after a failed attempt"
+    assert choice_words(drawn_one, NAMES, released.target)[0] == "target: 1 tin: 0 objects above; chosen at random after a failed attempt"
 
 
 @pytest.mark.parametrize(
@@ -209,25 +210,27 @@ def test_a_draw_after_a_failure_is_named_where_the_settings_have_it():
 )
 def test_where_the_suction_point_is(suction, said):
     one = attempt((seen(0, grasp_pixel=suction),), {}, 0, tilt=-np.pi / 2)
-    assert choice_words(one, NAMES, Config())[1] == said
+    assert choice_words(one, NAMES, Config().target)[1] == said
 
 
 def test_what_the_seal_bore():
     good = attempt((FIRST, SECOND), {}, 0, engaged=(0, 1), picked=(1,), peak_force=(1.0, 6.25, 3.0))
-    assert seal_words(good, NAMES, Config()) == [
+    assert seal_words(good, NAMES, Config().suction) == [
         "rays: 10 of 10 hit; good seal, breaks at 40 N",
         "engaged: 1 tin, 2 box; largest force 6.2 N",
         "picked: 2 box",
     ]
     poor = attempt((FIRST,), {}, 0, hits=3, good_seal=False, engaged=(7,))
     said = ["rays: 3 of 10 hit; poor seal, breaks at 2 N", "engaged: instance 7, unseen", "picked: nothing"]
-    assert seal_words(poor, NAMES, Config()) == said
-    assert seal_words(attempt((FIRST,), {}, 0, hits=0, peak_force=(0.0, 0.0)), NAMES, Config()) == ["rays: 0 of 10 hit"]
-    assert seal_words(attempt((), {}), NAMES, Config()) == []
+    assert seal_words(poor, NAMES, Config().suction) == said
+    assert seal_words(attempt((FIRST,), {}, 0, hits=0, peak_force=(0.0, 0.0)), NAMES, Config().suction) == ["rays: 0 of 10 hit"]
+    assert seal_words(attempt((), {}), NAMES, Config().suction) == []
 
 
 def test_a_load_of_half_the_limit_lies_half_way_below_it():
-    plot = picture_of(load_chart(attempt((FIRST,), {}, 0, peak_force=(20.0,) * 9), Config(), 400, 200), 1.0)
+    plot = picture_of(
+        load_chart(attempt((FIRST,), {}, 0, peak_force=(20.0,) * 9), Config().suction, Config().physics.tick_time, 400, 200), 1.0
+    )
     limit, curve = (np.flatnonzero(near(plot, color, 30)[:, 300]) for color in ("#c83c3c", "#145aaa"))
     axis = np.flatnonzero(near(plot, "#1e1e1e", 30)[:, 300:303].all(axis=1))[:1]
     assert plot.shape == (200, 400, 3)
@@ -235,7 +238,7 @@ def test_a_load_of_half_the_limit_lies_half_way_below_it():
 
 
 def test_a_lift_without_a_seal_says_so():
-    nothing = load_chart(attempt((FIRST,), {}, 0, hits=0), Config(), 400, 100)
+    nothing = load_chart(attempt((FIRST,), {}, 0, hits=0), Config().suction, Config().physics.tick_time, 400, 100)
     assert "nothing was engaged" in str(nothing)
     assert picture_of(nothing, 1.0).shape == (190, 400, 3)
 

@@ -154,7 +154,7 @@ def test_depth_has_one_scale_the_totes(dataset, tmp_path):
     (dataset / "config.toml").write_text(config_to_toml(config()))
     views = sample(find_scenes(dataset), 6)
     records = [scene.files().camera(frame) for scene, frame in views]
-    near, far = tote_scale(read_baked(dataset, set()).config, records)
+    near, far = tote_scale(read_baked(dataset, set()).config.tote, records)
     tote = config().tote
     heights = {"near": tote.outer_size[2] - tote.wall, "far": 0.0}
     sizes = {"near": tote.rim_size, "far": tote.floor_size}

@@ -13,7 +13,7 @@ from synpick_warp.scenes.collision.hulls import mass_properties
 from synpick_warp.scenes.collision.simplification import simplify_hull
 from synpick_warp.scenes.types import Catalog, CatalogEntry, ConvexPiece, Material, TriangleMesh
 from synpick_warp.stages.sim.simulate import Simulation, TickRecord
-from synpick_warp.stages.stream import TickReader, TickReport
+from synpick_warp.stages.stream import TickReport, read_tick
 from tests.harness.devices import default_device
 
 BOX = ((0.08, 0.06, 0.04),)
@@ -91,9 +91,7 @@ def _entry(obj_id: int, sizes: Sequence[tuple[float, float, float]]) -> CatalogE
 
 def report(record: TickRecord) -> TickReport:
     """Report of a tick."""
-    reader = TickReader(record)
-    reader.start()
-    return reader.wait()
+    return read_tick(record)
 
 
 def run_ticks(simulation: Simulation, ticks: int) -> list[TickReport]:

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from synpick_warp.codes import Ending
+from synpick_warp.configs.export import ExportSettings
 from synpick_warp.configs.load import load_config
 from synpick_warp.configs.schema import Config
 from synpick_warp.exporters.base import ExportContext
@@ -92,7 +93,9 @@ def write_set(
     """Write a complete data set in this process; returns the folder of its USD files."""
     (out / PARTIAL).mkdir(parents=True)
     with WriterPool(0, 0) as pool:
-        exporter = UsdExporter(ExportContext(out, config, catalog, make_cameras(config.cameras), lights or skies()[:2], pool))
+        exporter = UsdExporter(
+            ExportContext(out, ExportSettings.of(config), catalog, make_cameras(config.cameras), lights or skies()[:2], pool)
+        )
         assert exporter.write_constants() == [Path("usd/assets")]
         for episode in episodes:
             for batch in episode_ticks(episode, frames):

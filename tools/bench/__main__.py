@@ -32,10 +32,10 @@ from synpick_warp.errors import SynpickError
 from synpick_warp.exporters.registry import Needs
 from synpick_warp.factory.assembly import Factory, build_factory
 from synpick_warp.stages import timing
-from synpick_warp.stages.render.view_setup import make_views
+from synpick_warp.stages.render.view_setup import first_views
 from synpick_warp.stages.sim.physics import with_enough_worlds
 from synpick_warp.stages.sim.simulate import Simulation
-from synpick_warp.stages.stream import TickReader, TickReport
+from synpick_warp.stages.stream import TickReport, read_tick
 from synpick_warp.system.hardware.device import pick_device
 from synpick_warp.system.progress import SilentProgress
 from tools.bench.compare.peers import PEERS, check_installed, measure_peers
@@ -194,10 +194,10 @@ def measure(
         yield from _perception_fraction(config.bake.worlds * len(config.cameras.positions), config.physics.steps_per_tick, values)
         if "write" in parts:
             worlds = min(factory.simulation.layout.worlds, -(-WRITE_VIEWS // len(factory.cameras)))
-            yield from of_part("write", measure_writing(config, factory, _mark_live(factory.simulation, worlds), min_seconds))
+            yield from of_part("write", measure_writing(factory, _mark_live(factory.simulation, worlds), min_seconds))
         if "stream" in parts:
             live = _mark_live(factory.simulation, factory.simulation.layout.worlds)
-            yield from of_part("stream", measure_stream(config, factory, live, min_seconds))
+            yield from of_part("stream", measure_stream(factory, live, min_seconds))
         yield _memory_in_use(factory.simulation.device)
     if "pictures" in parts:
         yield from of_part("pictures", measure_pictures(config, after))
@@ -221,9 +221,9 @@ def _measure_worlds(quality: int, factory: Factory, min_seconds: float, parts: t
         yield from of_part("render", _measure_rendering(factory, min_seconds))
     if "encode" in parts:
         count = min(factory.stream.batch, factory.simulation.layout.worlds * len(factory.cameras))
-        images = factory.stream.buffers[0]
-        factory.stream.renderer.render(factory.simulation.record.snapshot, _first_views(factory, count), images)
-        device = factory.simulation.device
+        images, renderer, device = factory.stream.ring[0].images, factory.stream.renderer, factory.simulation.device
+        views = first_views(count, len(factory.cameras), renderer.instances, device)
+        renderer.render(factory.simulation.record.snapshot, views, images)
         yield from of_part("encode", measure_encoding(images, count, quality, device, min_seconds))
 
 
@@ -248,9 +248,7 @@ def _memory_in_use(device: wp.Device) -> Row:
 
 def _mark_live(simulation: Simulation, worlds: int) -> TickReport:
     """Report of the last tick, marked as a frame of the first `worlds` worlds alone."""
-    reader = TickReader(simulation.record)
-    reader.start()
-    report = reader.wait()
+    report = read_tick(simulation.record)
     report.status[:, Status.LIVE] = np.arange(simulation.layout.worlds) < worlds
     return report
 
@@ -261,7 +259,8 @@ def _measure_rendering(factory: Factory, min_seconds: float) -> Iterator[Row]:
     device, cameras = simulation.device, len(factory.cameras)
     count = min(stream.batch, simulation.layout.worlds * cameras)
     yield Row("views in a batch", count, "")
-    views, out, renderer = _first_views(factory, count), stream.buffers[0], stream.renderer
+    out, renderer = stream.ring[0].images, stream.renderer
+    views = first_views(count, cameras, renderer.instances, device)
 
     def render() -> None:
         renderer.render(simulation.record.snapshot, views, out)
@@ -286,13 +285,6 @@ def _measure_rendering(factory: Factory, min_seconds: float) -> Iterator[Row]:
     report = _mark_live(simulation, worlds)
     seconds = seconds_per_call(lambda: [len(batch) for batch in stream.render(simulation.record.snapshot, report)], device, min_seconds)
     yield Row("views, all stages and copies", worlds * cameras / seconds, "1/s")
-
-
-def _first_views(factory: Factory, count: int) -> Any:
-    """The struct `Views` of the first `count` views: world by world and camera by camera."""
-    cameras, renderer, view = len(factory.cameras), factory.stream.renderer, np.arange(count, dtype=np.int32)
-    world, camera = (wp.array(values, dtype=wp.int32, device=renderer.scene.device) for values in (view // cameras, view % cameras))
-    return make_views(world, camera, count, renderer.instances)
 
 
 def _time_passes(render: Callable[[], None], device: wp.Device, min_seconds: float) -> dict[str, float]:

@@ -11,8 +11,8 @@ import warp as wp
 from synpick_warp.exporters.writing.png import encode_png
 from synpick_warp.stages.arrays import allocate
 from synpick_warp.stages.buffers import ViewBuffers
-from synpick_warp.stages.encoding.jpeg import JpegBuffers, JpegEncoder, jpeg_sizes
-from synpick_warp.stages.encoding.png import DepthBuffers, DepthEncoder, depth_sizes
+from synpick_warp.stages.encoding.jpeg import JpegBuffers, JpegEncoder, JpegScratch, jpeg_sizes
+from synpick_warp.stages.encoding.png import DepthBuffers, DepthEncoder, allocate_depth_scratch, depth_sizes
 from synpick_warp.system.codecs.jpeg import encode_jpeg
 from tools.bench.physics import BURST, seconds_per_call
 from tools.options import Row
@@ -32,8 +32,10 @@ def measure_encoding(images: ViewBuffers, count: int, quality: int, device: wp.D
         min_seconds: Time of a measurement, at least [s].
     """
     views, height, width = images.depth.shape
-    jpeg, jpeg_out = JpegEncoder(views, width, height, device), allocate(JpegBuffers, jpeg_sizes(views, width, height), device)
-    depth, depth_out = DepthEncoder(views, width, height, device), allocate(DepthBuffers, depth_sizes(views, width, height), device)
+    sizes = jpeg_sizes(views, width, height)
+    jpeg, jpeg_out = JpegEncoder(allocate(JpegScratch, sizes, device), width, height), allocate(JpegBuffers, sizes, device)
+    depth = DepthEncoder(allocate_depth_scratch(views, width, height, device), width, height)
+    depth_out = allocate(DepthBuffers, depth_sizes(views, width, height), device)
     qualities = wp.full(views, quality, dtype=wp.int32, device=device)
     runs: dict[str, tuple[Callable[[], None], wp.array, int, Callable[[int], object]]] = {
         f"JPEG, quality {quality}": (

@@ -8,10 +8,9 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
-import numpy as np
 import warp as wp
 
 from synpick_warp.configs.schema import Cameras, Config
@@ -20,9 +19,10 @@ from synpick_warp.scenes.cameras import make_cameras
 from synpick_warp.scenes.catalog import load_catalog
 from synpick_warp.scenes.fixtures import make_fixtures
 from synpick_warp.scenes.lights import load_lights
+from synpick_warp.scenes.types import Catalog, EnvironmentMap
 from synpick_warp.stages.buffers import Snapshot, ViewBuffers, allocate
 from synpick_warp.stages.render.scene import RenderScene, build_render_scene
-from synpick_warp.stages.render.view_setup import make_views
+from synpick_warp.stages.render.view_setup import first_views
 from synpick_warp.stages.sim.physics import with_enough_worlds
 from synpick_warp.stages.sim.simulate import Simulation
 from synpick_warp.stages.stream import view_sizes
@@ -32,10 +32,9 @@ from tools.options import Row
 
 DROP_TICKS = 24
 """Ticks from the drop to the measurement: 1.6 s, in which nearly all objects land."""
-FRACTIONS = {"worlds": (0.125, 0.25, 0.5), "objects": (0.25, 0.5), "resolution": (1 / 3, 2 / 3), "cameras": (1 / 3, 2.0)}
-"""Values of each factor, as multiples of the settings' own: worlds, volume of the objects, image width and height, cameras."""
-PATHS = (1, 2, 4)
-"""Paths per coarse pixel."""
+FACTORS = {"worlds": (0.125, 0.25, 0.5), "objects": (0.25, 0.5), "resolution": (1 / 3, 2 / 3), "paths": (1, 2, 4), "cameras": (1 / 3, 2.0)}
+"""Values of each factor: paths per coarse pixel, and multiples of the settings' own worlds, volume of the objects, image width and height,
+cameras."""
 
 
 @dataclass(frozen=True)
@@ -51,21 +50,31 @@ class Pile:
     """Physics of a tick [s]."""
 
 
-class Assets:
-    """Objects and lights, loaded once, and measurements of worlds with them."""
+@dataclass(frozen=True, eq=False)
+class Variant:
+    """Measurements of worlds with some settings."""
 
-    def __init__(self, config: Config, min_seconds: float) -> None:
-        self.device, self.min_seconds = pick_device(config.bake.device), min_seconds
-        self.catalog, self.lights = load_catalog(config), load_lights(config.bake.lights)
+    config: Config
+    catalog: Catalog
+    lights: tuple[EnvironmentMap, ...]
+    device: wp.Device
+    min_seconds: float
 
-    def build_scene(self, config: Config) -> RenderScene:
-        """Build the renderer's scene of these settings."""
+    @property
+    def steps(self) -> int:
+        """Steps of all worlds in a tick."""
+        return self.config.physics.steps_per_tick * self.config.bake.worlds
+
+    def build_scene(self) -> RenderScene:
+        """Renderer's scene."""
+        config = self.config
         fixtures, cameras = make_fixtures(config.tote, config.gripper), make_cameras(config.cameras)
         return build_render_scene(config.render, config.tote, self.catalog, fixtures, cameras, self.lights, self.device)
 
-    def drop(self, config: Config, scene: RenderScene) -> Pile:
-        """Drop piles, and measure ticks of their physics."""
-        simulation = Simulation(config, self.catalog, len(self.lights), self.device, scene, range(config.bake.worlds))
+    def drop(self, scene: RenderScene) -> Pile:
+        """Drop piles and time ticks of their physics."""
+        worlds = range(self.config.bake.worlds)
+        simulation = Simulation(self.config, self.catalog, len(self.lights), self.device, scene, worlds)
         simulation.scene.settle.rest_ticks = simulation.scene.settle.max_ticks = FOREVER
         tick = simulation.tick
         for _ in range(DROP_TICKS):
@@ -74,50 +83,37 @@ class Assets:
         snapshot = simulation.record.snapshot
         return Pile(snapshot, float((snapshot.catalog_index.numpy() >= 0).sum(axis=1).mean()), seconds)
 
-    def time_view(self, config: Config, scene: RenderScene, pile: Pile) -> float:
-        """Time to render a view [s], measured in full batches."""
-        cameras, sizes = len(config.cameras.positions), view_sizes(config, self.device)
-        count = min(sizes["view"], config.bake.worlds * cameras)
-        histories = config.bake.worlds * cameras
-        renderer = make_renderer(config, scene, config.arrangement.max_objects, sizes["view"], histories)
-        images, view = allocate(ViewBuffers, sizes, self.device), np.arange(count, dtype=np.int32)
-        rows = [wp.array(values, dtype=wp.int32, device=self.device) for values in (view // cameras, view % cameras)]
-        views = make_views(rows[0], rows[1], count, renderer.instances)
-        return seconds_per_call(lambda: renderer.render(pile.snapshot, views, images), self.device, self.min_seconds, BURST) / count
+    def time_view(self, scene: RenderScene, pile: Pile) -> float:
+        """Time of a view [s], in full batches."""
+        config, device, worlds = self.config, self.device, self.config.bake.worlds
+        cameras, objects = len(config.cameras.positions), config.arrangement.max_objects
+        sizes = view_sizes(config.render, config.cameras, worlds, objects, device)
+        count = min(sizes["view"], worlds * cameras)
+        renderer = make_renderer(config, scene, objects, sizes["view"], worlds * cameras)
+        images, views = allocate(ViewBuffers, sizes, device), first_views(count, cameras, objects, device)
+        return seconds_per_call(lambda: renderer.render(pile.snapshot, views, images), device, self.min_seconds, BURST) / count
 
 
-def vary_worlds(config: Config, factor: float) -> tuple[str, Config]:
-    """Settings with `factor` times as many worlds, at least as many as a GPU takes, and their label."""
-    worlds = max(1, round(factor * config.bake.worlds))
-    config = with_enough_worlds(config.with_values({"bake.worlds": worlds}), pick_device(config.bake.device))
-    return str(config.bake.worlds), config
+def vary(config: Config, factor: str, value: float) -> tuple[str, Config]:
+    """The settings with one factor changed, and its new value in words; `value` is a multiple of the old one, or the number of paths.
 
-
-def vary_objects(config: Config, factor: float) -> tuple[str, Config]:
-    """Settings with `factor` times the total volume of the objects (arrangement.volume), and their label."""
-    volume = factor * config.arrangement.volume
-    return f"{1e3 * volume:.3g} l", config.with_values({"arrangement.volume": volume})
-
-
-def vary_resolution(config: Config, factor: float) -> tuple[str, Config]:
-    """Settings with the width and height of images times `factor`, and their label."""
-    width, height = (max(1, round(factor * size)) for size in config.cameras.resolution)
-    return f"{width}x{height}", config.with_values({"cameras.resolution": (width, height)})
-
-
-def vary_paths(config: Config, paths: float) -> tuple[str, Config]:
-    """Settings with this number of paths per coarse pixel, of the low-resolution lighting pass (render.coarse_paths), and their label."""
-    return str(int(paths)), config.with_values({"render.coarse_paths": int(paths)})
-
-
-def vary_cameras(config: Config, factor: float) -> tuple[str, Config]:
-    """Settings with `factor` times as many cameras, and their label: the first ones, or all, and then these turned by 180° about the
-    vertical.
+    More cameras than there are are these again, turned by 180° about the vertical.
     """
-    cameras, present = config.cameras, len(config.cameras.positions)
-    count = max(1, round(factor * present))
-    chosen = replace(cameras, positions=_turn(cameras, "positions", count), ups=_turn(cameras, "ups", count))
-    return str(count), replace(config, cameras=chosen)
+    if factor == "worlds":
+        worlds = max(1, round(value * config.bake.worlds))
+        config = with_enough_worlds(config.with_values({"bake.worlds": worlds}), pick_device(config.bake.device))
+        return str(config.bake.worlds), config
+    if factor == "objects":
+        volume = value * config.arrangement.volume
+        return f"{1e3 * volume:.3g} l", config.with_values({"arrangement.volume": volume})
+    if factor == "resolution":
+        width, height = (max(1, round(value * size)) for size in config.cameras.resolution)
+        return f"{width}x{height}", config.with_values({"cameras.resolution": (width, height)})
+    if factor == "paths":
+        return str(int(value)), config.with_values({"render.coarse_paths": int(value)})
+    cameras = config.cameras
+    count = max(1, round(value * len(cameras.positions)))
+    return str(count), replace(config, cameras=replace(cameras, **{name: _turn(cameras, name, count) for name in ("positions", "ups")}))
 
 
 def _turn(cameras: Cameras, name: str, count: int) -> tuple[tuple[float, float, float], ...]:
@@ -129,28 +125,20 @@ def _turn(cameras: Cameras, name: str, count: int) -> tuple[tuple[float, float, 
     return tuple(((-1) ** turn * x, (-1) ** turn * y, z) for turn in range(repeats) for x, y, z in vectors)[:count]
 
 
-VARIATIONS: dict[str, Callable[[Config, float], tuple[str, Config]]] = {
-    "worlds": vary_worlds,
-    "objects": vary_objects,
-    "resolution": vary_resolution,
-    "paths": vary_paths,
-    "cameras": vary_cameras,
-}
-
-
 def measure_growth(config: Config, min_seconds: float) -> Iterator[Row]:
     """Measure the settings themselves, then each factor's values; a measurement is repeated for at least `min_seconds` [s]."""
     started = time.perf_counter()
-    assets = Assets(config, min_seconds)
-    scene = assets.build_scene(config)
-    pile = assets.drop(config, scene)
-    yield from _rows("as set", config.physics.steps_per_tick * config.bake.worlds, pile, assets.time_view(config, scene, pile))
-    for factor, vary in VARIATIONS.items():
-        for value, varied in dict(vary(config, multiple) for multiple in FRACTIONS.get(factor, PATHS)).items():
-            other = assets.build_scene(varied) if factor in ("resolution", "cameras") else scene
-            dropped = assets.drop(varied, scene) if factor in ("worlds", "objects") else None
-            view = assets.time_view(varied, other, dropped or pile)
-            yield from _rows(f"{factor} {value}", varied.physics.steps_per_tick * varied.bake.worlds, dropped, view)
+    own = Variant(config, load_catalog(config), load_lights(config.bake.lights), pick_device(config.bake.device), min_seconds)
+    scene = own.build_scene()
+    pile = own.drop(scene)
+    yield from _rows("as set", own.steps, pile, own.time_view(scene, pile))
+    for factor, values in FACTORS.items():
+        for value, changed in dict(vary(config, factor, each) for each in values).items():
+            varied = replace(own, config=changed)
+            other = varied.build_scene() if factor in ("resolution", "cameras") else scene
+            dropped = varied.drop(scene) if factor in ("worlds", "objects") else None
+            view = varied.time_view(other, dropped or pile)
+            yield from _rows(f"{factor} {value}", varied.steps, dropped, view)
     yield Row("all measurements", time.perf_counter() - started, "s")
 
 

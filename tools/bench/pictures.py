@@ -26,10 +26,10 @@ from synpick_warp.kernels.render.lighting.history import MAX_PERIOD_BITS
 from synpick_warp.stages.buffers import Snapshot
 from synpick_warp.stages.render.denoised import LIGHT_HISTORY, DenoisedRenderer
 from synpick_warp.stages.render.renderer import Renderer
-from synpick_warp.stages.stream import FrameStream, TickReader, TickReport
+from synpick_warp.stages.stream import FrameStream, TickReport, read_tick
 from synpick_warp.system.progress import SilentProgress
 from tools.bench.meter import LIVE_FRACTION
-from tools.bench.steady import plan_spare_episodes
+from tools.bench.steady import SPARE_EPISODES
 from tools.bench.stream import batch_views, select_views
 from tools.options import Row
 
@@ -86,7 +86,7 @@ def measure_pictures(config: Config, after: int = 0) -> Iterator[Row]:
         after: Ticks simulated before the histories begin; just after the drop little moves.
     """
     started = time.perf_counter()
-    config = plan_spare_episodes(config)
+    config = config.with_values({"bake.episodes": SPARE_EPISODES * config.bake.worlds})
     needs = Needs.of(config)
     factory = build_factory(config, SilentProgress(), needs_images=needs.images)
     stream, device = factory.stream, factory.simulation.device
@@ -140,9 +140,7 @@ def keep_tick(factory: Factory) -> KeptTick:
 def _tick(factory: Factory) -> TickReport:
     """Simulate a tick, and wait for its report."""
     factory.simulation.tick()
-    reader = TickReader(factory.simulation.record)
-    reader.start()
-    return reader.wait()
+    return read_tick(factory.simulation.record)
 
 
 def render_ticks(stream: FrameStream, renderer: Renderer, ticks: list[KeptTick]) -> None:
@@ -150,8 +148,8 @@ def render_ticks(stream: FrameStream, renderer: Renderer, ticks: list[KeptTick])
     slot = 0
     for tick in ticks:
         for views in tick.batches:
-            renderer.render(tick.snapshot, views, stream.buffers[slot], stream.layer_buffers[slot])
-            slot = (slot + 1) % len(stream.buffers)
+            renderer.render(tick.snapshot, views, stream.ring[slot].images, stream.ring[slot].layers)
+            slot = (slot + 1) % len(stream.ring)
 
 
 def _time_passes(stream: FrameStream, renderers: dict[str, Renderer], ticks: list[KeptTick]) -> dict[str, list[float]]:

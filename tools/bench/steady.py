@@ -26,20 +26,14 @@ SPARE_EPISODES = 16
 """Episodes planned for each world, so that none runs out of them in the measurement."""
 
 
-def plan_spare_episodes(config: Config, devices: int = 1) -> Config:
-    """Settings with SPARE_EPISODES episodes for each world of each device."""
-    episodes = SPARE_EPISODES * config.bake.worlds * devices
-    return config.with_values({"bake.episodes": episodes})
-
-
 @contextlib.contextmanager
-def clean_up_behind(config: Config, out: Path, suffixes: tuple[str, ...] = ()) -> Iterator[Cleaner]:
+def clean_up_behind(layout: DataLayout, out: Path, suffixes: tuple[str, ...] = ()) -> Iterator[Cleaner]:
     """Context manager: verify the episodes of a bake to `out` while it runs, and delete their files with these suffixes (empty: all).
 
     Raises:
         DatasetError: An episode was damaged.
     """
-    folders = tuple(map(str, shared_files(load_exporter_classes(config.bake.formats), DataLayout.of(config)).folders))
+    folders = tuple(map(str, shared_files(load_exporter_classes(layout.formats), layout).folders))
     with Cleaner(Assignment(out, folders, suffixes)) as cleaner:
         yield cleaner
         tally = cleaner.poll()
@@ -57,9 +51,10 @@ def measure_steady(config: Config, min_seconds: float, devices: Sequence[str] = 
     """
     names = pick_processes(config, devices, INT32_MAX) if devices else ()
     count = max(1, len(names))
-    config, device = plan_spare_episodes(config, count), pick_device(names[0] if names else config.bake.device)
+    config = config.with_values({"bake.episodes": SPARE_EPISODES * config.bake.worlds * count})
+    device = pick_device(names[0] if names else config.bake.device)
     live_views = LIVE_FRACTION * config.bake.worlds * len(config.cameras.positions)
-    with tempfile.TemporaryDirectory() as folder, clean_up_behind(config, Path(folder) / "out") as cleaner:
+    with tempfile.TemporaryDirectory() as folder, clean_up_behind(DataLayout.of(config), Path(folder) / "out") as cleaner:
         meter = SteadyMeter(min_seconds, Path(folder), live_views, config.bake.worlds, device, cleaner, devices=count)
         summary = run_bake(config, Path(folder) / "out", meter, devices=names)
     if len(meter.readings) > 1:

@@ -11,7 +11,6 @@ import numpy as np
 import warp as wp
 
 from synpick_warp.codes import Phase
-from synpick_warp.configs.schema import Config
 from synpick_warp.factory.assembly import Factory, Stages
 from synpick_warp.factory.episodes import BakeSummary
 from synpick_warp.online.selection import Selection
@@ -20,7 +19,7 @@ from synpick_warp.stages.buffers import Snapshot
 from synpick_warp.stages.online.batches import BatchRing, ViewBatch
 from synpick_warp.stages.render.renderer import Renderer
 from synpick_warp.stages.render.view_setup import make_views, pair_views
-from synpick_warp.stages.stream import TickReport, view_sizes
+from synpick_warp.stages.stream import TickReport
 from synpick_warp.stages.ticks import TickLoop
 from synpick_warp.system.progress import SilentProgress
 from tools.options import Row
@@ -50,28 +49,23 @@ class _UnloggedProducer(Producer):
         return
 
 
-def measure_stream(config: Config, factory: Factory, report: TickReport, min_seconds: float) -> Iterator[Row]:
+def measure_stream(factory: Factory, report: TickReport, min_seconds: float) -> Iterator[Row]:
     """Benchmark of batches of one tick, and of ticks.
 
     Args:
-        config: Settings.
         factory: Worlds in the middle of acting, and renderer.
         report: Report of the last tick, with the worlds that are rendered marked as live.
         min_seconds: Time for which a measurement is repeated, at least [s].
     """
-    device = factory.simulation.device
-    sizes, renderer, ids = view_sizes(config, device), factory.stream.renderer, factory.log.object_ids
-    stages = Stages(
-        config, factory.catalog, factory.cameras, factory.lights, factory.simulation, renderer, sizes, ids, factory.stream.lights
-    )
-    ring = BatchRing(sizes, config.render.layers, renderer, config.bop.depth_scale)
-    parts = (stages, ring, Selection().resolve(len(config.cameras.positions)), BakeSummary(), SilentProgress())
+    device, config = factory.simulation.device, factory.config
+    ring = BatchRing(factory.sizes, config.render.layers, factory.renderer, config.bop.depth_scale)
+    parts = (factory, ring, Selection().resolve(len(factory.cameras)), BakeSummary(), SilentProgress())
     yield Row("views in a batch", ring.views, "")
     still = ViewStream(_StillProducer(report, *parts))
-    sources = {"renderer alone": _render_loop(stages, ring, report), "stream of one tick": map(_consumer(device), still)}
+    sources = {"renderer alone": _render_loop(factory, ring, report), "stream of one tick": map(_consumer(device), still)}
     yield from _compare(sources, device, min_seconds)
     sources = {
-        "simulation and renderer alone": _tick_loop(stages, ring),
+        "simulation and renderer alone": _tick_loop(factory, ring),
         "stream of ticks": map(_consumer(device), ViewStream(_UnloggedProducer(*parts))),
     }
     yield from _compare(sources, device, min_seconds)

@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from synpick_warp.configs.schema import Config
+from synpick_warp.configs.splits import DataLayout
 from synpick_warp.dataset.commit.manifest import committed_episodes
 from synpick_warp.factory.pipeline import run_bake
 from synpick_warp.system.progress import SilentProgress
@@ -98,7 +99,7 @@ def measure_whole(config: Config, bake: WholeBake, steady_rate: float, traces: d
         traces: Receives the columns of `describe_trace` under the key "whole".
     """
     config = config.with_values({"bake.episodes": bake.episodes, "bake.worlds": bake.worlds})
-    with tempfile.TemporaryDirectory() as folder, clean_up_behind(config, Path(folder) / "out", PICTURES) as cleaner:
+    with tempfile.TemporaryDirectory() as folder, clean_up_behind(DataLayout.of(config), Path(folder) / "out", PICTURES) as cleaner:
         trace = _Trace(Path(folder), cleaner)
         summary = run_bake(config, Path(folder) / "out", trace)
         whole = Stretch(time.perf_counter() - trace.started, summary.views)

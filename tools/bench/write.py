@@ -13,8 +13,8 @@ from pathlib import Path
 import numpy as np
 
 from synpick_warp.codes import Ending
-from synpick_warp.configs.schema import Config
-from synpick_warp.exporters.base import ExportContext, Exporter, TaskSizes
+from synpick_warp.configs.export import ExportSettings
+from synpick_warp.exporters.base import ExportContext, Exporter
 from synpick_warp.exporters.registry import load_exporter_classes
 from synpick_warp.exporters.writing.files import PARTIAL
 from synpick_warp.exporters.writing.pool import QUEUE_DEPTH, WriterPool
@@ -55,35 +55,34 @@ class _Input:
         return ((COPIES + 1) * episode + copy).astype(np.int32)
 
 
-def measure_writing(config: Config, factory: Factory, report: TickReport, min_seconds: float) -> Iterator[Row]:
+def measure_writing(factory: Factory, report: TickReport, min_seconds: float) -> Iterator[Row]:
     """Benchmark of each format alone.
 
     Args:
-        config: Settings, with the formats.
-        factory: Worlds and renderer that provide the input.
+        factory: Worlds and renderer that provide the input; its settings name the formats.
         report: Selects the worlds whose views are written.
         min_seconds: Time of a measurement, at least [s].
     """
-    snapshot = factory.simulation.record.snapshot
+    config, snapshot = factory.config, factory.simulation.record.snapshot
     batches = [_copy(batch) for batch in factory.stream.render(snapshot, report)]
     layers = {name: np.concatenate([batch.layers[name] for batch in batches]) for name in batches[0].layers}
     names = [name for name, array in vars(batches[0]).items() if isinstance(array, np.ndarray)]
     views = FrameBatch(**{name: np.concatenate([getattr(batch, name) for batch in batches]) for name in names}, layers=layers)
-    frames = tick_batch(report, factory.log.object_ids, config.physics.step * config.physics.steps_per_tick)
+    frames = tick_batch(report, factory.object_ids, factory.tick_time)
     yield Row("objects per view", float((views.object_id >= 0).sum(axis=1).mean()), "")
     # Files are kept until the end: some file systems create files more slowly after many deletions.
     with tempfile.TemporaryDirectory() as folder:
         for name in config.bake.formats:
-            yield from _measure_format(name, config, factory, _Input(views, frames), min_seconds, Path(folder) / name)
+            yield from _measure_format(name, factory, _Input(views, frames), min_seconds, Path(folder) / name)
 
 
-def _measure_format(name: str, config: Config, factory: Factory, source: _Input, min_seconds: float, folder: Path) -> Iterator[Row]:
+def _measure_format(name: str, factory: Factory, source: _Input, min_seconds: float, folder: Path) -> Iterator[Row]:
     """Benchmark of one format for 1, 2, 4, ... processes up to one per core; finishing episodes is measured with the last count."""
     (exporter_class,) = load_exporter_classes((name,))
     cores = count_cores()
     result = _Result(0.0, {}, 0.0, 0, 0.0, 0.0, 0.0)
     for processes in sorted({1, *(2**power for power in range(1, cores.bit_length())), cores}):
-        result = _write(exporter_class, config, factory, source, processes, min_seconds, folder / str(processes))
+        result = _write(exporter_class, factory, source, processes, min_seconds, folder / str(processes))
         label = f"{name}, {processes} process{'es' if processes > 1 else ''}"
         yield Row(f"{label}: views", result.rate, "1/s")
         for part, seconds in result.cpu.items():
@@ -126,15 +125,14 @@ class _Result:
     """Size of files per view [B]."""
 
 
-def _write(
-    exporter_class: type[Exporter], config: Config, factory: Factory, source: _Input, processes: int, min_seconds: float, out: Path
-) -> _Result:
+def _write(exporter_class: type[Exporter], factory: Factory, source: _Input, processes: int, min_seconds: float, out: Path) -> _Result:
     """Write into the new folder `out` for at least `min_seconds` [s], or until episodes have `MAX_FRAMES` frames; returns the measured
     values.
     """
     (out / PARTIAL).mkdir(parents=True)
-    with WriterPool(processes, exporter_class.slot_bytes(TaskSizes.of(config))) as pool:
-        exporter = exporter_class(ExportContext(out, config, factory.catalog, factory.cameras, factory.lights, pool))
+    settings = ExportSettings.of(factory.config)
+    with WriterPool(processes, exporter_class.slot_bytes(settings)) as pool:
+        exporter = exporter_class(ExportContext(out, settings, factory.catalog, factory.cameras, factory.lights, pool))
         exporter.write_constants()
         for batch in (source.at(COPIES, 0)[0] for _ in range(-(-processes * QUEUE_DEPTH // len(source.views)))):
             exporter.write_views(batch)

@@ -28,11 +28,13 @@ from synpick_warp.scenes.fixtures import make_fixtures
 from synpick_warp.scenes.lights import load_lights
 from synpick_warp.stages.arrays import allocate
 from synpick_warp.stages.buffers import LayerBuffers, Snapshot, ViewBuffers, view_buffer_sizes
+from synpick_warp.stages.render.renderer import Renderer
 from synpick_warp.stages.render.scene import build_render_scene
-from synpick_warp.stages.render.view_setup import make_views
+from synpick_warp.stages.render.view_setup import first_views
+from synpick_warp.stages.sim.physics import with_enough_worlds
+from synpick_warp.stages.sim.simulate import Simulation
 from synpick_warp.system.hardware.device import pick_device
 from tools.options import configure, fail, make_parser, write_json
-from tools.reports.render_checks import with_mode
 from tools.reports.render_piles import next_frame, settle_piles
 
 CREEP = 1e-3
@@ -179,16 +181,18 @@ def compare_devices(config: Config, devices: list[Any], console: Console) -> lis
     """
     catalog = load_catalog(config, report=console.print)
     lights = load_lights(config.bake.lights)
-    snapshot = next_frame(settle_piles(config, catalog, len(lights), devices[0]), CREEP)
+    simulation = Simulation(with_enough_worlds(config, devices[0]), catalog, len(lights), devices[0])
+    snapshot = next_frame(settle_piles(simulation, config.bake.worlds), CREEP)
     cameras = make_cameras(config.cameras)
     fixtures = make_fixtures(config.tote, config.gripper)
     differences = []
     for mode in COLORS:
-        mode_config = with_mode(config, mode)
+        mode_config, objects = config.with_values({"render.mode": mode}), config.arrangement.max_objects
         outputs = []
         for device in devices:
             scene = build_render_scene(mode_config.render, mode_config.tote, catalog, fixtures, cameras, lights, device)
-            outputs.append(render_views(mode_config, scene, copy_snapshot(snapshot, device)))
+            renderer = make_renderer(mode_config, scene, objects, config.bake.worlds * len(cameras))
+            outputs.append(render_views(renderer, copy_snapshot(snapshot, device)))
         differences += [compare(mode, name, outputs[0][name], outputs[1][name]) for name in outputs[0]]
     return differences
 
@@ -199,15 +203,12 @@ def copy_snapshot(snapshot: Snapshot, device: Any) -> Snapshot:
     return Snapshot(**{name: wp.array(array.numpy(), dtype=array.dtype, device=device) for name, array in arrays.items()})
 
 
-def render_views(config: Config, scene: Any, snapshot: Snapshot) -> dict[str, np.ndarray]:
-    """Render all worlds by all cameras; returns all images and layers by name."""
-    worlds, cameras, device = config.bake.worlds, scene.camera_count, scene.device
-    sizes = view_buffer_sizes(worlds * cameras, scene.width, scene.height, config.arrangement.max_objects)
-    renderer = make_renderer(config, scene, config.arrangement.max_objects, worlds * cameras)
+def render_views(renderer: Renderer, snapshot: Snapshot) -> dict[str, np.ndarray]:
+    """Render all worlds by all cameras, whose views are a full batch; returns all images and layers by name."""
+    scene, device = renderer.scene, renderer.scene.device
+    sizes = view_buffer_sizes(renderer.views, scene.width, scene.height, renderer.instances)
     out, layers = allocate(ViewBuffers, sizes, device), allocate(LayerBuffers, sizes, device, LAYERS)
-    view = np.arange(worlds * cameras, dtype=np.int32)
-    world, camera = (wp.array(values, dtype=wp.int32, device=device) for values in (view // cameras, view % cameras))
-    renderer.render(snapshot, make_views(world, camera, len(view), renderer.instances), out, layers)
+    renderer.render(snapshot, first_views(renderer.views, scene.camera_count, renderer.instances, device), out, layers)
     images = {item.name: getattr(out, item.name).numpy() for item in fields(ViewBuffers)}
     return images | {name: getattr(layers, name).numpy() for name in LAYERS}
 

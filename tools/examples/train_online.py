@@ -14,6 +14,8 @@ import math
 import sys
 import time
 
+from synpick_warp.online.stream import ViewStream
+
 try:
     import torch  # pyright: ignore[reportMissingImports]
     from torch import nn  # pyright: ignore[reportMissingImports]
@@ -23,7 +25,6 @@ except ModuleNotFoundError as missing:
 
 import synpick_warp
 from synpick_warp.cli.main import parse_resolution
-from synpick_warp.configs.schema import Config
 from synpick_warp.errors import ConfigError, SynpickError
 from synpick_warp.online.dataset import FIELDS, StreamDataset
 from synpick_warp.system.hardware.device import pick_device
@@ -68,26 +69,24 @@ def _convolutions(before: int, after: int) -> nn.Sequential:
     return nn.Sequential(*itertools.chain.from_iterable(pairs))
 
 
-def hold_out(config: Config, views: int) -> tuple[list[dict[str, torch.Tensor]], int]:
-    """Copies of `views` views or a few more of episodes that nobody trains on, in batches; and the number of classes, 0 for no object."""
+def hold_out(stream: ViewStream, views: int) -> tuple[list[dict[str, torch.Tensor]], int]:
+    """Copies of `views` views or a few more of a stream, in batches; and the number of classes, 0 for no object."""
     batches, count = [], 0
-    with synpick_warp.stream(config, episodes=HELD_OUT, stride=HELD_OUT_STRIDE) as stream:
-        while count < views:
-            batch = next(stream, None)
-            if batch is None:
-                raise ConfigError(f"--held-out is {views}, but {len(HELD_OUT)} episodes have {count} views; name fewer")
-            batches.append({name: FIELDS[name](batch).clone() for name in ("rgb", "classes")})
-            count += len(batch)
-        return batches, 1 + max(stream.object_names)
+    while count < views:
+        batch = next(stream, None)
+        if batch is None:
+            raise ConfigError(f"--held-out is {views}, but {len(HELD_OUT)} episodes have {count} views; name fewer")
+        batches.append({name: FIELDS[name](batch).clone() for name in ("rgb", "classes")})
+        count += len(batch)
+    return batches, 1 + max(stream.object_names)
 
 
-def train(config: Config, views: int, stride: int, classes: int, width: int, device: torch.device) -> tuple[Network, list[float]]:
+def train(dataset: StreamDataset, views: int, classes: int, width: int, device: torch.device) -> tuple[Network, list[float]]:
     """Train a new network on at least `views` views, in whole batches; returns the network and the loss of each batch."""
-    torch.manual_seed(config.bake.seed)
+    torch.manual_seed(dataset.config.bake.seed)
     network = Network(classes, width).to(device)
     optimizer = torch.optim.AdamW(network.parameters(), LEARNING_RATE)
     losses, seen = [], 0
-    dataset = StreamDataset(config, fields=("rgb", "classes"), episodes=TRAINING, stride=stride)
     for batch in torch.utils.data.DataLoader(dataset, batch_size=None):
         done = seen / views
         factor = done / WARM_UP if done < WARM_UP else 0.5 + 0.5 * math.cos(math.pi * (done - WARM_UP) / (1 - WARM_UP))
@@ -144,11 +143,14 @@ def run(options: argparse.Namespace, device: torch.device) -> list[float]:
     results = []
     # A stream of its own: work on CUDA's default stream would wait for all that the renderer has queued.
     with torch.cuda.stream(torch.cuda.Stream(device) if device.type == "cuda" else None):
-        batches, classes = hold_out(config, options.held_out)
+        # Nobody trains on these episodes.
+        with synpick_warp.stream(config, episodes=HELD_OUT, stride=HELD_OUT_STRIDE) as stream:
+            batches, classes = hold_out(stream, options.held_out)
         print(f"held out: {sum(len(batch['rgb']) for batch in batches)} views, obj_id up to {classes - 1}")
         for views in options.views:
             started = time.perf_counter()
-            network, losses = train(config, views, options.stride, classes, options.width, device)
+            dataset = StreamDataset(config, fields=("rgb", "classes"), episodes=TRAINING, stride=options.stride)
+            network, losses = train(dataset, views, classes, options.width, device)
             seconds = time.perf_counter() - started
             results.append(mean_iou(network, batches, classes))
             tail = losses[-max(1, len(losses) // 10) :]

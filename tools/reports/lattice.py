@@ -27,12 +27,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import warp as wp
 from rich.console import Console
 
 from synpick_warp.apps.viz.preview import write_picture
 from synpick_warp.codes import Segment
-from synpick_warp.configs.schema import FAST, REFERENCE, Config, Render
+from synpick_warp.configs.schema import FAST, Config, Render
 from synpick_warp.errors import SynpickError
 from synpick_warp.factory.assembly import Stages, build_stages, make_renderer
 from synpick_warp.factory.sizes import fit_to_device
@@ -45,13 +44,14 @@ from synpick_warp.stages.arrays import allocate
 from synpick_warp.stages.buffers import FIXTURES, Snapshot
 from synpick_warp.stages.render.sampling_rates import coarse_size, shadow_size
 from synpick_warp.stages.render.scene import build_render_scene
-from synpick_warp.stages.stream import TickReader
+from synpick_warp.stages.sim.simulate import Simulation
+from synpick_warp.stages.stream import read_tick
 from synpick_warp.system.hardware.device import pick_device
 from synpick_warp.system.progress import SilentProgress
 from tools.figures import finish_report
 from tools.options import Row, configure, fail, image_resolution, make_parser, positive_count
 from tools.reports.reference_store import ReferenceStore, existing_folder
-from tools.reports.render_checks import Shot, Studio, with_mode, with_one_camera
+from tools.reports.render_checks import Shot, Studio, first_camera
 from tools.reports.render_piles import Pair
 
 MAX_FLIP = 0.05
@@ -131,10 +131,13 @@ def main(arguments: list[str] | None = None) -> int:
     rows: list[Row] = []
     try:
         fixed = {"bake.mode": options.mode, "bake.episodes": 1, "bake.worlds": 1}
-        configs = [with_one_camera(configure(options, fixed | {"cameras.resolution": list(size)})) for size in options.sizes]
+        configs = [configure(options, fixed | {"cameras.resolution": list(size)}) for size in options.sizes]
+        configs = [each.with_values(first_camera(each.cameras)) for each in configs]
         config = configs[0]
         device = pick_device(config.bake.device)
-        stages, snapshots = simulate_frames(config, options.frame, device)
+        fast = fit_to_device(config.with_values({"render.mode": FAST}), device, 1)
+        stages = build_stages(fast, device, SilentProgress(), range(1))
+        snapshots = simulate_frames(stages.simulation, options.frame)
         for size, sized in zip(options.sizes, configs, strict=True):
             for pair, periods in compare_maps(sized, stages, snapshots, options):
                 rows += describe(pair, size, periods)
@@ -148,26 +151,22 @@ def main(arguments: list[str] | None = None) -> int:
     return finish_report("tools.reports.lattice", options.json, device, "denoised frames", title, rows)
 
 
-def simulate_frames(config: Config, last: int, device: wp.Device) -> tuple[Stages, list[dict[str, np.ndarray]]]:
-    """Simulate one episode; returns its stages, and the snapshots of the frames up to `last` on the host.
+def simulate_frames(simulation: Simulation, last: int) -> list[dict[str, np.ndarray]]:
+    """Simulate one episode; returns the snapshots of the frames up to `last` on the host.
 
     Raises:
         SynpickError: The episode ends earlier.
     """
-    config = fit_to_device(with_mode(config, FAST), device, 1)
-    stages = build_stages(config, device, SilentProgress(), range(1))
     snapshots: list[dict[str, np.ndarray]] = []
     while len(snapshots) <= last:
-        stages.simulation.tick()
-        reader = TickReader(stages.simulation.record)
-        reader.start()
-        report = reader.wait()
+        simulation.tick()
+        report = read_tick(simulation.record)
         if report.column("live")[0] and report.column("frame")[0] == len(snapshots):
-            snapshot = stages.simulation.record.snapshot
+            snapshot = simulation.record.snapshot
             snapshots.append({item.name: getattr(snapshot, item.name).numpy()[:1].copy() for item in fields(Snapshot)})
         elif snapshots:
             raise SynpickError(f"the episode has only {len(snapshots)} frames; name an earlier one than --frame {last}")
-    return stages, snapshots
+    return snapshots
 
 
 def compare_maps(
@@ -188,10 +187,8 @@ def compare_maps(
     scene = build_render_scene(config.render, config.tote, stages.catalog, fixtures, make_cameras(config.cameras), stages.lights, device)
     width, height = config.cameras.resolution
     samples = min(MAX_SAMPLES, max(2, 1 << int(math.log2(options.paths / (width * height)))))
-    half = config.with_values({"render.samples": samples // 2})
-    store = ReferenceStore(options.cache, half)
-    denoised = Studio(make_renderer(with_mode(config, FAST), scene, room, 1, 1))
-    references = [Studio(make_renderer(with_mode(half, REFERENCE, seed=config.bake.seed + each), scene, room, 1)) for each in (0, 1)]
+    store = ReferenceStore(options.cache, config.with_values({"render.samples": samples}), scene)
+    denoised = Studio(make_renderer(config.with_values({"render.mode": FAST}), scene, room, 1, 1))
     sizes = {"world": 1, "instance": room, "fixture": len(FIXTURES)}
     state = allocate(Snapshot, sizes, device)
     for index, map_ in enumerate(stages.lights):
@@ -205,7 +202,7 @@ def compare_maps(
                 getattr(state, name).assign(values)
             state.light.fill_(index)
             shots.append(denoised.render(state, 0, 0))
-        first, second = store.get(state, 0, lambda: (references[0].render(state, 0, 0), references[1].render(state, 0, 0)))
+        first, second = store.get(state, 0)
         yield Pair(map_.name, shots[-1], first, float(shots[-1].radiance.mean()), second), lattice_periods(config.render, width)
 
 

@@ -5,15 +5,16 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import hashlib
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from synpick_warp.configs.schema import Config
+from synpick_warp.configs.schema import REFERENCE, Config
+from synpick_warp.factory.assembly import make_renderer
 from synpick_warp.stages.buffers import Snapshot
-from tools.reports.render_checks import Shot
+from synpick_warp.stages.render.scene import RenderScene
+from tools.reports.render_checks import Shot, Studio
 
 DENOISER_SETTINGS = ("coarse_pixel", "coarse_paths", "history", "mode")
 """Settings of section `render` that do not affect references, and are left out of the cache key."""
@@ -30,37 +31,35 @@ def existing_folder(text: str) -> Path:
 
 
 class ReferenceStore:
-    """Cache of pairs of references, one file per pair. The key is a hash of the settings and of the world's state.
+    """Pairs of references with half of the paths each, cached in one file per pair. The key is a hash of settings and of the world's state.
 
     The key does not cover the code: clear the folder after a change of the reference renderer.
     """
 
-    def __init__(self, folder: Path | None, config: Config) -> None:
+    def __init__(self, folder: Path | None, config: Config, scene: RenderScene) -> None:
         """
         Args:
             folder: Folder of the files; None: no caching.
             config: Settings of the references, including the number of paths.
+            scene: Scene of the references.
         """
         self._folder = folder
+        half, room = {"render.mode": REFERENCE, "render.samples": max(1, config.render.samples // 2)}, config.arrangement.max_objects
+        both = (config.with_values(half | {"bake.seed": config.bake.seed + offset}) for offset in (0, 1))
+        self._studios = [Studio(make_renderer(each, scene, room, 1)) for each in both]
         content: dict[str, Any] = dataclasses.asdict(config)
         for name in DENOISER_SETTINGS:
             del content["render"][name]
         self._settings = repr(content).encode()
 
-    def get(self, snapshot: Snapshot, world: int, render: Callable[[], tuple[Shot, Shot]]) -> tuple[Shot, Shot]:
-        """Return the references of a world, from the cache or else from the renderer.
-
-        Args:
-            snapshot: State of the worlds.
-            world: Index of the world.
-            render: Renders both references on a cache miss.
-        """
-        if self._folder is None:
-            return render()
-        path = self._folder / f"{self._digest(snapshot, world)}.npz"
-        if path.exists():
+    def get(self, snapshot: Snapshot, world: int) -> list[Shot]:
+        """Return the references of a world by camera 0, from the cache or else from the renderer."""
+        path = None if self._folder is None else self._folder / f"{self._digest(snapshot, world)}.npz"
+        if path is not None and path.exists():
             return _read(path)
-        shots = render()
+        shots = [studio.render(snapshot, world, 0) for studio in self._studios]
+        if path is None:
+            return shots
         arrays = {f"{name}{index}": getattr(shot, name) for index, shot in enumerate(shots) for name in _ARRAYS}
         part = path.with_suffix(".part.npz")
         np.savez(part, **arrays)
@@ -75,8 +74,7 @@ class ReferenceStore:
         return state.hexdigest()
 
 
-def _read(path: Path) -> tuple[Shot, Shot]:
+def _read(path: Path) -> list[Shot]:
     """Two reference renderings from a file; their times are not kept (0)."""
     with np.load(path) as content:
-        first, second = (Shot(*(content[f"{name}{index}"] for name in _ARRAYS), seconds=0.0) for index in (0, 1))
-    return first, second
+        return [Shot(*(content[f"{name}{index}"] for name in _ARRAYS), seconds=0.0) for index in (0, 1)]

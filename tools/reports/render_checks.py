@@ -10,7 +10,7 @@ import numpy as np
 import trimesh
 import warp as wp
 
-from synpick_warp.configs.schema import FAST, REFERENCE, Config
+from synpick_warp.configs.schema import FAST, REFERENCE, Cameras, Config
 from synpick_warp.factory.assembly import make_renderer
 from synpick_warp.scenes.cameras import make_cameras
 from synpick_warp.scenes.environment import map_directions
@@ -79,15 +79,9 @@ def bounded_row(name: str, value: float, unit: str, bound: float) -> Row:
     return Row(name, value, unit, f"within {bound:g}", bool(abs(value) < bound))
 
 
-def with_mode(config: Config, mode: str, **bake: object) -> Config:
-    """Copy of the settings with another rendering mode, and other values of the section bake."""
-    return config.with_values({"render.mode": mode, **{f"bake.{name}": value for name, value in bake.items()}})
-
-
-def with_one_camera(config: Config) -> Config:
-    """Copy of the settings with the first camera alone."""
-    cameras = config.cameras
-    return config.with_values({"cameras.positions": cameras.positions[:1], "cameras.ups": cameras.ups[:1]})
+def first_camera(cameras: Cameras) -> dict[str, object]:
+    """Settings of the first camera alone."""
+    return {"cameras.positions": cameras.positions[:1], "cameras.ups": cameras.ups[:1]}
 
 
 def measure_furnaces(config: Config, device: Any) -> list[Row]:
@@ -102,7 +96,7 @@ def measure_furnaces(config: Config, device: Any) -> list[Row]:
     )
     rows = []
     for mode in (REFERENCE, FAST):
-        studio = _probe_studio(with_mode(config, mode), mesh, surfaces, make_cameras(above), _uniform_light(), device)
+        studio = _probe_studio(config, mode, mesh, surfaces, make_cameras(above), _uniform_light(), device)
         snapshot = _probe_snapshot(config.arrangement.max_objects, len(surfaces), device)
         for world, (metallic, roughness) in enumerate(surfaces):
             shot = studio.render(snapshot, world, 0)
@@ -137,7 +131,7 @@ def measure_planes(config: Config, device: Any) -> list[Row]:
     rows = []
     for height in LAMP_HEIGHTS:
         cosine = float(np.sin(np.radians(height)))
-        studio = _probe_studio(with_mode(config, REFERENCE), mesh, [(0.0, 1.0)], make_cameras(around), _lamp_light(cosine), device)
+        studio = _probe_studio(config, REFERENCE, mesh, [(0.0, 1.0)], make_cameras(around), _lamp_light(cosine), device)
         snapshot = _probe_snapshot(config.arrangement.max_objects, 1, device)
         radiance = [float(studio.render(snapshot, 0, camera).radiance.mean()) for camera in range(len(positions))]
         error = 100.0 * (float(node_weights @ radiance) / (np.sin(LAMP_RADIUS) ** 2 * cosine) - 1.0)
@@ -159,10 +153,16 @@ def _lamp_light(cosine: float) -> EnvironmentMap:
 
 
 def _probe_studio(
-    config: Config, mesh: TriangleMesh, surfaces: list[tuple[float, float]], cameras: tuple[Camera, ...], light: EnvironmentMap, device: Any
+    config: Config,
+    mode: str,
+    mesh: TriangleMesh,
+    surfaces: list[tuple[float, float]],
+    cameras: tuple[Camera, ...],
+    light: EnvironmentMap,
+    device: Any,
 ) -> Studio:
     """Studio of a white mesh alone, with one catalog entry per surface (metallic, roughness)."""
-    config = config.with_values({"render.table": False})
+    config = config.with_values({"render.table": False, "render.mode": mode})
     white = [Material((1.0, 1.0, 1.0), None, metallic, roughness) for metallic, roughness in surfaces]
     # Volume, radius, mass and diameter do not affect rendering.
     entries = tuple(

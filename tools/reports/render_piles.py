@@ -16,12 +16,11 @@ from synpick_warp.errors import SynpickError
 from synpick_warp.scenes.cameras import make_cameras
 from synpick_warp.scenes.catalog import load_catalog
 from synpick_warp.scenes.lights import load_lights
-from synpick_warp.scenes.types import Catalog
 from synpick_warp.stages.buffers import Snapshot
 from synpick_warp.stages.sim.physics import with_enough_worlds
 from synpick_warp.stages.sim.simulate import Simulation
 from tools.options import Row
-from tools.reports.render_checks import Shot, Studio, bounded_row, make_studio, with_mode
+from tools.reports.render_checks import Shot, Studio, bounded_row, make_studio
 
 MIN_PSNR = 32.0
 """Bound of the mean PSNR of denoised images against references [dB]."""
@@ -80,12 +79,12 @@ def compare_piles(
     """
     catalog = load_catalog(config, report=report)
     lights = load_lights(config.bake.lights)
-    snapshot = settle_piles(config, catalog, len(lights), device)
+    snapshot = settle_piles(Simulation(with_enough_worlds(config, device), catalog, len(lights), device), config.bake.worlds)
     cameras = make_cameras(config.cameras)[:1]
-    configs = [with_mode(config, FAST), with_mode(config, REFERENCE)]
+    values: list[dict[str, object]] = [{"render.mode": FAST}, {"render.mode": REFERENCE}]
     if noise:
-        configs.append(with_mode(config, REFERENCE, seed=config.bake.seed + 1))
-    denoised, reference, *second = (make_studio(each, catalog, cameras, lights, device) for each in configs)
+        values.append({"render.mode": REFERENCE, "bake.seed": config.bake.seed + 1})
+    denoised, reference, *second = (make_studio(config.with_values(each), catalog, cameras, lights, device) for each in values)
     piles = config.bake.worlds
     rows, pairs, static, displaced = [], [], [], []
     for index in range(max(piles, len(lights)) if every_light else piles):
@@ -153,15 +152,13 @@ def mean_difference(a: Shot, b: Shot) -> float:
     return float(np.abs(a.color.astype(np.int16) - b.color).mean())
 
 
-def settle_piles(config: Config, catalog: Catalog, lights: int, device: Any) -> Snapshot:
-    """Simulate piles until rest, one a world; returns each in the tick in which it begins to act. World w has light map w % `lights`.
+def settle_piles(simulation: Simulation, count: int) -> Snapshot:
+    """Simulate `count` piles until rest, one a world; returns each in the tick in which it begins to act. World w has light map w % their
+    number.
 
     Raises:
         SynpickError: A pile does not come to rest.
     """
-    count = config.bake.worlds
-    config = with_enough_worlds(config, device)
-    simulation = Simulation(config, catalog, lights, device)
     record = simulation.record
     piles: dict[int, dict[str, np.ndarray]] = {}
     for _ in range(MAX_TICKS):
@@ -178,7 +175,7 @@ def settle_piles(config: Config, catalog: Catalog, lights: int, device: Any) -> 
         for world, pile in piles.items():
             rows[world] = pile[item.name]
         getattr(record.snapshot, item.name).assign(rows)
-    record.snapshot.light.assign(np.arange(config.bake.worlds, dtype=np.int32) % lights)
+    record.snapshot.light.assign(np.arange(simulation.layout.worlds, dtype=np.int32) % simulation.scene.drop.lights)
     return record.snapshot
 
 

@@ -156,7 +156,7 @@ def _finish_episodes(simulation: Simulation, worlds: np.ndarray) -> None:
 def _measure(simulation: Simulation, catalog: Catalog, before: TickReport, now: TickReport, worlds: np.ndarray) -> list[Pile]:
     """Measure the piles of `worlds` at the end of the tick `now`; `before` is the report of the tick before."""
     state, layout = simulation.state, simulation.layout
-    tick = simulation.config.physics.step * simulation.config.physics.steps_per_tick
+    tick = simulation.config.physics.tick_time
     progress, slots = state.progress.numpy(), state.body_slot.numpy()
     body_qd = simulation.physics.state.body_qd
     assert body_qd is not None  # Models with rigid bodies have it.

@@ -15,27 +15,25 @@ from __future__ import annotations
 import argparse
 import sys
 import time
-from collections.abc import Iterator, Sequence
-from functools import partial
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 from rich.console import Console
 
 from synpick_warp.codes import Phase
-from synpick_warp.configs.schema import FAST, REFERENCE, Config
+from synpick_warp.configs.schema import FAST, Config
 from synpick_warp.errors import SynpickError
-from synpick_warp.factory.assembly import build_stages, make_renderer
-from synpick_warp.factory.memory_plan import check_memory, explain_shortage
+from synpick_warp.factory.assembly import build_stages
+from synpick_warp.factory.memory_plan import check_memory, explain_shortage, plan_memory
 from synpick_warp.factory.sizes import fit_to_device
-from synpick_warp.stages.buffers import Snapshot
-from synpick_warp.stages.stream import TickReader
+from synpick_warp.stages.stream import read_tick
 from synpick_warp.system.hardware.device import pick_device
 from synpick_warp.system.progress import SilentProgress
 from tools.figures import finish_report
 from tools.options import Row, configure, fail, make_parser, positive_count, writable_file
 from tools.reports.reference_store import ReferenceStore, existing_folder
-from tools.reports.render_checks import Shot, Studio, bounded_row, with_mode, with_one_camera
+from tools.reports.render_checks import Studio, bounded_row, first_camera
 from tools.reports.render_piles import MAX_BIAS, Pair
 from tools.reports.render_sheet import write_sheets
 
@@ -73,7 +71,8 @@ def main(arguments: list[str] | None = None) -> int:
     missing = set(options.frames)
     try:
         worlds = {"bake.episodes": options.episodes, "bake.worlds": options.episodes}
-        config = with_one_camera(configure(options, worlds | {"bake.mode": options.mode, "render.samples": options.samples}))
+        config = configure(options, worlds | {"bake.mode": options.mode, "render.samples": options.samples})
+        config = config.with_values(first_camera(config.cameras))
         device = pick_device(config.bake.device)
         for frame, pair in compare_frames(config, options.frames, options.references):
             pairs.append(pair)
@@ -103,41 +102,27 @@ def compare_frames(config: Config, frames: tuple[int, ...], cache: Path | None =
         frames: Indices of frames.
         cache: Folder in which references are cached; None: no caching.
     """
-    store = ReferenceStore(cache, config)
     device = pick_device(config.bake.device)
-    config = fit_to_device(with_mode(config, FAST), device, config.bake.episodes)
-    check_memory(config, device)
-    with explain_shortage(config):
-        stages = build_stages(config, device, SilentProgress(), range(config.bake.episodes))
-    denoised = Studio(stages.renderer)
-    room, half = config.arrangement.max_objects, config.with_values({"render.samples": max(1, config.render.samples // 2)})
-    references = [
-        Studio(make_renderer(with_mode(half, REFERENCE, seed=config.bake.seed + offset), stages.renderer.scene, room, 1))
-        for offset in (0, 1)
-    ]
+    fitted = fit_to_device(config.with_values({"render.mode": FAST}), device, config.bake.episodes)
+    check_memory(plan_memory(fitted, device), device)
+    with explain_shortage(fitted):
+        stages = build_stages(fitted, device, SilentProgress(), range(config.bake.episodes))
+    denoised, store = Studio(stages.renderer), ReferenceStore(cache, config, stages.renderer.scene)
     simulation, names = stages.simulation, stages.light_table.name
     while True:
         simulation.tick()
-        reader = TickReader(simulation.record)
-        reader.start()
-        report = reader.wait()
+        report = read_tick(simulation.record)
         snapshot, shown = simulation.record.snapshot, report.column("frame")
         for world in np.flatnonzero(report.column("live")).tolist():
             if shown[world] <= max(frames):
                 shot = denoised.render(snapshot, world, 0)
                 if shown[world] in frames:
                     light = str(names[int(snapshot.light.numpy()[world])])
-                    first, second = store.get(snapshot, world, partial(_render_both, references, snapshot, world))
+                    first, second = store.get(snapshot, world)
                     yield int(shown[world]), Pair(light, shot, first, float(shot.radiance.mean()), second)
         phase = report.column("phase")
         if ((phase == Phase.IDLE) | ((phase == Phase.ACT) & (shown >= max(frames)))).all():
             return
-
-
-def _render_both(references: Sequence[Studio], snapshot: Snapshot, world: int) -> tuple[Shot, Shot]:
-    """Render a world by two references with different samples."""
-    first, second = (each.render(snapshot, world, 0) for each in references)
-    return first, second
 
 
 def _summarize(pairs: list[Pair]) -> list[Row]:

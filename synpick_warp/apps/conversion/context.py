@@ -6,7 +6,7 @@ from functools import cached_property
 from pathlib import Path
 
 from synpick_warp.apps.conversion.source import Source
-from synpick_warp.configs.schema import Config
+from synpick_warp.configs.export import ExportSettings
 from synpick_warp.dataset.object_names import object_names
 from synpick_warp.errors import DatasetError
 from synpick_warp.exporters.base import ExportContext
@@ -17,17 +17,17 @@ from synpick_warp.scenes.types import Catalog, EnvironmentMap
 class StoredContext(ExportContext):
     """Context of the exporters that write a converted data set."""
 
-    def __init__(self, source: Source, out: Path, config: Config, pool: WriterPool) -> None:
+    def __init__(self, source: Source, out: Path, settings: ExportSettings, pool: WriterPool) -> None:
         """
         Args:
             source: The data set that is converted.
             out: See `ExportContext`.
-            config: Settings of the converted data set.
+            settings: Settings of the converted data set.
             pool: See `ExportContext`.
         """
         from synpick_warp.scenes.cameras import make_cameras
 
-        super().__init__(out, config, Catalog(()), make_cameras(config.cameras), (), pool)
+        super().__init__(out, settings, Catalog(()), make_cameras(settings.cameras), (), pool)
         self._source = source
 
     @cached_property
@@ -64,7 +64,8 @@ class StoredContext(ExportContext):
         if data.has_store:
             found = {item.object_id: item.name for item in data.objects}
         else:
-            known = object_names(self._source.folder, self._source.config, set(data.models_info))
+            config, found = self._source.config, set(data.models_info)
+            known = object_names(self._source.folder, found, config.object_rows, config.objects.diameter_tolerance)
             found = {index: known.get(index, f"obj_{index:06d}") for index in data.models_info}
         return dict(sorted(found.items()))
 

@@ -15,6 +15,7 @@ from pathlib import Path
 
 from synpick_warp.apps.conversion.scenes import StoredSceneFiles, StoredViewFiles, find_runs
 from synpick_warp.codes import Ending
+from synpick_warp.configs.export import ExportSettings
 from synpick_warp.configs.load import load_config
 from synpick_warp.configs.schema import Config
 from synpick_warp.dataset.bop.layout import TARGETS
@@ -112,8 +113,8 @@ class FoundSceneFiles(StoredSceneFiles):
 class _Context(ExportContext):
     """Context of the exporters: names from models, or else numbers; models are copied."""
 
-    def __init__(self, data: DataSet, out: Path, config: Config, pool: WriterPool) -> None:
-        super().__init__(out, config, Catalog(()), make_cameras(config.cameras), (), pool)
+    def __init__(self, data: DataSet, out: Path, settings: ExportSettings, pool: WriterPool) -> None:
+        super().__init__(out, settings, Catalog(()), make_cameras(settings.cameras), (), pool)
         self._data = data
 
     @property
@@ -126,7 +127,7 @@ class _Context(ExportContext):
         """Names by obj_id of all objects in views, from the models folder; "obj_NNNNNN" where there is none. Cached."""
         found = {int(index) for view in self._data.views() for index in view.object_ids}
         folder = self._data.folder
-        named = object_names(folder, None, found) if (folder / models_folder(folder) / "models_info.json").is_file() else {}
+        named = object_names(folder, found) if (folder / models_folder(folder) / "models_info.json").is_file() else {}
         return {index: named.get(index, f"obj_{index:06d}") for index in sorted(found)}
 
     def copy_constants(self, names: tuple[Path, ...]) -> bool:
@@ -172,14 +173,14 @@ def convert_found(data: DataSet, out: Path, formats: Sequence[str], processes: i
     check_output_folder(out)
     if out.is_dir() and any(out.iterdir()):
         raise ConfigError(f"--out is {out}, which is not empty; name a new folder: data sets that no bake wrote are converted as a whole")
-    config = _make_config(data, first, formats)
+    settings = ExportSettings.of(_make_config(data, first, formats))
     try:
         make_folder(out.parent)
         work = Path(tempfile.mkdtemp(prefix=f".{out.name}.", dir=out.parent))
     except OSError as error:
         raise output_error(out, error) from error
     try:
-        count = _write(data, work, config, processes, report)
+        count = _write(data, work, settings, processes, report)
         work.chmod(0o755)
         work.rename(out)
     except OSError as error:
@@ -242,9 +243,9 @@ def _make_config(data: DataSet, first: SceneFiles, formats: Sequence[str]) -> Co
     )
 
 
-def _write(data: DataSet, work: Path, config: Config, processes: int, report: Report) -> int:
+def _write(data: DataSet, work: Path, settings: ExportSettings, processes: int, report: Report) -> int:
     """Write a data set into a new folder; returns the number of scenes."""
-    classes = load_exporter_classes(config.bake.formats)
+    classes = load_exporter_classes(settings.bake.formats)
     scenes = [data.scene_id(index, 0) for index in data]
     done: list[int] = []
 
@@ -254,23 +255,26 @@ def _write(data: DataSet, work: Path, config: Config, processes: int, report: Re
 
     (work / PARTIAL).mkdir()
     with WriterPool(processes or count_cores(), 0) as pool:
-        exporters = Exporters(classes, _Context(data, work, config, pool))
+        context = _Context(data, work, settings, pool)
+        exporters = Exporters(classes, context)
         exporters.write_constants()
         for episode, scene in zip(data.values(), scenes, strict=True):
             images = tuple(episode.image_ids)
             files = data.scene_files(episode.index, 0)
-            suffix = f".{config.bop.color_format}"
-            exporters.write_stored(scene, [FoundSceneFiles(files, scene, images, suffix, config.cameras.resolution)])
+            suffix = f".{settings.bop.color_format}"
+            exporters.write_stored(scene, [FoundSceneFiles(files, scene, images, suffix, settings.cameras.resolution)])
             end = EpisodeEnd(scene, 0, len(images), int(Ending.FINISHED), image_ids=images)
             exporters.end_episode(end, lambda scene=scene: commit(scene))
         pool.wait()
         exporters.close()
-        finalize(classes, work, config, pool, sorted(done))
+        finalize(classes, work, settings, pool, sorted(done))
     shutil.rmtree(work / PARTIAL)
     for name in _BAKED:
         (work / name).unlink(missing_ok=True)
     listing = _found(data).layout.listing
-    for name in sorted(name for name in listing.files if name == CAMERA_FILE or ("bop" in config.bake.formats and TARGETS.fullmatch(name))):
+    for name in sorted(
+        name for name in listing.files if name == CAMERA_FILE or ("bop" in settings.bake.formats and TARGETS.fullmatch(name))
+    ):
         (work / name).write_bytes(listing.read(name, MAX_IMAGE_FILE))
     text = f"Converted by synpick-warp from the BOP data set {data.folder.resolve().name}: {len(scenes):,} scenes with their own ids.\n"
     write_atomically(work / NOTES_FILE, text.encode())

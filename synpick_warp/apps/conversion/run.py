@@ -11,6 +11,7 @@ from synpick_warp.apps.conversion.context import StoredContext
 from synpick_warp.apps.conversion.found import convert_found
 from synpick_warp.apps.conversion.source import Source
 from synpick_warp.codes import Ending
+from synpick_warp.configs.export import ExportSettings
 from synpick_warp.configs.schema import CLASSIC
 from synpick_warp.dataset.commit.writing import OutputFolder, finalize_data_set
 from synpick_warp.dataset.reading import open_data_set
@@ -69,12 +70,13 @@ def convert(folder: Path, out: Path, formats: Sequence[str], processes: int, rep
         if output.is_finished:
             return Converted(resumed, resumed)
         with WriterPool(processes or count_cores(), 0, output.lock) as pool:
-            exporters = Exporters(classes, StoredContext(source, out, config, pool))
+            settings = ExportSettings.of(config)
+            exporters = Exporters(classes, StoredContext(source, out, settings, pool))
             output.prepare(exporters, source.inputs, pool)
             _convert_episodes(source, output, exporters, pool, contents, report)
             pool.wait()
             exporters.close()
-            finalize_data_set(out, config, classes, pool)
+            finalize_data_set(out, settings, classes, pool)
     return Converted(len(source.episodes), resumed)
 
 

@@ -119,7 +119,7 @@ def take_samples(data_set: DataSet, statistics: Statistics, episodes: Episodes, 
     asked["frames"] = len(views)
     for done, view in enumerate(views):
         report("frames", done, len(views))
-        scale = None if data_set.found else tote_scale(data_set.config, [view.records.camera])
+        scale = None if data_set.found else tote_scale(data_set.config.tote, [view.records.camera])
         data["frames"] += _present(make_frame(view, content, names, episodes.rows[view.episode].mode, album, scale))
     chosen = choose_episodes(episodes)
     asked["strips"] = len(chosen)

@@ -24,7 +24,7 @@ from synpick_warp.apps.viz.explain_record import (
     suction_kind,
 )
 from synpick_warp.codes import Outcome
-from synpick_warp.configs.schema import Config
+from synpick_warp.configs.manipulation import Suction
 from synpick_warp.dataset.commit.manifest import episode_entry
 from synpick_warp.dataset.reading import DataSet
 from synpick_warp.dataset.view import View
@@ -88,10 +88,10 @@ def make_attempt(data_set: DataSet, found: Found, content: Content, names: Mappi
         "frame": attempt.frame,
         "picture": places[0],
         "size": [picture.shape[1], picture.shape[0]],
-        "words": [*choice_words(attempt, names, config), *seal_words(attempt, names, config)],
+        "words": [*choice_words(attempt, names, config.target), *seal_words(attempt, names, config.suction)],
         "objects": _objects(attempt, names),
         "graph": _graph(attempt, config.perception.min_votes),
-        "force": _force(attempt, config),
+        "force": _force(attempt, config.suction, config.physics.tick_time),
     }
 
 
@@ -145,13 +145,12 @@ def _graph(attempt: Attempt, min_votes: float) -> dict[str, Any] | None:
     return {"size": list(GRAPH_SIZE), "nodes": nodes, "edges": curves, "kept": KEPT}
 
 
-def _force(attempt: Attempt, config: Config) -> dict[str, Any] | None:
+def _force(attempt: Attempt, suction: Suction, tick_time: float) -> dict[str, Any] | None:
     """Seal force over time [s, N], and the force at which the seal breaks; None: nothing was engaged."""
     if not attempt.peak_force or not attempt.hits:
         return None
-    tick = config.physics.step * config.physics.steps_per_tick
-    values = [{"time": round(tick * number, 4), "force": round(force, 3)} for number, force in enumerate(attempt.peak_force)]
-    return {"values": values, "limit": break_force(attempt, config)}
+    values = [{"time": round(tick_time * number, 4), "force": round(force, 3)} for number, force in enumerate(attempt.peak_force)]
+    return {"values": values, "limit": break_force(attempt, suction)}
 
 
 def _color(instance: int) -> str:

@@ -14,6 +14,7 @@ from synpick_warp.apps.statistics.depth import Depth
 from synpick_warp.apps.statistics.lights import Lights
 from synpick_warp.apps.statistics.paper import Comparison, compare
 from synpick_warp.apps.statistics.timeline import TimePoint
+from synpick_warp.configs.schema import Config
 from synpick_warp.configs.splits import split_kind
 from synpick_warp.dataset.object_names import object_names
 from synpick_warp.dataset.reading import DataSet
@@ -148,7 +149,8 @@ def _objects(data_set: DataSet, collected: Collected, total: Annotations) -> tup
     object_ids = sorted(known | set(total.objects))
     names: dict[int, str] = {}
     if known:
-        names = object_names(data_set.folder, None if data_set.found else data_set.config, set(object_ids))
+        config = Config() if data_set.found else data_set.config
+        names = object_names(data_set.folder, set(object_ids), config.object_rows, config.objects.diameter_tolerance)
     elif data_set.has_store:
         names = {each.object_id: each.name for each in data_set.objects}
     return tuple(

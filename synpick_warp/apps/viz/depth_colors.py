@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 
 from synpick_warp.apps.viz.drawing import Image
-from synpick_warp.configs.schema import Config, Tote
+from synpick_warp.configs.schema import Tote
 
 _RANGE = (1.0, 99.0)
 """Percentiles of the depths that map to the first and the last colour, where no tote gives the range."""
@@ -27,11 +27,11 @@ class DepthScale(NamedTuple):
     far: float
 
 
-def tote_scale(config: Config, cameras: Iterable[Mapping[str, Any]]) -> DepthScale | None:
+def tote_scale(tote: Tote, cameras: Iterable[Mapping[str, Any]]) -> DepthScale | None:
     """Depths from the nearest corner of the tote's rim to the farthest of its floor, over some cameras; None: a camera has no pose.
 
     Args:
-        config: Settings of the bake, for the tote's size.
+        tote: Settings of the tote.
         cameras: Records of scene_camera.json; their world is the tote's frame: origin in the middle of the inner floor, z up.
     """
     depths = []
@@ -39,7 +39,7 @@ def tote_scale(config: Config, cameras: Iterable[Mapping[str, Any]]) -> DepthSca
         if "cam_R_w2c" not in camera or "cam_t_w2c" not in camera:
             return None
         axis, offset = np.array(camera["cam_R_w2c"][6:9], float), float(camera["cam_t_w2c"][2])
-        depths.append(_corners(config.tote) @ axis * MM + offset)
+        depths.append(_corners(tote) @ axis * MM + offset)
     if not depths:
         return None
     near, far = float(np.min(depths)), float(np.max(depths))

@@ -17,14 +17,13 @@ from synpick_warp.apps.viz.explain_graph import CYCLIC, GREY, OUTVOTED, RED, clu
 from synpick_warp.apps.viz.explain_panels import GREEN, LINE, PLOT_HEIGHT, SMALL, SOFT, TEXT, WORDS_WIDTH, draw_words, load_chart
 from synpick_warp.apps.viz.explain_record import MODE_WORDS, Attempt, choose_attempts, labels, read_attempts
 from synpick_warp.configs.load import load_config
-from synpick_warp.configs.schema import Config
 from synpick_warp.configs.splits import DataLayout
 from synpick_warp.dataset.annotations import SCENE_SCHEMAS, read_checked
 from synpick_warp.dataset.object_names import object_names
 from synpick_warp.dataset.records import Pixel
 from synpick_warp.dataset.view_files import read_image
 from synpick_warp.errors import DatasetError
-from synpick_warp.system.codecs.charts import Spec, render_charts
+from synpick_warp.system.codecs.charts import render_charts
 from synpick_warp.system.inputs.paths import path_inside
 
 DEFAULT_ATTEMPTS = 3
@@ -80,18 +79,22 @@ def write_explanation(dataset: Path, out: Path, episode: int | None, attempt: in
     if not path.exists():
         raise DatasetError(f"{dataset} has no config.toml; the settings of the bake are needed to explain what it did")
     config = load_config(str(path), {})
-    names = object_names(dataset, config, {one.object_id for each in attempts for one in each.seen})
-    rows = [_row(each, _read_scene(dataset, config, each), names, config) for each in attempts]
-    plots = render_charts([plot for _, plot in rows], scale=1.0)
-    for (sheet, _), data in zip(rows, plots, strict=True):
+    seen = {one.object_id for each in attempts for one in each.seen}
+    names = object_names(dataset, seen, config.object_rows, config.objects.diameter_tolerance)
+    layout, suction, tick_time = DataLayout.of(config), config.suction, config.physics.tick_time
+    rows = []
+    for each in attempts:
+        scene = _read_scene(dataset, layout, config.cameras.resolution, each)
+        rows.append(_row(each, scene, draw_words(each, names, config.target, suction), config.perception.min_votes))
+    charts = [load_chart(each, suction, tick_time, IMAGE_WIDTH, room) for each, (_, room) in zip(attempts, rows, strict=True)]
+    for (sheet, _), data in zip(rows, render_charts(charts, scale=1.0), strict=True):
         plot = np.asarray(cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR))
         _paste(sheet, plot, MARGIN, len(sheet) - MARGIN - len(plot))
     return write_picture(out, np.concatenate([sheet for sheet, _ in rows]))
 
 
-def _read_scene(dataset: Path, config: Config, attempt: Attempt) -> _Scene:
+def _read_scene(dataset: Path, layout: DataLayout, resolution: tuple[int, int], attempt: Attempt) -> _Scene:
     """Read colour image, visible masks and ground truth of the attempt's frame by camera 0; raises DatasetError."""
-    layout = DataLayout.of(config)
     split = path_inside(dataset, layout.folder(attempt.episode), dataset / "config.toml", DatasetError)
     index, suffix = layout.scene(attempt.episode, 0)
     scene = split / f"{index:06d}"
@@ -99,7 +102,7 @@ def _read_scene(dataset: Path, config: Config, attempt: Attempt) -> _Scene:
     truth = read_checked(scene / f"scene_gt{suffix}.json", SCENE_SCHEMAS["gt"]).get(attempt.frame)
     if truth is None:
         raise DatasetError(f"{scene}/scene_gt{suffix}.json has no image {attempt.frame}, which {dataset}/attempts.jsonl names")
-    color = read_image(scene / f"rgb{suffix}", stem, cv2.IMREAD_COLOR, config.cameras.resolution)
+    color = read_image(scene / f"rgb{suffix}", stem, cv2.IMREAD_COLOR, resolution)
     masks = None
     folder = scene / f"mask_visib{suffix}"
     if folder.is_dir():
@@ -132,12 +135,10 @@ def image_scale(size: tuple[int, int]) -> float:
     return min(IMAGE_WIDTH / size[0], _MAX_IMAGE_HEIGHT / size[1])
 
 
-def _row(attempt: Attempt, scene: _Scene, names: Mapping[int, str], config: Config) -> tuple[Image, Spec]:
-    """Draw one attempt: (picture of image, clutter graph, text and table with room at the lower left for a plot; specification of that
-    plot, of the seal force).
-    """
+def _row(attempt: Attempt, scene: _Scene, words: Image, min_votes: float) -> tuple[Image, int]:
+    """Draw one attempt: image, clutter graph, and text and table (`words`), with room at the lower left for the force's plot, whose height
+    [px] is returned, too."""
     image = draw_observation(attempt, scene.color, scene.masks)
-    words = draw_words(attempt, names, config)
     left = image.shape[0] + 2 * LINE + MARGIN + PLOT_HEIGHT
     height = max(left, words.shape[0], _MIN_ROW_HEIGHT)
     sheet = np.full((HEAD + height + 2 * MARGIN, IMAGE_WIDTH + _GRAPH_WIDTH + WORDS_WIDTH + 4 * MARGIN, 3), 255, np.uint8)
@@ -145,10 +146,9 @@ def _row(attempt: Attempt, scene: _Scene, names: Mapping[int, str], config: Conf
     top = MARGIN + HEAD
     _paste(sheet, image, columns[0], top)
     _draw_key(sheet, columns[0], top + image.shape[0] + 24)
-    plot = load_chart(attempt, config, IMAGE_WIDTH, height - image.shape[0] - 2 * LINE - MARGIN)
-    states = {edge.state for edge in clutter_edges(attempt, config.perception.min_votes)}
+    states = {edge.state for edge in clutter_edges(attempt, min_votes)}
     foot = _graph_foot(states) if attempt.seen else []
-    _paste(sheet, draw_graph(attempt, config.perception.min_votes, (_GRAPH_WIDTH, height - LINE * len(foot))), columns[1], top)
+    _paste(sheet, draw_graph(attempt, min_votes, (_GRAPH_WIDTH, height - LINE * len(foot))), columns[1], top)
     for number, (text, color) in enumerate(foot):
         put_text(sheet, text, (columns[1], top + height - LINE * (len(foot) - 1 - number) - 6), SMALL, color)
     _paste(sheet, words, columns[2], top)
@@ -160,7 +160,7 @@ def _row(attempt: Attempt, scene: _Scene, names: Mapping[int, str], config: Conf
     for text, column in zip(captions, columns, strict=True):
         put_text(sheet, text, (column, top - 9), TEXT, SOFT)
     sheet[-1] = GREY
-    return sheet, plot
+    return sheet, height - image.shape[0] - 2 * LINE - MARGIN
 
 
 def _paste(sheet: Image, picture: Image, column: int, row: int) -> None:

@@ -10,7 +10,7 @@ import numpy as np
 from synpick_warp.apps.viz.drawing import FONT, INK, Image, instance_color, put_text
 from synpick_warp.apps.viz.explain_graph import GREY, RED, disc
 from synpick_warp.apps.viz.explain_record import Attempt, break_force, choice_words, labels, seal_words, suction_kind
-from synpick_warp.configs.schema import Config
+from synpick_warp.configs.manipulation import Suction, Target
 from synpick_warp.system.codecs.charts import Spec, axis, limit, line, points, theme
 
 WORDS_WIDTH = 470
@@ -37,10 +37,10 @@ _COLUMNS = ((0, "object"), (236, "above"), (296, "share"), (356, "pixels"), (416
 """Position [px] and heading of the table's columns."""
 
 
-def draw_words(attempt: Attempt, names: Mapping[int, str], config: Config) -> Image:
+def draw_words(attempt: Attempt, names: Mapping[int, str], target: Target, suction: Suction) -> Image:
     """Draw the explanation in sentences, and below it the table of objects, ranked by the choice rule."""
-    lines = [(line, INK) for text in choice_words(attempt, names, config) for line in wrapped(text, TEXT, WORDS_WIDTH)]
-    lines += [(line, INK) for text in seal_words(attempt, names, config) for line in wrapped(text, TEXT, WORDS_WIDTH)]
+    lines = [(line, INK) for text in choice_words(attempt, names, target) for line in wrapped(text, TEXT, WORDS_WIDTH)]
+    lines += [(line, INK) for text in seal_words(attempt, names, suction) for line in wrapped(text, TEXT, WORDS_WIDTH)]
     outcome = attempt.sentence[:1].upper() + attempt.sentence[1:]
     lines += [(line, GREEN if attempt.picked else RED) for line in wrapped(outcome, TEXT, WORDS_WIDTH)]
     canvas = np.full((LINE * (len(lines) + len(attempt.seen) + 3), WORDS_WIDTH, 3), 255, np.uint8)
@@ -94,17 +94,20 @@ def fitted(text: str, size: float, width: int) -> str:
     return text + ".."
 
 
-def load_chart(attempt: Attempt, config: Config, width: int, height: int) -> Spec:
-    """Chart of the seal force over time, with the break force; size in pixels, whose height is kept in its limits."""
+def load_chart(attempt: Attempt, suction: Suction, tick_time: float, width: int, height: int) -> Spec:
+    """Chart of the seal force over time, with the break force; size in pixels, whose height is kept in its limits.
+
+    `tick_time`: time between two frames [s].
+    """
     height = max(PLOT_HEIGHT, min(height, _MAX_PLOT_HEIGHT))
     size = {"width": width, "height": height, "autosize": {"type": "fit", "contains": "padding"}, "padding": 2, "background": "white"}
     text = {"color": _SOFT, "fontSize": _FONT}
     title = {**text, "text": "seal force [N] (the largest, if several)", "anchor": "start", "fontWeight": "normal"}
-    breaks = break_force(attempt, config)
+    breaks = break_force(attempt, suction)
     if not attempt.peak_force or not attempt.hits:
         said = {"type": "text", "text": "no force: nothing was engaged", **text}
         return {**size, "title": title, "data": {"values": [{}]}, "mark": said, "config": theme(_FONT)}
-    span = config.physics.step * config.physics.steps_per_tick * max(1, len(attempt.peak_force) - 1)
+    span = tick_time * max(1, len(attempt.peak_force) - 1)
     peak = 1.25 * max(breaks, *attempt.peak_force)
     y = axis("y", None, 0.0, peak, tickCount=4)
     times = np.linspace(0.0, span, max(2, len(attempt.peak_force)))[: len(attempt.peak_force)]

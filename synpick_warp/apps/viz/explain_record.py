@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from synpick_warp.apps.viz.drawing import short_labels
-from synpick_warp.configs.schema import Config
+from synpick_warp.configs.manipulation import Suction, Target
 from synpick_warp.dataset import records
 from synpick_warp.dataset.annotations import ADVICE, check_content
 from synpick_warp.dataset.commit.manifest import ATTEMPTS_FILE
@@ -167,7 +167,7 @@ def suction_kind(one: InstanceObservation) -> int:
     return min(range(len(CANDIDATES)), key=lambda kind: math.dist(one.candidates[kind], one.grasp_pixel))
 
 
-def choice_words(attempt: Attempt, names: Mapping[int, str], config: Config) -> list[str]:
+def choice_words(attempt: Attempt, names: Mapping[int, str], settings: Target) -> list[str]:
     """Explain in sentences the chosen target, the reason, and the suction point."""
     if attempt.target is None:
         return ["target: none, nothing is visible"]
@@ -177,17 +177,17 @@ def choice_words(attempt: Attempt, names: Mapping[int, str], config: Config) -> 
     share = one.distances[kind] / one.distances[0] if one.distances[0] else 1.0
     where = ("pole of inaccessibility", "centroid", "half-way point")[kind] + (f", {share:.2f} of the pole's distance" if kind else "")
     tilt = "" if attempt.tilt is None else f"; cup tilted by {abs(math.degrees(attempt.tilt)):.0f} degrees"
-    return [f"target: {full[attempt.target]}: {_reason(attempt, one, full, config)}", f"suction point: {where}{tilt}"]
+    return [f"target: {full[attempt.target]}: {_reason(attempt, one, full, settings)}", f"suction point: {where}{tilt}"]
 
 
-def _reason(attempt: Attempt, one: InstanceObservation, full: Mapping[int, str], config: Config) -> str:
+def _reason(attempt: Attempt, one: InstanceObservation, full: Mapping[int, str], settings: Target) -> str:
     """Clause on why an object was chosen: number of objects above it, and its visible fraction if several have as many."""
     targeted = attempt.mode == "target"
     count = len(one.ancestors)
     above = f"{count} object{'' if count == 1 else 's'} above"
     first = attempt.ranked()[0]
     if first.visible_fraction != one.visible_fraction or len(first.ancestors) != count:
-        if targeted and config.target.random_after_failure:
+        if targeted and settings.random_after_failure:
             return f"{above}; chosen at random after a failed attempt"
         return f"{above}; the rule would name {full[first.instance]}"
     equals = sum(len(other.ancestors) == count for other in attempt.seen)
@@ -198,23 +198,23 @@ def _reason(attempt: Attempt, one: InstanceObservation, full: Mapping[int, str],
     return f"{above}; visible fraction {one.visible_fraction:.2f}, the {'smallest' if targeted else 'largest'} of {equals} such"
 
 
-def seal_words(attempt: Attempt, names: Mapping[int, str], config: Config) -> list[str]:
+def seal_words(attempt: Attempt, names: Mapping[int, str], suction: Suction) -> list[str]:
     """Explain in sentences the rays, the seal, its force and the picked objects; none if nothing was chosen."""
     if attempt.target is None:
         return []
     full = full_names(attempt, names)
     lines = [f"rays: {attempt.hits} of {attempt.rays} hit"]
     if attempt.hits:
-        lines[0] += f"; {'good' if attempt.good_seal else 'poor'} seal, breaks at {break_force(attempt, config):g} N"
+        lines[0] += f"; {'good' if attempt.good_seal else 'poor'} seal, breaks at {break_force(attempt, suction):g} N"
         peak = f"; largest force {max(attempt.peak_force):.1f} N" if attempt.peak_force else ""
         lines.append(f"engaged: {_listed(attempt.engaged, full)}{peak}")
         lines.append(f"picked: {_listed(attempt.picked, full)}")
     return lines
 
 
-def break_force(attempt: Attempt, config: Config) -> float:
+def break_force(attempt: Attempt, suction: Suction) -> float:
     """Force at which a seal of the attempt breaks [N]."""
-    return config.suction.good_force if attempt.good_seal else config.suction.poor_force
+    return suction.good_force if attempt.good_seal else suction.poor_force
 
 
 def _listed(instances: Sequence[int], full: Mapping[int, str]) -> str:

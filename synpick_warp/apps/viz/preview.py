@@ -87,7 +87,7 @@ def write_contact_sheet(dataset: Path, out: Path, views: int) -> Path:
         raise OutputError(f"{views} views requested; a contact sheet has at least 1")
     shown = list(_read_views(sample(find_scenes(dataset), views)))
     baked = read_baked(dataset, {record["obj_id"] for view in shown for record, _ in view.truth})
-    scale = tote_scale(baked.config, [view.camera for view in shown]) if baked.config else None
+    scale = tote_scale(baked.config.tote, [view.camera for view in shown]) if baked.config else None
     scale = scale or pooled_scale(depth for view in shown if (depth := _read_depth(view)) is not None)
     most = max(len(view.truth) for view in shown)
     rows = [_row(view, scale, baked, most) for view in shown]
@@ -109,7 +109,7 @@ class Baked(NamedTuple):
         lines = [f"{scene.folder.parent.name}/{scene.folder.name}{scene.sensor.replace('_', ' ', 1)}, image {frame}"]
         if self.config is not None:
             episode, physics = DataLayout.of(self.config).scene_episode(int(scene.folder.name)), self.config.physics
-            parts = [f"episode {episode}", f"{frame * physics.step * physics.steps_per_tick:.2f} s"]
+            parts = [f"episode {episode}", f"{frame * physics.tick_time:.2f} s"]
             with contextlib.suppress(SynpickError):
                 entry = read_entry(self.dataset, episode_entry(episode))
                 parts += [f"mode {entry['row']['mode']}"] if entry is not None else []
@@ -129,8 +129,10 @@ def read_baked(dataset: Path, object_ids: set[int]) -> Baked:
     """
     path = dataset / CONFIG_FILE
     config = load_config(str(path), {}) if path.exists() else None
-    named = (dataset / "models" / "models_info.json").exists()
-    return Baked(dataset, config, object_names(dataset, config or load_config(), object_ids) if named else {})
+    if not (dataset / "models" / "models_info.json").exists():
+        return Baked(dataset, config, {})
+    known = config or load_config()
+    return Baked(dataset, config, object_names(dataset, object_ids, known.object_rows, known.objects.diameter_tolerance))
 
 
 def find_scenes(dataset: Path) -> list[Scene]:

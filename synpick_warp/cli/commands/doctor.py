@@ -9,7 +9,6 @@ import platform
 from pathlib import Path
 
 import warp as wp
-from rich.console import Console
 from rich.table import Table
 
 from synpick_warp import __version__
@@ -27,18 +26,12 @@ MIB = 1024**2
 GIB = 1024**3
 
 
-def examine(config: Config, console: Console) -> None:
-    """Print device, versions, caches and the memory of every array of a bake with these settings.
-
-    Raises:
-        DeviceError: The configured device does not exist.
-    """
-    device = pick_device(config.bake.device)
+def machine_report(device: wp.Device) -> Table:
+    """Table of device, versions and caches."""
     table = Table(show_header=False, box=None)
     for name, value in [*describe_machine(device), *_caches()]:
         table.add_row(name, value)
-    console.print(table)
-    console.print(memory_report(config))
+    return table
 
 
 def describe_machine(device: wp.Device) -> list[tuple[str, str]]:
@@ -48,12 +41,14 @@ def describe_machine(device: wp.Device) -> list[tuple[str, str]]:
 
 def memory_report(config: Config) -> Table:
     """Table of shape, unit and size of every array in the memory plan of a bake with these settings, and their sum."""
-    from synpick_warp.factory.memory_plan import describe_memory
+    from synpick_warp.exporters.registry import Needs
+    from synpick_warp.factory.memory_plan import plan_memory
     from synpick_warp.factory.sizes import count_writers, fit_to_device, without_pictures
 
-    episodes = sum(map(len, DataLayout.of(config).plan()))
-    config = fit_to_device(without_pictures(config), pick_device(config.bake.device), episodes, count_writers(config))
-    rows = describe_memory(config)
+    device, episodes = pick_device(config.bake.device), DataLayout.of(config).planned
+    writers = count_writers(config.bake.writers, Needs.of(config).slot_bytes)
+    config = fit_to_device(without_pictures(config), device, episodes, writers)
+    rows = [row for term in plan_memory(config, device) for row in term.rows]
     width, height = config.cameras.resolution
     table = Table("array", "shape", "unit", "MiB", title=f"{config.bake.worlds} worlds, {width}x{height}", show_footer=True)
     table.columns[3].justify = "right"

@@ -15,6 +15,7 @@ from itertools import takewhile
 from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple
 
+from synpick_warp.configs.export import ExportSettings
 from synpick_warp.configs.schema import Config
 from synpick_warp.configs.splits import DataLayout
 from synpick_warp.configs.write import config_to_toml
@@ -169,7 +170,7 @@ def _fill(out: Path, sources: dict[Path, Path], config: Config, manifest: bytes)
             write_atomically(out / CONFIG_FILE, config_to_toml(config).encode())
             write_atomically(out / MANIFEST_FILE, manifest)
             with WriterPool(config.bake.writers or count_cores(), needs.slot_bytes, lock) as pool:
-                finalize_data_set(out, config, needs.classes, pool)
+                finalize_data_set(out, ExportSettings.of(config), needs.classes, pool)
         except BaseException:
             added.remove()
             raise

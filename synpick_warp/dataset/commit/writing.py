@@ -18,6 +18,7 @@ from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 
+from synpick_warp.configs.export import ExportSettings
 from synpick_warp.configs.load import load_config
 from synpick_warp.configs.modes import may_pick
 from synpick_warp.configs.schema import Config
@@ -51,6 +52,7 @@ from synpick_warp.exporters.writing.files import (
     is_folder,
     is_litter,
     output_error,
+    output_errors,
     remove_folder,
     sync_folder,
     write_atomically,
@@ -98,11 +100,9 @@ class OutputFolder:
         self._exporters: Exporters | None = None
         check_output_folder(out)
         self._created = [folder for folder in (out, *out.parents) if not os.path.lexists(folder)]
-        try:
+        with output_errors(out):
             make_folder(out)
             self.lock = lock_folder(out)
-        except OSError as error:
-            raise output_error(out, error) from error
         try:
             self._scan()
         except OSError as error:
@@ -162,7 +162,7 @@ class OutputFolder:
         if differing:
             raise ConfigError(f"{self.out} was started with other {' and '.join(differing)}; {_ADVICE}")
         self._exporters = exporters
-        try:
+        with output_errors(self.out):
             if self._known:
                 remove_folder(self.out / PARTIAL, ignore_errors=True)
             else:
@@ -179,8 +179,6 @@ class OutputFolder:
                 paths = self._write_constants(exporters)
                 pool.submit(write_manifest_entry, (), (self.out, CONSTANTS, paths, {}), path=self.out / CONSTANTS)
                 pool.wait()
-        except OSError as error:
-            raise output_error(self.out, error) from error
 
     def _write_constants(self, exporters: Exporters) -> list[Path]:
         """Let the exporters write the constants; on an error, delete what was written."""
@@ -290,7 +288,7 @@ def commit_episode(out: Path, exporters: Exporters, pool: WriterPool, end: Episo
         submit_entry()
 
 
-def finalize_data_set(out: Path, config: Config, kinds: Sequence[type[Exporter]], pool: WriterPool) -> None:
+def finalize_data_set(out: Path, settings: ExportSettings, kinds: Sequence[type[Exporter]], pool: WriterPool) -> None:
     """Write and commit the indices of the data set: lists of episodes, attempts and evaluation targets over all committed episodes.
 
     Raises:
@@ -300,7 +298,7 @@ def finalize_data_set(out: Path, config: Config, kinds: Sequence[type[Exporter]]
         remove_folder(out / PARTIAL, ignore_errors=True)
         (out / PARTIAL).mkdir()
         episodes = committed_episodes(out)
-        paths = build_lists(out, may_pick(config.bake, config.splits)) + finalize(kinds, out, config, pool, episodes)
+        paths = build_lists(out, may_pick(settings.bake, settings.layout.splits)) + finalize(kinds, out, settings, pool, episodes)
         write_manifest_entry(out, INDICES, paths, {"episodes": episodes})
     except OSError as error:
         raise output_error(out, error) from error

@@ -8,7 +8,8 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from synpick_warp.configs.schema import Bop, Config
+from synpick_warp.configs.export import ExportSettings
+from synpick_warp.configs.schema import Bop
 from synpick_warp.configs.splits import DataLayout
 from synpick_warp.exporters.base import ExportContext, SharedFiles
 from synpick_warp.exporters.bop.keypoints import make_category_keys
@@ -23,7 +24,7 @@ from synpick_warp.exporters.bop.shared.targets import (
     target_files,
     write_scene_targets,
 )
-from synpick_warp.exporters.writing.files import PARTIAL, output_error
+from synpick_warp.exporters.writing.files import PARTIAL, output_errors
 from synpick_warp.exporters.writing.pool import WriterPool
 
 
@@ -57,11 +58,11 @@ class BopExporter(SceneExporter):
         return SharedFiles(CONSTANTS, tuple(map(Path, target_files(layout))), BopExporter.folders(layout))
 
     @staticmethod
-    def finalize(out: Path, config: Config, pool: WriterPool, episodes: Sequence[int]) -> list[Path]:
+    def finalize(out: Path, settings: ExportSettings, pool: WriterPool, episodes: Sequence[int]) -> list[Path]:
         """Write the lists of evaluation targets over all episodes; returns their paths. See `Exporter`."""
-        layout = DataLayout.of(config)
+        layout = settings.layout
         parts, names, sensors = out / PARTIAL / BopExporter.staging / "targets", target_files(layout), sensor_suffixes(layout)
-        try:
+        with output_errors(out):
             parts.parent.mkdir(exist_ok=True)
             shutil.rmtree(parts, ignore_errors=True)
             for name in (parts, *(parts / name for name in names)):
@@ -69,11 +70,9 @@ class BopExporter(SceneExporter):
             for folder in layout.folders:
                 places = tuple(str(parts / name) for name in scene_target_files(layout, folder))
                 for scene in find_scenes(out / folder, layout.scene_ids(episodes)):
-                    pool.submit(write_scene_targets, (), (scene, places, config.bop.target_visibility, sensors), path=scene)
+                    pool.submit(write_scene_targets, (), (scene, places, settings.bop.target_visibility, sensors), path=scene)
             pool.wait()
             concatenate_targets(parts, out, names)
-        except OSError as error:
-            raise output_error(out, error) from error
         return [Path(name) for name in names]
 
     def files(self, episode: int) -> list[Path]:

@@ -8,10 +8,10 @@ from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar
 
+from synpick_warp.configs.export import ExportSettings
 from synpick_warp.configs.schema import Bop
-from synpick_warp.configs.sensors import effect_ranges
 from synpick_warp.configs.splits import DataLayout
-from synpick_warp.exporters.base import ExportContext, StoredScene, TaskSizes, view_bytes
+from synpick_warp.exporters.base import ExportContext, StoredScene, view_bytes
 from synpick_warp.exporters.bop.keypoints import sample_keypoints
 from synpick_warp.exporters.bop.shared.models import MODEL_FOLDERS, describe_dataset, write_constants
 from synpick_warp.exporters.bop.shared.toolkit import PARAMS_FILE, format_dataset_params
@@ -26,7 +26,7 @@ from synpick_warp.exporters.bop.view import (
     write_stored_views,
 )
 from synpick_warp.exporters.staging import EpisodeExporter, StagedEpisode
-from synpick_warp.exporters.writing.files import output_error
+from synpick_warp.exporters.writing.files import output_errors
 from synpick_warp.exporters.writing.notes import CAMERA_FILE, NOTES_FILE
 from synpick_warp.exporters.writing.pool import WriteTask
 from synpick_warp.views.frames import EpisodeEnd, FrameBatch
@@ -54,21 +54,20 @@ class SceneExporter(EpisodeExporter[tuple[Path, ...]]):
     def __init__(self, context: ExportContext) -> None:
         """See `Exporter`."""
         super().__init__(context)
-        config, bop = context.config, context.config.bop
+        settings, bop = context.settings, context.settings.bop
         self._out = context.out
         self._bop = bop
         self._cameras = context.cameras
         self._pool = context.pool
         self._suffix = f".{bop.color_format}"
-        self._layers = config.render.layers if self.write_layer else ()
-        effects = tuple(name for name, limits in effect_ranges(config.effects).items() if any(limits))
+        self._layers = settings.render.layers if self.write_layer else ()
         entries = context.catalog.entries if bop.keypoints and self.annotates(bop) else ()
         self._keypoints = {entry.obj_id: sample_keypoints(entry.mesh.vertices, bop.keypoints) for entry in entries}
         self._views = tuple(
             ViewSettings(
                 color_suffix=self._suffix,
                 jpeg_quality=bop.jpeg_quality,
-                effects=effects,
+                effects=settings.effects,
                 masks=bop.masks,
                 coco=bop.coco,
                 camera=make_camera_constants(camera, bop.depth_scale),
@@ -99,9 +98,9 @@ class SceneExporter(EpisodeExporter[tuple[Path, ...]]):
         """Folder of the split that a scene belongs to."""
         return self._out / self.folder_name(self._context.layout.folder(scene_id // len(self._cameras)))
 
-    @abstractmethod
     def _stage_scene(self, scene: Path) -> None:
         """Create the staging folder of a scene, and its subfolders."""
+        scene.mkdir()
 
     @abstractmethod
     def _commit_task(self, scenes: tuple[tuple[Path, int], ...], images: Sequence[int]) -> tuple[Callable[..., None], tuple[Any, ...]]:
@@ -112,25 +111,23 @@ class SceneExporter(EpisodeExporter[tuple[Path, ...]]):
         """Existing paths of an episode, relative to the data set. See `Exporter`."""
 
     @staticmethod
-    def slot_bytes(sizes: TaskSizes) -> int:
+    def slot_bytes(settings: ExportSettings) -> int:
         """Bytes of a view's images in shared memory. See `Exporter`."""
-        return view_bytes(sizes.resolution, sizes.has_layers)
+        return view_bytes(settings.cameras.resolution, bool(settings.render.layers))
 
     def write_constants(self) -> list[Path]:
         """Create the folders, and write models, camera and notes, or copy them when converting; returns their paths. See `Exporter`."""
         context = self._context
-        try:
+        with output_errors(self._out):
             for folder in self.folders(context.layout):
                 (self._out / folder).mkdir(exist_ok=True)
             if context.copy_constants(CONSTANTS):
                 return list(CONSTANTS)
             texts = {
-                NOTES_FILE: describe_dataset(context.config, context.catalog, self._cameras),
+                NOTES_FILE: describe_dataset(context.settings, context.catalog, self._cameras),
                 PARAMS_FILE: format_dataset_params(context.layout, self._bop.color_format, context.catalog, self._cameras),
             }
             return write_constants(self._out, context.catalog, self._cameras[0], self._bop.depth_scale, texts)
-        except OSError as error:
-            raise output_error(self._out, error) from error
 
     def write_views(self, batch: FrameBatch) -> None:
         """Submit a task for each view of a batch. See `Exporter`."""

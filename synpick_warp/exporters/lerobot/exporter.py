@@ -13,9 +13,10 @@ from pathlib import Path
 import numpy as np
 
 from synpick_warp.codes import Ending, Task
-from synpick_warp.configs.schema import Config, Physics
+from synpick_warp.configs.export import ExportSettings
+from synpick_warp.configs.schema import Physics
 from synpick_warp.configs.splits import DataLayout
-from synpick_warp.exporters.base import ExportContext, SharedFiles, StoredScene, TaskSizes
+from synpick_warp.exporters.base import ExportContext, SharedFiles, StoredScene
 from synpick_warp.exporters.lerobot.episode import EpisodeContent, EpisodeSettings, commit_episode, frame_path, group_path
 from synpick_warp.exporters.lerobot.index import write_indices
 from synpick_warp.exporters.lerobot.layout import (
@@ -36,7 +37,7 @@ from synpick_warp.exporters.lerobot.layout import (
 from synpick_warp.exporters.lerobot.part import TICK
 from synpick_warp.exporters.lerobot.video import GROUP, write_frame, write_spooled_group, write_stored_group
 from synpick_warp.exporters.staging import EpisodeExporter, StagedEpisode
-from synpick_warp.exporters.writing.files import output_error
+from synpick_warp.exporters.writing.files import output_errors
 from synpick_warp.exporters.writing.notes import note_files, write_notes
 from synpick_warp.exporters.writing.pool import WriterPool, WriteTask
 from synpick_warp.system.processes.shared_memory import shared_bytes
@@ -75,14 +76,13 @@ class LerobotExporter(EpisodeExporter[_Content]):
     def __init__(self, context: ExportContext) -> None:
         """See `Exporter`."""
         super().__init__(context)
-        config = context.config
-        cameras = len(config.cameras.positions)
-        self._settings = EpisodeSettings(context.out, cameras, config.cameras.resolution, video_rate(config.physics), context.names)
+        settings, cameras = context.settings, context.layout.cameras
+        self._settings = EpisodeSettings(context.out, cameras, settings.cameras.resolution, video_rate(settings.physics), context.names)
 
     @staticmethod
-    def slot_bytes(sizes: TaskSizes) -> int:
+    def slot_bytes(settings: ExportSettings) -> int:
         """Bytes of a colour image in shared memory. See `Exporter`."""
-        width, height = sizes.resolution
+        width, height = settings.cameras.resolution
         return shared_bytes((height * width * 3,))
 
     @staticmethod
@@ -93,20 +93,16 @@ class LerobotExporter(EpisodeExporter[_Content]):
         return SharedFiles(note_files(layout.formats), (INFO, STATS, TASKS, EPISODES, DATA, CARD), (PARTS, *videos, *between, FOLDER))
 
     @staticmethod
-    def finalize(out: Path, config: Config, pool: WriterPool, episodes: Sequence[int]) -> list[Path]:
+    def finalize(out: Path, settings: ExportSettings, pool: WriterPool, episodes: Sequence[int]) -> list[Path]:
         """Write the tables over all episodes from their parts; returns their paths. See `Exporter`."""
-        try:
-            return write_indices(out, config, episodes)
-        except OSError as error:
-            raise output_error(out / FOLDER, error) from error
+        with output_errors(out / FOLDER):
+            return write_indices(out, settings, episodes)
 
     def write_constants(self) -> list[Path]:
         """Write camera file and notes; returns their paths. See `Exporter`."""
         context = self._context
-        try:
-            return write_notes(context.out, context.config, self._settings.objects, context.cameras)
-        except OSError as error:
-            raise output_error(context.out, error) from error
+        with output_errors(context.out):
+            return write_notes(context.out, context.settings, self._settings.objects, context.cameras)
 
     def write_views(self, batch: FrameBatch) -> None:
         """Submit a task for each view, which spools its colour image. See `Exporter`."""

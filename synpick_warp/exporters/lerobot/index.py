@@ -17,7 +17,8 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from synpick_warp.configs.schema import Bake, Config
+from synpick_warp.configs.export import ExportSettings
+from synpick_warp.configs.schema import Bake
 from synpick_warp.configs.splits import DataLayout
 from synpick_warp.errors import DatasetError
 from synpick_warp.exporters.lerobot.episode import make_folders
@@ -67,17 +68,17 @@ class _Totals:
     """Rows of the table of episodes."""
 
 
-def write_indices(out: Path, config: Config, episodes: Iterable[int]) -> list[Path]:
+def write_indices(out: Path, settings: ExportSettings, episodes: Iterable[int]) -> list[Path]:
     """Write the tables over the committed episodes, sorted; returns them, relative to the data set.
 
     Raises:
         DatasetError: A part is damaged.
         OSError: A file cannot be written.
     """
-    cameras, rate, totals = len(config.cameras.positions), frame_rate(config.physics), _Totals()
+    cameras, rate, totals = settings.layout.cameras, frame_rate(settings.physics), _Totals()
     totals.levels = [np.zeros((3, 256), np.int64) for _ in range(cameras)]
     with pq.ParquetWriter(out / PARTIAL / "data.parquet", _data_schema(), compression="zstd") as writer:
-        for batch in _batch_tables(_read_tables(out, totals, config.cameras.resolution, rate, DataLayout.of(config), episodes)):
+        for batch in _batch_tables(_read_tables(out, totals, settings.cameras.resolution, rate, settings.layout, episodes)):
             writer.write_table(batch)
     _place(out, DATA, lambda path: (out / PARTIAL / "data.parquet").replace(path))
     _place(
@@ -87,12 +88,12 @@ def write_indices(out: Path, config: Config, episodes: Iterable[int]) -> list[Pa
     videos = {camera_key(index): describe_levels(levels, totals.frames) for index, levels in enumerate(totals.levels) if levels.any()}
     statistics = {name: to_json(values) for name, values in (totals.statistics | videos).items()}
     splits = [row["source/split"] for row in totals.rows]
-    info = make_info(config.cameras, rate, splits, totals.frames, len(totals.tasks))
+    info = make_info(settings.cameras, rate, splits, totals.frames, len(totals.tasks))
     info["features"]["attempt.outcome"]["info"] = {"codes": list(outcome_names())}
     for place, content in ((STATS, statistics), (INFO, info)):
         text = json.dumps(content, indent=2) + "\n"
         _place(out, place, lambda path, text=text: path.write_text(text, encoding="ascii"))
-    _place(out, CARD, lambda path: path.write_text(_make_card(config.bake, bool(config.splits), totals), encoding="utf-8"))
+    _place(out, CARD, lambda path: path.write_text(_make_card(settings.bake, bool(settings.layout.splits), totals), encoding="utf-8"))
     return [INFO, STATS, TASKS, EPISODES, DATA, CARD]
 
 

@@ -100,7 +100,7 @@ def video_folders(cameras: int) -> list[Path]:
 
 def frame_rate(physics: Physics) -> float | int:
     """Frames per second of simulated time [Hz]; whole numbers as integers."""
-    rate = 1.0 / (physics.step * physics.steps_per_tick)
+    rate = 1.0 / physics.tick_time
     return round(rate) if abs(rate - round(rate)) < 1e-9 else rate
 
 

@@ -12,14 +12,15 @@ from typing import Any
 import numpy as np
 
 from synpick_warp.codes import Ending, Mode
+from synpick_warp.configs.export import ExportSettings
 from synpick_warp.configs.splits import DataLayout
-from synpick_warp.exporters.base import ExportContext, SharedFiles, TaskSizes
+from synpick_warp.exporters.base import ExportContext, SharedFiles
 from synpick_warp.exporters.staging import EpisodeExporter, StagedEpisode
 from synpick_warp.exporters.trajectory.arrays import EPISODES, STORE
 from synpick_warp.exporters.trajectory.episode import EpisodeContent, EpisodeSettings, write_episode
 from synpick_warp.exporters.trajectory.spool import SPOOL_ROWS, Place, batch_type, count_instances, make_rows, spool_bytes, write_rows
 from synpick_warp.exporters.trajectory.store import constant_places, write_constants
-from synpick_warp.exporters.writing.files import output_error
+from synpick_warp.exporters.writing.files import output_errors
 from synpick_warp.exporters.writing.pool import WriteTask
 from synpick_warp.system.processes.shared_memory import shared_bytes
 from synpick_warp.views.frames import EpisodeEnd, TickBatch
@@ -55,18 +56,18 @@ class TrajectoryExporter(EpisodeExporter[_Content]):
     def __init__(self, context: ExportContext) -> None:
         """See `Exporter`."""
         super().__init__(context)
-        config = context.config
+        settings = context.settings
         self._settings = EpisodeSettings(
-            trajectory=config.trajectory,
-            step=config.physics.step,
-            steps_per_tick=config.physics.steps_per_tick,
+            trajectory=settings.trajectory,
+            step=settings.physics.step,
+            steps_per_tick=settings.physics.steps_per_tick,
             masses={entry.obj_id: entry.mass for entry in context.catalog.entries},
         )
 
     @staticmethod
-    def slot_bytes(sizes: TaskSizes) -> int:
+    def slot_bytes(settings: ExportSettings) -> int:
         """Bytes of a spooled tick in shared memory. See `Exporter`."""
-        size = spool_bytes(sizes.objects, sizes.steps_per_tick, sizes.stores_steps)
+        size = spool_bytes(settings.objects, settings.physics.steps_per_tick, settings.trajectory.steps)
         return shared_bytes((size,))
 
     @staticmethod
@@ -79,14 +80,12 @@ class TrajectoryExporter(EpisodeExporter[_Content]):
     def write_constants(self) -> list[Path]:
         """Write the store with its groups of objects, cameras and lights; returns their paths. See `Exporter`."""
         context, store = self._context, self._context.out / STORE
-        try:
+        with output_errors(store):
             store.mkdir(exist_ok=True)
             (store / EPISODES).mkdir(exist_ok=True)
-            config, level = context.config, context.config.trajectory.level
+            settings, level = context.settings, context.settings.trajectory.level
             assets = (context.catalog, context.cameras, context.lights)
-            written = write_constants(store, config.bake.seed, config.physics, level, *assets)
-        except OSError as error:
-            raise output_error(store, error) from error
+            written = write_constants(store, settings.bake.seed, settings.physics, level, *assets)
         return [path.relative_to(context.out) for path in written]
 
     def write_ticks(self, batch: TickBatch) -> None:
@@ -157,7 +156,7 @@ class TrajectoryExporter(EpisodeExporter[_Content]):
             "frames": end.frames,
             "ending": ending.name.lower(),
             "sentence": ending.sentence,
-            "seed": self._context.config.bake.seed,
+            "seed": self._context.settings.bake.seed,
             **end.row,
             **kept.initial,
         }

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from pxr import Gf, Usd, UsdGeom, UsdShade
 
-from synpick_warp.configs.schema import Config, Physics
+from synpick_warp.configs.schema import Gripper, Physics, Tote
 from synpick_warp.exporters.usd.lights import write_light_maps
 from synpick_warp.exporters.usd.parts import (
     TEXTURES,
@@ -31,7 +31,15 @@ from synpick_warp.scenes.tote import TABLE_ROUGHNESS, TABLE_SIZE, tote_colliders
 from synpick_warp.scenes.types import Catalog, CatalogEntry, ConvexPiece, EnvironmentMap, Fixture, Material, TriangleMesh
 
 
-def write_library(library: Path, config: Config, catalog: Catalog, lights: tuple[EnvironmentMap, ...]) -> None:
+def write_library(
+    library: Path,
+    tote: Tote,
+    gripper: Gripper,
+    physics: Physics,
+    table_color: tuple[float, float, float] | None,
+    catalog: Catalog,
+    lights: tuple[EnvironmentMap, ...],
+) -> None:
     """Write all assets into an existing folder, replacing existing ones.
 
     Raises:
@@ -41,7 +49,6 @@ def write_library(library: Path, config: Config, catalog: Catalog, lights: tuple
     for name in (TEXTURES, "lights"):
         (library / name).mkdir(exist_ok=True)
     write_light_maps(library, lights)
-    gripper, physics, tote = config.gripper, config.physics, config.tote
     for entry in catalog.entries:
         _write_object(library, physics, entry)
     _save(library, "tote", _make_fixture(library, physics, "tote", tote_fixture(tote), tote_colliders(tote)))
@@ -53,7 +60,7 @@ def write_library(library: Path, config: Config, catalog: Catalog, lights: tuple
     length, mass = gripper.cup_length, gripper.cup_mass
     add_body(cup.GetDefaultPrim(), mass, np.array([0.0, 0.0, -length / 2]), np.diag(rod_inertia(mass, length)), kinematic=True)
     _save(library, "cup", cup)
-    _write_table(library, physics, -tote.wall, config.render.table_color if config.render.table else None)
+    _write_table(library, physics, -tote.wall, table_color)
 
 
 def _save(library: Path, name: str, stage: Usd.Stage) -> None:

@@ -6,14 +6,15 @@ import os
 from functools import cached_property, partial
 from pathlib import Path
 
+from synpick_warp.configs.export import ExportSettings
 from synpick_warp.configs.splits import DataLayout
-from synpick_warp.exporters.base import SharedFiles, TaskSizes
+from synpick_warp.exporters.base import SharedFiles
 from synpick_warp.exporters.staging import EpisodeExporter, StagedEpisode
 from synpick_warp.exporters.usd.episode import write_episode
 from synpick_warp.exporters.usd.lights import make_stage_light
 from synpick_warp.exporters.usd.spool import TickSpool, tick_rows
 from synpick_warp.exporters.usd.types import EpisodeMetadata, EpisodeSettings
-from synpick_warp.exporters.writing.files import output_error
+from synpick_warp.exporters.writing.files import output_errors
 from synpick_warp.exporters.writing.pool import WriteTask
 from synpick_warp.views.frames import EpisodeEnd, TickBatch
 
@@ -33,7 +34,7 @@ class UsdExporter(EpisodeExporter[TickSpool]):
     staging = FOLDER.name
 
     @staticmethod
-    def slot_bytes(sizes: TaskSizes) -> int:
+    def slot_bytes(settings: ExportSettings) -> int:
         """0: tasks have no images. See `Exporter`."""
         return 0
 
@@ -48,12 +49,12 @@ class UsdExporter(EpisodeExporter[TickSpool]):
 
         context = self._context
         library = context.out / LIBRARY
-        try:
+        with output_errors(library):
             for folder in (library.parent, library):
                 folder.mkdir(exist_ok=True)
-            write_library(library, context.config, context.catalog, context.lights)
-        except OSError as error:
-            raise output_error(library, error) from error
+            settings, render = context.settings, context.settings.render
+            color = render.table_color if render.table else None
+            write_library(library, settings.tote, settings.gripper, settings.physics, color, context.catalog, context.lights)
         return [LIBRARY]
 
     def write_ticks(self, batch: TickBatch) -> None:
@@ -61,18 +62,14 @@ class UsdExporter(EpisodeExporter[TickSpool]):
         make_spool = partial(_make_spool, batch.object_id.shape[1])
         for index, row in zip(batch.episode.tolist(), tick_rows(batch), strict=True):
             spool = self._staged(index, make_spool).content
-            try:
+            with output_errors(spool.path):
                 spool.add(row)
-            except OSError as error:
-                raise output_error(spool.path, error) from error
 
     def _commit(self, episode: StagedEpisode[TickSpool], end: EpisodeEnd) -> WriteTask:
         """Task that writes an episode's USD file from its spool."""
         spool, place = episode.content, self._place(end.episode)
-        try:
+        with output_errors(spool.path):
             spool.flush()
-        except OSError as error:
-            raise output_error(spool.path, error) from error
         return WriteTask(write_episode, (), (spool.path, spool.instances, place, EpisodeMetadata.from_end(end), self._settings), place)
 
     def files(self, episode: int) -> list[Path]:
@@ -88,12 +85,12 @@ class UsdExporter(EpisodeExporter[TickSpool]):
     def _settings(self) -> EpisodeSettings:
         """Settings of all episodes: tick rate, gravity, cameras, lights, names."""
         context = self._context
-        config = context.config
+        settings = context.settings
         return EpisodeSettings(
-            tick_rate=1.0 / (config.physics.step * config.physics.steps_per_tick),
-            gravity=config.physics.gravity,
+            tick_rate=1.0 / settings.physics.tick_time,
+            gravity=settings.physics.gravity,
             cameras=context.cameras,
-            lights=tuple(make_stage_light(index, light, config.render.exposure) for index, light in enumerate(context.lights)),
+            lights=tuple(make_stage_light(index, light, settings.render.exposure) for index, light in enumerate(context.lights)),
             names={entry.obj_id: entry.name for entry in context.catalog.entries},
         )
 

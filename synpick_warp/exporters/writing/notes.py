@@ -6,8 +6,7 @@ import json
 from collections.abc import Collection, Mapping
 from pathlib import Path
 
-from synpick_warp.configs.modes import bake_modes
-from synpick_warp.configs.schema import Bake, Config
+from synpick_warp.configs.export import ExportSettings
 from synpick_warp.scenes.types import Camera
 
 CAMERA_FILE, NOTES_FILE = "camera.json", "dataset_info.md"
@@ -25,37 +24,34 @@ def write_camera(path: Path, camera: Camera, depth_scale: float) -> None:
     path.write_text(json.dumps(content, indent=2) + "\n", encoding="ascii")
 
 
-def write_notes(out: Path, config: Config, names: Mapping[int, str], cameras: tuple[Camera, ...]) -> list[Path]:
+def write_notes(out: Path, settings: ExportSettings, names: Mapping[int, str], cameras: tuple[Camera, ...]) -> list[Path]:
     """Write `note_files`, replacing existing ones; returns their paths.
 
     Args:
         out: The data set.
-        config: Its settings.
+        settings: Its settings.
         names: obj_id -> name.
         cameras: The cameras.
 
     Raises:
         OSError: A file cannot be written.
     """
-    places = note_files(config.bake.formats)
+    places = note_files(settings.bake.formats)
     if places:
-        period = config.physics.step * config.physics.steps_per_tick
-        write_camera(out / CAMERA_FILE, cameras[0], config.bop.depth_scale)
-        (out / NOTES_FILE).write_text(
-            _describe(config.bake, bake_modes(config.bake, config.splits), period, names, cameras), encoding="utf-8", newline="\n"
-        )
+        write_camera(out / CAMERA_FILE, cameras[0], settings.bop.depth_scale)
+        (out / NOTES_FILE).write_text(_describe(settings, names, cameras), encoding="utf-8", newline="\n")
     return list(places)
 
 
-def _describe(bake: Bake, modes: tuple[str, ...], period: float, names: Mapping[int, str], cameras: tuple[Camera, ...]) -> str:
-    """Text of dataset_info.md: conventions, cameras and objects; `period`: time between frames [s]."""
-    camera = cameras[0]
+def _describe(settings: ExportSettings, names: Mapping[int, str], cameras: tuple[Camera, ...]) -> str:
+    """Text of dataset_info.md: conventions, cameras and objects."""
+    bake, camera = settings.bake, cameras[0]
     objects = "\n".join(f"| {index} | {name} |" for index, name in sorted(names.items()))
     poses = "\n".join(f"| {index} | {_row(one.rotation.ravel())} | {_row(one.translation)} |" for index, one in enumerate(cameras))
     return f"""# A SynPick data set
 
-Made by synpick-warp (mode {", ".join(modes)}, seed {bake.seed}, {len(cameras)} cameras, formats
-{", ".join(sorted(bake.formats))}). Frames are {period:g} s apart.
+Made by synpick-warp (mode {", ".join(settings.modes)}, seed {bake.seed}, {len(cameras)} cameras, formats
+{", ".join(sorted(bake.formats))}). Frames are {settings.physics.tick_time:g} s apart.
 
 - Pictures have {camera.width} x {camera.height} pixels and no lens distortion; `camera.json` has the intrinsics of all cameras.
   The centre of pixel (row, column) is (column + 0.5, row + 0.5): for OpenCV and Open3D, whose pixel centres have whole

@@ -30,7 +30,7 @@ from synpick_warp.kernels.encoding.stuffing import (
 from synpick_warp.kernels.encoding.tables import BLOCK, BLOCK_SIZE, BLOCKS_PER_MCU, MCU
 from synpick_warp.kernels.render.images.camera_effects import jpeg_quality_kernel
 from synpick_warp.kernels.tuning import JPEG_THREADS
-from synpick_warp.stages.arrays import allocate, allocate_struct, device_array, struct_arrays
+from synpick_warp.stages.arrays import allocate_struct, device_array, struct_arrays
 from synpick_warp.stages.buffers import ViewBuffers
 from synpick_warp.system.codecs.jpeg import (
     AC_COUNTS,
@@ -109,18 +109,17 @@ def jpeg_sizes(views: int, width: int, height: int) -> dict[str, int]:
 
 
 class JpegEncoder:
-    """Encodes batches of views. Owns its scratch; `encode` only launches kernels."""
+    """Encodes batches of views; `encode` only launches kernels."""
 
-    def __init__(self, views: int, width: int, height: int, device: wp.Device) -> None:
+    def __init__(self, scratch: JpegScratch, width: int, height: int) -> None:
         """
         Args:
-            views: Maximum number of views.
+            scratch: Scratch for the largest batch.
             width: Of the images [px].
             height: Of the images [px].
-            device: Where to encode.
         """
-        self.device = device
-        self.scratch: JpegScratch = allocate(JpegScratch, jpeg_sizes(views, width, height), device)
+        self.scratch, self.device = scratch, scratch.sample.device
+        device = self.device
         self.tables = upload_huffman(device)
         divisor = np.stack([quantization(quality) for quality in range(QUALITIES)]) * DIVISOR_SCALE
         self.reciprocal = wp.array(reciprocals(divisor), dtype=wp.uint32, device=device)
@@ -169,31 +168,23 @@ class JpegEncoder:
 
 
 class Compressor:
-    """JPEG files of a ring of view batches.
+    """JPEG files of batches of views."""
 
-    Attributes:
-        out: `JpegBuffers` of each batch of the ring.
-    """
-
-    def __init__(self, sizes: dict[str, int], quality: int, ring: int, device: wp.Device) -> None:
+    def __init__(self, scratch: JpegScratch, width: int, height: int, quality: int) -> None:
         """
         Args:
-            sizes: Extents of `ViewBuffers`.
+            scratch, width, height: As of `JpegEncoder`.
             quality: JPEG quality of views without a sampled one.
-            ring: Number of batches.
-            device: Where to encode.
         """
-        views, width, height = sizes["view"], sizes["column"], sizes["row"]
-        self.fixed_quality, self.device = quality, device
-        self.encoder = JpegEncoder(views, width, height, device)
-        self.quality = wp.empty(views, dtype=wp.int32, device=device)
-        self.out = [allocate(JpegBuffers, jpeg_sizes(views, width, height), device) for _ in range(ring)]
+        self.encoder = JpegEncoder(scratch, width, height)
+        self.fixed_quality, self.device = quality, self.encoder.device
+        self.quality = wp.empty(scratch.sample.shape[0], dtype=wp.int32, device=self.device)
 
-    def compress(self, slot: int, count: int, images: ViewBuffers) -> None:
-        """Encode the colour images of the first `count` views into `out[slot]`, with the quality of their effects."""
+    def compress(self, count: int, images: ViewBuffers, out: JpegBuffers) -> None:
+        """Encode the colour images of the first `count` views into `out`, with the quality of their effects."""
         inputs = [images.effects, self.fixed_quality]
         wp.launch(jpeg_quality_kernel, dim=count, inputs=inputs, outputs=[self.quality], device=self.device)
-        self.encoder.encode(images.color, self.quality, count, self.out[slot])
+        self.encoder.encode(images.color, self.quality, count, out)
 
 
 def upload_huffman(device: wp.Device) -> Any:

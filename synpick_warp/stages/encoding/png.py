@@ -66,34 +66,33 @@ class DepthScratch:
     """First bit of each group of slots."""
 
 
-DEPTH_SCRATCH = (DepthScratch, SLOT_SUMS, GROUP_SUMS)
-"""All scratch of the encoder."""
-
-
 def depth_sizes(views: int, width: int, height: int) -> dict[str, int]:
-    """Extents of the dimensions of `DepthBuffers` and `DEPTH_SCRATCH`, for `views` images [px]."""
+    """Extents of the dimensions of all arrays of the encoder, for `views` images [px]."""
     slots = height * -(-width // SEGMENT) + 2
     bits = CODE_BITS * (1 + 2 * min(width, SEGMENT))
     sizes = {"view": views, "slot": slots, "group": -(-slots // int(GROUP))}
     return sizes | {"slot_word": max(len(pack_words(make_prefix())), -(-bits // 32)), "depth_byte": max_data_bytes(width, height)}
 
 
-class DepthEncoder:
-    """Encodes batches of depth images. Owns its scratch; `encode` only launches kernels."""
+def allocate_depth_scratch(views: int, width: int, height: int, device: wp.Device) -> tuple[DepthScratch, Any, Any]:
+    """Allocate the scratch of the encoder for `views` images [px]; the others are structs `SlotSums`, of slots and of groups."""
+    sizes = depth_sizes(views, width, height)
+    return allocate(DepthScratch, sizes, device), allocate_struct(SLOT_SUMS, sizes, device), allocate_struct(GROUP_SUMS, sizes, device)
 
-    def __init__(self, views: int, width: int, height: int, device: wp.Device) -> None:
+
+class DepthEncoder:
+    """Encodes batches of depth images; `encode` only launches kernels."""
+
+    def __init__(self, scratch: tuple[DepthScratch, Any, Any], width: int, height: int) -> None:
         """
         Args:
-            views: Maximum number of views.
+            scratch: Scratch by `allocate_depth_scratch`.
             width: Of the images [px].
             height: Of the images [px].
-            device: Where to encode.
         """
-        sizes = depth_sizes(views, width, height)
-        self.device, self.width, self.height = device, width, height
-        self.scratch: DepthScratch = allocate(DepthScratch, sizes, device)
-        self.slots: Any = allocate_struct(SLOT_SUMS, sizes, device)
-        self.groups: Any = allocate_struct(GROUP_SUMS, sizes, device)
+        self.scratch, self.slots, self.groups = scratch
+        self.device, self.width, self.height = self.scratch.slot.device, width, height
+        device = self.device
         tables = {"literal": literal_codes(), "run": run_codes(), "distance": distance_codes()}
         self.codes: Any = allocate_struct(CODES, {"byte": 256, "run": len(tables["run"]), "distance": len(tables["distance"])}, device)
         for name, codes in tables.items():

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, fields
 from typing import Any
 
@@ -53,14 +53,17 @@ class MaskBuffers:
     amodal: wp.array = device_array("view", "instance", "row", "column", dtype=wp.bool)
 
 
+def allocate_slot(sizes: dict[str, int], layers: Collection[str], device: wp.Device) -> tuple[ViewBuffers, TruthBuffers, LayerBuffers]:
+    """Allocate images, ground truth and layers of a batch; arguments as of `BatchRing`."""
+    return allocate(ViewBuffers, sizes, device), allocate(TruthBuffers, sizes, device), allocate(LayerBuffers, sizes, device, layers)
+
+
 class Slot:
     """Images, layers, ground truth and masks of one batch in the ring, and the gate that orders the access to these."""
 
     def __init__(self, sizes: dict[str, int], layers: list[str], device: wp.Device) -> None:
         self.sizes, self.device = sizes, device
-        self.images = allocate(ViewBuffers, sizes, device)
-        self.truth = allocate(TruthBuffers, sizes, device)
-        self.layers = allocate(LayerBuffers, sizes, device, layers)
+        self.images, self.truth, self.layers = allocate_slot(sizes, layers, device)
         self.lists = wp.zeros((2, sizes["view"]), dtype=wp.int32, device=device)
         self.masks: dict[str, wp.array] = {}
         self.gate = Gate(device)

@@ -13,11 +13,11 @@ from synpick_warp.kernels.perception.exact_hits import intersect_hits_kernel
 from synpick_warp.kernels.render.visibility.camera import TILE_PIXELS
 from synpick_warp.kernels.render.visibility.view_setup import aim_views_kernel
 from synpick_warp.scenes.cameras import make_cameras
-from synpick_warp.stages.arrays import allocate_struct, memory_table
+from synpick_warp.stages.arrays import allocate, allocate_struct, dry_run
 from synpick_warp.stages.buffers import Snapshot
 from synpick_warp.stages.launch import launch_pixels
 from synpick_warp.stages.perception.arrays import PerceptionArrays, SegmentationScratch
-from synpick_warp.stages.render.raster import VISIBILITY_BUFFER, Rasterizer, visibility_sizes
+from synpick_warp.stages.render.raster import Rasterizer, allocate_visibility
 from synpick_warp.stages.render.scene import RenderScene, build_cameras, build_grid
 from synpick_warp.stages.render.view_setup import GBUFFER, VIEW_BODIES, VIEWS, body_sizes, set_up_views
 
@@ -26,28 +26,35 @@ GPU_BYTES = 2 * 2**30
 """Scratch that the views of a batch may take if `perception.views` is 0."""
 CPU_VIEWS = 4
 """Maximum number of views on the CPU in that case: larger batches gain nothing there, and unused views still cost a little."""
-SCRATCH = (VIEWS, VIEW_BODIES, GBUFFER, VISIBILITY_BUFFER, PerceptionArrays, SegmentationScratch)
-"""Declarations of the arrays of a batch."""
 
 
-def perception_sizes(settings: schema.Perception, instances: int, views: int) -> dict[str, int]:
-    """Extents of the dimensions of the declarations in `SCRATCH`."""
+Batch = tuple[Any, Any, Any, PerceptionArrays, SegmentationScratch]
+"""Arrays of a batch of worlds: the structs `Views`, `ViewBodies` and `GBuffer`, and the arrays of their segmentation."""
+
+
+def allocate_batch(settings: schema.Perception, instances: int, views: int, device: wp.Device) -> Batch:
+    """Allocate the arrays of a batch of `views` worlds with `instances` instances each."""
     width, height = settings.resolution
-    sizes = {"instance": instances, "point": settings.contour_points}
-    return sizes | body_sizes(instances, width, height) | visibility_sizes(views, width, height)
+    sizes = {"view": views, "row": height, "column": width, "instance": instances, "point": settings.contour_points}
+    sizes |= body_sizes(instances, width, height)
+    views_of_worlds, bodies, gbuffer = (allocate_struct(kind, sizes, device) for kind in (VIEWS, VIEW_BODIES, GBUFFER))
+    arrays, scratch = allocate(PerceptionArrays, sizes, device), allocate(SegmentationScratch, sizes, device)
+    return views_of_worlds, bodies, gbuffer, arrays, scratch
 
 
-def view_bytes(settings: schema.Perception, instances: int) -> int:
+def view_bytes(settings: schema.Perception, instances: int, device: wp.Device) -> int:
     """Scratch of one view [bytes]."""
-    sizes = perception_sizes(settings, instances, 1)
-    return sum(row[3] for kind in SCRATCH for row in memory_table(kind, sizes))
+    with dry_run() as arrays:
+        allocate_batch(settings, instances, 1, device)
+        allocate_visibility(1, *settings.resolution, device)
+    return sum(array.row[3] for array in arrays)
 
 
 def count_views(settings: schema.Perception, worlds: int, instances: int, device: wp.Device) -> int:
     """Views of a batch: the setting, or as many as fit into the memory budget; never more than there are worlds."""
     views = settings.views
     if views == 0:
-        each = view_bytes(settings, instances)
+        each = view_bytes(settings, instances, device)
         views = GPU_BYTES // each if device.is_cuda else min(CPU_BYTES // each, CPU_VIEWS)
     return min(max(views, 1), worlds)
 
@@ -60,7 +67,7 @@ class PerceptionImages:
         views: The struct `Views` of the batch. The caller fills `views.world` (view): each world once; -1: the view is unused.
         bodies: The struct `ViewBodies` of the batch.
         gbuffer: The struct `GBuffer` of the batch.
-        sizes: Extents of the dimensions of the declarations in `SCRATCH`.
+        arrays, scratch: Arrays of `Segmenter`.
     """
 
     def __init__(
@@ -87,12 +94,9 @@ class PerceptionImages:
             raise ConfigError(f"perception.views is {count}; of {width} x {height} px that is more than 2³¹ pixels; take fewer")
         camera = make_cameras(replace(cameras, resolution=settings.resolution))[:1]
         self.scene = replace(render_scene, cameras=build_cameras(camera, device), grid=grid, camera_count=1)
-        self.sizes = perception_sizes(settings, instances, count)
-        self.views: Any = allocate_struct(VIEWS, self.sizes, device)
+        self.views, self.bodies, self.gbuffer, self.arrays, self.scratch = allocate_batch(settings, instances, count, device)
         self.views.world.fill_(-1)
         self.views.count, self.views.instances = count, instances
-        self.bodies: Any = allocate_struct(VIEW_BODIES, self.sizes, device)
-        self.gbuffer: Any = allocate_struct(GBUFFER, self.sizes, device)
         self.fixture_visible = wp.array([[1, 0, 0]] * worlds, dtype=wp.int32, device=device)
         self.rasterizer = Rasterizer(self.scene, 1.0, count)
 

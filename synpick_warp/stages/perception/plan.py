@@ -41,9 +41,10 @@ class VoteArrays:
 CYCLES = struct_arrays(Cycles, "view", "instance", weight=("view", "instance", "instance"), best=("view", "subset"))
 
 
-def plan_sizes(settings: schema.Perception, instances: int, views: int) -> dict[str, int]:
-    """Extents of the dimensions of `VoteArrays` and `CYCLES`."""
-    return {"view": views, "instance": instances, "kind": 2, "subset": 1 << min(settings.exact_cycle, instances)}
+def allocate_votes(settings: schema.Perception, instances: int, views: int, device: wp.Device) -> tuple[VoteArrays, Any]:
+    """Allocate the scratch of a batch: `VoteArrays`, and the struct `Cycles`."""
+    sizes = {"view": views, "instance": instances, "kind": 2, "subset": 1 << min(settings.exact_cycle, instances)}
+    return allocate(VoteArrays, sizes, device), allocate_struct(CYCLES, sizes, device)
 
 
 class GraspPlanner:
@@ -60,9 +61,7 @@ class GraspPlanner:
         self.images, self.arrays = images, arrays
         self.device = arrays.largest.device
         self.views, self.instances = arrays.largest.shape
-        sizes = plan_sizes(settings, self.instances, self.views)
-        self.voting = allocate(VoteArrays, sizes, self.device)
-        self.cycles = allocate_struct(CYCLES, sizes, self.device)
+        self.voting, self.cycles = allocate_votes(settings, self.instances, self.views, self.device)
 
     def plan(self, scene: SceneData, state: WorldState, attempts: AttemptState, observation: Observation, plan: Plan, seed: int) -> None:
         """Write votes and clutter graph to `observation`, target and grasp to `plan`, for the worlds of the batch.

@@ -9,10 +9,9 @@ import warp as wp
 
 from synpick_warp.kernels.perception import components, contours, distance_transform, grasp_points
 from synpick_warp.kernels.render.visibility.camera import TILE_PIXELS
-from synpick_warp.stages.arrays import allocate
 from synpick_warp.stages.constants import SceneData
 from synpick_warp.stages.launch import launch_pixels
-from synpick_warp.stages.perception.arrays import Observation, PerceptionArrays, SegmentationScratch
+from synpick_warp.stages.perception.arrays import Observation
 from synpick_warp.stages.perception.images import PerceptionImages
 
 
@@ -24,14 +23,13 @@ class Segmenter:
     """
 
     def __init__(self, images: PerceptionImages) -> None:
-        """Allocate scratch for the views of `images`, whose G-buffers it reads."""
+        """Take the scratch of `images`, whose G-buffers it reads."""
         self.images = images
         self.grid, self.device = images.scene.grid, images.scene.device
         self.width, self.height, self.instances = self.grid.width, self.grid.height, images.views.instances
         self.pixels = images.views.count * self.grid.tiles * int(TILE_PIXELS)
         self.strips = -(-self.width // int(components.STRIP))
-        self.arrays = allocate(PerceptionArrays, images.sizes, self.device)
-        self.scratch = allocate(SegmentationScratch, images.sizes, self.device)
+        self.arrays, self.scratch = images.arrays, images.scratch
         self.flat = _flatten_images(self.arrays, self.scratch)
         self.flat |= {name: _flatten(getattr(images.gbuffer, name)) for name in ("segment", "depth")}
 

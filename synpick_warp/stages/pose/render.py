@@ -14,7 +14,7 @@ from synpick_warp.stages.arrays import allocate, allocate_struct
 from synpick_warp.stages.buffers import FIXTURES, Snapshot
 from synpick_warp.stages.render.raster import Rasterizer
 from synpick_warp.stages.render.scene import RenderScene, build_cameras, build_grid
-from synpick_warp.stages.render.view_setup import GBUFFER, VIEW_BODIES, body_sizes, make_views, set_up_views
+from synpick_warp.stages.render.view_setup import GBUFFER, VIEW_BODIES, body_sizes, first_views, set_up_views
 
 IDENTITY = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
 
@@ -59,8 +59,7 @@ def render_object(scene: RenderScene, model: int, pose: Sequence[float] | np.nda
     world.catalog_index.fill_(model)
     world.pose.fill_(wp.transform(*np.asarray(pose, np.float64).tolist()))
     sizes = {"view": count, "row": scene.height, "column": scene.width} | body_sizes(1, scene.width, scene.height)
-    first_world = wp.zeros(count, dtype=wp.int32, device=device)
-    views = make_views(first_world, wp.array(range(count), dtype=wp.int32, device=device), count, 1)
+    views = first_views(count, count, 1, device)
     bodies, gbuffer = allocate_struct(VIEW_BODIES, sizes, device), allocate_struct(GBUFFER, sizes, device)
     set_up_views(scene, scene.cameras, scene.grid, world, world.fixture_visible, views, bodies)
     Rasterizer(scene, 1.0, count, background=gbuffer).rasterize(bodies, views, gbuffer)

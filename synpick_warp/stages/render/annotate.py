@@ -22,11 +22,6 @@ from synpick_warp.stages.render.scene import RenderScene
 BORDER_BOXES = struct_arrays(BorderBoxes, "view_instance", length=("one",))
 
 
-def border_sizes(views: int, instances: int) -> dict[str, int]:
-    """Extents of the dimensions of `BORDER_BOXES`."""
-    return {"view_instance": views * instances, "one": 1}
-
-
 class Annotator:
     """Counts the instances' pixels and bounds them by boxes. Owns its scratch; `annotate` only launches."""
 
@@ -39,7 +34,7 @@ class Annotator:
             views: Maximum number of views of a batch.
         """
         self.scene = scene
-        self.border_boxes: Any = allocate_struct(BORDER_BOXES, border_sizes(views, instances), scene.device)
+        self.border_boxes: Any = allocate_struct(BORDER_BOXES, {"view_instance": views * instances, "one": 1}, scene.device)
 
     def annotate(self, bodies: Any, views: Any, out: ViewBuffers) -> None:
         """Compute `out.pixels` and `out.boxes` of the views from their images and, beyond the image border, by rays.

@@ -139,21 +139,8 @@ class FootprintLists:
     """Footprints in each list."""
 
 
-DENOISED_SCRATCH = (
-    (GUIDE, 1),
-    (PATH_LISTS, 1),
-    (COARSE_LIGHT, 2),
-    (RATIO_IMAGES, 2),
-    (ShadowRays, 1),
-    (LAMP_SHADOWS, 1),
-    (EDGE_LISTS, 1),
-    (FootprintLists, 1),
-)
-"""Arrays that `DenoisedRenderer` allocates, and how many of each."""
-
-
 def scratch_sizes(render: Render, width: int, height: int, histories: int = 0) -> dict[str, int]:
-    """Extents of the dimensions of `DENOISED_SCRATCH` other than the view, for images of `width` x `height` px."""
+    """Extents of the dimensions of the scratch other than the view, for images of `width` x `height` px."""
     size = coarse_size(render, width, histories)
     shadow = shadow_size(size)
     tile_pixels = int(TILE_PIXELS) * shadow**2

@@ -21,7 +21,7 @@ from synpick_warp.stages.arrays import allocate, allocate_struct, struct_arrays
 from synpick_warp.stages.buffers import FIXTURES, Snapshot, ViewBuffers
 from synpick_warp.stages.launch import launch_pixels, launch_views
 from synpick_warp.stages.render.scene import RenderScene
-from synpick_warp.stages.render.view_setup import GBUFFER, VIEW_BODIES, body_sizes, make_views, set_up_views
+from synpick_warp.stages.render.view_setup import BACKGROUND, VIEW_BODIES, body_sizes, first_views, set_up_views
 
 BLOCKS = 32768
 """Capacity for pixel blocks of large triangles per view. A full-HD view filled by thirteen low-polygon objects (hundreds to thousands of
@@ -50,13 +50,17 @@ class Rasterizer:
         Raises:
             CatalogError: A mesh has more triangles than a visibility key can hold.
         """
-        most = max(len(mesh.indices) // 3 for mesh in scene.keep)
+        most = max((len(mesh.indices) // 3 for mesh in scene.keep), default=0)
         if most > MAX_TRIANGLES:
             raise CatalogError(f"a mesh has {most} triangles; at most {MAX_TRIANGLES} can be rendered")
         self.scene = scene
         self.counts_per_meter = counts_per_meter
-        self.visibility = allocate_struct(VISIBILITY_BUFFER, visibility_sizes(views, scene.width, scene.height), scene.device)
-        self.background = render_background(scene) if background is None else background
+        self.visibility = allocate_visibility(views, scene.width, scene.height, scene.device)
+        self.background = background
+        if background is None:
+            self.background = allocate_background(scene.camera_count, scene.width, scene.height, scene.device)
+            if scene.keep:
+                render_background(scene, self.background)
 
     def rasterize(self, bodies: Any, views: Any, gbuffer: Any, out: ViewBuffers | None = None) -> None:
         """Render the G-buffer of a batch of views.
@@ -80,23 +84,26 @@ class Rasterizer:
         launch_pixels(resolve_visibility_kernel, pixels, inputs, [gbuffer, instance, depth], device)
 
 
-def render_background(scene: RenderScene) -> Any:
-    """Render the static background: the struct `GBuffer`, one view a camera, of a world that contains the tote alone."""
+def render_background(scene: RenderScene, gbuffer: Any) -> None:
+    """Render the static background to the struct `GBuffer`, one view a camera, of a world that contains the tote alone."""
     device, cameras = scene.device, scene.camera_count
     sizes = {"view": cameras, "row": scene.height, "column": scene.width} | body_sizes(0, scene.width, scene.height)
     world = allocate(Snapshot, {"world": 1, "instance": 0, "fixture": len(FIXTURES)}, device)
     world.fixture_pose.fill_(wp.transform_identity())
     tote = wp.array([[1, 0, 0]], dtype=wp.int32, device=device)
-    first_world = wp.zeros(cameras, dtype=wp.int32, device=device)
-    views = make_views(first_world, wp.array(range(cameras), dtype=wp.int32, device=device), cameras, 0)
-    bodies, gbuffer = allocate_struct(VIEW_BODIES, sizes, device), allocate_struct(GBUFFER, sizes, device)
+    views = first_views(cameras, cameras, 0, device)
+    bodies = allocate_struct(VIEW_BODIES, sizes, device)
     set_up_views(scene, scene.cameras, scene.grid, world, tote, views, bodies)
     # The background itself must be rasterized.
     bodies.uses_background.zero_()
     Rasterizer(scene, 1.0, cameras, background=gbuffer).rasterize(bodies, views, gbuffer)
-    return gbuffer
 
 
-def visibility_sizes(views: int, width: int, height: int) -> dict[str, int]:
-    """Extents of the dimensions of `VISIBILITY_BUFFER`."""
-    return {"view": views, "row": height, "column": width, "block": BLOCKS}
+def allocate_visibility(views: int, width: int, height: int, device: wp.Device) -> Any:
+    """Allocate the struct `VisibilityBuffer`."""
+    return allocate_struct(VISIBILITY_BUFFER, {"view": views, "row": height, "column": width, "block": BLOCKS}, device)
+
+
+def allocate_background(cameras: int, width: int, height: int, device: wp.Device) -> Any:
+    """Allocate the struct `GBuffer` of a static background, one view a camera."""
+    return allocate_struct(BACKGROUND, {"camera": cameras, "row": height, "column": width}, device)

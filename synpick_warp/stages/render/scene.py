@@ -70,6 +70,13 @@ class RenderScene:
         return self.grid.height
 
 
+def blank_scene(cameras: int, width: int, height: int, device: wp.Device) -> RenderScene:
+    """Scene of cameras without content: in a dry run, constructors ask it for sizes alone."""
+    content = dict.fromkeys(("meshes", "surfaces", "cameras", "lights", "table", "paths"))
+    ids = wp.empty(0, dtype=wp.int32, device="cpu")
+    return RenderScene(**content, grid=build_grid(width, height), obj_id=ids, camera_count=cameras, device=device, keep=())
+
+
 def mip_levels(texture: np.ndarray) -> list[np.ndarray]:
     """Mip pyramid of a texture (H, W, 3) uint8: box-filtered in linear light, down to one texel."""
     levels = [np.ascontiguousarray(texture)]

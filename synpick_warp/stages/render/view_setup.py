@@ -27,6 +27,7 @@ VIEW_BODIES = struct_arrays(
 )
 VIEWS = struct_arrays(Views, "view")
 GBUFFER = struct_arrays(GBuffer, "view", "row", "column", units={"depth": "m"})
+BACKGROUND = struct_arrays(GBuffer, "camera", "row", "column", units={"depth": "m"})
 
 
 def pair_views(worlds: np.ndarray, cameras: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -46,6 +47,13 @@ def make_views(world: wp.array, camera: wp.array, count: int, instances: int) ->
     views = Views()
     views.world, views.camera, views.count, views.instances = world, camera, count, instances
     return views
+
+
+def first_views(count: int, cameras: int, instances: int, device: wp.Device) -> Any:
+    """The struct `Views` of the first views, world by world and camera by camera; arguments as of `make_views`, and number of cameras."""
+    view = np.arange(count, dtype=np.int32)
+    world, camera = (wp.array(values, dtype=wp.int32, device=device) for values in (view // cameras, view % cameras))
+    return make_views(world, camera, count, instances)
 
 
 def body_sizes(instances: int, width: int, height: int) -> dict[str, int]:

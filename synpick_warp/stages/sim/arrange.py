@@ -81,11 +81,12 @@ def sample_episodes_ahead(config: Config, catalog: Catalog, episodes: np.ndarray
     objects.count = len(catalog)
     objects.volume = wp.array([entry.volume for entry in catalog.entries], dtype=float, device=device)
     objects.compound = wp.zeros(len(catalog), dtype=int, device=device)
+    drop = drop_data(config.arrangement, config.render, config.tote, config.pick, config.move, config.physics.gravity, 1)
     index, slot = (wp.empty((count, layout.instances), dtype=wp.int32, device=device) for _ in range(2))
     wp.launch(
         arrangement.sample_objects_kernel,
         dim=count,
-        inputs=[seed, layout, objects, drop_data(config, 1), identity, mode, phase, ending],
+        inputs=[seed, layout, objects, drop, identity, mode, phase, ending],
         outputs=[index, slot],
         device=device,
     )

@@ -55,7 +55,7 @@ def with_enough_worlds(config: Config, device: wp.Device, episodes: int | None =
     """
     worlds = config.bake.worlds
     if not worlds:
-        count = sum(map(len, DataLayout.of(config).plan())) if episodes is None else episodes
+        count = DataLayout.of(config).planned if episodes is None else episodes
         worlds = balance_worlds(count, MAX_GPU_WORLDS if device.is_cuda else MAX_CPU_WORLDS)
     worlds = max(worlds, MIN_GPU_WORLDS) if device.is_cuda else worlds
     return config if worlds == config.bake.worlds else config.with_values({"bake.worlds": worlds})

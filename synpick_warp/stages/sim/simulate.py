@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import newton
@@ -46,6 +46,13 @@ class TickRecord:
     """None: physics is not recorded."""
 
 
+def allocate_worlds(sizes: dict[str, int], device: wp.Device) -> tuple[WorldState, AttemptState, SealState, LastFrame, TickRecord]:
+    """Allocate state and record of all worlds, but for physics, see `StepRecorder`; `sizes`: extents by `world_sizes`."""
+    record = TickRecord(*(allocate(kind, sizes, device) for kind in (Snapshot, WorldStatus, Observation, Plan)))
+    state, attempts, seals = allocate(WorldState, sizes, device), allocate(AttemptState, sizes, device), allocate(SealState, sizes, device)
+    return state, attempts, seals, allocate(LastFrame, sizes, device), record
+
+
 class Simulation:
     """N worlds that run the episodes of a list until none is left."""
 
@@ -83,20 +90,14 @@ class Simulation:
         indices = np.asarray(planned, np.int32)
         self.episodes = wp.array(indices, dtype=wp.int32, device=device)
         sizes = world_sizes(config.bake.worlds, config.arrangement.max_objects, config.move.rounds, built.layout.bodies_per_world)
-        self.state = allocate(WorldState, sizes, device)
-        self.attempts = allocate(AttemptState, sizes, device)
-        self.seals = allocate(SealState, sizes, device)
-        self.observation = allocate(Observation, sizes, device)
-        self.plan = allocate(Plan, sizes, device)
-        self.last = allocate(LastFrame, sizes, device)
+        self.state, self.attempts, self.seals, self.last, record = allocate_worlds(sizes, device)
+        self.observation, self.plan = record.observation, record.plan
         self.recorder: StepRecorder | None = None
         if records_physics:
             self.recorder = StepRecorder(
                 config.trajectory, config.gripper, self.scene, self.state, self.attempts, self.seals, self.physics, sizes
             )
-        physics = self.recorder.record if self.recorder is not None else None
-        snapshot, status = allocate(Snapshot, sizes, device), allocate(WorldStatus, sizes, device)
-        self.record = TickRecord(snapshot, status, self.observation, self.plan, physics)
+        self.record = replace(record, physics=self.recorder.record if self.recorder is not None else None)
         self.suction: Suction | None = None
         self.perception: Perception | None = None
         if may_pick(config.bake, config.splits):

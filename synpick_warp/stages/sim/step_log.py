@@ -72,9 +72,9 @@ def record_sizes(sizes: dict[str, int], steps_per_tick: int) -> dict[str, int]:
     return sizes | {"step": steps_per_tick, "place": sizes["instance"] + build.GRIPPER_BODIES}
 
 
-def record_kinds(settings: Trajectory) -> tuple[type, ...]:
-    """Dataclasses of this module that are allocated under these settings."""
-    return (StepArrays, DropArrays) if settings.steps else (DropArrays,)
+def allocate_record(stores_steps: bool, sizes: dict[str, int], device: wp.Device) -> PhysicsRecord:
+    """Allocate the record of a tick's physics; `sizes`: extents by `record_sizes`."""
+    return PhysicsRecord(allocate(StepArrays, sizes, device) if stores_steps else None, allocate(DropArrays, sizes, device))
 
 
 class StepRecorder:
@@ -111,8 +111,7 @@ class StepRecorder:
         self._device = state.phase.device
         self._sizes = record_sizes(sizes, physics.settings.steps_per_tick)
         self._steps = settings.steps
-        steps = allocate(StepArrays, self._sizes, self._device) if settings.steps else None
-        self.record = PhysicsRecord(steps, allocate(DropArrays, self._sizes, self._device))
+        self.record = allocate_record(settings.steps, self._sizes, self._device)
         self._substep_fraction = 1.0 / physics.settings.substeps
         self._weight = (gripper.finger_mass + gripper.cup_mass) * physics.settings.gravity
         self._total = wp.zeros((sizes["body"], int(step_log.MAGNITUDE) + 1), dtype=wp.int64, device=self._device)

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from pycocotools.coco import COCO
 
+from synpick_warp.configs.export import ExportSettings
 from synpick_warp.configs.schema import Split
 from synpick_warp.configs.splits import DataLayout
 from synpick_warp.errors import DatasetError, OutputError
@@ -132,4 +133,4 @@ def test_damaged_parts_are_one_error(tmp_path, name):
     (out / name).write_text("[}\n")
     (out / ".partial").mkdir()
     with pytest.raises(DatasetError, match=Path(name).name):
-        CocoExporter.finalize(out, config(), None, (0,))  # type: ignore[arg-type]
+        CocoExporter.finalize(out, ExportSettings.of(config()), None, (0,))  # type: ignore[arg-type]

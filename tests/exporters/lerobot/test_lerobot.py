@@ -15,6 +15,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from synpick_warp.codes import Outcome, Task
+from synpick_warp.configs.export import ExportSettings
 from synpick_warp.configs.load import load_config
 from synpick_warp.configs.schema import Config, Split
 from synpick_warp.configs.splits import DataLayout
@@ -194,7 +195,7 @@ def test_splits_are_ranges_of_episodes(tmp_path, dataset, episodes):
     settings = dataclasses.replace(trajectories.config(), splits=splits)
     shutil.copytree(dataset, out := tmp_path / "set" / "lerobot")
     (out.parent / ".partial").mkdir()
-    LerobotExporter.finalize(out.parent, settings, None, range(10))  # type: ignore[arg-type]
+    LerobotExporter.finalize(out.parent, ExportSettings.of(settings), None, range(10))  # type: ignore[arg-type]
     assert json.loads((out / "meta" / "info.json").read_text())["splits"] == {"train": "0:1", "test": "1:2"}
     assert [row["source/split"] for row in pq.read_table(out.parent / layout.EPISODES).to_pylist()] == ["train", "test"]
     assert "  data_files: data/*/*.parquet\n" in (out / "README.md").read_text()
@@ -246,7 +247,7 @@ def test_damaged_parts_are_one_error(tmp_path, fault):
         part.symlink_to(tmp_path / "elsewhere")
     (out / ".partial").mkdir()
     with pytest.raises(DatasetError, match=r"000000\.json"):
-        LerobotExporter.finalize(out, trajectories.config(), None, (0,))  # type: ignore[arg-type]
+        LerobotExporter.finalize(out, ExportSettings.of(trajectories.config()), None, (0,))  # type: ignore[arg-type]
 
 
 def test_missing_packages_are_one_line_that_says_what_to_install(monkeypatch):

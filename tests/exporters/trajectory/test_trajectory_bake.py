@@ -15,12 +15,13 @@ import zarr
 
 import synpick_warp
 from synpick_warp.configs.schema import Config
-from synpick_warp.factory import assembly, memory_plan
+from synpick_warp.factory import assembly
 from synpick_warp.factory.pipeline import run_bake
 from synpick_warp.stages import ticks
 from synpick_warp.stages.stream import FrameStream
 from synpick_warp.system.progress import SilentProgress
 from tests.harness.exporter_contract import digests
+from tests.harness.memory_tables import device_arrays
 from tests.worlds.sights import SHORT
 from tests.worlds.small_worlds import catalog, settings
 
@@ -130,7 +131,7 @@ def test_what_is_opened_is_what_was_baked(out, mixed):
 def test_the_memory_table_counts_recorded_arrays(mixed):
     """One record; none for formats that ask for none."""
     mixed = replace(mixed, bake=replace(mixed.bake, device="cpu"))  # A GPU gets at least eight worlds.
-    rows = [row for row in memory_plan.describe_arrays(mixed) if row[0] == "StepArrays.pose"]
+    rows = [row for row in device_arrays(mixed) if row[0] == "StepArrays.pose"]
     assert rows == [("StepArrays.pose", (1, 16, 4), "m", 16 * 4 * 28)]
     without = replace(mixed, bake=replace(mixed.bake, formats=("bop",)))
-    assert not any(row[0].startswith("StepArrays") for row in memory_plan.describe_arrays(without))
+    assert not any(row[0].startswith("StepArrays") for row in device_arrays(without))

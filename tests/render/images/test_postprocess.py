@@ -17,7 +17,6 @@ from synpick_warp.configs.load import load_config
 from synpick_warp.configs.schema import Config
 from synpick_warp.configs.sensors import Effects, effect_ranges
 from synpick_warp.errors import ConfigError
-from synpick_warp.factory.memory_plan import describe_arrays
 from synpick_warp.kernels.render.images.antialias import ShadedImage
 from synpick_warp.kernels.render.images.camera_effects import EffectParameters
 from synpick_warp.kernels.render.lighting.environment import Lights
@@ -27,6 +26,7 @@ from synpick_warp.stages.render.scene import build_cameras, build_grid
 from synpick_warp.stages.render.view_setup import make_views
 from synpick_warp.system.hardware.device import pick_device
 from tests.harness.devices import default_device
+from tests.harness.memory_tables import device_arrays
 from tests.worlds.toy_scene import UPRIGHT, ToyScene, box, camera, entry, render
 
 WIDTH, HEIGHT = 72, 40
@@ -341,7 +341,7 @@ def test_effect_parameters_are_uniform_in_their_ranges():
 
 def test_scratch_of_the_lens_filter_is_declared_only_if_needed():
     for effects, needed in (({}, False), ({"vignette": (0.1, 0.2)}, False), ({"blur": (0.0, 1.0)}, True)):
-        names = {name for name, *_ in describe_arrays(make_config(**effects))}
+        names = {name for name, *_ in device_arrays(make_config(**effects))}
         assert ("LensArrays.radiance" in names) == needed
 
 

@@ -58,9 +58,9 @@ def measure_peers(config: Config, peers: tuple[str, ...], min_seconds: float) ->
     pile = pick_pile(factory.catalog, factory.simulation.record.snapshot)
     yield Row(f"build and settle {few.bake.worlds} worlds", time.perf_counter() - started, "s", part="setup")
     if "sensor-camera" in peers:
-        yield from _guard("sensor", partial(measure_sensor, few, factory, min_seconds))
+        yield from _guard("sensor", partial(measure_sensor, factory, min_seconds))
     if "mujoco-warp" in peers:
-        yield from _guard("mujoco-warp", partial(measure_rendering, few, factory, min_seconds))
+        yield from _guard("mujoco-warp", partial(measure_rendering, factory, min_seconds))
     if {"mujoco-warp", "mujoco"} & set(peers):
         yield from _measure_physics(config.physics, config.tote, config.bake.worlds, pile, peers, factory.simulation.device)
 

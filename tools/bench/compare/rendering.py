@@ -9,16 +9,15 @@ from dataclasses import fields, replace
 import numpy as np
 import warp as wp
 
-from synpick_warp.configs.schema import UNOCCLUDED, Config
+from synpick_warp.configs.schema import UNOCCLUDED
 from synpick_warp.factory.assembly import Factory, make_renderer
 from synpick_warp.scenes.cameras import make_cameras
 from synpick_warp.scenes.fixtures import make_fixtures
 from synpick_warp.scenes.types import Camera
-from synpick_warp.stages.buffers import Snapshot, allocate_view_buffers
+from synpick_warp.stages.buffers import Snapshot
 from synpick_warp.stages.render.scene import build_cameras, build_grid
-from synpick_warp.stages.render.view_setup import make_views
 from tools.bench.compare.ray_scene import RayScene
-from tools.bench.compare.sensor import CHECKED_VIEWS, compare_hits, rate_rows
+from tools.bench.compare.sensor import CHECKED_VIEWS, OurViews, compare_hits, rate_rows
 from tools.bench.physics import BURST, seconds_per_call
 from tools.options import Row
 
@@ -28,25 +27,25 @@ SMALL_WORLDS, SMALL_WORLDS_CPU = 2048, 8
 """Worlds with such images, on a GPU and on the CPU."""
 
 
-def measure_rendering(config: Config, factory: Factory, min_seconds: float) -> Iterator[Row]:
+def measure_rendering(factory: Factory, min_seconds: float) -> Iterator[Row]:
     """Benchmark of both renderers, with images of `cameras.resolution` in as many worlds as make a batch, and with small ones in many.
 
     Worlds beyond the factory's show its piles again.
     """
-    cameras, device = len(factory.cameras), factory.simulation.device
-    yield from _measure_size(config, factory, max(1, factory.stream.batch // cameras), min_seconds)
-    small = config.with_values({"cameras.resolution": SMALL_SIZE})
-    yield from _measure_size(small, factory, SMALL_WORLDS if device.is_cuda else SMALL_WORLDS_CPU, min_seconds)
+    cameras, device = factory.cameras, factory.simulation.device
+    yield from _measure_size(factory, cameras, max(1, factory.stream.batch // len(cameras)), min_seconds)
+    small = make_cameras(replace(factory.config.cameras, resolution=SMALL_SIZE))
+    yield from _measure_size(factory, small, SMALL_WORLDS if device.is_cuda else SMALL_WORLDS_CPU, min_seconds)
 
 
-def _measure_size(config: Config, factory: Factory, worlds: int, min_seconds: float) -> Iterator[Row]:
-    """Benchmark of both renderers with images of `cameras.resolution` in `worlds` worlds."""
-    cameras, device, scene = make_cameras(config.cameras), factory.simulation.device, factory.stream.renderer.scene
+def _measure_size(factory: Factory, cameras: tuple[Camera, ...], worlds: int, min_seconds: float) -> Iterator[Row]:
+    """Benchmark of both renderers with images of these cameras in `worlds` worlds."""
+    device, scene, config = factory.simulation.device, factory.stream.renderer.scene, factory.config
     snapshot = tile_snapshot(factory.simulation.record.snapshot, worlds, device)
     count, pixels = worlds * len(cameras), cameras[0].width * cameras[0].height
     size = f"{cameras[0].width}x{cameras[0].height}, {worlds:,} world{'' if worlds == 1 else 's'}"
     yield Row(f"{size}: views in a batch", count, "")
-    ours = OurViews(config, factory, cameras, snapshot, worlds)
+    ours = make_views_of(factory, config.render.mode, cameras, snapshot, worlds)
     meshes = [(entry.mesh, entry.material) for entry in factory.catalog.entries]
     table = (float(scene.table.height), config.render.table_color) if config.render.table else None
     theirs = RayScene(meshes, make_fixtures(config.tote, config.gripper), cameras, table, snapshot, worlds, device)
@@ -68,7 +67,7 @@ def _measure_size(config: Config, factory: Factory, worlds: int, min_seconds: fl
     everything = "color by light maps with indirect light and anti-aliasing, depth, ids, amodal bits, counts, boxes"
     theirs_colored = "color by one light with shadows, depth, ids"
     yield from _pair(size, pixels, everything, theirs_colored, seconds)
-    unoccluded = OurViews(config.with_values({"render.mode": UNOCCLUDED}), factory, cameras, snapshot, worlds)
+    unoccluded = make_views_of(factory, UNOCCLUDED, cameras, snapshot, worlds)
     seconds = time_view(functools.partial(unoccluded.render)), seconds[1]
     plain = "render.mode unoccluded, color by light maps with shadows of one lamp and anti-aliasing, depth, ids, amodal bits, counts, boxes"
     yield from _pair(size, pixels, plain, theirs_colored, seconds)
@@ -89,23 +88,9 @@ def tile_snapshot(snapshot: Snapshot, worlds: int, device: wp.Device) -> Snapsho
     return Snapshot(**{name: wp.array(array.numpy()[chosen], dtype=array.dtype, device=device) for name, array in arrays.items()})
 
 
-class OurViews:
-    """Our renderer at the image size of `cameras`, for all cameras of the first worlds of a snapshot."""
-
-    def __init__(self, config: Config, factory: Factory, cameras: tuple[Camera, ...], snapshot: Snapshot, worlds: int) -> None:
-        scene, count, instances = factory.stream.renderer.scene, worlds * len(cameras), factory.stream.renderer.instances
-        width, height = cameras[0].width, cameras[0].height
-        scene = replace(scene, cameras=build_cameras(cameras, scene.device), grid=build_grid(width, height))
-        self.snapshot, view = snapshot, np.arange(count, dtype=np.int32)
-        self.renderer = make_renderer(config, scene, instances, count, histories=count)
-        self.out = allocate_view_buffers(count, width, height, instances, scene.device)
-        world, camera = (wp.array(v, dtype=wp.int32, device=scene.device) for v in (view // len(cameras), view % len(cameras)))
-        self.views = make_views(world, camera, count, instances)
-
-    def render_gbuffer(self) -> None:
-        """Render depth, ids and amodal bits alone."""
-        self.renderer.render_gbuffer(self.snapshot, self.views, self.out)
-
-    def render(self) -> None:
-        """Render the views by all stages of our renderer."""
-        self.renderer.render(self.snapshot, self.views, self.out)
+def make_views_of(factory: Factory, mode: str, cameras: tuple[Camera, ...], snapshot: Snapshot, worlds: int) -> OurViews:
+    """Our renderer in a mode and at the image size of `cameras`, for all cameras of the first worlds of a snapshot."""
+    count, scene = worlds * len(cameras), factory.renderer.scene
+    scene = replace(scene, cameras=build_cameras(cameras, scene.device), grid=build_grid(cameras[0].width, cameras[0].height))
+    config = factory.config.with_values({"render.mode": mode})
+    return OurViews(make_renderer(config, scene, factory.renderer.instances, count, histories=count), snapshot, count)

@@ -15,14 +15,15 @@ from newton.sensors import SensorCamera
 from scipy.spatial.transform import Rotation
 
 from synpick_warp.codes import Segment
-from synpick_warp.configs.schema import Config, Render
+from synpick_warp.configs.schema import Render
 from synpick_warp.factory.assembly import Factory
 from synpick_warp.scenes.fixtures import make_fixtures
 from synpick_warp.scenes.types import Camera, Catalog, Fixture, Material, TriangleMesh
 from synpick_warp.stages.arrays import allocate
-from synpick_warp.stages.buffers import LayerBuffers, Snapshot
+from synpick_warp.stages.buffers import LayerBuffers, Snapshot, allocate_view_buffers
 from synpick_warp.stages.render.layers import LayerRenderer
-from synpick_warp.stages.render.view_setup import make_views
+from synpick_warp.stages.render.renderer import Renderer
+from synpick_warp.stages.render.view_setup import first_views
 from tools.bench.physics import BURST, seconds_per_call
 from tools.options import Row
 
@@ -213,13 +214,13 @@ def compare_surfaces(cameras: tuple[Camera, ...], normal: np.ndarray, albedo: np
     ]
 
 
-def measure_sensor(config: Config, factory: Factory, min_seconds: float) -> Iterator[Row]:
+def measure_sensor(factory: Factory, min_seconds: float) -> Iterator[Row]:
     """Benchmark of both renderers for three sets of outputs.
 
     Both update poses and render a batch of views. On CUDA both launch without waiting, so that launch overhead is hidden. The
     sensor has no light maps, amodal bits, counts, boxes, or texture minification.
     """
-    simulation, renderer = factory.simulation, factory.stream.renderer
+    simulation, renderer, config = factory.simulation, factory.stream.renderer, factory.config
     device, snapshot = simulation.device, simulation.record.snapshot
     count = min(factory.stream.batch, simulation.layout.worlds * len(factory.cameras))
     started = time.perf_counter()
@@ -229,7 +230,9 @@ def measure_sensor(config: Config, factory: Factory, min_seconds: float) -> Iter
     wp.synchronize_device(device)
     yield Row("build a Newton model of the batch's worlds", time.perf_counter() - started, "s")
     yield Row("views in a batch", count, "")
-    ours = _OurRenderer(factory, count)
+    ours = OurViews(renderer, snapshot, count)
+    layer_renderer = LayerRenderer(LAYERS, None, renderer.scene, renderer.instances, count)
+    our_layers = allocate(LayerBuffers, {"view": count, "row": renderer.scene.height, "column": renderer.scene.width}, device, LAYERS)
     hit_images = scene.allocate_outputs(forward_depth_image="depth_forward", shape_index_image="shape_index")
     surface_images = scene.allocate_outputs(normal_image="normal", albedo_image="albedo")
     color_images = scene.allocate_outputs(color_image="color")
@@ -237,6 +240,11 @@ def measure_sensor(config: Config, factory: Factory, min_seconds: float) -> Iter
     def time_view(function: Callable[[], object]) -> float:
         """Time of one view [s]."""
         return seconds_per_call(function, device, min_seconds / 4, BURST) / count
+
+    def render_layers() -> None:
+        """Layers, besides depth, ids and amodal bits."""
+        ours.render_gbuffer()
+        layer_renderer.render(snapshot, renderer.bodies, renderer.gbuffer, ours.views, our_layers)
 
     times = [time_view(ours.render_gbuffer)]
     orders = {name: time_view(functools.partial(scene.render, order, hit_images)) for name, order in ORDERS.items()}
@@ -251,41 +259,33 @@ def measure_sensor(config: Config, factory: Factory, min_seconds: float) -> Iter
     pixels = factory.cameras[0].width * factory.cameras[0].height
     yield from _comparison_rows("depth, index", ", amodal bits", "", (times[0], orders[best]), pixels)
     textured = replace(ORDERS[best], enable_textures=True)
-    times = [time_view(ours.render_layers), time_view(functools.partial(scene.render, textured, hit_images | surface_images))]
-    layers = {name: getattr(ours.layers, name)[:checked].numpy() for name in LAYERS}
+    times = [time_view(render_layers), time_view(functools.partial(scene.render, textured, hit_images | surface_images))]
+    layers = {name: getattr(our_layers, name)[:checked].numpy() for name in LAYERS}
     normal, albedo = (image[:checked].numpy() for image in surface_images.values())
     yield from compare_surfaces(factory.cameras, normal, albedo, layers)
     yield from _comparison_rows("depth, index, normals, albedo", ", amodal bits", "", (times[0], times[1]), pixels)
     lit = replace(textured, enable_shadows=True)
-    times = [time_view(ours.render_color), time_view(functools.partial(scene.render, lit, hit_images | color_images))]
+    times = [time_view(ours.render), time_view(functools.partial(scene.render, lit, hit_images | color_images))]
     yield from _comparison_rows(
         "color, depth, index", ", indirect light, anti-aliasing, amodal bits, counts, boxes", ", one light", (times[0], times[1]), pixels
     )
 
 
-class _OurRenderer:
-    """Our renderer, for the first views of the last snapshot."""
+class OurViews:
+    """Our renderer, for the first views of a snapshot."""
 
-    def __init__(self, factory: Factory, count: int) -> None:
-        self.renderer, self.out = factory.stream.renderer, factory.stream.buffers[0]
-        self.snapshot = factory.simulation.record.snapshot
-        scene, cameras, view = self.renderer.scene, len(factory.cameras), np.arange(count, dtype=np.int32)
-        world, camera = (wp.array(v, dtype=wp.int32, device=scene.device) for v in (view // cameras, view % cameras))
-        self.views = make_views(world, camera, count, self.renderer.instances)
-        self.layer_renderer = LayerRenderer(LAYERS, None, scene, self.renderer.instances, count)
-        self.layers = allocate(LayerBuffers, {"view": count, "row": scene.height, "column": scene.width}, scene.device, LAYERS)
+    def __init__(self, renderer: Renderer, snapshot: Snapshot, count: int) -> None:
+        scene = renderer.scene
+        self.renderer, self.snapshot = renderer, snapshot
+        self.out = allocate_view_buffers(count, scene.width, scene.height, renderer.instances, scene.device)
+        self.views = first_views(count, scene.camera_count, renderer.instances, scene.device)
 
     def render_gbuffer(self) -> None:
-        """Render the G-buffer alone."""
+        """Depth, ids and amodal bits alone."""
         self.renderer.render_gbuffer(self.snapshot, self.views, self.out)
 
-    def render_layers(self) -> None:
-        """Render the G-buffer and the layers."""
-        self.render_gbuffer()
-        self.layer_renderer.render(self.snapshot, self.renderer.bodies, self.renderer.gbuffer, self.views, self.layers)
-
-    def render_color(self) -> None:
-        """Render all images, colour included."""
+    def render(self) -> None:
+        """All stages."""
         self.renderer.render(self.snapshot, self.views, self.out)
 
 

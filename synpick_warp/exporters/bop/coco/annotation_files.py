@@ -16,15 +16,14 @@ from typing import Any
 
 import msgspec
 
-from synpick_warp.configs.schema import Config
-from synpick_warp.configs.splits import DataLayout
+from synpick_warp.configs.export import ExportSettings
 from synpick_warp.errors import DatasetError
 from synpick_warp.exporters.base import EncodedView
 from synpick_warp.exporters.bop.keypoints import Keypoints, make_category_keys
 from synpick_warp.exporters.bop.outlines import trace_outlines
 from synpick_warp.exporters.bop.scene import AnnotationBlocks
 from synpick_warp.exporters.bop.view import ANNOTATIONS, ViewSettings, annotation_block, make_keypoints, make_rle, to_json
-from synpick_warp.exporters.writing.files import PARTIAL, output_error, sync_folder, write_synced
+from synpick_warp.exporters.writing.files import PARTIAL, output_errors, sync_folder, write_synced
 from synpick_warp.exporters.writing.folder import open_folder
 from synpick_warp.exporters.writing.rle import Runs
 from synpick_warp.system.inputs.files import read_file
@@ -57,15 +56,13 @@ def annotation_file(split: str) -> Path:
 
 def write_categories(out: Path, names: Mapping[int, str], keypoints: Mapping[int, Keypoints]) -> None:
     """Write names and keypoints (or none) of the objects by obj_id, and the folders of the format."""
-    try:
+    with output_errors(out / CATEGORIES):
         for folder in (FOLDER, IMAGES, PARTS):
             (out / folder).mkdir(exist_ok=True)
         extras = {obj_id: make_category_keys(points) for obj_id, points in keypoints.items()}
         named = [{"id": obj_id, "name": name, "supercategory": "object"} for obj_id, name in sorted(names.items())]
         categories = [category | extras.get(obj_id, {}) for category, obj_id in zip(named, sorted(names), strict=True)]
         (out / CATEGORIES).write_text(json.dumps(categories, indent=2) + "\n", encoding="ascii")
-    except OSError as error:
-        raise output_error(out / CATEGORIES, error) from error
 
 
 def scene_files(out: Path, scenes: Iterable[int]) -> list[Path]:
@@ -135,21 +132,21 @@ def commit_scenes(scenes: tuple[tuple[Path, int], ...], out: Path, frames: Seque
         sync_folder(out / folder)
 
 
-def write_annotation_files(out: Path, config: Config, episodes: Iterable[int]) -> list[Path]:
+def write_annotation_files(out: Path, settings: ExportSettings, episodes: Iterable[int]) -> list[Path]:
     """Join the episodes' parts to an annotation file a split; images and annotations are numbered from 1 in each. Returns their names.
 
     Raises:
         DatasetError: A part is damaged.
         OSError: A file cannot be written.
     """
-    layout = DataLayout.of(config)
+    layout = settings.layout
     parts: dict[str, list[Path]] = {split: [] for split in layout.folders}
     cameras = layout.cameras
     for episode in episodes:
         names = (out / PARTS / f"{scene:06d}.jsonl" for scene in range(cameras * episode, cameras * (episode + 1)))
         parts[layout.folder(episode)] += filter(os.path.lexists, names)
     categories = read_json(path_inside(out, str(CATEGORIES), out, DatasetError), list[_Category], DatasetError, _ADVICE)
-    describe = partial(_describe_image, cameras, config.cameras.resolution, config.bop.color_format)
+    describe = partial(_describe_image, cameras, settings.cameras.resolution, settings.bop.color_format)
     return [_write_annotations(out, describe, split, found, categories) for split, found in parts.items()]
 
 

@@ -9,7 +9,8 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from synpick_warp.configs.schema import Bop, Config
+from synpick_warp.configs.export import ExportSettings
+from synpick_warp.configs.schema import Bop
 from synpick_warp.configs.splits import DataLayout
 from synpick_warp.exporters.base import SharedFiles
 from synpick_warp.exporters.bop.coco.annotation_files import (
@@ -25,7 +26,7 @@ from synpick_warp.exporters.bop.coco.annotation_files import (
     write_view,
 )
 from synpick_warp.exporters.bop.scene_exporter import SceneExporter
-from synpick_warp.exporters.writing.files import output_error
+from synpick_warp.exporters.writing.files import output_errors
 from synpick_warp.exporters.writing.notes import note_files, write_notes
 from synpick_warp.exporters.writing.pool import WriterPool
 
@@ -57,29 +58,21 @@ class CocoExporter(SceneExporter):
         return SharedFiles((CATEGORIES, *note_files(layout.formats)), places, (IMAGES, PARTS, places[0].parent, FOLDER))
 
     @staticmethod
-    def finalize(out: Path, config: Config, pool: WriterPool, episodes: Sequence[int]) -> list[Path]:
+    def finalize(out: Path, settings: ExportSettings, pool: WriterPool, episodes: Sequence[int]) -> list[Path]:
         """Write the annotation file of each split from the parts of all episodes; returns their paths. See `Exporter`."""
-        try:
-            return write_annotation_files(out, config, episodes)
-        except OSError as error:
-            raise output_error(out / FOLDER, error) from error
+        with output_errors(out / FOLDER):
+            return write_annotation_files(out, settings, episodes)
 
     def write_constants(self) -> list[Path]:
         """Write names and keypoints of the objects, camera file and notes; returns their paths. See `Exporter`."""
         names = self._context.names
         write_categories(self._out, names, self._keypoints)
-        try:
-            return [CATEGORIES, *write_notes(self._out, self._context.config, names, self._cameras)]
-        except OSError as error:
-            raise output_error(self._out, error) from error
+        with output_errors(self._out):
+            return [CATEGORIES, *write_notes(self._out, self._context.settings, names, self._cameras)]
 
     def files(self, episode: int) -> list[Path]:
         """Existing paths of an episode: folders of images, and parts of annotations. See `Exporter`."""
         return scene_files(self._out, [self.scene_id(episode, camera) for camera in range(len(self._cameras))])
-
-    def _stage_scene(self, scene: Path) -> None:
-        """Create the staging folder of a scene."""
-        scene.mkdir()
 
     def _commit_task(self, scenes: tuple[tuple[Path, int], ...], images: Sequence[int]) -> tuple[Callable[..., None], tuple[Any, ...]]:
         """Task that completes an episode: renames its staged images and annotation parts to their places (`commit_scenes`)."""

@@ -7,14 +7,13 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from synpick_warp.configs.schema import Config
-from synpick_warp.configs.sensors import effect_ranges
+from synpick_warp.configs.export import ExportSettings
 from synpick_warp.configs.splits import DataLayout
 from synpick_warp.exporters.base import SharedFiles
 from synpick_warp.exporters.bop.scene_exporter import CONSTANTS, SceneExporter
 from synpick_warp.exporters.bop.shards.card import CARD_FILE, CardContent, SplitContent, hub_splits, make_card
 from synpick_warp.exporters.bop.shards.tar_files import commit_shards, find_shards, list_keys, shard_index, write_layer, write_view
-from synpick_warp.exporters.writing.files import PARTIAL, output_error, write_atomically
+from synpick_warp.exporters.writing.files import PARTIAL, output_errors, write_atomically
 from synpick_warp.exporters.writing.pool import WriterPool
 
 KEYS_FILE = "key_to_shard.json"
@@ -45,19 +44,17 @@ class ShardsExporter(SceneExporter):
         return SharedFiles(CONSTANTS, (*(split / KEYS_FILE for split in splits), Path(CARD_FILE)), splits)
 
     @staticmethod
-    def finalize(out: Path, config: Config, pool: WriterPool, episodes: Sequence[int]) -> list[Path]:
+    def finalize(out: Path, settings: ExportSettings, pool: WriterPool, episodes: Sequence[int]) -> list[Path]:
         """Write the index of views and shards of each split, and the dataset card; returns their paths. See `Exporter`."""
-        layout = DataLayout.of(config)
+        layout = settings.layout
         cameras = layout.cameras
         scenes = [scene for episode in episodes for scene in range(cameras * episode, cameras * (episode + 1))]
         contents = [
             _write_keys(out, name, split, pool, scenes)
             for name, split in zip(hub_splits(layout), ShardsExporter.folders(layout), strict=True)
         ]
-        try:
-            write_atomically(out / CARD_FILE, make_card(_describe(config, contents)).encode())
-        except OSError as error:
-            raise output_error(out / CARD_FILE, error) from error
+        with output_errors(out / CARD_FILE):
+            write_atomically(out / CARD_FILE, make_card(_describe(settings, contents)).encode())
         return [*(Path(split.folder) / KEYS_FILE for split in contents), Path(CARD_FILE)]
 
     def files(self, episode: int) -> list[Path]:
@@ -65,33 +62,29 @@ class ShardsExporter(SceneExporter):
         scenes = (self.scene_id(episode, camera) for camera in range(len(self._cameras)))
         return sorted(path.relative_to(self._out) for scene in scenes for path in find_shards(scene, self._folder(scene)))
 
-    def _stage_scene(self, scene: Path) -> None:
-        """Create the staging folder of a scene."""
-        scene.mkdir()
-
     def _commit_task(self, scenes: tuple[tuple[Path, int], ...], images: Sequence[int]) -> tuple[Callable[..., None], tuple[Any, ...]]:
         """Task that completes an episode: packs its staged views into tar shards (`commit_shards`)."""
         return commit_shards, (scenes, self._folder(scenes[0][1]), images, self._layers)
 
 
-def _describe(config: Config, splits: list[SplitContent]) -> CardContent:
+def _describe(settings: ExportSettings, splits: list[SplitContent]) -> CardContent:
     """Content of a data set's card, from its settings and splits."""
-    bake, bop = config.bake, config.bop
+    bake, bop = settings.bake, settings.bop
     return CardContent(
         splits=tuple(splits),
         embedded=not (bake.models or bake.lights),
         color_suffix=f".{bop.color_format}",
         masks=bop.masks,
-        instances=config.arrangement.max_objects,
-        layers=config.render.layers,
-        effects=tuple(name for name, limits in effect_ranges(config.effects).items() if any(limits)),
+        instances=settings.objects,
+        layers=settings.render.layers,
+        effects=settings.effects,
     )
 
 
 def _write_keys(out: Path, name: str, split: Path, pool: WriterPool, scenes: Sequence[int]) -> SplitContent:
     """Write the index of the views and shards of those scenes that a split has; returns how many there are."""
     parts = out / PARTIAL / ShardsExporter.staging / "keys"
-    try:
+    with output_errors(out / split):
         parts.parent.mkdir(exist_ok=True)
         shutil.rmtree(parts, ignore_errors=True)
         parts.mkdir()
@@ -102,5 +95,3 @@ def _write_keys(out: Path, name: str, split: Path, pool: WriterPool, scenes: Seq
         lines = [line for part in sorted(parts.iterdir(), key=shard_index) for line in part.read_bytes().splitlines()]
         write_atomically(out / split / KEYS_FILE, b"{\n" + b",\n".join(lines) + b"\n}\n")
         return SplitContent(name, split.name, len(lines), len(shards), sum(shard.stat().st_size for shard in shards))
-    except OSError as error:
-        raise output_error(out / split, error) from error

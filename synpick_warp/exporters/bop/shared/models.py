@@ -9,8 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from synpick_warp.configs.modes import bake_modes
-from synpick_warp.configs.schema import Config
+from synpick_warp.configs.export import ExportSettings
 from synpick_warp.configs.splits import DataLayout
 from synpick_warp.errors import CatalogError
 from synpick_warp.exporters.bop.shared.toolkit import describe_toolkit
@@ -186,17 +185,16 @@ def _describe_scenes(layout: DataLayout) -> str:
     return f"Camera c of episode k is scene {layout.cameras} · k + c"
 
 
-def describe_dataset(config: Config, catalog: Catalog, cameras: tuple[Camera, ...]) -> str:
+def describe_dataset(settings: ExportSettings, catalog: Catalog, cameras: tuple[Camera, ...]) -> str:
     """Text of dataset_info.md: conventions of the ground truth, and the objects."""
-    camera, layout, modes = cameras[0], DataLayout.of(config), ", ".join(bake_modes(config.bake, config.splits))
-    period = config.physics.step * config.physics.steps_per_tick
+    camera, layout, period = cameras[0], settings.layout, settings.physics.tick_time
     objects = "\n".join(f"| {entry.obj_id} | {entry.name} | {entry.mass:g} |" for entry in catalog.entries)
     return f"""# A SynPick data set
 
-Made by synpick-warp (mode {modes}, seed {config.bake.seed}, {layout.cameras} cameras), in the format of the
+Made by synpick-warp (mode {", ".join(settings.modes)}, seed {settings.bake.seed}, {layout.cameras} cameras), in the format of the
 BOP challenge (scenewise). {_describe_scenes(layout)} of {_describe_folders(layout)}. Frames are {period:g} s apart.
 
-- Lengths are in millimetres. A depth image's count times `depth_scale` ({config.bop.depth_scale:g}) is the planar depth, along the
+- Lengths are in millimetres. A depth image's count times `depth_scale` ({settings.bop.depth_scale:g}) is the planar depth, along the
   optical axis; 0: no surface.
 - Pictures have {camera.width} x {camera.height} pixels. The centre of pixel (row, column) is (column + 0.5, row + 0.5): for OpenCV and
   Open3D, whose pixel centres have whole coordinates, subtract 0.5 from cx and cy. Cameras have x right, y down, z forward.
@@ -208,7 +206,7 @@ BOP challenge (scenewise). {_describe_scenes(layout)} of {_describe_folders(layo
   in an image's list.
 - `mask_visib` is exact: what the ray through the pixel's centre meets first. The masks of an image do not overlap.
 - `px_count_all` and `bbox_obj` count what lies outside of the picture too, up to one picture's size beyond each border.
-{layer_notes(config.render.layers)}- `models_eval/` equals `models/`.
+{layer_notes(settings.render.layers)}- `models_eval/` equals `models/`.
 
 | obj_id | name | mass [kg] |
 |---|---|---|

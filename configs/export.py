@@ -1,0 +1,52 @@
+"""Settings that all writers of a data set share: sections, and values that follow from others."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from synpick_warp.configs.modes import bake_modes
+from synpick_warp.configs.schema import Bake, Bop, Cameras, Config, Gripper, Physics, Render, Tote, Trajectory
+from synpick_warp.configs.sensors import effect_ranges
+from synpick_warp.configs.splits import DataLayout
+
+
+@dataclass(frozen=True)
+class ExportSettings:
+    """Settings by which files are written: what all views and episodes of a data set have in common."""
+
+    layout: DataLayout
+    bake: Bake
+    bop: Bop
+    cameras: Cameras
+    physics: Physics
+    render: Render
+    trajectory: Trajectory
+    tote: Tote
+    gripper: Gripper
+    effects: tuple[str, ...]
+    """Names of the camera effects that are on."""
+    objects: int
+    """Maximum number of objects of an episode."""
+
+    @classmethod
+    def of(cls, config: Config) -> ExportSettings:
+        """Those of all settings."""
+        effects = tuple(name for name, limits in effect_ranges(config.effects).items() if any(limits))
+        return cls(
+            DataLayout.of(config),
+            config.bake,
+            config.bop,
+            config.cameras,
+            config.physics,
+            config.render,
+            config.trajectory,
+            config.tote,
+            config.gripper,
+            effects,
+            config.arrangement.max_objects,
+        )
+
+    @property
+    def modes(self) -> tuple[str, ...]:
+        """Modes of the data set or of its splits."""
+        return bake_modes(self.bake, self.layout.splits)
