@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import os
 import signal
@@ -28,10 +27,6 @@ def bake(out: Path, *arguments: str) -> int:
     overrides = {key: value for key, value in (QUICK | SETTINGS).items() if key != "bake.device"}
     settings = [part for key, value in overrides.items() for part in ("--set", f"{key}={json.dumps(value)}")]
     return main(["bake", "--out", str(out), "--config", "smoke", *settings, *arguments])
-
-
-def digests(folder: Path) -> dict[str, str]:
-    return {str(path.relative_to(folder)): hashlib.sha256(path.read_bytes()).hexdigest() for path in folder.rglob("*") if path.is_file()}
 
 
 def kill_one(out: Path, killed: list[int]) -> None:
