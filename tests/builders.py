@@ -22,8 +22,15 @@ from synpick_warp.progress import SilentProgress
 from tests.worlds.sights import SHORT
 from tests.worlds.small_worlds import catalog, settings
 
-COARSE = {"physics.step": 4e-3, "physics.steps_per_tick": 16, "physics.substeps": 1, "physics.iterations": 6}
-"""Settings under which physics takes few steps."""
+COARSE = {
+    "physics.step": 4e-3,
+    "physics.steps_per_tick": 16,
+    "physics.substeps": 1,
+    "physics.iterations": 6,
+    "render.coarse_pixel": 2,
+    "render.coarse_paths": 1,
+}
+"""Settings under which physics takes few steps, and light few paths."""
 STIRRING = COARSE | {"move.speed": 4.0}
 """Episodes of some ten frames."""
 PICKING = COARSE | {key.replace("__", "."): value for key, value in SHORT.items()}

@@ -25,15 +25,12 @@ from synpick_warp.errors import DatasetError, DeviceError, OutputError, SynpickE
 from synpick_warp.exporters.writing.pool import WriterPool
 from synpick_warp.stages import timing
 from tests.builders import mistake
+from tests.system.test_pool import refuse  # Writer processes import its module, which imports little.
 
 
 def finished(number: int) -> BakeSummary:
     rows = [EpisodeRow(episode, 0, Ending.FINISHED, 10, 1.0, "move", 9, 0, 0, 0, 9) for episode in range(number)]
     return BakeSummary(number, rows, views=30 * number, wall_seconds=2.0, resampled=1)
-
-
-def raise_error(error: Exception) -> None:
-    raise error
 
 
 @pytest.fixture
@@ -281,7 +278,7 @@ def test_a_fault_of_ours_in_a_writer_process_shows_its_traceback(tmp_path, bakes
 @pytest.mark.parametrize("processes", [0, 1])
 def test_other_errors_in_a_writer_process_are_one_line(tmp_path, bakes, error, processes):
     with pytest.raises(SynpickError) as caught, WriterPool(processes, 1) as pool:
-        pool.submit(raise_error, (), (error,), path=tmp_path)
+        pool.submit(refuse, (), (error,), path=tmp_path)
     bakes.result = caught.value
     mistake("bake", "--device", "cpu", "--out", str(tmp_path / "data"))
 

@@ -32,7 +32,7 @@ from synpick_warp.exporters.lerobot.exporter import LerobotExporter
 from synpick_warp.exporters.lerobot.layout import ROW
 from synpick_warp.exporters.writing import files
 from synpick_warp.exporters.writing.pool import WriterPool
-from tests.builders import run
+from tests.builders import once, run
 from tests.harness.scripted_bake import bake, settings, snapshot
 
 HANG = 120
@@ -51,18 +51,15 @@ FOREIGN = (
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory) -> Path:
     """A finished data set of all formats, of two episodes."""
-    out = tmp_path_factory.mktemp("whole") / "set"
-    bake(out, settings())
-    return out
+    return once(tmp_path_factory, "whole", lambda out: bake(out, settings()))[0]
 
 
 @pytest.fixture(scope="module")
 def narrow(tmp_path_factory) -> Path:
     """A finished data set that can be converted to most formats."""
-    out = tmp_path_factory.mktemp("narrow") / "set"
     plain = settings(formats=("bop", "zarr"))
-    bake(out, dataclasses.replace(plain, bop=dataclasses.replace(plain.bop, keypoints=0)))
-    return out
+    config = dataclasses.replace(plain, bop=dataclasses.replace(plain.bop, keypoints=0))
+    return once(tmp_path_factory, "narrow", lambda out: bake(out, config))[0]
 
 
 @pytest.fixture(autouse=True)

@@ -9,7 +9,6 @@ import os
 import re
 import shutil
 import signal
-import subprocess
 from dataclasses import replace
 from pathlib import Path
 
