@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import hashlib
 import os
-import pickle
 import signal
 import subprocess
 from collections.abc import Callable, Iterator
@@ -20,9 +18,6 @@ from tests.harness.devices import VARIABLE
 ROOT = Path(__file__).resolve().parent.parent
 REAL_DATA = ROOT.parent / "shared" / "data"
 """Real objects and lights, where somebody has put them beside the checkout; tests that want them are skipped elsewhere."""
-
-MOST_LIGHTS = 50
-"""Environment maps whose tables are kept."""
 
 # Examples follow from the test's name, so that two runs do the same; compiling a kernel may take any time.
 settings.register_profile("house", deadline=None, derandomize=True, max_examples=50)
@@ -80,22 +75,11 @@ def device(request: pytest.FixtureRequest) -> wp.Device:
 
 
 @pytest.fixture(scope="session", autouse=True)
-def remembered_lights() -> Iterator[None]:
-    """Tables of the environment maps of a renderer are made once a process: they follow from the arguments alone."""
-    from synpick_warp.stages.render import scene
+def quick_worlds() -> Iterator[None]:
+    """What takes most of the time to build small worlds is made once a process."""
+    from tests.harness.made_once import made_once
 
-    made, make = {}, scene.precompute_environment
-
-    def remember(*arguments: object) -> object:
-        key = hashlib.sha256(pickle.dumps(arguments)).digest()
-        if key not in made:
-            if len(made) > MOST_LIGHTS:
-                made.clear()
-            made[key] = make(*arguments)
-        return made[key]
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(scene, "precompute_environment", remember)
+    with made_once():
         yield
 
 

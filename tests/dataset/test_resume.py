@@ -9,7 +9,6 @@ import shutil
 import signal
 import subprocess
 import time
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -34,12 +33,6 @@ EPISODES = TINY["bake.episodes"]
 PAGE = os.sysconf("SC_PAGE_SIZE")
 FILES_OF_THE_MANIFEST = 2 + 2 * (EPISODES + 2)
 """Files without a checksum: settings, manifest, and two for each entry."""
-
-
-@pytest.fixture(scope="module")
-def server() -> Iterator[BakeServer]:
-    with BakeServer() as server:
-        yield server
 
 
 @pytest.fixture(scope="module")
