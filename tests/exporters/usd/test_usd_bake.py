@@ -13,7 +13,7 @@ from scipy.spatial import ConvexHull
 from tests.exporters.usd.test_usd import validation_errors
 
 CAMERAS = 3
-NEAR = 0.02
+NEAR = 0.01
 """Tolerance at outlines [px]: pixels whose centres are nearer may be in or out, as USD's camera parameters have 32 bits."""
 
 
@@ -68,5 +68,5 @@ def inside(prim: Usd.Prim, frame: int, view: np.ndarray, shape: tuple[int, int])
 
 def test_an_object_was_picked(picked_set):
     """Otherwise the test above would not cover objects that disappear."""
-    rows = [json.loads(line) for line in (picked_set / "episodes.jsonl").read_text().splitlines()]
-    assert sum(row["picked"] for row in rows) > 0
+    row = json.loads((picked_set / "episodes.jsonl").read_text().splitlines()[0])
+    assert row["picked"] > 0
