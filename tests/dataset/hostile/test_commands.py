@@ -20,11 +20,12 @@ from synpick_warp.errors import SynpickError
 from synpick_warp.estimation import factories
 from synpick_warp.evaluation.results import write_results
 from synpick_warp.evaluation.truth import read_truth
-from tests.builders import run
+from tests.builders import PICKED, bake_boxes, once, run
 from tests.estimation.fakes import FakeEstimator
 from tests.harness.fuzz import fuzz_examples
 from tests.harness.hostile import LEAVES, WHOLE, places, removed, replaced
 
+TINY = PICKED | {"bake.episodes": 1, "bake.worlds": 1, "bake.formats": ["bop", "shards", "zarr"], "cameras.resolution": [48, 27]}
 HANG = 20.0
 """Longest time that one command may take [s]; some 0.1 s are usual."""
 REMOVED = object()
@@ -61,10 +62,11 @@ class Sandbox:
 
 
 @pytest.fixture(scope="module")
-def sandbox(picked_set, tmp_path_factory) -> Sandbox:
-    """A finished set with two attempts in its first episode, in all formats that are read back."""
+def sandbox(tmp_path_factory) -> Sandbox:
+    """A finished set of one episode with two attempts, in all formats that are read back, and with few pixels: it is read often."""
     folder = tmp_path_factory.mktemp("hostile")
-    return Sandbox(shutil.copytree(picked_set, folder / "set"), folder)
+    baked, _ = once(tmp_path_factory, "hostile", lambda out: bake_boxes(out, TINY))
+    return Sandbox(shutil.copytree(baked, folder / "set"), folder)
 
 
 @functools.lru_cache(maxsize=64)
