@@ -25,7 +25,13 @@ from tests.estimation.fakes import FakeEstimator
 from tests.harness.fuzz import fuzz_examples
 from tests.harness.hostile import LEAVES, WHOLE, places, removed, replaced
 
-TINY = PICKED | {"bake.episodes": 1, "bake.worlds": 1, "bake.formats": ["bop", "shards", "zarr"], "cameras.resolution": [48, 27]}
+TINY = PICKED | {
+    "bake.device": "cpu",
+    "bake.episodes": 1,
+    "bake.worlds": 1,
+    "bake.formats": ["bop", "shards", "zarr"],
+    "cameras.resolution": [48, 27],
+}
 HANG = 20.0
 """Longest time that one command may take [s]; some 0.1 s are usual."""
 REMOVED = object()
