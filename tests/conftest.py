@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import os
 import signal
+import subprocess
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
@@ -70,6 +72,47 @@ def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
 def device(request: pytest.FixtureRequest) -> wp.Device:
     """Device under test. On the CPU results must agree to the bit; a GPU may round differently where a test says so."""
     return pick_device(request.param)
+
+
+@pytest.fixture(scope="session", autouse=True)
+def quick_worlds() -> Iterator[None]:
+    """What takes most of the time to build small worlds is made once a process."""
+    from tests.harness.made_once import made_once
+
+    with made_once():
+        yield
+
+
+@pytest.fixture(scope="session")
+def picked_set(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    """Two episodes of mode pick as scenes with two layers, shards, stages and trajectories, baked once for all processes. Read only."""
+    from tests.builders import PICKED, bake_boxes, once
+
+    folder, _ = once(tmp_path_factory, "picked", lambda out: bake_boxes(out, PICKED))
+    before = _times(folder)
+    yield folder
+    assert _times(folder) == before, "a test has changed the shared data set"
+
+
+def _times(folder: Path) -> dict[Path, int]:
+    return {path: path.stat().st_mtime_ns for path in folder.rglob("*")}
+
+
+@pytest.fixture
+def small_disk(tmp_path: Path) -> Iterator[Callable[[int], Path]]:
+    """Makes a file system of so many kB; the test is skipped where nobody may mount one."""
+    folder = tmp_path / "disk"
+
+    def mount(size: int) -> Path:
+        folder.mkdir()
+        command = ["mount", "-t", "tmpfs", "-o", f"size={size}k", "tmpfs", str(folder)]
+        if os.geteuid() or subprocess.run(command, capture_output=True).returncode:
+            pytest.skip("mounting needs root")
+        return folder
+
+    yield mount
+    if folder.is_mount():
+        subprocess.run(["umount", folder], check=True)
 
 
 @pytest.fixture(scope="session")

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
-import subprocess
 import tomllib
 from collections import Counter
+from collections.abc import Mapping
 from pathlib import Path
 
 import cv2
@@ -19,56 +18,47 @@ from synpick_warp.configs.load import load_config
 from synpick_warp.errors import OutputError
 from synpick_warp.exporters.bop.exporter import BopExporter
 from synpick_warp.exporters.writing.png import frame_depth_png
-from synpick_warp.factory import assembly
+from synpick_warp.factory.episodes import BakeSummary
 from synpick_warp.factory.pipeline import run_bake
 from synpick_warp.stages import ticks, timing
 from synpick_warp.stages.ticks import TickLoop
 from synpick_warp.system.progress import SilentProgress
+from tests.builders import PICKED, STIRRING, assignments, bake_boxes, boxes, once
+from tests.harness.exporter_contract import digests
 from tests.twins.depth_png import encode_depth
-from tests.worlds.sights import SHORT
-from tests.worlds.small_worlds import QUICK, catalog, settings
+from tests.worlds.small_worlds import QUICK, settings
 
 EPISODES, CAMERAS = 3, 3
 WIDTH, HEIGHT = 96, 54
-TINY = {
+TINY = STIRRING | {
     "bake.worlds": 2,
     "bake.episodes": EPISODES,
     "cameras.resolution": [WIDTH, HEIGHT],
     "render.views_per_batch": CAMERAS,
-    "physics.step": 4e-3,
-    "physics.steps_per_tick": 16,
-    "physics.substeps": 1,
-    "physics.iterations": 6,
-    "move.speed": 4.0,
 }
-PICKING = SHORT | {"arrangement__max_objects": 2, "bake__episodes": 2, "pick__failures": 1, "perception__resolution": [160, 90]}
 
 
 def tiny(**overrides: object):
-    given = TINY | {key.replace("__", "."): value for key, value in overrides.items()}
-    return settings(**{key.replace(".", "__"): value for key, value in given.items()})
+    return settings(**TINY | {key.replace("__", "."): value for key, value in overrides.items()})
 
 
 @pytest.fixture(scope="module", autouse=True)
-def boxes():
+def all_boxes():
     """All bakes here are of boxes."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(assembly, "load_catalog", lambda config, report: catalog())
+    with boxes():
         yield
 
 
 class Baked:
-    """A finished bake."""
+    """A finished bake; `made`: its folder and summary, if it is not to be baked here."""
 
-    def __init__(self, out: Path, **overrides: object) -> None:
-        self.out, self.config = out, tiny(**overrides)
-        self.summary = run_bake(self.config, out, SilentProgress())
+    def __init__(self, out: Path, given: Mapping[str, object] = TINY, made: BakeSummary | None = None) -> None:
+        self.out, self.config = out, settings(**given)
+        self.summary = made or run_bake(self.config, out, SilentProgress())
         self.split = out / self.config.bop.split
 
     def files(self, folder: str = ".") -> dict[str, str]:
-        """Digest of every file below a folder."""
-        base = self.out / folder
-        return {str(path.relative_to(base)): hashlib.sha256(path.read_bytes()).hexdigest() for path in base.rglob("*") if path.is_file()}
+        return digests(self.out / folder)
 
     def scenes(self) -> list[Path]:
         return sorted(self.split.iterdir())
@@ -86,7 +76,8 @@ def mask(scene: Path, kind: str, view: int, instance: int) -> np.ndarray:
 
 @pytest.fixture(scope="module")
 def baked(tmp_path_factory) -> Baked:
-    return Baked(tmp_path_factory.mktemp("bake") / "set")
+    folder, summary = once(tmp_path_factory, "stirred", lambda out: Baked(out).summary)
+    return Baked(folder, made=summary)
 
 
 # ---- the same bytes ----
@@ -112,7 +103,7 @@ def test_neither_the_number_of_worlds_nor_the_lead_of_physics_changes_a_scene(ba
     leads, may_begin = set(), TickLoop._may_begin
     monkeypatch.setattr(ticks, "queue_lead", lambda *_: lead)
     monkeypatch.setattr(TickLoop, "_may_begin", lambda loop: leads.add(loop._enqueued - loop._taken) or may_begin(loop))
-    other = Baked(tmp_path / "other", bake__worlds=worlds)
+    other = Baked(tmp_path / "other", TINY | {"bake.worlds": worlds})
     assert max(leads) == lead or other.config.bake.device != "cpu"  # A GPU may not get so far ahead.
     split = baked.config.bop.split
     assert other.files(split) == baked.files(split)
@@ -120,13 +111,13 @@ def test_neither_the_number_of_worlds_nor_the_lead_of_physics_changes_a_scene(ba
 
 
 def test_neither_writers_nor_batches_change_a_file(baked, tmp_path):
-    other = Baked(tmp_path / "other", bake__writers=2, render__views_per_batch=4)
+    other = Baked(tmp_path / "other", TINY | {"bake.writers": 2, "render.views_per_batch": 4})
     split = baked.config.bop.split
     assert other.files(split) == baked.files(split)
 
 
 def test_another_seed_gives_other_scenes(baked, tmp_path):
-    other = Baked(tmp_path / "other", bake__seed=1, bake__episodes=1, bake__worlds=1)
+    other = Baked(tmp_path / "other", TINY | {"bake.seed": 1, "bake.episodes": 1, "bake.worlds": 1})
     for scene in other.scenes():
         assert (scene / "scene_gt.json").read_bytes() != (baked.split / scene.name / "scene_gt.json").read_bytes()
 
@@ -235,8 +226,8 @@ def test_an_instance_keeps_its_object_through_the_episode(baked):
 
 
 @pytest.fixture(scope="module")
-def picked(tmp_path_factory) -> Baked:
-    return Baked(tmp_path_factory.mktemp("picked") / "set", **PICKING)
+def picked(picked_set, tmp_path_factory) -> Baked:
+    return Baked(picked_set, PICKED, once(tmp_path_factory, "picked", lambda out: bake_boxes(out, PICKED))[1])
 
 
 def records(baked: Baked, name: str) -> list[dict]:
@@ -270,15 +261,15 @@ def test_what_was_picked_is_in_the_truth_until_then(picked):
 
 
 def test_attempts_are_the_same_in_any_number_of_worlds(picked, tmp_path):
-    other = Baked(tmp_path / "other", **PICKING | {"bake__worlds": 1, "perception__views": 1})
+    other = Baked(tmp_path / "other", PICKED | {"bake.worlds": 1, "perception.views": 1})
     assert {name for name, _ in other.files().items() ^ picked.files().items()} == {"config.toml"}
 
 
 @pytest.mark.slow
 def test_a_bake_that_grows_lists_the_attempts_of_both(picked, tmp_path):
     """The first episode's attempts come from its record: by the second bake nobody remembers them."""
-    Baked(tmp_path / "set", **PICKING | {"bake__episodes": 1, "bake__worlds": 1})
-    grown = Baked(tmp_path / "set", **PICKING)
+    Baked(tmp_path / "set", PICKED | {"bake.episodes": 1, "bake.worlds": 1})
+    grown = Baked(tmp_path / "set", PICKED)
     assert (grown.summary.resumed, grown.summary.episodes) == (1, picked.summary.episodes)
     assert grown.summary.outcomes == picked.summary.outcomes
     assert grown.files() == picked.files()
@@ -314,7 +305,7 @@ def test_an_error_leaves_whole_scenes_only(tmp_path, monkeypatch, baked, share):
 
 def arguments(**overrides: object) -> list[str]:
     given = QUICK | TINY | {key.replace("__", "."): value for key, value in overrides.items()}
-    return ["--config", "smoke", *(part for key, value in given.items() for part in ("--set", f"{key}={json.dumps(value)}"))]
+    return ["--config", "smoke", *assignments(given)]
 
 
 def test_episodes_that_are_given_up(tmp_path, capsys):
@@ -346,23 +337,8 @@ def test_drawn_again_and_counted(tmp_path):
     assert summary.remedies == {Ending.UNSETTLED: advice}
 
 
-@pytest.fixture
-def small_disk(tmp_path):
-    """A file system too small for the bake."""
-    folder = tmp_path / "disk"
-    folder.mkdir()
-    try:
-        made = subprocess.run(["mount", "-t", "tmpfs", "-o", "size=200k", "tmpfs", folder], capture_output=True).returncode
-    except OSError:
-        made = 1
-    if made:
-        pytest.skip("no rights to mount a small file system")
-    yield folder
-    subprocess.run(["umount", folder], check=True)
-
-
 def test_a_full_disk_is_one_line_and_exit_code_2(small_disk, capsys):
-    out = small_disk / "set"
+    out = small_disk(200) / "set"
     assert commands.main(["bake", "--out", str(out), *arguments()]) == commands.EXIT_MISTAKE
     said = capsys.readouterr().err.strip().splitlines()
     assert said[-1].startswith("synpick-warp: error: cannot write ")

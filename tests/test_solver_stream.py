@@ -2,18 +2,14 @@
 
 from __future__ import annotations
 
-from synpick_warp.factory import assembly
-from synpick_warp.factory.pipeline import run_bake
 from synpick_warp.stages.render_streams import RenderStreams
 from synpick_warp.stages.sim.physics import Physics
-from synpick_warp.system.progress import SilentProgress
-from tests.test_bake import tiny
-from tests.worlds.small_worlds import catalog
+from tests.builders import bake_boxes
+from tests.test_bake import TINY
 
 
 def test_the_solver_runs_on_the_reserved_multiprocessors_while_there_are_views(tmp_path, monkeypatch):
     """On a CPU: `confine` is replaced to provide a marker as stream, which is removed before physics sees it."""
-    monkeypatch.setattr(assembly, "load_catalog", lambda config, report: catalog())
     monkeypatch.setattr(RenderStreams, "confine", lambda self, share: setattr(self, "solver", "reserved"))
     tick_parts, given = Physics.tick_parts, []
 
@@ -23,7 +19,7 @@ def test_the_solver_runs_on_the_reserved_multiprocessors_while_there_are_views(t
         return tick_parts(self, *arguments)
 
     monkeypatch.setattr(Physics, "tick_parts", spy)
-    summary = run_bake(tiny(bake__worlds=1, bake__episodes=1, bake__device="cpu"), tmp_path / "out", SilentProgress())
+    summary = bake_boxes(tmp_path / "out", TINY | {"bake.worlds": 1, "bake.episodes": 1, "bake.device": "cpu"})
     frames = summary.views // 3
     assert len(given) > frames
     first = given.index("reserved")

@@ -17,13 +17,10 @@ import warp as wp
 
 import synpick_warp
 from synpick_warp.exporters.bop.exporter import BopExporter
-from synpick_warp.factory import assembly
-from synpick_warp.factory.pipeline import run_bake
-from synpick_warp.system.progress import SilentProgress
+from tests.builders import bake_boxes
 from tests.harness.exporter_contract import export
-from tests.test_bake import tiny
+from tests.test_bake import TINY
 from tests.worlds import box_views
-from tests.worlds.small_worlds import catalog
 
 ROOT = Path(synpick_warp.__file__).parent
 README = (ROOT / "kernels" / "README.md").read_text(encoding="utf-8")
@@ -116,11 +113,10 @@ def calls(tmp_path_factory):
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(wp, "launch", record)
-        patch.setattr(assembly, "load_catalog", lambda config, report: catalog())
         sys.setprofile(calls.watch)
         threading.setprofile(calls.watch)
         try:
-            run_bake(tiny(bake__episodes=1, bake__worlds=1), out / "bake", SilentProgress())
+            bake_boxes(out / "bake", TINY | {"bake.episodes": 1, "bake.worlds": 1})
             export(BopExporter, out / "export", box_views.config(), (0,), processes=0)
         finally:
             sys.setprofile(None)

@@ -24,15 +24,13 @@ from synpick_warp.errors import DatasetError, DeviceError, OutputError, SynpickE
 from synpick_warp.exporters.writing.pool import WriterPool
 from synpick_warp.factory.episodes import BakeSummary, EpisodeRow
 from synpick_warp.stages import timing
+from tests.builders import mistake
+from tests.system.test_pool import refuse  # Writer processes import its module, which imports little.
 
 
 def finished(number: int) -> BakeSummary:
     rows = [EpisodeRow(episode, 0, Ending.FINISHED, 10, 1.0, "move", 9, 0, 0, 0, 9) for episode in range(number)]
     return BakeSummary(number, rows, views=30 * number, wall_seconds=2.0, resampled=1)
-
-
-def raise_error(error: Exception) -> None:
-    raise error
 
 
 @pytest.fixture
@@ -66,15 +64,6 @@ def bakes(monkeypatch):
     sizes.fit_to_device, sizes.without_pictures, sizes.count_writers = lambda config, *_: config, lambda config: config, lambda *_: 1
     monkeypatch.setitem(sys.modules, "synpick_warp.factory.sizes", sizes)
     return module
-
-
-def mistake(capsys, *arguments: str) -> str:
-    """Run, expect exit code 2 and one line, and return what it says."""
-    assert main(arguments) == 2
-    lines = capsys.readouterr().err.splitlines()
-    assert len(lines) == 1
-    assert lines[0].startswith("synpick-warp: error: ")
-    return lines[0].removeprefix("synpick-warp: error: ")
 
 
 def test_bake_passes_resolved_settings_on(tmp_path, bakes, capsys):
@@ -137,31 +126,31 @@ def test_bake_says_so_by_exit_code_if_episodes_are_missing(tmp_path, bakes, caps
         (["extra"], "Unused Tokens: ['extra']."),
     ],
 )
-def test_a_mistake_is_one_line_and_leaves_nothing(tmp_path, bakes, capsys, monkeypatch, arguments, said):
+def test_a_mistake_is_one_line_and_leaves_nothing(tmp_path, bakes, monkeypatch, arguments, said):
     monkeypatch.chdir(tmp_path)
     device = [] if "--device" in arguments else ["--device", "cpu"]
-    assert mistake(capsys, "bake", "--out", "deep/data", *device, *arguments).startswith(said)
+    assert mistake("bake", "--out", "deep/data", *device, *arguments).startswith(said)
     assert not bakes.calls
     assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.skipif(wp.get_cuda_device_count() > 0, reason="this machine has a GPU")
-def test_a_gpu_that_is_not_there(tmp_path, bakes, capsys):
-    said = mistake(capsys, "bake", "--out", str(tmp_path / "data"), "--device", "cuda:0")
+def test_a_gpu_that_is_not_there(tmp_path, bakes):
+    said = mistake("bake", "--out", str(tmp_path / "data"), "--device", "cuda:0")
     assert said == "cuda:0 was requested, but Warp finds no CUDA device here; use --device cpu"
     assert list(tmp_path.iterdir()) == []
 
 
-def test_unknown_key_in_a_file(tmp_path, bakes, capsys):
+def test_unknown_key_in_a_file(tmp_path, bakes):
     (tmp_path / "my.toml").write_text("[bake]\nworld = 3\n")
-    said = mistake(capsys, "bake", "--out", str(tmp_path / "data"), "--config", str(tmp_path / "my.toml"))
+    said = mistake("bake", "--out", str(tmp_path / "data"), "--config", str(tmp_path / "my.toml"))
     assert said.startswith(f"there is no key bake.world, set in {tmp_path / 'my.toml'}; keys of bake: mode, mix, worlds, ")
     assert said.endswith("did you mean worlds?")
 
 
 @pytest.mark.parametrize("arguments", [["bake", "--out"], ["bkae"], ["merge"], ["--frobnicate"]])
-def test_incomplete_command_lines(capsys, arguments):
-    mistake(capsys, *arguments)
+def test_incomplete_command_lines(arguments):
+    mistake(*arguments)
 
 
 def test_formats_and_share_are_passed_on(tmp_path, bakes):
@@ -189,8 +178,8 @@ def test_splits_are_passed_on(bakes, tmp_path):
         ("--shard=4/8", "--shard 4/8 has none of 4 episodes; use fewer shards"),
     ],
 )
-def test_formats_and_shares_that_are_not_there(tmp_path, bakes, capsys, option, said):
-    assert mistake(capsys, "bake", "--device=cpu", f"--out={tmp_path}", option) == said
+def test_formats_and_shares_that_are_not_there(tmp_path, bakes, option, said):
+    assert mistake("bake", "--device=cpu", f"--out={tmp_path}", option) == said
 
 
 def test_a_profile_is_a_table_and_a_trace_beside_the_data_set(tmp_path, bakes, capsys, monkeypatch):
@@ -216,11 +205,11 @@ def test_a_profile_is_a_table_and_a_trace_beside_the_data_set(tmp_path, bakes, c
     assert timing.scope("a") is timing.scope("b")
 
 
-def test_a_trace_is_never_written_into_the_data_set(tmp_path, bakes, capsys):
+def test_a_trace_is_never_written_into_the_data_set(tmp_path, bakes):
     out = tmp_path / "set"
-    said = mistake(capsys, "bake", "--device=cpu", f"--out={out}", f"--profile-out={out / 'trace.json'}")
+    said = mistake("bake", "--device=cpu", f"--out={out}", f"--profile-out={out / 'trace.json'}")
     assert said == f"--profile-out is {out / 'trace.json'}, inside the data set {out}; name a file outside of it"
-    said = mistake(capsys, "bake", "--device=cpu", f"--out={out}", f"--profile-out={tmp_path / 'no' / 'trace.json'}")
+    said = mistake("bake", "--device=cpu", f"--out={out}", f"--profile-out={tmp_path / 'no' / 'trace.json'}")
     assert said.endswith("allowed: a file in an existing folder")
     assert not bakes.calls
 
@@ -232,38 +221,38 @@ def test_a_stopped_bake_says_how_to_go_on(tmp_path, bakes, capsys):
     assert capsys.readouterr().err.endswith("interrupted: 4 of 4 episodes are complete; the same command resumes with the others\n")
 
 
-def test_output_folder_that_is_not_empty(tmp_path, bakes, capsys):
+def test_output_folder_that_is_not_empty(tmp_path, bakes):
     (tmp_path / "mine.txt").write_text("precious")
-    said = mistake(capsys, "bake", "--device", "cpu", "--out", str(tmp_path))
+    said = mistake("bake", "--device", "cpu", "--out", str(tmp_path))
     assert said == f"{tmp_path} is not empty; --out takes a new or an empty folder, or a data set to resume"
     assert [path.name for path in tmp_path.iterdir()] == ["mine.txt"]
     assert not bakes.calls
 
 
-def test_output_folder_that_is_a_file(tmp_path, bakes, capsys):
+def test_output_folder_that_is_a_file(tmp_path, bakes):
     (tmp_path / "file").write_text("precious")
-    said = mistake(capsys, "bake", "--device", "cpu", "--out", str(tmp_path / "file"))
+    said = mistake("bake", "--device", "cpu", "--out", str(tmp_path / "file"))
     assert said == f"{tmp_path / 'file'} is a file; --out takes a new or an empty folder"
-    said = mistake(capsys, "bake", "--device", "cpu", "--out", str(tmp_path / "file" / "data"))
+    said = mistake("bake", "--device", "cpu", "--out", str(tmp_path / "file" / "data"))
     assert said.startswith(f"cannot write {tmp_path / 'file' / 'data'}: Not a directory; ")
 
 
-def test_output_folder_that_cannot_be_written(tmp_path, bakes, capsys):
+def test_output_folder_that_cannot_be_written(tmp_path, bakes):
     if os.geteuid() == 0:
         pytest.skip("root may write everywhere")
     tmp_path.chmod(0o500)
-    assert ": Permission denied; " in mistake(capsys, "bake", "--device", "cpu", "--out", str(tmp_path / "data"))
+    assert ": Permission denied; " in mistake("bake", "--device", "cpu", "--out", str(tmp_path / "data"))
 
 
-def test_a_mistake_found_while_baking_takes_empty_folders_away_again(tmp_path, bakes, capsys):
+def test_a_mistake_found_while_baking_takes_empty_folders_away_again(tmp_path, bakes):
     bakes.result = OutputError("the disk\nis full")
-    assert mistake(capsys, "bake", "--device", "cpu", "--out", str(tmp_path / "a" / "b")) == "the disk is full"
+    assert mistake("bake", "--device", "cpu", "--out", str(tmp_path / "a" / "b")) == "the disk is full"
     assert list(tmp_path.iterdir()) == []
 
 
-def test_an_existing_empty_folder_is_used_and_kept(tmp_path, bakes, capsys):
+def test_an_existing_empty_folder_is_used_and_kept(tmp_path, bakes):
     bakes.result = OutputError("no")
-    mistake(capsys, "bake", "--device", "cpu", "--out", str(tmp_path))
+    mistake("bake", "--device", "cpu", "--out", str(tmp_path))
     assert tmp_path.is_dir()
 
 
@@ -291,11 +280,11 @@ def test_a_fault_of_ours_in_a_writer_process_shows_its_traceback(tmp_path, bakes
 
 @pytest.mark.parametrize("error", [OSError(28, "No space left on device"), MemoryError("x"), DatasetError("x is damaged")])
 @pytest.mark.parametrize("processes", [0, 1])
-def test_other_errors_in_a_writer_process_are_one_line(tmp_path, bakes, capsys, error, processes):
+def test_other_errors_in_a_writer_process_are_one_line(tmp_path, bakes, error, processes):
     with pytest.raises(SynpickError) as caught, WriterPool(processes, 1) as pool:
-        pool.submit(raise_error, (), (error,), path=tmp_path)
+        pool.submit(refuse, (), (error,), path=tmp_path)
     bakes.result = caught.value
-    mistake(capsys, "bake", "--device", "cpu", "--out", str(tmp_path / "data"))
+    mistake("bake", "--device", "cpu", "--out", str(tmp_path / "data"))
 
 
 def test_help_shows_units_and_defaults(capsys):
@@ -359,12 +348,11 @@ def test_version():
     assert result.stdout.strip() == __version__
 
 
-def test_a_reader_that_leaves_is_no_fault():
-    reader, writer = os.pipe()
-    os.close(reader)
-    result = subprocess.run([*COMMAND, "config"], stdout=writer, stderr=subprocess.PIPE, text=True, check=False)
-    os.close(writer)
-    assert (result.returncode, result.stderr) == (141, "")
+def test_a_bake_imports_neither_evaluation_nor_estimation():
+    parts = ("synpick_warp.apps.eval", "synpick_warp.apps.estim", "synpick_warp.stages.pose")
+    program = f"import sys, synpick_warp.cli.main, synpick_warp.factory.pipeline; print([n for n in sys.modules if n.startswith({parts})])"
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=120, check=True)
+    assert done.stdout.strip().splitlines()[-1] == "[]"
 
 
 PLY_HEAD = "ply\nformat ascii 1.0\n{comment}element vertex 3\nproperty float x\nproperty float y\nproperty float z\n"
@@ -380,12 +368,12 @@ PLY_HEAD = "ply\nformat ascii 1.0\n{comment}element vertex 3\nproperty float x\n
     ],
     ids=["no faces", "no texture file"],
 )
-def test_models_that_cannot_be_used(tmp_path, capsys, ply):
+def test_models_that_cannot_be_used(tmp_path, ply):
     models = tmp_path / "models"
     models.mkdir()
     (models / "models_info.json").write_text('{"1": {"diameter": 12.7}}')
     (models / "obj_000001.ply").write_text(ply)
-    said = mistake(capsys, "bake", "--config", "smoke", "--device", "cpu", "--models", str(models), "--out", str(tmp_path / "data"))
+    said = mistake("bake", "--config", "smoke", "--device", "cpu", "--models", str(models), "--out", str(tmp_path / "data"))
     assert "obj_000001.ply" in said
     assert not (tmp_path / "data").exists()
 
@@ -414,11 +402,11 @@ STRICT = "[objects]\nstrict = true\n"
     ],
     ids=["empty", "too large", "millimetres", "over budget", "no mass", "hardly a mass", "hardly a density"],
 )
-def test_objects_that_cannot_be_baked(tmp_path, capsys, sides, settings, said):
+def test_objects_that_cannot_be_baked(tmp_path, sides, settings, said):
     """One line, before anything is simulated, and nothing in the data set's place."""
     models, file, out = tmp_path / "models", tmp_path / "my.toml", tmp_path / "deep" / "data"
     boxes(models, *sides)
     file.write_text(f'preset = "smoke"\n{settings}')
-    heard = mistake(capsys, "bake", "--config", str(file), "--device", "cpu", "--models", str(models), "--out", str(out))
+    heard = mistake("bake", "--config", str(file), "--device", "cpu", "--models", str(models), "--out", str(out))
     assert heard.startswith(said.format(models=models, file=file))
     assert not out.parent.exists()

@@ -17,6 +17,7 @@ from synpick_warp.configs.schema import Config, Split
 from synpick_warp.dataset.commit.verify import verify
 from synpick_warp.errors import ConfigError, DatasetError
 from synpick_warp.scenes.embedded.skies import skies
+from tests.builders import once
 from tests.harness import scripted_bake
 from tests.harness.scripted_bake import INPUTS, snapshot
 from tests.worlds import box_views
@@ -34,23 +35,21 @@ def settings(*formats: str, jpg: bool = False, keypoints: int = 0) -> Config:
 @pytest.fixture(scope="module")
 def sets(tmp_path_factory) -> dict[str, Path]:
     """Data sets that were baked directly, by name."""
-    folder = tmp_path_factory.mktemp("conversion")
     wanted = {
         "source": settings("bop", "zarr"),
-        "shards": settings("shards"),
-        "bop": settings("bop"),
-        "lerobot": settings("lerobot"),
-        "usd": settings("usd"),
-        "coco": settings("coco"),
-        "yolo": settings("yolo"),
+        **{name: settings(name) for name in ("shards", "bop", "lerobot", "usd", "coco", "yolo")},
         "keypoints": settings("bop", keypoints=8),
         "keypoints shards": settings("shards", keypoints=8),
         "keypoints coco": settings("coco", keypoints=8),
         "jpg": settings("bop", jpg=True),
         "jpg shards": settings("shards", jpg=True),
     }
-    for name, config in wanted.items():
-        scripted_bake.bake(folder / name, config)
+
+    def make(folder: Path) -> None:
+        for name, config in wanted.items():
+            scripted_bake.bake(folder / name, config)
+
+    folder, _ = once(tmp_path_factory, "conversion", make)
     return {name: folder / name for name in wanted}
 
 

@@ -14,9 +14,9 @@ import numpy as np
 import pytest
 
 import synpick_warp
-from synpick_warp.cli.main import main
 from synpick_warp.dataset.bop.measured import measure_info
 from synpick_warp.errors import DatasetError
+from tests.builders import run
 from tests.validation.conftest import good  # noqa: F401
 from tests.validation.layouts import LAYOUTS, _rename_images, _strip, tless
 
@@ -42,12 +42,6 @@ def plain(good, tmp_path) -> Path:  # noqa: F811
     out = _strip(good, tmp_path / "plain")
     (out / "train").rename(out / "test")
     return out
-
-
-def run(capsys, *words: object) -> tuple[int, str, str]:
-    code = main([str(word) for word in words])
-    said = capsys.readouterr()
-    return code, said.out, said.err
 
 
 @pytest.mark.parametrize("name", LAYOUTS)
@@ -131,43 +125,43 @@ def test_scenes_of_the_same_index_are_told_apart(good, tmp_path):  # noqa: F811
 
 
 @pytest.mark.parametrize("name", LAYOUTS)
-def test_statistics_and_report_of_any_layout(folders, name, tmp_path, capsys):
+def test_statistics_and_report_of_any_layout(folders, name, tmp_path):
     data = synpick_warp.open(folders[name])
     views = sum(len(episode) * len(episode.cameras) for episode in data.values())
-    code, out, _ = run(capsys, "stats", folders[name], "--threads", 1)
+    code, out, _ = run("stats", folders[name], "--threads", 1)
     assert code == 0
     assert f"{views} views in " in out
     assert "missing: no bake wrote this data set" in out
-    assert run(capsys, "report", folders[name], "--out", tmp_path / "page.html", "--views", 2, "--threads", 1)[0] == 0
+    assert run("report", folders[name], "--out", tmp_path / "page.html", "--views", 2, "--threads", 1)[0] == 0
 
 
 @pytest.mark.parametrize("name", LAYOUTS)
-def test_a_contact_sheet_of_any_layout(folders, name, tmp_path, capsys):
-    assert run(capsys, "preview", folders[name], "--out", tmp_path / "sheet.png", "--views", 3)[0] == 0
+def test_a_contact_sheet_of_any_layout(folders, name, tmp_path):
+    assert run("preview", folders[name], "--out", tmp_path / "sheet.png", "--views", 3)[0] == 0
     assert cv2.imread(str(tmp_path / "sheet.png")).std() > 10
 
 
-def test_estimates_are_made_and_scored(plain, tmp_path, capsys):
+def test_estimates_are_made_and_scored(plain, tmp_path):
     """Without models a line says so; without masks, too."""
     results = tmp_path / "refine_plain-test.csv"
     words = ("estimate", "--data", plain, "--method", "refine", "--every", 1, "--device", "cpu", "--out", results, "--threads", 1)
-    assert run(capsys, *words)[0] == 0
+    assert run(*words)[0] == 0
     assert {line.split(",")[0] for line in results.read_text().splitlines()[1:]} == {"0", "1", "2"}
-    code, out, _ = run(capsys, "eval", "--data", plain, "--results", results)
+    code, out, _ = run("eval", "--data", plain, "--results", results)
     assert code == 0
     assert "unknown" not in out
     listed = ("eval", "--data", plain, "--results", results, "--targets", plain / "test_targets_bop19.json")
-    assert run(capsys, *listed)[0] == 0
+    assert run(*listed)[0] == 0
     (plain / "models").rename(plain / "models_cad")
-    assert run(capsys, "eval", "--data", plain, "--results", results)[0] == 0
+    assert run("eval", "--data", plain, "--results", results)[0] == 0
     shutil.rmtree(plain / "models_cad")
     shutil.rmtree(plain / "models_eval")
-    code, _, said = run(capsys, "eval", "--data", plain, "--results", results)
+    code, _, said = run("eval", "--data", plain, "--results", results)
     assert code == 2
     assert "has no models/models_info.json, which poses are evaluated with" in said
     for scene in plain.glob("test/*"):
         shutil.rmtree(scene / "mask_visib")
-    code, _, said = run(capsys, *words)
+    code, _, said = run(*words)
     assert code == 2
     assert "has no masks (mask_visib), which poses are estimated with" in said
     assert said.count("\n") == 1
@@ -181,15 +175,13 @@ def test_estimates_are_made_and_scored(plain, tmp_path, capsys):
         ("depth", "has no depth images, which poses are estimated with"),
     ],
 )
-def test_what_estimation_lacks_is_named(plain, tmp_path, capsys, file, said):
+def test_what_estimation_lacks_is_named(plain, tmp_path, file, said):
     for scene in plain.glob("test/*"):
         path = scene / file
         shutil.rmtree(path) if path.is_dir() else path.unlink()
         if file == "scene_gt.json":
             (scene / "scene_gt_info.json").unlink()
-    code, _, line = run(
-        capsys, "estimate", "--data", plain, "--method", "refine", "--device", "cpu", "--out", tmp_path / "out.csv", "--threads", 1
-    )
+    code, _, line = run("estimate", "--data", plain, "--method", "refine", "--device", "cpu", "--out", tmp_path / "out.csv", "--threads", 1)
     assert code == 2
     assert said in line
     assert not (tmp_path / "out.csv").exists()
@@ -220,13 +212,13 @@ def test_names_of_images_may_be_written_otherwise(plain, change):
     [("scene_camera.json", "depth", "mask", "mask_visib"), ("rgb", "mask", "mask_visib", "scene_gt.json", "scene_gt_info.json")],
     ids=["rgb_and_gt", "depth"],
 )
-def test_a_set_with_a_single_kind_of_images(plain, tmp_path, capsys, missing):
+def test_a_set_with_a_single_kind_of_images(plain, tmp_path, missing):
     for path in [path for name in missing for path in plain.glob(f"test/*/{name}")]:
         shutil.rmtree(path) if path.is_dir() else path.unlink()
     shutil.rmtree(plain / "models")
     assert len(list(synpick_warp.open(plain).views())) == 6
     for words in (("stats", "--threads", 1), ("preview", "--out", tmp_path / "sheet.png"), ("report", "--out", tmp_path / "page.html")):
-        assert run(capsys, words[0], plain, *words[1:])[0] == 0
+        assert run(words[0], plain, *words[1:])[0] == 0
     assert cv2.imread(str(tmp_path / "sheet.png"))[20:300, :480].std() > 10
 
 
@@ -235,9 +227,9 @@ def rows(view) -> dict:
 
 
 @pytest.mark.parametrize(("name", "to"), [("tless", "shards"), ("imagewise", "bop")])
-def test_converted_views_are_those_of_the_source(folders, tmp_path, capsys, name, to):
+def test_converted_views_are_those_of_the_source(folders, tmp_path, name, to):
     out = tmp_path / "new" / "out"
-    code, said, _ = run(capsys, "convert", folders[name], "--to", f"{to},coco", "--out", out, "--processes", 1)
+    code, said, _ = run("convert", folders[name], "--to", f"{to},coco", "--out", out, "--processes", 1)
     assert code == 0
     assert f"3 scenes converted to {to}, coco" in said
     assert [path.name for path in out.parent.iterdir()] == ["out"]
@@ -252,22 +244,22 @@ def test_converted_views_are_those_of_the_source(folders, tmp_path, capsys, name
     assert len(content["images"]) == 6
     assert all((out / "coco" / "images" / image["file_name"]).is_file() for image in content["images"])
     assert len(content["annotations"]) == sum(int(mask.any()) for view in source.views() for mask in view.masks)
-    assert run(capsys, "validate", out)[0] == 0
+    assert run("validate", out)[0] == 0
 
 
-def test_a_split_is_converted(folders, tmp_path, capsys):
+def test_a_split_is_converted(folders, tmp_path):
     words = ("convert", folders["ycbv"], "--to", "shards", "--split", "test", "--out", tmp_path / "out", "--processes", 1)
-    assert run(capsys, *words)[0] == 0
+    assert run(*words)[0] == 0
     assert [(view.episode, view.image_id) for view in synpick_warp.open(tmp_path / "out").views()] == [
         (scene, image) for scene in (48, 49, 50) for image in (1, 36)
     ]
 
 
-def test_images_of_other_kinds_are_encoded_and_keep_their_ids(folders, tmp_path, capsys):
+def test_images_of_other_kinds_are_encoded_and_keep_their_ids(folders, tmp_path):
     shutil.copytree(folders["itodd"] / "val", tmp_path / "set" / "val")
     for scene in (tmp_path / "set/val").iterdir():
         _rename_images(scene, {0: 1, 1: 36})
-    assert run(capsys, "convert", tmp_path / "set", "--to", "shards,coco", "--out", tmp_path / "out", "--processes", 1)[0] == 0
+    assert run("convert", tmp_path / "set", "--to", "shards,coco", "--out", tmp_path / "out", "--processes", 1)[0] == 0
     for theirs, ours in zip(synpick_warp.open(tmp_path / "set").views(), synpick_warp.open(tmp_path / "out").views(), strict=True):
         assert ours.image_id in (1, 36)
         np.testing.assert_array_equal(theirs.rgb, ours.rgb)
@@ -287,26 +279,26 @@ def test_images_of_other_kinds_are_encoded_and_keep_their_ids(folders, tmp_path,
         ("multisensor", "coco", "has 3 sensors; convert takes"),
     ],
 )
-def test_what_can_not_be_made_of_a_found_set_is_one_line(folders, tmp_path, capsys, name, to, said):
-    code, _, line = run(capsys, "convert", folders[name], "--to", to, "--out", tmp_path / "out", "--processes", 1)
+def test_what_can_not_be_made_of_a_found_set_is_one_line(folders, tmp_path, name, to, said):
+    code, _, line = run("convert", folders[name], "--to", to, "--out", tmp_path / "out", "--processes", 1)
     assert code == 2
     assert re.search(said, line)
     assert line.count("\n") == 1
     assert not list(tmp_path.iterdir())
 
 
-def test_a_conversion_that_fails_leaves_nothing(plain, tmp_path, capsys):
+def test_a_conversion_that_fails_leaves_nothing(plain, tmp_path):
     sorted(plain.glob("test/000002/depth/*"))[-1].write_bytes(b"")
     before = sorted(path.name for path in tmp_path.iterdir())
-    code, _, line = run(capsys, "convert", plain, "--to", "shards", "--out", tmp_path / "out", "--processes", 1)
+    code, _, line = run("convert", plain, "--to", "shards", "--out", tmp_path / "out", "--processes", 1)
     assert code == 2
     assert "is not an image" in line
     assert sorted(path.name for path in tmp_path.iterdir()) == before
 
 
-def test_tracking_needs_instance_ids(plain, tmp_path, capsys):
+def test_tracking_needs_instance_ids(plain, tmp_path):
     words = ("estimate", "--data", plain, "--method", "track", "--device", "cpu", "--out", tmp_path / "out.csv", "--threads", 1)
-    code, _, said = run(capsys, *words)
+    code, _, said = run(*words)
     assert code == 2
     assert "has no instance_id in its ground truth, by which instances are tracked; use another method" in said
     assert said.count("\n") == 1

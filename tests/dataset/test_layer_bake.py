@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
+from collections.abc import Mapping
 from pathlib import Path
 
 import cv2
@@ -12,43 +12,32 @@ import pytest
 
 from synpick_warp.configs.schema import LAYERS
 from synpick_warp.dataset.commit.manifest import episode_entry, read_checksums
-from synpick_warp.factory import assembly
-from synpick_warp.factory.pipeline import run_bake
-from synpick_warp.system.progress import SilentProgress
 from synpick_warp.views.layer_codec import read_layer
-from tests.worlds.sights import SHORT
-from tests.worlds.small_worlds import catalog, settings
+from tests.builders import PICKING, STIRRING, bake_boxes, once
+from tests.harness.exporter_contract import digests
 
 WIDTH, HEIGHT = 96, 54
-TINY = {
-    "bake__episodes": 3,
-    "cameras__resolution": [WIDTH, HEIGHT],
-    "cameras__positions": [[0, 0, 2], [0, -0.9, 1.8]],
-    "cameras__ups": [[0, 1, 0], [0, 1, 0]],
-    "physics__step": 4e-3,
-    "physics__steps_per_tick": 16,
-    "physics__substeps": 1,
-    "physics__iterations": 6,
-    "move__speed": 4.0,
-    "bop__coco": False,
-    "render__layers": list(LAYERS),
+TINY = STIRRING | {
+    "bake.episodes": 3,
+    "cameras.resolution": [WIDTH, HEIGHT],
+    "cameras.positions": [[0, 0, 2], [0, -0.9, 1.8]],
+    "cameras.ups": [[0, 1, 0], [0, 1, 0]],
+    "bop.coco": False,
+    "render.layers": list(LAYERS),
 }
 DEPTH_STEP = 1e-4
 """A count of the depth images [m]; half of it is their error."""
 
 
-def baked(out: Path, **overrides: object) -> Path:
-    config = settings(**(TINY | overrides))
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(assembly, "load_catalog", lambda config, report: catalog())
-        run_bake(config, out, SilentProgress())
-    return out / config.bop.split
+def baked(out: Path, given: Mapping[str, object] = TINY) -> Path:
+    bake_boxes(out, given)
+    return out / "train"
 
 
 @pytest.fixture(scope="module")
 def split(tmp_path_factory) -> Path:
     """One world takes all episodes, one after the other."""
-    return baked(tmp_path_factory.mktemp("layers") / "set")
+    return once(tmp_path_factory, "layers", baked)[0] / "train"
 
 
 class View:
@@ -142,8 +131,7 @@ def test_motion_is_that_of_the_poses(split):
 
 
 def test_a_gripper_that_was_out_of_the_picture_has_no_motion(tmp_path):
-    picking = SHORT | {"arrangement__max_objects": 2, "bake__episodes": 1, "pick__failures": 1, "perception__resolution": [160, 90]}
-    split = baked(tmp_path / "set", **picking)
+    split = baked(tmp_path / "set", TINY | PICKING | {"bake.episodes": 1})
     chosen = {json.loads(line)["frame"] for line in (split.parent / "attempts.jsonl").read_text().splitlines()}
     appeared = 0
     for view in views(split):
@@ -190,22 +178,18 @@ def test_normals_and_albedo_cover_what_there_is(split):
             assert np.abs(albedo[view.mask(index)].astype(int) - (153, 128, 102)).max(initial=0) <= 1
 
 
-def digests(split: Path) -> dict[str, str]:
-    return {str(path.relative_to(split)): hashlib.sha256(path.read_bytes()).hexdigest() for path in split.rglob("*") if path.is_file()}
-
-
 def test_worlds_writers_and_batches_change_no_layer(split, tmp_path):
-    other = baked(tmp_path / "other", bake__worlds=2, bake__writers=2, render__views_per_batch=3)
+    other = baked(tmp_path / "other", TINY | {"bake.worlds": 2, "bake.writers": 2, "render.views_per_batch": 3})
     assert digests(other) == digests(split)
 
 
 def test_layers_have_checksums(split):
-    names = {name for episode in range(TINY["bake__episodes"]) for name in read_checksums(split.parent, episode_entry(episode))}
+    names = {name for episode in range(TINY["bake.episodes"]) for name in read_checksums(split.parent, episode_entry(episode))}
     assert names == {f"{split.name}/{name}" for name in digests(split)}
     assert {Path(name).parts[2] for name in names} >= set(LAYERS)
 
 
 def test_layers_change_nothing_else(split, tmp_path):
-    few = digests(baked(tmp_path / "few", render__layers=["flow"]))
+    few = digests(baked(tmp_path / "few", TINY | {"render.layers": ["flow"]}))
     whole = digests(split)
     assert few == {name: digest for name, digest in whole.items() if Path(name).parts[1] not in set(LAYERS) - {"flow"}}

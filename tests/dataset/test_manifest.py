@@ -28,14 +28,15 @@ from synpick_warp.views.frames import EpisodeEnd
 from tests.harness.entries import episode_content
 from tests.worlds.small_worlds import catalog, settings
 
+CONFIG = settings()
+MANIFEST = manifest.make_manifest(CONFIG)
+
 
 def changed(key: str) -> Config:
-    """Settings that differ from `settings()` in one value."""
-    config = settings()
+    """Settings that differ from CONFIG in one value."""
     section, name = key.split(".")
-    part = getattr(config, section)
-    value = getattr(part, name)
-    return dataclasses.replace(config, **{section: dataclasses.replace(part, **{name: other(value)})})
+    part = getattr(CONFIG, section)
+    return dataclasses.replace(CONFIG, **{section: dataclasses.replace(part, **{name: other(getattr(part, name))})})
 
 
 def other(value: object) -> object:
@@ -47,15 +48,14 @@ def other(value: object) -> object:
 
 
 def keys() -> Iterator[str]:
-    config = settings()
-    for section in dataclasses.fields(config):
+    for section in dataclasses.fields(CONFIG):
         if section.name not in ("object_rows", "splits"):
-            yield from (f"{section.name}.{name}" for name in settings_of(type(getattr(config, section.name))))
+            yield from (f"{section.name}.{name}" for name in settings_of(type(getattr(CONFIG, section.name))))
 
 
 @pytest.mark.parametrize("key", list(keys()))
 def test_every_setting_binds_but_the_free_ones(key):
-    said = manifest.describe_differences(manifest.make_manifest(changed(key)), manifest.make_manifest(settings()))
+    said = manifest.describe_differences(manifest.make_manifest(changed(key)), MANIFEST)
     assert said.startswith(f"{key} is ") if key not in manifest.FREE_SETTINGS else said == ""
 
 
@@ -75,17 +75,16 @@ def test_a_table_of_objects_binds(tmp_path):
 
 
 def test_versions_bind():
-    content = manifest.make_manifest(settings())
-    assert all(content["versions"].values())
-    later = content | {"versions": content["versions"] | {"newton": "1.9.0"}}
-    assert manifest.describe_differences(later, content) == f'versions.newton is "1.9.0", there "{content["versions"]["newton"]}"'
+    versions = MANIFEST["versions"]
+    assert all(versions.values())
+    later = MANIFEST | {"versions": versions | {"newton": "1.9.0"}}
+    assert manifest.describe_differences(later, MANIFEST) == f'versions.newton is "1.9.0", there "{versions["newton"]}"'
 
 
 def test_a_manifest_comes_back(tmp_path):
-    content = manifest.make_manifest(settings())
-    (tmp_path / manifest.MANIFEST_FILE).write_bytes(manifest.encode_manifest(content))
-    assert manifest.read_manifest(tmp_path) == content
-    assert content["seed"] == 0
+    (tmp_path / manifest.MANIFEST_FILE).write_bytes(manifest.encode_manifest(MANIFEST))
+    assert manifest.read_manifest(tmp_path) == MANIFEST
+    assert MANIFEST["seed"] == 0
 
 
 @pytest.mark.parametrize(
@@ -208,4 +207,4 @@ def test_data_sets_from_before_a_setting_are_read_with_what_held_then(tmp_path):
     lines = config_to_toml(config).splitlines()
     (tmp_path / "config.toml").write_text("\n".join(line for line in lines if not line.startswith("fill")) + "\n")
     assert manifest.read_settings(tmp_path, content).arrangement.fill == "within"
-    assert manifest.make_manifest(settings())["settings"]["arrangement"]["fill"] == "exceed"
+    assert MANIFEST["settings"]["arrangement"]["fill"] == "exceed"

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import os
 import random
@@ -10,7 +9,6 @@ import shutil
 import signal
 import subprocess
 import time
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -24,6 +22,7 @@ from synpick_warp.dataset.commit.verify import verify
 from synpick_warp.errors import DatasetError, OutputError
 from synpick_warp.exporters.writing.files import PARTIAL
 from tests.harness.bake_server import TINY, BakeServer
+from tests.harness.exporter_contract import digests
 from tests.harness.processes import children, kill_after, wait_for
 
 KILLS = int(os.environ.get("SYNPICK_KILLS", 20))
@@ -34,16 +33,6 @@ EPISODES = TINY["bake.episodes"]
 PAGE = os.sysconf("SC_PAGE_SIZE")
 FILES_OF_THE_MANIFEST = 2 + 2 * (EPISODES + 2)
 """Files without a checksum: settings, manifest, and two for each entry."""
-
-
-def digests(folder: Path) -> dict[str, str]:
-    return {str(path.relative_to(folder)): hashlib.sha256(path.read_bytes()).hexdigest() for path in folder.rglob("*") if path.is_file()}
-
-
-@pytest.fixture(scope="module")
-def server() -> Iterator[BakeServer]:
-    with BakeServer() as server:
-        yield server
 
 
 @pytest.fixture(scope="module")
@@ -305,8 +294,14 @@ def test_a_file_that_cannot_be_written(server, expected, tmp_path):
 
 
 @pytest.mark.slow
-def test_a_full_disk(server, expected, small_disk):
-    out, log = small_disk / "set", small_disk.parent / "log"
+def test_a_full_disk(server, whole, expected, small_disk):
+    """With room for half of the episodes, and a little more."""
+    constants, episodes = (
+        sum(-(-(whole / name).stat().st_size // PAGE) * PAGE for place in places for name in read_checksums(whole, place))
+        for places in ([CONSTANTS], [episode_entry(number) for number in range(EPISODES)])
+    )
+    disk = small_disk(round((constants + 0.6 * episodes) / 1024))
+    out, log = disk / "set", disk.parent / "log"
     server.start(out, log=str(log))
     assert server.wait() == 2
     said = log.read_text().splitlines()[-1]
@@ -316,7 +311,7 @@ def test_a_full_disk(server, expected, small_disk):
     assert 1 <= len(there) < EPISODES
     assert verify(out).problem == ""
     assert not (out / PARTIAL).exists()
-    subprocess.run(["mount", "-o", "remount,size=50m", small_disk], check=True)
+    subprocess.run(["mount", "-o", "remount,size=50m", disk], check=True)
     assert server.bake(out) == 0
     assert digests(out) == expected
 
@@ -331,22 +326,6 @@ def goes_on_after(server: BakeServer, out: Path, log: Path, expected: dict[str, 
     assert not (out / PARTIAL).exists()
     assert server.bake(out) == 0
     assert digests(out) == expected
-
-
-@pytest.fixture
-def small_disk(whole, tmp_path) -> Iterator[Path]:
-    """A file system with room for half of the episodes, and a little more."""
-    folder = tmp_path / "disk"
-    folder.mkdir()
-    constants, episodes = (
-        sum(-(-(whole / name).stat().st_size // PAGE) * PAGE for place in places for name in read_checksums(whole, place))
-        for places in ([CONSTANTS], [episode_entry(number) for number in range(EPISODES)])
-    )
-    size = f"size={(constants + 0.6 * episodes) / 1024:.0f}k"
-    if os.geteuid() or subprocess.run(["mount", "-t", "tmpfs", "-o", size, "tmpfs", folder], capture_output=True).returncode:
-        pytest.skip("mounting needs root")
-    yield folder
-    subprocess.run(["umount", folder], check=True)
 
 
 # ---- verify ----

@@ -3,22 +3,14 @@
 from __future__ import annotations
 
 import signal
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
 from synpick_warp.dataset.commit.merge import merge
 from tests.dataset.test_resume import digests
-from tests.harness.bake_server import BakeServer
 
 SENSORS = {"bop.layout": "multisensor", "bop.keypoints": 4, "bake.formats": ["bop"], "bake.episodes": 2}
-
-
-@pytest.fixture(scope="module")
-def server() -> Iterator[BakeServer]:
-    with BakeServer() as server:
-        yield server
 
 
 @pytest.fixture(scope="module")

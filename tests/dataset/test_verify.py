@@ -21,14 +21,15 @@ EPISODES, FILES = 4, 7
 TOTAL = 1 + EPISODES * FILES
 """Number of files, including the one that all episodes share."""
 THREADS = [1, 3]
+CONFIG = settings()
 
 
 @pytest.fixture
 def out(tmp_path, monkeypatch) -> Path:
     """Data set of EPISODES episodes with FILES files each; the minimum work per process is lowered, so that `verify` uses all `threads`."""
     monkeypatch.setattr(verify, "_FILES_PER_PROCESS", 1)
-    (tmp_path / manifest.MANIFEST_FILE).write_bytes(manifest.encode_manifest(manifest.make_manifest(settings())))
-    (tmp_path / manifest.CONFIG_FILE).write_text(config_to_toml(settings()))
+    (tmp_path / manifest.MANIFEST_FILE).write_bytes(manifest.encode_manifest(manifest.make_manifest(CONFIG)))
+    (tmp_path / manifest.CONFIG_FILE).write_text(config_to_toml(CONFIG))
     (tmp_path / "manifest").mkdir()
     write_files(tmp_path, manifest.CONSTANTS, ["models/obj_000001.ply"], {})
     for episode in range(EPISODES):
@@ -39,7 +40,7 @@ def out(tmp_path, monkeypatch) -> Path:
 
 
 def name(episode: int, file: int) -> str:
-    return f"train/{len(settings().cameras.positions) * episode:06d}/rgb/{file:06d}.jpg"
+    return f"train/{len(CONFIG.cameras.positions) * episode:06d}/rgb/{file:06d}.jpg"
 
 
 def write_files(out: Path, entry: Path, names: list[str], content: dict) -> None:

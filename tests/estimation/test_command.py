@@ -7,7 +7,6 @@ import os
 import re
 import shutil
 import signal
-import subprocess
 import sys
 from pathlib import Path
 
@@ -242,12 +241,3 @@ def test_lists_that_do_not_fit_the_data_set_are_refused_by_eval(folder, tmp_path
         capsys.readouterr()
         assert main(["eval", "--data", str(folder), "--results", str(out), "--targets", str(targets)]) == 2
         assert message in capsys.readouterr().err
-
-
-def test_a_bake_does_not_import_the_estimation():
-    program = (
-        "import sys, synpick_warp.cli.main, synpick_warp.factory.pipeline;"
-        "print([name for name in sys.modules if 'synpick_warp.apps.estim' in name or 'stages.pose' in name])"
-    )
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=120, check=True)
-    assert done.stdout.strip().splitlines()[-1] == "[]"

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import csv
+import os
+import shutil
 
 import numpy as np
 import pytest
@@ -11,28 +13,19 @@ import synpick_warp
 from synpick_warp.apps.evaluation.results import write_results
 from synpick_warp.apps.evaluation.truth import read_truth
 from synpick_warp.cli.main import main
-from synpick_warp.factory import assembly
-from synpick_warp.factory.pipeline import run_bake
-from synpick_warp.system.progress import SilentProgress
-from tests.harness.bake_server import TINY
-from tests.worlds.small_worlds import catalog, settings
 
 
 @pytest.fixture(scope="module", params=["bop,zarr", "shards"])
-def folder(request, tmp_path_factory):
-    out = tmp_path_factory.mktemp("baked") / "set"
-    overrides = TINY | {"bake.episodes": 2, "bake.formats": request.param.split(","), "render.layers": []}
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(assembly, "load_catalog", lambda config, report: catalog())
-        run_bake(settings(**{key.replace(".", "__"): value for key, value in overrides.items()}), out, SilentProgress())
-    return out
+def folder(request, picked_set, tmp_path_factory):
+    others = ("train", "trajectory.zarr") if request.param == "shards" else ("train_web",)
+    return shutil.copytree(picked_set, tmp_path_factory.mktemp("baked") / "set", ignore=lambda *_: others, copy_function=os.link)
 
 
 def test_the_truth_of_a_bake_scores_100(folder, tmp_path, capsys):
     data = synpick_warp.open(folder)
     truth = read_truth(data)
     assert len(truth.images) == sum(len(episode) for episode in data.values()) * data.camera_count
-    assert set(truth.mode) == {"move"}
+    assert set(truth.mode) == {"pick"}
     assert np.isfinite(truth.speed).all()
     assert 0.0 <= truth.speed.min() <= truth.speed.max() < 10.0
     results, table = tmp_path / "truth.csv", tmp_path / "table.csv"

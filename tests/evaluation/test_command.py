@@ -6,7 +6,6 @@ import json
 import shlex
 import shutil
 import subprocess
-import sys
 from types import SimpleNamespace
 
 import cv2
@@ -172,13 +171,6 @@ def test_visibility_that_no_instance_has_is_refused(folder, files, tmp_path, cap
         path.write_text(path.read_text().replace('"visib_fract": 1.0', '"visib_fract": 0.5'))
     assert run("--data", hidden, "--results", files[0], "--visib-min", "0.9") == 2
     assert "--visib-min is 0.9; no instance of" in capsys.readouterr().err
-
-
-def test_a_bake_does_not_import_the_evaluation():
-    modules = "[name for name in sys.modules if name.startswith('synpick_warp.apps')]"
-    program = f"import sys, synpick_warp.cli.main, synpick_warp.factory.pipeline; print({modules})"
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=120, check=True)
-    assert done.stdout.strip().splitlines()[-1] == "[]"
 
 
 def test_names_that_do_not_print_are_escaped(folder, files, capsys, tmp_path):

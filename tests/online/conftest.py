@@ -5,29 +5,19 @@ from __future__ import annotations
 import pytest
 
 from synpick_warp.configs.schema import LAYERS
-from synpick_warp.factory import assembly
-from tests.worlds.small_worlds import catalog, settings
+from tests.builders import STIRRING, boxes
+from tests.worlds.small_worlds import settings
 
-TINY = {
-    "bake__worlds": 2,
-    "bake__episodes": 2,
-    "cameras__resolution": [64, 36],
-    "physics__step": 4e-3,
-    "physics__steps_per_tick": 16,
-    "physics__substeps": 1,
-    "physics__iterations": 6,
-    "move__speed": 4.0,
-}
-LAYERED = TINY | {"render__layers": list(LAYERS)}
+TINY = STIRRING | {"bake.worlds": 2, "bake.episodes": 2, "cameras.resolution": [64, 36]}
+LAYERED = TINY | {"render.layers": list(LAYERS)}
 
 
 @pytest.fixture(scope="module", autouse=True)
-def boxes():
+def all_boxes():
     """All objects here are boxes."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(assembly, "load_catalog", lambda config, report: catalog())
+    with boxes():
         yield
 
 
 def tiny(**overrides: object):
-    return settings(**TINY | overrides)
+    return settings(**TINY | {key.replace("__", "."): value for key, value in overrides.items()})

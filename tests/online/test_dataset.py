@@ -29,7 +29,7 @@ def short() -> Config:
 
 def test_tensors_are_the_stream(tmp_path):
     """Each field against the reader of a bake, and images in the buffers themselves."""
-    config = settings(**LAYERED | {"bake__episodes": 1})
+    config = settings(**LAYERED | {"bake.episodes": 1})
     synpick_warp.bake(config, tmp_path / "set")
     data = synpick_warp.open(tmp_path / "set")
     count = 0

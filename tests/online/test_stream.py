@@ -73,7 +73,7 @@ def equal(one: dict[tuple[int, int, int], View], other: dict[tuple[int, int, int
 
 def test_views_are_those_that_a_bake_writes(streamed, tmp_path):
     views, stream = streamed
-    summary = synpick_warp.bake(settings(**LAYERED | {"bake__worlds": 1}), tmp_path / "set")
+    summary = synpick_warp.bake(settings(**LAYERED | {"bake.worlds": 1}), tmp_path / "set")
     assert (stream.summary.episodes, stream.summary.views) == (summary.episodes, summary.views)
     data = synpick_warp.open(tmp_path / "set")
     expected = {(index, camera, frame) for index in data for camera in range(3) for frame in range(len(data[index]))}
@@ -126,7 +126,7 @@ def test_kernels_that_are_compiled_ahead_change_nothing(streamed, monkeypatch):
 def test_what_is_left_out_changes_nothing_in_the_rest(streamed):
     """Light accumulates from frame to frame; where frames are left out, each is rendered as without a history."""
     some = taken(synpick_warp.stream(settings(**LAYERED), cameras=(2, 0), stride=3, episodes=range(1, 9), shard=(1, 8)))
-    accumulated, alone = streamed[0], taken(synpick_warp.stream(settings(**LAYERED, render__history=0), episodes=range(1, 2)))
+    accumulated, alone = streamed[0], taken(synpick_warp.stream(settings(**LAYERED | {"render.history": 0}), episodes=range(1, 2)))
     expected = {key: dict(view) for key, view in accumulated.items() if key[0] == 1 and key[1] != 1 and key[2] % 3 == 0}
     for key, view in expected.items():
         view["color"] = alone[key]["color"]

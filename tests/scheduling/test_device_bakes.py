@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
 import os
 import signal
 import threading
@@ -16,7 +14,9 @@ from synpick_warp.cli.main import EXIT_MISTAKE, main
 from synpick_warp.dataset.commit.manifest import committed_episodes
 from synpick_warp.dataset.commit.verify import verify
 from synpick_warp.exporters.writing.files import PARTIAL
+from tests.builders import assignments
 from tests.harness.bake_server import TINY
+from tests.harness.exporter_contract import digests
 from tests.worlds.small_worlds import QUICK
 
 EPISODES = 6
@@ -26,12 +26,7 @@ SETTINGS = TINY | {"bake.episodes": EPISODES, "bake.worlds": 1, "bake.formats": 
 
 def bake(out: Path, *arguments: str) -> int:
     overrides = {key: value for key, value in (QUICK | SETTINGS).items() if key != "bake.device"}
-    settings = [part for key, value in overrides.items() for part in ("--set", f"{key}={json.dumps(value)}")]
-    return main(["bake", "--out", str(out), "--config", "smoke", *settings, *arguments])
-
-
-def digests(folder: Path) -> dict[str, str]:
-    return {str(path.relative_to(folder)): hashlib.sha256(path.read_bytes()).hexdigest() for path in folder.rglob("*") if path.is_file()}
+    return main(["bake", "--out", str(out), "--config", "smoke", *assignments(overrides), *arguments])
 
 
 def kill_one(out: Path, killed: list[int]) -> None:

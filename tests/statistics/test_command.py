@@ -14,9 +14,9 @@ from rich.console import Console
 import synpick_warp
 from synpick_warp.apps.statistics import Statistics, compute_statistics
 from synpick_warp.apps.statistics.tables import make_tables
-from synpick_warp.cli.main import main
 from synpick_warp.configs.schema import Split
 from synpick_warp.system.codecs.tables import Column, Table, to_csv
+from tests.builders import mistake, run
 from tests.harness.scripted_bake import bake, settings
 from tests.worlds.evaluation_set import CAMERAS, FRAMES, write_evaluation_set
 
@@ -38,37 +38,28 @@ def copy(folder, tmp_path) -> Path:
     return tmp_path / "copy"
 
 
-def run(capsys, *arguments: object) -> tuple[str, str]:
+def stats(*arguments: object) -> tuple[str, str]:
     """Standard output and error of a command that succeeds."""
-    assert main(["stats", *map(str, arguments)]) == 0
-    captured = capsys.readouterr()
-    return captured.out, captured.err
+    code, out, err = run("stats", *arguments)
+    assert code == 0, err
+    return out, err
 
 
-def refused(capsys, *arguments: object) -> str:
-    """Message of a command that is refused."""
-    assert main(["stats", *map(str, arguments)]) == 2
-    captured = capsys.readouterr()
-    assert captured.out == ""
-    (line,) = captured.err.splitlines()
-    return line.removeprefix("synpick-warp: error: ")
-
-
-def test_text_json_and_csv_are_the_same_numbers(folder, tmp_path, capsys):
+def test_text_json_and_csv_are_the_same_numbers(folder, tmp_path):
     statistics = compute_statistics(synpick_warp.open(folder))
-    text, error = run(capsys, folder)
+    text, error = stats(folder)
     assert error == ""
     assert text.startswith("Views and mean visibility, by split and mode\n")
     assert text.splitlines()[-1].endswith("MiB")
     assert f"{statistics.total.annotations.visibility:.3f}" in text
-    out, error = run(capsys, folder, "--json")
+    out, error = stats(folder, "--json")
     assert " views/s); peak memory " in error
     content = json.loads(out)
     assert content.keys() == {field.name for field in dataclasses.fields(statistics)}
     assert [(row["split"], row["mode"], row["annotations"]["views"]) for row in content["groups"]] == [
         (row.split, row.mode, row.annotations.views) for row in statistics.groups
     ]
-    run(capsys, folder, "--csv", tmp_path / "tables")
+    stats(folder, "--csv", tmp_path / "tables")
     tables = make_tables(statistics)
     assert {path.stem for path in (tmp_path / "tables").iterdir()} == {table.name for table in tables}
     for table in tables:
@@ -80,9 +71,9 @@ def test_text_json_and_csv_are_the_same_numbers(folder, tmp_path, capsys):
 
 
 @pytest.mark.parametrize("width", [40, 79, 100, 120, 300])
-def test_no_column_is_cut_at_any_width(folder, capsys, monkeypatch, width):
+def test_no_column_is_cut_at_any_width(folder, monkeypatch, width):
     monkeypatch.setattr("synpick_warp.cli.display.make_console", lambda: Console(width=width, highlight=False))
-    text, _ = run(capsys, folder, "--paper")
+    text, _ = stats(folder, "--paper")
     assert "…" not in text
     statistics = compute_statistics(synpick_warp.open(folder))
     for table in make_tables(statistics):
@@ -93,26 +84,26 @@ def test_no_column_is_cut_at_any_width(folder, capsys, monkeypatch, width):
         assert max(map(len, text.splitlines()[1:4])) <= width
 
 
-def test_the_paper_stands_beside_its_own_objects_or_if_asked_for(folder, tmp_path, capsys, monkeypatch):
+def test_the_paper_stands_beside_its_own_objects_or_if_asked_for(folder, tmp_path, monkeypatch):
     hint = "the objects are not those of the paper; --paper shows its numbers beside these"
     for arguments, shown, hinted in (([], False, True), (["--paper"], True, False), (["--no-paper"], False, False)):
-        text, _ = run(capsys, folder, *arguments)
+        text, _ = stats(folder, *arguments)
         assert ("Beside SynPick" in text, hint in text) == (shown, hinted)
     monkeypatch.setattr(Statistics, "has_paper_objects", True)
-    text, _ = run(capsys, folder)
+    text, _ = stats(folder)
     assert "Beside SynPick" in text
     assert hint not in text
 
 
-def test_splits_are_counted_apart_and_alone(folder, capsys):
+def test_splits_are_counted_apart_and_alone(folder):
     statistics = compute_statistics(synpick_warp.open(folder))
     assert [(row.split, row.episodes.episodes) for row in statistics.groups] == [("train", 2), ("test", 1)]
     assert statistics.total.episodes.episodes == 3
     assert [row.split for row in statistics.paper] == ["train", "test"]
-    alone = json.loads(run(capsys, folder, "--split", "test", "--json")[0])
+    alone = json.loads(stats(folder, "--split", "test", "--json")[0])
     assert [row["split"] for row in alone["groups"]] == ["test"]
     assert alone["missing"] == ["the objects are not those of the paper, so their distributions are not compared"]
-    assert refused(capsys, folder, "--split", "val") == f'{folder} has no split "val"; splits: train, test'
+    assert mistake("stats", folder, "--split", "val") == f'{folder} has no split "val"; splits: train, test'
 
 
 def test_shards_count_as_scenes_do(folder, copy):
@@ -121,11 +112,11 @@ def test_shards_count_as_scenes_do(folder, copy):
     assert compute_statistics(synpick_warp.open(copy)) == compute_statistics(synpick_warp.open(folder))
 
 
-def test_a_set_without_images_gives_episodes_and_attempts(copy, capsys):
+def test_a_set_without_images_gives_episodes_and_attempts(copy):
     for split in ("train", "test"):
         shutil.rmtree(copy / split)
         shutil.rmtree(copy / f"{split}_web")
-    text, _ = run(capsys, copy)
+    text, _ = stats(copy)
     assert "missing: 3 episodes have no images" in text
     assert "missing: no images: no views, visibility" in text
     statistics = compute_statistics(synpick_warp.open(copy))
@@ -134,18 +125,18 @@ def test_a_set_without_images_gives_episodes_and_attempts(copy, capsys):
     assert (statistics.depth, statistics.lights, statistics.paper) == (None, None, ())
 
 
-def test_a_set_without_trajectories_attempts_lights_and_depth_gives_the_rest(tmp_path, capsys):
-    text, _ = run(capsys, write_evaluation_set(tmp_path / "set"))
+def test_a_set_without_trajectories_attempts_lights_and_depth_gives_the_rest(tmp_path):
+    text, _ = stats(write_evaluation_set(tmp_path / "set"))
     assert f"{2 * FRAMES * CAMERAS} views in " in text
     for said in ("no depth images", "names no light maps", "no attempts", "are not those of the paper"):
         assert said in text
 
 
-def test_an_unfinished_set_says_how_much_is_there(copy, capsys):
+def test_an_unfinished_set_says_how_much_is_there(copy):
     for name in ("000002.json", "000002.sha256"):
         (copy / "manifest" / name).unlink()
-    assert "missing: 1 of 3 planned episodes are not baked" in run(capsys, copy)[0]
-    assert "not baked" not in run(capsys, copy, "--split", "train")[0]
+    assert "missing: 1 of 3 planned episodes are not baked" in stats(copy)[0]
+    assert "not baked" not in stats(copy, "--split", "train")[0]
 
 
 @pytest.mark.parametrize(
@@ -163,35 +154,35 @@ def test_an_unfinished_set_says_how_much_is_there(copy, capsys):
         ("train/000000/depth/000000.png", "nothing", "{path} is not an image"),
     ],
 )
-def test_a_damaged_file_is_named_in_one_line(copy, tmp_path, capsys, file, content, said):
+def test_a_damaged_file_is_named_in_one_line(copy, tmp_path, file, content, said):
     path = copy / file
     path.unlink()
     if content is not None:
         path.write_text(content)
-    assert refused(capsys, copy, "--csv", tmp_path / "tables").startswith(said.format(path=path, folder=copy))
+    assert mistake("stats", copy, "--csv", tmp_path / "tables").startswith(said.format(path=path, folder=copy))
     assert not (tmp_path / "tables").exists()
 
 
-def test_folders_that_are_no_data_set_are_named_in_one_line(copy, tmp_path, capsys):
-    assert refused(capsys, tmp_path / "gone").startswith(f"{tmp_path / 'gone'} is not a data set")
+def test_folders_that_are_no_data_set_are_named_in_one_line(copy, tmp_path):
+    assert mistake("stats", tmp_path / "gone").startswith(f"{tmp_path / 'gone'} is not a data set")
     (tmp_path / "empty").mkdir()
-    assert refused(capsys, tmp_path / "empty").startswith(f"{tmp_path / 'empty'} is not a data set: it has neither manifest.json nor")
+    assert mistake("stats", tmp_path / "empty").startswith(f"{tmp_path / 'empty'} is not a data set: it has neither manifest.json nor")
 
 
-def test_wrong_options_are_named_in_one_line(folder, tmp_path, capsys):
-    assert refused(capsys, folder, "--depth-views", "-1").startswith("--depth-views is -1; allowed: 0 to ")
-    assert refused(capsys, folder, "--threads", "9999").startswith("--threads is 9999; allowed: 0 to ")
+def test_wrong_options_are_named_in_one_line(folder, tmp_path):
+    assert mistake("stats", folder, "--depth-views", "-1").startswith("--depth-views is -1; allowed: 0 to ")
+    assert mistake("stats", folder, "--threads", "9999").startswith("--threads is 9999; allowed: 0 to ")
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "thesis.txt").touch()
-    assert refused(capsys, folder, "--csv", tmp_path / "full") == f"--csv is {tmp_path / 'full'}; allowed: a new or an empty folder"
-    assert refused(capsys, folder, "--csv", folder / "tables").startswith(f"--csv is {folder / 'tables'}, among the files of the data set")
+    assert mistake("stats", folder, "--csv", tmp_path / "full") == f"--csv is {tmp_path / 'full'}; allowed: a new or an empty folder"
+    assert mistake("stats", folder, "--csv", folder / "tables").startswith(f"--csv is {folder / 'tables'}, among the files of the data set")
 
 
-def test_names_are_neither_formulas_nor_markup(copy, capsys):
+def test_names_are_neither_formulas_nor_markup(copy):
     table = Table("names", "Names", (Column("name"),), [("=1+1",), ("[red]x",), ("\x1b[2J",)])
     assert to_csv(table) == "name\n'=1+1\n[red]x\n\\x1b[2J\n"
     path = copy / "manifest" / "000000.json"
     entry = json.loads(path.read_text())
     entry["row"]["ending"] = "[red]\x1b[2J"
     path.write_text(json.dumps(entry))
-    assert "[red]\\x1b[2J" in run(capsys, copy)[0]
+    assert "[red]\\x1b[2J" in stats(copy)[0]

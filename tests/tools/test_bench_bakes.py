@@ -21,7 +21,7 @@ from synpick_warp.exporters.writing.checksums import write_manifest_entry
 from synpick_warp.stages.render.renderer import Renderer
 from tests.harness.entries import episode_content
 from tests.harness.processes import wait_for
-from tests.tools.test_tools import FEW_STEPS, SHORT_EPISODES, SMALL_IMAGES
+from tests.tools.test_tools import SHORT_PICKS
 from tools.bench import __main__ as bench
 from tools.bench import cleaner as cleaner_module
 from tools.bench import growth, meter, physics, steady, whole
@@ -29,7 +29,7 @@ from tools.bench.cleaner import Assignment, Cleaner, Tally, clean_episode
 from tools.bench.usage import Usage, measure_usage
 from tools.figures import read_runs
 
-TINY = ("--worlds", "2", "--resolution", "32x18", *FEW_STEPS, *SMALL_IMAGES, *SHORT_EPISODES)
+TINY = ("--worlds", "2", "--resolution", "32x18", *SHORT_PICKS)
 ANY_DEVICE = tuple(part for part in TINY if part not in ("--device", "cpu"))
 SHARED = ("train", "deep/shared")
 

@@ -13,13 +13,13 @@ import pytest
 
 from synpick_warp.stages.render.renderer import Renderer
 from synpick_warp.stages.sim.simulate import Simulation
-from tests.tools.test_tools import FEW_STEPS
+from tests.builders import FEW_STEPS, assignments
 from tools.bench import __main__ as bench
 from tools.bench import pictures
 
 WORLDS, CAMERAS, BATCH, AFTER, HISTORY_TICKS, KEPT_TICKS, ROUNDS = 2, 3, 4, 2, 2, 3, 2
-SETTINGS = ("bake.mode=move", "settle.rest_displacement=1e-3", f"render.views_per_batch={BATCH}")
-SMALL = ("--worlds", str(WORLDS), "--resolution", "32x18", *FEW_STEPS, *(part for text in SETTINGS for part in ("--set", text)))
+SETTINGS = {"bake.mode": "move", "settle.rest_displacement": 1e-3, "render.views_per_batch": BATCH}
+SMALL = ("--worlds", str(WORLDS), "--resolution", "32x18", *FEW_STEPS, *assignments(SETTINGS))
 
 
 @pytest.fixture(scope="module")

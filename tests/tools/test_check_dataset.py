@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import shutil
-import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -142,20 +141,19 @@ def test_a_missing_image_is_found(dataset):
     assert violated(dataset) == {"missing"}
 
 
-def run(*arguments: object) -> subprocess.CompletedProcess[str]:
-    return subprocess.run([sys.executable, "-m", tool.__name__, *map(str, arguments)], capture_output=True, text=True, timeout=300)
+def test_exit_codes(dataset, tmp_path, monkeypatch, capsys):
+    def run(*arguments: object) -> tuple[int, str, str]:
+        monkeypatch.setattr(sys, "argv", ["dataset", *map(str, arguments)])
+        return tool.main(), *capsys.readouterr()
 
-
-def test_exit_codes(dataset, tmp_path):
-    right = run(dataset, "--views", 2)
-    assert (right.returncode, right.stderr) == (0, "")
-    assert "VIOLATED" not in right.stdout
+    code, out, err = run(dataset, "--views", 2)
+    assert (code, err) == (0, "")
+    assert "VIOLATED" not in out
     DEPTH(dataset / "train_pbr" / "000000")
-    wrong = run(dataset, "--views", 6)
-    assert wrong.returncode == 1
-    assert "depth against models, inside" in {line.split("  ")[0] for line in wrong.stdout.splitlines() if "VIOLATED" in line}
-    none = run(tmp_path / "none")
-    assert (none.returncode, none.stderr) == (2, f"check_dataset: {tmp_path / 'none'} has no scene\n")
+    code, out, _ = run(dataset, "--views", 6)
+    assert code == 1
+    assert "depth against models, inside" in {line.split("  ")[0] for line in out.splitlines() if "VIOLATED" in line}
+    assert run(tmp_path / "none") == (2, "", f"check_dataset: {tmp_path / 'none'} has no scene\n")
 
 
 def test_ray_casting_hits_a_known_triangle():

@@ -11,23 +11,8 @@ import warp as wp
 
 from synpick_warp.configs.schema import FAST, LAYERS, REFERENCE, RENDER_MODES
 from synpick_warp.stages.buffers import ViewBuffers
+from tests.builders import ONE_OBJECT, assignments
 from tools.compare import pictures as tool
-
-FEW_STEPS = (
-    "--set",
-    "arrangement.volume=1e-3",
-    "--set",
-    "arrangement.max_objects=1",
-    "--set",
-    "physics.substeps=1",
-    "--set",
-    "physics.steps_per_tick=10",
-    "--set",
-    "settle.min_time=0.1",
-    "--set",
-    "settle.rest_ticks=2",
-)
-"""Settings: one object, and as few steps as bring it to rest."""
 
 
 def values(difference) -> tuple[float, ...]:
@@ -91,7 +76,7 @@ def test_counts_and_boxes_are_compared_value_by_value():
 
 def test_a_device_equals_itself(tmp_path):
     file = tmp_path / "numbers.json"
-    options = ["--devices", "cpu,cpu", "--scenes", "1", "--size", "16x9", "--samples", "2", "--json", str(file), *FEW_STEPS]
+    options = ["--devices", "cpu,cpu", "--scenes", "1", "--size", "16x9", "--samples", "2", "--json", str(file), *assignments(ONE_OBJECT)]
     assert tool.main(options) == 0
     rows = json.loads(file.read_text())["rows"]
     assert {(row["mode"], row["output"]) for row in rows} == {(mode, name) for mode in RENDER_MODES for name in (*tool.TOLERANCES, "color")}

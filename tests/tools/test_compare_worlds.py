@@ -7,25 +7,10 @@ import json
 import numpy as np
 import pytest
 
+from tests.builders import ONE_OBJECT, assignments
 from tools.compare import worlds as tool
 
-FEW_STEPS = (
-    "--episodes",
-    "2",
-    "--ticks",
-    "12",
-    "--set",
-    "arrangement.volume=1e-3",
-    "--set",
-    "arrangement.max_objects=1",
-    "--set",
-    "bake.mode=move",
-    "--set",
-    "physics.substeps=1",
-    "--set",
-    "physics.steps_per_tick=4",
-)
-"""Settings: one object, and few steps."""
+FEW_STEPS = ("--episodes", "2", "--ticks", "12", *assignments(ONE_OBJECT | {"bake.mode": "move", "physics.steps_per_tick": 4}))
 
 
 def tick(catalog_index: int, *x: float) -> tuple[np.ndarray, np.ndarray]:

@@ -1,4 +1,4 @@
-"""The examples: each runs on a small data set of boxes and passes its own check; without a folder it bakes one."""
+"""The examples: each runs on a small data set of boxes and passes its own check; without a picked_set it bakes one."""
 
 from __future__ import annotations
 
@@ -15,62 +15,39 @@ import pytest
 import synpick_warp
 from synpick_warp.configs.load import load_config
 from synpick_warp.dataset.webdataset import decode_view
-from synpick_warp.factory import assembly
-from tests.worlds.sights import SHORT
-from tests.worlds.small_worlds import catalog, settings
 from tools.examples import bake_and_show, read_trajectory, train_loop
 
 ROOT = Path(__file__).resolve().parents[2]
-TINY = SHORT | {
-    "bake__formats": ["bop", "shards", "zarr"],
-    "cameras__resolution": [96, 54],
-    "physics__step": 4e-3,
-    "physics__steps_per_tick": 16,
-    "physics__substeps": 1,
-    "physics__iterations": 6,
-    "arrangement__max_objects": 2,
-    "pick__failures": 1,
-    "perception__resolution": [160, 90],
-}
 
 
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory) -> Path:
-    folder = tmp_path_factory.mktemp("examples") / "set"
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(assembly, "load_catalog", lambda config, report: catalog())
-        synpick_warp.bake(settings(**TINY), folder)
-    return folder
-
-
-def test_bake_and_show(folder, tmp_path, capsys):
-    bake_and_show.main([str(folder), "--out", str(tmp_path / "view.png")])
+def test_bake_and_show(picked_set, tmp_path, capsys):
+    bake_and_show.main([str(picked_set), "--out", str(tmp_path / "view.png")])
     assert "2 objects" in capsys.readouterr().out
-    drawn, view = cv2.imread(str(tmp_path / "view.png")), synpick_warp.open(folder)[0].view(0)
+    drawn, view = cv2.imread(str(tmp_path / "view.png")), synpick_warp.open(picked_set)[0].view(0)
     assert drawn.shape == view.rgb.shape
     changed = (drawn[..., ::-1] != view.rgb).any(axis=-1)
     assert changed[view.masks.any(axis=0)].mean() > 0.9
 
 
-def test_the_check_of_bake_and_show_fails_on_a_wrong_pose(folder):
-    data = synpick_warp.open(folder)
+def test_the_check_of_bake_and_show_fails_on_a_wrong_pose(picked_set):
+    data = synpick_warp.open(picked_set)
     view = data[0].view(0)
     view.object_to_camera[:, 2, 3] += 0.2
     with pytest.raises(SystemExit, match="from its pose"):
         bake_and_show.check(view, data.models_info)
 
 
-def test_train_loop(folder):
+def test_train_loop(picked_set):
     """In a process of its own: webdataset leaves files open, which is an error here."""
-    command = [sys.executable, "-m", "tools.examples.train_loop", str(folder)]
+    command = [sys.executable, "-m", "tools.examples.train_loop", str(picked_set)]
     done = subprocess.run(command, capture_output=True, text=True, check=True, cwd=ROOT)
     assert done.stdout.startswith("epoch 0: cross entropy 0.")
 
 
-def test_samples_of_the_train_loop_are_views(folder):
-    view = synpick_warp.open(folder)[0].view(1)
+def test_samples_of_the_train_loop_are_views(picked_set):
+    view = synpick_warp.open(picked_set)[0].view(1)
     names = ("rgb.png", "depth.png", "camera.json", "mask_visib.json")
-    with tarfile.open(folder / "train_web" / "shard-000000.tar") as shard:
+    with tarfile.open(picked_set / "train_web" / "shard-000000.tar") as shard:
         entries = {name: shard.extractfile(f"000000_000001.{name}").read() for name in names}
     decoded = {name: decode_view(f".{name}", data) for name, data in entries.items()}
     sample = train_loop.prepare(decoded | {"camera.json": json.loads(entries["camera.json"])})
@@ -79,10 +56,10 @@ def test_samples_of_the_train_loop_are_views(folder):
     np.testing.assert_array_equal(sample["foreground"], view.masks.any(axis=0))
 
 
-def test_read_trajectory(folder, tmp_path, capsys):
-    read_trajectory.main([str(folder), "--out", str(tmp_path / "paths.png")])
+def test_read_trajectory(picked_set, tmp_path, capsys):
+    read_trajectory.main([str(picked_set), "--out", str(tmp_path / "paths.png")])
     printed = capsys.readouterr().out
-    episode = synpick_warp.open(folder)[0]
+    episode = synpick_warp.open(picked_set)[0]
     assert printed.count("\nattempt ") + printed.startswith("attempt ") == len(episode.attempts) > 0
     assert f"2 objects, {len(episode)} frames" in printed
     assert (cv2.imread(str(tmp_path / "paths.png")) < 255).any()

@@ -13,27 +13,10 @@ import warp as wp
 from synpick_warp.configs.load import load_config
 from synpick_warp.stages.arrays import allocate
 from synpick_warp.stages.buffers import Snapshot
+from tests.builders import FEW_STEPS, ONE_OBJECT
 from tools.reports import render as render_report
 from tools.reports import render_checks, render_piles, render_sheet
 from tools.reports import sequence as render_sequence
-
-FEW_STEPS = (
-    "--device",
-    "cpu",
-    "--set",
-    "arrangement.volume=1e-3",
-    "--set",
-    "arrangement.max_objects=1",
-    "--set",
-    "physics.substeps=1",
-    "--set",
-    "physics.steps_per_tick=10",
-    "--set",
-    "settle.min_time=0.1",
-    "--set",
-    "settle.rest_ticks=2",
-)
-"""Settings: one object, and as few steps as bring it to rest."""
 
 
 def shot(level: int, size: tuple[int, int] = (9, 16)):
@@ -62,22 +45,8 @@ def test_two_references_tell_the_error_without_their_noise():
 
 def test_a_report_of_one_pile_has_all_rows_and_images(tmp_path):
     file, out, sheet = tmp_path / "numbers.json", tmp_path / "pictures", tmp_path / "sheet.png"
-    options = [
-        "--scenes",
-        "1",
-        "--size",
-        "32x18",
-        "--samples",
-        "8",
-        "--json",
-        str(file),
-        "--out",
-        str(out),
-        "--sheet",
-        str(sheet),
-        *FEW_STEPS,
-    ]
-    code = render_report.main(options)
+    options = ("--scenes", "1", "--size", "32x18", "--samples", "8", "--json", str(file), "--out", str(out), "--sheet", str(sheet))
+    code = render_report.main([*options, *FEW_STEPS])
     rows = {row["name"]: row for row in json.loads(file.read_text())["rows"]}
     assert all(row["holds"] for name, row in rows.items() if name.startswith("reference: "))
     assert code == int(not all(row["holds"] for row in rows.values()))
@@ -190,8 +159,7 @@ def test_references_are_kept_for_other_settings_of_the_denoiser(tmp_path, monkey
 def test_histories_bring_frames_nearer_to_the_reference():
     """With histories later frames have more paths than single frames have; references of few paths suffice, as their noise cancels."""
     fixed = {"cameras.resolution": [64, 36], "bake.mode": "move", "bake.episodes": 1, "bake.worlds": 1, "render.samples": 64}
-    quick = dict(part.split("=") for part in FEW_STEPS if "=" in part)
-    given = fixed | {"bake.device": "cpu"} | {key: json.loads(value) for key, value in quick.items()}
+    given = fixed | ONE_OBJECT | {"bake.device": "cpu"}
     quality = {}
     for history in (0, 16):
         config = load_config("synpick", given | {"render.history": history})

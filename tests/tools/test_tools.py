@@ -10,58 +10,31 @@ import numpy as np
 import pytest
 
 from synpick_warp.configs.schema import Config
+from tests.builders import FEW_STEPS, assignments
 from tools.bench import __main__ as bench
 from tools.bench import physics as bench_physics
 from tools.figures import read_runs
 from tools.reports import rest as rest_report
 
-FEW_STEPS = (
-    "--device",
-    "cpu",
-    "--set",
-    "arrangement.volume=1e-3",
-    "--set",
-    "arrangement.max_objects=1",
-    "--set",
-    "physics.substeps=1",
-    "--set",
-    "physics.steps_per_tick=10",
-    "--set",
-    "settle.min_time=0.1",
-    "--set",
-    "settle.rest_ticks=2",
-)
-"""Settings: one object per world, and as few steps as bring it to rest."""
-SMALL_IMAGES = (
-    "--set",
-    "perception.resolution=[160,90]",
-    "--set",
-    "perception.contour_points=512",
-    "--set",
-    "perception.contour_offset=1.5",
-    "--set",
-    "perception.min_votes=2.0",
-    "--set",
-    "perception.normal_window=2",
-)
-"""Settings: small images for perception."""
-SHORT_EPISODES = (
-    "--set",
-    "pick.appear_height=0.2",
-    "--set",
-    "pick.speed=4.0",
-    "--set",
-    "pick.near_speed=0.5",
-    "--set",
-    "pick.lift_height=0.2",
-    "--set",
-    "pick.lift_speed=2.0",
-    "--set",
-    "pick.failures=1",
-    "--set",
-    "settle.rest_displacement=1e-3",
-)
-"""Settings: short picking episodes."""
+SMALL_IMAGES = {
+    "perception.resolution": [160, 90],
+    "perception.contour_points": 512,
+    "perception.contour_offset": 1.5,
+    "perception.min_votes": 2.0,
+    "perception.normal_window": 2,
+}
+"""Small images for perception."""
+SHORT_EPISODES = {
+    "pick.appear_height": 0.2,
+    "pick.speed": 4.0,
+    "pick.near_speed": 0.5,
+    "pick.lift_height": 0.2,
+    "pick.lift_speed": 2.0,
+    "pick.failures": 1,
+    "settle.rest_displacement": 1e-3,
+}
+"""Short picking episodes."""
+SHORT_PICKS = (*FEW_STEPS, *assignments(SMALL_IMAGES | SHORT_EPISODES))
 
 
 def pile(**changes):
@@ -156,7 +129,7 @@ def test_bench_measures_every_part_of_small_worlds(tmp_path, monkeypatch, capsys
         monkeypatch.setattr(bench, name, value)
     file = tmp_path / "bench.json"
     small = ("--worlds", "1", "--resolution", "32x18", "--seconds", "0", "--set", 'bake.formats=["bop", "shards"]')
-    assert bench.main([*small, "--json", str(file), *FEW_STEPS, *SMALL_IMAGES, *SHORT_EPISODES]) == 0
+    assert bench.main([*small, "--json", str(file), *SHORT_PICKS]) == 0
     rows = json.loads(file.read_text())["rows"]
     assert {row["part"] for row in rows} == {"setup", *bench.DEFAULT_PARTS}
     assert all(row["value"] >= 0.0 for row in rows)

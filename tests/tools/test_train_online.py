@@ -4,23 +4,21 @@ from __future__ import annotations
 
 import pytest
 
-from synpick_warp.factory import assembly
+from tests.builders import assignments, boxes
 from tests.online.conftest import TINY
-from tests.worlds.small_worlds import QUICK, catalog
+from tests.worlds.small_worlds import QUICK
 
 torch = pytest.importorskip("torch", exc_type=ImportError)
 train_online = pytest.importorskip("tools.examples.train_online", exc_type=ImportError)
 
 
-def test_a_network_learns_from_the_stream(monkeypatch, capsys):
-    monkeypatch.setattr(assembly, "load_catalog", lambda config, report: catalog())
-    given = QUICK | {key.replace("__", "."): value for key, value in TINY.items()} | {"bake.mode": "move", "arrangement.volume": 3e-4}
-    assignments = [
-        part for key, value in given.items() if key not in ("bake.device", "bake.worlds") for part in ("--set", f"{key}={value}")
-    ]
+def test_a_network_learns_from_the_stream(capsys):
+    given = QUICK | TINY | {"bake.mode": "move", "arrangement.volume": 3e-4}
+    chosen = assignments({key: value for key, value in given.items() if key not in ("bake.device", "bake.worlds")})
     small = ["--device", "cpu", "--worlds", "2", "--resolution", "48x27", "--batch", "3", "--width", "8", "--stride", "1"]
-    options = train_online.parse([*small, *assignments, "--held-out", "6", "--views", "6,24,96"])
-    results = train_online.run(options, torch.device("cpu"))
+    options = train_online.parse([*small, *chosen, "--held-out", "6", "--views", "6,24,96"])
+    with boxes():
+        results = train_online.run(options, torch.device("cpu"))
     assert all(0 <= value <= 1 for value in results)
     said = capsys.readouterr().out.splitlines()
     assert len(results) == 3

@@ -25,7 +25,7 @@ HOLE = 10
 def write_set(folder: Path, exporter: type, **bop: object) -> Path:
     """A finished data set of boxes, with settings and manifest."""
     settings = config(LAYERS, **({"split": "train", "color_format": "png"} | bop))
-    export(exporter, folder, settings, EPISODES)
+    export(exporter, folder, settings, EPISODES, processes=0)
     (folder / CONFIG_FILE).write_text(config_to_toml(settings))
     (folder / MANIFEST_FILE).write_text("{}")
     (folder / ENTRIES).mkdir()

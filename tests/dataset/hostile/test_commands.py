@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import functools
-import io
 import json
 import shutil
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, redirect_stderr, redirect_stdout
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
@@ -19,31 +18,19 @@ import synpick_warp
 from synpick_warp.apps.estimation import factories
 from synpick_warp.apps.evaluation.results import write_results
 from synpick_warp.apps.evaluation.truth import read_truth
-from synpick_warp.cli.main import main
-from synpick_warp.configs.load import load_config
 from synpick_warp.dataset.reading import DataSet
 from synpick_warp.errors import SynpickError
-from synpick_warp.factory import assembly
-from synpick_warp.factory.pipeline import run_bake
-from synpick_warp.system.progress import SilentProgress
+from tests.builders import PICKED, bake_boxes, once, run
 from tests.estimation.fakes import FakeEstimator
 from tests.harness.fuzz import fuzz_examples
 from tests.harness.hostile import LEAVES, WHOLE, places, removed, replaced
-from tests.worlds.sights import SHORT
-from tests.worlds.small_worlds import QUICK, catalog
 
-TINY = {
-    "bake.formats": ["bop", "shards", "zarr"],
+TINY = PICKED | {
     "bake.device": "cpu",
+    "bake.episodes": 1,
+    "bake.worlds": 1,
+    "bake.formats": ["bop", "shards", "zarr"],
     "cameras.resolution": [48, 27],
-    "render.layers": ["flow", "classes"],
-    "physics.step": 4e-3,
-    "physics.steps_per_tick": 16,
-    "physics.substeps": 1,
-    "physics.iterations": 6,
-    "arrangement.max_objects": 2,
-    "pick.failures": 1,
-    "perception.resolution": [160, 90],
 }
 HANG = 20.0
 """Longest time that one command may take [s]; some 0.1 s are usual."""
@@ -82,13 +69,10 @@ class Sandbox:
 
 @pytest.fixture(scope="module")
 def sandbox(tmp_path_factory) -> Sandbox:
-    """A finished set of one episode with two attempts, in all formats that are read back."""
+    """A finished set of one episode with two attempts, in all formats that are read back, and with few pixels: it is read often."""
     folder = tmp_path_factory.mktemp("hostile")
-    overrides = QUICK | {key.replace("__", "."): value for key, value in SHORT.items()} | TINY
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(assembly, "load_catalog", lambda config, report: catalog())
-        run_bake(load_config("smoke", overrides), folder / "set", SilentProgress())
-    return Sandbox(folder / "set", folder)
+    baked, _ = once(tmp_path_factory, "hostile", lambda out: bake_boxes(out, TINY))
+    return Sandbox(shutil.copytree(baked, folder / "set"), folder)
 
 
 @functools.lru_cache(maxsize=64)
@@ -166,15 +150,13 @@ def attempted(part: Callable[[], object]):
 
 def run_command(*arguments: object) -> int:
     """Run a command: exit code 0 or 1, or 2 with one line."""
-    out, err = io.StringIO(), io.StringIO()
     started = time.monotonic()
-    with redirect_stdout(out), redirect_stderr(err):
-        code = main([str(part) for part in arguments])
+    code, _, err = run(*arguments)
     assert time.monotonic() - started < HANG, arguments
     assert code in (0, 1, 2), arguments
-    assert (code == 2) == bool(err.getvalue()), (arguments, err.getvalue())
+    assert (code == 2) == bool(err), (arguments, err)
     if code == 2:
-        [line] = err.getvalue().splitlines()
+        [line] = err.splitlines()
         assert line.startswith("synpick-warp: error: "), line
         assert line.isprintable()
     return code

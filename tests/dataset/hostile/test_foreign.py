@@ -7,7 +7,6 @@ import contextlib
 import dataclasses
 import errno
 import hashlib
-import io
 import json
 import os
 import re
@@ -22,7 +21,6 @@ import numpy as np
 import pytest
 
 from synpick_warp.apps.conversion import run as conversion
-from synpick_warp.cli.main import main
 from synpick_warp.configs.splits import DataLayout
 from synpick_warp.dataset.commit.file_names import check_file_names, describe_strays
 from synpick_warp.dataset.commit.manifest import CONSTANTS, episode_entry, read_checksums
@@ -34,6 +32,7 @@ from synpick_warp.exporters.lerobot.exporter import LerobotExporter
 from synpick_warp.exporters.lerobot.layout import ROW
 from synpick_warp.exporters.writing import files
 from synpick_warp.exporters.writing.pool import WriterPool
+from tests.builders import once, run
 from tests.harness.scripted_bake import bake, settings, snapshot
 
 HANG = 120
@@ -52,18 +51,15 @@ FOREIGN = (
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory) -> Path:
     """A finished data set of all formats, of two episodes."""
-    out = tmp_path_factory.mktemp("whole") / "set"
-    bake(out, settings())
-    return out
+    return once(tmp_path_factory, "whole", lambda out: bake(out, settings()))[0]
 
 
 @pytest.fixture(scope="module")
 def narrow(tmp_path_factory) -> Path:
     """A finished data set that can be converted to most formats."""
-    out = tmp_path_factory.mktemp("narrow") / "set"
     plain = settings(formats=("bop", "zarr"))
-    bake(out, dataclasses.replace(plain, bop=dataclasses.replace(plain.bop, keypoints=0)))
-    return out
+    config = dataclasses.replace(plain, bop=dataclasses.replace(plain.bop, keypoints=0))
+    return once(tmp_path_factory, "narrow", lambda out: bake(out, config))[0]
 
 
 @pytest.fixture(autouse=True)
@@ -101,13 +97,11 @@ def add_line(data_set: Path, entry: Path, name: str) -> None:
     replace(data_set / f"{entry}.json", json.dumps(content).encode())
 
 
-def run(*arguments: object) -> tuple[int, str]:
+def told(*arguments: object) -> tuple[int, str]:
     """Exit code and error of a command: 0 or 1, or 2 and one line."""
-    error = io.StringIO()
-    with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(error):
-        code = main([str(argument) for argument in arguments])
-    assert (code == 2) == (len(error.getvalue().splitlines()) == 1), error.getvalue()
-    return code, error.getvalue()
+    code, _, err = run(*arguments)
+    assert (code == 2) == (len(err.splitlines()) == 1), err
+    return code, err
 
 
 def commands(folder: Path, scratch: Path) -> Iterator[tuple[str, tuple[int, str]]]:
@@ -121,7 +115,7 @@ def commands(folder: Path, scratch: Path) -> Iterator[tuple[str, tuple[int, str]
         ("merge", "--out", scratch / "merged"),
         ("convert", "--to", "shards", "--processes", 1, "--out", scratch / "converted"),
     ):
-        yield name, run(name, folder, *options)
+        yield name, told(name, folder, *options)
         for out in ("merged", "converted"):
             shutil.rmtree(scratch / out, ignore_errors=True)
 
@@ -146,7 +140,7 @@ def test_a_list_plants_no_file(narrow, tmp_path, entry, name):
     before = snapshot(tmp_path)
     with pytest.raises(DatasetError, match=f'{entry}.sha256 names "{name}", which none of its formats writes; remove manifest/'):
         merge([folder], out)
-    code, error = run("convert", folder, "--to", "shards", "--processes", 1, "--out", out)
+    code, error = told("convert", folder, "--to", "shards", "--processes", 1, "--out", out)
     assert (code, "none of its formats writes" in error) == ((2, True) if entry == CONSTANTS else (0, False))
     assert not (out / name).exists() or (out / name).read_bytes() != b"evil"  # Shards have a README.md of their own.
     shutil.rmtree(out)
@@ -231,7 +225,7 @@ def test_what_is_no_file_is_neither_waited_for_nor_read(whole, tmp_path, place, 
     path.parent.mkdir(exist_ok=True)
     KINDS[kind](path)
     for name, *options in (("verify",), ("stats",), ("merge", "--out", tmp_path / "merged")):
-        run(name, folder, *options)
+        told(name, folder, *options)
     with contextlib.suppress(SynpickError):
         bake(folder, settings())
         assert verify(folder).finished
@@ -280,14 +274,15 @@ def test_litter_is_no_data(whole, tmp_path):
 
 
 @pytest.mark.parametrize("place", ["coco/parts/000099.jsonl", "coco/parts/000000 (copy).jsonl", "lerobot/parts/000099.json"])
-def test_a_part_of_no_committed_episode_is_told(whole, tmp_path, place, capsys):
+def test_a_part_of_no_committed_episode_is_told(whole, tmp_path, place):
     folder = copied(whole, tmp_path / "set")
     assert describe_strays(folder, DataLayout.of(settings()), (0, 1)) == ""
     (folder / place).write_text("[]\n")
     line = f"left out: {folder}/{place}, of no committed episode"
     assert describe_strays(folder, DataLayout.of(settings()), (0, 1)) == line
-    assert main(["merge", str(folder), "--out", str(tmp_path / "merged")]) == 0
-    assert line in capsys.readouterr().out.splitlines()
+    code, out, _ = run("merge", folder, "--out", tmp_path / "merged")
+    assert code == 0
+    assert line in out.splitlines()
 
 
 def test_commands_pass_litter_over(narrow, tmp_path):
@@ -322,7 +317,7 @@ def test_frames_are_counted_not_believed(tmp_path, formats, frames):
     if frames > 7 or formats in (("bop",), ("coco",)):
         assert "counts" in verify(folder).problem
     for name, *options in (("stats",), ("report", "--out", tmp_path / "r.html"), ("convert", "--to", "lerobot", "--out", tmp_path / "new")):
-        code, error = run(name, folder, *options)
+        code, error = told(name, folder, *options)
         assert code == 2 or frames == 7, error
     assert not (tmp_path / "new").exists()
 
@@ -333,8 +328,8 @@ def test_episodes_in_the_settings_are_not_believed(narrow, tmp_path):
     replace(folder / "config.toml", text.replace("episodes = 2", f"episodes = {2**31 - 1}").encode())
     shared = LerobotExporter.shared_files(dataclasses.replace(DataLayout.of(settings()), episodes=2**31 - 1))
     assert len(shared.folders) < 20
-    assert run("convert", folder, "--to", "lerobot", "--processes", 1, "--out", tmp_path / "new") == (0, "")
-    assert run("stats", folder)[0] == 0
+    assert told("convert", folder, "--to", "lerobot", "--processes", 1, "--out", tmp_path / "new") == (0, "")
+    assert told("stats", folder)[0] == 0
 
 
 def test_an_attempt_has_as_many_votes_as_pairs_of_objects(whole, tmp_path):
@@ -342,7 +337,7 @@ def test_an_attempt_has_as_many_votes_as_pairs_of_objects(whole, tmp_path):
     votes = [[index % 30, 31, 0.5] for index in range(100_000)]
     edit(folder / "manifest" / "000000.json", lambda content: content["attempts"][0]["observation"].update(votes=votes))
     assert "length <= 992" in verify(folder).problem
-    assert run("merge", folder, "--out", tmp_path / "merged")[0] == 2
+    assert told("merge", folder, "--out", tmp_path / "merged")[0] == 2
 
 
 @pytest.mark.parametrize(("array", "axis"), [("attempts/record", 0), ("attempts/frame", 0), ("attempts/peak_force", 1), ("ticks/pose", 1)])

@@ -15,52 +15,44 @@ import zarr
 
 import synpick_warp
 from synpick_warp.configs.schema import Config
-from synpick_warp.factory import assembly
-from synpick_warp.factory.pipeline import run_bake
 from synpick_warp.stages import ticks
 from synpick_warp.stages.stream import FrameStream
-from synpick_warp.system.progress import SilentProgress
+from tests.builders import PICKING, bake_boxes, boxes, once
 from tests.harness.exporter_contract import digests
 from tests.harness.memory_tables import device_arrays
-from tests.worlds.sights import SHORT
-from tests.worlds.small_worlds import catalog, settings
+from tests.worlds.small_worlds import settings
 
 TOOL = "tools.checks.trajectory"
 
 
+MIXED = PICKING | {
+    "bake.formats": ["zarr"],
+    "bake.mode": "mixed",
+    "bake.episodes": 3,
+    "cameras.resolution": [32, 18],
+    "physics.iterations": 8,
+}
+"""Settings of a mixed bake that takes some seconds and includes an episode of picking."""
+
+
 @pytest.fixture(scope="module")
 def mixed() -> Config:
-    """Settings of a mixed bake that takes some seconds and includes an episode of picking."""
-    return settings(
-        **SHORT
-        | {
-            "bake__formats": ["zarr"],
-            "bake__mode": "mixed",
-            "bake__episodes": 3,
-            "arrangement__max_objects": 2,
-            "pick__failures": 1,
-            "perception__resolution": [160, 90],
-            "cameras__resolution": [32, 18],
-            "physics__step": 4e-3,
-            "physics__steps_per_tick": 16,
-            "physics__substeps": 1,
-            "physics__iterations": 8,
-        }
-    )
+    return settings(**MIXED)
 
 
 @pytest.fixture(scope="module")
-def out(tmp_path_factory, mixed) -> Path:
+def out(tmp_path_factory) -> Path:
     """A finished bake of boxes; beside it the same with another number of worlds, and with physics ahead."""
-    folder = tmp_path_factory.mktemp("bake") / "set"
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(assembly, "load_catalog", lambda config, report: catalog())
-        # No format needs images.
-        patch.setattr(FrameStream, "render", lambda *_: pytest.fail("views were rendered"))
-        run_bake(mixed, folder, SilentProgress())
-        patch.setattr(ticks, "queue_lead", lambda *_: 5)
-        run_bake(replace(mixed, bake=replace(mixed.bake, worlds=3)), folder.with_name("again"), SilentProgress())
-    return folder
+
+    def make(folder: Path) -> None:
+        with boxes() as patch:
+            # No format needs images.
+            patch.setattr(FrameStream, "render", lambda *_: pytest.fail("views were rendered"))
+            bake_boxes(folder, MIXED)
+            patch.setattr(ticks, "queue_lead", lambda *_: 5)
+            bake_boxes(folder.with_name("again"), MIXED | {"bake.worlds": 3})
+
+    return once(tmp_path_factory, "mixed", make)[0]
 
 
 def check(monkeypatch, *arguments: object) -> int:

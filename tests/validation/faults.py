@@ -1,0 +1,284 @@
+"""Faults to plant in a copy of a correct data set: the rule that must find each, words of its message, and how it is planted."""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+import tarfile
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import trimesh
+
+from tests.validation.planting import (
+    CAMERA,
+    COCO,
+    GT,
+    INFO,
+    MODELS,
+    SCENE,
+    SHARD,
+    TARGETS,
+    Plant,
+    doubled,
+    drop,
+    gone,
+    mask_path,
+    moved,
+    named,
+    pixels,
+    put,
+    raw,
+    read,
+    whole,
+    write,
+)
+
+Faults = dict[str, tuple[str, str, Plant]]
+RGB, DEPTH, MASK, VISIBLE = "rgb/000001.png", "depth/000001.png", "mask/000001_000001.png", "mask_visib/000001_000001.png"
+PLY = "models/obj_000007.ply"
+
+
+def link_image_out_of_the_set(folder: Path) -> None:
+    outside = (folder / SCENE / RGB).rename(folder.parent / "secret.png")
+    os.symlink(outside, folder / SCENE / RGB)
+
+
+def in_metres(entries: list[dict[str, Any]], key: str) -> None:
+    for item in entries:
+        item[key] = [value / 1000.0 for value in item[key]]
+
+
+FILES: Faults = {
+    "link out of the set": ("link-outside", "", lambda folder: os.symlink(folder.parent, folder / "models" / "elsewhere")),
+    "image is a link out of the set": ("scene-links", "", link_image_out_of_the_set),
+    "stray folder in split": ("split-folders", "no scene", lambda folder: (folder / "train/backup").mkdir()),
+    "short scene name": ("split-folders", "4 digits", named("train/000002", "train/0002")),
+    "camera without focal length": ("camera-file", "fx", drop("camera.json", "fx")),
+    "no targets": ("set-files", "toolkit", gone(TARGETS)),
+    "bake interrupted": ("bake-finished", "", gone("manifest/joined.json")),
+    "model missing for evaluation": ("set-files", "this object", gone("models_eval/obj_000007.ply")),
+    "no scene camera": ("scene-files", "", gone(CAMERA)),
+    "no infos": ("ground-truth", "", gone(INFO)),
+    "odd file name": ("image-names", "", doubled(f"{SCENE}/{RGB}", f"{SCENE}/rgb/1.png")),
+    "missing depth": ("image-missing", "", gone(f"{SCENE}/{DEPTH}")),
+    "missing mask": ("image-missing", "", gone(f"{SCENE}/mask/000001_000002.png")),
+    "mask beyond the list": (
+        "image-extra",
+        "no instance 7",
+        doubled(f"{SCENE}/mask/000001_000000.png", f"{SCENE}/mask/000001_000007.png"),
+    ),
+    "image without entry": ("image-extra", "no entry 9", doubled(f"{SCENE}/{RGB}", f"{SCENE}/rgb/000009.png")),
+}
+ANNOTATIONS: Faults = {
+    "translation of two numbers": ("json-schema", "", put(GT, "1", 0, "cam_t_m2c", [1.0, 2.0])),
+    "padded key": ("json-keys", "leading zeros", whole(GT, lambda content: {f"{int(key):06d}": value for key, value in content.items()})),
+    "image without truth": ("same-images", "", whole(GT, lambda content: {"0": content["0"]})),
+    "mirrored rotation": ("rotation", "determinant is -1", put(GT, "1", 1, "cam_R_m2c", [1, 0, 0, 0, 1, 0, 0, 0, -1])),
+    "scaled rotation": ("rotation", "cam_R_w2c", put(CAMERA, "1", "cam_R_w2c", [1.01, 0, 0, 0, 1, 0, 0, 0, 1])),
+    "two camera models": (
+        "camera-model",
+        "both",
+        whole(CAMERA, lambda content: content["1"].update(cam_model={"projection_params": [1.0]})),
+    ),
+    "transposed intrinsics": ("camera-model", "column by column", put(CAMERA, "1", "cam_K", [600.0, 0, 0, 0, 600.0, 0, 100.0, 75.0, 1])),
+    "no depth scale": ("depth-scale", "", drop(CAMERA, "1", "depth_scale")),
+    "translation of minus one": ("skip-translation", "", put(GT, "1", 1, "cam_t_m2c", [-1, -1, -1])),
+    "pose in metres": ("translation-units", "metres", whole(GT, lambda content: in_metres(content["1"], "cam_t_m2c"))),
+    "camera in metres": ("camera-units", "metres", whole(CAMERA, lambda content: in_metres(list(content.values()), "cam_t_w2c"))),
+    "half of the extrinsics": ("extrinsics", "", drop(CAMERA, "1", "cam_t_w2c")),
+    "OpenGL pose": (
+        "behind-camera",
+        "",
+        whole(GT, lambda content: content["1"][0].update(cam_t_m2c=np.multiply(content["1"][0]["cam_t_m2c"], (1, -1, -1)).tolist())),
+    ),
+    "instance twice": ("instance-ids", "2 times", put(GT, "1", 0, "instance_id", 3)),
+    "unknown object": ("object-model", "obj_id 99", put(GT, "1", 0, "obj_id", 99)),
+    "short infos": ("list-lengths", "", drop(INFO, "1", -1)),
+    "wrong fraction": ("visible-fraction", "", put(INFO, "1", 0, "visib_fract", 0.5)),
+    "counts in the wrong order": ("count-order", "", put(INFO, "1", 0, "px_count_all", 10)),
+    "zero box of a visible instance": ("hidden-boxes", "", put(INFO, "1", 0, "bbox_visib", [-1, -1, -1, -1])),
+    "box reaches out": ("box-inside-box", "", put(INFO, "1", 0, "bbox_visib", [0, 0, 199, 149])),
+}
+
+
+def fill(image: np.ndarray, where: tuple[slice, slice], value: int) -> np.ndarray:
+    image[where] = value
+    return image
+
+
+def amodal_masks_as_visible_ones(folder: Path) -> None:
+    first, second = (read(mask_path(folder, index)) for index in (0, 1))
+    for index, image in ((0, first | second), (1, second)):
+        write(mask_path(folder, index, "mask_visib"), image)
+
+
+def row_major(content: dict[str, Any]) -> None:
+    for item in content["annotations"]:
+        runs = item["segmentation"]
+        height, width = runs["size"]
+        flat = np.repeat(np.arange(len(runs["counts"])) % 2, runs["counts"]).reshape(width, height).T.reshape(-1)
+        edges = np.flatnonzero(np.diff(flat)) + 1
+        runs["counts"] = np.diff(np.concatenate(([0], edges, [height * width]))).tolist()
+
+
+IMAGES: Faults = {
+    "truncated image": ("image-decodes", "", raw(f"{SCENE}/{RGB}", lambda data: data[:100])),
+    "small depth": ("image-size", "100 x 75", pixels(DEPTH, lambda image: image[::2, ::2])),
+    "grey rgb": ("colour-type", "1 channels", pixels(RGB, lambda image: image[..., 0])),
+    "depth of eight bits": ("depth-type", "8 bits", pixels(DEPTH, lambda image: (image // 256).astype(np.uint8))),
+    "empty depth": ("depth-known", "", pixels(DEPTH, lambda image: 0 * image)),
+    "mask of ones": ("mask-type", "values", pixels(MASK, lambda image: image // 255)),
+    "mask in colour": ("mask-type", "RGB", pixels(MASK, lambda image: cv2.cvtColor(image, cv2.COLOR_GRAY2BGR))),
+    "visible beyond the silhouette": ("mask-inside-mask", "", pixels(VISIBLE, lambda image: fill(image, np.s_[:5, :5], 255))),
+    "amodal masks as visible ones": ("mask-overlap", "", amodal_masks_as_visible_ones),
+    "wrong visible count": ("visible-count", "", put(INFO, "1", 0, "px_count_visib", 3000)),
+    "wrong valid count": ("valid-count", "", put(INFO, "1", 0, "px_count_valid", 1000)),
+    "wrong amodal count": ("amodal-count", "", put(INFO, "1", 2, "px_count_all", 9000)),
+    "visible box with one more": ("visible-box", "+ 1", moved(INFO, "1", 0, "bbox_visib", [0, 0, 1, 1])),
+    "amodal box with one more": ("amodal-box", "+ 1", moved(INFO, "1", 2, "bbox_obj", [0, 0, 1, 1])),
+    "COCO without categories": ("coco-schema", "", drop(COCO, "categories")),
+    "COCO ids from zero": (
+        "coco-ids",
+        "id 0",
+        whole(COCO, lambda content: [item.update(id=item["id"] - 1) for item in content["annotations"]] and None),
+    ),
+    "COCO wrong file name": ("coco-images", "file_name", put(COCO, "images", 0, "file_name", "000000.png")),
+    "COCO categories from one": ("coco-categories", "", put(COCO, "categories", [{"id": 1, "name": "1"}])),
+    "COCO annotation missing": ("coco-instances", "", drop(COCO, "annotations", -1)),
+    "COCO row major": ("coco-mask", "row by row", whole(COCO, row_major)),
+    "COCO box without one": ("coco-box", "+ 1", moved(COCO, "annotations", 0, "bbox", [0, 0, -1, -1])),
+    "COCO ignores visible": ("coco-ignore", "", put(COCO, "annotations", 0, "ignore", True)),
+}
+
+
+def move_model(scale: float, shift: float) -> Plant:
+    def plant(folder: Path) -> None:
+        for path in (folder / PLY, folder / "models_eval/obj_000007.ply"):
+            mesh = trimesh.load_mesh(path, process=False)
+            mesh.vertices = scale * mesh.vertices + shift
+            path.write_bytes(mesh.export(file_type="ply"))
+
+    return plant
+
+
+def symmetry(*matrix: float) -> Plant:
+    return whole(MODELS, lambda content: content["7"].update(symmetries_discrete=[list(matrix)]))
+
+
+def shard_without_a_mask(folder: Path) -> None:
+    path, kept = folder / SHARD, []
+    with tarfile.open(path) as tar:
+        for member in tar.getmembers():
+            data = tar.extractfile(member).read()
+            if member.name == "000000_000001.mask.json":
+                data = json.dumps({key: value for key, value in json.loads(data).items() if key != "1"}).encode()
+            member.size = len(data)
+            kept.append((member, data))
+    with tarfile.open(path, "w", format=tarfile.USTAR_FORMAT) as tar:
+        for member, data in kept:
+            tar.addfile(member, io.BytesIO(data))
+
+
+SETS: Faults = {
+    "model missing": ("model-files", "no model", gone("models_eval/obj_000007.ply")),
+    "model of other types": ("model-dialect", "float32", raw(PLY, lambda data: data.replace(b"property float ", b"property float32 "))),
+    "model cut short": ("model-mesh", "", raw(PLY, lambda data: data[:-40])),
+    "model without diameter": ("model-entry", "", drop(MODELS, "7", "diameter")),
+    "diameter in metres": ("model-diameter", "metres", put(MODELS, "7", "diameter", 0.21213)),
+    "wrong model size": ("model-box", "size_z", put(MODELS, "7", "size_z", 100.0)),
+    "model in metres": ("model-units", "metres", move_model(1e-3, 0.0)),
+    "model off its origin": ("model-origin", "", move_model(1.0, 60.0)),
+    "identity listed": ("symmetry-identity", "", symmetry(*np.eye(4).ravel().tolist())),
+    "mirror symmetry": ("symmetry-rigid", "", symmetry(*np.diag([-1.0, 1.0, 1.0, 1.0]).ravel().tolist())),
+    "false symmetry": ("symmetry-maps", "", symmetry(0, 0, 1, 0, 0, 1, 0, 0, -1, 0, 0, 0, 0, 0, 0, 1)),
+    "targets are no list": ("target-schema", "", raw(TARGETS, lambda _: b"{}")),
+    "target of another scene": ("target-scenes", "scene 77", put(TARGETS, 0, "scene_id", 77)),
+    "target of another image": ("target-images", "image 50", put(TARGETS, 0, "im_id", 50)),
+    "wrong target count": ("target-counts", "", put(TARGETS, 0, "inst_count", 9)),
+    "camera missing": ("rig-complete", "", named("train/000002", "gone")),
+    "camera moved": ("world-poses", "mm", put(CAMERA, "1", "cam_t_w2c", [0.0, 0.0, 1490.0])),
+    "shard missing": ("shard-index", "no shard-000000.tar", gone(SHARD)),
+    "shard cut short": ("shard-files", "", raw(SHARD, lambda data: data[:5000])),
+    "shard without a mask": ("mask-entries", "", shard_without_a_mask),
+}
+
+
+def scale_depth(factor: float) -> Plant:
+    return pixels("depth/*", lambda image: np.rint(image * factor).astype(np.uint16))
+
+
+def depth_of_rays(folder: Path) -> None:
+    fx, _, cx, _, fy, cy, *_ = json.loads((folder / CAMERA).read_text())["1"]["cam_K"]
+
+    def lengthen(depth: np.ndarray) -> np.ndarray:
+        x, y = ((np.arange(size) + 0.5 - c) / f for size, c, f in ((depth.shape[1], cx, fx), (depth.shape[0], cy, fy)))
+        return np.rint(depth * np.sqrt(1.0 + x[None] ** 2 + y[:, None] ** 2)).astype(np.uint16)
+
+    pixels("depth/*", lengthen)(folder)
+
+
+def swap(entries: list[Any], first: int, second: int) -> None:
+    entries[first], entries[second] = entries[second], entries[first]
+
+
+def swap_objects(content: dict[str, Any]) -> None:
+    one, two = content["1"][1:3]
+    one["obj_id"], two["obj_id"] = two["obj_id"], one["obj_id"]
+
+
+def masks_swapped(folder: Path) -> None:
+    for kind in ("mask", "mask_visib"):
+        paths = [mask_path(folder, index, kind) for index in (0, 2)]
+        for path, data in zip(paths, [path.read_bytes() for path in paths][::-1], strict=True):
+            path.write_bytes(data)
+
+
+def turn(content: dict[str, Any]) -> None:
+    about_z = np.array([[np.cos(0.5), -np.sin(0.5), 0.0], [np.sin(0.5), np.cos(0.5), 0.0], [0.0, 0.0, 1.0]])
+    content["1"][2]["cam_R_m2c"] = (about_z @ np.reshape(content["1"][2]["cam_R_m2c"], (3, 3))).ravel().tolist()
+
+
+def mask_of_a_box(mask: np.ndarray) -> np.ndarray:
+    x, y, width, height = cv2.boundingRect(mask)
+    return fill(mask, np.s_[y : y + height, x : x + width], 255)
+
+
+def depth_of_something_else(folder: Path) -> None:
+    visible = read(mask_path(folder, 0, "mask_visib")) > 0
+    visible[: int(np.flatnonzero(visible.any(axis=1)).mean()) + 5] = False
+    pixels(DEPTH, lambda depth: depth - 300 * visible.astype(np.uint16))(folder)
+
+
+RENDERED: Faults = {
+    "depth scaled up": ("depth-scaled", "1.02 times", scale_depth(1.02)),
+    "depth scaled down": ("depth-scaled", "0.99 times", scale_depth(0.99)),
+    "depth of rays": ("depth-planar", "", depth_of_rays),
+    "masks shifted": ("mask-shifted", "(3, 0)", pixels("mask*/*_000001.png", lambda image: np.roll(image, 3, axis=1))),
+    "mask shifted by one pixel": ("mask-shifted", "(0, -1)", pixels(MASK, lambda image: np.roll(image, -1, axis=0))),
+    "visible masks shifted": (
+        "mask-shifted",
+        "mask_visib is shifted by (4, 0)",
+        pixels("mask_visib/000001_000000.png", lambda image: np.roll(image, 4, axis=1)),
+    ),
+    "object ids swapped": ("object-shown", "object 7", whole(GT, swap_objects)),
+    "masks swapped": ("instances-swapped", "instances 0 and 2", masks_swapped),
+    "truths swapped": ("instances-swapped", "instances 0 and 1", whole(GT, lambda content: swap(content["1"], 0, 1))),
+    "pose moved sideways": ("pose", "about", moved(GT, "1", 0, "cam_t_m2c", [12.0, 0.0, 0.0])),
+    "pose moved away": ("pose", "about 8 mm", moved(GT, "1", 2, "cam_t_m2c", [0.0, 0.0, -8.0])),
+    "pose turned": ("pose", "does not fit", whole(GT, turn)),
+    "mask of a box": ("mask-rendered", "", pixels(MASK, mask_of_a_box)),
+    "half of the visible mask": (
+        "visible-rendered",
+        "",
+        pixels(
+            "mask_visib/000001_000000.png",
+            lambda image: fill(image, np.s_[:, : int(np.flatnonzero(image.any(axis=0)).mean())], 0),
+        ),
+    ),
+    "depth of something else": ("depth-rendered", "", depth_of_something_else),
+}
+FAULTS = FILES | ANNOTATIONS | IMAGES | SETS | RENDERED
