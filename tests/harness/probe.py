@@ -30,7 +30,8 @@ class Probe:
         """Values of the function at rows of arguments, which broadcast as NumPy arrays.
 
         Args:
-            arguments: Structs and arrays, which all rows share; all else by rows: NumPy arrays (..., components), or one value for all.
+            arguments: Arrays, and structs that have some, which all rows share; all else by rows: NumPy arrays (..., components),
+                structured for structs, or one value for all.
             device: The tests' default device if None.
 
         Returns:
@@ -43,8 +44,7 @@ class Probe:
         values, rows = list(arguments), {}
         for index, (kind, value) in enumerate(zip(self.inputs.values(), arguments, strict=True)):
             if not _shared(kind):
-                scalar = wp.dtype_to_numpy(getattr(kind, "_wp_scalar_type_", kind))
-                rows[index] = kind, np.asarray(value.numpy() if isinstance(value, wp.array) else value).astype(scalar)
+                rows[index] = kind, _numpy(kind, value)
         shape = np.broadcast_shapes(*(values.shape[: values.ndim - len(_components(kind))] for kind, values in rows.values()))
         count = int(np.prod(shape))
         for index, (kind, row) in rows.items():
@@ -86,8 +86,14 @@ def probe(func: wp.Function) -> Probe:
 
 
 def _shared(kind: Any) -> bool:
-    """Structs and arrays are the same for all rows."""
-    return isinstance(kind, Struct) or is_array(kind)
+    """Arrays, and structs that have some, are the same for all rows."""
+    return is_array(kind) or (isinstance(kind, Struct) and any(_shared(member.type) for member in kind.vars.values()))
+
+
+def _numpy(kind: Any, value: Any) -> np.ndarray:
+    if isinstance(kind, Struct):
+        return value if isinstance(value, np.ndarray) else wp.array([value], dtype=kind, device="cpu").numpy()[0]
+    return np.asarray(value).astype(wp.dtype_to_numpy(getattr(kind, "_wp_scalar_type_", kind)))
 
 
 def _components(kind: Any) -> tuple[int, ...]:
