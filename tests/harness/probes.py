@@ -3,7 +3,6 @@
 import warp as wp
 
 from synpick_warp.kernels import rng
-from synpick_warp.kernels.sim import gripper
 
 wp.set_module_options({"enable_backward": False})
 
@@ -25,15 +24,3 @@ def sample_kernel(
     uniform_out[i] = rng.uniform(key, stream_index[i, 3])
     index_out[i] = rng.uniform_index(key, stream_index[i, 3], count)
     rotation_out[i] = rng.uniform_rotation(key, stream_index[i, 3])
-
-
-@wp.kernel
-def force_kernel(
-    offset: wp.array[wp.vec3],
-    velocity: wp.array[wp.vec3],
-    law: wp.array2d[float],
-    force_out: wp.array[wp.vec3],
-):
-    """Impedance force; law: stiffness, damping, largest force, mass, time step."""
-    i = wp.tid()
-    force_out[i] = gripper.impedance_force(offset[i], velocity[i], law[i, 0], law[i, 1], law[i, 2], law[i, 3], law[i, 4])

@@ -9,22 +9,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from synpick_warp.kernels.newton_patches.friction import solve_friction
+from tests.harness.probe import probe
 
 
-@wp.kernel(enable_backward=False)
-def solve_kernel(
-    scale: wp.array[float],
-    values: wp.array[wp.vec2],
-    axis: wp.array[wp.vec2],
-    residual: wp.array[wp.vec2],
-    old: wp.array[wp.vec2],
-    radius: wp.array[float],
-    relaxation: float,
-    found_out: wp.array[wp.vec2],
-):
-    """Solve the friction rows of one contact per thread."""
-    i = wp.tid()
-    found_out[i] = solve_friction(scale[i], values[i][0], values[i][1], axis[i], residual[i], old[i], radius[i], relaxation)
+@wp.func
+def solve_rows(scale: float, values: wp.vec2, axis: wp.vec2, residual: wp.vec2, old: wp.vec2, radius: float, relaxation: float):
+    return solve_friction(scale, values[0], values[1], axis, residual, old, radius, relaxation)
+
+
+probe_rows = probe(solve_rows)
 
 
 def solve(matrices, residual, old, radius, device, relaxation: float = 1.0) -> np.ndarray:
@@ -34,11 +27,7 @@ def solve(matrices, residual, old, radius, device, relaxation: float = 1.0) -> n
     """
     values, vectors = np.linalg.eigh(matrices)
     scale = np.maximum(np.maximum(matrices[:, 0, 0], matrices[:, 1, 1]), 1e-20)
-    arrays = (scale, values[:, ::-1] / scale[:, None], vectors[:, :, 1], residual, old, radius)
-    inputs = [wp.array(np.float32(a), dtype=wp.vec2 if a.ndim > 1 else float, device=device) for a in arrays]
-    found = wp.empty(len(scale), dtype=wp.vec2, device=device)
-    wp.launch(solve_kernel, dim=len(scale), inputs=[*inputs, relaxation], outputs=[found], device=device)
-    return found.numpy()
+    return probe_rows(scale, values[:, ::-1] / scale[:, None], vectors[:, :, 1], residual, old, radius, relaxation, device=device)
 
 
 def bisect(matrix: np.ndarray, residual: np.ndarray, old: np.ndarray, radius: float) -> np.ndarray:
