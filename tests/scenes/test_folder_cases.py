@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -272,10 +271,3 @@ def test_a_mesh_in_metres_among_millimetres_is_told(tmp_path):
     (folder / "models_info.json").write_text(json.dumps({"1": {"diameter": 118.3}}))
     with pytest.raises(SynpickError, match=r"diameter is 0\.1183 mm, but models_info\.json says 118\.3; scale it to millimetres"):
         load(folder, tmp_path)
-
-
-def test_the_real_objects_agree_with_their_models_info(real_models, tmp_path):
-    config = Config(bake=Bake(models=str(real_models)), objects=Objects(concave_ratio=0.0))
-    lines: list[str] = []
-    load_catalog(replace(config, object_rows=()), tmp_path, lines.append)
-    assert not lines

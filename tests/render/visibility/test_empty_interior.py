@@ -79,7 +79,7 @@ def test_the_early_out_is_conservative(device, tote):
     reach = np.where(rng.random(4000) < 0.5, float(FAR), rng.uniform(0.0, 0.6, 4000))
     skipped = stays(fixture.interior, start, direction, reach, device)
     unit = direction / np.linalg.norm(direction, axis=1)[:, None]
-    distance = np.array([first_hit(fixture.mesh.vertices, fixture.mesh.faces, *ray) for ray in zip(start, unit, strict=True)])
+    distance = first_hit(fixture.mesh.vertices, fixture.mesh.faces, start, unit)
     hit = distance < reach * np.linalg.norm(direction, axis=1)
     assert not (skipped & hit).any()
     # It applies to many rays: those that start in the tote and go up, or end in it.
