@@ -117,10 +117,7 @@ class GraspHarness:
         self.arrays.component.assign(self.expected["component"])
         self.arrays.largest.assign(self.expected["largest"])
         self.grasp_pixel = self.expected["grasp_pixel"]
-        many = np.ones(len(toy.entries))
-        self.worlds = KernelWorlds(
-            device, views, volume=many, compound=many * 0, radius=many, instances=instances, single_slots=instances, compound_slots=0
-        )
+        self.worlds = KernelWorlds(device, views, len(toy.entries), instances)
         filled(self.worlds.scene.perception, {**planning.SETTINGS, "normal_window": window})
         self.worlds.scene.pick.tilt_limit = tilt_limit
         self.scene = self.worlds.scene

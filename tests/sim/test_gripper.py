@@ -28,18 +28,7 @@ TIP = 0.05
 
 
 def made(device, worlds: int = 1, **move) -> KernelWorlds:
-    one = np.array([1.0])
-    result = KernelWorlds(
-        device,
-        worlds,
-        volume=one,
-        compound=np.array([0]),
-        radius=one,
-        instances=1,
-        single_slots=1,
-        compound_slots=0,
-        move={"corner": wp.vec3(*CORNER), "tcp_offset": TIP, **move},
-    )
+    result = KernelWorlds(device, worlds, move={"corner": wp.vec3(*CORNER), "tcp_offset": TIP, **move})
     result.set(result.state.frame, -1)
     return result
 

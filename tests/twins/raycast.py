@@ -3,20 +3,15 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import ArrayLike
+from scipy.spatial.transform import Rotation
 
 from synpick_warp.scenes.types import Camera, TriangleMesh
 
 
-def rotation_of(quaternion: np.ndarray) -> np.ndarray:
+def rotation_of(quaternion: ArrayLike) -> np.ndarray:
     """Rotation matrix (3, 3) of a quaternion x, y, z, w, which is normalized first."""
-    x, y, z, w = np.asarray(quaternion, dtype=np.float64) / np.linalg.norm(np.asarray(quaternion, dtype=np.float64))
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-        ]
-    )
+    return Rotation.from_quat(np.asarray(quaternion, np.float64)).as_matrix()
 
 
 def cast_mesh(mesh: TriangleMesh, pose: np.ndarray, camera: Camera) -> np.ndarray:

@@ -8,20 +8,15 @@ import numpy as np
 import pytest
 
 from synpick_warp.codes import Segment
-from synpick_warp.configs.schema import FAST, REFERENCE, Config
+from synpick_warp.configs.schema import FAST, REFERENCE
 from synpick_warp.kernels.render.images.antialias import sample_offset
 from synpick_warp.scenes.assets.appearance import srgb_to_linear
-from synpick_warp.scenes.types import Material, TriangleMesh
+from synpick_warp.scenes.types import TriangleMesh
 from synpick_warp.stages.render.sampling_rates import COVERAGE_RAYS, NARROW_COVERAGE_RAYS
 from tests.harness.probe import probe
-from tests.worlds.toy_scene import UPRIGHT, RenderedViews, ToyScene, box, camera, entry, even_light, render, sheet, sun
+from tests.worlds.toy_scene import UPRIGHT, RenderedViews, box, camera, even_light, render_objects, sheet, sun, surface, with_render
 
 VIEW = camera(48, 40, 200.0, (0.0, 0.0, 2.0))
-EMPTY = entry(sheet(0.1, 0.1))
-
-
-def with_render(**settings) -> Config:
-    return replace(Config(), render=replace(Config().render, **settings))
 
 
 def rotated_pose(x: float, y: float, z: float, angle: float, axis: int = 2) -> tuple[float, ...]:
@@ -33,9 +28,8 @@ def rotated_pose(x: float, y: float, z: float, angle: float, axis: int = 2) -> t
 
 def render_image(device, *bodies, view=VIEW, config=None, **more) -> RenderedViews:
     """Image of bodies, given as (mesh, pose, colour)."""
-    entries = [entry(mesh, Material(color=color, texture=None, metallic=0.0, roughness=1.0)) for mesh, _, color in bodies] or [EMPTY]
-    world = [(index, pose) for index, (_, pose, _) in enumerate(bodies)]
-    return render(ToyScene(entries, [world], (view,), config=config or with_render(), **more), device)
+    placed = [(mesh, surface(color), pose) for mesh, pose, color in bodies]
+    return render_objects(device, *placed, view=view, config=config, **more)
 
 
 def sample_offsets(samples: int = NARROW_COVERAGE_RAYS) -> np.ndarray:

@@ -11,7 +11,7 @@ import pytest
 import warp as wp
 
 from synpick_warp.codes import Segment
-from synpick_warp.configs.schema import FAST, REFERENCE, Config
+from synpick_warp.configs.schema import REFERENCE, Config
 from synpick_warp.factory.assembly import make_renderer
 from synpick_warp.kernels.render.lighting import history as kernels
 from synpick_warp.kernels.render.lighting.history import LIGHT_CHANGE, MAX_PERIOD_BITS, MAX_TRAVEL, LightHistory
@@ -22,7 +22,7 @@ from synpick_warp.stages.render.renderer import Renderer
 from synpick_warp.stages.render.view_setup import make_views
 from tests.harness.denoise_probe import guide_segments
 from tests.harness.probe import probe
-from tests.worlds.toy_scene import UPRIGHT, ToyScene, ball, box, build_scene, camera, entry, even_light, sheet, snapshot
+from tests.worlds.toy_scene import UPRIGHT, ToyScene, ball, box, build_scene, camera, entry, even_light, sheet, snapshot, with_render
 
 PATHS = 16
 LONGEST_PERIOD = 1 << int(MAX_PERIOD_BITS)
@@ -52,7 +52,7 @@ lag_frames, covered_fraction = probe(kernels.lag_frames), probe(kernels.covered_
 
 
 def settings() -> Config:
-    return Config(render=replace(Config().render, mode=FAST, coarse_pixel=2, coarse_paths=1, history=PATHS))
+    return with_render(coarse_pixel=2, coarse_paths=1, history=PATHS)
 
 
 def toy(ball_height: float | None = 0.08, config: Config | None = None) -> ToyScene:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -10,7 +9,7 @@ import pytest
 import warp as wp
 
 from synpick_warp.arrays import allocate_struct
-from synpick_warp.configs.schema import FAST, Config
+from synpick_warp.configs.schema import Config
 from synpick_warp.factory.assembly import make_renderer
 from synpick_warp.kernels.render.lighting.paths.lists import REGION_PIXELS
 from synpick_warp.kernels.render.lighting.paths.queues import QUEUE_CAPACITY, PathPixel, PathQueues, first_record, read_path, write_path
@@ -23,7 +22,7 @@ from synpick_warp.stages.render.sampling_rates import interleaved_threads
 from synpick_warp.stages.render.view_setup import make_views
 from tests.harness.probe import probe
 from tests.render.lighting.test_history import show
-from tests.worlds.toy_scene import UPRIGHT, ToyScene, ball, box, build_scene, camera, entry, even_light, sheet, snapshot
+from tests.worlds.toy_scene import UPRIGHT, ToyScene, ball, box, build_scene, camera, entry, even_light, sheet, snapshot, with_render
 
 VIEW = camera(96, 64, 250.0, (0.0, 0.0, 1.5))
 LIGHT = EnvironmentMap("gradient", even_light(1.0, 32).radiance * np.linspace(3.0, 0.1, 64, dtype=np.float32)[None, :, None])
@@ -57,13 +56,13 @@ def pile(frame: int, bounces: int, walls: bool, paths: int) -> ToyScene:
         placed.append((1, (0.05, 0.02, 0.03, *UPRIGHT)))
     entries = [entry(mesh) for mesh in (sheet(0.4, 0.4), box(0.04, 0.04, 0.06), ball(0.03, 3), box(0.02, 0.5, 0.6))]
     # As many paths as by default: several where no history is usable, one elsewhere.
-    render = replace(Config().render, mode=FAST, coarse_pixel=1, coarse_paths=paths, bounces=bounces, history=8)
-    return ToyScene(entries, [placed], (VIEW,), lights=(LIGHT,), config=Config(render=render))
+    config = with_render(coarse_pixel=1, coarse_paths=paths, bounces=bounces, history=8)
+    return ToyScene(entries, [placed], (VIEW,), lights=(LIGHT,), config=config)
 
 
 def make_queues(renderer: Renderer, regions: int, views: int = 1) -> Any:
     """Queues of a renderer for some views at a time; 0 regions: none."""
-    render = replace(Config().render, bounces=renderer.shading.rules.bounces)  # type: ignore[union-attr]
+    render = with_render(bounces=renderer.shading.rules.bounces).render  # type: ignore[union-attr]
     sizes = queue_sizes(render, VIEW.width, VIEW.height, views, 1, renderer.scene.device)
     return allocate_struct(PATH_QUEUES, sizes | {"queue_region": regions, "queue_view": views}, renderer.scene.device)
 

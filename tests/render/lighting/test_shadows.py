@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import itertools
-from dataclasses import replace
 
 import numpy as np
 import pytest
 import warp as wp
 
-from synpick_warp.configs.schema import FAST, Config
 from synpick_warp.factory.assembly import make_renderer
 from synpick_warp.kernels.render.lighting import moving_bodies, shadow_filter, shadow_upsampling, shadows
 from synpick_warp.kernels.render.lighting.shadow_filter import FULL_SHARE, MAX_STEEPNESS, MIN_STEEPNESS, STEEPNESS_LEVELS
@@ -21,7 +19,7 @@ from synpick_warp.stages.render.renderer import Renderer
 from synpick_warp.stages.render.scene import rays_per_lamp
 from tests.harness.probe import probe
 from tests.render.lighting.test_history import show
-from tests.worlds.toy_scene import UPRIGHT, ToyScene, ball, box, build_scene, camera, entry, sheet, sun
+from tests.worlds.toy_scene import UPRIGHT, ToyScene, ball, box, build_scene, camera, entry, sheet, sun, with_render
 
 SAMPLES = 2000
 VIEW = camera(96, 64, 250.0, (0.0, 0.0, 1.5))
@@ -133,7 +131,7 @@ def stirred(frame: int, balls: int = 2) -> ToyScene:
     if balls > 1 and 5 <= frame < 9:
         placed.append((2, (0.0, -0.06, 0.2, *UPRIGHT)))
     entries = [entry(sheet(0.4, 0.4)), entry(box(0.04, 0.04, 0.06)), entry(ball(0.02, 3))]
-    config = Config(render=replace(Config().render, mode=FAST, coarse_pixel=1, coarse_paths=1))
+    config = with_render(coarse_pixel=1, coarse_paths=1)
     return ToyScene(entries, [placed], (VIEW,), lights=(LAMPS,), config=config)
 
 
@@ -182,7 +180,7 @@ def test_lamps_share_the_light_of_a_map_with_the_paths(device):
     """A plane that sees everything has the same light with all lamps, with one, and with none."""
     values = []
     for lamps in (8, 1, 0):
-        config = Config(render=replace(Config().render, mode=FAST, coarse_paths=64, lamps=lamps))
+        config = with_render(coarse_paths=64, lamps=lamps)
         each = ToyScene([entry(sheet(1.0, 1.0))], [[(0, (0.0, 0.0, 0.0, *UPRIGHT))]], (VIEW,), lights=(LAMPS,), config=config)
         scene = build_scene(each, device)
         assert scene.lights.lamps.numpy().tolist() == [min(lamps, 3)]

@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 import warp as wp
 
-from synpick_warp.configs.schema import FAST, UNOCCLUDED, Config
+from synpick_warp.configs.schema import FAST, UNOCCLUDED
 from synpick_warp.kernels.render.lighting.shading import MAX_WEIGHT_CHANGE, move_weights, shade_kernel, shade_samples_kernel, sum_of
 from synpick_warp.kernels.render.visibility.triangles import Triangle, edge_areas
-from synpick_warp.scenes.types import EnvironmentMap, Material
+from synpick_warp.scenes.types import EnvironmentMap
 from synpick_warp.stages.render import denoised
 from tests.harness.probe import probe
-from tests.worlds.toy_scene import ToyScene, ball, camera, entry, render, sheet
+from tests.worlds.toy_scene import WHITE, ToyScene, ball, camera, entry, render, sheet, surface, with_render
 
 WIDTH, HEIGHT, FINE = 64, 48, 8
 """Image size, and the number of pixels of a finer image along one of its pixels."""
@@ -47,10 +45,6 @@ def view(scale: int = 1):
     return camera(scale * WIDTH, scale * HEIGHT, scale * 200.0, (0.0, 0.0, 2.0))
 
 
-def render_config(**settings):
-    return replace(Config().render, **settings)
-
-
 def radiance_of(mesh, material, pose, device, scale=1) -> np.ndarray:
     scene = ToyScene([entry(mesh, material)], [[(0, pose)]], (view(scale),), lights=(STRIPES,))
     return render(scene, device).radiance[0]
@@ -70,7 +64,7 @@ def radiance_of(mesh, material, pose, device, scale=1) -> np.ndarray:
     ],
 )
 def test_images_whose_coarse_pixels_are_pixels_are_supersampled(settings, width, histories, expected):
-    assert denoised.supersamples(render_config(**settings), width, histories) == expected
+    assert denoised.supersamples(with_render(**settings).render, width, histories) == expected
 
 
 def test_points_lie_on_the_plane_of_the_triangle(device):
@@ -110,7 +104,7 @@ def test_a_ray_that_misses_the_plane_keeps_the_center(device, corners, ray):
 
 def test_a_plain_flat_surface_is_the_same_with_either_kernel(device, monkeypatch):
     """All points of a matt, evenly lit plane have the same radiance, so that supersampling changes nothing."""
-    matt = Material(color=(0.5, 0.4, 0.3), texture=None, metallic=0.0, roughness=1.0)
+    matt = surface((0.5, 0.4, 0.3))
     found = radiance_of(sheet(0.4, 0.3), matt, TILTED, device)
     monkeypatch.setattr(denoised, "supersamples", lambda *_: False)
     np.testing.assert_allclose(found, radiance_of(sheet(0.4, 0.3), matt, TILTED, device), rtol=2e-3)
@@ -122,9 +116,9 @@ def test_the_mean_of_a_pixel_is_approached(device, monkeypatch, shape):
     random = np.random.default_rng(7)
     if shape == "texture":
         texture = np.repeat(np.repeat(random.integers(0, 255, (32, 32, 3)), 8, 0), 8, 1).astype(np.uint8)
-        body = sheet(0.4, 0.4), Material(color=(1.0, 1.0, 1.0), texture=texture, metallic=0.0, roughness=1.0), TILTED
+        body = sheet(0.4, 0.4), surface(texture=texture), TILTED
     else:
-        body = ball(0.1, 3), Material(color=(1.0, 1.0, 1.0), texture=None, metallic=1.0, roughness=0.1), TILTED
+        body = ball(0.1, 3), surface(WHITE, 1.0, 0.1), TILTED
     inner = np.s_[HEIGHT // 2 - 4 : HEIGHT // 2 + 4, WIDTH // 2 - 8 : WIDTH // 2 + 8]
     mean = radiance_of(*body, device, FINE).reshape(HEIGHT, FINE, WIDTH, FINE, 3).mean((1, 3))[inner]
     errors = []
