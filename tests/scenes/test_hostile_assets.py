@@ -29,6 +29,7 @@ from synpick_warp.scenes.lights import MAX_MAP_PIXELS, MAX_RADIANCE, load_lights
 from synpick_warp.stages.render.light_tables import precompute_environment
 from tests.harness.fuzz import start_isolation
 from tests.scenes.test_fuzz_assets import BINARY, CORNERS, DOCUMENT, FACES, OBJ, glb, picture
+from tests.worlds.model_files import binary_ply
 
 SECONDS = 5.0
 """Longest time that any input may take."""
@@ -36,11 +37,8 @@ SECONDS = 5.0
 
 def ply(*comments: str, scale: float = 100.0) -> bytes:
     """A textured tetrahedron in BOP's format."""
-    names = ("x", "y", "z", "texture_u", "texture_v")
-    header = ["ply", "format binary_little_endian 1.0", *comments, f"element vertex {len(CORNERS)}"]
-    header += [f"property float {name}" for name in names] + [f"element face {len(FACES)}", "property list uchar int vertex_indices"]
-    rows = np.asarray(CORNERS, "<f4") * np.array([scale, scale, scale, 1, 1], "<f4")
-    return "\n".join([*header, "end_header\n"]).encode() + rows.tobytes() + b"".join(struct.pack("<B3i", 3, *face) for face in FACES)
+    rows = np.multiply(CORNERS, (scale, scale, scale, 1, 1))
+    return binary_ply(rows, FACES, ("x", "y", "z", "texture_u", "texture_v"), "\n".join(comments))
 
 
 def folder_of(parent: Path, *comments: str) -> Path:

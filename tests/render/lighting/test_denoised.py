@@ -133,7 +133,7 @@ def test_two_frames_of_a_still_scene_are_identical(device):
     toy.placed[1] = [(0, (0.0, 0.0, 0.2, *UPRIGHT))]
     toy.config = with_render(coarse_pixel=4)
     scene = build_scene(toy, device)
-    renderer = make_renderer(toy.with_render(), scene, toy.instances, 1)
+    renderer = make_renderer(toy.settings(), scene, toy.instances, 1)
     out = allocate_view_buffers(1, scene.width, scene.height, toy.instances, device)
     state, zero, images = snapshot(toy, device), wp.zeros(1, dtype=wp.int32, device=device), []
     for world in (0, 1, 0, 0):
