@@ -93,4 +93,4 @@ def put(path: Path, content: str | bytes) -> Path:
 
 def read(path: Path, content: str | bytes, options: MeshOptions | None = None, scale: float = 1.0) -> tuple[Any, Any]:
     """Write a model file, and read it: mesh and finish."""
-    return read_mesh(put(path, content), scale, *filter(None, [options]))
+    return read_mesh(put(path, content), scale, options or MeshOptions())
