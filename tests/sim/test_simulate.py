@@ -16,12 +16,11 @@ from synpick_warp.stages.sim import arrange
 from synpick_warp.stages.sim.physics import with_enough_worlds
 from synpick_warp.stages.sim.simulate import Simulation
 from tests.twins.raycast import rotation_of
-from tests.worlds.small_worlds import ANGLE, BOX, CUBE, catalog, report, run_ticks, settings
+from tests.worlds.small_worlds import ANGLE, BOX, COARSE, CUBE, catalog, report, run_ticks, settings
 
 EPISODES = 3
 LIGHTS = 3
 # Coarse, where only sameness or ends count.
-COARSE = {"physics__step": 4e-3, "physics__steps_per_tick": 16, "physics__substeps": 1, "physics__iterations": 6}
 LONGEST = 150
 
 

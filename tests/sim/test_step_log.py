@@ -16,10 +16,9 @@ from synpick_warp.stages.stream import TickReader, TickReport, tick_batch
 from tests.twins import gripper as twin
 from tests.twins.raycast import rotation_of
 from tests.worlds.sights import SHORT, picking
-from tests.worlds.small_worlds import ANGLE, BOX, CUBE, catalog, settings
+from tests.worlds.small_worlds import ANGLE, BOX, COARSE, CUBE, catalog, settings
 
 LONGEST = 200
-COARSE = {"physics__step": 4e-3, "physics__steps_per_tick": 16, "physics__substeps": 1, "physics__iterations": 6}
 GRAVITY = 9.81
 
 
