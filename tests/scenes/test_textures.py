@@ -2,22 +2,15 @@
 
 from __future__ import annotations
 
-import json
-import struct
-from pathlib import Path
-
 import cv2
 import numpy as np
 import pytest
-import trimesh
-from PIL import Image
-from trimesh.visual import TextureVisuals
-from trimesh.visual.material import PBRMaterial
 
 from synpick_warp.errors import CatalogError
 from synpick_warp.scenes.assets.appearance import decode_texture
 from synpick_warp.scenes.assets.meshes import MeshOptions, read_mesh
-from tests.worlds.model_files import CORNERS, FACES, ascii_ply, glb, picture, put, read
+from tests.scenes.test_gltf import TEXTURE, Builder, pbr
+from tests.worlds.model_files import CORNERS, FACES, ascii_ply, picture, put, read
 
 UNWRAPPED = ("x", "y", "z", "texture_u", "texture_v")
 UNWRAPPED_OBJ = "mtllib a.mtl\n" + "".join(f"v {x} {y} {z}\n" for x, y, z in CORNERS) + "usemtl skin\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n"
@@ -40,30 +33,12 @@ def test_images_of_any_bit_depth_channels_and_size(tmp_path, channels, size, dty
     assert np.abs(texture - expected / largest * 255.0).max() <= (0 if dtype == np.uint8 else 1)
 
 
-def without_coordinates(file: Path) -> None:
-    """Take the texture coordinates of a GLB's meshes away."""
-    data = file.read_bytes()
-    length = struct.unpack_from("<I", data, 12)[0]
-    header = json.loads(data[20 : 20 + length])
-    for mesh in header["meshes"]:
-        for primitive in mesh["primitives"]:
-            del primitive["attributes"]["TEXCOORD_0"]
-    text = json.dumps(header).encode()
-    text += b" " * (-len(text) % 4)
-    chunks = struct.pack("<I", len(text)) + data[16:20] + text + data[20 + length :]
-    file.write_bytes(data[:8] + struct.pack("<I", 12 + len(chunks)) + chunks)
-
-
 def test_a_texture_on_a_mesh_that_is_not_unwrapped_is_refused(tmp_path):
-    box = trimesh.creation.box((0.1, 0.1, 0.1))
-    skin = Image.new("RGB", (8, 8), (200, 10, 10))
-    box.visual = TextureVisuals(uv=np.zeros((8, 2)), material=PBRMaterial(baseColorTexture=skin))
-    file = put(tmp_path / "a.glb", glb(box))
-    without_coordinates(file)
-    (tmp_path / "a.obj").write_text(UNWRAPPED_OBJ)
-    (tmp_path / "a.mtl").write_text("newmtl skin\nmap_Kd skin.png\n")
-    skin.save(tmp_path / "skin.png")
-    for path in (file, tmp_path / "a.obj"):
+    put(tmp_path / "a.glb", Builder(**pbr(**TEXTURE)).image().glb())
+    put(tmp_path / "a.obj", UNWRAPPED_OBJ)
+    put(tmp_path / "a.mtl", "newmtl skin\nmap_Kd skin.png\n")
+    picture(tmp_path / "skin.png")
+    for path in (tmp_path / "a.glb", tmp_path / "a.obj"):
         with pytest.raises(CatalogError, match="without texture coordinates; unwrap it") as caught:
             read_mesh(path, 1.0)
         assert str(caught.value).startswith(f"{path}: ")

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import json
 import struct
+import zlib
 from pathlib import Path
 from typing import Any
 
@@ -76,6 +78,27 @@ def exported(mesh: trimesh.Trimesh | trimesh.Scene, kind: str = "ply") -> bytes:
 def glb(*meshes: trimesh.Trimesh) -> bytes:
     """GLB file of meshes."""
     return exported(trimesh.Scene(list(meshes)), "glb")
+
+
+def pack_glb(text: bytes, binary: bytes) -> bytes:
+    """GLB file of a JSON and a binary chunk."""
+    chunks = struct.pack("<I4s", len(text), b"JSON") + text + struct.pack("<I4s", len(binary), b"BIN\0") + binary
+    return struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks
+
+
+def unpack_glb(data: bytes) -> tuple[dict[str, Any], bytes]:
+    """JSON and binary chunk of a GLB file."""
+    (length,) = struct.unpack_from("<I", data, 12)
+    return json.loads(data[20 : 20 + length]), data[28 + length :]
+
+
+def pack_png(
+    width: int, height: int, *between: tuple[bytes, bytes], depth: int = 8, kind: int = 0, rest: tuple[int, ...] = (0, 0, 0)
+) -> bytes:
+    """PNG file of chunks (kind, data) between the header and the end."""
+    chunks = ((b"IHDR", struct.pack(">IIBBBBB", width, height, depth, kind, *rest)), *between, (b"IEND", b""))
+    packed = [struct.pack(">I", len(data)) + name + data + struct.pack(">I", zlib.crc32(name + data)) for name, data in chunks]
+    return b"\x89PNG\r\n\x1a\n" + b"".join(packed)
 
 
 def picture(path: Path, color=(200, 10, 30), size=(4, 2)) -> Path:
