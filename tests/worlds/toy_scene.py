@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from typing import Any
-from unittest import mock
 
 import numpy as np
 import trimesh
@@ -16,10 +14,8 @@ from synpick_warp.factory.assembly import make_renderer
 from synpick_warp.scenes.environment import map_directions
 from synpick_warp.scenes.types import Camera, Catalog, CatalogEntry, EnvironmentMap, Fixture, Material, TriangleMesh
 from synpick_warp.stages.buffers import Snapshot, ViewBuffers, allocate_view_buffers
-from synpick_warp.stages.render import scene
-from synpick_warp.stages.render.light_tables import EnvironmentTables, precompute_environment
 from synpick_warp.stages.render.renderer import Renderer
-from synpick_warp.stages.render.scene import RenderScene
+from synpick_warp.stages.render.scene import RenderScene, build_render_scene
 from synpick_warp.stages.render.view_setup import make_views
 
 GREY = Material(color=(0.7, 0.7, 0.7), texture=None, metallic=0.0, roughness=0.8)
@@ -29,8 +25,6 @@ UPRIGHT = (0.0, 0.0, 0.0, 1.0)
 FLAT = (0.0, 0.0, 0.0, *UPRIGHT)
 """Pose at the origin."""
 WHITE = (1.0, 1.0, 1.0)
-_tables: dict[Any, EnvironmentTables] = {}
-"""What `_precompute_once` has made."""
 
 
 def flat_shaded(vertices: np.ndarray, faces: np.ndarray) -> TriangleMesh:
@@ -196,27 +190,17 @@ def snapshot(toy: ToyScene, device: wp.Device) -> Snapshot:
 def build_scene(toy: ToyScene, device: wp.Device) -> RenderScene:
     """The renderer's constant data of a toy scene."""
     settings = toy.settings()
-    with mock.patch.object(scene, "precompute_environment", _precompute_once):
-        catalog = Catalog(tuple(toy.entries))
-        return scene.build_render_scene(settings.render, settings.tote, catalog, toy.fixtures, toy.cameras, toy.lights, device)
-
-
-def _precompute_once(light: EnvironmentMap, ground: np.ndarray | None, lamps: int) -> EnvironmentTables:
-    """Tables of a map, remembered: hundreds of toy scenes have the same few lights, and tables take longer than a small picture."""
-    key = light.radiance.tobytes(), repr(light.sun), repr(ground), lamps
-    if key not in _tables:
-        _tables[key] = precompute_environment(light, ground, lamps)
-    return _tables[key]
+    return build_render_scene(settings.render, settings.tote, Catalog(tuple(toy.entries)), toy.fixtures, toy.cameras, toy.lights, device)
 
 
 def render(toy: ToyScene, device: wp.Device) -> RenderedViews:
     """Render every world by every camera: view = world x cameras + camera."""
     config = toy.settings()
-    built = build_scene(toy, device)
+    scene = build_scene(toy, device)
     worlds, cameras = len(toy.placed), len(toy.cameras)
     views = worlds * cameras
-    renderer = make_renderer(config, built, toy.instances, views)
-    out = allocate_view_buffers(views, built.width, built.height, toy.instances, device)
+    renderer = make_renderer(config, scene, toy.instances, views)
+    out = allocate_view_buffers(views, scene.width, scene.height, toy.instances, device)
     view_world = wp.array(np.repeat(np.arange(worlds), cameras), dtype=wp.int32, device=device)
     view_camera = wp.array(np.tile(np.arange(cameras), worlds), dtype=wp.int32, device=device)
     renderer.render(snapshot(toy, device), make_views(view_world, view_camera, views, toy.instances), out)
@@ -236,9 +220,9 @@ def render_objects(device: wp.Device, *placed, view: Camera, config: Config | No
 
 def render_gbuffer(toy: ToyScene, device: wp.Device) -> tuple[ViewBuffers, Renderer]:
     """Render the G-buffer of world 0 by camera 0 only."""
-    built = build_scene(toy, device)
-    renderer = make_renderer(toy.settings(), built, toy.instances, 1)
-    out = allocate_view_buffers(1, built.width, built.height, toy.instances, device)
+    scene = build_scene(toy, device)
+    renderer = make_renderer(toy.settings(), scene, toy.instances, 1)
+    out = allocate_view_buffers(1, scene.width, scene.height, toy.instances, device)
     zero = wp.zeros(1, dtype=wp.int32, device=device)
     views = make_views(zero, zero, 1, toy.instances)
     renderer.render_gbuffer(snapshot(toy, device), views, out)
