@@ -144,6 +144,7 @@ def parse_assignment(text: str) -> tuple[str, object]:
     return key, written if annotation is str and not isinstance(value, str) else value
 
 
+@functools.cache
 def sections() -> dict[str, type[Any]]:
     """Dataclass of every section by its name, in their order."""
     hints = typing.get_type_hints(Config)

@@ -11,25 +11,29 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from synpick_warp.codes import Stream
-from tests.harness.probes import sample_kernel
+from synpick_warp.kernels import rng as kernels
+from tests.harness.probe import probe
 from tests.twins import rng
 
 # A test below fails by chance once in 10⁵ fixed seeds, so never.
 SIGMA = 4.5
 
 
+@wp.func
+def sample_all(seed: wp.uint64, episode: int, arrangement: int, stream: int, index: int, count: int):
+    """One sample of each type."""
+    key = kernels.stream_key(seed, episode, arrangement, stream)
+    return key, kernels.uniform(key, index), kernels.uniform_index(key, index, count), kernels.uniform_rotation(key, index)
+
+
+sample = probe(sample_all)
+
+
 def draw(device, seeds, stream_indices, count: int = 21):
     """Keys, uniforms, indices and rotations from the device."""
     stream_indices = np.atleast_2d(np.asarray(stream_indices, np.int32))
     seeds = np.broadcast_to(np.asarray(seeds, np.uint64), len(stream_indices))
-    outputs = [wp.zeros(len(stream_indices), dtype=dtype, device=device) for dtype in (wp.uint64, float, int, wp.quat)]
-    inputs = [
-        wp.array(np.ascontiguousarray(seeds), dtype=wp.uint64, device=device),
-        wp.array(stream_indices, dtype=int, device=device),
-        count,
-    ]
-    wp.launch(sample_kernel, dim=len(stream_indices), inputs=inputs, outputs=outputs, device=device)
-    return [output.numpy() for output in outputs]
+    return sample(seeds, *stream_indices.T, count, device=device)
 
 
 def stream(device, length: int, seed: int = 0, episode: int = 0, arrangement: int = 0, stream: int = Stream.DROP, step: int = 1):

@@ -18,6 +18,7 @@ from synpick_warp.configs.write import config_to_toml
 from synpick_warp.errors import ConfigError
 from synpick_warp.scenes.collision.hulls import hull_size
 from synpick_warp.scenes.gripper import cup_collider, finger_collider
+from tests.configs.test_presets import resolved
 
 COUPLED = {
     "bake.episodes",
@@ -82,12 +83,6 @@ def test_other_presets_build_on_the_default_preset():
     assert released.object_rows == load_config(None, {}).object_rows
     smoke = load_config("smoke", {})
     assert (smoke.move.rounds, smoke.bop.color_format, len(smoke.object_rows)) == (1, "png", 21)
-
-
-def resolved(name: str) -> dict[str, object]:
-    """Full key -> value of every setting of a preset."""
-    config = load_config(name, {})
-    return {f"{section}.{key}": getattr(getattr(config, section), key) for section, kind in sections().items() for key in settings_of(kind)}
 
 
 def test_the_released_generator_differs_in_exactly_this():

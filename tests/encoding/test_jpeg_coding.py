@@ -13,6 +13,7 @@ from synpick_warp.kernels.encoding.dct import quantize
 from synpick_warp.stages.encoding.jpeg import upload_huffman
 from synpick_warp.system.codecs import jpeg
 from tests.encoding.test_jpeg import encode
+from tests.harness.probe import probe
 from tests.twins.jpeg_entropy import code_blocks, code_interval
 
 wp.set_module_options({"enable_backward": False})
@@ -20,11 +21,14 @@ wp.set_module_options({"enable_backward": False})
 SENTINEL = 0xA5
 
 
-@wp.kernel
-def quantize_kernel(reciprocal: wp.array[wp.uint32], out: wp.array2d[int]):
-    """Quotients (divisor, magnitude), of the negative coefficient."""
-    i, magnitude = wp.tid()
-    out[i, magnitude] = quantize(-magnitude, reciprocal[i])
+@wp.func
+def quantize_all(reciprocal: wp.uint32, quotient: wp.array2d[int], row: int):
+    """Quotients (row, magnitude) of negative coefficients."""
+    for magnitude in range(quotient.shape[1]):
+        quotient[row, magnitude] = quantize(-magnitude, reciprocal)
+
+
+quotients = probe(quantize_all)
 
 
 def test_reciprocals_divide_exactly(device):
@@ -32,8 +36,7 @@ def test_reciprocals_divide_exactly(device):
     divisors = jpeg.DIVISOR_SCALE * np.arange(1, 256)
     magnitudes = np.arange(1 << 16)
     out = wp.empty((len(divisors), len(magnitudes)), dtype=int, device=device)
-    reciprocals = wp.array(jpeg.reciprocals(divisors), dtype=wp.uint32, device=device)
-    wp.launch(quantize_kernel, dim=out.shape, inputs=[reciprocals], outputs=[out], device=device)
+    quotients(jpeg.reciprocals(divisors), out, np.arange(len(divisors)), device=device)
     assert all(np.array_equal(row, -((magnitudes + d // 2) // d)) for row, d in zip(out.numpy(), divisors, strict=True))
 
 

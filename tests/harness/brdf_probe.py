@@ -1,134 +1,39 @@
-"""Test kernels that evaluate the BRDF, the environment sampler and the sample points."""
+"""Probes of the BRDF, with the normal +z."""
 
 import numpy as np
 import warp as wp
 
-from synpick_warp.kernels.render.lighting.brdf import (
-    AlbedoTables,
-    brdf_pdf,
-    evaluate_brdf,
-    evaluate_disc,
-    make_brdf,
-    sample_brdf,
-    view_factors,
-)
-from synpick_warp.kernels.render.lighting.sampling import (
-    EnvironmentCdf,
-    environment_pdf,
-    invert_conditional,
-    invert_marginal,
-    sample_environment,
-    scrambled_point,
-)
-
-wp.set_module_options({"enable_backward": False})
+from synpick_warp.kernels.render.lighting import brdf
+from synpick_warp.kernels.render.lighting.brdf import AlbedoTables, make_brdf
+from tests.harness.probe import probe
 
 UP = wp.constant(wp.vec3(0.0, 0.0, 1.0))
 
 
-@wp.kernel
-def evaluate_kernel(
-    # In:
-    tables: AlbedoTables,
-    base: wp.vec3,
-    metallic: float,
-    roughness: float,
-    outgoing: wp.array[wp.vec3],  # (sample)
-    incoming: wp.array[wp.vec3],  # (sample)
-    # Out:
-    value_out: wp.array[wp.vec3],  # (sample)
-    pdf_out: wp.array[float],  # (sample)
+@wp.func
+def evaluate_pair(tables: AlbedoTables, base: wp.vec3, metallic: float, roughness: float, outgoing: wp.vec3, incoming: wp.vec3):
+    """BRDF times cosine, and the pdf of sampling `incoming`."""
+    surface = make_brdf(tables, base, metallic, roughness, UP, outgoing)
+    value = brdf.evaluate_brdf(tables, surface, incoming)
+    return value.specular + value.diffuse * surface.diffuse, brdf.brdf_pdf(surface, incoming)
+
+
+@wp.func
+def evaluate_disc(
+    tables: AlbedoTables, base: wp.vec3, metallic: float, roughness: float, outgoing: wp.vec3, center: wp.vec3, radius: float
 ):
-    """BRDF times cosine, and the pdf of sampling `incoming`; normal +z."""
-    i = wp.tid()
-    brdf = make_brdf(tables, base, metallic, roughness, UP, outgoing[i])
-    value = evaluate_brdf(tables, brdf, incoming[i])
-    value_out[i] = value.specular + value.diffuse * brdf.diffuse
-    pdf_out[i] = brdf_pdf(brdf, incoming[i])
+    """Mean of BRDF times cosine over a disc light about `center`."""
+    surface = make_brdf(tables, base, metallic, roughness, UP, outgoing)
+    return brdf.evaluate_disc(tables, surface, brdf.view_factors(surface), center, radius)
 
 
-@wp.kernel
-def evaluate_disc_kernel(
-    # In:
-    tables: AlbedoTables,
-    base: wp.vec3,
-    metallic: float,
-    roughness: float,
-    outgoing: wp.vec3,
-    center: wp.array[wp.vec3],  # (sample)
-    radius: float,
-    # Out:
-    value_out: wp.array[wp.vec3],  # (sample)
-):
-    """Mean of BRDF times cosine over disc lights about `center`; normal +z."""
-    i = wp.tid()
-    brdf = make_brdf(tables, base, metallic, roughness, UP, outgoing)
-    value_out[i] = evaluate_disc(tables, brdf, view_factors(brdf), center[i], radius)
+@wp.func
+def sample_direction(tables: AlbedoTables, base: wp.vec3, metallic: float, roughness: float, outgoing: wp.vec3, u: wp.vec3):
+    """Direction sampled by three uniform numbers."""
+    return brdf.sample_brdf(make_brdf(tables, base, metallic, roughness, UP, outgoing), u[0], wp.vec2(u[1], u[2]))
 
 
-@wp.kernel
-def sample_brdf_kernel(
-    # In:
-    tables: AlbedoTables,
-    base: wp.vec3,
-    metallic: float,
-    roughness: float,
-    outgoing: wp.vec3,
-    numbers: wp.array[wp.vec3],  # (sample)
-    # Out:
-    incoming_out: wp.array[wp.vec3],  # (sample)
-):
-    """Directions sampled by triples of uniform numbers; normal +z."""
-    i = wp.tid()
-    u = numbers[i]
-    incoming_out[i] = sample_brdf(make_brdf(tables, base, metallic, roughness, UP, outgoing), u[0], wp.vec2(u[1], u[2]))
-
-
-@wp.kernel
-def sample_environment_kernel(
-    # In:
-    cdf: EnvironmentCdf,
-    numbers: wp.array[wp.vec2],  # (sample)
-    # Out:
-    direction_out: wp.array[wp.vec3],  # (sample)
-    sampled_pdf_out: wp.array[float],  # (sample)
-    evaluated_pdf_out: wp.array[float],  # (sample)
-):
-    """Directions sampled from map 0, the pdf that the sampler returns with them, and the pdf evaluated for them afterwards."""
-    i = wp.tid()
-    sample = sample_environment(cdf, 0, numbers[i])
-    direction_out[i] = sample.direction
-    sampled_pdf_out[i] = sample.pdf
-    evaluated_pdf_out[i] = environment_pdf(cdf, 0, sample.direction)
-
-
-@wp.kernel
-def invert_cdf_kernel(
-    # In:
-    cdf: EnvironmentCdf,
-    row: int,
-    numbers: wp.array[float],  # (sample)
-    # Out:
-    row_out: wp.array[int],  # (sample)
-    column_out: wp.array[int],  # (sample)
-):
-    """Rows by the marginal CDF of map 0, and columns by the conditional CDF of one of its rows."""
-    i = wp.tid()
-    row_out[i] = invert_marginal(cdf, 0, numbers[i])
-    column_out[i] = invert_conditional(cdf, 0, row, numbers[i])
-
-
-@wp.kernel
-def sample_point_kernel(
-    # In:
-    key: wp.uint64,
-    dimension: int,
-    # Out:
-    point_out: wp.array[wp.vec2],  # (sample)
-):
-    """The first scrambled Sobol' points of a dimension."""
-    i = wp.tid()
-    point_out[i] = scrambled_point(key, i, dimension)
+_pairs, _discs, _samples = probe(evaluate_pair), probe(evaluate_disc), probe(sample_direction)
 
 
 def toward(cosine, azimuth=0.0):
@@ -138,12 +43,17 @@ def toward(cosine, azimuth=0.0):
 
 
 def evaluate(tables, material, outgoing, incoming):
-    """BRDF times cosine (N, 3) and pdf (N) for pairs of directions."""
-    incoming = np.atleast_2d(incoming)
-    outgoing = np.broadcast_to(outgoing, incoming.shape)
-    arrays = [wp.array(np.ascontiguousarray(a), dtype=wp.vec3, device=tables.directional.device) for a in (outgoing, incoming)]
-    value = wp.empty(len(incoming), dtype=wp.vec3, device=tables.directional.device)
-    pdf = wp.empty(len(incoming), dtype=wp.float32, device=tables.directional.device)
-    base, metallic, roughness = material
-    wp.launch(evaluate_kernel, len(incoming), [tables, wp.vec3(*base), metallic, roughness, *arrays], [value, pdf], device=value.device)
-    return value.numpy().astype(np.float64), pdf.numpy().astype(np.float64)
+    """BRDF times cosine (N, 3) and pdf (N) for pairs of directions; a material is base colour, metallic and roughness."""
+    value, pdf = _pairs(tables, *material, outgoing, np.atleast_2d(incoming), device=tables.directional.device)
+    return value.astype(np.float64), pdf.astype(np.float64)
+
+
+def evaluate_discs(tables, material, outgoing, centers, tangent):
+    """Mean of BRDF times cosine (N, 3) over disc lights about directions (N, 3)."""
+    return _discs(tables, *material, outgoing, centers, tangent, device=tables.directional.device).astype(np.float64)
+
+
+def sample(tables, material, outgoing, count):
+    """Sampled directions (count, 3)."""
+    numbers = np.random.default_rng(3).random((count, 3), dtype=np.float32)
+    return _samples(tables, *material, outgoing, numbers, device=tables.directional.device).astype(np.float64)

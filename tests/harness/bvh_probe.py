@@ -1,66 +1,43 @@
-"""Test kernels of ray queries: the wide BVH, its references (Warp's mesh queries, a test of every triangle), and a count of node visits."""
+"""Probes of ray queries: the wide BVH, its references (Warp's mesh queries, a test of every triangle), and a count of node visits."""
 
 import warp as wp
 
 from synpick_warp.kernels.perception.exact_hits import intersect_triangle
 from synpick_warp.kernels.render.visibility.gbuffer import FAR
 from synpick_warp.kernels.render.visibility.wide_bvh import WideBvh, query_any_hit, query_closest_hit
+from tests.harness.probe import probe
 
-wp.set_module_options({"enable_backward": False})
+
+@wp.func
+def query_bvh(bvh: WideBvh, row: int, start: wp.vec3, direction: wp.vec3, reach: float):
+    """Closest hit (t, u, v), its triangle, and whether the any-hit query finds one, of mesh `row`."""
+    hit = query_closest_hit(bvh, bvh.root[row], start, direction, reach)
+    blocked = query_any_hit(bvh, bvh.root[row], start, direction, reach)
+    return wp.vec3(hit[0], hit[1], hit[2]), wp.cast(hit[3], int), blocked
 
 
-@wp.kernel
-def query_kernel(
-    # Scene:
-    bvh: WideBvh,
-    mesh: wp.uint64,
-    # In:
-    row: int,
-    own: int,
-    start: wp.array[wp.vec3],  # (ray)
-    direction: wp.array[wp.vec3],  # (ray)
-    reach: float,
-    # Out:
-    hit_out: wp.array[wp.vec3],  # (ray)
-    face_out: wp.array[int],  # (ray)
-    blocked_out: wp.array[int],  # (ray)
-):
-    """Closest-hit query (t, u, v; triangle, -1 if none) and any-hit query: of mesh `row` of `bvh` if `own` is 1, else of `mesh` by Warp."""
-    ray = wp.tid()
-    if own == 1:
-        hit = query_closest_hit(bvh, bvh.root[row], start[ray], direction[ray], reach)
-        hit_out[ray] = wp.vec3(hit[0], hit[1], hit[2])
-        face_out[ray] = wp.cast(hit[3], int)
-        blocked_out[ray] = int(query_any_hit(bvh, bvh.root[row], start[ray], direction[ray], reach))
-        return
-    hit_out[ray] = wp.vec3(-1.0, 0.0, 0.0)
-    face_out[ray] = -1
-    query = wp.mesh_query_ray(mesh, start[ray], direction[ray], reach)
+@wp.func
+def query_mesh(mesh: wp.uint64, start: wp.vec3, direction: wp.vec3, reach: float):
+    """The same of one of Warp's meshes."""
+    hit = wp.vec3(-1.0, 0.0, 0.0)
+    face = -1
+    query = wp.mesh_query_ray(mesh, start, direction, reach)
     if query.result:
-        hit_out[ray] = wp.vec3(query.t, query.u, query.v)
-        face_out[ray] = query.face
-    blocked_out[ray] = int(wp.mesh_query_ray_anyhit(mesh, start[ray], direction[ray], reach))
+        hit = wp.vec3(query.t, query.u, query.v)
+        face = query.face
+    return hit, face, wp.mesh_query_ray_anyhit(mesh, start, direction, reach)
 
 
-@wp.kernel
-def hit_every_triangle_kernel(
-    # Scene:
-    corner: wp.array[wp.vec3],  # (3 x triangle) [m]
-    # In:
-    start: wp.array[wp.vec3],  # (ray)
-    direction: wp.array[wp.vec3],  # (ray)
-    # Out:
-    nearest_out: wp.array[float],  # (ray)
-):
-    """Distance of each ray's closest hit by a test of every triangle; -1: none."""
-    ray = wp.tid()
+@wp.func
+def hit_triangles(corner: wp.array[wp.vec3], start: wp.vec3, direction: wp.vec3):
+    """Distance of a ray's closest hit by a test of every triangle; -1: none."""
     nearest = float(FAR)
     for triangle in range(corner.shape[0] // 3):
         first = 3 * triangle
-        hit = intersect_triangle(start[ray], direction[ray], corner[first], corner[first + 1], corner[first + 2])
+        hit = intersect_triangle(start, direction, corner[first], corner[first + 1], corner[first + 2])
         if hit[0] >= 0.0 and hit[0] < nearest:
             nearest = hit[0]
-    nearest_out[ray] = wp.where(nearest < FAR, nearest, -1.0)
+    return wp.where(nearest < FAR, nearest, -1.0)
 
 
 @wp.func_native(
@@ -72,17 +49,4 @@ def count_visits(bvh: WideBvh, root: int, start: wp.vec3, direction: wp.vec3, re
     """The closest-hit query with the number of nodes it visited instead of the triangle."""
 
 
-@wp.kernel
-def count_visits_kernel(
-    # Scene:
-    bvh: WideBvh,
-    # In:
-    start: wp.array[wp.vec3],  # (ray)
-    direction: wp.array[wp.vec3],  # (ray)
-    # Out:
-    visits_out: wp.array[int],  # (ray)
-):
-    """Nodes that a closest-hit query of the first mesh visits."""
-    ray = wp.tid()
-    hit = count_visits(bvh, bvh.root[0], start[ray], direction[ray], 1.0e30)
-    visits_out[ray] = int(hit[3])
+query_wide, query_warp, hit_every_triangle, visits_of = probe(query_bvh), probe(query_mesh), probe(hit_triangles), probe(count_visits)

@@ -1,118 +1,18 @@
-"""Test kernels for coarse pixels and sample points, and the denoiser on synthetic input."""
+"""The denoiser on synthetic input, and its packed images."""
 
 from typing import Any
 
 import numpy as np
 import warp as wp
 
-from synpick_warp.kernels.render.lighting.coarse_grid import (
-    CoarseGrid,
-    interleaved_pixel,
-    morton_index,
-    pack_surface,
-    surface_depth,
-    surface_normal,
-    surface_segment,
-)
 from synpick_warp.kernels.render.lighting.color import MIN_RADIANCE
-from synpick_warp.kernels.render.lighting.denoise import choose_widths_kernel, filter_blocks_kernel, shrink, smooth_ratios_kernel
-from synpick_warp.kernels.render.lighting.sampling import scrambled_point, sobol_point
-from synpick_warp.kernels.render.visibility.camera import in_image
-from synpick_warp.kernels.render.visibility.records import read_record, write_record
+from synpick_warp.kernels.render.lighting.denoise import choose_widths_kernel, filter_blocks_kernel, smooth_ratios_kernel
 from synpick_warp.scenes.environment import LUMINANCE
 from synpick_warp.scenes.types import Camera
 from synpick_warp.stages.arrays import allocate_struct
 from synpick_warp.stages.render.denoised import COARSE_LIGHT, GUIDE, RATIO_IMAGES, build_coarse_grid
 from synpick_warp.stages.render.scene import build_cameras, build_grid, pack_half3_array
 from synpick_warp.stages.render.view_setup import make_views
-
-wp.set_module_options({"enable_backward": False})
-
-
-@wp.kernel
-def count_visits_kernel(
-    # Scene:
-    coarse: CoarseGrid,
-    # Out:
-    visits_inout: wp.array3d[int],  # (view, cell_row, cell_column)
-):
-    """Number of threads per coarse pixel in interleaved order."""
-    view, row, column = interleaved_pixel(coarse, wp.tid())
-    if in_image(coarse.grid, row, column):
-        wp.atomic_add(visits_inout, view, row, column, 1)
-
-
-@wp.kernel
-def morton_kernel(
-    # In:
-    period: int,
-    # Out:
-    index_out: wp.array2d[int],  # (row, column)
-):
-    """Morton index by row and column."""
-    row, column = wp.tid()
-    index_out[row, column] = morton_index(period, row, column)
-
-
-@wp.kernel
-def sobol_kernel(
-    # In:
-    first: int,
-    # Out:
-    point_out: wp.array[wp.vec2],  # (sample)
-):
-    """A run of Sobol' points."""
-    i = wp.tid()
-    point_out[i] = sobol_point(first + i)
-
-
-@wp.kernel
-def scrambled_kernel(
-    # In:
-    key: wp.uint64,
-    dimension: int,
-    first: int,
-    # Out:
-    point_out: wp.array[wp.vec2],  # (sample)
-):
-    """A run of scrambled Sobol' points."""
-    i = wp.tid()
-    point_out[i] = scrambled_point(key, first + i, dimension)
-
-
-@wp.kernel
-def shrink_kernel(
-    # In:
-    wide: wp.array[wp.vec3],  # (sample)
-    narrow: wp.array[wp.vec3],  # (sample)
-    variance: wp.array[float],  # (sample)
-    # Out:
-    value_out: wp.array[wp.vec3],  # (sample)
-):
-    """Shrinkage estimates from the means of a wide and a narrow kernel."""
-    i = wp.tid()
-    value_out[i] = shrink(wide[i], narrow[i], variance[i])
-
-
-@wp.kernel
-def surface_kernel(
-    # In:
-    segment: wp.array[int],  # (sample)
-    depth: wp.array[float],  # (sample) [m]
-    normal: wp.array[wp.vec3],  # (sample)
-    # Out:
-    record_out: wp.array3d[wp.vec4],  # (one, one, sample)
-    segment_out: wp.array[int],  # (sample)
-    depth_out: wp.array[float],  # (sample) [m]
-    normal_out: wp.array[wp.vec3],  # (sample)
-):
-    """Round trip of surfaces through the guide image: pack, store, load and unpack."""
-    i = wp.tid()
-    write_record(record_out, i, pack_surface(segment[i], depth[i], normal[i]))
-    surface = read_record(record_out, i)
-    segment_out[i] = int(surface_segment(surface))
-    depth_out[i] = surface_depth(surface)
-    normal_out[i] = surface_normal(surface)
 
 
 class FlatDenoiser:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 
-from synpick_warp.system.processes.isolation import Limits, run_isolated
+from synpick_warp.system.processes import isolation
 
 
 def fuzz_examples(default: int) -> int:
@@ -14,4 +14,6 @@ def fuzz_examples(default: int) -> int:
 
 def start_isolation() -> None:
     """Start the server of isolated processes, if it does not run: its start does not count as time that an input takes."""
-    list(run_isolated(abs, [(1,)], Limits(60.0, 2**30)))
+    worker = isolation._server._worker
+    if worker is None or worker.process.poll() is not None:
+        list(isolation.run_isolated(abs, [(1,)], isolation.Limits(60.0, 2**30)))

@@ -1,4 +1,4 @@
-"""Test kernels that evaluate the device functions of pose estimation, and a harness for its normal equations."""
+"""What pose estimation sees of model samples, and a harness for its normal equations."""
 
 from typing import Any
 
@@ -8,111 +8,55 @@ import warp as wp
 from synpick_warp.kernels.pose.appearance import accumulate_samples_kernel, intensity_gradient, silhouette_residual
 from synpick_warp.kernels.pose.lighting import CHANNELS
 from synpick_warp.kernels.pose.observation import Images, Observation, Targets
-from synpick_warp.kernels.pose.residuals import LANES, LossParameters, Models, jacobian, tukey_weight
+from synpick_warp.kernels.pose.residuals import LANES, LossParameters, Models
 from synpick_warp.kernels.pose.samples import VISIBLE, has_color, interpolate_color, view_sample
-from synpick_warp.kernels.pose.solve import StepLimits, apply_step, pose_difference, rotation_vector, solve_cholesky, step_poses_kernel
+from synpick_warp.kernels.pose.solve import StepLimits, step_poses_kernel
 from synpick_warp.kernels.pose.surface import accumulate_points_kernel
 from synpick_warp.stages.arrays import allocate_struct
 from synpick_warp.stages.pose.models import PoseModels
 from synpick_warp.stages.pose.observe import Observer
 from synpick_warp.stages.pose.refine import LIGHTING, SUMS
-
-wp.set_module_options({"enable_backward": False})
-
-
-@wp.kernel
-def solve_kernel(
-    matrix: wp.array[wp.spatial_matrix],
-    right: wp.array[wp.spatial_vector],
-    result_out: wp.array[wp.spatial_vector],
-):
-    """Cholesky solutions of 6 x 6 systems."""
-    i = wp.tid()
-    result_out[i] = solve_cholesky(matrix[i], right[i])
+from tests.harness.probe import probe
 
 
-@wp.kernel
-def step_kernel(
-    pose: wp.array[wp.transform],
-    step: wp.array[wp.spatial_vector],
-    radius: float,
-    pose_out: wp.array[wp.transform],
-    back_out: wp.array[wp.spatial_vector],
-    log_out: wp.array[wp.vec3],
-):
-    """Apply steps to poses: new poses, the differences from the old ones, and the rotation vectors of the new ones."""
-    i = wp.tid()
-    moved = apply_step(pose[i], step[i], radius)
-    pose_out[i] = moved
-    back_out[i] = pose_difference(moved, pose[i], radius)
-    log_out[i] = rotation_vector(wp.transform_get_rotation(moved))
-
-
-@wp.kernel
-def residual_kernel(
-    point: wp.array[wp.vec3],
-    direction: wp.array[wp.vec3],
-    origin: wp.vec3,
-    radius: float,
-    cutoff: float,
-    line_out: wp.array[wp.spatial_vector],
-    weight_out: wp.array[float],
-):
-    """Jacobian of each point's motion, and the Tukey weight of its x coordinate taken as a residual."""
-    i = wp.tid()
-    line_out[i] = jacobian(point[i], origin, direction[i], radius)
-    weight_out[i] = tukey_weight(point[i][0], cutoff)
-
-
-@wp.kernel
-def view_samples_kernel(
+@wp.func
+def view_colored_sample(
     models: Models,
     loss: LossParameters,
     images: Images,
     targets: Targets,
     observation: Observation,
-    pose: wp.array[wp.transform],
-    state_out: wp.array2d[int],
-    position_out: wp.array2d[wp.vec3],
-    normal_out: wp.array2d[wp.vec3],
-    crop_out: wp.array2d[wp.vec2],
-    area_out: wp.array2d[float],
-    way_out: wp.array2d[wp.vec4],
-    colored_out: wp.array2d[int],
-    color_out: wp.array2d[wp.vec3],
-    line_out: wp.array2d[wp.vec3],
+    pose: wp.transform,
+    instance: int,
+    k: int,
 ):
-    """Evaluate `view_sample` for every model sample, with its silhouette offset (direction, distance), colour and gradient of red."""
-    instance, k = wp.tid()
-    sample = view_sample(models, images, targets, observation, loss, instance, pose[instance], k)
-    state_out[instance, k] = sample.state
-    position_out[instance, k] = sample.position
-    normal_out[instance, k] = sample.normal
-    crop_out[instance, k] = sample.crop
-    area_out[instance, k] = sample.area
+    """`view_sample`, with the silhouette offset (direction, distance), whether it has a colour, the colour, and the gradient of red."""
+    sample = view_sample(models, images, targets, observation, loss, instance, pose, k)
     intrinsics = images.intrinsics[targets.view[instance]]
+    way = wp.vec4()
+    color = wp.vec3()
+    line = wp.vec3()
     if sample.area > 0.0:
         residual = silhouette_residual(observation, instance, sample, intrinsics)
-        way_out[instance, k] = wp.vec4(residual.direction[0], residual.direction[1], residual.direction[2], residual.distance)
-    if sample.state == VISIBLE and has_color(observation, instance, sample.crop):
-        colored_out[instance, k] = 1
-        color, across, down = interpolate_color(observation, instance, sample.crop)
-        color_out[instance, k] = color
-        line_out[instance, k] = intensity_gradient(across[0], down[0], intrinsics, observation.pitch[instance], sample.position)
+        way = wp.vec4(residual.direction[0], residual.direction[1], residual.direction[2], residual.distance)
+    colored = sample.state == VISIBLE and has_color(observation, instance, sample.crop)
+    if colored:
+        value, across, down = interpolate_color(observation, instance, sample.crop)
+        color = value
+        line = intensity_gradient(across[0], down[0], intrinsics, observation.pitch[instance], sample.position)
+    return sample, way, colored, color, line
 
 
-OUTPUTS = {"state": int, "position": wp.vec3, "normal": wp.vec3, "crop": wp.vec2, "area": float, "way": wp.vec4}
-OUTPUTS |= {"colored": int, "color": wp.vec3, "line": wp.vec3}
+_view_samples = probe(view_colored_sample)
 
 
 def view_samples(models: PoseModels, loss: Any, observer: Observer, pose: np.ndarray) -> dict[str, np.ndarray]:
-    """Outputs of `view_samples_kernel` by name (instance, sample, ...), for poses (N, 7)."""
-    shape = (observer.instances, models.models.position.shape[1])
-    outputs = {name: wp.zeros(shape, dtype=kind, device=observer.device) for name, kind in OUTPUTS.items()}
-    poses = wp.array(np.atleast_2d(pose).astype(np.float32), dtype=wp.transform, device=observer.device)
-    inputs = [models.models, loss, observer.images, observer.targets, observer.observation, poses]
-    wp.launch(view_samples_kernel, dim=shape, inputs=inputs, outputs=list(outputs.values()), device=observer.device)
-    return {name: array.numpy() for name, array in outputs.items()}
+    """Outputs of `view_colored_sample` by name (instance, sample, ...), for poses (N, 7)."""
+    instance, k = np.indices((observer.instances, models.models.position.shape[1]))
+    poses = np.broadcast_to(np.atleast_2d(pose), (observer.instances, 7))[:, None]
+    inputs = (models.models, loss, observer.images, observer.targets, observer.observation, poses, instance, k)
+    sample, *others = _view_samples(*inputs, device=observer.device)
+    return {name: sample[name] for name in sample.dtype.names} | dict(zip(("way", "colored", "color", "line"), others, strict=True))
 
 
 class Normals:

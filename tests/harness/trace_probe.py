@@ -1,39 +1,34 @@
-"""Test kernel that renders a G-buffer by ray tracing, the reference of the rasterizer."""
+"""Rendering of a G-buffer by ray tracing, the reference of the rasterizer."""
 
+import numpy as np
 import warp as wp
 
 from synpick_warp.kernels.render.visibility.bvh_rays import hit_table, trace_camera_ray
-from synpick_warp.kernels.render.visibility.camera import Cameras, ImageGrid, Views, camera_ray, in_image, tile_of, tile_pixel
+from synpick_warp.kernels.render.visibility.camera import TILE_PIXELS, Cameras, ImageGrid, Views, camera_ray, in_image, tile_of, tile_pixel
 from synpick_warp.kernels.render.visibility.gbuffer import GBuffer, Meshes, Table, ViewBodies, store_hit
+from synpick_warp.stages.render.scene import RenderScene
+from tests.harness.probe import probe
 
-wp.set_module_options({"enable_backward": False})
 
-
-@wp.kernel
-def trace_gbuffer_kernel(
-    # Scene:
-    meshes: Meshes,
-    table: Table,
-    cameras: Cameras,
-    grid: ImageGrid,
-    # In:
-    bodies: ViewBodies,
-    views: Views,
-    offset: wp.vec2,
-    first: int,
-    # Out:
-    gbuffer_out: GBuffer,
+@wp.func
+def trace_pixel(
+    meshes: Meshes, table: Table, cameras: Cameras, grid: ImageGrid, bodies: ViewBodies, views: Views, gbuffer: GBuffer, index: int
 ):
-    """Render the G-buffer by ray tracing: one ray a pixel, `offset` [px] off its centre. Pixels of unused views (camera -1) stay.
+    """Trace the ray through the centre of a pixel, by its index in tile order. Pixels of unused views (camera -1) stay."""
+    view, row, column = tile_pixel(grid, index)
+    camera = -1
+    if in_image(grid, row, column):
+        camera = views.camera[view]
+    if camera >= 0:
+        ray = camera_ray(cameras.intrinsics[camera], row, column, wp.vec2(0.0, 0.0))
+        hit = trace_camera_ray(meshes, bodies, view, tile_of(grid, row, column), ray, views.instances)
+        store_hit(gbuffer, view, row, column, hit_table(table, cameras, camera, ray, hit))
 
-    One thread a pixel from flat index `first` on, in tile order.
-    """
-    view, row, column = tile_pixel(grid, wp.tid() + first)
-    if not in_image(grid, row, column):
-        return
-    camera = views.camera[view]
-    if camera < 0:
-        return
-    ray = camera_ray(cameras.intrinsics[camera], row, column, offset)
-    hit = trace_camera_ray(meshes, bodies, view, tile_of(grid, row, column), ray, views.instances)
-    store_hit(gbuffer_out, view, row, column, hit_table(table, cameras, camera, ray, hit))
+
+_trace_pixels = probe(trace_pixel)
+
+
+def trace_gbuffer(scene: RenderScene, bodies: ViewBodies, views: Views, gbuffer: GBuffer, count: int) -> None:
+    """Render the G-buffer of `count` views by one ray a pixel."""
+    pixels = np.arange(count * scene.grid.tiles * int(TILE_PIXELS))
+    _trace_pixels(scene.meshes, scene.table, scene.cameras, scene.grid, bodies, views, gbuffer, pixels, device=scene.device)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import struct
 import zlib
 
 import cv2
@@ -14,6 +13,7 @@ from synpick_warp.exporters.writing.png import encode_mask_png, encode_png
 from synpick_warp.exporters.writing.rle import find_run_boundaries
 from synpick_warp.system.inputs.image_files import decode_image
 from synpick_warp.system.inputs.png_crop import _WIDE, decode_grey_crop
+from tests.worlds.model_files import pack_png
 
 SIZE = 70, 50
 """Width and height."""
@@ -22,19 +22,10 @@ MASK = (np.hypot(*np.mgrid[-20:30, -30:40]) < 18).astype(np.uint8)
 IMAGE = np.random.default_rng(0).integers(0, 256, SIZE[::-1], dtype=np.uint8)
 
 
-def chunk(kind: bytes, data: bytes) -> bytes:
-    return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
-
-
 def png(rows: bytes, header: tuple[int, ...] = (*SIZE, 8, 0, 0, 0, 0)) -> bytes:
-    return (
-        b"\x89PNG\r\n\x1a\n"
-        + chunk(b"IHDR", struct.pack(">IIBBBBB", *header))
-        + chunk(b"tEXt", b"note")
-        + chunk(b"IDAT", zlib.compress(rows)[:30])
-        + chunk(b"IDAT", zlib.compress(rows)[30:])
-        + chunk(b"IEND", b"")
-    )
+    width, height, depth, kind, *rest = header
+    parts = ((b"tEXt", b"note"), (b"IDAT", zlib.compress(rows)[:30]), (b"IDAT", zlib.compress(rows)[30:]))
+    return pack_png(width, height, *parts, depth=depth, kind=kind, rest=tuple(rest))
 
 
 def lines(kind: int, image: np.ndarray) -> bytes:

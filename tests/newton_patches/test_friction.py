@@ -9,22 +9,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from synpick_warp.kernels.newton_patches.friction import solve_friction
+from tests.harness.probe import probe
 
 
-@wp.kernel(enable_backward=False)
-def solve_kernel(
-    scale: wp.array[float],
-    values: wp.array[wp.vec2],
-    axis: wp.array[wp.vec2],
-    residual: wp.array[wp.vec2],
-    old: wp.array[wp.vec2],
-    radius: wp.array[float],
-    relaxation: float,
-    found_out: wp.array[wp.vec2],
-):
-    """Solve the friction rows of one contact per thread."""
-    i = wp.tid()
-    found_out[i] = solve_friction(scale[i], values[i][0], values[i][1], axis[i], residual[i], old[i], radius[i], relaxation)
+@wp.func
+def solve_rows(scale: float, values: wp.vec2, axis: wp.vec2, residual: wp.vec2, old: wp.vec2, radius: float, relaxation: float):
+    return solve_friction(scale, values[0], values[1], axis, residual, old, radius, relaxation)
+
+
+probe_rows = probe(solve_rows)
 
 
 def solve(matrices, residual, old, radius, device, relaxation: float = 1.0) -> np.ndarray:
@@ -34,25 +27,23 @@ def solve(matrices, residual, old, radius, device, relaxation: float = 1.0) -> n
     """
     values, vectors = np.linalg.eigh(matrices)
     scale = np.maximum(np.maximum(matrices[:, 0, 0], matrices[:, 1, 1]), 1e-20)
-    arrays = (scale, values[:, ::-1] / scale[:, None], vectors[:, :, 1], residual, old, radius)
-    inputs = [wp.array(np.float32(a), dtype=wp.vec2 if a.ndim > 1 else float, device=device) for a in arrays]
-    found = wp.empty(len(scale), dtype=wp.vec2, device=device)
-    wp.launch(solve_kernel, dim=len(scale), inputs=[*inputs, relaxation], outputs=[found], device=device)
-    return found.numpy()
+    return probe_rows(scale, values[:, ::-1] / scale[:, None], vectors[:, :, 1], residual, old, radius, relaxation, device=device)
 
 
-def bisect(matrix: np.ndarray, residual: np.ndarray, old: np.ndarray, radius: float) -> np.ndarray:
-    """Minimizer of ½ xᵀA x - bᵀx within a disk, with b = A old - residual, by bisection in double precision."""
-    b = matrix @ old - residual
-    free = np.linalg.solve(matrix, b)
-    if np.linalg.norm(free) <= radius:
-        return free
-    low, high = 0.0, np.linalg.norm(b) / radius
+def bisect(matrices: np.ndarray, residual: np.ndarray, old: np.ndarray, radius: np.ndarray) -> np.ndarray:
+    """Minimizers (contact, 2) of ½ xᵀA x - bᵀx within disks, with b = A old - residual, by bisection in double precision."""
+
+    def solved(shift: np.ndarray) -> np.ndarray:
+        return np.linalg.solve(matrices + shift[:, None, None] * np.eye(2), b[..., None])[..., 0]
+
+    b = (matrices @ old[..., None])[..., 0] - residual
+    low, high = np.zeros(len(radius)), np.linalg.norm(b, axis=1) / radius
     for _ in range(200):
         middle = (low + high) / 2.0
-        outside = np.linalg.norm(np.linalg.solve(matrix + middle * np.eye(2), b)) > radius
-        low, high = (middle, high) if outside else (low, middle)
-    return np.linalg.solve(matrix + high * np.eye(2), b)
+        outside = np.linalg.norm(solved(middle), axis=1) > radius
+        low, high = np.where(outside, middle, low), np.where(outside, high, middle)
+    free = solved(np.zeros(len(radius)))
+    return np.where(np.linalg.norm(free, axis=1, keepdims=True) <= radius[:, None], free, solved(high))
 
 
 def random_contacts(count: int, condition: float, seed: int = 1):
@@ -75,7 +66,7 @@ def random_contacts(count: int, condition: float, seed: int = 1):
 def test_impulses_are_those_of_a_bisection(device, condition):
     contacts = random_contacts(3000, condition)
     found = solve(*contacts, device)
-    expected = np.array([bisect(*contact) for contact in zip(*contacts, strict=True)])
+    expected = bisect(*contacts)
     error = np.linalg.norm(found - expected, axis=1) / contacts[3]
     slides = np.linalg.norm(expected, axis=1) > 0.999 * contacts[3]
     assert 0.2 < slides.mean() < 0.95
@@ -117,7 +108,7 @@ def test_an_old_impulse_may_be_far_outside_the_disk(device):
     matrices, residual, old, radius = random_contacts(2000, 20.0, seed=3)
     old *= 1000.0
     found = solve(matrices, residual, old, radius, device)
-    expected = np.array([bisect(*contact) for contact in zip(matrices, residual, old, radius, strict=True)])
+    expected = bisect(matrices, residual, old, radius)
     assert (np.linalg.norm(found - expected, axis=1) / radius).max() < 1e-3
 
 

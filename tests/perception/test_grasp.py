@@ -13,13 +13,14 @@ from hypothesis import strategies as st
 
 from synpick_warp.codes import Mode
 from synpick_warp.factory.assembly import make_renderer
+from synpick_warp.kernels.perception import grasp
 from synpick_warp.stages.arrays import allocate
 from synpick_warp.stages.buffers import ViewBuffers, view_buffer_sizes
 from synpick_warp.stages.perception.arrays import Observation, PerceptionArrays, Plan
 from synpick_warp.stages.perception.plan import GraspPlanner
 from synpick_warp.stages.render.view_setup import make_views
 from synpick_warp.stages.sim.worlds import AttemptState
-from tests.harness.grasp_probe import solve_kinematics_kernel
+from tests.harness.probe import probe
 from tests.twins import planning
 from tests.worlds.kernel_worlds import KernelWorlds, filled
 from tests.worlds.toy_scene import ToyScene, ball, box, build_scene, camera, entry, flat_shaded, sheet, snapshot
@@ -31,13 +32,14 @@ VIEW = camera(160, 120, 400.0, (0.02, -0.03, 2.0))
 # ---- inverse kinematics ----
 
 
-def solve(device, normals, limit: float = QUARTER) -> tuple[np.ndarray, np.ndarray]:
-    """Yaw and tilt (n, 2), and limited normals (n, 3), for normals of any length."""
-    count = len(normals)
-    outputs = [wp.zeros(count, dtype=dtype, device=device) for dtype in (wp.vec2, wp.vec3)]
-    inputs = [wp.array(np.asarray(normals, np.float32), dtype=wp.vec3, device=device), limit]
-    wp.launch(solve_kinematics_kernel, dim=count, inputs=inputs, outputs=outputs, device=device)
-    return tuple(array.numpy() for array in outputs)
+@wp.func
+def limit_and_solve(normal: wp.vec3, limit: float):
+    """Yaw and tilt [rad] for a normal of any length, and the limited normal."""
+    limited = grasp.limit_normal(normal, limit)
+    return grasp.gripper_angles(limited), limited
+
+
+solve = probe(limit_and_solve)
 
 
 @pytest.mark.parametrize(
@@ -55,8 +57,8 @@ def solve(device, normals, limit: float = QUARTER) -> tuple[np.ndarray, np.ndarr
     ],
 )
 def test_angles_of_known_normals(device, normal, yaw, tilt):
-    angles, _ = solve(device, [normal])
-    np.testing.assert_allclose(angles[0], (yaw, tilt), atol=1e-6)
+    angles, _ = solve(normal, QUARTER, device=device)
+    np.testing.assert_allclose(angles, (yaw, tilt), atol=1e-6)
 
 
 directions = st.tuples(st.floats(-1, 1), st.floats(-1, 1), st.floats(0, 1)).filter(lambda v: np.linalg.norm(v) > 1e-2)
@@ -64,7 +66,7 @@ directions = st.tuples(st.floats(-1, 1), st.floats(-1, 1), st.floats(0, 1)).filt
 
 @given(direction=directions)
 def test_forward_kinematics_returns_the_normal(direction, device):
-    (yaw, tilt), limited = (array[0] for array in solve(device, [direction]))
+    (yaw, tilt), limited = solve(direction, QUARTER, device=device)
     normal = np.array(direction) / np.linalg.norm(direction)
     assert -QUARTER < yaw <= np.float32(QUARTER)
     assert abs(tilt) <= QUARTER + 1e-6
@@ -81,7 +83,7 @@ def test_normals_are_limited_to_the_tilt_limit(direction, limit, device):
     length, across = np.linalg.norm(direction), np.linalg.norm(direction[:2])
     assume(length > 1e-2 and across > 1e-3)
     limit = np.radians(limit)
-    (yaw, tilt), limited = (array[0] for array in solve(device, [direction], limit))
+    (yaw, tilt), limited = solve(direction, limit, device=device)
     assert abs(tilt) <= limit + 1e-5
     lean = min(np.arctan2(across, direction[2]), limit)
     expected = [*(np.sin(lean) / across * np.array(direction[:2])), np.cos(lean)]
@@ -90,7 +92,7 @@ def test_normals_are_limited_to_the_tilt_limit(direction, limit, device):
 
 
 def test_zero_and_downward_normals_become_vertical(device):
-    _, limited = solve(device, [(0, 0, 0), (0, 0, -3)])
+    _, limited = solve([(0, 0, 0), (0, 0, -3)], QUARTER, device=device)
     np.testing.assert_array_equal(limited, [[0, 0, 1]] * 2)
 
 
@@ -115,10 +117,7 @@ class GraspHarness:
         self.arrays.component.assign(self.expected["component"])
         self.arrays.largest.assign(self.expected["largest"])
         self.grasp_pixel = self.expected["grasp_pixel"]
-        many = np.ones(len(toy.entries))
-        self.worlds = KernelWorlds(
-            device, views, volume=many, compound=many * 0, radius=many, instances=instances, single_slots=instances, compound_slots=0
-        )
+        self.worlds = KernelWorlds(device, views, len(toy.entries), instances)
         filled(self.worlds.scene.perception, {**planning.SETTINGS, "normal_window": window})
         self.worlds.scene.pick.tilt_limit = tilt_limit
         self.scene = self.worlds.scene

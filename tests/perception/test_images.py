@@ -12,14 +12,12 @@ import warp as wp
 from synpick_warp.codes import Segment
 from synpick_warp.configs.schema import Config
 from synpick_warp.errors import ConfigError
-from synpick_warp.kernels.render.visibility.camera import TILE_PIXELS
 from synpick_warp.scenes.cameras import make_cameras
 from synpick_warp.scenes.types import Catalog, Fixture
-from synpick_warp.stages.launch import launch_pixels
 from synpick_warp.stages.perception import images
 from synpick_warp.stages.perception.images import PerceptionImages
 from synpick_warp.stages.render.scene import build_render_scene
-from tests.harness.trace_probe import trace_gbuffer_kernel
+from tests.harness.trace_probe import trace_gbuffer
 from tests.worlds.toy_scene import GREY, UPRIGHT, ToyScene, ball, box, build_scene, entry, render, snapshot
 
 RESOLUTION = (96, 54)
@@ -90,9 +88,7 @@ def test_rasterized_hits_equal_traced_hits_pixel_by_pixel(device, toy, displacem
     made.render(state)
     names = ("segment", "triangle", "barycentric", "depth")
     rasterized = {name: getattr(made.gbuffer, name).numpy().copy() for name in names}
-    scene, pixels = made.scene, 3 * made.scene.grid.tiles * int(TILE_PIXELS)
-    inputs = [scene.meshes, scene.table, scene.cameras, scene.grid, made.bodies, made.views, wp.vec2(0.0, 0.0)]
-    launch_pixels(trace_gbuffer_kernel, pixels, inputs, [made.gbuffer], device)
+    trace_gbuffer(made.scene, made.bodies, made.views, made.gbuffer, 3)
     traced = {name: getattr(made.gbuffer, name).numpy() for name in names}
     assert made.bodies.uses_background.numpy()[[0, 2]].tolist() == [int(displacement == 0.0)] * 2
     ours, expected = ({name: values[[0, 2]] for name, values in hits.items()} for hits in (rasterized, traced))

@@ -7,11 +7,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
+from synpick_warp.kernels.pose import residuals, solve
 from synpick_warp.kernels.pose.residuals import LANES
 from synpick_warp.kernels.pose.solve import UNSEEN, score_poses_kernel
 from synpick_warp.stages.pose.models import build_models
 from synpick_warp.stages.pose.refine import LossScales, make_loss
-from tests.harness.pose_probe import Normals, residual_kernel, solve_kernel, step_kernel, step_limits
+from tests.harness.pose_probe import Normals, step_limits
+from tests.harness.probe import probe
 from tests.twins import pose as twin
 from tests.worlds.pose_views import drawn, model_of, observe, pose_errors, pose_of, table_of
 from tests.worlds.toy_scene import box
@@ -19,23 +21,15 @@ from tests.worlds.toy_scene import box
 RADIUS = 0.1
 
 
-def solve(device, matrix: np.ndarray, right: np.ndarray) -> np.ndarray:
-    count = len(matrix)
-    result = wp.zeros(count, dtype=wp.spatial_vector, device=device)
-    matrices = wp.array(matrix.astype(np.float32), dtype=wp.spatial_matrix, device=device)
-    rights = wp.array(right.astype(np.float32), dtype=wp.spatial_vector, device=device)
-    wp.launch(solve_kernel, dim=count, inputs=[matrices, rights], outputs=[result], device=device)
-    return result.numpy()
+@wp.func
+def step_there_and_back(pose: wp.transform, step: wp.spatial_vector, radius: float):
+    """Stepped pose, its difference from the old one, and the logarithm of its rotation."""
+    moved = solve.apply_step(pose, step, radius)
+    return moved, solve.pose_difference(moved, pose, radius), solve.rotation_vector(wp.transform_get_rotation(moved))
 
 
-def apply(device, pose: np.ndarray, step: np.ndarray, radius: float = RADIUS) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Stepped poses, steps back, logarithms of their rotations."""
-    count = len(pose)
-    outputs = [wp.zeros(count, dtype=kind, device=device) for kind in (wp.transform, wp.spatial_vector, wp.vec3)]
-    poses = wp.array(pose.astype(np.float32), dtype=wp.transform, device=device)
-    steps = wp.array(step.astype(np.float32), dtype=wp.spatial_vector, device=device)
-    wp.launch(step_kernel, dim=count, inputs=[poses, steps, radius], outputs=outputs, device=device)
-    return tuple(array.numpy() for array in outputs)
+step_and_back, cholesky = probe(step_there_and_back), probe(solve.solve_cholesky)
+jacobian, tukey = probe(residuals.jacobian), probe(residuals.tukey_weight)
 
 
 def random_poses(seed: int, count: int) -> np.ndarray:
@@ -51,13 +45,13 @@ def test_cholesky_solves_positive_definite_systems(device, seed):
     matrix = factor @ factor.transpose(0, 2, 1) + 0.1 * np.eye(6)
     right = random.normal(size=(4, 6))
     expected = np.linalg.solve(matrix, right[..., None])[..., 0]
-    assert solve(device, matrix, right) == pytest.approx(expected, rel=2e-3, abs=2e-3 * np.abs(expected).max())
+    assert cholesky(matrix, right, device=device) == pytest.approx(expected, rel=2e-3, abs=2e-3 * np.abs(expected).max())
 
 
 def test_an_unknown_that_nothing_determines_stays_zero(device):
     matrix = np.diag([2.0, 1.0, 0.0, 4.0, 0.5, 1.0])
     right = np.array([2.0, 1.0, 0.0, 2.0, 0.5, 3.0])
-    assert solve(device, matrix[None], right[None])[0] == pytest.approx([1.0, 1.0, 0.0, 0.5, 1.0, 3.0])
+    assert cholesky(matrix, right, device=device) == pytest.approx([1.0, 1.0, 0.0, 0.5, 1.0, 3.0])
 
 
 @given(seed=st.integers(0, 2**32 - 1), size=st.sampled_from([0.0, 1e-5, 1e-3, 0.05, 0.3]))
@@ -66,7 +60,7 @@ def test_a_step_and_the_difference_of_poses_are_inverse(device, seed, size):
     random = np.random.default_rng(seed)
     pose, step = random_poses(seed, 8), random.normal(size=(8, 6))
     step *= size / np.linalg.norm(step[:, :3], axis=1, keepdims=True)
-    moved, back, _ = apply(device, pose, step)
+    moved, back, _ = step_and_back(pose, step, RADIUS, device=device)
     assert back == pytest.approx(step, abs=2e-6)
     for row in range(8):
         rotation, translation = twin.stepped(pose[row], step[row], RADIUS)
@@ -78,7 +72,7 @@ def test_a_step_and_the_difference_of_poses_are_inverse(device, seed, size):
 def test_logarithm_of_rotations(device):
     pose = random_poses(3, 64)
     pose[0, 3:], pose[1, 3:], pose[2, 3:] = (0, 0, 0, 1), (0, 0, 0, -1), (0, 1, 0, 0)
-    _, _, log = apply(device, pose, np.zeros((64, 6)))
+    _, _, log = step_and_back(pose, np.zeros((64, 6)), RADIUS, device=device)
     assert log[:3].tolist() == pytest.approx(np.array([[0, 0, 0], [0, 0, 0], [0, np.pi, 0]]))
     assert log[3:] == pytest.approx(Rotation.from_quat(pose[3:, 3:]).as_rotvec(), abs=1e-5)
 
@@ -87,21 +81,18 @@ def test_a_step_moves_points_as_linearized(device):
     """p + w x (p - c) / ρ + v to first order: the rest is quadratic in the step."""
     random = np.random.default_rng(5)
     pose, step = random_poses(5, 16), random.normal(size=(16, 6)) * 1e-3
-    moved, _, _ = apply(device, pose, step)
+    moved, _, _ = step_and_back(pose, step, RADIUS, device=device)
     point = random.uniform(-RADIUS, RADIUS, (16, 3))
     before, after = (Rotation.from_quat(p[:, 3:]).apply(point) + p[:, :3] for p in (pose, moved))
     linear = np.cross(step[:, :3], before - pose[:, :3]) / RADIUS + step[:, 3:]
     rest = 0.5 * (np.linalg.norm(step[:, :3], axis=1) / RADIUS) ** 2 * np.linalg.norm(point, axis=1)
     assert (np.linalg.norm(after - before - linear, axis=1) < rest + 1e-6).all()
     direction = random.normal(size=(16, 3))
-    line, weight = wp.zeros(16, dtype=wp.spatial_vector, device=device), wp.zeros(16, dtype=float, device=device)
-    origin = wp.vec3(0.1, 0.2, 0.3)
-    inputs = [wp.array(before, dtype=wp.vec3, device=device), wp.array(direction, dtype=wp.vec3, device=device), origin, RADIUS, 0.2]
-    wp.launch(residual_kernel, dim=16, inputs=inputs, outputs=[line, weight], device=device)
+    line, weight = jacobian(before, (0.1, 0.2, 0.3), direction, RADIUS, device=device), tukey(before[:, 0], 0.2, device=device)
     along = np.cross(step[:, :3], before - (0.1, 0.2, 0.3)) / RADIUS + step[:, 3:]
-    assert np.einsum("nk,nk->n", line.numpy(), step) == pytest.approx(np.einsum("nk,nk->n", along, direction), abs=1e-7)
+    assert np.einsum("nk,nk->n", line, step) == pytest.approx(np.einsum("nk,nk->n", along, direction), abs=1e-7)
     inside = np.maximum(1.0 - (before[:, 0] / 0.2) ** 2, 0.0)
-    assert weight.numpy() == pytest.approx(inside**2, abs=1e-6)
+    assert weight == pytest.approx(inside**2, abs=1e-6)
 
 
 class Scene:

@@ -20,31 +20,8 @@ from synpick_warp.scenes.catalog import load_catalog
 from synpick_warp.scenes.collision.hulls import hull_size
 from synpick_warp.scenes.embedded.objects import procedural_objects
 from synpick_warp.scenes.types import CatalogEntry
+from tests.worlds.model_files import REAL_HULLS, exported, glb, put
 
-# Litres of the convex hulls, and concave or not, as the README of the real data gives them.
-REAL_HULLS = {
-    1: 1.142,
-    2: 2.310,
-    3: 0.661,
-    4: 0.357,
-    5: 0.699,
-    6: 0.187,
-    7: 0.352,
-    8: 0.179,
-    9: 0.420,
-    10: 0.265,
-    11: 3.125,
-    12: 1.067,
-    13: 0.749,
-    14: 0.525,
-    15: 1.292,
-    16: 1.605,
-    17: 0.129,
-    18: 0.033,
-    19: 0.377,
-    20: 0.601,
-    21: 0.197,
-}
 REAL_CONCAVE = {13, 14, 15}
 
 
@@ -56,8 +33,7 @@ def write_box(file: Path, extents=(0.1, 0.1, 0.1), offset=(0.0, 0.0, 0.0)) -> Pa
     """In metres, or in millimetres for names of BOP models."""
     box = trimesh.creation.box(np.array(extents) * (1000 if file.name.startswith("obj_") else 1))
     box.apply_translation(offset)
-    file.write_bytes(box.export(file_type="ply") if file.suffix == ".ply" else box.export(file_type=file.suffix[1:]).encode())
-    return file
+    return put(file, exported(box, file.suffix[1:]))
 
 
 def write_info(folder: Path, content) -> None:
@@ -124,7 +100,7 @@ def test_a_row_applies_if_id_and_diameter_agree(tmp_path):
 def test_meshes_that_are_not_bop_models_are_in_metres(tmp_path):
     write_box(tmp_path / "b.ply", (0.1, 0.2, 0.3))
     write_box(tmp_path / "a.obj")
-    (tmp_path / "c.glb").write_bytes(trimesh.Scene([trimesh.creation.icosphere(2, 0.04)]).export(file_type="glb"))
+    put(tmp_path / "c.glb", glb(trimesh.creation.icosphere(2, 0.04)))
     (tmp_path / "notes.txt").write_text("no model")
     (tmp_path / ".hidden.ply").write_text("no model")
     # These ids are only positions: rows are matched by name, not by id.
@@ -154,7 +130,7 @@ def test_concave_by_volume_ratio_or_by_row(tmp_path, monkeypatch):
     monkeypatch.setattr(catalog, "collision_shapes", remember)
     tube = trimesh.creation.annulus(0.04, 0.05, 0.1)
     for name in ("hollow", "ruled"):
-        (tmp_path / f"{name}.ply").write_bytes(tube.export(file_type="ply"))
+        put(tmp_path / f"{name}.ply", exported(tube))
     write_box(tmp_path / "solid.ply")
     write_box(tmp_path / "wanted.ply")
     rows = (ObjectRow(name="ruled", concave=False), ObjectRow(name="wanted", concave=True))
@@ -224,8 +200,7 @@ def turned_box(file: Path, extents: tuple[float, float, float], seed: int | None
     box = trimesh.creation.box(np.array(extents))
     if seed is not None:
         box.apply_transform(trimesh.transformations.random_rotation_matrix(np.random.default_rng(seed).uniform(size=3)))
-    file.write_bytes(box.export(file_type="ply"))
-    return file
+    return put(file, exported(box))
 
 
 @pytest.mark.parametrize("seed", [None, 1, 2])
@@ -327,11 +302,14 @@ def test_embedded_objects_need_no_folder_and_no_table(tmp_path, monkeypatch):
 
 
 def test_the_real_objects(real_models, tmp_path):
+    """They agree with their models_info.json, too: nothing is said."""
     # Rows from the preset, but no decompositions: they take minutes. `test_collision` decomposes a small bowl.
     config = load_config("synpick", {})
     rows = tuple(replace(row, concave=False) for row in config.object_rows)
     config = replace(config, bake=replace(config.bake, models=str(real_models)), object_rows=rows)
-    entries = load(config, tmp_path)
+    lines: list[str] = []
+    entries = load_catalog(config, tmp_path / "cache", lines.append).entries
+    assert not lines
     assert [entry.obj_id for entry in entries] == list(range(1, 22))
     for entry, row in zip(entries, rows, strict=True):
         assert (entry.name, entry.mass) == (row.name, row.mass)

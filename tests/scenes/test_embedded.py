@@ -26,6 +26,7 @@ from synpick_warp.scenes.modelling import (
     torus,
 )
 from tests.twins.rays import edges_match
+from tests.worlds.model_files import REAL_HULLS
 
 TABLE = {
     # id: mass [kg], diameter [m] of the real object, metallic, roughness
@@ -51,30 +52,6 @@ TABLE = {
     20: (0.202, 0.217, 0.1, 0.5),
     21: (0.028, 0.103, 0.1, 0.7),
 }
-HULL_LITRES = (
-    1.14,
-    2.31,
-    0.66,
-    0.36,
-    0.70,
-    0.19,
-    0.35,
-    0.18,
-    0.42,
-    0.27,
-    3.13,
-    1.07,
-    0.75,
-    0.53,
-    1.29,
-    1.61,
-    0.13,
-    0.033,
-    0.38,
-    0.60,
-    0.20,
-)
-"""Convex hulls of the real objects: what an arrangement's volume budget counts."""
 PRINTED = (1, 2, 3, 4, 5, 6, 7, 8, 9, 12, 14)
 CONCAVE = (13, 14, 15)
 OBJECTS = {raw.obj_id: raw for raw in procedural_objects()}
@@ -138,7 +115,7 @@ def test_the_origin_is_the_middle_of_the_bounding_box(raw):
 
 def test_sizes_are_near_the_real_ones(raw):
     assert raw.hull.diameter == pytest.approx(TABLE[raw.obj_id][1], rel=0.1)
-    assert ConvexHull(raw.mesh.vertices).volume * 1000 == pytest.approx(HULL_LITRES[raw.obj_id - 1], rel=0.16)
+    assert ConvexHull(raw.mesh.vertices).volume * 1000 == pytest.approx(REAL_HULLS[raw.obj_id], rel=0.16)
 
 
 def test_normals_are_units_on_the_outside(raw):

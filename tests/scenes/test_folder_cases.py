@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -18,6 +17,7 @@ from synpick_warp.scenes.catalog import load_catalog
 from synpick_warp.scenes.lights import load_lights
 from synpick_warp.scenes.types import Catalog
 from tests.scenes.test_fuzz_assets import OBJ, picture
+from tests.worlds.model_files import exported, put
 
 CASES = Path(__file__).resolve().parents[3] / "shared" / "cases"
 needs_cases = pytest.mark.skipif(not CASES.is_dir(), reason="the cases are not here")
@@ -33,16 +33,8 @@ def load(folder: Path, cache: Path, **objects) -> tuple[Catalog, list[str]]:
 def write(folder: Path, **files: str | bytes) -> Path:
     """Files by name, with __ for / and _dot_ for the dot."""
     for name, content in files.items():
-        path = folder / name.replace("__", "/").replace("_dot_", ".")
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_bytes(content if isinstance(content, bytes) else content.encode())
+        put(folder / name.replace("__", "/").replace("_dot_", "."), content)
     return folder
-
-
-def exported(mesh: trimesh.Trimesh, kind: str = "ply") -> bytes:
-    data = mesh.export(file_type=kind)
-    assert isinstance(data, bytes | str)
-    return data if isinstance(data, bytes) else data.encode()
 
 
 def box(*extents: float, kind: str = "ply") -> bytes:
@@ -272,10 +264,3 @@ def test_a_mesh_in_metres_among_millimetres_is_told(tmp_path):
     (folder / "models_info.json").write_text(json.dumps({"1": {"diameter": 118.3}}))
     with pytest.raises(SynpickError, match=r"diameter is 0\.1183 mm, but models_info\.json says 118\.3; scale it to millimetres"):
         load(folder, tmp_path)
-
-
-def test_the_real_objects_agree_with_their_models_info(real_models, tmp_path):
-    config = Config(bake=Bake(models=str(real_models)), objects=Objects(concave_ratio=0.0))
-    lines: list[str] = []
-    load_catalog(replace(config, object_rows=()), tmp_path, lines.append)
-    assert not lines

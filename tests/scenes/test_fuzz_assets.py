@@ -27,6 +27,7 @@ from synpick_warp.scenes.assets.models_info import read_models_info
 from synpick_warp.scenes.lights import MAX_RADIANCE, load_lights
 from tests.harness.fuzz import fuzz_examples, start_isolation
 from tests.harness.hostile import LEAVES, places, removed, replaced
+from tests.worlds.model_files import exported, pack_glb, unpack_glb
 
 SECONDS = 5.0
 """Longest time that any input may take."""
@@ -148,19 +149,12 @@ def glb_chunks() -> tuple[dict[str, Any], bytes]:
     image = Image.new("RGB", (4, 4), (9, 8, 7))
     material = PBRMaterial(baseColorTexture=image, metallicRoughnessTexture=image, metallicFactor=0.5, baseColorFactor=(9, 9, 9, 255))
     box.visual = TextureVisuals(uv=np.zeros((8, 2)), material=material)
-    data = trimesh.Scene([box]).export(file_type="glb")
-    (length,) = struct.unpack_from("<I", data, 12)
-    return json.loads(data[20 : 20 + length]), data[28 + length :]
+    return unpack_glb(exported(trimesh.Scene([box]), "glb"))
 
 
 DOCUMENT, BINARY = glb_chunks()
 PLACES = list(places(DOCUMENT))
 GLB_VALUES = (*LEAVES, 1e308, float("nan"), 0, 1, 2, 7, 2**31 - 1, 5126, "data:,base64,x", "/etc/passwd", [0, 0], [0] * 16, {"index": 9})
-
-
-def glb(text: bytes, binary: bytes) -> bytes:
-    chunk = struct.pack("<I4s", len(binary), b"BIN\0") + binary
-    return struct.pack("<4sIII4s", b"glTF", 2, 20 + len(text) + len(chunk), len(text), b"JSON") + text + chunk
 
 
 @fuzz
@@ -177,7 +171,7 @@ def test_any_glb_is_one_line_or_a_mesh(data):
         except (KeyError, IndexError, TypeError):
             continue  # An earlier change took the place away.
     text = json.dumps(document).encode()
-    content = glb(text, mutate_bytes(data, BINARY))
+    content = pack_glb(text, mutate_bytes(data, BINARY))
     if not data.draw(st.integers(0, 3)):
         content = mutate_bytes(data, content)
     read("a.glb", content, {}, check_mesh, CatalogError)

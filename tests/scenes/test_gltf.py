@@ -5,7 +5,6 @@ from __future__ import annotations
 import base64
 import io
 import json
-import struct
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +15,7 @@ from PIL import Image
 from synpick_warp.errors import CatalogError
 from synpick_warp.scenes.assets.appearance import linear_to_srgb, srgb_to_linear
 from synpick_warp.scenes.assets.meshes import MeshOptions, read_mesh
+from tests.worlds.model_files import pack_glb
 
 CORNERS = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], np.float32)
 FACES = np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]], np.uint16)
@@ -66,9 +66,7 @@ class Builder:
 
     def glb(self) -> bytes:
         text = json.dumps(self.content | {"buffers": [{"byteLength": len(self.binary)}]}).encode()
-        text += b" " * (-len(text) % 4)
-        chunks = struct.pack("<I4s", len(text), b"JSON") + text + struct.pack("<I4s", len(self.binary), b"BIN\0") + self.binary
-        return struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks
+        return pack_glb(text + b" " * (-len(text) % 4), self.binary)
 
     def read(self, folder: Path) -> tuple[Any, Any, list[str]]:
         (folder / "a.glb").write_bytes(self.glb())

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import os
 import re
-import struct
 import time
 import warnings
 import zlib
@@ -28,7 +27,8 @@ from synpick_warp.scenes.collision.shapes import collision_shapes
 from synpick_warp.scenes.lights import MAX_MAP_PIXELS, MAX_RADIANCE, load_lights
 from synpick_warp.stages.render.light_tables import precompute_environment
 from tests.harness.fuzz import start_isolation
-from tests.scenes.test_fuzz_assets import BINARY, CORNERS, DOCUMENT, FACES, OBJ, glb, picture
+from tests.scenes.test_fuzz_assets import BINARY, CORNERS, DOCUMENT, FACES, OBJ, picture
+from tests.worlds.model_files import binary_ply, exported, pack_glb, pack_png, unpack_glb
 
 SECONDS = 5.0
 """Longest time that any input may take."""
@@ -36,11 +36,8 @@ SECONDS = 5.0
 
 def ply(*comments: str, scale: float = 100.0) -> bytes:
     """A textured tetrahedron in BOP's format."""
-    names = ("x", "y", "z", "texture_u", "texture_v")
-    header = ["ply", "format binary_little_endian 1.0", *comments, f"element vertex {len(CORNERS)}"]
-    header += [f"property float {name}" for name in names] + [f"element face {len(FACES)}", "property list uchar int vertex_indices"]
-    rows = np.asarray(CORNERS, "<f4") * np.array([scale, scale, scale, 1, 1], "<f4")
-    return "\n".join([*header, "end_header\n"]).encode() + rows.tobytes() + b"".join(struct.pack("<B3i", 3, *face) for face in FACES)
+    rows = np.multiply(CORNERS, (scale, scale, scale, 1, 1))
+    return binary_ply(rows, FACES, ("x", "y", "z", "texture_u", "texture_v"), "\n".join(comments))
 
 
 def folder_of(parent: Path, *comments: str) -> Path:
@@ -132,7 +129,7 @@ def test_a_glb_stays_in_its_folder(tmp_path, uri, key):
     os.mkfifo(folder / "fifo")
     (tmp_path / "evil.bin").write_bytes(BINARY)
     document = {**DOCUMENT, key: [{"uri": uri, "byteLength": len(BINARY)} for _ in DOCUMENT[key]]}
-    (folder / "a.glb").write_bytes(glb(json.dumps(document).encode(), BINARY))
+    (folder / "a.glb").write_bytes(pack_glb(json.dumps(document).encode(), BINARY))
     with pytest.raises(CatalogError, match=r"names the file|no file|not a regular file"):
         read_mesh(folder / "a.glb", 1.0)
 
@@ -183,9 +180,7 @@ def test_a_fifo_in_the_cache_of_shapes_is_no_obstacle(tmp_path):
 
 def png(width: int, height: int) -> bytes:
     """A PNG file of zeros that are never decoded."""
-    chunks = ((b"IHDR", struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)), (b"IDAT", zlib.compress(bytes(100))), (b"IEND", b""))
-    packed = [struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data)) for kind, data in chunks]
-    return b"\x89PNG\r\n\x1a\n" + b"".join(packed)
+    return pack_png(width, height, (b"IDAT", zlib.compress(bytes(100))), kind=2)
 
 
 @pytest.mark.parametrize("side", [8193, 13_000, 60_000])
@@ -221,16 +216,14 @@ def test_a_header_announces_no_more_than_the_file_has(tmp_path):
 
 def test_instances_in_a_glb_are_counted_before_they_are_made(tmp_path):
     scene = trimesh.Scene([trimesh.creation.icosphere(5, 0.1)])
-    data = scene.export(file_type="glb")
-    (length,) = struct.unpack_from("<I", data, 12)
-    document = json.loads(data[20 : 20 + length])
+    document, binary = unpack_glb(exported(scene, "glb"))
     document["nodes"] = [{"mesh": 0} for _ in range(1000)]
     document["scenes"] = [{"nodes": list(range(1000))}]
-    (tmp_path / "a.glb").write_bytes(glb(json.dumps(document).encode(), data[28 + length :]))
+    (tmp_path / "a.glb").write_bytes(pack_glb(json.dumps(document).encode(), binary))
     with pytest.raises(CatalogError, match="more than 2097152 vertices"):
         read_mesh(tmp_path / "a.glb", 1.0)
     document["nodes"] = [{"children": [number + 1]} for number in range(999)] + [{"mesh": 0, "children": [0]}]
-    (tmp_path / "a.glb").write_bytes(glb(json.dumps(document).encode(), data[28 + length :]))
+    (tmp_path / "a.glb").write_bytes(pack_glb(json.dumps(document).encode(), binary))
     with pytest.raises(CatalogError, match=r"root and a child|nested deeper"):
         read_mesh(tmp_path / "a.glb", 1.0)
 
@@ -243,7 +236,7 @@ def test_instances_in_a_glb_are_counted_before_they_are_made(tmp_path):
 def test_a_material_out_of_range_is_refused(tmp_path, key, value):
     document = json.loads(json.dumps(DOCUMENT))
     document["materials"][0]["pbrMetallicRoughness"][key] = "VALUE"
-    (tmp_path / "a.glb").write_bytes(glb(json.dumps(document).replace('"VALUE"', value).encode(), BINARY))
+    (tmp_path / "a.glb").write_bytes(pack_glb(json.dumps(document).replace('"VALUE"', value).encode(), BINARY))
     with pytest.raises(CatalogError, match=rf"{key}|malformed|out of range"):
         read_mesh(tmp_path / "a.glb", 1.0)
 

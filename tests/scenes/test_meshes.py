@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import struct
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -19,34 +18,9 @@ from synpick_warp.errors import CatalogError
 from synpick_warp.scenes.assets.appearance import bake_vertex_colors, linear_to_srgb, rgb8, srgb_to_linear
 from synpick_warp.scenes.assets.meshes import MeshOptions, merge_positions, read_mesh, signed_volume
 from synpick_warp.scenes.assets.normals import smooth_normals
+from tests.worlds.model_files import CORNERS, FACES, OBJ, ascii_ply, binary_ply, glb, picture, put, read
 
 SMOOTH = MeshOptions(crease_angle=180.0)
-CORNERS = [(0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, 1)]
-FACES = [(0, 2, 1), (0, 1, 3), (0, 3, 2), (1, 2, 3)]
-
-
-def ascii_ply(vertices, faces, columns=("x", "y", "z"), comment="", face_tail=None) -> str:
-    rows = [" ".join(str(value) for value in row) for row in vertices]
-    tails = face_tail or [""] * len(faces)
-    rows += [f"{len(face)} {' '.join(map(str, face))} {tail}".strip() for face, tail in zip(faces, tails, strict=True)]
-    header = ["ply", "format ascii 1.0", *([comment] if comment else []), f"element vertex {len(vertices)}"]
-    header += [f"property {'uchar' if name in ('red', 'green', 'blue') else 'float'} {name}" for name in columns]
-    header += [f"element face {len(faces)}", "property list uchar int vertex_indices"]
-    header += ["property list uchar float texcoord"] if face_tail else []
-    return "\n".join([*header, "end_header", *rows]) + "\n"
-
-
-def binary_ply(vertices, faces, columns, comment="") -> bytes:
-    header = ["ply", "format binary_little_endian 1.0", *([comment] if comment else []), f"element vertex {len(vertices)}"]
-    header += [f"property float {name}" for name in columns]
-    header += [f"element face {len(faces)}", "property list uchar int vertex_indices", "end_header"]
-    body = np.asarray(vertices, "<f4").tobytes() + b"".join(struct.pack("<B3i", 3, *face) for face in faces)
-    return "\n".join(header).encode() + b"\n" + body
-
-
-def picture(path: Path, color=(200, 10, 30), size=(4, 2)) -> Path:
-    Image.new("RGB", size, color).save(path)
-    return path
 
 
 @pytest.mark.parametrize("binary", [False, True])
@@ -57,9 +31,7 @@ def test_a_ply_keeps_order_texture_coordinates_and_scale(tmp_path, binary):
     vertices = [(0, 0, 0, 0.1, 0.2), (0, 0, 0, 0.9, 0.8), (1000, 0, 0, 0.3, 0.4), (0, 1000, 0, 0.5, 0.6), (0, 0, 1000, 0.7, 1.0)]
     faces = [(0, 3, 2), (1, 2, 4), (0, 4, 3), (2, 3, 4)]
     data = (binary_ply if binary else ascii_ply)(vertices, faces, columns, comment="comment TextureFile skin.png")
-    file = tmp_path / "obj_000001.ply"
-    file.write_bytes(data if isinstance(data, bytes) else data.encode())
-    mesh, finish = read_mesh(file, 1e-3, SMOOTH)
+    mesh, finish = read(tmp_path / "obj_000001.ply", data, SMOOTH, 1e-3)
     rows = np.asarray(vertices, np.float32)
     assert np.allclose(mesh.vertices, rows[:, :3] / 1000, atol=1e-7)
     assert np.array_equal(mesh.uv, rows[:, 3:])
@@ -78,9 +50,7 @@ def test_a_ply_keeps_order_texture_coordinates_and_scale(tmp_path, binary):
 def test_normals_of_the_file_are_used_and_made_unit(tmp_path):
     rows = [(*corner, *np.multiply(2.0, normal)) for corner, normal in zip(CORNERS, np.eye(3)[[0, 1, 2, 0]], strict=True)]
     rows[3] = (*CORNERS[3], 0.0, 0.0, 0.0)
-    file = tmp_path / "a.ply"
-    file.write_text(ascii_ply(rows, FACES, ("x", "y", "z", "nx", "ny", "nz")))
-    mesh, _ = read_mesh(file, 1.0)
+    mesh, _ = read(tmp_path / "a.ply", ascii_ply(rows, FACES, ("x", "y", "z", "nx", "ny", "nz")))
     assert np.allclose(mesh.normals[:3], np.eye(3))
     computed = smooth_normals(mesh.vertices, mesh.faces)
     assert np.allclose(mesh.normals[3], computed[3])
@@ -89,34 +59,28 @@ def test_normals_of_the_file_are_used_and_made_unit(tmp_path):
 def test_texture_coordinates_at_the_faces_split_vertices(tmp_path):
     picture(tmp_path / "t.png")
     tails = [f"6 0 0 {i / 4} 0 0 1" for i in range(4)]
-    file = tmp_path / "a.ply"
-    file.write_text(ascii_ply(CORNERS, FACES, comment="comment TextureFile t.png", face_tail=tails))
-    mesh, _ = read_mesh(file, 1.0)
+    mesh, _ = read(tmp_path / "a.ply", ascii_ply(CORNERS, FACES, comment="comment TextureFile t.png", face_tail=tails))
     assert len(mesh.vertices) == 12
     assert np.allclose(mesh.uv[4], (0.25, 0.0))
     assert signed_volume(mesh.vertices, mesh.faces) == pytest.approx(1 / 6)
 
 
 def test_an_inside_out_mesh_is_flipped(tmp_path):
-    file = tmp_path / "a.ply"
-    file.write_text(ascii_ply(CORNERS, [face[::-1] for face in FACES]))
-    mesh, _ = read_mesh(file, 1.0, SMOOTH)
+    mesh, _ = read(tmp_path / "a.ply", ascii_ply(CORNERS, [face[::-1] for face in FACES]), SMOOTH)
     assert signed_volume(mesh.vertices, mesh.faces) == pytest.approx(1 / 6)
     assert mesh.normals[1, 0] > 0.0
 
 
 def test_inside_out_normals_are_flipped_with_their_triangles(tmp_path):
     inward = [(*corner, *(0.25 - np.array(corner))) for corner in CORNERS]
-    file = tmp_path / "a.ply"
-    file.write_text(ascii_ply(inward, [face[::-1] for face in FACES], ("x", "y", "z", "nx", "ny", "nz")))
-    mesh, _ = read_mesh(file, 1.0)
+    mesh, _ = read(tmp_path / "a.ply", ascii_ply(inward, [face[::-1] for face in FACES], ("x", "y", "z", "nx", "ny", "nz")))
     assert np.all(np.einsum("vi,vi->v", mesh.normals, mesh.vertices - 0.25) > 0.0)
 
 
 def test_unused_vertices_and_degenerate_triangles_are_dropped(tmp_path):
-    file = tmp_path / "a.ply"
-    file.write_text(ascii_ply([(9, 9, 9), *CORNERS], [*[tuple(i + 1 for i in face) for face in FACES], (1, 1, 2)]))
-    mesh, _ = read_mesh(file, 1.0, SMOOTH)
+    mesh, _ = read(
+        tmp_path / "a.ply", ascii_ply([(9, 9, 9), *CORNERS], [*[tuple(i + 1 for i in face) for face in FACES], (1, 1, 2)]), SMOOTH
+    )
     assert np.array_equal(mesh.vertices, np.asarray(CORNERS, np.float32))
     assert np.array_equal(mesh.faces, FACES)
 
@@ -124,22 +88,18 @@ def test_unused_vertices_and_degenerate_triangles_are_dropped(tmp_path):
 def test_quads_become_triangles(tmp_path):
     box = trimesh.creation.box((1, 1, 1))
     quads = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
-    file = tmp_path / "a.ply"
-    file.write_text(ascii_ply(box.vertices, quads))
-    mesh, _ = read_mesh(file, 1.0)
+    mesh, _ = read(tmp_path / "a.ply", ascii_ply(box.vertices, quads))
     assert len(mesh.faces) == 12
     assert signed_volume(mesh.vertices, mesh.faces) == pytest.approx(1.0)
 
 
 def test_vertex_colors_become_a_color_or_a_texture(tmp_path):
     columns = ("x", "y", "z", "red", "green", "blue")
-    file = tmp_path / "a.ply"
-    file.write_text(ascii_ply([(*corner, 255, 0, 51) for corner in CORNERS], FACES, columns))
-    _, finish = read_mesh(file, 1.0)
+    _, finish = read(tmp_path / "a.ply", ascii_ply([(*corner, 255, 0, 51) for corner in CORNERS], FACES, columns))
     assert finish.texture is None
     assert finish.color == pytest.approx((1.0, 0.0, 0.2))
-    file.write_text(ascii_ply([(*corner, 60 * i, 255 - 60 * i, 7) for i, corner in enumerate(CORNERS)], FACES, columns))
-    mesh, finish = read_mesh(file, 1.0)
+    content = ascii_ply([(*corner, 60 * i, 255 - 60 * i, 7) for i, corner in enumerate(CORNERS)], FACES, columns)
+    mesh, finish = read(tmp_path / "a.ply", content)
     assert finish.texture is not None
     assert finish.color == (1.0, 1.0, 1.0)
     height, width = finish.texture.shape[:2]
@@ -170,8 +130,7 @@ def test_colors_of_any_type_and_name(tmp_path, kind, largest, names, at):
     text = text.replace(before, columns + before)
     if at == "face":
         text = "\n".join(f"{line} {color[0]} {color[1]} {color[2]}" if line.startswith("3 ") else line for line in text.split("\n"))
-    (tmp_path / "a.ply").write_text(text)
-    _, finish = read_mesh(tmp_path / "a.ply", 1.0)
+    _, finish = read(tmp_path / "a.ply", text)
     assert finish.color == pytest.approx((1.0, 0.0, 0.2))
 
 
@@ -188,8 +147,7 @@ def test_each_face_has_its_color_also_polygons(tmp_path):
         body = box.astype(f"{order}f4").tobytes() + b"".join(struct.pack(f"{order}B{row[0]}i3B", *row) for row in rows)
         contents.append(header.replace("FORMAT", name).encode() + body)
     for content in contents:
-        (tmp_path / "a.ply").write_bytes(content)
-        mesh, finish = read_mesh(tmp_path / "a.ply", 1.0)
+        mesh, finish = read(tmp_path / "a.ply", content)
         assert len(mesh.faces) == 12
         assert signed_volume(mesh.vertices, mesh.faces) == pytest.approx(8.0)
         height, width = finish.texture.shape[:2]
@@ -206,14 +164,12 @@ def test_each_face_has_its_color_also_polygons(tmp_path):
 @pytest.mark.parametrize("kind", ["ply", "stl"])
 def test_text_of_any_encoding(tmp_path, encoding, kind):
     text = trimesh.creation.box((1, 1, 1)).export(file_type=f"{kind}_ascii") if kind == "stl" else GOOD
-    (tmp_path / f"a.{kind}").write_bytes(str(text).encode(encoding))
-    assert len(read_mesh(tmp_path / f"a.{kind}", 1.0)[0].faces) == (12 if kind == "stl" else 4)
+    assert len(read(tmp_path / f"a.{kind}", str(text).encode(encoding))[0].faces) == (12 if kind == "stl" else 4)
 
 
 def test_strips_of_triangles(tmp_path):
     text = ascii_ply(CORNERS, []).replace("face 0\nproperty list uchar", "tristrips 1\nproperty list int")
-    (tmp_path / "a.ply").write_text(text + "8 0 2 1 3 -1 0 3 2\n")
-    mesh, _ = read_mesh(tmp_path / "a.ply", 1.0, SMOOTH)
+    mesh, _ = read(tmp_path / "a.ply", text + "8 0 2 1 3 -1 0 3 2\n", SMOOTH)
     assert np.array_equal(np.sort(mesh.faces), np.sort([(0, 2, 1), (1, 2, 3), (0, 3, 2)]))
 
 
@@ -223,8 +179,7 @@ def test_an_stl_is_read_with_its_equal_corners_merged(tmp_path, kind):
     data = ball.export(file_type="stl" if kind == "solid" else kind)
     if kind == "solid":  # A binary file that begins like text, and has bytes behind its end.
         data = b"solid".ljust(80, b"\0") + data[80:] + b"more"
-    (tmp_path / "a.stl").write_bytes(data if isinstance(data, bytes) else (data + data).encode())
-    mesh, finish = read_mesh(tmp_path / "a.stl", 1.0)
+    mesh, finish = read(tmp_path / "a.stl", data if isinstance(data, bytes) else data + data)
     assert len(mesh.vertices) == len(ball.vertices)
     assert finish.color == (0.7, 0.7, 0.7)
 
@@ -287,12 +242,6 @@ def test_a_palette_is_resolved():
     assert np.all(rgb8(Image.new("RGB", (2, 2), (250, 0, 0)).quantize(2)) == (250, 0, 0))
 
 
-def glb(tmp_path: Path, *meshes: trimesh.Trimesh) -> Path:
-    file = tmp_path / "a.glb"
-    file.write_bytes(trimesh.Scene(list(meshes)).export(file_type="glb"))
-    return file
-
-
 def textured_box(color, **material) -> trimesh.Trimesh:
     box = trimesh.creation.box((0.1, 0.1, 0.1))
     uv = np.random.default_rng(0).random((8, 2))
@@ -302,7 +251,7 @@ def textured_box(color, **material) -> trimesh.Trimesh:
 
 def test_a_glb_has_its_material(tmp_path):
     box = textured_box((200, 10, 10), metallicFactor=0.7, roughnessFactor=0.2)
-    mesh, finish = read_mesh(glb(tmp_path, box), 1.0, SMOOTH)
+    mesh, finish = read(tmp_path / "a.glb", glb(box), SMOOTH)
     assert np.allclose(mesh.uv, box.visual.uv, atol=1e-6)
     assert finish.texture is not None
     assert np.all(finish.texture == (200, 10, 10))
@@ -312,7 +261,7 @@ def test_a_glb_has_its_material(tmp_path):
 def test_base_color_factors_of_a_glb_are_linear(tmp_path):
     box = trimesh.creation.box((0.1, 0.1, 0.1))
     box.visual = TextureVisuals(material=PBRMaterial(baseColorFactor=(55, 255, 0, 255)))
-    _, finish = read_mesh(glb(tmp_path, box), 1.0)
+    _, finish = read(tmp_path / "a.glb", glb(box))
     assert finish.color == pytest.approx((float(linear_to_srgb(55 / 255)), 1.0, 0.0), abs=0.01)
     assert (finish.metallic, finish.roughness) == (1.0, 1.0)
 
@@ -321,7 +270,7 @@ def test_parts_of_a_glb_are_merged_with_their_transforms(tmp_path):
     red, plain = textured_box((200, 10, 10), metallicFactor=1.0), trimesh.creation.box((0.1, 0.1, 0.1))
     plain.visual = TextureVisuals(material=PBRMaterial(baseColorFactor=(0, 255, 0, 255), metallicFactor=0.0))
     plain.apply_translation((0.3, 0, 0))
-    mesh, finish = read_mesh(glb(tmp_path, red, plain), 1.0)
+    mesh, finish = read(tmp_path / "a.glb", glb(red, plain))
     assert len(mesh.faces) == 24
     assert np.allclose((mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)), ((-0.05, -0.05, -0.05), (0.35, 0.05, 0.05)))
     assert finish.texture is not None
@@ -336,7 +285,7 @@ def test_parts_with_one_material_share_its_texture(tmp_path):
     one = textured_box((1, 2, 3))
     two = one.copy()
     two.apply_translation((0.3, 0, 0))
-    mesh, finish = read_mesh(glb(tmp_path, one, two), 1.0)
+    mesh, finish = read(tmp_path / "a.glb", glb(one, two))
     assert len(mesh.faces) == 24
     assert finish.texture is not None
     assert np.all(finish.texture == (1, 2, 3))
@@ -345,40 +294,21 @@ def test_parts_with_one_material_share_its_texture(tmp_path):
 def test_a_reflected_part_keeps_outward_orientation(tmp_path):
     scene = trimesh.Scene()
     scene.add_geometry(trimesh.creation.box((0.1, 0.2, 0.3)), transform=np.diag((-2.0, 1.0, 1.0, 1.0)))
-    file = tmp_path / "a.glb"
-    file.write_bytes(scene.export(file_type="glb"))
-    mesh, _ = read_mesh(file, 1.0)
+    mesh, _ = read(tmp_path / "a.glb", scene.export(file_type="glb"))
     assert signed_volume(mesh.vertices, mesh.faces) == pytest.approx(0.012)
 
 
 def test_vertex_colors_of_a_glb_are_linear(tmp_path):
     box = trimesh.creation.box((0.1, 0.1, 0.1))
     box.visual = ColorVisuals(box, vertex_colors=np.tile((55, 55, 55, 255), (8, 1)))
-    _, finish = read_mesh(glb(tmp_path, box), 1.0)
+    _, finish = read(tmp_path / "a.glb", glb(box))
     assert finish.color == pytest.approx((float(linear_to_srgb(55 / 255)),) * 3, abs=0.003)
 
 
-OBJ = """mtllib a.mtl
-v 0 0 0
-v 1 0 0
-v 0 1 0
-v 0 0 1
-vt 0 0
-vt 1 0
-vt 1 1
-usemtl skin
-f 1/1 3/2 2/3
-f 1/1 2/2 4/3
-f 1/1 4/2 3/3
-f 2/1 3/2 4/3
-"""
-
-
 def test_an_obj_with_an_image(tmp_path):
-    (tmp_path / "a.obj").write_text(OBJ)
-    (tmp_path / "a.mtl").write_text("newmtl skin\nKd 0 0 0\nmap_Kd skin.png\n")
+    put(tmp_path / "a.mtl", "newmtl skin\nKd 0 0 0\nmap_Kd skin.png\n")
     picture(tmp_path / "skin.png")
-    mesh, finish = read_mesh(tmp_path / "a.obj", 1.0)
+    mesh, finish = read(tmp_path / "a.obj", OBJ)
     assert signed_volume(mesh.vertices, mesh.faces) == pytest.approx(1 / 6)
     assert set(map(tuple, mesh.uv)) == {(0.0, 0.0), (1.0, 0.0), (1.0, 1.0)}
     assert finish.texture is not None
@@ -387,18 +317,16 @@ def test_an_obj_with_an_image(tmp_path):
 
 
 def test_an_obj_with_a_plain_color(tmp_path):
-    (tmp_path / "a.obj").write_text(OBJ)
-    (tmp_path / "a.mtl").write_text("newmtl skin\nKd 0.2 0.4 0.6\n")
-    _, finish = read_mesh(tmp_path / "a.obj", 1.0)
+    put(tmp_path / "a.mtl", "newmtl skin\nKd 0.2 0.4 0.6\n")
+    _, finish = read(tmp_path / "a.obj", OBJ)
     assert finish.texture is None
     assert finish.color == pytest.approx((0.2, 0.4, 0.6), abs=0.003)
 
 
 def test_the_image_of_a_material_must_exist(tmp_path):
-    (tmp_path / "a.obj").write_text(OBJ)
-    (tmp_path / "a.mtl").write_text("newmtl skin\nmap_Kd skin.png\n")
+    put(tmp_path / "a.mtl", "newmtl skin\nmap_Kd skin.png\n")
     with pytest.raises(CatalogError, match=r"skin\.png"):
-        read_mesh(tmp_path / "a.obj", 1.0)
+        read(tmp_path / "a.obj", OBJ)
 
 
 GOOD = ascii_ply(CORNERS, FACES)
@@ -435,23 +363,17 @@ GOOD = ascii_ply(CORNERS, FACES)
     ],
 )
 def test_invalid_files_are_one_line(tmp_path, name, content, message):
-    file = tmp_path / name
-    file.write_bytes(content if isinstance(content, bytes) else content.encode())
     with pytest.raises(CatalogError, match=message) as caught:
-        read_mesh(file, 1.0)
-    assert str(file) in str(caught.value)
+        read(tmp_path / name, content)
+    assert str(tmp_path / name) in str(caught.value)
     assert "\n" not in str(caught.value)
 
 
 def test_a_texture_needs_coordinates_and_a_readable_image(tmp_path):
-    file = tmp_path / "a.ply"
-    file.write_text(ascii_ply(CORNERS, FACES, comment="comment TextureFile t.png"))
-    picture(tmp_path / "t.png")
-    with pytest.raises(CatalogError, match="texture_u"):
-        read_mesh(file, 1.0)
-    (tmp_path / "t.png").write_bytes(b"no picture")
-    with pytest.raises(CatalogError, match="not readable as an image"):
-        read_mesh(file, 1.0)
+    for skin, said in ((picture(tmp_path / "good.png").read_bytes(), "texture_u"), (b"no picture", "not readable as an image")):
+        put(tmp_path / "t.png", skin)
+        with pytest.raises(CatalogError, match=said):
+            read(tmp_path / "a.ply", ascii_ply(CORNERS, comment="comment TextureFile t.png"))
 
 
 def test_normals_where_triangles_cancel_out():

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 import pytest
 import trimesh
@@ -17,6 +15,7 @@ from synpick_warp.scenes.assets.meshes import MeshOptions, merge_positions, read
 from synpick_warp.scenes.assets.normals import crease_normals, smooth_normals
 from synpick_warp.scenes.catalog import load_catalog
 from tests.twins.layers import render_layers
+from tests.worlds.model_files import exported, put
 from tests.worlds.toy_scene import ToyScene, camera, entry
 
 KINDS = ("ply", "obj", "glb", "gltf", "stl")
@@ -31,8 +30,7 @@ def write(folder, mesh: trimesh.Trimesh, kind: str, *, split: bool = False):
         for name, data in export_gltf(trimesh.Scene([bare])).items():
             (folder / (file.name if name == "model.gltf" else name)).write_bytes(data)
     else:
-        content: Any = bare.export(file_type=kind)
-        file.write_bytes(content.encode() if isinstance(content, str) else content)
+        put(file, exported(bare, kind))
     return file
 
 

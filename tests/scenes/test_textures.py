@@ -2,33 +2,18 @@
 
 from __future__ import annotations
 
-import json
-import struct
-from pathlib import Path
-
 import cv2
 import numpy as np
 import pytest
-import trimesh
-from PIL import Image
-from trimesh.visual import TextureVisuals
-from trimesh.visual.material import PBRMaterial
 
 from synpick_warp.errors import CatalogError
 from synpick_warp.scenes.assets.appearance import decode_texture
 from synpick_warp.scenes.assets.meshes import MeshOptions, read_mesh
+from tests.scenes.test_gltf import TEXTURE, Builder, pbr
+from tests.worlds.model_files import CORNERS, FACES, ascii_ply, picture, put, read
 
-CORNERS = ("0 0 0", "1 0 0", "0 1 0", "0 0 1")
-UNWRAPPED_OBJ = "mtllib a.mtl\n" + "".join(f"v {corner}\n" for corner in CORNERS) + "usemtl skin\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n"
-
-
-def ply(rows, *, textured: bool) -> str:
-    """A tetrahedron of the first four of these vertices; `textured`: rows have texture_u and texture_v, and t.png is named."""
-    names = ["x", "y", "z", *(("texture_u", "texture_v") if textured else ())]
-    lines = ["ply", "format ascii 1.0", *(["comment TextureFile t.png"] if textured else []), f"element vertex {len(rows)}"]
-    lines += [f"property float {name}" for name in names]
-    lines += ["element face 4", "property list uchar int vertex_indices", "end_header", *rows]
-    return "\n".join([*lines, "3 0 2 1", "3 0 1 3", "3 0 3 2", "3 1 2 3"]) + "\n"
+UNWRAPPED = ("x", "y", "z", "texture_u", "texture_v")
+UNWRAPPED_OBJ = "mtllib a.mtl\n" + "".join(f"v {x} {y} {z}\n" for x, y, z in CORNERS) + "usemtl skin\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n"
 
 
 @pytest.mark.parametrize("channels", [1, 3, 4])
@@ -48,31 +33,12 @@ def test_images_of_any_bit_depth_channels_and_size(tmp_path, channels, size, dty
     assert np.abs(texture - expected / largest * 255.0).max() <= (0 if dtype == np.uint8 else 1)
 
 
-def without_coordinates(file: Path) -> None:
-    """Take the texture coordinates of a GLB's meshes away."""
-    data = file.read_bytes()
-    length = struct.unpack_from("<I", data, 12)[0]
-    header = json.loads(data[20 : 20 + length])
-    for mesh in header["meshes"]:
-        for primitive in mesh["primitives"]:
-            del primitive["attributes"]["TEXCOORD_0"]
-    text = json.dumps(header).encode()
-    text += b" " * (-len(text) % 4)
-    chunks = struct.pack("<I", len(text)) + data[16:20] + text + data[20 + length :]
-    file.write_bytes(data[:8] + struct.pack("<I", 12 + len(chunks)) + chunks)
-
-
 def test_a_texture_on_a_mesh_that_is_not_unwrapped_is_refused(tmp_path):
-    box = trimesh.creation.box((0.1, 0.1, 0.1))
-    skin = Image.new("RGB", (8, 8), (200, 10, 10))
-    box.visual = TextureVisuals(uv=np.zeros((8, 2)), material=PBRMaterial(baseColorTexture=skin))
-    file = tmp_path / "a.glb"
-    file.write_bytes(trimesh.Scene([box]).export(file_type="glb"))
-    without_coordinates(file)
-    (tmp_path / "a.obj").write_text(UNWRAPPED_OBJ)
-    (tmp_path / "a.mtl").write_text("newmtl skin\nmap_Kd skin.png\n")
-    skin.save(tmp_path / "skin.png")
-    for path in (file, tmp_path / "a.obj"):
+    put(tmp_path / "a.glb", Builder(**pbr(**TEXTURE)).image().glb())
+    put(tmp_path / "a.obj", UNWRAPPED_OBJ)
+    put(tmp_path / "a.mtl", "newmtl skin\nmap_Kd skin.png\n")
+    picture(tmp_path / "skin.png")
+    for path in (tmp_path / "a.glb", tmp_path / "a.obj"):
         with pytest.raises(CatalogError, match="without texture coordinates; unwrap it") as caught:
             read_mesh(path, 1.0)
         assert str(caught.value).startswith(f"{path}: ")
@@ -82,7 +48,7 @@ def test_a_texture_on_a_mesh_that_is_not_unwrapped_is_refused(tmp_path):
 def test_a_mesh_without_texture_needs_no_coordinates(tmp_path):
     (tmp_path / "a.obj").write_text(UNWRAPPED_OBJ)
     (tmp_path / "a.mtl").write_text("newmtl skin\nKd 0.2 0.4 0.6\n")
-    (tmp_path / "a.ply").write_text(ply(CORNERS, textured=False))
+    (tmp_path / "a.ply").write_text(ascii_ply(CORNERS))
     for name, color in (("a.obj", (0.2, 0.4, 0.6)), ("a.ply", (0.7, 0.7, 0.7))):
         mesh, finish = read_mesh(tmp_path / name, 1.0)
         assert finish.texture is None
@@ -93,11 +59,13 @@ def test_a_mesh_without_texture_needs_no_coordinates(tmp_path):
 
 @pytest.mark.parametrize("value", ["nan", "inf", "-1e30", "10001"])
 def test_invalid_texture_coordinates(tmp_path, value):
-    Image.new("RGB", (4, 2)).save(tmp_path / "t.png")
-    rows = [f"{corner} 0.5 0.5" for corner in CORNERS]
-    (tmp_path / "a.ply").write_text(ply([*rows[:3], f"{CORNERS[3]} {value} 0.5"], textured=True))
+    picture(tmp_path / "t.png")
+    rows = [(*corner, 0.5, 0.5) for corner in CORNERS]
+
+    def textured(last: tuple) -> str:
+        return ascii_ply([*rows[: 4 if last[0] == 9 else 3], (*last, value, 0.5)], FACES, UNWRAPPED, "comment TextureFile t.png")
+
     with pytest.raises(CatalogError, match="not finite or beyond 10000; repair the mesh"):
-        read_mesh(tmp_path / "a.ply", 1.0)
+        read(tmp_path / "a.ply", textured(CORNERS[3]))
     # A vertex that no triangle uses may have any.
-    (tmp_path / "a.ply").write_text(ply([*rows, f"9 9 9 {value} 0.5"], textured=True))
-    assert len(read_mesh(tmp_path / "a.ply", 1.0, MeshOptions(crease_angle=180.0))[0].vertices) == 4
+    assert len(read(tmp_path / "a.ply", textured((9, 9, 9)), MeshOptions(crease_angle=180.0))[0].vertices) == 4

@@ -34,17 +34,7 @@ class Cups(KernelWorlds):
     """Worlds whose cups press for long enough, with room for four objects."""
 
     def __init__(self, device, worlds: int = 1, surface: str = "hull", **suction) -> None:
-        super().__init__(
-            device,
-            worlds,
-            volume=np.full(3, 0.1),
-            compound=np.array([0, 0, 1]),
-            radius=np.ones(3),
-            instances=4,
-            single_slots=4,
-            compound_slots=0,
-            pick={"press_steps": PRESS_STEPS},
-        )
+        super().__init__(device, worlds, 3, 4, compound=np.array([0, 0, 1]), pick={"press_steps": PRESS_STEPS})
         filled(
             self.scene.suction,
             {

@@ -15,8 +15,7 @@ SEED = 2**40 + 3
 
 def made(device, worlds: int = 24, **drop) -> KernelWorlds:
     """Worlds that draw from five light maps."""
-    one = {"volume": np.array([0.1]), "compound": np.array([0]), "radius": np.array([0.05])}
-    return KernelWorlds(device, worlds, **one, instances=1, single_slots=1, compound_slots=0, drop=drop)
+    return KernelWorlds(device, worlds, drop=drop)
 
 
 def test_lights_are_even_and_turn(device):

@@ -20,10 +20,9 @@ from synpick_warp.stages.sim.step_log import record_arrays
 from synpick_warp.system.hardware.green_contexts import SmPartition
 from tests.worlds.cubes import place_cubes
 from tests.worlds.sights import SHORT, picking
-from tests.worlds.small_worlds import BOX, CUBE, catalog, report, settings
+from tests.worlds.small_worlds import BOX, COARSE, CUBE, catalog, report, settings
 
 WORLDS, TICKS = 8, 5
-COARSE = {"physics__step": 4e-3, "physics__steps_per_tick": 16, "physics__substeps": 1, "physics__iterations": 6}
 MAX_TICKS = 60
 
 

@@ -12,11 +12,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from synpick_warp.codes import Phase
+from synpick_warp.kernels.sim.gripper import impedance_force
 from synpick_warp.scenes import build
 from synpick_warp.stages.sim import arrange
 from synpick_warp.stages.sim import gripper as act
 from synpick_warp.stages.sim.simulate import Simulation
-from tests.harness.probes import force_kernel
+from tests.harness.probe import probe
 from tests.twins import gripper as twin
 from tests.worlds.kernel_worlds import KernelWorlds
 from tests.worlds.small_worlds import CUBE, catalog, settings
@@ -27,18 +28,7 @@ TIP = 0.05
 
 
 def made(device, worlds: int = 1, **move) -> KernelWorlds:
-    one = np.array([1.0])
-    result = KernelWorlds(
-        device,
-        worlds,
-        volume=one,
-        compound=np.array([0]),
-        radius=one,
-        instances=1,
-        single_slots=1,
-        compound_slots=0,
-        move={"corner": wp.vec3(*CORNER), "tcp_offset": TIP, **move},
-    )
+    result = KernelWorlds(device, worlds, move={"corner": wp.vec3(*CORNER), "tcp_offset": TIP, **move})
     result.set(result.state.frame, -1)
     return result
 
@@ -46,17 +36,7 @@ def made(device, worlds: int = 1, **move) -> KernelWorlds:
 # ---- the law ----
 
 
-def forces(device, offset, velocity, law) -> np.ndarray:
-    count = len(offset)
-    out = wp.zeros(count, dtype=wp.vec3, device=device)
-    inputs = [
-        wp.array(np.asarray(values, np.float32), dtype=dtype, device=device)
-        for values, dtype in ((offset, wp.vec3), (velocity, wp.vec3), (law, float))
-    ]
-    wp.launch(force_kernel, dim=count, inputs=inputs, outputs=[out], device=device)
-    return out.numpy()
-
-
+forces = probe(impedance_force)
 vectors = st.tuples(*[st.floats(-1.0, 1.0)] * 3)
 
 
@@ -71,15 +51,15 @@ vectors = st.tuples(*[st.floats(-1.0, 1.0)] * 3)
 )
 def test_the_force_is_the_twins_and_never_above_the_limit(offset, velocity, stiffness, damping, limit, mass, step, device):
     law = [stiffness, damping, limit, mass, step]
-    found = forces(device, [offset], [velocity], [law])[0]
+    found = forces(offset, velocity, *law, device=device)
     np.testing.assert_allclose(found, twin.force(offset, velocity, *law), rtol=2e-3, atol=2e-4 * limit)
     assert np.linalg.norm(found) <= limit * (1 + 1e-5)
 
 
 def test_the_force_is_a_spring_at_rest_and_a_damper_at_the_setpoint(device):
     """With a step that vanishes: 1000 N/m · 1 cm = 10 N; 60 N·s/m · 0.1 m/s = 6 N; 1 m is too far: 30 N."""
-    law = [[1000.0, 60.0, 30.0, 2.0, 1e-7]] * 3
-    found = forces(device, [[0.01, 0, 0], [0, 0, 0], [0, 0, 1]], [[0, 0, 0], [0, 0.1, 0], [0, 0, 0]], law)
+    law = (1000.0, 60.0, 30.0, 2.0, 1e-7)
+    found = forces([[0.01, 0, 0], [0, 0, 0], [0, 0, 1]], [[0, 0, 0], [0, 0.1, 0], [0, 0, 0]], *law, device=device)
     np.testing.assert_allclose(found, [[10, 0, 0], [0, -6, 0], [0, 0, 30]], rtol=1e-4, atol=1e-5)
 
 
@@ -91,7 +71,7 @@ def test_the_law_is_stable_for_every_mass(device, mass, step):
     setpoint = np.array([0.02, -0.01, 0.005])
     energies = []
     for _ in range(60):
-        force = forces(device, [setpoint - x], [v], [[1e4, 0.0, 1e6, mass, step]])[0].astype(float)
+        force = forces(setpoint - x, v, 1e4, 0.0, 1e6, mass, step, device=device).astype(float)
         v = v + step * force / mass
         x = x + step * v
         energies.append(0.5e4 * np.sum((setpoint - x) ** 2) + 0.5 * mass * np.sum(v**2))

@@ -20,17 +20,8 @@ INSIDE = np.array([0.0, 0.0, 0.05, 0.0, 0.0, 0.0, 1.0])
 
 def made(device, worlds: int = 1, objects: int = 2, **settings) -> KernelWorlds:
     """Worlds in which `objects` instances lie in the tote and rest."""
-    result = KernelWorlds(
-        device,
-        worlds,
-        volume=np.full(3, 0.1),
-        compound=np.array([0, 1, 0]),
-        radius=np.array([0.05, 0.1, 0.2]),
-        instances=4,
-        single_slots=4,
-        compound_slots=2,
-        **settings,
-    )
+    compound, radius = np.array([0, 1, 0]), np.array([0.05, 0.1, 0.2])
+    result = KernelWorlds(device, worlds, 3, 4, 4, 2, compound=compound, radius=radius, **settings)
     entry, slot = np.full((worlds, 4), -1), np.zeros((worlds, 4))
     entry[:, :objects] = (np.arange(objects) % 2) * 2
     slot[:, :objects] = np.arange(objects)

@@ -241,9 +241,7 @@ SLOTS = (3, 0, 2)
 
 def scripted(device, bodies: list[twin.Body], objects_in_tcp: np.ndarray, attached: list[int], break_force: float) -> KernelWorlds:
     """One world with a moving cup and three moving objects in the slots SLOTS."""
-    worlds = KernelWorlds(
-        device, 1, volume=np.ones(1), compound=np.zeros(1, int), radius=np.ones(1), instances=3, single_slots=4, compound_slots=0
-    )
+    worlds = KernelWorlds(device, 1, instances=3, single_slots=4)
     filled(worlds.scene.suction, LAW)
     rows = [1, *(2 + slot for slot in SLOTS)]
     columns = {

@@ -15,12 +15,12 @@ from synpick_warp.stages.constants import GRIPPER_HOME
 from synpick_warp.stages.sim import arrange
 from synpick_warp.stages.sim.physics import with_enough_worlds
 from synpick_warp.stages.sim.simulate import Simulation
-from tests.worlds.small_worlds import ANGLE, BOX, CUBE, catalog, report, run_ticks, settings
+from tests.twins.raycast import rotation_of
+from tests.worlds.small_worlds import ANGLE, BOX, COARSE, CUBE, catalog, report, run_ticks, settings
 
 EPISODES = 3
 LIGHTS = 3
 # Coarse, where only sameness or ends count.
-COARSE = {"physics__step": 4e-3, "physics__steps_per_tick": 16, "physics__substeps": 1, "physics__iterations": 6}
 LONGEST = 150
 
 
@@ -139,7 +139,7 @@ def energy(simulation: Simulation, seen) -> np.ndarray:
     slot, total = simulation.state.body_slot.numpy(), np.zeros(layout.worlds)
     for world, instance in zip(*np.nonzero(seen.catalog_index >= 0), strict=True):
         body = world * layout.bodies_per_world + build.GRIPPER_BODIES + slot[world, instance]
-        turn = matrix(pose[body, 3:])
+        turn = rotation_of(pose[body, 3:])
         height = (turn @ center[body] + pose[body, :3])[2]
         spin = turn.T @ velocity[body, 3:]
         total[world] += mass[body] * (simulation.config.physics.gravity * height + 0.5 * velocity[body, :3] @ velocity[body, :3])
@@ -147,14 +147,8 @@ def energy(simulation: Simulation, seen) -> np.ndarray:
     return total
 
 
-def matrix(quaternion: np.ndarray) -> np.ndarray:
-    x, y, z, w = quaternion / np.linalg.norm(quaternion)
-    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-    return np.eye(3) + 2 * w * cross + 2 * cross @ cross
-
-
 def corners(entry: int, pose: np.ndarray) -> np.ndarray:
-    return catalog().entries[entry].mesh.vertices @ matrix(pose[3:].astype(float)).T + pose[:3]
+    return catalog().entries[entry].mesh.vertices @ rotation_of(pose[3:].astype(float)).T + pose[:3]
 
 
 def test_piles_come_to_rest_on_the_floor(resting):
@@ -264,7 +258,7 @@ def test_a_box_comes_to_rest_flat_on_the_floor(bench):
     poses = advance(bench, 15).copy()
     for pose, axis in zip(poses, (2, 0), strict=True):
         assert pose[2] == pytest.approx(BOX[0][axis] / 2, abs=5e-4)
-        up = matrix(pose[3:].astype(float))[2]
+        up = rotation_of(pose[3:].astype(float))[2]
         assert abs(up[axis]) == pytest.approx(1.0, abs=1e-4)
     after = advance(bench, 3)
     assert np.abs(after - poses).max() < 2e-4

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import warp as wp
+from scipy.spatial.transform import Rotation
 
 from synpick_warp.codes import Phase, Task
 from synpick_warp.kernels.sim import step_log
@@ -13,11 +14,11 @@ from synpick_warp.scenes.types import Catalog
 from synpick_warp.stages.sim.simulate import Simulation
 from synpick_warp.stages.stream import TickReader, TickReport, tick_batch
 from tests.twins import gripper as twin
+from tests.twins.raycast import rotation_of
 from tests.worlds.sights import SHORT, picking
-from tests.worlds.small_worlds import ANGLE, BOX, CUBE, catalog, settings
+from tests.worlds.small_worlds import ANGLE, BOX, COARSE, CUBE, catalog, settings
 
 LONGEST = 200
-COARSE = {"physics__step": 4e-3, "physics__steps_per_tick": 16, "physics__substeps": 1, "physics__iterations": 6}
 GRAVITY = 9.81
 
 
@@ -147,7 +148,7 @@ def test_velocities_are_those_of_poses(device):
     simulation.physics.refresh_poses()
     (steps,) = Log(simulation, 1).steps
     pose = steps["pose"][0, :, 0].astype(float)
-    center = pose[:, :3] + np.array([matrix(one) @ entry.center_of_mass for one in pose[:, 3:]])
+    center = pose[:, :3] + np.array([rotation_of(one) @ entry.center_of_mass for one in pose[:, 3:]])
     np.testing.assert_allclose(np.diff(center, axis=0) / step, steps["velocity"][0, 1:, 0], atol=2e-4)
     assert np.abs(np.diff(pose[:, :3], axis=0) / step - steps["velocity"][0, 1:, 0]).max() > 1e-2
     turns = np.array([spin(before, after) for before, after in zip(pose[:-1, 3:], pose[1:, 3:], strict=True)]) / step
@@ -155,17 +156,9 @@ def test_velocities_are_those_of_poses(device):
     assert np.linalg.norm(turns, axis=1).min() > 5.0
 
 
-def matrix(quaternion: np.ndarray) -> np.ndarray:
-    x, y, z, w = quaternion / np.linalg.norm(quaternion)
-    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-    return np.eye(3) + 2 * w * cross + 2 * cross @ cross
-
-
 def spin(before: np.ndarray, after: np.ndarray) -> np.ndarray:
     """Rotation vector from one orientation to the other, in the world's axes [rad]."""
-    turn = matrix(after) @ matrix(before).T
-    axis = np.array([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]]) / 2
-    return axis * (np.arcsin(np.linalg.norm(axis)) / np.linalg.norm(axis))
+    return (Rotation.from_quat(after) * Rotation.from_quat(before).inv()).as_rotvec()
 
 
 @pytest.mark.parametrize("run", ["moved", "picked"])

@@ -37,18 +37,7 @@ NORMAL = (0.6, 0.0, 0.8)
 
 def made(device, worlds: int = 1, **pick) -> KernelWorlds:
     """Worlds of three single objects in three slots, all in the scene, acting in mode PICK."""
-    result = KernelWorlds(
-        device=device,
-        worlds=worlds,
-        volume=np.ones(3),
-        compound=np.zeros(3),
-        radius=np.full(3, 0.1),
-        instances=3,
-        single_slots=3,
-        compound_slots=0,
-        pick=PICK | pick,
-        move={"tcp_offset": TIP, "step": STEP},
-    )
+    result = KernelWorlds(device, worlds, 3, radius=np.full(3, 0.1), pick=PICK | pick, move={"tcp_offset": TIP, "step": STEP})
     result.begin(Phase.ACT)
     result.set(result.state.mode, Mode.PICK)
     result.set(result.state.catalog_index, [0, 1, 2])

@@ -66,16 +66,7 @@ class PlannerHarness:
     ) -> None:
         ids, depths = np.stack(ids), np.stack(depths)
         self.views, height, width = ids.shape
-        self.worlds = kernel_worlds.KernelWorlds(
-            device,
-            self.views,
-            volume=np.full(instances, 0.1),
-            compound=np.zeros(instances, int),
-            radius=np.full(instances, diagonal),
-            instances=instances,
-            single_slots=instances,
-            compound_slots=0,
-        )
+        self.worlds = kernel_worlds.KernelWorlds(device, self.views, instances, radius=np.full(instances, diagonal))
         self.worlds.set(self.worlds.state.catalog_index, np.arange(instances))
         kernel_worlds.filled(self.worlds.scene.perception, {**SETTINGS, **(settings or {})})
         sizes = {"view": self.views, "world": self.views, "instance": instances, "row": height, "column": width, "point": CAPACITY}

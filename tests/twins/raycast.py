@@ -3,20 +3,15 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import ArrayLike
+from scipy.spatial.transform import Rotation
 
 from synpick_warp.scenes.types import Camera, TriangleMesh
 
 
-def rotation_of(quaternion: np.ndarray) -> np.ndarray:
+def rotation_of(quaternion: ArrayLike) -> np.ndarray:
     """Rotation matrix (3, 3) of a quaternion x, y, z, w, which is normalized first."""
-    x, y, z, w = np.asarray(quaternion, dtype=np.float64) / np.linalg.norm(np.asarray(quaternion, dtype=np.float64))
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-        ]
-    )
+    return Rotation.from_quat(np.asarray(quaternion, np.float64)).as_matrix()
 
 
 def cast_mesh(mesh: TriangleMesh, pose: np.ndarray, camera: Camera) -> np.ndarray:
@@ -34,22 +29,21 @@ def cast_mesh(mesh: TriangleMesh, pose: np.ndarray, camera: Camera) -> np.ndarra
     corners = pixels[mesh.faces]
     low = np.clip(np.floor(corners.min(axis=1)).astype(int) - 1, 0, [camera.width, camera.height])
     high = np.clip(np.ceil(corners.max(axis=1)).astype(int) + 1, 0, [camera.width, camera.height])
-    x = (np.arange(camera.width) + 0.5 - cx) / fx
-    y = (np.arange(camera.height) + 0.5 - cy) / fy
+    # A row for each pair of a triangle and a pixel in its box.
+    width = np.maximum(high[:, 0] - low[:, 0], 0)
+    pixels = width * np.maximum(high[:, 1] - low[:, 1], 0)
+    face = np.repeat(np.arange(len(pixels)), pixels)
+    index = np.arange(len(face)) - np.repeat(np.cumsum(pixels) - pixels, pixels)
+    column, row = low[face, 0] + index % width[face], low[face, 1] + index // width[face]
+    ray = np.stack([(column + 0.5 - cx) / fx, (row + 0.5 - cy) / fy, np.ones(len(face))], axis=1)
+    a, b, c = points[mesh.faces].transpose(1, 0, 2)
+    normal = np.cross(b - a, c - a)
+    sides = [(side[face] * ray).sum(axis=1) for side in (np.cross(a, b), np.cross(b, c), np.cross(c, a))]
+    inside = np.logical_and.reduce([side >= 0 for side in sides]) | np.logical_and.reduce([side <= 0 for side in sides])
+    facing = (normal[face] * ray).sum(axis=1)
+    inside &= facing != 0.0
     depth = np.full((camera.height, camera.width), np.inf)
-    for face, (left, top), (right, bottom) in zip(mesh.faces, low, high, strict=True):
-        if right <= left or bottom <= top:
-            continue
-        a, b, c = points[face]
-        normal = np.cross(b - a, c - a)
-        columns, rows = x[None, left:right], y[top:bottom, None]
-        sides = [side[0] * columns + side[1] * rows + side[2] for side in (np.cross(a, b), np.cross(b, c), np.cross(c, a))]
-        inside = np.logical_and.reduce([s >= 0 for s in sides]) | np.logical_and.reduce([s <= 0 for s in sides])
-        facing = normal[0] * columns + normal[1] * rows + normal[2]
-        inside &= facing != 0.0
-        found = np.where(inside, (a @ normal) / np.where(facing == 0.0, 1.0, facing), np.inf)
-        part = depth[top:bottom, left:right]
-        np.minimum(part, found, out=part)
+    np.minimum.at(depth, (row[inside], column[inside]), (a * normal).sum(axis=1)[face[inside]] / facing[inside])
     return depth
 
 

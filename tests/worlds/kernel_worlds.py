@@ -68,12 +68,15 @@ class KernelWorlds:
 
     device: Any
     worlds: int
-    volume: np.ndarray
-    compound: np.ndarray
-    radius: np.ndarray
-    instances: int
-    single_slots: int
-    compound_slots: int
+    objects: int = 1
+    """Number of single objects of volume 1 m³ and radius 1 m, where `volume`, `compound` and `radius` do not say otherwise."""
+    instances: int = 0
+    """Of a world; 0: as many as objects. `single_slots` are as many as instances unless given."""
+    single_slots: int | None = None
+    compound_slots: int = 0
+    volume: Any = None
+    compound: Any = None
+    radius: Any = None
     drop: dict[str, Any] = field(default_factory=dict)
     settle: dict[str, Any] = field(default_factory=dict)
     move: dict[str, Any] = field(default_factory=dict)
@@ -87,6 +90,11 @@ class KernelWorlds:
     pick: dict[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
+        self.volume = np.ones(self.objects) if self.volume is None else self.volume
+        self.compound = np.zeros(len(self.volume), int) if self.compound is None else self.compound
+        self.radius = np.ones(len(self.volume)) if self.radius is None else self.radius
+        self.instances = self.instances or len(self.volume)
+        self.single_slots = self.instances if self.single_slots is None else self.single_slots
         self.slots = self.single_slots + self.compound_slots
         self.bodies, self.coords, self.dofs = GRIPPER_BODIES + self.slots, GRIPPER_DOFS + 7 * self.slots, GRIPPER_DOFS + 6 * self.slots
         self.scene = SceneData(

@@ -74,11 +74,11 @@ SET_INSTANCES = 6
 """Instances of each of its scenes; two further objects are clutter without masks of their own."""
 
 
-def fixed_set(device: wp.Device) -> Scene:
-    """Two scenes of eight objects in two layers, each moving steadily; the poses follow from fixed seeds."""
+def fixed_set(device: wp.Device, frames: int = SET_FRAMES) -> Scene:
+    """Two scenes of eight objects in two layers, each moving steadily; the poses follow from fixed seeds, whatever the number of frames."""
     objects = embedded(*SET_IDS)
     count = SET_INSTANCES + 2
-    poses = np.empty((SET_FRAMES, SET_SCENES, count, 7), np.float32)
+    poses = np.empty((frames, SET_SCENES, count, 7), np.float32)
     models = np.empty((SET_SCENES, count), np.int32)
     for scene in range(SET_SCENES):
         random = np.random.default_rng(40 + scene)
@@ -87,16 +87,16 @@ def fixed_set(device: wp.Device) -> Scene:
         place = np.concatenate([cells + random.uniform(-0.02, 0.02, (8, 2)), random.uniform(0.62, 0.82, (8, 1))], axis=1)
         rotation = Rotation.random(count, rng=random)
         speed, spin = random.normal(0.0, 0.003, (count, 3)), random.normal(0.0, np.deg2rad(2.0), (count, 3))
-        for frame in range(SET_FRAMES):
+        for frame in range(frames):
             poses[frame, scene, :, :3] = place + frame * speed
             poses[frame, scene, :, 3:] = (Rotation.from_rotvec(frame * spin) * rotation).as_quat()
     placed = [
         [(int(models[scene, slot]), poses[frame, scene, slot]) for slot in range(count)]
-        for frame in range(SET_FRAMES)
+        for frame in range(frames)
         for scene in range(SET_SCENES)
     ]
     batch = rendered(objects, placed, device)
-    frames = tuple(select(batch, slice(SET_SCENES * frame, SET_SCENES * (frame + 1))) for frame in range(SET_FRAMES))
+    views = tuple(select(batch, slice(SET_SCENES * frame, SET_SCENES * (frame + 1))) for frame in range(frames))
     rows = [(scene, slot, int(models[scene, slot])) for scene in range(SET_SCENES) for slot in range(SET_INSTANCES)]
-    true = poses[:, :, :SET_INSTANCES].reshape(SET_FRAMES, -1, 7)
-    return Scene(objects, frames, table_of(*rows), true)
+    true = poses[:, :, :SET_INSTANCES].reshape(frames, -1, 7)
+    return Scene(objects, views, table_of(*rows), true)

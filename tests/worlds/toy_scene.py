@@ -8,8 +8,9 @@ import numpy as np
 import trimesh
 import warp as wp
 
-from synpick_warp.configs.schema import Config
+from synpick_warp.configs.schema import FAST, Config
 from synpick_warp.factory.assembly import make_renderer
+from synpick_warp.scenes.environment import map_directions
 from synpick_warp.scenes.types import Camera, Catalog, CatalogEntry, EnvironmentMap, Fixture, Material, TriangleMesh
 from synpick_warp.stages.arrays import allocate
 from synpick_warp.stages.buffers import Snapshot, ViewBuffers, allocate_view_buffers
@@ -21,6 +22,9 @@ GREY = Material(color=(0.7, 0.7, 0.7), texture=None, metallic=0.0, roughness=0.8
 DOWN = np.diag([1.0, -1.0, -1.0])
 """World to camera of a camera that looks down; up in the image is +y."""
 UPRIGHT = (0.0, 0.0, 0.0, 1.0)
+FLAT = (0.0, 0.0, 0.0, *UPRIGHT)
+"""Pose at the origin."""
+WHITE = (1.0, 1.0, 1.0)
 
 
 def flat_shaded(vertices: np.ndarray, faces: np.ndarray) -> TriangleMesh:
@@ -66,6 +70,11 @@ def sheet(width: float, height: float) -> TriangleMesh:
     )
 
 
+def surface(color=WHITE, metallic: float = 0.0, roughness: float = 1.0, texture: np.ndarray | None = None) -> Material:
+    """A material, matt by default."""
+    return Material(color=color, texture=texture, metallic=metallic, roughness=roughness)
+
+
 def entry(mesh: TriangleMesh, material: Material = GREY) -> CatalogEntry:
     """A catalog entry for rendering; its physical properties are arbitrary."""
     return CatalogEntry(
@@ -97,6 +106,14 @@ def even_light(radiance: float = 1.0, rows: int = 16) -> EnvironmentMap:
     return EnvironmentMap("even", np.full((rows, 2 * rows, 3), radiance, np.float32))
 
 
+def lamp(cosine: float, radius: float, radiance: float, sky: float = 0.0, rows: int = 256) -> EnvironmentMap:
+    """A uniform sky with a disc lamp of angular radius `radius` [rad] at azimuth 0, its edge one texel soft."""
+    directions, _ = map_directions(rows)
+    angle = np.arccos(np.clip(directions @ np.array([np.sqrt(1.0 - cosine**2), 0.0, cosine], np.float32), -1.0, 1.0))
+    coverage = np.clip((radius - angle) / (np.pi / rows) + 0.5, 0.0, 1.0)
+    return EnvironmentMap("lamp", np.repeat(sky + radiance * coverage[..., None], 3, axis=2).astype(np.float32))
+
+
 def sun(direction: tuple[float, float, float], sky: float = 0.3, strength: float = 2000.0, rows: int = 128) -> EnvironmentMap:
     """Constant sky with one bright texel."""
     x, y, z = np.asarray(direction, dtype=np.float64) / np.linalg.norm(direction)
@@ -104,6 +121,11 @@ def sun(direction: tuple[float, float, float], sky: float = 0.3, strength: float
     column = int((np.arctan2(y, x) / (2.0 * np.pi) + 0.5) * 2 * rows) % (2 * rows)
     radiance[min(int(np.arccos(z) / np.pi * rows), rows - 1), column] = strength
     return EnvironmentMap("sun", radiance)
+
+
+def with_render(mode: str = FAST, **settings) -> Config:
+    """Default settings with others of the renderer."""
+    return Config(render=replace(Config().render, mode=mode, **settings))
 
 
 @dataclass
@@ -187,6 +209,13 @@ def render(toy: ToyScene, device: wp.Device) -> RenderedViews:
     return RenderedViews(
         **images, exact_depth=renderer.gbuffer.depth.numpy(), radiance=shown.radiance.numpy(), resolve=shown.resolve.numpy()
     )
+
+
+def render_objects(device: wp.Device, *placed, view: Camera, config: Config | None = None, **more) -> RenderedViews:
+    """Render objects (mesh, material, pose) in one view; without a pose they are at the origin."""
+    entries = [entry(mesh, material) for mesh, material, *_ in placed] or [entry(sheet(0.1, 0.1))]
+    world = [(index, pose[0] if pose else FLAT) for index, (_, _, *pose) in enumerate(placed)]
+    return render(ToyScene(entries, [world], (view,), config=config or Config(), **more), device)
 
 
 def render_gbuffer(toy: ToyScene, device: wp.Device) -> tuple[ViewBuffers, Renderer]:

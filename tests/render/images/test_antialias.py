@@ -6,22 +6,17 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import warp as wp
 
 from synpick_warp.codes import Segment
-from synpick_warp.configs.schema import FAST, REFERENCE, Config
+from synpick_warp.configs.schema import FAST, REFERENCE
 from synpick_warp.kernels.render.images.antialias import sample_offset
 from synpick_warp.scenes.assets.appearance import srgb_to_linear
-from synpick_warp.scenes.types import Material, TriangleMesh
+from synpick_warp.scenes.types import TriangleMesh
 from synpick_warp.stages.render.sampling_rates import COVERAGE_RAYS, NARROW_COVERAGE_RAYS
-from tests.worlds.toy_scene import UPRIGHT, RenderedViews, ToyScene, box, camera, entry, even_light, render, sheet, sun
+from tests.harness.probe import probe
+from tests.worlds.toy_scene import UPRIGHT, RenderedViews, box, camera, even_light, render_objects, sheet, sun, surface, with_render
 
 VIEW = camera(48, 40, 200.0, (0.0, 0.0, 2.0))
-EMPTY = entry(sheet(0.1, 0.1))
-
-
-def with_render(**settings) -> Config:
-    return replace(Config(), render=replace(Config().render, **settings))
 
 
 def rotated_pose(x: float, y: float, z: float, angle: float, axis: int = 2) -> tuple[float, ...]:
@@ -33,9 +28,8 @@ def rotated_pose(x: float, y: float, z: float, angle: float, axis: int = 2) -> t
 
 def render_image(device, *bodies, view=VIEW, config=None, **more) -> RenderedViews:
     """Image of bodies, given as (mesh, pose, colour)."""
-    entries = [entry(mesh, Material(color=color, texture=None, metallic=0.0, roughness=1.0)) for mesh, _, color in bodies] or [EMPTY]
-    world = [(index, pose) for index, (_, pose, _) in enumerate(bodies)]
-    return render(ToyScene(entries, [world], (view,), config=config or with_render(), **more), device)
+    placed = [(mesh, surface(color), pose) for mesh, pose, color in bodies]
+    return render_objects(device, *placed, view=view, config=config, **more)
 
 
 def sample_offsets(samples: int = NARROW_COVERAGE_RAYS) -> np.ndarray:
@@ -68,19 +62,13 @@ def sample_positions(view, pose, distance: float, samples: int = NARROW_COVERAGE
     return np.stack([np.cos(angle) * x + np.sin(angle) * y, np.cos(angle) * y - np.sin(angle) * x], axis=-1)
 
 
-@wp.kernel
-def list_offsets(samples: int, offsets_out: wp.array[wp.vec2]):
-    """`sample_offset` of all samples."""
-    sample = wp.tid()
-    offsets_out[sample] = sample_offset(sample, samples)
+offset_of = probe(sample_offset)
 
 
 @pytest.mark.parametrize("samples", [4, 8, 16])
 def test_samples_are_stratified_and_sorted_by_quadrant(device, samples):
     """Each of n rows and n columns contains one of n samples, and each quadrant n / 4; 4 samples form the rotated grid (four rooks)."""
-    offsets = wp.zeros(samples, dtype=wp.vec2, device=device)
-    wp.launch(list_offsets, dim=samples, inputs=[samples], outputs=[offsets], device=device)
-    found = offsets.numpy()
+    found = offset_of(np.arange(samples), samples, device=device)
     for axis in range(2):
         np.testing.assert_allclose(np.sort(found[:, axis]), (np.arange(samples) + 0.5) / samples - 0.5, atol=1e-7)
     np.testing.assert_array_equal(2 * (found[:, 1] > 0) + (found[:, 0] > 0), np.repeat(np.arange(4), samples // 4))

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-import warp as wp
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from synpick_warp.stages.render.light_tables import measure_albedo
-from tests.harness.brdf_probe import evaluate, evaluate_disc_kernel, sample_brdf_kernel, toward
+from tests.harness.brdf_probe import evaluate, evaluate_discs, sample, toward
 
 WHITE, BLACK = (1.0, 1.0, 1.0), (0.0, 0.0, 0.0)
 ROUGHNESSES = (0.0, 0.13, 0.3, 0.55, 0.8, 1.0)
@@ -21,16 +20,6 @@ ROWS, COLUMNS = 256, 512
 @pytest.fixture(scope="module")
 def tables(device):
     return measure_albedo(device)
-
-
-def sample(tables, material, outgoing, count):
-    """Sampled directions (count, 3)."""
-    numbers = wp.array(np.random.default_rng(3).random((count, 3), dtype=np.float32), dtype=wp.vec3, device=tables.directional.device)
-    directions = wp.empty(count, dtype=wp.vec3, device=numbers.device)
-    base, metallic, roughness = material
-    inputs = [tables, wp.vec3(*base), metallic, roughness, wp.vec3(*outgoing), numbers]
-    wp.launch(sample_brdf_kernel, count, inputs, [directions], device=numbers.device)
-    return directions.numpy().astype(np.float64)
 
 
 def hemisphere():
@@ -124,16 +113,6 @@ def disc(center: np.ndarray, tangent: float, count: int = 4096) -> np.ndarray:
     y = np.cross(center, x)
     directions = center + radius[:, None] * (np.cos(angle)[:, None] * x + np.sin(angle)[:, None] * y)
     return directions / np.linalg.norm(directions, axis=1, keepdims=True)
-
-
-def evaluate_discs(tables, material, outgoing, centers, tangent):
-    """Mean of BRDF times cosine (N, 3) over disc lights about directions (N, 3)."""
-    base, metallic, roughness = material
-    directions = wp.array(centers.astype(np.float32), dtype=wp.vec3, device=tables.directional.device)
-    value = wp.empty(len(centers), dtype=wp.vec3, device=directions.device)
-    inputs = [tables, wp.vec3(*base), metallic, roughness, wp.vec3(*outgoing), directions, tangent]
-    wp.launch(evaluate_disc_kernel, len(centers), inputs, [value], device=directions.device)
-    return value.numpy().astype(np.float64)
 
 
 @pytest.mark.parametrize("tangent", [0.005, 0.035, 0.07])

@@ -8,12 +8,25 @@ import warp as wp
 from hypothesis import given
 from hypothesis import strategies as st
 
+from synpick_warp.kernels.render.lighting import coarse_grid
 from synpick_warp.kernels.render.lighting.paths.coarse import SEQUENCE_PERIOD
+from synpick_warp.kernels.render.visibility.camera import in_image
 from synpick_warp.stages.render.denoised import build_coarse_grid
 from synpick_warp.stages.render.sampling_rates import interleaved_threads
 from synpick_warp.stages.render.scene import build_grid
-from tests.harness.denoise_probe import count_visits_kernel, morton_kernel
 from tests.harness.devices import default_device
+from tests.harness.probe import probe
+
+
+@wp.func
+def count_visit(coarse: coarse_grid.CoarseGrid, visits: wp.array3d[int], index: int):
+    """Count a thread's coarse pixel in interleaved order."""
+    view, row, column = coarse_grid.interleaved_pixel(coarse, index)
+    if in_image(coarse.grid, row, column):
+        wp.atomic_add(visits, view, row, column, 1)
+
+
+count_visits, morton = probe(count_visit), probe(coarse_grid.morton_index)
 
 
 @given(width=st.integers(1, 150), height=st.integers(1, 100), size=st.integers(1, 5), views=st.integers(1, 3))
@@ -21,17 +34,13 @@ def test_interleaved_order_visits_each_coarse_pixel_once(width, height, size, vi
     coarse = build_coarse_grid(build_grid(width, height), size, 1)
     assert (coarse.grid.width, coarse.grid.height) == (-(-width // size), -(-height // size))
     visits = wp.zeros((views, coarse.grid.height, coarse.grid.width), dtype=wp.int32, device=default_device())
-    wp.launch(
-        count_visits_kernel, views * interleaved_threads(coarse.grid.width, coarse.grid.height), [coarse], [visits], device=default_device()
-    )
+    count_visits(coarse, visits, np.arange(views * interleaved_threads(coarse.grid.width, coarse.grid.height)))
     assert (visits.numpy() == 1).all()
 
 
 @pytest.mark.parametrize("period", [2, 4, int(SEQUENCE_PERIOD)])
 def test_aligned_squares_hold_aligned_runs_of_morton_indices(device, period):
-    index = wp.empty((3 * period, 2 * period), dtype=wp.int32, device=device)
-    wp.launch(morton_kernel, index.shape, [period], [index], device=device)
-    index = index.numpy()
+    index = morton(period, *np.indices((3 * period, 2 * period)), device=device)
     size = 1
     while size <= period:
         for row in range(0, len(index), size):

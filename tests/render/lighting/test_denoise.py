@@ -8,9 +8,12 @@ import warp as wp
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from synpick_warp.kernels.render.lighting import coarse_grid, denoise
+from synpick_warp.kernels.render.visibility.records import read_record, write_record
 from synpick_warp.system.hardware.device import pick_device
-from tests.harness.denoise_probe import FlatDenoiser, shrink_kernel, surface_kernel
+from tests.harness.denoise_probe import FlatDenoiser
 from tests.harness.devices import default_device
+from tests.harness.probe import probe
 
 colors = st.tuples(*[st.floats(0.0, 10.0)] * 3)
 
@@ -18,21 +21,28 @@ HALF_ROUNDING = 2.0**-11
 """Largest relative rounding of half precision, in which coarse light and ratios are stored."""
 
 
+@wp.func
+def repack_surface(records: wp.array3d[wp.vec4], index: int, segment: int, depth: float, normal: wp.vec3):
+    """Round trip of a surface through the guide image: pack, store, load and unpack."""
+    write_record(records, index, coarse_grid.pack_surface(segment, depth, normal))
+    surface = read_record(records, index)
+    return int(coarse_grid.surface_segment(surface)), coarse_grid.surface_depth(surface), coarse_grid.surface_normal(surface)
+
+
+shrink, repacked = probe(denoise.shrink), probe(repack_surface)
+
+
 @given(wide=colors, narrow=colors, variance=st.floats(0.0, 20.0))
 def test_shrinkage_follows_the_narrow_kernel_beyond_its_variance(wide, narrow, variance):
-    arrays = [wp.array([value], dtype=wp.vec3, device=default_device()) for value in (wide, narrow)]
-    result = wp.empty(1, dtype=wp.vec3, device=default_device())
-    wp.launch(
-        shrink_kernel, 1, [*arrays, wp.array([variance], dtype=wp.float32, device=default_device())], [result], device=default_device()
-    )
+    result = shrink(wide, narrow, variance)
     wide, narrow = np.array(wide), np.array(narrow)
     square = float((narrow - wide) @ (0.2126, 0.7152, 0.0722)) ** 2
     expected = wide if square <= variance else wide + (1.0 - variance / square) * (narrow - wide)
     # Where both are nearly equal, rounding decides.
     if abs(square - variance) > 1e-4 * (1.0 + variance):
-        np.testing.assert_allclose(result.numpy()[0], expected, rtol=1e-3, atol=1e-3)
+        np.testing.assert_allclose(result, expected, rtol=1e-3, atol=1e-3)
     if variance == 0.0 and square > 1e-3:
-        np.testing.assert_allclose(result.numpy()[0], narrow, rtol=1e-5, atol=1e-5)
+        np.testing.assert_allclose(result, narrow, rtol=1e-5, atol=1e-5)
 
 
 def test_packed_surfaces_keep_id_depth_and_normal(device):
@@ -40,17 +50,12 @@ def test_packed_surfaces_keep_id_depth_and_normal(device):
     normal = np.concatenate([np.random.default_rng(0).normal(size=(250, 3)), np.eye(3), -np.eye(3)])
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)
     segment, depth = np.arange(256), np.linspace(0.3, 3.0, 256, dtype=np.float32)
-    inputs = [
-        wp.array(segment, dtype=wp.int32, device=device),
-        wp.array(depth, device=device),
-        wp.array(normal, dtype=wp.vec3, device=device),
-    ]
-    out = [wp.empty((1, 1, 256), dtype=wp.vec4, device=device), *(wp.empty_like(array) for array in inputs)]
-    wp.launch(surface_kernel, 256, inputs, out, device=device)
-    np.testing.assert_array_equal(out[1].numpy(), segment)
-    np.testing.assert_array_equal(out[2].numpy(), depth)
+    records = wp.empty((1, 1, 256), dtype=wp.vec4, device=device)
+    found = repacked(records, np.arange(256), segment, depth, normal, device=device)
+    np.testing.assert_array_equal(found[0], segment)
+    np.testing.assert_array_equal(found[1], depth)
     # Near z = 0, the root of a rounding error; id 0 has no side.
-    np.testing.assert_allclose(out[3].numpy()[1:], normal[1:], atol=5e-4)
+    np.testing.assert_allclose(found[2][1:], normal[1:], atol=5e-4)
 
 
 @settings(max_examples=10)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from dataclasses import replace
 
 import cv2
@@ -13,42 +14,36 @@ from synpick_warp.configs.schema import FAST, REFERENCE, Config
 from synpick_warp.factory.assembly import make_renderer
 from synpick_warp.scenes.assets.appearance import linear_to_srgb
 from synpick_warp.scenes.environment import map_directions
-from synpick_warp.scenes.types import Catalog, EnvironmentMap, Material
+from synpick_warp.scenes.types import Catalog, EnvironmentMap
 from synpick_warp.stages.buffers import allocate_view_buffers
 from synpick_warp.stages.render.light_tables import measure_albedo, precompute_environment
 from synpick_warp.stages.render.scene import build_render_scene
 from synpick_warp.stages.render.view_setup import make_views
 from tests.harness.brdf_probe import evaluate, toward
-from tests.worlds.toy_scene import UPRIGHT, ToyScene, ball, box, build_scene, camera, entry, even_light, render, sheet, snapshot, sun
+from tests.worlds import toy_scene
+from tests.worlds.toy_scene import (
+    FLAT,
+    UPRIGHT,
+    WHITE,
+    ToyScene,
+    ball,
+    box,
+    build_scene,
+    camera,
+    entry,
+    even_light,
+    lamp,
+    sheet,
+    snapshot,
+    sun,
+    surface,
+    with_render,
+)
 
 VIEW = camera(64, 48, 200.0, (0.0, 0.0, 2.0))
-FLAT = (0.0, 0.0, 0.0, *UPRIGHT)
-WHITE = (1.0, 1.0, 1.0)
 EVEN = even_light()
 HALF = (float(linear_to_srgb(0.5)),) * 3
-
-
-def settings(mode=FAST, **render_settings) -> Config:
-    return replace(Config(), render=replace(Config().render, mode=mode, **render_settings))
-
-
-def surface(color=WHITE, metallic=0.0, roughness=1.0) -> Material:
-    return Material(color=color, texture=None, metallic=metallic, roughness=roughness)
-
-
-def render_objects(device, *placed, lights=(EVEN,), view=VIEW, config=None, **more):
-    """Render objects (mesh, material, pose); without a pose they are at the origin."""
-    entries = [entry(mesh, material) for mesh, material, *_ in placed] or [entry(sheet(0.1, 0.1))]
-    world = [(index, pose[0] if pose else FLAT) for index, (_, _, *pose) in enumerate(placed)]
-    return render(ToyScene(entries, [world], (view,), lights=lights, config=config or settings(), **more), device)
-
-
-def lamp(cosine: float, radius: float, radiance: float, sky: float = 0.0, rows: int = 256) -> EnvironmentMap:
-    """A uniform sky with a disc lamp of angular radius `radius` [rad] at azimuth 0, its edge one texel soft."""
-    directions, _ = map_directions(rows)
-    angle = np.arccos(np.clip(directions @ toward(cosine), -1.0, 1.0))
-    coverage = np.clip((radius - angle) / (np.pi / rows) + 0.5, 0.0, 1.0)
-    return EnvironmentMap("lamp", np.repeat(sky + radiance * coverage[..., None], 3, axis=2).astype(np.float32))
+render_objects = functools.partial(toy_scene.render_objects, view=VIEW)
 
 
 def clutter() -> list:
@@ -80,7 +75,7 @@ def test_white_furnace(device, metallic, roughness):
 def test_grey_plane_under_a_uniform_map_equals_the_reference(device, table):
     plane = (sheet(0.6, 0.5), surface(HALF, 0.0, 0.7))
     denoised, reference = (
-        render_objects(device, plane, table=table, config=settings(mode, coarse_paths=16)).radiance.mean(axis=(0, 1, 2))
+        render_objects(device, plane, table=table, config=with_render(mode, coarse_paths=16)).radiance.mean(axis=(0, 1, 2))
         for mode in (FAST, REFERENCE)
     )
     np.testing.assert_allclose(denoised, reference, rtol=0.01)
@@ -96,7 +91,7 @@ def test_plane_under_a_lamp_has_the_analytic_irradiance(device, cosine, degrees)
     radiance = 3.0 / (np.pi * np.sin(radius) ** 2)
     light = lamp(cosine, radius, radiance)
     view = camera(64, 48, 2000.0, (0.0, 0.0, 2.0))
-    picture = render_objects(device, (sheet(1.0, 1.0), surface(HALF)), lights=(light,), view=view, config=settings(coarse_paths=32))
+    picture = render_objects(device, (sheet(1.0, 1.0), surface(HALF)), lights=(light,), view=view, config=with_render(coarse_paths=32))
     value, _ = evaluate(measure_albedo(device), ((0.5,) * 3, 0.0, 1.0), toward(1.0), toward(cosine))
     np.testing.assert_allclose(picture.radiance[0].mean(axis=(0, 1)), value[0] * 3.0, rtol=0.02)
 
@@ -118,10 +113,10 @@ def test_tables_split_a_map_into_lamps_and_the_rest(degrees, lamps):
 def test_cluttered_scene_approaches_the_reference(device):
     view = camera(160, 120, 700.0, (0.0, 0.0, 1.5))
     lights = (EnvironmentMap("room", 0.4 * even_light(1.0, 64).radiance + lamp(0.8, np.radians(14.0), 8.0, rows=64).radiance),)
-    reference = render_objects(device, *clutter(), lights=lights, view=view, config=settings(REFERENCE, samples=256)).radiance[0]
+    reference = render_objects(device, *clutter(), lights=lights, view=view, config=with_render(REFERENCE, samples=256)).radiance[0]
     quality = {}
     for paths in (1, 4, 16):
-        denoised = render_objects(device, *clutter(), lights=lights, view=view, config=settings(coarse_paths=paths)).radiance[0]
+        denoised = render_objects(device, *clutter(), lights=lights, view=view, config=with_render(coarse_paths=paths)).radiance[0]
         quality[paths] = psnr(denoised, reference)
         if paths > 1:
             np.testing.assert_allclose(denoised.mean(axis=(0, 1)), reference.mean(axis=(0, 1)), rtol=0.015)
@@ -136,7 +131,7 @@ def test_two_frames_of_a_still_scene_are_identical(device):
     toy = ToyScene([entry(mesh, material) for mesh, material, *_ in clutter()], [[], []], (VIEW,), lights=(sun((0.5, 0.2, 0.8), rows=256),))
     toy.placed[0] = [(index, pose[0] if pose else FLAT) for index, (_, _, *pose) in enumerate(clutter())][1:]
     toy.placed[1] = [(0, (0.0, 0.0, 0.2, *UPRIGHT))]
-    toy.config = settings(coarse_pixel=4)
+    toy.config = with_render(coarse_pixel=4)
     scene = build_scene(toy, device)
     renderer = make_renderer(toy.settings(), scene, toy.instances, 1)
     out = allocate_view_buffers(1, scene.width, scene.height, toy.instances, device)
@@ -153,7 +148,9 @@ def test_two_frames_of_a_still_scene_are_identical(device):
 @pytest.mark.parametrize("size", [(64, 48), (61, 35), (3, 5), (1, 1)])
 def test_coarse_pixels_and_images_of_any_size_render(device, cell, size):
     view = camera(*size, 4.0 * size[0], (0.0, 0.0, 2.0))
-    picture = render_objects(device, *clutter(), lights=(sun((0.5, 0.2, 0.8)),), view=view, table=True, config=settings(coarse_pixel=cell))
+    picture = render_objects(
+        device, *clutter(), lights=(sun((0.5, 0.2, 0.8)),), view=view, table=True, config=with_render(coarse_pixel=cell)
+    )
     assert picture.radiance.shape[1:3] == size[::-1]
     assert np.isfinite(picture.radiance).all()
     assert (picture.radiance > 0.0).all()
@@ -163,7 +160,8 @@ def test_coarse_pixels_and_images_of_any_size_render(device, cell, size):
 def test_wider_coarse_pixels_have_the_same_light(device, cell):
     view = camera(160, 120, 700.0, (0.0, 0.0, 1.5))
     fine, wide = (
-        render_objects(device, *clutter(), view=view, config=settings(coarse_pixel=size, coarse_paths=8)).radiance[0] for size in (1, cell)
+        render_objects(device, *clutter(), view=view, config=with_render(coarse_pixel=size, coarse_paths=8)).radiance[0]
+        for size in (1, cell)
     )
     np.testing.assert_allclose(wide.mean(axis=(0, 1)), fine.mean(axis=(0, 1)), rtol=0.015)
     assert psnr(wide, fine + 1e-6) > 28.0
@@ -174,7 +172,7 @@ def test_objects_smaller_than_a_coarse_pixel_are_lit(device, light):
     # 3 px in coarse pixels of 16 px, over background: the middle of none of them lies on it.
     small_sheet = (sheet(0.03, 0.03), surface(HALF), (0.055, 0.035, 0.0, *UPRIGHT))
     coarse, fine = (
-        render_objects(device, small_sheet, lights=(light,), config=settings(coarse_pixel=size, coarse_paths=16)) for size in (16, 1)
+        render_objects(device, small_sheet, lights=(light,), config=with_render(coarse_pixel=size, coarse_paths=16)) for size in (16, 1)
     )
     visible = coarse.instance[0] == 1
     assert 4 <= visible.sum() <= 16
@@ -188,7 +186,7 @@ def test_only_background_and_only_table(device):
     assert (render_objects(device, lights=(light,)).instance == 0).all()
     # The table is an open plane: uniform.
     assert (table.std(axis=(0, 1)) < 0.02 * table.mean(axis=(0, 1))).all()
-    reference = render_objects(device, lights=(light,), table=True, config=settings(REFERENCE, samples=256)).radiance[0]
+    reference = render_objects(device, lights=(light,), table=True, config=with_render(REFERENCE, samples=256)).radiance[0]
     np.testing.assert_allclose(table.mean(axis=(0, 1)), reference.mean(axis=(0, 1)), rtol=0.02)
 
 
@@ -201,7 +199,7 @@ def test_sun_shadow_has_its_geometric_outline(device, yaw):
     tables = precompute_environment(light, None)
     (only,) = tables.lamps
     direction = only.direction
-    lit = render_objects(device, *objects, lights=(light,), view=view, light_yaw=yaw, config=settings(coarse_paths=16))
+    lit = render_objects(device, *objects, lights=(light,), view=view, light_yaw=yaw, config=with_render(coarse_paths=16))
     ground = lit.instance[0] == 1
     rows, columns = np.mgrid[:160, :160]
     x, y = (columns + 0.5 - 80.0) / 200.0, -(rows + 0.5 - 80.0) / 200.0
@@ -229,7 +227,7 @@ def test_shadow_at_the_edge_of_a_sunlit_surface_stays_dark(device, turn):
     pose = (0.0, 0.0, 0.08, 0.0, 0.0, np.sin(turn / 2), np.cos(turn / 2))
     objects = [(sheet(2.0, 2.0), surface(HALF)), (sheet(0.4, 0.4), surface(WHITE), pose)]
     light = sun((1.0, 0.0, 1.0), rows=256, strength=6000.0)
-    config = settings(coarse_pixel=4, coarse_paths=4, antialias=False)
+    config = with_render(coarse_pixel=4, coarse_paths=4, antialias=False)
     picture = render_objects(device, *objects, lights=(light,), view=view, config=config)
     ground, value = picture.instance[0] == 1, picture.radiance[0, ..., 0]
     strip = np.zeros_like(ground)
@@ -241,7 +239,7 @@ def test_shadow_at_the_edge_of_a_sunlit_surface_stays_dark(device, turn):
 
 
 def test_scratch_has_the_size_of_the_scenes_images(device):
-    config = replace(settings(coarse_pixel=4), cameras=replace(Config().cameras, resolution=(8, 8)))
+    config = replace(with_render(coarse_pixel=4), cameras=replace(Config().cameras, resolution=(8, 8)))
     scene = build_render_scene(
         config.render, config.tote, Catalog((entry(sheet(0.1, 0.1)),)), ToyScene([], [], ()).fixtures, (VIEW,), (EVEN,), device
     )
@@ -261,7 +259,7 @@ def test_light_does_not_leak_from_the_rim_of_a_pit_to_its_floor(device):
     objects = [(sheet(0.5, 0.5), surface(HALF), (0.0, 0.0, 0.0, *UPRIGHT)), *rim]
     view = camera(64, 48, 300.0, (0.0, 0.0, 2.0))
     denoised, reference = (
-        render_objects(device, *objects, view=view, instances=5, config=settings(mode, coarse_pixel=5, coarse_paths=16, samples=256))
+        render_objects(device, *objects, view=view, instances=5, config=with_render(mode, coarse_pixel=5, coarse_paths=16, samples=256))
         for mode in (FAST, REFERENCE)
     )
     floor = denoised.instance[0] == 1
@@ -278,7 +276,7 @@ def test_indirect_sunlight_equals_the_reference(device, metallic):
         for side, metal in ((-1, metallic), (1, 0.0))
     ]
     low_sun = (sun((-0.9, 0.0, 0.3), sky=0.002),)
-    configs = (settings(coarse_paths=16, coarse_pixel=1), settings(REFERENCE, samples=256))
+    configs = (with_render(coarse_paths=16, coarse_pixel=1), with_render(REFERENCE, samples=256))
     denoised, reference = (render_objects(device, *slopes, lights=low_sun, config=config) for config in configs)
     for instance in (1, 2):
         inside = cv2.erode((denoised.instance[0] == instance).astype(np.uint8), np.ones((3, 3))) > 0
@@ -293,7 +291,7 @@ def test_specular_highlight_of_a_small_lamp_equals_the_reference(device, metalli
     plate = (sheet(0.3, 0.2), surface((0.8, 0.8, 0.8), metallic, roughness))
     for cosine in (0.9, 0.99):
         light = (lamp(cosine, np.radians(2.0), 500.0, 0.01),)
-        configs = (settings(coarse_paths=16, coarse_pixel=1), settings(REFERENCE, samples=256))
+        configs = (with_render(coarse_paths=16, coarse_pixel=1), with_render(REFERENCE, samples=256))
         denoised, reference = (render_objects(device, plate, lights=light, config=config) for config in configs)
         inside = cv2.erode((denoised.instance[0] == 1).astype(np.uint8), np.ones((5, 5))) > 0
         assert denoised.radiance[0][inside].mean() == pytest.approx(reference.radiance[0][inside].mean(), rel=0.02)

@@ -11,8 +11,9 @@ import pytest
 import warp as wp
 
 from synpick_warp.codes import Segment
-from synpick_warp.configs.schema import FAST, REFERENCE, Config
+from synpick_warp.configs.schema import REFERENCE, Config
 from synpick_warp.factory.assembly import make_renderer
+from synpick_warp.kernels.render.lighting import history as kernels
 from synpick_warp.kernels.render.lighting.history import LIGHT_CHANGE, MAX_PERIOD_BITS, MAX_TRAVEL, LightHistory
 from synpick_warp.kernels.render.lighting.moving_bodies import MAX_DRIFT
 from synpick_warp.scenes.types import EnvironmentMap
@@ -20,8 +21,8 @@ from synpick_warp.stages.buffers import Snapshot, allocate_view_buffers
 from synpick_warp.stages.render.renderer import Renderer
 from synpick_warp.stages.render.view_setup import make_views
 from tests.harness.denoise_probe import guide_segments
-from tests.harness.history_probe import lag_frames_kernel, schedule_kernel, usable_paths_kernel
-from tests.worlds.toy_scene import UPRIGHT, ToyScene, ball, box, build_scene, camera, entry, even_light, sheet, snapshot
+from tests.harness.probe import probe
+from tests.worlds.toy_scene import UPRIGHT, ToyScene, ball, box, build_scene, camera, entry, even_light, sheet, snapshot, with_render
 
 PATHS = 16
 LONGEST_PERIOD = 1 << int(MAX_PERIOD_BITS)
@@ -33,8 +34,25 @@ VIEW = camera(64, 48, 300.0, (0.0, 0.0, 1.5))
 LIGHT = EnvironmentMap("gradient", even_light(1.0, 32).radiance * np.linspace(3.0, 0.1, 64, dtype=np.float32)[None, :, None])
 
 
+@wp.func
+def list_paths(numbers: wp.array2d[int], row: int, column: int, first: int):
+    """Numbers of the paths that a coarse pixel of a still scene traces until the array is full; its history begins in frame `first`."""
+    paths = wp.int32(0)
+    frame = first
+    while paths < numbers.shape[1]:
+        bits = kernels.period_bits(wp.min(paths, 16), 1000)
+        if bits == 0 or kernels.update_frame(row, column, bits) == frame % (1 << bits):
+            numbers[first, paths] = kernels.path_number(frame, bits)
+            paths += 1
+        frame += 1
+
+
+schedule, usable_paths = probe(list_paths), probe(kernels.usable_paths)
+lag_frames, covered_fraction = probe(kernels.lag_frames), probe(kernels.covered_fraction)
+
+
 def settings() -> Config:
-    return Config(render=replace(Config().render, mode=FAST, coarse_pixel=2, coarse_paths=1, history=PATHS))
+    return with_render(coarse_pixel=2, coarse_paths=1, history=PATHS)
 
 
 def toy(ball_height: float | None = 0.08, config: Config | None = None) -> ToyScene:
@@ -74,11 +92,10 @@ def renderer(device) -> Renderer:
 
 def usable(paths: int, limit: int, device: wp.Device) -> tuple[int, int]:
     """Paths that may be kept, and the rest period [frames]."""
-    history, result = LightHistory(), wp.zeros(2, dtype=wp.int32, device=device)
+    history = LightHistory()
     history.paths = wp.full((1, 1, 1), paths, dtype=wp.uint8, device=device)
-    wp.launch(usable_paths_kernel, dim=1, inputs=[history, limit], outputs=[result], device=device)
-    kept, bits = result.numpy().tolist()
-    return kept, 1 << bits
+    kept, bits = usable_paths(history, 0, 0, 0, limit, device=device)
+    return int(kept), 1 << int(bits)
 
 
 def remembered(renderer: Renderer) -> np.ndarray:
@@ -133,7 +150,7 @@ def test_averages_span_no_more_frames_than_the_lag_allows(device, paths, limit, 
 def test_the_paths_of_a_history_have_distinct_samples(device, row, column):
     """In whichever frame of an episode the history begins, and as it forgets: any PATHS paths in a row."""
     numbers = wp.empty((FIRST_FRAMES, 3 * PATHS), dtype=wp.int32, device=device)
-    wp.launch(schedule_kernel, dim=FIRST_FRAMES, inputs=[row, column], outputs=[numbers], device=device)
+    schedule(numbers, row, column, np.arange(FIRST_FRAMES), device=device)
     ordered = np.sort(np.lib.stride_tricks.sliding_window_view(numbers.numpy(), PATHS, axis=1), axis=-1)
     assert (np.diff(ordered) > 0).all()
 
@@ -199,15 +216,14 @@ def test_frames_that_the_lag_allows(renderer, device):
     moving = renderer.shading.moving  # type: ignore[union-attr]
     assert moving.count.numpy()[0] == 2
     points = np.array([[x, 0.0, 0.0] for x in (-0.1, 0.0, 0.1, 0.2, 0.4, 2.0)], dtype=np.float32)
-    frames, covered = wp.empty(6, dtype=float, device=device), wp.empty((6, 2), dtype=float, device=device)
-    inputs = [renderer.scene.meshes, moving, wp.array(points, dtype=wp.vec3, device=device), 1e9]
-    wp.launch(lag_frames_kernel, dim=6, inputs=inputs, outputs=[frames, covered], device=device)
+    frames = lag_frames(renderer.scene.meshes, moving, 0, points, 1e9, device=device)
+    covered = covered_fraction(renderer.scene.meshes, moving, 0, np.arange(2), points[:, None], device=device)
     travel = np.geomspace(1e-2, 1e4, 100_000)[:, None] * moving.change.numpy()[0, :2]
-    change = np.minimum(travel, float(MAX_TRAVEL)) @ covered.numpy().T
+    change = np.minimum(travel, float(MAX_TRAVEL)) @ covered.T
     allowed = np.array([np.searchsorted(column, float(LIGHT_CHANGE)) for column in change.T])
     expected = np.append(np.geomspace(1e-2, 1e4, 100_000), np.inf)[allowed]
-    assert (frames.numpy() <= 1.001 * expected).all()
-    assert (frames.numpy() >= 0.9 * np.minimum(expected, 1e3)).all()
+    assert (frames <= 1.001 * expected).all()
+    assert (frames >= 0.9 * np.minimum(expected, 1e3)).all()
     assert expected[0] < 10.0
     assert np.isinf(expected[-1])
 

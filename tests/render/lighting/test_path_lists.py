@@ -6,14 +6,24 @@ import numpy as np
 import pytest
 import warp as wp
 
-from synpick_warp.kernels.render.lighting.paths.lists import AGED, FRESH, REGION_PIXELS
+from synpick_warp.kernels.render.lighting.paths.lists import AGED, FRESH, REGION_PIXELS, PathLists, append_pixel, listed_pixel
 from synpick_warp.stages.arrays import allocate_struct
 from synpick_warp.stages.render.denoised import PATH_LISTS
-from tests.harness.path_list_probe import append_kernel, read_kernel
+from tests.harness.probe import probe
 
 VIEWS, REGIONS, MAX_KNOWN, MAX_BITS = 2, 3, 255, 3
 REGION = int(REGION_PIXELS)
 THREADS = REGIONS * REGION
+
+
+@wp.func
+def append_if_known(lists: PathLists, view: int, index: int, known: int, bits: int):
+    """Append a coarse pixel, unless `known` is negative."""
+    if known >= 0:
+        append_pixel(lists, view, index, known, bits)
+
+
+append, read = probe(append_if_known), probe(listed_pixel)
 
 
 @pytest.mark.parametrize("listed", [0.0, 0.3, 1.0])
@@ -25,11 +35,9 @@ def test_every_listed_pixel_is_read_once_with_its_history(device, listed):
     known[:REGION], bits[:REGION] = MAX_KNOWN, MAX_BITS  # A full region, to the last bit of its entries.
     lists = allocate_struct(PATH_LISTS, {"view": VIEWS, "region": REGIONS, "rank": REGION, "path_kind": 2}, device)
     lists.count.zero_()
-    inputs = [wp.array(known, dtype=int, device=device), wp.array(bits, dtype=int, device=device), THREADS]
-    wp.launch(append_kernel, dim=known.size, inputs=inputs, outputs=[lists], device=device)
-    read = wp.empty((known.size, 3), dtype=int, device=device)
-    wp.launch(read_kernel, dim=known.size, inputs=[lists], outputs=[read], device=device)
-    found = read.numpy()
+    threads = np.arange(known.size)
+    append(lists, threads // THREADS, threads, known, bits, device=device)
+    found = np.stack(read(lists, threads, device=device), axis=1)
     counts = known.reshape(VIEWS, REGIONS, REGION)
     np.testing.assert_array_equal(lists.count.numpy()[..., int(FRESH)], (counts == 0).sum(axis=2))
     np.testing.assert_array_equal(lists.count.numpy()[..., int(AGED)], (counts > 0).sum(axis=2))

@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
 import warp as wp
 
-from synpick_warp.configs.schema import FAST, Config
+from synpick_warp.configs.schema import Config
 from synpick_warp.factory.assembly import make_renderer
 from synpick_warp.kernels.render.lighting.paths.lists import REGION_PIXELS
-from synpick_warp.kernels.render.lighting.paths.queues import QUEUE_CAPACITY
+from synpick_warp.kernels.render.lighting.paths.queues import QUEUE_CAPACITY, PathPixel, PathQueues, first_record, read_path, write_path
+from synpick_warp.kernels.render.lighting.paths.tracing import Path
 from synpick_warp.scenes.types import EnvironmentMap
 from synpick_warp.stages.arrays import allocate_struct
 from synpick_warp.stages.buffers import allocate_view_buffers
@@ -20,13 +20,31 @@ from synpick_warp.stages.render.denoised import PATH_QUEUES, queue_sizes, queue_
 from synpick_warp.stages.render.renderer import Renderer
 from synpick_warp.stages.render.sampling_rates import interleaved_threads
 from synpick_warp.stages.render.view_setup import make_views
-from tests.harness.path_queue_probe import MAX_INTEGERS, VECTORS, repack_kernel
+from tests.harness.probe import probe
 from tests.render.lighting.test_history import show
-from tests.worlds.toy_scene import UPRIGHT, ToyScene, ball, box, build_scene, camera, entry, even_light, sheet, snapshot
+from tests.worlds.toy_scene import UPRIGHT, ToyScene, ball, box, build_scene, camera, entry, even_light, sheet, snapshot, with_render
 
 VIEW = camera(96, 64, 250.0, (0.0, 0.0, 1.5))
 LIGHT = EnvironmentMap("gradient", even_light(1.0, 32).radiance * np.linspace(3.0, 0.1, 64, dtype=np.float32)[None, :, None])
 FRAMES = 5
+MAX_INTEGERS = {
+    "path": {"bounce": 63, "hit.segment": 255, "hit.triangle": (1 << 26) - 1},
+    "pixel": {"offset": 511, "segment": 255, "known": 255, "number": (1 << 30) - 1},
+}
+"""Largest integers of a queued path and of its coarse pixel."""
+NOT_QUEUED = {"hit.depth", "unoccluded.indirect"}
+"""Members that have no use after a bounce."""
+
+
+@wp.func
+def repack_path(queues: PathQueues, slot: int, path: Path, pixel: PathPixel):
+    """Round trip: store a path in a slot of the queue (view 0, region 0), and load it again."""
+    write_path(queues, first_record(queues, 0, 0, slot), path, pixel)
+    again, place = read_path(queues, first_record(queues, 0, 0, slot))
+    return again, place
+
+
+repack = probe(repack_path)
 
 
 def pile(frame: int, bounces: int, walls: bool, paths: int) -> ToyScene:
@@ -38,13 +56,13 @@ def pile(frame: int, bounces: int, walls: bool, paths: int) -> ToyScene:
         placed.append((1, (0.05, 0.02, 0.03, *UPRIGHT)))
     entries = [entry(mesh) for mesh in (sheet(0.4, 0.4), box(0.04, 0.04, 0.06), ball(0.03, 3), box(0.02, 0.5, 0.6))]
     # As many paths as by default: several where no history is usable, one elsewhere.
-    render = replace(Config().render, mode=FAST, coarse_pixel=1, coarse_paths=paths, bounces=bounces, history=8)
-    return ToyScene(entries, [placed], (VIEW,), lights=(LIGHT,), config=Config(render=render))
+    config = with_render(coarse_pixel=1, coarse_paths=paths, bounces=bounces, history=8)
+    return ToyScene(entries, [placed], (VIEW,), lights=(LIGHT,), config=config)
 
 
 def make_queues(renderer: Renderer, regions: int, views: int = 1) -> Any:
     """Queues of a renderer for some views at a time; 0 regions: none."""
-    render = replace(Config().render, bounces=renderer.shading.rules.bounces)  # type: ignore[union-attr]
+    render = with_render(bounces=renderer.shading.rules.bounces).render  # type: ignore[union-attr]
     sizes = queue_sizes(render, VIEW.width, VIEW.height, views, 1, renderer.scene.device)
     return allocate_struct(PATH_QUEUES, sizes | {"queue_region": regions, "queue_view": views}, renderer.scene.device)
 
@@ -84,19 +102,32 @@ def test_queued_paths_have_the_light_of_paths_traced_by_one_thread(device, bounc
     assert (2 * counts > int(QUEUE_CAPACITY)).any() == (walls and bounces > 1 and paths == 1)
 
 
+def leaves(rows: np.ndarray, prefix: str = "") -> dict[str, np.ndarray]:
+    """Members of nested structs by their paths, as views."""
+    parts = [
+        leaves(rows[name], f"{prefix}{name}.") if rows[name].dtype.names else {f"{prefix}{name}": rows[name]} for name in rows.dtype.names
+    ]
+    return {name: values for part in parts for name, values in part.items()}
+
+
 def test_paths_survive_packing(device):
-    """Random paths, the first with the largest integers."""
-    random, paths = np.random.default_rng(1), 40
-    integers = random.integers(0, np.array(MAX_INTEGERS) + 1, (paths, len(MAX_INTEGERS)), dtype=np.int32)
-    integers[0] = MAX_INTEGERS
-    vectors = random.normal(size=(paths, VECTORS, 3)).astype(np.float32)
-    vectors[:, -1, 1:] = 0.0
+    """Random paths, the first with the largest integers; all but what a queued path has none of."""
+    random, count = np.random.default_rng(1), 40
+    given = {name: np.zeros(count, np.dtype(kind.numpy_dtype())) for name, kind in (("path", Path), ("pixel", PathPixel))}
+    for name, rows in given.items():
+        for member, values in leaves(rows).items():
+            if largest := MAX_INTEGERS[name].get(member):
+                values[:] = random.integers(0, largest + 1, count)
+                values[0] = largest
+            else:
+                values[:] = random.normal(size=values.shape)
     queues = allocate_struct(PATH_QUEUES, queue_sizes(Config().render, VIEW.width, VIEW.height, 1, 1, device) | {"queue_region": 1}, device)
-    outputs = [wp.zeros(integers.shape, dtype=wp.int32, device=device), wp.zeros((paths, VECTORS), dtype=wp.vec3, device=device)]
-    inputs = [wp.array(integers, device=device), wp.array(vectors, dtype=wp.vec3, device=device)]
-    wp.launch(repack_kernel, dim=paths, inputs=inputs, outputs=[queues, *outputs], device=device)
-    np.testing.assert_array_equal(outputs[0].numpy(), integers)
-    np.testing.assert_array_equal(outputs[1].numpy(), vectors)
+    found = dict(zip(given, repack(queues, np.arange(count), *given.values(), device=device), strict=True))
+    for name, rows in given.items():
+        again = leaves(found[name])
+        for member, values in leaves(rows).items():
+            if member not in NOT_QUEUED:
+                np.testing.assert_array_equal(again[member], values, err_msg=member)
 
 
 def test_batches_of_more_views_than_queues_take_turns(device):

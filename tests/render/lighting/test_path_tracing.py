@@ -10,42 +10,22 @@ import pytest
 from synpick_warp.configs.schema import REFERENCE, Config
 from synpick_warp.kernels.render.lighting.paths.tracing import BRDF_SAMPLING, LIGHT_SAMPLING
 from synpick_warp.scenes.assets.appearance import linear_to_srgb
-from synpick_warp.scenes.environment import map_directions
-from synpick_warp.scenes.types import EnvironmentMap, Material
+from synpick_warp.scenes.types import EnvironmentMap
 from synpick_warp.stages.render import reference
 from synpick_warp.stages.render.light_tables import measure_albedo
 from tests.harness.brdf_probe import evaluate, toward
-from tests.worlds.toy_scene import UPRIGHT, ToyScene, ball, box, camera, entry, even_light, render, sheet, sun
+from tests.worlds import toy_scene
+from tests.worlds.toy_scene import UPRIGHT, WHITE, ball, box, camera, even_light, lamp, sheet, sun, surface, with_render
 
 VIEW = camera(64, 48, 200.0, (0.0, 0.0, 2.0))
-FLAT = (0.0, 0.0, 0.0, *UPRIGHT)
-WHITE = (1.0, 1.0, 1.0)
-EVEN = even_light()
 
 
 def settings(samples=32, bounces=4, **bake) -> Config:
-    config = Config()
-    render_settings = replace(config.render, mode=REFERENCE, samples=samples, bounces=bounces)
-    return replace(config, render=render_settings, bake=replace(config.bake, **bake))
+    return replace(with_render(REFERENCE, samples=samples, bounces=bounces), bake=replace(Config().bake, **bake))
 
 
-def surface(color=WHITE, metallic=0.0, roughness=1.0) -> Material:
-    return Material(color=color, texture=None, metallic=metallic, roughness=roughness)
-
-
-def render_objects(device, *placed, lights=(EVEN,), view=VIEW, config=None, **more):
-    """Render objects (mesh, material, pose); without a pose they are at the origin."""
-    entries = [entry(mesh, material) for mesh, material, *_ in placed]
-    world = [(index, pose[0] if pose else FLAT) for index, (_, _, *pose) in enumerate(placed)]
-    return render(ToyScene(entries, [world], (view,), lights=lights, config=config or settings(), **more), device)
-
-
-def lamp(cosine, radius, radiance, rows=256):
-    """A black map with a disc lamp of angular radius `radius` [rad] at azimuth 0, its edge one texel soft."""
-    directions, _ = map_directions(rows)
-    angle = np.arccos(np.clip(directions @ toward(cosine), -1.0, 1.0))
-    coverage = np.clip((radius - angle) / (np.pi / rows) + 0.5, 0.0, 1.0)
-    return EnvironmentMap("lamp", np.repeat(radiance * coverage[..., None], 3, axis=2).astype(np.float32))
+def render_objects(device, *placed, view=VIEW, config=None, **more):
+    return toy_scene.render_objects(device, *placed, view=view, config=config or settings(), **more)
 
 
 @pytest.mark.parametrize("metallic", [0.0, 1.0])
@@ -105,7 +85,7 @@ def test_sampling_strategies_have_the_same_mean(device, monkeypatch):
         (ball(0.06, 3), surface((0.9, 0.8, 0.7), 1.0, 0.35), (0.05, 0.0, 0.06, *UPRIGHT)),
         (box(0.1, 0.1, 0.1), surface((0.3, 0.5, 0.7)), (-0.1, 0.0, 0.05, *UPRIGHT)),
     ]
-    radiance = 0.3 * even_light(1.0, 64).radiance + lamp(0.7, np.radians(12.0), 20.0, 64).radiance
+    radiance = 0.3 * even_light(1.0, 64).radiance + lamp(0.7, np.radians(12.0), 20.0, rows=64).radiance
     lights = (EnvironmentMap("room", radiance),)
     combined = render_objects(device, *objects, lights=lights, config=settings(64), light_yaw=0.7).radiance[0]
     noise = {}

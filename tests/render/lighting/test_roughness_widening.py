@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import trimesh
-import warp as wp
 
 from synpick_warp.kernels.render.lighting.materials import MAX_WIDENING, PIXEL_VARIANCE, widen_roughness
 from synpick_warp.scenes.types import Material, TriangleMesh
 from synpick_warp.stages.render import scene
 from synpick_warp.stages.render.scene import normal_gradient
+from tests.harness.probe import probe
 from tests.worlds.toy_scene import UPRIGHT, ToyScene, ball, box, camera, entry, render, sun
 
 RADIUS = 6.0
@@ -43,26 +43,14 @@ def test_degenerate_triangles_have_no_normal_gradient():
     assert normal_gradient(flat)[0] == 0.0
 
 
-@wp.kernel
-def widen_kernel(
-    # In:
-    roughness: wp.array[float],  # (sample)
-    normal_spread: wp.array[float],  # (sample) [rad]
-    # Out:
-    widened_out: wp.array[float],  # (sample)
-):
-    """`widen_roughness`."""
-    i = wp.tid()
-    widened_out[i] = widen_roughness(roughness[i], normal_spread[i])
+widen = probe(widen_roughness)
 
 
 def test_squared_widths_add_up_to_max_widening(device):
     roughness, spread = (grid.ravel().astype(np.float32) for grid in np.meshgrid(np.linspace(0.0, 1.0, 11), [0.0, 1e-3, 0.1, 1.0, 100.0]))
-    widened = wp.zeros(roughness.size, dtype=float, device=device)
-    inputs = [wp.array(values, device=device) for values in (roughness, spread)]
-    wp.launch(widen_kernel, dim=roughness.size, inputs=inputs, outputs=[widened], device=device)
+    widened = widen(roughness, spread, device=device)
     added = np.minimum(float(PIXEL_VARIANCE) * spread.astype(np.float64) ** 2, float(MAX_WIDENING))
-    np.testing.assert_allclose(widened.numpy(), np.minimum(roughness.astype(np.float64) ** 4 + added, 1.0) ** 0.25, atol=2e-6)
+    np.testing.assert_allclose(widened, np.minimum(roughness.astype(np.float64) ** 4 + added, 1.0) ** 0.25, atol=2e-6)
 
 
 def brightness_while_moving(device, light) -> np.ndarray:

@@ -8,13 +8,16 @@ import warp as wp
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from synpick_warp.kernels.render.lighting import sampling
 from synpick_warp.scenes.environment import map_directions
 from synpick_warp.stages.render.light_tables import build_environment_cdf, environment_cdf
-from tests.harness.brdf_probe import invert_cdf_kernel, sample_environment_kernel, sample_point_kernel
-from tests.harness.denoise_probe import scrambled_kernel, sobol_kernel
 from tests.harness.devices import default_device
+from tests.harness.probe import probe
 
 BITS = 32
+sobol_point, scrambled_point = probe(sampling.sobol_point), probe(sampling.scrambled_point)
+invert_marginal, invert_conditional = probe(sampling.invert_marginal), probe(sampling.invert_conditional)
+sampled, pdf_of = probe(sampling.sample_environment), probe(sampling.environment_pdf)
 
 
 def sobol(index: np.ndarray) -> np.ndarray:
@@ -32,9 +35,8 @@ def sobol(index: np.ndarray) -> np.ndarray:
 
 @pytest.mark.parametrize("first", [0, 1000, 2**20 - 17])
 def test_points_are_those_of_sobol(device, first):
-    points = wp.empty(600, dtype=wp.vec2, device=device)
-    wp.launch(sobol_kernel, 600, [first], [points], device=device)
-    np.testing.assert_allclose(points.numpy(), sobol(first + np.arange(600)), atol=2.0**-24)
+    index = first + np.arange(600)
+    np.testing.assert_allclose(sobol_point(index, device=device), sobol(index), atol=2.0**-24)
 
 
 @settings(max_examples=20)
@@ -42,9 +44,7 @@ def test_points_are_those_of_sobol(device, first):
 def test_aligned_runs_of_scrambled_points_are_nets(key, dimension, run, power):
     # A (0, 2) sequence: each box of 2^-a by 2^-(k - a) holds one of an aligned run of 2^k points.
     count = 2**power
-    points = wp.empty(count, dtype=wp.vec2, device=default_device())
-    wp.launch(scrambled_kernel, count, [wp.uint64(key), dimension, run * count], [points], device=default_device())
-    points = points.numpy()
+    points = scrambled_point(key, run * count + np.arange(count), dimension)
     assert (points >= 0.0).all()
     assert (points < 1.0).all()
     for a in range(power + 1):
@@ -53,9 +53,7 @@ def test_aligned_runs_of_scrambled_points_are_nets(key, dimension, run, power):
 
 
 def scrambled_points(device, key: int, dimension: int, count: int = 256) -> np.ndarray:
-    points = wp.empty(count, dtype=wp.vec2, device=device)
-    wp.launch(sample_point_kernel, count, [wp.uint64(key), dimension], [points], device=device)
-    return points.numpy()
+    return scrambled_point(key, np.arange(count), dimension, device=device)
 
 
 def test_scrambled_points_are_stratified(device):
@@ -88,20 +86,17 @@ def test_guide_tables_find_what_a_search_of_the_whole_cdf_finds(rows: int, seed:
     ends = np.concatenate([marginal, conditional[row], np.arange(128) / 128.0]).astype(np.float32)
     numbers = np.concatenate([ends, np.nextafter(ends, np.float32(0.0)), np.nextafter(ends, np.float32(1.0)), rng.random(500, np.float32)])
     numbers = numbers[(numbers >= 0.0) & (numbers < 1.0)]
-    found = [wp.empty(len(numbers), dtype=wp.int32, device=device) for _ in range(2)]
-    inputs = [cdf, row, wp.array(numbers, dtype=wp.float32, device=device)]
-    wp.launch(invert_cdf_kernel, dim=len(numbers), inputs=inputs, outputs=found, device=device)
-    for indices, entries in zip(found, (marginal, conditional[row]), strict=True):
-        np.testing.assert_array_equal(indices.numpy(), np.searchsorted(entries, numbers, side="right") - 1)
+    for indices, entries in (
+        (invert_marginal(cdf, 0, numbers), marginal),
+        (invert_conditional(cdf, 0, row, numbers), conditional[row]),
+    ):
+        np.testing.assert_array_equal(indices, np.searchsorted(entries, numbers, side="right") - 1)
 
 
 def sample_environment(device, cdf, count):
     """Sampled directions (count, 3), the sampler's pdf and the evaluated pdf (count)."""
-    numbers = wp.array(np.random.default_rng(1).random((count, 2), dtype=np.float32), dtype=wp.vec2, device=device)
-    direction = wp.empty(count, dtype=wp.vec3, device=device)
-    sampled_pdf, evaluated_pdf = (wp.empty(count, dtype=wp.float32, device=device) for _ in range(2))
-    wp.launch(sample_environment_kernel, count, [cdf, numbers], [direction, sampled_pdf, evaluated_pdf], device=device)
-    return direction.numpy(), sampled_pdf.numpy(), evaluated_pdf.numpy()
+    found = sampled(cdf, 0, np.random.default_rng(1).random((count, 2), dtype=np.float32), device=device)
+    return found["direction"], found["pdf"], pdf_of(cdf, 0, found["direction"], device=device)
 
 
 def test_texels_are_sampled_in_proportion_to_their_light(device):

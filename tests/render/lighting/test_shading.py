@@ -7,28 +7,34 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from synpick_warp.configs.schema import Config
 from synpick_warp.factory.assembly import make_renderer
 from synpick_warp.scenes.assets.appearance import linear_to_srgb, srgb_to_linear
 from synpick_warp.scenes.environment import map_directions
-from synpick_warp.scenes.types import EnvironmentMap, Material
+from synpick_warp.scenes.types import EnvironmentMap
 from synpick_warp.stages import launch
 from synpick_warp.stages.render.light_tables import precompute_environment, prefilter_specular, sh_basis
 from synpick_warp.stages.render.scene import mip_levels, uv_density
 from synpick_warp.stages.render.view_setup import make_views
-from tests.worlds.toy_scene import GREY, UPRIGHT, ToyScene, ball, box, build_scene, camera, entry, even_light, render, sheet, sun
+from tests.worlds.toy_scene import (
+    FLAT,
+    GREY,
+    UPRIGHT,
+    ToyScene,
+    ball,
+    box,
+    build_scene,
+    camera,
+    entry,
+    even_light,
+    render,
+    sheet,
+    sun,
+    surface,
+    with_render,
+)
 
 VIEW = camera(64, 48, 200.0, (0.0, 0.0, 2.0))
 EVEN = even_light()
-FLAT = (0.0, 0.0, 0.0, *UPRIGHT)
-
-
-def with_render(**settings) -> Config:
-    return replace(Config(), render=replace(Config().render, **settings))
-
-
-def matte(color=(1.0, 1.0, 1.0), texture=None) -> Material:
-    return Material(color=color, texture=texture, metallic=0.0, roughness=1.0)
 
 
 def shown(material, device, *, mesh=None, lights=(EVEN,), view=VIEW, pose=FLAT, **more):
@@ -39,7 +45,7 @@ def test_texture_is_upright_and_not_mirrored(device):
     # Row 0 of the image is v = 1, the sheet's +y edge, the image's upper edge: red green / blue white.
     texture = np.zeros((8, 8, 3), np.uint8)
     texture[:4, :4], texture[:4, 4:], texture[4:, :4], texture[4:, 4:] = (255, 0, 0), (0, 255, 0), (0, 0, 255), (255, 255, 255)
-    color = shown(matte(texture=texture), device).color[0]
+    color = shown(surface(texture=texture), device).color[0]
     assert [int(np.argmax(color[row, column])) for row, column in ((17, 22), (17, 42), (31, 22))] == [0, 1, 2]
     assert color[31, 42].min() > 100
 
@@ -47,8 +53,8 @@ def test_texture_is_upright_and_not_mirrored(device):
 def test_fine_texture_is_averaged_in_linear_light(device):
     texture = np.zeros((512, 512, 3), np.uint8)
     texture[::2, ::2] = texture[1::2, 1::2] = 255
-    picture = shown(matte(texture=texture), device)
-    plain = shown(matte(color=(float(linear_to_srgb(0.5)),) * 3), device)
+    picture = shown(surface(texture=texture), device)
+    plain = shown(surface(color=(float(linear_to_srgb(0.5)),) * 3), device)
     middle = (0, slice(15, 33), slice(18, 46))
     np.testing.assert_allclose(picture.radiance[middle], plain.radiance[middle], rtol=0.01)
 
@@ -58,9 +64,9 @@ def test_textures_of_any_size_render(device, size):
     # Red from left to right, as far as there are columns; green throughout.
     texture = np.zeros((*size, 3), np.uint8)
     texture[..., 0], texture[..., 1] = np.linspace(40, 200, size[1]), 120
-    shown_rows = shown(matte(texture=texture), device).radiance[0, 12:36, 14:50]
+    shown_rows = shown(surface(texture=texture), device).radiance[0, 12:36, 14:50]
     # Light is sampled without the surface's colour: its noise is the same on both.
-    plain = shown(matte(color=(0.0, 120 / 255, 0.0)), device).radiance[0, 12:36, 14:50]
+    plain = shown(surface(color=(0.0, 120 / 255, 0.0)), device).radiance[0, 12:36, 14:50]
     # Texels are rounded to 10 bits of the square root.
     np.testing.assert_allclose(shown_rows[..., 1], plain[..., 1], rtol=2.5e-3)
     # Both colours have the same noise except for the specular part: some per cent of the light, to some per cent.
@@ -94,7 +100,7 @@ def test_exposure_depends_on_the_setting_and_not_on_the_maps_scale(device):
 
 def test_one_ev_doubles_the_light_before_the_tone_curve(device):
     # Linear albedo 0.1 shows 0.125 plus the specular part; twice that is still below the shoulder.
-    grey = matte((float(linear_to_srgb(0.1)),) * 3)
+    grey = surface((float(linear_to_srgb(0.1)),) * 3)
     plain, more = (shown(grey, device, light_exposure=ev).color[0, 24, 32] / 255.0 for ev in (0.0, 1.0))
     np.testing.assert_allclose(srgb_to_linear(more), 2.0 * srgb_to_linear(plain), rtol=0.02)
     same = shown(grey, device, light_exposure=0.5, config=with_render(exposure=2.0**-0.5)).color[0, 24, 32] / 255.0
@@ -103,7 +109,7 @@ def test_one_ev_doubles_the_light_before_the_tone_curve(device):
 
 def test_grey_sheet_has_the_analytic_brightness(device):
     # Linear albedo 0.2 under a uniform map: 0.2 x 1.25 of white, below the shoulder of the tone curve, plus the specular part.
-    value = shown(matte((float(linear_to_srgb(0.2)),) * 3), device).color[0, 16:32, 22:42].mean(axis=(0, 1))
+    value = shown(surface((float(linear_to_srgb(0.2)),) * 3), device).color[0, 16:32, 22:42].mean(axis=(0, 1))
     assert (value >= np.rint(255 * linear_to_srgb(0.25)) - 1).all()
     assert (value <= np.rint(255 * linear_to_srgb(0.31))).all()
 

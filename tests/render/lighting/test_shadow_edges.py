@@ -9,13 +9,11 @@ import pytest
 import warp as wp
 
 from synpick_warp.codes import Segment
-from synpick_warp.configs.schema import FAST, Config
 from synpick_warp.scenes.environment import map_directions
 from synpick_warp.scenes.types import EnvironmentMap
 from synpick_warp.stages.render.denoised import scratch_sizes
 from synpick_warp.stages.render.sampling_rates import shadow_size
-from tests.render.lighting.test_denoised import lamp
-from tests.worlds.toy_scene import UPRIGHT, ToyScene, camera, entry, flat_shaded, render, sheet
+from tests.worlds.toy_scene import FLAT, ToyScene, camera, entry, flat_shaded, lamp, render, sheet, with_render
 from tools.reports.lattice import measure_lattice
 
 FOCAL, DISTANCE = 300.0, 1.5
@@ -34,12 +32,12 @@ def shadow(device: wp.Device, size: int, degrees: float, height: float, turn: fl
     """
     along = np.array([np.cos(turn), np.sin(turn)])
     pose = (-along[0], -along[1], height, 0.0, 0.0, np.sin(turn / 2), np.cos(turn / 2))
-    config = Config(render=replace(Config().render, mode=FAST, coarse_pixel=size, coarse_paths=1, bounces=1, antialias=False))
+    config = with_render(coarse_pixel=size, coarse_paths=1, bounces=1, antialias=False)
     radiance = 3.0 / np.sin(np.radians(degrees)) ** 2
     # The lamp's azimuth is π, so that the shadow lies beside the sheet.
     light = lamp(COSINE, np.radians(degrees), radiance, rows=512)
     light = replace(light, radiance=np.roll(light.radiance, 512, axis=1))
-    placed = [(0, (0.0, 0.0, 0.0, *UPRIGHT)), (1, pose)]
+    placed = [(0, FLAT), (1, pose)]
     toy = ToyScene(
         [entry(sheet(4.0, 4.0)), entry(sheet(2.0, 4.0))],
         [placed],
@@ -94,10 +92,10 @@ def test_the_shadows_of_many_lamps_show_no_lattice(device, size, periods):
     for azimuth in azimuths:
         center = np.array([0.5 * np.cos(azimuth), 0.5 * np.sin(azimuth), np.sqrt(0.75)])
         radiance[directions @ center > np.cos(np.radians(4.0))] = 60.0
-    config = Config(render=replace(Config().render, mode=FAST, coarse_pixel=size, coarse_paths=16, bounces=1, antialias=False))
+    config = with_render(coarse_pixel=size, coarse_paths=16, bounces=1, antialias=False)
     toy = ToyScene(
         [entry(sheet(4.0, 4.0)), entry(sheet(2.0, 4.0))],
-        [[(0, (0.0, 0.0, 0.0, *UPRIGHT)), (1, (-1.45, 0.0, 0.5, 0.0, 0.0, np.sin(0.1), np.cos(0.1)))]],
+        [[(0, FLAT), (1, (-1.45, 0.0, 0.5, 0.0, 0.0, np.sin(0.1), np.cos(0.1)))]],
         (camera(320, 240, FOCAL, (0.0, 0.0, DISTANCE)),),
         lights=(EnvironmentMap("lamps", radiance),),
         config=config,
@@ -116,10 +114,10 @@ def test_a_bevel_in_the_shadow_of_a_wall_is_dark(device, size):
     profile = np.array([(-0.4, 0.0), (0.195, 0.0), (0.205, 0.01), (0.215, 0.15)])
     vertices = np.array([(x, y, z) for y in (-0.4, 0.4) for x, z in profile])
     faces = np.array([face for i in range(3) for face in ((i, i + 1, i + 5), (i, i + 5, i + 4))])
-    config = Config(render=replace(Config().render, mode=FAST, coarse_pixel=size, coarse_paths=16, bounces=1, antialias=False))
+    config = with_render(coarse_pixel=size, coarse_paths=16, bounces=1, antialias=False)
     light = lamp(np.sqrt(0.75), np.radians(3.0), 1000.0)
     view = camera(WIDTH, HEIGHT, FOCAL, (0.0, 0.0, DISTANCE))
-    toy = ToyScene([entry(flat_shaded(vertices, faces))], [[(0, (0.0, 0.0, 0.0, *UPRIGHT))]], (view,), lights=(light,), config=config)
+    toy = ToyScene([entry(flat_shaded(vertices, faces))], [[(0, FLAT)]], (view,), lights=(light,), config=config)
     value = render(toy, device).radiance[0][30:90].mean(axis=2)
     column = {x: int(WIDTH / 2 + x * FOCAL / DISTANCE) for x in (-0.1, 0.1, 0.175, 0.21)}
     lit = value[:, column[-0.1] : column[0.1]]
@@ -130,7 +128,7 @@ def test_a_bevel_in_the_shadow_of_a_wall_is_dark(device, size):
 @pytest.mark.parametrize("size", [1, 2, 3, 4, 8, 9, 32, 33, 64])
 def test_lists_of_edges_index_all_pixels_of_their_chunk(size):
     width, height = 1920, 1080
-    sizes = scratch_sizes(replace(Config().render, mode=FAST, coarse_pixel=size), width, height)
+    sizes = scratch_sizes(with_render(coarse_pixel=size).render, width, height)
     assert sizes["chunk_pixel"] <= np.iinfo(np.uint16).max + 1
     assert sizes["chunk_cell"] * shadow_size(size) ** 2 == sizes["chunk_pixel"]
     assert sizes["edge_chunk"] * sizes["chunk_pixel"] >= width * height

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import itertools
-from dataclasses import replace
 
 import numpy as np
 import pytest
 import warp as wp
 
-from synpick_warp.configs.schema import FAST, Config
 from synpick_warp.factory.assembly import make_renderer
+from synpick_warp.kernels.render.lighting import moving_bodies, shadow_filter, shadow_upsampling, shadows
 from synpick_warp.kernels.render.lighting.shadow_filter import FULL_SHARE, MAX_STEEPNESS, MIN_STEEPNESS, STEEPNESS_LEVELS
 from synpick_warp.kernels.render.lighting.shadows import REFRESH_FRAMES
 from synpick_warp.kernels.render.visibility.bvh_rays import RAY_OFFSET
@@ -18,13 +17,23 @@ from synpick_warp.kernels.render.visibility.gbuffer import Meshes
 from synpick_warp.scenes.types import EnvironmentMap
 from synpick_warp.stages.render.renderer import Renderer
 from synpick_warp.stages.render.scene import rays_per_lamp
-from tests.harness.shadow_probe import blend_kernel, fractions_kernel, slab_kernel, spread_kernel, steepness_kernel, world_box_kernel
+from tests.harness.probe import probe
 from tests.render.lighting.test_history import show
-from tests.worlds.toy_scene import UPRIGHT, ToyScene, ball, box, build_scene, camera, entry, sheet, sun
+from tests.worlds.toy_scene import UPRIGHT, ToyScene, ball, box, build_scene, camera, entry, sheet, sun, with_render
 
 SAMPLES = 2000
 VIEW = camera(96, 64, 250.0, (0.0, 0.0, 1.5))
 LAMPS = EnvironmentMap("lamps", sum(sun(at, 0.1, 900.0).radiance for at in ((1.0, 0.0, 1.0), (-0.6, 0.8, 0.9), (0.1, -1.0, 0.7))))
+
+
+@wp.func
+def spread_byte(bits: int, lamp: int):
+    """Byte of a lamp after its bit was spread."""
+    return shadows.byte_of(shadows.spread_bits(bits), lamp)
+
+
+spread_bytes, blend, lamp_fractions = probe(spread_byte), probe(shadow_upsampling.blend_bytes), probe(shadow_filter.lamp_fractions)
+steepness, meets_box, world_box = probe(shadow_filter.steepness_levels), probe(shadows.meets_box), probe(moving_bodies.world_box)
 
 
 def as_bytes(packed: np.ndarray) -> np.ndarray:
@@ -33,9 +42,8 @@ def as_bytes(packed: np.ndarray) -> np.ndarray:
 
 
 def test_bits_of_lamps_spread_to_bytes(device):
-    result = wp.zeros((256, 8), dtype=wp.int32, device=device)
-    wp.launch(spread_kernel, dim=result.shape, outputs=[result], device=device)
-    np.testing.assert_array_equal(result.numpy(), (np.arange(256)[:, None] >> np.arange(8)) & 1)
+    bits, lamps = np.indices((256, 8))
+    np.testing.assert_array_equal(spread_bytes(bits, lamps, device=device), (bits >> lamps) & 1)
 
 
 def test_blended_bytes_are_weighted_means(device):
@@ -44,10 +52,7 @@ def test_blended_bytes_are_weighted_means(device):
     # Some weights are as small as those of coarse pixels on other surfaces.
     weights = random.random((SAMPLES, 4)) * np.where(random.random((SAMPLES, 4)) < 0.3, 1e-4, 1.0) + 1e-8
     taps[: SAMPLES // 4] = taps[: SAMPLES // 4, :1]
-    result = wp.zeros(SAMPLES, dtype=wp.uint64, device=device)
-    inputs = [wp.array(taps, dtype=wp.uint64, device=device), wp.array(weights, dtype=wp.vec4, device=device)]
-    wp.launch(blend_kernel, dim=SAMPLES, inputs=inputs, outputs=[result], device=device)
-    blended = as_bytes(result.numpy()).astype(float)
+    blended = as_bytes(blend(taps, weights, device=device)).astype(float)
     expected = (weights[..., None] * as_bytes(taps).astype(float)).sum(axis=1) / weights.sum(axis=1)[:, None]
     # Fixed-point weights are off by up to 1/256 between two taps, and the mean is rounded.
     assert np.abs(blended - expected).max() < 2.0
@@ -62,19 +67,15 @@ def test_fractions_count_the_free_rays_of_each_lamp(device, lamps, rays, weight)
     free = random.integers(0, weight + 1, (SAMPLES, 8))
     shifts = np.arange(0, 64, 16, dtype=np.uint64)
     sums = [(free[:, first::2].astype(np.uint64) << shifts).sum(axis=1, dtype=np.uint64) for first in (0, 1)]
-    result = wp.zeros(SAMPLES, dtype=wp.uint64, device=device)
-    inputs = [*(wp.array(each, dtype=wp.uint64, device=device) for each in sums), weight, lamps, rays]
-    wp.launch(fractions_kernel, dim=SAMPLES, inputs=inputs, outputs=[result], device=device)
+    found = as_bytes(lamp_fractions(*sums, weight, lamps, rays, device=device))
     expected = free[:, : lamps * rays].reshape(SAMPLES, lamps, rays).sum(axis=2) / (weight * rays)
-    assert np.abs(as_bytes(result.numpy())[:, :lamps] / 255.0 - expected).max() <= 0.5 / 255.0 + 1e-12
-    assert not as_bytes(result.numpy())[:, lamps:].any()
+    assert np.abs(found[:, :lamps] / 255.0 - expected).max() <= 0.5 / 255.0 + 1e-12
+    assert not found[:, lamps:].any()
 
 
 @pytest.mark.parametrize(("share", "supported"), [(1.0, True), (0.16, True), (0.03, True), (1.0, False)])
 def test_shadows_are_steep_where_fractions_differ_and_where_few_rays_tell(device, share, supported):
-    result = wp.zeros((256, 256), dtype=wp.int32, device=device)
-    wp.launch(steepness_kernel, dim=result.shape, inputs=[share, supported], outputs=[result], device=device)
-    levels, top = result.numpy(), int(STEEPNESS_LEVELS)
+    levels, top = steepness(*np.indices((256, 256)), share, supported, device=device), int(STEEPNESS_LEVELS)
     assert levels[0, 0] == levels[255, 255] == 0
     if supported:
         difference = np.arange(256) / 255.0 * min(share / float(FULL_SHARE), 1.0)
@@ -100,10 +101,7 @@ def test_rays_that_pass_through_a_box_meet_it(device):
     direction = (target - origin) * random.choice([-1.0, 1.0], (SAMPLES, 1))
     steps = origin[:, None] + np.linspace(0.0, 8.0, 4000)[None, :, None] * direction[:, None]
     expected = ((steps > lower) & (steps < upper)).all(axis=2).any(axis=1)
-    result = wp.zeros(SAMPLES, dtype=wp.int32, device=device)
-    rays = [wp.array(values, dtype=wp.vec3, device=device) for values in (origin, direction)]
-    wp.launch(slab_kernel, dim=SAMPLES, inputs=[*rays, wp.vec3(*lower), wp.vec3(*upper)], outputs=[result], device=device)
-    meets = result.numpy() == 1
+    meets = meets_box(origin, 1.0 / direction.astype(np.float32), lower, upper, device=device)
     assert meets[expected].all()
     assert 100 < expected.sum() < SAMPLES - 100
     # Rays that cut a corner between two steps.
@@ -117,15 +115,13 @@ def test_boxes_around_bodies_are_their_corners_box_and_a_margin(device):
     poses[:, 3:] /= np.linalg.norm(poses[:, 3:], axis=1)[:, None]
     meshes = Meshes()
     meshes.lower, meshes.upper = (wp.array(corner[None], dtype=wp.vec3, device=device) for corner in (lower, upper))
-    results = [wp.zeros(50, dtype=wp.vec3, device=device) for _ in range(2)]
-    inputs = [meshes, wp.array(poses, dtype=wp.transformf, device=device)]
-    wp.launch(world_box_kernel, dim=50, inputs=inputs, outputs=results, device=device)
+    boxes = world_box(meshes, 0, poses, device=device)
     corners = np.stack(np.meshgrid(*zip(lower, upper, strict=True)), axis=-1).reshape(-1, 3)
     for i, pose in enumerate(poses):
         q, w = pose[3:6], pose[6]
         turned = corners + 2.0 * np.cross(q, np.cross(q, corners) + w * corners) + pose[:3]
-        np.testing.assert_allclose(results[0].numpy()[i], turned.min(axis=0) - RAY_OFFSET, atol=1e-6)
-        np.testing.assert_allclose(results[1].numpy()[i], turned.max(axis=0) + RAY_OFFSET, atol=1e-6)
+        np.testing.assert_allclose(boxes[0][i], turned.min(axis=0) - RAY_OFFSET, atol=1e-6)
+        np.testing.assert_allclose(boxes[1][i], turned.max(axis=0) + RAY_OFFSET, atol=1e-6)
 
 
 def stirred(frame: int, balls: int = 2) -> ToyScene:
@@ -135,7 +131,7 @@ def stirred(frame: int, balls: int = 2) -> ToyScene:
     if balls > 1 and 5 <= frame < 9:
         placed.append((2, (0.0, -0.06, 0.2, *UPRIGHT)))
     entries = [entry(sheet(0.4, 0.4)), entry(box(0.04, 0.04, 0.06)), entry(ball(0.02, 3))]
-    config = Config(render=replace(Config().render, mode=FAST, coarse_pixel=1, coarse_paths=1))
+    config = with_render(coarse_pixel=1, coarse_paths=1)
     return ToyScene(entries, [placed], (VIEW,), lights=(LAMPS,), config=config)
 
 
@@ -184,7 +180,7 @@ def test_lamps_share_the_light_of_a_map_with_the_paths(device):
     """A plane that sees everything has the same light with all lamps, with one, and with none."""
     values = []
     for lamps in (8, 1, 0):
-        config = Config(render=replace(Config().render, mode=FAST, coarse_paths=64, lamps=lamps))
+        config = with_render(coarse_paths=64, lamps=lamps)
         each = ToyScene([entry(sheet(1.0, 1.0))], [[(0, (0.0, 0.0, 0.0, *UPRIGHT))]], (VIEW,), lights=(LAMPS,), config=config)
         scene = build_scene(each, device)
         assert scene.lights.lamps.numpy().tolist() == [min(lamps, 3)]

@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 import warp as wp
 
-from synpick_warp.configs.schema import FAST, UNOCCLUDED, Config
-from synpick_warp.kernels.render.lighting.shading import MAX_WEIGHT_CHANGE, shade_kernel, shade_samples_kernel
-from synpick_warp.scenes.types import EnvironmentMap, Material
+from synpick_warp.configs.schema import FAST, UNOCCLUDED
+from synpick_warp.kernels.render.lighting.shading import MAX_WEIGHT_CHANGE, move_weights, shade_kernel, shade_samples_kernel, sum_of
+from synpick_warp.kernels.render.visibility.triangles import Triangle, edge_areas
+from synpick_warp.scenes.types import EnvironmentMap
 from synpick_warp.stages.render import denoised
-from tests.harness.shading_probe import move_weights_kernel
-from tests.worlds.toy_scene import ToyScene, ball, camera, entry, render, sheet
+from tests.harness.probe import probe
+from tests.worlds.toy_scene import WHITE, ToyScene, ball, camera, entry, render, sheet, surface, with_render
 
 WIDTH, HEIGHT, FINE = 64, 48, 8
 """Image size, and the number of pixels of a finer image along one of its pixels."""
@@ -25,12 +24,25 @@ STRIPES = EnvironmentMap(
 """Sky with horizontal stripes, six degrees wide."""
 
 
+@wp.func
+def move_to_ray(triangle: Triangle, ray: wp.vec3, center_ray: wp.vec3, center: wp.vec3):
+    """Weights of the point where a ray of depth 1 meets its triangle's plane, and the fraction of the way from `center`."""
+    weights, fraction = move_weights(center, wp.sign(sum_of(edge_areas(triangle, center_ray))), edge_areas(triangle, ray))
+    return weights, fraction
+
+
+moved_weights = probe(move_to_ray)
+
+
+def triangles(corners: np.ndarray) -> np.ndarray:
+    """Triangles of corners (N, 3, 3), in camera axes [m]."""
+    rows = np.zeros(len(corners), np.dtype(Triangle.numpy_dtype()))
+    rows["a"], rows["b"], rows["c"] = corners.transpose(1, 0, 2)
+    return rows
+
+
 def view(scale: int = 1):
     return camera(scale * WIDTH, scale * HEIGHT, scale * 200.0, (0.0, 0.0, 2.0))
-
-
-def render_config(**settings):
-    return replace(Config().render, **settings)
 
 
 def radiance_of(mesh, material, pose, device, scale=1) -> np.ndarray:
@@ -52,7 +64,7 @@ def radiance_of(mesh, material, pose, device, scale=1) -> np.ndarray:
     ],
 )
 def test_images_whose_coarse_pixels_are_pixels_are_supersampled(settings, width, histories, expected):
-    assert denoised.supersamples(render_config(**settings), width, histories) == expected
+    assert denoised.supersamples(with_render(**settings).render, width, histories) == expected
 
 
 def test_points_lie_on_the_plane_of_the_triangle(device):
@@ -64,10 +76,7 @@ def test_points_lie_on_the_plane_of_the_triangle(device):
     middle = random.dirichlet((1.0, 1.0, 1.0), count)
     point = np.einsum("nk,nkd->nd", middle, corners)
     ray = point / point[:, 2:] + np.c_[random.uniform(-1e-3, 1e-3, (count, 2)), np.zeros(count)]
-    arrays = (corners, ray, point / point[:, 2:], middle)
-    inputs = [wp.array(values.astype(np.float32), dtype=wp.vec3, device=device) for values in arrays]
-    weights, fraction = wp.empty(count, dtype=wp.vec3, device=device), wp.empty(count, dtype=float, device=device)
-    wp.launch(move_weights_kernel, dim=count, inputs=inputs, outputs=[weights, fraction], device=device)
+    weights, fraction = moved_weights(triangles(corners), ray, point / point[:, 2:], middle, device=device)
     on_plane = np.linalg.solve(corners.transpose(0, 2, 1), ray[..., None])[..., 0]
     change = on_plane / on_plane.sum(1, keepdims=True) - middle
     largest = np.abs(change).max(1)
@@ -76,8 +85,8 @@ def test_points_lie_on_the_plane_of_the_triangle(device):
     assert facing.sum() > count // 2
     assert (expected[facing] < 1.0).any()
     assert (expected[facing] == 1.0).any()
-    np.testing.assert_allclose(fraction.numpy()[facing], expected[facing], rtol=0.02)
-    np.testing.assert_allclose(weights.numpy()[facing], (middle + expected[:, None] * change)[facing], atol=0.02)
+    np.testing.assert_allclose(fraction[facing], expected[facing], rtol=0.02)
+    np.testing.assert_allclose(weights[facing], (middle + expected[:, None] * change)[facing], atol=0.02)
 
 
 @pytest.mark.parametrize(
@@ -88,17 +97,14 @@ def test_points_lie_on_the_plane_of_the_triangle(device):
     ],
 )
 def test_a_ray_that_misses_the_plane_keeps_the_center(device, corners, ray):
-    arrays = [[corners], [ray], [(0.0, 0.0, 1.0)], [(0.2, 0.3, 0.5)]]
-    inputs = [wp.array(np.array(values, np.float32), dtype=wp.vec3, device=device) for values in arrays]
-    weights, fraction = wp.empty(1, dtype=wp.vec3, device=device), wp.empty(1, dtype=float, device=device)
-    wp.launch(move_weights_kernel, dim=1, inputs=inputs, outputs=[weights, fraction], device=device)
-    np.testing.assert_allclose(weights.numpy()[0], (0.2, 0.3, 0.5), rtol=1e-6)
-    assert fraction.numpy()[0] == 0.0
+    weights, fraction = moved_weights(triangles(np.array([corners])), ray, (0.0, 0.0, 1.0), (0.2, 0.3, 0.5), device=device)
+    np.testing.assert_allclose(weights[0], (0.2, 0.3, 0.5), rtol=1e-6)
+    assert fraction[0] == 0.0
 
 
 def test_a_plain_flat_surface_is_the_same_with_either_kernel(device, monkeypatch):
     """All points of a matt, evenly lit plane have the same radiance, so that supersampling changes nothing."""
-    matt = Material(color=(0.5, 0.4, 0.3), texture=None, metallic=0.0, roughness=1.0)
+    matt = surface((0.5, 0.4, 0.3))
     found = radiance_of(sheet(0.4, 0.3), matt, TILTED, device)
     monkeypatch.setattr(denoised, "supersamples", lambda *_: False)
     np.testing.assert_allclose(found, radiance_of(sheet(0.4, 0.3), matt, TILTED, device), rtol=2e-3)
@@ -110,9 +116,9 @@ def test_the_mean_of_a_pixel_is_approached(device, monkeypatch, shape):
     random = np.random.default_rng(7)
     if shape == "texture":
         texture = np.repeat(np.repeat(random.integers(0, 255, (32, 32, 3)), 8, 0), 8, 1).astype(np.uint8)
-        body = sheet(0.4, 0.4), Material(color=(1.0, 1.0, 1.0), texture=texture, metallic=0.0, roughness=1.0), TILTED
+        body = sheet(0.4, 0.4), surface(texture=texture), TILTED
     else:
-        body = ball(0.1, 3), Material(color=(1.0, 1.0, 1.0), texture=None, metallic=1.0, roughness=0.1), TILTED
+        body = ball(0.1, 3), surface(WHITE, 1.0, 0.1), TILTED
     inner = np.s_[HEIGHT // 2 - 4 : HEIGHT // 2 + 4, WIDTH // 2 - 8 : WIDTH // 2 + 8]
     mean = radiance_of(*body, device, FINE).reshape(HEIGHT, FINE, WIDTH, FINE, 3).mean((1, 3))[inner]
     errors = []

@@ -10,15 +10,15 @@ import synpick_warp
 from synpick_warp.configs.schema import FAST, REFERENCE, UNOCCLUDED
 from synpick_warp.stages.render.denoised import history_sizes, scratch_sizes
 from tests.online.conftest import tiny
-from tests.render.lighting.test_denoised import HALF, WHITE, clutter, lamp, psnr, render_objects, settings, surface
-from tests.worlds.toy_scene import UPRIGHT, ball, box, camera, even_light, sheet
+from tests.render.lighting.test_denoised import HALF, clutter, psnr, render_objects
+from tests.worlds.toy_scene import UPRIGHT, WHITE, ball, box, camera, even_light, lamp, sheet, surface, with_render
 
 
 @pytest.mark.parametrize(("metallic", "roughness"), [(0.0, 0.7), (1.0, 0.25), (1.0, 1.0)])
 def test_white_furnace(device, metallic, roughness):
     view = camera(128, 96, 500.0, (0.0, 0.0, 2.0))
     objects = (ball(0.1, 4), surface(WHITE, metallic, roughness))
-    picture = render_objects(device, objects, lights=(even_light(2.0),), view=view, config=settings(UNOCCLUDED))
+    picture = render_objects(device, objects, lights=(even_light(2.0),), view=view, config=with_render(UNOCCLUDED))
     np.testing.assert_allclose(picture.radiance[0][picture.instance[0] == 1].mean(axis=0), 2.0, rtol=0.01)
 
 
@@ -30,9 +30,9 @@ def test_walls_do_not_darken_a_floor(device):
     unoccluded, alone, fast = (
         picture.radiance[0][picture.instance[0] == 1].mean()
         for picture in (
-            render_objects(device, floor, *walls, view=view, config=settings(UNOCCLUDED)),
-            render_objects(device, floor, view=view, config=settings(UNOCCLUDED)),
-            render_objects(device, floor, *walls, view=view, config=settings(FAST, coarse_paths=16)),
+            render_objects(device, floor, *walls, view=view, config=with_render(UNOCCLUDED)),
+            render_objects(device, floor, view=view, config=with_render(UNOCCLUDED)),
+            render_objects(device, floor, *walls, view=view, config=with_render(FAST, coarse_paths=16)),
         )
     )
     np.testing.assert_allclose(unoccluded, alone, rtol=1e-5)
@@ -45,7 +45,7 @@ def test_sunlight_and_shadows_are_those_of_the_reference(device):
     objects = [(sheet(0.6, 0.5), surface(HALF)), (box(0.1, 0.1, 0.1), surface(HALF), (0.0, 0.0, 0.05, *UPRIGHT))]
     pictures = [
         render_objects(device, *objects, lights=(light,), config=config)
-        for config in (settings(UNOCCLUDED), settings(REFERENCE, samples=64, bounces=1))
+        for config in (with_render(UNOCCLUDED), with_render(REFERENCE, samples=64, bounces=1))
     ]
     unoccluded, reference = (picture.radiance[0] for picture in pictures)
     on_surface = pictures[0].instance[0] > 0
@@ -58,14 +58,14 @@ def test_sunlight_and_shadows_are_those_of_the_reference(device):
 
 def test_annotations_are_those_of_the_other_modes(device):
     view = camera(160, 120, 300.0, (0.0, 0.0, 1.0))
-    unoccluded, fast = (render_objects(device, *clutter(), view=view, config=settings(mode)) for mode in (UNOCCLUDED, FAST))
+    unoccluded, fast = (render_objects(device, *clutter(), view=view, config=with_render(mode)) for mode in (UNOCCLUDED, FAST))
     for name in ("depth", "instance", "amodal", "pixels", "boxes"):
         np.testing.assert_array_equal(getattr(unoccluded, name), getattr(fast, name))
     assert psnr(unoccluded.radiance, fast.radiance) > 20.0
 
 
 def test_no_memory_for_paths_and_histories():
-    unoccluded, fast = (settings(mode).render for mode in (UNOCCLUDED, FAST))
+    unoccluded, fast = (with_render(mode).render for mode in (UNOCCLUDED, FAST))
     of_unoccluded, of_fast = (scratch_sizes(render, 1920, 1080, 12) for render in (unoccluded, fast))
     shadow_grid = {"shadow_row", "shadow_column", "edge_chunk", "chunk_pixel"}  # As wide as coarse pixels are in images of their own.
     differing = {key for key, size in of_unoccluded.items() if size != of_fast[key]}

@@ -11,68 +11,42 @@ from hypothesis import strategies as st
 from synpick_warp.kernels.render.visibility.camera import ImageGrid, camera_ray, in_image, projected_box, tile_pixel
 from synpick_warp.stages.render.scene import build_grid
 from tests.harness.devices import default_device
+from tests.harness.probe import probe
 from tests.twins.raycast import rotation_of
 
 WIDTH, HEIGHT, FOCAL = 160, 90, 200.0
 
 
-@wp.kernel
-def visit_kernel(grid: ImageGrid, visits: wp.array3d[int]):
-    view, row, column = tile_pixel(grid, wp.tid())
+@wp.func
+def visit_pixel(grid: ImageGrid, visits: wp.array3d[int], index: int):
+    view, row, column = tile_pixel(grid, index)
     if in_image(grid, row, column):
         wp.atomic_add(visits, view, row, column, 1)
 
 
-@wp.kernel
-def ray_kernel(intrinsics: wp.vec4, offset: wp.vec2, rays: wp.array2d[wp.vec3]):
-    row, column = wp.tid()
-    rays[row, column] = camera_ray(intrinsics, row, column, offset)
-
-
-@wp.kernel
-def box_kernel(
-    lower: wp.array[wp.vec3],
-    upper: wp.array[wp.vec3],
-    rotation: wp.array[wp.mat33d],
-    position: wp.array[wp.vec3d],
-    intrinsics: wp.vec4,
-    grid: ImageGrid,
-    boxes: wp.array[wp.vec4i],
-):
-    i = wp.tid()
-    boxes[i] = projected_box(lower[i], upper[i], rotation[i], position[i], intrinsics, grid)
+visit, ray_of, box_of = probe(visit_pixel), probe(camera_ray), probe(projected_box)
 
 
 def project(lower, upper, rotation, position):
-    boxes = wp.zeros(1, dtype=wp.vec4i, device=default_device())
-    inputs = [
-        wp.array([lower], dtype=wp.vec3, device=default_device()),
-        wp.array([upper], dtype=wp.vec3, device=default_device()),
-        wp.array([rotation], dtype=wp.mat33d, device=default_device()),
-        wp.array([position], dtype=wp.vec3d, device=default_device()),
-        wp.vec4(FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2),
-        build_grid(WIDTH, HEIGHT),
-    ]
-    wp.launch(box_kernel, dim=1, inputs=inputs, outputs=[boxes], device=default_device())
-    return boxes.numpy()[0]
+    intrinsics = wp.vec4(FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2)
+    return box_of(lower, upper, rotation, position, intrinsics, build_grid(WIDTH, HEIGHT))
 
 
 @pytest.mark.parametrize(("width", "height"), [(8, 4), (1, 1), (33, 17), (7, 9)])
 def test_tiles_visit_every_pixel_once(width, height):
     grid = build_grid(width, height)
     visits = wp.zeros((2, height, width), dtype=int, device=default_device())
-    wp.launch(visit_kernel, dim=2 * grid.tiles * 32, inputs=[grid], outputs=[visits], device=default_device())
+    visit(grid, visits, np.arange(2 * grid.tiles * 32))
     assert (visits.numpy() == 1).all()
 
 
 def test_rays_pass_pixel_centres():
-    rays = wp.zeros((2, 3), dtype=wp.vec3, device=default_device())
-    wp.launch(ray_kernel, dim=(2, 3), inputs=[wp.vec4(10.0, 20.0, 1.5, 1.0), wp.vec2(0.0, 0.0)], outputs=[rays], device=default_device())
-    np.testing.assert_allclose(rays.numpy()[0, 0], [-1.0 / 10.0, -0.5 / 20.0, 1.0], rtol=1e-6)
-    np.testing.assert_allclose(rays.numpy()[1, 2], [1.0 / 10.0, 0.5 / 20.0, 1.0], rtol=1e-6)
-    np.testing.assert_allclose(rays.numpy()[0, 1][0], 0.0, atol=1e-7)
-    wp.launch(ray_kernel, dim=(2, 3), inputs=[wp.vec4(10.0, 20.0, 1.5, 1.0), wp.vec2(0.5, -0.5)], outputs=[rays], device=default_device())
-    np.testing.assert_allclose(rays.numpy()[0, 0], [-0.5 / 10.0, -1.0 / 20.0, 1.0], rtol=1e-6)
+    rays = ray_of((10.0, 20.0, 1.5, 1.0), *np.indices((2, 3)), (0.0, 0.0))
+    np.testing.assert_allclose(rays[0, 0], [-1.0 / 10.0, -0.5 / 20.0, 1.0], rtol=1e-6)
+    np.testing.assert_allclose(rays[1, 2], [1.0 / 10.0, 0.5 / 20.0, 1.0], rtol=1e-6)
+    np.testing.assert_allclose(rays[0, 1][0], 0.0, atol=1e-7)
+    rays = ray_of((10.0, 20.0, 1.5, 1.0), *np.indices((2, 3)), (0.5, -0.5))
+    np.testing.assert_allclose(rays[0, 0], [-0.5 / 10.0, -1.0 / 20.0, 1.0], rtol=1e-6)
 
 
 def test_a_box_straight_ahead_has_a_known_projection():

@@ -15,6 +15,7 @@ from synpick_warp.kernels.render.visibility.gbuffer import FAR
 from synpick_warp.kernels.render.visibility.gbuffer import Interior as DeviceInterior
 from synpick_warp.scenes.tote import tote_fixture
 from synpick_warp.scenes.types import Interior
+from tests.harness.probe import probe
 from tests.twins.rays import first_hit
 from tests.worlds.toy_scene import UPRIGHT, ToyScene, box, camera, entry, render
 
@@ -41,30 +42,13 @@ def corners(interior: Interior) -> np.ndarray:
     return np.array(points)
 
 
-@wp.kernel
-def stays_in_interior_kernel(
-    # In:
-    interior: DeviceInterior,
-    start: wp.array[wp.vec3],
-    direction: wp.array[wp.vec3],
-    reach: wp.array[float],
-    # Out:
-    result_out: wp.array[int],
-):
-    """1 where `stays_in_interior`."""
-    ray = wp.tid()
-    result_out[ray] = int(stays_in_interior(interior, start[ray], direction[ray], reach[ray]))
+early_out = probe(stays_in_interior)
 
 
 def stays(interior: Interior, start: np.ndarray, direction: np.ndarray, reach: np.ndarray, device) -> np.ndarray:
     given = DeviceInterior()
     given.half, given.growth, given.floor, given.top = wp.vec3(*interior.half), wp.vec3(*interior.growth), interior.floor, interior.top
-    inputs = [given] + [
-        wp.array(values, dtype=kind, device=device) for values, kind in ((start, wp.vec3), (direction, wp.vec3), (reach, float))
-    ]
-    result = wp.zeros(len(start), dtype=wp.int32, device=device)
-    wp.launch(stays_in_interior_kernel, dim=len(start), inputs=inputs, outputs=[result], device=device)
-    return result.numpy() != 0
+    return early_out(given, start, direction, reach, device=device)
 
 
 @pytest.mark.parametrize("tote", [TOTE, OTHER, replace(TOTE, floor_size=TOTE.rim_size)])
@@ -95,7 +79,7 @@ def test_the_early_out_is_conservative(device, tote):
     reach = np.where(rng.random(4000) < 0.5, float(FAR), rng.uniform(0.0, 0.6, 4000))
     skipped = stays(fixture.interior, start, direction, reach, device)
     unit = direction / np.linalg.norm(direction, axis=1)[:, None]
-    distance = np.array([first_hit(fixture.mesh.vertices, fixture.mesh.faces, *ray) for ray in zip(start, unit, strict=True)])
+    distance = first_hit(fixture.mesh.vertices, fixture.mesh.faces, start, unit)
     hit = distance < reach * np.linalg.norm(direction, axis=1)
     assert not (skipped & hit).any()
     # It applies to many rays: those that start in the tote and go up, or end in it.

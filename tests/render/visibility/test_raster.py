@@ -12,14 +12,12 @@ from hypothesis import strategies as st
 
 from synpick_warp.codes import Segment
 from synpick_warp.errors import CatalogError
-from synpick_warp.kernels.render.visibility.camera import TILE_PIXELS
 from synpick_warp.scenes.types import Fixture, TriangleMesh
-from synpick_warp.stages.launch import launch_pixels
 from synpick_warp.stages.render import raster
 from synpick_warp.stages.render.view_setup import make_views
 from synpick_warp.system.hardware.device import pick_device
 from tests.harness.devices import default_device
-from tests.harness.trace_probe import trace_gbuffer_kernel
+from tests.harness.trace_probe import trace_gbuffer
 from tests.worlds.toy_scene import GREY, UPRIGHT, ToyScene, ball, box, camera, entry, flat_shaded, render, render_gbuffer, sheet
 
 VIEW = camera(96, 64, 150.0, (0.0, 0.0, 1.0))
@@ -36,10 +34,8 @@ def gbuffer_of(toy: ToyScene, device: wp.Device, by_rays: bool = False) -> dict[
     """G-buffer and amodal bits of world 0 seen by camera 0; `by_rays`: the G-buffer by ray tracing."""
     out, renderer = render_gbuffer(toy, device)
     if by_rays:
-        scene, zero = renderer.scene, wp.zeros(1, dtype=wp.int32, device=device)
-        inputs = [scene.meshes, scene.table, scene.cameras, scene.grid, renderer.bodies]
-        inputs += [make_views(zero, zero, 1, toy.instances), wp.vec2(0.0, 0.0)]
-        launch_pixels(trace_gbuffer_kernel, scene.grid.tiles * int(TILE_PIXELS), inputs, [renderer.gbuffer], device)
+        zero = wp.zeros(1, dtype=wp.int32, device=device)
+        trace_gbuffer(renderer.scene, renderer.bodies, make_views(zero, zero, 1, toy.instances), renderer.gbuffer, 1)
     found = {name: getattr(renderer.gbuffer, name).numpy()[0].copy() for name in ("segment", "triangle", "barycentric", "depth")}
     return found | {"amodal": out.amodal.numpy()[0].copy()}
 

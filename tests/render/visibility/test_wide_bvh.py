@@ -20,7 +20,7 @@ from synpick_warp.stages.render.wide_bvh import (
     needed_stack,
 )
 from synpick_warp.system.hardware.device import pick_device
-from tests.harness.bvh_probe import count_visits_kernel, hit_every_triangle_kernel, query_kernel
+from tests.harness.bvh_probe import hit_every_triangle, query_warp, query_wide, visits_of
 from tests.harness.devices import default_device
 from tests.worlds.toy_scene import ball, box
 
@@ -65,13 +65,11 @@ def rays_at(mesh: TriangleMesh, seed: int) -> tuple[np.ndarray, np.ndarray]:
 
 def run_queries(meshes: list[TriangleMesh], row: int, rays: tuple[np.ndarray, np.ndarray], reach: float, device: wp.Device, own: bool):
     """Hits (ray, 3) of (t, u, v), triangles (ray) and blocked rays (ray), by the wide BVH (`own`) or by Warp's."""
-    start, direction = (wp.array(values, dtype=wp.vec3, device=device) for values in rays)
-    outputs = [wp.zeros(RAYS, dtype=kind, device=device) for kind in (wp.vec3, int, int)]
+    if own:
+        return query_wide(build_wide_bvh(meshes, device), row, *rays, reach, device=device)
     points = wp.array(meshes[row].vertices, dtype=wp.vec3, device=device)
     mesh = wp.Mesh(points, wp.array(meshes[row].faces.reshape(-1), dtype=wp.int32, device=device))
-    inputs = [build_wide_bvh(meshes, device), mesh.id, row, int(own), start, direction, reach]
-    wp.launch(query_kernel, dim=RAYS, inputs=inputs, outputs=outputs, device=device)
-    return [output.numpy() for output in outputs]
+    return query_warp(mesh.id, *rays, reach, device=device)
 
 
 def check_queries(meshes: list[TriangleMesh], row: int, seed: int, reach: float) -> int:
@@ -90,7 +88,7 @@ def check_queries(meshes: list[TriangleMesh], row: int, seed: int, reach: float)
     point = u * corners[:, 0] + v * corners[:, 1] + (1.0 - u - v) * corners[:, 2]
     assert (np.abs(start + t * direction - point) < 1e-5 * (1.0 + t)).all()
     assert np.array_equal(blocked, expected_blocked)
-    assert np.array_equal(blocked == 1, hit[:, 0] >= 0.0)
+    assert np.array_equal(blocked, hit[:, 0] >= 0.0)
     return len(point)
 
 
@@ -220,13 +218,11 @@ def check_against_every_triangle(mesh: TriangleMesh, start: np.ndarray, directio
     """Distances of hits equal the smallest of all triangles' own, by the test that leaves use; the any-hit query agrees."""
     device = pick_device(default_device())
     hit, _, blocked = run_queries([mesh], 0, (start, direction), 1e30, device, own=True)
-    rays = [wp.array(values, dtype=wp.vec3, device=device) for values in (start, direction)]
     corners = wp.array(mesh.vertices[mesh.faces].reshape(-1, 3), dtype=wp.vec3, device=device)
-    nearest = wp.empty(len(start), dtype=float, device=device)
-    wp.launch(hit_every_triangle_kernel, dim=len(start), inputs=[corners, *rays], outputs=[nearest], device=device)
+    nearest = hit_every_triangle(corners, start, direction, device=device)
     assert (hit[:, 0] >= 0.0).sum() > 0.1 * len(start)
-    np.testing.assert_array_equal(hit[:, 0], nearest.numpy())
-    np.testing.assert_array_equal(blocked == 1, nearest.numpy() >= 0.0)
+    np.testing.assert_array_equal(hit[:, 0], nearest)
+    np.testing.assert_array_equal(blocked, nearest >= 0.0)
 
 
 def test_a_box_of_just_more_than_the_largest_coordinate_is_quantized():
@@ -241,8 +237,6 @@ def test_a_box_of_just_more_than_the_largest_coordinate_is_quantized():
 def test_queries_visit_few_nodes():
     """Nearest first, and none beyond a hit: most rays at a ball of 1,280 triangles visit about as many nodes as its tree has levels."""
     mesh, device = ball(0.1, 3), pick_device(default_device())
-    start, direction = rays_at(mesh, 0)
-    rays = [wp.array(values, dtype=wp.vec3, device=device) for values in (start, direction)]
-    visits = wp.empty(RAYS, dtype=int, device=device)
-    wp.launch(count_visits_kernel, dim=RAYS, inputs=[build_wide_bvh([mesh], device), *rays], outputs=[visits], device=device)
-    assert 5.0 < visits.numpy().mean() < 9.6
+    bvh = build_wide_bvh([mesh], device)
+    visits = visits_of(bvh, int(bvh.root.numpy()[0]), *rays_at(mesh, 0), 1e30, device=device)[:, 3]
+    assert 5.0 < visits.mean() < 9.6

@@ -1,0 +1,119 @@
+"""Model files made by hand: a tetrahedron as PLY and OBJ, pictures, and any mesh."""
+
+from __future__ import annotations
+
+import json
+import struct
+import zlib
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import trimesh
+from PIL import Image
+
+from synpick_warp.scenes.assets.meshes import MeshOptions, read_mesh
+
+CORNERS = [(0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, 1)]
+FACES = [(0, 2, 1), (0, 1, 3), (0, 3, 2), (1, 2, 3)]
+"""A tetrahedron."""
+OBJ = "mtllib a.mtl\n" + "".join(f"v {x} {y} {z}\n" for x, y, z in CORNERS) + "vt 0 0\nvt 1 0\nvt 1 1\nusemtl skin\n"
+OBJ += "f 1/1 3/2 2/3\nf 1/1 2/2 4/3\nf 1/1 4/2 3/3\nf 2/1 3/2 4/3\n"
+"""The tetrahedron with texture coordinates, in the material `skin` of a.mtl."""
+REAL_HULLS = {
+    1: 1.142,
+    2: 2.310,
+    3: 0.661,
+    4: 0.357,
+    5: 0.699,
+    6: 0.187,
+    7: 0.352,
+    8: 0.179,
+    9: 0.420,
+    10: 0.265,
+    11: 3.125,
+    12: 1.067,
+    13: 0.749,
+    14: 0.525,
+    15: 1.292,
+    16: 1.605,
+    17: 0.129,
+    18: 0.033,
+    19: 0.377,
+    20: 0.601,
+    21: 0.197,
+}
+"""Litres of the convex hulls of the real objects by obj_id, as the README of the real data gives them: what an arrangement's volume
+budget counts."""
+
+
+def ascii_ply(vertices, faces=FACES, columns=("x", "y", "z"), comment="", face_tail=None) -> str:
+    """PLY as text; `face_tail`: what follows after the corners of each face, its texture coordinates."""
+    rows = [" ".join(str(value) for value in row) for row in vertices]
+    tails = face_tail or [""] * len(faces)
+    rows += [f"{len(face)} {' '.join(map(str, face))} {tail}".strip() for face, tail in zip(faces, tails, strict=True)]
+    header = _header("ascii", len(vertices), len(faces), columns, comment)
+    header += ["property list uchar float texcoord"] if face_tail else []
+    return "\n".join([*header, "end_header", *rows]) + "\n"
+
+
+def binary_ply(vertices, faces=FACES, columns=("x", "y", "z"), comment="") -> bytes:
+    """PLY in binary."""
+    body = np.asarray(vertices, "<f4").tobytes() + b"".join(struct.pack("<B3i", 3, *face) for face in faces)
+    return "\n".join([*_header("binary_little_endian", len(vertices), len(faces), columns, comment), "end_header\n"]).encode() + body
+
+
+def _header(kind: str, vertices: int, faces: int, columns, comment: str) -> list[str]:
+    lines = ["ply", f"format {kind} 1.0", *filter(None, [comment]), f"element vertex {vertices}"]
+    lines += [f"property {'uchar' if name in ('red', 'green', 'blue') else 'float'} {name}" for name in columns]
+    return [*lines, f"element face {faces}", "property list uchar int vertex_indices"]
+
+
+def exported(mesh: trimesh.Trimesh | trimesh.Scene, kind: str = "ply") -> bytes:
+    """Model file of any kind."""
+    data: Any = mesh.export(file_type=kind)
+    return data if isinstance(data, bytes) else data.encode()
+
+
+def glb(*meshes: trimesh.Trimesh) -> bytes:
+    """GLB file of meshes."""
+    return exported(trimesh.Scene(list(meshes)), "glb")
+
+
+def pack_glb(text: bytes, binary: bytes) -> bytes:
+    """GLB file of a JSON and a binary chunk."""
+    chunks = struct.pack("<I4s", len(text), b"JSON") + text + struct.pack("<I4s", len(binary), b"BIN\0") + binary
+    return struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks
+
+
+def unpack_glb(data: bytes) -> tuple[dict[str, Any], bytes]:
+    """JSON and binary chunk of a GLB file."""
+    (length,) = struct.unpack_from("<I", data, 12)
+    return json.loads(data[20 : 20 + length]), data[28 + length :]
+
+
+def pack_png(
+    width: int, height: int, *between: tuple[bytes, bytes], depth: int = 8, kind: int = 0, rest: tuple[int, ...] = (0, 0, 0)
+) -> bytes:
+    """PNG file of chunks (kind, data) between the header and the end."""
+    chunks = ((b"IHDR", struct.pack(">IIBBBBB", width, height, depth, kind, *rest)), *between, (b"IEND", b""))
+    packed = [struct.pack(">I", len(data)) + name + data + struct.pack(">I", zlib.crc32(name + data)) for name, data in chunks]
+    return b"\x89PNG\r\n\x1a\n" + b"".join(packed)
+
+
+def picture(path: Path, color=(200, 10, 30), size=(4, 2)) -> Path:
+    """Write an image of one colour."""
+    Image.new("RGB", size, color).save(path)
+    return path
+
+
+def put(path: Path, content: str | bytes) -> Path:
+    """Write a file, with its folder."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_bytes(content if isinstance(content, bytes) else content.encode())
+    return path
+
+
+def read(path: Path, content: str | bytes, options: MeshOptions | None = None, scale: float = 1.0) -> tuple[Any, Any]:
+    """Write a model file, and read it: mesh and finish."""
+    return read_mesh(put(path, content), scale, options or MeshOptions())
