@@ -74,9 +74,7 @@ class View:
 
     def _image(self, name: str, channels: int | None, dtype: str) -> np.ndarray:
         """An image of the camera's size, with these channels."""
-        return check_planes(
-            self._files.image(name, self.image_id), channels, f"{name} of image {self.image_id} in {self._files.place}", dtype
-        )
+        return _read_image(self._files, name, self.image_id, channels, dtype)
 
     @cached_property
     def masks(self) -> np.ndarray:
@@ -104,11 +102,7 @@ class View:
         Raises:
             DatasetError: The data set has no such layer.
         """
-        if name not in LAYERS:
-            raise DatasetError(f"there is no layer {name}; layers: {', '.join(LAYERS)}")
-        dtype, channels = image_format(name)
-        image = self._image(name, channels, dtype)
-        return decode_layer(name, image if channels is None else image[..., ::-1])
+        return read_layer(self._files, name, self.image_id)
 
     @cached_property
     def intrinsics(self) -> np.ndarray:
@@ -189,6 +183,19 @@ class View:
 
     def __repr__(self) -> str:
         return f"View(episode {self.episode}, camera {self.camera}, frame {self.frame})"
+
+
+def read_layer(files: SceneFiles, name: str, frame: int) -> np.ndarray:
+    """Decode a layer of one image; values, units, shapes and errors as of `View.layer`."""
+    if name not in LAYERS:
+        raise DatasetError(f"there is no layer {name}; layers: {', '.join(LAYERS)}")
+    dtype, channels = image_format(name)
+    image = _read_image(files, name, frame, channels, dtype)
+    return decode_layer(name, image if channels is None else image[..., ::-1])
+
+
+def _read_image(files: SceneFiles, name: str, frame: int, channels: int | None, dtype: str) -> np.ndarray:
+    return check_planes(files.image(name, frame), channels, f"{name} of image {frame} in {files.place}", dtype)
 
 
 def make_transform(rotation: Any, translation: Any) -> np.ndarray:

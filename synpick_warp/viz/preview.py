@@ -202,7 +202,6 @@ def _read_depth(view: _View) -> np.ndarray | None:
 
 def _row(view: _View, depth_scale: DepthScale | None, baked: Baked, most: int) -> Image:
     """Draw all panels of a view side by side; `most` is the largest number of instances of all views."""
-    folder, sensor = view.scene.folder, view.scene.sensor
     depth = _read_depth(view)
     colored = None if depth is None else color_depth(depth, depth_scale)
     color = view.files.image("rgb", view.frame) if view.files.has("rgb") or colored is None else colored
@@ -221,7 +220,7 @@ def _row(view: _View, depth_scale: DepthScale | None, baked: Baked, most: int) -
     ]
     count = float(view.camera.get("depth_scale", 1.0))
     counts = depth_scale and DepthScale(*(each / count for each in depth_scale))
-    layers = layer_pictures(folder, view.frame, size, sensor, counts)
+    layers = layer_pictures(view.files, view.frame, counts)
     panels += [(caption, partial(_fit, picture, smooth=False)) for caption, picture in layers]
     scale = min(_PANEL_WIDTH / size[0], _MAX_PANEL_HEIGHT / size[1])
     drawn = [(caption, draw(scale)) for caption, draw in panels]

@@ -12,8 +12,9 @@ import pytest
 
 from synpick_warp.configs.schema import LAYERS
 from synpick_warp.dataset.manifest import episode_entry, read_checksums
+from synpick_warp.dataset.view import read_layer
+from synpick_warp.dataset.view_files import SceneFolder
 from synpick_warp.factory import assembly
-from synpick_warp.layer_codec import read_layer
 from synpick_warp.pipeline import run_bake
 from synpick_warp.progress import SilentProgress
 from tests.worlds.sights import SHORT
@@ -76,7 +77,7 @@ class View:
         return None
 
     def layer(self, name: str) -> np.ndarray:
-        return read_layer(self.scene, name, self.frame)
+        return read_layer(SceneFolder(self.scene), name, self.frame)
 
 
 def views(split: Path) -> list[View]:
