@@ -161,7 +161,7 @@ def convert_found(data: DataSet, out: Path, formats: Sequence[str], processes: i
     _check_formats(data, first, formats)
     check_output_folder(out)
     if out.is_dir() and any(out.iterdir()):
-        raise ConfigError(f"--out is {out}, which is not empty; name a new folder: data sets that no bake wrote are converted as a whole")
+        raise ConfigError(f"--out is {out}, which is not empty; name a new folder: data sets from other sources are converted as a whole")
     config = _make_config(data, first, formats)
     try:
         make_folder(out.parent)
@@ -192,7 +192,7 @@ def _check_formats(data: DataSet, first: SceneFiles, formats: Sequence[str]) -> 
         if name not in contents:
             raise ConfigError(f"--to names {name}; allowed: {', '.join(each for each in contents if contents[each] <= _IMAGES)}")
         if not contents[name] <= _IMAGES:
-            raise ConfigError(f"--to names {name}, which is made of trajectories; {data.folder} has none, as no bake wrote it")
+            raise ConfigError(f"--to names {name}, which is made of trajectories; {data.folder} is from another source and has none")
         if (name == "bop" and isinstance(first, SceneFolder)) or (name == "shards" and first.place.suffix == ".tar"):
             raise ConfigError(f"--to names {name}, which {data.folder} has already; copy the folder")
         (kind,) = load_exporter_classes([name])
