@@ -6,9 +6,11 @@ from collections.abc import Iterator
 
 import numpy as np
 from scipy.spatial import KDTree
+from trimesh.transformations import rotation_matrix
 
 from synpick_warp.dataset.bop.layout import MODEL_FILE
-from synpick_warp.validation.model_files import ModelsFolder, ModelSubject, diameter, sample_area, turn_about
+from synpick_warp.scenes.assets.models_info import ROTATION_TOLERANCE, is_rigid
+from synpick_warp.validation.model_files import ModelsFolder, ModelSubject, diameter, sample_area
 from synpick_warp.validation.registry import Findings, Level, rule
 
 LENGTH_TOLERANCE = 1e-3
@@ -22,7 +24,6 @@ ANGLES = (0.7, 1.9, 3.3)
 """Angles by which continuous symmetries are tried [rad]."""
 TINY = 3.0
 """Diameter of a model that looks like metres [mm]: BOP's smallest object has 24 mm, and 3 m is larger than any."""
-RIGID_TOLERANCE = 1e-3
 _NUMBERS = {"float", "double", "int", "uint", "uchar"}
 """Types that the toolkit's reader knows in binary files."""
 _VERTEX = {"x", "y", "z", "nx", "ny", "nz", "red", "green", "blue", "alpha", "texture_u", "texture_v"}
@@ -134,7 +135,7 @@ def check_origin(model: ModelSubject) -> Findings:
 def check_identity(model: ModelSubject) -> Findings:
     """symmetries_discrete does not list the identity: the toolkit adds it."""
     for index, matrix in _discrete(model):
-        if np.abs(matrix - np.eye(4)).max() <= RIGID_TOLERANCE:
+        if np.abs(matrix - np.eye(4)).max() <= ROTATION_TOLERANCE:
             yield model.info_file, f"object {model.obj_id}: symmetries_discrete[{index}] is the identity"
 
 
@@ -142,7 +143,7 @@ def check_identity(model: ModelSubject) -> Findings:
 def check_rigid(model: ModelSubject) -> Findings:
     """Symmetries are rigid: a rotation and a translation [mm], row by row; axes are not 0."""
     for index, matrix in _discrete(model):
-        if not _is_rigid(matrix):
+        if not is_rigid(matrix):
             hint = "; it looks column by column" if np.abs(matrix[3, :3]).max() > 0.0 and not matrix[:3, 3].any() else ""
             yield model.info_file, f"object {model.obj_id}: symmetries_discrete[{index}] is not rigid{hint}"
     for index, (axis, _) in _continuous(model):
@@ -153,10 +154,10 @@ def check_rigid(model: ModelSubject) -> Findings:
 @rule(ModelSubject, "symmetry-maps", "remove the symmetry, or correct its axis, offset or translation")
 def check_symmetries(model: ModelSubject) -> Findings:
     """Symmetries map the model onto itself: no point moves away from the surface by more than 15 mm and a tenth of the diameter."""
-    transforms = [(f"symmetries_discrete[{index}]", matrix) for index, matrix in _discrete(model) if _is_rigid(matrix)]
+    transforms = [(f"symmetries_discrete[{index}]", matrix) for index, matrix in _discrete(model) if is_rigid(matrix)]
     for index, (axis, offset) in _continuous(model):
         if np.linalg.norm(axis) > 0.0:
-            transforms += [(f"symmetries_continuous[{index}]", turn_about(axis, offset, angle)) for angle in ANGLES]
+            transforms += [(f"symmetries_continuous[{index}]", rotation_matrix(angle, axis, offset)) for angle in ANGLES]
     mesh = model.mesh[0]
     if not transforms or mesh is None:
         return
@@ -170,12 +171,6 @@ def check_symmetries(model: ModelSubject) -> Findings:
     for name, distance in farthest.items():
         if distance > bound:
             yield model.info_file, f"object {model.obj_id}: {name} moves a point {distance:.3g} mm off the surface; allowed: {bound:.3g} mm"
-
-
-def _is_rigid(matrix: np.ndarray) -> bool:
-    rotation = matrix[:3, :3]
-    off = max(np.abs(rotation @ rotation.T - np.eye(3)).max(), np.abs(matrix[3] - (0, 0, 0, 1)).max(), abs(np.linalg.det(rotation) - 1.0))
-    return bool(off <= RIGID_TOLERANCE)
 
 
 def _discrete(model: ModelSubject) -> Iterator[tuple[int, np.ndarray]]:
