@@ -11,9 +11,6 @@ import time
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
-import numpy as np
-import warp as wp
-
 from synpick_warp.configs.schema import Cameras, Config
 from synpick_warp.factory.assembly import make_renderer
 from synpick_warp.scenes.cameras import make_cameras
@@ -22,12 +19,12 @@ from synpick_warp.scenes.fixtures import make_fixtures
 from synpick_warp.scenes.lights import load_lights
 from synpick_warp.stages.buffers import Snapshot, ViewBuffers, allocate
 from synpick_warp.stages.render.scene import RenderScene, build_render_scene
-from synpick_warp.stages.render.view_setup import make_views
 from synpick_warp.stages.sim.physics import with_enough_worlds
 from synpick_warp.stages.sim.simulate import Simulation
 from synpick_warp.stages.stream import view_sizes
 from synpick_warp.system.device import pick_device
 from tools.bench.physics import BURST, FOREVER, seconds_per_call
+from tools.bench.stream import first_views
 from tools.options import Row
 
 DROP_TICKS = 24
@@ -77,9 +74,7 @@ class Assets:
         count = min(sizes["view"], config.bake.worlds * cameras)
         histories = config.bake.worlds * cameras
         renderer = make_renderer(config, scene, config.arrangement.max_objects, sizes["view"], histories)
-        images, view = allocate(ViewBuffers, sizes, self.device), np.arange(count, dtype=np.int32)
-        rows = [wp.array(values, dtype=wp.int32, device=self.device) for values in (view // cameras, view % cameras)]
-        views = make_views(rows[0], rows[1], count, renderer.instances)
+        images, views = allocate(ViewBuffers, sizes, self.device), first_views(count, cameras, renderer)
         return seconds_per_call(lambda: renderer.render(pile.snapshot, views, images), self.device, self.min_seconds, BURST) / count
 
 
