@@ -77,7 +77,7 @@ class FoundViewFiles(StoredViewFiles):
     def layer(self, name: str) -> Buffer:
         """See `StoredView`."""
         suffix, data = self.files.image_file(name, self.frame)
-        return data if suffix == ".png" else encode_png(self._image(name, None, "uint16"))
+        return data if suffix == ".png" else encode_png(self.files.typed_image(name, self.frame, None, "uint16"))
 
     def masks(self) -> list[Masks]:
         """See `EncodedView`; where there are no amodal masks, COCO's formats need none."""

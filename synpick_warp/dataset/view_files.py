@@ -146,6 +146,10 @@ class SceneFiles(ABC):
             return to_color(decode_picture(data, source, DatasetError))
         return decode_picture(data, source, DatasetError, self.image_size(frame))
 
+    def typed_image(self, name: str, frame: int, channels: int | None, dtype: str) -> np.ndarray:
+        """An `image`, with its channels and type checked; see `check_planes`."""
+        return check_planes(self.image(name, frame), channels, f"{name} of image {frame} in {self.place}", dtype)
+
     def image_file(self, name: str, frame: int) -> tuple[str, bytes]:
         """Suffix and content of an image's file, which states the scene's size; `name` as for `image`."""
         suffix, data, source = self._need(name, frame)

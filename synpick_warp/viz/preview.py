@@ -20,7 +20,7 @@ from synpick_warp.dataset.bop.layout import NoLayoutError
 from synpick_warp.dataset.bop.scenes import FoundScenes
 from synpick_warp.dataset.manifest import CONFIG_FILE, episode_entry, read_entry
 from synpick_warp.dataset.object_names import object_names
-from synpick_warp.dataset.view_files import SceneFiles, check_planes
+from synpick_warp.dataset.view_files import SceneFiles
 from synpick_warp.errors import DatasetError, OutputError, SynpickError
 from synpick_warp.viz.depth_colors import DepthScale, color_depth, describe_depth, pooled_scale, tote_scale
 from synpick_warp.viz.drawing import GOLDEN, Image, check_picture_name, instance_color, put_text, write_picture
@@ -51,10 +51,6 @@ class Scene:
     """Suffix of the sensor's folders and files, such as "_cam1"; empty: classic layout."""
     files: Callable[[], SceneFiles] = field(compare=False, repr=False, kw_only=True)
     """Opens it; what others leave out may be missing."""
-
-    def images(self, name: str) -> Path:
-        """Folder of one kind of images, such as "rgb"."""
-        return self.folder / f"{name}{self.sensor}"
 
 
 @dataclass(frozen=True)
@@ -196,7 +192,7 @@ def _read_depth(view: _View) -> np.ndarray | None:
     """Depth image of a view [mm]; None: it has none."""
     if not view.files.has("depth") or "depth_scale" not in view.camera:
         return None
-    counts = check_planes(view.files.image("depth", view.frame), None, f"{view.scene.images('depth')}/{view.frame:06d}")
+    counts = view.files.typed_image("depth", view.frame, None, "")
     return counts * float(view.camera["depth_scale"])
 
 
