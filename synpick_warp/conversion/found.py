@@ -29,7 +29,7 @@ from synpick_warp.exporters.base import ExportContext
 from synpick_warp.exporters.bop.shared.models import MODEL_FOLDERS
 from synpick_warp.exporters.formats import contents_of, convertible
 from synpick_warp.exporters.registry import Exporters, finalize, load_exporter_classes
-from synpick_warp.exporters.writing.files import PARTIAL, check_output_folder, output_error, write_atomically
+from synpick_warp.exporters.writing.files import PARTIAL, check_output_folder, output_error, output_errors, write_atomically
 from synpick_warp.exporters.writing.folder import Buffer
 from synpick_warp.exporters.writing.notes import CAMERA_FILE, NOTES_FILE
 from synpick_warp.exporters.writing.png import encode_png
@@ -163,11 +163,9 @@ def convert_found(data: DataSet, out: Path, formats: Sequence[str], processes: i
     if out.is_dir() and any(out.iterdir()):
         raise ConfigError(f"--out is {out}, which is not empty; name a new folder: data sets from other sources are converted as a whole")
     config = _make_config(data, first, formats)
-    try:
+    with output_errors(out):
         make_folder(out.parent)
         work = Path(tempfile.mkdtemp(prefix=f".{out.name}.", dir=out.parent))
-    except OSError as error:
-        raise output_error(out, error) from error
     try:
         count = _write(data, work, config, processes, report)
         work.chmod(0o755)

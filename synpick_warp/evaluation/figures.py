@@ -23,7 +23,7 @@ from synpick_warp.evaluation.tables import summarize
 from synpick_warp.evaluation.tracking.sweep import AlphaSweep, split_by_mode, sweep_alpha
 from synpick_warp.evaluation.tracking.tracks import find_tracks, track_of_instance
 from synpick_warp.evaluation.truth import Truth
-from synpick_warp.exporters.writing.files import output_error, write_atomically
+from synpick_warp.exporters.writing.files import output_errors, write_atomically
 from synpick_warp.system.folders import make_folder
 
 Track = tuple[int, int]
@@ -226,9 +226,7 @@ def write_figures(folder: Path, pictures: Mapping[str, bytes]) -> Iterator[Path]
         OutputError: A file cannot be written.
     """
     for name, picture in pictures.items():
-        try:
+        with output_errors(folder / name):
             make_folder(folder)
             write_atomically(folder / name, picture)
-        except OSError as error:
-            raise output_error(folder / name, error) from error
         yield folder / name
