@@ -322,16 +322,14 @@ def check_trace_file(trace: Path, out: Path) -> None:
 def _bake_profiled(config: Config, out: Path, shard: tuple[int, int], splits: Sequence[str], trace: Path) -> int:
     """Bake with the profiler on; print the table and write the trace."""
     from synpick_warp.cli.display import make_console, print_profile
-    from synpick_warp.exporters.writing.files import output_error
+    from synpick_warp.exporters.writing.files import output_errors
     from synpick_warp.stages.timing import record
 
     with record() as recorder:
         code = _bake(config, out, shard, splits)
     print_profile(make_console(), recorder)
-    try:
+    with output_errors(trace):
         recorder.write_trace(trace)
-    except OSError as error:
-        raise output_error(trace, error) from error
     print(f"trace: {trace}")
     return code
 

@@ -16,7 +16,7 @@ import numpy as np
 from synpick_warp.codes import Ending
 from synpick_warp.configs.schema import Config
 from synpick_warp.exporters.base import ExportContext, StoredScene
-from synpick_warp.exporters.writing.files import PARTIAL, output_error
+from synpick_warp.exporters.writing.files import PARTIAL, output_errors
 from synpick_warp.exporters.writing.pool import WriterPool, WriteTask
 from synpick_warp.views.frames import EpisodeEnd, FrameBatch, TickBatch
 
@@ -116,12 +116,10 @@ class EpisodeExporter(ABC, Generic[_Content]):
             # A suffix unique to each arrangement: the discarded one's folder may not be removed yet.
             self._arrangements += 1
             folder = self._staging / f"{index:06d}-{self._arrangements}"
-            try:
+            with output_errors(folder):
                 self._staging.mkdir(exist_ok=True)
                 folder.mkdir()
                 episode = self._episodes[index] = StagedEpisode(index, folder, make_content(folder))
-            except OSError as error:
-                raise output_error(folder, error) from error
         return episode
 
     def _task(

@@ -12,10 +12,11 @@ import pytest
 
 from synpick_warp.configs.schema import LAYERS
 from synpick_warp.dataset.commit.manifest import episode_entry, read_checksums
+from synpick_warp.dataset.view import read_layer
+from synpick_warp.dataset.view_files import SceneFolder
 from synpick_warp.factory import assembly
 from synpick_warp.factory.pipeline import run_bake
 from synpick_warp.system.progress import SilentProgress
-from synpick_warp.views.layer_codec import read_layer
 from tests.worlds.sights import SHORT
 from tests.worlds.small_worlds import catalog, settings
 
@@ -76,7 +77,7 @@ class View:
         return None
 
     def layer(self, name: str) -> np.ndarray:
-        return read_layer(self.scene, name, self.frame)
+        return read_layer(SceneFolder(self.scene), name, self.frame)
 
 
 def views(split: Path) -> list[View]:

@@ -17,7 +17,7 @@ from synpick_warp.configs.load import load_config
 from synpick_warp.configs.write import config_to_toml
 from synpick_warp.errors import DatasetError
 from synpick_warp.system.inputs.files import check_regular_file, read_file
-from synpick_warp.system.inputs.json import decode_json, read_json_lines
+from synpick_warp.system.inputs.json import decode_json
 from synpick_warp.system.inputs.paths import path_inside
 from synpick_warp.system.inputs.toml import MAX_TOML, decode_toml, read_toml
 
@@ -113,12 +113,6 @@ def test_json_errors_name_source_place_and_advice(data, message):
 def test_deep_json_is_refused():
     with pytest.raises(DatasetError, match="nested too deeply"):
         decode_json(b"[" * 10**6, Any, "F", DatasetError)
-
-
-def test_lines_are_numbered(tmp_path):
-    (tmp_path / "list").write_text('{"count": 1}\n{"count": null}\n')
-    with pytest.raises(DatasetError, match=r"list, line 2, is damaged: expected int, got null - at \$.count"):
-        list(read_json_lines(tmp_path / "list", Record, DatasetError))
 
 
 # ---- TOML ----

@@ -308,7 +308,7 @@ def test_trajectories_are_baked_without_rendering_views(tmp_path, monkeypatch):
 
 def test_each_factor_changes_its_setting_alone():
     config = bench.Config()
-    varied = {factor: growth.VARIATIONS[factor](config, factor == "paths" or 0.5) for factor in growth.VARIATIONS}
+    varied = {factor: growth.vary(config, factor, factor == "paths" or 0.5) for factor in growth.FACTORS}
     assert varied["objects"][0] == "3.5 l"
     assert varied["resolution"][0] == "960x540"
     assert varied["paths"][0] == "1"
@@ -323,7 +323,7 @@ def test_each_factor_changes_its_setting_alone():
 
 def test_more_cameras_are_turned_about_the_vertical():
     cameras = replace(bench.Config().cameras, positions=((1.0, 2.0, 3.0), (0.0, 0.0, 2.0)), ups=((0.0, 0.0, 1.0), (0.0, 1.0, 0.0)))
-    value, varied = growth.vary_cameras(replace(bench.Config(), cameras=cameras), 1.5)
+    value, varied = growth.vary(replace(bench.Config(), cameras=cameras), "cameras", 1.5)
     assert value == "3"
     assert varied.cameras.positions == ((1.0, 2.0, 3.0), (0.0, 0.0, 2.0), (-1.0, -2.0, 3.0))
     assert varied.cameras.ups == ((0.0, 0.0, 1.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
@@ -332,8 +332,8 @@ def test_more_cameras_are_turned_about_the_vertical():
 def test_growth_has_rows_of_all_factors(tmp_path, monkeypatch):
     monkeypatch.setattr(growth, "DROP_TICKS", 1)
     monkeypatch.setattr(growth, "BURST", 1)
-    monkeypatch.setattr(growth, "PATHS", (4,))
-    monkeypatch.setattr(growth, "FRACTIONS", {"worlds": (0.5, 0.4), "objects": (0.5,), "resolution": (0.5,), "cameras": (2.0,)})
+    factors = {"worlds": (0.5, 0.4), "objects": (0.5,), "resolution": (0.5,), "paths": (4,), "cameras": (2.0,)}
+    monkeypatch.setattr(growth, "FACTORS", factors)
     monkeypatch.setattr(physics, "MIN_REPEATS", 1)
     file = tmp_path / "growth.json"
     assert bench.main([*TINY, "--parts", "growth", "--seconds", "0", "--json", str(file)]) == 0

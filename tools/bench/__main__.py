@@ -32,7 +32,6 @@ from synpick_warp.errors import SynpickError
 from synpick_warp.exporters.registry import Needs
 from synpick_warp.factory.assembly import Factory, build_factory
 from synpick_warp.stages import timing
-from synpick_warp.stages.render.view_setup import make_views
 from synpick_warp.stages.sim.physics import with_enough_worlds
 from synpick_warp.stages.sim.simulate import Simulation
 from synpick_warp.stages.stream import TickReader, TickReport
@@ -44,7 +43,7 @@ from tools.bench.growth import measure_growth
 from tools.bench.physics import BURST, measure_simulation, seconds_per_call
 from tools.bench.pictures import measure_pictures
 from tools.bench.steady import measure_steady
-from tools.bench.stream import measure_stream
+from tools.bench.stream import first_views, measure_stream
 from tools.bench.trajectories import measure_trajectories
 from tools.bench.whole import WholeBake, measure_whole
 from tools.bench.write import measure_writing
@@ -220,7 +219,9 @@ def _measure_worlds(quality: int, factory: Factory, min_seconds: float, parts: t
     if "encode" in parts:
         count = min(factory.stream.batch, factory.simulation.layout.worlds * len(factory.cameras))
         images = factory.stream.buffers[0]
-        factory.stream.renderer.render(factory.simulation.record.snapshot, _first_views(factory, count), images)
+        factory.stream.renderer.render(
+            factory.simulation.record.snapshot, first_views(count, len(factory.cameras), factory.stream.renderer), images
+        )
         device = factory.simulation.device
         yield from of_part("encode", measure_encoding(images, count, quality, device, min_seconds))
 
@@ -259,7 +260,8 @@ def _measure_rendering(factory: Factory, min_seconds: float) -> Iterator[Row]:
     device, cameras = simulation.device, len(factory.cameras)
     count = min(stream.batch, simulation.layout.worlds * cameras)
     yield Row("views in a batch", count, "")
-    views, out, renderer = _first_views(factory, count), stream.buffers[0], stream.renderer
+    out, renderer = stream.buffers[0], stream.renderer
+    views = first_views(count, cameras, renderer)
 
     def render() -> None:
         renderer.render(simulation.record.snapshot, views, out)
@@ -284,13 +286,6 @@ def _measure_rendering(factory: Factory, min_seconds: float) -> Iterator[Row]:
     report = _mark_live(simulation, worlds)
     seconds = seconds_per_call(lambda: [len(batch) for batch in stream.render(simulation.record.snapshot, report)], device, min_seconds)
     yield Row("views, all stages and copies", worlds * cameras / seconds, "1/s")
-
-
-def _first_views(factory: Factory, count: int) -> Any:
-    """The struct `Views` of the first `count` views: world by world and camera by camera."""
-    cameras, renderer, view = len(factory.cameras), factory.stream.renderer, np.arange(count, dtype=np.int32)
-    world, camera = (wp.array(values, dtype=wp.int32, device=renderer.scene.device) for values in (view // cameras, view % cameras))
-    return make_views(world, camera, count, renderer.instances)
 
 
 def _time_passes(render: Callable[[], None], device: wp.Device, min_seconds: float) -> dict[str, float]:

@@ -8,11 +8,8 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
-
-import numpy as np
-import warp as wp
 
 from synpick_warp.configs.schema import Cameras, Config
 from synpick_warp.factory.assembly import make_renderer
@@ -22,20 +19,19 @@ from synpick_warp.scenes.fixtures import make_fixtures
 from synpick_warp.scenes.lights import load_lights
 from synpick_warp.stages.buffers import Snapshot, ViewBuffers, allocate
 from synpick_warp.stages.render.scene import RenderScene, build_render_scene
-from synpick_warp.stages.render.view_setup import make_views
 from synpick_warp.stages.sim.physics import with_enough_worlds
 from synpick_warp.stages.sim.simulate import Simulation
 from synpick_warp.stages.stream import view_sizes
 from synpick_warp.system.hardware.device import pick_device
 from tools.bench.physics import BURST, FOREVER, seconds_per_call
+from tools.bench.stream import first_views
 from tools.options import Row
 
 DROP_TICKS = 24
 """Ticks from the drop to the measurement: 1.6 s, in which nearly all objects land."""
-FRACTIONS = {"worlds": (0.125, 0.25, 0.5), "objects": (0.25, 0.5), "resolution": (1 / 3, 2 / 3), "cameras": (1 / 3, 2.0)}
-"""Values of each factor, as multiples of the settings' own: worlds, volume of the objects, image width and height, cameras."""
-PATHS = (1, 2, 4)
-"""Paths per coarse pixel."""
+FACTORS = {"worlds": (0.125, 0.25, 0.5), "objects": (0.25, 0.5), "resolution": (1 / 3, 2 / 3), "paths": (1, 2, 4), "cameras": (1 / 3, 2.0)}
+"""Values of each factor: paths per coarse pixel, and multiples of the settings' own worlds, volume of the objects, image width and height,
+cameras."""
 
 
 @dataclass(frozen=True)
@@ -78,57 +74,36 @@ class Assets:
         count = min(sizes["view"], config.bake.worlds * cameras)
         histories = config.bake.worlds * cameras
         renderer = make_renderer(config, scene, config.arrangement.max_objects, sizes["view"], histories)
-        images, view = allocate(ViewBuffers, sizes, self.device), np.arange(count, dtype=np.int32)
-        rows = [wp.array(values, dtype=wp.int32, device=self.device) for values in (view // cameras, view % cameras)]
-        views = make_views(rows[0], rows[1], count, renderer.instances)
+        images, views = allocate(ViewBuffers, sizes, self.device), first_views(count, cameras, renderer)
         return seconds_per_call(lambda: renderer.render(pile.snapshot, views, images), self.device, self.min_seconds, BURST) / count
 
 
-def vary_worlds(config: Config, factor: float) -> tuple[str, Config]:
-    """Other number of worlds."""
-    worlds = max(1, round(factor * config.bake.worlds))
-    config = with_enough_worlds(config.with_values({"bake.worlds": worlds}), pick_device(config.bake.device))
-    return str(config.bake.worlds), config
+def vary(config: Config, factor: str, value: float) -> tuple[str, Config]:
+    """The settings with one factor changed, and its new value in words; `value` is a multiple of the old one, or the number of paths.
 
-
-def vary_objects(config: Config, factor: float) -> tuple[str, Config]:
-    """Other volume of the objects."""
-    volume = factor * config.arrangement.volume
-    return f"{1e3 * volume:.3g} l", config.with_values({"arrangement.volume": volume})
-
-
-def vary_resolution(config: Config, factor: float) -> tuple[str, Config]:
-    """Other image size of the same shape."""
-    width, height = (max(1, round(factor * size)) for size in config.cameras.resolution)
-    return f"{width}x{height}", config.with_values({"cameras.resolution": (width, height)})
-
-
-def vary_paths(config: Config, paths: float) -> tuple[str, Config]:
-    """Other number of paths per coarse pixel."""
-    return str(int(paths)), config.with_values({"render.coarse_paths": int(paths)})
-
-
-def vary_cameras(config: Config, factor: float) -> tuple[str, Config]:
-    """Other number of cameras: the first ones, or all, and then these turned by 180° about the vertical."""
-    cameras, present = config.cameras, len(config.cameras.positions)
-    count = max(1, round(factor * present))
-    chosen = replace(cameras, positions=_turn(cameras, "positions", count), ups=_turn(cameras, "ups", count))
-    return str(count), replace(config, cameras=chosen)
+    More cameras than there are are these again, turned by 180° about the vertical.
+    """
+    if factor == "worlds":
+        worlds = max(1, round(value * config.bake.worlds))
+        config = with_enough_worlds(config.with_values({"bake.worlds": worlds}), pick_device(config.bake.device))
+        return str(config.bake.worlds), config
+    if factor == "objects":
+        volume = value * config.arrangement.volume
+        return f"{1e3 * volume:.3g} l", config.with_values({"arrangement.volume": volume})
+    if factor == "resolution":
+        width, height = (max(1, round(value * size)) for size in config.cameras.resolution)
+        return f"{width}x{height}", config.with_values({"cameras.resolution": (width, height)})
+    if factor == "paths":
+        return str(int(value)), config.with_values({"render.coarse_paths": int(value)})
+    cameras = config.cameras
+    count = max(1, round(value * len(cameras.positions)))
+    return str(count), replace(config, cameras=replace(cameras, **{name: _turn(cameras, name, count) for name in ("positions", "ups")}))
 
 
 def _turn(cameras: Cameras, name: str, count: int) -> tuple[tuple[float, float, float], ...]:
     vectors = getattr(cameras, name)
     repeats = math.ceil(count / len(vectors))
     return tuple(((-1) ** turn * x, (-1) ** turn * y, z) for turn in range(repeats) for x, y, z in vectors)[:count]
-
-
-VARIATIONS: dict[str, Callable[[Config, float], tuple[str, Config]]] = {
-    "worlds": vary_worlds,
-    "objects": vary_objects,
-    "resolution": vary_resolution,
-    "paths": vary_paths,
-    "cameras": vary_cameras,
-}
 
 
 def measure_growth(config: Config, min_seconds: float) -> Iterator[Row]:
@@ -138,8 +113,8 @@ def measure_growth(config: Config, min_seconds: float) -> Iterator[Row]:
     scene = assets.build_scene(config)
     pile = assets.drop(config, scene)
     yield from _rows("as set", config.physics.steps_per_tick * config.bake.worlds, pile, assets.time_view(config, scene, pile))
-    for factor, vary in VARIATIONS.items():
-        for value, varied in dict(vary(config, multiple) for multiple in FRACTIONS.get(factor, PATHS)).items():
+    for factor, values in FACTORS.items():
+        for value, varied in dict(vary(config, factor, each) for each in values).items():
             other = assets.build_scene(varied) if factor in ("resolution", "cameras") else scene
             dropped = assets.drop(varied, scene) if factor in ("worlds", "objects") else None
             view = assets.time_view(varied, other, dropped or pile)

@@ -123,6 +123,13 @@ def batch_views(world: np.ndarray, camera: np.ndarray, size: int, renderer: Rend
         yield make_views(rows[0], rows[1], len(rows[0]), renderer.instances)
 
 
+def first_views(count: int, cameras: int, renderer: Renderer) -> Any:
+    """The struct `Views` of the first `count` views: world by world, and camera by camera in each."""
+    view = np.arange(count, dtype=np.int32)
+    (views,) = batch_views(view // cameras, view % cameras, count, renderer)
+    return views
+
+
 def _consumer(device: wp.Device) -> Callable[[ViewBatch], int]:
     """Make a consumer that imports colour and ids through DLPack on a CUDA stream of its own, and returns the number of views of a
     batch."""

@@ -8,7 +8,6 @@ exceeds its tolerance, with 2 if nothing can be compared.
 
 from __future__ import annotations
 
-import argparse
 import dataclasses
 import sys
 from dataclasses import dataclass, fields
@@ -29,12 +28,18 @@ from synpick_warp.scenes.lights import load_lights
 from synpick_warp.stages.arrays import allocate
 from synpick_warp.stages.buffers import LayerBuffers, Snapshot, ViewBuffers, view_buffer_sizes
 from synpick_warp.stages.render.scene import build_render_scene
-from synpick_warp.stages.render.view_setup import make_views
 from synpick_warp.system.hardware.device import pick_device
+from tools.bench.stream import first_views
 from tools.options import configure, fail, make_parser, write_json
 from tools.reports.render_checks import with_mode
 from tools.reports.render_piles import next_frame, settle_piles
 
+OWN = {
+    "devices": {"default": "cpu,cuda:0", "help": "two devices, comma-separated (default: cpu,cuda:0)"},
+    "scenes": {"type": int, "default": 3, "help": "piles to render by all cameras (default: 3)"},
+    "samples": {"type": int, "default": 8, "help": "paths per pixel of the reference (default: 8)"},
+}
+"""Options of this report; see `tools.options.OPTIONS`."""
 CREEP = 1e-3
 """Displacement of objects since the frame before [m]."""
 
@@ -127,14 +132,16 @@ def compare(mode: str, output: str, a: np.ndarray, b: np.ndarray) -> Difference:
 
 def main(arguments: list[str] | None = None) -> int:
     """Run the command line; returns the exit code."""
-    options = _parse(arguments)
+    options = make_parser(__doc__, "models", "lights", "seed", "set", "json", "size", own=OWN, size="160x90").parse_args(arguments)
     console = Console(highlight=False)
     try:
         names = options.devices.split(",")
         if len(names) != 2:
             raise SynpickError(f"--devices is {options.devices}; it takes two devices, such as cpu,cuda:0")
         devices = [pick_device(name) for name in names]
-        config = _config(options, names[0])
+        fixed = dict.fromkeys(("bake.episodes", "bake.worlds"), options.scenes) | {"render.layers": list(LAYERS)}
+        fixed |= {"bake.mode": "move", "bake.device": names[0], "render.samples": options.samples}
+        config = configure(options, fixed)
         differences = compare_devices(config, devices, console)
     except SynpickError as error:
         return fail("compare pictures", error)
@@ -143,27 +150,6 @@ def main(arguments: list[str] | None = None) -> int:
     rows = [dataclasses.asdict(row) | {"holds": row.holds} for row in differences]
     write_json(options.json, {"devices": names, "size": size, "rows": rows})
     return 0 if all(row.holds for row in differences) else 1
-
-
-def _parse(arguments: list[str] | None) -> argparse.Namespace:
-    parser = make_parser(__doc__, "models", "lights", "seed", "set", "json", "size")
-    parser.set_defaults(size="160x90")
-    parser.add_argument("--devices", default="cpu,cuda:0", help="two devices, comma-separated (default: cpu,cuda:0)")
-    parser.add_argument("--scenes", type=int, default=3, help="piles to render by all cameras (default: 3)")
-    parser.add_argument("--samples", type=int, default=8, help="paths per pixel of the reference (default: 8)")
-    return parser.parse_args(arguments)
-
-
-def _config(options: argparse.Namespace, device: str) -> Config:
-    fixed = {
-        "bake.mode": "move",
-        "bake.episodes": options.scenes,
-        "bake.worlds": options.scenes,
-        "bake.device": device,
-        "render.samples": options.samples,
-        "render.layers": list(LAYERS),
-    }
-    return configure(options, fixed)
 
 
 def compare_devices(config: Config, devices: list[Any], console: Console) -> list[Difference]:
@@ -200,9 +186,7 @@ def render_views(config: Config, scene: Any, snapshot: Snapshot) -> dict[str, np
     sizes = view_buffer_sizes(worlds * cameras, scene.width, scene.height, config.arrangement.max_objects)
     renderer = make_renderer(config, scene, config.arrangement.max_objects, worlds * cameras)
     out, layers = allocate(ViewBuffers, sizes, device), allocate(LayerBuffers, sizes, device, LAYERS)
-    view = np.arange(worlds * cameras, dtype=np.int32)
-    world, camera = (wp.array(values, dtype=wp.int32, device=device) for values in (view // cameras, view % cameras))
-    renderer.render(snapshot, make_views(world, camera, len(view), renderer.instances), out, layers)
+    renderer.render(snapshot, first_views(worlds * cameras, cameras, renderer), out, layers)
     images = {item.name: getattr(out, item.name).numpy() for item in fields(ViewBuffers)}
     return images | {name: getattr(layers, name).numpy() for name in LAYERS}
 

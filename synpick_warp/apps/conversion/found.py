@@ -28,7 +28,7 @@ from synpick_warp.exporters.base import ExportContext
 from synpick_warp.exporters.bop.shared.models import MODEL_FOLDERS
 from synpick_warp.exporters.formats import contents_of, convertible
 from synpick_warp.exporters.registry import Exporters, finalize, load_exporter_classes
-from synpick_warp.exporters.writing.files import PARTIAL, check_output_folder, output_error, write_atomically
+from synpick_warp.exporters.writing.files import PARTIAL, check_output_folder, output_error, output_errors, write_atomically
 from synpick_warp.exporters.writing.folder import Buffer
 from synpick_warp.exporters.writing.notes import CAMERA_FILE, NOTES_FILE
 from synpick_warp.exporters.writing.png import encode_png
@@ -77,7 +77,7 @@ class FoundViewFiles(StoredViewFiles):
     def layer(self, name: str) -> Buffer:
         """See `StoredView`."""
         suffix, data = self.files.image_file(name, self.frame)
-        return data if suffix == ".png" else encode_png(self._image(name, None, "uint16"))
+        return data if suffix == ".png" else encode_png(self.files.typed_image(name, self.frame, None, "uint16"))
 
     def masks(self) -> list[Masks]:
         """See `EncodedView`; where there are no amodal masks, COCO's formats need none."""
@@ -161,13 +161,11 @@ def convert_found(data: DataSet, out: Path, formats: Sequence[str], processes: i
     _check_formats(data, first, formats)
     check_output_folder(out)
     if out.is_dir() and any(out.iterdir()):
-        raise ConfigError(f"--out is {out}, which is not empty; name a new folder: data sets that no bake wrote are converted as a whole")
+        raise ConfigError(f"--out is {out}, which is not empty; name a new folder: data sets from other sources are converted as a whole")
     config = _make_config(data, first, formats)
-    try:
+    with output_errors(out):
         make_folder(out.parent)
         work = Path(tempfile.mkdtemp(prefix=f".{out.name}.", dir=out.parent))
-    except OSError as error:
-        raise output_error(out, error) from error
     try:
         count = _write(data, work, config, processes, report)
         work.chmod(0o755)
@@ -192,7 +190,7 @@ def _check_formats(data: DataSet, first: SceneFiles, formats: Sequence[str]) -> 
         if name not in contents:
             raise ConfigError(f"--to names {name}; allowed: {', '.join(each for each in contents if contents[each] <= _IMAGES)}")
         if not contents[name] <= _IMAGES:
-            raise ConfigError(f"--to names {name}, which is made of trajectories; {data.folder} has none, as no bake wrote it")
+            raise ConfigError(f"--to names {name}, which is made of trajectories; {data.folder} is from another source and has none")
         if (name == "bop" and isinstance(first, SceneFolder)) or (name == "shards" and first.place.suffix == ".tar"):
             raise ConfigError(f"--to names {name}, which {data.folder} has already; copy the folder")
         (kind,) = load_exporter_classes([name])

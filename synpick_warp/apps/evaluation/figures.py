@@ -22,7 +22,7 @@ from synpick_warp.apps.evaluation.tracking.sweep import AlphaSweep, split_by_mod
 from synpick_warp.apps.evaluation.tracking.tracks import find_tracks, track_of_instance
 from synpick_warp.apps.evaluation.truth import Truth
 from synpick_warp.errors import ConfigError, OutputError
-from synpick_warp.exporters.writing.files import output_error, write_atomically
+from synpick_warp.exporters.writing.files import output_errors, write_atomically
 from synpick_warp.system.codecs.charts import Spec, render_charts
 from synpick_warp.system.folders import make_folder
 
@@ -226,9 +226,7 @@ def write_figures(folder: Path, pictures: Mapping[str, bytes]) -> Iterator[Path]
         OutputError: A file cannot be written.
     """
     for name, picture in pictures.items():
-        try:
+        with output_errors(folder / name):
             make_folder(folder)
             write_atomically(folder / name, picture)
-        except OSError as error:
-            raise output_error(folder / name, error) from error
         yield folder / name

@@ -17,7 +17,7 @@ import numpy as np
 from synpick_warp.apps.evaluation.poses import PoseTable
 from synpick_warp.apps.evaluation.truth import Truth
 from synpick_warp.errors import OutputError, ResultError
-from synpick_warp.exporters.writing.files import output_error, write_atomically
+from synpick_warp.exporters.writing.files import output_errors, write_atomically
 from synpick_warp.system.inputs.files import read_file
 
 HEADER = "scene_id,im_id,obj_id,score,R,t,time"
@@ -250,7 +250,5 @@ def write_results(path: Path, poses: PoseTable) -> None:
     """
     if path.is_dir():
         raise OutputError(f"{path} is a folder; name a file")
-    try:
+    with output_errors(path):
         write_atomically(path, encode_results(poses))
-    except OSError as error:
-        raise output_error(path, error) from error

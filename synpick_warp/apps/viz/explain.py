@@ -6,7 +6,6 @@ The layout follows the figure of the paper (Periyasamy et al., SynPick, 2021).
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
@@ -18,14 +17,12 @@ from synpick_warp.apps.viz.explain_panels import GREEN, LINE, PLOT_HEIGHT, SMALL
 from synpick_warp.apps.viz.explain_record import MODE_WORDS, Attempt, choose_attempts, labels, read_attempts
 from synpick_warp.configs.load import load_config
 from synpick_warp.configs.schema import Config
-from synpick_warp.configs.splits import DataLayout
-from synpick_warp.dataset.annotations import SCENE_SCHEMAS, read_checked
 from synpick_warp.dataset.object_names import object_names
 from synpick_warp.dataset.records import Pixel
-from synpick_warp.dataset.view_files import read_image
+from synpick_warp.dataset.scene_index import SceneIndex
+from synpick_warp.dataset.view import View
 from synpick_warp.errors import DatasetError
 from synpick_warp.system.codecs.charts import Spec, render_charts
-from synpick_warp.system.inputs.paths import path_inside
 
 DEFAULT_ATTEMPTS = 3
 """Attempts that are drawn if none is named."""
@@ -45,16 +42,6 @@ _LABEL = 0.5
 """Font scale of an object's label on the image; the target's is larger."""
 _HALO = 3
 """Width of the dark outline around bright lines on the image [px]."""
-
-
-@dataclass(frozen=True, eq=False)
-class _Scene:
-    """Images of camera 0 at the time of an attempt's observation."""
-
-    place: str
-    color: Image
-    masks: dict[int, np.ndarray] | None
-    """Instance id -> modal mask; None: the data set has no masks."""
 
 
 def write_explanation(dataset: Path, out: Path, episode: int | None, attempt: int | None = None) -> Path:
@@ -81,7 +68,8 @@ def write_explanation(dataset: Path, out: Path, episode: int | None, attempt: in
         raise DatasetError(f"{dataset} has no config.toml; the settings of the bake are needed to explain what it did")
     config = load_config(str(path), {})
     names = object_names(dataset, config, {one.object_id for each in attempts for one in each.seen})
-    rows = [_row(each, _read_scene(dataset, config, each), names, config) for each in attempts]
+    scenes = SceneIndex(dataset, config)
+    rows = [_row(each, _open_view(dataset, scenes, each), names, config) for each in attempts]
     plots = render_charts([plot for _, plot in rows], scale=1.0)
     for (sheet, _), data in zip(rows, plots, strict=True):
         plot = np.asarray(cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR))
@@ -89,26 +77,11 @@ def write_explanation(dataset: Path, out: Path, episode: int | None, attempt: in
     return write_picture(out, np.concatenate([sheet for sheet, _ in rows]))
 
 
-def _read_scene(dataset: Path, config: Config, attempt: Attempt) -> _Scene:
-    layout = DataLayout.of(config)
-    split = path_inside(dataset, layout.folder(attempt.episode), dataset / "config.toml", DatasetError)
-    index, suffix = layout.scene(attempt.episode, 0)
-    scene = split / f"{index:06d}"
-    stem = f"{attempt.frame:06d}"
-    truth = read_checked(scene / f"scene_gt{suffix}.json", SCENE_SCHEMAS["gt"]).get(attempt.frame)
-    if truth is None:
-        raise DatasetError(f"{scene}/scene_gt{suffix}.json has no image {attempt.frame}, which {dataset}/attempts.jsonl names")
-    color = read_image(scene / f"rgb{suffix}", stem, cv2.IMREAD_COLOR, config.cameras.resolution)
-    masks = None
-    folder = scene / f"mask_visib{suffix}"
-    if folder.is_dir():
-        seen = attempt.objects
-        masks = {
-            record["instance_id"]: read_image(folder, f"{stem}_{index:06d}", cv2.IMREAD_GRAYSCALE, color.shape[1::-1])
-            for index, record in enumerate(truth)
-            if record.get("instance_id") in seen
-        }
-    return _Scene(f"{scene.parent.name}/{scene.name}, image {attempt.frame}", color, masks)
+def _open_view(dataset: Path, scenes: SceneIndex, attempt: Attempt) -> View:
+    files = scenes.files(attempt.episode, 0)
+    if attempt.frame not in files.frames():
+        raise DatasetError(f"{files.place} has no image {attempt.frame}, which {dataset}/attempts.jsonl names")
+    return View(files, attempt.episode, 0, attempt.frame)
 
 
 def to_color_image(pixel: Pixel, resolution: tuple[int, int], size: tuple[int, int]) -> tuple[float, float]:
@@ -131,9 +104,9 @@ def image_scale(size: tuple[int, int]) -> float:
     return min(IMAGE_WIDTH / size[0], _MAX_IMAGE_HEIGHT / size[1])
 
 
-def _row(attempt: Attempt, scene: _Scene, names: Mapping[int, str], config: Config) -> tuple[Image, Spec]:
+def _row(attempt: Attempt, view: View, names: Mapping[int, str], config: Config) -> tuple[Image, Spec]:
     """Draw one attempt: image, clutter graph, text and table, with room at the lower left for the force's plot, which is the second."""
-    image = draw_observation(attempt, scene.color, scene.masks)
+    image = draw_observation(attempt, view)
     words = draw_words(attempt, names, config)
     left = image.shape[0] + 2 * LINE + MARGIN + PLOT_HEIGHT
     height = max(left, words.shape[0], _MIN_ROW_HEIGHT)
@@ -151,8 +124,9 @@ def _row(attempt: Attempt, scene: _Scene, names: Mapping[int, str], config: Conf
     _paste(sheet, words, columns[2], top)
     head = f"Episode {attempt.episode}, attempt {attempt.attempt} ({MODE_WORDS[attempt.mode]}): {attempt.sentence}"
     put_text(sheet, head, (MARGIN, MARGIN + 20), 0.68, GREEN if attempt.picked else RED, 2)
-    captions = [f"camera 0: {scene.place}", "clutter graph", "choice and outcome"]
-    if scene.masks is None:
+    scene = Path(view.place)
+    captions = [f"camera 0: {scene.parent.name}/{scene.name}, image {attempt.frame}", "clutter graph", "choice and outcome"]
+    if not view.has("mask_visib"):
         captions[0] += "; no contours: this data set has no masks"
     for text, column in zip(captions, columns, strict=True):
         put_text(sheet, text, (column, top - 9), TEXT, SOFT)
@@ -164,15 +138,19 @@ def _paste(sheet: Image, picture: Image, column: int, row: int) -> None:
     sheet[row : row + picture.shape[0], column : column + picture.shape[1]] = picture
 
 
-def draw_observation(attempt: Attempt, color: Image, masks: Mapping[int, np.ndarray] | None) -> Image:
-    """Draw contours and suction points on the colour image, which is darkened except for the target.
+def draw_observation(attempt: Attempt, view: View) -> Image:
+    """Draw contours, if the data set has masks, and suction points on the colour image, which is darkened except for the target.
 
     Args:
         attempt: The attempt.
-        color: Image of camera 0 at the observation (H, W, 3) uint8, blue first.
-        masks: Instance id -> modal mask (H, W) uint8, of visible instances; None: the data set has no masks.
+        view: Camera 0 at the observation.
+
+    Raises:
+        DatasetError: A file is missing or damaged, or has no such view.
     """
-    masks = masks or {}
+    color, seen = view.rgb[..., ::-1], attempt.objects
+    ids = view.instance_ids.tolist() if view.has("mask_visib") else []
+    masks = {instance: view.masks[row] for row, instance in enumerate(ids) if instance in seen}
     height, width = color.shape[:2]
     scale = image_scale((width, height))
     size = (max(1, round(scale * width)), max(1, round(scale * height)))
@@ -180,7 +158,7 @@ def draw_observation(attempt: Attempt, color: Image, masks: Mapping[int, np.ndar
     drawn = (0.62 * color).astype(np.uint8)
     order = sorted(masks, key=lambda instance: instance == attempt.target)
     for instance in order:
-        mask = cv2.resize(np.minimum(masks[instance], 1) * 255, size, interpolation=cv2.INTER_LINEAR) > 127
+        mask = cv2.resize(255 * masks[instance].astype(np.uint8), size, interpolation=cv2.INTER_LINEAR) > 127
         _draw_contours(drawn, color, mask, instance, instance == attempt.target)
     short = labels(attempt)
     for one in attempt.seen:

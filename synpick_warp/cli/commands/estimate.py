@@ -114,7 +114,7 @@ def run_method(
     from synpick_warp.apps.evaluation.targets import encode_targets, in_layout
     from synpick_warp.cli.display import CountProgress, make_console
     from synpick_warp.dataset.reading import open_data_set
-    from synpick_warp.exporters.writing.files import output_error, write_atomically
+    from synpick_warp.exporters.writing.files import output_errors, write_atomically
 
     data_set = open_data_set(data)
     if split is not None:
@@ -132,10 +132,8 @@ def run_method(
         run = run_estimation(scenes, [model.object_id for model in models], factory, options, counter.report, pool)
     listed = None if complete and split is None else targets_file(out)
     if listed is not None:
-        try:
+        with output_errors(listed):
             write_atomically(listed, encode_targets(in_layout(list_targets(scenes), data_set.sensors)))
-        except OSError as error:
-            raise output_error(listed, error) from error
     write_results(out, run.poses)
     return run, listed
 

@@ -283,12 +283,10 @@ def write_table(out: Path, table: str) -> None:
     Raises:
         OutputError: It cannot be written.
     """
-    from synpick_warp.exporters.writing.files import output_error, write_atomically
+    from synpick_warp.exporters.writing.files import output_errors, write_atomically
 
-    try:
+    with output_errors(out):
         write_atomically(out, table.encode("utf-8"))
-    except OSError as error:
-        raise output_error(out, error) from error
 
 
 def object_names(data_set: DataSet) -> dict[int, str]:

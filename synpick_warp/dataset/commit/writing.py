@@ -51,6 +51,7 @@ from synpick_warp.exporters.writing.files import (
     is_folder,
     is_litter,
     output_error,
+    output_errors,
     remove_folder,
     sync_folder,
     write_atomically,
@@ -98,11 +99,9 @@ class OutputFolder:
         self._exporters: Exporters | None = None
         check_output_folder(out)
         self._created = [folder for folder in (out, *out.parents) if not os.path.lexists(folder)]
-        try:
+        with output_errors(out):
             make_folder(out)
             self.lock = lock_folder(out)
-        except OSError as error:
-            raise output_error(out, error) from error
         try:
             self._scan()
         except OSError as error:
@@ -162,7 +161,7 @@ class OutputFolder:
         if differing:
             raise ConfigError(f"{self.out} was started with other {' and '.join(differing)}; {_ADVICE}")
         self._exporters = exporters
-        try:
+        with output_errors(self.out):
             if self._known:
                 remove_folder(self.out / PARTIAL, ignore_errors=True)
             else:
@@ -179,8 +178,6 @@ class OutputFolder:
                 paths = self._write_constants(exporters)
                 pool.submit(write_manifest_entry, (), (self.out, CONSTANTS, paths, {}), path=self.out / CONSTANTS)
                 pool.wait()
-        except OSError as error:
-            raise output_error(self.out, error) from error
 
     def _write_constants(self, exporters: Exporters) -> list[Path]:
         """Let the exporters write the constants; on an error, delete what was written."""

@@ -23,7 +23,7 @@ from synpick_warp.exporters.bop.shared.targets import (
     target_files,
     write_scene_targets,
 )
-from synpick_warp.exporters.writing.files import PARTIAL, output_error
+from synpick_warp.exporters.writing.files import PARTIAL, output_errors
 from synpick_warp.exporters.writing.pool import WriterPool
 
 
@@ -61,7 +61,7 @@ class BopExporter(SceneExporter):
         """See `Exporter`: the lists of evaluation targets."""
         layout = DataLayout.of(config)
         parts, names, sensors = out / PARTIAL / BopExporter.staging / "targets", target_files(layout), sensor_suffixes(layout)
-        try:
+        with output_errors(out):
             parts.parent.mkdir(exist_ok=True)
             shutil.rmtree(parts, ignore_errors=True)
             for name in (parts, *(parts / name for name in names)):
@@ -72,8 +72,6 @@ class BopExporter(SceneExporter):
                     pool.submit(write_scene_targets, (), (scene, places, config.bop.target_visibility, sensors), path=scene)
             pool.wait()
             concatenate_targets(parts, out, names)
-        except OSError as error:
-            raise output_error(out, error) from error
         return [Path(name) for name in names]
 
     def files(self, episode: int) -> list[Path]:

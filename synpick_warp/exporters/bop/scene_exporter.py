@@ -26,7 +26,7 @@ from synpick_warp.exporters.bop.view import (
     write_stored_views,
 )
 from synpick_warp.exporters.staging import EpisodeExporter, StagedEpisode
-from synpick_warp.exporters.writing.files import output_error
+from synpick_warp.exporters.writing.files import output_errors
 from synpick_warp.exporters.writing.notes import CAMERA_FILE, NOTES_FILE
 from synpick_warp.exporters.writing.pool import WriteTask
 from synpick_warp.views.frames import EpisodeEnd, FrameBatch
@@ -119,7 +119,7 @@ class SceneExporter(EpisodeExporter[tuple[Path, ...]]):
     def write_constants(self) -> list[Path]:
         """See `Exporter`: models, camera and notes."""
         context = self._context
-        try:
+        with output_errors(self._out):
             for folder in self.folders(context.layout):
                 (self._out / folder).mkdir(exist_ok=True)
             if context.copy_constants(CONSTANTS):
@@ -129,8 +129,6 @@ class SceneExporter(EpisodeExporter[tuple[Path, ...]]):
                 PARAMS_FILE: format_dataset_params(context.layout, self._bop.color_format, context.catalog, self._cameras),
             }
             return write_constants(self._out, context.catalog, self._cameras[0], self._bop.depth_scale, texts)
-        except OSError as error:
-            raise output_error(self._out, error) from error
 
     def write_views(self, batch: FrameBatch) -> None:
         """See `Exporter`."""

@@ -36,7 +36,7 @@ from synpick_warp.exporters.lerobot.layout import (
 from synpick_warp.exporters.lerobot.part import TICK
 from synpick_warp.exporters.lerobot.video import GROUP, write_frame, write_spooled_group, write_stored_group
 from synpick_warp.exporters.staging import EpisodeExporter, StagedEpisode
-from synpick_warp.exporters.writing.files import output_error
+from synpick_warp.exporters.writing.files import output_errors
 from synpick_warp.exporters.writing.notes import note_files, write_notes
 from synpick_warp.exporters.writing.pool import WriterPool, WriteTask
 from synpick_warp.system.processes.shared_memory import shared_bytes
@@ -95,18 +95,14 @@ class LerobotExporter(EpisodeExporter[_Content]):
     @staticmethod
     def finalize(out: Path, config: Config, pool: WriterPool, episodes: Sequence[int]) -> list[Path]:
         """See `Exporter`: the tables over all episodes."""
-        try:
+        with output_errors(out / FOLDER):
             return write_indices(out, config, episodes)
-        except OSError as error:
-            raise output_error(out / FOLDER, error) from error
 
     def write_constants(self) -> list[Path]:
         """See `Exporter`: camera and notes."""
         context = self._context
-        try:
+        with output_errors(context.out):
             return write_notes(context.out, context.config, self._settings.objects, context.cameras)
-        except OSError as error:
-            raise output_error(context.out, error) from error
 
     def write_views(self, batch: FrameBatch) -> None:
         """See `Exporter`."""

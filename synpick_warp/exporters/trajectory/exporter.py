@@ -19,7 +19,7 @@ from synpick_warp.exporters.trajectory.arrays import EPISODES, STORE
 from synpick_warp.exporters.trajectory.episode import EpisodeContent, EpisodeSettings, write_episode
 from synpick_warp.exporters.trajectory.spool import SPOOL_ROWS, Place, batch_type, count_instances, make_rows, spool_bytes, write_rows
 from synpick_warp.exporters.trajectory.store import constant_places, write_constants
-from synpick_warp.exporters.writing.files import output_error
+from synpick_warp.exporters.writing.files import output_errors
 from synpick_warp.exporters.writing.pool import WriteTask
 from synpick_warp.system.processes.shared_memory import shared_bytes
 from synpick_warp.views.frames import EpisodeEnd, TickBatch
@@ -77,14 +77,12 @@ class TrajectoryExporter(EpisodeExporter[_Content]):
     def write_constants(self) -> list[Path]:
         """See `Exporter`: the store with its groups of objects and cameras."""
         context, store = self._context, self._context.out / STORE
-        try:
+        with output_errors(store):
             store.mkdir(exist_ok=True)
             (store / EPISODES).mkdir(exist_ok=True)
             config, level = context.config, context.config.trajectory.level
             assets = (context.catalog, context.cameras, context.lights)
             written = write_constants(store, config.bake.seed, config.physics, level, *assets)
-        except OSError as error:
-            raise output_error(store, error) from error
         return [path.relative_to(context.out) for path in written]
 
     def write_ticks(self, batch: TickBatch) -> None:

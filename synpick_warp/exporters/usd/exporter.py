@@ -13,7 +13,7 @@ from synpick_warp.exporters.usd.episode import write_episode
 from synpick_warp.exporters.usd.lights import make_stage_light
 from synpick_warp.exporters.usd.spool import TickSpool, tick_rows
 from synpick_warp.exporters.usd.types import EpisodeMetadata, EpisodeSettings
-from synpick_warp.exporters.writing.files import output_error
+from synpick_warp.exporters.writing.files import output_errors
 from synpick_warp.exporters.writing.pool import WriteTask
 from synpick_warp.views.frames import EpisodeEnd, TickBatch
 
@@ -48,12 +48,10 @@ class UsdExporter(EpisodeExporter[TickSpool]):
 
         context = self._context
         library = context.out / LIBRARY
-        try:
+        with output_errors(library):
             for folder in (library.parent, library):
                 folder.mkdir(exist_ok=True)
             write_library(library, context.config, context.catalog, context.lights)
-        except OSError as error:
-            raise output_error(library, error) from error
         return [LIBRARY]
 
     def write_ticks(self, batch: TickBatch) -> None:
@@ -61,17 +59,13 @@ class UsdExporter(EpisodeExporter[TickSpool]):
         make_spool = partial(_make_spool, batch.object_id.shape[1])
         for index, row in zip(batch.episode.tolist(), tick_rows(batch), strict=True):
             spool = self._staged(index, make_spool).content
-            try:
+            with output_errors(spool.path):
                 spool.add(row)
-            except OSError as error:
-                raise output_error(spool.path, error) from error
 
     def _commit(self, episode: StagedEpisode[TickSpool], end: EpisodeEnd) -> WriteTask:
         spool, place = episode.content, self._place(end.episode)
-        try:
+        with output_errors(spool.path):
             spool.flush()
-        except OSError as error:
-            raise output_error(spool.path, error) from error
         return WriteTask(write_episode, (), (spool.path, spool.instances, place, EpisodeMetadata.from_end(end), self._settings), place)
 
     def files(self, episode: int) -> list[Path]:

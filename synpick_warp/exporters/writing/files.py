@@ -6,6 +6,7 @@ import contextlib
 import os
 import shutil
 import uuid
+from collections.abc import Iterator
 from pathlib import Path
 
 from synpick_warp.errors import OutputError
@@ -94,6 +95,15 @@ def output_error(path: Path | str, error: OSError) -> OutputError:
     """Convert an operating-system error into an `OutputError` of one line that names the file, the reason and the remedy."""
     reason = error.strerror or str(error) or type(error).__name__
     return OutputError(f"cannot write {error.filename or path}: {reason}; free space or rights there, or name another folder with --out")
+
+
+@contextlib.contextmanager
+def output_errors(path: Path | str) -> Iterator[None]:
+    """Raise an operating-system error in this context as `output_error`."""
+    try:
+        yield
+    except OSError as error:
+        raise output_error(path, error) from error
 
 
 def write_atomically(path: Path, data: bytes) -> None:

@@ -5,7 +5,6 @@ Numbers are finite, integers fit into 64 bits unless declared otherwise, nesting
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -41,14 +40,6 @@ def decode_json(data: bytes, schema: type[_Content], source: object, error: type
 def read_json(path: Path, schema: type[_Content], error: type[SynpickError], advice: str = "", limit: int = MAX_JSON) -> _Content:
     """Read and validate a JSON file; arguments and errors as `decode_json` and `read_file`."""
     return decode_json(read_file(path, limit, error), schema, path, error, advice)
-
-
-def read_json_lines(
-    path: Path, schema: type[_Content], error: type[SynpickError], advice: str = "", limit: int = MAX_JSON
-) -> Iterator[_Content]:
-    """Read and validate a JSON Lines file, one record a line; errors name the line."""
-    for number, line in enumerate(read_file(path, limit, error).splitlines(), start=1):
-        yield decode_json(line, schema, f"{path}, line {number},", error, advice)
 
 
 def _describe(fault: Exception) -> str:

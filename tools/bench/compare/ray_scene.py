@@ -133,11 +133,6 @@ class RayScene:
         geom, depth = context.seg_data[:worlds].numpy()[..., 0].reshape(shape), context.depth_data[:worlds].numpy().reshape(shape)
         return np.where(geom < 0, len(self.segment) - 1, geom).astype(np.int64), depth
 
-    def read_color(self, context: Any) -> np.ndarray:
-        """Color of the first world's views (view, row, column, 3) uint8, red first."""
-        packed = context.rgb_data[:1].numpy().reshape(-1, self.cameras[0].height, self.cameras[0].width)
-        return np.stack([packed >> shift & 255 for shift in (16, 8, 0)], axis=-1).astype(np.uint8)
-
 
 @wp.func
 def _find_root(bvh: wp.uint64, world: wp.int32):

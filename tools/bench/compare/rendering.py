@@ -16,10 +16,10 @@ from synpick_warp.scenes.fixtures import make_fixtures
 from synpick_warp.scenes.types import Camera
 from synpick_warp.stages.buffers import Snapshot, allocate_view_buffers
 from synpick_warp.stages.render.scene import build_cameras, build_grid
-from synpick_warp.stages.render.view_setup import make_views
 from tools.bench.compare.ray_scene import RayScene
 from tools.bench.compare.sensor import CHECKED_VIEWS, compare_hits, rate_rows
 from tools.bench.physics import BURST, seconds_per_call
+from tools.bench.stream import first_views
 from tools.options import Row
 
 SMALL_SIZE = (64, 64)
@@ -96,11 +96,10 @@ class OurViews:
         scene, count, instances = factory.stream.renderer.scene, worlds * len(cameras), factory.stream.renderer.instances
         width, height = cameras[0].width, cameras[0].height
         scene = replace(scene, cameras=build_cameras(cameras, scene.device), grid=build_grid(width, height))
-        self.snapshot, view = snapshot, np.arange(count, dtype=np.int32)
+        self.snapshot = snapshot
         self.renderer = make_renderer(config, scene, instances, count, histories=count)
         self.out = allocate_view_buffers(count, width, height, instances, scene.device)
-        world, camera = (wp.array(v, dtype=wp.int32, device=scene.device) for v in (view // len(cameras), view % len(cameras)))
-        self.views = make_views(world, camera, count, instances)
+        self.views = first_views(count, len(cameras), self.renderer)
 
     def render_gbuffer(self) -> None:
         """Depth, ids and amodal bits alone."""

@@ -22,8 +22,8 @@ from synpick_warp.scenes.types import Camera, Catalog, Fixture, Material, Triang
 from synpick_warp.stages.arrays import allocate
 from synpick_warp.stages.buffers import LayerBuffers, Snapshot
 from synpick_warp.stages.render.layers import LayerRenderer
-from synpick_warp.stages.render.view_setup import make_views
 from tools.bench.physics import BURST, seconds_per_call
+from tools.bench.stream import first_views
 from tools.options import Row
 
 ORDERS = {
@@ -266,9 +266,8 @@ class _OurRenderer:
     def __init__(self, factory: Factory, count: int) -> None:
         self.renderer, self.out = factory.stream.renderer, factory.stream.buffers[0]
         self.snapshot = factory.simulation.record.snapshot
-        scene, cameras, view = self.renderer.scene, len(factory.cameras), np.arange(count, dtype=np.int32)
-        world, camera = (wp.array(v, dtype=wp.int32, device=scene.device) for v in (view // cameras, view % cameras))
-        self.views = make_views(world, camera, count, self.renderer.instances)
+        scene = self.renderer.scene
+        self.views = first_views(count, len(factory.cameras), self.renderer)
         self.layer_renderer = LayerRenderer(LAYERS, None, scene, self.renderer.instances, count)
         self.layers = allocate(LayerBuffers, {"view": count, "row": scene.height, "column": scene.width}, scene.device, LAYERS)
 

@@ -24,7 +24,7 @@ from synpick_warp.exporters.bop.keypoints import Keypoints, make_category_keys
 from synpick_warp.exporters.bop.outlines import trace_outlines
 from synpick_warp.exporters.bop.scene import AnnotationBlocks
 from synpick_warp.exporters.bop.view import ANNOTATIONS, ViewSettings, annotation_block, make_keypoints, make_rle, to_json
-from synpick_warp.exporters.writing.files import PARTIAL, output_error, sync_folder, write_synced
+from synpick_warp.exporters.writing.files import PARTIAL, output_errors, sync_folder, write_synced
 from synpick_warp.exporters.writing.folder import open_folder
 from synpick_warp.exporters.writing.rle import Runs
 from synpick_warp.system.inputs.files import read_file
@@ -55,15 +55,13 @@ def annotation_file(split: str) -> Path:
 
 def write_categories(out: Path, names: Mapping[int, str], keypoints: Mapping[int, Keypoints]) -> None:
     """Write names and keypoints (or none) of the objects by obj_id, and the folders of the format."""
-    try:
+    with output_errors(out / CATEGORIES):
         for folder in (FOLDER, IMAGES, PARTS):
             (out / folder).mkdir(exist_ok=True)
         extras = {obj_id: make_category_keys(points) for obj_id, points in keypoints.items()}
         named = [{"id": obj_id, "name": name, "supercategory": "object"} for obj_id, name in sorted(names.items())]
         categories = [category | extras.get(obj_id, {}) for category, obj_id in zip(named, sorted(names), strict=True)]
         (out / CATEGORIES).write_text(json.dumps(categories, indent=2) + "\n", encoding="ascii")
-    except OSError as error:
-        raise output_error(out / CATEGORIES, error) from error
 
 
 def scene_files(out: Path, scenes: Iterable[int]) -> list[Path]:

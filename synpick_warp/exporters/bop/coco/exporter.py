@@ -25,7 +25,7 @@ from synpick_warp.exporters.bop.coco.annotation_files import (
     write_view,
 )
 from synpick_warp.exporters.bop.scene_exporter import SceneExporter
-from synpick_warp.exporters.writing.files import output_error
+from synpick_warp.exporters.writing.files import output_errors
 from synpick_warp.exporters.writing.notes import note_files, write_notes
 from synpick_warp.exporters.writing.pool import WriterPool
 
@@ -57,19 +57,15 @@ class CocoExporter(SceneExporter):
     @staticmethod
     def finalize(out: Path, config: Config, pool: WriterPool, episodes: Sequence[int]) -> list[Path]:
         """See `Exporter`: the annotations of each split."""
-        try:
+        with output_errors(out / FOLDER):
             return write_annotation_files(out, config, episodes)
-        except OSError as error:
-            raise output_error(out / FOLDER, error) from error
 
     def write_constants(self) -> list[Path]:
         """See `Exporter`: names and keypoints of the objects, camera and notes."""
         names = self._context.names
         write_categories(self._out, names, self._keypoints)
-        try:
+        with output_errors(self._out):
             return [CATEGORIES, *write_notes(self._out, self._context.config, names, self._cameras)]
-        except OSError as error:
-            raise output_error(self._out, error) from error
 
     def files(self, episode: int) -> list[Path]:
         """See `Exporter`: folders of images, and parts."""

@@ -14,7 +14,7 @@ from synpick_warp.exporters.base import SharedFiles
 from synpick_warp.exporters.bop.scene_exporter import CONSTANTS, SceneExporter
 from synpick_warp.exporters.bop.shards.card import CARD_FILE, CardContent, SplitContent, hub_splits, make_card
 from synpick_warp.exporters.bop.shards.tar_files import commit_shards, find_shards, list_keys, shard_index, write_layer, write_view
-from synpick_warp.exporters.writing.files import PARTIAL, output_error, write_atomically
+from synpick_warp.exporters.writing.files import PARTIAL, output_errors, write_atomically
 from synpick_warp.exporters.writing.pool import WriterPool
 
 KEYS_FILE = "key_to_shard.json"
@@ -52,10 +52,8 @@ class ShardsExporter(SceneExporter):
             _write_keys(out, name, split, pool, scenes)
             for name, split in zip(hub_splits(layout), ShardsExporter.folders(layout), strict=True)
         ]
-        try:
+        with output_errors(out / CARD_FILE):
             write_atomically(out / CARD_FILE, make_card(_describe(config, contents)).encode())
-        except OSError as error:
-            raise output_error(out / CARD_FILE, error) from error
         return [*(Path(split.folder) / KEYS_FILE for split in contents), Path(CARD_FILE)]
 
     def files(self, episode: int) -> list[Path]:
@@ -87,7 +85,7 @@ def _describe(config: Config, splits: list[SplitContent]) -> CardContent:
 def _write_keys(out: Path, name: str, split: Path, pool: WriterPool, scenes: Sequence[int]) -> SplitContent:
     """Write the index of the views and shards of those scenes that a split has; returns how many there are."""
     parts = out / PARTIAL / ShardsExporter.staging / "keys"
-    try:
+    with output_errors(out / split):
         parts.parent.mkdir(exist_ok=True)
         shutil.rmtree(parts, ignore_errors=True)
         parts.mkdir()
@@ -98,5 +96,3 @@ def _write_keys(out: Path, name: str, split: Path, pool: WriterPool, scenes: Seq
         lines = [line for part in sorted(parts.iterdir(), key=shard_index) for line in part.read_bytes().splitlines()]
         write_atomically(out / split / KEYS_FILE, b"{\n" + b",\n".join(lines) + b"\n}\n")
         return SplitContent(name, split.name, len(lines), len(shards), sum(shard.stat().st_size for shard in shards))
-    except OSError as error:
-        raise output_error(out / split, error) from error

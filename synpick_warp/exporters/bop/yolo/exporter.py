@@ -12,7 +12,7 @@ from synpick_warp.configs.splits import DataLayout
 from synpick_warp.exporters.base import ExportContext, SharedFiles
 from synpick_warp.exporters.bop.scene_exporter import SceneExporter
 from synpick_warp.exporters.bop.yolo.label_files import CONTENTS, DATA, FOLDER, commit_scenes, image_list, write_data_file, write_view
-from synpick_warp.exporters.writing.files import output_error
+from synpick_warp.exporters.writing.files import output_errors
 from synpick_warp.exporters.writing.notes import note_files, write_notes
 
 
@@ -44,13 +44,11 @@ class YoloExporter(SceneExporter):
     def write_constants(self) -> list[Path]:
         """See `Exporter`: splits and names of the classes, camera and notes."""
         context = self._context
-        try:
+        with output_errors(self._out):
             for folder in reversed(self.shared_files(context.layout).folders):
                 (self._out / folder).mkdir(exist_ok=True)
             write_data_file(self._out, context.names, context.layout.folders)
             return [DATA, *write_notes(self._out, context.config, context.names, self._cameras)]
-        except OSError as error:
-            raise output_error(self._out, error) from error
 
     def files(self, episode: int) -> list[Path]:
         """See `Exporter`: lists of images, and folders of images and labels."""
