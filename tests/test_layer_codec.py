@@ -10,10 +10,12 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from synpick_warp.configs.schema import LAYERS
+from synpick_warp.dataset.view import read_layer
+from synpick_warp.dataset.view_files import SceneFolder
 from synpick_warp.errors import DatasetError
 from synpick_warp.exporters.bop.scene import write_layer
 from synpick_warp.exporters.bop.view import write_rendered_layer
-from synpick_warp.views.layer_codec import CODECS, decode_layer, encode_layer, layer_notes, layer_path, read_layer
+from synpick_warp.views.layer_codec import CODECS, decode_layer, encode_layer, layer_notes, layer_path
 from synpick_warp.views.layers import LAYER_TABLE
 
 SIDES = st.tuples(st.integers(1, 6), st.integers(1, 6))
@@ -100,7 +102,7 @@ def test_layer_files_round_trip(tmp_path, name):
     (tmp_path / name).mkdir()
     write_rendered_layer(VALUES[name], write_layer, tmp_path, 0, name, 12)
     assert layer_path(tmp_path, name, 12) == tmp_path / name / "000012.png"
-    back = read_layer(tmp_path, name, 12)
+    back = read_layer(SceneFolder(tmp_path), name, 12)
     assert (back.shape, back.dtype) == (VALUES[name].shape, VALUES[name].dtype)
     assert (back.dtype.name, back.shape[2:] or (1,)) == (LAYER_TABLE[name].dtype, (LAYER_TABLE[name].components,))
     np.testing.assert_allclose(back, VALUES[name], atol=2e-5)
@@ -108,14 +110,14 @@ def test_layer_files_round_trip(tmp_path, name):
 
 def test_missing_and_invalid_files_are_reported(tmp_path):
     with pytest.raises(DatasetError, match=r"there is no layer depth; layers: normals, "):
-        read_layer(tmp_path, "depth", 0)
-    with pytest.raises(DatasetError, match=r"there is no .*flow/000003.png; bake with render.layers naming flow"):
-        read_layer(tmp_path, "flow", 3)
+        read_layer(SceneFolder(tmp_path), "depth", 0)
+    with pytest.raises(DatasetError, match=r"there is no .*flow/000003.png or .jpg; the data set is not complete"):
+        read_layer(SceneFolder(tmp_path), "flow", 3)
     (tmp_path / "flow").mkdir()
     path = tmp_path / "flow" / "000003.png"
     grey = cv2.imencode(".png", np.zeros((4, 4), np.uint16))[1].tobytes()
     eight = cv2.imencode(".png", np.zeros((4, 4, 3), np.uint8))[1].tobytes()
     for content in (b"", b"no picture", grey, eight):
         path.write_bytes(content)
-        with pytest.raises(DatasetError, match=r"flow/000003\.png is (no image of the layer flow|not an image)"):
-            read_layer(tmp_path, "flow", 3)
+        with pytest.raises(DatasetError, match=r"flow/000003\.png is not an image|flow of image 3 in .*; expected: 3 of type uint16"):
+            read_layer(SceneFolder(tmp_path), "flow", 3)

@@ -17,6 +17,7 @@ import warp as wp
 
 import synpick_warp
 from synpick_warp.exporters.bop.exporter import BopExporter
+from synpick_warp.stages.launch import launch
 from tests.builders import bake_boxes
 from tests.harness.exporter_contract import export
 from tests.test_bake import TINY
@@ -88,8 +89,10 @@ class CallGraph:
             self.graph.add_edge(caller, called)
 
     def launched(self, kernel: wp.Kernel) -> None:
-        """Add a launch from the frame that called `wp.launch`."""
-        if (called := self.name(kernel.func.__code__)) and (caller := self.caller(sys._getframe(2))):
+        """Add a launch from the frame that called `wp.launch`, or `launch`, which finds arguments by name."""
+        frame = sys._getframe(2)
+        frame = frame.f_back if frame.f_code is launch.__code__ else frame
+        if (called := self.name(kernel.func.__code__)) and (caller := self.caller(frame)):
             self.graph.add_edge(caller, called)
 
     def leads(self, first: str, second: str) -> bool:
@@ -105,11 +108,11 @@ class CallGraph:
 def calls(tmp_path_factory):
     """Of a bake of one episode, and of an export in this process, whose tasks run in it."""
     calls = CallGraph()
-    launch, out = wp.launch, tmp_path_factory.mktemp("spine")
+    warps, out = wp.launch, tmp_path_factory.mktemp("spine")
 
     def record(kernel: Any, *arguments: Any, **options: Any) -> Any:
         calls.launched(kernel)
-        return launch(kernel, *arguments, **options)
+        return warps(kernel, *arguments, **options)
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(wp, "launch", record)

@@ -73,6 +73,17 @@ def describe_error(error: BaseException) -> str:
     return text if len(text) <= MAX_SHOWN else f"{text[:MAX_SHOWN]}…"
 
 
+@contextmanager
+def reading_as(kind: str, path: Path) -> Iterator[None]:
+    """Raise whatever a reader raises in this context as a `CatalogError`: on a damaged file, that may be nearly anything."""
+    try:
+        yield
+    except CatalogError:
+        raise
+    except Exception as error:
+        raise CatalogError(f"{path}: not readable as {kind} ({describe_error(error)})") from error
+
+
 @dataclass(frozen=True)
 class AssetScope:
     """Folder that the files of one object may refer to, and the names that were found elsewhere than stated."""

@@ -24,8 +24,8 @@ MAX_DEPTH = 16
 
 _NAME = re.compile(r"obj_([0-9]+)\.ply", re.IGNORECASE)
 _MILLIMETRE = 1e-3
-# Published matrices have six digits.
-_ROTATION_TOLERANCE = 1e-3
+ROTATION_TOLERANCE = 1e-3
+"""Of the elements of a rigid transform: published matrices have six digits."""
 _ADVICE = "or remove the file to go without symmetries"
 _NEEDED = "diameter above 0 in mm, symmetries_discrete of 16 numbers each, symmetries_continuous of axis and offset of 3 numbers each"
 
@@ -202,12 +202,14 @@ def _scaled(info: ModelInfo, factor: float) -> ModelInfo:
 
 def _check_symmetries(info: ModelInfo, vertices: np.ndarray, diameter: float) -> list[str]:
     """Name the symmetries that do not map a mesh onto itself, by its extents (support function) in random directions."""
+    from trimesh.transformations import rotation_matrix
+
     directions = np.random.default_rng(0).normal(size=(_DIRECTIONS, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     extent = (vertices @ directions.T).max(axis=0)
     moves = [(f"symmetries_discrete[{index}]", [np.reshape(row, (4, 4))]) for index, row in enumerate(info.symmetries_discrete)]
     moves += [
-        (f"symmetries_continuous[{index}]", [_turn(np.array(axis), np.array(offset), turn) for turn in range(1, _TURNS)])
+        (f"symmetries_continuous[{index}]", [rotation_matrix(turn * 2.0 * np.pi / _TURNS, axis, offset) for turn in range(1, _TURNS)])
         for index, (axis, offset) in enumerate(info.symmetries_continuous)
     ]
     said = []
@@ -219,16 +221,6 @@ def _check_symmetries(info: ModelInfo, vertices: np.ndarray, diameter: float) ->
         if off > _ASYMMETRY * diameter:
             said.append(f"{name}, which moves its surface by {off / _MILLIMETRE:.3g} mm; it is used as given, correct or remove it")
     return said
-
-
-def _turn(axis: np.ndarray, offset: np.ndarray, turn: int) -> np.ndarray:
-    """Rotation about an axis through a point by `turn` of _TURNS parts of a circle (Rodrigues), as a 4 x 4 matrix."""
-    angle = 2.0 * np.pi * turn / _TURNS
-    cross = np.cross(np.eye(3), axis)
-    rotation = np.eye(3) + np.sin(angle) * cross + (1.0 - np.cos(angle)) * cross @ cross
-    matrix = np.eye(4)
-    matrix[:3, :3], matrix[:3, 3] = rotation, offset - rotation @ offset
-    return matrix
 
 
 def read_entries(path: Path) -> dict[str, Any] | None:
@@ -270,17 +262,22 @@ def _info(entry: _Entry, place: str) -> ModelInfo:
 def _rigid(value: list[float], place: str) -> tuple[float, ...]:
     """Validate a rigid 4 x 4 matrix, row by row [mm], and convert the translation to metres."""
     matrix = np.array(value, dtype=np.float64).reshape(4, 4)
-    rotation = matrix[:3, :3]
-    off = max(np.abs(rotation @ rotation.T - np.eye(3)).max(), np.abs(matrix[3] - (0, 0, 0, 1)).max(), abs(np.linalg.det(rotation) - 1.0))
-    if off > _ROTATION_TOLERANCE:
+    if not is_rigid(matrix):
         raise CatalogError(f"{place}: not a rotation and translation; needed: a rigid 4 x 4 matrix, row by row")
     matrix[:3, 3] *= _MILLIMETRE
     return tuple(float(value) for value in matrix.reshape(-1))
 
 
+def is_rigid(matrix: np.ndarray) -> bool:
+    """Whether a 4 x 4 matrix is a rotation and a translation."""
+    rotation = matrix[:3, :3]
+    off = max(np.abs(rotation @ rotation.T - np.eye(3)).max(), np.abs(matrix[3] - (0, 0, 0, 1)).max(), abs(np.linalg.det(rotation) - 1.0))
+    return bool(off <= ROTATION_TOLERANCE)
+
+
 def _is_identity(matrix: tuple[float, ...]) -> bool:
     """Whether a transform leaves everything in place: some data sets list the identity, which makes no object symmetric."""
-    return bool(np.abs(np.reshape(matrix, (4, 4)) - np.eye(4)).max() < _ROTATION_TOLERANCE)
+    return bool(np.abs(np.reshape(matrix, (4, 4)) - np.eye(4)).max() < ROTATION_TOLERANCE)
 
 
 def _axis(value: _Axis, place: str) -> tuple[tuple[float, float, float], tuple[float, float, float]]:

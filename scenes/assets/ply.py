@@ -13,7 +13,7 @@ from trimesh.exchange.ply import load_ply
 
 from synpick_warp.errors import CatalogError
 from synpick_warp.scenes.assets.appearance import MAX_TEXTURE_FILE, FileMaterial, decode_texture
-from synpick_warp.scenes.assets.asset_files import MAX_MESH_FILE, MAX_ROWS, MAX_TEXT_MESH, describe_error, quiet_decoding, read_referred
+from synpick_warp.scenes.assets.asset_files import MAX_MESH_FILE, MAX_ROWS, MAX_TEXT_MESH, quiet_decoding, read_referred, reading_as
 from synpick_warp.scenes.assets.mesh_parts import NO_MATERIAL, WHITE, MeshPart, Notes
 from synpick_warp.scenes.assets.ply_binary import read_binary
 from synpick_warp.scenes.assets.polygons import clip_ears, find_concave
@@ -92,12 +92,8 @@ def read_ply(path: Path, notes: Notes) -> list[MeshPart]:
         CatalogError: The file cannot be read or has no triangles, or its texture is missing.
     """
     data = read_ply_file(path)
-    try:
+    with reading_as("PLY", path):
         part = _ply_part(_elements(data, path), path, notes)
-    except CatalogError:
-        raise
-    except Exception as error:  # the reader raises nearly anything on damaged files
-        raise CatalogError(f"{path}: not readable as PLY ({describe_error(error)})") from error
     found = notes.image(lambda: read_ply_texture(data, path))
     if found is None:
         return [replace(part, uv=None)]
@@ -116,13 +112,8 @@ def read_ply_vertices(path: Path) -> np.ndarray:
         CatalogError: The file cannot be read, has no vertices, or one that is not finite.
     """
     data = read_ply_file(path)
-    try:
-        with quiet_decoding():
-            vertices = _columns(_elements(data, path).get("vertex", {}), ("x", "y", "z"))
-    except CatalogError:
-        raise
-    except Exception as error:  # the reader raises nearly anything on damaged files
-        raise CatalogError(f"{path}: not readable as PLY ({describe_error(error)})") from error
+    with reading_as("PLY", path), quiet_decoding():
+        vertices = _columns(_elements(data, path).get("vertex", {}), ("x", "y", "z"))
     if vertices is None or not len(vertices):
         raise CatalogError(f"{path}: no vertices with x, y and z")
     if not np.isfinite(vertices).all():

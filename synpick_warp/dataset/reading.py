@@ -257,10 +257,10 @@ class DataSet(Mapping[int, Episode]):
 
         Raises:
             ConfigError: They are missing, or this version cannot read them.
-            DatasetError: No bake wrote the data set.
+            DatasetError: The data set is from another source.
         """
         if self.found is not None:
-            raise DatasetError(f"{self.folder} has no settings: no bake of synpick-warp wrote it")
+            raise DatasetError(f"{self.folder} has no settings: it is from another source than synpick-warp bake")
         from synpick_warp.configs.load import load_config
 
         return load_config(str(self.folder / CONFIG_FILE), {})

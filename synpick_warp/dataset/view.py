@@ -15,7 +15,7 @@ from msgspec import UNSET
 from synpick_warp.configs.schema import LAYERS
 from synpick_warp.dataset.annotations import ADVICE
 from synpick_warp.dataset.bop.arrays import instance_ids
-from synpick_warp.dataset.view_files import SceneFiles, ViewRecords, check_planes
+from synpick_warp.dataset.view_files import SceneFiles, ViewRecords
 from synpick_warp.errors import DatasetError
 from synpick_warp.views.layer_codec import decode_layer, image_format
 
@@ -58,25 +58,19 @@ class View:
     @cached_property
     def rgb(self) -> np.ndarray:
         """Colour image, sRGB (H, W, 3) uint8, red first."""
-        return np.ascontiguousarray(self._image("rgb", 3, "uint8")[..., ::-1])
+        return np.ascontiguousarray(self._files.typed_image("rgb", self.image_id, 3, "uint8")[..., ::-1])
 
     @cached_property
     def depth(self) -> np.ndarray:
         """Planar depth (z in the camera frame) (H, W) float32 [m]; 0: no surface."""
         scale = np.float32(self._camera_value("depth_scale") / MILLIMETERS)
-        return self._image("depth", None, "uint16") * scale
+        return self._files.typed_image("depth", self.image_id, None, "uint16") * scale
 
     def _camera_value(self, key: str) -> Any:
         """Value of the view's entry in scene_camera.json; raises DatasetError if it is missing, as in some data sets of other programs."""
         if key not in self.records.camera:
             raise DatasetError(f"{self._files.place}: the camera of image {self.image_id} has no {key}")
         return self.records.camera[key]
-
-    def _image(self, name: str, channels: int | None, dtype: str) -> np.ndarray:
-        """An image of the camera's size, with these channels."""
-        return check_planes(
-            self._files.image(name, self.image_id), channels, f"{name} of image {self.image_id} in {self._files.place}", dtype
-        )
 
     @cached_property
     def masks(self) -> np.ndarray:
@@ -105,11 +99,7 @@ class View:
         Raises:
             DatasetError: The data set has no such layer.
         """
-        if name not in LAYERS:
-            raise DatasetError(f"there is no layer {name}; layers: {', '.join(LAYERS)}")
-        dtype, channels = image_format(name)
-        image = self._image(name, channels, dtype)
-        return decode_layer(name, image if channels is None else image[..., ::-1])
+        return read_layer(self._files, name, self.image_id)
 
     @cached_property
     def intrinsics(self) -> np.ndarray:
@@ -191,6 +181,15 @@ class View:
 
     def __repr__(self) -> str:
         return f"View(episode {self.episode}, camera {self.camera}, frame {self.frame})"
+
+
+def read_layer(files: SceneFiles, name: str, frame: int) -> np.ndarray:
+    """Decode a layer of one image; values, units, shapes and errors as of `View.layer`."""
+    if name not in LAYERS:
+        raise DatasetError(f"there is no layer {name}; layers: {', '.join(LAYERS)}")
+    dtype, channels = image_format(name)
+    image = files.typed_image(name, frame, channels, dtype)
+    return decode_layer(name, image if channels is None else image[..., ::-1])
 
 
 def make_transform(rotation: Any, translation: Any) -> np.ndarray:

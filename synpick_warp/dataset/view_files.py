@@ -147,6 +147,10 @@ class SceneFiles(ABC):
             return to_color(decode_picture(data, source, DatasetError))
         return decode_picture(data, source, DatasetError, self.image_size(frame))
 
+    def typed_image(self, name: str, frame: int, channels: int | None, dtype: str) -> np.ndarray:
+        """An `image`, with its channels and type checked; see `check_planes`."""
+        return check_planes(self.image(name, frame), channels, f"{name} of image {frame} in {self.place}", dtype)
+
     def image_file(self, name: str, frame: int) -> tuple[str, bytes]:
         """Suffix and content of an image's file, which states the scene's size; `name` as for `image`."""
         suffix, data, source = self._need(name, frame)
@@ -427,24 +431,3 @@ def decode_run_lengths(counts: Sequence[int], size: Sequence[int]) -> np.ndarray
     """
     values = np.arange(len(counts)) % 2 == 1
     return np.repeat(values, counts).reshape(size[1], size[0]).T
-
-
-def read_image(folder: Path, stem: str, flags: int = -1, size: tuple[int, int] | None = None) -> np.ndarray:
-    """Decode the PNG or JPEG file of that name without suffix.
-
-    Args:
-        folder: Where it lies.
-        stem: File name without suffix.
-        flags: OpenCV's `IMREAD_` flags; -1: unchanged.
-        size: Width and height that it must have [px]; None: any.
-
-    Raises:
-        DatasetError: There is none, or OpenCV cannot decode it, or it has another size.
-    """
-    base = f"{folder}{os.sep}{stem}"
-    for suffix in SUFFIXES:
-        path = f"{base}{suffix}"
-        data = read_file_if_present(path, MAX_IMAGE_FILE, DatasetError)
-        if data is not None:
-            return decode_image(data, path, DatasetError, flags, size)
-    raise DatasetError(f"there is no {folder / stem}.png or .jpg; the data set is not complete")

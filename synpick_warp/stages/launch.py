@@ -1,8 +1,9 @@
-"""Kernel launches over pixels and views: blocks of whole tiles on the GPU, several threads on the CPU."""
+"""Kernel launches: arguments by name; over pixels and views in blocks of whole tiles on the GPU, in several threads on the CPU."""
 
 from __future__ import annotations
 
 import functools
+import inspect
 import os
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
@@ -40,6 +41,44 @@ def _pool() -> ThreadPoolExecutor:
 
 # Threads do not survive a fork: a child process creates its own pool.
 os.register_at_fork(after_in_child=_pool.cache_clear)
+
+
+def launch(
+    kernel: wp.Kernel, dim: int | tuple[int, ...], *sources: object, out: object = None, block_dim: int = 256, **given: object
+) -> None:
+    """Launch a kernel with arguments by the names of its parameters, without their suffixes `_out` and `_inout`.
+
+    Args:
+        kernel: The kernel.
+        dim: Number of threads.
+        sources: Objects with attributes of these names, such as groups of device arrays; each name is that of one of them.
+        out: Object with the parameters that end in `_out`; None: they are looked for like the others.
+        block_dim: Threads of a block on the GPU.
+        given: Arguments that no object has under the parameter's name, by this name, with or without suffix.
+
+    Raises:
+        TypeError: No source has an argument, or several have it, or an argument is none of the kernel's.
+    """
+    arguments = []
+    for parameter, name in _parameters(kernel):
+        if given.keys() & {parameter, name}:
+            arguments.append(given.pop(parameter if parameter in given else name))
+            continue
+        owners = [out] if out is not None and parameter.endswith("_out") else [source for source in sources if hasattr(source, name)]
+        if len(owners) != 1:
+            raise TypeError(f"{kernel.key}: {len(owners)} sources have {name}")
+        arguments.append(getattr(owners[0], name))
+    if given:
+        raise TypeError(f"{kernel.key} has no parameter {', '.join(given)}")
+    device = next(argument.device for argument in arguments if isinstance(argument, wp.array))
+    wp.launch(kernel, dim=dim, inputs=arguments, device=device, block_dim=block_dim)
+
+
+@functools.cache
+def _parameters(kernel: wp.Kernel) -> list[tuple[str, str]]:
+    """Parameters of a kernel, and their names without suffix."""
+    names = inspect.signature(kernel.func).parameters
+    return [(name, name.removesuffix("_out").removesuffix("_inout")) for name in names]
 
 
 def launch_pixels(kernel: wp.Kernel, pixels: int, inputs: list[Any], outputs: list[Any], device: wp.Device) -> None:

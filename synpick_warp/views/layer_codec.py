@@ -1,6 +1,4 @@
-"""PNG codec of annotation layers: quantizes their values to 8 or 16 bits, and reads them back.
-
-    flow = read_layer(Path("DATA/train_pbr/000003"), "flow", 17)      # (H, W, 2) float32 [px], NaN: unknown
+"""PNG codec of annotation layers: quantizes their values to 8 or 16 bits, and back.
 
 The layers, with type, unit and meaning of their values: `layers.LAYER_TABLE`. Axes are the camera's: x right, y down, z forward.
 """
@@ -12,11 +10,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
-import cv2
 import numpy as np
 
-from synpick_warp.errors import DatasetError
-from synpick_warp.system.inputs.image_files import read_image_file
 from synpick_warp.views.layers import FLOW_STEPS, LAYER_TABLE, MAX_CODE, NORMAL_STEPS, SCENE_FLOW_STEP, ZERO_CODE
 
 
@@ -40,31 +35,6 @@ def decode_layer(name: str, image: np.ndarray) -> np.ndarray:
         (H, W, 2) float32, albedo (H, W, 3) uint8, classes and depth_sensor (H, W) uint16.
     """
     return CODECS[LAYER_TABLE[name].encoding].decode(image)
-
-
-def read_layer(scene: Path, name: str, frame: int, size: tuple[int, int] | None = None, sensor: str = "") -> np.ndarray:
-    """Read a layer of one image of a BOP scene; the values are those of `decode_layer`.
-
-    Args:
-        scene: Folder of the scene.
-        name: Name of the layer.
-        frame: Index of the image.
-        size: Width and height that it must have [px]; None: any.
-        sensor: Suffix of the folders of one sensor, such as "_cam1"; empty: classic layout.
-
-    Raises:
-        DatasetError: There is no such layer or file, or the file is no image of this layer and size.
-    """
-    if name not in LAYER_TABLE:
-        raise DatasetError(f"there is no layer {name}; layers: {', '.join(LAYER_TABLE)}")
-    path = layer_path(scene, f"{name}{sensor}", frame)
-    if not path.exists():
-        raise DatasetError(f"there is no {path}; bake with render.layers naming {name}")
-    dtype, channels = image_format(name)
-    image = read_image_file(path, DatasetError, cv2.IMREAD_UNCHANGED, size)
-    if image.dtype.name != dtype or image.shape[2:] != (() if channels is None else (channels,)):
-        raise DatasetError(f"{path} is no image of the layer {name}; bake the data set again")
-    return decode_layer(name, image if channels is None else image[..., ::-1])
 
 
 def layer_path(scene: Path, name: str, frame: int) -> Path:

@@ -131,7 +131,7 @@ def test_statistics_and_report_of_any_layout(folders, name, tmp_path):
     code, out, _ = run("stats", folders[name], "--threads", 1)
     assert code == 0
     assert f"{views} views in " in out
-    assert "missing: no bake wrote this data set" in out
+    assert "missing: this data set is from another source" in out
     assert run("report", folders[name], "--out", tmp_path / "page.html", "--views", 2, "--threads", 1)[0] == 0
 
 
@@ -348,5 +348,5 @@ def test_folders_that_are_no_data_set_say_so(tmp_path, plain):
         synpick_warp.open(plain / "test")
     with pytest.raises(DatasetError, match="is a scene; name the data set, two folders above"):
         synpick_warp.open(plain / "test/000000")
-    with pytest.raises(DatasetError, match="has no settings: no bake of synpick-warp wrote it"):
+    with pytest.raises(DatasetError, match="has no settings: it is from another source"):
         _ = synpick_warp.open(plain).config

@@ -12,7 +12,8 @@ import pytest
 
 from synpick_warp.configs.schema import LAYERS
 from synpick_warp.dataset.commit.manifest import episode_entry, read_checksums
-from synpick_warp.views.layer_codec import read_layer
+from synpick_warp.dataset.view import read_layer
+from synpick_warp.dataset.view_files import SceneFolder
 from tests.builders import PICKING, STIRRING, bake_boxes, once
 from tests.harness.exporter_contract import digests
 
@@ -65,7 +66,7 @@ class View:
         return None
 
     def layer(self, name: str) -> np.ndarray:
-        return read_layer(self.scene, name, self.frame)
+        return read_layer(SceneFolder(self.scene), name, self.frame)
 
 
 def views(split: Path) -> list[View]:

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from scipy.spatial.distance import pdist
 
 from synpick_warp.apps.validation.comparison import best_shift, fit_masks, moved
-from synpick_warp.apps.validation.model_files import diameter, sample_area, turn_about
+from synpick_warp.apps.validation.model_files import diameter, sample_area
 from synpick_warp.apps.validation.pictures import crop_mask, decode_mask, png_type
 from synpick_warp.apps.validation.rules.coco import run_lengths
 from synpick_warp.errors import DatasetError
@@ -76,12 +76,6 @@ def test_samples_are_spread_evenly_over_the_area():
     assert points[:, 0].mean() == pytest.approx(2.0, abs=0.02)
     assert points[:, 1].mean() == pytest.approx(0.5, abs=0.02)
     assert (points[:, 2] == 0.0).all()
-
-
-def test_a_turn_about_an_axis_keeps_its_points():
-    turn = turn_about((0.0, 0.0, 2.0), (1.0, 2.0, 5.0), np.pi / 2.0)
-    np.testing.assert_allclose(turn @ (1.0, 2.0, -7.0, 1.0), (1.0, 2.0, -7.0, 1.0), atol=1e-12)
-    np.testing.assert_allclose(turn @ (2.0, 2.0, 0.0, 1.0), (1.0, 3.0, 0.0, 1.0), atol=1e-12)
 
 
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16])

@@ -279,7 +279,7 @@ CIRCLE = {
         (damaged(peak_force=[float("inf")]), r"line 2, is damaged: JSON is malformed"),
         (damaged(observation=NO_POLE), r"line 2, is damaged: expected array, got null - at \$\.observation\.instances\[0\]\.pole"),
         (damaged(observation=CIRCLE), r"the clutter graph of attempt 0 of episode 1 has a cycle"),
-        (damaged(frame=77), r"scene_gt\.json has no image 77, which "),
+        (damaged(frame=77), r"000003 has no image 77, which .*attempts\.jsonl names"),
     ],
 )
 def test_a_damaged_record_is_one_clear_line(dataset, line, said):
@@ -303,7 +303,7 @@ def test_a_damaged_record_is_one_clear_line(dataset, line, said):
         (lambda folder: (folder / "attempts.jsonl").write_text(""), r"has no attempt of episode 1; episodes that have: none"),
         (lambda folder: (folder / "config.toml").unlink(), r"has no config\.toml"),
         (lambda folder: (folder / "models" / "models_info.json").unlink(), r"there is no file .*models_info\.json"),
-        (lambda folder: shutil.rmtree(folder / "train" / "000003"), r"there is no file .*000003/scene_gt\.json"),
+        (lambda folder: shutil.rmtree(folder / "train" / "000003"), r"has no images of episode 1"),
         (lambda folder: (folder / "train/000003/rgb/000000.png").unlink(), r"there is no .*rgb/000000\.png or \.jpg"),
         (lambda folder: (folder / "train/000003/rgb/000000.png").write_bytes(b"x"), r"000000\.png is not an image"),
         (lambda folder: (folder / "train/000003/mask_visib/000000_000001.png").unlink(), r"there is no .*000000_000001\.png"),

@@ -50,7 +50,7 @@ def test_a_row_a_view_four_pictures_and_a_legend_a_row(dataset, tmp_path):
     assert sheet.shape == (4 * (20 + 360 + 4), 4 * (480 + 4) + LEGEND, 3)
     first = sheet[20:380, :480]
     scene, frame = sample(find_scenes(dataset), 4)[0]
-    color = cv2.imread(str(scene.images("rgb") / f"{frame:06d}.jpg"))
+    color = cv2.imread(str(scene.folder / f"rgb{scene.sensor}" / f"{frame:06d}.jpg"))
     np.testing.assert_array_equal(first[2::5, 2::5], color)
 
 
@@ -102,7 +102,7 @@ def test_instances_and_boxes_are_drawn_where_they_are(dataset, tmp_path):
     sheet = cv2.imread(str(write_contact_sheet(dataset, tmp_path / "sheet.png", 1)))
     scene, frame = sample(find_scenes(dataset), 1)[0]
     index = 1
-    mask = cv2.imread(str(scene.images("mask_visib") / f"{frame:06d}_{index:06d}.png"), cv2.IMREAD_GRAYSCALE) > 0
+    mask = cv2.imread(str(scene.folder / f"mask_visib{scene.sensor}" / f"{frame:06d}_{index:06d}.png"), cv2.IMREAD_GRAYSCALE) > 0
     instances = sheet[20:380, 2 * 484 : 2 * 484 + 480][2::5, 2::5]
     assert len(np.unique(instances[mask], axis=0)) == 1
     color = instances[mask][0]
@@ -168,7 +168,9 @@ def test_depth_has_one_scale_the_totes(dataset, tmp_path):
     assert (near, far) == pytest.approx((min(depths["near"] + depths["far"]), max(depths["near"] + depths["far"])))
     sheet = cv2.imread(str(write_contact_sheet(dataset, tmp_path / "sheet.png", 6)))
     for row, (scene, frame) in enumerate(views):
-        depth = cv2.imread(str(scene.images("depth") / f"{frame:06d}.png"), cv2.IMREAD_UNCHANGED) * records[row]["depth_scale"]
+        depth = (
+            cv2.imread(str(scene.folder / f"depth{scene.sensor}" / f"{frame:06d}.png"), cv2.IMREAD_UNCHANGED) * records[row]["depth_scale"]
+        )
         expected = color_depth(depth, (near, far))
         np.testing.assert_array_equal(sheet[384 * row + 20 : 384 * row + 380, 484 : 484 + 480][2::5, 2::5], expected)
 

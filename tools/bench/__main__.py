@@ -117,7 +117,6 @@ def _describe_setup(count: int, cameras: Cameras, options: argparse.Namespace) -
 
 
 def _parse(arguments: list[str] | None) -> argparse.Namespace:
-    """Parse the command line."""
     parser = make_parser(__doc__, "device", "models", "lights", "set", "json")
     worlds_help = f"worlds simulated in parallel (default: {WORLDS}; the part whole: as many as a bake of --episodes chooses)"
     parser.add_argument("--worlds", type=positive_count, help=worlds_help)
@@ -151,7 +150,6 @@ def _parse(arguments: list[str] | None) -> argparse.Namespace:
 
 
 def _config(options: argparse.Namespace) -> Config:
-    """Settings of the options: as many episodes as worlds, the resolution."""
     worlds, resolution = options.worlds or WORLDS, parse_resolution(options.resolution)
     return configure(options, {"bake.worlds": worlds, "bake.episodes": worlds, "cameras.resolution": resolution})
 

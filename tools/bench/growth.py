@@ -39,9 +39,7 @@ cameras."""
 
 @dataclass(frozen=True)
 class Pile:
-    """Worlds DROP_TICKS ticks after the drop: snapshot, mean number of objects in a world, and time of the physics of a tick of all worlds
-    together [s].
-    """
+    """Worlds after the drop."""
 
     snapshot: Snapshot
     objects: float
@@ -117,9 +115,6 @@ def vary(config: Config, factor: str, value: float) -> tuple[str, Config]:
 
 
 def _turn(cameras: Cameras, name: str, count: int) -> tuple[tuple[float, float, float], ...]:
-    """First `count` vectors of the cameras' member `name`, repeated as needed; every second repetition is turned by 180° about the
-    vertical.
-    """
     vectors = getattr(cameras, name)
     repeats = math.ceil(count / len(vectors))
     return tuple(((-1) ** turn * x, (-1) ** turn * y, z) for turn in range(repeats) for x, y, z in vectors)[:count]
@@ -143,11 +138,7 @@ def measure_growth(config: Config, min_seconds: float) -> Iterator[Row]:
 
 
 def _rows(name: str, steps: int, pile: Pile | None, view: float) -> Iterator[Row]:
-    """Rows of one measurement: objects, physics time and world-steps per second if a pile was dropped for it (else None), and time of a
-    view.
-
-    `steps`: physics steps of a tick, of all worlds together; `view` [s].
-    """
+    """Rows of a point: of piles that were dropped for it, and of a view that takes `view` [s]."""
     if pile is not None:
         yield Row(f"{name}: objects a tote", pile.objects)
         yield Row(f"{name}: physics of a tick", 1e3 * pile.seconds, "ms")

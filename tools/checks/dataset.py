@@ -1,14 +1,14 @@
-"""Consistency check of a baked BOP data set: images against models and poses, scene_gt_info against images, cameras against each other.
+"""Accuracy check of a baked BOP data set: images and scene_gt_info against models and poses, cameras against each other.
 
-Independent of the project's code: triangles of models/ are intersected with the rays of pixel centres here, in float64. Prints a
-table; exits with 1 if a bound is violated, with 2 if the folder cannot be checked.
+Independent of the kernels that made it: triangles of models/ are intersected with the rays of pixel centres here, in float64. Prints a
+table; exits with 1 if a bound is violated, with 2 if the folder cannot be checked. What files say of each other, without models (counts
+of masks, COCO annotations, missing files), is checked by `synpick-warp validate`.
 
     python -m tools.checks.dataset DIR --views 24
 """
 
 from __future__ import annotations
 
-import argparse
 import json
 import sys
 from collections import defaultdict
@@ -22,7 +22,7 @@ import cv2
 import numpy as np
 import trimesh
 
-from tools.checks.measures import Measure, UnusableError, print_measures
+from tools.checks.measures import Measure, UnusableError, run_check
 
 DEPTH_TOLERANCE = 0.2
 """Largest allowed difference between a depth image and the models [mm]."""
@@ -36,7 +36,6 @@ CHUNK = 2_000_000
 class Report:
     """Measures of the check, one for each bounded quantity."""
 
-    missing: Measure = field(default_factory=lambda: Measure("missing files, and lists of different length", "", 0))
     rotation: Measure = field(default_factory=lambda: Measure("rotations: deviation from orthonormal", "", 1e-9))
     world: Measure = field(default_factory=lambda: Measure("position of an instance, camera against camera", "mm", 1e-3))
     depth: Measure = field(default_factory=lambda: Measure("depth against models, inside", "mm", DEPTH_TOLERANCE))
@@ -44,15 +43,8 @@ class Report:
     unknown: Measure = field(default_factory=lambda: Measure("visible instance without depth", "% of px", 0))
     mask: Measure = field(default_factory=lambda: Measure("mask against models", "% of px", 0.05))
     visible: Measure = field(default_factory=lambda: Measure("mask_visib against models and depth", "% of px", 0.05))
-    overlap: Measure = field(default_factory=lambda: Measure("mask_visib of several instances", "% of px", 0))
-    outside: Measure = field(default_factory=lambda: Measure("mask_visib outside mask", "% of px", 0))
     count_all: Measure = field(default_factory=lambda: Measure("px_count_all against models, beyond 2 px and 0.1 %", "px", 0))
-    count_valid: Measure = field(default_factory=lambda: Measure("px_count_valid against mask and depth", "px", 0))
-    count_visible: Measure = field(default_factory=lambda: Measure("px_count_visib against mask_visib", "px", 0))
-    fraction: Measure = field(default_factory=lambda: Measure("visib_fract against counts", "", 1e-12))
     box_amodal: Measure = field(default_factory=lambda: Measure("bbox_obj against models", "px", 1))
-    box_visible: Measure = field(default_factory=lambda: Measure("bbox_visib against mask_visib", "px", 0))
-    coco: Measure = field(default_factory=lambda: Measure("COCO annotations wrong or missing", "", 0))
 
 
 @dataclass(frozen=True, eq=False)
@@ -164,23 +156,6 @@ def transform_matrix(record: dict[str, Any], rotation: str, translation: str) ->
     return matrix
 
 
-def check_files(scene: Path, report: Report) -> None:
-    """Check that all lists of a scene have the same length and that no image is missing."""
-    cameras, truth, infos = (read_json(scene / f"scene_{name}.json") for name in ("camera", "gt", "gt_info"))
-    problems = len(cameras.keys() ^ truth.keys()) + len(cameras.keys() ^ infos.keys())
-    masks = [folder for name in ("mask", "mask_visib") if (folder := scene / name).is_dir()]
-    names = {
-        folder.name: {path.name for path in folder.iterdir()} for folder in (scene / "rgb", scene / "depth", *masks) if folder.is_dir()
-    }
-    for frame, records in truth.items():
-        stem = f"{int(frame):06d}"
-        problems += len(records) != len(infos.get(frame, ()))
-        problems += not names.get("rgb", set()) & {f"{stem}.jpg", f"{stem}.png"}
-        problems += f"{stem}.png" not in names.get("depth", ())
-        problems += sum(f"{stem}_{index:06d}.png" not in names[folder.name] for folder in masks for index in range(len(records)))
-    report.missing.update_max(problems, scene.name)
-
-
 def check_world(scenes: list[Path], frame: str, report: Report) -> None:
     """Check that each instance has the same world position in all cameras of an episode."""
     extents = defaultdict(list)
@@ -267,27 +242,16 @@ def check_images(view: View, report: Report) -> None:
         report.mask.add_pixels(mask ^ np.isfinite(inside[index]), mask, view.where)
     for index, visible in enumerate(view.visible):
         report.visible.add_pixels(visible ^ expected[index], visible, view.where)
-    report.overlap.add_pixels(view.visible.sum(axis=0) > 1, view.visible.any(axis=0), view.where)
-    if len(view.masks) == len(view.visible):
-        report.outside.add_pixels(view.visible & ~view.masks, view.visible, view.where)
 
 
 def check_info(view: View, report: Report) -> None:
-    """Check scene_gt_info against images and models."""
+    """Check scene_gt_info against models."""
     for index, (info, silhouette) in enumerate(zip(view.infos, view.silhouettes, strict=True)):
         where = f"{view.where} instance {index}"
         amodal = int(np.isfinite(silhouette.depth).sum())
         report.count_all.update_max(max(0.0, abs(info["px_count_all"] - amodal) - max(2.0, 1e-3 * amodal)), where)
-        fraction = info["px_count_visib"] / info["px_count_all"] if info["px_count_all"] else 0.0
-        report.fraction.update_max(abs(info["visib_fract"] - fraction), where)
         box = silhouette.box() if info["px_count_visib"] else [-1, -1, -1, -1]
         report.box_amodal.update_max(box_error(info["bbox_obj"], box), where)
-        if len(view.masks):
-            valid = np.count_nonzero(view.masks[index] & np.isfinite(view.depth))
-            report.count_valid.update_max(abs(info["px_count_valid"] - valid), where)
-        if len(view.visible):
-            report.count_visible.update_max(abs(info["px_count_visib"] - np.count_nonzero(view.visible[index])), where)
-            report.box_visible.update_max(box_error(info["bbox_visib"], tight_box(view.visible[index])), where)
 
 
 def box_error(one: list[int], other: list[int]) -> float:
@@ -296,38 +260,14 @@ def box_error(one: list[int], other: list[int]) -> float:
     return float(max(abs(a - b) for a, b in zip(*sides, strict=True)))
 
 
-def check_coco(scene: Path, frame: str, view: View, report: Report) -> None:
-    """Check COCO annotations against masks, boxes and scene_gt."""
-    if not (scene / "scene_gt_coco.json").is_file() or len(view.visible) != len(view.masks):
-        return
-    coco = read_json(scene / "scene_gt_coco.json")
-    annotations = [annotation for annotation in coco["annotations"] if annotation["image_id"] == int(frame)]
-    expected = [index for index, visible in enumerate(view.visible) if visible.any()]
-    wrong = abs(len(annotations) - len(expected)) + (int(frame) not in {image["id"] for image in coco["images"]})
-    for annotation, index in zip(annotations, expected, strict=False):
-        counts, (height, width) = annotation["segmentation"]["counts"], annotation["segmentation"]["size"]
-        runs = np.repeat(np.arange(len(counts)) % 2 == 1, counts)
-        mask_equal = runs.size == height * width and np.array_equal(runs.reshape(width, height).T, view.visible[index])
-        x, y, box_width, box_height = tight_box(view.masks[index])
-        wrong += not (
-            mask_equal
-            and annotation["bbox"] == [x, y, box_width + 1, box_height + 1]
-            and annotation["area"] == np.count_nonzero(view.visible[index])
-            and annotation["category_id"] == read_json(scene / "scene_gt.json")[frame][index]["obj_id"]
-            and annotation["ignore"] == (view.infos[index]["visib_fract"] < 0.1)
-        )
-    report.coco.update_max(wrong, view.where)
-
-
 def check(dataset: Path, views: int) -> Report:
-    """Check that all files of a data set exist, and `views` views spread evenly over it; returns all measures."""
+    """Check `views` views spread evenly over a data set."""
     scenes = sorted(path.parent for path in dataset.glob("[!.]*/*/scene_camera.json"))
     if not scenes:
         raise UnusableError(f"{dataset} has no scene")
     report = Report()
     cameras = set()
     for scene in scenes:
-        check_files(scene, report)
         first = next(iter(read_json(scene / "scene_camera.json").values()), {})
         cameras.add((*first.get("cam_R_w2c", ()), *first.get("cam_t_w2c", ())))
     order = [(scene, frame) for scene in scenes for frame in sorted(read_json(scene / "scene_gt.json"), key=int)]
@@ -340,32 +280,12 @@ def check(dataset: Path, views: int) -> Report:
         view = read_view(scene, frame)
         check_images(view, report)
         check_info(view, report)
-        check_coco(scene, frame, view, report)
     return report
-
-
-def print_report(report: Report) -> bool:
-    """Print the table; returns whether all bounds hold and the sampled views have instances."""
-    held = print_measures(vars(report).values())
-    if not (report.depth.total and report.world.total):
-        print("nothing was checked: no sampled view has an instance")
-        return False
-    return held
 
 
 def main() -> int:
     """Run the command line; returns the exit code."""
-    parser = argparse.ArgumentParser(description="Check a baked BOP data set for consistency.")
-    parser.add_argument("dataset", type=Path, metavar="DIR", help="folder of the data set")
-    parser.add_argument("--views", type=int, default=24, help="views to check, spread over the data set (default %(default)s)")
-    arguments = parser.parse_args()
-    if arguments.views < 1:
-        parser.error(f"--views is {arguments.views}; allowed: at least 1")
-    try:
-        return 0 if print_report(check(arguments.dataset, arguments.views)) else 1
-    except UnusableError as error:
-        print(f"check_dataset: {error}", file=sys.stderr)
-        return 2
+    return run_check(__doc__, "views", 24, lambda folder, count: vars(check(folder, count)), ("depth", "world"))
 
 
 if __name__ == "__main__":

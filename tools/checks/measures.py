@@ -1,12 +1,16 @@
-"""Bounded quantities of a data set check: their worst value, their verdict, and the table of all."""
+"""Bounded quantities of a data set check: their worst value, their verdict, the table of all, and the command line of a check."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+import argparse
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
+
+from tools.options import fail, positive_count
 
 
 class UnusableError(Exception):
@@ -62,3 +66,31 @@ def print_measures(measures: Iterable[Measure]) -> bool:
         print(f"{measure.name:<60} {worst:>12} {measure.allowed:>9g} {measure.unit:<8} {measure.total:>10}  {measure.where}{verdict}")
         held = held and measure.holds
     return held
+
+
+def run_check(
+    doc: str | None, samples: str, default: int, check: Callable[[Path, int], Mapping[str, Measure]], needed: Iterable[str]
+) -> int:
+    """Run the command line of a check; returns the exit code.
+
+    Args:
+        doc: Docstring of the check, whose first line describes it.
+        samples: Name of what it takes samples of, such as "views".
+        default: Number of samples.
+        check: The check of a folder, with that many samples.
+        needed: Quantities without which nothing was checked.
+    """
+    parser = argparse.ArgumentParser(description=(doc or "").partition("\n")[0])
+    parser.add_argument("dataset", type=Path, metavar="DIR", help="folder of the data set")
+    text = f"{samples} to check, spread over the data set (default %(default)s)"
+    parser.add_argument(f"--{samples}", dest="count", type=positive_count, default=default, help=text)
+    given = parser.parse_args()
+    try:
+        measures = check(given.dataset, given.count)
+    except UnusableError as error:
+        return fail(parser.prog, str(error))
+    held = print_measures(measures.values())
+    missing = next((measures[name].name for name in needed if not measures[name].total), None)
+    if missing is not None:
+        print(f"nothing was checked: no sample has values of '{missing}'")
+    return 0 if held and missing is None else 1

@@ -9,7 +9,6 @@ with 2 if the folder cannot be checked.
 
 from __future__ import annotations
 
-import argparse
 import json
 import sys
 import tomllib
@@ -19,7 +18,7 @@ from typing import Any
 import numpy as np
 import zarr
 
-from tools.checks.measures import Measure, UnusableError, print_measures
+from tools.checks.measures import Measure, UnusableError, run_check
 
 STORE = "trajectory.zarr"
 MAX_SPEED = 5.0
@@ -157,28 +156,9 @@ def read_arrays(episode: zarr.Group, group: str) -> dict[str, np.ndarray]:
     return {name: np.asarray(array[...]) for name, array in episode[group].arrays()}  # type: ignore[union-attr]
 
 
-def print_table(measures: dict[str, Measure]) -> bool:
-    """Print the table; returns whether all bounds hold and the sampled episodes have steps."""
-    held = print_measures(measures.values())
-    if not measures["momentum"].total:
-        print("nothing was checked: no episode has steps")
-        return False
-    return held
-
-
 def main() -> int:
     """Run the command line; returns the exit code."""
-    parser = argparse.ArgumentParser(description="Check a data set's trajectories against the laws of motion.")
-    parser.add_argument("dataset", type=Path, metavar="DIR", help="folder of the data set")
-    parser.add_argument("--episodes", type=int, default=8, help="episodes to check, spread over the data set (default %(default)s)")
-    arguments = parser.parse_args()
-    if arguments.episodes < 1:
-        parser.error(f"--episodes is {arguments.episodes}; allowed: at least 1")
-    try:
-        return 0 if print_table(check(arguments.dataset, arguments.episodes)) else 1
-    except UnusableError as error:
-        print(f"check_trajectory: {error}", file=sys.stderr)
-        return 2
+    return run_check(__doc__, "episodes", 8, check, ("momentum",))
 
 
 if __name__ == "__main__":

@@ -1,7 +1,6 @@
-"""Comparisons: data sets, world counts, devices, checkouts.
+"""Comparisons: data sets, devices, checkouts.
 
-python -m tools.compare runs A B          # two data sets, file by file
-python -m tools.compare worlds            # the same episodes in different numbers of worlds
+python -m tools.compare runs A B          # two data sets, file by file, such as bakes with different numbers of worlds
 python -m tools.compare pictures          # the same pictures on two devices
 python -m tools.compare guard OLD NEW     # two checkouts, in all that they write, read and compile
 """
@@ -13,7 +12,7 @@ import sys
 
 from tools.options import fail
 
-COMMANDS = ("runs", "worlds", "pictures", "guard")
+COMMANDS = ("runs", "pictures", "guard")
 
 
 def main(arguments: list[str]) -> int:

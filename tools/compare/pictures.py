@@ -1,4 +1,4 @@
-"""Comparison of rendered outputs between two devices: every image and layer of the same piles, in all three rendering modes.
+"""Comparison of rendered outputs between two devices: every image and layer of the same piles, in both rendering modes.
 
 Piles settle once, on the first device; then objects are displaced by `CREEP`, so that flow is not zero. Exits with 1 if a difference
 exceeds its tolerance, with 2 if nothing can be compared.
@@ -8,7 +8,6 @@ exceeds its tolerance, with 2 if nothing can be compared.
 
 from __future__ import annotations
 
-import argparse
 import dataclasses
 import sys
 from dataclasses import dataclass, fields
@@ -37,15 +36,19 @@ from synpick_warp.system.hardware.device import pick_device
 from tools.options import configure, fail, make_parser, write_json
 from tools.reports.render_piles import next_frame, settle_piles
 
+OWN = {
+    "devices": {"default": "cpu,cuda:0", "help": "two devices, comma-separated (default: cpu,cuda:0)"},
+    "scenes": {"type": int, "default": 3, "help": "piles to render by all cameras (default: 3)"},
+    "samples": {"type": int, "default": 8, "help": "paths per pixel of the reference (default: 8)"},
+}
+"""Options of this report; see `tools.options.OPTIONS`."""
 CREEP = 1e-3
 """Displacement of objects since the frame before [m]."""
 
 
 @dataclass(frozen=True)
 class Tolerance:
-    """Tolerance of one output: difference up to which a pixel counts as equal (None: labels, which are equal or not), and the percentage of
-    pixels that may differ by more.
-    """
+    """Tolerance of one output: a difference per pixel, and the fraction of pixels that may exceed it."""
 
     difference: float | None
     """Largest difference that counts as equal [the output's unit]; None: labels, which are equal or not."""
@@ -99,8 +102,7 @@ class Difference:
 
 
 def compare(mode: str, output: str, a: np.ndarray, b: np.ndarray) -> Difference:
-    """Difference of one output between two devices: percentage of pixels that differ at all and beyond the tolerance, mean and largest
-    absolute difference. Labels (a tolerance of None) are equal or not, 0 or 1.
+    """Compare one output of two devices.
 
     Args:
         mode: Rendering mode.
@@ -132,14 +134,16 @@ def compare(mode: str, output: str, a: np.ndarray, b: np.ndarray) -> Difference:
 
 def main(arguments: list[str] | None = None) -> int:
     """Run the command line; returns the exit code."""
-    options = _parse(arguments)
+    options = make_parser(__doc__, "models", "lights", "seed", "set", "json", "size", own=OWN, size="160x90").parse_args(arguments)
     console = Console(highlight=False)
     try:
         names = options.devices.split(",")
         if len(names) != 2:
             raise SynpickError(f"--devices is {options.devices}; it takes two devices, such as cpu,cuda:0")
         devices = [pick_device(name) for name in names]
-        config = _config(options, names[0])
+        fixed = dict.fromkeys(("bake.episodes", "bake.worlds"), options.scenes) | {"render.layers": list(LAYERS)}
+        fixed |= {"bake.mode": "move", "bake.device": names[0], "render.samples": options.samples}
+        config = configure(options, fixed)
         differences = compare_devices(config, devices, console)
     except SynpickError as error:
         return fail("compare pictures", error)
@@ -150,31 +154,8 @@ def main(arguments: list[str] | None = None) -> int:
     return 0 if all(row.holds for row in differences) else 1
 
 
-def _parse(arguments: list[str] | None) -> argparse.Namespace:
-    """Parse the command line."""
-    parser = make_parser(__doc__, "models", "lights", "seed", "set", "json", "size")
-    parser.set_defaults(size="160x90")
-    parser.add_argument("--devices", default="cpu,cuda:0", help="two devices, comma-separated (default: cpu,cuda:0)")
-    parser.add_argument("--scenes", type=int, default=3, help="piles to render by all cameras (default: 3)")
-    parser.add_argument("--samples", type=int, default=8, help="paths per pixel of the reference (default: 8)")
-    return parser.parse_args(arguments)
-
-
-def _config(options: argparse.Namespace, device: str) -> Config:
-    """Settings of the options: one world for each pile, all layers, on `device`."""
-    fixed = {
-        "bake.mode": "move",
-        "bake.episodes": options.scenes,
-        "bake.worlds": options.scenes,
-        "bake.device": device,
-        "render.samples": options.samples,
-        "render.layers": list(LAYERS),
-    }
-    return configure(options, fixed)
-
-
 def compare_devices(config: Config, devices: list[Any], console: Console) -> list[Difference]:
-    """Render settled piles on both devices in each mode of COLORS, the denoised one first; returns the differences of all outputs.
+    """Render settled piles on both devices and compare all outputs; first those of the denoised mode.
 
     Raises:
         SynpickError: Models or lights cannot be used, or a pile does not come to rest.
@@ -214,7 +195,6 @@ def render_views(renderer: Renderer, snapshot: Snapshot) -> dict[str, np.ndarray
 
 
 def _print(console: Console, differences: list[Difference], title: str) -> None:
-    """Print a table of the differences, and whether each is within its tolerance."""
     table = Table("mode", "output", "differ %", "mean", "largest", "unit", "tolerance", "beyond %", "max %", title=title)
     table.add_column("", min_width=len("VIOLATED"), no_wrap=True)
     for row in differences:

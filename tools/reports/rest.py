@@ -16,6 +16,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from rich.console import Console
+from scipy.spatial.transform import Rotation
 
 from synpick_warp.codes import Ending, Phase
 from synpick_warp.configs.schema import Tote
@@ -192,14 +193,7 @@ def _measure(simulation: Simulation, catalog: Catalog, before: TickReport, now: 
 
 def transform_points(pose: np.ndarray, point: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Transform points (N, 3) by poses (N, 7: x, y, z, quaternion x, y, z, w); returns positions (N, 3) and rotation matrices (N, 3, 3)."""
-    x, y, z, w = pose[:, 3:].astype(np.float64).T
-    rotation = np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-        ]
-    ).transpose(2, 0, 1)
+    rotation = Rotation.from_quat(pose[:, 3:]).as_matrix()
     return pose[:, :3] + np.einsum("nij,nj->ni", rotation, point), rotation
 
 

@@ -33,8 +33,8 @@ from synpick_warp.system.progress import SilentProgress
 from tools.figures import finish_report
 from tools.options import Row, configure, fail, make_parser, positive_count, writable_file
 from tools.reports.reference_store import ReferenceStore, existing_folder
-from tools.reports.render_checks import Studio, bounded_row, first_camera
-from tools.reports.render_piles import MAX_BIAS, Pair
+from tools.reports.render_checks import Studio, first_camera
+from tools.reports.render_piles import Pair, summarize_pairs
 from tools.reports.render_sheet import write_sheets
 
 MIN_PSNR = 35.0
@@ -88,7 +88,7 @@ def main(arguments: list[str] | None = None) -> int:
             console.print(f"wrote {file}")
     except SynpickError as error:
         return fail("reports.sequence", error)
-    rows += _summarize(pairs)
+    rows += summarize_pairs(pairs, MIN_PSNR)
     width, height = config.cameras.resolution
     title = f"{config.bake.mode}, {width} x {height}, {config.render.samples} paths per pixel, {time.perf_counter() - started:.0f} s"
     return finish_report("tools.reports.sequence", options.json, device, "frames of episodes", title, rows)
@@ -123,16 +123,6 @@ def compare_frames(config: Config, frames: tuple[int, ...], cache: Path | None =
         phase = report.column("phase")
         if ((phase == Phase.IDLE) | ((phase == Phase.ACT) & (shown >= max(frames)))).all():
             return
-
-
-def _summarize(pairs: list[Pair]) -> list[Row]:
-    """Rows of image quality (PSNR, denoised against reference) and bias over all pairs."""
-    mean = float(np.mean([pair.quality for pair in pairs]))
-    return [
-        Row("denoised against reference, mean", mean, "dB", f">= {MIN_PSNR:g}", mean >= MIN_PSNR),
-        Row("denoised against reference, min", min(pair.quality for pair in pairs), "dB"),
-        bounded_row("bias of mean radiance, mean", float(np.mean([pair.bias for pair in pairs])), "%", MAX_BIAS),
-    ]
 
 
 if __name__ == "__main__":

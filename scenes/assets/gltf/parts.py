@@ -21,7 +21,7 @@ from synpick_warp.scenes.assets.appearance import (
     linear_to_srgb,
     srgb_to_linear,
 )
-from synpick_warp.scenes.assets.asset_files import describe_error
+from synpick_warp.scenes.assets.asset_files import reading_as
 from synpick_warp.scenes.assets.gltf.document import (
     COMPONENTS,
     FAN,
@@ -60,12 +60,8 @@ def read_gltf(path: Path, notes: Notes) -> list[MeshPart]:
         CatalogError: The file or one that it refers to cannot be used.
     """
     document = read_document(path, notes)
-    try:
+    with reading_as(path.suffix[1:].upper(), path):  # Values may be valid one by one, and not fit together.
         return _Reader(document, notes).parts()
-    except CatalogError:
-        raise
-    except Exception as error:  # values that are valid one by one, and do not fit together
-        raise CatalogError(f"{path}: not readable as {path.suffix[1:].upper()} ({describe_error(error)})") from error
 
 
 class _Reader:

@@ -18,9 +18,9 @@ from synpick_warp.scenes.assets.asset_files import (
     MAX_ROWS,
     MAX_TEXT_MESH,
     MissingFileError,
-    describe_error,
     is_missing,
     read_referred,
+    reading_as,
 )
 from synpick_warp.scenes.assets.mesh_parts import NO_MATERIAL, WHITE, MeshPart, Notes
 from synpick_warp.scenes.assets.text import decode_text
@@ -59,12 +59,8 @@ def read_obj(path: Path, notes: Notes) -> list[MeshPart]:
         notes.said += [f"the image {ascii(image)[:80]} of an unused material is missing" for image in known[name].missing_images()]
     pixels = TexturePixels(path)
     materials = {name: read_material(known[name], pixels, notes) for name in used if name in known}
-    try:
+    with reading_as("OBJ", path):
         parts = [_part(mesh, used, known, materials, path, notes) for mesh in _load(text, used)]
-    except CatalogError:
-        raise
-    except Exception as error:  # the reader raises nearly anything on damaged files
-        raise CatalogError(f"{path}: not readable as OBJ ({describe_error(error)})") from error
     if not parts:
         raise CatalogError(f"{path}: no triangles; a model needs a surface, a point cloud has none")
     return parts

@@ -29,7 +29,7 @@ from synpick_warp.exporters.base import ExportContext
 from synpick_warp.exporters.bop.shared.models import MODEL_FOLDERS
 from synpick_warp.exporters.formats import contents_of, convertible
 from synpick_warp.exporters.registry import Exporters, finalize, load_exporter_classes
-from synpick_warp.exporters.writing.files import PARTIAL, check_output_folder, output_error, write_atomically
+from synpick_warp.exporters.writing.files import PARTIAL, check_output_folder, output_error, output_errors, write_atomically
 from synpick_warp.exporters.writing.folder import Buffer
 from synpick_warp.exporters.writing.notes import CAMERA_FILE, NOTES_FILE
 from synpick_warp.exporters.writing.png import encode_png
@@ -64,10 +64,7 @@ class FoundViewFiles(StoredViewFiles):
 
     @property
     def color(self) -> tuple[str, Buffer]:
-        """Suffix and encoded colour image: the stored bytes if they have the format of the scene's first image, else encoded again.
-
-        See `EncodedView`. Raises DatasetError if the image's size is not that of the first one.
-        """
+        """See `EncodedView`."""
         size = self.files.image_size(self.frame)
         if size != self.size:
             shown, first = (f"{width} x {height}" for width, height in (size, self.size))
@@ -79,31 +76,28 @@ class FoundViewFiles(StoredViewFiles):
         return self.suffix, encode_png(image) if self.suffix == ".png" else encode_jpeg(image, _JPEG_QUALITY)
 
     def layer(self, name: str) -> Buffer:
-        """Encoded layer as PNG: the stored bytes, or encoded again if they are of another format. See `StoredView`."""
+        """See `StoredView`."""
         suffix, data = self.files.image_file(name, self.frame)
-        return data if suffix == ".png" else encode_png(self._image(name, None, "uint16"))
+        return data if suffix == ".png" else encode_png(self.files.typed_image(name, self.frame, None, "uint16"))
 
     def masks(self) -> list[Masks]:
-        """Run lengths of the amodal and visible mask of each instance; without amodal masks the visible ones stand for both. See
-        `EncodedView`.
-        """
+        """See `EncodedView`; where there are no amodal masks, COCO's formats need none."""
         visible = self._runs("mask_visib")
         return [Masks(*pair) for pair in zip(self._runs("mask") if self.files.has("mask") else visible, visible, strict=True)]
 
     def _runs(self, name: str) -> list[Runs]:
-        """Run lengths of one kind of masks, in the order of instances."""
         return [find_runs(mask) for mask in self.files.masks(name, self.frame, len(self.gt))]
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class FoundSceneFiles(StoredSceneFiles):
-    """Scene of any BOP data set as a `StoredScene`: its views in the colour format and size of its first image."""
+    """`StoredScene` of any BOP scene."""
 
     suffix: str
     size: tuple[int, int]
 
     def views(self, frames: range) -> Iterator[StoredViewFiles]:
-        """Yield the views of these frames (indices, not im_ids), with the colour format and size of the first. See `StoredScene`."""
+        """See `StoredScene`."""
         for frame in frames:
             view = FoundViewFiles(self.files, self.scene, self.images[frame])
             view.suffix, view.size = self.suffix, self.size
@@ -119,22 +113,18 @@ class _Context(ExportContext):
 
     @property
     def names(self) -> dict[int, str]:
-        """Names by obj_id, sorted, of the objects that occur in views. See `ExportContext`."""
+        """See `ExportContext`."""
         return self._names
 
     @cached_property
     def _names(self) -> dict[int, str]:
-        """Names by obj_id of all objects in views, from the models folder; "obj_NNNNNN" where there is none. Cached."""
         found = {int(index) for view in self._data.views() for index in view.object_ids}
         folder = self._data.folder
         named = object_names(folder, found) if (folder / models_folder(folder) / "models_info.json").is_file() else {}
         return {index: named.get(index, f"obj_{index:06d}") for index in sorted(found)}
 
     def copy_constants(self, names: tuple[Path, ...]) -> bool:
-        """Copy meshes, textures and JSON files of the models folders to the output folder, whatever `names` says; returns True.
-
-        See `ExportContext`.
-        """
+        """See `ExportContext`: what there is of models."""
         layout = _found(self._data).layout
         for name in MODEL_FOLDERS:
             source = layout.models.get(name if name in layout.models else models_folder(layout.root))
@@ -146,7 +136,7 @@ class _Context(ExportContext):
 
 
 def _found(data: DataSet) -> FoundScenes:
-    """Found scenes of a data set of another program."""
+    """The scenes of a data set from another source."""
     assert data.found is not None
     return data.found
 
@@ -172,13 +162,11 @@ def convert_found(data: DataSet, out: Path, formats: Sequence[str], processes: i
     _check_formats(data, first, formats)
     check_output_folder(out)
     if out.is_dir() and any(out.iterdir()):
-        raise ConfigError(f"--out is {out}, which is not empty; name a new folder: data sets that no bake wrote are converted as a whole")
+        raise ConfigError(f"--out is {out}, which is not empty; name a new folder: data sets from other sources are converted as a whole")
     settings = ExportSettings.of(_make_config(data, first, formats))
-    try:
+    with output_errors(out):
         make_folder(out.parent)
         work = Path(tempfile.mkdtemp(prefix=f".{out.name}.", dir=out.parent))
-    except OSError as error:
-        raise output_error(out, error) from error
     try:
         count = _write(data, work, settings, processes, report)
         work.chmod(0o755)
@@ -203,7 +191,7 @@ def _check_formats(data: DataSet, first: SceneFiles, formats: Sequence[str]) -> 
         if name not in contents:
             raise ConfigError(f"--to names {name}; allowed: {', '.join(each for each in contents if contents[each] <= _IMAGES)}")
         if not contents[name] <= _IMAGES:
-            raise ConfigError(f"--to names {name}, which is made of trajectories; {data.folder} has none, as no bake wrote it")
+            raise ConfigError(f"--to names {name}, which is made of trajectories; {data.folder} is from another source and has none")
         if (name == "bop" and isinstance(first, SceneFolder)) or (name == "shards" and first.place.suffix == ".tar"):
             raise ConfigError(f"--to names {name}, which {data.folder} has already; copy the folder")
         (kind,) = load_exporter_classes([name])
@@ -216,7 +204,6 @@ def _check_formats(data: DataSet, first: SceneFiles, formats: Sequence[str]) -> 
 
 
 def _has_masks(scene: SceneFiles) -> bool:
-    """Whether a scene has both amodal and visible masks."""
     return scene.has("mask") and scene.has("mask_visib")
 
 

@@ -57,7 +57,7 @@ def convert(folder: Path, out: Path, formats: Sequence[str], processes: int, rep
         _check_apart(folder, out)
         return Converted(convert_found(data if split is None else data.split(split), out, formats, processes, report), 0)
     if split is not None:
-        raise ConfigError("--split is for data sets that no bake wrote; those of a bake are converted as a whole")
+        raise ConfigError("--split is for data sets from other sources; those of synpick-warp bake are converted as a whole")
     source = Source(folder)
     check_formats(formats, source.config.bop.layout, source.config.bake.formats, folder)
     contents: set[Content] = {content for name in formats for content in contents_of(name, source.config.bop)}

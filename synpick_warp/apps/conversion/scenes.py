@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from synpick_warp.dataset.annotations import ADVICE
-from synpick_warp.dataset.view_files import SceneFiles, ViewRecords, check_planes
+from synpick_warp.dataset.view_files import SceneFiles, ViewRecords
 from synpick_warp.errors import DatasetError
 from synpick_warp.exporters.writing.folder import Buffer
 from synpick_warp.exporters.writing.rle import Masks, Runs, find_run_boundaries
@@ -88,15 +88,11 @@ class StoredViewFiles:
 
     def color_image(self) -> np.ndarray:
         """Decoded colour image, sRGB, RGB order (H, W, 3) uint8. See `StoredView`."""
-        return np.ascontiguousarray(self._image("rgb", 3, "uint8")[..., ::-1])
+        return np.ascontiguousarray(self.files.typed_image("rgb", self.frame, 3, "uint8")[..., ::-1])
 
     def depth_image(self) -> np.ndarray:
         """Decoded depth image (H, W) uint16 in counts. See `EncodedView`."""
-        return self._image("depth", None, "uint16")
-
-    def _image(self, name: str, channels: int | None, dtype: str) -> np.ndarray:
-        """Decoded image of a kind; raises DatasetError unless it has these channels (None: one plane) and this dtype."""
-        return check_planes(self.files.image(name, self.frame), channels, f"{name} of image {self.frame} in {self.files.place}", dtype)
+        return self.files.typed_image("depth", self.frame, None, "uint16")
 
     def masks(self) -> list[Masks]:
         """Run lengths of the amodal and visible mask of each instance, read within their boxes. See `EncodedView`."""

@@ -11,7 +11,6 @@ import numpy as np
 
 from synpick_warp.apps.estimation.mask_errors import disturb_labels
 from synpick_warp.apps.estimation.scenes import ABSENT, Scene
-from synpick_warp.dataset.view_files import SceneFiles, check_planes
 from synpick_warp.errors import DatasetError
 from synpick_warp.stages.pose.batch import RgbdBatch
 from synpick_warp.system.processes.shared_memory import SharedArray, shared_bytes
@@ -67,12 +66,12 @@ class DecodeJob:
             return
         frame = scene.plan.frames[step]
         batch.intrinsics[view], batch.depth_scale[view] = scene.intrinsics[step], scene.depth_scale[step]
-        color = _read_image(scene.files, "rgb", frame, 3, "uint8")
+        color = scene.files.typed_image("rgb", frame, 3, "uint8")
         if color.shape[1::-1] != scene.size:
             sizes = f"{color.shape[1]} x {color.shape[0]} pixels, the scene's first one {scene.size[0]} x {scene.size[1]}"
             raise DatasetError(f"{scene.files.place}: image {frame} has {sizes}; poses are estimated in images of one size")
         cv2.cvtColor(color, cv2.COLOR_BGR2RGB, dst=batch.color[view])
-        batch.depth[view] = _read_image(scene.files, self.depth, frame, None, "uint16")
+        batch.depth[view] = scene.files.typed_image(self.depth, frame, None, "uint16")
         paint_label(scene, step, batch.label[view])
         if self.mask_seed is not None:
             disturb_labels(batch.label[view], scene.boxes[step], scene.instances, self.mask_seed, scene.plan.scene, frame)
@@ -99,11 +98,6 @@ class DecodeJob:
         yield "depth_scale", (views,), "float32"
         yield "label", (views, height, width), "uint8"
         yield "intrinsics", (views, 4), "float32"
-
-
-def _read_image(files: SceneFiles, name: str, frame: int, channels: int | None, dtype: str) -> np.ndarray:
-    """Decoded image of a kind; raises DatasetError unless it has these channels (None: one plane) and this dtype."""
-    return check_planes(files.image(name, frame), channels, f"{name} of image {frame} in {files.place}", dtype)
 
 
 def paint_label(scene: Scene, step: int, label: np.ndarray) -> None:

@@ -173,7 +173,7 @@ def _lead(data_set: DataSet, statistics: Statistics, findings: list[Finding]) ->
     modes = ", ".join(dict.fromkeys(group.mode for group in statistics.groups))
     splits = ", ".join(dict.fromkeys(group.split for group in statistics.groups))
     if data_set.found is not None:
-        said = f"No bake of synpick-warp wrote this data set; splits {splits}. "
+        said = f"A BOP data set from another source than synpick-warp bake; splits {splits}. "
     else:
         width, height = data_set.config.cameras.resolution
         said = f"Modes {modes}; splits {splits}; images of {width} x {height} pixels; seed {data_set.config.bake.seed}. "
@@ -215,7 +215,7 @@ def _parts(data_set: DataSet, statistics: Statistics, samples: Samples, findings
     ]
 
 
-_NO_SETTINGS = "No bake of synpick-warp wrote this data set: there are no settings."
+_NO_SETTINGS = "A BOP data set from another source than synpick-warp bake: there are no settings."
 _EMPTY = {
     "frames": "This data set has no images.",
     "strips": "This data set has no images.",

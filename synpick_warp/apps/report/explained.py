@@ -27,7 +27,6 @@ from synpick_warp.codes import Outcome
 from synpick_warp.configs.manipulation import Suction
 from synpick_warp.dataset.commit.manifest import episode_entry
 from synpick_warp.dataset.reading import DataSet
-from synpick_warp.dataset.view import View
 from synpick_warp.errors import DatasetError
 
 MAX_ATTEMPTS = 6
@@ -74,7 +73,7 @@ def make_attempt(data_set: DataSet, found: Found, content: Content, names: Mappi
     if not attempt.frame < len(episode):
         raise DatasetError(f"attempt {attempt.attempt} of episode {found.episode} begins in frame {attempt.frame}; it has {len(episode)}")
     view = episode.view(attempt.frame)
-    picture = draw_observation(attempt, view.rgb[..., ::-1], _masks(attempt, view) if content.masks else None)
+    picture = draw_observation(attempt, view)
     places = album.add(Section.ATTEMPTS, [encode_photo(picture)])
     if places is None:
         return None
@@ -92,14 +91,6 @@ def make_attempt(data_set: DataSet, found: Found, content: Content, names: Mappi
         "objects": _objects(attempt, names),
         "graph": _graph(attempt, config.perception.min_votes),
         "force": _force(attempt, config.suction, config.physics.tick_time),
-    }
-
-
-def _masks(attempt: Attempt, view: View) -> dict[int, np.ndarray]:
-    """Modal masks (H, W) uint8 of the observed instances by their ids."""
-    seen = attempt.objects
-    return {
-        instance: mask.astype(np.uint8) for instance, mask in zip(view.instance_ids.tolist(), view.masks, strict=True) if instance in seen
     }
 
 

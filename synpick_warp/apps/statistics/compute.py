@@ -23,7 +23,7 @@ from synpick_warp.system.hardware.cores import count_cores
 
 OTHER_OBJECTS = "the objects are not those of the paper, so their distributions are not compared"
 """What is missing of data sets of other objects."""
-NOT_BAKED = "no bake wrote this data set: its scenes count as episodes, without modes, endings, attempts and times"
+NOT_BAKED = "this data set is from another source: its scenes count as episodes, without modes, endings, attempts and times"
 """What is missing of data sets of other programs."""
 DEPTH_VIEWS = 64
 """Views whose depth image is read."""

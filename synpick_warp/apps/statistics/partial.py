@@ -19,7 +19,6 @@ from synpick_warp.apps.statistics.timeline import TimelineCounts
 from synpick_warp.dataset.annotations import check_content
 from synpick_warp.dataset.commit.manifest import episode_entry
 from synpick_warp.dataset.reading import DataSet
-from synpick_warp.dataset.view_files import check_planes
 from synpick_warp.errors import DatasetError
 
 MAX_OBJECTS = 65_536
@@ -89,9 +88,7 @@ class Partial:
         """Accumulate the histogram of a depth image; scenes without depth images are skipped."""
         if not scene.files.has("depth") or np.isnan(scene.depth_scale[frame]):
             return
-        image_id = scene.images[frame]
-        source = f"{scene.files.place}, depth of image {image_id},"
-        image = check_planes(scene.files.image("depth", image_id), None, source, np.uint16.__name__)
+        image = scene.files.typed_image("depth", scene.images[frame], None, "uint16")
         self.depth.add_image(image, float(scene.depth_scale[frame]))
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -128,13 +127,3 @@ def sample_area(vertices: np.ndarray, faces: np.ndarray, count: int) -> np.ndarr
     area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
     face, weights = sample_triangles(area, count)
     return np.einsum("sk,skc->sc", weights, corners[face])
-
-
-def turn_about(axis: Sequence[float], offset: Sequence[float], angle: float) -> np.ndarray:
-    """Rigid transform (4, 4): rotation by an angle [rad] about an axis through a point (Rodrigues' formula)."""
-    x, y, z = np.asarray(axis) / np.linalg.norm(axis)
-    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    result = np.eye(4)
-    result[:3, :3] += np.sin(angle) * cross + (1.0 - np.cos(angle)) * cross @ cross
-    result[:3, 3] = np.asarray(offset) - result[:3, :3] @ np.asarray(offset)
-    return result

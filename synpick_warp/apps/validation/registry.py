@@ -1,4 +1,4 @@
-"""Registry of validation rules: a rule is a function with a name, a description and advice, declared by the decorator `rule`."""
+"""Registry of validation rules: a rule is a function with a name and advice, declared by `rule`; its docstring says what holds."""
 
 from __future__ import annotations
 
@@ -13,7 +13,9 @@ from synpick_warp.errors import SynpickError
 
 MODULES = ("tree", "records", "info", "images", "masks", "coco", "models", "targets", "rig", "shards", "poses")
 """Modules in `validation.rules`, in the order of their rules."""
-_Check = TypeVar("_Check", bound=Callable[[Any], Iterator[Any]])
+Findings = Iterator[tuple[str, str]]
+"""What a check yields: (file, what is wrong) for each violation."""
+_Check = TypeVar("_Check", bound=Callable[[Any], Findings])
 
 
 class Level(enum.StrEnum):
@@ -48,28 +50,26 @@ class Rule:
     """What holds in a correct data set."""
     cure: str
     """How to mend a violation."""
-    check: Callable[[Any], Iterator[tuple[str, str]]]
-    """Yields (file, what is wrong) for each violation."""
+    check: Callable[[Any], Findings]
 
 
 RULES: dict[str, Rule] = {}
 """Declared rules by name, in the order of imports; see `load_rules`."""
 
 
-def rule(subject: type, name: str, sentence: str, cure: str, level: Level = Level.ERROR) -> Callable[[_Check], _Check]:
-    """Declare the decorated function as the check of a rule.
+def rule(subject: type, name: str, cure: str, level: Level = Level.ERROR) -> Callable[[_Check], _Check]:
+    """Declare the decorated function as the check of a rule, whose sentence is its docstring.
 
     Args:
         subject: Type of the function's argument; the rule is applied to each such subject of a data set.
         name: Name of the rule: words joined by hyphens.
-        sentence: What holds in a correct data set.
         cure: How to mend a violation.
         level: Level of its violations.
     """
 
     def declare(check: _Check) -> _Check:
         assert name not in RULES, name
-        RULES[name] = Rule(name, subject, level, sentence, cure, check)
+        RULES[name] = Rule(name, subject, level, " ".join((check.__doc__ or "").split()), cure, check)
         return check
 
     return declare

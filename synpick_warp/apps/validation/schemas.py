@@ -8,41 +8,31 @@ from typing import Annotated, Any
 import msgspec
 from msgspec import UNSET, Struct, UnsetType
 
-from synpick_warp.dataset.annotations import Box, Index, Length, Matrix3, Vector3
+from synpick_warp.dataset.annotations import Index, InfoEntry, Length, LenientCameraEntry, Matrix3, TruthEntry
 
 PLAIN_KEY = re.compile(r"0|[1-9][0-9]{0,8}")
 """An index as a key: decimal digits without leading zeros."""
 
 
-class Camera(Struct, gc=False):
+class Camera(LenientCameraEntry, gc=False):
     """Schema of an entry of scene_camera.json: intrinsics [px], depth scale [mm per count], world-to-camera rotation and translation [mm];
     UNSET: missing.
     """
 
-    cam_K: Matrix3 | UnsetType = UNSET  # noqa: N815
     cam_model: dict[str, Any] | UnsetType = UNSET
     depth_scale: Length | UnsetType = UNSET
     cam_R_w2c: Matrix3 | UnsetType = UNSET  # noqa: N815
-    cam_t_w2c: Vector3 | UnsetType = UNSET
 
 
-class Truth(Struct, gc=False):
+class Truth(TruthEntry, gc=False):
     """Schema of an instance's entry in scene_gt.json: object-to-camera rotation and translation [mm], obj_id."""
 
     cam_R_m2c: Matrix3  # noqa: N815
-    cam_t_m2c: Vector3
-    obj_id: Index
-    instance_id: Index | UnsetType = UNSET
 
 
-class Info(Struct, gc=False):
+class Info(InfoEntry, gc=False):
     """Schema of an instance's entry in scene_gt_info.json: boxes and pixel counts [px], visible fraction."""
 
-    bbox_obj: Box
-    bbox_visib: Box
-    px_count_all: Index
-    px_count_valid: Index
-    px_count_visib: Index
     visib_fract: Length
 
 

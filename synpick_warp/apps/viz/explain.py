@@ -5,8 +5,7 @@ The layout follows the figure of the paper (Periyasamy et al., SynPick, 2021).
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 from pathlib import Path
 
 import cv2
@@ -18,13 +17,12 @@ from synpick_warp.apps.viz.explain_panels import GREEN, LINE, PLOT_HEIGHT, SMALL
 from synpick_warp.apps.viz.explain_record import MODE_WORDS, Attempt, choose_attempts, labels, read_attempts
 from synpick_warp.configs.load import load_config
 from synpick_warp.configs.splits import DataLayout
-from synpick_warp.dataset.annotations import SCENE_SCHEMAS, read_checked
 from synpick_warp.dataset.object_names import object_names
 from synpick_warp.dataset.records import Pixel
-from synpick_warp.dataset.view_files import read_image
+from synpick_warp.dataset.scene_index import SceneIndex
+from synpick_warp.dataset.view import View
 from synpick_warp.errors import DatasetError
 from synpick_warp.system.codecs.charts import render_charts
-from synpick_warp.system.inputs.paths import path_inside
 
 DEFAULT_ATTEMPTS = 3
 """Attempts that are drawn if none is named."""
@@ -44,16 +42,6 @@ _LABEL = 0.5
 """Font scale of an object's label on the image; the target's is larger."""
 _HALO = 3
 """Width of the dark outline around bright lines on the image [px]."""
-
-
-@dataclass(frozen=True, eq=False)
-class _Scene:
-    """Colour image of camera 0 in the frame of an attempt, and visible masks by instance (None: the data set has none)."""
-
-    place: str
-    color: Image
-    masks: dict[int, np.ndarray] | None
-    """Instance id -> modal mask; None: the data set has no masks."""
 
 
 def write_explanation(dataset: Path, out: Path, episode: int | None, attempt: int | None = None) -> Path:
@@ -81,11 +69,12 @@ def write_explanation(dataset: Path, out: Path, episode: int | None, attempt: in
     config = load_config(str(path), {})
     seen = {one.object_id for each in attempts for one in each.seen}
     names = object_names(dataset, seen, config.object_rows, config.objects.diameter_tolerance)
-    layout, suction, tick_time = DataLayout.of(config), config.suction, config.physics.tick_time
+    scenes = SceneIndex(dataset, DataLayout.of(config), config.cameras.resolution)
+    suction, tick_time = config.suction, config.physics.tick_time
     rows = []
     for each in attempts:
-        scene = _read_scene(dataset, layout, config.cameras.resolution, each)
-        rows.append(_row(each, scene, draw_words(each, names, config.target, suction), config.perception.min_votes))
+        view = _open_view(dataset, scenes, each)
+        rows.append(_row(each, view, draw_words(each, names, config.target, suction), config.perception.min_votes))
     charts = [load_chart(each, suction, tick_time, IMAGE_WIDTH, room) for each, (_, room) in zip(attempts, rows, strict=True)]
     for (sheet, _), data in zip(rows, render_charts(charts, scale=1.0), strict=True):
         plot = np.asarray(cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR))
@@ -93,26 +82,12 @@ def write_explanation(dataset: Path, out: Path, episode: int | None, attempt: in
     return write_picture(out, np.concatenate([sheet for sheet, _ in rows]))
 
 
-def _read_scene(dataset: Path, layout: DataLayout, resolution: tuple[int, int], attempt: Attempt) -> _Scene:
-    """Read colour image, visible masks and ground truth of the attempt's frame by camera 0; raises DatasetError."""
-    split = path_inside(dataset, layout.folder(attempt.episode), dataset / "config.toml", DatasetError)
-    index, suffix = layout.scene(attempt.episode, 0)
-    scene = split / f"{index:06d}"
-    stem = f"{attempt.frame:06d}"
-    truth = read_checked(scene / f"scene_gt{suffix}.json", SCENE_SCHEMAS["gt"]).get(attempt.frame)
-    if truth is None:
-        raise DatasetError(f"{scene}/scene_gt{suffix}.json has no image {attempt.frame}, which {dataset}/attempts.jsonl names")
-    color = read_image(scene / f"rgb{suffix}", stem, cv2.IMREAD_COLOR, resolution)
-    masks = None
-    folder = scene / f"mask_visib{suffix}"
-    if folder.is_dir():
-        seen = attempt.objects
-        masks = {
-            record["instance_id"]: read_image(folder, f"{stem}_{index:06d}", cv2.IMREAD_GRAYSCALE, color.shape[1::-1])
-            for index, record in enumerate(truth)
-            if record.get("instance_id") in seen
-        }
-    return _Scene(f"{scene.parent.name}/{scene.name}, image {attempt.frame}", color, masks)
+def _open_view(dataset: Path, scenes: SceneIndex, attempt: Attempt) -> View:
+    """View of camera 0 in which an attempt's choice was made."""
+    files = scenes.files(attempt.episode, 0)
+    if attempt.frame not in files.frames():
+        raise DatasetError(f"{files.place} has no image {attempt.frame}, which {dataset}/attempts.jsonl names")
+    return View(files, attempt.episode, 0, attempt.frame)
 
 
 def to_color_image(pixel: Pixel, resolution: tuple[int, int], size: tuple[int, int]) -> tuple[float, float]:
@@ -135,10 +110,10 @@ def image_scale(size: tuple[int, int]) -> float:
     return min(IMAGE_WIDTH / size[0], _MAX_IMAGE_HEIGHT / size[1])
 
 
-def _row(attempt: Attempt, scene: _Scene, words: Image, min_votes: float) -> tuple[Image, int]:
+def _row(attempt: Attempt, view: View, words: Image, min_votes: float) -> tuple[Image, int]:
     """Draw one attempt: image, clutter graph, and text and table (`words`), with room at the lower left for the force's plot, whose height
     [px] is returned, too."""
-    image = draw_observation(attempt, scene.color, scene.masks)
+    image = draw_observation(attempt, view)
     left = image.shape[0] + 2 * LINE + MARGIN + PLOT_HEIGHT
     height = max(left, words.shape[0], _MIN_ROW_HEIGHT)
     sheet = np.full((HEAD + height + 2 * MARGIN, IMAGE_WIDTH + _GRAPH_WIDTH + WORDS_WIDTH + 4 * MARGIN, 3), 255, np.uint8)
@@ -154,8 +129,9 @@ def _row(attempt: Attempt, scene: _Scene, words: Image, min_votes: float) -> tup
     _paste(sheet, words, columns[2], top)
     head = f"Episode {attempt.episode}, attempt {attempt.attempt} ({MODE_WORDS[attempt.mode]}): {attempt.sentence}"
     put_text(sheet, head, (MARGIN, MARGIN + 20), 0.68, GREEN if attempt.picked else RED, 2)
-    captions = [f"camera 0: {scene.place}", "clutter graph", "choice and outcome"]
-    if scene.masks is None:
+    scene = Path(view.place)
+    captions = [f"camera 0: {scene.parent.name}/{scene.name}, image {attempt.frame}", "clutter graph", "choice and outcome"]
+    if not view.has("mask_visib"):
         captions[0] += "; no contours: this data set has no masks"
     for text, column in zip(captions, columns, strict=True):
         put_text(sheet, text, (column, top - 9), TEXT, SOFT)
@@ -164,19 +140,22 @@ def _row(attempt: Attempt, scene: _Scene, words: Image, min_votes: float) -> tup
 
 
 def _paste(sheet: Image, picture: Image, column: int, row: int) -> None:
-    """Copy a picture into the sheet, its corner at (row, column)."""
     sheet[row : row + picture.shape[0], column : column + picture.shape[1]] = picture
 
 
-def draw_observation(attempt: Attempt, color: Image, masks: Mapping[int, np.ndarray] | None) -> Image:
-    """Draw contours and suction points on the colour image, which is darkened except for the target.
+def draw_observation(attempt: Attempt, view: View) -> Image:
+    """Draw contours, if the data set has masks, and suction points on the colour image, which is darkened except for the target.
 
     Args:
         attempt: The attempt.
-        color: Image of camera 0 at the observation (H, W, 3) uint8, blue first.
-        masks: Instance id -> modal mask (H, W) uint8, of visible instances; None: the data set has no masks.
+        view: Camera 0 at the observation.
+
+    Raises:
+        DatasetError: A file is missing or damaged, or has no such view.
     """
-    masks = masks or {}
+    color, seen = view.rgb[..., ::-1], attempt.objects
+    ids = view.instance_ids.tolist() if view.has("mask_visib") else []
+    masks = {instance: view.masks[row] for row, instance in enumerate(ids) if instance in seen}
     height, width = color.shape[:2]
     scale = image_scale((width, height))
     size = (max(1, round(scale * width)), max(1, round(scale * height)))
@@ -184,7 +163,7 @@ def draw_observation(attempt: Attempt, color: Image, masks: Mapping[int, np.ndar
     drawn = (0.62 * color).astype(np.uint8)
     order = sorted(masks, key=lambda instance: instance == attempt.target)
     for instance in order:
-        mask = cv2.resize(np.minimum(masks[instance], 1) * 255, size, interpolation=cv2.INTER_LINEAR) > 127
+        mask = cv2.resize(255 * masks[instance].astype(np.uint8), size, interpolation=cv2.INTER_LINEAR) > 127
         _draw_contours(drawn, color, mask, instance, instance == attempt.target)
     short = labels(attempt)
     for one in attempt.seen:
@@ -237,14 +216,13 @@ def draw_chosen(picture: Image, place: tuple[float, float], color: tuple[int, in
 
 
 def _put_label(picture: Image, text: str, point: tuple[float, float], color: tuple[int, int, int], size: float) -> None:
-    """Draw a label beside a point, on a box of the colour."""
     (width, height), _ = cv2.getTextSize(text, FONT, size, 1)
     place = (point[0] + (22 if size > _LABEL else 13) + width / 2, point[1] - 8 - height / 2)
     put_boxed(picture, text, place, size, readable_on(color), color)
 
 
 def _draw_key(sheet: Image, x: int, y: int) -> None:
-    """Draw the legend of the markers: pole, centroid, half-way point, suction point, target."""
+    """Draw the legend of the image's markers."""
     for kind, text in enumerate(("pole of inaccessibility", "centroid", "half-way", "suction point", "that of the target")):
         place = (x + (17.0 if kind == 4 else 8.0), y - 4.5)
         if kind < 3:
@@ -256,7 +234,6 @@ def _draw_key(sheet: Image, x: int, y: int) -> None:
 
 
 def _graph_foot(states: set[str]) -> Sequence[tuple[str, tuple[int, int, int]]]:
-    """Lines of the legend with their colours: arrows, badges, and the kinds of removed edges that occur."""
     lines = [("arrow: from the object on top to the one below, with its votes", SOFT), ("badge: number of objects above", SOFT)]
     lines += [(f"dashed: {OUTVOTED}", GREY)] if OUTVOTED in states else []
     return lines + ([(f"dashed: {CYCLIC}", RED)] if CYCLIC in states else [])

@@ -24,7 +24,7 @@ from synpick_warp.dataset.bop.layout import NoLayoutError
 from synpick_warp.dataset.bop.scenes import FoundScenes
 from synpick_warp.dataset.commit.manifest import CONFIG_FILE, episode_entry, read_entry
 from synpick_warp.dataset.object_names import object_names
-from synpick_warp.dataset.view_files import SceneFiles, check_planes
+from synpick_warp.dataset.view_files import SceneFiles
 from synpick_warp.errors import DatasetError, OutputError, SynpickError
 
 _PANEL_WIDTH = 480
@@ -51,10 +51,6 @@ class Scene:
     """Suffix of the sensor's folders and files, such as "_cam1"; empty: classic layout."""
     files: Callable[[], SceneFiles] = field(compare=False, repr=False, kw_only=True)
     """Opens it; what others leave out may be missing."""
-
-    def images(self, name: str) -> Path:
-        """Folder of one kind of images, such as "rgb"."""
-        return self.folder / f"{name}{self.sensor}"
 
 
 @dataclass(frozen=True)
@@ -200,13 +196,12 @@ def _read_depth(view: _View) -> np.ndarray | None:
     """Depth image of a view [mm]; None: it has none."""
     if not view.files.has("depth") or "depth_scale" not in view.camera:
         return None
-    counts = check_planes(view.files.image("depth", view.frame), None, f"{view.scene.images('depth')}/{view.frame:06d}")
+    counts = view.files.typed_image("depth", view.frame, None, "")
     return counts * float(view.camera["depth_scale"])
 
 
 def _row(view: _View, depth_scale: DepthScale | None, baked: Baked, most: int) -> Image:
     """Draw all panels of a view side by side; `most` is the largest number of instances of all views."""
-    folder, sensor = view.scene.folder, view.scene.sensor
     depth = _read_depth(view)
     colored = None if depth is None else color_depth(depth, depth_scale)
     color = view.files.image("rgb", view.frame) if view.files.has("rgb") or colored is None else colored
@@ -225,7 +220,7 @@ def _row(view: _View, depth_scale: DepthScale | None, baked: Baked, most: int) -
     ]
     count = float(view.camera.get("depth_scale", 1.0))
     counts = depth_scale and DepthScale(*(each / count for each in depth_scale))
-    layers = layer_pictures(folder, view.frame, size, sensor, counts)
+    layers = layer_pictures(view.files, view.frame, counts)
     panels += [(caption, partial(_fit, picture, smooth=False)) for caption, picture in layers]
     scale = min(_PANEL_WIDTH / size[0], _MAX_PANEL_HEIGHT / size[1])
     drawn = [(caption, draw(scale)) for caption, draw in panels]

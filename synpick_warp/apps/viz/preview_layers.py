@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from pathlib import Path
 
 import cv2
 import numpy as np
 
 from synpick_warp.apps.viz.depth_colors import DepthScale, color_depth
 from synpick_warp.apps.viz.drawing import GOLDEN, Image
-from synpick_warp.views.layer_codec import read_layer
+from synpick_warp.dataset.view import read_layer
+from synpick_warp.dataset.view_files import SceneFiles
 
 _MOTION_RANGE = 99.0
 """Percentile of an image's motions that maps to full colour."""
@@ -19,30 +19,26 @@ _GREY = 64
 
 
 def color_layer(name: str, values: np.ndarray) -> Image:
-    """One layer as colours, from its values as `synpick_warp.views.layer_codec.read_layer` returns them."""
+    """One layer as colours, from its values as `synpick_warp.dataset.view.read_layer` returns them."""
     return draw_layer(name, values)[1]
 
 
 def draw_layer(name: str, values: np.ndarray, depth_scale: DepthScale | None = None) -> tuple[str, Image]:
-    """Caption and colours of one layer, from its values as `synpick_warp.views.layer_codec.read_layer` returns them.
+    """Caption and colours of one layer, from its values as `synpick_warp.dataset.view.read_layer` returns them.
 
     `depth_scale` is that of depth images beside it, in the unit of the values; None: the image's own.
     """
     return _draw_depth_sensor(values, depth_scale) if name == "depth_sensor" else _DRAW[name](values)
 
 
-def layer_pictures(
-    scene: Path, frame: int, size: tuple[int, int], sensor: str = "", depth_scale: DepthScale | None = None
-) -> list[tuple[str, Image]]:
-    """Draw each layer of a scene that can be drawn: caption and image, whose width and height must be `size` [px].
-
-    `sensor` is the suffix of the folders of one sensor, such as "_cam1"; empty: classic layout.
+def layer_pictures(files: SceneFiles, frame: int, depth_scale: DepthScale | None) -> list[tuple[str, Image]]:
+    """Caption and colours of each layer that a scene has.
 
     Raises:
-        DatasetError: The scene has a layer, but not for this frame, or not of this size.
+        DatasetError: The scene has a layer, but not for this frame, or the file is damaged.
     """
-    present = [name for name in (*_DRAW, "depth_sensor") if (scene / f"{name}{sensor}").is_dir()]
-    return [draw_layer(name, read_layer(scene, name, frame, size, sensor), depth_scale) for name in present]
+    present = [name for name in (*_DRAW, "depth_sensor") if files.has(name)]
+    return [draw_layer(name, read_layer(files, name, frame), depth_scale) for name in present]
 
 
 def _draw_normals(values: np.ndarray) -> tuple[str, Image]:

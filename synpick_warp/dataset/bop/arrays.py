@@ -17,7 +17,7 @@ from synpick_warp.errors import DatasetError
 from synpick_warp.system.inputs.json import read_json
 
 _PER_OBJECT = 1000
-"""Ids of instances that are made up, per object."""
+"""An instance without id gets one from _PER_OBJECT * obj_id on; see `instance_ids`."""
 _INFO = InfoEntry.__struct_fields__
 
 
@@ -28,7 +28,7 @@ class SceneArrays:
     images: np.ndarray
     """im_id (F,) int64."""
     cameras: Sequence[Any]
-    """Entry of each image in scene_camera.json, of the schema that was asked for."""
+    """Entry of each image in scene_camera.json, as the schema given to `read_arrays`."""
     row: np.ndarray
     """Index of each instance's image among these (N,) int64."""
     object_id: np.ndarray
@@ -124,15 +124,15 @@ def _read_views(files: SceneFiles, images: Sequence[int], camera: Any) -> _Parts
     records = [files.records(image) for image in images]
     cameras = [check_content(record.camera, camera, files.place) for record in records]
     truth = [msgspec.convert(record.gt, list[TruthEntry]) for record in records]
-    # What has been measured, or is not known, needs no check, and NaN would not pass it.
+    # A missing scene_gt_info is filled in with measured values, or NaN where nothing is known, which the schema would refuse.
     return cameras, truth, [[InfoEntry(**{key: entry[key] for key in _INFO}) for entry in record.gt_info] for record in records]
 
 
 def instance_ids(instances: Sequence[tuple[int, Any]], lenient: bool) -> list[int] | None:
     """Ids of the instances of an image; None: they have none.
 
-    Of a lenient scene they are then 1000 times the object's and how many of it come before in the image: the same through a scene that has
-    one of each object; of several, which is which is not known from image to image.
+    Those of a lenient scene are then made up: 1000 obj_id, plus the number of instances of the same object before it in the image's list.
+    They follow an instance through a scene that has one of each object; of several, nothing tells which is which in the next image.
 
     Args:
         instances: obj_id and instance_id, or UNSET, of each.

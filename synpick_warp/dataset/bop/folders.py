@@ -12,9 +12,7 @@ from synpick_warp.system.inputs.files import read_file
 
 @dataclass(frozen=True)
 class Listing:
-    """Names of the files and folders in a folder of a data set, links that lead out of it apart. Whatever is read has been listed before,
-    folder by folder from the root on.
-    """
+    """Names in a folder. Files are read by these names only, so that no link leads a reader out of the data set."""
 
     root: Path
     """The data set, resolved."""
@@ -23,7 +21,7 @@ class Listing:
     files: frozenset[str] = frozenset()
     folders: frozenset[str] = frozenset()
     outside: tuple[str, ...] = ()
-    """Links that lead out of the data set, or nowhere."""
+    """Symbolic links that lead out of the data set, or nowhere."""
     special: tuple[str, ...] = field(default=())
     """Pipes, sockets and devices."""
 

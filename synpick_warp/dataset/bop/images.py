@@ -20,11 +20,12 @@ SUFFIXES = ("png", "jpg", "jpeg", "tif", "tiff")
 """File formats of images that BOP data sets have, the preferred one first."""
 KINDS = ("rgb", "gray", "depth", "mask", "mask_visib")
 COLOR = ("rgb", "gray")
-"""Those that show colour or brightness, the preferred one first."""
-_STEM = re.compile(r"([0-9]{1,9})(?:_([0-9]{1,9}))?\.(\w+)")
+"""Kinds that can be shown as a colour image, the preferred one first."""
+_NAME = re.compile(r"([0-9]{1,9})(?:_([0-9]{1,9}))?\.(\w+)")
+"""Name of an image's file: image, ground-truth index of a mask, suffix."""
 
 Index = tuple[int, int | None]
-"""Image, and ground-truth index of a mask."""
+"""im_id of an image, and for a mask the index of its instance in the image's list in scene_gt.json (BOP's gt_id)."""
 
 
 class FolderImages:
@@ -41,7 +42,7 @@ class FolderImages:
         self._indices: dict[str, dict[Index, str]] = {}
 
     def folder(self, kind: str) -> str:
-        """Folder of a type: KIND_SENSOR, or, where a modality has annotations of its own (scene_gt_gray1.json), the modality itself."""
+        """Folder of a kind: KIND_SENSOR, such as rgb_cam1; but images of a sensor that is named like a kind, "gray1", are in "gray1"."""
         modality = self.sensor[1:]
         if kind in ("rgb", "gray", "depth") and re.fullmatch(rf"{kind}[0-9]*", modality) and modality in self.listing.folders:
             return modality
@@ -66,7 +67,7 @@ class FolderImages:
     def _index(self, listing: Listing, paired: bool) -> dict[Index, str]:
         """File names by (image, instance or None); `paired`: names with an instance (masks). Of several files one suffix wins."""
         found: dict[Index, str] = {}
-        matches = [match for name in listing.files if (match := _STEM.fullmatch(name)) and match[3].lower() in SUFFIXES]
+        matches = [match for name in listing.files if (match := _NAME.fullmatch(name)) and match[3].lower() in SUFFIXES]
         for match in sorted(matches, key=lambda match: SUFFIXES.index(match[3].lower())):
             if bool(match[2]) == paired and min(map(len, filter(None, match.group(1, 2)))) >= self._digits:
                 found.setdefault((int(match[1]), int(match[2]) if match[2] else None), match[0])
@@ -90,17 +91,19 @@ class FolderImages:
 
 @dataclass(frozen=True)
 class Member:
-    """Location of an image or record: a file, or `size` bytes at `offset` of a shard."""
+    """Where one file of a view is: a file of its own, or a part of a shard."""
 
     file: str
+    """Name for messages: PATH, or SHARD:NAME, relative to the data set."""
     path: Path
+    """The file, or the shard."""
     offset: int = 0
     size: int | None = None
     """[B]; None: the whole file."""
 
 
 class KeyedImages:
-    """Images of a scene with a key each. All masks of an image are one member, of run lengths."""
+    """Images of a scene in shards or in the imagewise layout. All masks of an image are one JSON file, of run lengths (COCO's RLE)."""
 
     def __init__(self, listing: Listing, ref: SceneRef) -> None:
         """

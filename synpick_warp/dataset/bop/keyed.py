@@ -1,4 +1,8 @@
-"""Folders of keyed views as subjects of rules: webdataset shards with key_to_shard.json, and the imagewise layout."""
+"""Folders in which a file name begins with a key that names the view, SCENE_IMAGE, such as 000001_000042.rgb.jpg.
+
+BOP has two: webdataset shards (tar files of such files, with a key_to_shard.json that says which), and the imagewise layout (the files
+themselves, all in one folder).
+"""
 
 from __future__ import annotations
 
@@ -13,11 +17,12 @@ from synpick_warp.system.inputs.json import MAX_JSON, decode_json
 from synpick_warp.system.inputs.tar_files import list_members
 
 KEY = re.compile(r"([0-9]{6,9})_([0-9]{6,9})")
+"""Key of a view: scene, image."""
 
 
 @dataclass(frozen=True, eq=False)
 class KeyedFolder:
-    """Folder of shards, or of the imagewise layout (files KEY.CONTENT), with the keys found in it."""
+    """A folder of shards, or of files in the imagewise layout."""
 
     listing: Listing
 
@@ -33,7 +38,7 @@ class KeyedFolder:
 
     @cached_property
     def keys(self) -> tuple[dict[str, int] | None, str]:
-        """(shard index by key, fault) of key_to_shard.json; None: there is no such file, or it is damaged."""
+        """What key_to_shard.json says, the number of the shard by key, or None; and why it is None, or ""."""
         if KEYS not in self.listing.files:
             return None, f"there is no {KEYS}" if self.shards else ""
         try:

@@ -12,16 +12,19 @@ from synpick_warp.dataset.bop.folders import Listing, list_folder
 from synpick_warp.errors import DatasetError
 
 SPLIT = re.compile(r"(train|val|test)(_.*)?")
+"""Folders that are splits even without a scene; others are splits if they have scenes."""
 MODELS = re.compile(r"models(_.*)?")
 MODEL_FILE = re.compile(r"obj_([0-9]{6,9})\.ply")
 TARGETS = re.compile(r".*targets.*\.json")
+"""Lists of the instances that a BOP challenge asks for."""
 KEYS = "key_to_shard.json"
 SHARD = re.compile(r"shard-[0-9]+\.tar")
 KEYED = re.compile(r"([0-9]{6,9})_([0-9]{6,9})\.(.+)")
 """File of the imagewise layout, and member of a shard: scene, image, content."""
 _ANNOTATION = re.compile(r"scene_(?:camera|gt)(?:_(?!info(?:_|\.)|coco(?:_|\.)|world(?:_|\.))(\w+))?\.json")
+"""Annotations of a scene, with the name of the sensor, if there is one."""
 RENDERING_MODELS = ("models", "models_cad", "models_eval", "models_reconst")
-"""Models folders in the order in which poses are checked with them: the first is what ground truth is rendered with."""
+"""Models folders, the preferred one first: poses in the ground truth are those of the first one that there is."""
 
 
 class NoLayoutError(DatasetError):
@@ -35,7 +38,7 @@ class SceneRef:
     split: str
     scene: int
     name: str
-    """Folder in the split; empty: keyed files (shards, imagewise)."""
+    """Folder in the split; empty: the scene is in shards or in the imagewise layout."""
     sensor: str = ""
     """Suffix of the sensor's files, such as "_cam1" of scene_gt_cam1.json; empty: the classic layout."""
     shards: tuple[str, ...] = ()

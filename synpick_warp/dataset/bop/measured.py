@@ -17,7 +17,7 @@ UNKNOWN: dict[str, Any] = {
     "px_count_visib": 0,
     "visib_fract": math.nan,
 }
-"""Entry of an instance of which neither scene_gt_info.json nor masks tell anything: not hidden, but not known."""
+"""Entry of an instance without scene_gt_info.json and masks: visible fraction NaN says that nothing is known, not that it is hidden."""
 
 
 def measure_info(visible: Sequence[np.ndarray], amodal: Sequence[np.ndarray] | None) -> list[dict[str, Any]]:

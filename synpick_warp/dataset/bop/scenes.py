@@ -1,4 +1,7 @@
-"""Scenes of a BOP folder that no bake describes: found by its layout, read as far as they are there (lenient reading)."""
+"""Scenes of BOP data sets from other sources: there is no config.toml, so splits, scenes and sensors are found from folder and file names.
+
+They are read leniently: annotations, images and instance ids may be missing, and only what is asked for must be there.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +16,7 @@ from synpick_warp.dataset.view_files import SceneFiles, SceneFolder, SceneShards
 from synpick_warp.errors import DatasetError
 
 _SCENE_OFFSET = 10**6
-"""Between the episodes of splits that have scenes of the same index."""
+"""Added to the episodes of each further split, where splits have scenes of the same index, so that every episode has its own."""
 
 
 class FoundScenes:

@@ -51,7 +51,7 @@ _MAX_DENOMINATOR = 100_000
 
 @dataclass(eq=False)
 class _Content:
-    """Content of an episode in progress: rows of `TICK` so far, and spooled frames of each (camera, group) that is not encoded yet."""
+    """What is kept of an episode whose frames are being spooled and encoded."""
 
     ticks: bytearray = field(default_factory=bytearray)
     """Rows of `TICK`: 50 bytes a frame."""
@@ -81,31 +81,31 @@ class LerobotExporter(EpisodeExporter[_Content]):
 
     @staticmethod
     def slot_bytes(settings: ExportSettings) -> int:
-        """Bytes of a colour image in shared memory. See `Exporter`."""
+        """See `Exporter`: a colour image."""
         width, height = settings.cameras.resolution
         return shared_bytes((height * width * 3,))
 
     @staticmethod
     def shared_files(layout: DataLayout) -> SharedFiles:
-        """Names of what is written beside episodes: notes, the tables and card over all episodes, and the folders. See `Exporter`."""
+        """See `Exporter`."""
         videos = video_folders(layout.cameras)
         between = (EPISODES.parent, EPISODES.parent.parent, META, DATA.parent, DATA.parent.parent)
         return SharedFiles(note_files(layout.formats), (INFO, STATS, TASKS, EPISODES, DATA, CARD), (PARTS, *videos, *between, FOLDER))
 
     @staticmethod
     def finalize(out: Path, settings: ExportSettings, pool: WriterPool, episodes: Sequence[int]) -> list[Path]:
-        """Write the tables over all episodes from their parts; returns their paths. See `Exporter`."""
+        """See `Exporter`: the tables over all episodes."""
         with output_errors(out / FOLDER):
             return write_indices(out, settings, episodes)
 
     def write_constants(self) -> list[Path]:
-        """Write camera file and notes; returns their paths. See `Exporter`."""
+        """See `Exporter`: camera and notes."""
         context = self._context
         with output_errors(context.out):
             return write_notes(context.out, context.settings, self._settings.objects, context.cameras)
 
     def write_views(self, batch: FrameBatch) -> None:
-        """Submit a task for each view, which spools its colour image. See `Exporter`."""
+        """See `Exporter`."""
         tasks = []
         for view in range(len(batch)):
             index, camera, frame = (int(column[view]) for column in (batch.episode, batch.camera, batch.frame))
@@ -116,10 +116,7 @@ class LerobotExporter(EpisodeExporter[_Content]):
         self._context.pool.submit_all(tasks)
 
     def write_stored(self, episode: int, scenes: Sequence[StoredScene]) -> None:
-        """Submit a task for each group of pictures of a stored episode. See `Exporter`.
-
-        Videos of JPEG images differ from a bake's, as they were compressed before.
-        """
+        """See `Exporter`: a task for each group of pictures. Videos of JPEG images differ from a bake's, as they were compressed before."""
         staged, tasks = self._staged(episode, _make_content), []
         for camera, scene in enumerate(scenes):
             for group in range(-(-scene.frames // GROUP)):
@@ -128,22 +125,20 @@ class LerobotExporter(EpisodeExporter[_Content]):
         self._context.pool.submit_all(tasks)
 
     def write_ticks(self, batch: TickBatch) -> None:
-        """Append the frame's row of state and action to each episode, in memory. See `Exporter`."""
+        """See `Exporter`."""
         for index, row in zip(batch.episode.tolist(), make_ticks(batch), strict=True):
             self._staged(index, _make_content).content.ticks += row.tobytes()
 
     def files(self, episode: int) -> list[Path]:
-        """Existing paths of an episode, sorted: its part and videos. See `Exporter`."""
+        """See `Exporter`: part and videos."""
         places = [part_path(episode), *(video_path(camera, episode) for camera in range(self._settings.cameras))]
         return sorted(place for place in places if os.path.lexists(self._context.out / place))
 
     def _finish(self, episode: _Staged, end: EpisodeEnd) -> None:
-        """Encode the last, incomplete groups of pictures of an episode that has ended."""
         for camera, group in list(episode.content.spooled):
             self._encode_if_complete(episode, camera, group)
 
     def _frame_spooled(self, episode: _Staged, camera: int, group: int) -> None:
-        """Count a frame that was spooled; encodes its group of pictures if it is complete."""
         episode.content.spooled[camera, group] += 1
         self._encode_if_complete(episode, camera, group)
 
@@ -159,7 +154,6 @@ class LerobotExporter(EpisodeExporter[_Content]):
         self._context.pool.submit_all((self._task((episode,), write_spooled_group, (), arguments, path),))
 
     def _commit(self, episode: _Staged, end: EpisodeEnd) -> WriteTask:
-        """Task that joins an episode's videos and writes its part; raises ValueError if frames are missing."""
         count = len(episode.content.ticks) // TICK.itemsize
         if count != end.frames:
             raise ValueError(f"episode {end.episode} ended with {end.frames} frames, but {count} came")
@@ -171,12 +165,11 @@ class LerobotExporter(EpisodeExporter[_Content]):
 
 
 def _make_content(_: Path) -> _Content:
-    """Empty content of a staged episode."""
     return _Content()
 
 
 def make_content(end: EpisodeEnd, ticks: bytes) -> EpisodeContent:
-    """Content of an episode's part, from its end and the rows of its ticks."""
+    """What the part of an episode is made of."""
     row = end.row
     return EpisodeContent(
         end.episode, str(row.get("mode", "")), Ending(end.ending).name.lower(), int(row.get("picked", 0)), ticks, end.attempts
@@ -194,5 +187,5 @@ def make_ticks(batch: TickBatch) -> np.ndarray:
 
 
 def video_rate(physics: Physics) -> Fraction:
-    """Frames per second, as an exact fraction."""
+    """Frames per second as a fraction."""
     return Fraction(frame_rate(physics)).limit_denominator(_MAX_DENOMINATOR)

@@ -28,7 +28,7 @@ from synpick_warp.views.frames import EpisodeEnd, TickBatch
 
 @dataclass(eq=False)
 class _Content:
-    """Content of an episode whose ticks are being spooled: row type, attributes of the first tick, objects, drop poses, ticks so far."""
+    """What is kept of an episode whose ticks are being spooled."""
 
     row: np.dtype
     """Type of a row of its spool file."""
@@ -66,19 +66,17 @@ class TrajectoryExporter(EpisodeExporter[_Content]):
 
     @staticmethod
     def slot_bytes(settings: ExportSettings) -> int:
-        """Bytes of a spooled tick in shared memory. See `Exporter`."""
+        """See `Exporter`: a tick of some episodes."""
         size = spool_bytes(settings.objects, settings.physics.steps_per_tick, settings.trajectory.steps)
         return shared_bytes((size,))
 
     @staticmethod
     def shared_files(layout: DataLayout) -> SharedFiles:
-        """Names of what is written beside episodes: the store's metadata, objects and cameras, no index files, and the folders. See
-        `Exporter`.
-        """
+        """See `Exporter`."""
         return SharedFiles(tuple(constant_places(STORE)), (), (STORE / EPISODES, STORE))
 
     def write_constants(self) -> list[Path]:
-        """Write the store with its groups of objects, cameras and lights; returns their paths. See `Exporter`."""
+        """See `Exporter`: the store with its groups of objects and cameras."""
         context, store = self._context, self._context.out / STORE
         with output_errors(store):
             store.mkdir(exist_ok=True)
@@ -89,18 +87,18 @@ class TrajectoryExporter(EpisodeExporter[_Content]):
         return [path.relative_to(context.out) for path in written]
 
     def write_ticks(self, batch: TickBatch) -> None:
-        """Submit tasks that spool the ticks of all episodes. See `Exporter`."""
+        """See `Exporter`."""
         indices = batch.episode.tolist()
         episodes = [self._staged(index, partial(self._make_content, batch, world)) for world, index in enumerate(indices)]
         self._context.pool.submit_all(self._spool(batch, episodes))
 
     def files(self, episode: int) -> list[Path]:
-        """Group of an episode, if it exists, relative to the data set. See `Exporter`."""
+        """See `Exporter`: the group."""
         place = self._place(episode)
         return [place.relative_to(self._context.out)] if os.path.lexists(place) else []
 
     def _make_content(self, batch: TickBatch, world: int, _: Path) -> _Content:
-        """Content of a new episode, from its first tick in a batch."""
+        """What the first tick of an episode tells, that of a world of a batch."""
         instances = count_instances(batch, world)
         light = int(batch.light[world])
         initial: dict[str, Any] = {
@@ -145,7 +143,6 @@ class TrajectoryExporter(EpisodeExporter[_Content]):
                 yield self._task(owners, write_rows, (image,), (self._staging, places), self._staging)
 
     def _commit(self, episode: _Staged, end: EpisodeEnd) -> WriteTask:
-        """Task that writes an episode's group from its spool; raises ValueError if frames are missing."""
         kept = episode.content
         if kept.count != end.frames:
             raise ValueError(f"episode {end.episode} ended with {end.frames} frames, but {kept.count} came")
@@ -165,5 +162,4 @@ class TrajectoryExporter(EpisodeExporter[_Content]):
         return WriteTask(write_episode, (), (episode.folder, kept.row, kept.count, place, content, self._settings), place)
 
     def _place(self, episode: int) -> Path:
-        """Folder of an episode's group in the store."""
         return self._context.out / STORE / EPISODES / f"{episode:06d}"

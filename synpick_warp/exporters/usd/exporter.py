@@ -35,16 +35,16 @@ class UsdExporter(EpisodeExporter[TickSpool]):
 
     @staticmethod
     def slot_bytes(settings: ExportSettings) -> int:
-        """0: tasks have no images. See `Exporter`."""
+        """See `Exporter`: tasks have no images."""
         return 0
 
     @staticmethod
     def shared_files(layout: DataLayout) -> SharedFiles:
-        """Names of what is written beside episodes: the asset library, no index files, and the folder. See `Exporter`."""
+        """See `Exporter`."""
         return SharedFiles((LIBRARY,), (), (FOLDER,))
 
     def write_constants(self) -> list[Path]:
-        """Write the asset library; returns its path. See `Exporter`."""
+        """See `Exporter`: the asset library."""
         from synpick_warp.exporters.usd.assets import write_library  # pxr loads slowly, and only this method needs it.
 
         context = self._context
@@ -58,7 +58,7 @@ class UsdExporter(EpisodeExporter[TickSpool]):
         return [LIBRARY]
 
     def write_ticks(self, batch: TickBatch) -> None:
-        """Append the tick's row to the spool of each episode. See `Exporter`."""
+        """See `Exporter`."""
         make_spool = partial(_make_spool, batch.object_id.shape[1])
         for index, row in zip(batch.episode.tolist(), tick_rows(batch), strict=True):
             spool = self._staged(index, make_spool).content
@@ -66,24 +66,21 @@ class UsdExporter(EpisodeExporter[TickSpool]):
                 spool.add(row)
 
     def _commit(self, episode: StagedEpisode[TickSpool], end: EpisodeEnd) -> WriteTask:
-        """Task that writes an episode's USD file from its spool."""
         spool, place = episode.content, self._place(end.episode)
         with output_errors(spool.path):
             spool.flush()
         return WriteTask(write_episode, (), (spool.path, spool.instances, place, EpisodeMetadata.from_end(end), self._settings), place)
 
     def files(self, episode: int) -> list[Path]:
-        """The USD file of an episode, if it exists, relative to the data set. See `Exporter`."""
+        """See `Exporter`: the one file."""
         place = self._place(episode)
         return [place.relative_to(self._context.out)] if os.path.lexists(place) else []
 
     def _place(self, episode: int) -> Path:
-        """Path of an episode's USD file."""
         return self._context.out / FOLDER / f"{episode:06d}.usdc"
 
     @cached_property
     def _settings(self) -> EpisodeSettings:
-        """Settings of all episodes: tick rate, gravity, cameras, lights, names."""
         context = self._context
         settings = context.settings
         return EpisodeSettings(
@@ -96,5 +93,4 @@ class UsdExporter(EpisodeExporter[TickSpool]):
 
 
 def _make_spool(instances: int, folder: Path) -> TickSpool:
-    """Spool of an episode in its staging folder."""
     return TickSpool(folder / _SPOOL, instances)

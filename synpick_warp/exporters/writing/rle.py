@@ -85,20 +85,15 @@ class RunBoundaries:
     """Value of the pixel below the boundary (N)."""
 
     def runs_of(self, value: int) -> Runs:
-        """Mask of the pixels that equal a value other than 0."""
-        typed = self.above.dtype.type(value)
-        return self._runs((self.above == typed) | (self.below == typed))
-
-    def runs_with(self, bit: int) -> Runs:
-        """Mask of the pixels that have a bit set; 0 is the lowest."""
-        return self._runs((self.above ^ self.below) & self.above.dtype.type(1 << bit) != 0)
+        """Mask of the pixels that equal a value from 1 to MAX_INSTANCES."""
+        return self.split_by_value([value - 1])[0]
 
     def split_by_value(self, instances: Sequence[int]) -> list[Runs]:
-        """Masks of the pixels that equal 1 + i for instances i: `runs_of` each, from one pass over the boundaries."""
+        """Masks of the pixels that equal 1 + i for instances i, from one pass over the boundaries."""
         return self._split(self._list_values(self.below), self._list_values(self.above), instances)
 
     def split_by_bit(self, instances: Sequence[int]) -> list[Runs]:
-        """Masks of the pixels that have bit i set for instances i: `runs_with` each, from one pass over the boundaries."""
+        """Masks of the pixels that have bit i set for instances i, 0 the lowest, from one pass over the boundaries."""
         changed = self.above ^ self.below
         return self._split(self._list_bits(changed & self.below), self._list_bits(changed & self.above), instances)
 
@@ -148,13 +143,6 @@ class RunBoundaries:
         rows = list(zip(bounds.tolist(), bounds[1:].tolist(), *measures.tolist(), strict=False))
         chosen = (rows[instance] for instance in instances)
         return [Runs(column[start:stop], first[start:stop], past[start:stop], *measured) for start, stop, *measured in chosen]
-
-    def _runs(self, chosen: np.ndarray) -> Runs:
-        """Pair the chosen boundaries: they alternate between start and end of a run, as both neighbours of a boundary differ."""
-        column, row = (part.astype(np.int64) for part in _divide(self.place[chosen], self.span))
-        first, past = row[::2], row[1::2]
-        top, bottom = (int(first.min()), int(past.max())) if row.size else (0, 0)
-        return Runs(column[::2], first, past, int((past - first).sum()), top, bottom)
 
 
 def unpack_run_boundaries(packed: np.ndarray, height: int) -> RunBoundaries:

@@ -21,6 +21,7 @@ from synpick_warp.kernels.encoding.png import (
     sum_groups_kernel,
 )
 from synpick_warp.stages.arrays import allocate, allocate_struct, device_array, struct_arrays
+from synpick_warp.stages.launch import launch
 from synpick_warp.system.codecs.depth_png import (
     MAX_RUN,
     distance_codes,
@@ -116,32 +117,9 @@ class DepthEncoder:
             count: Views in use.
             out: Written.
         """
-        scratch, device = self.scratch, self.device
-        wp.launch(
-            encode_segments_kernel,
-            dim=(count, self.height, -(-self.width // SEGMENT)),
-            inputs=[image, self.codes, SEGMENT],
-            outputs=[scratch.slot, self.slots],
-            device=device,
-        )
-        wp.launch(
-            sum_groups_kernel,
-            dim=(count, scratch.group_begin.shape[1]),
-            inputs=[self.slots],
-            outputs=[scratch.begin, self.groups],
-            device=device,
-        )
-        wp.launch(
-            close_streams_kernel,
-            dim=count,
-            inputs=[self.groups, self.end_code, self.height, self.width],
-            outputs=[scratch.group_begin, scratch.slot, self.slots, out.depth_idat_size],
-            device=device,
-        )
-        wp.launch(
-            join_slots_kernel,
-            dim=(count, scratch.slot.shape[1], LANES),
-            inputs=[scratch.slot, self.slots, scratch.begin, scratch.group_begin, LANES],
-            outputs=[out.depth_idat],
-            device=device,
-        )
+        scratch = self.scratch
+        segments = (count, self.height, -(-self.width // SEGMENT))
+        launch(encode_segments_kernel, segments, self, scratch, image=image, segment=SEGMENT, sums=self.slots)
+        launch(sum_groups_kernel, (count, scratch.group_begin.shape[1]), self, scratch)
+        launch(close_streams_kernel, count, self, scratch, rows=self.height, columns=self.width, size=out.depth_idat_size)
+        launch(join_slots_kernel, (count, scratch.slot.shape[1], LANES), self, scratch, lanes=LANES, data=out.depth_idat)

@@ -12,6 +12,7 @@ import warp as wp
 from synpick_warp.kernels.render.images.ground_truth import expand_masks_kernel, gather_cameras_kernel, gather_objects_kernel
 from synpick_warp.stages.arrays import allocate, device_array
 from synpick_warp.stages.buffers import LayerBuffers, Snapshot, ViewBuffers
+from synpick_warp.stages.launch import launch
 from synpick_warp.stages.online.exchange import DeviceArray, Gate
 from synpick_warp.stages.render.renderer import Renderer
 from synpick_warp.stages.render.view_setup import make_views
@@ -216,18 +217,7 @@ class BatchRing:
 
     def _gather(self, snapshot: Snapshot, views: Any, truth: TruthBuffers) -> None:
         """Launch the kernels that write `truth` for a batch of views."""
-        cameras, object_ids = self.renderer.scene.cameras, self.renderer.scene.obj_id
-        wp.launch(
-            gather_cameras_kernel,
-            dim=views.count,
-            inputs=[cameras, snapshot.episode, snapshot.frame, views],
-            outputs=[truth.episode, truth.camera, truth.frame, truth.intrinsics, truth.world_to_camera],
-            device=self.device,
-        )
-        wp.launch(
-            gather_objects_kernel,
-            dim=(views.count, self.instances),
-            inputs=[cameras, object_ids, snapshot.catalog_index, snapshot.pose, views],
-            outputs=[truth.object_id, truth.pose, truth.object_to_camera],
-            device=self.device,
-        )
+        scene = self.renderer.scene
+        launch(gather_cameras_kernel, views.count, scene, snapshot, out=truth, views=views)
+        objects = (views.count, self.instances)
+        launch(gather_objects_kernel, objects, scene, snapshot, out=truth, views=views, object_ids=scene.obj_id)

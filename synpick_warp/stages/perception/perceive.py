@@ -8,6 +8,7 @@ from synpick_warp.configs import schema
 from synpick_warp.kernels.perception import worklist
 from synpick_warp.stages.buffers import Snapshot
 from synpick_warp.stages.constants import SceneData
+from synpick_warp.stages.launch import launch
 from synpick_warp.stages.perception.arrays import Observation, Plan
 from synpick_warp.stages.perception.images import PerceptionImages
 from synpick_warp.stages.perception.plan import GraspPlanner
@@ -88,31 +89,17 @@ class Perception:
 
     def list_worlds(self) -> None:
         """Build the worklist of worlds whose task is LOOK and reset the loop to its beginning."""
-        wp.launch(
-            worklist.list_worlds_kernel,
-            dim=1,
-            inputs=[self.state.phase.shape[0], self.state.phase, self.attempts.task],
-            outputs=[self._worklist, self._length, self._next, self._remaining],
-            device=self.device,
-        )
+        sources, lists = (self.state, self.attempts), {"worklist": self._worklist, "length": self._length}
+        given = {"worlds": len(self.state.phase), "next": self._next, "remaining": self._remaining}
+        launch(worklist.list_worlds_kernel, 1, *sources, **lists, **given)
 
     def perceive_batch(self, snapshot: Snapshot) -> None:
         """Loop body: observe the next worlds of the worklist, one a view, and plan their attempts."""
         views = self.images.views
-        wp.launch(
-            worklist.take_batch_kernel,
-            dim=views.count,
-            inputs=[self._worklist, self._length, self._next],
-            outputs=[views.world],
-            device=self.device,
-        )
+        given = {"worklist": self._worklist, "length": self._length, "next_item": self._next}
+        launch(worklist.take_batch_kernel, views.count, **given, world_out=views.world)
         self.images.render(snapshot)
         self.segmenter.find_grasp_points(self.scene, snapshot.catalog_index, self.observation)
         self.planner.plan(self.scene, self.state, self.attempts, self.observation, self.plan, self.seed)
-        wp.launch(
-            worklist.advance_batch_kernel,
-            dim=1,
-            inputs=[views.count, self._length],
-            outputs=[self._next, self._remaining],
-            device=self.device,
-        )
+        given = {"views": views.count, "length": self._length, "next": self._next, "remaining": self._remaining}
+        launch(worklist.advance_batch_kernel, 1, **given)

@@ -21,6 +21,7 @@ from synpick_warp.kernels.perception.target import choose_target_kernel
 from synpick_warp.kernels.tuning import VIEW_BLOCK
 from synpick_warp.stages.arrays import allocate, allocate_struct, device_array, struct_arrays
 from synpick_warp.stages.constants import SceneData
+from synpick_warp.stages.launch import launch
 from synpick_warp.stages.perception.arrays import Observation, PerceptionArrays, Plan
 from synpick_warp.stages.perception.images import PerceptionImages
 from synpick_warp.stages.sim.worlds import AttemptState, WorldState
@@ -62,6 +63,8 @@ class GraspPlanner:
         self.device = arrays.largest.device
         self.views, self.instances = arrays.largest.shape
         self.voting, self.cycles = allocate_votes(settings, self.instances, self.views, self.device)
+        self._sources = (images, images.scene, arrays, self.voting)
+        self._contours = (self.views, self.instances, int(CONTOUR_LANES))
 
     def plan(self, scene: SceneData, state: WorldState, attempts: AttemptState, observation: Observation, plan: Plan, seed: int) -> None:
         """Write votes and clutter graph to `observation`, target and grasp to `plan`, for the worlds of the batch.
@@ -84,57 +87,34 @@ class GraspPlanner:
 
     def bound_contours(self, scene: SceneData, state: WorldState, observation: Observation) -> None:
         """Compute each contour's bounding box, and its instance's reach."""
-        images, arrays = self.images, self.arrays
         self.voting.extent.fill_(int(NOWHERE))
-        inputs = [scene.catalog, images.scene.cameras, scene.perception, state.catalog_index, images.views]
-        inputs += [arrays.contour, arrays.contour_length, observation.depth]
-        self._launch_contours(bound_contours_kernel, inputs, [self.voting.extent, self.voting.reach])
+        launch(bound_contours_kernel, self._contours, scene, state, observation, *self._sources)
 
     def count_votes(self, scene: SceneData, observation: Observation) -> None:
         """Count the occlusion votes along every contour, by kind."""
-        images, arrays, voting = self.images, self.arrays, self.voting
-        voting.count.zero_()
-        inputs = [images.scene.grid, scene.perception, images.gbuffer, images.views, arrays.component, arrays.largest]
-        inputs += [arrays.contour, arrays.contour_length, observation.depth, voting.extent, voting.reach]
-        self._launch_contours(count_votes_kernel, inputs, [voting.count])
+        self.voting.count.zero_()
+        launch(count_votes_kernel, self._contours, scene, observation, *self._sources)
 
     def weigh_votes(self, scene: SceneData, observation: Observation) -> None:
-        """Sum the counted votes by their weights: writes the observation's `votes`."""
-        inputs = [scene.perception, self.images.views, self.voting.count]
-        dim = (self.views, self.instances, self.instances)
-        wp.launch(weigh_votes_kernel, dim=dim, inputs=inputs, outputs=[observation.votes], device=self.device)
+        """Sum the votes by weight."""
+        launch(weigh_votes_kernel, (self.views, self.instances, self.instances), scene, observation, *self._sources)
 
     def order_clutter(self, scene: SceneData, observation: Observation) -> None:
         """Build the acyclic clutter graph and its transitive closure."""
-        inputs = [scene.perception, self.images.views, observation.votes]
-        self._launch_views(order_clutter_kernel, inputs, [self.cycles, observation.above, observation.ancestors])
+        launch(order_clutter_kernel, self.views, scene, observation, self.images, cycles=self.cycles, block_dim=VIEW_BLOCK)
 
     def choose_target(
         self, scene: SceneData, state: WorldState, attempts: AttemptState, observation: Observation, plan: Plan, seed: int
     ) -> None:
-        """Choose the instance to pick in each world: writes the plan's `target`."""
-        inputs = [wp.uint64(seed), scene.pick, state.arrangement_id, state.mode, attempts.attempt, attempts.outcome]
-        inputs += [self.images.views, observation.visible, observation.visible_fraction, observation.ancestors]
-        self._launch_views(choose_target_kernel, inputs, [plan.target])
+        """Choose the instance to pick."""
+        sources = (scene, state, attempts, observation, plan, self.images)
+        launch(choose_target_kernel, self.views, *sources, seed=wp.uint64(seed), block_dim=VIEW_BLOCK)
 
     def smooth_normal(self, scene: SceneData, observation: Observation, plan: Plan) -> None:
         """Sum the normals in the window around the target's grasp point."""
-        images, arrays = self.images, self.arrays
-        inputs = [images.scene.meshes, images.scene.surfaces, images.scene.cameras, images.scene.grid, scene.perception.normal_window]
-        inputs += [images.bodies, images.gbuffer, images.views, arrays.component, arrays.largest, observation.grasp_pixel, plan.target]
-        self._launch_views(smooth_normal_kernel, inputs, [plan.normal])
+        window = scene.perception.normal_window
+        launch(smooth_normal_kernel, self.views, observation, plan, *self._sources, window=window, block_dim=VIEW_BLOCK)
 
     def frame_grasp(self, scene: SceneData, observation: Observation, plan: Plan) -> None:
         """Compute the grasp point in the world, its unit normal, and the gripper's angles."""
-        images = self.images
-        inputs = [images.scene.cameras, scene.pick, images.gbuffer, images.views, observation.grasp_pixel, plan.target]
-        self._launch_views(frame_grasp_kernel, inputs, [plan.normal, plan.point, plan.yaw, plan.tilt])
-
-    def _launch_views(self, kernel: wp.Kernel, inputs: list[Any], outputs: list[Any]) -> None:
-        """Launch a kernel with one thread a view."""
-        wp.launch(kernel, dim=self.views, inputs=inputs, outputs=outputs, device=self.device, block_dim=VIEW_BLOCK)
-
-    def _launch_contours(self, kernel: wp.Kernel, inputs: list[Any], outputs: list[Any]) -> None:
-        """Launch a kernel with `CONTOUR_LANES` threads a contour."""
-        dim = (self.views, self.instances, int(CONTOUR_LANES))
-        wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self.device)
+        launch(frame_grasp_kernel, self.views, scene, observation, plan, *self._sources, block_dim=VIEW_BLOCK)

@@ -17,6 +17,7 @@ from synpick_warp.kernels.render.images.boxes_counts import (
 from synpick_warp.kernels.tuning import BORDER_CHUNK, BORDER_GROUPS, BORDER_THREADS, COUNT_THREADS
 from synpick_warp.stages.arrays import allocate_struct, struct_arrays
 from synpick_warp.stages.buffers import ViewBuffers
+from synpick_warp.stages.launch import launch
 from synpick_warp.stages.render.scene import RenderScene
 
 BORDER_BOXES = struct_arrays(BorderBoxes, "view_instance", length=("one",))
@@ -44,18 +45,13 @@ class Annotator:
             views: The struct `Views`.
             out: Its images are read, its counts and boxes written.
         """
-        scene, device, instances = self.scene, self.scene.device, out.pixels.shape[1]
-        threads = COUNT_THREADS if device.is_cuda else 1
-        wp.launch(clear_boxes_counts_kernel, dim=(views.count, instances), outputs=[out.pixels, out.boxes], device=device)
-        wp.launch(
-            count_image_pixels_kernel,
-            dim=(views.count, instances, threads),
-            inputs=[scene.grid, bodies, out.instance, out.depth, out.amodal, threads],
-            outputs=[out.pixels, out.boxes],
-            device=device,
-        )
+        scene, instances = self.scene, out.pixels.shape[1]
+        threads = COUNT_THREADS if scene.device.is_cuda else 1
+        images = {"instance_image": out.instance, "depth_image": out.depth, "amodal_image": out.amodal}
+        launch(clear_boxes_counts_kernel, (views.count, instances), out)
+        launch(count_image_pixels_kernel, (views.count, instances, threads), scene, out, bodies=bodies, threads=threads, **images)
         self._count_border_pixels(bodies, views, out)
-        wp.launch(reset_empty_boxes_kernel, dim=(views.count, instances, 2), outputs=[out.boxes], device=device)
+        launch(reset_empty_boxes_kernel, (views.count, instances, 2), out)
 
     def _count_border_pixels(self, bodies: Any, views: Any, out: ViewBuffers) -> None:
         """List the boxes that reach beyond the image, and count the pixels there by rays."""
@@ -69,11 +65,5 @@ class Annotator:
             outputs=[self.border_boxes],
             device=device,
         )
-        wp.launch(
-            count_border_pixels_kernel,
-            dim=(groups, threads),
-            inputs=[scene.meshes, scene.cameras, scene.grid, bodies, views, self.border_boxes, groups, threads, BORDER_CHUNK],
-            outputs=[out.pixels, out.boxes],
-            device=device,
-            block_dim=BORDER_THREADS,
-        )
+        given = {"bodies": bodies, "views": views, "groups": groups, "threads": threads, "chunk": BORDER_CHUNK}
+        launch(count_border_pixels_kernel, (groups, threads), self, scene, out, block_dim=BORDER_THREADS, **given)

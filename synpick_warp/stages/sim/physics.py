@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Iterator
+from types import SimpleNamespace
 from typing import Any, Protocol
 
 import newton
@@ -19,6 +20,7 @@ from synpick_warp.newton_patches.broad_phase import replace_broad_phase
 from synpick_warp.newton_patches.narrow_phase import resize_blocks
 from synpick_warp.newton_patches.solver import choose_solver
 from synpick_warp.scenes import build
+from synpick_warp.stages.launch import launch
 from synpick_warp.system.processes.threads import is_only_launcher
 
 # Sentinel: default of `next` for an exhausted iterator.
@@ -108,13 +110,7 @@ class Physics:
         Args:
             yaw: Counter-clockwise from above (world) float32 [rad].
         """
-        wp.launch(
-            gripper.set_yaw_kernel,
-            dim=self.layout.worlds,
-            inputs=[self._finger_joint, yaw],
-            outputs=[self.model.joint_X_c],
-            device=self.device,
-        )
+        launch(gripper.set_yaw_kernel, self.layout.worlds, finger_joint=self._finger_joint, yaw=yaw, joint_child_out=self.model.joint_X_c)
         self.solver.notify_model_changed(newton.ModelFlags.JOINT_PROPERTIES)
 
     def load(self, variant: wp.array, restarted: wp.array) -> None:
@@ -305,3 +301,10 @@ def _sweep(physics: PhysicsConfig, slots: int, parallel: bool) -> dict[str, Any]
         "free_body_constraint_max": build.FREE_DOFS * slots,
         "deterministic": wp.DeterministicMode.RUN_TO_RUN if physics.deterministic else wp.DeterministicMode.NOT_GUARANTEED,
     }
+
+
+def contact_arrays(physics: Physics) -> SimpleNamespace:
+    """Arrays of the contacts, and the body of each shape, by the names of kernels' parameters."""
+    names = ("shape0", "shape1", "point0", "point1", "normal", "margin0", "margin1")
+    arrays = {name: getattr(physics.contacts, f"rigid_contact_{name}") for name in names}
+    return SimpleNamespace(**arrays, contact_count=physics.contacts.rigid_contact_count, shape_body=physics.model.shape_body)

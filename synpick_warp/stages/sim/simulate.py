@@ -19,6 +19,7 @@ from synpick_warp.scenes.types import Catalog
 from synpick_warp.stages.arrays import allocate
 from synpick_warp.stages.buffers import LastFrame, Snapshot
 from synpick_warp.stages.constants import SceneData, fill, make_scene_data
+from synpick_warp.stages.launch import launch
 from synpick_warp.stages.perception.arrays import Observation, Plan
 from synpick_warp.stages.perception.perceive import Perception
 from synpick_warp.stages.render.scene import RenderScene
@@ -188,58 +189,13 @@ class Simulation:
 
     def _take_snapshot(self) -> None:
         """Copy the state of the worlds into the snapshot of the record, with the previous frame beside it, and pack the status rows."""
-        state, attempts, snapshot, status = self.state, self.attempts, self.record.snapshot, self.record.status
-        device = self.device
-        wp.launch(
-            pack.take_snapshot_kernel,
-            dim=self.layout.worlds,
-            inputs=[
-                self.scene.layout,
-                state.phase,
-                state.ending,
-                state.arrangement_id,
-                state.frame,
-                attempts.task,
-                state.catalog_index,
-                state.body_slot,
-                self.physics.state.body_q,
-            ],
-            outputs=[
-                snapshot.live,
-                snapshot.episode,
-                snapshot.frame,
-                snapshot.catalog_index,
-                snapshot.pose,
-                snapshot.fixture_pose,
-                snapshot.fixture_visible,
-            ],
-            device=device,
-        )
-        wp.launch(
-            pack.pack_status_kernel,
-            dim=self.layout.worlds,
-            inputs=[
-                snapshot.live,
-                state.phase,
-                state.ending,
-                state.arrangement_id,
-                state.frame,
-                state.mode,
-                attempts.task,
-                attempts.attempt,
-                attempts.outcome,
-                self.plan.target,
-                attempts.hits,
-                attempts.engaged_bits,
-                attempts.attached_bits,
-                self.seals.peak_force,
-            ],
-            outputs=[status.table, status.measures],
-            device=device,
-        )
+        state, snapshot, status, worlds = self.state, self.record.snapshot, self.record.status, self.layout.worlds
+        launch(pack.take_snapshot_kernel, worlds, self.scene, state, self.attempts, self.physics.state, out=snapshot)
+        tables = {"status_out": status.table, "measure_out": status.measures}
+        launch(pack.pack_status_kernel, worlds, state, self.attempts, self.seals, live=snapshot.live, target=self.plan.target, **tables)
         outputs = [_frame_poses(self.last), snapshot.follows, snapshot.last_catalog_index, snapshot.last_pose, snapshot.last_fixture_pose]
         outputs += [snapshot.last_fixture_visible]
-        wp.launch(pack.link_frames_kernel, dim=self.layout.worlds, inputs=[_frame_poses(snapshot)], outputs=outputs, device=device)
+        wp.launch(pack.link_frames_kernel, dim=worlds, inputs=[_frame_poses(snapshot)], outputs=outputs, device=self.device)
         wp.copy(snapshot.light, state.light)
         wp.copy(snapshot.light_yaw, state.light_yaw)
         wp.copy(snapshot.light_exposure, state.light_exposure)

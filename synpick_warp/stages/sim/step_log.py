@@ -14,7 +14,8 @@ from synpick_warp.kernels.sim import step_log
 from synpick_warp.scenes import build
 from synpick_warp.stages.arrays import allocate, device_array
 from synpick_warp.stages.constants import SceneData
-from synpick_warp.stages.sim.physics import Physics
+from synpick_warp.stages.launch import launch
+from synpick_warp.stages.sim.physics import Physics, contact_arrays
 from synpick_warp.stages.sim.worlds import AttemptState, SealState, WorldState
 
 
@@ -119,14 +120,8 @@ class StepRecorder:
 
     def save_drop_poses(self) -> None:
         """Save the drop poses of objects that have just been dropped."""
-        state = self._state
-        wp.launch(
-            step_log.save_drop_poses_kernel,
-            dim=state.catalog_index.shape,
-            inputs=[self._scene.layout, state.phase, state.progress, state.catalog_index, state.body_slot, self._physics.state.body_q],
-            outputs=[self.record.drops.drop_pose],
-            device=self._device,
-        )
+        state, drop = self._state, self.record.drops.drop_pose
+        launch(step_log.save_drop_poses_kernel, state.catalog_index.shape, self._scene, state, self._physics.state, drop_out=drop)
 
     def begin_step(self) -> None:
         """Clear the sums of contact forces, before a step."""
@@ -135,67 +130,25 @@ class StepRecorder:
     def save_impedance_force(self) -> None:
         """Save the impedance forces of a step, before seal forces are added to the joint forces."""
         if self._steps:
-            wp.launch(
-                step_log.save_impedance_force_kernel,
-                dim=self._force.shape,
-                inputs=[self._scene.layout, self._weight, self._physics.control.joint_f],
-                outputs=[self._force],
-                device=self._device,
-            )
+            given = {"weight": self._weight, "force_out": self._force}
+            launch(step_log.save_impedance_force_kernel, self._force.shape, self._scene, self._physics.control, **given)
 
     def after_solve(self, contact_f: wp.array) -> None:
         """Add the contact forces of a solver substep: the force of each contact on its first shape (contact) spatial vector [N]."""
-        contacts = self._physics.contacts
-        wp.launch(
-            step_log.sum_contacts_kernel,
-            dim=contacts.rigid_contact_max,
-            inputs=[
-                self._physics.model.shape_body,
-                contacts.rigid_contact_count,
-                contacts.rigid_contact_shape0,
-                contacts.rigid_contact_shape1,
-                contact_f,
-            ],
-            outputs=[self._total],
-            device=self._device,
-        )
+        physics, given = self._physics, {"contact_force": contact_f, "total_inout": self._total}
+        launch(step_log.sum_contacts_kernel, physics.contacts.rigid_contact_max, contact_arrays(physics), **given)
 
     def end_step(self, step: int, current: newton.State) -> None:
         """Record step `step` of the tick from the state at its end."""
-        scene, state, seals, log = self._scene, self._state, self._seals, self.record.steps
+        log, worlds = self.record.steps, self._sizes["world"]
         if log is None:
             return
-        places = (self._sizes["world"], self._sizes["place"])
-        wp.launch(
-            step_log.record_motion_kernel,
-            dim=places,
-            inputs=[scene.layout, step, state.catalog_index, state.body_slot, current.body_q, current.body_qd],
-            outputs=[log.pose, log.velocity, log.angular_velocity],
-            device=self._device,
-        )
-        wp.launch(
-            step_log.record_forces_kernel,
-            dim=places,
-            inputs=[
-                scene.layout,
-                step,
-                self._substep_fraction,
-                state.catalog_index,
-                state.body_slot,
-                seals.attached,
-                seals.seal_force,
-                self._total,
-            ],
-            outputs=[log.contact_force, log.contact_load, log.seal_force, log.attached],
-            device=self._device,
-        )
-        wp.launch(
-            step_log.record_gripper_kernel,
-            dim=self._sizes["world"],
-            inputs=[step, state.phase, state.mode, self._attempts.task, state.setpoint, self._force],
-            outputs=[log.setpoint, log.impedance_force, log.task],
-            device=self._device,
-        )
+        places, sources = (worlds, self._sizes["place"]), (self._scene, self._state)
+        launch(step_log.record_motion_kernel, places, *sources, current, step=step, out=log)
+        given = {"substep_fraction": self._substep_fraction, "total": self._total}
+        launch(step_log.record_forces_kernel, places, *sources, self._seals, step=step, out=log, **given)
+        given = {"force": self._force, "force_out": log.impedance_force}
+        launch(step_log.record_gripper_kernel, worlds, *sources, self._attempts, step=step, out=log, **given)
 
     def end_tick(self) -> None:
         """Complete the record at the end of a tick."""

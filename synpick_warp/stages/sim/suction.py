@@ -13,8 +13,9 @@ from synpick_warp.kernels.sim import cup_rays, seal
 from synpick_warp.scenes.collision.hull_planes import plane_table
 from synpick_warp.scenes.types import Catalog
 from synpick_warp.stages.constants import SceneData, fill
+from synpick_warp.stages.launch import launch
 from synpick_warp.stages.render.scene import RenderScene
-from synpick_warp.stages.sim.physics import Physics
+from synpick_warp.stages.sim.physics import Physics, contact_arrays
 from synpick_warp.stages.sim.worlds import AttemptState, SealState, WorldState
 
 
@@ -35,69 +36,23 @@ class Suction:
 
     def engage(self, scene: SceneData, state: WorldState, attempts: AttemptState, seals: SealState, physics: Physics) -> None:
         """Switch suction on where task PRESS is complete: cast the rays and attach the engaged objects. Runs at the end of a tick."""
-        task = [state.phase, attempts.task, attempts.steps]
-        body_q, device = physics.state.body_q, state.phase.device
-        wp.launch(
-            cup_rays.count_seal_rays_kernel,
-            dim=state.phase.shape[0],
-            inputs=[scene.layout, scene.pick, scene.suction, self.surface, *task, state.catalog_index, state.body_slot, body_q],
-            outputs=[attempts.hits, attempts.engaged_bits],
-            device=device,
-        )
-        wp.launch(
-            cup_rays.engage_seals_kernel,
-            dim=state.catalog_index.shape,
-            inputs=[scene.layout, scene.pick, scene.suction, *task, state.body_slot, body_q, attempts.hits, attempts.engaged_bits],
-            outputs=[seals.attached, seals.object_in_tcp, seals.seal_force, seals.break_force],
-            device=device,
-        )
+        sources = (scene, state, attempts, physics.state)
+        launch(cup_rays.count_seal_rays_kernel, len(state.phase), *sources, self)
+        launch(cup_rays.engage_seals_kernel, state.catalog_index.shape, *sources, seals)
 
     def apply_seal_forces(self, scene: SceneData, state: WorldState, seals: SealState, physics: Physics, current: newton.State) -> None:
         """Add the seals' wrenches to the joint forces of objects and gripper, and break overloaded seals.
 
         Runs before a step, after the gripper's forces were written.
         """
-        model = physics.model
-        wp.launch(
-            seal.apply_seal_forces_kernel,
-            dim=state.phase.shape[0],
-            inputs=[
-                scene.layout,
-                scene.suction,
-                model.body_com,
-                model.body_inv_mass,
-                model.body_inv_inertia,
-                state.body_slot,
-                seals.object_in_tcp,
-                seals.break_force,
-                current.body_q,
-                current.body_qd,
-                seals.attached,
-                seals.seal_force,
-                seals.peak_force,
-                physics.control.joint_f,
-            ],
-            device=state.phase.device,
-        )
+        bodies = {name: getattr(physics.model, name) for name in ("body_com", "body_inv_mass", "body_inv_inertia")}
+        launch(seal.apply_seal_forces_kernel, len(state.phase), scene, state, seals, current, physics.control, **bodies)
 
     def ignore_attached_contacts(self, scene: SceneData, state: WorldState, seals: SealState, physics: Physics) -> None:
         """Disable contacts between cups and their attached objects. Runs between collision detection and solver."""
         contacts = physics.contacts
-        wp.launch(
-            seal.ignore_attached_contacts_kernel,
-            dim=contacts.rigid_contact_max,
-            inputs=[
-                scene.layout,
-                physics.model.shape_body,
-                contacts.rigid_contact_count,
-                state.body_slot,
-                seals.attached,
-                contacts.rigid_contact_shape0,
-                contacts.rigid_contact_shape1,
-            ],
-            outputs=[contacts.rigid_contact_margin0],
-            device=state.phase.device,
-        )
+        sources, margin = (scene, state, seals, contact_arrays(physics)), contacts.rigid_contact_margin0
+        launch(seal.ignore_attached_contacts_kernel, contacts.rigid_contact_max, *sources, margin_out=margin)
 
 
 def _surface_data(use_mesh: bool, catalog: Catalog, meshes: wp.array, device: wp.Device) -> Any:

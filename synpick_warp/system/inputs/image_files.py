@@ -7,11 +7,9 @@ Other formats that OpenCV could read are refused. NumPy and OpenCV are imported 
 from __future__ import annotations
 
 import struct
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 from synpick_warp.errors import SynpickError
-from synpick_warp.system.inputs.files import read_file
 
 if TYPE_CHECKING:
     import numpy as np
@@ -143,11 +141,6 @@ def _decode_grey(data: bytes, size: tuple[int, int]) -> np.ndarray | None:
         return None
     image = decode_grey_crop(data, size, slice(0, size[1]), slice(0, size[0]), bits=data[24])
     return None if image is None else image.astype(image.dtype.newbyteorder("="), copy=False)
-
-
-def read_image_file(path: Path, error: type[SynpickError], flags: int = -1, size: tuple[int, int] | None = None) -> np.ndarray:
-    """Read and decode a PNG or JPEG file; arguments and errors as `decode_image` and `read_file`."""
-    return decode_image(read_file(path, MAX_IMAGE_FILE, error), path, error, flags, size)
 
 
 def _show(size: tuple[int, ...]) -> str:

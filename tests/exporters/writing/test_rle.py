@@ -61,7 +61,7 @@ def test_known_run_lengths(mask, counts):
 
 @pytest.mark.parametrize("shape", [(0, 3), (3, 0), (0, 0), (2, 3)])
 def test_an_empty_crop_has_no_runs(shape):
-    runs = find_run_boundaries(np.zeros(shape, np.uint32), 2, 1).runs_with(31)
+    runs = find_run_boundaries(np.zeros(shape, np.uint32), 2, 1).split_by_bit([31])[0]
     assert runs.counts(4, 5).tolist() == [20]
     assert runs.box() is None
     assert runs.count == 0
@@ -83,14 +83,16 @@ def test_values_become_runs_and_run_lengths(image, value, data):
 
 
 @given(
-    hnp.arrays(np.uint32, st.tuples(SIDE, SIDE), elements=st.sampled_from([0, 1, 5, 2**31, 2**32 - 1])),
-    st.sampled_from([0, 2, 31]),
+    hnp.arrays(np.uint32, st.tuples(SIDE, SIDE), elements=st.sampled_from([0, 1, 5, 7, 2**31, 2**32 - 1])),
+    st.sampled_from([[0], [2, 31], range(32)]),
     st.data(),
 )
-def test_bits_become_runs(bits, instance, data):
+def test_bits_become_runs(bits, instances, data):
     part, top, left, height, width = place_randomly(bits, data)
-    expected = paste((bits >> np.uint32(instance)) & 1 == 1, top, left, height, width)
-    np.testing.assert_array_equal(paint(find_run_boundaries(part, top, left).runs_with(instance), height, width), expected)
+    for instance, runs in zip(instances, find_run_boundaries(part, top, left).split_by_bit(instances), strict=True):
+        expected = paste((bits >> np.uint32(instance)) & 1 == 1, top, left, height, width)
+        np.testing.assert_array_equal(paint(runs, height, width), expected)
+        assert runs.count == expected.sum()
 
 
 @pytest.mark.filterwarnings("ignore:__array__ implementation:DeprecationWarning")
@@ -105,29 +107,16 @@ def test_pycocotools_decodes_and_encodes_the_same_run_lengths(mask):
     assert coco.area(theirs) == runs.count
 
 
-def assert_same_runs(found: Runs, expected: Runs) -> None:
-    for name in ("column", "first", "past"):
-        np.testing.assert_array_equal(getattr(found, name), getattr(expected, name))
-        assert getattr(found, name).dtype == np.int64
-    assert (found.count, found.top, found.bottom) == (expected.count, expected.top, expected.bottom)
-
-
 @given(hnp.arrays(np.uint8, st.tuples(SIDE, SIDE), elements=st.sampled_from([0, 1, 2, 32, 33, 255])), st.data())
-def test_all_values_at_once_give_the_runs_of_each(image, data):
-    boundaries = find_run_boundaries(*place_randomly(image, data)[:3])
-    for index, runs in zip((0, 1, 7, 31), boundaries.split_by_value((0, 1, 7, 31)), strict=True):
-        assert_same_runs(runs, boundaries.runs_of(1 + index))
-
-
-@given(hnp.arrays(np.uint32, st.tuples(SIDE, SIDE), elements=st.sampled_from([0, 1, 5, 7, 2**31, 2**32 - 1])), st.data())
-def test_all_bits_at_once_give_the_runs_of_each(bits, data):
-    boundaries = find_run_boundaries(*place_randomly(bits, data)[:3])
-    for index, runs in enumerate(boundaries.split_by_bit(range(32))):
-        assert_same_runs(runs, boundaries.runs_with(index))
+def test_several_values_at_once_become_runs(image, data):
+    part, top, left, height, width = place_randomly(image, data)
+    for index, runs in zip((0, 1, 7, 31), find_run_boundaries(part, top, left).split_by_value((0, 1, 7, 31)), strict=True):
+        np.testing.assert_array_equal(paint(runs, height, width), paste(image == 1 + index, top, left, height, width))
 
 
 def test_images_with_more_positions_than_32_bits_are_split():
     place = np.array([5, 2**12, 2**35, 2**35 + 1], np.uint64)
     boundaries = RunBoundaries(place, 2**13, np.array([0, 9, 0, 9], np.uint32), np.array([9, 0, 9, 0], np.uint32))
-    assert_same_runs(boundaries.split_by_value([8])[0], boundaries.runs_of(9))
-    assert_same_runs(boundaries.split_by_bit([3])[0], boundaries.runs_with(3))
+    for runs in (boundaries.runs_of(9), boundaries.split_by_bit([3])[0]):
+        assert [part.tolist() for part in (runs.column, runs.first, runs.past)] == [[0, 2**22], [5, 0], [2**12, 1]]
+        assert (runs.count, runs.top, runs.bottom) == (2**12 - 4, 0, 2**12)

@@ -74,7 +74,7 @@ def _measure_size(factory: Factory, cameras: tuple[Camera, ...], worlds: int, mi
 
 
 def _pair(size: str, pixels: int, ours: str, theirs: str, seconds: tuple[float, float]) -> Iterator[Row]:
-    """Rows of the rates of both renderers and of their ratio, from the times of a view [s]."""
+    """Rows of the rates of both renderers, from the times of a view [s] by ours and theirs, and of their ratio."""
     our_seconds, their_seconds = seconds
     yield from rate_rows(f"{size}, ours: {ours}", our_seconds, pixels)
     yield from rate_rows(f"{size}, MuJoCo Warp: {theirs}", their_seconds, pixels)

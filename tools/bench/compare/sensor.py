@@ -46,9 +46,7 @@ CHECKED_VIEWS = 6
 
 @dataclass(frozen=True, eq=False)
 class SensorScene:
-    """Newton model of the worlds of a snapshot's first views, and the sensor's inputs: pixel rays in the camera frame, camera-to-world
-    transforms, segmentation id of each shape.
-    """
+    """Newton model of the worlds of a snapshot's first views, and the inputs with which the sensor renders them."""
 
     model: newton.Model
     state: newton.State
@@ -149,7 +147,6 @@ class _Mesh(newton.Mesh):
 
     @property
     def texture_hash(self) -> int:
-        """Identity of the texture, as Newton's sensor asks for it."""
         return id(self.texture)
 
 
@@ -290,7 +287,7 @@ class OurViews:
 
 
 def _comparison_rows(outputs: str, our_extras: str, their_extras: str, times: tuple[float, float], pixels: int) -> Iterator[Row]:
-    """Rows of both renderers' times of a view and their rates, and of the ratio of the times; `times` [s], ours first."""
+    """Rows of the times of a view [s] of `pixels` pixels by ours and theirs, of their rates, and of their ratio."""
     ours, theirs = times
     for name, seconds in ((f"ours: {outputs}{our_extras}", ours), (f"SensorCamera: {outputs}{their_extras}", theirs)):
         yield Row(name, 1e3 * seconds, "ms")

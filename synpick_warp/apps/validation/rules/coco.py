@@ -8,7 +8,7 @@ import numpy as np
 from msgspec import UNSET
 
 from synpick_warp.apps.validation.pictures import Mask
-from synpick_warp.apps.validation.registry import rule
+from synpick_warp.apps.validation.registry import Findings, rule
 from synpick_warp.apps.validation.schemas import Annotation
 from synpick_warp.apps.validation.subjects import CocoFile, SceneSubject, ViewSubject
 from synpick_warp.exporters.writing.rle import find_run_boundaries
@@ -18,30 +18,19 @@ IGNORED_VISIBILITY = 0.1
 """Visible fraction below which the toolkit sets `ignore`."""
 FRACTION_SLACK = 1e-3
 """Distance from that fraction within which either value of `ignore` is right: files are often rounded."""
-_Finding = Iterator[tuple[str, str]]
 
 
-@rule(
-    SceneSubject,
-    "coco-schema",
-    "scene_gt_coco.json has images, annotations and categories with COCO's keys and types.",
-    "make the file again with calc_gt_coco.py",
-)
-def check_schema(scene: SceneSubject) -> _Finding:
-    """Yield COCO files that do not fit the schema."""
+@rule(SceneSubject, "coco-schema", "make the file again with calc_gt_coco.py")
+def check_schema(scene: SceneSubject) -> Findings:
+    """scene_gt_coco.json has images, annotations and categories with COCO's keys and types."""
     for coco in scene.cocos:
         if coco.content is None:
             yield coco.file, coco.fault
 
 
-@rule(
-    SceneSubject,
-    "coco-ids",
-    "Annotation ids are 1, 2, 3, ... in each scene.",
-    "number the annotations from 1 on: pycocotools takes 0 for 'no match'",
-)
-def check_ids(scene: SceneSubject) -> _Finding:
-    """Yield the first annotation of a file whose id is not its place in the list plus 1."""
+@rule(SceneSubject, "coco-ids", "number the annotations from 1 on: pycocotools takes 0 for 'no match'")
+def check_ids(scene: SceneSubject) -> Findings:
+    """Annotation ids are 1, 2, 3, ... in each scene."""
     for coco in scene.cocos:
         ids = [annotation.id for annotation in coco.content.annotations] if coco.content else []
         wrong = next((place for place, number in enumerate(ids) if number != place + 1), None)
@@ -49,14 +38,9 @@ def check_ids(scene: SceneSubject) -> _Finding:
             yield coco.file, f"annotation {wrong} in the list has the id {ids[wrong]}; expected: {wrong + 1}"
 
 
-@rule(
-    SceneSubject,
-    "coco-images",
-    "Its images are those of scene_gt.json, with the names of their files.",
-    "list every image once, file_name relative to the scene's folder",
-)
-def check_images(scene: SceneSubject) -> _Finding:
-    """Yield images that the COCO file lacks or has alone, and those whose file_name is not that of the colour image."""
+@rule(SceneSubject, "coco-images", "list every image once, file_name relative to the scene's folder")
+def check_images(scene: SceneSubject) -> Findings:
+    """Its images are those of scene_gt.json, with the names of their files."""
     kind = scene.colour
     for coco in scene.cocos:
         listed = {image.id: image for image in coco.content.images} if coco.content else {}
@@ -72,14 +56,9 @@ def check_images(scene: SceneSubject) -> _Finding:
                 yield coco.file, f"image {image}: file_name is {listed[image].file_name[:200]!a}, the file is {path}"
 
 
-@rule(
-    SceneSubject,
-    "coco-categories",
-    "category_id is an obj_id, and categories lists it.",
-    "use obj_id as the id of categories, also where ids have gaps",
-)
-def check_categories(scene: SceneSubject) -> _Finding:
-    """Yield category_ids of annotations and obj_ids of instances that are not in `categories`."""
+@rule(SceneSubject, "coco-categories", "use obj_id as the id of categories, also where ids have gaps")
+def check_categories(scene: SceneSubject) -> Findings:
+    """category_id is an obj_id, and categories lists it."""
     for coco in scene.cocos:
         if coco.content is not None:
             known = {category.id for category in coco.content.categories}
@@ -89,14 +68,9 @@ def check_categories(scene: SceneSubject) -> _Finding:
                 yield coco.file, f"obj_id {missing} of {scene.record('gt').file} is not in categories"
 
 
-@rule(
-    ViewSubject,
-    "coco-instances",
-    "There is one annotation for each instance with visible pixels, in the order of scene_gt.json, with its obj_id as category.",
-    "leave out instances whose mask_visib is empty, and no others",
-)
-def check_instances(view: ViewSubject) -> _Finding:
-    """Yield views whose annotations do not have the obj_ids of the visible instances, in their order."""
+@rule(ViewSubject, "coco-instances", "leave out instances whose mask_visib is empty, and no others")
+def check_instances(view: ViewSubject) -> Findings:
+    """There is one annotation for each instance with visible pixels, in the order of scene_gt.json, with its obj_id as category."""
     for coco in view.scene.cocos if _has_masks(view) else ():
         given = [annotation.category_id for annotation in coco.by_image.get(view.image, ())]
         expected = [view.truths[index].obj_id for index, _, _ in _visible(view)]
@@ -107,11 +81,10 @@ def check_instances(view: ViewSubject) -> _Finding:
 @rule(
     ViewSubject,
     "coco-mask",
-    "segmentation is the uncompressed column-major run-length encoding of mask_visib; size is height, width; area counts its pixels.",
     "encode mask_visib column by column, starting with the number of zeros (pass bool, not 0/255, to the toolkit's encoder)",
 )
-def check_masks(view: ViewSubject) -> _Finding:
-    """Yield annotations whose run lengths or area differ from those of the visible mask, or are compressed."""
+def check_masks(view: ViewSubject) -> Findings:
+    """segmentation is the uncompressed column-major run-length encoding of mask_visib; size is height, width; area counts its pixels."""
     for coco, annotation, _, visible, _ in _matched(view):
         place = f"image {view.image}, annotation {annotation.id}"
         runs = annotation.segmentation
@@ -126,14 +99,9 @@ def check_masks(view: ViewSubject) -> _Finding:
             yield coco.file, f"{place}: area is {annotation.area:g}, the mask has {visible.count} pixels"
 
 
-@rule(
-    ViewSubject,
-    "coco-box",
-    "bbox is the tight box of mask, clipped to the image (modal files: of mask_visib), with width x_max - x_min + 1.",
-    "compute the box from the mask with + 1; scene_gt_info.json has none",
-)
-def check_boxes(view: ViewSubject) -> _Finding:
-    """Yield annotations whose bbox is not the box of the mask: of the visible one in the modal file, else of the amodal one."""
+@rule(ViewSubject, "coco-box", "compute the box from the mask with + 1; scene_gt_info.json has none")
+def check_boxes(view: ViewSubject) -> Findings:
+    """bbox is the tight box of mask, clipped to the image (modal files: of mask_visib), with width x_max - x_min + 1."""
     for coco, annotation, amodal, visible, _ in _matched(view):
         mask = visible if coco.modal else amodal
         if mask is not None and mask.box is not None and annotation.bbox != list(mask.box):
@@ -145,14 +113,9 @@ def check_boxes(view: ViewSubject) -> _Finding:
             )
 
 
-@rule(
-    ViewSubject,
-    "coco-ignore",
-    "ignore is true exactly where visib_fract is below 0.1.",
-    "set ignore by visib_fract",
-)
-def check_ignore(view: ViewSubject) -> _Finding:
-    """Yield annotations whose `ignore` is not (visib_fract below IGNORED_VISIBILITY); fractions close to it are left out."""
+@rule(ViewSubject, "coco-ignore", "set ignore by visib_fract")
+def check_ignore(view: ViewSubject) -> Findings:
+    """ignore is true exactly where visib_fract is below 0.1."""
     for coco, annotation, _, _, index in _matched(view):
         fraction = view.infos[index].visib_fract if view.infos else IGNORED_VISIBILITY
         clear = annotation.ignore is not UNSET and abs(fraction - IGNORED_VISIBILITY) > FRACTION_SLACK

@@ -2,38 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-
 import numpy as np
 
-from synpick_warp.apps.validation.registry import Level, rule
+from synpick_warp.apps.validation.registry import Findings, Level, rule
 from synpick_warp.apps.validation.subjects import ViewSubject
 
 MIN_KNOWN_DEPTH = 0.05
 """Smallest fraction of pixels with depth that raises no warning; the poorest sensors of BOP's sets have half."""
-_Finding = Iterator[tuple[str, str]]
 
 
-@rule(
-    ViewSubject,
-    "image-decodes",
-    "Every image is a PNG, JPEG or TIFF file that decodes.",
-    "restore the file: it is damaged, empty or of another format",
-)
-def check_decodes(view: ViewSubject) -> _Finding:
-    """Yield colour, depth and mask files that cannot be decoded."""
+@rule(ViewSubject, "image-decodes", "restore the file: it is damaged, empty or of another format")
+def check_decodes(view: ViewSubject) -> Findings:
+    """Every image is a PNG, JPEG or TIFF file that decodes."""
     _ = view.colour, view.depth, view.masks
     yield from dict.fromkeys(view.faults)
 
 
-@rule(
-    ViewSubject,
-    "image-size",
-    "Colour, depth and masks of an image have the same width and height.",
-    "write them at the resolution of the camera",
-)
-def check_sizes(view: ViewSubject) -> _Finding:
-    """Yield masks and depth images that have another size than the colour image."""
+@rule(ViewSubject, "image-size", "write them at the resolution of the camera")
+def check_sizes(view: ViewSubject) -> Findings:
+    """Colour, depth and masks of an image have the same width and height."""
     if view.size is None:
         return
     sizes = [(mask.file, mask.size) for masks in view.masks.values() for mask in masks if mask is not None]
@@ -44,14 +31,9 @@ def check_sizes(view: ViewSubject) -> _Finding:
             yield file, f"{size[0]} x {size[1]} px; the image has {view.size[0]} x {view.size[1]}"
 
 
-@rule(
-    ViewSubject,
-    "colour-type",
-    "rgb has three channels of 8 bits, gray one of 8 or 16 bits.",
-    "convert the image; put greyscale images into gray",
-)
-def check_colour(view: ViewSubject) -> _Finding:
-    """Yield a colour image that is not 3 x 8 bits, or a grey one that is not grey of 8 or 16 bits."""
+@rule(ViewSubject, "colour-type", "convert the image; put greyscale images into gray")
+def check_colour(view: ViewSubject) -> Findings:
+    """rgb has three channels of 8 bits, gray one of 8 or 16 bits."""
     if view.colour is None:
         return
     file, image = view.colour
@@ -63,14 +45,9 @@ def check_colour(view: ViewSubject) -> _Finding:
     yield file, f"{(*image.shape[2:], 1)[0]} channels of type {image.dtype}"
 
 
-@rule(
-    ViewSubject,
-    "depth-type",
-    "Depth is a PNG (or TIFF) file of one channel with 16 bits.",
-    "write uint16 counts, clamped to 65535; 0 is no measurement",
-)
-def check_depth_type(view: ViewSubject) -> _Finding:
-    """Yield a depth image that is not of one channel of 16 bits."""
+@rule(ViewSubject, "depth-type", "write uint16 counts, clamped to 65535; 0 is no measurement")
+def check_depth_type(view: ViewSubject) -> Findings:
+    """Depth is a PNG (or TIFF) file of one channel with 16 bits."""
     if view.depth_file is None:
         return
     file, image, kind = view.depth_file
@@ -79,15 +56,9 @@ def check_depth_type(view: ViewSubject) -> _Finding:
         yield file, f"{(*image.shape[2:], 1)[0]} channels, {bits}"
 
 
-@rule(
-    ViewSubject,
-    "depth-known",
-    "A depth image has measurements.",
-    "check the writer, and depth_scale: counts above 65535 do not fit",
-    level=Level.WARNING,
-)
-def check_depth_known(view: ViewSubject) -> _Finding:
-    """Yield a depth image in which fewer than MIN_KNOWN_DEPTH of the pixels have depth."""
+@rule(ViewSubject, "depth-known", "check the writer, and depth_scale: counts above 65535 do not fit", level=Level.WARNING)
+def check_depth_known(view: ViewSubject) -> Findings:
+    """A depth image has measurements."""
     if view.depth is not None and view.depth_file is not None:
         known = np.count_nonzero(view.depth) / view.depth.size
         if known < MIN_KNOWN_DEPTH:

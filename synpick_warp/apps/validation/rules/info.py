@@ -4,24 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from synpick_warp.apps.validation.registry import rule
+from synpick_warp.apps.validation.registry import Findings, rule
 from synpick_warp.apps.validation.schemas import Info
 from synpick_warp.apps.validation.subjects import SceneSubject
 
 FRACTION_TOLERANCE = 1e-3
 """Largest error of visib_fract; files are often rounded."""
 EMPTY = [-1, -1, -1, -1]
-_Finding = Iterator[tuple[str, str]]
 
 
-@rule(
-    SceneSubject,
-    "list-lengths",
-    "scene_gt_info.json has as many entries for an image as scene_gt.json, in the same order.",
-    "make scene_gt_info.json again from scene_gt.json (calc_gt_info.py)",
-)
-def check_lengths(scene: SceneSubject) -> _Finding:
-    """Yield images that have another number of infos than of instances."""
+@rule(SceneSubject, "list-lengths", "make scene_gt_info.json again from scene_gt.json (calc_gt_info.py)")
+def check_lengths(scene: SceneSubject) -> Findings:
+    """scene_gt_info.json has as many entries for an image as scene_gt.json, in the same order."""
     record = scene.record("gt_info")
     for image, infos in scene.infos.items():
         truths = scene.truths.get(image)
@@ -29,42 +23,27 @@ def check_lengths(scene: SceneSubject) -> _Finding:
             yield record.where(image), f"image {image} has {len(infos)} infos, but {len(truths)} instances"
 
 
-@rule(
-    SceneSubject,
-    "visible-fraction",
-    "visib_fract is px_count_visib / px_count_all, or 0 if px_count_all is 0.",
-    "compute it from the two counts",
-)
-def check_fraction(scene: SceneSubject) -> _Finding:
-    """Yield infos whose visib_fract is not px_count_visib / px_count_all (0 for none)."""
+@rule(SceneSubject, "visible-fraction", "compute it from the two counts")
+def check_fraction(scene: SceneSubject) -> Findings:
+    """visib_fract is px_count_visib / px_count_all, or 0 if px_count_all is 0."""
     for file, place, info in _infos(scene):
         expected = info.px_count_visib / info.px_count_all if info.px_count_all else 0.0
         if abs(info.visib_fract - expected) > FRACTION_TOLERANCE:
             yield file, f"{place}: visib_fract is {info.visib_fract:.4g}, but the counts give {expected:.4g}"
 
 
-@rule(
-    SceneSubject,
-    "count-order",
-    "px_count_visib and px_count_valid are at most px_count_all, which includes the silhouette beyond the image.",
-    "count px_count_all over the whole silhouette, up to one image size beyond each border",
-)
-def check_order(scene: SceneSubject) -> _Finding:
-    """Yield infos whose px_count_visib or px_count_valid exceeds px_count_all."""
+@rule(SceneSubject, "count-order", "count px_count_all over the whole silhouette, up to one image size beyond each border")
+def check_order(scene: SceneSubject) -> Findings:
+    """px_count_visib and px_count_valid are at most px_count_all, which includes the silhouette beyond the image."""
     for file, place, info in _infos(scene):
         for name in ("px_count_visib", "px_count_valid"):
             if getattr(info, name) > info.px_count_all:
                 yield file, f"{place}: {name} is {getattr(info, name)}, more than px_count_all, {info.px_count_all}"
 
 
-@rule(
-    SceneSubject,
-    "hidden-boxes",
-    "bbox_obj and bbox_visib are -1, -1, -1, -1 if px_count_visib is 0, and only then.",
-    "write four times -1 for instances of which no pixel is visible, and boxes for all others",
-)
-def check_hidden_boxes(scene: SceneSubject) -> _Finding:
-    """Yield infos with a box although no pixel is visible, without one although some are, or with a box of negative size."""
+@rule(SceneSubject, "hidden-boxes", "write four times -1 for instances of which no pixel is visible, and boxes for all others")
+def check_hidden_boxes(scene: SceneSubject) -> Findings:
+    """bbox_obj and bbox_visib are -1, -1, -1, -1 if px_count_visib is 0, and only then."""
     for file, place, info in _infos(scene):
         for name in ("bbox_obj", "bbox_visib"):
             box = getattr(info, name)
@@ -74,14 +53,9 @@ def check_hidden_boxes(scene: SceneSubject) -> _Finding:
                 yield file, f"{place}: {name} is {box}; its size is negative"
 
 
-@rule(
-    SceneSubject,
-    "box-inside-box",
-    "bbox_visib lies inside bbox_obj.",
-    "compute both from the masks: x_min, y_min, x_max - x_min, y_max - y_min",
-)
-def check_nested_boxes(scene: SceneSubject) -> _Finding:
-    """Yield infos whose bbox_visib reaches out of bbox_obj."""
+@rule(SceneSubject, "box-inside-box", "compute both from the masks: x_min, y_min, x_max - x_min, y_max - y_min")
+def check_nested_boxes(scene: SceneSubject) -> Findings:
+    """bbox_visib lies inside bbox_obj."""
     for file, place, info in _infos(scene):
         outer, inner = info.bbox_obj, info.bbox_visib
         if EMPTY in (outer, inner):

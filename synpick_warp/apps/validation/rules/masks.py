@@ -7,14 +7,13 @@ from collections.abc import Iterator
 import numpy as np
 
 from synpick_warp.apps.validation.pictures import Mask
-from synpick_warp.apps.validation.registry import rule
+from synpick_warp.apps.validation.registry import Findings, rule
 from synpick_warp.apps.validation.rules.info import EMPTY
 from synpick_warp.apps.validation.schemas import Info
 from synpick_warp.apps.validation.subjects import ViewSubject
 
 COUNT_SLACK, COUNT_FRACTION = 2, 1e-3
 """Largest difference of a count from the mask's: pixels, or a fraction of them (the acceptance bound of reference renderers)."""
-_Finding = Iterator[tuple[str, str]]
 
 
 def _all_masks(view: ViewSubject, kind: str) -> Iterator[tuple[int, Mask]]:
@@ -35,14 +34,9 @@ def _file(view: ViewSubject) -> str:
     return view.scene.record("gt_info").where(view.image)
 
 
-@rule(
-    ViewSubject,
-    "mask-type",
-    "Masks are 8-bit greyscale images of 0 and 255 alone.",
-    "write uint8 masks of one channel, 255 where the instance is",
-)
-def check_type(view: ViewSubject) -> _Finding:
-    """Yield masks that are not greyscale of 8 bits, or have values besides 0 and 255."""
+@rule(ViewSubject, "mask-type", "write uint8 masks of one channel, 255 where the instance is")
+def check_type(view: ViewSubject) -> Findings:
+    """Masks are 8-bit greyscale images of 0 and 255 alone."""
     for masks in view.masks.values():
         for mask in masks:
             if mask is not None and mask.kind not in (None, (8, "greyscale")):
@@ -51,14 +45,9 @@ def check_type(view: ViewSubject) -> _Finding:
                 yield mask.file, "values besides 0 and 255"
 
 
-@rule(
-    ViewSubject,
-    "mask-inside-mask",
-    "mask_visib is a part of mask.",
-    "cut mask_visib from mask; check that both have the same index",
-)
-def check_inside(view: ViewSubject) -> _Finding:
-    """Yield visible masks with pixels outside of the amodal mask."""
+@rule(ViewSubject, "mask-inside-mask", "cut mask_visib from mask; check that both have the same index")
+def check_inside(view: ViewSubject) -> Findings:
+    """mask_visib is a part of mask."""
     amodal = dict(_all_masks(view, "mask"))
     for index, visible in _all_masks(view, "mask_visib"):
         if index in amodal and visible.box is not None:
@@ -67,14 +56,9 @@ def check_inside(view: ViewSubject) -> _Finding:
                 yield visible.file, f"{outside} of {visible.count} visible pixels are outside of the silhouette in mask"
 
 
-@rule(
-    ViewSubject,
-    "mask-overlap",
-    "Visible masks of an image do not overlap. Checked where masks are exact: the toolkit's, made from depth with a tolerance, do.",
-    "give each pixel to the nearest instance",
-)
-def check_overlap(view: ViewSubject) -> _Finding:
-    """Yield visible masks that share pixels with that of an earlier instance; only in data sets of this program."""
+@rule(ViewSubject, "mask-overlap", "give each pixel to the nearest instance")
+def check_overlap(view: ViewSubject) -> Findings:
+    """Visible masks of an image do not overlap. Checked where masks are exact: the toolkit's, made from depth with a tolerance, do."""
     if not view.scene.layout.ours or view.size is None:
         return
     taken = np.zeros((view.size[1], view.size[0]), bool)
@@ -88,14 +72,9 @@ def check_overlap(view: ViewSubject) -> _Finding:
             part |= mask.crop
 
 
-@rule(
-    ViewSubject,
-    "visible-count",
-    "px_count_visib is the number of pixels of mask_visib.",
-    "count the mask's pixels",
-)
-def check_visible_count(view: ViewSubject) -> _Finding:
-    """Yield instances whose px_count_visib differs from the count of the visible mask."""
+@rule(ViewSubject, "visible-count", "count the mask's pixels")
+def check_visible_count(view: ViewSubject) -> Findings:
+    """px_count_visib is the number of pixels of mask_visib."""
     for index, mask, info in _pairs(view, "mask_visib"):
         if _differ(info.px_count_visib, mask.count):
             yield (
@@ -104,14 +83,9 @@ def check_visible_count(view: ViewSubject) -> _Finding:
             )
 
 
-@rule(
-    ViewSubject,
-    "valid-count",
-    "px_count_valid is the number of pixels of mask that have depth.",
-    "count the pixels of mask whose depth is not 0",
-)
-def check_valid_count(view: ViewSubject) -> _Finding:
-    """Yield instances whose px_count_valid differs from the count of amodal mask pixels with depth."""
+@rule(ViewSubject, "valid-count", "count the pixels of mask whose depth is not 0")
+def check_valid_count(view: ViewSubject) -> Findings:
+    """px_count_valid is the number of pixels of mask that have depth."""
     depth = view.depth
     if depth is None or depth.shape[::-1] != view.size:
         return
@@ -127,41 +101,26 @@ def check_valid_count(view: ViewSubject) -> _Finding:
             )
 
 
-@rule(
-    ViewSubject,
-    "amodal-count",
-    "px_count_all is the number of pixels of mask, or more if the silhouette touches the image's border.",
-    "count the silhouette in the image and up to one image size beyond each border",
-)
-def check_amodal_count(view: ViewSubject) -> _Finding:
-    """Yield instances whose px_count_all differs from the count of the amodal mask, or is below it where the image cuts the mask."""
+@rule(ViewSubject, "amodal-count", "count the silhouette in the image and up to one image size beyond each border")
+def check_amodal_count(view: ViewSubject) -> Findings:
+    """px_count_all is the number of pixels of mask, or more if the silhouette touches the image's border."""
     for index, mask, info in _pairs(view, "mask"):
         inside = not _touched_sides(mask)
         if (inside and _differ(info.px_count_all, mask.count)) or info.px_count_all + COUNT_SLACK < mask.count * (1.0 - COUNT_FRACTION):
             yield _file(view), f"image {view.image}, instance {index}: px_count_all is {info.px_count_all}, {mask.file} has {mask.count}"
 
 
-@rule(
-    ViewSubject,
-    "visible-box",
-    "bbox_visib is the tight box of mask_visib: x_min, y_min, x_max - x_min, y_max - y_min, without + 1.",
-    "compute the box from the mask; COCO's boxes have + 1, these do not",
-)
-def check_visible_box(view: ViewSubject) -> _Finding:
-    """Yield instances whose bbox_visib is not the box of the visible mask."""
+@rule(ViewSubject, "visible-box", "compute the box from the mask; COCO's boxes have + 1, these do not")
+def check_visible_box(view: ViewSubject) -> Findings:
+    """bbox_visib is the tight box of mask_visib: x_min, y_min, x_max - x_min, y_max - y_min, without + 1."""
     for index, mask, info in _pairs(view, "mask_visib"):
         if mask.box is not None and info.bbox_visib != EMPTY and info.bbox_visib != bop_box(mask.box):
             yield _file(view), f"image {view.image}, instance {index}: bbox_visib is {_describe(info.bbox_visib, mask.box)}"
 
 
-@rule(
-    ViewSubject,
-    "amodal-box",
-    "bbox_obj is the tight box of the whole silhouette, without + 1; beyond the image where the silhouette is.",
-    "compute the box from the whole silhouette; COCO's boxes have + 1, these do not",
-)
-def check_amodal_box(view: ViewSubject) -> _Finding:
-    """Yield instances whose bbox_obj is not the box of the amodal mask; sides at the image border may lie outside."""
+@rule(ViewSubject, "amodal-box", "compute the box from the whole silhouette; COCO's boxes have + 1, these do not")
+def check_amodal_box(view: ViewSubject) -> Findings:
+    """bbox_obj is the tight box of the whole silhouette, without + 1; beyond the image where the silhouette is."""
     for index, mask, info in _pairs(view, "mask"):
         if mask.box is None or info.bbox_obj == EMPTY:
             continue

@@ -6,10 +6,12 @@ from collections.abc import Iterator
 
 import numpy as np
 from scipy.spatial import KDTree
+from trimesh.transformations import rotation_matrix
 
-from synpick_warp.apps.validation.model_files import ModelsFolder, ModelSubject, diameter, sample_area, turn_about
-from synpick_warp.apps.validation.registry import Level, rule
+from synpick_warp.apps.validation.model_files import ModelsFolder, ModelSubject, diameter, sample_area
+from synpick_warp.apps.validation.registry import Findings, Level, rule
 from synpick_warp.dataset.bop.layout import MODEL_FILE
+from synpick_warp.scenes.assets.models_info import ROTATION_TOLERANCE, is_rigid
 
 LENGTH_TOLERANCE = 1e-3
 """Largest error of diameter, minimum and size, as a fraction of the diameter; published values have 0.1 % of a small object."""
@@ -22,21 +24,14 @@ ANGLES = (0.7, 1.9, 3.3)
 """Angles by which continuous symmetries are tried [rad]."""
 TINY = 3.0
 """Diameter of a model that looks like metres [mm]: BOP's smallest object has 24 mm, and 3 m is larger than any."""
-RIGID_TOLERANCE = 1e-3
 _NUMBERS = {"float", "double", "int", "uint", "uchar"}
 """Types that the toolkit's reader knows in binary files."""
 _VERTEX = {"x", "y", "z", "nx", "ny", "nz", "red", "green", "blue", "alpha", "texture_u", "texture_v"}
-_Finding = Iterator[tuple[str, str]]
 
 
-@rule(
-    ModelsFolder,
-    "model-files",
-    "A models folder has models obj_NNNNNN.ply, and models_info.json has an entry for each of them and for no others.",
-    "name models by obj_id with six digits; calc_model_info.py makes models_info.json",
-)
-def check_files(folder: ModelsFolder) -> _Finding:
-    """Yield models of another name than obj_NNNNNN.ply, links out of the data set, and entries of models_info.json without a model."""
+@rule(ModelsFolder, "model-files", "name models by obj_id with six digits; calc_model_info.py makes models_info.json")
+def check_files(folder: ModelsFolder) -> Findings:
+    """A models folder has models obj_NNNNNN.ply, and models_info.json has an entry for each of them and for no others."""
     for name in sorted(folder.listing.files):
         if name.lower().endswith(".ply") and not MODEL_FILE.fullmatch(name):
             yield folder.listing.name(name), "a model whose name is not obj_NNNNNN.ply"
@@ -52,11 +47,10 @@ def check_files(folder: ModelsFolder) -> _Finding:
 @rule(
     ModelSubject,
     "model-dialect",
-    "PLY files are ascii or binary_little_endian, of triangles, with the property names and types that the toolkit's reader knows.",
     "export with float, double, int, uint, uchar and vertex_indices; texture_u, texture_v for texture coordinates",
 )
-def check_dialect(model: ModelSubject) -> _Finding:
-    """Yield headers of PLY files that `inout.load_ply` of BOP's toolkit would not read, or read wrongly."""
+def check_dialect(model: ModelSubject) -> Findings:
+    """PLY files are ascii or binary_little_endian, of triangles, with the property names and types that the toolkit's reader knows."""
     element = ""
     for line in model.header:
         words = line.split()
@@ -75,50 +69,30 @@ def check_dialect(model: ModelSubject) -> _Finding:
                 yield model.place, f"face property {name[:40]!a}; expected: vertex_indices"
 
 
-@rule(
-    ModelSubject,
-    "model-mesh",
-    "A model can be read: triangles whose vertices exist, finite numbers, and its texture is there.",
-    "repair or restore the mesh",
-)
-def check_mesh(model: ModelSubject) -> _Finding:
-    """Yield models whose geometry or texture cannot be read."""
+@rule(ModelSubject, "model-mesh", "repair or restore the mesh")
+def check_mesh(model: ModelSubject) -> Findings:
+    """A model can be read: triangles whose vertices exist, finite numbers, and its texture is there."""
     if model.mesh[0] is None:
         yield model.place, model.mesh[1]
 
 
-@rule(
-    ModelSubject,
-    "model-units",
-    "Models are in millimetres.",
-    "multiply the vertices by 1000 if they are in metres",
-)
-def check_units(model: ModelSubject) -> _Finding:
-    """Yield models whose diameter is below TINY [mm]: they are probably in metres."""
+@rule(ModelSubject, "model-units", "multiply the vertices by 1000 if they are in metres")
+def check_units(model: ModelSubject) -> Findings:
+    """Models are in millimetres."""
     if model.vertices is not None and (size := diameter(model.vertices)) < TINY:
         yield model.place, f"the diameter is {size:.3g} mm; it looks like metres"
 
 
-@rule(
-    ModelSubject,
-    "model-entry",
-    "An entry of models_info.json has diameter, min_x to min_z, size_x to size_z, and symmetries as 16 numbers, or axis and offset.",
-    "make it again with calc_model_info.py, and add the symmetries by hand",
-)
-def check_entry(model: ModelSubject) -> _Finding:
-    """Yield entries of models_info.json that do not fit the schema."""
+@rule(ModelSubject, "model-entry", "make it again with calc_model_info.py, and add the symmetries by hand")
+def check_entry(model: ModelSubject) -> Findings:
+    """An entry of models_info.json has diameter, min_x to min_z, size_x to size_z, and symmetries as 16 numbers, or axis and offset."""
     if model.entry[1]:
         yield model.info_file, f"object {model.obj_id}: {model.entry[1]}"
 
 
-@rule(
-    ModelSubject,
-    "model-diameter",
-    "diameter is the largest distance between two vertices [mm].",
-    "compute it from the model's vertices (calc_model_info.py)",
-)
-def check_diameter(model: ModelSubject) -> _Finding:
-    """Yield entries whose diameter is not that of the mesh."""
+@rule(ModelSubject, "model-diameter", "compute it from the model's vertices (calc_model_info.py)")
+def check_diameter(model: ModelSubject) -> Findings:
+    """diameter is the largest distance between two vertices [mm]."""
     entry = model.entry[0]
     if entry is not None and model.vertices is not None:
         expected = diameter(model.vertices)
@@ -127,14 +101,9 @@ def check_diameter(model: ModelSubject) -> _Finding:
             yield model.info_file, f"object {model.obj_id}: diameter is {entry.diameter:g} mm, that of the mesh {expected:.6g}{hint}"
 
 
-@rule(
-    ModelSubject,
-    "model-box",
-    "min_x, min_y, min_z and size_x, size_y, size_z are the bounding box of the vertices [mm].",
-    "compute them from the model's vertices (calc_model_info.py)",
-)
-def check_box(model: ModelSubject) -> _Finding:
-    """Yield entries whose min_x .. size_z are not those of the mesh's bounding box."""
+@rule(ModelSubject, "model-box", "compute them from the model's vertices (calc_model_info.py)")
+def check_box(model: ModelSubject) -> Findings:
+    """min_x, min_y, min_z and size_x, size_y, size_z are the bounding box of the vertices [mm]."""
     entry = model.entry[0]
     if entry is None or model.vertices is None:
         return
@@ -150,12 +119,11 @@ def check_box(model: ModelSubject) -> _Finding:
 @rule(
     ModelSubject,
     "model-origin",
-    "The origin of a model is the centre of its bounding box.",
     "move the mesh, and all poses with it; tools that crop by the origin and the diameter expect it",
     level=Level.WARNING,
 )
-def check_origin(model: ModelSubject) -> _Finding:
-    """Yield models whose bounding box is centred further from the origin than a tenth of its diagonal."""
+def check_origin(model: ModelSubject) -> Findings:
+    """The origin of a model is the centre of its bounding box."""
     if model.vertices is not None:
         center = (model.vertices.min(axis=0) + model.vertices.max(axis=0)) / 2.0
         off, size = float(np.linalg.norm(center)), float(np.linalg.norm(np.ptp(model.vertices, axis=0)))
@@ -163,29 +131,19 @@ def check_origin(model: ModelSubject) -> _Finding:
             yield model.place, f"the box's centre is {off:.4g} mm from the origin"
 
 
-@rule(
-    ModelSubject,
-    "symmetry-identity",
-    "symmetries_discrete does not list the identity: the toolkit adds it.",
-    "remove the identity",
-)
-def check_identity(model: ModelSubject) -> _Finding:
-    """Yield discrete symmetries that are the identity."""
+@rule(ModelSubject, "symmetry-identity", "remove the identity")
+def check_identity(model: ModelSubject) -> Findings:
+    """symmetries_discrete does not list the identity: the toolkit adds it."""
     for index, matrix in _discrete(model):
-        if np.abs(matrix - np.eye(4)).max() <= RIGID_TOLERANCE:
+        if np.abs(matrix - np.eye(4)).max() <= ROTATION_TOLERANCE:
             yield model.info_file, f"object {model.obj_id}: symmetries_discrete[{index}] is the identity"
 
 
-@rule(
-    ModelSubject,
-    "symmetry-rigid",
-    "Symmetries are rigid: a rotation and a translation [mm], row by row; axes are not 0.",
-    "write a proper 4 x 4 matrix; mirror images are no symmetries",
-)
-def check_rigid(model: ModelSubject) -> _Finding:
-    """Yield discrete symmetries that are no rigid transform, and continuous ones whose axis is 0."""
+@rule(ModelSubject, "symmetry-rigid", "write a proper 4 x 4 matrix; mirror images are no symmetries")
+def check_rigid(model: ModelSubject) -> Findings:
+    """Symmetries are rigid: a rotation and a translation [mm], row by row; axes are not 0."""
     for index, matrix in _discrete(model):
-        if not _is_rigid(matrix):
+        if not is_rigid(matrix):
             hint = "; it looks column by column" if np.abs(matrix[3, :3]).max() > 0.0 and not matrix[:3, 3].any() else ""
             yield model.info_file, f"object {model.obj_id}: symmetries_discrete[{index}] is not rigid{hint}"
     for index, (axis, _) in _continuous(model):
@@ -193,18 +151,13 @@ def check_rigid(model: ModelSubject) -> _Finding:
             yield model.info_file, f"object {model.obj_id}: symmetries_continuous[{index}].axis is 0"
 
 
-@rule(
-    ModelSubject,
-    "symmetry-maps",
-    "Symmetries map the model onto itself: no point moves away from the surface by more than 15 mm and a tenth of the diameter.",
-    "remove the symmetry, or correct its axis, offset or translation",
-)
-def check_symmetries(model: ModelSubject) -> _Finding:
-    """Yield symmetries that move points of the surface away from it, by more than the bound."""
-    transforms = [(f"symmetries_discrete[{index}]", matrix) for index, matrix in _discrete(model) if _is_rigid(matrix)]
+@rule(ModelSubject, "symmetry-maps", "remove the symmetry, or correct its axis, offset or translation")
+def check_symmetries(model: ModelSubject) -> Findings:
+    """Symmetries map the model onto itself: no point moves away from the surface by more than 15 mm and a tenth of the diameter."""
+    transforms = [(f"symmetries_discrete[{index}]", matrix) for index, matrix in _discrete(model) if is_rigid(matrix)]
     for index, (axis, offset) in _continuous(model):
         if np.linalg.norm(axis) > 0.0:
-            transforms += [(f"symmetries_continuous[{index}]", turn_about(axis, offset, angle)) for angle in ANGLES]
+            transforms += [(f"symmetries_continuous[{index}]", rotation_matrix(angle, axis, offset)) for angle in ANGLES]
     mesh = model.mesh[0]
     if not transforms or mesh is None:
         return
@@ -218,13 +171,6 @@ def check_symmetries(model: ModelSubject) -> _Finding:
     for name, distance in farthest.items():
         if distance > bound:
             yield model.info_file, f"object {model.obj_id}: {name} moves a point {distance:.3g} mm off the surface; allowed: {bound:.3g} mm"
-
-
-def _is_rigid(matrix: np.ndarray) -> bool:
-    """Whether a 4 x 4 matrix is a rotation and translation, with determinant +1."""
-    rotation = matrix[:3, :3]
-    off = max(np.abs(rotation @ rotation.T - np.eye(3)).max(), np.abs(matrix[3] - (0, 0, 0, 1)).max(), abs(np.linalg.det(rotation) - 1.0))
-    return bool(off <= RIGID_TOLERANCE)
 
 
 def _discrete(model: ModelSubject) -> Iterator[tuple[int, np.ndarray]]:

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
 
 import numpy as np
 from msgspec import UNSET
 
-from synpick_warp.apps.validation.registry import Level, rule
+from synpick_warp.apps.validation.registry import Findings, Level, rule
 from synpick_warp.apps.validation.subjects import SceneSubject
 
 ROTATION_TOLERANCE = 1e-3
@@ -17,44 +16,28 @@ NEAR = 20.0
 """Largest distance that is taken for metres [mm]: no camera of a data set is this close to an object, and few are 20 m away."""
 MAX_DEPTH_SCALE = 100.0
 """Largest depth_scale [mm]; BOP's sets have 0.1 to 1."""
-_Finding = Iterator[tuple[str, str]]
 _KEY = re.compile(r"-?[0-9]+")
 
 
-@rule(
-    SceneSubject,
-    "json-schema",
-    "scene_camera.json, scene_gt.json and scene_gt_info.json are JSON objects by image, with BOP's keys and types.",
-    "write the file again in BOP's format: lists of numbers, matrices row by row",
-)
-def check_schema(scene: SceneSubject) -> _Finding:
-    """Yield files and entries that lack one of BOP's keys or have a value of another type or length."""
+@rule(SceneSubject, "json-schema", "write the file again in BOP's format: lists of numbers, matrices row by row")
+def check_schema(scene: SceneSubject) -> Findings:
+    """scene_camera.json, scene_gt.json and scene_gt_info.json are JSON objects by image, with BOP's keys and types."""
     for name in ("camera", "gt", "gt_info"):
         yield from scene.record(name).faults
 
 
-@rule(
-    SceneSubject,
-    "json-keys",
-    'Images are plain decimal integers as keys ("0", "17"), without leading zeros.',
-    "write the key without leading zeros or other characters",
-)
-def check_keys(scene: SceneSubject) -> _Finding:
-    """Yield keys of the annotation files that are not plain decimal integers."""
+@rule(SceneSubject, "json-keys", "write the key without leading zeros or other characters")
+def check_keys(scene: SceneSubject) -> Findings:
+    """Images are plain decimal integers as keys ("0", "17"), without leading zeros."""
     for name in ("camera", "gt", "gt_info"):
         for key in scene.record(name).keys:
             shown = key if len(key) <= 40 else f"{key[:39]}…"
             yield scene.record(name).file, f'key "{shown}"' + (" has leading zeros or a sign" if _KEY.fullmatch(key) else " is no index")
 
 
-@rule(
-    SceneSubject,
-    "same-images",
-    "scene_camera.json, scene_gt.json and scene_gt_info.json have the same images.",
-    "add the missing entry: an empty list for an image without instances",
-)
-def check_same_images(scene: SceneSubject) -> _Finding:
-    """Yield images that one of the three annotation files has and another lacks."""
+@rule(SceneSubject, "same-images", "add the missing entry: an empty list for an image without instances")
+def check_same_images(scene: SceneSubject) -> Findings:
+    """scene_camera.json, scene_gt.json and scene_gt_info.json have the same images."""
     camera = scene.record("camera")
     for name in ("gt", "gt_info"):
         record = scene.record(name)
@@ -68,11 +51,10 @@ def check_same_images(scene: SceneSubject) -> _Finding:
 @rule(
     SceneSubject,
     "rotation",
-    "Rotations (cam_R_m2c, cam_R_w2c) are orthonormal with determinant +1.",
     "write a proper rotation, row by row; a determinant of -1 is a mirrored axis, other matrices are scaled or cut short",
 )
-def check_rotations(scene: SceneSubject) -> _Finding:
-    """Yield rotations of cameras and instances that are not orthonormal with determinant +1."""
+def check_rotations(scene: SceneSubject) -> Findings:
+    """Rotations (cam_R_m2c, cam_R_w2c) are orthonormal with determinant +1."""
     camera, truth = scene.record("camera"), scene.record("gt")
     places, matrices = [], []
     for image, entry in scene.cameras.items():
@@ -93,14 +75,9 @@ def check_rotations(scene: SceneSubject) -> _Finding:
         yield file, f"{place} is no rotation: its determinant is {determinant[row]:.4g}, R Rᵀ differs from 1 by up to {off[row]:.2g}"
 
 
-@rule(
-    SceneSubject,
-    "camera-model",
-    "An image has either cam_K, with focal lengths above 0 and 0 0 1 as its last row, or cam_model; never both.",
-    "keep one of the two; cam_K is fx s cx 0 fy cy 0 0 1 in pixels",
-)
-def check_camera_model(scene: SceneSubject) -> _Finding:
-    """Yield images that have neither or both of cam_K and cam_model, or a cam_K that is no intrinsic matrix."""
+@rule(SceneSubject, "camera-model", "keep one of the two; cam_K is fx s cx 0 fy cy 0 0 1 in pixels")
+def check_camera_model(scene: SceneSubject) -> Findings:
+    """An image has either cam_K, with focal lengths above 0 and 0 0 1 as its last row, or cam_model; never both."""
     record = scene.record("camera")
     for image, entry in scene.cameras.items():
         has_matrix, has_model = entry.cam_K is not UNSET, entry.cam_model is not UNSET
@@ -116,14 +93,9 @@ def check_camera_model(scene: SceneSubject) -> _Finding:
             yield record.where(image), f"image {image}: cam_K is no intrinsic matrix{hint}"
 
 
-@rule(
-    SceneSubject,
-    "depth-scale",
-    "scene_camera.json has a depth_scale above 0 for every image with depth: millimetres per count.",
-    "add depth_scale: the toolkit's calc_gt_info.py, calc_gt_masks.py and VSD read it",
-)
-def check_depth_scale(scene: SceneSubject) -> _Finding:
-    """Yield images of a scene with depth whose depth_scale is missing, not above 0, or above MAX_DEPTH_SCALE."""
+@rule(SceneSubject, "depth-scale", "add depth_scale: the toolkit's calc_gt_info.py, calc_gt_masks.py and VSD read it")
+def check_depth_scale(scene: SceneSubject) -> Findings:
+    """scene_camera.json has a depth_scale above 0 for every image with depth: millimetres per count."""
     record = scene.record("camera")
     for image, entry in scene.cameras.items() if "depth" in scene.files.kinds else ():
         if entry.depth_scale is UNSET:
@@ -132,14 +104,9 @@ def check_depth_scale(scene: SceneSubject) -> _Finding:
             yield record.where(image), f"image {image}: depth_scale is {entry.depth_scale:g}; expected: above 0, up to {MAX_DEPTH_SCALE:g}"
 
 
-@rule(
-    SceneSubject,
-    "skip-translation",
-    "No instance has the translation -1, -1, -1, which the toolkit takes for 'fully occluded, skip'.",
-    "write the pose, also of hidden instances, or leave the instance out",
-)
-def check_skip_translation(scene: SceneSubject) -> _Finding:
-    """Yield instances with the translation (-1, -1, -1)."""
+@rule(SceneSubject, "skip-translation", "write the pose, also of hidden instances, or leave the instance out")
+def check_skip_translation(scene: SceneSubject) -> Findings:
+    """No instance has the translation -1, -1, -1, which the toolkit takes for 'fully occluded, skip'."""
     record = scene.record("gt")
     for image, entries in scene.truths.items():
         for index, item in enumerate(entries):
@@ -147,14 +114,9 @@ def check_skip_translation(scene: SceneSubject) -> _Finding:
                 yield record.where(image), f"image {image}, instance {index}: cam_t_m2c is -1, -1, -1"
 
 
-@rule(
-    SceneSubject,
-    "translation-units",
-    "Translations of instances are in millimetres.",
-    "multiply cam_t_m2c by 1000 if it is in metres",
-)
-def check_units(scene: SceneSubject) -> _Finding:
-    """Yield instances whose translation is shorter than NEAR [mm]: it is probably in metres."""
+@rule(SceneSubject, "translation-units", "multiply cam_t_m2c by 1000 if it is in metres")
+def check_units(scene: SceneSubject) -> Findings:
+    """Translations of instances are in millimetres."""
     record = scene.record("gt")
     for image, entries in scene.truths.items():
         for index, item in enumerate(entries):
@@ -163,42 +125,26 @@ def check_units(scene: SceneSubject) -> _Finding:
                 yield record.where(image), f"image {image}, instance {index}: {length:.3g} mm from the camera; it looks like metres"
 
 
-@rule(
-    SceneSubject,
-    "camera-units",
-    "Camera positions (cam_t_w2c) are in millimetres.",
-    "multiply cam_t_w2c by 1000 if it is in metres",
-    level=Level.WARNING,
-)
-def check_camera_units(scene: SceneSubject) -> _Finding:
-    """Yield the scene if all its camera translations are shorter than NEAR [mm]: they are probably in metres."""
+@rule(SceneSubject, "camera-units", "multiply cam_t_w2c by 1000 if it is in metres", level=Level.WARNING)
+def check_camera_units(scene: SceneSubject) -> Findings:
+    """Camera positions (cam_t_w2c) are in millimetres."""
     lengths = [float(np.linalg.norm(entry.cam_t_w2c)) for entry in scene.cameras.values() if isinstance(entry.cam_t_w2c, list)]
     if lengths and 0.0 < max(lengths) < NEAR:
         yield scene.record("camera").file, f"the world's origin is at most {max(lengths):.3g} mm from the camera; it looks like metres"
 
 
-@rule(
-    SceneSubject,
-    "extrinsics",
-    "cam_R_w2c and cam_t_w2c come together.",
-    "add the missing one, or remove the other",
-)
-def check_extrinsics(scene: SceneSubject) -> _Finding:
-    """Yield images that have only one of cam_R_w2c and cam_t_w2c."""
+@rule(SceneSubject, "extrinsics", "add the missing one, or remove the other")
+def check_extrinsics(scene: SceneSubject) -> Findings:
+    """cam_R_w2c and cam_t_w2c come together."""
     record = scene.record("camera")
     for image, entry in scene.cameras.items():
         if (entry.cam_R_w2c is UNSET) != (entry.cam_t_w2c is UNSET):
             yield record.where(image), f"image {image} has only one of cam_R_w2c and cam_t_w2c"
 
 
-@rule(
-    SceneSubject,
-    "behind-camera",
-    "Instances with visible pixels are in front of the camera (z above 0; OpenCV's axes: x right, y down, z forward).",
-    "convert poses of an OpenGL camera by diag(1, -1, -1)",
-)
-def check_in_front(scene: SceneSubject) -> _Finding:
-    """Yield instances with visible pixels whose origin is not in front of the camera (z of cam_t_m2c not above 0)."""
+@rule(SceneSubject, "behind-camera", "convert poses of an OpenGL camera by diag(1, -1, -1)")
+def check_in_front(scene: SceneSubject) -> Findings:
+    """Instances with visible pixels are in front of the camera (z above 0; OpenCV's axes: x right, y down, z forward)."""
     record = scene.record("gt")
     for image, entries in scene.truths.items():
         infos = scene.infos.get(image, [])
@@ -208,14 +154,9 @@ def check_in_front(scene: SceneSubject) -> _Finding:
                 yield record.where(image), f"image {image}, instance {index}: z is {item.cam_t_m2c[2]:g} mm, behind the camera"
 
 
-@rule(
-    SceneSubject,
-    "instance-ids",
-    "instance_id, where it exists, is unique in an image and stays with one object.",
-    "write the identity of each object over the scene; BOP's ground-truth index is only a list position",
-)
-def check_instance_ids(scene: SceneSubject) -> _Finding:
-    """Yield instance_ids that occur twice in an image, or belong to more than one object over the scene."""
+@rule(SceneSubject, "instance-ids", "write the identity of each object over the scene; BOP's ground-truth index is only a list position")
+def check_instance_ids(scene: SceneSubject) -> Findings:
+    """instance_id, where it exists, is unique in an image and stays with one object."""
     record, known = scene.record("gt"), {}
     for image, entries in scene.truths.items():
         present = [(item.instance_id, item.obj_id) for item in entries if item.instance_id is not UNSET]
@@ -227,14 +168,9 @@ def check_instance_ids(scene: SceneSubject) -> _Finding:
                 yield record.where(image), f"image {image}: instance_id {instance} has obj_id {obj_id}, before {known[instance]}"
 
 
-@rule(
-    SceneSubject,
-    "object-model",
-    "Every obj_id of scene_gt.json has a model obj_NNNNNN.ply in models (T-LESS: models_cad).",
-    "add the model, or correct obj_id",
-)
-def check_object_models(scene: SceneSubject) -> _Finding:
-    """Yield obj_ids without a model, once each."""
+@rule(SceneSubject, "object-model", "add the model, or correct obj_id")
+def check_object_models(scene: SceneSubject) -> Findings:
+    """Every obj_id of scene_gt.json has a model obj_NNNNNN.ply in models (T-LESS: models_cad)."""
     models, reported = scene.layout.model_files, set()
     for image, entries in scene.truths.items() if models else ():
         for index, item in enumerate(entries):

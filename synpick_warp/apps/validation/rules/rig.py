@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from msgspec import UNSET
 
-from synpick_warp.apps.validation.registry import rule
+from synpick_warp.apps.validation.registry import Findings, rule
 from synpick_warp.apps.validation.subjects import SceneSubject
 
 DISTANCE_TOLERANCE, ANGLE_TOLERANCE = 0.1, 1e-3
 """Largest difference of an instance's world poses from two cameras [mm], [rad]; ours differ by 1e-12 mm."""
-_Finding = Iterator[tuple[str, str]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,26 +25,16 @@ class RigSubject:
     """Number of cameras that the rig has."""
 
 
-@rule(
-    RigSubject,
-    "rig-complete",
-    "Every camera of an episode has its scene.",
-    "restore the scene, or bake again: the same command resumes",
-)
-def check_complete(rig: RigSubject) -> _Finding:
-    """Yield episodes of a multi-sensor rig that have fewer scenes than the rig has cameras."""
+@rule(RigSubject, "rig-complete", "restore the scene, or bake again: the same command resumes")
+def check_complete(rig: RigSubject) -> Findings:
+    """Every camera of an episode has its scene."""
     if len(rig.scenes) < rig.cameras:
         yield rig.place, f"{len(rig.scenes)} scenes of {rig.cameras} cameras"
 
 
-@rule(
-    RigSubject,
-    "world-poses",
-    "cam_R_w2c and cam_t_w2c map an instance (instance_id) to the same world pose from every camera.",
-    "check the extrinsics' unit and direction (world to camera) and the pose of the instance",
-)
-def check_world_poses(rig: RigSubject) -> _Finding:
-    """Yield instances whose world pose, by one camera, differs from that by the first camera that shows them."""
+@rule(RigSubject, "world-poses", "check the extrinsics' unit and direction (world to camera) and the pose of the instance")
+def check_world_poses(rig: RigSubject) -> Findings:
+    """cam_R_w2c and cam_t_w2c map an instance (instance_id) to the same world pose from every camera."""
     known: dict[tuple[int, int], tuple[str, np.ndarray]] = {}
     for scene in rig.scenes:
         record = scene.record("gt")

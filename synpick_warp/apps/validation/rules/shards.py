@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-
-from synpick_warp.apps.validation.registry import rule
+from synpick_warp.apps.validation.registry import Findings, rule
 from synpick_warp.apps.validation.scene_files import KeyedScene
 from synpick_warp.apps.validation.subjects import ViewSubject
 from synpick_warp.dataset.bop.keyed import KEY, KeyedFolder
@@ -12,17 +10,11 @@ from synpick_warp.dataset.bop.layout import KEYED, KEYS
 
 MAX_VIEWS = 1000
 """Most views of a shard, as in BOP's webdataset layout."""
-_Finding = Iterator[tuple[str, str]]
 
 
-@rule(
-    KeyedFolder,
-    "shard-index",
-    "key_to_shard.json maps every key SSSSSS_IIIIII to the index of the shard that contains it, and no others.",
-    "list the keys of each shard again, or restore the shard",
-)
-def check_index(folder: KeyedFolder) -> _Finding:
-    """Yield keys of key_to_shard.json whose view is in no or another shard, and views in shards that it does not name."""
+@rule(KeyedFolder, "shard-index", "list the keys of each shard again, or restore the shard")
+def check_index(folder: KeyedFolder) -> Findings:
+    """key_to_shard.json maps every key SSSSSS_IIIIII to the index of the shard that contains it, and no others."""
     keys, fault = folder.keys
     if fault:
         yield folder.listing.name(KEYS), fault
@@ -42,14 +34,9 @@ def check_index(folder: KeyedFolder) -> _Finding:
         yield folder.listing.name(KEYS), f"key {key} of {places[key]} is missing"
 
 
-@rule(
-    KeyedFolder,
-    "shard-files",
-    "Shards are tar files of regular members named KEY.CONTENT, with at most 1000 views each.",
-    "write the shard again, without links or other files",
-)
-def check_shards(folder: KeyedFolder) -> _Finding:
-    """Yield shards that cannot be read or hold more than MAX_VIEWS views, and files of other names than KEY.CONTENT."""
+@rule(KeyedFolder, "shard-files", "write the shard again, without links or other files")
+def check_shards(folder: KeyedFolder) -> Findings:
+    """Shards are tar files of regular members named KEY.CONTENT, with at most 1000 views each."""
     for shard, found in folder.members.items():
         if isinstance(found, str):
             yield folder.listing.name(shard), found
@@ -60,14 +47,9 @@ def check_shards(folder: KeyedFolder) -> _Finding:
             yield folder.listing.name(name), "a file name that is not KEY.CONTENT"
 
 
-@rule(
-    ViewSubject,
-    "mask-entries",
-    "KEY.mask.json and KEY.mask_visib.json have run lengths of every instance.",
-    "write one entry for each ground-truth index",
-)
-def check_entries(view: ViewSubject) -> _Finding:
-    """Yield instances of a keyed view whose mask is missing."""
+@rule(ViewSubject, "mask-entries", "write one entry for each ground-truth index")
+def check_entries(view: ViewSubject) -> Findings:
+    """KEY.mask.json and KEY.mask_visib.json have run lengths of every instance."""
     if isinstance(view.scene.files, KeyedScene):
         for kind, masks in view.masks.items():
             faults = {file for file, _ in view.faults}

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator
 
 from msgspec import UNSET
 
-from synpick_warp.apps.validation.registry import rule
+from synpick_warp.apps.validation.registry import Findings, rule
 from synpick_warp.apps.validation.subjects import SceneSubject
 from synpick_warp.apps.validation.target_lists import TargetLists
 
@@ -15,44 +14,28 @@ MIN_VISIBILITY = 0.1
 """Visible fraction from which an instance is a target, in the toolkit's enumerate_test_targets.py."""
 FRACTION_SLACK = 1e-3
 """Distance from that fraction within which an instance may be a target or not: files are often rounded."""
-_Finding = Iterator[tuple[str, str]]
 
 
-@rule(
-    TargetLists,
-    "target-schema",
-    "A target list is a JSON list of records with scene_id and im_id; those of 2019 also with obj_id and inst_count.",
-    "make it again with enumerate_test_targets.py",
-)
-def check_schema(lists: TargetLists) -> _Finding:
-    """Yield target lists that do not fit the schema."""
+@rule(TargetLists, "target-schema", "make it again with enumerate_test_targets.py")
+def check_schema(lists: TargetLists) -> Findings:
+    """A target list is a JSON list of records with scene_id and im_id; those of 2019 also with obj_id and inst_count."""
     for name, found in lists.lists.items():
         if found.fault:
             yield name, found.fault
 
 
-@rule(
-    TargetLists,
-    "target-scenes",
-    "Every scene of a target list exists.",
-    "remove its records, or restore the scene",
-)
-def check_scenes(lists: TargetLists) -> _Finding:
-    """Yield scenes that a target list names and no split has."""
+@rule(TargetLists, "target-scenes", "remove its records, or restore the scene")
+def check_scenes(lists: TargetLists) -> Findings:
+    """Every scene of a target list exists."""
     for name, found in lists.lists.items():
         known = lists.scene_ids(name)
         for scene in sorted(set(found.scenes) - known):
             yield name, f"there is no scene {scene}"
 
 
-@rule(
-    SceneSubject,
-    "target-images",
-    "Every image and object of a target list is in the scene's ground truth, and no record occurs twice.",
-    "remove the record, or restore the image",
-)
-def check_images(scene: SceneSubject) -> _Finding:
-    """Yield targets whose image does not exist, whose object is not in it, or that occur twice."""
+@rule(SceneSubject, "target-images", "remove the record, or restore the image")
+def check_images(scene: SceneSubject) -> Findings:
+    """Every image and object of a target list is in the scene's ground truth, and no record occurs twice."""
     for name, by_image in scene.targets.items():
         for image, records in by_image.items():
             place = f"scene {scene.files.ref.scene}, image {image}"
@@ -68,14 +51,9 @@ def check_images(scene: SceneSubject) -> _Finding:
                     yield name, f"{place}: obj_id {obj_id} is not in the image"
 
 
-@rule(
-    SceneSubject,
-    "target-counts",
-    "inst_count is the number of instances of the object whose visib_fract is at least 0.1.",
-    "make the list again with enumerate_test_targets.py",
-)
-def check_counts(scene: SceneSubject) -> _Finding:
-    """Yield targets whose inst_count is not the number of instances visible by at least MIN_VISIBILITY."""
+@rule(SceneSubject, "target-counts", "make the list again with enumerate_test_targets.py")
+def check_counts(scene: SceneSubject) -> Findings:
+    """inst_count is the number of instances of the object whose visib_fract is at least 0.1."""
     for name, by_image in scene.targets.items():
         for image, records in by_image.items():
             truths, infos = scene.truths.get(image), scene.infos.get(image)

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
 from typing import Annotated, Any
 
 import msgspec
 
-from synpick_warp.apps.validation.registry import Level, rule
+from synpick_warp.apps.validation.registry import Findings, Level, rule
 from synpick_warp.apps.validation.scene_files import FolderScene
 from synpick_warp.apps.validation.subjects import MASKS, SceneSubject, TreeSubject
 from synpick_warp.dataset.bop.images import SUFFIXES
@@ -21,7 +20,6 @@ _MASK = re.compile(r"[0-9]{6,9}_[0-9]{6,9}")
 _CAMERA = re.compile(r"camera(_\w+)?\.json")
 _MAX_CAMERA = 2**20
 """Largest camera.json [bytes]; they have 200."""
-_Finding = Iterator[tuple[str, str]]
 _Positive = Annotated[float, msgspec.Meta(gt=0.0, le=1e6)]
 
 
@@ -37,14 +35,9 @@ class _CameraFile(msgspec.Struct):
     depth_scale: _Positive | msgspec.UnsetType = msgspec.UNSET
 
 
-@rule(
-    TreeSubject,
-    "link-outside",
-    "No symbolic link leads out of the data set, or nowhere, and there are no pipes or devices.",
-    "replace the link by a copy of what it names",
-)
-def check_links(tree: TreeSubject) -> _Finding:
-    """Yield links that lead out of the data set or nowhere, and entries that are neither file nor folder, outside of scenes."""
+@rule(TreeSubject, "link-outside", "replace the link by a copy of what it names")
+def check_links(tree: TreeSubject) -> Findings:
+    """No symbolic link leads out of the data set, or nowhere, and there are no pipes or devices."""
     layout = tree.layout
     for listing in (layout.listing, *layout.models.values(), *layout.splits.values(), *layout.keyed.values()):
         for name in listing.outside:
@@ -53,14 +46,9 @@ def check_links(tree: TreeSubject) -> _Finding:
             yield listing.name(name), "neither a file nor a folder; it is not opened"
 
 
-@rule(
-    TreeSubject,
-    "split-folders",
-    "A split contains only scene folders, named by six digits: the toolkit takes every folder in it for a scene.",
-    "rename the folder to its scene index with six digits, or move it out of the split",
-)
-def check_split_folders(tree: TreeSubject) -> _Finding:
-    """Yield folders of a split that are no scenes or whose name has not six digits, and splits without a scene."""
+@rule(TreeSubject, "split-folders", "rename the folder to its scene index with six digits, or move it out of the split")
+def check_split_folders(tree: TreeSubject) -> Findings:
+    """A split contains only scene folders, named by six digits: the toolkit takes every folder in it for a scene."""
     for listing in tree.layout.splits.values():
         for name in sorted(listing.folders):
             if not is_index(name):
@@ -72,14 +60,9 @@ def check_split_folders(tree: TreeSubject) -> _Finding:
             yield listing.place, "a split without a scene"
 
 
-@rule(
-    TreeSubject,
-    "camera-file",
-    "camera.json (or camera_SENSOR.json) has width, height, fx, fy, cx, cy above 0, and depth_scale if it is there.",
-    "write the intrinsics of the split's camera, in pixels",
-)
-def check_camera_file(tree: TreeSubject) -> _Finding:
-    """Yield camera files that cannot be read or do not fit the schema."""
+@rule(TreeSubject, "camera-file", "write the intrinsics of the split's camera, in pixels")
+def check_camera_file(tree: TreeSubject) -> Findings:
+    """camera.json (or camera_SENSOR.json) has width, height, fx, fy, cx, cy above 0, and depth_scale if it is there."""
     listing = tree.layout.listing
     for name in sorted(filter(_CAMERA.fullmatch, listing.files)):
         try:
@@ -88,15 +71,9 @@ def check_camera_file(tree: TreeSubject) -> _Finding:
             yield name, str(error)
 
 
-@rule(
-    TreeSubject,
-    "set-files",
-    "The data set has camera.json, models, models_eval with a models_info.json of its own, and test_targets_bop19.json.",
-    "add the file: tools read it without asking (test_targets_bop19.json may be [])",
-    level=Level.WARNING,
-)
-def check_set_files(tree: TreeSubject) -> _Finding:
-    """Yield camera file, models, models_info.json and target list that are missing although BOP's tools open them unconditionally."""
+@rule(TreeSubject, "set-files", "add the file: tools read it without asking (test_targets_bop19.json may be [])", level=Level.WARNING)
+def check_set_files(tree: TreeSubject) -> Findings:
+    """The data set has camera.json, models, models_eval with a models_info.json of its own, and test_targets_bop19.json."""
     layout = tree.layout
     if not any(map(_CAMERA.fullmatch, layout.listing.files)):
         yield "camera.json", "missing; BlenderProc and render_train_imgs.py read it"
@@ -114,41 +91,25 @@ def check_set_files(tree: TreeSubject) -> _Finding:
         yield "test_targets_bop19.json", "missing; the toolkit's calc_gt_masks.py and calc_gt_coco.py open it"
 
 
-@rule(
-    TreeSubject,
-    "bake-finished",
-    "A bake of ours is finished.",
-    "the command that started the bake resumes it",
-    level=Level.WARNING,
-)
-def check_finished(tree: TreeSubject) -> _Finding:
-    """Yield the manifest's last entry if it is missing: the bake has not finished."""
+@rule(TreeSubject, "bake-finished", "the command that started the bake resumes it", level=Level.WARNING)
+def check_finished(tree: TreeSubject) -> Findings:
+    """A bake of ours is finished."""
     if tree.layout.ours and "joined.json" not in tree.layout.listing.enter("manifest").files:
         yield "manifest/joined.json", "missing: the bake was interrupted, so lists and episodes are missing"
 
 
-@rule(
-    SceneSubject,
-    "scene-links",
-    "No symbolic link in a scene leads out of the data set, and its folders contain regular files only.",
-    "replace the link by a copy of what it names",
-)
-def check_scene_links(scene: SceneSubject) -> _Finding:
-    """Yield links out of the data set and special files, in the scene's folder and its image folders."""
+@rule(SceneSubject, "scene-links", "replace the link by a copy of what it names")
+def check_scene_links(scene: SceneSubject) -> Findings:
+    """No symbolic link in a scene leads out of the data set, and its folders contain regular files only."""
     if isinstance(scene.files, FolderScene):
         for listing in (scene.files.listing, *scene.files.listings.values()):
             for name in (*listing.outside, *listing.special):
                 yield listing.name(name), "leads out of the data set, or is no regular file; it is not read"
 
 
-@rule(
-    SceneSubject,
-    "scene-files",
-    "A scene has scene_camera.json and images in rgb or gray.",
-    "restore the file; without it no tool can read the scene",
-)
-def check_scene_files(scene: SceneSubject) -> _Finding:
-    """Yield a missing or empty scene_camera.json, and a scene without any colour or depth image."""
+@rule(SceneSubject, "scene-files", "restore the file; without it no tool can read the scene")
+def check_scene_files(scene: SceneSubject) -> Findings:
+    """A scene has scene_camera.json and images in rgb or gray."""
     camera = scene.record("camera")
     if not camera.present or not (camera.raw or camera.faults or camera.keys):
         yield camera.file, "missing or empty"
@@ -159,12 +120,11 @@ def check_scene_files(scene: SceneSubject) -> _Finding:
 @rule(
     SceneSubject,
     "ground-truth",
-    "A scene has scene_gt.json, scene_gt_info.json and, with ground truth, both mask folders.",
     "restore it, or make it by the toolkit's calc_gt_info.py and calc_gt_masks.py; test scenes with hidden ground truth have none",
     level=Level.WARNING,
 )
-def check_ground_truth(scene: SceneSubject) -> _Finding:
-    """Yield missing annotation files and mask folders, which public test scenes may lack."""
+def check_ground_truth(scene: SceneSubject) -> Findings:
+    """A scene has scene_gt.json, scene_gt_info.json and, with ground truth, both mask folders."""
     for name in ("gt", "gt_info"):
         if not scene.record(name).present:
             yield scene.record(name).file, "missing"
@@ -174,14 +134,9 @@ def check_ground_truth(scene: SceneSubject) -> _Finding:
                 yield f"{scene.place}/{name}{scene.files.ref.sensor}", "missing; COCO annotations and trainers need it"
 
 
-@rule(
-    SceneSubject,
-    "image-names",
-    "Images are named by six digits and .png, .jpg or .tif; masks by image and ground-truth index of six digits each.",
-    "rename the file, or move it out of the folder",
-)
-def check_image_names(scene: SceneSubject) -> _Finding:
-    """Yield files that no tool expects, second files of an image, and folders, in image folders."""
+@rule(SceneSubject, "image-names", "rename the file, or move it out of the folder")
+def check_image_names(scene: SceneSubject) -> Findings:
+    """Images are named by six digits and .png, .jpg or .tif; masks by image and ground-truth index of six digits each."""
     if not isinstance(scene.files, FolderScene):
         return
     for kind, listing in scene.files.listings.items():
@@ -198,14 +153,9 @@ def check_image_names(scene: SceneSubject) -> _Finding:
             yield listing.name(name), "a folder among images"
 
 
-@rule(
-    SceneSubject,
-    "image-missing",
-    "Every image that the annotations name exists: colour or grey, depth, and a mask of each kind for each instance.",
-    "restore the image, or remove its entries from the scene's JSON files",
-)
-def check_images_present(scene: SceneSubject) -> _Finding:
-    """Yield colour, depth and mask files that an annotated image lacks."""
+@rule(SceneSubject, "image-missing", "restore the image, or remove its entries from the scene's JSON files")
+def check_images_present(scene: SceneSubject) -> Findings:
+    """Every image that the annotations name exists: colour or grey, depth, and a mask of each kind for each instance."""
     for kind in (scene.colour, "depth"):
         if kind is not None and (kind == scene.colour or kind in scene.files.kinds):
             known = scene.files.indices(kind)
@@ -220,14 +170,9 @@ def check_images_present(scene: SceneSubject) -> _Finding:
                     yield scene.files.file(kind, image, index), f"missing: image {image} has {len(truths)} instances"
 
 
-@rule(
-    SceneSubject,
-    "image-extra",
-    "There is no image without an entry in scene_camera.json, and no mask beyond the image's list in scene_gt.json.",
-    "add the entry, or remove the file",
-)
-def check_images_extra(scene: SceneSubject) -> _Finding:
-    """Yield images and masks that no annotation names."""
+@rule(SceneSubject, "image-extra", "add the entry, or remove the file")
+def check_images_extra(scene: SceneSubject) -> Findings:
+    """There is no image without an entry in scene_camera.json, and no mask beyond the image's list in scene_gt.json."""
     cameras, truths = scene.record("camera"), scene.record("gt")
     for kind in sorted(scene.files.kinds):
         for (image, index), name in sorted(scene.files.indices(kind).items(), key=_order):

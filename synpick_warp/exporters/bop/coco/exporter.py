@@ -41,39 +41,36 @@ class CocoExporter(SceneExporter):
 
     @staticmethod
     def annotates(bop: Bop) -> bool:
-        """True: COCO annotations are this format. See `SceneExporter`."""
+        """See `SceneExporter`."""
         return True
 
     @staticmethod
     def folder_name(split: str) -> str:
-        """Folder "coco", for all splits. See `SceneExporter`."""
+        """See `SceneExporter`: one for all splits."""
         return FOLDER.name
 
     @staticmethod
     def shared_files(layout: DataLayout) -> SharedFiles:
-        """Names of what is written beside episodes: categories and notes, an annotation file for each split, and the folders. See
-        `Exporter`.
-        """
+        """See `Exporter`."""
         places = tuple(map(annotation_file, layout.folders))
         return SharedFiles((CATEGORIES, *note_files(layout.formats)), places, (IMAGES, PARTS, places[0].parent, FOLDER))
 
     @staticmethod
     def finalize(out: Path, settings: ExportSettings, pool: WriterPool, episodes: Sequence[int]) -> list[Path]:
-        """Write the annotation file of each split from the parts of all episodes; returns their paths. See `Exporter`."""
+        """See `Exporter`: the annotations of each split."""
         with output_errors(out / FOLDER):
             return write_annotation_files(out, settings, episodes)
 
     def write_constants(self) -> list[Path]:
-        """Write names and keypoints of the objects, camera file and notes; returns their paths. See `Exporter`."""
+        """See `Exporter`: names and keypoints of the objects, camera and notes."""
         names = self._context.names
         write_categories(self._out, names, self._keypoints)
         with output_errors(self._out):
             return [CATEGORIES, *write_notes(self._out, self._context.settings, names, self._cameras)]
 
     def files(self, episode: int) -> list[Path]:
-        """Existing paths of an episode: folders of images, and parts of annotations. See `Exporter`."""
+        """See `Exporter`: folders of images, and parts."""
         return scene_files(self._out, [self.scene_id(episode, camera) for camera in range(len(self._cameras))])
 
     def _commit_task(self, scenes: tuple[tuple[Path, int], ...], images: Sequence[int]) -> tuple[Callable[..., None], tuple[Any, ...]]:
-        """Task that completes an episode: renames its staged images and annotation parts to their places (`commit_scenes`)."""
         return commit_scenes, (scenes, self._out, images)

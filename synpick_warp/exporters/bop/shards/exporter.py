@@ -32,20 +32,18 @@ class ShardsExporter(SceneExporter):
 
     @staticmethod
     def folder_name(split: str) -> str:
-        """Folder of a split: its name and "_web", as BOP's toolkit calls it. See `SceneExporter`."""
+        """See `SceneExporter`: the toolkit's name."""
         return f"{split}_web"
 
     @staticmethod
     def shared_files(layout: DataLayout) -> SharedFiles:
-        """Names of what is written beside episodes: models, camera and notes, key_to_shard.json of each split and the card. See
-        `Exporter`.
-        """
+        """See `Exporter`."""
         splits = ShardsExporter.folders(layout)
         return SharedFiles(CONSTANTS, (*(split / KEYS_FILE for split in splits), Path(CARD_FILE)), splits)
 
     @staticmethod
     def finalize(out: Path, settings: ExportSettings, pool: WriterPool, episodes: Sequence[int]) -> list[Path]:
-        """Write the index of views and shards of each split, and the dataset card; returns their paths. See `Exporter`."""
+        """See `Exporter`: the index of views and shards of each split, and the dataset card."""
         layout = settings.layout
         cameras = layout.cameras
         scenes = [scene for episode in episodes for scene in range(cameras * episode, cameras * (episode + 1))]
@@ -58,17 +56,16 @@ class ShardsExporter(SceneExporter):
         return [*(Path(split.folder) / KEYS_FILE for split in contents), Path(CARD_FILE)]
 
     def files(self, episode: int) -> list[Path]:
-        """Existing shards of an episode's scenes, sorted, relative to the data set. See `Exporter`."""
+        """See `Exporter`: the shards of its scenes."""
         scenes = (self.scene_id(episode, camera) for camera in range(len(self._cameras)))
         return sorted(path.relative_to(self._out) for scene in scenes for path in find_shards(scene, self._folder(scene)))
 
     def _commit_task(self, scenes: tuple[tuple[Path, int], ...], images: Sequence[int]) -> tuple[Callable[..., None], tuple[Any, ...]]:
-        """Task that completes an episode: packs its staged views into tar shards (`commit_shards`)."""
         return commit_shards, (scenes, self._folder(scenes[0][1]), images, self._layers)
 
 
 def _describe(settings: ExportSettings, splits: list[SplitContent]) -> CardContent:
-    """Content of a data set's card, from its settings and splits."""
+    """What the card of a data set says."""
     bake, bop = settings.bake, settings.bop
     return CardContent(
         splits=tuple(splits),

@@ -32,21 +32,17 @@ class YoloExporter(SceneExporter):
 
     @staticmethod
     def folder_name(split: str) -> str:
-        """Folder "yolo", for all splits. See `SceneExporter`."""
+        """See `SceneExporter`: one for all splits."""
         return FOLDER.name
 
     @staticmethod
     def shared_files(layout: DataLayout) -> SharedFiles:
-        """Names of what is written beside episodes: data.yaml and the notes (constants), no index files, and the folders of images and
-        labels by split. See `Exporter`.
-        """
+        """See `Exporter`."""
         splits = tuple(FOLDER / kind / split for kind in CONTENTS for split in layout.folders)
         return SharedFiles((DATA, *note_files(layout.formats)), (), (*splits, *(FOLDER / kind for kind in CONTENTS), FOLDER))
 
     def write_constants(self) -> list[Path]:
-        """Create the folders, and write data.yaml (splits, names of the classes), the camera file and the notes; returns their names. See
-        `Exporter`.
-        """
+        """See `Exporter`: splits and names of the classes, camera and notes."""
         context = self._context
         with output_errors(self._out):
             for folder in reversed(self.shared_files(context.layout).folders):
@@ -55,9 +51,7 @@ class YoloExporter(SceneExporter):
             return [DATA, *write_notes(self._out, context.settings, context.names, self._cameras)]
 
     def files(self, episode: int) -> list[Path]:
-        """Existing paths of an episode in the data set, sorted: lists of images, and folders of images and of each kind of labels. See
-        `Exporter`.
-        """
+        """See `Exporter`: lists of images, and folders of images and labels."""
         split = self._context.layout.folder(episode)
         scenes = [self.scene_id(episode, camera) for camera in range(len(self._cameras))]
         folders = [FOLDER / kind / split / f"{scene:06d}" for scene in scenes for kind in CONTENTS]
@@ -65,14 +59,10 @@ class YoloExporter(SceneExporter):
         return sorted(place for place in places if os.path.lexists(self._out / place))
 
     def _stage_scene(self, scene: Path) -> None:
-        """Create the staging folder of a scene, with one folder for images and one for each kind of labels."""
         scene.mkdir()
         for kind in CONTENTS:
             (scene / kind).mkdir()
 
     def _commit_task(self, scenes: tuple[tuple[Path, int], ...], images: Sequence[int]) -> tuple[Callable[..., None], tuple[Any, ...]]:
-        """Task that completes an episode: writes each scene's list of images, and renames its staged folders of images and labels to their
-        places (`commit_scenes`).
-        """
         split = self._context.layout.folder(scenes[0][1] // len(self._cameras))
         return commit_scenes, (scenes, self._out, split, images)
