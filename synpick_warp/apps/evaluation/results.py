@@ -51,7 +51,7 @@ class ResultFile:
 
 
 def read_results(path: Path) -> ResultFile:
-    """Read a BOP result file; rows of equal scene, image and object keep their order.
+    """Read a BOP result file; rows are sorted by scene, image and object, and keep their order where these are equal.
 
     Raises:
         ResultError: In one line with the line's number: wrong columns, a number that is none, not finite or out of range, a matrix that is
@@ -83,7 +83,7 @@ def read_results(path: Path) -> ResultFile:
 
 
 def _convert(lines: list[bytes], path: Path, start: int) -> tuple[np.ndarray, np.ndarray]:
-    """Indices (N, 3) int64, and score, R, t and time (N, 14) float64 of lines from line `start` on."""
+    """Indices (N, 3) int64, and score, R, t and time (N, 14) float64 of lines from line `start` on; raises ResultError."""
     rows = [line.split(b",") for line in lines]
     for number, (line, row) in enumerate(zip(lines, rows, strict=True), start):
         # Cheap checks of every line, which make the conversion below fit; the messages are composed only if one fails.

@@ -11,7 +11,10 @@ _Finding = Iterator[tuple[str, str]]
 
 
 def _found(rendered: DiagnosedView, *kinds: Kind) -> _Finding:
-    """Findings of some kinds: those about an instance in the file of its mask or in scene_gt.json, others in the depth image."""
+    """Yield file and text of the findings of some kinds.
+
+    The file is the instance's mask (SHIFT, SHIFT_VISIBLE, MASK, VISIBLE), the depth image (SCALE, RAY, DEPTH), or else scene_gt.json.
+    """
     view = rendered.view
     for finding in rendered.findings:
         if finding.kind not in kinds:
@@ -87,7 +90,7 @@ def check_object(rendered: DiagnosedView) -> _Finding:
     "correct cam_R_m2c and cam_t_m2c (model to camera, mm); check obj_id and the model's origin",
 )
 def check_pose(rendered: DiagnosedView) -> _Finding:
-    """Yield poses that neither the mask nor depth agree with."""
+    """Yield poses whose silhouette does not fit the mask, without depth confirming them, and those whose depth is off as a whole."""
     yield from _found(rendered, Kind.POSE)
 
 
@@ -98,7 +101,7 @@ def check_pose(rendered: DiagnosedView) -> _Finding:
     "make the mask again from model and pose (calc_gt_masks.py)",
 )
 def check_mask(rendered: DiagnosedView) -> _Finding:
-    """Yield masks of another shape than the rendered one, although depth says that the pose is right."""
+    """Yield masks whose shape is not the rendered one although depth confirms the pose, and empty masks of objects in the image."""
     yield from _found(rendered, Kind.MASK)
 
 
@@ -109,7 +112,7 @@ def check_mask(rendered: DiagnosedView) -> _Finding:
     "make mask_visib again from the instance image, or from model, pose and depth",
 )
 def check_visible(rendered: DiagnosedView) -> _Finding:
-    """Yield visible masks that leave out pixels at which the object is rendered in front."""
+    """Yield visible masks that leave out many pixels whose depth is that of the object as rendered."""
     yield from _found(rendered, Kind.VISIBLE)
 
 
@@ -120,5 +123,5 @@ def check_visible(rendered: DiagnosedView) -> _Finding:
     "check the mask of what lies in front, and the depth image",
 )
 def check_depth(rendered: DiagnosedView) -> _Finding:
-    """Yield visible masks that cover pixels whose depth is not the object's."""
+    """Yield instances of whose visible mask too large a part has a depth that is not the object's."""
     yield from _found(rendered, Kind.DEPTH)
