@@ -39,7 +39,7 @@ class FoundScenes:
 
     @cached_property
     def _scenes(self) -> dict[int, dict[str, SceneRef]]:
-        """Scenes by episode and sensor suffix."""
+        """Scenes of the chosen split, or all, by episode (scene_id, plus an offset for each split if some clash) and sensor suffix."""
         by_split: dict[str, list[SceneRef]] = {}
         for ref in self.refs():
             by_split.setdefault(ref.split, []).append(ref)
