@@ -107,7 +107,7 @@ class SceneFiles(ABC):
         return [self.mask(name, frame, index) for index in range(count)]
 
     def camera(self, frame: int) -> dict[str, Any]:
-        """A frame's entry in scene_camera.json; empty: there is no such file."""
+        """A frame's entry in scene_camera.json; empty: there is no such file. Raises DatasetError if the file lacks the frame."""
         found = self._part("camera", frame)
         if found is None and self.has("camera"):
             raise DatasetError(f"{self.place}: scene_camera.json has no image {frame}")
@@ -201,7 +201,7 @@ class SceneFolder(SceneFiles):
 
     @cached_property
     def _records(self) -> list[dict[int, Any] | None]:
-        """Annotations by image of each of RECORD_NAMES; None: there is no such file."""
+        """Annotations by image of each of RECORD_NAMES; None: a lenient scene has no such file, others raise DatasetError."""
         schemas = LENIENT_SCENE_SCHEMAS if self.lenient else SCENE_SCHEMAS
         return [
             read_checked(self.annotations(name), schemas[name]) if not self.lenient or self.has(name) else None for name in RECORD_NAMES

@@ -58,7 +58,7 @@ class FoundScenes:
         return [*folders, *(ref for ref in self._keyed() if ref.split.removesuffix("_web") not in splits)]
 
     def _keyed(self) -> Iterator[SceneRef]:
-        """Yield the scenes of shards and of the imagewise layout."""
+        """Yield the scenes of shards and of the imagewise layout; raises DatasetError if a shard cannot be read."""
         for folder in map(KeyedFolder, self.layout.keyed.values()):
             if fault := next((keys for keys in folder.members.values() if isinstance(keys, str)), None):
                 raise DatasetError(fault)
