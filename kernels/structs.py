@@ -11,16 +11,16 @@ TILT = wp.constant(3)
 
 @wp.struct
 class LayoutData:
-    """Sizes and offsets of one world in the model's flat arrays: capacity for instances, body slots, bodies, coordinates, degrees of
-    freedom and shapes; see `scenes.build.Layout`.
+    """Sizes and offsets of one world in the model's flat arrays; see `scenes.build.Layout`. A body slot is a body that can become any
+    object of its class: single (one convex piece) or compound (several).
     """
 
     instances: int
     """Capacity for objects of an episode."""
     single_slots: int
-    """Body slots for objects of one collision shape; they come first."""
+    """Number of single slots, which come before the compound ones."""
     slots: int
-    """All body slots."""
+    """Number of body slots of both classes."""
     gripper_bodies: int
     """Bodies of the gripper, which precede the slots: shaft and cup."""
     gripper_dofs: int
@@ -34,13 +34,13 @@ class LayoutData:
     shapes: int
     """Collision shapes of a world."""
     finger_shape: int
-    """Index of the gripper shaft's shape in its world."""
+    """Index of the shape of the finger, which is the gripper's shaft, in its world."""
 
 
 @wp.struct
 class CatalogData:
-    """Catalog of objects, an element per object: collision volume [m³], bounding radius about the origin [m], mass [kg], area of the box's
-    larger sides, diagonal, body variant; and variants and mass of empty slots.
+    """Catalog of objects, an element per object, and what empty body slots are. A variant is the index of the body that a slot becomes:
+    those of a class are its objects in catalog order, then the empty one.
     """
 
     count: int
@@ -58,7 +58,7 @@ class CatalogData:
     compound: wp.array[int]
     """1: several convex pieces, in a compound slot; 0: one, in a single slot."""
     variant: wp.array[int]
-    """Body variant of the object in the slots of its class."""
+    """Variant of the object, in slots of its class (single or compound)."""
     empty_single: int
     """Variant of an empty single slot."""
     empty_compound: int
@@ -74,7 +74,7 @@ class DropData:
     volume: float
     """Budget for the total volume of an episode's objects [m³]."""
     exceed: int
-    """1: the object that exceeds the budget is the last; 0: the one before it."""
+    """1: sampling ends with the object that reaches or exceeds the budget, which is kept; 0: before one that exceeds it."""
     move_repeats: int
     """1: an object may occur several times in mode MOVE."""
     pick_repeats: int
@@ -82,7 +82,7 @@ class DropData:
     clearance: float
     """Gap between bounding spheres in the drop column [m]."""
     spread: float
-    """Fraction of the free opening over which drop positions spread."""
+    """Fraction of the opening, less the object's bounding radius, over which drop positions spread."""
     rim_length: float
     """Opening of the tote at the rim along x [m]."""
     rim_width: float
@@ -94,7 +94,7 @@ class DropData:
     gripper_home: wp.vec3
     """Wrist position while the gripper waits [m]."""
     lights: int
-    """Environment maps."""
+    """Number of environment maps."""
     random_yaw: int
     """1: sample the yaw of environment maps."""
     exposure_spread: float
@@ -103,9 +103,7 @@ class DropData:
 
 @wp.struct
 class SettleData:
-    """Rest and re-drops: least and longest time to rest and time in penetration [ticks], displacement of an object at rest in a tick and
-    penetration of a stuck one [m], number of re-drops; see `configs.schema.Settle`.
-    """
+    """Rest of dropped objects, and re-drops of stuck ones; see `configs.schema.Settle`."""
 
     min_ticks: int
     """Shortest time from drop to rest [ticks]."""
@@ -129,7 +127,7 @@ class SettleData:
 
 @wp.struct
 class ModeData:
-    """First episode of a split, probabilities of PICK and of PICK or TARGET, and the period of a round robin over modes (0: random)."""
+    """Distribution of a split's episodes over the modes: independent samples, or a round robin."""
 
     first: int
     """Index of the split's first episode."""
@@ -138,7 +136,7 @@ class ModeData:
     pick_or_target_share: float
     """Probability of PICK or TARGET."""
     cycle: int
-    """Period of a round robin [episodes], whose episodes have evenly spaced samples instead of random ones; 0: random."""
+    """Period of a round robin [episodes], in which evenly spaced numbers, instead of random ones, choose the modes; 0: random."""
 
 
 @wp.struct
@@ -154,11 +152,11 @@ class MoveData:
     speed: float
     """Speed of the setpoint [m/s]."""
     corner: wp.vec3
-    """TCP at the corner with positive x and y [m]."""
+    """TCP at the waypoint in the tote's corner with positive x and y [m]."""
     start_height: float
     """Height of the TCP above the floor in the first frame, over the first corner [m]."""
     waypoints: int
-    """Corners to visit."""
+    """Number of corners to visit, repeats included."""
     mass: float
     """Mass of shaft and cup [kg]."""
     gravity: float
@@ -194,7 +192,7 @@ class PickData:
     lift_speed: float
     """Speed of the setpoint in LIFT [m/s]."""
     failures: int
-    """Failed attempts that end an episode."""
+    """Number of failed attempts that ends an episode; not only those in a row, but see `forgive`."""
     floor: float
     """Height below which an object is lost [m]."""
     tilt_limit: float
@@ -207,10 +205,14 @@ class PickData:
 
 @wp.struct
 class PerceptionData:
-    """Thresholds, weights and windows of grasp points, occlusion votes and the clutter graph, named as in configs.schema.Perception."""
+    """Thresholds, weights and windows of grasp points, occlusion votes and the clutter graph, named as in configs.schema.Perception.
+
+    Where a neighbour's surface across the contour is nearer to the camera, it casts a vote that it lies above.
+    """
 
     center_fraction: float
-    """Distance of centroid or midpoint to the contour, as a fraction of the pole's, from which it is the suction point."""
+    """The suction point is the centroid, or its midpoint with the mask's innermost point (pole), if that is farther from the contour
+    than this fraction of the pole's distance; else the pole."""
     heavy_mass: float
     """Mass above which an object is grasped nearer to its centroid [kg]."""
     heavy_center_fraction: float
@@ -224,7 +226,7 @@ class PerceptionData:
     min_votes: float
     """Minimum occlusion votes for an edge of the clutter graph."""
     reach: float
-    """Maximum distance of a neighbour's contour from the compared pixel [bounding box diagonals]."""
+    """A neighbour votes only if its contour stays this near to the compared pixel [diagonals of its own 3-D bounding box]."""
     exact_cycle: int
     """Maximum size of a cycle that is broken at minimum cost."""
     normal_window: int
@@ -266,6 +268,6 @@ class SuctionData:
     cup_mass: float
     """Mass of the cup [kg]."""
     tilt_inertia: float
-    """Effective inertia about the wrist axis in one step: armature and the drive, which is implicit in velocity and position [kg·m²]."""
+    """Effective inertia about the wrist axis in one step: armature + step · damping + step² · stiffness of the implicit drive [kg·m²]."""
     step: float
     """Time step [s]."""

@@ -35,9 +35,7 @@ DISC_RINGS, DISC_SPOKES = 16, 64
 
 
 class Lamp(NamedTuple):
-    """Lamp: a small and bright light of an environment map, or a part of one. Unit direction towards its centre, irradiance on a surface
-    that faces it, tangent of its angular radius, and unit directions towards sample points.
-    """
+    """Lamp: a small and bright light of an environment map, or a part of one."""
 
     direction: np.ndarray
     """Unit direction to its center (3)."""

@@ -23,9 +23,7 @@ SOLAR_TANGENT = np.tan(np.radians(0.267))
 
 
 class ExtractedSun(NamedTuple):
-    """Sun of an environment map: unit direction towards it, irradiance on a surface that faces it (zero: no sun there), tangent of its
-    angular radius; and the map without it.
-    """
+    """Sun of an environment map, and the map without it."""
 
     rest: np.ndarray
     """The map without the sun (rows, 2 rows, 3)."""
@@ -57,7 +55,10 @@ def extract_sun(radiance: np.ndarray, direction: np.ndarray) -> ExtractedSun:
 
 
 def sun_fraction(radiance: np.ndarray, direction: np.ndarray) -> np.ndarray:
-    """Fraction (rows, 2 rows) of each texel's radiance that belongs to the sun about a unit direction (3): contrast threshold."""
+    """Fraction (rows, 2 rows) of each texel's radiance that belongs to the sun about a unit direction (3), from 0 to below 1.
+
+    1 - t / luminance within SUN_SEARCH_RADIUS, above the horizon and where luminance exceeds t = SUN_CONTRAST · the map's mean; else 0.
+    """
     directions, solid_angles = map_directions(radiance.shape[0])
     luminance = radiance @ LUMINANCE
     threshold = SUN_CONTRAST * (luminance * solid_angles).sum() / (4.0 * np.pi)
@@ -81,7 +82,7 @@ def disc_radius_tangent(weight: np.ndarray, direction: np.ndarray) -> float:
 def replace_sun(radiance: np.ndarray, sun: Sun) -> ExtractedSun:
     """Replace the bright place of a map by the sun that its sIBL set names.
 
-    The sun has the set's direction and colour, and the larger luminance of the set's sun and the light it replaces: a clipped map
+    The sun has the set's direction and colour; its luminance is the larger one of the set's sun and the light it replaces: a clipped map
     lacks light, while a map that holds its sun unclipped is more exact than a number set by eye. Its angular radius is that of the
     light it replaces, but no less than the real sun's.
 
@@ -98,8 +99,8 @@ def draw_sun_disc(bright: np.ndarray, direction: np.ndarray, irradiance: np.ndar
     """Render a sun as a uniform disc into a black map (rows, 2 rows, 3), with the given irradiance on a surface that faces it.
 
     Args:
-        bright: Texels where the map is bright (rows, 2 rows) bool. If the disc overlaps them, its other texels are left out: hills
-            hide them.
+        bright: Texels where the map is bright (rows, 2 rows) bool. If any lies in the disc, the disc keeps only these: hills hide the
+            rest.
         direction: Unit direction (3) to the disc's centre, above the horizon.
         irradiance: (3).
         radius_tangent: Tangent of the disc's angular radius; the disc has at least one texel.

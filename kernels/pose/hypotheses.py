@@ -47,9 +47,7 @@ class Track:
 
 @wp.struct
 class TrackPolicy:
-    """Limits of acceptance into a track: least number of points, increase of the cost above which an estimate is rejected, frames without
-    an estimate after which any is taken (patience), and first running mean of the cost.
-    """
+    """Limits of acceptance of an estimate into a track."""
 
     min_points: int
     """Minimum observed points; with fewer an instance keeps its pose."""

@@ -34,9 +34,7 @@ class Models:
 
 @wp.struct
 class LossParameters:
-    """Robust losses: outlier distance (Tukey, Huber) and truncation of costs [m], depth margin [m], weights of silhouette and colour
-    residuals, colour outliers, and the stride with which points and samples are taken.
-    """
+    """Robust losses (Tukey, Huber): distances of outliers, weights, and the stride of points and samples."""
 
     cutoff: float
     """Distance from which a surface residual is an outlier (Tukey's biweight), and a silhouette residual grows linearly (Huber) [m]."""

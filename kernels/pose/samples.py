@@ -18,9 +18,7 @@ PROTRUDING = wp.constant(2)
 
 @wp.struct
 class SampleView:
-    """Model sample in a view: state (HIDDEN, VISIBLE, PROTRUDING), position [m] and normal in the camera frame, crop coordinates, area
-    across the ray [m²], depth by which it lies in front of what is seen there [m].
-    """
+    """Model sample in a view: state, position, normal and area, and depth in front of what is seen there."""
 
     state: int
     """HIDDEN, VISIBLE or PROTRUDING."""

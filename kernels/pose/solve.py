@@ -17,9 +17,7 @@ UNSEEN = wp.constant(1.0e6)
 
 @wp.struct
 class StepLimits:
-    """Gauss-Newton step: weights of the prior pose and of damping relative to the observation, largest translation [m] and
-    rotation [rad].
-    """
+    """Regularization and limits of a Gauss-Newton step."""
 
     prior: float
     """Weight of staying at the prior pose, relative to that of the observation."""

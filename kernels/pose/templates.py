@@ -64,9 +64,7 @@ class Probes:
 
 @wp.struct
 class Search:
-    """Template search: number of in-plane rotations, of shifts to each side and their step (of the diameter), truncation of depth
-    differences and tolerance in front of the background [m].
-    """
+    """Template search: in-plane rotations, shifts of the template, and tolerances in depth."""
 
     rotations: int
     """Number of in-plane rotations, about the optical axis."""

@@ -57,9 +57,7 @@ class Wrench:
 
 @wp.struct
 class TcpMotion:
-    """Motion of the TCP frame, in the world's axes: position [m], rotation to the world, unit axes of cup and wrist, moment arm from the
-    wrist to the TCP [m], velocity [m/s], angular velocity [rad/s].
-    """
+    """Pose and velocity of the TCP frame, and its arm from the wrist, in the world's axes."""
 
     position: wp.vec3
     """[m]"""

@@ -36,9 +36,10 @@ def begin_picking_kernel(
     removed_out: wp.array2d[int],  # (world, instance)
     tilt_out: wp.array[float],  # (coord) [rad]
 ):
-    """Reset the attempt state of worlds outside of phase ACT and in its first frame: there, a picking mode begins with task LOOK.
+    """Reset the attempt state of worlds outside of phase ACT or in its first frame, in which the picking modes begin with task LOOK.
 
-    The outcome of every world becomes NONE: it is an event of one tick. `tilt` is the drive target of the tilt joint. Launched over world.
+    The outcome of every world becomes NONE: it is an event of one tick. `tilt_out` (drive target of the tilt joint) and `overflow_out` (a
+    contour exceeds its capacity) become 0. Launched over world.
     """
     world = wp.tid()
     outcome_out[world] = Outcome.NONE
@@ -65,7 +66,7 @@ def clear_seals_kernel(
     # Out:
     attached_out: wp.array2d[int],  # (world, instance)
 ):
-    """Detach all objects of worlds outside of phase ACT: the last episode may have ended during a lift. Launched over world, instance."""
+    """Release all seals of worlds outside of phase ACT: the last episode may have ended during a lift. Launched over world, instance."""
     world, instance = wp.tid()
     if phase[world] != Phase.ACT:
         attached_out[world, instance] = 0
@@ -88,7 +89,10 @@ def remove_lost_kernel(
     removed_out: wp.array2d[int],  # (world, instance)
     attached_out: wp.array2d[int],  # (world, instance)
 ):
-    """Remove objects in phase ACT that fell below `pick.floor`, or are at rest outside of the tote: LOST. Launched over world, instance."""
+    """Remove objects in phase ACT that fell below `pick.floor`, or are at rest outside of the tote; `removed` becomes LOST.
+
+    `displacement` is an object's motion in the last tick. Launched over world, instance.
+    """
     world, instance = wp.tid()
     if phase[world] != Phase.ACT or catalog_index_inout[world, instance] < 0:
         return
@@ -121,7 +125,7 @@ def pack_attached_kernel(
 
 @wp.func
 def judge_attempt(target: int, engaged_bits: wp.uint32, attached_bits: wp.uint32) -> int:
-    """Outcome of an attempt from the target, the engaged instances and those still attached after the lift, both as bit masks."""
+    """`Outcome` of an attempt from the instances that it engaged (hit by a ray) and those still attached after the lift, as bit masks."""
     if attached_bits != wp.uint32(0):
         if target >= 0 and (attached_bits & (wp.uint32(1) << wp.uint32(target))) != wp.uint32(0):
             return Outcome.TARGET_PICKED
@@ -161,9 +165,9 @@ def advance_tasks_kernel(
     # Out:
     outcome_out: wp.array[int],  # (world)
 ):
-    """Task transitions at the end of a tick: PRESS to LIFT; LIFT to LOOK with an outcome; LOOK without a target to LOOK.
+    """Task transitions at the end of a tick: PRESS to LIFT; end of an attempt after LIFT, or after a LOOK without target (NOTHING_SEEN).
 
-    `outcome` is written in the tick in which an attempt ends. Launched over world.
+    The end writes `outcome`, counts failures and starts LOOK; `kernels.sim.gripper` has the transitions between. Launched over world.
     """
     world = wp.tid()
     if phase[world] != Phase.ACT or mode[world] == Mode.MOVE:
@@ -204,7 +208,7 @@ def end_attempts_kernel(
     joint_qd_out: wp.array[float],  # (dof) [m/s, rad/s]
     tilt_out: wp.array[float],  # (coord) [rad]
 ):
-    """In worlds at task LOOK, remove attached objects (PICKED) and place the gripper at home, cup upright, out of view.
+    """At task LOOK: release and remove attached objects (`removed` becomes PICKED), and place the gripper at `gripper_home`, cup upright.
 
     Launched over world.
     """
@@ -232,7 +236,7 @@ def park_removed_kernel(
     joint_qd_out: wp.array[float],  # (dof) [m/s, rad/s]
     joint_f_out: wp.array[float],  # (dof) [N, N·m]
 ):
-    """Park removed objects far below, each at its own position, in every tick; within a tick they fall by some centimetres.
+    """Park removed objects far below, each at its own position; in every tick, since they are simulated on and fall some centimetres.
 
     Launched over world, instance.
     """
@@ -260,7 +264,10 @@ def begin_attempts_kernel(
     hits_out: wp.array[int],  # (world)
     engaged_bits_out: wp.array[wp.uint32],  # (world)
 ):
-    """Begin an attempt in worlds at task LOOK after perception; those with a target change to APPROACH. Launched over world."""
+    """Begin an attempt in worlds at task LOOK after perception: no ray hits, no engaged instances; with a target, change to APPROACH.
+
+    Launched over world.
+    """
     world = wp.tid()
     if phase[world] != Phase.ACT or task_inout[world] != Task.LOOK:
         return
@@ -313,7 +320,7 @@ def set_shaft_collision_kernel(
     # Out:
     shape_transform_out: wp.array[wp.transform],  # (shape) [m]
 ):
-    """Enable collisions of the gripper shaft in mode MOVE, where the gripper is one rigid body, and disable them in picking modes.
+    """Disable collisions of the gripper shaft in the picking modes, by moving its shape far away; in mode MOVE it is in place.
 
     Launched over world.
     """

@@ -53,7 +53,7 @@ def collision_shapes(
 ) -> list[Shape | CatalogError]:
     """Compute the collision shape of each mesh (convex hull, or convex decomposition), or read it from the cache.
 
-    Those of the embedded objects come with the program (`embedded_shapes`). Both are computed in isolated processes (`system.isolation`).
+    Those of the embedded objects come with the program (`embedded_shapes`). Others are computed in isolated processes (`run_isolated`).
     What CoACD crashes on, cannot decompose or does not finish in time gets its convex hull instead, and a line says so.
 
     Args:
@@ -96,7 +96,7 @@ def collision_shapes(
 
 @dataclass(frozen=True, eq=False)
 class _Job:
-    """Convex decomposition to compute: the object's name and mesh, the recipe, and the cache file of the result."""
+    """Object whose collision shape is wanted: name, mesh, recipe (hull or decomposition), and the cache file of the shape."""
 
     name: str
     mesh: TriangleMesh
@@ -107,7 +107,7 @@ class _Job:
 def _decompose_all(jobs: Mapping[int, _Job], seconds: float, report: Callable[[str], None]) -> Iterator[tuple[int, Shape | Failure]]:
     """Decompose objects; yields the pieces of each as soon as it and all before it are done, or why there are none.
 
-    A decomposition that did not end within the same time before is not tried again.
+    A decomposition that an earlier call stopped at the same time limit, as the cache records, fails at once.
     """
     late = [index for index, job in jobs.items() if _load(_late_file(job.file, seconds))]
     yield from ((index, Failure(f"took longer than {seconds:g} s before", timed_out=True)) for index in late)
@@ -134,7 +134,7 @@ def _late_file(file: Path, seconds: float) -> Path:
 
 
 class _Saver:
-    """Writes shapes into the cache, until that fails once."""
+    """Writes shapes into the cache; once that has failed, it writes no more."""
 
     def __init__(self, report: Callable[[str], None]) -> None:
         self._report = report

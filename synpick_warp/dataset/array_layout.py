@@ -113,7 +113,7 @@ def check_layout(folder: Path, metadata: ArrayMetadata, spec: ArraySpec | None, 
 
 
 def _check_shape(folder: Path, shape: tuple[int, ...], dtype: np.dtype, spec: ArraySpec | None, sizes: Mapping[str, int]) -> dict[str, int]:
-    """Compare type and shape with the schema; returns the dimensions whose sizes nothing determines."""
+    """Compare type and shape with the schema (None: any); returns name and size of the dimensions whose sizes nothing determines."""
     import numpy as np
 
     if spec is None:
@@ -170,7 +170,7 @@ def _chunk_shapes(metadata: ArrayMetadata) -> list[Sequence[int]]:
 
 
 def _check_chunks(folder: Path, shape: Sequence[int], levels: Sequence[Sequence[int]], rows: int) -> None:
-    """Check that chunks are not larger than the array, but for the end of the last one, and not too many.
+    """Raise DatasetError if chunks are larger than the array, but for the end of the last one, or more than one a row and _FEW_CHUNKS.
 
     Args:
         folder: The array.

@@ -29,9 +29,7 @@ _MAX_METADATA = 2**24
 
 @dataclass(frozen=True, eq=False)
 class ObjectInfo:
-    """Physical properties of a catalog object, in its frame: mass [kg], centre of mass [m], inertia about it [kg·m²], diameter [m], volume
-    [m³].
-    """
+    """Physical properties of a catalog object, in its frame."""
 
     object_id: int
     """BOP object id."""
@@ -50,9 +48,7 @@ class ObjectInfo:
 
 @dataclass(frozen=True, eq=False)
 class CameraInfo:
-    """Pinhole camera: resolution and K [px], world-to-camera rotation and translation [m]. OpenCV's axes (x right, y down, z forward);
-    pixel centres at + 0.5.
-    """
+    """Pinhole camera in OpenCV's axes (x right, y down, z forward); pixel centres at + 0.5."""
 
     resolution: np.ndarray
     """Width and height (2) int32 [px]."""
@@ -88,10 +84,10 @@ class _ObjectsAttributes(Struct):
 
 @dataclass(frozen=True)
 class GroupContext:
-    """Sizes of dimensions and listed files that the arrays of a group must agree with; computed when the first array is opened."""
+    """What the arrays of a group must agree with: sizes of dimensions, and files that the manifest lists; computed on access."""
 
     sizes: Callable[[], Mapping[str, int]] = dict
-    """Sizes of dimensions by name, such as that of `tick`; others can have any."""
+    """Sizes of dimensions by name, such as that of `tick`; dimensions that are not named may have any size."""
     files: Callable[[], Collection[Path]] = tuple
     """Files that the manifest lists; none if there is no manifest."""
 
@@ -123,7 +119,7 @@ class Arrays(Mapping[str, "zarr.Array"]):
     def _check_files(self, folder: Path, largest: int) -> None:
         """Check that the chunk files that the manifest lists exist, and that all are regular files of up to `largest` bytes.
 
-        Zarr takes a chunk without file for one without values, and those are not written: only the manifest tells a lost one.
+        Zarr reads a missing chunk file as fill values, and writes no file for a chunk of these: only the manifest shows that one was lost.
         """
         present = {folder / entry.name for entry in os.scandir(folder)}
         for path in sorted(path for path in self._context.files() if path.parent == folder and path not in present):

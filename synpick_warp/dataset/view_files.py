@@ -52,8 +52,8 @@ class ViewRecords(NamedTuple):
 class SceneFiles(ABC):
     """Files of one scene: all frames of one camera in one episode.
 
-    Those of a bake have all parts, and images of one size. Of a lenient scene, from another source, parts may be missing, and images be of
-    any format that BOP data sets have; grey ones stand in for colour.
+    A scene of a bake has all parts, and images of one size. A lenient scene is from another source: parts may be missing, images may have
+    any format that BOP data sets have, and grey images stand in for colour.
     """
 
     def __init__(self, size: tuple[int, int] | None, lenient: bool = False) -> None:
@@ -107,14 +107,14 @@ class SceneFiles(ABC):
         return [self.mask(name, frame, index) for index in range(count)]
 
     def camera(self, frame: int) -> dict[str, Any]:
-        """A frame's entry in scene_camera.json; empty: there is no such file."""
+        """A frame's entry in scene_camera.json; empty: there is no such file. Raises DatasetError if the file lacks the frame."""
         found = self._part("camera", frame)
         if found is None and self.has("camera"):
             raise DatasetError(f"{self.place}: scene_camera.json has no image {frame}")
         return found or {}
 
     def records(self, frame: int) -> ViewRecords:
-        """Annotations of a frame. Of a lenient scene, what a missing scene_gt_info would tell is measured from the masks, or unknown."""
+        """Annotations of a frame. A lenient scene may lack scene_gt_info: it is measured from visible masks, or without these UNKNOWN."""
         camera, gt, info = (self._part(name, frame) for name in RECORD_NAMES)
         if not self.lenient:
             if camera is None or gt is None or info is None or len(gt) != len(info):
@@ -139,7 +139,7 @@ class SceneFiles(ABC):
         return found
 
     def image(self, name: str, frame: int) -> np.ndarray:
-        """An image, decoded by OpenCV without conversion (H, W[, 3]), blue first; `name` is "rgb", "depth" or a layer."""
+        """Decoded image "rgb", "depth" or a layer (H, W[, C]), as stored, blue first; lenient: "rgb" is converted to (H, W, 3) uint8."""
         _, data, source = self._need(name, frame)
         if not self.lenient:
             return decode_image(data, source, DatasetError, size=self.size)
@@ -152,7 +152,7 @@ class SceneFiles(ABC):
         return check_planes(self.image(name, frame), channels, f"{name} of image {frame} in {self.place}", dtype)
 
     def image_file(self, name: str, frame: int) -> tuple[str, bytes]:
-        """Suffix and content of an image's file, which states the scene's size; `name` as for `image`."""
+        """Suffix and content of an image's file; raises DatasetError unless its header states the scene's size. `name` as for `image`."""
         suffix, data, source = self._need(name, frame)
         return suffix, check_stated_size(data, self.image_size(frame) if self.lenient else self.size, source)
 
@@ -205,14 +205,14 @@ class SceneFolder(SceneFiles):
 
     @cached_property
     def _records(self) -> list[dict[int, Any] | None]:
-        """Annotations by image of each of RECORD_NAMES; None: there is no such file."""
+        """Annotations by image of each of RECORD_NAMES; None: a lenient scene has no such file, others raise DatasetError."""
         schemas = LENIENT_SCENE_SCHEMAS if self.lenient else SCENE_SCHEMAS
         return [
             read_checked(self.annotations(name), schemas[name]) if not self.lenient or self.has(name) else None for name in RECORD_NAMES
         ]
 
     def _part(self, name: str, frame: int) -> Any:
-        """Record of a frame by name; None: there is none; lenient: an empty list where only the annotation lacks it. See `SceneFiles`."""
+        """Record of a frame by name; None: none, but an empty list if a lenient gt or gt_info file exists without it. See `SceneFiles`."""
         part = self._records[RECORD_NAMES.index(name)]
         return None if part is None else part.get(frame, [] if self.lenient and name != "camera" else None)
 
@@ -292,7 +292,7 @@ class SceneShards(SceneFiles):
         return self.shards[0]
 
     def frames(self) -> tuple[int, ...]:
-        """Sorted im_ids of the views' records, or if lenient of images. See `SceneFiles`."""
+        """Sorted im_ids of the views that have camera.json, else gt.json, else (only if lenient) images. See `SceneFiles`."""
         for name in ("camera.json", "gt.json"):
             if found := [frame for frame, content in self._images.members if content == name]:
                 return tuple(sorted(found))
@@ -317,7 +317,7 @@ class SceneShards(SceneFiles):
         return f"{self.shards[0].parent} has no {self.scene:06d}_{frame:06d}.{name}.png{advice}"
 
     def masks(self, name: str, frame: int, count: int) -> list[np.ndarray]:
-        """Decoded masks of all instances; raises DatasetError unless they are numbered from 0 to count - 1. See `SceneFiles`."""
+        """Decoded masks 0 to count - 1; raises DatasetError if one is missing, others are ignored. See `SceneFiles`."""
         if (runs := self._read_runs(name, frame)) is None:
             raise DatasetError(f"{self.shards[0]} has no {name}; bake with bop.masks = true")
         if missing := set(range(count)) - set(runs):
@@ -381,7 +381,7 @@ def to_color(image: np.ndarray) -> np.ndarray:
 
 
 def check_stated_size(data: bytes, size: tuple[int, int] | None, source: object) -> bytes:
-    """Check the size that an image file states; returns its content."""
+    """Return an image file's content; raises DatasetError if its header is no image's or states another size (None: any)."""
     stated = image_size(data) or tiff_size(data)
     if stated is None or (size is not None and stated != size):
         there = "is not an image" if stated is None else f"has {stated[0]} x {stated[1]} pixels, not the camera's; {ADVICE}"
@@ -390,7 +390,7 @@ def check_stated_size(data: bytes, size: tuple[int, int] | None, source: object)
 
 
 def check_run_lengths(record: Mapping[str, Any], size: tuple[int, int] | None, source: str) -> None:
-    """Check that run lengths cover an image of that width and height exactly."""
+    """Raise DatasetError unless run lengths fill their own height and width, which must be `size` (width, height; None: any)."""
     height, width = record["size"]
     if size is not None and (width, height) != size:
         raise DatasetError(f"{source} has {width} x {height} pixels; the images of this camera have {size[0]} x {size[1]}")

@@ -55,8 +55,8 @@ def struct_arrays(struct: Any, *shape: str, units: Mapping[str, str] | None = No
 
     Args:
         struct: Class decorated by `wp.struct`. Its array annotations give types and numbers of dimensions; other members stay 0.
-        shape: Names of the dimensions of all its arrays ...
-        shapes: ... but for these, by the name of the member.
+        shape: Names of the dimensions of all its arrays that `shapes` does not name.
+        shapes: Names of the dimensions of single arrays, by the name of the member.
         units: Unit by the name of the member.
 
     Raises:

@@ -86,7 +86,7 @@ class HostCopy:
         self.done = wp.Event(self.device) if self.device.is_cuda else None
 
     def start(self, stream: wp.Stream | None) -> None:
-        """Begin to copy on `stream`, after the work queued on the current stream; None: on the current stream. A CPU copies at once."""
+        """Begin to copy on `stream` (None: the current one), after the work queued on the current one. A CPU copies at once, if at all."""
         if self.target is self.source:
             return
         if self.done is None:

@@ -38,7 +38,7 @@ RING = 3
 
 
 def views_per_batch(render: Render, cameras: Cameras, worlds: int, device: wp.Device) -> int:
-    """Count of views rendered at once: `render.views_per_batch`, or chosen by device and resolution."""
+    """Number of views rendered at once: as set; else on a CPU one world's, on a GPU what BATCH_BYTES hold, up to all worlds'."""
     views = len(cameras.positions)
     if render.views_per_batch:
         return render.views_per_batch

@@ -16,9 +16,7 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.struct
 class BodyMotions:
-    """Motion of each body from this frame back to the previous one, in the camera's axes: whether known, rotation minus identity, current
-    origin, and displacement to the previous origin [m]; by view and body. Scratch.
-    """
+    """Motion of each body from this frame back to the previous one, in the camera's axes. Scratch."""
 
     known: wp.array2d[int]
     """1: the body was in the scene in the previous frame, of the same episode (view, body)."""
@@ -65,7 +63,7 @@ def compute_motions_kernel(
     """Relative rigid motion of each body: p_then - p = (R_then R⁻¹ - 1) (p - o) + (o_then - o), in float64, stored in float32.
 
     `motions_out` receives R_then R⁻¹ - 1, o and o_then - o, rotated to the camera's axes. Differences are stored instead of poses, so that
-    small motions have small errors. Launched over view, body.
+    small motions have small errors. `follows` is 1 if the last tick was the previous frame of the same episode. Launched over view, body.
     """
     view, body = wp.tid()
     world = views.world[view]

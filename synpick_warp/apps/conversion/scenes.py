@@ -1,4 +1,4 @@
-"""Views of a scene that is converted, as exporters take them: files as they are, annotations as they were read, masks as runs."""
+"""Views of a scene that is converted, as exporters take them: image files byte for byte, annotations unchanged, masks as run lengths."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class StoredSceneFiles:
     """`StoredScene` of a scene folder or of shards."""
 
     files: SceneFiles
-    """Of which nothing has been read, so that they are small when pickled."""
+    """Files of the scene; none has been read yet, so that this is small when pickled."""
     scene: int
     """BOP scene_id."""
     images: Sequence[int]
@@ -95,7 +95,7 @@ class StoredViewFiles:
         return self.files.typed_image("depth", self.frame, None, "uint16")
 
     def masks(self) -> list[Masks]:
-        """Run lengths of the amodal and visible mask of each instance, read within their boxes. See `EncodedView`."""
+        """Run lengths of the amodal and visible mask of each instance; decoded within its box where that suffices. See `EncodedView`."""
         return [
             Masks(
                 self._read_runs("mask", index, info["bbox_obj"], info["px_count_valid"]),
@@ -105,7 +105,7 @@ class StoredViewFiles:
         ]
 
     def _read_runs(self, name: str, index: int, box: list[int], count: int) -> Runs:
-        """Read a mask within its box, or the whole of it, if the box does not hold the pixels that the annotations count."""
+        """Runs of a mask, decoded within its box; if that has not exactly `count` pixels, as annotated, the whole mask is decoded."""
         width, height = self.files.image_size(self.frame)
         left, top = max(0, box[0]), max(0, box[1])
         rows, columns = slice(top, max(top, min(height, box[1] + box[3] + 1))), slice(left, max(left, min(width, box[0] + box[2] + 1)))

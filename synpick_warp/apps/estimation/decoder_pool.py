@@ -38,7 +38,7 @@ class Decoder:
 
 @dataclass(frozen=True)
 class OpenJob:
-    """Task: open a job in the shared memory of a handle."""
+    """Task: make a job the current one; its batches lie in the shared memory whose file handle comes with the task."""
 
     job: DecodeJob
 
@@ -52,7 +52,7 @@ class OpenJob:
 
 @dataclass(frozen=True)
 class DecodeViews:
-    """Task: decode the views `first` to `stop - 1` of a step into the batch of that index."""
+    """Task: decode one frame of the job's scenes `first` to `stop - 1` into a batch: view i is scene i, `step` the frame's index in it."""
 
     batch: int
     step: int
@@ -99,7 +99,7 @@ class DecoderPool(WorkerPool):
         """Open a job in all processes; later tasks refer to it.
 
         Returns:
-            Its batches, which lie in shared memory, and the answers to come.
+            Its batches, which lie in shared memory, and a future per process, done when it has opened the job.
 
         Raises:
             ProcessError: Memory cannot be allocated, or a process died.

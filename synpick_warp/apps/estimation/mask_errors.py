@@ -19,12 +19,12 @@ MIN_RADIUS = 1.0
 def disturb_labels(label: np.ndarray, boxes: np.ndarray, instances: np.ndarray, seed: int, scene: int, frame: int) -> None:
     """Change the masks of random instances of an image, in place.
 
-    An instance is eroded, dilated or swapped if its first sample says so, each with probability FRACTION, in the order of slots. Swaps
-    exchange the masks of two instances, so one begins a swap with half the probability; the partner is drawn from the neighbours that were
-    not swapped yet, and an instance without one keeps its mask. Swaps come first, then the new masks are eroded and dilated.
+    An instance is eroded with probability FRACTION, dilated with FRACTION, and begins a swap with half of FRACTION, since a swap exchanges
+    the masks of two. The partner is drawn from the visible neighbours that were not swapped yet; without one the mask stays. Swaps come
+    first, by slot; an instance that was chosen for an error of its own may be a partner, and its new mask is eroded or dilated.
 
     Args:
-        label: Label image (H, W) uint8: 1 + slot.
+        label: Label image (H, W) uint8: 1 + slot, the index of an instance in the scene's arrays.
         boxes: Visible boxes (S, 4) [px] by slot: x, y, width, height as BOP has them; negative sizes: nothing is visible.
         instances: Instance index by slot (S,), which names the random samples.
         seed: Seed of the estimation.

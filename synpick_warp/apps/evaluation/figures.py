@@ -87,7 +87,7 @@ def draw_figures(
         attempts: Episode -> frames of its pick attempts.
 
     Returns:
-        File name -> PNG file. There is no trajectory if no track has two images, and no error by visibility
+        File name -> PNG file. There is no trajectory if all methods have no track of two images in common, and no error by visibility
         or speed if none is known.
 
     Raises:
@@ -155,8 +155,8 @@ def _track_rows(truth: Truth, track: Track) -> np.ndarray:
 def _farthest_track(truth: Truth, methods: Sequence[Method], min_visibility: float) -> Track | None:
     """Of the tracks that all methods have in half of their images, the one with the longest diagonal of a box around its positions.
 
-    Images count in which the instance is visible enough, so that what falls out of sight is no motion. If no track is known so well, it is
-    the first that all methods have at all.
+    Images count in which the instance is visible enough, so that what falls out of sight is no motion; a track has two of them. If none is
+    known so well, it is the farthest that all methods have in any image. None: there is no such track.
     """
     seen = np.flatnonzero(truth.shown(min_visibility))
     keys = np.stack((truth.poses.scene[seen], truth.poses.instance[seen]), axis=1)
@@ -206,10 +206,10 @@ def file_names(names: Sequence[str]) -> list[str]:
 
 
 def check_folder(folder: Path) -> None:
-    """Check that pictures can be written to a folder, which is new or empty.
+    """Check that the folder for pictures is new or empty, and below a folder; whether it can be written is not tested.
 
     Raises:
-        OutputError: It is something else.
+        OutputError: It is not, or cannot be read.
     """
     try:
         if os.path.lexists(folder) and (not folder.is_dir() or any(folder.iterdir())):

@@ -52,7 +52,7 @@ def plot_trajectory(
         method: Name of the method.
 
     Raises:
-        DatasetError: A table has several rows of an image, or there is nothing to draw.
+        DatasetError: A table has several rows of an image, two curves have the same name, or there is nothing to draw.
     """
     named = {"Ground truth": truth, method: estimates, **filtered}
     if len(named) != 2 + len(filtered):
@@ -87,7 +87,7 @@ def plot_recall(errors: Mapping[str, np.ndarray], *, metric: str = "ADD-S", max_
     """Accuracy-threshold curves: the fraction of instances with an error of at most the threshold.
 
     Args:
-        errors: Name of a method or an object -> errors of all instances (N,) [m], infinity for misses; a name may tell the area.
+        errors: Name of a method or an object -> errors of all instances (N,) [m], infinity for misses; the legend shows the names.
         metric: Name of the error.
         max_error: Largest threshold [m].
     """
@@ -102,7 +102,7 @@ def plot_recall(errors: Mapping[str, np.ndarray], *, metric: str = "ADD-S", max_
 def plot_error_by_visibility(
     visibility: np.ndarray, errors: Mapping[str, np.ndarray], *, metric: str = "ADD-S", edges: Sequence[float] = VISIBILITY_BINS
 ) -> Spec:
-    """Error against the visible fraction of instances (N,), from 0 to 1; otherwise as `plot_error_by_speed`."""
+    """Error against the visible fraction of instances (N,), from 0 to 1: the panels and arguments of `plot_error_by_speed`."""
     ticks = [f"{100 * edge:g}" for edge in edges]
     return _plot_bins(np.asarray(visibility, np.float64), errors, metric, np.asarray(edges, np.float64), ticks, "Visible fraction [%]")
 
@@ -110,7 +110,7 @@ def plot_error_by_visibility(
 def plot_error_by_speed(
     speed: np.ndarray, errors: Mapping[str, np.ndarray], *, metric: str = "ADD-S", edges: Sequence[float] = SPEED_BINS
 ) -> Spec:
-    """Error against speed: median and quartiles of each bin, and below them the number of instances.
+    """Error against speed, in bins: above, median and quartiles of each method [cm]; below, the share of all instances [%].
 
     Args:
         speed: Speed of each true instance (N,) [m/s].
@@ -145,7 +145,7 @@ def plot_sweep(sweep: AlphaSweep, *, score: str = "ADD-S AUC") -> Spec:
 
 
 def _plot_bins(values: np.ndarray, errors: Mapping[str, np.ndarray], metric: str, edges: np.ndarray, ticks: list[str], label: str) -> Spec:
-    """Median and quartiles of errors by bins of equal width on the page, whatever their width in values."""
+    """Chart of errors by bins, drawn equally wide: median and quartiles of each method above, the share of instances [%] below."""
     if len(edges) < 2 or not (np.diff(edges) > 0).all():
         raise DatasetError(f"bin edges {edges.tolist()} are not allowed; give at least two, rising")
     if values.ndim != 1 or not np.isfinite(values).all():

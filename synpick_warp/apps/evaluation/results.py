@@ -51,7 +51,7 @@ class ResultFile:
 
 
 def read_results(path: Path) -> ResultFile:
-    """Read a BOP result file; rows of equal scene, image and object keep their order.
+    """Read a BOP result file; rows are sorted by scene, image and object, and keep their order where these are equal.
 
     Raises:
         ResultError: In one line with the line's number: wrong columns, a number that is none, not finite or out of range, a matrix that is
@@ -83,7 +83,7 @@ def read_results(path: Path) -> ResultFile:
 
 
 def _convert(lines: list[bytes], path: Path, start: int) -> tuple[np.ndarray, np.ndarray]:
-    """Indices (N, 3) int64, and score, R, t and time (N, 14) float64 of lines from line `start` on."""
+    """Indices (N, 3) int64, and score, R, t and time (N, 14) float64 of lines from line `start` on; raises ResultError."""
     rows = [line.split(b",") for line in lines]
     for number, (line, row) in enumerate(zip(lines, rows, strict=True), start):
         # Cheap checks of every line, which make the conversion below fit; the messages are composed only if one fails.
@@ -103,7 +103,7 @@ def _convert(lines: list[bytes], path: Path, start: int) -> tuple[np.ndarray, np
 
 
 def _describe_line(line: bytes, path: Path, number: int) -> str:
-    """Error message on a line with a wrong number of columns."""
+    """Error message on a line that is not of FORMAT: wrong number of columns or of their numbers, or a text that is no number."""
     place, row = f"{path}, line {number}", line.split(b",")
     if not line.strip():
         return f"{place} is empty; each line is {FORMAT}"
@@ -215,7 +215,7 @@ def _first(results: ResultFile, bad: np.ndarray) -> int:
 
 
 def _check_units(results: ResultFile, truth: Truth) -> None:
-    """Compare the median distances from the camera, which a wrong unit changes by a factor of 1000."""
+    """Raise ResultError if the median distance from the camera is so far from the truth's that t seems to have another unit."""
     if not len(truth):
         return
     estimated, true = (float(np.median(np.linalg.norm(poses.translation, axis=1))) for poses in (results.poses, truth.poses))

@@ -29,9 +29,7 @@ PoseStep = Callable[[PoseTable], PoseTable]
 
 @dataclass(frozen=True, eq=False)
 class Scores:
-    """Errors of one method for the T true instances that are visible enough: by metric [m] (infinity: missed), rotation [°] and translation
-    [m] (NaN: missed); mean time per image [s] (NaN: unknown).
-    """
+    """Errors of one method for the T true instances that are visible enough."""
 
     name: str
     """Name of the method."""

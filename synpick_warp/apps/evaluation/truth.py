@@ -49,7 +49,7 @@ def read_truth(data_set: DataSet) -> Truth:
     """Read the ground truth of all committed episodes and cameras.
 
     Raises:
-        DatasetError: The data set has no images or no episode, or a file is missing or damaged.
+        DatasetError: The data set has no ground truth, instance ids or episode, a scene id in two splits, or a file missing or damaged.
     """
     parts, splits = [], dict[int, str]()
     for index, episode in data_set.items():

@@ -37,14 +37,14 @@ def choose_episodes(episodes: Episodes) -> list[int]:
 
 
 def make_strip(data_set: DataSet, index: int, strips: int, album: Album, report: Callable[[int, int], None]) -> dict[str, Any] | None:
-    """JSON of an episode's film strip, whose pictures are added to the album; None: not even two frames fit the budget.
+    """JSON of an episode's film strip, whose pictures are added to the album; None: not even two frames fit the album's budget in bytes.
 
     Args:
         data_set: The data set.
         index: Index of the episode.
         strips: Number of strips that are still to share the budget, this one included.
         album: Receives the pictures.
-        report: Receives the number of pictures that were read, and the largest number.
+        report: Receives the number of pictures that were encoded, and how many there are at most.
 
     Raises:
         DatasetError: A file is missing or damaged.

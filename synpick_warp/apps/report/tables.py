@@ -42,7 +42,7 @@ _SUCCESSES = {outcome.name.lower() for outcome in Outcome if outcome.succeeded}
 
 
 def statistics_tables(statistics: Statistics) -> Html:
-    """Tables by split and mode, and beside the paper's numbers."""
+    """HTML of SHOWN_TABLES: views by split and mode, comparison with the paper, attempts and seals, quantiles of depth."""
     return join(_table(table) for table in make_tables(statistics) if table.name in SHOWN_TABLES and table.rows)
 
 
@@ -53,14 +53,14 @@ def _table(table: Table) -> Html:
 
 
 def plain_table(names: Sequence[str], rows: Iterable[Sequence[str]], classes: Sequence[str]) -> Html:
-    """A table with a header; a class for each column."""
+    """HTML of a table with a header; `classes` has the CSS class of each column."""
     head = element("tr", [element("th", name, class_=each, scope="col") for name, each in zip(names, classes, strict=True)])
     body = [element("tr", [element("td", value, class_=each) for value, each in zip(row, classes, strict=True)]) for row in rows]
     return element("table", element("thead", head), element("tbody", body))
 
 
 def findings_list(findings: Sequence[Finding]) -> Html:
-    """HTML list of all findings."""
+    """HTML list of what is odd in the data set's figures (`report.findings`), with level, title and detail; a sentence if nothing is."""
     if not findings:
         return element("p", "Nothing was found that a person would raise.", class_="empty")
     items = [

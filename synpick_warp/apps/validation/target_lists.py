@@ -13,12 +13,12 @@ from synpick_warp.system.inputs.json import MAX_JSON, decode_json
 
 @dataclass(frozen=True)
 class TargetList:
-    """Target list: records by scene and image (none of several views), and what is wrong with the file (empty: nothing)."""
+    """Target list: its records of single images, by scene and image, and what is wrong with the file."""
 
     scenes: dict[int, dict[int, list[TargetEntry]]] = field(default_factory=dict)
-    """Records by scene and image. Records of several views, as in multi-view lists, are under no image."""
+    """Records by scene and image. Those of several images (multi-view lists) are dropped; their scene stays, with what else it has."""
     fault: str = ""
-    """What is wrong with the file."""
+    """What is wrong with the file; empty: nothing."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,7 +47,10 @@ class TargetLists:
         return TargetList(scenes)
 
     def splits(self, name: str) -> list[str]:
-        """Splits that a target list refers to: those with its prefix, else the validation splits, else all."""
+        """Splits that a target list refers to: `PREFIX` and `PREFIX_*` of a file `PREFIX_targets*`, else `val` and `val_*`, else all.
+
+        Splits with scene folders come first: others count only if no split has any.
+        """
         prefix = name.split("_targets")[0]
         with_scenes = [split for split, listing in self.layout.splits.items() if any(map(is_index, listing.folders))]
         names = with_scenes or list(self.layout.splits) or list(self.layout.keyed)
@@ -58,7 +61,7 @@ class TargetLists:
         return names
 
     def scene_ids(self, name: str) -> set[int]:
-        """Indices of the scenes in the splits that a list is about."""
+        """Indices of the scenes in the splits that a list is about; without scene folders (shards, imagewise), those that it names."""
         splits = self.splits(name)
         if not self.layout.splits:
             return set(self.lists[name].scenes)

@@ -65,7 +65,7 @@ class FolderImages:
         return self._indices[kind]
 
     def _index(self, listing: Listing, paired: bool) -> dict[Index, str]:
-        """File names by (image, instance or None); `paired`: names with an instance (masks). Of several files one suffix wins."""
+        """File names by (image, instance or None); `paired`: names with an instance (masks). Of several the first in SUFFIXES wins."""
         found: dict[Index, str] = {}
         matches = [match for name in listing.files if (match := _NAME.fullmatch(name)) and match[3].lower() in SUFFIXES]
         for match in sorted(matches, key=lambda match: SUFFIXES.index(match[3].lower())):
@@ -137,7 +137,7 @@ class KeyedImages:
             found[int(match[2]), match[3]] = member
 
     def content(self, member: Member, limit: int) -> bytes:
-        """Content of a member of at most `limit` bytes. Raises DatasetError if it cannot be read."""
+        """Content of a member, of a shard's its first `limit` bytes. Raises DatasetError if it cannot be read, or a file is larger."""
         if member.size is None:
             return self.listing.read(member.path.name, limit)
         try:

@@ -56,7 +56,7 @@ class Layout:
     def __init__(self, folder: Path) -> None:
         """
         Raises:
-            DatasetError: The folder does not exist, cannot be listed, or has nothing of a BOP data set.
+            DatasetError: The folder does not exist, cannot be listed, has nothing of a BOP data set, or is a scene or split of one.
         """
         if not folder.is_dir():
             raise NoLayoutError(f"there is no folder {folder}; name the folder of a BOP data set")

@@ -42,7 +42,7 @@ class FoundScenes:
 
     @cached_property
     def _scenes(self) -> dict[int, dict[str, SceneRef]]:
-        """Scenes by episode and sensor suffix."""
+        """Scenes of the chosen split, or all, by episode (scene_id, plus an offset for each split if some clash) and sensor suffix."""
         by_split: dict[str, list[SceneRef]] = {}
         for ref in self.refs():
             by_split.setdefault(ref.split, []).append(ref)
@@ -61,7 +61,7 @@ class FoundScenes:
         return [*folders, *(ref for ref in self._keyed() if ref.split.removesuffix("_web") not in splits)]
 
     def _keyed(self) -> Iterator[SceneRef]:
-        """Yield the scenes of shards and of the imagewise layout."""
+        """Yield the scenes of shards and of the imagewise layout; raises DatasetError if a shard cannot be read."""
         for folder in map(KeyedFolder, self.layout.keyed.values()):
             if fault := next((keys for keys in folder.members.values() if isinstance(keys, str)), None):
                 raise DatasetError(fault)

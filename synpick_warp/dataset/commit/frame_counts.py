@@ -28,7 +28,7 @@ _TIME = 0.125
 
 
 def check_frames(folder: Path, layout: DataLayout | None, episode: int, frames: int) -> None:
-    """Compare an episode's number of frames with the sizes of its files in every format.
+    """Compare an episode's number of frames, if it is above _HARMLESS, with the sizes of its files in every format.
 
     Args:
         folder: The data set.

@@ -138,7 +138,7 @@ def read_manifest(folder: Path) -> dict[str, Any]:
     """Read a data set's manifest.
 
     Raises:
-        DatasetError: There is none, it is damaged, or has been changed by hand.
+        DatasetError: There is none, it is of another format, damaged, or has been changed by hand.
     """
     path = path_inside(folder, MANIFEST_FILE, folder, DatasetError)
     if not os.path.lexists(path):

@@ -124,7 +124,7 @@ def _check_folders(parts: Sequence[Path], out: Path) -> None:
 
 
 def _sources(parts: Sequence[Path], layout: DataLayout) -> dict[Path, Path]:
-    """Choose the part that each manifest entry is taken from: entry -> part. Reads, and so validates, all entries and checksum lists."""
+    """Choose the part that each manifest entry is taken from: entry -> part. All entries and checksum lists are read, and so checked."""
     sources: dict[Path, Path] = {}
     for part in parts:
         for entry in (CONSTANTS, *map(episode_entry, committed_episodes(part))):

@@ -54,7 +54,7 @@ class Verdict(NamedTuple):
 
 
 class CheckPart(NamedTuple):
-    """Task: check part `part` of `parts` of the files that a manifest entry lists."""
+    """Task: check one of `parts` equal parts of the files that a manifest entry lists."""
 
     entry: Path
     part: int = 0
@@ -75,7 +75,7 @@ class Checked(NamedTuple):
 def verify(folder: Path, threads: int | None = None, report: Report = lambda unit, done, total: None) -> Verdict:
     """Verify the checksum of every file of a data set, as recorded when it was written; stops at the first mismatch.
 
-    Order: settings, constants, episodes by index, indices.
+    Order: settings, constants, episodes by index, indices; then, whether an episode that the indices list is missing.
 
     Args:
         folder: The data set.
@@ -83,7 +83,7 @@ def verify(folder: Path, threads: int | None = None, report: Report = lambda uni
         report: Receives the number of checked files.
 
     Raises:
-        DatasetError: The folder is not a data set.
+        DatasetError: The folder is not a data set, or its manifest is damaged.
         ProcessError: Processes cannot be started, or one died.
     """
     manifest = read_manifest(folder)
@@ -146,7 +146,9 @@ class _Checker:
 
 
 def check_part(folder: Path, task: CheckPart, read: Callable[[Path, Path], dict[str, str]] = read_checksums) -> Checked:
-    """Check a part of a manifest entry's files, up to the first problem; returns their number and the problem.
+    """Check the checksums of a part of a manifest entry's files, up to the first problem.
+
+    Part 0 also checks, before, that the list has the file names that the settings imply, and after, an episode's number of frames.
 
     Args:
         folder: The data set.
@@ -168,7 +170,7 @@ def check_part(folder: Path, task: CheckPart, read: Callable[[Path, Path], dict[
 
 
 def _check_counts(folder: Path, entry: Path, known: Mapping[str, str]) -> str:
-    """Compare an episode's number of frames with its files; returns the problem, or an empty string."""
+    """Compare an episode's number of frames with its files; returns the problem, or an empty string, as for entries of no episode."""
     if entry in (CONSTANTS, INDICES):
         return ""
     try:
@@ -192,7 +194,8 @@ def check_files(folder: Path, known: Mapping[str, str], limit: int | None = None
     Args:
         folder: The data set.
         known: Expected SHA-256 of each file, by path relative to the data set.
-        limit: Size of all files together [bytes]; a larger one, which may have holes of terabytes, is not read.
+        limit: Largest size of a file [bytes], such as the sum of all; a larger file is a problem and not read: it may be a sparse
+            file of terabytes. None: any size.
     """
     for number, (name, expected) in enumerate(known.items(), 1):
         if problem := _check_file(f"{folder}/{name}", expected, limit):  # Faster than Path's operator by a fifth of a small file's time.

@@ -41,7 +41,7 @@ class ArraySpec:
     """Names of the values 0, 1, ... of an enumeration."""
 
     def shape(self, sizes: Mapping[str, int]) -> tuple[int, ...]:
-        """Shape of the array for these sizes; dimensions with labels have a fixed size."""
+        """Shape of the array, from the sizes of dimensions by name; those in LABELS have as many elements as labels."""
         return tuple(len(LABELS[name]) if name in LABELS else sizes[name] for name in self.dims)
 
 

@@ -131,7 +131,7 @@ def _write_arrangement(group: zarr.Group, content: EpisodeContent, settings: Epi
 
 
 def make_attempt_arrays(attempts: Sequence[Mapping[str, Any]], instances: int) -> dict[str, np.ndarray]:
-    """Convert attempts (lines of attempts.jsonl) to columns, the arrays of ATTEMPTS; `record` stays empty."""
+    """Convert attempts (lines of attempts.jsonl) to the arrays of ATTEMPTS, with NaN, -1 or 0 for unknown; `record` stays empty."""
     ticks = max((len(attempt["peak_force"]) for attempt in attempts), default=0)
     sizes = {"attempt": len(attempts), "instance": instances, "lift_tick": ticks, "byte": 0}
     columns = {}

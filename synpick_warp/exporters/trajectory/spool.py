@@ -72,7 +72,7 @@ def batch_type(batch: TickBatch, instances: int, steps_per_tick: int) -> np.dtyp
         steps_per_tick: Number of physics steps in a tick.
 
     Raises:
-        ValueError: The batch has arrays that the schema lacks.
+        ValueError: The batch has arrays of steps that the schema lacks; such arrays of ticks are left out.
     """
     ticks = tuple(name for name in TICKS.arrays if name in _OWN or name in batch.tick)
     steps = tuple(name for name in STEPS.arrays if name in batch.steps)

@@ -58,7 +58,7 @@ def parse_checksums(lines: bytes, folder: Path, source: Path, advice: str) -> di
         advice: What to do if it is damaged.
 
     Raises:
-        DatasetError: A line is no digest and name, a name leads out of the folder, or is there twice.
+        DatasetError: The list is not UTF-8, a line is no digest and name, a name leads out of the folder, is a record, or is there twice.
     """
     known: dict[str, str] = {}
     folders: set[str] = set()

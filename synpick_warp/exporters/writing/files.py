@@ -28,7 +28,7 @@ def check_output_folder(out: Path) -> None:
     """Check that a data set can be written to a folder; creates nothing that stays.
 
     Raises:
-        OutputError: The folder holds something other than a data set, or cannot be created or written.
+        OutputError: The folder holds something other than a data set, lies in another data set, or cannot be created or written.
     """
     _check_outside(out)
     created = [folder for folder in (out, *out.parents) if not os.path.lexists(folder)]
@@ -59,7 +59,7 @@ def _check_outside(out: Path) -> None:
     """Check that a data set does not lie in another one, whose files it would mix with.
 
     Raises:
-        OutputError: It does.
+        OutputError: It does, or the path cannot be resolved.
     """
     try:
         parents = out.resolve().parents

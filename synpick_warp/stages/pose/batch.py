@@ -71,9 +71,7 @@ class InstanceTable:
 
 @dataclass(frozen=True, eq=False)
 class Estimates:
-    """Estimates of the N instances of a table in one frame: pose from object to camera [m], score (higher is better), whether there is one,
-    and time [s].
-    """
+    """Pose estimates of the N instances of a table in one frame."""
 
     pose: np.ndarray
     """Object to camera (N, 7) float32: translation x, y, z [m], unit quaternion x, y, z, w."""

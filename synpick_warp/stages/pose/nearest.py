@@ -72,7 +72,7 @@ class NearestVertices:
 
         Args:
             rotation: (P, 3, 3).
-            translation: (P, 3) [m]; all moved vertices must be within reach.
+            translation: (P, 3) [m]; all moved vertices must lie in the cube of the constructor's `center` and `reach`.
 
         Returns:
             (P,) [m].
@@ -92,7 +92,7 @@ class NearestVertices:
         return result
 
     def _build(self, count: int) -> tuple[np.ndarray, np.ndarray]:
-        """(nodes, candidates): the arrays of the grid, as the kernel reads them."""
+        """Arrays (nodes, candidates) of the grid, as the kernel reads them, for `count` distinct vertices."""
         level = _Level(np.zeros((1, 3)), np.zeros(1, np.int64), np.full(1, count), np.arange(count))
         edge = 2.0 * self._half
         nodes, candidates, nodes_before, entries_before = [], [], 0, 0
@@ -120,7 +120,7 @@ class NearestVertices:
         return np.concatenate(nodes), np.concatenate(candidates)
 
     def _divide(self, level: _Level, edge: float) -> _Level:
-        """Children of cells, each with its list, in the order of their parents."""
+        """The BRANCH³ children of each cell, of edge `edge` [m], each with its list, in the order of their parents."""
         cells = CHILDREN * len(level.corner)
         inputs = [self._vertex, self._upload(level.corner, wp.vec3d)]
         inputs += [self._upload(part, wp.int32) for part in (level.start, level.length, level.candidate)]
@@ -144,7 +144,7 @@ class NearestVertices:
 
 
 def _longest(length: np.ndarray) -> np.ndarray:
-    """Mask of the cells whose list is so long that they are divided (C,) bool."""
+    """Mask of the cells to divide (C,) bool: with lists longer than _MAX_LIST, but of these only the longest, at most _MAX_DIVIDED."""
     limit = _MAX_LIST
     if len(length) > _MAX_DIVIDED:
         limit = max(limit, int(np.partition(length, -_MAX_DIVIDED)[-_MAX_DIVIDED]))

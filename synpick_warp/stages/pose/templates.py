@@ -40,9 +40,7 @@ PROBES = struct_arrays(
 
 @dataclass(frozen=True)
 class SearchSettings:
-    """Settings of the template search: viewing directions, in-plane rotations, shifts (of the diameter), numbers of compared points inside
-    and beside the mask, tolerances in depth [m].
-    """
+    """Settings of the template search: directions, rotations and shifts, compared points, tolerances in depth."""
 
     directions: int = 96
     """Viewing directions, spread over the sphere: 20° apart."""

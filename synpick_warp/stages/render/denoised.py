@@ -169,7 +169,7 @@ def scratch_sizes(render: Render, width: int, height: int, histories: int = 0) -
 def queue_sizes(render: Render, width: int, height: int, views: int, histories: int, device: wp.Device) -> dict[str, int]:
     """Extents of the dimensions of `PATH_QUEUES`, for at most `views` views of a batch.
 
-    There are no queues on a CPU, which has no warps, and where all coarse pixels trace several paths.
+    There are no queues on a CPU, which has no warps, nor where no paths are traced, or several in every coarse pixel.
     """
     single = accumulates(render, histories) or paths_per_coarse_pixel(render, width, histories) == 1
     size = coarse_size(render, width, histories)

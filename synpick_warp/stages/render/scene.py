@@ -122,7 +122,7 @@ def uv_density(mesh: TriangleMesh) -> np.ndarray:
 def build_meshes(
     shapes: list[TriangleMesh], entries: int, device: wp.Device, interior: Interior | None = None
 ) -> tuple[Any, tuple[wp.Mesh, ...]]:
-    """Build one `wp.Mesh` with its BVH per shape, and the struct `Meshes`; `interior` is the tote's empty interior."""
+    """The struct `Meshes`, and a `wp.Mesh` per shape, which must outlive it; `interior` is the tote's empty interior (None: none)."""
     keep = tuple(
         wp.Mesh(
             points=wp.array(shape.vertices, dtype=wp.vec3, device=device),

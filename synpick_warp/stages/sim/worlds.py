@@ -66,9 +66,7 @@ class WorldState:
 
 @dataclass(frozen=True, eq=False)
 class AttemptState:
-    """Attempt to pick of each world: task, its duration [steps], outcome, failures, rays that hit, engaged and attached instances as bit
-    fields, and why instances have left the scene.
-    """
+    """Attempt to pick of each world: task, outcome, failures, instances that the cup holds, and what has left the scene."""
 
     task: wp.array = device_array("world", dtype=wp.int32)
     """`Task`."""
@@ -92,9 +90,7 @@ class AttemptState:
 
 @dataclass(frozen=True, eq=False)
 class SealState:
-    """Seals of each world's cup: which instances are attached, their poses in the TCP frame at engagement, seal forces (0: none), break
-    force and peak force [N].
-    """
+    """Seals of each world's cup: attached instances, with their poses and forces."""
 
     attached: wp.array = device_array("world", "instance", dtype=wp.int32)
     """1: a seal holds the instance."""

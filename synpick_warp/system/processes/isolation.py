@@ -65,10 +65,10 @@ class Limits:
 
 @dataclass(frozen=True)
 class Failure:
-    """Why an isolated call has no result: a predicate such as "crashed (SIGSEGV)", and whether it timed out."""
+    """Why an isolated call has no result, and whether it timed out."""
 
     reason: str
-    """Predicate, such as "crashed (SIGSEGV)"."""
+    """Reason, as the rest of a sentence whose subject the caller adds, such as "crashed (SIGSEGV)"."""
     timed_out: bool = False
 
 
@@ -76,7 +76,7 @@ _STOPPED = Failure("was stopped")
 
 
 class _Server:
-    """The running server, if there is one, and the links of running calls."""
+    """The server process, shared by all threads: started by the first call, and again after it has exited."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
@@ -103,7 +103,7 @@ class _Server:
         return ours
 
     def stop(self) -> None:
-        """End the server; calls that run come to their end."""
+        """End the server; running calls go on to their end."""
         if self._worker is not None:
             self._worker.kill()
             self._worker = None
@@ -117,7 +117,7 @@ def run_isolated(function: Callable[..., Any], calls: Sequence[tuple[Any, ...]],
     """Call a function with each tuple of arguments, in a process each, as many at a time as there are usable cores.
 
     Args:
-        function: A function of a module, by whose name the process finds it.
+        function: Function at the top of a module: it is pickled by name, and the process imports it.
         calls: Arguments of each call; they are pickled.
         limits: Limits of each call.
 
@@ -198,7 +198,7 @@ def _open_scratch() -> BinaryIO:
 
 
 def _exchange(link: socket.socket, request: bytes, limits: Limits) -> bytes:
-    """Send a request to an isolated process; returns the header of its answer."""
+    """Send a request to an isolated process and wait; returns how it ended, as packed by `_END`, or less if the link was closed."""
     with contextlib.suppress(OSError):
         link.sendall(_REQUEST.pack(limits.seconds, limits.memory, len(request)))
         link.sendall(request)
@@ -206,7 +206,7 @@ def _exchange(link: socket.socket, request: bytes, limits: Limits) -> bytes:
 
 
 def _outcome(end: bytes, stream: BinaryIO, limits: Limits) -> Any:
-    """Result of a call from its end, and from the file with the pickled result."""
+    """Result of a call, unpickled from `stream`, or a `Failure`, from how its process ended (`_END`)."""
     if len(end) < _END.size:
         return _STOPPED
     code, timed_out = _END.unpack(end)
@@ -255,7 +255,7 @@ def _exit_after(function: Callable[..., int], *arguments: Any) -> None:
 
 
 def _supervise(link: socket.socket, result: int) -> int:
-    """Run a request in a child, and send its end; the child is killed if its time is over or the caller has closed the link."""
+    """Run a request in a child, and send how it ended (`_END`); the child is killed if its time is over or the caller closed the link."""
     signal.signal(signal.SIGCHLD, signal.SIG_DFL)
     link.sendall(_STARTED)
     header = _receive(link, _REQUEST.size)
@@ -304,7 +304,7 @@ def _work(result_file: int, request: bytes, seconds: float, memory: int) -> int:
 
 
 def _limit_memory(memory: int) -> None:
-    """Limit the address space, no cores; and let the kernel end this process first if memory runs out."""
+    """Limit the address space to `memory` [bytes] more, without core dumps; the kernel ends this process first if memory runs out."""
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
     with contextlib.suppress(OSError):
         Path("/proc/self/oom_score_adj").write_text("1000")

@@ -57,12 +57,12 @@ def sweep_alpha(
     *,
     symmetries: Mapping[int, np.ndarray] | None = None,
 ) -> AlphaSweep:
-    """Filter and score the estimates of each mode with each alpha; tracks are found once.
+    """Filter and score the estimates of each mode with each alpha, and score them unfiltered; tracks are found once a mode.
 
     Args:
         tables: Mode -> its estimates; see `split_by_mode`.
         score: Score function, or one for each mode where misses count against the truth of that mode's scenes only.
-        alphas: Weights of the new estimate, above 0 and at most 1, in any order.
+        alphas: Weights of the new estimate, above 0 and at most 1, in any order; equal ones count once.
         symmetries: As `filter_poses`.
 
     Raises:

@@ -7,8 +7,8 @@ from synpick_warp.apps.validation.registry import Findings, rule
 
 
 def _declare(name: str, sentence: str, cure: str, *kinds: Kind) -> None:
-    """Declare a rule that reports the findings of some kinds: those about an instance in the file of its mask or in scene_gt.json, others
-    in the depth image."""
+    """Declare a rule that yields the findings of some kinds: shifted or wrong masks with the mask's file; scale, ray length and depth with
+    the depth image; others with scene_gt.json."""
 
     def check(rendered: DiagnosedView) -> Findings:
         view = rendered.view

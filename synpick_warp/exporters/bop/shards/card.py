@@ -65,7 +65,7 @@ def hub_splits(layout: DataLayout) -> tuple[str, ...]:
 
 
 def make_card(content: CardContent) -> str:
-    """Text of README.md. Splits without shards, which may be baked later, have no files: a pattern that matches none is an error."""
+    """Text of README.md. It leaves out splits without shards, unless none has any: a pattern that matches no file is an error."""
     splits = [split for split in content.splits if split.shards] or content.splits
     views, shards, size = (sum(getattr(split, name) for split in splits) for name in ("views", "shards", "bytes"))
     split, folder = splits[0].name, splits[0].folder

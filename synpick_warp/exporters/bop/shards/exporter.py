@@ -79,7 +79,7 @@ def _describe(settings: ExportSettings, splits: list[SplitContent]) -> CardConte
 
 
 def _write_keys(out: Path, name: str, split: Path, pool: WriterPool, scenes: Sequence[int]) -> SplitContent:
-    """Write the index of the views and shards of those scenes that a split has; returns how many there are."""
+    """Write the index of the views and shards of those scenes that a split has; returns their numbers and the size of the shards."""
     parts = out / PARTIAL / ShardsExporter.staging / "keys"
     with output_errors(out / split):
         parts.parent.mkdir(exist_ok=True)

@@ -81,15 +81,16 @@ def _tar_entry(name: str, data: Buffer) -> tuple[Buffer, ...]:
 
 
 def commit_shards(scenes: tuple[tuple[Path, int], ...], split: Path, images: Sequence[int], layers: tuple[str, ...]) -> None:
-    """Task: concatenate an episode's views and layers into shards, and rename these to their places.
-
-    Shards are synced to disk before the rename.
+    """Task: concatenate an episode's views and layers into shards, synced to disk, and rename these to their places.
 
     Args:
         scenes: (staging folder, scene_id) of each scene.
         split: Folder of the shards.
         images: Images (im_id) that each scene must have, ascending.
         layers: Names of the layers of each view.
+
+    Raises:
+        OutputError: A scene has other images or layers.
     """
     complete: list[tuple[Path, Path]] = []
     for scene, scene_id in scenes:

@@ -69,7 +69,7 @@ def write_models(folder: Path, catalog: Catalog) -> None:
 def encode_model(entry: CatalogEntry) -> bytes:
     """Encode an object as binary PLY in millimetres, with the property types that the BOP toolkit reads.
 
-    With texture coordinates and a texture of the same name, or else with vertex colours.
+    Of a textured object with texture coordinates and the name of the texture, obj_ID.png; else with the material's colour at every vertex.
     """
     mesh, textured = entry.mesh, entry.material.texture is not None
     names = ["x", "y", "z", "nx", "ny", "nz", *(("texture_u", "texture_v") if textured else ())]
@@ -131,7 +131,7 @@ def _copy_model(entry: CatalogEntry, source: Path, path: Path) -> None:
     """Copy a PLY file, and the texture that its header names, under the same name inside the set; without that texture, write the object.
 
     Raises:
-        CatalogError: The texture has changed since it was read, or has the name of another file of the set.
+        CatalogError: The texture has changed or gone since it was read, or its name is not allowed or that of another file of the set.
     """
     data = read_ply_file(source)
     try:

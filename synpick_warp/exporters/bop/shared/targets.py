@@ -74,10 +74,10 @@ def find_scenes(split: Path, scenes: Collection[int]) -> list[Path]:
 
 
 def write_scene_targets(scene: Path, folders: tuple[str, ...], visibility: float, sensors: tuple[str, ...] = ("",)) -> None:
-    """Task: write a scene's targets, one per line, into the folders, BOP19, BOP24 and MULTIVIEW, under the scene's name.
+    """Task: write a scene's targets, one per line, under its name, into up to three folders: BOP19, BOP24, MULTIVIEW.
 
-    BOP19: for each image and object, the number of instances whose visible fraction is at least `visibility`. BOP24: every image. Of
-    several sensors, both list the images of the first, by which the toolkit evaluates. MULTIVIEW: the images of all sensors at a time.
+    BOP19: for each image and object, the number of instances of at least `visibility` (fraction), if any. BOP24: every image. Of several
+    sensors, both list the images of the first, by which the toolkit evaluates. MULTIVIEW: the images of all sensors at a time.
     """
     truth = _read(scene, f"scene_gt{sensors[0]}.json", dict[_Frame, list[_Truth]])
     infos = _read(scene, f"scene_gt_info{sensors[0]}.json", dict[_Frame, list[_Info]])
