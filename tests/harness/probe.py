@@ -13,11 +13,11 @@ from warp._src.types import is_array, type_to_warp
 from tests.harness.devices import default_device
 
 _probes: dict[str, list[Probe]] = {}
-"""Probes by the Python module that declares them. They share a Warp module, so that a test file compiles once."""
+"""Probes by the folder that declares them. They share a Warp module: a folder of tests compiles once."""
 
 
 class Probe:
-    """Vectorised call of a Warp function, in a kernel that is generated when the first probe of its file is called."""
+    """Vectorised call of a Warp function, in a kernel that is generated when the first probe of its folder is called."""
 
     def __init__(self, func: wp.Function, owner: str) -> None:
         self.func, self.owner = func, owner
@@ -39,7 +39,8 @@ class Probe:
         """
         if self.kernel is None:
             for each in _probes[self.owner]:
-                each._make_kernel()
+                if each.kernel is None:
+                    each._make_kernel()
         device = wp.get_device(device or default_device())
         values, rows = list(arguments), {}
         for index, (kind, value) in enumerate(zip(self.inputs.values(), arguments, strict=True)):
@@ -82,7 +83,7 @@ def probe(func: wp.Function) -> Probe:
     frame = inspect.currentframe()
     assert frame is not None
     assert frame.f_back is not None
-    return Probe(func, frame.f_back.f_globals["__name__"])
+    return Probe(func, frame.f_back.f_globals["__name__"].rpartition(".")[0])
 
 
 def _shared(kind: Any) -> bool:
