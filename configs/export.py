@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 from synpick_warp.configs.modes import bake_modes
 from synpick_warp.configs.schema import Bake, Bop, Cameras, Config, Gripper, Physics, Render, Tote, Trajectory
@@ -32,19 +33,9 @@ class ExportSettings:
     def of(cls, config: Config) -> ExportSettings:
         """Those of all settings."""
         effects = tuple(name for name, limits in effect_ranges(config.effects).items() if any(limits))
-        return cls(
-            DataLayout.of(config),
-            config.bake,
-            config.bop,
-            config.cameras,
-            config.physics,
-            config.render,
-            config.trajectory,
-            config.tote,
-            config.gripper,
-            effects,
-            config.arrangement.max_objects,
-        )
+        names = ("bake", "bop", "cameras", "physics", "render", "trajectory", "tote", "gripper")
+        sections: dict[str, Any] = {name: getattr(config, name) for name in names}
+        return cls(layout=DataLayout.of(config), effects=effects, objects=config.arrangement.max_objects, **sections)
 
     @property
     def modes(self) -> tuple[str, ...]:

@@ -10,6 +10,8 @@ from synpick_warp.codes import Ending
 from synpick_warp.configs.schema import Config
 from synpick_warp.factory.episodes import remedy
 
+CONFIG = Config()
+SECTIONS = (CONFIG.physics, CONFIG.perception, CONFIG.arrangement, CONFIG.settle)
 CURED = {Ending.UNSETTLED, Ending.ARRANGEMENT_OVERFLOW, Ending.SOLVER_OVERFLOW, Ending.PERCEPTION_OVERFLOW}
 
 
@@ -19,15 +21,9 @@ def setting_values(config: Config) -> dict[str, object]:
     return {f"{name}.{item.name}": getattr(section, item.name) for name, section in sections.items() for item in fields(section)}
 
 
-def advice(ending: Ending) -> str:
-    """`remedy` with the default settings."""
-    config = Config()
-    return remedy(ending, config.physics, config.perception, config.arrangement, config.settle)
-
-
 @pytest.mark.parametrize("ending", Ending)
 def test_a_remedy_names_settings_with_their_values(ending):
-    text = advice(ending)
+    text = remedy(ending, *SECTIONS)
     assert bool(text) == (ending in CURED)
     values = setting_values(Config())
     named = [word for word in text.split() if "." in word and "(" not in word]
@@ -37,5 +33,5 @@ def test_a_remedy_names_settings_with_their_values(ending):
 
 def test_a_solver_overflow_names_every_capacity_of_the_solver():
     capacities = {name for name in setting_values(Config()) if name.endswith("_per_world")}
-    assert all(name in advice(Ending.SOLVER_OVERFLOW) for name in capacities)
+    assert all(name in remedy(Ending.SOLVER_OVERFLOW, *SECTIONS) for name in capacities)
     assert len(capacities) == 4

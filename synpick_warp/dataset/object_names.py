@@ -21,13 +21,9 @@ _MAX_MODEL = 2**40
 
 
 def object_names(dataset: Path, object_ids: set[int], rows: Sequence[ObjectRow] = (), tolerance: float = 0.0) -> dict[int, str]:
-    """Names of objects (obj_id -> name): from the exported model's comment, else from the object table; some have none.
+    """Names of objects (obj_id -> name): from the exported model's comment, else from the settings' object table; some have none.
 
-    Args:
-        dataset: Folder of the data set.
-        object_ids: The objects.
-        rows: The settings' object table.
-        tolerance: `objects.diameter_tolerance`.
+    `rows`, `tolerance`: the object table, and `objects.diameter_tolerance`.
     """
     folder = dataset / models_folder(dataset)
     infos = read_checked(folder / INFO, dict[Key, ModelDiameter])

@@ -42,8 +42,9 @@ def allocate_batch(settings: schema.Perception, instances: int, views: int, devi
     return views_of_worlds, bodies, gbuffer, arrays, scratch
 
 
-def view_bytes(settings: schema.Perception, instances: int, device: wp.Device) -> int:
+def view_bytes(settings: schema.Perception, instances: int) -> int:
     """Scratch of one view [bytes]."""
+    device = wp.get_device("cpu")
     with dry_run() as arrays:
         allocate_batch(settings, instances, 1, device)
         allocate_visibility(1, *settings.resolution, device)
@@ -54,7 +55,7 @@ def count_views(settings: schema.Perception, worlds: int, instances: int, device
     """Views of a batch: the setting, or as many as fit into the memory budget; never more than there are worlds."""
     views = settings.views
     if views == 0:
-        each = view_bytes(settings, instances, device)
+        each = view_bytes(settings, instances)
         views = GPU_BYTES // each if device.is_cuda else min(CPU_BYTES // each, CPU_VIEWS)
     return min(max(views, 1), worlds)
 
