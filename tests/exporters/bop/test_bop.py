@@ -222,11 +222,6 @@ def test_models_are_toolkit_compatible_ply_in_millimetres(dataset, folder):
     assert "comment TextureFile obj_000003.png" in (dataset / folder / "obj_000003.ply").read_bytes().split(b"end_header")[0].decode()
 
 
-def test_bytes_do_not_depend_on_the_number_of_processes(dataset, tmp_path):
-    for processes in (0, 2):
-        assert digests(make(tmp_path / str(processes), processes)) == digests(dataset)
-
-
 def test_files_of_the_device_stand_for_images(dataset, tmp_path):
     with exporting(BopExporter, tmp_path, config(), 2) as exporter:
         exporter.write_constants()
