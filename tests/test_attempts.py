@@ -162,37 +162,28 @@ def test_an_arrangement_that_is_drawn_again_leaves_no_attempt(mixed):
     assert (attempt.attempt, attempt.frame, attempt.target, attempt.outcome) == (0, 0, 2, Outcome.DROPPED)
 
 
+def one_attempt(world: World, **found: object) -> Ticks:
+    world.settle(0, 0, Mode.PICK, [0, 1, 2, 0])
+    world.first_frame()
+    world.look(0)
+    yield
+    yield from world.attempt(0, [0.0], **found)
+    world.over(Ending.GAVE_UP)
+    yield
+
+
 def test_the_last_of_32_instances_is_a_bit_like_the_others(device):
     world = new_world(device)
-
-    def script() -> Ticks:
-        world.settle(0, 0, Mode.PICK, [0, 1, 2, 0])
-        world.first_frame()
-        world.look(0)
-        yield
-        yield from world.attempt(0, [0.0], outcome=Outcome.OTHER_PICKED, hits=1, engaged=bits(0, 31), attached=bits(31))
-        world.over(Ending.GAVE_UP)
-        yield
-
-    (record,) = run((world, script())).values()
+    script = one_attempt(world, outcome=Outcome.OTHER_PICKED, hits=1, engaged=bits(0, 31), attached=bits(31))
+    (record,) = run((world, script)).values()
     assert (record.attempts[0].engaged, record.attempts[0].picked) == ((0, 31), (31,))
 
 
 @pytest.mark.parametrize(("hits", "tolerated", "good"), [(RAYS, 0, True), (RAYS - 1, 0, False), (RAYS - 2, 2, True), (0, RAYS - 1, False)])
 def test_a_good_seal(device, hits, tolerated, good):
     world = new_world(device)
-
-    def script() -> Ticks:
-        world.settle(0, 0, Mode.PICK, [0, 1, 2, 0])
-        world.first_frame()
-        world.look(0)
-        yield
-        yield from world.attempt(0, [0.0], outcome=Outcome.DROPPED, hits=hits, attached=0)
-        world.over(Ending.GAVE_UP)
-        yield
-
     log = AttemptLog(settings(suction__tolerated_misses=tolerated).suction, CONFIG.perception.resolution, OBJECT_IDS)
-    (record,) = play({world: script()}, log).values()
+    (record,) = play({world: one_attempt(world, outcome=Outcome.DROPPED, hits=hits, attached=0)}, log).values()
     assert record.attempts[0].good_seal is good
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import fnmatch
+import functools
 import re
 import tomllib
 from collections.abc import Iterator
@@ -29,6 +30,11 @@ def sources() -> Iterator[Path]:
     """Every Python file of the project, once."""
     for folder in sorted(FOLDERS):
         yield from (path for path in sorted((ROOT / folder).rglob("*.py")) if path.resolve() == path)
+
+
+@functools.cache
+def parsed(path: Path) -> ast.Module:
+    return ast.parse(path.read_text())
 
 
 def ignored(name: str) -> bool:
@@ -65,7 +71,7 @@ def test_files_are_short():
 def test_functions_are_short():
     long = {}
     for path in sources():
-        for node in ast.walk(ast.parse(path.read_text())):
+        for node in ast.walk(parsed(path)):
             if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
                 length = (node.end_lineno or node.lineno) - node.lineno + 1
                 if length > MAX_FUNCTION_LINES:
@@ -75,13 +81,13 @@ def test_functions_are_short():
 
 def test_every_module_says_what_it_is_for():
     modules = [path for path in sources() if path.relative_to(ROOT).parts[0] != "tests"]
-    assert [str(path.relative_to(ROOT)) for path in modules if ast.get_docstring(ast.parse(path.read_text())) is None] == []
+    assert [str(path.relative_to(ROOT)) for path in modules if ast.get_docstring(parsed(path)) is None] == []
 
 
 def test_host_code_postpones_annotations():
     lacking = []
     for path in sources():
-        body = ast.parse(path.read_text()).body
+        body = parsed(path).body
         postponed = any(isinstance(node, ast.ImportFrom) and node.module == "__future__" for node in body)
         code = any(isinstance(node, ast.FunctionDef | ast.ClassDef) for node in body)
         if code and not postponed and path.relative_to(ROOT).parts[0] not in ("kernels", "tests"):

@@ -8,10 +8,11 @@ import trimesh
 from synpick_warp.configs.load import load_config
 from synpick_warp.factory.pipeline import run_bake
 from synpick_warp.system.progress import SilentProgress
+from tests.builders import PICKING
 from tests.harness.bake_server import TINY
 from tests.worlds.small_worlds import QUICK
 
-SETTINGS = {key: value for key, value in (QUICK | TINY).items() if not key.startswith("arrangement.")} | {
+SETTINGS = {key: value for key, value in (QUICK | PICKING | TINY).items() if not key.startswith("arrangement.")} | {
     "bake.worlds": 1,
     "bake.episodes": 1,
     "bake.formats": ["bop"],

@@ -348,13 +348,6 @@ def test_version():
     assert result.stdout.strip() == __version__
 
 
-def test_a_bake_imports_neither_evaluation_nor_estimation():
-    parts = ("synpick_warp.apps.eval", "synpick_warp.apps.estim", "synpick_warp.stages.pose")
-    program = f"import sys, synpick_warp.cli.main, synpick_warp.factory.pipeline; print([n for n in sys.modules if n.startswith({parts})])"
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=120, check=True)
-    assert done.stdout.strip().splitlines()[-1] == "[]"
-
-
 PLY_HEAD = "ply\nformat ascii 1.0\n{comment}element vertex 3\nproperty float x\nproperty float y\nproperty float z\n"
 
 

@@ -103,19 +103,26 @@ def build(*_, **__): raise AssertionError("the bake goes on")
 # No kernels are compiled or loaded, whatever the load of the machine: the first line comes before, and ends the bake.
 pipeline.build_factory = build
 pipeline.advise_processes = lambda *_: "the first line"
-sys.exit(main(sys.argv[1:]))
+code = main(sys.argv[2:])
+open(sys.argv[1], "w").write("\\n".join(sys.modules))
+sys.exit(code)
 """
 
 
 def test_a_bake_on_a_full_device_stops_in_its_first_progress_line(tmp_path):
-    """Fault 10: nothing is left behind."""
-    out = tmp_path / "deep" / "set"
+    """Fault 10: nothing is left behind. By then, all is imported: neither evaluation nor estimation."""
+    out, modules = tmp_path / "deep" / "set", tmp_path / "modules"
     arguments = f"bake --config smoke --device cpu --resolution 160x90 --worlds 1 --episodes 1 --mode move --out {out}"
     with open("/dev/full", "w") as full:
-        command = [sys.executable, "-c", BAKE_ON_FULL_DEVICE, *arguments.split()]
+        command = [sys.executable, "-c", BAKE_ON_FULL_DEVICE, str(modules), *arguments.split()]
         result = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, check=False)
     assert (result.returncode, result.stderr.decode()) == (2, FULL)
     assert not out.parent.exists()
+    imported = modules.read_text().split()
+    assert "synpick_warp.factory.pipeline" in imported
+    assert not [
+        name for name in imported if name.startswith(("synpick_warp.apps.eval", "synpick_warp.apps.estim", "synpick_warp.stages.pose"))
+    ]
 
 
 @pytest.mark.parametrize("columns", ["1", "0", "-5", "x", "1000000000", "9" * 5000, "²", ""])
