@@ -17,6 +17,7 @@ from tests.builders import FEW_STEPS, ONE_OBJECT
 from tools.reports import render as render_report
 from tools.reports import render_checks, render_piles, render_sheet
 from tools.reports import sequence as render_sequence
+from tools.reports.reference_store import ReferenceStore
 
 
 def shot(level: int, size: tuple[int, int] = (9, 16)):
@@ -133,11 +134,11 @@ def test_references_are_kept_for_other_settings_of_the_denoiser(tmp_path, monkey
     def run(*options: str) -> tuple[dict[str, float], int]:
         """Values, and the number of references that were rendered."""
         file, rendered = tmp_path / "numbers.json", []
-        original = render_sequence._render_both
-        monkeypatch.setattr(render_sequence, "_render_both", lambda *given: rendered.append(1) or original(*given))
+        original = ReferenceStore._render
+        monkeypatch.setattr(ReferenceStore, "_render", lambda *given: rendered.append(1) or original(*given))
         common = ["--mode", "move", "--frames", "0,3", "--size", "32x18", "--references", str(kept), "--json", str(file)]
         render_sequence.main([*common, *FEW_STEPS, *options])
-        monkeypatch.setattr(render_sequence, "_render_both", original)
+        monkeypatch.setattr(ReferenceStore, "_render", original)
         return {row["name"]: row["value"] for row in json.loads(file.read_text())["rows"]}, len(rendered)
 
     kept = tmp_path / "kept"

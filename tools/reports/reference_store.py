@@ -57,7 +57,7 @@ class ReferenceStore:
         path = None if self._folder is None else self._folder / f"{self._digest(snapshot, world)}.npz"
         if path is not None and path.exists():
             return _read(path)
-        shots = [studio.render(snapshot, world, 0) for studio in self._studios]
+        shots = self._render(snapshot, world)
         if path is None:
             return shots
         arrays = {f"{name}{index}": getattr(shot, name) for index, shot in enumerate(shots) for name in _ARRAYS}
@@ -65,6 +65,9 @@ class ReferenceStore:
         np.savez(part, **arrays)
         part.replace(path)
         return shots
+
+    def _render(self, snapshot: Snapshot, world: int) -> list[Shot]:
+        return [studio.render(snapshot, world, 0) for studio in self._studios]
 
     def _digest(self, snapshot: Snapshot, world: int) -> str:
         """SHA-256 of the settings and a world's snapshot, the key of its reference."""
