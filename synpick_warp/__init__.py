@@ -12,6 +12,7 @@ Importing this package loads neither simulator, NumPy nor OpenCV; the functions 
 
 from __future__ import annotations
 
+import importlib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -41,6 +42,16 @@ __all__ = [
     "open",
     "stream",
 ]
+
+_DOORS = ("pytorch", "webdataset")
+"""Modules of `dataset` that are attributes of this package, too: notes in data sets name them so."""
+
+
+def __getattr__(name: str) -> object:
+    """Import a module of `_DOORS` when it is first asked for."""
+    if name not in _DOORS:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return importlib.import_module(f"{__name__}.dataset.{name}")
 
 
 def bake(

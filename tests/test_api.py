@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import subprocess
 import sys
 import tomllib
@@ -40,6 +41,13 @@ def test_no_module_takes_the_name_of_a_function():
     assert functions == ["bake", "load_config", "open", "stream"]
     modules = {path.stem for path in (ROOT / "synpick_warp").iterdir()}
     assert modules.isdisjoint(functions)
+
+
+def test_notes_of_data_sets_name_what_exists():
+    decode_view = importlib.import_module("synpick_warp.dataset.webdataset").decode_view
+    assert synpick_warp.webdataset.decode_view is decode_view
+    with pytest.raises(AttributeError, match="has no attribute 'pipeline'"):
+        _ = synpick_warp.pipeline
 
 
 def test_importing_and_reading_settings_load_nothing_heavy():

@@ -99,7 +99,7 @@ the conventions and the objects.
 {licence}
     datasets.load_dataset("DIR", split="{split}")
     datasets.load_dataset("webdataset", data_dir="DIR/{folder}", data_files="*.tar", split="train")
-    webdataset.WebDataset("DIR/{folder}/shard-000000.tar").decode(synpick_warp.dataset.webdataset.decode_view)
+    webdataset.WebDataset("DIR/{folder}/shard-000000.tar").decode(synpick_warp.webdataset.decode_view)
 
 The first line has the columns' types from this file; the second infers them from the first views, which fails or loses masks if
 later scenes have more objects. `datasets` reads 16-bit depth whole (Pillow's mode I;16), but colour layers of 16 bits as 8: cast
