@@ -17,6 +17,7 @@ from synpick_warp.codes import Phase
 from synpick_warp.kernels.newton_patches import contact_sweep, world_order
 from synpick_warp.kernels.newton_patches.warm_start import apply_warm_start_kernel
 from synpick_warp.newton_patches import solver as fused_solver
+from synpick_warp.newton_patches.narrow_phase import BLOCK
 from synpick_warp.scenes import build
 from synpick_warp.stages.sim import physics
 from synpick_warp.stages.sim.simulate import Simulation
@@ -196,7 +197,7 @@ def test_worlds_move_as_with_the_launches_of_newton(device, monkeypatch, worlds,
             phases |= set(simulation.state.phase.numpy().tolist())
         solver, narrow_phase = simulation.physics.solver, simulation.physics.pipeline.narrow_phase
         assert isinstance(solver, fused_solver.FusedSteel) == (version != "another")
-        assert (narrow_phase.split_convex_block_dim == physics.NARROW_PHASE_BLOCK) == (version != "another")
+        assert (narrow_phase.split_convex_block_dim == BLOCK) == (version != "another")
         assert fused_solver.find_unsupported(solver) == []
     fused, launched = found.values()
     np.testing.assert_array_equal(fused, launched)

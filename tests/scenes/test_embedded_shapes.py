@@ -1,4 +1,4 @@
-"""Shipped collision shapes: each embedded object has one, equal to the computed one, and keys tolerate rounding of vertices."""
+"""Shipped collision shapes: each embedded object has one, that which is computed, and keys tolerate rounding of vertices."""
 
 from __future__ import annotations
 
@@ -25,12 +25,14 @@ def pieces_of(shape):
 
 @pytest.mark.parametrize("name", OBJECTS)
 def test_each_object_has_its_shape(name):
-    """`python -m tools.embedded_shapes` computes it again where an object has changed."""
+    """`python -m tools.embedded_shapes` computes it again where an object has changed. Releases of NumPy differ by 1e-15 m at zero."""
     raw, recipe = OBJECTS[name], shape_recipe(OBJECTS[name], SETTINGS)
     shape = embedded_shape(raw.mesh, recipe)
     assert shape is not None
     if not recipe.concave:
-        assert pieces_of(shape) == pieces_of([simplify_hull(raw.mesh.vertices, recipe.hull_vertices)])
+        (found,), computed = shape, simplify_hull(raw.mesh.vertices, recipe.hull_vertices)
+        np.testing.assert_array_equal(found.faces, computed.faces)
+        np.testing.assert_allclose(found.vertices, computed.vertices, rtol=0, atol=1e-14)
 
 
 @pytest.mark.slow
