@@ -34,9 +34,8 @@ checks: $(VENV)/installed-dev
 	$(BIN)/ruff check --quiet --output-format concise .
 	$(BIN)/ruff format --quiet --check .
 	$(BIN)/lint-imports --no-logo
-	$(BIN)/basedpyright
-	$(BIN)/python -m tools.checks.kernels
-	$(BIN)/python -m tools.checks.history
+	$(BIN)/basedpyright & types=$$!; \
+	$(BIN)/python -m tools.checks.kernels && $(BIN)/python -m tools.checks.history; others=$$?; wait $$types && exit $$others
 
 clean:
 	rm -rf $(VENV) $(DEMO) build dist *.egg-info .pytest_cache .hypothesis .ruff_cache .import_linter_cache
