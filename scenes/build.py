@@ -86,7 +86,7 @@ class Layout:
 
 @dataclass(frozen=True, eq=False)
 class BuiltModel:
-    """Finalized Newton model, its layout, and the body variants of its slots: of each catalog entry, and of empty slots."""
+    """Finalized Newton model with its layout, and the body variant (shape and mass) that a slot selects for each catalog entry."""
 
     model: newton.Model
     layout: Layout

@@ -84,18 +84,18 @@ class _Faults:
         self._errors: list[CatalogError] = []
 
     def add(self, error: CatalogError) -> None:
-        """Collect the error of an object; raises it if settings are strict."""
+        """Collect the error of an object, or raise it if `objects.strict` is set."""
         if self._strict:
             raise error
         self._errors.append(error)
 
     def tell(self) -> None:
-        """Report the objects that are left out, a line each."""
+        """Print a line for each object that is left out."""
         for error in self._errors:
             self._report(f"left out: {error}")
 
     def summary(self) -> CatalogError:
-        """Error to raise for a folder of which no object can be used."""
+        """Return the error for a folder without a usable object: that of its only object, or the number of objects and the first error."""
         if len(self._errors) == 1:
             return self._errors[0]
         count = len(self._errors)

@@ -25,8 +25,8 @@ COST_MEAN = wp.constant(0.2)
 
 @wp.struct
 class Track:
-    """State of each tracked instance: last pose and the one before (object to camera), centroid [m], frames with an estimate, frames since
-    the last accepted one, and running means of cost and colour correlation (NO_CORRELATION: none yet).
+    """Tracker state of each instance: its last two poses (object to camera), centroid [m], number of frames with an estimate and since the
+    last accepted one, and running means of cost and colour correlation (NO_CORRELATION: none yet).
     """
 
     pose: wp.array[wp.transform]

@@ -13,11 +13,14 @@ import stat
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from synpick_warp.cli.options import one_line
 from synpick_warp.configs.schema import Bake, Config, Split
 from synpick_warp.errors import DatasetError, OutputError, SynpickError, escape
+
+if TYPE_CHECKING:
+    from synpick_warp.dataset.reading import DataSet
 
 DEFAULT_NAME = "synpick-data"
 """Folder of a bake without --out; its neighbours are synpick-data-2, synpick-data-3, ..."""
@@ -240,3 +243,13 @@ def check_output_file(
         if is_folder or place.parent != root or place.suffix.lower() not in OWN_SUFFIXES:
             kind = "folder" if is_folder else "file"
             raise OutputError(f"{option} is {out}, among the files of the data set {root}; name a {kind} outside of it")
+
+
+def open_split(folder: Path, split: str | None) -> DataSet:
+    """Open a data set, or one of its splits. Raises DatasetError if a baked one lacks its settings, or has no such split."""
+    from synpick_warp.dataset.reading import open_data_set
+
+    data_set = open_data_set(folder)
+    if data_set.found is None and not (folder / "config.toml").exists():
+        raise DatasetError(f"{folder} has no config.toml; name the folder of a data set that synpick-warp baked")
+    return data_set if split is None else data_set.split(split)

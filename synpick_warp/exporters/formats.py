@@ -94,42 +94,42 @@ class Format(NamedTuple):
 
 
 def _bop(layout: DataLayout, episode: int) -> str:
-    """Regular expression of an episode's files in scene folders."""
+    """Regular expression that matches the paths of an episode's files in scene folders."""
     scenes = "|".join(dict.fromkeys(f"{layout.scene(episode, camera)[0]:06d}" for camera in range(layout.cameras)))
     image = rf"[a-z_]+(?:_cam[0-9]+)?/{_INDEX}(?:_[0-9]{{6}})?\.(?:png|jpg)"
     return rf"{re.escape(layout.folder(episode))}/(?:{scenes})/(?:scene_[a-z_]+(?:_cam[0-9]+)?\.json|{image})"
 
 
 def _shards(layout: DataLayout, episode: int) -> str:
-    """Regular expression of an episode's shards."""
+    """Regular expression that matches the paths of an episode's shards, relative to the data set."""
     # Further shards of a scene have its id plus a multiple of a million.
     return rf"{re.escape(layout.folder(episode))}_web/shard-[0-9]{{0,12}}(?:{_scenes(layout, episode)})\.tar"
 
 
 def _usd(_: DataLayout, episode: int) -> str:
-    """Regular expression of an episode's USD file."""
+    """Regular expression that matches the paths of an episode's USD file."""
     return rf"usd/{episode:06d}\.usdc"
 
 
 def _zarr(_: DataLayout, episode: int) -> str:
-    """Regular expression of an episode's files in the zarr store."""
+    """Regular expression that matches the paths of an episode's files in the zarr store."""
     return rf"{_STORE}/episodes/{episode:06d}/(?:zarr\.json|[a-z_]+/(?:zarr\.json|{_ZARR_ARRAY}))"
 
 
 def _lerobot(_: DataLayout, episode: int) -> str:
-    """Regular expression of an episode's part and videos in the LeRobot folder."""
+    """Regular expression that matches the paths of an episode's part and videos in the LeRobot folder."""
     video = rf"chunk-{episode // 1000:03d}/file-{episode % 1000:03d}\.mp4"
     return rf"lerobot/(?:parts/{episode:06d}\.json|videos/observation\.images\.camera_[0-9]+/{video})"
 
 
 def _coco(layout: DataLayout, episode: int) -> str:
-    """Regular expression of an episode's images and parts in the COCO folder."""
+    """Regular expression that matches the paths of an episode's images and parts in the COCO folder."""
     scenes = _scenes(layout, episode)
     return rf"coco/(?:parts/(?:{scenes})\.jsonl|images/(?:{scenes})/{_INDEX}\.(?:png|jpg))"
 
 
 def _yolo(layout: DataLayout, episode: int) -> str:
-    """Regular expression of an episode's images, labels and lists in the YOLO folder."""
+    """Regular expression that matches the paths of an episode's images, labels and lists in the YOLO folder."""
     split = re.escape(layout.folder(episode))
     files = rf"(?:images|labels|boxes|oriented_boxes)/{split}/(?:{{0}})/{_INDEX}_{_INDEX}\.(?:png|jpg|txt)"
     return rf"yolo/(?:(?:{{0}})\.txt|{files})".replace("{0}", _scenes(layout, episode))

@@ -93,7 +93,7 @@ def _read_supervision(copy: Path, split: str, scene: str, frames: list[int]) -> 
 
 
 def expect(data_set: Any) -> dict[str, np.ndarray]:
-    """Values that `read` must return, from the views in memory: visible instances; masks of several parts have bridges between them."""
+    """Expected result of `read`, from the views in memory: visible instances; bridges join the parts of a mask into one polygon."""
     import cv2
 
     from synpick_warp.exporters.bop.outlines import join_parts, trace_outlines

@@ -81,7 +81,7 @@ def check_trajectory(data: Episode, end: EpisodeEnd, lights: int, *, gripper: bo
 
 
 def _check_attempts(end: EpisodeEnd) -> None:
-    """Check the attempts of an episode's manifest entry against their schema; raises DatasetError."""
+    """Validate the attempt records of an episode, as its manifest entry has them, against their schema. Raises DatasetError."""
     source = f"the manifest entry of episode {end.episode}"
     for line in end.attempts:
         check_content(msgspec.json.decode(line), _Attempt, source)

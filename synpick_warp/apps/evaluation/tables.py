@@ -83,7 +83,7 @@ def _labels(group: str, truth: Truth, target: np.ndarray, names: Mapping[int, st
 
 
 def _interval(low: float, high: float) -> str:
-    """Label of an interval: "0.1 to 0.3", or "over 0.3" if it has no upper bound."""
+    """Format an interval as text: "0.1 to 0.3", or "over 0.3" without an upper bound."""
     return f"over {low:g}" if math.isinf(high) else f"{low:g} to {high:g}"
 
 

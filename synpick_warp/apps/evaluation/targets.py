@@ -35,7 +35,7 @@ class Target(msgspec.Struct, frozen=True, order=True, omit_defaults=True):
 
 @dataclass(frozen=True)
 class TargetList:
-    """Target list read from a file: its entries in order."""
+    """BOP target list, in the order of its file."""
 
     path: Path
     targets: tuple[Target, ...]

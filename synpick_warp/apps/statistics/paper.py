@@ -40,7 +40,7 @@ class PaperGroup(msgspec.Struct, frozen=True):
 
 
 class Paper(msgspec.Struct, frozen=True):
-    """Numbers of the paper's data set: cameras, views and mean visibility in all, and a row for each split and mode."""
+    """Statistics that the paper publishes of its data set: cameras, views and mean visibility, and a row for each split and mode."""
 
     cameras: int
     total_views: int

@@ -136,7 +136,7 @@ def _objects(statistics: Statistics) -> Table:
 
 
 def _annotations(statistics: Statistics) -> Table:
-    """Table of annotated instances by split, mode and object; not printed as text."""
+    """Table of annotated instances by split, mode and object; left out of the printed text."""
     columns = (*GROUP_COLUMNS, Column("object_id"), Column("name"), Column("instances", ","))
     rows: list[tuple[Value, ...]] = [
         (*_label(row), each.object_id, each.name, row.annotations.objects.get(each.object_id, 0))
@@ -243,7 +243,7 @@ def _lights(statistics: Statistics) -> Table:
 
 
 def _yaw(statistics: Statistics) -> Table:
-    """Histogram of the environment map's yaw [°] over episodes; not printed as text."""
+    """Histogram of the environment map's yaw [°] over episodes; left out of the printed text."""
     step = TURN / YAW_BINS
     counts: Sequence[int] = statistics.lights.yaw if statistics.lights else ()
     rows: list[tuple[Value, ...]] = [(index * step, (index + 1) * step, count) for index, count in enumerate(counts)]
@@ -252,14 +252,14 @@ def _yaw(statistics: Statistics) -> Table:
 
 
 def _exposure(statistics: Statistics) -> Table:
-    """Histogram of exposure compensation [EV] over episodes; not printed as text."""
+    """Histogram of exposure compensation [EV] over episodes; left out of the printed text."""
     rows: list[tuple[Value, ...]] = list(statistics.lights.exposure.items()) if statistics.lights else []
     columns = (Column("from_EV", ".1f"), Column("episodes", ","))
     return Table("light_exposure", "Episodes by exposure compensation [EV]", columns, rows, in_text=False)
 
 
 def _coverage(statistics: Statistics) -> Table:
-    """Table of views by object and bin of the viewing direction in its frame, without empty bins; not printed as text."""
+    """Table of views by object and bin of the viewing direction in its frame, without empty bins; left out of the printed text."""
     columns = (Column("object_id"), Column("z_from"), Column("z_to"), Column("longitude_from"), Column("longitude_to"), Column("views"))
     table = Table("coverage", "Views by object and viewing direction in its frame", columns, in_text=False)
     heights = [2.0 * index / BANDS - 1.0 for index in range(BANDS + 1)]

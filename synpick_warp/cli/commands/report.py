@@ -8,9 +8,9 @@ from typing import Annotated
 from cyclopts import Parameter
 from rich.console import Console
 
-from synpick_warp.cli.folders import beside, check_output_file, find_data_set
+from synpick_warp.cli.folders import beside, check_output_file, find_data_set, open_split
 from synpick_warp.cli.options import MAX_THREADS, PaperOption, WholeNumber, check_range
-from synpick_warp.errors import DatasetError, escape
+from synpick_warp.errors import escape
 
 MEGABYTE = 1e6
 """Bytes."""
@@ -40,13 +40,8 @@ def write_page(
     check_out(page)
     check_output_file(page, "--out", folder)
     from synpick_warp.cli.display import CountProgress
-    from synpick_warp.dataset.reading import open_data_set
 
-    data_set = open_data_set(folder)
-    if data_set.found is None and not (folder / "config.toml").exists():
-        raise DatasetError(f"{folder} has no config.toml; name the folder of a data set that synpick-warp baked")
-    if split is not None:
-        data_set = data_set.split(split)
+    data_set = open_split(folder, split)
     with CountProgress(Console(stderr=True, highlight=False, soft_wrap=True)) as counter:
         write_report(data_set, page, frames=views, paper=paper, threads=threads, report=counter.report)
     print(f"report: {escape(str(page))} ({page.stat().st_size / MEGABYTE:.1f} MB)")

@@ -10,9 +10,9 @@ from typing import Annotated
 from cyclopts import Parameter
 from rich.console import Console
 
-from synpick_warp.cli.folders import check_output_file, find_data_set
+from synpick_warp.cli.folders import check_output_file, find_data_set, open_split
 from synpick_warp.cli.options import MAX_THREADS, PaperOption, WholeNumber, check_range
-from synpick_warp.errors import DatasetError, escape
+from synpick_warp.errors import escape
 
 MAX_DEPTH_VIEWS = 100_000
 MEBIBYTE = 2**20
@@ -47,14 +47,9 @@ def show_statistics(
     from synpick_warp.apps.statistics.collect import collect
     from synpick_warp.apps.statistics.compute import assemble
     from synpick_warp.cli.display import CountProgress, make_console
-    from synpick_warp.dataset.reading import open_data_set
     from synpick_warp.system.hardware.cores import count_cores
 
-    data_set = open_data_set(folder)
-    if data_set.found is None and not (folder / "config.toml").exists():
-        raise DatasetError(f"{folder} has no config.toml; name the folder of a data set that synpick-warp baked")
-    if split is not None:
-        data_set = data_set.split(split)
+    data_set = open_split(folder, split)
     started = time.perf_counter()
     notes = Console(stderr=True, highlight=False, soft_wrap=True)
     with CountProgress(notes) as counter:

@@ -227,7 +227,7 @@ class WriterPool:
                 self._answered.append(future)
 
     def _finish_answered(self) -> None:
-        """Finish the answered tasks in order: their slots become free, callbacks are called; the first error is kept and raised."""
+        """Finish completed tasks in order: release their slots and call their callbacks; store and raise the first error."""
         self._finishing = True
         try:
             while self._answered:

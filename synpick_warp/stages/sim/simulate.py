@@ -48,14 +48,14 @@ class TickRecord:
 
 
 def allocate_worlds(sizes: dict[str, int], device: wp.Device) -> tuple[WorldState, AttemptState, SealState, LastFrame, TickRecord]:
-    """Allocate state and record of all worlds, but for physics, see `StepRecorder`; `sizes`: extents by `world_sizes`."""
+    """Allocate the state of all worlds and the record of a tick, without physics (see `StepRecorder`); `sizes`: of `world_sizes`."""
     record = TickRecord(*(allocate(kind, sizes, device) for kind in (Snapshot, WorldStatus, Observation, Plan)))
     state, attempts, seals = allocate(WorldState, sizes, device), allocate(AttemptState, sizes, device), allocate(SealState, sizes, device)
     return state, attempts, seals, allocate(LastFrame, sizes, device), record
 
 
 class Simulation:
-    """N worlds that run the episodes of a list until none is left."""
+    """Batched simulation: each world runs one episode after another, until none is left in the list."""
 
     def __init__(
         self,
