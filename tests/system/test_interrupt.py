@@ -11,6 +11,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable
+from types import FrameType, FunctionType
 
 import pytest
 
@@ -114,6 +115,31 @@ def test_a_second_interrupt_does_not_wait_for_the_import(tmp_path, monkeypatch):
 @pytest.mark.parametrize("end", [wait, lambda: None, lambda: 1 / 0])
 def test_a_swallowed_interrupt_comes_again(end):
     stopped(swallow, end)
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGALRM])
+@pytest.mark.parametrize("entered", ["__exit__", "setitimer", "signal"])
+def test_a_signal_at_the_end_leaves_no_timer(number, entered):
+    """A timer that goes on would raise interrupts in whatever runs next, for ever."""
+    sent = []
+
+    def send(frame: FrameType, event: str, function: object) -> None:
+        name = getattr(function, "__name__", frame.f_code.co_name)
+        if event in ("call", "c_call") and name == entered and not sent and frame_of(KeptInterrupt.__exit__, frame):
+            sent.append(name)
+            os.kill(os.getpid(), number)
+
+    try:
+        stopped(swallow, lambda: sys.setprofile(send))
+    finally:
+        sys.setprofile(None)
+    assert sent == [entered]
+
+
+def frame_of(function: FunctionType, frame: FrameType | None) -> bool:
+    while frame is not None and frame.f_code is not function.__code__:
+        frame = frame.f_back
+    return frame is not None
 
 
 def test_what_cleans_up_after_an_interrupt_is_not_disturbed():

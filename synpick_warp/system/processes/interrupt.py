@@ -50,7 +50,7 @@ class KeptInterrupt:
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         if self._caller is None:
             return
-        if self._count:
+        if self._before is not None:
             signal.setitimer(signal.ITIMER_REAL, 0.0)
             signal.signal(signal.SIGALRM, self._before)  # type: ignore[arg-type]
         signal.signal(signal.SIGINT, signal.default_int_handler)
@@ -62,7 +62,9 @@ class KeptInterrupt:
     def _handle(self, _: int, frame: FrameType | None) -> None:
         """Handler of SIGINT: count it, raise, and start the timer that raises again until it is taken."""
         self._count += 1
-        if self._count == 1:
+        if self._is_leaving(frame):
+            return
+        if self._before is None:
             self._before = signal.signal(signal.SIGALRM, self._retry)
         signal.setitimer(signal.ITIMER_REAL, RETRY, RETRY)
         self._raise(frame)
@@ -72,11 +74,18 @@ class KeptInterrupt:
         self._raise(frame)
 
     def _raise(self, frame: FrameType | None) -> None:
-        """Raise the interrupt, unless an import runs or it is on its way."""
-        if self._is_on_its_way() or (self._count == 1 and self._is_importing(frame)):
+        """Raise the interrupt, unless an import runs, or it is on its way or about to be raised by `__exit__`."""
+        if self._is_on_its_way() or self._is_leaving(frame) or (self._count == 1 and self._is_importing(frame)):
             return
         self._raised = KeyboardInterrupt()
         raise self._raised
+
+    @staticmethod
+    def _is_leaving(frame: FrameType | None) -> bool:
+        """Whether the interrupted code is `__exit__`, which an interrupt must not break off: the timer would go on for ever."""
+        while frame is not None and frame.f_code is not KeptInterrupt.__exit__.__code__:
+            frame = frame.f_back
+        return frame is not None
 
     def _is_importing(self, frame: FrameType | None) -> bool:
         """Whether the interrupted code is within an import, which must not be broken off."""
