@@ -40,6 +40,7 @@ SUFFIXES = tuple(_READERS)
 
 # Maximum coordinate [m]: larger ones are mistakes, and lose precision in 32-bit floats.
 _MAX_EXTENT = 1e4
+_MILLIMETRE = 1e-3
 # Maximum texture coordinate: larger ones are mistakes, with a resolution of a thousandth of the image in 32-bit floats.
 _MAX_UV = 1e4
 
@@ -54,6 +55,8 @@ class MeshOptions:
     """Move the centre of the mesh's bounding box to the origin."""
     substitute: bool = False
     """Replace images that are not there by a colour, with a warning."""
+    unit: str = ""
+    """Name of the unit, which is told with the mesh's size; empty: neither is told."""
 
 
 def _ignore(line: str) -> None:
@@ -90,6 +93,9 @@ def read_mesh(
 def _finish(part: MeshPart, unit: float, options: MeshOptions, notes: Notes) -> tuple[TriangleMesh, FileMaterial]:
     """Convert a validated part to metres, centre it if asked to, orient it outward and complete its normals."""
     metres = part.vertices * unit
+    if options.unit:
+        sides = " x ".join(f"{side / _MILLIMETRE:.4g}" for side in np.ptp(metres, axis=0))
+        notes.said.append(f"{sides} mm, unit {options.unit}")
     if options.center:
         offset = -(metres.min(axis=0) + metres.max(axis=0)) / 2.0
         if np.abs(offset).max() > 1e-6 * np.ptp(metres, axis=0).max():

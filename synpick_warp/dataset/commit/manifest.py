@@ -26,6 +26,7 @@ import msgspec
 
 from synpick_warp import __version__
 from synpick_warp.configs.load import load_config, override_config
+from synpick_warp.configs.objects import AUTO_UNIT
 from synpick_warp.configs.schema import CLASSIC, WITHIN, Config
 from synpick_warp.dataset.records import Entry, EpisodeEntry, IndicesEntry, Manifest, read_record
 from synpick_warp.errors import DatasetError
@@ -62,7 +63,7 @@ FREE_SETTINGS = (
 )
 """Settings that may differ when a bake is resumed: no episode depends on them. Objects and lights are compared by content, not by the name
 of their folder. A device of another type computes the same episodes up to rounding."""
-YOUNGER_SETTINGS: dict[str, Any] = {"bop.layout": CLASSIC, "bop.keypoints": 0, "arrangement.fill": WITHIN}
+YOUNGER_SETTINGS: dict[str, Any] = {"bop.layout": CLASSIC, "bop.keypoints": 0, "arrangement.fill": WITHIN, "objects.unit": AUTO_UNIT}
 """Settings that older manifests lack, and what held before: left out where they have these values, so that older data sets can still be
 read, and resumed with them."""
 PACKAGES = ("warp-lang", "newton", "numpy", "scipy", "coacd", "opencv-python-headless", "isal", "orjson", "usd-core", "zarr")
