@@ -73,7 +73,9 @@ class Bake:
     seed: int = setting(0, "", "Random seed, from which every random number of the bake follows.", low=0, high=2**63 - 1)
     device: str = setting("auto", "", "Device: cpu, cuda:N, or auto (the first GPU if there is one).")
     models: str = setting(
-        "", "", "Folder of BOP models, of PLY, OBJ, glTF and STL meshes, or of a folder per object; empty: the embedded procedural objects."
+        "",
+        "",
+        "Folder of BOP models, of PLY, OBJ, glTF, STL and STEP files, or of a folder per object; empty: the embedded procedural objects.",
     )
     lights: str = setting("", "", "Folder of HDR environment maps (.hdr) and sIBL sets; empty: the embedded procedural maps.")
     formats: tuple[str, ...] = setting(

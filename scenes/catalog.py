@@ -17,6 +17,7 @@ from synpick_warp.scenes.assets.asset_files import asset_scope
 from synpick_warp.scenes.assets.meshes import MeshOptions, read_mesh, signed_volume
 from synpick_warp.scenes.assets.model_folders import ModelFile, list_models
 from synpick_warp.scenes.assets.models_info import ModelInfo, check_against_mesh, read_models_info
+from synpick_warp.scenes.assets.step import STEP_SUFFIXES
 from synpick_warp.scenes.collision.decomposition import ShapeRecipe
 from synpick_warp.scenes.collision.hulls import hull_size, mass_properties
 from synpick_warp.scenes.collision.shapes import collision_shapes, default_cache_dir
@@ -145,7 +146,7 @@ def _read_folder(folder: Path, rules: _Rules, report: Callable[[str], None], fau
     calls = [(model, infos.get(model.obj_id, ModelInfo()), rules) for model in models]
     raws, sizes = [], []
     for model, result in zip(models, run_isolated(_read_model, calls, READ_LIMITS), strict=True):
-        if isinstance(result, _SizeError | tuple):
+        if isinstance(result, _SizeError | tuple) and model.path.suffix.lower() not in STEP_SUFFIXES:
             sizes.append(result.size if isinstance(result, _SizeError) else result[0].hull.diameter)
             faults.advice = _advise_unit(sizes, _unit(rules.objects, model), rules.tote)
         if isinstance(result, Failure):

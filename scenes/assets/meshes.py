@@ -1,4 +1,4 @@
-"""Mesh import: PLY, OBJ, glTF and STL files, each as one triangle mesh with one material."""
+"""Mesh import: PLY, OBJ, glTF, STL and STEP files, each as one triangle mesh with one material."""
 
 from __future__ import annotations
 
@@ -24,6 +24,7 @@ from synpick_warp.scenes.assets.gltf.parts import read_gltf
 from synpick_warp.scenes.assets.mesh_parts import WHITE, MeshPart, Notes
 from synpick_warp.scenes.assets.normals import DEFAULT_CREASE, crease_normals, smooth_normals
 from synpick_warp.scenes.assets.ply import read_ply
+from synpick_warp.scenes.assets.step import STEP_SUFFIXES, read_step
 from synpick_warp.scenes.assets.stl import read_stl
 from synpick_warp.scenes.assets.wavefront.obj import read_obj
 from synpick_warp.scenes.types import TriangleMesh
@@ -34,6 +35,7 @@ _READERS: dict[str, Callable[[Path, Notes], list[MeshPart]]] = {
     ".glb": read_gltf,
     ".gltf": read_gltf,
     ".stl": read_stl,
+    **dict.fromkeys(STEP_SUFFIXES, read_step),
 }
 SUFFIXES = tuple(_READERS)
 """Endings of mesh files."""
@@ -69,8 +71,8 @@ def read_mesh(
     """Read a mesh file. Parts are merged into one mesh, several materials into a texture atlas; vertex colours are baked into a texture.
 
     Args:
-        path: A .ply, .obj, .glb, .gltf or .stl file.
-        unit: Length of the file's unit [m].
+        path: A .ply, .obj, .glb, .gltf, .stl, .step or .stp file.
+        unit: Length of the file's unit [m]; STEP files name their own.
         options: How the mesh is completed.
         report: Called with one line if features of the file are ignored or replaced.
 
@@ -78,6 +80,8 @@ def read_mesh(
         CatalogError: The file cannot be read, has no triangles or invalid ones, or refers to a texture that is missing and is not replaced.
     """
     notes = Notes(options.substitute)
+    if path.suffix.lower() in STEP_SUFFIXES:
+        unit, options = 1.0, replace(options, unit=options.unit and "of the file")
     with quiet_decoding():
         parts = [_clean(part, unit, path) for part in _READERS[path.suffix.lower()](path, notes) if len(part.faces)]
         parts = [part for part in parts if len(part.faces)]
