@@ -48,8 +48,9 @@ def check_value(key: str, value: object, item: dataclasses.Field[Any], annotatio
         ConfigError: The value has the wrong type or length, is not finite, or lies outside the setting's range.
     """
     try:
-        result = _convert(value, annotation)
-    except _MismatchError as mismatch:
+        parse = item.metadata.get("parse")
+        result = _convert(parse(value) if parse else value, annotation)
+    except (_MismatchError, ValueError) as mismatch:
         allowed = str(mismatch) or describe_type(annotation)
         raise ConfigError(f"{key} is {format_value(value)} {source}; allowed: {allowed}{_unit(item)}") from None
     if not all(_inside(leaf, item) for leaf in _leaves(result)):

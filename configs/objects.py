@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from math import hypot
+from typing import Any
 
 from synpick_warp.configs.fields import INT32_MAX, setting
 
@@ -10,6 +13,77 @@ AUTO_UNIT = "auto"
 """Unit of mesh files by their kind: millimetres of BOP models, metres of others."""
 UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254}
 """Units of mesh files [m]."""
+DECLARED, DETECT = "declared", "detect"
+SYMMETRIES = (DECLARED, DETECT)
+"""Sources of an object's symmetries."""
+MAX_FOLD = 72
+"""Largest fold that can be declared."""
+_TURN = "an axis that is not zero and a fold from 2 to 72, with an offset [m] or without: { axis = [0, 0, 1], fold = 2 }"
+_DISCRETE = f"{_TURN}; or a rigid 4 x 4 matrix, row by row [m]"
+_CONTINUOUS = "an axis that is not zero, with an offset [m] or without: { axis = [0, 0, 1], offset = [0, 0, 0] }"
+_RIGID = 1e-3
+"""Tolerance of the elements of a rotation: published matrices have six digits."""
+
+
+def _parse_discrete(value: Any) -> Any:
+    """Discrete symmetries as lists of numbers: 16 of a matrix, or axis, fold and offset, if there is one."""
+    return _parse_each(value, _flatten_discrete, _DISCRETE)
+
+
+def _parse_continuous(value: Any) -> Any:
+    """Continuous symmetries as lists of numbers: axis, and offset, if there is one."""
+    return _parse_each(value, _flatten_continuous, _CONTINUOUS)
+
+
+def _parse_each(value: Any, flatten: Callable[[Any], list[Any]], rule: str) -> Any:
+    """Convert each symmetry of a list; raises ValueError with the rule."""
+    if not isinstance(value, list | tuple):
+        raise ValueError(f"a list of symmetries, each {rule}")
+    rows = []
+    for one in value:
+        row = flatten(one)
+        if not all(isinstance(number, int | float) and not isinstance(number, bool) and abs(number) < 1e9 for number in row):
+            raise ValueError(rule)
+        if not (_is_rigid(row) if len(row) == 16 else len(row) in (3, 4, 6, 7) and hypot(*row[:3]) > 0.0):
+            raise ValueError(rule)
+        rows.append(row)
+    return rows
+
+
+def _flatten_discrete(one: Any) -> list[Any]:
+    """Numbers of a discrete symmetry; an empty list if its form is another one."""
+    if isinstance(one, dict) and {"axis", "fold"} <= one.keys() <= {"axis", "fold", "offset"}:
+        one = [*_triple(one["axis"]), one["fold"], *(_triple(one["offset"]) if "offset" in one else ())]
+    elif isinstance(one, dict) and one.keys() == {"matrix"}:
+        one = one["matrix"]
+    row = list(one) if isinstance(one, list | tuple) else []
+    if len(row) == 4 and all(isinstance(line, list | tuple) and len(line) == 4 for line in row):
+        row = [number for line in row for number in line]
+    is_turn = len(row) in (4, 7) and isinstance(row[3], int | float) and row[3] in range(2, MAX_FOLD + 1)
+    return row if is_turn or len(row) == 16 else []
+
+
+def _flatten_continuous(one: Any) -> list[Any]:
+    """Numbers of a continuous symmetry; an empty list if its form is another one."""
+    if isinstance(one, dict) and {"axis"} <= one.keys() <= {"axis", "offset"}:
+        one = [*_triple(one["axis"]), *(_triple(one["offset"]) if "offset" in one else ())]
+    row = list(one) if isinstance(one, list | tuple) else []
+    return row if len(row) in (3, 6) else []
+
+
+def _triple(value: Any) -> list[Any]:
+    """A list of three elements; of others one that no number is in."""
+    return list(value) if isinstance(value, list | tuple) and len(value) == 3 else [None]
+
+
+def _is_rigid(row: list[Any]) -> bool:
+    """Whether 16 numbers are a rotation and a translation, row by row."""
+    a, b, c = row[0:3], row[4:7], row[8:11]
+    cross = (a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0])
+    lengths = (sum(x * x for x in one) - 1.0 for one in (a, b))
+    offs = (*lengths, sum(x * y for x, y in zip(a, b, strict=True)), *(x - y for x, y in zip(c, cross, strict=True)))
+    last = (*row[12:15], row[15] - 1.0)
+    return max(abs(off) for off in (*offs, *last)) <= _RIGID
 
 
 @dataclass(frozen=True)
@@ -56,6 +130,21 @@ class Objects:
         "",
         "Move the centre of each mesh's bounding box to its origin; BOP models, whose poses refer to their origin, stay as they are.",
     )
+    symmetries: str = setting(
+        DECLARED,
+        "",
+        "Symmetries of objects: declared (those of their rows, else of models_info.json), or detect (of objects that declare none, by the "
+        "shape alone: texture does not count).",
+        choices=SYMMETRIES,
+    )
+    symmetry_tolerance: float = setting(
+        0.03,
+        "",
+        "Largest distance between a surface and its rotated self for the rotation to be detected as a symmetry, in diameters (BOP's "
+        "organizers took 0.1, at least 15 mm, and left out what texture tells apart).",
+        low=1e-3,
+        high=0.2,
+    )
     diameter_tolerance: float = setting(
         0.1,
         "",
@@ -78,3 +167,16 @@ class ObjectRow:
     concave: bool = setting(False, "", "Use a convex decomposition as collision shape instead of the convex hull.")
     metallic: float = setting(0.1, "", "Metallic factor, unless the mesh file names one.", low=0.0, high=1.0)
     roughness: float = setting(0.5, "", "Roughness, unless the mesh file names one.", low=0.0, high=1.0)
+    symmetries_discrete: tuple[tuple[float, ...], ...] = setting(
+        (),
+        "m",
+        f"Discrete symmetries in the frame of the mesh file, replacing those of models_info.json; each {_DISCRETE}. Without an offset the "
+        "axis passes through the centroid of the surface. Products of those listed are added.",
+        parse=_parse_discrete,
+    )
+    symmetries_continuous: tuple[tuple[float, ...], ...] = setting(
+        (),
+        "m",
+        f"Continuous symmetries in the frame of the mesh file, replacing those of models_info.json; each {_CONTINUOUS}.",
+        parse=_parse_continuous,
+    )

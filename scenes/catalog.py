@@ -14,7 +14,7 @@ from synpick_warp.configs.schema import Config, ObjectRow, Objects, Tote
 from synpick_warp.errors import CatalogError, SynpickError
 from synpick_warp.scenes.assets.appearance import FileMaterial
 from synpick_warp.scenes.assets.asset_files import asset_scope
-from synpick_warp.scenes.assets.meshes import MeshOptions, read_mesh, signed_volume
+from synpick_warp.scenes.assets.meshes import MeshOptions, read_mesh_file, signed_volume
 from synpick_warp.scenes.assets.model_folders import ModelFile, list_models
 from synpick_warp.scenes.assets.models_info import ModelInfo, check_against_mesh, read_models_info
 from synpick_warp.scenes.assets.step import STEP_SUFFIXES
@@ -22,6 +22,7 @@ from synpick_warp.scenes.collision.decomposition import ShapeRecipe
 from synpick_warp.scenes.collision.hulls import hull_size, mass_properties
 from synpick_warp.scenes.collision.shapes import collision_shapes, default_cache_dir
 from synpick_warp.scenes.embedded.objects import procedural_objects
+from synpick_warp.scenes.symmetries.objects import add_symmetries
 from synpick_warp.scenes.types import Catalog, CatalogEntry, ConvexPiece, HullSize, Material, RawObject, TriangleMesh
 from synpick_warp.system.processes.isolation import Failure, Limits, run_isolated
 
@@ -60,9 +61,8 @@ def load_catalog(config: Config, cache_dir: Path | None = None, report: Callable
         CatalogError: The folder cannot be used, or none of its objects: a file is damaged, an object does not fit into the tote or has an
             invalid mass.
     """
-    rules = _Rules(config.objects, config.object_rows, config.tote)
     faults = _Faults(config.objects.strict, config.bake.models, report)
-    raws = _read_folder(Path(config.bake.models).expanduser(), rules, report, faults) if config.bake.models else procedural_objects()
+    raws = _read_objects(config, report, faults)
     recipes = [shape_recipe(raw, config.objects) for raw in raws]
     names, meshes = [raw.name for raw in raws], [raw.mesh for raw in raws]
     seconds = config.objects.decomposition_time
@@ -78,6 +78,20 @@ def load_catalog(config: Config, cache_dir: Path | None = None, report: Callable
     faults.tell()
     _report_undrawable(entries, config.arrangement.volume, report)
     return Catalog(tuple(sorted(entries, key=lambda entry: entry.obj_id)))
+
+
+def read_objects(config: Config, report: Callable[[str], None] = _ignore) -> list[RawObject]:
+    """Read and check the objects of a bake, without collision shapes; arguments, files and errors as of `load_catalog`."""
+    faults = _Faults(config.objects.strict, config.bake.models, report)
+    raws = _read_objects(config, report, faults)
+    faults.tell()
+    return raws
+
+
+def _read_objects(config: Config, report: Callable[[str], None], faults: _Faults) -> list[RawObject]:
+    """The embedded objects, or those of the folder `bake.models`."""
+    rules = _Rules(config.objects, config.object_rows, config.tote)
+    return _read_folder(Path(config.bake.models).expanduser(), rules, report, faults) if config.bake.models else procedural_objects()
 
 
 class _SizeError(CatalogError):
@@ -173,19 +187,22 @@ def _read_model(model: ModelFile, info: ModelInfo, rules: _Rules) -> tuple[RawOb
     unit, center = _unit(objects, model), objects.center and not model.is_bop
     options = MeshOptions(objects.crease_angle, center, not objects.strict, unit if center or objects.unit != AUTO_UNIT else "")
     with asset_scope(model.root) as scope:
-        mesh, material = read_mesh(model.path, UNITS[unit], options, lines.append)
+        found = read_mesh_file(model.path, UNITS[unit], options, lines.append)
+    mesh = found.mesh
     hull, tolerance = hull_size(mesh.vertices), objects.diameter_tolerance
     if model.is_bop and hull.diameter > 0.0:
         info, said = _check_info(info, mesh, hull, model, objects.strict)
         lines += said
     rows = (row for row in rules.rows if (row.id == model.obj_id if model.is_bop else row.name == model.name))
     row = next((row for row in rows if _fits(row, hull.diameter, tolerance)), None)
-    raw = _raw(model, mesh, hull, material, row, objects)
+    raw = _raw(model, mesh, hull, found.material, row, objects)
+    _check_size(raw, str(model.path if model.is_bop else raw.name), rules.tote)
+    info, said = add_symmetries(info, found, hull.diameter, row, objects, str(model.path))
+    lines += said
     raw = replace(raw, symmetries_discrete=info.symmetries_discrete, symmetries_continuous=info.symmetries_continuous)
     # A copy of the file could not name its texture as it does, and would have another unit than BOP's.
     if model.is_bop and unit == "mm" and not scope.moved:
         raw = replace(raw, source=model.path)
-    _check_size(raw, str(model.path if model.is_bop else raw.name), rules.tote)
     _checked_mass(raw, objects.density)
     return raw, [*scope.moved[:1], *lines]
 

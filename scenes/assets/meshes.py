@@ -65,9 +65,24 @@ def _ignore(line: str) -> None:
     """Default for `report`: drops the line."""
 
 
+@dataclass(frozen=True, eq=False)
+class MeshFile:
+    """Mesh [m] and material of a mesh file, and by what the mesh was moved to be centred (3) [m]."""
+
+    mesh: TriangleMesh
+    material: FileMaterial
+    moved: np.ndarray
+
+
 def read_mesh(
     path: Path, unit: float, options: MeshOptions = MeshOptions(), report: Callable[[str], None] = _ignore
 ) -> tuple[TriangleMesh, FileMaterial]:
+    """Mesh and material of a mesh file; arguments and errors as of `read_mesh_file`."""
+    found = read_mesh_file(path, unit, options, report)
+    return found.mesh, found.material
+
+
+def read_mesh_file(path: Path, unit: float, options: MeshOptions = MeshOptions(), report: Callable[[str], None] = _ignore) -> MeshFile:
     """Read a mesh file. Parts are merged into one mesh, several materials into a texture atlas; vertex colours are baked into a texture.
 
     Args:
@@ -87,30 +102,31 @@ def read_mesh(
         parts = [part for part in parts if len(part.faces)]
         if not parts:
             raise CatalogError(f"{path}: no triangles; a model needs a surface, a point cloud has none")
-        mesh = _finish(_join([_bake_colors(part) for part in parts], path, options, notes), unit, options, notes)
+        found = _finish(_join([_bake_colors(part) for part in parts], path, options, notes), unit, options, notes)
     line = notes.line(path)
     if line is not None:
         report(line)
-    return mesh
+    return found
 
 
-def _finish(part: MeshPart, unit: float, options: MeshOptions, notes: Notes) -> tuple[TriangleMesh, FileMaterial]:
+def _finish(part: MeshPart, unit: float, options: MeshOptions, notes: Notes) -> MeshFile:
     """Convert a validated part to metres, centre it if asked to, orient it outward and complete its normals."""
     metres = part.vertices * unit
     if options.unit:
         sides = " x ".join(f"{side / _MILLIMETRE:.4g}" for side in np.ptp(metres, axis=0))
         notes.said.append(f"{sides} mm, unit {options.unit}")
+    moved = np.zeros(3)
     if options.center:
         offset = -(metres.min(axis=0) + metres.max(axis=0)) / 2.0
         if np.abs(offset).max() > 1e-6 * np.ptp(metres, axis=0).max():
             notes.said.append(f"centred: moved by {', '.join(f'{value:.6g}' for value in offset.round(6) + 0.0)} m")
-            metres = metres + offset
+            metres, moved = metres + offset, offset
     vertices = metres.astype(np.float32)
     faces, given = _orient_outward(vertices, part.faces, part.normals)
     part = complete_normals(replace(part, vertices=vertices, faces=faces, normals=given), options.crease_angle)
     vertices, normals = part.vertices.astype(np.float32), np.asarray(part.normals, np.float32)
     uv = np.zeros((len(vertices), 2), np.float32) if part.uv is None else part.uv.astype(np.float32)
-    return TriangleMesh(vertices, part.faces.astype(np.int32), normals, uv), part.material
+    return MeshFile(TriangleMesh(vertices, part.faces.astype(np.int32), normals, uv), part.material, moved)
 
 
 def complete_normals(part: MeshPart, crease_angle: float) -> MeshPart:

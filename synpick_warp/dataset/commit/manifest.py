@@ -26,7 +26,7 @@ import msgspec
 
 from synpick_warp import __version__
 from synpick_warp.configs.load import load_config, override_config
-from synpick_warp.configs.objects import AUTO_UNIT
+from synpick_warp.configs.objects import AUTO_UNIT, Objects
 from synpick_warp.configs.schema import CLASSIC, WITHIN, Config
 from synpick_warp.dataset.records import Entry, EpisodeEntry, IndicesEntry, Manifest, read_record
 from synpick_warp.errors import DatasetError
@@ -63,9 +63,18 @@ FREE_SETTINGS = (
 )
 """Settings that may differ when a bake is resumed: no episode depends on them. Objects and lights are compared by content, not by the name
 of their folder. A device of another type computes the same episodes up to rounding."""
-YOUNGER_SETTINGS: dict[str, Any] = {"bop.layout": CLASSIC, "bop.keypoints": 0, "arrangement.fill": WITHIN, "objects.unit": AUTO_UNIT}
+YOUNGER_SETTINGS: dict[str, Any] = {
+    "bop.layout": CLASSIC,
+    "bop.keypoints": 0,
+    "arrangement.fill": WITHIN,
+    "objects.unit": AUTO_UNIT,
+    "objects.symmetries": Objects().symmetries,
+    "objects.symmetry_tolerance": Objects().symmetry_tolerance,
+}
 """Settings that older manifests lack, and what held before: left out where they have these values, so that older data sets can still be
 read, and resumed with them."""
+_YOUNGER_KEYS = ("symmetries_discrete", "symmetries_continuous")
+"""Keys of object rows that older manifests lack: left out if they are empty."""
 PACKAGES = ("warp-lang", "newton", "numpy", "scipy", "coacd", "opencv-python-headless", "isal", "orjson", "usd-core", "zarr")
 """Packages whose versions the output of every format depends on; `FORMAT_TABLE` has those of single formats."""
 MAX_DIFFERENCES, MAX_SHOWN = 8, 80
@@ -109,6 +118,9 @@ def fixed_settings(config: Config) -> dict[str, Any]:
         section, name = key.split(".")
         if settings[section][name] == before:
             del settings[section][name]
+    for row in settings["object_rows"]:
+        for name in [name for name in _YOUNGER_KEYS if not row[name]]:
+            del row[name]
     settings["bake"]["formats"] = sorted(set(config.bake.formats))
     for split in settings["splits"]:
         del split["episodes"]
