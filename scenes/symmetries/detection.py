@@ -182,7 +182,8 @@ def _refine(surface: Surface, axis: np.ndarray, point: np.ndarray, fold: int, co
 
 
 def _turn(surface: Surface, axis: np.ndarray, point: np.ndarray, fold: int) -> Turn:
-    """Rotation by a fold's angle with its distance."""
+    """Rotation by a fold's angle with its distance; the axis's largest component is positive."""
+    axis = axis * np.sign(axis[np.argmax(np.abs(axis))])
     return Turn(axis, point, fold, surface.deviation(turn_matrix(axis, point, 2.0 * np.pi / fold)))
 
 

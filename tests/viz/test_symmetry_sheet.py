@@ -49,6 +49,13 @@ def test_the_symmetries_of_a_folder_of_parts(tmp_path, capsys):
     assert len(np.unique(image.reshape(-1, 3), axis=0)) > 10
 
 
+def test_the_symmetries_that_a_data_set_states(picked_set, tmp_path, capsys):
+    assert main(["preview", str(picked_set), "--symmetries", "--out", str(tmp_path / "a.png")]) == 0
+    assert capsys.readouterr().out == f"symmetries: {tmp_path / 'a.png'}\n"
+    assert main(["preview", str(picked_set), "--symmetries", "--config", "smoke"]) == 2
+    assert "which has its settings" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
