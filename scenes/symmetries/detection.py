@@ -63,6 +63,29 @@ def turn_matrix(axis: np.ndarray, point: np.ndarray, angle: float) -> np.ndarray
     return matrix
 
 
+def find_axes(matrices: np.ndarray) -> list[Turn]:
+    """Axes of discrete symmetries (N, 4, 4), each with its largest fold, without distances; larger folds first."""
+    found: list[Turn] = []
+    for matrix in matrices:
+        vector = Rotation.from_matrix(matrix[:3, :3]).as_rotvec()
+        angle = float(np.linalg.norm(vector))
+        if angle < 1e-3:
+            continue
+        axis = _upward(vector / angle)
+        turn = Turn(axis, np.linalg.pinv(np.eye(3) - matrix[:3, :3], rcond=1e-6) @ matrix[:3, 3], max(round(2.0 * np.pi / angle), 2), 0.0)
+        beside = next((index for index, other in enumerate(found) if abs(other.axis @ axis) > np.cos(np.radians(2.0))), None)
+        if beside is None:
+            found.append(turn)
+        elif turn.fold > found[beside].fold:
+            found[beside] = turn
+    return sorted(found, key=lambda turn: -turn.fold)
+
+
+def _upward(axis: np.ndarray) -> np.ndarray:
+    """An axis in the direction in which its largest component is positive."""
+    return axis * np.sign(axis[np.argmax(np.abs(axis))])
+
+
 def find_symmetries(vertices: np.ndarray, faces: np.ndarray, diameter: float, tolerance: float) -> Symmetries:
     """Find the rotational symmetries of a mesh.
 
@@ -182,8 +205,8 @@ def _refine(surface: Surface, axis: np.ndarray, point: np.ndarray, fold: int, co
 
 
 def _turn(surface: Surface, axis: np.ndarray, point: np.ndarray, fold: int) -> Turn:
-    """Rotation by a fold's angle with its distance; the axis's largest component is positive."""
-    axis = axis * np.sign(axis[np.argmax(np.abs(axis))])
+    """Rotation by a fold's angle with its distance."""
+    axis = _upward(axis)
     return Turn(axis, point, fold, surface.deviation(turn_matrix(axis, point, 2.0 * np.pi / fold)))
 
 

@@ -11,9 +11,12 @@ from synpick_warp.configs.objects import DETECT, ObjectRow, Objects
 from synpick_warp.errors import CatalogError
 from synpick_warp.scenes.assets.meshes import MeshFile
 from synpick_warp.scenes.assets.models_info import ModelInfo, check_against_mesh
-from synpick_warp.scenes.symmetries.detection import Symmetries, Turn, find_symmetries, turn_matrix
+from synpick_warp.scenes.symmetries.detection import Symmetries, Turn, find_axes, find_symmetries, turn_matrix
 from synpick_warp.scenes.symmetries.groups import MAX_ELEMENTS, close_transforms
 from synpick_warp.scenes.symmetries.surface import Surface
+
+_MAX_SHOWN = 4
+"""Most axes of discrete symmetries that a line names."""
 
 
 def add_symmetries(
@@ -79,25 +82,31 @@ def _axis(values: Sequence[float], offset: Sequence[float], moved: np.ndarray, c
 
 
 def _with(info: ModelInfo, matrices: Sequence[np.ndarray] | np.ndarray, axes: Sequence[tuple[np.ndarray, np.ndarray]]) -> ModelInfo:
-    """The entry with these symmetries."""
+    """The entry with these symmetries, rounded to 1e-9: further digits depend on the machine, and the catalog's digest on all of them."""
     return replace(
         info,
-        symmetries_discrete=tuple(tuple(float(value) for value in matrix.reshape(-1)) for matrix in matrices),
+        symmetries_discrete=tuple(tuple(_rounded(value) for value in matrix.reshape(-1)) for matrix in matrices),
         symmetries_continuous=tuple((_triple(axis), _triple(point)) for axis, point in axes),
     )
 
 
 def _triple(vector: np.ndarray) -> tuple[float, float, float]:
-    """Vector as a tuple, without negative zeros."""
-    x, y, z = (float(value) + 0.0 for value in vector)
+    """Vector as a tuple."""
+    x, y, z = (_rounded(value) for value in vector)
     return x, y, z
+
+
+def _rounded(value: float) -> float:
+    """Number with nine decimals, without a negative zero."""
+    return round(float(value), 9) + 0.0
 
 
 def describe_symmetries(symmetries: Symmetries, tolerance: float) -> str:
     """Line on detected symmetries with their distances, or on the nearest miss; `tolerance`: that of the detection [m]."""
     parts = [f"continuous about {_shown(turn.axis)}" for turn in symmetries.continuous]
-    if len(symmetries.discrete):
-        parts.append(f"{len(symmetries.discrete)} discrete")
+    axes = find_axes(symmetries.discrete)
+    parts += [f"{turn.fold}-fold about {_shown(turn.axis)}" for turn in axes[:_MAX_SHOWN]]
+    parts += [f"{len(axes) - _MAX_SHOWN} more axes"] if len(axes) > _MAX_SHOWN else []
     allowed = f"{1e3 * tolerance:.3g} mm allowed"
     if parts:
         off = max([*symmetries.deviations, *(turn.deviation for turn in symmetries.continuous)])

@@ -239,7 +239,7 @@ def test_detected_symmetries_reach_models_info_and_evaluation(tmp_path, name):
         mesh.apply_scale(1000.0)
         put(tmp_path / "parts" / "models_info.json", json.dumps({"1": {"diameter": 116.6, "extra": 1}}))
     catalog, (line,) = load(tmp_path, mesh, name, symmetries="detect")
-    assert "symmetries detected: continuous about (0, 0, 1), 1 discrete; they move its surface by up to 0." in line
+    assert "symmetries detected: continuous about (0, 0, 1), 2-fold about (1, 0, 0); they move its surface by up to 0." in line
     (tmp_path / "set").mkdir()
     write_models(tmp_path / "set" / "models", catalog)
     info = read_models_info(tmp_path / "set" / "models" / "models_info.json", [1])[1]

@@ -42,7 +42,8 @@ def test_the_symmetries_of_a_folder_of_parts(tmp_path, capsys):
     assert main(arguments) == 0
     said = capsys.readouterr().out
     assert "nut.stl: 60 x 51.96 x 20 mm, unit mm" in said
-    assert "nut.stl: symmetries detected: 11 discrete; " in said
+    assert "nut.stl: symmetries detected: 6-fold about (0, 0, 1), 2-fold about (" in said
+    assert ", 3 more axes; they move its surface by up to " in said
     image = cv2.imread(str(tmp_path / "a.png"))
     assert image is not None
     assert image.shape[1] == 5 * image.shape[0] * 260 // 304  # The part, and four rotations.

@@ -8,12 +8,11 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from synpick_warp.apps.viz.drawing import INK, WHITE, Image, put_text, write_picture
 from synpick_warp.configs.schema import Config
 from synpick_warp.scenes.catalog import read_objects
-from synpick_warp.scenes.symmetries.detection import Turn, turn_matrix
+from synpick_warp.scenes.symmetries.detection import Turn, find_axes, turn_matrix
 from synpick_warp.scenes.symmetries.surface import Surface
 from synpick_warp.scenes.types import RawObject
 
@@ -58,24 +57,9 @@ def write_symmetry_sheet(config: Config, out: Path, report: Callable[[str], None
 
 
 def group_turns(raw: RawObject) -> list[Turn]:
-    """Axes of an object's symmetries: continuous ones (fold 0), then of the discrete ones those of the largest fold, without distances."""
+    """Axes of an object's symmetries: continuous ones (fold 0), then those of the discrete ones, without distances."""
     turns = [Turn(np.array(axis), np.array(point), 0, 0.0) for axis, point in raw.symmetries_continuous]
-    found: list[Turn] = []
-    for values in raw.symmetries_discrete:
-        matrix = np.reshape(values, (4, 4))
-        vector = Rotation.from_matrix(matrix[:3, :3]).as_rotvec()
-        angle = float(np.linalg.norm(vector))
-        axis = vector / angle
-        # The axis's sign is arbitrary: the largest component is positive.
-        axis = axis * np.sign(axis[np.argmax(np.abs(axis))])
-        point = np.linalg.pinv(np.eye(3) - matrix[:3, :3], rcond=1e-6) @ matrix[:3, 3]
-        fold = max(round(2.0 * np.pi / angle), 2)
-        beside = next((index for index, other in enumerate(found) if abs(other.axis @ axis) > 0.999), None)
-        if beside is None:
-            found.append(Turn(axis, point, fold, 0.0))
-        elif fold > found[beside].fold:
-            found[beside] = Turn(axis, point, fold, 0.0)
-    return turns + sorted(found, key=lambda turn: -turn.fold)
+    return turns + find_axes(np.reshape(raw.symmetries_discrete, (-1, 4, 4)))
 
 
 def _row(raw: RawObject, tolerance: float) -> Image:
