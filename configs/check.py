@@ -9,6 +9,7 @@ import typing
 from collections.abc import Iterator
 from typing import Any
 
+from synpick_warp.configs.randomize import Distribution
 from synpick_warp.errors import ConfigError, format_value, suggest
 
 _NAMES = {
@@ -65,6 +66,8 @@ def describe_allowed(item: dataclasses.Field[Any], annotation: Any) -> str:
     if rules["choices"]:
         return ("any of " if typing.get_origin(annotation) is tuple else "") + ", ".join(rules["choices"])
     words = [f"{word} {_number(rules[name])}" for name, word in _BOUNDS if rules[name] is not None]
+    if _is_distribution(annotation):
+        return f"{annotation.describe()}; {', '.join(words)}"
     if not words:
         return describe_type(annotation)
     return ("each " if typing.get_origin(annotation) is tuple else "") + ", ".join(words)
@@ -72,6 +75,8 @@ def describe_allowed(item: dataclasses.Field[Any], annotation: Any) -> str:
 
 def describe_type(annotation: Any, *, plural: bool = False) -> str:
     """Describe a type: "a finite number", "2 whole numbers in a list", "a list of lists of 3 numbers"."""
+    if _is_distribution(annotation):
+        return annotation.describe()
     if typing.get_origin(annotation) is not tuple:
         return _NAMES[annotation][plural]
     parts = typing.get_args(annotation)
@@ -86,6 +91,11 @@ def _convert(value: object, annotation: Any) -> Any:
     """Value as the annotated type (int becomes float, lists tuples); raises _MismatchError if it does not fit."""
     if typing.get_origin(annotation) is tuple:
         return _convert_tuple(value, typing.get_args(annotation))
+    if _is_distribution(annotation):
+        try:
+            return annotation.parse(value)
+        except ValueError as error:
+            raise _MismatchError(str(error)) from None
     if annotation is float:
         if not isinstance(value, int | float) or isinstance(value, bool):
             raise _MismatchError
@@ -95,6 +105,11 @@ def _convert(value: object, annotation: Any) -> Any:
     if isinstance(value, int) and not -(2**63) <= value < 2**63:
         raise _MismatchError("a whole number of at most 64 bits, as TOML has")
     return value
+
+
+def _is_distribution(annotation: Any) -> bool:
+    """Whether a type is that of a distribution."""
+    return isinstance(annotation, type) and issubclass(annotation, Distribution)
 
 
 def _convert_tuple(value: object, parts: tuple[Any, ...]) -> tuple[Any, ...]:
@@ -129,8 +144,10 @@ def _encodable(text: str) -> bool:
 
 
 def _leaves(value: Any) -> Iterator[Any]:
-    """Yield the single values of nested tuples."""
-    if isinstance(value, tuple):
+    """Yield the single values of nested tuples, and of a distribution those that must lie within the setting's range."""
+    if isinstance(value, Distribution):
+        yield from value.limits()
+    elif isinstance(value, tuple):
         for one in value:
             yield from _leaves(one)
     else:

@@ -1,7 +1,7 @@
 """Settings schema of a bake: frozen dataclasses, each field with default, unit, range and meaning. Nothing else has defaults.
 
 The defaults are the paper's values (preset `synpick`); where the paper names none, the help text says where a value comes from.
-"Released" means the generator that the paper's authors published. Sections: here, `manipulation` and `sensors`.
+"Released" means the generator that the paper's authors published. Sections: here, `manipulation`, `randomize` and `sensors`.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ from typing import Any
 from synpick_warp.codes import Tone, names
 from synpick_warp.configs.fields import INT32_MAX, setting
 from synpick_warp.configs.manipulation import Move, Perception, Pick, Suction, Target
+from synpick_warp.configs.randomize import Randomize
 from synpick_warp.configs.sensors import DepthSensor, Effects
 from synpick_warp.views.layers import LAYER_TABLE
 
@@ -465,6 +466,7 @@ class Config:
     render: Render = field(default_factory=Render)
     effects: Effects = field(default_factory=Effects)
     depth_sensor: DepthSensor = field(default_factory=DepthSensor)
+    randomize: Randomize = field(default_factory=Randomize)
     bop: Bop = field(default_factory=Bop)
     trajectory: Trajectory = field(default_factory=Trajectory)
     object_rows: tuple[ObjectRow, ...] = ()

@@ -7,6 +7,7 @@ from typing import Any
 
 from synpick_warp.configs.check import describe_allowed
 from synpick_warp.configs.load import ROWS, sections, settings_of
+from synpick_warp.configs.randomize import Distribution
 from synpick_warp.configs.schema import Config, ObjectRow, Split
 from synpick_warp.configs.split_tables import SPLITS, split_settings
 
@@ -50,6 +51,10 @@ def format_toml(value: Any) -> str:
         return "true" if value else "false"
     if isinstance(value, str):
         return json.dumps(value, ensure_ascii=False).replace(_DELETE, "\\u007f")
+    if isinstance(value, Distribution):
+        return format_toml(value.to_toml())
+    if isinstance(value, dict):
+        return f"{{ {', '.join(f'{key} = {format_toml(one)}' for key, one in value.items())} }}"
     if isinstance(value, tuple):
         return f"[{', '.join(format_toml(one) for one in value)}]"
     return repr(value)

@@ -159,6 +159,43 @@ class Stream(enum.IntEnum):
     EFFECTS = 9
     COLOR_NOISE = 10
     DEPTH_NOISE = 11
+    LOOKS = 12
+
+
+class Look(enum.IntEnum):
+    """Appearance parameter that an episode draws, of a body or the table; see `configs.randomize`."""
+
+    HUE = 0
+    """Rotation of the hue [°]."""
+    BRIGHTNESS = 1
+    """Factor on the base colour."""
+    ROUGHNESS = 2
+    METALLIC = 3
+    COLOR = 4
+    """Base colour [sRGB]."""
+    TEXTURE = 5
+    """Index of a texture."""
+    TEXTURE_WIDTH = 6
+    """Width of one repeat of the texture [m]."""
+
+
+class LookPart(enum.IntEnum):
+    """Part of a scene whose appearance an episode draws."""
+
+    OBJECT = 0
+    BIN = 1
+    TABLE = 2
+
+
+class LookKind(enum.IntEnum):
+    """Kind of a probability distribution; see `configs.randomize.Distribution`."""
+
+    OFF = 0
+    FIXED = 1
+    UNIFORM = 2
+    LOG_UNIFORM = 3
+    NORMAL = 4
+    CHOICE = 5
 
 
 class Segment(enum.IntEnum):

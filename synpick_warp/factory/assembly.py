@@ -7,9 +7,10 @@ from __future__ import annotations
 
 import contextlib
 import gc
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from typing import Any
 
 import numpy as np
 import warp as wp
@@ -27,8 +28,10 @@ from synpick_warp.scenes.cameras import make_cameras
 from synpick_warp.scenes.catalog import load_catalog
 from synpick_warp.scenes.fixtures import make_fixtures
 from synpick_warp.scenes.lights import load_lights
+from synpick_warp.scenes.looks import load_looks
 from synpick_warp.scenes.types import Camera, Catalog, EnvironmentMap
 from synpick_warp.stages.host_copies import host_images
+from synpick_warp.stages.render.looks import draw_looks
 from synpick_warp.stages.render.renderer import Renderer
 from synpick_warp.stages.render.scene import RenderScene, build_render_scene
 from synpick_warp.stages.sim.simulate import Simulation
@@ -59,6 +62,12 @@ class Stages:
     def tick_time(self) -> float:
         """Time between two frames [s]."""
         return self.config.physics.tick_time
+
+    @property
+    def looks(self) -> Callable[[int, int], Mapping[str, Any]] | None:
+        """Function of episode and number of objects that returns the record of the episode's looks; None: none is randomized."""
+        looks = self.renderer.scene.looks
+        return partial(draw_looks, looks, self.config.bake.seed) if looks else None
 
     def make_log(self) -> AttemptLog:
         """Create an empty attempt log."""
@@ -173,7 +182,8 @@ def build_stages(
     if longest_first and episodes is not None:
         episodes = order_longest_first(config, catalog, episodes, device)
     progress.stage(f"building {config.bake.worlds} worlds of {len(catalog)} objects on {device.alias}")
-    scene = build_render_scene(config.render, config.tote, catalog, fixtures, cameras, lights, device)
+    looks = load_looks(config.randomize, progress.note, config.objects.strict)
+    scene = build_render_scene(config.render, config.tote, catalog, fixtures, cameras, lights, device, looks)
     simulation = Simulation(config, catalog, len(lights), device, scene, episodes, records_physics)
     sizes = view_sizes(config.render, config.cameras, config.bake.worlds, config.arrangement.max_objects, device)
     histories = simulation.layout.worlds * len(cameras)

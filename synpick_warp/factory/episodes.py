@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
@@ -41,20 +41,27 @@ class EpisodeRow(NamedTuple):
     """Objects at the last frame."""
     split: str = ""
     """Name of the episode's split; empty, and no key: the settings have no splits."""
+    looks: Mapping[str, Any] | None = None
+    """Randomized looks of the episode, as `draw_looks` has them; None, and no key: the settings randomize none."""
 
     def as_json(self) -> dict[str, Any]:
         """Row as the dictionary of a line of episodes.jsonl."""
         row = {**self._asdict(), "ending": self.ending.name.lower()}
-        if not self.split:
-            del row["split"]
+        for name, value in _OPTIONAL.items():
+            if row[name] == value:
+                del row[name]
         return {**row, "sentence": self.ending.sentence}
 
     @classmethod
     def from_json(cls, row: Mapping[str, Any]) -> EpisodeRow:
         """Row from the dictionary of a line of episodes.jsonl."""
-        values: dict[str, Any] = {name: row[name] for name in cls._fields if name != "split" or name in row}
+        values: dict[str, Any] = {name: row[name] for name in cls._fields if name not in _OPTIONAL or name in row}
         values["ending"] = Ending[row["ending"].upper()]
         return cls(**values)
+
+
+_OPTIONAL = EpisodeRow._field_defaults
+"""Fields that rows lack where they have these values."""
 
 
 @dataclass
@@ -114,8 +121,15 @@ class BakeSummary:
         self.outcomes.update(attempt.outcome for attempt in record.attempts)
 
 
-def episode_row(layout: DataLayout, tick_time: float, report: TickReport, world: int, record: EpisodeRecord) -> EpisodeRow:
-    """Build the row of the episode that ended in a world. `tick_time`: time between two frames [s]."""
+def episode_row(
+    layout: DataLayout,
+    tick_time: float,
+    looks: Callable[[int, int], Mapping[str, Any]] | None,
+    report: TickReport,
+    world: int,
+    record: EpisodeRecord,
+) -> EpisodeRow:
+    """Build the row of the episode that ended in a world. `tick_time`: time between two frames [s]; `looks`: see `Stages.looks`."""
     episode, arrangement, frame, ending = (int(report.column(name)[world]) for name in ("episode", "arrangement", "frame", "ending"))
     split = layout.split_of(episode)
     return EpisodeRow(
@@ -131,6 +145,7 @@ def episode_row(layout: DataLayout, tick_time: float, report: TickReport, world:
         record.lost,
         record.left,
         "" if split is None else split.name,
+        None if looks is None else looks(episode, record.objects),
     )
 
 

@@ -43,7 +43,7 @@ class StoredContext(ExportContext):
 
         source = self._source
         catalog, lights = load_catalog(source.config), load_lights(source.config.bake.lights)
-        if digest_inputs(catalog, lights) != source.inputs:
+        if any(source.inputs.get(name) != digest for name, digest in digest_inputs(catalog, lights).items()):
             raise DatasetError(f"the objects or lights of {source.folder} have changed since its bake, but are needed; restore them")
         return catalog, lights
 

@@ -26,6 +26,7 @@ import msgspec
 
 from synpick_warp import __version__
 from synpick_warp.configs.load import load_config, override_config
+from synpick_warp.configs.randomize import Distribution, Randomize
 from synpick_warp.configs.schema import CLASSIC, WITHIN, Config
 from synpick_warp.dataset.records import Entry, EpisodeEntry, IndicesEntry, Manifest, read_record
 from synpick_warp.errors import DatasetError
@@ -56,13 +57,23 @@ FREE_SETTINGS = (
     "bake.device",
     "bake.models",
     "bake.lights",
+    "randomize.bin_textures",
+    "randomize.table_textures",
     "bake.writers",
     "render.views_per_batch",
     "perception.views",
 )
-"""Settings that may differ when a bake is resumed: no episode depends on them. Objects and lights are compared by content, not by the name
-of their folder. A device of another type computes the same episodes up to rounding."""
+"""Settings that may differ when a bake is resumed: no episode depends on them. Objects, lights and textures are compared by content, not
+by the name of their folder. A device of another type computes the same episodes up to rounding."""
+
+
+def _plain(value: Any) -> Any:
+    """A value of a setting in types of TOML."""
+    return value.to_toml() if isinstance(value, Distribution) else value
+
+
 YOUNGER_SETTINGS: dict[str, Any] = {"bop.layout": CLASSIC, "bop.keypoints": 0, "arrangement.fill": WITHIN}
+YOUNGER_SETTINGS |= {f"randomize.{item.name}": _plain(item.default) for item in dataclasses.fields(Randomize)}
 """Settings that older manifests lack, and what held before: left out where they have these values, so that older data sets can still be
 read, and resumed with them."""
 PACKAGES = ("warp-lang", "newton", "numpy", "scipy", "coacd", "opencv-python-headless", "isal", "orjson", "usd-core", "zarr")
@@ -101,13 +112,15 @@ def fixed_settings(config: Config) -> dict[str, Any]:
     Nested; formats sorted by name.
     """
     settings = dataclasses.asdict(config)
+    settings["randomize"] = {item.name: _plain(getattr(config.randomize, item.name)) for item in dataclasses.fields(Randomize)}
     for key in FREE_SETTINGS:
         section, name = key.split(".")
         del settings[section][name]
     for key, before in YOUNGER_SETTINGS.items():
         section, name = key.split(".")
-        if settings[section][name] == before:
+        if settings[section].get(name) == before:
             del settings[section][name]
+    settings = {section: content for section, content in settings.items() if content != {}}
     settings["bake"]["formats"] = sorted(set(config.bake.formats))
     for split in settings["splits"]:
         del split["episodes"]
@@ -177,8 +190,10 @@ def differences(here: Mapping[str, Any], there: Mapping[str, Any], path: str = "
     """Compare two manifests: yields (key, value here, value there) of each difference; None: no such key."""
     for name in [*here, *(name for name in there if name not in here)]:
         first, second = here.get(name), there.get(name)
-        if isinstance(first, Mapping) and isinstance(second, Mapping):
-            yield from differences(first, second, f"{path}{name}.")
+        if isinstance(first, Mapping) and isinstance(second, Mapping | None):
+            yield from differences(first, second or {}, f"{path}{name}.")
+        elif isinstance(second, Mapping) and first is None:
+            yield from differences({}, second, f"{path}{name}.")
         elif first != second:
             yield f"{path}{name}", first, second
 
