@@ -17,7 +17,7 @@ from synpick_warp.stages.render.postprocess import PostProcessor
 from synpick_warp.stages.render.raster import Rasterizer
 from synpick_warp.stages.render.reference import ReferenceRenderer
 from synpick_warp.stages.render.scene import RenderScene
-from synpick_warp.stages.render.view_setup import GBUFFER, VIEW_BODIES, body_sizes, set_up_views
+from synpick_warp.stages.render.view_setup import GBUFFER, VIEW_BODIES, VIEW_CAMERAS, body_sizes, set_up_views
 from synpick_warp.stages.timing import scope
 
 SHADED_IMAGE = struct_arrays(ShadedImage, "view", "row", "column")
@@ -32,6 +32,7 @@ class Renderer:
     Attributes:
         instances: Instance capacity of a world.
         views: Maximum number of views of a batch.
+        cameras: The struct `ViewCameras` of the last batch.
         bodies: The struct `ViewBodies` of the last batch.
         gbuffer: The struct `GBuffer` of the last batch.
         image: The struct `ShadedImage` of the last batch: linear radiance.
@@ -68,6 +69,7 @@ class Renderer:
         self.scene = scene = self.dresser.scene if self.dresser else scene
         self.instances = instances
         self.views = views
+        self.cameras = allocate_struct(VIEW_CAMERAS, sizes, scene.device)
         self.bodies = allocate_struct(VIEW_BODIES, sizes, scene.device)
         if self.dresser:
             self.bodies.material = self.dresser.material
@@ -88,7 +90,7 @@ class Renderer:
 
         Args:
             snapshot: State of the worlds.
-            views: The struct `Views`.
+            views: The struct `Views`; its cameras are set.
             out: Written.
             layers: Written; None: no layers.
 
@@ -114,8 +116,9 @@ class Renderer:
     def render_gbuffer(self, snapshot: Snapshot, views: Any, out: ViewBuffers) -> None:
         """First part of `render`: the G-buffer, and the images of depth, instances and amodal bits."""
         scene = self.scene
+        views.cameras = self.cameras
         with scope("set up views", scene.device):
-            set_up_views(scene, scene.cameras, scene.grid, snapshot, snapshot.fixture_visible, views, self.bodies)
+            set_up_views(scene, snapshot, snapshot.fixture_visible, views, self.bodies)
             if self.dresser:
                 self.dresser.dress(snapshot, views, self.bodies)
         with scope("rasterize", scene.device):
