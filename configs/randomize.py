@@ -119,11 +119,14 @@ def _number(value: object) -> float:
 
 
 _NONE, _NO_COLOR, _HALF_METRE = Distribution(), ColorDistribution(), Distribution(FIXED, ((0.5,),))
+_ELEVATION, _RADIUS = Distribution(UNIFORM, ((30.0,), (80.0,))), Distribution(LOG_UNIFORM, ((1.0,), (8.0,)))
+_STRENGTH, _TEMPERATURE = Distribution(LOG_UNIFORM, ((0.1,), (1.0,))), Distribution(UNIFORM, ((2700.0,), (6500.0,)))
 
 
 @dataclass(frozen=True)
 class Randomize:
     """Domain randomization: each episode draws these anew, all off by default. Geometry, physics and labels do not depend on them.
+    Lamps are drawn for each variant of an environment map, of which each episode draws one.
 
     A distribution is a value, or `{ uniform = [low, high] }`, `{ log_uniform = [low, high] }`, `{ normal = [mean, sigma] }` (clamped to
     what is allowed) or `{ choice = [...], weights = [...] }`. Not in the paper.
@@ -143,3 +146,17 @@ class Randomize:
     table_roughness: Distribution = setting(_NONE, "", "Roughness of the table.", low=0.0, high=1.0)
     table_textures: str = setting("", "", "Folder of images, one of which each episode draws as the table's texture; empty: none.")
     texture_width: Distribution = setting(_HALF_METRE, "m", "Width of one repeat of the textures of bin and table.", low=0.01, high=100.0)
+    lamps: Distribution = setting(
+        _NONE,
+        "",
+        "Number of lamps besides an environment map, rounded: distant discs, which cast soft shadows.",
+        low=0,
+        high=4,
+    )
+    lamp_variants: int = setting(4, "", "With lamps: variants of each environment map, each with lamps of its own.", low=1, high=64)
+    lamp_elevation: Distribution = setting(_ELEVATION, "°", "Height of each lamp above the horizon.", low=10.0, high=90.0)
+    lamp_radius: Distribution = setting(_RADIUS, "°", "Angular radius of each lamp.", low=0.3, high=20.0)
+    lamp_strength: Distribution = setting(
+        _STRENGTH, "", "Light of each lamp on a surface that faces up, relative to that of the map.", low=0.01, high=100.0
+    )
+    lamp_temperature: Distribution = setting(_TEMPERATURE, "K", "Colour temperature of each lamp.", low=1700.0, high=25000.0)

@@ -163,7 +163,7 @@ class Stream(enum.IntEnum):
 
 
 class Look(enum.IntEnum):
-    """Appearance parameter that an episode draws, of a body or the table; see `configs.randomize`."""
+    """Appearance parameter that is drawn, of a body, the table or a lamp; see `configs.randomize`."""
 
     HUE = 0
     """Rotation of the hue [°]."""
@@ -177,14 +177,27 @@ class Look(enum.IntEnum):
     """Index of a texture."""
     TEXTURE_WIDTH = 6
     """Width of one repeat of the texture [m]."""
+    COUNT = 7
+    """Number of lamps."""
+    ELEVATION = 8
+    """Height of a lamp above the horizon [°]."""
+    RADIUS = 9
+    """Angular radius of a lamp [°]."""
+    STRENGTH = 10
+    """Irradiance of a surface that faces up by a lamp, relative to that by the map."""
+    TEMPERATURE = 11
+    """Colour temperature of a lamp [K]."""
+    AZIMUTH = 12
+    """Azimuth of a lamp in the map [°]."""
 
 
 class LookPart(enum.IntEnum):
-    """Part of a scene whose appearance an episode draws."""
+    """Part of a scene whose appearance is drawn."""
 
     OBJECT = 0
     BIN = 1
     TABLE = 2
+    LAMP = 3
 
 
 class LookKind(enum.IntEnum):

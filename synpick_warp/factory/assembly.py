@@ -27,10 +27,10 @@ from synpick_warp.scenes.build import REPEATS, find_repeat_rules, must_repeat, w
 from synpick_warp.scenes.cameras import make_cameras
 from synpick_warp.scenes.catalog import load_catalog
 from synpick_warp.scenes.fixtures import make_fixtures
-from synpick_warp.scenes.lights import load_lights
 from synpick_warp.scenes.looks import load_looks
 from synpick_warp.scenes.types import Camera, Catalog, EnvironmentMap
 from synpick_warp.stages.host_copies import host_images
+from synpick_warp.stages.render.lamp_variants import load_scene_lights
 from synpick_warp.stages.render.looks import draw_looks
 from synpick_warp.stages.render.renderer import Renderer
 from synpick_warp.stages.render.scene import RenderScene, build_render_scene
@@ -177,7 +177,7 @@ def build_stages(
     cameras = make_cameras(config.cameras)
     fixtures = make_fixtures(config.tote, config.gripper)
     catalog = load_catalog(config, report=progress.note)
-    lights = load_lights(config.bake.lights, progress.note, config.objects.strict)
+    lights = load_scene_lights(config.bake.lights, config.randomize, config.bake.seed, progress.note, config.objects.strict)
     config = _fit_to_catalog(config, catalog, device, progress)
     if longest_first and episodes is not None:
         episodes = order_longest_first(config, catalog, episodes, device)

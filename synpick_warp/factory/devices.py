@@ -39,9 +39,9 @@ from synpick_warp.factory.sizes import count_writers
 from synpick_warp.scenes.build import REPEATS, must_repeat
 from synpick_warp.scenes.cameras import make_cameras
 from synpick_warp.scenes.catalog import load_catalog
-from synpick_warp.scenes.lights import load_lights
 from synpick_warp.scenes.looks import Looks, load_looks
 from synpick_warp.scenes.types import Catalog, EnvironmentMap
+from synpick_warp.stages.render.lamp_variants import load_scene_lights
 from synpick_warp.system.descriptors import duplicate_above_streams, open_standard_descriptors
 from synpick_warp.system.hardware.caches import KERNEL_VARIABLE
 from synpick_warp.system.hardware.device import describe_kinds, pick_device
@@ -271,7 +271,7 @@ def bake_on_devices(
         report = partial(processes.report_once, progress)
         report("stage", "loading objects and lights")
         catalog = load_catalog(config, report=partial(report, "note"))
-        lights = load_lights(config.bake.lights, partial(report, "note"), config.objects.strict)
+        lights = load_scene_lights(config.bake.lights, config.randomize, config.bake.seed, partial(report, "note"), config.objects.strict)
         looks = load_looks(config.randomize, partial(report, "note"), config.objects.strict)
         prepare_folder(output, needs, catalog, lights, looks)
         filled = config.with_values(REPEATS) if must_repeat(config.arrangement, catalog) else config

@@ -30,10 +30,10 @@ from synpick_warp.factory.meter import ThroughputMeter
 from synpick_warp.factory.sizes import advise_processes, count_writers, pick_processes
 from synpick_warp.factory.worker import BakeLink
 from synpick_warp.scenes.catalog import load_catalog
-from synpick_warp.scenes.lights import load_lights
 from synpick_warp.scenes.looks import load_looks
 from synpick_warp.stages.buffers import Snapshot
 from synpick_warp.stages.launch import limit_threads
+from synpick_warp.stages.render.lamp_variants import load_scene_lights
 from synpick_warp.stages.stream import TickReport, tick_batch
 from synpick_warp.stages.ticks import TickLoop
 from synpick_warp.stages.timing import scope
@@ -110,7 +110,7 @@ def _fill(config: Config, output: OutputFolder, needs: Needs, names: Sequence[st
             factory = build_factory(config, progress, output.remaining, needs.physics, needs.images, longest_first=True)
     else:
         catalog = load_catalog(config, report=progress.note)
-        lights = load_lights(config.bake.lights, progress.note, config.objects.strict)
+        lights = load_scene_lights(config.bake.lights, config.randomize, config.bake.seed, progress.note, config.objects.strict)
         prepare_folder(output, needs, catalog, lights, load_looks(config.randomize, progress.note, config.objects.strict))
     with WriterPool(count_writers(config.bake.writers, needs.slot_bytes), needs.slot_bytes, output.lock) as pool:
         started = time.perf_counter()

@@ -28,6 +28,11 @@ SETTINGS = {
     (LookPart.BIN, Look.METALLIC): "bin_metallic",
     (LookPart.TABLE, Look.COLOR): "table_color",
     (LookPart.TABLE, Look.ROUGHNESS): "table_roughness",
+    (LookPart.LAMP, Look.COUNT): "lamps",
+    (LookPart.LAMP, Look.ELEVATION): "lamp_elevation",
+    (LookPart.LAMP, Look.RADIUS): "lamp_radius",
+    (LookPart.LAMP, Look.STRENGTH): "lamp_strength",
+    (LookPart.LAMP, Look.TEMPERATURE): "lamp_temperature",
 }
 """Setting of `Randomize` that has a part's distribution of a parameter."""
 _COPIED = ("color", "metallic", "roughness", "texture_size", "first_texel", "texture_levels")
@@ -49,6 +54,7 @@ def build_look_table(looks: Looks, first_texture: int, first_row: int, device: A
     for place, name in SETTINGS.items():
         rules = Randomize.__dataclass_fields__[name].metadata
         drawn[place] = getattr(looks.randomize, name), rules["low"], rules["high"]
+    drawn[LookPart.LAMP, Look.AZIMUTH] = Distribution(UNIFORM, ((-180.0,), (180.0,))), 0.0, 0.0
     for part, textures in ((LookPart.BIN, looks.bin_textures), (LookPart.TABLE, looks.table_textures)):
         if textures:
             rows = tuple((float(first_texture + index),) for index in range(len(textures)))
@@ -136,6 +142,20 @@ def _copy(kind: Any, struct: Any) -> Any:
     return result
 
 
+def draw_parameters(looks: Looks, seed: int, episode: int, parts: list[tuple[LookPart, int]]) -> tuple[np.ndarray, np.ndarray]:
+    """Draw all parameters of bodies (part, index within it), on the processor by the renderer's function.
+
+    Returns:
+        `LookKind` of each parameter (part, look), and the values (body, look, 3) float32.
+    """
+    table = build_look_table(looks, 0, 0, "cpu")
+    part, body = (wp.array(column, dtype=wp.int32, device="cpu") for column in zip(*parts, strict=True))
+    values = wp.zeros((len(parts), len(Look)), dtype=wp.vec3, device="cpu")
+    inputs = [wp.uint64(seed), table, wp.full(len(parts), episode, dtype=wp.int32, device="cpu"), part, body]
+    wp.launch(draw_looks_kernel, dim=values.shape, inputs=inputs, outputs=[values], device="cpu")
+    return table.distribution.numpy()["kind"], values.numpy()
+
+
 def draw_looks(looks: Looks, seed: int, episode: int, objects: int) -> dict[str, Any]:
     """Looks of an episode, as its records have them: by part and parameter, and of each object. Textures by index, colours in sRGB.
 
@@ -147,13 +167,8 @@ def draw_looks(looks: Looks, seed: int, episode: int, objects: int) -> dict[str,
         episode: Index of the episode.
         objects: Instances whose looks are wanted.
     """
-    table = build_look_table(looks, 0, 0, "cpu")
     parts = [(LookPart.BIN, 0), (LookPart.TABLE, 0), *((LookPart.OBJECT, index) for index in range(objects))]
-    part, body = (wp.array(column, dtype=wp.int32, device="cpu") for column in zip(*parts, strict=True))
-    values = wp.zeros((len(parts), len(Look)), dtype=wp.vec3, device="cpu")
-    inputs = [wp.uint64(seed), table, wp.full(len(parts), episode, dtype=wp.int32, device="cpu"), part, body]
-    wp.launch(draw_looks_kernel, dim=values.shape, inputs=inputs, outputs=[values], device="cpu")
-    kinds, drawn = table.distribution.numpy()["kind"], values.numpy()
+    kinds, drawn = draw_parameters(looks, seed, episode, parts)
     rows = [_record(kinds[part], drawn[index], looks, part) for index, (part, _) in enumerate(parts)]
     return {"bin": rows[0], "table": rows[1], "objects": rows[2:]}
 

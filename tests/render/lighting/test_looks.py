@@ -16,15 +16,16 @@ from synpick_warp.configs.load import load_config
 from synpick_warp.configs.randomize import ColorDistribution, Distribution, Randomize
 from synpick_warp.errors import ConfigError
 from synpick_warp.scenes.assets.appearance import linear_to_srgb, srgb_to_linear
+from synpick_warp.scenes.environment import LUMINANCE, map_directions
 from synpick_warp.scenes.looks import Looks
+from synpick_warp.scenes.types import EnvironmentMap, Fixture
+from synpick_warp.stages.render.lamp_variants import add_lamps, black_body_color, load_scene_lights
 from synpick_warp.stages.render.looks import draw_looks
 from tests.builders import STIRRING, bake_boxes
 from tests.harness.exporter_contract import digests
 from tests.twins.layers import render_layers, surface_points
 from tests.worlds.small_worlds import settings
 from tests.worlds.toy_scene import FLAT, UPRIGHT, ToyScene, box, camera, entry, surface
-
-from synpick_warp.scenes.types import Fixture  # isort: skip
 
 DRAWS = 1000
 VIEW = camera(160, 90, 200.0, (0.0, 0.0, 2.0))
@@ -220,3 +221,49 @@ def test_distributions_are_written_as_they_are_read(value, tmp_path):
     config = load_config("smoke", {"randomize.object_roughness": value, "randomize.bin_color": {"choice": [[0.1, 0.2, 0.3]]}})
     (tmp_path / "c.toml").write_text(config_to_toml(config, comments=True))
     assert replace(load_config(tmp_path / "c.toml")) == config
+
+
+# ---- lamps ----
+
+
+def test_lamps_add_their_share_of_light():
+    """With one lamp of strength 0.5, a surface that faces up gets half as much again, from a disc at its elevation."""
+    given = looks(lamps=1, lamp_strength=0.5, lamp_elevation=40.0, lamp_radius=3.0, lamp_temperature=3000.0)
+    plain = EnvironmentMap("even", np.ones((256, 512, 3), np.float32))
+    directions, angles = map_directions(len(plain.radiance))
+    upward = np.maximum(directions[..., 2], 0.0) * angles
+    for variant in range(3):
+        lit = add_lamps(plain, "lit", given, 7, variant)
+        added = (lit.radiance - plain.radiance) @ LUMINANCE
+        assert (added * upward).sum() == pytest.approx(0.5 * (plain.radiance @ LUMINANCE * upward).sum(), rel=5e-3)
+        middle = (added * angles)[..., None] * directions
+        middle = middle.sum(axis=(0, 1)) / np.linalg.norm(middle.sum(axis=(0, 1)))
+        assert np.degrees(np.arcsin(middle[2])) == pytest.approx(40.0, abs=0.3)
+        assert np.degrees(np.arccos((directions @ middle)[added > 0.0].min())) < 3.0 + 360.0 / len(added)
+
+
+def test_variants_of_maps_have_lamps_of_their_own():
+    randomize = looks(lamps={"uniform": [1, 4]}).randomize
+    lights = load_scene_lights("", replace(randomize, lamp_variants=2), 3, print)
+    plain = load_scene_lights("", Randomize(), 3, print)
+    assert [light.name for light in lights] == [f"{light.name}+{variant}" for light in plain for variant in range(2)]
+    assert len({light.radiance.tobytes() for light in lights}) == len(lights)
+
+
+@pytest.mark.parametrize("temperature", [1800.0, 2700.0, 4000.0, 6500.0, 12000.0])
+def test_black_bodies_have_the_colour_of_their_spectrum(temperature):
+    """Planck's law through the CIE 1931 observer, in the fit of Wyman, Sloan and Shirley (2013)."""
+    nm = np.arange(360.0, 830.0)
+    spectrum = nm**-5 / np.expm1(1.438776877e7 / (nm * temperature))
+
+    def lobe(peak: float, left: float, right: float) -> np.ndarray:
+        return np.exp(-0.5 * ((nm - peak) * np.where(nm < peak, left, right)) ** 2)
+
+    x = 1.056 * lobe(599.8, 0.0264, 0.0323) + 0.362 * lobe(442.0, 0.0624, 0.0374) - 0.065 * lobe(501.1, 0.0490, 0.0382)
+    y = 0.821 * lobe(568.8, 0.0213, 0.0247) + 0.286 * lobe(530.9, 0.0613, 0.0322)
+    z = 1.217 * lobe(437.0, 0.0845, 0.0278) + 0.681 * lobe(459.0, 0.0385, 0.0725)
+    xyz = np.array([(spectrum * curve).sum() for curve in (x, y, z)])
+    to_rgb = np.linalg.inv([[0.4124564, 0.3575761, 0.1804375], [0.2126729, 0.7151522, 0.0721750], [0.0193339, 0.1191920, 0.9503041]])
+    expected = np.maximum(to_rgb @ xyz, 0.0)
+    expected /= expected @ LUMINANCE
+    np.testing.assert_allclose(black_body_color(temperature), expected, rtol=0.04, atol=0.02)
