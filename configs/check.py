@@ -9,7 +9,7 @@ import typing
 from collections.abc import Iterator
 from typing import Any
 
-from synpick_warp.configs.randomize import Distribution
+from synpick_warp.configs.randomize import OFF, Distribution
 from synpick_warp.errors import ConfigError, format_value, suggest
 
 _NAMES = {
@@ -53,6 +53,8 @@ def check_value(key: str, value: object, item: dataclasses.Field[Any], annotatio
     except _MismatchError as mismatch:
         allowed = str(mismatch) or describe_type(annotation)
         raise ConfigError(f"{key} is {format_value(value)} {source}; allowed: {allowed}{_unit(item)}") from None
+    if isinstance(result, Distribution) and result.kind == OFF != item.default.kind:
+        raise ConfigError(f"{key} is {format_value(value)} {source}; allowed: {describe_allowed(item, annotation)}{_unit(item)}")
     if not all(_inside(leaf, item) for leaf in _leaves(result)):
         wrong = next(leaf for leaf in _leaves(result) if not _inside(leaf, item))
         hint = suggest(str(wrong), item.metadata["choices"])
@@ -67,7 +69,8 @@ def describe_allowed(item: dataclasses.Field[Any], annotation: Any) -> str:
         return ("any of " if typing.get_origin(annotation) is tuple else "") + ", ".join(rules["choices"])
     words = [f"{word} {_number(rules[name])}" for name, word in _BOUNDS if rules[name] is not None]
     if _is_distribution(annotation):
-        return f"{annotation.describe()}; {', '.join(words)}"
+        off = f'"{OFF}", ' if item.default.kind == OFF else ""
+        return f"{off}{annotation.noun} or distribution, {', '.join(words)}"
     if not words:
         return describe_type(annotation)
     return ("each " if typing.get_origin(annotation) is tuple else "") + ", ".join(words)

@@ -88,7 +88,7 @@ class Distribution:
     @classmethod
     def describe(cls) -> str:
         """What a setting of this type allows."""
-        pairs = "{ uniform | log_uniform = [low, high] }, { normal = [mean, sigma] }"
+        pairs = "{ uniform = [low, high] }, { log_uniform = [low, high] }, { normal = [mean, sigma] }"
         return f'"{OFF}", a {cls.noun}, {pairs}, {{ choice = [{cls.noun}, ...], weights = [...] }}'
 
     def limits(self) -> Iterator[float]:
