@@ -72,7 +72,13 @@ def _plain(value: Any) -> Any:
     return value.to_toml() if isinstance(value, Distribution) else value
 
 
-YOUNGER_SETTINGS: dict[str, Any] = {"bop.layout": CLASSIC, "bop.keypoints": 0, "arrangement.fill": WITHIN}
+YOUNGER_SETTINGS: dict[str, Any] = {
+    "bop.layout": CLASSIC,
+    "bop.keypoints": 0,
+    "arrangement.fill": WITHIN,
+    "perception.camera": "",
+    "camera": (),
+}
 YOUNGER_SETTINGS |= {f"randomize.{item.name}": _plain(item.default) for item in dataclasses.fields(Randomize)}
 """Settings that older manifests lack, and what held before: left out where they have these values, so that older data sets can still be
 read, and resumed with them."""
@@ -117,9 +123,10 @@ def fixed_settings(config: Config) -> dict[str, Any]:
         section, name = key.split(".")
         del settings[section][name]
     for key, before in YOUNGER_SETTINGS.items():
-        section, name = key.split(".")
-        if settings[section].get(name) == before:
-            del settings[section][name]
+        *sections, name = key.split(".")
+        table = settings[sections[0]] if sections else settings
+        if name in table and table[name] == before:
+            del table[name]
     settings = {section: content for section, content in settings.items() if content != {}}
     settings["bake"]["formats"] = sorted(set(config.bake.formats))
     for split in settings["splits"]:
@@ -178,7 +185,8 @@ def read_settings(folder: Path, manifest: Mapping[str, Any]) -> Config:
     path = path_inside(folder, CONFIG_FILE, folder, DatasetError)
     check_regular_file(path, MAX_TOML, DatasetError)
     settings = manifest["settings"]
-    before = {key: value for key, value in YOUNGER_SETTINGS.items() if key.split(".")[1] not in settings.get(key.split(".")[0], {})}
+    younger = {key: value for key, value in YOUNGER_SETTINGS.items() if "." in key}
+    before = {key: value for key, value in younger.items() if key.split(".")[1] not in settings.get(key.split(".")[0], {})}
     config = override_config(load_config(str(path), {}), before)
     said = describe_differences({"settings": make_manifest(config)["settings"]}, {"settings": settings})
     if said:
