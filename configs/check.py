@@ -80,7 +80,7 @@ def describe_type(annotation: Any, *, plural: bool = False) -> str:
     """Describe a type: "a finite number", "2 whole numbers in a list", "a list of lists of 3 numbers"."""
     if _is_distribution(annotation):
         return annotation.describe()
-    if dataclasses.is_dataclass(annotation):
+    if is_table(annotation):
         return f"a table of {', '.join(part.name for part in dataclasses.fields(annotation))}"
     if typing.get_origin(annotation) is not tuple:
         return _NAMES[annotation][plural]
@@ -110,6 +110,11 @@ def _convert(value: object, annotation: Any) -> Any:
     if isinstance(value, int) and not -(2**63) <= value < 2**63:
         raise _MismatchError("a whole number of at most 64 bits, as TOML has")
     return value
+
+
+def is_table(annotation: Any) -> bool:
+    """Whether a setting of this type is a table in TOML."""
+    return isinstance(annotation, type) and dataclasses.is_dataclass(annotation) and not _is_distribution(annotation)
 
 
 def _is_distribution(annotation: Any) -> bool:

@@ -26,6 +26,7 @@ import msgspec
 
 from synpick_warp import __version__
 from synpick_warp.configs.load import load_config, override_config
+from synpick_warp.configs.objects import AUTO_UNIT
 from synpick_warp.configs.randomize import Distribution, Randomize
 from synpick_warp.configs.schema import CLASSIC, WITHIN, Config
 from synpick_warp.dataset.records import Entry, EpisodeEntry, IndicesEntry, Manifest, read_record
@@ -78,6 +79,7 @@ YOUNGER_SETTINGS: dict[str, Any] = {
     "arrangement.fill": WITHIN,
     "perception.camera": "",
     "camera": (),
+    "objects.unit": AUTO_UNIT,
 }
 YOUNGER_SETTINGS |= {f"randomize.{item.name}": _plain(item.default) for item in dataclasses.fields(Randomize)}
 """Settings that older manifests lack, and what held before: left out where they have these values, so that older data sets can still be
