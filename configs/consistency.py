@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
-import itertools
 import math
 import re
 from collections import Counter
 from collections.abc import Iterator, Sequence
 
+from synpick_warp.configs.cell import BinSizes, bin_sizes
 from synpick_warp.configs.modes import bake_modes
 from synpick_warp.configs.schema import (
     FORMATS,
@@ -44,21 +44,21 @@ Conflict = tuple[str, str]
 
 def find_conflicts(config: Config) -> Iterator[Conflict]:
     """Find all violated constraints, the most basic first."""
-    bake, cameras, tote, bop = config.bake, config.cameras, config.tote, config.bop
+    bake, cameras, bins, bop = config.bake, config.cameras, bin_sizes(config), config.bop
     yield from _mix(bake, config.splits, cameras)
-    yield from _tote(tote, config.move)
-    yield from _cameras(cameras, tote)
+    yield from _tote(config.tote, config.move)
+    yield from _cameras(cameras, bins)
     yield from _times(config.settle, config.physics)
-    yield from _pick(config.pick, tote)
+    yield from _pick(config.pick, bins)
     yield from _suction(config.suction, config.gripper)
     yield from _layers(config.render.layers)
     yield from _ranges(config.effects, config.depth_sensor)
     if "depth_sensor" in config.render.layers:
-        yield from _depth_sensor(config.depth_sensor, cameras, tote)
+        yield from _depth_sensor(config.depth_sensor, cameras, bins)
     yield from _jpeg_quality(config.effects, bop)
     yield from _split_folders(config.splits, bop)
     yield from _scene_ids(DataLayout.of(config))
-    yield from _depth_scale(bop, cameras, tote)
+    yield from _depth_scale(bop, cameras, bins)
     yield from _object_rows(config.object_rows)
 
 
@@ -85,7 +85,7 @@ def _tote(tote: Tote, move: Move) -> Iterator[Conflict]:
         yield "move.start_height", f"at least move.height, {move.height:g} [m]"
 
 
-def _cameras(cameras: Cameras, tote: Tote) -> Iterator[Conflict]:
+def _cameras(cameras: Cameras, bins: Sequence[BinSizes]) -> Iterator[Conflict]:
     """Yield conflicts of camera positions, up vectors and target: degenerate, below the floor, or not showing the tote."""
     if not cameras.positions:
         yield "cameras.positions", "at least one position"
@@ -100,7 +100,7 @@ def _cameras(cameras: Cameras, tote: Tote) -> Iterator[Conflict]:
             yield "cameras.ups", f"up vectors that are not zero or parallel to the viewing direction, as that of camera {index} is"
         elif position[2] <= 0.0:
             yield "cameras.positions", f"positions above the tote's floor, z > 0, below which camera {index} sees no object [m]"
-        elif not _sees_tote(cameras, tote, position):
+        elif not any(_sees_bin(cameras, one, position) for one in bins):
             yield "cameras.target", f"a point that lets each camera see the tote, which lies outside of the images of camera {index} [m]"
 
 
@@ -113,9 +113,9 @@ def _times(settle: Settle, physics: Physics) -> Iterator[Conflict]:
         yield "settle.max_time", f"at least the time of settle.rest_ticks ticks, {rest:g} [s]"
 
 
-def _pick(pick: Pick, tote: Tote) -> Iterator[Conflict]:
+def _pick(pick: Pick, bins: Sequence[BinSizes]) -> Iterator[Conflict]:
     """Yield conflicts of the heights and speeds of picking."""
-    height = tote.outer_size[2] - tote.wall
+    height = max(one.height for one in bins)
     if pick.appear_height < pick.near:
         yield "pick.appear_height", f"at least pick.near, {pick.near:g} [m]"
     if pick.speed < pick.near_speed:
@@ -159,12 +159,12 @@ def _jpeg_quality(effects: Effects, bop: Bop) -> Iterator[Conflict]:
         yield "effects.jpeg_quality", f"0, 0 with bop.color_format {bop.color_format}"
 
 
-def _depth_sensor(sensor: DepthSensor, cameras: Cameras, tote: Tote) -> Iterator[Conflict]:
+def _depth_sensor(sensor: DepthSensor, cameras: Cameras, bins: Sequence[BinSizes]) -> Iterator[Conflict]:
     """With the layer depth_sensor: the tote must lie within what the sensor measures, and its disparity be more than a step."""
     width, _ = cameras.resolution
     focal = width / 2 / math.tan(math.radians(cameras.fov) / 2)
     for index, position in enumerate(cameras.positions):
-        depths = _tote_depths(cameras, tote, position)
+        depths = _bin_depths(cameras, bins, position)
         near, far = max(0.0, min(depths)), max(depths)
         if sensor.distances[1] < near or sensor.distances[0] > far:
             yield "depth_sensor.distances", f"a range that reaches the tote, {near:.3g} to {far:.3g} m from camera {index} [m]"
@@ -173,21 +173,20 @@ def _depth_sensor(sensor: DepthSensor, cameras: Cameras, tote: Tote) -> Iterator
             yield "depth_sensor.baseline", f"at least {least:.3g}, so that the disparity of the tote is a disparity_step or more [m]"
 
 
-def _tote_depths(cameras: Cameras, tote: Tote, position: tuple[float, ...]) -> list[float]:
-    """Planar depths of the corners of the tote's outer box in the image of a camera at `position`, which looks at cameras.target [m]."""
-    length, width, height = tote.outer_size
+def _bin_depths(cameras: Cameras, bins: Sequence[BinSizes], position: tuple[float, ...]) -> list[float]:
+    """Planar depths of the corners of the bins' outer boxes in the image of a camera at `position`, which looks at cameras.target [m]."""
     forward = [b - a for a, b in zip(position, cameras.target, strict=True)]
     size = math.hypot(*forward) or 1.0
-    corners = itertools.product((-length / 2, length / 2), (-width / 2, width / 2), (-tote.wall, height - tote.wall))
+    corners = [corner for one in bins for corner in one.corners]
     return [sum((c - a) * f for a, c, f in zip(position, corner, forward, strict=True)) / size for corner in corners]
 
 
-def _sees_tote(cameras: Cameras, tote: Tote, position: tuple[float, ...]) -> bool:
-    """Whether the tote's bounding sphere meets the cone around a camera's view, which is wider than its image."""
-    length, width, height = tote.outer_size
-    center = (0.0, 0.0, height / 2 - tote.wall)
+def _sees_bin(cameras: Cameras, sizes: BinSizes, position: tuple[float, ...]) -> bool:
+    """Whether the bounding sphere of a bin meets the cone around a camera's view, which is wider than its image."""
+    height = sizes.height - sizes.base
+    center = (0.0, 0.0, sizes.base + height / 2)
     forward = [b - a for a, b in zip(position, cameras.target, strict=True)]
-    away, radius = [b - a for a, b in zip(position, center, strict=True)], math.hypot(length, width, height) / 2
+    away, radius = [b - a for a, b in zip(position, center, strict=True)], math.hypot(*sizes.outer, height) / 2
     distance = math.hypot(*away)
     if distance <= radius:
         return True
@@ -218,9 +217,9 @@ def _scene_ids(layout: DataLayout) -> Iterator[Conflict]:
         yield key, f"episode indices below {most} with the format shards, whose names hold no more scenes"
 
 
-def _depth_scale(bop: Bop, cameras: Cameras, tote: Tote) -> Iterator[Conflict]:
+def _depth_scale(bop: Bop, cameras: Cameras, bins: Sequence[BinSizes]) -> Iterator[Conflict]:
     """Yield the depth scale if 16 bits do not reach the farthest corner of the tote."""
-    far = max((depth for position in cameras.positions for depth in _tote_depths(cameras, tote, position)), default=0.0)
+    far = max((depth for position in cameras.positions for depth in _bin_depths(cameras, bins, position)), default=0.0)
     if bop.depth_scale * 1e-3 * DEPTH_COUNTS < far:
         yield "bop.depth_scale", f"at least {far * 1e3 / DEPTH_COUNTS:.3g}, so that 16 bits reach the tote at {far:.3g} m [mm]"
 

@@ -11,6 +11,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 from synpick_warp.codes import Tone, names
+from synpick_warp.configs.bins import Tote
 from synpick_warp.configs.fields import INT32_MAX, setting
 from synpick_warp.configs.manipulation import Move, Perception, Pick, Suction, Target
 from synpick_warp.configs.sensors import DepthSensor, Effects
@@ -144,19 +145,6 @@ class ObjectRow:
     concave: bool = setting(False, "", "Use a convex decomposition as collision shape instead of the convex hull.")
     metallic: float = setting(0.1, "", "Metallic factor, unless the mesh file names one.", low=0.0, high=1.0)
     roughness: float = setting(0.5, "", "Roughness, unless the mesh file names one.", low=0.0, high=1.0)
-
-
-@dataclass(frozen=True)
-class Tote:
-    """The tote (an open box). Its frame is the world frame: origin at the centre of the inner floor, z up. Sizes of the released mesh."""
-
-    outer_size: tuple[float, float, float] = setting((0.615, 0.373, 0.200), "m", "Outer length, width and height.", above=0.0, high=10.0)
-    floor_size: tuple[float, float] = setting((0.513, 0.319), "m", "Length and width of the inner floor.", above=0.0, high=10.0)
-    rim_size: tuple[float, float] = setting((0.545, 0.352), "m", "Length and width of the opening at the rim.", above=0.0, high=10.0)
-    wall: float = setting(0.0045, "m", "Thickness of walls and floor.", above=0.0, high=1.0)
-    color: tuple[float, float, float] = setting((0.65, 0.05, 0.04), "sRGB", "Base colour.", low=0.0, high=1.0)
-    metallic: float = setting(0.0, "", "Metallic factor.", low=0.0, high=1.0)
-    roughness: float = setting(0.5, "", "Roughness.", low=0.0, high=1.0)
 
 
 @dataclass(frozen=True)

@@ -15,11 +15,13 @@ import newton
 import numpy as np
 import warp as wp
 
+from synpick_warp.configs.cell import bin_sizes
 from synpick_warp.configs.modes import mode_weights
 from synpick_warp.configs.schema import EXCEED, Arrangement, Bake, Config, Gripper, Move, Physics, Pick
 from synpick_warp.errors import ConfigError
+from synpick_warp.scenes.bins import guide_walls, make_bins
 from synpick_warp.scenes.gripper import cup_collider, finger_collider, rod_inertia
-from synpick_warp.scenes.tote import TABLE_SIZE, guide_walls, tote_colliders
+from synpick_warp.scenes.tote import TABLE_SIZE
 from synpick_warp.scenes.types import Catalog, CatalogEntry, ConvexPiece
 
 # Mass [kg] and inertia [kg·m²] of an empty slot. Its gravity is compensated, so any positive values will do.
@@ -197,12 +199,13 @@ def build_model(config: Config, catalog: Catalog, device: wp.Device) -> BuiltMod
     world = newton.ModelBuilder(gravity=(0.0, 0.0, -config.physics.gravity))
     newton.solvers.SolverSteel.register_custom_attributes(world)
     shape = newton.ModelBuilder.ShapeConfig(density=0.0, mu=config.physics.friction, gap=config.physics.gap, restitution=0.0)
-    for piece in tote_colliders(config.tote):
+    bins = make_bins(bin_sizes(config))
+    for piece in bins[0].pieces:
         world.add_shape_convex_hull(-1, mesh=_hull(piece), cfg=shape)
-    table = wp.transform(wp.vec3(0.0, 0.0, -config.tote.wall - TABLE_SIZE[2]), wp.quat_identity())
+    table = wp.transform(wp.vec3(0.0, 0.0, bins[0].sizes.base - TABLE_SIZE[2]), wp.quat_identity())
     world.add_shape_box(-1, xform=table, hx=TABLE_SIZE[0], hy=TABLE_SIZE[1], hz=TABLE_SIZE[2], cfg=shape)
     guides = tuple(
-        world.add_shape_convex_hull(-1, mesh=_hull(piece), cfg=shape) for piece in guide_walls(config.tote, config.physics.guide_height)
+        world.add_shape_convex_hull(-1, mesh=_hull(piece), cfg=shape) for piece in guide_walls(bins[0].sizes, config.physics.guide_height)
     )
     gripper = _add_gripper(world, config.gripper, shape)
     variant, empty = _add_slots(world, config.physics, catalog, shape, (single, compound))

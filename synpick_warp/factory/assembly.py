@@ -14,6 +14,7 @@ from functools import partial
 import numpy as np
 import warp as wp
 
+from synpick_warp.configs.cell import bin_sizes
 from synpick_warp.configs.schema import Config
 from synpick_warp.configs.splits import DataLayout
 from synpick_warp.exporters.registry import Needs
@@ -22,6 +23,7 @@ from synpick_warp.factory.compilation import is_cache_warm, make_compiler, sole_
 from synpick_warp.factory.memory_plan import check_memory, plan_memory
 from synpick_warp.factory.order import order_longest_first
 from synpick_warp.factory.sizes import count_writers, fit_to_device, without_pictures
+from synpick_warp.scenes.bins import make_bins
 from synpick_warp.scenes.build import REPEATS, find_repeat_rules, must_repeat, with_capacities
 from synpick_warp.scenes.cameras import make_cameras
 from synpick_warp.scenes.catalog import load_catalog
@@ -166,14 +168,14 @@ def build_stages(
     """Load assets, and build worlds and renderer, from settings with resolved sizes. Other arguments and errors: `build_factory`."""
     progress.stage("loading objects and lights")
     cameras = make_cameras(config.cameras)
-    fixtures = make_fixtures(config.tote, config.gripper)
+    bins = make_bins(bin_sizes(config))
     catalog = load_catalog(config, report=progress.note)
     lights = load_lights(config.bake.lights, progress.note, config.objects.strict)
     config = _fit_to_catalog(config, catalog, device, progress)
     if longest_first and episodes is not None:
         episodes = order_longest_first(config, catalog, episodes, device)
     progress.stage(f"building {config.bake.worlds} worlds of {len(catalog)} objects on {device.alias}")
-    scene = build_render_scene(config.render, config.tote, catalog, fixtures, cameras, lights, device)
+    scene = build_render_scene(config.render, bins[0].sizes.base, catalog, make_fixtures(bins, config.gripper), cameras, lights, device)
     simulation = Simulation(config, catalog, len(lights), device, scene, episodes, records_physics)
     sizes = view_sizes(config.render, config.cameras, config.bake.worlds, config.arrangement.max_objects, device)
     histories = simulation.layout.worlds * len(cameras)

@@ -53,7 +53,7 @@ def make_images(toy: ToyScene, device: wp.Device, worlds: int = 4, views: int = 
     cameras = replace(config.cameras, resolution=(192, 108))
     settings = replace(config.perception, resolution=RESOLUTION, views=views)
     scene = build_render_scene(
-        config.render, config.tote, Catalog(tuple(toy.entries)), toy.fixtures, make_cameras(cameras), toy.lights, device
+        config.render, -config.tote.wall, Catalog(tuple(toy.entries)), toy.fixtures, make_cameras(cameras), toy.lights, device
     )
     return PerceptionImages(settings, cameras, scene, worlds, toy.instances)
 

@@ -190,7 +190,9 @@ def snapshot(toy: ToyScene, device: wp.Device) -> Snapshot:
 def build_scene(toy: ToyScene, device: wp.Device) -> RenderScene:
     """The renderer's constant data of a toy scene."""
     settings = toy.settings()
-    return build_render_scene(settings.render, settings.tote, Catalog(tuple(toy.entries)), toy.fixtures, toy.cameras, toy.lights, device)
+    return build_render_scene(
+        settings.render, -settings.tote.wall, Catalog(tuple(toy.entries)), toy.fixtures, toy.cameras, toy.lights, device
+    )
 
 
 def render(toy: ToyScene, device: wp.Device) -> RenderedViews:

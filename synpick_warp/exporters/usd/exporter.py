@@ -16,6 +16,7 @@ from synpick_warp.exporters.usd.spool import TickSpool, tick_rows
 from synpick_warp.exporters.usd.types import EpisodeMetadata, EpisodeSettings
 from synpick_warp.exporters.writing.files import output_errors
 from synpick_warp.exporters.writing.pool import WriteTask
+from synpick_warp.scenes.bins import make_bins
 from synpick_warp.views.frames import EpisodeEnd, TickBatch
 
 FOLDER = Path("usd")
@@ -54,7 +55,7 @@ class UsdExporter(EpisodeExporter[TickSpool]):
                 folder.mkdir(exist_ok=True)
             settings, render = context.settings, context.settings.render
             color = render.table_color if render.table else None
-            write_library(library, settings.tote, settings.gripper, settings.physics, color, context.catalog, context.lights)
+            write_library(library, make_bins(settings.bins), settings.gripper, settings.physics, color, context.catalog, context.lights)
         return [LIBRARY]
 
     def write_ticks(self, batch: TickBatch) -> None:

@@ -1,0 +1,53 @@
+"""Extents of the bins that stand under the cameras, as the settings give them."""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass
+
+from synpick_warp.configs.bins import Tote
+from synpick_warp.configs.schema import Config
+
+Sides = tuple[float, float]
+"""Length (along x) and width (along y) [m]."""
+Point = tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class BinSizes:
+    """Extents of a bin [m] in its own frame: origin at the centre of the inner floor, z up."""
+
+    name: str
+    shell: Tote
+    """Sizes and material of its walls."""
+    outer: Sides
+    floor: Sides
+    """Inner floor."""
+    opening: Sides
+    """At the rim."""
+    height: float
+    """Height of the rim."""
+    base: float
+    """z of its underside."""
+
+    @classmethod
+    def of_tote(cls, tote: Tote) -> BinSizes:
+        """Sizes of the tote."""
+        return cls("tote", tote, tote.outer_size[:2], tote.floor_size, tote.rim_size, tote.outer_size[2] - tote.wall, -tote.wall)
+
+    @property
+    def corners(self) -> list[Point]:
+        """Corners of the outer box (8)."""
+        length, width = self.outer
+        return list(itertools.product((-length / 2, length / 2), (-width / 2, width / 2), (self.base, self.height)))
+
+    @property
+    def inner_corners(self) -> list[Point]:
+        """Corners of the inner floor and of the rim (8)."""
+        levels = ((self.floor, 0.0), (self.opening, self.height))
+        return [(x * length / 2, y * width / 2, z) for (length, width), z in levels for x, y in itertools.product((-1, 1), repeat=2)]
+
+
+def bin_sizes(config: Config) -> tuple[BinSizes, ...]:
+    """Bins from which an episode draws its own; the first stands on the table, whose height follows from its wall."""
+    return (BinSizes.of_tote(config.tote),)
