@@ -29,6 +29,8 @@ class BinSizes:
     """Height of the rim."""
     base: float
     """z of its underside."""
+    weight: float = 1.0
+    """Weight with which an episode draws it."""
 
     @classmethod
     def of_tote(cls, tote: Tote) -> BinSizes:
@@ -40,6 +42,21 @@ class BinSizes:
         """Corners of the outer box (8)."""
         length, width = self.outer
         return list(itertools.product((-length / 2, length / 2), (-width / 2, width / 2), (self.base, self.height)))
+
+    @property
+    def centers(self) -> list[Sides]:
+        """Centre of each compartment."""
+        return [(0.0, 0.0)]
+
+    @property
+    def cell(self) -> Sides:
+        """Inner floor of a compartment."""
+        return self.floor
+
+    @property
+    def mouth(self) -> Sides:
+        """Opening of a compartment."""
+        return self.opening
 
     @property
     def inner_corners(self) -> list[Point]:

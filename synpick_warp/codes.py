@@ -159,6 +159,8 @@ class Stream(enum.IntEnum):
     EFFECTS = 9
     COLOR_NOISE = 10
     DEPTH_NOISE = 11
+    BIN = 12
+    COMPARTMENT = 15
 
 
 class Segment(enum.IntEnum):

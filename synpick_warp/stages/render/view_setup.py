@@ -82,7 +82,17 @@ def set_up_views(
         bodies: The struct `ViewBodies`; written.
     """
     dim = (views.count, bodies.mesh.shape[1])
-    inputs = [scene.meshes, cameras, grid, snapshot.catalog_index, snapshot.pose, snapshot.fixture_pose, fixture_visible, views]
+    inputs = [
+        scene.meshes,
+        cameras,
+        grid,
+        snapshot.bin,
+        snapshot.catalog_index,
+        snapshot.pose,
+        snapshot.fixture_pose,
+        fixture_visible,
+        views,
+    ]
     wp.launch(set_up_views_kernel, dim=dim, inputs=inputs, outputs=[bodies], device=scene.device)
     wp.launch(sort_bodies_kernel, dim=dim, inputs=[scene.meshes], outputs=[bodies], device=scene.device)
     inputs = [scene.meshes, cameras, grid, views]
