@@ -6,6 +6,10 @@ from dataclasses import dataclass
 
 from synpick_warp.configs.fields import setting
 
+TOTE, NONE, PALLET = "tote", "none", "pallet"
+KINDS = (TOTE, NONE, PALLET)
+"""What stands under the cameras."""
+
 
 @dataclass(frozen=True)
 class Tote:
@@ -18,3 +22,17 @@ class Tote:
     color: tuple[float, float, float] = setting((0.65, 0.05, 0.04), "sRGB", "Base colour.", low=0.0, high=1.0)
     metallic: float = setting(0.0, "", "Metallic factor.", low=0.0, high=1.0)
     roughness: float = setting(0.5, "", "Roughness.", low=0.0, high=1.0)
+
+
+@dataclass(frozen=True)
+class Bins:
+    """What stands under the cameras: the tote, or without walls a table alone or a pallet, whose frame has its origin on top."""
+
+    kind: str = setting(TOTE, "", "What objects are dropped into or onto: tote ([tote]), none (the table), pallet.", choices=KINDS)
+    area: tuple[float, float] = setting(
+        (0.5, 0.35), "m", "Length and width over which objects are dropped, without walls.", above=0.0, high=10.0
+    )
+    margin: float = setting(0.15, "m", "Without walls, an object that is farther outside of the area has left.", low=0.0, high=5.0)
+    pallet_size: tuple[float, float, float] = setting(
+        (0.6, 0.4, 0.144), "m", "Length, width and height of the pallet; half a EUR pallet by default.", above=0.0, high=10.0
+    )

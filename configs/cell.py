@@ -1,11 +1,11 @@
-"""Extents of the bins that stand under the cameras, as the settings give them."""
+"""Extents of the bins that stand under the cameras, as the settings give them; a table and a pallet are bins without walls."""
 
 from __future__ import annotations
 
 import itertools
 from dataclasses import dataclass
 
-from synpick_warp.configs.bins import Tote
+from synpick_warp.configs.bins import NONE, PALLET, Tote
 from synpick_warp.configs.schema import Config
 
 Sides = tuple[float, float]
@@ -18,24 +18,34 @@ class BinSizes:
     """Extents of a bin [m] in its own frame: origin at the centre of the inner floor, z up."""
 
     name: str
-    shell: Tote
-    """Sizes and material of its walls."""
+    noun: str
+    """What it is, in sentences: tote, bin, pallet or table."""
+    shell: Tote | None
+    """Sizes and material of its walls; None: it has none."""
     outer: Sides
     floor: Sides
     """Inner floor."""
     opening: Sides
-    """At the rim."""
+    """At the rim; without walls, the area over which objects are dropped."""
     height: float
     """Height of the rim."""
     base: float
     """z of its underside."""
+    margin: float = 0.0
+    """Distance from the opening beyond which an object has left it."""
     weight: float = 1.0
     """Weight with which an episode draws it."""
 
     @classmethod
     def of_tote(cls, tote: Tote) -> BinSizes:
         """Sizes of the tote."""
-        return cls("tote", tote, tote.outer_size[:2], tote.floor_size, tote.rim_size, tote.outer_size[2] - tote.wall, -tote.wall)
+        height = tote.outer_size[2] - tote.wall
+        return cls("tote", "tote", tote, tote.outer_size[:2], tote.floor_size, tote.rim_size, height, -tote.wall)
+
+    @property
+    def is_visible(self) -> bool:
+        """Whether there is anything but the table."""
+        return self.noun != "table"
 
     @property
     def corners(self) -> list[Point]:
@@ -66,5 +76,11 @@ class BinSizes:
 
 
 def bin_sizes(config: Config) -> tuple[BinSizes, ...]:
-    """Bins from which an episode draws its own; the first stands on the table, whose height follows from its wall."""
+    """Bins from which an episode draws its own; the first stands on the table, whose height follows from its base."""
+    bins = config.bins
+    if bins.kind == NONE:
+        return (BinSizes("table", "table", None, bins.area, bins.area, bins.area, 0.0, 0.0, bins.margin),)
+    if bins.kind == PALLET:
+        length, width, height = bins.pallet_size
+        return (BinSizes("pallet", "pallet", None, (length, width), bins.area, bins.area, 0.0, -height, bins.margin),)
     return (BinSizes.of_tote(config.tote),)

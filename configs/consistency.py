@@ -8,6 +8,7 @@ import re
 from collections import Counter
 from collections.abc import Iterator, Sequence
 
+from synpick_warp.configs.bins import PALLET, TOTE, Bins, Tote
 from synpick_warp.configs.cell import BinSizes, bin_sizes
 from synpick_warp.configs.modes import bake_modes
 from synpick_warp.configs.schema import (
@@ -20,14 +21,12 @@ from synpick_warp.configs.schema import (
     DepthSensor,
     Effects,
     Gripper,
-    Move,
     ObjectRow,
     Physics,
     Pick,
     Settle,
     Split,
     Suction,
-    Tote,
 )
 from synpick_warp.configs.splits import MAX_SHARD_SCENES, DataLayout
 from synpick_warp.errors import format_value
@@ -46,7 +45,9 @@ def find_conflicts(config: Config) -> Iterator[Conflict]:
     """Find all violated constraints, the most basic first."""
     bake, cameras, bins, bop = config.bake, config.cameras, bin_sizes(config), config.bop
     yield from _mix(bake, config.splits, cameras)
-    yield from _tote(config.tote, config.move)
+    yield from _bins(config.bins) if config.bins.kind != TOTE else _tote(config.tote)
+    if config.move.start_height < config.move.height:
+        yield "move.start_height", f"at least move.height, {config.move.height:g} [m]"
     yield from _cameras(cameras, bins)
     yield from _times(config.settle, config.physics)
     yield from _pick(config.pick, bins)
@@ -72,8 +73,8 @@ def _mix(bake: Bake, splits: Sequence[Split], cameras: Cameras) -> Iterator[Conf
         yield "cameras.resolution", "even width and height with the format lerobot, whose videos have a colour for 2 x 2 pixels"
 
 
-def _tote(tote: Tote, move: Move) -> Iterator[Conflict]:
-    """Yield conflicts of the tote's sizes, and a height at which the gripper starts below that at which it moves."""
+def _tote(tote: Tote) -> Iterator[Conflict]:
+    """Yield conflicts of the tote's sizes."""
     if any(rim < floor for rim, floor in zip(tote.rim_size, tote.floor_size, strict=True)):
         yield "tote.rim_size", f"at least tote.floor_size on both sides, {format_value(tote.floor_size)} [m]"
     if any(outer < rim + 2 * tote.wall for outer, rim in zip(tote.outer_size[:2], tote.rim_size, strict=True)):
@@ -81,8 +82,12 @@ def _tote(tote: Tote, move: Move) -> Iterator[Conflict]:
         yield "tote.outer_size", f"at least tote.rim_size and two walls, {format_value(needed)} [m]"
     if tote.outer_size[2] <= tote.wall:
         yield "tote.wall", f"less than the tote's height, {tote.outer_size[2]:g} [m]"
-    if move.start_height < move.height:
-        yield "move.start_height", f"at least move.height, {move.height:g} [m]"
+
+
+def _bins(bins: Bins) -> Iterator[Conflict]:
+    """Yield conflicts of what stands under the cameras without walls."""
+    if bins.kind == PALLET and any(side > pallet for side, pallet in zip(bins.area, bins.pallet_size, strict=False)):
+        yield "bins.area", f"at most the pallet's length and width, {format_value(bins.pallet_size[:2])} [m]"
 
 
 def _cameras(cameras: Cameras, bins: Sequence[BinSizes]) -> Iterator[Conflict]:
@@ -92,6 +97,7 @@ def _cameras(cameras: Cameras, bins: Sequence[BinSizes]) -> Iterator[Conflict]:
     if len(cameras.ups) != len(cameras.positions):
         yield "cameras.ups", f"one direction for each of the {len(cameras.positions)} cameras.positions"
         return
+    noun = bins[0].noun
     for index, (position, up) in enumerate(zip(cameras.positions, cameras.ups, strict=True)):
         forward = tuple(b - a for a, b in zip(position, cameras.target, strict=True))
         if math.hypot(*forward) == 0.0:
@@ -99,9 +105,9 @@ def _cameras(cameras: Cameras, bins: Sequence[BinSizes]) -> Iterator[Conflict]:
         elif math.hypot(*_cross(forward, up)) <= _PARALLEL * math.hypot(*forward) * math.hypot(*up):
             yield "cameras.ups", f"up vectors that are not zero or parallel to the viewing direction, as that of camera {index} is"
         elif position[2] <= 0.0:
-            yield "cameras.positions", f"positions above the tote's floor, z > 0, below which camera {index} sees no object [m]"
+            yield "cameras.positions", f"positions above the {noun}'s floor, z > 0, below which camera {index} sees no object [m]"
         elif not any(_sees_bin(cameras, one, position) for one in bins):
-            yield "cameras.target", f"a point that lets each camera see the tote, which lies outside of the images of camera {index} [m]"
+            yield "cameras.target", f"a point that lets each camera see the {noun}, which lies outside of the images of camera {index} [m]"
 
 
 def _times(settle: Settle, physics: Physics) -> Iterator[Conflict]:
@@ -121,7 +127,7 @@ def _pick(pick: Pick, bins: Sequence[BinSizes]) -> Iterator[Conflict]:
     if pick.speed < pick.near_speed:
         yield "pick.speed", f"at least pick.near_speed, {pick.near_speed:g} [m/s]"
     if pick.lift_height < height:
-        yield "pick.lift_height", f"at least the inner height of the tote, {height:g}: attached objects must leave the tote [m]"
+        yield "pick.lift_height", f"at least the inner height of the {bins[0].noun}, {height:g}: attached objects must leave it [m]"
 
 
 def _suction(suction: Suction, gripper: Gripper) -> Iterator[Conflict]:
@@ -167,10 +173,13 @@ def _depth_sensor(sensor: DepthSensor, cameras: Cameras, bins: Sequence[BinSizes
         depths = _bin_depths(cameras, bins, position)
         near, far = max(0.0, min(depths)), max(depths)
         if sensor.distances[1] < near or sensor.distances[0] > far:
-            yield "depth_sensor.distances", f"a range that reaches the tote, {near:.3g} to {far:.3g} m from camera {index} [m]"
+            yield "depth_sensor.distances", f"a range that reaches the {bins[0].noun}, {near:.3g} to {far:.3g} m from camera {index} [m]"
         if focal * sensor.baseline < sensor.disparity_step * far:
             least = sensor.disparity_step * far / focal
-            yield "depth_sensor.baseline", f"at least {least:.3g}, so that the disparity of the tote is a disparity_step or more [m]"
+            yield (
+                "depth_sensor.baseline",
+                f"at least {least:.3g}, so that the disparity of the {bins[0].noun} is a disparity_step or more [m]",
+            )
 
 
 def _bin_depths(cameras: Cameras, bins: Sequence[BinSizes], position: tuple[float, ...]) -> list[float]:
@@ -221,7 +230,7 @@ def _depth_scale(bop: Bop, cameras: Cameras, bins: Sequence[BinSizes]) -> Iterat
     """Yield the depth scale if 16 bits do not reach the farthest corner of the tote."""
     far = max((depth for position in cameras.positions for depth in _bin_depths(cameras, bins, position)), default=0.0)
     if bop.depth_scale * 1e-3 * DEPTH_COUNTS < far:
-        yield "bop.depth_scale", f"at least {far * 1e3 / DEPTH_COUNTS:.3g}, so that 16 bits reach the tote at {far:.3g} m [mm]"
+        yield "bop.depth_scale", f"at least {far * 1e3 / DEPTH_COUNTS:.3g}, so that 16 bits reach the {bins[0].noun} at {far:.3g} m [mm]"
 
 
 def _object_rows(rows: Sequence[ObjectRow]) -> Iterator[Conflict]:

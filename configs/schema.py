@@ -11,7 +11,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 from synpick_warp.codes import Tone, names
-from synpick_warp.configs.bins import Tote
+from synpick_warp.configs.bins import Bins, Tote
 from synpick_warp.configs.fields import INT32_MAX, setting
 from synpick_warp.configs.manipulation import Move, Perception, Pick, Suction, Target
 from synpick_warp.configs.sensors import DepthSensor, Effects
@@ -440,6 +440,7 @@ class Config:
     bake: Bake = field(default_factory=Bake)
     objects: Objects = field(default_factory=Objects)
     tote: Tote = field(default_factory=Tote)
+    bins: Bins = field(default_factory=Bins)
     gripper: Gripper = field(default_factory=Gripper)
     cameras: Cameras = field(default_factory=Cameras)
     arrangement: Arrangement = field(default_factory=Arrangement)

@@ -234,7 +234,7 @@ def _check_fits_bin(vertices: np.ndarray, size: float, origin: str, sizes: BinSi
     It passes if the two smaller sides of a bounding box are at most as long as the opening's. The axis-aligned box is tried first, since
     the minimum oriented bounding box takes long to compute for fine meshes.
     """
-    inside = float(np.linalg.norm((*sizes.opening, sizes.height)))
+    inside = float(np.linalg.norm((*sizes.opening, sizes.height))) if sizes.shell else np.inf
     opening = sorted(sizes.opening)
     box = sorted(np.ptp(vertices, axis=0).tolist())
     if size <= inside and box[0] <= opening[0] and box[1] <= opening[1]:
@@ -243,7 +243,7 @@ def _check_fits_bin(vertices: np.ndarray, size: float, origin: str, sizes: BinSi
     if size <= inside and box[0] <= opening[0] and box[1] <= opening[1]:
         return
     raise CatalogError(
-        f"{origin}: too large for the {sizes.name}: {_by(box)} m, diameter {size:.4g} m, but the {sizes.name}'s opening is "
+        f"{origin}: too large for the {sizes.noun}: {_by(box)} m, diameter {size:.4g} m, but the {sizes.noun}'s opening is "
         f"{_by(opening)} m, and its inner diagonal {inside:.3g} m; {_UNITS}"
     )
 

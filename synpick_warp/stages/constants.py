@@ -18,6 +18,8 @@ from synpick_warp.scenes import build
 from synpick_warp.scenes.types import Catalog, CatalogEntry
 from synpick_warp.stages.sim.worlds import CORNERS
 
+# Height of what has no walls, so that whatever is beside it is outside [m].
+FAR = 1e30
 # Home position of the wrist, used while objects fall and while perception runs [m]: beside the bin, outside every camera's view.
 GRIPPER_HOME = (3.0, 0.0, 1.0)
 
@@ -182,14 +184,14 @@ def bin_data(sizes: Sequence[BinSizes], move: schema.Move, parts: Sequence[build
     return fill(
         structs.BinData,
         count=len(sizes),
-        visible=True,
+        visible=sizes[0].is_visible,
         share=array(shares / shares[-1], float),
         lift=array([one.base - sizes[0].base for one in sizes], float),
         shift=wp.vec2(0.0, 0.0),
         yaw=0.0,
-        reach=array([np.array(one.opening) / 2 for one in sizes], wp.vec2),
+        reach=array([np.array(one.opening) / 2 + one.margin for one in sizes], wp.vec2),
         rim_height=array([one.height for one in sizes], float),
-        wall_height=array([one.height for one in sizes], float),
+        wall_height=array([one.height if one.shell else FAR for one in sizes], float),
         corner=array([(move.corner * one.cell[0] / 2, move.corner * one.cell[1] / 2, move.height) for one in sizes], wp.vec3),
         first_compartment=array(np.cumsum([0, *(len(one.centers) for one in sizes)]), int),
         center=array([center for one in sizes for center in one.centers], wp.vec2),

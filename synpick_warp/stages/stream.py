@@ -32,7 +32,7 @@ BATCH_BYTES = 512 << 20
 # Size of color, depth, segmentation id and amodal bits of one pixel [bytes].
 PIXEL_BYTES = 3 + 2 + 1 + 4
 # Names of the snapshot's arrays that are copied to `TickReport.snapshot`.
-_SNAPSHOT = ("fixture_pose", "fixture_visible", "light", "light_yaw", "light_exposure")
+_SNAPSHOT = ("bin", "fixture_pose", "fixture_visible", "light", "light_yaw", "light_exposure")
 # Ring size of view batches: one is read while another is copied and a third is rendered.
 RING = 3
 

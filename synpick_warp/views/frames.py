@@ -140,8 +140,10 @@ class TickBatch:
     """obj_id of each instance; -1: the instance is not in the scene (W, I) int32."""
     pose: np.ndarray
     """Object-to-world poses: x, y, z [m], quaternion x, y, z, w (W, I, 7) float32."""
+    bin: np.ndarray
+    """Index of the episode's bin (W) int32."""
     fixture_pose: np.ndarray
-    """Poses of tote, gripper shaft ("finger") and cup, in the same form (W, 3, 7) float32."""
+    """Poses of bin, gripper shaft ("finger") and cup, in the same form (W, 3, 7) float32."""
     fixture_visible: np.ndarray
     """1 if the fixture is visible in the images, else 0 (W, 3) int32."""
     light: np.ndarray

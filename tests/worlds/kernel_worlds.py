@@ -21,7 +21,7 @@ from synpick_warp.stages.sim.worlds import AttemptState, SealState, WorldState
 
 GRIPPER_BODIES, GRIPPER_DOFS = 2, 4
 GUIDES = (6, 7, 8, 9)
-BIN = BinSizes("box", Tote(), outer=(0.55, 0.35), floor=(0.8, 0.4), opening=(0.5, 0.3), height=0.2, base=-0.005)
+BIN = BinSizes("box", "bin", Tote(), outer=(0.55, 0.35), floor=(0.8, 0.4), opening=(0.5, 0.3), height=0.2, base=-0.005)
 """Bin whose waypoints are at (±0.2, ±0.1, 0.02) m."""
 SHAPES = 20
 

@@ -108,6 +108,7 @@ def read_ticks(data: Episode, steps_per_tick: int) -> Iterator[TickBatch]:
     setpoint = read_array(data.steps[SETPOINT]).reshape(len(data), steps_per_tick, 3) if SETPOINT in data.steps else None
     light = _read_light(data)
     columns: dict[str, Any] = {
+        "bin": np.zeros(1, np.int32),
         "light": np.array([light.map], np.int32),
         "light_yaw": np.array([light.yaw], np.float32),
         "light_exposure": np.array([light.exposure], np.float32),

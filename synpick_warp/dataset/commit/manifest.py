@@ -25,6 +25,7 @@ from typing import Any
 import msgspec
 
 from synpick_warp import __version__
+from synpick_warp.configs.bins import Bins
 from synpick_warp.configs.load import load_config, override_config
 from synpick_warp.configs.schema import CLASSIC, WITHIN, Config
 from synpick_warp.dataset.records import Entry, EpisodeEntry, IndicesEntry, Manifest, read_record
@@ -62,7 +63,8 @@ FREE_SETTINGS = (
 )
 """Settings that may differ when a bake is resumed: no episode depends on them. Objects and lights are compared by content, not by the name
 of their folder. A device of another type computes the same episodes up to rounding."""
-YOUNGER_SETTINGS: dict[str, Any] = {"bop.layout": CLASSIC, "bop.keypoints": 0, "arrangement.fill": WITHIN}
+YOUNGER_BINS = {f"bins.{item.name}": item.default for item in dataclasses.fields(Bins)}
+YOUNGER_SETTINGS: dict[str, Any] = {"bop.layout": CLASSIC, "bop.keypoints": 0, "arrangement.fill": WITHIN, **YOUNGER_BINS}
 """Settings that older manifests lack, and what held before: left out where they have these values, so that older data sets can still be
 read, and resumed with them."""
 PACKAGES = ("warp-lang", "newton", "numpy", "scipy", "coacd", "opencv-python-headless", "isal", "orjson", "usd-core", "zarr")
@@ -108,6 +110,7 @@ def fixed_settings(config: Config) -> dict[str, Any]:
         section, name = key.split(".")
         if settings[section][name] == before:
             del settings[section][name]
+    settings = {section: values for section, values in settings.items() if values != {}}
     settings["bake"]["formats"] = sorted(set(config.bake.formats))
     for split in settings["splits"]:
         del split["episodes"]

@@ -27,6 +27,7 @@ from synpick_warp.exporters.usd.parts import (
     save_layer,
     write_texture,
 )
+from synpick_warp.exporters.usd.types import bin_asset
 from synpick_warp.scenes.bins import Bin
 from synpick_warp.scenes.gripper import cup_collider, cup_fixture, finger_collider, finger_fixture, rod_inertia
 from synpick_warp.scenes.tote import TABLE_ROUGHNESS, TABLE_SIZE
@@ -54,7 +55,9 @@ def write_library(
     for entry in catalog.entries:
         _write_object(library, physics, entry)
     for one in bins:
-        _save(library, one.sizes.name, _make_fixture(library, physics, one.sizes.name, one.fixture, one.pieces))
+        if one.sizes.is_visible:
+            name = bin_asset(one.sizes)
+            _save(library, name, _make_fixture(library, physics, name, one.fixture, one.pieces))
     finger = _make_fixture(library, physics, "finger", finger_fixture(gripper), (finger_collider(gripper),))
     length, mass = gripper.finger_length, gripper.finger_mass
     add_body(finger.GetDefaultPrim(), mass, np.array([0.0, 0.0, length / 2]), np.diag(rod_inertia(mass, length)), kinematic=True)

@@ -13,7 +13,7 @@ from synpick_warp.exporters.staging import EpisodeExporter, StagedEpisode
 from synpick_warp.exporters.usd.episode import write_episode
 from synpick_warp.exporters.usd.lights import make_stage_light
 from synpick_warp.exporters.usd.spool import TickSpool, tick_rows
-from synpick_warp.exporters.usd.types import EpisodeMetadata, EpisodeSettings
+from synpick_warp.exporters.usd.types import EpisodeMetadata, EpisodeSettings, bin_asset
 from synpick_warp.exporters.writing.files import output_errors
 from synpick_warp.exporters.writing.pool import WriteTask
 from synpick_warp.scenes.bins import make_bins
@@ -87,6 +87,7 @@ class UsdExporter(EpisodeExporter[TickSpool]):
         return EpisodeSettings(
             tick_rate=1.0 / settings.physics.tick_time,
             gravity=settings.physics.gravity,
+            bins=tuple(bin_asset(sizes) if sizes.is_visible else None for sizes in settings.bins),
             cameras=context.cameras,
             lights=tuple(make_stage_light(index, light, settings.render.exposure) for index, light in enumerate(context.lights)),
             names={entry.obj_id: entry.name for entry in context.catalog.entries},
