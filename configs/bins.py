@@ -29,6 +29,10 @@ class Bins:
     """What stands under the cameras: the tote, or without walls a table alone or a pallet, whose frame has its origin on top."""
 
     kind: str = setting(TOTE, "", "What objects are dropped into or onto: tote ([tote]), none (the table), pallet.", choices=KINDS)
+    shift: tuple[float, float] = setting(
+        (0.0, 0.0), "m", "Half widths of the offset in x and y that each episode draws for its bin.", low=0.0, high=1.0
+    )
+    yaw: float = setting(0.0, "°", "Half width of the rotation about z that each episode draws for its bin.", low=0.0, high=180.0)
     area: tuple[float, float] = setting(
         (0.5, 0.35), "m", "Length and width over which objects are dropped, without walls.", above=0.0, high=10.0
     )

@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 from dataclasses import dataclass
 
-from synpick_warp.configs.bins import NONE, PALLET, Tote
+from synpick_warp.configs.bins import NONE, PALLET, TOTE, Tote
 from synpick_warp.configs.schema import Config
 
 Sides = tuple[float, float]
@@ -73,6 +73,13 @@ class BinSizes:
         """Corners of the inner floor and of the rim (8)."""
         levels = ((self.floor, 0.0), (self.opening, self.height))
         return [(x * length / 2, y * width / 2, z) for (length, width), z in levels for x, y in itertools.product((-1, 1), repeat=2)]
+
+
+def recorded_bins(config: Config) -> tuple[str, ...]:
+    """Names of the bins, where data sets record that of each episode; empty for a tote that is always in its place."""
+    bins = config.bins
+    moves = any(bins.shift) or bins.yaw > 0.0
+    return tuple(sizes.name for sizes in bin_sizes(config)) if moves or bins.kind != TOTE else ()
 
 
 def bin_sizes(config: Config) -> tuple[BinSizes, ...]:

@@ -9,7 +9,7 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 
 from synpick_warp.configs.bins import PALLET, TOTE, Bins, Tote
-from synpick_warp.configs.cell import BinSizes, bin_sizes
+from synpick_warp.configs.cell import BinSizes, Sides, bin_sizes
 from synpick_warp.configs.modes import bake_modes
 from synpick_warp.configs.schema import (
     FORMATS,
@@ -48,7 +48,7 @@ def find_conflicts(config: Config) -> Iterator[Conflict]:
     yield from _bins(config.bins) if config.bins.kind != TOTE else _tote(config.tote)
     if config.move.start_height < config.move.height:
         yield "move.start_height", f"at least move.height, {config.move.height:g} [m]"
-    yield from _cameras(cameras, bins)
+    yield from _cameras(cameras, bins, config.bins.shift)
     yield from _times(config.settle, config.physics)
     yield from _pick(config.pick, bins)
     yield from _suction(config.suction, config.gripper)
@@ -90,7 +90,7 @@ def _bins(bins: Bins) -> Iterator[Conflict]:
         yield "bins.area", f"at most the pallet's length and width, {format_value(bins.pallet_size[:2])} [m]"
 
 
-def _cameras(cameras: Cameras, bins: Sequence[BinSizes]) -> Iterator[Conflict]:
+def _cameras(cameras: Cameras, bins: Sequence[BinSizes], shift: Sides) -> Iterator[Conflict]:
     """Yield conflicts of camera positions, up vectors and target: degenerate, below the floor, or not showing the tote."""
     if not cameras.positions:
         yield "cameras.positions", "at least one position"
@@ -106,7 +106,7 @@ def _cameras(cameras: Cameras, bins: Sequence[BinSizes]) -> Iterator[Conflict]:
             yield "cameras.ups", f"up vectors that are not zero or parallel to the viewing direction, as that of camera {index} is"
         elif position[2] <= 0.0:
             yield "cameras.positions", f"positions above the {noun}'s floor, z > 0, below which camera {index} sees no object [m]"
-        elif not any(_sees_bin(cameras, one, position) for one in bins):
+        elif not all(_sees_bin(cameras, one, place, position) for one in bins for place in _places(shift)):
             yield "cameras.target", f"a point that lets each camera see the {noun}, which lies outside of the images of camera {index} [m]"
 
 
@@ -190,10 +190,16 @@ def _bin_depths(cameras: Cameras, bins: Sequence[BinSizes], position: tuple[floa
     return [sum((c - a) * f for a, c, f in zip(position, corner, forward, strict=True)) / size for corner in corners]
 
 
-def _sees_bin(cameras: Cameras, sizes: BinSizes, position: tuple[float, ...]) -> bool:
-    """Whether the bounding sphere of a bin meets the cone around a camera's view, which is wider than its image."""
+def _places(shift: Sides) -> list[Sides]:
+    """Places of the bin at the ends of its offsets [m]."""
+    x, y = shift
+    return sorted({(-x, -y), (-x, y), (x, -y), (x, y)})
+
+
+def _sees_bin(cameras: Cameras, sizes: BinSizes, place: Sides, position: tuple[float, ...]) -> bool:
+    """Whether the bounding sphere of a bin at a place meets the cone around a camera's view, which is wider than its image."""
     height = sizes.height - sizes.base
-    center = (0.0, 0.0, sizes.base + height / 2)
+    center = (*place, sizes.base + height / 2)
     forward = [b - a for a, b in zip(position, cameras.target, strict=True)]
     away, radius = [b - a for a, b in zip(position, center, strict=True)], math.hypot(*sizes.outer, height) / 2
     distance = math.hypot(*away)

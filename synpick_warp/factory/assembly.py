@@ -14,7 +14,7 @@ from functools import partial
 import numpy as np
 import warp as wp
 
-from synpick_warp.configs.cell import bin_sizes
+from synpick_warp.configs.cell import bin_sizes, recorded_bins
 from synpick_warp.configs.schema import Config
 from synpick_warp.configs.splits import DataLayout
 from synpick_warp.exporters.registry import Needs
@@ -152,7 +152,7 @@ def _add_stream(stages: Stages, device: wp.Device, needs_images: bool, depth_fil
     config, table, tick_time = stages.config, stages.light_table, stages.tick_time
     host = host_images(config.bop, config.cameras.resolution[1], device, needs_images, depth_files)
     layers, cameras, ids = config.render.layers, len(stages.cameras), stages.object_ids
-    stream = FrameStream(stages.sizes, layers, cameras, tick_time, stages.renderer, ids, table, device, host)
+    stream = FrameStream(stages.sizes, layers, cameras, tick_time, stages.renderer, ids, table, device, host, recorded_bins(config))
     return Factory(**vars(stages), stream=stream, log=stages.make_log())
 
 

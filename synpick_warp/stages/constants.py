@@ -87,7 +87,7 @@ def make_scene_data(config: schema.Config, catalog: Catalog, built: build.BuiltM
         ),
         fill(structs.PerceptionData, config.perception),
         _suction_data(config.suction, gripper, physics.step),
-        bin_data(bin_sizes(config), config.move, built.layout.parts, device),
+        bin_data(bin_sizes(config), config.bins, config.move, built.layout.parts, device),
     )
 
 
@@ -174,7 +174,9 @@ def drop_data(
     )
 
 
-def bin_data(sizes: Sequence[BinSizes], move: schema.Move, parts: Sequence[build.Part], device: wp.Device) -> structs.BinData:
+def bin_data(
+    sizes: Sequence[BinSizes], bins: schema.Bins, move: schema.Move, parts: Sequence[build.Part], device: wp.Device
+) -> structs.BinData:
     """Fill `BinData` but for the arrays of worlds; `parts`: the collision shapes of the bins in a world."""
 
     def array(values: Sequence[Any], dtype: type) -> wp.array:
@@ -187,8 +189,8 @@ def bin_data(sizes: Sequence[BinSizes], move: schema.Move, parts: Sequence[build
         visible=sizes[0].is_visible,
         share=array(shares / shares[-1], float),
         lift=array([one.base - sizes[0].base for one in sizes], float),
-        shift=wp.vec2(0.0, 0.0),
-        yaw=0.0,
+        shift=wp.vec2(*bins.shift),
+        yaw=math.radians(bins.yaw),
         reach=array([np.array(one.opening) / 2 + one.margin for one in sizes], wp.vec2),
         rim_height=array([one.height for one in sizes], float),
         wall_height=array([one.height if one.shell else FAR for one in sizes], float),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from types import SimpleNamespace
 from typing import Any
@@ -9,7 +10,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from synpick_warp.configs.bins import Tote
+from synpick_warp.configs.bins import Bins, Tote
 from synpick_warp.configs.cell import BinSizes
 from synpick_warp.configs.manipulation import Move
 from synpick_warp.kernels import structs
@@ -91,6 +92,8 @@ class KernelWorlds:
     physics: Any = None
     pick: dict[str, Any] = field(default_factory=dict)
     bins: tuple[BinSizes, ...] = (BIN,)
+    places: Bins = field(default_factory=Bins)
+    parts: Sequence[tuple[int, int, bool]] = tuple((shape, 0, True) for shape in GUIDES)
 
     def __post_init__(self) -> None:
         self.volume = np.ones(self.objects) if self.volume is None else self.volume
@@ -140,8 +143,8 @@ class KernelWorlds:
         )
 
     def _bins(self) -> Any:
-        """Bins by `bins`; parts: the guide walls of the first."""
-        return bin_data(self.bins, Move(corner=0.5), [Part(shape, 0, True) for shape in GUIDES], self.device)
+        """Bins by `bins`."""
+        return bin_data(self.bins, self.places, Move(corner=0.5), [Part(*part) for part in self.parts], self.device)
 
     def _catalog(self) -> Any:
         compound = np.asarray(self.compound, np.int32)

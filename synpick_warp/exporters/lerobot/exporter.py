@@ -77,7 +77,8 @@ class LerobotExporter(EpisodeExporter[_Content]):
         """See `Exporter`."""
         super().__init__(context)
         settings, cameras = context.settings, context.layout.cameras
-        self._settings = EpisodeSettings(context.out, cameras, settings.cameras.resolution, video_rate(settings.physics), context.names)
+        known = (settings.cameras.resolution, video_rate(settings.physics), context.names, settings.bins[0].noun)
+        self._settings = EpisodeSettings(context.out, cameras, *known)
 
     @staticmethod
     def slot_bytes(settings: ExportSettings) -> int:

@@ -79,7 +79,7 @@ def _add_root(stage: Usd.Stage, metadata: EpisodeMetadata, settings: EpisodeSett
     stage.SetEndTimeCode(metadata.frames - 1)
     stage.SetTimeCodesPerSecond(settings.tick_rate)
     stage.SetFramesPerSecond(settings.tick_rate)
-    for name in ("episode", "arrangement", "frames", "ending", *(("split",) if metadata.split else ())):
+    for name in ("episode", "arrangement", "frames", "ending", *(name for name in ("split", "bin") if getattr(metadata, name))):
         add_property(root, name, getattr(metadata, name))
     scene = UsdPhysics.Scene.Define(stage, f"{ROOT}/Physics")
     scene.CreateGravityDirectionAttr(Gf.Vec3f(0.0, 0.0, -1.0))

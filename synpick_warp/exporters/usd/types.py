@@ -58,11 +58,15 @@ class EpisodeMetadata:
     ending: str
     split: str = ""
     """Name of the episode's split; empty: the data set has none."""
+    bin: str = ""
+    """Name of the bin; empty: a tote that is always in its place."""
 
     @staticmethod
     def from_end(end: EpisodeEnd) -> EpisodeMetadata:
         """Take the metadata from the episode's end."""
-        return EpisodeMetadata(end.episode, end.arrangement, end.frames, Ending(end.ending).name.lower(), end.row.get("split", ""))
+        own = (end.row or {}).get("bin") or {}
+        ending = Ending(end.ending).name.lower()
+        return EpisodeMetadata(end.episode, end.arrangement, end.frames, ending, end.row.get("split", ""), own.get("name", ""))
 
 
 def bin_asset(sizes: BinSizes) -> str:
