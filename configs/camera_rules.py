@@ -1,4 +1,4 @@
-"""Validation across the settings of cameras, tote and depth: poses and matrices that are none, cameras that see no tote."""
+"""Validation across the settings of cameras, bins and depth: poses and matrices that are none, cameras that see no bin."""
 
 from __future__ import annotations
 
@@ -6,11 +6,13 @@ import itertools
 import math
 import re
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
+from synpick_warp.configs.bins import Tote
 from synpick_warp.configs.cameras import CameraRow, Cameras, Pose
+from synpick_warp.configs.cell import BinSizes, Sides
 from synpick_warp.configs.rig import Rig, intrinsics, position, viewing_direction
-from synpick_warp.configs.schema import Bop, Config, DepthSensor, Tote
+from synpick_warp.configs.schema import Bop, Config, DepthSensor
 
 Conflict = tuple[str, str]
 """Key of the wrong setting, and its allowed values."""
@@ -31,7 +33,7 @@ FORMS = (("matrix",), ("position", "quaternion"), ("position", "look_at", "up"))
 """Keys of a pose: one of these sets."""
 
 
-def find_camera_conflicts(config: Config) -> Iterator[Conflict]:
+def find_camera_conflicts(config: Config, bins: Sequence[BinSizes]) -> Iterator[Conflict]:
     """Find the violated constraints of cameras, the most basic first."""
     listed = _rows(config.camera) if config.camera else _section(config.cameras)
     if found := list(listed):
@@ -40,12 +42,12 @@ def find_camera_conflicts(config: Config) -> Iterator[Conflict]:
         return
     rig = config.rig
     for index in range(len(rig)):
-        yield from _view(rig, index, config)
+        yield from _view(rig, index, config, bins)
     if config.perception.camera and config.perception.camera not in rig.names:
         yield "perception.camera", f"the name of a camera, {', '.join(rig.names)}, or none"
     if "depth_sensor" in config.render.layers:
-        yield from _depth_sensor(config.depth_sensor, rig, config.tote)
-    yield from _depth_scale(config.bop, rig, config.tote)
+        yield from _depth_sensor(config.depth_sensor, rig, bins)
+    yield from _depth_scale(config.bop, rig, bins)
 
 
 def _section(cameras: Cameras) -> Iterator[Conflict]:
@@ -91,9 +93,9 @@ def _pose(key: str, pose: Pose) -> Iterator[Conflict]:
             yield key, "a rotation; this matrix is a mirror image: x is right, y down and z forward"
 
 
-def _view(rig: Rig, index: int, config: Config) -> Iterator[Conflict]:
-    """Yield conflicts of a camera's intrinsics, odd sides with videos, and a degenerate view or one that does not show the tote."""
-    row, label = rig.rows[index], rig.label(index)
+def _view(rig: Rig, index: int, config: Config, bins: Sequence[BinSizes]) -> Iterator[Conflict]:
+    """Yield conflicts of a camera's intrinsics, odd sides with videos, and a degenerate view or one that does not show the bin."""
+    row, label, noun = rig.rows[index], rig.label(index), bins[0].noun
     (width, height), (fx, fy, *_) = rig.sizes[index], intrinsics(row)
     if "lerobot" in config.bake.formats and (width % 2 or height % 2):
         key = rig.key(index, "resolution") if config.camera and config.camera[index].resolution else "cameras.resolution"
@@ -108,11 +110,11 @@ def _view(rig: Rig, index: int, config: Config) -> Iterator[Conflict]:
     elif up is not None and math.hypot(*_cross(forward, up)) <= PARALLEL * math.hypot(*forward) * math.hypot(*up):
         yield aim, f"up vectors that are not zero or parallel to the viewing direction, as that of {label} is"
     elif at[2] <= 0.0:
-        yield place, f"positions above the tote's floor, z > 0, below which {label} sees no object [m]"
-    elif fx > 0.0 < fy and not _sees_tote(row, config.tote):
-        yield target, f"a point that lets each camera see the tote, which lies outside of the images of {label} [m]"
-    elif _in_wall(at, config.tote):
-        yield place, f"positions outside of the tote's walls, in which {label} is [m]"
+        yield place, f"positions above the {noun}'s floor, z > 0, below which {label} sees no object [m]"
+    elif fx > 0.0 < fy and not all(_sees_bin(row, one, spot) for one in bins for spot in _places(config.bins.shift)):
+        yield target, f"a point that lets each camera see the {noun}, which lies outside of the images of {label} [m]"
+    elif any(one.shell is not None and _in_wall(at, one.shell) for one in bins):
+        yield place, f"positions outside of the {noun}'s walls, in which {label} is [m]"
 
 
 def _matrix(key: str, matrix: tuple[tuple[float, float, float], ...], width: int, height: int) -> Iterator[Conflict]:
@@ -132,40 +134,48 @@ def _matrix(key: str, matrix: tuple[tuple[float, float, float], ...], width: int
         yield key, f"a principal point cx, cy inside its images of {width} x {height} px: are numbers, or width and height, swapped? [px]"
 
 
-def _depth_sensor(sensor: DepthSensor, rig: Rig, tote: Tote) -> Iterator[Conflict]:
-    """With the layer depth_sensor: the tote must lie within what the sensor measures, and its disparity be more than a step."""
+def _depth_sensor(sensor: DepthSensor, rig: Rig, bins: Sequence[BinSizes]) -> Iterator[Conflict]:
+    """With the layer depth_sensor: the bin must lie within what the sensor measures, and its disparity be more than a step."""
     for index, row in enumerate(rig.rows):
-        focal, depths = intrinsics(row)[0], _tote_depths(row, tote)
+        focal, depths = intrinsics(row)[0], _bin_depths(row, bins)
         near, far = max(0.0, min(depths)), max(depths)
         if sensor.distances[1] < near or sensor.distances[0] > far:
-            yield "depth_sensor.distances", f"a range that reaches the tote, {near:.3g} to {far:.3g} m from {rig.label(index)} [m]"
+            yield (
+                "depth_sensor.distances",
+                f"a range that reaches the {bins[0].noun}, {near:.3g} to {far:.3g} m from {rig.label(index)} [m]",
+            )
         if focal * sensor.baseline < sensor.disparity_step * far:
             least = sensor.disparity_step * far / focal
-            yield "depth_sensor.baseline", f"at least {least:.3g}, so that the disparity of the tote is a disparity_step or more [m]"
+            rule = f"so that the disparity of the {bins[0].noun} is a disparity_step or more [m]"
+            yield "depth_sensor.baseline", f"at least {least:.3g}, {rule}"
 
 
-def _depth_scale(bop: Bop, rig: Rig, tote: Tote) -> Iterator[Conflict]:
-    """Yield the depth scale if 16 bits do not reach the farthest corner of the tote."""
-    far = max(depth for row in rig.rows for depth in _tote_depths(row, tote))
+def _depth_scale(bop: Bop, rig: Rig, bins: Sequence[BinSizes]) -> Iterator[Conflict]:
+    """Yield the depth scale if 16 bits do not reach the farthest corner of the bins."""
+    far = max(depth for row in rig.rows for depth in _bin_depths(row, bins))
     if bop.depth_scale * 1e-3 * DEPTH_COUNTS < far:
-        yield "bop.depth_scale", f"at least {far * 1e3 / DEPTH_COUNTS:.3g}, so that 16 bits reach the tote at {far:.3g} m [mm]"
+        yield "bop.depth_scale", f"at least {far * 1e3 / DEPTH_COUNTS:.3g}, so that 16 bits reach the {bins[0].noun} at {far:.3g} m [mm]"
 
 
-def _tote_depths(row: CameraRow, tote: Tote) -> list[float]:
-    """Planar depths of the corners of the tote's outer box in the image of a camera [m]."""
-    length, width, height = tote.outer_size
+def _bin_depths(row: CameraRow, bins: Sequence[BinSizes]) -> list[float]:
+    """Planar depths of the corners of the bins' outer boxes in the image of a camera [m]."""
     at, forward = position(row.pose), viewing_direction(row.pose)
     size = math.hypot(*forward) or 1.0
-    corners = itertools.product((-length / 2, length / 2), (-width / 2, width / 2), (-tote.wall, height - tote.wall))
+    corners = [corner for one in bins for corner in one.corners]
     return [sum((c - a) * f for a, c, f in zip(at, corner, forward, strict=True)) / size for corner in corners]
 
 
-def _sees_tote(row: CameraRow, tote: Tote) -> bool:
-    """Whether the tote's bounding sphere meets the cone around a camera's view, which is wider than its image."""
-    length, width, height = tote.outer_size
-    center = (0.0, 0.0, height / 2 - tote.wall)
+def _places(shift: Sides) -> list[Sides]:
+    """Places of the bin at the ends of its offsets [m]."""
+    return sorted(set(itertools.product((-shift[0], shift[0]), (-shift[1], shift[1]))))
+
+
+def _sees_bin(row: CameraRow, sizes: BinSizes, place: Sides) -> bool:
+    """Whether the bounding sphere of a bin at a place meets the cone around a camera's view, which is wider than its image."""
+    height = sizes.height - sizes.base
+    center = (*place, sizes.base + height / 2)
     forward = viewing_direction(row.pose)
-    away, radius = [b - a for a, b in zip(position(row.pose), center, strict=True)], math.hypot(length, width, height) / 2
+    away, radius = [b - a for a, b in zip(position(row.pose), center, strict=True)], math.hypot(*sizes.outer, height) / 2
     distance = math.hypot(*away)
     if distance <= radius:
         return True

@@ -7,7 +7,9 @@ import re
 from collections import Counter
 from collections.abc import Iterator, Sequence
 
+from synpick_warp.configs.bins import PALLET, TOTE, Bins, Tote
 from synpick_warp.configs.camera_rules import Conflict, find_camera_conflicts
+from synpick_warp.configs.cell import BinSizes, bin_sizes
 from synpick_warp.configs.modes import bake_modes
 from synpick_warp.configs.schema import (
     FORMATS,
@@ -18,14 +20,12 @@ from synpick_warp.configs.schema import (
     DepthSensor,
     Effects,
     Gripper,
-    Move,
     ObjectRow,
     Physics,
     Pick,
     Settle,
     Split,
     Suction,
-    Tote,
 )
 from synpick_warp.configs.splits import MAX_SHARD_SCENES, DataLayout
 from synpick_warp.errors import format_value
@@ -35,12 +35,14 @@ _SPLIT = re.compile(r"(train|val|test)(_[A-Za-z0-9]+)*")
 
 def find_conflicts(config: Config) -> Iterator[Conflict]:
     """Find all violated constraints, the most basic first."""
-    tote, bop = config.tote, config.bop
+    bins, bop = bin_sizes(config), config.bop
     yield from _mix(config.bake, config.splits)
-    yield from _tote(tote, config.move)
-    yield from find_camera_conflicts(config)
+    yield from _bins(config.bins) if config.bins.kind != TOTE else _tote(config.tote)
+    if config.move.start_height < config.move.height:
+        yield "move.start_height", f"at least move.height, {config.move.height:g} [m]"
+    yield from find_camera_conflicts(config, bins)
     yield from _times(config.settle, config.physics)
-    yield from _pick(config.pick, tote)
+    yield from _pick(config.pick, bins)
     yield from _suction(config.suction, config.gripper)
     yield from _layers(config.render.layers)
     yield from _ranges(config.effects, config.depth_sensor)
@@ -58,8 +60,8 @@ def _mix(bake: Bake, splits: Sequence[Split]) -> Iterator[Conflict]:
         yield "bake.formats", f"at least one of {', '.join(FORMATS)}"
 
 
-def _tote(tote: Tote, move: Move) -> Iterator[Conflict]:
-    """Yield conflicts of the tote's sizes, and a height at which the gripper starts below that at which it moves."""
+def _tote(tote: Tote) -> Iterator[Conflict]:
+    """Yield conflicts of the tote's sizes."""
     if any(rim < floor for rim, floor in zip(tote.rim_size, tote.floor_size, strict=True)):
         yield "tote.rim_size", f"at least tote.floor_size on both sides, {format_value(tote.floor_size)} [m]"
     if any(outer < rim + 2 * tote.wall for outer, rim in zip(tote.outer_size[:2], tote.rim_size, strict=True)):
@@ -67,8 +69,12 @@ def _tote(tote: Tote, move: Move) -> Iterator[Conflict]:
         yield "tote.outer_size", f"at least tote.rim_size and two walls, {format_value(needed)} [m]"
     if tote.outer_size[2] <= tote.wall:
         yield "tote.wall", f"less than the tote's height, {tote.outer_size[2]:g} [m]"
-    if move.start_height < move.height:
-        yield "move.start_height", f"at least move.height, {move.height:g} [m]"
+
+
+def _bins(bins: Bins) -> Iterator[Conflict]:
+    """Yield conflicts of what stands under the cameras without walls."""
+    if bins.kind == PALLET and any(side > pallet for side, pallet in zip(bins.area, bins.pallet_size, strict=False)):
+        yield "bins.area", f"at most the pallet's length and width, {format_value(bins.pallet_size[:2])} [m]"
 
 
 def _times(settle: Settle, physics: Physics) -> Iterator[Conflict]:
@@ -80,15 +86,15 @@ def _times(settle: Settle, physics: Physics) -> Iterator[Conflict]:
         yield "settle.max_time", f"at least the time of settle.rest_ticks ticks, {rest:g} [s]"
 
 
-def _pick(pick: Pick, tote: Tote) -> Iterator[Conflict]:
+def _pick(pick: Pick, bins: Sequence[BinSizes]) -> Iterator[Conflict]:
     """Yield conflicts of the heights and speeds of picking."""
-    height = tote.outer_size[2] - tote.wall
+    height = max(one.height for one in bins)
     if pick.appear_height < pick.near:
         yield "pick.appear_height", f"at least pick.near, {pick.near:g} [m]"
     if pick.speed < pick.near_speed:
         yield "pick.speed", f"at least pick.near_speed, {pick.near_speed:g} [m/s]"
     if pick.lift_height < height:
-        yield "pick.lift_height", f"at least the inner height of the tote, {height:g}: attached objects must leave the tote [m]"
+        yield "pick.lift_height", f"at least the inner height of the {bins[0].noun}, {height:g}: attached objects must leave it [m]"
 
 
 def _suction(suction: Suction, gripper: Gripper) -> Iterator[Conflict]:

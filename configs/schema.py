@@ -12,6 +12,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 from synpick_warp.codes import Tone, names
+from synpick_warp.configs.bins import Bins, Tote
 from synpick_warp.configs.cameras import CameraRow, Cameras
 from synpick_warp.configs.fields import INT32_MAX, setting
 from synpick_warp.configs.manipulation import Move, Perception, Pick, Suction, Target
@@ -89,19 +90,6 @@ class Bake:
         choices=FORMATS,
     )
     writers: int = setting(0, "", "Processes that write files, for all devices; 0: one per CPU core, if memory suffices.", low=0, high=1024)
-
-
-@dataclass(frozen=True)
-class Tote:
-    """The tote (an open box). Its frame is the world frame: origin at the centre of the inner floor, z up. Sizes of the released mesh."""
-
-    outer_size: tuple[float, float, float] = setting((0.615, 0.373, 0.200), "m", "Outer length, width and height.", above=0.0, high=10.0)
-    floor_size: tuple[float, float] = setting((0.513, 0.319), "m", "Length and width of the inner floor.", above=0.0, high=10.0)
-    rim_size: tuple[float, float] = setting((0.545, 0.352), "m", "Length and width of the opening at the rim.", above=0.0, high=10.0)
-    wall: float = setting(0.0045, "m", "Thickness of walls and floor.", above=0.0, high=1.0)
-    color: tuple[float, float, float] = setting((0.65, 0.05, 0.04), "sRGB", "Base colour.", low=0.0, high=1.0)
-    metallic: float = setting(0.0, "", "Metallic factor.", low=0.0, high=1.0)
-    roughness: float = setting(0.5, "", "Roughness.", low=0.0, high=1.0)
 
 
 @dataclass(frozen=True)
@@ -374,6 +362,7 @@ class Config:
     bake: Bake = field(default_factory=Bake)
     objects: Objects = field(default_factory=Objects)
     tote: Tote = field(default_factory=Tote)
+    bins: Bins = field(default_factory=Bins)
     gripper: Gripper = field(default_factory=Gripper)
     cameras: Cameras = field(default_factory=Cameras)
     arrangement: Arrangement = field(default_factory=Arrangement)

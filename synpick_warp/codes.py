@@ -159,7 +159,9 @@ class Stream(enum.IntEnum):
     EFFECTS = 9
     COLOR_NOISE = 10
     DEPTH_NOISE = 11
-    LOOKS = 12
+    BIN = 12
+    LOOKS = 13
+    COMPARTMENT = 15
 
 
 class Look(enum.IntEnum):

@@ -203,6 +203,7 @@ def test_what_a_tick_says_of_its_live_worlds():
     known = dataclasses.replace(
         known,
         snapshot=SimpleNamespace(
+            bin=np.zeros(len(fixtures), np.int32),
             fixture_pose=fixtures,
             fixture_visible=np.arange(15).reshape(WORLDS, 3),
             light=numbers,

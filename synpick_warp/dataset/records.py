@@ -65,6 +65,14 @@ class IndicesEntry(Entry):
     """Episodes that the indices cover, sorted."""
 
 
+class BinRecord(msgspec.Struct):
+    """Schema of the record of an episode's bin; see `views.bins.bin_record`."""
+
+    name: str
+    position: tuple[float, float, float]
+    yaw: float
+
+
 class Row(msgspec.Struct):
     """Schema of a line of episodes.jsonl; see `episodes.EpisodeRow`."""
 
@@ -82,6 +90,7 @@ class Row(msgspec.Struct):
     sentence: str
     split: str = ""
     looks: dict[str, Any] | None = None
+    bin: BinRecord | None = None
 
     def __post_init__(self) -> None:
         _check_name("ending", self.ending, names(Ending)[1:])

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from synpick_warp.configs.cell import bin_sizes, recorded_bins
 from synpick_warp.configs.schema import Config
 from synpick_warp.configs.splits import DataLayout
 from synpick_warp.exporters.registry import Needs
@@ -23,6 +24,7 @@ from synpick_warp.factory.compilation import is_cache_warm, make_compiler, sole_
 from synpick_warp.factory.memory_plan import check_memory, plan_memory
 from synpick_warp.factory.order import order_longest_first
 from synpick_warp.factory.sizes import count_writers, fit_to_device, without_pictures
+from synpick_warp.scenes.bins import make_bins
 from synpick_warp.scenes.build import REPEATS, find_repeat_rules, must_repeat, with_capacities
 from synpick_warp.scenes.cameras import make_cameras
 from synpick_warp.scenes.catalog import load_catalog
@@ -159,7 +161,7 @@ def _add_stream(stages: Stages, device: wp.Device, needs_images: bool, depth_fil
     config, table, tick_time = stages.config, stages.light_table, stages.tick_time
     host = host_images(config.bop, config.rig.largest[1], device, needs_images, depth_files)
     layers, cameras, ids = config.render.layers, len(stages.cameras), stages.object_ids
-    stream = FrameStream(stages.sizes, layers, cameras, tick_time, stages.renderer, ids, table, device, host)
+    stream = FrameStream(stages.sizes, layers, cameras, tick_time, stages.renderer, ids, table, device, host, recorded_bins(config))
     return Factory(**vars(stages), stream=stream, log=stages.make_log())
 
 
@@ -175,7 +177,7 @@ def build_stages(
     """Load assets, and build worlds and renderer, from settings with resolved sizes. Other arguments and errors: `build_factory`."""
     progress.stage("loading objects and lights")
     cameras = make_cameras(config.rig)
-    fixtures = make_fixtures(config.tote, config.gripper)
+    bins = make_bins(bin_sizes(config))
     catalog = load_catalog(config, report=progress.note)
     lights = load_scene_lights(config.bake.lights, config.randomize, config.bake.seed, progress.note, config.objects.strict)
     config = _fit_to_catalog(config, catalog, device, progress)
@@ -183,7 +185,8 @@ def build_stages(
         episodes = order_longest_first(config, catalog, episodes, device)
     progress.stage(f"building {config.bake.worlds} worlds of {len(catalog)} objects on {device.alias}")
     looks = load_looks(config.randomize, progress.note, config.objects.strict)
-    scene = build_render_scene(config.render, config.tote, catalog, fixtures, cameras, lights, device, looks)
+    fixtures = make_fixtures(bins, config.gripper)
+    scene = build_render_scene(config.render, bins[0].sizes.base, catalog, fixtures, cameras, lights, device, looks)
     simulation = Simulation(config, catalog, len(lights), device, scene, episodes, records_physics)
     sizes = view_sizes(config.render, config.rig, config.bake.worlds, config.arrangement.max_objects, device)
     histories = simulation.layout.worlds * len(cameras)

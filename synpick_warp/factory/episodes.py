@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
@@ -13,10 +13,14 @@ from synpick_warp.configs.schema import Arrangement, Physics, Settle
 from synpick_warp.configs.splits import DataLayout
 from synpick_warp.factory.attempts import EpisodeRecord
 from synpick_warp.stages.stream import TickReport
+from synpick_warp.views.bins import bin_noun, bin_record
 from synpick_warp.views.frames import EpisodeEnd
 
 PLACES = 6
 """Decimal places of a time [s]; more would be noise."""
+
+
+"""Fields without a key where they are empty."""
 
 
 class EpisodeRow(NamedTuple):
@@ -43,14 +47,15 @@ class EpisodeRow(NamedTuple):
     """Name of the episode's split; empty, and no key: the settings have no splits."""
     looks: Mapping[str, Any] | None = None
     """Randomized looks of the episode, as `draw_looks` has them; None, and no key: the settings randomize none."""
+    bin: dict[str, Any] | None = None
+    """Record of the bin; None, and no key: a tote that is always in its place."""
 
     def as_json(self) -> dict[str, Any]:
         """Row as the dictionary of a line of episodes.jsonl."""
         row = {**self._asdict(), "ending": self.ending.name.lower()}
-        for name, value in _OPTIONAL.items():
-            if row[name] == value:
-                del row[name]
-        return {**row, "sentence": self.ending.sentence}
+        row = {name: value for name, value in row.items() if name not in _OPTIONAL or value != _OPTIONAL[name]}
+        sentence = self.ending.sentence.replace("tote", bin_noun(self.bin["name"])) if self.bin else self.ending.sentence
+        return {**row, "sentence": sentence}
 
     @classmethod
     def from_json(cls, row: Mapping[str, Any]) -> EpisodeRow:
@@ -123,13 +128,17 @@ class BakeSummary:
 
 def episode_row(
     layout: DataLayout,
+    bins: Sequence[str],
     tick_time: float,
     looks: Callable[[int, int], Mapping[str, Any]] | None,
     report: TickReport,
     world: int,
     record: EpisodeRecord,
 ) -> EpisodeRow:
-    """Build the row of the episode that ended in a world. `tick_time`: time between two frames [s]; `looks`: see `Stages.looks`."""
+    """Build the row of the episode that ended in a world.
+
+    `bins`: of `recorded_bins`; `tick_time`: time between two frames [s]; `looks`: see `Stages.looks`.
+    """
     episode, arrangement, frame, ending = (int(report.column(name)[world]) for name in ("episode", "arrangement", "frame", "ending"))
     split = layout.split_of(episode)
     return EpisodeRow(
@@ -146,6 +155,7 @@ def episode_row(
         record.left,
         "" if split is None else split.name,
         None if looks is None else looks(episode, record.objects),
+        bin_record(bins[int(report.snapshot.bin[world])], report.snapshot.fixture_pose[world, 0]) if bins else None,
     )
 
 

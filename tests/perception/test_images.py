@@ -53,7 +53,8 @@ def make_images(toy: ToyScene, device: wp.Device, worlds: int = 4, views: int = 
     config = toy.settings()
     rig = Rig.of(replace(config.cameras, resolution=(192, 108)))
     settings = replace(config.perception, resolution=RESOLUTION, views=views)
-    scene = build_render_scene(config.render, config.tote, Catalog(tuple(toy.entries)), toy.fixtures, make_cameras(rig), toy.lights, device)
+    catalog, cameras = Catalog(tuple(toy.entries)), make_cameras(rig)
+    scene = build_render_scene(config.render, -config.tote.wall, catalog, toy.fixtures, cameras, toy.lights, device)
     return PerceptionImages(settings, rig, scene, worlds, toy.instances)
 
 

@@ -193,7 +193,7 @@ def build_scene(toy: ToyScene, device: wp.Device) -> RenderScene:
     """The renderer's constant data of a toy scene."""
     settings = toy.settings()
     catalog = Catalog(tuple(toy.entries))
-    return build_render_scene(settings.render, settings.tote, catalog, toy.fixtures, toy.cameras, toy.lights, device, toy.looks)
+    return build_render_scene(settings.render, -settings.tote.wall, catalog, toy.fixtures, toy.cameras, toy.lights, device, toy.looks)
 
 
 def render(toy: ToyScene, device: wp.Device) -> RenderedViews:

@@ -10,9 +10,11 @@ import numpy as np
 import trimesh
 import warp as wp
 
+from synpick_warp.configs.cell import bin_sizes
 from synpick_warp.configs.rig import Rig
 from synpick_warp.configs.schema import FAST, REFERENCE, Cameras, Config
 from synpick_warp.factory.assembly import make_renderer
+from synpick_warp.scenes.bins import make_bins
 from synpick_warp.scenes.cameras import make_cameras
 from synpick_warp.scenes.environment import map_directions
 from synpick_warp.scenes.fixtures import make_fixtures
@@ -70,8 +72,8 @@ class Studio:
 
 def make_studio(config: Config, catalog: Catalog, cameras: tuple[Camera, ...], lights: tuple[EnvironmentMap, ...], device: Any) -> Studio:
     """Build a scene and its renderer, without light histories."""
-    fixtures = make_fixtures(config.tote, config.gripper)
-    scene = build_render_scene(config.render, config.tote, catalog, fixtures, cameras, lights, device)
+    fixtures = make_fixtures(make_bins(bin_sizes(config)), config.gripper)
+    scene = build_render_scene(config.render, -config.tote.wall, catalog, fixtures, cameras, lights, device)
     return Studio(make_renderer(config, scene, config.arrangement.max_objects, 1))
 
 

@@ -13,7 +13,7 @@ from synpick_warp.kernels.render.visibility.camera import (
     camera_ray,
     projected_box,
 )
-from synpick_warp.kernels.render.visibility.gbuffer import FAR, FIXTURES, Meshes, ViewBodies
+from synpick_warp.kernels.render.visibility.gbuffer import FAR, FIXTURES, Meshes, ViewBodies, fixture_mesh
 from synpick_warp.kernels.render.visibility.ray_bodies import write_ray_body
 
 wp.set_module_options({"enable_backward": False})
@@ -57,6 +57,7 @@ def set_up_views_kernel(
     meshes: Meshes,
     grid: ImageGrid,
     # State:
+    bin: wp.array[int],  # (world)
     catalog_index: wp.array2d[int],  # (world, instance)
     pose: wp.array2d[wp.transformf],  # (world, instance) [m]
     fixture_pose: wp.array2d[wp.transformf],  # (world, fixture) [m]
@@ -80,11 +81,11 @@ def set_up_views_kernel(
         mesh = catalog_index[world, body]
         placed = pose[world, body]
     elif fixture_visible[world, body - views.instances] != 0:
-        mesh = meshes.entries + body - views.instances
+        mesh = fixture_mesh(meshes, bin[world], body - views.instances)
         placed = fixture_pose[world, body - views.instances]
     bodies_out.mesh[view, body] = mesh
     if body == views.instances:
-        bodies_out.uses_background[view] = int(mesh >= 0 and placed == wp.transform_identity(dtype=float))
+        bodies_out.uses_background[view] = int(mesh == meshes.entries and placed == wp.transform_identity(dtype=float))
     if mesh < 0:
         bodies_out.box[view, body] = wp.vec4i(0, 0, -1, -1)
         bodies_out.sphere[view, body] = wp.vec4(0.0, 0.0, 0.0, -1.0)

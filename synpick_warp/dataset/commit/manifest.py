@@ -25,6 +25,7 @@ from typing import Any
 import msgspec
 
 from synpick_warp import __version__
+from synpick_warp.configs.bins import Bins
 from synpick_warp.configs.load import load_config, override_config
 from synpick_warp.configs.objects import AUTO_UNIT
 from synpick_warp.configs.randomize import Distribution, Randomize
@@ -81,6 +82,7 @@ YOUNGER_SETTINGS: dict[str, Any] = {
     "camera": (),
     "objects.unit": AUTO_UNIT,
 }
+YOUNGER_SETTINGS |= {f"bins.{item.name}": item.default for item in dataclasses.fields(Bins)}
 YOUNGER_SETTINGS |= {f"randomize.{item.name}": _plain(item.default) for item in dataclasses.fields(Randomize)}
 """Settings that older manifests lack, and what held before: left out where they have these values, so that older data sets can still be
 read, and resumed with them."""

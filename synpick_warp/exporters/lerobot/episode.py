@@ -32,6 +32,8 @@ class EpisodeSettings:
     """Frames per second."""
     objects: Mapping[int, str]
     """obj_id -> name."""
+    noun: str = "tote"
+    """What the objects are in, or on."""
 
 
 @dataclass(frozen=True)
@@ -69,7 +71,7 @@ def commit_episode(folder: Path, content: EpisodeContent, settings: EpisodeSetti
         sync_file(video)
         videos.append((video, settings.out / video_path(name, content.episode)))
     attempts = [json.loads(line) for line in content.attempts]
-    sentences, tasks = describe_tasks(content.mode, len(ticks), attempts, settings.objects)
+    sentences, tasks = describe_tasks(content.mode, len(ticks), attempts, settings.objects, settings.noun)
     rows = make_rows(ticks, attempts, sentences, tasks)
     part = Part(len(ticks), content.mode, content.ending, len(attempts), content.picked, sentences, rows.tobytes(), levels)
     write_synced(folder / "part", msgspec.json.encode(part))

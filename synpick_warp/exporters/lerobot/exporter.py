@@ -76,8 +76,9 @@ class LerobotExporter(EpisodeExporter[_Content]):
     def __init__(self, context: ExportContext) -> None:
         """See `Exporter`."""
         super().__init__(context)
-        rig = context.settings.rig
-        self._settings = EpisodeSettings(context.out, rig.names, rig.sizes, video_rate(context.settings.physics), context.names)
+        settings, rig = context.settings, context.settings.rig
+        rate, noun = video_rate(settings.physics), settings.bins[0].noun
+        self._settings = EpisodeSettings(context.out, rig.names, rig.sizes, rate, context.names, noun)
 
     @staticmethod
     def slot_bytes(settings: ExportSettings) -> int:

@@ -27,7 +27,8 @@ INSTANCE = "instance"
 """Taxonomy of instance labels, and prefix of the objects' prim names."""
 ROOT = "/Episode"
 FIXTURES = {"tote": f"{ROOT}/Tote", "finger": f"{ROOT}/Gripper/Finger", "cup": f"{ROOT}/Gripper/Cup"}
-"""Asset and prim of each row of `TickBatch.fixture_pose`."""
+"""Asset and prim of each row of `TickBatch.fixture_pose`; a bin that is no tote has the prim BIN."""
+BIN = f"{ROOT}/Bin"
 
 
 def make_episode_layer(ticks: np.ndarray, metadata: EpisodeMetadata, settings: EpisodeSettings) -> Sdf.Layer:
@@ -43,7 +44,12 @@ def make_episode_layer(ticks: np.ndarray, metadata: EpisodeMetadata, settings: E
     _add_root(stage, metadata, settings)
     assets = {f"{ROOT}/Table": "table"}
     UsdGeom.Xform.Define(stage, f"{ROOT}/Table")
+    own = settings.bins[int(ticks["bin"][0])]
     for index, (asset, path) in enumerate(FIXTURES.items()):
+        if index == 0 and own != asset:
+            asset, path = own, BIN
+        if asset is None:
+            continue
         visible = ticks["fixture_visible"][:, index] != 0
         _add_moving(stage, path, ticks["fixture_pose"][:, index], visible, np.arange(len(ticks)))
         assets[path] = asset
@@ -73,7 +79,7 @@ def _add_root(stage: Usd.Stage, metadata: EpisodeMetadata, settings: EpisodeSett
     stage.SetEndTimeCode(metadata.frames - 1)
     stage.SetTimeCodesPerSecond(settings.tick_rate)
     stage.SetFramesPerSecond(settings.tick_rate)
-    for name in ("episode", "arrangement", "frames", "ending", *(("split",) if metadata.split else ())):
+    for name in ("episode", "arrangement", "frames", "ending", *(name for name in ("split", "bin") if getattr(metadata, name))):
         add_property(root, name, getattr(metadata, name))
     scene = UsdPhysics.Scene.Define(stage, f"{ROOT}/Physics")
     scene.CreateGravityDirectionAttr(Gf.Vec3f(0.0, 0.0, -1.0))

@@ -78,7 +78,7 @@ Made by synpick-warp (mode {", ".join(settings.modes)}, seed {bake.seed}, {len(c
 - Pictures have {describe_sizes(settings.layout, cameras)} and no lens distortion; {_INTRINSICS[settings.layout.is_listed]}.
   The centre of pixel (row, column) is (column + 0.5, row + 0.5): for OpenCV and Open3D, whose pixel centres have whole
   coordinates, subtract 0.5 from cx and cy. Cameras have x right, y down, z forward.
-- The world is the tote's frame: centre of its inner floor, z up, metres.
+- The world is the {settings.bins[0].noun}'s frame: centre of its inner floor, z up, metres.
 - `config.toml` has all settings, `episodes.jsonl` a line an episode, `attempts.jsonl` one for each attempt to pick.
 
 | camera | world to camera, row-major | translation [m] |

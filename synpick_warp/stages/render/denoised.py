@@ -295,7 +295,7 @@ class DenoisedRenderer:
         options: dict[str, Any] = {"dim": views.count, "device": self.scene.device, "block_dim": VIEW_BLOCK}
         inputs = [snapshot.episode, snapshot.frame, views]
         wp.launch(advance_history_kernel, inputs=inputs, outputs=[self.history, self.moving], **options)
-        inputs = [self.scene.meshes, snapshot.catalog_index, snapshot.pose, snapshot.fixture_pose, snapshot.fixture_visible]
+        inputs = [self.scene.meshes, snapshot.bin, snapshot.catalog_index, snapshot.pose, snapshot.fixture_pose, snapshot.fixture_visible]
         inputs += [snapshot.last_catalog_index, snapshot.last_pose, snapshot.last_fixture_pose, snapshot.last_fixture_visible]
         inputs += [views, self.moving.mesh.shape[1]]
         wp.launch(find_moving_bodies_kernel, inputs=inputs, outputs=[self.moving], **options)

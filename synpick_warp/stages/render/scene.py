@@ -289,9 +289,9 @@ def shadowed_lamps(settings: schema.Render) -> int:
 
 def build_render_scene(
     settings: schema.Render,
-    tote: schema.Tote,
+    table_height: float,
     catalog: Catalog,
-    fixtures: tuple[Fixture, Fixture, Fixture],
+    fixtures: tuple[Fixture, ...],
     cameras: tuple[Camera, ...],
     lights: tuple[EnvironmentMap, ...],
     device: wp.Device,
@@ -301,9 +301,9 @@ def build_render_scene(
 
     Args:
         settings: Settings of the renderer.
-        tote: Settings of the tote, which stands on the table.
+        table_height: z of the table, on which the first bin stands [m].
         catalog: The objects; `Snapshot.catalog_index` is the index into it.
-        fixtures: Tote, gripper shaft and cup, each in its own frame.
+        fixtures: Bins, then gripper shaft and cup, each in its own frame.
         cameras: Cameras of one image size; `Views.camera` is the index into it.
         lights: Environment maps; `Snapshot.light` is the index into it.
         device: Device of the arrays.
@@ -317,7 +317,7 @@ def build_render_scene(
     materials += [Material((1.0, 1.0, 1.0), texture, 0.0, 1.0) for texture in (looks.all_textures if looks else ())]
     meshes, keep = build_meshes(shapes, len(catalog), device, fixtures[0].interior)
     table = Table()
-    table.visible, table.height = int(settings.table), -tote.wall
+    table.visible, table.height = int(settings.table), table_height
     ground = srgb_to_linear(np.array(settings.table_color)) if settings.table else None
     paths = PathScene()
     paths.meshes = meshes

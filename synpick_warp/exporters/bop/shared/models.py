@@ -199,9 +199,9 @@ BOP challenge (scenewise). {_describe_scenes(layout)} of {_describe_folders(layo
   optical axis; 0: no surface.
 - Pictures have {describe_sizes(layout, cameras)}. The centre of pixel (row, column) is (column + 0.5, row + 0.5): for OpenCV and
   Open3D, whose pixel centres have whole coordinates, subtract 0.5 from cx and cy. Cameras have x right, y down, z forward.
-- `cam_R_w2c` and `cam_t_w2c` lead from the tote's frame (centre of its inner floor, z up) to the camera.
+- `cam_R_w2c` and `cam_t_w2c` lead from the {settings.bins[0].noun}'s frame (centre of its inner floor, z up) to the camera.
 - `light` in scene_camera.json describes the episode's light: the map's name, its yaw [rad], the exposure relative to the automatic
-  one [EV], and the direction to the sun or lamp that casts shadows, in the tote's frame; null if none is dominant.
+  one [EV], and the direction to the sun or lamp that casts shadows, in the {settings.bins[0].noun}'s frame; null if none is dominant.
   `effects`, if present, has the parameters of the camera effects on colour; `config.toml` has the ranges from which they were sampled.
 - `instance_id` in scene_gt.json is an object's number for the whole episode, the same for all cameras; a gt_id is only the position
   in an image's list.
