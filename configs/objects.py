@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from math import hypot
-from typing import Any
+from typing import Any, ClassVar
 
 from synpick_warp.configs.fields import INT32_MAX, setting
 
@@ -158,6 +158,8 @@ class Objects:
 class ObjectRow:
     """A row of the object table: physical and material properties that model files do not contain."""
 
+    REQUIRED: ClassVar = ("id", "diameter")
+    IDENTITY: ClassVar = ("id", "name", "diameter")
     id: int = setting(0, "", "The model's obj_id in its BOP folder.", low=0, high=INT32_MAX)
     name: str = setting(
         "", "", "Name of the object; for meshes that are not BOP models the file name without suffix, by which the row is found."

@@ -82,13 +82,7 @@ class DropData:
     clearance: float
     """Gap between bounding spheres in the drop column [m]."""
     spread: float
-    """Fraction of the opening, less the object's bounding radius, over which drop positions spread."""
-    rim_length: float
-    """Opening of the tote at the rim along x [m]."""
-    rim_width: float
-    """The same along y [m]."""
-    rim_height: float
-    """Height of the rim [m]."""
+    """Fraction of the opening of a compartment, less the object's bounding radius, over which drop positions spread."""
     gravity: float
     """Gravitational acceleration [m/s²]."""
     gripper_home: wp.vec3
@@ -99,6 +93,50 @@ class DropData:
     """1: sample the yaw of environment maps."""
     exposure_spread: float
     """Half-width of the sampled exposure range [EV]."""
+
+
+@wp.struct
+class BinData:
+    """Bins from which an episode draws its own, where it is placed, and their collision shapes. Lengths are in a bin's frame: origin at the
+    centre of the inner floor, z up. A bin without dividers is one compartment.
+    """
+
+    count: int
+    """Number of bins."""
+    visible: int
+    """1: bins are rendered; 0: there is a table alone."""
+    share: wp.array[float]
+    """(bin): share of the episodes that have this bin or one before it."""
+    lift: wp.array[float]
+    """(bin): z of the bin's frame where it stands on the table [m]."""
+    shift: wp.vec2
+    """Half widths of the offset in x and y [m]."""
+    yaw: float
+    """Half width of the rotation about z [rad]."""
+    reach: wp.array[wp.vec2]
+    """(bin): half length and width beyond which an object lies beside the bin [m]."""
+    rim_height: wp.array[float]
+    """(bin): height of the rim, over which objects are dropped [m]."""
+    wall_height: wp.array[float]
+    """(bin): height below which an object beside the bin is outside [m]."""
+    corner: wp.array[wp.vec3]
+    """(bin): TCP at the waypoint in the corner with positive x and y of a compartment, from its centre [m]."""
+    first_compartment: wp.array[int]
+    """(bin + 1): index of the bin's first compartment; the last entry is their number."""
+    center: wp.array[wp.vec2]
+    """(compartment): centre [m]."""
+    half: wp.array[wp.vec2]
+    """(compartment): half length and width of the opening [m]."""
+    chosen: wp.array[int]
+    """(world): bin of the world's episode."""
+    pose: wp.array[wp.transform]
+    """(world): its pose in the world [m]."""
+    shape: wp.array[int]
+    """(part): index of a collision shape of a bin, or of a guide wall on its rim, among a world's shapes."""
+    shape_bin: wp.array[int]
+    """(part): the bin that it belongs to."""
+    shape_guide: wp.array[int]
+    """(part): 1: a guide wall."""
 
 
 @wp.struct
@@ -151,8 +189,6 @@ class MoveData:
     """Largest force of the impedance control [N]."""
     speed: float
     """Speed of the setpoint [m/s]."""
-    corner: wp.vec3
-    """TCP at the waypoint in the tote's corner with positive x and y [m]."""
     start_height: float
     """Height of the TCP above the floor in the first frame, over the first corner [m]."""
     waypoints: int

@@ -10,16 +10,19 @@ from __future__ import annotations
 import warnings
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import newton
 import numpy as np
 import warp as wp
 
+from synpick_warp.configs.cell import bin_sizes
 from synpick_warp.configs.modes import mode_weights
 from synpick_warp.configs.schema import EXCEED, Arrangement, Bake, Config, Gripper, Move, Physics, Pick
 from synpick_warp.errors import ConfigError
+from synpick_warp.scenes.bins import guide_walls, make_bins
 from synpick_warp.scenes.gripper import cup_collider, finger_collider, rod_inertia
-from synpick_warp.scenes.tote import TABLE_SIZE, guide_walls, tote_colliders
+from synpick_warp.scenes.tote import TABLE_SIZE
 from synpick_warp.scenes.types import Catalog, CatalogEntry, ConvexPiece
 
 # Mass [kg] and inertia [kg·m²] of an empty slot. Its gravity is compensated, so any positive values will do.
@@ -44,6 +47,14 @@ FREE_COORDS = 7
 FREE_DOFS = 6
 
 
+class Part(NamedTuple):
+    """Collision shape of a bin, or guide wall on its rim: index among a world's shapes, index of the bin, whether it is a guide wall."""
+
+    shape: int
+    bin: int
+    guide: bool
+
+
 @dataclass(frozen=True)
 class Layout:
     """Counts and offsets of bodies, joints and shapes in the arrays of the model. World w starts at w times the count per world."""
@@ -56,8 +67,8 @@ class Layout:
     compound_slots: int
     """Body slots for objects with a convex decomposition."""
     shapes_per_world: int
-    guide_shapes: tuple[int, ...]
-    """Shape indices of the guide walls within a world."""
+    parts: tuple[Part, ...]
+    """Collision shapes and guide walls of all bins, of which each world has one in place."""
     finger_shape: int
     """Shape index of the gripper shaft within a world."""
     cup_shape: int
@@ -197,13 +208,17 @@ def build_model(config: Config, catalog: Catalog, device: wp.Device) -> BuiltMod
     world = newton.ModelBuilder(gravity=(0.0, 0.0, -config.physics.gravity))
     newton.solvers.SolverSteel.register_custom_attributes(world)
     shape = newton.ModelBuilder.ShapeConfig(density=0.0, mu=config.physics.friction, gap=config.physics.gap, restitution=0.0)
-    for piece in tote_colliders(config.tote):
-        world.add_shape_convex_hull(-1, mesh=_hull(piece), cfg=shape)
-    table = wp.transform(wp.vec3(0.0, 0.0, -config.tote.wall - TABLE_SIZE[2]), wp.quat_identity())
+    bins = make_bins(bin_sizes(config))
+
+    def add(index: int, pieces: Sequence[ConvexPiece], guide: bool) -> list[Part]:
+        return [Part(world.add_shape_convex_hull(-1, mesh=_hull(piece), cfg=shape), index, guide) for piece in pieces]
+
+    parts = add(0, bins[0].pieces, False)
+    table = wp.transform(wp.vec3(0.0, 0.0, bins[0].sizes.base - TABLE_SIZE[2]), wp.quat_identity())
     world.add_shape_box(-1, xform=table, hx=TABLE_SIZE[0], hy=TABLE_SIZE[1], hz=TABLE_SIZE[2], cfg=shape)
-    guides = tuple(
-        world.add_shape_convex_hull(-1, mesh=_hull(piece), cfg=shape) for piece in guide_walls(config.tote, config.physics.guide_height)
-    )
+    for index, one in enumerate(bins):
+        parts += [] if index == 0 else add(index, one.pieces, False)
+        parts += add(index, guide_walls(one.sizes, config.physics.guide_height), True)
     gripper = _add_gripper(world, config.gripper, shape)
     variant, empty = _add_slots(world, config.physics, catalog, shape, (single, compound))
     scene = newton.ModelBuilder(gravity=(0.0, 0.0, -config.physics.gravity))
@@ -213,7 +228,7 @@ def build_model(config: Config, catalog: Catalog, device: wp.Device) -> BuiltMod
         # Newton raises the inertia of bodies of a few millimetres to its threshold, and says so for every slot.
         warnings.filterwarnings("ignore", "Eigenvalues below threshold")
         model = scene.finalize(device=device)
-    layout = Layout(config.bake.worlds, config.arrangement.max_objects, single, compound, world.shape_count, guides, *gripper)
+    layout = Layout(config.bake.worlds, config.arrangement.max_objects, single, compound, world.shape_count, tuple(parts), *gripper)
     return BuiltModel(model, layout, variant, empty)
 
 

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 from trimesh.bounds import oriented_bounds
 
+from synpick_warp.configs.cell import BinSizes, bin_sizes
 from synpick_warp.configs.objects import AUTO_UNIT, UNITS
-from synpick_warp.configs.schema import Config, ObjectRow, Objects, Tote
+from synpick_warp.configs.schema import Config, ObjectRow, Objects
 from synpick_warp.errors import CatalogError, SynpickError
 from synpick_warp.scenes.assets.appearance import FileMaterial
 from synpick_warp.scenes.assets.asset_files import asset_scope
@@ -53,7 +54,7 @@ def load_catalog(config: Config, cache_dir: Path | None = None, report: Callable
     are left out, with a line each; with `objects.strict`, the first of them is an error. Files are read in isolated processes.
 
     Args:
-        config: Settings: bake.models, objects, object_rows, tote, arrangement.volume.
+        config: Settings: bake.models, objects, object_rows, bins, arrangement.volume.
         cache_dir: Folder in which collision shapes are cached; None: `default_cache_dir()`.
         report: Called with each line of progress.
 
@@ -90,7 +91,7 @@ def read_objects(config: Config, report: Callable[[str], None] = _ignore) -> lis
 
 def _read_objects(config: Config, report: Callable[[str], None], faults: _Faults) -> list[RawObject]:
     """The embedded objects, or those of the folder `bake.models`."""
-    rules = _Rules(config.objects, config.object_rows, config.tote)
+    rules = _Rules(config.objects, config.object_rows, bin_sizes(config))
     return _read_folder(Path(config.bake.models).expanduser(), rules, report, faults) if config.bake.models else procedural_objects()
 
 
@@ -138,11 +139,11 @@ class _Faults:
 
 @dataclass(frozen=True)
 class _Rules:
-    """Settings by which a model is read and checked: objects, rows of the object table, tote."""
+    """Settings by which a model is read and checked: objects, rows of the object table, bins."""
 
     objects: Objects
     rows: tuple[ObjectRow, ...]
-    tote: Tote
+    bins: tuple[BinSizes, ...]
 
 
 def _read_folder(folder: Path, rules: _Rules, report: Callable[[str], None], faults: _Faults) -> list[RawObject]:
@@ -162,7 +163,7 @@ def _read_folder(folder: Path, rules: _Rules, report: Callable[[str], None], fau
     for model, result in zip(models, run_isolated(_read_model, calls, READ_LIMITS), strict=True):
         if isinstance(result, _SizeError | tuple) and model.path.suffix.lower() not in STEP_SUFFIXES:
             sizes.append(result.size if isinstance(result, _SizeError) else result[0].hull.diameter)
-            faults.advice = _advise_unit(sizes, _unit(rules.objects, model), rules.tote)
+            faults.advice = _advise_unit(sizes, _unit(rules.objects, model), rules.bins[0])
         if isinstance(result, Failure):
             faults.add(CatalogError(f"{model.path}: the process that reads it {result.reason}; repair or simplify the file"))
         elif isinstance(result, SynpickError):
@@ -196,7 +197,7 @@ def _read_model(model: ModelFile, info: ModelInfo, rules: _Rules) -> tuple[RawOb
     rows = (row for row in rules.rows if (row.id == model.obj_id if model.is_bop else row.name == model.name))
     row = next((row for row in rows if _fits(row, hull.diameter, tolerance)), None)
     raw = _raw(model, mesh, hull, found.material, row, objects)
-    _check_size(raw, str(model.path if model.is_bop else raw.name), rules.tote)
+    _check_size(raw, str(model.path if model.is_bop else raw.name), rules.bins)
     info, said = add_symmetries(info, found, hull.diameter, row, objects, str(model.path))
     lines += said
     raw = replace(raw, symmetries_discrete=info.symmetries_discrete, symmetries_continuous=info.symmetries_continuous)
@@ -212,10 +213,10 @@ def _unit(objects: Objects, model: ModelFile) -> str:
     return objects.unit if objects.unit != AUTO_UNIT else "mm" if model.is_bop else "m"
 
 
-def _advise_unit(sizes: list[float], unit: str, tote: Tote) -> str:
+def _advise_unit(sizes: list[float], unit: str, place: BinSizes) -> str:
     """Advice if the median diameter [m] of objects that were read in a unit is implausible, and is not in another unit; else empty."""
     median = float(np.median(sizes)) if sizes else _TYPICAL
-    if _SMALL <= median <= _inner_diagonal(tote):
+    if _SMALL <= median <= _inner_diagonal(place):
         return ""
     likely = min(("m", "cm", "mm"), key=lambda name: abs(np.log(max(median, 1e-30) / UNITS[unit] * UNITS[name] / _TYPICAL)))
     if likely == unit:
@@ -269,14 +270,15 @@ def _fits(row: ObjectRow, size: float, tolerance: float) -> bool:
     return row.diameter == 0.0 or _near(size, row.diameter, tolerance)
 
 
-def _check_size(raw: RawObject, origin: str, tote: Tote) -> None:
+def _check_size(raw: RawObject, origin: str, bins: Sequence[BinSizes]) -> None:
     """Refuse an object that is flat, too small, too large for the tote, or far from its origin."""
     if raw.hull.volume == 0.0:
         raise CatalogError(f"{origin}: all vertices lie in one plane; a body needs a volume")
     size = raw.hull.diameter
     if size < _MIN_DIAMETER:
         raise _SizeError(f"{origin}: diameter {size:.4g} m; a body needs at least {_MIN_DIAMETER:g} m; {_UNITS}", size)
-    _check_fits_tote(raw.mesh.vertices, size, origin, tote)
+    for sizes in bins:
+        _check_fits_bin(raw.mesh.vertices, size, origin, sizes)
     radius = float(np.linalg.norm(raw.mesh.vertices, axis=1).max())
     if radius > _MAX_ORIGIN_DISTANCE * size:
         raise CatalogError(
@@ -285,14 +287,14 @@ def _check_size(raw: RawObject, origin: str, tote: Tote) -> None:
         )
 
 
-def _check_fits_tote(vertices: np.ndarray, size: float, origin: str, tote: Tote) -> None:
-    """Refuse an object of this diameter [m] that passes through the tote's opening in no orientation, or does not fit into the tote.
+def _check_fits_bin(vertices: np.ndarray, size: float, origin: str, sizes: BinSizes) -> None:
+    """Refuse an object of this diameter [m] that passes through a bin's opening in no orientation, or does not fit into the bin.
 
     It passes if the two smaller sides of a bounding box are at most as long as the opening's. The axis-aligned box is tried first, since
     the minimum oriented bounding box takes long to compute for fine meshes.
     """
-    inside = _inner_diagonal(tote)
-    opening = sorted(tote.rim_size)
+    inside = _inner_diagonal(sizes) if sizes.shell else np.inf
+    opening = sorted(sizes.opening)
     box = sorted(np.ptp(vertices, axis=0).tolist())
     if size <= inside and box[0] <= opening[0] and box[1] <= opening[1]:
         return
@@ -300,15 +302,15 @@ def _check_fits_tote(vertices: np.ndarray, size: float, origin: str, tote: Tote)
     if size <= inside and box[0] <= opening[0] and box[1] <= opening[1]:
         return
     raise _SizeError(
-        f"{origin}: too large for the tote: {_by(box)} m, diameter {size:.4g} m, but the tote's opening is {_by(opening)} m, "
-        f"and its inner diagonal {inside:.3g} m; {_UNITS}",
+        f"{origin}: too large for the {sizes.noun}: {_by(box)} m, diameter {size:.4g} m, but the {sizes.noun}'s opening is "
+        f"{_by(opening)} m, and its inner diagonal {inside:.3g} m; {_UNITS}",
         size,
     )
 
 
-def _inner_diagonal(tote: Tote) -> float:
-    """Diagonal of the tote's inside [m]."""
-    return float(np.linalg.norm((*tote.rim_size, tote.outer_size[2] - tote.wall)))
+def _inner_diagonal(sizes: BinSizes) -> float:
+    """Diagonal of a bin's inside, or of the area where objects are dropped [m]."""
+    return float(np.linalg.norm((*sizes.opening, sizes.height)))
 
 
 def _by(sides: list[float]) -> str:

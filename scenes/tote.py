@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from synpick_warp.configs.schema import Tote
+from synpick_warp.configs.bins import Tote
 from synpick_warp.errors import ConfigError
 from synpick_warp.scenes.collision.simplification import simplify_hull
 from synpick_warp.scenes.modelling import Patch, join, loft, make_mesh, rounded_rectangle, solid, strips
@@ -27,8 +27,6 @@ MIN_WALL = 0.02
 """Minimum thickness of the walls' collision shapes at the rim [m], for the same reason."""
 INTERIOR_MARGIN = 1e-4
 """Margin between interior and faces [m]: far above the rounding error of hit positions, below the offset of ray origins."""
-GUIDE_THICKNESS = 0.1
-"""Thickness of the guide walls [m]."""
 TABLE_SIZE = (10.0, 10.0, 0.1)
 """Half extents of the table under the tote [m]; large enough for objects that leave the tote."""
 TABLE_ROUGHNESS = 0.8
@@ -89,7 +87,7 @@ def tote_colliders(tote: Tote) -> tuple[ConvexPiece, ...]:
     _check(tote)
     top = rim_height(tote)
     outer = np.maximum(np.array(tote.outer_size[:2]) / 2, np.array(tote.rim_size) / 2 + MIN_WALL)
-    floor = _box((-outer[0], -outer[1], -FLOOR_DEPTH), (outer[0], outer[1], 0.0))
+    floor = box_piece((-outer[0], -outer[1], -FLOOR_DEPTH), (outer[0], outer[1], 0.0))
     walls = []
     for axis in (0, 1):
         inner, rim, out, along = tote.floor_size[axis] / 2, tote.rim_size[axis] / 2, outer[axis], outer[1 - axis]
@@ -109,19 +107,6 @@ def _corner(tote: Tote, x: float, y: float) -> ConvexPiece:
         for along, across in ((-reach, 0.0), (0.0, -reach), (MIN_WALL, 0.0), (0.0, MIN_WALL), (MIN_WALL, MIN_WALL)):
             points.append((x * (half[0] + along), y * (half[1] + across), z))
     return _piece(points)
-
-
-def guide_walls(tote: Tote, height: float) -> tuple[ConvexPiece, ...]:
-    """Build four temporary walls on the rim, flush with the opening, that keep falling objects over the tote; height [m]."""
-    low = rim_height(tote)
-    x, y = tote.rim_size[0] / 2, tote.rim_size[1] / 2
-    far_x, far_y, high = x + GUIDE_THICKNESS, y + GUIDE_THICKNESS, low + height
-    return (
-        _box((x, -far_y, low), (far_x, far_y, high)),
-        _box((-far_x, -far_y, low), (-x, far_y, high)),
-        _box((-far_x, y, low), (far_x, far_y, high)),
-        _box((-far_x, -far_y, low), (far_x, -y, high)),
-    )
 
 
 def _check(tote: Tote) -> None:
@@ -185,8 +170,8 @@ def _ribs(tote: Tote) -> list[Patch]:
     return ribs
 
 
-def _box(low: tuple[float, float, float], high: tuple[float, float, float]) -> ConvexPiece:
-    """Box between two corners, as a convex piece."""
+def box_piece(low: tuple[float, float, float], high: tuple[float, float, float]) -> ConvexPiece:
+    """Make a convex piece of the box between two corners."""
     return _piece([(x, y, z) for x in (low[0], high[0]) for y in (low[1], high[1]) for z in (low[2], high[2])])
 
 

@@ -1,11 +1,11 @@
-"""Episode start: assign episodes to worlds, sample mode, objects and light, and stack the objects above the tote to be dropped."""
+"""Episode start: assign episodes to worlds, sample mode, bin, objects and light, and stack the objects above the bin to be dropped."""
 
 import warp as wp
 
 from synpick_warp.codes import Ending, Mode, Phase, Stream
 from synpick_warp.kernels.rng import TAU, stream_key, uniform, uniform_index, uniform_rotation
 from synpick_warp.kernels.sim.endings import delivers
-from synpick_warp.kernels.structs import CatalogData, DropData, LayoutData, ModeData
+from synpick_warp.kernels.structs import BinData, CatalogData, DropData, LayoutData, ModeData
 
 wp.set_module_options({"enable_backward": False})
 
@@ -209,16 +209,60 @@ def sample_lights_kernel(
     light_exposure_out[world] = drop.exposure_spread * (2.0 * uniform(key, 2) - 1.0)
 
 
+@wp.kernel
+def sample_bins_kernel(
+    # Scene:
+    seed: wp.uint64,
+    bins: BinData,
+    # State:
+    arrangement_id: wp.array[wp.vec2i],  # (world)
+    phase: wp.array[int],  # (world)
+    # Out:
+    bin_out: wp.array[int],  # (world)
+    bin_pose_out: wp.array[wp.transform],  # (world) [m]
+):
+    """Sample the bin of starting episodes and its pose.
+
+    With the samples u_i of the stream (seed, episode, arrangement, Stream.BIN): the first bin whose share exceeds u_0, offset
+    s (2 u_1 - 1), s (2 u_2 - 1) for half widths s, yaw = a (2 u_3 - 1). Launched over world.
+    """
+    world = wp.tid()
+    if phase[world] != Phase.START:
+        return
+    key = stream_key(seed, arrangement_id[world][0], arrangement_id[world][1], Stream.BIN)
+    chosen = int(0)
+    while chosen < bins.count - 1 and uniform(key, 0) >= bins.share[chosen]:
+        chosen += 1
+    # Not s (2 u - 1), which is -0 for a width of 0.
+    x = 2.0 * bins.shift[0] * uniform(key, 1) - bins.shift[0]
+    y = 2.0 * bins.shift[1] * uniform(key, 2) - bins.shift[1]
+    angle = 2.0 * bins.yaw * uniform(key, 3) - bins.yaw
+    bin_out[world] = chosen
+    bin_pose_out[world] = wp.transform(wp.vec3(x, y, bins.lift[chosen]), wp.quat_from_axis_angle(wp.vec3(0.0, 0.0, 1.0), angle))
+
+
 @wp.func
-def drop_pose(key: wp.uint64, index: int, radius: float, height: float, drop: DropData) -> wp.transform:
-    """Sample a drop pose at a height [m]: uniform rotation, position uniform over a fraction of the rim's opening.
+def choose_compartment(bins: BinData, world: int, key: wp.uint64, instance: int) -> int:
+    """Sample the compartment of the world's bin that an instance is dropped into, from the stream of `Stream.COMPARTMENT`."""
+    chosen = bins.chosen[world]
+    first = bins.first_compartment[chosen]
+    return first + uniform_index(key, instance, bins.first_compartment[chosen + 1] - first)
+
+
+@wp.func
+def drop_pose(
+    key: wp.uint64, index: int, radius: float, height: float, drop: DropData, bins: BinData, world: int, compartment: int
+) -> wp.transform:
+    """Sample a drop pose at a height above the floor [m]: uniform rotation, position uniform over a fraction of a compartment's opening.
 
     The opening is reduced by the object's bounding radius [m]; `index` counts the drops of the stream.
     """
     first = index * DROP_SAMPLES
-    x = (2.0 * uniform(key, first) - 1.0) * drop.spread * wp.max(0.0, 0.5 * drop.rim_length - radius)
-    y = (2.0 * uniform(key, first + 1) - 1.0) * drop.spread * wp.max(0.0, 0.5 * drop.rim_width - radius)
-    return wp.transform(wp.vec3(x, y, height), uniform_rotation(key, first + 2))
+    center = bins.center[compartment]
+    half = bins.half[compartment]
+    x = (2.0 * uniform(key, first) - 1.0) * drop.spread * wp.max(0.0, half[0] - radius) + center[0]
+    y = (2.0 * uniform(key, first + 1) - 1.0) * drop.spread * wp.max(0.0, half[1] - radius) + center[1]
+    return bins.pose[world] * wp.transform(wp.vec3(x, y, height), uniform_rotation(key, first + 2))
 
 
 @wp.func
@@ -294,6 +338,7 @@ def drop_objects_kernel(
     layout: LayoutData,
     catalog: CatalogData,
     drop: DropData,
+    bins: BinData,
     # State:
     arrangement_id: wp.array[wp.vec2i],  # (world)
     catalog_index: wp.array2d[int],  # (world, instance)
@@ -305,16 +350,17 @@ def drop_objects_kernel(
     joint_qd_out: wp.array[float],  # (dof) [m/s, rad/s]
     joint_f_out: wp.array[float],  # (dof) [N, N·m]
 ):
-    """Assign objects to their body slots and stack them above the tote in a column of bounding spheres, at rest; phase becomes SETTLE.
+    """Assign objects to their body slots and stack them above the bin in a column of bounding spheres, at rest; phase becomes SETTLE.
 
-    Height of sphere i: z_i = rim + r_i + Σ_{j<i} (2 r_j + clearance). Launched over world.
+    Height of sphere i above the floor: z_i = rim + r_i + Σ_{j<i} (2 r_j + clearance), in whichever compartment. Launched over world.
     """
     world = wp.tid()
     if phase_inout[world] != Phase.START:
         return
     body = world * layout.bodies + layout.gripper_bodies
     key = stream_key(seed, arrangement_id[world][0], arrangement_id[world][1], Stream.DROP)
-    height = drop.rim_height
+    places = stream_key(seed, arrangement_id[world][0], arrangement_id[world][1], Stream.COMPARTMENT)
+    height = bins.rim_height[bins.chosen[world]]
     for instance in range(layout.instances):
         index = catalog_index[world, instance]
         if index >= 0:
@@ -322,9 +368,10 @@ def drop_objects_kernel(
             variant_out[body + slot] = catalog.variant[index]
             q = world * layout.coords + layout.gripper_dofs + 7 * slot
             qd = world * layout.dofs + layout.gripper_dofs + 6 * slot
-            write_body(
-                joint_q_out, joint_qd_out, q, qd, drop_pose(key, instance, catalog.radius[index], height + catalog.radius[index], drop)
-            )
+            radius = catalog.radius[index]
+            compartment = choose_compartment(bins, world, places, instance)
+            pose = drop_pose(key, instance, radius, height + radius, drop, bins, world, compartment)
+            write_body(joint_q_out, joint_qd_out, q, qd, pose)
             joint_f_out[qd + 2] = 0.0
-            height += 2.0 * catalog.radius[index] + drop.clearance
+            height += 2.0 * radius + drop.clearance
     phase_inout[world] = Phase.SETTLE

@@ -1,4 +1,4 @@
-"""Gripper control: setpoint generation (tote corners, or approach and lift), impedance control, and the yaw of the shaft.
+"""Gripper control: setpoint generation (corners of the bin, or approach and lift), impedance control, and the yaw of the shaft.
 
 The gripper is a vertical shaft ("finger" in settings and data sets) with three prismatic joints, and a suction cup that tilts about the
 wrist axis at the shaft's lower end. Setpoints are positions of the wrist; the TCP lies `tcp_offset` below it when the cup is upright.
@@ -8,24 +8,32 @@ import warp as wp
 
 from synpick_warp.codes import Mode, Phase, Stream, Task
 from synpick_warp.kernels.rng import stream_key, uniform_index
-from synpick_warp.kernels.structs import TILT, LayoutData, MoveData, PickData
+from synpick_warp.kernels.structs import TILT, BinData, LayoutData, MoveData, PickData
 
 wp.set_module_options({"enable_backward": False})
 
-# Waypoints of a round: the four corners of the tote.
+# Waypoints of a round: the four corners of a compartment.
 ROUND = wp.constant(4)
+# Height above the rim in which the TCP passes from one compartment to the next [m].
+PASS_HEIGHT = wp.constant(0.05)
 
 
 @wp.func
-def tote_corner(code: int, corner: wp.vec3) -> wp.vec3:
-    """Corner 0 to 3 of the tote, mirrored from `corner` [m]: bit 0 of the code negates x, bit 1 negates y."""
+def bin_corner(code: int, bins: BinData, world: int) -> wp.vec3:
+    """TCP at the corner of a compartment that `code` names, in the frame of the world's bin [m].
+
+    Bits 0 and 1 negate x and y of the corner with positive ones, relative to the compartment's centre; the others are the compartment.
+    """
+    chosen = bins.chosen[world]
+    corner = bins.corner[chosen]
+    center = bins.center[bins.first_compartment[chosen] + code // ROUND]
     x = corner[0]
     y = corner[1]
     if (code & 1) == 1:
         x = -x
     if (code & 2) == 2:
         y = -y
-    return wp.vec3(x, y, corner[2])
+    return wp.vec3(x + center[0], y + center[1], corner[2])
 
 
 @wp.kernel
@@ -34,6 +42,7 @@ def begin_moving_kernel(
     seed: wp.uint64,
     layout: LayoutData,
     move: MoveData,
+    bins: BinData,
     # State:
     arrangement_id: wp.array[wp.vec2i],  # (world)
     mode: wp.array[int],  # (world)
@@ -48,7 +57,8 @@ def begin_moving_kernel(
 ):
     """Count frames; in the first frame of mode MOVE, sample the order of the corners and place the gripper above the first one.
 
-    The order is a Fisher-Yates shuffle of the four corners for each round. `frame` is -1 outside of phase ACT, and counts from 0 in it.
+    The order is a Fisher-Yates shuffle of the four corners for each round; rounds take the compartments in turn, from a random one on.
+    `corner_order` is the corner, 0 to 3, plus 4 times the compartment. `frame` is -1 outside of phase ACT, and counts from 0 in it.
     Launched over world.
     """
     world = wp.tid()
@@ -67,8 +77,14 @@ def begin_moving_kernel(
         kept = corner_order_out[world, visit]
         corner_order_out[world, visit] = corner_order_out[world, other]
         corner_order_out[world, other] = kept
-    setpoint = tote_corner(corner_order_out[world, 0], move.corner)
-    setpoint = wp.vec3(setpoint[0], setpoint[1], move.start_height + move.tcp_offset)
+    chosen = bins.chosen[world]
+    compartments = bins.first_compartment[chosen + 1] - bins.first_compartment[chosen]
+    first = uniform_index(key, move.waypoints, compartments)
+    for visit in range(move.waypoints):
+        corner_order_out[world, visit] = corner_order_out[world, visit] + ROUND * ((first + visit // ROUND) % compartments)
+    corner = bin_corner(corner_order_out[world, 0], bins, world)
+    setpoint = wp.transform_point(bins.pose[world], wp.vec3(corner[0], corner[1], move.start_height))
+    setpoint = wp.vec3(setpoint[0], setpoint[1], setpoint[2] + move.tcp_offset)
     setpoint_out[world] = setpoint
     waypoint_out[world] = 0
     place_gripper(layout, world, setpoint, 0.0, joint_q_inout, joint_qd_inout)
@@ -95,6 +111,16 @@ def step_towards(setpoint: wp.vec3, target: wp.vec3, stride: float) -> wp.vec3:
 
 
 @wp.func
+def pass_over(setpoint: wp.vec3, target: wp.vec3, height: float) -> wp.vec3:
+    """Next point of a path that leads up to `height`, over to the target, and down to it [m]."""
+    if setpoint[0] == target[0] and setpoint[1] == target[1]:
+        return target
+    if setpoint[2] < height:
+        return wp.vec3(setpoint[0], setpoint[1], height)
+    return wp.vec3(target[0], target[1], setpoint[2])
+
+
+@wp.func
 def task_setpoint(task: int, point: wp.vec3, normal: wp.vec3, pick: PickData, tcp_offset: float) -> wp.vec3:
     """Wrist position at the end of a task [m]: with the TCP at the grasp point, before it (APPROACH), or above it (LIFT)."""
     wrist = point + tcp_offset * normal
@@ -110,6 +136,7 @@ def advance_setpoints_kernel(
     # Scene:
     move: MoveData,
     pick: PickData,
+    bins: BinData,
     # State:
     phase: wp.array[int],  # (world)
     mode: wp.array[int],  # (world)
@@ -123,22 +150,30 @@ def advance_setpoints_kernel(
 ):
     """Advance the setpoints by one step of physics, at constant speed.
 
-    Mode MOVE: towards the next corner; a reached one increments `waypoint`. Picking: APPROACH to `near` before the grasp point, then
-    DESCEND along the normal, then PRESS without motion. The ends of PRESS and LIFT are detected once a tick, by
-    `tasks.advance_tasks_kernel`. Launched over world.
+    Mode MOVE: towards the next corner, over the rim into another compartment; a reached one increments `waypoint`. Picking: APPROACH to
+    `near` before the grasp point, then DESCEND along the normal, then PRESS without motion. The ends of PRESS and LIFT are detected once a
+    tick, by `tasks.advance_tasks_kernel`. Launched over world.
     """
     world = wp.tid()
     if phase[world] != Phase.ACT:
         return
     setpoint = setpoint_inout[world]
     if mode[world] == Mode.MOVE:
-        if waypoint_inout[world] < move.waypoints:
-            target = tote_corner(corner_order[world, waypoint_inout[world]], move.corner)
+        waypoint = waypoint_inout[world]
+        if waypoint < move.waypoints:
+            code = corner_order[world, waypoint]
+            target = wp.transform_point(bins.pose[world], bin_corner(code, bins, world))
             target = wp.vec3(target[0], target[1], target[2] + move.tcp_offset)
-            setpoint = step_towards(setpoint, target, move.speed * move.step)
+            next = target
+            if waypoint > 0 and corner_order[world, wp.max(waypoint - 1, 0)] // ROUND != code // ROUND:
+                height = (
+                    wp.transform_get_translation(bins.pose[world])[2] + bins.rim_height[bins.chosen[world]] + PASS_HEIGHT + move.tcp_offset
+                )
+                next = pass_over(setpoint, target, height)
+            setpoint = step_towards(setpoint, next, move.speed * move.step)
             setpoint_inout[world] = setpoint
             if setpoint == target:
-                waypoint_inout[world] = waypoint_inout[world] + 1
+                waypoint_inout[world] = waypoint + 1
         return
     task = task_inout[world]
     steps_inout[world] = steps_inout[world] + 1

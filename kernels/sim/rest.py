@@ -4,12 +4,12 @@ import warp as wp
 
 from synpick_warp.codes import Phase, Stream
 from synpick_warp.kernels.rng import stream_key
-from synpick_warp.kernels.sim.arrangement import drop_pose, write_body
-from synpick_warp.kernels.structs import CatalogData, DropData, LayoutData, SettleData
+from synpick_warp.kernels.sim.arrangement import choose_compartment, drop_pose, write_body
+from synpick_warp.kernels.structs import BinData, CatalogData, DropData, LayoutData, SettleData
 
 wp.set_module_options({"enable_backward": False})
 
-# Height of an object's origin below which it has left the tote, through its floor or beside it [m].
+# Height of an object's origin below which it has left the bin, through its floor or beside it [m].
 BELOW_FLOOR = wp.constant(-0.01)
 # Offset of collision shapes that must not touch anything: above whatever falls [m].
 SHAPES_AWAY = wp.constant(1000.0)
@@ -89,10 +89,13 @@ def measure_displacement_kernel(
 
 
 @wp.func
-def is_outside(position: wp.vec3, drop: DropData) -> bool:
-    """True if an object's origin [m] lies below the floor, or beside the rim's opening and below the rim."""
-    beside = wp.abs(position[0]) > 0.5 * drop.rim_length or wp.abs(position[1]) > 0.5 * drop.rim_width
-    return position[2] < BELOW_FLOOR or (beside and position[2] < drop.rim_height)
+def is_outside(position: wp.vec3, bins: BinData, world: int) -> bool:
+    """True if an object's origin [m] lies below the floor of the world's bin, or beside its opening and below the rim."""
+    chosen = bins.chosen[world]
+    local = wp.transform_point(wp.transform_inverse(bins.pose[world]), position)
+    reach = bins.reach[chosen]
+    beside = wp.abs(local[0]) > reach[0] or wp.abs(local[1]) > reach[1]
+    return local[2] < BELOW_FLOOR or (beside and local[2] < bins.wall_height[chosen])
 
 
 @wp.kernel
@@ -103,6 +106,7 @@ def redrop_objects_kernel(
     catalog: CatalogData,
     drop: DropData,
     settle: SettleData,
+    bins: BinData,
     # State:
     arrangement_id: wp.array[wp.vec2i],  # (world)
     phase: wp.array[int],  # (world)
@@ -115,7 +119,7 @@ def redrop_objects_kernel(
     joint_q_inout: wp.array[float],  # (coord) [m, rad]
     joint_qd_inout: wp.array[float],  # (dof) [m/s, rad/s]
 ):
-    """Drop objects again that left the tote or were stuck, that is, in deep penetration for longer than `stuck_ticks`.
+    """Drop objects again that left the bin or were stuck, that is, in deep penetration for longer than `stuck_ticks`.
 
     They are stacked one above the other, and the guide walls return. `progress` holds ticks since the drop, ticks at rest, re-drops, and
     whether the guide walls stand; `stuck` counts each instance's ticks in deep penetration. Launched over world.
@@ -125,7 +129,8 @@ def redrop_objects_kernel(
         return
     progress = progress_inout[world]
     key = stream_key(seed, arrangement_id[world][0], arrangement_id[world][1], Stream.REDROP)
-    height = drop.rim_height
+    places = stream_key(seed, arrangement_id[world][0], arrangement_id[world][1], Stream.COMPARTMENT)
+    height = bins.rim_height[bins.chosen[world]]
     body = world * layout.bodies + layout.gripper_bodies
     for instance in range(layout.instances):
         index = catalog_index[world, instance]
@@ -134,10 +139,13 @@ def redrop_objects_kernel(
             stuck = stuck_inout[world, instance] + 1
             if penetration[body + slot] < settle.stuck_depth:
                 stuck = 0
-            if stuck > settle.stuck_ticks or is_outside(wp.transform_get_translation(body_q[body + slot]), drop):
+            position = wp.transform_get_translation(body_q[body + slot])
+            if stuck > settle.stuck_ticks or is_outside(position, bins, world):
                 stuck = 0
-                pose = drop_pose(key, progress[2], catalog.radius[index], height + catalog.radius[index], drop)
-                height += 2.0 * catalog.radius[index] + drop.clearance
+                radius = catalog.radius[index]
+                compartment = choose_compartment(bins, world, places, instance)
+                pose = drop_pose(key, progress[2], radius, height + radius, drop, bins, world, compartment)
+                height += 2.0 * radius + drop.clearance
                 q = world * layout.coords + layout.gripper_dofs + 7 * slot
                 write_body(joint_q_inout, joint_qd_inout, q, world * layout.dofs + layout.gripper_dofs + 6 * slot, pose)
                 progress = wp.vec4i(progress[0], -1, progress[2] + 1, 1)
@@ -214,18 +222,22 @@ def shape_pose(collides: bool) -> wp.transform:
 
 
 @wp.kernel
-def set_guides_kernel(
+def place_bins_kernel(
     # Scene:
     layout: LayoutData,
-    guide_shapes: wp.array[int],  # (guide)
+    bins: BinData,
     # State:
     progress: wp.array[wp.vec4i],  # (world) [ticks]
     # Out:
     shape_transform_out: wp.array[wp.transform],  # (shape) [m]
 ):
-    """Enable the guide walls of worlds whose `progress` says that they stand, and disable the others, by their shapes' poses.
+    """Place the collision shapes of each world's bin, and its guide walls while `progress` says that they stand; all others are far above.
 
-    Launched over world, guide wall.
+    Launched over world, part: a collision shape or guide wall of a bin.
     """
-    world, guide = wp.tid()
-    shape_transform_out[world * layout.shapes + guide_shapes[guide]] = shape_pose(progress[world][3] == 1)
+    world, part = wp.tid()
+    stands = bins.shape_bin[part] == bins.chosen[world] and (bins.shape_guide[part] == 0 or progress[world][3] == 1)
+    pose = shape_pose(stands)
+    if stands:
+        pose = bins.pose[world]
+    shape_transform_out[world * layout.shapes + bins.shape[part]] = pose

@@ -4,57 +4,9 @@ import warp as wp
 
 from synpick_warp.codes import Measure, Phase, Status, Task
 from synpick_warp.kernels.sim.endings import delivers
-from synpick_warp.kernels.structs import LayoutData
+from synpick_warp.kernels.structs import BinData, LayoutData
 
 wp.set_module_options({"enable_backward": False})
-
-
-@wp.kernel
-def take_snapshot_kernel(
-    # Scene:
-    layout: LayoutData,
-    # State:
-    phase: wp.array[int],  # (world)
-    ending: wp.array[int],  # (world)
-    arrangement_id: wp.array[wp.vec2i],  # (world)
-    frame: wp.array[int],  # (world)
-    task: wp.array[int],  # (world)
-    catalog_index: wp.array2d[int],  # (world, instance)
-    body_slot: wp.array2d[int],  # (world, instance)
-    body_q: wp.array[wp.transform],  # (body) [m]
-    # Out:
-    live_out: wp.array[int],  # (world)
-    episode_out: wp.array[int],  # (world)
-    frame_out: wp.array[int],  # (world)
-    catalog_index_out: wp.array2d[int],  # (world, instance)
-    pose_out: wp.array2d[wp.transform],  # (world, instance) [m]
-    fixture_pose_out: wp.array2d[wp.transform],  # (world, fixture) [m]
-    fixture_visible_out: wp.array2d[int],  # (world, fixture)
-):
-    """Copy episode, frame, catalog indices and poses of objects and fixtures into the snapshot.
-
-    `live` is 1 if the tick is a frame: in phase ACT, and in the tick in which an episode ends that becomes part of the data set
-    (`delivers`). The gripper is invisible during task LOOK, in which it waits at home. Fixtures are tote, gripper shaft ("finger") and cup.
-    Launched over world.
-    """
-    world = wp.tid()
-    live = int(0)
-    if phase[world] == Phase.ACT or (phase[world] == Phase.OVER and delivers(ending[world])):
-        live = 1
-    live_out[world] = live
-    episode_out[world] = arrangement_id[world][0]
-    frame_out[world] = frame[world]
-    body = world * layout.bodies
-    for instance in range(layout.instances):
-        catalog_index_out[world, instance] = catalog_index[world, instance]
-        if catalog_index[world, instance] >= 0:
-            pose_out[world, instance] = body_q[body + layout.gripper_bodies + body_slot[world, instance]]
-    gripper = wp.where(task[world] == Task.LOOK, 0, 1)
-    fixture_pose_out[world, 0] = wp.transform_identity()
-    fixture_visible_out[world, 0] = 1
-    for link in range(2):
-        fixture_pose_out[world, 1 + link] = body_q[body + link]
-        fixture_visible_out[world, 1 + link] = gripper
 
 
 @wp.struct
@@ -79,6 +31,49 @@ class FramePoses:
     """(world, fixture): fixture to world [m]."""
     fixture_visible: wp.array2d[int]
     """(world, fixture): 0 if it is not rendered."""
+
+
+@wp.kernel
+def take_snapshot_kernel(
+    # Scene:
+    layout: LayoutData,
+    bins: BinData,
+    # State:
+    phase: wp.array[int],  # (world)
+    ending: wp.array[int],  # (world)
+    arrangement_id: wp.array[wp.vec2i],  # (world)
+    frame: wp.array[int],  # (world)
+    task: wp.array[int],  # (world)
+    catalog_index: wp.array2d[int],  # (world, instance)
+    body_slot: wp.array2d[int],  # (world, instance)
+    body_q: wp.array[wp.transform],  # (body) [m]
+    # Out:
+    now_out: FramePoses,
+):
+    """Copy episode, frame, catalog indices and poses of objects and fixtures into the snapshot.
+
+    `live` is 1 if the tick is a frame: in phase ACT, and in the tick in which an episode ends that becomes part of the data set
+    (`delivers`). The gripper is invisible during task LOOK, in which it waits at home. Fixtures are bin, gripper shaft ("finger") and cup.
+    Launched over world.
+    """
+    world = wp.tid()
+    live = int(0)
+    if phase[world] == Phase.ACT or (phase[world] == Phase.OVER and delivers(ending[world])):
+        live = 1
+    now_out.live[world] = live
+    now_out.episode[world] = arrangement_id[world][0]
+    now_out.frame[world] = frame[world]
+    body = world * layout.bodies
+    for instance in range(layout.instances):
+        now_out.catalog_index[world, instance] = catalog_index[world, instance]
+        if catalog_index[world, instance] >= 0:
+            now_out.pose[world, instance] = body_q[body + layout.gripper_bodies + body_slot[world, instance]]
+    gripper = wp.where(task[world] == Task.LOOK, 0, 1)
+    now_out.fixture_pose[world, 0] = bins.pose[world]
+    now_out.fixture_visible[world, 0] = bins.visible
+    for link in range(2):
+        now_out.fixture_pose[world, 1 + link] = body_q[body + link]
+        now_out.fixture_visible[world, 1 + link] = gripper
 
 
 @wp.kernel

@@ -6,7 +6,7 @@ from synpick_warp.codes import Mode, Outcome, Phase, Removal, Task
 from synpick_warp.kernels.sim.arrangement import PARKED_HEIGHT, write_body
 from synpick_warp.kernels.sim.gripper import place_gripper, task_setpoint
 from synpick_warp.kernels.sim.rest import is_outside, shape_pose
-from synpick_warp.kernels.structs import TILT, DropData, LayoutData, MoveData, PickData, SettleData
+from synpick_warp.kernels.structs import TILT, BinData, DropData, LayoutData, MoveData, PickData, SettleData
 
 wp.set_module_options({"enable_backward": False})
 
@@ -76,9 +76,9 @@ def clear_seals_kernel(
 def remove_lost_kernel(
     # Scene:
     layout: LayoutData,
-    drop: DropData,
     settle: SettleData,
     pick: PickData,
+    bins: BinData,
     # State:
     phase: wp.array[int],  # (world)
     body_slot: wp.array2d[int],  # (world, instance)
@@ -89,7 +89,7 @@ def remove_lost_kernel(
     removed_out: wp.array2d[int],  # (world, instance)
     attached_out: wp.array2d[int],  # (world, instance)
 ):
-    """Remove objects in phase ACT that fell below `pick.floor`, or are at rest outside of the tote; `removed` becomes LOST.
+    """Remove objects in phase ACT that fell below `pick.floor`, or are at rest outside of the bin; `removed` becomes LOST.
 
     `displacement` is an object's motion in the last tick. Launched over world, instance.
     """
@@ -97,7 +97,7 @@ def remove_lost_kernel(
     if phase[world] != Phase.ACT or catalog_index_inout[world, instance] < 0:
         return
     position = wp.transform_get_translation(body_q[world * layout.bodies + layout.gripper_bodies + body_slot[world, instance]])
-    beside = is_outside(position, drop) and displacement[world, instance] < settle.relaxed_rest_threshold
+    beside = is_outside(position, bins, world) and displacement[world, instance] < settle.relaxed_rest_threshold
     if beside or position[2] < pick.floor:
         catalog_index_inout[world, instance] = -1
         removed_out[world, instance] = Removal.LOST

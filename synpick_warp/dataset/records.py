@@ -31,8 +31,8 @@ Vector = tuple[float, float, float]
 Pixel = tuple[float, float]
 """Column and row in the perception image; integers are pixel centres."""
 _Value = bool | int | float | str | None
-_Section = dict[str, _Value | list[_Value | list[_Value]]]
-"""Settings of a section, or of an object row."""
+_Section = dict[str, _Value | list[_Value | list[_Value]] | dict[str, Any]]
+"""Settings of a section, or of an object row; distributions are objects."""
 _Schema = TypeVar("_Schema", bound=msgspec.Struct)
 
 
@@ -65,6 +65,14 @@ class IndicesEntry(Entry):
     """Episodes that the indices cover, sorted."""
 
 
+class BinRecord(msgspec.Struct):
+    """Schema of the record of an episode's bin; see `views.bins.bin_record`."""
+
+    name: str
+    position: tuple[float, float, float]
+    yaw: float
+
+
 class Row(msgspec.Struct):
     """Schema of a line of episodes.jsonl; see `episodes.EpisodeRow`."""
 
@@ -81,6 +89,8 @@ class Row(msgspec.Struct):
     left: Index
     sentence: str
     split: str = ""
+    looks: dict[str, Any] | None = None
+    bin: BinRecord | None = None
 
     def __post_init__(self) -> None:
         _check_name("ending", self.ending, names(Ending)[1:])

@@ -7,13 +7,15 @@ from __future__ import annotations
 
 import contextlib
 import gc
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from typing import Any
 
 import numpy as np
 import warp as wp
 
+from synpick_warp.configs.cell import bin_sizes, recorded_bins
 from synpick_warp.configs.schema import Config
 from synpick_warp.configs.splits import DataLayout
 from synpick_warp.exporters.registry import Needs
@@ -22,13 +24,16 @@ from synpick_warp.factory.compilation import is_cache_warm, make_compiler, sole_
 from synpick_warp.factory.memory_plan import check_memory, plan_memory
 from synpick_warp.factory.order import order_longest_first
 from synpick_warp.factory.sizes import count_writers, fit_to_device, without_pictures
+from synpick_warp.scenes.bins import make_bins
 from synpick_warp.scenes.build import REPEATS, find_repeat_rules, must_repeat, with_capacities
 from synpick_warp.scenes.cameras import make_cameras
 from synpick_warp.scenes.catalog import load_catalog
 from synpick_warp.scenes.fixtures import make_fixtures
-from synpick_warp.scenes.lights import load_lights
+from synpick_warp.scenes.looks import load_looks
 from synpick_warp.scenes.types import Camera, Catalog, EnvironmentMap
 from synpick_warp.stages.host_copies import host_images
+from synpick_warp.stages.render.lamp_variants import load_scene_lights
+from synpick_warp.stages.render.looks import draw_looks
 from synpick_warp.stages.render.renderer import Renderer
 from synpick_warp.stages.render.scene import RenderScene, build_render_scene
 from synpick_warp.stages.sim.simulate import Simulation
@@ -59,6 +64,12 @@ class Stages:
     def tick_time(self) -> float:
         """Time between two frames [s]."""
         return self.config.physics.tick_time
+
+    @property
+    def looks(self) -> Callable[[int, int], Mapping[str, Any]] | None:
+        """Function of episode and number of objects that returns the record of the episode's looks; None: none is randomized."""
+        looks = self.renderer.scene.looks
+        return partial(draw_looks, looks, self.config.bake.seed) if looks else None
 
     def make_log(self) -> AttemptLog:
         """Create an empty attempt log."""
@@ -148,9 +159,9 @@ def build_smallest(config: Config, device: wp.Device, progress: Progress, record
 def _add_stream(stages: Stages, device: wp.Device, needs_images: bool, depth_files: bool) -> Factory:
     """Add a stream of views to stages; arguments as of `host_images`."""
     config, table, tick_time = stages.config, stages.light_table, stages.tick_time
-    host = host_images(config.bop, config.cameras.resolution[1], device, needs_images, depth_files)
+    host = host_images(config.bop, config.rig.largest[1], device, needs_images, depth_files)
     layers, cameras, ids = config.render.layers, len(stages.cameras), stages.object_ids
-    stream = FrameStream(stages.sizes, layers, cameras, tick_time, stages.renderer, ids, table, device, host)
+    stream = FrameStream(stages.sizes, layers, cameras, tick_time, stages.renderer, ids, table, device, host, recorded_bins(config))
     return Factory(**vars(stages), stream=stream, log=stages.make_log())
 
 
@@ -165,17 +176,19 @@ def build_stages(
 ) -> Stages:
     """Load assets, and build worlds and renderer, from settings with resolved sizes. Other arguments and errors: `build_factory`."""
     progress.stage("loading objects and lights")
-    cameras = make_cameras(config.cameras)
-    fixtures = make_fixtures(config.tote, config.gripper)
+    cameras = make_cameras(config.rig)
+    bins = make_bins(bin_sizes(config))
     catalog = load_catalog(config, report=progress.note)
-    lights = load_lights(config.bake.lights, progress.note, config.objects.strict)
+    lights = load_scene_lights(config.bake.lights, config.randomize, config.bake.seed, progress.note, config.objects.strict)
     config = _fit_to_catalog(config, catalog, device, progress)
     if longest_first and episodes is not None:
         episodes = order_longest_first(config, catalog, episodes, device)
     progress.stage(f"building {config.bake.worlds} worlds of {len(catalog)} objects on {device.alias}")
-    scene = build_render_scene(config.render, config.tote, catalog, fixtures, cameras, lights, device)
+    looks = load_looks(config.randomize, progress.note, config.objects.strict)
+    fixtures = make_fixtures(bins, config.gripper)
+    scene = build_render_scene(config.render, bins[0].sizes.base, catalog, fixtures, cameras, lights, device, looks)
     simulation = Simulation(config, catalog, len(lights), device, scene, episodes, records_physics)
-    sizes = view_sizes(config.render, config.cameras, config.bake.worlds, config.arrangement.max_objects, device)
+    sizes = view_sizes(config.render, config.rig, config.bake.worlds, config.arrangement.max_objects, device)
     histories = simulation.layout.worlds * len(cameras)
     renderer = make_renderer(config, scene, config.arrangement.max_objects, sizes["view"], histories)
     object_ids = np.array([entry.obj_id for entry in catalog.entries], dtype=np.int32)

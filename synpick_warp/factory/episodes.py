@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
@@ -13,10 +13,14 @@ from synpick_warp.configs.schema import Arrangement, Physics, Settle
 from synpick_warp.configs.splits import DataLayout
 from synpick_warp.factory.attempts import EpisodeRecord
 from synpick_warp.stages.stream import TickReport
+from synpick_warp.views.bins import bin_noun, bin_record
 from synpick_warp.views.frames import EpisodeEnd
 
 PLACES = 6
 """Decimal places of a time [s]; more would be noise."""
+
+
+"""Fields without a key where they are empty."""
 
 
 class EpisodeRow(NamedTuple):
@@ -41,20 +45,28 @@ class EpisodeRow(NamedTuple):
     """Objects at the last frame."""
     split: str = ""
     """Name of the episode's split; empty, and no key: the settings have no splits."""
+    looks: Mapping[str, Any] | None = None
+    """Randomized looks of the episode, as `draw_looks` has them; None, and no key: the settings randomize none."""
+    bin: dict[str, Any] | None = None
+    """Record of the bin; None, and no key: a tote that is always in its place."""
 
     def as_json(self) -> dict[str, Any]:
         """Row as the dictionary of a line of episodes.jsonl."""
         row = {**self._asdict(), "ending": self.ending.name.lower()}
-        if not self.split:
-            del row["split"]
-        return {**row, "sentence": self.ending.sentence}
+        row = {name: value for name, value in row.items() if name not in _OPTIONAL or value != _OPTIONAL[name]}
+        sentence = self.ending.sentence.replace("tote", bin_noun(self.bin["name"])) if self.bin else self.ending.sentence
+        return {**row, "sentence": sentence}
 
     @classmethod
     def from_json(cls, row: Mapping[str, Any]) -> EpisodeRow:
         """Row from the dictionary of a line of episodes.jsonl."""
-        values: dict[str, Any] = {name: row[name] for name in cls._fields if name != "split" or name in row}
+        values: dict[str, Any] = {name: row[name] for name in cls._fields if name not in _OPTIONAL or name in row}
         values["ending"] = Ending[row["ending"].upper()]
         return cls(**values)
+
+
+_OPTIONAL = EpisodeRow._field_defaults
+"""Fields that rows lack where they have these values."""
 
 
 @dataclass
@@ -114,8 +126,19 @@ class BakeSummary:
         self.outcomes.update(attempt.outcome for attempt in record.attempts)
 
 
-def episode_row(layout: DataLayout, tick_time: float, report: TickReport, world: int, record: EpisodeRecord) -> EpisodeRow:
-    """Build the row of the episode that ended in a world. `tick_time`: time between two frames [s]."""
+def episode_row(
+    layout: DataLayout,
+    bins: Sequence[str],
+    tick_time: float,
+    looks: Callable[[int, int], Mapping[str, Any]] | None,
+    report: TickReport,
+    world: int,
+    record: EpisodeRecord,
+) -> EpisodeRow:
+    """Build the row of the episode that ended in a world.
+
+    `bins`: of `recorded_bins`; `tick_time`: time between two frames [s]; `looks`: see `Stages.looks`.
+    """
     episode, arrangement, frame, ending = (int(report.column(name)[world]) for name in ("episode", "arrangement", "frame", "ending"))
     split = layout.split_of(episode)
     return EpisodeRow(
@@ -131,6 +154,8 @@ def episode_row(layout: DataLayout, tick_time: float, report: TickReport, world:
         record.lost,
         record.left,
         "" if split is None else split.name,
+        None if looks is None else looks(episode, record.objects),
+        bin_record(bins[int(report.snapshot.bin[world])], report.snapshot.fixture_pose[world, 0]) if bins else None,
     )
 
 

@@ -19,6 +19,7 @@ import numpy as np
 import warp as wp
 
 from synpick_warp.codes import Phase
+from synpick_warp.configs.cell import recorded_bins
 from synpick_warp.configs.schema import Config
 from synpick_warp.configs.splits import DataLayout
 from synpick_warp.errors import ConfigError
@@ -154,7 +155,8 @@ class Producer:
         world, camera = pair_views(np.flatnonzero(shown), cameras)
         for first in range(0, len(world), self.ring.views):
             part = slice(first, first + self.ring.views)
-            host = describe_views(report, world[part], camera[part], stages.tick_time, self.object_ids, stages.light_table)
+            known = (self.object_ids, stages.light_table, recorded_bins(stages.config))
+            host = describe_views(report, world[part], camera[part], stages.tick_time, *known)
             host["arrangement"] = report.column("arrangement")[world[part]]
             yield self.ring.render(snapshot, world[part], camera[part], host)
 
@@ -164,7 +166,7 @@ class Producer:
         layout = DataLayout.of(config)
         for world in np.flatnonzero(report.column("phase") == Phase.OVER).tolist():
             record = records[int(report.column("episode")[world])]
-            row = episode_row(layout, self.stages.tick_time, report, world, record)
+            row = episode_row(layout, recorded_bins(config), self.stages.tick_time, self.stages.looks, report, world, record)
             if is_resampled(row, config.settle.tries):
                 self.summary.take_resample(row.ending)
                 self.progress.note(f"episode {row.episode}, arrangement {row.arrangement + 1}: {row.ending.sentence}")
@@ -190,7 +192,7 @@ def open_stream(
         raise ConfigError(f"shard {shard[0]}/{shard[1]} has no episode; give more episodes, or fewer parts")
     device = pick_device(config.bake.device)
     check_episodes(len(indices), config.bake.episodes)
-    selection = selection.resolve(len(config.cameras.positions))
+    selection = selection.resolve(len(config.rig))
     if selection.stride > 1:
         # A history holds the frame before, which is not rendered.
         config = config.with_values({"render.history": 0})

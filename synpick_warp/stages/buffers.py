@@ -27,12 +27,14 @@ class Snapshot:
     """Episode index."""
     frame: wp.array = device_array("world", dtype=wp.int32)
     """Frame index within the episode."""
+    bin: wp.array = device_array("world", dtype=wp.int32)
+    """Bin of the episode; its pose is that of the first fixture."""
     catalog_index: wp.array = device_array("world", "instance", dtype=wp.int32)
     """Catalog index of each instance; -1: none."""
     pose: wp.array = device_array("world", "instance", dtype=wp.transformf, unit="m")
     """Object to world."""
     fixture_pose: wp.array = device_array("world", "fixture", dtype=wp.transformf, unit="m")
-    """Tote, gripper shaft and cup to world."""
+    """Bin, gripper shaft and cup to world."""
     fixture_visible: wp.array = device_array("world", "fixture", dtype=wp.int32)
     """0: the fixture is not rendered."""
     light: wp.array = device_array("world", dtype=wp.int32)

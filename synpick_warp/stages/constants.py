@@ -11,22 +11,22 @@ import numpy as np
 import warp as wp
 
 from synpick_warp.configs import schema
+from synpick_warp.configs.cell import BinSizes, bin_sizes
 from synpick_warp.configs.modes import mode_weights
 from synpick_warp.kernels import structs
 from synpick_warp.scenes import build
 from synpick_warp.scenes.types import Catalog, CatalogEntry
 from synpick_warp.stages.sim.worlds import CORNERS
 
-# Home position of the wrist, used while objects fall and while perception runs [m]: beside the tote, outside every camera's view.
+# Height of what has no walls, so that whatever is beside it is outside [m].
+FAR = 1e30
+# Home position of the wrist, used while objects fall and while perception runs [m]: beside the bin, outside every camera's view.
 GRIPPER_HOME = (3.0, 0.0, 1.0)
 
 
 @dataclass(frozen=True, eq=False)
 class SceneData:
-    """Constants of the kernels: one struct for each subject, the modes of the splits and the guide walls.
-
-    `modes` has one `ModeData` per split, `guide_shapes` the indices of a world's guide walls among its shapes.
-    """
+    """Constants of the kernels: one struct for each subject, and the modes of the splits: `modes` has one `ModeData` each."""
 
     layout: structs.LayoutData
     catalog: structs.CatalogData
@@ -37,7 +37,7 @@ class SceneData:
     pick: structs.PickData
     perception: structs.PerceptionData
     suction: structs.SuctionData
-    guide_shapes: wp.array
+    bins: structs.BinData
 
 
 def fill(kind: Any, *sections: Any, **derived: Any) -> Any:
@@ -74,10 +74,10 @@ def make_scene_data(config: schema.Config, catalog: Catalog, built: build.BuiltM
     return SceneData(
         _layout_data(built.layout),
         _catalog_data(catalog, built, device),
-        drop_data(config.arrangement, config.render, config.tote, config.pick, config.move, physics.gravity, lights),
+        drop_data(config.arrangement, config.render, config.pick, config.move, physics.gravity, lights),
         _settle_data(config.settle, physics.tick_time),
         mode_data(mode_rows(config.bake, config.splits), device),
-        _move_data(config.move, config.tote, gripper, physics),
+        _move_data(config.move, gripper, physics),
         fill(
             structs.PickData,
             config.pick,
@@ -87,7 +87,7 @@ def make_scene_data(config: schema.Config, catalog: Catalog, built: build.BuiltM
         ),
         fill(structs.PerceptionData, config.perception),
         _suction_data(config.suction, gripper, physics.step),
-        wp.array(np.array(built.layout.guide_shapes, dtype=np.int32), device=device),
+        bin_data(bin_sizes(config), config.bins, config.move, built.layout.parts, device),
     )
 
 
@@ -155,7 +155,6 @@ def mode_rows(bake: schema.Bake, splits: Sequence[schema.Split]) -> list[tuple[i
 def drop_data(
     arrangement: schema.Arrangement,
     render: schema.Render,
-    tote: schema.Tote,
     pick: schema.Pick,
     move: schema.Move,
     gravity: float,
@@ -169,12 +168,41 @@ def drop_data(
         exceed=arrangement.fill == schema.EXCEED,
         move_repeats=move.repeats,
         pick_repeats=pick.repeats,
-        rim_length=tote.rim_size[0],
-        rim_width=tote.rim_size[1],
-        rim_height=tote.outer_size[2] - tote.wall,
         gravity=gravity,
         gripper_home=wp.vec3(*GRIPPER_HOME),
         lights=lights,
+    )
+
+
+def bin_data(
+    sizes: Sequence[BinSizes], bins: schema.Bins, move: schema.Move, parts: Sequence[build.Part], device: wp.Device
+) -> structs.BinData:
+    """Fill `BinData` but for the arrays of worlds; `parts`: the collision shapes of the bins in a world."""
+
+    def array(values: Sequence[Any], dtype: type) -> wp.array:
+        return wp.array(np.array(values), dtype=dtype, device=device)
+
+    shares = np.cumsum([one.weight for one in sizes])
+    return fill(
+        structs.BinData,
+        count=len(sizes),
+        visible=sizes[0].is_visible,
+        share=array(shares / shares[-1], float),
+        lift=array([one.base - sizes[0].base for one in sizes], float),
+        shift=wp.vec2(*bins.shift),
+        yaw=math.radians(bins.yaw),
+        reach=array([np.array(one.opening) / 2 + one.margin for one in sizes], wp.vec2),
+        rim_height=array([one.height for one in sizes], float),
+        wall_height=array([one.height if one.shell else FAR for one in sizes], float),
+        corner=array([(move.corner * one.cell[0] / 2, move.corner * one.cell[1] / 2, move.height) for one in sizes], wp.vec3),
+        first_compartment=array(np.cumsum([0, *(len(one.centers) for one in sizes)]), int),
+        center=array([center for one in sizes for center in one.centers], wp.vec2),
+        half=array([np.array(one.mouth) / 2 for one in sizes for _ in one.centers], wp.vec2),
+        shape=array([part.shape for part in parts], int),
+        shape_bin=array([part.bin for part in parts], int),
+        shape_guide=array([int(part.guide) for part in parts], int),
+        chosen=None,
+        pose=None,
     )
 
 
@@ -192,14 +220,12 @@ def _settle_data(settle: schema.Settle, tick: float) -> structs.SettleData:
     )
 
 
-def _move_data(move: schema.Move, tote: schema.Tote, gripper: schema.Gripper, physics: schema.Physics) -> structs.MoveData:
+def _move_data(move: schema.Move, gripper: schema.Gripper, physics: schema.Physics) -> structs.MoveData:
     """Fill `MoveData` from the settings."""
-    length, width = tote.floor_size
     return fill(
         structs.MoveData,
         move,
         physics,
-        corner=wp.vec3(move.corner * length / 2, move.corner * width / 2, move.height),
         waypoints=CORNERS * move.rounds,
         mass=gripper.finger_mass + gripper.cup_mass,
         tcp_offset=gripper.cup_length,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from types import SimpleNamespace
 from typing import Any
@@ -12,7 +12,8 @@ import numpy as np
 import warp as wp
 
 from synpick_warp.codes import Measure, Status, column_names
-from synpick_warp.configs.schema import Cameras, Render
+from synpick_warp.configs.rig import Rig
+from synpick_warp.configs.schema import Render
 from synpick_warp.stages.arrays import allocate, dry_run
 from synpick_warp.stages.buffers import LayerBuffers, Snapshot, ViewBuffers, view_buffer_sizes
 from synpick_warp.stages.encoding.jpeg import Compressor, JpegBuffers, JpegScratch, jpeg_sizes
@@ -32,28 +33,28 @@ BATCH_BYTES = 512 << 20
 # Size of color, depth, segmentation id and amodal bits of one pixel [bytes].
 PIXEL_BYTES = 3 + 2 + 1 + 4
 # Names of the snapshot's arrays that are copied to `TickReport.snapshot`.
-_SNAPSHOT = ("fixture_pose", "fixture_visible", "light", "light_yaw", "light_exposure")
+_SNAPSHOT = ("bin", "fixture_pose", "fixture_visible", "light", "light_yaw", "light_exposure")
 # Ring size of view batches: one is read while another is copied and a third is rendered.
 RING = 3
 
 
-def views_per_batch(render: Render, cameras: Cameras, worlds: int, device: wp.Device) -> int:
+def views_per_batch(render: Render, rig: Rig, worlds: int, device: wp.Device) -> int:
     """Number of views rendered at once: as set; else on a CPU one world's, on a GPU what BATCH_BYTES hold, up to all worlds'."""
-    views = len(cameras.positions)
+    views = len(rig)
     if render.views_per_batch:
         return render.views_per_batch
     if not device.is_cuda:
         return views
-    width, height = cameras.resolution
+    width, height = rig.largest
     with dry_run() as layers:
         allocate(LayerBuffers, {"view": 1, "row": height, "column": width}, device, render.layers)
     each = width * height * PIXEL_BYTES + sum(layer.row[3] for layer in layers)
     return max(1, min(BATCH_BYTES // each, views * worlds))
 
 
-def view_sizes(render: Render, cameras: Cameras, worlds: int, objects: int, device: wp.Device) -> dict[str, int]:
+def view_sizes(render: Render, rig: Rig, worlds: int, objects: int, device: wp.Device) -> dict[str, int]:
     """Extents of the dimensions of `ViewBuffers` and `LayerBuffers`, for `worlds` worlds of at most `objects` objects."""
-    return view_buffer_sizes(views_per_batch(render, cameras, worlds, device), *cameras.resolution, objects)
+    return view_buffer_sizes(views_per_batch(render, rig, worlds, device), *rig.largest, objects)
 
 
 @dataclass(frozen=True, eq=False)
@@ -196,7 +197,13 @@ def tick_batch(report: TickReport, object_ids: np.ndarray, tick_time: float) -> 
 
 
 def describe_views(
-    report: TickReport, world: np.ndarray, camera: np.ndarray, tick_time: float, object_ids: np.ndarray, lights: LightTable
+    report: TickReport,
+    world: np.ndarray,
+    camera: np.ndarray,
+    tick_time: float,
+    object_ids: np.ndarray,
+    lights: LightTable,
+    bins: Sequence[str] = (),
 ) -> dict[str, Any]:
     """Fields of `FrameBatch` for B views, without images: episode, camera, frame, time [s], object ids, poses; name, yaw, exposure and
     direction of the light.
@@ -208,7 +215,9 @@ def describe_views(
         tick_time: Time between two frames [s].
         object_ids: obj_id of each catalog entry, and behind them -1 for none (entry + 1) int32.
         lights: Table of the environment maps.
+        bins: Names of the bins, of `recorded_bins`; empty: without those of the views.
     """
+    own = {"bin_name": np.array(bins)[report.snapshot.bin[world]], "bin_pose": report.snapshot.fixture_pose[world, 0]} if bins else {}
     frame = report.column("frame")[world]
     light, yaw = report.snapshot.light[world], report.snapshot.light_yaw[world]
     return {
@@ -222,6 +231,7 @@ def describe_views(
         "light_yaw": yaw,
         "light_exposure": report.snapshot.light_exposure[world],
         "light_direction": lights.directions(light, yaw),
+        **own,
     }
 
 
@@ -296,6 +306,7 @@ class FrameStream:
         lights: LightTable,
         device: wp.Device,
         host: HostImages | None = None,
+        bins: Sequence[str] = (),
     ) -> None:
         """Allocate the ring of batches.
 
@@ -309,11 +320,12 @@ class FrameStream:
             lights: Table of the environment maps.
             device: Device of rendering.
             host: Which images are copied to the host; None: all.
+            bins: As of `describe_views`.
         """
         self.renderer = renderer
         self.host = host or HostImages()
         self.object_ids = np.append(object_ids, -1).astype(np.int32)
-        self.lights = lights
+        self.lights, self.bins = lights, bins
         self.cameras = cameras
         self.tick_time = tick_time
         self.batch, self.instances = sizes["view"], sizes["instance"]
@@ -359,7 +371,7 @@ class FrameStream:
                 yield from self._deliver()
             part = slice(first, min(first + self.batch, len(world)))
             self._launch(self.next_slot, snapshot, world[part], camera[part])
-            description = describe_views(report, world[part], camera[part], self.tick_time, self.object_ids, self.lights)
+            description = describe_views(report, world[part], camera[part], self.tick_time, self.object_ids, self.lights, self.bins)
             self.in_flight.append(_Launched(self.next_slot, part.stop - first, description))
             self.next_slot = (self.next_slot + 1) % len(self.ring)
             ahead += int(self.device.is_cuda)

@@ -64,6 +64,10 @@ class FrameBatch:
     """Unit vector towards the sun or strongest lamp of the map, in the world frame; zero: the map has none (B, 3) float32."""
     layers: dict[str, np.ndarray] = field(default_factory=dict)
     """Layers (AOVs) that `render.layers` names, each (B, H, W[, C]); see `synpick_warp.views.layer_codec`."""
+    bin_name: np.ndarray | None = None
+    """Name of the episode's bin (B) str; None: a tote that is always in its place."""
+    bin_pose: np.ndarray | None = None
+    """Its pose to the world: x, y, z [m], quaternion x, y, z, w (B, 7) float32."""
     boundary_count: np.ndarray | None = None
     """Number of run boundaries (value changes down a column) of `instance` and `amodal` (B, 2) int32; above R: `boundaries` is cut."""
     boundaries: np.ndarray | None = None
@@ -140,8 +144,10 @@ class TickBatch:
     """obj_id of each instance; -1: the instance is not in the scene (W, I) int32."""
     pose: np.ndarray
     """Object-to-world poses: x, y, z [m], quaternion x, y, z, w (W, I, 7) float32."""
+    bin: np.ndarray
+    """Index of the episode's bin (W) int32."""
     fixture_pose: np.ndarray
-    """Poses of tote, gripper shaft ("finger") and cup, in the same form (W, 3, 7) float32."""
+    """Poses of bin, gripper shaft ("finger") and cup, in the same form (W, 3, 7) float32."""
     fixture_visible: np.ndarray
     """1 if the fixture is visible in the images, else 0 (W, 3) int32."""
     light: np.ndarray

@@ -60,7 +60,7 @@ def test_a_gltf_material_reaches_the_renderer(tmp_path, device):
     config = load_config(None, {"bake.models": str(tmp_path / "models")})
     catalog = load_catalog(config, tmp_path / "cache")
     toy = ToyScene([], [], (camera(8, 8, 8.0, (0.0, 0.0, 1.0)),))
-    scene = build_render_scene(config.render, config.tote, catalog, toy.fixtures, toy.cameras, (even_light(),), device)
+    scene = build_render_scene(config.render, -config.tote.wall, catalog, toy.fixtures, toy.cameras, (even_light(),), device)
     surfaces = scene.surfaces
     assert surfaces.metallic.numpy()[0] == pytest.approx(0.5 * 220 / 255, abs=1e-3)
     assert surfaces.roughness.numpy()[0] == pytest.approx(0.8 * 150 / 255, abs=1e-3)

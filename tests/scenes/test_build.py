@@ -12,12 +12,13 @@ from hypothesis import given
 from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
 
+from synpick_warp.configs.cell import BinSizes
 from synpick_warp.configs.schema import Config, Physics
 from synpick_warp.errors import ConfigError
 from synpick_warp.kernels.newton_patches import contact_sweep
 from synpick_warp.scenes import build
+from synpick_warp.scenes.bins import guide_walls
 from synpick_warp.scenes.embedded.objects import procedural_objects
-from synpick_warp.scenes.tote import guide_walls
 from synpick_warp.scenes.types import Catalog, ConvexPiece
 from tests.harness.fuzz import fuzz_examples
 from tests.twins import arrangement
@@ -106,10 +107,10 @@ def test_dofs_belong_to_the_body_of_their_slot(device, built):
 
 def test_guide_shapes_are_the_guide_walls(built):
     config = config_of()
-    walls = guide_walls(config.tote, config.physics.guide_height)
-    assert len(built.layout.guide_shapes) == len(walls)
+    walls = guide_walls(BinSizes.of_tote(config.tote), config.physics.guide_height)
+    guides = [part.shape for part in built.layout.parts if part.guide]
     for world in range(WORLDS):
-        for guide, wall in zip(built.layout.guide_shapes, walls, strict=True):
+        for guide, wall in zip(guides, walls, strict=True):
             shape = world * built.layout.shapes_per_world + guide
             assert built.model.shape_body.numpy()[shape] == -1
             source = built.model.shape_source[shape]

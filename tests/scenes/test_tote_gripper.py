@@ -9,12 +9,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from synpick_warp.configs.cell import BinSizes
 from synpick_warp.configs.schema import Gripper, Tote
 from synpick_warp.errors import ConfigError
 from synpick_warp.scenes.assets.meshes import merge_positions, signed_volume
+from synpick_warp.scenes.bins import guide_walls
 from synpick_warp.scenes.gripper import cup_collider, cup_fixture, finger_collider, finger_fixture
 from synpick_warp.scenes.modelling import at_height, cap, join, loft, make_mesh, rounded_rectangle, strips
-from synpick_warp.scenes.tote import CORNER_RADIUS, FLOOR_DEPTH, MIN_WALL, guide_walls, rim_height, tote_colliders, tote_fixture
+from synpick_warp.scenes.tote import CORNER_RADIUS, FLOOR_DEPTH, MIN_WALL, rim_height, tote_colliders, tote_fixture
 from tests.twins.rays import edges_match, first_hit
 
 TOTE = Tote()
@@ -110,7 +112,7 @@ def test_collision_shapes_coincide_with_the_visual_mesh(direction, height):
 
 def test_collision_shapes_are_convex_and_thick():
     floor, *walls = tote_colliders(TOTE)
-    for piece in (floor, *walls, *guide_walls(TOTE, 2.0)):
+    for piece in (floor, *walls, *guide_walls(BinSizes.of_tote(TOTE), 2.0)):
         assert convex(piece)
     assert floor.vertices[:, 2].min() == pytest.approx(-FLOOR_DEPTH)
     assert floor.vertices[:, 2].max() == 0
@@ -135,7 +137,7 @@ def test_collision_shapes_leave_the_inside_free_and_fill_the_walls(x, y, share):
 
 
 def test_guide_walls_stand_on_the_rim_flush_with_the_opening():
-    walls = guide_walls(TOTE, 2.0)
+    walls = guide_walls(BinSizes.of_tote(TOTE), 2.0)
     assert len(walls) == 4
     everything = np.concatenate([wall.vertices for wall in walls])
     assert everything[:, 2].min() == pytest.approx(TOP)

@@ -303,8 +303,7 @@ def test_objects_fall_from_a_column_within_the_opening(sizes, spread, clearance,
     over = worlds.state.phase.numpy() == Phase.OVER
     arrange.drop_objects(worlds.scene, worlds.state, worlds.physics, SEED)
     np.testing.assert_array_equal(worlds.state.phase.numpy(), np.where(over, Phase.OVER, Phase.SETTLE))
-    drop = worlds.scene.drop
-    rim = (drop.rim_length, drop.rim_width, drop.rim_height)
+    rim = (*worlds.bins[0].opening, worlds.bins[0].height)
     for world in range(WORLDS):
         catalog_index = worlds.state.catalog_index.numpy()[world]
         catalog_index = catalog_index[catalog_index >= 0]
@@ -313,7 +312,7 @@ def test_objects_fall_from_a_column_within_the_opening(sizes, spread, clearance,
         expected = arrangement.drop_poses(SEED, episode + world, 0, radius, rim=rim, clearance=clearance, spread=spread)
         np.testing.assert_allclose(poses, expected, atol=1e-5)
         place, bottom = poses[:, :3].astype(np.float64), poses[:, 2] - radius
-        assert (bottom >= drop.rim_height - 1e-5).all()
+        assert (bottom >= rim[2] - 1e-5).all()
         gaps = np.linalg.norm(place[:, None] - place[None], axis=2) - radius[:, None] - radius[None]
         assert (gaps[~np.eye(len(catalog_index), dtype=bool)] >= -1e-5).all()
         for axis in range(2):

@@ -7,7 +7,6 @@ import itertools
 
 import numpy as np
 import pytest
-import warp as wp
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -28,7 +27,7 @@ TIP = 0.05
 
 
 def made(device, worlds: int = 1, **move) -> KernelWorlds:
-    result = KernelWorlds(device, worlds, move={"corner": wp.vec3(*CORNER), "tcp_offset": TIP, **move})
+    result = KernelWorlds(device, worlds, move={"tcp_offset": TIP, **move})
     result.set(result.state.frame, -1)
     return result
 
@@ -201,7 +200,7 @@ def run(device):
     values = {"phase": np.full(worlds, Phase.ACT), "waypoint": waypoint, "corner_order": order, "setpoint": setpoint.astype(np.float32)}
     for name, value in values.items():
         getattr(state, name).assign(value)
-    arrange.set_guides(simulation.scene, state, physics)
+    arrange.place_bins(simulation.scene, state, physics)
     drive = functools.partial(act.drive_gripper, simulation.scene, state, simulation.attempts, simulation.plan, physics)
     rows = []
     for _ in range(STEPS):

@@ -229,14 +229,14 @@ def test_guides_stand_or_are_far_above_everything(device):
     worlds = made(device, worlds=2)
     worlds.set(worlds.physics.model.shape_transform, [1.0, 2.0, 3.0, 0.0, 0.0, 0.0, 1.0])
     worlds.set(worlds.state.progress, [[0, 0, 0, 1], [0, 0, 0, 0]])
-    arrange.set_guides(worlds.scene, worlds.state, worlds.physics)
+    arrange.place_bins(worlds.scene, worlds.state, worlds.physics)
     poses = worlds.physics.model.shape_transform.numpy().reshape(2, SHAPES, 7)
     others = np.delete(poses, GUIDES, axis=1)
     assert (others == [1.0, 2.0, 3.0, 0.0, 0.0, 0.0, 1.0]).all()
     assert (poses[0, list(GUIDES)] == [0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0]).all()
     assert (poses[1, list(GUIDES)] == [0.0, 0.0, rest.SHAPES_AWAY, 0.0, 0.0, 0.0, 1.0]).all()
     worlds.set(worlds.state.progress, [0, 0, 0, 1])
-    arrange.set_guides(worlds.scene, worlds.state, worlds.physics)
+    arrange.place_bins(worlds.scene, worlds.state, worlds.physics)
     poses = worlds.physics.model.shape_transform.numpy().reshape(2, SHAPES, 7)
     assert (poses[1, list(GUIDES), :3] == 0.0).all()
 
@@ -272,8 +272,8 @@ def test_what_leaves_the_tote_is_dropped_again(device, place, outside):
     pose, drop, radius = worlds.coordinates()[0, 1], worlds.scene.drop, worlds.radius[2]
     key = rng.stream_key(SEED, 0, 0, Stream.REDROP)
     share = 2 * rng.uniform(key, np.arange(2)) - 1
-    free = np.maximum(0.0, np.array([drop.rim_length, drop.rim_width]) / 2 - radius)
-    np.testing.assert_allclose(pose[:3], [*(share * drop.spread * free), drop.rim_height + radius], atol=1e-6)
+    free = np.maximum(0.0, np.array(worlds.bins[0].opening) / 2 - radius)
+    np.testing.assert_allclose(pose[:3], [*(share * drop.spread * free), worlds.bins[0].height + radius], atol=1e-6)
     np.testing.assert_allclose(pose[3:], rng.uniform_rotation(key, 2), atol=1e-6)
     speed = worlds.physics.state.joint_qd.numpy()[4:].reshape(-1, 6)
     assert (speed[1] == 0.0).all()

@@ -289,7 +289,7 @@ def test_depth_is_how_far_a_box_sinks_into_the_floor(bench):
 def test_guide_walls_stop_what_flies_while_they_stand(bench):
     """One world has its guides, the other not; both boxes fly sideways above the rim."""
     bench.state.progress.assign(np.array([[0, 0, 0, 1], [0, 0, 0, 0]], np.int32))
-    arrange.set_guides(bench.scene, bench.state, bench.physics)
+    arrange.place_bins(bench.scene, bench.state, bench.physics)
     for world in range(2):
         placed(bench, world, 0, [0.0, 0.0, 0.45, 0.0, 0.0, 0.0, 1.0], speed=(3.0, 0, 0, 0, 0, 0))
     poses = advance(bench, 3)

@@ -9,6 +9,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from synpick_warp.configs.cell import BinSizes
 from synpick_warp.configs.schema import Config
 from tests.builders import FEW_STEPS, assignments
 from tools.bench import __main__ as bench
@@ -97,7 +98,7 @@ def test_inside_is_within_the_rim_from_the_floor_to_the_heap_height():
             [np.nan, 0, 0.1],
         ]
     )
-    assert rest_report.is_inside(config.tote, positions).tolist() == [True, False, True, False, False, True, False, False]
+    assert rest_report.is_inside(BinSizes.of_tote(config.tote), positions).tolist() == [True, False, True, False, False, True, False, False]
 
 
 def test_transform_points_rotates_then_translates():

@@ -121,6 +121,7 @@ def _tick(episode: int, frame: int) -> dict[str, np.ndarray]:
         "time": np.float64(frame / 15),
         "object_id": OBJECT_IDS if frame < 2 else np.where(np.arange(ROOM) == 3, -1, OBJECT_IDS).astype(np.int32),
         "pose": poses(episode, frame),
+        "bin": np.int32(0),
         "fixture_pose": fixtures,
         "fixture_visible": np.array([1, frame > 0, frame > 0], np.int32),
         "light": np.int32(0),

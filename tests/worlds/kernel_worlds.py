@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from types import SimpleNamespace
 from typing import Any
@@ -9,14 +10,20 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from synpick_warp.configs.bins import Bins, Tote
+from synpick_warp.configs.cell import BinSizes
+from synpick_warp.configs.manipulation import Move
 from synpick_warp.kernels import structs
+from synpick_warp.scenes.build import Part
 from synpick_warp.stages.arrays import allocate
-from synpick_warp.stages.constants import SceneData, fill, mode_data
+from synpick_warp.stages.constants import SceneData, bin_data, fill, mode_data
 from synpick_warp.stages.perception.arrays import Observation, Plan
 from synpick_warp.stages.sim.worlds import AttemptState, SealState, WorldState
 
 GRIPPER_BODIES, GRIPPER_DOFS = 2, 4
 GUIDES = (6, 7, 8, 9)
+BIN = BinSizes("box", "bin", Tote(), outer=(0.55, 0.35), floor=(0.8, 0.4), opening=(0.5, 0.3), height=0.2, base=-0.005)
+"""Bin whose waypoints are at (±0.2, ±0.1, 0.02) m."""
 SHAPES = 20
 
 DROP: dict[str, Any] = {
@@ -26,9 +33,6 @@ DROP: dict[str, Any] = {
     "pick_repeats": 1,
     "clearance": 0.01,
     "spread": 0.5,
-    "rim_length": 0.5,
-    "rim_width": 0.3,
-    "rim_height": 0.2,
     "gravity": 9.81,
     "gripper_home": wp.vec3(3.0, 0.0, 1.0),
     "lights": 5,
@@ -48,7 +52,6 @@ SETTLE: dict[str, Any] = {
 }
 MOVE: dict[str, Any] = {
     "waypoints": 8,
-    "corner": wp.vec3(0.2, 0.1, 0.02),
     "start_height": 0.3,
     "tcp_offset": 0.05,
     "mass": 2.0,
@@ -88,6 +91,9 @@ class KernelWorlds:
     plan: Any = None
     physics: Any = None
     pick: dict[str, Any] = field(default_factory=dict)
+    bins: tuple[BinSizes, ...] = (BIN,)
+    places: Bins = field(default_factory=Bins)
+    parts: Sequence[tuple[int, int, bool]] = tuple((shape, 0, True) for shape in GUIDES)
 
     def __post_init__(self) -> None:
         self.volume = np.ones(self.objects) if self.volume is None else self.volume
@@ -107,7 +113,7 @@ class KernelWorlds:
             filled(structs.PickData(), self.pick),
             structs.PerceptionData(),
             structs.SuctionData(),
-            wp.array(GUIDES, dtype=int, device=self.device),
+            self._bins(),
         )
         sizes = {
             "one": 1,
@@ -118,6 +124,8 @@ class KernelWorlds:
             "waypoint": self.scene.move.waypoints,
         }
         self.state = allocate(WorldState, sizes, self.device)
+        self.state.bin_pose.fill_(wp.transform_identity())
+        self.scene.bins.chosen, self.scene.bins.pose = self.state.bin, self.state.bin_pose
         self.attempts = allocate(AttemptState, sizes, self.device)
         self.seals = allocate(SealState, sizes, self.device)
         self.observation = allocate(Observation, sizes, self.device)
@@ -133,6 +141,10 @@ class KernelWorlds:
             shapes=SHAPES,
             finger_shape=10,
         )
+
+    def _bins(self) -> Any:
+        """Bins by `bins`."""
+        return bin_data(self.bins, self.places, Move(corner=0.5), [Part(*part) for part in self.parts], self.device)
 
     def _catalog(self) -> Any:
         compound = np.asarray(self.compound, np.int32)

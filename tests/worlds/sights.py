@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from typing import Any
 
+from synpick_warp.configs.cell import bin_sizes
 from synpick_warp.configs.schema import Config
+from synpick_warp.scenes.bins import make_bins
 from synpick_warp.scenes.cameras import make_cameras
 from synpick_warp.scenes.fixtures import make_fixtures
 from synpick_warp.scenes.lights import load_lights
@@ -27,8 +29,8 @@ SHORT = {
 
 def render_scene(config: Config, objects: Catalog, device: Any) -> RenderScene:
     """The scene of a bake, under one light."""
-    fixtures = make_fixtures(config.tote, config.gripper)
-    return build_render_scene(config.render, config.tote, objects, fixtures, make_cameras(config.cameras), load_lights("")[:LIGHTS], device)
+    fixtures, cameras = make_fixtures(make_bins(bin_sizes(config)), config.gripper), make_cameras(config.rig)
+    return build_render_scene(config.render, -config.tote.wall, objects, fixtures, cameras, load_lights("")[:LIGHTS], device)
 
 
 def picking(config: Config, objects: Catalog, device: Any, **other: Any) -> Simulation:

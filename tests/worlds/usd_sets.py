@@ -72,6 +72,7 @@ def episode_ticks(episode: int, frames: int = FRAMES) -> list[TickBatch]:
                 time=np.array([frame / 15.0]),
                 object_id=object_id[None],
                 pose=pose[None, :4].astype(np.float32),
+                bin=np.zeros(1, np.int32),
                 fixture_pose=pose[None, 4:].astype(np.float32),
                 fixture_visible=np.array([[1, visible, visible]], np.int32),
                 light=np.array([LIGHT], np.int32),
@@ -94,7 +95,7 @@ def write_set(
     (out / PARTIAL).mkdir(parents=True)
     with WriterPool(0, 0) as pool:
         exporter = UsdExporter(
-            ExportContext(out, ExportSettings.of(config), catalog, make_cameras(config.cameras), lights or skies()[:2], pool)
+            ExportContext(out, ExportSettings.of(config), catalog, make_cameras(config.rig), lights or skies()[:2], pool)
         )
         assert exporter.write_constants() == [Path("usd/assets")]
         for episode in episodes:

@@ -21,10 +21,12 @@ import warp as wp
 from rich.console import Console
 
 from synpick_warp.apps.viz.preview import put_text, write_picture
+from synpick_warp.configs.cell import bin_sizes
 from synpick_warp.configs.load import load_config
 from synpick_warp.errors import SynpickError
 from synpick_warp.factory.assembly import make_renderer
 from synpick_warp.scenes.assets.meshes import SUFFIXES, MeshOptions, read_mesh
+from synpick_warp.scenes.bins import make_bins
 from synpick_warp.scenes.cameras import make_cameras
 from synpick_warp.scenes.fixtures import make_fixtures
 from synpick_warp.scenes.lights import load_lights
@@ -93,10 +95,10 @@ def draw(outcomes: list[Outcome], device: str) -> np.ndarray:
     fixed = {"cameras.resolution": [CELL, CELL], "cameras.positions": [[0.0, 0.0, 0.9]], "cameras.ups": [[0.0, 1.0, 0.0]]}
     config = load_config(None, fixed)
     entries = [_entry(number, *found) for number, outcome in enumerate(outcomes) if (found := outcome.found) is not None]
-    cameras, count = make_cameras(config.cameras), len(entries)
-    fixtures = make_fixtures(config.tote, config.gripper)
+    cameras, count = make_cameras(config.rig), len(entries)
+    fixtures = make_fixtures(make_bins(bin_sizes(config)), config.gripper)
     scene = build_render_scene(
-        config.render, config.tote, Catalog(tuple(entries)), fixtures, cameras, load_lights("")[:1], wp.get_device(device)
+        config.render, -config.tote.wall, Catalog(tuple(entries)), fixtures, cameras, load_lights("")[:1], wp.get_device(device)
     )
     world = allocate(Snapshot, {"world": count, "instance": 1, "fixture": len(fixtures)}, scene.device)
     world.catalog_index.assign(np.arange(count)[:, None])

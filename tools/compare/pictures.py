@@ -18,9 +18,11 @@ import warp as wp
 from rich.console import Console
 from rich.table import Table
 
+from synpick_warp.configs.cell import bin_sizes
 from synpick_warp.configs.schema import FAST, LAYERS, REFERENCE, UNOCCLUDED, Config
 from synpick_warp.errors import SynpickError
 from synpick_warp.factory.assembly import make_renderer
+from synpick_warp.scenes.bins import make_bins
 from synpick_warp.scenes.cameras import make_cameras
 from synpick_warp.scenes.catalog import load_catalog
 from synpick_warp.scenes.fixtures import make_fixtures
@@ -164,14 +166,14 @@ def compare_devices(config: Config, devices: list[Any], console: Console) -> lis
     lights = load_lights(config.bake.lights)
     simulation = Simulation(with_enough_worlds(config, devices[0]), catalog, len(lights), devices[0])
     snapshot = next_frame(settle_piles(simulation, config.bake.worlds), CREEP)
-    cameras = make_cameras(config.cameras)
-    fixtures = make_fixtures(config.tote, config.gripper)
+    cameras = make_cameras(config.rig)
+    fixtures = make_fixtures(make_bins(bin_sizes(config)), config.gripper)
     differences = []
     for mode in COLORS:
         mode_config, objects = config.with_values({"render.mode": mode}), config.arrangement.max_objects
         outputs = []
         for device in devices:
-            scene = build_render_scene(mode_config.render, mode_config.tote, catalog, fixtures, cameras, lights, device)
+            scene = build_render_scene(mode_config.render, -mode_config.tote.wall, catalog, fixtures, cameras, lights, device)
             renderer = make_renderer(mode_config, scene, objects, config.bake.worlds * len(cameras))
             outputs.append(render_views(renderer, copy_snapshot(snapshot, device)))
         differences += [compare(mode, name, outputs[0][name], outputs[1][name]) for name in outputs[0]]

@@ -31,6 +31,7 @@ from rich.console import Console
 
 from synpick_warp.apps.viz.preview import write_picture
 from synpick_warp.codes import Segment
+from synpick_warp.configs.cell import bin_sizes
 from synpick_warp.configs.schema import FAST, Config, Render
 from synpick_warp.errors import SynpickError
 from synpick_warp.factory.assembly import Stages, build_stages, make_renderer
@@ -38,6 +39,7 @@ from synpick_warp.factory.sizes import fit_to_device
 from synpick_warp.kernels.render.lighting.history import NEVER
 from synpick_warp.kernels.render.lighting.shadows import STRATA_PERIOD
 from synpick_warp.kernels.tuning import LANE_STRIDE
+from synpick_warp.scenes.bins import make_bins
 from synpick_warp.scenes.cameras import make_cameras
 from synpick_warp.scenes.fixtures import make_fixtures
 from synpick_warp.stages.arrays import allocate
@@ -183,8 +185,8 @@ def compare_maps(
     Yields the denoised frame beside two references, and the periods of the lattice [px].
     """
     device, room = stages.renderer.scene.device, config.arrangement.max_objects
-    fixtures = make_fixtures(config.tote, config.gripper)
-    scene = build_render_scene(config.render, config.tote, stages.catalog, fixtures, make_cameras(config.cameras), stages.lights, device)
+    fixtures = make_fixtures(make_bins(bin_sizes(config)), config.gripper)
+    scene = build_render_scene(config.render, -config.tote.wall, stages.catalog, fixtures, make_cameras(config.rig), stages.lights, device)
     width, height = config.cameras.resolution
     samples = min(MAX_SAMPLES, max(2, 1 << int(math.log2(options.paths / (width * height)))))
     store = ReferenceStore(options.cache, config.with_values({"render.samples": samples}), scene)

@@ -19,7 +19,7 @@ from rich.console import Console
 from scipy.spatial.transform import Rotation
 
 from synpick_warp.codes import Ending, Phase
-from synpick_warp.configs.schema import Tote
+from synpick_warp.configs.cell import BinSizes
 from synpick_warp.errors import SynpickError
 from synpick_warp.scenes import build
 from synpick_warp.scenes.catalog import load_catalog
@@ -185,7 +185,7 @@ def _measure(simulation: Simulation, catalog: Catalog, before: TickReport, now: 
                 tick_speed=1e3 * np.linalg.norm(position - last, axis=1) / tick,
                 speed=1e3 * np.linalg.norm(linear, axis=1),
                 depth=1e3 * depths[bodies],
-                inside=is_inside(simulation.config.tote, position),
+                inside=is_inside(BinSizes.of_tote(simulation.config.tote), position),
             )
         )
     return piles
@@ -197,11 +197,10 @@ def transform_points(pose: np.ndarray, point: np.ndarray) -> tuple[np.ndarray, n
     return pose[:, :3] + np.einsum("nij,nj->ni", rotation, point), rotation
 
 
-def is_inside(tote: Tote, position: np.ndarray) -> np.ndarray:
+def is_inside(sizes: BinSizes, position: np.ndarray) -> np.ndarray:
     """Whether positions (N, 3) lie above the floor, within the rim's opening, and at most `HEAP_HEIGHT` above the rim."""
-    rim = np.array(tote.rim_size) / 2
-    height = tote.outer_size[2] - tote.wall
-    return (np.abs(position[:, :2]) < rim).all(axis=1) & (position[:, 2] > 0.0) & (position[:, 2] < height + HEAP_HEIGHT)
+    rim = np.array(sizes.opening) / 2
+    return (np.abs(position[:, :2]) < rim).all(axis=1) & (position[:, 2] > 0.0) & (position[:, 2] < sizes.height + HEAP_HEIGHT)
 
 
 def report(results: Results) -> list[Row]:

@@ -7,7 +7,7 @@ import warp as wp
 
 from synpick_warp.kernels.render.visibility.bvh_rays import RAY_OFFSET
 from synpick_warp.kernels.render.visibility.camera import Views
-from synpick_warp.kernels.render.visibility.gbuffer import FAR, Meshes
+from synpick_warp.kernels.render.visibility.gbuffer import FAR, Meshes, fixture_mesh
 
 wp.set_module_options({"enable_backward": False})
 
@@ -115,6 +115,7 @@ def find_moving_bodies_kernel(
     # Scene:
     meshes: Meshes,
     # State: worlds
+    bin: wp.array[int],  # (world)
     catalog_index: wp.array2d[int],  # (world, instance)
     pose: wp.array2d[wp.transformf],  # (world, instance) [m]
     fixture_pose: wp.array2d[wp.transformf],  # (world, fixture) [m]
@@ -153,8 +154,8 @@ def find_moving_bodies_kernel(
             then = last_pose[world, body]
         else:
             fixture = body - views.instances
-            mesh = wp.where(fixture_visible[world, fixture] != 0, meshes.entries + fixture, -1)
-            last_mesh = wp.where(last_fixture_visible[world, fixture] != 0, meshes.entries + fixture, -1)
+            mesh = wp.where(fixture_visible[world, fixture] != 0, fixture_mesh(meshes, bin[world], fixture), -1)
+            last_mesh = wp.where(last_fixture_visible[world, fixture] != 0, fixture_mesh(meshes, bin[world], fixture), -1)
             now = fixture_pose[world, fixture]
             then = last_fixture_pose[world, fixture]
         change = float(mesh != last_mesh)

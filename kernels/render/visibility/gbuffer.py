@@ -35,7 +35,7 @@ class Interior:
 
 @wp.struct
 class Meshes:
-    """Triangle meshes of the catalog, then tote, gripper shaft, cup, each in its own frame: handle, BVH, box and sphere [m], corners [m]
+    """Triangle meshes of the catalog, then bins, gripper shaft, cup, each in its own frame: handle, BVH, box and sphere [m], corners [m]
     and unit normals of all triangles, empty interior of the tote. Constant.
     """
 
@@ -56,7 +56,7 @@ class Meshes:
     face_normal: wp.array[wp.vec3]
     """(triangle): unit normals by the winding; zero for degenerate triangles."""
     entries: int
-    """Number of catalog meshes; the mesh of fixture f is entries + f."""
+    """Row of the first bin; see `fixture_mesh`."""
     interior: Interior
     """Empty interior of the tote."""
 
@@ -77,6 +77,8 @@ class ViewBodies:
 
     mesh: wp.array2d[int]
     """(view, body): row of `Meshes`; -1: the body is absent."""
+    material: wp.array2d[int]
+    """(view, body, and last the table): row of `Surfaces`; empty: that of the mesh."""
     rotation: wp.array2d[wp.mat33]
     """(view, body): camera to body frame."""
     start: wp.array2d[wp.vec3]
@@ -131,6 +133,14 @@ class Hit:
     barycentric: wp.vec2
     depth: float
     """Planar depth of a camera ray, distance along any other [m]."""
+
+
+@wp.func
+def fixture_mesh(meshes: Meshes, bin: int, fixture: int) -> int:
+    """Row of `Meshes` of a fixture in a world with the bin `bin`: bins beside the first lie before it, in reverse order."""
+    if fixture == 0:
+        return meshes.entries - bin
+    return meshes.entries + fixture
 
 
 @wp.func

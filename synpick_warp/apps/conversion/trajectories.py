@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import msgspec
@@ -32,10 +32,17 @@ class _Light(msgspec.Struct):
     exposure: float
 
 
+class _Bin(msgspec.Struct):
+    """Schema of an episode's bin: its name."""
+
+    name: str
+
+
 class _Attributes(msgspec.Struct):
     """Schema of the attributes of an episode's group, as far as they are converted."""
 
     light: _Light
+    bin: _Bin | None = None
 
 
 class _Attempt(msgspec.Struct):
@@ -99,15 +106,22 @@ def _read_light(data: Episode) -> _Light:
     return check_content(data.attributes, _Attributes, data.group / GROUP_FILE).light
 
 
-def read_ticks(data: Episode, steps_per_tick: int) -> Iterator[TickBatch]:
+def read_ticks(data: Episode, steps_per_tick: int, bins: Sequence[str]) -> Iterator[TickBatch]:
     """Yield the frames of an episode, as they came from the simulation, with gripper state and setpoints if there are any; poses of absent
-    instances are NaN.
+    instances are NaN. `bins`: of `recorded_bins`.
+
+    Raises:
+        DatasetError: The episode's bin is none of them.
     """
     arrays = {name: read_array(data.ticks[name]) for name in POSES}
     state = {name: read_array(data.ticks[name]) for name in GRIPPER if name in data.ticks}
     setpoint = read_array(data.steps[SETPOINT]).reshape(len(data), steps_per_tick, 3) if SETPOINT in data.steps else None
-    light = _read_light(data)
+    attributes = check_content(data.attributes, _Attributes, data.group / GROUP_FILE)
+    light, own = attributes.light, attributes.bin.name if attributes.bin else ""
+    if bins and own not in bins:
+        raise DatasetError(f"{data.group / GROUP_FILE} is damaged: its bin is {own!r}, the settings have {', '.join(bins)}; {ADVICE}")
     columns: dict[str, Any] = {
+        "bin": np.array([bins.index(own) if bins else 0], np.int32),
         "light": np.array([light.map], np.int32),
         "light_yaw": np.array([light.yaw], np.float32),
         "light_exposure": np.array([light.exposure], np.float32),

@@ -29,7 +29,8 @@ from synpick_warp.apps.report.sampling import (
 from synpick_warp.apps.report.strips import choose_episodes, make_strip
 from synpick_warp.apps.report.tables import findings_list, settings_tables, statistics_tables, tiles
 from synpick_warp.apps.statistics import Statistics, compute_statistics
-from synpick_warp.apps.viz.depth_colors import tote_scale
+from synpick_warp.apps.viz.depth_colors import bin_scale
+from synpick_warp.configs.cell import bin_sizes
 from synpick_warp.dataset.commit.manifest import read_manifest
 from synpick_warp.dataset.reading import DataSet
 from synpick_warp.dataset.view import View
@@ -119,7 +120,7 @@ def take_samples(data_set: DataSet, statistics: Statistics, episodes: Episodes, 
     asked["frames"] = len(views)
     for done, view in enumerate(views):
         report("frames", done, len(views))
-        scale = None if data_set.found else tote_scale(data_set.config.tote, [view.records.camera])
+        scale = None if data_set.found else bin_scale(bin_sizes(data_set.config), [view.records.camera])
         data["frames"] += _present(make_frame(view, content, names, episodes.rows[view.episode].mode, album, scale))
     chosen = choose_episodes(episodes)
     asked["strips"] = len(chosen)
@@ -175,8 +176,8 @@ def _lead(data_set: DataSet, statistics: Statistics, findings: list[Finding]) ->
     if data_set.found is not None:
         said = f"A BOP data set from another source than synpick-warp bake; splits {splits}. "
     else:
-        width, height = data_set.config.cameras.resolution
-        said = f"Modes {modes}; splits {splits}; images of {width} x {height} pixels; seed {data_set.config.bake.seed}. "
+        sizes = ", ".join(dict.fromkeys(f"{width} x {height}" for width, height in data_set.config.rig.sizes))
+        said = f"Modes {modes}; splits {splits}; images of {sizes} pixels; seed {data_set.config.bake.seed}. "
     return join([said, element("a", f"Findings: {summary(findings)}", href="#findings"), "."])
 
 

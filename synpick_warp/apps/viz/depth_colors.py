@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
-from itertools import product
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
 
 from synpick_warp.apps.viz.drawing import Image
-from synpick_warp.configs.schema import Tote
+from synpick_warp.configs.cell import BinSizes
 
 _RANGE = (1.0, 99.0)
-"""Percentiles of the depths that map to the first and the last colour, where no tote gives the range."""
+"""Percentiles of the depths that map to the first and the last colour, where no bin gives the range."""
 _EVERY = 7
 """Every n-th pixel counts for percentiles."""
 MM = 1000.0
@@ -27,29 +26,23 @@ class DepthScale(NamedTuple):
     far: float
 
 
-def tote_scale(tote: Tote, cameras: Iterable[Mapping[str, Any]]) -> DepthScale | None:
-    """Depths from the nearest corner of the tote's rim to the farthest of its floor, over some cameras; None: a camera has no pose.
+def bin_scale(bins: Sequence[BinSizes], cameras: Iterable[Mapping[str, Any]]) -> DepthScale | None:
+    """Depths from the nearest corner of the bins' rims to the farthest of their floors, over some cameras; None: a camera has no pose.
 
     Args:
-        tote: Settings of the tote.
-        cameras: Records of scene_camera.json; their world is the tote's frame: origin in the middle of the inner floor, z up.
+        bins: The bins.
+        cameras: Records of scene_camera.json; their world is the bin's frame: origin in the middle of the inner floor, z up.
     """
-    depths = []
+    corners, depths = np.array([corner for sizes in bins for corner in sizes.inner_corners]), []
     for camera in cameras:
         if "cam_R_w2c" not in camera or "cam_t_w2c" not in camera:
             return None
         axis, offset = np.array(camera["cam_R_w2c"][6:9], float), float(camera["cam_t_w2c"][2])
-        depths.append(_corners(tote) @ axis * MM + offset)
+        depths.append(corners @ axis * MM + offset)
     if not depths:
         return None
     near, far = float(np.min(depths)), float(np.max(depths))
     return DepthScale(near, far) if 0.0 < near < far else None
-
-
-def _corners(tote: Tote) -> np.ndarray:
-    """Corners of the inner floor and of the rim (8, 3) [m]."""
-    levels = ((tote.floor_size, 0.0), (tote.rim_size, tote.outer_size[2] - tote.wall))
-    return np.array([(x * w / 2, y * h / 2, z) for (w, h), z in levels for x, y in product((-1, 1), repeat=2)])
 
 
 def pooled_scale(depths: Iterable[np.ndarray]) -> DepthScale | None:

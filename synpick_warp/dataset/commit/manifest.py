@@ -25,8 +25,10 @@ from typing import Any
 import msgspec
 
 from synpick_warp import __version__
+from synpick_warp.configs.bins import Bins
 from synpick_warp.configs.load import load_config, override_config
 from synpick_warp.configs.objects import AUTO_UNIT, Objects
+from synpick_warp.configs.randomize import Distribution, Randomize
 from synpick_warp.configs.schema import CLASSIC, WITHIN, Config
 from synpick_warp.dataset.records import Entry, EpisodeEntry, IndicesEntry, Manifest, read_record
 from synpick_warp.errors import DatasetError
@@ -57,20 +59,33 @@ FREE_SETTINGS = (
     "bake.device",
     "bake.models",
     "bake.lights",
+    "randomize.bin_textures",
+    "randomize.table_textures",
     "bake.writers",
     "render.views_per_batch",
     "perception.views",
 )
-"""Settings that may differ when a bake is resumed: no episode depends on them. Objects and lights are compared by content, not by the name
-of their folder. A device of another type computes the same episodes up to rounding."""
+"""Settings that may differ when a bake is resumed: no episode depends on them. Objects, lights and textures are compared by content, not
+by the name of their folder. A device of another type computes the same episodes up to rounding."""
+
+
+def _plain(value: Any) -> Any:
+    """A value of a setting in types of TOML."""
+    return value.to_toml() if isinstance(value, Distribution) else value
+
+
 YOUNGER_SETTINGS: dict[str, Any] = {
     "bop.layout": CLASSIC,
     "bop.keypoints": 0,
     "arrangement.fill": WITHIN,
+    "perception.camera": "",
+    "camera": (),
     "objects.unit": AUTO_UNIT,
     "objects.symmetries": Objects().symmetries,
     "objects.symmetry_tolerance": Objects().symmetry_tolerance,
 }
+YOUNGER_SETTINGS |= {f"bins.{item.name}": item.default for item in dataclasses.fields(Bins)}
+YOUNGER_SETTINGS |= {f"randomize.{item.name}": _plain(item.default) for item in dataclasses.fields(Randomize)}
 """Settings that older manifests lack, and what held before: left out where they have these values, so that older data sets can still be
 read, and resumed with them."""
 _YOUNGER_KEYS = ("symmetries_discrete", "symmetries_continuous")
@@ -111,16 +126,19 @@ def fixed_settings(config: Config) -> dict[str, Any]:
     Nested; formats sorted by name.
     """
     settings = dataclasses.asdict(config)
+    settings["randomize"] = {item.name: _plain(getattr(config.randomize, item.name)) for item in dataclasses.fields(Randomize)}
     for key in FREE_SETTINGS:
         section, name = key.split(".")
         del settings[section][name]
     for key, before in YOUNGER_SETTINGS.items():
-        section, name = key.split(".")
-        if settings[section][name] == before:
-            del settings[section][name]
+        *sections, name = key.split(".")
+        table = settings[sections[0]] if sections else settings
+        if name in table and table[name] == before:
+            del table[name]
     for row in settings["object_rows"]:
         for name in [name for name in _YOUNGER_KEYS if not row[name]]:
             del row[name]
+    settings = {section: content for section, content in settings.items() if content != {}}
     settings["bake"]["formats"] = sorted(set(config.bake.formats))
     for split in settings["splits"]:
         del split["episodes"]
@@ -178,7 +196,8 @@ def read_settings(folder: Path, manifest: Mapping[str, Any]) -> Config:
     path = path_inside(folder, CONFIG_FILE, folder, DatasetError)
     check_regular_file(path, MAX_TOML, DatasetError)
     settings = manifest["settings"]
-    before = {key: value for key, value in YOUNGER_SETTINGS.items() if key.split(".")[1] not in settings.get(key.split(".")[0], {})}
+    younger = {key: value for key, value in YOUNGER_SETTINGS.items() if "." in key}
+    before = {key: value for key, value in younger.items() if key.split(".")[1] not in settings.get(key.split(".")[0], {})}
     config = override_config(load_config(str(path), {}), before)
     said = describe_differences({"settings": make_manifest(config)["settings"]}, {"settings": settings})
     if said:
@@ -190,8 +209,10 @@ def differences(here: Mapping[str, Any], there: Mapping[str, Any], path: str = "
     """Compare two manifests: yields (key, value here, value there) of each difference; None: no such key."""
     for name in [*here, *(name for name in there if name not in here)]:
         first, second = here.get(name), there.get(name)
-        if isinstance(first, Mapping) and isinstance(second, Mapping):
-            yield from differences(first, second, f"{path}{name}.")
+        if isinstance(first, Mapping) and isinstance(second, Mapping | None):
+            yield from differences(first, second or {}, f"{path}{name}.")
+        elif isinstance(second, Mapping) and first is None:
+            yield from differences({}, second, f"{path}{name}.")
         elif first != second:
             yield f"{path}{name}", first, second
 

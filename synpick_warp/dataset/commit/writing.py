@@ -151,14 +151,15 @@ class OutputFolder:
 
         Args:
             exporters: All exporters of the bake.
-            inputs: Content digests of objects and lights.
+            inputs: Content digests of objects, lights and textures.
             pool: Writer processes.
 
         Raises:
             ConfigError: The data set was started with other objects or lights.
             OutputError: The folder cannot be written.
         """
-        differing = [name for name in inputs if self._known and self._known.get(INPUTS, {}).get(name) != inputs[name]]
+        known = self._known.get(INPUTS, {}) if self._known else inputs
+        differing = [name for name in {**inputs, **known} if known.get(name) != inputs.get(name)]
         if differing:
             raise ConfigError(f"{self.out} was started with other {' and '.join(differing)}; {_ADVICE}")
         self._exporters = exporters
@@ -214,7 +215,7 @@ class OutputFolder:
 
     def _named_episodes(self) -> set[int]:
         """Superset of the episodes with files: each number in a file name is taken as an episode index and as a BOP scene id."""
-        cameras = len(self.config.cameras.positions)
+        cameras = len(self.config.rig)
         found: set[int] = set()
         for folder in (ENTRIES, *list_folders(self.out, self._shared.folders)):
             names = os.listdir(self.out / folder) if (self.out / folder).is_dir() else []

@@ -23,6 +23,7 @@ from synpick_warp.exporters.writing.png import encode_png, frame_depth_png
 from synpick_warp.exporters.writing.rle import Masks, Runs, find_run_boundaries, unpack_run_boundaries
 from synpick_warp.scenes.types import Camera
 from synpick_warp.system.codecs.jpeg import encode_jpeg
+from synpick_warp.views.bins import bin_record
 from synpick_warp.views.frames import FrameBatch
 from synpick_warp.views.layer_codec import encode_layer
 
@@ -227,7 +228,7 @@ def make_view_task(batch: FrameBatch, view: int, scene: int, settings: ViewSetti
 
 
 def _make_extras(batch: FrameBatch, view: int, effects: dict[str, float]) -> dict[str, Any]:
-    """Extra keys of a view's entry in scene_camera.json: light, and camera effects if any are active."""
+    """Extra keys of a view's entry in scene_camera.json: light, and bin and camera effects where they differ."""
     direction = batch.light_direction[view]
     light = {
         "map": str(batch.light_name[view]),
@@ -235,7 +236,8 @@ def _make_extras(batch: FrameBatch, view: int, effects: dict[str, float]) -> dic
         "exposure": round(float(batch.light_exposure[view]), _DIGITS),
         "direction": [round(part, _DIGITS) for part in direction.tolist()] if direction.any() else None,
     }
-    return {"light": light} | ({"effects": {name: round(value, _DIGITS) for name, value in effects.items()}} if effects else {})
+    own = {} if batch.bin_name is None or batch.bin_pose is None else {"bin": bin_record(str(batch.bin_name[view]), batch.bin_pose[view])}
+    return {"light": light} | own | ({"effects": {name: round(value, _DIGITS) for name, value in effects.items()}} if effects else {})
 
 
 def _select_boundaries(batch: FrameBatch, view: int, pixels: int) -> tuple[np.ndarray, ...]:

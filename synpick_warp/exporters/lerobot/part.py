@@ -81,7 +81,7 @@ def make_rows(ticks: np.ndarray, attempts: Sequence[Mapping[str, Any]], sentence
 
 
 def describe_tasks(
-    mode: str, frames: int, attempts: Iterable[Mapping[str, Any]], objects: Mapping[int, str]
+    mode: str, frames: int, attempts: Iterable[Mapping[str, Any]], objects: Mapping[int, str], noun: str = "tote"
 ) -> tuple[list[str], np.ndarray]:
     """The task of each frame in words: that of the running attempt, or else of the next one, of the last one, or of the episode.
 
@@ -90,18 +90,20 @@ def describe_tasks(
         frames: Number of frames.
         attempts: The episode's lines of attempts.jsonl, in order.
         objects: obj_id -> name.
+        noun: What the objects are in, or on: tote, bin, table or pallet.
 
     Returns:
         Sentences in order of appearance, and the index of each frame's (frame) int32.
     """
-    general = "stir the objects in the tote" if mode == Mode.MOVE.name.lower() else "pick all objects out of the tote"
+    there = ("on", "off") if noun in ("table", "pallet") else ("in", "out of")
+    general = f"stir the objects {there[0]} the {noun}" if mode == Mode.MOVE.name.lower() else f"pick all objects {there[1]} the {noun}"
     verb = "dig" if mode == Mode.TARGET.name.lower() else "pick"
     of_frame = np.full(frames, general, object)
     begin = 0
     for attempt in attempts:
         if attempt["object_id"] is not None:
             name = objects.get(attempt["object_id"], f"object {attempt['object_id']}")
-            of_frame[begin : attempt["end_frame"]] = f"{verb} the {speak(name)} out of the tote"
+            of_frame[begin : attempt["end_frame"]] = f"{verb} the {speak(name)} {there[1]} the {noun}"
         begin = attempt["end_frame"]
     # The frame in which the last attempt was judged belongs to no attempt.
     if 0 < begin < frames:

@@ -1,16 +1,17 @@
-"""Asset library shared by all USD episodes: one file per object, and tote, gripper shaft ("finger"), cup and table."""
+"""Asset library shared by all USD episodes: one file per object and bin, and gripper shaft ("finger"), cup and table."""
 
 # pxr's modules are filled when they are loaded, invisible to type checkers.
 # pyright: reportAttributeAccessIssue=false
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 from pxr import Gf, Usd, UsdGeom, UsdShade
 
-from synpick_warp.configs.schema import Gripper, Physics, Tote
+from synpick_warp.configs.schema import Gripper, Physics
 from synpick_warp.exporters.usd.lights import write_light_maps
 from synpick_warp.exporters.usd.parts import (
     TEXTURES,
@@ -26,14 +27,16 @@ from synpick_warp.exporters.usd.parts import (
     save_layer,
     write_texture,
 )
+from synpick_warp.exporters.usd.types import bin_asset
+from synpick_warp.scenes.bins import Bin
 from synpick_warp.scenes.gripper import cup_collider, cup_fixture, finger_collider, finger_fixture, rod_inertia
-from synpick_warp.scenes.tote import TABLE_ROUGHNESS, TABLE_SIZE, tote_colliders, tote_fixture
+from synpick_warp.scenes.tote import TABLE_ROUGHNESS, TABLE_SIZE
 from synpick_warp.scenes.types import Catalog, CatalogEntry, ConvexPiece, EnvironmentMap, Fixture, Material, TriangleMesh
 
 
 def write_library(
     library: Path,
-    tote: Tote,
+    bins: Sequence[Bin],
     gripper: Gripper,
     physics: Physics,
     table_color: tuple[float, float, float] | None,
@@ -51,7 +54,10 @@ def write_library(
     write_light_maps(library, lights)
     for entry in catalog.entries:
         _write_object(library, physics, entry)
-    _save(library, "tote", _make_fixture(library, physics, "tote", tote_fixture(tote), tote_colliders(tote)))
+    for one in bins:
+        if one.sizes.is_visible:
+            name = bin_asset(one.sizes)
+            _save(library, name, _make_fixture(library, physics, name, one.fixture, one.pieces))
     finger = _make_fixture(library, physics, "finger", finger_fixture(gripper), (finger_collider(gripper),))
     length, mass = gripper.finger_length, gripper.finger_mass
     add_body(finger.GetDefaultPrim(), mass, np.array([0.0, 0.0, length / 2]), np.diag(rod_inertia(mass, length)), kinematic=True)
@@ -60,7 +66,7 @@ def write_library(
     length, mass = gripper.cup_length, gripper.cup_mass
     add_body(cup.GetDefaultPrim(), mass, np.array([0.0, 0.0, -length / 2]), np.diag(rod_inertia(mass, length)), kinematic=True)
     _save(library, "cup", cup)
-    _write_table(library, physics, -tote.wall, table_color)
+    _write_table(library, physics, bins[0].sizes.base, table_color)
 
 
 def _save(library: Path, name: str, stage: Usd.Stage) -> None:
@@ -99,7 +105,7 @@ def _add_shapes(
 
 
 def _write_table(library: Path, physics: Physics, height: float, color: tuple[float, float, float] | None) -> None:
-    """Write the table under the tote: a collision box, and a visible top side.
+    """Write the table under the bins: a collision box, and a visible top side.
 
     Args:
         library: Folder of the assets.

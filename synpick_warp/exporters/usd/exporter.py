@@ -13,9 +13,10 @@ from synpick_warp.exporters.staging import EpisodeExporter, StagedEpisode
 from synpick_warp.exporters.usd.episode import write_episode
 from synpick_warp.exporters.usd.lights import make_stage_light
 from synpick_warp.exporters.usd.spool import TickSpool, tick_rows
-from synpick_warp.exporters.usd.types import EpisodeMetadata, EpisodeSettings
+from synpick_warp.exporters.usd.types import EpisodeMetadata, EpisodeSettings, bin_asset
 from synpick_warp.exporters.writing.files import output_errors
 from synpick_warp.exporters.writing.pool import WriteTask
+from synpick_warp.scenes.bins import make_bins
 from synpick_warp.views.frames import EpisodeEnd, TickBatch
 
 FOLDER = Path("usd")
@@ -54,7 +55,7 @@ class UsdExporter(EpisodeExporter[TickSpool]):
                 folder.mkdir(exist_ok=True)
             settings, render = context.settings, context.settings.render
             color = render.table_color if render.table else None
-            write_library(library, settings.tote, settings.gripper, settings.physics, color, context.catalog, context.lights)
+            write_library(library, make_bins(settings.bins), settings.gripper, settings.physics, color, context.catalog, context.lights)
         return [LIBRARY]
 
     def write_ticks(self, batch: TickBatch) -> None:
@@ -86,6 +87,7 @@ class UsdExporter(EpisodeExporter[TickSpool]):
         return EpisodeSettings(
             tick_rate=1.0 / settings.physics.tick_time,
             gravity=settings.physics.gravity,
+            bins=tuple(bin_asset(sizes) if sizes.is_visible else None for sizes in settings.bins),
             cameras=context.cameras,
             lights=tuple(make_stage_light(index, light, settings.render.exposure) for index, light in enumerate(context.lights)),
             names={entry.obj_id: entry.name for entry in context.catalog.entries},

@@ -10,7 +10,7 @@ from synpick_warp.views.frames import TickBatch
 
 TICKS = 64
 """Number of ticks that are buffered in memory: about 50 kB per world."""
-_FIELDS = ("frame", "object_id", "pose", "fixture_pose", "fixture_visible", "light", "light_yaw", "light_exposure")
+_FIELDS = ("frame", "bin", "object_id", "pose", "fixture_pose", "fixture_visible", "light", "light_yaw", "light_exposure")
 """Fields of `TickBatch` that are spooled, with its shapes."""
 
 
@@ -46,6 +46,7 @@ def tick_type(instances: int) -> np.dtype:
     return np.dtype(
         [
             ("frame", "<i4"),
+            ("bin", "<i4"),
             ("object_id", "<i4", instances),
             ("pose", "<f4", (instances, 7)),
             ("fixture_pose", "<f4", (3, 7)),

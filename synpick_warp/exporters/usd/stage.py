@@ -27,7 +27,8 @@ INSTANCE = "instance"
 """Taxonomy of instance labels, and prefix of the objects' prim names."""
 ROOT = "/Episode"
 FIXTURES = {"tote": f"{ROOT}/Tote", "finger": f"{ROOT}/Gripper/Finger", "cup": f"{ROOT}/Gripper/Cup"}
-"""Asset and prim of each row of `TickBatch.fixture_pose`."""
+"""Asset and prim of each row of `TickBatch.fixture_pose`; a bin that is no tote has the prim BIN."""
+BIN = f"{ROOT}/Bin"
 
 
 def make_episode_layer(ticks: np.ndarray, metadata: EpisodeMetadata, settings: EpisodeSettings) -> Sdf.Layer:
@@ -43,7 +44,12 @@ def make_episode_layer(ticks: np.ndarray, metadata: EpisodeMetadata, settings: E
     _add_root(stage, metadata, settings)
     assets = {f"{ROOT}/Table": "table"}
     UsdGeom.Xform.Define(stage, f"{ROOT}/Table")
+    own = settings.bins[int(ticks["bin"][0])]
     for index, (asset, path) in enumerate(FIXTURES.items()):
+        if index == 0 and own != asset:
+            asset, path = own, BIN
+        if asset is None:
+            continue
         visible = ticks["fixture_visible"][:, index] != 0
         _add_moving(stage, path, ticks["fixture_pose"][:, index], visible, np.arange(len(ticks)))
         assets[path] = asset
@@ -53,7 +59,7 @@ def make_episode_layer(ticks: np.ndarray, metadata: EpisodeMetadata, settings: E
         path, obj_id = _add_object(stage, ticks, instance, settings)
         assets[path] = object_asset(obj_id)
     for index, camera in enumerate(settings.cameras):
-        _add_camera(stage, index, camera)
+        _add_camera(stage, camera.name or f"camera_{index}", camera)
     first = ticks[0]
     _add_light(stage, settings.lights[first["light"]], float(first["light_yaw"]), float(first["light_exposure"]))
     # References are added last and without a stage, since they cannot be resolved from a file that is not in its place yet.
@@ -73,7 +79,7 @@ def _add_root(stage: Usd.Stage, metadata: EpisodeMetadata, settings: EpisodeSett
     stage.SetEndTimeCode(metadata.frames - 1)
     stage.SetTimeCodesPerSecond(settings.tick_rate)
     stage.SetFramesPerSecond(settings.tick_rate)
-    for name in ("episode", "arrangement", "frames", "ending", *(("split",) if metadata.split else ())):
+    for name in ("episode", "arrangement", "frames", "ending", *(name for name in ("split", "bin") if getattr(metadata, name))):
         add_property(root, name, getattr(metadata, name))
     scene = UsdPhysics.Scene.Define(stage, f"{ROOT}/Physics")
     scene.CreateGravityDirectionAttr(Gf.Vec3f(0.0, 0.0, -1.0))
@@ -155,9 +161,9 @@ def _make_continuous(quaternions: np.ndarray) -> np.ndarray:
     return unit
 
 
-def _add_camera(stage: Usd.Stage, index: int, camera: Camera) -> None:
+def _add_camera(stage: Usd.Stage, name: str, camera: Camera) -> None:
     """Add a pinhole camera and its render product. USD's cameras look along -z with y up; film lengths are tenths of a metre."""
-    lens = UsdGeom.Camera.Define(stage, f"{ROOT}/Cameras/camera_{index}")
+    lens = UsdGeom.Camera.Define(stage, f"{ROOT}/Cameras/{name}")
     (fx, _, cx), (_, fy, cy), _ = camera.matrix.tolist()
     focal = APERTURE * fx / camera.width
     height = focal * camera.height / fy
@@ -173,7 +179,7 @@ def _add_camera(stage: Usd.Stage, index: int, camera: Camera) -> None:
     pose[:3, 3] = -camera.rotation.T @ camera.translation
     lens.AddTransformOp().Set(Gf.Matrix4d(*pose.T.ravel().tolist()))  # USD multiplies row vectors.
     UsdGeom.Scope.Define(stage, f"{ROOT}/Render")
-    product = UsdRender.Product.Define(stage, f"{ROOT}/Render/camera_{index}")
+    product = UsdRender.Product.Define(stage, f"{ROOT}/Render/{name}")
     product.CreateResolutionAttr(Gf.Vec2i(camera.width, camera.height))
     product.CreatePixelAspectRatioAttr(fx / fy)
     product.CreateCameraRel().SetTargets([lens.GetPath()])

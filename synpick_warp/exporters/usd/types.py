@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from synpick_warp.codes import Ending
+from synpick_warp.configs.cell import BinSizes
 from synpick_warp.scenes.types import Camera
 from synpick_warp.views.frames import EpisodeEnd
 
@@ -32,12 +33,14 @@ class StageLight:
 
 @dataclass(frozen=True)
 class EpisodeSettings:
-    """Settings common to all episodes: tick rate [1/s], gravity [m/s²], cameras, lights, object names by obj_id."""
+    """Settings common to all episodes: tick rate [1/s], gravity [m/s²], bins, cameras, lights, object names by obj_id."""
 
     tick_rate: float
     """Frames per second of simulated time [1/s]."""
     gravity: float
     """[m/s²]"""
+    bins: tuple[str | None, ...]
+    """Asset of each bin; None: there is nothing but the table."""
     cameras: tuple[Camera, ...]
     lights: tuple[StageLight, ...]
     names: dict[int, str]
@@ -55,8 +58,17 @@ class EpisodeMetadata:
     ending: str
     split: str = ""
     """Name of the episode's split; empty: the data set has none."""
+    bin: str = ""
+    """Name of the bin; empty: a tote that is always in its place."""
 
     @staticmethod
     def from_end(end: EpisodeEnd) -> EpisodeMetadata:
         """Take the metadata from the episode's end."""
-        return EpisodeMetadata(end.episode, end.arrangement, end.frames, Ending(end.ending).name.lower(), end.row.get("split", ""))
+        own = (end.row or {}).get("bin") or {}
+        ending = Ending(end.ending).name.lower()
+        return EpisodeMetadata(end.episode, end.arrangement, end.frames, ending, end.row.get("split", ""), own.get("name", ""))
+
+
+def bin_asset(sizes: BinSizes) -> str:
+    """Name of a bin's asset."""
+    return sizes.name if sizes.noun == sizes.name else f"bin_{sizes.name}"

@@ -12,11 +12,12 @@ from synpick_warp.stages.buffers import LayerBuffers, Snapshot, ViewBuffers
 from synpick_warp.stages.render.annotate import Annotator
 from synpick_warp.stages.render.denoised import DenoisedRenderer
 from synpick_warp.stages.render.layers import LayerRenderer, sensor_parameters
+from synpick_warp.stages.render.looks import Dresser
 from synpick_warp.stages.render.postprocess import PostProcessor
 from synpick_warp.stages.render.raster import Rasterizer
 from synpick_warp.stages.render.reference import ReferenceRenderer
 from synpick_warp.stages.render.scene import RenderScene
-from synpick_warp.stages.render.view_setup import GBUFFER, VIEW_BODIES, body_sizes, set_up_views
+from synpick_warp.stages.render.view_setup import GBUFFER, VIEW_BODIES, VIEW_CAMERAS, body_sizes, set_up_views
 from synpick_warp.stages.timing import scope
 
 SHADED_IMAGE = struct_arrays(ShadedImage, "view", "row", "column")
@@ -31,6 +32,7 @@ class Renderer:
     Attributes:
         instances: Instance capacity of a world.
         views: Maximum number of views of a batch.
+        cameras: The struct `ViewCameras` of the last batch.
         bodies: The struct `ViewBodies` of the last batch.
         gbuffer: The struct `GBuffer` of the last batch.
         image: The struct `ShadedImage` of the last batch: linear radiance.
@@ -63,10 +65,14 @@ class Renderer:
             histories: Worlds times cameras whose light is averaged over the frames of an episode; 0: each frame is rendered by itself.
         """
         sizes = {"view": views, "row": scene.height, "column": scene.width} | body_sizes(instances, scene.width, scene.height)
-        self.scene = scene
+        self.dresser = Dresser(scene, seed, instances, views) if scene.looks is not None else None
+        self.scene = scene = self.dresser.scene if self.dresser else scene
         self.instances = instances
         self.views = views
+        self.cameras = allocate_struct(VIEW_CAMERAS, sizes, scene.device)
         self.bodies = allocate_struct(VIEW_BODIES, sizes, scene.device)
+        if self.dresser:
+            self.bodies.material = self.dresser.material
         self.gbuffer = allocate_struct(GBUFFER, sizes, scene.device)
         self.image = allocate_struct(SHADED_IMAGE, sizes, scene.device)
         if settings.mode == schema.REFERENCE:
@@ -84,7 +90,7 @@ class Renderer:
 
         Args:
             snapshot: State of the worlds.
-            views: The struct `Views`.
+            views: The struct `Views`; its cameras are set.
             out: Written.
             layers: Written; None: no layers.
 
@@ -110,7 +116,10 @@ class Renderer:
     def render_gbuffer(self, snapshot: Snapshot, views: Any, out: ViewBuffers) -> None:
         """First part of `render`: the G-buffer, and the images of depth, instances and amodal bits."""
         scene = self.scene
+        views.cameras = self.cameras
         with scope("set up views", scene.device):
-            set_up_views(scene, scene.cameras, scene.grid, snapshot, snapshot.fixture_visible, views, self.bodies)
+            set_up_views(scene, snapshot, snapshot.fixture_visible, views, self.bodies)
+            if self.dresser:
+                self.dresser.dress(snapshot, views, self.bodies)
         with scope("rasterize", scene.device):
             self.rasterizer.rasterize(self.bodies, views, self.gbuffer, out)

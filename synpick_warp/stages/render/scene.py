@@ -19,6 +19,7 @@ from synpick_warp.kernels.render.visibility.camera import TILE_HEIGHT, TILE_PIXE
 from synpick_warp.kernels.render.visibility.gbuffer import Meshes, Table
 from synpick_warp.scenes.assets.appearance import linear_to_srgb, srgb_to_linear
 from synpick_warp.scenes.environment import LUMINANCE
+from synpick_warp.scenes.looks import Looks, project_from_box
 from synpick_warp.scenes.tote import TABLE_ROUGHNESS
 from synpick_warp.scenes.types import Camera, Catalog, EnvironmentMap, Fixture, Interior, Material, TriangleMesh
 from synpick_warp.stages.render.light_tables import (
@@ -58,6 +59,8 @@ class RenderScene:
     device: wp.Device
     keep: tuple[wp.Mesh, ...]
     """Owners of the meshes whose handles `meshes` holds."""
+    looks: Looks | None = None
+    """What episodes draw their looks from; the textures' materials are the last rows of `surfaces`."""
 
     @property
     def width(self) -> int:
@@ -156,7 +159,7 @@ def build_meshes(
 
 
 def build_surfaces(shapes: list[TriangleMesh], materials: list[Material], device: wp.Device) -> Any:
-    """The struct `Surfaces`: normals, uv, materials, mip-mapped textures; `materials` ends with the table's, which has no shape."""
+    """The struct `Surfaces`: normals, uv, materials, mip-mapped textures; after those of the shapes, `materials` may have others."""
     chains = map_in_threads(lambda material: mip_levels(material.texture) if material.texture is not None else [], materials)
     depth = max(1, *(len(chain) for chain in chains))
     first_texel = np.zeros((len(chains), depth), dtype=np.int32)
@@ -286,30 +289,35 @@ def shadowed_lamps(settings: schema.Render) -> int:
 
 def build_render_scene(
     settings: schema.Render,
-    tote: schema.Tote,
+    table_height: float,
     catalog: Catalog,
-    fixtures: tuple[Fixture, Fixture, Fixture],
+    fixtures: tuple[Fixture, ...],
     cameras: tuple[Camera, ...],
     lights: tuple[EnvironmentMap, ...],
     device: wp.Device,
+    looks: Looks | None = None,
 ) -> RenderScene:
     """Put all constant data of the renderer on the device.
 
     Args:
         settings: Settings of the renderer.
-        tote: Settings of the tote, which stands on the table.
+        table_height: z of the table, on which the first bin stands [m].
         catalog: The objects; `Snapshot.catalog_index` is the index into it.
-        fixtures: Tote, gripper shaft and cup, each in its own frame.
+        fixtures: Bins, then gripper shaft and cup, each in its own frame.
         cameras: Cameras of one image size; `Views.camera` is the index into it.
         lights: Environment maps; `Snapshot.light` is the index into it.
         device: Device of the arrays.
+        looks: What episodes draw their looks from; None: nothing.
     """
     shapes = [entry.mesh for entry in catalog.entries] + [fixture.mesh for fixture in fixtures]
+    if looks and looks.bin_textures:
+        shapes[len(catalog)] = project_from_box(shapes[len(catalog)])
     table_material = Material(color=settings.table_color, texture=None, metallic=0.0, roughness=TABLE_ROUGHNESS)
     materials = [entry.material for entry in catalog.entries] + [fixture.material for fixture in fixtures] + [table_material]
+    materials += [Material((1.0, 1.0, 1.0), texture, 0.0, 1.0) for texture in (looks.all_textures if looks else ())]
     meshes, keep = build_meshes(shapes, len(catalog), device, fixtures[0].interior)
     table = Table()
-    table.visible, table.height = int(settings.table), -tote.wall
+    table.visible, table.height = int(settings.table), table_height
     ground = srgb_to_linear(np.array(settings.table_color)) if settings.table else None
     paths = PathScene()
     paths.meshes = meshes
@@ -329,4 +337,5 @@ def build_render_scene(
         camera_count=len(cameras),
         device=device,
         keep=keep,
+        looks=looks,
     )

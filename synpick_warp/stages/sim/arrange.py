@@ -23,8 +23,9 @@ def assign_episodes(state: WorldState, episodes: wp.array, tries: int) -> None:
 
 
 def sample_episodes(scene: SceneData, state: WorldState, seed: int) -> None:
-    """Sample mode, objects and light of starting episodes."""
-    for kernel in (arrangement.sample_modes_kernel, arrangement.sample_objects_kernel, arrangement.sample_lights_kernel):
+    """Sample mode, bin, objects and light of starting episodes."""
+    kernels = (arrangement.sample_modes_kernel, arrangement.sample_bins_kernel, arrangement.sample_objects_kernel)
+    for kernel in (*kernels, arrangement.sample_lights_kernel):
         launch(kernel, len(state.phase), scene, state, seed=wp.uint64(seed))
 
 
@@ -57,7 +58,7 @@ def sample_episodes_ahead(config: Config, catalog: Catalog, episodes: np.ndarray
     objects.count = len(catalog)
     objects.volume = wp.array([entry.volume for entry in catalog.entries], dtype=float, device=device)
     objects.compound = wp.zeros(len(catalog), dtype=int, device=device)
-    drop = drop_data(config.arrangement, config.render, config.tote, config.pick, config.move, config.physics.gravity, 1)
+    drop = drop_data(config.arrangement, config.render, config.pick, config.move, config.physics.gravity, 1)
     index, slot = (wp.empty((count, layout.instances), dtype=wp.int32, device=device) for _ in range(2))
     wp.launch(
         arrangement.sample_objects_kernel,
@@ -70,7 +71,7 @@ def sample_episodes_ahead(config: Config, catalog: Catalog, episodes: np.ndarray
 
 
 def drop_objects(scene: SceneData, state: WorldState, physics: Physics, seed: int) -> None:
-    """Reset free worlds, stack sampled objects above the tote, and load variants and joint coordinates into the physics."""
+    """Reset free worlds, stack sampled objects above the bin, and load variants and joint coordinates into the physics."""
     sources = (scene, state, physics.state, physics.control)
     launch(arrangement.reset_worlds_kernel, len(state.phase), *sources)
     launch(arrangement.drop_objects_kernel, len(state.phase), *sources, seed=wp.uint64(seed))
@@ -89,7 +90,7 @@ def measure_displacement(scene: SceneData, state: WorldState, physics: Physics) 
 
 
 def judge_settling(scene: SceneData, state: WorldState, physics: Physics, seed: int) -> None:
-    """Re-drop objects that left the tote or are stuck, count ticks at rest, and begin phase ACT in worlds at rest."""
+    """Re-drop objects that left the bin or are stuck, count ticks at rest, and begin phase ACT in worlds at rest."""
     measure_penetration(state, physics)
     measure_displacement(scene, state, physics)
     launch(rest.redrop_objects_kernel, len(state.phase), scene, state, physics.state, seed=wp.uint64(seed))
@@ -103,7 +104,7 @@ def judge_episodes(scene: SceneData, state: WorldState, attempts: AttemptState, 
     launch(endings.judge_episodes_kernel, len(state.phase), scene, state, physics.state, **overflows)
 
 
-def set_guides(scene: SceneData, state: WorldState, physics: Physics) -> None:
-    """Enable guide walls while a world's objects fall, disable them afterwards."""
-    dim = (len(state.phase), scene.guide_shapes.shape[0])
-    launch(rest.set_guides_kernel, dim, scene, state, shape_transform=physics.model.shape_transform)
+def place_bins(scene: SceneData, state: WorldState, physics: Physics) -> None:
+    """Place the collision shapes of each world's bin, and its guide walls while objects fall."""
+    dim = (len(state.phase), scene.bins.shape.shape[0])
+    launch(rest.place_bins_kernel, dim, scene, state, shape_transform=physics.model.shape_transform)

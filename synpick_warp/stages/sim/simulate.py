@@ -92,6 +92,8 @@ class Simulation:
         self.episodes = wp.array(indices, dtype=wp.int32, device=device)
         sizes = world_sizes(config.bake.worlds, config.arrangement.max_objects, config.move.rounds, built.layout.bodies_per_world)
         self.state, self.attempts, self.seals, self.last, record = allocate_worlds(sizes, device)
+        self.state.bin_pose.fill_(wp.transform_identity())
+        self.scene.bins.chosen, self.scene.bins.pose = self.state.bin, self.state.bin_pose
         self.observation, self.plan = record.observation, record.plan
         self.recorder: StepRecorder | None = None
         if records_physics:
@@ -106,7 +108,7 @@ class Simulation:
                 raise ValueError("episodes that pick need a render_scene for perception")
             self.suction = Suction(config.suction, catalog, render_scene, device)
             state = (self.scene, self.state, self.attempts, self.observation, self.plan)
-            self.perception = Perception(config.perception, config.cameras, config.bake.seed, render_scene, *state)
+            self.perception = Perception(config.perception, config.rig, config.bake.seed, render_scene, *state)
 
     def tick(self) -> None:
         """Advance all worlds by one tick; `record` has its output."""
@@ -152,7 +154,7 @@ class Simulation:
         arrange.assign_episodes(state, self.episodes, self.config.settle.tries)
         arrange.sample_episodes(scene, state, seed)
         arrange.drop_objects(scene, state, physics, seed)
-        arrange.set_guides(scene, state, physics)
+        arrange.place_bins(scene, state, physics)
         gripper.set_shaft_collision(scene, state, physics)
         gripper.clear_seals(state, self.seals)
         self.seals.peak_force.zero_()
@@ -163,7 +165,7 @@ class Simulation:
         """Update phases and tasks after physics, remove objects that were picked or lost, and end episodes."""
         state, scene, physics, seed = self.state, self.scene, self.physics, self.config.bake.seed
         arrange.judge_settling(scene, state, physics, seed)
-        arrange.set_guides(scene, state, physics)
+        arrange.place_bins(scene, state, physics)
         gripper.begin_moving(scene, state, physics, seed)
         gripper.begin_picking(scene, state, self.attempts, self.observation, self.plan, physics)
         gripper.remove_lost(scene, state, self.attempts, self.seals, physics)
@@ -190,12 +192,13 @@ class Simulation:
     def _take_snapshot(self) -> None:
         """Copy the state of the worlds into the snapshot of the record, with the previous frame beside it, and pack the status rows."""
         state, snapshot, status, worlds = self.state, self.record.snapshot, self.record.status, self.layout.worlds
-        launch(pack.take_snapshot_kernel, worlds, self.scene, state, self.attempts, self.physics.state, out=snapshot)
+        launch(pack.take_snapshot_kernel, worlds, self.scene, state, self.attempts, self.physics.state, now=_frame_poses(snapshot))
         tables = {"status_out": status.table, "measure_out": status.measures}
         launch(pack.pack_status_kernel, worlds, state, self.attempts, self.seals, live=snapshot.live, target=self.plan.target, **tables)
         outputs = [_frame_poses(self.last), snapshot.follows, snapshot.last_catalog_index, snapshot.last_pose, snapshot.last_fixture_pose]
         outputs += [snapshot.last_fixture_visible]
         wp.launch(pack.link_frames_kernel, dim=worlds, inputs=[_frame_poses(snapshot)], outputs=outputs, device=self.device)
+        wp.copy(snapshot.bin, state.bin)
         wp.copy(snapshot.light, state.light)
         wp.copy(snapshot.light_yaw, state.light_yaw)
         wp.copy(snapshot.light_exposure, state.light_exposure)

@@ -10,7 +10,7 @@ from synpick_warp.codes import Measure, Status
 from synpick_warp.stages.arrays import device_array
 from synpick_warp.stages.buffers import FIXTURES
 
-# Waypoints of a round of moving: the corners of the tote.
+# Waypoints of a round of moving: the corners of a compartment.
 CORNERS = 4
 
 
@@ -32,6 +32,10 @@ class WorldState:
     """Position in the bake's list of episodes of the next one to start."""
     progress: wp.array = device_array("world", dtype=wp.vec4i)
     """Ticks since the drop, ticks at rest, number of re-drops, 1 while the guide walls stand."""
+    bin: wp.array = device_array("world", dtype=wp.int32)
+    """Bin of the episode."""
+    bin_pose: wp.array = device_array("world", dtype=wp.transformf, unit="m")
+    """Bin to world."""
     catalog_index: wp.array = device_array("world", "instance", dtype=wp.int32)
     """Object of each instance; -1: none."""
     body_slot: wp.array = device_array("world", "instance", dtype=wp.int32)
@@ -51,7 +55,7 @@ class WorldState:
     frame: wp.array = device_array("world", dtype=wp.int32)
     """Frame index since phase ACT began; -1: not yet."""
     corner_order: wp.array = device_array("world", "waypoint", dtype=wp.int32)
-    """Tote corner, 0 to 3, of each waypoint."""
+    """Corner, 0 to 3, of each waypoint, plus 4 times the compartment."""
     waypoint: wp.array = device_array("world", dtype=wp.int32)
     """Waypoints that the setpoint has reached."""
     setpoint: wp.array = device_array("world", dtype=wp.vec3f, unit="m")

@@ -130,7 +130,8 @@ def test_the_simulated_model_has_the_same_shapes(read, device):
     built = build.build_model(usd_sets.settings(bake__worlds=1, arrangement__max_objects=4), CATALOG, device)
     model, layout = built.model, built.layout
     bodies = model.shape_body.numpy()
-    still = [shape for shape in np.flatnonzero(bodies == -1) if shape not in layout.guide_shapes]
+    guides = [part.shape for part in layout.parts if part.guide]
+    still = [shape for shape in np.flatnonzero(bodies == -1) if shape not in guides]
     assert len(still) == len(colliders(read, -1))
     mass = model.body_mass.numpy()[: build.GRIPPER_BODIES]
     np.testing.assert_allclose(mass, [read.body_mass[body_of(read, f"Gripper/{name}")] for name in ("Finger", "Cup")])

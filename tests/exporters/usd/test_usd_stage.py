@@ -25,7 +25,7 @@ from tests.exporters.usd.test_exr import decode
 from tests.worlds import usd_sets
 
 SETTINGS = usd_sets.settings()
-LENSES = make_cameras(SETTINGS.cameras)
+LENSES = make_cameras(SETTINGS.rig)
 TICKS = usd_sets.episode_ticks(0)
 ROWS = 64
 
@@ -43,7 +43,9 @@ def open_episode(rows: np.ndarray, cameras=LENSES, lights: tuple[EnvironmentMap,
     """Open the stage of an episode, without its assets."""
     stage_lights = tuple(make_stage_light(index, light, 1.0) for index, light in enumerate(lights))
     metadata = EpisodeMetadata(0, 0, len(rows), "emptied")
-    layer = make_episode_layer(rows, metadata, EpisodeSettings(15.0, 9.81, cameras, stage_lights, {1: "one", 2: "two", 3: "three"}))
+    layer = make_episode_layer(
+        rows, metadata, EpisodeSettings(15.0, 9.81, ("tote",), cameras, stage_lights, {1: "one", 2: "two", 3: "three"})
+    )
     for prim in layer.rootPrims["Episode"].nameChildren.values():
         for each in (prim, *prim.nameChildren.values()):
             each.referenceList.ClearEdits()

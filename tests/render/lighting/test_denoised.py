@@ -241,7 +241,7 @@ def test_shadow_at_the_edge_of_a_sunlit_surface_stays_dark(device, turn):
 def test_scratch_has_the_size_of_the_scenes_images(device):
     config = replace(with_render(coarse_pixel=4), cameras=replace(Config().cameras, resolution=(8, 8)))
     scene = build_render_scene(
-        config.render, config.tote, Catalog((entry(sheet(0.1, 0.1)),)), ToyScene([], [], ()).fixtures, (VIEW,), (EVEN,), device
+        config.render, -config.tote.wall, Catalog((entry(sheet(0.1, 0.1)),)), ToyScene([], [], ()).fixtures, (VIEW,), (EVEN,), device
     )
     shading = make_renderer(config, scene, 1, 2).shading
     assert shading.guide.surface.shape == shading.ratios.record.shape == (2, 12, 16)

@@ -9,8 +9,10 @@ import newton
 import numpy as np
 import warp as wp
 
+from synpick_warp.configs.cell import BinSizes
 from synpick_warp.configs.schema import Physics, Tote
-from synpick_warp.scenes.tote import TABLE_SIZE, guide_walls, tote_colliders
+from synpick_warp.scenes.bins import guide_walls
+from synpick_warp.scenes.tote import TABLE_SIZE, tote_colliders
 from synpick_warp.scenes.types import Catalog, CatalogEntry, ConvexPiece
 from synpick_warp.stages.buffers import Snapshot
 
@@ -50,7 +52,7 @@ def build_piles(physics: Physics, tote: Tote, pile: Pile, worlds: int, device: w
     world = newton.ModelBuilder(gravity=(0.0, 0.0, -physics.gravity))
     newton.solvers.SolverSteel.register_custom_attributes(world)
     shape = newton.ModelBuilder.ShapeConfig(density=0.0, mu=physics.friction, gap=physics.gap, restitution=0.0)
-    for piece in (*tote_colliders(tote), *guide_walls(tote, physics.guide_height)):
+    for piece in (*tote_colliders(tote), *guide_walls(BinSizes.of_tote(tote), physics.guide_height)):
         world.add_shape_convex_hull(-1, mesh=_hull(piece), cfg=shape)
     table = wp.transform(wp.vec3(0.0, 0.0, -tote.wall - TABLE_SIZE[2]), wp.quat_identity())
     world.add_shape_box(-1, xform=table, hx=TABLE_SIZE[0], hy=TABLE_SIZE[1], hz=TABLE_SIZE[2], cfg=shape)

@@ -9,8 +9,11 @@ from dataclasses import fields, replace
 import numpy as np
 import warp as wp
 
+from synpick_warp.configs.cell import bin_sizes
+from synpick_warp.configs.rig import Rig
 from synpick_warp.configs.schema import UNOCCLUDED
 from synpick_warp.factory.assembly import Factory, make_renderer
+from synpick_warp.scenes.bins import make_bins
 from synpick_warp.scenes.cameras import make_cameras
 from synpick_warp.scenes.fixtures import make_fixtures
 from synpick_warp.scenes.types import Camera
@@ -34,7 +37,7 @@ def measure_rendering(factory: Factory, min_seconds: float) -> Iterator[Row]:
     """
     cameras, device = factory.cameras, factory.simulation.device
     yield from _measure_size(factory, cameras, max(1, factory.stream.batch // len(cameras)), min_seconds)
-    small = make_cameras(replace(factory.config.cameras, resolution=SMALL_SIZE))
+    small = make_cameras(Rig.of(replace(factory.config.cameras, resolution=SMALL_SIZE)))
     yield from _measure_size(factory, small, SMALL_WORLDS if device.is_cuda else SMALL_WORLDS_CPU, min_seconds)
 
 
@@ -48,7 +51,7 @@ def _measure_size(factory: Factory, cameras: tuple[Camera, ...], worlds: int, mi
     ours = make_views_of(factory, config.render.mode, cameras, snapshot, worlds)
     meshes = [(entry.mesh, entry.material) for entry in factory.catalog.entries]
     table = (float(scene.table.height), config.render.table_color) if config.render.table else None
-    theirs = RayScene(meshes, make_fixtures(config.tote, config.gripper), cameras, table, snapshot, worlds, device)
+    theirs = RayScene(meshes, make_fixtures(make_bins(bin_sizes(config)), config.gripper), cameras, table, snapshot, worlds, device)
 
     def time_view(function: functools.partial[None]) -> float:
         """Time of one view [s]."""

@@ -15,8 +15,10 @@ from newton.sensors import SensorCamera
 from scipy.spatial.transform import Rotation
 
 from synpick_warp.codes import Segment
+from synpick_warp.configs.cell import bin_sizes
 from synpick_warp.configs.schema import Render
 from synpick_warp.factory.assembly import Factory
+from synpick_warp.scenes.bins import make_bins
 from synpick_warp.scenes.fixtures import make_fixtures
 from synpick_warp.scenes.types import Camera, Catalog, Fixture, Material, TriangleMesh
 from synpick_warp.stages.arrays import allocate
@@ -221,7 +223,7 @@ def measure_sensor(factory: Factory, min_seconds: float) -> Iterator[Row]:
     device, snapshot = simulation.device, simulation.record.snapshot
     count = min(factory.stream.batch, simulation.layout.worlds * len(factory.cameras))
     started = time.perf_counter()
-    fixtures = make_fixtures(config.tote, config.gripper)
+    fixtures = make_fixtures(make_bins(bin_sizes(config)), config.gripper)
     table = float(renderer.scene.table.height)
     scene = build_sensor_scene(config.render, factory.catalog, fixtures, factory.cameras, table, snapshot, count, device)
     wp.synchronize_device(device)

@@ -6,6 +6,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from synpick_warp.configs.cell import BinSizes
 from synpick_warp.configs.schema import Tote
 from tools.bench.compare.engines import Engine
 from tools.bench.compare.piles import Pile
@@ -30,7 +31,11 @@ def measure_engine(engine: Engine, tote: Tote, pile: Pile) -> Iterator[Row]:
     yield Row(f"{engine.name}, at rest: median speed", float(np.median(speed)), "mm/s")
     moved = np.linalg.norm(position - pile.pose[:, :3], axis=-1)
     yield Row(f"{engine.name}, at rest: mean distance from the start", 1e3 * float(moved.mean()), "mm")
-    yield Row(f"{engine.name}, at rest: objects in the tote", 100.0 * float(is_inside(tote, position.reshape(-1, 3)).mean()), "%")
+    yield Row(
+        f"{engine.name}, at rest: objects in the tote",
+        100.0 * float(is_inside(BinSizes.of_tote(tote), position.reshape(-1, 3)).mean()),
+        "%",
+    )
 
 
 def _rate(engine: Engine, steps: int) -> float:

@@ -1,0 +1,76 @@
+"""Bins that stand under the cameras: visual mesh with material and empty interior, collision shapes, guide walls."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+
+from synpick_warp.configs.cell import BinSizes, Point
+from synpick_warp.scenes.modelling import Patch, at_height, join, make_mesh, solid
+from synpick_warp.scenes.tote import box_piece, tote_colliders, tote_fixture
+from synpick_warp.scenes.types import ConvexPiece, Fixture, Material
+
+GUIDE_THICKNESS = 0.1
+"""Thickness of the guide walls [m]."""
+BOARD, BOARD_GAP, BOARDS = 0.022, 0.006, 5
+"""Thickness of a pallet's boards (EN 13698-1) [m], gap between those of the deck [m], and their number."""
+RUNNER = 0.16
+"""Width of a pallet's runners, as a fraction of its length."""
+WOOD, WOOD_ROUGHNESS = (0.66, 0.52, 0.36), 0.8
+"""Colour (sRGB) and roughness of a pallet: raw softwood."""
+
+
+@dataclass(frozen=True, eq=False)
+class Bin:
+    """A bin in its own frame: origin at the centre of the inner floor, z up."""
+
+    sizes: BinSizes
+    fixture: Fixture
+    """Visual mesh, material and empty interior."""
+    pieces: tuple[ConvexPiece, ...]
+    """Collision shapes."""
+
+
+def make_bins(sizes: Iterable[BinSizes]) -> tuple[Bin, ...]:
+    """Build bins.
+
+    Raises:
+        ConfigError: The sizes of a bin do not fit each other.
+    """
+    return tuple(Bin(one, tote_fixture(one.shell), tote_colliders(one.shell)) if one.shell else _make_pallet(one) for one in sizes)
+
+
+def _make_pallet(sizes: BinSizes) -> Bin:
+    """Build a pallet of deck boards on three runners; its collision shape is one box. A table has none, and its mesh is never rendered."""
+    length, width = (side / 2 for side in sizes.outer)
+    base = min(sizes.base, -2.0 * BOARD)
+    edges = np.linspace(-width, width + BOARD_GAP, BOARDS + 1)
+    boxes = [((-length, low, -BOARD), (length, high - BOARD_GAP, 0.0)) for low, high in itertools.pairwise(edges.tolist())]
+    # The runners' tops end inside the boards, so that no faces are coplanar.
+    runners = (-length, -RUNNER * length, length - 2 * RUNNER * length)
+    boxes += [((x, -width, base), (x + 2 * RUNNER * length, width, -BOARD / 2)) for x in runners]
+    mesh = make_mesh(join(*(_box_patch(low, high) for low, high in boxes)), centered=False)
+    pieces = (box_piece((-length, -width, base), (length, width, 0.0)),) if sizes.is_visible else ()
+    return Bin(sizes, Fixture(mesh, Material(WOOD, None, 0.0, WOOD_ROUGHNESS)), pieces)
+
+
+def _box_patch(low: Point, high: Point) -> Patch:
+    """Closed surface of the box between two corners."""
+    ring = np.array([(low[0], low[1]), (high[0], low[1]), (high[0], high[1]), (low[0], high[1])])
+    return solid(np.stack([at_height(ring, low[2]), at_height(ring, high[2])]))
+
+
+def guide_walls(sizes: BinSizes, height: float) -> tuple[ConvexPiece, ...]:
+    """Build four temporary walls on the rim, flush with the opening, that keep falling objects over the bin; height [m]."""
+    low = sizes.height
+    x, y = sizes.opening[0] / 2, sizes.opening[1] / 2
+    far_x, far_y, high = x + GUIDE_THICKNESS, y + GUIDE_THICKNESS, low + height
+    return (
+        box_piece((x, -far_y, low), (far_x, far_y, high)),
+        box_piece((-far_x, -far_y, low), (-x, far_y, high)),
+        box_piece((-far_x, y, low), (far_x, far_y, high)),
+        box_piece((-far_x, -far_y, low), (far_x, -y, high)),
+    )

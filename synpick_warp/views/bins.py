@@ -1,0 +1,22 @@
+"""Records of an episode's bin in data sets."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+
+_DIGITS = 6
+
+
+def bin_record(name: str, pose: np.ndarray) -> dict[str, Any]:
+    """Record of a bin: name, position [m] and yaw [rad] in the world, from its pose (7): x, y, z [m], quaternion x, y, z, w."""
+    x, y, z, _, _, sine, cosine = pose.astype(np.float64).tolist()
+    yaw = round(2.0 * math.atan2(sine, cosine), _DIGITS)
+    return {"name": name, "position": [round(part, _DIGITS) for part in (x, y, z)], "yaw": yaw}
+
+
+def bin_noun(name: str) -> str:
+    """Noun for a bin of this name in sentences."""
+    return name if name in ("tote", "table", "pallet") else "bin"

@@ -1,0 +1,108 @@
+"""Bins of worlds: which one an episode draws and where, and that everything in the simulation is in its frame."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from synpick_warp.codes import Mode, Phase, Stream
+from synpick_warp.configs.bins import Bins
+from synpick_warp.stages.sim import arrange, gripper
+from tests.twins import rng
+from tests.worlds.kernel_worlds import BIN, KernelWorlds
+
+SEED, WORLDS = 7, 64
+DROP = {"volume": 10.0, "pick_repeats": 0, "move_repeats": 0}
+PLACES = Bins(shift=(0.1, 0.05), yaw=30.0)
+LOW = dataclasses.replace(BIN, name="low", opening=(0.3, 0.2), height=0.1, base=-0.02, weight=3.0)
+
+
+def started(device, worlds: int = WORLDS, **more) -> KernelWorlds:
+    """Worlds that start episodes of five small objects, with bins drawn."""
+    result = KernelWorlds(
+        device, worlds, objects=5, radius=np.full(5, 0.05), drop={"volume": 10.0, "pick_repeats": 0, "move_repeats": 0}, **more
+    )
+    result.set(result.state.phase, Phase.START)
+    result.set(result.state.arrangement_id, np.stack([np.arange(worlds), np.arange(worlds) % 3], axis=1))
+    arrange.sample_episodes(result.scene, result.state, SEED)
+    return result
+
+
+def test_bin_and_pose_follow_the_law(device):
+    worlds = started(device, bins=(BIN, LOW), places=PLACES)
+    key = np.array([rng.stream_key(SEED, world, world % 3, Stream.BIN) for world in range(WORLDS)])
+    u = [rng.uniform(key, index) for index in range(4)]
+    chosen = (u[0] >= 0.25).astype(int)
+    assert 0 < chosen.sum() < WORLDS
+    np.testing.assert_array_equal(worlds.state.bin.numpy(), chosen)
+    pose = worlds.state.bin_pose.numpy()
+    lift = np.where(chosen == 1, LOW.base - BIN.base, 0.0)
+    np.testing.assert_allclose(pose[:, :3], np.stack([0.1 * (2 * u[1] - 1), 0.05 * (2 * u[2] - 1), lift], axis=1), atol=1e-6)
+    yaw = Rotation.from_quat(pose[:, 3:]).as_euler("xyz")
+    np.testing.assert_allclose(yaw, np.stack([0 * u[3], 0 * u[3], np.radians(30) * (2 * u[3] - 1)], axis=1), atol=1e-6)
+
+
+def test_a_bin_that_does_not_move_is_exactly_at_the_origin(device):
+    pose = started(device).state.bin_pose.numpy()
+    assert pose.tobytes() == np.tile(np.array([0, 0, 0, 0, 0, 0, 1], np.float32), (WORLDS, 1)).tobytes()
+
+
+def test_drops_and_waypoints_are_those_of_a_bin_at_the_origin_moved_with_it(device):
+    """Drop poses and the gripper's first setpoint, in the bin's frame, do not depend on its pose."""
+    found = []
+    for places in (Bins(), PLACES):
+        worlds = started(device, places=places)
+        arrange.drop_objects(worlds.scene, worlds.state, worlds.physics, SEED)
+        drops = worlds.coordinates()
+        worlds.set(worlds.state.phase, Phase.ACT)
+        worlds.set(worlds.state.mode, Mode.MOVE)
+        worlds.set(worlds.state.frame, -1)
+        gripper.begin_moving(worlds.scene, worlds.state, worlds.physics, SEED)
+        pose = worlds.state.bin_pose.numpy().astype(np.float64)
+        back = Rotation.from_quat(pose[:, 3:]).inv()
+        points = [back.apply(each - pose[:, :3]) for each in (*drops[:, :, :3].transpose(1, 0, 2), worlds.state.setpoint.numpy())]
+        turns = [(back * Rotation.from_quat(each)).as_matrix() for each in drops[:, :, 3:].transpose(1, 0, 2)]
+        found.append((np.array(points), np.array(turns)))
+    for first, second in zip(*found, strict=True):
+        np.testing.assert_allclose(first, second, atol=2e-6)
+
+
+@pytest.mark.parametrize(
+    ("sizes", "place", "outside"),
+    [
+        (BIN, (0.24, 0.14, 0.1), False),
+        (BIN, (0.26, 0.0, 0.1), True),
+        (BIN, (0.26, 0.0, 0.3), False),
+        (BIN, (0.0, 0.0, -0.02), True),
+        (dataclasses.replace(BIN, shell=None, height=0.0, margin=0.1), (0.34, 0.0, 0.05), False),
+        (dataclasses.replace(BIN, shell=None, height=0.0, margin=0.1), (0.36, 0.0, 0.05), True),
+        (dataclasses.replace(BIN, shell=None, height=0.0, margin=0.1), (0.0, 0.26, 2.0), True),
+    ],
+)
+def test_what_is_outside_is_outside_in_the_bins_frame(device, sizes, place, outside):
+    worlds = started(device, 1, bins=(sizes,), places=PLACES)
+    arrange.drop_objects(worlds.scene, worlds.state, worlds.physics, SEED)
+    worlds.set(worlds.state.phase, Phase.SETTLE)
+    pose = worlds.state.bin_pose.numpy()[0]
+    inside = np.array([0.0, 0.0, 0.1])
+    for instance in range(5):
+        local = np.array(place) if instance == 2 else inside
+        worlds.place(0, instance, [*(pose[:3] + Rotation.from_quat(pose[3:]).apply(local)), 0.0, 0.0, 0.0, 1.0])
+    worlds.physics.contacts.rigid_contact_max = 0
+    arrange.launch(arrange.rest.redrop_objects_kernel, 1, worlds.scene, worlds.state, worlds.physics.state, seed=np.uint64(SEED))
+    assert worlds.state.progress.numpy()[0, 2] == int(outside)
+
+
+def test_shapes_of_the_drawn_bin_are_at_its_pose_and_all_others_away(device):
+    parts = [(0, 0, False), (1, 0, True), (2, 1, False), (3, 1, True)]
+    worlds = started(device, bins=(BIN, LOW), places=PLACES, parts=parts)
+    worlds.set(worlds.state.progress, [[0, 0, 0, world % 2] for world in range(WORLDS)])
+    arrange.place_bins(worlds.scene, worlds.state, worlds.physics)
+    found = worlds.physics.model.shape_transform.numpy().reshape(WORLDS, -1, 7)
+    for world, (chosen, pose) in enumerate(zip(worlds.state.bin.numpy(), worlds.state.bin_pose.numpy(), strict=True)):
+        for shape, owner, guide in parts:
+            stands = owner == chosen and (not guide or world % 2 == 1)
+            np.testing.assert_array_equal(found[world, shape], pose if stands else [0, 0, arrange.rest.SHAPES_AWAY, 0, 0, 0, 1])
