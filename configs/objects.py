@@ -159,7 +159,7 @@ class ObjectRow:
     """A row of the object table: physical and material properties that model files do not contain."""
 
     REQUIRED: ClassVar = ("id", "diameter")
-    IDENTITY: ClassVar = ("id", "name", "diameter")
+    IDENTITY: ClassVar = ("id", "name", "diameter", "symmetries_discrete", "symmetries_continuous")
     id: int = setting(0, "", "The model's obj_id in its BOP folder.", low=0, high=INT32_MAX)
     name: str = setting(
         "", "", "Name of the object; for meshes that are not BOP models the file name without suffix, by which the row is found."

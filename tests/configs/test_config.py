@@ -403,7 +403,11 @@ def free_settings() -> dict[str, st.SearchStrategy]:
     return {key: values(*pair) for key, pair in free.items() if pair[1] in (float, int, bool, str, tuple[str, ...])}
 
 
-ROW = st.builds(ObjectRow, **{name: values(*pair) for name, pair in settings_of(ObjectRow).items()})
+TURNS = {
+    "symmetries_discrete": st.sampled_from([(), ((0.0, 0.0, 1.0, 4.0), (1.0, 0.0, 0.0, 2.0, 0.0, 0.1, 0.0))]),
+    "symmetries_continuous": st.sampled_from([(), ((0.0, 1.0, 0.5),), ((0.0, 1.0, 0.0, 0.1, 0.0, 0.0),)]),
+}
+ROW = st.builds(ObjectRow, **{name: values(*pair) for name, pair in settings_of(ObjectRow).items()} | TURNS)
 ROWS = st.lists(ROW, max_size=3, unique_by=lambda row: row.id)
 WORD = st.text(st.characters(exclude_categories=["Cc", "Cs", "Zl", "Zp"]), max_size=20)
 ANYTHING = st.one_of(st.none(), st.integers(), st.floats(), TEXT, st.lists(st.integers(), max_size=3))
