@@ -32,6 +32,7 @@ Pixel = tuple[float, float]
 """Column and row in the perception image; integers are pixel centres."""
 _Value = bool | int | float | str | None
 _Section = dict[str, _Value | list[_Value | list[_Value]]]
+_Row = dict[str, _Value | list[_Value | list[_Value]] | _Section]
 """Settings of a section, or of an object row."""
 _Schema = TypeVar("_Schema", bound=msgspec.Struct)
 
@@ -43,7 +44,7 @@ class Manifest(msgspec.Struct):
     seed: int
     versions: dict[str, str]
     settings_checksum: str
-    settings: dict[str, _Section | list[_Section]]
+    settings: dict[str, _Section | list[_Row]]
     inputs: dict[str, str] = msgspec.field(default_factory=dict)
 
 

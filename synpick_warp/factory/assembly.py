@@ -30,9 +30,10 @@ from synpick_warp.scenes.lights import load_lights
 from synpick_warp.scenes.types import Camera, Catalog, EnvironmentMap
 from synpick_warp.stages.host_copies import host_images
 from synpick_warp.stages.render.renderer import Renderer
-from synpick_warp.stages.render.scene import RenderScene, build_render_scene
+from synpick_warp.stages.render.scene import RenderScene, build_render_scene, with_cameras
 from synpick_warp.stages.sim.simulate import Simulation
-from synpick_warp.stages.stream import FrameStream, LightTable, name_lights, view_sizes
+from synpick_warp.stages.stream import FrameStream, LightTable, name_lights
+from synpick_warp.stages.view_ring import CameraGroup, ViewRing, view_sizes
 from synpick_warp.system.hardware.device import pick_device
 from synpick_warp.system.processes.garbage import collection_paused
 from synpick_warp.system.progress import Progress, SilentProgress
@@ -48,9 +49,8 @@ class Stages:
     cameras: tuple[Camera, ...]
     lights: tuple[EnvironmentMap, ...]
     simulation: Simulation
-    renderer: Renderer
-    sizes: dict[str, int]
-    """Extents by `view_sizes`."""
+    groups: tuple[CameraGroup, ...]
+    """The cameras by image size, with their renderers."""
     object_ids: np.ndarray
     """obj_id of each catalog entry (entry) int32."""
     light_table: LightTable
@@ -148,9 +148,11 @@ def build_smallest(config: Config, device: wp.Device, progress: Progress, record
 def _add_stream(stages: Stages, device: wp.Device, needs_images: bool, depth_files: bool) -> Factory:
     """Add a stream of views to stages; arguments as of `host_images`."""
     config, table, tick_time = stages.config, stages.light_table, stages.tick_time
-    host = host_images(config.bop, config.rig.largest[1], device, needs_images, depth_files)
-    layers, cameras, ids = config.render.layers, len(stages.cameras), stages.object_ids
-    stream = FrameStream(stages.sizes, layers, cameras, tick_time, stages.renderer, ids, table, device, host)
+    rings = [
+        ViewRing(group, config.render.layers, device, host_images(config.bop, group.sizes["row"], device, needs_images, depth_files))
+        for group in stages.groups
+    ]
+    stream = FrameStream(rings, tick_time, stages.object_ids, table, device)
     return Factory(**vars(stages), stream=stream, log=stages.make_log())
 
 
@@ -175,12 +177,18 @@ def build_stages(
     progress.stage(f"building {config.bake.worlds} worlds of {len(catalog)} objects on {device.alias}")
     scene = build_render_scene(config.render, config.tote, catalog, fixtures, cameras, lights, device)
     simulation = Simulation(config, catalog, len(lights), device, scene, episodes, records_physics)
-    sizes = view_sizes(config.render, config.rig, config.bake.worlds, config.arrangement.max_objects, device)
-    histories = simulation.layout.worlds * len(cameras)
-    renderer = make_renderer(config, scene, config.arrangement.max_objects, sizes["view"], histories)
+    groups = tuple(_build_group(config, scene, cameras, index) for index in range(len(config.rig.groups)))
     object_ids = np.array([entry.obj_id for entry in catalog.entries], dtype=np.int32)
     table = name_lights([light.name for light in lights], scene.lights)
-    return Stages(config, catalog, cameras, lights, simulation, renderer, sizes, object_ids, table)
+    return Stages(config, catalog, cameras, lights, simulation, groups, object_ids, table)
+
+
+def _build_group(config: Config, scene: RenderScene, cameras: tuple[Camera, ...], index: int) -> CameraGroup:
+    """Renderer of a group of cameras, for `bake.worlds` worlds; they share all constant data but the cameras."""
+    indices, worlds, objects = config.rig.groups[index], config.bake.worlds, config.arrangement.max_objects
+    sizes = view_sizes(config.render, config.rig, worlds, objects, scene.device, index)
+    scene = with_cameras(scene, tuple(cameras[camera] for camera in indices))
+    return CameraGroup(indices, sizes, make_renderer(config, scene, objects, sizes["view"], worlds * len(indices)))
 
 
 def _fit_to_catalog(config: Config, catalog: Catalog, device: wp.Device, progress: Progress) -> Config:

@@ -25,8 +25,9 @@ from typing import Any
 import msgspec
 
 from synpick_warp import __version__
-from synpick_warp.configs.load import load_config, override_config
+from synpick_warp.configs.load import load_config, override_config, table_lists
 from synpick_warp.configs.schema import CLASSIC, WITHIN, Config
+from synpick_warp.configs.table_lists import given_values
 from synpick_warp.dataset.records import Entry, EpisodeEntry, IndicesEntry, Manifest, read_record
 from synpick_warp.errors import DatasetError
 from synpick_warp.exporters.formats import FORMAT_TABLE
@@ -67,7 +68,7 @@ YOUNGER_SETTINGS: dict[str, Any] = {
     "bop.keypoints": 0,
     "arrangement.fill": WITHIN,
     "perception.camera": "",
-    "camera": (),
+    "camera": [],
 }
 """Settings that older manifests lack, and what held before: left out where they have these values, so that older data sets can still be
 read, and resumed with them."""
@@ -107,6 +108,8 @@ def fixed_settings(config: Config) -> dict[str, Any]:
     Nested; formats sorted by name.
     """
     settings = dataclasses.asdict(config)
+    for name in table_lists():
+        settings[name] = [given_values(row) for row in getattr(config, name)]
     for key in FREE_SETTINGS:
         section, name = key.split(".")
         del settings[section][name]
