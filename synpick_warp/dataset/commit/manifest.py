@@ -26,10 +26,11 @@ import msgspec
 
 from synpick_warp import __version__
 from synpick_warp.configs.bins import Bins
-from synpick_warp.configs.load import load_config, override_config
+from synpick_warp.configs.load import load_config, override_config, table_lists
 from synpick_warp.configs.objects import AUTO_UNIT, Objects
 from synpick_warp.configs.randomize import Distribution, Randomize
 from synpick_warp.configs.schema import CLASSIC, WITHIN, Config
+from synpick_warp.configs.table_lists import given_values
 from synpick_warp.dataset.records import Entry, EpisodeEntry, IndicesEntry, Manifest, read_record
 from synpick_warp.errors import DatasetError
 from synpick_warp.exporters.formats import FORMAT_TABLE
@@ -79,7 +80,7 @@ YOUNGER_SETTINGS: dict[str, Any] = {
     "bop.keypoints": 0,
     "arrangement.fill": WITHIN,
     "perception.camera": "",
-    "camera": (),
+    "camera": [],
     "objects.unit": AUTO_UNIT,
     "objects.symmetries": Objects().symmetries,
     "objects.symmetry_tolerance": Objects().symmetry_tolerance,
@@ -126,6 +127,8 @@ def fixed_settings(config: Config) -> dict[str, Any]:
     Nested; formats sorted by name.
     """
     settings = dataclasses.asdict(config)
+    for name in table_lists():
+        settings[name] = [given_values(row) for row in getattr(config, name)]
     settings["randomize"] = {item.name: _plain(getattr(config.randomize, item.name)) for item in dataclasses.fields(Randomize)}
     for key in FREE_SETTINGS:
         section, name = key.split(".")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import cv2
@@ -214,6 +214,12 @@ def build_cameras(cameras: tuple[Camera, ...], device: wp.Device) -> Any:
     result.center = wp.array(-np.einsum("kji,kj->ki", rotation, translation), dtype=wp.vec3d, device=device)
     result.to_world = wp.array(rotation.transpose(0, 2, 1), dtype=wp.mat33, device=device)
     return result
+
+
+def with_cameras(scene: RenderScene, cameras: tuple[Camera, ...]) -> RenderScene:
+    """The same scene with other cameras, of one image size."""
+    grid = build_grid(cameras[0].width, cameras[0].height)
+    return replace(scene, cameras=build_cameras(cameras, scene.device), grid=grid, camera_count=len(cameras))
 
 
 def build_grid(width: int, height: int) -> Any:
