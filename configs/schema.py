@@ -8,10 +8,10 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, ClassVar
 
 from synpick_warp.codes import Tone, names
-from synpick_warp.configs.bins import Bins, Tote
+from synpick_warp.configs.bins import BinRow, Bins, Tote
 from synpick_warp.configs.fields import INT32_MAX, setting
 from synpick_warp.configs.manipulation import Move, Perception, Pick, Suction, Target
 from synpick_warp.configs.sensors import DepthSensor, Effects
@@ -136,6 +136,8 @@ class Objects:
 class ObjectRow:
     """A row of the object table: physical and material properties that model files do not contain."""
 
+    REQUIRED: ClassVar = ("id", "diameter")
+    IDENTITY: ClassVar = ("id", "name", "diameter")
     id: int = setting(0, "", "The model's obj_id in its BOP folder.", low=0, high=INT32_MAX)
     name: str = setting(
         "", "", "Name of the object; for meshes that are not BOP models the file name without suffix, by which the row is found."
@@ -456,6 +458,7 @@ class Config:
     depth_sensor: DepthSensor = field(default_factory=DepthSensor)
     bop: Bop = field(default_factory=Bop)
     trajectory: Trajectory = field(default_factory=Trajectory)
+    bin: tuple[BinRow, ...] = ()
     object_rows: tuple[ObjectRow, ...] = ()
     splits: tuple[Split, ...] = ()
     """Resolved splits, by first episode; empty: one split, bop.split, of bake.episodes episodes."""

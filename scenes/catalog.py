@@ -59,7 +59,8 @@ def load_catalog(config: Config, cache_dir: Path | None = None, report: Callable
     """
     rules = _Rules(config.objects, config.object_rows, bin_sizes(config))
     faults = _Faults(config.objects.strict, config.bake.models, report)
-    raws = _read_folder(Path(config.bake.models).expanduser(), rules, report, faults) if config.bake.models else procedural_objects()
+    folder = Path(config.bake.models).expanduser()
+    raws = _read_folder(folder, rules, report, faults) if config.bake.models else _embedded_objects(rules, faults)
     recipes = [shape_recipe(raw, config.objects) for raw in raws]
     names, meshes = [raw.name for raw in raws], [raw.mesh for raw in raws]
     seconds = config.objects.decomposition_time
@@ -100,7 +101,8 @@ class _Faults:
         if len(self._errors) == 1:
             return self._errors[0]
         count = len(self._errors)
-        return CatalogError(f"models folder {self._folder}: none of its {count} objects can be used; the first: {self._errors[0]}")
+        folder = f"models folder {self._folder}" if self._folder else "the embedded objects"
+        return CatalogError(f"{folder}: none of its {count} objects can be used; the first: {self._errors[0]}")
 
 
 @dataclass(frozen=True)
@@ -135,6 +137,21 @@ def _read_folder(folder: Path, rules: _Rules, report: Callable[[str], None], fau
             raw, lines = result
             for line in lines:
                 report(line)
+            raws.append(raw)
+    if not raws:
+        raise faults.summary()
+    return raws
+
+
+def _embedded_objects(rules: _Rules, faults: _Faults) -> list[RawObject]:
+    """Embedded objects that fit into the bins, ordered by obj_id."""
+    raws = []
+    for raw in procedural_objects():
+        try:
+            _check_size(raw, raw.name, rules.bins)
+        except CatalogError as error:
+            faults.add(error)
+        else:
             raws.append(raw)
     if not raws:
         raise faults.summary()
@@ -234,8 +251,8 @@ def _check_fits_bin(vertices: np.ndarray, size: float, origin: str, sizes: BinSi
     It passes if the two smaller sides of a bounding box are at most as long as the opening's. The axis-aligned box is tried first, since
     the minimum oriented bounding box takes long to compute for fine meshes.
     """
-    inside = float(np.linalg.norm((*sizes.opening, sizes.height))) if sizes.shell else np.inf
-    opening = sorted(sizes.opening)
+    inside = float(np.linalg.norm((*sizes.mouth, sizes.height))) if sizes.shell else np.inf
+    opening = sorted(sizes.mouth)
     box = sorted(np.ptp(vertices, axis=0).tolist())
     if size <= inside and box[0] <= opening[0] and box[1] <= opening[1]:
         return

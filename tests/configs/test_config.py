@@ -42,7 +42,7 @@ COUPLED = {
     "suction.good_force",
     "suction.poor_force",
 }
-COUPLED_SECTIONS = {"tote", "cameras", "settle", "physics"}
+COUPLED_SECTIONS = {"tote", "bins", "cameras", "settle", "physics"}
 """Settings with constraints between them: independent random values mostly violate these."""
 
 
@@ -77,7 +77,7 @@ def test_object_rows_have_the_diameters_of_the_real_models(real_models):
 
 
 def test_other_presets_build_on_the_default_preset():
-    assert preset_names() == ["smoke", "synpick", "synpick-hard", "synpick-released", "synpick-test"]
+    assert preset_names() == ["smoke", "synpick", "synpick-hard", "synpick-released", "synpick-test", "tabletop"]
     released = load_config("synpick-released", {})
     assert released.move.damping == 1.0
     assert released.object_rows == load_config(None, {}).object_rows

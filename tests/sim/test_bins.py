@@ -22,9 +22,7 @@ LOW = dataclasses.replace(BIN, name="low", opening=(0.3, 0.2), height=0.1, base=
 
 def started(device, worlds: int = WORLDS, **more) -> KernelWorlds:
     """Worlds that start episodes of five small objects, with bins drawn."""
-    result = KernelWorlds(
-        device, worlds, objects=5, radius=np.full(5, 0.05), drop={"volume": 10.0, "pick_repeats": 0, "move_repeats": 0}, **more
-    )
+    result = KernelWorlds(device, worlds, objects=5, radius=np.full(5, 0.05), drop=DROP, **more)
     result.set(result.state.phase, Phase.START)
     result.set(result.state.arrangement_id, np.stack([np.arange(worlds), np.arange(worlds) % 3], axis=1))
     arrange.sample_episodes(result.scene, result.state, SEED)
@@ -106,3 +104,45 @@ def test_shapes_of_the_drawn_bin_are_at_its_pose_and_all_others_away(device):
         for shape, owner, guide in parts:
             stands = owner == chosen and (not guide or world % 2 == 1)
             np.testing.assert_array_equal(found[world, shape], pose if stands else [0, 0, arrange.rest.SHAPES_AWAY, 0, 0, 0, 1])
+
+
+def test_objects_fall_over_their_compartments_and_rounds_take_them_in_turn(device):
+    sizes = dataclasses.replace(BIN, floor=(0.5, 0.3), compartments=(3, 2))
+    worlds = started(device, bins=(sizes,))
+    arrange.drop_objects(worlds.scene, worlds.state, worlds.physics, SEED)
+    place = worlds.coordinates()[:, :, :2]
+    apart = np.abs(place[:, :, None] - np.array(sizes.centers)) - (np.array(sizes.cell) / 2 - 0.05)
+    there = (apart < 1e-6).all(axis=3)
+    assert (there.sum(axis=2) == 1).all()
+    key = np.array([rng.stream_key(SEED, world, world % 3, Stream.COMPARTMENT) for world in range(WORLDS)])
+    expected = np.stack([rng.uniform_index(key, instance, 6) for instance in range(5)], axis=1)
+    slots = worlds.state.body_slot.numpy()
+    np.testing.assert_array_equal(np.take_along_axis(there.argmax(axis=2), slots, axis=1), expected)
+    worlds.set(worlds.state.phase, Phase.ACT)
+    worlds.set(worlds.state.mode, Mode.MOVE)
+    worlds.set(worlds.state.frame, -1)
+    gripper.begin_moving(worlds.scene, worlds.state, worlds.physics, SEED)
+    compartment = worlds.state.corner_order.numpy().reshape(WORLDS, -1, 4) // 4
+    assert (compartment == compartment[:, :, :1]).all()
+    assert ((compartment[:, 1, 0] - compartment[:, 0, 0]) % 6 == 1).all()
+    assert len(np.unique(compartment)) == 6
+
+
+def test_the_gripper_passes_over_dividers_and_nowhere_below_the_rim_through_them(device):
+    sizes = dataclasses.replace(BIN, floor=(0.5, 0.3), compartments=(2, 1))
+    worlds = started(device, 1, bins=(sizes,), places=PLACES, move={"speed": 2.0})
+    worlds.set(worlds.state.phase, Phase.ACT)
+    worlds.set(worlds.state.mode, Mode.MOVE)
+    worlds.set(worlds.state.frame, -1)
+    gripper.begin_moving(worlds.scene, worlds.state, worlds.physics, SEED)
+    points = [worlds.state.setpoint.numpy()[0].copy()]
+    while worlds.state.waypoint.numpy()[0] < worlds.scene.move.waypoints:
+        gripper.launch(gripper.gripper.advance_setpoints_kernel, 1, worlds.scene, worlds.state, worlds.attempts, worlds.plan)
+        points.append(worlds.state.setpoint.numpy()[0].copy())
+        assert len(points) < 5000
+    pose = worlds.state.bin_pose.numpy()[0].astype(np.float64)
+    local = Rotation.from_quat(pose[3:]).inv().apply(np.array(points) - pose[:3]) - (0.0, 0.0, worlds.scene.move.tcp_offset)
+    crossing = np.flatnonzero(np.diff(np.sign(local[:, 0])))
+    assert len(crossing) == 1
+    assert (local[crossing[0] : crossing[0] + 2, 2] > sizes.height + 0.049).all()
+    assert np.linalg.norm(np.diff(points, axis=0), axis=1).max() < 2.0 * 2e-3 + 1e-6

@@ -81,7 +81,6 @@ def set_up_views_kernel(
     rotation = wp.quat_to_matrix(wp.normalize(wp.quatd(wp.float64(q[0]), wp.float64(q[1]), wp.float64(q[2]), wp.float64(q[3]))))
     to_camera = cameras.rotation[camera] * rotation
     origin = cameras.rotation[camera] * (position - cameras.center[camera])
-
     c = meshes.center[mesh]
     center = wp.vec3d(wp.float64(c[0]), wp.float64(c[1]), wp.float64(c[2]))
     radius = meshes.radius[mesh]

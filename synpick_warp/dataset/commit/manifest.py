@@ -64,7 +64,7 @@ FREE_SETTINGS = (
 """Settings that may differ when a bake is resumed: no episode depends on them. Objects and lights are compared by content, not by the name
 of their folder. A device of another type computes the same episodes up to rounding."""
 YOUNGER_BINS = {f"bins.{item.name}": item.default for item in dataclasses.fields(Bins)}
-YOUNGER_SETTINGS: dict[str, Any] = {"bop.layout": CLASSIC, "bop.keypoints": 0, "arrangement.fill": WITHIN, **YOUNGER_BINS}
+YOUNGER_SETTINGS: dict[str, Any] = {"bop.layout": CLASSIC, "bop.keypoints": 0, "arrangement.fill": WITHIN, **YOUNGER_BINS, "bin": ()}
 """Settings that older manifests lack, and what held before: left out where they have these values, so that older data sets can still be
 read, and resumed with them."""
 PACKAGES = ("warp-lang", "newton", "numpy", "scipy", "coacd", "opencv-python-headless", "isal", "orjson", "usd-core", "zarr")
@@ -107,9 +107,10 @@ def fixed_settings(config: Config) -> dict[str, Any]:
         section, name = key.split(".")
         del settings[section][name]
     for key, before in YOUNGER_SETTINGS.items():
-        section, name = key.split(".")
-        if settings[section][name] == before:
-            del settings[section][name]
+        *sections, name = key.split(".")
+        table = settings[sections[0]] if sections else settings
+        if table[name] == before:
+            del table[name]
     settings = {section: values for section, values in settings.items() if values != {}}
     settings["bake"]["formats"] = sorted(set(config.bake.formats))
     for split in settings["splits"]:
@@ -168,7 +169,8 @@ def read_settings(folder: Path, manifest: Mapping[str, Any]) -> Config:
     path = path_inside(folder, CONFIG_FILE, folder, DatasetError)
     check_regular_file(path, MAX_TOML, DatasetError)
     settings = manifest["settings"]
-    before = {key: value for key, value in YOUNGER_SETTINGS.items() if key.split(".")[1] not in settings.get(key.split(".")[0], {})}
+    younger = {key: value for key, value in YOUNGER_SETTINGS.items() if "." in key}
+    before = {key: value for key, value in younger.items() if key.split(".")[1] not in settings.get(key.split(".")[0], {})}
     config = override_config(load_config(str(path), {}), before)
     said = describe_differences({"settings": make_manifest(config)["settings"]}, {"settings": settings})
     if said:
@@ -180,8 +182,9 @@ def differences(here: Mapping[str, Any], there: Mapping[str, Any], path: str = "
     """Compare two manifests: yields (key, value here, value there) of each difference; None: no such key."""
     for name in [*here, *(name for name in there if name not in here)]:
         first, second = here.get(name), there.get(name)
-        if isinstance(first, Mapping) and isinstance(second, Mapping):
-            yield from differences(first, second, f"{path}{name}.")
+        if isinstance(first, Mapping | None) and isinstance(second, Mapping | None):
+            # A section of which one has no key, since all have their old values.
+            yield from differences(first or {}, second or {}, f"{path}{name}.")
         elif first != second:
             yield f"{path}{name}", first, second
 
