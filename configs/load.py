@@ -21,6 +21,7 @@ from synpick_warp.system.inputs.toml import decode_toml, read_toml
 DEFAULT_PRESET = "synpick"
 COMMAND_LINE = "on the command line"
 """Source of settings that come as options, in error messages."""
+CAMERA = "camera"
 _OFFERED = "offered splits"
 """Key of the splits of a preset, which hold only if they are asked for."""
 _BASE = "preset"
@@ -277,7 +278,20 @@ def _build(values: Values, override: str) -> Config:
         for section, kind in sections().items()
     }
     parts |= {name: values[name][0] for name in table_lists() if name in values}
+    _check_sole_cameras(values, override)
     return Config(**parts, splits=splits)
+
+
+def _check_sole_cameras(values: Values, override: str) -> None:
+    """Raise ConfigError if [cameras] and [[camera]] are set in one place, where one of both would be of no effect."""
+    rows, source = values.get(CAMERA, ((), ""))
+    for key, (value, origin) in values.items():
+        section, _, name = key.partition(".")
+        is_default = name == "resolution" and any(row.resolution is None for row in rows)
+        if rows and section == "cameras" and origin in (source, override) and not is_default:
+            raise ConfigError(
+                f"{key} is {format_value(value)} {origin}; allowed: none, as the [[{CAMERA}]] tables have values of their own"
+            )
 
 
 def _value_of(config: Config, key: str) -> Any:

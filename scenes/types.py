@@ -189,3 +189,6 @@ class Camera:
     """World-to-camera rotation (3, 3) float64."""
     translation: np.ndarray
     """World-to-camera translation (3) float64 [m]."""
+    name: str = ""
+    lens: object | None = None
+    """Distortion of the lens; None: a pinhole."""

@@ -1,4 +1,4 @@
-"""Perception images: G-buffers of camera 0 without the gripper, for batches of worlds, entirely on the device."""
+"""Perception images: G-buffers of one camera without the gripper, for batches of worlds, entirely on the device."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from typing import Any
 import warp as wp
 
 from synpick_warp.configs import schema
+from synpick_warp.configs.rig import Rig, resized
 from synpick_warp.errors import ConfigError
 from synpick_warp.kernels.perception.exact_hits import intersect_hits_kernel
 from synpick_warp.kernels.render.visibility.camera import TILE_PIXELS
@@ -19,7 +20,7 @@ from synpick_warp.stages.launch import launch_pixels
 from synpick_warp.stages.perception.arrays import PerceptionArrays, SegmentationScratch
 from synpick_warp.stages.render.raster import Rasterizer, allocate_visibility
 from synpick_warp.stages.render.scene import RenderScene, build_cameras, build_grid
-from synpick_warp.stages.render.view_setup import GBUFFER, VIEW_BODIES, VIEWS, body_sizes, set_up_views
+from synpick_warp.stages.render.view_setup import GBUFFER, VIEW_BODIES, VIEW_CAMERAS, VIEWS, body_sizes, set_up_views
 
 CPU_BYTES = 512 * 2**20
 GPU_BYTES = 2 * 2**30
@@ -38,6 +39,7 @@ def allocate_batch(settings: schema.Perception, instances: int, views: int, devi
     sizes = {"view": views, "row": height, "column": width, "instance": instances, "point": settings.contour_points}
     sizes |= body_sizes(instances, width, height)
     views_of_worlds, bodies, gbuffer = (allocate_struct(kind, sizes, device) for kind in (VIEWS, VIEW_BODIES, GBUFFER))
+    views_of_worlds.cameras = allocate_struct(VIEW_CAMERAS, sizes, device)
     arrays, scratch = allocate(PerceptionArrays, sizes, device), allocate(SegmentationScratch, sizes, device)
     return views_of_worlds, bodies, gbuffer, arrays, scratch
 
@@ -64,21 +66,19 @@ class PerceptionImages:
     """Renders the G-buffers of a batch of worlds. Owns its scratch; `render` only launches kernels, so a CUDA graph can capture it.
 
     Attributes:
-        scene: The renderer's scene with camera 0 alone, at the resolution of perception.
+        scene: The renderer's scene with the camera of perception alone, at the resolution of perception.
         views: The struct `Views` of the batch. The caller fills `views.world` (view): each world once; -1: the view is unused.
         bodies: The struct `ViewBodies` of the batch.
         gbuffer: The struct `GBuffer` of the batch.
         arrays, scratch: Arrays of `Segmenter`.
     """
 
-    def __init__(
-        self, settings: schema.Perception, cameras: schema.Cameras, render_scene: RenderScene, worlds: int, instances: int
-    ) -> None:
+    def __init__(self, settings: schema.Perception, rig: Rig, render_scene: RenderScene, worlds: int, instances: int) -> None:
         """Allocate scratch and render the static background.
 
         Args:
             settings: Settings of perception.
-            cameras: Settings of the cameras; the resolution is that of `settings`.
+            rig: The cameras; the resolution is that of `settings`.
             render_scene: Meshes, materials and table of the renderer; its cameras are not used.
             worlds: Number of worlds.
             instances: Instance capacity of a world, at most 32.
@@ -93,7 +93,8 @@ class PerceptionImages:
         self.pixels = count * grid.tiles * int(TILE_PIXELS)
         if self.pixels >= 2**31:
             raise ConfigError(f"perception.views is {count}; of {width} x {height} px that is more than 2³¹ pixels; take fewer")
-        camera = make_cameras(replace(cameras, resolution=settings.resolution))[:1]
+        seen = resized(rig.rows[rig.index(settings.camera)], settings.resolution)
+        camera = make_cameras(Rig((seen,), rig.is_listed))
         self.scene = replace(render_scene, cameras=build_cameras(camera, device), grid=grid, camera_count=1)
         self.views, self.bodies, self.gbuffer, self.arrays, self.scratch = allocate_batch(settings, instances, count, device)
         self.views.world.fill_(-1)
@@ -105,7 +106,7 @@ class PerceptionImages:
         """Rasterize each view's world without gripper shaft and cup. Unused views keep their content."""
         scene, views = self.scene, self.views
         wp.launch(aim_views_kernel, dim=views.count, outputs=[views], device=scene.device)
-        set_up_views(scene, scene.cameras, scene.grid, snapshot, self.fixture_visible, views, self.bodies)
+        set_up_views(scene, snapshot, self.fixture_visible, views, self.bodies)
         self.rasterizer.rasterize(self.bodies, views, self.gbuffer)
-        inputs = [scene.meshes, scene.cameras, scene.grid, self.bodies, views]
+        inputs = [scene.meshes, scene.grid, self.bodies, views]
         launch_pixels(intersect_hits_kernel, self.pixels, inputs, [self.gbuffer], scene.device)
