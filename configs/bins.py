@@ -30,7 +30,7 @@ class BinRow(Tote):
     """A bin of bins.kind = "own", an open box as the tote. An episode draws one of the bins by their weights."""
 
     REQUIRED: ClassVar = ("name",)
-    name: str = setting("", "", "Name, of lower-case letters, digits, - and _, at most 32; no two bins have the same.")
+    name: str = setting("", "", "Name, of at most 32 lower-case letters, digits and underscores; no two bins have the same.")
     weight: float = setting(1.0, "", "Weight with which an episode draws it.", low=0.0, high=1e6)
     compartments: tuple[int, int] = setting((1, 1), "", "Columns (along x) and rows of compartments of equal floors.", low=1, high=6)
     divider_height: float = setting(0.1, "m", "Height of the dividers between compartments.", above=0.0, high=10.0)

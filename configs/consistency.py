@@ -30,8 +30,8 @@ from synpick_warp.configs.schema import (
 from synpick_warp.configs.splits import MAX_SHARD_SCENES, DataLayout
 from synpick_warp.errors import format_value
 
-_NAME = re.compile(r"[a-z0-9_-]{1,32}")
-"""Name of a bin."""
+_NAME = re.compile(r"(?!(tote|table|pallet)$)[a-z0-9_]{1,32}")
+"""Name of a bin: no other kind's, and one that prims of USD can have."""
 _MIN_COMPARTMENT = 0.03
 """Least length and width of a compartment [m]."""
 _SPLIT = re.compile(r"(train|val|test)(_[A-Za-z0-9]+)*")
@@ -85,7 +85,10 @@ def _bins(bins: Bins, rows: Sequence[BinRow]) -> Iterator[Conflict]:
     names = [row.name for row in rows]
     for index, row in enumerate(rows):
         if not _NAME.fullmatch(row.name) or names.count(row.name) > 1:
-            yield f"bin[{index}].name", "lower-case letters, digits, - and _, at most 32, and other than those of other bins"
+            yield (
+                f"bin[{index}].name",
+                "lower-case letters, digits and underscores, at most 32, other than those of other bins; not tote, table, pallet",
+            )
         sizes = BinSizes.of_row(row)
         if row.compartments != (1, 1) and row.divider_height > sizes.height:
             yield f"bin[{index}].divider_height", f"at most the height of the rim, {sizes.height:g} [m]"

@@ -88,6 +88,7 @@ def test_compartments_are_equal_and_dividers_fill_what_is_between_them(tmp_path)
         ('kind = "own"', 'kind = "tote"', r'bins.kind is "tote" .*; allowed: own with \[\[bin\]\] tables'),
         ('name = "flat"', 'name = "kanban"', r'bin\[0\].name is "kanban" .*; allowed: .* other than those of other bins'),
         ('name = "flat"', 'name = "a/b"', r'bin\[1\].name is "a/b" .*; allowed: lower-case letters'),
+        ('name = "flat"', 'name = "pallet"', r'bin\[1\].name is "pallet" .*; allowed: .* not tote, table, pallet'),
         ('name = "flat"', "weight = 1.0", r"bin\[1\] has no name .*; a row needs name"),
         ("[2, 3]", "[2, 7]", r"bin\[0\].compartments is .*; allowed: .* 6"),
         ("[2, 3]", "[6, 6]\ndivider_height = 0.3", r"bin\[0\].divider_height is 0.3 .*; allowed: at most the height of the rim, 0.1955 "),
