@@ -6,13 +6,18 @@ import dataclasses
 
 import numpy as np
 import pytest
+import warp as wp
 from scipy.spatial.transform import Rotation
 
 from synpick_warp.codes import Mode, Phase, Stream
-from synpick_warp.configs.bins import Bins
+from synpick_warp.configs.bins import BinRow, Bins
+from synpick_warp.configs.cell import bin_sizes
 from synpick_warp.stages.sim import arrange, gripper
+from synpick_warp.stages.sim.simulate import Simulation
+from synpick_warp.stages.stream import read_tick
 from tests.twins import rng
 from tests.worlds.kernel_worlds import BIN, KernelWorlds
+from tests.worlds.small_worlds import COARSE, catalog, settings
 
 SEED, WORLDS = 7, 64
 DROP = {"volume": 10.0, "pick_repeats": 0, "move_repeats": 0}
@@ -146,3 +151,48 @@ def test_the_gripper_passes_over_dividers_and_nowhere_below_the_rim_through_them
     assert len(crossing) == 1
     assert (local[crossing[0] : crossing[0] + 2, 2] > sizes.height + 0.049).all()
     assert np.linalg.norm(np.diff(points, axis=0), axis=1).max() < 2.0 * 2e-3 + 1e-6
+
+
+def first_frames(config, worlds: int) -> dict[int, tuple[int, np.ndarray, np.ndarray]]:
+    """Bin, its pose and the poses of the objects in the first frame of each episode."""
+    config = dataclasses.replace(config, bake=dataclasses.replace(config.bake, worlds=worlds))
+    simulation = Simulation(config, catalog(), 1, wp.get_device(config.bake.device))
+    found = {}
+    for _ in range(300):
+        simulation.tick()
+        report = read_tick(simulation.record)
+        for world in np.flatnonzero(report.column("live") & (report.column("frame") == 0)):
+            poses = report.pose[world][report.catalog_index[world] >= 0]
+            found[int(report.column("episode")[world])] = (int(report.snapshot.bin[world]), report.snapshot.fixture_pose[world, 0], poses)
+        if len(found) == config.bake.episodes:
+            return found
+    raise AssertionError(f"{len(found)} of {config.bake.episodes} episodes began")
+
+
+ROWS = (
+    BinRow(name="halves", compartments=(2, 1), divider_height=0.15),
+    BinRow(name="flat", outer_size=(0.615, 0.373, 0.1), wall=0.01, rim_size=(0.53, 0.34)),
+)
+
+
+@pytest.mark.parametrize(
+    "bins", [dataclasses.replace(PLACES, kind="own"), dataclasses.replace(PLACES, kind="none"), dataclasses.replace(PLACES, kind="pallet")]
+)
+def test_piles_rest_in_or_on_the_bin_that_is_drawn_in_any_number_of_worlds(bins):
+    base = settings(bake__episodes=4, bake__mode="move", move__speed=10.0, **COARSE)
+    config = dataclasses.replace(base, bins=bins, bin=ROWS if bins.kind == "own" else ())
+    sizes, found = bin_sizes(config), first_frames(config, 4)
+    assert {chosen for chosen, _, _ in found.values()} == set(range(len(sizes)))
+    for chosen, pose, objects in found.values():
+        local = Rotation.from_quat(pose[3:]).inv().apply(objects[:, :3] - pose[:3])
+        limit = np.array(sizes[chosen].opening) / 2 + sizes[chosen].margin
+        assert len(objects) > 0
+        assert (np.abs(local[:, :2]) < limit).all()
+        # The smallest side of an object is 3 cm, and no object rests on the rim or a divider.
+        assert (local[:, 2] > 0.014).all()
+        assert (local[:, 2] < 0.15).all()
+    one = first_frames(config, 1)
+    for episode, (chosen, pose, objects) in found.items():
+        assert chosen == one[episode][0]
+        np.testing.assert_array_equal(pose, one[episode][1])
+        np.testing.assert_array_equal(objects, one[episode][2])
