@@ -107,8 +107,9 @@ def test_shapes_of_the_drawn_bin_are_at_its_pose_and_all_others_away(device):
     found = worlds.physics.model.shape_transform.numpy().reshape(WORLDS, -1, 7)
     for world, (chosen, pose) in enumerate(zip(worlds.state.bin.numpy(), worlds.state.bin_pose.numpy(), strict=True)):
         for shape, owner, guide in parts:
+            away = arrange.rest.SHAPES_AWAY if owner == chosen else arrange.rest.BINS_AWAY
             stands = owner == chosen and (not guide or world % 2 == 1)
-            np.testing.assert_array_equal(found[world, shape], pose if stands else [0, 0, arrange.rest.SHAPES_AWAY, 0, 0, 0, 1])
+            np.testing.assert_array_equal(found[world, shape], pose if stands else [0, 0, away, 0, 0, 0, 1])
 
 
 def test_objects_fall_over_their_compartments_and_rounds_take_them_in_turn(device):
