@@ -81,6 +81,7 @@ YOUNGER_SETTINGS: dict[str, Any] = {
     "arrangement.fill": WITHIN,
     "perception.camera": "",
     "camera": [],
+    "bin": [],
     "objects.unit": AUTO_UNIT,
     "objects.symmetries": Objects().symmetries,
     "objects.symmetry_tolerance": Objects().symmetry_tolerance,
@@ -212,10 +213,9 @@ def differences(here: Mapping[str, Any], there: Mapping[str, Any], path: str = "
     """Compare two manifests: yields (key, value here, value there) of each difference; None: no such key."""
     for name in [*here, *(name for name in there if name not in here)]:
         first, second = here.get(name), there.get(name)
-        if isinstance(first, Mapping) and isinstance(second, Mapping | None):
-            yield from differences(first, second or {}, f"{path}{name}.")
-        elif isinstance(second, Mapping) and first is None:
-            yield from differences({}, second, f"{path}{name}.")
+        if isinstance(first, Mapping | None) and isinstance(second, Mapping | None):
+            # A section of which one has no key, since all have their old values.
+            yield from differences(first or {}, second or {}, f"{path}{name}.")
         elif first != second:
             yield f"{path}{name}", first, second
 

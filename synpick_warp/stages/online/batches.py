@@ -119,7 +119,8 @@ class ViewBatch:
         depth_scale: Millimetres per count of `depth`.
         host: The numbers of the views that the host knows anyway, as NumPy arrays that stay valid, by name: episode, arrangement (how
             often the episode's arrangement was resampled), camera, frame, time [s], object_id, pose, light_name, light_yaw,
-            light_exposure, light_direction; see `synpick_warp.views.frames.FrameBatch`.
+            light_exposure, light_direction, and bin_name and bin_pose unless there is a tote in its place; see
+            `synpick_warp.views.frames.FrameBatch`.
     """
 
     color: DeviceArray

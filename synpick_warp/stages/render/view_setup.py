@@ -86,16 +86,8 @@ def set_up_views(
     """
     wp.launch(aim_cameras_kernel, dim=views.count, inputs=[scene.cameras], outputs=[views], device=scene.device)
     dim = (views.count, bodies.mesh.shape[1])
-    inputs = [
-        scene.meshes,
-        scene.grid,
-        snapshot.bin,
-        snapshot.catalog_index,
-        snapshot.pose,
-        snapshot.fixture_pose,
-        fixture_visible,
-        views,
-    ]
+    worlds = [snapshot.bin, snapshot.catalog_index, snapshot.pose, snapshot.fixture_pose, fixture_visible]
+    inputs = [scene.meshes, scene.grid, *worlds, views]
     wp.launch(set_up_views_kernel, dim=dim, inputs=inputs, outputs=[bodies], device=scene.device)
     wp.launch(sort_bodies_kernel, dim=dim, inputs=[scene.meshes], outputs=[bodies], device=scene.device)
     inputs = [scene.meshes, scene.grid, views]
