@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 from synpick_warp.configs.fields import setting
 
-TOTE, NONE, PALLET = "tote", "none", "pallet"
-KINDS = (TOTE, NONE, PALLET)
+TOTE, OWN, NONE, PALLET = "tote", "own", "none", "pallet"
+KINDS = (TOTE, OWN, NONE, PALLET)
 """What stands under the cameras."""
 
 
@@ -25,10 +26,26 @@ class Tote:
 
 
 @dataclass(frozen=True)
+class BinRow(Tote):
+    """A bin of bins.kind = "own", an open box as the tote. An episode draws one of the bins by their weights."""
+
+    REQUIRED: ClassVar = ("name",)
+    name: str = setting("", "", "Name, of at most 32 lower-case letters, digits and underscores; no two bins have the same.")
+    weight: float = setting(1.0, "", "Weight with which an episode draws it.", low=0.0, high=1e6)
+    compartments: tuple[int, int] = setting((1, 1), "", "Columns (along x) and rows of compartments of equal floors.", low=1, high=6)
+    divider_height: float = setting(0.1, "m", "Height of the dividers between compartments.", above=0.0, high=10.0)
+
+
+@dataclass(frozen=True)
 class Bins:
     """What stands under the cameras: the tote, or without walls a table alone or a pallet, whose frame has its origin on top."""
 
-    kind: str = setting(TOTE, "", "What objects are dropped into or onto: tote ([tote]), none (the table), pallet.", choices=KINDS)
+    kind: str = setting(
+        TOTE,
+        "",
+        "What objects are dropped into or onto: tote ([tote]), own (a bin of [[bin]], drawn in each episode), none (the table), pallet.",
+        choices=KINDS,
+    )
     shift: tuple[float, float] = setting(
         (0.0, 0.0), "m", "Half widths of the offset in x and y that each episode draws for its bin.", low=0.0, high=1.0
     )

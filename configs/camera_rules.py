@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 import re
 from collections import Counter
 from collections.abc import Iterator, Sequence
 
-from synpick_warp.configs.bins import Tote
 from synpick_warp.configs.cameras import CameraRow, Cameras, Pose
-from synpick_warp.configs.cell import BinSizes, Sides
+from synpick_warp.configs.cell import BinSizes, Sides, bin_sizes
 from synpick_warp.configs.rig import Rig, intrinsics, position, viewing_direction
 from synpick_warp.configs.schema import Bop, Config, DepthSensor
 
@@ -33,7 +31,7 @@ FORMS = (("matrix",), ("position", "quaternion"), ("position", "look_at", "up"))
 """Keys of a pose: one of these sets."""
 
 
-def find_camera_conflicts(config: Config, bins: Sequence[BinSizes]) -> Iterator[Conflict]:
+def find_camera_conflicts(config: Config) -> Iterator[Conflict]:
     """Find the violated constraints of cameras, the most basic first."""
     listed = _rows(config.camera) if config.camera else _section(config.cameras)
     if found := list(listed):
@@ -42,12 +40,12 @@ def find_camera_conflicts(config: Config, bins: Sequence[BinSizes]) -> Iterator[
         return
     rig = config.rig
     for index in range(len(rig)):
-        yield from _view(rig, index, config, bins)
+        yield from _view(rig, index, config)
     if config.perception.camera and config.perception.camera not in rig.names:
         yield "perception.camera", f"the name of a camera, {', '.join(rig.names)}, or none"
     if "depth_sensor" in config.render.layers:
-        yield from _depth_sensor(config.depth_sensor, rig, bins)
-    yield from _depth_scale(config.bop, rig, bins)
+        yield from _depth_sensor(config.depth_sensor, rig, bin_sizes(config))
+    yield from _depth_scale(config.bop, rig, bin_sizes(config))
 
 
 def _section(cameras: Cameras) -> Iterator[Conflict]:
@@ -93,9 +91,10 @@ def _pose(key: str, pose: Pose) -> Iterator[Conflict]:
             yield key, "a rotation; this matrix is a mirror image: x is right, y down and z forward"
 
 
-def _view(rig: Rig, index: int, config: Config, bins: Sequence[BinSizes]) -> Iterator[Conflict]:
-    """Yield conflicts of a camera's intrinsics, odd sides with videos, and a degenerate view or one that does not show the bin."""
-    row, label, noun = rig.rows[index], rig.label(index), bins[0].noun
+def _view(rig: Rig, index: int, config: Config) -> Iterator[Conflict]:
+    """Yield conflicts of a camera's intrinsics, odd sides with videos, and a degenerate view or one that does not show the bins."""
+    bins = bin_sizes(config)
+    row, label = rig.rows[index], rig.label(index)
     (width, height), (fx, fy, *_) = rig.sizes[index], intrinsics(row)
     if "lerobot" in config.bake.formats and (width % 2 or height % 2):
         key = rig.key(index, "resolution") if config.camera and config.camera[index].resolution else "cameras.resolution"
@@ -110,11 +109,11 @@ def _view(rig: Rig, index: int, config: Config, bins: Sequence[BinSizes]) -> Ite
     elif up is not None and math.hypot(*_cross(forward, up)) <= PARALLEL * math.hypot(*forward) * math.hypot(*up):
         yield aim, f"up vectors that are not zero or parallel to the viewing direction, as that of {label} is"
     elif at[2] <= 0.0:
-        yield place, f"positions above the {noun}'s floor, z > 0, below which {label} sees no object [m]"
-    elif fx > 0.0 < fy and not all(_sees_bin(row, one, spot) for one in bins for spot in _places(config.bins.shift)):
-        yield target, f"a point that lets each camera see the {noun}, which lies outside of the images of {label} [m]"
-    elif any(one.shell is not None and _in_wall(at, one.shell) for one in bins):
-        yield place, f"positions outside of the {noun}'s walls, in which {label} is [m]"
+        yield place, f"positions above the {bins[0].noun}'s floor, z > 0, below which {label} sees no object [m]"
+    elif fx > 0.0 < fy and not all(_sees_bin(row, one, place) for one in bins for place in _places(config.bins.shift)):
+        yield target, f"a point that lets each camera see the {bins[0].noun}, which lies outside of the images of {label} [m]"
+    elif any(_in_wall(at, one) for one in bins if one.shell):
+        yield place, f"positions outside of the {bins[0].noun}'s walls, in which {label} is [m]"
 
 
 def _matrix(key: str, matrix: tuple[tuple[float, float, float], ...], width: int, height: int) -> Iterator[Conflict]:
@@ -135,7 +134,7 @@ def _matrix(key: str, matrix: tuple[tuple[float, float, float], ...], width: int
 
 
 def _depth_sensor(sensor: DepthSensor, rig: Rig, bins: Sequence[BinSizes]) -> Iterator[Conflict]:
-    """With the layer depth_sensor: the bin must lie within what the sensor measures, and its disparity be more than a step."""
+    """With the layer depth_sensor: the bins must lie within what the sensor measures, and its disparity be more than a step."""
     for index, row in enumerate(rig.rows):
         focal, depths = intrinsics(row)[0], _bin_depths(row, bins)
         near, far = max(0.0, min(depths)), max(depths)
@@ -167,7 +166,8 @@ def _bin_depths(row: CameraRow, bins: Sequence[BinSizes]) -> list[float]:
 
 def _places(shift: Sides) -> list[Sides]:
     """Places of the bin at the ends of its offsets [m]."""
-    return sorted(set(itertools.product((-shift[0], shift[0]), (-shift[1], shift[1]))))
+    x, y = shift
+    return sorted({(-x, -y), (-x, y), (x, -y), (x, y)})
 
 
 def _sees_bin(row: CameraRow, sizes: BinSizes, place: Sides) -> bool:
@@ -185,12 +185,12 @@ def _sees_bin(row: CameraRow, sizes: BinSizes, place: Sides) -> bool:
     return math.acos(max(-1.0, min(1.0, cosine))) <= cone + math.asin(radius / distance)
 
 
-def _in_wall(at: tuple[float, ...], tote: Tote) -> bool:
-    """Whether a point lies in the tote's walls: in its outer box, but not above the floor between the walls of the opening."""
+def _in_wall(at: tuple[float, ...], sizes: BinSizes) -> bool:
+    """Whether a point lies in the walls of a bin: in its outer box, but not above the floor between the walls of the opening."""
     x, y, z = at
-    inside = [abs(value) < size / 2 for value, size in zip((x, y), tote.outer_size[:2], strict=True)]
-    share = z / (tote.outer_size[2] - tote.wall)
-    free = [abs(v) < (f + (r - f) * share) / 2 for v, f, r in zip((x, y), tote.floor_size, tote.rim_size, strict=True)]
+    inside = [abs(value) < size / 2 for value, size in zip((x, y), sizes.outer, strict=True)]
+    share = z / sizes.height
+    free = [abs(v) < (f + (r - f) * share) / 2 for v, f, r in zip((x, y), sizes.floor, sizes.opening, strict=True)]
     return 0.0 < share < 1.0 and all(inside) and not all(free)
 
 

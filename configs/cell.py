@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import itertools
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
-from synpick_warp.configs.bins import NONE, PALLET, TOTE, Tote
+from synpick_warp.configs.bins import NONE, OWN, PALLET, TOTE, BinRow, Tote
 from synpick_warp.configs.schema import Config
 
 Sides = tuple[float, float]
 """Length (along x) and width (along y) [m]."""
 Point = tuple[float, float, float]
+DIVIDER = 0.01
+"""Thickness of dividers [m]: more than an object at physics.max_speed moves in one step."""
 
 
 @dataclass(frozen=True)
@@ -35,12 +37,21 @@ class BinSizes:
     """Distance from the opening beyond which an object has left it."""
     weight: float = 1.0
     """Weight with which an episode draws it."""
+    compartments: tuple[int, int] = (1, 1)
+    """Columns (along x) and rows (along y)."""
+    divider_height: float = 0.0
 
     @classmethod
-    def of_tote(cls, tote: Tote) -> BinSizes:
-        """Sizes of the tote."""
+    def of_tote(cls, tote: Tote, name: str = TOTE, noun: str = TOTE) -> BinSizes:
+        """Sizes of the tote, or of a box like it."""
         height = tote.outer_size[2] - tote.wall
-        return cls("tote", "tote", tote, tote.outer_size[:2], tote.floor_size, tote.rim_size, height, -tote.wall)
+        return cls(name, noun, tote, tote.outer_size[:2], tote.floor_size, tote.rim_size, height, -tote.wall)
+
+    @classmethod
+    def of_row(cls, row: BinRow) -> BinSizes:
+        """Sizes of a row of [[bin]]."""
+        sizes = cls.of_tote(row, row.name, "bin")
+        return replace(sizes, weight=row.weight, compartments=row.compartments, divider_height=row.divider_height)
 
     @property
     def is_visible(self) -> bool:
@@ -55,18 +66,25 @@ class BinSizes:
 
     @property
     def centers(self) -> list[Sides]:
-        """Centre of each compartment."""
-        return [(0.0, 0.0)]
+        """Centre of each compartment, column by column."""
+        columns, rows = (
+            [-side / 2 + cell / 2 + index * (cell + DIVIDER) for index in range(count)] if count > 1 else [0.0]
+            for side, cell, count in zip(self.floor, self.cell, self.compartments, strict=True)
+        )
+        return list(itertools.product(columns, rows))
 
     @property
     def cell(self) -> Sides:
         """Inner floor of a compartment."""
-        return self.floor
+        length, width = (
+            (side - (count - 1) * DIVIDER) / count if count > 1 else side for side, count in zip(self.floor, self.compartments, strict=True)
+        )
+        return length, width
 
     @property
     def mouth(self) -> Sides:
-        """Opening of a compartment."""
-        return self.opening
+        """Opening of a compartment: over its floor, where there are several."""
+        return self.opening if self.compartments == (1, 1) else self.cell
 
     @property
     def inner_corners(self) -> list[Point]:
@@ -90,4 +108,13 @@ def bin_sizes(config: Config) -> tuple[BinSizes, ...]:
     if bins.kind == PALLET:
         length, width, height = bins.pallet_size
         return (BinSizes("pallet", "pallet", None, (length, width), bins.area, bins.area, 0.0, -height, bins.margin),)
+    if bins.kind == OWN and config.bin:
+        return tuple(BinSizes.of_row(row) for row in config.bin)
     return (BinSizes.of_tote(config.tote),)
+
+
+def bin_tables(config: Config) -> dict[str, Tote]:
+    """Tables of the bins with walls by their keys: tote, or bin[0] and so on."""
+    if config.bins.kind == OWN:
+        return {f"bin[{index}]": row for index, row in enumerate(config.bin)}
+    return {TOTE: config.tote} if config.bins.kind == TOTE else {}

@@ -7,9 +7,9 @@ import re
 from collections import Counter
 from collections.abc import Iterator, Sequence
 
-from synpick_warp.configs.bins import PALLET, TOTE, Bins, Tote
+from synpick_warp.configs.bins import OWN, PALLET, TOTE, BinRow, Bins, Tote
 from synpick_warp.configs.camera_rules import Conflict, find_camera_conflicts
-from synpick_warp.configs.cell import BinSizes, bin_sizes
+from synpick_warp.configs.cell import BinSizes, bin_sizes, bin_tables
 from synpick_warp.configs.modes import bake_modes
 from synpick_warp.configs.schema import (
     FORMATS,
@@ -30,6 +30,10 @@ from synpick_warp.configs.schema import (
 from synpick_warp.configs.splits import MAX_SHARD_SCENES, DataLayout
 from synpick_warp.errors import format_value
 
+_NAME = re.compile(r"(?!(tote|table|pallet)$)[a-z0-9_]{1,32}")
+"""Name of a bin: no other kind's, and one that prims of USD can have."""
+_MIN_COMPARTMENT = 0.03
+"""Least length and width of a compartment [m]."""
 _SPLIT = re.compile(r"(train|val|test)(_[A-Za-z0-9]+)*")
 
 
@@ -37,10 +41,12 @@ def find_conflicts(config: Config) -> Iterator[Conflict]:
     """Find all violated constraints, the most basic first."""
     bins, bop = bin_sizes(config), config.bop
     yield from _mix(config.bake, config.splits)
-    yield from _bins(config.bins) if config.bins.kind != TOTE else _tote(config.tote)
+    yield from _bins(config.bins, config.bin)
+    for key, row in bin_tables(config).items():
+        yield from _box(key, row)
     if config.move.start_height < config.move.height:
         yield "move.start_height", f"at least move.height, {config.move.height:g} [m]"
-    yield from find_camera_conflicts(config, bins)
+    yield from find_camera_conflicts(config)
     yield from _times(config.settle, config.physics)
     yield from _pick(config.pick, bins)
     yield from _suction(config.suction, config.gripper)
@@ -60,19 +66,36 @@ def _mix(bake: Bake, splits: Sequence[Split]) -> Iterator[Conflict]:
         yield "bake.formats", f"at least one of {', '.join(FORMATS)}"
 
 
-def _tote(tote: Tote) -> Iterator[Conflict]:
-    """Yield conflicts of the tote's sizes."""
+def _box(key: str, tote: Tote) -> Iterator[Conflict]:
+    """Yield conflicts of the sizes of the tote, or of a bin like it; `key`: of its table."""
+    noun = TOTE if key == TOTE else "bin"
     if any(rim < floor for rim, floor in zip(tote.rim_size, tote.floor_size, strict=True)):
-        yield "tote.rim_size", f"at least tote.floor_size on both sides, {format_value(tote.floor_size)} [m]"
+        yield f"{key}.rim_size", f"at least {key}.floor_size on both sides, {format_value(tote.floor_size)} [m]"
     if any(outer < rim + 2 * tote.wall for outer, rim in zip(tote.outer_size[:2], tote.rim_size, strict=True)):
         needed = [round(rim + 2 * tote.wall, 9) for rim in tote.rim_size]
-        yield "tote.outer_size", f"at least tote.rim_size and two walls, {format_value(needed)} [m]"
+        yield f"{key}.outer_size", f"at least {key}.rim_size and two walls, {format_value(needed)} [m]"
     if tote.outer_size[2] <= tote.wall:
-        yield "tote.wall", f"less than the tote's height, {tote.outer_size[2]:g} [m]"
+        yield f"{key}.wall", f"less than the {noun}'s height, {tote.outer_size[2]:g} [m]"
 
 
-def _bins(bins: Bins) -> Iterator[Conflict]:
-    """Yield conflicts of what stands under the cameras without walls."""
+def _bins(bins: Bins, rows: Sequence[BinRow]) -> Iterator[Conflict]:
+    """Yield conflicts of what stands under the cameras: a kind that the tables do not fit, areas, names, weights and compartments."""
+    if (bins.kind == OWN) != bool(rows):
+        yield "bins.kind", f"{OWN} with [[bin]] tables, and another kind without"
+    names = [row.name for row in rows]
+    for index, row in enumerate(rows):
+        if not _NAME.fullmatch(row.name) or names.count(row.name) > 1:
+            yield (
+                f"bin[{index}].name",
+                "lower-case letters, digits and underscores, at most 32, other than those of other bins; not tote, table, pallet",
+            )
+        sizes = BinSizes.of_row(row)
+        if row.compartments != (1, 1) and row.divider_height > sizes.height:
+            yield f"bin[{index}].divider_height", f"at most the height of the rim, {sizes.height:g} [m]"
+        if min(sizes.cell) < _MIN_COMPARTMENT:
+            yield f"bin[{index}].compartments", f"compartments of at least {_MIN_COMPARTMENT:g} m"
+    if rows and not any(row.weight for row in rows):
+        yield "bin[0].weight", "more than 0 of at least one bin"
     if bins.kind == PALLET and any(side > pallet for side, pallet in zip(bins.area, bins.pallet_size, strict=False)):
         yield "bins.area", f"at most the pallet's length and width, {format_value(bins.pallet_size[:2])} [m]"
 

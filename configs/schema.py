@@ -12,7 +12,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 from synpick_warp.codes import Tone, names
-from synpick_warp.configs.bins import Bins, Tote
+from synpick_warp.configs.bins import BinRow, Bins, Tote
 from synpick_warp.configs.cameras import CameraRow, Cameras
 from synpick_warp.configs.fields import INT32_MAX, setting
 from synpick_warp.configs.manipulation import Move, Perception, Pick, Suction, Target
@@ -380,6 +380,7 @@ class Config:
     bop: Bop = field(default_factory=Bop)
     trajectory: Trajectory = field(default_factory=Trajectory)
     camera: tuple[CameraRow, ...] = ()
+    bin: tuple[BinRow, ...] = ()
     object_rows: tuple[ObjectRow, ...] = ()
     splits: tuple[Split, ...] = ()
     """Resolved splits, by first episode; empty: one split, bop.split, of bake.episodes episodes."""

@@ -23,7 +23,7 @@ def config_to_toml(config: Config, *, comments: bool = False) -> str:
         config: The configuration.
         comments: Precede each setting by its meaning, unit and allowed values.
     """
-    # Without rows those of the preset would hold; no preset has cameras.
+    # Without rows those of the preset would hold; no preset has rows of another kind.
     lines = [] if config.object_rows else ["object_rows = []", ""]
     for section, kind in sections().items():
         if comments and kind.__doc__:

@@ -8,13 +8,18 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from synpick_warp.configs.cell import BinSizes, Point
+from synpick_warp.configs.bins import TOTE, Tote
+from synpick_warp.configs.cell import DIVIDER, BinSizes, Point
+from synpick_warp.errors import ConfigError
+from synpick_warp.scenes.collision.simplification import simplify_hull
 from synpick_warp.scenes.modelling import Patch, at_height, join, make_mesh, solid
 from synpick_warp.scenes.tote import box_piece, tote_colliders, tote_fixture
 from synpick_warp.scenes.types import ConvexPiece, Fixture, Material
 
 GUIDE_THICKNESS = 0.1
 """Thickness of the guide walls [m]."""
+CROSSING = 1e-4
+"""Difference in height of crossing dividers [m]."""
 BOARD, BOARD_GAP, BOARDS = 0.022, 0.006, 5
 """Thickness of a pallet's boards (EN 13698-1) [m], gap between those of the deck [m], and their number."""
 RUNNER = 0.16
@@ -40,7 +45,36 @@ def make_bins(sizes: Iterable[BinSizes]) -> tuple[Bin, ...]:
     Raises:
         ConfigError: The sizes of a bin do not fit each other.
     """
-    return tuple(Bin(one, tote_fixture(one.shell), tote_colliders(one.shell)) if one.shell else _make_pallet(one) for one in sizes)
+    return tuple(_make_box(one, one.shell) if one.shell else _make_pallet(one) for one in sizes)
+
+
+def _make_box(sizes: BinSizes, shell: Tote) -> Bin:
+    """Build an open box with dividers."""
+    try:
+        dividers = _dividers(sizes, shell)
+        patches = [solid(np.stack(rings)) for rings in dividers]
+        pieces = tuple(simplify_hull(np.concatenate(rings), 8) for rings in dividers)
+        return Bin(sizes, tote_fixture(shell, patches), (*tote_colliders(shell), *pieces))
+    except ConfigError as error:
+        raise ConfigError(f"{error}" if sizes.name == TOTE else f"bin {sizes.name}: {str(error).removeprefix('tote.')}") from error
+
+
+def _dividers(sizes: BinSizes, shell: Tote) -> list[list[np.ndarray]]:
+    """Lower and upper outline (4, 3) of each divider. They end inside walls and floor, so that no faces are coplanar."""
+    found = []
+    for axis, count in enumerate(sizes.compartments):
+        pitch, other = sizes.cell[axis] + DIVIDER, 1 - axis
+        for index in range(1, count):
+            middle = -sizes.floor[axis] / 2 - DIVIDER / 2 + index * pitch
+            rings = []
+            # Rows are lower by a hair, so that tops do not coincide where dividers cross.
+            for z in (-shell.wall / 2, sizes.divider_height - axis * CROSSING):
+                end = (sizes.floor[other] + max(z, 0.0) / sizes.height * (sizes.opening[other] - sizes.floor[other]) + shell.wall) / 2
+                ring = np.array([(-DIVIDER / 2, -end), (DIVIDER / 2, -end), (DIVIDER / 2, end), (-DIVIDER / 2, end)])
+                ring[:, 0] += middle
+                rings.append(at_height(ring if axis == 0 else ring[::-1, ::-1], z))
+            found.append(rings)
+    return found
 
 
 def _make_pallet(sizes: BinSizes) -> Bin:

@@ -92,7 +92,9 @@ def read_objects(config: Config, report: Callable[[str], None] = _ignore) -> lis
 def _read_objects(config: Config, report: Callable[[str], None], faults: _Faults) -> list[RawObject]:
     """The embedded objects, or those of the folder `bake.models`."""
     rules = _Rules(config.objects, config.object_rows, bin_sizes(config))
-    return _read_folder(Path(config.bake.models).expanduser(), rules, report, faults) if config.bake.models else procedural_objects()
+    if not config.bake.models:
+        return _embedded_objects(rules, faults)
+    return _read_folder(Path(config.bake.models).expanduser(), rules, report, faults)
 
 
 class _SizeError(CatalogError):
@@ -133,7 +135,8 @@ class _Faults:
         """Return the error for a folder without a usable object: that of its only object, or the number of objects and the first error."""
         count, first = len(self._errors), self._errors[0]
         if count > 1:
-            first = CatalogError(f"models folder {self._folder}: none of its {count} objects can be used; the first: {first}")
+            folder = f"models folder {self._folder}" if self._folder else "the embedded objects"
+            first = CatalogError(f"{folder}: none of its {count} objects can be used; the first: {first}")
         return self._advised(first)
 
 
@@ -172,6 +175,21 @@ def _read_folder(folder: Path, rules: _Rules, report: Callable[[str], None], fau
             raw, lines = result
             for line in lines:
                 report(line)
+            raws.append(raw)
+    if not raws:
+        raise faults.summary()
+    return raws
+
+
+def _embedded_objects(rules: _Rules, faults: _Faults) -> list[RawObject]:
+    """Embedded objects that fit into the bins, ordered by obj_id."""
+    raws = []
+    for raw in procedural_objects():
+        try:
+            _check_size(raw, raw.name, rules.bins)
+        except CatalogError as error:
+            faults.add(error)
+        else:
             raws.append(raw)
     if not raws:
         raise faults.summary()
@@ -294,7 +312,7 @@ def _check_fits_bin(vertices: np.ndarray, size: float, origin: str, sizes: BinSi
     the minimum oriented bounding box takes long to compute for fine meshes.
     """
     inside = _inner_diagonal(sizes) if sizes.shell else np.inf
-    opening = sorted(sizes.opening)
+    opening = sorted(sizes.mouth)
     box = sorted(np.ptp(vertices, axis=0).tolist())
     if size <= inside and box[0] <= opening[0] and box[1] <= opening[1]:
         return
@@ -310,7 +328,7 @@ def _check_fits_bin(vertices: np.ndarray, size: float, origin: str, sizes: BinSi
 
 def _inner_diagonal(sizes: BinSizes) -> float:
     """Diagonal of a bin's inside, or of the area where objects are dropped [m]."""
-    return float(np.linalg.norm((*sizes.opening, sizes.height)))
+    return float(np.linalg.norm((*sizes.mouth, sizes.height)))
 
 
 def _by(sides: list[float]) -> str:

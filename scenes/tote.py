@@ -5,6 +5,8 @@ All geometry is in the tote's frame, which is the world frame: origin at the cen
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from synpick_warp.configs.bins import Tote
@@ -38,8 +40,8 @@ def rim_height(tote: Tote) -> float:
     return tote.outer_size[2] - tote.wall
 
 
-def tote_fixture(tote: Tote) -> Fixture:
-    """Build the visual mesh: a closed shell for the tote and one for each rib.
+def tote_fixture(tote: Tote, more: Sequence[Patch] = ()) -> Fixture:
+    """Build the visual mesh: a closed shell for the tote, one for each rib, and `more`, with which its interior is not empty.
 
     Raises:
         ConfigError: The rim does not fit into the outer size, the floor is larger than the rim or too small for its rounded corners, or the
@@ -58,8 +60,8 @@ def tote_fixture(tote: Tote) -> Fixture:
         ]
     )
     shell = join(strips(rings[0], below=True), loft(rings), strips(rings[-1]))
-    mesh = make_mesh(join(shell, *_ribs(tote)), centered=False)
-    return Fixture(mesh, Material(tote.color, None, tote.metallic, tote.roughness), tote_interior(tote))
+    mesh = make_mesh(join(shell, *_ribs(tote), *more), centered=False)
+    return Fixture(mesh, Material(tote.color, None, tote.metallic, tote.roughness), None if more else tote_interior(tote))
 
 
 def tote_interior(tote: Tote) -> Interior:

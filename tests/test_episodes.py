@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import fields, is_dataclass
 
+import numpy as np
 import pytest
 
 from synpick_warp.codes import Ending
 from synpick_warp.configs.schema import Config
-from synpick_warp.factory.episodes import remedy
+from synpick_warp.dataset.annotations import check_content
+from synpick_warp.dataset.records import Row
+from synpick_warp.factory.episodes import EpisodeRow, remedy
+from synpick_warp.views.bins import bin_record
 
 CONFIG = Config()
 SECTIONS = (CONFIG.physics, CONFIG.perception, CONFIG.arrangement, CONFIG.settle)
@@ -35,3 +40,15 @@ def test_a_solver_overflow_names_every_capacity_of_the_solver():
     capacities = {name for name in setting_values(Config()) if name.endswith("_per_world")}
     assert all(name in remedy(Ending.SOLVER_OVERFLOW, *SECTIONS) for name in capacities)
     assert len(capacities) == 4
+
+
+@pytest.mark.parametrize(("name", "noun"), [("", "tote"), ("tote", "tote"), ("table", "table"), ("kanban", "bin")])
+def test_rows_of_episodes_have_their_bin_unless_it_is_a_tote_in_its_place(name, noun):
+    record = bin_record(name, np.array([0.1, -0.2, 0.0, 0.0, 0.0, -0.5, np.sqrt(0.75)], np.float32)) if name else None
+    assert record is None or record == {"name": name, "position": [0.1, -0.2, 0.0], "yaw": pytest.approx(-np.pi / 3, abs=1e-6)}
+    row = EpisodeRow(3, 1, Ending.EMPTIED, 10, 0.6, "pick", 3, 3, 3, 0, 0, "val", record)
+    line = row.as_json()
+    assert ("bin" in line) == bool(name)
+    assert line["sentence"] == f"no object is left in the {noun}"
+    assert EpisodeRow.from_json(line) == row
+    assert check_content(json.loads(json.dumps(line)), Row, "a line").split == "val"

@@ -18,6 +18,8 @@ MPR_INFLATION = wp.constant(2.0e-4)
 AXIS_STEP = wp.constant(0.15)
 # Steps per unit of each octahedral coordinate, -1 to 1, of a packed direction.
 DIRECTION_STEPS = wp.constant(32767.0)
+# Height above which shapes touch nothing [m]: static ones are put there to be out of the way.
+UNREACHED = wp.constant(1500.0)
 
 
 @wp.struct
@@ -89,7 +91,7 @@ def list_overlaps_kernel(
     """All-pairs broad phase: list the pairs of shapes of each world whose bounding boxes, enlarged by gaps and margins, overlap.
 
     `pair_out` receives the pairs in arbitrary order, `pair_count_inout` is increased by their number, which may exceed the capacity. Shapes
-    that are not empty are first compacted to `occupied_out`. Launched over world, lane: one block of threads per world.
+    that are neither empty nor UNREACHED are first compacted to `occupied_out`. Launched over world, lane: one block of threads per world.
     """
     world, lane = wp.tid()
     first = world * shapes.count
@@ -97,7 +99,7 @@ def list_overlaps_kernel(
         occupied_count_inout[world] = 0
     synchronize_block()
     for shape in range(lane, shapes.count, wp.block_dim()):
-        if lower[first + shape][0] <= upper[first + shape][0]:
+        if lower[first + shape][0] <= upper[first + shape][0] and lower[first + shape][2] < UNREACHED:
             occupied_out[world, wp.atomic_add(occupied_count_inout, world, 1)] = shape
     synchronize_block()
     occupied = occupied_count_inout[world]

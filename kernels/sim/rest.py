@@ -13,6 +13,8 @@ wp.set_module_options({"enable_backward": False})
 BELOW_FLOOR = wp.constant(-0.01)
 # Offset of collision shapes that must not touch anything: above whatever falls [m].
 SHAPES_AWAY = wp.constant(1000.0)
+# Offset of the shapes of bins that are not drawn: above all others, such as the shaft of a gripper that picks, which is SHAPES_AWAY [m].
+BINS_AWAY = wp.constant(2000.0)
 
 
 @wp.kernel
@@ -231,13 +233,16 @@ def place_bins_kernel(
     # Out:
     shape_transform_out: wp.array[wp.transform],  # (shape) [m]
 ):
-    """Place the collision shapes of each world's bin, and its guide walls while `progress` says that they stand; all others are far above.
+    """Place the collision shapes of each world's bin, and its guide walls while `progress` says that they stand.
+
+    Its other guide walls are at SHAPES_AWAY, what belongs to other bins at BINS_AWAY.
 
     Launched over world, part: a collision shape or guide wall of a bin.
     """
     world, part = wp.tid()
-    stands = bins.shape_bin[part] == bins.chosen[world] and (bins.shape_guide[part] == 0 or progress[world][3] == 1)
-    pose = shape_pose(stands)
-    if stands:
-        pose = bins.pose[world]
+    pose = bins.pose[world]
+    if bins.shape_bin[part] != bins.chosen[world]:
+        pose = wp.transform(wp.vec3(0.0, 0.0, BINS_AWAY), wp.quat_identity())
+    elif bins.shape_guide[part] == 1 and progress[world][3] == 0:
+        pose = shape_pose(False)
     shape_transform_out[world * layout.shapes + bins.shape[part]] = pose

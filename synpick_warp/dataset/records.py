@@ -32,7 +32,7 @@ Pixel = tuple[float, float]
 """Column and row in the perception image; integers are pixel centres."""
 _Value = bool | int | float | str | None
 _Section = dict[str, _Value | list[_Value | list[_Value]] | dict[str, Any]]
-"""Settings of a section, or of an object row; distributions are objects."""
+"""Settings of a section, or of a row of a list; distributions and tables are objects."""
 _Schema = TypeVar("_Schema", bound=msgspec.Struct)
 
 

@@ -119,7 +119,7 @@ def _fill(config: Config, output: OutputFolder, needs: Needs, names: Sequence[st
             context = ExportContext(output.out, settings, factory.catalog, factory.cameras, factory.lights, pool)
             exporters = Exporters(needs.classes, context)
             with aborting(pool, exporters):
-                output.prepare(exporters, digest_inputs(factory.catalog, factory.lights, factory.renderer.scene.looks), pool)
+                output.prepare(exporters, digest_inputs(factory.catalog, factory.lights, factory.randomized), pool)
                 _Run(factory, exporters, needs.views, partial(output.commit, exporters, pool), summary, progress, StopRequest()).run()
                 with scope("wait for writers"):
                     pool.wait()

@@ -53,8 +53,8 @@ def make_images(toy: ToyScene, device: wp.Device, worlds: int = 4, views: int = 
     config = toy.settings()
     rig = Rig.of(replace(config.cameras, resolution=(192, 108)))
     settings = replace(config.perception, resolution=RESOLUTION, views=views)
-    catalog, cameras = Catalog(tuple(toy.entries)), make_cameras(rig)
-    scene = build_render_scene(config.render, -config.tote.wall, catalog, toy.fixtures, cameras, toy.lights, device)
+    catalog = Catalog(tuple(toy.entries))
+    scene = build_render_scene(config.render, -config.tote.wall, catalog, toy.fixtures, make_cameras(rig), toy.lights, device)
     return PerceptionImages(settings, rig, scene, worlds, toy.instances)
 
 

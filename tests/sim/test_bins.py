@@ -6,13 +6,18 @@ import dataclasses
 
 import numpy as np
 import pytest
+import warp as wp
 from scipy.spatial.transform import Rotation
 
 from synpick_warp.codes import Mode, Phase, Stream
-from synpick_warp.configs.bins import Bins
+from synpick_warp.configs.bins import BinRow, Bins
+from synpick_warp.configs.cell import bin_sizes
 from synpick_warp.stages.sim import arrange, gripper
+from synpick_warp.stages.sim.simulate import Simulation
+from synpick_warp.stages.stream import read_tick
 from tests.twins import rng
 from tests.worlds.kernel_worlds import BIN, KernelWorlds
+from tests.worlds.small_worlds import COARSE, catalog, settings
 
 SEED, WORLDS = 7, 64
 DROP = {"volume": 10.0, "pick_repeats": 0, "move_repeats": 0}
@@ -22,9 +27,7 @@ LOW = dataclasses.replace(BIN, name="low", opening=(0.3, 0.2), height=0.1, base=
 
 def started(device, worlds: int = WORLDS, **more) -> KernelWorlds:
     """Worlds that start episodes of five small objects, with bins drawn."""
-    result = KernelWorlds(
-        device, worlds, objects=5, radius=np.full(5, 0.05), drop={"volume": 10.0, "pick_repeats": 0, "move_repeats": 0}, **more
-    )
+    result = KernelWorlds(device, worlds, objects=5, radius=np.full(5, 0.05), drop=DROP, **more)
     result.set(result.state.phase, Phase.START)
     result.set(result.state.arrangement_id, np.stack([np.arange(worlds), np.arange(worlds) % 3], axis=1))
     arrange.sample_episodes(result.scene, result.state, SEED)
@@ -104,5 +107,93 @@ def test_shapes_of_the_drawn_bin_are_at_its_pose_and_all_others_away(device):
     found = worlds.physics.model.shape_transform.numpy().reshape(WORLDS, -1, 7)
     for world, (chosen, pose) in enumerate(zip(worlds.state.bin.numpy(), worlds.state.bin_pose.numpy(), strict=True)):
         for shape, owner, guide in parts:
+            away = arrange.rest.SHAPES_AWAY if owner == chosen else arrange.rest.BINS_AWAY
             stands = owner == chosen and (not guide or world % 2 == 1)
-            np.testing.assert_array_equal(found[world, shape], pose if stands else [0, 0, arrange.rest.SHAPES_AWAY, 0, 0, 0, 1])
+            np.testing.assert_array_equal(found[world, shape], pose if stands else [0, 0, away, 0, 0, 0, 1])
+
+
+def test_objects_fall_over_their_compartments_and_rounds_take_them_in_turn(device):
+    sizes = dataclasses.replace(BIN, floor=(0.5, 0.3), compartments=(3, 2))
+    worlds = started(device, bins=(sizes,))
+    arrange.drop_objects(worlds.scene, worlds.state, worlds.physics, SEED)
+    place = worlds.coordinates()[:, :, :2]
+    apart = np.abs(place[:, :, None] - np.array(sizes.centers)) - (np.array(sizes.cell) / 2 - 0.05)
+    there = (apart < 1e-6).all(axis=3)
+    assert (there.sum(axis=2) == 1).all()
+    key = np.array([rng.stream_key(SEED, world, world % 3, Stream.COMPARTMENT) for world in range(WORLDS)])
+    expected = np.stack([rng.uniform_index(key, instance, 6) for instance in range(5)], axis=1)
+    slots = worlds.state.body_slot.numpy()
+    np.testing.assert_array_equal(np.take_along_axis(there.argmax(axis=2), slots, axis=1), expected)
+    worlds.set(worlds.state.phase, Phase.ACT)
+    worlds.set(worlds.state.mode, Mode.MOVE)
+    worlds.set(worlds.state.frame, -1)
+    gripper.begin_moving(worlds.scene, worlds.state, worlds.physics, SEED)
+    compartment = worlds.state.corner_order.numpy().reshape(WORLDS, -1, 4) // 4
+    assert (compartment == compartment[:, :, :1]).all()
+    assert ((compartment[:, 1, 0] - compartment[:, 0, 0]) % 6 == 1).all()
+    assert len(np.unique(compartment)) == 6
+
+
+def test_the_gripper_passes_over_dividers_and_nowhere_below_the_rim_through_them(device):
+    sizes = dataclasses.replace(BIN, floor=(0.5, 0.3), compartments=(2, 1))
+    worlds = started(device, 1, bins=(sizes,), places=PLACES, move={"speed": 2.0})
+    worlds.set(worlds.state.phase, Phase.ACT)
+    worlds.set(worlds.state.mode, Mode.MOVE)
+    worlds.set(worlds.state.frame, -1)
+    gripper.begin_moving(worlds.scene, worlds.state, worlds.physics, SEED)
+    points = [worlds.state.setpoint.numpy()[0].copy()]
+    while worlds.state.waypoint.numpy()[0] < worlds.scene.move.waypoints:
+        gripper.launch(gripper.gripper.advance_setpoints_kernel, 1, worlds.scene, worlds.state, worlds.attempts, worlds.plan)
+        points.append(worlds.state.setpoint.numpy()[0].copy())
+        assert len(points) < 5000
+    pose = worlds.state.bin_pose.numpy()[0].astype(np.float64)
+    local = Rotation.from_quat(pose[3:]).inv().apply(np.array(points) - pose[:3]) - (0.0, 0.0, worlds.scene.move.tcp_offset)
+    crossing = np.flatnonzero(np.diff(np.sign(local[:, 0])))
+    assert len(crossing) == 1
+    assert (local[crossing[0] : crossing[0] + 2, 2] > sizes.height + 0.049).all()
+    assert np.linalg.norm(np.diff(points, axis=0), axis=1).max() < 2.0 * 2e-3 + 1e-6
+
+
+def first_frames(config, worlds: int) -> dict[int, tuple[int, np.ndarray, np.ndarray]]:
+    """Bin, its pose and the poses of the objects in the first frame of each episode."""
+    config = dataclasses.replace(config, bake=dataclasses.replace(config.bake, worlds=worlds))
+    simulation = Simulation(config, catalog(), 1, wp.get_device(config.bake.device))
+    found = {}
+    for _ in range(300):
+        simulation.tick()
+        report = read_tick(simulation.record)
+        for world in np.flatnonzero(report.column("live") & (report.column("frame") == 0)):
+            poses = report.pose[world][report.catalog_index[world] >= 0]
+            found[int(report.column("episode")[world])] = (int(report.snapshot.bin[world]), report.snapshot.fixture_pose[world, 0], poses)
+        if len(found) == config.bake.episodes:
+            return found
+    raise AssertionError(f"{len(found)} of {config.bake.episodes} episodes began")
+
+
+ROWS = (
+    BinRow(name="halves", compartments=(2, 1), divider_height=0.15),
+    BinRow(name="flat", outer_size=(0.615, 0.373, 0.1), wall=0.01, rim_size=(0.53, 0.34)),
+)
+
+
+@pytest.mark.parametrize(
+    "bins", [dataclasses.replace(PLACES, kind="own"), dataclasses.replace(PLACES, kind="none"), dataclasses.replace(PLACES, kind="pallet")]
+)
+def test_piles_rest_in_or_on_the_bin_that_is_drawn_in_any_number_of_worlds(bins):
+    base = settings(bake__episodes=4, bake__mode="move", move__speed=10.0, **COARSE)
+    config = dataclasses.replace(base, bins=bins, bin=ROWS if bins.kind == "own" else ())
+    sizes, found = bin_sizes(config), first_frames(config, 4)
+    assert {chosen for chosen, _, _ in found.values()} == set(range(len(sizes)))
+    for chosen, pose, objects in found.values():
+        local = Rotation.from_quat(pose[3:]).inv().apply(objects[:, :3] - pose[:3])
+        limit = np.array(sizes[chosen].opening) / 2 + sizes[chosen].margin
+        assert len(objects) > 0
+        assert (np.abs(local[:, :2]) < limit).all()
+        # The smallest side of an object is 3 cm, and no object rests on the rim or a divider.
+        assert (local[:, 2] > 0.014).all()
+        assert (local[:, 2] < 0.15).all()
+    one = first_frames(config, 1)
+    for episode, (chosen, pose, objects) in found.items():
+        assert chosen == one[episode][0]
+        np.testing.assert_array_equal(pose, one[episode][1])
+        np.testing.assert_array_equal(objects, one[episode][2])

@@ -29,8 +29,8 @@ SHORT = {
 
 def render_scene(config: Config, objects: Catalog, device: Any) -> RenderScene:
     """The scene of a bake, under one light."""
-    fixtures, cameras = make_fixtures(make_bins(bin_sizes(config)), config.gripper), make_cameras(config.rig)
-    return build_render_scene(config.render, -config.tote.wall, objects, fixtures, cameras, load_lights("")[:LIGHTS], device)
+    fixtures, lights = make_fixtures(make_bins(bin_sizes(config)), config.gripper), load_lights("")[:LIGHTS]
+    return build_render_scene(config.render, -config.tote.wall, objects, fixtures, make_cameras(config.rig), lights, device)
 
 
 def picking(config: Config, objects: Catalog, device: Any, **other: Any) -> Simulation:

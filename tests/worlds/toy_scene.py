@@ -138,9 +138,11 @@ class ToyScene:
     """(entry, pose) of the instances of each world."""
     cameras: tuple[Camera, ...]
     lights: tuple[EnvironmentMap, ...] = (even_light(),)
-    fixtures: tuple[Fixture, Fixture, Fixture] = (Fixture(box(1, 1, 0.1), GREY),) + (Fixture(box(0.1, 0.1, 0.1), GREY),) * 2
+    fixtures: tuple[Fixture, ...] = (Fixture(box(1, 1, 0.1), GREY),) + (Fixture(box(0.1, 0.1, 0.1), GREY),) * 2
     fixture_poses: tuple[tuple[float, ...], ...] = ((0.0, 0.0, 0.0, *UPRIGHT),) * 3
     fixtures_visible: tuple[int, int, int] = (0, 0, 0)
+    bin: int = 0
+    """Bin of every world; more of them come first in `fixtures`."""
     instances: int = 4
     """Instance capacity of a world."""
     light_yaw: float = 0.0
@@ -184,6 +186,7 @@ def snapshot(toy: ToyScene, device: wp.Device) -> Snapshot:
     result.pose.assign(poses)
     result.fixture_pose.assign(np.tile(np.array(toy.fixture_poses, np.float32), (worlds, 1, 1)))
     result.fixture_visible.assign(np.tile(np.array(toy.fixtures_visible), (worlds, 1)))
+    result.bin.fill_(toy.bin)
     result.light_yaw.fill_(toy.light_yaw)
     result.light_exposure.fill_(toy.light_exposure)
     return result

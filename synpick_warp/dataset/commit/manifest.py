@@ -26,10 +26,11 @@ import msgspec
 
 from synpick_warp import __version__
 from synpick_warp.configs.bins import Bins
-from synpick_warp.configs.load import load_config, override_config
+from synpick_warp.configs.load import load_config, override_config, table_lists
 from synpick_warp.configs.objects import AUTO_UNIT, Objects
 from synpick_warp.configs.randomize import Distribution, Randomize
 from synpick_warp.configs.schema import CLASSIC, WITHIN, Config
+from synpick_warp.configs.table_lists import given_values
 from synpick_warp.dataset.records import Entry, EpisodeEntry, IndicesEntry, Manifest, read_record
 from synpick_warp.errors import DatasetError
 from synpick_warp.exporters.formats import FORMAT_TABLE
@@ -79,7 +80,8 @@ YOUNGER_SETTINGS: dict[str, Any] = {
     "bop.keypoints": 0,
     "arrangement.fill": WITHIN,
     "perception.camera": "",
-    "camera": (),
+    "camera": [],
+    "bin": [],
     "objects.unit": AUTO_UNIT,
     "objects.symmetries": Objects().symmetries,
     "objects.symmetry_tolerance": Objects().symmetry_tolerance,
@@ -126,6 +128,8 @@ def fixed_settings(config: Config) -> dict[str, Any]:
     Nested; formats sorted by name.
     """
     settings = dataclasses.asdict(config)
+    for name in table_lists():
+        settings[name] = [given_values(row) for row in getattr(config, name)]
     settings["randomize"] = {item.name: _plain(getattr(config.randomize, item.name)) for item in dataclasses.fields(Randomize)}
     for key in FREE_SETTINGS:
         section, name = key.split(".")
@@ -209,10 +213,9 @@ def differences(here: Mapping[str, Any], there: Mapping[str, Any], path: str = "
     """Compare two manifests: yields (key, value here, value there) of each difference; None: no such key."""
     for name in [*here, *(name for name in there if name not in here)]:
         first, second = here.get(name), there.get(name)
-        if isinstance(first, Mapping) and isinstance(second, Mapping | None):
-            yield from differences(first, second or {}, f"{path}{name}.")
-        elif isinstance(second, Mapping) and first is None:
-            yield from differences({}, second, f"{path}{name}.")
+        if isinstance(first, Mapping | None) and isinstance(second, Mapping | None):
+            # A section of which one has no key, since all have their old values.
+            yield from differences(first or {}, second or {}, f"{path}{name}.")
         elif first != second:
             yield f"{path}{name}", first, second
 

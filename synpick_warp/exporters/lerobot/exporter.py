@@ -77,8 +77,8 @@ class LerobotExporter(EpisodeExporter[_Content]):
         """See `Exporter`."""
         super().__init__(context)
         settings, rig = context.settings, context.settings.rig
-        rate, noun = video_rate(settings.physics), settings.bins[0].noun
-        self._settings = EpisodeSettings(context.out, rig.names, rig.sizes, rate, context.names, noun)
+        known = (video_rate(settings.physics), context.names, settings.bins[0].noun)
+        self._settings = EpisodeSettings(context.out, rig.names, rig.sizes, *known)
 
     @staticmethod
     def slot_bytes(settings: ExportSettings) -> int:

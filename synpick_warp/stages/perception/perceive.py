@@ -51,6 +51,7 @@ class Perception:
         self.device = state.phase.device
         worlds, instances = observation.visible.shape
         self.images = PerceptionImages(settings, rig, render_scene, worlds, instances)
+        self.images.fixture_visible[:, :1].fill_(scene.bins.visible)
         self.segmenter = Segmenter(self.images)
         self.planner = GraspPlanner(settings, self.images, self.segmenter.arrays)
         self._worklist = wp.zeros(worlds, dtype=wp.int32, device=self.device)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import cv2
@@ -125,7 +125,8 @@ def uv_density(mesh: TriangleMesh) -> np.ndarray:
 def build_meshes(
     shapes: list[TriangleMesh], entries: int, device: wp.Device, interior: Interior | None = None
 ) -> tuple[Any, tuple[wp.Mesh, ...]]:
-    """The struct `Meshes`, and a `wp.Mesh` per shape, which must outlive it; `interior` is the tote's empty interior (None: none)."""
+    """The struct `Meshes`, and a `wp.Mesh` per shape, which must outlive it; `entries` is the row of the first bin, `interior` its empty
+    interior (None: none)."""
     keep = tuple(
         wp.Mesh(
             points=wp.array(shape.vertices, dtype=wp.vec3, device=device),
@@ -216,6 +217,12 @@ def build_cameras(cameras: tuple[Camera, ...], device: wp.Device) -> Any:
     return result
 
 
+def with_cameras(scene: RenderScene, cameras: tuple[Camera, ...]) -> RenderScene:
+    """The same scene with other cameras, of one image size."""
+    grid = build_grid(cameras[0].width, cameras[0].height)
+    return replace(scene, cameras=build_cameras(cameras, scene.device), grid=grid, camera_count=len(cameras))
+
+
 def build_grid(width: int, height: int) -> Any:
     """The struct `ImageGrid` of images of `width` x `height` px."""
     grid = ImageGrid()
@@ -233,6 +240,8 @@ def pack_half3_array(colors: np.ndarray) -> np.ndarray:
     return halves.view(np.uint64)[..., 0]
 
 
+GRIPPER = 2
+"""Fixtures of the gripper: shaft and cup."""
 MAX_RAYS_PER_LAMP = 4
 """Maximum number of shadow rays per lamp and pixel of the shadow grid: 8 would gain 0.05 dB in PSNR."""
 
@@ -309,13 +318,17 @@ def build_render_scene(
         device: Device of the arrays.
         looks: What episodes draw their looks from; None: nothing.
     """
+    # The first bin comes last, see `fixture_mesh`.
+    bins, grip = fixtures[:-GRIPPER], fixtures[-GRIPPER:]
+    fixtures = (*reversed(bins), *grip)
     shapes = [entry.mesh for entry in catalog.entries] + [fixture.mesh for fixture in fixtures]
     if looks and looks.bin_textures:
-        shapes[len(catalog)] = project_from_box(shapes[len(catalog)])
+        first = len(catalog)
+        shapes[first : first + len(bins)] = map(project_from_box, shapes[first : first + len(bins)])
     table_material = Material(color=settings.table_color, texture=None, metallic=0.0, roughness=TABLE_ROUGHNESS)
     materials = [entry.material for entry in catalog.entries] + [fixture.material for fixture in fixtures] + [table_material]
     materials += [Material((1.0, 1.0, 1.0), texture, 0.0, 1.0) for texture in (looks.all_textures if looks else ())]
-    meshes, keep = build_meshes(shapes, len(catalog), device, fixtures[0].interior)
+    meshes, keep = build_meshes(shapes, len(catalog) + len(bins) - 1, device, bins[0].interior if len(bins) == 1 else None)
     table = Table()
     table.visible, table.height = int(settings.table), table_height
     ground = srgb_to_linear(np.array(settings.table_color)) if settings.table else None

@@ -37,7 +37,7 @@ def pair_views(worlds: np.ndarray, cameras: np.ndarray) -> tuple[np.ndarray, np.
     return np.repeat(worlds, len(cameras)).astype(np.int32), np.tile(cameras, len(worlds)).astype(np.int32)
 
 
-def make_views(world: wp.array, camera: wp.array, count: int, instances: int, cameras: Any = None) -> Any:
+def make_views(world: wp.array, camera: wp.array, count: int, instances: int, cameras: Any = None, slot: wp.array | None = None) -> Any:
     """The struct `Views`.
 
     Args:
@@ -46,9 +46,11 @@ def make_views(world: wp.array, camera: wp.array, count: int, instances: int, ca
         count: Views in the batch; arrays may be longer.
         instances: Instance capacity of a world.
         cameras: The struct `ViewCameras`; None: the renderer brings its own.
+        slot: Row of each view's camera in the scene (view) int32; None: that of its index.
     """
     views = Views()
     views.world, views.camera, views.count, views.instances = world, camera, count, instances
+    views.slot = camera if slot is None else slot
     if cameras is not None:
         views.cameras = cameras
     return views
@@ -84,16 +86,8 @@ def set_up_views(
     """
     wp.launch(aim_cameras_kernel, dim=views.count, inputs=[scene.cameras], outputs=[views], device=scene.device)
     dim = (views.count, bodies.mesh.shape[1])
-    inputs = [
-        scene.meshes,
-        scene.grid,
-        snapshot.bin,
-        snapshot.catalog_index,
-        snapshot.pose,
-        snapshot.fixture_pose,
-        fixture_visible,
-        views,
-    ]
+    worlds = [snapshot.bin, snapshot.catalog_index, snapshot.pose, snapshot.fixture_pose, fixture_visible]
+    inputs = [scene.meshes, scene.grid, *worlds, views]
     wp.launch(set_up_views_kernel, dim=dim, inputs=inputs, outputs=[bodies], device=scene.device)
     wp.launch(sort_bodies_kernel, dim=dim, inputs=[scene.meshes], outputs=[bodies], device=scene.device)
     inputs = [scene.meshes, scene.grid, views]

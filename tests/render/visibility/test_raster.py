@@ -204,6 +204,48 @@ def test_a_moved_or_hidden_tote_does_not_use_the_background(device):
     assert not gone.any()
 
 
+BINS = (
+    Fixture(box(0.5, 0.3, 0.05), replace(GREY, color=(0.7, 0.1, 0.1))),
+    Fixture(box(0.3, 0.4, 0.1), replace(GREY, color=(0.1, 0.2, 0.7))),
+)
+GRIP = (Fixture(box(0.05, 0.05, 0.3), GREY), Fixture(box(0.1, 0.1, 0.1), GREY))
+IN_A_BIN = ToyScene(
+    [entry(box(0.1, 0.1, 0.1)), entry(ball(0.06, 3))],
+    [[(0, (0.05, 0.0, 0.1, *UPRIGHT)), (1, (-0.08, 0.02, 0.11, *UPRIGHT))]],
+    (VIEW,),
+    fixture_poses=((0.0, 0.0, 0.0, *UPRIGHT), (0.0, 0.1, 0.3, *UPRIGHT), (0.0, 0.1, 0.15, *UPRIGHT)),
+    fixtures_visible=(1, 1, 1),
+    table=True,
+)
+
+
+@pytest.mark.parametrize("chosen", range(2))
+def test_a_world_shows_its_own_bin(device, chosen):
+    """The picture is that of a scene with this bin alone."""
+    several = render(replace(IN_A_BIN, fixtures=(*BINS, *GRIP), bin=chosen), device)
+    alone = render(replace(IN_A_BIN, fixtures=(BINS[chosen], *GRIP)), device)
+    assert {1, 2, Segment.TABLE, Segment.TOTE, Segment.FINGER} <= set(np.unique(alone.instance))
+    for name in ("color", "depth", "instance", "amodal", "pixels", "boxes"):
+        np.testing.assert_array_equal(getattr(several, name), getattr(alone, name))
+
+
+def test_a_bin_that_moves_with_camera_and_objects_gives_the_same_picture(device):
+    """One is shown before the static background, the other not."""
+    offset = np.array([0.125, -0.0625, 0.0])
+
+    def moved(pose):
+        return (*(np.array(pose[:3]) + offset).tolist(), *pose[3:])
+
+    toy = replace(IN_A_BIN, fixtures=(BINS[0], *GRIP))
+    lens = replace(VIEW, translation=VIEW.translation - VIEW.rotation @ offset)
+    placed = [[(which, moved(pose)) for which, pose in toy.placed[0]]]
+    other = replace(toy, cameras=(lens,), placed=placed, fixture_poses=tuple(map(moved, toy.fixture_poses)))
+    first, second = render(toy, device), render(other, device)
+    np.testing.assert_array_equal(first.instance, second.instance)
+    np.testing.assert_allclose(first.exact_depth, second.exact_depth, rtol=2e-6)
+    assert np.abs(first.color.astype(int) - second.color).max() <= 1
+
+
 def test_a_mesh_with_more_triangles_than_marks_can_name_is_refused(device, monkeypatch):
     monkeypatch.setattr(raster, "MAX_TRIANGLES", 11)
     with pytest.raises(CatalogError, match="a mesh has 12 triangles; at most 11"):
