@@ -117,8 +117,8 @@ def write_constants(
     root = zarr.create_group(
         store,
         attributes={
-            "description": f"Physics of a synpick-warp data set. SI units; the world's origin is the centre of the {noun}'s inner floor, z up."
-            f" Episodes are in {EPISODES}, named by number.",
+            "description": f"Physics of a synpick-warp data set. SI units; the world's origin is the centre of the {noun}'s inner floor,"
+            f" z up. Episodes are in {EPISODES}, named by number.",
             "format": FORMAT,
             "seed": seed,
             "step": physics.step,
