@@ -61,4 +61,4 @@ class CameraRow:
     matrix: tuple[tuple[float, float, float], tuple[float, float, float], tuple[float, float, float]] | None = setting(
         None, "px", "Camera matrix with fx, fy, cx and cy, instead of fov.", low=-1e6, high=1e6
     )
-    pose: Pose = setting(Pose(), "", "Pose in the tote's frame: {matrix}, {position, quaternion} or {position, look_at, up}.")  # noqa: RUF009
+    pose: Pose = setting(Pose(), "", "Pose in the tote's frame: {matrix}, {position, quaternion} or {position, look_at, up}.")

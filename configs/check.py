@@ -9,6 +9,7 @@ import typing
 from collections.abc import Iterator
 from typing import Any
 
+from synpick_warp.configs.randomize import OFF, Distribution
 from synpick_warp.errors import ConfigError, format_value, suggest
 
 _NAMES = {
@@ -48,10 +49,13 @@ def check_value(key: str, value: object, item: dataclasses.Field[Any], annotatio
         ConfigError: The value has the wrong type or length, is not finite, or lies outside the setting's range.
     """
     try:
-        result = _convert(value, annotation)
-    except _MismatchError as mismatch:
+        parse = item.metadata.get("parse")
+        result = _convert(parse(value) if parse else value, annotation)
+    except (_MismatchError, ValueError) as mismatch:
         allowed = str(mismatch) or describe_type(annotation)
         raise ConfigError(f"{key} is {format_value(value)} {source}; allowed: {allowed}{_unit(item)}") from None
+    if isinstance(result, Distribution) and result.kind == OFF != item.default.kind:
+        raise ConfigError(f"{key} is {format_value(value)} {source}; allowed: {describe_allowed(item, annotation)}{_unit(item)}")
     if not all(_inside(leaf, item) for leaf in _leaves(result)):
         wrong = next(leaf for leaf in _leaves(result) if not _inside(leaf, item))
         hint = suggest(str(wrong), item.metadata["choices"])
@@ -65,6 +69,9 @@ def describe_allowed(item: dataclasses.Field[Any], annotation: Any) -> str:
     if rules["choices"]:
         return ("any of " if typing.get_origin(annotation) is tuple else "") + ", ".join(rules["choices"])
     words = [f"{word} {_number(rules[name])}" for name, word in _BOUNDS if rules[name] is not None]
+    if _is_distribution(annotation):
+        off = f'"{OFF}", ' if item.default.kind == OFF else ""
+        return f"{off}{annotation.noun} or distribution, {', '.join(words)}"
     if not words:
         return describe_type(annotation)
     return ("each " if typing.get_origin(annotation) is tuple else "") + ", ".join(words)
@@ -72,7 +79,9 @@ def describe_allowed(item: dataclasses.Field[Any], annotation: Any) -> str:
 
 def describe_type(annotation: Any, *, plural: bool = False) -> str:
     """Describe a type: "a finite number", "2 whole numbers in a list", "a list of lists of 3 numbers"."""
-    if dataclasses.is_dataclass(annotation):
+    if _is_distribution(annotation):
+        return annotation.describe()
+    if is_table(annotation):
         return f"a table of {', '.join(part.name for part in dataclasses.fields(annotation))}"
     if typing.get_origin(annotation) is not tuple:
         return _NAMES[annotation][plural]
@@ -88,6 +97,11 @@ def _convert(value: object, annotation: Any) -> Any:
     """Value as the annotated type (int becomes float, lists tuples); raises _MismatchError if it does not fit."""
     if typing.get_origin(annotation) is tuple:
         return _convert_tuple(value, typing.get_args(annotation))
+    if _is_distribution(annotation):
+        try:
+            return annotation.parse(value)
+        except ValueError as error:
+            raise _MismatchError(str(error)) from None
     if annotation is float:
         if not isinstance(value, int | float) or isinstance(value, bool):
             raise _MismatchError
@@ -97,6 +111,16 @@ def _convert(value: object, annotation: Any) -> Any:
     if isinstance(value, int) and not -(2**63) <= value < 2**63:
         raise _MismatchError("a whole number of at most 64 bits, as TOML has")
     return value
+
+
+def is_table(annotation: Any) -> bool:
+    """Whether a setting of this type is a table in TOML."""
+    return isinstance(annotation, type) and dataclasses.is_dataclass(annotation) and not _is_distribution(annotation)
+
+
+def _is_distribution(annotation: Any) -> bool:
+    """Whether a type is that of a distribution."""
+    return isinstance(annotation, type) and issubclass(annotation, Distribution)
 
 
 def _convert_tuple(value: object, parts: tuple[Any, ...]) -> tuple[Any, ...]:
@@ -131,8 +155,10 @@ def _encodable(text: str) -> bool:
 
 
 def _leaves(value: Any) -> Iterator[Any]:
-    """Yield the single values of nested tuples."""
-    if isinstance(value, tuple):
+    """Yield the single values of nested tuples, and of a distribution those that must lie within the setting's range."""
+    if isinstance(value, Distribution):
+        yield from value.limits()
+    elif isinstance(value, tuple):
         for one in value:
             yield from _leaves(one)
     else:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import field
 from typing import Any
 
@@ -18,6 +19,7 @@ def setting(
     high: float | None = None,
     above: float | None = None,
     choices: tuple[str, ...] = (),
+    parse: Callable[[Any], Any] | None = None,
 ) -> Any:
     """Declare a setting: a dataclass field whose metadata are unit, meaning (one sentence) and allowed values.
 
@@ -29,6 +31,7 @@ def setting(
         high: Maximum, inclusive.
         above: Minimum, exclusive.
         choices: Allowed strings; empty: any.
+        parse: Converts a value as TOML has it to one of the field's type; raises ValueError with what is allowed.
     """
-    metadata = {"unit": unit, "doc": doc, "low": low, "high": high, "above": above, "choices": choices}
+    metadata = {"unit": unit, "doc": doc, "low": low, "high": high, "above": above, "choices": choices, "parse": parse}
     return field(default=default, metadata=metadata)

@@ -60,6 +60,12 @@ class Rig:
         """Width and height of each camera's images [px]."""
         return tuple(row.resolution for row in self.rows if row.resolution is not None)
 
+    @cached_property
+    def groups(self) -> tuple[tuple[int, ...], ...]:
+        """Indices of the cameras of each image size, which are rendered together."""
+        sizes = dict.fromkeys(self.sizes)
+        return tuple(tuple(index for index, own in enumerate(self.sizes) if own == size) for size in sizes)
+
     @property
     def largest(self) -> Size:
         """Width and height of the images with most pixels [px]."""

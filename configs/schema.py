@@ -1,20 +1,23 @@
 """Settings schema of a bake: frozen dataclasses, each field with default, unit, range and meaning. Nothing else has defaults.
 
 The defaults are the paper's values (preset `synpick`); where the paper names none, the help text says where a value comes from.
-"Released" means the generator that the paper's authors published. Sections: here, `cameras`, `manipulation` and `sensors`.
+"Released" means the generator that the paper's authors published. Sections: here, `cameras`, `manipulation`, `objects`, `randomize` and
+`sensors`.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import Any, ClassVar
+from typing import Any
 
 from synpick_warp.codes import Tone, names
 from synpick_warp.configs.bins import BinRow, Bins, Tote
 from synpick_warp.configs.cameras import CameraRow, Cameras
 from synpick_warp.configs.fields import INT32_MAX, setting
 from synpick_warp.configs.manipulation import Move, Perception, Pick, Suction, Target
+from synpick_warp.configs.objects import ObjectRow, Objects
+from synpick_warp.configs.randomize import Randomize
 from synpick_warp.configs.rig import Rig
 from synpick_warp.configs.sensors import DepthSensor, Effects
 from synpick_warp.views.layers import LAYER_TABLE
@@ -75,7 +78,9 @@ class Bake:
     seed: int = setting(0, "", "Random seed, from which every random number of the bake follows.", low=0, high=2**63 - 1)
     device: str = setting("auto", "", "Device: cpu, cuda:N, or auto (the first GPU if there is one).")
     models: str = setting(
-        "", "", "Folder of BOP models, of PLY, OBJ, glTF and STL meshes, or of a folder per object; empty: the embedded procedural objects."
+        "",
+        "",
+        "Folder of BOP models, of PLY, OBJ, glTF, STL and STEP files, or of a folder per object; empty: the embedded procedural objects.",
     )
     lights: str = setting("", "", "Folder of HDR environment maps (.hdr) and sIBL sets; empty: the embedded procedural maps.")
     formats: tuple[str, ...] = setting(
@@ -85,70 +90,6 @@ class Bake:
         choices=FORMATS,
     )
     writers: int = setting(0, "", "Processes that write files, for all devices; 0: one per CPU core, if memory suffices.", low=0, high=1024)
-
-
-@dataclass(frozen=True)
-class Objects:
-    """How a mesh becomes a rigid body: collision shape, mass and material."""
-
-    hull_vertices: int = setting(
-        64,
-        "",
-        "Maximum vertices of a convex hull. With 64, all but 5 % of the vertices of the real objects' hulls lie less than 2.5 mm outside.",
-        low=8,
-        high=256,
-    )
-    piece_vertices: int = setting(32, "", "Maximum vertices of each piece of a convex decomposition.", low=8, high=256)
-    pieces: int = setting(16, "", "Maximum pieces of a convex decomposition.", low=1, high=64)
-    concavity: float = setting(0.05, "", "CoACD's concavity threshold; smaller values follow the surface more closely.", low=0.01, high=1.0)
-    decomposition_time: float = setting(
-        300.0, "s", "Time limit of a convex decomposition; an object that takes longer gets its convex hull.", above=0.0, high=86400.0
-    )
-    concave_ratio: float = setting(
-        0.6, "", "Objects without a row in the object table are decomposed if mesh volume / hull volume is below this.", low=0.0, high=1.0
-    )
-    strict: bool = setting(
-        False, "", "End the bake at the first object or light map that cannot be used, instead of leaving it out with a line."
-    )
-    density: float = setting(400.0, "kg/m³", "Density over the volume of the convex hull, for objects without a mass.", above=0.0, high=1e5)
-    metallic: float = setting(0.1, "", "Metallic factor of objects whose material names none.", low=0.0, high=1.0)
-    roughness: float = setting(0.5, "", "Roughness of objects whose material names none.", low=0.0, high=1.0)
-    crease_angle: float = setting(
-        35.0,
-        "°",
-        "Meshes without normals are smooth where triangles meet at up to this angle, and have a sharp edge beyond; 180: smooth all over.",
-        low=0.0,
-        high=180.0,
-    )
-    center: bool = setting(
-        False,
-        "",
-        "Move the centre of each mesh's bounding box to its origin; BOP models, whose poses refer to their origin, stay as they are.",
-    )
-    diameter_tolerance: float = setting(
-        0.1,
-        "",
-        "Largest relative difference between a model's diameter and that of its row in the object table; with more, the row is not used.",
-        above=0.0,
-        high=1.0,
-    )
-
-
-@dataclass(frozen=True)
-class ObjectRow:
-    """A row of the object table: physical and material properties that model files do not contain."""
-
-    REQUIRED: ClassVar = ("id", "diameter")
-    IDENTITY: ClassVar = ("id", "name", "diameter")
-    id: int = setting(0, "", "The model's obj_id in its BOP folder.", low=0, high=INT32_MAX)
-    name: str = setting(
-        "", "", "Name of the object; for meshes that are not BOP models the file name without suffix, by which the row is found."
-    )
-    diameter: float = setting(0.0, "m", "Diameter of the model, which must agree for the row to be used; 0: any.", low=0.0)
-    mass: float = setting(0.1, "kg", "Mass.", above=0.0)
-    concave: bool = setting(False, "", "Use a convex decomposition as collision shape instead of the convex hull.")
-    metallic: float = setting(0.1, "", "Metallic factor, unless the mesh file names one.", low=0.0, high=1.0)
-    roughness: float = setting(0.5, "", "Roughness, unless the mesh file names one.", low=0.0, high=1.0)
 
 
 @dataclass(frozen=True)
@@ -435,6 +376,7 @@ class Config:
     render: Render = field(default_factory=Render)
     effects: Effects = field(default_factory=Effects)
     depth_sensor: DepthSensor = field(default_factory=DepthSensor)
+    randomize: Randomize = field(default_factory=Randomize)
     bop: Bop = field(default_factory=Bop)
     trajectory: Trajectory = field(default_factory=Trajectory)
     camera: tuple[CameraRow, ...] = ()

@@ -14,7 +14,7 @@ import typing
 from collections.abc import Mapping
 from typing import Any
 
-from synpick_warp.configs.check import check_value
+from synpick_warp.configs.check import check_value, is_table
 from synpick_warp.errors import ConfigError, format_value, shorten, suggest
 
 Settings = dict[str, tuple[dataclasses.Field[Any], Any]]
@@ -66,8 +66,8 @@ def read_table(key: str, kind: type[Any], content: object, source: str) -> Any:
 
 def _read_setting(key: str, value: object, item: dataclasses.Field[Any], annotation: Any, source: str) -> Any:
     """Checked value of a setting, which may be a table."""
-    if dataclasses.is_dataclass(annotation):
-        return read_table(key, annotation, value, source)  # type: ignore[arg-type]
+    if is_table(annotation):
+        return read_table(key, annotation, value, source)
     return check_value(key, value, item, annotation, source)
 
 
@@ -92,4 +92,4 @@ def change_rows(key: str, kind: type[Any], rows: tuple[Any, ...], changes: Mappi
 def given_values(row: Any) -> dict[str, Any]:
     """Settings of a row that are given, by name: all but those that are None; tables as dictionaries."""
     values = ((name, getattr(row, name)) for name in settings_of(type(row)))
-    return {name: given_values(value) if dataclasses.is_dataclass(value) else value for name, value in values if value is not None}
+    return {name: given_values(value) if is_table(type(value)) else value for name, value in values if value is not None}

@@ -7,6 +7,7 @@ from typing import Any
 
 from synpick_warp.configs.check import describe_allowed
 from synpick_warp.configs.load import sections, table_lists
+from synpick_warp.configs.randomize import Distribution
 from synpick_warp.configs.schema import Config, Split
 from synpick_warp.configs.split_tables import SPLITS, split_settings
 from synpick_warp.configs.table_lists import given_values, settings_of
@@ -55,8 +56,10 @@ def format_toml(value: Any) -> str:
         return "true" if value else "false"
     if isinstance(value, str):
         return json.dumps(value, ensure_ascii=False).replace(_DELETE, "\\u007f")
+    if isinstance(value, Distribution):
+        return format_toml(value.to_toml())
     if isinstance(value, dict):
-        return f"{{ {', '.join(f'{name} = {format_toml(one)}' for name, one in value.items())} }}"
+        return f"{{ {', '.join(f'{key} = {format_toml(one)}' for key, one in value.items())} }}"
     if isinstance(value, tuple):
         return f"[{', '.join(format_toml(one) for one in value)}]"
     return repr(value)

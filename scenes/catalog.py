@@ -10,21 +10,23 @@ import numpy as np
 from trimesh.bounds import oriented_bounds
 
 from synpick_warp.configs.cell import BinSizes, bin_sizes
+from synpick_warp.configs.objects import AUTO_UNIT, UNITS
 from synpick_warp.configs.schema import Config, ObjectRow, Objects
 from synpick_warp.errors import CatalogError, SynpickError
 from synpick_warp.scenes.assets.appearance import FileMaterial
 from synpick_warp.scenes.assets.asset_files import asset_scope
-from synpick_warp.scenes.assets.meshes import MeshOptions, read_mesh, signed_volume
+from synpick_warp.scenes.assets.meshes import MeshOptions, read_mesh_file, signed_volume
 from synpick_warp.scenes.assets.model_folders import ModelFile, list_models
 from synpick_warp.scenes.assets.models_info import ModelInfo, check_against_mesh, read_models_info
+from synpick_warp.scenes.assets.step import STEP_SUFFIXES
 from synpick_warp.scenes.collision.decomposition import ShapeRecipe
 from synpick_warp.scenes.collision.hulls import hull_size, mass_properties
 from synpick_warp.scenes.collision.shapes import collision_shapes, default_cache_dir
 from synpick_warp.scenes.embedded.objects import procedural_objects
+from synpick_warp.scenes.symmetries.objects import add_symmetries
 from synpick_warp.scenes.types import Catalog, CatalogEntry, ConvexPiece, HullSize, Material, RawObject, TriangleMesh
 from synpick_warp.system.processes.isolation import Failure, Limits, run_isolated
 
-_MILLIMETRE = 1e-3
 # Minimum diameter [m]: smaller bodies vanish in the contact margin, and come from files in another unit than expected.
 _MIN_DIAMETER = 2e-3
 # Maximum distance of a vertex from the origin, in diameters: with more, the origin lies far outside the body, and the bounding sphere
@@ -34,7 +36,10 @@ _MAX_ORIGIN_DISTANCE = 1.5
 _MASS_RANGE = (1e-7, 1e4)
 READ_LIMITS = Limits(600.0, 2**33)
 """Limits of a mesh file with its textures: 10 min and 8 GiB; the largest files that are read take a minute and 3 GiB."""
-_UNITS = "files named obj_NNNNNN.ply are read in millimetres, all others in metres"
+_UNITS = "files named obj_NNNNNN.ply are read in millimetres, all others in metres, unless objects.unit says otherwise"
+# Median diameters below this [m], or beyond the tote's diagonal, are told as implausible; the metric unit in which the median is nearest to
+# the typical diameter [m] of parts in a bin is proposed (inches are seldom, and near to centimetres).
+_SMALL, _TYPICAL = 5e-3, 0.1
 
 
 def _ignore(line: str) -> None:
@@ -57,10 +62,8 @@ def load_catalog(config: Config, cache_dir: Path | None = None, report: Callable
         CatalogError: The folder cannot be used, or none of its objects: a file is damaged, an object does not fit into the tote or has an
             invalid mass.
     """
-    rules = _Rules(config.objects, config.object_rows, bin_sizes(config))
     faults = _Faults(config.objects.strict, config.bake.models, report)
-    folder = Path(config.bake.models).expanduser()
-    raws = _read_folder(folder, rules, report, faults) if config.bake.models else _embedded_objects(rules, faults)
+    raws = _read_objects(config, report, faults)
     recipes = [shape_recipe(raw, config.objects) for raw in raws]
     names, meshes = [raw.name for raw in raws], [raw.mesh for raw in raws]
     seconds = config.objects.decomposition_time
@@ -78,31 +81,63 @@ def load_catalog(config: Config, cache_dir: Path | None = None, report: Callable
     return Catalog(tuple(sorted(entries, key=lambda entry: entry.obj_id)))
 
 
+def read_objects(config: Config, report: Callable[[str], None] = _ignore) -> list[RawObject]:
+    """Read and check the objects of a bake, without collision shapes; arguments, files and errors as of `load_catalog`."""
+    faults = _Faults(config.objects.strict, config.bake.models, report)
+    raws = _read_objects(config, report, faults)
+    faults.tell()
+    return raws
+
+
+def _read_objects(config: Config, report: Callable[[str], None], faults: _Faults) -> list[RawObject]:
+    """The embedded objects, or those of the folder `bake.models`."""
+    rules = _Rules(config.objects, config.object_rows, bin_sizes(config))
+    if not config.bake.models:
+        return _embedded_objects(rules, faults)
+    return _read_folder(Path(config.bake.models).expanduser(), rules, report, faults)
+
+
+class _SizeError(CatalogError):
+    """An object is too small or too large; `size` is its diameter [m]."""
+
+    def __init__(self, message: str, size: float = 0.0) -> None:
+        super().__init__(message)
+        self.size = size
+
+
 class _Faults:
     """Objects that cannot be used: with `objects.strict`, or if there is no other object, the first one is an error."""
 
     def __init__(self, strict: bool, folder: str, report: Callable[[str], None]) -> None:
         self._strict, self._folder, self._report = strict, folder, report
         self._errors: list[CatalogError] = []
+        self.advice = ""
+        """What may be wrong with all objects together."""
 
     def add(self, error: CatalogError) -> None:
         """Collect the error of an object, or raise it if `objects.strict` is set."""
         if self._strict:
-            raise error
+            raise self._advised(error)
         self._errors.append(error)
 
     def tell(self) -> None:
-        """Print a line for each object that is left out."""
+        """Print a line for each object that is left out, and the advice."""
         for error in self._errors:
             self._report(f"left out: {error}")
+        if self.advice:
+            self._report(f"models folder {self._folder}: {self.advice}")
+
+    def _advised(self, error: CatalogError) -> CatalogError:
+        """Error with the advice behind its message."""
+        return CatalogError(f"{error}; {self.advice}") if self.advice else error
 
     def summary(self) -> CatalogError:
         """Return the error for a folder without a usable object: that of its only object, or the number of objects and the first error."""
-        if len(self._errors) == 1:
-            return self._errors[0]
-        count = len(self._errors)
-        folder = f"models folder {self._folder}" if self._folder else "the embedded objects"
-        return CatalogError(f"{folder}: none of its {count} objects can be used; the first: {self._errors[0]}")
+        count, first = len(self._errors), self._errors[0]
+        if count > 1:
+            folder = f"models folder {self._folder}" if self._folder else "the embedded objects"
+            first = CatalogError(f"{folder}: none of its {count} objects can be used; the first: {first}")
+        return self._advised(first)
 
 
 @dataclass(frozen=True)
@@ -127,8 +162,11 @@ def _read_folder(folder: Path, rules: _Rules, report: Callable[[str], None], fau
 
         infos = read_models_info(folder / "models_info.json", [model.obj_id for model in models], without)
     calls = [(model, infos.get(model.obj_id, ModelInfo()), rules) for model in models]
-    raws = []
+    raws, sizes = [], []
     for model, result in zip(models, run_isolated(_read_model, calls, READ_LIMITS), strict=True):
+        if isinstance(result, _SizeError | tuple) and model.path.suffix.lower() not in STEP_SUFFIXES:
+            sizes.append(result.size if isinstance(result, _SizeError) else result[0].hull.diameter)
+            faults.advice = _advise_unit(sizes, _unit(rules.objects, model), rules.bins[0])
         if isinstance(result, Failure):
             faults.add(CatalogError(f"{model.path}: the process that reads it {result.reason}; repair or simplify the file"))
         elif isinstance(result, SynpickError):
@@ -165,22 +203,44 @@ def _read_model(model: ModelFile, info: ModelInfo, rules: _Rules) -> tuple[RawOb
     """
     lines: list[str] = []
     objects = rules.objects
-    options = MeshOptions(objects.crease_angle, objects.center and not model.is_bop, not objects.strict)
+    unit, center = _unit(objects, model), objects.center and not model.is_bop
+    options = MeshOptions(objects.crease_angle, center, not objects.strict, unit if center or objects.unit != AUTO_UNIT else "")
     with asset_scope(model.root) as scope:
-        mesh, material = read_mesh(model.path, _MILLIMETRE if model.is_bop else 1.0, options, lines.append)
+        found = read_mesh_file(model.path, UNITS[unit], options, lines.append)
+    mesh = found.mesh
     hull, tolerance = hull_size(mesh.vertices), objects.diameter_tolerance
     if model.is_bop and hull.diameter > 0.0:
         info, said = _check_info(info, mesh, hull, model, objects.strict)
         lines += said
     rows = (row for row in rules.rows if (row.id == model.obj_id if model.is_bop else row.name == model.name))
     row = next((row for row in rows if _fits(row, hull.diameter, tolerance)), None)
-    raw = _raw(model, mesh, hull, material, row, objects)
-    raw = replace(raw, symmetries_discrete=info.symmetries_discrete, symmetries_continuous=info.symmetries_continuous)
-    if model.is_bop and not scope.moved:  # A copy of the file could not name its texture as it does.
-        raw = replace(raw, source=model.path)
+    raw = _raw(model, mesh, hull, found.material, row, objects)
     _check_size(raw, str(model.path if model.is_bop else raw.name), rules.bins)
+    info, said = add_symmetries(info, found, hull.diameter, row, objects, str(model.path))
+    lines += said
+    raw = replace(raw, symmetries_discrete=info.symmetries_discrete, symmetries_continuous=info.symmetries_continuous)
+    # A copy of the file could not name its texture as it does, and would have another unit than BOP's.
+    if model.is_bop and unit == "mm" and not scope.moved:
+        raw = replace(raw, source=model.path)
     _checked_mass(raw, objects.density)
     return raw, [*scope.moved[:1], *lines]
+
+
+def _unit(objects: Objects, model: ModelFile) -> str:
+    """Unit of a mesh file."""
+    return objects.unit if objects.unit != AUTO_UNIT else "mm" if model.is_bop else "m"
+
+
+def _advise_unit(sizes: list[float], unit: str, place: BinSizes) -> str:
+    """Advice if the median diameter [m] of objects that were read in a unit is implausible, and is not in another unit; else empty."""
+    median = float(np.median(sizes)) if sizes else _TYPICAL
+    if _SMALL <= median <= _inner_diagonal(place):
+        return ""
+    likely = min(("m", "cm", "mm"), key=lambda name: abs(np.log(max(median, 1e-30) / UNITS[unit] * UNITS[name] / _TYPICAL)))
+    if likely == unit:
+        return ""
+    shown = f"{median:.3g} m" if median >= 1.0 else f"{median / UNITS['mm']:.3g} mm"
+    return f'{"median " if len(sizes) > 1 else ""}size {shown}: did you mean objects.unit = "{likely}"?'
 
 
 def _check_info(info: ModelInfo, mesh: TriangleMesh, hull: HullSize, model: ModelFile, strict: bool) -> tuple[ModelInfo, list[str]]:
@@ -234,7 +294,7 @@ def _check_size(raw: RawObject, origin: str, bins: Sequence[BinSizes]) -> None:
         raise CatalogError(f"{origin}: all vertices lie in one plane; a body needs a volume")
     size = raw.hull.diameter
     if size < _MIN_DIAMETER:
-        raise CatalogError(f"{origin}: diameter {size:.4g} m; a body needs at least {_MIN_DIAMETER:g} m; {_UNITS}")
+        raise _SizeError(f"{origin}: diameter {size:.4g} m; a body needs at least {_MIN_DIAMETER:g} m; {_UNITS}", size)
     for sizes in bins:
         _check_fits_bin(raw.mesh.vertices, size, origin, sizes)
     radius = float(np.linalg.norm(raw.mesh.vertices, axis=1).max())
@@ -251,7 +311,7 @@ def _check_fits_bin(vertices: np.ndarray, size: float, origin: str, sizes: BinSi
     It passes if the two smaller sides of a bounding box are at most as long as the opening's. The axis-aligned box is tried first, since
     the minimum oriented bounding box takes long to compute for fine meshes.
     """
-    inside = float(np.linalg.norm((*sizes.mouth, sizes.height))) if sizes.shell else np.inf
+    inside = _inner_diagonal(sizes) if sizes.shell else np.inf
     opening = sorted(sizes.mouth)
     box = sorted(np.ptp(vertices, axis=0).tolist())
     if size <= inside and box[0] <= opening[0] and box[1] <= opening[1]:
@@ -259,10 +319,16 @@ def _check_fits_bin(vertices: np.ndarray, size: float, origin: str, sizes: BinSi
     box = sorted(oriented_bounds(vertices)[1].tolist())
     if size <= inside and box[0] <= opening[0] and box[1] <= opening[1]:
         return
-    raise CatalogError(
+    raise _SizeError(
         f"{origin}: too large for the {sizes.noun}: {_by(box)} m, diameter {size:.4g} m, but the {sizes.noun}'s opening is "
-        f"{_by(opening)} m, and its inner diagonal {inside:.3g} m; {_UNITS}"
+        f"{_by(opening)} m, and its inner diagonal {inside:.3g} m; {_UNITS}",
+        size,
     )
+
+
+def _inner_diagonal(sizes: BinSizes) -> float:
+    """Diagonal of a bin's inside, or of the area where objects are dropped [m]."""
+    return float(np.linalg.norm((*sizes.mouth, sizes.height)))
 
 
 def _by(sides: list[float]) -> str:

@@ -160,7 +160,57 @@ class Stream(enum.IntEnum):
     COLOR_NOISE = 10
     DEPTH_NOISE = 11
     BIN = 12
+    LOOKS = 13
     COMPARTMENT = 15
+
+
+class Look(enum.IntEnum):
+    """Appearance parameter that is drawn, of a body, the table or a lamp; see `configs.randomize`."""
+
+    HUE = 0
+    """Rotation of the hue [°]."""
+    BRIGHTNESS = 1
+    """Factor on the base colour."""
+    ROUGHNESS = 2
+    METALLIC = 3
+    COLOR = 4
+    """Base colour [sRGB]."""
+    TEXTURE = 5
+    """Index of a texture."""
+    TEXTURE_WIDTH = 6
+    """Width of one repeat of the texture [m]."""
+    COUNT = 7
+    """Number of lamps."""
+    ELEVATION = 8
+    """Height of a lamp above the horizon [°]."""
+    RADIUS = 9
+    """Angular radius of a lamp [°]."""
+    STRENGTH = 10
+    """Irradiance of a surface that faces up by a lamp, relative to that by the map."""
+    TEMPERATURE = 11
+    """Colour temperature of a lamp [K]."""
+    AZIMUTH = 12
+    """Azimuth of a lamp in the map [°]."""
+
+
+class LookPart(enum.IntEnum):
+    """Part of a scene whose appearance is drawn."""
+
+    OBJECT = 0
+    BIN = 1
+    TABLE = 2
+    LAMP = 3
+
+
+class LookKind(enum.IntEnum):
+    """Kind of a probability distribution; see `configs.randomize.Distribution`."""
+
+    OFF = 0
+    FIXED = 1
+    UNIFORM = 2
+    LOG_UNIFORM = 3
+    NORMAL = 4
+    CHOICE = 5
 
 
 class Segment(enum.IntEnum):

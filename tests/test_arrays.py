@@ -26,7 +26,7 @@ from synpick_warp.stages.sim.physics import MIN_GPU_WORLDS
 from synpick_warp.stages.sim.simulate import allocate_worlds
 from synpick_warp.stages.sim.step_log import allocate_record, record_sizes
 from synpick_warp.stages.sim.worlds import world_sizes
-from synpick_warp.stages.stream import RING, allocate_ring
+from synpick_warp.stages.view_ring import RING, allocate_ring
 from synpick_warp.system.hardware.device import pick_device
 from tests.harness.memory_tables import device_arrays, queued_ticks
 from tests.worlds.small_worlds import settings

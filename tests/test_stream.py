@@ -16,7 +16,7 @@ import warp as wp
 from synpick_warp.codes import Effect, Measure, Phase, Status
 from synpick_warp.configs.schema import LAYERS, Config
 from synpick_warp.exporters.writing.rle import find_run_boundaries, unpack_run_boundaries
-from synpick_warp.stages import host_copies, stream
+from synpick_warp.stages import host_copies, view_ring
 from synpick_warp.stages.arrays import allocate
 from synpick_warp.stages.buffers import Snapshot, ViewBuffers
 from synpick_warp.stages.host_copies import HostCopy
@@ -32,9 +32,8 @@ from synpick_warp.stages.stream import (
     name_lights,
     read_tick,
     tick_batch,
-    view_sizes,
-    views_per_batch,
 )
+from synpick_warp.stages.view_ring import CameraGroup, ViewRing, view_sizes, views_per_batch
 from synpick_warp.system.codecs.jpeg import encode_jpeg
 from synpick_warp.views.frames import FrameBatch
 from tests.twins.depth_png import encode_depth
@@ -87,10 +86,9 @@ def sizes_of(config: Config, device: wp.Device) -> dict[str, int]:
     return view_sizes(config.render, config.rig, config.bake.worlds, config.arrangement.max_objects, device)
 
 
-def frame_stream(config: Config, renderer: FakeRenderer, device) -> FrameStream:
-    sizes, layers, cameras = sizes_of(config, device), config.render.layers, len(config.rig)
-    tick_time = config.physics.step * config.physics.steps_per_tick
-    return FrameStream(sizes, layers, cameras, tick_time, renderer, OBJECT_IDS, LIGHTS, device)  # type: ignore[arg-type]
+def frame_stream(config: Config, renderer: FakeRenderer, device, host: host_copies.HostImages | None = None) -> FrameStream:
+    group = CameraGroup(config.rig.groups[0], sizes_of(config, device), renderer)  # type: ignore[arg-type]
+    return FrameStream([ViewRing(group, config.render.layers, device, host)], config.physics.tick_time, OBJECT_IDS, LIGHTS, device)
 
 
 def rendered(device, live: list[int], batch: int, **overrides: object) -> tuple[list[dict[str, Any]], FakeRenderer]:
@@ -154,8 +152,8 @@ def test_layers_make_batches_smaller():
     gpu = SimpleNamespace(is_cuda=True)
     large = {"bake__worlds": 1000, "cameras__resolution": [1920, 1080]}
     count = batch_of(settings(**large, render__layers=list(LAYERS)), gpu)
-    pixel = stream.PIXEL_BYTES + 12 + 3 + 12 + 2 + 8 + 12 + 2
-    assert count * 1920 * 1080 * pixel <= stream.BATCH_BYTES < (count + 1) * 1920 * 1080 * pixel
+    pixel = view_ring.PIXEL_BYTES + 12 + 3 + 12 + 2 + 8 + 12 + 2
+    assert count * 1920 * 1080 * pixel <= view_ring.BATCH_BYTES < (count + 1) * 1920 * 1080 * pixel
 
 
 def test_no_live_world_gives_no_batch(device):
@@ -264,7 +262,7 @@ def test_batch_sizes():
     assert batch_of(config_of(), gpu) == 3 * WORLDS
     huge = settings(bake__worlds=1000, cameras__resolution=[1920, 1080])
     count = batch_of(huge, gpu)
-    assert count * 1920 * 1080 * stream.PIXEL_BYTES <= stream.BATCH_BYTES < (count + 1) * 1920 * 1080 * stream.PIXEL_BYTES
+    assert count * 1920 * 1080 * view_ring.PIXEL_BYTES <= view_ring.BATCH_BYTES < (count + 1) * 1920 * 1080 * view_ring.PIXEL_BYTES
     assert batch_of(settings(cameras__resolution=[8192, 8192]), gpu) == 1
 
 
@@ -274,7 +272,7 @@ def test_view_sizes_are_those_of_the_buffers(device):
     assert buffers.color.shape == (views, 6, 8)
     assert buffers.pixels.shape == (views, ROOM, 3)
     pixel = sum(wp.types.type_size_in_bytes(getattr(buffers, name).dtype) for name in ("color", "depth", "instance", "amodal"))
-    assert pixel == stream.PIXEL_BYTES
+    assert pixel == view_ring.PIXEL_BYTES
 
 
 def test_main_lights_are_told_in_the_world_and_maps_without_any_as_zero(device):
@@ -364,9 +362,8 @@ def test_run_boundaries_are_those_of_the_batchs_own_images(device):
 def test_files_and_lists_stand_for_images(device):
     """JPEG and depth files equal the encoded images; images that stay on the device are copied on demand, one at a time."""
     renderer, config = FakeRenderer([]), config_of(render__views_per_batch=4)
-    sizes, tick_time = sizes_of(config, device), config.physics.step * config.physics.steps_per_tick
     host = host_copies.HostImages(("color", "depth", "instance", "amodal"), 90, depth_files=True)
-    frames = FrameStream(sizes, (), 3, tick_time, renderer, OBJECT_IDS, LIGHTS, device, host)  # type: ignore[arg-type]
+    frames = frame_stream(config, renderer, device, host)
     code = iter([11, 12, 13, 41, 42, 43])
     for batch in frames.render("snapshot", report_of([0, 1, 0, 0, 1])):  # type: ignore[arg-type]
         for view in range(len(batch)):

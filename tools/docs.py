@@ -10,12 +10,11 @@ from __future__ import annotations
 import argparse
 import re
 from collections.abc import Callable
-from dataclasses import is_dataclass
 from pathlib import Path
 from typing import Any
 
 from synpick_warp.apps.validation.registry import load_rules
-from synpick_warp.configs.check import describe_allowed
+from synpick_warp.configs.check import describe_allowed, is_table
 from synpick_warp.configs.load import sections, table_lists
 from synpick_warp.configs.schema import Split
 from synpick_warp.configs.split_tables import SPLITS, split_settings
@@ -52,7 +51,7 @@ def _section(title: str, kind: type[Any], prefix: str) -> list[str]:
     """Rows of a section: its title and meaning, then its settings."""
     lines = [f'| <a id="{_anchor(title)}"></a>**`{title}`** | | | | **{" ".join((kind.__doc__ or "").split())}** |']
     for name, (item, annotation) in (split_settings() if kind is Split else settings_of(kind)).items():
-        if isinstance(annotation, type) and is_dataclass(annotation):
+        if is_table(annotation):
             lines += _section(f"{prefix}{name}", annotation, f"{prefix}{name}.")[1:]
             continue
         unit, rule = item.metadata["unit"], describe_allowed(item, annotation)

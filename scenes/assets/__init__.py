@@ -1,1 +1,1 @@
-"""Asset import: BOP folders, meshes (PLY, OBJ, glTF, STL), textures, from folders that may come from anywhere."""
+"""Asset import: BOP folders, meshes (PLY, OBJ, glTF, STL, STEP), textures, from folders that may come from anywhere."""

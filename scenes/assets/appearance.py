@@ -11,6 +11,7 @@ from PIL import Image, UnidentifiedImageError
 
 from synpick_warp.errors import CatalogError
 from synpick_warp.scenes.assets.asset_files import describe_error, quiet_decoding
+from synpick_warp.scenes.assets.exr import EXR_MAGIC, decode_exr
 
 MAX_TEXTURE_FILE = 2**27
 """Largest image file [bytes]: 128 MiB."""
@@ -72,16 +73,20 @@ def rgb8(image: Image.Image) -> np.ndarray:
     return np.repeat(np.rint(grey).astype(np.uint8)[:, :, None], 3, axis=2)
 
 
-def decode_texture(data: bytes, source: str) -> np.ndarray:
+def decode_texture(data: bytes, source: str, linear: bool = False) -> np.ndarray:
     """Decode an image as (H, W, 3) uint8. Its size is taken from the header and checked before any pixel is decoded.
 
     Args:
         data: The image file.
         source: Where it comes from, for errors.
+        linear: Whether the image has numbers such as roughness, which OpenEXR stores as they are, as colours of other formats are.
 
     Raises:
         CatalogError: The image is too large, of another format, or damaged.
     """
+    if data.startswith(EXR_MAGIC):
+        light = decode_exr(data, source, MAX_TEXTURE_PIXELS)
+        return np.rint(255.0 * (np.clip(light, 0.0, 1.0) if linear else linear_to_srgb(light))).astype(np.uint8)
     limit = f"allowed: {MAX_TEXTURE_PIXELS} pixels, such as 8192 x 8192; scale it down"
     with quiet_decoding():
         try:

@@ -1,4 +1,4 @@
-"""Mesh import: PLY, OBJ, glTF and STL files, each as one triangle mesh with one material."""
+"""Mesh import: PLY, OBJ, glTF, STL and STEP files, each as one triangle mesh with one material."""
 
 from __future__ import annotations
 
@@ -24,6 +24,7 @@ from synpick_warp.scenes.assets.gltf.parts import read_gltf
 from synpick_warp.scenes.assets.mesh_parts import WHITE, MeshPart, Notes
 from synpick_warp.scenes.assets.normals import DEFAULT_CREASE, crease_normals, smooth_normals
 from synpick_warp.scenes.assets.ply import read_ply
+from synpick_warp.scenes.assets.step import STEP_SUFFIXES, read_step
 from synpick_warp.scenes.assets.stl import read_stl
 from synpick_warp.scenes.assets.wavefront.obj import read_obj
 from synpick_warp.scenes.types import TriangleMesh
@@ -34,12 +35,14 @@ _READERS: dict[str, Callable[[Path, Notes], list[MeshPart]]] = {
     ".glb": read_gltf,
     ".gltf": read_gltf,
     ".stl": read_stl,
+    **dict.fromkeys(STEP_SUFFIXES, read_step),
 }
 SUFFIXES = tuple(_READERS)
 """Endings of mesh files."""
 
 # Maximum coordinate [m]: larger ones are mistakes, and lose precision in 32-bit floats.
 _MAX_EXTENT = 1e4
+_MILLIMETRE = 1e-3
 # Maximum texture coordinate: larger ones are mistakes, with a resolution of a thousandth of the image in 32-bit floats.
 _MAX_UV = 1e4
 
@@ -54,20 +57,37 @@ class MeshOptions:
     """Move the centre of the mesh's bounding box to the origin."""
     substitute: bool = False
     """Replace images that are not there by a colour, with a warning."""
+    unit: str = ""
+    """Name of the unit, which is told with the mesh's size; empty: neither is told."""
 
 
 def _ignore(line: str) -> None:
     """Default for `report`: drops the line."""
 
 
+@dataclass(frozen=True, eq=False)
+class MeshFile:
+    """Mesh [m] and material of a mesh file, and by what the mesh was moved to be centred (3) [m]."""
+
+    mesh: TriangleMesh
+    material: FileMaterial
+    moved: np.ndarray
+
+
 def read_mesh(
     path: Path, unit: float, options: MeshOptions = MeshOptions(), report: Callable[[str], None] = _ignore
 ) -> tuple[TriangleMesh, FileMaterial]:
+    """Mesh and material of a mesh file; arguments and errors as of `read_mesh_file`."""
+    found = read_mesh_file(path, unit, options, report)
+    return found.mesh, found.material
+
+
+def read_mesh_file(path: Path, unit: float, options: MeshOptions = MeshOptions(), report: Callable[[str], None] = _ignore) -> MeshFile:
     """Read a mesh file. Parts are merged into one mesh, several materials into a texture atlas; vertex colours are baked into a texture.
 
     Args:
-        path: A .ply, .obj, .glb, .gltf or .stl file.
-        unit: Length of the file's unit [m].
+        path: A .ply, .obj, .glb, .gltf, .stl, .step or .stp file.
+        unit: Length of the file's unit [m]; STEP files name their own.
         options: How the mesh is completed.
         report: Called with one line if features of the file are ignored or replaced.
 
@@ -75,32 +95,38 @@ def read_mesh(
         CatalogError: The file cannot be read, has no triangles or invalid ones, or refers to a texture that is missing and is not replaced.
     """
     notes = Notes(options.substitute)
+    if path.suffix.lower() in STEP_SUFFIXES:
+        unit, options = 1.0, replace(options, unit=options.unit and "of the file")
     with quiet_decoding():
         parts = [_clean(part, unit, path) for part in _READERS[path.suffix.lower()](path, notes) if len(part.faces)]
         parts = [part for part in parts if len(part.faces)]
         if not parts:
             raise CatalogError(f"{path}: no triangles; a model needs a surface, a point cloud has none")
-        mesh = _finish(_join([_bake_colors(part) for part in parts], path, options, notes), unit, options, notes)
+        found = _finish(_join([_bake_colors(part) for part in parts], path, options, notes), unit, options, notes)
     line = notes.line(path)
     if line is not None:
         report(line)
-    return mesh
+    return found
 
 
-def _finish(part: MeshPart, unit: float, options: MeshOptions, notes: Notes) -> tuple[TriangleMesh, FileMaterial]:
+def _finish(part: MeshPart, unit: float, options: MeshOptions, notes: Notes) -> MeshFile:
     """Convert a validated part to metres, centre it if asked to, orient it outward and complete its normals."""
     metres = part.vertices * unit
+    if options.unit:
+        sides = " x ".join(f"{side / _MILLIMETRE:.4g}" for side in np.ptp(metres, axis=0))
+        notes.said.append(f"{sides} mm, unit {options.unit}")
+    moved = np.zeros(3)
     if options.center:
         offset = -(metres.min(axis=0) + metres.max(axis=0)) / 2.0
         if np.abs(offset).max() > 1e-6 * np.ptp(metres, axis=0).max():
             notes.said.append(f"centred: moved by {', '.join(f'{value:.6g}' for value in offset.round(6) + 0.0)} m")
-            metres = metres + offset
+            metres, moved = metres + offset, offset
     vertices = metres.astype(np.float32)
     faces, given = _orient_outward(vertices, part.faces, part.normals)
     part = complete_normals(replace(part, vertices=vertices, faces=faces, normals=given), options.crease_angle)
     vertices, normals = part.vertices.astype(np.float32), np.asarray(part.normals, np.float32)
     uv = np.zeros((len(vertices), 2), np.float32) if part.uv is None else part.uv.astype(np.float32)
-    return TriangleMesh(vertices, part.faces.astype(np.int32), normals, uv), part.material
+    return MeshFile(TriangleMesh(vertices, part.faces.astype(np.int32), normals, uv), part.material, moved)
 
 
 def complete_normals(part: MeshPart, crease_angle: float) -> MeshPart:

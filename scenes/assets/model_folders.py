@@ -15,6 +15,7 @@ from synpick_warp.errors import CatalogError
 from synpick_warp.scenes.assets.asset_files import check_file_name
 from synpick_warp.scenes.assets.meshes import SUFFIXES
 from synpick_warp.scenes.assets.models_info import bop_obj_id
+from synpick_warp.scenes.assets.step import STEP_SUFFIXES
 
 MAX_DEPTH = 3
 """Depth to which an object's folder is searched for its mesh."""
@@ -24,7 +25,7 @@ MAX_OBJECTS = 4096
 """Maximum objects of a model folder."""
 # Of several meshes in an object's folder, textured ones are preferred, by what their names begin with; then GLB, whose material is richest.
 _PREFERRED = ("textured", "model", "mesh", "visual")
-_FORMATS = (".glb", ".gltf", ".obj", ".ply", ".stl")
+_FORMATS = (".glb", ".gltf", ".obj", ".ply", ".stl", *STEP_SUFFIXES)
 
 Say = Callable[[str], None]
 Fault = Callable[[CatalogError], None]
@@ -56,15 +57,17 @@ def list_models(folder: Path, report: Say, fault: Fault) -> list[ModelFile]:
         CatalogError: The folder is missing, cannot be listed or contains no models.
     """
     if not folder.is_dir():
-        raise CatalogError(f"models folder {folder}: no such folder; give a BOP model folder, or a folder of PLY, OBJ, glTF or STL meshes")
+        raise CatalogError(
+            f"models folder {folder}: no such folder; give a BOP model folder, or a folder of PLY, OBJ, glTF, STL or STEP files"
+        )
     try:
         entries = sorted(entry for entry in folder.iterdir() if not entry.name.startswith("."))
-        files = [entry for entry in entries if entry.suffix.lower() in SUFFIXES]
+        files = _without_sources([entry for entry in entries if entry.suffix.lower() in SUFFIXES], report)
         found = [] if files else _in_subfolders(entries, report)
     except OSError as error:
         raise CatalogError(f"models folder {folder}: cannot be listed ({error.strerror})") from error
     if not files and not found:
-        raise CatalogError(f"models folder {folder}: it contains no models; add obj_NNNNNN.ply files, or PLY, OBJ, glTF or STL meshes")
+        raise CatalogError(f"models folder {folder}: it contains no models; add obj_NNNNNN.ply, or PLY, OBJ, glTF, STL or STEP files")
     if max(len(files), len(found)) > MAX_OBJECTS:
         raise CatalogError(f"models folder {folder}: more than {MAX_OBJECTS} meshes; bake a part of them")
     models, faults = _list_bop(files, folder, report)
@@ -73,6 +76,15 @@ def list_models(folder: Path, report: Say, fault: Fault) -> list[ModelFile]:
     for error in faults:
         fault(error)
     return models
+
+
+def _without_sources(files: list[Path], report: Say) -> list[Path]:
+    """Files without the STEP files beside which their own tessellation lies."""
+    meshes = {file.stem for file in files if file.suffix.lower() not in STEP_SUFFIXES}
+    sources = {file for file in files if file.suffix.lower() in STEP_SUFFIXES and file.stem in meshes}
+    if sources:
+        report(f"{min(sources).parent}: {len(sources)} STEP files beside meshes of the same name are ignored")
+    return [file for file in files if file not in sources]
 
 
 def _list_bop(files: list[Path], folder: Path, report: Say) -> tuple[list[ModelFile], list[CatalogError]]:

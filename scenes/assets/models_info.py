@@ -29,6 +29,7 @@ ROTATION_TOLERANCE = 1e-3
 _ADVICE = "or remove the file to go without symmetries"
 _NEEDED = "diameter above 0 in mm, symmetries_discrete of 16 numbers each, symmetries_continuous of axis and offset of 3 numbers each"
 
+_SYMMETRIES = ("symmetries_discrete", "symmetries_continuous")
 _EXTENTS = ("min_x", "min_y", "min_z", "size_x", "size_y", "size_z")
 # Relative difference between a diameter or extent and that of the mesh, from which it belongs to another mesh.
 _TOLERANCE = 0.1
@@ -174,15 +175,29 @@ def compare_sizes(info: ModelInfo, low: np.ndarray, size: np.ndarray, diameter: 
 
 
 def corrected_entry(entry: Any, own: dict[str, Any]) -> dict[str, Any]:
-    """An object's entry for a data set: as it is if it agrees with the mesh, else with the sizes of its `own` [mm], or `own` altogether."""
+    """An object's entry for a data set: as it is if it agrees with the mesh, else with the sizes of its `own` [mm], or `own` altogether.
+
+    Symmetries are those of `own` where these are others.
+    """
     low, size = (np.array([own[key] for key in keys]) * _MILLIMETRE for keys in (_EXTENTS[:3], _EXTENTS[3:]))
     try:
-        _, said = compare_sizes(_convert(entry, 0, Path()), low, size, own["diameter"] * _MILLIMETRE)
+        info = _convert(entry, 0, Path())
+        _, said = compare_sizes(info, low, size, own["diameter"] * _MILLIMETRE)
     except CatalogError:
         return own
+    if not _same_symmetries(info, _convert(own, 0, Path())):
+        entry = {key: value for key, value in entry.items() if key not in _SYMMETRIES} | {
+            key: own[key] for key in _SYMMETRIES if key in own
+        }
     if not said:
         return entry
     return own if any("metres" in line for line in said) else entry | {key: own[key] for key in ("diameter", *_EXTENTS)}
+
+
+def _same_symmetries(one: ModelInfo, other: ModelInfo) -> bool:
+    """Whether two entries have the same symmetries, in the same order, up to rounding."""
+    pairs = ((one.symmetries_discrete, other.symmetries_discrete), (one.symmetries_continuous, other.symmetries_continuous))
+    return all(len(a) == len(b) and np.allclose(np.array(a), np.array(b), atol=1e-9) for a, b in pairs)
 
 
 def _near(value: float, expected: float, tolerance: float) -> bool:

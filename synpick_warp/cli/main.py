@@ -345,7 +345,9 @@ def _check_inputs(models: str, lights: str) -> None:
         LightError: There are no lights.
     """
     if models and not os.path.isdir(models):
-        raise CatalogError(f"there is no models folder {models}; --models takes a folder of BOP models or of PLY, OBJ, glTF or STL meshes")
+        raise CatalogError(
+            f"there is no models folder {models}; --models takes a folder of BOP models or of PLY, OBJ, glTF, STL or STEP files"
+        )
     if lights and not os.path.isdir(lights):
         raise LightError(f"there is no lights folder {lights}; --lights takes a folder of .hdr maps and sIBL sets")
 

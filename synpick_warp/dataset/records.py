@@ -31,8 +31,8 @@ Vector = tuple[float, float, float]
 Pixel = tuple[float, float]
 """Column and row in the perception image; integers are pixel centres."""
 _Value = bool | int | float | str | None
-_Section = dict[str, _Value | list[_Value | list[_Value]]]
-"""Settings of a section, or of an object row."""
+_Section = dict[str, _Value | list[_Value | list[_Value]] | dict[str, Any]]
+"""Settings of a section, or of a row of a list; distributions and tables are objects."""
 _Schema = TypeVar("_Schema", bound=msgspec.Struct)
 
 
@@ -89,6 +89,7 @@ class Row(msgspec.Struct):
     left: Index
     sentence: str
     split: str = ""
+    looks: dict[str, Any] | None = None
     bin: BinRecord | None = None
 
     def __post_init__(self) -> None:

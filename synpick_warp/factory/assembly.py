@@ -7,9 +7,10 @@ from __future__ import annotations
 
 import contextlib
 import gc
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from typing import Any
 
 import numpy as np
 import warp as wp
@@ -28,13 +29,16 @@ from synpick_warp.scenes.build import REPEATS, find_repeat_rules, must_repeat, w
 from synpick_warp.scenes.cameras import make_cameras
 from synpick_warp.scenes.catalog import load_catalog
 from synpick_warp.scenes.fixtures import make_fixtures
-from synpick_warp.scenes.lights import load_lights
+from synpick_warp.scenes.looks import Looks, load_looks
 from synpick_warp.scenes.types import Camera, Catalog, EnvironmentMap
 from synpick_warp.stages.host_copies import host_images
+from synpick_warp.stages.render.lamp_variants import load_scene_lights
+from synpick_warp.stages.render.looks import draw_looks
 from synpick_warp.stages.render.renderer import Renderer
-from synpick_warp.stages.render.scene import RenderScene, build_render_scene
+from synpick_warp.stages.render.scene import RenderScene, build_render_scene, with_cameras
 from synpick_warp.stages.sim.simulate import Simulation
-from synpick_warp.stages.stream import FrameStream, LightTable, name_lights, view_sizes
+from synpick_warp.stages.stream import FrameStream, LightTable, name_lights
+from synpick_warp.stages.view_ring import CameraGroup, ViewRing, view_sizes
 from synpick_warp.system.hardware.device import pick_device
 from synpick_warp.system.processes.garbage import collection_paused
 from synpick_warp.system.progress import Progress, SilentProgress
@@ -50,9 +54,8 @@ class Stages:
     cameras: tuple[Camera, ...]
     lights: tuple[EnvironmentMap, ...]
     simulation: Simulation
-    renderer: Renderer
-    sizes: dict[str, int]
-    """Extents by `view_sizes`."""
+    groups: tuple[CameraGroup, ...]
+    """The cameras by image size, with their renderers."""
     object_ids: np.ndarray
     """obj_id of each catalog entry (entry) int32."""
     light_table: LightTable
@@ -61,6 +64,16 @@ class Stages:
     def tick_time(self) -> float:
         """Time between two frames [s]."""
         return self.config.physics.tick_time
+
+    @property
+    def randomized(self) -> Looks | None:
+        """What episodes draw their looks from; None: nothing."""
+        return self.groups[0].renderer.scene.looks
+
+    @property
+    def looks(self) -> Callable[[int, int], Mapping[str, Any]] | None:
+        """Function of episode and number of objects that returns the record of the episode's looks; None: none is randomized."""
+        return partial(draw_looks, self.randomized, self.config.bake.seed) if self.randomized else None
 
     def make_log(self) -> AttemptLog:
         """Create an empty attempt log."""
@@ -150,9 +163,11 @@ def build_smallest(config: Config, device: wp.Device, progress: Progress, record
 def _add_stream(stages: Stages, device: wp.Device, needs_images: bool, depth_files: bool) -> Factory:
     """Add a stream of views to stages; arguments as of `host_images`."""
     config, table, tick_time = stages.config, stages.light_table, stages.tick_time
-    host = host_images(config.bop, config.rig.largest[1], device, needs_images, depth_files)
-    layers, cameras, ids = config.render.layers, len(stages.cameras), stages.object_ids
-    stream = FrameStream(stages.sizes, layers, cameras, tick_time, stages.renderer, ids, table, device, host, recorded_bins(config))
+    rings = [
+        ViewRing(group, config.render.layers, device, host_images(config.bop, group.sizes["row"], device, needs_images, depth_files))
+        for group in stages.groups
+    ]
+    stream = FrameStream(rings, tick_time, stages.object_ids, table, device, recorded_bins(config))
     return Factory(**vars(stages), stream=stream, log=stages.make_log())
 
 
@@ -170,19 +185,27 @@ def build_stages(
     cameras = make_cameras(config.rig)
     bins = make_bins(bin_sizes(config))
     catalog = load_catalog(config, report=progress.note)
-    lights = load_lights(config.bake.lights, progress.note, config.objects.strict)
+    lights = load_scene_lights(config.bake.lights, config.randomize, config.bake.seed, progress.note, config.objects.strict)
     config = _fit_to_catalog(config, catalog, device, progress)
     if longest_first and episodes is not None:
         episodes = order_longest_first(config, catalog, episodes, device)
     progress.stage(f"building {config.bake.worlds} worlds of {len(catalog)} objects on {device.alias}")
-    scene = build_render_scene(config.render, bins[0].sizes.base, catalog, make_fixtures(bins, config.gripper), cameras, lights, device)
+    looks = load_looks(config.randomize, progress.note, config.objects.strict)
+    fixtures = make_fixtures(bins, config.gripper)
+    scene = build_render_scene(config.render, bins[0].sizes.base, catalog, fixtures, cameras, lights, device, looks)
     simulation = Simulation(config, catalog, len(lights), device, scene, episodes, records_physics)
-    sizes = view_sizes(config.render, config.rig, config.bake.worlds, config.arrangement.max_objects, device)
-    histories = simulation.layout.worlds * len(cameras)
-    renderer = make_renderer(config, scene, config.arrangement.max_objects, sizes["view"], histories)
+    groups = tuple(_build_group(config, scene, cameras, index) for index in range(len(config.rig.groups)))
     object_ids = np.array([entry.obj_id for entry in catalog.entries], dtype=np.int32)
     table = name_lights([light.name for light in lights], scene.lights)
-    return Stages(config, catalog, cameras, lights, simulation, renderer, sizes, object_ids, table)
+    return Stages(config, catalog, cameras, lights, simulation, groups, object_ids, table)
+
+
+def _build_group(config: Config, scene: RenderScene, cameras: tuple[Camera, ...], index: int) -> CameraGroup:
+    """Renderer of a group of cameras, for `bake.worlds` worlds; they share all constant data but the cameras."""
+    indices, worlds, objects = config.rig.groups[index], config.bake.worlds, config.arrangement.max_objects
+    sizes = view_sizes(config.render, config.rig, worlds, objects, scene.device, index)
+    scene = with_cameras(scene, tuple(cameras[camera] for camera in indices))
+    return CameraGroup(indices, sizes, make_renderer(config, scene, objects, sizes["view"], worlds * len(indices)))
 
 
 def _fit_to_catalog(config: Config, catalog: Catalog, device: wp.Device, progress: Progress) -> Config:

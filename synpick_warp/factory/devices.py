@@ -39,8 +39,9 @@ from synpick_warp.factory.sizes import count_writers
 from synpick_warp.scenes.build import REPEATS, must_repeat
 from synpick_warp.scenes.cameras import make_cameras
 from synpick_warp.scenes.catalog import load_catalog
-from synpick_warp.scenes.lights import load_lights
+from synpick_warp.scenes.looks import Looks, load_looks
 from synpick_warp.scenes.types import Catalog, EnvironmentMap
+from synpick_warp.stages.render.lamp_variants import load_scene_lights
 from synpick_warp.system.descriptors import duplicate_above_streams, open_standard_descriptors
 from synpick_warp.system.hardware.caches import KERNEL_VARIABLE
 from synpick_warp.system.hardware.device import describe_kinds, pick_device
@@ -229,14 +230,14 @@ def _wait_for_hangup(pipes: Sequence[int], timeout: float) -> None:
             left -= 1
 
 
-def prepare_folder(output: OutputFolder, needs: Needs, catalog: Catalog, lights: tuple[EnvironmentMap, ...]) -> None:
+def prepare_folder(output: OutputFolder, needs: Needs, catalog: Catalog, lights: tuple[EnvironmentMap, ...], looks: Looks | None) -> None:
     """Prepare the output folder (`OutputFolder.prepare`) in a process that generates no episodes itself."""
     config = output.config
     with WriterPool(1, needs.slot_bytes, output.lock) as pool:
         context = ExportContext(output.out, ExportSettings.of(config), catalog, make_cameras(config.rig), lights, pool)
         exporters = Exporters(needs.classes, context)
         with aborting(pool, exporters):
-            output.prepare(exporters, digest_inputs(catalog, lights), pool)
+            output.prepare(exporters, digest_inputs(catalog, lights, looks), pool)
             exporters.close()
 
 
@@ -270,8 +271,9 @@ def bake_on_devices(
         report = partial(processes.report_once, progress)
         report("stage", "loading objects and lights")
         catalog = load_catalog(config, report=partial(report, "note"))
-        lights = load_lights(config.bake.lights, partial(report, "note"), config.objects.strict)
-        prepare_folder(output, needs, catalog, lights)
+        lights = load_scene_lights(config.bake.lights, config.randomize, config.bake.seed, partial(report, "note"), config.objects.strict)
+        looks = load_looks(config.randomize, partial(report, "note"), config.objects.strict)
+        prepare_folder(output, needs, catalog, lights, looks)
         filled = config.with_values(REPEATS) if must_repeat(config.arrangement, catalog) else config
         dealt = deal_episodes(order_longest_first(filled, catalog, output.remaining, pick_device("cpu")), len(names))
         writers = deal_writers(count_writers(config.bake.writers, needs.slot_bytes), len(names))

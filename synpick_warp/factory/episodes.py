@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
@@ -20,7 +20,6 @@ PLACES = 6
 """Decimal places of a time [s]; more would be noise."""
 
 
-_OPTIONAL = ("split", "bin")
 """Fields without a key where they are empty."""
 
 
@@ -46,13 +45,15 @@ class EpisodeRow(NamedTuple):
     """Objects at the last frame."""
     split: str = ""
     """Name of the episode's split; empty, and no key: the settings have no splits."""
+    looks: Mapping[str, Any] | None = None
+    """Randomized looks of the episode, as `draw_looks` has them; None, and no key: the settings randomize none."""
     bin: dict[str, Any] | None = None
     """Record of the bin; None, and no key: a tote that is always in its place."""
 
     def as_json(self) -> dict[str, Any]:
         """Row as the dictionary of a line of episodes.jsonl."""
         row = {**self._asdict(), "ending": self.ending.name.lower()}
-        row = {name: value for name, value in row.items() if name not in _OPTIONAL or value}
+        row = {name: value for name, value in row.items() if name not in _OPTIONAL or value != _OPTIONAL[name]}
         sentence = self.ending.sentence.replace("tote", bin_noun(self.bin["name"])) if self.bin else self.ending.sentence
         return {**row, "sentence": sentence}
 
@@ -62,6 +63,10 @@ class EpisodeRow(NamedTuple):
         values: dict[str, Any] = {name: row[name] for name in cls._fields if name not in _OPTIONAL or name in row}
         values["ending"] = Ending[row["ending"].upper()]
         return cls(**values)
+
+
+_OPTIONAL = EpisodeRow._field_defaults
+"""Fields that rows lack where they have these values."""
 
 
 @dataclass
@@ -122,9 +127,18 @@ class BakeSummary:
 
 
 def episode_row(
-    layout: DataLayout, bins: Sequence[str], tick_time: float, report: TickReport, world: int, record: EpisodeRecord
+    layout: DataLayout,
+    bins: Sequence[str],
+    tick_time: float,
+    looks: Callable[[int, int], Mapping[str, Any]] | None,
+    report: TickReport,
+    world: int,
+    record: EpisodeRecord,
 ) -> EpisodeRow:
-    """Build the row of the episode that ended in a world. `bins`: of `recorded_bins`; `tick_time`: time between two frames [s]."""
+    """Build the row of the episode that ended in a world.
+
+    `bins`: of `recorded_bins`; `tick_time`: time between two frames [s]; `looks`: see `Stages.looks`.
+    """
     episode, arrangement, frame, ending = (int(report.column(name)[world]) for name in ("episode", "arrangement", "frame", "ending"))
     split = layout.split_of(episode)
     return EpisodeRow(
@@ -140,6 +154,7 @@ def episode_row(
         record.lost,
         record.left,
         "" if split is None else split.name,
+        None if looks is None else looks(episode, record.objects),
         bin_record(bins[int(report.snapshot.bin[world])], report.snapshot.fixture_pose[world, 0]) if bins else None,
     )
 

@@ -33,8 +33,9 @@ from synpick_warp.stages.sim.physics import with_enough_worlds
 from synpick_warp.stages.sim.simulate import allocate_worlds
 from synpick_warp.stages.sim.step_log import allocate_record, record_sizes
 from synpick_warp.stages.sim.worlds import world_sizes
-from synpick_warp.stages.stream import RING, TickReader, allocate_ring, view_sizes
+from synpick_warp.stages.stream import TickReader
 from synpick_warp.stages.tick_queue import allocate_rings, queue_lead, record_bytes
+from synpick_warp.stages.view_ring import RING, allocate_ring, view_sizes
 from synpick_warp.system.hardware.device import pick_device
 from synpick_warp.system.hardware.free_memory import free_device_memory, free_host_memory
 
@@ -95,12 +96,14 @@ def plan_memory(config: Config, device: wp.Device, writers: int = 1) -> list[Ter
     bodies = build.GRIPPER_BODIES + 2 * objects
     sizes = record_sizes(world_sizes(worlds, objects, config.move.rounds, bodies), config.physics.steps_per_tick)
     terms = [*_simulation(sizes, config.trajectory.steps if needs.physics else None, device)]
-    count, views = len(rig), view_sizes(config.render, rig, worlds, objects, device)
-    scene, sections = blank_scene(count, *rig.largest, device), (config.render, config.effects, config.depth_sensor)
-    with dry_run() as arrays:
-        Renderer(scene, *sections, seed=0, depth_scale=1.0, instances=objects, views=views["view"], histories=worlds * count)
-    host = host_images(config.bop, rig.largest[1], device, needs.images, needs.depth_files) if writers else None
-    terms += _images(arrays, views, count, config.render.layers, host, device)
+    for index, group in enumerate(rig.groups):
+        count, views = len(group), view_sizes(config.render, rig, worlds, objects, device, index)
+        size, sections = rig.sizes[group[0]], (config.render, config.effects, config.depth_sensor)
+        with dry_run() as arrays:
+            scene = blank_scene(count, *size, device)
+            Renderer(scene, *sections, seed=0, depth_scale=1.0, instances=objects, views=views["view"], histories=worlds * count)
+        host = host_images(config.bop, size[1], device, needs.images, needs.depth_files) if writers else None
+        terms += _images(arrays, views, count, config.render.layers, host, device)
     if may_pick(config.bake, config.splits):
         terms.append(_perception(config.perception, worlds, objects, device))
     terms += _newton(config.physics, worlds, device.is_cuda)

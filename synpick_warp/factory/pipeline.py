@@ -31,9 +31,10 @@ from synpick_warp.factory.meter import ThroughputMeter
 from synpick_warp.factory.sizes import advise_processes, count_writers, pick_processes
 from synpick_warp.factory.worker import BakeLink
 from synpick_warp.scenes.catalog import load_catalog
-from synpick_warp.scenes.lights import load_lights
+from synpick_warp.scenes.looks import load_looks
 from synpick_warp.stages.buffers import Snapshot
 from synpick_warp.stages.launch import limit_threads
+from synpick_warp.stages.render.lamp_variants import load_scene_lights
 from synpick_warp.stages.stream import TickReport, tick_batch
 from synpick_warp.stages.ticks import TickLoop
 from synpick_warp.stages.timing import scope
@@ -109,16 +110,16 @@ def _fill(config: Config, output: OutputFolder, needs: Needs, names: Sequence[st
         with scope("build"):
             factory = build_factory(config, progress, output.remaining, needs.physics, needs.images, longest_first=True)
     else:
-        prepare_folder(
-            output, needs, load_catalog(config, report=progress.note), load_lights(config.bake.lights, progress.note, config.objects.strict)
-        )
+        catalog = load_catalog(config, report=progress.note)
+        lights = load_scene_lights(config.bake.lights, config.randomize, config.bake.seed, progress.note, config.objects.strict)
+        prepare_folder(output, needs, catalog, lights, load_looks(config.randomize, progress.note, config.objects.strict))
     with WriterPool(count_writers(config.bake.writers, needs.slot_bytes), needs.slot_bytes, output.lock) as pool:
         started = time.perf_counter()
         if factory is not None:
             context = ExportContext(output.out, settings, factory.catalog, factory.cameras, factory.lights, pool)
             exporters = Exporters(needs.classes, context)
             with aborting(pool, exporters):
-                output.prepare(exporters, digest_inputs(factory.catalog, factory.lights), pool)
+                output.prepare(exporters, digest_inputs(factory.catalog, factory.lights, factory.randomized), pool)
                 _Run(factory, exporters, needs.views, partial(output.commit, exporters, pool), summary, progress, StopRequest()).run()
                 with scope("wait for writers"):
                     pool.wait()
@@ -228,7 +229,8 @@ class _Run:
     def _end(self, report: TickReport, world: int, record: EpisodeRecord) -> None:
         """End an episode: count it, and commit it, or resample its arrangement, by its ending."""
         config, tries = self.factory.config, self.factory.config.settle.tries
-        row = episode_row(self.layout, recorded_bins(config), self.factory.tick_time, report, world, record)
+        bins, factory = recorded_bins(config), self.factory
+        row = episode_row(self.layout, bins, factory.tick_time, factory.looks, report, world, record)
         end = episode_end(row, record, tries)
         advice = remedy(row.ending, config.physics, config.perception, config.arrangement, config.settle)
         if advice:

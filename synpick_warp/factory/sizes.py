@@ -16,7 +16,7 @@ from synpick_warp.exporters.writing.pool import QUEUE_DEPTH
 from synpick_warp.factory.memory_plan import Term, free_memory, plan_memory, split_memories
 from synpick_warp.stages.perception.images import count_views
 from synpick_warp.stages.sim.physics import MIN_GPU_WORLDS, with_enough_worlds
-from synpick_warp.stages.stream import views_per_batch
+from synpick_warp.stages.view_ring import views_per_batch
 from synpick_warp.system.hardware.cores import count_cores
 from synpick_warp.system.hardware.device import ALL, pick_device, pick_devices
 
@@ -55,7 +55,9 @@ def fit_to_device(config: Config, device: wp.Device, episodes: int, writers: int
     while terms := _short_terms(split_memories(plan_memory(config, device, writers), device, processes)):
         worlds, objects = config.bake.worlds, config.arrangement.max_objects
         amounts = {
-            "render.views_per_batch": views_per_batch(config.render, config.rig, worlds, device),
+            "render.views_per_batch": max(
+                views_per_batch(config.render, config.rig, worlds, device, group) for group in range(len(config.rig.groups))
+            ),
             "perception.views": count_views(config.perception, worlds, objects, device),
             "bake.worlds": worlds,
         }

@@ -64,7 +64,7 @@ class ViewStream:
         # The generator must not refer to this object: without a cycle, the last reference frees the device's memory at once.
         self._batches: Iterator[ViewBatch] | None = _batches(producer)
         self._simulation = weakref.ref(stages.simulation)
-        self._ring: BatchRing | None = producer.ring
+        self._rings: tuple[BatchRing, ...] | None = producer.rings
         self._stream = self.device.stream if self.device.is_cuda else None
         self._current: ViewBatch | None = None
         self._ahead: ViewBatch | None = None
@@ -105,7 +105,7 @@ class ViewStream:
         if self._stream is not None:
             # Consumers' queues may still read the buffers, and freed memory goes to whoever asks next.
             wp.synchronize_device(self.device)
-        self._ring = None
+        self._rings = None
         batches.close()  # type: ignore[attr-defined]
         if self._simulation() is not None:
             # Warp's code generation catches exceptions in cycles with their frames, and these hold all callers' variables: the worlds of
@@ -122,14 +122,16 @@ class ViewStream:
         try:
             self.close()
         except Exception:  # At the interpreter's end, modules may be gone.
-            self._batches = self._ring = None
+            self._batches = self._rings = None
 
 
 class Producer:
     """Producer of a stream's batches: takes ticks from a `TickLoop`, renders the selected views, and logs ended episodes."""
 
-    def __init__(self, stages: Stages, ring: BatchRing, selection: Selection, summary: BakeSummary, progress: Progress) -> None:
-        self.stages, self.ring, self.selection, self.summary, self.progress = stages, ring, selection, summary, progress
+    def __init__(
+        self, stages: Stages, rings: tuple[BatchRing, ...], selection: Selection, summary: BakeSummary, progress: Progress
+    ) -> None:
+        self.stages, self.rings, self.selection, self.summary, self.progress = stages, rings, selection, summary, progress
         self.log = stages.make_log()
         self.object_ids = np.append(stages.object_ids, -1).astype(np.int32)
 
@@ -149,16 +151,23 @@ class Producer:
                     return
 
     def render(self, report: TickReport, snapshot: Snapshot) -> Iterator[ViewBatch]:
-        """Render the selected views of a tick, world by world and camera by camera."""
-        stages, cameras = self.stages, np.asarray(self.selection.cameras, np.int32)
+        """Render the selected views of a tick, group by group of cameras, world by world and camera by camera."""
         shown = report.column("live").astype(bool) & (report.column("frame") % self.selection.stride == 0)
-        world, camera = pair_views(np.flatnonzero(shown), cameras)
-        for first in range(0, len(world), self.ring.views):
-            part = slice(first, first + self.ring.views)
+        for ring in self.rings:
+            cameras = [camera for camera in self.selection.cameras or () if camera in ring.group.cameras]
+            yield from self._render_group(report, snapshot, ring, *pair_views(np.flatnonzero(shown), np.array(cameras, np.int32)))
+
+    def _render_group(
+        self, report: TickReport, snapshot: Snapshot, ring: BatchRing, world: np.ndarray, camera: np.ndarray
+    ) -> Iterator[ViewBatch]:
+        """Render views (world, camera) of a group."""
+        stages = self.stages
+        for first in range(0, len(world), ring.views):
+            part = slice(first, first + ring.views)
             known = (self.object_ids, stages.light_table, recorded_bins(stages.config))
             host = describe_views(report, world[part], camera[part], stages.tick_time, *known)
             host["arrangement"] = report.column("arrangement")[world[part]]
-            yield self.ring.render(snapshot, world[part], camera[part], host)
+            yield ring.render(snapshot, world[part], camera[part], host)
 
     def _end_episodes(self, report: TickReport) -> None:
         """Add the episodes that ended in a tick to the summary."""
@@ -166,7 +175,7 @@ class Producer:
         layout = DataLayout.of(config)
         for world in np.flatnonzero(report.column("phase") == Phase.OVER).tolist():
             record = records[int(report.column("episode")[world])]
-            row = episode_row(layout, recorded_bins(config), self.stages.tick_time, report, world, record)
+            row = episode_row(layout, recorded_bins(config), self.stages.tick_time, self.stages.looks, report, world, record)
             if is_resampled(row, config.settle.tries):
                 self.summary.take_resample(row.ending)
                 self.progress.note(f"episode {row.episode}, arrangement {row.arrangement + 1}: {row.ending.sentence}")
@@ -202,8 +211,8 @@ def open_stream(
         smallest = partial(build_smallest, config, device, SilentProgress(), False, True)
         with compiling_if_cold(smallest, device, progress):
             stages = build_stages(config, device, progress, indices)
-        ring = BatchRing(stages.sizes, config.render.layers, stages.renderer, config.bop.depth_scale)
-    return ViewStream(Producer(stages, ring, selection, BakeSummary(len(indices)), progress))
+        rings = tuple(BatchRing(group, config.render.layers, config.bop.depth_scale) for group in stages.groups)
+    return ViewStream(Producer(stages, rings, selection, BakeSummary(len(indices)), progress))
 
 
 def _batches(producer: Producer) -> Iterator[ViewBatch]:

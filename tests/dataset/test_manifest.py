@@ -13,6 +13,7 @@ import pytest
 
 from synpick_warp.codes import Ending
 from synpick_warp.configs.load import load_config, sections, settings_of
+from synpick_warp.configs.randomize import FIXED, Distribution
 from synpick_warp.configs.schema import Config
 from synpick_warp.configs.write import config_to_toml
 from synpick_warp.dataset.commit import manifest
@@ -42,6 +43,8 @@ def changed(key: str) -> Config:
 def other(value: object) -> object:
     if isinstance(value, bool):
         return not value
+    if isinstance(value, Distribution):
+        return type(value)(FIXED, ((0.75,) * value.components,), (1.0,))
     if isinstance(value, tuple):
         return (other(value[0]), *value[1:]) if value else ("x",)
     return f"{value}x" if isinstance(value, str) else value + 1  # type: ignore[operator]

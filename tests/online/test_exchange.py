@@ -15,6 +15,7 @@ from synpick_warp.stages.buffers import Snapshot, view_buffer_sizes
 from synpick_warp.stages.online.batches import GPU_RING, BatchRing, ViewBatch
 from synpick_warp.stages.online.exchange import DeviceArray, Gate
 from synpick_warp.stages.render.view_setup import VIEW_CAMERAS
+from synpick_warp.stages.view_ring import CameraGroup
 from tests.harness.spin import SPINS, spin_kernel
 from tests.online.conftest import tiny
 
@@ -40,7 +41,7 @@ class NumberingRenderer:
 @pytest.fixture
 def ring(device) -> BatchRing:
     sizes = view_buffer_sizes(VIEWS, 32, 16, ROOM)
-    return BatchRing(sizes, (), NumberingRenderer(device), 0.1)  # type: ignore[arg-type]
+    return BatchRing(CameraGroup((0,), sizes, NumberingRenderer(device)), (), 0.1)  # type: ignore[arg-type]
 
 
 def render(ring: BatchRing) -> ViewBatch:

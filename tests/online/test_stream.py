@@ -198,7 +198,8 @@ def held_by(stream) -> tuple[weakref.ref, ...]:
     """Weak references to the parts of a stream that hold memory: worlds, their collision pipeline and model, renderer, ring."""
     producer = stream._batches.gi_frame.f_locals["producer"]
     simulation = producer.stages.simulation
-    parts = (producer, producer.ring, simulation, simulation.physics.pipeline, simulation.physics.model, producer.stages.renderer)
+    renderer, ring = producer.stages.groups[0].renderer, producer.rings[0]
+    parts = (producer, ring, simulation, simulation.physics.pipeline, simulation.physics.model, renderer)
     return tuple(weakref.ref(part) for part in parts)
 
 

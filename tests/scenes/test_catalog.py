@@ -183,6 +183,59 @@ def test_wrong_sizes_and_origins(tmp_path, extents, offset, words):
     fails(config_for(tmp_path), tmp_path, "thing", *words)
 
 
+@pytest.mark.parametrize(
+    ("unit", "center", "size", "said"),
+    [
+        ("auto", False, (0.084, 0.04, 0.012), []),
+        ("m", False, (0.084, 0.04, 0.012), ["84 x 40 x 12 mm, unit m"]),
+        ("cm", False, (8.4, 4, 1.2), ["84 x 40 x 12 mm, unit cm"]),
+        ("in", False, (4, 2, 1), ["101.6 x 50.8 x 25.4 mm, unit in"]),
+        ("mm", True, (84, 40, 12), ["84 x 40 x 12 mm, unit mm; centred: moved by -0.042, -0.02, -0.006 m"]),
+        ("auto", True, (0.084, 0.04, 0.012), ["84 x 40 x 12 mm, unit m; centred: moved by -0.042, -0.02, -0.006 m"]),
+        ("cm", False, (0.3, 0.3, 0.2), ["3 x 3 x 2 mm, unit cm", 'size 4.69 mm: did you mean objects.unit = "m"?']),
+    ],
+)
+@pytest.mark.parametrize("name", ["bracket.stl", "bracket.glb", "obj_000003.ply"])
+def test_units_and_centring_are_told(tmp_path, name, unit, center, size, said):
+    """Of BOP models, whose poses refer to their origin, only a unit that was asked for."""
+    file, is_bop = tmp_path / name, name.startswith("obj_")
+    if is_bop and (center or unit == "auto"):
+        pytest.skip("BOP models are in millimetres, and stay where they are")
+    box = trimesh.creation.box(size)
+    box.apply_translation(np.array(size) / 2)
+    put(file, exported(box, file.suffix[1:]))
+    lines: list[str] = []
+    (entry,) = load_catalog(config_for(tmp_path, unit=unit, center=center), tmp_path / "cache", lines.append).entries
+    scale = {"auto": 1.0, "m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254}[unit]
+    assert np.ptp(entry.mesh.vertices, axis=0) == pytest.approx(scale * np.array(size), rel=1e-5)
+    assert np.allclose(entry.mesh.vertices.max(axis=0), np.array(size) * scale * (0.5 if center else 1.0))
+    assert [line.partition(": ")[2] for line in lines] == said
+    assert entry.source is None
+
+
+@pytest.mark.parametrize(
+    ("unit", "side", "advice"),
+    [
+        ("auto", 42.0, 'median size 72.7 m: did you mean objects.unit = "mm"?'),
+        ("m", 2.5, 'median size 4.33 m: did you mean objects.unit = "cm"?'),
+        ("mm", 0.06, 'median size 0.104 mm: did you mean objects.unit = "m"?'),
+        ("mm", 0.8, 'median size 1.39 mm: did you mean objects.unit = "cm"?'),
+    ],
+)
+def test_an_implausible_unit_is_told_with_a_likely_one(tmp_path, unit, side, advice):
+    for name in ("a", "b", "c"):
+        put(tmp_path / f"{name}.stl", exported(trimesh.creation.box((side, side, side)), "stl"))
+    fails(config_for(tmp_path, unit=unit), tmp_path, advice.removeprefix("median "))
+    with pytest.raises(CatalogError) as caught:
+        load(config_for(tmp_path, unit=unit), tmp_path)
+    assert str(caught.value).endswith(f"; {advice}")
+    # One that fits does not hide it.
+    put(tmp_path / "d.stl", exported(trimesh.creation.box(np.full(3, 0.05 / {"auto": 1, "m": 1, "mm": 1e-3}[unit])), "stl"))
+    lines: list[str] = []
+    load_catalog(config_for(tmp_path, unit=unit), tmp_path / "cache", lines.append)
+    assert lines[-1] == f"models folder {tmp_path}: {advice}"
+
+
 @pytest.mark.parametrize("mass", [0.0, -1.0, 1e-9, 1e5, np.inf, np.nan])
 def test_masses_out_of_range(tmp_path, mass):
     write_box(tmp_path / "thing.ply")

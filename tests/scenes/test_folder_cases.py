@@ -183,6 +183,47 @@ def test_a_folder_per_object_with_textures_beside(tmp_path, mtl, depth):
     assert sum("2 meshes, of which" in line for line in lines) == 2
 
 
+YCB = "002_master_chef_can"
+"""A name of YCB's, whose download has several resolutions and reconstructions of an object, and point clouds."""
+
+
+@pytest.mark.parametrize(
+    ("files", "read"),
+    [
+        (
+            (
+                "google_16k/textured.obj",
+                "google_16k/nontextured.ply",
+                "google_16k/nontextured.stl",
+                "tsdf/textured.obj",
+                "clouds/merged_cloud.ply",
+            ),
+            "google_16k/textured.obj",
+        ),
+        (("google_64k/textured.obj", "google_512k/textured.obj", "google_16k/textured.obj"), "google_16k/textured.obj"),
+        (("poisson/nontextured.stl", "tsdf/textured.obj"), "tsdf/textured.obj"),
+        (("meshes/model.obj", "meshes/collision.stl", "thumbnails/0.jpg"), "meshes/model.obj"),
+        (("visual.glb", "collision.obj"), "visual.glb"),
+        ((f"{YCB}.stl", "a.stl"), f"{YCB}.stl"),
+    ],
+)
+def test_the_mesh_of_an_object_that_has_a_folder(tmp_path, files, read):
+    """A box of 60 mm is the one to be read; its texture lies beside it, or where Google Scanned Objects have theirs."""
+    folder = tmp_path / "models" / YCB
+    for name in files:
+        side = 0.06 if name == read else 0.1
+        kind = Path(name).suffix[1:]
+        content = SMALL.replace("0.1", str(side)) if kind == "obj" else b"" if kind == "jpg" else box(side, side, side, kind=kind)
+        put(folder / name, content)
+        put((folder / name).with_name("a.mtl"), "newmtl skin\nmap_Kd texture_map.png\n")
+        put((folder / name).with_name("texture_map.png"), picture())
+    catalog, lines = load(tmp_path / "models", tmp_path)
+    assert [entry.name for entry in catalog.entries] == [YCB]
+    assert np.ptp(catalog.entries[0].mesh.vertices, axis=0) == pytest.approx([0.06] * 3, rel=1e-5)
+    assert (catalog.entries[0].material.texture is not None) == read.endswith(".obj")
+    assert any(f"of which {read} is read" in line for line in lines)
+
+
 def test_a_whole_bop_data_set_is_pointed_to_its_models(tmp_path):
     write(tmp_path / "set", models__obj_000001_dot_ply=box(100.0, 60.0, 20.0), camera_dot_json="{}")
     with pytest.raises(CatalogError, match=r"its folder models has BOP models; give .*/set/models$"):

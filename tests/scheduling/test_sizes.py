@@ -21,7 +21,7 @@ from synpick_warp.factory.sizes import (
     pick_processes,
     without_pictures,
 )
-from synpick_warp.stages import stream
+from synpick_warp.stages import view_ring
 from synpick_warp.stages.perception.images import count_views
 from synpick_warp.stages.sim.physics import balance_worlds
 
@@ -32,7 +32,7 @@ GPU = SimpleNamespace(is_cuda=True, alias="cuda:0", total_memory=64 * GIB)
 
 
 def views_per_batch(config: Config, device: Any) -> int:
-    return stream.views_per_batch(config.render, config.rig, config.bake.worlds, device)
+    return view_ring.views_per_batch(config.render, config.rig, config.bake.worlds, device)
 
 
 @pytest.fixture

@@ -11,6 +11,7 @@ import warp as wp
 from synpick_warp.configs.schema import FAST, Config
 from synpick_warp.factory.assembly import make_renderer
 from synpick_warp.scenes.environment import map_directions
+from synpick_warp.scenes.looks import Looks
 from synpick_warp.scenes.types import Camera, Catalog, CatalogEntry, EnvironmentMap, Fixture, Material, TriangleMesh
 from synpick_warp.stages.arrays import allocate
 from synpick_warp.stages.buffers import Snapshot, ViewBuffers, allocate_view_buffers
@@ -147,6 +148,7 @@ class ToyScene:
     light_yaw: float = 0.0
     light_exposure: float = 0.0
     table: bool = False
+    looks: Looks | None = None
     config: Config = field(default_factory=Config)
 
     def settings(self) -> Config:
@@ -193,9 +195,8 @@ def snapshot(toy: ToyScene, device: wp.Device) -> Snapshot:
 def build_scene(toy: ToyScene, device: wp.Device) -> RenderScene:
     """The renderer's constant data of a toy scene."""
     settings = toy.settings()
-    return build_render_scene(
-        settings.render, -settings.tote.wall, Catalog(tuple(toy.entries)), toy.fixtures, toy.cameras, toy.lights, device
-    )
+    catalog = Catalog(tuple(toy.entries))
+    return build_render_scene(settings.render, -settings.tote.wall, catalog, toy.fixtures, toy.cameras, toy.lights, device, toy.looks)
 
 
 def render(toy: ToyScene, device: wp.Device) -> RenderedViews:

@@ -218,8 +218,8 @@ def _measure_worlds(quality: int, factory: Factory, min_seconds: float, parts: t
     if "render" in parts:
         yield from of_part("render", _measure_rendering(factory, min_seconds))
     if "encode" in parts:
-        count = min(factory.stream.batch, factory.simulation.layout.worlds * len(factory.cameras))
-        images, renderer, device = factory.stream.ring[0].images, factory.stream.renderer, factory.simulation.device
+        count = min(factory.stream.rings[0].batch, factory.simulation.layout.worlds * len(factory.cameras))
+        images, renderer, device = factory.stream.rings[0].slots[0].images, factory.stream.rings[0].renderer, factory.simulation.device
         views = first_views(count, len(factory.cameras), renderer.instances, device)
         renderer.render(factory.simulation.record.snapshot, views, images)
         yield from of_part("encode", measure_encoding(images, count, quality, device, min_seconds))
@@ -255,9 +255,9 @@ def _measure_rendering(factory: Factory, min_seconds: float) -> Iterator[Row]:
     """Benchmark of rendering: each stage of a view, a whole batch, copies to the host, and batches with copies overlapped."""
     simulation, stream = factory.simulation, factory.stream
     device, cameras = simulation.device, len(factory.cameras)
-    count = min(stream.batch, simulation.layout.worlds * cameras)
+    count = min(stream.rings[0].batch, simulation.layout.worlds * cameras)
     yield Row("views in a batch", count, "")
-    out, renderer = stream.ring[0].images, stream.renderer
+    out, renderer = stream.rings[0].slots[0].images, stream.rings[0].renderer
     views = first_views(count, cameras, renderer.instances, device)
 
     def render() -> None:
@@ -270,16 +270,16 @@ def _measure_rendering(factory: Factory, min_seconds: float) -> Iterator[Row]:
     yield Row("views, ground truth alone", 1.0 / (spent["set up views"] + spent["rasterize"] + spent["annotate"]), "1/s")
     yield Row("views, all stages", 1.0 / spent["all"], "1/s")
     if device.is_cuda:
-        size = sum(array.capacity for array in stream.copies[0].source)
+        size = sum(array.capacity for array in stream.rings[0].copies[0].source)
 
         def copy() -> None:
-            stream.copies[0].start(stream.streams.copy)
-            stream.copies[0].wait()
+            stream.rings[0].copies[0].start(stream.streams.copy)
+            stream.rings[0].copies[0].wait()
 
         seconds = seconds_per_call(copy, device, min_seconds / 4)
         yield Row("copy to the host", 1e-9 * size / seconds, "GB/s")
-        yield Row("views copied to the host", stream.batch / seconds, "1/s")
-    worlds = min(simulation.layout.worlds, -(-STREAM_BATCHES * stream.batch // cameras))
+        yield Row("views copied to the host", stream.rings[0].batch / seconds, "1/s")
+    worlds = min(simulation.layout.worlds, -(-STREAM_BATCHES * stream.rings[0].batch // cameras))
     report = _mark_live(simulation, worlds)
     seconds = seconds_per_call(lambda: [len(batch) for batch in stream.render(simulation.record.snapshot, report)], device, min_seconds)
     yield Row("views, all stages and copies", worlds * cameras / seconds, "1/s")

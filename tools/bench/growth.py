@@ -27,7 +27,7 @@ from synpick_warp.stages.render.scene import RenderScene, build_render_scene
 from synpick_warp.stages.render.view_setup import first_views
 from synpick_warp.stages.sim.physics import with_enough_worlds
 from synpick_warp.stages.sim.simulate import Simulation
-from synpick_warp.stages.stream import view_sizes
+from synpick_warp.stages.view_ring import view_sizes
 from synpick_warp.system.hardware.device import pick_device
 from tools.bench.physics import BURST, FOREVER, seconds_per_call
 from tools.options import Row

@@ -94,23 +94,25 @@ def measure_pictures(config: Config, after: int = 0) -> Iterator[Row]:
     for _ in range(after):
         _tick(factory)
     for _ in range(HISTORY_TICKS):
-        render_ticks(stream, stream.renderer, [keep_tick(factory)])
+        render_ticks(stream, stream.rings[0].renderer, [keep_tick(factory)])
     ticks = [keep_tick(factory) for _ in range(KEPT_TICKS)]
     views = sum(tick.views for tick in ticks)
     wp.synchronize_device(device)
     yield Row(f"setup: load, drop objects, render {HISTORY_TICKS} ticks", time.perf_counter() - started, "s")
     yield Row("ticks in a pass", len(ticks), "")
     yield Row("views in a pass", views, "")
-    yield Row("views in a batch", stream.batch, "")
+    yield Row("views in a batch", stream.rings[0].batch, "")
     if views == 0:
         return  # All episodes have ended.
-    renderers = {"all stages": stream.renderer}
-    history = light_history(stream.renderer)
+    renderers = {"all stages": stream.rings[0].renderer}
+    history = light_history(stream.rings[0].renderer)
     if history is not None:
         paths = history.paths.numpy()[history.frame.numpy() >= 0]  # NEVER, a negative index: no frame yet.
         yield Row("paths in a history before a pass, mean", float(paths.mean()), "")
         without = config.with_values({"render.history": 0})
-        renderers["all stages, render.history=0"] = make_renderer(without, stream.renderer.scene, stream.instances, stream.batch)
+        renderers["all stages, render.history=0"] = make_renderer(
+            without, stream.rings[0].renderer.scene, stream.rings[0].instances, stream.rings[0].batch
+        )
     megapixels = 1e-6 * config.cameras.resolution[0] * config.cameras.resolution[1]
     for name, times in _time_passes(stream, renderers, ticks).items():
         rate = views / statistics.median(times)
@@ -134,7 +136,7 @@ def keep_tick(factory: Factory) -> KeptTick:
     world, camera = select_views(_tick(factory), len(factory.cameras))
     snapshot = factory.simulation.record.snapshot
     copy = Snapshot(**{item.name: wp.clone(getattr(snapshot, item.name)) for item in fields(snapshot)})
-    return KeptTick(copy, list(batch_views(world, camera, factory.stream.batch, factory.stream.renderer)))
+    return KeptTick(copy, list(batch_views(world, camera, factory.stream.rings[0].batch, factory.stream.rings[0].renderer)))
 
 
 def _tick(factory: Factory) -> TickReport:
@@ -148,8 +150,8 @@ def render_ticks(stream: FrameStream, renderer: Renderer, ticks: list[KeptTick])
     slot = 0
     for tick in ticks:
         for views in tick.batches:
-            renderer.render(tick.snapshot, views, stream.ring[slot].images, stream.ring[slot].layers)
-            slot = (slot + 1) % len(stream.ring)
+            renderer.render(tick.snapshot, views, stream.rings[0].slots[slot].images, stream.rings[0].slots[slot].layers)
+            slot = (slot + 1) % len(stream.rings[0].slots)
 
 
 def _time_passes(stream: FrameStream, renderers: dict[str, Renderer], ticks: list[KeptTick]) -> dict[str, list[float]]:

@@ -58,8 +58,8 @@ def measure_stream(factory: Factory, report: TickReport, min_seconds: float) -> 
         min_seconds: Time for which a measurement is repeated, at least [s].
     """
     device, config = factory.simulation.device, factory.config
-    ring = BatchRing(factory.sizes, config.render.layers, factory.renderer, config.bop.depth_scale)
-    parts = (factory, ring, Selection().resolve(len(factory.cameras)), BakeSummary(), SilentProgress())
+    ring = BatchRing(factory.groups[0], config.render.layers, config.bop.depth_scale)
+    parts = (factory, (ring,), Selection().resolve(len(factory.cameras)), BakeSummary(), SilentProgress())
     yield Row("views in a batch", ring.views, "")
     still = ViewStream(_StillProducer(report, *parts))
     sources = {"renderer alone": _render_loop(factory, ring, report), "stream of one tick": map(_consumer(device), still)}
@@ -103,8 +103,8 @@ def _render_loop(stages: Stages, ring: BatchRing, report: TickReport) -> Iterato
 def _render_all(stages: Stages, ring: BatchRing, snapshot: Snapshot, world: np.ndarray, camera: np.ndarray) -> Iterator[int]:
     """Render the views in batches into one slot of the ring; yields the number of views of each."""
     slot = ring.slots[0]
-    for views in batch_views(world, camera, ring.views, stages.renderer):
-        stages.renderer.render(snapshot, views, slot.images, slot.layers)
+    for views in batch_views(world, camera, ring.views, stages.groups[0].renderer):
+        stages.groups[0].renderer.render(snapshot, views, slot.images, slot.layers)
         yield views.count
 
 

@@ -184,7 +184,7 @@ def compare_maps(
 
     Yields the denoised frame beside two references, and the periods of the lattice [px].
     """
-    device, room = stages.renderer.scene.device, config.arrangement.max_objects
+    device, room = stages.groups[0].renderer.scene.device, config.arrangement.max_objects
     fixtures, cameras = make_fixtures(make_bins(bin_sizes(config)), config.gripper), make_cameras(config.rig)
     scene = build_render_scene(config.render, -config.tote.wall, stages.catalog, fixtures, cameras, stages.lights, device)
     width, height = config.cameras.resolution

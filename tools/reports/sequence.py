@@ -107,7 +107,7 @@ def compare_frames(config: Config, frames: tuple[int, ...], cache: Path | None =
     check_memory(plan_memory(fitted, device), device)
     with explain_shortage(fitted):
         stages = build_stages(fitted, device, SilentProgress(), range(config.bake.episodes))
-    denoised, store = Studio(stages.renderer), ReferenceStore(cache, config, stages.renderer.scene)
+    denoised, store = Studio(stages.groups[0].renderer), ReferenceStore(cache, config, stages.groups[0].renderer.scene)
     simulation, names = stages.simulation, stages.light_table.name
     while True:
         simulation.tick()

@@ -7,8 +7,24 @@ import warp as wp
 
 from synpick_warp.codes import Segment
 from synpick_warp.kernels.render.lighting.color import srgb_byte
-from synpick_warp.kernels.render.lighting.materials import Surface, Surfaces, interpolate_surface, make_table_surface, sample_base_color
-from synpick_warp.kernels.render.visibility.camera import NEAR_PLANE, ImageGrid, ViewCameras, Views, camera_ray, in_image, tile_pixel
+from synpick_warp.kernels.render.lighting.materials import (
+    Surface,
+    Surfaces,
+    interpolate_surface,
+    make_table_surface,
+    map_table,
+    sample_base_color,
+)
+from synpick_warp.kernels.render.visibility.camera import (
+    NEAR_PLANE,
+    ImageGrid,
+    ViewCameras,
+    Views,
+    camera_ray,
+    hit_position,
+    in_image,
+    tile_pixel,
+)
 from synpick_warp.kernels.render.visibility.gbuffer import GBuffer, Meshes, ViewBodies, body_of
 
 wp.set_module_options({"enable_backward": False})
@@ -101,13 +117,16 @@ def hit_surface(
     instances: int,
 ) -> Surface:
     """Surface attributes of a pixel's primary hit, from the G-buffer; the pixel must show a body or the table."""
-    to_camera = -wp.normalize(cameras.to_world[view] * camera_ray(cameras, view, row, column, wp.vec2(0.0, 0.0)))
+    ray = camera_ray(cameras, view, row, column, wp.vec2(0.0, 0.0))
+    to_camera = -wp.normalize(cameras.to_world[view] * ray)
     segment = int(gbuffer.segment[view, row, column])
+    depth = gbuffer.depth[view, row, column]
+    width = depth / cameras.intrinsics[view][0]
     if segment == Segment.TABLE:
-        return make_table_surface(meshes, to_camera)
+        table = make_table_surface(meshes, bodies, view, to_camera)
+        return map_table(surfaces, table, hit_position(cameras, view, ray, depth), to_camera, width)
     triangle = gbuffer.triangle[view, row, column]
     barycentric = gbuffer.barycentric[view, row, column]
-    width = gbuffer.depth[view, row, column] / cameras.intrinsics[view][0]
     return interpolate_surface(meshes, surfaces, bodies, view, body_of(segment, instances), triangle, barycentric, to_camera, width)
 
 

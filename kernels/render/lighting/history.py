@@ -83,7 +83,7 @@ def advance_history_kernel(
     """
     view = wp.tid()
     world = views.world[view]
-    slot = world * history_inout.cameras + views.camera[view]
+    slot = world * history_inout.cameras + views.slot[view]
     moving_out.holds[view] = int(history_inout.episode[slot] == episode[world] and history_inout.frame[slot] + 1 == frame[world])
     history_inout.episode[slot] = episode[world]
     history_inout.frame[slot] = frame[world]
@@ -144,7 +144,7 @@ def lag_limit(
     """
     if history.max_paths == 0 or moving.holds[view] == 0:
         return 0
-    slot = views.world[view] * history.cameras + views.camera[view]
+    slot = views.world[view] * history.cameras + views.slot[view]
     if int(history.segment[slot, row, column]) != segment:
         return 0
     frames = int(MAX_FRAMES)

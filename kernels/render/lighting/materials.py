@@ -31,9 +31,10 @@ TRIANGLE_RECORDS = wp.constant(5)
 
 @wp.struct
 class Surfaces:
-    """Materials, textures and shading normals of all meshes. Constant.
+    """Materials, textures and shading normals of all meshes. Constant, but for the materials of views.
 
-    Rows called mesh are those of `Meshes`, and a last one for the table.
+    Rows called material are those of `Meshes`, one for the table, and where episodes draw their looks (`looks`) one for each texture that
+    they draw from and for each body of each view.
     """
 
     triangle: wp.array[wp.vec4]
@@ -41,21 +42,25 @@ class Surfaces:
     coordinate u of corners a, b, c. Record 3: texture coordinates v of a, b, c; texture density [texture widths per metre]. Record 4: face
     normal, as in `Meshes.face_normal`; Frobenius norm of the gradient of the interpolated normal [rad/m]."""
     color: wp.array[wp.vec3]
-    """(mesh): base colour, linear."""
+    """(material): base colour, linear."""
     metallic: wp.array[float]
-    """(mesh)."""
+    """(material)."""
     roughness: wp.array[float]
-    """(mesh): perceptual; the GGX width is its square."""
+    """(material): perceptual; the GGX width is its square."""
     texture_size: wp.array[wp.vec2i]
-    """(mesh): width and height of the finest mip level; 0, 0: no texture."""
+    """(material): width and height of the finest mip level; 0, 0: no texture."""
     first_texel: wp.array2d[int]
-    """(mesh, level): index of the first texel of a mip level."""
+    """(material, level): index of the first texel of a mip level."""
     texture_levels: wp.array[int]
-    """(mesh): number of mip levels."""
+    """(material): number of mip levels."""
     texel: wp.array[wp.uint32]
     """(texel): square roots of linear red, green and blue in TEXEL_BITS bits each, red in the lowest, so that one load reads all."""
     albedo: AlbedoTables
     """Directional albedo of the specular lobe, the same for all surfaces."""
+    recolor: wp.array[wp.mat33]
+    """(material): matrix on the linear base colour, whose result is clamped to 0..1; empty: none."""
+    repeats: wp.array[float]
+    """(material): factor on texture coordinates; empty: none."""
 
 
 @wp.struct
@@ -84,12 +89,29 @@ def face_forward(normal: wp.vec3, reference: wp.vec3) -> wp.vec3:
 
 
 @wp.func
-def make_table_surface(meshes: Meshes, view_direction: wp.vec3) -> Surface:
-    """Shading data of the table; `view_direction` points to the viewer."""
+def make_table_surface(meshes: Meshes, bodies: ViewBodies, view: int, view_direction: wp.vec3) -> Surface:
+    """Shading data of the table, without texture coordinates; `view_direction` points to the viewer."""
     result = Surface()
     result.row = meshes.entries + FIXTURES
+    if bodies.material:
+        result.row = bodies.material[view, bodies.mesh.shape[1]]
     result.face_normal = face_forward(wp.vec3(0.0, 0.0, 1.0), view_direction)
     result.normal = result.face_normal
+    return result
+
+
+@wp.func
+def map_table(surfaces: Surfaces, surface: Surface, position: wp.vec3, view_direction: wp.vec3, pixel_width: float) -> Surface:
+    """The table's shading data with texture coordinates, the horizontal axes of the world, if its material may have a texture.
+
+    Arguments as of `interpolate_surface`; `position` in the world [m].
+    """
+    result = surface
+    if surfaces.repeats:
+        scale = surfaces.repeats[surface.row]
+        tilt = wp.sqrt(wp.max(wp.abs(view_direction[2]), MIN_TILT))
+        result.uv = scale * wp.vec2(position[0], position[1])
+        result.uv_footprint = scale * pixel_width / tilt
     return result
 
 
@@ -113,6 +135,8 @@ def interpolate_surface(
     to_world = wp.transpose(bodies.world_rotation[view, body])
     result = Surface()
     result.row = mesh
+    if bodies.material:
+        result.row = bodies.material[view, body]
     first = TRIANGLE_RECORDS * (meshes.first_triangle[mesh] + triangle)
     a = read_flat_record(surfaces.triangle, first)
     b = read_flat_record(surfaces.triangle, first + 1)
@@ -132,6 +156,9 @@ def interpolate_surface(
     tilt = wp.sqrt(wp.max(wp.dot(result.face_normal, view_direction), MIN_TILT))
     result.uv_footprint = pixel_width / tilt * more[3]
     result.normal_spread = pixel_width / tilt * face[3]
+    if surfaces.repeats:
+        result.uv = surfaces.repeats[result.row] * result.uv
+        result.uv_footprint = surfaces.repeats[result.row] * result.uv_footprint
     return result
 
 
@@ -177,7 +204,17 @@ def sample_mip_level(surfaces: Surfaces, row: int, level: int, uv: wp.vec2) -> w
 
 @wp.func
 def sample_base_color(surfaces: Surfaces, surface: Surface) -> wp.vec3:
-    """Linear base colour: material colour times texture, filtered trilinearly at the mip level given by TEXEL_WIDTH."""
+    """Linear base colour: material colour times texture, changed by the material's matrix if there is one."""
+    color = sample_texture(surfaces, surface)
+    if surfaces.recolor:
+        turned = surfaces.recolor[surface.row] * color
+        return wp.vec3(wp.clamp(turned[0], 0.0, 1.0), wp.clamp(turned[1], 0.0, 1.0), wp.clamp(turned[2], 0.0, 1.0))
+    return color
+
+
+@wp.func
+def sample_texture(surfaces: Surfaces, surface: Surface) -> wp.vec3:
+    """Material colour times texture, linear, filtered trilinearly at the mip level given by TEXEL_WIDTH."""
     color = surfaces.color[surface.row]
     size = surfaces.texture_size[surface.row]
     if size[0] == 0:

@@ -22,6 +22,7 @@ from synpick_warp.kernels.render.lighting.materials import (
     Surface,
     interpolate_surface,
     make_table_surface,
+    map_table,
     sample_base_color,
     widen_roughness,
 )
@@ -32,7 +33,7 @@ from synpick_warp.kernels.render.lighting.shadow_upsampling import upsample_shad
 from synpick_warp.kernels.render.lighting.shadows import byte_of
 from synpick_warp.kernels.render.lighting.unoccluded import unoccluded_light
 from synpick_warp.kernels.render.lighting.upsampling import RatioImages, Ratios, upsample_ratios
-from synpick_warp.kernels.render.visibility.camera import ViewCameras, Views, camera_ray, in_image, tile_pixel
+from synpick_warp.kernels.render.visibility.camera import ViewCameras, Views, camera_ray, hit_position, in_image, tile_pixel
 from synpick_warp.kernels.render.visibility.gbuffer import GBuffer, ViewBodies, body_of
 from synpick_warp.kernels.render.visibility.triangles import camera_triangle, edge_areas
 from synpick_warp.kernels.tuning import SAMPLE_SHADE_REGISTERS, SHADE_REGISTERS
@@ -217,8 +218,11 @@ def shade_pixel(
     barycentric = gbuffer.barycentric[view, row, column]
     body = body_of(segment, views.instances)
     width = gbuffer.depth[view, row, column] / intrinsics[0]
-    surface = make_table_surface(scene.meshes, outgoing)
-    if segment != Segment.TABLE:
+    surface = make_table_surface(scene.meshes, bodies, view, outgoing)
+    if segment == Segment.TABLE:
+        position = hit_position(views.cameras, view, middle_ray, gbuffer.depth[view, row, column])
+        surface = map_table(scene.surfaces, surface, position, outgoing, width)
+    else:
         surface = interpolate_surface(scene.meshes, scene.surfaces, bodies, view, body, triangle, barycentric, outgoing, width)
     normal = surface.face_normal
     light = gather_light(scene, views.cameras, coarse, shadow_grid, sky, gbuffer, ratios, shadows, edges, view, row, column, normal)

@@ -262,7 +262,7 @@ def trace_shadow_rays_kernel(
     view, row, column = tile_pixel(coarse.grid, wp.tid() + first)
     if not in_image(coarse.grid, row, column):
         return
-    world, camera = views.world[view], views.camera[view]
+    world = views.world[view]
     which = light[world]
     rays = lights.lamps[which] * lights.lamp_rays[which]
     if rays == 0:
@@ -270,7 +270,7 @@ def trace_shadow_rays_kernel(
     pixel = middle_pixel(coarse, row, column)
     segment = int(gbuffer.segment[view, pixel[0], pixel[1]])
     depth = gbuffer.depth[view, pixel[0], pixel[1]]
-    slot = world * history_inout.cameras + camera
+    slot = world * history_inout.cameras + views.slot[view]
     free, packed_normal = int(ALL_RAYS), int(0)
     if segment != Segment.NOTHING:
         camera_direction = camera_ray(views.cameras, view, pixel[0], pixel[1], wp.vec2(0.0, 0.0))

@@ -68,7 +68,9 @@ class Views:
     world: wp.array[int]
     """(view); -1: the view is not in use."""
     camera: wp.array[int]
-    """(view): row of `Cameras`; -1: the view is not in use."""
+    """(view): index among all cameras, by which random numbers are addressed; -1: the view is not in use."""
+    slot: wp.array[int]
+    """(view): row of `Cameras`, which has the cameras of one image size."""
     cameras: ViewCameras
     """Camera of each view."""
     count: int

@@ -307,7 +307,7 @@ def resolve_visibility_kernel(
     if key != EMPTY:
         hit = resolve_hit(meshes, bodies, view, views.instances, key, ray)
     if bodies.uses_background[view] != 0:
-        static_hit = read_hit(background, camera, row, column)
+        static_hit = read_hit(background, views.slot[view], row, column)
         if static_hit.segment != Segment.NOTHING and static_hit.depth < hit.depth:
             hit = static_hit
     else:

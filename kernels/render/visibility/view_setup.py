@@ -43,8 +43,8 @@ def aim_cameras_kernel(
 ):
     """Set the camera of each view that is in use. Launched over view."""
     view = wp.tid()
-    camera = views_inout.camera[view]
-    if camera >= 0:
+    if views_inout.camera[view] >= 0:
+        camera = views_inout.slot[view]
         views_inout.cameras.intrinsics[view] = cameras.intrinsics[camera]
         views_inout.cameras.rotation[view] = cameras.rotation[camera]
         views_inout.cameras.center[view] = cameras.center[camera]

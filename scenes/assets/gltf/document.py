@@ -250,13 +250,13 @@ class Document:
     buffers: list[bytes]
 
 
-def read_document(path: Path, notes: Notes) -> Document:
-    """Read a .glb or .gltf file and the buffers that it refers to.
+def read_document(path: Path, notes: Notes, data: bytes | None = None) -> Document:
+    """Read a .glb or .gltf file, or decode `data` in its place, and the buffers that it refers to.
 
     Raises:
         CatalogError: The file is damaged, exceeds a limit, refers to a file outside of its folder, or needs an unknown extension.
     """
-    data = read_file(path, MAX_MESH_FILE, CatalogError)
+    data = read_file(path, MAX_MESH_FILE, CatalogError) if data is None else data
     if data[:4] == b"glTF" or path.suffix.lower() == ".glb":
         header, chunks = _split_chunks(data, path)
     else:

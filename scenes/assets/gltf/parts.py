@@ -53,13 +53,18 @@ _DIELECTRIC = 0.04
 _CLAMP, _MIRROR = 33071, 33648
 
 
-def read_gltf(path: Path, notes: Notes) -> list[MeshPart]:
+def read_gltf(path: Path, notes: Notes, data: bytes | None = None) -> list[MeshPart]:
     """Read a .glb or .gltf file: one part for each primitive of each node of the default scene.
+
+    Args:
+        path: The file.
+        notes: What is left out is noted there.
+        data: Content to decode in place of the file's.
 
     Raises:
         CatalogError: The file or one that it refers to cannot be used.
     """
-    document = read_document(path, notes)
+    document = read_document(path, notes, data)
     with reading_as(path.suffix[1:].upper(), path):  # Values may be valid one by one, and not fit together.
         return _Reader(document, notes).parts()
 

@@ -60,10 +60,10 @@ class TexturePixels:
     """Image decoder of one OBJ file: decodes each image once, and limits the number of pixels of all together."""
 
     owner: Path
-    images: dict[Path, np.ndarray] = field(default_factory=dict)
+    images: dict[tuple[Path, bool], np.ndarray] = field(default_factory=dict)
 
-    def read(self, name: str, library: Path) -> np.ndarray:
-        """Decode an image that a material library names.
+    def read(self, name: str, library: Path, linear: bool) -> np.ndarray:
+        """Decode an image that a material library names; `linear`: one of numbers, as roughness is.
 
         Returns:
             The image (H, W, 3) uint8.
@@ -74,11 +74,12 @@ class TexturePixels:
         plain = name.partition(" #")[0].strip()
         name = plain if plain and is_missing(library.parent, name, library) else name
         path, data = read_referred(library.parent, name, library, MAX_TEXTURE_FILE)
-        if path not in self.images:
-            self.images[path] = decode_texture(data, str(path))
+        key = path, linear and path.suffix.lower() == ".exr"
+        if key not in self.images:
+            self.images[key] = decode_texture(data, str(path), linear)
             if sum(image.size // 3 for image in self.images.values()) > MAX_TEXTURE_PIXELS:
                 raise CatalogError(f"{self.owner}: its textures have more than {MAX_TEXTURE_PIXELS} pixels together; scale them down")
-        return self.images[path]
+        return self.images[key]
 
 
 def parse_library(text: str, library: Path) -> dict[str, MtlMaterial]:
@@ -191,7 +192,10 @@ def read_material(material: MtlMaterial, pixels: TexturePixels, notes: Notes) ->
         CatalogError: An image is damaged, or missing and not replaced.
     """
     notes.ignored += material.ignored
-    images = {key: notes.image(lambda name=name: pixels.read(name, material.library)) for key, name in material.maps.items()}
+    images = {
+        key: notes.image(lambda name=name, key=key: pixels.read(name, material.library, key != "map_kd"))
+        for key, name in material.maps.items()
+    }
     factors = dict(material.factors)
     factors |= {key[4:]: float(image.mean() / 255.0) for key, image in images.items() if key != "map_kd" and image is not None}
     texture = images.get("map_kd")

@@ -39,11 +39,12 @@ class StoredContext(ExportContext):
         """
         from synpick_warp.dataset.commit.digests import digest_inputs
         from synpick_warp.scenes.catalog import load_catalog
-        from synpick_warp.scenes.lights import load_lights
+        from synpick_warp.stages.render.lamp_variants import load_scene_lights
 
-        source = self._source
-        catalog, lights = load_catalog(source.config), load_lights(source.config.bake.lights)
-        if digest_inputs(catalog, lights) != source.inputs:
+        source, config = self._source, self._source.config
+        catalog = load_catalog(config)
+        lights = load_scene_lights(config.bake.lights, config.randomize, config.bake.seed, lambda line: None)
+        if any(source.inputs.get(name) != digest for name, digest in digest_inputs(catalog, lights).items()):
             raise DatasetError(f"the objects or lights of {source.folder} have changed since its bake, but are needed; restore them")
         return catalog, lights
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
@@ -9,6 +10,8 @@ from cyclopts import Parameter
 
 from synpick_warp.cli.folders import beside, check_output_file, find_data_set, has_attempts, has_scenes
 from synpick_warp.cli.options import WholeNumber
+from synpick_warp.configs.load import load_config
+from synpick_warp.configs.objects import AUTO_UNIT, DECLARED, DETECT
 from synpick_warp.errors import ConfigError, escape
 
 
@@ -18,8 +21,23 @@ def preview(
     *,
     out: Annotated[Path | None, Parameter(help="PNG or JPEG file to write (default DIR-contact-sheet.png, beside the data set).")] = None,
     views: Annotated[WholeNumber, Parameter(help="Number of views, spread over the data set.")] = 8,
+    symmetries: Annotated[
+        bool,
+        Parameter(
+            negative=(),
+            help="Draw the symmetries of the objects instead: of a data set those that it states; DIR may also be a folder of models, "
+            "where they are detected unless they are declared.",
+        ),
+    ] = False,
+    config: Annotated[
+        str | None, Parameter(help="Settings of a folder of models (unit, object table, tolerance): a preset or .toml file.")
+    ] = None,
 ) -> int:
     """Draw a contact sheet: colour, depth, instance masks, bounding boxes and layers of sampled views."""
+    if symmetries:
+        return _preview_symmetries(folder, out, config)
+    if config is not None:
+        raise ConfigError("--config is given without --symmetries; a data set has its settings")
     if views < 1:
         raise ConfigError(f"--views is {views}; allowed: at least 1")
     folder = find_data_set(folder, "synpick-warp preview DIR", has_scenes)
@@ -30,6 +48,32 @@ def preview(
     check_output_file(sheet, "--out", folder)
     write_contact_sheet(folder, sheet, views)
     print(f"contact sheet: {escape(str(sheet))}")
+    return 0
+
+
+def _preview_symmetries(folder: Path | None, out: Path | None, config: str | None) -> int:
+    """Draw the symmetries of the objects of a data set, or of a folder of models."""
+    from synpick_warp.dataset.commit.manifest import CONFIG_FILE, MANIFEST_FILE
+
+    settings: dict[str, object] = {"objects.symmetries": DETECT}
+    models, is_set = folder, False
+    if folder is None or (folder / MANIFEST_FILE).is_file():
+        folder = find_data_set(folder, "synpick-warp preview DIR --symmetries", has_scenes)
+        if config is not None:
+            raise ConfigError(f"--config is given, but {folder} is a data set, which has its settings; name the folder of models")
+        # Its models are BOP's, with symmetries of their own; rows may be of meshes with other ids.
+        models, is_set = folder / "models", True
+        settings = {"objects.symmetries": DECLARED, "objects.unit": AUTO_UNIT}
+        config = str(folder / CONFIG_FILE) if (folder / CONFIG_FILE).exists() else None
+    sheet = out or beside(folder, "-symmetries.png")
+    from synpick_warp.apps.viz.drawing import check_picture_name
+    from synpick_warp.apps.viz.symmetries import write_symmetry_sheet
+
+    check_picture_name(sheet)
+    check_output_file(sheet, "--out", folder)
+    resolved = load_config(config, settings | {"bake.models": str(models)})
+    write_symmetry_sheet(replace(resolved, object_rows=()) if is_set else resolved, sheet, lambda line: print(escape(line)))
+    print(f"symmetries: {escape(str(sheet))}")
     return 0
 
 

@@ -12,12 +12,14 @@ from pathlib import Path
 
 import numpy as np
 
+from synpick_warp.scenes.looks import Looks
 from synpick_warp.scenes.types import Catalog, EnvironmentMap
 
 
-def digest_inputs(catalog: Catalog, lights: tuple[EnvironmentMap, ...]) -> dict[str, str]:
-    """Digests of the content of objects and lights, without the names of their files: the manifest's INPUTS."""
-    return {"objects": _digest_data(catalog), "lights": _digest_data(lights)}
+def digest_inputs(catalog: Catalog, lights: tuple[EnvironmentMap, ...], looks: Looks | None = None) -> dict[str, str]:
+    """Digests of the content of objects, lights and textures, if any, without the names of their files: the manifest's INPUTS."""
+    textures = {"textures": _digest_data((looks.bin_textures, looks.table_textures))} if looks and looks.all_textures else {}
+    return {"objects": _digest_data(catalog), "lights": _digest_data(lights)} | textures
 
 
 def _digest_data(value: object) -> str:

@@ -26,8 +26,11 @@ import msgspec
 
 from synpick_warp import __version__
 from synpick_warp.configs.bins import Bins
-from synpick_warp.configs.load import load_config, override_config
+from synpick_warp.configs.load import load_config, override_config, table_lists
+from synpick_warp.configs.objects import AUTO_UNIT, Objects
+from synpick_warp.configs.randomize import Distribution, Randomize
 from synpick_warp.configs.schema import CLASSIC, WITHIN, Config
+from synpick_warp.configs.table_lists import given_values
 from synpick_warp.dataset.records import Entry, EpisodeEntry, IndicesEntry, Manifest, read_record
 from synpick_warp.errors import DatasetError
 from synpick_warp.exporters.formats import FORMAT_TABLE
@@ -57,24 +60,38 @@ FREE_SETTINGS = (
     "bake.device",
     "bake.models",
     "bake.lights",
+    "randomize.bin_textures",
+    "randomize.table_textures",
     "bake.writers",
     "render.views_per_batch",
     "perception.views",
 )
-"""Settings that may differ when a bake is resumed: no episode depends on them. Objects and lights are compared by content, not by the name
-of their folder. A device of another type computes the same episodes up to rounding."""
-YOUNGER_BINS = {f"bins.{item.name}": item.default for item in dataclasses.fields(Bins)}
+"""Settings that may differ when a bake is resumed: no episode depends on them. Objects, lights and textures are compared by content, not
+by the name of their folder. A device of another type computes the same episodes up to rounding."""
+
+
+def _plain(value: Any) -> Any:
+    """A value of a setting in types of TOML."""
+    return value.to_toml() if isinstance(value, Distribution) else value
+
+
 YOUNGER_SETTINGS: dict[str, Any] = {
     "bop.layout": CLASSIC,
     "bop.keypoints": 0,
     "arrangement.fill": WITHIN,
     "perception.camera": "",
-    "camera": (),
-    "bin": (),
-    **YOUNGER_BINS,
+    "camera": [],
+    "bin": [],
+    "objects.unit": AUTO_UNIT,
+    "objects.symmetries": Objects().symmetries,
+    "objects.symmetry_tolerance": Objects().symmetry_tolerance,
 }
+YOUNGER_SETTINGS |= {f"bins.{item.name}": item.default for item in dataclasses.fields(Bins)}
+YOUNGER_SETTINGS |= {f"randomize.{item.name}": _plain(item.default) for item in dataclasses.fields(Randomize)}
 """Settings that older manifests lack, and what held before: left out where they have these values, so that older data sets can still be
 read, and resumed with them."""
+_YOUNGER_KEYS = ("symmetries_discrete", "symmetries_continuous")
+"""Keys of object rows that older manifests lack: left out if they are empty."""
 PACKAGES = ("warp-lang", "newton", "numpy", "scipy", "coacd", "opencv-python-headless", "isal", "orjson", "usd-core", "zarr")
 """Packages whose versions the output of every format depends on; `FORMAT_TABLE` has those of single formats."""
 MAX_DIFFERENCES, MAX_SHOWN = 8, 80
@@ -111,15 +128,21 @@ def fixed_settings(config: Config) -> dict[str, Any]:
     Nested; formats sorted by name.
     """
     settings = dataclasses.asdict(config)
+    for name in table_lists():
+        settings[name] = [given_values(row) for row in getattr(config, name)]
+    settings["randomize"] = {item.name: _plain(getattr(config.randomize, item.name)) for item in dataclasses.fields(Randomize)}
     for key in FREE_SETTINGS:
         section, name = key.split(".")
         del settings[section][name]
     for key, before in YOUNGER_SETTINGS.items():
         *sections, name = key.split(".")
         table = settings[sections[0]] if sections else settings
-        if table[name] == before:
+        if name in table and table[name] == before:
             del table[name]
-    settings = {section: values for section, values in settings.items() if values != {}}
+    for row in settings["object_rows"]:
+        for name in [name for name in _YOUNGER_KEYS if not row[name]]:
+            del row[name]
+    settings = {section: content for section, content in settings.items() if content != {}}
     settings["bake"]["formats"] = sorted(set(config.bake.formats))
     for split in settings["splits"]:
         del split["episodes"]

@@ -151,14 +151,15 @@ class OutputFolder:
 
         Args:
             exporters: All exporters of the bake.
-            inputs: Content digests of objects and lights.
+            inputs: Content digests of objects, lights and textures.
             pool: Writer processes.
 
         Raises:
             ConfigError: The data set was started with other objects or lights.
             OutputError: The folder cannot be written.
         """
-        differing = [name for name in inputs if self._known and self._known.get(INPUTS, {}).get(name) != inputs[name]]
+        known = self._known.get(INPUTS, {}) if self._known else inputs
+        differing = [name for name in {**inputs, **known} if known.get(name) != inputs.get(name)]
         if differing:
             raise ConfigError(f"{self.out} was started with other {' and '.join(differing)}; {_ADVICE}")
         self._exporters = exporters

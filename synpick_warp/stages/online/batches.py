@@ -14,9 +14,9 @@ from synpick_warp.stages.arrays import allocate, device_array
 from synpick_warp.stages.buffers import LayerBuffers, Snapshot, ViewBuffers
 from synpick_warp.stages.launch import launch
 from synpick_warp.stages.online.exchange import DeviceArray, Gate
-from synpick_warp.stages.render.renderer import Renderer
 from synpick_warp.stages.render.view_setup import make_views
 from synpick_warp.stages.timing import scope
+from synpick_warp.stages.view_ring import CameraGroup
 
 GPU_RING = 3
 """Slots on a GPU: one with the consumer, one rendered ahead, and one that the consumer's queue may still read."""
@@ -65,7 +65,7 @@ class Slot:
     def __init__(self, sizes: dict[str, int], layers: list[str], device: wp.Device) -> None:
         self.sizes, self.device = sizes, device
         self.images, self.truth, self.layers = allocate_slot(sizes, layers, device)
-        self.lists = wp.zeros((2, sizes["view"]), dtype=wp.int32, device=device)
+        self.lists = wp.zeros((3, sizes["view"]), dtype=wp.int32, device=device)
         self.masks: dict[str, wp.array] = {}
         self.gate = Gate(device)
         self._expanded: dict[str, int] = {}
@@ -179,16 +179,16 @@ class ViewBatch:
 class BatchRing:
     """Renders batches of views into a ring of slots; `render` only launches kernels."""
 
-    def __init__(self, sizes: dict[str, int], layers: tuple[str, ...], renderer: Renderer, depth_scale: float) -> None:
+    def __init__(self, group: CameraGroup, layers: tuple[str, ...], depth_scale: float) -> None:
         """Allocate the slots.
 
         Args:
-            sizes: Extents by `stages.stream.view_sizes`.
+            group: Cameras and their renderer.
             layers: Names of the layers to render.
-            renderer: Renderer and annotator of views.
             depth_scale: Millimetres per count of the depth image.
         """
-        self.renderer, self.device, self.depth_scale = renderer, renderer.scene.device, depth_scale
+        renderer, sizes = group.renderer, group.sizes
+        self.group, self.renderer, self.device, self.depth_scale = group, renderer, renderer.scene.device, depth_scale
         self.views, self.instances = sizes["view"], sizes["instance"]
         names = [item.name for item in fields(LayerBuffers) if item.name in layers]
         self.slots = [Slot(sizes, names, self.device) for _ in range(GPU_RING if self.device.is_cuda else 1)]
@@ -206,10 +206,10 @@ class BatchRing:
         slot, count = self.slots[self._next], len(world)
         self._next = (self._next + 1) % len(self.slots)
         slot.gate.wait_for_consumers()
-        padded = np.zeros((2, self.views), dtype=np.int32)
-        padded[:, :count] = world, camera
+        padded = np.zeros((3, self.views), dtype=np.int32)
+        padded[:, :count] = world, camera, self.group.slots(camera)
         slot.lists.assign(padded)
-        views = make_views(slot.lists[0], slot.lists[1], count, self.instances)
+        views = make_views(slot.lists[0], slot.lists[1], count, self.instances, slot=slot.lists[2])
         with scope("render", self.device):
             self.renderer.render(snapshot, views, slot.images, slot.layers)
             self._gather(snapshot, views, slot.truth)

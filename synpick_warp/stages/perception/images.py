@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Any
 
 import warp as wp
@@ -19,7 +18,7 @@ from synpick_warp.stages.buffers import Snapshot
 from synpick_warp.stages.launch import launch_pixels
 from synpick_warp.stages.perception.arrays import PerceptionArrays, SegmentationScratch
 from synpick_warp.stages.render.raster import Rasterizer, allocate_visibility
-from synpick_warp.stages.render.scene import RenderScene, build_cameras, build_grid
+from synpick_warp.stages.render.scene import RenderScene, build_grid, with_cameras
 from synpick_warp.stages.render.view_setup import GBUFFER, VIEW_BODIES, VIEW_CAMERAS, VIEWS, body_sizes, set_up_views
 
 CPU_BYTES = 512 * 2**20
@@ -89,13 +88,12 @@ class PerceptionImages:
         device = render_scene.device
         count = count_views(settings, worlds, instances, device)
         width, height = settings.resolution
-        grid = build_grid(width, height)
-        self.pixels = count * grid.tiles * int(TILE_PIXELS)
+        self.pixels = count * build_grid(width, height).tiles * int(TILE_PIXELS)
         if self.pixels >= 2**31:
             raise ConfigError(f"perception.views is {count}; of {width} x {height} px that is more than 2³¹ pixels; take fewer")
         seen = resized(rig.rows[rig.index(settings.camera)], settings.resolution)
         camera = make_cameras(Rig((seen,), rig.is_listed))
-        self.scene = replace(render_scene, cameras=build_cameras(camera, device), grid=grid, camera_count=1)
+        self.scene = with_cameras(render_scene, camera)
         self.views, self.bodies, self.gbuffer, self.arrays, self.scratch = allocate_batch(settings, instances, count, device)
         self.views.world.fill_(-1)
         self.views.count, self.views.instances = count, instances

@@ -12,6 +12,7 @@ from synpick_warp.stages.buffers import LayerBuffers, Snapshot, ViewBuffers
 from synpick_warp.stages.render.annotate import Annotator
 from synpick_warp.stages.render.denoised import DenoisedRenderer
 from synpick_warp.stages.render.layers import LayerRenderer, sensor_parameters
+from synpick_warp.stages.render.looks import Dresser
 from synpick_warp.stages.render.postprocess import PostProcessor
 from synpick_warp.stages.render.raster import Rasterizer
 from synpick_warp.stages.render.reference import ReferenceRenderer
@@ -64,11 +65,14 @@ class Renderer:
             histories: Worlds times cameras whose light is averaged over the frames of an episode; 0: each frame is rendered by itself.
         """
         sizes = {"view": views, "row": scene.height, "column": scene.width} | body_sizes(instances, scene.width, scene.height)
-        self.scene = scene
+        self.dresser = Dresser(scene, seed, instances, views) if scene.looks is not None else None
+        self.scene = scene = self.dresser.scene if self.dresser else scene
         self.instances = instances
         self.views = views
         self.cameras = allocate_struct(VIEW_CAMERAS, sizes, scene.device)
         self.bodies = allocate_struct(VIEW_BODIES, sizes, scene.device)
+        if self.dresser:
+            self.bodies.material = self.dresser.material
         self.gbuffer = allocate_struct(GBUFFER, sizes, scene.device)
         self.image = allocate_struct(SHADED_IMAGE, sizes, scene.device)
         if settings.mode == schema.REFERENCE:
@@ -115,5 +119,7 @@ class Renderer:
         views.cameras = self.cameras
         with scope("set up views", scene.device):
             set_up_views(scene, snapshot, snapshot.fixture_visible, views, self.bodies)
+            if self.dresser:
+                self.dresser.dress(snapshot, views, self.bodies)
         with scope("rasterize", scene.device):
             self.rasterizer.rasterize(self.bodies, views, self.gbuffer, out)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import cv2
@@ -19,6 +19,7 @@ from synpick_warp.kernels.render.visibility.camera import TILE_HEIGHT, TILE_PIXE
 from synpick_warp.kernels.render.visibility.gbuffer import Meshes, Table
 from synpick_warp.scenes.assets.appearance import linear_to_srgb, srgb_to_linear
 from synpick_warp.scenes.environment import LUMINANCE
+from synpick_warp.scenes.looks import Looks, project_from_box
 from synpick_warp.scenes.tote import TABLE_ROUGHNESS
 from synpick_warp.scenes.types import Camera, Catalog, EnvironmentMap, Fixture, Interior, Material, TriangleMesh
 from synpick_warp.stages.render.light_tables import (
@@ -58,6 +59,8 @@ class RenderScene:
     device: wp.Device
     keep: tuple[wp.Mesh, ...]
     """Owners of the meshes whose handles `meshes` holds."""
+    looks: Looks | None = None
+    """What episodes draw their looks from; the textures' materials are the last rows of `surfaces`."""
 
     @property
     def width(self) -> int:
@@ -157,7 +160,7 @@ def build_meshes(
 
 
 def build_surfaces(shapes: list[TriangleMesh], materials: list[Material], device: wp.Device) -> Any:
-    """The struct `Surfaces`: normals, uv, materials, mip-mapped textures; `materials` ends with the table's, which has no shape."""
+    """The struct `Surfaces`: normals, uv, materials, mip-mapped textures; after those of the shapes, `materials` may have others."""
     chains = map_in_threads(lambda material: mip_levels(material.texture) if material.texture is not None else [], materials)
     depth = max(1, *(len(chain) for chain in chains))
     first_texel = np.zeros((len(chains), depth), dtype=np.int32)
@@ -212,6 +215,12 @@ def build_cameras(cameras: tuple[Camera, ...], device: wp.Device) -> Any:
     result.center = wp.array(-np.einsum("kji,kj->ki", rotation, translation), dtype=wp.vec3d, device=device)
     result.to_world = wp.array(rotation.transpose(0, 2, 1), dtype=wp.mat33, device=device)
     return result
+
+
+def with_cameras(scene: RenderScene, cameras: tuple[Camera, ...]) -> RenderScene:
+    """The same scene with other cameras, of one image size."""
+    grid = build_grid(cameras[0].width, cameras[0].height)
+    return replace(scene, cameras=build_cameras(cameras, scene.device), grid=grid, camera_count=len(cameras))
 
 
 def build_grid(width: int, height: int) -> Any:
@@ -295,6 +304,7 @@ def build_render_scene(
     cameras: tuple[Camera, ...],
     lights: tuple[EnvironmentMap, ...],
     device: wp.Device,
+    looks: Looks | None = None,
 ) -> RenderScene:
     """Put all constant data of the renderer on the device.
 
@@ -306,13 +316,18 @@ def build_render_scene(
         cameras: Cameras of one image size; `Views.camera` is the index into it.
         lights: Environment maps; `Snapshot.light` is the index into it.
         device: Device of the arrays.
+        looks: What episodes draw their looks from; None: nothing.
     """
     # The first bin comes last, see `fixture_mesh`.
     bins, grip = fixtures[:-GRIPPER], fixtures[-GRIPPER:]
     fixtures = (*reversed(bins), *grip)
     shapes = [entry.mesh for entry in catalog.entries] + [fixture.mesh for fixture in fixtures]
+    if looks and looks.bin_textures:
+        first = len(catalog)
+        shapes[first : first + len(bins)] = map(project_from_box, shapes[first : first + len(bins)])
     table_material = Material(color=settings.table_color, texture=None, metallic=0.0, roughness=TABLE_ROUGHNESS)
     materials = [entry.material for entry in catalog.entries] + [fixture.material for fixture in fixtures] + [table_material]
+    materials += [Material((1.0, 1.0, 1.0), texture, 0.0, 1.0) for texture in (looks.all_textures if looks else ())]
     meshes, keep = build_meshes(shapes, len(catalog) + len(bins) - 1, device, bins[0].interior if len(bins) == 1 else None)
     table = Table()
     table.visible, table.height = int(settings.table), table_height
@@ -335,4 +350,5 @@ def build_render_scene(
         camera_count=len(cameras),
         device=device,
         keep=keep,
+        looks=looks,
     )

@@ -19,6 +19,7 @@ VIEW_BODIES = struct_arrays(
     ViewBodies,
     "view",
     "body",
+    material=("view", "material"),
     ray_record=("view", "body", "record"),
     present=("view",),
     uses_background=("view",),
@@ -36,7 +37,7 @@ def pair_views(worlds: np.ndarray, cameras: np.ndarray) -> tuple[np.ndarray, np.
     return np.repeat(worlds, len(cameras)).astype(np.int32), np.tile(cameras, len(worlds)).astype(np.int32)
 
 
-def make_views(world: wp.array, camera: wp.array, count: int, instances: int, cameras: Any = None) -> Any:
+def make_views(world: wp.array, camera: wp.array, count: int, instances: int, cameras: Any = None, slot: wp.array | None = None) -> Any:
     """The struct `Views`.
 
     Args:
@@ -45,9 +46,11 @@ def make_views(world: wp.array, camera: wp.array, count: int, instances: int, ca
         count: Views in the batch; arrays may be longer.
         instances: Instance capacity of a world.
         cameras: The struct `ViewCameras`; None: the renderer brings its own.
+        slot: Row of each view's camera in the scene (view) int32; None: that of its index.
     """
     views = Views()
     views.world, views.camera, views.count, views.instances = world, camera, count, instances
+    views.slot = camera if slot is None else slot
     if cameras is not None:
         views.cameras = cameras
     return views
@@ -62,7 +65,7 @@ def first_views(count: int, cameras: int, instances: int, device: wp.Device) -> 
 
 def body_sizes(instances: int, width: int, height: int) -> dict[str, int]:
     """Extents of the dimensions that `VIEW_BODIES` names beside the view, for images of `width` x `height` px."""
-    return {"body": instances + len(FIXTURES), "tile": build_grid(width, height).tiles, "record": int(RAY_RECORDS)}
+    return {"body": instances + len(FIXTURES), "material": 0, "tile": build_grid(width, height).tiles, "record": int(RAY_RECORDS)}
 
 
 def set_up_views(

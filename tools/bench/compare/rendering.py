@@ -36,14 +36,14 @@ def measure_rendering(factory: Factory, min_seconds: float) -> Iterator[Row]:
     Worlds beyond the factory's show its piles again.
     """
     cameras, device = factory.cameras, factory.simulation.device
-    yield from _measure_size(factory, cameras, max(1, factory.stream.batch // len(cameras)), min_seconds)
+    yield from _measure_size(factory, cameras, max(1, factory.stream.rings[0].batch // len(cameras)), min_seconds)
     small = make_cameras(Rig.of(replace(factory.config.cameras, resolution=SMALL_SIZE)))
     yield from _measure_size(factory, small, SMALL_WORLDS if device.is_cuda else SMALL_WORLDS_CPU, min_seconds)
 
 
 def _measure_size(factory: Factory, cameras: tuple[Camera, ...], worlds: int, min_seconds: float) -> Iterator[Row]:
     """Benchmark of both renderers with images of these cameras in `worlds` worlds."""
-    device, scene, config = factory.simulation.device, factory.stream.renderer.scene, factory.config
+    device, scene, config = factory.simulation.device, factory.stream.rings[0].renderer.scene, factory.config
     snapshot = tile_snapshot(factory.simulation.record.snapshot, worlds, device)
     count, pixels = worlds * len(cameras), cameras[0].width * cameras[0].height
     size = f"{cameras[0].width}x{cameras[0].height}, {worlds:,} world{'' if worlds == 1 else 's'}"
@@ -93,7 +93,7 @@ def tile_snapshot(snapshot: Snapshot, worlds: int, device: wp.Device) -> Snapsho
 
 def make_views_of(factory: Factory, mode: str, cameras: tuple[Camera, ...], snapshot: Snapshot, worlds: int) -> OurViews:
     """Our renderer in a mode and at the image size of `cameras`, for all cameras of the first worlds of a snapshot."""
-    count, scene = worlds * len(cameras), factory.renderer.scene
+    count, scene = worlds * len(cameras), factory.groups[0].renderer.scene
     scene = replace(scene, cameras=build_cameras(cameras, scene.device), grid=build_grid(cameras[0].width, cameras[0].height))
     config = factory.config.with_values({"render.mode": mode})
-    return OurViews(make_renderer(config, scene, factory.renderer.instances, count, histories=count), snapshot, count)
+    return OurViews(make_renderer(config, scene, factory.groups[0].renderer.instances, count, histories=count), snapshot, count)

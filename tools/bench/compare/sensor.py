@@ -219,9 +219,9 @@ def measure_sensor(factory: Factory, min_seconds: float) -> Iterator[Row]:
     Both update poses and render a batch of views. On CUDA both launch without waiting, so that launch overhead is hidden. The
     sensor has no light maps, amodal bits, counts, boxes, or texture minification.
     """
-    simulation, renderer, config = factory.simulation, factory.stream.renderer, factory.config
+    simulation, renderer, config = factory.simulation, factory.stream.rings[0].renderer, factory.config
     device, snapshot = simulation.device, simulation.record.snapshot
-    count = min(factory.stream.batch, simulation.layout.worlds * len(factory.cameras))
+    count = min(factory.stream.rings[0].batch, simulation.layout.worlds * len(factory.cameras))
     started = time.perf_counter()
     fixtures = make_fixtures(make_bins(bin_sizes(config)), config.gripper)
     table = float(renderer.scene.table.height)

@@ -64,7 +64,7 @@ def extend_queued_paths_kernel(
     path = extend_path(scene, bodies, rules, context, pixel.number, pixel.diffuse, path, vertex)
     if path.bounce == TERMINATED:
         cell = flat_index(coarse.grid, view, row, column)
-        history_slot = world * history_inout.cameras + views.camera[view]
+        history_slot = world * history_inout.cameras + views.slot[view]
         finish_path(scene, rules, context, coarse_light_out, history_inout, cell, history_slot, row, column, pixel, path.radiance)
     else:
         requeue_path(queues_inout, view, region, stage + 1, slot, path, pixel)

@@ -251,8 +251,8 @@ def trace_pixel(
     view, row, column = interleaved_pixel(coarse, index)
     if not in_image(coarse.grid, row, column):
         return
-    camera, world = views.camera[view], views.world[view]
-    slot = world * history.cameras + camera
+    world = views.world[view]
+    slot = world * history.cameras + views.slot[view]
     samples = new_paths(rules, history, slot, known)
     if queued != (samples == 1 and regions > 0):
         return

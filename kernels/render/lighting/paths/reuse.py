@@ -56,9 +56,9 @@ def reuse_histories_kernel(
     if not in_image(coarse.grid, row, column):
         return
     cell = flat_index(coarse.grid, view, row, column)
-    camera, world = views.camera[view], views.world[view]
+    world = views.world[view]
     surface = coarse_surface(views.cameras, coarse, gbuffer, view, row, column)
-    slot = world * history_inout.cameras + camera
+    slot = world * history_inout.cameras + views.slot[view]
     if surface.hit.segment == Segment.NOTHING:
         write_record(guide_out.surface, cell, wp.vec4())
         history_inout.segment[slot, row, column] = wp.uint8(Segment.NOTHING)

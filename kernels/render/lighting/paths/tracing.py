@@ -12,7 +12,13 @@ import warp as wp
 from synpick_warp.codes import Segment, Stream
 from synpick_warp.kernels.render.lighting.brdf import Brdf, BrdfValue, SplitRadiance, brdf_pdf, evaluate_brdf, make_brdf, sample_brdf
 from synpick_warp.kernels.render.lighting.environment import Lights, environment_radiance, rotate_z
-from synpick_warp.kernels.render.lighting.materials import Surfaces, interpolate_surface, make_table_surface, sample_base_color
+from synpick_warp.kernels.render.lighting.materials import (
+    Surfaces,
+    interpolate_surface,
+    make_table_surface,
+    map_table,
+    sample_base_color,
+)
 from synpick_warp.kernels.render.lighting.sampling import (
     EnvironmentCdf,
     EnvironmentSample,
@@ -149,11 +155,12 @@ def make_vertex(
     min_roughness: float,
 ) -> Vertex:
     """Build the path vertex at a hit. `outgoing` points back along the ray; `width` [m] is the footprint's, across the ray."""
-    surface = make_table_surface(scene.meshes, outgoing)
+    surface = make_table_surface(scene.meshes, bodies, view, outgoing)
     at = position
     if hit.segment == Segment.TABLE:
         # Far away, rounding would lift or sink it by more than the rays' offset.
         at = wp.vec3(position[0], position[1], scene.table.height)
+        surface = map_table(scene.surfaces, surface, at, outgoing, width)
     else:
         body = body_of(hit.segment, instances)
         surface = interpolate_surface(scene.meshes, scene.surfaces, bodies, view, body, hit.triangle, hit.barycentric, outgoing, width)

@@ -1,0 +1,184 @@
+"""Settings of objects: sections of the schema (see `schema`)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from math import hypot
+from typing import Any, ClassVar
+
+from synpick_warp.configs.fields import INT32_MAX, setting
+
+AUTO_UNIT = "auto"
+"""Unit of mesh files by their kind: millimetres of BOP models, metres of others."""
+UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254}
+"""Units of mesh files [m]."""
+DECLARED, DETECT = "declared", "detect"
+SYMMETRIES = (DECLARED, DETECT)
+"""Sources of an object's symmetries."""
+MAX_FOLD = 72
+"""Largest fold that can be declared."""
+_TURN = "an axis that is not zero and a fold from 2 to 72, with an offset [m] or without: { axis = [0, 0, 1], fold = 2 }"
+_DISCRETE = f"{_TURN}; or a rigid 4 x 4 matrix, row by row [m]"
+_CONTINUOUS = "an axis that is not zero, with an offset [m] or without: { axis = [0, 0, 1], offset = [0, 0, 0] }"
+_RIGID = 1e-3
+"""Tolerance of the elements of a rotation: published matrices have six digits."""
+
+
+def _parse_discrete(value: Any) -> Any:
+    """Discrete symmetries as lists of numbers: 16 of a matrix, or axis, fold and offset, if there is one."""
+    return _parse_each(value, _flatten_discrete, _DISCRETE)
+
+
+def _parse_continuous(value: Any) -> Any:
+    """Continuous symmetries as lists of numbers: axis, and offset, if there is one."""
+    return _parse_each(value, _flatten_continuous, _CONTINUOUS)
+
+
+def _parse_each(value: Any, flatten: Callable[[Any], list[Any]], rule: str) -> Any:
+    """Convert each symmetry of a list; raises ValueError with the rule."""
+    if not isinstance(value, list | tuple):
+        raise ValueError(f"a list of symmetries, each {rule}")
+    rows = []
+    for one in value:
+        row = flatten(one)
+        if not all(isinstance(number, int | float) and not isinstance(number, bool) and abs(number) < 1e9 for number in row):
+            raise ValueError(rule)
+        if not (_is_rigid(row) if len(row) == 16 else len(row) in (3, 4, 6, 7) and hypot(*row[:3]) > 0.0):
+            raise ValueError(rule)
+        rows.append(row)
+    return rows
+
+
+def _flatten_discrete(one: Any) -> list[Any]:
+    """Numbers of a discrete symmetry; an empty list if its form is another one."""
+    if isinstance(one, dict) and {"axis", "fold"} <= one.keys() <= {"axis", "fold", "offset"}:
+        one = [*_triple(one["axis"]), one["fold"], *(_triple(one["offset"]) if "offset" in one else ())]
+    elif isinstance(one, dict) and one.keys() == {"matrix"}:
+        one = one["matrix"]
+    row = list(one) if isinstance(one, list | tuple) else []
+    if len(row) == 4 and all(isinstance(line, list | tuple) and len(line) == 4 for line in row):
+        row = [number for line in row for number in line]
+    is_turn = len(row) in (4, 7) and isinstance(row[3], int | float) and row[3] in range(2, MAX_FOLD + 1)
+    return row if is_turn or len(row) == 16 else []
+
+
+def _flatten_continuous(one: Any) -> list[Any]:
+    """Numbers of a continuous symmetry; an empty list if its form is another one."""
+    if isinstance(one, dict) and {"axis"} <= one.keys() <= {"axis", "offset"}:
+        one = [*_triple(one["axis"]), *(_triple(one["offset"]) if "offset" in one else ())]
+    row = list(one) if isinstance(one, list | tuple) else []
+    return row if len(row) in (3, 6) else []
+
+
+def _triple(value: Any) -> list[Any]:
+    """A list of three elements; of others one that no number is in."""
+    return list(value) if isinstance(value, list | tuple) and len(value) == 3 else [None]
+
+
+def _is_rigid(row: list[Any]) -> bool:
+    """Whether 16 numbers are a rotation and a translation, row by row."""
+    a, b, c = row[0:3], row[4:7], row[8:11]
+    cross = (a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0])
+    lengths = (sum(x * x for x in one) - 1.0 for one in (a, b))
+    offs = (*lengths, sum(x * y for x, y in zip(a, b, strict=True)), *(x - y for x, y in zip(c, cross, strict=True)))
+    last = (*row[12:15], row[15] - 1.0)
+    return max(abs(off) for off in (*offs, *last)) <= _RIGID
+
+
+@dataclass(frozen=True)
+class Objects:
+    """How a mesh becomes a rigid body: collision shape, mass and material."""
+
+    unit: str = setting(
+        AUTO_UNIT,
+        "",
+        "Unit of all mesh files; auto: mm for BOP models (obj_NNNNNN.ply), m for others. STEP files name their own.",
+        choices=(AUTO_UNIT, *UNITS),
+    )
+    hull_vertices: int = setting(
+        64,
+        "",
+        "Maximum vertices of a convex hull. With 64, all but 5 % of the vertices of the real objects' hulls lie less than 2.5 mm outside.",
+        low=8,
+        high=256,
+    )
+    piece_vertices: int = setting(32, "", "Maximum vertices of each piece of a convex decomposition.", low=8, high=256)
+    pieces: int = setting(16, "", "Maximum pieces of a convex decomposition.", low=1, high=64)
+    concavity: float = setting(0.05, "", "CoACD's concavity threshold; smaller values follow the surface more closely.", low=0.01, high=1.0)
+    decomposition_time: float = setting(
+        300.0, "s", "Time limit of a convex decomposition; an object that takes longer gets its convex hull.", above=0.0, high=86400.0
+    )
+    concave_ratio: float = setting(
+        0.6, "", "Objects without a row in the object table are decomposed if mesh volume / hull volume is below this.", low=0.0, high=1.0
+    )
+    strict: bool = setting(
+        False, "", "End the bake at the first object or light map that cannot be used, instead of leaving it out with a line."
+    )
+    density: float = setting(400.0, "kg/m³", "Density over the volume of the convex hull, for objects without a mass.", above=0.0, high=1e5)
+    metallic: float = setting(0.1, "", "Metallic factor of objects whose material names none.", low=0.0, high=1.0)
+    roughness: float = setting(0.5, "", "Roughness of objects whose material names none.", low=0.0, high=1.0)
+    crease_angle: float = setting(
+        35.0,
+        "°",
+        "Meshes without normals are smooth where triangles meet at up to this angle, and have a sharp edge beyond; 180: smooth all over.",
+        low=0.0,
+        high=180.0,
+    )
+    center: bool = setting(
+        False,
+        "",
+        "Move the centre of each mesh's bounding box to its origin; BOP models, whose poses refer to their origin, stay as they are.",
+    )
+    symmetries: str = setting(
+        DECLARED,
+        "",
+        "Symmetries of objects: declared (those of their rows, else of models_info.json), or detect (of objects that declare none, by the "
+        "shape alone: texture does not count).",
+        choices=SYMMETRIES,
+    )
+    symmetry_tolerance: float = setting(
+        0.03,
+        "",
+        "Largest distance between a surface and its rotated self for the rotation to be detected as a symmetry, in diameters (BOP's "
+        "organizers took 0.1, at least 15 mm, and left out what texture tells apart).",
+        low=1e-3,
+        high=0.2,
+    )
+    diameter_tolerance: float = setting(
+        0.1,
+        "",
+        "Largest relative difference between a model's diameter and that of its row in the object table; with more, the row is not used.",
+        above=0.0,
+        high=1.0,
+    )
+
+
+@dataclass(frozen=True)
+class ObjectRow:
+    """A row of the object table: physical and material properties that model files do not contain."""
+
+    REQUIRED: ClassVar = ("id", "diameter")
+    IDENTITY: ClassVar = ("id", "name", "diameter")
+    id: int = setting(0, "", "The model's obj_id in its BOP folder.", low=0, high=INT32_MAX)
+    name: str = setting(
+        "", "", "Name of the object; for meshes that are not BOP models the file name without suffix, by which the row is found."
+    )
+    diameter: float = setting(0.0, "m", "Diameter of the model, which must agree for the row to be used; 0: any.", low=0.0)
+    mass: float = setting(0.1, "kg", "Mass.", above=0.0)
+    concave: bool = setting(False, "", "Use a convex decomposition as collision shape instead of the convex hull.")
+    metallic: float = setting(0.1, "", "Metallic factor, unless the mesh file names one.", low=0.0, high=1.0)
+    roughness: float = setting(0.5, "", "Roughness, unless the mesh file names one.", low=0.0, high=1.0)
+    symmetries_discrete: tuple[tuple[float, ...], ...] = setting(
+        (),
+        "m",
+        f"Discrete symmetries in the frame of the mesh file, replacing those of models_info.json; each {_DISCRETE}. Without an offset the "
+        "axis passes through the centroid of the surface. Products of those listed are added.",
+        parse=_parse_discrete,
+    )
+    symmetries_continuous: tuple[tuple[float, ...], ...] = setting(
+        (),
+        "m",
+        f"Continuous symmetries in the frame of the mesh file, replacing those of models_info.json; each {_CONTINUOUS}.",
+        parse=_parse_continuous,
+    )

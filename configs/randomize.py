@@ -1,0 +1,162 @@
+"""Domain randomization settings (Tobin et al., IROS 2017): probability distributions of what each episode looks like."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any, ClassVar, Self
+
+from synpick_warp.codes import LookKind, names
+from synpick_warp.configs.fields import setting
+
+OFF, FIXED, UNIFORM, LOG_UNIFORM, NORMAL, CHOICE = KINDS = names(LookKind)
+"""Kinds of distributions."""
+_WEIGHTS = "weights"
+_LIMITS = (LOG_UNIFORM, UNIFORM)
+_PAIRS = (*_LIMITS, NORMAL)
+MOST_CHOICES = 256
+"""Maximum number of values of a choice."""
+
+
+@dataclass(frozen=True)
+class Distribution:
+    """Probability distribution of a number; of subclasses, of a vector whose components are independent.
+
+    In TOML: a value (`0.5`), "off", or a table of one kind: `{ uniform = [low, high] }`, `{ log_uniform = [low, high] }`,
+    `{ normal = [mean, sigma] }`, clamped to the setting's range, or `{ choice = [value, ...], weights = [...] }`.
+    """
+
+    kind: str = OFF
+    values: tuple[tuple[float, ...], ...] = ()
+    """Parameters of the kind: the value, low and high, mean and standard deviation, or the choices; each with all components."""
+    weights: tuple[float, ...] = ()
+    """Of a choice: the relative weight of each value; empty: equal."""
+
+    components: ClassVar[int] = 1
+    noun: ClassVar[str] = "number"
+
+    @classmethod
+    def parse(cls, value: object) -> Self:
+        """Distribution of a TOML value.
+
+        Raises:
+            ValueError: It is none.
+        """
+        if value == OFF:
+            return cls()
+        if isinstance(value, Distribution):
+            return cls(value.kind, value.values, value.weights)
+        if not isinstance(value, Mapping):
+            return cls(FIXED, (cls._components(value),))
+        kind, *others = [key for key in value if key != _WEIGHTS] or [""]
+        if others or kind not in (*_PAIRS, CHOICE):
+            raise ValueError(cls.describe())
+        given = value[kind]
+        if not isinstance(given, list | tuple) or (kind in _PAIRS and len(given) != 2) or not 0 < len(given) <= MOST_CHOICES:
+            raise ValueError(f"{kind} = a list of {'2' if kind in _PAIRS else f'1 to {MOST_CHOICES}'}")
+        values = tuple(cls._components(one) for one in given)
+        if kind in _LIMITS and any(low > high for low, high in zip(*values, strict=True)):
+            raise ValueError(f"{kind} = [low, high] with low at most high")
+        if kind == LOG_UNIFORM and min(values[0]) <= 0.0:
+            raise ValueError("log_uniform = [low, high] above 0")
+        if kind == NORMAL and min(values[1]) < 0.0:
+            raise ValueError("normal = [mean, sigma] with sigma at least 0")
+        return cls(kind, values, cls._weights(value, kind, len(values)))
+
+    @staticmethod
+    def _weights(table: Mapping[str, Any], kind: str, count: int) -> tuple[float, ...]:
+        if _WEIGHTS not in table:
+            return ()
+        weights = table[_WEIGHTS]
+        if kind != CHOICE or not isinstance(weights, list | tuple) or len(weights) != count:
+            raise ValueError("weights for a choice, one for each value")
+        numbers = tuple(_number(weight) for weight in weights)
+        if min(numbers) < 0.0 or not 0.0 < sum(numbers) < math.inf:
+            raise ValueError("weights of at least 0, not all 0")
+        return numbers
+
+    @classmethod
+    def _components(cls, value: object) -> tuple[float, ...]:
+        if cls.components == 1:
+            return (_number(value),)
+        if not isinstance(value, list | tuple) or len(value) != cls.components:
+            raise ValueError(cls.describe())
+        return tuple(_number(one) for one in value)
+
+    @classmethod
+    def describe(cls) -> str:
+        """What a setting of this type allows."""
+        pairs = "{ uniform = [low, high] }, { log_uniform = [low, high] }, { normal = [mean, sigma] }"
+        return f'"{OFF}", a {cls.noun}, {pairs}, {{ choice = [{cls.noun}, ...], weights = [...] }}'
+
+    def limits(self) -> Iterator[float]:
+        """Numbers that the setting's range must contain: all that are drawn; of a normal distribution, which is clamped, the mean."""
+        return itertools.chain(*(self.values[:1] if self.kind == NORMAL else self.values))
+
+    def to_toml(self) -> Any:
+        """The value of `parse`, in types of TOML: numbers, strings, tuples and a mapping."""
+        values = tuple(value[0] if self.components == 1 else value for value in self.values)
+        if self.kind in (OFF, FIXED):
+            return values[0] if values else OFF
+        return {self.kind: values} | ({_WEIGHTS: self.weights} if self.weights else {})
+
+
+@dataclass(frozen=True)
+class ColorDistribution(Distribution):
+    """Probability distribution of a colour: three independent components in sRGB."""
+
+    components: ClassVar[int] = 3
+    noun: ClassVar[str] = "[red, green, blue]"
+
+
+def _number(value: object) -> float:
+    """A finite number as float; raises ValueError."""
+    if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < 1e30:
+        raise ValueError("finite numbers")
+    return float(value)
+
+
+_NONE, _NO_COLOR, _HALF_METRE = Distribution(), ColorDistribution(), Distribution(FIXED, ((0.5,),))
+_ELEVATION, _RADIUS = Distribution(UNIFORM, ((30.0,), (80.0,))), Distribution(LOG_UNIFORM, ((1.0,), (8.0,)))
+_STRENGTH, _TEMPERATURE = Distribution(LOG_UNIFORM, ((0.1,), (1.0,))), Distribution(UNIFORM, ((2700.0,), (6500.0,)))
+
+
+@dataclass(frozen=True)
+class Randomize:
+    """Domain randomization: each episode draws these anew, all off by default. Geometry, physics and labels do not depend on them.
+    Lamps are drawn for each variant of an environment map, of which each episode draws one.
+
+    A distribution is a value, or `{ uniform = [low, high] }`, `{ log_uniform = [low, high] }`, `{ normal = [mean, sigma] }` (clamped to
+    what is allowed) or `{ choice = [...], weights = [...] }`. Not in the paper.
+    """
+
+    object_hue: Distribution = setting(_NONE, "°", "Rotation of the hue of each object's base colour and texture.", low=-180.0, high=180.0)
+    object_brightness: Distribution = setting(
+        _NONE, "", "Factor on the base colour of each object, in linear light; the result is clamped to 1.", low=0.05, high=20.0
+    )
+    object_roughness: Distribution = setting(_NONE, "", "Roughness of each object, in place of its own.", low=0.0, high=1.0)
+    object_metallic: Distribution = setting(_NONE, "", "Metallic factor of each object, in place of its own.", low=0.0, high=1.0)
+    bin_color: ColorDistribution = setting(_NO_COLOR, "sRGB", "Base colour of the bin; with a texture, its factor.", low=0.0, high=1.0)
+    bin_roughness: Distribution = setting(_NONE, "", "Roughness of the bin.", low=0.0, high=1.0)
+    bin_metallic: Distribution = setting(_NONE, "", "Metallic factor of the bin.", low=0.0, high=1.0)
+    bin_textures: str = setting("", "", "Folder of images, one of which each episode draws as the bin's texture; empty: none.")
+    table_color: ColorDistribution = setting(_NO_COLOR, "sRGB", "Base colour of the table; with a texture, its factor.", low=0.0, high=1.0)
+    table_roughness: Distribution = setting(_NONE, "", "Roughness of the table.", low=0.0, high=1.0)
+    table_textures: str = setting("", "", "Folder of images, one of which each episode draws as the table's texture; empty: none.")
+    texture_width: Distribution = setting(_HALF_METRE, "m", "Width of one repeat of the textures of bin and table.", low=0.01, high=100.0)
+    lamps: Distribution = setting(
+        _NONE,
+        "",
+        "Number of lamps besides an environment map, rounded: distant discs, which cast soft shadows.",
+        low=0,
+        high=4,
+    )
+    lamp_variants: int = setting(4, "", "With lamps: variants of each environment map, each with lamps of its own.", low=1, high=64)
+    lamp_elevation: Distribution = setting(_ELEVATION, "°", "Height of each lamp above the horizon.", low=10.0, high=90.0)
+    lamp_radius: Distribution = setting(_RADIUS, "°", "Angular radius of each lamp.", low=0.3, high=20.0)
+    lamp_strength: Distribution = setting(
+        _STRENGTH, "", "Light of each lamp on a surface that faces up, relative to that of the map.", low=0.01, high=100.0
+    )
+    lamp_temperature: Distribution = setting(_TEMPERATURE, "K", "Colour temperature of each lamp.", low=1700.0, high=25000.0)

@@ -1,0 +1,111 @@
+"""Randomized appearance of a cell: folders of textures for bin and table, and texture coordinates of the bin by box projection."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from synpick_warp.configs.randomize import Randomize
+from synpick_warp.errors import CatalogError, SynpickError
+from synpick_warp.scenes.assets.appearance import MAX_TEXTURE_FILE, decode_texture
+from synpick_warp.scenes.assets.asset_files import check_file_name
+from synpick_warp.scenes.types import TriangleMesh
+from synpick_warp.system.inputs.files import read_file
+from synpick_warp.system.processes.isolation import Failure, Limits, run_isolated
+
+LIMITS = Limits(60.0, 2**31)
+"""Limits of the process that decodes a texture: 1 min and 2 GiB."""
+SUFFIXES = (".png", ".jpg", ".jpeg", ".webp")
+MAX_TEXTURES = 256
+"""Maximum number of textures of a folder, as many as a distribution has choices."""
+MAX_SIDE = 1024
+"""Larger textures are downsampled to this many texels along their longer side [px]: 256 of them then take 1.4 GB with mip levels."""
+
+Textures = tuple[np.ndarray, ...]
+"""Base colour textures (H, W, 3) uint8, sRGB, top row first, sorted by their file names."""
+
+
+@dataclass(frozen=True, eq=False)
+class Looks:
+    """What episodes draw their looks from: the distributions, and the textures of bin and table; none: no textures."""
+
+    randomize: Randomize
+    bin_textures: Textures
+    table_textures: Textures
+
+    @property
+    def all_textures(self) -> Textures:
+        """Textures in the order of their materials: those of the bin, then of the table."""
+        return self.bin_textures + self.table_textures
+
+
+def load_looks(randomize: Randomize, report: Callable[[str], None], strict: bool = False) -> Looks | None:
+    """Load the textures that settings name; None: nothing is randomized. Arguments and errors as of `load_textures`."""
+    if randomize == Randomize():
+        return None
+    folders = (("randomize.bin_textures", randomize.bin_textures), ("randomize.table_textures", randomize.table_textures))
+    return Looks(randomize, *(load_textures(key, folder, report, strict) for key, folder in folders))
+
+
+def load_textures(key: str, folder: str, report: Callable[[str], None], strict: bool = False) -> Textures:
+    """Load the images of a folder, in isolated processes; empty: none. Those that cannot be used are left out with a line each.
+
+    Args:
+        key: The setting that names the folder.
+        folder: The folder.
+        report: Called with each line on what is left out.
+        strict: Whether the first image that cannot be used is an error.
+
+    Raises:
+        CatalogError: The folder does not exist, or has no image that can be used, or too many.
+    """
+    if not folder:
+        return ()
+    try:
+        files = sorted(path for path in Path(folder).iterdir() if path.suffix.lower() in SUFFIXES)
+    except OSError as error:
+        raise CatalogError(f"{key}: the folder {folder} cannot be read: {error.strerror}") from error
+    if not 0 < len(files) <= MAX_TEXTURES:
+        raise CatalogError(f"{key}: the folder {folder} has {len(files)} images ({', '.join(SUFFIXES)}); allowed: 1 to {MAX_TEXTURES}")
+    textures, faults = [], []
+    for path, result in zip(files, run_isolated(_read, [(path,) for path in files], LIMITS), strict=True):
+        if isinstance(result, Failure | SynpickError):
+            reason = f"{path}: the process that reads it {result.reason}; replace it" if isinstance(result, Failure) else str(result)
+            faults.append(CatalogError(reason))
+            if strict:
+                raise faults[-1]
+        else:
+            textures.append(result)
+    if not textures:
+        raise CatalogError(f"{key}: none of the {len(files)} images of {folder} can be used; the first: {faults[0]}")
+    for fault in faults:
+        report(f"left out: {fault}")
+    return tuple(textures)
+
+
+def _read(path: Path) -> np.ndarray:
+    """Decode an image, with at most MAX_SIDE texels along its longer side."""
+    check_file_name(path, CatalogError)
+    image = decode_texture(read_file(path, MAX_TEXTURE_FILE, CatalogError), str(path))
+    scale = MAX_SIDE / max(image.shape[:2])
+    if scale >= 1.0:
+        return image
+    height, width = (max(1, round(scale * side)) for side in image.shape[:2])
+    return cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
+
+
+def project_from_box(mesh: TriangleMesh) -> TriangleMesh:
+    """Cube projection of texture coordinates: each triangle takes the two axes [m] across the one that its normal is closest to.
+
+    Triangles get vertices of their own, since neighbours may take other axes.
+    """
+    corners = mesh.vertices[mesh.faces]
+    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    across = np.array([(1, 2), (0, 2), (0, 1)])[np.abs(normal).argmax(axis=1)]
+    uv = np.take_along_axis(corners, across[:, None, :], axis=2)
+    faces = np.arange(3 * len(mesh.faces), dtype=np.int32).reshape(-1, 3)
+    return TriangleMesh(corners.reshape(-1, 3), faces, mesh.normals[mesh.faces].reshape(-1, 3), uv.reshape(-1, 2).astype(np.float32))

@@ -1,0 +1,292 @@
+"""Detection of rotational symmetries of a surface: candidate axes, refinement, verification by distance, closure to a group.
+
+The surface is symmetric under a rotation if the Hausdorff distance between it and its rotated self is within a tolerance: BOP's
+condition (Hodaň et al., BOP Challenge 2020), which takes 0.1 of the diameter, at least 15 mm. Texture does not count.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from synpick_warp.scenes.symmetries.groups import close_group, find_element
+from synpick_warp.scenes.symmetries.surface import Surface
+
+MAX_FOLD = 36
+"""Largest fold that is looked for; an axis with all folds up to it is continuous."""
+_GRID, _GRID_FOLDS = 600, (2, 3, 4, 5)
+"""Directions over the half sphere, 6° apart, and the folds about them: polyhedra have no others; axes of larger folds are principal."""
+_MOMENTS = 0.15
+"""Relative difference between the covariances of a surface and its rotated self up to which the rotation is looked at."""
+_MARGIN = 0.03
+"""Mean distance that a candidate may have beyond the tolerance, in diameters: its axis is up to 4° off."""
+_NEIGHBOURHOOD = np.cos(np.radians(9.0))
+_PARALLEL = np.cos(np.radians(5.0))
+_SAME = 15.0
+"""Angle up to which two rotations of a group are one [°], or 0.4 of the angle of the largest fold; in the icosahedron's, 44° is least."""
+_STEPS, _ROUGH, _FINE = 8, 600, 6_000
+"""Iterations of the refinement; points from which all candidates, and those within twice the tolerance, are refined."""
+
+
+@dataclass(frozen=True)
+class Turn:
+    """A rotation that maps a surface onto itself: unit axis, a point on it [m], fold (0: any angle), Hausdorff distance [m]."""
+
+    axis: np.ndarray
+    point: np.ndarray
+    fold: int
+    deviation: float
+
+    def matrix(self, angle: float | None = None) -> np.ndarray:
+        """Rigid transform by an angle [rad]; None: a turn by a fold's angle."""
+        return turn_matrix(self.axis, self.point, 2.0 * np.pi / max(self.fold, 2) if angle is None else angle)
+
+
+@dataclass(frozen=True)
+class Symmetries:
+    """Symmetries that were found: discrete ones (N, 4, 4) without the identity, closed under composition up to the continuous ones,
+    with their distances (N) [m], and continuous ones; and the nearest miss, if it is near."""
+
+    discrete: np.ndarray
+    deviations: np.ndarray
+    continuous: tuple[Turn, ...]
+    missed: Turn | None
+
+
+def turn_matrix(axis: np.ndarray, point: np.ndarray, angle: float) -> np.ndarray:
+    """Rotation by an angle [rad] about an axis through a point, as a 4 x 4 matrix."""
+    matrix = np.eye(4)
+    matrix[:3, :3] = Rotation.from_rotvec(angle * axis).as_matrix()
+    matrix[:3, 3] = point - matrix[:3, :3] @ point
+    return matrix
+
+
+def find_axes(matrices: np.ndarray) -> list[Turn]:
+    """Axes of discrete symmetries (N, 4, 4), each with its largest fold, without distances; larger folds first."""
+    found: list[Turn] = []
+    for matrix in matrices:
+        vector = Rotation.from_matrix(matrix[:3, :3]).as_rotvec()
+        angle = float(np.linalg.norm(vector))
+        if angle < 1e-3:
+            continue
+        axis = _upward(vector / angle)
+        turn = Turn(axis, np.linalg.pinv(np.eye(3) - matrix[:3, :3], rcond=1e-6) @ matrix[:3, 3], max(round(2.0 * np.pi / angle), 2), 0.0)
+        beside = next((index for index, other in enumerate(found) if abs(other.axis @ axis) > np.cos(np.radians(2.0))), None)
+        if beside is None:
+            found.append(turn)
+        elif turn.fold > found[beside].fold:
+            found[beside] = turn
+    return sorted(found, key=lambda turn: -turn.fold)
+
+
+def _upward(axis: np.ndarray) -> np.ndarray:
+    """An axis in the direction in which its largest component is positive."""
+    return axis * np.sign(axis[np.argmax(np.abs(axis))])
+
+
+def find_symmetries(vertices: np.ndarray, faces: np.ndarray, diameter: float, tolerance: float) -> Symmetries:
+    """Find the rotational symmetries of a mesh.
+
+    Args:
+        vertices: (V, 3) [m].
+        faces: (F, 3).
+        diameter: Diameter [m].
+        tolerance: Largest Hausdorff distance [m].
+
+    Returns:
+        A closed group of discrete symmetries; those about a continuous axis are left to it, and beside it at most one half turn stays,
+        which swaps its ends. Of a ball three continuous axes, which stand for all rotations.
+    """
+    surface = Surface(vertices, faces)
+    turns, missed = _find_turns(surface, diameter, tolerance)
+    continuous = sorted((turn for turn in turns if turn.fold == 0), key=lambda turn: turn.deviation)[:1]
+    if continuous:
+        first = continuous[0]
+        others = [turn for turn in turns if turn.fold == 0 and abs(turn.axis @ first.axis) < _PARALLEL]
+        if others:
+            return Symmetries(np.zeros((0, 4, 4)), np.zeros(0), _ball(surface, tolerance) or (first,), None)
+        flips = [flip for turn in turns if turn.fold == 2 and (flip := _flip(surface, first, turn)).deviation <= tolerance]
+        best = min(flips, key=lambda turn: turn.deviation, default=None)
+        found = [] if best is None else [best]
+        return Symmetries(
+            np.array([turn.matrix() for turn in found]).reshape(-1, 4, 4), np.array([turn.deviation for turn in found]), (first,), missed
+        )
+    return Symmetries(*_close(surface, turns, tolerance), (), missed)
+
+
+def _find_turns(surface: Surface, diameter: float, tolerance: float) -> tuple[list[Turn], Turn | None]:
+    """Rotations within the tolerance, of continuous axes with fold 0; and the nearest one beyond it, up to twice the tolerance."""
+    turns: list[Turn] = []
+    missed: Turn | None = None
+    seen: list[tuple[np.ndarray, int]] = []
+
+    def is_known(axis: np.ndarray, fold: int) -> bool:
+        return any(abs(axis @ other) > _PARALLEL and of in (0, fold) for other, of in seen)
+
+    for _, axis, fold in sorted(_candidates(surface, diameter, tolerance), key=lambda candidate: candidate[0]):
+        if is_known(axis, fold):
+            continue
+        axis, point = _refine(surface, axis, surface.center, fold, _ROUGH)
+        if is_known(axis, fold):
+            continue
+        turn = _turn(surface, axis, point, fold)
+        if turn.deviation <= 2.0 * tolerance:
+            fine = _turn(surface, *_refine(surface, axis, point, fold, _FINE), fold)
+            turn = fine if fine.deviation <= turn.deviation + 0.1 * tolerance else turn
+        seen.append((turn.axis, fold if turn.deviation > tolerance else 0))
+        if turn.deviation > tolerance:
+            if turn.deviation <= 2.0 * tolerance and (missed is None or turn.deviation < missed.deviation):
+                missed = turn
+            continue
+        turn = _snap(surface, turn, tolerance)
+        turns += _all_folds(surface, turn, tolerance)
+        if sum(each.fold == 0 for each in turns) > 1:
+            break
+    return turns, missed
+
+
+def _candidates(surface: Surface, diameter: float, tolerance: float) -> list[tuple[float, np.ndarray, int]]:
+    """(mean distance, axis, fold) of rotations that nearly keep the covariance, and a coarse sample, in place.
+
+    Axes are the principal ones, those of coordinates and the normals of flat regions, for all folds; and a grid for small folds.
+    """
+    index = np.arange(_GRID) + 0.5
+    height, turn = index / _GRID, np.pi * (1.0 + np.sqrt(5.0)) * index
+    grid = np.column_stack([np.sqrt(1.0 - height**2) * np.cos(turn), np.sqrt(1.0 - height**2) * np.sin(turn), height])
+    features = np.concatenate([np.linalg.eigh(surface.covariance)[1].T, np.eye(3), surface.facets])
+    result = []
+    polygons = [fold for fold in range(2, MAX_FOLD + 1) if fold not in _GRID_FOLDS]
+    for axes, folds, margin in ((features, polygons, 0.4 * _MARGIN), (np.concatenate([features, grid]), _GRID_FOLDS, _MARGIN)):
+        for fold in folds:
+            rotations = Rotation.from_rotvec(2.0 * np.pi / fold * axes).as_matrix()
+            changes = np.linalg.norm(rotations @ surface.covariance @ rotations.transpose(0, 2, 1) - surface.covariance, axis=(1, 2))
+            kept = changes <= _MOMENTS * np.linalg.norm(surface.covariance)
+            if not kept.any():
+                continue
+            near, offs = axes[kept], surface.mean_distances(rotations[kept])
+            # Least of its neighbourhood: the others would be refined to the same axis.
+            beside = np.where(np.abs(near @ near.T) > _NEIGHBOURHOOD, offs[None], np.inf).min(axis=1)
+            rows = np.flatnonzero((offs <= beside) & (offs <= tolerance + margin * diameter))
+            result += [(float(offs[row]), near[row], fold) for row in rows]
+    return result
+
+
+def _refine(surface: Surface, axis: np.ndarray, point: np.ndarray, fold: int, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Axis and a point on it, next to the given one, about which a rotation of the fold maps the surface best onto itself: ICP with
+    point-to-plane distances (Chen and Medioni, 1992), from `count` points."""
+    center, rows = surface.center, slice(None, None, len(surface.points) // count)
+    points, own = surface.points[rows], surface.normals[rows]
+    matrix = turn_matrix(axis, point, 2.0 * np.pi / fold)
+    for _ in range(_STEPS):
+        moved = points @ matrix[:3, :3].T + matrix[:3, 3]
+        distance, index = surface.tree.query(moved)
+        normals = surface.normals[index]
+        weight = ((own @ matrix[:3, :3].T * normals).sum(axis=1) > 0.3) / (1.0 + (distance / (2.0 * np.median(distance) + 1e-12)) ** 2)
+        rows_of = np.concatenate([np.cross(moved - center, normals), normals], axis=1)
+        gain = rows_of.T @ (weight[:, None] * rows_of)
+        right = rows_of.T @ (weight * np.einsum("ni,ni->n", normals, surface.points[index] - moved))
+        step = np.linalg.solve(gain + 1e-6 * np.diag(np.diag(gain)) + 1e-12 * np.trace(gain) * np.eye(6), right)
+        update = np.eye(4)
+        update[:3, :3] = Rotation.from_rotvec(step[:3]).as_matrix()
+        update[:3, 3] = center + step[3:] - update[:3, :3] @ center
+        matrix = update @ matrix
+        if np.abs(step).max() < 1e-6:
+            break
+    rotation = Rotation.from_matrix(matrix[:3, :3])
+    vector = rotation.as_rotvec()
+    length = np.linalg.norm(vector)
+    if length > 0.1:
+        axis = vector / length * (1.0 if vector @ axis > 0.0 else -1.0)
+    shift = matrix[:3, :3] @ center + matrix[:3, 3] - center
+    point = center + np.linalg.pinv(np.eye(3) - matrix[:3, :3], rcond=1e-3) @ (shift - axis * (axis @ shift))
+    return axis, point
+
+
+def _turn(surface: Surface, axis: np.ndarray, point: np.ndarray, fold: int) -> Turn:
+    """Rotation by a fold's angle with its distance."""
+    axis = _upward(axis)
+    return Turn(axis, point, fold, surface.deviation(turn_matrix(axis, point, 2.0 * np.pi / fold)))
+
+
+def _snap(surface: Surface, turn: Turn, tolerance: float) -> Turn:
+    """The same rotation about the next axis of coordinates, and through the origin, if it is as good: parts are mostly built so."""
+    options = [turn.axis]
+    near = int(np.argmax(np.abs(turn.axis)))
+    if abs(turn.axis[near]) > np.cos(np.radians(3.0)):
+        options.insert(0, np.sign(turn.axis[near]) * np.eye(3)[near])
+    for axis in options:
+        for point in (np.zeros(3), turn.point - axis * (axis @ turn.point)):
+            found = _turn(surface, axis, point, turn.fold)
+            if found.deviation <= turn.deviation + 0.05 * tolerance:
+                return found
+    return turn
+
+
+def _all_folds(surface: Surface, turn: Turn, tolerance: float) -> list[Turn]:
+    """All folds of an axis within the tolerance; if all are, one rotation of fold 0 with the largest distance."""
+    result = [turn]
+    worst = turn.deviation
+    for fold in range(2, MAX_FOLD + 1):
+        if fold == turn.fold:
+            continue
+        matrix = turn_matrix(turn.axis, turn.point, 2.0 * np.pi / fold)
+        if surface.deviation(matrix, surface.coarse) > tolerance:
+            continue
+        off = surface.deviation(matrix)
+        if off <= tolerance:
+            worst = max(worst, off)
+            result.append(Turn(turn.axis, turn.point, fold, off))
+    return [Turn(turn.axis, turn.point, 0, worst)] if len(result) == MAX_FOLD - 1 else result
+
+
+def _flip(surface: Surface, main: Turn, turn: Turn) -> Turn:
+    """Half turn about an axis that is made exactly perpendicular to a continuous one; of all of these, the one nearest to x or y."""
+    beside = np.eye(3)[int(np.argmin(np.abs(main.axis)))]
+    axis = beside - main.axis * (main.axis @ beside)
+    point = main.point + main.axis * (main.axis @ (turn.point - main.point))
+    return _turn(surface, axis / np.linalg.norm(axis), point, 2)
+
+
+def _ball(surface: Surface, tolerance: float) -> tuple[Turn, ...]:
+    """Three continuous axes through the centroid, if each is within the tolerance; else nothing."""
+    found = [
+        each for axis in np.eye(3) for each in _all_folds(surface, _turn(surface, axis, surface.center, 2), tolerance) if each.fold == 0
+    ]
+    return tuple(found) if len(found) == 3 else ()
+
+
+def _close(surface: Surface, turns: list[Turn], tolerance: float) -> tuple[np.ndarray, np.ndarray]:
+    """Largest group of discrete symmetries (N, 4, 4) that the rotations generate, best first, with all products within the tolerance;
+    without the identity, and their distances (N)."""
+    group, offs, used = np.eye(3)[None], np.zeros(1), []
+    center = surface.center
+    for turn in sorted(turns, key=lambda turn: turn.deviation):
+        within = min(_SAME, 0.4 * 360.0 / max(each.fold for each in [*used, turn]))
+        if find_element(group, turn.matrix()[:3, :3], within) >= 0:
+            continue
+        larger = close_group(np.array([each.matrix()[:3, :3] for each in [*used, turn]]), within)
+        if larger is None:
+            continue
+        middle = _common_point([*used, turn], surface.center)
+        distances = np.array([surface.deviation(_about(rotation, middle)) for rotation in larger])
+        if distances.max() <= tolerance:
+            group, offs, center = larger, distances, middle
+            used.append(turn)
+    return np.array([_about(rotation, center) for rotation in group[1:]]).reshape(-1, 4, 4), offs[1:]
+
+
+def _about(rotation: np.ndarray, center: np.ndarray) -> np.ndarray:
+    """Rotation about a point as a 4 x 4 matrix."""
+    matrix = np.eye(4)
+    matrix[:3, :3], matrix[:3, 3] = rotation, center - rotation @ center
+    return matrix
+
+
+def _common_point(turns: list[Turn], center: np.ndarray) -> np.ndarray:
+    """Point next to all axes, and along a common direction next to the centroid."""
+    across = [np.eye(3) - np.outer(turn.axis, turn.axis) for turn in turns]
+    weak = 1e-9 * np.eye(3)
+    point = np.linalg.solve(sum(across) + weak, sum(one @ turn.point for one, turn in zip(across, turns, strict=True)) + weak @ center)
+    return point if len(turns) > 1 else turns[0].point

@@ -1,0 +1,81 @@
+"""Surface of a mesh as points, and how far a rigid transform moves it off itself: the two-sided Hausdorff distance."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.spatial import KDTree
+
+from synpick_warp.scenes.assets.meshes import merge_positions
+
+_DENSE = 60_000
+"""Points of the sample that distances are measured to."""
+_QUERIES = 2_000
+"""Points of the sample, and at most as many vertices, that distances are measured from: vertices have the tips of small features."""
+_NEIGHBOURS = 4
+"""Points of the dense sample whose tangent planes are tried: beside an edge, the nearest point may lie on the other side of it."""
+_THIN, _COARSE = 6_000, 150
+"""Points of the samples by which candidates are ranked."""
+_GAP = 2.0
+"""Distance between neighbours of the dense sample, in its mean spacing; displacements along the surface below it do not count."""
+
+
+class Surface:
+    """Dense sample of a mesh's surface (area-weighted, with a fixed seed) for nearest-point distances."""
+
+    def __init__(self, vertices: np.ndarray, faces: np.ndarray) -> None:
+        positions, faces = merge_positions(vertices.astype(np.float64), faces)
+        corners = positions[faces]
+        crosses = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        areas = np.linalg.norm(crosses, axis=1) / 2.0
+        corners, crosses, areas = (each[areas > 0.0] for each in (corners, crosses, areas))
+        random = np.random.default_rng(0)
+        rows = np.searchsorted(np.cumsum(areas), (np.arange(_DENSE) + random.random(_DENSE)) * areas.sum() / _DENSE).clip(
+            max=len(areas) - 1
+        )
+        self.rows = rows
+        root, share = np.sqrt(random.random(_DENSE)), random.random(_DENSE)
+        self.weights = np.stack([1.0 - root, root * (1.0 - share), root * share], axis=1)
+        self.points = np.einsum("nc,nci->ni", self.weights, corners[rows])
+        self.normals = crosses[rows] / (2.0 * areas[rows, None])
+        self.area = float(areas.sum())
+        self.center = areas @ corners.mean(axis=1) / self.area
+        """Centroid of the surface, through which each axis of symmetry passes."""
+        offsets = self.points - self.center
+        self.covariance = offsets.T @ offsets / _DENSE
+        used = np.unique(faces)
+        picked = [random.permutation(_DENSE)[:_QUERIES], random.permutation(used)[:_QUERIES]]
+        self.queries = np.concatenate([self.points[picked[0]], positions[picked[1]]])
+        self.coarse = self.points[picked[0][:_COARSE]]
+        self.tree, self.thin = KDTree(self.points), KDTree(self.points[:: _DENSE // _THIN])
+        self.gap = _GAP * float(np.sqrt(self.area / _DENSE))
+        self.facets = _facet_normals(crosses, areas)
+
+    def distances(self, points: np.ndarray) -> np.ndarray:
+        """Distances (N) of points to the surface [m]."""
+        distance, index = self.tree.query(points, _NEIGHBOURS)
+        along = np.einsum("nki,nki->nk", points[:, None] - self.points[index], self.normals[index])
+        aside = np.sqrt(np.maximum(distance**2 - along**2, 0.0))
+        return np.hypot(along, np.maximum(aside - self.gap, 0.0)).min(axis=1)
+
+    def deviation(self, matrix: np.ndarray, queries: np.ndarray | None = None) -> float:
+        """Hausdorff distance between the surface and itself, moved by a rigid 4 x 4 matrix [m], from all queries or those given."""
+        points = self.queries if queries is None else queries
+        rotation, translation = matrix[:3, :3], matrix[:3, 3]
+        return float(max(self.distances(points @ rotation.T + translation).max(), self.distances((points - translation) @ rotation).max()))
+
+    def mean_distances(self, rotations: np.ndarray) -> np.ndarray:
+        """Mean distances (N) of a coarse sample to another one, when rotated about the centroid by (N, 3, 3) [m]."""
+        moved = (self.coarse - self.center) @ rotations.transpose(0, 2, 1) + self.center
+        return self.thin.query(moved.reshape(-1, 3))[0].reshape(len(rotations), -1).mean(axis=1)
+
+
+def _facet_normals(crosses: np.ndarray, areas: np.ndarray, count: int = 16) -> np.ndarray:
+    """Directions of the largest flat regions, at most `count`, without opposite ones (N, 3)."""
+    normals = crosses / (2.0 * areas[:, None])
+    normals = normals * np.where(normals[:, [2]] + 1e-3 * normals[:, [1]] + 1e-6 * normals[:, [0]] < 0.0, -1.0, 1.0)
+    cells, index = np.unique(np.round(normals * 20.0), axis=0, return_inverse=True)
+    total = np.zeros((len(cells), 3))
+    np.add.at(total, index.reshape(-1), normals * areas[:, None])
+    length = np.linalg.norm(total, axis=1)
+    order = np.argsort(-length)[:count]
+    return total[order][length[order] > 0.01 * areas.sum()] / length[order][length[order] > 0.01 * areas.sum()][:, None]

@@ -1,0 +1,185 @@
+"""Domain randomization of materials: tables of distributions on the device, materials of each batch of views, and records for the host."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from synpick_warp.codes import Look, LookKind, LookPart
+from synpick_warp.configs.randomize import CHOICE, FIXED, LOG_UNIFORM, NORMAL, UNIFORM, Distribution, Randomize
+from synpick_warp.kernels.render.lighting.looks import LookDistribution, LookTable, draw_looks_kernel, dress_bodies_kernel
+from synpick_warp.kernels.render.lighting.materials import Surfaces
+from synpick_warp.kernels.render.lighting.paths.tracing import PathScene
+from synpick_warp.kernels.render.visibility.gbuffer import FIXTURES
+from synpick_warp.scenes.looks import Looks
+from synpick_warp.stages.buffers import Snapshot
+from synpick_warp.stages.render.scene import RenderScene
+
+SETTINGS = {
+    (LookPart.OBJECT, Look.HUE): "object_hue",
+    (LookPart.OBJECT, Look.BRIGHTNESS): "object_brightness",
+    (LookPart.OBJECT, Look.ROUGHNESS): "object_roughness",
+    (LookPart.OBJECT, Look.METALLIC): "object_metallic",
+    (LookPart.BIN, Look.COLOR): "bin_color",
+    (LookPart.BIN, Look.ROUGHNESS): "bin_roughness",
+    (LookPart.BIN, Look.METALLIC): "bin_metallic",
+    (LookPart.TABLE, Look.COLOR): "table_color",
+    (LookPart.TABLE, Look.ROUGHNESS): "table_roughness",
+    (LookPart.LAMP, Look.COUNT): "lamps",
+    (LookPart.LAMP, Look.ELEVATION): "lamp_elevation",
+    (LookPart.LAMP, Look.RADIUS): "lamp_radius",
+    (LookPart.LAMP, Look.STRENGTH): "lamp_strength",
+    (LookPart.LAMP, Look.TEMPERATURE): "lamp_temperature",
+}
+"""Setting of `Randomize` that has a part's distribution of a parameter."""
+_COPIED = ("color", "metallic", "roughness", "texture_size", "first_texel", "texture_levels")
+"""Arrays of `Surfaces` with a row for each material."""
+
+_ROW: Any = LookDistribution.numpy_dtype()
+
+
+def build_look_table(looks: Looks, first_texture: int, first_row: int, device: Any) -> Any:
+    """The struct `LookTable`.
+
+    Args:
+        looks: Distributions and textures.
+        first_texture: Row of `Surfaces` of the first texture; those of the bin come first.
+        first_row: Row of `Surfaces` of the first view's first body.
+        device: Device of the arrays.
+    """
+    drawn: dict[tuple[int, int], tuple[Distribution, float, float]] = {}
+    for place, name in SETTINGS.items():
+        rules = Randomize.__dataclass_fields__[name].metadata
+        drawn[place] = getattr(looks.randomize, name), rules["low"], rules["high"]
+    drawn[LookPart.LAMP, Look.AZIMUTH] = Distribution(UNIFORM, ((-180.0,), (180.0,))), 0.0, 0.0
+    for part, textures in ((LookPart.BIN, looks.bin_textures), (LookPart.TABLE, looks.table_textures)):
+        if textures:
+            rows = tuple((float(first_texture + index),) for index in range(len(textures)))
+            drawn[part, Look.TEXTURE] = Distribution(CHOICE, rows), 0.0, 0.0
+            drawn[part, Look.TEXTURE_WIDTH] = looks.randomize.texture_width, 0.01, 100.0
+        first_texture += len(textures)
+    distributions = np.zeros((len(LookPart), len(Look)), dtype=_ROW)
+    choices: list[np.ndarray] = []
+    for place, (distribution, low, high) in drawn.items():
+        distributions[int(place[0]), int(place[1])] = _pack(distribution, low, high, len(choices))
+        if distribution.kind == CHOICE:
+            choices += _pack_choice(distribution)
+    table = LookTable()
+    table.distribution = wp.array(distributions, dtype=LookDistribution, device=device)
+    table.choice = wp.array(np.array(choices or [np.zeros(4)], np.float32), dtype=wp.vec4, device=device)
+    table.first_row = first_row
+    return table
+
+
+def _vectors(distribution: Distribution) -> np.ndarray:
+    """Parameters of a distribution as vectors (..., 3): scalars in the first component."""
+    values = np.array(distribution.values, np.float64)
+    return values if values.shape[1] == 3 else np.pad(values, [(0, 0), (0, 2)], constant_values=1.0)
+
+
+def _pack(distribution: Distribution, low: float, high: float, first: int) -> Any:
+    """A row of `LookDistribution`; `first` is the index of its first choice."""
+    row: Any = np.zeros((), dtype=_ROW)
+    row["kind"], row["low"], row["high"] = LookKind[distribution.kind.upper()], low, high
+    row["first"], row["count"] = first, len(distribution.values)
+    if distribution.kind in (FIXED, UNIFORM, LOG_UNIFORM, NORMAL):
+        values = _vectors(distribution)
+        values = np.log(values) if distribution.kind == LOG_UNIFORM else values
+        row["a"], row["b"] = values[0], values[-1]
+    return row
+
+
+def _pack_choice(distribution: Distribution) -> list[np.ndarray]:
+    """Rows of `LookTable.choice` of a distribution."""
+    weights = np.array(distribution.weights or [1.0] * len(distribution.values))
+    return list(np.column_stack([_vectors(distribution), np.cumsum(weights) / weights.sum()]))
+
+
+class Dresser:
+    """Makes the materials of each batch of views. Owns a scene with space for them.
+
+    Attributes:
+        scene: The scene whose surfaces have a row for each body of each view.
+    """
+
+    def __init__(self, scene: RenderScene, seed: int, instances: int, views: int) -> None:
+        """Allocate the materials of at most `views` views of worlds with `instances` instances. `scene` must have looks."""
+        self._seed = wp.uint64(seed)
+        materials = scene.surfaces.color.shape[0]
+        self._table = build_look_table(scene.looks, materials - len(scene.looks.all_textures), materials, scene.device)
+        self._materials = instances + int(FIXTURES) + 1
+        rows = views * self._materials
+        self.material = wp.zeros((views, self._materials), dtype=wp.int32, device=scene.device)
+        surfaces, paths = _copy(Surfaces, scene.surfaces), _copy(PathScene, scene.paths)
+        for name in _COPIED:
+            values = getattr(scene.surfaces, name)
+            longer = wp.zeros((values.shape[0] + rows, *values.shape[1:]), dtype=values.dtype, device=scene.device)
+            wp.copy(longer, values, count=values.size)
+            setattr(surfaces, name, longer)
+        total = surfaces.color.shape[0]
+        surfaces.recolor = wp.zeros(total, dtype=wp.mat33, device=scene.device)
+        surfaces.repeats = wp.zeros(total, dtype=wp.float32, device=scene.device)
+        paths.surfaces = surfaces
+        self.scene = replace(scene, surfaces=surfaces, paths=paths)
+
+    def dress(self, snapshot: Snapshot, views: Any, bodies: Any) -> None:
+        """Make the materials of the bodies of all views, and of their tables; `bodies` must be set up."""
+        scene = self.scene
+        inputs = [self._seed, scene.meshes, self._table, snapshot.episode, views]
+        wp.launch(
+            dress_bodies_kernel, dim=(views.count, self._materials), inputs=inputs, outputs=[bodies, scene.surfaces], device=scene.device
+        )
+
+
+def _copy(kind: Any, struct: Any) -> Any:
+    """Shallow copy of a Warp struct."""
+    result = kind()
+    for name in kind.vars:
+        setattr(result, name, getattr(struct, name))
+    return result
+
+
+def draw_parameters(looks: Looks, seed: int, episode: int, parts: list[tuple[LookPart, int]]) -> tuple[np.ndarray, np.ndarray]:
+    """Draw all parameters of bodies (part, index within it), on the processor by the renderer's function.
+
+    Returns:
+        `LookKind` of each parameter (part, look), and the values (body, look, 3) float32.
+    """
+    table = build_look_table(looks, 0, 0, "cpu")
+    part, body = (wp.array(column, dtype=wp.int32, device="cpu") for column in zip(*parts, strict=True))
+    values = wp.zeros((len(parts), len(Look)), dtype=wp.vec3, device="cpu")
+    inputs = [wp.uint64(seed), table, wp.full(len(parts), episode, dtype=wp.int32, device="cpu"), part, body]
+    wp.launch(draw_looks_kernel, dim=values.shape, inputs=inputs, outputs=[values], device="cpu")
+    return table.distribution.numpy()["kind"], values.numpy()
+
+
+def draw_looks(looks: Looks, seed: int, episode: int, objects: int) -> dict[str, Any]:
+    """Looks of an episode, as its records have them: by part and parameter, and of each object. Textures by index, colours in sRGB.
+
+    Computed on the processor by the renderer's function: it agrees with a GPU up to the rounding of logarithms and cosines.
+
+    Args:
+        looks: What is drawn from.
+        seed: Seed of the bake.
+        episode: Index of the episode.
+        objects: Instances whose looks are wanted.
+    """
+    parts = [(LookPart.BIN, 0), (LookPart.TABLE, 0), *((LookPart.OBJECT, index) for index in range(objects))]
+    kinds, drawn = draw_parameters(looks, seed, episode, parts)
+    rows = [_record(kinds[part], drawn[index], looks, part) for index, (part, _) in enumerate(parts)]
+    return {"bin": rows[0], "table": rows[1], "objects": rows[2:]}
+
+
+def _record(kinds: np.ndarray, values: np.ndarray, looks: Looks, part: LookPart) -> dict[str, Any]:
+    """Parameters of a body that are drawn, by name."""
+    record: dict[str, Any] = {}
+    for look in Look:
+        if kinds[look] != LookKind.OFF:
+            value = values[look].astype(np.float64).round(6)
+            record[look.name.lower()] = value.tolist() if look == Look.COLOR else float(value[0])
+    if "texture" in record:
+        record["texture"] = int(record["texture"]) - (len(looks.bin_textures) if part == LookPart.TABLE else 0)
+    return record

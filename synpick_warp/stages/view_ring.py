@@ -1,0 +1,187 @@
+"""Ring of batches of views of one image size: renders and encodes views, and copies them to the host asynchronously."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection
+from dataclasses import dataclass, fields
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from synpick_warp.configs.rig import Rig
+from synpick_warp.configs.schema import Render
+from synpick_warp.stages.arrays import allocate, dry_run
+from synpick_warp.stages.buffers import LayerBuffers, Snapshot, ViewBuffers, view_buffer_sizes
+from synpick_warp.stages.encoding.jpeg import Compressor, JpegBuffers, JpegScratch, jpeg_sizes
+from synpick_warp.stages.encoding.png import DepthBuffers, DepthEncoder, DepthScratch, allocate_depth_scratch, depth_sizes
+from synpick_warp.stages.host_copies import DeviceImages, HostCopy, HostImages
+from synpick_warp.stages.render.mask_runs import BoundaryBuffers, BoundaryScratch, boundary_sizes, list_boundaries
+from synpick_warp.stages.render.renderer import Renderer
+from synpick_warp.stages.render.view_setup import make_views
+from synpick_warp.stages.render_streams import RenderStreams
+from synpick_warp.stages.timing import scope
+
+# Size of one batch's images on a GPU [bytes]: large enough to fill the GPU, small enough for several batches in flight.
+BATCH_BYTES = 512 << 20
+# Size of color, depth, segmentation id and amodal bits of one pixel [bytes].
+PIXEL_BYTES = 3 + 2 + 1 + 4
+# Ring size of view batches: one is read while another is copied and a third is rendered.
+RING = 3
+
+
+def views_per_batch(render: Render, rig: Rig, worlds: int, device: wp.Device, group: int = 0) -> int:
+    """Number of views of a group of cameras rendered at once: as set; else on a CPU one world's, on a GPU what the group's share of
+    BATCH_BYTES holds, up to all worlds'.
+    """
+    cameras = rig.groups[group]
+    views = len(cameras)
+    if render.views_per_batch:
+        return render.views_per_batch
+    if not device.is_cuda:
+        return views
+    width, height = rig.sizes[cameras[0]]
+    with dry_run() as layers:
+        allocate(LayerBuffers, {"view": 1, "row": height, "column": width}, device, render.layers)
+    each = width * height * PIXEL_BYTES + sum(layer.row[3] for layer in layers)
+    pixels = sum(map(math.prod, rig.sizes))
+    return max(1, min(BATCH_BYTES * views * width * height // (pixels * each), views * worlds))
+
+
+def view_sizes(render: Render, rig: Rig, worlds: int, objects: int, device: wp.Device, group: int = 0) -> dict[str, int]:
+    """Extents of `ViewBuffers` and `LayerBuffers` of a group of cameras, for `worlds` worlds of at most `objects` objects."""
+    size = rig.sizes[rig.groups[group][0]]
+    return view_buffer_sizes(views_per_batch(render, rig, worlds, device, group), *size, objects)
+
+
+@dataclass(frozen=True, eq=False)
+class CameraGroup:
+    """Cameras of one image size, which are rendered together."""
+
+    cameras: tuple[int, ...]
+    """Their indices; their order is that of the cameras in the renderer's scene."""
+    sizes: dict[str, int]
+    """Extents by `view_sizes`."""
+    renderer: Renderer
+
+    def slots(self, camera: np.ndarray) -> np.ndarray:
+        """Row of cameras in the renderer's scene (view) int32, by their indices (view)."""
+        return np.searchsorted(np.array(self.cameras), camera).astype(np.int32)
+
+
+@dataclass(frozen=True, eq=False)
+class BatchBuffers:
+    """Device arrays of a batch of views in the ring: images, layers, and what is encoded of them."""
+
+    images: ViewBuffers
+    boundaries: BoundaryBuffers
+    layers: LayerBuffers
+    jpeg: JpegBuffers | None
+    depth: DepthBuffers | None
+
+    def copied(self, on_demand: Collection[str]) -> dict[str, wp.array]:
+        """Arrays that are copied to the host, by name: all but `on_demand`."""
+        parts = [part for part in (self.images, self.boundaries, self.jpeg, self.depth, self.layers) if part is not None]
+        arrays = {item.name: getattr(part, item.name) for part in parts for item in fields(part)}
+        return {name: array for name, array in arrays.items() if name not in on_demand and array is not None}
+
+
+Scratch = tuple[BoundaryScratch, JpegScratch | None, tuple[DepthScratch, Any, Any] | None]
+"""Scratch of run boundaries and encoders (see `allocate_depth_scratch`), which all batches of the ring share."""
+
+
+def allocate_ring(
+    sizes: dict[str, int], layers: Collection[str], host: HostImages, device: wp.Device
+) -> tuple[list[BatchBuffers], Scratch]:
+    """Allocate a ring of batches, on a CPU a single one, and the scratch of encoding; arguments as of `FrameStream`."""
+    frame, boundaries = (sizes["view"], sizes["column"], sizes["row"]), boundary_sizes(sizes)
+    ring = [
+        BatchBuffers(
+            allocate(ViewBuffers, sizes, device),
+            allocate(BoundaryBuffers, boundaries, device),
+            allocate(LayerBuffers, sizes, device, layers),
+            allocate(JpegBuffers, jpeg_sizes(*frame), device) if host.jpeg_quality else None,
+            allocate(DepthBuffers, depth_sizes(*frame), device) if host.depth_files else None,
+        )
+        for _ in range(RING if device.is_cuda else 1)
+    ]
+    jpeg = allocate(JpegScratch, jpeg_sizes(*frame), device) if host.jpeg_quality else None
+    depth = allocate_depth_scratch(*frame, device) if host.depth_files else None
+    return ring, (allocate(BoundaryScratch, boundaries, device), jpeg, depth)
+
+
+class ViewRing:
+    """Batches of a group's views: on a GPU up to two are in flight while one is consumed."""
+
+    def __init__(self, group: CameraGroup, layers: Collection[str], device: wp.Device, host: HostImages | None = None) -> None:
+        """Allocate the ring of batches.
+
+        Args:
+            group: Cameras and their renderer.
+            layers: Names of the layers to render.
+            device: Device of rendering.
+            host: Which images are copied to the host; None: all.
+        """
+        sizes = group.sizes
+        self.group, self.cameras, self.renderer = group, group.cameras, group.renderer
+        self.host = host or HostImages()
+        self.batch, self.instances = sizes["view"], sizes["instance"]
+        self.device = device
+        self.layers = [item.name for item in fields(LayerBuffers) if item.name in layers]
+        self.slots, (self.boundary_scratch, jpeg, depth) = allocate_ring(sizes, layers, self.host, device)
+        frame = (sizes["column"], sizes["row"])
+        self.compressor = Compressor(jpeg, *frame, self.host.jpeg_quality) if jpeg is not None else None
+        self.depth_encoder = DepthEncoder(depth, *frame) if depth is not None else None
+        copied = [batch.copied(self.host.on_demand) for batch in self.slots]
+        self.images = [name for name in copied[0] if name not in self.layers]
+        self.copies = [HostCopy(list(arrays.values())) for arrays in copied]
+        self.lists = [wp.zeros((3, self.batch), dtype=wp.int32, device=device) for _ in self.slots]
+        self._next = 0
+
+    def launch(self, snapshot: Snapshot, world: np.ndarray, camera: np.ndarray, streams: RenderStreams) -> int:
+        """Render the views (world, camera) of a snapshot into the next slot, then start to encode and copy the images; returns the slot."""
+        slot, count = self._next, len(world)
+        self._next = (slot + 1) % len(self.slots)
+        rows = self.lists[slot]
+        padded = np.zeros((3, self.batch), dtype=np.int32)
+        padded[1] = self.cameras[0]
+        padded[:, :count] = world, camera, self.group.slots(camera)
+        rows.assign(padded)
+        views = make_views(rows[0], rows[1], count, self.instances, slot=rows[2])
+        with wp.ScopedStream(streams.render, sync_exit=True), scope("render", self.device):
+            self.renderer.render(snapshot, views, self.slots[slot].images, self.slots[slot].layers)
+        with wp.ScopedStream(streams.copy):
+            with scope("encode", self.device):
+                self._encode(slot, count)
+            self.copies[slot].start(streams.copy)
+        return slot
+
+    def _encode(self, slot: int, count: int) -> None:
+        """Encode `count` views of a slot, on the device: run boundaries of the instance and amodal images, and JPEG and PNG data where
+        these are enabled. Starts no copy; `launch` does.
+
+        Runs on the copy stream: after these views are rendered, beside the rendering of the next batch. Batches share one scratch; the
+        order of this stream protects it.
+        """
+        batch = self.slots[slot]
+        list_boundaries(self.boundary_scratch, count, batch.images, batch.boundaries)
+        if self.compressor is not None and batch.jpeg is not None:
+            self.compressor.compress(count, batch.images, batch.jpeg)
+        if self.depth_encoder is not None and batch.depth is not None:
+            self.depth_encoder.encode(batch.images.depth, count, batch.depth)
+
+    def wait(self, slot: int) -> list[np.ndarray]:
+        """Wait for the copies of a slot."""
+        return self.copies[slot].wait()
+
+    def collect(self, slot: int, count: int) -> dict[str, Any]:
+        """Wait for the copies of a slot; returns the images of its `count` views as fields of `FrameBatch`."""
+        with scope("wait for images"):
+            copied = self.wait(slot)
+        arrays = {name: array[:count] for name, array in zip(self.images + self.layers, copied, strict=True)}
+        return {
+            **{name: arrays[name] for name in self.images},
+            **{name: DeviceImages(getattr(self.slots[slot].images, name)) for name in self.host.on_demand},
+            "layers": {name: arrays[name] for name in self.layers},
+        }
