@@ -46,7 +46,7 @@ def test_a_solver_overflow_names_every_capacity_of_the_solver():
 def test_rows_of_episodes_have_their_bin_unless_it_is_a_tote_in_its_place(name, noun):
     record = bin_record(name, np.array([0.1, -0.2, 0.0, 0.0, 0.0, -0.5, np.sqrt(0.75)], np.float32)) if name else None
     assert record is None or record == {"name": name, "position": [0.1, -0.2, 0.0], "yaw": pytest.approx(-np.pi / 3, abs=1e-6)}
-    row = EpisodeRow(3, 1, Ending.EMPTIED, 10, 0.6, "pick", 3, 3, 3, 0, 0, "val", record)
+    row = EpisodeRow(3, 1, Ending.EMPTIED, 10, 0.6, "pick", 3, 3, 3, 0, 0, "val", bin=record)
     line = row.as_json()
     assert ("bin" in line) == bool(name)
     assert line["sentence"] == f"no object is left in the {noun}"

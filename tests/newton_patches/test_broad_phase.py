@@ -122,7 +122,7 @@ def test_piles_move_as_with_the_broad_phase_of_newton(device, monkeypatch):
 
 @pytest.mark.parametrize(("gap", "height", "overlaps", "kept"), [(1e-3, 5.0, 1, 1), (9e-3, 5.0, 1, 0), (1e-3, 1600.0, 0, 0)])
 def test_boxes_with_overlapping_bounds_are_rejected_beyond_their_contact_margins(device, gap, height, overlaps, kept):
-    """Two cubes, turned by 45 degrees about z, have faces at a distance `gap`; all other bodies are far away. UNREACHED, they do not count."""
+    """Two cubes, turned by 45 degrees about z, have faces at a distance `gap`; all others are far away. UNREACHED, they do not count."""
     built = build.build_model(settings(bake__worlds=1, arrangement__max_objects=2), catalog(CUBE), device)
     cubes = np.arange(build.GRIPPER_BODIES, build.GRIPPER_BODIES + 2)
     variant = np.full(built.model.body_count, -1, np.int32)

@@ -83,7 +83,7 @@ class TrajectoryExporter(EpisodeExporter[_Content]):
             (store / EPISODES).mkdir(exist_ok=True)
             settings, level = context.settings, context.settings.trajectory.level
             assets = (context.catalog, context.cameras, context.lights)
-            written = write_constants(store, settings.bake.seed, settings.physics, level, *assets)
+            written = write_constants(store, settings.bins[0].noun, settings.bake.seed, settings.physics, level, *assets)
         return [path.relative_to(context.out) for path in written]
 
     def write_ticks(self, batch: TickBatch) -> None:

@@ -84,12 +84,20 @@ def constant_places(store: Path) -> list[Path]:
 
 
 def write_constants(
-    store: Path, seed: int, physics: Physics, level: int, catalog: Catalog, cameras: tuple[Camera, ...], lights: tuple[EnvironmentMap, ...]
+    store: Path,
+    noun: str,
+    seed: int,
+    physics: Physics,
+    level: int,
+    catalog: Catalog,
+    cameras: tuple[Camera, ...],
+    lights: tuple[EnvironmentMap, ...],
 ) -> list[Path]:
     """Write the store's root, the groups of objects and cameras, and the empty group of episodes, replacing existing ones.
 
     Args:
         store: Existing folder that contains a folder for the episodes.
+        noun: What objects are in or on, such as tote.
         seed: Seed of the bake.
         physics: Time step and gravity.
         level: Compression level of zstd.
@@ -109,8 +117,8 @@ def write_constants(
     root = zarr.create_group(
         store,
         attributes={
-            "description": "Physics of a synpick-warp data set. SI units; the world's origin is the centre of the tote's inner floor, z up."
-            f" Episodes are in {EPISODES}, named by number.",
+            "description": f"Physics of a synpick-warp data set. SI units; the world's origin is the centre of the {noun}'s inner floor,"
+            f" z up. Episodes are in {EPISODES}, named by number.",
             "format": FORMAT,
             "seed": seed,
             "step": physics.step,
