@@ -4,7 +4,7 @@ import warp as wp
 
 from synpick_warp.codes import Segment
 from synpick_warp.kernels.render.visibility.bvh_rays import body_ray_start
-from synpick_warp.kernels.render.visibility.camera import Cameras, ImageGrid, Views, camera_ray, in_image, tile_pixel
+from synpick_warp.kernels.render.visibility.camera import ImageGrid, Views, camera_ray, in_image, tile_pixel
 from synpick_warp.kernels.render.visibility.gbuffer import GBuffer, Meshes, ViewBodies, body_of
 
 wp.set_module_options({"enable_backward": False})
@@ -29,7 +29,6 @@ def intersect_triangle(start: wp.vec3, direction: wp.vec3, a: wp.vec3, b: wp.vec
 def intersect_hits_kernel(
     # Scene:
     meshes: Meshes,
-    cameras: Cameras,
     grid: ImageGrid,
     # In:
     bodies: ViewBodies,
@@ -50,9 +49,8 @@ def intersect_hits_kernel(
     segment = int(gbuffer_inout.segment[view, row, column])
     if segment == Segment.NOTHING or segment == Segment.TABLE:
         return
-    camera = views.camera[view]
     body = body_of(segment, views.instances)
-    ray = camera_ray(cameras.intrinsics[camera], row, column, wp.vec2(0.0, 0.0))
+    ray = camera_ray(views.cameras, view, row, column, wp.vec2(0.0, 0.0))
     start = body_ray_start(bodies, view, body, ray)
     direction = bodies.rotation[view, body] * ray
     corner = 3 * (meshes.first_triangle[bodies.mesh[view, body]] + gbuffer_inout.triangle[view, row, column])

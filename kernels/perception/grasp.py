@@ -3,7 +3,7 @@
 import warp as wp
 
 from synpick_warp.kernels.render.lighting.materials import Surfaces, interpolate_surface
-from synpick_warp.kernels.render.visibility.camera import Cameras, ImageGrid, Views, camera_ray
+from synpick_warp.kernels.render.visibility.camera import ImageGrid, Views, camera_ray
 from synpick_warp.kernels.render.visibility.gbuffer import GBuffer, Meshes, ViewBodies
 from synpick_warp.kernels.structs import PickData
 
@@ -53,7 +53,6 @@ def smooth_normal_kernel(
     # Scene:
     meshes: Meshes,
     surfaces: Surfaces,
-    cameras: Cameras,
     grid: ImageGrid,
     window: int,
     # In:
@@ -77,13 +76,12 @@ def smooth_normal_kernel(
     if world < 0 or target[world] < 0:
         return
     instance = target[world]
-    camera = views.camera[view]
     p = grasp_pixel[world, instance]
     total = wp.vec3(0.0, 0.0, 0.0)
     for row in range(wp.max(p[1] - window, 0), wp.min(p[1] + window + 1, grid.height)):
         for column in range(wp.max(p[0] - window, 0), wp.min(p[0] + window + 1, grid.width)):
             if component[view, row, column] == largest[view, instance]:
-                ray = cameras.to_world[camera] * camera_ray(cameras.intrinsics[camera], row, column, wp.vec2(0.0, 0.0))
+                ray = views.cameras.to_world[view] * camera_ray(views.cameras, view, row, column, wp.vec2(0.0, 0.0))
                 triangle = gbuffer.triangle[view, row, column]
                 barycentric = gbuffer.barycentric[view, row, column]
                 # Only the normal is used; the pixel width (0) affects texture filtering alone.
@@ -95,7 +93,6 @@ def smooth_normal_kernel(
 @wp.kernel
 def frame_grasp_kernel(
     # Scene:
-    cameras: Cameras,
     pick: PickData,
     # In:
     gbuffer: GBuffer,
@@ -117,11 +114,10 @@ def frame_grasp_kernel(
     world = views.world[view]
     if world < 0 or target[world] < 0:
         return
-    camera = views.camera[view]
     p = grasp_pixel[world, target[world]]
-    ray = camera_ray(cameras.intrinsics[camera], p[1], p[0], wp.vec2(0.0, 0.0)) * gbuffer.depth[view, p[1], p[0]]
+    ray = camera_ray(views.cameras, view, p[1], p[0], wp.vec2(0.0, 0.0)) * gbuffer.depth[view, p[1], p[0]]
     position = wp.vec3d(wp.float64(ray[0]), wp.float64(ray[1]), wp.float64(ray[2]))
-    point_out[world] = wp.vec3(cameras.center[camera] + wp.transpose(cameras.rotation[camera]) * position)
+    point_out[world] = wp.vec3(views.cameras.center[view] + wp.transpose(views.cameras.rotation[view]) * position)
     normal = limit_normal(normal_inout[world], pick.tilt_limit)
     angles = gripper_angles(normal)
     normal_inout[world] = normal

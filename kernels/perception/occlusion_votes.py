@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from synpick_warp.kernels.render.visibility.camera import Cameras, ImageGrid, Views
+from synpick_warp.kernels.render.visibility.camera import ImageGrid, Views
 from synpick_warp.kernels.render.visibility.gbuffer import GBuffer
 from synpick_warp.kernels.structs import CatalogData, PerceptionData
 
@@ -82,7 +82,6 @@ def is_in_reach(q: wp.vec2i, reach: float, extent: wp.vec4i, contour: wp.array3d
 def bound_contours_kernel(
     # Scene:
     catalog: CatalogData,
-    cameras: Cameras,
     perception: PerceptionData,
     # State:
     catalog_index: wp.array2d[int],  # (world, instance)
@@ -107,9 +106,7 @@ def bound_contours_kernel(
         return
     e = catalog_index[world, instance]
     if lane == 0 and e >= 0:
-        reach_out[view, instance] = (
-            perception.reach * catalog.diagonal[e] * cameras.intrinsics[views.camera[view]][0] / depth[world, instance]
-        )
+        reach_out[view, instance] = perception.reach * catalog.diagonal[e] * views.cameras.intrinsics[view][0] / depth[world, instance]
     extent = wp.vec4i(NOWHERE, NOWHERE, NOWHERE, NOWHERE)
     length = contour_length[view, instance]
     for point in range(lane, length, CONTOUR_LANES):

@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from synpick_warp.kernels.render.visibility.camera import camera_ray
+from synpick_warp.kernels.render.visibility.camera import pinhole_ray
 
 wp.set_module_options({"enable_backward": False})
 
@@ -95,7 +95,7 @@ class Observation:
 @wp.func
 def back_project(intrinsics: wp.vec4, row: int, column: int, depth: float) -> wp.vec3:
     """Point of the camera frame [m] at a pixel's centre and planar depth."""
-    return depth * camera_ray(intrinsics, row, column, wp.vec2(0.0, 0.0))
+    return depth * pinhole_ray(intrinsics, row, column, wp.vec2(0.0, 0.0))
 
 
 @wp.func

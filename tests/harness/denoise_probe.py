@@ -12,7 +12,7 @@ from synpick_warp.scenes.types import Camera
 from synpick_warp.stages.arrays import allocate_struct
 from synpick_warp.stages.render.denoised import COARSE_LIGHT, GUIDE, RATIO_IMAGES, build_coarse_grid
 from synpick_warp.stages.render.scene import build_cameras, build_grid, pack_half3_array
-from synpick_warp.stages.render.view_setup import make_views
+from tests.harness.aimed_views import aimed_views
 
 
 class FlatDenoiser:
@@ -22,10 +22,9 @@ class FlatDenoiser:
         sizes = {"view": 1, "cell_row": height, "cell_column": width}
         matrix = np.array([[100.0, 0.0, width / 2.0], [0.0, 100.0, height / 2.0], [0.0, 0.0, 1.0]])
         self.device, self.count = device, build_grid(width, height).tiles * 32
-        self.cameras = build_cameras((Camera(width, height, matrix, np.eye(3), np.zeros(3)),), device)
         self.coarse = build_coarse_grid(build_grid(width, height), 1, 1)
-        zero = wp.zeros(1, dtype=wp.int32, device=device)
-        self.views = make_views(zero, zero, 1, 1)
+        cameras = build_cameras((Camera(width, height, matrix, np.eye(3), np.zeros(3)),), device)
+        self.views = aimed_views([0], [0], 1, cameras, device)
         self.guide = allocate_struct(GUIDE, sizes, device)
         self.show(np.ones((height, width)), np.ones((height, width)))
         self.coarse_light, self.blocks = (allocate_struct(COARSE_LIGHT, sizes, device) for _ in range(2))
@@ -48,7 +47,7 @@ class FlatDenoiser:
             records = pack_light_array(self.light[name], self.light[f"unoccluded_{name}"])
             getattr(self.coarse_light, name).assign(records[None])
         self.coarse_light.indirect.assign(pack_half3_array(self.light["indirect"][None]))
-        shared = [self.cameras, self.coarse, self.guide]
+        shared = [self.coarse, self.guide]
         for kernel, source, rules, out in (
             (filter_blocks_kernel, self.coarse_light, (), self.blocks),
             (choose_widths_kernel, self.blocks, (variance_scale,), self.chosen),

@@ -10,10 +10,11 @@ import pytest
 import warp as wp
 
 import synpick_warp
-from synpick_warp.kernels.render.visibility.camera import Cameras
+from synpick_warp.stages.arrays import allocate_struct
 from synpick_warp.stages.buffers import Snapshot, view_buffer_sizes
 from synpick_warp.stages.online.batches import GPU_RING, BatchRing, ViewBatch
 from synpick_warp.stages.online.exchange import DeviceArray, Gate
+from synpick_warp.stages.render.view_setup import VIEW_CAMERAS
 from tests.harness.spin import SPINS, spin_kernel
 from tests.online.conftest import tiny
 
@@ -24,15 +25,13 @@ class NumberingRenderer:
     """Fills the depth of its n-th batch with n, after some time."""
 
     def __init__(self, device: wp.Device) -> None:
-        cameras = Cameras()
-        cameras.intrinsics = wp.zeros(1, dtype=wp.vec4, device=device)
-        cameras.rotation = wp.zeros(1, dtype=wp.mat33d, device=device)
-        cameras.center = wp.zeros(1, dtype=wp.vec3d, device=device)
-        self.scene = SimpleNamespace(device=device, cameras=cameras, obj_id=wp.zeros(1, dtype=wp.int32, device=device))
+        self.cameras = allocate_struct(VIEW_CAMERAS, {"view": VIEWS}, device)
+        self.scene = SimpleNamespace(device=device, obj_id=wp.zeros(1, dtype=wp.int32, device=device))
         self.busy, self.count = wp.zeros(1, dtype=float, device=device), 0
 
     def render(self, snapshot, views, out, layers) -> None:
         self.count += 1
+        views.cameras = self.cameras
         wp.launch(spin_kernel, dim=1, inputs=[self.busy, SPINS], device=self.scene.device)
         out.depth.fill_(self.count)
         out.instance.fill_(1 + self.count % ROOM)

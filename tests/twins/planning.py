@@ -8,7 +8,6 @@ from typing import Any
 
 import cv2
 import numpy as np
-import warp as wp
 
 from synpick_warp.configs.schema import Perception
 from synpick_warp.scenes.types import Camera
@@ -16,8 +15,9 @@ from synpick_warp.stages.arrays import allocate, allocate_struct
 from synpick_warp.stages.perception.arrays import Observation, PerceptionArrays, Plan
 from synpick_warp.stages.perception.plan import GraspPlanner
 from synpick_warp.stages.render.scene import build_cameras, build_grid
-from synpick_warp.stages.render.view_setup import GBUFFER, make_views
+from synpick_warp.stages.render.view_setup import GBUFFER
 from synpick_warp.stages.sim.worlds import AttemptState
+from tests.harness.aimed_views import aimed_views
 from tests.worlds import kernel_worlds
 
 FOCAL = 100.0
@@ -76,10 +76,10 @@ class PlannerHarness:
         self.gbuffer.segment.assign((ids + 1).astype(np.uint8))
         self.gbuffer.depth.assign(depths)
         camera = Camera(width, height, np.array([[FOCAL, 0, width / 2], [0, FOCAL, height / 2], [0, 0, 1.0]]), np.eye(3), np.zeros(3))
-        world, camera_index = (wp.array(values, dtype=wp.int32, device=device) for values in (range(self.views), [0] * self.views))
+        cameras = build_cameras((camera,), device)
         self.images: Any = SimpleNamespace(
-            scene=SimpleNamespace(cameras=build_cameras((camera,), device), grid=build_grid(width, height)),
-            views=make_views(world, camera_index, self.views, instances),
+            scene=SimpleNamespace(grid=build_grid(width, height)),
+            views=aimed_views(range(self.views), [0] * self.views, instances, cameras, device),
             gbuffer=self.gbuffer,
         )
         self.expected = segment(ids, depths, instances)

@@ -11,7 +11,7 @@ from synpick_warp.codes import Segment
 from synpick_warp.kernels.render.lighting.plane_distance import Plane, plane_distance, tangent_plane
 from synpick_warp.kernels.render.lighting.sampling import UNIT, reverse_bits
 from synpick_warp.kernels.render.visibility.bvh_rays import hit_table, trace_bodies
-from synpick_warp.kernels.render.visibility.camera import Cameras, ImageGrid, Views, camera_ray, clamp_index, in_image, tile_of, tile_pixel
+from synpick_warp.kernels.render.visibility.camera import ImageGrid, Views, camera_ray, clamp_index, in_image, tile_of, tile_pixel
 from synpick_warp.kernels.render.visibility.gbuffer import GBuffer, Hit, Meshes, Table, ViewBodies, body_of, face_normal, triangle_normal
 from synpick_warp.kernels.tuning import RAY_REGISTERS
 
@@ -191,7 +191,6 @@ def has_discontinuity(
 @wp.kernel
 def find_footprints_kernel(
     # Scene:
-    cameras: Cameras,
     grid: ImageGrid,
     footprints: ImageGrid,
     # In:
@@ -220,7 +219,7 @@ def find_footprints_kernel(
     right = wp.min(column, grid.width - 1)
     # First the contrast: most footprints have none, and this test costs a fifth of the other.
     if has_contrast(radiance, view, top, left, bottom, right):
-        if has_discontinuity(gbuffer, grid, cameras.intrinsics[views.camera[view]], view, top, left, bottom, right):
+        if has_discontinuity(gbuffer, grid, views.cameras.intrinsics[view], view, top, left, bottom, right):
             chunk = tile_of(footprints, row, column) // CHUNK_TILES
             footprint_out[view, chunk, wp.atomic_add(count_inout, view, chunk, 1)] = row * footprints.width + column
 
@@ -314,7 +313,6 @@ def resolve_footprints_kernel(
     # Scene:
     meshes: Meshes,
     table: Table,
-    cameras: Cameras,
     grid: ImageGrid,
     footprints: ImageGrid,
     # In:
@@ -340,8 +338,6 @@ def resolve_footprints_kernel(
     chunks = wp.uint32(count.shape[1])
     view = int(place // chunks)
     chunk = int(place % chunks)
-    camera = views.camera[view]
-    intrinsics = cameras.intrinsics[camera]
     for index in range(int(thread % wp.uint32(threads)), samples * count[view, chunk], threads):
         cell = wp.uint32(footprint[view, chunk, int(wp.uint32(index) // wp.uint32(samples))])
         row = int(cell // wp.uint32(footprints.width))
@@ -353,15 +349,15 @@ def resolve_footprints_kernel(
         c = corner_column(column, own)
         if in_image(grid, r, c):
             offset = sample_offset(sample, samples)
-            ray = camera_ray(intrinsics, r, c, offset)
+            ray = camera_ray(views.cameras, view, r, c, offset)
             visible = visible_bodies(gbuffer, grid, view, row, column, views.instances)
             body_mask = filter_body_mask(bodies, view, tile_of(grid, r, c), visible)
             hit = trace_bodies(meshes, bodies, view, body_mask, ray, views.instances)
-            hit = hit_table(table, cameras, camera, ray, hit)
+            hit = hit_table(table, views.cameras, view, ray, hit)
             normal = wp.vec3(0.0, 0.0, 0.0)
             if hit.segment != Segment.NOTHING:
-                normal = wp.transpose(cameras.to_world[camera]) * face_normal(meshes, bodies, view, hit, views.instances)
-            plane = tangent_plane(intrinsics, r, c, wp.uint8(hit.segment), hit.depth, normal)
+                normal = wp.transpose(views.cameras.to_world[view]) * face_normal(meshes, bodies, view, hit, views.instances)
+            plane = tangent_plane(views.cameras, view, r, c, wp.uint8(hit.segment), hit.depth, normal)
             plane.height = hit.depth * wp.dot(normal, ray)
             mesh = int(-1)
             if hit.segment != Segment.NOTHING and hit.segment != Segment.TABLE:

@@ -3,7 +3,7 @@
 import warp as wp
 
 from synpick_warp.kernels.render.visibility.bvh_rays import hits_body
-from synpick_warp.kernels.render.visibility.camera import Cameras, ImageGrid, Views, camera_ray, in_image
+from synpick_warp.kernels.render.visibility.camera import ImageGrid, Views, camera_ray, in_image
 from synpick_warp.kernels.render.visibility.gbuffer import Meshes, ViewBodies
 
 wp.set_module_options({"enable_backward": False})
@@ -184,7 +184,6 @@ def find_box(first_chunk: wp.array[int], listed: int, chunk: int) -> int:
 def count_border_pixels_kernel(
     # Scene:
     meshes: Meshes,
-    cameras: Cameras,
     grid: ImageGrid,
     # In:
     bodies: ViewBodies,
@@ -209,7 +208,6 @@ def count_border_pixels_kernel(
         view = border_boxes.owner[listed] // views.instances
         instance = border_boxes.owner[listed] % views.instances
         box = bodies.box[view, instance]
-        intrinsics = cameras.intrinsics[views.camera[view]]
         columns = box[2] - box[0] + 1
         begin = (index - border_boxes.first_chunk[listed]) * chunk
         amodal = int(0)
@@ -218,7 +216,7 @@ def count_border_pixels_kernel(
             row = box[1] + i // columns
             column = box[0] + i % columns
             if not in_image(grid, row, column):
-                if hits_body(meshes, bodies, view, instance, camera_ray(intrinsics, row, column, wp.vec2(0.0, 0.0))):
+                if hits_body(meshes, bodies, view, instance, camera_ray(views.cameras, view, row, column, wp.vec2(0.0, 0.0))):
                     amodal += 1
                     amodal_box = extend_box(amodal_box, row, column)
         if amodal > 0:

@@ -5,7 +5,7 @@ import warp as wp
 from synpick_warp.codes import Segment, Stream
 from synpick_warp.kernels.render.images.layers import hit_surface
 from synpick_warp.kernels.render.lighting.materials import Surfaces
-from synpick_warp.kernels.render.visibility.camera import Cameras, ImageGrid, Views, camera_ray, in_image, tile_pixel
+from synpick_warp.kernels.render.visibility.camera import ImageGrid, Views, camera_ray, in_image, tile_pixel
 from synpick_warp.kernels.render.visibility.gbuffer import MAX_COUNTS, GBuffer, Meshes, ViewBodies
 from synpick_warp.kernels.rng import normal_pair, pixel_key, view_key
 
@@ -136,7 +136,6 @@ def render_depth_sensor_kernel(
     # Scene:
     meshes: Meshes,
     surfaces: Surfaces,
-    cameras: Cameras,
     grid: ImageGrid,
     # State:
     episode: wp.array[int],  # (world)
@@ -169,11 +168,11 @@ def render_depth_sensor_kernel(
     at_column = wp.clamp(column + int(wp.rint(displacement[1])), 0, grid.width - 1)
     if int(gbuffer.segment[view, at_row, at_column]) == Segment.NOTHING:
         return
-    intrinsics = cameras.intrinsics[camera]
+    intrinsics = views.cameras.intrinsics[view]
     focal_baseline = intrinsics[0] * sensor.baseline
     depth = gbuffer.depth[view, at_row, at_column]
-    surface = hit_surface(meshes, surfaces, cameras, bodies, gbuffer, view, at_row, at_column, camera, views.instances)
-    ray = wp.normalize(cameras.to_world[camera] * camera_ray(intrinsics, at_row, at_column, wp.vec2(0.0, 0.0)))
+    surface = hit_surface(meshes, surfaces, views.cameras, bodies, gbuffer, view, at_row, at_column, views.instances)
+    ray = wp.normalize(views.cameras.to_world[view] * camera_ray(views.cameras, view, at_row, at_column, wp.vec2(0.0, 0.0)))
     cosine = wp.abs(wp.dot(surface.face_normal, ray))
     if cosine < sensor.grazing_cosine:
         return

@@ -3,7 +3,7 @@
 import warp as wp
 
 from synpick_warp.kernels.render.images.layers import position_of, rotation_of
-from synpick_warp.kernels.render.visibility.camera import Cameras, Views
+from synpick_warp.kernels.render.visibility.camera import Views
 
 wp.set_module_options({"enable_backward": False})
 
@@ -28,8 +28,6 @@ def rigid_transform(r: wp.mat33d, t: wp.vec3d) -> wp.mat44:
 
 @wp.kernel
 def gather_cameras_kernel(
-    # Scene:
-    cameras: Cameras,
     # State:
     episode: wp.array[int],  # (world)
     frame: wp.array[int],  # (world)
@@ -49,15 +47,14 @@ def gather_cameras_kernel(
     episode_out[view] = episode[world]
     camera_out[view] = camera
     frame_out[view] = frame[world]
-    intrinsics_out[view] = camera_matrix(cameras.intrinsics[camera])
-    rotation = cameras.rotation[camera]
-    world_to_camera_out[view] = rigid_transform(rotation, -(rotation * cameras.center[camera]))
+    intrinsics_out[view] = camera_matrix(views.cameras.intrinsics[view])
+    rotation = views.cameras.rotation[view]
+    world_to_camera_out[view] = rigid_transform(rotation, -(rotation * views.cameras.center[view]))
 
 
 @wp.kernel
 def gather_objects_kernel(
     # Scene:
-    cameras: Cameras,
     object_ids: wp.array[int],  # (entry)
     # State:
     catalog_index: wp.array2d[int],  # (world, instance)
@@ -75,7 +72,6 @@ def gather_objects_kernel(
     """
     view, instance = wp.tid()
     world = views.world[view]
-    camera = views.camera[view]
     entry = catalog_index[world, instance]
     if entry < 0:
         object_id_out[view, instance] = -1
@@ -83,10 +79,10 @@ def gather_objects_kernel(
         object_to_camera_out[view, instance] = wp.identity(n=4, dtype=float)
         return
     body = pose[world, instance]
-    rotation = cameras.rotation[camera]
+    rotation = views.cameras.rotation[view]
     object_id_out[view, instance] = object_ids[entry]
     pose_out[view, instance] = body
-    position = rotation * (position_of(body) - cameras.center[camera])
+    position = rotation * (position_of(body) - views.cameras.center[view])
     object_to_camera_out[view, instance] = rigid_transform(rotation * rotation_of(body), position)
 
 

@@ -8,7 +8,7 @@ import warp as wp
 from synpick_warp.codes import Segment
 from synpick_warp.kernels.render.lighting.color import srgb_byte
 from synpick_warp.kernels.render.lighting.materials import Surface, Surfaces, interpolate_surface, make_table_surface, sample_base_color
-from synpick_warp.kernels.render.visibility.camera import NEAR_PLANE, Cameras, ImageGrid, Views, camera_ray, in_image, tile_pixel
+from synpick_warp.kernels.render.visibility.camera import NEAR_PLANE, ImageGrid, ViewCameras, Views, camera_ray, in_image, tile_pixel
 from synpick_warp.kernels.render.visibility.gbuffer import GBuffer, Meshes, ViewBodies, body_of
 
 wp.set_module_options({"enable_backward": False})
@@ -45,7 +45,6 @@ def position_of(pose: wp.transformf) -> wp.vec3d:
 @wp.kernel
 def compute_motions_kernel(
     # Scene:
-    cameras: Cameras,
     # State:
     catalog_index: wp.array2d[int],  # (world, instance)
     pose: wp.array2d[wp.transformf],  # (world, instance) [m]
@@ -82,10 +81,10 @@ def compute_motions_kernel(
     motions_out.known[view, body] = known
     if known == 0:
         return
-    to_camera = cameras.rotation[views.camera[view]]
+    to_camera = views.cameras.rotation[view]
     rotation = to_camera * rotation_of(then) * wp.transpose(rotation_of(now)) * wp.transpose(to_camera)
     motions_out.rotation[view, body] = wp.mat33(rotation - wp.identity(n=3, dtype=wp.float64))
-    motions_out.origin[view, body] = wp.vec3(to_camera * (position_of(now) - cameras.center[views.camera[view]]))
+    motions_out.origin[view, body] = wp.vec3(to_camera * (position_of(now) - views.cameras.center[view]))
     motions_out.displacement[view, body] = wp.vec3(to_camera * (position_of(then) - position_of(now)))
 
 
@@ -93,23 +92,22 @@ def compute_motions_kernel(
 def hit_surface(
     meshes: Meshes,
     surfaces: Surfaces,
-    cameras: Cameras,
+    cameras: ViewCameras,
     bodies: ViewBodies,
     gbuffer: GBuffer,
     view: int,
     row: int,
     column: int,
-    camera: int,
     instances: int,
 ) -> Surface:
     """Surface attributes of a pixel's primary hit, from the G-buffer; the pixel must show a body or the table."""
-    to_camera = -wp.normalize(cameras.to_world[camera] * camera_ray(cameras.intrinsics[camera], row, column, wp.vec2(0.0, 0.0)))
+    to_camera = -wp.normalize(cameras.to_world[view] * camera_ray(cameras, view, row, column, wp.vec2(0.0, 0.0)))
     segment = int(gbuffer.segment[view, row, column])
     if segment == Segment.TABLE:
         return make_table_surface(meshes, to_camera)
     triangle = gbuffer.triangle[view, row, column]
     barycentric = gbuffer.barycentric[view, row, column]
-    width = gbuffer.depth[view, row, column] / cameras.intrinsics[camera][0]
+    width = gbuffer.depth[view, row, column] / cameras.intrinsics[view][0]
     return interpolate_surface(meshes, surfaces, bodies, view, body_of(segment, instances), triangle, barycentric, to_camera, width)
 
 
@@ -118,7 +116,6 @@ def render_normals_kernel(
     # Scene:
     meshes: Meshes,
     surfaces: Surfaces,
-    cameras: Cameras,
     grid: ImageGrid,
     # In:
     bodies: ViewBodies,
@@ -135,11 +132,10 @@ def render_normals_kernel(
     view, row, column = tile_pixel(grid, wp.tid() + first)
     if not in_image(grid, row, column):
         return
-    camera = views.camera[view]
     normal = wp.vec3(0.0, 0.0, 0.0)
     if int(gbuffer.segment[view, row, column]) != Segment.NOTHING:
-        surface = hit_surface(meshes, surfaces, cameras, bodies, gbuffer, view, row, column, camera, views.instances)
-        normal = wp.transpose(cameras.to_world[camera]) * surface.normal
+        surface = hit_surface(meshes, surfaces, views.cameras, bodies, gbuffer, view, row, column, views.instances)
+        normal = wp.transpose(views.cameras.to_world[view]) * surface.normal
     normals_out[view, row, column] = normal
 
 
@@ -148,7 +144,6 @@ def render_albedo_kernel(
     # Scene:
     meshes: Meshes,
     surfaces: Surfaces,
-    cameras: Cameras,
     grid: ImageGrid,
     # In:
     bodies: ViewBodies,
@@ -167,7 +162,7 @@ def render_albedo_kernel(
         return
     color = wp.vec3(0.0, 0.0, 0.0)
     if int(gbuffer.segment[view, row, column]) != Segment.NOTHING:
-        surface = hit_surface(meshes, surfaces, cameras, bodies, gbuffer, view, row, column, views.camera[view], views.instances)
+        surface = hit_surface(meshes, surfaces, views.cameras, bodies, gbuffer, view, row, column, views.instances)
         color = sample_base_color(surfaces, surface)
     albedo_out[view, row, column] = wp.vec3ub(srgb_byte(color[0]), srgb_byte(color[1]), srgb_byte(color[2]))
 
@@ -253,7 +248,6 @@ def point_displacement(
 @wp.kernel
 def render_scene_flow_kernel(
     # Scene:
-    cameras: Cameras,
     grid: ImageGrid,
     # State:
     follows: wp.array[int],  # (world)
@@ -272,7 +266,7 @@ def render_scene_flow_kernel(
     view, row, column = tile_pixel(grid, wp.tid() + first)
     if not in_image(grid, row, column):
         return
-    ray = camera_ray(cameras.intrinsics[views.camera[view]], row, column, wp.vec2(0.0, 0.0))
+    ray = camera_ray(views.cameras, view, row, column, wp.vec2(0.0, 0.0))
     displacement = point_displacement(motions, gbuffer, view, row, column, ray, follows[views.world[view]], views.instances)
     scene_flow_out[view, row, column] = displacement
 
@@ -280,7 +274,6 @@ def render_scene_flow_kernel(
 @wp.kernel
 def render_flow_kernel(
     # Scene:
-    cameras: Cameras,
     grid: ImageGrid,
     # State:
     follows: wp.array[int],  # (world)
@@ -300,8 +293,8 @@ def render_flow_kernel(
     view, row, column = tile_pixel(grid, wp.tid() + first)
     if not in_image(grid, row, column):
         return
-    intrinsics = cameras.intrinsics[views.camera[view]]
-    ray = camera_ray(intrinsics, row, column, wp.vec2(0.0, 0.0))
+    intrinsics = views.cameras.intrinsics[view]
+    ray = camera_ray(views.cameras, view, row, column, wp.vec2(0.0, 0.0))
     d = point_displacement(motions, gbuffer, view, row, column, ray, follows[views.world[view]], views.instances)
     depth = gbuffer.depth[view, row, column] + d[2]
     flow = wp.vec2(wp.NAN, wp.NAN)

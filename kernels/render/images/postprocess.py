@@ -15,7 +15,7 @@ from synpick_warp.kernels.render.images.camera_effects import (
 )
 from synpick_warp.kernels.render.lighting.color import srgb_byte
 from synpick_warp.kernels.render.lighting.environment import Lights
-from synpick_warp.kernels.render.visibility.camera import PIXEL_CENTER, Cameras, ImageGrid, Views, camera_ray, in_image, tile_pixel
+from synpick_warp.kernels.render.visibility.camera import PIXEL_CENTER, ImageGrid, ViewCameras, Views, camera_ray, in_image, tile_pixel
 from synpick_warp.kernels.rng import view_key
 
 wp.set_module_options({"enable_backward": False, "fast_math": True})
@@ -82,7 +82,7 @@ def postprocess_kernel(
 def filter_lens(
     image: ShadedImage,
     parameters: EffectParameters,
-    intrinsics: wp.vec4,
+    cameras: ViewCameras,
     grid: ImageGrid,
     view: int,
     row: int,
@@ -95,6 +95,7 @@ def filter_lens(
     The channel is magnified by `channel_magnification`: it is resampled at the inverse position, between two pixels, with Gaussian
     weights; coordinates are clamped to the image. The first pass, along the row, reads resolved radiance and applies the vignette.
     """
+    intrinsics = cameras.intrinsics[view]
     size = grid.height
     center = intrinsics[3]
     position = float(row) + PIXEL_CENTER
@@ -126,7 +127,7 @@ def filter_lens(
         value = float(0.0)
         if along_row != 0:
             value = resolve_radiance(image, view, row, at)[channel]
-            value *= vignette_factor(loss, camera_ray(intrinsics, row, at, wp.vec2(0.0, 0.0)), slope)
+            value *= vignette_factor(loss, camera_ray(cameras, view, row, at, wp.vec2(0.0, 0.0)), slope)
         else:
             value = image.radiance[view, at, column][channel]
         total += ((1.0 - fraction) * weight + fraction * before) * value
@@ -138,7 +139,6 @@ def filter_lens(
 @wp.kernel
 def filter_lens_rows_kernel(
     # Scene:
-    cameras: Cameras,
     grid: ImageGrid,
     # In:
     effects: wp.array[EffectParameters],  # (view)
@@ -155,10 +155,9 @@ def filter_lens_rows_kernel(
     view, row, column = tile_pixel(grid, wp.tid() + first)
     if not in_image(grid, row, column):
         return
-    intrinsics = cameras.intrinsics[views.camera[view]]
     value = wp.vec3(0.0, 0.0, 0.0)
     for channel in range(3):
-        value[channel] = filter_lens(image, effects[view], intrinsics, grid, view, row, column, channel, 1)
+        value[channel] = filter_lens(image, effects[view], views.cameras, grid, view, row, column, channel, 1)
     radiance_out[view, row, column] = value
 
 
@@ -177,7 +176,6 @@ class PostProcessSettings:
 @wp.kernel
 def postprocess_effects_kernel(
     # Scene:
-    cameras: Cameras,
     grid: ImageGrid,
     lights: Lights,
     # State:
@@ -205,15 +203,15 @@ def postprocess_effects_kernel(
         return
     world = views.world[view]
     camera = views.camera[view]
-    intrinsics = cameras.intrinsics[camera]
+    intrinsics = views.cameras.intrinsics[view]
     parameters = effects[view]
     value = resolve_radiance(image, view, row, column)
     if settings.lens_filter != 0:
         for channel in range(3):
-            value[channel] = filter_lens(image, parameters, intrinsics, grid, view, row, column, channel, 0)
+            value[channel] = filter_lens(image, parameters, views.cameras, grid, view, row, column, channel, 0)
     else:
         corner = corner_slope(intrinsics, grid.width, grid.height)
-        value *= vignette_factor(parameters[Effect.VIGNETTE], camera_ray(intrinsics, row, column, wp.vec2(0.0, 0.0)), corner)
+        value *= vignette_factor(parameters[Effect.VIGNETTE], camera_ray(views.cameras, view, row, column, wp.vec2(0.0, 0.0)), corner)
     value *= lights.exposure[light[world]] * wp.pow(2.0, light_exposure[world])
     value = wp.cw_mul(value, color_gains(parameters))
     key = view_key(settings.seed, episode[world], frame[world], camera, Stream.COLOR_NOISE)

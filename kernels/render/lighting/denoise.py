@@ -22,7 +22,7 @@ from synpick_warp.kernels.render.lighting.paths.light import CoarseLight, pack_l
 from synpick_warp.kernels.render.lighting.plane_distance import Plane, plane_distance, tangent_plane
 from synpick_warp.kernels.render.lighting.unoccluded import visibility_ratio
 from synpick_warp.kernels.render.lighting.upsampling import RatioImages, RatioRecord, Ratios, add_ratios, pack_ratios
-from synpick_warp.kernels.render.visibility.camera import Cameras, ImageGrid, Views, clamp_index, in_image, tile_pixel
+from synpick_warp.kernels.render.visibility.camera import ImageGrid, ViewCameras, Views, clamp_index, in_image, tile_pixel
 from synpick_warp.kernels.render.visibility.records import read_record, read_uint64, write_record, write_uint64
 from synpick_warp.kernels.tuning import CHOICE_REGISTERS, FILTER_REGISTERS
 
@@ -48,11 +48,11 @@ SAME_BODY_WEIGHT = wp.constant(0.02)
 
 
 @wp.func
-def coarse_plane(coarse: CoarseGrid, surface: wp.vec4, intrinsics: wp.vec4, row: int, column: int) -> Plane:
+def coarse_plane(coarse: CoarseGrid, surface: wp.vec4, cameras: ViewCameras, view: int, row: int, column: int) -> Plane:
     """Tangent plane at a coarse pixel of packed `surface`, whose `down`, `right` and `width` are per coarse pixel."""
     pixel = middle_pixel(coarse, row, column)
     depth = surface_depth(surface)
-    plane = tangent_plane(intrinsics, pixel[0], pixel[1], surface_segment(surface), depth, surface_normal(surface))
+    plane = tangent_plane(cameras, view, pixel[0], pixel[1], surface_segment(surface), depth, surface_normal(surface))
     size = float(coarse.size)
     plane.down = size * plane.down
     plane.right = size * plane.right
@@ -163,7 +163,6 @@ def block_row_weights(guide: Guide, plane: Plane, grid: ImageGrid, view: int, ro
 @wp.kernel(cuda_max_registers=FILTER_REGISTERS)
 def filter_blocks_kernel(
     # Scene:
-    cameras: Cameras,
     coarse: CoarseGrid,
     # In:
     guide: Guide,
@@ -185,7 +184,7 @@ def filter_blocks_kernel(
     surface = read_record(guide.surface, index)
     if int(surface_segment(surface)) == Segment.NOTHING:
         return
-    plane = coarse_plane(coarse, surface, cameras.intrinsics[views.camera[view]], row, column)
+    plane = coarse_plane(coarse, surface, views.cameras, view, row, column)
     sums = KernelSum()
     square = wp.vec2(0.0, 0.0)
     squared_weight = float(0.0)
@@ -270,7 +269,6 @@ def add_blocks(total: KernelSum, blocks: CoarseLight, middle: int, weights: wp.v
 @wp.kernel(cuda_max_registers=CHOICE_REGISTERS)
 def choose_widths_kernel(
     # Scene:
-    cameras: Cameras,
     coarse: CoarseGrid,
     # In:
     guide: Guide,
@@ -295,7 +293,7 @@ def choose_widths_kernel(
     segment = surface_segment(surface)
     if int(segment) == Segment.NOTHING:
         return
-    plane = coarse_plane(coarse, surface, cameras.intrinsics[views.camera[view]], row, column)
+    plane = coarse_plane(coarse, surface, views.cameras, view, row, column)
     # The two middle rows come first: their inner blocks are the medium kernel. The loops are not unrolled, see `filter_blocks_kernel`.
     sums = KernelSum()
     sides = wp.vec4()
@@ -333,7 +331,6 @@ def choose_widths_kernel(
 @wp.kernel
 def smooth_ratios_kernel(
     # Scene:
-    cameras: Cameras,
     coarse: CoarseGrid,
     # In:
     guide: Guide,
@@ -356,7 +353,7 @@ def smooth_ratios_kernel(
     if int(segment) == Segment.NOTHING:
         ratios_out.record[view, row, column] = RatioRecord()
         return
-    plane = coarse_plane(coarse, surface, cameras.intrinsics[views.camera[view]], row, column)
+    plane = coarse_plane(coarse, surface, views.cameras, view, row, column)
     sums = Ratios()
     total = float(0.0)
     for down in range(-1, 2):

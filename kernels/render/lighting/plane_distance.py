@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from synpick_warp.kernels.render.visibility.camera import camera_ray
+from synpick_warp.kernels.render.visibility.camera import ViewCameras, camera_ray
 
 wp.set_module_options({"enable_backward": False})
 
@@ -28,12 +28,13 @@ class Plane:
 
 
 @wp.func
-def tangent_plane(intrinsics: wp.vec4, row: int, column: int, segment: wp.uint8, depth: float, normal: wp.vec3) -> Plane:
+def tangent_plane(cameras: ViewCameras, view: int, row: int, column: int, segment: wp.uint8, depth: float, normal: wp.vec3) -> Plane:
     """Tangent plane of the surface at a pixel; `depth` is planar [m], `normal` is in camera space."""
+    intrinsics = cameras.intrinsics[view]
     plane = Plane()
     plane.segment = segment
     plane.normal = normal
-    plane.facing = wp.dot(normal, camera_ray(intrinsics, row, column, wp.vec2(0.0, 0.0)))
+    plane.facing = wp.dot(normal, camera_ray(cameras, view, row, column, wp.vec2(0.0, 0.0)))
     plane.down = normal[1] / intrinsics[1]
     plane.right = normal[0] / intrinsics[0]
     plane.height = depth * plane.facing

@@ -32,7 +32,7 @@ from synpick_warp.kernels.render.lighting.shadow_upsampling import upsample_shad
 from synpick_warp.kernels.render.lighting.shadows import byte_of
 from synpick_warp.kernels.render.lighting.unoccluded import unoccluded_light
 from synpick_warp.kernels.render.lighting.upsampling import RatioImages, Ratios, upsample_ratios
-from synpick_warp.kernels.render.visibility.camera import Cameras, Views, camera_ray, in_image, tile_pixel
+from synpick_warp.kernels.render.visibility.camera import ViewCameras, Views, camera_ray, in_image, tile_pixel
 from synpick_warp.kernels.render.visibility.gbuffer import GBuffer, ViewBodies, body_of
 from synpick_warp.kernels.render.visibility.triangles import camera_triangle, edge_areas
 from synpick_warp.kernels.tuning import SAMPLE_SHADE_REGISTERS, SHADE_REGISTERS
@@ -104,7 +104,7 @@ def shade_surface(
 @wp.func
 def gather_light(
     scene: PathScene,
-    cameras: Cameras,
+    cameras: ViewCameras,
     coarse: CoarseGrid,
     shadow_grid: CoarseGrid,
     sky: Sky,
@@ -112,7 +112,6 @@ def gather_light(
     ratios: RatioImages,
     shadows: LampShadows,
     edges: wp.array3d[wp.vec3],
-    camera: int,
     view: int,
     row: int,
     column: int,
@@ -123,8 +122,8 @@ def gather_light(
     `edges` is that of `upsample_shadows`.
     """
     segment = gbuffer.segment[view, row, column]
-    normal = wp.transpose(cameras.to_world[camera]) * face_normal
-    plane = tangent_plane(cameras.intrinsics[camera], row, column, segment, gbuffer.depth[view, row, column], normal)
+    normal = wp.transpose(cameras.to_world[view]) * face_normal
+    plane = tangent_plane(cameras, view, row, column, segment, gbuffer.depth[view, row, column], normal)
     result = PixelLight()
     if scene.lights.lamps[sky.light] > 0:
         result.lamps = upsample_shadows(shadows, edges, shadow_grid, view, row, column, plane)
@@ -189,7 +188,6 @@ def world_sky(light: wp.array[int], light_yaw: wp.array[float], world: int) -> S
 @wp.func
 def shade_pixel(
     scene: PathScene,
-    cameras: Cameras,
     coarse: CoarseGrid,
     shadow_grid: CoarseGrid,
     sky: Sky,
@@ -209,10 +207,9 @@ def shade_pixel(
     A pixel of a body is the mean of `samples_per_axis`² shading samples of its triangle, all in the light at the pixel's center. Kernels
     pass a constant, so that the compiler removes the loop if there is one sample. `edges` is that of `upsample_shadows`.
     """
-    camera = views.camera[view]
-    intrinsics = cameras.intrinsics[camera]
-    middle_ray = camera_ray(intrinsics, row, column, wp.vec2(0.0, 0.0))
-    outgoing = -wp.normalize(cameras.to_world[camera] * middle_ray)
+    intrinsics = views.cameras.intrinsics[view]
+    middle_ray = camera_ray(views.cameras, view, row, column, wp.vec2(0.0, 0.0))
+    outgoing = -wp.normalize(views.cameras.to_world[view] * middle_ray)
     segment = int(gbuffer.segment[view, row, column])
     if segment == Segment.NOTHING:
         return environment_radiance(scene.lights, sky.light, rotate_z(-outgoing, -sky.yaw))
@@ -224,7 +221,7 @@ def shade_pixel(
     if segment != Segment.TABLE:
         surface = interpolate_surface(scene.meshes, scene.surfaces, bodies, view, body, triangle, barycentric, outgoing, width)
     normal = surface.face_normal
-    light = gather_light(scene, cameras, coarse, shadow_grid, sky, gbuffer, ratios, shadows, edges, camera, view, row, column, normal)
+    light = gather_light(scene, views.cameras, coarse, shadow_grid, sky, gbuffer, ratios, shadows, edges, view, row, column, normal)
     if segment == Segment.TABLE or samples_per_axis == 1:
         return shade_point(scene, sky, surface, outgoing, light)
     corners = camera_triangle(scene.meshes, bodies, view, body, triangle)
@@ -233,9 +230,9 @@ def shade_pixel(
     samples = samples_per_axis * samples_per_axis
     total = wp.vec3(0.0)
     for sample in range(samples):
-        ray = camera_ray(intrinsics, row, column, sample_offset(sample, samples_per_axis))
+        ray = camera_ray(views.cameras, view, row, column, sample_offset(sample, samples_per_axis))
         weights, moved = move_weights(center, orientation, edge_areas(corners, ray))
-        outgoing = -wp.normalize(cameras.to_world[camera] * ray)
+        outgoing = -wp.normalize(views.cameras.to_world[view] * ray)
         # A sample that stays at the center has the footprint of a whole pixel.
         footprint_scale = 1.0 - moved * (1.0 - 1.0 / float(samples_per_axis))
         point = wp.vec2(weights[0], weights[1])
@@ -248,7 +245,6 @@ def shade_pixel(
 def shade_kernel(
     # Scene:
     scene: PathScene,
-    cameras: Cameras,
     coarse: CoarseGrid,
     shadow_grid: CoarseGrid,
     # State: worlds
@@ -273,7 +269,7 @@ def shade_kernel(
     if in_image(coarse.image, row, column):
         sky = world_sky(light, light_yaw, views.world[view])
         radiance_inout[view, row, column] = shade_pixel(
-            scene, cameras, coarse, shadow_grid, sky, bodies, gbuffer, ratios, shadows, radiance_inout, views, view, row, column, 1
+            scene, coarse, shadow_grid, sky, bodies, gbuffer, ratios, shadows, radiance_inout, views, view, row, column, 1
         )
 
 
@@ -281,7 +277,6 @@ def shade_kernel(
 def shade_samples_kernel(
     # Scene:
     scene: PathScene,
-    cameras: Cameras,
     coarse: CoarseGrid,
     shadow_grid: CoarseGrid,
     # State: worlds
@@ -306,7 +301,6 @@ def shade_samples_kernel(
         sky = world_sky(light, light_yaw, views.world[view])
         radiance_inout[view, row, column] = shade_pixel(
             scene,
-            cameras,
             coarse,
             shadow_grid,
             sky,

@@ -15,7 +15,6 @@ from synpick_warp.kernels.render.lighting.shadow_upsampling import all_steepness
 from synpick_warp.kernels.render.lighting.shadows import is_shadowed, point_direction, visible_normal
 from synpick_warp.kernels.render.visibility.camera import (
     TILE_PIXELS,
-    Cameras,
     Views,
     camera_ray,
     hit_position,
@@ -99,22 +98,20 @@ def list_edge_cells_kernel(
 
 @wp.func
 def pixel_plane(
-    meshes: Meshes, cameras: Cameras, bodies: ViewBodies, gbuffer: GBuffer, views: Views, view: int, row: int, column: int
+    meshes: Meshes, bodies: ViewBodies, gbuffer: GBuffer, views: Views, view: int, row: int, column: int
 ) -> tuple[Plane, wp.vec3]:
     """Tangent plane at a pixel that shows a surface, and the surface's geometric normal in the world."""
-    camera = views.camera[view]
-    outward = cameras.to_world[camera] * camera_ray(cameras.intrinsics[camera], row, column, wp.vec2(0.0, 0.0))
+    outward = views.cameras.to_world[view] * camera_ray(views.cameras, view, row, column, wp.vec2(0.0, 0.0))
     normal = visible_normal(meshes, bodies, view, read_hit(gbuffer, view, row, column), views.instances, outward)
-    local = wp.transpose(cameras.to_world[camera]) * normal
+    local = wp.transpose(views.cameras.to_world[view]) * normal
     segment, depth = gbuffer.segment[view, row, column], gbuffer.depth[view, row, column]
-    return tangent_plane(cameras.intrinsics[camera], row, column, segment, depth, local), normal
+    return tangent_plane(views.cameras, view, row, column, segment, depth, local), normal
 
 
 @wp.kernel
 def list_edge_pixels_kernel(
     # Scene:
     meshes: Meshes,
-    cameras: Cameras,
     coarse: CoarseGrid,
     # In:
     bodies: ViewBodies,
@@ -139,7 +136,7 @@ def list_edge_pixels_kernel(
         row, column = listed_pixel(coarse, lists_inout.cell, view, chunk, index)
         if in_image(coarse.image, row, column):
             if int(gbuffer.segment[view, row, column]) != Segment.NOTHING:
-                plane, _normal = pixel_plane(meshes, cameras, bodies, gbuffer, views, view, row, column)
+                plane, _normal = pixel_plane(meshes, bodies, gbuffer, views, view, row, column)
                 steepness = all_steepness(find_shadow_taps(shadows_inout, coarse, view, row, column, plane))
                 if steepness != wp.uint32(0):
                     shadows_inout.edge[view, row, column] = steepness
@@ -151,7 +148,6 @@ def list_edge_pixels_kernel(
 def trace_pixel_edges(
     meshes: Meshes,
     table: Table,
-    cameras: Cameras,
     coarse: CoarseGrid,
     lights: Lights,
     which: int,
@@ -165,11 +161,10 @@ def trace_pixel_edges(
     column: int,
 ) -> wp.uint32:
     """Trace the rays of a pixel to the lamps whose `steepness` is above 0; packed as in `LampShadows.edge`."""
-    camera = views.camera[view]
-    direction_to_surface = camera_ray(cameras.intrinsics[camera], row, column, wp.vec2(0.0, 0.0))
-    outward = cameras.to_world[camera] * direction_to_surface
+    direction_to_surface = camera_ray(views.cameras, view, row, column, wp.vec2(0.0, 0.0))
+    outward = views.cameras.to_world[view] * direction_to_surface
     normal = visible_normal(meshes, bodies, view, read_hit(gbuffer, view, row, column), views.instances, outward)
-    position = hit_position(cameras, camera, direction_to_surface, gbuffer.depth[view, row, column])
+    position = hit_position(views.cameras, view, direction_to_surface, gbuffer.depth[view, row, column])
     result = wp.uint32(0)
     for lamp in range(lights.lamps[which]):
         if (steepness >> wp.uint32(STEEPNESS_BITS * lamp)) & wp.uint32(STEEPNESS_LEVELS) != wp.uint32(0):
@@ -188,7 +183,6 @@ def trace_shadow_edges_kernel(
     # Scene:
     meshes: Meshes,
     table: Table,
-    cameras: Cameras,
     coarse: CoarseGrid,
     lights: Lights,
     # State: worlds
@@ -221,7 +215,7 @@ def trace_shadow_edges_kernel(
         row, column = listed_pixel(coarse, lists.cell, view, chunk, int(lists.pixel[view, chunk, index]))
         steepness = shadows_inout.edge[view, row, column]
         shadows_inout.edge[view, row, column] = trace_pixel_edges(
-            meshes, table, cameras, coarse, lights, which, heading, bodies, gbuffer, views, steepness, view, row, column
+            meshes, table, coarse, lights, which, heading, bodies, gbuffer, views, steepness, view, row, column
         )
 
 
@@ -229,7 +223,6 @@ def trace_shadow_edges_kernel(
 def filter_shadow_edges_kernel(
     # Scene:
     meshes: Meshes,
-    cameras: Cameras,
     coarse: CoarseGrid,
     lights: Lights,
     # State: worlds
@@ -256,6 +249,6 @@ def filter_shadow_edges_kernel(
     lamps = lights.lamps[light[views.world[view]]]
     for index in range(start, lists.count[view, chunk, PIXELS], threads):
         row, column = listed_pixel(coarse, lists.cell, view, chunk, int(lists.pixel[view, chunk, index]))
-        plane, _normal = pixel_plane(meshes, cameras, bodies, gbuffer, views, view, row, column)
+        plane, _normal = pixel_plane(meshes, bodies, gbuffer, views, view, row, column)
         fractions = filter_edge(shadows, coarse, gbuffer, lamps, view, row, column, plane)
         radiance_out[view, row, column] = pack_fractions(fractions)

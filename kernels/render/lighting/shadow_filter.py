@@ -17,7 +17,7 @@ from synpick_warp.kernels.render.lighting.coarse_grid import (
 from synpick_warp.kernels.render.lighting.environment import Lights, lamp_share
 from synpick_warp.kernels.render.lighting.plane_distance import Plane, plane_distance, tangent_plane
 from synpick_warp.kernels.render.lighting.shadows import rays_bits, rays_depth, rays_normal, rays_segment, spread_bits, visible_normal
-from synpick_warp.kernels.render.visibility.camera import Cameras, Views, camera_ray, in_image, tile_pixel
+from synpick_warp.kernels.render.visibility.camera import Views, camera_ray, in_image, tile_pixel
 from synpick_warp.kernels.render.visibility.gbuffer import GBuffer, Meshes, ViewBodies, read_hit
 from synpick_warp.kernels.render.visibility.records import read_uint64, write_record, write_uint64
 
@@ -134,7 +134,6 @@ def lamp_fractions(even: wp.uint64, odd: wp.uint64, weight: int, lamps: int, ray
 @wp.func
 def grid_plane(
     meshes: Meshes,
-    cameras: Cameras,
     coarse: CoarseGrid,
     bodies: ViewBodies,
     gbuffer: GBuffer,
@@ -145,12 +144,11 @@ def grid_plane(
 ) -> Plane:
     """Tangent plane at the middle pixel of a pixel of the shadow grid, which must show a surface."""
     pixel = middle_pixel(coarse, row, column)
-    camera = views.camera[view]
     segment = gbuffer.segment[view, pixel[0], pixel[1]]
     depth = gbuffer.depth[view, pixel[0], pixel[1]]
-    ray = cameras.to_world[camera] * camera_ray(cameras.intrinsics[camera], pixel[0], pixel[1], wp.vec2(0.0, 0.0))
+    ray = views.cameras.to_world[view] * camera_ray(views.cameras, view, pixel[0], pixel[1], wp.vec2(0.0, 0.0))
     normal = visible_normal(meshes, bodies, view, read_hit(gbuffer, view, pixel[0], pixel[1]), views.instances, ray)
-    return tangent_plane(cameras.intrinsics[camera], pixel[0], pixel[1], segment, depth, wp.transpose(cameras.to_world[camera]) * normal)
+    return tangent_plane(views.cameras, view, pixel[0], pixel[1], segment, depth, wp.transpose(views.cameras.to_world[view]) * normal)
 
 
 @wp.func
@@ -179,7 +177,6 @@ def grid_shows(coarse: CoarseGrid, rays: wp.array3d[wp.uint64], plane: Plane, pi
 def filter_shadows_kernel(
     # Scene:
     meshes: Meshes,
-    cameras: Cameras,
     coarse: CoarseGrid,
     lights: Lights,
     # State: worlds
@@ -204,7 +201,7 @@ def filter_shadows_kernel(
     which = light[views.world[view]]
     if lights.lamps[which] == 0 or int(rays_segment(rays[view, row, column])) == Segment.NOTHING:
         return
-    plane = grid_plane(meshes, cameras, coarse, bodies, gbuffer, views, view, row, column)
+    plane = grid_plane(meshes, coarse, bodies, gbuffer, views, view, row, column)
     pixel = middle_pixel(coarse, row, column)
     even = wp.uint64(0)
     odd = wp.uint64(0)
@@ -321,7 +318,6 @@ def mark_edges(coarse: CoarseGrid, near_edge: wp.array3d[wp.uint8], view: int, r
 def measure_steepness_kernel(
     # Scene:
     meshes: Meshes,
-    cameras: Cameras,
     coarse: CoarseGrid,
     lights: Lights,
     # State: worlds
@@ -352,7 +348,7 @@ def measure_steepness_kernel(
         write_record(shadows_inout.record, index, wp.vec4())
         mark_edges(coarse, shadows_inout.near_edge, view, row, column, 1)
         return
-    plane = grid_plane(meshes, cameras, coarse, bodies, gbuffer, views, view, row, column)
+    plane = grid_plane(meshes, coarse, bodies, gbuffer, views, view, row, column)
     pixel = middle_pixel(coarse, row, column)
     own = read_uint64(shadows_inout.fractions, index)
     extremes = FractionRange(wp.uint32(own), wp.uint32(own), wp.uint32(own >> wp.uint64(32)), wp.uint32(own >> wp.uint64(32)))

@@ -16,7 +16,6 @@ from synpick_warp.kernels.render.visibility.bvh_rays import RAY_OFFSET, is_block
 from synpick_warp.kernels.render.visibility.camera import (
     TILE_HEIGHT,
     TILE_WIDTH,
-    Cameras,
     Views,
     camera_ray,
     hit_position,
@@ -241,7 +240,6 @@ def trace_shadow_rays_kernel(
     # Scene:
     meshes: Meshes,
     table: Table,
-    cameras: Cameras,
     coarse: CoarseGrid,
     lights: Lights,
     # State: worlds
@@ -275,12 +273,12 @@ def trace_shadow_rays_kernel(
     slot = world * history_inout.cameras + camera
     free, packed_normal = int(ALL_RAYS), int(0)
     if segment != Segment.NOTHING:
-        camera_direction = camera_ray(cameras.intrinsics[camera], pixel[0], pixel[1], wp.vec2(0.0, 0.0))
-        position = hit_position(cameras, camera, camera_direction, depth)
+        camera_direction = camera_ray(views.cameras, view, pixel[0], pixel[1], wp.vec2(0.0, 0.0))
+        position = hit_position(views.cameras, view, camera_direction, depth)
         heading = unit_heading(light_yaw[world])
         hit = read_hit(gbuffer, view, pixel[0], pixel[1])
-        normal = visible_normal(meshes, bodies, view, hit, views.instances, cameras.to_world[camera] * camera_direction)
-        packed_normal = pack_normal(wp.transpose(cameras.to_world[camera]) * normal)
+        normal = visible_normal(meshes, bodies, view, hit, views.instances, views.cameras.to_world[view] * camera_direction)
+        packed_normal = pack_normal(wp.transpose(views.cameras.to_world[view]) * normal)
         known, last = last_rays(history_inout, moving, views, view, slot, row, column, segment)
         traced = int(ALL_RAYS)
         if known:

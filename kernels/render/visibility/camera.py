@@ -33,6 +33,20 @@ class Cameras:
 
 
 @wp.struct
+class ViewCameras:
+    """Camera of each view of a batch, as `Cameras`: where it stands in the view's frame. Filled by `aim_cameras_kernel`."""
+
+    intrinsics: wp.array[wp.vec4]
+    """(view): fx, fy, cx, cy [px]."""
+    rotation: wp.array[wp.mat33d]
+    """(view): world to camera."""
+    center: wp.array[wp.vec3d]
+    """(view): optical centre in the world [m]."""
+    to_world: wp.array[wp.mat33]
+    """(view): camera to world, in float32 for the per-pixel kernels."""
+
+
+@wp.struct
 class ImageGrid:
     """Size of an image [px], tiles in a row of its grid, and tiles in the image."""
 
@@ -47,14 +61,16 @@ class ImageGrid:
 
 @wp.struct
 class Views:
-    """Views of a batch: world and camera of each (-1: not in use), number of views, instances per world. Rows from `count` on
-    are not read.
+    """Views of a batch: world and camera of each (-1: not in use), where the cameras stand, number of views, instances per world. Rows from
+    `count` on are not read.
     """
 
     world: wp.array[int]
     """(view); -1: the view is not in use."""
     camera: wp.array[int]
     """(view): row of `Cameras`; -1: the view is not in use."""
+    cameras: ViewCameras
+    """Camera of each view."""
     count: int
     """Views in the batch."""
     instances: int
@@ -97,20 +113,26 @@ def tile_of(grid: ImageGrid, row: int, column: int) -> int:
 
 
 @wp.func
-def camera_ray(intrinsics: wp.vec4, row: int, column: int, offset: wp.vec2) -> wp.vec3:
-    """Camera ray ((x - cx) / fx, (y - cy) / fy, 1) of a pixel in the camera's axes: its parameter is planar depth.
-
-    `offset` [px] from the pixel's centre; zero for depth, ids and masks.
-    """
+def pinhole_ray(intrinsics: wp.vec4, row: int, column: int, offset: wp.vec2) -> wp.vec3:
+    """Ray ((x - cx) / fx, (y - cy) / fy, 1) of a pixel, `offset` [px] from its centre, in the axes of a pinhole camera."""
     x = float(column) + PIXEL_CENTER + offset[0]
     y = float(row) + PIXEL_CENTER + offset[1]
     return wp.vec3((x - intrinsics[2]) / intrinsics[0], (y - intrinsics[3]) / intrinsics[1], 1.0)
 
 
 @wp.func
-def hit_position(cameras: Cameras, camera: int, ray: wp.vec3, depth: float) -> wp.vec3:
+def camera_ray(cameras: ViewCameras, view: int, row: int, column: int, offset: wp.vec2) -> wp.vec3:
+    """Camera ray (x, y, 1) of a pixel of a view in the camera's axes: its parameter is planar depth.
+
+    `offset` [px] from the pixel's centre; zero for depth, ids and masks.
+    """
+    return pinhole_ray(cameras.intrinsics[view], row, column, offset)
+
+
+@wp.func
+def hit_position(cameras: ViewCameras, view: int, ray: wp.vec3, depth: float) -> wp.vec3:
     """World position of a camera ray at a planar depth [m]."""
-    return wp.vec3(cameras.center[camera]) + cameras.to_world[camera] * (depth * ray)
+    return wp.vec3(cameras.center[view]) + cameras.to_world[view] * (depth * ray)
 
 
 @wp.func

@@ -9,7 +9,7 @@ import warp as wp
 
 from synpick_warp.codes import Segment
 from synpick_warp.kernels.render.visibility.bvh_rays import hit_table
-from synpick_warp.kernels.render.visibility.camera import Cameras, ImageGrid, Views, camera_ray, in_image, tile_pixel
+from synpick_warp.kernels.render.visibility.camera import ImageGrid, ViewCameras, Views, camera_ray, in_image, tile_pixel
 from synpick_warp.kernels.render.visibility.gbuffer import (
     FAR,
     MAX_COUNTS,
@@ -101,7 +101,7 @@ def amodal_bit(body: int, instances: int) -> wp.uint32:
 def rasterize_footprint(
     visibility: VisibilityBuffer,
     amodal: wp.array3d[wp.uint32],
-    intrinsics: wp.vec4,
+    cameras: ViewCameras,
     view: int,
     pixels: wp.vec4i,
     triangle: Triangle,
@@ -124,7 +124,7 @@ def rasterize_footprint(
             last = span[1]
         if column > last:
             break
-        ray = camera_ray(intrinsics, row, column, wp.vec2(0.0, 0.0))
+        ray = camera_ray(cameras, view, row, column, wp.vec2(0.0, 0.0))
         write_sample(visibility, amodal, view, row, column, triangle, ray, low_half, bit)
         column += 1
 
@@ -171,7 +171,6 @@ def clear_visibility_kernel(
 def rasterize_triangles_kernel(
     # Scene:
     meshes: Meshes,
-    cameras: Cameras,
     grid: ImageGrid,
     # In:
     bodies: ViewBodies,
@@ -199,7 +198,7 @@ def rasterize_triangles_kernel(
     box = bodies.box[view, body]
     if box[2] < 0 or box[3] < 0 or box[0] >= grid.width or box[1] >= grid.height:
         return
-    intrinsics = cameras.intrinsics[views.camera[view]]
+    intrinsics = views.cameras.intrinsics[view]
     mesh = bodies.mesh[view, body]
     bit = amodal_bit(body, views.instances)
     for k in range(index % threads, meshes.first_triangle[mesh + 1] - meshes.first_triangle[mesh], threads):
@@ -214,14 +213,13 @@ def rasterize_triangles_kernel(
                 listed = list_blocks(visibility_inout, view, rank, k, pixels)
             if not listed:
                 low_half = pack_low_half(body, k)
-                rasterize_footprint(visibility_inout, amodal_inout, intrinsics, view, pixels, triangle, footprint, low_half, bit)
+                rasterize_footprint(visibility_inout, amodal_inout, views.cameras, view, pixels, triangle, footprint, low_half, bit)
 
 
 @wp.kernel
 def rasterize_blocks_kernel(
     # Scene:
     meshes: Meshes,
-    cameras: Cameras,
     grid: ImageGrid,
     # In:
     bodies: ViewBodies,
@@ -242,7 +240,7 @@ def rasterize_blocks_kernel(
     camera = views.camera[view]
     if camera < 0:
         return
-    intrinsics = cameras.intrinsics[camera]
+    intrinsics = views.cameras.intrinsics[view]
     blocks = wp.min(visibility_inout.blocks[view], visibility_inout.block.shape[1])
     for i in range(index % threads, BLOCK_ROWS * blocks, threads):
         block = visibility_inout.block[view, i // BLOCK_ROWS]
@@ -254,7 +252,7 @@ def rasterize_blocks_kernel(
             pixels = wp.vec4i(block[3], row, wp.min(block[3] + BLOCK_COLUMNS - 1, footprint.pixels[2]), row)
             low_half = pack_low_half(body, block[1])
             bit = amodal_bit(body, views.instances)
-            rasterize_footprint(visibility_inout, amodal_inout, intrinsics, view, pixels, triangle, footprint, low_half, bit)
+            rasterize_footprint(visibility_inout, amodal_inout, views.cameras, view, pixels, triangle, footprint, low_half, bit)
 
 
 @wp.func
@@ -276,7 +274,6 @@ def resolve_visibility_kernel(
     # Scene:
     meshes: Meshes,
     table: Table,
-    cameras: Cameras,
     grid: ImageGrid,
     background: GBuffer,
     # In:
@@ -302,7 +299,7 @@ def resolve_visibility_kernel(
     camera = views.camera[view]
     if camera < 0:
         return
-    ray = camera_ray(cameras.intrinsics[camera], row, column, wp.vec2(0.0, 0.0))
+    ray = camera_ray(views.cameras, view, row, column, wp.vec2(0.0, 0.0))
     hit = Hit()
     hit.segment = Segment.NOTHING
     hit.depth = FAR
@@ -314,7 +311,7 @@ def resolve_visibility_kernel(
         if static_hit.segment != Segment.NOTHING and static_hit.depth < hit.depth:
             hit = static_hit
     else:
-        hit = hit_table(table, cameras, camera, ray, hit)
+        hit = hit_table(table, views.cameras, view, ray, hit)
     store_hit(gbuffer_out, view, row, column, hit)
     if instance_out:
         instance_out[view, row, column] = wp.uint8(hit.segment)

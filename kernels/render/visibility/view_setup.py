@@ -35,10 +35,26 @@ def aim_views_kernel(
 
 
 @wp.kernel
+def aim_cameras_kernel(
+    # Scene:
+    cameras: Cameras,
+    # Out:
+    views_inout: Views,
+):
+    """Set the camera of each view that is in use. Launched over view."""
+    view = wp.tid()
+    camera = views_inout.camera[view]
+    if camera >= 0:
+        views_inout.cameras.intrinsics[view] = cameras.intrinsics[camera]
+        views_inout.cameras.rotation[view] = cameras.rotation[camera]
+        views_inout.cameras.center[view] = cameras.center[camera]
+        views_inout.cameras.to_world[view] = cameras.to_world[camera]
+
+
+@wp.kernel
 def set_up_views_kernel(
     # Scene:
     meshes: Meshes,
-    cameras: Cameras,
     grid: ImageGrid,
     # State:
     catalog_index: wp.array2d[int],  # (world, instance)
@@ -56,7 +72,6 @@ def set_up_views_kernel(
     """
     view, body = wp.tid()
     world = views.world[view]
-    camera = views.camera[view]
     mesh = int(-1)
     placed = wp.transform_identity(dtype=float)
     if world < 0:
@@ -78,8 +93,8 @@ def set_up_views_kernel(
     q = wp.transform_get_rotation(placed)
     position = wp.vec3d(wp.float64(p[0]), wp.float64(p[1]), wp.float64(p[2]))
     rotation = wp.quat_to_matrix(wp.normalize(wp.quatd(wp.float64(q[0]), wp.float64(q[1]), wp.float64(q[2]), wp.float64(q[3]))))
-    to_camera = cameras.rotation[camera] * rotation
-    origin = cameras.rotation[camera] * (position - cameras.center[camera])
+    to_camera = views.cameras.rotation[view] * rotation
+    origin = views.cameras.rotation[view] * (position - views.cameras.center[view])
 
     c = meshes.center[mesh]
     center = wp.vec3d(wp.float64(c[0]), wp.float64(c[1]), wp.float64(c[2]))
@@ -91,7 +106,8 @@ def set_up_views_kernel(
     bodies_out.rotation[view, body] = wp.mat33(wp.transpose(to_camera))
     bodies_out.start[view, body] = wp.vec3(start)
     bodies_out.near[view, body] = near
-    bodies_out.box[view, body] = projected_box(meshes.lower[mesh], meshes.upper[mesh], to_camera, origin, cameras.intrinsics[camera], grid)
+    intrinsics = views.cameras.intrinsics[view]
+    bodies_out.box[view, body] = projected_box(meshes.lower[mesh], meshes.upper[mesh], to_camera, origin, intrinsics, grid)
     bodies_out.world_rotation[view, body] = wp.mat33(wp.transpose(rotation))
     bodies_out.position[view, body] = p
     bodies_out.sphere[view, body] = wp.vec4(float(sphere[0]), float(sphere[1]), float(sphere[2]), radius * radius)
@@ -157,7 +173,6 @@ def hits_box(lower: wp.vec3, upper: wp.vec3, start: wp.vec3, direction: wp.vec3)
 def bin_bodies_kernel(
     # Scene:
     meshes: Meshes,
-    cameras: Cameras,
     grid: ImageGrid,
     # In:
     views: Views,
@@ -173,12 +188,12 @@ def bin_bodies_kernel(
     camera = views.camera[view]
     mask = wp.uint64(0)
     if camera >= 0:
-        intrinsics = cameras.intrinsics[camera]
+        intrinsics = views.cameras.intrinsics[view]
         tile_row = tile // grid.tile_columns
         row = tile_row * TILE_HEIGHT
         column = (tile - tile_row * grid.tile_columns) * TILE_WIDTH
         middle = wp.vec2(0.5 * float(TILE_WIDTH) - PIXEL_CENTER, 0.5 * float(TILE_HEIGHT) - PIXEL_CENTER)
-        ray = camera_ray(intrinsics, row, column, middle)
+        ray = camera_ray(views.cameras, view, row, column, middle)
         spread = TILE_RADIUS / wp.min(intrinsics[0], intrinsics[1])
         for rank in range(bodies_inout.present[view]):
             body = bodies_inout.order[view, rank]

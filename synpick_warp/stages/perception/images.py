@@ -19,7 +19,7 @@ from synpick_warp.stages.launch import launch_pixels
 from synpick_warp.stages.perception.arrays import PerceptionArrays, SegmentationScratch
 from synpick_warp.stages.render.raster import Rasterizer, allocate_visibility
 from synpick_warp.stages.render.scene import RenderScene, build_cameras, build_grid
-from synpick_warp.stages.render.view_setup import GBUFFER, VIEW_BODIES, VIEWS, body_sizes, set_up_views
+from synpick_warp.stages.render.view_setup import GBUFFER, VIEW_BODIES, VIEW_CAMERAS, VIEWS, body_sizes, set_up_views
 
 CPU_BYTES = 512 * 2**20
 GPU_BYTES = 2 * 2**30
@@ -38,6 +38,7 @@ def allocate_batch(settings: schema.Perception, instances: int, views: int, devi
     sizes = {"view": views, "row": height, "column": width, "instance": instances, "point": settings.contour_points}
     sizes |= body_sizes(instances, width, height)
     views_of_worlds, bodies, gbuffer = (allocate_struct(kind, sizes, device) for kind in (VIEWS, VIEW_BODIES, GBUFFER))
+    views_of_worlds.cameras = allocate_struct(VIEW_CAMERAS, sizes, device)
     arrays, scratch = allocate(PerceptionArrays, sizes, device), allocate(SegmentationScratch, sizes, device)
     return views_of_worlds, bodies, gbuffer, arrays, scratch
 
@@ -105,7 +106,7 @@ class PerceptionImages:
         """Rasterize each view's world without gripper shaft and cup. Unused views keep their content."""
         scene, views = self.scene, self.views
         wp.launch(aim_views_kernel, dim=views.count, outputs=[views], device=scene.device)
-        set_up_views(scene, scene.cameras, scene.grid, snapshot, self.fixture_visible, views, self.bodies)
+        set_up_views(scene, snapshot, self.fixture_visible, views, self.bodies)
         self.rasterizer.rasterize(self.bodies, views, self.gbuffer)
-        inputs = [scene.meshes, scene.cameras, scene.grid, self.bodies, views]
+        inputs = [scene.meshes, scene.grid, self.bodies, views]
         launch_pixels(intersect_hits_kernel, self.pixels, inputs, [self.gbuffer], scene.device)

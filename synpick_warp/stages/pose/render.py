@@ -61,6 +61,6 @@ def render_object(scene: RenderScene, model: int, pose: Sequence[float] | np.nda
     sizes = {"view": count, "row": scene.height, "column": scene.width} | body_sizes(1, scene.width, scene.height)
     views = first_views(count, count, 1, device)
     bodies, gbuffer = allocate_struct(VIEW_BODIES, sizes, device), allocate_struct(GBUFFER, sizes, device)
-    set_up_views(scene, scene.cameras, scene.grid, world, world.fixture_visible, views, bodies)
+    set_up_views(scene, world, world.fixture_visible, views, bodies)
     Rasterizer(scene, 1.0, count, background=gbuffer).rasterize(bodies, views, gbuffer)
     return gbuffer

@@ -308,11 +308,11 @@ class DenoisedRenderer:
         scene, threads = self.scene, interleaved_threads(self.coarse.grid.width, self.coarse.grid.height)
         if self.history.max_paths > 0:
             self.path_lists.count.zero_()
-            inputs = [scene.paths, scene.cameras, self.coarse, snapshot.light, snapshot.light_yaw, bodies, gbuffer, views, self.moving]
+            inputs = [scene.paths, self.coarse, snapshot.light, snapshot.light_yaw, bodies, gbuffer, views, self.moving]
             outputs = [self.history, self.path_lists, self.guide, self.coarse_light]
             launch_views(reuse_histories_kernel, views.count, threads, inputs, outputs, scene.device)
         worlds = [snapshot.episode, snapshot.light, snapshot.light_yaw]
-        inputs = [scene.paths, scene.cameras, self.coarse, *worlds, bodies, gbuffer, views, self.path_lists, self.rules]
+        inputs = [scene.paths, self.coarse, *worlds, bodies, gbuffer, views, self.path_lists, self.rules]
         outputs = [self.queues, self.history, self.guide, self.coarse_light]
         if self.queues.count.shape[1] == 0:
             launch_pixels(trace_coarse_paths_kernel, views.count * threads, inputs, outputs, scene.device)
@@ -335,7 +335,7 @@ class DenoisedRenderer:
 
     def denoise(self, views: Any) -> None:
         """Filter visibility ratios: block means, choice of the kernel's width, smoothing."""
-        shared = [self.scene.cameras, self.coarse, self.guide]
+        shared = [self.coarse, self.guide]
         self._launch(filter_blocks_kernel, self.coarse.grid, views, [*shared, self.coarse_light, views], [self.blocks])
         self._launch(choose_widths_kernel, self.coarse.grid, views, [*shared, self.blocks, views, self.variance_scale], [self.chosen])
         self._launch(smooth_ratios_kernel, self.coarse.grid, views, [*shared, self.chosen, views], [self.ratios])
@@ -343,9 +343,9 @@ class DenoisedRenderer:
     def trace_shadows(self, snapshot: Snapshot, bodies: Any, gbuffer: Any, views: Any, radiance: wp.array) -> None:
         """Visibility of the lamps: shadow rays and filter on the shadow grid, rays from pixels at steep edges; see `trace_shadow_edges`."""
         scene, coarse, rays = self.scene, self.shadow_grid, self.shadow_rays.packed
-        inputs = [scene.meshes, scene.table, scene.cameras, coarse, scene.lights, snapshot.light, snapshot.light_yaw, bodies, gbuffer]
+        inputs = [scene.meshes, scene.table, coarse, scene.lights, snapshot.light, snapshot.light_yaw, bodies, gbuffer]
         self._launch(trace_shadow_rays_kernel, coarse.grid, views, [*inputs, views, self.moving], [self.history, rays])
-        inputs = [scene.meshes, scene.cameras, coarse, scene.lights, snapshot.light, bodies, gbuffer, rays, views]
+        inputs = [scene.meshes, coarse, scene.lights, snapshot.light, bodies, gbuffer, rays, views]
         self._launch(filter_shadows_kernel, coarse.grid, views, inputs, [self.shadows])
         self._launch(measure_steepness_kernel, coarse.grid, views, inputs, [self.shadows])
         self.trace_shadow_edges(snapshot, bodies, gbuffer, views, radiance)
@@ -360,19 +360,19 @@ class DenoisedRenderer:
         launch_views(list_edge_cells_kernel, views.count, coarse.grid.tiles * int(TILE_PIXELS), [coarse, views], outputs, device)
         threads = EDGE_THREADS if device.is_cuda else CPU_EDGE_THREADS
         sharing = lists.count.shape[1] * threads
-        inputs = [scene.meshes, scene.cameras, coarse, bodies, gbuffer, views, threads]
+        inputs = [scene.meshes, coarse, bodies, gbuffer, views, threads]
         launch_views(list_edge_pixels_kernel, views.count, sharing, inputs, outputs, device)
-        inputs = [scene.meshes, scene.table, scene.cameras, coarse, scene.lights, snapshot.light, snapshot.light_yaw, bodies, gbuffer]
+        inputs = [scene.meshes, scene.table, coarse, scene.lights, snapshot.light, snapshot.light_yaw, bodies, gbuffer]
         inputs += [lists, views, threads]
         launch_pixels(trace_shadow_edges_kernel, views.count * sharing, inputs, [self.shadows], device)
-        inputs = [scene.meshes, scene.cameras, coarse, scene.lights, snapshot.light, bodies, gbuffer, lists, self.shadows]
+        inputs = [scene.meshes, coarse, scene.lights, snapshot.light, bodies, gbuffer, lists, self.shadows]
         inputs += [views, threads]
         launch_pixels(filter_shadow_edges_kernel, views.count * sharing, inputs, [radiance], device)
 
     def shade_pixels(self, snapshot: Snapshot, bodies: Any, gbuffer: Any, views: Any, radiance: wp.array) -> None:
         """Deferred shading: radiance of each pixel."""
         scene = self.scene
-        inputs = [scene.paths, scene.cameras, self.coarse, self.shadow_grid, snapshot.light, snapshot.light_yaw, bodies, gbuffer]
+        inputs = [scene.paths, self.coarse, self.shadow_grid, snapshot.light, snapshot.light_yaw, bodies, gbuffer]
         inputs += [self.ratios, self.shadows, views]
         self._launch(self.shade_kernel, scene.grid, views, inputs, [radiance])
 
@@ -382,12 +382,12 @@ class DenoisedRenderer:
         scene, lists = self.scene, self.footprint_lists
         lists.count.zero_()
         # Atomics of a launch on the CPU hold in one thread alone, so these are not cut into pieces.
-        inputs = [scene.cameras, scene.grid, self.footprints, gbuffer, image.radiance, views]
+        inputs = [scene.grid, self.footprints, gbuffer, image.radiance, views]
         outputs = [image.resolve, lists.footprint, lists.count]
         footprints = views.count * self.footprints.tiles * int(TILE_PIXELS)
         wp.launch(find_footprints_kernel, dim=footprints, inputs=inputs, outputs=outputs, device=scene.device, block_dim=PIXEL_BLOCK)
         threads = FOOTPRINT_THREADS if scene.device.is_cuda else CPU_FOOTPRINT_THREADS
-        inputs = [scene.meshes, scene.table, scene.cameras, scene.grid, self.footprints, bodies, gbuffer, lists.footprint, lists.count]
+        inputs = [scene.meshes, scene.table, scene.grid, self.footprints, bodies, gbuffer, lists.footprint, lists.count]
         inputs += [views, image.samples, threads]
         samples = views.count * lists.count.shape[1] * threads
         wp.launch(

@@ -87,10 +87,10 @@ class LayerRenderer:
         scene = self.scene
         if self.motions is not None:
             self.compute_motions(snapshot, views)
-        surface = [scene.meshes, scene.surfaces, scene.cameras, scene.grid, bodies, gbuffer, views]
-        sensor = [scene.meshes, scene.surfaces, scene.cameras, scene.grid, snapshot.episode, snapshot.frame]
+        surface = [scene.meshes, scene.surfaces, scene.grid, bodies, gbuffer, views]
+        sensor = [scene.meshes, scene.surfaces, scene.grid, snapshot.episode, snapshot.frame]
         sensor += [self.sensor, bodies, gbuffer, views]
-        motion = [scene.cameras, scene.grid, snapshot.follows, self.motions, gbuffer, views]
+        motion = [scene.grid, snapshot.follows, self.motions, gbuffer, views]
         objects = [scene.meshes, scene.grid, bodies, gbuffer, views]
         classes = [scene.grid, scene.obj_id, bodies, gbuffer, views]
         count = views.count
@@ -108,7 +108,7 @@ class LayerRenderer:
 
     def compute_motions(self, snapshot: Snapshot, views: Any) -> None:
         """Compute the motion of every body from this frame back to the previous one."""
-        inputs = [self.scene.cameras, snapshot.catalog_index, snapshot.pose, snapshot.fixture_pose, snapshot.follows]
+        inputs = [snapshot.catalog_index, snapshot.pose, snapshot.fixture_pose, snapshot.follows]
         inputs += [snapshot.last_catalog_index, snapshot.last_pose, snapshot.last_fixture_pose, snapshot.last_fixture_visible, views]
         dim = (views.count, self.motions.known.shape[1])
         wp.launch(compute_motions_kernel, dim=dim, inputs=inputs, outputs=[self.motions], device=self.scene.device)

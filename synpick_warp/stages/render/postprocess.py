@@ -92,12 +92,12 @@ class PostProcessor:
         inputs = [snapshot.episode, snapshot.frame, self.effects, views]
         wp.launch(sample_effects_kernel, dim=views.count, inputs=inputs, outputs=[out.effects], device=scene.device)
         if self.filtered is not None:
-            inputs = [scene.cameras, scene.grid, out.effects, views, image]
+            inputs = [scene.grid, out.effects, views, image]
             self._launch(filter_lens_rows_kernel, views.count, inputs, self.filtered)
             filtered = ShadedImage()
             filtered.radiance, filtered.resolve, filtered.samples = self.filtered, image.resolve, image.samples
             image = filtered
-        inputs = [scene.cameras, scene.grid, scene.lights, snapshot.episode, snapshot.frame, snapshot.light, snapshot.light_exposure]
+        inputs = [scene.grid, scene.lights, snapshot.episode, snapshot.frame, snapshot.light, snapshot.light_exposure]
         inputs += [self.settings, out.effects, views, image]
         self._launch(postprocess_effects_kernel, views.count, inputs, out.color)
 

@@ -75,12 +75,12 @@ class Rasterizer:
         pixels = views.count * scene.grid.tiles * int(TILE_PIXELS)
         instance, depth, amodal = (None, None, None) if out is None else (out.instance, out.depth, out.amodal)
         launch_pixels(clear_visibility_kernel, pixels, [scene.grid, views], [visibility, amodal], device)
-        inputs = [scene.meshes, scene.cameras, scene.grid, bodies, views]
+        inputs = [scene.meshes, scene.grid, bodies, views]
         per_body, per_view = (TRIANGLE_THREADS, BLOCK_THREADS) if device.is_cuda else (1, 1)
         threads = bodies.mesh.shape[1] * per_body
         launch_views(rasterize_triangles_kernel, views.count, threads, [*inputs, per_body], [visibility, amodal], device)
         launch_views(rasterize_blocks_kernel, views.count, per_view, [*inputs, per_view], [visibility, amodal], device)
-        inputs = [scene.meshes, scene.table, scene.cameras, scene.grid, self.background, bodies, visibility, views, self.counts_per_meter]
+        inputs = [scene.meshes, scene.table, scene.grid, self.background, bodies, visibility, views, self.counts_per_meter]
         launch_pixels(resolve_visibility_kernel, pixels, inputs, [gbuffer, instance, depth], device)
 
 
@@ -93,7 +93,7 @@ def render_background(scene: RenderScene, gbuffer: Any) -> None:
     tote = wp.array([[1, 0, 0]], dtype=wp.int32, device=device)
     views = first_views(cameras, cameras, 0, device)
     bodies = allocate_struct(VIEW_BODIES, sizes, device)
-    set_up_views(scene, scene.cameras, scene.grid, world, tote, views, bodies)
+    set_up_views(scene, world, tote, views, bodies)
     # The background itself must be rasterized.
     bodies.uses_background.zero_()
     Rasterizer(scene, 1.0, cameras, background=gbuffer).rasterize(bodies, views, gbuffer)

@@ -16,7 +16,7 @@ from synpick_warp.stages.render.postprocess import PostProcessor
 from synpick_warp.stages.render.raster import Rasterizer
 from synpick_warp.stages.render.reference import ReferenceRenderer
 from synpick_warp.stages.render.scene import RenderScene
-from synpick_warp.stages.render.view_setup import GBUFFER, VIEW_BODIES, body_sizes, set_up_views
+from synpick_warp.stages.render.view_setup import GBUFFER, VIEW_BODIES, VIEW_CAMERAS, body_sizes, set_up_views
 from synpick_warp.stages.timing import scope
 
 SHADED_IMAGE = struct_arrays(ShadedImage, "view", "row", "column")
@@ -31,6 +31,7 @@ class Renderer:
     Attributes:
         instances: Instance capacity of a world.
         views: Maximum number of views of a batch.
+        cameras: The struct `ViewCameras` of the last batch.
         bodies: The struct `ViewBodies` of the last batch.
         gbuffer: The struct `GBuffer` of the last batch.
         image: The struct `ShadedImage` of the last batch: linear radiance.
@@ -66,6 +67,7 @@ class Renderer:
         self.scene = scene
         self.instances = instances
         self.views = views
+        self.cameras = allocate_struct(VIEW_CAMERAS, sizes, scene.device)
         self.bodies = allocate_struct(VIEW_BODIES, sizes, scene.device)
         self.gbuffer = allocate_struct(GBUFFER, sizes, scene.device)
         self.image = allocate_struct(SHADED_IMAGE, sizes, scene.device)
@@ -84,7 +86,7 @@ class Renderer:
 
         Args:
             snapshot: State of the worlds.
-            views: The struct `Views`.
+            views: The struct `Views`; its cameras are set.
             out: Written.
             layers: Written; None: no layers.
 
@@ -110,7 +112,8 @@ class Renderer:
     def render_gbuffer(self, snapshot: Snapshot, views: Any, out: ViewBuffers) -> None:
         """First part of `render`: the G-buffer, and the images of depth, instances and amodal bits."""
         scene = self.scene
+        views.cameras = self.cameras
         with scope("set up views", scene.device):
-            set_up_views(scene, scene.cameras, scene.grid, snapshot, snapshot.fixture_visible, views, self.bodies)
+            set_up_views(scene, snapshot, snapshot.fixture_visible, views, self.bodies)
         with scope("rasterize", scene.device):
             self.rasterizer.rasterize(self.bodies, views, self.gbuffer, out)

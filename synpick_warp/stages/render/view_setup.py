@@ -7,11 +7,11 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from synpick_warp.kernels.render.visibility.camera import Views
+from synpick_warp.kernels.render.visibility.camera import ViewCameras, Views
 from synpick_warp.kernels.render.visibility.gbuffer import GBuffer, ViewBodies
 from synpick_warp.kernels.render.visibility.ray_bodies import RAY_RECORDS
-from synpick_warp.kernels.render.visibility.view_setup import bin_bodies_kernel, set_up_views_kernel, sort_bodies_kernel
-from synpick_warp.stages.arrays import struct_arrays
+from synpick_warp.kernels.render.visibility.view_setup import aim_cameras_kernel, bin_bodies_kernel, set_up_views_kernel, sort_bodies_kernel
+from synpick_warp.stages.arrays import allocate_struct, struct_arrays
 from synpick_warp.stages.buffers import FIXTURES, Snapshot
 from synpick_warp.stages.render.scene import RenderScene, build_grid
 
@@ -26,6 +26,7 @@ VIEW_BODIES = struct_arrays(
     units={"start": "m", "near": "m", "box": "px", "position": "m", "sphere": "m, m²"},
 )
 VIEWS = struct_arrays(Views, "view")
+VIEW_CAMERAS = struct_arrays(ViewCameras, "view", units={"intrinsics": "px", "center": "m"})
 GBUFFER = struct_arrays(GBuffer, "view", "row", "column", units={"depth": "m"})
 BACKGROUND = struct_arrays(GBuffer, "camera", "row", "column", units={"depth": "m"})
 
@@ -35,7 +36,7 @@ def pair_views(worlds: np.ndarray, cameras: np.ndarray) -> tuple[np.ndarray, np.
     return np.repeat(worlds, len(cameras)).astype(np.int32), np.tile(cameras, len(worlds)).astype(np.int32)
 
 
-def make_views(world: wp.array, camera: wp.array, count: int, instances: int) -> Any:
+def make_views(world: wp.array, camera: wp.array, count: int, instances: int, cameras: Any = None) -> Any:
     """The struct `Views`.
 
     Args:
@@ -43,9 +44,12 @@ def make_views(world: wp.array, camera: wp.array, count: int, instances: int) ->
         camera: Camera of each view (view) int32.
         count: Views in the batch; arrays may be longer.
         instances: Instance capacity of a world.
+        cameras: The struct `ViewCameras`; None: the renderer brings its own.
     """
     views = Views()
     views.world, views.camera, views.count, views.instances = world, camera, count, instances
+    if cameras is not None:
+        views.cameras = cameras
     return views
 
 
@@ -53,7 +57,7 @@ def first_views(count: int, cameras: int, instances: int, device: wp.Device) -> 
     """The struct `Views` of the first views, world by world and camera by camera; arguments as of `make_views`, and number of cameras."""
     view = np.arange(count, dtype=np.int32)
     world, camera = (wp.array(values, dtype=wp.int32, device=device) for values in (view // cameras, view % cameras))
-    return make_views(world, camera, count, instances)
+    return make_views(world, camera, count, instances, allocate_struct(VIEW_CAMERAS, {"view": count}, device))
 
 
 def body_sizes(instances: int, width: int, height: int) -> dict[str, int]:
@@ -63,27 +67,24 @@ def body_sizes(instances: int, width: int, height: int) -> dict[str, int]:
 
 def set_up_views(
     scene: RenderScene,
-    cameras: Any,
-    grid: Any,
     snapshot: Snapshot,
     fixture_visible: wp.array,
     views: Any,
     bodies: Any,
 ) -> None:
-    """Transform the bodies of each view into its camera's axes, sort them front to back and bin them into tiles.
+    """Set each view's camera, transform the bodies into its axes, sort them front to back and bin them into tiles.
 
     Args:
-        scene: Constant data, but for the cameras.
-        cameras: The struct `Cameras`.
-        grid: The struct `ImageGrid` of their images.
+        scene: Constant data.
         snapshot: The worlds.
         fixture_visible: Which fixtures are visible (world, fixture) int32.
-        views: The struct `Views`.
+        views: The struct `Views`; its cameras are written.
         bodies: The struct `ViewBodies`; written.
     """
+    wp.launch(aim_cameras_kernel, dim=views.count, inputs=[scene.cameras], outputs=[views], device=scene.device)
     dim = (views.count, bodies.mesh.shape[1])
-    inputs = [scene.meshes, cameras, grid, snapshot.catalog_index, snapshot.pose, snapshot.fixture_pose, fixture_visible, views]
+    inputs = [scene.meshes, scene.grid, snapshot.catalog_index, snapshot.pose, snapshot.fixture_pose, fixture_visible, views]
     wp.launch(set_up_views_kernel, dim=dim, inputs=inputs, outputs=[bodies], device=scene.device)
     wp.launch(sort_bodies_kernel, dim=dim, inputs=[scene.meshes], outputs=[bodies], device=scene.device)
-    inputs = [scene.meshes, cameras, grid, views]
-    wp.launch(bin_bodies_kernel, dim=(views.count, grid.tiles), inputs=inputs, outputs=[bodies], device=scene.device)
+    inputs = [scene.meshes, scene.grid, views]
+    wp.launch(bin_bodies_kernel, dim=(views.count, scene.grid.tiles), inputs=inputs, outputs=[bodies], device=scene.device)

@@ -11,7 +11,7 @@ from synpick_warp.kernels.render.images.ground_truth import expand_masks_kernel,
 from synpick_warp.kernels.render.visibility.camera import Cameras
 from synpick_warp.stages.arrays import allocate
 from synpick_warp.stages.online.batches import TruthBuffers
-from synpick_warp.stages.render.view_setup import make_views
+from tests.harness.aimed_views import aimed_views
 
 WORLDS, ROOM, CAMERAS, VIEWS = 4, 3, 2, 7
 WORLD = np.array([3, 3, 0, 1, 2, 2, 1], np.int32)
@@ -28,12 +28,12 @@ def gather(device: wp.Device, rotation: np.ndarray, center: np.ndarray, entry: n
     cameras.center = wp.array(center, dtype=wp.vec3d, device=device)
     index = np.arange(WORLDS, dtype=np.int32)
     episode, frame = (wp.array(values, dtype=wp.int32, device=device) for values in (20 + index, 2 * index))
-    views = make_views(*(wp.array(values, dtype=wp.int32, device=device) for values in (WORLD, CAMERA)), VIEWS, ROOM)
+    cameras.to_world = wp.zeros(CAMERAS, dtype=wp.mat33, device=device)
+    views = aimed_views(WORLD, CAMERA, ROOM, cameras, device)
     out = allocate(TruthBuffers, {"view": VIEWS, "instance": ROOM}, device)
     outputs = [out.episode, out.camera, out.frame, out.intrinsics, out.world_to_camera]
-    wp.launch(gather_cameras_kernel, dim=VIEWS, inputs=[cameras, episode, frame, views], outputs=outputs, device=device)
+    wp.launch(gather_cameras_kernel, dim=VIEWS, inputs=[episode, frame, views], outputs=outputs, device=device)
     inputs = [
-        cameras,
         wp.array(OBJECT_IDS, dtype=wp.int32, device=device),
         wp.array(entry, dtype=wp.int32, device=device),
         wp.array(pose, dtype=wp.transformf, device=device),

@@ -23,8 +23,8 @@ from synpick_warp.kernels.render.lighting.environment import Lights
 from synpick_warp.scenes.assets.appearance import linear_to_srgb, srgb_to_linear
 from synpick_warp.stages.render.postprocess import PostProcessor
 from synpick_warp.stages.render.scene import build_cameras, build_grid
-from synpick_warp.stages.render.view_setup import make_views
 from synpick_warp.system.hardware.device import pick_device
+from tests.harness.aimed_views import aimed_views
 from tests.harness.devices import default_device
 from tests.harness.memory_tables import device_arrays
 from tests.worlds.toy_scene import UPRIGHT, ToyScene, box, camera, entry, render
@@ -59,9 +59,7 @@ def postprocess(radiance: np.ndarray, config: Config, at: ViewKeys = ONE, stops:
     lights = Lights()
     lights.exposure = wp.array([GAIN], dtype=wp.float32, device=device)
     height, width = radiance.shape[:2]
-    scene = SimpleNamespace(
-        cameras=build_cameras((lens,) * 9, device), grid=build_grid(width, height), lights=lights, width=width, height=height, device=device
-    )
+    scene = SimpleNamespace(grid=build_grid(width, height), lights=lights, width=width, height=height, device=device)
 
     def device_array(values: list[Any], kind: Any = wp.int32) -> wp.array:
         return wp.array(values, dtype=kind, device=device)
@@ -79,7 +77,7 @@ def postprocess(radiance: np.ndarray, config: Config, at: ViewKeys = ONE, stops:
     image = ShadedImage()
     image.radiance = wp.array(np.repeat(radiance[None] / GAIN, views, axis=0), dtype=wp.vec3, device=device)
     image.resolve = wp.zeros((views, height, width), dtype=wp.uint32, device=device)
-    batch = make_views(device_array(list(range(views))), device_array(at.camera), views, 0)
+    batch = aimed_views(range(views), at.camera, 0, build_cameras((lens,) * 9, device), device)
     PostProcessor(config.effects, config.render.tone, config.bake.seed, scene, views).process(world, batch, image, out)
     return out.color.numpy(), out.effects.numpy()
 

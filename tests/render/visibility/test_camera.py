@@ -8,7 +8,7 @@ import warp as wp
 from hypothesis import given
 from hypothesis import strategies as st
 
-from synpick_warp.kernels.render.visibility.camera import ImageGrid, camera_ray, in_image, projected_box, tile_pixel
+from synpick_warp.kernels.render.visibility.camera import ImageGrid, in_image, pinhole_ray, projected_box, tile_pixel
 from synpick_warp.stages.render.scene import build_grid
 from tests.harness.devices import default_device
 from tests.harness.probe import probe
@@ -24,7 +24,7 @@ def visit_pixel(grid: ImageGrid, visits: wp.array3d[int], index: int):
         wp.atomic_add(visits, view, row, column, 1)
 
 
-visit, ray_of, box_of = probe(visit_pixel), probe(camera_ray), probe(projected_box)
+visit, ray_of, box_of = probe(visit_pixel), probe(pinhole_ray), probe(projected_box)
 
 
 def project(lower, upper, rotation, position):

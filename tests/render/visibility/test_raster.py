@@ -35,7 +35,7 @@ def gbuffer_of(toy: ToyScene, device: wp.Device, by_rays: bool = False) -> dict[
     out, renderer = render_gbuffer(toy, device)
     if by_rays:
         zero = wp.zeros(1, dtype=wp.int32, device=device)
-        trace_gbuffer(renderer.scene, renderer.bodies, make_views(zero, zero, 1, toy.instances), renderer.gbuffer, 1)
+        trace_gbuffer(renderer.scene, renderer.bodies, make_views(zero, zero, 1, toy.instances, renderer.cameras), renderer.gbuffer, 1)
     found = {name: getattr(renderer.gbuffer, name).numpy()[0].copy() for name in ("segment", "triangle", "barycentric", "depth")}
     return found | {"amodal": out.amodal.numpy()[0].copy()}
 

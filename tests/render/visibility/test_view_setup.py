@@ -42,7 +42,7 @@ def test_tile_body_masks_are_conservative(device, seed):
     expected = {name: getattr(out, name).numpy().copy() for name in ("instance", "depth", "amodal")}
     renderer.bodies.body_mask.fill_(wp.uint64((1 << 14) - 1))
     zero = wp.zeros(1, dtype=wp.int32, device=device)
-    renderer.rasterizer.rasterize(renderer.bodies, make_views(zero, zero, 1, toy.instances), renderer.gbuffer, out)
+    renderer.rasterizer.rasterize(renderer.bodies, make_views(zero, zero, 1, toy.instances, renderer.cameras), renderer.gbuffer, out)
     for name, image in expected.items():
         np.testing.assert_array_equal(image, getattr(out, name).numpy())
     counts = np.array([int(value).bit_count() for value in masks])

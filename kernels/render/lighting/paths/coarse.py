@@ -39,7 +39,7 @@ from synpick_warp.kernels.render.lighting.paths.tracing import (
     next_vertex,
 )
 from synpick_warp.kernels.render.lighting.unoccluded import unoccluded_light
-from synpick_warp.kernels.render.visibility.camera import Cameras, Views, in_image
+from synpick_warp.kernels.render.visibility.camera import Views, in_image
 from synpick_warp.kernels.render.visibility.gbuffer import GBuffer, ViewBodies
 from synpick_warp.kernels.render.visibility.records import write_record
 from synpick_warp.kernels.rng import stream_key
@@ -220,7 +220,6 @@ def make_path_pixel(
 @wp.func
 def trace_pixel(
     scene: PathScene,
-    cameras: Cameras,
     coarse: CoarseGrid,
     episode: wp.array[int],
     light: wp.array[int],
@@ -258,12 +257,12 @@ def trace_pixel(
     if queued != (samples == 1 and regions > 0):
         return
     cell = flat_index(coarse.grid, view, row, column)
-    surface = coarse_surface(cameras, coarse, gbuffer, view, camera, row, column)
+    surface = coarse_surface(views.cameras, coarse, gbuffer, view, row, column)
     if surface.hit.segment == Segment.NOTHING:
         write_record(guide_out.surface, cell, wp.vec4())
         return
     vertex = make_vertex(scene, bodies, view, views.instances, surface.hit, surface.position, surface.outgoing, surface.width, 0.0)
-    write_guide(guide_out, cameras.to_world[camera], cell, surface.hit, vertex.brdf.normal)
+    write_guide(guide_out, views.cameras.to_world[view], cell, surface.hit, vertex.brdf.normal)
     context = make_context(scene, coarse, rules, views, view, row, column, episode[world], light[world], light_yaw[world])
     beginning = wp.where(known > 0, rules.first_samples, samples)
     number = first_path_index(beginning, row, column, path_number(history_frame(history, slot, known), bits), known > 0)
@@ -284,7 +283,6 @@ def trace_pixel(
 def trace_coarse_paths_kernel(
     # Scene:
     scene: PathScene,
-    cameras: Cameras,
     coarse: CoarseGrid,
     # State: worlds
     episode: wp.array[int],  # (world)
@@ -311,7 +309,6 @@ def trace_coarse_paths_kernel(
     """
     trace_pixel(
         scene,
-        cameras,
         coarse,
         episode,
         light,
@@ -334,7 +331,6 @@ def trace_coarse_paths_kernel(
 def start_paths_kernel(
     # Scene:
     scene: PathScene,
-    cameras: Cameras,
     coarse: CoarseGrid,
     # State: worlds
     episode: wp.array[int],  # (world)
@@ -360,7 +356,6 @@ def start_paths_kernel(
     """
     trace_pixel(
         scene,
-        cameras,
         coarse,
         episode,
         light,

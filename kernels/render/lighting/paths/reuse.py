@@ -18,7 +18,7 @@ from synpick_warp.kernels.render.lighting.paths.lists import PathLists, append_p
 from synpick_warp.kernels.render.lighting.paths.surface import coarse_surface, write_guide
 from synpick_warp.kernels.render.lighting.paths.tracing import PathScene, make_vertex
 from synpick_warp.kernels.render.lighting.unoccluded import unoccluded_light
-from synpick_warp.kernels.render.visibility.camera import Cameras, Views, in_image
+from synpick_warp.kernels.render.visibility.camera import Views, in_image
 from synpick_warp.kernels.render.visibility.gbuffer import GBuffer, ViewBodies
 from synpick_warp.kernels.render.visibility.records import write_record
 from synpick_warp.kernels.tuning import RAY_REGISTERS
@@ -30,7 +30,6 @@ wp.set_module_options({"enable_backward": False, "fast_math": True})
 def reuse_histories_kernel(
     # Scene:
     scene: PathScene,
-    cameras: Cameras,
     coarse: CoarseGrid,
     # State: worlds
     light: wp.array[int],  # (world)
@@ -58,7 +57,7 @@ def reuse_histories_kernel(
         return
     cell = flat_index(coarse.grid, view, row, column)
     camera, world = views.camera[view], views.world[view]
-    surface = coarse_surface(cameras, coarse, gbuffer, view, camera, row, column)
+    surface = coarse_surface(views.cameras, coarse, gbuffer, view, row, column)
     slot = world * history_inout.cameras + camera
     if surface.hit.segment == Segment.NOTHING:
         write_record(guide_out.surface, cell, wp.vec4())
@@ -73,4 +72,4 @@ def reuse_histories_kernel(
     unoccluded = unoccluded_light(scene.lights, light[world], light_yaw[world], vertex.brdf)
     exposure = scene.lights.exposure[light[world]]
     store_light(coarse_light_out, cell, read_history(history_inout, slot, row, column), scale_light(unoccluded, exposure))
-    write_guide(guide_out, cameras.to_world[camera], cell, surface.hit, vertex.brdf.normal)
+    write_guide(guide_out, views.cameras.to_world[view], cell, surface.hit, vertex.brdf.normal)

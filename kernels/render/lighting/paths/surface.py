@@ -3,7 +3,7 @@
 import warp as wp
 
 from synpick_warp.kernels.render.lighting.coarse_grid import CoarseGrid, Guide, middle_pixel, pack_surface
-from synpick_warp.kernels.render.visibility.camera import Cameras, camera_ray, hit_position
+from synpick_warp.kernels.render.visibility.camera import ViewCameras, camera_ray, hit_position
 from synpick_warp.kernels.render.visibility.gbuffer import GBuffer, Hit, read_hit
 from synpick_warp.kernels.render.visibility.records import write_record
 
@@ -24,17 +24,17 @@ class CoarseSurface:
 
 
 @wp.func
-def coarse_surface(cameras: Cameras, coarse: CoarseGrid, gbuffer: GBuffer, view: int, camera: int, row: int, column: int) -> CoarseSurface:
+def coarse_surface(cameras: ViewCameras, coarse: CoarseGrid, gbuffer: GBuffer, view: int, row: int, column: int) -> CoarseSurface:
     """Surface that a coarse pixel shows: hit, position, direction to the camera and footprint, read from the G-buffer at its
     middle pixel.
     """
     pixel = middle_pixel(coarse, row, column)
-    ray = camera_ray(cameras.intrinsics[camera], pixel[0], pixel[1], wp.vec2(0.0, 0.0))
+    ray = camera_ray(cameras, view, pixel[0], pixel[1], wp.vec2(0.0, 0.0))
     surface = CoarseSurface()
     surface.hit = read_hit(gbuffer, view, pixel[0], pixel[1])
-    surface.position = hit_position(cameras, camera, ray, surface.hit.depth)
-    surface.outgoing = -wp.normalize(cameras.to_world[camera] * ray)
-    surface.width = float(coarse.size) * surface.hit.depth / cameras.intrinsics[camera][0]
+    surface.position = hit_position(cameras, view, ray, surface.hit.depth)
+    surface.outgoing = -wp.normalize(cameras.to_world[view] * ray)
+    surface.width = float(coarse.size) * surface.hit.depth / cameras.intrinsics[view][0]
     return surface
 
 

@@ -21,7 +21,7 @@ from synpick_warp.kernels.render.lighting.sampling import (
     scrambled_point,
 )
 from synpick_warp.kernels.render.visibility.bvh_rays import RAY_OFFSET, hit_table, is_blocked, trace_camera_ray, trace_ray
-from synpick_warp.kernels.render.visibility.camera import Cameras, ImageGrid, Views, camera_ray, hit_position, in_image, tile_of, tile_pixel
+from synpick_warp.kernels.render.visibility.camera import ImageGrid, Views, camera_ray, hit_position, in_image, tile_of, tile_pixel
 from synpick_warp.kernels.render.visibility.gbuffer import FAR, Hit, Meshes, Table, ViewBodies, body_of
 from synpick_warp.kernels.rng import mix, stream_key
 
@@ -323,7 +323,6 @@ def extend_path(
 def trace_paths_kernel(
     # Scene:
     scene: PathScene,
-    cameras: Cameras,
     grid: ImageGrid,
     # State: worlds
     episode: wp.array[int],  # (world)
@@ -355,18 +354,18 @@ def trace_paths_kernel(
     context.yaw = light_yaw[world]
     pixel = (camera * grid.height + row) * grid.width + column
     context.key = mix(stream_key(rules.seed, episode[world], 0, Stream.PATHS) ^ wp.uint64(pixel))
-    footprint = 1.0 / (cameras.intrinsics[camera][0] * wp.sqrt(float(rules.samples)))
+    footprint = 1.0 / (views.cameras.intrinsics[view][0] * wp.sqrt(float(rules.samples)))
     total = wp.vec3(0.0, 0.0, 0.0)
     for index in range(rules.samples):
         offset = scrambled_point(context.key, index, 0) - wp.vec2(0.5, 0.5)
-        ray = camera_ray(cameras.intrinsics[camera], row, column, offset)
+        ray = camera_ray(views.cameras, view, row, column, offset)
         hit = trace_camera_ray(scene.meshes, bodies, view, tile_of(grid, row, column), ray, views.instances)
-        hit = hit_table(scene.table, cameras, camera, ray, hit)
-        direction = wp.normalize(cameras.to_world[camera] * ray)
+        hit = hit_table(scene.table, views.cameras, view, ray, hit)
+        direction = wp.normalize(views.cameras.to_world[view] * ray)
         if hit.segment == Segment.NOTHING:
             total += environment_radiance(scene.lights, context.light, rotate_z(direction, -context.yaw))
         else:
-            start = hit_position(cameras, camera, ray, hit.depth)
+            start = hit_position(views.cameras, view, ray, hit.depth)
             width = footprint * hit.depth
             vertex = make_vertex(scene, bodies, view, views.instances, hit, start, -direction, width, 0.0)
             diffuse = vertex.brdf.diffuse
