@@ -168,6 +168,12 @@ def _depth_sensor(sensor: DepthSensor, cameras: Cameras, tote: Tote) -> Iterator
         near, far = max(0.0, min(depths)), max(depths)
         if sensor.distances[1] < near or sensor.distances[0] > far:
             yield "depth_sensor.distances", f"a range that reaches the tote, {near:.3g} to {far:.3g} m from camera {index} [m]"
+        if focal * sensor.baseline > far * sensor.max_disparity > 0.0:
+            most = sensor.max_disparity * far / focal
+            yield (
+                "depth_sensor.baseline",
+                f"at most {most:.3g}, so that the tote's disparity is within max_disparity; or a shorter lens [m]",
+            )
         if focal * sensor.baseline < sensor.disparity_step * far:
             least = sensor.disparity_step * far / focal
             yield "depth_sensor.baseline", f"at least {least:.3g}, so that the disparity of the tote is a disparity_step or more [m]"

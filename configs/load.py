@@ -10,6 +10,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from synpick_warp.configs.calibration.sensor_presets import sensor_settings
 from synpick_warp.configs.check import check_value
 from synpick_warp.configs.consistency import find_conflicts
 from synpick_warp.configs.schema import Bake, Bop, Config, ObjectRow
@@ -97,8 +98,9 @@ def override_config(config: Config, settings: Mapping[str, object], source: str 
         section, _, name = key.partition(".")
         if section == SPLITS or (config.splits and key in _OF_SPLITS):
             raise ConfigError(f"{key} is set {source}, but the configuration has its splits already; pass it to load_config")
-        values |= _section_values(section, {name: value}, source)
-        config = config.with_values({key: values[key][0]})
+        found = _section_values(section, {name: value}, source)
+        values |= found
+        config = config.with_values({name: pair[0] for name, pair in found.items()})
     _check_conflicts(config, values)
     return config
 
@@ -221,6 +223,8 @@ def _section_values(section: str, content: Mapping[str, Any], source: str) -> Va
     """Checked values of a section by key, with their source."""
     _check_section(section, source)
     values: Values = {}
+    if section == "depth_sensor":
+        content = sensor_settings(str(content.get("preset", ""))) | dict(content)
     for name, value in content.items():
         key = f"{section}.{name}"
         item, annotation = _setting(section, name, source)

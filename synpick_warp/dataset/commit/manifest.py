@@ -62,7 +62,14 @@ FREE_SETTINGS = (
 )
 """Settings that may differ when a bake is resumed: no episode depends on them. Objects and lights are compared by content, not by the name
 of their folder. A device of another type computes the same episodes up to rounding."""
-YOUNGER_SETTINGS: dict[str, Any] = {"bop.layout": CLASSIC, "bop.keypoints": 0, "arrangement.fill": WITHIN}
+YOUNGER_SETTINGS: dict[str, Any] = {
+    "bop.layout": CLASSIC,
+    "bop.keypoints": 0,
+    "arrangement.fill": WITHIN,
+    "depth_sensor.preset": "",
+    "depth_sensor.disparity_noise": 0.0,
+    "depth_sensor.max_disparity": 0.0,
+}
 """Settings that older manifests lack, and what held before: left out where they have these values, so that older data sets can still be
 read, and resumed with them."""
 PACKAGES = ("warp-lang", "newton", "numpy", "scipy", "coacd", "opencv-python-headless", "isal", "orjson", "usd-core", "zarr")
