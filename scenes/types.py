@@ -8,6 +8,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from synpick_warp.configs.calibration.lens import LensMap
+
 
 @dataclass(frozen=True, eq=False)
 class TriangleMesh:
@@ -189,3 +191,6 @@ class Camera:
     """World-to-camera rotation (3, 3) float64."""
     translation: np.ndarray
     """World-to-camera translation (3) float64 [m]."""
+    name: str = ""
+    lens: LensMap | None = None
+    """Distortion of the lens; None: a pinhole."""

@@ -28,8 +28,8 @@ _RADII, _ANGLES = 2048, 48
 """Samples of the plane in polar coordinates, for the search of folds."""
 _EDGE = 256
 """Most samples of an edge of the image."""
-_BEND_MARGIN = 1.1
-"""Factor on the sampled maximum of the second derivative."""
+_BOUND_MARGIN = 1.1
+"""Factor on sampled maxima."""
 _REACH = 8.0
 """Radius, in radii of the domain, to which the linear continuation is checked; farther out it is straighter still."""
 _CLOSE = 1e-8
@@ -134,6 +134,8 @@ class LensMap:
     bend: float
     """Upper bound of the second derivative of the projection in any direction [px]. The image of a straight segment of length L in the
     normalised plane is nowhere farther than bend L² / 8 from its chord [px]."""
+    stretch: float
+    """Upper bound of the distance of two rays in the normalised plane, by the distance of their pixels [1/px]."""
 
     def __init__(self, lens: Lens, intrinsics: tuple[float, float, float, float], size: tuple[int, int]) -> None:
         """
@@ -154,7 +156,7 @@ class LensMap:
         outer, inside = np.max(self._rays_of_border(BORDER, limit)), np.max(inner)
         # Close to a fold the lens cannot be continued: the slope there is 0.
         self.radius = float(min(1.02 * outer, inside + 0.9 * (limit - inside)))
-        self.bend = self._bend()
+        self.bend, self.stretch = self._bounds()
 
     def project(self, points: np.ndarray) -> np.ndarray:
         """Pixel coordinates (..., 2) of points (..., 2) of the normalised plane."""
@@ -274,19 +276,19 @@ class LensMap:
         size = np.linalg.norm(goal, axis=1)
         return goal * (np.interp(size, image, radii) / np.where(size > 0, size, 1))[:, None]
 
-    def _bend(self) -> float:
-        """Upper bound of the second derivative, over the domain and its continuation."""
+    def _bounds(self) -> tuple[float, float]:
+        """Upper bounds of the second derivative, and of the inverse of the first, over the domain and its continuation."""
         directions, step = _directions(_ANGLES), 1e-4 * self.radius
         radii = self.radius * np.concatenate((np.linspace(0, 1, 64), np.geomspace(1.0 + 1e-3, _REACH, 32)))
         points = radii[:, None, None] * directions
         image, jacobian = self._continued(points)
         if not (np.linalg.det(jacobian) > 0).all():
             raise ConfigError("distortion folds over beyond the image, where it is continued; check the coefficients' order and signs")
-        second = [
-            self._continued(points + step * v)[0] - 2 * image + self._continued(points - step * v)[0]
-            for v in directions[: _ANGLES // 2 : 2]
-        ]
-        return float(_BEND_MARGIN * np.max(np.linalg.norm(np.array(second) * self._focal, axis=-1)) / step**2)
+        halves = directions[: _ANGLES // 2 : 2]
+        second = [self._continued(points + step * v)[0] - 2 * image + self._continued(points - step * v)[0] for v in halves]
+        bend = np.max(np.linalg.norm(np.array(second) * self._focal, axis=-1)) / step**2
+        least = np.min(np.linalg.svd(jacobian * self._focal[:, None], compute_uv=False))
+        return float(_BOUND_MARGIN * bend), float(_BOUND_MARGIN / least)
 
 
 def _directions(count: int) -> np.ndarray:

@@ -8,8 +8,18 @@ import warp as wp
 from synpick_warp.codes import Segment
 from synpick_warp.kernels.render.lighting.color import srgb_byte
 from synpick_warp.kernels.render.lighting.materials import Surface, Surfaces, interpolate_surface, make_table_surface, sample_base_color
-from synpick_warp.kernels.render.visibility.camera import NEAR_PLANE, ImageGrid, ViewCameras, Views, camera_ray, in_image, tile_pixel
+from synpick_warp.kernels.render.visibility.camera import (
+    NEAR_PLANE,
+    ImageGrid,
+    ViewCameras,
+    Views,
+    camera_ray,
+    in_image,
+    lens_of,
+    tile_pixel,
+)
 from synpick_warp.kernels.render.visibility.gbuffer import GBuffer, Meshes, ViewBodies, body_of
+from synpick_warp.kernels.render.visibility.lens import distort
 
 wp.set_module_options({"enable_backward": False})
 
@@ -285,7 +295,8 @@ def render_flow_kernel(
     # Out:
     flow_out: wp.array3d[wp.vec2],  # (view, row, column) [px]
 ):
-    """Backward optical flow [px]: f_x ((x + d_x) / (z + d_z) - x / z) = f_x (d_x - (x / z) d_z) / (z + d_z), rows alike.
+    """Backward optical flow [px]: f_x ((x + d_x) / (z + d_z) - x / z) = f_x (d_x - (x / z) d_z) / (z + d_z), rows alike;
+    through a lens, the difference of both places.
 
     NaN where the displacement d is unknown, and where the point was behind the camera. Launched over view, pixel (tile order, from flat
     index `first` on).
@@ -300,4 +311,10 @@ def render_flow_kernel(
     flow = wp.vec2(wp.NAN, wp.NAN)
     if depth > NEAR_PLANE:
         flow = wp.vec2(intrinsics[0] * (d[0] - ray[0] * d[2]) / depth, intrinsics[1] * (d[1] - ray[1] * d[2]) / depth)
+        lens = lens_of(views.cameras, view)
+        if lens >= 0 and wp.length_sq(d) > 0.0:
+            point = gbuffer.depth[view, row, column] * ray + d
+            before, _ = distort(views.cameras.lenses, lens, wp.vec2(point[0], point[1]) / depth)
+            now, _ = distort(views.cameras.lenses, lens, wp.vec2(ray[0], ray[1]))
+            flow = wp.cw_mul(wp.vec2(intrinsics[0], intrinsics[1]), before - now)
     flow_out[view, row, column] = flow
