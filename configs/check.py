@@ -72,6 +72,8 @@ def describe_allowed(item: dataclasses.Field[Any], annotation: Any) -> str:
 
 def describe_type(annotation: Any, *, plural: bool = False) -> str:
     """Describe a type: "a finite number", "2 whole numbers in a list", "a list of lists of 3 numbers"."""
+    if dataclasses.is_dataclass(annotation):
+        return f"a table of {', '.join(part.name for part in dataclasses.fields(annotation))}"
     if typing.get_origin(annotation) is not tuple:
         return _NAMES[annotation][plural]
     parts = typing.get_args(annotation)

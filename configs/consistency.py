@@ -3,19 +3,17 @@
 from __future__ import annotations
 
 import dataclasses
-import itertools
-import math
 import re
 from collections import Counter
 from collections.abc import Iterator, Sequence
 
+from synpick_warp.configs.camera_rules import Conflict, find_camera_conflicts
 from synpick_warp.configs.modes import bake_modes
 from synpick_warp.configs.schema import (
     FORMATS,
     MIXED,
     Bake,
     Bop,
-    Cameras,
     Config,
     DepthSensor,
     Effects,
@@ -32,44 +30,32 @@ from synpick_warp.configs.schema import (
 from synpick_warp.configs.splits import MAX_SHARD_SCENES, DataLayout
 from synpick_warp.errors import format_value
 
-DEPTH_COUNTS = 65535
-"""Maximum value of a 16-bit depth image."""
-_PARALLEL = 1e-6
-"""Sine of the angle below which a camera's up vector counts as parallel to its viewing direction."""
 _SPLIT = re.compile(r"(train|val|test)(_[A-Za-z0-9]+)*")
-
-Conflict = tuple[str, str]
-"""Key of the wrong setting, and its allowed values."""
 
 
 def find_conflicts(config: Config) -> Iterator[Conflict]:
     """Find all violated constraints, the most basic first."""
-    bake, cameras, tote, bop = config.bake, config.cameras, config.tote, config.bop
-    yield from _mix(bake, config.splits, cameras)
+    tote, bop = config.tote, config.bop
+    yield from _mix(config.bake, config.splits)
     yield from _tote(tote, config.move)
-    yield from _cameras(cameras, tote)
+    yield from find_camera_conflicts(config)
     yield from _times(config.settle, config.physics)
     yield from _pick(config.pick, tote)
     yield from _suction(config.suction, config.gripper)
     yield from _layers(config.render.layers)
     yield from _ranges(config.effects, config.depth_sensor)
-    if "depth_sensor" in config.render.layers:
-        yield from _depth_sensor(config.depth_sensor, cameras, tote)
     yield from _jpeg_quality(config.effects, bop)
     yield from _split_folders(config.splits, bop)
     yield from _scene_ids(DataLayout.of(config))
-    yield from _depth_scale(bop, cameras, tote)
     yield from _object_rows(config.object_rows)
 
 
-def _mix(bake: Bake, splits: Sequence[Split], cameras: Cameras) -> Iterator[Conflict]:
-    """Yield conflicts of modes, formats and resolution."""
+def _mix(bake: Bake, splits: Sequence[Split]) -> Iterator[Conflict]:
+    """Yield conflicts of modes and formats."""
     if MIXED in bake_modes(bake, splits) and not any(bake.mix):
         yield "bake.mix", "at least one weight above 0, with the mode mixed"
     if not bake.formats:
         yield "bake.formats", f"at least one of {', '.join(FORMATS)}"
-    if "lerobot" in bake.formats and any(side % 2 for side in cameras.resolution):
-        yield "cameras.resolution", "even width and height with the format lerobot, whose videos have a colour for 2 x 2 pixels"
 
 
 def _tote(tote: Tote, move: Move) -> Iterator[Conflict]:
@@ -83,25 +69,6 @@ def _tote(tote: Tote, move: Move) -> Iterator[Conflict]:
         yield "tote.wall", f"less than the tote's height, {tote.outer_size[2]:g} [m]"
     if move.start_height < move.height:
         yield "move.start_height", f"at least move.height, {move.height:g} [m]"
-
-
-def _cameras(cameras: Cameras, tote: Tote) -> Iterator[Conflict]:
-    """Yield conflicts of camera positions, up vectors and target: degenerate, below the floor, or not showing the tote."""
-    if not cameras.positions:
-        yield "cameras.positions", "at least one position"
-    if len(cameras.ups) != len(cameras.positions):
-        yield "cameras.ups", f"one direction for each of the {len(cameras.positions)} cameras.positions"
-        return
-    for index, (position, up) in enumerate(zip(cameras.positions, cameras.ups, strict=True)):
-        forward = tuple(b - a for a, b in zip(position, cameras.target, strict=True))
-        if math.hypot(*forward) == 0.0:
-            yield "cameras.positions", f"positions other than cameras.target, the position of camera {index}"
-        elif math.hypot(*_cross(forward, up)) <= _PARALLEL * math.hypot(*forward) * math.hypot(*up):
-            yield "cameras.ups", f"up vectors that are not zero or parallel to the viewing direction, as that of camera {index} is"
-        elif position[2] <= 0.0:
-            yield "cameras.positions", f"positions above the tote's floor, z > 0, below which camera {index} sees no object [m]"
-        elif not _sees_tote(cameras, tote, position):
-            yield "cameras.target", f"a point that lets each camera see the tote, which lies outside of the images of camera {index} [m]"
 
 
 def _times(settle: Settle, physics: Physics) -> Iterator[Conflict]:
@@ -159,50 +126,6 @@ def _jpeg_quality(effects: Effects, bop: Bop) -> Iterator[Conflict]:
         yield "effects.jpeg_quality", f"0, 0 with bop.color_format {bop.color_format}"
 
 
-def _depth_sensor(sensor: DepthSensor, cameras: Cameras, tote: Tote) -> Iterator[Conflict]:
-    """With the layer depth_sensor: the tote must lie within what the sensor measures, and its disparity be more than a step."""
-    width, _ = cameras.resolution
-    focal = width / 2 / math.tan(math.radians(cameras.fov) / 2)
-    for index, position in enumerate(cameras.positions):
-        depths = _tote_depths(cameras, tote, position)
-        near, far = max(0.0, min(depths)), max(depths)
-        if sensor.distances[1] < near or sensor.distances[0] > far:
-            yield "depth_sensor.distances", f"a range that reaches the tote, {near:.3g} to {far:.3g} m from camera {index} [m]"
-        if focal * sensor.baseline > far * sensor.max_disparity > 0.0:
-            most = sensor.max_disparity * far / focal
-            yield (
-                "depth_sensor.baseline",
-                f"at most {most:.3g}, so that the tote's disparity is within max_disparity; or a shorter lens [m]",
-            )
-        if focal * sensor.baseline < sensor.disparity_step * far:
-            least = sensor.disparity_step * far / focal
-            yield "depth_sensor.baseline", f"at least {least:.3g}, so that the disparity of the tote is a disparity_step or more [m]"
-
-
-def _tote_depths(cameras: Cameras, tote: Tote, position: tuple[float, ...]) -> list[float]:
-    """Planar depths of the corners of the tote's outer box in the image of a camera at `position`, which looks at cameras.target [m]."""
-    length, width, height = tote.outer_size
-    forward = [b - a for a, b in zip(position, cameras.target, strict=True)]
-    size = math.hypot(*forward) or 1.0
-    corners = itertools.product((-length / 2, length / 2), (-width / 2, width / 2), (-tote.wall, height - tote.wall))
-    return [sum((c - a) * f for a, c, f in zip(position, corner, forward, strict=True)) / size for corner in corners]
-
-
-def _sees_tote(cameras: Cameras, tote: Tote, position: tuple[float, ...]) -> bool:
-    """Whether the tote's bounding sphere meets the cone around a camera's view, which is wider than its image."""
-    length, width, height = tote.outer_size
-    center = (0.0, 0.0, height / 2 - tote.wall)
-    forward = [b - a for a, b in zip(position, cameras.target, strict=True)]
-    away, radius = [b - a for a, b in zip(position, center, strict=True)], math.hypot(length, width, height) / 2
-    distance = math.hypot(*away)
-    if distance <= radius:
-        return True
-    cosine = sum(a * b for a, b in zip(forward, away, strict=True)) / (math.hypot(*forward) * distance)
-    columns, rows = cameras.resolution
-    cone = math.atan(math.tan(math.radians(cameras.fov) / 2) * math.hypot(1.0, rows / columns))
-    return math.acos(max(-1.0, min(1.0, cosine))) <= cone + math.asin(radius / distance)
-
-
 def _split_folders(splits: Sequence[Split], bop: Bop) -> Iterator[Conflict]:
     """Yield folders of splits with names that BOP does not allow, or that do not fit the colour format."""
     folders = [(f"splits.{split.name}.folder", split.folder) for split in splits] or [("bop.split", bop.split)]
@@ -224,20 +147,8 @@ def _scene_ids(layout: DataLayout) -> Iterator[Conflict]:
         yield key, f"episode indices below {most} with the format shards, whose names hold no more scenes"
 
 
-def _depth_scale(bop: Bop, cameras: Cameras, tote: Tote) -> Iterator[Conflict]:
-    """Yield the depth scale if 16 bits do not reach the farthest corner of the tote."""
-    far = max((depth for position in cameras.positions for depth in _tote_depths(cameras, tote, position)), default=0.0)
-    if bop.depth_scale * 1e-3 * DEPTH_COUNTS < far:
-        yield "bop.depth_scale", f"at least {far * 1e3 / DEPTH_COUNTS:.3g}, so that 16 bits reach the tote at {far:.3g} m [mm]"
-
-
 def _object_rows(rows: Sequence[ObjectRow]) -> Iterator[Conflict]:
     """Yield ids that several object rows have."""
     counts = Counter(row.id for row in rows)
     for repeated in sorted(row_id for row_id, count in counts.items() if count > 1):
         yield "object_rows", f"one row per id; {repeated} comes {counts[repeated]} times"
-
-
-def _cross(a: tuple[float, ...], b: tuple[float, ...]) -> tuple[float, float, float]:
-    """Cross product of two vectors."""
-    return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]

@@ -6,7 +6,8 @@ from dataclasses import dataclass
 from typing import Any
 
 from synpick_warp.configs.modes import bake_modes
-from synpick_warp.configs.schema import Bake, Bop, Cameras, Config, Gripper, Physics, Render, Tote, Trajectory
+from synpick_warp.configs.rig import Rig
+from synpick_warp.configs.schema import Bake, Bop, Config, Gripper, Physics, Render, Tote, Trajectory
 from synpick_warp.configs.sensors import effect_ranges
 from synpick_warp.configs.splits import DataLayout
 
@@ -18,7 +19,7 @@ class ExportSettings:
     layout: DataLayout
     bake: Bake
     bop: Bop
-    cameras: Cameras
+    rig: Rig
     physics: Physics
     render: Render
     trajectory: Trajectory
@@ -33,7 +34,7 @@ class ExportSettings:
     def of(cls, config: Config) -> ExportSettings:
         """Those of all settings."""
         effects = tuple(name for name, limits in effect_ranges(config.effects).items() if any(limits))
-        names = ("bake", "bop", "cameras", "physics", "render", "trajectory", "tote", "gripper")
+        names = ("bake", "bop", "rig", "physics", "render", "trajectory", "tote", "gripper")
         sections: dict[str, Any] = {name: getattr(config, name) for name in names}
         return cls(layout=DataLayout.of(config), effects=effects, objects=config.arrangement.max_objects, **sections)
 

@@ -11,25 +11,24 @@ from pathlib import Path
 from typing import Any
 
 from synpick_warp.configs.calibration.sensor_presets import sensor_settings
+from synpick_warp.configs.calibration.tables import fill_tables
 from synpick_warp.configs.check import check_value
 from synpick_warp.configs.consistency import find_conflicts
-from synpick_warp.configs.schema import Bake, Bop, Config, ObjectRow
+from synpick_warp.configs.schema import Bake, Bop, Config
 from synpick_warp.configs.split_tables import SPLITS, override_table, read_tables, resolve_splits, split_settings
+from synpick_warp.configs.table_lists import change_rows, given_values, read_rows, settings_of
 from synpick_warp.errors import ConfigError, format_value, shorten, suggest
 from synpick_warp.system.inputs.toml import decode_toml, read_toml
 
 DEFAULT_PRESET = "synpick"
 COMMAND_LINE = "on the command line"
 """Source of settings that come as options, in error messages."""
-ROWS = "object_rows"
+CAMERA = "camera"
 _OFFERED = "offered splits"
 """Key of the splits of a preset, which hold only if they are asked for."""
 _BASE = "preset"
 _OF_SPLITS = ("bake.mode", "bake.episodes")
 """Settings from which splits are resolved."""
-_ROW_NEEDS = ("id", "diameter")
-_ROW_IDENTITY = ("id", "name", "diameter")
-"""Keys by which a row finds its model."""
 
 Values = dict[str, tuple[Any, str]]
 """Full key -> (checked value, its source for error messages)."""
@@ -108,9 +107,9 @@ def override_config(config: Config, settings: Mapping[str, object], source: str 
 def _check_conflicts(config: Config, values: Values) -> None:
     """Raise a ConfigError for the first violated rule between settings; `values` has the sources of those that were set."""
     for key, rule in find_conflicts(config):
-        owner = values.get(SPLITS if key.startswith(f"{SPLITS}.") else key, (None, "by default"))
+        owner = values.get(SPLITS if key.startswith(f"{SPLITS}.") else key.partition("[")[0], (None, "by default"))
         value, origin = _value_of(config, key), owner[1]
-        has = f"has {len(value)} rows" if key == ROWS else f"is {format_value(value)}"
+        has = f"has {len(value)} rows" if key in table_lists() else f"is {format_value(value)}"
         raise ConfigError(f"{key} {has} {origin}; allowed: {rule}")
 
 
@@ -150,14 +149,15 @@ def parse_assignment(text: str) -> tuple[str, object]:
 def sections() -> dict[str, type[Any]]:
     """Dataclass of every section by its name, in their order."""
     hints = typing.get_type_hints(Config)
-    return {item.name: hints[item.name] for item in dataclasses.fields(Config) if item.name not in (ROWS, SPLITS)}
+    return {item.name: hints[item.name] for item in dataclasses.fields(Config) if dataclasses.is_dataclass(hints[item.name])}
 
 
 @functools.cache
-def settings_of(section: type[Any]) -> dict[str, tuple[dataclasses.Field[Any], Any]]:
-    """Name -> (field, resolved type) of every setting of a section or of an object row, in order."""
-    hints = typing.get_type_hints(section)
-    return {item.name: (item, hints[item.name]) for item in dataclasses.fields(section)}
+def table_lists() -> dict[str, type[Any]]:
+    """Dataclass of the rows of every list of tables by its name, such as camera: [[camera]]."""
+    hints = typing.get_type_hints(Config)
+    lists = (item.name for item in dataclasses.fields(Config) if item.name not in (*sections(), SPLITS))
+    return {name: typing.get_args(hints[name])[0] for name in lists}
 
 
 def _folder() -> Path:
@@ -169,6 +169,8 @@ def _read(preset_or_file: str) -> Values:
     """Values of a preset or a .toml file over the preset it is based on, with the source of each."""
     if preset_or_file.endswith(".toml"):
         document = _parse(Path(preset_or_file))
+        if "camera" in document:
+            document["camera"] = fill_tables(document["camera"], Path(preset_or_file).parent, f"in {preset_or_file}")
         base = document.pop(_BASE, DEFAULT_PRESET)
         if not isinstance(base, str):
             raise ConfigError(f"{_BASE} is {format_value(base)} in {preset_or_file}; allowed: {', '.join(preset_names())}")
@@ -206,10 +208,10 @@ def _override(base: Values, document: Mapping[str, Any], source: str) -> Values:
     if isinstance(bake, dict) and ("mode" in bake or "episodes" in bake):
         values = {key: value for key, value in values.items() if key not in (SPLITS, _OFFERED)}
     for name, content in document.items():
-        if name == ROWS and isinstance(content, dict):
-            values[ROWS] = (_changed_rows(base[ROWS][0] if ROWS in base else (), content, source), source)
-        elif name == ROWS:
-            values[ROWS] = (_rows(content, source), source)
+        if (kind := table_lists().get(name)) and isinstance(content, dict):
+            values[name] = (change_rows(name, kind, base[name][0] if name in base else (), content, source), source)
+        elif kind:
+            values[name] = (read_rows(name, kind, content, source), source)
         elif name == SPLITS:
             values[SPLITS] = (read_tables(content, source), source)
         elif name in sections() and not isinstance(content, dict):
@@ -235,13 +237,16 @@ def _section_values(section: str, content: Mapping[str, Any], source: str) -> Va
 def _check_section(section: str, source: str) -> None:
     """Raise ConfigError if there is no section of this name, with a hint."""
     known = sections()
-    if section == ROWS:
-        raise ConfigError(f"{ROWS} cannot be set {source}; write [[{ROWS}]] tables into a file")
+    if section.partition("[")[0] in table_lists():
+        name = section.partition("[")[0]
+        raise ConfigError(f"{name} cannot be set {source}; write [[{name}]] tables into a file")
     if section not in known:
         # A setting without its section is likelier than a misspelt section.
         keys = [f"{name}.{section}" for name, kind in known.items() if section in settings_of(kind)]
         hint = f"; did you mean {' or '.join(keys)}?" if keys else suggest(section, list(known))
-        raise ConfigError(f"there is no section {shorten(section)}, set {source}; sections: {', '.join(known)}, {ROWS}, {SPLITS}{hint}")
+        raise ConfigError(
+            f"there is no section {shorten(section)}, set {source}; sections: {', '.join((*known, *table_lists(), SPLITS))}{hint}"
+        )
 
 
 def _setting(section: str, name: str, source: str) -> tuple[dataclasses.Field[Any], Any]:
@@ -255,36 +260,6 @@ def _setting(section: str, name: str, source: str) -> tuple[dataclasses.Field[An
             hint = f"; did you mean {' or '.join(keys)}?"
         raise ConfigError(f"there is no key {section}.{shorten(name)}, set {source}; keys of {section}: {', '.join(known)}{hint}")
     return known[name]
-
-
-def _rows(content: Any, source: str) -> tuple[ObjectRow, ...]:
-    """Object rows of [[object_rows]] tables; raises ConfigError."""
-    if not isinstance(content, list) or not all(isinstance(row, dict) for row in content):
-        raise ConfigError(f"{ROWS} is {format_value(content)} {source}; allowed: [[{ROWS}]] tables")
-    return tuple(_row(f"{ROWS}[{index}]", row, source) for index, row in enumerate(content))
-
-
-def _changed_rows(rows: tuple[ObjectRow, ...], changes: Mapping[str, Any], source: str) -> tuple[ObjectRow, ...]:
-    """Rows of a preset with the values of an [object_rows] table, which holds for all of them."""
-    known = {name: pair for name, pair in settings_of(ObjectRow).items() if name not in _ROW_IDENTITY}
-    for name in changes:
-        if name not in known:
-            rule = f"keys that may hold for every row: {', '.join(known)}; [[{ROWS}]] tables have all"
-            raise ConfigError(f"[{ROWS}] has the key {shorten(name)} {source}; {rule}{suggest(name, list(known))}")
-    values = {name: check_value(f"{ROWS}.{name}", value, *known[name], source) for name, value in changes.items()}
-    return tuple(dataclasses.replace(row, **values) for row in rows)
-
-
-def _row(key: str, content: Mapping[str, Any], source: str) -> ObjectRow:
-    """Object row of a table; raises ConfigError for unknown or missing keys."""
-    known = settings_of(ObjectRow)
-    for name in content:
-        if name not in known:
-            raise ConfigError(f"there is no key {key}.{shorten(name)}, set {source}; keys: {', '.join(known)}{suggest(name, list(known))}")
-    for name in _ROW_NEEDS:
-        if name not in content:
-            raise ConfigError(f"{key} has no {name} {source}; a row needs {' and '.join(_ROW_NEEDS)}")
-    return ObjectRow(**{name: check_value(f"{key}.{name}", value, *known[name], source) for name, value in content.items()})
 
 
 def _build(values: Values, override: str) -> Config:
@@ -309,14 +284,30 @@ def _build(values: Values, override: str) -> Config:
         section: kind(**{name: values[f"{section}.{name}"][0] for name in settings_of(kind) if f"{section}.{name}" in values})
         for section, kind in sections().items()
     }
-    if ROWS in values:
-        parts[ROWS] = values[ROWS][0]
+    parts |= {name: values[name][0] for name in table_lists() if name in values}
+    _check_sole_cameras(values, override)
     return Config(**parts, splits=splits)
 
 
+def _check_sole_cameras(values: Values, override: str) -> None:
+    """Raise ConfigError if [cameras] and [[camera]] are set in one place, where one of both would be of no effect."""
+    rows, source = values.get(CAMERA, ((), ""))
+    for key, (value, origin) in values.items():
+        section, _, name = key.partition(".")
+        is_default = name == "resolution" and any(row.resolution is None for row in rows)
+        if rows and section == "cameras" and origin in (source, override) and not is_default:
+            raise ConfigError(
+                f"{key} is {format_value(value)} {origin}; allowed: none, as the [[{CAMERA}]] tables have values of their own"
+            )
+
+
 def _value_of(config: Config, key: str) -> Any:
-    """Value of a setting by its key, "section.name" or "splits.split.name"."""
+    """Value of a setting by its key, "section.name", "splits.split.name" or "list[index].name"."""
     if key.startswith(f"{SPLITS}."):
         _, name, item = key.split(".")
         return next(getattr(split, item) for split in config.splits if split.name == name)
+    if "[" in key:
+        rows, _, rest = key.partition("[")
+        index, _, name = rest.partition("].")
+        return given_values(getattr(config, rows)[int(index)]).get(name)
     return functools.reduce(getattr, key.split("."), config)

@@ -75,15 +75,16 @@ class Target:
 
 @dataclass(frozen=True)
 class Perception:
-    """Perception of the gripper: suction points and clutter graph from the segmentation that camera 0 sees without the gripper."""
+    """Perception of the gripper: suction points and clutter graph from the segmentation that a camera sees without the gripper."""
 
     resolution: tuple[int, int] = setting(
         (1920, 1080),
         "px",
-        "Image width and height for perception; cameras.fov is the horizontal field of view, so a wider aspect ratio covers less height.",
+        "Image width and height for perception; the horizontal field of view is the camera's, so a wider aspect ratio covers less height.",
         low=16,
         high=8192,
     )
+    camera: str = setting("", "", "Name of the camera that perception uses; empty: the first.")
     views: int = setting(0, "", "Images processed in one batch; 0: chosen by device and resolution.", low=0, high=INT32_MAX)
     contour_points: int = setting(
         8192, "", "Capacity for the points of one contour; a longer contour ends the episode.", low=16, high=INT32_MAX

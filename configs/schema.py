@@ -1,18 +1,20 @@
 """Settings schema of a bake: frozen dataclasses, each field with default, unit, range and meaning. Nothing else has defaults.
 
 The defaults are the paper's values (preset `synpick`); where the paper names none, the help text says where a value comes from.
-"Released" means the generator that the paper's authors published. Sections: here, `manipulation` and `sensors`.
+"Released" means the generator that the paper's authors published. Sections: here, `cameras`, `manipulation` and `sensors`.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, ClassVar
 
 from synpick_warp.codes import Tone, names
+from synpick_warp.configs.cameras import CameraRow, Cameras
 from synpick_warp.configs.fields import INT32_MAX, setting
 from synpick_warp.configs.manipulation import Move, Perception, Pick, Suction, Target
+from synpick_warp.configs.rig import Rig
 from synpick_warp.configs.sensors import DepthSensor, Effects
 from synpick_warp.views.layers import LAYER_TABLE
 
@@ -135,6 +137,8 @@ class Objects:
 class ObjectRow:
     """A row of the object table: physical and material properties that model files do not contain."""
 
+    REQUIRED: ClassVar = ("id", "diameter")
+    IDENTITY: ClassVar = ("id", "name", "diameter")
     id: int = setting(0, "", "The model's obj_id in its BOP folder.", low=0, high=INT32_MAX)
     name: str = setting(
         "", "", "Name of the object; for meshes that are not BOP models the file name without suffix, by which the row is found."
@@ -179,29 +183,6 @@ class Gripper:
     cup_color: tuple[float, float, float] = setting((0.05, 0.05, 0.055), "sRGB", "Base colour of the cup.", low=0.0, high=1.0)
     metallic: float = setting(0.01, "", "Metallic factor of shaft and cup (released).", low=0.0, high=1.0)
     roughness: float = setting(0.9, "", "Roughness of shaft and cup (released).", low=0.0, high=1.0)
-
-
-@dataclass(frozen=True)
-class Cameras:
-    """Pinhole cameras above the tote: square pixels with centres at +0.5, principal point in the middle of the image."""
-
-    resolution: tuple[int, int] = setting((1920, 1080), "px", "Image width and height.", low=1, high=8192)
-    fov: float = setting(20.0, "°", "Horizontal field of view.", low=1.0, high=170.0)
-    positions: tuple[tuple[float, float, float], ...] = setting(
-        ((0.0, 0.0, 2.0), (0.0, 0.573, 2.0), (0.0, -0.573, 2.0)),
-        "m",
-        "Position of each camera in the tote's frame (released).",
-        low=-100.0,
-        high=100.0,
-    )
-    target: tuple[float, float, float] = setting((0.0, 0.0, 0.16), "m", "Look-at point of all cameras (released).", low=-100.0, high=100.0)
-    ups: tuple[tuple[float, float, float], ...] = setting(
-        ((0.0, 1.0, 0.0), (0.0, -1.0, 0.0), (0.0, 1.0, 0.0)),
-        "",
-        "Up vector of each camera; by default +y for the first, and towards the tote's centre line for the others.",
-        low=-1e3,
-        high=1e3,
-    )
 
 
 @dataclass(frozen=True)
@@ -467,9 +448,15 @@ class Config:
     depth_sensor: DepthSensor = field(default_factory=DepthSensor)
     bop: Bop = field(default_factory=Bop)
     trajectory: Trajectory = field(default_factory=Trajectory)
+    camera: tuple[CameraRow, ...] = ()
     object_rows: tuple[ObjectRow, ...] = ()
     splits: tuple[Split, ...] = ()
     """Resolved splits, by first episode; empty: one split, bop.split, of bake.episodes episodes."""
+
+    @property
+    def rig(self) -> Rig:
+        """All cameras."""
+        return Rig.of(self.cameras, self.camera)
 
     def value(self, key: str) -> Any:
         """Value of a setting by its full key, such as "physics.step"."""

@@ -66,16 +66,28 @@ class DataLayout:
     """Number of episodes without splits."""
     split: str
     """BOP folder without splits."""
-    cameras: int
-    """Number of cameras."""
+    names: tuple[str, ...]
+    """Names of the cameras."""
+    sensor_names: tuple[str, ...]
+    """Their names as sensors of a scene."""
     has_sensors: bool
     """Whether the cameras of an episode share a scene, as its sensors; else each has a scene of its own."""
 
     @classmethod
     def of(cls, config: Config) -> DataLayout:
         """Layout by the settings of a bake."""
-        bake, bop = config.bake, config.bop
-        return cls(bake.formats, config.splits, bake.episodes, bop.split, len(config.cameras.positions), bop.layout == MULTISENSOR)
+        bake, bop, rig = config.bake, config.bop, config.rig
+        return cls(bake.formats, config.splits, bake.episodes, bop.split, rig.names, rig.sensors, bop.layout == MULTISENSOR)
+
+    @property
+    def cameras(self) -> int:
+        """Number of cameras."""
+        return len(self.names)
+
+    @property
+    def is_listed(self) -> bool:
+        """Whether the cameras are those of [[camera]] tables, with names of their own."""
+        return self.names == self.sensor_names
 
     def plan(self, names: Sequence[str] = (), shard: tuple[int, int] = (0, 1)) -> list[range]:
         """Episode indices of a bake, ascending, one range per split.
@@ -148,7 +160,7 @@ class DataLayout:
 
     def scene(self, episode: int, camera: int) -> tuple[int, str]:
         """Scene id of a camera's images of an episode, and the suffix of their files: empty, or that of the sensor, such as "_cam1"."""
-        return (episode, f"_{sensor_name(camera)}") if self.has_sensors else (self.cameras * episode + camera, "")
+        return (episode, f"_{self.sensor_names[camera]}") if self.has_sensors else (self.cameras * episode + camera, "")
 
     def scene_ids(self, episodes: Iterable[int]) -> set[int]:
         """Ids of all BOP scenes of episodes."""
@@ -161,12 +173,7 @@ class DataLayout:
     @property
     def sensors(self) -> tuple[str, ...]:
         """Names of the sensors of a scene; none if each camera has a scene of its own."""
-        return tuple(map(sensor_name, range(self.cameras))) if self.has_sensors else ()
-
-
-def sensor_name(camera: int) -> str:
-    """Name of a camera among the sensors of a scene."""
-    return f"cam{camera}"
+        return self.sensor_names if self.has_sensors else ()
 
 
 def split_kind(folder: str) -> str:

@@ -6,9 +6,10 @@ import json
 from typing import Any
 
 from synpick_warp.configs.check import describe_allowed
-from synpick_warp.configs.load import ROWS, sections, settings_of
-from synpick_warp.configs.schema import Config, ObjectRow, Split
+from synpick_warp.configs.load import sections, table_lists
+from synpick_warp.configs.schema import Config, Split
 from synpick_warp.configs.split_tables import SPLITS, split_settings
+from synpick_warp.configs.table_lists import given_values, settings_of
 
 _DELETE = "\x7f"
 """The only control character that JSON does not escape and TOML forbids."""
@@ -21,13 +22,15 @@ def config_to_toml(config: Config, *, comments: bool = False) -> str:
         config: The configuration.
         comments: Precede each setting by its meaning, unit and allowed values.
     """
-    lines = [] if config.object_rows else [f"{ROWS} = []", ""]
+    # Without rows those of the preset would hold; no preset has cameras.
+    lines = [] if config.object_rows else ["object_rows = []", ""]
     for section, kind in sections().items():
         if comments and kind.__doc__:
             lines += [f"# {' '.join(kind.__doc__.split())}"]
         lines += [f"[{section}]", *_table(getattr(config, section), kind, comments), ""]
-    for index, row in enumerate(config.object_rows):
-        lines += [f"[[{ROWS}]]", *_table(row, ObjectRow, comments and index == 0), ""]
+    for name, kind in table_lists().items():
+        for index, row in enumerate(getattr(config, name)):
+            lines += [f"[[{name}]]", *_table(row, kind, comments and index == 0), ""]
     for index, split in enumerate(config.splits):
         lines += [f"[{SPLITS}.{split.name}]", *_table(split, Split, comments and index == 0), ""]
     return "\n".join(lines)
@@ -35,12 +38,14 @@ def config_to_toml(config: Config, *, comments: bool = False) -> str:
 
 def _table(values: Any, kind: type[Any], comments: bool) -> list[str]:
     """Lines of a TOML table; `comments`: each setting with meaning, unit and allowed values above it."""
-    lines = []
+    lines, given = [], given_values(values)
     for name, (item, annotation) in (split_settings() if kind is Split else settings_of(kind)).items():
+        if name not in given:
+            continue
         if comments:
             unit = f"[{item.metadata['unit']}] " if item.metadata["unit"] else ""
             lines.append(f"# {item.metadata['doc']} {unit}Allowed: {describe_allowed(item, annotation)}.")
-        lines.append(f"{name} = {format_toml(getattr(values, name))}")
+        lines.append(f"{name} = {format_toml(given[name])}")
     return lines
 
 
@@ -50,6 +55,8 @@ def format_toml(value: Any) -> str:
         return "true" if value else "false"
     if isinstance(value, str):
         return json.dumps(value, ensure_ascii=False).replace(_DELETE, "\\u007f")
+    if isinstance(value, dict):
+        return f"{{ {', '.join(f'{name} = {format_toml(one)}' for name, one in value.items())} }}"
     if isinstance(value, tuple):
         return f"[{', '.join(format_toml(one) for one in value)}]"
     return repr(value)

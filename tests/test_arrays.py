@@ -33,9 +33,9 @@ from tests.worlds.small_worlds import settings
 
 WORLDS = MIN_GPU_WORLDS + 1
 NAMES = (
-    "WorldState AttemptState SealState LastFrame Observation Plan WorldStatus Snapshot ViewBuffers ViewCameras ViewBodies GBuffer ShadedImage "
+    "WorldState AttemptState SealState LastFrame Observation Plan WorldStatus Snapshot ViewBuffers ViewBodies GBuffer ShadedImage "
     "BoundaryBuffers BoundaryScratch Guide CoarseLight RatioImages LampShadows ShadowRays EdgeLists FootprintLists VisibilityBuffer "
-    "BorderBoxes LightHistory MovingBodies PathLists PathQueues DepthBuffers DepthScratch SlotSums"
+    "ViewCameras BorderBoxes LightHistory MovingBodies PathLists PathQueues DepthBuffers DepthScratch SlotSums"
 )
 BASE = set(NAMES.split())
 """Declarations of which every bake has arrays."""

@@ -63,7 +63,7 @@ class FakeRenderer:
 
 
 def batch_of(config: Config, device: Any) -> int:
-    return views_per_batch(config.render, config.cameras, config.bake.worlds, device)
+    return views_per_batch(config.render, config.rig, config.bake.worlds, device)
 
 
 def config_of(**overrides: object):
@@ -84,11 +84,11 @@ def report_of(live: list[int]) -> TickReport:
 
 
 def sizes_of(config: Config, device: wp.Device) -> dict[str, int]:
-    return view_sizes(config.render, config.cameras, config.bake.worlds, config.arrangement.max_objects, device)
+    return view_sizes(config.render, config.rig, config.bake.worlds, config.arrangement.max_objects, device)
 
 
 def frame_stream(config: Config, renderer: FakeRenderer, device) -> FrameStream:
-    sizes, layers, cameras = sizes_of(config, device), config.render.layers, len(config.cameras.positions)
+    sizes, layers, cameras = sizes_of(config, device), config.render.layers, len(config.rig)
     tick_time = config.physics.step * config.physics.steps_per_tick
     return FrameStream(sizes, layers, cameras, tick_time, renderer, OBJECT_IDS, LIGHTS, device)  # type: ignore[arg-type]
 
@@ -397,7 +397,7 @@ def test_files_and_lists_stand_for_images(device):
 )
 def test_what_is_copied_to_the_host(cuda, needs_images, settings_, expected):
     config = settings(**({"cameras__resolution": [640, 360]} | settings_))
-    assert host_copies.host_images(config.bop, config.cameras.resolution[1], SimpleNamespace(is_cuda=cuda), needs_images, True) == expected  # type: ignore[arg-type]
+    assert host_copies.host_images(config.bop, config.rig.largest[1], SimpleNamespace(is_cuda=cuda), needs_images, True) == expected  # type: ignore[arg-type]
 
 
 def test_the_largest_lists_are_no_larger_than_images():

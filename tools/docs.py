@@ -10,15 +10,17 @@ from __future__ import annotations
 import argparse
 import re
 from collections.abc import Callable
+from dataclasses import is_dataclass
 from pathlib import Path
 from typing import Any
 
 from synpick_warp.apps.validation.registry import load_rules
 from synpick_warp.configs.calibration.sensor_presets import SENSORS
 from synpick_warp.configs.check import describe_allowed
-from synpick_warp.configs.load import ROWS, sections, settings_of
-from synpick_warp.configs.schema import ObjectRow, Split
+from synpick_warp.configs.load import sections, table_lists
+from synpick_warp.configs.schema import Split
 from synpick_warp.configs.split_tables import SPLITS, split_settings
+from synpick_warp.configs.table_lists import settings_of
 from synpick_warp.configs.write import format_toml
 from tools.figures import figures_tables, read_runs
 
@@ -35,7 +37,7 @@ def settings_reference() -> str:
     """The settings reference as Markdown: the prose as committed; links to the sections, and a table of all settings by section."""
     head, begin, _ = SETTINGS_REFERENCE.read_text(encoding="utf-8").partition(_SETTINGS_BEGIN)
     parts = {f"[{name}]": (kind, f"{name}.") for name, kind in sections().items()}
-    parts |= {f"[[{ROWS}]]": (ObjectRow, ""), f"[{SPLITS}.NAME]": (Split, "")}
+    parts |= {f"[[{name}]]": (kind, "") for name, kind in table_lists().items()} | {f"[{SPLITS}.NAME]": (Split, "")}
     links = " · ".join(f"[{title.strip('[]')}](#{_anchor(title)})" for title in parts)
     lines = ["| key | default | unit | allowed | meaning |", "|---|---|---|---|---|"]
     lines += [line for title, (kind, prefix) in parts.items() for line in _section(title, kind, prefix)]
@@ -59,8 +61,12 @@ def _section(title: str, kind: type[Any], prefix: str) -> list[str]:
     """Rows of a section: its title and meaning, then its settings."""
     lines = [f'| <a id="{_anchor(title)}"></a>**`{title}`** | | | | **{" ".join((kind.__doc__ or "").split())}** |']
     for name, (item, annotation) in (split_settings() if kind is Split else settings_of(kind)).items():
+        if isinstance(annotation, type) and is_dataclass(annotation):
+            lines += _section(f"{prefix}{name}", annotation, f"{prefix}{name}.")[1:]
+            continue
         unit, rule = item.metadata["unit"], describe_allowed(item, annotation)
-        lines.append(f"| `{prefix}{name}` | `{format_toml(item.default)}` | {unit} | {rule} | {item.metadata['doc']} |")
+        default = "" if item.default is None else f"`{format_toml(item.default)}`"
+        lines.append(f"| `{prefix}{name}` | {default} | {unit} | {rule} | {item.metadata['doc']} |")
     return lines
 
 

@@ -24,6 +24,7 @@ from synpick_warp.errors import ConfigError, format_value
 
 PINHOLE = "pinhole"
 FISHEYE = "fisheye"
+MODELS = (PINHOLE, FISHEYE)
 COUNTS = {PINHOLE: (4, 5, 8, 12), FISHEYE: (4,)}
 """Numbers of coefficients of each model: k1 k2 p1 p2 [k3 [k4 k5 k6 [s1 s2 s3 s4]]] and k1 k2 k3 k4, in OpenCV's order."""
 INTEGERS, HALVES = 0.0, 0.5

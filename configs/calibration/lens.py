@@ -7,6 +7,7 @@ the fisheye model that of Kannala and Brandt (2006).
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass
 
 import numpy as np
@@ -120,6 +121,14 @@ class Lens:
         roots = np.roots((1.0, *self._padded()[5:8]))
         real = roots.real[(abs(roots.imag) <= 1e-9 * abs(roots)) & (roots.real > 1e-9)]
         return float(1 / np.sqrt(real.max())) if len(real) else np.inf
+
+
+@functools.lru_cache(maxsize=64)
+def make_lens_map(
+    model: str, coefficients: tuple[float, ...], intrinsics: tuple[float, float, float, float], size: tuple[int, int]
+) -> LensMap:
+    """Projection through a lens, as of `LensMap`; made once for the same numbers."""
+    return LensMap(Lens(model, coefficients), intrinsics, size)
 
 
 class LensMap:

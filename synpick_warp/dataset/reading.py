@@ -324,7 +324,7 @@ class DataSet(Mapping[int, Episode]):
 
         from synpick_warp.scenes.cameras import make_cameras
 
-        cameras = make_cameras(self.config.cameras)
+        cameras = make_cameras(self.config.rig)
         return tuple(CameraInfo(np.array((c.width, c.height), np.int32), c.matrix, c.rotation, c.translation) for c in cameras)
 
     def intrinsics(self, convention: str = "synpick") -> np.ndarray:
@@ -369,7 +369,7 @@ class DataSet(Mapping[int, Episode]):
         """Number of cameras: found in files, or of the settings."""
         if self.found is not None:
             return self.found.cameras
-        return len(self.config.cameras.positions)
+        return len(self.config.rig)
 
     @property
     def attempts(self) -> Iterator[dict[str, Any]]:
@@ -432,7 +432,7 @@ class DataSet(Mapping[int, Episode]):
         return self._index() if (self.folder / CONFIG_FILE).exists() else None
 
     def _index(self) -> SceneIndex:
-        return SceneIndex(self.folder, DataLayout.of(self.config), self.config.cameras.resolution)
+        return SceneIndex(self.folder, DataLayout.of(self.config), self.config.rig.sizes)
 
     @property
     def _parts(self) -> list[PartFiles]:

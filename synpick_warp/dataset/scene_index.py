@@ -7,6 +7,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from synpick_warp.configs.rig import Size
 from synpick_warp.configs.splits import DataLayout
 from synpick_warp.dataset.commit.manifest import CONFIG_FILE
 from synpick_warp.errors import DatasetError
@@ -19,14 +20,14 @@ if TYPE_CHECKING:
 class SceneIndex:
     """Scene folders and shards of a data set by episode and camera."""
 
-    def __init__(self, folder: Path, layout: DataLayout, resolution: tuple[int, int]) -> None:
+    def __init__(self, folder: Path, layout: DataLayout, sizes: tuple[Size, ...]) -> None:
         """
         Args:
             folder: Folder of the data set.
             layout: Its layout.
-            resolution: Width and height of its images [px].
+            sizes: Width and height of each camera's images [px].
         """
-        self._folder, self._size, self._layout = folder, resolution, layout
+        self._folder, self._sizes, self._layout = folder, sizes, layout
 
     @cached_property
     def _folders(self) -> dict[str, tuple[Path, Path]]:
@@ -46,10 +47,10 @@ class SceneIndex:
         folder, web = self._folders[self._layout.folder(episode)]
         index, suffix = self._layout.scene(episode, camera)
         if (folder / f"{index:06d}").is_dir():
-            return SceneFolder(folder / f"{index:06d}", self._size, suffix)
+            return SceneFolder(folder / f"{index:06d}", self._sizes[camera], suffix)
         scene = self._layout.cameras * episode + camera
         if shards := list(find_shards(scene, web)):
-            return SceneShards(shards, scene, self._size)
+            return SceneShards(shards, scene, self._sizes[camera])
         raise DatasetError(f"{self._folder} has no images of episode {episode}; bake with --formats bop or shards")
 
     def has(self, episode: int) -> bool:

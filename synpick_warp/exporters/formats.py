@@ -33,7 +33,7 @@ _PLAIN = r"[^./][^/]*"
 """A part of a path that is not hidden."""
 _MODELS = rf"models(?:_eval)?/(?:models_info\.json|obj_{_INDEX}\.ply|(?:{_PLAIN}/)*{_PLAIN}\.(?i:{'|'.join(TEXTURE_KINDS)}))"
 """Models, and textures, whose names come from the models of the user."""
-_NOTES = r"camera\.json|dataset_info\.md"
+_NOTES = r"camera(?:_[a-z][a-z0-9_]{0,31})?\.json|dataset_info\.md"
 _SCENE_CONSTANTS = rf"{_MODELS}|{_NOTES}|bop_dataset_params\.py"
 _ZARR_ARRAY = r"[a-z_]+/(?:zarr\.json|c(?:\.[0-9]+)*)"
 _STORE = r"trajectory\.zarr"
@@ -96,8 +96,9 @@ class Format(NamedTuple):
 def _bop(layout: DataLayout, episode: int) -> str:
     """Regular expression that matches the paths of an episode's files in scene folders."""
     scenes = "|".join(dict.fromkeys(f"{layout.scene(episode, camera)[0]:06d}" for camera in range(layout.cameras)))
-    image = rf"[a-z_]+(?:_cam[0-9]+)?/{_INDEX}(?:_[0-9]{{6}})?\.(?:png|jpg)"
-    return rf"{re.escape(layout.folder(episode))}/(?:{scenes})/(?:scene_[a-z_]+(?:_cam[0-9]+)?\.json|{image})"
+    sensor = f"(?:_(?:{'|'.join(layout.sensors)}))?" if layout.has_sensors else ""
+    image = rf"[a-z_]+{sensor}/{_INDEX}(?:_[0-9]{{6}})?\.(?:png|jpg)"
+    return rf"{re.escape(layout.folder(episode))}/(?:{scenes})/(?:scene_[a-z_]+{sensor}\.json|{image})"
 
 
 def _shards(layout: DataLayout, episode: int) -> str:
@@ -116,10 +117,10 @@ def _zarr(_: DataLayout, episode: int) -> str:
     return rf"{_STORE}/episodes/{episode:06d}/(?:zarr\.json|[a-z_]+/(?:zarr\.json|{_ZARR_ARRAY}))"
 
 
-def _lerobot(_: DataLayout, episode: int) -> str:
+def _lerobot(layout: DataLayout, episode: int) -> str:
     """Regular expression that matches the paths of an episode's part and videos in the LeRobot folder."""
     video = rf"chunk-{episode // 1000:03d}/file-{episode % 1000:03d}\.mp4"
-    return rf"lerobot/(?:parts/{episode:06d}\.json|videos/observation\.images\.camera_[0-9]+/{video})"
+    return rf"lerobot/(?:parts/{episode:06d}\.json|videos/observation\.images\.(?:{'|'.join(layout.names)})/{video})"
 
 
 def _coco(layout: DataLayout, episode: int) -> str:

@@ -148,7 +148,7 @@ def build_smallest(config: Config, device: wp.Device, progress: Progress, record
 def _add_stream(stages: Stages, device: wp.Device, needs_images: bool, depth_files: bool) -> Factory:
     """Add a stream of views to stages; arguments as of `host_images`."""
     config, table, tick_time = stages.config, stages.light_table, stages.tick_time
-    host = host_images(config.bop, config.cameras.resolution[1], device, needs_images, depth_files)
+    host = host_images(config.bop, config.rig.largest[1], device, needs_images, depth_files)
     layers, cameras, ids = config.render.layers, len(stages.cameras), stages.object_ids
     stream = FrameStream(stages.sizes, layers, cameras, tick_time, stages.renderer, ids, table, device, host)
     return Factory(**vars(stages), stream=stream, log=stages.make_log())
@@ -165,7 +165,7 @@ def build_stages(
 ) -> Stages:
     """Load assets, and build worlds and renderer, from settings with resolved sizes. Other arguments and errors: `build_factory`."""
     progress.stage("loading objects and lights")
-    cameras = make_cameras(config.cameras)
+    cameras = make_cameras(config.rig)
     fixtures = make_fixtures(config.tote, config.gripper)
     catalog = load_catalog(config, report=progress.note)
     lights = load_lights(config.bake.lights, progress.note, config.objects.strict)
@@ -175,7 +175,7 @@ def build_stages(
     progress.stage(f"building {config.bake.worlds} worlds of {len(catalog)} objects on {device.alias}")
     scene = build_render_scene(config.render, config.tote, catalog, fixtures, cameras, lights, device)
     simulation = Simulation(config, catalog, len(lights), device, scene, episodes, records_physics)
-    sizes = view_sizes(config.render, config.cameras, config.bake.worlds, config.arrangement.max_objects, device)
+    sizes = view_sizes(config.render, config.rig, config.bake.worlds, config.arrangement.max_objects, device)
     histories = simulation.layout.worlds * len(cameras)
     renderer = make_renderer(config, scene, config.arrangement.max_objects, sizes["view"], histories)
     object_ids = np.array([entry.obj_id for entry in catalog.entries], dtype=np.int32)

@@ -91,15 +91,15 @@ def plan_memory(config: Config, device: wp.Device, writers: int = 1) -> list[Ter
         writers: Writer processes; 0: nothing is written, views stay on the device.
     """
     config, needs = with_enough_worlds(config, device), Needs.of(config)
-    worlds, objects, cameras = config.bake.worlds, config.arrangement.max_objects, config.cameras
+    worlds, objects, rig = config.bake.worlds, config.arrangement.max_objects, config.rig
     bodies = build.GRIPPER_BODIES + 2 * objects
     sizes = record_sizes(world_sizes(worlds, objects, config.move.rounds, bodies), config.physics.steps_per_tick)
     terms = [*_simulation(sizes, config.trajectory.steps if needs.physics else None, device)]
-    count, views = len(cameras.positions), view_sizes(config.render, cameras, worlds, objects, device)
-    scene, sections = blank_scene(count, *cameras.resolution, device), (config.render, config.effects, config.depth_sensor)
+    count, views = len(rig), view_sizes(config.render, rig, worlds, objects, device)
+    scene, sections = blank_scene(count, *rig.largest, device), (config.render, config.effects, config.depth_sensor)
     with dry_run() as arrays:
         Renderer(scene, *sections, seed=0, depth_scale=1.0, instances=objects, views=views["view"], histories=worlds * count)
-    host = host_images(config.bop, cameras.resolution[1], device, needs.images, needs.depth_files) if writers else None
+    host = host_images(config.bop, rig.largest[1], device, needs.images, needs.depth_files) if writers else None
     terms += _images(arrays, views, count, config.render.layers, host, device)
     if may_pick(config.bake, config.splits):
         terms.append(_perception(config.perception, worlds, objects, device))

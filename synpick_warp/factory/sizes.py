@@ -55,7 +55,7 @@ def fit_to_device(config: Config, device: wp.Device, episodes: int, writers: int
     while terms := _short_terms(split_memories(plan_memory(config, device, writers), device, processes)):
         worlds, objects = config.bake.worlds, config.arrangement.max_objects
         amounts = {
-            "render.views_per_batch": views_per_batch(config.render, config.cameras, worlds, device),
+            "render.views_per_batch": views_per_batch(config.render, config.rig, worlds, device),
             "perception.views": count_views(config.perception, worlds, objects, device),
             "bake.worlds": worlds,
         }

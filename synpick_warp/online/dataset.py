@@ -138,7 +138,7 @@ class StreamDataset(IterableDataset):
         self.fields, self.batched, self.shuffle, self.transform = tuple(fields), batched, shuffle, transform
         self.episodes = range(episodes) if isinstance(episodes, int) else episodes
         self.fresh, self.shard, self.splits = fresh, shard, tuple(splits)
-        self.selection = Selection(cameras, stride).resolve(len(self.config.cameras.positions))
+        self.selection = Selection(cameras, stride).resolve(len(self.config.rig))
         choose_episodes(DataLayout.of(self.config), self.episodes, shard, self.splits)
         self._epoch = torch.zeros((), dtype=torch.int64).share_memory_()  # Workers that live through all epochs see it change.
 

@@ -190,7 +190,7 @@ def open_stream(
         raise ConfigError(f"shard {shard[0]}/{shard[1]} has no episode; give more episodes, or fewer parts")
     device = pick_device(config.bake.device)
     check_episodes(len(indices), config.bake.episodes)
-    selection = selection.resolve(len(config.cameras.positions))
+    selection = selection.resolve(len(config.rig))
     if selection.stride > 1:
         # A history holds the frame before, which is not rendered.
         config = config.with_values({"render.history": 0})

@@ -12,7 +12,8 @@ import numpy as np
 import warp as wp
 
 from synpick_warp.codes import Measure, Status, column_names
-from synpick_warp.configs.schema import Cameras, Render
+from synpick_warp.configs.rig import Rig
+from synpick_warp.configs.schema import Render
 from synpick_warp.stages.arrays import allocate, dry_run
 from synpick_warp.stages.buffers import LayerBuffers, Snapshot, ViewBuffers, view_buffer_sizes
 from synpick_warp.stages.encoding.jpeg import Compressor, JpegBuffers, JpegScratch, jpeg_sizes
@@ -37,23 +38,23 @@ _SNAPSHOT = ("fixture_pose", "fixture_visible", "light", "light_yaw", "light_exp
 RING = 3
 
 
-def views_per_batch(render: Render, cameras: Cameras, worlds: int, device: wp.Device) -> int:
+def views_per_batch(render: Render, rig: Rig, worlds: int, device: wp.Device) -> int:
     """Number of views rendered at once: as set; else on a CPU one world's, on a GPU what BATCH_BYTES hold, up to all worlds'."""
-    views = len(cameras.positions)
+    views = len(rig)
     if render.views_per_batch:
         return render.views_per_batch
     if not device.is_cuda:
         return views
-    width, height = cameras.resolution
+    width, height = rig.largest
     with dry_run() as layers:
         allocate(LayerBuffers, {"view": 1, "row": height, "column": width}, device, render.layers)
     each = width * height * PIXEL_BYTES + sum(layer.row[3] for layer in layers)
     return max(1, min(BATCH_BYTES // each, views * worlds))
 
 
-def view_sizes(render: Render, cameras: Cameras, worlds: int, objects: int, device: wp.Device) -> dict[str, int]:
+def view_sizes(render: Render, rig: Rig, worlds: int, objects: int, device: wp.Device) -> dict[str, int]:
     """Extents of the dimensions of `ViewBuffers` and `LayerBuffers`, for `worlds` worlds of at most `objects` objects."""
-    return view_buffer_sizes(views_per_batch(render, cameras, worlds, device), *cameras.resolution, objects)
+    return view_buffer_sizes(views_per_batch(render, rig, worlds, device), *rig.largest, objects)
 
 
 @dataclass(frozen=True, eq=False)

@@ -23,6 +23,7 @@ from tests.configs.test_presets import resolved
 
 COUPLED = {
     "bake.episodes",
+    "perception.camera",
     "pick.press_time",
     "bop.split",
     "bop.color_format",

@@ -10,6 +10,7 @@ import pytest
 import warp as wp
 
 from synpick_warp.codes import Segment
+from synpick_warp.configs.rig import Rig
 from synpick_warp.configs.schema import Config
 from synpick_warp.errors import ConfigError
 from synpick_warp.scenes.cameras import make_cameras
@@ -38,7 +39,7 @@ def toy() -> ToyScene:
     return ToyScene(
         [entry(box(0.1, 0.06, 0.04)), entry(ball(0.04, 3))],
         placed,
-        make_cameras(config.cameras)[:1],
+        make_cameras(config.rig)[:1],
         fixtures=(tote, *gripper),
         fixture_poses=poses,
         fixtures_visible=(1, 0, 0),
@@ -50,12 +51,10 @@ def toy() -> ToyScene:
 def make_images(toy: ToyScene, device: wp.Device, worlds: int = 4, views: int = 3) -> PerceptionImages:
     """Perception of the toy scene, whose other cameras have another resolution."""
     config = toy.settings()
-    cameras = replace(config.cameras, resolution=(192, 108))
+    rig = Rig.of(replace(config.cameras, resolution=(192, 108)))
     settings = replace(config.perception, resolution=RESOLUTION, views=views)
-    scene = build_render_scene(
-        config.render, config.tote, Catalog(tuple(toy.entries)), toy.fixtures, make_cameras(cameras), toy.lights, device
-    )
-    return PerceptionImages(settings, cameras, scene, worlds, toy.instances)
+    scene = build_render_scene(config.render, config.tote, Catalog(tuple(toy.entries)), toy.fixtures, make_cameras(rig), toy.lights, device)
+    return PerceptionImages(settings, rig, scene, worlds, toy.instances)
 
 
 def test_gbuffer_equals_the_renderers_without_gripper(device, toy):
@@ -126,4 +125,4 @@ def test_more_pixels_than_31_bits_count_are_an_error(device, toy):
     settings = replace(Config().perception, resolution=(8192, 8192), views=32)
     scene = build_scene(toy, device)
     with pytest.raises(ConfigError, match=r"perception\.views is 32"):
-        PerceptionImages(settings, Config().cameras, scene, 32, toy.instances)
+        PerceptionImages(settings, Config().rig, scene, 32, toy.instances)

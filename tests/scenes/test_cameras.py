@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from synpick_warp.configs.rig import Rig
 from synpick_warp.configs.schema import Cameras
 from synpick_warp.errors import ConfigError
 from synpick_warp.scenes.cameras import make_cameras
@@ -22,7 +23,7 @@ def project(camera, point):
 
 
 def test_the_papers_cameras_have_the_papers_matrix():
-    cameras = make_cameras(Cameras())
+    cameras = make_cameras(Rig.of(Cameras()))
     assert len(cameras) == 3
     for camera in cameras:
         assert (camera.width, camera.height) == (1920, 1080)
@@ -32,7 +33,7 @@ def test_the_papers_cameras_have_the_papers_matrix():
 
 
 def test_the_first_camera_looks_straight_down_with_y_up():
-    (camera,) = make_cameras(ONE)
+    (camera,) = make_cameras(Rig.of(ONE))
     assert np.allclose(camera.rotation, [[1, 0, 0], [0, -1, 0], [0, 0, -1]])
     assert np.allclose(camera.translation, [0, 0, 2])
     assert project(camera, (0, 0, 0.16)) == pytest.approx((960, 540))
@@ -42,7 +43,7 @@ def test_the_first_camera_looks_straight_down_with_y_up():
 
 
 def test_the_other_two_cameras_look_at_the_target_with_the_centre_line_up():
-    _, far, near = make_cameras(Cameras())
+    _, far, near = make_cameras(Rig.of(Cameras()))
     for camera, side in ((far, 1.0), (near, -1.0)):
         assert np.allclose(-camera.rotation.T @ camera.translation, (0, side * 0.573, 2.0))
         assert project(camera, (0, 0, 0.16)) == pytest.approx((960, 540))
@@ -56,7 +57,7 @@ def test_up_vectors_point_up_and_the_target_is_in_the_image_centre(position, tar
     forward = np.subtract(target, position)
     if np.linalg.norm(np.cross(forward, up)) < 1e-3 * np.linalg.norm(forward) or np.linalg.norm(forward) < 1e-2:
         return
-    (camera,) = make_cameras(Cameras(positions=(position,), target=target, ups=(up,), fov=fov))
+    (camera,) = make_cameras(Rig.of(Cameras(positions=(position,), target=target, ups=(up,), fov=fov)))
     assert np.linalg.det(camera.rotation) == pytest.approx(1)
     assert project(camera, target) == pytest.approx((960, 540), abs=1e-3)
     higher = (np.array(target) + 1e-3 * np.array(up)).tolist()
@@ -66,7 +67,7 @@ def test_up_vectors_point_up_and_the_target_is_in_the_image_centre(position, tar
 
 
 def test_resolution_scales_the_intrinsics():
-    (camera,) = make_cameras(replace(ONE, resolution=(640, 360)))
+    (camera,) = make_cameras(Rig.of(replace(ONE, resolution=(640, 360))))
     assert np.allclose(camera.matrix, [[1814.81, 0, 320], [0, 1814.81, 180], [0, 0, 1]], atol=5e-3)
 
 
@@ -77,11 +78,11 @@ def test_resolution_scales_the_intrinsics():
         ({"ups": ((0.0, 0.0, 0.0),)}, "zero"),
         ({"ups": ((0.0, 1.0, 0.0), (0.0, 1.0, 0.0))}, "1 entries and cameras.ups 2"),
         ({"positions": (), "ups": ()}, "empty"),
-        ({"target": (0.0, 0.0, 2.0)}, "is at cameras.target"),
+        ({"target": (0.0, 0.0, 2.0)}, "is at its look-at point"),
         ({"target": (0.0, float("nan"), 0.0)}, "not finite"),
     ],
 )
 def test_invalid_cameras_are_refused(change, words):
     with pytest.raises(ConfigError, match=words) as caught:
-        make_cameras(replace(ONE, **change))
+        make_cameras(Rig.of(replace(ONE, **change)))
     assert "\n" not in str(caught.value)

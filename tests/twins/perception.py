@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 import warp as wp
 
+from synpick_warp.configs.rig import Rig
 from synpick_warp.configs.schema import Config, Perception
 from synpick_warp.kernels import structs
 from synpick_warp.scenes.cameras import make_cameras
@@ -32,7 +33,7 @@ class SegmenterHarness:
             bake=replace(config.bake, worlds=worlds),
             arrangement=replace(config.arrangement, max_objects=instances),
         )
-        camera = make_cameras(replace(config.cameras, resolution=(width, height)))[0]
+        camera = make_cameras(Rig.of(replace(config.cameras, resolution=(width, height))))[0]
         self.focal = camera.matrix[[0, 1], [0, 1]]
         views, _, gbuffer, arrays, scratch = allocate_batch(self.config.perception, instances, worlds, device)
         self.images: Any = SimpleNamespace(

@@ -28,7 +28,7 @@ SHORT = {
 def render_scene(config: Config, objects: Catalog, device: Any) -> RenderScene:
     """The scene of a bake, under one light."""
     fixtures = make_fixtures(config.tote, config.gripper)
-    return build_render_scene(config.render, config.tote, objects, fixtures, make_cameras(config.cameras), load_lights("")[:LIGHTS], device)
+    return build_render_scene(config.render, config.tote, objects, fixtures, make_cameras(config.rig), load_lights("")[:LIGHTS], device)
 
 
 def picking(config: Config, objects: Catalog, device: Any, **other: Any) -> Simulation:

@@ -94,7 +94,7 @@ def write_set(
     (out / PARTIAL).mkdir(parents=True)
     with WriterPool(0, 0) as pool:
         exporter = UsdExporter(
-            ExportContext(out, ExportSettings.of(config), catalog, make_cameras(config.cameras), lights or skies()[:2], pool)
+            ExportContext(out, ExportSettings.of(config), catalog, make_cameras(config.rig), lights or skies()[:2], pool)
         )
         assert exporter.write_constants() == [Path("usd/assets")]
         for episode in episodes:

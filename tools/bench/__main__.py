@@ -189,7 +189,7 @@ def measure(
         for row in _measure_worlds(config.bop.jpeg_quality, factory, min_seconds, parts):
             values[row.name] = row.value
             yield row
-        yield from _perception_fraction(config.bake.worlds * len(config.cameras.positions), config.physics.steps_per_tick, values)
+        yield from _perception_fraction(config.bake.worlds * len(config.rig), config.physics.steps_per_tick, values)
         if "write" in parts:
             worlds = min(factory.simulation.layout.worlds, -(-WRITE_VIEWS // len(factory.cameras)))
             yield from of_part("write", measure_writing(factory, _mark_live(factory.simulation, worlds), min_seconds))

@@ -66,7 +66,7 @@ class Variant:
     def build_scene(self) -> RenderScene:
         """Renderer's scene."""
         config = self.config
-        fixtures, cameras = make_fixtures(config.tote, config.gripper), make_cameras(config.cameras)
+        fixtures, cameras = make_fixtures(config.tote, config.gripper), make_cameras(config.rig)
         return build_render_scene(config.render, config.tote, self.catalog, fixtures, cameras, self.lights, self.device)
 
     def drop(self, scene: RenderScene) -> Pile:
@@ -84,8 +84,8 @@ class Variant:
     def time_view(self, scene: RenderScene, pile: Pile) -> float:
         """Time of a view [s], in full batches."""
         config, device, worlds = self.config, self.device, self.config.bake.worlds
-        cameras, objects = len(config.cameras.positions), config.arrangement.max_objects
-        sizes = view_sizes(config.render, config.cameras, worlds, objects, device)
+        cameras, objects = len(config.rig), config.arrangement.max_objects
+        sizes = view_sizes(config.render, config.rig, worlds, objects, device)
         count = min(sizes["view"], worlds * cameras)
         renderer = make_renderer(config, scene, objects, sizes["view"], worlds * cameras)
         images, views = allocate(ViewBuffers, sizes, device), first_views(count, cameras, objects, device)

@@ -53,7 +53,7 @@ def measure_steady(config: Config, min_seconds: float, devices: Sequence[str] = 
     count = max(1, len(names))
     config = config.with_values({"bake.episodes": SPARE_EPISODES * config.bake.worlds * count})
     device = pick_device(names[0] if names else config.bake.device)
-    live_views = LIVE_FRACTION * config.bake.worlds * len(config.cameras.positions)
+    live_views = LIVE_FRACTION * config.bake.worlds * len(config.rig)
     with tempfile.TemporaryDirectory() as folder, clean_up_behind(DataLayout.of(config), Path(folder) / "out") as cleaner:
         meter = SteadyMeter(min_seconds, Path(folder), live_views, config.bake.worlds, device, cleaner, devices=count)
         summary = run_bake(config, Path(folder) / "out", meter, devices=names)

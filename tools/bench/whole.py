@@ -105,7 +105,7 @@ def measure_whole(config: Config, bake: WholeBake, steady_rate: float, traces: d
         whole = Stretch(time.perf_counter() - trace.started, summary.views)
         tally = cleaner.finish(len(committed_episodes(Path(folder) / "out")))
         verified = time.perf_counter() - trace.started
-    cameras = len(config.cameras.positions)
+    cameras = len(config.rig)
     traces["whole"] = describe_trace(trace.points, cameras)
     yield from summarize(trace.points, cameras, whole, steady_rate)
     for text, seconds in trace.stages:

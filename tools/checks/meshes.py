@@ -93,7 +93,7 @@ def draw(outcomes: list[Outcome], device: str) -> np.ndarray:
     fixed = {"cameras.resolution": [CELL, CELL], "cameras.positions": [[0.0, 0.0, 0.9]], "cameras.ups": [[0.0, 1.0, 0.0]]}
     config = load_config(None, fixed)
     entries = [_entry(number, *found) for number, outcome in enumerate(outcomes) if (found := outcome.found) is not None]
-    cameras, count = make_cameras(config.cameras), len(entries)
+    cameras, count = make_cameras(config.rig), len(entries)
     fixtures = make_fixtures(config.tote, config.gripper)
     scene = build_render_scene(
         config.render, config.tote, Catalog(tuple(entries)), fixtures, cameras, load_lights("")[:1], wp.get_device(device)

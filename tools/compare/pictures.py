@@ -164,7 +164,7 @@ def compare_devices(config: Config, devices: list[Any], console: Console) -> lis
     lights = load_lights(config.bake.lights)
     simulation = Simulation(with_enough_worlds(config, devices[0]), catalog, len(lights), devices[0])
     snapshot = next_frame(settle_piles(simulation, config.bake.worlds), CREEP)
-    cameras = make_cameras(config.cameras)
+    cameras = make_cameras(config.rig)
     fixtures = make_fixtures(config.tote, config.gripper)
     differences = []
     for mode in COLORS:

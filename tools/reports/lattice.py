@@ -184,7 +184,7 @@ def compare_maps(
     """
     device, room = stages.renderer.scene.device, config.arrangement.max_objects
     fixtures = make_fixtures(config.tote, config.gripper)
-    scene = build_render_scene(config.render, config.tote, stages.catalog, fixtures, make_cameras(config.cameras), stages.lights, device)
+    scene = build_render_scene(config.render, config.tote, stages.catalog, fixtures, make_cameras(config.rig), stages.lights, device)
     width, height = config.cameras.resolution
     samples = min(MAX_SAMPLES, max(2, 1 << int(math.log2(options.paths / (width * height)))))
     store = ReferenceStore(options.cache, config.with_values({"render.samples": samples}), scene)

@@ -10,6 +10,7 @@ import numpy as np
 import trimesh
 import warp as wp
 
+from synpick_warp.configs.rig import Rig
 from synpick_warp.configs.schema import FAST, REFERENCE, Cameras, Config
 from synpick_warp.factory.assembly import make_renderer
 from synpick_warp.scenes.cameras import make_cameras
@@ -96,7 +97,7 @@ def measure_furnaces(config: Config, device: Any) -> list[Row]:
     )
     rows = []
     for mode in (REFERENCE, FAST):
-        studio = _probe_studio(config, mode, mesh, surfaces, make_cameras(above), _uniform_light(), device)
+        studio = _probe_studio(config, mode, mesh, surfaces, make_cameras(Rig.of(above)), _uniform_light(), device)
         snapshot = _probe_snapshot(config.arrangement.max_objects, len(surfaces), device)
         for world, (metallic, roughness) in enumerate(surfaces):
             shot = studio.render(snapshot, world, 0)
@@ -131,7 +132,7 @@ def measure_planes(config: Config, device: Any) -> list[Row]:
     rows = []
     for height in LAMP_HEIGHTS:
         cosine = float(np.sin(np.radians(height)))
-        studio = _probe_studio(config, REFERENCE, mesh, [(0.0, 1.0)], make_cameras(around), _lamp_light(cosine), device)
+        studio = _probe_studio(config, REFERENCE, mesh, [(0.0, 1.0)], make_cameras(Rig.of(around)), _lamp_light(cosine), device)
         snapshot = _probe_snapshot(config.arrangement.max_objects, 1, device)
         radiance = [float(studio.render(snapshot, 0, camera).radiance.mean()) for camera in range(len(positions))]
         error = 100.0 * (float(node_weights @ radiance) / (np.sin(LAMP_RADIUS) ** 2 * cosine) - 1.0)

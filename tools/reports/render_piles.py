@@ -80,7 +80,7 @@ def compare_piles(
     catalog = load_catalog(config, report=report)
     lights = load_lights(config.bake.lights)
     snapshot = settle_piles(Simulation(with_enough_worlds(config, device), catalog, len(lights), device), config.bake.worlds)
-    cameras = make_cameras(config.cameras)[:1]
+    cameras = make_cameras(config.rig)[:1]
     values: list[dict[str, object]] = [{"render.mode": FAST}, {"render.mode": REFERENCE}]
     if noise:
         values.append({"render.mode": REFERENCE, "bake.seed": config.bake.seed + 1})

@@ -23,6 +23,9 @@ from synpick_warp.kernels.render.visibility.lens import distort
 
 wp.set_module_options({"enable_backward": False})
 
+SMALL_SHIFT = wp.constant(1.0e-8)
+"""Squared distance in the normalised plane below which a lens moves points by its Jacobian: the difference of two places is rounded."""
+
 
 @wp.struct
 class BodyMotions:
@@ -312,9 +315,12 @@ def render_flow_kernel(
     if depth > NEAR_PLANE:
         flow = wp.vec2(intrinsics[0] * (d[0] - ray[0] * d[2]) / depth, intrinsics[1] * (d[1] - ray[1] * d[2]) / depth)
         lens = lens_of(views.cameras, view)
-        if lens >= 0 and wp.length_sq(d) > 0.0:
-            point = gbuffer.depth[view, row, column] * ray + d
-            before, _ = distort(views.cameras.lenses, lens, wp.vec2(point[0], point[1]) / depth)
-            now, _ = distort(views.cameras.lenses, lens, wp.vec2(ray[0], ray[1]))
-            flow = wp.cw_mul(wp.vec2(intrinsics[0], intrinsics[1]), before - now)
+        if lens >= 0:
+            shift = wp.vec2(flow[0] / intrinsics[0], flow[1] / intrinsics[1])
+            now, jacobian = distort(views.cameras.lenses, lens, wp.vec2(ray[0], ray[1]))
+            change = jacobian * shift
+            if wp.length_sq(shift) > SMALL_SHIFT:
+                before, _ = distort(views.cameras.lenses, lens, wp.vec2(ray[0], ray[1]) + shift)
+                change = before - now
+            flow = wp.vec2(intrinsics[0] * change[0], intrinsics[1] * change[1])
     flow_out[view, row, column] = flow

@@ -27,7 +27,7 @@ class StoredContext(ExportContext):
         """
         from synpick_warp.scenes.cameras import make_cameras
 
-        super().__init__(out, settings, Catalog(()), make_cameras(settings.cameras), (), pool)
+        super().__init__(out, settings, Catalog(()), make_cameras(settings.rig), (), pool)
         self._source = source
 
     @cached_property

@@ -108,7 +108,7 @@ class _Context(ExportContext):
     """Context of the exporters: names from models, or else numbers; models are copied."""
 
     def __init__(self, data: DataSet, out: Path, settings: ExportSettings, pool: WriterPool) -> None:
-        super().__init__(out, settings, Catalog(()), make_cameras(settings.cameras), (), pool)
+        super().__init__(out, settings, Catalog(()), make_cameras(settings.rig), (), pool)
         self._data = data
 
     @property
@@ -249,7 +249,7 @@ def _write(data: DataSet, work: Path, settings: ExportSettings, processes: int, 
             images = tuple(episode.image_ids)
             files = data.scene_files(episode.index, 0)
             suffix = f".{settings.bop.color_format}"
-            exporters.write_stored(scene, [FoundSceneFiles(files, scene, images, suffix, settings.cameras.resolution)])
+            exporters.write_stored(scene, [FoundSceneFiles(files, scene, images, suffix, settings.rig.sizes[0])])
             end = EpisodeEnd(scene, 0, len(images), int(Ending.FINISHED), image_ids=images)
             exporters.end_episode(end, lambda scene=scene: commit(scene))
         pool.wait()

@@ -175,8 +175,8 @@ def _lead(data_set: DataSet, statistics: Statistics, findings: list[Finding]) ->
     if data_set.found is not None:
         said = f"A BOP data set from another source than synpick-warp bake; splits {splits}. "
     else:
-        width, height = data_set.config.cameras.resolution
-        said = f"Modes {modes}; splits {splits}; images of {width} x {height} pixels; seed {data_set.config.bake.seed}. "
+        sizes = ", ".join(dict.fromkeys(f"{width} x {height}" for width, height in data_set.config.rig.sizes))
+        said = f"Modes {modes}; splits {splits}; images of {sizes} pixels; seed {data_set.config.bake.seed}. "
     return join([said, element("a", f"Findings: {summary(findings)}", href="#findings"), "."])
 
 

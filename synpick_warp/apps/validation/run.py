@@ -170,6 +170,6 @@ def _count_cameras(layout: Layout) -> int:
     if not layout.ours:
         return 1
     try:
-        return max(1, len(read_settings(layout.root, read_manifest(layout.root)).cameras.positions))
+        return len(read_settings(layout.root, read_manifest(layout.root)).rig)
     except (SynpickError, DatasetError):
         return 1

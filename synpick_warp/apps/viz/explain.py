@@ -69,11 +69,11 @@ def write_explanation(dataset: Path, out: Path, episode: int | None, attempt: in
     config = load_config(str(path), {})
     seen = {one.object_id for each in attempts for one in each.seen}
     names = object_names(dataset, seen, config.object_rows, config.objects.diameter_tolerance)
-    scenes = SceneIndex(dataset, DataLayout.of(config), config.cameras.resolution)
+    scenes = SceneIndex(dataset, DataLayout.of(config), config.rig.sizes)
     suction, tick_time = config.suction, config.physics.tick_time
     rows = []
     for each in attempts:
-        view = _open_view(dataset, scenes, each)
+        view = _open_view(dataset, scenes, each, config.rig.index(config.perception.camera))
         rows.append(_row(each, view, draw_words(each, names, config.target, suction), config.perception.min_votes))
     charts = [load_chart(each, suction, tick_time, IMAGE_WIDTH, room) for each, (_, room) in zip(attempts, rows, strict=True)]
     for (sheet, _), data in zip(rows, render_charts(charts, scale=1.0), strict=True):
@@ -82,18 +82,18 @@ def write_explanation(dataset: Path, out: Path, episode: int | None, attempt: in
     return write_picture(out, np.concatenate([sheet for sheet, _ in rows]))
 
 
-def _open_view(dataset: Path, scenes: SceneIndex, attempt: Attempt) -> View:
-    """View of camera 0 in which an attempt's choice was made."""
-    files = scenes.files(attempt.episode, 0)
+def _open_view(dataset: Path, scenes: SceneIndex, attempt: Attempt, camera: int) -> View:
+    """View of the camera of perception in which an attempt's choice was made."""
+    files = scenes.files(attempt.episode, camera)
     if attempt.frame not in files.frames():
         raise DatasetError(f"{files.place} has no image {attempt.frame}, which {dataset}/attempts.jsonl names")
-    return View(files, attempt.episode, 0, attempt.frame)
+    return View(files, attempt.episode, camera, attempt.frame)
 
 
 def to_color_image(pixel: Pixel, resolution: tuple[int, int], size: tuple[int, int]) -> tuple[float, float]:
     """Map a pixel of the perception image to the colour image (column, row); in both, integers are pixel centres.
 
-    Both images have the same camera, principal point in the middle and horizontal field of view; their aspect ratios may differ.
+    Both images have the same camera and horizontal field of view, and the same point in the middle; their aspect ratios may differ.
 
     Args:
         pixel: Column and row in the perception image.
@@ -130,7 +130,7 @@ def _row(attempt: Attempt, view: View, words: Image, min_votes: float) -> tuple[
     head = f"Episode {attempt.episode}, attempt {attempt.attempt} ({MODE_WORDS[attempt.mode]}): {attempt.sentence}"
     put_text(sheet, head, (MARGIN, MARGIN + 20), 0.68, GREEN if attempt.picked else RED, 2)
     scene = Path(view.place)
-    captions = [f"camera 0: {scene.parent.name}/{scene.name}, image {attempt.frame}", "clutter graph", "choice and outcome"]
+    captions = [f"camera {view.camera}: {scene.parent.name}/{scene.name}, image {attempt.frame}", "clutter graph", "choice and outcome"]
     if not view.has("mask_visib"):
         captions[0] += "; no contours: this data set has no masks"
     for text, column in zip(captions, columns, strict=True):
@@ -148,7 +148,7 @@ def draw_observation(attempt: Attempt, view: View) -> Image:
 
     Args:
         attempt: The attempt.
-        view: Camera 0 at the observation.
+        view: The camera of perception at the observation.
 
     Raises:
         DatasetError: A file is missing or damaged, or has no such view.

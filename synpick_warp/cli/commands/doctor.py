@@ -49,8 +49,8 @@ def memory_report(config: Config) -> Table:
     writers = count_writers(config.bake.writers, Needs.of(config).slot_bytes)
     config = fit_to_device(without_pictures(config), device, episodes, writers)
     rows = [row for term in plan_memory(config, device) for row in term.rows]
-    width, height = config.cameras.resolution
-    table = Table("array", "shape", "unit", "MiB", title=f"{config.bake.worlds} worlds, {width}x{height}", show_footer=True)
+    size = ", ".join(dict.fromkeys(f"{width}x{height}" for width, height in config.rig.sizes))
+    table = Table("array", "shape", "unit", "MiB", title=f"{config.bake.worlds} worlds, {size}", show_footer=True)
     table.columns[3].justify = "right"
     for name, shape, unit, size in sorted(rows, key=lambda row: -row[3]):
         table.add_row(name, " x ".join(map(str, shape)), unit, f"{size / MIB:.2f}")

@@ -69,6 +69,8 @@ YOUNGER_SETTINGS: dict[str, Any] = {
     "depth_sensor.preset": "",
     "depth_sensor.disparity_noise": 0.0,
     "depth_sensor.max_disparity": 0.0,
+    "perception.camera": "",
+    "camera": (),
 }
 """Settings that older manifests lack, and what held before: left out where they have these values, so that older data sets can still be
 read, and resumed with them."""
@@ -112,9 +114,10 @@ def fixed_settings(config: Config) -> dict[str, Any]:
         section, name = key.split(".")
         del settings[section][name]
     for key, before in YOUNGER_SETTINGS.items():
-        section, name = key.split(".")
-        if settings[section][name] == before:
-            del settings[section][name]
+        *sections, name = key.split(".")
+        table = settings[sections[0]] if sections else settings
+        if table[name] == before:
+            del table[name]
     settings["bake"]["formats"] = sorted(set(config.bake.formats))
     for split in settings["splits"]:
         del split["episodes"]
@@ -172,7 +175,8 @@ def read_settings(folder: Path, manifest: Mapping[str, Any]) -> Config:
     path = path_inside(folder, CONFIG_FILE, folder, DatasetError)
     check_regular_file(path, MAX_TOML, DatasetError)
     settings = manifest["settings"]
-    before = {key: value for key, value in YOUNGER_SETTINGS.items() if key.split(".")[1] not in settings.get(key.split(".")[0], {})}
+    younger = {key: value for key, value in YOUNGER_SETTINGS.items() if "." in key}
+    before = {key: value for key, value in younger.items() if key.split(".")[1] not in settings.get(key.split(".")[0], {})}
     config = override_config(load_config(str(path), {}), before)
     said = describe_differences({"settings": make_manifest(config)["settings"]}, {"settings": settings})
     if said:

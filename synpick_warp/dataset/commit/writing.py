@@ -214,7 +214,7 @@ class OutputFolder:
 
     def _named_episodes(self) -> set[int]:
         """Superset of the episodes with files: each number in a file name is taken as an episode index and as a BOP scene id."""
-        cameras = len(self.config.cameras.positions)
+        cameras = len(self.config.rig)
         found: set[int] = set()
         for folder in (ENTRIES, *list_folders(self.out, self._shared.folders)):
             names = os.listdir(self.out / folder) if (self.out / folder).is_dir() else []

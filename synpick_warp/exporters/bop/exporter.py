@@ -14,7 +14,7 @@ from synpick_warp.configs.splits import DataLayout
 from synpick_warp.exporters.base import ExportContext, SharedFiles
 from synpick_warp.exporters.bop.keypoints import make_category_keys
 from synpick_warp.exporters.bop.scene import SceneSettings, commit_scenes, create_scene_folders, write_layer, write_view
-from synpick_warp.exporters.bop.scene_exporter import CONSTANTS, SceneExporter
+from synpick_warp.exporters.bop.scene_exporter import SceneExporter, constant_files
 from synpick_warp.exporters.bop.sensors import commit_sensor_scene
 from synpick_warp.exporters.bop.shared.targets import (
     concatenate_targets,
@@ -55,7 +55,7 @@ class BopExporter(SceneExporter):
     @staticmethod
     def shared_files(layout: DataLayout) -> SharedFiles:
         """Names of what is written beside episodes: models, camera and notes, target lists, and the folders of splits. See `Exporter`."""
-        return SharedFiles(CONSTANTS, tuple(map(Path, target_files(layout))), BopExporter.folders(layout))
+        return SharedFiles(constant_files(layout), tuple(map(Path, target_files(layout))), BopExporter.folders(layout))
 
     @staticmethod
     def finalize(out: Path, settings: ExportSettings, pool: WriterPool, episodes: Sequence[int]) -> list[Path]:
@@ -86,14 +86,19 @@ class BopExporter(SceneExporter):
 
     def _commit_task(self, scenes: tuple[tuple[Path, int], ...], images: Sequence[int]) -> tuple[Callable[..., None], tuple[Any, ...]]:
         """Task that completes an episode: writes the annotation files of its scenes, and renames the folders to their places."""
-        settings = SceneSettings(
-            split=self._context.layout.folder(scenes[0][1] // len(self._cameras)),
-            images=images,
-            width=self._cameras[0].width,
-            height=self._cameras[0].height,
-            color_suffix=self._suffix,
-            coco=self._bop.coco,
-            categories=self._categories,
+        layout = self._context.layout
+        settings = tuple(
+            SceneSettings(
+                split=layout.folder(scenes[0][1] // len(self._cameras)),
+                images=images,
+                width=camera.width,
+                height=camera.height,
+                color_suffix=self._suffix,
+                coco=self._bop.coco,
+                categories=self._categories,
+                sensor=layout.scene(0, index)[1],
+            )
+            for index, camera in enumerate(self._cameras)
         )
         if self._context.layout.has_sensors:
             return commit_sensor_scene, (tuple(scene for scene, _ in scenes), self._place(scenes[0][1]), settings)

@@ -104,14 +104,14 @@ def _make_annotations(view: EncodedView, masks: list[Masks], settings: ViewSetti
             } | points
 
 
-def commit_scenes(scenes: tuple[tuple[Path, Path], ...], settings: SceneSettings) -> None:
+def commit_scenes(scenes: tuple[tuple[Path, Path], ...], settings: tuple[SceneSettings, ...]) -> None:
     """Task: complete an episode's scenes, and rename each from its staging folder to its place: (from, to).
 
     JSON files and folder entries are synced to disk before the rename. Images are at least in the page cache: they survive the end
     of this process, but not necessarily a power cut.
     """
-    for scene, _ in scenes:
-        complete_scene(scene, settings)
+    for (scene, _), own in zip(scenes, settings, strict=True):
+        complete_scene(scene, own)
     for scene, place in scenes:
         scene.rename(place)
     for folder in {place.parent for _, place in scenes}:

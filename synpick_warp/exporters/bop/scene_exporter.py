@@ -13,7 +13,7 @@ from synpick_warp.configs.schema import Bop
 from synpick_warp.configs.splits import DataLayout
 from synpick_warp.exporters.base import ExportContext, StoredScene, view_bytes
 from synpick_warp.exporters.bop.keypoints import sample_keypoints
-from synpick_warp.exporters.bop.shared.models import MODEL_FOLDERS, describe_dataset, write_constants
+from synpick_warp.exporters.bop.shared.models import MODEL_FOLDERS, describe_dataset, write_models_folders
 from synpick_warp.exporters.bop.shared.toolkit import PARAMS_FILE, format_dataset_params
 from synpick_warp.exporters.bop.view import (
     ViewSettings,
@@ -27,12 +27,14 @@ from synpick_warp.exporters.bop.view import (
 )
 from synpick_warp.exporters.staging import EpisodeExporter, StagedEpisode
 from synpick_warp.exporters.writing.files import output_errors
-from synpick_warp.exporters.writing.notes import CAMERA_FILE, NOTES_FILE
+from synpick_warp.exporters.writing.notes import CAMERA_FILE, NOTES_FILE, camera_files, write_cameras
 from synpick_warp.exporters.writing.pool import WriteTask
 from synpick_warp.views.frames import EpisodeEnd, FrameBatch
 
-CONSTANTS = tuple(map(Path, (*MODEL_FOLDERS, CAMERA_FILE, NOTES_FILE, PARAMS_FILE)))
-"""Names of the files that all scenes share."""
+
+def constant_files(layout: DataLayout) -> tuple[Path, ...]:
+    """Names of the files that all scenes share."""
+    return tuple(map(Path, (*MODEL_FOLDERS, CAMERA_FILE, *camera_files(layout), NOTES_FILE, PARAMS_FILE)))
 
 
 _Staged = StagedEpisode[tuple[Path, ...]]
@@ -113,7 +115,7 @@ class SceneExporter(EpisodeExporter[tuple[Path, ...]]):
     @staticmethod
     def slot_bytes(settings: ExportSettings) -> int:
         """Bytes of a view's images in shared memory. See `Exporter`."""
-        return view_bytes(settings.cameras.resolution, bool(settings.render.layers))
+        return view_bytes(settings.rig.largest, bool(settings.render.layers))
 
     def write_constants(self) -> list[Path]:
         """Create the folders, and write models, camera and notes, or copy them when converting; returns their paths. See `Exporter`."""
@@ -121,13 +123,18 @@ class SceneExporter(EpisodeExporter[tuple[Path, ...]]):
         with output_errors(self._out):
             for folder in self.folders(context.layout):
                 (self._out / folder).mkdir(exist_ok=True)
-            if context.copy_constants(CONSTANTS):
-                return list(CONSTANTS)
+            names = constant_files(context.layout)
+            if context.copy_constants(names):
+                return list(names)
             texts = {
                 NOTES_FILE: describe_dataset(context.settings, context.catalog, self._cameras),
                 PARAMS_FILE: format_dataset_params(context.layout, self._bop.color_format, context.catalog, self._cameras),
             }
-            return write_constants(self._out, context.catalog, self._cameras[0], self._bop.depth_scale, texts)
+            write_models_folders(self._out, context.catalog)
+            write_cameras(self._out, context.layout, self._cameras, self._bop.depth_scale)
+            for name, text in texts.items():
+                (self._out / name).write_text(text, encoding="utf-8", newline="\n")
+            return list(names)
 
     def write_views(self, batch: FrameBatch) -> None:
         """Submit a task for each view of a batch. See `Exporter`."""

@@ -6,15 +6,13 @@ processes, so it imports neither Warp nor Newton.
 
 from __future__ import annotations
 
-import dataclasses
 from pathlib import Path
 
-from synpick_warp.configs.splits import sensor_name
 from synpick_warp.exporters.bop.scene import SceneSettings, complete_scene
 from synpick_warp.exporters.writing.files import sync_folder
 
 
-def commit_sensor_scene(scenes: tuple[Path, ...], place: Path, settings: SceneSettings) -> None:
+def commit_sensor_scene(scenes: tuple[Path, ...], place: Path, settings: tuple[SceneSettings, ...]) -> None:
     """Task: complete the scenes of an episode's cameras, bring them together in one folder, and rename it to its place.
 
     The rename of the folder is the commit: a killed bake leaves nothing at `place`.
@@ -22,15 +20,14 @@ def commit_sensor_scene(scenes: tuple[Path, ...], place: Path, settings: SceneSe
     Args:
         scenes: Staging folder of each camera.
         place: Folder of the scene.
-        settings: Settings of the scenes, without sensor.
+        settings: Settings of each scene, with its sensor.
     """
     whole = scenes[0].with_name(f"{scenes[0].name}-sensors")
     whole.mkdir()
-    for camera, scene in enumerate(scenes):
-        suffix = f"_{sensor_name(camera)}"
-        complete_scene(scene, dataclasses.replace(settings, sensor=suffix))
+    for scene, own in zip(scenes, settings, strict=True):
+        complete_scene(scene, own)
         for path in sorted(scene.iterdir()):
-            path.rename(whole / f"{path.stem}{suffix}{path.suffix}")
+            path.rename(whole / f"{path.stem}{own.sensor}{path.suffix}")
     sync_folder(whole)
     whole.rename(place)
     sync_folder(place.parent)

@@ -11,6 +11,7 @@ from pathlib import Path
 import msgspec
 import numpy as np
 
+from synpick_warp.configs.rig import Size
 from synpick_warp.exporters.lerobot.layout import part_path, video_path
 from synpick_warp.exporters.lerobot.part import TICK, Part, describe_tasks, make_rows
 from synpick_warp.exporters.lerobot.video import GROUP, join_groups
@@ -19,13 +20,14 @@ from synpick_warp.exporters.writing.files import sync_file, sync_folder, write_s
 
 @dataclass(frozen=True)
 class EpisodeSettings:
-    """Settings common to all episodes: data set, cameras, image size [px], frame rate [1/s], object names by obj_id."""
+    """Settings common to all episodes: data set, cameras, image sizes [px], frame rate [1/s], object names by obj_id."""
 
     out: Path
     """The data set."""
-    cameras: int
-    size: tuple[int, int]
-    """Width and height of the images [px]."""
+    cameras: tuple[str, ...]
+    """Their names."""
+    sizes: tuple[Size, ...]
+    """Width and height of each camera's images [px]."""
     rate: Fraction
     """Frames per second."""
     objects: Mapping[int, str]
@@ -61,11 +63,11 @@ def commit_episode(folder: Path, content: EpisodeContent, settings: EpisodeSetti
     ticks = np.frombuffer(content.ticks, TICK)
     groups = range(-(-len(ticks) // GROUP))
     videos, levels = [], []
-    for camera in range(settings.cameras):
+    for camera, (name, size) in enumerate(zip(settings.cameras, settings.sizes, strict=True)):
         video = folder / f"{camera}.mp4"
-        levels.append(join_groups([group_path(folder, camera, group) for group in groups], settings.size, settings.rate, video).tolist())
+        levels.append(join_groups([group_path(folder, camera, group) for group in groups], size, settings.rate, video).tolist())
         sync_file(video)
-        videos.append((video, settings.out / video_path(camera, content.episode)))
+        videos.append((video, settings.out / video_path(name, content.episode)))
     attempts = [json.loads(line) for line in content.attempts]
     sentences, tasks = describe_tasks(content.mode, len(ticks), attempts, settings.objects)
     rows = make_rows(ticks, attempts, sentences, tasks)

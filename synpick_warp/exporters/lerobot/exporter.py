@@ -76,21 +76,21 @@ class LerobotExporter(EpisodeExporter[_Content]):
     def __init__(self, context: ExportContext) -> None:
         """See `Exporter`."""
         super().__init__(context)
-        settings, cameras = context.settings, context.layout.cameras
-        self._settings = EpisodeSettings(context.out, cameras, settings.cameras.resolution, video_rate(settings.physics), context.names)
+        rig = context.settings.rig
+        self._settings = EpisodeSettings(context.out, rig.names, rig.sizes, video_rate(context.settings.physics), context.names)
 
     @staticmethod
     def slot_bytes(settings: ExportSettings) -> int:
         """See `Exporter`: a colour image."""
-        width, height = settings.cameras.resolution
+        width, height = settings.rig.largest
         return shared_bytes((height * width * 3,))
 
     @staticmethod
     def shared_files(layout: DataLayout) -> SharedFiles:
         """See `Exporter`."""
-        videos = video_folders(layout.cameras)
+        videos = video_folders(layout.names)
         between = (EPISODES.parent, EPISODES.parent.parent, META, DATA.parent, DATA.parent.parent)
-        return SharedFiles(note_files(layout.formats), (INFO, STATS, TASKS, EPISODES, DATA, CARD), (PARTS, *videos, *between, FOLDER))
+        return SharedFiles(note_files(layout), (INFO, STATS, TASKS, EPISODES, DATA, CARD), (PARTS, *videos, *between, FOLDER))
 
     @staticmethod
     def finalize(out: Path, settings: ExportSettings, pool: WriterPool, episodes: Sequence[int]) -> list[Path]:
@@ -131,7 +131,7 @@ class LerobotExporter(EpisodeExporter[_Content]):
 
     def files(self, episode: int) -> list[Path]:
         """See `Exporter`: part and videos."""
-        places = [part_path(episode), *(video_path(camera, episode) for camera in range(self._settings.cameras))]
+        places = [part_path(episode), *(video_path(camera, episode) for camera in self._settings.cameras)]
         return sorted(place for place in places if os.path.lexists(self._context.out / place))
 
     def _finish(self, episode: _Staged, end: EpisodeEnd) -> None:
@@ -150,7 +150,7 @@ class LerobotExporter(EpisodeExporter[_Content]):
         del episode.content.spooled[camera, group]
         frames = [frame_path(episode.folder, camera, frame) for frame in range(group * GROUP, group * GROUP + size)]
         path = group_path(episode.folder, camera, group)
-        arguments = (frames, self._settings.size, self._settings.rate, path)
+        arguments = (frames, self._settings.sizes[camera], self._settings.rate, path)
         self._context.pool.submit_all((self._task((episode,), write_spooled_group, (), arguments, path),))
 
     def _commit(self, episode: _Staged, end: EpisodeEnd) -> WriteTask:

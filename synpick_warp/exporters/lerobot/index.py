@@ -8,7 +8,7 @@ from __future__ import annotations
 import json
 import math
 import os
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -18,6 +18,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from synpick_warp.configs.export import ExportSettings
+from synpick_warp.configs.rig import Size
 from synpick_warp.configs.schema import Bake
 from synpick_warp.configs.splits import DataLayout
 from synpick_warp.errors import DatasetError
@@ -61,8 +62,8 @@ class _Totals:
     tasks: dict[str, int] = field(default_factory=dict)
     """Sentence -> index, in order of appearance."""
     statistics: dict[str, Statistics] = field(default_factory=dict)
-    levels: list[np.ndarray] = field(default_factory=list)
-    """Histogram of each camera's channels."""
+    levels: dict[str, np.ndarray] = field(default_factory=dict)
+    """Histogram of the channels of each camera, by its name."""
     frames: int = 0
     rows: list[dict[str, Any]] = field(default_factory=list)
     """Rows of the table of episodes."""
@@ -75,20 +76,20 @@ def write_indices(out: Path, settings: ExportSettings, episodes: Iterable[int]) 
         DatasetError: A part is damaged.
         OSError: A file cannot be written.
     """
-    cameras, rate, totals = settings.layout.cameras, frame_rate(settings.physics), _Totals()
-    totals.levels = [np.zeros((3, 256), np.int64) for _ in range(cameras)]
+    rig, rate, totals = settings.rig, frame_rate(settings.physics), _Totals()
+    totals.levels = {name: np.zeros((3, 256), np.int64) for name in rig.names}
     with pq.ParquetWriter(out / PARTIAL / "data.parquet", _data_schema(), compression="zstd") as writer:
-        for batch in _batch_tables(_read_tables(out, totals, settings.cameras.resolution, rate, settings.layout, episodes)):
+        for batch in _batch_tables(_read_tables(out, totals, rig.sizes, rate, settings.layout, episodes)):
             writer.write_table(batch)
     _place(out, DATA, lambda path: (out / PARTIAL / "data.parquet").replace(path))
     _place(
-        out, EPISODES, lambda path: pq.write_table(pa.Table.from_pylist(totals.rows, _episode_schema(cameras)), path, compression="zstd")
+        out, EPISODES, lambda path: pq.write_table(pa.Table.from_pylist(totals.rows, _episode_schema(rig.names)), path, compression="zstd")
     )
     _place(out, TASKS, lambda path: pq.write_table(_task_table(totals.tasks), path))
-    videos = {camera_key(index): describe_levels(levels, totals.frames) for index, levels in enumerate(totals.levels) if levels.any()}
+    videos = {camera_key(name): describe_levels(levels, totals.frames) for name, levels in totals.levels.items() if levels.any()}
     statistics = {name: to_json(values) for name, values in (totals.statistics | videos).items()}
     splits = [row["source/split"] for row in totals.rows]
-    info = make_info(settings.cameras, rate, splits, totals.frames, len(totals.tasks))
+    info = make_info(rig, rate, splits, totals.frames, len(totals.tasks))
     info["features"]["attempt.outcome"]["info"] = {"codes": list(outcome_names())}
     for place, content in ((STATS, statistics), (INFO, info)):
         text = json.dumps(content, indent=2) + "\n"
@@ -110,7 +111,7 @@ def _place(out: Path, name: Path, write: Callable[[Path], object]) -> None:
 
 
 def _read_tables(
-    out: Path, totals: _Totals, resolution: tuple[int, int], rate: float, layout: DataLayout, episodes: Iterable[int]
+    out: Path, totals: _Totals, sizes: tuple[Size, ...], rate: float, layout: DataLayout, episodes: Iterable[int]
 ) -> Iterator[pa.Table]:
     """Yield the tables of the episodes' frames, in order, and add them to the totals; episodes that were given up have no part."""
     period = 1.0 / rate
@@ -119,9 +120,9 @@ def _read_tables(
         part = read_json(path_inside(out, str(name), out / PARTS, DatasetError), Part, DatasetError, _ADVICE)
         if len(part.levels) != len(totals.levels):
             raise DatasetError(f"{out / name} has {len(part.levels)} cameras, the settings {len(totals.levels)}; {_ADVICE}")
-        pixels = part.frames * math.prod(resolution)
-        if not all(part.frames <= sum(channel) <= pixels for camera in part.levels for channel in camera):
-            raise DatasetError(f"{out / name} has a histogram of no pixel a frame, or of more than {pixels:,} pixels; {_ADVICE}")
+        for levels, pixels in zip(part.levels, (part.frames * math.prod(size) for size in sizes), strict=True):
+            if not all(part.frames <= sum(channel) <= pixels for channel in levels):
+                raise DatasetError(f"{out / name} has a histogram of no pixel a frame, or of more than {pixels:,} pixels; {_ADVICE}")
         columns = _make_columns(part, totals, period)
         _add_episode(source, part, columns, totals, period)
         totals.rows[-1]["source/split"] = split_name(layout, source)
@@ -152,10 +153,9 @@ def _make_columns(part: Part, totals: _Totals, period: float) -> dict[str, np.nd
 
 def _add_episode(source: int, part: Part, columns: dict[str, np.ndarray], totals: _Totals, period: float) -> None:
     """Add a row of the table of episodes, and the episode's statistics."""
-    cameras = range(len(totals.levels))
     numbers = {name: describe_numbers(values.reshape(part.frames, -1)) for name, values in columns.items()}
-    levels = [np.array(part.levels[camera]) for camera in cameras]
-    statistics = numbers | {camera_key(camera): describe_levels(levels[camera], part.frames) for camera in cameras}
+    levels = {name: np.array(own) for name, own in zip(totals.levels, part.levels, strict=True)}
+    statistics = numbers | {camera_key(name): describe_levels(own, part.frames) for name, own in levels.items()}
     row: dict[str, Any] = {
         "episode_index": len(totals.rows),
         "tasks": part.sentences,
@@ -169,11 +169,11 @@ def _add_episode(source: int, part: Part, columns: dict[str, np.ndarray], totals
         "source/attempts": part.attempts,
         "source/picked": part.picked,
     }
-    for camera in cameras:
+    for camera, own in levels.items():
         place = f"videos/{camera_key(camera)}"
         row |= {f"{place}/chunk_index": source // CHUNK, f"{place}/file_index": source % CHUNK}
         row |= {f"{place}/from_timestamp": 0.0, f"{place}/to_timestamp": part.frames * period}
-        totals.levels[camera] += levels[camera]
+        totals.levels[camera] += own
     for name, values in statistics.items():
         row |= {f"stats/{name}/{key}": value for key, value in to_json(values).items()}
     for name, values in numbers.items():
@@ -209,7 +209,7 @@ def _data_schema() -> pa.Schema:
     return pa.schema(fields)
 
 
-def _episode_schema(cameras: int) -> pa.Schema:
+def _episode_schema(cameras: Sequence[str]) -> pa.Schema:
     """Arrow schema of the table of episodes."""
     integers = ("episode_index", "length", "dataset_from_index", "dataset_to_index", "data/chunk_index", "data/file_index")
     fields: dict[str, pa.DataType] = dict.fromkeys(integers, pa.int64()) | {"tasks": pa.list_(pa.string())}
@@ -218,7 +218,7 @@ def _episode_schema(cameras: int) -> pa.Schema:
     fields |= dict.fromkeys(("source/mode", "source/ending", "source/split"), pa.string())
     numbers = pa.list_(pa.float64())
     kinds = dict.fromkeys(FRAME_FEATURES, numbers)
-    for camera in range(cameras):
+    for camera in cameras:
         place = f"videos/{camera_key(camera)}"
         fields |= dict.fromkeys((f"{place}/chunk_index", f"{place}/file_index"), pa.int64())
         fields |= dict.fromkeys((f"{place}/from_timestamp", f"{place}/to_timestamp"), pa.float64())

@@ -14,7 +14,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from synpick_warp.configs.schema import Cameras, Physics
+from synpick_warp.configs.rig import Rig
+from synpick_warp.configs.schema import Physics
 from synpick_warp.configs.splits import DataLayout, split_kind
 
 FOLDER = Path("lerobot")
@@ -76,9 +77,9 @@ ROW = np.dtype(
 """A frame in a part: what its episode alone determines. `task` is an index into the part's sentences."""
 
 
-def camera_key(camera: int) -> str:
-    """Feature name of a camera's video."""
-    return f"observation.images.camera_{camera}"
+def camera_key(camera: str) -> str:
+    """Feature name of a camera's video, by the camera's name."""
+    return f"observation.images.{camera}"
 
 
 def part_path(episode: int) -> Path:
@@ -86,15 +87,15 @@ def part_path(episode: int) -> Path:
     return PARTS / f"{episode:06d}.json"
 
 
-def video_path(camera: int, episode: int) -> Path:
+def video_path(camera: str, episode: int) -> Path:
     """Video of an episode, relative to the data set."""
     place = _CHUNKED.format(chunk_index=episode // CHUNK, file_index=episode % CHUNK)
     return VIDEOS / camera_key(camera) / f"{place}.mp4"
 
 
-def video_folders(cameras: int) -> list[Path]:
+def video_folders(cameras: Sequence[str]) -> list[Path]:
     """Folders that hold the videos, each after the folders within it; see `SharedFiles.folders`."""
-    keys = [VIDEOS / camera_key(camera) for camera in range(cameras)]
+    keys = [VIDEOS / camera_key(camera) for camera in cameras]
     return [*(key / "chunk-*" for key in keys), *keys, VIDEOS]
 
 
@@ -117,24 +118,9 @@ def split_ranges(names: Sequence[str]) -> dict[str, str]:
     return {name: f"{end - count}:{end}" for (name, count), end in zip(counts.items(), ends, strict=True)}
 
 
-def make_info(cameras: Cameras, rate: float, splits: Sequence[str], frames: int, tasks: int) -> dict[str, Any]:
+def make_info(rig: Rig, rate: float, splits: Sequence[str], frames: int, tasks: int) -> dict[str, Any]:
     """Content of meta/info.json; `rate`: see `frame_rate`; `splits`: name of the split of each episode."""
-    width, height = cameras.resolution
-    video = {
-        "dtype": "video",
-        "shape": [height, width, 3],
-        "names": ["height", "width", "channels"],
-        "info": {
-            "video.height": height,
-            "video.width": width,
-            "video.codec": CODEC,
-            "video.pix_fmt": PIXEL_FORMAT,
-            "video.is_depth_map": False,
-            "video.fps": rate,
-            "video.channels": 3,
-            "has_audio": False,
-        },
-    }
+    videos = {camera_key(name): _video_feature(*size, rate) for name, size in zip(rig.names, rig.sizes, strict=True)}
     columns = {
         name: {"dtype": feature.dtype, "shape": [len(feature.names) or 1], "names": list(feature.names) or None}
         for name, feature in FRAME_FEATURES.items()
@@ -151,5 +137,24 @@ def make_info(cameras: Cameras, rate: float, splits: Sequence[str], frames: int,
         "splits": split_ranges(splits),
         "data_path": f"data/{_CHUNKED}.parquet",
         "video_path": f"videos/{{video_key}}/{_CHUNKED}.mp4",
-        "features": {**{camera_key(camera): video for camera in range(len(cameras.positions))}, **columns},
+        "features": videos | columns,
+    }
+
+
+def _video_feature(width: int, height: int, rate: float) -> dict[str, Any]:
+    """Feature of a camera's videos."""
+    return {
+        "dtype": "video",
+        "shape": [height, width, 3],
+        "names": ["height", "width", "channels"],
+        "info": {
+            "video.height": height,
+            "video.width": width,
+            "video.codec": CODEC,
+            "video.pix_fmt": PIXEL_FORMAT,
+            "video.is_depth_map": False,
+            "video.fps": rate,
+            "video.channels": 3,
+            "has_audio": False,
+        },
     }

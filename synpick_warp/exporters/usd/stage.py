@@ -53,7 +53,7 @@ def make_episode_layer(ticks: np.ndarray, metadata: EpisodeMetadata, settings: E
         path, obj_id = _add_object(stage, ticks, instance, settings)
         assets[path] = object_asset(obj_id)
     for index, camera in enumerate(settings.cameras):
-        _add_camera(stage, index, camera)
+        _add_camera(stage, camera.name or f"camera_{index}", camera)
     first = ticks[0]
     _add_light(stage, settings.lights[first["light"]], float(first["light_yaw"]), float(first["light_exposure"]))
     # References are added last and without a stage, since they cannot be resolved from a file that is not in its place yet.
@@ -155,9 +155,9 @@ def _make_continuous(quaternions: np.ndarray) -> np.ndarray:
     return unit
 
 
-def _add_camera(stage: Usd.Stage, index: int, camera: Camera) -> None:
+def _add_camera(stage: Usd.Stage, name: str, camera: Camera) -> None:
     """Add a pinhole camera and its render product. USD's cameras look along -z with y up; film lengths are tenths of a metre."""
-    lens = UsdGeom.Camera.Define(stage, f"{ROOT}/Cameras/camera_{index}")
+    lens = UsdGeom.Camera.Define(stage, f"{ROOT}/Cameras/{name}")
     (fx, _, cx), (_, fy, cy), _ = camera.matrix.tolist()
     focal = APERTURE * fx / camera.width
     height = focal * camera.height / fy
@@ -173,7 +173,7 @@ def _add_camera(stage: Usd.Stage, index: int, camera: Camera) -> None:
     pose[:3, 3] = -camera.rotation.T @ camera.translation
     lens.AddTransformOp().Set(Gf.Matrix4d(*pose.T.ravel().tolist()))  # USD multiplies row vectors.
     UsdGeom.Scope.Define(stage, f"{ROOT}/Render")
-    product = UsdRender.Product.Define(stage, f"{ROOT}/Render/camera_{index}")
+    product = UsdRender.Product.Define(stage, f"{ROOT}/Render/{name}")
     product.CreateResolutionAttr(Gf.Vec2i(camera.width, camera.height))
     product.CreatePixelAspectRatioAttr(fx / fy)
     product.CreateCameraRel().SetTargets([lens.GetPath()])

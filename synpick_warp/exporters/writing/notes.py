@@ -3,18 +3,40 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 
 from synpick_warp.configs.export import ExportSettings
+from synpick_warp.configs.splits import DataLayout
 from synpick_warp.scenes.types import Camera
 
+_INTRINSICS = ("`camera.json` has the intrinsics of all cameras", "`camera_NAME.json` has the intrinsics of each camera")
+"""Where intrinsics are: of alike cameras, and of others."""
 CAMERA_FILE, NOTES_FILE = "camera.json", "dataset_info.md"
 
 
-def note_files(formats: Collection[str]) -> tuple[Path, ...]:
+def note_files(layout: DataLayout) -> tuple[Path, ...]:
     """Files that `write_notes` writes, relative to the data set; none where bop or shards write theirs."""
-    return () if {"bop", "shards"} & set(formats) else (Path(CAMERA_FILE), Path(NOTES_FILE))
+    return () if {"bop", "shards"} & set(layout.formats) else tuple(map(Path, (CAMERA_FILE, *camera_files(layout), NOTES_FILE)))
+
+
+def camera_files(layout: DataLayout) -> tuple[str, ...]:
+    """Files like camera.json of single cameras, for those of [[camera]] tables."""
+    return tuple(f"camera_{name}.json" for name in layout.names) if layout.is_listed else ()
+
+
+def write_cameras(out: Path, layout: DataLayout, cameras: tuple[Camera, ...], depth_scale: float) -> None:
+    """Write camera.json, of the first camera, and `camera_files`."""
+    write_camera(out / CAMERA_FILE, cameras[0], depth_scale)
+    for name, camera in zip(camera_files(layout), cameras, strict=False):
+        write_camera(out / name, camera, depth_scale)
+
+
+def describe_sizes(layout: DataLayout, cameras: tuple[Camera, ...]) -> str:
+    """Clause on the sizes of pictures."""
+    if not layout.is_listed:
+        return f"{cameras[0].width} x {cameras[0].height} pixels"
+    return ", ".join(f"{camera.width} x {camera.height} ({camera.name})" for camera in cameras) + " pixels"
 
 
 def write_camera(path: Path, camera: Camera, depth_scale: float) -> None:
@@ -36,16 +58,16 @@ def write_notes(out: Path, settings: ExportSettings, names: Mapping[int, str], c
     Raises:
         OSError: A file cannot be written.
     """
-    places = note_files(settings.bake.formats)
+    places = note_files(settings.layout)
     if places:
-        write_camera(out / CAMERA_FILE, cameras[0], settings.bop.depth_scale)
+        write_cameras(out, settings.layout, cameras, settings.bop.depth_scale)
         (out / NOTES_FILE).write_text(_describe(settings, names, cameras), encoding="utf-8", newline="\n")
     return list(places)
 
 
 def _describe(settings: ExportSettings, names: Mapping[int, str], cameras: tuple[Camera, ...]) -> str:
     """Text of dataset_info.md: conventions, cameras and objects."""
-    bake, camera = settings.bake, cameras[0]
+    bake = settings.bake
     objects = "\n".join(f"| {index} | {name} |" for index, name in sorted(names.items()))
     poses = "\n".join(f"| {index} | {_row(one.rotation.ravel())} | {_row(one.translation)} |" for index, one in enumerate(cameras))
     return f"""# A SynPick data set
@@ -53,7 +75,7 @@ def _describe(settings: ExportSettings, names: Mapping[int, str], cameras: tuple
 Made by synpick-warp (mode {", ".join(settings.modes)}, seed {bake.seed}, {len(cameras)} cameras, formats
 {", ".join(sorted(bake.formats))}). Frames are {settings.physics.tick_time:g} s apart.
 
-- Pictures have {camera.width} x {camera.height} pixels and no lens distortion; `camera.json` has the intrinsics of all cameras.
+- Pictures have {describe_sizes(settings.layout, cameras)} and no lens distortion; {_INTRINSICS[settings.layout.is_listed]}.
   The centre of pixel (row, column) is (column + 0.5, row + 0.5): for OpenCV and Open3D, whose pixel centres have whole
   coordinates, subtract 0.5 from cx and cy. Cameras have x right, y down, z forward.
 - The world is the tote's frame: centre of its inner floor, z up, metres.

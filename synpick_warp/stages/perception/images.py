@@ -1,4 +1,4 @@
-"""Perception images: G-buffers of camera 0 without the gripper, for batches of worlds, entirely on the device."""
+"""Perception images: G-buffers of one camera without the gripper, for batches of worlds, entirely on the device."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from typing import Any
 import warp as wp
 
 from synpick_warp.configs import schema
+from synpick_warp.configs.rig import Rig, resized
 from synpick_warp.errors import ConfigError
 from synpick_warp.kernels.perception.exact_hits import intersect_hits_kernel
 from synpick_warp.kernels.render.visibility.camera import TILE_PIXELS
@@ -65,21 +66,19 @@ class PerceptionImages:
     """Renders the G-buffers of a batch of worlds. Owns its scratch; `render` only launches kernels, so a CUDA graph can capture it.
 
     Attributes:
-        scene: The renderer's scene with camera 0 alone, at the resolution of perception.
+        scene: The renderer's scene with the camera of perception alone, at the resolution of perception.
         views: The struct `Views` of the batch. The caller fills `views.world` (view): each world once; -1: the view is unused.
         bodies: The struct `ViewBodies` of the batch.
         gbuffer: The struct `GBuffer` of the batch.
         arrays, scratch: Arrays of `Segmenter`.
     """
 
-    def __init__(
-        self, settings: schema.Perception, cameras: schema.Cameras, render_scene: RenderScene, worlds: int, instances: int
-    ) -> None:
+    def __init__(self, settings: schema.Perception, rig: Rig, render_scene: RenderScene, worlds: int, instances: int) -> None:
         """Allocate scratch and render the static background.
 
         Args:
             settings: Settings of perception.
-            cameras: Settings of the cameras; the resolution is that of `settings`.
+            rig: The cameras; the resolution is that of `settings`.
             render_scene: Meshes, materials and table of the renderer; its cameras are not used.
             worlds: Number of worlds.
             instances: Instance capacity of a world, at most 32.
@@ -94,7 +93,8 @@ class PerceptionImages:
         self.pixels = count * grid.tiles * int(TILE_PIXELS)
         if self.pixels >= 2**31:
             raise ConfigError(f"perception.views is {count}; of {width} x {height} px that is more than 2³¹ pixels; take fewer")
-        camera = make_cameras(replace(cameras, resolution=settings.resolution))[:1]
+        seen = resized(rig.rows[rig.index(settings.camera)], settings.resolution)
+        camera = make_cameras(Rig((seen,), rig.is_listed))
         self.scene = replace(render_scene, cameras=build_cameras(camera, device), grid=grid, camera_count=1)
         self.views, self.bodies, self.gbuffer, self.arrays, self.scratch = allocate_batch(settings, instances, count, device)
         self.views.world.fill_(-1)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import warp as wp
 
 from synpick_warp.configs import schema
+from synpick_warp.configs.rig import Rig
 from synpick_warp.kernels.perception import worklist
 from synpick_warp.stages.buffers import Snapshot
 from synpick_warp.stages.constants import SceneData
@@ -23,7 +24,7 @@ class Perception:
     def __init__(
         self,
         settings: schema.Perception,
-        cameras: schema.Cameras,
+        rig: Rig,
         seed: int,
         render_scene: RenderScene,
         scene: SceneData,
@@ -36,7 +37,7 @@ class Perception:
 
         Args:
             settings: Settings of perception.
-            cameras: Settings of the cameras; perception uses camera 0.
+            rig: The cameras; perception uses that of `perception.camera`, or the first.
             seed: Seed of the random choices of targets.
             render_scene: Meshes, materials and table.
             scene: Constants of the simulation.
@@ -49,7 +50,7 @@ class Perception:
         self.seed = seed
         self.device = state.phase.device
         worlds, instances = observation.visible.shape
-        self.images = PerceptionImages(settings, cameras, render_scene, worlds, instances)
+        self.images = PerceptionImages(settings, rig, render_scene, worlds, instances)
         self.segmenter = Segmenter(self.images)
         self.planner = GraspPlanner(settings, self.images, self.segmenter.arrays)
         self._worklist = wp.zeros(worlds, dtype=wp.int32, device=self.device)

@@ -106,7 +106,7 @@ class Simulation:
                 raise ValueError("episodes that pick need a render_scene for perception")
             self.suction = Suction(config.suction, catalog, render_scene, device)
             state = (self.scene, self.state, self.attempts, self.observation, self.plan)
-            self.perception = Perception(config.perception, config.cameras, config.bake.seed, render_scene, *state)
+            self.perception = Perception(config.perception, config.rig, config.bake.seed, render_scene, *state)
 
     def tick(self) -> None:
         """Advance all worlds by one tick; `record` has its output."""

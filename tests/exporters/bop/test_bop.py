@@ -300,10 +300,10 @@ def test_annotation_blocks_are_sorted_and_checked_for_completeness(tmp_path):
                 folder.append(ANNOTATIONS, annotation_block(frame, (b'{"view": %d}' % frame, b"[]", b"[1]", *annotations)))
         if frames != (2, 0, 1):
             with pytest.raises(OutputError, match=f"has {len(frames)} of 3 frames"):
-                commit_scenes(((scene, place),), settings)
+                commit_scenes(((scene, place),), (settings,))
             shutil.rmtree(scene)
             continue
-        commit_scenes(((scene, place),), settings)
+        commit_scenes(((scene, place),), (settings,))
         assert load(place / "scene_camera.json") == {str(frame): {"view": frame} for frame in range(3)}
         assert list(load(place / "scene_gt_info.json").items()) == [(str(frame), [1]) for frame in range(3)]
         assert load(place / "scene_gt_coco.json")["annotations"] == [

@@ -200,7 +200,7 @@ def test_splits_are_ranges_of_episodes(tmp_path, dataset, episodes):
     assert [row["source/split"] for row in pq.read_table(out.parent / layout.EPISODES).to_pylist()] == ["train", "test"]
     assert "  data_files: data/*/*.parquet\n" in (out / "README.md").read_text()
     assert "in `meta/info.json`): train, test.\n" in (out / "README.md").read_text()
-    chunk = layout.video_path(0, 1500).parent
+    chunk = layout.video_path("camera_0", 1500).parent
     (out.parent / chunk).mkdir()
     assert chunk in list_folders(out.parent, LerobotExporter.shared_files(DataLayout.of(settings)).folders)
     assert str(layout.PARTS) == FORMAT_TABLE["lerobot"].part.folder
@@ -264,6 +264,6 @@ def test_odd_image_sizes_are_refused_at_the_start():
 
 
 def test_chunks_hold_a_thousand_videos():
-    assert str(layout.video_path(1, 2345)).endswith("camera_1/chunk-002/file-345.mp4")
-    assert len(layout.video_folders(2)) == 2 + 2 + 1
+    assert str(layout.video_path("camera_1", 2345)).endswith("camera_1/chunk-002/file-345.mp4")
+    assert len(layout.video_folders(("camera_0", "camera_1"))) == 2 + 2 + 1
     assert dataclasses.replace(Config()).bake.formats == ("bop",)

@@ -25,7 +25,7 @@ from tests.exporters.usd.test_exr import decode
 from tests.worlds import usd_sets
 
 SETTINGS = usd_sets.settings()
-LENSES = make_cameras(SETTINGS.cameras)
+LENSES = make_cameras(SETTINGS.rig)
 TICKS = usd_sets.episode_ticks(0)
 ROWS = 64
 

@@ -9,6 +9,7 @@ from dataclasses import fields, replace
 import numpy as np
 import warp as wp
 
+from synpick_warp.configs.rig import Rig
 from synpick_warp.configs.schema import UNOCCLUDED
 from synpick_warp.factory.assembly import Factory, make_renderer
 from synpick_warp.scenes.cameras import make_cameras
@@ -34,7 +35,7 @@ def measure_rendering(factory: Factory, min_seconds: float) -> Iterator[Row]:
     """
     cameras, device = factory.cameras, factory.simulation.device
     yield from _measure_size(factory, cameras, max(1, factory.stream.batch // len(cameras)), min_seconds)
-    small = make_cameras(replace(factory.config.cameras, resolution=SMALL_SIZE))
+    small = make_cameras(Rig.of(replace(factory.config.cameras, resolution=SMALL_SIZE)))
     yield from _measure_size(factory, small, SMALL_WORLDS if device.is_cuda else SMALL_WORLDS_CPU, min_seconds)
 
 

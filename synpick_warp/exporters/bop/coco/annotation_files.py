@@ -17,6 +17,7 @@ from typing import Any
 import msgspec
 
 from synpick_warp.configs.export import ExportSettings
+from synpick_warp.configs.rig import Size
 from synpick_warp.errors import DatasetError
 from synpick_warp.exporters.base import EncodedView
 from synpick_warp.exporters.bop.keypoints import Keypoints, make_category_keys
@@ -146,7 +147,7 @@ def write_annotation_files(out: Path, settings: ExportSettings, episodes: Iterab
         names = (out / PARTS / f"{scene:06d}.jsonl" for scene in range(cameras * episode, cameras * (episode + 1)))
         parts[layout.folder(episode)] += filter(os.path.lexists, names)
     categories = read_json(path_inside(out, str(CATEGORIES), out, DatasetError), list[_Category], DatasetError, _ADVICE)
-    describe = partial(_describe_image, cameras, settings.cameras.resolution, settings.bop.color_format)
+    describe = partial(_describe_image, settings.rig.sizes, settings.bop.color_format)
     return [_write_annotations(out, describe, split, found, categories) for split, found in parts.items()]
 
 
@@ -194,9 +195,9 @@ def _read_part(part: Path, out: Path) -> Iterator[list[dict[str, Any]] | None]:
         yield decode_json(line, _Line, f"{part}, line {number},", DatasetError, _ADVICE)
 
 
-def _describe_image(cameras: int, resolution: tuple[int, int], color_format: str, scene: int, frame: int) -> dict[str, Any]:
+def _describe_image(sizes: tuple[Size, ...], color_format: str, scene: int, frame: int) -> dict[str, Any]:
     """Entry of an image in COCO's list, but for its id: file name, size, episode, camera, frame."""
-    width, height = resolution
-    episode, camera = divmod(scene, cameras)
+    episode, camera = divmod(scene, len(sizes))
+    width, height = sizes[camera]
     name = f"{scene:06d}/{frame:06d}.{color_format}"
     return {"file_name": name, "width": width, "height": height, "episode": episode, "camera": camera, "frame": frame}

@@ -53,7 +53,7 @@ class CocoExporter(SceneExporter):
     def shared_files(layout: DataLayout) -> SharedFiles:
         """See `Exporter`."""
         places = tuple(map(annotation_file, layout.folders))
-        return SharedFiles((CATEGORIES, *note_files(layout.formats)), places, (IMAGES, PARTS, places[0].parent, FOLDER))
+        return SharedFiles((CATEGORIES, *note_files(layout)), places, (IMAGES, PARTS, places[0].parent, FOLDER))
 
     @staticmethod
     def finalize(out: Path, settings: ExportSettings, pool: WriterPool, episodes: Sequence[int]) -> list[Path]:

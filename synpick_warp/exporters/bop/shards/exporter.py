@@ -10,7 +10,7 @@ from typing import Any
 from synpick_warp.configs.export import ExportSettings
 from synpick_warp.configs.splits import DataLayout
 from synpick_warp.exporters.base import SharedFiles
-from synpick_warp.exporters.bop.scene_exporter import CONSTANTS, SceneExporter
+from synpick_warp.exporters.bop.scene_exporter import SceneExporter, constant_files
 from synpick_warp.exporters.bop.shards.card import CARD_FILE, CardContent, SplitContent, hub_splits, make_card
 from synpick_warp.exporters.bop.shards.tar_files import commit_shards, find_shards, list_keys, shard_index, write_layer, write_view
 from synpick_warp.exporters.writing.files import PARTIAL, output_errors, write_atomically
@@ -39,7 +39,7 @@ class ShardsExporter(SceneExporter):
     def shared_files(layout: DataLayout) -> SharedFiles:
         """See `Exporter`."""
         splits = ShardsExporter.folders(layout)
-        return SharedFiles(CONSTANTS, (*(split / KEYS_FILE for split in splits), Path(CARD_FILE)), splits)
+        return SharedFiles(constant_files(layout), (*(split / KEYS_FILE for split in splits), Path(CARD_FILE)), splits)
 
     @staticmethod
     def finalize(out: Path, settings: ExportSettings, pool: WriterPool, episodes: Sequence[int]) -> list[Path]:

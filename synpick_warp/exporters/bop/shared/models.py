@@ -14,7 +14,7 @@ from synpick_warp.configs.splits import DataLayout
 from synpick_warp.errors import CatalogError
 from synpick_warp.exporters.bop.shared.toolkit import describe_toolkit
 from synpick_warp.exporters.bop.view import MILLIMETERS
-from synpick_warp.exporters.writing.notes import CAMERA_FILE, write_camera
+from synpick_warp.exporters.writing.notes import describe_sizes
 from synpick_warp.exporters.writing.png import encode_png
 from synpick_warp.scenes.assets.appearance import decode_texture, linear_to_srgb, srgb_to_linear
 from synpick_warp.scenes.assets.asset_files import MissingFileError
@@ -30,8 +30,8 @@ MODEL_FOLDERS = ("models", "models_eval")
 """The toolkit renders the first and evaluates with the second; ours are equal."""
 
 
-def write_constants(out: Path, catalog: Catalog, camera: Camera, depth_scale: float, texts: dict[str, str]) -> list[Path]:
-    """Write models/, models_eval/, camera.json and the texts by name, replacing existing ones; returns their paths.
+def write_models_folders(out: Path, catalog: Catalog) -> None:
+    """Write models/ and models_eval/, replacing existing ones.
 
     Raises:
         CatalogError: A model file or its texture is not what was read for the catalog.
@@ -41,10 +41,6 @@ def write_constants(out: Path, catalog: Catalog, camera: Camera, depth_scale: fl
         if (out / name).exists():
             shutil.rmtree(out / name)
         write_models(out / name, catalog)
-    write_camera(out / CAMERA_FILE, camera, depth_scale)
-    for name, text in texts.items():
-        (out / name).write_text(text, encoding="utf-8", newline="\n")
-    return [Path(name) for name in (*MODEL_FOLDERS, CAMERA_FILE, *texts)]
 
 
 def write_models(folder: Path, catalog: Catalog) -> None:
@@ -181,13 +177,18 @@ def _describe_folders(layout: DataLayout) -> str:
 def _describe_scenes(layout: DataLayout) -> str:
     """Sentence for the notes on which scene has which episode and camera."""
     if layout.has_sensors:
-        return f"Episode k is scene k, with files of the sensors cam0 to cam{layout.cameras - 1},"
+        return f"Episode k is scene k, with files of the sensors {_sensor_names(layout)},"
     return f"Camera c of episode k is scene {layout.cameras} · k + c"
+
+
+def _sensor_names(layout: DataLayout) -> str:
+    """Names of the sensors for the notes."""
+    return f"{layout.sensors[0]} to {layout.sensors[-1]}" if layout.sensors[0] == "cam0" else ", ".join(layout.sensors)
 
 
 def describe_dataset(settings: ExportSettings, catalog: Catalog, cameras: tuple[Camera, ...]) -> str:
     """Text of dataset_info.md: conventions of the ground truth, and the objects."""
-    camera, layout, period = cameras[0], settings.layout, settings.physics.tick_time
+    layout, period = settings.layout, settings.physics.tick_time
     objects = "\n".join(f"| {entry.obj_id} | {entry.name} | {entry.mass:g} |" for entry in catalog.entries)
     return f"""# A SynPick data set
 
@@ -196,7 +197,7 @@ BOP challenge (scenewise). {_describe_scenes(layout)} of {_describe_folders(layo
 
 - Lengths are in millimetres. A depth image's count times `depth_scale` ({settings.bop.depth_scale:g}) is the planar depth, along the
   optical axis; 0: no surface.
-- Pictures have {camera.width} x {camera.height} pixels. The centre of pixel (row, column) is (column + 0.5, row + 0.5): for OpenCV and
+- Pictures have {describe_sizes(layout, cameras)}. The centre of pixel (row, column) is (column + 0.5, row + 0.5): for OpenCV and
   Open3D, whose pixel centres have whole coordinates, subtract 0.5 from cx and cy. Cameras have x right, y down, z forward.
 - `cam_R_w2c` and `cam_t_w2c` lead from the tote's frame (centre of its inner floor, z up) to the camera.
 - `light` in scene_camera.json describes the episode's light: the map's name, its yaw [rad], the exposure relative to the automatic

@@ -104,6 +104,9 @@ toolkit.get_model_params = extend(
 toolkit.get_camera_params = extend(toolkit.get_camera_params, lambda datasets_path, name, cam_type=None: camera_params(datasets_path))
 '''
 
+_ONE_SIZE = '{sensor: IM_SIZE for sensor in ("", *SENSORS)} if SENSORS else IM_SIZE'
+"""Expression of the body for images of one size."""
+
 
 def format_dataset_params(layout: DataLayout, color_format: str, catalog: Catalog, cameras: tuple[Camera, ...]) -> str:
     """Text of bop_dataset_params.py: Python that adds the data set to the toolkit's functions."""
@@ -116,7 +119,11 @@ def format_dataset_params(layout: DataLayout, color_format: str, catalog: Catalo
         "IM_SIZE": (cameras[0].width, cameras[0].height),
         "RGB_EXT": f".{color_format}",
     }
-    return _HEAD + "\n".join(f"{name} = {value!r}" for name, value in values.items()) + "\n" + _BODY
+    sizes = {sensor: (camera.width, camera.height) for sensor, camera in zip(layout.sensors, cameras, strict=False)}
+    body = _BODY
+    if len(set(sizes.values())) > 1:
+        values["IM_SIZE"], body = {"": values["IM_SIZE"], **sizes}, _BODY.replace(_ONE_SIZE, "IM_SIZE")
+    return _HEAD + "\n".join(f"{name} = {value!r}" for name, value in values.items()) + "\n" + body
 
 
 def describe_toolkit(layout: DataLayout) -> str:
@@ -127,7 +134,8 @@ def describe_toolkit(layout: DataLayout) -> str:
     ending = f"{split}-{kind}" if kind else split
     meaning = f"`{split}`" + (f" of the type `{kind}`" if kind else "")
     sensors = (
-        "\nScripts evaluate the sensor cam0; for another one, put it first in `SENSORS` of `bop_dataset_params.py`. VSD, and so\n"
+        f"\nScripts evaluate the sensor {layout.sensors[0]}; for another one, put it first in `SENSORS` of `bop_dataset_params.py`. "
+        "VSD, and so\n"
         "`eval_bop19_pose.py`, is not computed for data sets of several sensors; `eval_bop24_pose.py` is.\n"
         if layout.has_sensors
         else ""

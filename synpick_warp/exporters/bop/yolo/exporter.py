@@ -39,7 +39,7 @@ class YoloExporter(SceneExporter):
     def shared_files(layout: DataLayout) -> SharedFiles:
         """See `Exporter`."""
         splits = tuple(FOLDER / kind / split for kind in CONTENTS for split in layout.folders)
-        return SharedFiles((DATA, *note_files(layout.formats)), (), (*splits, *(FOLDER / kind for kind in CONTENTS), FOLDER))
+        return SharedFiles((DATA, *note_files(layout)), (), (*splits, *(FOLDER / kind for kind in CONTENTS), FOLDER))
 
     def write_constants(self) -> list[Path]:
         """See `Exporter`: splits and names of the classes, camera and notes."""

@@ -1,0 +1,209 @@
+"""Validation across the settings of cameras, tote and depth: poses and matrices that are none, cameras that see no tote."""
+
+from __future__ import annotations
+
+import itertools
+import math
+import re
+from collections import Counter
+from collections.abc import Iterator
+
+from synpick_warp.configs.cameras import CameraRow, Cameras, Pose
+from synpick_warp.configs.rig import Rig, intrinsics, lens_map, position, viewing_direction
+from synpick_warp.configs.schema import Bop, Config, DepthSensor, Tote
+from synpick_warp.errors import ConfigError
+
+Conflict = tuple[str, str]
+"""Key of the wrong setting, and its allowed values."""
+DEPTH_COUNTS = 65535
+"""Maximum value of a 16-bit depth image."""
+PARALLEL = 1e-6
+"""Sine of the angle below which a camera's up vector counts as parallel to its viewing direction."""
+ORTHONORMAL = 1e-3
+"""Largest error of the lengths and products of a rotation's columns: calibration files have four digits or more."""
+ASPECT = 2.0
+"""Largest ratio of fx and fy: sensors that bin pixels in one direction reach it."""
+FOCAL_LENGTHS = (1 / (2 * math.tan(math.radians(85.0))), 1 / (2 * math.tan(math.radians(0.5))))
+"""Least and largest focal length in widths of the image: those of fov."""
+_NAME = re.compile(r"[a-z][a-z0-9_]{0,31}")
+_RESERVED = ("world", "gripper", "info", "coco", "visib")
+"""Words that mean something else where the names of cameras are: what a pose refers to, and in names of BOP's files."""
+FORMS = (("matrix",), ("position", "quaternion"), ("position", "look_at", "up"))
+"""Keys of a pose: one of these sets."""
+
+
+def find_camera_conflicts(config: Config) -> Iterator[Conflict]:
+    """Find the violated constraints of cameras, the most basic first."""
+    listed = _rows(config.camera) if config.camera else _section(config.cameras)
+    if found := list(listed):
+        # What follows needs a rig.
+        yield from found
+        return
+    rig = config.rig
+    for index in range(len(rig)):
+        yield from _view(rig, index, config)
+    if config.perception.camera and config.perception.camera not in rig.names:
+        yield "perception.camera", f"the name of a camera, {', '.join(rig.names)}, or none"
+    if "depth_sensor" in config.render.layers:
+        yield from _depth_sensor(config.depth_sensor, rig, config.tote)
+    yield from _depth_scale(config.bop, rig, config.tote)
+
+
+def _section(cameras: Cameras) -> Iterator[Conflict]:
+    """Yield conflicts of the section [cameras]."""
+    if not cameras.positions:
+        yield "cameras.positions", "at least one position"
+    elif len(cameras.ups) != len(cameras.positions):
+        yield "cameras.ups", f"one direction for each of the {len(cameras.positions)} cameras.positions"
+
+
+def _rows(rows: tuple[CameraRow, ...]) -> Iterator[Conflict]:
+    """Yield conflicts within the [[camera]] tables."""
+    names = [row.name or f"camera_{index}" for index, row in enumerate(rows)]
+    counts = Counter(names)
+    for index, (row, name) in enumerate(zip(rows, names, strict=True)):
+        key = f"camera[{index}]"
+        if not _NAME.fullmatch(name) or name in _RESERVED:
+            rule = "a lower-case letter, then up to 31 of these, digits and underscores"
+            yield f"{key}.name", f"{rule}; not {', '.join(_RESERVED)}"
+        if counts[name] > 1:
+            yield f"{key}.name", f"names that differ; {name} comes {counts[name]} times"
+        if (row.fov is None) == (row.matrix is None):
+            yield f"{key}.{'fov' if row.matrix is None else 'matrix'}", "either fov or matrix"
+        yield from _pose(f"{key}.pose", row.pose)
+
+
+def _pose(key: str, pose: Pose) -> Iterator[Conflict]:
+    """Yield conflicts within a pose."""
+    given = {name for name in ("matrix", "position", "quaternion", "look_at", "up") if getattr(pose, name) is not None}
+    if given not in map(set, FORMS):
+        yield key, " or ".join(f"{{{', '.join(form)}}}" for form in FORMS)
+    elif pose.quaternion is not None and abs(math.hypot(*pose.quaternion) - 1.0) > ORTHONORMAL:
+        yield key, "a quaternion x, y, z, w of length 1"
+    elif pose.matrix is not None:
+        if len(pose.matrix) != 4 or any(abs(a - b) > 0.0 for a, b in zip(pose.matrix[3], (0.0, 0.0, 0.0, 1.0), strict=True)):
+            yield key, "a matrix of 4 rows, the last 0, 0, 0, 1"
+            return
+        columns = [tuple(row[column] for row in pose.matrix[:3]) for column in range(3)]
+        products = [(i == j) - sum(a * b for a, b in zip(columns[i], columns[j], strict=True)) for i in range(3) for j in range(i + 1)]
+        if max(map(abs, products)) > ORTHONORMAL:
+            yield key, "a matrix whose first three columns are perpendicular and of length 1 [m]"
+        elif sum(a * b for a, b in zip(_cross(columns[0], columns[1]), columns[2], strict=True)) < 0.0:
+            yield key, "a rotation; this matrix is a mirror image: x is right, y down and z forward"
+
+
+def _view(rig: Rig, index: int, config: Config) -> Iterator[Conflict]:
+    """Yield conflicts of a camera's intrinsics, odd sides with videos, and a degenerate view or one that does not show the tote."""
+    row, label = rig.rows[index], rig.label(index)
+    (width, height), (fx, fy, *_) = rig.sizes[index], intrinsics(row)
+    if "lerobot" in config.bake.formats and (width % 2 or height % 2):
+        key = rig.key(index, "resolution") if config.camera and config.camera[index].resolution else "cameras.resolution"
+        yield key, "even width and height with the format lerobot, whose videos have a colour for 2 x 2 pixels"
+    if row.matrix is not None:
+        yield from _matrix(rig.key(index, "matrix"), row.matrix, width, height)
+    if row.distortion:
+        yield from _lens(rig.key(index, "distortion"), row, config.render.layers)
+    at, forward, up = position(row.pose), viewing_direction(row.pose), row.pose.up
+    place, aim, target = (rig.key(index, "pose", name) for name in ("positions", "ups", "target"))
+    if math.hypot(*forward) == 0.0:
+        other = "look_at" if rig.is_listed else "cameras.target"
+        yield place, f"positions other than {other}, the position of {label}"
+    elif up is not None and math.hypot(*_cross(forward, up)) <= PARALLEL * math.hypot(*forward) * math.hypot(*up):
+        yield aim, f"up vectors that are not zero or parallel to the viewing direction, as that of {label} is"
+    elif at[2] <= 0.0:
+        yield place, f"positions above the tote's floor, z > 0, below which {label} sees no object [m]"
+    elif fx > 0.0 < fy and not _sees_tote(row, config.tote):
+        yield target, f"a point that lets each camera see the tote, which lies outside of the images of {label} [m]"
+    elif _in_wall(at, config.tote):
+        yield place, f"positions outside of the tote's walls, in which {label} is [m]"
+
+
+def _matrix(key: str, matrix: tuple[tuple[float, float, float], ...], width: int, height: int) -> Iterator[Conflict]:
+    """Yield a camera matrix that no camera with images of this size has."""
+    (fx, skew, cx), (other, fy, cy), last = matrix
+    low, high = (factor * width for factor in FOCAL_LENGTHS)
+    if last != (0.0, 0.0, 1.0) or other != 0.0:
+        yield key, "[[fx, 0, cx], [0, fy, cy], [0, 0, 1]]"
+    elif skew != 0.0:
+        yield key, "a matrix without skew: 0 beside fx"
+    elif not (low <= fx <= high and max(fx, fy) <= ASPECT * min(fx, fy)):
+        yield (
+            key,
+            f"fx from {low:.4g} to {high:.4g}, which are a fov of 170° and 1° of {width} px, and fy within twice fx [px]",
+        )
+    elif not (0.0 <= cx <= width and 0.0 <= cy <= height):
+        yield key, f"a principal point cx, cy inside its images of {width} x {height} px: are numbers, or width and height, swapped? [px]"
+
+
+def _lens(key: str, row: CameraRow, layers: tuple[str, ...]) -> Iterator[Conflict]:
+    """Yield a distortion that no lens has, or with which a layer cannot be rendered."""
+    try:
+        lens = lens_map(row)
+    except ConfigError as error:
+        yield key, f"that of a lens which covers the image, but {error}"
+        return
+    if lens is not None and "depth_sensor" in layers:
+        yield key, "none with the layer depth_sensor, which is the rectified image of a sensor"
+
+
+def _depth_sensor(sensor: DepthSensor, rig: Rig, tote: Tote) -> Iterator[Conflict]:
+    """With the layer depth_sensor: the tote must lie within what the sensor measures, and its disparity be more than a step."""
+    for index, row in enumerate(rig.rows):
+        focal, depths = intrinsics(row)[0], _tote_depths(row, tote)
+        near, far = max(0.0, min(depths)), max(depths)
+        if sensor.distances[1] < near or sensor.distances[0] > far:
+            yield "depth_sensor.distances", f"a range that reaches the tote, {near:.3g} to {far:.3g} m from {rig.label(index)} [m]"
+        if focal * sensor.baseline > far * sensor.max_disparity > 0.0:
+            most = sensor.max_disparity * far / focal
+            yield (
+                "depth_sensor.baseline",
+                f"at most {most:.3g}, so that the tote's disparity is within max_disparity; or a shorter lens [m]",
+            )
+        if focal * sensor.baseline < sensor.disparity_step * far:
+            least = sensor.disparity_step * far / focal
+            yield "depth_sensor.baseline", f"at least {least:.3g}, so that the disparity of the tote is a disparity_step or more [m]"
+
+
+def _depth_scale(bop: Bop, rig: Rig, tote: Tote) -> Iterator[Conflict]:
+    """Yield the depth scale if 16 bits do not reach the farthest corner of the tote."""
+    far = max(depth for row in rig.rows for depth in _tote_depths(row, tote))
+    if bop.depth_scale * 1e-3 * DEPTH_COUNTS < far:
+        yield "bop.depth_scale", f"at least {far * 1e3 / DEPTH_COUNTS:.3g}, so that 16 bits reach the tote at {far:.3g} m [mm]"
+
+
+def _tote_depths(row: CameraRow, tote: Tote) -> list[float]:
+    """Planar depths of the corners of the tote's outer box in the image of a camera [m]."""
+    length, width, height = tote.outer_size
+    at, forward = position(row.pose), viewing_direction(row.pose)
+    size = math.hypot(*forward) or 1.0
+    corners = itertools.product((-length / 2, length / 2), (-width / 2, width / 2), (-tote.wall, height - tote.wall))
+    return [sum((c - a) * f for a, c, f in zip(at, corner, forward, strict=True)) / size for corner in corners]
+
+
+def _sees_tote(row: CameraRow, tote: Tote) -> bool:
+    """Whether the tote's bounding sphere meets the cone around a camera's view, which is wider than its image."""
+    length, width, height = tote.outer_size
+    center = (0.0, 0.0, height / 2 - tote.wall)
+    forward = viewing_direction(row.pose)
+    away, radius = [b - a for a, b in zip(position(row.pose), center, strict=True)], math.hypot(length, width, height) / 2
+    distance = math.hypot(*away)
+    if distance <= radius:
+        return True
+    cosine = sum(a * b for a, b in zip(forward, away, strict=True)) / (math.hypot(*forward) * distance)
+    (columns, rows), (fx, fy, cx, cy) = row.resolution or (0, 0), intrinsics(row)
+    cone = math.atan(math.hypot(max(cx, columns - cx) / fx, max(cy, rows - cy) / fy))
+    return math.acos(max(-1.0, min(1.0, cosine))) <= cone + math.asin(radius / distance)
+
+
+def _in_wall(at: tuple[float, ...], tote: Tote) -> bool:
+    """Whether a point lies in the tote's walls: in its outer box, but not above the floor between the walls of the opening."""
+    x, y, z = at
+    inside = [abs(value) < size / 2 for value, size in zip((x, y), tote.outer_size[:2], strict=True)]
+    share = z / (tote.outer_size[2] - tote.wall)
+    free = [abs(v) < (f + (r - f) * share) / 2 for v, f, r in zip((x, y), tote.floor_size, tote.rim_size, strict=True)]
+    return 0.0 < share < 1.0 and all(inside) and not all(free)
+
+
+def _cross(a: tuple[float, ...], b: tuple[float, ...]) -> tuple[float, float, float]:
+    """Cross product of two vectors."""
+    return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]

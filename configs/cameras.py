@@ -1,0 +1,82 @@
+"""Settings of the cameras: the section [cameras] for alike cameras that look at one point, and [[camera]] tables for any others."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+from synpick_warp.configs.calibration.files import MODELS
+from synpick_warp.configs.fields import setting
+
+Vector = tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class Cameras:
+    """Pinhole cameras above the tote: square pixels with centres at +0.5, principal point in the middle of the image."""
+
+    resolution: tuple[int, int] = setting((1920, 1080), "px", "Image width and height.", low=1, high=8192)
+    fov: float = setting(20.0, "°", "Horizontal field of view.", low=1.0, high=170.0)
+    positions: tuple[tuple[float, float, float], ...] = setting(
+        ((0.0, 0.0, 2.0), (0.0, 0.573, 2.0), (0.0, -0.573, 2.0)),
+        "m",
+        "Position of each camera in the tote's frame (released).",
+        low=-100.0,
+        high=100.0,
+    )
+    target: tuple[float, float, float] = setting((0.0, 0.0, 0.16), "m", "Look-at point of all cameras (released).", low=-100.0, high=100.0)
+    ups: tuple[tuple[float, float, float], ...] = setting(
+        ((0.0, 1.0, 0.0), (0.0, -1.0, 0.0), (0.0, 1.0, 0.0)),
+        "",
+        "Up vector of each camera; by default +y for the first, and towards the tote's centre line for the others.",
+        low=-1e3,
+        high=1e3,
+    )
+
+
+@dataclass(frozen=True)
+class Pose:
+    """Pose of a camera in the tote's frame, in one of three forms; the camera's axes are OpenCV's and ROS's: x right, y down, z forward."""
+
+    matrix: tuple[tuple[float, float, float, float], ...] | None = setting(
+        None, "m", "Camera-to-world transform, 4 x 4 (extrinsics as OpenCV's are its inverse).", low=-100.0, high=100.0
+    )
+    position: tuple[float, float, float] | None = setting(
+        None, "m", "Optical centre; with quaternion, or with look_at and up.", low=-100.0, high=100.0
+    )
+    quaternion: tuple[float, float, float, float] | None = setting(None, "", "Camera-to-world rotation: x, y, z, w.", low=-1.1, high=1.1)
+    look_at: tuple[float, float, float] | None = setting(None, "m", "Point that the optical axis meets.", low=-100.0, high=100.0)
+    up: tuple[float, float, float] | None = setting(None, "", "Direction that is up in the image.", low=-1e3, high=1e3)
+
+
+@dataclass(frozen=True)
+class CameraRow:
+    """A camera. The tables replace [cameras]; pixel centres are at +0.5: add 0.5 to cx and cy of OpenCV and ROS, which have integers."""
+
+    REQUIRED: ClassVar = ("pose",)
+    name: str = setting("", "", "Name in the files of a data set: lower-case letters, digits and underscores; empty: camera_0 and so on.")
+    resolution: tuple[int, int] | None = setting(None, "px", "Image width and height; not given: cameras.resolution.", low=1, high=8192)
+    fov: float | None = setting(
+        None, "°", "Horizontal field of view, with square pixels and the principal point in the middle.", low=1.0, high=170.0
+    )
+    matrix: tuple[tuple[float, float, float], tuple[float, float, float], tuple[float, float, float]] | None = setting(
+        None, "px", "Camera matrix with fx, fy, cx and cy, instead of fov.", low=-1e6, high=1e6
+    )
+    distortion: tuple[float, ...] | None = setting(
+        None,
+        "",
+        "Distortion of the lens by OpenCV's coefficients, k1 k2 p1 p2 [k3 [k4 k5 k6 [s1 s2 s3 s4]]]; of a fisheye k1 k2 k3 k4.",
+        low=-1e6,
+        high=1e6,
+    )
+    model: str | None = setting(None, "", "Distortion model, pinhole unless it is given.", choices=MODELS)
+    file: str | None = setting(
+        None, "", "Calibration file of OpenCV, ROS, BOP, RealSense or Zivid, instead of matrix, distortion and resolution."
+    )
+    sensor: str | None = setting(None, "", "Depth sensor whose resolution and matrix the camera has, [as listed](#sensor-presets).")
+    pixel_center: float | None = setting(
+        None,
+        "px",
+        "Where the given matrix or file has the centre of the first pixel, 0 or 0.5; not given: 0.5, and in a file its format's.",
+    )
+    pose: Pose = setting(Pose(), "", "Pose in the tote's frame: {matrix}, {position, quaternion} or {position, look_at, up}.")  # noqa: RUF009

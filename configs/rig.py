@@ -1,0 +1,135 @@
+"""Camera rig: all cameras of a bake, from [[camera]] tables or from the section [cameras]."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import TYPE_CHECKING
+
+from synpick_warp.configs.cameras import CameraRow, Cameras, Pose, Vector
+from synpick_warp.errors import ConfigError
+
+if TYPE_CHECKING:
+    from synpick_warp.configs.calibration.lens import LensMap
+
+Size = tuple[int, int]
+"""Width and height [px]."""
+
+
+@dataclass(frozen=True)
+class Rig:
+    """Cameras of a bake, in their order; scenes have their images under these indices."""
+
+    rows: tuple[CameraRow, ...]
+    """With name and resolution."""
+    is_listed: bool
+    """Whether they come from [[camera]] tables."""
+
+    @classmethod
+    def of(cls, cameras: Cameras, rows: tuple[CameraRow, ...] = ()) -> Rig:
+        """Rig of [[camera]] tables, or without any of the section.
+
+        Raises:
+            ConfigError: The section has no position, or another number of up vectors.
+        """
+        listed = bool(rows)
+        if not listed:
+            if not cameras.positions:
+                raise ConfigError("cameras.positions is empty; at least one camera is needed")
+            if len(cameras.positions) != len(cameras.ups):
+                counts = f"{len(cameras.positions)} entries and cameras.ups {len(cameras.ups)}"
+                raise ConfigError(f"cameras.positions has {counts}; each camera needs one of both")
+            pairs = zip(cameras.positions, cameras.ups, strict=True)
+            rows = tuple(CameraRow(fov=cameras.fov, pose=Pose(position=at, look_at=cameras.target, up=up)) for at, up in pairs)
+        named = (replace(row, name=row.name or f"camera_{index}") for index, row in enumerate(rows))
+        return cls(tuple(replace(row, resolution=row.resolution or cameras.resolution) for row in named), listed)
+
+    def __len__(self) -> int:
+        """Number of cameras."""
+        return len(self.rows)
+
+    @cached_property
+    def names(self) -> tuple[str, ...]:
+        """Names of the cameras."""
+        return tuple(row.name for row in self.rows)
+
+    @cached_property
+    def sensors(self) -> tuple[str, ...]:
+        """Names of the cameras as sensors of a scene: theirs, or cam0 and so on."""
+        return self.names if self.is_listed else tuple(f"cam{index}" for index in range(len(self)))
+
+    @cached_property
+    def sizes(self) -> tuple[Size, ...]:
+        """Width and height of each camera's images [px]."""
+        return tuple(row.resolution for row in self.rows if row.resolution is not None)
+
+    @property
+    def largest(self) -> Size:
+        """Width and height of the images with most pixels [px]."""
+        return max(self.sizes, key=math.prod)
+
+    def index(self, name: str) -> int:
+        """Index of a camera by its name; empty: the first."""
+        return self.names.index(name) if name else 0
+
+    def key(self, index: int, name: str, section: str = "") -> str:
+        """Full key of a camera's setting `name` for messages; `section`: its name in [cameras], if that differs."""
+        return f"camera[{index}].{name}" if self.is_listed else f"cameras.{section or name}"
+
+    def label(self, index: int) -> str:
+        """Name of a camera for messages, such as "camera 0"."""
+        return f"camera {self.rows[index].name if self.is_listed else index}"
+
+
+def intrinsics(row: CameraRow) -> tuple[float, float, float, float]:
+    """Focal lengths and principal point (fx, fy, cx, cy) of a row with a resolution [px]."""
+    if row.matrix is not None:
+        return row.matrix[0][0], row.matrix[1][1], row.matrix[0][2], row.matrix[1][2]
+    width, height = row.resolution or (0, 0)
+    focal = width / 2 / math.tan(math.radians(row.fov or 0.0) / 2)
+    return focal, focal, width / 2, height / 2
+
+
+def lens_map(row: CameraRow) -> LensMap | None:
+    """Distortion of a row with a resolution; None: a pinhole.
+
+    Raises:
+        ConfigError: The coefficients are none of a lens that covers the image.
+    """
+    if not row.distortion or row.resolution is None:
+        return None
+    from synpick_warp.configs.calibration.lens import PINHOLE, make_lens_map
+
+    made = make_lens_map(row.model or PINHOLE, row.distortion, intrinsics(row), row.resolution)
+    return None if made.lens.is_identity else made
+
+
+def position(pose: Pose) -> Vector:
+    """Optical centre [m] of a valid pose."""
+    if pose.matrix is not None:
+        return pose.matrix[0][3], pose.matrix[1][3], pose.matrix[2][3]
+    return pose.position or (0.0, 0.0, 0.0)
+
+
+def viewing_direction(pose: Pose) -> Vector:
+    """Direction of the optical axis of a valid pose, not normalized."""
+    if pose.matrix is not None:
+        return pose.matrix[0][2], pose.matrix[1][2], pose.matrix[2][2]
+    if pose.quaternion is not None:
+        x, y, z, w = pose.quaternion
+        return 2 * (x * z + w * y), 2 * (y * z - w * x), w * w + z * z - x * x - y * y
+    at, target = position(pose), pose.look_at or (0.0, 0.0, 0.0)
+    return target[0] - at[0], target[1] - at[1], target[2] - at[2]
+
+
+def resized(row: CameraRow, size: Size) -> CameraRow:
+    """Pinhole camera with the same pose and horizontal field of view, and images of another size: their middle stays in the middle."""
+    if row.matrix is None or row.resolution is None:
+        return replace(row, resolution=size, distortion=None)
+    fx, fy, cx, cy = intrinsics(row)
+    width, height = row.resolution
+    scale = size[0] / width
+    center = (size[0] / 2 + scale * (cx - width / 2), size[1] / 2 + scale * (cy - height / 2))
+    matrix = ((scale * fx, 0.0, center[0]), (0.0, scale * fy, center[1]), (0.0, 0.0, 1.0))
+    return replace(row, resolution=size, matrix=matrix, distortion=None)
