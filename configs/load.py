@@ -12,6 +12,7 @@ from typing import Any
 
 from synpick_warp.configs.calibration.sensor_presets import sensor_settings
 from synpick_warp.configs.calibration.tables import fill_tables
+from synpick_warp.configs.cameras import Cameras
 from synpick_warp.configs.check import check_value
 from synpick_warp.configs.consistency import find_conflicts
 from synpick_warp.configs.schema import Bake, Bop, Config
@@ -290,8 +291,13 @@ def _build(values: Values, override: str) -> Config:
 
 
 def _check_sole_cameras(values: Values, override: str) -> None:
-    """Raise ConfigError if [cameras] and [[camera]] are set in one place, where one of both would be of no effect."""
+    """Raise ConfigError if [cameras] and [[camera]] are set in one place, where one of both would be of no effect.
+
+    A place that sets all of [cameras] is what `config_to_toml` wrote.
+    """
     rows, source = values.get(CAMERA, ((), ""))
+    if all(values.get(f"cameras.{name}", (None, ""))[1] == source for name in settings_of(Cameras)):
+        return
     for key, (value, origin) in values.items():
         section, _, name = key.partition(".")
         is_default = name == "resolution" and any(row.resolution is None for row in rows)

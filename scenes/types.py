@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -194,3 +194,8 @@ class Camera:
     name: str = ""
     lens: LensMap | None = None
     """Distortion of the lens; None: a pinhole."""
+
+    @property
+    def distortion(self) -> dict[str, Any]:
+        """Model and OpenCV's coefficients of the lens, as keys of BOP's files; none of a pinhole."""
+        return {} if self.lens is None else {"cam_dist_model": self.lens.lens.model, "cam_dist": list(self.lens.lens.coefficients)}

@@ -147,8 +147,9 @@ def _ros(tree: Tree, model: str) -> Calibration:
 
 
 def _bop(tree: Tree, model: str) -> Calibration:
-    """Values of BOP's camera.json."""
-    return Calibration(*_size(tree, ("width",), ("height",)), *_four(tree, "fx fy cx cy"))
+    """Values of BOP's camera.json; with the distortion that this program adds to it."""
+    lens = (str(tree.get("cam_dist_model", PINHOLE)), _numbers(tree.get("cam_dist", []), "cam_dist"))
+    return Calibration(*_size(tree, ("width",), ("height",)), *_four(tree, "fx fy cx cy"), *lens)
 
 
 def _realsense(tree: Tree, model: str) -> Calibration:

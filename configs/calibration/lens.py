@@ -7,8 +7,11 @@ the fisheye model that of Kannala and Brandt (2006).
 
 from __future__ import annotations
 
+import copy
 import functools
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -123,6 +126,27 @@ class Lens:
         return float(1 / np.sqrt(real.max())) if len(real) else np.inf
 
 
+def read_lens(camera: Mapping[str, Any], size: tuple[int, int]) -> LensMap | None:
+    """Projection of an entry of scene_camera.json, by its `cam_K`, `cam_dist` and `cam_dist_model`; None: a pinhole.
+
+    Args:
+        camera: The entry.
+        size: Width and height of the image [px].
+
+    Raises:
+        ConfigError: The values are none of a lens that covers the image.
+    """
+    if not camera.get("cam_dist"):
+        return None
+    try:
+        coefficients = tuple(float(value) for value in camera["cam_dist"])
+        fx, _, cx, _, fy, cy, *_ = (float(value) for value in camera["cam_K"])
+    except (TypeError, ValueError, KeyError):
+        raise ConfigError(f"cam_dist is {format_value(camera['cam_dist'])}; allowed: OpenCV's coefficients beside cam_K") from None
+    made = make_lens_map(str(camera.get("cam_dist_model", PINHOLE)), coefficients, (fx, fy, cx, cy), size)
+    return None if made.lens.is_identity else made
+
+
 @functools.lru_cache(maxsize=64)
 def make_lens_map(
     model: str, coefficients: tuple[float, ...], intrinsics: tuple[float, float, float, float], size: tuple[int, int]
@@ -185,6 +209,12 @@ class LensMap:
     def rays(self) -> np.ndarray:
         """Ray (x, y, 1) of each pixel's centre: (height, width, 2) float32."""
         return self.unproject(_pixel_centers(self.size)).astype(np.float32)
+
+    def cropped(self, left: int, top: int, size: tuple[int, int]) -> LensMap:
+        """The same projection with its origin at a pixel of the image, for an image of another size, which may reach beyond this one."""
+        made = copy.copy(self)
+        made.size, made._center = size, self._center - (left, top)
+        return made
 
     def undistortion_maps(self) -> np.ndarray:
         """Maps (2, height, width) float32 for `cv2.remap`, x and y: where each pixel of the undistorted picture lies in the distorted one.

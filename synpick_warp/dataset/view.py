@@ -7,7 +7,7 @@ OpenCV's axes (x right, y down, z forward); `world`, the tote's axes (z up). The
 from __future__ import annotations
 
 from functools import cached_property
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from msgspec import UNSET
@@ -16,8 +16,11 @@ from synpick_warp.configs.schema import LAYERS
 from synpick_warp.dataset.annotations import ADVICE
 from synpick_warp.dataset.bop.arrays import instance_ids
 from synpick_warp.dataset.view_files import SceneFiles, ViewRecords
-from synpick_warp.errors import DatasetError, format_value
+from synpick_warp.errors import ConfigError, DatasetError, format_value
 from synpick_warp.views.layer_codec import decode_layer, image_format
+
+if TYPE_CHECKING:
+    from synpick_warp.configs.calibration.lens import LensMap
 
 MILLIMETERS = 1000.0
 """In a metre: BOP's files are in millimetres, this module is in metres."""
@@ -132,6 +135,21 @@ class View:
         return np.reshape(np.asarray(self._camera_value("cam_K"), np.float64), (3, 3)).view(CameraMatrix)
 
     @cached_property
+    def lens(self) -> LensMap | None:
+        """Projection through the camera's lens, with `project`, `unproject` and `undistortion_maps`, which are for `cv2.remap`; None: a
+        pinhole. Its `lens` has model and coefficients for OpenCV.
+
+        Raises:
+            DatasetError: Its values are none of a lens.
+        """
+        from synpick_warp.configs.calibration.lens import read_lens
+
+        try:
+            return read_lens(self.records.camera, self._files.image_size(self.image_id))
+        except ConfigError as error:
+            raise DatasetError(f"{self._files.place}: the camera of image {self.image_id} has a {error}; {ADVICE}") from None
+
+    @cached_property
     def world_to_camera(self) -> np.ndarray:
         """World-to-camera transform (4, 4) float64 [m], OpenCV's axes."""
         camera, place = self.records.camera, f"{self._files.place}: the camera of image {self.image_id}"
@@ -185,7 +203,7 @@ class View:
         return np.array([row[key] for row in getattr(self.records, record)], dtype=dtype)
 
     def project(self, points: np.ndarray, transform: np.ndarray | None = None) -> np.ndarray:
-        """Project points by the pinhole model.
+        """Project points by the camera's matrix and, if it has one, its lens.
 
         Args:
             points: (..., 3) [m].
@@ -197,6 +215,8 @@ class View:
         points = np.asarray(points, np.float64)
         if transform is not None:
             points = points @ transform[:3, :3].T + transform[:3, 3]
+        if self.lens is not None:
+            return self.lens.project(points[..., :2] / points[..., 2:])
         image = points @ self.intrinsics.T
         return image[..., :2] / image[..., 2:]
 

@@ -13,7 +13,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from synpick_warp.configs.calibration.files import FISHEYE, PINHOLE, Calibration, read_calibration
+from synpick_warp.configs.calibration.sensor_presets import SENSORS, sensor_camera
+from synpick_warp.configs.load import load_config
+from synpick_warp.configs.write import config_to_toml
 from synpick_warp.errors import ConfigError
+from synpick_warp.scenes.cameras import make_cameras
 
 FIVE = (-0.12, 0.08, 5e-4, -3e-4, 0.01)
 EIGHT = (*FIVE, 0.02, -0.01, 0.03)
@@ -208,3 +212,95 @@ def test_damaged_files_are_read_or_refused(tmp_path_factory, name, data):
     with contextlib.suppress(ConfigError):
         camera = read_calibration(path)
         assert np.isfinite([camera.fx, camera.fy, camera.cx, camera.cy, *camera.distortion]).all()
+
+
+POSE = "pose = { position = [0.0, -0.4, 1.1], look_at = [0.0, 0.0, 0.1], up = [0.0, 1.0, 0.0] }"
+INLINE = "resolution = [320, 240]\nmatrix = [[275.0, 0, 163.3], [0, 274.6, 117.0], [0, 0, 1]]\n"
+
+
+def cell(folder, lines, settings=None):
+    """Configuration of one camera with these lines in its table."""
+    path = folder / "cell.toml"
+    path.write_text(f'preset = "smoke"\n[[camera]]\n{lines}\n{POSE}\n')
+    return load_config(str(path), settings)
+
+
+@pytest.mark.parametrize(
+    ("lines", "model"),
+    [
+        ('file = "camera.file"', "pinhole"),
+        (f"{INLINE}pixel_center = 0.0\ndistortion = {list(FIVE)}", None),
+    ],
+)
+def test_a_camera_table_has_the_numbers_of_its_file(lines, model, tmp_path):
+    """They are written to config.toml, and the file is not read again."""
+    saved(tmp_path, opencv(FIVE))
+    config = cell(tmp_path, lines)
+    row = config.camera[0]
+    assert (row.resolution, row.distortion, row.model, row.file) == ((320, 240), FIVE, model, None)
+    assert row.matrix == ((275.0, 0.0, 163.8), (0.0, 274.6, 117.5), (0.0, 0.0, 1.0))
+    (tmp_path / "camera.file").unlink()
+    (tmp_path / "config.toml").write_text(config_to_toml(config))
+    assert load_config(str(tmp_path / "config.toml")).camera == config.camera
+    (camera,) = make_cameras(config.rig)
+    assert camera.lens.lens.coefficients == FIVE
+    assert camera.distortion == {"cam_dist_model": "pinhole", "cam_dist": list(FIVE)}
+
+
+@pytest.mark.parametrize("name", [name for name in SENSORS if sensor_camera(name) is not None])
+def test_a_camera_table_has_the_intrinsics_of_its_sensor(name, tmp_path):
+    row, figures = cell(tmp_path, f'sensor = "{name}"').camera[0], SENSORS[name]
+    assert row.resolution == figures["resolution"].value
+    assert (row.matrix[0][0], row.matrix[1][1]) == figures["focal"].value
+    assert (row.matrix[0][2], row.matrix[1][2]) == figures["center"].value
+
+
+TABLES_REFUSED = {
+    "no file": ('file = "absent.yml"', "there is no file .*absent.yml"),
+    "a file beside a matrix": (
+        f'file = "camera.file"\n{INLINE}',
+        r"camera\[0\]\.matrix stands beside camera\[0\]\.file in .*; allowed: one",
+    ),
+    "a file beside a sensor": ('file = "camera.file"\nsensor = "d435"', "sensor stands beside"),
+    "another size": (
+        'file = "camera.file"\nresolution = [640, 480]',
+        r"resolution is \[640, 480\] .*; allowed: \[320, 240\], that of its file",
+    ),
+    "a number as file": ("file = 3", "file is 3 .*; allowed: a string"),
+    "an unknown sensor": ('sensor = "d436"', 'sensor is "d436" .*; allowed: d435, .*; did you mean d43'),
+    "the ideal sensor": ('sensor = "ideal"', 'sensor is "ideal" .*; allowed: d435'),
+    "another centre": (f"{INLINE}pixel_center = 1.0", r"pixel_center is 1\.0 .*; allowed: 0 or 0\.5"),
+    "an unknown model": (f'{INLINE}model = "brown"\ndistortion = [0.1, 0, 0, 0]', 'model is "brown" .*; allowed: pinhole, fisheye'),
+    "six coefficients": (
+        f"{INLINE}distortion = [0.1, 0, 0, 0, 0, 0]",
+        r"camera\[0\]\.distortion is .* in .*6 coefficients; allowed: 4 or 5",
+    ),
+    "a fold": (
+        f"{INLINE}distortion = [-0.9, 0, 0, 0]",
+        r"camera\[0\]\.distortion is .*distortion folds over at \d+ px .* inside the image",
+    ),
+    "nan": (f"{INLINE}distortion = [nan, 0, 0, 0]", "distortion is .*; allowed: "),
+    "an empty list of coefficients and a word": (f'{INLINE}distortion = "none"', 'distortion is "none" .*; allowed: a list of numbers'),
+}
+
+
+@pytest.mark.parametrize("name", TABLES_REFUSED)
+def test_a_wrong_camera_table_is_one_line(name, tmp_path):
+    saved(tmp_path, opencv(FIVE))
+    lines, message = TABLES_REFUSED[name]
+    with pytest.raises(ConfigError, match=message) as caught:
+        cell(tmp_path, lines)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_distorted_camera_has_no_depth_sensor(tmp_path):
+    with pytest.raises(ConfigError, match="none with the layer depth_sensor"):
+        cell(tmp_path, f"{INLINE}distortion = [0.1, 0, 0, 0]", {"render.layers": ["depth_sensor"]})
+    assert cell(tmp_path, f"{INLINE}distortion = [0, 0, 0, 0]", {"render.layers": ["depth_sensor"]}).camera
+
+
+def test_a_file_without_size_needs_a_resolution(tmp_path):
+    saved(tmp_path, ZIVID)
+    with pytest.raises(ConfigError, match="does not say the image's size"):
+        cell(tmp_path, 'file = "camera.file"')
+    assert cell(tmp_path, 'file = "camera.file"\nresolution = [320, 240]').camera[0].distortion == FIVE

@@ -169,6 +169,19 @@ def hit_position(cameras: ViewCameras, view: int, ray: wp.vec3, depth: float) ->
 
 
 @wp.func
+def clip_to_canvas(canvas: wp.vec4i, box: wp.vec4, margin: float) -> wp.vec4i:
+    """Pixels of a box (x_min, y_min, x_max, y_max), enlarged by a margin [px], within those of a canvas, inclusive; x_max < x_min: none."""
+    # Clamp before converting: the projection of a corner close to the near plane may overflow an int.
+    x_min = wp.clamp(box[0] - margin, float(canvas[0]), float(canvas[2] + 1))
+    y_min = wp.clamp(box[1] - margin, float(canvas[1]), float(canvas[3] + 1))
+    x_max = wp.clamp(box[2] + margin, float(canvas[0] - 1), float(canvas[2]))
+    y_max = wp.clamp(box[3] + margin, float(canvas[1] - 1), float(canvas[3]))
+    if x_max < x_min or y_max < y_min:
+        return wp.vec4i(0, 0, -1, -1)
+    return wp.vec4i(int(wp.floor(x_min)), int(wp.floor(y_min)), int(wp.floor(x_max)), int(wp.floor(y_max)))
+
+
+@wp.func
 def projected_box(
     lower: wp.vec3,
     upper: wp.vec3,
@@ -195,15 +208,9 @@ def projected_box(
     y_max = float(-1.0e9)
     behind = int(0)
     for corner in range(8):
-        x = lower[0]
-        y = lower[1]
-        z = lower[2]
-        if corner & 1 != 0:
-            x = upper[0]
-        if corner & 2 != 0:
-            y = upper[1]
-        if corner & 4 != 0:
-            z = upper[2]
+        x = wp.where(corner & 1 != 0, upper[0], lower[0])
+        y = wp.where(corner & 2 != 0, upper[1], lower[1])
+        z = wp.where(corner & 4 != 0, upper[2], lower[2])
         point = rotation * wp.vec3d(wp.float64(x), wp.float64(y), wp.float64(z)) + position
         depth = float(point[2])
         if depth < NEAR_PLANE:
@@ -229,11 +236,4 @@ def projected_box(
     margin = float(BOX_MARGIN)
     if lens >= 0:
         margin += cameras.lenses.number[lens, BEND] * wp.length_sq(most - least) / 6.0
-    # Clamp before converting: the projection of a corner close to the near plane may overflow an int.
-    x_min = wp.clamp(x_min - margin, float(canvas[0]), float(canvas[2] + 1))
-    y_min = wp.clamp(y_min - margin, float(canvas[1]), float(canvas[3] + 1))
-    x_max = wp.clamp(x_max + margin, float(canvas[0] - 1), float(canvas[2]))
-    y_max = wp.clamp(y_max + margin, float(canvas[1] - 1), float(canvas[3]))
-    if x_max < x_min or y_max < y_min:
-        return wp.vec4i(0, 0, -1, -1)
-    return wp.vec4i(int(wp.floor(x_min)), int(wp.floor(y_min)), int(wp.floor(x_max)), int(wp.floor(y_max)))
+    return clip_to_canvas(canvas, wp.vec4(x_min, y_min, x_max, y_max), margin)

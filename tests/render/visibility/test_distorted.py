@@ -3,7 +3,6 @@ beyond the image, flow and the undistorted picture are right."""
 
 from __future__ import annotations
 
-import copy
 from dataclasses import replace
 
 import cv2
@@ -19,6 +18,7 @@ from synpick_warp.system.hardware.device import pick_device
 from tests.harness.devices import default_device
 from tests.render.visibility.test_raster import NEVER, depth_in_float64, gbuffer_of, random_triangles, triangles
 from tests.twins.annotate import count_pixels
+from tests.twins.layers import PreviousFrame, render_layers
 from tests.worlds.toy_scene import (
     UPRIGHT,
     ToyScene,
@@ -103,8 +103,7 @@ def test_edges_lie_where_opencv_projects_them(device, name):
 @pytest.mark.parametrize("place", [(0.68, 0.0), (-0.75, 0.45), (0.0, -0.62)])
 def test_masks_beyond_the_border_are_those_of_the_continued_lens(device, name, place):
     view = VIEWS[name]
-    lens = copy.copy(view.lens)
-    lens.size, lens._center = (3 * view.width, 3 * view.height), lens._center + np.array((view.width, view.height))
+    lens = view.lens.cropped(-view.width, -view.height, (3 * view.width, 3 * view.height))
     shifted = view.matrix + np.array([[0, 0, view.width], [0, 0, view.height], [0, 0, 0]])
     canvas = Camera(*lens.size, shifted, view.rotation, view.translation, lens=lens)
     toy = ToyScene([entry(ball(0.15, 3))], [[(0, (*place, 0.1, *UPRIGHT)), (0, (*place, -0.3, *UPRIGHT))]], (view,))
@@ -114,6 +113,23 @@ def test_masks_beyond_the_border_are_those_of_the_continued_lens(device, name, p
     # The inverse is float32 here and float64 there: a ray within 1e-3 px of an outline may pass it on either side.
     assert np.abs(picture.pixels[0] - pixels).max() <= 1
     assert np.abs(picture.boxes[0] - boxes).max() <= 1
+
+
+@pytest.mark.parametrize("name", VIEWS)
+@pytest.mark.parametrize("shift", [0.0, 1e-5, 0.03])
+def test_flow_is_the_difference_of_opencvs_projections(device, name, shift):
+    """Of a sheet that moves across and towards the camera, by nothing, by less than float32 resolves in pixels, and by pixels."""
+    view, moved = VIEWS[name], np.array((shift, -shift / 2, shift))
+    toy = ToyScene([entry(sheet(0.8, 0.5))], [[(0, (0.05, 0.02, 0.0, *UPRIGHT))]], (view,))
+    before = PreviousFrame([[(0, (*(np.array((0.05, 0.02, 0.0)) - moved), *UPRIGHT))]], [1])
+    rendered = render_layers(toy, device, before, names=("flow",))
+    seen = rendered.segment[0] == 1
+    centers = np.stack(np.meshgrid(np.arange(view.width) + 0.5, np.arange(view.height) + 0.5), -1)[seen]
+    rays = np.column_stack((view.lens.unproject(centers), np.ones(len(centers))))
+    points = (rays * rendered.depth[0][seen][:, None] - view.translation) @ view.rotation
+    expected = opencv_pixels(view, points - moved) - centers
+    np.testing.assert_allclose(rendered["flow"][0][seen], expected, atol=2e-3 if shift > 1e-4 else 1e-5)
+    assert seen.sum() > 1000
 
 
 @pytest.mark.parametrize("name", ["issue", "fisheye"])
