@@ -9,8 +9,9 @@ from collections.abc import Iterator, Sequence
 
 from synpick_warp.configs.cameras import CameraRow, Cameras, Pose
 from synpick_warp.configs.cell import BinSizes, Sides, bin_sizes
-from synpick_warp.configs.rig import Rig, intrinsics, position, viewing_direction
+from synpick_warp.configs.rig import Rig, intrinsics, lens_map, position, viewing_direction
 from synpick_warp.configs.schema import Bop, Config, DepthSensor
+from synpick_warp.errors import ConfigError
 
 Conflict = tuple[str, str]
 """Key of the wrong setting, and its allowed values."""
@@ -101,6 +102,8 @@ def _view(rig: Rig, index: int, config: Config) -> Iterator[Conflict]:
         yield key, "even width and height with the format lerobot, whose videos have a colour for 2 x 2 pixels"
     if row.matrix is not None:
         yield from _matrix(rig.key(index, "matrix"), row.matrix, width, height)
+    if row.distortion:
+        yield from _lens(rig.key(index, "distortion"), row, config.render.layers)
     at, forward, up = position(row.pose), viewing_direction(row.pose), row.pose.up
     place, aim, target = (rig.key(index, "pose", name) for name in ("positions", "ups", "target"))
     if math.hypot(*forward) == 0.0:
@@ -133,6 +136,17 @@ def _matrix(key: str, matrix: tuple[tuple[float, float, float], ...], width: int
         yield key, f"a principal point cx, cy inside its images of {width} x {height} px: are numbers, or width and height, swapped? [px]"
 
 
+def _lens(key: str, row: CameraRow, layers: tuple[str, ...]) -> Iterator[Conflict]:
+    """Yield a distortion that no lens has, or with which a layer cannot be rendered."""
+    try:
+        lens = lens_map(row)
+    except ConfigError as error:
+        yield key, f"that of a lens which covers the image, but {error}"
+        return
+    if lens is not None and "depth_sensor" in layers:
+        yield key, "none with the layer depth_sensor, which is the rectified image of a sensor"
+
+
 def _depth_sensor(sensor: DepthSensor, rig: Rig, bins: Sequence[BinSizes]) -> Iterator[Conflict]:
     """With the layer depth_sensor: the bins must lie within what the sensor measures, and its disparity be more than a step."""
     for index, row in enumerate(rig.rows):
@@ -142,6 +156,12 @@ def _depth_sensor(sensor: DepthSensor, rig: Rig, bins: Sequence[BinSizes]) -> It
             yield (
                 "depth_sensor.distances",
                 f"a range that reaches the {bins[0].noun}, {near:.3g} to {far:.3g} m from {rig.label(index)} [m]",
+            )
+        if focal * sensor.baseline > far * sensor.max_disparity > 0.0:
+            most = sensor.max_disparity * far / focal
+            yield (
+                "depth_sensor.baseline",
+                f"at most {most:.3g}, so that the {bins[0].noun}'s disparity is within max_disparity; or a shorter lens [m]",
             )
         if focal * sensor.baseline < sensor.disparity_step * far:
             least = sensor.disparity_step * far / focal

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import ClassVar
 
+from synpick_warp.configs.calibration.files import MODELS
 from synpick_warp.configs.fields import setting
 
 Vector = tuple[float, float, float]
@@ -60,5 +61,22 @@ class CameraRow:
     )
     matrix: tuple[tuple[float, float, float], tuple[float, float, float], tuple[float, float, float]] | None = setting(
         None, "px", "Camera matrix with fx, fy, cx and cy, instead of fov.", low=-1e6, high=1e6
+    )
+    distortion: tuple[float, ...] | None = setting(
+        None,
+        "",
+        "Distortion of the lens by OpenCV's coefficients, k1 k2 p1 p2 [k3 [k4 k5 k6 [s1 s2 s3 s4]]]; of a fisheye k1 k2 k3 k4.",
+        low=-1e6,
+        high=1e6,
+    )
+    model: str | None = setting(None, "", "Distortion model, pinhole unless it is given.", choices=MODELS)
+    file: str | None = setting(
+        None, "", "Calibration file of OpenCV, ROS, BOP, RealSense or Zivid, instead of matrix, distortion and resolution."
+    )
+    sensor: str | None = setting(None, "", "Depth sensor whose resolution and matrix the camera has, [as listed](#sensor-presets).")
+    pixel_center: float | None = setting(
+        None,
+        "px",
+        "Where the given matrix or file has the centre of the first pixel, 0 or 0.5; not given: 0.5, and in a file its format's.",
     )
     pose: Pose = setting(Pose(), "", "Pose in the tote's frame: {matrix}, {position, quaternion} or {position, look_at, up}.")

@@ -10,6 +10,9 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from synpick_warp.configs.calibration.sensor_presets import sensor_settings
+from synpick_warp.configs.calibration.tables import fill_tables
+from synpick_warp.configs.cameras import Cameras
 from synpick_warp.configs.check import check_value
 from synpick_warp.configs.consistency import find_conflicts
 from synpick_warp.configs.schema import Bake, Bop, Config
@@ -95,8 +98,9 @@ def override_config(config: Config, settings: Mapping[str, object], source: str 
         section, _, name = key.partition(".")
         if section == SPLITS or (config.splits and key in _OF_SPLITS):
             raise ConfigError(f"{key} is set {source}, but the configuration has its splits already; pass it to load_config")
-        values |= _section_values(section, {name: value}, source)
-        config = config.with_values({key: values[key][0]})
+        found = _section_values(section, {name: value}, source)
+        values |= found
+        config = config.with_values({name: pair[0] for name, pair in found.items()})
     _check_conflicts(config, values)
     return config
 
@@ -166,6 +170,8 @@ def _read(preset_or_file: str) -> Values:
     """Values of a preset or a .toml file over the preset it is based on, with the source of each."""
     if preset_or_file.endswith(".toml"):
         document = _parse(Path(preset_or_file))
+        if "camera" in document:
+            document["camera"] = fill_tables(document["camera"], Path(preset_or_file).parent, f"in {preset_or_file}")
         base = document.pop(_BASE, DEFAULT_PRESET)
         if not isinstance(base, str):
             raise ConfigError(f"{_BASE} is {format_value(base)} in {preset_or_file}; allowed: {', '.join(preset_names())}")
@@ -220,6 +226,8 @@ def _section_values(section: str, content: Mapping[str, Any], source: str) -> Va
     """Checked values of a section by key, with their source."""
     _check_section(section, source)
     values: Values = {}
+    if section == "depth_sensor":
+        content = sensor_settings(str(content.get("preset", ""))) | dict(content)
     for name, value in content.items():
         key = f"{section}.{name}"
         item, annotation = _setting(section, name, source)
@@ -283,8 +291,13 @@ def _build(values: Values, override: str) -> Config:
 
 
 def _check_sole_cameras(values: Values, override: str) -> None:
-    """Raise ConfigError if [cameras] and [[camera]] are set in one place, where one of both would be of no effect."""
+    """Raise ConfigError if [cameras] and [[camera]] are set in one place, where one of both would be of no effect.
+
+    A place that sets all of [cameras] is what `config_to_toml` wrote.
+    """
     rows, source = values.get(CAMERA, ((), ""))
+    if all(values.get(f"cameras.{name}", (None, ""))[1] == source for name in settings_of(Cameras)):
+        return
     for key, (value, origin) in values.items():
         section, _, name = key.partition(".")
         is_default = name == "resolution" and any(row.resolution is None for row in rows)

@@ -5,9 +5,13 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 from synpick_warp.configs.cameras import CameraRow, Cameras, Pose, Vector
 from synpick_warp.errors import ConfigError
+
+if TYPE_CHECKING:
+    from synpick_warp.configs.calibration.lens import LensMap
 
 Size = tuple[int, int]
 """Width and height [px]."""
@@ -93,6 +97,20 @@ def intrinsics(row: CameraRow) -> tuple[float, float, float, float]:
     return focal, focal, width / 2, height / 2
 
 
+def lens_map(row: CameraRow) -> LensMap | None:
+    """Distortion of a row with a resolution; None: a pinhole.
+
+    Raises:
+        ConfigError: The coefficients are none of a lens that covers the image.
+    """
+    if not row.distortion or row.resolution is None:
+        return None
+    from synpick_warp.configs.calibration.lens import PINHOLE, make_lens_map
+
+    made = make_lens_map(row.model or PINHOLE, row.distortion, intrinsics(row), row.resolution)
+    return None if made.lens.is_identity else made
+
+
 def position(pose: Pose) -> Vector:
     """Optical centre [m] of a valid pose."""
     if pose.matrix is not None:
@@ -112,12 +130,12 @@ def viewing_direction(pose: Pose) -> Vector:
 
 
 def resized(row: CameraRow, size: Size) -> CameraRow:
-    """Camera with the same pose and horizontal field of view, and images of another size: the middle of the image stays in the middle."""
+    """Pinhole camera with the same pose and horizontal field of view, and images of another size: their middle stays in the middle."""
     if row.matrix is None or row.resolution is None:
-        return replace(row, resolution=size)
+        return replace(row, resolution=size, distortion=None)
     fx, fy, cx, cy = intrinsics(row)
     width, height = row.resolution
     scale = size[0] / width
     center = (size[0] / 2 + scale * (cx - width / 2), size[1] / 2 + scale * (cy - height / 2))
     matrix = ((scale * fx, 0.0, center[0]), (0.0, scale * fy, center[1]), (0.0, 0.0, 1.0))
-    return replace(row, resolution=size, matrix=matrix)
+    return replace(row, resolution=size, matrix=matrix, distortion=None)

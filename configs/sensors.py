@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from synpick_warp.configs.calibration.sensor_presets import SENSORS
 from synpick_warp.configs.fields import setting
 
 
@@ -73,9 +74,16 @@ class DepthSensor:
     """Structured-light depth camera model for the layer depth_sensor: disparity quantization, noise, lateral noise and holes.
 
     Axial noise is sigma_z = noise + noise_growth (z - noise_distance)² + noise_angle / √z · (θ / (π/2 - θ))², as Nguyen, Izadi and
-    Lovell (3DIMPVT 2012) measured for a Kinect, with z in m and θ the angle of incidence. Not in the paper.
+    Lovell (3DIMPVT 2012) measured for a Kinect, with z in m and θ the angle of incidence: a law of depth alone, whatever the lens. Noise
+    of disparity adds z² disparity_noise / (f · baseline), which is that of stereo and of projected patterns. Not in the paper.
     """
 
+    preset: str = setting(
+        "",
+        "",
+        "Sensor that sets baseline, noise, quantization and range, [as listed](#sensor-presets), unless they are set beside it.",
+        choices=("", *SENSORS),
+    )
     baseline: float = setting(
         0.075, "m", "Distance from the camera to the projector at its right (Khoshelham and Elberink, 2012).", above=0.0, high=1.0
     )
@@ -85,6 +93,12 @@ class DepthSensor:
         "Disparity quantization, which makes depth steps of z² / (f · baseline) times this (Khoshelham and Elberink, 2012).",
         above=0.0,
         high=16.0,
+    )
+    disparity_noise: float = setting(
+        0.0, "px", "Standard deviation of disparity, which makes depth noise z² / (f · baseline) times this.", low=0.0, high=16.0
+    )
+    max_disparity: float = setting(
+        0.0, "px", "Largest disparity that is searched, so the least depth is f · baseline / max_disparity; 0: no limit.", low=0.0, high=1e4
     )
     distances: tuple[float, float] = setting((0.4, 5.0), "m", "Minimum and maximum depth that is measured.", above=0.0, high=100.0)
     noise: float = setting(0.0012, "m", "Axial noise at noise_distance, as standard deviation (Nguyen et al., 2012).", low=0.0, high=1.0)

@@ -6,7 +6,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from synpick_warp.configs.cameras import CameraRow
-from synpick_warp.configs.rig import Rig
+from synpick_warp.configs.rig import Rig, lens_map
 from synpick_warp.errors import ConfigError
 from synpick_warp.scenes.types import Camera
 
@@ -46,7 +46,7 @@ def _make_camera(label: str, row: CameraRow) -> Camera:
             rotation = Rotation.from_quat(pose.quaternion).as_matrix().T
         else:
             rotation = _look_at(label, position, np.array(pose.look_at, dtype=float), np.array(pose.up, dtype=float))
-    return Camera(width, height, matrix, rotation, -rotation @ position, row.name)
+    return Camera(width, height, matrix, rotation, -rotation @ position, row.name, lens_map(row))
 
 
 def _look_at(label: str, position: np.ndarray, target: np.ndarray, up: np.ndarray) -> np.ndarray:

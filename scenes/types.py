@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
+
+from synpick_warp.configs.calibration.lens import LensMap
 
 
 @dataclass(frozen=True, eq=False)
@@ -190,5 +192,10 @@ class Camera:
     translation: np.ndarray
     """World-to-camera translation (3) float64 [m]."""
     name: str = ""
-    lens: object | None = None
+    lens: LensMap | None = None
     """Distortion of the lens; None: a pinhole."""
+
+    @property
+    def distortion(self) -> dict[str, Any]:
+        """Model and OpenCV's coefficients of the lens, as keys of BOP's files; none of a pinhole."""
+        return {} if self.lens is None else {"cam_dist_model": self.lens.lens.model, "cam_dist": list(self.lens.lens.coefficients)}

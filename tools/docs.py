@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from synpick_warp.apps.validation.registry import load_rules
+from synpick_warp.configs.calibration.sensor_presets import SENSORS
 from synpick_warp.configs.check import describe_allowed, is_table
 from synpick_warp.configs.load import sections, table_lists
 from synpick_warp.configs.schema import Split
@@ -39,7 +40,15 @@ def settings_reference() -> str:
     links = " · ".join(f"[{title.strip('[]')}](#{_anchor(title)})" for title in parts)
     lines = ["| key | default | unit | allowed | meaning |", "|---|---|---|---|---|"]
     lines += [line for title, (kind, prefix) in parts.items() for line in _section(title, kind, prefix)]
-    return f"{head}{begin}\n{links}\n\n" + "\n".join([*lines, ""])
+    return f"{head}{begin}\n{links}\n\n" + "\n".join([*lines, "", *_sensors(), ""])
+
+
+def _sensors() -> list[str]:
+    """Heading and rows of the presets of depth sensors: every figure with its source."""
+    lines = ["## Sensor presets", "", "| preset | figure | value | trust | source |", "|---|---|---|---|---|"]
+    for name, figures in SENSORS.items():
+        lines += [f"| `{name}` | {key} | `{format_toml(one.value)}` | {one.trust} | {one.source} |" for key, one in figures.items()]
+    return lines
 
 
 def _anchor(title: str) -> str:

@@ -51,6 +51,8 @@ class CameraEntry(Struct, gc=False):
     depth_scale: Annotated[float, Meta(gt=0.0, le=1e6)]
     cam_R_w2c: Rotation | UnsetType = UNSET  # noqa: N815
     cam_t_w2c: Vector3 | UnsetType = UNSET
+    cam_dist: Any = UNSET
+    cam_dist_model: Any = UNSET
 
 
 class LenientCameraEntry(Struct, gc=False):
@@ -62,6 +64,8 @@ class LenientCameraEntry(Struct, gc=False):
     depth_scale: Annotated[float, Meta(gt=0.0, le=1e6)] | UnsetType = UNSET
     cam_R_w2c: Rotation | UnsetType = UNSET  # noqa: N815
     cam_t_w2c: Vector3 | UnsetType = UNSET
+    cam_dist: Any = UNSET
+    cam_dist_model: Any = UNSET
 
 
 class TruthEntry(Struct, gc=False):

@@ -41,6 +41,8 @@ from synpick_warp.system.inputs.json import decode_json
 from synpick_warp.system.inputs.paths import path_inside
 
 if TYPE_CHECKING:
+    import numpy as np
+
     from synpick_warp.configs.schema import Config
     from synpick_warp.dataset.bop.scenes import FoundScenes
     from synpick_warp.dataset.tracks import Track, Tracks
@@ -324,6 +326,13 @@ class DataSet(Mapping[int, Episode]):
 
         cameras = make_cameras(self.config.rig)
         return tuple(CameraInfo(np.array((c.width, c.height), np.int32), c.matrix, c.rotation, c.translation) for c in cameras)
+
+    def intrinsics(self, convention: str = "synpick") -> np.ndarray:
+        """Camera matrices (camera, 3, 3) [px] in the first frame, as of `View.intrinsics`: "opencv" has pixel centres at integers."""
+        import numpy as np
+
+        first = next(iter(self.values()))
+        return np.stack([first.view(0, camera).intrinsics(convention) for camera in first.cameras])
 
     @cached_property
     def sensors(self) -> tuple[str, ...]:

@@ -7,7 +7,7 @@ OpenCV's axes (x right, y down, z forward); `world`, the tote's axes (z up). The
 from __future__ import annotations
 
 from functools import cached_property
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from msgspec import UNSET
@@ -16,13 +16,41 @@ from synpick_warp.configs.schema import LAYERS
 from synpick_warp.dataset.annotations import ADVICE
 from synpick_warp.dataset.bop.arrays import instance_ids
 from synpick_warp.dataset.view_files import SceneFiles, ViewRecords
-from synpick_warp.errors import DatasetError
+from synpick_warp.errors import ConfigError, DatasetError, format_value
 from synpick_warp.views.layer_codec import decode_layer, image_format
+
+if TYPE_CHECKING:
+    from synpick_warp.configs.calibration.lens import LensMap
 
 MILLIMETERS = 1000.0
 """In a metre: BOP's files are in millimetres, this module is in metres."""
 _ORTHOGONAL = 1e-3
 """Tolerance of R Rᵀ = 1 for a rotation that is read; files have at least six digits."""
+PIXEL_CENTERS = {"synpick": 0.5, "opencv": 0.0, "open3d": 0.0}
+"""Image coordinates of the centre of the first pixel [px], by convention."""
+
+
+class CameraMatrix(np.ndarray):
+    """Camera matrix K (3, 3) [px]; called with a convention, the matrix in that convention.
+
+    OpenCV and Open3D count pixel centres at integers, this package at + 0.5: for them subtract 0.5 from cx and cy, as K("opencv") does.
+    """
+
+    def __call__(self, convention: str = "synpick") -> np.ndarray:
+        """Matrix in the convention "synpick", "opencv" or "open3d".
+
+        Raises:
+            ValueError: There is no such convention.
+        """
+        if convention not in PIXEL_CENTERS:
+            raise ValueError(f"there is no convention {format_value(convention)}; conventions: {', '.join(PIXEL_CENTERS)}")
+        matrix = np.array(self)
+        matrix[:2, 2] += PIXEL_CENTERS[convention] - PIXEL_CENTERS["synpick"]
+        return matrix
+
+    def __array_wrap__(self, array: np.ndarray, context: Any = None, return_scalar: bool = False) -> Any:
+        """Result of arithmetic, which is a plain array."""
+        return array[()] if return_scalar else np.asarray(array)
 
 
 class View:
@@ -102,9 +130,24 @@ class View:
         return read_layer(self._files, name, self.image_id)
 
     @cached_property
-    def intrinsics(self) -> np.ndarray:
-        """Camera matrix K (3, 3) float64 [px]."""
-        return np.reshape(np.asarray(self._camera_value("cam_K"), np.float64), (3, 3))
+    def intrinsics(self) -> CameraMatrix:
+        """Camera matrix K (3, 3) float64 [px]; `intrinsics("opencv")` is the one for OpenCV and Open3D."""
+        return np.reshape(np.asarray(self._camera_value("cam_K"), np.float64), (3, 3)).view(CameraMatrix)
+
+    @cached_property
+    def lens(self) -> LensMap | None:
+        """Projection through the camera's lens, with `project`, `unproject` and `undistortion_maps`, which are for `cv2.remap`; None: a
+        pinhole. Its `lens` has model and coefficients for OpenCV.
+
+        Raises:
+            DatasetError: Its values are none of a lens.
+        """
+        from synpick_warp.configs.calibration.lens import read_lens
+
+        try:
+            return read_lens(self.records.camera, self._files.image_size(self.image_id))
+        except ConfigError as error:
+            raise DatasetError(f"{self._files.place}: the camera of image {self.image_id} has a {error}; {ADVICE}") from None
 
     @cached_property
     def world_to_camera(self) -> np.ndarray:
@@ -160,7 +203,7 @@ class View:
         return np.array([row[key] for row in getattr(self.records, record)], dtype=dtype)
 
     def project(self, points: np.ndarray, transform: np.ndarray | None = None) -> np.ndarray:
-        """Project points by the pinhole model.
+        """Project points by the camera's matrix and, if it has one, its lens.
 
         Args:
             points: (..., 3) [m].
@@ -172,6 +215,8 @@ class View:
         points = np.asarray(points, np.float64)
         if transform is not None:
             points = points @ transform[:3, :3].T + transform[:3, 3]
+        if self.lens is not None:
+            return self.lens.project(points[..., :2] / points[..., 2:])
         image = points @ self.intrinsics.T
         return image[..., :2] / image[..., 2:]
 

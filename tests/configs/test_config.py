@@ -12,7 +12,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from synpick_warp.configs.load import COMMAND_LINE, load_config, parse_assignment, preset_names, sections, settings_of
+from synpick_warp.configs.calibration.sensor_presets import ASSUMED, MEASURED, PUBLISHED, SENSORS, sensor_settings
+from synpick_warp.configs.load import COMMAND_LINE, load_config, override_config, parse_assignment, preset_names, sections, settings_of
 from synpick_warp.configs.schema import Config, ObjectRow
 from synpick_warp.configs.write import config_to_toml
 from synpick_warp.errors import ConfigError
@@ -29,6 +30,8 @@ COUPLED = {
     "bop.depth_scale",
     "depth_sensor.baseline",
     "depth_sensor.disparity_step",
+    "depth_sensor.max_disparity",
+    "depth_sensor.preset",
     "move.height",
     "move.start_height",
     "pick.near",
@@ -436,3 +439,29 @@ def test_values_by_key():
     assert config.with_values({"bake.worlds": 0, "physics.step": Config().physics.step, "bake.seed": 0}) == Config()
     with pytest.raises(TypeError):
         config.with_values({"bake.world": 1})
+
+
+@pytest.mark.parametrize("name", SENSORS)
+def test_a_sensor_preset_sets_its_figures(name, tmp_path):
+    """Also where a finished configuration is overridden, and read back from what is written of it."""
+    sensor = load_config("smoke", {"depth_sensor.preset": name}).depth_sensor
+    assert {key: getattr(sensor, key) for key in sensor_settings(name)} == sensor_settings(name)
+    assert override_config(load_config("smoke"), {"depth_sensor.preset": name}).depth_sensor == sensor
+    path = tmp_path / "config.toml"
+    path.write_text(config_to_toml(load_config("smoke", {"depth_sensor.preset": name, "depth_sensor.disparity_noise": 0.5})))
+    assert load_config(str(path)).depth_sensor == dataclasses.replace(sensor, disparity_noise=0.5)
+    for key, figure in SENSORS[name].items():
+        assert figure.trust in (PUBLISHED, MEASURED, ASSUMED), key
+        assert figure.source
+
+
+def test_a_sensor_preset_gives_way_to_what_stands_beside_it(tmp_path):
+    path = tmp_path / "cell.toml"
+    path.write_text('preset = "smoke"\n[depth_sensor]\nbaseline = 0.06\npreset = "d435"\n')
+    assert load_config(str(path)).depth_sensor.baseline == 0.06
+    assert load_config(str(path), {"depth_sensor.preset": "d415"}).depth_sensor.baseline == 0.055
+    with pytest.raises(ConfigError, match=r"depth_sensor\.preset is \"d453\" .*; allowed: .*d435.*did you mean d4"):
+        load_config("smoke", {"depth_sensor.preset": "d453"})
+    # The paper's long lens at 2 m has more disparity than the D435 searches.
+    with pytest.raises(ConfigError, match=r"depth_sensor\.baseline is 0\.05 .*; allowed: at most 0\.0[0-9]+, .* or a shorter lens"):
+        load_config("synpick", {"depth_sensor.preset": "d435", "render.layers": ["depth_sensor"]})

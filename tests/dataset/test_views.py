@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 import pytest
 
@@ -86,6 +87,22 @@ def test_cameras(data):
         np.testing.assert_array_equal(view.intrinsics, lens.matrix)
         np.testing.assert_allclose(view.world_to_camera[:3, :3], lens.rotation)
         np.testing.assert_allclose(view.world_to_camera[:3, 3], lens.translation)
+
+
+def test_intrinsics_for_opencv_have_pixel_centres_at_integers(data):
+    """Points that OpenCV projects are half a pixel before ours; arithmetic gives plain arrays."""
+    view = data[0].view(0, 1)
+    points = np.array([[0.01, -0.02, 0.5], [0.1, 0.05, 1.0]])
+    for convention in ("opencv", "open3d"):
+        matrix = view.intrinsics(convention)
+        assert type(matrix) is type(view.intrinsics @ matrix) is np.ndarray
+        there = cv2.projectPoints(points, np.zeros(3), np.zeros(3), matrix, None)[0][:, 0]
+        np.testing.assert_allclose(there, view.project(points) - 0.5, atol=1e-9)
+        np.testing.assert_allclose(data.intrinsics(convention)[1], matrix)
+    np.testing.assert_array_equal(view.intrinsics(), LENSES[1].matrix)
+    np.testing.assert_array_equal(data.intrinsics()[2], LENSES[2].matrix)
+    with pytest.raises(ValueError, match='no convention "cv"; conventions: synpick, opencv, open3d'):
+        view.intrinsics("cv")
 
 
 def test_layers_are_decoded(data):

@@ -8,6 +8,7 @@ import numpy as np
 import trimesh
 import warp as wp
 
+from synpick_warp.configs.calibration.lens import PINHOLE, Lens, LensMap
 from synpick_warp.configs.schema import FAST, Config
 from synpick_warp.factory.assembly import make_renderer
 from synpick_warp.scenes.environment import map_directions
@@ -100,6 +101,13 @@ def camera(width: int, height: int, focal: float, center: tuple[float, float, fl
     """A camera at `center` [m] with its principal point in the middle of the image."""
     matrix = np.array([[focal, 0.0, width / 2.0], [0.0, focal, height / 2.0], [0.0, 0.0, 1.0]])
     return Camera(width, height, matrix, rotation, -rotation @ np.asarray(center, dtype=np.float64))
+
+
+def distorted(view: Camera, *coefficients: float, model: str = PINHOLE) -> Camera:
+    """The same camera behind a lens."""
+    k = view.matrix
+    lens = LensMap(Lens(model, coefficients), (k[0, 0], k[1, 1], k[0, 2], k[1, 2]), (view.width, view.height))
+    return replace(view, lens=lens)
 
 
 def even_light(radiance: float = 1.0, rows: int = 16) -> EnvironmentMap:

@@ -3,7 +3,7 @@
 import warp as wp
 
 from synpick_warp.kernels.render.visibility.bvh_rays import hits_body
-from synpick_warp.kernels.render.visibility.camera import ImageGrid, Views, camera_ray, in_image
+from synpick_warp.kernels.render.visibility.camera import ImageGrid, Views, border_ray, in_image
 from synpick_warp.kernels.render.visibility.gbuffer import Meshes, ViewBodies
 
 wp.set_module_options({"enable_backward": False})
@@ -216,7 +216,7 @@ def count_border_pixels_kernel(
             row = box[1] + i // columns
             column = box[0] + i % columns
             if not in_image(grid, row, column):
-                if hits_body(meshes, bodies, view, instance, camera_ray(views.cameras, view, row, column, wp.vec2(0.0, 0.0))):
+                if hits_body(meshes, bodies, view, instance, border_ray(views.cameras, view, row, column)):
                     amodal += 1
                     amodal_box = extend_box(amodal_box, row, column)
         if amodal > 0:

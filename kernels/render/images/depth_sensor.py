@@ -21,8 +21,8 @@ MIN_DEPTH = wp.constant(1.0e-3)
 
 @wp.struct
 class SensorParameters:
-    """Structured-light sensor model: seed, baseline [m], disparity quantization [px], range [m], axial and lateral noise, grazing limit,
-    matching window, and whether projector shadows are invalid; see configs.sensors.DepthSensor.
+    """Structured-light sensor model: seed, baseline [m], disparity quantization, noise and limit [px], range [m], axial and lateral noise,
+    grazing limit, matching window, and whether projector shadows are invalid; see configs.sensors.DepthSensor.
     """
 
     seed: wp.uint64
@@ -31,6 +31,10 @@ class SensorParameters:
     """From the camera to the projector, to the right [m]."""
     disparity_step: float
     """Quantization step of disparity [px]."""
+    disparity_noise: float
+    """Standard deviation of disparity [px]."""
+    max_disparity: float
+    """Largest disparity that is measured [px]; 0: any."""
     near: float
     far: float
     """Measuring range of depth [m]."""
@@ -121,11 +125,16 @@ def axial_noise(sensor: SensorParameters, depth: float, cosine: float) -> float:
 
 
 @wp.func
-def quantize_depth(sensor: SensorParameters, focal_baseline: float, depth: float) -> float:
-    """Depth whose disparity is rounded to the nearest multiple of the step [m]; 0: outside of the measuring range."""
+def quantize_depth(sensor: SensorParameters, focal_baseline: float, depth: float, noise: float) -> float:
+    """Depth whose disparity, with `noise` standard deviations added, is rounded to the nearest multiple of the step [m].
+
+    0: outside of the measuring range.
+    """
     if depth < sensor.near or depth > sensor.far:
         return 0.0
-    steps = wp.rint(focal_baseline / (depth * sensor.disparity_step))
+    if sensor.max_disparity > 0.0 and focal_baseline > sensor.max_disparity * depth:
+        return 0.0
+    steps = wp.rint(focal_baseline / (depth * sensor.disparity_step) + sensor.disparity_noise * noise / sensor.disparity_step)
     if steps < 1.0:
         return 0.0
     return focal_baseline / (steps * sensor.disparity_step)
@@ -149,12 +158,12 @@ def render_depth_sensor_kernel(
     # Out:
     depth_sensor_out: wp.array3d[wp.uint16],  # (view, row, column) [counts]
 ):
-    """Simulate a structured-light depth image: disparity d = f b / (z + σ n), rounded to steps; n is standard normal.
+    """Simulate a structured-light depth image: disparity d = f b / (z + σ n) + σ' n', rounded to steps; n and n' are standard normal.
 
-    z is the depth of a pixel displaced by lateral noise, σ its axial noise. `depth_sensor_out` receives f b / d in counts, 0 for invalid
-    pixels (holes): no surface, grazing incidence, depth discontinuities, projector shadow, outside of the measuring range. n is of the
-    random number stream (seed, episode, frame, camera, DEPTH_NOISE) and the pixel, so each image has noise of its own. Launched over view,
-    pixel (tile order, from flat index `first` on).
+    z is the depth of a pixel displaced by lateral noise, σ its axial noise, σ' the noise of disparity. `depth_sensor_out` receives f b / d
+    in counts, 0 for invalid pixels (holes): no surface, grazing incidence, depth discontinuities, projector shadow, outside of the
+    measuring range. n and n' are of the random number stream (seed, episode, frame, camera, DEPTH_NOISE) and the pixel, so each image has
+    noise of its own. Launched over view, pixel (tile order, from flat index `first` on).
     """
     view, row, column = tile_pixel(grid, wp.tid() + first)
     if not in_image(grid, row, column):
@@ -181,7 +190,8 @@ def render_depth_sensor_kernel(
     if sensor.shadows != 0:
         if in_projector_shadow(gbuffer, bodies, grid, focal_baseline, view, at_row, at_column):
             return
-    noisy = depth + axial_noise(sensor, depth, cosine) * normal_pair(key, 2)[0]
-    counts = wp.rint(sensor.counts_per_meter * quantize_depth(sensor, focal_baseline, noisy))
+    noise = normal_pair(key, 2)
+    noisy = depth + axial_noise(sensor, depth, cosine) * noise[0]
+    counts = wp.rint(sensor.counts_per_meter * quantize_depth(sensor, focal_baseline, noisy, noise[1]))
     if counts <= MAX_COUNTS:
         depth_sensor_out[view, row, column] = wp.uint16(counts)

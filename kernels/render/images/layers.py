@@ -23,11 +23,16 @@ from synpick_warp.kernels.render.visibility.camera import (
     camera_ray,
     hit_position,
     in_image,
+    lens_of,
     tile_pixel,
 )
 from synpick_warp.kernels.render.visibility.gbuffer import GBuffer, Meshes, ViewBodies, body_of
+from synpick_warp.kernels.render.visibility.lens import distort
 
 wp.set_module_options({"enable_backward": False})
+
+SMALL_SHIFT = wp.constant(1.0e-8)
+"""Squared distance in the normalised plane below which a lens moves points by its Jacobian: the difference of two places is rounded."""
 
 
 @wp.struct
@@ -304,7 +309,8 @@ def render_flow_kernel(
     # Out:
     flow_out: wp.array3d[wp.vec2],  # (view, row, column) [px]
 ):
-    """Backward optical flow [px]: f_x ((x + d_x) / (z + d_z) - x / z) = f_x (d_x - (x / z) d_z) / (z + d_z), rows alike.
+    """Backward optical flow [px]: f_x ((x + d_x) / (z + d_z) - x / z) = f_x (d_x - (x / z) d_z) / (z + d_z), rows alike;
+    through a lens, the difference of both places.
 
     NaN where the displacement d is unknown, and where the point was behind the camera. Launched over view, pixel (tile order, from flat
     index `first` on).
@@ -319,4 +325,13 @@ def render_flow_kernel(
     flow = wp.vec2(wp.NAN, wp.NAN)
     if depth > NEAR_PLANE:
         flow = wp.vec2(intrinsics[0] * (d[0] - ray[0] * d[2]) / depth, intrinsics[1] * (d[1] - ray[1] * d[2]) / depth)
+        lens = lens_of(views.cameras, view)
+        if lens >= 0:
+            shift = wp.vec2(flow[0] / intrinsics[0], flow[1] / intrinsics[1])
+            now, jacobian = distort(views.cameras.lenses, lens, wp.vec2(ray[0], ray[1]))
+            change = jacobian * shift
+            if wp.length_sq(shift) > SMALL_SHIFT:
+                before, _ = distort(views.cameras.lenses, lens, wp.vec2(ray[0], ray[1]) + shift)
+                change = before - now
+            flow = wp.vec2(intrinsics[0] * change[0], intrinsics[1] * change[1])
     flow_out[view, row, column] = flow

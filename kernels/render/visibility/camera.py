@@ -1,6 +1,8 @@
-"""Pinhole cameras (OpenCV convention): pixel tiles, camera rays, projected boxes. The only place that defines where pixel centres are."""
+"""Cameras (OpenCV convention): pixel tiles, camera rays, projected boxes. The only place that defines where pixel centres are."""
 
 import warp as wp
+
+from synpick_warp.kernels.render.visibility.lens import BEND, Lenses, distort, table_ray, undistort
 
 wp.set_module_options({"enable_backward": False})
 
@@ -30,6 +32,10 @@ class Cameras:
     """(camera): optical centre in the world [m]."""
     to_world: wp.array[wp.mat33]
     """(camera): camera to world, in float32 for the per-pixel kernels."""
+    lens: wp.array[int]
+    """(camera): row of `lenses`; -1: a pinhole. Null: all are."""
+    lenses: Lenses
+    """Lenses of the cameras that are distorted."""
 
 
 @wp.struct
@@ -44,6 +50,10 @@ class ViewCameras:
     """(view): optical centre in the world [m]."""
     to_world: wp.array[wp.mat33]
     """(view): camera to world, in float32 for the per-pixel kernels."""
+    lens: wp.array[int]
+    """(view): row of `lenses`; -1: a pinhole. Not read where no camera is distorted."""
+    lenses: Lenses
+    """Lenses of the cameras that are distorted."""
 
 
 @wp.struct
@@ -123,12 +133,35 @@ def pinhole_ray(intrinsics: wp.vec4, row: int, column: int, offset: wp.vec2) -> 
 
 
 @wp.func
+def lens_of(cameras: ViewCameras, view: int) -> int:
+    """Row of a view's lens in `ViewCameras.lenses`; -1: a pinhole."""
+    if cameras.lenses.ray.shape[0] == 0:
+        return -1
+    return cameras.lens[view]
+
+
+@wp.func
 def camera_ray(cameras: ViewCameras, view: int, row: int, column: int, offset: wp.vec2) -> wp.vec3:
     """Camera ray (x, y, 1) of a pixel of a view in the camera's axes: its parameter is planar depth.
 
-    `offset` [px] from the pixel's centre; zero for depth, ids and masks.
+    `offset` [px] from the pixel's centre; zero for depth, ids and masks. The ray of a lens is that of the nearest pixel in the image.
     """
+    lens = lens_of(cameras, view)
+    if lens >= 0:
+        return table_ray(cameras.lenses, lens, row, column, offset)
     return pinhole_ray(cameras.intrinsics[view], row, column, offset)
+
+
+@wp.func
+def border_ray(cameras: ViewCameras, view: int, row: int, column: int) -> wp.vec3:
+    """As `camera_ray`, of a pixel's centre that may lie outside the image, where a lens is continued."""
+    ray = pinhole_ray(cameras.intrinsics[view], row, column, wp.vec2(0.0, 0.0))
+    lens = lens_of(cameras, view)
+    if lens >= 0:
+        near = table_ray(cameras.lenses, lens, row, column, wp.vec2(0.0, 0.0))
+        found = undistort(cameras.lenses, lens, wp.vec2(ray[0], ray[1]), wp.vec2(near[0], near[1]))
+        ray = wp.vec3(found[0], found[1], 1.0)
+    return ray
 
 
 @wp.func
@@ -138,19 +171,38 @@ def hit_position(cameras: ViewCameras, view: int, ray: wp.vec3, depth: float) ->
 
 
 @wp.func
+def clip_to_canvas(canvas: wp.vec4i, box: wp.vec4, margin: float) -> wp.vec4i:
+    """Pixels of a box (x_min, y_min, x_max, y_max), enlarged by a margin [px], within those of a canvas, inclusive; x_max < x_min: none."""
+    # Clamp before converting: the projection of a corner close to the near plane may overflow an int.
+    x_min = wp.clamp(box[0] - margin, float(canvas[0]), float(canvas[2] + 1))
+    y_min = wp.clamp(box[1] - margin, float(canvas[1]), float(canvas[3] + 1))
+    x_max = wp.clamp(box[2] + margin, float(canvas[0] - 1), float(canvas[2]))
+    y_max = wp.clamp(box[3] + margin, float(canvas[1] - 1), float(canvas[3]))
+    if x_max < x_min or y_max < y_min:
+        return wp.vec4i(0, 0, -1, -1)
+    return wp.vec4i(int(wp.floor(x_min)), int(wp.floor(y_min)), int(wp.floor(x_max)), int(wp.floor(y_max)))
+
+
+@wp.func
 def projected_box(
     lower: wp.vec3,
     upper: wp.vec3,
     rotation: wp.mat33d,
     position: wp.vec3d,
-    intrinsics: wp.vec4,
+    cameras: ViewCameras,
+    view: int,
     grid: ImageGrid,
 ) -> wp.vec4i:
     """Conservative screen box (x_min, y_min, x_max, y_max) [px] of a bounding box, inclusive; x_max < x_min: empty.
 
     The box has corners `lower` and `upper` [m] in a frame that `rotation` and `position` transform into the camera's. The result is
-    clipped to one image size beyond each border; it is that whole canvas if a corner lies behind the near plane, and empty if all do.
+    clipped to one image size beyond each border; it is that whole canvas if a corner lies behind the near plane, and empty if all do. A
+    lens bends the box: its image lies within bend D² / 6 of that of its corners, where D is their diameter in the normalised plane.
     """
+    intrinsics = cameras.intrinsics[view]
+    lens = lens_of(cameras, view)
+    least = wp.vec2(1.0e9, 1.0e9)
+    most = wp.vec2(-1.0e9, -1.0e9)
     canvas = wp.vec4i(-grid.width, -grid.height, 2 * grid.width - 1, 2 * grid.height - 1)
     x_min = float(1.0e9)
     y_min = float(1.0e9)
@@ -158,15 +210,9 @@ def projected_box(
     y_max = float(-1.0e9)
     behind = int(0)
     for corner in range(8):
-        x = lower[0]
-        y = lower[1]
-        z = lower[2]
-        if corner & 1 != 0:
-            x = upper[0]
-        if corner & 2 != 0:
-            y = upper[1]
-        if corner & 4 != 0:
-            z = upper[2]
+        x = wp.where(corner & 1 != 0, upper[0], lower[0])
+        y = wp.where(corner & 2 != 0, upper[1], lower[1])
+        z = wp.where(corner & 4 != 0, upper[2], lower[2])
         point = rotation * wp.vec3d(wp.float64(x), wp.float64(y), wp.float64(z)) + position
         depth = float(point[2])
         if depth < NEAR_PLANE:
@@ -174,6 +220,13 @@ def projected_box(
         else:
             column = intrinsics[0] * float(point[0]) / depth + intrinsics[2]
             row = intrinsics[1] * float(point[1]) / depth + intrinsics[3]
+            if lens >= 0:
+                slope = wp.vec2(float(point[0]) / depth, float(point[1]) / depth)
+                least = wp.min(least, slope)
+                most = wp.max(most, slope)
+                image, _ = distort(cameras.lenses, lens, slope)
+                column = intrinsics[0] * image[0] + intrinsics[2]
+                row = intrinsics[1] * image[1] + intrinsics[3]
             x_min = wp.min(x_min, column)
             x_max = wp.max(x_max, column)
             y_min = wp.min(y_min, row)
@@ -182,11 +235,7 @@ def projected_box(
         return wp.vec4i(0, 0, -1, -1)
     if behind > 0:
         return canvas
-    # Clamp before converting: the projection of a corner close to the near plane may overflow an int.
-    x_min = wp.clamp(x_min - BOX_MARGIN, float(canvas[0]), float(canvas[2] + 1))
-    y_min = wp.clamp(y_min - BOX_MARGIN, float(canvas[1]), float(canvas[3] + 1))
-    x_max = wp.clamp(x_max + BOX_MARGIN, float(canvas[0] - 1), float(canvas[2]))
-    y_max = wp.clamp(y_max + BOX_MARGIN, float(canvas[1] - 1), float(canvas[3]))
-    if x_max < x_min or y_max < y_min:
-        return wp.vec4i(0, 0, -1, -1)
-    return wp.vec4i(int(wp.floor(x_min)), int(wp.floor(y_min)), int(wp.floor(x_max)), int(wp.floor(y_max)))
+    margin = float(BOX_MARGIN)
+    if lens >= 0:
+        margin += cameras.lenses.number[lens, BEND] * wp.length_sq(most - least) / 6.0
+    return clip_to_canvas(canvas, wp.vec4(x_min, y_min, x_max, y_max), margin)

@@ -198,12 +198,11 @@ def rasterize_triangles_kernel(
     box = bodies.box[view, body]
     if box[2] < 0 or box[3] < 0 or box[0] >= grid.width or box[1] >= grid.height:
         return
-    intrinsics = views.cameras.intrinsics[view]
     mesh = bodies.mesh[view, body]
     bit = amodal_bit(body, views.instances)
     for k in range(index % threads, meshes.first_triangle[mesh + 1] - meshes.first_triangle[mesh], threads):
         triangle = camera_triangle(meshes, bodies, view, body, k)
-        footprint = find_footprint(grid, intrinsics, triangle)
+        footprint = find_footprint(grid, views.cameras, view, triangle)
         pixels = footprint.pixels
         columns = pixels[2] - pixels[0] + 1
         rows = pixels[3] - pixels[1] + 1
@@ -240,14 +239,13 @@ def rasterize_blocks_kernel(
     camera = views.camera[view]
     if camera < 0:
         return
-    intrinsics = views.cameras.intrinsics[view]
     blocks = wp.min(visibility_inout.blocks[view], visibility_inout.block.shape[1])
     for i in range(index % threads, BLOCK_ROWS * blocks, threads):
         block = visibility_inout.block[view, i // BLOCK_ROWS]
         row = block[2] + i % BLOCK_ROWS
         body = bodies.order[view, block[0]]
         triangle = camera_triangle(meshes, bodies, view, body, block[1])
-        footprint = find_footprint(grid, intrinsics, triangle)
+        footprint = find_footprint(grid, views.cameras, view, triangle)
         if row <= footprint.pixels[3]:
             pixels = wp.vec4i(block[3], row, wp.min(block[3] + BLOCK_COLUMNS - 1, footprint.pixels[2]), row)
             low_half = pack_low_half(body, block[1])

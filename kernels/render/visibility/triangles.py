@@ -6,8 +6,9 @@ rays are those of `camera.camera_ray`, so that both agree.
 
 import warp as wp
 
-from synpick_warp.kernels.render.visibility.camera import NEAR_PLANE, PIXEL_CENTER, ImageGrid
+from synpick_warp.kernels.render.visibility.camera import NEAR_PLANE, PIXEL_CENTER, ImageGrid, ViewCameras, lens_of
 from synpick_warp.kernels.render.visibility.gbuffer import Meshes, ViewBodies
+from synpick_warp.kernels.render.visibility.lens import BEND, distort
 
 wp.set_module_options({"enable_backward": False})
 
@@ -110,19 +111,34 @@ def edge_line(start: wp.vec2, end: wp.vec2, sense: float, margin: float) -> wp.v
 
 
 @wp.func
-def find_footprint(grid: ImageGrid, intrinsics: wp.vec4, triangle: Triangle) -> Footprint:
-    """Project a triangle and compute its conservative footprint, clipped to the image."""
+def find_footprint(grid: ImageGrid, cameras: ViewCameras, view: int, triangle: Triangle) -> Footprint:
+    """Project a triangle and compute its conservative footprint, clipped to the image.
+
+    A lens bends the edges: the image lies within bend D² / 6 of that of the corners, D the longest edge in the normalised plane.
+    """
     found = Footprint()
     found.pixels = wp.vec4i(0, 0, grid.width - 1, grid.height - 1)
     depth = wp.vec3(triangle.near + triangle.a[2], triangle.near + triangle.b[2], triangle.near + triangle.c[2])
     if wp.min(depth) < NEAR_PLANE:
         # A corner so close has no useful projection.
         return found
+    intrinsics = cameras.intrinsics[view]
     focal = wp.vec2(intrinsics[0], intrinsics[1])
     middle = wp.vec2(intrinsics[2] - PIXEL_CENTER, intrinsics[3] - PIXEL_CENTER)
-    a = wp.cw_mul(focal, wp.vec2(triangle.a[0], triangle.a[1]) / depth[0]) + middle
-    b = wp.cw_mul(focal, wp.vec2(triangle.b[0], triangle.b[1]) / depth[1]) + middle
-    c = wp.cw_mul(focal, wp.vec2(triangle.c[0], triangle.c[1]) / depth[2]) + middle
+    a = wp.vec2(triangle.a[0], triangle.a[1]) / depth[0]
+    b = wp.vec2(triangle.b[0], triangle.b[1]) / depth[1]
+    c = wp.vec2(triangle.c[0], triangle.c[1]) / depth[2]
+    wide = float(MARGIN)
+    lens = lens_of(cameras, view)
+    if lens >= 0:
+        longest = wp.max(wp.length_sq(a - b), wp.max(wp.length_sq(b - c), wp.length_sq(c - a)))
+        wide += cameras.lenses.number[lens, BEND] * longest / 6.0
+        a, _ = distort(cameras.lenses, lens, a)
+        b, _ = distort(cameras.lenses, lens, b)
+        c, _ = distort(cameras.lenses, lens, c)
+    a = wp.cw_mul(focal, a) + middle
+    b = wp.cw_mul(focal, b) + middle
+    c = wp.cw_mul(focal, c) + middle
     least = wp.min(wp.min(a, b), c)
     most = wp.max(wp.max(a, b), c)
     if wp.max(wp.max(-least), wp.max(most)) > MAX_PROJECTION:
@@ -130,10 +146,10 @@ def find_footprint(grid: ImageGrid, intrinsics: wp.vec4, triangle: Triangle) -> 
     width = float(grid.width)
     height = float(grid.height)
     found.pixels = wp.vec4i(
-        int(wp.ceil(wp.clamp(least[0] - MARGIN, 0.0, width))),
-        int(wp.ceil(wp.clamp(least[1] - MARGIN, 0.0, height))),
-        int(wp.floor(wp.clamp(most[0] + MARGIN, -1.0, width - 1.0))),
-        int(wp.floor(wp.clamp(most[1] + MARGIN, -1.0, height - 1.0))),
+        int(wp.ceil(wp.clamp(least[0] - wide, 0.0, width))),
+        int(wp.ceil(wp.clamp(least[1] - wide, 0.0, height))),
+        int(wp.floor(wp.clamp(most[0] + wide, -1.0, width - 1.0))),
+        int(wp.floor(wp.clamp(most[1] + wide, -1.0, height - 1.0))),
     )
     if found.pixels[2] < found.pixels[0] or found.pixels[3] < found.pixels[1]:
         return found
@@ -143,7 +159,7 @@ def find_footprint(grid: ImageGrid, intrinsics: wp.vec4, triangle: Triangle) -> 
     b -= least
     c -= least
     extent = most - least
-    margin = MARGIN * (extent[0] + extent[1] + 1.0)
+    margin = wide * (extent[0] + extent[1] + 1.0)
     sense = wp.where((b[0] - a[0]) * (c[1] - a[1]) < (b[1] - a[1]) * (c[0] - a[0]), -1.0, 1.0)
     found.origin = least
     found.ab = edge_line(a, b, sense, margin)

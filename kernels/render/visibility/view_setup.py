@@ -11,9 +11,11 @@ from synpick_warp.kernels.render.visibility.camera import (
     ImageGrid,
     Views,
     camera_ray,
+    lens_of,
     projected_box,
 )
 from synpick_warp.kernels.render.visibility.gbuffer import FAR, FIXTURES, Meshes, ViewBodies, fixture_mesh
+from synpick_warp.kernels.render.visibility.lens import STRETCH
 from synpick_warp.kernels.render.visibility.ray_bodies import write_ray_body
 
 wp.set_module_options({"enable_backward": False})
@@ -49,6 +51,8 @@ def aim_cameras_kernel(
         views_inout.cameras.rotation[view] = cameras.rotation[camera]
         views_inout.cameras.center[view] = cameras.center[camera]
         views_inout.cameras.to_world[view] = cameras.to_world[camera]
+        if cameras.lenses.ray.shape[0] > 0:
+            views_inout.cameras.lens[view] = cameras.lens[camera]
 
 
 @wp.kernel
@@ -107,8 +111,7 @@ def set_up_views_kernel(
     bodies_out.rotation[view, body] = wp.mat33(wp.transpose(to_camera))
     bodies_out.start[view, body] = wp.vec3(start)
     bodies_out.near[view, body] = near
-    intrinsics = views.cameras.intrinsics[view]
-    bodies_out.box[view, body] = projected_box(meshes.lower[mesh], meshes.upper[mesh], to_camera, origin, intrinsics, grid)
+    bodies_out.box[view, body] = projected_box(meshes.lower[mesh], meshes.upper[mesh], to_camera, origin, views.cameras, view, grid)
     bodies_out.world_rotation[view, body] = wp.mat33(wp.transpose(rotation))
     bodies_out.position[view, body] = p
     bodies_out.sphere[view, body] = wp.vec4(float(sphere[0]), float(sphere[1]), float(sphere[2]), radius * radius)
@@ -196,6 +199,11 @@ def bin_bodies_kernel(
         middle = wp.vec2(0.5 * float(TILE_WIDTH) - PIXEL_CENTER, 0.5 * float(TILE_HEIGHT) - PIXEL_CENTER)
         ray = camera_ray(views.cameras, view, row, column, middle)
         spread = TILE_RADIUS / wp.min(intrinsics[0], intrinsics[1])
+        lens = lens_of(views.cameras, view)
+        if lens >= 0:
+            # The ray of the pixel that is nearest to the middle: of all others in the image, none is farther than the tile's diagonal.
+            ray = camera_ray(views.cameras, view, row + TILE_HEIGHT // 2, column + TILE_WIDTH // 2, wp.vec2(0.0, 0.0))
+            spread = 2.0 * TILE_RADIUS * views.cameras.lenses.number[lens, STRETCH]
         for rank in range(bodies_inout.present[view]):
             body = bodies_inout.order[view, rank]
             box = bodies_inout.box[view, body]

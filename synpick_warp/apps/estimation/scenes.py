@@ -136,6 +136,10 @@ def _read_cameras(truth: SceneArrays, place: object) -> tuple[np.ndarray, np.nda
     for image, camera in zip(truth.images, truth.cameras, strict=True):
         if missing := [key for key in ("cam_K", "depth_scale") if getattr(camera, key) is UNSET]:
             raise DatasetError(f"{place}: the camera of image {image} has no {missing[0]}, which poses are estimated with")
+        if camera.cam_dist not in (UNSET, None):
+            raise DatasetError(
+                f"{place}: image {image} is distorted by its lens, and poses are estimated with pinhole cameras; undistort it"
+            )
     matrices = np.reshape([camera.cam_K for camera in truth.cameras], (-1, 9))
     if not (matrices[:, [0, 4]] > 0.0).all():
         raise DatasetError(f"{place}: a focal length in cam_K is not above 0; {ADVICE}")

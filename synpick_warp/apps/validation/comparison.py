@@ -12,6 +12,8 @@ from scipy.signal import fftconvolve
 
 from synpick_warp.apps.validation.pictures import Mask, crop_mask
 from synpick_warp.apps.validation.subjects import ViewSubject
+from synpick_warp.configs.calibration.lens import LensMap, read_lens
+from synpick_warp.errors import ConfigError
 
 if TYPE_CHECKING:
     from synpick_warp.apps.validation.rendering import ObjectRenderer, Patch
@@ -111,6 +113,18 @@ class RenderedView:
         return np.reshape(np.array(camera.cam_K, np.float64), (3, 3))
 
     @cached_property
+    def lens(self) -> LensMap | None:
+        """Distortion of the camera; None: a pinhole, or values that no lens has."""
+        camera, size = self.view.camera, self.view.size
+        if self.matrix is None or camera is None or size is None or camera.cam_dist is UNSET:
+            return None
+        try:
+            values = {"cam_K": camera.cam_K, "cam_dist": camera.cam_dist}
+            return read_lens(values if camera.cam_dist_model is UNSET else values | {"cam_dist_model": camera.cam_dist_model}, size)
+        except ConfigError:
+            return None
+
+    @cached_property
     def depth(self) -> np.ndarray | None:
         """Depth image (H, W) float32 [mm]; None: the view has none."""
         view = self.view
@@ -129,7 +143,7 @@ class RenderedView:
         for item in view.truths:
             rotation, translation = np.reshape(np.array(item.cam_R_m2c, np.float64), (3, 3)), np.array(item.cam_t_m2c, np.float64)
             usable = self.renderer.has(item.obj_id) and abs(np.linalg.det(rotation) - 1.0) < 0.01
-            patches.append(self.renderer.render(item.obj_id, rotation, translation, matrix, view.size) if usable else None)
+            patches.append(self.renderer.render(item.obj_id, rotation, translation, matrix, view.size, self.lens) if usable else None)
         nearest = np.full((view.size[1], view.size[0]), np.inf, np.float32)
         for patch in patches:
             if patch is not None:
@@ -146,7 +160,7 @@ class RenderedView:
         if self.matrix is None or self.view.size is None or not self.renderer.has(obj_id):
             return result
         rotation = np.reshape(np.array(truth.cam_R_m2c, np.float64), (3, 3))
-        patch = self.renderer.render(obj_id, rotation, item.translation, self.matrix, self.view.size)
+        patch = self.renderer.render(obj_id, rotation, item.translation, self.matrix, self.view.size, self.lens)
         shown = crop_mask(np.isfinite(patch.depth), "") if patch.depth.size else None
         if shown is None:
             return result

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from synpick_warp.configs.calibration.lens import LensMap
 from synpick_warp.dataset.bop.layout import Layout
 from synpick_warp.errors import CatalogError, DatasetError, SynpickError
 from synpick_warp.scenes.assets.meshes import read_mesh
@@ -45,7 +46,15 @@ class ObjectRenderer:
         self._models: dict[int, tuple[TriangleMesh, Any, tuple[wp.Mesh, ...]]] = {}
         self._damaged: set[int] = set()
 
-    def render(self, obj_id: int, rotation: np.ndarray, translation: np.ndarray, matrix: np.ndarray, size: tuple[int, int]) -> Patch:
+    def render(
+        self,
+        obj_id: int,
+        rotation: np.ndarray,
+        translation: np.ndarray,
+        matrix: np.ndarray,
+        size: tuple[int, int],
+        lens: LensMap | None = None,
+    ) -> Patch:
         """Render an object.
 
         Args:
@@ -54,6 +63,7 @@ class ObjectRenderer:
             translation: Object to camera (3) [mm].
             matrix: Intrinsics (3, 3) [px]; the centre of pixel (row, column) is (column + 0.5, row + 0.5).
             size: Width and height of the image [px].
+            lens: Distortion; None: a pinhole.
 
         Raises:
             CatalogError: The model cannot be read, or has too many triangles.
@@ -61,11 +71,12 @@ class ObjectRenderer:
         """
         mesh, meshes, keep = self._load(obj_id)
         points = mesh.vertices.astype(np.float64) @ rotation.T + translation * _MILLIMETRE
-        left, top, right, bottom = _crop(points, matrix, size)
+        left, top, right, bottom = _crop(points, matrix, size, lens)
         if left >= right or top >= bottom:
             return Patch(0, 0, np.full((0, 0), np.inf, np.float32))
         shifted = matrix - np.array([[0.0, 0.0, left], [0.0, 0.0, top], [0.0, 0.0, 0.0]])
-        camera = Camera(right - left, bottom - top, shifted, rotation, translation * _MILLIMETRE)
+        bent = None if lens is None else lens.cropped(left, top, (right - left, bottom - top))
+        camera = Camera(right - left, bottom - top, shifted, rotation, translation * _MILLIMETRE, lens=bent)
         depth = render_object(object_scene(meshes, keep, (camera,), self.device), 0).depth.numpy()[0]
         depth = depth[: bottom - top, : right - left].astype(np.float32)
         return Patch(left, top, np.where(depth < _FAR, depth / np.float32(_MILLIMETRE), np.float32(np.inf)))
@@ -98,7 +109,7 @@ class ObjectRenderer:
         return found
 
 
-def _crop(points: np.ndarray, matrix: np.ndarray, size: tuple[int, int]) -> tuple[int, int, int, int]:
+def _crop(points: np.ndarray, matrix: np.ndarray, size: tuple[int, int], lens: LensMap | None) -> tuple[int, int, int, int]:
     """Part of the image that shows points (V, 3) [m], with a pixel around it: left, top, right, bottom; the last two exclusive."""
     width, height = size
     if points[:, 2].max() <= _NEAR:
@@ -107,6 +118,11 @@ def _crop(points: np.ndarray, matrix: np.ndarray, size: tuple[int, int]) -> tupl
         return 0, 0, width, height
     x = matrix[0, 0] * points[:, 0] / points[:, 2] + matrix[0, 2]
     y = matrix[1, 1] * points[:, 1] / points[:, 2] + matrix[1, 2]
-    low = np.clip(np.floor([x.min(), y.min()]) - 1.0, 0, size)
-    high = np.clip(np.ceil([x.max(), y.max()]) + 1.0, 0, size)
+    margin = 1.0
+    if lens is not None:
+        slopes = points[:, :2] / points[:, 2:]
+        x, y = lens.project(slopes).T
+        margin += lens.bend * (np.ptp(slopes, axis=0) ** 2).sum() / 6
+    low = np.clip(np.floor([x.min(), y.min()]) - margin, 0, size)
+    high = np.clip(np.ceil([x.max(), y.max()]) + margin, 0, size)
     return int(low[0]), int(low[1]), int(high[0]), int(high[1])

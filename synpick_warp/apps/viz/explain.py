@@ -105,6 +105,14 @@ def to_color_image(pixel: Pixel, resolution: tuple[int, int], size: tuple[int, i
     return column, row
 
 
+def _through_lens(view: View, places: list[tuple[float, float]]) -> list[tuple[float, float]]:
+    """Places (column, row) in the image of a pinhole, as the view's lens shows them."""
+    assert view.lens is not None
+    matrix = view.intrinsics
+    slopes = (np.array(places) + 0.5 - matrix[:2, 2]) / matrix[[0, 1], [0, 1]]
+    return [(x, y) for x, y in (view.lens.project(slopes) - 0.5).tolist()]
+
+
 def image_scale(size: tuple[int, int]) -> float:
     """Scale of a colour image of that width and height [px] on the sheet."""
     return min(IMAGE_WIDTH / size[0], _MAX_IMAGE_HEIGHT / size[1])
@@ -168,6 +176,8 @@ def draw_observation(attempt: Attempt, view: View) -> Image:
     short = labels(attempt)
     for one in attempt.seen:
         places = [to_color_image(point, attempt.observation.resolution, (width, height)) for point in (*one.candidates, one.grasp_pixel)]
+        if view.lens is not None:
+            places = _through_lens(view, places)
         points = [(scale * (x + 0.5) - 0.5, scale * (y + 0.5) - 0.5) for x, y in places]
         target = one.instance == attempt.target
         for kind, point in enumerate(points[:-1]):

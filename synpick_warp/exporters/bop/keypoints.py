@@ -14,6 +14,8 @@ from typing import Any
 
 import numpy as np
 
+from synpick_warp.configs.calibration.lens import LensMap, read_lens
+
 MILLIMETERS = 1000.0
 """Millimetres per metre."""
 UNLABELED, OCCLUDED, VISIBLE = 0, 1, 2
@@ -82,17 +84,21 @@ def project_keypoints(
         depth: Depth image (H, W) uint16, in units of `depth_scale`; 0: no surface, which hides nothing.
         keypoints: Keypoints by obj_id.
     """
-    matrix = np.reshape(camera["cam_K"], (3, 3))
-    return [_project(entry, matrix, depth, camera["depth_scale"], keypoints[entry["obj_id"]].positions) for entry in entries]
+    matrix, lens = np.reshape(camera["cam_K"], (3, 3)), read_lens(camera, depth.shape[::-1])
+    return [_project(entry, matrix, lens, depth, camera["depth_scale"], keypoints[entry["obj_id"]].positions) for entry in entries]
 
 
-def _project(entry: dict[str, Any], matrix: np.ndarray, depth: np.ndarray, scale: float, positions: np.ndarray) -> dict[str, Any]:
+def _project(
+    entry: dict[str, Any], matrix: np.ndarray, lens: LensMap | None, depth: np.ndarray, scale: float, positions: np.ndarray
+) -> dict[str, Any]:
     """Project an instance's keypoints into the image: COCO's (x, y, visibility) for each; 0, 0, 0 outside of the image."""
     points = positions @ np.reshape(entry["cam_R_m2c"], (3, 3)).T + entry["cam_t_m2c"]
     z = points[:, 2]
     with np.errstate(divide="ignore", invalid="ignore"):
         pixels = points @ matrix.T
         pixels = pixels[:, :2] / pixels[:, 2:]
+        if lens is not None:
+            pixels = lens.project(points[:, :2] / np.where(z > 0.0, z, np.inf)[:, None])
     height, width = depth.shape
     inside = (z > 0.0) & (pixels >= 0.0).all(axis=1) & (pixels < (width, height)).all(axis=1)
     columns, rows = np.where(inside[:, None], pixels, 0.0).astype(np.int64).T

@@ -191,6 +191,7 @@ def make_camera_constants(camera: Camera, depth_scale: float) -> dict[str, Any]:
         "cam_R_w2c": camera.rotation.ravel().tolist(),
         "cam_t_w2c": (MILLIMETERS * camera.translation).tolist(),
         "depth_scale": depth_scale,
+        **camera.distortion,
     }
 
 

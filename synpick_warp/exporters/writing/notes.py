@@ -39,10 +39,19 @@ def describe_sizes(layout: DataLayout, cameras: tuple[Camera, ...]) -> str:
     return ", ".join(f"{camera.width} x {camera.height} ({camera.name})" for camera in cameras) + " pixels"
 
 
+def describe_lenses(cameras: tuple[Camera, ...]) -> str:
+    """Clause on lens distortion."""
+    bent = [camera.name for camera in cameras if camera.lens is not None]
+    if not bent:
+        return "no lens distortion"
+    return f"are distorted by the lens (`cam_dist`, OpenCV's coefficients of `cam_dist_model`) in {', '.join(bent)}"
+
+
 def write_camera(path: Path, camera: Camera, depth_scale: float) -> None:
     """Write camera.json: size, intrinsics [px] and millimetres per count of depth."""
     (fx, _, cx), (_, fy, cy), _ = camera.matrix.tolist()
     content = {"width": camera.width, "height": camera.height, "fx": fx, "fy": fy, "cx": cx, "cy": cy, "depth_scale": depth_scale}
+    content |= camera.distortion
     path.write_text(json.dumps(content, indent=2) + "\n", encoding="ascii")
 
 
@@ -75,7 +84,7 @@ def _describe(settings: ExportSettings, names: Mapping[int, str], cameras: tuple
 Made by synpick-warp (mode {", ".join(settings.modes)}, seed {bake.seed}, {len(cameras)} cameras, formats
 {", ".join(sorted(bake.formats))}). Frames are {settings.physics.tick_time:g} s apart.
 
-- Pictures have {describe_sizes(settings.layout, cameras)} and no lens distortion; {_INTRINSICS[settings.layout.is_listed]}.
+- Pictures have {describe_sizes(settings.layout, cameras)} and {describe_lenses(cameras)}; {_INTRINSICS[settings.layout.is_listed]}.
   The centre of pixel (row, column) is (column + 0.5, row + 0.5): for OpenCV and Open3D, whose pixel centres have whole
   coordinates, subtract 0.5 from cx and cy. Cameras have x right, y down, z forward.
 - The world is the {settings.bins[0].noun}'s frame: centre of its inner floor, z up, metres.

@@ -59,7 +59,7 @@ def render_object(scene: RenderScene, model: int, pose: Sequence[float] | np.nda
     world.catalog_index.fill_(model)
     world.pose.fill_(wp.transform(*np.asarray(pose, np.float64).tolist()))
     sizes = {"view": count, "row": scene.height, "column": scene.width} | body_sizes(1, scene.width, scene.height)
-    views = first_views(count, count, 1, device)
+    views = first_views(count, count, 1, device, scene.cameras)
     bodies, gbuffer = allocate_struct(VIEW_BODIES, sizes, device), allocate_struct(GBUFFER, sizes, device)
     set_up_views(scene, world, world.fixture_visible, views, bodies)
     Rasterizer(scene, 1.0, count, background=gbuffer).rasterize(bodies, views, gbuffer)

@@ -36,7 +36,8 @@ BODY_MOTIONS = struct_arrays(BodyMotions, "view", "body", units={"origin": "m", 
 def sensor_parameters(settings: DepthSensor, seed: int, depth_scale: float) -> Any:
     """The struct `SensorParameters`, for a bake's seed and its depth scale [mm per count]."""
     result = SensorParameters()
-    for name in ("baseline", "disparity_step", "noise", "noise_growth", "noise_distance", "noise_angle", "lateral_noise"):
+    same = ("baseline", "disparity_step", "disparity_noise", "max_disparity", "noise", "noise_growth", "noise_distance", "noise_angle")
+    for name in (*same, "lateral_noise"):
         setattr(result, name, getattr(settings, name))
     result.seed = seed
     result.near, result.far = settings.distances

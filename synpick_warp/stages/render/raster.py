@@ -91,7 +91,7 @@ def render_background(scene: RenderScene, gbuffer: Any) -> None:
     world = allocate(Snapshot, {"world": 1, "instance": 0, "fixture": len(FIXTURES)}, device)
     world.fixture_pose.fill_(wp.transform_identity())
     tote = wp.array([[1, 0, 0]], dtype=wp.int32, device=device)
-    views = first_views(cameras, cameras, 0, device)
+    views = first_views(cameras, cameras, 0, device, scene.cameras)
     bodies = allocate_struct(VIEW_BODIES, sizes, device)
     set_up_views(scene, world, tote, views, bodies)
     # The background itself must be rasterized.

@@ -17,7 +17,7 @@ from synpick_warp.stages.render.postprocess import PostProcessor
 from synpick_warp.stages.render.raster import Rasterizer
 from synpick_warp.stages.render.reference import ReferenceRenderer
 from synpick_warp.stages.render.scene import RenderScene
-from synpick_warp.stages.render.view_setup import GBUFFER, VIEW_BODIES, VIEW_CAMERAS, body_sizes, set_up_views
+from synpick_warp.stages.render.view_setup import GBUFFER, VIEW_BODIES, allocate_view_cameras, body_sizes, set_up_views
 from synpick_warp.stages.timing import scope
 
 SHADED_IMAGE = struct_arrays(ShadedImage, "view", "row", "column")
@@ -69,7 +69,7 @@ class Renderer:
         self.scene = scene = self.dresser.scene if self.dresser else scene
         self.instances = instances
         self.views = views
-        self.cameras = allocate_struct(VIEW_CAMERAS, sizes, scene.device)
+        self.cameras = allocate_view_cameras(views, scene.device, scene.cameras)
         self.bodies = allocate_struct(VIEW_BODIES, sizes, scene.device)
         if self.dresser:
             self.bodies.material = self.dresser.material

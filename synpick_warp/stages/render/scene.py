@@ -10,6 +10,7 @@ import numpy as np
 import warp as wp
 
 from synpick_warp.configs import schema
+from synpick_warp.configs.calibration.lens import FISHEYE, LensMap
 from synpick_warp.kernels.render.lighting.color import MAX_HALF
 from synpick_warp.kernels.render.lighting.environment import MAX_LAMPS, Lights
 from synpick_warp.kernels.render.lighting.materials import TEXEL_BITS, TEXEL_MASK, TRIANGLE_RECORDS, Surfaces
@@ -17,6 +18,7 @@ from synpick_warp.kernels.render.lighting.paths.tracing import PathScene
 from synpick_warp.kernels.render.lighting.shadows import LAMP_POINTS
 from synpick_warp.kernels.render.visibility.camera import TILE_HEIGHT, TILE_PIXELS, TILE_WIDTH, Cameras, ImageGrid
 from synpick_warp.kernels.render.visibility.gbuffer import Meshes, Table
+from synpick_warp.kernels.render.visibility.lens import BEND, FIRST, FISHEYE_MODEL, MODEL, NUMBERS, RADIUS, STRETCH, Lenses
 from synpick_warp.scenes.assets.appearance import linear_to_srgb, srgb_to_linear
 from synpick_warp.scenes.environment import LUMINANCE
 from synpick_warp.scenes.looks import Looks, project_from_box
@@ -214,6 +216,23 @@ def build_cameras(cameras: tuple[Camera, ...], device: wp.Device) -> Any:
     result.rotation = wp.array(rotation, dtype=wp.mat33d, device=device)
     result.center = wp.array(-np.einsum("kji,kj->ki", rotation, translation), dtype=wp.vec3d, device=device)
     result.to_world = wp.array(rotation.transpose(0, 2, 1), dtype=wp.mat33, device=device)
+    if lenses := [camera.lens for camera in cameras if camera.lens is not None]:
+        rows = np.cumsum([camera.lens is not None for camera in cameras]) - 1
+        rows = [row if camera.lens is not None else -1 for row, camera in zip(rows, cameras, strict=True)]
+        result.lens = wp.array(rows, dtype=wp.int32, device=device)
+        tables = Lenses()
+        tables.ray = wp.array(np.stack([lens.rays() for lens in lenses]), dtype=wp.vec2, device=device)
+        tables.number = wp.array(np.stack([lens_numbers(lens) for lens in lenses]), dtype=wp.float32, device=device)
+        result.lenses = tables
+    return result
+
+
+def lens_numbers(lens: LensMap) -> np.ndarray:
+    """Row of `Lenses.number`."""
+    result = np.zeros(int(NUMBERS), np.float32)
+    result[int(MODEL)] = float(FISHEYE_MODEL) * (lens.lens.model == FISHEYE)
+    result[int(FIRST) : int(FIRST) + len(lens.lens.coefficients)] = lens.lens.coefficients
+    result[[int(RADIUS), int(BEND), int(STRETCH)]] = lens.radius, lens.bend, lens.stretch
     return result
 
 

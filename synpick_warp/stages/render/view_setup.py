@@ -56,11 +56,20 @@ def make_views(world: wp.array, camera: wp.array, count: int, instances: int, ca
     return views
 
 
-def first_views(count: int, cameras: int, instances: int, device: wp.Device) -> Any:
-    """The struct `Views` of the first views, world by world and camera by camera; arguments as of `make_views`, and number of cameras."""
+def allocate_view_cameras(views: int, device: wp.Device, cameras: Any = None) -> Any:
+    """Allocate the struct `ViewCameras`, with the lenses of the struct `Cameras`; None: no camera is distorted."""
+    made = allocate_struct(VIEW_CAMERAS, {"view": views}, device)
+    if cameras is not None and cameras.lens is not None:
+        made.lenses = cameras.lenses
+    return made
+
+
+def first_views(count: int, cameras: int, instances: int, device: wp.Device, lenses: Any = None) -> Any:
+    """The struct `Views` of the first views, world by world and camera by camera; arguments as of `make_views`, number of cameras, and the
+    struct `Cameras` if some are distorted."""
     view = np.arange(count, dtype=np.int32)
     world, camera = (wp.array(values, dtype=wp.int32, device=device) for values in (view // cameras, view % cameras))
-    return make_views(world, camera, count, instances, allocate_struct(VIEW_CAMERAS, {"view": count}, device))
+    return make_views(world, camera, count, instances, allocate_view_cameras(count, device, lenses))
 
 
 def body_sizes(instances: int, width: int, height: int) -> dict[str, int]:

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import warp as wp
 
+from synpick_warp.configs.calibration.sensor_presets import SENSORS, sensor_camera, sensor_settings
 from synpick_warp.configs.schema import Config
 from synpick_warp.configs.sensors import DepthSensor
 from synpick_warp.factory.assembly import make_renderer
@@ -45,17 +46,22 @@ class Measured:
     """Counts of the rendered depth."""
     exact: np.ndarray
     """Rendered depth before rounding [m]."""
+    count: float
+    """One count [m]."""
 
     @property
     def depth(self) -> np.ndarray:
         """[m], NaN: hole."""
-        return np.where(self.counts > 0, self.counts * COUNT, np.nan)
+        return np.where(self.counts > 0, self.counts * self.count, np.nan)
 
 
-def measure(toy: ToyScene, device: wp.Device, frames: int = 1, seed: int = 0, first_episode: int = 0, **sensor: Any) -> Measured:
+def measure(
+    toy: ToyScene, device: wp.Device, frames: int = 1, seed: int = 0, first_episode: int = 0, count: float = COUNT, **sensor: Any
+) -> Measured:
     """Simulate the sensor for every world and camera, in `frames` batches for frames 0, 1, ..., stacked."""
     config = replace(toy.settings(), depth_sensor=DepthSensor(**sensor))
     config = replace(config, render=replace(config.render, layers=("depth_sensor",)), bake=replace(config.bake, seed=seed))
+    config = config.with_values({"bop.depth_scale": count * 1e3})
     scene = build_scene(toy, device)
     worlds, cameras = len(toy.placed), len(toy.cameras)
     views = worlds * cameras
@@ -71,7 +77,7 @@ def measure(toy: ToyScene, device: wp.Device, frames: int = 1, seed: int = 0, fi
         worlds_now.frame.fill_(frame)
         renderer.render(worlds_now, make_views(world, camera_index, views, toy.instances), images, layers)
         frames_measured.append(layers.depth_sensor.numpy().copy())
-    return Measured(np.concatenate(frames_measured), images.depth.numpy(), renderer.gbuffer.depth.numpy())
+    return Measured(np.concatenate(frames_measured), images.depth.numpy(), renderer.gbuffer.depth.numpy(), count)
 
 
 def wall(depth: float, tilt: float = 0.0) -> ToyScene:
@@ -103,6 +109,28 @@ def test_axial_noise_grows_with_the_square_of_depth(device, depth):
     np.testing.assert_allclose(middle.mean(), depth, atol=4.0 * deviation(depth) / middle.size**0.5 + COUNT)
     pairs = measured.depth[0].ravel(), measured.depth[1].ravel()
     assert abs(np.corrcoef(*pairs)[0, 1]) < 0.05
+
+
+@pytest.mark.parametrize("depth", [0.6, 1.0, 2.0])
+@pytest.mark.parametrize("name", SENSORS)
+def test_noise_of_presets_is_that_of_disparity(device, name, depth):
+    """σz = z² σd / (f b), by the preset's own focal length; quantization alone is below 5 % of it."""
+    settings, lens = sensor_settings(name), sensor_camera(name)
+    focal = FOCAL if lens is None else lens.fx
+    toy = replace(wall(depth), cameras=(camera(WIDTH, HEIGHT, focal, (0.0, 0.0, TOP)),))
+    settings |= {"distances": (0.1, 10.0), "max_disparity": 0.0, "disparity_step": min(settings["disparity_step"], 1 / 32)}
+    settings = {"baseline": DepthSensor().baseline} | settings
+    measured = measure(toy, device, count=depth / 60000, **settings)
+    expected = depth**2 * settings["disparity_noise"] / (focal * settings["baseline"])
+    middle = measured.depth[0, 20:76, 20:140]
+    np.testing.assert_allclose(middle.std(), expected, rtol=0.05, atol=2e-5)
+    np.testing.assert_allclose(middle.mean(), depth, atol=4.0 * expected / middle.size**0.5 + 2e-3 * depth**2)
+
+
+def test_no_disparity_beyond_the_search_is_measured(device):
+    settings = PERFECT | {"baseline": 0.05, "max_disparity": FOCAL * 0.05 / 1.2}
+    assert not measure(wall(1.19), device, **settings).counts.any()
+    assert measure(wall(1.21), device, **settings).counts.all()
 
 
 def test_axial_noise_grows_with_the_angle_of_incidence(device):

@@ -8,7 +8,7 @@ import warp as wp
 from hypothesis import given
 from hypothesis import strategies as st
 
-from synpick_warp.kernels.render.visibility.camera import ImageGrid, in_image, pinhole_ray, projected_box, tile_pixel
+from synpick_warp.kernels.render.visibility.camera import ImageGrid, ViewCameras, in_image, pinhole_ray, projected_box, tile_pixel
 from synpick_warp.stages.render.scene import build_grid
 from tests.harness.devices import default_device
 from tests.harness.probe import probe
@@ -28,8 +28,9 @@ visit, ray_of, box_of = probe(visit_pixel), probe(pinhole_ray), probe(projected_
 
 
 def project(lower, upper, rotation, position):
-    intrinsics = wp.vec4(FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2)
-    return box_of(lower, upper, rotation, position, intrinsics, build_grid(WIDTH, HEIGHT))
+    cameras = ViewCameras()
+    cameras.intrinsics = wp.array([(FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2)], dtype=wp.vec4, device=default_device())
+    return box_of(lower, upper, rotation, position, cameras, 0, build_grid(WIDTH, HEIGHT))
 
 
 @pytest.mark.parametrize(("width", "height"), [(8, 4), (1, 1), (33, 17), (7, 9)])

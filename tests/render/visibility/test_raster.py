@@ -45,6 +45,9 @@ def depth_in_float64(corners: np.ndarray, view=VIEW) -> tuple[np.ndarray, np.nda
     k = view.matrix
     x, y = (np.arange(view.width) + 0.5 - k[0, 2]) / k[0, 0], (np.arange(view.height) + 0.5 - k[1, 2]) / k[1, 1]
     ray = np.stack([*np.broadcast_arrays(x[None, :], y[:, None]), np.ones((view.height, view.width))], axis=-1)
+    if view.lens is not None:
+        centers = np.stack(np.meshgrid(np.arange(view.width) + 0.5, np.arange(view.height) + 0.5), -1)
+        ray[..., :2] = view.lens.unproject(centers)
     nearest, clear = np.full(ray.shape[:2], NEVER), np.full(ray.shape[:2], np.inf)
     for a, b, c in corners.astype(np.float32).astype(np.float64) @ view.rotation.T + view.translation:
         across = np.cross(ray, c - a)

@@ -56,6 +56,8 @@ class CardContent:
     layers: tuple[str, ...]
     effects: tuple[str, ...]
     """Names of the active camera effects."""
+    distorted: bool = False
+    """Whether a camera has a lens that distorts."""
 
 
 def hub_splits(layout: DataLayout) -> tuple[str, ...]:
@@ -125,6 +127,8 @@ def _count(power: int) -> str:
 def _features(content: CardContent) -> dict[str, object]:
     """Columns of the card's table with their types: a type's name, a structure or a list."""
     camera = {"cam_K": _NUMBERS, "cam_R_w2c": _NUMBERS, "cam_t_w2c": _NUMBERS, "depth_scale": "float64", "light": _LIGHT}
+    if content.distorted:
+        camera |= {"cam_dist_model": "string", "cam_dist": _NUMBERS}
     if content.effects:
         camera["effects"] = dict.fromkeys(content.effects, "float64")
     masks = {str(index): _MASK for index in range(content.instances)}

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from synpick_warp.configs.export import ExportSettings
+from synpick_warp.configs.rig import lens_map
 from synpick_warp.configs.splits import DataLayout
 from synpick_warp.exporters.base import SharedFiles
 from synpick_warp.exporters.bop.scene_exporter import SceneExporter, constant_files
@@ -75,6 +76,7 @@ def _describe(settings: ExportSettings, splits: list[SplitContent]) -> CardConte
         instances=settings.objects,
         layers=settings.render.layers,
         effects=settings.effects,
+        distorted=any(lens_map(row) is not None for row in settings.rig.rows),
     )
 
 

@@ -14,7 +14,7 @@ from synpick_warp.configs.splits import DataLayout
 from synpick_warp.errors import CatalogError
 from synpick_warp.exporters.bop.shared.toolkit import describe_toolkit
 from synpick_warp.exporters.bop.view import MILLIMETERS
-from synpick_warp.exporters.writing.notes import describe_sizes
+from synpick_warp.exporters.writing.notes import describe_lenses, describe_sizes
 from synpick_warp.exporters.writing.png import encode_png
 from synpick_warp.scenes.assets.appearance import decode_texture, linear_to_srgb, srgb_to_linear
 from synpick_warp.scenes.assets.asset_files import MissingFileError
@@ -190,6 +190,9 @@ def describe_dataset(settings: ExportSettings, catalog: Catalog, cameras: tuple[
     """Text of dataset_info.md: conventions of the ground truth, and the objects."""
     layout, period = settings.layout, settings.physics.tick_time
     objects = "\n".join(f"| {entry.obj_id} | {entry.name} | {entry.mass:g} |" for entry in catalog.entries)
+    pictures = describe_sizes(layout, cameras)
+    if any(camera.lens is not None for camera in cameras):
+        pictures += f" and {describe_lenses(cameras)}"
     return f"""# A SynPick data set
 
 Made by synpick-warp (mode {", ".join(settings.modes)}, seed {settings.bake.seed}, {layout.cameras} cameras), in the format of the
@@ -197,7 +200,7 @@ BOP challenge (scenewise). {_describe_scenes(layout)} of {_describe_folders(layo
 
 - Lengths are in millimetres. A depth image's count times `depth_scale` ({settings.bop.depth_scale:g}) is the planar depth, along the
   optical axis; 0: no surface.
-- Pictures have {describe_sizes(layout, cameras)}. The centre of pixel (row, column) is (column + 0.5, row + 0.5): for OpenCV and
+- Pictures have {pictures}. The centre of pixel (row, column) is (column + 0.5, row + 0.5): for OpenCV and
   Open3D, whose pixel centres have whole coordinates, subtract 0.5 from cx and cy. Cameras have x right, y down, z forward.
 - `cam_R_w2c` and `cam_t_w2c` lead from the {settings.bins[0].noun}'s frame (centre of its inner floor, z up) to the camera.
 - `light` in scene_camera.json describes the episode's light: the map's name, its yaw [rad], the exposure relative to the automatic

@@ -1,0 +1,124 @@
+"""Presets of depth sensors: intrinsics of the depth image, baseline, noise and range of products, each figure with its source.
+
+A preset sets `depth_sensor.*`; its noise is one of disparity, so that depth noise follows from focal length and baseline:
+sigma_z = z² sigma_d / (f b). Units of one product differ by some pixels: a calibration file of one's own is better.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+from synpick_warp.configs.calibration.files import Calibration
+
+PUBLISHED = "published"
+MEASURED = "measured"
+ASSUMED = "assumed"
+DEFINED = "defined"
+"""Trust in a figure: stated by the manufacturer; calibrated or computed from calibrations of units by others; not public, or not read where
+it was published, chosen here; of a sensor that is none."""
+COUPLED: dict[str, Any] = {"noise": 0.0, "noise_growth": 0.0, "noise_angle": 0.0}
+"""Settings of all presets: no noise but that of disparity and of the pixel's position."""
+
+
+class Figure(NamedTuple):
+    """Value of a preset, how far it can be trusted, and where it is from."""
+
+    value: Any
+    trust: str
+    source: str
+
+
+_UNKNOWN_NOISE = Figure(0.08, ASSUMED, "a usual figure for well textured surfaces; the manufacturer states depth errors only")
+_FRACTION = Figure(1 / 32, ASSUMED, "five fractional bits, as in librealsense's disparity format")
+_SEARCH = Figure(126.0, PUBLISHED, "disparities that are searched, which give the least distance f b / 126 (librealsense, issue 3039)")
+_MIDDLE = "middle of the image"
+_RAGGED = Figure(0.5, ASSUMED, "as of other sensors that match windows (Handa et al., 2014)")
+_ABOVE = Figure(1.0, ASSUMED, "within the range in which noise is below 3 mm")
+
+SENSORS: dict[str, dict[str, Figure]] = {
+    "d435": {
+        "resolution": Figure((1280, 720), PUBLISHED, "full depth image"),
+        "focal": Figure((645.0, 645.0), MEASURED, "white paper of Intel as quoted by others; lens 1.93 mm, pixel 3 µm"),
+        "center": Figure((640.0, 360.0), ASSUMED, _MIDDLE),
+        "height": _ABOVE,
+        "baseline": Figure(0.050, ASSUMED, "of the D400 series' data sheet, as quoted by others"),
+        "disparity_noise": _UNKNOWN_NOISE,
+        "disparity_step": _FRACTION,
+        "max_disparity": _SEARCH,
+        "distances": Figure((0.1, 10.0), ASSUMED, "no other limit than max_disparity is near"),
+        "lateral_noise": _RAGGED,
+    },
+    "d415": {
+        "resolution": Figure((1280, 720), PUBLISHED, "full depth image"),
+        "focal": Figure((940.0, 940.0), MEASURED, "white paper of Intel as quoted by others; SAPIEN has 920"),
+        "center": Figure((640.0, 360.0), ASSUMED, _MIDDLE),
+        "height": _ABOVE,
+        "baseline": Figure(0.055, ASSUMED, "of the D400 series' data sheet, as quoted by others"),
+        "disparity_noise": _UNKNOWN_NOISE,
+        "disparity_step": _FRACTION,
+        "max_disparity": _SEARCH,
+        "distances": Figure((0.1, 10.0), ASSUMED, "no other limit than max_disparity is near"),
+        "lateral_noise": _RAGGED,
+    },
+    "d455": {
+        "resolution": Figure((1280, 800), PUBLISHED, "full colour image"),
+        "focal": Figure((629.6, 629.6), MEASURED, "colour camera of one unit (Hand_Tools, ABC-iRobotics), taken for the depth image"),
+        "center": Figure((629.6, 398.0), MEASURED, "as focal, with 0.5 added"),
+        "height": _ABOVE,
+        "baseline": Figure(0.095, ASSUMED, "as commonly stated; not found in a document of the manufacturer"),
+        "disparity_noise": _UNKNOWN_NOISE,
+        "disparity_step": _FRACTION,
+        "max_disparity": _SEARCH,
+        "distances": Figure((0.1, 10.0), ASSUMED, "no other limit than max_disparity is near"),
+        "lateral_noise": _RAGGED,
+    },
+    "xtion": {
+        "resolution": Figure((640, 480), PUBLISHED, "depth image"),
+        "focal": Figure((1066.8, 1067.5), MEASURED, "YCB-Video's camera, to whose colour image depth is registered (oprb/ycbvideo)"),
+        "center": Figure((313.5, 241.8), MEASURED, "as focal, with 0.5 added"),
+        "height": _ABOVE,
+        "baseline": Figure(0.075, MEASURED, "of the Kinect, with the same sensor (Khoshelham and Elberink, 2012)"),
+        "disparity_noise": Figure(0.115, ASSUMED, "half a step of 1/8 px with the sensor's own focal length of some 580 px"),
+        "disparity_step": Figure(0.23, ASSUMED, "1/8 px (Khoshelham and Elberink, 2012) with that focal length"),
+        "distances": Figure((0.5, 5.0), ASSUMED, "usual for the Kinect"),
+        "lateral_noise": Figure(0.5, ASSUMED, "Handa et al. (2014)"),
+    },
+    "zivid2p_m130": {
+        "resolution": Figure((2448, 2048), PUBLISHED, "support.zivid.com, sampling"),
+        "focal": Figure((4062.5, 4062.5), MEASURED, "from 0.32 mm a pixel at 1.3 m (support.zivid.com)"),
+        "center": Figure((1224.0, 1024.0), ASSUMED, _MIDDLE),
+        "height": Figure(1.3, PUBLISHED, "the distance that the product is named after"),
+        "baseline": Figure(0.110, ASSUMED, "not public; a guess from the housing's width"),
+        "disparity_noise": Figure(0.03, ASSUMED, "not public; 0.11 mm of noise at 1.3 m"),
+        "disparity_step": Figure(1 / 256, ASSUMED, "not public; phase is not quantized to pixels"),
+        "distances": Figure((0.8, 2.0), ASSUMED, "about the distance of 1.3 m"),
+        "lateral_noise": Figure(0.0, ASSUMED, "each pixel is measured by itself"),
+    },
+    "ideal": {
+        "disparity_noise": Figure(0.0, DEFINED, "no noise"),
+        "disparity_step": Figure(1e-5, DEFINED, "finer than depth images are"),
+        "distances": Figure((0.001, 100.0), DEFINED, "all"),
+        "lateral_noise": Figure(0.0, DEFINED, "no noise"),
+        "grazing_angle": Figure(89.0, DEFINED, "the limit of the setting"),
+        "edge_width": Figure(0, DEFINED, "no holes at edges"),
+        "shadows": Figure(False, DEFINED, "no holes beside objects"),
+    },
+}
+"""Figures of each preset. `focal` is fx, fy, `center` cx, cy with pixel centres at + 0.5 [px], `height` the distance above the bin [m]; all
+others are settings of `depth_sensor`. The depth image is rectified: it has no distortion."""
+_CAMERA = ("resolution", "focal", "center", "height")
+
+
+def sensor_settings(name: str) -> dict[str, Any]:
+    """Settings of the section `depth_sensor` that a preset stands for; none without a preset, or one that is not known."""
+    figures = SENSORS.get(name, {})
+    known = {key: figure.value for key, figure in figures.items() if key not in _CAMERA}
+    return {**COUPLED, "max_disparity": 0.0, **known} if figures else {}
+
+
+def sensor_camera(name: str) -> Calibration | None:
+    """Resolution and intrinsics of a preset's depth image; None: it has no camera of its own, as `ideal`."""
+    figures = SENSORS[name]
+    if "focal" not in figures:
+        return None
+    return Calibration(*figures["resolution"].value, *figures["focal"].value, *figures["center"].value)
