@@ -300,7 +300,8 @@ def _check_sole_cameras(values: Values, override: str) -> None:
         return
     for key, (value, origin) in values.items():
         section, _, name = key.partition(".")
-        is_default = name == "resolution" and any(row.resolution is None for row in rows)
+        # A written configuration has the resolution, which is that of rows without one.
+        is_default = name == "resolution" and (origin != override or any(row.resolution is None for row in rows))
         if rows and section == "cameras" and origin in (source, override) and not is_default:
             raise ConfigError(
                 f"{key} is {format_value(value)} {origin}; allowed: none, as the [[{CAMERA}]] tables have values of their own"

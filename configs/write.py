@@ -12,6 +12,7 @@ from synpick_warp.configs.schema import Config, Split
 from synpick_warp.configs.split_tables import SPLITS, split_settings
 from synpick_warp.configs.table_lists import given_values, settings_of
 
+CAMERAS = "cameras"
 _DELETE = "\x7f"
 """The only control character that JSON does not escape and TOML forbids."""
 
@@ -28,7 +29,11 @@ def config_to_toml(config: Config, *, comments: bool = False) -> str:
     for section, kind in sections().items():
         if comments and kind.__doc__:
             lines += [f"# {' '.join(kind.__doc__.split())}"]
-        lines += [f"[{section}]", *_table(getattr(config, section), kind, comments), ""]
+        table = _table(getattr(config, section), kind, comments)
+        if section == CAMERAS and config.camera:
+            # The rest is of no effect beside [[camera]] tables, which are read only alone.
+            table = [f"resolution = {format_toml(config.cameras.resolution)}"]
+        lines += [f"[{section}]", *table, ""]
     for name, kind in table_lists().items():
         for index, row in enumerate(getattr(config, name)):
             lines += [f"[[{name}]]", *_table(row, kind, comments and index == 0), ""]

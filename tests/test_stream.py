@@ -14,6 +14,7 @@ import pytest
 import warp as wp
 
 from synpick_warp.codes import Effect, Measure, Phase, Status
+from synpick_warp.configs.cameras import CameraRow
 from synpick_warp.configs.schema import LAYERS, Config
 from synpick_warp.exporters.writing.rle import find_run_boundaries, unpack_run_boundaries
 from synpick_warp.stages import host_copies, view_ring
@@ -401,3 +402,27 @@ def test_what_is_copied_to_the_host(cuda, needs_images, settings_, expected):
 def test_the_largest_lists_are_no_larger_than_images():
     one, columns = np.dtype(np.uint32).itemsize * FIELDS, 7
     assert one * BOUNDARIES_PER_COLUMN * columns <= host_copies.MIN_LISTED_ROWS * columns
+
+
+def test_groups_of_cameras_take_turns_in_a_tick(device):
+    """Cameras 0 and 2 have other images than camera 1: each batch has one size, and views know their camera among all."""
+    config, renderer = config_of(render__views_per_batch=3), FakeRenderer([])
+    rows = tuple(CameraRow(resolution=size, fov=20.0) for size in ((8, 6), (10, 4), (8, 6)))
+    config = dataclasses.replace(config, camera=rows)
+    rings = []
+    for index, cameras in enumerate(config.rig.groups):
+        sizes = view_sizes(config.render, config.rig, WORLDS, ROOM, device, index)
+        rings.append(ViewRing(CameraGroup(cameras, sizes, renderer), (), device))  # type: ignore[arg-type]
+    frames = FrameStream(rings, config.physics.tick_time, OBJECT_IDS, LIGHTS, device)
+    ended, seen = [], []
+    for tick in range(3):
+        for batch in frames.advance("snapshot", report_of([1, 1, 0, 0, 1]), lambda tick=tick: ended.append(tick)):  # type: ignore[arg-type]
+            assert len({rows[camera].resolution for camera in batch.camera.tolist()}) == 1
+            assert batch.color.shape[1:3] == (rows[batch.camera[0]].resolution or ())[::-1]
+            code = 10 * (batch.episode - 20) + batch.camera + 1
+            assert (batch.color.reshape(len(batch), -1) == code[:, None]).all()
+            seen += zip(batch.episode.tolist(), batch.camera.tolist(), strict=True)
+    for batch in frames.drain():
+        seen += zip(batch.episode.tolist(), batch.camera.tolist(), strict=True)
+    assert ended == [0, 1, 2]
+    assert sorted(seen) == sorted(3 * [(20 + world, camera) for world in (0, 1, 4) for camera in range(3)])

@@ -1,0 +1,122 @@
+"""[[camera]] tables: what they mean, how they are written, and what is refused."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from synpick_warp.configs.cameras import CameraRow
+from synpick_warp.configs.load import COMMAND_LINE, load_config
+from synpick_warp.configs.rig import Rig, intrinsics, resized, viewing_direction
+from synpick_warp.configs.schema import Cameras, Config
+from synpick_warp.configs.write import config_to_toml
+from synpick_warp.errors import ConfigError
+
+K = "matrix = [[275.0, 0.0, 163.8], [0.0, 274.6, 117.5], [0.0, 0.0, 1.0]]"
+LOOK = "pose = { position = [0.0, -0.4, 1.1], look_at = [0.0, 0.0, 0.1], up = [0.0, 1.0, 0.0] }"
+DOWN = "[[1, 0, 0, 0], [0, -1, 0, 0], [0, 0, -1, 1.2], [0, 0, 0, 1]]"
+LEFT = f'[[camera]]\nname = "left"\nresolution = [320, 240]\n{K}\n{LOOK}\n'
+TOP = f"[[camera]]\nfov = 40.0\npose = {{ matrix = {DOWN} }}\n"
+
+
+def load(folder: Path, text: str, **settings: object) -> Config:
+    path = folder / "cell.toml"
+    path.write_text(f'preset = "smoke"\n{text}')
+    return load_config(str(path), {key.replace("__", "."): value for key, value in settings.items()}, source=COMMAND_LINE)
+
+
+def test_tables_replace_the_section(tmp_path):
+    rig = load(tmp_path, LEFT + TOP + TOP).rig
+    assert (rig.names, rig.sensors) == (("left", "camera_1", "camera_2"),) * 2
+    assert rig.sizes == ((320, 240), (320, 180), (320, 180))
+    assert rig.groups == ((0,), (1, 2))
+    assert intrinsics(rig.rows[0]) == (275.0, 274.6, 163.8, 117.5)
+    assert load(tmp_path, TOP, cameras__resolution=[64, 48]).rig.sizes == ((64, 48),)
+    ours = Rig.of(Cameras())
+    assert (ours.names[0], ours.sensors[0], ours.groups) == ("camera_0", "cam0", ((0, 1, 2),))
+
+
+@pytest.mark.parametrize("comments", [False, True])
+def test_tables_are_written_and_read(tmp_path, comments):
+    config = load(tmp_path, LEFT + TOP)
+    path = tmp_path / "again.toml"
+    path.write_text(config_to_toml(config, comments=comments))
+    assert load_config(str(path)) == config
+    assert "[[camera]]" not in config_to_toml(load_config("smoke"))
+
+
+def test_poses_of_all_forms_look_the_same_way(tmp_path):
+    forms = (
+        f"matrix = {DOWN}",
+        "position = [0, 0, 1.2], quaternion = [1, 0, 0, 0]",
+        "position = [0, 0, 1.2], look_at = [0, 0, 0.2], up = [0, 1, 0]",
+    )
+    rows = load(tmp_path, "".join(f"[[camera]]\nfov = 40\npose = {{ {form} }}\n" for form in forms)).camera
+    assert [viewing_direction(row.pose) for row in rows] == [pytest.approx((0.0, 0.0, -1.0))] * 3
+
+
+def test_another_size_keeps_width_of_view_and_middle():
+    row = CameraRow(resolution=(320, 240), matrix=((275.0, 0.0, 163.8), (0.0, 274.6, 117.5), (0.0, 0.0, 1.0)))
+    assert intrinsics(resized(row, (640, 360))) == pytest.approx((550.0, 549.2, 327.6, 175.0))
+
+
+HEAD = '[[camera]]\nname = "left"\nresolution = [320, 240]\n'
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("camera = 3\n", "camera is 3 in {path}; allowed: [[camera]] tables"),
+        ("[camera]\nfov = 3\n", "camera is a table in {path}; allowed: [[camera]] tables, one for each"),
+        ("[[camera]]\nfov = 40\n", "camera[0] has no pose in {path}; a row needs pose"),
+        (LEFT.replace("matrix", "matrx"), "there is no key camera[0].matrx, set in {path}"),
+        (LEFT.replace("look_at", "lookat"), "there is no key camera[0].pose.lookat, set in {path}"),
+        (f"{HEAD}{K}\npose = 3\n", "camera[0].pose is 3 in {path}; allowed: a table of matrix, position, "),
+        (LEFT + LEFT, "camera[0].name is "),
+        (LEFT.replace('"left"', '"Left"'), 'camera[0].name is "Left" in {path}; allowed: a lower-case letter, '),
+        (LEFT.replace('"left"', '"info"'), 'camera[0].name is "info" in {path}; allowed: a lower-case letter, '),
+        (LEFT + "fov = 3\n", "camera[0].matrix is "),
+        (HEAD + LOOK, "camera[0].fov is null in {path}; allowed: either fov or matrix"),
+        (LEFT.replace("275.0", "0.0"), "allowed: fx from "),
+        (LEFT.replace("275.0", "nan"), "camera[0].matrix is "),
+        (LEFT.replace("274.6", "-274.6"), "and fy within twice fx [px]"),
+        (LEFT.replace("275.0, 0.0", "275.0, 2.0"), "allowed: a matrix without skew"),
+        (LEFT.replace("0.0, 0.0, 1.0]]", "163.8, 117.5, 1.0]]"), "allowed: [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]"),
+        (LEFT.replace("[320, 240]", "[240, 100]"), "a principal point cx, cy inside its images of 240 x 100 px"),
+        (
+            LEFT.replace(K, "matrix = [[163.8, 0, 275.0], [0, 117.5, 274.6], [0, 0, 1]]"),
+            "are numbers, or width and height, swapped?",
+        ),
+        (LEFT.replace(K, "matrix = [[275.0, 0.0], [0.0, 274.6]]"), "allowed: 3 lists of 3 numbers in a list [px]"),
+        (LEFT.replace("up = [0.0, 1.0, 0.0]", "quaternion = [0, 0, 0, 1]"), "allowed: {{matrix}} or {{position, quaternion}} or "),
+        (TOP.replace("[0, -1, 0, 0]", "[0, 1, 0, 0]"), "this matrix is a mirror image"),
+        (TOP.replace("[0, -1, 0, 0]", "[0, -2, 0, 0]"), "perpendicular and of length 1"),
+        (TOP.replace(", [0, 0, 0, 1]]", "]"), "allowed: a matrix of 4 rows, the last 0, 0, 0, 1"),
+        (TOP.replace(f"matrix = {DOWN}", "position = [0, 0, 1], quaternion = [0, 0, 0, 0]"), "a quaternion x, y, z, w of length 1"),
+        (
+            LEFT.replace("look_at = [0.0, 0.0, 0.1]", "look_at = [0.0, -0.4, 1.1]"),
+            "positions other than look_at, the position of camera left",
+        ),
+        (LEFT.replace("up = [0.0, 1.0, 0.0]", "up = [0.0, 0.0, 0.0]"), "up vectors that are not zero or parallel"),
+        (TOP.replace("-1, 1.2]", "-1, -1.2]"), "positions above the tote's floor, z > 0, below which camera camera_0"),
+        (LEFT.replace("look_at = [0.0, 0.0, 0.1]", "look_at = [0.0, 0.0, 9.0]"), "outside of the images of camera left [m]"),
+        (TOP.replace(f"matrix = {DOWN}", "position = [0.28, 0, 0.1], look_at = [0, 0, 0], up = [0, 1, 0]"), "outside of the tote's walls"),
+        (LEFT + "[cameras]\nfov = 30.0\n", "cameras.fov is 30.0 in {path}; allowed: none, as the [[camera]] tables have values"),
+        (LEFT + '[perception]\ncamera = "right"\n', 'perception.camera is "right" in {path}; allowed: the name of a camera, left, or none'),
+        (LEFT.replace("[320, 240]", "[321, 240]") + '[bake]\nformats = ["lerobot"]\n', "camera[0].resolution is [321, 240] in {path}; "),
+    ],
+)
+def test_what_is_refused_and_said(tmp_path, text, words):
+    with pytest.raises(ConfigError) as caught:
+        load(tmp_path, text)
+    assert words.format(path=tmp_path / "cell.toml") in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_options_that_would_have_no_effect_are_refused(tmp_path):
+    for key, value in (("cameras.resolution", [64, 48]), ("cameras.fov", 30.0)):
+        with pytest.raises(ConfigError, match=rf"{key} is .* on the command line; allowed: none, as the \[\[camera\]\] tables"):
+            load(tmp_path, LEFT, **{key.replace(".", "__"): value})
+    with pytest.raises(ConfigError, match=r"camera cannot be set on the command line; write \[\[camera\]\] tables into a file"):
+        load(tmp_path, LEFT, camera__fov=3)
