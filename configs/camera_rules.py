@@ -8,7 +8,7 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 
 from synpick_warp.configs.cameras import CameraRow, Cameras, Pose
-from synpick_warp.configs.cell import BinSizes, Sides, bin_sizes
+from synpick_warp.configs.cell import BinSizes, Sides
 from synpick_warp.configs.rig import Rig, intrinsics, lens_map, position, viewing_direction
 from synpick_warp.configs.schema import Bop, Config, DepthSensor
 from synpick_warp.errors import ConfigError
@@ -45,8 +45,8 @@ def find_camera_conflicts(config: Config) -> Iterator[Conflict]:
     if config.perception.camera and config.perception.camera not in rig.names:
         yield "perception.camera", f"the name of a camera, {', '.join(rig.names)}, or none"
     if "depth_sensor" in config.render.layers:
-        yield from _depth_sensor(config.depth_sensor, rig, bin_sizes(config))
-    yield from _depth_scale(config.bop, rig, bin_sizes(config))
+        yield from _depth_sensor(config.depth_sensor, rig, config.cell.bins)
+    yield from _depth_scale(config.bop, rig, config.cell.bins)
 
 
 def _section(cameras: Cameras) -> Iterator[Conflict]:
@@ -94,7 +94,7 @@ def _pose(key: str, pose: Pose) -> Iterator[Conflict]:
 
 def _view(rig: Rig, index: int, config: Config) -> Iterator[Conflict]:
     """Yield conflicts of a camera's intrinsics, odd sides with videos, and a degenerate view or one that does not show the bins."""
-    bins = bin_sizes(config)
+    bins = config.cell.bins
     row, label = rig.rows[index], rig.label(index)
     (width, height), (fx, fy, *_) = rig.sizes[index], intrinsics(row)
     if "lerobot" in config.bake.formats and (width % 2 or height % 2):

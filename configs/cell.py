@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import itertools
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
-from synpick_warp.configs.bins import NONE, OWN, PALLET, TOTE, BinRow, Tote
-from synpick_warp.configs.schema import Config
+from synpick_warp.configs.bins import NONE, OWN, PALLET, TOTE, BinRow, Bins, Tote
 
 Sides = tuple[float, float]
 """Length (along x) and width (along y) [m]."""
@@ -93,28 +93,31 @@ class BinSizes:
         return [(x * length / 2, y * width / 2, z) for (length, width), z in levels for x, y in itertools.product((-1, 1), repeat=2)]
 
 
-def recorded_bins(config: Config) -> tuple[str, ...]:
+@dataclass(frozen=True)
+class Cell:
+    """What stands under the cameras: the bins from which an episode draws its own."""
+
+    bins: tuple[BinSizes, ...]
+    """Extents of the bins; the first stands on the table, whose height follows from its base."""
+    tables: Mapping[str, Tote]
+    """Settings of the bins with walls by their keys: tote, or bin[0] and so on."""
+    recorded: tuple[str, ...]
     """Names of the bins, where data sets record that of each episode; empty for a tote that is always in its place."""
-    bins = config.bins
-    moves = any(bins.shift) or bins.yaw > 0.0
-    return tuple(sizes.name for sizes in bin_sizes(config)) if moves or bins.kind != TOTE else ()
 
-
-def bin_sizes(config: Config) -> tuple[BinSizes, ...]:
-    """Bins from which an episode draws its own; the first stands on the table, whose height follows from its base."""
-    bins = config.bins
-    if bins.kind == NONE:
-        return (BinSizes("table", "table", None, bins.area, bins.area, bins.area, 0.0, 0.0, bins.margin),)
-    if bins.kind == PALLET:
-        length, width, height = bins.pallet_size
-        return (BinSizes("pallet", "pallet", None, (length, width), bins.area, bins.area, 0.0, -height, bins.margin),)
-    if bins.kind == OWN and config.bin:
-        return tuple(BinSizes.of_row(row) for row in config.bin)
-    return (BinSizes.of_tote(config.tote),)
-
-
-def bin_tables(config: Config) -> dict[str, Tote]:
-    """Tables of the bins with walls by their keys: tote, or bin[0] and so on."""
-    if config.bins.kind == OWN:
-        return {f"bin[{index}]": row for index, row in enumerate(config.bin)}
-    return {TOTE: config.tote} if config.bins.kind == TOTE else {}
+    @classmethod
+    def of(cls, tote: Tote, bins: Bins, rows: tuple[BinRow, ...]) -> Cell:
+        """The cell of these settings."""
+        tables: dict[str, Tote] = {}
+        if bins.kind == NONE:
+            sizes: tuple[BinSizes, ...] = (BinSizes("table", "table", None, bins.area, bins.area, bins.area, 0.0, 0.0, bins.margin),)
+        elif bins.kind == PALLET:
+            length, width, height = bins.pallet_size
+            sizes = (BinSizes("pallet", "pallet", None, (length, width), bins.area, bins.area, 0.0, -height, bins.margin),)
+        elif bins.kind == OWN and rows:
+            sizes = tuple(BinSizes.of_row(row) for row in rows)
+            tables = {f"bin[{index}]": row for index, row in enumerate(rows)}
+        else:
+            sizes = (BinSizes.of_tote(tote),)
+            tables = {TOTE: tote} if bins.kind == TOTE else {}
+        stays = bins.kind == TOTE and not any(bins.shift) and bins.yaw == 0.0
+        return cls(sizes, tables, () if stays else tuple(one.name for one in sizes))

@@ -9,7 +9,7 @@ from collections.abc import Iterator, Sequence
 
 from synpick_warp.configs.bins import OWN, PALLET, TOTE, BinRow, Bins, Tote
 from synpick_warp.configs.camera_rules import Conflict, find_camera_conflicts
-from synpick_warp.configs.cell import BinSizes, bin_sizes, bin_tables
+from synpick_warp.configs.cell import BinSizes
 from synpick_warp.configs.modes import bake_modes
 from synpick_warp.configs.schema import (
     FORMATS,
@@ -39,10 +39,10 @@ _SPLIT = re.compile(r"(train|val|test)(_[A-Za-z0-9]+)*")
 
 def find_conflicts(config: Config) -> Iterator[Conflict]:
     """Find all violated constraints, the most basic first."""
-    bins, bop = bin_sizes(config), config.bop
+    bins, bop = config.cell.bins, config.bop
     yield from _mix(config.bake, config.splits)
     yield from _bins(config.bins, config.bin)
-    for key, row in bin_tables(config).items():
+    for key, row in config.cell.tables.items():
         yield from _box(key, row)
     if config.move.start_height < config.move.height:
         yield "move.start_height", f"at least move.height, {config.move.height:g} [m]"

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-from synpick_warp.configs.cell import BinSizes, bin_sizes
+from synpick_warp.configs.cell import BinSizes
 from synpick_warp.configs.modes import bake_modes
 from synpick_warp.configs.rig import Rig
 from synpick_warp.configs.schema import Bake, Bop, Config, Gripper, Physics, Render, Trajectory
@@ -38,9 +38,7 @@ class ExportSettings:
         effects = tuple(name for name, limits in effect_ranges(config.effects).items() if any(limits))
         names = ("bake", "bop", "rig", "physics", "render", "trajectory", "gripper")
         sections: dict[str, Any] = {name: getattr(config, name) for name in names}
-        return cls(
-            layout=DataLayout.of(config), bins=bin_sizes(config), effects=effects, objects=config.arrangement.max_objects, **sections
-        )
+        return cls(layout=DataLayout.of(config), bins=config.cell.bins, effects=effects, objects=config.arrangement.max_objects, **sections)
 
     @property
     def modes(self) -> tuple[str, ...]:

@@ -14,6 +14,7 @@ from typing import Any
 from synpick_warp.codes import Tone, names
 from synpick_warp.configs.bins import BinRow, Bins, Tote
 from synpick_warp.configs.cameras import CameraRow, Cameras
+from synpick_warp.configs.cell import Cell
 from synpick_warp.configs.fields import INT32_MAX, setting
 from synpick_warp.configs.manipulation import Move, Perception, Pick, Suction, Target
 from synpick_warp.configs.objects import ObjectRow, Objects
@@ -389,6 +390,11 @@ class Config:
     def rig(self) -> Rig:
         """All cameras."""
         return Rig.of(self.cameras, self.camera)
+
+    @property
+    def cell(self) -> Cell:
+        """What stands under the cameras."""
+        return Cell.of(self.tote, self.bins, self.bin)
 
     def value(self, key: str) -> Any:
         """Value of a setting by its full key, such as "physics.step"."""

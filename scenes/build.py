@@ -16,7 +16,6 @@ import newton
 import numpy as np
 import warp as wp
 
-from synpick_warp.configs.cell import bin_sizes
 from synpick_warp.configs.modes import mode_weights
 from synpick_warp.configs.schema import EXCEED, Arrangement, Bake, Config, Gripper, Move, Physics, Pick
 from synpick_warp.errors import ConfigError
@@ -208,7 +207,7 @@ def build_model(config: Config, catalog: Catalog, device: wp.Device) -> BuiltMod
     world = newton.ModelBuilder(gravity=(0.0, 0.0, -config.physics.gravity))
     newton.solvers.SolverSteel.register_custom_attributes(world)
     shape = newton.ModelBuilder.ShapeConfig(density=0.0, mu=config.physics.friction, gap=config.physics.gap, restitution=0.0)
-    bins = make_bins(bin_sizes(config))
+    bins = make_bins(config.cell.bins)
 
     def add(index: int, pieces: Sequence[ConvexPiece], guide: bool) -> list[Part]:
         return [Part(world.add_shape_convex_hull(-1, mesh=_hull(piece), cfg=shape), index, guide) for piece in pieces]

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from trimesh.bounds import oriented_bounds
 
-from synpick_warp.configs.cell import BinSizes, bin_sizes
+from synpick_warp.configs.cell import BinSizes
 from synpick_warp.configs.objects import AUTO_UNIT, UNITS
 from synpick_warp.configs.schema import Config, ObjectRow, Objects
 from synpick_warp.errors import CatalogError, SynpickError
@@ -63,7 +63,7 @@ def load_catalog(config: Config, cache_dir: Path | None = None, report: Callable
             invalid mass.
     """
     faults = _Faults(config.objects.strict, config.bake.models, report)
-    raws = _read_objects(config, report, faults)
+    raws = _read_objects(config.bake.models, _Rules(config.objects, config.object_rows, config.cell.bins), report, faults)
     recipes = [shape_recipe(raw, config.objects) for raw in raws]
     names, meshes = [raw.name for raw in raws], [raw.mesh for raw in raws]
     seconds = config.objects.decomposition_time
@@ -84,17 +84,14 @@ def load_catalog(config: Config, cache_dir: Path | None = None, report: Callable
 def read_objects(config: Config, report: Callable[[str], None] = _ignore) -> list[RawObject]:
     """Read and check the objects of a bake, without collision shapes; arguments, files and errors as of `load_catalog`."""
     faults = _Faults(config.objects.strict, config.bake.models, report)
-    raws = _read_objects(config, report, faults)
+    raws = _read_objects(config.bake.models, _Rules(config.objects, config.object_rows, config.cell.bins), report, faults)
     faults.tell()
     return raws
 
 
-def _read_objects(config: Config, report: Callable[[str], None], faults: _Faults) -> list[RawObject]:
-    """The embedded objects, or those of the folder `bake.models`."""
-    rules = _Rules(config.objects, config.object_rows, bin_sizes(config))
-    if not config.bake.models:
-        return _embedded_objects(rules, faults)
-    return _read_folder(Path(config.bake.models).expanduser(), rules, report, faults)
+def _read_objects(folder: str, rules: _Rules, report: Callable[[str], None], faults: _Faults) -> list[RawObject]:
+    """The objects of a folder; empty: the embedded objects."""
+    return _read_folder(Path(folder).expanduser(), rules, report, faults) if folder else _embedded_objects(rules, faults)
 
 
 class _SizeError(CatalogError):

@@ -15,7 +15,6 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from synpick_warp.configs.cell import bin_sizes, recorded_bins
 from synpick_warp.configs.schema import Config
 from synpick_warp.configs.splits import DataLayout
 from synpick_warp.exporters.registry import Needs
@@ -167,7 +166,7 @@ def _add_stream(stages: Stages, device: wp.Device, needs_images: bool, depth_fil
         ViewRing(group, config.render.layers, device, host_images(config.bop, group.sizes["row"], device, needs_images, depth_files))
         for group in stages.groups
     ]
-    stream = FrameStream(rings, tick_time, stages.object_ids, table, device, recorded_bins(config))
+    stream = FrameStream(rings, tick_time, stages.object_ids, table, device, config.cell.recorded)
     return Factory(**vars(stages), stream=stream, log=stages.make_log())
 
 
@@ -183,7 +182,7 @@ def build_stages(
     """Load assets, and build worlds and renderer, from settings with resolved sizes. Other arguments and errors: `build_factory`."""
     progress.stage("loading objects and lights")
     cameras = make_cameras(config.rig)
-    bins = make_bins(bin_sizes(config))
+    bins = make_bins(config.cell.bins)
     catalog = load_catalog(config, report=progress.note)
     lights = load_scene_lights(config.bake.lights, config.randomize, config.bake.seed, progress.note, config.objects.strict)
     config = _fit_to_catalog(config, catalog, device, progress)

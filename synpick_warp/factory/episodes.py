@@ -137,7 +137,7 @@ def episode_row(
 ) -> EpisodeRow:
     """Build the row of the episode that ended in a world.
 
-    `bins`: of `recorded_bins`; `tick_time`: time between two frames [s]; `looks`: see `Stages.looks`.
+    `bins`: `Cell.recorded`; `tick_time`: time between two frames [s]; `looks`: see `Stages.looks`.
     """
     episode, arrangement, frame, ending = (int(report.column(name)[world]) for name in ("episode", "arrangement", "frame", "ending"))
     split = layout.split_of(episode)

@@ -10,7 +10,6 @@ from pathlib import Path
 import numpy as np
 
 from synpick_warp.codes import Phase
-from synpick_warp.configs.cell import recorded_bins
 from synpick_warp.configs.export import ExportSettings
 from synpick_warp.configs.schema import Config
 from synpick_warp.configs.splits import DataLayout
@@ -229,7 +228,7 @@ class _Run:
     def _end(self, report: TickReport, world: int, record: EpisodeRecord) -> None:
         """End an episode: count it, and commit it, or resample its arrangement, by its ending."""
         config, tries = self.factory.config, self.factory.config.settle.tries
-        bins, factory = recorded_bins(config), self.factory
+        bins, factory = config.cell.recorded, self.factory
         row = episode_row(self.layout, bins, factory.tick_time, factory.looks, report, world, record)
         end = episode_end(row, record, tries)
         advice = remedy(row.ending, config.physics, config.perception, config.arrangement, config.settle)

@@ -11,7 +11,7 @@ import numpy as np
 import warp as wp
 
 from synpick_warp.configs import schema
-from synpick_warp.configs.cell import BinSizes, bin_sizes
+from synpick_warp.configs.cell import BinSizes
 from synpick_warp.configs.modes import mode_weights
 from synpick_warp.kernels import structs
 from synpick_warp.scenes import build
@@ -87,7 +87,7 @@ def make_scene_data(config: schema.Config, catalog: Catalog, built: build.BuiltM
         ),
         fill(structs.PerceptionData, config.perception),
         _suction_data(config.suction, gripper, physics.step),
-        bin_data(bin_sizes(config), config.bins, config.move, built.layout.parts, device),
+        bin_data(config.cell.bins, config.bins, config.move, built.layout.parts, device),
     )
 
 

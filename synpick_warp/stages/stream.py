@@ -183,7 +183,7 @@ def describe_views(
         tick_time: Time between two frames [s].
         object_ids: obj_id of each catalog entry, and behind them -1 for none (entry + 1) int32.
         lights: Table of the environment maps.
-        bins: Names of the bins, of `recorded_bins`; empty: without those of the views.
+        bins: Names of the bins, `Cell.recorded`; empty: without those of the views.
     """
     own = {"bin_name": np.array(bins)[report.snapshot.bin[world]], "bin_pose": report.snapshot.fixture_pose[world, 0]} if bins else {}
     frame = report.column("frame")[world]

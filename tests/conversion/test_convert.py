@@ -182,7 +182,7 @@ def test_keypoints_need_the_objects_of_the_bake(sets, tmp_path, assets, monkeypa
     truth.write_text(truth.read_text().replace('"obj_id":7', '"obj_id":8'))
     with pytest.raises(DatasetError, match="obj_id 8, which is none of the bake's objects"):
         run(source, tmp_path / "first", "coco")
-    monkeypatch.setattr("synpick_warp.dataset.commit.digests.digest_inputs", lambda *_: {})
+    monkeypatch.setattr("synpick_warp.dataset.commit.digests.digest_inputs", lambda *_: {"objects": "other"})
     with pytest.raises(DatasetError, match="have changed since its bake"):
         run(sets["keypoints"], tmp_path / "second", "coco")
 

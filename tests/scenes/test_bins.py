@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from synpick_warp.configs.cell import bin_sizes, recorded_bins
 from synpick_warp.configs.load import load_config
 from synpick_warp.configs.write import config_to_toml
 from synpick_warp.dataset.commit.manifest import make_manifest
@@ -18,7 +17,7 @@ from tests.scenes.test_tote_gripper import test_fixtures_are_closed_and_face_out
 
 def made(**settings):
     config = load_config("smoke", {f"bins.{name}": value for name, value in settings.items()})
-    return make_bins(bin_sizes(config))
+    return make_bins(config.cell.bins)
 
 
 def test_a_pallet_is_closed_and_its_box_holds_its_boards():
@@ -58,15 +57,15 @@ def read(tmp_path, text=ROWS):
 
 def test_rows_are_bins_and_are_written_back(tmp_path):
     config = read(tmp_path)
-    first, second = bin_sizes(config)
+    first, second = config.cell.bins
     assert (first.name, second.name, second.height, first.compartments) == ("kanban", "flat", 0.05 - 0.006, (2, 3))
     assert read(tmp_path, config_to_toml(config)) == config
-    assert recorded_bins(config) == ("kanban", "flat")
+    assert config.cell.recorded == ("kanban", "flat")
     assert "bin" in make_manifest(config)["settings"]
 
 
 def test_compartments_are_equal_and_dividers_fill_what_is_between_them(tmp_path):
-    kanban, flat = make_bins(bin_sizes(read(tmp_path)))
+    kanban, flat = make_bins(read(tmp_path).cell.bins)
     check_closed(kanban.fixture)
     assert (kanban.fixture.interior, flat.fixture.interior is None) == (None, False)
     assert len(kanban.pieces) == len(flat.pieces) + 3

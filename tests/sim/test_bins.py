@@ -11,7 +11,6 @@ from scipy.spatial.transform import Rotation
 
 from synpick_warp.codes import Mode, Phase, Stream
 from synpick_warp.configs.bins import BinRow, Bins
-from synpick_warp.configs.cell import bin_sizes
 from synpick_warp.stages.sim import arrange, gripper
 from synpick_warp.stages.sim.simulate import Simulation
 from synpick_warp.stages.stream import read_tick
@@ -182,7 +181,7 @@ ROWS = (
 def test_piles_rest_in_or_on_the_bin_that_is_drawn_in_any_number_of_worlds(bins):
     base = settings(bake__episodes=4, bake__mode="move", move__speed=10.0, **COARSE)
     config = dataclasses.replace(base, bins=bins, bin=ROWS if bins.kind == "own" else ())
-    sizes, found = bin_sizes(config), first_frames(config, 4)
+    sizes, found = config.cell.bins, first_frames(config, 4)
     assert {chosen for chosen, _, _ in found.values()} == set(range(len(sizes)))
     for chosen, pose, objects in found.values():
         local = Rotation.from_quat(pose[3:]).inv().apply(objects[:, :3] - pose[:3])

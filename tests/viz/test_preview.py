@@ -17,7 +17,6 @@ from synpick_warp.apps.viz.drawing import instance_color, short_labels
 from synpick_warp.apps.viz.preview import MAX_VIEWS, find_scenes, read_baked, sample, write_contact_sheet
 from synpick_warp.apps.viz.preview_legend import COLUMN, LINE, Box, draw_legend, legend_width, place_labels
 from synpick_warp.cli.main import main
-from synpick_warp.configs.cell import bin_sizes
 from synpick_warp.configs.write import config_to_toml
 from synpick_warp.errors import DatasetError, OutputError
 from synpick_warp.exporters.bop.exporter import BopExporter
@@ -155,7 +154,7 @@ def test_depth_has_one_scale_the_totes(dataset, tmp_path):
     (dataset / "config.toml").write_text(config_to_toml(config()))
     views = sample(find_scenes(dataset), 6)
     records = [scene.files().camera(frame) for scene, frame in views]
-    near, far = bin_scale(bin_sizes(read_baked(dataset, set()).config), records)
+    near, far = bin_scale(read_baked(dataset, set()).config.cell.bins, records)
     tote = config().tote
     heights = {"near": tote.outer_size[2] - tote.wall, "far": 0.0}
     sizes = {"near": tote.rim_size, "far": tote.floor_size}

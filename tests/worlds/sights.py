@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import Any
 
-from synpick_warp.configs.cell import bin_sizes
 from synpick_warp.configs.schema import Config
 from synpick_warp.scenes.bins import make_bins
 from synpick_warp.scenes.cameras import make_cameras
@@ -29,7 +28,7 @@ SHORT = {
 
 def render_scene(config: Config, objects: Catalog, device: Any) -> RenderScene:
     """The scene of a bake, under one light."""
-    fixtures, lights = make_fixtures(make_bins(bin_sizes(config)), config.gripper), load_lights("")[:LIGHTS]
+    fixtures, lights = make_fixtures(make_bins(config.cell.bins), config.gripper), load_lights("")[:LIGHTS]
     return build_render_scene(config.render, -config.tote.wall, objects, fixtures, make_cameras(config.rig), lights, device)
 
 

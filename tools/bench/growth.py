@@ -13,7 +13,6 @@ from dataclasses import dataclass, replace
 
 import warp as wp
 
-from synpick_warp.configs.cell import bin_sizes
 from synpick_warp.configs.schema import Cameras, Config
 from synpick_warp.factory.assembly import make_renderer
 from synpick_warp.scenes.bins import make_bins
@@ -68,7 +67,7 @@ class Variant:
     def build_scene(self) -> RenderScene:
         """Renderer's scene."""
         config = self.config
-        fixtures, cameras = make_fixtures(make_bins(bin_sizes(config)), config.gripper), make_cameras(config.rig)
+        fixtures, cameras = make_fixtures(make_bins(config.cell.bins), config.gripper), make_cameras(config.rig)
         return build_render_scene(config.render, -config.tote.wall, self.catalog, fixtures, cameras, self.lights, self.device)
 
     def drop(self, scene: RenderScene) -> Pile:

@@ -21,7 +21,6 @@ import warp as wp
 from rich.console import Console
 
 from synpick_warp.apps.viz.preview import put_text, write_picture
-from synpick_warp.configs.cell import bin_sizes
 from synpick_warp.configs.load import load_config
 from synpick_warp.errors import SynpickError
 from synpick_warp.factory.assembly import make_renderer
@@ -96,7 +95,7 @@ def draw(outcomes: list[Outcome], device: str) -> np.ndarray:
     config = load_config(None, fixed)
     entries = [_entry(number, *found) for number, outcome in enumerate(outcomes) if (found := outcome.found) is not None]
     cameras, count = make_cameras(config.rig), len(entries)
-    fixtures = make_fixtures(make_bins(bin_sizes(config)), config.gripper)
+    fixtures = make_fixtures(make_bins(config.cell.bins), config.gripper)
     scene = build_render_scene(
         config.render, -config.tote.wall, Catalog(tuple(entries)), fixtures, cameras, load_lights("")[:1], wp.get_device(device)
     )

@@ -18,7 +18,6 @@ import warp as wp
 from rich.console import Console
 from rich.table import Table
 
-from synpick_warp.configs.cell import bin_sizes
 from synpick_warp.configs.schema import FAST, LAYERS, REFERENCE, UNOCCLUDED, Config
 from synpick_warp.errors import SynpickError
 from synpick_warp.factory.assembly import make_renderer
@@ -167,7 +166,7 @@ def compare_devices(config: Config, devices: list[Any], console: Console) -> lis
     simulation = Simulation(with_enough_worlds(config, devices[0]), catalog, len(lights), devices[0])
     snapshot = next_frame(settle_piles(simulation, config.bake.worlds), CREEP)
     cameras = make_cameras(config.rig)
-    fixtures = make_fixtures(make_bins(bin_sizes(config)), config.gripper)
+    fixtures = make_fixtures(make_bins(config.cell.bins), config.gripper)
     differences = []
     for mode in COLORS:
         mode_config, objects = config.with_values({"render.mode": mode}), config.arrangement.max_objects

@@ -31,7 +31,6 @@ from rich.console import Console
 
 from synpick_warp.apps.viz.preview import write_picture
 from synpick_warp.codes import Segment
-from synpick_warp.configs.cell import bin_sizes
 from synpick_warp.configs.schema import FAST, Config, Render
 from synpick_warp.errors import SynpickError
 from synpick_warp.factory.assembly import Stages, build_stages, make_renderer
@@ -185,7 +184,7 @@ def compare_maps(
     Yields the denoised frame beside two references, and the periods of the lattice [px].
     """
     device, room = stages.groups[0].renderer.scene.device, config.arrangement.max_objects
-    fixtures, cameras = make_fixtures(make_bins(bin_sizes(config)), config.gripper), make_cameras(config.rig)
+    fixtures, cameras = make_fixtures(make_bins(config.cell.bins), config.gripper), make_cameras(config.rig)
     scene = build_render_scene(config.render, -config.tote.wall, stages.catalog, fixtures, cameras, stages.lights, device)
     width, height = config.cameras.resolution
     samples = min(MAX_SAMPLES, max(2, 1 << int(math.log2(options.paths / (width * height)))))

@@ -10,7 +10,6 @@ import numpy as np
 import trimesh
 import warp as wp
 
-from synpick_warp.configs.cell import bin_sizes
 from synpick_warp.configs.rig import Rig
 from synpick_warp.configs.schema import FAST, REFERENCE, Cameras, Config
 from synpick_warp.factory.assembly import make_renderer
@@ -72,7 +71,7 @@ class Studio:
 
 def make_studio(config: Config, catalog: Catalog, cameras: tuple[Camera, ...], lights: tuple[EnvironmentMap, ...], device: Any) -> Studio:
     """Build a scene and its renderer, without light histories."""
-    fixtures = make_fixtures(make_bins(bin_sizes(config)), config.gripper)
+    fixtures = make_fixtures(make_bins(config.cell.bins), config.gripper)
     scene = build_render_scene(config.render, -config.tote.wall, catalog, fixtures, cameras, lights, device)
     return Studio(make_renderer(config, scene, config.arrangement.max_objects, 1))
 

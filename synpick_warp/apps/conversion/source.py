@@ -12,7 +12,6 @@ from typing import Any
 from synpick_warp.apps.conversion.scenes import StoredSceneFiles
 from synpick_warp.apps.conversion.trajectories import check_trajectory, read_ticks
 from synpick_warp.codes import Ending
-from synpick_warp.configs.cell import recorded_bins
 from synpick_warp.configs.schema import Config
 from synpick_warp.configs.splits import DataLayout
 from synpick_warp.dataset.annotations import ADVICE, check_content
@@ -102,7 +101,7 @@ class Source:
 
     def ticks(self, end: EpisodeEnd) -> Iterator[TickBatch]:
         """Yield the ticks of an episode's stored trajectory. See `trajectories.read_ticks`."""
-        return read_ticks(self.data[end.episode], self.config.physics.steps_per_tick, recorded_bins(self.config))
+        return read_ticks(self.data[end.episode], self.config.physics.steps_per_tick, self.config.cell.recorded)
 
     def episode_end(self, index: int) -> EpisodeEnd:
         """How a committed episode ended.

@@ -108,7 +108,7 @@ def _read_light(data: Episode) -> _Light:
 
 def read_ticks(data: Episode, steps_per_tick: int, bins: Sequence[str]) -> Iterator[TickBatch]:
     """Yield the frames of an episode, as they came from the simulation, with gripper state and setpoints if there are any; poses of absent
-    instances are NaN. `bins`: of `recorded_bins`.
+    instances are NaN. `bins`: as `Cell.recorded`.
 
     Raises:
         DatasetError: The episode's bin is none of them.

@@ -30,7 +30,6 @@ from synpick_warp.apps.report.strips import choose_episodes, make_strip
 from synpick_warp.apps.report.tables import findings_list, settings_tables, statistics_tables, tiles
 from synpick_warp.apps.statistics import Statistics, compute_statistics
 from synpick_warp.apps.viz.depth_colors import bin_scale
-from synpick_warp.configs.cell import bin_sizes
 from synpick_warp.dataset.commit.manifest import read_manifest
 from synpick_warp.dataset.reading import DataSet
 from synpick_warp.dataset.view import View
@@ -120,7 +119,7 @@ def take_samples(data_set: DataSet, statistics: Statistics, episodes: Episodes, 
     asked["frames"] = len(views)
     for done, view in enumerate(views):
         report("frames", done, len(views))
-        scale = None if data_set.found else bin_scale(bin_sizes(data_set.config), [view.records.camera])
+        scale = None if data_set.found else bin_scale(data_set.config.cell.bins, [view.records.camera])
         data["frames"] += _present(make_frame(view, content, names, episodes.rows[view.episode].mode, album, scale))
     chosen = choose_episodes(episodes)
     asked["strips"] = len(chosen)

@@ -17,7 +17,6 @@ from synpick_warp.apps.viz.depth_colors import DepthScale, bin_scale, color_dept
 from synpick_warp.apps.viz.drawing import GOLDEN, Image, check_picture_name, instance_color, put_text, write_picture
 from synpick_warp.apps.viz.preview_layers import layer_pictures
 from synpick_warp.apps.viz.preview_legend import PAPER, Box, draw_labels, draw_legend, label_texts, legend_width
-from synpick_warp.configs.cell import bin_sizes
 from synpick_warp.configs.load import load_config
 from synpick_warp.configs.schema import Config
 from synpick_warp.configs.splits import DataLayout
@@ -84,7 +83,7 @@ def write_contact_sheet(dataset: Path, out: Path, views: int) -> Path:
         raise OutputError(f"{views} views requested; a contact sheet has at least 1")
     shown = list(_read_views(sample(find_scenes(dataset), views)))
     baked = read_baked(dataset, {record["obj_id"] for view in shown for record, _ in view.truth})
-    scale = bin_scale(bin_sizes(baked.config), [view.camera for view in shown]) if baked.config else None
+    scale = bin_scale(baked.config.cell.bins, [view.camera for view in shown]) if baked.config else None
     scale = scale or pooled_scale(depth for view in shown if (depth := _read_depth(view)) is not None)
     most = max(len(view.truth) for view in shown)
     rows = [_row(view, scale, baked, most) for view in shown]

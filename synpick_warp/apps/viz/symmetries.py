@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -10,8 +10,6 @@ import cv2
 import numpy as np
 
 from synpick_warp.apps.viz.drawing import INK, WHITE, Image, put_text, write_picture
-from synpick_warp.configs.schema import Config
-from synpick_warp.scenes.catalog import read_objects
 from synpick_warp.scenes.symmetries.detection import Turn, find_axes, turn_matrix
 from synpick_warp.scenes.symmetries.surface import Surface
 from synpick_warp.scenes.types import RawObject
@@ -40,17 +38,16 @@ class _Drawn:
     colors: np.ndarray
 
 
-def write_symmetry_sheet(config: Config, out: Path, report: Callable[[str], None]) -> Path:
-    """Draw the symmetries of all objects that `config` names, detected where `objects.symmetries` says so; returns the path.
+def write_symmetry_sheet(objects: Sequence[RawObject], tolerance: float, out: Path, report: Callable[[str], None]) -> Path:
+    """Draw the symmetries of objects, with distances up to a tolerance [diameters]; returns the path.
 
     Raises:
-        CatalogError: The models cannot be read.
         OutputError: The picture cannot be written.
     """
-    objects = sorted(read_objects(config, report), key=lambda raw: raw.obj_id)
+    objects = sorted(objects, key=lambda raw: raw.obj_id)
     if len(objects) > MAX_OBJECTS:
         report(f"the first {MAX_OBJECTS} of {len(objects)} objects are drawn")
-    rows = [_row(raw, config.objects.symmetry_tolerance * raw.hull.diameter) for raw in objects[:MAX_OBJECTS]]
+    rows = [_row(raw, tolerance * raw.hull.diameter) for raw in objects[:MAX_OBJECTS]]
     width = max(row.shape[1] for row in rows)
     sheet = [cv2.copyMakeBorder(row, 0, 0, 0, width - row.shape[1], cv2.BORDER_CONSTANT, value=WHITE) for row in rows]
     return write_picture(out, np.concatenate(sheet))

@@ -68,11 +68,17 @@ def _preview_symmetries(folder: Path | None, out: Path | None, config: str | Non
     sheet = out or beside(folder, "-symmetries.png")
     from synpick_warp.apps.viz.drawing import check_picture_name
     from synpick_warp.apps.viz.symmetries import write_symmetry_sheet
+    from synpick_warp.scenes.catalog import read_objects
 
     check_picture_name(sheet)
     check_output_file(sheet, "--out", folder)
     resolved = load_config(config, settings | {"bake.models": str(models)})
-    write_symmetry_sheet(replace(resolved, object_rows=()) if is_set else resolved, sheet, lambda line: print(escape(line)))
+    resolved = replace(resolved, object_rows=()) if is_set else resolved
+
+    def report(line: str) -> None:
+        print(escape(line))
+
+    write_symmetry_sheet(read_objects(resolved, report), resolved.objects.symmetry_tolerance, sheet, report)
     print(f"symmetries: {escape(str(sheet))}")
     return 0
 

@@ -9,7 +9,6 @@ from dataclasses import fields, replace
 import numpy as np
 import warp as wp
 
-from synpick_warp.configs.cell import bin_sizes
 from synpick_warp.configs.rig import Rig
 from synpick_warp.configs.schema import UNOCCLUDED
 from synpick_warp.factory.assembly import Factory, make_renderer
@@ -51,7 +50,7 @@ def _measure_size(factory: Factory, cameras: tuple[Camera, ...], worlds: int, mi
     ours = make_views_of(factory, config.render.mode, cameras, snapshot, worlds)
     meshes = [(entry.mesh, entry.material) for entry in factory.catalog.entries]
     table = (float(scene.table.height), config.render.table_color) if config.render.table else None
-    theirs = RayScene(meshes, make_fixtures(make_bins(bin_sizes(config)), config.gripper), cameras, table, snapshot, worlds, device)
+    theirs = RayScene(meshes, make_fixtures(make_bins(config.cell.bins), config.gripper), cameras, table, snapshot, worlds, device)
 
     def time_view(function: functools.partial[None]) -> float:
         """Time of one view [s]."""

@@ -15,7 +15,6 @@ from newton.sensors import SensorCamera
 from scipy.spatial.transform import Rotation
 
 from synpick_warp.codes import Segment
-from synpick_warp.configs.cell import bin_sizes
 from synpick_warp.configs.schema import Render
 from synpick_warp.factory.assembly import Factory
 from synpick_warp.scenes.bins import make_bins
@@ -223,7 +222,7 @@ def measure_sensor(factory: Factory, min_seconds: float) -> Iterator[Row]:
     device, snapshot = simulation.device, simulation.record.snapshot
     count = min(factory.stream.rings[0].batch, simulation.layout.worlds * len(factory.cameras))
     started = time.perf_counter()
-    fixtures = make_fixtures(make_bins(bin_sizes(config)), config.gripper)
+    fixtures = make_fixtures(make_bins(config.cell.bins), config.gripper)
     table = float(renderer.scene.table.height)
     scene = build_sensor_scene(config.render, factory.catalog, fixtures, factory.cameras, table, snapshot, count, device)
     wp.synchronize_device(device)
