@@ -7,6 +7,7 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 
 import pytest
@@ -70,6 +71,21 @@ def test_a_server_that_has_ended_is_started_again():
     assert isolation._server._worker is not None
     isolation._server._worker.process.kill()
     assert list(run_isolated(math.sqrt, [(4.0,)], LIMITS)) == [2.0]
+
+
+def test_calls_that_are_left_end_wherever_they_are_collected():
+    """The garbage collector may run while a thread starts, which holds the lock that joining a thread takes."""
+    results = run_isolated(time.sleep, [(0.0,), (600.0,)], LIMITS)
+    next(results)
+
+    def collect() -> None:
+        with threading._shutdown_locks_lock:  # type: ignore[attr-defined]
+            results.close()  # type: ignore[attr-defined]
+
+    thread = threading.Thread(target=collect, daemon=True)
+    thread.start()
+    thread.join(20)
+    assert not thread.is_alive()
 
 
 PROGRAM = """

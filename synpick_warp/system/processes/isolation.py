@@ -131,19 +131,21 @@ def run_isolated(function: Callable[..., Any], calls: Sequence[tuple[Any, ...]],
     if not calls:
         return
     links = _Links()
-    with ThreadPoolExecutor(min(len(calls), count_cores()), thread_name_prefix=SETUP) as threads:
-        try:
-            yield from threads.map(lambda arguments: links.call(pickle.dumps((function, arguments)), limits), calls)
-        finally:
-            # After an error, or Ctrl-C, nobody waits for the other calls.
-            links.close()
+    threads = ThreadPoolExecutor(min(len(calls), count_cores()), thread_name_prefix=SETUP)
+    try:
+        yield from threads.map(lambda arguments: links.call(pickle.dumps((function, arguments)), limits), calls)
+    finally:
+        # After an error, or Ctrl-C, nobody waits for the other calls. Nor for the threads, which end by themselves: of a generator that was
+        # left before its end this runs in the garbage collector, in any thread, which may hold the lock that joining a thread takes.
+        links.close()
+        threads.shutdown(wait=False)
 
 
 class _Links:
     """The links of the running calls, to be closed together."""
 
     def __init__(self) -> None:
-        self._lock = threading.Lock()
+        self._lock = threading.RLock()  # The garbage collector may close links in the thread that opens one.
         self._open: set[socket.socket] = set()
         self._closed = False
 
