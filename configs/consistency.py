@@ -31,7 +31,7 @@ from synpick_warp.configs.splits import MAX_SHARD_SCENES, DataLayout
 from synpick_warp.errors import format_value
 
 _NAME = re.compile(r"(?!(tote|table|pallet)$)[a-z0-9_]{1,32}")
-"""Name of a bin: no other kind's, and one that prims of USD can have."""
+"""Regular expression of valid bin names: identifiers, as USD needs for prims, that are not the name of another kind of bin."""
 _MIN_COMPARTMENT = 0.03
 """Least length and width of a compartment [m]."""
 _SPLIT = re.compile(r"(train|val|test)(_[A-Za-z0-9]+)*")

@@ -22,7 +22,7 @@ MOST_CHOICES = 256
 
 @dataclass(frozen=True)
 class Distribution:
-    """Probability distribution of a number; of subclasses, of a vector whose components are independent.
+    """Probability distribution of a scalar; subclasses draw vectors with independent components.
 
     In TOML: a value (`0.5`), "off", or a table of one kind: `{ uniform = [low, high] }`, `{ log_uniform = [low, high] }`,
     `{ normal = [mean, sigma] }`, clamped to the setting's range, or `{ choice = [value, ...], weights = [...] }`.

@@ -119,7 +119,7 @@ def position(pose: Pose) -> Vector:
 
 
 def viewing_direction(pose: Pose) -> Vector:
-    """Direction of the optical axis of a valid pose, not normalized."""
+    """Viewing direction of a camera pose, along the optical axis, unnormalized; the pose must be valid."""
     if pose.matrix is not None:
         return pose.matrix[0][2], pose.matrix[1][2], pose.matrix[2][2]
     if pose.quaternion is not None:

@@ -90,6 +90,6 @@ def change_rows(key: str, kind: type[Any], rows: tuple[Any, ...], changes: Mappi
 
 
 def given_values(row: Any) -> dict[str, Any]:
-    """Settings of a row that are given, by name: all but those that are None; tables as dictionaries."""
+    """Convert a row to a dictionary of the settings that are given (not None); nested tables become dictionaries."""
     values = ((name, getattr(row, name)) for name in settings_of(type(row)))
     return {name: given_values(value) if is_table(type(value)) else value for name, value in values if value is not None}

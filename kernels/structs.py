@@ -110,7 +110,7 @@ class BinData:
     lift: wp.array[float]
     """(bin): z of the bin's frame where it stands on the table [m]."""
     shift: wp.vec2
-    """Half widths of the offset in x and y [m]."""
+    """Half widths of the uniform distribution of the bin's offset in x and y [m]."""
     yaw: float
     """Half width of the rotation about z [rad]."""
     reach: wp.array[wp.vec2]

@@ -11,5 +11,5 @@ from synpick_warp.scenes.types import Fixture
 
 
 def make_fixtures(bins: Sequence[Bin], gripper: Gripper) -> tuple[Fixture, ...]:
-    """Visual meshes and materials of the bins, then of gripper shaft and suction cup, as `build_render_scene` takes them."""
+    """Create the visual meshes and materials of all bins, the gripper shaft and the suction cup, in this order."""
     return (*(one.fixture for one in bins), finger_fixture(gripper), cup_fixture(gripper))

@@ -252,7 +252,7 @@ class LensMap:
         return found
 
     def _refusal(self, limit: float, folds: bool) -> str:
-        """Message on an image that the lens does not cover."""
+        """Error message for an image with pixels that no ray through the lens reaches."""
         corners = np.array([(x, y) for x in (0, self.size[0]) for y in (0, self.size[1])])
         away = np.max(np.linalg.norm(corners - self._center, axis=1))
         edge, _ = self.lens.linearize(limit * _directions(_ANGLES))

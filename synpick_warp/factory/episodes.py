@@ -20,9 +20,6 @@ PLACES = 6
 """Decimal places of a time [s]; more would be noise."""
 
 
-"""Fields without a key where they are empty."""
-
-
 class EpisodeRow(NamedTuple):
     """Line of episodes.jsonl and of the summary; the fields are the JSON keys. Counts are 0 if the episode is not part of the data set."""
 

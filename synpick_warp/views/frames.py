@@ -147,7 +147,7 @@ class TickBatch:
     bin: np.ndarray
     """Index of the episode's bin (W) int32."""
     fixture_pose: np.ndarray
-    """Poses of bin, gripper shaft ("finger") and cup, in the same form (W, 3, 7) float32."""
+    """Fixture-to-world poses of the bin, the gripper shaft ("finger") and the cup: x, y, z [m], quaternion x, y, z, w (W, 3, 7) float32."""
     fixture_visible: np.ndarray
     """1 if the fixture is visible in the images, else 0 (W, 3) int32."""
     light: np.ndarray

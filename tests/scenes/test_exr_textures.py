@@ -47,7 +47,7 @@ def test_channels_of_any_name_and_kind(tmp_path, channels, linear, expected):
 
 
 def test_maps_of_a_material_library(tmp_path):
-    """Albedo is light and becomes sRGB, roughness and metallic are numbers; a normal map is named as ignored."""
+    """Base colour maps are converted to sRGB, roughness and metallic maps stay linear, and normal maps are reported as ignored."""
     put(tmp_path / "a.obj", OBJ)
     put(tmp_path / "a.mtl", MTL)
     write_exr(tmp_path / "maps" / "albedo.exr", R=plane(0.2), G=plane(0.5), B=plane(1.0))

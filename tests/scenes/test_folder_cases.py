@@ -184,7 +184,7 @@ def test_a_folder_per_object_with_textures_beside(tmp_path, mtl, depth):
 
 
 YCB = "002_master_chef_can"
-"""A name of YCB's, whose download has several resolutions and reconstructions of an object, and point clouds."""
+"""Name of an object folder in the YCB data set; its download has meshes of several resolutions and reconstructions, and point clouds."""
 
 
 @pytest.mark.parametrize(

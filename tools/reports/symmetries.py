@@ -95,7 +95,7 @@ def _holds(move: np.ndarray, discrete: np.ndarray, axes: list[np.ndarray]) -> bo
 
 
 def _verdict(lacking: int, beyond: int, off: float, tolerance: float) -> str:
-    """Words for a comparison, with the reason for a difference."""
+    """Describe how detected and listed symmetries compare, with the reason for a difference."""
     parts = []
     if lacking:
         reason = f"{100 * off:.1f} % are more than {100 * tolerance:g} %" if off > tolerance else "not found"
@@ -106,7 +106,7 @@ def _verdict(lacking: int, beyond: int, off: float, tolerance: float) -> str:
 
 
 def _counts(counts: tuple[int, int]) -> str:
-    """Numbers of discrete and continuous symmetries as words."""
+    """Format the numbers of discrete and continuous symmetries as text."""
     return ", ".join(f"{count} {kind}" for count, kind in zip(counts, ("discrete", "continuous"), strict=True) if count) or "none"
 
 
