@@ -96,8 +96,8 @@ def test_what_a_camera_covers_is_said():
     lines = describe_camera(BENT, "left", tote)
     assert lines[0].startswith("left: 80 x 60 px, 4")
     assert lines[1].endswith(", pinhole 5 coefficients")
-    assert describe_camera(TOP, "top", tote)[2] == "2.00 m to the floor, 20 mm/px; sees 8 of 8 corners of the tote"
-    assert "sees 0 of 8" in describe_camera(camera(80, 60, 100.0, (3.0, 0.0, 2.0)), "off", tote)[2]
+    assert describe_camera(TOP, "top", tote)[2] == "2.00 m to the floor, 20 mm/px; 8 of 8 corners of the tote in view"
+    assert "; 0 of 8 corners" in describe_camera(camera(80, 60, 100.0, (3.0, 0.0, 2.0)), "off", tote)[2]
 
 
 CELL = """preset = "smoke"

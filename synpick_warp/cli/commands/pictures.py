@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
@@ -109,13 +110,13 @@ def _preview_cell(cell: str, out: Path | None) -> int:
     return 0
 
 
-def draw_cell(config: Config, name: str, out: Path) -> None:
-    """Draw a cell, with the progress on the console; arguments and errors as of `write_cell_sheet`."""
+def draw_cell(config: Config, name: str, out: Path, say: Callable[[str], str] = escape) -> None:
+    """Draw a cell, with the progress on the console; `say` words notes; other arguments and errors as of `write_cell_sheet`."""
     from synpick_warp.apps.viz.cell.sheet import write_cell_sheet
     from synpick_warp.cli.display import make_console, make_progress
 
     with make_progress(make_console()) as progress:
-        write_cell_sheet(config, name, out, progress)
+        write_cell_sheet(config, name, out, progress, lambda note: progress.note(say(note)))
 
 
 def explain(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -60,7 +60,7 @@ class Laid:
 class CellScene:
     """What a cell shows before anything is simulated."""
 
-    def __init__(self, config: Config, progress: Progress) -> None:
+    def __init__(self, config: Config, progress: Progress, report: Callable[[str], None]) -> None:
         """Read the objects, and build the scene.
 
         Raises:
@@ -71,7 +71,7 @@ class CellScene:
         self.sizes = config.cell.bins
         bins = make_bins(self.sizes)
         progress.stage("reading objects")
-        self.objects = read_objects(config, progress.note)
+        self.objects = read_objects(config, report)
         self.laid = [lay_out(self.objects, sizes) for sizes in self.sizes]
         catalog = Catalog(tuple(map(_entry, self.objects)))
         light = next(sky for sky in skies() if sky.name == _SKY)

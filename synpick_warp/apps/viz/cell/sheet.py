@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import colorsys
 import math
+from collections.abc import Callable
 from pathlib import Path
 
 import cv2
@@ -41,21 +42,22 @@ _MAX_NAMED = 16
 """Most objects that are named."""
 
 
-def write_cell_sheet(config: Config, name: str, out: Path, progress: Progress) -> Path:
+def write_cell_sheet(config: Config, name: str, out: Path, progress: Progress, report: Callable[[str], None]) -> Path:
     """Draw the cell of a configuration, and write the image file; returns its path.
 
     Args:
         config: All settings.
         name: What the sheet is of, for its title.
         out: PNG or JPEG file to write; its folder is created.
-        progress: Observer.
+        progress: Observer of the stages.
+        report: Called with each line on what is corrected in, or left out of, the objects.
 
     Raises:
         SynpickError: Device, bins, cameras or all objects cannot be used, or the file cannot be written.
     """
     check_picture_name(out)
     cameras = make_cameras(config.rig)
-    scene = CellScene(config, progress)
+    scene = CellScene(config, progress, report)
     progress.stage(f"rendering {len(cameras)} cameras")
     bins = scene.sizes[:MAX_BINS]
     outside = _outside_camera(scene, cameras)
@@ -152,7 +154,7 @@ def describe_camera(camera: Camera, name: str, bin: BinSizes) -> list[str]:
     return [
         f"{name}: {width} x {height} px, {across:.1f} x {down:.1f} deg",
         f"fx {fx:.1f} fy {fy:.1f} cx {cx:.1f} cy {cy:.1f}{lens}",
-        f"{floor}; sees {inside.sum()} of {len(inside)} corners of the {bin.noun}",
+        f"{floor}; {inside.sum()} of {len(inside)} corners of the {bin.noun} in view",
     ]
 
 
