@@ -1,10 +1,11 @@
-"""The README's fenced lines, extracted and run as written in an empty folder; and its links."""
+"""Fenced lines of the README and of the page on a cell of one's own, extracted and run in an empty folder; and links of documents."""
 
 from __future__ import annotations
 
 import importlib.util
 import os
 import re
+import shlex
 import subprocess
 import sys
 import tomllib
@@ -12,10 +13,12 @@ from pathlib import Path
 
 import pytest
 
+from tests.builders import PICKING, assignments
 from tests.harness.environment import checkout_environment
 
 ROOT = Path(__file__).resolve().parents[1]
 README = (ROOT / "README.md").read_text()
+CELL = (ROOT / "configs" / "CELL.md").read_text()
 BLOCK = re.compile(r"(?P<skipped><!-- not run: [^\n]* -->\n)?```(?P<language>bash|python)\n(?P<text>.*?)```\n", re.DOTALL)
 FOLDERS = (".github", "configs", "kernels", "scenes", "synpick_warp", "tests", "tools")
 HISTORY = ROOT / "CHANGELOG.md"
@@ -31,20 +34,15 @@ SECONDS = 600
 """Longest time that a block may take."""
 
 
-def blocks() -> list[tuple[str, str]]:
+def blocks(document: str) -> list[tuple[str, str]]:
     """(language, text) of the blocks that run, in order."""
-    return [(match["language"], match["text"]) for match in BLOCK.finditer(README) if not match["skipped"]]
+    return [(match["language"], match["text"]) for match in BLOCK.finditer(document) if not match["skipped"]]
 
 
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory) -> Path:
-    return tmp_path_factory.mktemp("readme")
-
-
-@pytest.fixture(scope="module")
-def environment(folder) -> dict[str, str]:
+@pytest.fixture
+def environment(tmp_path) -> dict[str, str]:
     """The package importable from anywhere, a stand-in for PyTorch where it is missing, and a command `synpick-warp`."""
-    command = folder / "bin" / "synpick-warp"
+    command = tmp_path / "bin" / "synpick-warp"
     command.parent.mkdir()
     command.write_text(f'#!/bin/sh\nexec "{sys.executable}" -m synpick_warp "$@"\n')
     command.chmod(0o755)
@@ -53,15 +51,35 @@ def environment(folder) -> dict[str, str]:
     return checkout_environment(PYTHONPATH=os.pathsep.join([str(ROOT), paths]), PATH=f"{command.parent}:{os.environ['PATH']}")
 
 
-@pytest.mark.slow
-def test_the_lines_of_the_readme_run_as_written(folder, environment):
-    assert [language for language, _ in blocks()].count("python") == 3
-    for language, text in blocks():
+def run_blocks(document: str, folder: Path, environment: dict[str, str]) -> str:
+    """Run the blocks of a document; returns what they print."""
+    said = ""
+    for language, text in blocks(document):
         program = [sys.executable, "-c", text] if language == "python" else ["bash", "-e", "-c", text]
         done = subprocess.run(program, cwd=folder, env=environment, capture_output=True, text=True, timeout=SECONDS)
         assert done.returncode == 0, f"{text}\n{done.stdout}\n{done.stderr}"
-    assert (folder / "DATA.png").stat().st_size > 10_000
-    assert (folder / "view.png").stat().st_size > 10_000
+        said += done.stdout
+    return said
+
+
+@pytest.mark.slow
+def test_the_lines_of_the_readme_run_as_written(tmp_path, environment):
+    assert [language for language, _ in blocks(README)].count("python") == 3
+    run_blocks(README, tmp_path, environment)
+    assert (tmp_path / "DATA.png").stat().st_size > 10_000
+    assert (tmp_path / "view.png").stat().st_size > 10_000
+
+
+@pytest.mark.slow
+def test_the_page_on_ones_own_cell_leads_to_a_valid_data_set(tmp_path, environment):
+    """Settings of a quick bake are all that is added."""
+    bake = "synpick-warp bake "
+    assert CELL.count(f"\n{bake}") == 1
+    said = run_blocks(CELL.replace(f"\n{bake}", f"\n{bake}{shlex.join(assignments(PICKING))} --device cpu "), tmp_path, environment)
+    assert "0 errors" in said
+    assert "bracket.stl: 80 x 40 x 30 mm, unit mm" in said
+    for name in ("CELL/cell.png", "symmetries.png", "DATA.png", "DATA-report.html", "DATA/camera_left.json", "DATA/usd/000000.usdc"):
+        assert (tmp_path / name).stat().st_size > 100, name
 
 
 @pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: path.relative_to(ROOT).as_posix())

@@ -73,7 +73,7 @@ def write_cell_sheet(config: Config, name: str, out: Path, progress: Progress, r
 def _outside_camera(scene: CellScene, cameras: tuple[Camera, ...]) -> Camera:
     """A camera that sees all cameras, bins and the gripper; its principal point centres them."""
     corners = np.array([corner for one in scene.sizes for corner in one.corners])
-    top = (*scene.tcp[:2], scene.tcp[2] + scene.config.gripper.finger_length)
+    top = (*scene.tcp[:2], scene.tcp[2] + scene.config.gripper.cup_length + scene.config.gripper.finger_length)
     points = np.concatenate([corners, [center(camera) for camera in cameras], [scene.tcp, top]])
     middle = (points.min(axis=0) + points.max(axis=0)) / 2.0
     azimuth, elevation = math.radians(_AZIMUTH), math.radians(_ELEVATION)
