@@ -8,8 +8,9 @@ import warp as wp
 
 from synpick_warp.codes import Look, LookKind, LookPart, Stream
 from synpick_warp.kernels.render.lighting.materials import Surfaces
-from synpick_warp.kernels.render.visibility.camera import Views
+from synpick_warp.kernels.render.visibility.camera import AnyViews
 from synpick_warp.kernels.render.visibility.gbuffer import FIXTURES, Meshes, ViewBodies
+from synpick_warp.kernels.render.visibility.variants import view_kernel
 from synpick_warp.kernels.rng import TAU, normal_pair, pixel_key, stream_key, uniform
 
 wp.set_module_options({"enable_backward": False})
@@ -163,7 +164,7 @@ def draw_material(table: LookTable, surfaces: Surfaces, base: int, key: wp.uint6
     return result
 
 
-@wp.kernel
+@view_kernel
 def dress_bodies_kernel(
     # Scene:
     seed: wp.uint64,
@@ -172,7 +173,7 @@ def dress_bodies_kernel(
     # State:
     episode: wp.array[int],  # (world)
     # In:
-    views: Views,
+    views: AnyViews,
     # Out:
     bodies_inout: ViewBodies,
     surfaces_inout: Surfaces,

@@ -21,6 +21,7 @@ from synpick_warp.kernels.render.images.layers import (
     render_scene_flow_kernel,
 )
 from synpick_warp.kernels.render.visibility.camera import TILE_PIXELS
+from synpick_warp.kernels.render.visibility.variants import kernel_for
 from synpick_warp.stages.arrays import allocate_struct, struct_arrays
 from synpick_warp.stages.buffers import FIXTURES, LayerBuffers, Snapshot
 from synpick_warp.stages.launch import launch_pixels
@@ -112,7 +113,7 @@ class LayerRenderer:
         inputs = [snapshot.catalog_index, snapshot.pose, snapshot.fixture_pose, snapshot.follows]
         inputs += [snapshot.last_catalog_index, snapshot.last_pose, snapshot.last_fixture_pose, snapshot.last_fixture_visible, views]
         dim = (views.count, self.motions.known.shape[1])
-        wp.launch(compute_motions_kernel, dim=dim, inputs=inputs, outputs=[self.motions], device=self.scene.device)
+        wp.launch(kernel_for(compute_motions_kernel, views), dim=dim, inputs=inputs, outputs=[self.motions], device=self.scene.device)
 
     def _launch(self, kernel: wp.Kernel, count: int, inputs: list[Any], output: wp.array) -> None:
         """Launch a kernel over all pixels of `count` views."""

@@ -14,6 +14,7 @@ from synpick_warp.kernels.render.lighting.looks import LookDistribution, LookTab
 from synpick_warp.kernels.render.lighting.materials import Surfaces
 from synpick_warp.kernels.render.lighting.paths.tracing import PathScene
 from synpick_warp.kernels.render.visibility.gbuffer import FIXTURES
+from synpick_warp.kernels.render.visibility.variants import kernel_for
 from synpick_warp.scenes.looks import Looks
 from synpick_warp.stages.buffers import Snapshot
 from synpick_warp.stages.render.scene import RenderScene
@@ -130,7 +131,11 @@ class Dresser:
         scene = self.scene
         inputs = [self._seed, scene.meshes, self._table, snapshot.episode, views]
         wp.launch(
-            dress_bodies_kernel, dim=(views.count, self._materials), inputs=inputs, outputs=[bodies, scene.surfaces], device=scene.device
+            kernel_for(dress_bodies_kernel, views),
+            dim=(views.count, self._materials),
+            inputs=inputs,
+            outputs=[bodies, scene.surfaces],
+            device=scene.device,
         )
 
 
