@@ -13,7 +13,7 @@ from synpick_warp.kernels.render.lighting.sampling import UNIT, reverse_bits
 from synpick_warp.kernels.render.visibility.bvh_rays import hit_table, trace_bodies
 from synpick_warp.kernels.render.visibility.camera import AnyViews, ImageGrid, camera_ray, clamp_index, in_image, tile_of, tile_pixel
 from synpick_warp.kernels.render.visibility.gbuffer import GBuffer, Hit, Meshes, Table, ViewBodies, body_of, face_normal, triangle_normal
-from synpick_warp.kernels.render.visibility.variants import view_kernel
+from synpick_warp.kernels.render.visibility.variants import kernel_of_views
 from synpick_warp.kernels.tuning import RAY_REGISTERS
 
 wp.set_module_options({"enable_backward": False, "fast_math": True})
@@ -189,7 +189,7 @@ def has_discontinuity(
     )
 
 
-@view_kernel
+@kernel_of_views
 def find_footprints_kernel(
     # Scene:
     grid: ImageGrid,
@@ -309,7 +309,7 @@ def select_source(
     return best
 
 
-@view_kernel(cuda_max_registers=RAY_REGISTERS)
+@kernel_of_views(cuda_max_registers=RAY_REGISTERS)
 def resolve_footprints_kernel(
     # Scene:
     meshes: Meshes,

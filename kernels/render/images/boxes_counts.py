@@ -5,7 +5,7 @@ import warp as wp
 from synpick_warp.kernels.render.visibility.bvh_rays import hits_body
 from synpick_warp.kernels.render.visibility.camera import AnyViews, ImageGrid, border_ray, in_image
 from synpick_warp.kernels.render.visibility.gbuffer import Meshes, ViewBodies
-from synpick_warp.kernels.render.visibility.variants import view_kernel
+from synpick_warp.kernels.render.visibility.variants import kernel_of_views
 
 wp.set_module_options({"enable_backward": False})
 
@@ -181,7 +181,7 @@ def find_box(first_chunk: wp.array[int], listed: int, chunk: int) -> int:
     return low
 
 
-@view_kernel
+@kernel_of_views
 def count_border_pixels_kernel(
     # Scene:
     meshes: Meshes,

@@ -4,7 +4,7 @@ import warp as wp
 
 from synpick_warp.codes import Effect, Stream
 from synpick_warp.kernels.render.visibility.camera import AnyViews
-from synpick_warp.kernels.render.visibility.variants import view_kernel
+from synpick_warp.kernels.render.visibility.variants import kernel_of_views
 from synpick_warp.kernels.rng import normal_pair, pixel_key, uniform, view_key
 
 wp.set_module_options({"enable_backward": False})
@@ -28,7 +28,7 @@ class EffectRanges:
     """Largest value of each parameter."""
 
 
-@view_kernel
+@kernel_of_views
 def sample_effects_kernel(
     # State:
     episode: wp.array[int],  # (world)

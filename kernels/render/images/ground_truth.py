@@ -4,7 +4,7 @@ import warp as wp
 
 from synpick_warp.kernels.render.images.layers import position_of, rotation_of
 from synpick_warp.kernels.render.visibility.camera import AnyViews
-from synpick_warp.kernels.render.visibility.variants import view_kernel
+from synpick_warp.kernels.render.visibility.variants import kernel_of_views
 
 wp.set_module_options({"enable_backward": False})
 
@@ -27,7 +27,7 @@ def rigid_transform(r: wp.mat33d, t: wp.vec3d) -> wp.mat44:
     )  # fmt: skip
 
 
-@view_kernel
+@kernel_of_views
 def gather_cameras_kernel(
     # State:
     episode: wp.array[int],  # (world)
@@ -53,7 +53,7 @@ def gather_cameras_kernel(
     world_to_camera_out[view] = rigid_transform(rotation, -(rotation * views.cameras.center[view]))
 
 
-@view_kernel
+@kernel_of_views
 def gather_objects_kernel(
     # Scene:
     object_ids: wp.array[int],  # (entry)

@@ -28,7 +28,7 @@ from synpick_warp.kernels.render.visibility.camera import (
 )
 from synpick_warp.kernels.render.visibility.gbuffer import GBuffer, Meshes, ViewBodies, body_of
 from synpick_warp.kernels.render.visibility.lens import distort
-from synpick_warp.kernels.render.visibility.variants import view_kernel
+from synpick_warp.kernels.render.visibility.variants import kernel_of_views
 
 wp.set_module_options({"enable_backward": False})
 
@@ -64,7 +64,7 @@ def position_of(pose: wp.transformf) -> wp.vec3d:
     return wp.vec3d(wp.float64(p[0]), wp.float64(p[1]), wp.float64(p[2]))
 
 
-@view_kernel
+@kernel_of_views
 def compute_motions_kernel(
     # Scene:
     # State:
@@ -136,7 +136,7 @@ def hit_surface(
     return interpolate_surface(meshes, surfaces, bodies, view, body_of(segment, instances), triangle, barycentric, to_camera, width)
 
 
-@view_kernel
+@kernel_of_views
 def render_normals_kernel(
     # Scene:
     meshes: Meshes,
@@ -164,7 +164,7 @@ def render_normals_kernel(
     normals_out[view, row, column] = normal
 
 
-@view_kernel
+@kernel_of_views
 def render_albedo_kernel(
     # Scene:
     meshes: Meshes,
@@ -192,7 +192,7 @@ def render_albedo_kernel(
     albedo_out[view, row, column] = wp.vec3ub(srgb_byte(color[0]), srgb_byte(color[1]), srgb_byte(color[2]))
 
 
-@view_kernel
+@kernel_of_views
 def render_nocs_kernel(
     # Scene:
     meshes: Meshes,
@@ -225,7 +225,7 @@ def render_nocs_kernel(
     nocs_out[view, row, column] = coordinates
 
 
-@view_kernel
+@kernel_of_views
 def render_classes_kernel(
     # Scene:
     grid: ImageGrid,
@@ -270,7 +270,7 @@ def point_displacement(
     return motions.rotation[view, body] * (point - motions.origin[view, body]) + motions.displacement[view, body]
 
 
-@view_kernel
+@kernel_of_views
 def render_scene_flow_kernel(
     # Scene:
     grid: ImageGrid,
@@ -296,7 +296,7 @@ def render_scene_flow_kernel(
     scene_flow_out[view, row, column] = displacement
 
 
-@view_kernel
+@kernel_of_views
 def render_flow_kernel(
     # Scene:
     grid: ImageGrid,

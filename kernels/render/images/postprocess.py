@@ -16,7 +16,7 @@ from synpick_warp.kernels.render.images.camera_effects import (
 from synpick_warp.kernels.render.lighting.color import srgb_byte
 from synpick_warp.kernels.render.lighting.environment import Lights
 from synpick_warp.kernels.render.visibility.camera import PIXEL_CENTER, AnyCameras, AnyViews, ImageGrid, camera_ray, in_image, tile_pixel
-from synpick_warp.kernels.render.visibility.variants import view_kernel
+from synpick_warp.kernels.render.visibility.variants import kernel_of_views
 from synpick_warp.kernels.rng import view_key
 
 wp.set_module_options({"enable_backward": False, "fast_math": True})
@@ -51,7 +51,7 @@ def encode_display(linear: float, tone: int) -> wp.uint8:
     return srgb_byte(x)
 
 
-@view_kernel
+@kernel_of_views
 def postprocess_kernel(
     # Scene:
     grid: ImageGrid,
@@ -137,7 +137,7 @@ def filter_lens(
     return total / weights
 
 
-@view_kernel
+@kernel_of_views
 def filter_lens_rows_kernel(
     # Scene:
     grid: ImageGrid,
@@ -174,7 +174,7 @@ class PostProcessSettings:
     """1: the image is the result of `filter_lens_rows_kernel`, and the pass along columns is due; 0: no effect needs neighbours."""
 
 
-@view_kernel
+@kernel_of_views
 def postprocess_effects_kernel(
     # Scene:
     grid: ImageGrid,

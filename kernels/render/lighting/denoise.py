@@ -24,7 +24,7 @@ from synpick_warp.kernels.render.lighting.unoccluded import visibility_ratio
 from synpick_warp.kernels.render.lighting.upsampling import RatioImages, RatioRecord, Ratios, add_ratios, pack_ratios
 from synpick_warp.kernels.render.visibility.camera import AnyCameras, AnyViews, ImageGrid, clamp_index, in_image, tile_pixel
 from synpick_warp.kernels.render.visibility.records import read_record, read_uint64, write_record, write_uint64
-from synpick_warp.kernels.render.visibility.variants import view_kernel
+from synpick_warp.kernels.render.visibility.variants import kernel_of_views
 from synpick_warp.kernels.tuning import CHOICE_REGISTERS, FILTER_REGISTERS
 
 wp.set_module_options({"enable_backward": False, "fast_math": True})
@@ -161,7 +161,7 @@ def block_row_weights(guide: Guide, plane: Plane, grid: ImageGrid, view: int, ro
     return weights
 
 
-@view_kernel(cuda_max_registers=FILTER_REGISTERS)
+@kernel_of_views(cuda_max_registers=FILTER_REGISTERS)
 def filter_blocks_kernel(
     # Scene:
     coarse: CoarseGrid,
@@ -267,7 +267,7 @@ def add_blocks(total: KernelSum, blocks: CoarseLight, middle: int, weights: wp.v
     return result
 
 
-@view_kernel(cuda_max_registers=CHOICE_REGISTERS)
+@kernel_of_views(cuda_max_registers=CHOICE_REGISTERS)
 def choose_widths_kernel(
     # Scene:
     coarse: CoarseGrid,
@@ -329,7 +329,7 @@ def choose_widths_kernel(
     ratios_out.record[view, row, column] = pack_ratios(diffuse, specular, scale * sums.indirect, surface_depth(surface), segment)
 
 
-@view_kernel
+@kernel_of_views
 def smooth_ratios_kernel(
     # Scene:
     coarse: CoarseGrid,

@@ -12,7 +12,7 @@ from synpick_warp.kernels.render.lighting.color import pack_half3, unpack_half3
 from synpick_warp.kernels.render.lighting.moving_bodies import MAX_FRAMES, MovingBodies, mean_projected_area
 from synpick_warp.kernels.render.visibility.camera import AnyViews
 from synpick_warp.kernels.render.visibility.gbuffer import Meshes, body_of
-from synpick_warp.kernels.render.visibility.variants import view_kernel
+from synpick_warp.kernels.render.visibility.variants import kernel_of_views
 
 wp.set_module_options({"enable_backward": False})
 
@@ -66,7 +66,7 @@ class LightHistory:
     """Maximum history length [paths]; 0: no history is kept."""
 
 
-@view_kernel
+@kernel_of_views
 def advance_history_kernel(
     # State: worlds
     episode: wp.array[int],  # (world)

@@ -10,7 +10,7 @@ from synpick_warp.codes import Look, LookKind, LookPart, Stream
 from synpick_warp.kernels.render.lighting.materials import Surfaces
 from synpick_warp.kernels.render.visibility.camera import AnyViews
 from synpick_warp.kernels.render.visibility.gbuffer import FIXTURES, Meshes, ViewBodies
-from synpick_warp.kernels.render.visibility.variants import view_kernel
+from synpick_warp.kernels.render.visibility.variants import kernel_of_views
 from synpick_warp.kernels.rng import TAU, normal_pair, pixel_key, stream_key, uniform
 
 wp.set_module_options({"enable_backward": False})
@@ -164,7 +164,7 @@ def draw_material(table: LookTable, surfaces: Surfaces, base: int, key: wp.uint6
     return result
 
 
-@view_kernel
+@kernel_of_views
 def dress_bodies_kernel(
     # Scene:
     seed: wp.uint64,

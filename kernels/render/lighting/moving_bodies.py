@@ -8,7 +8,7 @@ import warp as wp
 from synpick_warp.kernels.render.visibility.bvh_rays import RAY_OFFSET
 from synpick_warp.kernels.render.visibility.camera import AnyViews
 from synpick_warp.kernels.render.visibility.gbuffer import FAR, Meshes, fixture_mesh
-from synpick_warp.kernels.render.visibility.variants import view_kernel
+from synpick_warp.kernels.render.visibility.variants import kernel_of_views
 
 wp.set_module_options({"enable_backward": False})
 
@@ -111,7 +111,7 @@ def list_moving_body(
     moving.all_upper[view] = wp.max(moving.all_upper[view], upper)
 
 
-@view_kernel
+@kernel_of_views
 def find_moving_bodies_kernel(
     # Scene:
     meshes: Meshes,

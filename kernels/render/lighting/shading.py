@@ -36,7 +36,7 @@ from synpick_warp.kernels.render.lighting.upsampling import RatioImages, Ratios,
 from synpick_warp.kernels.render.visibility.camera import AnyCameras, AnyViews, camera_ray, hit_position, in_image, tile_pixel
 from synpick_warp.kernels.render.visibility.gbuffer import GBuffer, ViewBodies, body_of
 from synpick_warp.kernels.render.visibility.triangles import camera_triangle, edge_areas
-from synpick_warp.kernels.render.visibility.variants import view_kernel
+from synpick_warp.kernels.render.visibility.variants import kernel_of_views
 from synpick_warp.kernels.tuning import SAMPLE_SHADE_REGISTERS, SHADE_REGISTERS
 
 wp.set_module_options({"enable_backward": False, "fast_math": True})
@@ -246,7 +246,7 @@ def shade_pixel(
     return total / float(samples)
 
 
-@view_kernel(cuda_max_registers=SHADE_REGISTERS)
+@kernel_of_views(cuda_max_registers=SHADE_REGISTERS)
 def shade_kernel(
     # Scene:
     scene: PathScene,
@@ -278,7 +278,7 @@ def shade_kernel(
         )
 
 
-@view_kernel(cuda_max_registers=SAMPLE_SHADE_REGISTERS)
+@kernel_of_views(cuda_max_registers=SAMPLE_SHADE_REGISTERS)
 def shade_samples_kernel(
     # Scene:
     scene: PathScene,

@@ -15,7 +15,7 @@ from synpick_warp.kernels.render.lighting.shadow_upsampling import all_steepness
 from synpick_warp.kernels.render.lighting.shadows import is_shadowed, point_direction, visible_normal
 from synpick_warp.kernels.render.visibility.camera import TILE_PIXELS, AnyViews, camera_ray, hit_position, in_image, tile_of, tile_pixel
 from synpick_warp.kernels.render.visibility.gbuffer import GBuffer, Meshes, Table, ViewBodies, read_hit
-from synpick_warp.kernels.render.visibility.variants import view_kernel
+from synpick_warp.kernels.render.visibility.variants import kernel_of_views
 from synpick_warp.kernels.tuning import RAY_REGISTERS
 
 wp.set_module_options({"enable_backward": False, "fast_math": True})
@@ -64,7 +64,7 @@ def listed_pixel(coarse: CoarseGrid, cell: wp.array3d[int], view: int, chunk: in
     return int(top) * coarse.size + int(down), int(left) * coarse.size + int(right)
 
 
-@view_kernel
+@kernel_of_views
 def list_edge_cells_kernel(
     # Scene:
     coarse: CoarseGrid,
@@ -101,7 +101,7 @@ def pixel_plane(
     return tangent_plane(views.cameras, view, row, column, segment, depth, local), normal
 
 
-@view_kernel
+@kernel_of_views
 def list_edge_pixels_kernel(
     # Scene:
     meshes: Meshes,
@@ -171,7 +171,7 @@ def trace_pixel_edges(
     return result
 
 
-@view_kernel(cuda_max_registers=RAY_REGISTERS)
+@kernel_of_views(cuda_max_registers=RAY_REGISTERS)
 def trace_shadow_edges_kernel(
     # Scene:
     meshes: Meshes,
@@ -212,7 +212,7 @@ def trace_shadow_edges_kernel(
         )
 
 
-@view_kernel
+@kernel_of_views
 def filter_shadow_edges_kernel(
     # Scene:
     meshes: Meshes,

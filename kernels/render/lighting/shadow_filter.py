@@ -20,7 +20,7 @@ from synpick_warp.kernels.render.lighting.shadows import rays_bits, rays_depth, 
 from synpick_warp.kernels.render.visibility.camera import AnyViews, camera_ray, in_image, tile_pixel
 from synpick_warp.kernels.render.visibility.gbuffer import GBuffer, Meshes, ViewBodies, read_hit
 from synpick_warp.kernels.render.visibility.records import read_uint64, write_record, write_uint64
-from synpick_warp.kernels.render.visibility.variants import view_kernel
+from synpick_warp.kernels.render.visibility.variants import kernel_of_views
 
 wp.set_module_options({"enable_backward": False, "fast_math": True})
 
@@ -174,7 +174,7 @@ def grid_shows(coarse: CoarseGrid, rays: wp.array3d[wp.uint64], plane: Plane, pi
     return same_surface(coarse, plane, down, right, rays_depth(packed), rays_segment(packed), rays_normal(packed))
 
 
-@view_kernel
+@kernel_of_views
 def filter_shadows_kernel(
     # Scene:
     meshes: Meshes,
@@ -315,7 +315,7 @@ def mark_edges(coarse: CoarseGrid, near_edge: wp.array3d[wp.uint8], view: int, r
             near_edge[view, r, c] = wp.uint8(1)
 
 
-@view_kernel
+@kernel_of_views
 def measure_steepness_kernel(
     # Scene:
     meshes: Meshes,

@@ -15,7 +15,7 @@ from synpick_warp.kernels.render.lighting.moving_bodies import MovingBodies
 from synpick_warp.kernels.render.visibility.bvh_rays import RAY_OFFSET, is_blocked
 from synpick_warp.kernels.render.visibility.camera import TILE_HEIGHT, TILE_WIDTH, AnyViews, camera_ray, hit_position, in_image, tile_pixel
 from synpick_warp.kernels.render.visibility.gbuffer import FAR, GBuffer, Hit, Meshes, Table, ViewBodies, body_of, face_normal, read_hit
-from synpick_warp.kernels.render.visibility.variants import view_kernel
+from synpick_warp.kernels.render.visibility.variants import kernel_of_views
 from synpick_warp.kernels.tuning import RAY_REGISTERS
 
 wp.set_module_options({"enable_backward": False, "fast_math": True})
@@ -228,7 +228,7 @@ def changed_rays(
     return result
 
 
-@view_kernel(cuda_max_registers=RAY_REGISTERS)
+@kernel_of_views(cuda_max_registers=RAY_REGISTERS)
 def trace_shadow_rays_kernel(
     # Scene:
     meshes: Meshes,

@@ -23,7 +23,7 @@ from synpick_warp.kernels.render.visibility.gbuffer import (
     store_hit,
 )
 from synpick_warp.kernels.render.visibility.triangles import Footprint, Triangle, camera_triangle, find_footprint, ray_weights, row_span
-from synpick_warp.kernels.render.visibility.variants import view_kernel
+from synpick_warp.kernels.render.visibility.variants import kernel_of_views
 
 wp.set_module_options({"enable_backward": False})
 
@@ -143,7 +143,7 @@ def list_blocks(visibility: VisibilityBuffer, view: int, rank: int, triangle: in
     return free == blocks
 
 
-@view_kernel
+@kernel_of_views
 def clear_visibility_kernel(
     # Scene:
     grid: ImageGrid,
@@ -168,7 +168,7 @@ def clear_visibility_kernel(
         visibility_out.blocks[view] = 0
 
 
-@view_kernel
+@kernel_of_views
 def rasterize_triangles_kernel(
     # Scene:
     meshes: Meshes,
@@ -216,7 +216,7 @@ def rasterize_triangles_kernel(
                 rasterize_footprint(visibility_inout, amodal_inout, views.cameras, view, pixels, triangle, footprint, low_half, bit)
 
 
-@view_kernel
+@kernel_of_views
 def rasterize_blocks_kernel(
     # Scene:
     meshes: Meshes,
@@ -268,7 +268,7 @@ def resolve_hit(meshes: Meshes, bodies: ViewBodies, view: int, instances: int, k
     return hit
 
 
-@view_kernel
+@kernel_of_views
 def resolve_visibility_kernel(
     # Scene:
     meshes: Meshes,

@@ -16,10 +16,10 @@ _lens_kernels: dict[wp.Kernel, wp.Kernel] = {}
 """Kernel for distorted cameras of each kernel for pinhole cameras; filled by module."""
 
 
-def view_kernel(function: Callable[..., None] | None = None, **options: Any) -> Any:
+def kernel_of_views(function: Callable[..., None] | None = None, **options: Any) -> Any:
     """Decorate a kernel with a parameter of type `AnyViews`, as `wp.kernel` does; the result is the kernel for pinhole cameras."""
     if function is None:
-        return lambda decorated: view_kernel(decorated, **options)
+        return lambda decorated: kernel_of_views(decorated, **options)
     template = wp.kernel(function, **options)
     kernel = wp.overload(template, {_views_of(template): Views})
     _templates[kernel] = template

@@ -17,7 +17,7 @@ from synpick_warp.kernels.render.visibility.camera import (
 from synpick_warp.kernels.render.visibility.gbuffer import FAR, FIXTURES, Meshes, ViewBodies, fixture_mesh
 from synpick_warp.kernels.render.visibility.lens import STRETCH
 from synpick_warp.kernels.render.visibility.ray_bodies import write_ray_body
-from synpick_warp.kernels.render.visibility.variants import view_kernel
+from synpick_warp.kernels.render.visibility.variants import kernel_of_views
 
 wp.set_module_options({"enable_backward": False})
 
@@ -25,7 +25,7 @@ TILE_RADIUS = wp.constant(5.5)
 """Largest distance of a tile's rays from its central ray [px]: half the diagonal, 4.5, plus the offsets of colour samples."""
 
 
-@view_kernel
+@kernel_of_views
 def aim_views_kernel(
     # Out:
     views_inout: AnyViews,
@@ -37,7 +37,7 @@ def aim_views_kernel(
         views_inout.camera[view] = -1
 
 
-@view_kernel
+@kernel_of_views
 def aim_cameras_kernel(
     # Scene:
     cameras: Cameras,
@@ -56,7 +56,7 @@ def aim_cameras_kernel(
             views_inout.cameras.lens[view] = cameras.lens[camera]
 
 
-@view_kernel
+@kernel_of_views
 def set_up_views_kernel(
     # Scene:
     meshes: Meshes,
@@ -174,7 +174,7 @@ def hits_box(lower: wp.vec3, upper: wp.vec3, start: wp.vec3, direction: wp.vec3)
     return enter <= leave
 
 
-@view_kernel
+@kernel_of_views
 def bin_bodies_kernel(
     # Scene:
     meshes: Meshes,

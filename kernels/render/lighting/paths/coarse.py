@@ -42,7 +42,7 @@ from synpick_warp.kernels.render.lighting.unoccluded import unoccluded_light
 from synpick_warp.kernels.render.visibility.camera import AnyViews, in_image
 from synpick_warp.kernels.render.visibility.gbuffer import GBuffer, ViewBodies
 from synpick_warp.kernels.render.visibility.records import write_record
-from synpick_warp.kernels.render.visibility.variants import view_kernel
+from synpick_warp.kernels.render.visibility.variants import kernel_of_views
 from synpick_warp.kernels.rng import stream_key
 from synpick_warp.kernels.tuning import COARSE_PATH_REGISTERS, SINGLE_PATH_REGISTERS
 
@@ -280,7 +280,7 @@ def trace_pixel(
         finish_pixel(coarse_light_out, history, exposure, cell, slot, row, column, pixel, paths, samples)
 
 
-@view_kernel(cuda_max_registers=COARSE_PATH_REGISTERS)
+@kernel_of_views(cuda_max_registers=COARSE_PATH_REGISTERS)
 def trace_coarse_paths_kernel(
     # Scene:
     scene: PathScene,
@@ -328,7 +328,7 @@ def trace_coarse_paths_kernel(
     )
 
 
-@view_kernel(cuda_max_registers=SINGLE_PATH_REGISTERS)
+@kernel_of_views(cuda_max_registers=SINGLE_PATH_REGISTERS)
 def start_paths_kernel(
     # Scene:
     scene: PathScene,
