@@ -160,3 +160,4 @@ class Randomize:
         _STRENGTH, "", "Light of each lamp on a surface that faces up, relative to that of the map.", low=0.01, high=100.0
     )
     lamp_temperature: Distribution = setting(_TEMPERATURE, "K", "Colour temperature of each lamp.", low=1700.0, high=25000.0)
+    exposure: Distribution = setting(_NONE, "EV", "Exposure offset, in place of what render.exposure_spread draws.", low=-5.0, high=5.0)

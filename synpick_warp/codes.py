@@ -165,7 +165,7 @@ class Stream(enum.IntEnum):
 
 
 class Look(enum.IntEnum):
-    """Appearance parameter that is drawn, of a body, the table or a lamp; see `configs.randomize`."""
+    """Parameter that is drawn, of a body, the table, a lamp or the episode; see `configs.randomize`."""
 
     HUE = 0
     """Rotation of the hue [°]."""
@@ -191,15 +191,19 @@ class Look(enum.IntEnum):
     """Colour temperature of a lamp [K]."""
     AZIMUTH = 12
     """Azimuth of a lamp in the map [°]."""
+    EXPOSURE = 13
+    """Exposure compensation [EV]."""
 
 
 class LookPart(enum.IntEnum):
-    """Part of a scene whose appearance is drawn."""
+    """Part of a scene that has such parameters."""
 
     OBJECT = 0
     BIN = 1
     TABLE = 2
     LAMP = 3
+    EPISODE = 4
+    """The episode as a whole."""
 
 
 class LookKind(enum.IntEnum):

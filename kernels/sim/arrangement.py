@@ -2,7 +2,8 @@
 
 import warp as wp
 
-from synpick_warp.codes import Ending, Mode, Phase, Stream
+from synpick_warp.codes import Ending, Look, LookKind, LookPart, Mode, Phase, Stream
+from synpick_warp.kernels.distributions import LookTable, draw_look, look_key
 from synpick_warp.kernels.rng import TAU, stream_key, uniform, uniform_index, uniform_rotation
 from synpick_warp.kernels.sim.endings import delivers
 from synpick_warp.kernels.structs import BinData, CatalogData, DropData, LayoutData, ModeData
@@ -187,6 +188,7 @@ def sample_lights_kernel(
     # Scene:
     seed: wp.uint64,
     drop: DropData,
+    looks: LookTable,
     # State:
     arrangement_id: wp.array[wp.vec2i],  # (world)
     phase: wp.array[int],  # (world)
@@ -198,7 +200,7 @@ def sample_lights_kernel(
     """Sample the environment map of starting episodes, its yaw [rad] and its exposure value [EV].
 
     With the samples u_i of the stream (seed, episode, arrangement, Stream.LIGHT): map by u_0, yaw = 2π u_1 or, without `random_yaw`, 0,
-    exposure = s (2 u_2 - 1) for a spread s. Launched over world.
+    exposure = s (2 u_2 - 1) for a spread s; but with a distribution of its own, exposure is a look of the episode. Launched over world.
     """
     world = wp.tid()
     if phase[world] != Phase.START:
@@ -207,6 +209,9 @@ def sample_lights_kernel(
     light_out[world] = uniform_index(key, 0, drop.lights)
     light_yaw_out[world] = TAU * uniform(key, 1) * float(drop.random_yaw)
     light_exposure_out[world] = drop.exposure_spread * (2.0 * uniform(key, 2) - 1.0)
+    if looks.distribution[LookPart.EPISODE, Look.EXPOSURE].kind != LookKind.OFF:
+        own = look_key(seed, arrangement_id[world][0], LookPart.EPISODE, 0)
+        light_exposure_out[world] = draw_look(looks, own, LookPart.EPISODE, Look.EXPOSURE)[0]
 
 
 @wp.kernel

@@ -14,8 +14,11 @@ from synpick_warp.configs import schema
 from synpick_warp.configs.cell import BinSizes
 from synpick_warp.configs.modes import mode_weights
 from synpick_warp.kernels import structs
+from synpick_warp.kernels.distributions import LookTable
 from synpick_warp.scenes import build
+from synpick_warp.scenes.looks import Looks
 from synpick_warp.scenes.types import Catalog, CatalogEntry
+from synpick_warp.stages.render.looks import build_look_table
 from synpick_warp.stages.sim.worlds import CORNERS
 
 # Height of what has no walls, so that whatever is beside it is outside [m].
@@ -38,6 +41,7 @@ class SceneData:
     perception: structs.PerceptionData
     suction: structs.SuctionData
     bins: structs.BinData
+    looks: LookTable
 
 
 def fill(kind: Any, *sections: Any, **derived: Any) -> Any:
@@ -88,6 +92,7 @@ def make_scene_data(config: schema.Config, catalog: Catalog, built: build.BuiltM
         fill(structs.PerceptionData, config.perception),
         _suction_data(config.suction, gripper, physics.step),
         bin_data(config.cell.bins, config.bins, config.move, built.layout.parts, device),
+        build_look_table(Looks(config.randomize, (), ()), 0, device),
     )
 
 

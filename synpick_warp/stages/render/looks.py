@@ -10,7 +10,8 @@ import warp as wp
 
 from synpick_warp.codes import Look, LookKind, LookPart
 from synpick_warp.configs.randomize import CHOICE, FIXED, LOG_UNIFORM, NORMAL, UNIFORM, Distribution, Randomize
-from synpick_warp.kernels.render.lighting.looks import LookDistribution, LookTable, draw_looks_kernel, dress_bodies_kernel
+from synpick_warp.kernels.distributions import LookDistribution, LookTable
+from synpick_warp.kernels.render.lighting.looks import draw_looks_kernel, dress_bodies_kernel
 from synpick_warp.kernels.render.lighting.materials import Surfaces
 from synpick_warp.kernels.render.lighting.paths.tracing import PathScene
 from synpick_warp.kernels.render.visibility.gbuffer import FIXTURES
@@ -28,6 +29,7 @@ SETTINGS = {
     (LookPart.BIN, Look.METALLIC): "bin_metallic",
     (LookPart.TABLE, Look.COLOR): "table_color",
     (LookPart.TABLE, Look.ROUGHNESS): "table_roughness",
+    (LookPart.EPISODE, Look.EXPOSURE): "exposure",
     (LookPart.LAMP, Look.COUNT): "lamps",
     (LookPart.LAMP, Look.ELEVATION): "lamp_elevation",
     (LookPart.LAMP, Look.RADIUS): "lamp_radius",
@@ -41,13 +43,12 @@ _COPIED = ("color", "metallic", "roughness", "texture_size", "first_texel", "tex
 _ROW: Any = LookDistribution.numpy_dtype()
 
 
-def build_look_table(looks: Looks, first_texture: int, first_row: int, device: Any) -> Any:
+def build_look_table(looks: Looks, first_texture: int, device: Any) -> Any:
     """The struct `LookTable`.
 
     Args:
         looks: Distributions and textures.
         first_texture: Row of `Surfaces` of the first texture; those of the bin come first.
-        first_row: Row of `Surfaces` of the first view's first body.
         device: Device of the arrays.
     """
     drawn: dict[tuple[int, int], tuple[Distribution, float, float]] = {}
@@ -70,7 +71,6 @@ def build_look_table(looks: Looks, first_texture: int, first_row: int, device: A
     table = LookTable()
     table.distribution = wp.array(distributions, dtype=LookDistribution, device=device)
     table.choice = wp.array(np.array(choices or [np.zeros(4)], np.float32), dtype=wp.vec4, device=device)
-    table.first_row = first_row
     return table
 
 
@@ -108,8 +108,8 @@ class Dresser:
     def __init__(self, scene: RenderScene, seed: int, instances: int, views: int) -> None:
         """Allocate the materials of at most `views` views of worlds with `instances` instances. `scene` must have looks."""
         self._seed = wp.uint64(seed)
-        materials = scene.surfaces.color.shape[0]
-        self._table = build_look_table(scene.looks, materials - len(scene.looks.all_textures), materials, scene.device)
+        self._first = scene.surfaces.color.shape[0]
+        self._table = build_look_table(scene.looks, self._first - len(scene.looks.all_textures), scene.device)
         self._materials = instances + int(FIXTURES) + 1
         rows = views * self._materials
         self.material = wp.zeros((views, self._materials), dtype=wp.int32, device=scene.device)
@@ -128,7 +128,7 @@ class Dresser:
     def dress(self, snapshot: Snapshot, views: Any, bodies: Any) -> None:
         """Make the materials of the bodies of all views, and of their tables; `bodies` must be set up."""
         scene = self.scene
-        inputs = [self._seed, scene.meshes, self._table, snapshot.episode, views]
+        inputs = [self._seed, scene.meshes, self._table, snapshot.episode, views, self._first]
         wp.launch(
             dress_bodies_kernel, dim=(views.count, self._materials), inputs=inputs, outputs=[bodies, scene.surfaces], device=scene.device
         )
@@ -148,7 +148,7 @@ def draw_parameters(looks: Looks, seed: int, episode: int, parts: list[tuple[Loo
     Returns:
         `LookKind` of each parameter (part, look), and the values (body, look, 3) float32.
     """
-    table = build_look_table(looks, 0, 0, "cpu")
+    table = build_look_table(looks, 0, "cpu")
     part, body = (wp.array(column, dtype=wp.int32, device="cpu") for column in zip(*parts, strict=True))
     values = wp.zeros((len(parts), len(Look)), dtype=wp.vec3, device="cpu")
     inputs = [wp.uint64(seed), table, wp.full(len(parts), episode, dtype=wp.int32, device="cpu"), part, body]
@@ -157,7 +157,7 @@ def draw_parameters(looks: Looks, seed: int, episode: int, parts: list[tuple[Loo
 
 
 def draw_looks(looks: Looks, seed: int, episode: int, objects: int) -> dict[str, Any]:
-    """Looks of an episode, as its records have them: by part and parameter, and of each object. Textures by index, colours in sRGB.
+    """Looks of an episode, as its records have them, by part and parameter, and of each object. Textures by index, colours in sRGB.
 
     Computed on the processor by the renderer's function: it agrees with a GPU up to the rounding of logarithms and cosines.
 
@@ -167,10 +167,10 @@ def draw_looks(looks: Looks, seed: int, episode: int, objects: int) -> dict[str,
         episode: Index of the episode.
         objects: Instances whose looks are wanted.
     """
-    parts = [(LookPart.BIN, 0), (LookPart.TABLE, 0), *((LookPart.OBJECT, index) for index in range(objects))]
+    parts = [(LookPart.EPISODE, 0), (LookPart.BIN, 0), (LookPart.TABLE, 0), *((LookPart.OBJECT, index) for index in range(objects))]
     kinds, drawn = draw_parameters(looks, seed, episode, parts)
     rows = [_record(kinds[part], drawn[index], looks, part) for index, (part, _) in enumerate(parts)]
-    return {"bin": rows[0], "table": rows[1], "objects": rows[2:]}
+    return {**rows[0], "bin": rows[1], "table": rows[2], "objects": rows[3:]}
 
 
 def _record(kinds: np.ndarray, values: np.ndarray, looks: Looks, part: LookPart) -> dict[str, Any]:
