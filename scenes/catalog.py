@@ -24,7 +24,7 @@ from synpick_warp.scenes.collision.hulls import hull_size, mass_properties
 from synpick_warp.scenes.collision.shapes import collision_shapes, default_cache_dir
 from synpick_warp.scenes.embedded.objects import procedural_objects
 from synpick_warp.scenes.symmetries.objects import add_symmetries
-from synpick_warp.scenes.types import Catalog, CatalogEntry, ConvexPiece, HullSize, Material, RawObject, TriangleMesh
+from synpick_warp.scenes.types import FIRST_DISTRACTOR, Catalog, CatalogEntry, ConvexPiece, HullSize, Material, RawObject, TriangleMesh
 from synpick_warp.system.processes.isolation import Failure, Limits, run_isolated
 
 # Minimum diameter [m]: smaller bodies vanish in the contact margin, and come from files in another unit than expected.
@@ -54,7 +54,7 @@ def load_catalog(config: Config, cache_dir: Path | None = None, report: Callable
     are left out, with a line each; with `objects.strict`, the first of them is an error. Files are read in isolated processes.
 
     Args:
-        config: Settings: bake.models, objects, object_rows, bins, arrangement.volume.
+        config: Settings: bake.models, objects, object_rows, bins, arrangement.volume, distractors of randomize.
         cache_dir: Folder in which collision shapes are cached; None: `default_cache_dir()`.
         report: Called with each line of progress.
 
@@ -62,23 +62,38 @@ def load_catalog(config: Config, cache_dir: Path | None = None, report: Callable
         CatalogError: The folder cannot be used, or none of its objects: a file is damaged, an object does not fit into the tote or has an
             invalid mass.
     """
-    faults = _Faults(config.objects.strict, config.bake.models, report)
-    raws = _read_objects(config.bake.models, _Rules(config.objects, config.object_rows, config.cell.bins), report, faults)
-    recipes = [shape_recipe(raw, config.objects) for raw in raws]
+    rules = _Rules(config.objects, config.object_rows, config.cell.bins)
+    entries = _load_entries(config.bake.models, rules, cache_dir, report)
+    _report_undrawable(entries, config.arrangement.volume, report)
+    if not config.randomize.most_distractors:
+        return Catalog(tuple(entries))
+    others = _load_entries(config.randomize.distractor_models, rules, cache_dir, report, tuple(entry.name for entry in entries))
+    return Catalog(tuple(entries), tuple(replace(entry, obj_id=FIRST_DISTRACTOR - index) for index, entry in enumerate(others)))
+
+
+def _load_entries(
+    folder: str, rules: _Rules, cache_dir: Path | None, report: Callable[[str], None], catalog: Sequence[str] = ()
+) -> list[CatalogEntry]:
+    """Load the objects of a folder, ordered by obj_id; of the embedded ones those that have no name of `catalog`."""
+    objects = rules.objects
+    faults = _Faults(objects.strict, folder, report)
+    raws = [raw for raw in _read_objects(folder, rules, report, faults) if folder or raw.name not in catalog]
+    if not raws:
+        raise CatalogError("randomize.distractors: the catalog has all embedded objects; name a folder by randomize.distractor_models")
+    recipes = [shape_recipe(raw, objects) for raw in raws]
     names, meshes = [raw.name for raw in raws], [raw.mesh for raw in raws]
-    seconds = config.objects.decomposition_time
+    seconds = objects.decomposition_time
     shapes = collision_shapes(names, meshes, recipes, cache_dir or default_cache_dir(), report, seconds)
     entries = []
     for raw, shape in zip(raws, shapes, strict=True):
         if isinstance(shape, CatalogError):
             faults.add(shape)
         else:
-            entries.append(_entry(raw, shape, _checked_mass(raw, config.objects.density)))
+            entries.append(_entry(raw, shape, _checked_mass(raw, objects.density)))
     if not entries:
         raise faults.summary()
     faults.tell()
-    _report_undrawable(entries, config.arrangement.volume, report)
-    return Catalog(tuple(sorted(entries, key=lambda entry: entry.obj_id)))
+    return sorted(entries, key=lambda entry: entry.obj_id)
 
 
 def read_objects(config: Config, report: Callable[[str], None] = _ignore) -> list[RawObject]:

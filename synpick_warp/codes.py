@@ -161,6 +161,7 @@ class Stream(enum.IntEnum):
     DEPTH_NOISE = 11
     BIN = 12
     LOOKS = 13
+    DISTRACTORS = 14
     COMPARTMENT = 15
 
 
@@ -180,7 +181,7 @@ class Look(enum.IntEnum):
     TEXTURE_WIDTH = 6
     """Width of one repeat of the texture [m]."""
     COUNT = 7
-    """Number of lamps."""
+    """Number of lamps, or of the episode's distractors."""
     ELEVATION = 8
     """Height of a lamp above the horizon [°]."""
     RADIUS = 9

@@ -75,10 +75,11 @@ def fill(kind: Any, *sections: Any, **derived: Any) -> Any:
 def make_scene_data(config: schema.Config, catalog: Catalog, built: build.BuiltModel, lights: int, device: wp.Device) -> SceneData:
     """Fill the structs that kernels take from settings, catalog and model; `lights` is the count of environment maps."""
     physics, gripper = config.physics, config.gripper
+    labelled = build.without_distractors(config.arrangement, config.randomize.most_distractors)
     return SceneData(
         _layout_data(built.layout),
         _catalog_data(catalog, built, device),
-        drop_data(config.arrangement, config.render, config.pick, config.move, physics.gravity, lights),
+        drop_data(labelled, config.render, config.pick, config.move, physics.gravity, lights),
         _settle_data(config.settle, physics.tick_time),
         mode_data(mode_rows(config.bake, config.splits), device),
         _move_data(config.move, gripper, physics),
@@ -116,11 +117,12 @@ def _catalog_data(catalog: Catalog, built: build.BuiltModel, device: wp.Device) 
     def column(values: list[float], dtype: type) -> wp.array:
         return wp.array(np.array(values), dtype=dtype, device=device)
 
-    entries = catalog.entries
+    entries = catalog.bodies
     empty_single, empty_compound = built.empty_variant
     return fill(
         structs.CatalogData,
-        count=len(entries),
+        count=len(catalog.entries),
+        distractors=len(catalog.distractors),
         volume=column([entry.volume for entry in entries], float),
         radius=column([entry.radius for entry in entries], float),
         mass=column([entry.mass for entry in entries], float),
@@ -165,11 +167,12 @@ def drop_data(
     gravity: float,
     lights: int,
 ) -> structs.DropData:
-    """Fill `DropData` from the settings; `lights` is the number of environment maps."""
+    """Fill `DropData` from the settings, those of the draw of objects with labels; `lights` is the number of environment maps."""
     return fill(
         structs.DropData,
         arrangement,
         render,
+        objects=arrangement.max_objects,
         exceed=arrangement.fill == schema.EXCEED,
         move_repeats=move.repeats,
         pick_repeats=pick.repeats,

@@ -97,6 +97,8 @@ class KernelWorlds:
     bins: tuple[BinSizes, ...] = (BIN,)
     places: Bins = field(default_factory=Bins)
     randomize: Randomize = field(default_factory=Randomize)
+    distractors: int = 0
+    """The last of the objects, without labels."""
     parts: Sequence[tuple[int, int, bool]] = tuple((shape, 0, True) for shape in GUIDES)
 
     def __post_init__(self) -> None:
@@ -110,7 +112,7 @@ class KernelWorlds:
         self.scene = SceneData(
             self._layout(),
             self._catalog(),
-            fill(structs.DropData, **(DROP | self.drop)),
+            fill(structs.DropData, **(DROP | {"objects": self.instances} | self.drop)),
             fill(structs.SettleData, **(SETTLE | self.settle)),
             mode_data([(0, 0.0, 0.0, 0)], self.device),
             fill(structs.MoveData, **(MOVE | self.move)),
@@ -167,7 +169,8 @@ class KernelWorlds:
         arrays = {name: wp.array(np.asarray(values), dtype=dtype, device=self.device) for name, (values, dtype) in columns.items()}
         return fill(
             structs.CatalogData,
-            count=len(compound),
+            count=len(compound) - self.distractors,
+            distractors=self.distractors,
             empty_single=int((compound == 0).sum()),
             empty_compound=int(compound.sum()),
             empty_mass=0.1,

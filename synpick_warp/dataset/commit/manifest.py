@@ -62,6 +62,7 @@ FREE_SETTINGS = (
     "bake.lights",
     "randomize.bin_textures",
     "randomize.table_textures",
+    "randomize.distractor_models",
     "bake.writers",
     "render.views_per_batch",
     "perception.views",

@@ -52,7 +52,7 @@ def write_library(
     for name in (TEXTURES, "lights"):
         (library / name).mkdir(exist_ok=True)
     write_light_maps(library, lights)
-    for entry in catalog.entries:
+    for entry in catalog.bodies:
         _write_object(library, physics, entry)
     for one in bins:
         if one.sizes.is_visible:
@@ -77,10 +77,11 @@ def _save(library: Path, name: str, stage: Usd.Stage) -> None:
 def _write_object(library: Path, physics: Physics, entry: CatalogEntry) -> None:
     """Write an object's asset: mesh, material, collision shapes and mass properties, as a dynamic rigid body."""
     name = object_asset(entry.obj_id)
-    stage = new_asset(name, entry.name)
+    stage = new_asset(name, entry.name if entry.obj_id >= 0 else "")
     root = stage.GetDefaultPrim()
     root.SetDisplayName(entry.name)
-    add_property(root, "obj_id", entry.obj_id)
+    if entry.obj_id >= 0:
+        add_property(root, "obj_id", entry.obj_id)
     _add_shapes(stage, physics, entry.mesh, entry.material, write_texture(library, name, entry.material), entry.pieces)
     add_body(root, entry.mass, entry.center_of_mass, entry.inertia, kinematic=False)
     _save(library, name, stage)

@@ -90,7 +90,7 @@ class UsdExporter(EpisodeExporter[TickSpool]):
             bins=tuple(bin_asset(sizes) if sizes.is_visible else None for sizes in settings.bins),
             cameras=context.cameras,
             lights=tuple(make_stage_light(index, light, settings.render.exposure) for index, light in enumerate(context.lights)),
-            names={entry.obj_id: entry.name for entry in context.catalog.entries},
+            names={body.obj_id: body.name for body in context.catalog.bodies},
         )
 
 

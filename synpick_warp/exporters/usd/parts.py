@@ -20,7 +20,7 @@ from synpick_warp.errors import OutputError
 from synpick_warp.exporters.writing.files import write_synced
 from synpick_warp.exporters.writing.png import encode_png
 from synpick_warp.scenes.assets.appearance import srgb_to_linear
-from synpick_warp.scenes.types import ConvexPiece, Material, TriangleMesh
+from synpick_warp.scenes.types import FIRST_DISTRACTOR, ConvexPiece, Material, TriangleMesh
 
 TEXTURES = "textures"
 """Folder of textures in the asset library."""
@@ -33,18 +33,19 @@ _SYSTEM_REASON = re.compile(r"writing file: ([^']+)'")
 
 
 def object_asset(obj_id: int) -> str:
-    """Name of an object's asset: stem of its file, and name of its root prim."""
-    return f"obj_{obj_id:06d}"
+    """Name of an object's asset: stem of its file, and name of its root prim. Distractors are numbered from 0."""
+    return f"obj_{obj_id:06d}" if obj_id >= 0 else f"distractor_{FIRST_DISTRACTOR - obj_id:06d}"
 
 
 def new_asset(name: str, label: str) -> Usd.Stage:
-    """Create a stage in memory whose root /NAME is a component with a class label."""
+    """Create a stage in memory whose root /NAME is a component with a class label; empty: without one."""
     stage = Usd.Stage.CreateInMemory()
     set_units(stage)
     root = UsdGeom.Xform.Define(stage, f"/{name}").GetPrim()
     stage.SetDefaultPrim(root)
     Usd.ModelAPI(root).SetKind(Kind.Tokens.component)
-    add_label(root, CLASS, label)
+    if label:
+        add_label(root, CLASS, label)
     return stage
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -30,6 +31,7 @@ SETTINGS = {
     (LookPart.TABLE, Look.COLOR): "table_color",
     (LookPart.TABLE, Look.ROUGHNESS): "table_roughness",
     (LookPart.EPISODE, Look.EXPOSURE): "exposure",
+    (LookPart.EPISODE, Look.COUNT): "distractors",
     (LookPart.LAMP, Look.COUNT): "lamps",
     (LookPart.LAMP, Look.ELEVATION): "lamp_elevation",
     (LookPart.LAMP, Look.RADIUS): "lamp_radius",
@@ -156,8 +158,8 @@ def draw_parameters(looks: Looks, seed: int, episode: int, parts: list[tuple[Loo
     return table.distribution.numpy()["kind"], values.numpy()
 
 
-def draw_looks(looks: Looks, seed: int, episode: int, objects: int) -> dict[str, Any]:
-    """Looks of an episode, as its records have them, by part and parameter, and of each object. Textures by index, colours in sRGB.
+def draw_looks(looks: Looks, seed: int, episode: int, objects: int, distractors: Mapping[int, str] | None = None) -> dict[str, Any]:
+    """Record of the looks of an episode: by part and parameter, of each object and distractor. Textures by index, colours in sRGB.
 
     Computed on the processor by the renderer's function: it agrees with a GPU up to the rounding of logarithms and cosines.
 
@@ -165,12 +167,20 @@ def draw_looks(looks: Looks, seed: int, episode: int, objects: int) -> dict[str,
         looks: What is drawn from.
         seed: Seed of the bake.
         episode: Index of the episode.
-        objects: Instances whose looks are wanted.
+        objects: Number of the first instances, whose looks are wanted.
+        distractors: Names of the distractors by instance; None: none can be drawn.
     """
-    parts = [(LookPart.EPISODE, 0), (LookPart.BIN, 0), (LookPart.TABLE, 0), *((LookPart.OBJECT, index) for index in range(objects))]
+    distractors = distractors or {}
+    instances = [(LookPart.OBJECT, index) for index in (*range(objects), *distractors)]
+    parts = [(LookPart.EPISODE, 0), (LookPart.BIN, 0), (LookPart.TABLE, 0), *instances]
     kinds, drawn = draw_parameters(looks, seed, episode, parts)
     rows = [_record(kinds[part], drawn[index], looks, part) for index, (part, _) in enumerate(parts)]
-    return {**rows[0], "bin": rows[1], "table": rows[2], "objects": rows[3:]}
+    record = {name: value for name, value in rows[0].items() if name != "count"}
+    record |= {"bin": rows[1], "table": rows[2], "objects": rows[3 : 3 + objects]}
+    if looks.randomize.most_distractors:
+        named = zip(distractors.items(), rows[3 + objects :], strict=True)
+        record["distractors"] = [{"instance": instance, "name": name, **row} for (instance, name), row in named]
+    return record
 
 
 def _record(kinds: np.ndarray, values: np.ndarray, looks: Looks, part: LookPart) -> dict[str, Any]:
