@@ -60,6 +60,8 @@ def find_conflicts(config: Config) -> Iterator[Conflict]:
     yield from _scene_ids(DataLayout.of(config))
     yield from _object_rows(config.object_rows)
     yield from _distractors(config.randomize, config.arrangement, config.bake)
+    if config.randomize.background_textures and config.render.table and not any(config.render.table_size):
+        yield "render.table_size", "above 0 with randomize.background_textures, which are seen beyond the edge of the table [m]"
 
 
 def _distractors(randomize: Randomize, arrangement: Arrangement, bake: Bake) -> Iterator[Conflict]:

@@ -147,7 +147,15 @@ class Randomize:
     table_color: ColorDistribution = setting(_NO_COLOR, "sRGB", "Base colour of the table; with a texture, its factor.", low=0.0, high=1.0)
     table_roughness: Distribution = setting(_NONE, "", "Roughness of the table.", low=0.0, high=1.0)
     table_textures: str = setting("", "", "Folder of images, one of which each episode draws as the table's texture; empty: none.")
-    texture_width: Distribution = setting(_HALF_METRE, "m", "Width of one repeat of the textures of bin and table.", low=0.01, high=100.0)
+    background_textures: str = setting(
+        "",
+        "",
+        "Folder of images, one of which each episode draws as the texture of a floor, which is seen beyond the edge of the table "
+        "(render.table_size); empty: the environment map is seen there.",
+    )
+    texture_width: Distribution = setting(
+        _HALF_METRE, "m", "Width of one repeat of the textures of bin, table and floor.", low=0.01, high=100.0
+    )
     lamps: Distribution = setting(
         _NONE,
         "",
@@ -171,7 +179,9 @@ class Randomize:
         high=MOST_DISTRACTORS,
     )
     distractor_models: str = setting(
-        "", "", "Folder of distractors, as bake.models; empty: the embedded objects that the catalog lacks, as with models of one's own."
+        "",
+        "",
+        "Folder of distractors, as bake.models; empty: the embedded objects that the catalog lacks, or, if it has all, geometric solids.",
     )
     exposure: Distribution = setting(_NONE, "EV", "Exposure offset, in place of what render.exposure_spread draws.", low=-5.0, high=5.0)
 

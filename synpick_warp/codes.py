@@ -205,6 +205,8 @@ class LookPart(enum.IntEnum):
     LAMP = 3
     EPISODE = 4
     """The episode as a whole."""
+    BACKGROUND = 5
+    """Floor that is seen beyond the edge of the table."""
 
 
 class LookKind(enum.IntEnum):

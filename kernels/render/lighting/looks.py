@@ -114,14 +114,14 @@ def dress_bodies_kernel(
     bodies_inout: ViewBodies,
     surfaces_inout: Surfaces,
 ):
-    """Materials of the bodies of each view, and of its table as the last: those of their meshes, changed by what the episode draws.
+    """Materials of the bodies of each view, of its table and of its background: those of their meshes, changed by what the episode draws.
 
     `first_row`: row of `Surfaces` of the first view's first body; the rows before are those of meshes, table and textures. Launched over
     view, material.
     """
     view, body = wp.tid()
     instances = bodies_inout.mesh.shape[1] - FIXTURES
-    at_table = body == bodies_inout.mesh.shape[1]
+    at_table = body >= bodies_inout.mesh.shape[1]
     world = views.world[view]
     if world < 0:
         return
@@ -134,7 +134,9 @@ def dress_bodies_kernel(
     bodies_inout.material[view, body] = row
     part = int(-1)
     slot = int(0)
-    if at_table:
+    if body > bodies_inout.mesh.shape[1]:
+        part = LookPart.BACKGROUND
+    elif at_table:
         part = LookPart.TABLE
     elif body < instances:
         part = LookPart.OBJECT

@@ -18,7 +18,7 @@ from synpick_warp.scenes.types import Catalog, EnvironmentMap
 
 def digest_inputs(catalog: Catalog, lights: tuple[EnvironmentMap, ...], looks: Looks | None = None) -> dict[str, str]:
     """Digests of the content of objects, lights, distractors and textures, without the names of their files: the manifest's INPUTS."""
-    textures = {"textures": _digest_data((looks.bin_textures, looks.table_textures))} if looks and looks.all_textures else {}
+    textures = {"textures": _digest_data(tuple(looks.textures.values()))} if looks and looks.all_textures else {}
     distractors = {"distractors": _digest_data(catalog.distractors)} if catalog.distractors else {}
     return {"objects": _digest_data(catalog), "lights": _digest_data(lights)} | distractors | textures
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
@@ -12,12 +13,15 @@ import warp as wp
 from synpick_warp.codes import Look, LookKind, LookPart
 from synpick_warp.configs.randomize import CHOICE, FIXED, LOG_UNIFORM, NORMAL, UNIFORM, Distribution, Randomize
 from synpick_warp.kernels.distributions import LookDistribution, LookTable
+from synpick_warp.kernels.render.lighting.background import shade_floor_kernel
 from synpick_warp.kernels.render.lighting.looks import draw_looks_kernel, dress_bodies_kernel
 from synpick_warp.kernels.render.lighting.materials import Surfaces
 from synpick_warp.kernels.render.lighting.paths.tracing import PathScene
+from synpick_warp.kernels.render.visibility.camera import TILE_PIXELS
 from synpick_warp.kernels.render.visibility.gbuffer import FIXTURES
 from synpick_warp.scenes.looks import Looks
 from synpick_warp.stages.buffers import Snapshot
+from synpick_warp.stages.launch import launch_pixels
 from synpick_warp.stages.render.scene import RenderScene
 
 SETTINGS = {
@@ -50,7 +54,7 @@ def build_look_table(looks: Looks, first_texture: int, device: Any) -> Any:
 
     Args:
         looks: Distributions and textures.
-        first_texture: Row of `Surfaces` of the first texture; those of the bin come first.
+        first_texture: Row of `Surfaces` of the first texture, of those in the order of `Looks.all_textures`.
         device: Device of the arrays.
     """
     drawn: dict[tuple[int, int], tuple[Distribution, float, float]] = {}
@@ -58,7 +62,7 @@ def build_look_table(looks: Looks, first_texture: int, device: Any) -> Any:
         rules = Randomize.__dataclass_fields__[name].metadata
         drawn[place] = getattr(looks.randomize, name), rules["low"], rules["high"]
     drawn[LookPart.LAMP, Look.AZIMUTH] = Distribution(UNIFORM, ((-180.0,), (180.0,))), 0.0, 0.0
-    for part, textures in ((LookPart.BIN, looks.bin_textures), (LookPart.TABLE, looks.table_textures)):
+    for part, textures in looks.textures.items():
         if textures:
             rows = tuple((float(first_texture + index),) for index in range(len(textures)))
             drawn[part, Look.TEXTURE] = Distribution(CHOICE, rows), 0.0, 0.0
@@ -112,7 +116,7 @@ class Dresser:
         self._seed = wp.uint64(seed)
         self._first = scene.surfaces.color.shape[0]
         self._table = build_look_table(scene.looks, self._first - len(scene.looks.all_textures), scene.device)
-        self._materials = instances + int(FIXTURES) + 1
+        self._materials = instances + int(FIXTURES) + 1 + bool(scene.looks.background_textures)
         rows = views * self._materials
         self.material = wp.zeros((views, self._materials), dtype=wp.int32, device=scene.device)
         surfaces, paths = _copy(Surfaces, scene.surfaces), _copy(PathScene, scene.paths)
@@ -128,12 +132,19 @@ class Dresser:
         self.scene = replace(scene, surfaces=surfaces, paths=paths)
 
     def dress(self, snapshot: Snapshot, views: Any, bodies: Any) -> None:
-        """Make the materials of the bodies of all views, and of their tables; `bodies` must be set up."""
+        """Make the materials of the bodies of all views, of their tables and backgrounds; `bodies` must be set up."""
         scene = self.scene
         inputs = [self._seed, scene.meshes, self._table, snapshot.episode, views, self._first]
         wp.launch(
             dress_bodies_kernel, dim=(views.count, self._materials), inputs=inputs, outputs=[bodies, scene.surfaces], device=scene.device
         )
+
+
+def shade_floor(scene: RenderScene, snapshot: Snapshot, bodies: Any, gbuffer: Any, views: Any, radiance: wp.array) -> None:
+    """Shade what the views show beyond the scene as a floor, if episodes draw a background."""
+    if scene.looks is not None and scene.looks.background_textures:
+        inputs = [scene.paths, scene.grid, snapshot.light, bodies, gbuffer, views]
+        launch_pixels(shade_floor_kernel, views.count * scene.grid.tiles * int(TILE_PIXELS), inputs, [radiance], scene.device)
 
 
 def _copy(kind: Any, struct: Any) -> Any:
@@ -172,13 +183,16 @@ def draw_looks(looks: Looks, seed: int, episode: int, objects: int, distractors:
     """
     distractors = distractors or {}
     instances = [(LookPart.OBJECT, index) for index in (*range(objects), *distractors)]
-    parts = [(LookPart.EPISODE, 0), (LookPart.BIN, 0), (LookPart.TABLE, 0), *instances]
+    scene = (LookPart.EPISODE, LookPart.BACKGROUND, LookPart.BIN, LookPart.TABLE)
+    parts = [*((part, 0) for part in scene), *instances]
     kinds, drawn = draw_parameters(looks, seed, episode, parts)
     rows = [_record(kinds[part], drawn[index], looks, part) for index, (part, _) in enumerate(parts)]
     record = {name: value for name, value in rows[0].items() if name != "count"}
-    record |= {"bin": rows[1], "table": rows[2], "objects": rows[3 : 3 + objects]}
+    if looks.background_textures:
+        record["background"] = rows[1]
+    record |= {"bin": rows[2], "table": rows[3], "objects": rows[4 : 4 + objects]}
     if looks.randomize.most_distractors:
-        named = zip(distractors.items(), rows[3 + objects :], strict=True)
+        named = zip(distractors.items(), rows[4 + objects :], strict=True)
         record["distractors"] = [{"instance": instance, "name": name, **row} for (instance, name), row in named]
     return record
 
@@ -191,5 +205,6 @@ def _record(kinds: np.ndarray, values: np.ndarray, looks: Looks, part: LookPart)
             value = values[look].astype(np.float64).round(6)
             record[look.name.lower()] = value.tolist() if look == Look.COLOR else float(value[0])
     if "texture" in record:
-        record["texture"] = int(record["texture"]) - (len(looks.bin_textures) if part == LookPart.TABLE else 0)
+        before = itertools.takewhile(lambda other: other != part, looks.textures)
+        record["texture"] = int(record["texture"]) - sum(len(looks.textures[other]) for other in before)
     return record

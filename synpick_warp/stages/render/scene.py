@@ -17,7 +17,7 @@ from synpick_warp.kernels.render.lighting.materials import TEXEL_BITS, TEXEL_MAS
 from synpick_warp.kernels.render.lighting.paths.tracing import PathScene
 from synpick_warp.kernels.render.lighting.shadows import LAMP_POINTS
 from synpick_warp.kernels.render.visibility.camera import TILE_HEIGHT, TILE_PIXELS, TILE_WIDTH, Cameras, ImageGrid
-from synpick_warp.kernels.render.visibility.gbuffer import Meshes, Table
+from synpick_warp.kernels.render.visibility.gbuffer import FAR, Meshes, Table
 from synpick_warp.kernels.render.visibility.lens import BEND, FIRST, FISHEYE_MODEL, MODEL, NUMBERS, RADIUS, STRETCH, Lenses
 from synpick_warp.scenes.assets.appearance import linear_to_srgb, srgb_to_linear
 from synpick_warp.scenes.environment import LUMINANCE
@@ -350,6 +350,7 @@ def build_render_scene(
     meshes, keep = build_meshes(shapes, len(catalog.bodies) + len(bins) - 1, device, bins[0].interior if len(bins) == 1 else None)
     table = Table()
     table.visible, table.height = int(settings.table), table_height
+    table.half = wp.vec2(*(0.5 * size if size > 0.0 else FAR for size in settings.table_size))
     ground = srgb_to_linear(np.array(settings.table_color)) if settings.table else None
     paths = PathScene()
     paths.meshes = meshes
