@@ -234,7 +234,7 @@ def prepare_folder(output: OutputFolder, needs: Needs, catalog: Catalog, lights:
     """Prepare the output folder (`OutputFolder.prepare`) in a process that generates no episodes itself."""
     config = output.config
     with WriterPool(1, needs.slot_bytes, output.lock) as pool:
-        context = ExportContext(output.out, ExportSettings.of(config), catalog, make_cameras(config.rig), lights, pool)
+        context = ExportContext(output.out, ExportSettings.of(config), catalog, make_cameras(config.rig), lights, pool, looks)
         exporters = Exporters(needs.classes, context)
         with aborting(pool, exporters):
             output.prepare(exporters, digest_inputs(catalog, lights, looks), pool)

@@ -11,8 +11,9 @@ from __future__ import annotations
 import numpy as np
 from pxr import Gf, Kind, Sdf, Usd, UsdGeom, UsdLux, UsdPhysics, UsdRender
 
-from synpick_warp.exporters.usd.parts import add_label, add_property, object_asset, set_units
-from synpick_warp.exporters.usd.types import EpisodeMetadata, EpisodeSettings, StageLight
+from synpick_warp.exporters.usd.looks import add_looks
+from synpick_warp.exporters.usd.parts import add_label, add_property, set_units
+from synpick_warp.exporters.usd.types import EpisodeMetadata, EpisodeSettings, StageLight, object_asset
 from synpick_warp.scenes.types import Camera
 
 APERTURE = 0.36
@@ -60,6 +61,7 @@ def make_episode_layer(ticks: np.ndarray, metadata: EpisodeMetadata, settings: E
     for instance in np.flatnonzero((ticks["object_id"] != -1).any(axis=0)).tolist():
         path, obj_id = _add_object(stage, ticks, instance, settings)
         assets[path] = object_asset(obj_id)
+    add_looks(stage, assets, metadata.looks, settings.surfaces)
     for index, camera in enumerate(settings.cameras):
         _add_camera(stage, camera.name or f"camera_{index}", camera)
     first = ticks[0]
