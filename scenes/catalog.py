@@ -23,6 +23,7 @@ from synpick_warp.scenes.collision.decomposition import ShapeRecipe
 from synpick_warp.scenes.collision.hulls import hull_size, mass_properties
 from synpick_warp.scenes.collision.shapes import collision_shapes, default_cache_dir
 from synpick_warp.scenes.embedded.objects import procedural_objects
+from synpick_warp.scenes.embedded.solids import solids
 from synpick_warp.scenes.symmetries.objects import add_symmetries
 from synpick_warp.scenes.types import FIRST_DISTRACTOR, Catalog, CatalogEntry, ConvexPiece, HullSize, Material, RawObject, TriangleMesh
 from synpick_warp.system.processes.isolation import Failure, Limits, run_isolated
@@ -74,12 +75,10 @@ def load_catalog(config: Config, cache_dir: Path | None = None, report: Callable
 def _load_entries(
     folder: str, rules: _Rules, cache_dir: Path | None, report: Callable[[str], None], catalog: Sequence[str] = ()
 ) -> list[CatalogEntry]:
-    """Load the objects of a folder, ordered by obj_id; of the embedded ones those that have no name of `catalog`."""
+    """Load the objects of `_read_objects`, ordered by obj_id."""
     objects = rules.objects
     faults = _Faults(objects.strict, folder, report)
-    raws = [raw for raw in _read_objects(folder, rules, report, faults) if folder or raw.name not in catalog]
-    if not raws:
-        raise CatalogError("randomize.distractors: the catalog has all embedded objects; name a folder by randomize.distractor_models")
+    raws = _read_objects(folder, rules, report, faults, catalog)
     recipes = [shape_recipe(raw, objects) for raw in raws]
     names, meshes = [raw.name for raw in raws], [raw.mesh for raw in raws]
     seconds = objects.decomposition_time
@@ -104,9 +103,13 @@ def read_objects(config: Config, report: Callable[[str], None] = _ignore) -> lis
     return raws
 
 
-def _read_objects(folder: str, rules: _Rules, report: Callable[[str], None], faults: _Faults) -> list[RawObject]:
-    """The objects of a folder; empty: the embedded objects."""
-    return _read_folder(Path(folder).expanduser(), rules, report, faults) if folder else _embedded_objects(rules, faults)
+def _read_objects(
+    folder: str, rules: _Rules, report: Callable[[str], None], faults: _Faults, catalog: Sequence[str] = ()
+) -> list[RawObject]:
+    """The objects of a folder; empty: the embedded objects that have no name of `catalog`."""
+    if folder:
+        return _read_folder(Path(folder).expanduser(), rules, report, faults)
+    return _embedded_objects(rules, faults, catalog)
 
 
 class _SizeError(CatalogError):
@@ -193,10 +196,10 @@ def _read_folder(folder: Path, rules: _Rules, report: Callable[[str], None], fau
     return raws
 
 
-def _embedded_objects(rules: _Rules, faults: _Faults) -> list[RawObject]:
-    """Embedded objects that fit into the bins, ordered by obj_id."""
+def _embedded_objects(rules: _Rules, faults: _Faults, catalog: Sequence[str]) -> list[RawObject]:
+    """Embedded objects that have no name of `catalog`, or if there are none geometric solids, that fit into the bins."""
     raws = []
-    for raw in procedural_objects():
+    for raw in [raw for raw in procedural_objects() if raw.name not in catalog] or solids():
         try:
             _check_size(raw, raw.name, rules.bins)
         except CatalogError as error:

@@ -17,21 +17,19 @@ from synpick_warp.configs.load import load_config
 from synpick_warp.configs.randomize import Distribution, Randomize
 from synpick_warp.dataset.commit.digests import digest_inputs
 from synpick_warp.errors import CatalogError, ConfigError
-from synpick_warp.factory import assembly
-from synpick_warp.factory.pipeline import run_bake
 from synpick_warp.scenes.build import count_distractor_slots
 from synpick_warp.scenes.catalog import load_catalog
-from synpick_warp.scenes.types import FIRST_DISTRACTOR, Catalog
+from synpick_warp.scenes.embedded.objects import procedural_objects
+from synpick_warp.scenes.embedded.solids import solids
+from synpick_warp.scenes.types import Catalog
 from synpick_warp.stages.sim import arrange
-from synpick_warp.system.progress import SilentProgress
-from tests.builders import PICKING, boxes
+from tests.builders import PICKING, bake_boxes
 from tests.harness.exporter_contract import digests
 from tests.twins import rng
 from tests.worlds.kernel_worlds import arrangement_worlds
-from tests.worlds.small_worlds import ANGLE, BOX, CUBE, settings
+from tests.worlds.small_worlds import cluttered_catalog, settings
 
 SEED = 7
-PLATE = ((0.2, 0.2, 0.01),)
 GIVEN = PICKING | {
     "arrangement.max_objects": 5,
     "arrangement.volume": 3e-4,
@@ -41,16 +39,6 @@ GIVEN = PICKING | {
     "randomize.distractors": {"choice": [1, 2]},
     "render.layers": ["classes", "nocs"],
 }
-
-
-def catalog() -> Catalog:
-    """Two kinds of boxes, and a plate and an L without labels."""
-    from tests.worlds import small_worlds
-
-    bodies = small_worlds.catalog(BOX, CUBE, PLATE, ANGLE).entries
-    names = ("box", "cube", "plate", "angle")
-    bodies = tuple(replace(body, name=name) for body, name in zip(bodies, names, strict=True))
-    return Catalog(bodies[:2], tuple(replace(body, obj_id=FIRST_DISTRACTOR - index) for index, body in enumerate(bodies[2:])))
 
 
 # ---- draws ----
@@ -121,9 +109,9 @@ def test_distractors_lie_anywhere_in_the_column(device):
 
 def test_slots_suffice_but_for_the_accepted_share():
     arrangement = settings(arrangement__slot_shortfall=0.01).arrangement
-    assert count_distractor_slots(0, catalog(), arrangement) == (0, 0)
-    assert count_distractor_slots(4, replace(catalog(), distractors=()), arrangement) == (0, 0)
-    assert count_distractor_slots(10, catalog(), arrangement) == (9, 9)  # More than 9 of 10 in a share of 2^-10.
+    assert count_distractor_slots(0, cluttered_catalog(), arrangement) == (0, 0)
+    assert count_distractor_slots(4, replace(cluttered_catalog(), distractors=()), arrangement) == (0, 0)
+    assert count_distractor_slots(10, cluttered_catalog(), arrangement) == (9, 9)  # More than 9 of 10 in a share of 2^-10.
 
 
 def test_a_bin_is_emptied_when_distractors_alone_are_left(device):
@@ -147,9 +135,7 @@ def baked(tmp_path_factory):
     """Folders of a data set, baked in one world and in two."""
     place = tmp_path_factory.mktemp("distractors")
     for worlds in (1, 2):
-        with boxes() as patch:
-            patch.setattr(assembly, "load_catalog", lambda config, report: catalog())
-            run_bake(settings(**(GIVEN | {"bake.worlds": worlds})), place / str(worlds), SilentProgress())
+        bake_boxes(place / str(worlds), GIVEN | {"bake.worlds": worlds}, objects=cluttered_catalog)
     return place / "1", place / "2"
 
 
@@ -218,8 +204,9 @@ def test_stores_and_stages_have_the_distractors_poses(baked):
 
 
 def test_inputs_without_distractors_have_the_digest_that_they_had():
-    objects = Catalog(catalog().entries)
-    assert digest_inputs(objects, ()) == {name: value for name, value in digest_inputs(catalog(), ()).items() if name != "distractors"}
+    with_some = digest_inputs(cluttered_catalog(), ())
+    assert with_some.pop("distractors")
+    assert digest_inputs(Catalog(cluttered_catalog().entries), ()) == with_some
 
 
 # ---- settings ----
@@ -233,11 +220,21 @@ def make_folder(folder: Path, *sides: float) -> Path:
     return folder
 
 
-def test_embedded_objects_are_distractors_of_other_models(tmp_path):
-    config = load_config("smoke", {"bake.models": str(make_folder(tmp_path / "own", 0.05)), "randomize.distractors": 2})
-    loaded = load_catalog(config)
-    assert len(loaded.distractors) == 21
-    assert loaded.object_ids.tolist()[len(loaded) :] == [-2 - index for index in range(21)]
+@pytest.mark.parametrize(("own", "count"), [(True, len(procedural_objects())), (False, len(solids()))])
+def test_embedded_objects_are_distractors_of_other_models_and_solids_of_their_own(tmp_path, own, count):
+    models = str(make_folder(tmp_path / "own", 0.05)) if own else ""
+    loaded = load_catalog(load_config("smoke", {"bake.models": models, "randomize.distractors": 2}))
+    assert {body.name for body in loaded.entries}.isdisjoint(body.name for body in loaded.distractors)
+    assert loaded.object_ids.tolist()[len(loaded) :] == [-2 - index for index in range(count)]
+
+
+def test_solids_are_closed_convex_and_as_large_as_other_parts():
+    for body in solids():
+        mesh = trimesh.Trimesh(body.mesh.vertices, body.mesh.faces)
+        mesh.merge_vertices(merge_norm=True, merge_tex=True)
+        assert mesh.is_watertight
+        assert mesh.volume == pytest.approx(body.hull.volume, rel=1e-3)
+        assert 0.04 < body.hull.diameter < 0.2
 
 
 @pytest.mark.parametrize(
@@ -260,7 +257,6 @@ def test_distractors_without_room_are_one_line(given, said):
 @pytest.mark.parametrize(
     ("folder", "said"),
     [
-        ("", "the catalog has all embedded objects; name a folder by randomize.distractor_models"),
         ("missing", "missing"),
         ("empty", "empty"),
         ("wide", "too large for the tote"),
@@ -269,7 +265,7 @@ def test_distractors_without_room_are_one_line(given, said):
 def test_distractors_that_cannot_be_used_are_one_line(folder, said, tmp_path):
     make_folder(tmp_path / "empty")
     make_folder(tmp_path / "wide", 3.0)
-    config = load_config("smoke", {"randomize.distractors": 1, "randomize.distractor_models": str(tmp_path / folder) if folder else ""})
+    config = load_config("smoke", {"randomize.distractors": 1, "randomize.distractor_models": str(tmp_path / folder)})
     with pytest.raises(CatalogError) as caught:
         load_catalog(config)
     assert said in str(caught.value)
