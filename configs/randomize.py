@@ -187,7 +187,8 @@ class Randomize:
 
     @property
     def most_distractors(self) -> int:
-        """Largest number of distractors that an episode may draw."""
+        """Largest number of distractors for which there is room: of a normal distribution, in all draws but 3 in 100,000."""
         if self.distractors.kind == NORMAL:
-            return MOST_DISTRACTORS
+            (mean,), (sigma,) = self.distractors.values
+            return min(MOST_DISTRACTORS, math.ceil(mean + 4.0 * sigma))
         return max((round(count) for (count,) in self.distractors.values), default=0)

@@ -243,7 +243,7 @@ def test_solids_are_closed_convex_and_as_large_as_other_parts():
         ({"randomize.distractors": 24}, "at least 0, at most 16"),
         ({"randomize.distractors": {"uniform": [0, 17]}}, "at most 16"),
         ({"randomize.distractors": 4, "arrangement.max_objects": 4}, "less than arrangement.max_objects, 4"),
-        ({"randomize.distractors": {"normal": [1, 1]}, "arrangement.max_objects": 16}, "less than arrangement.max_objects, 16"),
+        ({"randomize.distractors": {"normal": [1, 1]}, "arrangement.max_objects": 5}, "less than arrangement.max_objects, 5"),
         ({"randomize.distractors": 1, "bake.models": "some", "randomize.distractor_models": "some/"}, "another folder than bake.models"),
     ],
 )
