@@ -197,6 +197,7 @@ def render_nocs_kernel(
     # Scene:
     meshes: Meshes,
     grid: ImageGrid,
+    obj_id: wp.array[int],  # (entry)
     # In:
     bodies: ViewBodies,
     gbuffer: GBuffer,
@@ -207,8 +208,8 @@ def render_nocs_kernel(
 ):
     """NOCS map, normalized object coordinates (Wang et al., 2019): (p - c) / |u - l| + 1/2, c = (l + u) / 2, l and u the mesh's bounds.
 
-    Zero stands for no instance: no point of an object with an extent has 0 in all three components. Launched over view, pixel (tile order,
-    from flat index `first` on).
+    Zero stands for no instance, or one without label: no point of an object with an extent has 0 in all three components. Launched over
+    view, pixel (tile order, from flat index `first` on).
     """
     view, row, column = tile_pixel(grid, wp.tid() + first)
     if not in_image(grid, row, column):
@@ -217,11 +218,12 @@ def render_nocs_kernel(
     coordinates = wp.vec3(0.0, 0.0, 0.0)
     if segment != Segment.NOTHING and segment <= views.instances:
         mesh = bodies.mesh[view, segment - 1]
-        lower = meshes.lower[mesh]
-        upper = meshes.upper[mesh]
-        barycentric = gbuffer.barycentric[view, row, column]
-        point = wp.mesh_eval_position(meshes.id[mesh], gbuffer.triangle[view, row, column], barycentric[0], barycentric[1])
-        coordinates = (point - 0.5 * (lower + upper)) / wp.length(upper - lower) + wp.vec3(0.5, 0.5, 0.5)
+        if obj_id[mesh] >= 0:
+            lower = meshes.lower[mesh]
+            upper = meshes.upper[mesh]
+            barycentric = gbuffer.barycentric[view, row, column]
+            point = wp.mesh_eval_position(meshes.id[mesh], gbuffer.triangle[view, row, column], barycentric[0], barycentric[1])
+            coordinates = (point - 0.5 * (lower + upper)) / wp.length(upper - lower) + wp.vec3(0.5, 0.5, 0.5)
     nocs_out[view, row, column] = coordinates
 
 
@@ -238,7 +240,7 @@ def render_classes_kernel(
     # Out:
     classes_out: wp.array3d[wp.uint16],  # (view, row, column)
 ):
-    """Semantic segmentation: the class id, obj_id, of the visible instance; 0 without instance.
+    """Semantic segmentation: the class id, obj_id, of the visible instance; 0 without instance, or of one without label.
 
     Launched over view, pixel (tile order, from flat index `first` on).
     """
@@ -248,7 +250,7 @@ def render_classes_kernel(
     segment = int(gbuffer.segment[view, row, column])
     class_id = int(0)
     if segment != Segment.NOTHING and segment <= views.instances:
-        class_id = obj_id[bodies.mesh[view, segment - 1]]
+        class_id = wp.max(obj_id[bodies.mesh[view, segment - 1]], 0)
     classes_out[view, row, column] = wp.uint16(class_id)
 
 

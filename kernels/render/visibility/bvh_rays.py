@@ -111,16 +111,20 @@ def trace_camera_ray(meshes: Meshes, bodies: ViewBodies, view: int, tile: int, r
 
 @wp.func
 def hit_table(table: Table, cameras: AnyCameras, view: int, ray: wp.vec3, best: Hit) -> Hit:
-    """Closer one of a camera ray's hit `best` and its hit on the table's plane."""
+    """Closer one of a camera ray's hit `best` and its hit on the table."""
     result = best
     if table.visible != 0:
-        fall = (cameras.to_world[view] * ray)[2]
+        along = cameras.to_world[view] * ray
+        fall = along[2]
         height = float(cameras.center[view][2]) - table.height
         if fall * height < 0.0:
             depth = -height / fall
             if depth < best.depth:
-                result.segment = Segment.TABLE
-                result.depth = depth
+                x = float(cameras.center[view][0]) + depth * along[0]
+                y = float(cameras.center[view][1]) + depth * along[1]
+                if wp.abs(x) <= table.half[0] and wp.abs(y) <= table.half[1]:
+                    result.segment = Segment.TABLE
+                    result.depth = depth
     return result
 
 

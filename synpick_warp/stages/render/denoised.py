@@ -45,6 +45,7 @@ from synpick_warp.kernels.tuning import CPU_EDGE_THREADS, CPU_FOOTPRINT_THREADS,
 from synpick_warp.stages.arrays import allocate, allocate_struct, device_array, struct_arrays
 from synpick_warp.stages.buffers import FIXTURES, Snapshot
 from synpick_warp.stages.launch import launch_pixels, launch_views
+from synpick_warp.stages.render.looks import shade_floor
 from synpick_warp.stages.render.reference import make_path_rules
 from synpick_warp.stages.render.sampling_rates import (
     accumulates,
@@ -376,6 +377,7 @@ class DenoisedRenderer:
         inputs = [scene.paths, self.coarse, self.shadow_grid, snapshot.light, snapshot.light_yaw, bodies, gbuffer]
         inputs += [self.ratios, self.shadows, views]
         self._launch(self.shade_kernel, scene.grid, views, inputs, [radiance])
+        shade_floor(scene, snapshot, bodies, gbuffer, views, radiance)
 
     def resolve_footprints(self, bodies: Any, gbuffer: Any, views: Any, image: Any) -> None:
         """Anti-alias by coverage rays; writes `image.resolve` and `image.samples`."""

@@ -22,6 +22,7 @@ from synpick_warp.kernels.render.images.layers import (
 )
 from synpick_warp.kernels.render.visibility.camera import TILE_PIXELS
 from synpick_warp.kernels.render.visibility.variants import kernel_for
+from synpick_warp.scenes.types import FIRST_DISTRACTOR
 from synpick_warp.stages.arrays import allocate_struct, struct_arrays
 from synpick_warp.stages.buffers import FIXTURES, LayerBuffers, Snapshot
 from synpick_warp.stages.launch import launch_pixels
@@ -69,7 +70,7 @@ class LayerRenderer:
         self.names = names
         self.sensor = sensor
         if "classes" in names:
-            wrong = [obj_id for obj_id in scene.obj_id.numpy().tolist() if not 0 < obj_id <= MAX_CLASS]
+            wrong = [obj_id for obj_id in scene.obj_id.numpy().tolist() if not 0 < obj_id <= MAX_CLASS and obj_id > FIRST_DISTRACTOR]
             if wrong:
                 raise CatalogError(f"object {wrong[0]} has no place in the layer classes, which holds 1 to {MAX_CLASS}; renumber the model")
         self.motions = None
@@ -93,7 +94,7 @@ class LayerRenderer:
         sensor = [scene.meshes, scene.surfaces, scene.grid, snapshot.episode, snapshot.frame]
         sensor += [self.sensor, bodies, gbuffer, views]
         motion = [scene.grid, snapshot.follows, self.motions, gbuffer, views]
-        objects = [scene.meshes, scene.grid, bodies, gbuffer, views]
+        objects = [scene.meshes, scene.grid, scene.obj_id, bodies, gbuffer, views]
         classes = [scene.grid, scene.obj_id, bodies, gbuffer, views]
         count = views.count
         launches = {
