@@ -22,14 +22,15 @@ MIN_DEPTH = wp.constant(1.0e-3)
 
 @wp.struct
 class SensorParameters:
-    """Structured-light sensor model: seed, baseline [m], disparity quantization, noise and limit [px], range [m], axial and lateral noise,
-    grazing limit, matching window, and whether projector shadows are invalid; see configs.sensors.DepthSensor.
+    """Depth sensor model: seed, baseline [m], disparity quantization, noise and limit [px], range [m]; of structured light axial and
+    lateral noise, grazing limit, matching window, and whether projector shadows are invalid; of infrared images projector, dots, light
+    and noise. See configs.sensors.DepthSensor.
     """
 
     seed: wp.uint64
     """Seed of the bake."""
     baseline: float
-    """From the camera to the projector, to the right [m]."""
+    """From the camera to the projector, or to the right one of two cameras, to the right [m]."""
     disparity_step: float
     """Quantization step of disparity [px]."""
     disparity_noise: float
@@ -59,6 +60,16 @@ class SensorParameters:
     """1: pixels that the projector does not light are invalid."""
     counts_per_meter: float
     """Depth counts in a metre."""
+    projector: float
+    """From the left camera to the projector of dots, to the right [m]."""
+    dot_spacing: float
+    """Width of a cell of the pattern, which has one dot [px]."""
+    dot_brightness: float
+    """Brightness of dots on a white surface at 1 m, relative to full scale."""
+    ambient: float
+    """Brightness of ambient infrared light, relative to that of colour images."""
+    infrared_noise: float
+    """Standard deviation of infrared images, relative to full scale."""
 
 
 @wp.func
