@@ -62,6 +62,8 @@ FREE_SETTINGS = (
     "bake.lights",
     "randomize.bin_textures",
     "randomize.table_textures",
+    "randomize.background_textures",
+    "randomize.distractor_models",
     "bake.writers",
     "render.views_per_batch",
     "perception.views",
@@ -82,7 +84,13 @@ YOUNGER_SETTINGS: dict[str, Any] = {
     "depth_sensor.preset": "",
     "depth_sensor.disparity_noise": 0.0,
     "depth_sensor.max_disparity": 0.0,
+    "depth_sensor.projector": 0.5,
+    "depth_sensor.dot_spacing": 4.0,
+    "depth_sensor.dot_brightness": 1.0,
+    "depth_sensor.ambient": 0.25,
+    "depth_sensor.infrared_noise": 0.005,
     "perception.camera": "",
+    "render.table_size": (0.0, 0.0),
     "camera": [],
     "bin": [],
     "objects.unit": AUTO_UNIT,
@@ -203,7 +211,7 @@ def read_settings(folder: Path, manifest: Mapping[str, Any]) -> Config:
     path = path_inside(folder, CONFIG_FILE, folder, DatasetError)
     check_regular_file(path, MAX_TOML, DatasetError)
     settings = manifest["settings"]
-    younger = {key: value for key, value in YOUNGER_SETTINGS.items() if "." in key}
+    younger = {key: value for key, value in YOUNGER_SETTINGS.items() if "." in key and key not in FREE_SETTINGS}
     before = {key: value for key, value in younger.items() if key.split(".")[1] not in settings.get(key.split(".")[0], {})}
     config = override_config(load_config(str(path), {}), before)
     said = describe_differences({"settings": make_manifest(config)["settings"]}, {"settings": settings})
