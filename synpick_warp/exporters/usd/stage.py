@@ -187,7 +187,7 @@ def _add_camera(stage: Usd.Stage, name: str, camera: Camera) -> None:
     UsdGeom.Scope.Define(stage, f"{ROOT}/Render")
     product = UsdRender.Product.Define(stage, f"{ROOT}/Render/{name}")
     product.CreateResolutionAttr(Gf.Vec2i(camera.width, camera.height))
-    product.CreatePixelAspectRatioAttr(fx / fy)
+    product.CreatePixelAspectRatioAttr(fy / fx)  # Width by height of a pixel on the film: f / fx by f / fy.
     product.CreateCameraRel().SetTargets([lens.GetPath()])
 
 

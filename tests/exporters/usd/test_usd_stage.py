@@ -189,6 +189,70 @@ def project(stage: Usd.Stage, index: int, camera: Camera, point: np.ndarray) -> 
     return (shown[0] + 1.0) / 2.0 * camera.width, (1.0 - shown[1]) / 2.0 * camera.height
 
 
+CALIBRATED = {
+    "calibrated": (320, 240, 275.0, 274.6, 163.8, 117.5),
+    "oblong_pixels": (640, 400, 900.0, 850.0, 301.5, 222.25),
+    "off_center": (1280, 720, 631.5, 631.2, 500.25, 366.5),
+    "portrait": (200, 400, 373.2, 373.0, 97.5, 215.0),
+}
+"""Width, height, fx, fy, cx and cy of cameras [px]."""
+
+
+@pytest.fixture(scope="module")
+def calibrated(rows) -> Usd.Stage:
+    matrices = {name: np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]]) for name, (_, _, fx, fy, cx, cy) in CALIBRATED.items()}
+    lenses = [replace(LENSES[0], width=row[0], height=row[1], matrix=matrices[name], name=name) for name, row in CALIBRATED.items()]
+    return open_episode(rows, tuple(lenses))
+
+
+@pytest.mark.parametrize("name", CALIBRATED)
+def test_intrinsics_are_read_back(calibrated, name):
+    """By USD's definitions: aperture and focal length in one unit, offsets in that of the aperture, up and to the right."""
+    width, height, fx, fy, cx, cy = CALIBRATED[name]
+    lens = UsdGeom.Camera.Get(calibrated, f"/Episode/Cameras/{name}").GetCamera(0)
+    across, down = lens.horizontalAperture, lens.verticalAperture
+    assert lens.focalLength / across * width == pytest.approx(fx, rel=1e-6)
+    assert lens.focalLength / down * height == pytest.approx(fy, rel=1e-6)
+    assert 0.5 - lens.horizontalApertureOffset / across == pytest.approx(cx / width, abs=1e-6)
+    assert 0.5 + lens.verticalApertureOffset / down == pytest.approx(cy / height, abs=1e-6)
+    product = UsdRender.Product.Get(calibrated, f"/Episode/Render/{name}")
+    # Otherwise renderers expand the aperture until the aspect ratios agree (aspectRatioConformPolicy).
+    columns, image_rows = product.GetResolutionAttr().Get()
+    assert columns / image_rows * product.GetPixelAspectRatioAttr().Get() == pytest.approx(across / down, rel=1e-6)
+
+
+def blender_matrix(lens: Gf.Camera, width: int, height: int, aspect: float, fit: str = "AUTO") -> tuple[float, float, float, float]:
+    """fx, fy, cx, cy of a render in Blender after its import of a USD camera [px]; `aspect`: pixel_aspect_y / pixel_aspect_x.
+
+    By the formulas of its importer, shift_x and shift_y are the offsets divided by the horizontal aperture. By those of its renderer, focal
+    length, sensor width and shifts refer to the width of the image, or with the sensor fit AUTO to the longer side.
+    """
+    side = width if fit == "HORIZONTAL" or width >= aspect * height else aspect * height
+    focal = lens.focalLength / lens.horizontalAperture * side
+    shift_x, shift_y = (offset / lens.horizontalAperture for offset in (lens.horizontalApertureOffset, lens.verticalApertureOffset))
+    return focal, focal / aspect, width / 2 - shift_x * side, height / 2 + shift_y * side / aspect
+
+
+@pytest.mark.parametrize(
+    ("name", "aspect", "fit", "off"),
+    [
+        ("calibrated", 1.0, "AUTO", 0.05),
+        ("off_center", 1.0, "AUTO", 0.05),
+        ("calibrated", 275.0 / 274.6, "AUTO", 1e-4),
+        ("oblong_pixels", 900.0 / 850.0, "AUTO", 1e-4),
+        ("portrait", 373.2 / 373.0, "HORIZONTAL", 1e-4),
+    ],
+)
+def test_blender_shifts_its_lens_as_the_principal_point(calibrated, name, aspect, fit, off):
+    """Blender's import leaves the pixels' aspect ratio at 1, and so fy at fx; portrait images need the sensor fit."""
+    width, height, fx, fy, cx, cy = CALIBRATED[name]
+    lens = UsdGeom.Camera.Get(calibrated, f"/Episode/Cameras/{name}").GetCamera(0)
+    found = blender_matrix(lens, width, height, aspect, fit)
+    assert found[2:] == pytest.approx((cx, cy), abs=off)
+    assert found[0] == pytest.approx(fx, rel=1e-6)
+    assert found[1] == pytest.approx(fx if aspect == 1.0 else fy, rel=1e-6)
+
+
 def test_aperture_is_36_mm_and_render_products_have_the_resolution(stage):
     for index, camera in enumerate(LENSES):
         lens = UsdGeom.Camera.Get(stage, f"/Episode/Cameras/camera_{index}")
