@@ -1,4 +1,4 @@
-"""Validation across the settings of cameras, bins and depth: poses and matrices that are none, cameras that see no bin."""
+"""Validation across the settings of cameras, bins and depth: invalid poses and matrices, cameras that do not see the bin."""
 
 from __future__ import annotations
 
@@ -125,7 +125,7 @@ def _view(rig: Rig, index: int, config: Config) -> Iterator[Conflict]:
 
 
 def _matrix(key: str, matrix: tuple[tuple[float, float, float], ...], width: int, height: int) -> Iterator[Conflict]:
-    """Yield a camera matrix that no camera with images of this size has."""
+    """Yield a camera matrix that is singular, skewed or implausible for images of this size."""
     (fx, skew, cx), (other, fy, cy), last = matrix
     low, high = (factor * width for factor in FOCAL_LENGTHS)
     if last != (0.0, 0.0, 1.0) or other != 0.0:
@@ -142,7 +142,7 @@ def _matrix(key: str, matrix: tuple[tuple[float, float, float], ...], width: int
 
 
 def _lens(key: str, row: CameraRow, layers: tuple[str, ...]) -> Iterator[Conflict]:
-    """Yield a distortion that no lens has, or with which a layer cannot be rendered."""
+    """Yield a distortion that is not invertible over the image, or with which a layer cannot be rendered."""
     try:
         lens = lens_map(row)
     except ConfigError as error:

@@ -32,7 +32,7 @@ Textures = tuple[np.ndarray, ...]
 
 @dataclass(frozen=True, eq=False)
 class Looks:
-    """What episodes draw their looks from: the distributions, and the textures of bin, table and background; none: no textures."""
+    """Randomized appearance: the distributions, and the loaded textures of bin, table and background; empty: none."""
 
     randomize: Randomize
     bin_textures: Textures

@@ -1,4 +1,4 @@
-"""Text of a calibration file as a tree: YAML, XML or JSON, whatever its suffix; without aliases, tags and entities.
+"""Parsers of calibration files: YAML, XML or JSON, told apart by content, to nested mappings. Aliases, tags and entities are refused.
 
 OpenCV's own reader is not used: it fails by exceptions of C++, and takes files of any size.
 """

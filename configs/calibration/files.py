@@ -1,4 +1,4 @@
-"""Calibration files of other programs: OpenCV, ROS, BOP, RealSense and Zivid, as one kind of intrinsics with pixel centres at + 0.5.
+"""Readers of camera calibration files of OpenCV, ROS, BOP, RealSense and Zivid; all return intrinsics with pixel centres at + 0.5.
 
 | format | file | pixel centres | lens |
 |---|---|---|---|

@@ -14,8 +14,8 @@ PUBLISHED = "published"
 MEASURED = "measured"
 ASSUMED = "assumed"
 DEFINED = "defined"
-"""Trust in a figure: stated by the manufacturer; calibrated or computed from calibrations of units by others; not public, or not read where
-it was published, chosen here; of a sensor that is none."""
+"""Where a figure comes from: the manufacturer; calibrations of single units that others published; an assumption, where nothing
+is public or the source could not be read; the definition of the ideal sensor."""
 COUPLED: dict[str, Any] = {"noise": 0.0, "noise_growth": 0.0, "noise_angle": 0.0}
 """Settings of all presets: no noise but that of disparity and of the pixel's position."""
 

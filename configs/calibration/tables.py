@@ -1,4 +1,4 @@
-"""[[camera]] tables that name a calibration file or a sensor, with its numbers in their place, so that nothing reads the file again."""
+"""Resolution of [[camera]] tables that name a calibration file or a sensor: numbers replace the name, and the file is not read again."""
 
 from __future__ import annotations
 

@@ -19,7 +19,7 @@ MAX_FOLD = 36
 _GRID, _GRID_FOLDS = 600, (2, 3, 4, 5)
 """Directions over the half sphere, 6° apart, and the folds about them: polyhedra have no others; axes of larger folds are principal."""
 _MOMENTS = 0.15
-"""Relative difference between the covariances of a surface and its rotated self up to which the rotation is looked at."""
+"""Relative difference between the covariances of a surface and its rotated self up to which the rotation is a candidate."""
 _MARGIN = 0.03
 """Mean distance that a candidate may have beyond the tolerance, in diameters: its axis is up to 4° off."""
 _NEIGHBOURHOOD = np.cos(np.radians(9.0))
@@ -47,7 +47,7 @@ class Turn:
 @dataclass(frozen=True)
 class Symmetries:
     """Symmetries that were found: discrete ones (N, 4, 4) without the identity, closed under composition up to the continuous ones,
-    with their distances (N) [m], and continuous ones; and the nearest miss, if it is near."""
+    with their distances (N) [m], and continuous ones; and the best rotation beyond the tolerance, up to twice of it."""
 
     discrete: np.ndarray
     deviations: np.ndarray
@@ -82,7 +82,7 @@ def find_axes(matrices: np.ndarray) -> list[Turn]:
 
 
 def _upward(axis: np.ndarray) -> np.ndarray:
-    """An axis in the direction in which its largest component is positive."""
+    """Flip an axis such that its largest component is positive."""
     return axis * np.sign(axis[np.argmax(np.abs(axis))])
 
 
@@ -96,8 +96,8 @@ def find_symmetries(vertices: np.ndarray, faces: np.ndarray, diameter: float, to
         tolerance: Largest Hausdorff distance [m].
 
     Returns:
-        A closed group of discrete symmetries; those about a continuous axis are left to it, and beside it at most one half turn stays,
-        which swaps its ends. Of a ball three continuous axes, which stand for all rotations.
+        A closed group of discrete symmetries. Rotations about a continuous axis are omitted, as the axis stands for them; beside it there is
+        at most one half turn, about a perpendicular axis. A ball has three continuous axes, which stand for all rotations.
     """
     surface = Surface(vertices, faces)
     turns, missed = _find_turns(surface, diameter, tolerance)
@@ -211,7 +211,7 @@ def _turn(surface: Surface, axis: np.ndarray, point: np.ndarray, fold: int) -> T
 
 
 def _snap(surface: Surface, turn: Turn, tolerance: float) -> Turn:
-    """The same rotation about the next axis of coordinates, and through the origin, if it is as good: parts are mostly built so."""
+    """Snap a rotation to the nearest coordinate axis and to the origin if its distance stays as small: most parts are modelled so."""
     options = [turn.axis]
     near = int(np.argmax(np.abs(turn.axis)))
     if abs(turn.axis[near]) > np.cos(np.radians(3.0)):
@@ -285,7 +285,7 @@ def _about(rotation: np.ndarray, center: np.ndarray) -> np.ndarray:
 
 
 def _common_point(turns: list[Turn], center: np.ndarray) -> np.ndarray:
-    """Point next to all axes, and along a common direction next to the centroid."""
+    """Point closest to all axes (least squares), and along a common direction closest to the centroid."""
     across = [np.eye(3) - np.outer(turn.axis, turn.axis) for turn in turns]
     weak = 1e-9 * np.eye(3)
     point = np.linalg.solve(sum(across) + weak, sum(one @ turn.point for one, turn in zip(across, turns, strict=True)) + weak @ center)

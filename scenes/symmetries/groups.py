@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 MAX_ELEMENTS = 144
 """Largest group: dihedral ones have two elements for each fold; the rotations of the icosahedron are 60."""
 _EQUAL = 1.0
-"""Angle up to which two declared rotations are one [°], whose matrices are rounded."""
+"""Angle up to which two declared rotations are the same [°]: their matrices are rounded."""
 
 
 def find_element(elements: np.ndarray, rotation: np.ndarray, within: float = _EQUAL) -> int:
@@ -54,7 +54,7 @@ def close_group(generators: np.ndarray, within: float) -> np.ndarray | None:
 
 
 def make_exact(elements: np.ndarray, within: float) -> np.ndarray | None:
-    """Group whose products are exact, next to rotations (N, 3, 3) whose products are known within an angle [°]; None if there is none.
+    """Exact group closest to rotations (N, 3, 3) that are a group up to an angle [°]; None if there is none.
 
     Element a becomes the mean over all b of (a b) b⁻¹, which converges quadratically (Grove, Karcher and Ruh, 1974).
     """

@@ -1,4 +1,4 @@
-"""Surface of a mesh as points, and how far a rigid transform moves it off itself: the two-sided Hausdorff distance."""
+"""Point sample of a mesh's surface, and the two-sided Hausdorff distance between the surface and itself under a rigid transform."""
 
 from __future__ import annotations
 

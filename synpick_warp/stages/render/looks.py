@@ -106,7 +106,7 @@ def _pack_choice(distribution: Distribution) -> list[np.ndarray]:
 
 
 class Dresser:
-    """Makes the materials of each batch of views. Owns a scene with space for them.
+    """Sampler of the materials of each batch of views. Owns a scene with space for them.
 
     Attributes:
         scene: The scene whose surfaces have a row for each body of each view.
@@ -161,7 +161,7 @@ def _copy(kind: Any, struct: Any) -> Any:
 
 
 def draw_parameters(looks: Looks, seed: int, episode: int, parts: list[tuple[LookPart, int]]) -> tuple[np.ndarray, np.ndarray]:
-    """Draw all parameters of bodies (part, index within it), on the processor by the renderer's function.
+    """Sample all parameters of bodies (part, index within it) on the CPU, by the function that the renderer calls.
 
     Returns:
         `LookKind` of each parameter (part, look), and the values (body, look, 3) float32.
@@ -177,7 +177,7 @@ def draw_parameters(looks: Looks, seed: int, episode: int, parts: list[tuple[Loo
 def draw_looks(looks: Looks, seed: int, episode: int, objects: int, distractors: Mapping[int, str] | None = None) -> dict[str, Any]:
     """Record of the looks of an episode: by part and parameter, of each object and distractor. Textures by index, colours in sRGB.
 
-    Computed on the processor by the renderer's function: it agrees with a GPU up to the rounding of logarithms and cosines.
+    Computed on the CPU by the function that the renderer calls; a GPU's values differ by the rounding of logarithms and cosines.
 
     Args:
         looks: What is drawn from.
