@@ -162,6 +162,7 @@ class Stream(enum.IntEnum):
     BIN = 12
     LOOKS = 13
     COMPARTMENT = 15
+    CAMERA = 16
 
 
 class Look(enum.IntEnum):

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import contextlib
 import gc
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
@@ -25,7 +25,7 @@ from synpick_warp.factory.order import order_longest_first
 from synpick_warp.factory.sizes import count_writers, fit_to_device, without_pictures
 from synpick_warp.scenes.bins import make_bins
 from synpick_warp.scenes.build import REPEATS, find_repeat_rules, must_repeat, with_capacities
-from synpick_warp.scenes.cameras import make_cameras
+from synpick_warp.scenes.cameras import EpisodeCameras
 from synpick_warp.scenes.catalog import load_catalog
 from synpick_warp.scenes.fixtures import make_fixtures
 from synpick_warp.scenes.looks import Looks, load_looks
@@ -50,7 +50,7 @@ class Stages:
     config: Config
     """The settings; `bake.worlds` is the actual number."""
     catalog: Catalog
-    cameras: tuple[Camera, ...]
+    episode_cameras: EpisodeCameras
     lights: tuple[EnvironmentMap, ...]
     simulation: Simulation
     groups: tuple[CameraGroup, ...]
@@ -70,9 +70,14 @@ class Stages:
         return self.groups[0].renderer.scene.looks
 
     @property
-    def looks(self) -> Callable[[int, int], Mapping[str, Any]] | None:
-        """Function of episode and number of objects that returns the record of the episode's looks; None: none is randomized."""
-        return partial(draw_looks, self.randomized, self.config.bake.seed) if self.randomized else None
+    def cameras(self) -> tuple[Camera, ...]:
+        """The cameras, without what episodes draw of them."""
+        return self.episode_cameras.cameras
+
+    def draws(self, episode: int, objects: int) -> dict[str, Any]:
+        """Fields of `EpisodeRow` that record what an episode with a number of objects draws: looks and cameras; None: nothing."""
+        looks = draw_looks(self.randomized, self.config.bake.seed, episode, objects) if self.randomized else None
+        return {"looks": looks, "cameras": self.episode_cameras.record(episode)}
 
     def make_log(self) -> AttemptLog:
         """Create an empty attempt log."""
@@ -166,7 +171,7 @@ def _add_stream(stages: Stages, device: wp.Device, needs_images: bool, depth_fil
         ViewRing(group, config.render.layers, device, host_images(config.bop, group.sizes["row"], device, needs_images, depth_files))
         for group in stages.groups
     ]
-    stream = FrameStream(rings, tick_time, stages.object_ids, table, device, config.cell.recorded)
+    stream = FrameStream(rings, tick_time, stages.object_ids, table, device, config.cell.recorded, stages.episode_cameras)
     return Factory(**vars(stages), stream=stream, log=stages.make_log())
 
 
@@ -181,7 +186,8 @@ def build_stages(
 ) -> Stages:
     """Load assets, and build worlds and renderer, from settings with resolved sizes. Other arguments and errors: `build_factory`."""
     progress.stage("loading objects and lights")
-    cameras = make_cameras(config.rig)
+    episode_cameras = EpisodeCameras(config.rig, config.bake.seed)
+    cameras = episode_cameras.cameras
     bins = make_bins(config.cell.bins)
     catalog = load_catalog(config, report=progress.note)
     lights = load_scene_lights(config.bake.lights, config.randomize, config.bake.seed, progress.note, config.objects.strict)
@@ -196,7 +202,7 @@ def build_stages(
     groups = tuple(_build_group(config, scene, cameras, index) for index in range(len(config.rig.groups)))
     object_ids = np.array([entry.obj_id for entry in catalog.entries], dtype=np.int32)
     table = name_lights([light.name for light in lights], scene.lights)
-    return Stages(config, catalog, cameras, lights, simulation, groups, object_ids, table)
+    return Stages(config, catalog, episode_cameras, lights, simulation, groups, object_ids, table)
 
 
 def _build_group(config: Config, scene: RenderScene, cameras: tuple[Camera, ...], index: int) -> CameraGroup:
@@ -204,7 +210,8 @@ def _build_group(config: Config, scene: RenderScene, cameras: tuple[Camera, ...]
     indices, worlds, objects = config.rig.groups[index], config.bake.worlds, config.arrangement.max_objects
     sizes = view_sizes(config.render, config.rig, worlds, objects, scene.device, index)
     scene = with_cameras(scene, tuple(cameras[camera] for camera in indices))
-    return CameraGroup(indices, sizes, make_renderer(config, scene, objects, sizes["view"], worlds * len(indices)))
+    renderer = make_renderer(config, scene, objects, sizes["view"], worlds * len(indices))
+    return CameraGroup(indices, sizes, renderer, config.rig.is_placed(indices[0]))
 
 
 def _fit_to_catalog(config: Config, catalog: Catalog, device: wp.Device, progress: Progress) -> Config:

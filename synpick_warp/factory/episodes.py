@@ -46,6 +46,8 @@ class EpisodeRow(NamedTuple):
     """Randomized looks of the episode, as `draw_looks` has them; None, and no key: the settings randomize none."""
     bin: dict[str, Any] | None = None
     """Record of the bin; None, and no key: a tote that is always in its place."""
+    cameras: dict[str, Any] | None = None
+    """Record of the cameras by name, as `EpisodeCameras.record` has it; None, and no key: all are those of the settings."""
 
     def as_json(self) -> dict[str, Any]:
         """Row as the dictionary of a line of episodes.jsonl."""
@@ -127,14 +129,14 @@ def episode_row(
     layout: DataLayout,
     bins: Sequence[str],
     tick_time: float,
-    looks: Callable[[int, int], Mapping[str, Any]] | None,
+    draws: Callable[[int, int], Mapping[str, Any]],
     report: TickReport,
     world: int,
     record: EpisodeRecord,
 ) -> EpisodeRow:
     """Build the row of the episode that ended in a world.
 
-    `bins`: `Cell.recorded`; `tick_time`: time between two frames [s]; `looks`: see `Stages.looks`.
+    `bins`: `Cell.recorded`; `tick_time`: time between two frames [s]; `draws`: see `Stages.draws`.
     """
     episode, arrangement, frame, ending = (int(report.column(name)[world]) for name in ("episode", "arrangement", "frame", "ending"))
     split = layout.split_of(episode)
@@ -151,8 +153,8 @@ def episode_row(
         record.lost,
         record.left,
         "" if split is None else split.name,
-        None if looks is None else looks(episode, record.objects),
-        bin_record(bins[int(report.snapshot.bin[world])], report.snapshot.fixture_pose[world, 0]) if bins else None,
+        bin=bin_record(bins[int(report.snapshot.bin[world])], report.snapshot.fixture_pose[world, 0]) if bins else None,
+        **draws(episode, record.objects),
     )
 
 

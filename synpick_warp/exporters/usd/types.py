@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
 
 from synpick_warp.codes import Ending
 from synpick_warp.configs.cell import BinSizes
@@ -60,13 +62,16 @@ class EpisodeMetadata:
     """Name of the episode's split; empty: the data set has none."""
     bin: str = ""
     """Name of the bin; empty: a tote that is always in its place."""
+    cameras: Mapping[str, Any] = field(default_factory=dict)
+    """Matrix and pose of the cameras that the episode draws, by name."""
 
     @staticmethod
     def from_end(end: EpisodeEnd) -> EpisodeMetadata:
         """Take the metadata from the episode's end."""
         own = (end.row or {}).get("bin") or {}
         ending = Ending(end.ending).name.lower()
-        return EpisodeMetadata(end.episode, end.arrangement, end.frames, ending, end.row.get("split", ""), own.get("name", ""))
+        cameras = end.row.get("cameras") or {}
+        return EpisodeMetadata(end.episode, end.arrangement, end.frames, ending, end.row.get("split", ""), own.get("name", ""), cameras)
 
 
 def bin_asset(sizes: BinSizes) -> str:
