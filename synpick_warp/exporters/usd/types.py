@@ -101,11 +101,9 @@ class EpisodeMetadata:
     def from_end(end: EpisodeEnd) -> EpisodeMetadata:
         """Take the metadata from the episode's end."""
         row = end.row or {}
-        ending = Ending(end.ending).name.lower()
+        ending, bin = Ending(end.ending).name.lower(), (row.get("bin") or {}).get("name", "")
         drawn = {name: row.get(name) or {} for name in ("looks", "cameras")}
-        return EpisodeMetadata(
-            end.episode, end.arrangement, end.frames, ending, row.get("split", ""), (row.get("bin") or {}).get("name", ""), **drawn
-        )
+        return EpisodeMetadata(end.episode, end.arrangement, end.frames, ending, row.get("split", ""), bin, **drawn)
 
 
 def bin_asset(sizes: BinSizes) -> str:
