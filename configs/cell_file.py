@@ -8,7 +8,8 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from synpick_warp.configs.bins import BinRow
-from synpick_warp.configs.cameras import Pose
+from synpick_warp.configs.cameras import Jitter, Pose
+from synpick_warp.configs.check import is_table
 from synpick_warp.configs.load import sections, table_lists
 from synpick_warp.configs.randomize import ColorDistribution, Distribution
 from synpick_warp.configs.table_lists import given_values, settings_of
@@ -18,8 +19,8 @@ WIDTH = 120
 """Longest comment line [characters]."""
 FILL, _FEW = 0.1, 4
 """Volume of an episode's objects, as a fraction of the bin's, and their largest number: a few minutes on a CPU."""
-_HEAD = """Cell {name}: cameras, bin, parts and what is randomized. Meaning, unit and allowed values stand above each setting. Lines
-that begin with # and a key, as in #seed = 7, are examples: remove the # to use them.
+_HEAD = """Cell {name}: cameras, bin, parts and what is randomized. Meaning, unit and allowed values stand above each setting.
+Lines that begin with # and a key, as in #seed = 7, are examples: remove the # to use them.
 
     synpick-warp preview --cell {name}/cell.toml             # picture of the cell, after a change
     synpick-warp bake --config {name}/cell.toml --out DATA   # a small data set
@@ -96,8 +97,14 @@ _MEASURED: dict[str, Any] = {
     "distortion": (-0.12, 0.08, 0.0005, -0.0003, 0.0),
     "model": "pinhole",
     "pose": Pose(matrix=((1.0, 0.0, 0.0, 0.0), (0.0, -1.0, 0.0, 0.0), (0.0, 0.0, -1.0, 1.2), (0.0, 0.0, 0.0, 1.0))),
+    "jitter": Jitter(
+        Distribution("normal", ((0.0,), (0.002,))),
+        Distribution("normal", ((0.0,), (0.2,))),
+        Distribution("uniform", ((-0.005,), (0.005,))),
+        Distribution("uniform", ((-1.0,), (1.0,))),
+    ),
 }
-"""Example of a camera with lens and pose by numbers."""
+"""Example of a camera with lens and pose by numbers, and with jitter about them."""
 _RANDOMIZED: dict[str, Any] = {
     "object_hue": Distribution("normal", ((0.0,), (10.0,))),
     "object_brightness": Distribution("log_uniform", ((0.7,), (1.4,))),
@@ -148,5 +155,5 @@ def _table(header: str, name: str, values: Mapping[str, Any], examples: Mapping[
     for mark, settings in (("", values), ("#", examples)):
         for key, value in settings.items():
             lines += _comment(describe_setting(*known[key])) if first else []
-            lines.append(f"{mark}{key} = {format_toml(given_values(value) if isinstance(value, Pose) else value)}")
+            lines.append(f"{mark}{key} = {format_toml(given_values(value) if is_table(type(value)) else value)}")
     return [*lines, ""]
