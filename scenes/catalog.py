@@ -95,10 +95,13 @@ def _load_entries(
     return sorted(entries, key=lambda entry: entry.obj_id)
 
 
-def read_objects(config: Config, report: Callable[[str], None] = _ignore) -> list[RawObject]:
-    """Read and check the objects of a bake, without collision shapes; arguments, files and errors as of `load_catalog`."""
-    faults = _Faults(config.objects.strict, config.bake.models, report)
-    raws = _read_objects(config.bake.models, _Rules(config.objects, config.object_rows, config.cell.bins), report, faults)
+def read_objects(
+    models: str, objects: Objects, rows: tuple[ObjectRow, ...], bins: tuple[BinSizes, ...], report: Callable[[str], None] = _ignore
+) -> list[RawObject]:
+    """Read and check the objects of a folder, or if it is empty the embedded ones, without collision shapes; files and errors as of
+    `load_catalog`."""
+    faults = _Faults(objects.strict, models, report)
+    raws = _read_objects(models, _Rules(objects, rows, bins), report, faults)
     faults.tell()
     return raws
 

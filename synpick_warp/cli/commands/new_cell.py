@@ -99,8 +99,9 @@ def new_cell(
         width, height = rows[0][0].resolution or _RESOLUTION
         perception = (_PERCEPTION, max(_LEAST, round(_PERCEPTION * height / width)))
         cell = NewCell(cameras, shape, models, unit or AUTO_UNIT, perception=perception)
-        config = _write_cell(cell, escape(str(folder)), stage, {"bake.models": str(stage / PARTS)} if copied else {})
-        draw_cell(config, f"{place.name}/{CELL}", stage / PICTURE, lambda note: escape(note.replace(str(stage), str(folder))))
+        staged = {"bake.models": str(stage / PARTS)} if copied else {}
+        _write_cell(cell, escape(str(folder)), stage, staged)
+        draw_cell(stage / CELL, staged, f"{place.name}/{CELL}", stage / PICTURE, lambda note: escape(note.replace(str(stage), str(folder))))
     print(f"cell: {escape(str(folder / CELL))}, picture: {escape(str(folder / PICTURE))}")
     print(f"bake it: synpick-warp bake --config {escape(str(folder / CELL))} --out DATA")
     return 0
@@ -233,7 +234,7 @@ def _name_camera(stem: str, taken: Sequence[str]) -> str:
     return next(each for each in (name, *(f"{name}_{number}" for number in range(2, 1000))) if each not in taken)
 
 
-def _write_cell(cell: NewCell, name: str, stage: Path, staged: Mapping[str, object]) -> Config:
+def _write_cell(cell: NewCell, name: str, stage: Path, staged: Mapping[str, object]) -> None:
     """Write the settings, with a volume budget for the parts, and moved to their middle if they are too far from their origin; `staged`:
     settings while the files are there.
 
@@ -246,18 +247,20 @@ def _write_cell(cell: NewCell, name: str, stage: Path, staged: Mapping[str, obje
         (stage / CELL).write_text(cell_toml(cell, name), encoding="utf-8")
         return load_config(stage / CELL, staged)
 
-    def volume(config: Config) -> float:
-        return max(raw.hull.volume for raw in read_objects(config.with_values({"objects.strict": bool(staged)})))
+    def largest(cell: NewCell) -> float:
+        config = write(cell)
+        objects = replace(config.objects, strict=bool(staged))
+        return max(raw.hull.volume for raw in read_objects(config.bake.models, objects, config.object_rows, config.cell.bins))
 
-    config = write(cell)
     if not cell.models:
-        return config
+        write(cell)
+        return
     try:
-        largest = volume(config)
+        volume = largest(cell)
     except CatalogError as error:
         cell = replace(cell, center=True)
         try:
-            largest = volume(write(cell))
+            volume = largest(cell)
         except CatalogError:
             raise error from None
-    return write(replace(cell, volume=2.0 * largest))
+    write(replace(cell, volume=2.0 * volume))

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import replace
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Annotated
 
@@ -13,7 +12,6 @@ from synpick_warp.cli.folders import beside, check_output_file, find_data_set, h
 from synpick_warp.cli.options import WholeNumber
 from synpick_warp.configs.load import load_config
 from synpick_warp.configs.objects import AUTO_UNIT, DECLARED, DETECT
-from synpick_warp.configs.schema import Config
 from synpick_warp.errors import ConfigError, escape
 
 
@@ -88,12 +86,13 @@ def _preview_symmetries(folder: Path | None, out: Path | None, config: str | Non
     check_picture_name(sheet)
     check_output_file(sheet, "--out", folder)
     resolved = load_config(config, settings | {"bake.models": str(models)})
-    resolved = replace(resolved, object_rows=()) if is_set else resolved
 
     def report(line: str) -> None:
         print(escape(line))
 
-    write_symmetry_sheet(read_objects(resolved, report), resolved.objects.symmetry_tolerance, sheet, report)
+    rows = () if is_set else resolved.object_rows
+    objects = read_objects(resolved.bake.models, resolved.objects, rows, resolved.cell.bins, report)
+    write_symmetry_sheet(objects, resolved.objects.symmetry_tolerance, sheet, report)
     print(f"symmetries: {escape(str(sheet))}")
     return 0
 
@@ -105,18 +104,32 @@ def _preview_cell(cell: str, out: Path | None) -> int:
 
     check_picture_name(sheet)
     check_output_file(sheet, "--out", inputs=[Path(cell)])
-    draw_cell(load_config(cell), Path(cell).name, sheet)
+    draw_cell(cell, {}, Path(cell).name, sheet)
     print(f"cell: {escape(str(sheet))}")
     return 0
 
 
-def draw_cell(config: Config, name: str, out: Path, say: Callable[[str], str] = escape) -> None:
-    """Draw a cell, with the progress on the console; `say` words notes; other arguments and errors as of `write_cell_sheet`."""
+def draw_cell(preset_or_file: str | Path, settings: Mapping[str, object], name: str, out: Path, say: Callable[[str], str] = escape) -> None:
+    """Draw the cell of settings, as of `load_config`, with the progress on the console.
+
+    Args:
+        preset_or_file, settings: As of `load_config`.
+        name: What the sheet is of, for its title.
+        out: PNG or JPEG file to write.
+        say: Words a note.
+
+    Raises:
+        SynpickError: Settings, device, bins, cameras or all objects cannot be used, or the file cannot be written.
+    """
+    config = load_config(preset_or_file, settings)
+    from synpick_warp.apps.viz.cell.rendering import CellScene
     from synpick_warp.apps.viz.cell.sheet import write_cell_sheet
     from synpick_warp.cli.display import make_console, make_progress
 
     with make_progress(make_console()) as progress:
-        write_cell_sheet(config, name, out, progress, lambda note: progress.note(say(note)))
+        scene = CellScene(config, progress, lambda note: progress.note(say(note)))
+        progress.stage(f"rendering {len(config.rig)} cameras")
+        write_cell_sheet(scene, config.rig, config.bins, name, out)
 
 
 def explain(

@@ -71,7 +71,7 @@ class CellScene:
         self.sizes = config.cell.bins
         bins = make_bins(self.sizes)
         progress.stage("reading objects")
-        self.objects = read_objects(config, report)
+        self.objects = read_objects(config.bake.models, config.objects, config.object_rows, config.cell.bins, report)
         self.laid = [lay_out(self.objects, sizes) for sizes in self.sizes]
         catalog = Catalog(tuple(map(_entry, self.objects)))
         light = next(sky for sky in skies() if sky.name == _SKY)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import colorsys
 import math
-from collections.abc import Callable
 from pathlib import Path
 
 import cv2
@@ -13,12 +12,12 @@ import numpy as np
 from synpick_warp.apps.viz.cell.frusta import Canvas, center, draw_axes, draw_camera, project, rays
 from synpick_warp.apps.viz.cell.rendering import CellScene, scaled_down
 from synpick_warp.apps.viz.drawing import GOLDEN, INK, WHITE, Image, check_picture_name, put_text, write_picture
+from synpick_warp.configs.bins import Bins
 from synpick_warp.configs.cell import BinSizes
-from synpick_warp.configs.schema import Config
+from synpick_warp.configs.rig import Rig
 from synpick_warp.scenes.cameras import make_cameras
 from synpick_warp.scenes.types import Camera
 from synpick_warp.stages.constants import GRIPPER_HOME
-from synpick_warp.system.progress import Progress
 
 _OUTSIDE = (1040, 780)
 """Size of the view from outside [px]."""
@@ -42,28 +41,26 @@ _MAX_NAMED = 16
 """Most objects that are named."""
 
 
-def write_cell_sheet(config: Config, name: str, out: Path, progress: Progress, report: Callable[[str], None]) -> Path:
-    """Draw the cell of a configuration, and write the image file; returns its path.
+def write_cell_sheet(scene: CellScene, rig: Rig, bins: Bins, name: str, out: Path) -> Path:
+    """Draw a cell, and write the image file; returns its path.
 
     Args:
-        config: All settings.
+        scene: The cell.
+        rig: Its cameras.
+        bins: Settings of what stands under them.
         name: What the sheet is of, for its title.
         out: PNG or JPEG file to write; its folder is created.
-        progress: Observer of the stages.
-        report: Called with each line on what is corrected in, or left out of, the objects.
 
     Raises:
-        SynpickError: Device, bins, cameras or all objects cannot be used, or the file cannot be written.
+        ConfigError: A camera's pose is degenerate.
+        OutputError: The file cannot be written.
     """
     check_picture_name(out)
-    cameras = make_cameras(config.rig)
-    scene = CellScene(config, progress, report)
-    progress.stage(f"rendering {len(cameras)} cameras")
-    bins = scene.sizes[:MAX_BINS]
+    cameras = make_cameras(rig)
     outside = _outside_camera(scene, cameras)
-    views = [_draw_outside(scene, index, outside, cameras, config.rig.names) for index in range(len(bins))]
-    panels = [_draw_camera_view(scene, index, camera, config.rig.names[index]) for index, camera in enumerate(cameras)]
-    rows = [_row([view, _facts(scene, index, name if index == 0 else "")]) for index, view in enumerate(views)]
+    views = [_draw_outside(scene, index, outside, cameras, rig.names) for index in range(len(scene.sizes[:MAX_BINS]))]
+    panels = [_draw_camera_view(scene, index, camera, rig.names[index]) for index, camera in enumerate(cameras)]
+    rows = [_row([view, _facts(scene, bins, index, name if index == 0 else "")]) for index, view in enumerate(views)]
     rows += [_row(panels[start : start + _COLUMNS]) for start in range(0, len(panels), _COLUMNS)]
     width = max(row.shape[1] for row in rows)
     rows = [cv2.copyMakeBorder(row, 0, _GAP, 0, width - row.shape[1], cv2.BORDER_CONSTANT, value=WHITE) for row in rows]
@@ -166,9 +163,9 @@ def _with_text(picture: Image, lines: list[str]) -> Image:
     return np.concatenate([picture, caption])
 
 
-def _facts(scene: CellScene, index: int, title: str) -> Image:
+def _facts(scene: CellScene, bins: Bins, index: int, title: str) -> Image:
     """Column of text beside a view from outside."""
-    sizes, laid, config = scene.sizes[index], scene.laid[index], scene.config
+    sizes, laid = scene.sizes[index], scene.laid[index]
     lines = [title, ""] if title else []
     lines += [f"{sizes.noun} {sizes.name}" if sizes.name != sizes.noun else sizes.name]
     if sizes.is_visible:
@@ -176,11 +173,11 @@ def _facts(scene: CellScene, index: int, title: str) -> Image:
     lines += [f"  {'floor' if sizes.shell else 'area'} {_millimetres(sizes.floor)} mm"]
     if sizes.shell:
         lines += [f"  opening {_millimetres(sizes.opening)} mm, {1e3 * sizes.height:.0f} mm up"]
-    shift, yaw = config.bins.shift, config.bins.yaw
+    shift, yaw = bins.shift, bins.yaw
     if any(shift) or yaw:
         lines += [f"  moves by up to {_millimetres(shift)} mm, {yaw:g} deg"]
     if index == 0:
-        lines += ["", "gripper", f"  cup {1e3 * config.gripper.cup_width:.0f} mm wide, drawn over the {sizes.noun};"]
+        lines += ["", "gripper", f"  cup {1e3 * scene.config.gripper.cup_width:.0f} mm wide, drawn over the {sizes.noun};"]
         lines += [f"  home, out of view: {GRIPPER_HOME[0]:g}, {GRIPPER_HOME[1]:g}, {GRIPPER_HOME[2]:g} m"]
     lines += ["", f"{len(laid.indices)} of {len(scene.objects)} objects", "  laid out on the floor, not dropped [mm]:"]
     shown = [scene.objects[which] for which in laid.indices[:_MAX_NAMED]]
