@@ -85,7 +85,6 @@ def new_cell(
     place = Path(os.path.realpath(folder))
     _check_folder(folder, place)
     _check_parts(parts := part or [], unit)
-    size = None if resolution is None else parse_resolution(resolution)
     shape = bin_of_size(_parse_size(bin_))
     with _staged(folder, place) as stage:
         copied = [file for file in parts if not file.is_dir()]
@@ -93,7 +92,7 @@ def new_cell(
             (stage / PARTS).mkdir(exist_ok=True)
             (stage / PARTS / file.name).write_bytes(read_file(file, MAX_MESH_FILE, CatalogError))
         models = os.path.realpath(parts[0]) if parts and not copied else str(place / PARTS) if parts else ""
-        rows = _read_cameras(calibration or [], size, lens or "", stage)
+        rows = _read_cameras(calibration or [], resolution, lens or "", stage)
         sizes = BinSizes.of_row(shape)
         cameras = [NewCamera(row.name, given, pose_for(row, index, sizes)) for index, (row, given) in enumerate(rows)]
         width, height = rows[0][0].resolution or _RESOLUTION
@@ -193,7 +192,7 @@ def _staged(folder: Path, place: Path) -> Iterator[Path]:
                 parent.rmdir()
 
 
-def _read_cameras(files: Sequence[Path], size: Sequence[int] | None, model: str, stage: Path) -> list[tuple[CameraRow, dict[str, Any]]]:
+def _read_cameras(files: Sequence[Path], resolution: str | None, model: str, stage: Path) -> list[tuple[CameraRow, dict[str, Any]]]:
     """Cameras of calibration files, with the keys of their tables; without files two with a field of view.
 
     Raises:
@@ -201,6 +200,7 @@ def _read_cameras(files: Sequence[Path], size: Sequence[int] | None, model: str,
     """
     if model not in ("", *MODELS):
         raise ConfigError(f"--lens is {format_value(model)}; allowed: {', '.join(MODELS)}{suggest(model, MODELS)}")
+    size = None if resolution is None else parse_resolution(resolution)
     if not files:
         pixels = (size[0], size[1]) if size else _RESOLUTION
         return [(CameraRow(name=name, resolution=pixels, fov=_FOV), {"resolution": pixels, "fov": _FOV}) for name in ("top", "side")]
