@@ -7,6 +7,7 @@ import re
 from collections import Counter
 from collections.abc import Iterator, Sequence
 
+from synpick_warp.codes import MAX_DISPARITIES
 from synpick_warp.configs.cameras import CameraRow, Cameras, Pose
 from synpick_warp.configs.cell import BinSizes, Sides
 from synpick_warp.configs.rig import Rig, intrinsics, lens_map, position, viewing_direction
@@ -25,9 +26,11 @@ ASPECT = 2.0
 """Largest ratio of fx and fy: sensors that bin pixels in one direction reach it."""
 FOCAL_LENGTHS = (1 / (2 * math.tan(math.radians(85.0))), 1 / (2 * math.tan(math.radians(0.5))))
 """Least and largest focal length in widths of the image: those of fov."""
-_NAME = re.compile(r"[a-z][a-z0-9_]{0,31}")
-_RESERVED = ("world", "gripper", "info", "coco", "visib")
+NAME = re.compile(r"[a-z][a-z0-9_]{0,31}")
+RESERVED = ("world", "gripper", "info", "coco", "visib")
 """Words that mean something else where the names of cameras are: what a pose refers to, and in names of BOP's files."""
+SENSOR_LAYERS = {"depth_sensor", "ir_left", "ir_right", "depth_stereo"}
+"""Layers that are rectified images of a depth sensor."""
 FORMS = (("matrix",), ("position", "quaternion"), ("position", "look_at", "up"))
 """Keys of a pose: one of these sets."""
 
@@ -44,8 +47,10 @@ def find_camera_conflicts(config: Config) -> Iterator[Conflict]:
         yield from _view(rig, index, config)
     if config.perception.camera and config.perception.camera not in rig.names:
         yield "perception.camera", f"the name of a camera, {', '.join(rig.names)}, or none"
-    if "depth_sensor" in config.render.layers:
+    if SENSOR_LAYERS.intersection(config.render.layers):
         yield from _depth_sensor(config.depth_sensor, rig, config.cell.bins)
+    if "depth_stereo" in config.render.layers:
+        yield from _search(config.depth_sensor, rig, config.cell.bins)
     yield from _depth_scale(config.bop, rig, config.cell.bins)
 
 
@@ -63,9 +68,9 @@ def _rows(rows: tuple[CameraRow, ...]) -> Iterator[Conflict]:
     counts = Counter(names)
     for index, (row, name) in enumerate(zip(rows, names, strict=True)):
         key = f"camera[{index}]"
-        if not _NAME.fullmatch(name) or name in _RESERVED:
+        if not NAME.fullmatch(name) or name in RESERVED:
             rule = "a lower-case letter, then up to 31 of these, digits and underscores"
-            yield f"{key}.name", f"{rule}; not {', '.join(_RESERVED)}"
+            yield f"{key}.name", f"{rule}; not {', '.join(RESERVED)}"
         if counts[name] > 1:
             yield f"{key}.name", f"names that differ; {name} comes {counts[name]} times"
         if (row.fov is None) == (row.matrix is None):
@@ -143,12 +148,12 @@ def _lens(key: str, row: CameraRow, layers: tuple[str, ...]) -> Iterator[Conflic
     except ConfigError as error:
         yield key, f"that of a lens which covers the image, but {error}"
         return
-    if lens is not None and "depth_sensor" in layers:
-        yield key, "none with the layer depth_sensor, which is the rectified image of a sensor"
+    if lens is not None and (found := [name for name in layers if name in SENSOR_LAYERS]):
+        yield key, f"none with the layer {found[0]}, which is the rectified image of a sensor"
 
 
 def _depth_sensor(sensor: DepthSensor, rig: Rig, bins: Sequence[BinSizes]) -> Iterator[Conflict]:
-    """With the layer depth_sensor: the bins must lie within what the sensor measures, and its disparity be more than a step."""
+    """With layers of a depth sensor: the bins must lie within what the sensor measures, and its disparity be more than a step."""
     for index, row in enumerate(rig.rows):
         focal, depths = intrinsics(row)[0], _bin_depths(row, bins)
         near, far = max(0.0, min(depths)), max(depths)
@@ -167,6 +172,19 @@ def _depth_sensor(sensor: DepthSensor, rig: Rig, bins: Sequence[BinSizes]) -> It
             least = sensor.disparity_step * far / focal
             rule = f"so that the disparity of the {bins[0].noun} is a disparity_step or more [m]"
             yield "depth_sensor.baseline", f"at least {least:.3g}, {rule}"
+
+
+def _search(sensor: DepthSensor, rig: Rig, bins: Sequence[BinSizes]) -> Iterator[Conflict]:
+    """With the layer depth_stereo: the bins must lie within the disparities that are searched, which begin at the farthest depth's."""
+    for row in rig.rows:
+        focal, near = intrinsics(row)[0], min(_bin_depths(row, bins))
+        if near <= 0.0:
+            continue
+        scale, reach = focal * sensor.baseline, MAX_DISPARITIES - 2
+        nearest = min(scale / near, sensor.max_disparity or math.inf)
+        if nearest - scale / sensor.distances[1] > reach:
+            rule = f"a maximum of at most {scale / (nearest - reach):.3g}, from which on {MAX_DISPARITIES} disparities are searched"
+            yield "depth_sensor.distances", f"{rule}, as the {bins[0].noun} begins at {near:.3g} m; or a shorter lens [m]"
 
 
 def _depth_scale(bop: Bop, rig: Rig, bins: Sequence[BinSizes]) -> Iterator[Conflict]:

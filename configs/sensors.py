@@ -71,7 +71,9 @@ def effect_ranges(effects: Effects) -> dict[str, tuple[float, float]]:
 
 @dataclass(frozen=True)
 class DepthSensor:
-    """Structured-light depth camera model for the layer depth_sensor: disparity quantization, noise, lateral noise and holes.
+    """Depth camera model: for the layer depth_sensor structured light, with disparity quantization, noise, lateral noise and holes; for the
+    layers ir_left, ir_right and depth_stereo an active stereo camera, whose depth is matched from its images. Of the settings above
+    projector the latter has baseline, disparity_step, max_disparity and distances.
 
     Axial noise is sigma_z = noise + noise_growth (z - noise_distance)² + noise_angle / √z · (θ / (π/2 - θ))², as Nguyen, Izadi and
     Lovell (3DIMPVT 2012) measured for a Kinect, with z in m and θ the angle of incidence: a law of depth alone, whatever the lens. Noise
@@ -85,7 +87,11 @@ class DepthSensor:
         choices=("", *SENSORS),
     )
     baseline: float = setting(
-        0.075, "m", "Distance from the camera to the projector at its right (Khoshelham and Elberink, 2012).", above=0.0, high=1.0
+        0.075,
+        "m",
+        "Distance from the camera to the projector at its right (Khoshelham and Elberink, 2012), or to the right one of two cameras.",
+        above=0.0,
+        high=1.0,
     )
     disparity_step: float = setting(
         0.125,
@@ -124,3 +130,24 @@ class DepthSensor:
     )
     edge_step: float = setting(1.0, "px", "Disparity difference that makes an edge.", above=0.0, high=1e3)
     shadows: bool = setting(True, "", "No depth where the projector is occluded.")
+    projector: float = setting(
+        0.5, "", "Place of a stereo camera's dot projector on its baseline: 0 at the left camera, 1 at the right one.", low=0.0, high=1.0
+    )
+    dot_spacing: float = setting(
+        4.0,
+        "px",
+        "Width of a cell of the projected pattern, which has one dot at a random place; in pixels of the camera.",
+        low=2.0,
+        high=64.0,
+    )
+    dot_brightness: float = setting(
+        1.0,
+        "",
+        "Brightness of projected dots on a white surface at 1 m, relative to full scale; it falls with the square of depth; 0: no pattern.",
+        low=0.0,
+        high=1e3,
+    )
+    ambient: float = setting(
+        0.25, "", "Brightness of infrared images by ambient light, relative to that of colour images, without shadows.", low=0.0, high=10.0
+    )
+    infrared_noise: float = setting(0.005, "", "Standard deviation of noise in infrared images, relative to full scale.", low=0.0, high=1.0)

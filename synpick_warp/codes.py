@@ -1,4 +1,4 @@
-"""Enumerations: every integer code that device arrays, host code and files share. Imports nothing else of the project.
+"""Enumerations: every integer code that device arrays, host code and files share, and a limit of both. Imports nothing else of the project.
 
 Warp resolves members of an `IntEnum` in kernels, so device code, stages and exporters name the same member. The members of a
 `_Described` enum carry a sentence for people.
@@ -11,6 +11,9 @@ import functools
 from collections.abc import Mapping
 from types import MappingProxyType
 from typing import Self
+
+MAX_DISPARITIES = 256
+"""Largest number of disparities that stereo matching searches, from the smallest on [px]; a multiple of the 32 threads of a warp."""
 
 
 class _Described(enum.IntEnum):
@@ -163,6 +166,7 @@ class Stream(enum.IntEnum):
     LOOKS = 13
     DISTRACTORS = 14
     COMPARTMENT = 15
+    INFRARED_NOISE = 16
 
 
 class Look(enum.IntEnum):

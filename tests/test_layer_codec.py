@@ -94,6 +94,9 @@ VALUES = {
     "flow": np.array([[(1.25, -3.5)] * 3, [(np.nan, np.nan)] * 3], np.float32),
     "scene_flow": np.array([[(0.002, -0.1, 0.05)] * 3, [(np.nan, np.nan, np.nan)] * 3], np.float32),
     "depth_sensor": np.array([[0, 18000, 65535], [1, 17999, 18001]], np.uint16),
+    "ir_left": np.array([[0, 128, 255], [1, 127, 254]], np.uint8),
+    "ir_right": np.array([[0, 128, 255], [1, 127, 254]], np.uint8),
+    "depth_stereo": np.array([[0, 18000, 65535], [1, 17999, 18001]], np.uint16),
 }
 
 

@@ -153,7 +153,7 @@ def test_layers_make_batches_smaller():
     gpu = SimpleNamespace(is_cuda=True)
     large = {"bake__worlds": 1000, "cameras__resolution": [1920, 1080]}
     count = batch_of(settings(**large, render__layers=list(LAYERS)), gpu)
-    pixel = view_ring.PIXEL_BYTES + 12 + 3 + 12 + 2 + 8 + 12 + 2
+    pixel = view_ring.PIXEL_BYTES + 12 + 3 + 12 + 2 + 8 + 12 + 2 + 1 + 1 + 2
     assert count * 1920 * 1080 * pixel <= view_ring.BATCH_BYTES < (count + 1) * 1920 * 1080 * pixel
 
 

@@ -32,7 +32,8 @@ def decode_layer(name: str, image: np.ndarray) -> np.ndarray:
 
     Returns:
         Values of the type, components, unit and meaning that `LAYER_TABLE` states: normals, nocs and scene_flow (H, W, 3) float32, flow
-        (H, W, 2) float32, albedo (H, W, 3) uint8, classes and depth_sensor (H, W) uint16.
+        (H, W, 2) float32, albedo (H, W, 3) uint8, classes, depth_sensor and depth_stereo (H, W) uint16, ir_left and ir_right (H, W)
+        uint8.
     """
     return CODECS[LAYER_TABLE[name].encoding].decode(image)
 

@@ -112,5 +112,30 @@ LAYER_TABLE = {
         note="what a depth camera might measure (`depth_sensor` in config.toml): noise, steps and holes, which are 0; "
         "counts as in `depth/`.",
     ),
+    "ir_left": Layer(
+        dtype="uint8",
+        components=1,
+        unit="",
+        values="Infrared image of the left camera of a stereo pair, which is the view's own; linear.",
+        encoding="raw",
+        note="infrared image at this camera, the left one of a rectified stereo pair (`depth_sensor` in config.toml); linear.",
+    ),
+    "ir_right": Layer(
+        dtype="uint8",
+        components=1,
+        unit="",
+        values="Infrared image of the right camera, with the same intrinsics and rotation; linear.",
+        encoding="raw",
+        note="infrared image at the right camera: this one, moved by `depth_sensor.baseline` along its x axis; linear.",
+    ),
+    "depth_stereo": Layer(
+        dtype="uint16",
+        components=1,
+        unit="depth_scale",
+        values="Planar depth by stereo matching of the infrared pair, in counts of the depth scale; 0: hole.",
+        encoding="raw",
+        note="depth matched from `ir_left` and `ir_right`, whether these are stored or not: holes, which are 0, where nothing matches; "
+        "counts as in `depth/`.",
+    ),
 }
 """Layers by name, in the order of files, buffers and notes."""

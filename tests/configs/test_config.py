@@ -166,7 +166,7 @@ def test_whole_numbers_are_allowed_for_floats():
             "render.layers",
             ["flow", "normal"],
             'render.layers is ["flow", "normal"] on the command line; allowed: any of normals, albedo, nocs, classes, flow, scene_flow, '
-            "depth_sensor; did you mean normals?",
+            "depth_sensor, ir_left, ir_right, depth_stereo; did you mean normals?",
         ),
         ("render.layers", "flow", 'render.layers is "flow" on the command line; allowed: a list of strings'),
         ("tote.color", [0.5, 0.5, 1.5], "tote.color is [0.5, 0.5, 1.5] on the command line; allowed: each at least 0, at most 1 [sRGB]"),
@@ -287,6 +287,15 @@ def test_a_bad_value_in_the_file_is_reported_even_if_the_command_line_replaces_i
         (
             {"render.layers": ["depth_sensor"], "depth_sensor.baseline": 1e-5},
             "depth_sensor.baseline is 1e-05 on .*; allowed: at least 4.6e-05, so that the disparity of the tote is a disparity_step",
+        ),
+        (
+            {"render.layers": ["ir_right"], "depth_sensor.distances": [5, 9]},
+            r"depth_sensor.distances is \[5.0, 9.0\] on .*; allowed: a range that reaches the tote, 1.8 to 2 m from camera 0 \[m\]",
+        ),
+        (
+            {"render.layers": ["depth_stereo"], "depth_sensor.baseline": 0.3},
+            r"depth_sensor.distances is \[0.4, 5.0\] .*; allowed: a maximum of at most 2.5\d, from which on 256 disparities are searched, "
+            r"as the tote begins at 1.8 m; or a shorter lens \[m\]",
         ),
         ({"depth_sensor.grazing_angle": 1}, "depth_sensor.grazing_angle is 1 on .*; allowed: at least 10, at most 89"),
         ({"render.exposure": 1e9}, "render.exposure is .*; allowed: at least 0.01, at most 100"),

@@ -72,6 +72,9 @@ TOLERANCES = {
     "flow": Tolerance(0.02, 0.1, "px"),
     "scene_flow": Tolerance(2e-5, 0.1, "m"),
     "depth_sensor": Tolerance(1.0, 0.5, "counts"),
+    "ir_left": Tolerance(1.0, 0.1, "grey"),
+    "ir_right": Tolerance(1.0, 0.1, "grey"),
+    "depth_stereo": Tolerance(1.0, 5.0, "counts"),
 }
 """Tolerances of all outputs but color, which are the same in all modes."""
 TABLES = ("pixels", "boxes", "effects")

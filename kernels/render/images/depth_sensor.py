@@ -5,8 +5,9 @@ import warp as wp
 from synpick_warp.codes import Segment, Stream
 from synpick_warp.kernels.render.images.layers import hit_surface
 from synpick_warp.kernels.render.lighting.materials import Surfaces
-from synpick_warp.kernels.render.visibility.camera import ImageGrid, Views, camera_ray, in_image, tile_pixel
+from synpick_warp.kernels.render.visibility.camera import AnyViews, ImageGrid, camera_ray, in_image, tile_pixel
 from synpick_warp.kernels.render.visibility.gbuffer import MAX_COUNTS, GBuffer, Meshes, ViewBodies
+from synpick_warp.kernels.render.visibility.variants import kernel_of_views
 from synpick_warp.kernels.rng import normal_pair, pixel_key, view_key
 
 wp.set_module_options({"enable_backward": False})
@@ -21,14 +22,15 @@ MIN_DEPTH = wp.constant(1.0e-3)
 
 @wp.struct
 class SensorParameters:
-    """Structured-light sensor model: seed, baseline [m], disparity quantization, noise and limit [px], range [m], axial and lateral noise,
-    grazing limit, matching window, and whether projector shadows are invalid; see configs.sensors.DepthSensor.
+    """Depth sensor model: seed, baseline [m], disparity quantization, noise and limit [px], range [m]; of structured light axial and
+    lateral noise, grazing limit, matching window, and whether projector shadows are invalid; of infrared images projector, dots, light
+    and noise. See configs.sensors.DepthSensor.
     """
 
     seed: wp.uint64
     """Seed of the bake."""
     baseline: float
-    """From the camera to the projector, to the right [m]."""
+    """From the camera to the projector, or to the right one of two cameras, to the right [m]."""
     disparity_step: float
     """Quantization step of disparity [px]."""
     disparity_noise: float
@@ -58,6 +60,16 @@ class SensorParameters:
     """1: pixels that the projector does not light are invalid."""
     counts_per_meter: float
     """Depth counts in a metre."""
+    projector: float
+    """From the left camera to the projector of dots, to the right [m]."""
+    dot_spacing: float
+    """Width of a cell of the pattern, which has one dot [px]."""
+    dot_brightness: float
+    """Brightness of dots on a white surface at 1 m, relative to full scale."""
+    ambient: float
+    """Brightness of ambient infrared light, relative to that of colour images."""
+    infrared_noise: float
+    """Standard deviation of infrared images, relative to full scale."""
 
 
 @wp.func
@@ -140,7 +152,7 @@ def quantize_depth(sensor: SensorParameters, focal_baseline: float, depth: float
     return focal_baseline / (steps * sensor.disparity_step)
 
 
-@wp.kernel
+@kernel_of_views
 def render_depth_sensor_kernel(
     # Scene:
     meshes: Meshes,
@@ -153,7 +165,7 @@ def render_depth_sensor_kernel(
     sensor: SensorParameters,
     bodies: ViewBodies,
     gbuffer: GBuffer,
-    views: Views,
+    views: AnyViews,
     first: int,
     # Out:
     depth_sensor_out: wp.array3d[wp.uint16],  # (view, row, column) [counts]

@@ -10,8 +10,9 @@ from synpick_warp.kernels.render.lighting.environment import (
 )
 from synpick_warp.kernels.render.lighting.materials import Surface, map_table, sample_base_color
 from synpick_warp.kernels.render.lighting.paths.tracing import PathScene
-from synpick_warp.kernels.render.visibility.camera import ImageGrid, ViewCameras, Views, camera_ray, in_image, tile_pixel
+from synpick_warp.kernels.render.visibility.camera import AnyCameras, AnyViews, ImageGrid, camera_ray, in_image, tile_pixel
 from synpick_warp.kernels.render.visibility.gbuffer import GBuffer, ViewBodies
+from synpick_warp.kernels.render.visibility.variants import kernel_of_views
 
 wp.set_module_options({"enable_backward": False})
 
@@ -22,7 +23,7 @@ HORIZON = wp.constant(0.02)
 
 
 @wp.func
-def floor_radiance(scene: PathScene, bodies: ViewBodies, cameras: ViewCameras, view: int, light: int, direction: wp.vec3) -> wp.vec3:
+def floor_radiance(scene: PathScene, bodies: ViewBodies, cameras: AnyCameras, view: int, light: int, direction: wp.vec3) -> wp.vec3:
     """Radiance of the floor that a camera sees along a unit direction in the world, which points down: diffuse, in unoccluded light."""
     center = wp.vec3(cameras.center[view])
     distance = wp.max(center[2] - scene.table.height + FLOOR_DROP, 0.0) / -direction[2]
@@ -36,7 +37,7 @@ def floor_radiance(scene: PathScene, bodies: ViewBodies, cameras: ViewCameras, v
     return wp.cw_mul(sample_base_color(scene.surfaces, surface), irradiance) / wp.PI
 
 
-@wp.kernel
+@kernel_of_views
 def shade_floor_kernel(
     # Scene:
     scene: PathScene,
@@ -46,7 +47,7 @@ def shade_floor_kernel(
     # In:
     bodies: ViewBodies,
     gbuffer: GBuffer,
-    views: Views,
+    views: AnyViews,
     first: int,
     # Out:
     radiance_inout: wp.array3d[wp.vec3],  # (view, row, column)

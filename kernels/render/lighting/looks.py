@@ -9,8 +9,9 @@ import warp as wp
 from synpick_warp.codes import Look, LookKind, LookPart
 from synpick_warp.kernels.distributions import LookTable, draw_look, look_key
 from synpick_warp.kernels.render.lighting.materials import Surfaces
-from synpick_warp.kernels.render.visibility.camera import Views
+from synpick_warp.kernels.render.visibility.camera import AnyViews
 from synpick_warp.kernels.render.visibility.gbuffer import FIXTURES, Meshes, ViewBodies
+from synpick_warp.kernels.render.visibility.variants import kernel_of_views
 from synpick_warp.kernels.rng import TAU
 
 wp.set_module_options({"enable_backward": False})
@@ -99,7 +100,7 @@ def draw_material(table: LookTable, surfaces: Surfaces, base: int, key: wp.uint6
     return result
 
 
-@wp.kernel
+@kernel_of_views
 def dress_bodies_kernel(
     # Scene:
     seed: wp.uint64,
@@ -108,7 +109,7 @@ def dress_bodies_kernel(
     # State:
     episode: wp.array[int],  # (world)
     # In:
-    views: Views,
+    views: AnyViews,
     first_row: int,
     # Out:
     bodies_inout: ViewBodies,

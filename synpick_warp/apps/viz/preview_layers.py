@@ -1,7 +1,8 @@
-"""False-colour images of layers (AOVs): normals, coordinates, classes, optical flow, scene flow, sensor depth."""
+"""False-colour images of layers (AOVs): normals, coordinates, classes, optical flow, scene flow, infrared images, sensor depth."""
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 
 import cv2
@@ -28,7 +29,7 @@ def draw_layer(name: str, values: np.ndarray, depth_scale: DepthScale | None = N
 
     `depth_scale` is that of depth images beside it, in the unit of the values; None: the image's own.
     """
-    return _draw_depth_sensor(values, depth_scale) if name == "depth_sensor" else _DRAW[name](values)
+    return _draw_depth(_DEPTHS[name], values, depth_scale) if name in _DEPTHS else _DRAW[name](values)
 
 
 def layer_pictures(files: SceneFiles, frame: int, depth_scale: DepthScale | None) -> list[tuple[str, Image]]:
@@ -37,7 +38,7 @@ def layer_pictures(files: SceneFiles, frame: int, depth_scale: DepthScale | None
     Raises:
         DatasetError: The scene has a layer, but not for this frame, or the file is damaged.
     """
-    present = [name for name in (*_DRAW, "depth_sensor") if files.has(name)]
+    present = [name for name in (*_DRAW, *_DEPTHS) if files.has(name)]
     return [draw_layer(name, read_layer(files, name, frame), depth_scale) for name in present]
 
 
@@ -81,9 +82,14 @@ def _draw_scene_flow(values: np.ndarray) -> tuple[str, Image]:
     return f"scene flow: x, y, z as red, green, blue, up to {1e3 * full:.1f} mm", _with_unknown(colors, size)
 
 
-def _draw_depth_sensor(values: np.ndarray, scale: DepthScale | None) -> tuple[str, Image]:
+def _draw_depth(caption: str, values: np.ndarray, scale: DepthScale | None) -> tuple[str, Image]:
     """Depth as a TURBO colour map; holes are black."""
-    return f"depth sensor: {100.0 * (values == 0).mean():.1f} % holes, black", color_depth(values, scale)
+    return f"{caption}: {100.0 * (values == 0).mean():.1f} % holes, black", color_depth(values, scale)
+
+
+def _draw_infrared(caption: str, values: np.ndarray) -> tuple[str, Image]:
+    """Infrared image as grey levels, as they are."""
+    return caption, np.repeat(values[..., None], 3, axis=-1)
 
 
 def _full_scale(size: np.ndarray) -> float:
@@ -115,4 +121,8 @@ _DRAW: dict[str, Callable[[np.ndarray], tuple[str, Image]]] = {
     "classes": _draw_classes,
     "flow": _draw_flow,
     "scene_flow": _draw_scene_flow,
+    "ir_left": functools.partial(_draw_infrared, "infrared, left"),
+    "ir_right": functools.partial(_draw_infrared, "infrared, right"),
 }
+_DEPTHS = {"depth_sensor": "depth sensor", "depth_stereo": "stereo depth"}
+"""Layers of depth, and their captions."""

@@ -14,7 +14,7 @@ from synpick_warp.stages.arrays import allocate, device_array
 from synpick_warp.stages.buffers import LayerBuffers, Snapshot, ViewBuffers
 from synpick_warp.stages.launch import launch
 from synpick_warp.stages.online.exchange import DeviceArray, Gate
-from synpick_warp.stages.render.view_setup import make_views
+from synpick_warp.stages.render.view_setup import make_views, with_cameras
 from synpick_warp.stages.timing import scope
 from synpick_warp.stages.view_ring import CameraGroup
 
@@ -210,6 +210,7 @@ class BatchRing:
         padded[:, :count] = world, camera, self.group.slots(camera)
         slot.lists.assign(padded)
         views = make_views(slot.lists[0], slot.lists[1], count, self.instances, slot=slot.lists[2])
+        views = with_cameras(views, self.renderer.cameras)
         with scope("render", self.device):
             self.renderer.render(snapshot, views, slot.images, slot.layers)
             self._gather(snapshot, views, slot.truth)

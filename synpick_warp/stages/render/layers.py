@@ -21,11 +21,13 @@ from synpick_warp.kernels.render.images.layers import (
     render_scene_flow_kernel,
 )
 from synpick_warp.kernels.render.visibility.camera import TILE_PIXELS
+from synpick_warp.kernels.render.visibility.variants import kernel_for
 from synpick_warp.scenes.types import FIRST_DISTRACTOR
 from synpick_warp.stages.arrays import allocate_struct, struct_arrays
 from synpick_warp.stages.buffers import FIXTURES, LayerBuffers, Snapshot
 from synpick_warp.stages.launch import launch_pixels
 from synpick_warp.stages.render.scene import RenderScene
+from synpick_warp.stages.render.stereo import STEREO_LAYERS, StereoRenderer
 
 MAX_CLASS = 65535
 """Largest obj_id that fits into the layer `classes`."""
@@ -46,6 +48,9 @@ def sensor_parameters(settings: DepthSensor, seed: int, depth_scale: float) -> A
     result.edge_width, result.edge_step = settings.edge_width, settings.edge_step
     result.shadows = int(settings.shadows)
     result.counts_per_meter = 1000.0 / depth_scale
+    result.projector = settings.projector * settings.baseline
+    for name in ("dot_spacing", "dot_brightness", "ambient", "infrared_noise"):
+        setattr(result, name, getattr(settings, name))
     return result
 
 
@@ -75,6 +80,7 @@ class LayerRenderer:
         self.motions = None
         if MOTION_LAYERS.intersection(names):
             self.motions = allocate_struct(BODY_MOTIONS, {"view": views, "body": instances + len(FIXTURES)}, scene.device)
+        self.stereo = StereoRenderer(names, sensor, scene, views) if STEREO_LAYERS.intersection(names) else None
 
     def render(self, snapshot: Snapshot, bodies: Any, gbuffer: Any, views: Any, out: LayerBuffers) -> None:
         """Render the layers of a batch of views.
@@ -106,14 +112,17 @@ class LayerRenderer:
             "depth_sensor": lambda: self._launch(render_depth_sensor_kernel, count, sensor, out.depth_sensor),
         }
         for name in self.names:
-            launches[name]()
+            if name not in STEREO_LAYERS:
+                launches[name]()
+        if self.stereo is not None:
+            self.stereo.render(snapshot, bodies, gbuffer, views, out)
 
     def compute_motions(self, snapshot: Snapshot, views: Any) -> None:
         """Compute the motion of every body from this frame back to the previous one."""
         inputs = [snapshot.catalog_index, snapshot.pose, snapshot.fixture_pose, snapshot.follows]
         inputs += [snapshot.last_catalog_index, snapshot.last_pose, snapshot.last_fixture_pose, snapshot.last_fixture_visible, views]
         dim = (views.count, self.motions.known.shape[1])
-        wp.launch(compute_motions_kernel, dim=dim, inputs=inputs, outputs=[self.motions], device=self.scene.device)
+        wp.launch(kernel_for(compute_motions_kernel, views), dim=dim, inputs=inputs, outputs=[self.motions], device=self.scene.device)
 
     def _launch(self, kernel: wp.Kernel, count: int, inputs: list[Any], output: wp.array) -> None:
         """Launch a kernel over all pixels of `count` views."""

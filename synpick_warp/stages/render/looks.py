@@ -19,6 +19,7 @@ from synpick_warp.kernels.render.lighting.materials import Surfaces
 from synpick_warp.kernels.render.lighting.paths.tracing import PathScene
 from synpick_warp.kernels.render.visibility.camera import TILE_PIXELS
 from synpick_warp.kernels.render.visibility.gbuffer import FIXTURES
+from synpick_warp.kernels.render.visibility.variants import kernel_for
 from synpick_warp.scenes.looks import Looks
 from synpick_warp.stages.buffers import Snapshot
 from synpick_warp.stages.launch import launch_pixels
@@ -136,7 +137,11 @@ class Dresser:
         scene = self.scene
         inputs = [self._seed, scene.meshes, self._table, snapshot.episode, views, self._first]
         wp.launch(
-            dress_bodies_kernel, dim=(views.count, self._materials), inputs=inputs, outputs=[bodies, scene.surfaces], device=scene.device
+            kernel_for(dress_bodies_kernel, views),
+            dim=(views.count, self._materials),
+            inputs=inputs,
+            outputs=[bodies, scene.surfaces],
+            device=scene.device,
         )
 
 

@@ -1,0 +1,170 @@
+"""Infrared images of an active stereo camera: a rectified pair that sees ambient light and a projected dot pattern.
+
+The left camera is the view's own, whose G-buffer is read; rays of the right one, beside it along the image's rows, are traced.
+"""
+
+import warp as wp
+
+from synpick_warp.codes import Segment, Stream
+from synpick_warp.kernels.render.images.depth_sensor import SensorParameters
+from synpick_warp.kernels.render.lighting.brdf import Brdf, evaluate_brdf, make_brdf
+from synpick_warp.kernels.render.lighting.color import luminance
+from synpick_warp.kernels.render.lighting.environment import environment_radiance, rotate_z
+from synpick_warp.kernels.render.lighting.materials import (
+    Surface,
+    interpolate_surface,
+    make_table_surface,
+    map_table,
+    sample_base_color,
+    widen_roughness,
+)
+from synpick_warp.kernels.render.lighting.paths.tracing import PathScene
+from synpick_warp.kernels.render.lighting.unoccluded import unoccluded_light
+from synpick_warp.kernels.render.visibility.bvh_rays import RAY_OFFSET, is_blocked, trace_ray
+from synpick_warp.kernels.render.visibility.camera import AnyCameras, AnyViews, ImageGrid, camera_ray, in_image, tile_pixel
+from synpick_warp.kernels.render.visibility.gbuffer import GBuffer, Hit, ViewBodies, body_of, read_hit
+from synpick_warp.kernels.render.visibility.variants import kernel_of_views
+from synpick_warp.kernels.rng import normal_pair, pixel_key, uniform, view_key
+from synpick_warp.kernels.tuning import RAY_REGISTERS
+
+wp.set_module_options({"enable_backward": False})
+
+DOT_SIZE = wp.constant(0.7)
+"""Standard deviation of a projected dot [px]: a sharper one would fall between pixels."""
+DOT_PATTERN = wp.constant(wp.uint64(0x9E6D62D06F6A9A9B))
+"""Key of the places of dots: the pattern is that of a product, the same in all bakes."""
+LEAST_LIGHT = wp.constant(1.0e-4)
+"""Light of dots below this, a fortieth of a grey level, needs no shadow ray."""
+
+
+@wp.func
+def dot_pattern(column: float, row: float, spacing: float) -> float:
+    """Projected pattern at a place of the projector's image [px]: in each cell, `spacing` wide, a Gaussian dot at a random place.
+
+    Stratified places have no large gaps, and repeat nowhere, as those of a lattice would, so that each window has one match.
+    """
+    x = int(wp.floor(column / spacing))
+    y = int(wp.floor(row / spacing))
+    light = float(0.0)
+    # Not unrolled.
+    one = int(1)
+    for down in range(-one, one + 1):
+        for right in range(-one, one + 1):
+            key = pixel_key(pixel_key(DOT_PATTERN, y + down), x + right)
+            away_x = column - spacing * (float(x + right) + uniform(key, 0))
+            away_y = row - spacing * (float(y + down) + uniform(key, 1))
+            light += wp.exp(-0.5 * (away_x * away_x + away_y * away_y) / (DOT_SIZE * DOT_SIZE))
+    return wp.min(light, 1.0)
+
+
+@wp.func
+def right_camera_hit(scene: PathScene, bodies: ViewBodies, views: AnyViews, view: int, ray: wp.vec3, baseline: float) -> Hit:
+    """Closest hit of a ray of the right camera, with planar depth."""
+    cameras = views.cameras
+    origin = wp.vec3(cameras.center[view]) + cameras.to_world[view] * wp.vec3(baseline, 0.0, 0.0)
+    direction = wp.normalize(cameras.to_world[view] * ray)
+    hit = trace_ray(scene.meshes, scene.table, bodies, view, views.instances, origin, direction)
+    hit.depth = hit.depth / wp.length(ray)
+    return hit
+
+
+@wp.func
+def dot_light(
+    scene: PathScene,
+    sensor: SensorParameters,
+    bodies: ViewBodies,
+    views: AnyViews,
+    view: int,
+    point: wp.vec3,
+    surface: Surface,
+    brdf: Brdf,
+) -> float:
+    """Brightness of projected dots at a surface point, `point` in the camera's axes [m]: that of a white surface is the pattern's by
+    cosine / z², in the open."""
+    cameras = views.cameras
+    from_projector = point - wp.vec3(sensor.projector, 0.0, 0.0)
+    scale = cameras.intrinsics[view][0] / from_projector[2]
+    light = sensor.dot_brightness / (from_projector[2] * from_projector[2])
+    light *= dot_pattern(scale * from_projector[0], scale * from_projector[1], sensor.dot_spacing)
+    to_projector = -wp.normalize(cameras.to_world[view] * from_projector)
+    if light < LEAST_LIGHT or wp.dot(surface.face_normal, to_projector) <= 0.0:
+        return 0.0
+    value = evaluate_brdf(scene.surfaces.albedo, brdf, to_projector)
+    reflected = wp.PI * light * luminance(value.diffuse * brdf.diffuse + value.specular)
+    start = wp.vec3(cameras.center[view]) + cameras.to_world[view] * point + RAY_OFFSET * surface.face_normal
+    reach = wp.length(from_projector)
+    if reflected < LEAST_LIGHT or is_blocked(scene.meshes, scene.table, bodies, view, views.instances, start, to_projector, reach):
+        return 0.0
+    return reflected
+
+
+@wp.func
+def seen_surface(
+    scene: PathScene, bodies: ViewBodies, cameras: AnyCameras, view: int, hit: Hit, point: wp.vec3, outgoing: wp.vec3, instances: int
+) -> Surface:
+    """Surface attributes of a hit at `point` in the camera's axes [m]; the hit must be of a body or the table."""
+    width = hit.depth / cameras.intrinsics[view][0]
+    if hit.segment == Segment.TABLE:
+        position = wp.vec3(cameras.center[view]) + cameras.to_world[view] * point
+        return map_table(scene.surfaces, make_table_surface(scene.meshes, bodies, view, outgoing), position, outgoing, width)
+    body = body_of(hit.segment, instances)
+    return interpolate_surface(scene.meshes, scene.surfaces, bodies, view, body, hit.triangle, hit.barycentric, outgoing, width)
+
+
+@kernel_of_views(cuda_max_registers=RAY_REGISTERS)
+def render_infrared_kernel(
+    # Scene:
+    scene: PathScene,
+    grid: ImageGrid,
+    # State:
+    episode: wp.array[int],  # (world)
+    frame: wp.array[int],  # (world)
+    light: wp.array[int],  # (world)
+    light_yaw: wp.array[float],  # (world) [rad]
+    # In:
+    sensor: SensorParameters,
+    bodies: ViewBodies,
+    gbuffer: GBuffer,
+    views: AnyViews,
+    eye: int,
+    first: int,
+    # Out:
+    image_out: wp.array3d[wp.uint8],  # (view, row, column)
+):
+    """Infrared image of the left (eye 0) or right (1) camera: 8 bits, linear, with noise, at one ray a pixel.
+
+    Ambient light is the unoccluded environment's luminance, without lamps; surfaces reflect infrared light as visible light. Noise is of
+    the random number stream (seed, episode, frame, camera, INFRARED_NOISE), eye and pixel. Launched over view, pixel (tile order, from flat
+    index `first` on).
+    """
+    view, row, column = tile_pixel(grid, wp.tid() + first)
+    if not in_image(grid, row, column):
+        return
+    world = views.world[view]
+    which = light[world]
+    yaw = light_yaw[world]
+    ray = camera_ray(views.cameras, view, row, column, wp.vec2(0.0, 0.0))
+    outgoing = -wp.normalize(views.cameras.to_world[view] * ray)
+    offset = wp.where(eye == 0, 0.0, sensor.baseline)
+    hit = Hit()
+    if eye == 0:
+        hit = read_hit(gbuffer, view, row, column)
+    else:
+        hit = right_camera_hit(scene, bodies, views, view, ray, offset)
+    radiance = float(0.0)
+    dots = float(0.0)
+    if hit.segment == Segment.NOTHING:
+        radiance = luminance(environment_radiance(scene.lights, which, rotate_z(-outgoing, -yaw)))
+    else:
+        point = hit.depth * ray + wp.vec3(offset, 0.0, 0.0)
+        surface = seen_surface(scene, bodies, views.cameras, view, hit, point, outgoing, views.instances)
+        roughness = widen_roughness(scene.surfaces.roughness[surface.row], surface.normal_spread)
+        color = sample_base_color(scene.surfaces, surface)
+        brdf = make_brdf(scene.surfaces.albedo, color, scene.surfaces.metallic[surface.row], roughness, surface.normal, outgoing)
+        ambient = unoccluded_light(scene.lights, which, yaw, brdf)
+        radiance = luminance(wp.cw_mul(brdf.diffuse, ambient.diffuse) + ambient.specular)
+        dots = dot_light(scene, sensor, bodies, views, view, point, surface, brdf)
+    key = view_key(sensor.seed, episode[world], frame[world], views.camera[view], Stream.INFRARED_NOISE)
+    noise = normal_pair(pixel_key(key, (eye * grid.height + row) * grid.width + column), 0)[0]
+    value = sensor.ambient * scene.lights.exposure[which] * radiance + dots + sensor.infrared_noise * noise
+    image_out[view, row, column] = wp.uint8(wp.rint(255.0 * wp.clamp(value, 0.0, 1.0)))

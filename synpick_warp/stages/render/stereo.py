@@ -1,0 +1,108 @@
+"""Active stereo camera of a batch of views: launches of the infrared pair, and of stereo matching, view by view."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import warp as wp
+
+from synpick_warp.codes import MAX_DISPARITIES
+from synpick_warp.kernels.render.images.infrared import render_infrared_kernel
+from synpick_warp.kernels.render.images.stereo_matching import (
+    WARP,
+    match_left_kernel,
+    match_right_kernel,
+    measure_depth_kernel,
+    sum_path_costs_kernel,
+    transform_census_kernel,
+)
+from synpick_warp.kernels.render.visibility.camera import TILE_PIXELS
+from synpick_warp.stages.arrays import allocate, device_array
+from synpick_warp.stages.buffers import LayerBuffers, Snapshot
+from synpick_warp.stages.launch import launch_pixels, launch_views
+from synpick_warp.stages.render.scene import RenderScene
+
+EYES = ("ir_left", "ir_right")
+DEPTH = "depth_stereo"
+STEREO_LAYERS = {*EYES, DEPTH}
+"""Layers of an active stereo camera."""
+DIRECTIONS = 4
+"""Directions of paths: right, left, down and up."""
+
+
+@dataclass(frozen=True, eq=False)
+class InfraredImages:
+    """Infrared pair, where it is no layer itself."""
+
+    ir_left: wp.array = device_array("view", "row", "column", dtype=wp.uint8)
+    ir_right: wp.array = device_array("view", "row", "column", dtype=wp.uint8)
+
+
+@dataclass(frozen=True, eq=False)
+class MatchingScratch:
+    """Scratch of matching, of one view."""
+
+    census: wp.array = device_array("eye", "row", "column", dtype=wp.uint32)
+    cost: wp.array = device_array("row", "column", "disparity", dtype=wp.uint16)
+    """Cost volume: sum of the costs of all paths."""
+    right_match: wp.array = device_array("row", "column", dtype=wp.int32)
+    disparity: wp.array = device_array("row", "column", dtype=wp.int32)
+
+
+def count_disparities(max_disparity: float) -> int:
+    """Disparities that are searched, from that of the farthest depth on: up to `max_disparity` [px], if it is set, and MAX_DISPARITIES."""
+    return min(math.ceil(max_disparity) + 2, MAX_DISPARITIES) if max_disparity > 0.0 else MAX_DISPARITIES
+
+
+class StereoRenderer:
+    """Renders infrared pairs and matches them. Owns its scratch; `render` only launches, so a CUDA graph can capture it."""
+
+    def __init__(self, names: tuple[str, ...], sensor: Any, scene: RenderScene, views: int) -> None:
+        """Allocate scratch.
+
+        Args:
+            names: Layers to render; those that are none of `STEREO_LAYERS` are ignored.
+            sensor: The struct `SensorParameters`.
+            scene: Constant data.
+            views: Largest number of views in a batch.
+        """
+        self.scene, self.sensor = scene, sensor
+        self.matches = DEPTH in names
+        sizes = {"view": views, "eye": len(EYES), "row": scene.height, "column": scene.width}
+        sizes["disparity"] = count_disparities(sensor.max_disparity)
+        self.eyes = [eye for eye in EYES if eye in names or self.matches]
+        self.images = allocate(InfraredImages, sizes, scene.device, set(self.eyes) - set(names))
+        self.scratch = allocate(MatchingScratch, sizes, scene.device) if self.matches else None
+
+    def render(self, snapshot: Snapshot, bodies: Any, gbuffer: Any, views: Any, out: LayerBuffers) -> None:
+        """Render the infrared images of a batch of views, and match them; arguments as of `LayerRenderer.render`."""
+        scene = self.scene
+        pixels = views.count * scene.grid.tiles * int(TILE_PIXELS)
+        own = [getattr(self.images, eye) for eye in self.eyes]
+        images = {eye: getattr(out, eye) if image is None else image for eye, image in zip(self.eyes, own, strict=True)}
+        worlds = [snapshot.episode, snapshot.frame, snapshot.light, snapshot.light_yaw]
+        for eye, image in images.items():
+            inputs = [scene.paths, scene.grid, *worlds, self.sensor, bodies, gbuffer, views, EYES.index(eye)]
+            launch_pixels(render_infrared_kernel, pixels, inputs, [image], scene.device)
+        if self.scratch is not None:
+            for view in range(views.count):
+                self.match(view, views, list(images.values()), out.depth_stereo)
+
+    def match(self, view: int, views: Any, images: list[wp.array], depth: wp.array) -> None:
+        """Match the left and right images of a view."""
+        grid, sensor, scratch, device = self.scene.grid, self.sensor, self.scratch, self.scene.device
+        assert scratch is not None
+        pixels = grid.tiles * int(TILE_PIXELS)
+        launch_pixels(transform_census_kernel, len(EYES) * pixels, [grid, *images, view], [scratch.census], device)
+        lanes = WARP if device.is_cuda else 1
+        for direction in range(DIRECTIONS):
+            lines = grid.height if direction < DIRECTIONS // 2 else grid.width
+            inputs = [sensor, views, scratch.census, view, direction, lanes]
+            launch_views(sum_path_costs_kernel, lines, lanes, inputs, [scratch.cost], device)
+        inputs = [grid, sensor, views, scratch.cost]
+        launch_pixels(match_right_kernel, pixels, [*inputs, view], [scratch.right_match], device)
+        inputs += [scratch.right_match, scratch.census, view]
+        launch_pixels(match_left_kernel, pixels, inputs, [scratch.disparity], device)
+        launch_pixels(measure_depth_kernel, pixels, [grid, sensor, views, scratch.disparity, view], [depth], device)
