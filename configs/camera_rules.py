@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 import re
 from collections import Counter
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 
 from synpick_warp.codes import MAX_DISPARITIES
-from synpick_warp.configs.cameras import CameraRow, Cameras, Pose
+from synpick_warp.configs.cameras import CameraRow, Cameras, Jitter, Pose
 from synpick_warp.configs.cell import BinSizes, Sides
-from synpick_warp.configs.rig import Rig, intrinsics, lens_map, position, viewing_direction
+from synpick_warp.configs.randomize import FIXED
+from synpick_warp.configs.rig import Rig, intrinsics, lens_map, moved, position, viewing_direction
 from synpick_warp.configs.schema import Bop, Config, DepthSensor
 from synpick_warp.errors import ConfigError
 
@@ -101,7 +104,7 @@ def _view(rig: Rig, index: int, config: Config) -> Iterator[Conflict]:
     """Yield conflicts of a camera's intrinsics, odd sides with videos, and a degenerate view or one that does not show the bins."""
     bins = config.cell.bins
     row, label = rig.rows[index], rig.label(index)
-    (width, height), (fx, fy, *_) = rig.sizes[index], intrinsics(row)
+    width, height = rig.sizes[index]
     if "lerobot" in config.bake.formats and (width % 2 or height % 2):
         key = rig.key(index, "resolution") if config.camera and config.camera[index].resolution else "cameras.resolution"
         yield key, "even width and height with the format lerobot, whose videos have a colour for 2 x 2 pixels"
@@ -109,19 +112,66 @@ def _view(rig: Rig, index: int, config: Config) -> Iterator[Conflict]:
         yield from _matrix(rig.key(index, "matrix"), row.matrix, width, height)
     if row.distortion:
         yield from _lens(rig.key(index, "distortion"), row, config.render.layers)
+    keys = [rig.key(index, "pose", name) for name in ("positions", "ups", "target")]
+    yield from _placement(row, label, keys, bins, config.bins.shift)
+    if row.jitter is not None:
+        yield from _jitter(rig.key(index, "jitter"), row, row.jitter, label, bins, config.bins.shift)
+
+
+def _placement(
+    row: CameraRow, label: str, keys: Sequence[str], bins: Sequence[BinSizes], shift: Sides, turn: float = 0.0
+) -> Iterator[Conflict]:
+    """Yield a degenerate view, or one that does not show the bins, even if it were turned by an angle [rad].
+
+    Args:
+        row: The camera.
+        label: Its name for messages.
+        keys: Keys of its position, up vector and look-at point.
+        bins: The bins.
+        shift: `bins.shift`.
+        turn: The angle.
+    """
+    (place, aim, target), (fx, fy, *_) = keys, intrinsics(row)
     at, forward, up = position(row.pose), viewing_direction(row.pose), row.pose.up
-    place, aim, target = (rig.key(index, "pose", name) for name in ("positions", "ups", "target"))
     if math.hypot(*forward) == 0.0:
-        other = "look_at" if rig.is_listed else "cameras.target"
+        other = "look_at" if place != "cameras.positions" else "cameras.target"
         yield place, f"positions other than {other}, the position of {label}"
     elif up is not None and math.hypot(*_cross(forward, up)) <= PARALLEL * math.hypot(*forward) * math.hypot(*up):
         yield aim, f"up vectors that are not zero or parallel to the viewing direction, as that of {label} is"
     elif at[2] <= 0.0:
         yield place, f"positions above the {bins[0].noun}'s floor, z > 0, below which {label} sees no object [m]"
-    elif fx > 0.0 < fy and not all(_sees_bin(row, one, place) for one in bins for place in _places(config.bins.shift)):
+    elif fx > 0.0 < fy and not all(_sees_bin(row, one, spot, turn) for one in bins for spot in _places(shift)):
         yield target, f"a point that lets each camera see the {bins[0].noun}, which lies outside of the images of {label} [m]"
     elif any(_in_wall(at, one) for one in bins if one.shell):
         yield place, f"positions outside of the {bins[0].noun}'s walls, in which {label} is [m]"
+
+
+def _jitter(key: str, row: CameraRow, jitter: Jitter, label: str, bins: Sequence[BinSizes], shift: Sides) -> Iterator[Conflict]:
+    """Yield jitter that is none, or after which the camera would not be allowed; of several draws, each by itself."""
+    for name in ("position", "rotation", "focal_length", "center"):
+        kind = getattr(jitter, name)
+        if kind.kind == FIXED and kind.bounds() != (0.0, 0.0):
+            yield f"{key}.{name}", "a distribution, such as { normal = [0, 0.002] }; what all episodes share belongs to pose and matrix"
+    turn = math.radians(math.sqrt(2.0) * max(map(abs, jitter.rotation.bounds())))
+    for name, drawn in _extremes(row, jitter):
+        width, height = drawn.resolution or (0, 0)
+        found = [*_matrix(key, drawn.matrix, width, height)] if drawn.matrix is not None else []
+        found += _placement(drawn, label, (key,) * 3, bins, shift, turn if name == "rotation" else 0.0)
+        yield from ((f"{key}.{name}", f"less, so that every draw has {rule}") for _, rule in found)
+
+
+def _extremes(row: CameraRow, jitter: Jitter) -> Iterator[tuple[str, CameraRow]]:
+    """Rows at the ends of what may be drawn of a camera, each with the name of its distribution; rotations are left out of theirs."""
+    ends = jitter.position.bounds()
+    for offset in itertools.product(ends, ends, ends):
+        yield "position", replace(row, pose=moved(row.pose, offset))
+    yield "rotation", row
+    fx, fy, cx, cy = intrinsics(row)
+    for zoom in jitter.focal_length.bounds():
+        yield "focal_length", replace(row, fov=None, matrix=((fx * (1.0 + zoom), 0.0, cx), (0.0, fy * (1.0 + zoom), cy), (0.0, 0.0, 1.0)))
+    ends = jitter.center.bounds()
+    for x, y in itertools.product(ends, ends):
+        yield "center", replace(row, fov=None, matrix=((fx, 0.0, cx + x), (0.0, fy, cy + y), (0.0, 0.0, 1.0)))
 
 
 def _matrix(key: str, matrix: tuple[tuple[float, float, float], ...], width: int, height: int) -> Iterator[Conflict]:
@@ -208,8 +258,9 @@ def _places(shift: Sides) -> list[Sides]:
     return sorted({(-x, -y), (-x, y), (x, -y), (x, y)})
 
 
-def _sees_bin(row: CameraRow, sizes: BinSizes, place: Sides) -> bool:
-    """Whether the bounding sphere of a bin at a place meets the cone around a camera's view, which is wider than its image."""
+def _sees_bin(row: CameraRow, sizes: BinSizes, place: Sides, turn: float) -> bool:
+    """Whether the bounding sphere of a bin at a place meets the cone around a camera's view, which is wider than its image, even if it is
+    turned by an angle [rad]."""
     height = sizes.height - sizes.base
     center = (*place, sizes.base + height / 2)
     forward = viewing_direction(row.pose)
@@ -220,7 +271,7 @@ def _sees_bin(row: CameraRow, sizes: BinSizes, place: Sides) -> bool:
     cosine = sum(a * b for a, b in zip(forward, away, strict=True)) / (math.hypot(*forward) * distance)
     (columns, rows), (fx, fy, cx, cy) = row.resolution or (0, 0), intrinsics(row)
     cone = math.atan(math.hypot(max(cx, columns - cx) / fx, max(cy, rows - cy) / fy))
-    return math.acos(max(-1.0, min(1.0, cosine))) <= cone + math.asin(radius / distance)
+    return math.acos(max(-1.0, min(1.0, cosine))) + turn <= cone + math.asin(radius / distance)
 
 
 def _in_wall(at: tuple[float, ...], sizes: BinSizes) -> bool:

@@ -7,6 +7,7 @@ from typing import ClassVar
 
 from synpick_warp.configs.calibration.files import MODELS
 from synpick_warp.configs.fields import setting
+from synpick_warp.configs.randomize import Distribution
 
 Vector = tuple[float, float, float]
 
@@ -49,6 +50,24 @@ class Pose:
     up: tuple[float, float, float] | None = setting(None, "", "Direction that is up in the image.", low=-1e3, high=1e3)
 
 
+_NONE = Distribution()
+
+
+@dataclass(frozen=True)
+class Jitter:
+    """Random differences of a camera from its table, which each episode draws anew; perception keeps to the table.
+
+    Components are independent. Normal distributions are cut at three standard deviations. Not in the paper.
+    """
+
+    position: Distribution = setting(_NONE, "m", "Offset of the position along each axis of the frame of the pose.", low=-10.0, high=10.0)
+    rotation: Distribution = setting(
+        _NONE, "°", "Components of a rotation vector in the camera's axes, by which the camera is turned.", low=-90.0, high=90.0
+    )
+    focal_length: Distribution = setting(_NONE, "", "Relative change of fx and fy, such as 0.01 for 1 % more.", low=-0.9, high=9.0)
+    center: Distribution = setting(_NONE, "px", "Offset of cx and of cy.", low=-8192.0, high=8192.0)
+
+
 @dataclass(frozen=True)
 class CameraRow:
     """A camera. The tables replace [cameras]; pixel centres are at +0.5: add 0.5 to cx and cy of OpenCV and ROS, which have integers."""
@@ -80,3 +99,8 @@ class CameraRow:
         "Where the given matrix or file has the centre of the first pixel, 0 or 0.5; not given: 0.5, and in a file its format's.",
     )
     pose: Pose = setting(Pose(), "", "Pose in the tote's frame: {matrix}, {position, quaternion} or {position, look_at, up}.")
+    jitter: Jitter | None = setting(
+        None,
+        "",
+        "What each episode draws of the camera anew: {position, rotation, focal_length, center}, each a distribution.",
+    )

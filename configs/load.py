@@ -316,5 +316,8 @@ def _value_of(config: Config, key: str) -> Any:
     if "[" in key:
         rows, _, rest = key.partition("[")
         index, _, name = rest.partition("].")
-        return given_values(getattr(config, rows)[int(index)]).get(name)
+        given: Any = given_values(getattr(config, rows)[int(index)])
+        for part in name.split("."):
+            given = given.get(part)
+        return given
     return functools.reduce(getattr, key.split("."), config)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import bisect
 import itertools
 import math
 from collections.abc import Iterator, Mapping
@@ -18,6 +19,8 @@ _LIMITS = (LOG_UNIFORM, UNIFORM)
 _PAIRS = (*_LIMITS, NORMAL)
 MOST_DISTRACTORS = 16
 """Maximum number of distractors: half of the instances that a world may have."""
+NORMAL_REACH = 3.0
+"""Standard deviations at which `Distribution.sample` cuts a normal distribution, whose range can then be checked."""
 MOST_CHOICES = 256
 """Maximum number of values of a choice."""
 
@@ -96,6 +99,31 @@ class Distribution:
     def limits(self) -> Iterator[float]:
         """Numbers that the setting's range must contain: all that are drawn; of a normal distribution, which is clamped, the mean."""
         return itertools.chain(*(self.values[:1] if self.kind == NORMAL else self.values))
+
+    def bounds(self) -> tuple[float, float]:
+        """Least and largest scalar that `sample` returns; a normal distribution is cut at NORMAL_REACH standard deviations."""
+        if self.kind == OFF:
+            return 0.0, 0.0
+        values = [value[0] for value in self.values]
+        if self.kind == NORMAL:
+            return values[0] - NORMAL_REACH * values[1], values[0] + NORMAL_REACH * values[1]
+        return min(values), max(values)
+
+    def sample(self, first: float, second: float) -> float:
+        """Scalar from two samples that are uniform in [0, 1), in float64, within `bounds`; off: 0."""
+        if self.kind == OFF:
+            return 0.0
+        (a, *_), (b, *_) = self.values[0], self.values[-1]
+        if self.kind == CHOICE:
+            weights = self.weights or (1.0,) * len(self.values)
+            ends = [end / sum(weights) for end in itertools.accumulate(weights)]
+            return self.values[min(bisect.bisect_right(ends, first), len(ends) - 1)][0]
+        if self.kind == LOG_UNIFORM:
+            return a * (b / a) ** first
+        if self.kind == NORMAL:
+            normal = math.sqrt(-2.0 * math.log(1.0 - first)) * math.cos(2.0 * math.pi * second)
+            return a + b * max(-NORMAL_REACH, min(NORMAL_REACH, normal))
+        return a + (b - a) * first
 
     def to_toml(self) -> Any:
         """The value of `parse`, in types of TOML: numbers, strings, tuples and a mapping."""

@@ -66,9 +66,13 @@ class Rig:
 
     @cached_property
     def groups(self) -> tuple[tuple[int, ...], ...]:
-        """Indices of the cameras of each image size, which are rendered together."""
-        sizes = dict.fromkeys(self.sizes)
-        return tuple(tuple(index for index, own in enumerate(self.sizes) if own == size) for size in sizes)
+        """Indices of the cameras that are rendered together: of one image size, and all jittered or none."""
+        kinds = [(size, self.is_placed(index)) for index, size in enumerate(self.sizes)]
+        return tuple(tuple(index for index, own in enumerate(kinds) if own == kind) for kind in dict.fromkeys(kinds))
+
+    def is_placed(self, index: int) -> bool:
+        """Whether a camera's matrix and pose are not the same in all views."""
+        return self.rows[index].jitter is not None
 
     @property
     def largest(self) -> Size:
@@ -116,6 +120,16 @@ def position(pose: Pose) -> Vector:
     if pose.matrix is not None:
         return pose.matrix[0][3], pose.matrix[1][3], pose.matrix[2][3]
     return pose.position or (0.0, 0.0, 0.0)
+
+
+def moved(pose: Pose, offset: Vector) -> Pose:
+    """A valid pose with its position, and its look-at point, moved by an offset [m]."""
+    if pose.matrix is not None:
+        rows = [(*row[:3], row[3] + part) for row, part in zip(pose.matrix, offset, strict=False)]
+        return replace(pose, matrix=(*rows, pose.matrix[3]))
+    points = {name: getattr(pose, name) for name in ("position", "look_at")}
+    shifted = {name: tuple(map(sum, zip(point, offset, strict=True))) for name, point in points.items() if point is not None}
+    return replace(pose, **shifted)
 
 
 def viewing_direction(pose: Pose) -> Vector:

@@ -15,6 +15,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from synpick_warp.configs.check import check_value, is_table
+from synpick_warp.configs.randomize import Distribution
 from synpick_warp.errors import ConfigError, format_value, shorten, suggest
 
 Settings = dict[str, tuple[dataclasses.Field[Any], Any]]
@@ -90,6 +91,12 @@ def change_rows(key: str, kind: type[Any], rows: tuple[Any, ...], changes: Mappi
 
 
 def given_values(row: Any) -> dict[str, Any]:
-    """Convert a row to a dictionary of the settings that are given (not None); nested tables become dictionaries."""
+    """Convert a row to a dictionary of the settings that are given (not None), in types of TOML; nested tables become dictionaries."""
     values = ((name, getattr(row, name)) for name in settings_of(type(row)))
-    return {name: given_values(value) if is_table(type(value)) else value for name, value in values if value is not None}
+    return {name: _plain(value) for name, value in values if value is not None}
+
+
+def _plain(value: Any) -> Any:
+    if is_table(type(value)):
+        return given_values(value)
+    return value.to_toml() if isinstance(value, Distribution) else value

@@ -1,14 +1,20 @@
-"""Cameras of a rig: matrices and poses in float64."""
+"""Cameras of a rig: matrices and poses in float64, and what each episode draws of them."""
 
 from __future__ import annotations
+
+import functools
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from synpick_warp.configs.cameras import CameraRow
+from synpick_warp.codes import Stream
+from synpick_warp.configs.cameras import CameraRow, Jitter
 from synpick_warp.configs.rig import Rig, lens_map
 from synpick_warp.errors import ConfigError
 from synpick_warp.scenes.types import Camera
+from synpick_warp.system.random_numbers import stream_key, uniform
 
 PARALLEL = 1e-6
 """Sine of the angle below which `up` counts as parallel to the viewing direction."""
@@ -66,6 +72,62 @@ def _look_at(label: str, position: np.ndarray, target: np.ndarray, up: np.ndarra
         )
     right = right / length
     return np.stack([right, np.cross(forward, right), forward])
+
+
+class EpisodeCameras:
+    """Cameras of episodes and views, where these are not those of the rig: in float64, from seed, episode and camera alone.
+
+    Images are rendered with these numbers, and exported with them.
+    """
+
+    def __init__(self, rig: Rig, seed: int) -> None:
+        self.cameras = make_cameras(rig)
+        self.rig, self._seed = rig, seed
+        self._draw = functools.lru_cache(maxsize=4096)(self._drawn)
+
+    def of_episode(self, episode: int) -> tuple[Camera, ...]:
+        """Cameras of an episode, with what it draws of them."""
+        return tuple(self._draw(episode, camera) for camera in range(len(self.cameras)))
+
+    def of_views(self, episode: np.ndarray, camera: np.ndarray) -> dict[str, np.ndarray]:
+        """Fields matrix, rotation and translation of `FrameBatch` for views of these episodes and cameras (B), all of one group of the
+        rig; none if it has the rig's.
+        """
+        if not len(camera) or not self.rig.is_placed(int(camera[0])):
+            return {}
+        drawn = [self._draw(*pair) for pair in zip(episode.tolist(), camera.tolist(), strict=True)]
+        return {name: np.stack([getattr(one, name) for one in drawn]) for name in ("matrix", "rotation", "translation")}
+
+    def record(self, episode: int) -> dict[str, Any] | None:
+        """Record of an episode's cameras by name: matrix [px], world-to-camera rotation and translation [m] of those that are drawn; None:
+        none is.
+        """
+        drawn = [one for index, one in enumerate(self.of_episode(episode)) if self.rig.is_placed(index)]
+        keys = ("matrix", "rotation", "translation")
+        return {one.name: {key: getattr(one, key).tolist() for key in keys} for one in drawn} or None
+
+    def _drawn(self, episode: int, index: int) -> Camera:
+        camera, jitter = self.cameras[index], self.rig.rows[index].jitter
+        if jitter is None:
+            return camera
+        position, rotation, focal_length, center = draw_jitter(jitter, self._seed, episode, index)
+        matrix = camera.matrix.copy()
+        matrix[[0, 1], [0, 1]] *= 1.0 + focal_length
+        matrix[:2, 2] += center
+        at = position - camera.rotation.T @ camera.translation
+        turned = Rotation.from_rotvec(rotation, degrees=True).as_matrix().T @ camera.rotation
+        return replace(camera, matrix=matrix, rotation=turned, translation=-turned @ at)
+
+
+def draw_jitter(jitter: Jitter, seed: int, episode: int, camera: int) -> tuple[np.ndarray, np.ndarray, float, np.ndarray]:
+    """Offset of the position [m], rotation vector [°], relative change of the focal length and offset of the centre [px] in an episode.
+
+    The n-th of these nine numbers is drawn from samples 2 n and 2 n + 1 of the camera's stream.
+    """
+    key = stream_key(seed, episode, 0, Stream.CAMERA, camera)
+    kinds = [jitter.position] * 3 + [jitter.rotation] * 3 + [jitter.focal_length] + [jitter.center] * 2
+    drawn = [kind.sample(uniform(key, 2 * index), uniform(key, 2 * index + 1)) for index, kind in enumerate(kinds)]
+    return np.array(drawn[:3]), np.array(drawn[3:6]), drawn[6], np.array(drawn[7:])
 
 
 def _plain(vector: np.ndarray) -> str:

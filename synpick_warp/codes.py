@@ -167,6 +167,7 @@ class Stream(enum.IntEnum):
     DISTRACTORS = 14
     COMPARTMENT = 15
     INFRARED_NOISE = 16
+    CAMERA = 17
 
 
 class Look(enum.IntEnum):

@@ -52,7 +52,7 @@ class FakeRenderer:
 
     calls: list[tuple[Any, list[int], list[int], int]]
 
-    def render(self, snapshot, views, out, layers) -> None:
+    def render(self, snapshot, views, out, layers, placed=None) -> None:
         world, camera, count = views.world.numpy(), views.camera.numpy(), views.count
         self.calls.append((snapshot, world.tolist(), camera.tolist(), count))
         for array in (*vars(out).values(), *(array for array in vars(layers).values() if array is not None)):

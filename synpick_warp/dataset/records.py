@@ -28,6 +28,7 @@ Instances = Annotated[list[Index], msgspec.Meta(max_length=MAX_INSTANCES)]
 Amount = Annotated[float, msgspec.Meta(ge=0.0, le=1e9)]
 """Non-negative quantity in any unit; small enough for every drawing."""
 Vector = tuple[float, float, float]
+Matrix = tuple[Vector, Vector, Vector]
 Pixel = tuple[float, float]
 """Column and row in the perception image; integers are pixel centres."""
 _Value = bool | int | float | str | None
@@ -69,8 +70,16 @@ class BinRecord(msgspec.Struct):
     """Schema of the record of an episode's bin; see `views.bins.bin_record`."""
 
     name: str
-    position: tuple[float, float, float]
+    position: Vector
     yaw: float
+
+
+class CameraRecord(msgspec.Struct):
+    """Schema of the record of a camera in an episode; see `scenes.cameras.EpisodeCameras.record`."""
+
+    matrix: Matrix
+    rotation: Matrix
+    translation: Vector
 
 
 class Row(msgspec.Struct):
@@ -91,6 +100,7 @@ class Row(msgspec.Struct):
     split: str = ""
     looks: dict[str, Any] | None = None
     bin: BinRecord | None = None
+    cameras: dict[str, CameraRecord] | None = None
 
     def __post_init__(self) -> None:
         _check_name("ending", self.ending, names(Ending)[1:])

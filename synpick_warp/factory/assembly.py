@@ -7,9 +7,10 @@ from __future__ import annotations
 
 import contextlib
 import gc
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from typing import Any
 
 import numpy as np
 import warp as wp
@@ -19,13 +20,12 @@ from synpick_warp.configs.splits import DataLayout
 from synpick_warp.exporters.registry import Needs
 from synpick_warp.factory.attempts import AttemptLog
 from synpick_warp.factory.compilation import is_cache_warm, make_compiler, sole_compiler, submit_launches, submit_slow
-from synpick_warp.factory.episodes import DrawLooks
 from synpick_warp.factory.memory_plan import check_memory, plan_memory
 from synpick_warp.factory.order import order_longest_first
 from synpick_warp.factory.sizes import count_writers, fit_to_device, without_pictures
 from synpick_warp.scenes.bins import make_bins
 from synpick_warp.scenes.build import REPEATS, find_repeat_rules, must_repeat, with_capacities, without_distractors
-from synpick_warp.scenes.cameras import make_cameras
+from synpick_warp.scenes.cameras import EpisodeCameras
 from synpick_warp.scenes.catalog import load_catalog
 from synpick_warp.scenes.fixtures import make_fixtures
 from synpick_warp.scenes.looks import Looks, load_looks
@@ -50,7 +50,7 @@ class Stages:
     config: Config
     """The settings; `bake.worlds` is the actual number."""
     catalog: Catalog
-    cameras: tuple[Camera, ...]
+    episode_cameras: EpisodeCameras
     lights: tuple[EnvironmentMap, ...]
     simulation: Simulation
     groups: tuple[CameraGroup, ...]
@@ -70,10 +70,20 @@ class Stages:
         return self.groups[0].renderer.scene.looks
 
     @property
-    def looks(self) -> DrawLooks | None:
-        """Function of episode, number of objects and names of distractors by instance that returns the record of looks; None: none is
-        randomized."""
-        return partial(draw_looks, self.randomized, self.config.bake.seed) if self.randomized else None
+    def cameras(self) -> tuple[Camera, ...]:
+        """The cameras, without what episodes draw of them."""
+        return self.episode_cameras.cameras
+
+    def draws(self, episode: int, objects: int, distractors: Mapping[int, str]) -> dict[str, Any]:
+        """Fields of `EpisodeRow` that record what an episode draws: looks and cameras; None: nothing.
+
+        Args:
+            episode: Index of the episode.
+            objects: Number of its objects.
+            distractors: Names of its distractors, by instance.
+        """
+        looks = draw_looks(self.randomized, self.config.bake.seed, episode, objects, distractors) if self.randomized else None
+        return {"looks": looks, "cameras": self.episode_cameras.record(episode)}
 
     def make_log(self) -> AttemptLog:
         """Create an empty attempt log."""
@@ -168,7 +178,7 @@ def _add_stream(stages: Stages, device: wp.Device, needs_images: bool, depth_fil
         ViewRing(group, config.render.layers, device, host_images(config.bop, group.sizes["row"], device, needs_images, depth_files))
         for group in stages.groups
     ]
-    stream = FrameStream(rings, tick_time, stages.object_ids, table, device, config.cell.recorded)
+    stream = FrameStream(rings, tick_time, stages.object_ids, table, device, config.cell.recorded, stages.episode_cameras)
     return Factory(**vars(stages), stream=stream, log=stages.make_log())
 
 
@@ -183,7 +193,8 @@ def build_stages(
 ) -> Stages:
     """Load assets, and build worlds and renderer, from settings with resolved sizes. Other arguments and errors: `build_factory`."""
     progress.stage("loading objects and lights")
-    cameras = make_cameras(config.rig)
+    episode_cameras = EpisodeCameras(config.rig, config.bake.seed)
+    cameras = episode_cameras.cameras
     bins = make_bins(config.cell.bins)
     catalog = load_catalog(config, report=progress.note)
     lights = load_scene_lights(config.bake.lights, config.randomize, config.bake.seed, progress.note, config.objects.strict)
@@ -197,7 +208,7 @@ def build_stages(
     simulation = Simulation(config, catalog, len(lights), device, scene, episodes, records_physics)
     groups = tuple(_build_group(config, scene, cameras, index) for index in range(len(config.rig.groups)))
     table = name_lights([light.name for light in lights], scene.lights)
-    return Stages(config, catalog, cameras, lights, simulation, groups, catalog.object_ids, table)
+    return Stages(config, catalog, episode_cameras, lights, simulation, groups, catalog.object_ids, table)
 
 
 def _build_group(config: Config, scene: RenderScene, cameras: tuple[Camera, ...], index: int) -> CameraGroup:
@@ -205,7 +216,8 @@ def _build_group(config: Config, scene: RenderScene, cameras: tuple[Camera, ...]
     indices, worlds, objects = config.rig.groups[index], config.bake.worlds, config.arrangement.max_objects
     sizes = view_sizes(config.render, config.rig, worlds, objects, scene.device, index)
     scene = with_cameras(scene, tuple(cameras[camera] for camera in indices))
-    return CameraGroup(indices, sizes, make_renderer(config, scene, objects, sizes["view"], worlds * len(indices)))
+    renderer = make_renderer(config, scene, objects, sizes["view"], worlds * len(indices))
+    return CameraGroup(indices, sizes, renderer, config.rig.is_placed(indices[0]))
 
 
 def _fit_to_catalog(config: Config, catalog: Catalog, device: wp.Device, progress: Progress) -> Config:

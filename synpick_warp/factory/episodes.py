@@ -20,8 +20,8 @@ PLACES = 6
 """Decimal places of a time [s]; more would be noise."""
 
 
-DrawLooks = Callable[[int, int, Mapping[int, str]], Mapping[str, Any]]
-"""Type of `Stages.looks`."""
+Draws = Callable[[int, int, Mapping[int, str]], Mapping[str, Any]]
+"""Type of `Stages.draws`."""
 
 
 class EpisodeRow(NamedTuple):
@@ -50,6 +50,8 @@ class EpisodeRow(NamedTuple):
     """Randomized looks of the episode, as `draw_looks` has them; None, and no key: the settings randomize none."""
     bin: dict[str, Any] | None = None
     """Record of the bin; None, and no key: a tote that is always in its place."""
+    cameras: dict[str, Any] | None = None
+    """Record of the cameras by name, as `EpisodeCameras.record` has it; None, and no key: all are those of the settings."""
 
     def as_json(self) -> dict[str, Any]:
         """Row as the dictionary of a line of episodes.jsonl."""
@@ -131,14 +133,14 @@ def episode_row(
     layout: DataLayout,
     bins: Sequence[str],
     tick_time: float,
-    looks: DrawLooks | None,
+    draws: Draws,
     report: TickReport,
     world: int,
     record: EpisodeRecord,
 ) -> EpisodeRow:
     """Build the row of the episode that ended in a world.
 
-    `bins`: `Cell.recorded`; `tick_time`: time between two frames [s]; `looks`: see `Stages.looks`.
+    `bins`: `Cell.recorded`; `tick_time`: time between two frames [s]; `draws`: see `Stages.draws`.
     """
     episode, arrangement, frame, ending = (int(report.column(name)[world]) for name in ("episode", "arrangement", "frame", "ending"))
     split = layout.split_of(episode)
@@ -155,8 +157,8 @@ def episode_row(
         record.lost,
         record.left,
         "" if split is None else split.name,
-        None if looks is None else looks(episode, record.objects, dict(record.distractors)),
-        bin_record(bins[int(report.snapshot.bin[world])], report.snapshot.fixture_pose[world, 0]) if bins else None,
+        bin=bin_record(bins[int(report.snapshot.bin[world])], report.snapshot.fixture_pose[world, 0]) if bins else None,
+        **draws(episode, record.objects, dict(record.distractors)),
     )
 
 

@@ -163,7 +163,7 @@ class Producer:
         stages = self.stages
         for first in range(0, len(world), ring.views):
             part = slice(first, first + ring.views)
-            known = (self.object_ids, stages.light_table, stages.config.cell.recorded)
+            known = (self.object_ids, stages.light_table, stages.config.cell.recorded, stages.episode_cameras)
             host = describe_views(report, world[part], camera[part], stages.tick_time, *known)
             host["arrangement"] = report.column("arrangement")[world[part]]
             yield ring.render(snapshot, world[part], camera[part], host)
@@ -174,7 +174,7 @@ class Producer:
         layout = DataLayout.of(config)
         for world in np.flatnonzero(report.column("phase") == Phase.OVER).tolist():
             record = records[int(report.column("episode")[world])]
-            row = episode_row(layout, config.cell.recorded, self.stages.tick_time, self.stages.looks, report, world, record)
+            row = episode_row(layout, config.cell.recorded, self.stages.tick_time, self.stages.draws, report, world, record)
             if is_resampled(row, config.settle.tries):
                 self.summary.take_resample(row.ending)
                 self.progress.note(f"episode {row.episode}, arrangement {row.arrangement + 1}: {row.ending.sentence}")

@@ -12,6 +12,7 @@ import numpy as np
 import warp as wp
 
 from synpick_warp.codes import Measure, Status, column_names
+from synpick_warp.scenes.cameras import EpisodeCameras
 from synpick_warp.stages.buffers import Snapshot
 from synpick_warp.stages.host_copies import HostCopy
 from synpick_warp.stages.render.view_setup import pair_views
@@ -172,6 +173,7 @@ def describe_views(
     object_ids: np.ndarray,
     lights: LightTable,
     bins: Sequence[str] = (),
+    cameras: EpisodeCameras | None = None,
 ) -> dict[str, Any]:
     """Fields of `FrameBatch` for B views, without images: episode, camera, frame, time [s], object ids, poses; name, yaw, exposure and
     direction of the light.
@@ -184,12 +186,14 @@ def describe_views(
         object_ids: obj_id of each catalog entry, and behind them -1 for none (entry + 1) int32.
         lights: Table of the environment maps.
         bins: Names of the bins, `Cell.recorded`; empty: without those of the views.
+        cameras: Cameras of episodes and views; None: without those of the views.
     """
     own = {"bin_name": np.array(bins)[report.snapshot.bin[world]], "bin_pose": report.snapshot.fixture_pose[world, 0]} if bins else {}
-    frame = report.column("frame")[world]
+    episode, frame = report.column("episode")[world], report.column("frame")[world]
+    own |= cameras.of_views(episode, camera) if cameras is not None else {}
     light, yaw = report.snapshot.light[world], report.snapshot.light_yaw[world]
     return {
-        "episode": report.column("episode")[world],
+        "episode": episode,
         "camera": camera,
         "frame": frame,
         "time": frame * tick_time,
@@ -233,6 +237,7 @@ class FrameStream:
         lights: LightTable,
         device: wp.Device,
         bins: Sequence[str] = (),
+        cameras: EpisodeCameras | None = None,
     ) -> None:
         """
         Args:
@@ -241,11 +246,11 @@ class FrameStream:
             object_ids: obj_id of each catalog entry (entry) int32.
             lights: Table of the environment maps.
             device: Device of rendering.
-            bins: As of `describe_views`.
+            bins, cameras: As of `describe_views`.
         """
         self.rings = tuple(rings)
         self.object_ids = np.append(object_ids, -1).astype(np.int32)
-        self.lights, self.bins = lights, bins
+        self.lights, self.bins, self.cameras = lights, bins, cameras
         self.tick_time = tick_time
         self.device = device
         self.streams = RenderStreams(device)
@@ -282,8 +287,9 @@ class FrameStream:
                 while sum(launched.ring is ring for launched in self.in_flight) == len(ring.slots):
                     yield from self._deliver()
                 part = slice(first, min(first + ring.batch, len(world)))
-                slot = ring.launch(snapshot, world[part], camera[part], self.streams)
-                description = describe_views(report, world[part], camera[part], self.tick_time, self.object_ids, self.lights, self.bins)
+                known = (self.tick_time, self.object_ids, self.lights, self.bins, self.cameras)
+                description = describe_views(report, world[part], camera[part], *known)
+                slot = ring.launch(snapshot, world[part], camera[part], self.streams, description)
                 self.in_flight.append(_Launched(ring, slot, part.stop - first, description))
                 ahead += int(self.device.is_cuda)
         if len(live):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, fields
 from typing import Any
 
@@ -19,7 +19,7 @@ from synpick_warp.stages.encoding.png import DepthBuffers, DepthEncoder, DepthSc
 from synpick_warp.stages.host_copies import DeviceImages, HostCopy, HostImages
 from synpick_warp.stages.render.mask_runs import BoundaryBuffers, BoundaryScratch, boundary_sizes, list_boundaries
 from synpick_warp.stages.render.renderer import Renderer
-from synpick_warp.stages.render.view_setup import make_views
+from synpick_warp.stages.render.view_setup import allocate_view_cameras, make_views, place_cameras
 from synpick_warp.stages.render_streams import RenderStreams
 from synpick_warp.stages.timing import scope
 
@@ -57,17 +57,31 @@ def view_sizes(render: Render, rig: Rig, worlds: int, objects: int, device: wp.D
 
 @dataclass(frozen=True, eq=False)
 class CameraGroup:
-    """Cameras of one image size, which are rendered together."""
+    """Cameras of one image size, which are rendered together; see `Rig.groups`."""
 
     cameras: tuple[int, ...]
     """Their indices; their order is that of the cameras in the renderer's scene."""
     sizes: dict[str, int]
     """Extents by `view_sizes`."""
     renderer: Renderer
+    placed: bool = False
+    """Whether each view has a matrix and pose of its own, as of `Rig.is_placed`."""
 
     def slots(self, camera: np.ndarray) -> np.ndarray:
         """Row of cameras in the renderer's scene (view) int32, by their indices (view)."""
         return np.searchsorted(np.array(self.cameras), camera).astype(np.int32)
+
+    def allocate_cameras(self) -> Any:
+        """Allocate the struct `ViewCameras` of a batch; None: the scene has the cameras of all views."""
+        if not self.placed:
+            return None
+        scene = self.renderer.scene
+        return allocate_view_cameras(self.sizes["view"], scene.device, scene.cameras)
+
+    def place(self, cameras: Any, camera: np.ndarray, description: Mapping[str, Any]) -> None:
+        """Set the struct of `allocate_cameras` for views of these cameras (view), by their description, as `FrameBatch` has it."""
+        if cameras is not None:
+            place_cameras(cameras, self.renderer.scene, self.slots(camera), description)
 
 
 @dataclass(frozen=True, eq=False)
@@ -137,10 +151,16 @@ class ViewRing:
         self.images = [name for name in copied[0] if name not in self.layers]
         self.copies = [HostCopy(list(arrays.values())) for arrays in copied]
         self.lists = [wp.zeros((3, self.batch), dtype=wp.int32, device=device) for _ in self.slots]
+        self.view_cameras = [group.allocate_cameras() for _ in self.slots]
         self._next = 0
 
-    def launch(self, snapshot: Snapshot, world: np.ndarray, camera: np.ndarray, streams: RenderStreams) -> int:
-        """Render the views (world, camera) of a snapshot into the next slot, then start to encode and copy the images; returns the slot."""
+    def launch(
+        self, snapshot: Snapshot, world: np.ndarray, camera: np.ndarray, streams: RenderStreams, description: Mapping[str, Any]
+    ) -> int:
+        """Render the views (world, camera) of a snapshot into the next slot, then start to encode and copy the images; returns the slot.
+
+        `description`: that of the views by `describe_views`.
+        """
         slot, count = self._next, len(world)
         self._next = (slot + 1) % len(self.slots)
         rows = self.lists[slot]
@@ -148,9 +168,10 @@ class ViewRing:
         padded[1] = self.cameras[0]
         padded[:, :count] = world, camera, self.group.slots(camera)
         rows.assign(padded)
-        views = make_views(rows[0], rows[1], count, self.instances, slot=rows[2])
+        views, placed = make_views(rows[0], rows[1], count, self.instances, slot=rows[2]), self.view_cameras[slot]
+        self.group.place(placed, camera, description)
         with wp.ScopedStream(streams.render, sync_exit=True), scope("render", self.device):
-            self.renderer.render(snapshot, views, self.slots[slot].images, self.slots[slot].layers)
+            self.renderer.render(snapshot, views, self.slots[slot].images, self.slots[slot].layers, placed)
         with wp.ScopedStream(streams.copy):
             with scope("encode", self.device):
                 self._encode(slot, count)

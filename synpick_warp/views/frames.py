@@ -62,6 +62,12 @@ class FrameBatch:
     """Exposure compensation of the episode, relative to the automatic exposure [EV] (B) float32."""
     light_direction: np.ndarray
     """Unit vector towards the sun or strongest lamp of the map, in the world frame; zero: the map has none (B, 3) float32."""
+    matrix: np.ndarray | None = None
+    """Camera matrix of each view (B, 3, 3) float64 [px]; None, as of the next two: that of the camera, the same in all views."""
+    rotation: np.ndarray | None = None
+    """World-to-camera rotation (B, 3, 3) float64."""
+    translation: np.ndarray | None = None
+    """World-to-camera translation (B, 3) float64 [m]."""
     layers: dict[str, np.ndarray] = field(default_factory=dict)
     """Layers (AOVs) that `render.layers` names, each (B, H, W[, C]); see `synpick_warp.views.layer_codec`."""
     bin_name: np.ndarray | None = None

@@ -114,6 +114,44 @@ def test_what_is_refused_and_said(tmp_path, text, words):
     assert "\n" not in str(caught.value)
 
 
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("jitter = 3\n", "camera[0].jitter is 3 in {path}; allowed: a table of position, rotation, focal_length, center"),
+        ("[camera.jitter]\nzoom = 1\n", "there is no key camera[0].jitter.zoom, set in {path}; keys: position, "),
+        (
+            "[camera.jitter]\nposition = 0.01\n",
+            "camera[0].jitter.position is 0.01 in {path}; allowed: a distribution, such as {{ normal = [0, 0.002] }}",
+        ),
+        ("[camera.jitter]\nposition = [0.01, 0.02]\n", "camera[0].jitter.position is [0.01, 0.02] in {path}; allowed: finite numbers [m]"),
+        ("[camera.jitter]\nposition = { normal = [0, -1] }\n", "with sigma at least 0"),
+        ("[camera.jitter]\nposition = { uniform = [nan, 1] }\n", "camera[0].jitter.position is "),
+        # Under the tote, in its wall, beside it, out of the image: each where single draws are.
+        ("[camera.jitter]\nposition = { uniform = [-1.1, 0] }\n", "less, so that every draw has positions above the tote's floor"),
+        ("[camera.jitter]\nposition = { normal = [0, 0.4] }\n", "less, so that every draw has positions above the tote's floor"),
+        ("[camera.jitter]\nposition = { uniform = [-3, 3] }\n", "less, so that every draw has "),
+        (
+            "[camera.jitter]\nrotation = { uniform = [0, 80] }\n",
+            "less, so that every draw has a point that lets each camera see the tote",
+        ),
+        ("[camera.jitter]\ncenter = { uniform = [-170, 0] }\n", "less, so that every draw has a principal point cx, cy inside"),
+    ],
+)
+def test_jitter_that_is_refused(tmp_path, text, words):
+    with pytest.raises(ConfigError) as caught:
+        load(tmp_path, LEFT + text)
+    assert words.format(path=tmp_path / "cell.toml") in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_jitter_is_kept_and_makes_a_group_of_its_own(tmp_path):
+    config = load(tmp_path, LEFT + "[camera.jitter]\nposition = { normal = [0.0, 0.002] }\n" + LEFT.replace('"left"', '"right"'))
+    again = tmp_path / "again.toml"
+    again.write_text(config_to_toml(config))
+    assert load_config(str(again)) == config
+    assert config.rig.groups == ((0,), (1,))
+
+
 def test_options_that_would_have_no_effect_are_refused(tmp_path):
     for key, value in (("cameras.resolution", [64, 48]), ("cameras.fov", 30.0)):
         with pytest.raises(ConfigError, match=rf"{key} is .* on the command line; allowed: none, as the \[\[camera\]\] tables"):

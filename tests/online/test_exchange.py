@@ -30,7 +30,7 @@ class NumberingRenderer:
         self.scene = SimpleNamespace(device=device, obj_id=wp.zeros(1, dtype=wp.int32, device=device))
         self.busy, self.count = wp.zeros(1, dtype=float, device=device), 0
 
-    def render(self, snapshot, views, out, layers) -> None:
+    def render(self, snapshot, views, out, layers, placed) -> None:
         self.count += 1
         views.cameras = self.cameras
         wp.launch(spin_kernel, dim=1, inputs=[self.busy, SPINS], device=self.scene.device)

@@ -22,6 +22,7 @@ import cv2
 import numpy as np
 import trimesh
 
+from synpick_warp.configs.load import load_config
 from tools.checks.measures import Measure, UnusableError, run_check
 
 DEPTH_TOLERANCE = 0.2
@@ -260,23 +261,26 @@ def box_error(one: list[int], other: list[int]) -> float:
     return float(max(abs(a - b) for a, b in zip(*sides, strict=True)))
 
 
+def count_cameras(dataset: Path, scenes: list[Path]) -> int:
+    """Number of cameras: that of the settings; without these the number of poses that cameras have in the scenes' first images."""
+    if (dataset / "config.toml").exists():
+        return len(load_config(str(dataset / "config.toml")).rig)
+    firsts = [next(iter(read_json(scene / "scene_camera.json").values()), {}) for scene in scenes]
+    return len({(*first.get("cam_R_w2c", ()), *first.get("cam_t_w2c", ())) for first in firsts})
+
+
 def check(dataset: Path, views: int) -> Report:
     """Check `views` views spread evenly over a data set."""
     scenes = sorted(path.parent for path in dataset.glob("[!.]*/*/scene_camera.json"))
     if not scenes:
         raise UnusableError(f"{dataset} has no scene")
     report = Report()
-    cameras = set()
-    for scene in scenes:
-        first = next(iter(read_json(scene / "scene_camera.json").values()), {})
-        cameras.add((*first.get("cam_R_w2c", ()), *first.get("cam_t_w2c", ())))
+    cameras = count_cameras(dataset, scenes)
     order = [(scene, frame) for scene in scenes for frame in sorted(read_json(scene / "scene_gt.json"), key=int)]
     for index in np.unique(np.linspace(0, len(order) - 1, views).round().astype(int)):
         scene, frame = order[index]
-        episode = int(scene.name) // len(cameras)
-        check_world(
-            [other for other in scenes if other.parent == scene.parent and int(other.name) // len(cameras) == episode], frame, report
-        )
+        episode = int(scene.name) // cameras
+        check_world([other for other in scenes if other.parent == scene.parent and int(other.name) // cameras == episode], frame, report)
         view = read_view(scene, frame)
         check_images(view, report)
         check_info(view, report)

@@ -81,7 +81,9 @@ def write_contact_sheet(dataset: Path, out: Path, views: int) -> Path:
     check_picture_name(out)
     if views < 1:
         raise OutputError(f"{views} views requested; a contact sheet has at least 1")
-    shown = list(_read_views(sample(find_scenes(dataset), views)))
+    config = dataset / CONFIG_FILE
+    cameras = len(load_config(str(config), {}).rig) if config.exists() else 0
+    shown = list(_read_views(sample(find_scenes(dataset), views, cameras)))
     baked = read_baked(dataset, {record["obj_id"] for view in shown for record, _ in view.truth})
     scale = bin_scale(baked.config.cell.bins, [view.camera for view in shown]) if baked.config else None
     scale = scale or pooled_scale(depth for view in shown if (depth := _read_depth(view)) is not None)
@@ -149,22 +151,26 @@ def find_scenes(dataset: Path) -> list[Scene]:
     )
 
 
-def sample(scenes: list[Scene], views: int) -> list[tuple[Scene, int]]:
+def sample(scenes: list[Scene], views: int, cameras: int = 0) -> list[tuple[Scene, int]]:
     """Sample views: (scene, frame), sorted and distinct; all views if no more are there than asked for.
 
-    Cameras in turn; a camera's scenes evenly; within a scene at frames of a low-discrepancy sequence.
+    Cameras in turn; a camera's scenes evenly; within a scene at frames of a low-discrepancy sequence. `cameras`: number of cameras of our
+    own data set; 0: scenes are told apart by the poses of their cameras.
 
     Raises:
         DatasetError: A file is damaged, or no scene has a view.
         OutputError: More views are there and asked for than a sheet shows.
     """
-    by_camera: dict[tuple[float, ...], list[tuple[Scene, list[int]]]] = {}
+    by_camera: dict[tuple[Any, ...], list[tuple[Scene, list[int]]]] = {}
     for scene in scenes:
         files = scene.files()
         frames = files.frames()
         if frames:
             first = files.camera(frames[0])
-            group = by_camera.setdefault((*first.get("cam_R_w2c", ()), *first.get("cam_t_w2c", ())), [])
+            own = (*first.get("cam_R_w2c", ()), *first.get("cam_t_w2c", ()))
+            if cameras:
+                own = (scene.sensor or int(scene.folder.name) % cameras,)
+            group = by_camera.setdefault(own, [])
             group.append((scene, list(frames)))
     groups = list(by_camera.values())
     if not groups:

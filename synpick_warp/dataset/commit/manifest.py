@@ -28,7 +28,7 @@ from synpick_warp import __version__
 from synpick_warp.configs.bins import Bins
 from synpick_warp.configs.load import load_config, override_config, table_lists
 from synpick_warp.configs.objects import AUTO_UNIT, Objects
-from synpick_warp.configs.randomize import Distribution, Randomize
+from synpick_warp.configs.randomize import Randomize
 from synpick_warp.configs.schema import CLASSIC, WITHIN, Config
 from synpick_warp.configs.table_lists import given_values
 from synpick_warp.dataset.records import Entry, EpisodeEntry, IndicesEntry, Manifest, read_record
@@ -72,11 +72,6 @@ FREE_SETTINGS = (
 by the name of their folder. A device of another type computes the same episodes up to rounding."""
 
 
-def _plain(value: Any) -> Any:
-    """A value of a setting in types of TOML."""
-    return value.to_toml() if isinstance(value, Distribution) else value
-
-
 YOUNGER_SETTINGS: dict[str, Any] = {
     "bop.layout": CLASSIC,
     "bop.keypoints": 0,
@@ -98,7 +93,7 @@ YOUNGER_SETTINGS: dict[str, Any] = {
     "objects.symmetry_tolerance": Objects().symmetry_tolerance,
 }
 YOUNGER_SETTINGS |= {f"bins.{item.name}": item.default for item in dataclasses.fields(Bins)}
-YOUNGER_SETTINGS |= {f"randomize.{item.name}": _plain(item.default) for item in dataclasses.fields(Randomize)}
+YOUNGER_SETTINGS |= {f"randomize.{name}": value for name, value in given_values(Randomize()).items()}
 """Settings that older manifests lack, and what held before: left out where they have these values, so that older data sets can still be
 read, and resumed with them."""
 _YOUNGER_KEYS = ("symmetries_discrete", "symmetries_continuous")
@@ -141,7 +136,7 @@ def fixed_settings(config: Config) -> dict[str, Any]:
     settings = dataclasses.asdict(config)
     for name in table_lists():
         settings[name] = [given_values(row) for row in getattr(config, name)]
-    settings["randomize"] = {item.name: _plain(getattr(config.randomize, item.name)) for item in dataclasses.fields(Randomize)}
+    settings["randomize"] = given_values(config.randomize)
     for key in FREE_SETTINGS:
         section, name = key.split(".")
         del settings[section][name]

@@ -86,7 +86,7 @@ class ViewTruth:
     """BOP im_id."""
     jpeg_quality: int
     extras: dict[str, Any]
-    """Keys of this view's entry in scene_camera.json besides the camera: light and camera effects."""
+    """Keys of this view's entry in scene_camera.json besides the camera's constant ones: light, camera effects, its own matrix and pose."""
     instance_id: np.ndarray
     """(N)"""
     object_id: np.ndarray
@@ -119,7 +119,7 @@ class RenderedView:
         self._settings, self._truth = settings, truth
         self.scene, self.frame = truth.scene, truth.frame
         self.camera = settings.camera | truth.extras
-        self.gt, self.gt_info = make_gt_entries(truth, settings.camera), make_gt_info_entries(truth)
+        self.gt, self.gt_info = make_gt_entries(truth, self.camera), make_gt_info_entries(truth)
 
     @property
     def color(self) -> tuple[str, Buffer]:
@@ -186,12 +186,15 @@ def write_stored_views(
 
 def make_camera_constants(camera: Camera, depth_scale: float) -> dict[str, Any]:
     """Constant part of a camera's entries in scene_camera.json."""
+    return _pose_keys(camera.matrix, camera.rotation, camera.translation) | {"depth_scale": depth_scale, **camera.distortion}
+
+
+def _pose_keys(matrix: np.ndarray, rotation: np.ndarray, translation: np.ndarray) -> dict[str, Any]:
+    """Keys of scene_camera.json for a camera matrix and a pose, world to camera [m]."""
     return {
-        "cam_K": camera.matrix.ravel().tolist(),
-        "cam_R_w2c": camera.rotation.ravel().tolist(),
-        "cam_t_w2c": (MILLIMETERS * camera.translation).tolist(),
-        "depth_scale": depth_scale,
-        **camera.distortion,
+        "cam_K": matrix.ravel().tolist(),
+        "cam_R_w2c": rotation.ravel().tolist(),
+        "cam_t_w2c": (MILLIMETERS * translation).tolist(),
     }
 
 
@@ -229,7 +232,7 @@ def make_view_task(batch: FrameBatch, view: int, scene: int, settings: ViewSetti
 
 
 def _make_extras(batch: FrameBatch, view: int, effects: dict[str, float]) -> dict[str, Any]:
-    """Extra keys of a view's entry in scene_camera.json: light, and bin and camera effects where they differ."""
+    """Extra keys of a view's entry in scene_camera.json: light, and bin, matrix and pose, and camera effects where they differ."""
     direction = batch.light_direction[view]
     light = {
         "map": str(batch.light_name[view]),
@@ -238,6 +241,8 @@ def _make_extras(batch: FrameBatch, view: int, effects: dict[str, float]) -> dic
         "direction": [round(part, _DIGITS) for part in direction.tolist()] if direction.any() else None,
     }
     own = {} if batch.bin_name is None or batch.bin_pose is None else {"bin": bin_record(str(batch.bin_name[view]), batch.bin_pose[view])}
+    if batch.matrix is not None and batch.rotation is not None and batch.translation is not None:
+        own |= _pose_keys(batch.matrix[view], batch.rotation[view], batch.translation[view])
     return {"light": light} | own | ({"effects": {name: round(value, _DIGITS) for name, value in effects.items()}} if effects else {})
 
 

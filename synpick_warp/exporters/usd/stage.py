@@ -8,6 +8,8 @@ Every moving prim also has its first pose as default value: physics engines read
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from pxr import Gf, Kind, Sdf, Usd, UsdGeom, UsdLux, UsdPhysics, UsdRender
 
@@ -66,7 +68,8 @@ def make_episode_layer(ticks: np.ndarray, metadata: EpisodeMetadata, settings: E
         assets[path] = object_asset(obj_id)
     add_looks(stage, assets, metadata.looks, settings.surfaces)
     for index, camera in enumerate(settings.cameras):
-        _add_camera(stage, camera.name or f"camera_{index}", camera)
+        drawn = {key: np.array(value) for key, value in metadata.cameras.get(camera.name, {}).items()}
+        _add_camera(stage, camera.name or f"camera_{index}", replace(camera, **drawn))
     first = ticks[0]
     _add_light(stage, settings.lights[first["light"]], float(first["light_yaw"]), float(first["light_exposure"]))
     # References are added last and without a stage, since they cannot be resolved from a file that is not in its place yet.

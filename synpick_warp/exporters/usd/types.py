@@ -98,14 +98,18 @@ class EpisodeMetadata:
     """Name of the bin; empty: a tote that is always in its place."""
     looks: Mapping[str, Any] = field(default_factory=dict)
     """Record of the episode's looks; empty: they are not randomized."""
+    cameras: Mapping[str, Any] = field(default_factory=dict)
+    """Matrix and pose of the cameras that the episode draws, by name."""
 
     @staticmethod
     def from_end(end: EpisodeEnd) -> EpisodeMetadata:
         """Take the metadata from the episode's end."""
-        own = (end.row or {}).get("bin") or {}
+        row = end.row or {}
         ending = Ending(end.ending).name.lower()
-        looks = end.row.get("looks", {})
-        return EpisodeMetadata(end.episode, end.arrangement, end.frames, ending, end.row.get("split", ""), own.get("name", ""), looks)
+        drawn = {name: row.get(name) or {} for name in ("looks", "cameras")}
+        return EpisodeMetadata(
+            end.episode, end.arrangement, end.frames, ending, row.get("split", ""), (row.get("bin") or {}).get("name", ""), **drawn
+        )
 
 
 def bin_asset(sizes: BinSizes) -> str:

@@ -119,8 +119,8 @@ class ViewBatch:
         depth_scale: Millimetres per count of `depth`.
         host: The numbers of the views that the host knows anyway, as NumPy arrays that stay valid, by name: episode, arrangement (how
             often the episode's arrangement was resampled), camera, frame, time [s], object_id, pose, light_name, light_yaw,
-            light_exposure, light_direction, and bin_name and bin_pose unless there is a tote in its place; see
-            `synpick_warp.views.frames.FrameBatch`.
+            light_exposure, light_direction; bin_name and bin_pose unless there is a tote in its place; matrix, rotation and
+            translation where these are not those of the cameras; see `synpick_warp.views.frames.FrameBatch`.
     """
 
     color: DeviceArray
@@ -192,6 +192,7 @@ class BatchRing:
         self.views, self.instances = sizes["view"], sizes["instance"]
         names = [item.name for item in fields(LayerBuffers) if item.name in layers]
         self.slots = [Slot(sizes, names, self.device) for _ in range(GPU_RING if self.device.is_cuda else 1)]
+        self._cameras = [group.allocate_cameras() for _ in self.slots]
         self._next = 0
 
     def render(self, snapshot: Snapshot, world: np.ndarray, camera: np.ndarray, host: Mapping[str, Any]) -> ViewBatch:
@@ -203,16 +204,17 @@ class BatchRing:
             camera: Camera of each view (B) int32.
             host: For `ViewBatch.host`.
         """
-        slot, count = self.slots[self._next], len(world)
+        slot, cameras, count = self.slots[self._next], self._cameras[self._next], len(world)
         self._next = (self._next + 1) % len(self.slots)
         slot.gate.wait_for_consumers()
         padded = np.zeros((3, self.views), dtype=np.int32)
         padded[:, :count] = world, camera, self.group.slots(camera)
         slot.lists.assign(padded)
         views = make_views(slot.lists[0], slot.lists[1], count, self.instances, slot=slot.lists[2])
-        views = with_cameras(views, self.renderer.cameras)
+        self.group.place(cameras, camera, host)
+        views = with_cameras(views, self.renderer.cameras if cameras is None else cameras)
         with scope("render", self.device):
-            self.renderer.render(snapshot, views, slot.images, slot.layers)
+            self.renderer.render(snapshot, views, slot.images, slot.layers, cameras)
             self._gather(snapshot, views, slot.truth)
         slot.gate.mark_ready()
         return ViewBatch(slot, count, self.depth_scale, host)

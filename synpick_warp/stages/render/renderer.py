@@ -85,7 +85,7 @@ class Renderer:
         self.annotator = Annotator(scene, instances, views)
         self.postprocessor = PostProcessor(effects, settings.tone, seed, scene, views)
 
-    def render(self, snapshot: Snapshot, views: Any, out: ViewBuffers, layers: LayerBuffers | None = None) -> None:
+    def render(self, snapshot: Snapshot, views: Any, out: ViewBuffers, layers: LayerBuffers | None = None, placed: Any = None) -> None:
         """Render and annotate a batch of views: the one place that knows the order of the passes.
 
         Args:
@@ -93,6 +93,7 @@ class Renderer:
             views: The struct `Views`; the renderer brings their cameras.
             out: Written.
             layers: Written; None: no layers.
+            placed: The struct `ViewCameras` of the views; None: the scene has their cameras.
 
         Raises:
             ValueError: The batch has more views than there is scratch for.
@@ -102,7 +103,7 @@ class Renderer:
         if views.count == 0:
             return
         device = self.scene.device
-        views = self.render_gbuffer(snapshot, views, out)
+        views = self.render_gbuffer(snapshot, views, out, placed)
         if layers is not None:
             with scope("layers", device):
                 self.layer_renderer.render(snapshot, self.bodies, self.gbuffer, views, layers)
@@ -113,11 +114,11 @@ class Renderer:
         with scope("annotate", device):
             self.annotator.annotate(self.bodies, views, out)
 
-    def render_gbuffer(self, snapshot: Snapshot, views: Any, out: ViewBuffers) -> Any:
+    def render_gbuffer(self, snapshot: Snapshot, views: Any, out: ViewBuffers, placed: Any = None) -> Any:
         """First part of `render`: G-buffer, and images of depth, instances and amodal bits. Returns the views with their cameras."""
-        scene, views = self.scene, with_cameras(views, self.cameras)
+        scene, views = self.scene, with_cameras(views, self.cameras if placed is None else placed)
         with scope("set up views", scene.device):
-            set_up_views(scene, snapshot, snapshot.fixture_visible, views, self.bodies)
+            set_up_views(scene, snapshot, snapshot.fixture_visible, views, self.bodies, placed is not None)
             if self.dresser:
                 self.dresser.dress(snapshot, views, self.bodies)
         with scope("rasterize", scene.device):

@@ -208,14 +208,10 @@ def normal_gradient(mesh: TriangleMesh) -> np.ndarray:
 
 def build_cameras(cameras: tuple[Camera, ...], device: wp.Device) -> Any:
     """Build the struct `Cameras` on the device: intrinsics, rotations both ways, centres."""
-    rotation = np.array([camera.rotation for camera in cameras], dtype=np.float64)
-    translation = np.array([camera.translation for camera in cameras], dtype=np.float64)
-    matrices = [camera.matrix for camera in cameras]
+    values = camera_arrays(*(np.array([getattr(camera, name) for camera in cameras]) for name in ("matrix", "rotation", "translation")))
     result = Cameras()
-    result.intrinsics = wp.array([(k[0, 0], k[1, 1], k[0, 2], k[1, 2]) for k in matrices], dtype=wp.vec4, device=device)
-    result.rotation = wp.array(rotation, dtype=wp.mat33d, device=device)
-    result.center = wp.array(-np.einsum("kji,kj->ki", rotation, translation), dtype=wp.vec3d, device=device)
-    result.to_world = wp.array(rotation.transpose(0, 2, 1), dtype=wp.mat33, device=device)
+    for name, value in values.items():
+        setattr(result, name, wp.array(value, dtype=Cameras.vars[name].type.dtype, device=device))
     if lenses := [camera.lens for camera in cameras if camera.lens is not None]:
         rows = np.cumsum([camera.lens is not None for camera in cameras]) - 1
         rows = [row if camera.lens is not None else -1 for row, camera in zip(rows, cameras, strict=True)]
@@ -225,6 +221,16 @@ def build_cameras(cameras: tuple[Camera, ...], device: wp.Device) -> Any:
         tables.number = wp.array(np.stack([lens_numbers(lens) for lens in lenses]), dtype=wp.float32, device=device)
         result.lenses = tables
     return result
+
+
+def camera_arrays(matrix: np.ndarray, rotation: np.ndarray, translation: np.ndarray) -> dict[str, np.ndarray]:
+    """Members of `Cameras` without lenses for matrices (n, 3, 3) [px], world-to-camera rotations (n, 3, 3) and translations (n, 3) [m]."""
+    return {
+        "intrinsics": matrix[:, [0, 1, 0, 1], [0, 1, 2, 2]].astype(np.float32),
+        "rotation": rotation,
+        "center": -np.einsum("kji,kj->ki", rotation, translation),
+        "to_world": rotation.transpose(0, 2, 1).astype(np.float32),
+    }
 
 
 def lens_numbers(lens: LensMap) -> np.ndarray:

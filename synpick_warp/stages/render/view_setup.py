@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -14,7 +15,7 @@ from synpick_warp.kernels.render.visibility.variants import kernel_for
 from synpick_warp.kernels.render.visibility.view_setup import aim_cameras_kernel, bin_bodies_kernel, set_up_views_kernel, sort_bodies_kernel
 from synpick_warp.stages.arrays import allocate_struct, struct_arrays
 from synpick_warp.stages.buffers import FIXTURES, Snapshot
-from synpick_warp.stages.render.scene import RenderScene, build_grid
+from synpick_warp.stages.render.scene import RenderScene, build_grid, camera_arrays
 
 VIEW_BODIES = struct_arrays(
     ViewBodies,
@@ -75,6 +76,22 @@ def allocate_view_cameras(views: int, device: wp.Device, cameras: Any = None) ->
     return made
 
 
+def place_cameras(cameras: Any, scene: RenderScene, slot: np.ndarray, placed: Mapping[str, np.ndarray]) -> None:
+    """Set the first views of the struct `ViewCameras` on the host.
+
+    Args:
+        cameras: Written.
+        scene: Scene that has the lenses.
+        slot: Row of each view's camera in the scene (view) int32.
+        placed: Matrix, rotation and translation of each view, as fields of `FrameBatch`.
+    """
+    values = camera_arrays(placed["matrix"], placed["rotation"], placed["translation"])
+    if scene.cameras.lens is not None:
+        values["lens"] = scene.cameras.lens.numpy()[slot]
+    for name, value in values.items():
+        getattr(cameras, name)[: len(slot)].assign(value)
+
+
 def first_views(count: int, cameras: int, instances: int, device: wp.Device, lenses: Any = None) -> Any:
     """The struct `Views` of the first views, world by world and camera by camera; arguments as of `make_views`, number of cameras, and the
     struct `Cameras` if some are distorted."""
@@ -94,6 +111,7 @@ def set_up_views(
     fixture_visible: wp.array,
     views: Any,
     bodies: Any,
+    placed: bool = False,
 ) -> None:
     """Set each view's camera, transform the bodies into its axes, sort them front to back and bin them into tiles.
 
@@ -103,12 +121,16 @@ def set_up_views(
         fixture_visible: Which fixtures are visible (world, fixture) int32.
         views: The struct `Views`; its cameras are written.
         bodies: The struct `ViewBodies`; written.
+        placed: Whether the views' cameras are set already. The static background is then of no use.
     """
-    wp.launch(kernel_for(aim_cameras_kernel, views), dim=views.count, inputs=[scene.cameras], outputs=[views], device=scene.device)
+    if not placed:
+        wp.launch(kernel_for(aim_cameras_kernel, views), dim=views.count, inputs=[scene.cameras], outputs=[views], device=scene.device)
     dim = (views.count, bodies.mesh.shape[1])
     worlds = [snapshot.bin, snapshot.catalog_index, snapshot.pose, snapshot.fixture_pose, fixture_visible]
     inputs = [scene.meshes, scene.grid, *worlds, views]
     wp.launch(kernel_for(set_up_views_kernel, views), dim=dim, inputs=inputs, outputs=[bodies], device=scene.device)
+    if placed:
+        bodies.uses_background.zero_()
     wp.launch(sort_bodies_kernel, dim=dim, inputs=[scene.meshes], outputs=[bodies], device=scene.device)
     inputs = [scene.meshes, scene.grid, views]
     wp.launch(

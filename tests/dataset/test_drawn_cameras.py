@@ -1,0 +1,143 @@
+"""A bake of cameras that are not the same in all views: drawn anew by each episode. Files against formulas, in float64."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import zarr
+from pxr import Usd, UsdGeom
+from scipy.spatial.transform import Rotation
+
+import synpick_warp
+from synpick_warp.codes import Stream
+from synpick_warp.configs.load import load_config
+from synpick_warp.factory.pipeline import run_bake
+from synpick_warp.scenes.cameras import make_cameras
+from synpick_warp.system.progress import SilentProgress
+from tests.builders import STIRRING, boxes, once, run
+from tests.harness.exporter_contract import digests
+from tests.twins import rng
+from tests.worlds.small_worlds import settings
+from tools.checks.dataset import check
+
+CELL = """preset = "smoke"
+[[camera]]
+name = "drawn"
+resolution = [96, 72]
+matrix = [[82.5, 0.0, 49.14], [0.0, 82.38, 35.25], [0.0, 0.0, 1.0]]
+pose = { position = [0.0, -0.4, 1.1], look_at = [0.0, 0.0, 0.1], up = [0.0, 1.0, 0.0] }
+[camera.jitter]
+position = { normal = [0.0, 0.01] }
+rotation = { uniform = [-1.0, 1.5] }
+focal_length = { choice = [-0.02, 0.03], weights = [1, 3] }
+center = { normal = [0.5, 1.0] }
+[[camera]]
+name = "still"
+resolution = [96, 72]
+fov = 40.0
+pose = { position = [0.0, 0.0, 1.2], look_at = [0.0, 0.0, 0.0], up = [0.0, 1.0, 0.0] }
+"""
+FORMATS = ("bop", "usd", "zarr")
+EPISODES = 2
+
+
+def cell_config(folder: Path, **given: object):
+    """Settings of the cell, of boxes that are stirred."""
+    folder.mkdir(exist_ok=True, parents=True)
+    (folder / "cell.toml").write_text(CELL)
+    rows = load_config(str(folder / "cell.toml")).camera
+    return replace(settings(**STIRRING | {"bake.formats": list(FORMATS), "bake.episodes": EPISODES, "bake.worlds": 2} | given), camera=rows)
+
+
+def bake(out: Path, **given: object) -> None:
+    with boxes():
+        run_bake(cell_config(out.parent, **given), out, SilentProgress())
+
+
+@pytest.fixture(scope="module")
+def cell(tmp_path_factory):
+    return once(tmp_path_factory, "drawn-cameras", bake)[0]
+
+
+def cut_normal(mean: float, sigma: float, first: float, second: float) -> float:
+    """Box-Muller transform (1958), cut at three standard deviations."""
+    value = math.sqrt(-2 * math.log(1 - first)) * math.cos(2 * math.pi * second)
+    return mean + sigma * min(3.0, max(-3.0, value))
+
+
+def drawn_camera(config, episode: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Matrix, rotation and translation of camera 0 in an episode, by formula."""
+    with np.errstate(over="ignore"):
+        key = rng.mix((rng.stream_key(config.bake.seed, episode, 0, Stream.CAMERA) ^ np.uint64(0)) + rng.GAMMA)
+    pairs = rng.uniform(key, np.arange(18)).astype(float).reshape(9, 2).tolist()
+    offset = np.array([cut_normal(0.0, 0.01, *pair) for pair in pairs[:3]])
+    turn = np.radians([-1.0 + 2.5 * first for first, _ in pairs[3:6]])
+    zoom = -0.02 if pairs[6][0] < 0.25 else 0.03
+    center = [cut_normal(0.5, 1.0, *pair) for pair in pairs[7:]]
+    camera = make_cameras(config.rig)[0]
+    matrix = camera.matrix.copy()
+    matrix[0, 0], matrix[1, 1] = 82.5 * (1 + zoom), 82.38 * (1 + zoom)
+    matrix[:2, 2] += center
+    angle = np.linalg.norm(turn)
+    x, y, z = turn / angle
+    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    # Rodrigues' formula.
+    turned = np.eye(3) + math.sin(angle) * cross + (1 - math.cos(angle)) * cross @ cross
+    rotation = turned.T @ camera.rotation
+    return matrix, rotation, -rotation @ (np.array([0.0, -0.4, 1.1]) + offset)
+
+
+def test_each_episode_draws_its_own_camera_and_all_formats_have_it(cell):
+    config, seen = cell_config(cell.parent / "again"), []
+    rows = [json.loads(line) for line in (cell / "episodes.jsonl").read_text().splitlines()]
+    store = zarr.open_group(cell / "trajectory.zarr", mode="r")
+    for episode in range(EPISODES):
+        matrix, rotation, translation = drawn_camera(config, episode)
+        scene = json.loads((cell / f"train/{2 * episode:06d}/scene_camera.json").read_text())
+        for entry in scene.values():
+            np.testing.assert_allclose(np.reshape(entry["cam_K"], (3, 3)), matrix, rtol=0, atol=1e-12)
+            np.testing.assert_allclose(np.reshape(entry["cam_R_w2c"], (3, 3)), rotation, rtol=0, atol=1e-14)
+            np.testing.assert_allclose(entry["cam_t_w2c"], 1e3 * translation, rtol=0, atol=1e-10)
+        row = rows[episode]["cameras"]
+        assert list(row) == ["drawn"]
+        assert store[f"episodes/{episode:06d}"].attrs["cameras"] == row
+        assert np.ravel(row["drawn"]["matrix"]).tolist() == entry["cam_K"]
+        assert (1e3 * np.array(row["drawn"]["translation"])).tolist() == entry["cam_t_w2c"]
+        stage = Usd.Stage.Open(str(cell / f"usd/{episode:06d}.usdc"))
+        lens = UsdGeom.Camera(stage.GetPrimAtPath("/Episode/Cameras/drawn"))
+        pose = np.array(UsdGeom.XformCache().GetLocalToWorldTransform(lens.GetPrim())).T
+        np.testing.assert_allclose(pose[:3, 3], -rotation.T @ translation, atol=1e-12)
+        np.testing.assert_allclose(pose[:3, :3], rotation.T * [1, -1, -1], atol=1e-12)
+        focal = lens.GetFocalLengthAttr().Get() / lens.GetHorizontalApertureAttr().Get() * 96
+        assert focal == pytest.approx(matrix[0, 0], rel=1e-6)
+        seen.append(translation)
+    assert np.abs(seen[0] - seen[1]).max() > 1e-3
+    assert np.linalg.norm(Rotation.from_matrix(rotation @ make_cameras(config.rig)[0].rotation.T).as_rotvec()) > 1e-3
+
+
+def test_pictures_are_those_of_the_drawn_camera(cell):
+    """Masks, depth and boxes by rays in float64, from the models and the exported cameras."""
+    found = vars(check(cell, 8))
+    assert not [line for line in found.values() if not line.holds]
+    assert found["mask"].total > 1000
+
+
+def test_it_is_whole_and_valid(cell):
+    for command in ("verify", "validate"):
+        ran = run(command, cell)
+        assert ran.code == 0, ran
+    assert "0 errors" in ran.out
+    view = synpick_warp.open(cell)[1].view(3, 0)
+    np.testing.assert_allclose(view.intrinsics, drawn_camera(cell_config(cell.parent / "again"), 1)[0], rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("worlds", [1, 8])
+def test_the_number_of_worlds_changes_no_byte(cell, tmp_path, worlds):
+    bake(tmp_path / "set", **{"bake.worlds": worlds, "bake.formats": ["bop", "usd", "zarr"]})
+    ours, theirs = digests(cell), digests(tmp_path / "set")
+    assert {name for name, _ in ours.items() ^ theirs.items()} <= {"config.toml"}
