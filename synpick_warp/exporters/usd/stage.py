@@ -48,7 +48,10 @@ def make_episode_layer(ticks: np.ndarray, metadata: EpisodeMetadata, settings: E
     stage = Usd.Stage.Open(layer)
     _add_root(stage, metadata, settings)
     assets = {f"{ROOT}/Table": "table"}
-    UsdGeom.Xform.Define(stage, f"{ROOT}/Table")
+    if "background" in metadata.looks:
+        assets[f"{ROOT}/Floor"] = "floor"
+    for path in assets:
+        UsdGeom.Xform.Define(stage, path)
     own = settings.bins[int(ticks["bin"][0])]
     for index, (asset, path) in enumerate(FIXTURES.items()):
         if index == 0 and own != asset:
