@@ -26,8 +26,8 @@ ASPECT = 2.0
 """Largest ratio of fx and fy: sensors that bin pixels in one direction reach it."""
 FOCAL_LENGTHS = (1 / (2 * math.tan(math.radians(85.0))), 1 / (2 * math.tan(math.radians(0.5))))
 """Least and largest focal length in widths of the image: those of fov."""
-_NAME = re.compile(r"[a-z][a-z0-9_]{0,31}")
-_RESERVED = ("world", "gripper", "info", "coco", "visib")
+NAME = re.compile(r"[a-z][a-z0-9_]{0,31}")
+RESERVED = ("world", "gripper", "info", "coco", "visib")
 """Words that mean something else where the names of cameras are: what a pose refers to, and in names of BOP's files."""
 SENSOR_LAYERS = {"depth_sensor", "ir_left", "ir_right", "depth_stereo"}
 """Layers that are rectified images of a depth sensor."""
@@ -68,9 +68,9 @@ def _rows(rows: tuple[CameraRow, ...]) -> Iterator[Conflict]:
     counts = Counter(names)
     for index, (row, name) in enumerate(zip(rows, names, strict=True)):
         key = f"camera[{index}]"
-        if not _NAME.fullmatch(name) or name in _RESERVED:
+        if not NAME.fullmatch(name) or name in RESERVED:
             rule = "a lower-case letter, then up to 31 of these, digits and underscores"
-            yield f"{key}.name", f"{rule}; not {', '.join(_RESERVED)}"
+            yield f"{key}.name", f"{rule}; not {', '.join(RESERVED)}"
         if counts[name] > 1:
             yield f"{key}.name", f"names that differ; {name} comes {counts[name]} times"
         if (row.fov is None) == (row.matrix is None):

@@ -67,7 +67,7 @@ def describe_allowed(item: dataclasses.Field[Any], annotation: Any) -> str:
     """Describe the range or the choices of a setting, or its type if it has neither."""
     rules = item.metadata
     if rules["choices"]:
-        return ("any of " if typing.get_origin(annotation) is tuple else "") + ", ".join(rules["choices"])
+        return ("any of " if typing.get_origin(annotation) is tuple else "") + ", ".join(choice or '""' for choice in rules["choices"])
     words = [f"{word} {_number(rules[name])}" for name, word in _BOUNDS if rules[name] is not None]
     if _is_distribution(annotation):
         off = f'"{OFF}", ' if item.default.kind == OFF else ""

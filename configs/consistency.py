@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import os
 import re
 from collections import Counter
 from collections.abc import Iterator, Sequence
@@ -11,9 +12,11 @@ from synpick_warp.configs.bins import OWN, PALLET, TOTE, BinRow, Bins, Tote
 from synpick_warp.configs.camera_rules import Conflict, find_camera_conflicts
 from synpick_warp.configs.cell import BinSizes
 from synpick_warp.configs.modes import bake_modes
+from synpick_warp.configs.randomize import Randomize
 from synpick_warp.configs.schema import (
     FORMATS,
     MIXED,
+    Arrangement,
     Bake,
     Bop,
     Config,
@@ -56,6 +59,18 @@ def find_conflicts(config: Config) -> Iterator[Conflict]:
     yield from _split_folders(config.splits, bop)
     yield from _scene_ids(DataLayout.of(config))
     yield from _object_rows(config.object_rows)
+    yield from _distractors(config.randomize, config.arrangement, config.bake)
+    if config.randomize.background_textures and config.render.table and not any(config.render.table_size):
+        yield "render.table_size", "above 0 with randomize.background_textures, which are seen beyond the edge of the table [m]"
+
+
+def _distractors(randomize: Randomize, arrangement: Arrangement, bake: Bake) -> Iterator[Conflict]:
+    """Yield conflicts of distractors: no room for other objects, or the same models as these."""
+    most = randomize.most_distractors
+    if most >= arrangement.max_objects:
+        yield "randomize.distractors", f"less than arrangement.max_objects, {arrangement.max_objects}, which counts them, too"
+    if most and bake.models and os.path.realpath(randomize.distractor_models) == os.path.realpath(bake.models):
+        yield "randomize.distractor_models", "another folder than bake.models: its objects would be without labels"
 
 
 def _mix(bake: Bake, splits: Sequence[Split]) -> Iterator[Conflict]:

@@ -16,6 +16,8 @@ OFF, FIXED, UNIFORM, LOG_UNIFORM, NORMAL, CHOICE = KINDS = names(LookKind)
 _WEIGHTS = "weights"
 _LIMITS = (LOG_UNIFORM, UNIFORM)
 _PAIRS = (*_LIMITS, NORMAL)
+MOST_DISTRACTORS = 16
+"""Maximum number of distractors: half of the instances that a world may have."""
 MOST_CHOICES = 256
 """Maximum number of values of a choice."""
 
@@ -125,7 +127,7 @@ _STRENGTH, _TEMPERATURE = Distribution(LOG_UNIFORM, ((0.1,), (1.0,))), Distribut
 
 @dataclass(frozen=True)
 class Randomize:
-    """Domain randomization: each episode draws these anew, all off by default. Geometry, physics and labels do not depend on them.
+    """Domain randomization: each episode draws these anew, all off by default. Geometry and labels depend on none but the distractors.
     Lamps are drawn for each variant of an environment map, of which each episode draws one.
 
     A distribution is a value, or `{ uniform = [low, high] }`, `{ log_uniform = [low, high] }`, `{ normal = [mean, sigma] }` (clamped to
@@ -145,7 +147,15 @@ class Randomize:
     table_color: ColorDistribution = setting(_NO_COLOR, "sRGB", "Base colour of the table; with a texture, its factor.", low=0.0, high=1.0)
     table_roughness: Distribution = setting(_NONE, "", "Roughness of the table.", low=0.0, high=1.0)
     table_textures: str = setting("", "", "Folder of images, one of which each episode draws as the table's texture; empty: none.")
-    texture_width: Distribution = setting(_HALF_METRE, "m", "Width of one repeat of the textures of bin and table.", low=0.01, high=100.0)
+    background_textures: str = setting(
+        "",
+        "",
+        "Folder of images, one of which each episode draws as the texture of a floor, which is seen beyond the edge of the table "
+        "(render.table_size); empty: the environment map is seen there.",
+    )
+    texture_width: Distribution = setting(
+        _HALF_METRE, "m", "Width of one repeat of the textures of bin, table and floor.", low=0.01, high=100.0
+    )
     lamps: Distribution = setting(
         _NONE,
         "",
@@ -160,3 +170,25 @@ class Randomize:
         _STRENGTH, "", "Light of each lamp on a surface that faces up, relative to that of the map.", low=0.01, high=100.0
     )
     lamp_temperature: Distribution = setting(_TEMPERATURE, "K", "Colour temperature of each lamp.", low=1700.0, high=25000.0)
+    distractors: Distribution = setting(
+        _NONE,
+        "",
+        "Number of distractors, rounded: objects in the pile that are rendered and occlude others, but have no labels and are no targets. "
+        "They count towards arrangement.max_objects.",
+        low=0,
+        high=MOST_DISTRACTORS,
+    )
+    distractor_models: str = setting(
+        "",
+        "",
+        "Folder of distractors, as bake.models; empty: the embedded objects that the catalog lacks, or, if it has all, geometric solids.",
+    )
+    exposure: Distribution = setting(_NONE, "EV", "Exposure offset, in place of what render.exposure_spread draws.", low=-5.0, high=5.0)
+
+    @property
+    def most_distractors(self) -> int:
+        """Largest number of distractors for which there is room: of a normal distribution, in all draws but 3 in 100,000."""
+        if self.distractors.kind == NORMAL:
+            (mean,), (sigma,) = self.distractors.values
+            return min(MOST_DISTRACTORS, math.ceil(mean + 4.0 * sigma))
+        return max((round(count) for (count,) in self.distractors.values), default=0)

@@ -278,6 +278,13 @@ class Render:
         choices=names(Tone),
     )
     table: bool = setting(True, "", "Render a table under the tote; without it the environment map is the background.")
+    table_size: tuple[float, float] = setting(
+        (0.0, 0.0),
+        "m",
+        "Length and width of the table that cameras see, about the world's origin; 0: endless. Light and objects meet an endless one.",
+        low=0.0,
+        high=20.0,
+    )
     table_color: tuple[float, float, float] = setting((0.45, 0.45, 0.44), "sRGB", "Base colour of the table.", low=0.0, high=1.0)
     layers: tuple[str, ...] = setting(
         (), "", "Additional ground-truth layers (AOVs) of each view: any of the allowed names.", choices=LAYERS

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import re
+from dataclasses import Field
 from typing import Any
 
 from synpick_warp.configs.check import describe_allowed
@@ -49,10 +51,16 @@ def _table(values: Any, kind: type[Any], comments: bool) -> list[str]:
         if name not in given:
             continue
         if comments:
-            unit = f"[{item.metadata['unit']}] " if item.metadata["unit"] else ""
-            lines.append(f"# {item.metadata['doc']} {unit}Allowed: {describe_allowed(item, annotation)}.")
+            lines.append(f"# {describe_setting(item, annotation)}")
         lines.append(f"{name} = {format_toml(given[name])}")
     return lines
+
+
+def describe_setting(item: Field[Any], annotation: Any) -> str:
+    """Meaning, unit and allowed values of a setting, in sentences."""
+    unit = f"[{item.metadata['unit']}] " if item.metadata["unit"] else ""
+    meaning = re.sub(r"\[([^]]*)\]\([^)]*\)", r"\1", item.metadata["doc"])  # Links lead from configs/README.md.
+    return f"{meaning} {unit}Allowed: {describe_allowed(item, annotation)}."
 
 
 def format_toml(value: Any) -> str:

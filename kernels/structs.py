@@ -44,7 +44,9 @@ class CatalogData:
     """
 
     count: int
-    """Objects in the catalog."""
+    """Objects in the catalog that have labels; they come first."""
+    distractors: int
+    """Objects behind them, without labels."""
     volume: wp.array[float]
     """Volume of the collision shape [m³]."""
     radius: wp.array[float]
@@ -71,6 +73,8 @@ class CatalogData:
 class DropData:
     """Volume budget, heights and clearances of the drop, and the distribution of the light; see `configs.schema`."""
 
+    objects: int
+    """Maximum number of an episode's objects with labels."""
     volume: float
     """Budget for the total volume of an episode's objects [m³]."""
     exceed: int

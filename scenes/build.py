@@ -15,6 +15,7 @@ from typing import NamedTuple
 import newton
 import numpy as np
 import warp as wp
+from scipy.stats import binom
 
 from synpick_warp.configs.modes import mode_weights
 from synpick_warp.configs.schema import EXCEED, Arrangement, Bake, Config, Gripper, Move, Physics, Pick
@@ -148,6 +149,20 @@ def count_slots(arrangement: Arrangement, rules: Iterable[bool], catalog: Catalo
     return max(single for single, _ in needed), max(limit for _, limit in needed)
 
 
+def without_distractors(arrangement: Arrangement, most: int) -> Arrangement:
+    """Settings of the draw of objects with labels, which leaves room for `most` distractors."""
+    return replace(arrangement, max_objects=arrangement.max_objects - most)
+
+
+def count_distractor_slots(most: int, catalog: Catalog, arrangement: Arrangement) -> tuple[int, int]:
+    """Body slots (single, compound) that suffice for `most` distractors, in all draws but a fraction `slot_shortfall` for each type."""
+    if not most or not catalog.distractors:
+        return 0, 0
+    share = np.mean([len(entry.pieces) > 1 for entry in catalog.distractors])
+    single, compound = (int(binom.isf(arrangement.slot_shortfall, most, part)) for part in (1.0 - share, share))
+    return single, compound
+
+
 def _count_by_type(drawn: np.ndarray, compound: np.ndarray) -> np.ndarray:
     """Numbers of drawn objects by slot type, single and compound (trial, 2), from catalog indices (trial, capacity), -1: none."""
     return np.stack([((drawn >= 0) & (compound[drawn] == is_compound)).sum(axis=1) for is_compound in (False, True)], axis=1)
@@ -203,7 +218,9 @@ def build_model(config: Config, catalog: Catalog, device: wp.Device) -> BuiltMod
         catalog: The objects.
         device: Device of the model's arrays.
     """
-    single, compound = count_slots(config.arrangement, find_repeat_rules(config.bake, config.pick, config.move), catalog)
+    most = config.randomize.most_distractors
+    slots = count_slots(without_distractors(config.arrangement, most), find_repeat_rules(config.bake, config.pick, config.move), catalog)
+    single, compound = (count + more for count, more in zip(slots, count_distractor_slots(most, catalog, config.arrangement), strict=True))
     world = newton.ModelBuilder(gravity=(0.0, 0.0, -config.physics.gravity))
     newton.solvers.SolverSteel.register_custom_attributes(world)
     shape = newton.ModelBuilder.ShapeConfig(density=0.0, mu=config.physics.friction, gap=config.physics.gap, restitution=0.0)
@@ -245,7 +262,7 @@ def with_capacities(physics: Physics, count: int, catalog: Catalog) -> Physics:
     the margin keep the capacities of the settings.
     """
     margin, needed = 2.0 * physics.gap, 0.0
-    for entry in catalog.entries:
+    for entry in catalog.bodies:
         sides = np.sort(oriented_sides(entry.pieces))
         if sides[0] >= margin:
             continue
@@ -330,14 +347,14 @@ def _add_slots(
     Returns:
         Variant of each catalog entry (entry) int32, and the empty variants of single and compound slots.
     """
-    variant, empty = np.zeros(len(catalog), np.int32), []
+    variant, empty = np.zeros(len(catalog.bodies), np.int32), []
     damping = {
         "steel:rigid_body_angular_damping": physics.angular_damping,
         "steel:rigid_body_max_linear_velocity": physics.max_speed,
     }
     for compound, count in enumerate(slots):
-        entries = [index for index, entry in enumerate(catalog.entries) if (len(entry.pieces) > 1) == bool(compound)]
-        variants = [_variant(physics, catalog.entries[index], shape) for index in entries] + [_variant(physics, None, shape)]
+        entries = [index for index, entry in enumerate(catalog.bodies) if (len(entry.pieces) > 1) == bool(compound)]
+        variants = [_variant(physics, catalog.bodies[index], shape) for index in entries] + [_variant(physics, None, shape)]
         for position, index in enumerate(entries):
             variant[index] = position
         empty.append(len(entries))

@@ -23,8 +23,9 @@ from synpick_warp.scenes.collision.decomposition import ShapeRecipe
 from synpick_warp.scenes.collision.hulls import hull_size, mass_properties
 from synpick_warp.scenes.collision.shapes import collision_shapes, default_cache_dir
 from synpick_warp.scenes.embedded.objects import procedural_objects
+from synpick_warp.scenes.embedded.solids import solids
 from synpick_warp.scenes.symmetries.objects import add_symmetries
-from synpick_warp.scenes.types import Catalog, CatalogEntry, ConvexPiece, HullSize, Material, RawObject, TriangleMesh
+from synpick_warp.scenes.types import FIRST_DISTRACTOR, Catalog, CatalogEntry, ConvexPiece, HullSize, Material, RawObject, TriangleMesh
 from synpick_warp.system.processes.isolation import Failure, Limits, run_isolated
 
 # Minimum diameter [m]: smaller bodies vanish in the contact margin, and come from files in another unit than expected.
@@ -54,7 +55,7 @@ def load_catalog(config: Config, cache_dir: Path | None = None, report: Callable
     are left out, with a line each; with `objects.strict`, the first of them is an error. Files are read in isolated processes.
 
     Args:
-        config: Settings: bake.models, objects, object_rows, bins, arrangement.volume.
+        config: Settings: bake.models, objects, object_rows, bins, arrangement.volume, distractors of randomize.
         cache_dir: Folder in which collision shapes are cached; None: `default_cache_dir()`.
         report: Called with each line of progress.
 
@@ -62,23 +63,36 @@ def load_catalog(config: Config, cache_dir: Path | None = None, report: Callable
         CatalogError: The folder cannot be used, or none of its objects: a file is damaged, an object does not fit into the tote or has an
             invalid mass.
     """
-    faults = _Faults(config.objects.strict, config.bake.models, report)
-    raws = _read_objects(config.bake.models, _Rules(config.objects, config.object_rows, config.cell.bins), report, faults)
-    recipes = [shape_recipe(raw, config.objects) for raw in raws]
+    rules = _Rules(config.objects, config.object_rows, config.cell.bins)
+    entries = _load_entries(config.bake.models, rules, cache_dir, report)
+    _report_undrawable(entries, config.arrangement.volume, report)
+    if not config.randomize.most_distractors:
+        return Catalog(tuple(entries))
+    others = _load_entries(config.randomize.distractor_models, rules, cache_dir, report, tuple(entry.name for entry in entries))
+    return Catalog(tuple(entries), tuple(replace(entry, obj_id=FIRST_DISTRACTOR - index) for index, entry in enumerate(others)))
+
+
+def _load_entries(
+    folder: str, rules: _Rules, cache_dir: Path | None, report: Callable[[str], None], catalog: Sequence[str] = ()
+) -> list[CatalogEntry]:
+    """Load the objects of `_read_objects`, ordered by obj_id."""
+    objects = rules.objects
+    faults = _Faults(objects.strict, folder, report)
+    raws = _read_objects(folder, rules, report, faults, catalog)
+    recipes = [shape_recipe(raw, objects) for raw in raws]
     names, meshes = [raw.name for raw in raws], [raw.mesh for raw in raws]
-    seconds = config.objects.decomposition_time
+    seconds = objects.decomposition_time
     shapes = collision_shapes(names, meshes, recipes, cache_dir or default_cache_dir(), report, seconds)
     entries = []
     for raw, shape in zip(raws, shapes, strict=True):
         if isinstance(shape, CatalogError):
             faults.add(shape)
         else:
-            entries.append(_entry(raw, shape, _checked_mass(raw, config.objects.density)))
+            entries.append(_entry(raw, shape, _checked_mass(raw, objects.density)))
     if not entries:
         raise faults.summary()
     faults.tell()
-    _report_undrawable(entries, config.arrangement.volume, report)
-    return Catalog(tuple(sorted(entries, key=lambda entry: entry.obj_id)))
+    return sorted(entries, key=lambda entry: entry.obj_id)
 
 
 def read_objects(config: Config, report: Callable[[str], None] = _ignore) -> list[RawObject]:
@@ -89,9 +103,13 @@ def read_objects(config: Config, report: Callable[[str], None] = _ignore) -> lis
     return raws
 
 
-def _read_objects(folder: str, rules: _Rules, report: Callable[[str], None], faults: _Faults) -> list[RawObject]:
-    """The objects of a folder; empty: the embedded objects."""
-    return _read_folder(Path(folder).expanduser(), rules, report, faults) if folder else _embedded_objects(rules, faults)
+def _read_objects(
+    folder: str, rules: _Rules, report: Callable[[str], None], faults: _Faults, catalog: Sequence[str] = ()
+) -> list[RawObject]:
+    """The objects of a folder; empty: the embedded objects that have no name of `catalog`."""
+    if folder:
+        return _read_folder(Path(folder).expanduser(), rules, report, faults)
+    return _embedded_objects(rules, faults, catalog)
 
 
 class _SizeError(CatalogError):
@@ -178,10 +196,10 @@ def _read_folder(folder: Path, rules: _Rules, report: Callable[[str], None], fau
     return raws
 
 
-def _embedded_objects(rules: _Rules, faults: _Faults) -> list[RawObject]:
-    """Embedded objects that fit into the bins, ordered by obj_id."""
+def _embedded_objects(rules: _Rules, faults: _Faults, catalog: Sequence[str]) -> list[RawObject]:
+    """Embedded objects that have no name of `catalog`, or if there are none geometric solids, that fit into the bins."""
     raws = []
-    for raw in procedural_objects():
+    for raw in [raw for raw in procedural_objects() if raw.name not in catalog] or solids():
         try:
             _check_size(raw, raw.name, rules.bins)
         except CatalogError as error:

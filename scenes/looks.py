@@ -1,4 +1,4 @@
-"""Randomized appearance of a cell: folders of textures for bin and table, and texture coordinates of the bin by box projection."""
+"""Randomized appearance of a cell: folders of textures, and texture coordinates of the bin by box projection."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from synpick_warp.codes import LookPart
 from synpick_warp.configs.randomize import Randomize
 from synpick_warp.errors import CatalogError, SynpickError
 from synpick_warp.scenes.assets.appearance import MAX_TEXTURE_FILE, decode_texture
@@ -31,24 +32,31 @@ Textures = tuple[np.ndarray, ...]
 
 @dataclass(frozen=True, eq=False)
 class Looks:
-    """What episodes draw their looks from: the distributions, and the textures of bin and table; none: no textures."""
+    """What episodes draw their looks from: the distributions, and the textures of bin, table and background; none: no textures."""
 
     randomize: Randomize
     bin_textures: Textures
     table_textures: Textures
+    background_textures: Textures = ()
+
+    @property
+    def textures(self) -> dict[LookPart, Textures]:
+        """Textures by the part that draws one of them, in the order of their materials."""
+        parts = (LookPart.BIN, self.bin_textures), (LookPart.TABLE, self.table_textures), (LookPart.BACKGROUND, self.background_textures)
+        return dict(parts)
 
     @property
     def all_textures(self) -> Textures:
-        """Textures in the order of their materials: those of the bin, then of the table."""
-        return self.bin_textures + self.table_textures
+        """Textures of all parts in the order of their materials."""
+        return self.bin_textures + self.table_textures + self.background_textures
 
 
 def load_looks(randomize: Randomize, report: Callable[[str], None], strict: bool = False) -> Looks | None:
     """Load the textures that settings name; None: nothing is randomized. Arguments and errors as of `load_textures`."""
     if randomize == Randomize():
         return None
-    folders = (("randomize.bin_textures", randomize.bin_textures), ("randomize.table_textures", randomize.table_textures))
-    return Looks(randomize, *(load_textures(key, folder, report, strict) for key, folder in folders))
+    names = ("bin_textures", "table_textures", "background_textures")
+    return Looks(randomize, *(load_textures(f"randomize.{name}", getattr(randomize, name), report, strict) for name in names))
 
 
 def load_textures(key: str, folder: str, report: Callable[[str], None], strict: bool = False) -> Textures:

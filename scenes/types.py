@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -119,11 +119,27 @@ class CatalogEntry:
     """The PLY file of a BOP model folder; None: embedded, or from another format."""
 
 
+FIRST_DISTRACTOR = -2
+"""obj_id of the first distractor; others count down. Where there is no object at all it is -1."""
+
+
 @dataclass(frozen=True, eq=False)
 class Catalog:
-    """Objects of a data set, ordered by obj_id. A catalog index is an index into `entries`."""
+    """Objects of a data set, ordered by obj_id, and objects without labels. A catalog index is an index into `bodies`."""
 
     entries: tuple[CatalogEntry, ...]
+    distractors: tuple[CatalogEntry, ...] = field(default=(), hash=False)
+    """Objects without labels; their obj_ids are -2, -3 and so on."""
+
+    @property
+    def bodies(self) -> tuple[CatalogEntry, ...]:
+        """All objects: those with labels, then the distractors."""
+        return self.entries + self.distractors
+
+    @property
+    def object_ids(self) -> np.ndarray:
+        """obj_id of all bodies (body) int32."""
+        return np.array([body.obj_id for body in self.bodies], np.int32)
 
     def __len__(self) -> int:
         return len(self.entries)

@@ -164,12 +164,13 @@ class Stream(enum.IntEnum):
     DEPTH_NOISE = 11
     BIN = 12
     LOOKS = 13
+    DISTRACTORS = 14
     COMPARTMENT = 15
     INFRARED_NOISE = 16
 
 
 class Look(enum.IntEnum):
-    """Appearance parameter that is drawn, of a body, the table or a lamp; see `configs.randomize`."""
+    """Parameter that is drawn, of a body, the table, a lamp or the episode; see `configs.randomize`."""
 
     HUE = 0
     """Rotation of the hue [°]."""
@@ -184,7 +185,7 @@ class Look(enum.IntEnum):
     TEXTURE_WIDTH = 6
     """Width of one repeat of the texture [m]."""
     COUNT = 7
-    """Number of lamps."""
+    """Number of lamps, or of the episode's distractors."""
     ELEVATION = 8
     """Height of a lamp above the horizon [°]."""
     RADIUS = 9
@@ -195,15 +196,21 @@ class Look(enum.IntEnum):
     """Colour temperature of a lamp [K]."""
     AZIMUTH = 12
     """Azimuth of a lamp in the map [°]."""
+    EXPOSURE = 13
+    """Exposure compensation [EV]."""
 
 
 class LookPart(enum.IntEnum):
-    """Part of a scene whose appearance is drawn."""
+    """Part of a scene that has such parameters."""
 
     OBJECT = 0
     BIN = 1
     TABLE = 2
     LAMP = 3
+    EPISODE = 4
+    """The episode as a whole."""
+    BACKGROUND = 5
+    """Floor that is seen beyond the edge of the table."""
 
 
 class LookKind(enum.IntEnum):

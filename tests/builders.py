@@ -18,6 +18,7 @@ from synpick_warp.cli.main import main
 from synpick_warp.factory import assembly
 from synpick_warp.factory.episodes import BakeSummary
 from synpick_warp.factory.pipeline import run_bake
+from synpick_warp.scenes.types import Catalog
 from synpick_warp.system.progress import SilentProgress
 from tests.worlds.sights import SHORT
 from tests.worlds.small_worlds import catalog, settings
@@ -64,16 +65,18 @@ FEW_STEPS = ("--device", "cpu", *assignments(ONE_OBJECT))
 
 
 @contextmanager
-def boxes() -> Iterator[pytest.MonkeyPatch]:
+def boxes(objects: Callable[[], Catalog] = catalog) -> Iterator[pytest.MonkeyPatch]:
     """Bakes, streams and tools take boxes in place of models; gives the patches, to add others."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(assembly, "load_catalog", lambda config, report: catalog())
+        patch.setattr(assembly, "load_catalog", lambda config, report: objects())
         yield patch
 
 
-def bake_boxes(out: Path, given: Mapping[str, object], progress: SilentProgress | None = None) -> BakeSummary:
+def bake_boxes(
+    out: Path, given: Mapping[str, object], progress: SilentProgress | None = None, objects: Callable[[], Catalog] = catalog
+) -> BakeSummary:
     """Bake boxes with these settings on top of QUICK."""
-    with boxes():
+    with boxes(objects):
         return run_bake(settings(**given), out, progress or SilentProgress())
 
 

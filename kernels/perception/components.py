@@ -9,6 +9,7 @@ on the order of threads.
 import warp as wp
 
 from synpick_warp.kernels.render.visibility.camera import Views
+from synpick_warp.kernels.structs import CatalogData
 
 wp.set_module_options({"enable_backward": False})
 
@@ -226,14 +227,21 @@ def find_largest_kernel(
 
 @wp.kernel
 def unpack_largest_kernel(
+    # Scene:
+    catalog: CatalogData,
+    # State:
+    catalog_index: wp.array2d[int],  # (world, instance)
     # In:
     views: Views,
     largest_key: wp.array2d[wp.int64],  # (view, instance)
     # Out:
     largest_out: wp.array2d[int],  # (view, instance)
 ):
-    """Label of each instance's largest component; -1: not visible, or the view is unused. Launched over view, instance."""
+    """Label of each instance's largest component; -1: not visible, or a distractor, which perception does not know as an object, or the
+    view is unused. Launched over view, instance.
+    """
     view, instance = wp.tid()
     largest_out[view, instance] = NO_COMPONENT
-    if views.world[view] >= 0 and largest_key[view, instance] > wp.int64(0):
+    world = views.world[view]
+    if world >= 0 and largest_key[view, instance] > wp.int64(0) and catalog_index[world, instance] < catalog.count:
         largest_out[view, instance] = unpack_pixel(largest_key[view, instance])

@@ -139,6 +139,7 @@ def count_votes_kernel(
     At a point p with normal n, the pixel p - o n must belong to the largest component of i, and q = p + o n to another instance j with a
     smaller depth; o is the contour offset. The vote is deep if j at q lies below i's grasp point by more than `deep_distance`. A vote is
     rejected if a point of j's contour is farther from q than j's reach: the mask is then too large for j, which true masks hardly ever are.
+    Distractors have no component, and get no votes.
     Launched over view, instance, lane: the lanes of an instance stride over its contour.
     """
     view, instance, lane = wp.tid()
@@ -154,7 +155,7 @@ def count_votes_kernel(
         if inside[0] >= 0 and q[0] >= 0 and component[view, inside[1], inside[0]] == largest[view, instance]:
             j = visible_instance(gbuffer, view, q[1], q[0], instances)
             d = gbuffer.depth[view, q[1], q[0]]
-            if j >= 0 and j != instance and d < gbuffer.depth[view, inside[1], inside[0]]:
+            if j >= 0 and j != instance and largest[view, j] >= 0 and d < gbuffer.depth[view, inside[1], inside[0]]:
                 if is_in_reach(q, reach[view, j], extent[view, j], contour, view, j, contour_length[view, j]):
                     if d > depth[world, instance] + perception.deep_distance:
                         wp.atomic_add(count_out, view, instance, j, DEEP, 1)

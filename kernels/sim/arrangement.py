@@ -2,8 +2,9 @@
 
 import warp as wp
 
-from synpick_warp.codes import Ending, Mode, Phase, Stream
-from synpick_warp.kernels.rng import TAU, stream_key, uniform, uniform_index, uniform_rotation
+from synpick_warp.codes import Ending, Look, LookKind, LookPart, Mode, Phase, Stream
+from synpick_warp.kernels.distributions import LookTable, draw_look, look_key
+from synpick_warp.kernels.rng import TAU, pixel_key, stream_key, uniform, uniform_index, uniform_rotation
 from synpick_warp.kernels.sim.endings import delivers
 from synpick_warp.kernels.structs import BinData, CatalogData, DropData, LayoutData, ModeData
 
@@ -173,11 +174,69 @@ def sample_objects_kernel(
                 body_slot_out[world, count] = slot
                 total += catalog.volume[candidate]
                 count += 1
-            full = count == layout.instances or (repeats == 0 and count == catalog.count)
+            full = count == drop.objects or (repeats == 0 and count == catalog.count)
             if overflow or full or (drop.exceed == 1 and total >= drop.volume):
                 open = False
     if overflow:
         clear_catalog_indices(catalog_index_out, world, layout.instances)
+        ending_inout[world] = Ending.ARRANGEMENT_OVERFLOW
+        phase_inout[world] = Phase.OVER
+
+
+@wp.func
+def count_instances(catalog_index: wp.array2d[int], world: int, instances: int) -> int:
+    """Number of a world's objects before the first gap."""
+    count = int(0)
+    while count < instances and catalog_index[world, count] >= 0:
+        count += 1
+    return count
+
+
+@wp.kernel
+def sample_distractors_kernel(
+    # Scene:
+    seed: wp.uint64,
+    layout: LayoutData,
+    catalog: CatalogData,
+    looks: LookTable,
+    # State:
+    arrangement_id: wp.array[wp.vec2i],  # (world)
+    phase_inout: wp.array[int],  # (world)
+    ending_inout: wp.array[int],  # (world)
+    # Out:
+    catalog_index_inout: wp.array2d[int],  # (world, instance)
+    body_slot_inout: wp.array2d[int],  # (world, instance)
+):
+    """Sample distractors, objects without labels, into the instances behind the sampled objects, and the next free slots.
+
+    Their number n is drawn from the stream (seed, episode, arrangement, Stream.DISTRACTORS), then each uniformly, with repeats. Without a
+    free slot the episode ends (ARRANGEMENT_OVERFLOW). Launched over world.
+    """
+    world = wp.tid()
+    if phase_inout[world] != Phase.START:
+        return
+    key = stream_key(seed, arrangement_id[world][0], arrangement_id[world][1], Stream.DISTRACTORS)
+    wanted = int(wp.rint(draw_look(looks, key, LookPart.EPISODE, Look.COUNT)[0]))
+    first = count_instances(catalog_index_inout, world, layout.instances)
+    singles = int(0)
+    compounds = int(0)
+    for instance in range(first):
+        compounds += catalog.compound[catalog_index_inout[world, instance]]
+    singles = first - compounds
+    overflow = bool(False)
+    choices = pixel_key(key, 0)
+    for instance in range(first, wp.min(first + wanted, layout.instances)):
+        chosen = catalog.count + uniform_index(choices, instance - first, catalog.distractors)
+        slot = singles
+        if catalog.compound[chosen] == 1:
+            slot = layout.single_slots + compounds
+        compounds += catalog.compound[chosen]
+        singles += 1 - catalog.compound[chosen]
+        overflow = overflow or singles > layout.single_slots or compounds > layout.slots - layout.single_slots
+        catalog_index_inout[world, instance] = chosen
+        body_slot_inout[world, instance] = slot
+    if overflow:
+        clear_catalog_indices(catalog_index_inout, world, layout.instances)
         ending_inout[world] = Ending.ARRANGEMENT_OVERFLOW
         phase_inout[world] = Phase.OVER
 
@@ -187,6 +246,7 @@ def sample_lights_kernel(
     # Scene:
     seed: wp.uint64,
     drop: DropData,
+    looks: LookTable,
     # State:
     arrangement_id: wp.array[wp.vec2i],  # (world)
     phase: wp.array[int],  # (world)
@@ -198,7 +258,7 @@ def sample_lights_kernel(
     """Sample the environment map of starting episodes, its yaw [rad] and its exposure value [EV].
 
     With the samples u_i of the stream (seed, episode, arrangement, Stream.LIGHT): map by u_0, yaw = 2π u_1 or, without `random_yaw`, 0,
-    exposure = s (2 u_2 - 1) for a spread s. Launched over world.
+    exposure = s (2 u_2 - 1) for a spread s; but with a distribution of its own, exposure is a look of the episode. Launched over world.
     """
     world = wp.tid()
     if phase[world] != Phase.START:
@@ -207,6 +267,9 @@ def sample_lights_kernel(
     light_out[world] = uniform_index(key, 0, drop.lights)
     light_yaw_out[world] = TAU * uniform(key, 1) * float(drop.random_yaw)
     light_exposure_out[world] = drop.exposure_spread * (2.0 * uniform(key, 2) - 1.0)
+    if looks.distribution[LookPart.EPISODE, Look.EXPOSURE].kind != LookKind.OFF:
+        own = look_key(seed, arrangement_id[world][0], LookPart.EPISODE, 0)
+        light_exposure_out[world] = draw_look(looks, own, LookPart.EPISODE, Look.EXPOSURE)[0]
 
 
 @wp.kernel
@@ -352,7 +415,9 @@ def drop_objects_kernel(
 ):
     """Assign objects to their body slots and stack them above the bin in a column of bounding spheres, at rest; phase becomes SETTLE.
 
-    Height of sphere i above the floor: z_i = rim + r_i + Σ_{j<i} (2 r_j + clearance), in whichever compartment. Launched over world.
+    Height of sphere i above the floor: z_i = rim + r_i + Σ_{j<i} (2 r_j + clearance), in whichever compartment. With distractors, which are
+    the last instances, the column begins with a random instance and goes on from the last to the first, so that they lie anywhere in the
+    pile. Launched over world.
     """
     world = wp.tid()
     if phase_inout[world] != Phase.START:
@@ -361,7 +426,13 @@ def drop_objects_kernel(
     key = stream_key(seed, arrangement_id[world][0], arrangement_id[world][1], Stream.DROP)
     places = stream_key(seed, arrangement_id[world][0], arrangement_id[world][1], Stream.COMPARTMENT)
     height = bins.rim_height[bins.chosen[world]]
-    for instance in range(layout.instances):
+    count = count_instances(catalog_index, world, layout.instances)
+    first = int(0)
+    if catalog.distractors > 0 and count > 0:
+        order = stream_key(seed, arrangement_id[world][0], arrangement_id[world][1], Stream.DISTRACTORS)
+        first = uniform_index(pixel_key(order, 1), 0, count)
+    for place in range(count):
+        instance = (first + place) % count
         index = catalog_index[world, instance]
         if index >= 0:
             slot = body_slot[world, instance]

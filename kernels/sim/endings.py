@@ -3,7 +3,7 @@
 import warp as wp
 
 from synpick_warp.codes import Ending, Mode, Phase, Task
-from synpick_warp.kernels.structs import LayoutData, MoveData, PickData, SettleData
+from synpick_warp.kernels.structs import CatalogData, LayoutData, MoveData, PickData, SettleData
 
 wp.set_module_options({"enable_backward": False})
 
@@ -18,6 +18,7 @@ def delivers(ending: int) -> bool:
 def judge_tasks_kernel(
     # Scene:
     layout: LayoutData,
+    catalog: CatalogData,
     move: MoveData,
     pick: PickData,
     # State:
@@ -30,7 +31,7 @@ def judge_tasks_kernel(
     # Out:
     ending_out: wp.array[int],  # (world)
 ):
-    """Write the `Ending` of episodes that complete: all waypoints reached, no object left, or too many failed attempts.
+    """Write the `Ending` of episodes that complete: all waypoints reached, no object with label left, or too many failed attempts.
 
     Launched over world.
     """
@@ -45,7 +46,7 @@ def judge_tasks_kernel(
         return
     left = int(0)
     for instance in range(layout.instances):
-        if catalog_index[world, instance] >= 0:
+        if catalog_index[world, instance] >= 0 and catalog_index[world, instance] < catalog.count:
             left += 1
     if left == 0:
         ending_out[world] = Ending.EMPTIED

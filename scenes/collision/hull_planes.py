@@ -42,7 +42,7 @@ def hull_planes(piece: ConvexPiece) -> np.ndarray:
 
 def plane_table(catalog: Catalog) -> PlaneTable:
     """Collect the half-spaces of all entries' pieces."""
-    pieces = [[hull_planes(piece) for piece in entry.pieces] for entry in catalog.entries]
+    pieces = [[hull_planes(piece) for piece in entry.pieces] for entry in catalog.bodies]
     planes = [plane for entry in pieces for plane in entry]
     first_piece = np.cumsum([0] + [len(entry) for entry in pieces])
     first_plane = np.cumsum([0] + [len(plane) for plane in planes])

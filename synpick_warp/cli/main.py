@@ -16,6 +16,7 @@ from synpick_warp import __version__
 from synpick_warp.cli.commands.convert import convert
 from synpick_warp.cli.commands.estimate import estimate
 from synpick_warp.cli.commands.evaluate import evaluate
+from synpick_warp.cli.commands.new_cell import new_cell
 from synpick_warp.cli.commands.pictures import explain, preview
 from synpick_warp.cli.commands.report import write_page
 from synpick_warp.cli.commands.statistics import show_statistics
@@ -247,6 +248,7 @@ def show_config(*, config: ConfigOption = None, set_: SetOption = None) -> int:
     return 0
 
 
+app.command(new_cell)
 app.command(preview)
 app.command(explain)
 app.command(evaluate, name="eval")

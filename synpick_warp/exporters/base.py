@@ -14,6 +14,7 @@ from synpick_warp.configs.splits import DataLayout
 from synpick_warp.exporters.writing.folder import Buffer
 from synpick_warp.exporters.writing.pool import WriterPool
 from synpick_warp.exporters.writing.rle import Masks
+from synpick_warp.scenes.looks import Looks
 from synpick_warp.scenes.types import Camera, Catalog, EnvironmentMap
 from synpick_warp.system.codecs.depth_png import max_data_bytes
 from synpick_warp.system.processes.shared_memory import shared_bytes
@@ -39,6 +40,7 @@ class ExportContext:
         cameras: tuple[Camera, ...],
         lights: tuple[EnvironmentMap, ...],
         pool: WriterPool,
+        looks: Looks | None = None,
     ) -> None:
         """
         Args:
@@ -48,10 +50,11 @@ class ExportContext:
             cameras: The cameras.
             lights: The environment maps.
             pool: Writes all files of episodes. Exporters neither close nor abort it.
+            looks: What episodes draw their looks from; None: nothing.
         """
         self.out, self.settings, self.cameras, self.pool = out, settings, cameras, pool
         self.layout = settings.layout
-        self._catalog, self._lights = catalog, lights
+        self._catalog, self._lights, self._looks = catalog, lights, looks
 
     @property
     def catalog(self) -> Catalog:
@@ -62,6 +65,11 @@ class ExportContext:
     def lights(self) -> tuple[EnvironmentMap, ...]:
         """Environment maps of the data set."""
         return self._lights
+
+    @property
+    def looks(self) -> Looks | None:
+        """What episodes draw their looks from, with textures; None: nothing."""
+        return self._looks
 
     @property
     def names(self) -> dict[int, str]:

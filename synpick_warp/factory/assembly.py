@@ -7,10 +7,9 @@ from __future__ import annotations
 
 import contextlib
 import gc
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any
 
 import numpy as np
 import warp as wp
@@ -20,11 +19,12 @@ from synpick_warp.configs.splits import DataLayout
 from synpick_warp.exporters.registry import Needs
 from synpick_warp.factory.attempts import AttemptLog
 from synpick_warp.factory.compilation import is_cache_warm, make_compiler, sole_compiler, submit_launches, submit_slow
+from synpick_warp.factory.episodes import DrawLooks
 from synpick_warp.factory.memory_plan import check_memory, plan_memory
 from synpick_warp.factory.order import order_longest_first
 from synpick_warp.factory.sizes import count_writers, fit_to_device, without_pictures
 from synpick_warp.scenes.bins import make_bins
-from synpick_warp.scenes.build import REPEATS, find_repeat_rules, must_repeat, with_capacities
+from synpick_warp.scenes.build import REPEATS, find_repeat_rules, must_repeat, with_capacities, without_distractors
 from synpick_warp.scenes.cameras import make_cameras
 from synpick_warp.scenes.catalog import load_catalog
 from synpick_warp.scenes.fixtures import make_fixtures
@@ -56,7 +56,7 @@ class Stages:
     groups: tuple[CameraGroup, ...]
     """The cameras by image size, with their renderers."""
     object_ids: np.ndarray
-    """obj_id of each catalog entry (entry) int32."""
+    """obj_id of each body of the catalog (body) int32."""
     light_table: LightTable
 
     @property
@@ -70,13 +70,15 @@ class Stages:
         return self.groups[0].renderer.scene.looks
 
     @property
-    def looks(self) -> Callable[[int, int], Mapping[str, Any]] | None:
-        """Function of episode and number of objects that returns the record of the episode's looks; None: none is randomized."""
+    def looks(self) -> DrawLooks | None:
+        """Function of episode, number of objects and names of distractors by instance that returns the record of looks; None: none is
+        randomized."""
         return partial(draw_looks, self.randomized, self.config.bake.seed) if self.randomized else None
 
     def make_log(self) -> AttemptLog:
         """Create an empty attempt log."""
-        return AttemptLog(self.config.suction, self.config.perception.resolution, self.object_ids)
+        distractors = {body.obj_id: body.name for body in self.catalog.distractors}
+        return AttemptLog(self.config.suction, self.config.perception.resolution, self.object_ids, distractors)
 
 
 @dataclass(frozen=True, eq=False)
@@ -194,9 +196,8 @@ def build_stages(
     scene = build_render_scene(config.render, bins[0].sizes.base, catalog, fixtures, cameras, lights, device, looks)
     simulation = Simulation(config, catalog, len(lights), device, scene, episodes, records_physics)
     groups = tuple(_build_group(config, scene, cameras, index) for index in range(len(config.rig.groups)))
-    object_ids = np.array([entry.obj_id for entry in catalog.entries], dtype=np.int32)
     table = name_lights([light.name for light in lights], scene.lights)
-    return Stages(config, catalog, cameras, lights, simulation, groups, object_ids, table)
+    return Stages(config, catalog, cameras, lights, simulation, groups, catalog.object_ids, table)
 
 
 def _build_group(config: Config, scene: RenderScene, cameras: tuple[Camera, ...], index: int) -> CameraGroup:
@@ -213,7 +214,8 @@ def _fit_to_catalog(config: Config, catalog: Catalog, device: wp.Device, progres
     Raises:
         ConfigError: The capacities do not fit into the device's memory.
     """
-    filled = config.with_values(REPEATS) if must_repeat(config.arrangement, catalog) else config
+    labelled = without_distractors(config.arrangement, config.randomize.most_distractors)
+    filled = config.with_values(REPEATS) if must_repeat(labelled, catalog) else config
     if find_repeat_rules(filled.bake, filled.pick, filled.move) != find_repeat_rules(config.bake, config.pick, config.move):
         total = sum(entry.volume for entry in catalog.entries)
         budget = config.arrangement.volume

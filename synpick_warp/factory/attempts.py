@@ -6,7 +6,7 @@ Fields of the record dataclasses are the JSON keys.
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from typing import Any
 
@@ -115,7 +115,9 @@ class AttemptRecord:
 
 @dataclass(frozen=True)
 class EpisodeRecord:
-    """Attempts and object counts (first and last frame) of an episode; empty if it is not part of the data set."""
+    """Attempts and object counts (first and last frame) of an episode; empty if it is not part of the data set. Distractors count as no
+    objects.
+    """
 
     mode: str
     objects: int = 0
@@ -123,6 +125,8 @@ class EpisodeRecord:
     left: int = 0
     """Instances at the last frame."""
     attempts: tuple[AttemptRecord, ...] = ()
+    distractors: tuple[tuple[int, str], ...] = ()
+    """Instance and name of each distractor at the first frame."""
 
     @property
     def picked(self) -> int:
@@ -141,6 +145,9 @@ class _Running:
 
     episode: int
     objects: int
+    """Instances that are no distractors, at the first frame."""
+    distractors: dict[int, str]
+    """Name of each other instance."""
     attempts: list[AttemptRecord] = field(default_factory=list)
     planned: dict[str, Any] | None = None
     """Fields of the running attempt that are known from perception; None: no attempt runs."""
@@ -155,15 +162,19 @@ _OBSERVED = tuple(item.name for item in fields(InstanceObservation) if item.name
 class AttemptLog:
     """State machine that turns the reports of all ticks into episode records."""
 
-    def __init__(self, suction: Suction, resolution: tuple[int, int], object_ids: np.ndarray) -> None:
+    def __init__(
+        self, suction: Suction, resolution: tuple[int, int], object_ids: np.ndarray, distractors: Mapping[int, str] | None = None
+    ) -> None:
         """Start with no episode running.
 
         Args:
             suction: Settings of suction.
             resolution: Width and height of the perception image [px].
-            object_ids: obj_id of each catalog entry (entry) int32.
+            object_ids: obj_id of each body of the catalog (body) int32.
+            distractors: Name of each distractor, by its obj_id; None: there is none.
         """
-        self.object_ids = object_ids
+        self.object_ids = np.append(object_ids, -1)
+        self.distractors = distractors or {}
         self.resolution = resolution
         self.rays, self.tolerated_misses = suction.rays, suction.tolerated_misses
         self._running: dict[int, _Running] = {}
@@ -182,7 +193,10 @@ class AttemptLog:
         for world in self._eventful_worlds(report).tolist():
             running = self._running.get(world)
             if running is None:
-                running = self._running[world] = _Running(_status(report, "episode", world), int((report.catalog_index[world] >= 0).sum()))
+                names = ((index, self.distractors.get(obj_id)) for index, obj_id in enumerate(self._ids(report, world).tolist()))
+                distractors = {index: name for index, name in names if name is not None}
+                objects = len(self._labelled(report, world))
+                running = self._running[world] = _Running(_status(report, "episode", world), objects, distractors)
             self._update_attempt(running, report, world)
             if phase[world] == Phase.OVER:
                 ended[running.episode] = self._finish_episode(report, world)
@@ -213,7 +227,8 @@ class AttemptLog:
         running, mode = self._running.pop(world), Mode(_status(report, "mode", world)).name.lower()
         if not Ending(_status(report, "ending", world)).delivers:
             return EpisodeRecord(mode)
-        return EpisodeRecord(mode, running.objects, int((report.catalog_index[world] >= 0).sum()), tuple(running.attempts))
+        left = len(self._labelled(report, world))
+        return EpisodeRecord(mode, running.objects, left, tuple(running.attempts), tuple(running.distractors.items()))
 
     def _begin_attempt(self, episode: int, report: TickReport, world: int) -> dict[str, Any]:
         """Return the fields of an attempt that are known after perception."""
@@ -247,8 +262,8 @@ class AttemptLog:
                 rays=self.rays,
                 hits=hits,
                 good_seal=self.rays - hits <= self.tolerated_misses,
-                engaged=_instances(_status(report, "engaged", world)) if seen else (),
-                picked=_instances(_status(report, "attached", world)),
+                engaged=_instances(_status(report, "engaged", world), running.distractors) if seen else (),
+                picked=_instances(_status(report, "attached", world), running.distractors),
                 peak_force=tuple(running.forces),
             )
         )
@@ -256,7 +271,7 @@ class AttemptLog:
 
     def _observation(self, report: TickReport, world: int) -> ObservationRecord:
         """Record of what perception saw in a world: its present instances, and who lies above whom with votes."""
-        present = np.flatnonzero(report.catalog_index[world] >= 0)
+        present = self._labelled(report, world)
         votes = report.observation.votes[world][np.ix_(present, present)]
         lower, upper = np.nonzero(votes)
         pairs = zip(present[lower].tolist(), present[upper].tolist(), _round_vector(votes[lower, upper].tolist()), strict=True)
@@ -265,6 +280,14 @@ class AttemptLog:
         rows = zip(*(values.tolist() for values in columns.values()), strict=True)
         instances = tuple(_instance(dict(zip(columns, row, strict=True))) for row in rows)
         return ObservationRecord(self.resolution, instances, tuple(pairs))
+
+    def _ids(self, report: TickReport, world: int) -> np.ndarray:
+        """obj_id of each instance of a world; -1: none (instance) int32."""
+        return self.object_ids[report.catalog_index[world]]
+
+    def _labelled(self, report: TickReport, world: int) -> np.ndarray:
+        """Instances of a world that are objects with labels (object) int."""
+        return np.flatnonzero(self._ids(report, world) >= 0)
 
     def _object_id(self, report: TickReport, world: int, instance: int) -> int:
         """obj_id of an instance in a world."""
@@ -294,10 +317,9 @@ def _status(report: TickReport, name: str, world: int) -> int:
     return int(report.column(name)[world])
 
 
-def _instances(bits: int) -> tuple[int, ...]:
-    """Indices of the bits set in a mask of MASK_BITS bits, which may be signed."""
-    bits &= (1 << MASK_BITS) - 1
-    return tuple(instance for instance in range(bits.bit_length()) if bits >> instance & 1)
+def _instances(bits: int, but: Collection[int] = ()) -> tuple[int, ...]:
+    """Indices of the bits set in a mask of MASK_BITS bits, which may be signed, but for those in `but`."""
+    return tuple(instance for instance in range(MASK_BITS) if bits >> instance & 1 and instance not in but)
 
 
 def _round(value: float) -> float:

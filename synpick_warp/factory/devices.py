@@ -36,7 +36,7 @@ from synpick_warp.exporters.writing.pool import WriterPool
 from synpick_warp.factory.episodes import BakeSummary
 from synpick_warp.factory.order import deal_episodes, deal_writers, order_longest_first
 from synpick_warp.factory.sizes import count_writers
-from synpick_warp.scenes.build import REPEATS, must_repeat
+from synpick_warp.scenes.build import REPEATS, must_repeat, without_distractors
 from synpick_warp.scenes.cameras import make_cameras
 from synpick_warp.scenes.catalog import load_catalog
 from synpick_warp.scenes.looks import Looks, load_looks
@@ -234,7 +234,7 @@ def prepare_folder(output: OutputFolder, needs: Needs, catalog: Catalog, lights:
     """Prepare the output folder (`OutputFolder.prepare`) in a process that generates no episodes itself."""
     config = output.config
     with WriterPool(1, needs.slot_bytes, output.lock) as pool:
-        context = ExportContext(output.out, ExportSettings.of(config), catalog, make_cameras(config.rig), lights, pool)
+        context = ExportContext(output.out, ExportSettings.of(config), catalog, make_cameras(config.rig), lights, pool, looks)
         exporters = Exporters(needs.classes, context)
         with aborting(pool, exporters):
             output.prepare(exporters, digest_inputs(catalog, lights, looks), pool)
@@ -274,7 +274,8 @@ def bake_on_devices(
         lights = load_scene_lights(config.bake.lights, config.randomize, config.bake.seed, partial(report, "note"), config.objects.strict)
         looks = load_looks(config.randomize, partial(report, "note"), config.objects.strict)
         prepare_folder(output, needs, catalog, lights, looks)
-        filled = config.with_values(REPEATS) if must_repeat(config.arrangement, catalog) else config
+        labelled = without_distractors(config.arrangement, config.randomize.most_distractors)
+        filled = config.with_values(REPEATS) if must_repeat(labelled, catalog) else config
         dealt = deal_episodes(order_longest_first(filled, catalog, output.remaining, pick_device("cpu")), len(names))
         writers = deal_writers(count_writers(config.bake.writers, needs.slot_bytes), len(names))
         shares = [

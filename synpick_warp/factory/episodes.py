@@ -20,6 +20,10 @@ PLACES = 6
 """Decimal places of a time [s]; more would be noise."""
 
 
+DrawLooks = Callable[[int, int, Mapping[int, str]], Mapping[str, Any]]
+"""Type of `Stages.looks`."""
+
+
 class EpisodeRow(NamedTuple):
     """Line of episodes.jsonl and of the summary; the fields are the JSON keys. Counts are 0 if the episode is not part of the data set."""
 
@@ -127,7 +131,7 @@ def episode_row(
     layout: DataLayout,
     bins: Sequence[str],
     tick_time: float,
-    looks: Callable[[int, int], Mapping[str, Any]] | None,
+    looks: DrawLooks | None,
     report: TickReport,
     world: int,
     record: EpisodeRecord,
@@ -151,7 +155,7 @@ def episode_row(
         record.lost,
         record.left,
         "" if split is None else split.name,
-        None if looks is None else looks(episode, record.objects),
+        None if looks is None else looks(episode, record.objects, dict(record.distractors)),
         bin_record(bins[int(report.snapshot.bin[world])], report.snapshot.fixture_pose[world, 0]) if bins else None,
     )
 

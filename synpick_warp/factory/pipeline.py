@@ -115,7 +115,7 @@ def _fill(config: Config, output: OutputFolder, needs: Needs, names: Sequence[st
     with WriterPool(count_writers(config.bake.writers, needs.slot_bytes), needs.slot_bytes, output.lock) as pool:
         started = time.perf_counter()
         if factory is not None:
-            context = ExportContext(output.out, settings, factory.catalog, factory.cameras, factory.lights, pool)
+            context = ExportContext(output.out, settings, factory.catalog, factory.cameras, factory.lights, pool, factory.randomized)
             exporters = Exporters(needs.classes, context)
             with aborting(pool, exporters):
                 output.prepare(exporters, digest_inputs(factory.catalog, factory.lights, factory.randomized), pool)
@@ -150,7 +150,7 @@ def generate_share(share: Share, handles: Sequence[int], link: BakeLink) -> Bake
             link.writers = pool.pids()
             started = time.perf_counter()
             settings = ExportSettings.of(config)
-            context = ExportContext(share.out, settings, factory.catalog, factory.cameras, factory.lights, pool)
+            context = ExportContext(share.out, settings, factory.catalog, factory.cameras, factory.lights, pool, factory.randomized)
             exporters = Exporters(needs.classes, context)
             with aborting(pool, exporters):
                 _Run(factory, exporters, needs.views, partial(commit_episode, share.out, exporters, pool), summary, link, link).run()

@@ -14,8 +14,11 @@ from synpick_warp.configs import schema
 from synpick_warp.configs.cell import BinSizes
 from synpick_warp.configs.modes import mode_weights
 from synpick_warp.kernels import structs
+from synpick_warp.kernels.distributions import LookTable
 from synpick_warp.scenes import build
+from synpick_warp.scenes.looks import Looks
 from synpick_warp.scenes.types import Catalog, CatalogEntry
+from synpick_warp.stages.render.looks import build_look_table
 from synpick_warp.stages.sim.worlds import CORNERS
 
 # Height of what has no walls, so that whatever is beside it is outside [m].
@@ -38,6 +41,7 @@ class SceneData:
     perception: structs.PerceptionData
     suction: structs.SuctionData
     bins: structs.BinData
+    looks: LookTable
 
 
 def fill(kind: Any, *sections: Any, **derived: Any) -> Any:
@@ -71,10 +75,11 @@ def fill(kind: Any, *sections: Any, **derived: Any) -> Any:
 def make_scene_data(config: schema.Config, catalog: Catalog, built: build.BuiltModel, lights: int, device: wp.Device) -> SceneData:
     """Fill the structs that kernels take from settings, catalog and model; `lights` is the count of environment maps."""
     physics, gripper = config.physics, config.gripper
+    labelled = build.without_distractors(config.arrangement, config.randomize.most_distractors)
     return SceneData(
         _layout_data(built.layout),
         _catalog_data(catalog, built, device),
-        drop_data(config.arrangement, config.render, config.pick, config.move, physics.gravity, lights),
+        drop_data(labelled, config.render, config.pick, config.move, physics.gravity, lights),
         _settle_data(config.settle, physics.tick_time),
         mode_data(mode_rows(config.bake, config.splits), device),
         _move_data(config.move, gripper, physics),
@@ -88,6 +93,7 @@ def make_scene_data(config: schema.Config, catalog: Catalog, built: build.BuiltM
         fill(structs.PerceptionData, config.perception),
         _suction_data(config.suction, gripper, physics.step),
         bin_data(config.cell.bins, config.bins, config.move, built.layout.parts, device),
+        build_look_table(Looks(config.randomize, (), ()), 0, device),
     )
 
 
@@ -111,11 +117,12 @@ def _catalog_data(catalog: Catalog, built: build.BuiltModel, device: wp.Device) 
     def column(values: list[float], dtype: type) -> wp.array:
         return wp.array(np.array(values), dtype=dtype, device=device)
 
-    entries = catalog.entries
+    entries = catalog.bodies
     empty_single, empty_compound = built.empty_variant
     return fill(
         structs.CatalogData,
-        count=len(entries),
+        count=len(catalog.entries),
+        distractors=len(catalog.distractors),
         volume=column([entry.volume for entry in entries], float),
         radius=column([entry.radius for entry in entries], float),
         mass=column([entry.mass for entry in entries], float),
@@ -160,11 +167,12 @@ def drop_data(
     gravity: float,
     lights: int,
 ) -> structs.DropData:
-    """Fill `DropData` from the settings; `lights` is the number of environment maps."""
+    """Fill `DropData` from the settings, those of the draw of objects with labels; `lights` is the number of environment maps."""
     return fill(
         structs.DropData,
         arrangement,
         render,
+        objects=arrangement.max_objects,
         exceed=arrangement.fill == schema.EXCEED,
         move_repeats=move.repeats,
         pick_repeats=pick.repeats,

@@ -11,6 +11,7 @@ from typing import Any
 import warp as wp
 
 from synpick_warp.kernels.render.visibility.camera import TILE_PIXELS
+from synpick_warp.kernels.render.visibility.variants import kernel_for
 from synpick_warp.kernels.tuning import CPU_PIECE_PIXELS, CPU_PIECES, PIXEL_BLOCK
 from synpick_warp.system.hardware.cores import count_cores
 from synpick_warp.system.processes.threads import PIXELS
@@ -71,7 +72,7 @@ def launch(
     if given:
         raise TypeError(f"{kernel.key} has no parameter {', '.join(given)}")
     device = next(argument.device for argument in arguments if isinstance(argument, wp.array))
-    wp.launch(kernel, dim=dim, inputs=arguments, device=device, block_dim=block_dim)
+    wp.launch(kernel_for(kernel, *arguments), dim=dim, inputs=arguments, device=device, block_dim=block_dim)
 
 
 @functools.cache
@@ -88,6 +89,7 @@ def launch_pixels(kernel: wp.Kernel, pixels: int, inputs: list[Any], outputs: li
     interpreter lock; so pieces of whole tiles run in parallel in a thread pool, which does not change the result. Kernels launched so must
     not use Warp's tile functions, whose CPU storage is found by one static pointer per module; its debug mode follows that pointer always.
     """
+    kernel = kernel_for(kernel, *inputs)
     if device.is_cuda:
         wp.launch(kernel, dim=pixels, inputs=[*inputs, 0], outputs=outputs, device=device, block_dim=PIXEL_BLOCK)
         return
@@ -114,6 +116,7 @@ def launch_views(
     Threads of one view may write the same elements by atomic operations. The kernel's last input is the index of the first thread. On the
     CPU, where Warp's atomic operations are not atomic, the threads of a view run sequentially, and views in parallel.
     """
+    kernel = kernel_for(kernel, *inputs)
     if device.is_cuda:
         first = first_view * threads
         wp.launch(kernel, dim=views * threads, inputs=[*inputs, first], outputs=outputs, device=device, block_dim=PIXEL_BLOCK)

@@ -45,7 +45,7 @@ class FrameBatch:
     amodal: np.ndarray | Images
     """Amodal masks as a bit field: bit i is set where the pixel's ray hits instance i, hidden or not (B, H, W) uint32."""
     object_id: np.ndarray
-    """obj_id of each instance; -1: the instance is not in the scene (B, I) int32."""
+    """obj_id of each instance; -1: the instance is not in the scene; below: a distractor, without label (B, I) int32."""
     pose: np.ndarray
     """Object-to-world poses: x, y, z [m], quaternion x, y, z, w (B, I, 7) float32."""
     pixels: np.ndarray
@@ -141,7 +141,7 @@ class TickBatch:
     time: np.ndarray
     """Simulated time since the episode's first frame [s] (W) float64."""
     object_id: np.ndarray
-    """obj_id of each instance; -1: the instance is not in the scene (W, I) int32."""
+    """obj_id of each instance; -1: the instance is not in the scene; below: a distractor, without label (W, I) int32."""
     pose: np.ndarray
     """Object-to-world poses: x, y, z [m], quaternion x, y, z, w (W, I, 7) float32."""
     bin: np.ndarray

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import re
 from dataclasses import replace
@@ -207,4 +208,46 @@ def test_models_whose_appearance_cannot_be_used_are_one_line(tmp_path, write, sa
     write(models)
     heard = mistake(*BAKE, "--models", models, "--out", out)
     assert re.match(said.format(models=models), heard)
+    assert not out.parent.exists()
+
+
+@pytest.mark.parametrize(
+    ("given", "said"),
+    [
+        ({"randomize.bin_textures": "missing"}, "missing cannot be read"),
+        ({"randomize.table_textures": "empty"}, "empty has 0 images"),
+        (
+            {"randomize.background_textures": "damaged", "render.table_size": [1, 1]},
+            "randomize.background_textures: none of the 2 images of",
+        ),
+        ({"randomize.table_textures": "half", "objects.strict": True}, "half/b.jpg"),
+        ({"randomize.background_textures": "half"}, "render.table_size"),
+        ({"randomize.distractors": 1, "randomize.distractor_models": "missing"}, "missing"),
+        ({"randomize.distractors": 1, "randomize.distractor_models": "empty"}, "empty"),
+        ({"randomize.distractors": 1, "randomize.distractor_models": "wide"}, "too large for the tote"),
+        ({"randomize.distractors": 17}, "at most 16"),
+        ({"randomize.distractors": 9, "arrangement.max_objects": 9}, "less than arrangement.max_objects, 9"),
+        (
+            {"randomize.distractors": 1, "bake.models": "wide", "randomize.distractor_models": "empty/../wide"},
+            "another folder than bake.models",
+        ),
+        ({"randomize.object_metallic": {"uniform": [0, 1.5]}}, "at most 1"),
+        ({"randomize.exposure": {"normal": [9, 1]}}, "at most 5"),
+        ({"randomize.lamp_radius": {"log_uniform": [0, 5]}}, "log_uniform = [low, high] above 0"),
+    ],
+)
+def test_what_cannot_be_randomized_is_one_line_before_anything_is_baked(tmp_path, given, said):
+    for name in ("empty", "damaged", "half", "wide"):
+        (tmp_path / name).mkdir()
+    (tmp_path / "damaged" / "a.png").write_bytes(b"no picture")
+    (tmp_path / "damaged" / "b.webp").write_bytes(b"")
+    cv2.imwrite(str(tmp_path / "half" / "a.png"), np.zeros((4, 4, 3), np.uint8))
+    (tmp_path / "half" / "b.jpg").write_bytes((tmp_path / "half" / "a.png").read_bytes()[:40])
+    trimesh.creation.box((3, 3, 3)).export(tmp_path / "wide" / "box.stl")
+    # As TOML has it: a table's keys are joined by "=".
+    given = {key: str(tmp_path / value) if isinstance(value, str) else value for key, value in given.items()}
+    values = [key + "=" + json.dumps(value).replace('": ', '" = ') for key, value in given.items()]
+    out = tmp_path / "new" / "set"
+    line = mistake(*BAKE, "--out", out, *(part for value in values for part in ("--set", value)))
+    assert said in line
     assert not out.parent.exists()

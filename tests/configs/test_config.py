@@ -24,6 +24,7 @@ from tests.configs.test_presets import resolved
 COUPLED = {
     "bake.episodes",
     "perception.camera",
+    "randomize.background_textures",
     "pick.press_time",
     "bop.split",
     "bop.color_format",

@@ -78,8 +78,10 @@ class Probe:
         self.kernel = wp.Kernel(space["probe_kernel"], key=f"probe_{self.func.key}", source=source, module=module)
 
 
-def probe(func: wp.Function) -> Probe:
-    """Wrap a Warp function, to be called with NumPy arrays."""
+def probe(func: wp.Function, **kinds: Any) -> Probe:
+    """Wrap a Warp function, to be called with NumPy arrays; `kinds` are the types of its generic parameters."""
+    if kinds:
+        func = func.get_overload([kinds.get(name, kind) for name, kind in func.input_types.items()], {})
     frame = inspect.currentframe()
     assert frame is not None
     assert frame.f_back is not None

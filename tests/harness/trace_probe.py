@@ -4,14 +4,24 @@ import numpy as np
 import warp as wp
 
 from synpick_warp.kernels.render.visibility.bvh_rays import hit_table, trace_camera_ray
-from synpick_warp.kernels.render.visibility.camera import TILE_PIXELS, ImageGrid, Views, camera_ray, in_image, tile_of, tile_pixel
+from synpick_warp.kernels.render.visibility.camera import (
+    TILE_PIXELS,
+    AnyViews,
+    ImageGrid,
+    LensViews,
+    Views,
+    camera_ray,
+    in_image,
+    tile_of,
+    tile_pixel,
+)
 from synpick_warp.kernels.render.visibility.gbuffer import GBuffer, Meshes, Table, ViewBodies, store_hit
 from synpick_warp.stages.render.scene import RenderScene
 from tests.harness.probe import probe
 
 
 @wp.func
-def trace_pixel(meshes: Meshes, table: Table, grid: ImageGrid, bodies: ViewBodies, views: Views, gbuffer: GBuffer, index: int):
+def trace_pixel(meshes: Meshes, table: Table, grid: ImageGrid, bodies: ViewBodies, views: AnyViews, gbuffer: GBuffer, index: int):
     """Trace the ray through the centre of a pixel, by its index in tile order. Pixels of unused views (camera -1) stay."""
     view, row, column = tile_pixel(grid, index)
     camera = -1
@@ -23,10 +33,11 @@ def trace_pixel(meshes: Meshes, table: Table, grid: ImageGrid, bodies: ViewBodie
         store_hit(gbuffer, view, row, column, hit_table(table, views.cameras, view, ray, hit))
 
 
-_trace_pixels = probe(trace_pixel)
+_trace_pixels = {kind.cls: probe(trace_pixel, views=kind) for kind in (Views, LensViews)}
 
 
-def trace_gbuffer(scene: RenderScene, bodies: ViewBodies, views: Views, gbuffer: GBuffer, count: int) -> None:
+def trace_gbuffer(scene: RenderScene, bodies: ViewBodies, views: AnyViews, gbuffer: GBuffer, count: int) -> None:
     """Render the G-buffer of `count` views by one ray a pixel."""
     pixels = np.arange(count * scene.grid.tiles * int(TILE_PIXELS))
-    _trace_pixels(scene.meshes, scene.table, scene.grid, bodies, views, gbuffer, pixels, device=scene.device)
+    trace = next(trace for kind, trace in _trace_pixels.items() if isinstance(views, kind))
+    trace(scene.meshes, scene.table, scene.grid, bodies, views, gbuffer, pixels, device=scene.device)

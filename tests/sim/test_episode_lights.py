@@ -6,6 +6,9 @@ import numpy as np
 import pytest
 
 from synpick_warp.codes import Phase, Stream
+from synpick_warp.configs.randomize import Distribution, Randomize
+from synpick_warp.scenes.looks import Looks
+from synpick_warp.stages.render.looks import draw_looks
 from synpick_warp.stages.sim import arrange
 from tests.twins import rng
 from tests.worlds.kernel_worlds import KernelWorlds
@@ -49,6 +52,19 @@ def test_exposures_are_even_within_their_spread_and_the_episodes_own(device):
     arrange.sample_episodes(wide.scene, wide.state, SEED)
     np.testing.assert_allclose(wide.state.light_exposure.numpy(), 4.0 * drawn, rtol=1e-6)
     np.testing.assert_array_equal(wide.state.light_yaw.numpy(), worlds.state.light_yaw.numpy())
+
+
+def test_a_distribution_of_exposure_replaces_the_spread_and_is_that_of_the_record(device):
+    randomize = Randomize(exposure=Distribution.parse({"uniform": [1.0, 3.0]}))
+    plain, own = made(device), KernelWorlds(device, 24, randomize=randomize)
+    for worlds in (plain, own):
+        worlds.begin(Phase.START, arrangement=2)  # A look is the episode's, not that of one of its arrangements.
+        arrange.sample_episodes(worlds.scene, worlds.state, SEED)
+    recorded = [draw_looks(Looks(randomize, (), ()), SEED, episode, 0)["exposure"] for episode in range(24)]
+    np.testing.assert_allclose(own.state.light_exposure.numpy(), recorded, atol=1e-6)
+    assert 1.0 <= min(recorded) < 1.5
+    assert 2.5 < max(recorded) <= 3.0
+    assert np.abs(plain.state.light_exposure.numpy()).max() <= 0.5
 
 
 @pytest.mark.parametrize("setting", ["random_yaw", "exposure_spread"])

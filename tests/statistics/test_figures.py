@@ -28,6 +28,7 @@ from synpick_warp.apps.statistics.lights import LightCounts
 from synpick_warp.apps.statistics.partial import Partial
 from synpick_warp.apps.statistics.records import Light
 from synpick_warp.apps.statistics.scenes import SceneTruth
+from synpick_warp.apps.statistics.tables import make_tables
 from synpick_warp.apps.statistics.timeline import TIME_BIN, TimelineCounts
 from synpick_warp.dataset.reading import DataSet
 from synpick_warp.errors import DatasetError
@@ -38,6 +39,13 @@ ATTEMPTS = [
     {"outcome": "target_picked", "good_seal": False, "engaged": [0, 1], "peak_force": [0.0, 500.0]},
     {"outcome": "missed", "good_seal": False, "engaged": [], "peak_force": []},
 ]
+LOOKS = {
+    "exposure": -0.25,
+    "bin": {"color": [0.123, 0.5, 1.0], "texture": 3},
+    "table": {},
+    "objects": [{"hue": float(hue)} for hue in range(-90, 91, 10)],
+    "distractors": [{"instance": 19, "name": "cup", "hue": 12.345}],
+}
 HEIGHT, WIDTH = 4, 6
 
 
@@ -48,7 +56,7 @@ def folder(tmp_path_factory) -> Path:
     text = (out / "config.toml").read_text().replace("resolution = [320, 180]", f"resolution = [{WIDTH}, {HEIGHT}]", 1)
     (out / "config.toml").write_text(text)
     entry = out / "manifest" / "000001.json"
-    row = json.loads(entry.read_text())["row"] | {"objects": 4, "picked": 2, "lost": 1}
+    row = json.loads(entry.read_text())["row"] | {"objects": 4, "picked": 2, "lost": 1, "looks": LOOKS}
     entry.write_text(json.dumps({"row": row, "attempts": ATTEMPTS}))
     random = np.random.default_rng(3)
     for scene in range(CAMERAS, 2 * CAMERAS):
@@ -110,6 +118,22 @@ def test_lights_have_the_known_answers_and_what_is_missing_is_told(statistics, d
     move = assemble(data_set, collect(data_set, 0, 1))
     assert move.depth is None
     assert "no depth images: no depth range" in move.missing
+
+
+def test_looks_have_the_known_answers(statistics):
+    rows = {(row.part, row.parameter): (row.draws, *row.quantiles) for row in statistics.looks}
+    assert rows == {
+        ("bin", "color.blue"): (1, 1.0, 1.0, 1.0),
+        ("bin", "color.green"): (1, 0.5, 0.5, 0.5),
+        ("bin", "color.red"): (1, 0.12, 0.12, 0.12),
+        ("bin", "texture"): (1, 3.0, 3.0, 3.0),
+        ("distractor", "hue"): (1, 12.0, 12.0, 12.0),
+        ("episode", "distractors"): (1, 1.0, 1.0, 1.0),
+        ("episode", "exposure"): (1, -0.25, -0.25, -0.25),
+        ("object", "hue"): (19, -90.0, 0.0, 90.0),
+    }
+    (table,) = (table for table in make_tables(statistics) if table.name == "looks")
+    assert len(table.rows) == len(rows)
 
 
 def test_depth_is_that_of_all_pixels(statistics, folder):

@@ -47,6 +47,7 @@ class SegmenterHarness:
         self.segmenter = Segmenter(self.images)
         self.mass, self.area = np.full(instances, 0.1), np.full(instances, 0.01)
         catalog, rules = structs.CatalogData(), structs.PerceptionData()
+        catalog.count = instances
         catalog.mass = wp.zeros(instances, dtype=float, device=device)
         catalog.area = wp.zeros(instances, dtype=float, device=device)
         for name in ("center_fraction", "heavy_mass", "heavy_center_fraction"):

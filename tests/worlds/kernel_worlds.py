@@ -13,11 +13,14 @@ import warp as wp
 from synpick_warp.configs.bins import Bins, Tote
 from synpick_warp.configs.cell import BinSizes
 from synpick_warp.configs.manipulation import Move
+from synpick_warp.configs.randomize import Randomize
 from synpick_warp.kernels import structs
 from synpick_warp.scenes.build import Part
+from synpick_warp.scenes.looks import Looks
 from synpick_warp.stages.arrays import allocate
 from synpick_warp.stages.constants import SceneData, bin_data, fill, mode_data
 from synpick_warp.stages.perception.arrays import Observation, Plan
+from synpick_warp.stages.render.looks import build_look_table
 from synpick_warp.stages.sim.worlds import AttemptState, SealState, WorldState
 
 GRIPPER_BODIES, GRIPPER_DOFS = 2, 4
@@ -93,6 +96,9 @@ class KernelWorlds:
     pick: dict[str, Any] = field(default_factory=dict)
     bins: tuple[BinSizes, ...] = (BIN,)
     places: Bins = field(default_factory=Bins)
+    randomize: Randomize = field(default_factory=Randomize)
+    distractors: int = 0
+    """The last of the objects, without labels."""
     parts: Sequence[tuple[int, int, bool]] = tuple((shape, 0, True) for shape in GUIDES)
 
     def __post_init__(self) -> None:
@@ -106,7 +112,7 @@ class KernelWorlds:
         self.scene = SceneData(
             self._layout(),
             self._catalog(),
-            fill(structs.DropData, **(DROP | self.drop)),
+            fill(structs.DropData, **(DROP | {"objects": self.instances} | self.drop)),
             fill(structs.SettleData, **(SETTLE | self.settle)),
             mode_data([(0, 0.0, 0.0, 0)], self.device),
             fill(structs.MoveData, **(MOVE | self.move)),
@@ -114,6 +120,7 @@ class KernelWorlds:
             structs.PerceptionData(),
             structs.SuctionData(),
             self._bins(),
+            build_look_table(Looks(self.randomize, (), ()), 0, self.device),
         )
         sizes = {
             "one": 1,
@@ -162,7 +169,8 @@ class KernelWorlds:
         arrays = {name: wp.array(np.asarray(values), dtype=dtype, device=self.device) for name, (values, dtype) in columns.items()}
         return fill(
             structs.CatalogData,
-            count=len(compound),
+            count=len(compound) - self.distractors,
+            distractors=self.distractors,
             empty_single=int((compound == 0).sum()),
             empty_compound=int(compound.sum()),
             empty_mass=0.1,

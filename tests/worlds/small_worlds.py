@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 import trimesh
@@ -11,7 +12,7 @@ from synpick_warp.configs.load import load_config
 from synpick_warp.configs.schema import Config
 from synpick_warp.scenes.collision.hulls import mass_properties
 from synpick_warp.scenes.collision.simplification import simplify_hull
-from synpick_warp.scenes.types import Catalog, CatalogEntry, ConvexPiece, Material, TriangleMesh
+from synpick_warp.scenes.types import FIRST_DISTRACTOR, Catalog, CatalogEntry, ConvexPiece, Material, TriangleMesh
 from synpick_warp.stages.sim.simulate import Simulation, TickRecord
 from synpick_warp.stages.stream import TickReport, read_tick
 from tests.harness.devices import default_device
@@ -19,6 +20,7 @@ from tests.harness.devices import default_device
 BOX = ((0.08, 0.06, 0.04),)
 CUBE = ((0.05, 0.05, 0.05),)
 """Sizes [m] of an object's boxes; the second of an L stands beside the first."""
+PLATE = ((0.2, 0.2, 0.01),)
 ANGLE = ((0.09, 0.03, 0.03), (0.03, 0.06, 0.03))
 DENSITY = 500.0
 COARSE = {"physics__step": 4e-3, "physics__steps_per_tick": 16, "physics__substeps": 1, "physics__iterations": 6}
@@ -50,6 +52,13 @@ def settings(**overrides: object) -> Config:
 def catalog(*shapes: Sequence[tuple[float, float, float]]) -> Catalog:
     """Objects made of boxes: obj_ids from 1."""
     return Catalog(tuple(_entry(number, sizes) for number, sizes in enumerate(shapes or (BOX, CUBE, ANGLE), start=1)))
+
+
+def cluttered_catalog() -> Catalog:
+    """Two kinds of boxes, and without labels a plate and an L."""
+    names = ("box", "cube", "plate", "angle")
+    bodies = [replace(body, name=name) for body, name in zip(catalog(BOX, CUBE, PLATE, ANGLE).entries, names, strict=True)]
+    return Catalog(tuple(bodies[:2]), tuple(replace(body, obj_id=FIRST_DISTRACTOR - index) for index, body in enumerate(bodies[2:])))
 
 
 def pieces(sizes: Sequence[tuple[float, float, float]]) -> tuple[ConvexPiece, ...]:

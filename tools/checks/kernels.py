@@ -24,6 +24,8 @@ GROUPS = ("Scene", "State", "In", "Out")
 WRITTEN = ("_out", "_inout")
 KERNEL_PACKAGE = "synpick_warp.kernels"
 CODES = "synpick_warp.codes"
+TYPES = ("typing", "collections")
+"""Modules whose names annotations have."""
 LAUNCHING = ("synpick_warp/stages", "synpick_warp/newton_patches")
 HOST_FOLDERS = ("synpick_warp", "scenes", "configs", "tools")
 _GROUP = re.compile(rf"\s*#\s*({'|'.join(GROUPS)}):")
@@ -60,7 +62,7 @@ def check_module(path: Path, tree: ast.Module, writes: Writes) -> Iterator[Fault
     for line, name in imports(tree):
         if name == "__future__.annotations":
             yield path, line, "Warp reads annotations: no `from __future__ import annotations` here"
-        elif name.split(".")[0] != "warp" and not name.startswith((KERNEL_PACKAGE, CODES)):
+        elif name.split(".")[0] not in ("warp", *TYPES) and not name.startswith((KERNEL_PACKAGE, CODES)):
             yield path, line, f"kernels import Warp, codes and other kernels only, not {name}"
     lines = path.read_text().splitlines()
     for kernel in kernels:
@@ -181,8 +183,9 @@ def check_launches(root: Path, folder: str) -> Iterator[Fault]:
 
 
 def decorated(function: ast.FunctionDef, kind: str) -> bool:
-    """Whether the function has the decorator @wp.KIND, with or without arguments."""
-    return any(ast.unparse(decorator).split("(")[0] in (f"wp.{kind}", f"warp.{kind}") for decorator in function.decorator_list)
+    """Whether the function has the decorator @wp.KIND or @KIND_of_views, with or without arguments."""
+    names = (f"wp.{kind}", f"warp.{kind}", f"{kind}_of_views")
+    return any(ast.unparse(decorator).split("(")[0] in names for decorator in function.decorator_list)
 
 
 def disables_backward(node: ast.stmt) -> bool:

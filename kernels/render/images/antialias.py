@@ -11,8 +11,9 @@ from synpick_warp.codes import Segment
 from synpick_warp.kernels.render.lighting.plane_distance import Plane, plane_distance, tangent_plane
 from synpick_warp.kernels.render.lighting.sampling import UNIT, reverse_bits
 from synpick_warp.kernels.render.visibility.bvh_rays import hit_table, trace_bodies
-from synpick_warp.kernels.render.visibility.camera import ImageGrid, Views, camera_ray, clamp_index, in_image, tile_of, tile_pixel
+from synpick_warp.kernels.render.visibility.camera import AnyViews, ImageGrid, camera_ray, clamp_index, in_image, tile_of, tile_pixel
 from synpick_warp.kernels.render.visibility.gbuffer import GBuffer, Hit, Meshes, Table, ViewBodies, body_of, face_normal, triangle_normal
+from synpick_warp.kernels.render.visibility.variants import kernel_of_views
 from synpick_warp.kernels.tuning import RAY_REGISTERS
 
 wp.set_module_options({"enable_backward": False, "fast_math": True})
@@ -188,7 +189,7 @@ def has_discontinuity(
     )
 
 
-@wp.kernel
+@kernel_of_views
 def find_footprints_kernel(
     # Scene:
     grid: ImageGrid,
@@ -196,7 +197,7 @@ def find_footprints_kernel(
     # In:
     gbuffer: GBuffer,
     radiance: wp.array3d[wp.vec3],  # (view, row, column)
-    views: Views,
+    views: AnyViews,
     # Out:
     resolve_out: wp.array3d[wp.uint32],  # (view, row, column)
     footprint_out: wp.array3d[int],  # (view, chunk, chunk_footprint)
@@ -308,7 +309,7 @@ def select_source(
     return best
 
 
-@wp.kernel(cuda_max_registers=RAY_REGISTERS)
+@kernel_of_views(cuda_max_registers=RAY_REGISTERS)
 def resolve_footprints_kernel(
     # Scene:
     meshes: Meshes,
@@ -320,7 +321,7 @@ def resolve_footprints_kernel(
     gbuffer: GBuffer,
     footprint: wp.array3d[int],  # (view, chunk, chunk_footprint)
     count: wp.array2d[int],  # (view, chunk)
-    views: Views,
+    views: AnyViews,
     samples: int,
     threads: int,
     # Out:

@@ -3,8 +3,9 @@
 import warp as wp
 
 from synpick_warp.kernels.render.visibility.bvh_rays import hits_body
-from synpick_warp.kernels.render.visibility.camera import ImageGrid, Views, border_ray, in_image
+from synpick_warp.kernels.render.visibility.camera import AnyViews, ImageGrid, border_ray, in_image
 from synpick_warp.kernels.render.visibility.gbuffer import Meshes, ViewBodies
+from synpick_warp.kernels.render.visibility.variants import kernel_of_views
 
 wp.set_module_options({"enable_backward": False})
 
@@ -180,14 +181,14 @@ def find_box(first_chunk: wp.array[int], listed: int, chunk: int) -> int:
     return low
 
 
-@wp.kernel
+@kernel_of_views
 def count_border_pixels_kernel(
     # Scene:
     meshes: Meshes,
     grid: ImageGrid,
     # In:
     bodies: ViewBodies,
-    views: Views,
+    views: AnyViews,
     border_boxes: BorderBoxes,
     groups: int,
     threads: int,

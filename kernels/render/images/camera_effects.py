@@ -3,7 +3,8 @@
 import warp as wp
 
 from synpick_warp.codes import Effect, Stream
-from synpick_warp.kernels.render.visibility.camera import Views
+from synpick_warp.kernels.render.visibility.camera import AnyViews
+from synpick_warp.kernels.render.visibility.variants import kernel_of_views
 from synpick_warp.kernels.rng import normal_pair, pixel_key, uniform, view_key
 
 wp.set_module_options({"enable_backward": False})
@@ -27,14 +28,14 @@ class EffectRanges:
     """Largest value of each parameter."""
 
 
-@wp.kernel
+@kernel_of_views
 def sample_effects_kernel(
     # State:
     episode: wp.array[int],  # (world)
     frame: wp.array[int],  # (world)
     # In:
     ranges: EffectRanges,
-    views: Views,
+    views: AnyViews,
     # Out:
     effects_out: wp.array[EffectParameters],  # (view)
 ):

@@ -5,8 +5,9 @@ import warp as wp
 from synpick_warp.codes import Segment, Stream
 from synpick_warp.kernels.render.images.layers import hit_surface
 from synpick_warp.kernels.render.lighting.materials import Surfaces
-from synpick_warp.kernels.render.visibility.camera import ImageGrid, Views, camera_ray, in_image, tile_pixel
+from synpick_warp.kernels.render.visibility.camera import AnyViews, ImageGrid, camera_ray, in_image, tile_pixel
 from synpick_warp.kernels.render.visibility.gbuffer import MAX_COUNTS, GBuffer, Meshes, ViewBodies
+from synpick_warp.kernels.render.visibility.variants import kernel_of_views
 from synpick_warp.kernels.rng import normal_pair, pixel_key, view_key
 
 wp.set_module_options({"enable_backward": False})
@@ -151,7 +152,7 @@ def quantize_depth(sensor: SensorParameters, focal_baseline: float, depth: float
     return focal_baseline / (steps * sensor.disparity_step)
 
 
-@wp.kernel
+@kernel_of_views
 def render_depth_sensor_kernel(
     # Scene:
     meshes: Meshes,
@@ -164,7 +165,7 @@ def render_depth_sensor_kernel(
     sensor: SensorParameters,
     bodies: ViewBodies,
     gbuffer: GBuffer,
-    views: Views,
+    views: AnyViews,
     first: int,
     # Out:
     depth_sensor_out: wp.array3d[wp.uint16],  # (view, row, column) [counts]

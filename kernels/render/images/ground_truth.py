@@ -3,7 +3,8 @@
 import warp as wp
 
 from synpick_warp.kernels.render.images.layers import position_of, rotation_of
-from synpick_warp.kernels.render.visibility.camera import Views
+from synpick_warp.kernels.render.visibility.camera import AnyViews
+from synpick_warp.kernels.render.visibility.variants import kernel_of_views
 
 wp.set_module_options({"enable_backward": False})
 
@@ -26,13 +27,13 @@ def rigid_transform(r: wp.mat33d, t: wp.vec3d) -> wp.mat44:
     )  # fmt: skip
 
 
-@wp.kernel
+@kernel_of_views
 def gather_cameras_kernel(
     # State:
     episode: wp.array[int],  # (world)
     frame: wp.array[int],  # (world)
     # In:
-    views: Views,
+    views: AnyViews,
     # Out:
     episode_out: wp.array[int],  # (view)
     camera_out: wp.array[int],  # (view)
@@ -52,7 +53,7 @@ def gather_cameras_kernel(
     world_to_camera_out[view] = rigid_transform(rotation, -(rotation * views.cameras.center[view]))
 
 
-@wp.kernel
+@kernel_of_views
 def gather_objects_kernel(
     # Scene:
     object_ids: wp.array[int],  # (entry)
@@ -60,7 +61,7 @@ def gather_objects_kernel(
     catalog_index: wp.array2d[int],  # (world, instance)
     pose: wp.array2d[wp.transform],  # (world, instance) [m]
     # In:
-    views: Views,
+    views: AnyViews,
     # Out:
     object_id_out: wp.array2d[int],  # (view, instance)
     pose_out: wp.array2d[wp.transform],  # (view, instance) [m]

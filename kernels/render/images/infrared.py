@@ -21,8 +21,9 @@ from synpick_warp.kernels.render.lighting.materials import (
 from synpick_warp.kernels.render.lighting.paths.tracing import PathScene
 from synpick_warp.kernels.render.lighting.unoccluded import unoccluded_light
 from synpick_warp.kernels.render.visibility.bvh_rays import RAY_OFFSET, is_blocked, trace_ray
-from synpick_warp.kernels.render.visibility.camera import ImageGrid, ViewCameras, Views, camera_ray, in_image, tile_pixel
+from synpick_warp.kernels.render.visibility.camera import AnyCameras, AnyViews, ImageGrid, camera_ray, in_image, tile_pixel
 from synpick_warp.kernels.render.visibility.gbuffer import GBuffer, Hit, ViewBodies, body_of, read_hit
+from synpick_warp.kernels.render.visibility.variants import kernel_of_views
 from synpick_warp.kernels.rng import normal_pair, pixel_key, uniform, view_key
 from synpick_warp.kernels.tuning import RAY_REGISTERS
 
@@ -57,7 +58,7 @@ def dot_pattern(column: float, row: float, spacing: float) -> float:
 
 
 @wp.func
-def right_camera_hit(scene: PathScene, bodies: ViewBodies, views: Views, view: int, ray: wp.vec3, baseline: float) -> Hit:
+def right_camera_hit(scene: PathScene, bodies: ViewBodies, views: AnyViews, view: int, ray: wp.vec3, baseline: float) -> Hit:
     """Closest hit of a ray of the right camera, with planar depth."""
     cameras = views.cameras
     origin = wp.vec3(cameras.center[view]) + cameras.to_world[view] * wp.vec3(baseline, 0.0, 0.0)
@@ -72,7 +73,7 @@ def dot_light(
     scene: PathScene,
     sensor: SensorParameters,
     bodies: ViewBodies,
-    views: Views,
+    views: AnyViews,
     view: int,
     point: wp.vec3,
     surface: Surface,
@@ -99,7 +100,7 @@ def dot_light(
 
 @wp.func
 def seen_surface(
-    scene: PathScene, bodies: ViewBodies, cameras: ViewCameras, view: int, hit: Hit, point: wp.vec3, outgoing: wp.vec3, instances: int
+    scene: PathScene, bodies: ViewBodies, cameras: AnyCameras, view: int, hit: Hit, point: wp.vec3, outgoing: wp.vec3, instances: int
 ) -> Surface:
     """Surface attributes of a hit at `point` in the camera's axes [m]; the hit must be of a body or the table."""
     width = hit.depth / cameras.intrinsics[view][0]
@@ -110,7 +111,7 @@ def seen_surface(
     return interpolate_surface(scene.meshes, scene.surfaces, bodies, view, body, hit.triangle, hit.barycentric, outgoing, width)
 
 
-@wp.kernel(cuda_max_registers=RAY_REGISTERS)
+@kernel_of_views(cuda_max_registers=RAY_REGISTERS)
 def render_infrared_kernel(
     # Scene:
     scene: PathScene,
@@ -124,7 +125,7 @@ def render_infrared_kernel(
     sensor: SensorParameters,
     bodies: ViewBodies,
     gbuffer: GBuffer,
-    views: Views,
+    views: AnyViews,
     eye: int,
     first: int,
     # Out:

@@ -17,9 +17,9 @@ from synpick_warp.kernels.render.lighting.materials import (
 )
 from synpick_warp.kernels.render.visibility.camera import (
     NEAR_PLANE,
+    AnyCameras,
+    AnyViews,
     ImageGrid,
-    ViewCameras,
-    Views,
     camera_ray,
     hit_position,
     in_image,
@@ -28,6 +28,7 @@ from synpick_warp.kernels.render.visibility.camera import (
 )
 from synpick_warp.kernels.render.visibility.gbuffer import GBuffer, Meshes, ViewBodies, body_of
 from synpick_warp.kernels.render.visibility.lens import distort
+from synpick_warp.kernels.render.visibility.variants import kernel_of_views
 
 wp.set_module_options({"enable_backward": False})
 
@@ -63,7 +64,7 @@ def position_of(pose: wp.transformf) -> wp.vec3d:
     return wp.vec3d(wp.float64(p[0]), wp.float64(p[1]), wp.float64(p[2]))
 
 
-@wp.kernel
+@kernel_of_views
 def compute_motions_kernel(
     # Scene:
     # State:
@@ -76,7 +77,7 @@ def compute_motions_kernel(
     last_fixture_pose: wp.array2d[wp.transformf],  # (world, fixture) [m]
     last_fixture_visible: wp.array2d[int],  # (world, fixture)
     # In:
-    views: Views,
+    views: AnyViews,
     # Out:
     motions_out: BodyMotions,
 ):
@@ -113,7 +114,7 @@ def compute_motions_kernel(
 def hit_surface(
     meshes: Meshes,
     surfaces: Surfaces,
-    cameras: ViewCameras,
+    cameras: AnyCameras,
     bodies: ViewBodies,
     gbuffer: GBuffer,
     view: int,
@@ -135,7 +136,7 @@ def hit_surface(
     return interpolate_surface(meshes, surfaces, bodies, view, body_of(segment, instances), triangle, barycentric, to_camera, width)
 
 
-@wp.kernel
+@kernel_of_views
 def render_normals_kernel(
     # Scene:
     meshes: Meshes,
@@ -144,7 +145,7 @@ def render_normals_kernel(
     # In:
     bodies: ViewBodies,
     gbuffer: GBuffer,
-    views: Views,
+    views: AnyViews,
     first: int,
     # Out:
     normals_out: wp.array3d[wp.vec3],  # (view, row, column)
@@ -163,7 +164,7 @@ def render_normals_kernel(
     normals_out[view, row, column] = normal
 
 
-@wp.kernel
+@kernel_of_views
 def render_albedo_kernel(
     # Scene:
     meshes: Meshes,
@@ -172,7 +173,7 @@ def render_albedo_kernel(
     # In:
     bodies: ViewBodies,
     gbuffer: GBuffer,
-    views: Views,
+    views: AnyViews,
     first: int,
     # Out:
     albedo_out: wp.array3d[wp.vec3ub],  # (view, row, column)
@@ -191,23 +192,24 @@ def render_albedo_kernel(
     albedo_out[view, row, column] = wp.vec3ub(srgb_byte(color[0]), srgb_byte(color[1]), srgb_byte(color[2]))
 
 
-@wp.kernel
+@kernel_of_views
 def render_nocs_kernel(
     # Scene:
     meshes: Meshes,
     grid: ImageGrid,
+    obj_id: wp.array[int],  # (entry)
     # In:
     bodies: ViewBodies,
     gbuffer: GBuffer,
-    views: Views,
+    views: AnyViews,
     first: int,
     # Out:
     nocs_out: wp.array3d[wp.vec3],  # (view, row, column)
 ):
     """NOCS map, normalized object coordinates (Wang et al., 2019): (p - c) / |u - l| + 1/2, c = (l + u) / 2, l and u the mesh's bounds.
 
-    Zero stands for no instance: no point of an object with an extent has 0 in all three components. Launched over view, pixel (tile order,
-    from flat index `first` on).
+    Zero stands for no instance, or one without label: no point of an object with an extent has 0 in all three components. Launched over
+    view, pixel (tile order, from flat index `first` on).
     """
     view, row, column = tile_pixel(grid, wp.tid() + first)
     if not in_image(grid, row, column):
@@ -216,15 +218,16 @@ def render_nocs_kernel(
     coordinates = wp.vec3(0.0, 0.0, 0.0)
     if segment != Segment.NOTHING and segment <= views.instances:
         mesh = bodies.mesh[view, segment - 1]
-        lower = meshes.lower[mesh]
-        upper = meshes.upper[mesh]
-        barycentric = gbuffer.barycentric[view, row, column]
-        point = wp.mesh_eval_position(meshes.id[mesh], gbuffer.triangle[view, row, column], barycentric[0], barycentric[1])
-        coordinates = (point - 0.5 * (lower + upper)) / wp.length(upper - lower) + wp.vec3(0.5, 0.5, 0.5)
+        if obj_id[mesh] >= 0:
+            lower = meshes.lower[mesh]
+            upper = meshes.upper[mesh]
+            barycentric = gbuffer.barycentric[view, row, column]
+            point = wp.mesh_eval_position(meshes.id[mesh], gbuffer.triangle[view, row, column], barycentric[0], barycentric[1])
+            coordinates = (point - 0.5 * (lower + upper)) / wp.length(upper - lower) + wp.vec3(0.5, 0.5, 0.5)
     nocs_out[view, row, column] = coordinates
 
 
-@wp.kernel
+@kernel_of_views
 def render_classes_kernel(
     # Scene:
     grid: ImageGrid,
@@ -232,12 +235,12 @@ def render_classes_kernel(
     # In:
     bodies: ViewBodies,
     gbuffer: GBuffer,
-    views: Views,
+    views: AnyViews,
     first: int,
     # Out:
     classes_out: wp.array3d[wp.uint16],  # (view, row, column)
 ):
-    """Semantic segmentation: the class id, obj_id, of the visible instance; 0 without instance.
+    """Semantic segmentation: the class id, obj_id, of the visible instance; 0 without instance, or of one without label.
 
     Launched over view, pixel (tile order, from flat index `first` on).
     """
@@ -247,7 +250,7 @@ def render_classes_kernel(
     segment = int(gbuffer.segment[view, row, column])
     class_id = int(0)
     if segment != Segment.NOTHING and segment <= views.instances:
-        class_id = obj_id[bodies.mesh[view, segment - 1]]
+        class_id = wp.max(obj_id[bodies.mesh[view, segment - 1]], 0)
     classes_out[view, row, column] = wp.uint16(class_id)
 
 
@@ -269,7 +272,7 @@ def point_displacement(
     return motions.rotation[view, body] * (point - motions.origin[view, body]) + motions.displacement[view, body]
 
 
-@wp.kernel
+@kernel_of_views
 def render_scene_flow_kernel(
     # Scene:
     grid: ImageGrid,
@@ -278,7 +281,7 @@ def render_scene_flow_kernel(
     # In:
     motions: BodyMotions,
     gbuffer: GBuffer,
-    views: Views,
+    views: AnyViews,
     first: int,
     # Out:
     scene_flow_out: wp.array3d[wp.vec3],  # (view, row, column) [m]
@@ -295,7 +298,7 @@ def render_scene_flow_kernel(
     scene_flow_out[view, row, column] = displacement
 
 
-@wp.kernel
+@kernel_of_views
 def render_flow_kernel(
     # Scene:
     grid: ImageGrid,
@@ -304,7 +307,7 @@ def render_flow_kernel(
     # In:
     motions: BodyMotions,
     gbuffer: GBuffer,
-    views: Views,
+    views: AnyViews,
     first: int,
     # Out:
     flow_out: wp.array3d[wp.vec2],  # (view, row, column) [px]

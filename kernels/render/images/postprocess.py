@@ -15,7 +15,8 @@ from synpick_warp.kernels.render.images.camera_effects import (
 )
 from synpick_warp.kernels.render.lighting.color import srgb_byte
 from synpick_warp.kernels.render.lighting.environment import Lights
-from synpick_warp.kernels.render.visibility.camera import PIXEL_CENTER, ImageGrid, ViewCameras, Views, camera_ray, in_image, tile_pixel
+from synpick_warp.kernels.render.visibility.camera import PIXEL_CENTER, AnyCameras, AnyViews, ImageGrid, camera_ray, in_image, tile_pixel
+from synpick_warp.kernels.render.visibility.variants import kernel_of_views
 from synpick_warp.kernels.rng import view_key
 
 wp.set_module_options({"enable_backward": False, "fast_math": True})
@@ -50,7 +51,7 @@ def encode_display(linear: float, tone: int) -> wp.uint8:
     return srgb_byte(x)
 
 
-@wp.kernel
+@kernel_of_views
 def postprocess_kernel(
     # Scene:
     grid: ImageGrid,
@@ -59,7 +60,7 @@ def postprocess_kernel(
     light: wp.array[int],  # (world)
     light_exposure: wp.array[float],  # (world) [EV]
     # In:
-    views: Views,
+    views: AnyViews,
     image: ShadedImage,
     tone: int,
     first: int,
@@ -82,7 +83,7 @@ def postprocess_kernel(
 def filter_lens(
     image: ShadedImage,
     parameters: EffectParameters,
-    cameras: ViewCameras,
+    cameras: AnyCameras,
     grid: ImageGrid,
     view: int,
     row: int,
@@ -136,13 +137,13 @@ def filter_lens(
     return total / weights
 
 
-@wp.kernel
+@kernel_of_views
 def filter_lens_rows_kernel(
     # Scene:
     grid: ImageGrid,
     # In:
     effects: wp.array[EffectParameters],  # (view)
-    views: Views,
+    views: AnyViews,
     image: ShadedImage,
     first: int,
     # Out:
@@ -173,7 +174,7 @@ class PostProcessSettings:
     """1: the image is the result of `filter_lens_rows_kernel`, and the pass along columns is due; 0: no effect needs neighbours."""
 
 
-@wp.kernel
+@kernel_of_views
 def postprocess_effects_kernel(
     # Scene:
     grid: ImageGrid,
@@ -186,7 +187,7 @@ def postprocess_effects_kernel(
     # In:
     settings: PostProcessSettings,
     effects: wp.array[EffectParameters],  # (view)
-    views: Views,
+    views: AnyViews,
     image: ShadedImage,
     first: int,
     # Out:

@@ -10,8 +10,9 @@ import warp as wp
 
 from synpick_warp.codes import MAX_DISPARITIES
 from synpick_warp.kernels.render.images.depth_sensor import SensorParameters
-from synpick_warp.kernels.render.visibility.camera import ImageGrid, Views, clamp_index, in_image, tile_pixel
+from synpick_warp.kernels.render.visibility.camera import AnyViews, ImageGrid, clamp_index, in_image, tile_pixel
 from synpick_warp.kernels.render.visibility.gbuffer import MAX_COUNTS
+from synpick_warp.kernels.render.visibility.variants import kernel_of_views
 
 wp.set_module_options({"enable_backward": False})
 
@@ -36,7 +37,7 @@ NO_MATCH = wp.constant(-1)
 
 
 @wp.func
-def first_disparity(sensor: SensorParameters, views: Views, view: int) -> int:
+def first_disparity(sensor: SensorParameters, views: AnyViews, view: int) -> int:
     """Smallest disparity that is searched in a view, that of the farthest depth [px]."""
     return int(wp.floor(views.cameras.intrinsics[view][0] * sensor.baseline / sensor.far))
 
@@ -140,11 +141,11 @@ def follow_path(census: wp.array3d[wp.uint32], lowest: int, line: int, direction
     ...
 
 
-@wp.kernel
+@kernel_of_views
 def sum_path_costs_kernel(
     # In:
     sensor: SensorParameters,
-    views: Views,
+    views: AnyViews,
     census: wp.array3d[wp.uint32],  # (eye, row, column)
     view: int,
     direction: int,
@@ -158,13 +159,13 @@ def sum_path_costs_kernel(
     follow_path(census, first_disparity(sensor, views, view), line, direction, cost_inout)
 
 
-@wp.kernel
+@kernel_of_views
 def match_right_kernel(
     # Scene:
     grid: ImageGrid,
     # In:
     sensor: SensorParameters,
-    views: Views,
+    views: AnyViews,
     cost: wp.array3d[wp.uint16],  # (row, column, disparity)
     view: int,
     first: int,
@@ -223,13 +224,13 @@ def sub_pixel(before: int, here: int, after: int) -> int:
     return (FRACTIONS * (before - after + 2 * slope) + slope) // (2 * slope) - FRACTIONS
 
 
-@wp.kernel
+@kernel_of_views
 def match_left_kernel(
     # Scene:
     grid: ImageGrid,
     # In:
     sensor: SensorParameters,
-    views: Views,
+    views: AnyViews,
     cost: wp.array3d[wp.uint16],  # (row, column, disparity)
     right_match: wp.array2d[int],  # (row, column)
     census: wp.array3d[wp.uint32],  # (eye, row, column)
@@ -286,13 +287,13 @@ def median_disparity(disparity: wp.array2d[int], grid: ImageGrid, row: int, colu
     return NO_MATCH
 
 
-@wp.kernel
+@kernel_of_views
 def measure_depth_kernel(
     # Scene:
     grid: ImageGrid,
     # In:
     sensor: SensorParameters,
-    views: Views,
+    views: AnyViews,
     disparity: wp.array2d[int],  # (row, column) [px/FRACTIONS]
     view: int,
     first: int,

@@ -22,8 +22,9 @@ from synpick_warp.kernels.render.lighting.paths.light import CoarseLight, pack_l
 from synpick_warp.kernels.render.lighting.plane_distance import Plane, plane_distance, tangent_plane
 from synpick_warp.kernels.render.lighting.unoccluded import visibility_ratio
 from synpick_warp.kernels.render.lighting.upsampling import RatioImages, RatioRecord, Ratios, add_ratios, pack_ratios
-from synpick_warp.kernels.render.visibility.camera import ImageGrid, ViewCameras, Views, clamp_index, in_image, tile_pixel
+from synpick_warp.kernels.render.visibility.camera import AnyCameras, AnyViews, ImageGrid, clamp_index, in_image, tile_pixel
 from synpick_warp.kernels.render.visibility.records import read_record, read_uint64, write_record, write_uint64
+from synpick_warp.kernels.render.visibility.variants import kernel_of_views
 from synpick_warp.kernels.tuning import CHOICE_REGISTERS, FILTER_REGISTERS
 
 wp.set_module_options({"enable_backward": False, "fast_math": True})
@@ -48,7 +49,7 @@ SAME_BODY_WEIGHT = wp.constant(0.02)
 
 
 @wp.func
-def coarse_plane(coarse: CoarseGrid, surface: wp.vec4, cameras: ViewCameras, view: int, row: int, column: int) -> Plane:
+def coarse_plane(coarse: CoarseGrid, surface: wp.vec4, cameras: AnyCameras, view: int, row: int, column: int) -> Plane:
     """Tangent plane at a coarse pixel of packed `surface`, whose `down`, `right` and `width` are per coarse pixel."""
     pixel = middle_pixel(coarse, row, column)
     depth = surface_depth(surface)
@@ -160,14 +161,14 @@ def block_row_weights(guide: Guide, plane: Plane, grid: ImageGrid, view: int, ro
     return weights
 
 
-@wp.kernel(cuda_max_registers=FILTER_REGISTERS)
+@kernel_of_views(cuda_max_registers=FILTER_REGISTERS)
 def filter_blocks_kernel(
     # Scene:
     coarse: CoarseGrid,
     # In:
     guide: Guide,
     coarse_light: CoarseLight,
-    views: Views,
+    views: AnyViews,
     first: int,
     # Out:
     blocks_out: CoarseLight,
@@ -266,14 +267,14 @@ def add_blocks(total: KernelSum, blocks: CoarseLight, middle: int, weights: wp.v
     return result
 
 
-@wp.kernel(cuda_max_registers=CHOICE_REGISTERS)
+@kernel_of_views(cuda_max_registers=CHOICE_REGISTERS)
 def choose_widths_kernel(
     # Scene:
     coarse: CoarseGrid,
     # In:
     guide: Guide,
     blocks: CoarseLight,
-    views: Views,
+    views: AnyViews,
     variance_scale: float,
     first: int,
     # Out:
@@ -328,14 +329,14 @@ def choose_widths_kernel(
     ratios_out.record[view, row, column] = pack_ratios(diffuse, specular, scale * sums.indirect, surface_depth(surface), segment)
 
 
-@wp.kernel
+@kernel_of_views
 def smooth_ratios_kernel(
     # Scene:
     coarse: CoarseGrid,
     # In:
     guide: Guide,
     ratios: RatioImages,
-    views: Views,
+    views: AnyViews,
     first: int,
     # Out:
     ratios_out: RatioImages,

@@ -10,8 +10,9 @@ from synpick_warp.codes import Segment
 from synpick_warp.kernels.render.lighting.brdf import SplitRadiance
 from synpick_warp.kernels.render.lighting.color import pack_half3, unpack_half3
 from synpick_warp.kernels.render.lighting.moving_bodies import MAX_FRAMES, MovingBodies, mean_projected_area
-from synpick_warp.kernels.render.visibility.camera import Views
+from synpick_warp.kernels.render.visibility.camera import AnyViews
 from synpick_warp.kernels.render.visibility.gbuffer import Meshes, body_of
+from synpick_warp.kernels.render.visibility.variants import kernel_of_views
 
 wp.set_module_options({"enable_backward": False})
 
@@ -65,13 +66,13 @@ class LightHistory:
     """Maximum history length [paths]; 0: no history is kept."""
 
 
-@wp.kernel
+@kernel_of_views
 def advance_history_kernel(
     # State: worlds
     episode: wp.array[int],  # (world)
     frame: wp.array[int],  # (world)
     # In:
-    views: Views,
+    views: AnyViews,
     # Out:
     history_inout: LightHistory,
     moving_out: MovingBodies,
@@ -131,7 +132,7 @@ def lag_limit(
     meshes: Meshes,
     history: LightHistory,
     moving: MovingBodies,
-    views: Views,
+    views: AnyViews,
     view: int,
     row: int,
     column: int,

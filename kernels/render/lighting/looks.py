@@ -6,81 +6,18 @@ the host computes the same values for its records.
 
 import warp as wp
 
-from synpick_warp.codes import Look, LookKind, LookPart, Stream
+from synpick_warp.codes import Look, LookKind, LookPart
+from synpick_warp.kernels.distributions import LookTable, draw_look, look_key
 from synpick_warp.kernels.render.lighting.materials import Surfaces
-from synpick_warp.kernels.render.visibility.camera import Views
+from synpick_warp.kernels.render.visibility.camera import AnyViews
 from synpick_warp.kernels.render.visibility.gbuffer import FIXTURES, Meshes, ViewBodies
-from synpick_warp.kernels.rng import TAU, normal_pair, pixel_key, stream_key, uniform
+from synpick_warp.kernels.render.visibility.variants import kernel_of_views
+from synpick_warp.kernels.rng import TAU
 
 wp.set_module_options({"enable_backward": False})
 
-SAMPLES = wp.constant(6)
-"""Random numbers reserved for one draw: three components, by pairs."""
-PART_BODIES = wp.constant(1024)
-"""More than a world's instances: keys of parts do not meet."""
 GREY = wp.constant(0.57735)
 """Component of the unit vector along the grey axis: 1 / sqrt(3)."""
-
-
-@wp.struct
-class LookDistribution:
-    """Probability distribution of one appearance parameter; see `configs.randomize.Distribution`."""
-
-    kind: int
-    """`LookKind`."""
-    a: wp.vec3
-    """Value, low, logarithm of low, or mean."""
-    b: wp.vec3
-    """High, logarithm of high, or standard deviation."""
-    low: float
-    high: float
-    """Range to which a normal sample is clamped."""
-    first: int
-    """Index of the first value of a choice in `LookTable.choice`."""
-    count: int
-    """Number of values of a choice."""
-
-
-@wp.struct
-class LookTable:
-    """Distributions of all appearance parameters, and where the materials of views begin. Constant."""
-
-    distribution: wp.array2d[LookDistribution]
-    """(part, look)."""
-    choice: wp.array[wp.vec4]
-    """(choice): value, and cumulative probability up to and with it."""
-    first_row: int
-    """Row of `Surfaces` of the first view's first body; the rows before are those of meshes, table and textures."""
-
-
-@wp.func
-def draw_look(table: LookTable, key: wp.uint64, part: int, look: int) -> wp.vec3:
-    """Draw an appearance parameter from the stream of a body; a scalar is the first component."""
-    d = table.distribution[part, look]
-    index = SAMPLES * look
-    u = wp.vec3(uniform(key, index), uniform(key, index + 2), uniform(key, index + 4))
-    if d.kind == LookKind.FIXED:
-        return d.a
-    if d.kind == LookKind.UNIFORM:
-        return d.a + wp.cw_mul(d.b - d.a, u)
-    if d.kind == LookKind.LOG_UNIFORM:
-        x = d.a + wp.cw_mul(d.b - d.a, u)
-        return wp.vec3(wp.exp(x[0]), wp.exp(x[1]), wp.exp(x[2]))
-    if d.kind == LookKind.NORMAL:
-        n = wp.vec3(normal_pair(key, index)[0], normal_pair(key, index + 2)[0], normal_pair(key, index + 4)[0])
-        x = d.a + wp.cw_mul(d.b, n)
-        return wp.vec3(wp.clamp(x[0], d.low, d.high), wp.clamp(x[1], d.low, d.high), wp.clamp(x[2], d.low, d.high))
-    last = d.first + d.count - 1
-    chosen = int(d.first)
-    while chosen < last and u[0] >= table.choice[chosen][3]:
-        chosen += 1
-    return wp.vec3(table.choice[chosen][0], table.choice[chosen][1], table.choice[chosen][2])
-
-
-@wp.func
-def look_key(seed: wp.uint64, episode: int, part: int, body: int) -> wp.uint64:
-    """Key of the random numbers of a body's appearance; `body` counts within its part."""
-    return pixel_key(stream_key(seed, episode, 0, Stream.LOOKS), PART_BODIES * part + body)
 
 
 @wp.func
@@ -163,7 +100,7 @@ def draw_material(table: LookTable, surfaces: Surfaces, base: int, key: wp.uint6
     return result
 
 
-@wp.kernel
+@kernel_of_views
 def dress_bodies_kernel(
     # Scene:
     seed: wp.uint64,
@@ -172,18 +109,20 @@ def dress_bodies_kernel(
     # State:
     episode: wp.array[int],  # (world)
     # In:
-    views: Views,
+    views: AnyViews,
+    first_row: int,
     # Out:
     bodies_inout: ViewBodies,
     surfaces_inout: Surfaces,
 ):
-    """Materials of the bodies of each view, and of its table as the last: those of their meshes, changed by what the episode draws.
+    """Materials of the bodies of each view, of its table and of its background: those of their meshes, changed by what the episode draws.
 
-    Launched over view, material.
+    `first_row`: row of `Surfaces` of the first view's first body; the rows before are those of meshes, table and textures. Launched over
+    view, material.
     """
     view, body = wp.tid()
     instances = bodies_inout.mesh.shape[1] - FIXTURES
-    at_table = body == bodies_inout.mesh.shape[1]
+    at_table = body >= bodies_inout.mesh.shape[1]
     world = views.world[view]
     if world < 0:
         return
@@ -192,11 +131,13 @@ def dress_bodies_kernel(
         base = bodies_inout.mesh[view, body]
     if base < 0:
         return
-    row = table.first_row + view * bodies_inout.material.shape[1] + body
+    row = first_row + view * bodies_inout.material.shape[1] + body
     bodies_inout.material[view, body] = row
     part = int(-1)
     slot = int(0)
-    if at_table:
+    if body > bodies_inout.mesh.shape[1]:
+        part = LookPart.BACKGROUND
+    elif at_table:
         part = LookPart.TABLE
     elif body < instances:
         part = LookPart.OBJECT

@@ -6,8 +6,9 @@ The light of resting surfaces is reused (`history`, `shadows`) where none of the
 import warp as wp
 
 from synpick_warp.kernels.render.visibility.bvh_rays import RAY_OFFSET
-from synpick_warp.kernels.render.visibility.camera import Views
+from synpick_warp.kernels.render.visibility.camera import AnyViews
 from synpick_warp.kernels.render.visibility.gbuffer import FAR, Meshes, fixture_mesh
+from synpick_warp.kernels.render.visibility.variants import kernel_of_views
 
 wp.set_module_options({"enable_backward": False})
 
@@ -110,7 +111,7 @@ def list_moving_body(
     moving.all_upper[view] = wp.max(moving.all_upper[view], upper)
 
 
-@wp.kernel
+@kernel_of_views
 def find_moving_bodies_kernel(
     # Scene:
     meshes: Meshes,
@@ -125,7 +126,7 @@ def find_moving_bodies_kernel(
     last_fixture_pose: wp.array2d[wp.transformf],  # (world, fixture) [m]
     last_fixture_visible: wp.array2d[int],  # (world, fixture)
     # In:
-    views: Views,
+    views: AnyViews,
     bodies: int,
     # Out:
     moving_inout: MovingBodies,

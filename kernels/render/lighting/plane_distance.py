@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from synpick_warp.kernels.render.visibility.camera import ViewCameras, camera_ray
+from synpick_warp.kernels.render.visibility.camera import AnyCameras, camera_ray
 
 wp.set_module_options({"enable_backward": False})
 
@@ -28,7 +28,7 @@ class Plane:
 
 
 @wp.func
-def tangent_plane(cameras: ViewCameras, view: int, row: int, column: int, segment: wp.uint8, depth: float, normal: wp.vec3) -> Plane:
+def tangent_plane(cameras: AnyCameras, view: int, row: int, column: int, segment: wp.uint8, depth: float, normal: wp.vec3) -> Plane:
     """Tangent plane of the surface at a pixel; `depth` is planar [m], `normal` is in camera space."""
     intrinsics = cameras.intrinsics[view]
     plane = Plane()

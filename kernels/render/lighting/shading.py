@@ -33,9 +33,10 @@ from synpick_warp.kernels.render.lighting.shadow_upsampling import upsample_shad
 from synpick_warp.kernels.render.lighting.shadows import byte_of
 from synpick_warp.kernels.render.lighting.unoccluded import unoccluded_light
 from synpick_warp.kernels.render.lighting.upsampling import RatioImages, Ratios, upsample_ratios
-from synpick_warp.kernels.render.visibility.camera import ViewCameras, Views, camera_ray, hit_position, in_image, tile_pixel
+from synpick_warp.kernels.render.visibility.camera import AnyCameras, AnyViews, camera_ray, hit_position, in_image, tile_pixel
 from synpick_warp.kernels.render.visibility.gbuffer import GBuffer, ViewBodies, body_of
 from synpick_warp.kernels.render.visibility.triangles import camera_triangle, edge_areas
+from synpick_warp.kernels.render.visibility.variants import kernel_of_views
 from synpick_warp.kernels.tuning import SAMPLE_SHADE_REGISTERS, SHADE_REGISTERS
 
 wp.set_module_options({"enable_backward": False, "fast_math": True})
@@ -105,7 +106,7 @@ def shade_surface(
 @wp.func
 def gather_light(
     scene: PathScene,
-    cameras: ViewCameras,
+    cameras: AnyCameras,
     coarse: CoarseGrid,
     shadow_grid: CoarseGrid,
     sky: Sky,
@@ -197,7 +198,7 @@ def shade_pixel(
     ratios: RatioImages,
     shadows: LampShadows,
     edges: wp.array3d[wp.vec3],
-    views: Views,
+    views: AnyViews,
     view: int,
     row: int,
     column: int,
@@ -245,7 +246,7 @@ def shade_pixel(
     return total / float(samples)
 
 
-@wp.kernel(cuda_max_registers=SHADE_REGISTERS)
+@kernel_of_views(cuda_max_registers=SHADE_REGISTERS)
 def shade_kernel(
     # Scene:
     scene: PathScene,
@@ -259,7 +260,7 @@ def shade_kernel(
     gbuffer: GBuffer,
     ratios: RatioImages,
     shadows: LampShadows,
-    views: Views,
+    views: AnyViews,
     first: int,
     # Out:
     radiance_inout: wp.array3d[wp.vec3],  # (view, row, column)
@@ -277,7 +278,7 @@ def shade_kernel(
         )
 
 
-@wp.kernel(cuda_max_registers=SAMPLE_SHADE_REGISTERS)
+@kernel_of_views(cuda_max_registers=SAMPLE_SHADE_REGISTERS)
 def shade_samples_kernel(
     # Scene:
     scene: PathScene,
@@ -291,7 +292,7 @@ def shade_samples_kernel(
     gbuffer: GBuffer,
     ratios: RatioImages,
     shadows: LampShadows,
-    views: Views,
+    views: AnyViews,
     first: int,
     # Out:
     radiance_inout: wp.array3d[wp.vec3],  # (view, row, column)

@@ -13,16 +13,9 @@ from synpick_warp.kernels.render.lighting.plane_distance import Plane, tangent_p
 from synpick_warp.kernels.render.lighting.shadow_filter import STEEPNESS_BITS, STEEPNESS_LEVELS, LampShadows
 from synpick_warp.kernels.render.lighting.shadow_upsampling import all_steepness, filter_edge, find_shadow_taps, pack_fractions
 from synpick_warp.kernels.render.lighting.shadows import is_shadowed, point_direction, visible_normal
-from synpick_warp.kernels.render.visibility.camera import (
-    TILE_PIXELS,
-    Views,
-    camera_ray,
-    hit_position,
-    in_image,
-    tile_of,
-    tile_pixel,
-)
+from synpick_warp.kernels.render.visibility.camera import TILE_PIXELS, AnyViews, camera_ray, hit_position, in_image, tile_of, tile_pixel
 from synpick_warp.kernels.render.visibility.gbuffer import GBuffer, Meshes, Table, ViewBodies, read_hit
+from synpick_warp.kernels.render.visibility.variants import kernel_of_views
 from synpick_warp.kernels.tuning import RAY_REGISTERS
 
 wp.set_module_options({"enable_backward": False, "fast_math": True})
@@ -71,12 +64,12 @@ def listed_pixel(coarse: CoarseGrid, cell: wp.array3d[int], view: int, chunk: in
     return int(top) * coarse.size + int(down), int(left) * coarse.size + int(right)
 
 
-@wp.kernel
+@kernel_of_views
 def list_edge_cells_kernel(
     # Scene:
     coarse: CoarseGrid,
     # In:
-    views: Views,
+    views: AnyViews,
     first: int,
     # Out:
     shadows_inout: LampShadows,
@@ -98,7 +91,7 @@ def list_edge_cells_kernel(
 
 @wp.func
 def pixel_plane(
-    meshes: Meshes, bodies: ViewBodies, gbuffer: GBuffer, views: Views, view: int, row: int, column: int
+    meshes: Meshes, bodies: ViewBodies, gbuffer: GBuffer, views: AnyViews, view: int, row: int, column: int
 ) -> tuple[Plane, wp.vec3]:
     """Tangent plane at a pixel that shows a surface, and the surface's geometric normal in the world."""
     outward = views.cameras.to_world[view] * camera_ray(views.cameras, view, row, column, wp.vec2(0.0, 0.0))
@@ -108,7 +101,7 @@ def pixel_plane(
     return tangent_plane(views.cameras, view, row, column, segment, depth, local), normal
 
 
-@wp.kernel
+@kernel_of_views
 def list_edge_pixels_kernel(
     # Scene:
     meshes: Meshes,
@@ -116,7 +109,7 @@ def list_edge_pixels_kernel(
     # In:
     bodies: ViewBodies,
     gbuffer: GBuffer,
-    views: Views,
+    views: AnyViews,
     threads: int,
     first: int,
     # Out:
@@ -154,7 +147,7 @@ def trace_pixel_edges(
     heading: wp.vec2,
     bodies: ViewBodies,
     gbuffer: GBuffer,
-    views: Views,
+    views: AnyViews,
     steepness: wp.uint32,
     view: int,
     row: int,
@@ -178,7 +171,7 @@ def trace_pixel_edges(
     return result
 
 
-@wp.kernel(cuda_max_registers=RAY_REGISTERS)
+@kernel_of_views(cuda_max_registers=RAY_REGISTERS)
 def trace_shadow_edges_kernel(
     # Scene:
     meshes: Meshes,
@@ -192,7 +185,7 @@ def trace_shadow_edges_kernel(
     bodies: ViewBodies,
     gbuffer: GBuffer,
     lists: EdgeLists,
-    views: Views,
+    views: AnyViews,
     threads: int,
     first: int,
     # Out:
@@ -219,7 +212,7 @@ def trace_shadow_edges_kernel(
         )
 
 
-@wp.kernel
+@kernel_of_views
 def filter_shadow_edges_kernel(
     # Scene:
     meshes: Meshes,
@@ -232,7 +225,7 @@ def filter_shadow_edges_kernel(
     gbuffer: GBuffer,
     lists: EdgeLists,
     shadows: LampShadows,
-    views: Views,
+    views: AnyViews,
     threads: int,
     first: int,
     # Out:

@@ -17,9 +17,10 @@ from synpick_warp.kernels.render.lighting.coarse_grid import (
 from synpick_warp.kernels.render.lighting.environment import Lights, lamp_share
 from synpick_warp.kernels.render.lighting.plane_distance import Plane, plane_distance, tangent_plane
 from synpick_warp.kernels.render.lighting.shadows import rays_bits, rays_depth, rays_normal, rays_segment, spread_bits, visible_normal
-from synpick_warp.kernels.render.visibility.camera import Views, camera_ray, in_image, tile_pixel
+from synpick_warp.kernels.render.visibility.camera import AnyViews, camera_ray, in_image, tile_pixel
 from synpick_warp.kernels.render.visibility.gbuffer import GBuffer, Meshes, ViewBodies, read_hit
 from synpick_warp.kernels.render.visibility.records import read_uint64, write_record, write_uint64
+from synpick_warp.kernels.render.visibility.variants import kernel_of_views
 
 wp.set_module_options({"enable_backward": False, "fast_math": True})
 
@@ -137,7 +138,7 @@ def grid_plane(
     coarse: CoarseGrid,
     bodies: ViewBodies,
     gbuffer: GBuffer,
-    views: Views,
+    views: AnyViews,
     view: int,
     row: int,
     column: int,
@@ -173,7 +174,7 @@ def grid_shows(coarse: CoarseGrid, rays: wp.array3d[wp.uint64], plane: Plane, pi
     return same_surface(coarse, plane, down, right, rays_depth(packed), rays_segment(packed), rays_normal(packed))
 
 
-@wp.kernel
+@kernel_of_views
 def filter_shadows_kernel(
     # Scene:
     meshes: Meshes,
@@ -185,7 +186,7 @@ def filter_shadows_kernel(
     bodies: ViewBodies,
     gbuffer: GBuffer,
     rays: wp.array3d[wp.uint64],  # (view, shadow_row, shadow_column)
-    views: Views,
+    views: AnyViews,
     first: int,
     # Out:
     shadows_out: LampShadows,
@@ -314,7 +315,7 @@ def mark_edges(coarse: CoarseGrid, near_edge: wp.array3d[wp.uint8], view: int, r
             near_edge[view, r, c] = wp.uint8(1)
 
 
-@wp.kernel
+@kernel_of_views
 def measure_steepness_kernel(
     # Scene:
     meshes: Meshes,
@@ -326,7 +327,7 @@ def measure_steepness_kernel(
     bodies: ViewBodies,
     gbuffer: GBuffer,
     rays: wp.array3d[wp.uint64],  # (view, shadow_row, shadow_column)
-    views: Views,
+    views: AnyViews,
     first: int,
     # Out:
     shadows_inout: LampShadows,

@@ -13,16 +13,9 @@ from synpick_warp.kernels.render.lighting.environment import Lights, lamp_direct
 from synpick_warp.kernels.render.lighting.history import LightHistory
 from synpick_warp.kernels.render.lighting.moving_bodies import MovingBodies
 from synpick_warp.kernels.render.visibility.bvh_rays import RAY_OFFSET, is_blocked
-from synpick_warp.kernels.render.visibility.camera import (
-    TILE_HEIGHT,
-    TILE_WIDTH,
-    Views,
-    camera_ray,
-    hit_position,
-    in_image,
-    tile_pixel,
-)
+from synpick_warp.kernels.render.visibility.camera import TILE_HEIGHT, TILE_WIDTH, AnyViews, camera_ray, hit_position, in_image, tile_pixel
 from synpick_warp.kernels.render.visibility.gbuffer import FAR, GBuffer, Hit, Meshes, Table, ViewBodies, body_of, face_normal, read_hit
+from synpick_warp.kernels.render.visibility.variants import kernel_of_views
 from synpick_warp.kernels.tuning import RAY_REGISTERS
 
 wp.set_module_options({"enable_backward": False, "fast_math": True})
@@ -206,7 +199,7 @@ def is_shadowed(
 
 @wp.func
 def last_rays(
-    history: LightHistory, moving: MovingBodies, views: Views, view: int, slot: int, row: int, column: int, segment: int
+    history: LightHistory, moving: MovingBodies, views: AnyViews, view: int, slot: int, row: int, column: int, segment: int
 ) -> tuple[bool, int]:
     """Temporal reuse: (True, bits of a pixel's shadow rays in the previous frame) if these may be reused, else (False, 0).
 
@@ -235,7 +228,7 @@ def changed_rays(
     return result
 
 
-@wp.kernel(cuda_max_registers=RAY_REGISTERS)
+@kernel_of_views(cuda_max_registers=RAY_REGISTERS)
 def trace_shadow_rays_kernel(
     # Scene:
     meshes: Meshes,
@@ -248,7 +241,7 @@ def trace_shadow_rays_kernel(
     # In:
     bodies: ViewBodies,
     gbuffer: GBuffer,
-    views: Views,
+    views: AnyViews,
     moving: MovingBodies,
     first: int,
     # Out:

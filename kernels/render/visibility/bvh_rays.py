@@ -6,7 +6,7 @@ Camera rays are (x, y, 1) in the camera's axes, so that the ray parameter is pla
 import warp as wp
 
 from synpick_warp.codes import Segment
-from synpick_warp.kernels.render.visibility.camera import ViewCameras
+from synpick_warp.kernels.render.visibility.camera import AnyCameras
 from synpick_warp.kernels.render.visibility.gbuffer import FAR, Hit, Interior, Meshes, Table, ViewBodies, segment_of
 from synpick_warp.kernels.render.visibility.ray_bodies import first_ray_record, read_ray_body
 from synpick_warp.kernels.render.visibility.records import read_record
@@ -110,17 +110,21 @@ def trace_camera_ray(meshes: Meshes, bodies: ViewBodies, view: int, tile: int, r
 
 
 @wp.func
-def hit_table(table: Table, cameras: ViewCameras, view: int, ray: wp.vec3, best: Hit) -> Hit:
-    """Closer one of a camera ray's hit `best` and its hit on the table's plane."""
+def hit_table(table: Table, cameras: AnyCameras, view: int, ray: wp.vec3, best: Hit) -> Hit:
+    """Closer one of a camera ray's hit `best` and its hit on the table."""
     result = best
     if table.visible != 0:
-        fall = (cameras.to_world[view] * ray)[2]
+        along = cameras.to_world[view] * ray
+        fall = along[2]
         height = float(cameras.center[view][2]) - table.height
         if fall * height < 0.0:
             depth = -height / fall
             if depth < best.depth:
-                result.segment = Segment.TABLE
-                result.depth = depth
+                x = float(cameras.center[view][0]) + depth * along[0]
+                y = float(cameras.center[view][1]) + depth * along[1]
+                if wp.abs(x) <= table.half[0] and wp.abs(y) <= table.half[1]:
+                    result.segment = Segment.TABLE
+                    result.depth = depth
     return result
 
 

@@ -1,5 +1,7 @@
 """Cameras (OpenCV convention): pixel tiles, camera rays, projected boxes. The only place that defines where pixel centres are."""
 
+from typing import Any
+
 import warp as wp
 
 from synpick_warp.kernels.render.visibility.lens import BEND, Lenses, distort, table_ray, undistort
@@ -40,7 +42,7 @@ class Cameras:
 
 @wp.struct
 class ViewCameras:
-    """Camera of each view of a batch, as `Cameras`: where it stands in the view's frame. Filled by `aim_cameras_kernel`."""
+    """Pinhole camera of each view of a batch, as `Cameras`: where it stands in the view's frame. Filled by `aim_cameras_kernel`."""
 
     intrinsics: wp.array[wp.vec4]
     """(view): fx, fy, cx, cy [px]."""
@@ -51,9 +53,26 @@ class ViewCameras:
     to_world: wp.array[wp.mat33]
     """(view): camera to world, in float32 for the per-pixel kernels."""
     lens: wp.array[int]
-    """(view): row of `lenses`; -1: a pinhole. Not read where no camera is distorted."""
+    """As of `LensCameras`; never read."""
+    lenses: Lenses
+
+
+@wp.struct
+class LensCameras:
+    """Camera of each view of a batch, as `ViewCameras`, where some are distorted."""
+
+    intrinsics: wp.array[wp.vec4]
+    rotation: wp.array[wp.mat33d]
+    center: wp.array[wp.vec3d]
+    to_world: wp.array[wp.mat33]
+    lens: wp.array[int]
+    """(view): row of `lenses`; -1: a pinhole."""
     lenses: Lenses
     """Lenses of the cameras that are distorted."""
+
+
+AnyCameras = Any
+"""`ViewCameras`, or `LensCameras`: functions are compiled for each; see `variants`."""
 
 
 @wp.struct
@@ -87,6 +106,22 @@ class Views:
     """Views in the batch."""
     instances: int
     """Instance capacity of a world."""
+
+
+@wp.struct
+class LensViews:
+    """Views of a batch, as `Views`, where some cameras are distorted."""
+
+    world: wp.array[int]
+    camera: wp.array[int]
+    slot: wp.array[int]
+    cameras: LensCameras
+    count: int
+    instances: int
+
+
+AnyViews = Any
+"""`Views`, or `LensViews`: kernels are compiled for each; see `variants`."""
 
 
 @wp.func
@@ -134,14 +169,18 @@ def pinhole_ray(intrinsics: wp.vec4, row: int, column: int, offset: wp.vec2) -> 
 
 @wp.func
 def lens_of(cameras: ViewCameras, view: int) -> int:
-    """Row of a view's lens in `ViewCameras.lenses`; -1: a pinhole."""
-    if cameras.lenses.ray.shape[0] == 0:
-        return -1
+    """Row of a view's lens in `LensCameras.lenses`; -1: a pinhole, known when the kernel is compiled."""
+    return -1
+
+
+@wp.func
+def lens_of(cameras: LensCameras, view: int) -> int:  # noqa: F811
+    """Row of a view's lens in `LensCameras.lenses`; -1: a pinhole."""
     return cameras.lens[view]
 
 
 @wp.func
-def camera_ray(cameras: ViewCameras, view: int, row: int, column: int, offset: wp.vec2) -> wp.vec3:
+def camera_ray(cameras: AnyCameras, view: int, row: int, column: int, offset: wp.vec2) -> wp.vec3:
     """Camera ray (x, y, 1) of a pixel of a view in the camera's axes: its parameter is planar depth.
 
     `offset` [px] from the pixel's centre; zero for depth, ids and masks. The ray of a lens is that of the nearest pixel in the image.
@@ -153,7 +192,7 @@ def camera_ray(cameras: ViewCameras, view: int, row: int, column: int, offset: w
 
 
 @wp.func
-def border_ray(cameras: ViewCameras, view: int, row: int, column: int) -> wp.vec3:
+def border_ray(cameras: AnyCameras, view: int, row: int, column: int) -> wp.vec3:
     """As `camera_ray`, of a pixel's centre that may lie outside the image, where a lens is continued."""
     ray = pinhole_ray(cameras.intrinsics[view], row, column, wp.vec2(0.0, 0.0))
     lens = lens_of(cameras, view)
@@ -165,7 +204,7 @@ def border_ray(cameras: ViewCameras, view: int, row: int, column: int) -> wp.vec
 
 
 @wp.func
-def hit_position(cameras: ViewCameras, view: int, ray: wp.vec3, depth: float) -> wp.vec3:
+def hit_position(cameras: AnyCameras, view: int, ray: wp.vec3, depth: float) -> wp.vec3:
     """World position of a camera ray at a planar depth [m]."""
     return wp.vec3(cameras.center[view]) + cameras.to_world[view] * (depth * ray)
 
@@ -189,7 +228,7 @@ def projected_box(
     upper: wp.vec3,
     rotation: wp.mat33d,
     position: wp.vec3d,
-    cameras: ViewCameras,
+    cameras: AnyCameras,
     view: int,
     grid: ImageGrid,
 ) -> wp.vec4i:

@@ -63,12 +63,14 @@ class Meshes:
 
 @wp.struct
 class Table:
-    """Horizontal plane below the tote: whether it is visible (1), and its z in the world [m]."""
+    """Horizontal plane below the tote: whether it is visible (1), its z in the world [m], and how much of it cameras see."""
 
     visible: int
     """1: the scene has a table."""
     height: float
     """z in the world [m]."""
+    half: wp.vec2
+    """Half length and width of what cameras see, about the world's origin; FAR: endless [m]."""
 
 
 @wp.struct

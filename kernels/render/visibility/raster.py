@@ -9,7 +9,7 @@ import warp as wp
 
 from synpick_warp.codes import Segment
 from synpick_warp.kernels.render.visibility.bvh_rays import hit_table
-from synpick_warp.kernels.render.visibility.camera import ImageGrid, ViewCameras, Views, camera_ray, in_image, tile_pixel
+from synpick_warp.kernels.render.visibility.camera import AnyCameras, AnyViews, ImageGrid, camera_ray, in_image, tile_pixel
 from synpick_warp.kernels.render.visibility.gbuffer import (
     FAR,
     MAX_COUNTS,
@@ -23,6 +23,7 @@ from synpick_warp.kernels.render.visibility.gbuffer import (
     store_hit,
 )
 from synpick_warp.kernels.render.visibility.triangles import Footprint, Triangle, camera_triangle, find_footprint, ray_weights, row_span
+from synpick_warp.kernels.render.visibility.variants import kernel_of_views
 
 wp.set_module_options({"enable_backward": False})
 
@@ -101,7 +102,7 @@ def amodal_bit(body: int, instances: int) -> wp.uint32:
 def rasterize_footprint(
     visibility: VisibilityBuffer,
     amodal: wp.array3d[wp.uint32],
-    cameras: ViewCameras,
+    cameras: AnyCameras,
     view: int,
     pixels: wp.vec4i,
     triangle: Triangle,
@@ -142,12 +143,12 @@ def list_blocks(visibility: VisibilityBuffer, view: int, rank: int, triangle: in
     return free == blocks
 
 
-@wp.kernel
+@kernel_of_views
 def clear_visibility_kernel(
     # Scene:
     grid: ImageGrid,
     # In:
-    views: Views,
+    views: AnyViews,
     first: int,
     # Out:
     visibility_out: VisibilityBuffer,
@@ -167,14 +168,14 @@ def clear_visibility_kernel(
         visibility_out.blocks[view] = 0
 
 
-@wp.kernel
+@kernel_of_views
 def rasterize_triangles_kernel(
     # Scene:
     meshes: Meshes,
     grid: ImageGrid,
     # In:
     bodies: ViewBodies,
-    views: Views,
+    views: AnyViews,
     threads: int,
     first: int,
     # Out:
@@ -215,14 +216,14 @@ def rasterize_triangles_kernel(
                 rasterize_footprint(visibility_inout, amodal_inout, views.cameras, view, pixels, triangle, footprint, low_half, bit)
 
 
-@wp.kernel
+@kernel_of_views
 def rasterize_blocks_kernel(
     # Scene:
     meshes: Meshes,
     grid: ImageGrid,
     # In:
     bodies: ViewBodies,
-    views: Views,
+    views: AnyViews,
     threads: int,
     first: int,
     # Out:
@@ -267,7 +268,7 @@ def resolve_hit(meshes: Meshes, bodies: ViewBodies, view: int, instances: int, k
     return hit
 
 
-@wp.kernel
+@kernel_of_views
 def resolve_visibility_kernel(
     # Scene:
     meshes: Meshes,
@@ -277,7 +278,7 @@ def resolve_visibility_kernel(
     # In:
     bodies: ViewBodies,
     visibility: VisibilityBuffer,
-    views: Views,
+    views: AnyViews,
     counts_per_meter: float,
     first: int,
     # Out:

@@ -6,7 +6,7 @@ rays are those of `camera.camera_ray`, so that both agree.
 
 import warp as wp
 
-from synpick_warp.kernels.render.visibility.camera import NEAR_PLANE, PIXEL_CENTER, ImageGrid, ViewCameras, lens_of
+from synpick_warp.kernels.render.visibility.camera import NEAR_PLANE, PIXEL_CENTER, AnyCameras, ImageGrid, lens_of
 from synpick_warp.kernels.render.visibility.gbuffer import Meshes, ViewBodies
 from synpick_warp.kernels.render.visibility.lens import BEND, distort
 
@@ -111,7 +111,7 @@ def edge_line(start: wp.vec2, end: wp.vec2, sense: float, margin: float) -> wp.v
 
 
 @wp.func
-def find_footprint(grid: ImageGrid, cameras: ViewCameras, view: int, triangle: Triangle) -> Footprint:
+def find_footprint(grid: ImageGrid, cameras: AnyCameras, view: int, triangle: Triangle) -> Footprint:
     """Project a triangle and compute its conservative footprint, clipped to the image.
 
     A lens bends the edges: the image lies within bend D² / 6 of that of the corners, D the longest edge in the normalised plane.

@@ -7,9 +7,9 @@ from synpick_warp.kernels.render.visibility.camera import (
     PIXEL_CENTER,
     TILE_HEIGHT,
     TILE_WIDTH,
+    AnyViews,
     Cameras,
     ImageGrid,
-    Views,
     camera_ray,
     lens_of,
     projected_box,
@@ -17,6 +17,7 @@ from synpick_warp.kernels.render.visibility.camera import (
 from synpick_warp.kernels.render.visibility.gbuffer import FAR, FIXTURES, Meshes, ViewBodies, fixture_mesh
 from synpick_warp.kernels.render.visibility.lens import STRETCH
 from synpick_warp.kernels.render.visibility.ray_bodies import write_ray_body
+from synpick_warp.kernels.render.visibility.variants import kernel_of_views
 
 wp.set_module_options({"enable_backward": False})
 
@@ -24,10 +25,10 @@ TILE_RADIUS = wp.constant(5.5)
 """Largest distance of a tile's rays from its central ray [px]: half the diagonal, 4.5, plus the offsets of colour samples."""
 
 
-@wp.kernel
+@kernel_of_views
 def aim_views_kernel(
     # Out:
-    views_inout: Views,
+    views_inout: AnyViews,
 ):
     """Set the camera of each view: 0, or -1 where the view is unused (world -1). Launched over view."""
     view = wp.tid()
@@ -36,12 +37,12 @@ def aim_views_kernel(
         views_inout.camera[view] = -1
 
 
-@wp.kernel
+@kernel_of_views
 def aim_cameras_kernel(
     # Scene:
     cameras: Cameras,
     # Out:
-    views_inout: Views,
+    views_inout: AnyViews,
 ):
     """Set the camera of each view that is in use. Launched over view."""
     view = wp.tid()
@@ -55,7 +56,7 @@ def aim_cameras_kernel(
             views_inout.cameras.lens[view] = cameras.lens[camera]
 
 
-@wp.kernel
+@kernel_of_views
 def set_up_views_kernel(
     # Scene:
     meshes: Meshes,
@@ -67,7 +68,7 @@ def set_up_views_kernel(
     fixture_pose: wp.array2d[wp.transformf],  # (world, fixture) [m]
     fixture_visible: wp.array2d[int],  # (world, fixture)
     # In:
-    views: Views,
+    views: AnyViews,
     # Out:
     bodies_out: ViewBodies,
 ):
@@ -173,13 +174,13 @@ def hits_box(lower: wp.vec3, upper: wp.vec3, start: wp.vec3, direction: wp.vec3)
     return enter <= leave
 
 
-@wp.kernel
+@kernel_of_views
 def bin_bodies_kernel(
     # Scene:
     meshes: Meshes,
     grid: ImageGrid,
     # In:
-    views: Views,
+    views: AnyViews,
     # Out:
     bodies_inout: ViewBodies,
 ):

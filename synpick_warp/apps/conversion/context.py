@@ -11,6 +11,7 @@ from synpick_warp.dataset.object_names import object_names
 from synpick_warp.errors import DatasetError
 from synpick_warp.exporters.base import ExportContext
 from synpick_warp.exporters.writing.pool import WriterPool
+from synpick_warp.scenes.looks import Looks
 from synpick_warp.scenes.types import Catalog, EnvironmentMap
 
 
@@ -31,22 +32,24 @@ class StoredContext(ExportContext):
         self._source = source
 
     @cached_property
-    def _assets(self) -> tuple[Catalog, tuple[EnvironmentMap, ...]]:
-        """Objects and lights of the source, loaded again: its models are rounded to millimetres in single precision.
+    def _assets(self) -> tuple[Catalog, tuple[EnvironmentMap, ...], Looks | None]:
+        """Objects, lights and textures of the source, loaded again: its models are rounded to millimetres in single precision.
 
         Raises:
             DatasetError: They are not those that it was baked from.
         """
         from synpick_warp.dataset.commit.digests import digest_inputs
         from synpick_warp.scenes.catalog import load_catalog
+        from synpick_warp.scenes.looks import load_looks
         from synpick_warp.stages.render.lamp_variants import load_scene_lights
 
         source, config = self._source, self._source.config
         catalog = load_catalog(config)
         lights = load_scene_lights(config.bake.lights, config.randomize, config.bake.seed, lambda line: None)
-        if any(source.inputs.get(name) != digest for name, digest in digest_inputs(catalog, lights).items()):
-            raise DatasetError(f"the objects or lights of {source.folder} have changed since its bake, but are needed; restore them")
-        return catalog, lights
+        looks = load_looks(config.randomize, lambda line: None)
+        if any(source.inputs.get(name) != digest for name, digest in digest_inputs(catalog, lights, looks).items()):
+            raise DatasetError(f"objects, lights or textures of {source.folder} have changed since its bake, but are needed; restore them")
+        return catalog, lights, looks
 
     @property
     def catalog(self) -> Catalog:
@@ -57,6 +60,11 @@ class StoredContext(ExportContext):
     def lights(self) -> tuple[EnvironmentMap, ...]:
         """Environment maps of the data set, loaded on first use. See `ExportContext`."""
         return self._assets[1]
+
+    @property
+    def looks(self) -> Looks | None:
+        """What episodes draw their looks from, loaded on first use. See `ExportContext`."""
+        return self._assets[2]
 
     @property
     def names(self) -> dict[int, str]:

@@ -14,7 +14,7 @@ from synpick_warp.configs.schema import Config
 from synpick_warp.configs.write import config_to_toml, format_toml
 from synpick_warp.system.codecs.tables import Table
 
-SHOWN_TABLES = ("groups", "paper", "attempts", "depth")
+SHOWN_TABLES = ("groups", "paper", "attempts", "depth", "looks")
 """Tables of `statistics.tables` that are shown as they are."""
 UNKNOWN = "–"
 
@@ -42,7 +42,7 @@ _SUCCESSES = {outcome.name.lower() for outcome in Outcome if outcome.succeeded}
 
 
 def statistics_tables(statistics: Statistics) -> Html:
-    """HTML of SHOWN_TABLES: views by split and mode, comparison with the paper, attempts and seals, quantiles of depth."""
+    """HTML of SHOWN_TABLES: views by split and mode, comparison with the paper, attempts and seals, quantiles of depth and of looks."""
     return join(_table(table) for table in make_tables(statistics) if table.name in SHOWN_TABLES and table.rows)
 
 

@@ -12,6 +12,7 @@ from synpick_warp.apps.statistics.counting import Group
 from synpick_warp.apps.statistics.coverage import Coverage
 from synpick_warp.apps.statistics.depth import Depth
 from synpick_warp.apps.statistics.lights import Lights
+from synpick_warp.apps.statistics.looks import LookStatistics
 from synpick_warp.apps.statistics.paper import Comparison, compare
 from synpick_warp.apps.statistics.timeline import TimePoint
 from synpick_warp.configs.schema import Config
@@ -56,8 +57,8 @@ class ObjectStatistics:
 
 @dataclass(frozen=True)
 class Statistics:
-    """Statistics of a data set: groups and total, objects, depth, lights (None: not read), comparison with the paper, and what
-    is missing.
+    """Statistics of a data set: groups and total, objects, depth, lights (None: not read), comparison with the paper, what is
+    missing, and looks.
     """
 
     cameras: int
@@ -74,6 +75,8 @@ class Statistics:
     """Groups that the paper has, too."""
     missing: tuple[str, ...]
     """What the data set does not have, a sentence each."""
+    looks: tuple[LookStatistics, ...] = ()
+    """By part and parameter; none: looks are not randomized."""
 
     @property
     def has_paper_objects(self) -> bool:
@@ -137,7 +140,7 @@ def assemble(data_set: DataSet, collected: Collected) -> Statistics:
         missing.append("no attempts: no episode picks, so there are neither outcomes nor seal forces")
     if any(row.distance is None for row in paper):
         missing.append(OTHER_OBJECTS)
-    return Statistics(data_set.camera_count, rows, total, objects, depth, lights, paper, tuple(missing))
+    return Statistics(data_set.camera_count, rows, total, objects, depth, lights, paper, tuple(missing), partial.looks.result())
 
 
 def _objects(data_set: DataSet, collected: Collected, total: Annotations) -> tuple[ObjectStatistics, ...]:

@@ -13,6 +13,7 @@ from synpick_warp.apps.statistics.counting import Group
 from synpick_warp.apps.statistics.coverage import CoverageCounts
 from synpick_warp.apps.statistics.depth import DepthCounts
 from synpick_warp.apps.statistics.lights import LightCounts
+from synpick_warp.apps.statistics.looks import LookCounts
 from synpick_warp.apps.statistics.records import AttemptFacts, EpisodeFacts
 from synpick_warp.apps.statistics.scenes import SceneTruth, read_scene
 from synpick_warp.apps.statistics.timeline import TimelineCounts
@@ -35,6 +36,7 @@ class Partial:
     coverage: CoverageCounts = field(default_factory=CoverageCounts)
     depth: DepthCounts = field(default_factory=DepthCounts)
     lights: LightCounts = field(default_factory=LightCounts)
+    looks: LookCounts = field(default_factory=LookCounts)
 
     def merge(self, other: Partial) -> None:
         """Add the counts of another part. The order of merges does not change the result.
@@ -57,6 +59,7 @@ class Partial:
         row = check_content(known.row, EpisodeFacts, source)
         attempts = [check_content(attempt, AttemptFacts, source) for attempt in known.attempts]
         self.episodes.add_episode(group_of(data_set, episode, row), row, attempts)
+        self.looks.add_episode(row.looks)
         return row
 
     def add_scene(self, data_set: DataSet, episode: int, camera: int, depth_frames: Sequence[int] = ()) -> None:

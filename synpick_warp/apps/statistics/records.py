@@ -14,8 +14,14 @@ MAX_NAME = 256
 Name = Annotated[str, Meta(max_length=MAX_NAME)]
 
 
+LookFacts = dict[Name, Length | list[Length] | Name]
+"""Parameters of a body that an episode has drawn."""
+Looks = dict[Name, Length | LookFacts | list[LookFacts]]
+"""An episode's looks, as its row has them."""
+
+
 class EpisodeFacts(msgspec.Struct):
-    """Manifest row of an episode: mode, frames, ending and object counts."""
+    """Manifest row of an episode: mode, frames, ending, object counts and looks."""
 
     mode: Name
     frames: Index
@@ -23,6 +29,8 @@ class EpisodeFacts(msgspec.Struct):
     objects: Index = 0
     picked: Index = 0
     lost: Annotated[int, Meta(ge=-(2**31), lt=2**31)] = 0
+    looks: Looks = {}
+    """Empty: they are not randomized."""
 
 
 class AttemptFacts(msgspec.Struct):

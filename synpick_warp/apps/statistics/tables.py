@@ -10,6 +10,7 @@ from synpick_warp.apps.statistics.attempts import FORCE_BIN, FORCE_BINS
 from synpick_warp.apps.statistics.compute import GroupStatistics, Statistics
 from synpick_warp.apps.statistics.coverage import BANDS, SECTORS
 from synpick_warp.apps.statistics.lights import YAW_BINS
+from synpick_warp.apps.statistics.looks import QUANTILES
 from synpick_warp.apps.statistics.paper import read_paper
 from synpick_warp.system.codecs.tables import Column, Table, Value
 
@@ -43,6 +44,7 @@ def make_tables(statistics: Statistics) -> list[Table]:
         _lights,
         _yaw,
         _exposure,
+        _looks,
         _coverage,
     )
     return [table for table in (make(statistics) for make in makers) if table.rows]
@@ -256,6 +258,18 @@ def _exposure(statistics: Statistics) -> Table:
     rows: list[tuple[Value, ...]] = list(statistics.lights.exposure.items()) if statistics.lights else []
     columns = (Column("from_EV", ".1f"), Column("episodes", ","))
     return Table("light_exposure", "Episodes by exposure compensation [EV]", columns, rows, in_text=False)
+
+
+def _looks(statistics: Statistics) -> Table:
+    """Table of what episodes have drawn, by part and parameter; empty if looks are not randomized."""
+    columns = (
+        Column("part"),
+        Column("parameter"),
+        Column("draws", ","),
+        *(Column(f"quantile_{share}", ".3g", f"{share:.0%}") for share in QUANTILES),
+    )
+    rows: list[tuple[Value, ...]] = [(row.part, row.parameter, row.draws, *row.quantiles) for row in statistics.looks]
+    return Table("looks", "Randomized looks: quantiles of what episodes have drawn", columns, rows)
 
 
 def _coverage(statistics: Statistics) -> Table:

@@ -1,7 +1,8 @@
-"""Commands `preview` and `explain`: a contact sheet of sampled views, and figures of pick attempts."""
+"""Commands `preview` and `explain`: contact sheets, symmetries and cells, and figures of pick attempts."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
@@ -12,6 +13,7 @@ from synpick_warp.cli.folders import beside, check_output_file, find_data_set, h
 from synpick_warp.cli.options import WholeNumber
 from synpick_warp.configs.load import load_config
 from synpick_warp.configs.objects import AUTO_UNIT, DECLARED, DETECT
+from synpick_warp.configs.schema import Config
 from synpick_warp.errors import ConfigError, escape
 
 
@@ -32,8 +34,21 @@ def preview(
     config: Annotated[
         str | None, Parameter(help="Settings of a folder of models (unit, object table, tolerance): a preset or .toml file.")
     ] = None,
+    cell: Annotated[
+        str | None,
+        Parameter(
+            name="--cell",
+            help="Draw the cell of these settings instead, a preset or .toml file, before anything is simulated: from outside with the "
+            "frusta of the cameras, bins and gripper, and from each camera (default of --out: the file's name with .png).",
+        ),
+    ] = None,
 ) -> int:
     """Draw a contact sheet: colour, depth, instance masks, bounding boxes and layers of sampled views."""
+    if cell is not None:
+        others = {"DIR": folder, "--symmetries": symmetries or None, "--config": config}
+        if beside_it := [name for name, value in others.items() if value is not None]:
+            raise ConfigError(f"{beside_it[0]} is given beside --cell, which draws settings; allowed: one of both")
+        return _preview_cell(cell, out)
     if symmetries:
         return _preview_symmetries(folder, out, config)
     if config is not None:
@@ -81,6 +96,27 @@ def _preview_symmetries(folder: Path | None, out: Path | None, config: str | Non
     write_symmetry_sheet(read_objects(resolved, report), resolved.objects.symmetry_tolerance, sheet, report)
     print(f"symmetries: {escape(str(sheet))}")
     return 0
+
+
+def _preview_cell(cell: str, out: Path | None) -> int:
+    """Draw the cell of settings."""
+    sheet = out or Path(cell).with_suffix(".png")
+    from synpick_warp.apps.viz.drawing import check_picture_name
+
+    check_picture_name(sheet)
+    check_output_file(sheet, "--out", inputs=[Path(cell)])
+    draw_cell(load_config(cell), Path(cell).name, sheet)
+    print(f"cell: {escape(str(sheet))}")
+    return 0
+
+
+def draw_cell(config: Config, name: str, out: Path, say: Callable[[str], str] = escape) -> None:
+    """Draw a cell, with the progress on the console; `say` words notes; other arguments and errors as of `write_cell_sheet`."""
+    from synpick_warp.apps.viz.cell.sheet import write_cell_sheet
+    from synpick_warp.cli.display import make_console, make_progress
+
+    with make_progress(make_console()) as progress:
+        write_cell_sheet(config, name, out, progress, lambda note: progress.note(say(note)))
 
 
 def explain(

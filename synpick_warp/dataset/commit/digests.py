@@ -17,9 +17,10 @@ from synpick_warp.scenes.types import Catalog, EnvironmentMap
 
 
 def digest_inputs(catalog: Catalog, lights: tuple[EnvironmentMap, ...], looks: Looks | None = None) -> dict[str, str]:
-    """Digests of the content of objects, lights and textures, if any, without the names of their files: the manifest's INPUTS."""
-    textures = {"textures": _digest_data((looks.bin_textures, looks.table_textures))} if looks and looks.all_textures else {}
-    return {"objects": _digest_data(catalog), "lights": _digest_data(lights)} | textures
+    """Digests of the content of objects, lights, distractors and textures, without the names of their files: the manifest's INPUTS."""
+    textures = {"textures": _digest_data(tuple(looks.textures.values()))} if looks and looks.all_textures else {}
+    distractors = {"distractors": _digest_data(catalog.distractors)} if catalog.distractors else {}
+    return {"objects": _digest_data(catalog), "lights": _digest_data(lights)} | distractors | textures
 
 
 def _digest_data(value: object) -> str:
@@ -31,7 +32,7 @@ def _digest_data(value: object) -> str:
 
 
 def _parts(value: object) -> Iterator[bytes]:
-    """Serialize dataclasses, tuples, arrays and plain values; paths are left out."""
+    """Serialize dataclasses, tuples, arrays and plain values; paths, and fields that are not hashed, are left out."""
     if isinstance(value, np.ndarray):
         yield f"{value.dtype.str}{value.shape}".encode()
         yield np.ascontiguousarray(value).tobytes()
@@ -40,7 +41,7 @@ def _parts(value: object) -> Iterator[bytes]:
         for part in value:
             yield from _parts(part)
     elif dataclasses.is_dataclass(value):
-        for item in dataclasses.fields(value):
+        for item in (item for item in dataclasses.fields(value) if item.hash is not False):
             yield item.name.encode()
             yield from _parts(getattr(value, item.name))
     elif not isinstance(value, Path):

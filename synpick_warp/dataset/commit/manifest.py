@@ -62,6 +62,8 @@ FREE_SETTINGS = (
     "bake.lights",
     "randomize.bin_textures",
     "randomize.table_textures",
+    "randomize.background_textures",
+    "randomize.distractor_models",
     "bake.writers",
     "render.views_per_batch",
     "perception.views",
@@ -88,6 +90,7 @@ YOUNGER_SETTINGS: dict[str, Any] = {
     "depth_sensor.ambient": 0.25,
     "depth_sensor.infrared_noise": 0.005,
     "perception.camera": "",
+    "render.table_size": (0.0, 0.0),
     "camera": [],
     "bin": [],
     "objects.unit": AUTO_UNIT,
@@ -208,7 +211,7 @@ def read_settings(folder: Path, manifest: Mapping[str, Any]) -> Config:
     path = path_inside(folder, CONFIG_FILE, folder, DatasetError)
     check_regular_file(path, MAX_TOML, DatasetError)
     settings = manifest["settings"]
-    younger = {key: value for key, value in YOUNGER_SETTINGS.items() if "." in key}
+    younger = {key: value for key, value in YOUNGER_SETTINGS.items() if "." in key and key not in FREE_SETTINGS}
     before = {key: value for key, value in younger.items() if key.split(".")[1] not in settings.get(key.split(".")[0], {})}
     config = override_config(load_config(str(path), {}), before)
     said = describe_differences({"settings": make_manifest(config)["settings"]}, {"settings": settings})

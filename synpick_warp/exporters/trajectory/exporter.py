@@ -61,7 +61,7 @@ class TrajectoryExporter(EpisodeExporter[_Content]):
             trajectory=settings.trajectory,
             step=settings.physics.step,
             steps_per_tick=settings.physics.steps_per_tick,
-            masses={entry.obj_id: entry.mass for entry in context.catalog.entries},
+            masses={body.obj_id: body.mass for body in context.catalog.bodies},
         )
 
     @staticmethod
@@ -117,7 +117,7 @@ class TrajectoryExporter(EpisodeExporter[_Content]):
         drop_pose = batch.tick["drop_pose"][world, :instances].copy() if "drop_pose" in batch.tick else None
         object_id = batch.object_id[world, :instances].copy()
         if drop_pose is not None:
-            drop_pose[object_id < 0] = np.nan
+            drop_pose[object_id == -1] = np.nan
         row = batch_type(batch, instances, self._settings.steps_per_tick)
         return _Content(row, initial, object_id, drop_pose)
 

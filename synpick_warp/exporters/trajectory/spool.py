@@ -100,7 +100,7 @@ def make_rows(batch: TickBatch, row: np.dtype, instances: int) -> np.ndarray:
             values = values[(slice(None),) * axis + (slice(instances),)]
         rows[name] = values
     # The buffer's content for an absent instance depends on the world's earlier episodes.
-    rows["ticks/pose"][rows["ticks/object_id"] < 0] = np.nan
+    rows["ticks/pose"][rows["ticks/object_id"] == -1] = np.nan
     return rows
 
 
@@ -142,5 +142,5 @@ def read_rows(path: Path, row: np.dtype, count: int) -> np.ndarray:
 
 def count_instances(batch: TickBatch, world: int) -> int:
     """Size of a world's instance dimension: 1 + the largest index of an instance at its first frame."""
-    present = np.flatnonzero(batch.object_id[world] >= 0)
+    present = np.flatnonzero(batch.object_id[world] != -1)
     return int(present[-1]) + 1 if present.size else 0

@@ -13,7 +13,7 @@ from zarr.codecs import ZstdCodec
 
 from synpick_warp.configs.schema import Physics, Trajectory
 from synpick_warp.exporters.trajectory.arrays import CAMERAS, CONSTANT_GROUPS, EPISODES, FORMAT, LABELS, OBJECTS, ArraySpec, GroupSpec
-from synpick_warp.scenes.types import Camera, Catalog, EnvironmentMap
+from synpick_warp.scenes.types import FIRST_DISTRACTOR, Camera, Catalog, EnvironmentMap
 from synpick_warp.system.processes.threads import ZARR_THREADS
 
 zarr.config.set(ZARR_THREADS)
@@ -78,6 +78,12 @@ def chunk_layout(settings: Trajectory, ticks: int, rows_per_tick: int) -> tuple[
     return chunk, chunks * chunk
 
 
+def _describe_distractors(catalog: Catalog) -> dict[str, Any]:
+    """Attribute of the root on objects without labels: what their ids mean, and their names."""
+    text = f"Objects without labels, by the object_id that they have in the arrays: {FIRST_DISTRACTOR} and below."
+    return {"description": text, "names": {str(body.obj_id): body.name for body in catalog.distractors}}
+
+
 def constant_places(store: Path) -> list[Path]:
     """Files and folders of the store that all episodes share."""
     return [store / "zarr.json", *(store / name for name in CONSTANT_GROUPS), store / EPISODES / "zarr.json"]
@@ -126,6 +132,7 @@ def write_constants(
             "gravity": physics.gravity,
             "units": {"step": "s", "gravity": "m/s²"},
             "lights": [light.name for light in lights],
+            **({"distractors": _describe_distractors(catalog)} if catalog.distractors else {}),
         },
     )
     entries = catalog.entries

@@ -6,15 +6,16 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 from pxr import Gf, Usd, UsdGeom, UsdShade
 
-from synpick_warp.configs.schema import Gripper, Physics
+from synpick_warp.codes import LookPart
+from synpick_warp.configs.schema import Gripper, Physics, Render
 from synpick_warp.exporters.usd.lights import write_light_maps
 from synpick_warp.exporters.usd.parts import (
-    TEXTURES,
     add_body,
     add_collider,
     add_friction,
@@ -23,13 +24,13 @@ from synpick_warp.exporters.usd.parts import (
     add_surface,
     make_collider,
     new_asset,
-    object_asset,
     save_layer,
     write_texture,
 )
-from synpick_warp.exporters.usd.types import bin_asset
+from synpick_warp.exporters.usd.types import TEXTURES, bin_asset, drawn_texture, object_asset
 from synpick_warp.scenes.bins import Bin
 from synpick_warp.scenes.gripper import cup_collider, cup_fixture, finger_collider, finger_fixture, rod_inertia
+from synpick_warp.scenes.looks import Looks, project_from_box
 from synpick_warp.scenes.tote import TABLE_ROUGHNESS, TABLE_SIZE
 from synpick_warp.scenes.types import Catalog, CatalogEntry, ConvexPiece, EnvironmentMap, Fixture, Material, TriangleMesh
 
@@ -39,11 +40,12 @@ def write_library(
     bins: Sequence[Bin],
     gripper: Gripper,
     physics: Physics,
-    table_color: tuple[float, float, float] | None,
+    render: Render,
     catalog: Catalog,
     lights: tuple[EnvironmentMap, ...],
+    looks: Looks | None,
 ) -> None:
-    """Write all assets into an existing folder, replacing existing ones.
+    """Write all assets into an existing folder, replacing existing ones; with `looks`, the textures that episodes draw from, too.
 
     Raises:
         OSError: A file cannot be written.
@@ -52,12 +54,13 @@ def write_library(
     for name in (TEXTURES, "lights"):
         (library / name).mkdir(exist_ok=True)
     write_light_maps(library, lights)
-    for entry in catalog.entries:
+    for entry in catalog.bodies:
         _write_object(library, physics, entry)
     for one in bins:
         if one.sizes.is_visible:
             name = bin_asset(one.sizes)
-            _save(library, name, _make_fixture(library, physics, name, one.fixture, one.pieces))
+            mesh = project_from_box(one.fixture.mesh) if looks and looks.bin_textures else one.fixture.mesh
+            _save(library, name, _make_fixture(library, physics, name, replace(one.fixture, mesh=mesh), one.pieces))
     finger = _make_fixture(library, physics, "finger", finger_fixture(gripper), (finger_collider(gripper),))
     length, mass = gripper.finger_length, gripper.finger_mass
     add_body(finger.GetDefaultPrim(), mass, np.array([0.0, 0.0, length / 2]), np.diag(rod_inertia(mass, length)), kinematic=True)
@@ -66,7 +69,11 @@ def write_library(
     length, mass = gripper.cup_length, gripper.cup_mass
     add_body(cup.GetDefaultPrim(), mass, np.array([0.0, 0.0, -length / 2]), np.diag(rod_inertia(mass, length)), kinematic=True)
     _save(library, "cup", cup)
-    _write_table(library, physics, bins[0].sizes.base, table_color)
+    textures = {} if looks is None else {LookPart.BIN: looks.bin_textures, LookPart.TABLE: looks.table_textures}
+    for part, images in textures.items():
+        for index, texture in enumerate(images):
+            write_texture(library, drawn_texture(part, index), texture)
+    _write_table(library, physics, bins[0].sizes.base, render, bool(textures.get(LookPart.TABLE)))
 
 
 def _save(library: Path, name: str, stage: Usd.Stage) -> None:
@@ -77,11 +84,12 @@ def _save(library: Path, name: str, stage: Usd.Stage) -> None:
 def _write_object(library: Path, physics: Physics, entry: CatalogEntry) -> None:
     """Write an object's asset: mesh, material, collision shapes and mass properties, as a dynamic rigid body."""
     name = object_asset(entry.obj_id)
-    stage = new_asset(name, entry.name)
+    stage = new_asset(name, entry.name if entry.obj_id >= 0 else "")
     root = stage.GetDefaultPrim()
     root.SetDisplayName(entry.name)
-    add_property(root, "obj_id", entry.obj_id)
-    _add_shapes(stage, physics, entry.mesh, entry.material, write_texture(library, name, entry.material), entry.pieces)
+    if entry.obj_id >= 0:
+        add_property(root, "obj_id", entry.obj_id)
+    _add_shapes(stage, physics, entry.mesh, entry.material, write_texture(library, name, entry.material.texture), entry.pieces)
     add_body(root, entry.mass, entry.center_of_mass, entry.inertia, kinematic=False)
     _save(library, name, stage)
 
@@ -89,7 +97,7 @@ def _write_object(library: Path, physics: Physics, entry: CatalogEntry) -> None:
 def _make_fixture(library: Path, physics: Physics, name: str, fixture: Fixture, pieces: tuple[ConvexPiece, ...]) -> Usd.Stage:
     """Stage of a fixture's asset: mesh, material and collision shapes; not saved."""
     stage = new_asset(name, name)
-    _add_shapes(stage, physics, fixture.mesh, fixture.material, write_texture(library, name, fixture.material), pieces)
+    _add_shapes(stage, physics, fixture.mesh, fixture.material, write_texture(library, name, fixture.material.texture), pieces)
     return stage
 
 
@@ -104,22 +112,24 @@ def _add_shapes(
         add_collider(stage, f"{root}/Collision/piece_{index:02d}", piece, friction, physics.gap)
 
 
-def _write_table(library: Path, physics: Physics, height: float, color: tuple[float, float, float] | None) -> None:
+def _write_table(library: Path, physics: Physics, height: float, render: Render, has_textures: bool) -> None:
     """Write the table under the bins: a collision box, and a visible top side.
 
     Args:
         library: Folder of the assets.
         physics: Friction and contact gap.
         height: z of the top side [m].
-        color: sRGB base colour of the top side; None: the table is not rendered.
+        render: Whether the table is rendered, its size and colour.
+        has_textures: Whether texture coordinates are metres; else they span the table.
     """
     stage = new_asset("table", "table")
     root, friction = _add_contact_material(stage, physics)
-    if color is not None:
-        corners = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]]) * np.array(TABLE_SIZE) + [0.0, 0.0, height]
-        uv = np.array([[0, 0], [1, 0], [1, 1], [0, 1]], np.float32)
+    if render.table:
+        sides = [0.5 * size or most for size, most in zip(render.table_size, TABLE_SIZE[:2], strict=True)]
+        corners = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]]) * np.array([*sides, TABLE_SIZE[2]]) + [0.0, 0.0, height]
+        uv = corners[:, :2] if has_textures else np.array([[0, 0], [1, 0], [1, 1], [0, 1]], np.float32)
         quad = TriangleMesh(corners, np.array([[0, 1, 2], [0, 2, 3]]), np.tile([0.0, 0.0, 1.0], (4, 1)), uv)
-        material = Material(color, None, 0.0, TABLE_ROUGHNESS)
+        material = Material(render.table_color, None, 0.0, TABLE_ROUGHNESS)
         add_mesh(stage, f"{root}/Visual", quad, add_surface(stage, f"{root}/Materials/Surface", material, None))
     UsdGeom.Scope.Define(stage, f"{root}/Collision")
     box = UsdGeom.Cube.Define(stage, f"{root}/Collision/box")

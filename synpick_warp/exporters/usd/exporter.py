@@ -13,10 +13,12 @@ from synpick_warp.exporters.staging import EpisodeExporter, StagedEpisode
 from synpick_warp.exporters.usd.episode import write_episode
 from synpick_warp.exporters.usd.lights import make_stage_light
 from synpick_warp.exporters.usd.spool import TickSpool, tick_rows
-from synpick_warp.exporters.usd.types import EpisodeMetadata, EpisodeSettings, bin_asset
+from synpick_warp.exporters.usd.types import AssetSurface, EpisodeMetadata, EpisodeSettings, bin_asset, object_asset
 from synpick_warp.exporters.writing.files import output_errors
 from synpick_warp.exporters.writing.pool import WriteTask
 from synpick_warp.scenes.bins import make_bins
+from synpick_warp.scenes.tote import TABLE_ROUGHNESS
+from synpick_warp.scenes.types import Material
 from synpick_warp.views.frames import EpisodeEnd, TickBatch
 
 FOLDER = Path("usd")
@@ -53,9 +55,9 @@ class UsdExporter(EpisodeExporter[TickSpool]):
         with output_errors(library):
             for folder in (library.parent, library):
                 folder.mkdir(exist_ok=True)
-            settings, render = context.settings, context.settings.render
-            color = render.table_color if render.table else None
-            write_library(library, make_bins(settings.bins), settings.gripper, settings.physics, color, context.catalog, context.lights)
+            settings = context.settings
+            assets = (context.catalog, context.lights, context.looks)
+            write_library(library, make_bins(settings.bins), settings.gripper, settings.physics, settings.render, *assets)
         return [LIBRARY]
 
     def write_ticks(self, batch: TickBatch) -> None:
@@ -90,8 +92,17 @@ class UsdExporter(EpisodeExporter[TickSpool]):
             bins=tuple(bin_asset(sizes) if sizes.is_visible else None for sizes in settings.bins),
             cameras=context.cameras,
             lights=tuple(make_stage_light(index, light, settings.render.exposure) for index, light in enumerate(context.lights)),
-            names={entry.obj_id: entry.name for entry in context.catalog.entries},
+            names={body.obj_id: body.name for body in context.catalog.bodies},
+            surfaces=self._surfaces() if context.looks else {},
         )
+
+    def _surfaces(self) -> dict[str, AssetSurface]:
+        """Materials of the objects, bins and the table, by asset."""
+        settings, bodies = self._context.settings, self._context.catalog.bodies
+        materials = {object_asset(body.obj_id): body.material for body in bodies}
+        materials |= {bin_asset(one.sizes): one.fixture.material for one in make_bins(settings.bins)}
+        materials["table"] = Material(settings.render.table_color, None, 0.0, TABLE_ROUGHNESS)
+        return {name: AssetSurface.of(name, material) for name, material in materials.items()}
 
 
 def _make_spool(instances: int, folder: Path) -> TickSpool:

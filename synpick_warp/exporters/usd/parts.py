@@ -17,13 +17,12 @@ import numpy as np
 from pxr import Gf, Kind, Sdf, Tf, Usd, UsdGeom, UsdPhysics, UsdSemantics, UsdShade, Vt
 
 from synpick_warp.errors import OutputError
+from synpick_warp.exporters.usd.types import texture_file
 from synpick_warp.exporters.writing.files import write_synced
 from synpick_warp.exporters.writing.png import encode_png
 from synpick_warp.scenes.assets.appearance import srgb_to_linear
 from synpick_warp.scenes.types import ConvexPiece, Material, TriangleMesh
 
-TEXTURES = "textures"
-"""Folder of textures in the asset library."""
 CLASS = "class"
 """Taxonomy of semantic class labels."""
 USER = "userProperties:"
@@ -32,19 +31,15 @@ _PROPERTY_TYPES = {int: Sdf.ValueTypeNames.Int, float: Sdf.ValueTypeNames.Float,
 _SYSTEM_REASON = re.compile(r"writing file: ([^']+)'")
 
 
-def object_asset(obj_id: int) -> str:
-    """Name of an object's asset: stem of its file, and name of its root prim."""
-    return f"obj_{obj_id:06d}"
-
-
 def new_asset(name: str, label: str) -> Usd.Stage:
-    """Create a stage in memory whose root /NAME is a component with a class label."""
+    """Create a stage in memory whose root /NAME is a component with a class label; empty: without one."""
     stage = Usd.Stage.CreateInMemory()
     set_units(stage)
     root = UsdGeom.Xform.Define(stage, f"/{name}").GetPrim()
     stage.SetDefaultPrim(root)
     Usd.ModelAPI(root).SetKind(Kind.Tokens.component)
-    add_label(root, CLASS, label)
+    if label:
+        add_label(root, CLASS, label)
     return stage
 
 
@@ -107,11 +102,15 @@ def add_faces(stage: Usd.Stage, path: str, vertices: np.ndarray, faces: np.ndarr
     return prim
 
 
-def add_surface(stage: Usd.Stage, path: str, material: Material, texture: str | None) -> UsdShade.Material:
+def add_surface(
+    stage: Usd.Stage, path: str, material: Material, texture: str | None, gain: float = 1.0, repeats: float = 1.0
+) -> UsdShade.Material:
     """Add a metallic-roughness material (UsdPreviewSurface). The texture repeats, and is multiplied by the base colour in linear light.
 
     Args:
-        texture: File of the material's texture, relative to the asset; None: it has none.
+        texture: File of the material's texture, relative to the layer; None: it has none.
+        gain: Factor on the base colour in linear light.
+        repeats: Factor on texture coordinates.
     """
     surface = UsdShade.Material.Define(stage, path)
     shader = _add_shader(stage, f"{path}/Surface", "UsdPreviewSurface")
@@ -119,7 +118,7 @@ def add_surface(stage: Usd.Stage, path: str, material: Material, texture: str | 
     shader.CreateInput("metallic", Sdf.ValueTypeNames.Float).Set(material.metallic)
     shader.CreateInput("roughness", Sdf.ValueTypeNames.Float).Set(material.roughness)
     color = shader.CreateInput("diffuseColor", Sdf.ValueTypeNames.Color3f)
-    linear = srgb_to_linear(material.color).tolist()
+    linear = (gain * srgb_to_linear(material.color)).tolist()
     if texture is None:
         color.Set(Gf.Vec3f(*linear))
         return surface
@@ -131,18 +130,22 @@ def add_surface(stage: Usd.Stage, path: str, material: Material, texture: str | 
     image.CreateInput("scale", Sdf.ValueTypeNames.Float4).Set(Gf.Vec4f(*linear, 1.0))
     for name in ("wrapS", "wrapT"):
         image.CreateInput(name, Sdf.ValueTypeNames.Token).Set("repeat")
+    if repeats != 1.0:
+        scaled = _add_shader(stage, f"{path}/Scale", "UsdTransform2d")
+        scaled.CreateInput("scale", Sdf.ValueTypeNames.Float2).Set(Gf.Vec2f(repeats))
+        scaled.CreateInput("in", Sdf.ValueTypeNames.Float2).ConnectToSource(reader.CreateOutput("result", Sdf.ValueTypeNames.Float2))
+        reader = scaled
     image.CreateInput("st", Sdf.ValueTypeNames.Float2).ConnectToSource(reader.CreateOutput("result", Sdf.ValueTypeNames.Float2))
     color.ConnectToSource(image.CreateOutput("rgb", Sdf.ValueTypeNames.Float3))
     return surface
 
 
-def write_texture(library: Path, name: str, material: Material) -> str | None:
-    """Write a material's texture into the asset library; returns its path relative to the library, None without texture."""
-    if material.texture is None:
+def write_texture(library: Path, name: str, texture: np.ndarray | None) -> str | None:
+    """Write a texture into the asset library; returns its path relative to the library, None without texture."""
+    if texture is None:
         return None
-    file = f"{TEXTURES}/{name}.png"
-    write_synced(library / file, encode_png(material.texture))
-    return file
+    write_synced(library / texture_file(name), encode_png(texture))
+    return texture_file(name)
 
 
 def add_friction(stage: Usd.Stage, path: str, friction: float) -> UsdShade.Material:

@@ -11,8 +11,9 @@ from __future__ import annotations
 import numpy as np
 from pxr import Gf, Kind, Sdf, Usd, UsdGeom, UsdLux, UsdPhysics, UsdRender
 
-from synpick_warp.exporters.usd.parts import add_label, add_property, object_asset, set_units
-from synpick_warp.exporters.usd.types import EpisodeMetadata, EpisodeSettings, StageLight
+from synpick_warp.exporters.usd.looks import add_looks
+from synpick_warp.exporters.usd.parts import add_label, add_property, set_units
+from synpick_warp.exporters.usd.types import EpisodeMetadata, EpisodeSettings, StageLight, object_asset
 from synpick_warp.scenes.types import Camera
 
 APERTURE = 0.36
@@ -25,6 +26,8 @@ HOLD = 1.0 / 1024.0
 """Time codes before a frame at which a prim leaves for AWAY or comes back, so that it is not seen on its way between two frames."""
 INSTANCE = "instance"
 """Taxonomy of instance labels, and prefix of the objects' prim names."""
+DISTRACTOR = "distractor"
+"""Prefix of the distractors' prim names."""
 ROOT = "/Episode"
 FIXTURES = {"tote": f"{ROOT}/Tote", "finger": f"{ROOT}/Gripper/Finger", "cup": f"{ROOT}/Gripper/Cup"}
 """Asset and prim of each row of `TickBatch.fixture_pose`; a bin that is no tote has the prim BIN."""
@@ -55,9 +58,10 @@ def make_episode_layer(ticks: np.ndarray, metadata: EpisodeMetadata, settings: E
         assets[path] = asset
     pair = UsdPhysics.FilteredPairsAPI.Apply(stage.GetPrimAtPath(FIXTURES["finger"]))
     pair.CreateFilteredPairsRel().SetTargets([FIXTURES["cup"]])
-    for instance in np.flatnonzero((ticks["object_id"] >= 0).any(axis=0)).tolist():
+    for instance in np.flatnonzero((ticks["object_id"] != -1).any(axis=0)).tolist():
         path, obj_id = _add_object(stage, ticks, instance, settings)
         assets[path] = object_asset(obj_id)
+    add_looks(stage, assets, metadata.looks, settings.surfaces)
     for index, camera in enumerate(settings.cameras):
         _add_camera(stage, camera.name or f"camera_{index}", camera)
     first = ticks[0]
@@ -90,13 +94,15 @@ def _add_root(stage: Usd.Stage, metadata: EpisodeMetadata, settings: EpisodeSett
 
 
 def _add_object(stage: Usd.Stage, ticks: np.ndarray, instance: int, settings: EpisodeSettings) -> tuple[str, int]:
-    """Add an instance with its labels and ids; returns its path and its obj_id."""
-    visible = ticks["object_id"][:, instance] >= 0
+    """Add an instance with its labels and ids, or a distractor, which has none; returns its path and its obj_id."""
+    visible = ticks["object_id"][:, instance] != -1
     obj_id = int(ticks["object_id"][visible.argmax(), instance])
-    path = f"{ROOT}/Objects/{INSTANCE}_{instance:02d}"
+    path = f"{ROOT}/Objects/{INSTANCE if obj_id >= 0 else DISTRACTOR}_{instance:02d}"
     shown = np.flatnonzero(visible)
     prim = _add_moving(stage, path, ticks["pose"][:, instance], visible, np.arange(shown[0], shown[-1] + 1))
     prim.SetDisplayName(settings.names[obj_id])
+    if obj_id < 0:
+        return path, obj_id
     add_property(prim, "instance_id", instance)
     add_label(prim, INSTANCE, str(instance))
     primvars = UsdGeom.PrimvarsAPI(prim)

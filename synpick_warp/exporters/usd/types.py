@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any
 
-from synpick_warp.codes import Ending
+from synpick_warp.codes import Ending, LookPart
 from synpick_warp.configs.cell import BinSizes
-from synpick_warp.scenes.types import Camera
+from synpick_warp.scenes.types import FIRST_DISTRACTOR, Camera, Material
 from synpick_warp.views.frames import EpisodeEnd
 
 
@@ -31,6 +33,34 @@ class StageLight:
     """Angular diameter of the sun [°]."""
 
 
+TEXTURES = "textures"
+"""Folder of textures in the asset library."""
+
+
+@dataclass(frozen=True)
+class AssetSurface:
+    """Material of an asset, without the pixels of its texture."""
+
+    material: Material
+    texture: str | None
+    """File of its texture, relative to the asset library; None: it has none."""
+
+    @staticmethod
+    def of(name: str, material: Material) -> AssetSurface:
+        """That of the asset of this name."""
+        return AssetSurface(replace(material, texture=None), None if material.texture is None else texture_file(name))
+
+
+def texture_file(name: str) -> str:
+    """File of a texture, relative to the asset library: that of the asset of this name, or one of those that episodes draw from."""
+    return f"{TEXTURES}/{name}.png"
+
+
+def drawn_texture(part: LookPart, index: int) -> str:
+    """Name of a texture that episodes draw for the bin or the table."""
+    return f"{part.name.lower()}_{index:03d}"
+
+
 @dataclass(frozen=True)
 class EpisodeSettings:
     """Settings common to all episodes: tick rate [1/s], gravity [m/s²], bins, cameras, lights, object names by obj_id."""
@@ -45,6 +75,8 @@ class EpisodeSettings:
     lights: tuple[StageLight, ...]
     names: dict[int, str]
     """obj_id -> name of the object."""
+    surfaces: dict[str, AssetSurface]
+    """Materials by asset, of those that looks are drawn for; empty: looks are not randomized."""
 
 
 @dataclass(frozen=True)
@@ -60,15 +92,23 @@ class EpisodeMetadata:
     """Name of the episode's split; empty: the data set has none."""
     bin: str = ""
     """Name of the bin; empty: a tote that is always in its place."""
+    looks: Mapping[str, Any] = field(default_factory=dict)
+    """Record of the episode's looks; empty: they are not randomized."""
 
     @staticmethod
     def from_end(end: EpisodeEnd) -> EpisodeMetadata:
         """Take the metadata from the episode's end."""
         own = (end.row or {}).get("bin") or {}
         ending = Ending(end.ending).name.lower()
-        return EpisodeMetadata(end.episode, end.arrangement, end.frames, ending, end.row.get("split", ""), own.get("name", ""))
+        looks = end.row.get("looks", {})
+        return EpisodeMetadata(end.episode, end.arrangement, end.frames, ending, end.row.get("split", ""), own.get("name", ""), looks)
 
 
 def bin_asset(sizes: BinSizes) -> str:
     """Name of a bin's asset."""
     return sizes.name if sizes.noun == sizes.name else f"bin_{sizes.name}"
+
+
+def object_asset(obj_id: int) -> str:
+    """Name of an object's asset: stem of its file, and name of its root prim. Distractors are numbered from 0."""
+    return f"obj_{obj_id:06d}" if obj_id >= 0 else f"distractor_{FIRST_DISTRACTOR - obj_id:06d}"

@@ -14,7 +14,7 @@ from synpick_warp.stages.arrays import allocate, device_array
 from synpick_warp.stages.buffers import LayerBuffers, Snapshot, ViewBuffers
 from synpick_warp.stages.launch import launch
 from synpick_warp.stages.online.exchange import DeviceArray, Gate
-from synpick_warp.stages.render.view_setup import make_views
+from synpick_warp.stages.render.view_setup import make_views, with_cameras
 from synpick_warp.stages.timing import scope
 from synpick_warp.stages.view_ring import CameraGroup
 
@@ -35,7 +35,7 @@ class TruthBuffers:
     frame: wp.array = device_array("view", dtype=wp.int32)
     """Frame index within the episode, from 0."""
     object_id: wp.array = device_array("view", "instance", dtype=wp.int32)
-    """obj_id of each instance; -1: the instance is not in the scene."""
+    """obj_id of each instance; -1: the instance is not in the scene; below: a distractor, without label."""
     pose: wp.array = device_array("view", "instance", dtype=wp.transformf, unit="m")
     """Object to world: x, y, z, quaternion x, y, z, w."""
     object_to_camera: wp.array = device_array("view", "instance", dtype=wp.mat44, unit="m")
@@ -105,7 +105,7 @@ class ViewBatch:
             (B, H, W) uint8.
         amodal: Amodal masks as a bit field: bit i is set where the pixel's ray hits instance i, hidden or not (B, H, W) uint32.
         layers: Layers (AOVs) that `render.layers` names, as they are before quantization (B, H, W[, C]); see `synpick_warp.views.layers`.
-        object_id: obj_id of each instance; -1: the instance is not in the scene (B, I) int32.
+        object_id: obj_id of each instance; -1: the instance is not in the scene; below: a distractor, without label (B, I) int32.
         pose: Object to world: x, y, z [m], quaternion x, y, z, w (B, I, 7) float32.
         object_to_camera: The same in the camera's frame, as matrices (B, I, 4, 4) float32 [m].
         pixels: BOP's px_count_all, px_count_valid, px_count_visib (B, I, 3) int32.
@@ -210,6 +210,7 @@ class BatchRing:
         padded[:, :count] = world, camera, self.group.slots(camera)
         slot.lists.assign(padded)
         views = make_views(slot.lists[0], slot.lists[1], count, self.instances, slot=slot.lists[2])
+        views = with_cameras(views, self.renderer.cameras)
         with scope("render", self.device):
             self.renderer.render(snapshot, views, slot.images, slot.layers)
             self._gather(snapshot, views, slot.truth)

@@ -46,7 +46,7 @@ class Segmenter:
         self.merge_strips()
         self.measure_components()
         self.find_largest()
-        self.unpack_largest()
+        self.unpack_largest(scene, catalog_index)
         self.mark_patches()
         self.measure_columns()
         self.measure_rows()
@@ -82,9 +82,12 @@ class Segmenter:
         inputs = [self.flat["segment"], self.flat["area"]]
         self._launch(components.find_largest_kernel, (self.height * self.width,), inputs, [self.scratch.largest_key])
 
-    def unpack_largest(self) -> None:
+    def unpack_largest(self, scene: SceneData, catalog_index: wp.array) -> None:
         """Unpack the labels of the largest components from their keys."""
-        self._launch(components.unpack_largest_kernel, (self.instances,), [self.scratch.largest_key], [self.arrays.largest])
+        views = self.images.views
+        inputs = [scene.catalog, catalog_index, views, self.scratch.largest_key]
+        dim = (views.count, self.instances)
+        wp.launch(components.unpack_largest_kernel, dim=dim, inputs=inputs, outputs=[self.arrays.largest], device=self.device)
 
     def mark_patches(self) -> None:
         """Mark the pixels of the largest components and their neighbours."""

@@ -40,10 +40,12 @@ from synpick_warp.kernels.render.lighting.shadow_filter import LampShadows, filt
 from synpick_warp.kernels.render.lighting.shadows import trace_shadow_rays_kernel
 from synpick_warp.kernels.render.lighting.upsampling import RatioImages
 from synpick_warp.kernels.render.visibility.camera import TILE_PIXELS
+from synpick_warp.kernels.render.visibility.variants import kernel_for
 from synpick_warp.kernels.tuning import CPU_EDGE_THREADS, CPU_FOOTPRINT_THREADS, EDGE_THREADS, FOOTPRINT_THREADS, PIXEL_BLOCK, VIEW_BLOCK
 from synpick_warp.stages.arrays import allocate, allocate_struct, device_array, struct_arrays
 from synpick_warp.stages.buffers import FIXTURES, Snapshot
 from synpick_warp.stages.launch import launch_pixels, launch_views
+from synpick_warp.stages.render.looks import shade_floor
 from synpick_warp.stages.render.reference import make_path_rules
 from synpick_warp.stages.render.sampling_rates import (
     accumulates,
@@ -294,11 +296,11 @@ class DenoisedRenderer:
             return
         options: dict[str, Any] = {"dim": views.count, "device": self.scene.device, "block_dim": VIEW_BLOCK}
         inputs = [snapshot.episode, snapshot.frame, views]
-        wp.launch(advance_history_kernel, inputs=inputs, outputs=[self.history, self.moving], **options)
+        wp.launch(kernel_for(advance_history_kernel, views), inputs=inputs, outputs=[self.history, self.moving], **options)
         inputs = [self.scene.meshes, snapshot.bin, snapshot.catalog_index, snapshot.pose, snapshot.fixture_pose, snapshot.fixture_visible]
         inputs += [snapshot.last_catalog_index, snapshot.last_pose, snapshot.last_fixture_pose, snapshot.last_fixture_visible]
         inputs += [views, self.moving.mesh.shape[1]]
-        wp.launch(find_moving_bodies_kernel, inputs=inputs, outputs=[self.moving], **options)
+        wp.launch(kernel_for(find_moving_bodies_kernel, views), inputs=inputs, outputs=[self.moving], **options)
 
     def trace_coarse_paths(self, snapshot: Snapshot, bodies: Any, gbuffer: Any, views: Any) -> None:
         """Coarse path pass: guide image and light of coarse pixels, traced or taken from the history (temporal accumulation).
@@ -375,6 +377,7 @@ class DenoisedRenderer:
         inputs = [scene.paths, self.coarse, self.shadow_grid, snapshot.light, snapshot.light_yaw, bodies, gbuffer]
         inputs += [self.ratios, self.shadows, views]
         self._launch(self.shade_kernel, scene.grid, views, inputs, [radiance])
+        shade_floor(scene, snapshot, bodies, gbuffer, views, radiance)
 
     def resolve_footprints(self, bodies: Any, gbuffer: Any, views: Any, image: Any) -> None:
         """Anti-alias by coverage rays; writes `image.resolve` and `image.samples`."""
@@ -385,13 +388,25 @@ class DenoisedRenderer:
         inputs = [scene.grid, self.footprints, gbuffer, image.radiance, views]
         outputs = [image.resolve, lists.footprint, lists.count]
         footprints = views.count * self.footprints.tiles * int(TILE_PIXELS)
-        wp.launch(find_footprints_kernel, dim=footprints, inputs=inputs, outputs=outputs, device=scene.device, block_dim=PIXEL_BLOCK)
+        wp.launch(
+            kernel_for(find_footprints_kernel, views),
+            dim=footprints,
+            inputs=inputs,
+            outputs=outputs,
+            device=scene.device,
+            block_dim=PIXEL_BLOCK,
+        )
         threads = FOOTPRINT_THREADS if scene.device.is_cuda else CPU_FOOTPRINT_THREADS
         inputs = [scene.meshes, scene.table, scene.grid, self.footprints, bodies, gbuffer, lists.footprint, lists.count]
         inputs += [views, image.samples, threads]
         samples = views.count * lists.count.shape[1] * threads
         wp.launch(
-            resolve_footprints_kernel, dim=samples, inputs=inputs, outputs=[image.resolve], device=scene.device, block_dim=PIXEL_BLOCK
+            kernel_for(resolve_footprints_kernel, views),
+            dim=samples,
+            inputs=inputs,
+            outputs=[image.resolve],
+            device=scene.device,
+            block_dim=PIXEL_BLOCK,
         )
 
     def _launch(self, kernel: wp.Kernel, grid: Any, views: Any, inputs: list[Any], outputs: list[Any]) -> None:

@@ -21,6 +21,8 @@ from synpick_warp.kernels.render.images.layers import (
     render_scene_flow_kernel,
 )
 from synpick_warp.kernels.render.visibility.camera import TILE_PIXELS
+from synpick_warp.kernels.render.visibility.variants import kernel_for
+from synpick_warp.scenes.types import FIRST_DISTRACTOR
 from synpick_warp.stages.arrays import allocate_struct, struct_arrays
 from synpick_warp.stages.buffers import FIXTURES, LayerBuffers, Snapshot
 from synpick_warp.stages.launch import launch_pixels
@@ -72,7 +74,7 @@ class LayerRenderer:
         self.names = names
         self.sensor = sensor
         if "classes" in names:
-            wrong = [obj_id for obj_id in scene.obj_id.numpy().tolist() if not 0 < obj_id <= MAX_CLASS]
+            wrong = [obj_id for obj_id in scene.obj_id.numpy().tolist() if not 0 < obj_id <= MAX_CLASS and obj_id > FIRST_DISTRACTOR]
             if wrong:
                 raise CatalogError(f"object {wrong[0]} has no place in the layer classes, which holds 1 to {MAX_CLASS}; renumber the model")
         self.motions = None
@@ -97,7 +99,7 @@ class LayerRenderer:
         sensor = [scene.meshes, scene.surfaces, scene.grid, snapshot.episode, snapshot.frame]
         sensor += [self.sensor, bodies, gbuffer, views]
         motion = [scene.grid, snapshot.follows, self.motions, gbuffer, views]
-        objects = [scene.meshes, scene.grid, bodies, gbuffer, views]
+        objects = [scene.meshes, scene.grid, scene.obj_id, bodies, gbuffer, views]
         classes = [scene.grid, scene.obj_id, bodies, gbuffer, views]
         count = views.count
         launches = {
@@ -120,7 +122,7 @@ class LayerRenderer:
         inputs = [snapshot.catalog_index, snapshot.pose, snapshot.fixture_pose, snapshot.follows]
         inputs += [snapshot.last_catalog_index, snapshot.last_pose, snapshot.last_fixture_pose, snapshot.last_fixture_visible, views]
         dim = (views.count, self.motions.known.shape[1])
-        wp.launch(compute_motions_kernel, dim=dim, inputs=inputs, outputs=[self.motions], device=self.scene.device)
+        wp.launch(kernel_for(compute_motions_kernel, views), dim=dim, inputs=inputs, outputs=[self.motions], device=self.scene.device)
 
     def _launch(self, kernel: wp.Kernel, count: int, inputs: list[Any], output: wp.array) -> None:
         """Launch a kernel over all pixels of `count` views."""

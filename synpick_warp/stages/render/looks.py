@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -10,12 +12,17 @@ import warp as wp
 
 from synpick_warp.codes import Look, LookKind, LookPart
 from synpick_warp.configs.randomize import CHOICE, FIXED, LOG_UNIFORM, NORMAL, UNIFORM, Distribution, Randomize
-from synpick_warp.kernels.render.lighting.looks import LookDistribution, LookTable, draw_looks_kernel, dress_bodies_kernel
+from synpick_warp.kernels.distributions import LookDistribution, LookTable
+from synpick_warp.kernels.render.lighting.background import shade_floor_kernel
+from synpick_warp.kernels.render.lighting.looks import draw_looks_kernel, dress_bodies_kernel
 from synpick_warp.kernels.render.lighting.materials import Surfaces
 from synpick_warp.kernels.render.lighting.paths.tracing import PathScene
+from synpick_warp.kernels.render.visibility.camera import TILE_PIXELS
 from synpick_warp.kernels.render.visibility.gbuffer import FIXTURES
+from synpick_warp.kernels.render.visibility.variants import kernel_for
 from synpick_warp.scenes.looks import Looks
 from synpick_warp.stages.buffers import Snapshot
+from synpick_warp.stages.launch import launch_pixels
 from synpick_warp.stages.render.scene import RenderScene
 
 SETTINGS = {
@@ -28,6 +35,8 @@ SETTINGS = {
     (LookPart.BIN, Look.METALLIC): "bin_metallic",
     (LookPart.TABLE, Look.COLOR): "table_color",
     (LookPart.TABLE, Look.ROUGHNESS): "table_roughness",
+    (LookPart.EPISODE, Look.EXPOSURE): "exposure",
+    (LookPart.EPISODE, Look.COUNT): "distractors",
     (LookPart.LAMP, Look.COUNT): "lamps",
     (LookPart.LAMP, Look.ELEVATION): "lamp_elevation",
     (LookPart.LAMP, Look.RADIUS): "lamp_radius",
@@ -41,13 +50,12 @@ _COPIED = ("color", "metallic", "roughness", "texture_size", "first_texel", "tex
 _ROW: Any = LookDistribution.numpy_dtype()
 
 
-def build_look_table(looks: Looks, first_texture: int, first_row: int, device: Any) -> Any:
+def build_look_table(looks: Looks, first_texture: int, device: Any) -> Any:
     """The struct `LookTable`.
 
     Args:
         looks: Distributions and textures.
-        first_texture: Row of `Surfaces` of the first texture; those of the bin come first.
-        first_row: Row of `Surfaces` of the first view's first body.
+        first_texture: Row of `Surfaces` of the first texture, of those in the order of `Looks.all_textures`.
         device: Device of the arrays.
     """
     drawn: dict[tuple[int, int], tuple[Distribution, float, float]] = {}
@@ -55,7 +63,7 @@ def build_look_table(looks: Looks, first_texture: int, first_row: int, device: A
         rules = Randomize.__dataclass_fields__[name].metadata
         drawn[place] = getattr(looks.randomize, name), rules["low"], rules["high"]
     drawn[LookPart.LAMP, Look.AZIMUTH] = Distribution(UNIFORM, ((-180.0,), (180.0,))), 0.0, 0.0
-    for part, textures in ((LookPart.BIN, looks.bin_textures), (LookPart.TABLE, looks.table_textures)):
+    for part, textures in looks.textures.items():
         if textures:
             rows = tuple((float(first_texture + index),) for index in range(len(textures)))
             drawn[part, Look.TEXTURE] = Distribution(CHOICE, rows), 0.0, 0.0
@@ -70,7 +78,6 @@ def build_look_table(looks: Looks, first_texture: int, first_row: int, device: A
     table = LookTable()
     table.distribution = wp.array(distributions, dtype=LookDistribution, device=device)
     table.choice = wp.array(np.array(choices or [np.zeros(4)], np.float32), dtype=wp.vec4, device=device)
-    table.first_row = first_row
     return table
 
 
@@ -108,9 +115,9 @@ class Dresser:
     def __init__(self, scene: RenderScene, seed: int, instances: int, views: int) -> None:
         """Allocate the materials of at most `views` views of worlds with `instances` instances. `scene` must have looks."""
         self._seed = wp.uint64(seed)
-        materials = scene.surfaces.color.shape[0]
-        self._table = build_look_table(scene.looks, materials - len(scene.looks.all_textures), materials, scene.device)
-        self._materials = instances + int(FIXTURES) + 1
+        self._first = scene.surfaces.color.shape[0]
+        self._table = build_look_table(scene.looks, self._first - len(scene.looks.all_textures), scene.device)
+        self._materials = instances + int(FIXTURES) + 1 + bool(scene.looks.background_textures)
         rows = views * self._materials
         self.material = wp.zeros((views, self._materials), dtype=wp.int32, device=scene.device)
         surfaces, paths = _copy(Surfaces, scene.surfaces), _copy(PathScene, scene.paths)
@@ -126,12 +133,23 @@ class Dresser:
         self.scene = replace(scene, surfaces=surfaces, paths=paths)
 
     def dress(self, snapshot: Snapshot, views: Any, bodies: Any) -> None:
-        """Make the materials of the bodies of all views, and of their tables; `bodies` must be set up."""
+        """Make the materials of the bodies of all views, of their tables and backgrounds; `bodies` must be set up."""
         scene = self.scene
-        inputs = [self._seed, scene.meshes, self._table, snapshot.episode, views]
+        inputs = [self._seed, scene.meshes, self._table, snapshot.episode, views, self._first]
         wp.launch(
-            dress_bodies_kernel, dim=(views.count, self._materials), inputs=inputs, outputs=[bodies, scene.surfaces], device=scene.device
+            kernel_for(dress_bodies_kernel, views),
+            dim=(views.count, self._materials),
+            inputs=inputs,
+            outputs=[bodies, scene.surfaces],
+            device=scene.device,
         )
+
+
+def shade_floor(scene: RenderScene, snapshot: Snapshot, bodies: Any, gbuffer: Any, views: Any, radiance: wp.array) -> None:
+    """Shade what the views show beyond the scene as a floor, if episodes draw a background."""
+    if scene.looks is not None and scene.looks.background_textures:
+        inputs = [scene.paths, scene.grid, snapshot.light, bodies, gbuffer, views]
+        launch_pixels(shade_floor_kernel, views.count * scene.grid.tiles * int(TILE_PIXELS), inputs, [radiance], scene.device)
 
 
 def _copy(kind: Any, struct: Any) -> Any:
@@ -148,7 +166,7 @@ def draw_parameters(looks: Looks, seed: int, episode: int, parts: list[tuple[Loo
     Returns:
         `LookKind` of each parameter (part, look), and the values (body, look, 3) float32.
     """
-    table = build_look_table(looks, 0, 0, "cpu")
+    table = build_look_table(looks, 0, "cpu")
     part, body = (wp.array(column, dtype=wp.int32, device="cpu") for column in zip(*parts, strict=True))
     values = wp.zeros((len(parts), len(Look)), dtype=wp.vec3, device="cpu")
     inputs = [wp.uint64(seed), table, wp.full(len(parts), episode, dtype=wp.int32, device="cpu"), part, body]
@@ -156,8 +174,8 @@ def draw_parameters(looks: Looks, seed: int, episode: int, parts: list[tuple[Loo
     return table.distribution.numpy()["kind"], values.numpy()
 
 
-def draw_looks(looks: Looks, seed: int, episode: int, objects: int) -> dict[str, Any]:
-    """Looks of an episode, as its records have them: by part and parameter, and of each object. Textures by index, colours in sRGB.
+def draw_looks(looks: Looks, seed: int, episode: int, objects: int, distractors: Mapping[int, str] | None = None) -> dict[str, Any]:
+    """Record of the looks of an episode: by part and parameter, of each object and distractor. Textures by index, colours in sRGB.
 
     Computed on the processor by the renderer's function: it agrees with a GPU up to the rounding of logarithms and cosines.
 
@@ -165,12 +183,23 @@ def draw_looks(looks: Looks, seed: int, episode: int, objects: int) -> dict[str,
         looks: What is drawn from.
         seed: Seed of the bake.
         episode: Index of the episode.
-        objects: Instances whose looks are wanted.
+        objects: Number of the first instances, whose looks are wanted.
+        distractors: Names of the distractors by instance; None: none can be drawn.
     """
-    parts = [(LookPart.BIN, 0), (LookPart.TABLE, 0), *((LookPart.OBJECT, index) for index in range(objects))]
+    distractors = distractors or {}
+    instances = [(LookPart.OBJECT, index) for index in (*range(objects), *distractors)]
+    scene = (LookPart.EPISODE, LookPart.BACKGROUND, LookPart.BIN, LookPart.TABLE)
+    parts = [*((part, 0) for part in scene), *instances]
     kinds, drawn = draw_parameters(looks, seed, episode, parts)
     rows = [_record(kinds[part], drawn[index], looks, part) for index, (part, _) in enumerate(parts)]
-    return {"bin": rows[0], "table": rows[1], "objects": rows[2:]}
+    record = {name: value for name, value in rows[0].items() if name != "count"}
+    if looks.background_textures:
+        record["background"] = rows[1]
+    record |= {"bin": rows[2], "table": rows[3], "objects": rows[4 : 4 + objects]}
+    if looks.randomize.most_distractors:
+        named = zip(distractors.items(), rows[4 + objects :], strict=True)
+        record["distractors"] = [{"instance": instance, "name": name, **row} for (instance, name), row in named]
+    return record
 
 
 def _record(kinds: np.ndarray, values: np.ndarray, looks: Looks, part: LookPart) -> dict[str, Any]:
@@ -181,5 +210,6 @@ def _record(kinds: np.ndarray, values: np.ndarray, looks: Looks, part: LookPart)
             value = values[look].astype(np.float64).round(6)
             record[look.name.lower()] = value.tolist() if look == Look.COLOR else float(value[0])
     if "texture" in record:
-        record["texture"] = int(record["texture"]) - (len(looks.bin_textures) if part == LookPart.TABLE else 0)
+        before = itertools.takewhile(lambda other: other != part, looks.textures)
+        record["texture"] = int(record["texture"]) - sum(len(looks.textures[other]) for other in before)
     return record

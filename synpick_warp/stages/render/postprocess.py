@@ -18,6 +18,7 @@ from synpick_warp.kernels.render.images.postprocess import (
     postprocess_kernel,
 )
 from synpick_warp.kernels.render.visibility.camera import TILE_PIXELS
+from synpick_warp.kernels.render.visibility.variants import kernel_for
 from synpick_warp.stages.arrays import allocate, device_array
 from synpick_warp.stages.buffers import Snapshot, ViewBuffers
 from synpick_warp.stages.launch import launch_pixels
@@ -90,7 +91,7 @@ class PostProcessor:
             self._launch(postprocess_kernel, views.count, inputs, out.color)
             return
         inputs = [snapshot.episode, snapshot.frame, self.effects, views]
-        wp.launch(sample_effects_kernel, dim=views.count, inputs=inputs, outputs=[out.effects], device=scene.device)
+        wp.launch(kernel_for(sample_effects_kernel, views), dim=views.count, inputs=inputs, outputs=[out.effects], device=scene.device)
         if self.filtered is not None:
             inputs = [scene.grid, out.effects, views, image]
             self._launch(filter_lens_rows_kernel, views.count, inputs, self.filtered)

@@ -9,6 +9,7 @@ from synpick_warp.kernels.render.lighting.paths.tracing import COMBINED, PathRul
 from synpick_warp.kernels.render.visibility.camera import TILE_PIXELS
 from synpick_warp.stages.buffers import Snapshot
 from synpick_warp.stages.launch import launch_pixels
+from synpick_warp.stages.render.looks import shade_floor
 from synpick_warp.stages.render.scene import RenderScene
 
 ROULETTE = 2
@@ -45,7 +46,7 @@ class ReferenceRenderer:
         Args:
             snapshot: The worlds.
             bodies: The struct `ViewBodies` of these views.
-            gbuffer: Not read: each path traces its own camera ray.
+            gbuffer: The struct `GBuffer` of these views; each path traces its own camera ray, so that it is read for the floor alone.
             views: The struct `Views`.
             image: The struct `ShadedImage`; its `radiance` is written, which is anti-aliased.
         """
@@ -53,3 +54,4 @@ class ReferenceRenderer:
         inputs = [scene.paths, scene.grid, snapshot.episode, snapshot.light, snapshot.light_yaw]
         inputs += [bodies, views, self.rules]
         launch_pixels(trace_paths_kernel, views.count * scene.grid.tiles * int(TILE_PIXELS), inputs, [image.radiance], scene.device)
+        shade_floor(scene, snapshot, bodies, gbuffer, views, image.radiance)

@@ -17,7 +17,7 @@ from synpick_warp.stages.render.postprocess import PostProcessor
 from synpick_warp.stages.render.raster import Rasterizer
 from synpick_warp.stages.render.reference import ReferenceRenderer
 from synpick_warp.stages.render.scene import RenderScene
-from synpick_warp.stages.render.view_setup import GBUFFER, VIEW_BODIES, allocate_view_cameras, body_sizes, set_up_views
+from synpick_warp.stages.render.view_setup import GBUFFER, VIEW_BODIES, allocate_view_cameras, body_sizes, set_up_views, with_cameras
 from synpick_warp.stages.timing import scope
 
 SHADED_IMAGE = struct_arrays(ShadedImage, "view", "row", "column")
@@ -32,7 +32,7 @@ class Renderer:
     Attributes:
         instances: Instance capacity of a world.
         views: Maximum number of views of a batch.
-        cameras: The struct `ViewCameras` of the last batch.
+        cameras: The struct `ViewCameras` of the last batch, or `LensCameras` if some cameras are distorted.
         bodies: The struct `ViewBodies` of the last batch.
         gbuffer: The struct `GBuffer` of the last batch.
         image: The struct `ShadedImage` of the last batch: linear radiance.
@@ -90,7 +90,7 @@ class Renderer:
 
         Args:
             snapshot: State of the worlds.
-            views: The struct `Views`; its cameras are set.
+            views: The struct `Views`; the renderer brings their cameras.
             out: Written.
             layers: Written; None: no layers.
 
@@ -102,7 +102,7 @@ class Renderer:
         if views.count == 0:
             return
         device = self.scene.device
-        self.render_gbuffer(snapshot, views, out)
+        views = self.render_gbuffer(snapshot, views, out)
         if layers is not None:
             with scope("layers", device):
                 self.layer_renderer.render(snapshot, self.bodies, self.gbuffer, views, layers)
@@ -113,13 +113,13 @@ class Renderer:
         with scope("annotate", device):
             self.annotator.annotate(self.bodies, views, out)
 
-    def render_gbuffer(self, snapshot: Snapshot, views: Any, out: ViewBuffers) -> None:
-        """First part of `render`: the G-buffer, and the images of depth, instances and amodal bits."""
-        scene = self.scene
-        views.cameras = self.cameras
+    def render_gbuffer(self, snapshot: Snapshot, views: Any, out: ViewBuffers) -> Any:
+        """First part of `render`: G-buffer, and images of depth, instances and amodal bits. Returns the views with their cameras."""
+        scene, views = self.scene, with_cameras(views, self.cameras)
         with scope("set up views", scene.device):
             set_up_views(scene, snapshot, snapshot.fixture_visible, views, self.bodies)
             if self.dresser:
                 self.dresser.dress(snapshot, views, self.bodies)
         with scope("rasterize", scene.device):
             self.rasterizer.rasterize(self.bodies, views, self.gbuffer, out)
+        return views

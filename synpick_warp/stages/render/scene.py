@@ -17,7 +17,7 @@ from synpick_warp.kernels.render.lighting.materials import TEXEL_BITS, TEXEL_MAS
 from synpick_warp.kernels.render.lighting.paths.tracing import PathScene
 from synpick_warp.kernels.render.lighting.shadows import LAMP_POINTS
 from synpick_warp.kernels.render.visibility.camera import TILE_HEIGHT, TILE_PIXELS, TILE_WIDTH, Cameras, ImageGrid
-from synpick_warp.kernels.render.visibility.gbuffer import Meshes, Table
+from synpick_warp.kernels.render.visibility.gbuffer import FAR, Meshes, Table
 from synpick_warp.kernels.render.visibility.lens import BEND, FIRST, FISHEYE_MODEL, MODEL, NUMBERS, RADIUS, STRETCH, Lenses
 from synpick_warp.scenes.assets.appearance import linear_to_srgb, srgb_to_linear
 from synpick_warp.scenes.environment import LUMINANCE
@@ -56,7 +56,7 @@ class RenderScene:
     grid: Any
     """The struct `ImageGrid` of the cameras' images."""
     obj_id: wp.array
-    """obj_id of each catalog mesh (entry) int32."""
+    """obj_id of each catalog mesh (entry) int32; negative: a distractor, without label."""
     camera_count: int
     device: wp.Device
     keep: tuple[wp.Mesh, ...]
@@ -340,16 +340,17 @@ def build_render_scene(
     # The first bin comes last, see `fixture_mesh`.
     bins, grip = fixtures[:-GRIPPER], fixtures[-GRIPPER:]
     fixtures = (*reversed(bins), *grip)
-    shapes = [entry.mesh for entry in catalog.entries] + [fixture.mesh for fixture in fixtures]
+    shapes = [entry.mesh for entry in catalog.bodies] + [fixture.mesh for fixture in fixtures]
     if looks and looks.bin_textures:
-        first = len(catalog)
+        first = len(catalog.bodies)
         shapes[first : first + len(bins)] = map(project_from_box, shapes[first : first + len(bins)])
     table_material = Material(color=settings.table_color, texture=None, metallic=0.0, roughness=TABLE_ROUGHNESS)
-    materials = [entry.material for entry in catalog.entries] + [fixture.material for fixture in fixtures] + [table_material]
+    materials = [entry.material for entry in catalog.bodies] + [fixture.material for fixture in fixtures] + [table_material]
     materials += [Material((1.0, 1.0, 1.0), texture, 0.0, 1.0) for texture in (looks.all_textures if looks else ())]
-    meshes, keep = build_meshes(shapes, len(catalog) + len(bins) - 1, device, bins[0].interior if len(bins) == 1 else None)
+    meshes, keep = build_meshes(shapes, len(catalog.bodies) + len(bins) - 1, device, bins[0].interior if len(bins) == 1 else None)
     table = Table()
     table.visible, table.height = int(settings.table), table_height
+    table.half = wp.vec2(*(0.5 * size if size > 0.0 else FAR for size in settings.table_size))
     ground = srgb_to_linear(np.array(settings.table_color)) if settings.table else None
     paths = PathScene()
     paths.meshes = meshes
@@ -365,7 +366,7 @@ def build_render_scene(
         table=table,
         paths=paths,
         grid=build_grid(cameras[0].width, cameras[0].height),
-        obj_id=wp.array([entry.obj_id for entry in catalog.entries], dtype=wp.int32, device=device),
+        obj_id=wp.array(catalog.object_ids, dtype=wp.int32, device=device),
         camera_count=len(cameras),
         device=device,
         keep=keep,

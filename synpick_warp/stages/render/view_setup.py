@@ -7,9 +7,10 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from synpick_warp.kernels.render.visibility.camera import ViewCameras, Views
+from synpick_warp.kernels.render.visibility.camera import LensCameras, LensViews, ViewCameras, Views
 from synpick_warp.kernels.render.visibility.gbuffer import GBuffer, ViewBodies
 from synpick_warp.kernels.render.visibility.ray_bodies import RAY_RECORDS
+from synpick_warp.kernels.render.visibility.variants import kernel_for
 from synpick_warp.kernels.render.visibility.view_setup import aim_cameras_kernel, bin_bodies_kernel, set_up_views_kernel, sort_bodies_kernel
 from synpick_warp.stages.arrays import allocate_struct, struct_arrays
 from synpick_warp.stages.buffers import FIXTURES, Snapshot
@@ -28,6 +29,7 @@ VIEW_BODIES = struct_arrays(
 )
 VIEWS = struct_arrays(Views, "view")
 VIEW_CAMERAS = struct_arrays(ViewCameras, "view", units={"intrinsics": "px", "center": "m"})
+LENS_CAMERAS = struct_arrays(LensCameras, "view", units={"intrinsics": "px", "center": "m"})
 GBUFFER = struct_arrays(GBuffer, "view", "row", "column", units={"depth": "m"})
 BACKGROUND = struct_arrays(GBuffer, "camera", "row", "column", units={"depth": "m"})
 
@@ -38,17 +40,17 @@ def pair_views(worlds: np.ndarray, cameras: np.ndarray) -> tuple[np.ndarray, np.
 
 
 def make_views(world: wp.array, camera: wp.array, count: int, instances: int, cameras: Any = None, slot: wp.array | None = None) -> Any:
-    """The struct `Views`.
+    """The struct `Views`, or `LensViews` if some cameras are distorted.
 
     Args:
         world: World of each view (view) int32; -1: the view is not in use.
         camera: Camera of each view (view) int32.
         count: Views in the batch; arrays may be longer.
         instances: Instance capacity of a world.
-        cameras: The struct `ViewCameras`; None: the renderer brings its own.
+        cameras: The struct `ViewCameras` or `LensCameras`; None: the renderer brings its own.
         slot: Row of each view's camera in the scene (view) int32; None: that of its index.
     """
-    views = Views()
+    views = LensViews() if isinstance(cameras, LensCameras.cls) else Views()
     views.world, views.camera, views.count, views.instances = world, camera, count, instances
     views.slot = camera if slot is None else slot
     if cameras is not None:
@@ -56,11 +58,20 @@ def make_views(world: wp.array, camera: wp.array, count: int, instances: int, ca
     return views
 
 
+def with_cameras(views: Any, cameras: Any) -> Any:
+    """The same views with the cameras of a renderer: themselves, or the struct `LensViews` if these are the struct `LensCameras`."""
+    if isinstance(cameras, LensCameras.cls):
+        return make_views(views.world, views.camera, views.count, views.instances, cameras, views.slot)
+    views.cameras = cameras
+    return views
+
+
 def allocate_view_cameras(views: int, device: wp.Device, cameras: Any = None) -> Any:
-    """Allocate the struct `ViewCameras`, with the lenses of the struct `Cameras`; None: no camera is distorted."""
-    made = allocate_struct(VIEW_CAMERAS, {"view": views}, device)
-    if cameras is not None and cameras.lens is not None:
-        made.lenses = cameras.lenses
+    """Allocate the struct `ViewCameras`, or `LensCameras` if the struct `Cameras` has lenses; None: it has none."""
+    if cameras is None or cameras.lens is None:
+        return allocate_struct(VIEW_CAMERAS, {"view": views}, device)
+    made = allocate_struct(LENS_CAMERAS, {"view": views}, device)
+    made.lenses = cameras.lenses
     return made
 
 
@@ -93,11 +104,13 @@ def set_up_views(
         views: The struct `Views`; its cameras are written.
         bodies: The struct `ViewBodies`; written.
     """
-    wp.launch(aim_cameras_kernel, dim=views.count, inputs=[scene.cameras], outputs=[views], device=scene.device)
+    wp.launch(kernel_for(aim_cameras_kernel, views), dim=views.count, inputs=[scene.cameras], outputs=[views], device=scene.device)
     dim = (views.count, bodies.mesh.shape[1])
     worlds = [snapshot.bin, snapshot.catalog_index, snapshot.pose, snapshot.fixture_pose, fixture_visible]
     inputs = [scene.meshes, scene.grid, *worlds, views]
-    wp.launch(set_up_views_kernel, dim=dim, inputs=inputs, outputs=[bodies], device=scene.device)
+    wp.launch(kernel_for(set_up_views_kernel, views), dim=dim, inputs=inputs, outputs=[bodies], device=scene.device)
     wp.launch(sort_bodies_kernel, dim=dim, inputs=[scene.meshes], outputs=[bodies], device=scene.device)
     inputs = [scene.meshes, scene.grid, views]
-    wp.launch(bin_bodies_kernel, dim=(views.count, scene.grid.tiles), inputs=inputs, outputs=[bodies], device=scene.device)
+    wp.launch(
+        kernel_for(bin_bodies_kernel, views), dim=(views.count, scene.grid.tiles), inputs=inputs, outputs=[bodies], device=scene.device
+    )

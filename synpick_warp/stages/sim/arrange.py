@@ -9,6 +9,7 @@ from synpick_warp.codes import Phase
 from synpick_warp.configs.schema import Config
 from synpick_warp.kernels import structs
 from synpick_warp.kernels.sim import arrangement, endings, rest
+from synpick_warp.scenes.build import without_distractors
 from synpick_warp.scenes.types import Catalog
 from synpick_warp.stages.constants import SceneData, drop_data, mode_data, mode_rows
 from synpick_warp.stages.launch import launch
@@ -23,8 +24,10 @@ def assign_episodes(state: WorldState, episodes: wp.array, tries: int) -> None:
 
 
 def sample_episodes(scene: SceneData, state: WorldState, seed: int) -> None:
-    """Sample mode, bin, objects and light of starting episodes."""
+    """Sample mode, bin, objects, distractors and light of starting episodes."""
     kernels = (arrangement.sample_modes_kernel, arrangement.sample_bins_kernel, arrangement.sample_objects_kernel)
+    if scene.catalog.distractors:
+        kernels += (arrangement.sample_distractors_kernel,)
     for kernel in (*kernels, arrangement.sample_lights_kernel):
         launch(kernel, len(state.phase), scene, state, seed=wp.uint64(seed))
 
@@ -58,7 +61,8 @@ def sample_episodes_ahead(config: Config, catalog: Catalog, episodes: np.ndarray
     objects.count = len(catalog)
     objects.volume = wp.array([entry.volume for entry in catalog.entries], dtype=float, device=device)
     objects.compound = wp.zeros(len(catalog), dtype=int, device=device)
-    drop = drop_data(config.arrangement, config.render, config.pick, config.move, config.physics.gravity, 1)
+    labelled = without_distractors(config.arrangement, config.randomize.most_distractors)
+    drop = drop_data(labelled, config.render, config.pick, config.move, config.physics.gravity, 1)
     index, slot = (wp.empty((count, layout.instances), dtype=wp.int32, device=device) for _ in range(2))
     wp.launch(
         arrangement.sample_objects_kernel,

@@ -58,7 +58,7 @@ class Suction:
 def _surface_data(use_mesh: bool, catalog: Catalog, meshes: wp.array, device: wp.Device) -> Any:
     """Fill `SurfaceData`; `meshes` are ids of visual meshes, those of the catalog first."""
     table = plane_table(catalog)
-    parts = [[entry.mesh] if use_mesh else entry.pieces for entry in catalog.entries]
+    parts = [[entry.mesh] if use_mesh else entry.pieces for entry in catalog.bodies]
     radius = [max(np.linalg.norm(part.vertices, axis=1).max() for part in entry) for entry in parts]
     return fill(
         cup_rays.SurfaceData,

@@ -44,7 +44,7 @@ def open_episode(rows: np.ndarray, cameras=LENSES, lights: tuple[EnvironmentMap,
     stage_lights = tuple(make_stage_light(index, light, 1.0) for index, light in enumerate(lights))
     metadata = EpisodeMetadata(0, 0, len(rows), "emptied")
     layer = make_episode_layer(
-        rows, metadata, EpisodeSettings(15.0, 9.81, ("tote",), cameras, stage_lights, {1: "one", 2: "two", 3: "three"})
+        rows, metadata, EpisodeSettings(15.0, 9.81, ("tote",), cameras, stage_lights, {1: "one", 2: "two", 3: "three"}, {})
     )
     for prim in layer.rootPrims["Episode"].nameChildren.values():
         for each in (prim, *prim.nameChildren.values()):

@@ -25,7 +25,7 @@ from tests.builders import STIRRING, bake_boxes
 from tests.harness.exporter_contract import digests
 from tests.twins.layers import render_layers, surface_points
 from tests.worlds.small_worlds import settings
-from tests.worlds.toy_scene import FLAT, UPRIGHT, ToyScene, box, camera, entry, surface
+from tests.worlds.toy_scene import FLAT, UPRIGHT, ToyScene, box, camera, entry, render, surface, with_render
 
 DRAWS = 1000
 VIEW = camera(160, 90, 200.0, (0.0, 0.0, 2.0))
@@ -130,6 +130,40 @@ def test_textures_repeat_at_their_width(device):
         seen = inside & flat & (rendered.segment[0] == segment)
         assert seen.sum() > 200
         assert np.abs(rendered["albedo"][0][seen].astype(int) - color[seen]).max() <= 2
+
+
+FLOOR = (0.3, 0.6, 0.2)
+
+
+@pytest.mark.parametrize("mode", ["fast", "reference"])
+@pytest.mark.parametrize("floor", [False, True])
+def test_beyond_the_table_is_the_map_or_a_floor_without_depth(device, mode, floor):
+    """In the even light of radiance 1, the map is white, and a diffuse floor has the radiance of its albedo."""
+    image = np.full((4, 4, 3), np.rint(255 * np.array(FLOOR)), np.uint8)
+    given = replace(looks(), background_textures=(image,) if floor else ())
+    toy = scene(given)
+    sized = with_render(mode, table_size=(0.6, 0.4), samples=4)
+    rendered = render(replace(toy, placed=[[]], fixtures_visible=(0, 0, 0), config=sized), device)
+    places = np.stack(np.meshgrid((np.arange(160) - 79.5) / 200.0, (44.5 - np.arange(90)) / 200.0), axis=-1) * (2.0 + sized.tote.wall)
+    on_table = (np.abs(places) < (0.3, 0.2)).all(axis=-1)
+    inside = np.abs(np.abs(places) - (0.3, 0.2)).min(axis=-1) > 0.02  # Away from the edge, which is anti-aliased.
+    assert 0 < (on_table & inside).sum() < (~on_table & inside).sum()
+    np.testing.assert_array_equal(rendered.instance[0], np.where(on_table, Segment.TABLE, Segment.NOTHING))
+    assert ((rendered.depth[0] > 0) == on_table).all()
+    beyond = rendered.radiance[0][~on_table & inside]
+    expected = srgb_to_linear(np.rint(255 * np.array(FLOOR)) / 255) if floor else np.ones(3)
+    np.testing.assert_allclose(beyond, np.broadcast_to(expected, beyond.shape), rtol=0.01)
+
+
+def test_a_floor_has_the_texture_that_is_recorded(device):
+    colors = [(200, 30, 30), (30, 200, 30), (30, 30, 200)]
+    given = replace(looks(texture_width=0.5), background_textures=tuple(np.full((2, 2, 3), color, np.uint8) for color in colors))
+    sized = with_render(table_size=(0.1, 0.1))
+    rendered = render(replace(scene(given), placed=[[]], fixtures_visible=(0, 0, 0), config=sized), device)
+    record = draw_looks(given, 0, 0, 0)["background"]
+    assert record["texture_width"] == 0.5
+    expected = srgb_to_linear(np.array(colors[record["texture"]]) / 255)
+    np.testing.assert_allclose(rendered.radiance[0][0, 0], expected, rtol=0.02)
 
 
 def test_worlds_of_one_episode_look_the_same_whatever_their_place(device):

@@ -24,7 +24,7 @@ def visit_pixel(grid: ImageGrid, visits: wp.array3d[int], index: int):
         wp.atomic_add(visits, view, row, column, 1)
 
 
-visit, ray_of, box_of = probe(visit_pixel), probe(pinhole_ray), probe(projected_box)
+visit, ray_of, box_of = probe(visit_pixel), probe(pinhole_ray), probe(projected_box, cameras=ViewCameras)
 
 
 def project(lower, upper, rotation, position):

@@ -16,14 +16,15 @@ from synpick_warp.kernels.render.lighting.paths.queues import (
     requeue_path,
 )
 from synpick_warp.kernels.render.lighting.paths.tracing import TERMINATED, PathRules, PathScene, extend_path, next_vertex
-from synpick_warp.kernels.render.visibility.camera import Views
+from synpick_warp.kernels.render.visibility.camera import AnyViews
 from synpick_warp.kernels.render.visibility.gbuffer import ViewBodies
+from synpick_warp.kernels.render.visibility.variants import kernel_of_views
 from synpick_warp.kernels.tuning import SINGLE_PATH_REGISTERS
 
 wp.set_module_options({"enable_backward": False, "fast_math": True})
 
 
-@wp.kernel(cuda_max_registers=SINGLE_PATH_REGISTERS)
+@kernel_of_views(cuda_max_registers=SINGLE_PATH_REGISTERS)
 def extend_queued_paths_kernel(
     # Scene:
     scene: PathScene,
@@ -34,7 +35,7 @@ def extend_queued_paths_kernel(
     light_yaw: wp.array[float],  # (world) [rad]
     # In:
     bodies: ViewBodies,
-    views: Views,
+    views: AnyViews,
     rules: PathRules,
     stage: int,
     first: int,

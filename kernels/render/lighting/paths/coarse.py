@@ -39,9 +39,10 @@ from synpick_warp.kernels.render.lighting.paths.tracing import (
     next_vertex,
 )
 from synpick_warp.kernels.render.lighting.unoccluded import unoccluded_light
-from synpick_warp.kernels.render.visibility.camera import Views, in_image
+from synpick_warp.kernels.render.visibility.camera import AnyViews, in_image
 from synpick_warp.kernels.render.visibility.gbuffer import GBuffer, ViewBodies
 from synpick_warp.kernels.render.visibility.records import write_record
+from synpick_warp.kernels.render.visibility.variants import kernel_of_views
 from synpick_warp.kernels.rng import stream_key
 from synpick_warp.kernels.tuning import COARSE_PATH_REGISTERS, SINGLE_PATH_REGISTERS
 
@@ -60,7 +61,7 @@ def make_context(
     scene: PathScene,
     coarse: CoarseGrid,
     rules: PathRules,
-    views: Views,
+    views: AnyViews,
     view: int,
     row: int,
     column: int,
@@ -226,7 +227,7 @@ def trace_pixel(
     light_yaw: wp.array[float],
     bodies: ViewBodies,
     gbuffer: GBuffer,
-    views: Views,
+    views: AnyViews,
     lists: PathLists,
     rules: PathRules,
     thread: int,
@@ -279,7 +280,7 @@ def trace_pixel(
         finish_pixel(coarse_light_out, history, exposure, cell, slot, row, column, pixel, paths, samples)
 
 
-@wp.kernel(cuda_max_registers=COARSE_PATH_REGISTERS)
+@kernel_of_views(cuda_max_registers=COARSE_PATH_REGISTERS)
 def trace_coarse_paths_kernel(
     # Scene:
     scene: PathScene,
@@ -291,7 +292,7 @@ def trace_coarse_paths_kernel(
     # In:
     bodies: ViewBodies,
     gbuffer: GBuffer,
-    views: Views,
+    views: AnyViews,
     lists: PathLists,
     rules: PathRules,
     first: int,
@@ -327,7 +328,7 @@ def trace_coarse_paths_kernel(
     )
 
 
-@wp.kernel(cuda_max_registers=SINGLE_PATH_REGISTERS)
+@kernel_of_views(cuda_max_registers=SINGLE_PATH_REGISTERS)
 def start_paths_kernel(
     # Scene:
     scene: PathScene,
@@ -339,7 +340,7 @@ def start_paths_kernel(
     # In:
     bodies: ViewBodies,
     gbuffer: GBuffer,
-    views: Views,
+    views: AnyViews,
     lists: PathLists,
     rules: PathRules,
     first: int,

@@ -18,15 +18,16 @@ from synpick_warp.kernels.render.lighting.paths.lists import PathLists, append_p
 from synpick_warp.kernels.render.lighting.paths.surface import coarse_surface, write_guide
 from synpick_warp.kernels.render.lighting.paths.tracing import PathScene, make_vertex
 from synpick_warp.kernels.render.lighting.unoccluded import unoccluded_light
-from synpick_warp.kernels.render.visibility.camera import Views, in_image
+from synpick_warp.kernels.render.visibility.camera import AnyViews, in_image
 from synpick_warp.kernels.render.visibility.gbuffer import GBuffer, ViewBodies
 from synpick_warp.kernels.render.visibility.records import write_record
+from synpick_warp.kernels.render.visibility.variants import kernel_of_views
 from synpick_warp.kernels.tuning import RAY_REGISTERS
 
 wp.set_module_options({"enable_backward": False, "fast_math": True})
 
 
-@wp.kernel(cuda_max_registers=RAY_REGISTERS)
+@kernel_of_views(cuda_max_registers=RAY_REGISTERS)
 def reuse_histories_kernel(
     # Scene:
     scene: PathScene,
@@ -37,7 +38,7 @@ def reuse_histories_kernel(
     # In:
     bodies: ViewBodies,
     gbuffer: GBuffer,
-    views: Views,
+    views: AnyViews,
     moving: MovingBodies,
     first: int,
     # Out:

@@ -3,7 +3,7 @@
 import warp as wp
 
 from synpick_warp.kernels.render.lighting.coarse_grid import CoarseGrid, Guide, middle_pixel, pack_surface
-from synpick_warp.kernels.render.visibility.camera import ViewCameras, camera_ray, hit_position
+from synpick_warp.kernels.render.visibility.camera import AnyCameras, camera_ray, hit_position
 from synpick_warp.kernels.render.visibility.gbuffer import GBuffer, Hit, read_hit
 from synpick_warp.kernels.render.visibility.records import write_record
 
@@ -24,7 +24,7 @@ class CoarseSurface:
 
 
 @wp.func
-def coarse_surface(cameras: ViewCameras, coarse: CoarseGrid, gbuffer: GBuffer, view: int, row: int, column: int) -> CoarseSurface:
+def coarse_surface(cameras: AnyCameras, coarse: CoarseGrid, gbuffer: GBuffer, view: int, row: int, column: int) -> CoarseSurface:
     """Surface that a coarse pixel shows: hit, position, direction to the camera and footprint, read from the G-buffer at its
     middle pixel.
     """

@@ -27,8 +27,9 @@ from synpick_warp.kernels.render.lighting.sampling import (
     scrambled_point,
 )
 from synpick_warp.kernels.render.visibility.bvh_rays import RAY_OFFSET, hit_table, is_blocked, trace_camera_ray, trace_ray
-from synpick_warp.kernels.render.visibility.camera import ImageGrid, Views, camera_ray, hit_position, in_image, tile_of, tile_pixel
+from synpick_warp.kernels.render.visibility.camera import AnyViews, ImageGrid, camera_ray, hit_position, in_image, tile_of, tile_pixel
 from synpick_warp.kernels.render.visibility.gbuffer import FAR, Hit, Meshes, Table, ViewBodies, body_of
+from synpick_warp.kernels.render.visibility.variants import kernel_of_views
 from synpick_warp.kernels.rng import mix, stream_key
 
 wp.set_module_options({"enable_backward": False})
@@ -326,7 +327,7 @@ def extend_path(
     return result
 
 
-@wp.kernel
+@kernel_of_views
 def trace_paths_kernel(
     # Scene:
     scene: PathScene,
@@ -337,7 +338,7 @@ def trace_paths_kernel(
     light_yaw: wp.array[float],  # (world) [rad]
     # In:
     bodies: ViewBodies,
-    views: Views,
+    views: AnyViews,
     rules: PathRules,
     first: int,
     # Out:

@@ -1,0 +1,65 @@
+"""Background beyond the edge of the table: a textured floor in place of the environment map."""
+
+import warp as wp
+
+from synpick_warp.codes import Segment
+from synpick_warp.kernels.render.lighting.environment import (
+    lamp_center,
+    lamp_irradiance,
+    sh_irradiance,
+)
+from synpick_warp.kernels.render.lighting.materials import Surface, map_table, sample_base_color
+from synpick_warp.kernels.render.lighting.paths.tracing import PathScene
+from synpick_warp.kernels.render.visibility.camera import AnyCameras, AnyViews, ImageGrid, camera_ray, in_image, tile_pixel
+from synpick_warp.kernels.render.visibility.gbuffer import GBuffer, ViewBodies
+from synpick_warp.kernels.render.visibility.variants import kernel_of_views
+
+wp.set_module_options({"enable_backward": False})
+
+FLOOR_DROP = wp.constant(0.74)
+"""Height of the table above the floor [m]: that of a desk of fixed height (EN 527-1)."""
+HORIZON = wp.constant(0.02)
+"""Sine of the angle below the horizon at which the floor ends: 1.1 degrees, beyond which its texture is one colour."""
+
+
+@wp.func
+def floor_radiance(scene: PathScene, bodies: ViewBodies, cameras: AnyCameras, view: int, light: int, direction: wp.vec3) -> wp.vec3:
+    """Radiance of the floor that a camera sees along a unit direction in the world, which points down: diffuse, in unoccluded light."""
+    center = wp.vec3(cameras.center[view])
+    distance = wp.max(center[2] - scene.table.height + FLOOR_DROP, 0.0) / -direction[2]
+    surface = Surface()
+    surface.row = bodies.material[view, bodies.mesh.shape[1] + 1]
+    width = distance / cameras.intrinsics[view][0]
+    surface = map_table(scene.surfaces, surface, center + distance * direction, -direction, width)
+    irradiance = sh_irradiance(scene.lights, light, wp.vec3(0.0, 0.0, 1.0))
+    for lamp in range(scene.lights.lamps[light]):
+        irradiance += wp.max(lamp_center(scene.lights, light, lamp)[2], 0.0) * lamp_irradiance(scene.lights, light, lamp)
+    return wp.cw_mul(sample_base_color(scene.surfaces, surface), irradiance) / wp.PI
+
+
+@kernel_of_views
+def shade_floor_kernel(
+    # Scene:
+    scene: PathScene,
+    grid: ImageGrid,
+    # State: worlds
+    light: wp.array[int],  # (world)
+    # In:
+    bodies: ViewBodies,
+    gbuffer: GBuffer,
+    views: AnyViews,
+    first: int,
+    # Out:
+    radiance_inout: wp.array3d[wp.vec3],  # (view, row, column)
+):
+    """Show the floor where a pixel shows nothing and its ray points down. It is seen only: it has no depth, and reflects no light.
+
+    The last material of each view is the floor's. Launched over view, pixel (tile order, from flat index `first` on).
+    """
+    view, row, column = tile_pixel(grid, wp.tid() + first)
+    if not in_image(grid, row, column) or views.world[view] < 0:
+        return
+    if int(gbuffer.segment[view, row, column]) == Segment.NOTHING:
+        direction = wp.normalize(views.cameras.to_world[view] * camera_ray(views.cameras, view, row, column, wp.vec2(0.0, 0.0)))
+        if direction[2] < -HORIZON:
+            radiance_inout[view, row, column] = floor_radiance(scene, bodies, views.cameras, view, light[views.world[view]], direction)

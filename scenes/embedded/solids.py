@@ -1,0 +1,51 @@
+"""Geometric solids of plain colours, as distractors beside the embedded objects (Tobin et al., IROS 2017). Lengths [m]."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from synpick_warp.scenes.collision.hulls import hull_size
+from synpick_warp.scenes.modelling import BOX_FACES, NO_TEXTURE, Patch, lathe, make_mesh, rounded_box, solid
+from synpick_warp.scenes.types import Material, RawObject
+
+SIDES = 32
+"""Points per ring of a round solid."""
+_EDGE = 0.003
+"""Radius of the edges of boxes."""
+
+
+def _box(*size: float) -> Patch:
+    """Box with rounded edges."""
+    x, y, z = size
+    return rounded_box((x, y, z), _EDGE, dict.fromkeys(BOX_FACES, NO_TEXTURE))
+
+
+def _turned(points: int, *profile: tuple[float, float]) -> Patch:
+    """Surface of revolution, or with few points a prism or pyramid, through (radius, z)."""
+    return solid(lathe(list(profile), points))
+
+
+def _ball(radius: float) -> Patch:
+    """Sphere."""
+    angles = np.linspace(-np.pi / 2, np.pi / 2, SIDES // 2)[1:-1]
+    return _turned(SIDES, *((radius * float(np.cos(angle)), radius * float(np.sin(angle))) for angle in angles))
+
+
+def solids() -> list[RawObject]:
+    """Make the solids, all convex: closed meshes [m], centred on their bounding boxes; deterministic."""
+    rows = (
+        ("cube", _box(0.05, 0.05, 0.05), (0.75, 0.2, 0.15)),
+        ("slab", _box(0.12, 0.08, 0.016), (0.2, 0.35, 0.7)),
+        ("bar", _box(0.14, 0.025, 0.025), (0.85, 0.7, 0.2)),
+        ("cylinder", _turned(SIDES, (0.02, -0.05), (0.02, 0.05)), (0.25, 0.6, 0.3)),
+        ("disc", _turned(SIDES, (0.045, -0.01), (0.045, 0.01)), (0.8, 0.8, 0.78)),
+        ("cone", _turned(SIDES, (0.035, -0.04), (0.003, 0.04)), (0.85, 0.45, 0.1)),
+        ("ball", _ball(0.032), (0.5, 0.25, 0.6)),
+        ("prism", _turned(6, (0.03, -0.03), (0.03, 0.03)), (0.15, 0.15, 0.16)),
+    )
+    made = []
+    for obj_id, (name, patch, color) in enumerate(rows, start=1):
+        mesh = make_mesh(patch, centered=True)
+        material = Material(color, None, 0.0, 0.5)
+        made.append(RawObject(obj_id, name, mesh, hull_size(mesh.vertices), material, None, False, (), (), None))
+    return made

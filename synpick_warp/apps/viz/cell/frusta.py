@@ -1,0 +1,166 @@
+"""Lines in a rendered view: camera frusta to scale, their footprints, axes; what surfaces hide is faint."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+
+from synpick_warp.apps.viz.cell.rendering import Picture
+from synpick_warp.apps.viz.drawing import Image, put_text, text_size
+from synpick_warp.scenes.types import Camera
+
+Color = tuple[int, int, int]
+"""Blue, green, red."""
+_STEP = 4.0
+"""Length of the pieces whose visibility is tested [px]."""
+_SLACK = 0.004
+"""Depth by which a point may lie behind a surface and is still seen, relative to its distance."""
+_NEAR = 0.05
+"""Least depth of what is drawn [m]."""
+_FAINT = 0.3
+"""Opacity of what is hidden."""
+_EDGE = 12
+"""Points along each side of an image, whose rays bound its footprint."""
+_SHIFT = 4
+"""Fractional bits of OpenCV's coordinates."""
+_WIDE = 1.3
+"""Longest edge of a pyramid, in its depths, before it becomes less deep: of wide lenses."""
+_LIFT = 1e-3
+"""Height of footprints over the floor [m]."""
+
+
+def project(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Pixels (n, 2) and depths (n) [m] of points (n, 3) of the world, through the lens; points behind the camera have no place (nan)."""
+    seen = np.asarray(points, float) @ camera.rotation.T + camera.translation
+    depth = seen[:, 2]
+    flat = seen[:, :2] / np.where(depth > 0.0, depth, np.nan)[:, None]
+    if camera.lens is not None:
+        flat[depth > 0.0] = camera.lens.project(flat[depth > 0.0])
+        return flat, depth
+    return flat * np.diag(camera.matrix)[:2] + camera.matrix[:2, 2], depth
+
+
+def rays(camera: Camera, pixels: np.ndarray) -> np.ndarray:
+    """Rays (n, 3) through pixels (n, 2) in the world, of planar depth 1."""
+    plain = (pixels - camera.matrix[:2, 2]) / np.diag(camera.matrix)[:2]
+    flat = plain if camera.lens is None else camera.lens.unproject(pixels)
+    return np.column_stack([flat, np.ones(len(flat))]) @ camera.rotation
+
+
+def center(camera: Camera) -> np.ndarray:
+    """Optical centre (3) [m]."""
+    return -camera.rotation.T @ camera.translation
+
+
+def image_border(camera: Camera, points: int = _EDGE) -> np.ndarray:
+    """Points (4 points, 2) along the border of an image, clockwise from its top left corner [px]."""
+    along = np.arange(points) / points
+    sides = [(along, 0 * along), (0 * along + 1, along), (1 - along, 0 * along + 1), (0 * along, 1 - along)]
+    return np.concatenate([np.column_stack(side) for side in sides]) * (camera.width, camera.height)
+
+
+def footprint(camera: Camera, height: float, most: float) -> tuple[np.ndarray, np.ndarray]:
+    """Where the rays of an image's border meet a horizontal plane (n, 3), and whether they do within a depth of `most` [m]; of the others,
+    the point at that depth."""
+    at, along = center(camera), rays(camera, image_border(camera))
+    with np.errstate(divide="ignore"):
+        depth = np.where(along[:, 2] < 0.0, (height - at[2]) / along[:, 2], np.inf)
+    meets = (depth > 0.0) & (depth <= most)
+    return at + along * np.where(meets, depth, most)[:, None], meets
+
+
+class Canvas:
+    """A rendered view to draw into; `image` finishes it."""
+
+    def __init__(self, picture: Picture) -> None:
+        self.picture = picture
+        self._lines: list[tuple[np.ndarray, bool, Color, int]] = []
+        """Ends [px], whether nothing hides it, colour and width of each piece."""
+        self._labels: list[tuple[np.ndarray, str, Color, float, tuple[int, int]]] = []
+
+    def line(self, start: np.ndarray, stop: np.ndarray, color: Color, width: int = 1, *, on_top: bool = False) -> None:
+        """A straight line between two points of the world [m]; `on_top`: surfaces do not hide it."""
+        camera = self.picture.camera
+        ends = np.stack([start, stop]).astype(float)
+        depth = ends @ camera.rotation[2] + camera.translation[2]
+        if depth.max() <= _NEAR:
+            return
+        if depth.min() < _NEAR:
+            # Cut off what is behind the camera.
+            share = (_NEAR - depth[0]) / (depth[1] - depth[0])
+            ends[int(depth.argmin())] = ends[0] + share * (ends[1] - ends[0])
+        pixels = project(camera, ends)[0]
+        pieces = int(np.clip(np.linalg.norm(pixels[1] - pixels[0]) / _STEP, 1, 2000))
+        points = ends[0] + np.linspace(0.0, 1.0, 2 * pieces + 1)[:, None] * (ends[1] - ends[0])
+        places, depths = project(camera, points)
+        for index in range(0, 2 * pieces, 2):
+            seen = on_top or self._seen(places[index + 1], depths[index + 1])
+            self._lines.append((places[[index, index + 2]], seen, color, width))
+
+    def path(self, points: np.ndarray, color: Color, width: int = 1, *, closed: bool = False) -> None:
+        """Straight lines between points (n, 3) [m]."""
+        for start, stop in zip(points, np.roll(points, -1, axis=0) if closed else points[1:], strict=closed):
+            self.line(start, stop, color, width)
+
+    def label(self, point: np.ndarray, text: str, color: Color, size: float = 0.5, offset: tuple[int, int] = (6, -6)) -> None:
+        """Text beside a point of the world on a light ground, inside the picture; size and offset as of OpenCV [px]."""
+        self._labels.append((point, text, color, size, offset))
+
+    def image(self) -> Image:
+        """The picture with lines, hidden ones first and faint, and labels."""
+        faint = self.picture.color.copy()
+        self._draw(faint, seen=False)
+        image = cv2.addWeighted(faint, _FAINT, self.picture.color, 1.0 - _FAINT, 0.0)
+        self._draw(image, seen=True)
+        for point, text, color, size, offset in self._labels:
+            place, depth = project(self.picture.camera, point[None])
+            if depth[0] <= _NEAR:
+                continue
+            (width, height), (rows, columns) = text_size(text, size), image.shape[:2]
+            x = int(np.clip(place[0, 0] + offset[0], 2, columns - width - 4))
+            y = int(np.clip(place[0, 1] + offset[1], height + 4, rows - 6))
+            ground = image[y - height - 3 : y + 5, x - 2 : x + width + 3]
+            ground[:] = (0.25 * ground + 0.75 * 255).astype(np.uint8)
+            put_text(image, text, (x, y), size, color)
+        return image
+
+    def _draw(self, image: Image, *, seen: bool) -> None:
+        """Draw the pieces that are seen, or those that are hidden."""
+        for ends, visible, color, width in self._lines:
+            if visible == seen:
+                start, stop = (tuple(int(v) for v in np.rint(np.clip(place, -1e4, 1e4) * (1 << _SHIFT))) for place in ends)
+                cv2.line(image, start, stop, color, width, cv2.LINE_AA, _SHIFT)
+
+    def _seen(self, place: np.ndarray, depth: float) -> bool:
+        """Whether no surface lies before a point of a place in the picture."""
+        column, row = int(place[0]), int(place[1])
+        rows, columns = self.picture.depth.shape
+        return not (0 <= row < rows and 0 <= column < columns) or depth <= float(self.picture.depth[row, column]) * (1.0 + _SLACK)
+
+
+def draw_camera(canvas: Canvas, camera: Camera, label: str, color: Color, *, size: float, floor: float, most: float) -> None:
+    """Draw a camera as a pyramid of depth `size`, with a triangle on its upper side, and its rays down to a floor, or to a depth of `most`
+    [m]."""
+    at, along = center(camera), rays(camera, image_border(camera, 1))
+    ends = at + size / max(1.0, np.linalg.norm(along, axis=1).max() / _WIDE) * along
+    for end in ends:
+        canvas.line(at, end, color, 2)
+    canvas.path(ends, color, 2, closed=True)
+    top, height = ends[:2], np.linalg.norm(ends[3] - ends[0])
+    tip = top.mean(axis=0) - 0.35 * height * camera.rotation[1]
+    canvas.path(np.stack([top[0], tip, top[1]]), color, 2)
+    border, meets = footprint(camera, floor + _LIFT, most)
+    for index in range(0, len(border), _EDGE):
+        canvas.line(ends[index // _EDGE], border[index], color, 1)
+    for start, stop, both in zip(border, np.roll(border, -1, axis=0), meets & np.roll(meets, -1), strict=True):
+        if both:
+            canvas.line(start, stop, color, 1)
+    canvas.label(tip, label, color)
+
+
+def draw_axes(canvas: Canvas, length: float) -> None:
+    """Draw the axes of the world, x red, y green, z blue, with their length."""
+    for axis, (name, color) in enumerate((("x", (40, 40, 210)), ("y", (40, 140, 40)), ("z", (210, 80, 30)))):
+        tip = length * np.eye(3)[axis] + (0.0, 0.0, 2 * _LIFT)
+        canvas.line(np.array((0.0, 0.0, 2 * _LIFT)), tip, color, 2, on_top=True)
+        canvas.label(tip, f"{name} {length:g} m" if axis == 0 else name, color, 0.45, (4, 4))

@@ -1,0 +1,168 @@
+"""Rendering of a cell from any camera: bins, table, gripper, and objects laid on the floor of the bin; nothing is simulated."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+
+import numpy as np
+import warp as wp
+
+from synpick_warp.configs.calibration.lens import make_lens_map
+from synpick_warp.configs.cell import BinSizes
+from synpick_warp.configs.schema import FAST, Config
+from synpick_warp.factory.assembly import build_smallest, compiling_if_cold, make_renderer
+from synpick_warp.scenes.bins import make_bins
+from synpick_warp.scenes.catalog import read_objects
+from synpick_warp.scenes.embedded.skies import skies
+from synpick_warp.scenes.fixtures import make_fixtures
+from synpick_warp.scenes.types import Camera, Catalog, CatalogEntry, RawObject
+from synpick_warp.stages.arrays import allocate
+from synpick_warp.stages.buffers import FIXTURES, Snapshot, allocate_view_buffers
+from synpick_warp.stages.render.scene import build_render_scene, with_cameras
+from synpick_warp.stages.render.view_setup import make_views
+from synpick_warp.system.hardware.device import pick_device
+from synpick_warp.system.progress import Progress, SilentProgress
+
+OVER_RIM = 0.15
+"""Height of the gripper's cup over the rim of the bin [m]."""
+_GAP = 0.01
+"""Distance between objects, and from the walls [m]."""
+_MOST = 32
+"""Most objects: the instances that a view may have."""
+_SKY = "overcast"
+_PIXELS = 640
+"""Longest side of a camera's picture; larger images are scaled down [px]."""
+
+
+@dataclass(frozen=True, eq=False)
+class Picture:
+    """A rendered view."""
+
+    camera: Camera
+    color: np.ndarray
+    """(H, W, 3) uint8, blue first."""
+    depth: np.ndarray
+    """Planar depth (H, W) float32 [m]; 1e30: nothing is hit."""
+
+
+@dataclass(frozen=True, eq=False)
+class Laid:
+    """Objects side by side on the floor of a bin, in the orientation of their files."""
+
+    indices: list[int]
+    """Which ones of those given."""
+    positions: list[tuple[float, float, float]]
+    """Of their origins, in the bin's frame [m]."""
+
+
+class CellScene:
+    """What a cell shows before anything is simulated."""
+
+    def __init__(self, config: Config, progress: Progress, report: Callable[[str], None]) -> None:
+        """Read the objects, and build the scene.
+
+        Raises:
+            SynpickError: Device, bins, cameras or all objects cannot be used.
+        """
+        self.config = replace(config, render=replace(config.render, mode=FAST, layers=(), random_yaw=False))
+        self.device = device = pick_device(config.bake.device)
+        self.sizes = config.cell.bins
+        bins = make_bins(self.sizes)
+        progress.stage("reading objects")
+        self.objects = read_objects(config, report)
+        self.laid = [lay_out(self.objects, sizes) for sizes in self.sizes]
+        catalog = Catalog(tuple(map(_entry, self.objects)))
+        light = next(sky for sky in skies() if sky.name == _SKY)
+        smallest = partial(build_smallest, config, device, SilentProgress(), False, True)
+        with compiling_if_cold(smallest, device, progress):
+            fixtures = make_fixtures(bins, config.gripper)
+            any_camera = Camera(1, 1, np.eye(3), np.eye(3), np.zeros(3))
+            self.scene = build_render_scene(self.config.render, bins[0].sizes.base, catalog, fixtures, (any_camera,), (light,), device)
+        self.snapshot = self._snapshot()
+
+    @property
+    def tcp(self) -> tuple[float, float, float]:
+        """Where the gripper is drawn: its cup over the highest rim [m]."""
+        return 0.0, 0.0, max(one.height for one in self.sizes) + OVER_RIM
+
+    def _snapshot(self) -> Snapshot:
+        """A world for each bin with the gripper over it, and a last one of the first bin without."""
+        worlds = len(self.sizes) + 1
+        place = np.zeros((worlds, len(FIXTURES), 7), np.float32)
+        place[..., 6] = 1.0
+        place[:, 1:, 2] = self.tcp[2] + self.config.gripper.cup_length
+        entries, poses = np.full((worlds, _MOST), -1), np.zeros((worlds, _MOST, 7), np.float32)
+        poses[..., 6] = 1.0
+        which = [*range(len(self.sizes)), 0]
+        for world, index in enumerate(which):
+            place[world, 0, 2] = self.sizes[0].base - self.sizes[index].base
+            laid = self.laid[index]
+            for slot, (entry, position) in enumerate(zip(laid.indices, laid.positions, strict=True)):
+                entries[world, slot], poses[world, slot, :3] = entry, position
+                poses[world, slot, 2] += place[world, 0, 2]
+        visible = np.ones((worlds, len(FIXTURES)), np.int32)
+        visible[:, 0] = [self.sizes[index].is_visible for index in which]
+        visible[-1, 1:] = 0
+        result = allocate(Snapshot, {"world": worlds, "instance": _MOST, "fixture": len(FIXTURES)}, self.device)
+        for name, values in {
+            "catalog_index": entries,
+            "pose": poses,
+            "fixture_pose": place,
+            "fixture_visible": visible,
+            "bin": which,
+        }.items():
+            getattr(result, name).assign(np.array(values))
+        return result
+
+    def render(self, camera: Camera, world: int) -> Picture:
+        """A view of a world: that of a bin's index, or -1, the first bin without the gripper."""
+        scene = with_cameras(self.scene, (camera,))
+        renderer = make_renderer(self.config, scene, _MOST, 1)
+        out = allocate_view_buffers(1, scene.width, scene.height, _MOST, self.device)
+        of_world = wp.full(1, world % (len(self.sizes) + 1), dtype=wp.int32, device=self.device)
+        renderer.render(self.snapshot, make_views(of_world, wp.zeros(1, dtype=wp.int32, device=self.device), 1, _MOST), out)
+        return Picture(camera, np.ascontiguousarray(out.color.numpy()[0][..., ::-1]), renderer.gbuffer.depth.numpy()[0])
+
+
+def scaled_down(camera: Camera, most: int = _PIXELS) -> Camera:
+    """The same camera with smaller images, whose longest side is `most` [px]; smaller ones stay as they are."""
+    scale = most / max(camera.width, camera.height)
+    if scale >= 1.0:
+        return camera
+    width, height = max(1, round(scale * camera.width)), max(1, round(scale * camera.height))
+    # Pixel centres are at + 0.5, so that coordinates scale about the corner of the image.
+    matrix = np.diag((width / camera.width, height / camera.height, 1.0)) @ camera.matrix
+    lens = camera.lens
+    if lens is not None:
+        numbers = (float(matrix[0, 0]), float(matrix[1, 1]), float(matrix[0, 2]), float(matrix[1, 2]))
+        lens = make_lens_map(lens.lens.model, lens.lens.coefficients, numbers, (width, height))
+    return replace(camera, width=width, height=height, matrix=matrix, lens=lens)
+
+
+def lay_out(objects: Sequence[RawObject], sizes: BinSizes) -> Laid:
+    """Lay as many objects on a bin's floor as there is room for, row by row, in their order; of the bin's compartments in the first."""
+    laid = Laid([], [])
+    (left, front), (length, width) = sizes.centers[0], sizes.cell
+    left, front = left - length / 2, front - width / 2
+    x, y, depth = _GAP, _GAP, 0.0
+    for index, raw in enumerate(objects):
+        low, high = raw.mesh.vertices.min(axis=0), raw.mesh.vertices.max(axis=0)
+        size = high - low
+        if x + size[0] > length - _GAP:
+            x, y, depth = _GAP, y + depth + _GAP, 0.0
+        if x + size[0] > length - _GAP or y + size[1] > width - _GAP or len(laid.indices) == _MOST:
+            continue
+        laid.indices.append(index)
+        laid.positions.append((left + x - float(low[0]), front + y - float(low[1]), -float(low[2])))
+        x, depth = x + float(size[0]) + _GAP, max(depth, float(size[1]))
+    return laid
+
+
+def _entry(raw: RawObject) -> CatalogEntry:
+    """Entry of an object that is rendered and not simulated."""
+    radius = float(np.linalg.norm(raw.mesh.vertices, axis=1).max())
+    shape = {"pieces": (), "volume": raw.hull.volume, "radius": radius, "mass": 1.0, "center_of_mass": np.zeros(3), "inertia": np.eye(3)}
+    known = {name: getattr(raw, name) for name in ("obj_id", "name", "mesh", "material", "symmetries_discrete", "symmetries_continuous")}
+    return CatalogEntry(**known, **shape, diameter=raw.hull.diameter, source=raw.source)

@@ -1,0 +1,263 @@
+"""Command `new-cell`: a commented settings file of the user's cameras, bin and parts, with a picture of the cell."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import re
+import shutil
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import Annotated, Any
+
+from cyclopts import Parameter
+
+from synpick_warp.cli.commands.pictures import draw_cell
+from synpick_warp.cli.folders import check_output_file
+from synpick_warp.cli.options import parse_resolution
+from synpick_warp.configs.calibration.files import MODELS, read_calibration
+from synpick_warp.configs.camera_rules import NAME, RESERVED
+from synpick_warp.configs.cameras import CameraRow
+from synpick_warp.configs.cell import BinSizes
+from synpick_warp.configs.cell_file import NewCamera, NewCell, bin_of_size, cell_toml
+from synpick_warp.configs.load import load_config
+from synpick_warp.configs.objects import AUTO_UNIT, UNITS
+from synpick_warp.configs.rig import lens_map
+from synpick_warp.configs.schema import Config
+from synpick_warp.errors import CatalogError, ConfigError, OutputError, SynpickError, escape, format_value, suggest
+from synpick_warp.system.folders import make_folder
+from synpick_warp.system.inputs.files import read_file
+
+CELL, PICTURE, PARTS = "cell.toml", "cell.png", "parts"
+_FOV, _RESOLUTION = 40.0, (640, 480)
+"""Of cameras without a calibration file [°, px]."""
+_SIZE = re.compile(r"([0-9.]{1,12})[xX]([0-9.]{1,12})[xX]([0-9.]{1,12}) ?(mm|cm|m|in)?")
+_SIDES, _HEIGHTS = (0.08, 3.0), (0.03, 1.0)
+"""Allowed lengths and widths, and heights, of a bin [m]."""
+_OTHER_FILES = {".obj": rb"^\s*mtllib\s", ".gltf": rb'"uri"\s*:\s*"(?!data:)', ".ply": rb"^comment TextureFile "}
+"""What shows that a mesh file names others."""
+_PERCEPTION, _LEAST = 640, 16
+"""Width of the image of perception [px], that of the preset smoke, whose other settings are in its pixels; and its least height."""
+_LONGEST = 28
+"""Longest name of a camera, without a number behind it."""
+
+
+def new_cell(
+    folder: Annotated[Path, Parameter(name="DIR", help="Folder of the cell: new or empty.")],
+    /,
+    *,
+    calibration: Annotated[
+        list[Path] | None,
+        Parameter(
+            negative=(),
+            help="Calibration file of a camera: OpenCV (YAML, XML, JSON), ROS camera_info, BOP camera.json, RealSense or Zivid; may be "
+            "repeated, and names the camera (default: two cameras without distortion).",
+        ),
+    ] = None,
+    bin_: Annotated[
+        str, Parameter(name="--bin", help="Outer size of the bin, LENGTHxWIDTHxHEIGHT in metres, or as 600x400x220mm.")
+    ] = "0.6x0.4x0.2",
+    part: Annotated[
+        list[Path] | None,
+        Parameter(
+            negative=(),
+            help="Mesh file of a part (STL, PLY, OBJ, glTF, STEP), which is copied, or a folder of them, which is named; may be repeated "
+            "for files (default: the embedded household objects).",
+        ),
+    ] = None,
+    unit: Annotated[str | None, Parameter(help=f"Unit of the parts' files: {', '.join(UNITS)} (default: m; objects.unit).")] = None,
+    resolution: Annotated[str | None, Parameter(help="Image size of cameras whose calibration does not say it, as WIDTHxHEIGHT.")] = None,
+    lens: Annotated[
+        str | None, Parameter(help=f"Distortion model of calibrations that do not name it: {' or '.join(MODELS)} (camera.model).")
+    ] = None,
+) -> int:
+    """Write a commented cell.toml of your own cell, which bakes as it is, and a picture of it: a start to edit.
+
+    The poses of the cameras are guesses from which they see the bin; replace them by measured ones.
+
+    Exit codes: 0; 2, DIR is not empty, or a file or size cannot be used; then nothing is written.
+    """
+    from synpick_warp.apps.viz.cell.poses import pose_for
+    from synpick_warp.scenes.assets.asset_files import MAX_MESH_FILE
+
+    place = Path(os.path.realpath(folder))
+    _check_folder(folder, place)
+    _check_parts(parts := part or [], unit)
+    size = None if resolution is None else parse_resolution(resolution)
+    shape = bin_of_size(_parse_size(bin_))
+    with _staged(folder, place) as stage:
+        copied = [file for file in parts if not file.is_dir()]
+        for file in copied:
+            (stage / PARTS).mkdir(exist_ok=True)
+            (stage / PARTS / file.name).write_bytes(read_file(file, MAX_MESH_FILE, CatalogError))
+        models = os.path.realpath(parts[0]) if parts and not copied else str(place / PARTS) if parts else ""
+        rows = _read_cameras(calibration or [], size, lens or "", stage)
+        sizes = BinSizes.of_row(shape)
+        cameras = [NewCamera(row.name, given, pose_for(row, index, sizes)) for index, (row, given) in enumerate(rows)]
+        width, height = rows[0][0].resolution or _RESOLUTION
+        perception = (_PERCEPTION, max(_LEAST, round(_PERCEPTION * height / width)))
+        cell = NewCell(cameras, shape, models, unit or AUTO_UNIT, perception=perception)
+        config = _write_cell(cell, escape(str(folder)), stage, {"bake.models": str(stage / PARTS)} if copied else {})
+        draw_cell(config, f"{place.name}/{CELL}", stage / PICTURE, lambda note: escape(note.replace(str(stage), str(folder))))
+    print(f"cell: {escape(str(folder / CELL))}, picture: {escape(str(folder / PICTURE))}")
+    print(f"bake it: synpick-warp bake --config {escape(str(folder / CELL))} --out DATA")
+    return 0
+
+
+def _check_folder(folder: Path, place: Path) -> None:
+    """Raise OutputError unless a folder is new or empty, and outside of data sets."""
+    check_output_file(folder, "DIR", is_folder=True)
+    try:
+        taken = os.path.lexists(place) and any(place.iterdir())
+    except OSError as error:
+        raise OutputError(f"{folder} cannot be used: {error.strerror}; new-cell takes a new or an empty folder") from None
+    if taken:
+        raise OutputError(f"{folder} is not empty; new-cell takes a new or an empty folder")
+
+
+def _check_parts(parts: Sequence[Path], unit: str | None) -> None:
+    """Check the files of parts by their names, and that they are whole.
+
+    Raises:
+        ConfigError: One is missing or refers to other files, two have one name, a folder stands beside others, or the unit is unknown.
+    """
+    from synpick_warp.scenes.assets.asset_files import MAX_MESH_FILE
+    from synpick_warp.scenes.assets.meshes import SUFFIXES
+
+    if unit is not None and unit not in UNITS:
+        raise ConfigError(f"--unit is {format_value(unit)}; allowed: {', '.join(UNITS)}{suggest(unit, list(UNITS))}")
+    if unit is not None and not parts:
+        raise ConfigError("--unit is given without --part; the embedded objects have no unit")
+    if len(parts) > 1 and any(file.is_dir() for file in parts):
+        raise ConfigError("--part names a folder beside other parts; allowed: one folder, or files")
+    stems = [file.stem for file in parts]
+    for file in parts:
+        if stems.count(file.stem) > 1:
+            raise ConfigError(f"--part names {format_value(file.stem)} {stems.count(file.stem)} times; rename one of the files")
+        if file.is_dir():
+            continue
+        if file.suffix.lower() not in SUFFIXES:
+            raise ConfigError(f"--part is {format_value(str(file))}; allowed: a file that ends in {', '.join(SUFFIXES)}, or a folder")
+        mark = _OTHER_FILES.get(file.suffix.lower())
+        if mark and re.search(mark, read_file(file, MAX_MESH_FILE, CatalogError), re.MULTILINE):
+            raise ConfigError(f"--part is {file}, which refers to other files; name its folder, which is then used where it is")
+
+
+def _parse_size(text: str) -> tuple[float, float, float]:
+    """Parse "600x400x220mm" into lengths [m].
+
+    Raises:
+        ConfigError: The text has another form, or no bin has this size.
+    """
+    match = _SIZE.fullmatch(text.strip())
+    try:
+        numbers = [float(match[index]) for index in (1, 2, 3)] if match else []
+    except ValueError:
+        numbers = []
+    if not match or not numbers:
+        raise ConfigError(f"--bin is {format_value(text)}; allowed: LENGTHxWIDTHxHEIGHT in metres, or with a unit, as 600x400x220mm")
+    length, width, height = (round(number * UNITS[match[4] or "m"], 6) for number in numbers)
+    if not (_SIDES[0] <= min(length, width) <= max(length, width) <= _SIDES[1] and _HEIGHTS[0] <= height <= _HEIGHTS[1]):
+        hint = "; did you mean mm?" if not match[4] and min(numbers) >= 10.0 else ""
+        rule = f"{_SIDES[0]:g} to {_SIDES[1]:g} m long and wide, {_HEIGHTS[0]:g} to {_HEIGHTS[1]:g} m high"
+        raise ConfigError(f"--bin is {length:g} x {width:g} x {height:g} m; allowed: {rule}{hint}")
+    return length, width, height
+
+
+@contextmanager
+def _staged(folder: Path, place: Path) -> Iterator[Path]:
+    """A folder beside `place` whose content moves there if nothing is raised; otherwise nothing stays. Messages name `folder`."""
+    stage = place.with_name(f".{place.name}.{os.getpid()}")
+    created = [parent for parent in stage.parents if not os.path.lexists(parent)]
+    try:
+        make_folder(stage)
+        yield stage
+        if os.path.lexists(place):
+            # The settings last: without them, it is no cell.
+            for name in sorted(os.listdir(stage), key=lambda name: name == CELL):
+                (stage / name).rename(place / name)
+            stage.rmdir()
+        else:
+            stage.rename(place)
+    except SynpickError as error:
+        raise type(error)(str(error).replace(str(stage), str(folder))) from None
+    except OSError as error:
+        raise OutputError(f"cannot write {folder}: {error.strerror or error}; free space or rights there, or name another folder") from None
+    finally:
+        shutil.rmtree(stage, ignore_errors=True)
+        for parent in created:
+            with contextlib.suppress(OSError):
+                parent.rmdir()
+
+
+def _read_cameras(files: Sequence[Path], size: Sequence[int] | None, model: str, stage: Path) -> list[tuple[CameraRow, dict[str, Any]]]:
+    """Cameras of calibration files, with the keys of their tables; without files two with a field of view.
+
+    Raises:
+        ConfigError: A file cannot be used, or does not say the size of the image.
+    """
+    if model not in ("", *MODELS):
+        raise ConfigError(f"--lens is {format_value(model)}; allowed: {', '.join(MODELS)}{suggest(model, MODELS)}")
+    if not files:
+        pixels = (size[0], size[1]) if size else _RESOLUTION
+        return [(CameraRow(name=name, resolution=pixels, fov=_FOV), {"resolution": pixels, "fov": _FOV}) for name in ("top", "side")]
+    rows = []
+    for file in files:
+        found = read_calibration(file, model)
+        name = _name_camera(file.stem, [row.name for row, _ in rows])
+        given: dict[str, Any] = {"file": os.path.relpath(os.path.realpath(file), stage)}
+        pixels = (found.width, found.height)
+        if not found.width:
+            if size is None:
+                raise ConfigError(f"{file} does not say the image's size; add --resolution WIDTHxHEIGHT")
+            pixels = (size[0], size[1])
+            given["resolution"] = pixels
+        if model and found.distortion:
+            given["model"] = model
+        matrix = ((found.fx, 0.0, found.cx), (0.0, found.fy, found.cy), (0.0, 0.0, 1.0))
+        row = CameraRow(name=name, resolution=pixels, matrix=matrix, distortion=found.distortion or None, model=found.model)
+        try:
+            lens_map(row)
+        except ConfigError as error:
+            raise ConfigError(f"{file}: {error}") from None
+        rows.append((row, given))
+    return rows
+
+
+def _name_camera(stem: str, taken: Sequence[str]) -> str:
+    """Name of a camera after its file, which differs from those that are taken."""
+    name = re.sub(r"[^a-z0-9_]+", "_", stem.lower()).strip("_")
+    name = name[:_LONGEST] if NAME.fullmatch(name[:_LONGEST]) and name not in RESERVED else f"camera_{name}"[:_LONGEST].strip("_")
+    return next(each for each in (name, *(f"{name}_{number}" for number in range(2, 1000))) if each not in taken)
+
+
+def _write_cell(cell: NewCell, name: str, stage: Path, staged: Mapping[str, object]) -> Config:
+    """Write the settings, with a volume budget for the parts, and moved to their middle if they are too far from their origin; `staged`:
+    settings while the files are there.
+
+    Raises:
+        SynpickError: A setting, or a part, cannot be used.
+    """
+    from synpick_warp.scenes.catalog import read_objects
+
+    def write(cell: NewCell) -> Config:
+        (stage / CELL).write_text(cell_toml(cell, name), encoding="utf-8")
+        return load_config(stage / CELL, staged)
+
+    def volume(config: Config) -> float:
+        return max(raw.hull.volume for raw in read_objects(config.with_values({"objects.strict": bool(staged)})))
+
+    config = write(cell)
+    if not cell.models:
+        return config
+    try:
+        largest = volume(config)
+    except CatalogError as error:
+        cell = replace(cell, center=True)
+        try:
+            largest = volume(write(cell))
+        except CatalogError:
+            raise error from None
+    return write(replace(cell, volume=2.0 * largest))

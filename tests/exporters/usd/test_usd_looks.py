@@ -1,0 +1,105 @@
+"""Looks in USD: an episode's own materials, in place of those of the assets, as its record has them; from a bake and from a conversion."""
+
+from __future__ import annotations
+
+import json
+
+import cv2
+import numpy as np
+import pytest
+from pxr import Usd, UsdShade
+
+from synpick_warp.apps.conversion.run import convert
+from synpick_warp.scenes.assets.appearance import srgb_to_linear
+from tests.builders import STIRRING, bake_boxes
+from tests.harness.exporter_contract import digests
+from tests.worlds import small_worlds
+
+GIVEN = STIRRING | {
+    "bake.formats": ["usd", "zarr"],
+    "randomize.distractors": 1,
+    "randomize.object_hue": {"uniform": [-90, 90]},
+    "randomize.object_brightness": {"uniform": [0.5, 1.0]},
+    "randomize.object_roughness": {"uniform": [0.0, 1.0]},
+    "randomize.object_metallic": 0.25,
+    "randomize.bin_color": {"uniform": [[0, 0, 0], [1, 1, 1]]},
+    "randomize.texture_width": 0.25,
+    "randomize.table_roughness": {"uniform": [0.5, 1.0]},
+}
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    place = tmp_path_factory.mktemp("looks")
+    (place / "textures").mkdir()
+    for name, color in (("a", (10, 20, 200)), ("b", (200, 100, 0))):
+        cv2.imwrite(str(place / "textures" / f"{name}.png"), np.full((4, 8, 3), color, np.uint8))
+    bake_boxes(place / "set", GIVEN | {"randomize.table_textures": str(place / "textures")}, objects=small_worlds.cluttered_catalog)
+    return place / "set"
+
+
+@pytest.fixture(scope="module")
+def stage(folder):
+    return Usd.Stage.Open(str(folder / "usd/000000.usdc"))
+
+
+@pytest.fixture(scope="module")
+def record(folder):
+    return json.loads((folder / "episodes.jsonl").read_text().splitlines()[0])["looks"]
+
+
+def bound(stage, path: str) -> tuple[UsdShade.Shader, UsdShade.Shader | None]:
+    """Shader of the material that is bound to the visible mesh below a prim, and the texture that gives its colour."""
+    material, _ = UsdShade.MaterialBindingAPI(stage.GetPrimAtPath(f"{path}/Visual")).ComputeBoundMaterial()
+    shader, *_ = material.ComputeSurfaceSource()
+    sources, _ = shader.GetInput("diffuseColor").GetConnectedSources()
+    return shader, UsdShade.Shader(sources[0].source.GetPrim()) if sources else None
+
+
+def test_objects_have_the_drawn_material(stage, record):
+    """Without texture: brightness, and a rotation about the grey axis, which keeps the sum of the channels."""
+    assert len(record["objects"]) > 1
+    assert len(record["distractors"]) == 1
+    (base,) = {entry.material.color for entry in small_worlds.catalog().entries}
+    rows = {f"instance_{index:02d}": row for index, row in enumerate(record["objects"])}
+    rows |= {f"distractor_{row['instance']:02d}": row for row in record["distractors"]}
+    for name, row in rows.items():
+        shader, texture = bound(stage, f"/Episode/Objects/{name}")
+        assert texture is None
+        color = np.array(shader.GetInput("diffuseColor").Get())
+        assert color.sum() == pytest.approx(row["brightness"] * srgb_to_linear(base).sum(), abs=1e-5)
+        assert shader.GetInput("roughness").Get() == pytest.approx(row["roughness"], abs=1e-6)
+        assert shader.GetInput("metallic").Get() == pytest.approx(0.25)
+
+
+def test_the_bin_has_the_drawn_colour_and_what_else_it_is_made_of(stage, record):
+    shader, texture = bound(stage, "/Episode/Tote")
+    assert texture is None
+    np.testing.assert_allclose(shader.GetInput("diffuseColor").Get(), srgb_to_linear(record["bin"]["color"]), atol=1e-5)
+    asset = Usd.Stage.Open(stage.ResolveIdentifierToEditTarget("./assets/tote.usdc"))
+    given, _ = bound(asset, "/tote")
+    assert shader.GetInput("roughness").Get() == given.GetInput("roughness").Get()
+
+
+def test_the_table_has_the_drawn_texture_at_its_width(stage, folder, record):
+    shader, texture = bound(stage, "/Episode/Table")
+    assert shader.GetInput("roughness").Get() == pytest.approx(record["table"]["roughness"], abs=1e-6)
+    place = texture.GetInput("file").Get().resolvedPath
+    color = cv2.imread(place)[0, 0].tolist()
+    assert color == ([10, 20, 200], [200, 100, 0])[record["table"]["texture"]]
+    scale = UsdShade.Shader(texture.GetInput("st").GetConnectedSources()[0][0].source.GetPrim())
+    assert scale.GetIdAttr().Get() == "UsdTransform2d"
+    np.testing.assert_allclose(scale.GetInput("scale").Get(), (4.0, 4.0))
+    mesh = stage.GetPrimAtPath("/Episode/Table/Visual")
+    np.testing.assert_allclose(np.array(mesh.GetAttribute("primvars:st").Get()), np.array(mesh.GetAttribute("points").Get())[:, :2])
+
+
+def test_a_conversion_writes_the_same_looks(folder, tmp_path, monkeypatch):
+    monkeypatch.setattr("synpick_warp.scenes.catalog.load_catalog", lambda _: small_worlds.cluttered_catalog())
+    given = GIVEN | {"bake.formats": ["zarr"], "randomize.table_textures": str(folder.parent / "textures")}
+    bake_boxes(tmp_path / "zarr", given, objects=small_worlds.cluttered_catalog)
+    convert(tmp_path / "zarr", tmp_path / "usd", ("usd",), 1, lambda *_: None)
+    baked, converted = (
+        {name: value for name, value in digests(place).items() if name.startswith("usd/")} for place in (folder, tmp_path / "usd")
+    )
+    assert converted == baked
