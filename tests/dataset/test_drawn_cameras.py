@@ -17,6 +17,8 @@ from scipy.spatial.transform import Rotation
 import synpick_warp
 from synpick_warp.codes import Stream
 from synpick_warp.configs.load import load_config
+from synpick_warp.errors import ConfigError, OutputError
+from synpick_warp.factory import pipeline
 from synpick_warp.factory.pipeline import run_bake
 from synpick_warp.scenes.cameras import make_cameras
 from synpick_warp.system.progress import SilentProgress
@@ -177,7 +179,7 @@ def test_flow_through_the_moving_camera_leads_to_the_frame_before(cell):
         still = ~now.masks.any(axis=0) & np.isfinite(flow).all(axis=-1) & (points[..., 2] > 0) & (now.depth > 0.48)
         pixels = then @ before.intrinsics.T
         expected = pixels[..., :2] / pixels[..., 2:] - np.stack([columns, rows], -1)
-        assert still.sum() > 500
+        assert still.sum() > 200
         # Depth has steps of 0.1 mm, and flow of 1/64 px.
         assert np.abs(flow - expected)[still].max() < 0.05
         assert np.abs(scene_flow - (then - points))[still].max() < 5e-4
@@ -206,3 +208,34 @@ def test_the_number_of_worlds_changes_no_byte(cell, tmp_path, worlds):
     bake(tmp_path / "set", **{"bake.worlds": worlds, "bake.formats": ["bop", "usd", "zarr"]})
     ours, theirs = digests(cell), digests(tmp_path / "set")
     assert {name for name, _ in ours.items() ^ theirs.items()} <= {"config.toml"}
+
+
+def test_an_interrupted_bake_resumes_to_the_same_bytes(cell, tmp_path, monkeypatch):
+    """The first episode is committed when the second fails; the settings are then read back from the data set."""
+    ended, end = [], pipeline._Run._end
+
+    def fail(*arguments) -> None:
+        ended.append(arguments)
+        if len(ended) > 1:
+            raise OutputError("no space left")
+        end(*arguments)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(pipeline._Run, "_end", fail)
+        with pytest.raises(OutputError, match="no space left"):
+            bake(tmp_path / "set", **{"bake.worlds": 1})
+    assert len(list((tmp_path / "set/manifest").glob("0*.json"))) == 1
+    with boxes():
+        summary = run_bake(load_config(str(tmp_path / "set/config.toml")), tmp_path / "set", SilentProgress())
+    assert (summary.resumed, len(summary.episodes)) == (1, EPISODES)
+    assert {name for name, _ in digests(cell).items() ^ digests(tmp_path / "set").items()} <= {"config.toml"}
+
+
+@pytest.mark.parametrize(("old", "new"), [("[0.0, 0.01]", "[0.0, 0.02]"), ('"gripper"', '"world"'), ("70.0", "71.0")])
+def test_other_cameras_do_not_resume(cell, old, new):
+    changed = CELL.replace(old, new)
+    assert changed != CELL
+    (cell.parent / "other.toml").write_text(changed)
+    config = replace(cell_config(cell.parent / "again"), camera=load_config(str(cell.parent / "other.toml")).camera)
+    with pytest.raises(ConfigError, match="camera"):
+        run_bake(config, cell, SilentProgress())
