@@ -43,8 +43,8 @@ def pytest_configure(config: pytest.Config) -> None:
     if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
         signal.signal(signal.SIGINT, signal.default_int_handler)
     os.environ[VARIABLE] = devices(config)[0]
-    # USD's validators start a thread a core, which then wait for ever by polling: they would slow all later tests down.
-    os.environ.setdefault("PXR_WORK_THREAD_LIMIT", "1")
+    # USD starts a thread a core, of which some wait by polling for the rest of the run; without the second it tells of the first on standard error.
+    os.environ.update({"PXR_WORK_THREAD_LIMIT": "1", "TF_ENV_SETTING_ALERTS_ENABLED": "0"})
     if config.getoption("--check-bounds"):
         _check_bounds(config)
     start_warp()
