@@ -6,15 +6,17 @@ import itertools
 import math
 import re
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
+from functools import partial
 
 from synpick_warp.codes import MAX_DISPARITIES
 from synpick_warp.configs.cameras import CameraRow, Cameras, Jitter, Pose
 from synpick_warp.configs.cell import BinSizes, Sides
-from synpick_warp.configs.randomize import FIXED
+from synpick_warp.configs.modes import may_pick
+from synpick_warp.configs.randomize import FIXED, OFF
 from synpick_warp.configs.rig import Rig, intrinsics, lens_map, moved, position, viewing_direction
-from synpick_warp.configs.schema import Bop, Config, DepthSensor
+from synpick_warp.configs.schema import Bop, Config, DepthSensor, Gripper
 from synpick_warp.errors import ConfigError
 
 Conflict = tuple[str, str]
@@ -29,6 +31,8 @@ ASPECT = 2.0
 """Largest ratio of fx and fy: sensors that bin pixels in one direction reach it."""
 FOCAL_LENGTHS = (1 / (2 * math.tan(math.radians(85.0))), 1 / (2 * math.tan(math.radians(0.5))))
 """Least and largest focal length in widths of the image: those of fov."""
+STEPS = 4
+"""Steps of positions within their jitter that are checked."""
 NAME = re.compile(r"[a-z][a-z0-9_]{0,31}")
 RESERVED = ("world", "gripper", "info", "coco", "visib")
 """Words that mean something else where the names of cameras are: what a pose refers to, and in names of BOP's files."""
@@ -48,13 +52,20 @@ def find_camera_conflicts(config: Config) -> Iterator[Conflict]:
     rig = config.rig
     for index in range(len(rig)):
         yield from _view(rig, index, config)
-    if config.perception.camera and config.perception.camera not in rig.names:
-        yield "perception.camera", f"the name of a camera, {', '.join(rig.names)}, or none"
+    yield from _perception(config.perception.camera, rig, may_pick(config.bake, config.splits))
     if SENSOR_LAYERS.intersection(config.render.layers):
         yield from _depth_sensor(config.depth_sensor, rig, config.cell.bins)
     if "depth_stereo" in config.render.layers:
         yield from _search(config.depth_sensor, rig, config.cell.bins)
     yield from _depth_scale(config.bop, rig, config.cell.bins)
+
+
+def _perception(name: str, rig: Rig, plans: bool) -> Iterator[Conflict]:
+    """Yield the camera of perception if there is none of that name, or if it moves although grasps are planned with it."""
+    if name and name not in rig.names:
+        yield "perception.camera", f"the name of a camera, {', '.join(rig.names)}, or none"
+    elif plans and rig.moves(rig.index(name)):
+        yield "perception.camera", "the name of a camera that is fixed to the world, as the gripper waits elsewhere while perception looks"
 
 
 def _section(cameras: Cameras) -> Iterator[Conflict]:
@@ -113,31 +124,55 @@ def _view(rig: Rig, index: int, config: Config) -> Iterator[Conflict]:
     if row.distortion:
         yield from _lens(rig.key(index, "distortion"), row, config.render.layers)
     keys = [rig.key(index, "pose", name) for name in ("positions", "ups", "target")]
-    yield from _placement(row, label, keys, bins, config.bins.shift)
+    placement = partial(_placement, label=label, bins=bins, shift=config.bins.shift)
+    if rig.moves(index):
+        placement = partial(_mounting, label=label, gripper=config.gripper)
+    yield from placement(row, keys)
     if row.jitter is not None:
-        yield from _jitter(rig.key(index, "jitter"), row, row.jitter, label, bins, config.bins.shift)
+        yield from _jitter(rig.key(index, "jitter"), row, row.jitter, placement)
 
 
-def _placement(
-    row: CameraRow, label: str, keys: Sequence[str], bins: Sequence[BinSizes], shift: Sides, turn: float = 0.0
-) -> Iterator[Conflict]:
-    """Yield a degenerate view, or one that does not show the bins, even if it were turned by an angle [rad].
-
-    Args:
-        row: The camera.
-        label: Its name for messages.
-        keys: Keys of its position, up vector and look-at point.
-        bins: The bins.
-        shift: `bins.shift`.
-        turn: The angle.
-    """
-    (place, aim, target), (fx, fy, *_) = keys, intrinsics(row)
-    at, forward, up = position(row.pose), viewing_direction(row.pose), row.pose.up
+def _view_axes(row: CameraRow, keys: Sequence[str], label: str) -> Iterator[Conflict]:
+    """Yield a degenerate view; arguments as of `_placement`."""
+    place, aim, _ = keys
+    forward, up = viewing_direction(row.pose), row.pose.up
     if math.hypot(*forward) == 0.0:
         other = "look_at" if place != "cameras.positions" else "cameras.target"
         yield place, f"positions other than {other}, the position of {label}"
     elif up is not None and math.hypot(*_cross(forward, up)) <= PARALLEL * math.hypot(*forward) * math.hypot(*up):
         yield aim, f"up vectors that are not zero or parallel to the viewing direction, as that of {label} is"
+
+
+def _mounting(row: CameraRow, keys: Sequence[str], turn: float = 0.0, *, label: str, gripper: Gripper) -> Iterator[Conflict]:
+    """Yield a camera on the gripper that is in its shaft or cup, or sees nothing below; arguments as of `_placement`."""
+    place, _, target = keys
+    yield from _view_axes(row, keys, label)
+    x, y, z = position(row.pose)
+    if -gripper.cup_length <= z <= gripper.finger_length and math.hypot(x, y) <= max(gripper.finger_width, gripper.cup_width) / 2:
+        yield place, f"positions outside of the gripper's shaft and cup, in which {label} is [m]"
+    forward = viewing_direction(row.pose)
+    down = math.acos(max(-1.0, min(1.0, -forward[2] / (math.hypot(*forward) or 1.0))))
+    if down + turn - _cone(row) >= math.pi / 2:
+        yield target, f"a point that lets {label} see below the gripper, z < 0 [m]"
+
+
+def _placement(
+    row: CameraRow, keys: Sequence[str], turn: float = 0.0, *, label: str, bins: Sequence[BinSizes], shift: Sides
+) -> Iterator[Conflict]:
+    """Yield a degenerate view, or one that does not show the bins, even if it were turned by an angle [rad].
+
+    Args:
+        row: The camera.
+        keys: Keys of its position, up vector and look-at point.
+        turn: The angle.
+        label: Name of the camera for messages.
+        bins: The bins.
+        shift: `bins.shift`.
+    """
+    (place, _, target), (fx, fy, *_) = keys, intrinsics(row)
+    at = position(row.pose)
+    if found := list(_view_axes(row, keys, label)):
+        yield from found
     elif at[2] <= 0.0:
         yield place, f"positions above the {bins[0].noun}'s floor, z > 0, below which {label} sees no object [m]"
     elif fx > 0.0 < fy and not all(_sees_bin(row, one, spot, turn) for one in bins for spot in _places(shift)):
@@ -146,24 +181,29 @@ def _placement(
         yield place, f"positions outside of the {bins[0].noun}'s walls, in which {label} is [m]"
 
 
-def _jitter(key: str, row: CameraRow, jitter: Jitter, label: str, bins: Sequence[BinSizes], shift: Sides) -> Iterator[Conflict]:
-    """Yield jitter that is none, or after which the camera would not be allowed; of several draws, each by itself."""
+def _jitter(key: str, row: CameraRow, jitter: Jitter, placement: Callable[..., Iterator[Conflict]]) -> Iterator[Conflict]:
+    """Yield jitter that is none, or after which the camera would not be allowed by its matrix or `placement`; each draw by itself."""
     for name in ("position", "rotation", "focal_length", "center"):
         kind = getattr(jitter, name)
         if kind.kind == FIXED and kind.bounds() != (0.0, 0.0):
             yield f"{key}.{name}", "a distribution, such as { normal = [0, 0.002] }; what all episodes share belongs to pose and matrix"
+    if row.distortion and (jitter.focal_length.kind, jitter.center.kind) != (OFF, OFF):
+        yield key, "position and rotation alone with distortion, whose rays belong to one focal length and centre"
     turn = math.radians(math.sqrt(2.0) * max(map(abs, jitter.rotation.bounds())))
     for name, drawn in _extremes(row, jitter):
         width, height = drawn.resolution or (0, 0)
         found = [*_matrix(key, drawn.matrix, width, height)] if drawn.matrix is not None else []
-        found += _placement(drawn, label, (key,) * 3, bins, shift, turn if name == "rotation" else 0.0)
+        found += placement(drawn, (key,) * 3, turn if name == "rotation" else 0.0)
         yield from ((f"{key}.{name}", f"less, so that every draw has {rule}") for _, rule in found)
 
 
 def _extremes(row: CameraRow, jitter: Jitter) -> Iterator[tuple[str, CameraRow]]:
-    """Rows at the ends of what may be drawn of a camera, each with the name of its distribution; rotations are left out of theirs."""
-    ends = jitter.position.bounds()
-    for offset in itertools.product(ends, ends, ends):
+    """Rows over what may be drawn of a camera, its ends included, each with the name of its distribution; without rotations."""
+    least, most = jitter.position.bounds()
+    even = [least + (most - least) * part / STEPS for part in range(STEPS + 1)]
+    # And those that lead to the axes, about which the shaft and the bins lie.
+    x, y, z = ((*even, max(least, min(most, -value))) for value in position(row.pose))
+    for offset in itertools.product(x, y, z):
         yield "position", replace(row, pose=moved(row.pose, offset))
     yield "rotation", row
     fx, fy, cx, cy = intrinsics(row)
@@ -204,7 +244,7 @@ def _lens(key: str, row: CameraRow, layers: tuple[str, ...]) -> Iterator[Conflic
 
 def _depth_sensor(sensor: DepthSensor, rig: Rig, bins: Sequence[BinSizes]) -> Iterator[Conflict]:
     """With layers of a depth sensor: the bins must lie within what the sensor measures, and its disparity be more than a step."""
-    for index, row in enumerate(rig.rows):
+    for index, row in _world_rows(rig):
         focal, depths = intrinsics(row)[0], _bin_depths(row, bins)
         near, far = max(0.0, min(depths)), max(depths)
         if sensor.distances[1] < near or sensor.distances[0] > far:
@@ -226,7 +266,7 @@ def _depth_sensor(sensor: DepthSensor, rig: Rig, bins: Sequence[BinSizes]) -> It
 
 def _search(sensor: DepthSensor, rig: Rig, bins: Sequence[BinSizes]) -> Iterator[Conflict]:
     """With the layer depth_stereo: the bins must lie within the disparities that are searched, which begin at the farthest depth's."""
-    for row in rig.rows:
+    for _, row in _world_rows(rig):
         focal, near = intrinsics(row)[0], min(_bin_depths(row, bins))
         if near <= 0.0:
             continue
@@ -239,9 +279,14 @@ def _search(sensor: DepthSensor, rig: Rig, bins: Sequence[BinSizes]) -> Iterator
 
 def _depth_scale(bop: Bop, rig: Rig, bins: Sequence[BinSizes]) -> Iterator[Conflict]:
     """Yield the depth scale if 16 bits do not reach the farthest corner of the bins."""
-    far = max(depth for row in rig.rows for depth in _bin_depths(row, bins))
+    far = max((depth for _, row in _world_rows(rig) for depth in _bin_depths(row, bins)), default=0.0)
     if bop.depth_scale * 1e-3 * DEPTH_COUNTS < far:
         yield "bop.depth_scale", f"at least {far * 1e3 / DEPTH_COUNTS:.3g}, so that 16 bits reach the {bins[0].noun} at {far:.3g} m [mm]"
+
+
+def _world_rows(rig: Rig) -> Iterator[tuple[int, CameraRow]]:
+    """Indices and rows of the cameras that do not move: the others come as close to a bin as the gripper, and as far as it waits."""
+    return ((index, row) for index, row in enumerate(rig.rows) if not rig.moves(index))
 
 
 def _bin_depths(row: CameraRow, bins: Sequence[BinSizes]) -> list[float]:
@@ -269,9 +314,13 @@ def _sees_bin(row: CameraRow, sizes: BinSizes, place: Sides, turn: float) -> boo
     if distance <= radius:
         return True
     cosine = sum(a * b for a, b in zip(forward, away, strict=True)) / (math.hypot(*forward) * distance)
+    return math.acos(max(-1.0, min(1.0, cosine))) + turn <= _cone(row) + math.asin(radius / distance)
+
+
+def _cone(row: CameraRow) -> float:
+    """Angle between the optical axis and the farthest corner of a camera's image, without its distortion [rad]."""
     (columns, rows), (fx, fy, cx, cy) = row.resolution or (0, 0), intrinsics(row)
-    cone = math.atan(math.hypot(max(cx, columns - cx) / fx, max(cy, rows - cy) / fy))
-    return math.acos(max(-1.0, min(1.0, cosine))) + turn <= cone + math.asin(radius / distance)
+    return math.atan(math.hypot(max(cx, columns - cx) / fx, max(cy, rows - cy) / fy))
 
 
 def _in_wall(at: tuple[float, ...], sizes: BinSizes) -> bool:

@@ -10,6 +10,8 @@ from synpick_warp.configs.fields import setting
 from synpick_warp.configs.randomize import Distribution
 
 Vector = tuple[float, float, float]
+WORLD, GRIPPER = "world", "gripper"
+"""What cameras are fixed to."""
 
 
 @dataclass(frozen=True)
@@ -99,6 +101,13 @@ class CameraRow:
         "Where the given matrix or file has the centre of the first pixel, 0 or 0.5; not given: 0.5, and in a file its format's.",
     )
     pose: Pose = setting(Pose(), "", "Pose in the tote's frame: {matrix}, {position, quaternion} or {position, look_at, up}.")
+    fixed_to: str | None = setting(
+        None,
+        "",
+        "What carries the camera: the world, unless it is given, or the gripper (eye-in-hand). The pose is then in the frame of its shaft, "
+        "whose origin is on the wrist axis, z up.",
+        choices=(WORLD, GRIPPER),
+    )
     jitter: Jitter | None = setting(
         None,
         "",

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING
 
-from synpick_warp.configs.cameras import CameraRow, Cameras, Pose, Vector
+from synpick_warp.configs.cameras import GRIPPER, CameraRow, Cameras, Pose, Vector
 from synpick_warp.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -66,13 +66,17 @@ class Rig:
 
     @cached_property
     def groups(self) -> tuple[tuple[int, ...], ...]:
-        """Indices of the cameras that are rendered together: of one image size, and all jittered or none."""
-        kinds = [(size, self.is_placed(index)) for index, size in enumerate(self.sizes)]
+        """Indices of the cameras that are rendered together: of one image size, all placed or none, all moving or none."""
+        kinds = [(size, self.is_placed(index), self.moves(index)) for index, size in enumerate(self.sizes)]
         return tuple(tuple(index for index, own in enumerate(kinds) if own == kind) for kind in dict.fromkeys(kinds))
 
     def is_placed(self, index: int) -> bool:
         """Whether a camera's matrix and pose are not the same in all views."""
-        return self.rows[index].jitter is not None
+        return self.rows[index].jitter is not None or self.moves(index)
+
+    def moves(self, index: int) -> bool:
+        """Whether a camera moves within an episode."""
+        return self.rows[index].fixed_to == GRIPPER
 
     @property
     def largest(self) -> Size:
@@ -80,8 +84,8 @@ class Rig:
         return max(self.sizes, key=math.prod)
 
     def index(self, name: str) -> int:
-        """Index of a camera by its name; empty: the first."""
-        return self.names.index(name) if name else 0
+        """Index of a camera by its name; empty: the first that does not move, or the first."""
+        return self.names.index(name) if name else next((index for index in range(len(self)) if not self.moves(index)), 0)
 
     def key(self, index: int, name: str, section: str = "") -> str:
         """Full key of a camera's setting `name` for messages; `section`: its name in [cameras], if that differs."""

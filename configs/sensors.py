@@ -141,7 +141,7 @@ class DepthSensor:
         high=64.0,
     )
     dot_brightness: float = setting(
-        1.0,
+        2.0,
         "",
         "Brightness of projected dots on a white surface at 1 m, relative to full scale; it falls with the square of depth; 0: no pattern.",
         low=0.0,

@@ -10,7 +10,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from synpick_warp.codes import Stream
-from synpick_warp.configs.cameras import CameraRow, Jitter
+from synpick_warp.configs.cameras import WORLD, CameraRow, Jitter
 from synpick_warp.configs.rig import Rig, lens_map
 from synpick_warp.errors import ConfigError
 from synpick_warp.scenes.types import Camera
@@ -18,6 +18,8 @@ from synpick_warp.system.random_numbers import stream_key, uniform
 
 PARALLEL = 1e-6
 """Sine of the angle below which `up` counts as parallel to the viewing direction."""
+CAMERA_KEYS = ("matrix", "rotation", "translation")
+"""Names of a camera's matrix and pose, in `Camera`, `FrameBatch` and records of episodes."""
 _MIN_DISTANCE = 1e-6
 """Minimum distance between a camera and its target [m]."""
 
@@ -52,7 +54,7 @@ def _make_camera(label: str, row: CameraRow) -> Camera:
             rotation = Rotation.from_quat(pose.quaternion).as_matrix().T
         else:
             rotation = _look_at(label, position, np.array(pose.look_at, dtype=float), np.array(pose.up, dtype=float))
-    return Camera(width, height, matrix, rotation, -rotation @ position, row.name, lens_map(row))
+    return Camera(width, height, matrix, rotation, -rotation @ position, row.name, lens_map(row), row.fixed_to or WORLD)
 
 
 def _look_at(label: str, position: np.ndarray, target: np.ndarray, up: np.ndarray) -> np.ndarray:
@@ -89,22 +91,32 @@ class EpisodeCameras:
         """Cameras of an episode, with what it draws of them."""
         return tuple(self._draw(episode, camera) for camera in range(len(self.cameras)))
 
-    def of_views(self, episode: np.ndarray, camera: np.ndarray) -> dict[str, np.ndarray]:
-        """Fields matrix, rotation and translation of `FrameBatch` for views of these episodes and cameras (B), all of one group of the
-        rig; none if it has the rig's.
+    def of_views(self, episode: np.ndarray, camera: np.ndarray, shaft: np.ndarray) -> dict[str, np.ndarray]:
+        """Fields matrix, rotation and translation of `FrameBatch` for views of a group of the rig; none if all views have the rig's.
+
+        Args:
+            episode: Episode of each view (B).
+            camera: Camera of each view (B).
+            shaft: Pose of the gripper's shaft in each view: x, y, z [m], quaternion x, y, z, w (B, 7).
         """
         if not len(camera) or not self.rig.is_placed(int(camera[0])):
             return {}
         drawn = [self._draw(*pair) for pair in zip(episode.tolist(), camera.tolist(), strict=True)]
-        return {name: np.stack([getattr(one, name) for one in drawn]) for name in ("matrix", "rotation", "translation")}
+        matrix, rotation, translation = (np.stack([getattr(one, name) for one in drawn]) for name in CAMERA_KEYS)
+        if self.rig.moves(int(camera[0])):
+            rotation, translation = carry(rotation, translation, shaft)
+        return dict(zip(CAMERA_KEYS, (matrix, rotation, translation), strict=True))
 
     def record(self, episode: int) -> dict[str, Any] | None:
-        """Record of an episode's cameras by name: matrix [px], world-to-camera rotation and translation [m] of those that are drawn; None:
-        none is.
+        """Record of an episode's cameras by name, those that are drawn or move: matrix [px], rotation and translation [m] from the world,
+        or with `fixed_to` from what carries the camera; None: there is none.
         """
-        drawn = [one for index, one in enumerate(self.of_episode(episode)) if self.rig.is_placed(index)]
-        keys = ("matrix", "rotation", "translation")
-        return {one.name: {key: getattr(one, key).tolist() for key in keys} for one in drawn} or None
+        records = {}
+        for index, one in enumerate(self.of_episode(episode)):
+            if self.rig.is_placed(index):
+                records[one.name] = {key: getattr(one, key).tolist() for key in CAMERA_KEYS}
+                records[one.name] |= {"fixed_to": one.fixed_to} if self.rig.moves(index) else {}
+        return records or None
 
     def _drawn(self, episode: int, index: int) -> Camera:
         camera, jitter = self.cameras[index], self.rig.rows[index].jitter
@@ -117,6 +129,13 @@ class EpisodeCameras:
         at = position - camera.rotation.T @ camera.translation
         turned = Rotation.from_rotvec(rotation, degrees=True).as_matrix().T @ camera.rotation
         return replace(camera, matrix=matrix, rotation=turned, translation=-turned @ at)
+
+
+def carry(rotation: np.ndarray, translation: np.ndarray, pose: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """World-to-camera rotations (B, 3, 3) and translations (B, 3) [m] of cameras in what carries them, by its pose (B, 7) in the world."""
+    at = pose[:, :3].astype(np.float64)
+    turned = rotation @ Rotation.from_quat(pose[:, 3:].astype(np.float64)).as_matrix().transpose(0, 2, 1)
+    return turned, translation - np.einsum("nij,nj->ni", turned, at)
 
 
 def draw_jitter(jitter: Jitter, seed: int, episode: int, camera: int) -> tuple[np.ndarray, np.ndarray, float, np.ndarray]:

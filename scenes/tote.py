@@ -31,6 +31,8 @@ INTERIOR_MARGIN = 1e-4
 """Margin between interior and faces [m]: far above the rounding error of hit positions, below the offset of ray origins."""
 TABLE_SIZE = (10.0, 10.0, 0.1)
 """Half extents of the table under the tote [m]; large enough for objects that leave the tote."""
+FLOOR_DROP = 0.74
+"""Height of the table above the floor [m]: that of a desk of fixed height (EN 527-1)."""
 TABLE_ROUGHNESS = 0.8
 """Roughness of the table's material: matt. Its only setting is `render.table_color`."""
 

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from synpick_warp.configs.calibration.lens import LensMap
+from synpick_warp.configs.cameras import WORLD
 
 
 @dataclass(frozen=True, eq=False)
@@ -210,6 +211,8 @@ class Camera:
     name: str = ""
     lens: LensMap | None = None
     """Distortion of the lens; None: a pinhole."""
+    fixed_to: str = WORLD
+    """What carries the camera; rotation and translation lead from its frame, in place of the world's."""
 
     @property
     def distortion(self) -> dict[str, Any]:

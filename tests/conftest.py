@@ -43,6 +43,8 @@ def pytest_configure(config: pytest.Config) -> None:
     if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
         signal.signal(signal.SIGINT, signal.default_int_handler)
     os.environ[VARIABLE] = devices(config)[0]
+    # USD starts a thread a core, of which some wait by polling for the rest of the run. Without the second it reports the first.
+    os.environ.update({"PXR_WORK_THREAD_LIMIT": "1", "TF_ENV_SETTING_ALERTS_ENABLED": "0"})
     if config.getoption("--check-bounds"):
         _check_bounds(config)
     start_warp()

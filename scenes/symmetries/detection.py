@@ -96,8 +96,8 @@ def find_symmetries(vertices: np.ndarray, faces: np.ndarray, diameter: float, to
         tolerance: Largest Hausdorff distance [m].
 
     Returns:
-        A closed group of discrete symmetries. Rotations about a continuous axis are omitted: the axis stands for them. Beside it there is
-        at most one half turn, about a perpendicular axis. A ball has three continuous axes, which stand for all rotations.
+        A closed group of discrete symmetries. Rotations about a continuous axis are omitted, as the axis stands for them; beside it there
+        is at most one half turn, about a perpendicular axis. A ball has three continuous axes, which stand for all rotations.
     """
     surface = Surface(vertices, faces)
     turns, missed = _find_turns(surface, diameter, tolerance)

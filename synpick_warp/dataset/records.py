@@ -11,6 +11,7 @@ from typing import Annotated, Any, Literal, TypeVar
 import msgspec
 
 from synpick_warp.codes import Ending, Mode, Outcome, names
+from synpick_warp.configs.cameras import WORLD
 from synpick_warp.dataset.annotations import Index, Side
 from synpick_warp.errors import DatasetError
 from synpick_warp.system.inputs.files import read_file
@@ -80,6 +81,7 @@ class CameraRecord(msgspec.Struct):
     matrix: Matrix
     rotation: Matrix
     translation: Vector
+    fixed_to: str = WORLD
 
 
 class Row(msgspec.Struct):

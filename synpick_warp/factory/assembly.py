@@ -37,7 +37,7 @@ from synpick_warp.stages.render.renderer import Renderer
 from synpick_warp.stages.render.scene import RenderScene, build_render_scene, with_cameras
 from synpick_warp.stages.sim.simulate import Simulation
 from synpick_warp.stages.stream import FrameStream, LightTable, name_lights
-from synpick_warp.stages.view_ring import CameraGroup, ViewRing, view_sizes
+from synpick_warp.stages.view_ring import CameraGroup, ViewRing, history_count, view_sizes
 from synpick_warp.system.hardware.device import pick_device
 from synpick_warp.system.processes.garbage import collection_paused
 from synpick_warp.system.progress import Progress, SilentProgress
@@ -216,8 +216,8 @@ def _build_group(config: Config, scene: RenderScene, cameras: tuple[Camera, ...]
     indices, worlds, objects = config.rig.groups[index], config.bake.worlds, config.arrangement.max_objects
     sizes = view_sizes(config.render, config.rig, worlds, objects, scene.device, index)
     scene = with_cameras(scene, tuple(cameras[camera] for camera in indices))
-    renderer = make_renderer(config, scene, objects, sizes["view"], worlds * len(indices))
-    return CameraGroup(indices, sizes, renderer, config.rig.is_placed(indices[0]))
+    renderer = make_renderer(config, scene, objects, sizes["view"], history_count(config.rig, worlds, index))
+    return CameraGroup(indices, sizes, renderer, config.rig.is_placed(indices[0]), config.rig.moves(indices[0]))
 
 
 def _fit_to_catalog(config: Config, catalog: Catalog, device: wp.Device, progress: Progress) -> Config:

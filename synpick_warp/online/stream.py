@@ -30,7 +30,7 @@ from synpick_warp.online.selection import Selection, choose_episodes
 from synpick_warp.stages.buffers import Snapshot
 from synpick_warp.stages.online.batches import BatchRing, ViewBatch
 from synpick_warp.stages.render.view_setup import pair_views
-from synpick_warp.stages.stream import TickReport, describe_views
+from synpick_warp.stages.stream import TickReport, describe_views, last_cameras
 from synpick_warp.stages.ticks import TickLoop
 from synpick_warp.system.hardware.device import pick_device
 from synpick_warp.system.progress import Progress, SilentProgress
@@ -166,7 +166,8 @@ class Producer:
             known = (self.object_ids, stages.light_table, stages.config.cell.recorded, stages.episode_cameras)
             host = describe_views(report, world[part], camera[part], stages.tick_time, *known)
             host["arrangement"] = report.column("arrangement")[world[part]]
-            yield ring.render(snapshot, world[part], camera[part], host)
+            last = last_cameras(stages.episode_cameras, report, world[part], camera[part])
+            yield ring.render(snapshot, world[part], camera[part], host, last)
 
     def _end_episodes(self, report: TickReport) -> None:
         """Add the episodes that ended in a tick to the summary."""

@@ -22,7 +22,11 @@ from synpick_warp.stages.sim.step_log import host_record, record_arrays, tick_me
 from synpick_warp.stages.view_ring import ViewRing
 from synpick_warp.views.frames import FrameBatch, SelectedRows, TickBatch
 
+SHAFT = 1
+"""Column of the gripper's shaft in poses of fixtures."""
 # Names of the snapshot's arrays that are copied to `TickReport.snapshot`.
+_REPORTED = ("last_fixture_pose",)
+"""Further arrays, which `TickBatch` does not have."""
 _SNAPSHOT = ("bin", "fixture_pose", "fixture_visible", "light", "light_yaw", "light_exposure")
 
 
@@ -140,7 +144,7 @@ def read_tick(record: TickRecord) -> TickReport:
 def _reported_parts(record: TickRecord) -> list[tuple[Any, list[str]]]:
     """Parts of a record that become namespaces of a report, each with the names of the arrays that are copied."""
     parts: list[tuple[Any, list[str]]] = [(part, [item.name for item in fields(part)]) for part in (record.observation, record.plan)]
-    return [*parts, (record.snapshot, list(_SNAPSHOT))]
+    return [*parts, (record.snapshot, [*_SNAPSHOT, *_REPORTED])]
 
 
 def tick_batch(report: TickReport, object_ids: np.ndarray, tick_time: float) -> TickBatch:
@@ -190,7 +194,7 @@ def describe_views(
     """
     own = {"bin_name": np.array(bins)[report.snapshot.bin[world]], "bin_pose": report.snapshot.fixture_pose[world, 0]} if bins else {}
     episode, frame = report.column("episode")[world], report.column("frame")[world]
-    own |= cameras.of_views(episode, camera) if cameras is not None else {}
+    own |= cameras.of_views(episode, camera, report.snapshot.fixture_pose[world, SHAFT]) if cameras is not None else {}
     light, yaw = report.snapshot.light[world], report.snapshot.light_yaw[world]
     return {
         "episode": episode,
@@ -205,6 +209,13 @@ def describe_views(
         "light_direction": lights.directions(light, yaw),
         **own,
     }
+
+
+def last_cameras(cameras: EpisodeCameras | None, report: TickReport, world: np.ndarray, camera: np.ndarray) -> dict[str, np.ndarray]:
+    """As matrix, rotation and translation of `describe_views`, in the tick before."""
+    if cameras is None:
+        return {}
+    return cameras.of_views(report.column("episode")[world], camera, report.snapshot.last_fixture_pose[world, SHAFT])
 
 
 @dataclass(eq=False)
@@ -289,7 +300,8 @@ class FrameStream:
                 part = slice(first, min(first + ring.batch, len(world)))
                 known = (self.tick_time, self.object_ids, self.lights, self.bins, self.cameras)
                 description = describe_views(report, world[part], camera[part], *known)
-                slot = ring.launch(snapshot, world[part], camera[part], self.streams, description)
+                last = last_cameras(self.cameras, report, world[part], camera[part])
+                slot = ring.launch(snapshot, world[part], camera[part], self.streams, (description, last))
                 self.in_flight.append(_Launched(ring, slot, part.stop - first, description))
                 ahead += int(self.device.is_cuda)
         if len(live):

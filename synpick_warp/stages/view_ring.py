@@ -19,7 +19,7 @@ from synpick_warp.stages.encoding.png import DepthBuffers, DepthEncoder, DepthSc
 from synpick_warp.stages.host_copies import DeviceImages, HostCopy, HostImages
 from synpick_warp.stages.render.mask_runs import BoundaryBuffers, BoundaryScratch, boundary_sizes, list_boundaries
 from synpick_warp.stages.render.renderer import Renderer
-from synpick_warp.stages.render.view_setup import allocate_view_cameras, make_views, place_cameras
+from synpick_warp.stages.render.view_setup import PlacedCameras, allocate_view_cameras, make_views, place_cameras
 from synpick_warp.stages.render_streams import RenderStreams
 from synpick_warp.stages.timing import scope
 
@@ -55,6 +55,16 @@ def view_sizes(render: Render, rig: Rig, worlds: int, objects: int, device: wp.D
     return view_buffer_sizes(views_per_batch(render, rig, worlds, device, group), *size, objects)
 
 
+Placements = tuple[Mapping[str, Any], Mapping[str, Any]]
+"""Matrices and poses of the cameras of views, in this frame and in the one before."""
+
+
+def history_count(rig: Rig, worlds: int, group: int = 0) -> int:
+    """Number of light histories of a group of cameras, one a world and camera; 0: the cameras move, and no light is averaged."""
+    cameras = rig.groups[group]
+    return 0 if rig.moves(cameras[0]) else worlds * len(cameras)
+
+
 @dataclass(frozen=True, eq=False)
 class CameraGroup:
     """Cameras of one image size, which are rendered together; see `Rig.groups`."""
@@ -66,22 +76,30 @@ class CameraGroup:
     renderer: Renderer
     placed: bool = False
     """Whether each view has a matrix and pose of its own, as of `Rig.is_placed`."""
+    moves: bool = False
+    """Whether the cameras move within an episode, as of `Rig.moves`."""
 
     def slots(self, camera: np.ndarray) -> np.ndarray:
         """Row of cameras in the renderer's scene (view) int32, by their indices (view)."""
         return np.searchsorted(np.array(self.cameras), camera).astype(np.int32)
 
-    def allocate_cameras(self) -> Any:
-        """Allocate the struct `ViewCameras` of a batch; None: the scene has the cameras of all views."""
+    def allocate_cameras(self) -> PlacedCameras | None:
+        """Allocate the cameras of a batch; None: the scene has those of all views."""
         if not self.placed:
             return None
-        scene = self.renderer.scene
-        return allocate_view_cameras(self.sizes["view"], scene.device, scene.cameras)
+        scene, views = self.renderer.scene, self.sizes["view"]
+        now, last = (allocate_view_cameras(views, scene.device, scene.cameras) for _ in range(2))
+        return PlacedCameras(now, last if self.moves else now)
 
-    def place(self, cameras: Any, camera: np.ndarray, description: Mapping[str, Any]) -> None:
-        """Set the struct of `allocate_cameras` for views of these cameras (view), by their description, as `FrameBatch` has it."""
-        if cameras is not None:
-            place_cameras(cameras, self.renderer.scene, self.slots(camera), description)
+    def place(self, cameras: PlacedCameras | None, camera: np.ndarray, placed: Placements) -> None:
+        """Set what `allocate_cameras` made, for views of these cameras (view), by matrix, rotation and translation as `FrameBatch` has
+        them: of this frame, and of the one before."""
+        if cameras is None:
+            return
+        now, last = placed
+        place_cameras(cameras.now, self.renderer.scene, self.slots(camera), now)
+        if self.moves:
+            place_cameras(cameras.last, self.renderer.scene, self.slots(camera), last)
 
 
 @dataclass(frozen=True, eq=False)
@@ -154,12 +172,10 @@ class ViewRing:
         self.view_cameras = [group.allocate_cameras() for _ in self.slots]
         self._next = 0
 
-    def launch(
-        self, snapshot: Snapshot, world: np.ndarray, camera: np.ndarray, streams: RenderStreams, description: Mapping[str, Any]
-    ) -> int:
+    def launch(self, snapshot: Snapshot, world: np.ndarray, camera: np.ndarray, streams: RenderStreams, placed: Placements) -> int:
         """Render the views (world, camera) of a snapshot into the next slot, then start to encode and copy the images; returns the slot.
 
-        `description`: that of the views by `describe_views`.
+        `placed`: matrices and poses of the views' cameras, see `CameraGroup.place`.
         """
         slot, count = self._next, len(world)
         self._next = (slot + 1) % len(self.slots)
@@ -168,10 +184,10 @@ class ViewRing:
         padded[1] = self.cameras[0]
         padded[:, :count] = world, camera, self.group.slots(camera)
         rows.assign(padded)
-        views, placed = make_views(rows[0], rows[1], count, self.instances, slot=rows[2]), self.view_cameras[slot]
-        self.group.place(placed, camera, description)
+        views, cameras = make_views(rows[0], rows[1], count, self.instances, slot=rows[2]), self.view_cameras[slot]
+        self.group.place(cameras, camera, placed)
         with wp.ScopedStream(streams.render, sync_exit=True), scope("render", self.device):
-            self.renderer.render(snapshot, views, self.slots[slot].images, self.slots[slot].layers, placed)
+            self.renderer.render(snapshot, views, self.slots[slot].images, self.slots[slot].layers, cameras)
         with wp.ScopedStream(streams.copy):
             with scope("encode", self.device):
                 self._encode(slot, count)

@@ -144,6 +144,37 @@ def test_jitter_that_is_refused(tmp_path, text, words):
     assert "\n" not in str(caught.value)
 
 
+HAND = '[[camera]]\nfixed_to = "gripper"\nfov = 60\npose = { position = [0.1, 0, 0.2], look_at = [0, 0, -0.1], up = [0, 1, 0] }\n'
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        (HAND.replace("gripper", "hand"), 'camera[0].fixed_to is "hand" in {path}; allowed: world, gripper'),
+        (HAND.replace("[0.1, 0, 0.2]", "[0.01, 0, 0.2]"), "allowed: positions outside of the gripper's shaft and cup"),
+        (HAND.replace("-0.1]", "5]"), "allowed: a point that lets camera camera_0 see below the gripper, z < 0 [m]"),
+        (HAND.replace("up = [0, 1, 0]", "up = [0, 0, 0]"), "up vectors that are not zero or parallel"),
+        (HAND + "[camera.jitter]\nposition = { uniform = [-0.1, 0.1] }\n", "every draw has positions outside of the gripper's shaft"),
+        (HAND + "[camera.jitter]\nrotation = { uniform = [-90, 90] }\n", "every draw has a point that lets camera camera_0 see below"),
+        (HAND + '[bake]\nmode = "pick"\n', 'perception.camera is "" by default; allowed: the name of a camera that is fixed to the world'),
+        (
+            LEFT + HAND + '[bake]\nmode = "pick"\n[perception]\ncamera = "camera_1"\n',
+            'perception.camera is "camera_1" in {path}; allowed: the name of a camera that is fixed to the world',
+        ),
+    ],
+)
+def test_cameras_on_the_gripper_that_are_refused(tmp_path, text, words):
+    with pytest.raises(ConfigError) as caught:
+        load(tmp_path, text)
+    assert words.format(path=tmp_path / "cell.toml") in str(caught.value)
+
+
+def test_perception_takes_the_first_camera_that_does_not_move(tmp_path):
+    rig = load(tmp_path, HAND + LEFT + '[bake]\nmode = "pick"\n').rig
+    assert (rig.index(""), rig.groups) == (1, ((0,), (1,)))
+    load(tmp_path, HAND)  # Nothing is planned where objects are only stirred.
+
+
 def test_jitter_is_kept_and_makes_a_group_of_its_own(tmp_path):
     config = load(tmp_path, LEFT + "[camera.jitter]\nposition = { normal = [0.0, 0.002] }\n" + LEFT.replace('"left"', '"right"'))
     again = tmp_path / "again.toml"

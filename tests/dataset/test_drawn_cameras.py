@@ -1,4 +1,5 @@
-"""A bake of cameras that are not the same in all views: drawn anew by each episode. Files against formulas, in float64."""
+"""A bake of cameras that are not the same in all views: drawn anew by each episode, or carried by the gripper. Files against formulas, in
+float64."""
 
 from __future__ import annotations
 
@@ -16,6 +17,8 @@ from scipy.spatial.transform import Rotation
 import synpick_warp
 from synpick_warp.codes import Stream
 from synpick_warp.configs.load import load_config
+from synpick_warp.errors import ConfigError, OutputError
+from synpick_warp.factory import pipeline
 from synpick_warp.factory.pipeline import run_bake
 from synpick_warp.scenes.cameras import make_cameras
 from synpick_warp.system.progress import SilentProgress
@@ -41,7 +44,14 @@ name = "still"
 resolution = [96, 72]
 fov = 40.0
 pose = { position = [0.0, 0.0, 1.2], look_at = [0.0, 0.0, 0.0], up = [0.0, 1.0, 0.0] }
+[[camera]]
+name = "hand"
+resolution = [96, 72]
+fov = 70.0
+fixed_to = "gripper"
+pose = { position = [0.12, 0.02, 0.4], look_at = [0.02, 0.0, -0.1], up = [0.0, 1.0, 0.0] }
 """
+CAMERAS = 3
 FORMATS = ("bop", "usd", "zarr")
 EPISODES = 2
 
@@ -51,7 +61,14 @@ def cell_config(folder: Path, **given: object):
     folder.mkdir(exist_ok=True, parents=True)
     (folder / "cell.toml").write_text(CELL)
     rows = load_config(str(folder / "cell.toml")).camera
-    return replace(settings(**STIRRING | {"bake.formats": list(FORMATS), "bake.episodes": EPISODES, "bake.worlds": 2} | given), camera=rows)
+    return replace(
+        settings(
+            **STIRRING
+            | {"bake.formats": list(FORMATS), "render.layers": ["flow", "scene_flow"], "bake.episodes": EPISODES, "bake.worlds": 2}
+            | given
+        ),
+        camera=rows,
+    )
 
 
 def bake(out: Path, **given: object) -> None:
@@ -98,13 +115,13 @@ def test_each_episode_draws_its_own_camera_and_all_formats_have_it(cell):
     store = zarr.open_group(cell / "trajectory.zarr", mode="r")
     for episode in range(EPISODES):
         matrix, rotation, translation = drawn_camera(config, episode)
-        scene = json.loads((cell / f"train/{2 * episode:06d}/scene_camera.json").read_text())
+        scene = json.loads((cell / f"train/{CAMERAS * episode:06d}/scene_camera.json").read_text())
         for entry in scene.values():
             np.testing.assert_allclose(np.reshape(entry["cam_K"], (3, 3)), matrix, rtol=0, atol=1e-12)
             np.testing.assert_allclose(np.reshape(entry["cam_R_w2c"], (3, 3)), rotation, rtol=0, atol=1e-14)
             np.testing.assert_allclose(entry["cam_t_w2c"], 1e3 * translation, rtol=0, atol=1e-10)
         row = rows[episode]["cameras"]
-        assert list(row) == ["drawn"]
+        assert list(row) == ["drawn", "hand"]
         assert store[f"episodes/{episode:06d}"].attrs["cameras"] == row
         assert np.ravel(row["drawn"]["matrix"]).tolist() == entry["cam_K"]
         assert (1e3 * np.array(row["drawn"]["translation"])).tolist() == entry["cam_t_w2c"]
@@ -118,6 +135,56 @@ def test_each_episode_draws_its_own_camera_and_all_formats_have_it(cell):
         seen.append(translation)
     assert np.abs(seen[0] - seen[1]).max() > 1e-3
     assert np.linalg.norm(Rotation.from_matrix(rotation @ make_cameras(config.rig)[0].rotation.T).as_rotvec()) > 1e-3
+
+
+def hand_poses(cell: Path, episode: int) -> tuple[np.ndarray, np.ndarray]:
+    """World-to-camera rotations and translations of the camera on the gripper, from the recorded poses of the shaft."""
+    down = make_cameras(cell_config(cell.parent / "again").rig)[2]
+    shaft = np.array(zarr.open_group(cell / "trajectory.zarr", mode="r")[f"episodes/{episode:06d}/ticks/fixture_pose"])[:, 1].astype(float)
+    turned = np.stack([down.rotation @ Rotation.from_quat(pose[3:]).as_matrix().T for pose in shaft])
+    center = [pose[:3] + Rotation.from_quat(pose[3:]).as_matrix() @ [0.12, 0.02, 0.4] for pose in shaft]
+    return turned, -np.einsum("nij,nj->ni", turned, center)
+
+
+def test_a_camera_on_the_gripper_goes_where_it_goes(cell):
+    for episode in range(EPISODES):
+        rotations, translations = hand_poses(cell, episode)
+        assert np.ptp(translations, axis=0).max() > 0.05
+        scene = json.loads((cell / f"train/{CAMERAS * episode + 2:06d}/scene_camera.json").read_text())
+        stage = Usd.Stage.Open(str(cell / f"usd/{episode:06d}.usdc"))
+        prim = stage.GetPrimAtPath("/Episode/Cameras/hand")
+        assert len(scene) == len(rotations)
+        for frame, (rotation, translation) in enumerate(zip(rotations, translations, strict=True)):
+            entry = scene[str(frame)]
+            np.testing.assert_allclose(np.reshape(entry["cam_R_w2c"], (3, 3)), rotation, rtol=0, atol=1e-12)
+            np.testing.assert_allclose(entry["cam_t_w2c"], 1e3 * translation, rtol=0, atol=1e-9)
+            pose = np.array(UsdGeom.XformCache(frame).GetLocalToWorldTransform(prim)).T
+            np.testing.assert_allclose(pose[:3, :3], rotation.T * [1, -1, -1], atol=1e-12)
+            np.testing.assert_allclose(pose[:3, 3], -rotation.T @ translation, atol=1e-12)
+
+
+def test_flow_through_the_moving_camera_leads_to_the_frame_before(cell):
+    """Points of what does not move, from depth and flow, are where the exported cameras of both frames see them."""
+    scene, checked = synpick_warp.open(cell)[0], 0
+    for frame in range(1, len(scene)):
+        now, before = scene.view(frame, 2), scene.view(frame - 1, 2)
+        height, width = now.depth.shape
+        columns, rows = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
+        rays = np.stack([columns, rows, np.ones_like(rows)], -1) @ np.linalg.inv(now.intrinsics).T
+        points = rays * now.depth[..., None]
+        to_before = before.world_to_camera @ np.linalg.inv(now.world_to_camera)
+        then = points @ to_before[:3, :3].T + to_before[:3, 3]
+        flow, scene_flow = now.layer("flow"), now.layer("scene_flow")
+        # What has no instance stands still, but for the gripper, which is nearer.
+        still = ~now.masks.any(axis=0) & np.isfinite(flow).all(axis=-1) & (points[..., 2] > 0) & (now.depth > 0.48)
+        pixels = then @ before.intrinsics.T
+        expected = pixels[..., :2] / pixels[..., 2:] - np.stack([columns, rows], -1)
+        assert still.sum() > 200
+        # Depth has steps of 0.1 mm, and flow of 1/64 px.
+        assert np.abs(flow - expected)[still].max() < 0.05
+        assert np.abs(scene_flow - (then - points))[still].max() < 5e-4
+        checked += np.abs(expected[still]).max() > 2.0
+    assert checked
 
 
 def test_pictures_are_those_of_the_drawn_camera(cell):
@@ -141,3 +208,34 @@ def test_the_number_of_worlds_changes_no_byte(cell, tmp_path, worlds):
     bake(tmp_path / "set", **{"bake.worlds": worlds, "bake.formats": ["bop", "usd", "zarr"]})
     ours, theirs = digests(cell), digests(tmp_path / "set")
     assert {name for name, _ in ours.items() ^ theirs.items()} <= {"config.toml"}
+
+
+def test_an_interrupted_bake_resumes_to_the_same_bytes(cell, tmp_path, monkeypatch):
+    """The first episode is committed when the second fails; the settings are then read back from the data set."""
+    ended, end = [], pipeline._Run._end
+
+    def fail(*arguments) -> None:
+        ended.append(arguments)
+        if len(ended) > 1:
+            raise OutputError("no space left")
+        end(*arguments)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(pipeline._Run, "_end", fail)
+        with pytest.raises(OutputError, match="no space left"):
+            bake(tmp_path / "set", **{"bake.worlds": 1})
+    assert len(list((tmp_path / "set/manifest").glob("0*.json"))) == 1
+    with boxes():
+        summary = run_bake(load_config(str(tmp_path / "set/config.toml")), tmp_path / "set", SilentProgress())
+    assert (summary.resumed, len(summary.episodes)) == (1, EPISODES)
+    assert {name for name, _ in digests(cell).items() ^ digests(tmp_path / "set").items()} <= {"config.toml"}
+
+
+@pytest.mark.parametrize(("old", "new"), [("[0.0, 0.01]", "[0.0, 0.02]"), ('"gripper"', '"world"'), ("70.0", "71.0")])
+def test_other_cameras_do_not_resume(cell, old, new):
+    changed = CELL.replace(old, new)
+    assert changed != CELL
+    (cell.parent / "other.toml").write_text(changed)
+    config = replace(cell_config(cell.parent / "again"), camera=load_config(str(cell.parent / "other.toml")).camera)
+    with pytest.raises(ConfigError, match="camera"):
+        run_bake(config, cell, SilentProgress())

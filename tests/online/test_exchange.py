@@ -50,7 +50,7 @@ def render(ring: BatchRing) -> ViewBatch:
     arrays = {item.name: item.metadata["array"] for item in dataclasses.fields(Snapshot)}
     snapshot = Snapshot(**{n: wp.zeros([worlds[d] for d in spec.shape], dtype=spec.dtype, device=device) for n, spec in arrays.items()})
     zeros = np.zeros(VIEWS, np.int32)
-    return ring.render(snapshot, zeros, zeros, {})
+    return ring.render(snapshot, zeros, zeros, {}, {})
 
 
 def test_slow_consumers_on_their_own_stream_read_each_batch_whole(ring):

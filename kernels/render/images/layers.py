@@ -38,10 +38,10 @@ SMALL_SHIFT = wp.constant(1.0e-8)
 
 @wp.struct
 class BodyMotions:
-    """Motion of each body from this frame back to the previous one, in the camera's axes. Scratch."""
+    """Motion of each body, and of the table as the last, from this frame back to the previous one, in the camera's axes. Scratch."""
 
     known: wp.array2d[int]
-    """1: the body was in the scene in the previous frame, of the same episode (view, body)."""
+    """1: the body was in the scene in the previous frame, of the same episode; of the table: the camera has moved (view, body)."""
     rotation: wp.array2d[wp.mat33]
     """Rotation R from the current to the previous orientation, minus the identity (view, body)."""
     origin: wp.array2d[wp.vec3]
@@ -78,20 +78,30 @@ def compute_motions_kernel(
     last_fixture_visible: wp.array2d[int],  # (world, fixture)
     # In:
     views: AnyViews,
+    last_rotation: wp.array[wp.mat33d],  # (view)
+    last_center: wp.array[wp.vec3d],  # (view) [m]
     # Out:
     motions_out: BodyMotions,
 ):
     """Relative rigid motion of each body: p_then - p = (R_then R⁻¹ - 1) (p - o) + (o_then - o), in float64, stored in float32.
 
-    `motions_out` receives R_then R⁻¹ - 1, o and o_then - o, rotated to the camera's axes. Differences are stored instead of poses, so that
-    small motions have small errors. `follows` is 1 if the last tick was the previous frame of the same episode. Launched over view, body.
+    `motions_out` receives R_then R⁻¹ - 1, o and o_then - o, rotated to the camera's axes; positions of then are those in the axes of
+    the camera then, which has moved with the gripper or not at all. Differences are stored instead of poses, so that small motions have
+    small errors. `follows` is 1 if the last tick was the previous frame of the same episode. Launched over view, body and table.
     """
     view, body = wp.tid()
     world = views.world[view]
     known = follows[world]
-    now = pose[world, 0]
+    now = wp.transform_identity(dtype=float)
     then = now
-    if body < views.instances:
+    to_camera = views.cameras.rotation[view]
+    center = views.cameras.center[view]
+    moves = int(1)
+    if last_center[view] == center and last_rotation[view] == to_camera:
+        moves = 0
+    if body == motions_out.known.shape[1] - 1:
+        known *= moves
+    elif body < views.instances:
         now = pose[world, body]
         then = last_pose[world, body]
         if catalog_index[world, body] < 0 or last_catalog_index[world, body] != catalog_index[world, body]:
@@ -103,11 +113,13 @@ def compute_motions_kernel(
     motions_out.known[view, body] = known
     if known == 0:
         return
-    to_camera = views.cameras.rotation[view]
-    rotation = to_camera * rotation_of(then) * wp.transpose(rotation_of(now)) * wp.transpose(to_camera)
+    rotation = last_rotation[view] * rotation_of(then) * wp.transpose(rotation_of(now)) * wp.transpose(to_camera)
+    displacement = to_camera * (position_of(then) - position_of(now))
+    if moves != 0:
+        displacement = last_rotation[view] * (position_of(then) - last_center[view]) - to_camera * (position_of(now) - center)
     motions_out.rotation[view, body] = wp.mat33(rotation - wp.identity(n=3, dtype=wp.float64))
-    motions_out.origin[view, body] = wp.vec3(to_camera * (position_of(now) - views.cameras.center[view]))
-    motions_out.displacement[view, body] = wp.vec3(to_camera * (position_of(then) - position_of(now)))
+    motions_out.origin[view, body] = wp.vec3(to_camera * (position_of(now) - center))
+    motions_out.displacement[view, body] = wp.vec3(displacement)
 
 
 @wp.func
@@ -258,15 +270,18 @@ def render_classes_kernel(
 def point_displacement(
     motions: BodyMotions, gbuffer: GBuffer, view: int, row: int, column: int, ray: wp.vec3, follows: int, instances: int
 ) -> wp.vec3:
-    """Displacement from a pixel's surface point to its position in the previous frame, in the camera's axes [m]; NaN: unknown."""
+    """Displacement from a pixel's surface point to its position in the previous frame, each in the axes of its camera [m]; NaN: unknown."""
     unknown = wp.vec3(wp.NAN, wp.NAN, wp.NAN)
     segment = int(gbuffer.segment[view, row, column])
     if segment == Segment.NOTHING or follows == 0:
         return unknown
-    if segment == Segment.TABLE:
-        return wp.vec3(0.0, 0.0, 0.0)
-    body = body_of(segment, instances)
+    table = motions.known.shape[1] - 1
+    body = table
+    if segment != Segment.TABLE:
+        body = body_of(segment, instances)
     if motions.known[view, body] == 0:
+        if body == table:
+            return wp.vec3(0.0, 0.0, 0.0)
         return unknown
     point = gbuffer.depth[view, row, column] * ray
     return motions.rotation[view, body] * (point - motions.origin[view, body]) + motions.displacement[view, body]

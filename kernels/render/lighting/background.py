@@ -16,17 +16,19 @@ from synpick_warp.kernels.render.visibility.variants import kernel_of_views
 
 wp.set_module_options({"enable_backward": False})
 
-FLOOR_DROP = wp.constant(0.74)
-"""Height of the table above the floor [m]: that of a desk of fixed height (EN 527-1)."""
 HORIZON = wp.constant(0.02)
 """Sine of the angle below the horizon at which the floor ends: 1.1 degrees, beyond which its texture is one colour."""
 
 
 @wp.func
-def floor_radiance(scene: PathScene, bodies: ViewBodies, cameras: AnyCameras, view: int, light: int, direction: wp.vec3) -> wp.vec3:
-    """Radiance of the floor that a camera sees along a unit direction in the world, which points down: diffuse, in unoccluded light."""
+def floor_radiance(
+    scene: PathScene, drop: float, bodies: ViewBodies, cameras: AnyCameras, view: int, light: int, direction: wp.vec3
+) -> wp.vec3:
+    """Radiance of the floor, `drop` [m] below the table, along a unit direction in the world, which points down: diffuse, in unoccluded
+    light.
+    """
     center = wp.vec3(cameras.center[view])
-    distance = wp.max(center[2] - scene.table.height + FLOOR_DROP, 0.0) / -direction[2]
+    distance = wp.max(center[2] - scene.table.height + drop, 0.0) / -direction[2]
     surface = Surface()
     surface.row = bodies.material[view, bodies.mesh.shape[1] + 1]
     width = distance / cameras.intrinsics[view][0]
@@ -42,6 +44,7 @@ def shade_floor_kernel(
     # Scene:
     scene: PathScene,
     grid: ImageGrid,
+    drop: float,
     # State: worlds
     light: wp.array[int],  # (world)
     # In:
@@ -54,7 +57,8 @@ def shade_floor_kernel(
 ):
     """Show the floor where a pixel shows nothing and its ray points down. It is seen only: it has no depth, and reflects no light.
 
-    The last material of each view is the floor's. Launched over view, pixel (tile order, from flat index `first` on).
+    The last material of each view is that of the floor, which is `drop` [m] below the table. Launched over view, pixel (tile order, from
+    flat index `first` on).
     """
     view, row, column = tile_pixel(grid, wp.tid() + first)
     if not in_image(grid, row, column) or views.world[view] < 0:
@@ -62,4 +66,5 @@ def shade_floor_kernel(
     if int(gbuffer.segment[view, row, column]) == Segment.NOTHING:
         direction = wp.normalize(views.cameras.to_world[view] * camera_ray(views.cameras, view, row, column, wp.vec2(0.0, 0.0)))
         if direction[2] < -HORIZON:
-            radiance_inout[view, row, column] = floor_radiance(scene, bodies, views.cameras, view, light[views.world[view]], direction)
+            sky = light[views.world[view]]
+            radiance_inout[view, row, column] = floor_radiance(scene, drop, bodies, views.cameras, view, sky, direction)

@@ -81,7 +81,7 @@ YOUNGER_SETTINGS: dict[str, Any] = {
     "depth_sensor.max_disparity": 0.0,
     "depth_sensor.projector": 0.5,
     "depth_sensor.dot_spacing": 4.0,
-    "depth_sensor.dot_brightness": 1.0,
+    "depth_sensor.dot_brightness": 2.0,
     "depth_sensor.ambient": 0.25,
     "depth_sensor.infrared_noise": 0.005,
     "perception.camera": "",

@@ -11,6 +11,7 @@ import numpy as np
 import zarr
 from zarr.codecs import ZstdCodec
 
+from synpick_warp.configs.cameras import WORLD
 from synpick_warp.configs.schema import Physics, Trajectory
 from synpick_warp.exporters.trajectory.arrays import CAMERAS, CONSTANT_GROUPS, EPISODES, FORMAT, LABELS, OBJECTS, ArraySpec, GroupSpec
 from synpick_warp.scenes.types import FIRST_DISTRACTOR, Camera, Catalog, EnvironmentMap
@@ -140,7 +141,8 @@ def write_constants(
     for name, spec in OBJECTS.arrays.items():
         values = [entry.obj_id if name == "object_id" else getattr(entry, name) for entry in entries]
         add_array(objects, name, spec, np.array(values, spec.dtype), level)
-    group = add_group(root, "cameras", CAMERAS)
+    fixed_to = [camera.fixed_to for camera in cameras]
+    group = add_group(root, "cameras", CAMERAS, {"fixed_to": fixed_to} if set(fixed_to) != {WORLD} else {})
     for name, spec in CAMERAS.arrays.items():
         values = [(camera.width, camera.height) if name == "resolution" else getattr(camera, name) for camera in cameras]
         add_array(group, name, spec, np.array(values, spec.dtype), level)

@@ -27,11 +27,11 @@ from synpick_warp.exporters.usd.parts import (
     save_layer,
     write_texture,
 )
-from synpick_warp.exporters.usd.types import TEXTURES, bin_asset, drawn_texture, object_asset
+from synpick_warp.exporters.usd.types import FLOOR, TEXTURES, bin_asset, drawn_texture, object_asset
 from synpick_warp.scenes.bins import Bin
 from synpick_warp.scenes.gripper import cup_collider, cup_fixture, finger_collider, finger_fixture, rod_inertia
 from synpick_warp.scenes.looks import Looks, project_from_box
-from synpick_warp.scenes.tote import TABLE_ROUGHNESS, TABLE_SIZE
+from synpick_warp.scenes.tote import FLOOR_DROP, TABLE_ROUGHNESS, TABLE_SIZE
 from synpick_warp.scenes.types import Catalog, CatalogEntry, ConvexPiece, EnvironmentMap, Fixture, Material, TriangleMesh
 
 
@@ -69,7 +69,9 @@ def write_library(
     length, mass = gripper.cup_length, gripper.cup_mass
     add_body(cup.GetDefaultPrim(), mass, np.array([0.0, 0.0, -length / 2]), np.diag(rod_inertia(mass, length)), kinematic=True)
     _save(library, "cup", cup)
-    textures = {} if looks is None else {LookPart.BIN: looks.bin_textures, LookPart.TABLE: looks.table_textures}
+    textures = {} if looks is None else looks.textures
+    if textures.get(LookPart.BACKGROUND):
+        _write_floor(library, bins[0].sizes.base - FLOOR_DROP)
     for part, images in textures.items():
         for index, texture in enumerate(images):
             write_texture(library, drawn_texture(part, index), texture)
@@ -126,9 +128,7 @@ def _write_table(library: Path, physics: Physics, height: float, render: Render,
     root, friction = _add_contact_material(stage, physics)
     if render.table:
         sides = [0.5 * size or most for size, most in zip(render.table_size, TABLE_SIZE[:2], strict=True)]
-        corners = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]]) * np.array([*sides, TABLE_SIZE[2]]) + [0.0, 0.0, height]
-        uv = corners[:, :2] if has_textures else np.array([[0, 0], [1, 0], [1, 1], [0, 1]], np.float32)
-        quad = TriangleMesh(corners, np.array([[0, 1, 2], [0, 2, 3]]), np.tile([0.0, 0.0, 1.0], (4, 1)), uv)
+        quad = _make_quad(sides, height, has_textures)
         material = Material(render.table_color, None, 0.0, TABLE_ROUGHNESS)
         add_mesh(stage, f"{root}/Visual", quad, add_surface(stage, f"{root}/Materials/Surface", material, None))
     UsdGeom.Scope.Define(stage, f"{root}/Collision")
@@ -139,6 +139,21 @@ def _write_table(library: Path, physics: Physics, height: float, render: Render,
     box.AddScaleOp().Set(Gf.Vec3f(*TABLE_SIZE))
     make_collider(box, friction, physics.gap)
     _save(library, "table", stage)
+
+
+def _write_floor(library: Path, height: float) -> None:
+    """Write the floor at this height [m], which is seen beyond the edge of the table: a visible side without collision shape."""
+    stage = new_asset("floor", "floor")
+    surface = add_surface(stage, "/floor/Materials/Surface", FLOOR, None)
+    add_mesh(stage, "/floor/Visual", _make_quad(TABLE_SIZE[:2], height, True), surface)
+    _save(library, "floor", stage)
+
+
+def _make_quad(sides: Sequence[float], height: float, in_metres: bool) -> TriangleMesh:
+    """Horizontal rectangle of these half sides [m]; its texture coordinates are metres, or span it."""
+    corners = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]]) * np.array([*sides, 0.0]) + [0.0, 0.0, height]
+    uv = corners[:, :2] if in_metres else np.array([[0, 0], [1, 0], [1, 1], [0, 1]], np.float32)
+    return TriangleMesh(corners, np.array([[0, 1, 2], [0, 2, 3]]), np.tile([0.0, 0.0, 1.0], (4, 1)), uv)
 
 
 def _add_contact_material(stage: Usd.Stage, physics: Physics) -> tuple[str, UsdShade.Material]:

@@ -13,7 +13,7 @@ from synpick_warp.exporters.staging import EpisodeExporter, StagedEpisode
 from synpick_warp.exporters.usd.episode import write_episode
 from synpick_warp.exporters.usd.lights import make_stage_light
 from synpick_warp.exporters.usd.spool import TickSpool, tick_rows
-from synpick_warp.exporters.usd.types import AssetSurface, EpisodeMetadata, EpisodeSettings, bin_asset, object_asset
+from synpick_warp.exporters.usd.types import FLOOR, AssetSurface, EpisodeMetadata, EpisodeSettings, bin_asset, object_asset
 from synpick_warp.exporters.writing.files import output_errors
 from synpick_warp.exporters.writing.pool import WriteTask
 from synpick_warp.scenes.bins import make_bins
@@ -101,6 +101,7 @@ class UsdExporter(EpisodeExporter[TickSpool]):
         settings, bodies = self._context.settings, self._context.catalog.bodies
         materials = {object_asset(body.obj_id): body.material for body in bodies}
         materials |= {bin_asset(one.sizes): one.fixture.material for one in make_bins(settings.bins)}
+        materials["floor"] = FLOOR
         materials["table"] = Material(settings.render.table_color, None, 0.0, TABLE_ROUGHNESS)
         return {name: AssetSurface.of(name, material) for name, material in materials.items()}
 

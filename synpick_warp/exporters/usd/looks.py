@@ -18,6 +18,8 @@ from synpick_warp.scenes.assets.appearance import as_color, linear_to_srgb, srgb
 from synpick_warp.scenes.types import Material
 
 WHITE = (1.0, 1.0, 1.0)
+_PARTS = {"Tote": LookPart.BIN, "Bin": LookPart.BIN, "Table": LookPart.TABLE, "Floor": LookPart.BACKGROUND}
+"""Part of a scene that a prim shows, by its name."""
 
 
 def add_looks(stage: Usd.Stage, assets: Mapping[str, str], looks: Mapping[str, Any], surfaces: Mapping[str, AssetSurface]) -> None:
@@ -40,9 +42,8 @@ def _drawn(assets: Mapping[str, str], looks: Mapping[str, Any]) -> Iterator[tupl
     names = ("color", "metallic", "roughness", "hue", "brightness")
     for path in assets if looks else ():
         name = path.rpartition("/")[2]
-        if name in ("Tote", "Bin", "Table"):
-            part = LookPart.TABLE if name == "Table" else LookPart.BIN
-            yield path, part, looks[part.name.lower()]
+        if name in _PARTS:
+            yield path, _PARTS[name], looks[_PARTS[name].name.lower()]
         elif name.rpartition("_")[2].isdigit():
             row = rows.get(int(name.rpartition("_")[2]), {})
             yield path, LookPart.OBJECT, {key: row[key] for key in names if key in row}

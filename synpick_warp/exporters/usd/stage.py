@@ -13,9 +13,11 @@ from dataclasses import replace
 import numpy as np
 from pxr import Gf, Kind, Sdf, Usd, UsdGeom, UsdLux, UsdPhysics, UsdRender
 
+from synpick_warp.configs.cameras import GRIPPER
 from synpick_warp.exporters.usd.looks import add_looks
 from synpick_warp.exporters.usd.parts import add_label, add_property, set_units
 from synpick_warp.exporters.usd.types import EpisodeMetadata, EpisodeSettings, StageLight, object_asset
+from synpick_warp.scenes.cameras import CAMERA_KEYS, carry
 from synpick_warp.scenes.types import Camera
 
 APERTURE = 0.36
@@ -31,6 +33,8 @@ INSTANCE = "instance"
 DISTRACTOR = "distractor"
 """Prefix of the distractors' prim names."""
 ROOT = "/Episode"
+SHAFT = 1
+"""Column of the gripper's shaft in poses of fixtures."""
 FIXTURES = {"tote": f"{ROOT}/Tote", "finger": f"{ROOT}/Gripper/Finger", "cup": f"{ROOT}/Gripper/Cup"}
 """Asset and prim of each row of `TickBatch.fixture_pose`; a bin that is no tote has the prim BIN."""
 BIN = f"{ROOT}/Bin"
@@ -48,7 +52,10 @@ def make_episode_layer(ticks: np.ndarray, metadata: EpisodeMetadata, settings: E
     stage = Usd.Stage.Open(layer)
     _add_root(stage, metadata, settings)
     assets = {f"{ROOT}/Table": "table"}
-    UsdGeom.Xform.Define(stage, f"{ROOT}/Table")
+    if "background" in metadata.looks:
+        assets[f"{ROOT}/Floor"] = "floor"
+    for path in assets:
+        UsdGeom.Xform.Define(stage, path)
     own = settings.bins[int(ticks["bin"][0])]
     for index, (asset, path) in enumerate(FIXTURES.items()):
         if index == 0 and own != asset:
@@ -65,8 +72,8 @@ def make_episode_layer(ticks: np.ndarray, metadata: EpisodeMetadata, settings: E
         assets[path] = object_asset(obj_id)
     add_looks(stage, assets, metadata.looks, settings.surfaces)
     for index, camera in enumerate(settings.cameras):
-        drawn = {key: np.array(value) for key, value in metadata.cameras.get(camera.name, {}).items()}
-        _add_camera(stage, camera.name or f"camera_{index}", replace(camera, **drawn))
+        drawn = {key: np.array(value) for key, value in metadata.cameras.get(camera.name, {}).items() if key in CAMERA_KEYS}
+        _add_camera(stage, camera.name or f"camera_{index}", replace(camera, **drawn), ticks["fixture_pose"][:, SHAFT])
     first = ticks[0]
     _add_light(stage, settings.lights[first["light"]], float(first["light_yaw"]), float(first["light_exposure"]))
     # References are added last and without a stage, since they cannot be resolved from a file that is not in its place yet.
@@ -170,8 +177,11 @@ def _make_continuous(quaternions: np.ndarray) -> np.ndarray:
     return unit
 
 
-def _add_camera(stage: Usd.Stage, name: str, camera: Camera) -> None:
-    """Add a pinhole camera and its render product. USD's cameras look along -z with y up; film lengths are tenths of a metre."""
+def _add_camera(stage: Usd.Stage, name: str, camera: Camera, shaft: np.ndarray) -> None:
+    """Add a pinhole camera and its render product. USD's cameras look along -z with y up; film lengths are tenths of a metre.
+
+    One that is fixed to the gripper has time samples, by the poses of the shaft at every frame (frame, 7).
+    """
     lens = UsdGeom.Camera.Define(stage, f"{ROOT}/Cameras/{name}")
     (fx, _, cx), (_, fy, cy), _ = camera.matrix.tolist()
     focal = APERTURE * fx / camera.width
@@ -183,10 +193,19 @@ def _add_camera(stage: Usd.Stage, name: str, camera: Camera) -> None:
     lens.CreateHorizontalApertureOffsetAttr((0.5 - cx / camera.width) * APERTURE)
     lens.CreateVerticalApertureOffsetAttr((cy / camera.height - 0.5) * height)
     lens.CreateClippingRangeAttr(Gf.Vec2f(*CLIPPING))
-    pose = np.eye(4)
-    pose[:3, :3] = camera.rotation.T * [1.0, -1.0, -1.0]
-    pose[:3, 3] = -camera.rotation.T @ camera.translation
-    lens.AddTransformOp().Set(Gf.Matrix4d(*pose.T.ravel().tolist()))  # USD multiplies row vectors.
+    rotation, translation = camera.rotation[None], camera.translation[None]
+    if camera.fixed_to == GRIPPER:
+        rotation, translation = carry(rotation, translation, shaft)
+    place = lens.AddTransformOp()
+    for frame, (turn, move) in enumerate(zip(rotation, translation, strict=True)):
+        pose = np.eye(4)
+        pose[:3, :3] = turn.T * [1.0, -1.0, -1.0]
+        pose[:3, 3] = -turn.T @ move
+        value = Gf.Matrix4d(*pose.T.ravel().tolist())  # USD multiplies row vectors.
+        if frame == 0:
+            place.Set(value)
+        if len(rotation) > 1:
+            place.Set(value, frame)
     UsdGeom.Scope.Define(stage, f"{ROOT}/Render")
     product = UsdRender.Product.Define(stage, f"{ROOT}/Render/{name}")
     product.CreateResolutionAttr(Gf.Vec2i(camera.width, camera.height))

@@ -37,6 +37,10 @@ TEXTURES = "textures"
 """Folder of textures in the asset library."""
 
 
+FLOOR = Material((1.0, 1.0, 1.0), None, 0.0, 1.0)
+"""Material of the floor before an episode draws its texture."""
+
+
 @dataclass(frozen=True)
 class AssetSurface:
     """Material of an asset, without the pixels of its texture."""
@@ -57,7 +61,7 @@ def texture_file(name: str) -> str:
 
 
 def drawn_texture(part: LookPart, index: int) -> str:
-    """Name of a texture that episodes draw for the bin or the table."""
+    """Name of a texture that episodes draw for the bin, the table or the background."""
     return f"{part.name.lower()}_{index:03d}"
 
 

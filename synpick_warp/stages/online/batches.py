@@ -195,7 +195,9 @@ class BatchRing:
         self._cameras = [group.allocate_cameras() for _ in self.slots]
         self._next = 0
 
-    def render(self, snapshot: Snapshot, world: np.ndarray, camera: np.ndarray, host: Mapping[str, Any]) -> ViewBatch:
+    def render(
+        self, snapshot: Snapshot, world: np.ndarray, camera: np.ndarray, host: Mapping[str, Any], last: Mapping[str, np.ndarray]
+    ) -> ViewBatch:
         """Render views into the next slot, whose last batch must have expired.
 
         Args:
@@ -203,6 +205,7 @@ class BatchRing:
             world: World of each view (B) int32, at most `views`.
             camera: Camera of each view (B) int32.
             host: For `ViewBatch.host`.
+            last: As of `stream.last_cameras`.
         """
         slot, cameras, count = self.slots[self._next], self._cameras[self._next], len(world)
         self._next = (self._next + 1) % len(self.slots)
@@ -211,8 +214,8 @@ class BatchRing:
         padded[:, :count] = world, camera, self.group.slots(camera)
         slot.lists.assign(padded)
         views = make_views(slot.lists[0], slot.lists[1], count, self.instances, slot=slot.lists[2])
-        self.group.place(cameras, camera, host)
-        views = with_cameras(views, self.renderer.cameras if cameras is None else cameras)
+        self.group.place(cameras, camera, (host, last))
+        views = with_cameras(views, self.renderer.cameras if cameras is None else cameras.now)
         with scope("render", self.device):
             self.renderer.render(snapshot, views, slot.images, slot.layers, cameras)
             self._gather(snapshot, views, slot.truth)

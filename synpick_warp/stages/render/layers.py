@@ -79,10 +79,10 @@ class LayerRenderer:
                 raise CatalogError(f"object {wrong[0]} has no place in the layer classes, which holds 1 to {MAX_CLASS}; renumber the model")
         self.motions = None
         if MOTION_LAYERS.intersection(names):
-            self.motions = allocate_struct(BODY_MOTIONS, {"view": views, "body": instances + len(FIXTURES)}, scene.device)
+            self.motions = allocate_struct(BODY_MOTIONS, {"view": views, "body": instances + len(FIXTURES) + 1}, scene.device)
         self.stereo = StereoRenderer(names, sensor, scene, views) if STEREO_LAYERS.intersection(names) else None
 
-    def render(self, snapshot: Snapshot, bodies: Any, gbuffer: Any, views: Any, out: LayerBuffers) -> None:
+    def render(self, snapshot: Snapshot, bodies: Any, gbuffer: Any, views: Any, out: LayerBuffers, last: Any) -> None:
         """Render the layers of a batch of views.
 
         Args:
@@ -91,10 +91,11 @@ class LayerRenderer:
             gbuffer: The struct `GBuffer` of these views.
             views: The struct `Views`.
             out: The arrays of the named layers are written.
+            last: The cameras of the views in the frame before, as those of `views`; the same if they do not move.
         """
         scene = self.scene
         if self.motions is not None:
-            self.compute_motions(snapshot, views)
+            self.compute_motions(snapshot, views, last)
         surface = [scene.meshes, scene.surfaces, scene.grid, bodies, gbuffer, views]
         sensor = [scene.meshes, scene.surfaces, scene.grid, snapshot.episode, snapshot.frame]
         sensor += [self.sensor, bodies, gbuffer, views]
@@ -117,10 +118,11 @@ class LayerRenderer:
         if self.stereo is not None:
             self.stereo.render(snapshot, bodies, gbuffer, views, out)
 
-    def compute_motions(self, snapshot: Snapshot, views: Any) -> None:
-        """Compute the motion of every body from this frame back to the previous one."""
+    def compute_motions(self, snapshot: Snapshot, views: Any, last: Any) -> None:
+        """Compute the motion of every body, and of the table, from this frame back to the previous one; arguments as of `render`."""
         inputs = [snapshot.catalog_index, snapshot.pose, snapshot.fixture_pose, snapshot.follows]
-        inputs += [snapshot.last_catalog_index, snapshot.last_pose, snapshot.last_fixture_pose, snapshot.last_fixture_visible, views]
+        inputs += [snapshot.last_catalog_index, snapshot.last_pose, snapshot.last_fixture_pose, snapshot.last_fixture_visible]
+        inputs += [views, last.rotation, last.center]
         dim = (views.count, self.motions.known.shape[1])
         wp.launch(kernel_for(compute_motions_kernel, views), dim=dim, inputs=inputs, outputs=[self.motions], device=self.scene.device)
 

@@ -21,6 +21,7 @@ from synpick_warp.kernels.render.visibility.camera import TILE_PIXELS
 from synpick_warp.kernels.render.visibility.gbuffer import FIXTURES
 from synpick_warp.kernels.render.visibility.variants import kernel_for
 from synpick_warp.scenes.looks import Looks
+from synpick_warp.scenes.tote import FLOOR_DROP
 from synpick_warp.stages.buffers import Snapshot
 from synpick_warp.stages.launch import launch_pixels
 from synpick_warp.stages.render.scene import RenderScene
@@ -148,7 +149,7 @@ class Dresser:
 def shade_floor(scene: RenderScene, snapshot: Snapshot, bodies: Any, gbuffer: Any, views: Any, radiance: wp.array) -> None:
     """Shade what the views show beyond the scene as a floor, if episodes draw a background."""
     if scene.looks is not None and scene.looks.background_textures:
-        inputs = [scene.paths, scene.grid, snapshot.light, bodies, gbuffer, views]
+        inputs = [scene.paths, scene.grid, FLOOR_DROP, snapshot.light, bodies, gbuffer, views]
         launch_pixels(shade_floor_kernel, views.count * scene.grid.tiles * int(TILE_PIXELS), inputs, [radiance], scene.device)
 
 

@@ -17,7 +17,15 @@ from synpick_warp.stages.render.postprocess import PostProcessor
 from synpick_warp.stages.render.raster import Rasterizer
 from synpick_warp.stages.render.reference import ReferenceRenderer
 from synpick_warp.stages.render.scene import RenderScene
-from synpick_warp.stages.render.view_setup import GBUFFER, VIEW_BODIES, allocate_view_cameras, body_sizes, set_up_views, with_cameras
+from synpick_warp.stages.render.view_setup import (
+    GBUFFER,
+    VIEW_BODIES,
+    PlacedCameras,
+    allocate_view_cameras,
+    body_sizes,
+    set_up_views,
+    with_cameras,
+)
 from synpick_warp.stages.timing import scope
 
 SHADED_IMAGE = struct_arrays(ShadedImage, "view", "row", "column")
@@ -85,7 +93,9 @@ class Renderer:
         self.annotator = Annotator(scene, instances, views)
         self.postprocessor = PostProcessor(effects, settings.tone, seed, scene, views)
 
-    def render(self, snapshot: Snapshot, views: Any, out: ViewBuffers, layers: LayerBuffers | None = None, placed: Any = None) -> None:
+    def render(
+        self, snapshot: Snapshot, views: Any, out: ViewBuffers, layers: LayerBuffers | None = None, placed: PlacedCameras | None = None
+    ) -> None:
         """Render and annotate a batch of views: the one place that knows the order of the passes.
 
         Args:
@@ -93,7 +103,7 @@ class Renderer:
             views: The struct `Views`; the renderer brings their cameras.
             out: Written.
             layers: Written; None: no layers.
-            placed: The struct `ViewCameras` of the views; None: the scene has their cameras.
+            placed: Cameras of the views; None: the scene has them.
 
         Raises:
             ValueError: The batch has more views than there is scratch for.
@@ -106,7 +116,8 @@ class Renderer:
         views = self.render_gbuffer(snapshot, views, out, placed)
         if layers is not None:
             with scope("layers", device):
-                self.layer_renderer.render(snapshot, self.bodies, self.gbuffer, views, layers)
+                last = views.cameras if placed is None else placed.last
+                self.layer_renderer.render(snapshot, self.bodies, self.gbuffer, views, layers, last)
         with scope("shade", device):
             self.shading.shade(snapshot, self.bodies, self.gbuffer, views, self.image)
         with scope("post-process", device):
@@ -114,9 +125,9 @@ class Renderer:
         with scope("annotate", device):
             self.annotator.annotate(self.bodies, views, out)
 
-    def render_gbuffer(self, snapshot: Snapshot, views: Any, out: ViewBuffers, placed: Any = None) -> Any:
+    def render_gbuffer(self, snapshot: Snapshot, views: Any, out: ViewBuffers, placed: PlacedCameras | None = None) -> Any:
         """First part of `render`: G-buffer, and images of depth, instances and amodal bits. Returns the views with their cameras."""
-        scene, views = self.scene, with_cameras(views, self.cameras if placed is None else placed)
+        scene, views = self.scene, with_cameras(views, self.cameras if placed is None else placed.now)
         with scope("set up views", scene.device):
             set_up_views(scene, snapshot, snapshot.fixture_visible, views, self.bodies, placed is not None)
             if self.dresser:

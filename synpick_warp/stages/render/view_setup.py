@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -74,6 +75,15 @@ def allocate_view_cameras(views: int, device: wp.Device, cameras: Any = None) ->
     made = allocate_struct(LENS_CAMERAS, {"view": views}, device)
     made.lenses = cameras.lenses
     return made
+
+
+@dataclass(frozen=True, eq=False)
+class PlacedCameras:
+    """Cameras of the views of a batch, set on the host: the struct `ViewCameras` in this frame and in the one before."""
+
+    now: Any
+    last: Any
+    """The same struct if the cameras do not move."""
 
 
 def place_cameras(cameras: Any, scene: RenderScene, slot: np.ndarray, placed: Mapping[str, np.ndarray]) -> None:

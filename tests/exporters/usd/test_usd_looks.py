@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -25,7 +26,13 @@ GIVEN = STIRRING | {
     "randomize.bin_color": {"uniform": [[0, 0, 0], [1, 1, 1]]},
     "randomize.texture_width": 0.25,
     "randomize.table_roughness": {"uniform": [0.5, 1.0]},
+    "render.table_size": [1.0, 0.8],
 }
+
+
+def textures(place: Path) -> dict[str, object]:
+    """Settings of the textures of table and background."""
+    return {f"randomize.{part}_textures": str(place / "textures") for part in ("table", "background")}
 
 
 @pytest.fixture(scope="module")
@@ -34,7 +41,7 @@ def folder(tmp_path_factory):
     (place / "textures").mkdir()
     for name, color in (("a", (10, 20, 200)), ("b", (200, 100, 0))):
         cv2.imwrite(str(place / "textures" / f"{name}.png"), np.full((4, 8, 3), color, np.uint8))
-    bake_boxes(place / "set", GIVEN | {"randomize.table_textures": str(place / "textures")}, objects=small_worlds.cluttered_catalog)
+    bake_boxes(place / "set", GIVEN | textures(place), objects=small_worlds.cluttered_catalog)
     return place / "set"
 
 
@@ -81,22 +88,25 @@ def test_the_bin_has_the_drawn_colour_and_what_else_it_is_made_of(stage, record)
     assert shader.GetInput("roughness").Get() == given.GetInput("roughness").Get()
 
 
-def test_the_table_has_the_drawn_texture_at_its_width(stage, folder, record):
-    shader, texture = bound(stage, "/Episode/Table")
-    assert shader.GetInput("roughness").Get() == pytest.approx(record["table"]["roughness"], abs=1e-6)
+@pytest.mark.parametrize(("prim", "part", "side", "height"), [("Table", "table", 0.5, 0.0), ("Floor", "background", 10.0, -0.74)])
+def test_table_and_floor_have_the_drawn_texture_at_its_width(stage, record, prim, part, side, height):
+    shader, texture = bound(stage, f"/Episode/{prim}")
+    assert shader.GetInput("roughness").Get() == pytest.approx(record[part].get("roughness", 1.0), abs=1e-6)
     place = texture.GetInput("file").Get().resolvedPath
     color = cv2.imread(place)[0, 0].tolist()
-    assert color == ([10, 20, 200], [200, 100, 0])[record["table"]["texture"]]
+    assert color == ([10, 20, 200], [200, 100, 0])[record[part]["texture"]]
     scale = UsdShade.Shader(texture.GetInput("st").GetConnectedSources()[0][0].source.GetPrim())
     assert scale.GetIdAttr().Get() == "UsdTransform2d"
     np.testing.assert_allclose(scale.GetInput("scale").Get(), (4.0, 4.0))
-    mesh = stage.GetPrimAtPath("/Episode/Table/Visual")
-    np.testing.assert_allclose(np.array(mesh.GetAttribute("primvars:st").Get()), np.array(mesh.GetAttribute("points").Get())[:, :2])
+    mesh = stage.GetPrimAtPath(f"/Episode/{prim}/Visual")
+    points = np.array(mesh.GetAttribute("points").Get())
+    np.testing.assert_allclose(np.array(mesh.GetAttribute("primvars:st").Get()), points[:, :2])
+    assert (points[:, 0].max(), points[:, 2].max()) == pytest.approx((side, height - small_worlds.settings().tote.wall))
 
 
 def test_a_conversion_writes_the_same_looks(folder, tmp_path, monkeypatch):
     monkeypatch.setattr("synpick_warp.scenes.catalog.load_catalog", lambda _: small_worlds.cluttered_catalog())
-    given = GIVEN | {"bake.formats": ["zarr"], "randomize.table_textures": str(folder.parent / "textures")}
+    given = GIVEN | {"bake.formats": ["zarr"]} | textures(folder.parent)
     bake_boxes(tmp_path / "zarr", given, objects=small_worlds.cluttered_catalog)
     convert(tmp_path / "zarr", tmp_path / "usd", ("usd",), 1, lambda *_: None)
     baked, converted = (

@@ -127,6 +127,22 @@ def test_noise_of_presets_is_that_of_disparity(device, name, depth):
     np.testing.assert_allclose(middle.mean(), depth, atol=4.0 * expected / middle.size**0.5 + 2e-3 * depth**2)
 
 
+@pytest.mark.parametrize("depth", [0.6, 1.0, 1.95])
+@pytest.mark.parametrize("name", [name for name in SENSORS if name != "ideal"])
+def test_presets_as_they_are_have_the_noise_of_their_steps_too(device, name, depth):
+    """σz = z² √(σd² + step² / 12) / (f b) within the preset's range, and nothing outside."""
+    settings, lens = sensor_settings(name), sensor_camera(name)
+    assert lens is not None
+    toy = replace(wall(depth), cameras=(camera(WIDTH, HEIGHT, lens.fx, (0.0, 0.0, TOP)),))
+    middle = measure(toy, device, count=depth / 60000, **settings).depth[0, 20:76, 20:140]
+    scale, (near, far), most = lens.fx * settings["baseline"], settings["distances"], settings["max_disparity"]
+    if not near < depth < far or scale > depth * most > 0.0:
+        assert np.isnan(middle).all()
+        return
+    expected = depth**2 * np.hypot(settings["disparity_noise"], settings["disparity_step"] / 12**0.5) / scale
+    np.testing.assert_allclose(middle.std(), expected, rtol=0.05)
+
+
 def test_no_disparity_beyond_the_search_is_measured(device):
     settings = PERFECT | {"baseline": 0.05, "max_disparity": FOCAL * 0.05 / 1.2}
     assert not measure(wall(1.19), device, **settings).counts.any()

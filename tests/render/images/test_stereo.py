@@ -13,6 +13,7 @@ import warp as wp
 from synpick_warp.codes import MAX_DISPARITIES
 from synpick_warp.configs.schema import Config
 from synpick_warp.configs.sensors import DepthSensor
+from synpick_warp.kernels.render.images.stereo_matching import sum_path_costs_kernel
 from synpick_warp.stages.render.layers import sensor_parameters
 from synpick_warp.stages.render.scene import blank_scene
 from synpick_warp.stages.render.stereo import StereoRenderer, count_disparities
@@ -146,6 +147,13 @@ def test_path_costs_are_those_of_the_twin(device, shape, count):
     renderer, views = matcher(device, height, width, replace(DepthSensor(), max_disparity=count - 2.0), focal=3.2)
     costs, _ = match(renderer, views, images[0], images[1])
     np.testing.assert_array_equal(costs, path_costs(matching_costs(images[0], images[1], 3, count)))
+
+
+def test_the_kernels_compile_for_a_gpu(tmp_path):
+    """Paths are followed by a branch that a CPU does not compile. None is needed."""
+    wp.compile_aot_module(sum_path_costs_kernel.module, arch=90, module_dir=tmp_path, use_ptx=True)
+    (program,) = tmp_path.glob("*.ptx")
+    assert "shfl.sync" in program.read_text()
 
 
 def matcher(device: wp.Device, height: int, width: int, sensor: DepthSensor, focal: float) -> tuple[StereoRenderer, Any]:

@@ -242,7 +242,7 @@ def measure_sensor(factory: Factory, min_seconds: float) -> Iterator[Row]:
     def render_layers() -> None:
         """Layers, besides depth, ids and amodal bits."""
         ours.render_gbuffer()
-        layer_renderer.render(snapshot, renderer.bodies, renderer.gbuffer, ours.views, our_layers)
+        layer_renderer.render(snapshot, renderer.bodies, renderer.gbuffer, ours.views, our_layers, renderer.cameras)
 
     times = [time_view(ours.render_gbuffer)]
     orders = {name: time_view(functools.partial(scene.render, order, hit_images)) for name, order in ORDERS.items()}
