@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
 
-from synpick_warp.apps.viz.cell.frusta import Canvas, draw_camera, footprint, image_border, project, rays
-from synpick_warp.apps.viz.cell.rendering import Picture, lay_out, scaled_down
+from synpick_warp.apps.viz.cell.frusta import Canvas, center, draw_camera, footprint, image_border, project, rays
+from synpick_warp.apps.viz.cell.rendering import CellScene, Picture, lay_out, scaled_down
 from synpick_warp.apps.viz.cell.sheet import describe_camera
 from synpick_warp.configs.load import load_config
 from synpick_warp.scenes.embedded.objects import procedural_objects
@@ -98,6 +100,17 @@ def test_what_a_camera_covers_is_said():
     assert lines[1].endswith(", pinhole 5 coefficients")
     assert describe_camera(TOP, "top", tote)[2] == "2.00 m to the floor, 20 mm/px; 8 of 8 corners of the tote in view"
     assert "; 0 of 8 corners" in describe_camera(camera(80, 60, 100.0, (3.0, 0.0, 2.0)), "off", tote)[2]
+
+
+def test_a_camera_on_the_gripper_is_where_the_gripper_is_drawn():
+    scene = object.__new__(CellScene)
+    scene.config = config = load_config("smoke")
+    scene.sizes = config.cell.bins
+    placed = scene.placed(replace(TOP, fixed_to="gripper"))
+    # The gripper's shaft ends at the wrist axis, a cup's length above the cup, which is 0.15 m over the rim.
+    rim = config.tote.outer_size[2] - config.tote.wall
+    assert center(placed) == pytest.approx((0.1, 0.2, 2.0 + rim + 0.15 + config.gripper.cup_length))
+    assert (placed.fixed_to, scene.placed(TOP)) == ("world", TOP)
 
 
 CELL = """preset = "smoke"

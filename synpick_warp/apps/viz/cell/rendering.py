@@ -10,6 +10,7 @@ import numpy as np
 import warp as wp
 
 from synpick_warp.configs.calibration.lens import make_lens_map
+from synpick_warp.configs.cameras import WORLD
 from synpick_warp.configs.cell import BinSizes
 from synpick_warp.configs.schema import FAST, Config
 from synpick_warp.factory.assembly import build_smallest, compiling_if_cold, make_renderer
@@ -86,6 +87,13 @@ class CellScene:
     def tcp(self) -> tuple[float, float, float]:
         """Where the gripper is drawn: its cup over the highest rim [m]."""
         return 0.0, 0.0, max(one.height for one in self.sizes) + OVER_RIM
+
+    def placed(self, camera: Camera) -> Camera:
+        """Camera in the world; one on the gripper where that is drawn."""
+        if camera.fixed_to == WORLD:
+            return camera
+        shaft = (*self.tcp[:2], self.tcp[2] + self.config.gripper.cup_length)
+        return replace(camera, translation=camera.translation - camera.rotation @ shaft, fixed_to=WORLD)
 
     def _snapshot(self) -> Snapshot:
         """A world for each bin with the gripper over it, and a last one of the first bin without."""

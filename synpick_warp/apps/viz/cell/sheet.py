@@ -56,10 +56,10 @@ def write_cell_sheet(scene: CellScene, rig: Rig, bins: Bins, name: str, out: Pat
         OutputError: The file cannot be written.
     """
     check_picture_name(out)
-    cameras = make_cameras(rig)
+    cameras = tuple(scene.placed(camera) for camera in make_cameras(rig))
     outside = _outside_camera(scene, cameras)
     views = [_draw_outside(scene, index, outside, cameras, rig.names) for index in range(len(scene.sizes[:MAX_BINS]))]
-    panels = [_draw_camera_view(scene, index, camera, rig.names[index]) for index, camera in enumerate(cameras)]
+    panels = [_draw_camera_view(scene, rig, index, camera) for index, camera in enumerate(cameras)]
     rows = [_row([view, _facts(scene, bins, index, name if index == 0 else "")]) for index, view in enumerate(views)]
     rows += [_row(panels[start : start + _COLUMNS]) for start in range(0, len(panels), _COLUMNS)]
     width = max(row.shape[1] for row in rows)
@@ -123,9 +123,10 @@ def _round_length(length: float) -> float:
     return max(step * power for step in (1.0, 2.0, 5.0) if step * power <= length * (1.0 + 1e-9))
 
 
-def _draw_camera_view(scene: CellScene, index: int, camera: Camera, name: str) -> Image:
-    """What a camera sees of the cell with its first bin, in its colour, with what it covers in three lines."""
-    picture = scene.render(scaled_down(camera), -1).color
+def _draw_camera_view(scene: CellScene, rig: Rig, index: int, camera: Camera) -> Image:
+    """What a camera sees of the cell with its first bin, in its colour, with what it covers in three lines; on the gripper also of that."""
+    picture = scene.render(scaled_down(camera), 0 if rig.moves(index) else -1).color
+    name = f"{rig.names[index]} (on the gripper)" if rig.moves(index) else rig.names[index]
     scale = _PANEL / max(camera.width, camera.height)
     size = (max(1, round(scale * camera.width)), max(1, round(scale * camera.height)))
     picture = cv2.resize(picture, size, interpolation=cv2.INTER_CUBIC if scale > 1.0 else cv2.INTER_AREA)
