@@ -1,4 +1,4 @@
-"""Schemas of what statistics read: episodes, attempts, light. Other keys are passed over."""
+"""Schemas of what statistics read: episodes, bins, attempts, light. Other keys are passed over."""
 
 from __future__ import annotations
 
@@ -14,8 +14,16 @@ MAX_NAME = 256
 Name = Annotated[str, Meta(max_length=MAX_NAME)]
 
 
+class BinFacts(msgspec.Struct):
+    """Bin of an episode: name, position [m] and yaw [rad] in the world."""
+
+    name: Name
+    position: tuple[Length, Length, Length]
+    yaw: Length
+
+
 class EpisodeFacts(msgspec.Struct):
-    """Manifest row of an episode: mode, frames, ending and object counts."""
+    """Manifest row of an episode: mode, frames, ending, object counts, and the bin if it is told."""
 
     mode: Name
     frames: Index
@@ -23,6 +31,7 @@ class EpisodeFacts(msgspec.Struct):
     objects: Index = 0
     picked: Index = 0
     lost: Annotated[int, Meta(ge=-(2**31), lt=2**31)] = 0
+    bin: BinFacts | None = None
 
 
 class AttemptFacts(msgspec.Struct):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable, Sequence
 from itertools import pairwise
 
@@ -43,6 +44,7 @@ def make_tables(statistics: Statistics) -> list[Table]:
         _lights,
         _yaw,
         _exposure,
+        _bins,
         _coverage,
     )
     return [table for table in (make(statistics) for make in makers) if table.rows]
@@ -256,6 +258,19 @@ def _exposure(statistics: Statistics) -> Table:
     rows: list[tuple[Value, ...]] = list(statistics.lights.exposure.items()) if statistics.lights else []
     columns = (Column("from_EV", ".1f"), Column("episodes", ","))
     return Table("light_exposure", "Episodes by exposure compensation [EV]", columns, rows, in_text=False)
+
+
+def _bins(statistics: Statistics) -> Table:
+    """Table of episodes by bin, with the intervals that its places span; empty if bins are not told."""
+    total = sum(use.episodes for use in statistics.bins.values())
+    rows: list[tuple[Value, ...]] = [
+        (name, use.episodes, use.episodes / total, *(1e3 * end for end in (*use.x, *use.y)), *map(math.degrees, use.yaw))
+        for name, use in statistics.bins.items()
+    ]
+    ends = [
+        Column(f"{axis}_{end}_{unit}", ".0f") for axis, unit in (("x", "mm"), ("y", "mm"), ("yaw", "degrees")) for end in ("from", "to")
+    ]
+    return Table("bins", "Bins and where they stand", (Column("bin"), Column("episodes", ","), Column("fraction", ".1%"), *ends), rows)
 
 
 def _coverage(statistics: Statistics) -> Table:
