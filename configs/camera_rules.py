@@ -193,7 +193,7 @@ def _places(shift: Sides) -> list[Sides]:
 def _sees_bin(row: CameraRow, sizes: BinSizes, place: Sides) -> bool:
     """Whether the bounding sphere of a bin at a place meets the cone around a camera's view, which is wider than its image."""
     height = sizes.height - sizes.base
-    center = (*place, sizes.base + height / 2)
+    center = (place[0] + sizes.origin[0], place[1] + sizes.origin[1], sizes.ground + height / 2)
     forward = viewing_direction(row.pose)
     away, radius = [b - a for a, b in zip(position(row.pose), center, strict=True)], math.hypot(*sizes.outer, height) / 2
     distance = math.hypot(*away)
@@ -207,7 +207,7 @@ def _sees_bin(row: CameraRow, sizes: BinSizes, place: Sides) -> bool:
 
 def _in_wall(at: tuple[float, ...], sizes: BinSizes) -> bool:
     """Whether a point lies in the walls of a bin: in its outer box, but not above the floor between the walls of the opening."""
-    x, y, z = at
+    x, y, z = (a - b for a, b in zip(at, sizes.origin, strict=True))
     inside = [abs(value) < size / 2 for value, size in zip((x, y), sizes.outer, strict=True)]
     share = z / sizes.height
     free = [abs(v) < (f + (r - f) * share) / 2 for v, f, r in zip((x, y), sizes.floor, sizes.opening, strict=True)]

@@ -46,9 +46,10 @@ def find_conflicts(config: Config) -> Iterator[Conflict]:
         yield from _box(key, row)
     if config.move.start_height < config.move.height:
         yield "move.start_height", f"at least move.height, {config.move.height:g} [m]"
-    yield from find_camera_conflicts(config)
+    if all(row.measured or not row.file for row in config.bin):
+        yield from find_camera_conflicts(config)
+        yield from _pick(config.pick, bins)
     yield from _times(config.settle, config.physics)
-    yield from _pick(config.pick, bins)
     yield from _suction(config.suction, config.gripper)
     yield from _layers(config.render.layers)
     yield from _ranges(config.effects, config.depth_sensor)
@@ -89,6 +90,8 @@ def _bins(bins: Bins, rows: Sequence[BinRow]) -> Iterator[Conflict]:
                 f"bin[{index}].name",
                 "lower-case letters, digits and underscores, at most 32, other than those of other bins; not tote, table, pallet",
             )
+        if row.file:
+            continue
         sizes = BinSizes.of_row(row)
         if row.compartments != (1, 1) and row.divider_height > sizes.height:
             yield f"bin[{index}].divider_height", f"at most the height of the rim, {sizes.height:g} [m]"

@@ -66,7 +66,7 @@ def write_library(
     length, mass = gripper.cup_length, gripper.cup_mass
     add_body(cup.GetDefaultPrim(), mass, np.array([0.0, 0.0, -length / 2]), np.diag(rod_inertia(mass, length)), kinematic=True)
     _save(library, "cup", cup)
-    _write_table(library, physics, bins[0].sizes.base, table_color)
+    _write_table(library, physics, bins[0].sizes.ground, table_color)
 
 
 def _save(library: Path, name: str, stage: Usd.Stage) -> None:
