@@ -111,8 +111,8 @@ def _view(rig: Rig, index: int, config: Config) -> Iterator[Conflict]:
         yield place, f"positions other than {other}, the position of {label}"
     elif up is not None and math.hypot(*_cross(forward, up)) <= PARALLEL * math.hypot(*forward) * math.hypot(*up):
         yield aim, f"up vectors that are not zero or parallel to the viewing direction, as that of {label} is"
-    elif at[2] <= 0.0:
-        yield place, f"positions above the {bins[0].noun}'s floor, z > 0, below which {label} sees no object [m]"
+    elif at[2] <= (floor := bins[0].origin[2]):
+        yield place, f"positions above the {bins[0].noun}'s floor, z > {floor:g}, below which {label} sees no object [m]"
     elif fx > 0.0 < fy and not all(_sees_bin(row, one, place) for one in bins for place in _places(config.bins.shift)):
         yield target, f"a point that lets each camera see the {bins[0].noun}, which lies outside of the images of {label} [m]"
     elif any(_in_wall(at, one) for one in bins if one.shell):

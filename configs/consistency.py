@@ -119,6 +119,8 @@ def _pick(pick: Pick, bins: Sequence[BinSizes]) -> Iterator[Conflict]:
         yield "pick.appear_height", f"at least pick.near, {pick.near:g} [m]"
     if pick.speed < pick.near_speed:
         yield "pick.speed", f"at least pick.near_speed, {pick.near_speed:g} [m/s]"
+    if pick.floor > bins[0].origin[2]:
+        yield "pick.floor", f"at most the floor of the {bins[0].noun}, {bins[0].origin[2]:g}: what is below it is removed [m]"
     if pick.lift_height < height:
         yield "pick.lift_height", f"at least the inner height of the {bins[0].noun}, {height:g}: attached objects must leave it [m]"
 

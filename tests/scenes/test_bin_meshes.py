@@ -229,6 +229,19 @@ def test_what_belongs_to_a_mesh_needs_one(tmp_path):
         read(tmp_path, ROWS.replace("file = ", "unit = 'mm' #"))
 
 
-def test_rules_of_other_settings_hold_for_what_is_measured(tmp_path):
-    with pytest.raises(ConfigError, match=r"pick.lift_height is 0.19 .*; allowed: at least the inner height of the bin, 0.2"):
-        measured(read(tmp_path, ROWS + "[pick]\nlift_height = 0.19\n"))
+@pytest.mark.parametrize(
+    ("lines", "message"),
+    [
+        ("[pick]\nlift_height = 0.19", r"pick.lift_height is 0.19 .*; allowed: at least the inner height of the bin, 0.2"),
+        ("place = 'file'", r"pick.floor is -0.1 .*; allowed: at most the floor of the bin, -0.5: what is below it is removed"),
+        (
+            "place = 'file'\n[pick]\nfloor = -0.6\n[cameras]\npositions = [[0, 0, -0.55]]\nups = [[0, 1, 0]]",
+            r"cameras.positions .* z > -0.5,",
+        ),
+    ],
+)
+def test_rules_of_other_settings_hold_for_what_is_measured(tmp_path, lines, message):
+    config = read(tmp_path, ROWS + lines)
+    sloped_bin().apply_translation((0.0, 0.0, -0.5)).export(tmp_path / "bins" / "kanban.stl")
+    with pytest.raises(ConfigError, match=message):
+        measured(config)
