@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass
+from pathlib import Path
 from typing import ClassVar
 
 from synpick_warp.configs.fields import setting
+from synpick_warp.configs.objects import UNITS
+from synpick_warp.errors import ConfigError, format_value
 
 TOTE, OWN, NONE, PALLET = "tote", "own", "none", "pallet"
 KINDS = (TOTE, OWN, NONE, PALLET)
@@ -25,15 +29,55 @@ class Tote:
     roughness: float = setting(0.5, "", "Roughness.", low=0.0, high=1.0)
 
 
+AXES = ("z", "-z", "y", "-y", "x", "-x")
+"""Axes of a mesh file, of which one points up."""
+FLOOR, FILE = "floor", "file"
+PLACES = (FLOOR, FILE)
+"""Where the frame of a bin's mesh lies."""
+
+
+@dataclass(frozen=True)
+class MeasuredBin:
+    """What the mesh of a bin measures in the bin's frame: origin below the middle of the opening, on the lowest inner point, z up."""
+
+    REQUIRED: ClassVar = ("box", "opening", "height", "compartments", "checksum")
+    box: tuple[float, float, float, float, float, float] = setting((0.0,) * 6, "m", "Lower and upper corner of the mesh.")
+    opening: tuple[float, float] = setting((0.0, 0.0), "m", "Length and width of the inside.", above=0.0)
+    height: float = setting(0.0, "m", "Height of the rim, over which the inside would spill.", above=0.0)
+    origin: tuple[float, float, float] = setting((0.0, 0.0, 0.0), "m", "Origin of the bin's frame in the world.")
+    compartments: tuple[tuple[float, float, float, float, float, float, float], ...] = setting(
+        (), "m", "Each compartment: centre x, y, length, width; and its floor, z = a x + b y + c."
+    )
+    checksum: str = setting("", "", "SHA-256 of the mesh and its material.")
+
+
 @dataclass(frozen=True)
 class BinRow(Tote):
-    """A bin of bins.kind = "own", an open box as the tote. An episode draws one of the bins by their weights."""
+    """A bin of bins.kind = "own", an open box as the tote or a mesh. An episode draws one of the bins by their weights."""
 
     REQUIRED: ClassVar = ("name",)
     name: str = setting("", "", "Name, of at most 32 lower-case letters, digits and underscores; no two bins have the same.")
     weight: float = setting(1.0, "", "Weight with which an episode draws it.", low=0.0, high=1e6)
     compartments: tuple[int, int] = setting((1, 1), "", "Columns (along x) and rows of compartments of equal floors.", low=1, high=6)
     divider_height: float = setting(0.1, "m", "Height of the dividers between compartments.", above=0.0, high=10.0)
+    file: str | None = setting(
+        None, "", "Mesh (.stl, .ply, .obj, .glb, .gltf, .step) instead of sizes and compartments; relative to the file of settings."
+    )
+    unit: str | None = setting(None, "", "Unit of the mesh; m unless it is given.", choices=tuple(UNITS))
+    up: str | None = setting(None, "", "Axis of the mesh that points up; z unless it is given.", choices=AXES)
+    place: str | None = setting(
+        None,
+        "",
+        "Where the mesh lies: floor (unless it is given: its lowest inner point is the world's z = 0, below the middle of its opening), or "
+        "file (as modelled: the mesh's origin is the world's; bins after the first stand on the table of the first).",
+        choices=PLACES,
+    )
+    measured: MeasuredBin | None = setting(None, "", "What the mesh measures; the program writes this table.")
+
+    @property
+    def replaced(self) -> tuple[str, ...]:
+        """Names of the settings that its mesh stands for."""
+        return _SIZES if self.file else ()
 
 
 @dataclass(frozen=True)
@@ -57,3 +101,35 @@ class Bins:
     pallet_size: tuple[float, float, float] = setting(
         (0.6, 0.4, 0.144), "m", "Length, width and height of the pallet; half a EUR pallet by default.", above=0.0, high=10.0
     )
+
+
+_SIZES = ("outer_size", "floor_size", "rim_size", "wall", "compartments", "divider_height")
+"""Keys of a [[bin]] table that its mesh stands for."""
+_OF_FILE = ("unit", "up", "place", "measured")
+"""Keys that say how a mesh is read, or what it is."""
+
+
+def locate_meshes(tables: object, folder: Path, source: str) -> object:
+    """Content of [[bin]] tables with absolute paths of meshes; anything that is no such table is left as it is.
+
+    Args:
+        tables: Value of `bin` as parsed from TOML.
+        folder: Folder to which names of files are relative.
+        source: Where the tables come from, for messages.
+
+    Raises:
+        ConfigError: A file stands beside sizes, or something that belongs to a file without one.
+    """
+    if not isinstance(tables, list):
+        return tables
+    found = []
+    for index, table in enumerate(tables):
+        if isinstance(table, dict):
+            file = table.get("file", "")
+            others = [name for name in (_OF_FILE if file == "" else _SIZES) if name in table]
+            if others:
+                rule = "none without bin.file" if file == "" else "none beside bin.file, whose mesh has it"
+                raise ConfigError(f"bin[{index}].{others[0]} is {format_value(table[others[0]])} {source}; allowed: {rule}")
+            table = table | ({"file": os.path.abspath(folder / file)} if file and isinstance(file, str) else {})
+        found.append(table)
+    return found

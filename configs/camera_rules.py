@@ -173,8 +173,8 @@ def _placement(
     at = position(row.pose)
     if found := list(_view_axes(row, keys, label)):
         yield from found
-    elif at[2] <= 0.0:
-        yield place, f"positions above the {bins[0].noun}'s floor, z > 0, below which {label} sees no object [m]"
+    elif at[2] <= (floor := bins[0].origin[2]):
+        yield place, f"positions above the {bins[0].noun}'s floor, z > {floor:g}, below which {label} sees no object [m]"
     elif fx > 0.0 < fy and not all(_sees_bin(row, one, spot, turn) for one in bins for spot in _places(shift)):
         yield target, f"a point that lets each camera see the {bins[0].noun}, which lies outside of the images of {label} [m]"
     elif any(_in_wall(at, one) for one in bins if one.shell):
@@ -307,7 +307,7 @@ def _sees_bin(row: CameraRow, sizes: BinSizes, place: Sides, turn: float) -> boo
     """Whether the bounding sphere of a bin at a place meets the cone around a camera's view, which is wider than its image, even if it is
     turned by an angle [rad]."""
     height = sizes.height - sizes.base
-    center = (*place, sizes.base + height / 2)
+    center = (place[0] + sizes.origin[0], place[1] + sizes.origin[1], sizes.ground + height / 2)
     forward = viewing_direction(row.pose)
     away, radius = [b - a for a, b in zip(position(row.pose), center, strict=True)], math.hypot(*sizes.outer, height) / 2
     distance = math.hypot(*away)
@@ -325,7 +325,7 @@ def _cone(row: CameraRow) -> float:
 
 def _in_wall(at: tuple[float, ...], sizes: BinSizes) -> bool:
     """Whether a point lies in the walls of a bin: in its outer box, but not above the floor between the walls of the opening."""
-    x, y, z = at
+    x, y, z = (a - b for a, b in zip(at, sizes.origin, strict=True))
     inside = [abs(value) < size / 2 for value, size in zip((x, y), sizes.outer, strict=True)]
     share = z / sizes.height
     free = [abs(v) < (f + (r - f) * share) / 2 for v, f, r in zip((x, y), sizes.floor, sizes.opening, strict=True)]

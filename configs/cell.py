@@ -6,7 +6,7 @@ import itertools
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
-from synpick_warp.configs.bins import NONE, OWN, PALLET, TOTE, BinRow, Bins, Tote
+from synpick_warp.configs.bins import NONE, OWN, PALLET, TOTE, BinRow, Bins, MeasuredBin, Tote
 
 Sides = tuple[float, float]
 """Length (along x) and width (along y) [m]."""
@@ -23,7 +23,7 @@ class BinSizes:
     noun: str
     """What it is, in sentences: tote, bin, pallet or table."""
     shell: Tote | None
-    """Sizes and material of its walls; None: it has none."""
+    """Sizes and material of its walls, or file of its mesh; None: it has none."""
     outer: Sides
     floor: Sides
     """Inner floor."""
@@ -40,6 +40,8 @@ class BinSizes:
     compartments: tuple[int, int] = (1, 1)
     """Columns (along x) and rows (along y)."""
     divider_height: float = 0.0
+    measured: MeasuredBin | None = None
+    """Of a bin whose mesh has been read."""
 
     @classmethod
     def of_tote(cls, tote: Tote, name: str = TOTE, noun: str = TOTE) -> BinSizes:
@@ -49,7 +51,11 @@ class BinSizes:
 
     @classmethod
     def of_row(cls, row: BinRow) -> BinSizes:
-        """Sizes of a row of [[bin]]."""
+        """Sizes of a row of [[bin]]; one with a file must be measured."""
+        if (found := row.measured) is not None:
+            x, y = (2 * max(abs(found.box[axis]), abs(found.box[axis + 3])) for axis in (0, 1))
+            sides = found.opening
+            return cls(row.name, "bin", row, (x, y), sides, sides, found.height, found.box[2], weight=row.weight, measured=found)
         sizes = cls.of_tote(row, row.name, "bin")
         return replace(sizes, weight=row.weight, compartments=row.compartments, divider_height=row.divider_height)
 
@@ -59,14 +65,26 @@ class BinSizes:
         return self.noun != "table"
 
     @property
+    def origin(self) -> Point:
+        """Origin of its frame in the world, without shift, if it is the first bin."""
+        return self.measured.origin if self.measured else (0.0, 0.0, 0.0)
+
+    @property
+    def ground(self) -> float:
+        """z of its underside in the world, if it is the first bin: that of the table."""
+        return self.origin[2] + self.base
+
+    @property
     def corners(self) -> list[Point]:
-        """Corners of the outer box (8)."""
-        length, width = self.outer
-        return list(itertools.product((-length / 2, length / 2), (-width / 2, width / 2), (self.base, self.height)))
+        """Corners of the outer box in the world (8)."""
+        (length, width), (x, y, z) = self.outer, self.origin
+        return list(itertools.product((x - length / 2, x + length / 2), (y - width / 2, y + width / 2), (z + self.base, z + self.height)))
 
     @property
     def centers(self) -> list[Sides]:
         """Centre of each compartment, column by column."""
+        if self.measured:
+            return [one[:2] for one in self.measured.compartments]
         columns, rows = (
             [-side / 2 + cell / 2 + index * (cell + DIVIDER) for index in range(count)] if count > 1 else [0.0]
             for side, cell, count in zip(self.floor, self.cell, self.compartments, strict=True)
@@ -83,14 +101,38 @@ class BinSizes:
 
     @property
     def mouth(self) -> Sides:
-        """Opening of a compartment: over its floor, where there are several."""
+        """Opening of a compartment, of the smallest if they differ: over its floor, where there are several."""
+        if self.measured:
+            return min((one[2:4] for one in self.measured.compartments), key=min)
         return self.opening if self.compartments == (1, 1) else self.cell
 
     @property
+    def mouths(self) -> list[Sides]:
+        """Opening of each compartment."""
+        return [one[2:4] for one in self.measured.compartments] if self.measured else [self.mouth] * len(self.centers)
+
+    def waypoints(self, corner: float, height: float) -> list[list[Point]]:
+        """Points near the four corners of each compartment.
+
+        Args:
+            corner: Where they are, as a fraction of the way from the centre to the corners of the floor.
+            height: Their height above the floor [m].
+        """
+        if self.measured is None:
+            x, y = (corner * side / 2 for side in self.cell)
+            return [[(i * x + center[0], j * y + center[1], height) for j in (1, -1) for i in (1, -1)] for center in self.centers]
+        return [
+            [(x, y, a * x + b * y + c + height) for y in (cy + corner * width / 2, cy - corner * width / 2) for x in (cx + s, cx - s)]
+            for cx, cy, length, width, a, b, c in self.measured.compartments
+            for s in (corner * length / 2,)
+        ]
+
+    @property
     def inner_corners(self) -> list[Point]:
-        """Corners of the inner floor and of the rim (8)."""
-        levels = ((self.floor, 0.0), (self.opening, self.height))
-        return [(x * length / 2, y * width / 2, z) for (length, width), z in levels for x, y in itertools.product((-1, 1), repeat=2)]
+        """Corners of the inner floor and of the rim in the world (8)."""
+        levels, at = ((self.floor, 0.0), (self.opening, self.height)), self.origin
+        signs = list(itertools.product((-1, 1), repeat=2))
+        return [(at[0] + x * length / 2, at[1] + y * width / 2, at[2] + z) for (length, width), z in levels for x, y in signs]
 
 
 @dataclass(frozen=True)
@@ -100,7 +142,7 @@ class Cell:
     bins: tuple[BinSizes, ...]
     """Extents of the bins; the first stands on the table, whose height follows from its base."""
     tables: Mapping[str, Tote]
-    """Settings of the bins with walls by their keys: tote, or bin[0] and so on."""
+    """Settings of the bins with walls of sizes, not of a mesh, by their keys: tote, or bin[0] and so on."""
     recorded: tuple[str, ...]
     """Names of the bins, where data sets record that of each episode; empty for a tote that is always in its place."""
 
@@ -115,7 +157,7 @@ class Cell:
             sizes = (BinSizes("pallet", "pallet", None, (length, width), bins.area, bins.area, 0.0, -height, bins.margin),)
         elif bins.kind == OWN and rows:
             sizes = tuple(BinSizes.of_row(row) for row in rows)
-            tables = {f"bin[{index}]": row for index, row in enumerate(rows)}
+            tables = {f"bin[{index}]": row for index, row in enumerate(rows) if not row.file}
         else:
             sizes = (BinSizes.of_tote(tote),)
             tables = {TOTE: tote} if bins.kind == TOTE else {}

@@ -49,9 +49,10 @@ def find_conflicts(config: Config) -> Iterator[Conflict]:
         yield from _box(key, row)
     if config.move.start_height < config.move.height:
         yield "move.start_height", f"at least move.height, {config.move.height:g} [m]"
-    yield from find_camera_conflicts(config)
+    if all(row.measured or not row.file for row in config.bin):
+        yield from find_camera_conflicts(config)
+        yield from _pick(config.pick, bins)
     yield from _times(config.settle, config.physics)
-    yield from _pick(config.pick, bins)
     yield from _suction(config.suction, config.gripper)
     yield from _layers(config.render.layers)
     yield from _ranges(config.effects, config.depth_sensor)
@@ -104,6 +105,8 @@ def _bins(bins: Bins, rows: Sequence[BinRow]) -> Iterator[Conflict]:
                 f"bin[{index}].name",
                 "lower-case letters, digits and underscores, at most 32, other than those of other bins; not tote, table, pallet",
             )
+        if row.file:
+            continue
         sizes = BinSizes.of_row(row)
         if row.compartments != (1, 1) and row.divider_height > sizes.height:
             yield f"bin[{index}].divider_height", f"at most the height of the rim, {sizes.height:g} [m]"
@@ -131,6 +134,8 @@ def _pick(pick: Pick, bins: Sequence[BinSizes]) -> Iterator[Conflict]:
         yield "pick.appear_height", f"at least pick.near, {pick.near:g} [m]"
     if pick.speed < pick.near_speed:
         yield "pick.speed", f"at least pick.near_speed, {pick.near_speed:g} [m/s]"
+    if pick.floor > bins[0].origin[2]:
+        yield "pick.floor", f"at most the floor of the {bins[0].noun}, {bins[0].origin[2]:g}: what is below it is removed [m]"
     if pick.lift_height < height:
         yield "pick.lift_height", f"at least the inner height of the {bins[0].noun}, {height:g}: attached objects must leave it [m]"
 

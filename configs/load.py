@@ -10,6 +10,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from synpick_warp.configs.bins import locate_meshes
 from synpick_warp.configs.calibration.sensor_presets import sensor_settings
 from synpick_warp.configs.calibration.tables import fill_tables
 from synpick_warp.configs.cameras import Cameras
@@ -86,7 +87,7 @@ def override_config(config: Config, settings: Mapping[str, object], source: str 
 
     Args:
         config: The configuration.
-        settings: Full key, such as "physics.step", -> value.
+        settings: Full key, such as "physics.step", -> value; or list of tables, such as "bin", -> its rows.
         source: Where `settings` come from, for error messages.
 
     Raises:
@@ -95,6 +96,9 @@ def override_config(config: Config, settings: Mapping[str, object], source: str 
     """
     values: Values = {}
     for key, value in settings.items():
+        if key in table_lists():
+            config = dataclasses.replace(config, **{key: value})
+            continue
         section, _, name = key.partition(".")
         if section == SPLITS or (config.splits and key in _OF_SPLITS):
             raise ConfigError(f"{key} is set {source}, but the configuration has its splits already; pass it to load_config")
@@ -170,8 +174,9 @@ def _read(preset_or_file: str) -> Values:
     """Values of a preset or a .toml file over the preset it is based on, with the source of each."""
     if preset_or_file.endswith(".toml"):
         document = _parse(Path(preset_or_file))
-        if "camera" in document:
-            document["camera"] = fill_tables(document["camera"], Path(preset_or_file).parent, f"in {preset_or_file}")
+        for name, fill in (("camera", fill_tables), ("bin", locate_meshes)):
+            if name in document:
+                document[name] = fill(document[name], Path(preset_or_file).parent, f"in {preset_or_file}")
         base = document.pop(_BASE, DEFAULT_PRESET)
         if not isinstance(base, str):
             raise ConfigError(f"{_BASE} is {format_value(base)} in {preset_or_file}; allowed: {', '.join(preset_names())}")

@@ -1,8 +1,9 @@
 """Lists of tables in the settings, such as [[camera]]: each table is a row, a dataclass of settings.
 
 `Config` has a field for each list: `camera: tuple[CameraRow, ...] = ()`. The class of a row may name keys that every table needs
-(`REQUIRED`), and keys by which a row is told from others (`IDENTITY`); a list with these can be changed as a whole by a single table,
-[object_rows]. A setting may be a table itself, as `pose = {position = ...}`: its class is then the setting's type.
+(`REQUIRED`), keys of no effect beside others (`replaced`), and keys by which a row is told from others (`IDENTITY`); a list with these can
+be changed as a whole by a single table, [object_rows]. A setting may be a table itself, as `pose = {position = ...}`: its class is then
+the setting's type.
 """
 
 from __future__ import annotations
@@ -91,8 +92,8 @@ def change_rows(key: str, kind: type[Any], rows: tuple[Any, ...], changes: Mappi
 
 
 def given_values(row: Any) -> dict[str, Any]:
-    """Convert a row to a dictionary of the settings that are given (not None), in types of TOML; nested tables become dictionaries."""
-    values = ((name, getattr(row, name)) for name in settings_of(type(row)))
+    """Convert a row to a dictionary of the settings that are given (not None) and of effect; nested tables become dictionaries."""
+    values = ((name, getattr(row, name)) for name in settings_of(type(row)) if name not in getattr(row, "replaced", ()))
     return {name: _plain(value) for name, value in values if value is not None}
 
 

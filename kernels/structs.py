@@ -111,8 +111,8 @@ class BinData:
     """1: bins are rendered; 0: there is a table alone."""
     share: wp.array[float]
     """(bin): share of the episodes that have this bin or one before it."""
-    lift: wp.array[float]
-    """(bin): z of the bin's frame where it stands on the table [m]."""
+    origin: wp.array[wp.vec3]
+    """(bin): origin of the bin's frame in the world, without offset, where it stands on the table [m]."""
     shift: wp.vec2
     """Half widths of the uniform distribution of the bin's offset in x and y [m]."""
     yaw: float
@@ -123,14 +123,18 @@ class BinData:
     """(bin): height of the rim, over which objects are dropped [m]."""
     wall_height: wp.array[float]
     """(bin): height below which an object beside the bin is outside [m]."""
-    corner: wp.array[wp.vec3]
-    """(bin): TCP at the waypoint in the corner with positive x and y of a compartment, from its centre [m]."""
+    limit: wp.array3d[float]
+    """(bin, column, row): height below which an object's origin is outside, of bins with pitch [m]."""
+    pitch: wp.array[wp.vec2]
+    """(bin): sides of a cell of `limit`, whose middle is the origin [m]; 0: the bin's inside is a box."""
     first_compartment: wp.array[int]
     """(bin + 1): index of the bin's first compartment; the last entry is their number."""
     center: wp.array[wp.vec2]
     """(compartment): centre [m]."""
     half: wp.array[wp.vec2]
     """(compartment): half length and width of the opening [m]."""
+    waypoint: wp.array2d[wp.vec3]
+    """(compartment, corner): TCP near the corners of the floor; bits 0 and 1 of the corner: at negative x, at negative y [m]."""
     chosen: wp.array[int]
     """(world): bin of the world's episode."""
     pose: wp.array[wp.transform]

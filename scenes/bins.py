@@ -8,20 +8,24 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from synpick_warp.configs.bins import TOTE, Tote
+from synpick_warp.configs.bins import TOTE, BinRow, Tote
 from synpick_warp.configs.cell import DIVIDER, BinSizes, Point
 from synpick_warp.errors import ConfigError
+from synpick_warp.scenes.bin_meshes.inside import HeightField
+from synpick_warp.scenes.bin_meshes.reading import bin_material, read_bin
 from synpick_warp.scenes.collision.simplification import simplify_hull
 from synpick_warp.scenes.modelling import Patch, at_height, join, make_mesh, solid
 from synpick_warp.scenes.tote import box_piece, tote_colliders, tote_fixture
 from synpick_warp.scenes.types import ConvexPiece, Fixture, Material
 
-GUIDE_THICKNESS = 0.1
-"""Thickness of the guide walls [m]."""
+GUIDES, GUIDE_THICKNESS = 4, 0.1
+"""Number of guide walls, and their thickness [m]."""
 CROSSING = 1e-4
 """Difference in height of crossing dividers [m]."""
 BOARD, BOARD_GAP, BOARDS = 0.022, 0.006, 5
 """Thickness of a pallet's boards (EN 13698-1) [m], gap between those of the deck [m], and their number."""
+MAX_SHAPES = 256
+"""Collision shapes of all bins: each world has all of them, and the broad phase takes time with the square of their number."""
 RUNNER = 0.16
 """Width of a pallet's runners, as a fraction of its length."""
 WOOD, WOOD_ROUGHNESS = (0.66, 0.52, 0.36), 0.8
@@ -37,15 +41,43 @@ class Bin:
     """Visual mesh, material and empty interior."""
     pieces: tuple[ConvexPiece, ...]
     """Collision shapes."""
+    limits: HeightField | None = None
+    """Heights below which an object is outside; None: the inside is a box."""
+    notes: tuple[str, ...] = ()
+    """Lines on a mesh that was read."""
+
+    @property
+    def is_detailed(self) -> bool:
+        """Whether it has other collision shapes than a box's floor, walls and corners."""
+        return self.sizes.measured is not None or self.sizes.compartments != (1, 1)
 
 
 def make_bins(sizes: Iterable[BinSizes]) -> tuple[Bin, ...]:
     """Build bins.
 
     Raises:
-        ConfigError: The sizes of a bin do not fit each other.
+        ConfigError: The sizes of a bin do not fit each other, its mesh cannot be used or is not the one that was measured, or all bins
+            together have more than MAX_SHAPES collision shapes.
     """
-    return tuple(_make_box(one, one.shell) if one.shell else _make_pallet(one) for one in sizes)
+    bins = tuple(map(_make_bin, sizes))
+    if (count := sum(len(one.pieces) for one in bins)) > MAX_SHAPES:
+        raise ConfigError(f"{len(bins)} bins have {count} collision shapes; allowed: {MAX_SHAPES}; use fewer, or simplify their meshes")
+    return bins
+
+
+def _make_bin(sizes: BinSizes) -> Bin:
+    """Build a bin, of its mesh if it has one."""
+    shell = sizes.shell
+    if shell is None:
+        return _make_pallet(sizes)
+    if not isinstance(shell, BinRow) or not shell.file:
+        return _make_box(sizes, shell)
+    model = read_bin(shell)
+    if model.measured != sizes.measured:
+        raise ConfigError(
+            f"bin {sizes.name}: {shell.file} is not the mesh that was measured; restore it, or bake again into another folder"
+        )
+    return Bin(sizes, Fixture(model.mesh, bin_material(model, shell)), model.pieces, model.limits, model.notes)
 
 
 def _make_box(sizes: BinSizes, shell: Tote) -> Bin:
@@ -98,7 +130,7 @@ def _box_patch(low: Point, high: Point) -> Patch:
 
 
 def guide_walls(sizes: BinSizes, height: float) -> tuple[ConvexPiece, ...]:
-    """Build four temporary walls on the rim, flush with the opening, that keep falling objects over the bin; height [m]."""
+    """Build GUIDES temporary walls on the rim, flush with the opening, that keep falling objects over the bin; height [m]."""
     low = sizes.height
     x, y = sizes.opening[0] / 2, sizes.opening[1] / 2
     far_x, far_y, high = x + GUIDE_THICKNESS, y + GUIDE_THICKNESS, low + height

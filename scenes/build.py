@@ -15,12 +15,14 @@ from typing import NamedTuple
 import newton
 import numpy as np
 import warp as wp
+from scipy.spatial import ConvexHull
 from scipy.stats import binom
 
 from synpick_warp.configs.modes import mode_weights
 from synpick_warp.configs.schema import EXCEED, Arrangement, Bake, Config, Gripper, Move, Physics, Pick
 from synpick_warp.errors import ConfigError
-from synpick_warp.scenes.bins import guide_walls, make_bins
+from synpick_warp.scenes.bin_meshes.inside import HeightField
+from synpick_warp.scenes.bins import Bin, guide_walls, make_bins
 from synpick_warp.scenes.gripper import cup_collider, finger_collider, rod_inertia
 from synpick_warp.scenes.tote import TABLE_SIZE
 from synpick_warp.scenes.types import Catalog, CatalogEntry, ConvexPiece
@@ -34,6 +36,8 @@ CUP_ARMATURE = 1e-3
 SLOT_TRIALS = 100_000
 # Contacts of two convex shapes side by side, and such pairs of an object with floor and walls: a pile of 24 plates of 1 mm has up to 713.
 _PAIR_CONTACTS, _FIXTURES = 5, 1.5
+# Where shapes beside an object are counted, as fractions of the way from the middle of a compartment to its corners.
+_SHARES = (0.25, 0.5, 0.75, 1.0)
 MAX_CONTACTS = 4096
 """Contacts of a world that thin objects get at most, 1 MB on a GPU."""
 MAX_ROWS = 3072
@@ -105,6 +109,8 @@ class BuiltModel:
     """Variant index of each catalog entry in slots of its type (entry) int32."""
     empty_variant: tuple[int, int]
     """Index of the empty variant in single and in compound slots."""
+    fields: tuple[HeightField | None, ...]
+    """Height field of the inside of each bin."""
 
 
 REPEATS: Mapping[str, object] = {"pick.repeats": True, "move.repeats": True}
@@ -230,7 +236,7 @@ def build_model(config: Config, catalog: Catalog, device: wp.Device) -> BuiltMod
         return [Part(world.add_shape_convex_hull(-1, mesh=_hull(piece), cfg=shape), index, guide) for piece in pieces]
 
     parts = add(0, bins[0].pieces, False)
-    table = wp.transform(wp.vec3(0.0, 0.0, bins[0].sizes.base - TABLE_SIZE[2]), wp.quat_identity())
+    table = wp.transform(wp.vec3(0.0, 0.0, bins[0].sizes.ground - TABLE_SIZE[2]), wp.quat_identity())
     world.add_shape_box(-1, xform=table, hx=TABLE_SIZE[0], hy=TABLE_SIZE[1], hz=TABLE_SIZE[2], cfg=shape)
     for index, one in enumerate(bins):
         parts += [] if index == 0 else add(index, one.pieces, False)
@@ -245,7 +251,7 @@ def build_model(config: Config, catalog: Catalog, device: wp.Device) -> BuiltMod
         warnings.filterwarnings("ignore", "Eigenvalues below threshold")
         model = scene.finalize(device=device)
     layout = Layout(config.bake.worlds, config.arrangement.max_objects, single, compound, world.shape_count, tuple(parts), *gripper)
-    return BuiltModel(model, layout, variant, empty)
+    return BuiltModel(model, layout, variant, empty, tuple(one.limits for one in bins))
 
 
 def must_repeat(arrangement: Arrangement, catalog: Catalog) -> bool:
@@ -254,20 +260,25 @@ def must_repeat(arrangement: Arrangement, catalog: Catalog) -> bool:
     return arrangement.repeat_to_fill and sum(volumes) < arrangement.volume and len(volumes) < arrangement.max_objects
 
 
-def with_capacities(physics: Physics, count: int, catalog: Catalog) -> Physics:
-    """Raise the capacities of a world of at most `count` objects if some are thinner than the contact margin, so touch through others.
+def with_capacities(physics: Physics, count: int, catalog: Catalog, bins: Sequence[Bin] = ()) -> Physics:
+    """Raise the capacities of a world of at most `count` objects if some are thinner than the contact margin, so touch through others, or
+    if bins have more shapes beside an object than a box has.
 
     The margin of two shapes is twice `physics.gap`. Within a margin m of an object of side lengths a, b, c there is room for about
     (a + 2 m)(b + 2 m)(c + 2 m) / (a b c) - 1 others of its kind: 23 for plates of 100 x 80 x 1 mm. Piles of objects that are thicker than
     the margin keep the capacities of the settings.
     """
     margin, needed = 2.0 * physics.gap, 0.0
+    reach = float(np.mean([entry.radius for entry in catalog.bodies])) + margin
+    shapes = max((_count_beside(one, reach) for one in bins if one.is_detailed), default=_FIXTURES)
+    if shapes > _FIXTURES:
+        needed = physics.contacts_per_world + _PAIR_CONTACTS * (shapes - _FIXTURES) * count
     for entry in catalog.bodies:
         sides = np.sort(oriented_sides(entry.pieces))
         if sides[0] >= margin:
             continue
         neighbors = float(np.prod(sides + 2.0 * margin) / np.prod(sides)) - 1.0
-        pairs = min(count * neighbors, count * (count - 1)) / 2.0 + _FIXTURES * count
+        pairs = min(count * neighbors, count * (count - 1)) / 2.0 + max(shapes, _FIXTURES) * count
         needed = max(needed, _PAIR_CONTACTS * pairs * len(entry.pieces))
     if needed <= physics.contacts_per_world:
         return physics
@@ -280,6 +291,21 @@ def with_capacities(physics: Physics, count: int, catalog: Catalog) -> Physics:
         rows_per_world=max(physics.rows_per_world, min(3 * contacts, MAX_ROWS)),
         gripper_rows_per_world=round(share * physics.gripper_rows_per_world),
     )
+
+
+def _count_beside(one: Bin, reach: float) -> float:
+    """Mean number of a bin's collision shapes beside an object on its floor, in proportion to _FIXTURES of a box.
+
+    Over a grid of places in all compartments, shapes are counted whose planes are within `reach`, the object's bounding radius and margin
+    [m]; and so are floor and walls of boxes as large as the compartments.
+    """
+    planes = [ConvexHull(piece.vertices.astype(np.float64)).equations for piece in one.pieces]
+    shapes, sides = 0, 0
+    for center, mouth, *parts in zip(one.sizes.centers, one.sizes.mouths, *(one.sizes.waypoints(k, reach) for k in _SHARES), strict=True):
+        places, half = np.concatenate(parts), np.array(mouth) / 2.0
+        sides += len(places) + int((half - np.abs(places[:, :2] - center) <= reach).sum())
+        shapes += sum(int(((places @ each[:, :3].T + each[:, 3]).max(axis=1) <= reach).sum()) for each in planes)
+    return _FIXTURES * shapes / sides
 
 
 def oriented_sides(pieces: Sequence[ConvexPiece]) -> np.ndarray:

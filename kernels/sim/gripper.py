@@ -22,18 +22,9 @@ PASS_HEIGHT = wp.constant(0.05)
 def bin_corner(code: int, bins: BinData, world: int) -> wp.vec3:
     """TCP at the corner of a compartment that `code` names, in the frame of the world's bin [m].
 
-    Bits 0 and 1 negate x and y of the corner with positive ones, relative to the compartment's centre; the others are the compartment.
+    Bits 0 and 1 are the corner, the others the compartment.
     """
-    chosen = bins.chosen[world]
-    corner = bins.corner[chosen]
-    center = bins.center[bins.first_compartment[chosen] + code // ROUND]
-    x = corner[0]
-    y = corner[1]
-    if (code & 1) == 1:
-        x = -x
-    if (code & 2) == 2:
-        y = -y
-    return wp.vec3(x + center[0], y + center[1], corner[2])
+    return bins.waypoint[bins.first_compartment[bins.chosen[world]] + code // ROUND, code % ROUND]
 
 
 @wp.kernel

@@ -92,9 +92,19 @@ def measure_displacement_kernel(
 
 @wp.func
 def is_outside(position: wp.vec3, bins: BinData, world: int) -> bool:
-    """True if an object's origin [m] lies below the floor of the world's bin, or beside its opening and below the rim."""
+    """True if an object's origin [m] lies below the floor of the world's bin, or beside its opening and below the rim.
+
+    The inside of a bin of pitch > 0 is given by a height field.
+    """
     chosen = bins.chosen[world]
     local = wp.transform_point(wp.transform_inverse(bins.pose[world]), position)
+    pitch = bins.pitch[chosen]
+    if pitch[0] > 0.0:
+        column = int(wp.floor(local[0] / pitch[0])) + bins.limit.shape[1] // 2
+        row = int(wp.floor(local[1] / pitch[1])) + bins.limit.shape[2] // 2
+        if column < 0 or row < 0 or column >= bins.limit.shape[1] or row >= bins.limit.shape[2]:
+            return local[2] < bins.wall_height[chosen]
+        return local[2] < bins.limit[chosen, column, row]
     reach = bins.reach[chosen]
     beside = wp.abs(local[0]) > reach[0] or wp.abs(local[1]) > reach[1]
     return local[2] < BELOW_FLOOR or (beside and local[2] < bins.wall_height[chosen])

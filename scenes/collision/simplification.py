@@ -102,14 +102,14 @@ def simplify_hull(points: np.ndarray, max_vertices: int) -> ConvexPiece:
     middle, radius = (low + high) / 2.0, max(float(np.linalg.norm(high - low)) / 2.0, float(np.finfo(np.float32).tiny))
     full = _hull_of((points - middle) / radius)
     if len(full.vertices) <= max_vertices and _has_distinct_facets(full):
-        return _to_piece(points[full.vertices])
+        return hull_piece(points[full.vertices])
     candidates = full.points[full.vertices]
     try:
         vertices = _choose_facets(_decimate(candidates, _FINE_VERTICES, _FINE_GAIN * full.volume), max_vertices, full.volume)
     except QhullError:
         hull = _decimate(candidates, max_vertices, _COARSE_GAIN * full.volume)
         vertices = hull.points[hull.vertices]
-    return _to_piece(vertices * radius + middle)
+    return hull_piece(vertices * radius + middle)
 
 
 def _hull_of(points: np.ndarray) -> ConvexHull:
@@ -354,7 +354,7 @@ def _spanning_points(points: np.ndarray) -> list[int]:
     return [start, far, wide, high]
 
 
-def _to_piece(points: np.ndarray) -> ConvexPiece:
+def hull_piece(points: np.ndarray) -> ConvexPiece:
     """Vertices and triangles of the hull of points in single precision, of which near ones are welded.
 
     Outward orientation spreads over shared edges: normals of thin triangles are unreliable.

@@ -65,3 +65,8 @@ def make_exact(elements: np.ndarray, within: float) -> np.ndarray | None:
     for _ in range(8):
         elements = Rotation.from_matrix(np.einsum("abij,bkj->aik", elements[table], elements) / count).as_matrix()
     return elements
+
+
+def describe_counts(discrete: int, continuous: int) -> str:
+    """Text on the numbers of an object's symmetries."""
+    return ", ".join(f"{count} {kind}" for count, kind in ((discrete, "discrete"), (continuous, "continuous")) if count) or "none"

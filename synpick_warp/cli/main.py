@@ -36,7 +36,16 @@ from synpick_warp.cli.options import (
 )
 from synpick_warp.cli.streams import SafeStreams, StreamError, describe_fault
 from synpick_warp.configs.check import describe_allowed
-from synpick_warp.configs.load import COMMAND_LINE, DEFAULT_PRESET, load_config, parse_assignment, preset_names, sections, settings_of
+from synpick_warp.configs.load import (
+    COMMAND_LINE,
+    DEFAULT_PRESET,
+    load_config,
+    override_config,
+    parse_assignment,
+    preset_names,
+    sections,
+    settings_of,
+)
 from synpick_warp.configs.schema import Config
 from synpick_warp.configs.splits import DataLayout
 from synpick_warp.configs.write import config_to_toml
@@ -307,7 +316,12 @@ def _resolve(
     overrides |= {key: value for key, value in given.items() if value is not None}
     if resolution is not None:
         overrides["cameras.resolution"] = parse_resolution(resolution)
-    return load_config(config, overrides, source=COMMAND_LINE, splits=splits)
+    resolved = load_config(config, overrides, source=COMMAND_LINE, splits=splits)
+    if not any(row.file for row in resolved.bin):
+        return resolved
+    from synpick_warp.scenes.bin_meshes.reading import measure_bins
+
+    return override_config(resolved, measure_bins(resolved.bin))
 
 
 def check_trace_file(trace: Path, out: Path) -> None:

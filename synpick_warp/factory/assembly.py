@@ -23,7 +23,7 @@ from synpick_warp.factory.compilation import is_cache_warm, make_compiler, sole_
 from synpick_warp.factory.memory_plan import check_memory, plan_memory
 from synpick_warp.factory.order import order_longest_first
 from synpick_warp.factory.sizes import count_writers, fit_to_device, without_pictures
-from synpick_warp.scenes.bins import make_bins
+from synpick_warp.scenes.bins import Bin, make_bins
 from synpick_warp.scenes.build import REPEATS, find_repeat_rules, must_repeat, with_capacities, without_distractors
 from synpick_warp.scenes.cameras import EpisodeCameras
 from synpick_warp.scenes.catalog import load_catalog
@@ -196,15 +196,17 @@ def build_stages(
     episode_cameras = EpisodeCameras(config.rig, config.bake.seed)
     cameras = episode_cameras.cameras
     bins = make_bins(config.cell.bins)
+    for line in (line for one in bins for line in one.notes):
+        progress.note(line)
     catalog = load_catalog(config, report=progress.note)
     lights = load_scene_lights(config.bake.lights, config.randomize, config.bake.seed, progress.note, config.objects.strict)
-    config = _fit_to_catalog(config, catalog, device, progress)
+    config = _fit_to_catalog(config, catalog, bins, device, progress)
     if longest_first and episodes is not None:
         episodes = order_longest_first(config, catalog, episodes, device)
     progress.stage(f"building {config.bake.worlds} worlds of {len(catalog)} objects on {device.alias}")
     looks = load_looks(config.randomize, progress.note, config.objects.strict)
     fixtures = make_fixtures(bins, config.gripper)
-    scene = build_render_scene(config.render, bins[0].sizes.base, catalog, fixtures, cameras, lights, device, looks)
+    scene = build_render_scene(config.render, bins[0].sizes.ground, catalog, fixtures, cameras, lights, device, looks)
     simulation = Simulation(config, catalog, len(lights), device, scene, episodes, records_physics)
     groups = tuple(_build_group(config, scene, cameras, index) for index in range(len(config.rig.groups)))
     table = name_lights([light.name for light in lights], scene.lights)
@@ -220,8 +222,8 @@ def _build_group(config: Config, scene: RenderScene, cameras: tuple[Camera, ...]
     return CameraGroup(indices, sizes, renderer, config.rig.is_placed(indices[0]), config.rig.moves(indices[0]))
 
 
-def _fit_to_catalog(config: Config, catalog: Catalog, device: wp.Device, progress: Progress) -> Config:
-    """Settings that follow from the objects: whether they repeat in an episode, capacities for contacts of thin ones.
+def _fit_to_catalog(config: Config, catalog: Catalog, bins: Sequence[Bin], device: wp.Device, progress: Progress) -> Config:
+    """Settings that follow from objects and bins: whether objects repeat in an episode, capacities for contacts of thin or many shapes.
 
     Raises:
         ConfigError: The capacities do not fit into the device's memory.
@@ -232,10 +234,11 @@ def _fit_to_catalog(config: Config, catalog: Catalog, device: wp.Device, progres
         total = sum(entry.volume for entry in catalog.entries)
         budget = config.arrangement.volume
         progress.note(f"{len(catalog)} objects take {total:.3g} of {budget:g} m³ together, so that they repeat in an episode")
-    physics = with_capacities(filled.physics, filled.arrangement.max_objects, catalog)
+    physics = with_capacities(filled.physics, filled.arrangement.max_objects, catalog, bins)
     if physics is filled.physics:
         return filled
-    progress.note(f"thin objects: capacity for {physics.contacts_per_world:,} contacts a world")
+    cause = "bins of many shapes" if any(one.is_detailed for one in bins) else "thin objects"
+    progress.note(f"{cause}: capacity for {physics.contacts_per_world:,} contacts a world")
     fitted = replace(filled, physics=physics)
     check_memory(plan_memory(fitted, device, 0), device)
     return fitted

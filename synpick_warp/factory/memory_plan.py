@@ -20,6 +20,7 @@ from synpick_warp.configs.schema import Config, Perception, Physics
 from synpick_warp.errors import ConfigError, SynpickError, format_value
 from synpick_warp.exporters.registry import Needs
 from synpick_warp.scenes import build
+from synpick_warp.scenes.bins import GUIDES, make_bins
 from synpick_warp.stages.arrays import DryArray, Row, dry_run
 from synpick_warp.stages.buffers import Snapshot
 from synpick_warp.stages.host_copies import HostImages, host_images
@@ -108,6 +109,11 @@ def plan_memory(config: Config, device: wp.Device, writers: int = 1) -> list[Ter
     if may_pick(config.bake, config.splits):
         terms.append(_perception(config.perception, worlds, objects, device))
     terms += _newton(config.physics, worlds, device.is_cuda)
+    if config.bin:
+        # A separating axis for each pair of a world's shapes, of all bins with their guide walls, and at least one for each object.
+        shapes = sum(len(one.pieces) + GUIDES for one in make_bins(config.cell.bins)) + objects
+        row = ("separating axes", (worlds, shapes * (shapes - 1) // 2), "", worlds * 2 * shapes * (shapes - 1))
+        terms.append(Term("separating axes of shape pairs", (row,), ("bake.worlds",)))
     if writers:
         # A writer is counted with one slot of shared memory: those of its queue get memory only once they are used.
         row = ("shared memory of writers", (writers, needs.slot_bytes), "", writers * needs.slot_bytes)

@@ -7,6 +7,7 @@ from pathlib import Path
 
 from synpick_warp.configs.load import load_config, override_config
 from synpick_warp.configs.schema import Config
+from synpick_warp.scenes.bin_meshes.reading import measure_bins
 
 ARGUMENTS = {
     "worlds": "bake.worlds",
@@ -40,9 +41,9 @@ def resolve_settings(
     if given.get("bake.worlds") == "auto":  # As the command line has it.
         given["bake.worlds"] = 0
     overrides = dict(settings) | given
-    if isinstance(config, Config):
-        return override_config(config, overrides)
-    return load_config(config, overrides, splits=splits)
+    is_resolved = isinstance(config, Config)
+    found = override_config(config, overrides) if is_resolved else load_config(config, overrides, splits=splits)
+    return override_config(found, measured) if (measured := measure_bins(found.bin)) else found
 
 
 def _plain(value: object) -> object:

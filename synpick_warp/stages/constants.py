@@ -16,6 +16,7 @@ from synpick_warp.configs.modes import mode_weights
 from synpick_warp.kernels import structs
 from synpick_warp.kernels.distributions import LookTable
 from synpick_warp.scenes import build
+from synpick_warp.scenes.bin_meshes.inside import HeightField
 from synpick_warp.scenes.looks import Looks
 from synpick_warp.scenes.types import Catalog, CatalogEntry
 from synpick_warp.stages.render.looks import build_look_table
@@ -92,7 +93,7 @@ def make_scene_data(config: schema.Config, catalog: Catalog, built: build.BuiltM
         ),
         fill(structs.PerceptionData, config.perception),
         _suction_data(config.suction, gripper, physics.step),
-        bin_data(config.cell.bins, config.bins, config.move, built.layout.parts, device),
+        bin_data(config.cell.bins, config.bins, config.move, built.layout.parts, device, built.fields),
         build_look_table(Looks(config.randomize, (), ()), 0, device),
     )
 
@@ -183,9 +184,25 @@ def drop_data(
 
 
 def bin_data(
-    sizes: Sequence[BinSizes], bins: schema.Bins, move: schema.Move, parts: Sequence[build.Part], device: wp.Device
+    sizes: Sequence[BinSizes],
+    bins: schema.Bins,
+    move: schema.Move,
+    parts: Sequence[build.Part],
+    device: wp.Device,
+    fields: Sequence[HeightField | None] = (),
 ) -> structs.BinData:
-    """Fill `BinData` but for the arrays of worlds; `parts`: the collision shapes of the bins in a world."""
+    """Fill `BinData` but for the arrays of worlds.
+
+    Args:
+        sizes: The bins.
+        bins: Settings of their place.
+        move: Settings of the waypoints.
+        parts: The collision shapes of the bins in a world.
+        device: Device of the arrays.
+        fields: Height field of the inside of each bin; None, or none at all: it is a box.
+    """
+    fields = fields or [None] * len(sizes)
+    shape = next((one.limit.shape for one in fields if one), (1, 1))
 
     def array(values: Sequence[Any], dtype: type) -> wp.array:
         return wp.array(np.array(values), dtype=dtype, device=device)
@@ -196,16 +213,18 @@ def bin_data(
         count=len(sizes),
         visible=sizes[0].is_visible,
         share=array(shares / shares[-1], float),
-        lift=array([one.base - sizes[0].base for one in sizes], float),
+        origin=array([(*one.origin[:2], sizes[0].ground - one.base) for one in sizes], wp.vec3),
         shift=wp.vec2(*bins.shift),
         yaw=math.radians(bins.yaw),
         reach=array([np.array(one.opening) / 2 + one.margin for one in sizes], wp.vec2),
         rim_height=array([one.height for one in sizes], float),
         wall_height=array([one.height if one.shell else FAR for one in sizes], float),
-        corner=array([(move.corner * one.cell[0] / 2, move.corner * one.cell[1] / 2, move.height) for one in sizes], wp.vec3),
+        limit=array([one.limit if one else np.zeros(shape) for one in fields], float),
+        pitch=array([one.pitch if one else (0.0, 0.0) for one in fields], wp.vec2),
         first_compartment=array(np.cumsum([0, *(len(one.centers) for one in sizes)]), int),
         center=array([center for one in sizes for center in one.centers], wp.vec2),
-        half=array([np.array(one.mouth) / 2 for one in sizes for _ in one.centers], wp.vec2),
+        half=array([np.array(mouth) / 2 for one in sizes for mouth in one.mouths], wp.vec2),
+        waypoint=array([corners for one in sizes for corners in one.waypoints(move.corner, move.height)], wp.vec3),
         shape=array([part.shape for part in parts], int),
         shape_bin=array([part.bin for part in parts], int),
         shape_guide=array([int(part.guide) for part in parts], int),

@@ -7,14 +7,18 @@ import dataclasses
 import numpy as np
 import pytest
 import warp as wp
+from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
 from synpick_warp.codes import Mode, Phase, Stream
 from synpick_warp.configs.bins import BinRow, Bins
+from synpick_warp.scenes.bin_meshes.reading import measure_bins
+from synpick_warp.scenes.bins import make_bins
 from synpick_warp.stages.sim import arrange, gripper
 from synpick_warp.stages.sim.simulate import Simulation
 from synpick_warp.stages.stream import read_tick
 from tests.twins import rng
+from tests.worlds.bin_meshes import round_bin, sloped_bin, tote
 from tests.worlds.kernel_worlds import BIN, KernelWorlds
 from tests.worlds.small_worlds import COARSE, catalog, settings
 
@@ -41,7 +45,7 @@ def test_bin_and_pose_follow_the_law(device):
     assert 0 < chosen.sum() < WORLDS
     np.testing.assert_array_equal(worlds.state.bin.numpy(), chosen)
     pose = worlds.state.bin_pose.numpy()
-    lift = np.where(chosen == 1, LOW.base - BIN.base, 0.0)
+    lift = np.where(chosen == 1, BIN.base - LOW.base, 0.0)
     np.testing.assert_allclose(pose[:, :3], np.stack([0.1 * (2 * u[1] - 1), 0.05 * (2 * u[2] - 1), lift], axis=1), atol=1e-6)
     yaw = Rotation.from_quat(pose[:, 3:]).as_euler("xyz")
     np.testing.assert_allclose(yaw, np.stack([0 * u[3], 0 * u[3], np.radians(30) * (2 * u[3] - 1)], axis=1), atol=1e-6)
@@ -153,8 +157,8 @@ def test_the_gripper_passes_over_dividers_and_nowhere_below_the_rim_through_them
     assert np.linalg.norm(np.diff(points, axis=0), axis=1).max() < 2.0 * 2e-3 + 1e-6
 
 
-def first_frames(config, worlds: int) -> dict[int, tuple[int, np.ndarray, np.ndarray]]:
-    """Bin, its pose and the poses of the objects in the first frame of each episode."""
+def first_frames(config, worlds: int) -> dict[int, tuple[int, np.ndarray, np.ndarray, np.ndarray]]:
+    """Bin, its pose, and poses and catalog indices of the objects in the first frame of each episode."""
     config = dataclasses.replace(config, bake=dataclasses.replace(config.bake, worlds=worlds))
     simulation = Simulation(config, catalog(), 1, wp.get_device(config.bake.device))
     found = {}
@@ -162,8 +166,13 @@ def first_frames(config, worlds: int) -> dict[int, tuple[int, np.ndarray, np.nda
         simulation.tick()
         report = read_tick(simulation.record)
         for world in np.flatnonzero(report.column("live") & (report.column("frame") == 0)):
-            poses = report.pose[world][report.catalog_index[world] >= 0]
-            found[int(report.column("episode")[world])] = (int(report.snapshot.bin[world]), report.snapshot.fixture_pose[world, 0], poses)
+            there = report.catalog_index[world] >= 0
+            objects = report.pose[world][there], report.catalog_index[world][there]
+            found[int(report.column("episode")[world])] = (
+                int(report.snapshot.bin[world]),
+                report.snapshot.fixture_pose[world, 0],
+                *objects,
+            )
         if len(found) == config.bake.episodes:
             return found
     raise AssertionError(f"{len(found)} of {config.bake.episodes} episodes began")
@@ -175,6 +184,42 @@ ROWS = (
 )
 
 
+def deepest(pieces, points: np.ndarray) -> float:
+    """Largest depth of points in convex pieces [m]."""
+    planes = (ConvexHull(piece.vertices.astype(float)).equations for piece in pieces)
+    return max(float(-(points @ each[:, :3].T + each[:, 3]).max(axis=1).min()) for each in planes)
+
+
+def test_piles_rest_within_meshes_and_sized_bins_in_any_number_of_worlds(tmp_path):
+    """Bins of meshes and of sizes, shifted and turned: no corner of an object is in a wall, a floor or beside the inside."""
+    meshes = {"sloped": sloped_bin(), "round": round_bin(), "moulded": tote()}
+    for name, mesh in meshes.items():
+        mesh.export(tmp_path / f"{name}.stl")
+    rows = (*(BinRow(name=name, file=str(tmp_path / f"{name}.stl")) for name in meshes), ROWS[0])
+    base = settings(bake__episodes=8, bake__mode="move", move__speed=10.0, **COARSE)
+    config = dataclasses.replace(base, bins=dataclasses.replace(PLACES, kind="own"), **measure_bins(rows))
+    found, bins, objects = first_frames(config, 4), make_bins(config.cell.bins), catalog().entries
+    assert len({chosen for chosen, *_ in found.values()}) >= 3
+    for chosen, pose, poses, indices in found.values():
+        assert len(poses) > 0
+        for place, index in zip(poses, indices, strict=True):
+            corners = Rotation.from_quat(place[3:]).apply(objects[index].mesh.vertices) + place[:3]
+            local = Rotation.from_quat(pose[3:]).inv().apply(corners - pose[:3])
+            assert deepest(bins[chosen].pieces, local) < 2e-3
+            assert (np.abs(local[:, :2]) < np.array(bins[chosen].sizes.opening) / 2 + 2e-3).all()
+            assert (local[:, 2] > -2e-3).all()
+            assert (local[:, 2] < 0.25).all()
+    assert_same_frames(found, first_frames(config, 1))
+
+
+def assert_same_frames(found, one) -> None:
+    """Bins, poses and objects of all episodes are bit for bit those of another number of worlds."""
+    for episode, (chosen, *arrays) in found.items():
+        assert chosen == one[episode][0]
+        for here, there in zip(arrays, one[episode][1:], strict=True):
+            np.testing.assert_array_equal(here, there)
+
+
 @pytest.mark.parametrize(
     "bins", [dataclasses.replace(PLACES, kind="own"), dataclasses.replace(PLACES, kind="none"), dataclasses.replace(PLACES, kind="pallet")]
 )
@@ -182,8 +227,8 @@ def test_piles_rest_in_or_on_the_bin_that_is_drawn_in_any_number_of_worlds(bins)
     base = settings(bake__episodes=4, bake__mode="move", move__speed=10.0, **COARSE)
     config = dataclasses.replace(base, bins=bins, bin=ROWS if bins.kind == "own" else ())
     sizes, found = config.cell.bins, first_frames(config, 4)
-    assert {chosen for chosen, _, _ in found.values()} == set(range(len(sizes)))
-    for chosen, pose, objects in found.values():
+    assert {chosen for chosen, *_ in found.values()} == set(range(len(sizes)))
+    for chosen, pose, objects, _ in found.values():
         local = Rotation.from_quat(pose[3:]).inv().apply(objects[:, :3] - pose[:3])
         limit = np.array(sizes[chosen].opening) / 2 + sizes[chosen].margin
         assert len(objects) > 0
@@ -191,8 +236,4 @@ def test_piles_rest_in_or_on_the_bin_that_is_drawn_in_any_number_of_worlds(bins)
         # The smallest side of an object is 3 cm, and no object rests on the rim or a divider.
         assert (local[:, 2] > 0.014).all()
         assert (local[:, 2] < 0.15).all()
-    one = first_frames(config, 1)
-    for episode, (chosen, pose, objects) in found.items():
-        assert chosen == one[episode][0]
-        np.testing.assert_array_equal(pose, one[episode][1])
-        np.testing.assert_array_equal(objects, one[episode][2])
+    assert_same_frames(found, first_frames(config, 1))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import itertools
 import json
+import math
 from fractions import Fraction
 from pathlib import Path
 
@@ -19,6 +20,7 @@ from synpick_warp.apps.statistics import collect as collecting
 from synpick_warp.apps.statistics import partial as partials
 from synpick_warp.apps.statistics.annotations import VISIBILITY_BINS, AnnotationCounts
 from synpick_warp.apps.statistics.attempts import FORCE_BIN
+from synpick_warp.apps.statistics.bins import BinCounts, BinUse
 from synpick_warp.apps.statistics.collect import SceneTask, collect
 from synpick_warp.apps.statistics.compute import assemble, compute_statistics
 from synpick_warp.apps.statistics.counting import Group
@@ -26,7 +28,7 @@ from synpick_warp.apps.statistics.coverage import BANDS, BINS, MIN_VISIBILITY, S
 from synpick_warp.apps.statistics.depth import DEPTH_BIN, QUANTILES, DepthCounts
 from synpick_warp.apps.statistics.lights import LightCounts
 from synpick_warp.apps.statistics.partial import Partial
-from synpick_warp.apps.statistics.records import Light
+from synpick_warp.apps.statistics.records import BinFacts, Light
 from synpick_warp.apps.statistics.scenes import SceneTruth
 from synpick_warp.apps.statistics.tables import make_tables
 from synpick_warp.apps.statistics.timeline import TIME_BIN, TimelineCounts
@@ -56,7 +58,8 @@ def folder(tmp_path_factory) -> Path:
     text = (out / "config.toml").read_text().replace("resolution = [320, 180]", f"resolution = [{WIDTH}, {HEIGHT}]", 1)
     (out / "config.toml").write_text(text)
     entry = out / "manifest" / "000001.json"
-    row = json.loads(entry.read_text())["row"] | {"objects": 4, "picked": 2, "lost": 1, "looks": LOOKS}
+    own = {"name": "kanban", "position": [0.014, -0.012, 0.0], "yaw": -0.1}
+    row = json.loads(entry.read_text())["row"] | {"objects": 4, "picked": 2, "lost": 1, "looks": LOOKS, "bin": own}
     entry.write_text(json.dumps({"row": row, "attempts": ATTEMPTS}))
     random = np.random.default_rng(3)
     for scene in range(CAMERAS, 2 * CAMERAS):
@@ -108,6 +111,17 @@ def test_attempts_and_seal_forces_have_the_known_answers(statistics):
     assert (pick.seals, pick.good_seals, pick.force) == (2, 1, pytest.approx((5.5 + 500.0) / 2))
     assert {index: count for index, count in enumerate(pick.force_histogram) if count} == {int(5.5 / FORCE_BIN): 1, 29: 1}
     assert statistics.total.episodes.attempts == 3
+
+
+def test_bins_have_the_known_answers_and_merge(statistics):
+    step = math.radians(5.0)
+    assert statistics.bins == {"kanban": BinUse(1, (0.01, 0.02), (-0.02, -0.01), (-2 * step, -step))}
+    one, other = BinCounts(), BinCounts()
+    one.add_episode(BinFacts("a", (0.0, 0.0, 0.0), 0.0))
+    other.add_episode(BinFacts("b", (0.0, 0.0, 0.0), 0.0))
+    other.add_episode(BinFacts("b", (0.035, 0.0, 0.0), 0.0))
+    one.merge(other)
+    assert {name: (use.episodes, use.x) for name, use in one.result().items()} == {"b": (2, (0.0, 0.04)), "a": (1, (0.0, 0.01))}
 
 
 def test_lights_have_the_known_answers_and_what_is_missing_is_told(statistics, data_set):

@@ -19,6 +19,7 @@ from synpick_warp.scenes.assets.meshes import read_mesh
 from synpick_warp.scenes.assets.models_info import ModelInfo, bop_obj_id, read_models_info
 from synpick_warp.scenes.collision.hulls import hull_size
 from synpick_warp.scenes.symmetries.detection import find_symmetries, turn_matrix
+from synpick_warp.scenes.symmetries.groups import describe_counts
 from synpick_warp.scenes.symmetries.surface import Surface
 
 _MILLIMETRE = 1e-3
@@ -41,7 +42,7 @@ class Comparison:
     def cells(self) -> tuple[str, ...]:
         """Cells of the table's row."""
         shares = (f"{100 * off:.1f} %" if counts != (0, 0) else "" for counts, off in self._pairs())
-        return str(self.obj_id), _counts(self.stated), _counts(self.detected), *shares, self.verdict
+        return str(self.obj_id), describe_counts(*self.stated), describe_counts(*self.detected), *shares, self.verdict
 
     def _pairs(self) -> Iterator[tuple[tuple[int, int], float]]:
         yield self.stated, self.stated_off
@@ -103,11 +104,6 @@ def _verdict(lacking: int, beyond: int, off: float, tolerance: float) -> str:
     if beyond:
         parts.append("more than stated: shape alone, which texture tells apart")
     return "; ".join(parts) or "the same"
-
-
-def _counts(counts: tuple[int, int]) -> str:
-    """Format the numbers of discrete and continuous symmetries as text."""
-    return ", ".join(f"{count} {kind}" for count, kind in zip(counts, ("discrete", "continuous"), strict=True) if count) or "none"
 
 
 def main() -> None:

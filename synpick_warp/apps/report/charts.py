@@ -73,6 +73,7 @@ def make_charts(source: Source) -> list[Chart]:
         _exposure,
         _luma,
         _lights,
+        _own_bins,
     )
     return [chart for make in makers if (chart := make(source)) is not None]
 
@@ -397,6 +398,16 @@ def _lights(source: Source) -> Chart | None:
     rows = [{"what": name, "count": count} for name, count in list(lights.maps.items())[:MAX_LINES]]
     caption = f"{len(lights.maps):,} environment map{'' if len(lights.maps) == 1 else 's'} in {lights.episodes:,} episodes."
     return Chart("lights", "Light maps", caption, _bars(rows, [row["what"] for row in rows], ("map", "episodes")))
+
+
+def _own_bins(source: Source) -> Chart | None:
+    """Chart of episodes by bin, the most frequent bins; None: there is one, or none is told."""
+    bins = source.statistics.bins
+    if len(bins) < 2:
+        return None
+    rows = [{"what": name, "count": use.episodes} for name, use in list(bins.items())[:MAX_LINES]]
+    caption = f"{len(bins):,} bins in {sum(use.episodes for use in bins.values()):,} episodes."
+    return Chart("bins", "Bins", caption, _bars(rows, [row["what"] for row in rows], ("bin", "episodes")))
 
 
 def _exposure(source: Source) -> Chart | None:

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
 
 from synpick_warp.apps.statistics.annotations import Annotations
 from synpick_warp.apps.statistics.attempts import Episodes
+from synpick_warp.apps.statistics.bins import BinUse
 from synpick_warp.apps.statistics.collect import Collected, Report, collect
 from synpick_warp.apps.statistics.counting import Group
 from synpick_warp.apps.statistics.coverage import Coverage
@@ -58,7 +59,7 @@ class ObjectStatistics:
 @dataclass(frozen=True)
 class Statistics:
     """Statistics of a data set: groups and total, objects, depth, lights (None: not read), comparison with the paper, what is
-    missing, and looks.
+    missing, looks and bins.
     """
 
     cameras: int
@@ -77,6 +78,8 @@ class Statistics:
     """What the data set does not have, a sentence each."""
     looks: tuple[LookStatistics, ...] = ()
     """By part and parameter; none: looks are not randomized."""
+    bins: Mapping[str, BinUse] = field(default_factory=dict)
+    """By name; empty: no episode names its bin, since the tote is always in its place."""
 
     @property
     def has_paper_objects(self) -> bool:
@@ -140,7 +143,8 @@ def assemble(data_set: DataSet, collected: Collected) -> Statistics:
         missing.append("no attempts: no episode picks, so there are neither outcomes nor seal forces")
     if any(row.distance is None for row in paper):
         missing.append(OTHER_OBJECTS)
-    return Statistics(data_set.camera_count, rows, total, objects, depth, lights, paper, tuple(missing), partial.looks.result())
+    drawn = partial.looks.result(), partial.bins.result()
+    return Statistics(data_set.camera_count, rows, total, objects, depth, lights, paper, tuple(missing), *drawn)
 
 
 def _objects(data_set: DataSet, collected: Collected, total: Annotations) -> tuple[ObjectStatistics, ...]:

@@ -9,6 +9,7 @@ import numpy as np
 
 from synpick_warp.apps.statistics.annotations import AnnotationCounts
 from synpick_warp.apps.statistics.attempts import EpisodeCounts
+from synpick_warp.apps.statistics.bins import BinCounts
 from synpick_warp.apps.statistics.counting import Group
 from synpick_warp.apps.statistics.coverage import CoverageCounts
 from synpick_warp.apps.statistics.depth import DepthCounts
@@ -37,6 +38,7 @@ class Partial:
     depth: DepthCounts = field(default_factory=DepthCounts)
     lights: LightCounts = field(default_factory=LightCounts)
     looks: LookCounts = field(default_factory=LookCounts)
+    bins: BinCounts = field(default_factory=BinCounts)
 
     def merge(self, other: Partial) -> None:
         """Add the counts of another part. The order of merges does not change the result.
@@ -50,7 +52,7 @@ class Partial:
             raise DatasetError(f"the annotations have more than {MAX_OBJECTS:,} different obj_id; scene_gt.json is damaged")
 
     def add_episode(self, data_set: DataSet, episode: int) -> EpisodeFacts:
-        """Count an episode and its attempts; returns its row.
+        """Count an episode, its attempts and its bin; returns its row.
 
         Raises:
             DatasetError: Its manifest entry is damaged.
@@ -60,6 +62,8 @@ class Partial:
         attempts = [check_content(attempt, AttemptFacts, source) for attempt in known.attempts]
         self.episodes.add_episode(group_of(data_set, episode, row), row, attempts)
         self.looks.add_episode(row.looks)
+        if row.bin is not None:
+            self.bins.add_episode(row.bin)
         return row
 
     def add_scene(self, data_set: DataSet, episode: int, camera: int, depth_frames: Sequence[int] = ()) -> None:

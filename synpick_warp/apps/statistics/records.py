@@ -1,4 +1,4 @@
-"""Schemas of what statistics read: episodes, attempts, light. Other keys are passed over."""
+"""Schemas of what statistics read: episodes, bins, attempts, light. Other keys are passed over."""
 
 from __future__ import annotations
 
@@ -20,8 +20,16 @@ Looks = dict[Name, Length | LookFacts | list[LookFacts]]
 """An episode's looks, as its row has them."""
 
 
+class BinFacts(msgspec.Struct):
+    """Bin of an episode: name, position [m] and yaw [rad] in the world."""
+
+    name: Name
+    position: tuple[Length, Length, Length]
+    yaw: Length
+
+
 class EpisodeFacts(msgspec.Struct):
-    """Manifest row of an episode: mode, frames, ending, object counts and looks."""
+    """Manifest row of an episode: mode, frames, ending, object counts, looks, and the bin if it is told."""
 
     mode: Name
     frames: Index
@@ -31,6 +39,7 @@ class EpisodeFacts(msgspec.Struct):
     lost: Annotated[int, Meta(ge=-(2**31), lt=2**31)] = 0
     looks: Looks = {}
     """Empty: they are not randomized."""
+    bin: BinFacts | None = None
 
 
 class AttemptFacts(msgspec.Struct):

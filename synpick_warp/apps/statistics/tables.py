@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable, Sequence
 from itertools import pairwise
 
@@ -45,6 +46,7 @@ def make_tables(statistics: Statistics) -> list[Table]:
         _yaw,
         _exposure,
         _looks,
+        _bins,
         _coverage,
     )
     return [table for table in (make(statistics) for make in makers) if table.rows]
@@ -270,6 +272,19 @@ def _looks(statistics: Statistics) -> Table:
     )
     rows: list[tuple[Value, ...]] = [(row.part, row.parameter, row.draws, *row.quantiles) for row in statistics.looks]
     return Table("looks", "Randomized looks: quantiles of what episodes have drawn", columns, rows)
+
+
+def _bins(statistics: Statistics) -> Table:
+    """Table of episodes by bin, with the intervals that its places span; empty if bins are not told."""
+    total = sum(use.episodes for use in statistics.bins.values())
+    rows: list[tuple[Value, ...]] = [
+        (name, use.episodes, use.episodes / total, *(1e3 * end for end in (*use.x, *use.y)), *map(math.degrees, use.yaw))
+        for name, use in statistics.bins.items()
+    ]
+    ends = [
+        Column(f"{axis}_{end}_{unit}", ".0f") for axis, unit in (("x", "mm"), ("y", "mm"), ("yaw", "degrees")) for end in ("from", "to")
+    ]
+    return Table("bins", "Bins and where they stand", (Column("bin"), Column("episodes", ","), Column("fraction", ".1%"), *ends), rows)
 
 
 def _coverage(statistics: Statistics) -> Table:

@@ -11,6 +11,7 @@ import numpy as np
 
 from synpick_warp.apps.viz.drawing import INK, WHITE, Image, put_text, write_picture
 from synpick_warp.scenes.symmetries.detection import Turn, find_axes, turn_matrix
+from synpick_warp.scenes.symmetries.groups import describe_counts
 from synpick_warp.scenes.symmetries.surface import Surface
 from synpick_warp.scenes.types import RawObject
 
@@ -67,8 +68,7 @@ def _row(raw: RawObject, tolerance: float) -> Image:
     first = _splat([itself], surface.center, scale)
     for turn in turns:
         _draw_axis(first, turn, surface.center, scale, raw.hull.diameter)
-    count = len(raw.symmetries_discrete)
-    said = f"{count} discrete, {len(raw.symmetries_continuous)} continuous" if turns else "no symmetries"
+    said = f"symmetries: {describe_counts(len(raw.symmetries_discrete), len(raw.symmetries_continuous))}"
     panels = [_captioned(first, f"{raw.obj_id} {raw.name}"[:34], said)]
     for turn in turns[:_TURNS]:
         angles = [2.0 * np.pi / turn.fold] if turn.fold else [2.0 * np.pi * (step + 0.5) / _CHECKED for step in range(_CHECKED)]

@@ -68,8 +68,8 @@ FREE_SETTINGS = (
     "render.views_per_batch",
     "perception.views",
 )
-"""Settings that may differ when a bake is resumed: no episode depends on them. Objects, lights and textures are compared by content, not
-by the name of their folder. A device of another type computes the same episodes up to rounding."""
+"""Settings that may differ when a bake is resumed: no episode depends on them. Objects, lights, textures and meshes of bins are compared by
+content, not by the name of their file or folder. A device of another type computes the same episodes up to rounding."""
 
 
 YOUNGER_SETTINGS: dict[str, Any] = {
@@ -145,6 +145,8 @@ def fixed_settings(config: Config) -> dict[str, Any]:
         table = settings[sections[0]] if sections else settings
         if name in table and table[name] == before:
             del table[name]
+    for row in settings.get("bin", ()):
+        row.pop("file", None)
     for row in settings["object_rows"]:
         for name in [name for name in _YOUNGER_KEYS if not row[name]]:
             del row[name]

@@ -71,11 +71,11 @@ def write_library(
     _save(library, "cup", cup)
     textures = {} if looks is None else looks.textures
     if textures.get(LookPart.BACKGROUND):
-        _write_floor(library, bins[0].sizes.base - FLOOR_DROP)
+        _write_floor(library, bins[0].sizes.ground - FLOOR_DROP)
     for part, images in textures.items():
         for index, texture in enumerate(images):
             write_texture(library, drawn_texture(part, index), texture)
-    _write_table(library, physics, bins[0].sizes.base, render, bool(textures.get(LookPart.TABLE)))
+    _write_table(library, physics, bins[0].sizes.ground, render, bool(textures.get(LookPart.TABLE)))
 
 
 def _save(library: Path, name: str, stage: Usd.Stage) -> None:

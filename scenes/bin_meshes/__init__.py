@@ -1,0 +1,1 @@
+"""Bins from meshes: their inside, and collision shapes behind its faces."""

@@ -1,0 +1,231 @@
+"""The inside of a bin's mesh: depression filling (priority-flood, Barnes et al. 2014) of its height field.
+
+The height field is what is seen from above. Poured full, the bin holds what is in its depressions: they are its inside, and the rim is
+where it would spill. Holes of the floor and of the walls do not matter, since nothing flows below the surface.
+"""
+
+from __future__ import annotations
+
+import heapq
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from scipy import ndimage
+
+CELLS = 192
+"""Cells of the height field along the longer side of the mesh."""
+BORDER = 2
+"""Cells around the mesh."""
+MIN_DEPTH = 0.01
+"""Least depth of an inside [m]: less is a groove or a tray's edge, from which objects roll."""
+MIN_SIDE = 0.03
+"""Least length and width of a compartment [m], as of those that are given by sizes."""
+DIVIDER_SHARE = 0.25
+"""Least height of a divider above the floors that it parts, as a fraction of the inside's depth: lower ones are ribs."""
+POOL_SHARE = 0.1
+"""Least volume of a depression, as a fraction of the largest: smaller ones are grooves of a flange."""
+HOLE = 0.015
+"""Width of a hole that collision shapes may close [m]."""
+LEVELS = 48
+"""Levels at which dividers are looked for."""
+LIMIT_CELLS = 128
+"""Cells of the field of limits along each side."""
+BELOW_FLOOR = 0.01
+"""How far an object's origin is below the floor when it has left the bin [m]."""
+
+Rectangle = tuple[float, float, float, float]
+"""Centre x, y, length and width [m]."""
+
+
+@dataclass(frozen=True, eq=False)
+class HeightField:
+    """Field of limits over the inside of a bin, about the origin of its frame, for the kernels of the simulation."""
+
+    limit: np.ndarray
+    """Height below which an object's origin is outside (LIMIT_CELLS, LIMIT_CELLS), by x and y [m]."""
+    pitch: tuple[float, float]
+    """Sides of a cell [m]."""
+
+
+@dataclass(frozen=True, eq=False)
+class Surface:
+    """Upper envelope of a mesh on a grid, and its inside; z up, in the mesh's own frame [m]."""
+
+    low: np.ndarray
+    """Corner of the grid (2)."""
+    cell: float
+    """Side of a cell."""
+    height: np.ndarray
+    """Largest height of the mesh over each cell (nx, ny); where there is no mesh, that of its underside."""
+    inside: np.ndarray
+    """Cells of the inside (nx, ny) bool."""
+    rim: float
+    """Height of the rim."""
+    floor: float
+    """Height of the lowest inner point."""
+
+    def index(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Cells of points (..., 2 or 3), the nearest for points beside the grid."""
+        cells = np.floor((points[..., :2] - self.low) / self.cell).astype(int)
+        cells = np.clip(cells, 0, np.array(self.height.shape) - 1)
+        return cells[..., 0], cells[..., 1]
+
+    @cached_property
+    def closed(self) -> np.ndarray:
+        """Height field without holes narrower than HOLE, by a morphological closing (nx, ny)."""
+        return ndimage.grey_closing(self.height, round(HOLE / self.cell) // 2 * 2 + 1, mode="nearest")
+
+    @cached_property
+    def near_inside(self) -> np.ndarray:
+        """Cells of the inside, and two around it (nx, ny) bool."""
+        return ndimage.binary_dilation(self.inside, iterations=2)
+
+    def centers(self, cells: np.ndarray) -> np.ndarray:
+        """Middle of cells (..., 2) in the mesh's frame [m]."""
+        return self.low + (cells + 0.5) * self.cell
+
+
+def subdivide(corners: np.ndarray, longest: float) -> tuple[np.ndarray, np.ndarray]:
+    """Bisect the longest edges of triangles (F, 3, 3) until none exceeds `longest`; returns the triangles, and the given one of each."""
+    owner = np.arange(len(corners))
+    done, owners = [], []
+    while len(corners):
+        lengths = np.linalg.norm(corners - np.roll(corners, -1, axis=1), axis=2)
+        small = lengths.max(axis=1) <= longest
+        done.append(corners[small])
+        owners.append(owner[small])
+        rest, owner = corners[~small], owner[~small]
+        first = lengths[~small].argmax(axis=1)
+        a, b, c = (np.take_along_axis(rest, ((first + k) % 3)[:, None, None], axis=1)[:, 0] for k in range(3))
+        middle = (a + b) / 2.0
+        corners = np.concatenate([np.stack([a, middle, c], axis=1), np.stack([middle, b, c], axis=1)])
+        owner = np.concatenate([owner, owner])
+    return np.concatenate(done), np.concatenate(owners)
+
+
+def find_inside(corners: np.ndarray, count: int = CELLS) -> Surface | None:
+    """Height field and inside of triangles (F, 3, 3) [m]; None: they have none. `count`: cells along the longer side."""
+    low, high = corners.min(axis=(0, 1)), corners.max(axis=(0, 1))
+    # Not whole, so that no side of the mesh is on the border of cells: symmetric meshes get symmetric cells.
+    cell = float((high - low)[:2].max()) / (count + 0.371)
+    if cell <= 0.0 or high[2] - low[2] < MIN_DEPTH:
+        return None
+    shape = tuple(np.ceil((high - low)[:2] / cell).astype(int) + 1 + 2 * BORDER)
+    start = (low + high)[:2] / 2.0 - np.array(shape) * cell / 2.0
+    small, owner = subdivide(corners, 0.9 * cell)
+    points = small.reshape(-1, 3)
+    height = np.full(shape, low[2])
+    x, y = np.floor((points[:, :2] - start) / cell).astype(int).T
+    np.maximum.at(height, (x, y), points[:, 2])
+    level = _flood(height)
+    labels, pools = ndimage.label(level > height + 1e-9)
+    if pools == 0:
+        return None
+    each = np.arange(1, pools + 1)
+    volumes = ndimage.sum_labels(level - height, labels, each)
+    depths = ndimage.maximum(level - height, labels, each)
+    kept = each[(volumes >= POOL_SHARE * volumes.max()) & (depths >= MIN_DEPTH)]
+    if not len(kept):
+        return None
+    inside = np.isin(labels, kept)
+    # Walls raise the cells at the edges of the floor, where a slope is lowest: points of upper sides on these count, too.
+    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    upper = np.repeat((normal[:, 2] > 0.5 * np.linalg.norm(normal, axis=1))[owner], 3)
+    floor = float(height[inside].min())
+    near = upper & ndimage.binary_dilation(inside)[x, y] & (points[:, 2] >= floor - cell)
+    return Surface(start, cell, height, inside, float(level[inside].max()), float(points[near, 2].min(initial=floor)))
+
+
+def _flood(height: np.ndarray) -> np.ndarray:
+    """Level to which each cell fills, if nothing holds back at the border (nx, ny)."""
+    level = np.full(height.shape, np.inf)
+    border = np.ones(height.shape, bool)
+    border[1:-1, 1:-1] = False
+    level[border] = height[border]
+    queue = [(float(height[x, y]), int(x), int(y)) for x, y in np.argwhere(border)]
+    heapq.heapify(queue)
+    last = (height.shape[0] - 1, height.shape[1] - 1)
+    while queue:
+        here, x, y = heapq.heappop(queue)
+        for i, j in ((x - 1, y), (x + 1, y), (x, y - 1), (x, y + 1)):
+            if 0 <= i <= last[0] and 0 <= j <= last[1] and level[i, j] == np.inf:
+                level[i, j] = max(here, float(height[i, j]))
+                heapq.heappush(queue, (level[i, j], i, j))
+    return level
+
+
+def find_compartments(surface: Surface) -> list[Rectangle]:
+    """Largest rectangle in each compartment of a surface, by x and y; empty: none is of MIN_SIDE.
+
+    Compartments are the components of the inside below a level, the one with most of them, or else the highest.
+    """
+    depth = surface.rim - surface.floor
+    best: list[Rectangle] = []
+    for level in np.linspace(surface.rim, surface.floor, LEVELS, endpoint=False):
+        below = surface.inside & (surface.height < level - 1e-6)
+        labels, count = ndimage.label(below)
+        if count <= len(best):
+            continue
+        deepest = ndimage.minimum(surface.height, labels, np.arange(1, count + 1))
+        deep = np.flatnonzero(level - deepest >= DIVIDER_SHARE * depth) + 1
+        found = [_largest_rectangle(surface, labels == label) for label in deep] if len(deep) > len(best) else []
+        found = [one for one in found if min(one[2:]) >= MIN_SIDE]
+        best = found if len(found) > len(best) else best
+    return sorted(best)
+
+
+def _largest_rectangle(surface: Surface, cells: np.ndarray) -> Rectangle:
+    """Largest axis-aligned rectangle within cells (nx, ny) [m]."""
+    best, found = 0, (0, 0, 0, 0)
+    used = np.flatnonzero(cells.any(axis=1))
+    for first in range(int(used[0]), int(used[-1]) + 1):
+        free = np.logical_and.accumulate(cells[first : used[-1] + 1], axis=0)
+        free = free[: int(free.any(axis=1).sum())]
+        # Length of the run of free cells that ends at each cell.
+        order = np.arange(1, free.shape[1] + 1)
+        runs = order - np.maximum.accumulate(np.where(free, 0, order), axis=1)
+        sizes = runs * np.arange(1, len(free) + 1)[:, None]
+        if sizes.size and sizes.max() > best:
+            count, end = np.unravel_index(sizes.argmax(), sizes.shape)
+            best, found = int(sizes.max()), (first, first + int(count) + 1, int(end) + 1 - int(runs[count, end]), int(end) + 1)
+    x0, x1, y0, y1 = found
+    corners = surface.low + np.array([(x0, y0), (x1, y1)]) * surface.cell
+    center, sides = corners.mean(axis=0), corners[1] - corners[0]
+    return float(center[0]), float(center[1]), float(sides[0]), float(sides[1])
+
+
+def fit_floor(surface: Surface, rectangle: Rectangle) -> tuple[float, float, float]:
+    """Plane z = a x + b y + c over the floor in a rectangle: a fit by least squares, raised so that none of it lies below the floor.
+
+    The floor is what is nearer to the lowest point than to the rim, in the inner part of the rectangle.
+    """
+    x, y, length, width = rectangle
+    cells = np.argwhere(surface.inside)
+    points, heights = surface.centers(cells), surface.height[tuple(cells.T)]
+    near = (np.abs(points - (x, y)) <= 0.4 * np.array((length, width))).all(axis=1)
+    points, heights = points[near], heights[near]
+    low = heights <= (heights.min() + surface.rim) / 2.0
+    points, heights = points[low], heights[low]
+    terms = np.column_stack([points, np.ones(len(points))])
+    plane = np.linalg.lstsq(terms, heights, rcond=None)[0]
+    # Single cells on ribs or at walls do not count.
+    above = float(np.quantile(heights - terms @ plane, 0.95))
+    return float(plane[0]), float(plane[1]), float(plane[2] + max(above, 0.0))
+
+
+def make_limits(surface: Surface, origin: np.ndarray) -> HeightField:
+    """Field of limits of a surface in the frame at `origin` (3) [m].
+
+    Beside the inside, widened by two cells, the limit is the rim; within, BELOW_FLOOR below the lowest surface nearby.
+    """
+    near, floor = surface.near_inside, np.where(surface.inside, surface.height, np.inf)
+    floor = ndimage.minimum_filter(floor, 5, mode="nearest")
+    limit = np.where(near, floor - BELOW_FLOOR, surface.rim) - origin[2]
+    cells = np.argwhere(near)
+    reach = np.abs(np.stack([surface.centers(cells.min(axis=0)), surface.centers(cells.max(axis=0))]) - origin[:2]).max(axis=0)
+    pitch = 2.0 * (reach + surface.cell) / LIMIT_CELLS
+    places = (np.arange(LIMIT_CELLS) - LIMIT_CELLS // 2 + 0.5)[:, None] * pitch + origin[:2]
+    x = surface.index(np.column_stack([places[:, 0], places[:, 0]]))[0]
+    y = surface.index(np.column_stack([places[:, 1], places[:, 1]]))[1]
+    return HeightField(limit[np.ix_(x, y)].astype(np.float32), (float(pitch[0]), float(pitch[1])))

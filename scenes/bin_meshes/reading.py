@@ -1,0 +1,275 @@
+"""Meshes of bins: read in an isolated process, turned and placed, measured, and given collision shapes."""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial import ConvexHull
+
+from synpick_warp.configs.bins import AXES, FILE, BinRow, MeasuredBin
+from synpick_warp.configs.objects import UNITS
+from synpick_warp.errors import CatalogError, ConfigError, SynpickError
+from synpick_warp.scenes.assets.appearance import FileMaterial
+from synpick_warp.scenes.assets.mesh_parts import NO_MATERIAL
+from synpick_warp.scenes.assets.meshes import SUFFIXES, MeshOptions, read_mesh
+from synpick_warp.scenes.bin_meshes.colliders import make_colliders
+from synpick_warp.scenes.bin_meshes.inside import (
+    MIN_DEPTH,
+    MIN_SIDE,
+    HeightField,
+    Surface,
+    find_compartments,
+    find_inside,
+    fit_floor,
+    make_limits,
+)
+from synpick_warp.scenes.types import ConvexPiece, Material, TriangleMesh
+from synpick_warp.system.processes.isolation import Failure, Limits, run_isolated
+
+SIDES = (0.02, 10.0)
+"""Least and largest side of a bin [m], as of those that are given by sizes."""
+LIMITS = Limits(600.0, 2**33)
+"""Limits of reading a mesh."""
+MAX_FACES = 200_000
+"""Triangles of a mesh: more take minutes, and slow every picture."""
+COARSE = 64
+"""Cells of the height field where only its direction is in question."""
+DIGITS = 6
+"""Decimals of measured lengths [m]."""
+RAY_STEP = 5e-3
+"""Distance of the rays by which collision shapes are compared with the mesh [m]."""
+AGREEMENT, MAX_DIFFERENT = 3e-3, 0.01
+"""Largest difference of the heights where both agree [m], and largest fraction of the rays with more."""
+
+
+@dataclass(frozen=True, eq=False)
+class BinModel:
+    """Mesh, material and collision shapes of a bin in its frame, its inside, and what is told of it."""
+
+    mesh: TriangleMesh
+    material: FileMaterial
+    pieces: tuple[ConvexPiece, ...]
+    limits: HeightField
+    measured: MeasuredBin
+    notes: tuple[str, ...]
+    """Lines on what was read."""
+
+
+def measure_bins(rows: tuple[BinRow, ...]) -> dict[str, tuple[BinRow, ...]]:
+    """Setting, for `override_config`, of [[bin]] tables with what their meshes measure; none if they have it.
+
+    Raises:
+        ConfigError: A mesh cannot be used as a bin.
+    """
+    found = tuple(replace(row, measured=read_bin(row).measured) if row.file else row for row in rows)
+    return {} if found == rows else {"bin": found}
+
+
+def read_bin(row: BinRow) -> BinModel:
+    """Read the mesh of a bin, or return it as it was read before in this process.
+
+    Raises:
+        ConfigError: It cannot be used as a bin.
+    """
+    path = Path(row.file or "")
+    try:
+        stat = path.stat()
+    except OSError as error:
+        raise ConfigError(f"bin {row.name}: {path} cannot be read ({error.strerror})") from error
+    return _read(replace(row, measured=None, weight=1.0), (stat.st_mtime_ns, stat.st_size))
+
+
+@lru_cache(maxsize=64)
+def _read(row: BinRow, stamp: tuple[int, int]) -> BinModel:
+    """Read the mesh of a bin in an isolated process; `stamp`: time of change and size of the file."""
+    (found,) = run_isolated(_model, [(row,)], LIMITS)
+    if isinstance(found, Failure):
+        raise ConfigError(f"bin {row.name}: the process that reads {row.file} {found.reason}; repair or simplify the mesh")
+    if isinstance(found, SynpickError):
+        raise ConfigError(f"bin {row.name}: {found}")
+    return found
+
+
+def _model(row: BinRow) -> BinModel:
+    """Read and measure the mesh of a bin. Runs in an isolated process."""
+    path, lines = Path(row.file or ""), []
+    if path.suffix.lower() not in SUFFIXES:
+        raise CatalogError(f"{path} is no mesh; allowed: {', '.join(SUFFIXES)}")
+    unit, up = row.unit or "m", row.up or "z"
+    mesh, material = read_mesh(path, UNITS[unit], MeshOptions(substitute=True), lines.append)
+    if len(mesh.faces) > MAX_FACES:
+        raise CatalogError(f"{path} has {len(mesh.faces):,} triangles; allowed: {MAX_FACES:,}; decimate the mesh")
+    _check_sides(mesh, path, unit)
+    mesh = _turn(mesh, up)
+    corners = mesh.vertices[mesh.faces].astype(np.float64)
+    surface = find_inside(corners)
+    places = find_compartments(surface) if surface else []
+    if surface is None or not places:
+        raise CatalogError(f"{path} has no inside {_explain(corners, up)}")
+    cells = np.argwhere(surface.inside)
+    low, high = (surface.low + end * surface.cell for end in (cells.min(axis=0), cells.max(axis=0) + 1))
+    origin = np.array([*((low + high) / 2.0), surface.floor])
+    pieces = make_colliders(mesh.vertices, mesh.faces, surface)
+    share = _disagreement(corners, pieces, surface)
+    if share > MAX_DIFFERENT:
+        raise CatalogError(
+            f"{path}: collision shapes and mesh differ by more than {1e3 * AGREEMENT:g} mm over {share:.0%} of the opening; "
+            "close the gaps of the mesh, or simplify it"
+        )
+    floors = [(*(np.array(one[:2]) - origin[:2]), *one[2:], *_moved(fit_floor(surface, one), origin)) for one in places]
+    box = np.concatenate([corners.min(axis=(0, 1)), corners.max(axis=(0, 1))]) - np.tile(origin, 2)
+    mesh = replace(mesh, vertices=(mesh.vertices - origin).astype(np.float32))
+    measured = MeasuredBin(
+        box=_rounded(box),
+        opening=_rounded(high - low),
+        height=round(surface.rim - float(origin[2]), DIGITS),
+        origin=_rounded(origin) if row.place == FILE else (0.0, 0.0, 0.0),
+        compartments=tuple(_rounded(one) for one in floors),
+        checksum=_checksum(mesh, material),
+    )
+    pieces = tuple(ConvexPiece((piece.vertices - origin).astype(np.float32), piece.faces) for piece in pieces)
+    lines.append(_describe(measured, unit, len(pieces)))
+    limits = make_limits(surface, origin)
+    return BinModel(mesh, material, pieces, limits, measured, tuple(f"bin {row.name}: {line}" for line in lines))
+
+
+def _check_sides(mesh: TriangleMesh, path: Path, unit: str) -> None:
+    """Refuse a mesh that is too small or too large for a bin, with the unit in which it would not be."""
+    sides = np.ptp(mesh.vertices.astype(np.float64), axis=0)
+    if SIDES[0] <= sides.max() and sides.max() <= SIDES[1]:
+        return
+    fitting = [f'"{name}"' for name, size in UNITS.items() if 0.1 <= sides.max() / UNITS[unit] * size <= 2.0]
+    advice = f"; did you mean unit = {' or '.join(fitting)}?" if fitting else ""
+    shown = " x ".join(f"{side:.4g}" for side in sides)
+    raise CatalogError(f"{path} is {shown} m, unit {unit}; allowed: a longest side of {SIDES[0]:g} to {SIDES[1]:g} m{advice}")
+
+
+def _turn(mesh: TriangleMesh, up: str) -> TriangleMesh:
+    """Mesh whose axis `up` becomes z."""
+    turn = _rotation(up).astype(np.float32)
+    return replace(mesh, vertices=mesh.vertices @ turn.T, normals=mesh.normals @ turn.T)
+
+
+def _rotation(up: str) -> np.ndarray:
+    """Rotation of an axis to z: about x for y, about y for x."""
+    axis, sign = "xyz".index(up[-1]), -1.0 if up.startswith("-") else 1.0
+    rows = {
+        2: [(1, 0, 0), (0, sign, 0), (0, 0, sign)],
+        1: [(1, 0, 0), (0, 0, -sign), (0, sign, 0)],
+        0: [(0, 0, -sign), (0, 1, 0), (sign, 0, 0)],
+    }
+    return np.array(rows[axis], float)
+
+
+def _explain(corners: np.ndarray, up: str) -> str:
+    """Why a mesh has no inside: the direction in which it would have the largest one, if any."""
+    sizes = {}
+    back = _rotation(up).T
+    for other in AXES:
+        surface = find_inside(corners @ (_rotation(other) @ back).T, COARSE)
+        if other != up and surface is not None and find_compartments(surface):
+            sizes[other] = float((surface.rim - surface.height[surface.inside]).sum()) * surface.cell**2
+    rule = f"as seen from above, with up = {up}: it is closed, flat, or not {1e3 * MIN_DEPTH:g} mm deep and {1e3 * MIN_SIDE:g} mm wide"
+    best = max(sizes, key=lambda name: sizes[name], default="")
+    return f'{rule}; did you mean up = "{best}"?' if best else f"{rule}; a bin needs an open top"
+
+
+def _moved(plane: tuple[float, float, float], origin: np.ndarray) -> tuple[float, float, float]:
+    """Plane z = a x + b y + c in the frame at `origin`."""
+    a, b, c = plane
+    return a, b, float(a * origin[0] + b * origin[1] + c - origin[2])
+
+
+def _rounded(values: np.ndarray | tuple[float, ...]) -> tuple:
+    """Values to DIGITS decimals."""
+    return tuple(round(float(value), DIGITS) + 0.0 for value in values)
+
+
+def _checksum(mesh: TriangleMesh, material: FileMaterial) -> str:
+    """SHA-256 of a mesh in the bin's frame and of its material."""
+    state = hashlib.sha256(repr((material.color, material.metallic, material.roughness)).encode())
+    for array in (mesh.vertices, mesh.faces, mesh.normals, mesh.uv, material.texture):
+        state.update(b"" if array is None else np.ascontiguousarray(array).tobytes())
+    return state.hexdigest()
+
+
+def _describe(measured: MeasuredBin, unit: str, pieces: int) -> str:
+    """Line on what was measured."""
+    box = np.array(measured.box)
+    outer = " x ".join(f"{1e3 * side:.4g}" for side in box[3:] - box[:3])
+    inner = " x ".join(f"{1e3 * side:.4g}" for side in (*measured.opening, measured.height))
+    count = len(measured.compartments)
+    rooms = f"{count} compartments, " if count > 1 else ""
+    return f"{outer} mm, unit {unit}; inside {inner} mm, {rooms}{pieces} collision shapes"
+
+
+def _disagreement(corners: np.ndarray, pieces: tuple[ConvexPiece, ...], surface: Surface) -> float:
+    """Fraction of vertical rays into the inside for which collision shapes and mesh differ.
+
+    A ray that meets the collision shapes at a height between those of the mesh at it and its neighbours agrees: it may be beside a step.
+    """
+    low, high = (surface.centers(end) for end in (np.argwhere(surface.inside).min(axis=0), np.argwhere(surface.inside).max(axis=0)))
+    axes = [np.arange(low[axis], high[axis] + RAY_STEP, RAY_STEP) for axis in (0, 1)]
+    points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
+    mesh, shapes = (np.full(points.shape[:2], -np.inf) for _ in range(2))
+    for triangle in corners:
+        _raise_to_triangle(mesh, points, triangle)
+    for piece in pieces:
+        _raise_to_piece(shapes, points, piece)
+    least, most = (np.stack([np.roll(mesh, (i, j), (0, 1)) for i in (-1, 0, 1) for j in (-1, 0, 1)]) for _ in range(2))
+    agrees = (shapes >= least.min(axis=0) - AGREEMENT) & (shapes <= most.max(axis=0) + AGREEMENT)
+    counted = surface.inside[surface.index(points)] & np.isfinite(mesh)
+    return float((counted & ~agrees).sum()) / max(1, int(counted.sum()))
+
+
+def _block(points: np.ndarray, corners: np.ndarray) -> tuple[slice, slice]:
+    """Rows and columns of a grid of points that a set of corners may cover."""
+    low, high = corners[:, :2].min(axis=0), corners[:, :2].max(axis=0)
+    x, y = points[:, 0, 0], points[0, :, 1]
+    return (
+        slice(int(np.searchsorted(x, low[0])), int(np.searchsorted(x, high[0], "right"))),
+        slice(int(np.searchsorted(y, low[1])), int(np.searchsorted(y, high[1], "right"))),
+    )
+
+
+def _raise_to_triangle(heights: np.ndarray, points: np.ndarray, triangle: np.ndarray) -> None:
+    """Raise heights to those of a triangle where it lies over the points."""
+    (ax, ay, az), b, c = triangle[0], triangle[1] - triangle[0], triangle[2] - triangle[0]
+    area = b[0] * c[1] - b[1] * c[0]
+    block = _block(points, triangle)
+    if abs(area) < 1e-12 or heights[block].size == 0:
+        return
+    x, y = points[block][..., 0] - ax, points[block][..., 1] - ay
+    u, v = (x * c[1] - y * c[0]) / area, (y * b[0] - x * b[1]) / area
+    over = (u >= -1e-9) & (v >= -1e-9) & (u + v <= 1.0 + 1e-9)
+    heights[block] = np.where(over, np.maximum(heights[block], az + u * b[2] + v * c[2]), heights[block])
+
+
+def _raise_to_piece(heights: np.ndarray, points: np.ndarray, piece: ConvexPiece) -> None:
+    """Raise heights to the upper side of a convex piece where it lies over the points."""
+    vertices = piece.vertices.astype(np.float64)
+    block = _block(points, vertices)
+    if heights[block].size == 0:
+        return
+    planes = ConvexHull(vertices).equations
+    reach = points[block] @ planes[:, :2].T + planes[:, 3]
+    up, down, upright = planes[:, 2] > 1e-6, planes[:, 2] < -1e-6, np.abs(planes[:, 2]) <= 1e-6
+    top = (-reach[..., up] / planes[up, 2]).min(axis=-1)
+    bottom = (-reach[..., down] / planes[down, 2]).max(axis=-1)
+    over = (reach[..., upright] <= 1e-9).all(axis=-1) & (bottom <= top)
+    heights[block] = np.where(over, np.maximum(heights[block], top), heights[block])
+
+
+def bin_material(model: BinModel, row: BinRow) -> Material:
+    """Material of a bin: that of its file; what this does not state is the row's."""
+    given = model.material
+    return Material(
+        row.color if given.texture is None and given.color == NO_MATERIAL.color else given.color,
+        given.texture,
+        row.metallic if given.metallic is None else given.metallic,
+        row.roughness if given.roughness is None else given.roughness,
+    )
