@@ -114,6 +114,8 @@ def _view(rig: Rig, index: int, config: Config) -> Iterator[Conflict]:
     if "lerobot" in config.bake.formats and (width % 2 or height % 2):
         key = rig.key(index, "resolution") if config.camera and config.camera[index].resolution else "cameras.resolution"
         yield key, "even width and height with the format lerobot, whose videos have a colour for 2 x 2 pixels"
+    if rig.every[index] > 1:
+        yield from _every(rig.key(index, "every"), config.bake.formats, config.render.layers)
     if row.matrix is not None:
         yield from _matrix(rig.key(index, "matrix"), row.matrix, width, height)
     if row.distortion:
@@ -125,6 +127,14 @@ def _view(rig: Rig, index: int, config: Config) -> Iterator[Conflict]:
     yield from placement(row, keys)
     if row.jitter is not None:
         yield from _jitter(rig.key(index, "jitter"), row, row.jitter, placement)
+
+
+def _every(key: str, formats: tuple[str, ...], layers: tuple[str, ...]) -> Iterator[Conflict]:
+    """Yield what needs a picture of every frame."""
+    if "lerobot" in formats:
+        yield key, "1 with the format lerobot, whose videos have the frames of its states"
+    if found := [name for name in ("flow", "scene_flow") if name in layers]:
+        yield key, f"1 with the layer {found[0]}, which leads to the frame before"
 
 
 def _view_axes(row: CameraRow, keys: Sequence[str], label: str) -> Iterator[Conflict]:

@@ -108,6 +108,9 @@ class CameraRow:
         "whose origin is on the wrist axis, z up.",
         choices=(WORLD, GRIPPER),
     )
+    every: int | None = setting(
+        None, "frames", "Frames from one picture to the next, of which the first is that of frame 0; not given: 1.", low=1, high=1000
+    )
     jitter: Jitter | None = setting(
         None,
         "",

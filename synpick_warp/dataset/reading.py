@@ -185,6 +185,14 @@ class Episode:
         """The episode's USD file; it exists if the data set has the format usd."""
         return self._data_set.folder / USD / f"{self.index:06d}.usdc"
 
+    def frames(self, camera: int) -> range:
+        """Frames of which a camera has pictures: all, or with `every` in its settings each n-th."""
+        return range(0, len(self), self._data_set.every[camera])
+
+    def images(self, camera: int) -> Sequence[int]:
+        """BOP's im_id of each of a camera's pictures."""
+        return self.image_ids[:: self.frames(camera).step]
+
     def view(self, frame: int, camera: int = 0) -> View:
         """View of a frame and camera."""
         from synpick_warp.dataset.view import View
@@ -194,6 +202,8 @@ class Episode:
             raise IndexError(f"episode {self.index} has no frame {frame}; it has {frames} frames")
         if not 0 <= camera < cameras:
             raise IndexError(f"there is no camera {camera}; there are {cameras} cameras")
+        if frame % frames not in (own := self.frames(camera)):
+            raise IndexError(f"episode {self.index} has no picture of camera {camera} in frame {frame}; it has one every {own.step} frames")
         return View(self._files_of(camera), self.index, camera, frame % frames, self.image_ids[frame % frames])
 
     def _files_of(self, camera: int) -> SceneFiles:
@@ -207,7 +217,8 @@ class Episode:
         cameras = self.cameras if camera is None else (camera,)
         for frame in range(len(self)):
             for each in cameras:
-                yield self.view(frame, each)
+                if frame in self.frames(each):
+                    yield self.view(frame, each)
 
     def __len__(self) -> int:
         """Number of frames."""
@@ -333,6 +344,11 @@ class DataSet(Mapping[int, Episode]):
 
         first = next(iter(self.values()))
         return np.stack([first.view(0, camera).intrinsics(convention) for camera in first.cameras])
+
+    @cached_property
+    def every(self) -> tuple[int, ...]:
+        """Frames from one picture of each camera to the next."""
+        return self.config.rig.every if self.found is None else (1,) * self.camera_count
 
     @cached_property
     def sensors(self) -> tuple[str, ...]:

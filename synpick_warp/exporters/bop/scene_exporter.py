@@ -37,6 +37,8 @@ def constant_files(layout: DataLayout) -> tuple[Path, ...]:
     return tuple(map(Path, (*MODEL_FOLDERS, CAMERA_FILE, *camera_files(layout), NOTES_FILE, PARAMS_FILE)))
 
 
+SceneImages = tuple[Sequence[int], ...]
+"""Images (im_id) of each scene, ascending."""
 _Staged = StagedEpisode[tuple[Path, ...]]
 """Its content: the staging folder of each camera's scene, in that of the episode, named by scene_id."""
 
@@ -105,8 +107,8 @@ class SceneExporter(EpisodeExporter[tuple[Path, ...]]):
         scene.mkdir()
 
     @abstractmethod
-    def _commit_task(self, scenes: tuple[tuple[Path, int], ...], images: Sequence[int]) -> tuple[Callable[..., None], tuple[Any, ...]]:
-        """Task that completes scenes of these images (im_id), given as (staging folder, scene_id), and moves them to their places."""
+    def _commit_task(self, scenes: tuple[tuple[Path, int], ...], images: SceneImages) -> tuple[Callable[..., None], tuple[Any, ...]]:
+        """Task that completes scenes of these images, given as (staging folder, scene_id), and moves them to their places."""
 
     @abstractmethod
     def files(self, episode: int) -> list[Path]:
@@ -175,7 +177,7 @@ class SceneExporter(EpisodeExporter[tuple[Path, ...]]):
     def _commit(self, episode: _Staged, end: EpisodeEnd) -> WriteTask:
         """Task that moves an episode's scenes to their places."""
         first = self.scene_id(end.episode, 0)
-        function, arguments = self._commit_task(
-            tuple(zip(episode.content, range(first, first + len(self._cameras)), strict=True)), end.images
-        )
+        images = tuple(end.images[:: self._context.layout.every[camera]] for camera in range(len(self._cameras)))
+        scenes = tuple(zip(episode.content, range(first, first + len(self._cameras)), strict=True))
+        function, arguments = self._commit_task(scenes, images)
         return WriteTask(function, (), arguments, self._folder(first) / f"{first:06d}")
