@@ -89,11 +89,11 @@ class Views:
             raise DatasetError(f"cameras {list(self.cameras)}: {folder} has the cameras 0 to {data.camera_count - 1}")
         if stride < 1:
             raise DatasetError(f"stride {stride}: at least 1")
-        if sparse := [each for each in self.cameras if stride % data.every[each]]:
-            every = data.every[sparse[0]]
-            raise DatasetError(f"camera {sparse[0]} has a picture every {every} frames; give a stride of {every}, or cameras without it")
         self.stride = stride
         self.episodes = tuple(data)
+        for each in self.cameras if self.episodes else ():
+            if stride % (every := data[self.episodes[0]].frames(each).step):
+                raise DatasetError(f"camera {each} has a picture every {every} frames; give a stride of {every}, or cameras without it")
         counts = [len(self.cameras) * -(-len(data[episode]) // stride) for episode in self.episodes]
         self._ends = np.cumsum(counts, dtype=np.int64)
         self._data: DataSet | None = None

@@ -97,7 +97,7 @@ class Source:
     def scenes(self, end: EpisodeEnd) -> list[StoredSceneFiles]:
         """Files of the scene of each camera in an episode, in the order of cameras."""
         data, count = self.data, self.data.camera_count
-        images = [end.images[:: data.every[one]] for one in range(count)]
+        images = [end.images[:: self.config.rig.every[one]] for one in range(count)]
         return [StoredSceneFiles(data.scene_files(end.episode, one), count * end.episode + one, images[one]) for one in range(count)]
 
     def ticks(self, end: EpisodeEnd) -> Iterator[TickBatch]:
