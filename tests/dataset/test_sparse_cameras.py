@@ -98,8 +98,9 @@ def test_it_is_read_by_episode_and_frame(cell):
         Views(cell)
 
 
-def test_it_is_converted_and_streamed(cell, sensors, tmp_path):
-    ran = run("convert", sensors, "--to", "coco,shards", "--out", tmp_path / "more")
+def test_it_is_converted_and_streamed(cell, tmp_path):
+    bake(tmp_path / "set", **{"bake.formats": ["bop"]})
+    ran = run("convert", tmp_path / "set", "--to", "coco,shards", "--out", tmp_path / "more")
     assert ran.code == 0, ran
     ours, theirs = digests(cell), digests(tmp_path / "more")
     same = [name for name in ours if name.startswith(("coco/", "train_web/"))]
