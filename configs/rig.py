@@ -75,6 +75,11 @@ class Rig:
         """Frames from one picture of each camera to the next."""
         return tuple(row.every or 1 for row in self.rows)
 
+    def writes(self, index: int, modality: str) -> bool:
+        """Whether there are files of a camera's images of this kind, one of MODALITIES, if the settings have such at all."""
+        chosen = self.rows[index].modalities
+        return chosen is None or modality in chosen
+
     def is_placed(self, index: int) -> bool:
         """Whether a camera's matrix and pose are not the same in all views."""
         return self.rows[index].jitter is not None or self.moves(index)

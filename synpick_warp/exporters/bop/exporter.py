@@ -24,6 +24,7 @@ from synpick_warp.exporters.bop.shared.targets import (
     target_files,
     write_scene_targets,
 )
+from synpick_warp.exporters.bop.view import ViewSettings
 from synpick_warp.exporters.writing.files import PARTIAL, output_errors
 from synpick_warp.exporters.writing.pool import WriterPool
 
@@ -80,9 +81,10 @@ class BopExporter(SceneExporter):
         places = dict.fromkeys(self._place(self.scene_id(episode, camera)) for camera in range(len(self._cameras)))
         return [place.relative_to(self._out) for place in places if os.path.lexists(place)]
 
-    def _stage_scene(self, scene: Path) -> None:
+    def _stage_scene(self, scene: Path, settings: ViewSettings) -> None:
         """Create the staging folder of a scene, with a folder for each kind of images."""
-        create_scene_folders(scene, self._bop.masks, self._layers)
+        masks = ("mask", "mask_visib") if settings.masks else ()
+        create_scene_folders(scene, (*("rgb",) * settings.color, *("depth",) * settings.depth, *masks, *settings.layers))
 
     def _commit_task(self, scenes: tuple[tuple[Path, int], ...], images: SceneImages) -> tuple[Callable[..., None], tuple[Any, ...]]:
         """Task that completes an episode: writes the annotation files of its scenes, and renames the folders to their places."""
@@ -94,7 +96,7 @@ class BopExporter(SceneExporter):
                 width=camera.width,
                 height=camera.height,
                 color_suffix=self._suffix,
-                coco=self._bop.coco,
+                coco=self._views[index].coco,
                 categories=self._categories,
                 sensor=layout.scene(0, index)[1],
             )

@@ -62,7 +62,7 @@ class ShardsExporter(SceneExporter):
         return sorted(path.relative_to(self._out) for scene in scenes for path in find_shards(scene, self._folder(scene)))
 
     def _commit_task(self, scenes: tuple[tuple[Path, int], ...], images: SceneImages) -> tuple[Callable[..., None], tuple[Any, ...]]:
-        return commit_shards, (scenes, self._folder(scenes[0][1]), images, self._layers)
+        return commit_shards, (scenes, self._folder(scenes[0][1]), images, tuple(view.layers for view in self._views))
 
 
 def _describe(settings: ExportSettings, splits: list[SplitContent]) -> CardContent:

@@ -11,6 +11,7 @@ from typing import Any
 from synpick_warp.configs.splits import DataLayout
 from synpick_warp.exporters.base import ExportContext, SharedFiles
 from synpick_warp.exporters.bop.scene_exporter import SceneExporter, SceneImages
+from synpick_warp.exporters.bop.view import ViewSettings
 from synpick_warp.exporters.bop.yolo.label_files import CONTENTS, DATA, FOLDER, commit_scenes, image_list, write_data_file, write_view
 from synpick_warp.exporters.writing.files import output_errors
 from synpick_warp.exporters.writing.notes import note_files, write_notes
@@ -58,7 +59,7 @@ class YoloExporter(SceneExporter):
         places = [*map(image_list, scenes), *folders]
         return sorted(place for place in places if os.path.lexists(self._out / place))
 
-    def _stage_scene(self, scene: Path) -> None:
+    def _stage_scene(self, scene: Path, settings: ViewSettings) -> None:
         scene.mkdir()
         for kind in CONTENTS:
             (scene / kind).mkdir()
