@@ -11,7 +11,7 @@ from dataclasses import replace
 from functools import partial
 
 from synpick_warp.codes import MAX_DISPARITIES
-from synpick_warp.configs.cameras import CameraRow, Cameras, Jitter, Pose
+from synpick_warp.configs.cameras import COLOR, DEPTH, MASKS, MODALITIES, CameraRow, Cameras, Jitter, Pose
 from synpick_warp.configs.cell import BinSizes, Sides
 from synpick_warp.configs.modes import may_pick
 from synpick_warp.configs.randomize import FIXED, OFF
@@ -119,6 +119,11 @@ def _view(rig: Rig, index: int, config: Config) -> Iterator[Conflict]:
     if "lerobot" in config.bake.formats and (width % 2 or height % 2):
         key = rig.key(index, "resolution") if config.camera and config.camera[index].resolution else "cameras.resolution"
         yield key, "even width and height with the format lerobot, whose videos have a colour for 2 x 2 pixels"
+    shown = [name for name in config.render.layers if rig.writes(index, name)]
+    if rig.every[index] > 1:
+        yield from _every(rig.key(index, "every"), config.bake.formats, shown)
+    if row.modalities is not None:
+        yield from _modalities(rig.key(index, "modalities"), row.modalities, config.bake.formats, config.render.layers)
     if row.matrix is not None:
         yield from _matrix(rig.key(index, "matrix"), row.matrix, width, height)
     if row.distortion:
@@ -130,6 +135,24 @@ def _view(rig: Rig, index: int, config: Config) -> Iterator[Conflict]:
     yield from placement(row, keys)
     if row.jitter is not None:
         yield from _jitter(rig.key(index, "jitter"), row, row.jitter, placement)
+
+
+def _modalities(key: str, chosen: tuple[str, ...], formats: tuple[str, ...], layers: tuple[str, ...]) -> Iterator[Conflict]:
+    """Yield images that are none, are not rendered, or lack what a format consists of."""
+    if not chosen:
+        yield key, f"at least one of {', '.join(MODALITIES)}"
+    if missing := [name for name in chosen if name not in (COLOR, DEPTH, MASKS, *layers)]:
+        yield key, f"names of layers that are in render.layers, as {missing[0]} is not"
+    if COLOR not in chosen and (found := [name for name in ("lerobot", "coco", "yolo") if name in formats]):
+        yield key, f"color among them with the format {found[0]}, which consists of colour images"
+
+
+def _every(key: str, formats: tuple[str, ...], layers: Sequence[str]) -> Iterator[Conflict]:
+    """Yield what needs a picture of every frame."""
+    if "lerobot" in formats:
+        yield key, "1 with the format lerobot, whose videos have the frames of its states"
+    if found := [name for name in ("flow", "scene_flow") if name in layers]:
+        yield key, f"1 with the layer {found[0]}, which leads to the frame before"
 
 
 def _view_axes(row: CameraRow, keys: Sequence[str], label: str) -> Iterator[Conflict]:

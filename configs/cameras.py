@@ -8,10 +8,16 @@ from typing import ClassVar
 from synpick_warp.configs.calibration.files import MODELS
 from synpick_warp.configs.fields import setting
 from synpick_warp.configs.randomize import Distribution
+from synpick_warp.views.layers import LAYER_TABLE
 
 Vector = tuple[float, float, float]
 WORLD, GRIPPER = "world", "gripper"
 """What cameras are fixed to."""
+
+
+COLOR, DEPTH, MASKS = "color", "depth", "masks"
+MODALITIES = (COLOR, DEPTH, MASKS, *LAYER_TABLE)
+"""Kinds of images that a camera may have files of."""
 
 
 @dataclass(frozen=True)
@@ -107,6 +113,12 @@ class CameraRow:
         "What carries the camera: the world, unless it is given, or the gripper (eye-in-hand). The pose is then in the frame of its shaft, "
         "whose origin is on the wrist axis, z up.",
         choices=(WORLD, GRIPPER),
+    )
+    modalities: tuple[str, ...] | None = setting(
+        None, "", "Images in its files: any of the allowed names, of layers those in render.layers; not given: all.", choices=MODALITIES
+    )
+    every: int | None = setting(
+        None, "frames", "Frames from one picture to the next, of which the first is that of frame 0; not given: 1.", low=1, high=1000
     )
     jitter: Jitter | None = setting(
         None,

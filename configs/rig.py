@@ -66,9 +66,19 @@ class Rig:
 
     @cached_property
     def groups(self) -> tuple[tuple[int, ...], ...]:
-        """Indices of the cameras that are rendered together: of one image size, all placed or none, all moving or none."""
-        kinds = [(size, self.is_placed(index), self.moves(index)) for index, size in enumerate(self.sizes)]
+        """Indices of the cameras that are rendered together: of one image size and `every`, all placed or none, all moving or none."""
+        kinds = [(size, self.every[index], self.is_placed(index), self.moves(index)) for index, size in enumerate(self.sizes)]
         return tuple(tuple(index for index, own in enumerate(kinds) if own == kind) for kind in dict.fromkeys(kinds))
+
+    @cached_property
+    def every(self) -> tuple[int, ...]:
+        """Frames from one picture of each camera to the next."""
+        return tuple(row.every or 1 for row in self.rows)
+
+    def writes(self, index: int, modality: str) -> bool:
+        """Whether there are files of a camera's images of this kind, one of MODALITIES, if the settings have such at all."""
+        chosen = self.rows[index].modalities
+        return chosen is None or modality in chosen
 
     def is_placed(self, index: int) -> bool:
         """Whether a camera's matrix and pose are not the same in all views."""

@@ -70,6 +70,8 @@ class DataLayout:
     """Names of the cameras."""
     sensor_names: tuple[str, ...]
     """Their names as sensors of a scene."""
+    every: tuple[int, ...]
+    """Frames from one picture of each camera to the next."""
     has_sensors: bool
     """Whether the cameras of an episode share a scene, as its sensors; else each has a scene of its own."""
 
@@ -77,12 +79,16 @@ class DataLayout:
     def of(cls, config: Config) -> DataLayout:
         """Layout by the settings of a bake."""
         bake, bop, rig = config.bake, config.bop, config.rig
-        return cls(bake.formats, config.splits, bake.episodes, bop.split, rig.names, rig.sensors, bop.layout == MULTISENSOR)
+        return cls(bake.formats, config.splits, bake.episodes, bop.split, rig.names, rig.sensors, rig.every, bop.layout == MULTISENSOR)
 
     @property
     def cameras(self) -> int:
         """Number of cameras."""
         return len(self.names)
+
+    def frames(self, camera: int, count: int) -> range:
+        """Frames of which a camera has pictures, of an episode with `count` frames."""
+        return range(0, count, self.every[camera])
 
     @property
     def is_listed(self) -> bool:

@@ -91,6 +91,9 @@ class Views:
             raise DatasetError(f"stride {stride}: at least 1")
         self.stride = stride
         self.episodes = tuple(data)
+        for each in self.cameras if self.episodes else ():
+            if stride % (every := data[self.episodes[0]].frames(each).step):
+                raise DatasetError(f"camera {each} has a picture every {every} frames; give a stride of {every}, or cameras without it")
         counts = [len(self.cameras) * -(-len(data[episode]) // stride) for episode in self.episodes]
         self._ends = np.cumsum(counts, dtype=np.int64)
         self._data: DataSet | None = None

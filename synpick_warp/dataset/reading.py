@@ -59,11 +59,7 @@ class Episode:
     """One episode: row of the episode list, pick attempts, views, and arrays of the trajectory."""
 
     def __init__(self, data_set: DataSet, index: int) -> None:
-        """
-        Args:
-            data_set: The data set, which has the episode.
-            index: Index of the episode.
-        """
+        """Episode `index` of a data set, which has it."""
         self._data_set = data_set
         self.group = data_set.folder / STORE / EPISODES / f"{index:06d}"
         """Folder of its group in the trajectory store, if there is one."""
@@ -185,15 +181,25 @@ class Episode:
         """The episode's USD file; it exists if the data set has the format usd."""
         return self._data_set.folder / USD / f"{self.index:06d}.usdc"
 
+    def frames(self, camera: int) -> range:
+        """Frames of which a camera has pictures: all, or with `every` in its settings each n-th."""
+        return range(0, len(self), 1 if self._data_set.found is not None else self._data_set.config.rig.every[camera])
+
+    def images(self, camera: int) -> Sequence[int]:
+        """BOP's im_id of each of a camera's pictures."""
+        return self.image_ids[:: self.frames(camera).step]
+
     def view(self, frame: int, camera: int = 0) -> View:
         """View of a frame and camera."""
         from synpick_warp.dataset.view import View
 
         frames, cameras = len(self), self._data_set.camera_count
-        if not -frames <= frame < frames:
-            raise IndexError(f"episode {self.index} has no frame {frame}; it has {frames} frames")
         if not 0 <= camera < cameras:
             raise IndexError(f"there is no camera {camera}; there are {cameras} cameras")
+        if not -frames <= frame < frames:
+            raise IndexError(f"episode {self.index} has no frame {frame}; it has {frames} frames")
+        if frame % frames not in (own := self.frames(camera)):
+            raise IndexError(f"episode {self.index} has no picture of camera {camera} in frame {frame}; it has one every {own.step} frames")
         return View(self._files_of(camera), self.index, camera, frame % frames, self.image_ids[frame % frames])
 
     def _files_of(self, camera: int) -> SceneFiles:
@@ -206,8 +212,7 @@ class Episode:
         """Iterate over the views frame by frame, of one camera or of all."""
         cameras = self.cameras if camera is None else (camera,)
         for frame in range(len(self)):
-            for each in cameras:
-                yield self.view(frame, each)
+            yield from (self.view(frame, each) for each in cameras if frame in self.frames(each))
 
     def __len__(self) -> int:
         """Number of frames."""

@@ -219,7 +219,8 @@ def _build_group(config: Config, scene: RenderScene, cameras: tuple[Camera, ...]
     sizes = view_sizes(config.render, config.rig, worlds, objects, scene.device, index)
     scene = with_cameras(scene, tuple(cameras[camera] for camera in indices))
     renderer = make_renderer(config, scene, objects, sizes["view"], history_count(config.rig, worlds, index))
-    return CameraGroup(indices, sizes, renderer, config.rig.is_placed(indices[0]), config.rig.moves(indices[0]))
+    rig, first = config.rig, indices[0]
+    return CameraGroup(indices, sizes, renderer, rig.is_placed(first), rig.moves(first), rig.every[first])
 
 
 def _fit_to_catalog(config: Config, catalog: Catalog, bins: Sequence[Bin], device: wp.Device, progress: Progress) -> Config:

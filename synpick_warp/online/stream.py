@@ -151,8 +151,9 @@ class Producer:
 
     def render(self, report: TickReport, snapshot: Snapshot) -> Iterator[ViewBatch]:
         """Render the selected views of a tick, group by group of cameras, world by world and camera by camera."""
-        shown = report.column("live").astype(bool) & (report.column("frame") % self.selection.stride == 0)
+        frame = report.column("frame")
         for ring in self.rings:
+            shown = report.column("live").astype(bool) & (frame % self.selection.stride == 0) & (frame % ring.group.every == 0)
             cameras = [camera for camera in self.selection.cameras or () if camera in ring.group.cameras]
             yield from self._render_group(report, snapshot, ring, *pair_views(np.flatnonzero(shown), np.array(cameras, np.int32)))
 

@@ -290,12 +290,12 @@ class FrameStream:
             report: Report of the tick.
             finished: Called once the consumer is done with the tick's last batch (it requests the next one); ticks finish in order.
         """
-        live = np.flatnonzero(report.column("live"))
-        ahead = 0
+        launched, ahead = 0, 0
         for ring in self.rings:
-            world, camera = pair_views(live, np.array(ring.cameras))
+            shown = report.column("live").astype(bool) & (report.column("frame") % ring.group.every == 0)
+            world, camera = pair_views(np.flatnonzero(shown), np.array(ring.cameras))
             for first in range(0, len(world), ring.batch):
-                while sum(launched.ring is ring for launched in self.in_flight) == len(ring.slots):
+                while sum(batch.ring is ring for batch in self.in_flight) == len(ring.slots):
                     yield from self._deliver()
                 part = slice(first, min(first + ring.batch, len(world)))
                 known = (self.tick_time, self.object_ids, self.lights, self.bins, self.cameras)
@@ -303,12 +303,12 @@ class FrameStream:
                 last = last_cameras(self.cameras, report, world[part], camera[part])
                 slot = ring.launch(snapshot, world[part], camera[part], self.streams, (description, last))
                 self.in_flight.append(_Launched(ring, slot, part.stop - first, description))
-                ahead += int(self.device.is_cuda)
-        if len(live):
+                launched, ahead = launched + 1, ahead + int(self.device.is_cuda)
+        if launched:
             self.in_flight[-1].finished = finished
         while len(self.in_flight) > ahead:
             yield from self._deliver()
-        if not len(live):
+        if not launched:
             finished()
 
     def drain(self) -> Iterator[FrameBatch]:

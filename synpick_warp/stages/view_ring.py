@@ -60,9 +60,9 @@ Placements = tuple[Mapping[str, Any], Mapping[str, Any]]
 
 
 def history_count(rig: Rig, worlds: int, group: int = 0) -> int:
-    """Number of light histories of a group of cameras, one a world and camera; 0: the cameras move, and no light is averaged."""
+    """Number of light histories of a group of cameras, one a world and camera; 0: none is averaged, as cameras move or leave frames out."""
     cameras = rig.groups[group]
-    return 0 if rig.moves(cameras[0]) else worlds * len(cameras)
+    return 0 if rig.moves(cameras[0]) or rig.every[cameras[0]] > 1 else worlds * len(cameras)
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,6 +78,8 @@ class CameraGroup:
     """Whether each view has a matrix and pose of its own, as of `Rig.is_placed`."""
     moves: bool = False
     """Whether the cameras move within an episode, as of `Rig.moves`."""
+    every: int = 1
+    """Frames from one picture to the next."""
 
     def slots(self, camera: np.ndarray) -> np.ndarray:
         """Row of cameras in the renderer's scene (view) int32, by their indices (view)."""

@@ -151,6 +151,13 @@ HAND = '[[camera]]\nfixed_to = "gripper"\nfov = 60\npose = { position = [0.1, 0,
     ("text", "words"),
     [
         (HAND.replace("gripper", "hand"), 'camera[0].fixed_to is "hand" in {path}; allowed: world, gripper'),
+        (LEFT + "modalities = []\n", "camera[0].modalities is [] in {path}; allowed: at least one of color, depth, masks, "),
+        (LEFT + 'modalities = ["rgb"]\n', 'camera[0].modalities is ["rgb"] in {path}; allowed: any of color, depth, masks, '),
+        (LEFT + 'modalities = ["flow"]\n', "allowed: names of layers that are in render.layers, as flow is not"),
+        (LEFT + 'modalities = ["depth"]\n[bake]\nformats = ["bop", "coco"]\n', "allowed: color among them with the format coco"),
+        (LEFT + "every = 0\n", "camera[0].every is 0 in {path}; allowed: at least 1, at most 1000 [frames]"),
+        (LEFT + 'every = 2\n[bake]\nformats = ["lerobot"]\n', "camera[0].every is 2 in {path}; allowed: 1 with the format lerobot"),
+        (LEFT + 'every = 2\n[render]\nlayers = ["flow"]\n', "allowed: 1 with the layer flow, which leads to the frame before"),
         (HAND.replace("[0.1, 0, 0.2]", "[0.01, 0, 0.2]"), "allowed: positions outside of the gripper's shaft and cup"),
         (HAND.replace("-0.1]", "5]"), "allowed: a point that lets camera camera_0 see below the gripper, z < 0 [m]"),
         (HAND.replace("up = [0, 1, 0]", "up = [0, 0, 0]"), "up vectors that are not zero or parallel"),
@@ -163,7 +170,7 @@ HAND = '[[camera]]\nfixed_to = "gripper"\nfov = 60\npose = { position = [0.1, 0,
         ),
     ],
 )
-def test_cameras_on_the_gripper_that_are_refused(tmp_path, text, words):
+def test_what_else_is_refused(tmp_path, text, words):
     with pytest.raises(ConfigError) as caught:
         load(tmp_path, text)
     assert words.format(path=tmp_path / "cell.toml") in str(caught.value)

@@ -99,7 +99,7 @@ def sampled(rows: dict[int, Namespace], count: int) -> list[tuple[int, int, int]
         camera_count = 3
 
         def __getitem__(self, index: int) -> Namespace:
-            return Namespace(view=lambda frame, camera: (index, frame, camera))
+            return Namespace(view=lambda frame, camera: (index, frame, camera), frames=lambda camera: range(10**6))
 
     return sample_views(Set(), Episodes(rows, {}, len(rows)), count)
 

@@ -54,7 +54,7 @@ class BoxesExporter(SceneExporter):
         places = [FOLDER / f"{self.scene_id(episode, camera):06d}" for camera in range(len(self._cameras))]
         return [place for place in places if os.path.lexists(self._out / place)]
 
-    def _stage_scene(self, scene: Path) -> None:
+    def _stage_scene(self, scene: Path, settings) -> None:
         scene.mkdir()
 
     def _commit_task(self, scenes, frames):

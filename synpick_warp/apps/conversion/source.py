@@ -96,8 +96,9 @@ class Source:
 
     def scenes(self, end: EpisodeEnd) -> list[StoredSceneFiles]:
         """Files of the scene of each camera in an episode, in the order of cameras."""
-        data, cameras = self.data, range(self.data.camera_count)
-        return [StoredSceneFiles(data.scene_files(end.episode, one), len(cameras) * end.episode + one, end.images) for one in cameras]
+        data, count = self.data, self.data.camera_count
+        images = [end.images[:: self.config.rig.every[one]] for one in range(count)]
+        return [StoredSceneFiles(data.scene_files(end.episode, one), count * end.episode + one, images[one]) for one in range(count)]
 
     def ticks(self, end: EpisodeEnd) -> Iterator[TickBatch]:
         """Yield the ticks of an episode's stored trajectory. See `trajectories.read_ticks`."""

@@ -59,14 +59,13 @@ def plan_scenes(data_set: DataSet, selection: Selection) -> tuple[list[ScenePlan
     plans, total = [], 0
     for index in known:
         episode = data_set[index]
-        images = episode.image_ids
-        total += len(images) * len(episode.cameras)
+        total += sum(len(episode.images(camera)) for camera in episode.cameras)
         if selection.episodes is not None and index not in selection.episodes:
             continue
         if selection.modes is not None and episode.row.get("mode") not in selection.modes:
             continue
         for camera in episode.cameras if selection.cameras is None else sorted(set(selection.cameras) & set(episode.cameras)):
-            scene = data_set.scene_id(index, camera)
+            scene, images = data_set.scene_id(index, camera), episode.images(camera)
             chosen = images[:: selection.every] if listed is None else listed.get(scene, [])
             if unknown := set(chosen) - set(images):
                 path = selection.targets.path if selection.targets else data_set.folder

@@ -63,7 +63,7 @@ def read_truth(data_set: DataSet) -> Truth:
             files = data_set.scene_files(index, camera)
             if not files.has("gt"):
                 raise DatasetError(f"{files.place} has no ground truth (scene_gt.json), which estimates are scored against")
-            arrays = read_arrays(files, episode.image_ids)
+            arrays = read_arrays(files, episode.images(camera))
             arrays.require_instances(files.place)
             parts.append((arrays, scene, index, camera, mode))
     if not parts:

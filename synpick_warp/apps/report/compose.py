@@ -120,7 +120,7 @@ def take_samples(data_set: DataSet, statistics: Statistics, episodes: Episodes, 
     for done, view in enumerate(views):
         report("frames", done, len(views))
         scale = None if data_set.found else bin_scale(data_set.config.cell.bins, [view.records.camera])
-        data["frames"] += _present(make_frame(view, content, names, episodes.rows[view.episode].mode, album, scale))
+        data["frames"] += _present(make_frame(view, find_content(view), names, episodes.rows[view.episode].mode, album, scale))
     chosen = choose_episodes(episodes)
     asked["strips"] = len(chosen)
     for place, index in enumerate(chosen):

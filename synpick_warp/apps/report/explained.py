@@ -63,7 +63,7 @@ def choose_attempts(data_set: DataSet, episodes: Episodes) -> list[Found]:
 
 
 def make_attempt(data_set: DataSet, found: Found, content: Content, names: Mapping[int, str], album: Album) -> dict[str, Any] | None:
-    """JSON of an attempt, whose picture is added to the album; None: it exceeds the budget.
+    """JSON of an attempt, whose picture is added to the album; None: it exceeds the budget, or there is no colour image.
 
     Raises:
         DatasetError: The record or a file is missing or damaged.
@@ -72,7 +72,9 @@ def make_attempt(data_set: DataSet, found: Found, content: Content, names: Mappi
     attempt = parse_attempt(episode.attempts[found.place], f"{data_set.folder / episode_entry(found.episode)}.json")
     if not attempt.frame < len(episode):
         raise DatasetError(f"attempt {attempt.attempt} of episode {found.episode} begins in frame {attempt.frame}; it has {len(episode)}")
-    view = episode.view(attempt.frame)
+    view = episode.view(attempt.frame - attempt.frame % episode.frames(0).step)
+    if not view.has("rgb"):
+        return None
     picture = draw_observation(attempt, view)
     places = album.add(Section.ATTEMPTS, [encode_photo(picture)])
     if places is None:

@@ -103,6 +103,8 @@ def sample_views(data_set: DataSet, episodes: Episodes, count: int) -> list[View
         frames = episodes.rows[index].frames
         first = int(time * frames) * cameras + int(place * cameras)
         views = (divmod((first + step) % (frames * cameras), cameras) for step in range(min(count, frames * cameras)))
+        # Of a camera without a picture of the frame, the one before.
+        views = ((frame - frame % data_set[index].frames(camera).step, camera) for frame, camera in views)
         keys.update(next(([(index, *view)] for view in views if (index, *view) not in keys), []))
     return [data_set[index].view(frame, camera) for index, frame, camera in sorted(keys)]
 

@@ -56,7 +56,9 @@ def make_strip(data_set: DataSet, index: int, strips: int, album: Album, report:
 
     def encode(frame: int, camera: int) -> Picture:
         if (frame, camera) not in cache:
-            cache[frame, camera] = encode_photo(shrink(show(episode.view(frame, camera)), WIDTH), QUALITY)
+            cache[frame, camera] = encode_photo(
+                shrink(show(episode.view(frame - frame % episode.frames(camera).step, camera)), WIDTH), QUALITY
+            )
             report(len(cache), most)
         return cache[frame, camera]
 

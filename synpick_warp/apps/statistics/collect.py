@@ -69,9 +69,9 @@ def collect(data_set: DataSet, depth_views: int, threads: int, report: Report | 
     found = Collected()
     tasks, without = [], 0
     for episode in data_set:
-        row = found.partial.add_episode(data_set, episode)
+        found.partial.add_episode(data_set, episode)
         if _has_images(data_set, episode):
-            tasks += [SceneTask(episode, camera, row.frames) for camera in data_set[episode].cameras]
+            tasks += [SceneTask(episode, each, len(data_set[episode].images(each))) for each in data_set[episode].cameras]
         else:
             without += 1
     episodes = found.partial.episodes.groups()

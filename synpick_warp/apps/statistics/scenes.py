@@ -48,7 +48,7 @@ def read_scene(data_set: DataSet, episode: int, camera: int) -> SceneTruth:
         DatasetError: The data set has no images of it, or a file is missing or damaged.
     """
     files = data_set.scene_files(episode, camera)
-    images = files.frames() if files.lenient else range(len(data_set[episode]))
+    images = files.frames() if files.lenient else data_set[episode].images(camera)
     arrays = read_arrays(files, images, LitCameraEntry, whole=True)
     # The camera is at the origin: R d = -t.
     direction = -np.einsum("nji,nj->ni", arrays.rotation, arrays.translation)

@@ -36,7 +36,8 @@ class TimelineCounts(Counts):
 
     def add_scene(self, group: Group, scene: SceneTruth, period: float) -> None:
         """Count a scene's instances by time; `period` is the time from frame to frame [s]."""
-        bins = (np.arange(scene.frames) * (period / TIME_BIN) + _ROUNDING).astype(np.int64)
+        frames = np.asarray(scene.images or range(scene.frames))
+        bins = (frames * (period / TIME_BIN) + _ROUNDING).astype(np.int64)
         for index in np.unique(bins).tolist():
             self.frames[group, index] += int((bins == index).sum())
             self.objects[group, index] += int(scene.counts[bins == index].sum())

@@ -57,7 +57,7 @@ def check_listed_frames(folder: Path, layout: DataLayout, row: Mapping[str, Any]
     scene, suffix = layout.scene(episode, 0)
     for place in (f"{layout.folder(episode)}/{scene:06d}/rgb{suffix}/", f"coco/images/{scene:06d}/"):
         count = sum(name.startswith(place) for name in names)
-        if count and count != frames:
+        if count and count != len(layout.frames(0, frames)):
             raise DatasetError(f"the record of episode {episode} in {folder} counts {frames:,} frames, but {place} has {count:,}; {ADVICE}")
 
 
@@ -68,15 +68,15 @@ def _sizes(folder: Path, layout: DataLayout | None, episode: int) -> Iterator[tu
     if times.is_dir():
         yield times, sum(_size(path) for path in times.iterdir() if path.name.startswith("c")), _TIME
     parts = part_files(None if layout is None else layout.cameras)
-    places = [(folder / part.file(episode), part.frame_bytes) for part in parts]
+    places: list[tuple[Path, float]] = [(folder / part.file(episode), part.frame_bytes) for part in parts]
     if layout is not None:
         cameras, (scene, sensor) = layout.cameras, layout.scene(episode, 0)
         split = folder / layout.folder(episode)
-        places.append((split / f"{scene:06d}" / f"scene_camera{sensor}.json", _CAMERA))
+        places.append((split / f"{scene:06d}" / f"scene_camera{sensor}.json", _CAMERA / layout.every[0]))
         first = split.with_name(f"{split.name}_web") / f"shard-{cameras * episode:06d}.tar"
         if first.is_file():
             shards = first.parent.glob(f"shard-*{cameras * episode:06d}.tar")
-            yield first, sum(map(_size, shards)), _MEMBERS
+            yield first, sum(map(_size, shards)), _MEMBERS / layout.every[0]
     yield from ((path, _size(path), least) for path, least in places if path.is_file())
 
 

@@ -14,7 +14,7 @@ from synpick_warp.configs.splits import DataLayout
 from synpick_warp.exporters.base import ExportContext, SharedFiles
 from synpick_warp.exporters.bop.keypoints import make_category_keys
 from synpick_warp.exporters.bop.scene import SceneSettings, commit_scenes, create_scene_folders, write_layer, write_view
-from synpick_warp.exporters.bop.scene_exporter import SceneExporter, constant_files
+from synpick_warp.exporters.bop.scene_exporter import SceneExporter, SceneImages, constant_files
 from synpick_warp.exporters.bop.sensors import commit_sensor_scene
 from synpick_warp.exporters.bop.shared.targets import (
     concatenate_targets,
@@ -24,6 +24,7 @@ from synpick_warp.exporters.bop.shared.targets import (
     target_files,
     write_scene_targets,
 )
+from synpick_warp.exporters.bop.view import ViewSettings
 from synpick_warp.exporters.writing.files import PARTIAL, output_errors
 from synpick_warp.exporters.writing.pool import WriterPool
 
@@ -80,21 +81,22 @@ class BopExporter(SceneExporter):
         places = dict.fromkeys(self._place(self.scene_id(episode, camera)) for camera in range(len(self._cameras)))
         return [place.relative_to(self._out) for place in places if os.path.lexists(place)]
 
-    def _stage_scene(self, scene: Path) -> None:
+    def _stage_scene(self, scene: Path, settings: ViewSettings) -> None:
         """Create the staging folder of a scene, with a folder for each kind of images."""
-        create_scene_folders(scene, self._bop.masks, self._layers)
+        masks = ("mask", "mask_visib") if settings.masks else ()
+        create_scene_folders(scene, (*("rgb",) * settings.color, *("depth",) * settings.depth, *masks, *settings.layers))
 
-    def _commit_task(self, scenes: tuple[tuple[Path, int], ...], images: Sequence[int]) -> tuple[Callable[..., None], tuple[Any, ...]]:
+    def _commit_task(self, scenes: tuple[tuple[Path, int], ...], images: SceneImages) -> tuple[Callable[..., None], tuple[Any, ...]]:
         """Task that completes an episode: writes the annotation files of its scenes, and renames the folders to their places."""
         layout = self._context.layout
         settings = tuple(
             SceneSettings(
                 split=layout.folder(scenes[0][1] // len(self._cameras)),
-                images=images,
+                images=images[index],
                 width=camera.width,
                 height=camera.height,
                 color_suffix=self._suffix,
-                coco=self._bop.coco,
+                coco=self._views[index].coco,
                 categories=self._categories,
                 sensor=layout.scene(0, index)[1],
             )

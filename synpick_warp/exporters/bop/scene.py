@@ -46,10 +46,10 @@ class SceneSettings:
     """Suffix of the image folders, such as "_cam1"; empty: classic."""
 
 
-def create_scene_folders(scene: Path, masks: bool, layers: tuple[str, ...]) -> None:
+def create_scene_folders(scene: Path, kinds: Iterable[str]) -> None:
     """Create the staging folder of a scene, with a subfolder for each image type."""
     scene.mkdir()
-    for name in ("rgb", "depth", *(("mask", "mask_visib") if masks else ()), *layers):
+    for name in kinds:
         (scene / name).mkdir()
 
 
@@ -60,9 +60,11 @@ def write_view(view: EncodedView, scene: Path, settings: ViewSettings) -> None:
     """
     name = f"{view.frame:06d}"
     with open_folder(scene) as folder:
-        suffix, color = view.color
-        folder.write(f"rgb/{name}{suffix}", color)
-        folder.write(f"depth/{name}.png", view.depth)
+        if settings.color:
+            suffix, color = view.color
+            folder.write(f"rgb/{name}{suffix}", color)
+        if settings.depth:
+            folder.write(f"depth/{name}.png", view.depth)
         masks = view.masks() if settings.masks or settings.coco else []
         for index, mask in enumerate(masks if settings.masks else ()):
             amodal, visible = _encode_masks(mask, *settings.resolution)

@@ -8,6 +8,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar
 
+from synpick_warp.configs.cameras import COLOR, DEPTH, MASKS
 from synpick_warp.configs.export import ExportSettings
 from synpick_warp.configs.schema import Bop
 from synpick_warp.configs.splits import DataLayout
@@ -37,6 +38,8 @@ def constant_files(layout: DataLayout) -> tuple[Path, ...]:
     return tuple(map(Path, (*MODEL_FOLDERS, CAMERA_FILE, *camera_files(layout), NOTES_FILE, PARAMS_FILE)))
 
 
+SceneImages = tuple[Sequence[int], ...]
+"""Images (im_id) of each scene, ascending."""
 _Staged = StagedEpisode[tuple[Path, ...]]
 """Its content: the staging folder of each camera's scene, in that of the episode, named by scene_id."""
 
@@ -62,7 +65,7 @@ class SceneExporter(EpisodeExporter[tuple[Path, ...]]):
         self._cameras = context.cameras
         self._pool = context.pool
         self._suffix = f".{bop.color_format}"
-        self._layers = settings.render.layers if self.write_layer else ()
+        layers = settings.render.layers if self.write_layer else ()
         entries = context.catalog.entries if bop.keypoints and self.annotates(bop) else ()
         self._keypoints = {entry.obj_id: sample_keypoints(entry.mesh.vertices, bop.keypoints) for entry in entries}
         self._views = tuple(
@@ -70,15 +73,17 @@ class SceneExporter(EpisodeExporter[tuple[Path, ...]]):
                 color_suffix=self._suffix,
                 jpeg_quality=bop.jpeg_quality,
                 effects=settings.effects,
-                masks=bop.masks,
-                coco=bop.coco,
+                masks=bop.masks and settings.rig.writes(index, MASKS),
+                coco=bop.coco and settings.rig.writes(index, MASKS) and settings.rig.writes(index, COLOR),
                 camera=make_camera_constants(camera, bop.depth_scale),
                 resolution=(camera.width, camera.height),
-                depth=self.writes_depth,
+                color=settings.rig.writes(index, COLOR),
+                depth=self.writes_depth and settings.rig.writes(index, DEPTH),
+                layers=tuple(name for name in layers if settings.rig.writes(index, name)),
                 keypoints=self._keypoints,
                 polygons=bop.polygons,
             )
-            for camera in context.cameras
+            for index, camera in enumerate(context.cameras)
         )
 
     @classmethod
@@ -100,13 +105,13 @@ class SceneExporter(EpisodeExporter[tuple[Path, ...]]):
         """Folder of the split that a scene belongs to."""
         return self._out / self.folder_name(self._context.layout.folder(scene_id // len(self._cameras)))
 
-    def _stage_scene(self, scene: Path) -> None:
+    def _stage_scene(self, scene: Path, settings: ViewSettings) -> None:
         """Create the staging folder of a scene, and its subfolders."""
         scene.mkdir()
 
     @abstractmethod
-    def _commit_task(self, scenes: tuple[tuple[Path, int], ...], images: Sequence[int]) -> tuple[Callable[..., None], tuple[Any, ...]]:
-        """Task that completes scenes of these images (im_id), given as (staging folder, scene_id), and moves them to their places."""
+    def _commit_task(self, scenes: tuple[tuple[Path, int], ...], images: SceneImages) -> tuple[Callable[..., None], tuple[Any, ...]]:
+        """Task that completes scenes of these images, given as (staging folder, scene_id), and moves them to their places."""
 
     @abstractmethod
     def files(self, episode: int) -> list[Path]:
@@ -128,7 +133,9 @@ class SceneExporter(EpisodeExporter[tuple[Path, ...]]):
                 return list(names)
             texts = {
                 NOTES_FILE: describe_dataset(context.settings, context.catalog, self._cameras),
-                PARAMS_FILE: format_dataset_params(context.layout, self._bop.color_format, context.catalog, self._cameras),
+                PARAMS_FILE: format_dataset_params(
+                    context.layout, self._bop.color_format, context.catalog, self._cameras, context.settings.rig
+                ),
             }
             write_models_folders(self._out, context.catalog)
             write_cameras(self._out, context.layout, self._cameras, self._bop.depth_scale)
@@ -150,7 +157,7 @@ class SceneExporter(EpisodeExporter[tuple[Path, ...]]):
             place = self._folder(truth.scene) / scene.name
             arguments = (type(self).write_view, scene, self._views[camera], truth)
             yield self._task((episode,), write_rendered_view, images, arguments, place)
-            for name in self._layers:
+            for name in self._views[camera].layers:
                 arguments = (type(self).write_layer, scene, truth.scene, name, truth.frame)
                 yield self._task((episode,), write_rendered_layer, (batch.layers[name][view],), arguments, place)
 
@@ -158,7 +165,7 @@ class SceneExporter(EpisodeExporter[tuple[Path, ...]]):
         """Submit one task for each stored scene of an episode. See `Exporter`."""
         staged = self._staged(episode, partial(self._create_scenes, episode))
         for stored, scene, settings in zip(scenes, staged.content, self._views, strict=True):
-            arguments = (stored, type(self).write_view, type(self).write_layer, self._layers, scene, settings)
+            arguments = (stored, type(self).write_view, type(self).write_layer, settings.layers, scene, settings)
             self._pool.submit_all((self._task((staged,), write_stored_views, (), arguments, self._folder(int(scene.name)) / scene.name),))
 
     def scene_id(self, episode: int, camera: int) -> int:
@@ -168,14 +175,14 @@ class SceneExporter(EpisodeExporter[tuple[Path, ...]]):
     def _create_scenes(self, index: int, folder: Path) -> tuple[Path, ...]:
         """Create the staging folders of an episode's scenes, one per camera, in this folder; returns them."""
         scenes = tuple(folder / f"{self.scene_id(index, camera):06d}" for camera in range(len(self._cameras)))
-        for scene in scenes:
-            self._stage_scene(scene)
+        for scene, settings in zip(scenes, self._views, strict=True):
+            self._stage_scene(scene, settings)
         return scenes
 
     def _commit(self, episode: _Staged, end: EpisodeEnd) -> WriteTask:
         """Task that moves an episode's scenes to their places."""
         first = self.scene_id(end.episode, 0)
-        function, arguments = self._commit_task(
-            tuple(zip(episode.content, range(first, first + len(self._cameras)), strict=True)), end.images
-        )
+        images = tuple(end.images[:: self._context.layout.every[camera]] for camera in range(len(self._cameras)))
+        scenes = tuple(zip(episode.content, range(first, first + len(self._cameras)), strict=True))
+        function, arguments = self._commit_task(scenes, images)
         return WriteTask(function, (), arguments, self._folder(first) / f"{first:06d}")

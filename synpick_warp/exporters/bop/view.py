@@ -64,8 +64,12 @@ class ViewSettings:
     """Constant part of the views' entries in scene_camera.json."""
     resolution: tuple[int, int]
     """Width and height of the images [px]."""
+    color: bool = True
+    """Whether colour files are written."""
     depth: bool = True
     """Whether depth files are written."""
+    layers: tuple[str, ...] = ()
+    """Layers that are written."""
     keypoints: dict[int, Keypoints] = field(default_factory=dict)
     """Keypoints in COCO annotations, by obj_id; empty: none."""
     polygons: bool = False
@@ -228,7 +232,8 @@ def make_view_task(batch: FrameBatch, view: int, scene: int, settings: ViewSetti
         left=columns.start,
     )
     sources = boundaries or tuple(images[view][rows, columns] for images in (batch.instance, batch.amodal))
-    return (batch.color_source(view), depth, *sources), truth
+    color = batch.color_source(view) if settings.color else np.empty(0, np.uint8)
+    return (color, depth, *sources), truth
 
 
 def _make_extras(batch: FrameBatch, view: int, effects: dict[str, float]) -> dict[str, Any]:

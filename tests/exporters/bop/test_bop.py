@@ -293,7 +293,7 @@ def test_annotation_blocks_are_sorted_and_checked_for_completeness(tmp_path):
     settings = SceneSettings("train_pbr", range(3), 4, 3, ".jpg", True, categories=())
     for frames in ((2, 0, 1), (2, 0, 1, 0), (2, 0)):
         scene, place = tmp_path / "hidden", tmp_path / "-".join(map(str, frames))
-        create_scene_folders(scene, True, ())
+        create_scene_folders(scene, ("rgb", "depth", "mask", "mask_visib"))
         with open_folder(scene) as folder:
             for frame in frames:
                 annotations = [b'{"of": %d}' % frame] * frame

@@ -110,9 +110,9 @@ def test_scenes_are_checked_for_completeness(tmp_path):
     for name in (IMAGES, PARTS):
         (tmp_path / name).mkdir(parents=True)
     with pytest.raises(OutputError, match="has 2 of 3 frames"):
-        commit_scenes(((scene, 7),), tmp_path, range(3))
+        commit_scenes(((scene, 7),), tmp_path, (range(3),))
     write_view(empty[1], scene, settings)
-    commit_scenes(((scene, 7),), tmp_path, range(3))
+    commit_scenes(((scene, 7),), tmp_path, (range(3),))
     assert sorted(path.name for path in (tmp_path / IMAGES / "000007").iterdir()) == ["000000.jpg", "000001.jpg", "000002.jpg"]
 
 

@@ -107,4 +107,4 @@ def test_scenes_are_checked_for_completeness(tmp_path):
     for kind in CONTENTS:
         (tmp_path / "hidden" / kind).mkdir(parents=True)
     with pytest.raises(OutputError, match="has 0 of 3 frames"):
-        commit_scenes(((tmp_path / "hidden", 7),), tmp_path, "train_pbr", range(3))
+        commit_scenes(((tmp_path / "hidden", 7),), tmp_path, "train_pbr", (range(3),))

@@ -110,17 +110,17 @@ def _make_extras(pose: Mapping[str, Any], info: Mapping[str, Any]) -> dict[str, 
     return extras | ({"instance_id": pose["instance_id"]} if "instance_id" in pose else {})
 
 
-def commit_scenes(scenes: tuple[tuple[Path, int], ...], out: Path, frames: Sequence[int]) -> None:
+def commit_scenes(scenes: tuple[tuple[Path, int], ...], out: Path, frames: Sequence[Sequence[int]]) -> None:
     """Task: complete an episode's scenes, (staging folder, scene_id): a line of annotations for each frame, null for im_ids that sets of
     others leave out, and rename all to their places.
 
     Raises:
         OutputError: Not all `frames` (im_id) of a scene have arrived.
     """
-    for scene, scene_id in scenes:
+    for (scene, scene_id), own in zip(scenes, frames, strict=True):
         with (scene / ANNOTATIONS).open("rb") as file:
             blocks = AnnotationBlocks(file)
-            blocks.check_frames(scene, frames)
+            blocks.check_frames(scene, own)
             known = set(blocks.frames)
             lines = [next(blocks.read(frame, 0, 1)) if frame in known else "null" for frame in range(max(known, default=-1) + 1)]
         part = scene.with_name(f"{scene.name}.part")

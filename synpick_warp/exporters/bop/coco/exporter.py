@@ -25,7 +25,7 @@ from synpick_warp.exporters.bop.coco.annotation_files import (
     write_categories,
     write_view,
 )
-from synpick_warp.exporters.bop.scene_exporter import SceneExporter
+from synpick_warp.exporters.bop.scene_exporter import SceneExporter, SceneImages
 from synpick_warp.exporters.writing.files import output_errors
 from synpick_warp.exporters.writing.notes import note_files, write_notes
 from synpick_warp.exporters.writing.pool import WriterPool
@@ -72,5 +72,5 @@ class CocoExporter(SceneExporter):
         """See `Exporter`: folders of images, and parts."""
         return scene_files(self._out, [self.scene_id(episode, camera) for camera in range(len(self._cameras))])
 
-    def _commit_task(self, scenes: tuple[tuple[Path, int], ...], images: Sequence[int]) -> tuple[Callable[..., None], tuple[Any, ...]]:
+    def _commit_task(self, scenes: tuple[tuple[Path, int], ...], images: SceneImages) -> tuple[Callable[..., None], tuple[Any, ...]]:
         return commit_scenes, (scenes, self._out, images)

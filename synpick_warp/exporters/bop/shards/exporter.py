@@ -11,7 +11,7 @@ from synpick_warp.configs.export import ExportSettings
 from synpick_warp.configs.rig import lens_map
 from synpick_warp.configs.splits import DataLayout
 from synpick_warp.exporters.base import SharedFiles
-from synpick_warp.exporters.bop.scene_exporter import SceneExporter, constant_files
+from synpick_warp.exporters.bop.scene_exporter import SceneExporter, SceneImages, constant_files
 from synpick_warp.exporters.bop.shards.card import CARD_FILE, CardContent, SplitContent, hub_splits, make_card
 from synpick_warp.exporters.bop.shards.tar_files import commit_shards, find_shards, list_keys, shard_index, write_layer, write_view
 from synpick_warp.exporters.writing.files import PARTIAL, output_errors, write_atomically
@@ -61,8 +61,8 @@ class ShardsExporter(SceneExporter):
         scenes = (self.scene_id(episode, camera) for camera in range(len(self._cameras)))
         return sorted(path.relative_to(self._out) for scene in scenes for path in find_shards(scene, self._folder(scene)))
 
-    def _commit_task(self, scenes: tuple[tuple[Path, int], ...], images: Sequence[int]) -> tuple[Callable[..., None], tuple[Any, ...]]:
-        return commit_shards, (scenes, self._folder(scenes[0][1]), images, self._layers)
+    def _commit_task(self, scenes: tuple[tuple[Path, int], ...], images: SceneImages) -> tuple[Callable[..., None], tuple[Any, ...]]:
+        return commit_shards, (scenes, self._folder(scenes[0][1]), images, tuple(view.layers for view in self._views))
 
 
 def _describe(settings: ExportSettings, splits: list[SplitContent]) -> CardContent:

@@ -39,8 +39,8 @@ def shard_name(scene: int, part: int) -> str:
 
 def write_view(view: EncodedView, scene: Path, settings: ViewSettings) -> None:
     """Write a view as tar entries, without end-of-archive marker, to a file in the scene's staging folder named by its frame."""
-    suffix, color = view.color
-    entries: list[tuple[str, Buffer]] = [(f"rgb{suffix}", color), ("depth.png", view.depth)]
+    entries: list[tuple[str, Buffer]] = [(f"rgb{view.color[0]}", view.color[1])] if settings.color else []
+    entries += [("depth.png", view.depth)] if settings.depth else []
     entries += [(f"{name}.json", to_json(record)) for name, record in (("camera", view.camera), ("gt", view.gt), ("gt_info", view.gt_info))]
     if settings.masks:
         masks = view.masks()
@@ -80,7 +80,9 @@ def _tar_entry(name: str, data: Buffer) -> tuple[Buffer, ...]:
     return info.tobuf(tarfile.USTAR_FORMAT), data, bytes(-len(data) % tarfile.BLOCKSIZE)
 
 
-def commit_shards(scenes: tuple[tuple[Path, int], ...], split: Path, images: Sequence[int], layers: tuple[str, ...]) -> None:
+def commit_shards(
+    scenes: tuple[tuple[Path, int], ...], split: Path, images: Sequence[Sequence[int]], layers: Sequence[Sequence[str]]
+) -> None:
     """Task: concatenate an episode's views and layers into shards, synced to disk, and rename these to their places.
 
     Args:
@@ -93,12 +95,12 @@ def commit_shards(scenes: tuple[tuple[Path, int], ...], split: Path, images: Seq
         OutputError: A scene has other images or layers.
     """
     complete: list[tuple[Path, Path]] = []
-    for scene, scene_id in scenes:
-        views = [[str(frame), *(_layer_file(frame, name) for name in layers)] for frame in images]
+    for (scene, scene_id), own, shown in zip(scenes, images, layers, strict=True):
+        views = [[str(frame), *(_layer_file(frame, name) for name in shown)] for frame in own]
         names = {path.name for path in scene.iterdir()}
         if names != {name for view in views for name in view}:
-            raise OutputError(f"{scene} does not have {len(images)} whole frames; this is an error of synpick-warp, please report it")
-        for part, begin in enumerate(range(0, len(images), MAX_SHARD_VIEWS)):
+            raise OutputError(f"{scene} does not have {len(own)} whole frames; this is an error of synpick-warp, please report it")
+        for part, begin in enumerate(range(0, len(own), MAX_SHARD_VIEWS)):
             shard = scene / shard_name(scene_id, part)
             _concatenate(shard, [scene / name for view in views[begin : begin + MAX_SHARD_VIEWS] for name in view])
             complete.append((shard, split / shard.name))

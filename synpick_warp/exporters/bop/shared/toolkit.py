@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
+from synpick_warp.configs.cameras import COLOR, DEPTH
+from synpick_warp.configs.rig import Rig
 from synpick_warp.configs.splits import DataLayout
 from synpick_warp.scenes.types import Camera, Catalog
 
@@ -108,7 +110,13 @@ _ONE_SIZE = '{sensor: IM_SIZE for sensor in ("", *SENSORS)} if SENSORS else IM_S
 """Expression of the body for images of one size."""
 
 
-def format_dataset_params(layout: DataLayout, color_format: str, catalog: Catalog, cameras: tuple[Camera, ...]) -> str:
+_BOTH = '{sensor: ["rgb", "depth"] for sensor in SENSORS} or ["rgb", "depth"]'
+"""Expression of the body for images of both kinds from all sensors; also in its loop over these."""
+_PAIRS = '[(m, s) for s in SENSORS for m in ("rgb", "depth")]'
+_EVAL_SENSOR = '"eval_sensor": SENSORS[0]'
+
+
+def format_dataset_params(layout: DataLayout, color_format: str, catalog: Catalog, cameras: tuple[Camera, ...], rig: Rig) -> str:
     """Text of bop_dataset_params.py: Python that adds the data set to the toolkit's functions."""
     entries = catalog.entries
     values: dict[str, Any] = {
@@ -121,6 +129,11 @@ def format_dataset_params(layout: DataLayout, color_format: str, catalog: Catalo
     }
     sizes = {sensor: (camera.width, camera.height) for sensor, camera in zip(layout.sensors, cameras, strict=False)}
     body = _BODY
+    kinds = [[name for name, kind in (("rgb", COLOR), ("depth", DEPTH)) if rig.writes(camera, kind)] for camera in range(len(rig))]
+    if any(own != ["rgb", "depth"] for own in kinds):
+        values["MODALITIES"] = dict(zip(layout.sensors, kinds, strict=True)) if layout.sensors else kinds[0]
+        body = body.replace(_BOTH, "MODALITIES").replace(_PAIRS, "[(m, s) for s in SENSORS for m in MODALITIES[s]]")
+        body = body.replace(_EVAL_SENSOR, '"eval_sensor": next((s for s in SENSORS if "rgb" in MODALITIES[s]), SENSORS[0])')
     if len(set(sizes.values())) > 1:
         values["IM_SIZE"], body = {"": values["IM_SIZE"], **sizes}, _BODY.replace(_ONE_SIZE, "IM_SIZE")
     return _HEAD + "\n".join(f"{name} = {value!r}" for name, value in values.items()) + "\n" + body

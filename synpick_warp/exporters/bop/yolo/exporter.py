@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import dataclasses
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 from synpick_warp.configs.splits import DataLayout
 from synpick_warp.exporters.base import ExportContext, SharedFiles
-from synpick_warp.exporters.bop.scene_exporter import SceneExporter
+from synpick_warp.exporters.bop.scene_exporter import SceneExporter, SceneImages
+from synpick_warp.exporters.bop.view import ViewSettings
 from synpick_warp.exporters.bop.yolo.label_files import CONTENTS, DATA, FOLDER, commit_scenes, image_list, write_data_file, write_view
 from synpick_warp.exporters.writing.files import output_errors
 from synpick_warp.exporters.writing.notes import note_files, write_notes
@@ -58,11 +59,11 @@ class YoloExporter(SceneExporter):
         places = [*map(image_list, scenes), *folders]
         return sorted(place for place in places if os.path.lexists(self._out / place))
 
-    def _stage_scene(self, scene: Path) -> None:
+    def _stage_scene(self, scene: Path, settings: ViewSettings) -> None:
         scene.mkdir()
         for kind in CONTENTS:
             (scene / kind).mkdir()
 
-    def _commit_task(self, scenes: tuple[tuple[Path, int], ...], images: Sequence[int]) -> tuple[Callable[..., None], tuple[Any, ...]]:
+    def _commit_task(self, scenes: tuple[tuple[Path, int], ...], images: SceneImages) -> tuple[Callable[..., None], tuple[Any, ...]]:
         split = self._context.layout.folder(scenes[0][1] // len(self._cameras))
         return commit_scenes, (scenes, self._out, split, images)

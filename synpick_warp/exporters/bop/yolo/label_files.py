@@ -90,16 +90,16 @@ def _format_row(index: int, points: np.ndarray) -> str:
     return f"{index} {' '.join(f'{value:.6f}' for value in points.ravel().tolist())}\n"
 
 
-def commit_scenes(scenes: tuple[tuple[Path, int], ...], out: Path, split: str, frames: Sequence[int]) -> None:
+def commit_scenes(scenes: tuple[tuple[Path, int], ...], out: Path, split: str, frames: Sequence[Sequence[int]]) -> None:
     """Task: complete an episode's scenes, (staging folder, scene_id): list their images, and rename all to their places in a split.
 
     Raises:
         OutputError: Not all `frames` (im_id) of a scene have arrived.
     """
-    for scene, scene_id in scenes:
+    for (scene, scene_id), own in zip(scenes, frames, strict=True):
         images = sorted(os.listdir(scene / IMAGES))
-        if [image_name(scene_id, frame) for frame in frames] != [name.partition(".")[0] for name in images]:
-            raise OutputError(f"{scene} has {len(images)} of {len(frames)} frames; this is an error of synpick-warp, please report it")
+        if [image_name(scene_id, frame) for frame in own] != [name.partition(".")[0] for name in images]:
+            raise OutputError(f"{scene} has {len(images)} of {len(own)} frames; this is an error of synpick-warp, please report it")
         lines = "".join(f"./{IMAGES}/{split}/{scene_id:06d}/{name}\n" for name in images)
         write_synced(scene / "list", lines.encode())
         (scene / "list").rename(out / image_list(scene_id))
