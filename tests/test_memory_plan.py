@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
+import warp as wp
 from hypothesis import given
 from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
 
+from synpick_warp.configs.bins import BinRow
 from synpick_warp.configs.fields import INT32_MAX
 from synpick_warp.configs.load import load_config, sections, settings_of
 from synpick_warp.configs.schema import FAST, REFERENCE, UNOCCLUDED, Config, Physics, Settle
@@ -207,8 +210,6 @@ def test_the_plan_is_below_what_a_small_bake_allocates(device):
     """Lower bound: Newton's terms are at most what building its model and solver allocates on a CPU."""
     if device.is_cuda:
         pytest.skip("allocations of a GPU's memory pool are not counted by this test")
-    import warp as wp
-
     from synpick_warp.scenes.build import build_model
     from synpick_warp.stages.sim.physics import Physics
     from tests.worlds.small_worlds import catalog
@@ -232,6 +233,16 @@ def test_without_paths_images_need_less():
         terms = plan_memory(settings(render__mode=mode), CPU)
         sizes[mode] = sum(term.size for term in terms if "image" in term.name or "light" in term.name)
     assert sizes[REFERENCE] < sizes[UNOCCLUDED] < sizes[FAST]
+
+
+def test_shapes_of_bins_take_a_separating_axis_a_pair():
+    """Floor, four walls, four corners and four guide walls of each bin, and a shape for each of 24 objects."""
+    base = load_config("smoke", {"bake.worlds": 5})
+    config = replace(base, bins=replace(base.bins, kind="own"), bin=(BinRow(name="a"), BinRow(name="b")))
+    sizes = {term.name: term.size for term in plan_memory(config, wp.get_device("cpu"))}
+    shapes = 2 * (9 + 4) + 24
+    assert sizes["separating axes of shape pairs"] == 4 * 5 * shapes * (shapes - 1) // 2
+    assert "separating axes of shape pairs" not in {term.name for term in plan_memory(base, wp.get_device("cpu"))}
 
 
 def test_the_plan_has_the_arrays_of_all_stages_and_its_estimates():

@@ -57,6 +57,7 @@ def baked(tmp_path_factory):
         "bake.formats": list(FORMATS),
         "bake.episodes": 1,
         "bake.worlds": 1,
+        "cameras.resolution": [96, 54],
         "objects.unit": "mm",
         "objects.center": True,
         "arrangement.max_objects": 3,
