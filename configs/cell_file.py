@@ -100,8 +100,6 @@ _MEASURED: dict[str, Any] = {
     "jitter": Jitter(
         Distribution("normal", ((0.0,), (0.002,))),
         Distribution("normal", ((0.0,), (0.2,))),
-        Distribution("uniform", ((-0.005,), (0.005,))),
-        Distribution("uniform", ((-1.0,), (1.0,))),
     ),
 }
 """Example of a camera with lens and pose by numbers, and with jitter about them."""

@@ -132,9 +132,13 @@ class EpisodeCameras:
 
 
 def carry(rotation: np.ndarray, translation: np.ndarray, pose: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """World-to-camera rotations (B, 3, 3) and translations (B, 3) [m] of cameras in what carries them, by its pose (B, 7) in the world."""
-    at = pose[:, :3].astype(np.float64)
-    turned = rotation @ Rotation.from_quat(pose[:, 3:].astype(np.float64)).as_matrix().transpose(0, 2, 1)
+    """World-to-camera rotations (B, 3, 3) and translations (B, 3) [m] of cameras in what carries them, by its pose (B, 7) in the world.
+
+    Poses of zeros, which snapshots have before their first tick and in dry runs, are the identity.
+    """
+    at, quaternion = pose[:, :3].astype(np.float64), pose[:, 3:].astype(np.float64)
+    quaternion[~quaternion.any(axis=1), 3] = 1.0
+    turned = rotation @ Rotation.from_quat(quaternion).as_matrix().transpose(0, 2, 1)
     return turned, translation - np.einsum("nij,nj->ni", turned, at)
 
 

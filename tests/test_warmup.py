@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
 
 import pytest
 import warp as wp
 
 from synpick_warp.cli.main import main
+from synpick_warp.configs.cameras import CameraRow, Pose
 from synpick_warp.factory import assembly, warmup
 from synpick_warp.factory.compilation import launch_all
 from synpick_warp.newton_patches.narrow_phase import slow_builds
@@ -63,6 +65,15 @@ def test_dry_launches_find_all_that_a_warm_up_loads(device):
     assert found[0] == found[1] >= early.keys()
     assert {build: build.module.get_module_identifier(build.block) for build in early} == early
     assert all(build.is_cached() for build in found[0])
+
+
+def test_a_dry_run_takes_a_camera_on_the_gripper(device):
+    """Nothing has been simulated then: the poses of the gripper are zeros."""
+    row = CameraRow(fov=60.0, pose=Pose(position=(0.1, 0.0, 0.1), look_at=(0.0, 0.0, -0.1), up=(0.0, 1.0, 0.0)), fixed_to="gripper")
+    config = dataclasses.replace(settings(bake__mode="move", cameras__resolution=[32, 18]), camera=(row,))
+    factory = assembly.build_smallest(config, device, SilentProgress(), False, True)
+    with DryLaunches():
+        launch_all(factory.simulation, factory.stream)
 
 
 def test_a_cold_start_says_how_many_modules_it_compiles(monkeypatch):
