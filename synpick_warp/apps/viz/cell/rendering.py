@@ -71,6 +71,8 @@ class CellScene:
         self.device = device = pick_device(config.bake.device)
         self.sizes = config.cell.bins
         bins = make_bins(self.sizes)
+        for line in (line for one in bins for line in one.notes):
+            report(line)
         progress.stage("reading objects")
         self.objects = read_objects(config.bake.models, config.objects, config.object_rows, config.cell.bins, report)
         self.laid = [lay_out(self.objects, sizes) for sizes in self.sizes]
