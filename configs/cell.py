@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 from synpick_warp.configs.bins import NONE, OWN, PALLET, TOTE, BinRow, Bins, MeasuredBin, Tote
@@ -11,6 +11,7 @@ from synpick_warp.configs.bins import NONE, OWN, PALLET, TOTE, BinRow, Bins, Mea
 Sides = tuple[float, float]
 """Length (along x) and width (along y) [m]."""
 Point = tuple[float, float, float]
+Floor = tuple[float, float, float, float, float, float, float]
 DIVIDER = 0.01
 """Thickness of dividers [m]: more than an object at physics.max_speed moves in one step."""
 
@@ -111,6 +112,11 @@ class BinSizes:
         """Opening of each compartment."""
         return [one[2:4] for one in self.measured.compartments] if self.measured else [self.mouth] * len(self.centers)
 
+    @property
+    def floors(self) -> Sequence[Floor]:
+        """Inner floor of each compartment: centre x, y, length and width; and its height z = a x + b y + c."""
+        return self.measured.compartments if self.measured else [(*center, *self.cell, 0.0, 0.0, 0.0) for center in self.centers]
+
     def waypoints(self, corner: float, height: float) -> list[list[Point]]:
         """Points near the four corners of each compartment.
 
@@ -118,12 +124,9 @@ class BinSizes:
             corner: Where they are, as a fraction of the way from the centre to the corners of the floor.
             height: Their height above the floor [m].
         """
-        if self.measured is None:
-            x, y = (corner * side / 2 for side in self.cell)
-            return [[(i * x + center[0], j * y + center[1], height) for j in (1, -1) for i in (1, -1)] for center in self.centers]
         return [
             [(x, y, a * x + b * y + c + height) for y in (cy + corner * width / 2, cy - corner * width / 2) for x in (cx + s, cx - s)]
-            for cx, cy, length, width, a, b, c in self.measured.compartments
+            for cx, cy, length, width, a, b, c in self.floors
             for s in (corner * length / 2,)
         ]
 

@@ -58,9 +58,8 @@ class NewCell:
 
 def cell_toml(cell: NewCell, name: str) -> str:
     """TOML text of a cell; `name`: its folder."""
-    one, cameras = cell.bin, [camera.name for camera in cell.cameras]
-    height = one.outer_size[2] - one.wall
-    inside = height * sum(side[0] * side[1] for side in (one.floor_size, one.rim_size)) / 2.0
+    cameras = [camera.name for camera in cell.cameras]
+    inside, shape, shapes = _bin(cell.bin)
     volume = float(f"{max(FILL * inside, cell.volume):.2g}")
     parts = {"unit": cell.unit, "center": cell.center, "symmetries": "detect"} if cell.models else {}
     mass = {"id": 1, "name": "NAME", "diameter": 0.0, "mass": 0.1, "metallic": 0.6, "roughness": 0.3}
@@ -75,8 +74,7 @@ def cell_toml(cell: NewCell, name: str) -> str:
     lines += _section("perception", {"camera": cameras[0], "resolution": cell.perception}, {})
     lines += _title("Bin")
     lines += _section("bins", {"kind": "own"}, {"shift": (0.02, 0.02), "yaw": 5.0})
-    shape = {name: getattr(one, name) for name in ("name", "outer_size", "floor_size", "rim_size", "wall", "color")}
-    lines += _table("[[bin]]", "bin", shape, {"compartments": (2, 1), "divider_height": round(height / 2.0, 3)})
+    lines += _table("[[bin]]", "bin", shape, shapes)
     lines += _title("Parts")
     lines += _section("arrangement", {"volume": volume, "max_objects": _FEW}, {})
     lines += _section("objects", parts, {} if cell.models else {"unit": "mm", "symmetries": "detect"})
@@ -90,6 +88,18 @@ def cell_toml(cell: NewCell, name: str) -> str:
     return "\n".join(lines).rstrip() + "\n"
 
 
+def _bin(row: BinRow) -> tuple[float, dict[str, Any], dict[str, Any]]:
+    """Volume of the inside of a bin [m³], its settings, and examples of others."""
+    if row.measured:
+        height = row.measured.height
+        inside = sum(length * width * (height - a * x - b * y - c) for x, y, length, width, a, b, c in row.measured.compartments)
+        return inside, {name: getattr(row, name) for name in ("name", "file", "unit", "up")}, {"color": row.color}
+    height = row.outer_size[2] - row.wall
+    inside = height * sum(side[0] * side[1] for side in (row.floor_size, row.rim_size)) / 2.0
+    shape = {name: getattr(row, name) for name in ("name", "outer_size", "floor_size", "rim_size", "wall", "color")}
+    return inside, shape, {"compartments": (2, 1), "divider_height": round(height / 2.0, 3)}
+
+
 _MEASURED: dict[str, Any] = {
     "name": "measured",
     "resolution": (640, 480),
@@ -97,12 +107,9 @@ _MEASURED: dict[str, Any] = {
     "distortion": (-0.12, 0.08, 0.0005, -0.0003, 0.0),
     "model": "pinhole",
     "pose": Pose(matrix=((1.0, 0.0, 0.0, 0.0), (0.0, -1.0, 0.0, 0.0), (0.0, 0.0, -1.0, 1.2), (0.0, 0.0, 0.0, 1.0))),
-    "jitter": Jitter(
-        Distribution("normal", ((0.0,), (0.002,))),
-        Distribution("normal", ((0.0,), (0.2,))),
-    ),
+    "jitter": Jitter(Distribution("normal", ((0.0,), (0.002,))), Distribution("normal", ((0.0,), (0.2,)))),
 }
-"""Example of a camera with lens and pose by numbers, and with jitter about them."""
+"""Example of a camera with lens and pose by numbers, and with jitter of the pose about them."""
 _RANDOMIZED: dict[str, Any] = {
     "object_hue": Distribution("normal", ((0.0,), (10.0,))),
     "object_brightness": Distribution("log_uniform", ((0.7,), (1.4,))),

@@ -39,8 +39,6 @@ from synpick_warp.configs.check import describe_allowed
 from synpick_warp.configs.load import (
     COMMAND_LINE,
     DEFAULT_PRESET,
-    load_config,
-    override_config,
     parse_assignment,
     preset_names,
     sections,
@@ -50,6 +48,7 @@ from synpick_warp.configs.schema import Config
 from synpick_warp.configs.splits import DataLayout
 from synpick_warp.configs.write import config_to_toml
 from synpick_warp.errors import CatalogError, ConfigError, LightError, SynpickError
+from synpick_warp.scenes.bin_meshes.loading import load_settings
 from synpick_warp.system.processes.garbage import collection_paused
 from synpick_warp.system.processes.interrupt import KeptInterrupt
 
@@ -316,12 +315,7 @@ def _resolve(
     overrides |= {key: value for key, value in given.items() if value is not None}
     if resolution is not None:
         overrides["cameras.resolution"] = parse_resolution(resolution)
-    resolved = load_config(config, overrides, source=COMMAND_LINE, splits=splits)
-    if not any(row.file for row in resolved.bin):
-        return resolved
-    from synpick_warp.scenes.bin_meshes.reading import measure_bins
-
-    return override_config(resolved, measure_bins(resolved.bin))
+    return load_settings(config, overrides, source=COMMAND_LINE, splits=splits)
 
 
 def check_trace_file(trace: Path, out: Path) -> None:

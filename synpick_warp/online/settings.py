@@ -5,8 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from pathlib import Path
 
-from synpick_warp.configs.load import load_config, override_config
+from synpick_warp.configs.load import override_config
 from synpick_warp.configs.schema import Config
+from synpick_warp.scenes.bin_meshes.loading import load_settings
 from synpick_warp.scenes.bin_meshes.reading import measure_bins
 
 ARGUMENTS = {
@@ -41,9 +42,10 @@ def resolve_settings(
     if given.get("bake.worlds") == "auto":  # As the command line has it.
         given["bake.worlds"] = 0
     overrides = dict(settings) | given
-    is_resolved = isinstance(config, Config)
-    found = override_config(config, overrides) if is_resolved else load_config(config, overrides, splits=splits)
-    return override_config(found, measured) if (measured := measure_bins(found.bin)) else found
+    if not isinstance(config, Config):
+        return load_settings(config, overrides, splits=splits)
+    config = override_config(config, overrides)
+    return override_config(config, measure_bins(config.bin))
 
 
 def _plain(value: object) -> object:

@@ -18,8 +18,10 @@ from synpick_warp.configs.cell_file import WIDTH
 from synpick_warp.configs.load import load_config
 from synpick_warp.configs.rig import intrinsics
 from synpick_warp.errors import LightError
+from synpick_warp.scenes.bin_meshes.loading import load_settings
 from synpick_warp.scenes.cameras import make_cameras
 from tests.builders import mistake, run
+from tests.worlds.bin_meshes import sloped_bin
 from tests.worlds.model_files import OBJ, exported, put
 
 K = np.array([[275.0, 0.0, 163.3], [0.0, 274.6, 117.0], [0.0, 0.0, 1.0]])
@@ -79,9 +81,11 @@ def test_a_cell_without_options_is_complete(tmp_path, monkeypatch):
     assert config.cell.bins[0].outer == (0.6, 0.4)
 
 
-def test_each_setting_is_explained_and_each_example_is_valid(tmp_path, monkeypatch, drawn):
+@pytest.mark.parametrize("options", [[], ["--bin", "kanban.stl"]])
+def test_each_setting_is_explained_and_each_example_is_valid(tmp_path, monkeypatch, drawn, options):
     monkeypatch.chdir(tmp_path)
-    assert run("new-cell", "cell").code == 0
+    put(tmp_path / "kanban.stl", exported(sloped_bin(), "stl"))
+    assert run("new-cell", "cell", *options).code == 0
     text = Path("cell/cell.toml").read_text()
     lines = text.splitlines()
     assert max(len(line) for line in lines if line.startswith("# ")) <= WIDTH
@@ -95,8 +99,9 @@ def test_each_setting_is_explained_and_each_example_is_valid(tmp_path, monkeypat
             explained.add((table, setting[1]))
     assert len(explained) > 40
     said = text.replace("\n# ", " ")
-    for word in ("[px]", "[°]", "[m]", "[m³]", "[kg]", "[sRGB]", "Allowed: above 0, at most 10.", "at least -180, at most 180"):
+    for word in ("[px]", "[°]", "[m]", "[m³]", "[kg]", "[sRGB]", "at least -180, at most 180"):
         assert word in said
+    assert ("Allowed: above 0, at most 10." in said) == (not options)  # Of a divider's height.
     path = Path("cell/all.toml")
     path.write_text(re.sub(r"^#(?=[\[a-z])", "", text, flags=re.MULTILINE))
     config = load_config(path)
@@ -169,6 +174,35 @@ def test_a_large_part_has_its_volume_and_a_folder_is_named(tmp_path, drawn):
 
 
 @pytest.mark.parametrize(
+    ("file", "options", "up", "kept"),
+    [
+        ("kanban 1.stl", ["--bin-unit", "mm"], "z", "bins/kanban 1.stl"),
+        ("kanban.ply", ["--bin-unit", "mm"], "z", "bins/kanban.ply"),
+        ("kanban.glb", ["--bin-unit", "mm", "--bin-up", "y"], "y", "bins/kanban.glb"),
+        ("kanban.obj", ["--bin-unit", "mm"], "z", "../in/kanban.obj"),
+    ],
+)
+def test_a_bin_is_that_of_its_mesh(tmp_path, drawn, file, options, up, kept):
+    mesh = sloped_bin()
+    mesh.apply_scale(1e3)
+    if up == "y":
+        mesh.apply_transform(trimesh.transformations.rotation_matrix(-np.pi / 2, (1.0, 0.0, 0.0)))
+    path = put(tmp_path / "in" / file, (b"mtllib gone.mtl\n" if file.endswith("obj") else b"") + exported(mesh, file[-3:]))
+    assert run("new-cell", tmp_path / "cell", "--bin", path, *options).code == 0
+    assert f'file = "{kept}"' in (tmp_path / "cell" / "cell.toml").read_text()
+    config = load_settings(tmp_path / "cell" / "cell.toml")
+    assert (config.bin[0].name, config.bin[0].unit, config.bin[0].up) == ("bin", "mm", up)
+    assert Path(config.bin[0].file or "").read_bytes() == path.read_bytes()
+    (sizes,) = config.cell.bins
+    assert (*sizes.outer, sizes.height, sizes.base) == pytest.approx((0.408, 0.308, 0.2, -0.004), abs=1e-3)
+    # A tenth of the inside: the floor rises by 40 mm, and the divider takes 6 mm of 400.
+    assert config.arrangement.volume == pytest.approx(0.1 * 0.394 * 0.3 * 0.18, rel=0.03)
+    for camera in make_cameras(config.rig):
+        pixels, _ = project(camera, np.array(sizes.corners))
+        assert ((pixels > 0.0) & (pixels < (640.0, 480.0))).all()
+
+
+@pytest.mark.parametrize(
     ("arguments", "said"),
     [
         (["full"], "full is not empty; new-cell takes a new or an empty folder"),
@@ -190,6 +224,19 @@ def test_a_large_part_has_its_volume_and_a_folder_is_named(tmp_path, drawn):
             "--bin is 600 x 400 x 220 m; allowed: 0.08 to 3 m long and wide, 0.03 to 1 m high; did you mean mm?",
         ),
         (["c", "--bin", "0.6x0.4x0.001"], "--bin is 0.6 x 0.4 x 0.001 m; allowed"),
+        (["c", "--bin", "in"], '--bin is "in"; allowed: LENGTHxWIDTHxHEIGHT in metres, or as 600x400x220mm, or a mesh file'),
+        (["c", "--bin", "gone.stl"], "gone.stl cannot be read (No such file or directory)"),
+        (["c", "--bin", "void.stl"], "void.stl: "),
+        (
+            ["c", "--bin", "bin.stl"],
+            "bin.stl is 408 x 308 x 204 m, unit m; allowed: a longest side of 0.02 to 10 m; did you mean --bin-u",
+        ),
+        (["c", "--bin", "bin.stl", "--bin-unit", "mm", "--bin-up", "x"], "bin.stl has no inside as seen from above, with up = x"),
+        (["c", "--bin", "bin.stl", "--bin-unit", "inch"], '--bin-unit is "inch"; allowed: m, cm, mm, in'),
+        (["c", "--bin", "bin.stl", "--bin-up", "w"], '--bin-up is "w"; allowed: z, -z, y, -y, x, -x'),
+        (["c", "--bin-unit", "mm"], "--bin-unit is given without a mesh file; allowed: beside --bin FILE"),
+        (["c", "--bin", "bin.stl", "--bin-unit", "mm", "--part", "nut.stl"], "nut: too large for the bin"),
+        (["c", "--bin", "b\udcff.stl", "--bin-unit", "mm"], "cannot write c/cell.toml: the name of a file or folder in it is not UTF-8"),
         (["c", "--part", "gone.stl"], "there is no file gone.stl"),
         (["c", "--part", "empty.yaml"], '--part is "empty.yaml"; allowed: a file that ends in'),
         (["c", "--part", "a.obj"], "--part is a.obj, which refers to other files; name its folder"),
@@ -209,6 +256,10 @@ def test_mistakes_are_one_line_and_leave_nothing(tmp_path, monkeypatch, drawn, a
     put(tmp_path / "a.obj", OBJ.encode())
     for name in ("nut.stl", "in/nut.stl"):
         put(tmp_path / name, exported(trimesh.creation.cylinder(10.0, 8.0, sections=6), "stl"))
+    kanban = sloped_bin()
+    kanban.apply_scale(1e3)
+    for name in ("bin.stl", "b\udcff.stl"):
+        put(tmp_path / name, exported(kanban, "stl"))
     put(tmp_path / "flat.stl", exported(trimesh.Trimesh(np.eye(3) * 10.0, [(0, 1, 2), (0, 2, 1)]), "stl"))
     put(tmp_path / "zivid.json", json.dumps({"CameraIntrinsics": ZIVID}).encode())
     opencv(tmp_path / "skew.yaml", matrix=K + np.array([[0.0, 3.0, 0.0], [0.0] * 3, [0.0] * 3]))

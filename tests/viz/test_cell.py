@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -12,8 +13,10 @@ from synpick_warp.apps.viz.cell.frusta import Canvas, center, draw_camera, footp
 from synpick_warp.apps.viz.cell.rendering import CellScene, Picture, lay_out, scaled_down
 from synpick_warp.apps.viz.cell.sheet import describe_camera
 from synpick_warp.configs.load import load_config
+from synpick_warp.scenes.bin_meshes.loading import load_settings
 from synpick_warp.scenes.embedded.objects import procedural_objects
 from tests.builders import mistake, run
+from tests.worlds.bin_meshes import sloped_bin
 from tests.worlds.toy_scene import camera, distorted
 
 BEHIND = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
@@ -78,6 +81,29 @@ def test_a_camera_is_drawn_to_scale():
     assert (columns.min() + 1, columns.max()) == pytest.approx((200 - 160 / 3.4, 200 + 160 / 3.4), abs=2)
 
 
+@pytest.fixture
+def sloped(tmp_path) -> Path:
+    """Settings of a bin of a mesh, whose floor rises, with a divider, modelled 1 m away; both cameras look at it."""
+    sloped_bin().apply_translation((1.0, 0.0, 0.5)).export(tmp_path / "sloped.stl")
+    text = CELL.replace("[0.0, -0.4, 1.1]", "[1.0, -0.4, 1.6]").replace("[0.0, 0.0, 0.1]", "[1.0, 0.0, 0.6]")
+    text = text.replace("[0.0, 0.0, 1.2]", "[1.0, 0.0, 1.7]").replace("[0.0, 0.0, 0.0]", "[1.0, 0.0, 0.5]")
+    bins = '[bins]\nkind = "own"\n[[bin]]\nname = "sloped"\nfile = "sloped.stl"\nplace = "file"\ncolor = [0.65, 0.05, 0.04]\n'
+    (tmp_path / "cell.toml").write_text(text + bins)
+    return tmp_path / "cell.toml"
+
+
+def test_objects_lie_on_a_slope_and_in_one_compartment(sloped):
+    sizes, objects = load_settings(sloped).cell.bins[0], procedural_objects()
+    laid = lay_out(objects, sizes)
+    assert len(laid.indices) > 3
+    for index, place in zip(laid.indices, laid.positions, strict=True):
+        points = objects[index].mesh.vertices
+        (left, front, bottom), (right, back, _) = points.min(axis=0) + place, points.max(axis=0) + place
+        assert -0.2 < left < right < 0.047
+        assert -0.15 < front < back < 0.15
+        assert bottom == pytest.approx(0.04 * (right + 0.2) / 0.4, abs=2e-3)
+
+
 def test_objects_lie_side_by_side_on_the_floor():
     for preset, settings in (("smoke", {}), ("tabletop", {}), ("smoke", {"bins.kind": "pallet"})):
         sizes, objects = load_config(preset, settings).cell.bins[0], procedural_objects()
@@ -127,9 +153,13 @@ pose = { position = [0.0, 0.0, 1.2], look_at = [0.0, 0.0, 0.0], up = [0.0, 1.0, 
 """
 
 
-def test_the_command_draws_a_cell(tmp_path):
+@pytest.mark.parametrize("own", [False, True])
+def test_the_command_draws_a_cell(tmp_path, own, request):
     cell = tmp_path / "cell.toml"
-    cell.write_text(CELL)
+    if own:
+        request.getfixturevalue("sloped")
+    else:
+        cell.write_text(CELL)
     ran = run("preview", "--cell", cell)
     assert ran.code == 0, ran.err
     assert ran.out.endswith(f"cell: {tmp_path / 'cell.png'}\n")
@@ -138,7 +168,7 @@ def test_the_command_draws_a_cell(tmp_path):
     # Both panels show the red tote, and cameras are drawn in colours of their own.
     panels = sheet[-560:, :1000].astype(int)
     assert ((panels[..., 2] > 80) & (panels[..., 1] < 40))[:, :480].any()
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["cell.png", "cell.toml"]
+    assert {path.name for path in tmp_path.iterdir()} - {"sloped.stl"} == {"cell.png", "cell.toml"}
 
 
 @pytest.mark.parametrize(

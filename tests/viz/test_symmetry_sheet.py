@@ -13,6 +13,7 @@ from synpick_warp.apps.viz.symmetries import group_turns
 from synpick_warp.cli.main import main
 from synpick_warp.scenes.embedded.objects import procedural_objects
 from synpick_warp.scenes.symmetries.detection import turn_matrix
+from tests.worlds.bin_meshes import sloped_bin
 from tests.worlds.model_files import exported, put
 
 
@@ -48,6 +49,15 @@ def test_the_symmetries_of_a_folder_of_parts(tmp_path, capsys):
     assert image is not None
     assert image.shape[1] == 5 * image.shape[0] * 260 // 304  # The part, and four rotations.
     assert len(np.unique(image.reshape(-1, 3), axis=0)) > 10
+
+
+def test_parts_are_compared_with_the_bins_mesh(tmp_path, capsys):
+    """A part that does not fit into a bin of the default size."""
+    put(tmp_path / "parts" / "plate.stl", exported(trimesh.creation.box((0.6, 0.5, 0.1)), "stl"))
+    sloped_bin().apply_scale(3.0).export(tmp_path / "bin.stl")
+    put(tmp_path / "cell.toml", "preset = 'smoke'\n[bins]\nkind = 'own'\n[[bin]]\nname = 'large'\nfile = 'bin.stl'\n")
+    assert main(["preview", str(tmp_path / "parts"), "--symmetries", "--config", str(tmp_path / "cell.toml")]) == 0
+    assert "plate.stl: symmetries detected" in capsys.readouterr().out
 
 
 def test_the_symmetries_that_a_data_set_states(picked_set, tmp_path, capsys):

@@ -17,20 +17,21 @@ from cyclopts import Parameter
 from synpick_warp.cli.commands.pictures import draw_cell
 from synpick_warp.cli.folders import check_output_file
 from synpick_warp.cli.options import parse_resolution
+from synpick_warp.configs.bins import AXES, BinRow
 from synpick_warp.configs.calibration.files import MODELS, read_calibration
 from synpick_warp.configs.camera_rules import NAME, RESERVED
 from synpick_warp.configs.cameras import CameraRow
 from synpick_warp.configs.cell import BinSizes
 from synpick_warp.configs.cell_file import NewCamera, NewCell, bin_of_size, cell_toml
-from synpick_warp.configs.load import load_config
 from synpick_warp.configs.objects import AUTO_UNIT, UNITS
 from synpick_warp.configs.rig import lens_map
 from synpick_warp.configs.schema import Config
 from synpick_warp.errors import CatalogError, ConfigError, OutputError, SynpickError, escape, format_value, suggest
+from synpick_warp.scenes.bin_meshes.loading import load_settings
 from synpick_warp.system.folders import make_folder
 from synpick_warp.system.inputs.files import read_file
 
-CELL, PICTURE, PARTS = "cell.toml", "cell.png", "parts"
+CELL, PICTURE, PARTS, BINS = "cell.toml", "cell.png", "parts", "bins"
 _FOV, _RESOLUTION = 40.0, (640, 480)
 """Of cameras without a calibration file [°, px]."""
 _SIZE = re.compile(r"([0-9.]{1,12})[xX]([0-9.]{1,12})[xX]([0-9.]{1,12}) ?(mm|cm|m|in)?")
@@ -57,8 +58,19 @@ def new_cell(
         ),
     ] = None,
     bin_: Annotated[
-        str, Parameter(name="--bin", help="Outer size of the bin, LENGTHxWIDTHxHEIGHT in metres, or as 600x400x220mm.")
+        str,
+        Parameter(
+            name="--bin",
+            help="Outer size of the bin, LENGTHxWIDTHxHEIGHT in metres, or as 600x400x220mm; or its mesh file (STL, PLY, OBJ, glTF, STEP), "
+            "which is copied unless it refers to other files.",
+        ),
     ] = "0.6x0.4x0.2",
+    bin_unit: Annotated[
+        str | None, Parameter(help=f"Unit of the bin's mesh file, whatever that of the parts: {', '.join(UNITS)} (default: m; bin.unit).")
+    ] = None,
+    bin_up: Annotated[
+        str | None, Parameter(help=f"Axis of the bin's mesh file that points up: {', '.join(AXES)} (default: z; bin.up).")
+    ] = None,
     part: Annotated[
         list[Path] | None,
         Parameter(
@@ -80,20 +92,18 @@ def new_cell(
     Exit codes: 0; 2, DIR is not empty, or a file or size cannot be used; then nothing is written.
     """
     from synpick_warp.apps.viz.cell.poses import pose_for
-    from synpick_warp.scenes.assets.asset_files import MAX_MESH_FILE
 
     place = Path(os.path.realpath(folder))
     _check_folder(folder, place)
     _check_parts(parts := part or [], unit)
-    shape = bin_of_size(_parse_size(bin_))
+    shape = _read_bin(bin_, bin_unit, bin_up)
     with _staged(folder, place) as stage:
         copied = [file for file in parts if not file.is_dir()]
         for file in copied:
-            (stage / PARTS).mkdir(exist_ok=True)
-            (stage / PARTS / file.name).write_bytes(read_file(file, MAX_MESH_FILE, CatalogError))
+            _copy(file, stage / PARTS)
         models = os.path.realpath(parts[0]) if parts and not copied else str(place / PARTS) if parts else ""
         rows = _read_cameras(calibration or [], resolution, lens or "", stage)
-        sizes = BinSizes.of_row(shape)
+        sizes, shape = BinSizes.of_row(shape), _copy_bin(shape, stage)
         cameras = [NewCamera(row.name, given, pose_for(row, index, sizes)) for index, (row, given) in enumerate(rows)]
         width, height = rows[0][0].resolution or _RESOLUTION
         perception = (_PERCEPTION, max(_LEAST, round(_PERCEPTION * height / width)))
@@ -123,7 +133,6 @@ def _check_parts(parts: Sequence[Path], unit: str | None) -> None:
     Raises:
         ConfigError: One is missing or refers to other files, two have one name, a folder stands beside others, or the unit is unknown.
     """
-    from synpick_warp.scenes.assets.asset_files import MAX_MESH_FILE
     from synpick_warp.scenes.assets.meshes import SUFFIXES
 
     if unit is not None and unit not in UNITS:
@@ -140,9 +149,63 @@ def _check_parts(parts: Sequence[Path], unit: str | None) -> None:
             continue
         if file.suffix.lower() not in SUFFIXES:
             raise ConfigError(f"--part is {format_value(str(file))}; allowed: a file that ends in {', '.join(SUFFIXES)}, or a folder")
-        mark = _OTHER_FILES.get(file.suffix.lower())
-        if mark and re.search(mark, read_file(file, MAX_MESH_FILE, CatalogError), re.MULTILINE):
+        if _refers(file):
             raise ConfigError(f"--part is {file}, which refers to other files; name its folder, which is then used where it is")
+
+
+def _content(file: Path) -> bytes:
+    """Content of a mesh file."""
+    from synpick_warp.scenes.assets.asset_files import MAX_MESH_FILE
+
+    return read_file(file, MAX_MESH_FILE, CatalogError)
+
+
+def _refers(file: Path) -> bool:
+    """Whether a mesh file refers to other files."""
+    mark = _OTHER_FILES.get(file.suffix.lower())
+    return mark is not None and re.search(mark, _content(file), re.MULTILINE) is not None
+
+
+def _copy(file: Path, folder: Path) -> None:
+    """Copy a mesh file into a folder, which is created."""
+    folder.mkdir(exist_ok=True)
+    (folder / file.name).write_bytes(_content(file))
+
+
+def _read_bin(text: str, unit: str | None, up: str | None) -> BinRow:
+    """Bin of a size, or of a mesh file, which is measured.
+
+    Raises:
+        ConfigError: There is neither, the file cannot be used as a bin, or its options are unknown or without it.
+    """
+    from synpick_warp.scenes.assets.meshes import SUFFIXES
+    from synpick_warp.scenes.bin_meshes.reading import read_bin
+
+    is_mesh = Path(text).suffix.lower() in SUFFIXES
+    for name, value, allowed in (("--bin-unit", unit, tuple(UNITS)), ("--bin-up", up, AXES)):
+        if value is not None and not is_mesh:
+            raise ConfigError(f"{name} is given without a mesh file; allowed: beside --bin FILE, which ends in {', '.join(SUFFIXES)}")
+        if value is not None and value not in allowed:
+            raise ConfigError(f"{name} is {format_value(value)}; allowed: {', '.join(allowed)}{suggest(value, list(allowed))}")
+    if not is_mesh:
+        return bin_of_size(_parse_size(text))
+    row = BinRow(name="bin", file=os.path.abspath(text), unit=unit or "m", up=up or "z")
+    try:
+        return replace(row, measured=read_bin(row).measured)
+    except ConfigError as error:
+        said = str(error).removeprefix(f"bin {row.name}: ").replace(os.path.abspath(text), text)
+        raise ConfigError(re.sub(r'\b(unit|up) = "', r'--bin-\1 "', said)) from None
+
+
+def _copy_bin(row: BinRow, stage: Path) -> BinRow:
+    """Copy the mesh of a bin, if it has one; the name of its file becomes relative. One that refers to others is used where it is."""
+    if not row.file:
+        return row
+    file = Path(row.file)
+    if _refers(file):
+        return replace(row, file=os.path.relpath(os.path.realpath(file), stage))
+    _copy(file, stage / BINS)
+    return replace(row, file=f"{BINS}/{file.name}")
 
 
 def _parse_size(text: str) -> tuple[float, float, float]:
@@ -157,7 +220,7 @@ def _parse_size(text: str) -> tuple[float, float, float]:
     except ValueError:
         numbers = []
     if not match or not numbers:
-        raise ConfigError(f"--bin is {format_value(text)}; allowed: LENGTHxWIDTHxHEIGHT in metres, or with a unit, as 600x400x220mm")
+        raise ConfigError(f"--bin is {format_value(text)}; allowed: LENGTHxWIDTHxHEIGHT in metres, or as 600x400x220mm, or a mesh file")
     length, width, height = (round(number * UNITS[match[4] or "m"], 6) for number in numbers)
     if not (_SIDES[0] <= min(length, width) <= max(length, width) <= _SIDES[1] and _HEIGHTS[0] <= height <= _HEIGHTS[1]):
         hint = "; did you mean mm?" if not match[4] and min(numbers) >= 10.0 else ""
@@ -183,6 +246,8 @@ def _staged(folder: Path, place: Path) -> Iterator[Path]:
             stage.rename(place)
     except SynpickError as error:
         raise type(error)(str(error).replace(str(stage), str(folder))) from None
+    except UnicodeEncodeError:
+        raise OutputError(f"cannot write {folder / CELL}: the name of a file or folder in it is not UTF-8; rename that") from None
     except OSError as error:
         raise OutputError(f"cannot write {folder}: {error.strerror or error}; free space or rights there, or name another folder") from None
     finally:
@@ -245,7 +310,7 @@ def _write_cell(cell: NewCell, name: str, stage: Path, staged: Mapping[str, obje
 
     def write(cell: NewCell) -> Config:
         (stage / CELL).write_text(cell_toml(cell, name), encoding="utf-8")
-        return load_config(stage / CELL, staged)
+        return load_settings(stage / CELL, staged)
 
     def largest(cell: NewCell) -> float:
         config = write(cell)

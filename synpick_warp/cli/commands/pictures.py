@@ -13,6 +13,7 @@ from synpick_warp.cli.options import WholeNumber
 from synpick_warp.configs.load import load_config
 from synpick_warp.configs.objects import AUTO_UNIT, DECLARED, DETECT
 from synpick_warp.errors import ConfigError, escape
+from synpick_warp.scenes.bin_meshes.loading import load_settings
 
 
 def preview(
@@ -85,7 +86,9 @@ def _preview_symmetries(folder: Path | None, out: Path | None, config: str | Non
 
     check_picture_name(sheet)
     check_output_file(sheet, "--out", folder)
-    resolved = load_config(config, settings | {"bake.models": str(models)})
+    # A data set's settings have what its bins measured; their files may be gone.
+    load = load_config if is_set else load_settings
+    resolved = load(config, settings | {"bake.models": str(models)})
 
     def report(line: str) -> None:
         print(escape(line))
@@ -110,10 +113,10 @@ def _preview_cell(cell: str, out: Path | None) -> int:
 
 
 def draw_cell(preset_or_file: str | Path, settings: Mapping[str, object], name: str, out: Path, say: Callable[[str], str] = escape) -> None:
-    """Draw the cell of settings, as of `load_config`, with the progress on the console.
+    """Draw the cell of settings, as of `load_settings`, with the progress on the console.
 
     Args:
-        preset_or_file, settings: As of `load_config`.
+        preset_or_file, settings: As of `load_settings`.
         name: What the sheet is of, for its title.
         out: PNG or JPEG file to write.
         say: Words a note.
@@ -121,7 +124,7 @@ def draw_cell(preset_or_file: str | Path, settings: Mapping[str, object], name: 
     Raises:
         SynpickError: Settings, device, bins, cameras or all objects cannot be used, or the file cannot be written.
     """
-    config = load_config(preset_or_file, settings)
+    config = load_settings(preset_or_file, settings)
     from synpick_warp.apps.viz.cell.rendering import CellScene
     from synpick_warp.apps.viz.cell.sheet import write_cell_sheet
     from synpick_warp.cli.display import make_console, make_progress

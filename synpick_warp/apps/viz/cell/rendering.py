@@ -71,6 +71,8 @@ class CellScene:
         self.device = device = pick_device(config.bake.device)
         self.sizes = config.cell.bins
         bins = make_bins(self.sizes)
+        for line in (line for one in bins for line in one.notes):
+            report(line)
         progress.stage("reading objects")
         self.objects = read_objects(config.bake.models, config.objects, config.object_rows, config.cell.bins, report)
         self.laid = [lay_out(self.objects, sizes) for sizes in self.sizes]
@@ -80,13 +82,13 @@ class CellScene:
         with compiling_if_cold(smallest, device, progress):
             fixtures = make_fixtures(bins, config.gripper)
             any_camera = Camera(1, 1, np.eye(3), np.eye(3), np.zeros(3))
-            self.scene = build_render_scene(self.config.render, bins[0].sizes.base, catalog, fixtures, (any_camera,), (light,), device)
+            self.scene = build_render_scene(self.config.render, bins[0].sizes.ground, catalog, fixtures, (any_camera,), (light,), device)
         self.snapshot = self._snapshot()
 
     @property
     def tcp(self) -> tuple[float, float, float]:
         """Where the gripper is drawn: its cup over the highest rim [m]."""
-        return 0.0, 0.0, max(one.height for one in self.sizes) + OVER_RIM
+        return (*self.sizes[0].origin[:2], self.sizes[0].ground + max(one.height - one.base for one in self.sizes) + OVER_RIM)
 
     def placed(self, camera: Camera) -> Camera:
         """Camera in the world; one on the gripper where that is drawn."""
@@ -100,16 +102,16 @@ class CellScene:
         worlds = len(self.sizes) + 1
         place = np.zeros((worlds, len(FIXTURES), 7), np.float32)
         place[..., 6] = 1.0
-        place[:, 1:, 2] = self.tcp[2] + self.config.gripper.cup_length
+        place[:, 1:, :3] = (*self.tcp[:2], self.tcp[2] + self.config.gripper.cup_length)
         entries, poses = np.full((worlds, _MOST), -1), np.zeros((worlds, _MOST, 7), np.float32)
         poses[..., 6] = 1.0
         which = [*range(len(self.sizes)), 0]
         for world, index in enumerate(which):
-            place[world, 0, 2] = self.sizes[0].base - self.sizes[index].base
+            place[world, 0, :3] = (*self.sizes[index].origin[:2], self.sizes[0].ground - self.sizes[index].base)
             laid = self.laid[index]
             for slot, (entry, position) in enumerate(zip(laid.indices, laid.positions, strict=True)):
                 entries[world, slot], poses[world, slot, :3] = entry, position
-                poses[world, slot, 2] += place[world, 0, 2]
+                poses[world, slot, :3] += place[world, 0, :3]
         visible = np.ones((worlds, len(FIXTURES)), np.int32)
         visible[:, 0] = [self.sizes[index].is_visible for index in which]
         visible[-1, 1:] = 0
@@ -150,9 +152,12 @@ def scaled_down(camera: Camera, most: int = _PIXELS) -> Camera:
 
 
 def lay_out(objects: Sequence[RawObject], sizes: BinSizes) -> Laid:
-    """Lay as many objects on a bin's floor as there is room for, row by row, in their order; of the bin's compartments in the first."""
+    """Lay as many objects on a bin's floor as there is room for, row by row, in their order; of its compartments in the largest.
+
+    On a slope, they touch the floor where that is highest below them.
+    """
     laid = Laid([], [])
-    (left, front), (length, width) = sizes.centers[0], sizes.cell
+    left, front, length, width, a, b, c = max(sizes.floors, key=lambda floor: floor[2] * floor[3])
     left, front = left - length / 2, front - width / 2
     x, y, depth = _GAP, _GAP, 0.0
     for index, raw in enumerate(objects):
@@ -163,7 +168,8 @@ def lay_out(objects: Sequence[RawObject], sizes: BinSizes) -> Laid:
         if x + size[0] > length - _GAP or y + size[1] > width - _GAP or len(laid.indices) == _MOST:
             continue
         laid.indices.append(index)
-        laid.positions.append((left + x - float(low[0]), front + y - float(low[1]), -float(low[2])))
+        floor = c + max(a * (left + x), a * (left + x + float(size[0]))) + max(b * (front + y), b * (front + y + float(size[1])))
+        laid.positions.append((left + x - float(low[0]), front + y - float(low[1]), floor - float(low[2])))
         x, depth = x + float(size[0]) + _GAP, max(depth, float(size[1]))
     return laid
 

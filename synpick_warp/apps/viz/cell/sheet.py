@@ -104,7 +104,7 @@ def _draw_outside(scene: CellScene, index: int, outside: Camera, cameras: tuple[
     """The cell with one of its bins, from outside."""
     canvas, size = Canvas(scene.render(outside, index)), _size_of(cameras, scene)
     for number, (camera, name) in enumerate(zip(cameras, names, strict=True)):
-        draw_camera(canvas, camera, name, _color(number), size=_PYRAMID * size, floor=0.0, most=_FAR * size)
+        draw_camera(canvas, camera, name, _color(number), size=_PYRAMID * size, floor=scene.sizes[0].origin[2], most=_FAR * size)
     draw_axes(canvas, _round_length(min(scene.sizes[index].floor) / 2.0))
     if index == 0:
         canvas.label(np.array(scene.tcp), "gripper", INK, 0.45, (30, -30))
@@ -147,7 +147,7 @@ def describe_camera(camera: Camera, name: str, bin: BinSizes) -> list[str]:
     pixels, depth = project(camera, np.array(bin.inner_corners))
     inside = (depth > 0.0) & (pixels >= 0.0).all(axis=1) & (pixels <= (width, height)).all(axis=1)
     forward = camera.rotation[2]
-    distance = -center(camera)[2] / forward[2] if forward[2] < 0.0 else math.inf
+    distance = (bin.origin[2] - center(camera)[2]) / forward[2] if forward[2] < 0.0 else math.inf
     floor = f"{distance:.2f} m to the floor, {1e3 * distance / fx:.2g} mm/px" if distance < math.inf else "looks up"
     return [
         f"{name}: {width} x {height} px, {across:.1f} x {down:.1f} deg",

@@ -1,0 +1,33 @@
+"""Settings loading, with what the meshes of bins measure."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+
+from synpick_warp.configs.load import load_config, override_config
+from synpick_warp.configs.schema import Config
+
+
+def load_settings(
+    preset_or_file: Path | str | None = None,
+    settings: Mapping[str, object] | None = None,
+    *,
+    source: str = "in the settings passed",
+    splits: bool = False,
+) -> Config:
+    """Load a preset or a TOML file as `load_config` does, and measure the meshes of its bins.
+
+    Args:
+        preset_or_file, settings, source, splits: As of `load_config`.
+
+    Raises:
+        ConfigError: As of `load_config`, or a mesh cannot be used as a bin.
+    """
+    config = load_config(preset_or_file, settings, source=source, splits=splits)
+    if not any(row.file for row in config.bin):
+        return config
+    # Readers of meshes take a while to import.
+    from synpick_warp.scenes.bin_meshes.reading import measure_bins
+
+    return override_config(config, measure_bins(config.bin))
