@@ -44,6 +44,19 @@ _PERCEPTION, _LEAST = 640, 16
 _LONGEST = 28
 """Longest name of a camera, without a number behind it."""
 
+BinOption = Annotated[
+    str,
+    Parameter(
+        name="--bin",
+        help="Outer size of the bin, LENGTHxWIDTHxHEIGHT in metres, or as 600x400x220mm; or its mesh file (STL, PLY, OBJ, glTF, STEP), "
+        "which is copied unless it refers to other files.",
+    ),
+]
+BinUnitOption = Annotated[
+    str | None, Parameter(help=f"Unit of the bin's mesh file, whatever that of the parts: {', '.join(UNITS)} (default: m; bin.unit).")
+]
+BinUpOption = Annotated[str | None, Parameter(help=f"Axis of the bin's mesh file that points up: {', '.join(AXES)} (default: z; bin.up).")]
+
 
 def new_cell(
     folder: Annotated[Path, Parameter(name="DIR", help="Folder of the cell: new or empty.")],
@@ -57,20 +70,9 @@ def new_cell(
             "repeated, and names the camera (default: two cameras without distortion).",
         ),
     ] = None,
-    bin_: Annotated[
-        str,
-        Parameter(
-            name="--bin",
-            help="Outer size of the bin, LENGTHxWIDTHxHEIGHT in metres, or as 600x400x220mm; or its mesh file (STL, PLY, OBJ, glTF, STEP), "
-            "which is copied unless it refers to other files.",
-        ),
-    ] = "0.6x0.4x0.2",
-    bin_unit: Annotated[
-        str | None, Parameter(help=f"Unit of the bin's mesh file, whatever that of the parts: {', '.join(UNITS)} (default: m; bin.unit).")
-    ] = None,
-    bin_up: Annotated[
-        str | None, Parameter(help=f"Axis of the bin's mesh file that points up: {', '.join(AXES)} (default: z; bin.up).")
-    ] = None,
+    bin_: BinOption = "0.6x0.4x0.2",
+    bin_unit: BinUnitOption = None,
+    bin_up: BinUpOption = None,
     part: Annotated[
         list[Path] | None,
         Parameter(
