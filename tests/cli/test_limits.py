@@ -35,7 +35,7 @@ def test_a_limit_is_one_line(monkeypatch, capsys, error, said, wrapped):
             raise ValueError("a consequence") from error
         raise error
 
-    monkeypatch.setattr(commands, "load_config", fail)
+    monkeypatch.setattr(commands, "load_settings", fail)
     assert main(["config"]) == 2
     (line,) = capsys.readouterr().err.splitlines()
     assert line.startswith(f"synpick-warp: error: {said}")
@@ -46,7 +46,7 @@ def test_other_faults_keep_their_traceback(monkeypatch, error):
     def fail(*_, **__):
         raise error
 
-    monkeypatch.setattr(commands, "load_config", fail)
+    monkeypatch.setattr(commands, "load_settings", fail)
     with pytest.raises(type(error)):
         main(["config"])
 
