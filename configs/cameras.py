@@ -17,7 +17,7 @@ WORLD, GRIPPER = "world", "gripper"
 
 COLOR, DEPTH, MASKS = "color", "depth", "masks"
 MODALITIES = (COLOR, DEPTH, MASKS, *LAYER_TABLE)
-"""Kinds of images that a camera may have files of."""
+"""Image modalities that a camera may export."""
 
 
 @dataclass(frozen=True)

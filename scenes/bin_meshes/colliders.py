@@ -24,7 +24,7 @@ TOLERANCE = 2e-3
 """Distance of a facet's vertices from its plane [m], as of the tote's rounded corners; doubled until there are at most MAX_PIECES."""
 MAX_TOLERANCE = 4e-3
 MAX_PIECES = 64
-"""Collision shapes of a bin: the broad phase takes time with the square of a world's shapes."""
+"""Maximum number of collision shapes of a bin; the cost of the broad phase grows with the square of the shapes of a world."""
 MAX_VERTICES = 64
 """Vertices of a collision shape."""
 FACET_ANGLE = np.radians(30.0)

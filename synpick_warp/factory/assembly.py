@@ -224,7 +224,7 @@ def _build_group(config: Config, scene: RenderScene, cameras: tuple[Camera, ...]
 
 
 def _fit_to_catalog(config: Config, catalog: Catalog, bins: Sequence[Bin], device: wp.Device, progress: Progress) -> Config:
-    """Settings that follow from objects and bins: whether objects repeat in an episode, capacities for contacts of thin or many shapes.
+    """Resolve settings that depend on objects and bins: repetition of objects in an episode, and contact capacities.
 
     Raises:
         ConfigError: The capacities do not fit into the device's memory.

@@ -29,7 +29,7 @@ class BinUse:
 
 @dataclass
 class BinCounts(Counts):
-    """Accumulator of `BinUse`: episodes by bin, and by its place."""
+    """Accumulator of `BinUse`: episode counts and ranges of the pose, by bin."""
 
     names: Counter[str] = field(default_factory=Counter)
     places: Counter[tuple[str, str, int]] = field(default_factory=Counter)

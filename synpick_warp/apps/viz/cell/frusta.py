@@ -1,4 +1,4 @@
-"""Lines in a rendered view: camera frusta to scale, their footprints, axes; what surfaces hide is faint."""
+"""Line drawing over a rendered view, with a depth test: camera frusta to scale, their footprints and axes; hidden lines are faint."""
 
 from __future__ import annotations
 
@@ -14,23 +14,23 @@ Color = tuple[int, int, int]
 _STEP = 4.0
 """Length of the pieces whose visibility is tested [px]."""
 _SLACK = 0.004
-"""Depth by which a point may lie behind a surface and is still seen, relative to its distance."""
+"""Depth bias of the visibility test, relative to the distance of the point."""
 _NEAR = 0.05
-"""Least depth of what is drawn [m]."""
+"""Near plane of the drawing [m]."""
 _FAINT = 0.3
-"""Opacity of what is hidden."""
+"""Opacity of hidden lines."""
 _EDGE = 12
-"""Points along each side of an image, whose rays bound its footprint."""
+"""Samples along each side of an image border; their rays bound its footprint."""
 _SHIFT = 4
 """Fractional bits of OpenCV's coordinates."""
 _WIDE = 1.3
-"""Longest edge of a pyramid, in its depths, before it becomes less deep: of wide lenses."""
+"""Largest ratio of edge length to depth of a camera pyramid; pyramids of wider lenses are drawn less deep."""
 _LIFT = 1e-3
 """Height of footprints over the floor [m]."""
 
 
 def project(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Pixels (n, 2) and depths (n) [m] of points (n, 3) of the world, through the lens; points behind the camera have no place (nan)."""
+    """Projected pixels (n, 2) and depths (n) [m] of world points (n, 3), with lens distortion; NaN for points behind the camera."""
     seen = np.asarray(points, float) @ camera.rotation.T + camera.translation
     depth = seen[:, 2]
     flat = seen[:, :2] / np.where(depth > 0.0, depth, np.nan)[:, None]
@@ -41,7 +41,7 @@ def project(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]
 
 
 def rays(camera: Camera, pixels: np.ndarray) -> np.ndarray:
-    """Rays (n, 3) through pixels (n, 2) in the world, of planar depth 1."""
+    """World-space rays (n, 3) through pixels (n, 2), scaled to planar depth 1."""
     plain = (pixels - camera.matrix[:2, 2]) / np.diag(camera.matrix)[:2]
     flat = plain if camera.lens is None else camera.lens.unproject(pixels)
     return np.column_stack([flat, np.ones(len(flat))]) @ camera.rotation
@@ -132,7 +132,7 @@ class Canvas:
                 cv2.line(image, start, stop, color, width, cv2.LINE_AA, _SHIFT)
 
     def _seen(self, place: np.ndarray, depth: float) -> bool:
-        """Whether no surface lies before a point of a place in the picture."""
+        """Visibility of a point at a pixel: whether no surface is in front of it."""
         column, row = int(place[0]), int(place[1])
         rows, columns = self.picture.depth.shape
         return not (0 <= row < rows and 0 <= column < columns) or depth <= float(self.picture.depth[row, column]) * (1.0 + _SLACK)

@@ -31,7 +31,7 @@ OVER_RIM = 0.15
 _GAP = 0.01
 """Distance between objects, and from the walls [m]."""
 _MOST = 32
-"""Most objects: the instances that a view may have."""
+"""Maximum number of objects: the instance capacity of a view."""
 _SKY = "overcast"
 _PIXELS = 640
 """Longest side of a camera's picture; larger images are scaled down [px]."""
@@ -50,16 +50,16 @@ class Picture:
 
 @dataclass(frozen=True, eq=False)
 class Laid:
-    """Objects side by side on the floor of a bin, in the orientation of their files."""
+    """Layout of objects side by side on the floor of a bin, in the orientation of their files."""
 
     indices: list[int]
-    """Which ones of those given."""
+    """Indices of the objects that are placed."""
     positions: list[tuple[float, float, float]]
-    """Of their origins, in the bin's frame [m]."""
+    """Positions of their origins in the bin's frame [m]."""
 
 
 class CellScene:
-    """What a cell shows before anything is simulated."""
+    """Scene of a cell before simulation: bins, gripper and objects, rendered from any camera."""
 
     def __init__(self, config: Config, progress: Progress, report: Callable[[str], None]) -> None:
         """Read the objects, and build the scene.

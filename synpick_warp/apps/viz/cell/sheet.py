@@ -28,7 +28,7 @@ _AZIMUTH, _ELEVATION = -60.0, 22.0
 _MARGIN = 0.06
 """Free border of the view from outside, as a fraction of its sides."""
 _PYRAMID = 0.1
-"""Depth of the cameras' pyramids, as a fraction of the cell's size."""
+"""Depth of the camera pyramids, as a fraction of the diameter of the cell."""
 _FAR = 3.0
 """Depth to which views are drawn that meet no floor, in sizes of the cell."""
 _PANEL, _CAPTION, _GAP = 480, 62, 8
@@ -68,7 +68,7 @@ def write_cell_sheet(scene: CellScene, rig: Rig, bins: Bins, name: str, out: Pat
 
 
 def _outside_camera(scene: CellScene, cameras: tuple[Camera, ...]) -> Camera:
-    """A camera that sees all cameras, bins and the gripper; its principal point centres them."""
+    """Overview camera that has all cameras, bins and the gripper in view; its principal point is shifted so that they are centred."""
     corners = np.array([corner for one in scene.sizes for corner in one.corners])
     top = (*scene.tcp[:2], scene.tcp[2] + scene.config.gripper.cup_length + scene.config.gripper.finger_length)
     points = np.concatenate([corners, [center(camera) for camera in cameras], [scene.tcp, top]])
@@ -118,7 +118,7 @@ def _color(index: int) -> tuple[int, int, int]:
 
 
 def _round_length(length: float) -> float:
-    """The largest of 1, 2 and 5 times a power of ten that is at most a length [m]."""
+    """Round scale length: the largest of 1, 2 and 5 times a power of ten that is at most `length` [m]."""
     power = 10.0 ** math.floor(math.log10(length))
     return max(step * power for step in (1.0, 2.0, 5.0) if step * power <= length * (1.0 + 1e-9))
 
