@@ -349,7 +349,7 @@ def test_each_replacement_of_newton_is_left_out_once(monkeypatch):
         """Number whose bits are the parts that are Newton's own."""
         return sum(2**bit for bit, (name, own) in enumerate(patches.NEWTONS_OWN.values()) if getattr(patches.physics, name) is own)
 
-    config = bench.Config()
+    config = bench.Config().with_values({"bake.worlds": 4})
     steps = patches.TICKS * config.physics.steps_per_tick * config.bake.worlds
     monkeypatch.setattr(patches, "load_catalog", lambda config: None)
     monkeypatch.setattr(patches, "_seconds", lambda *given: steps / (1.0 + left_out(*given)))

@@ -1,6 +1,6 @@
 """Ablation benchmark of the replacements of Newton's parts (`newton_patches`): rate of physics with all of them, and without each.
 
-The same piles fall, come to rest and are stirred in every run, since all variants find the same contacts. Perception and pictures do not run.
+The same piles fall, come to rest and are stirred in every run, since all variants find the same contacts. Neither perception nor pictures.
 """
 
 from __future__ import annotations
