@@ -8,6 +8,7 @@ from functools import cached_property
 from typing import TYPE_CHECKING
 
 from synpick_warp.configs.cameras import GRIPPER, CameraRow, Cameras, Pose, Vector
+from synpick_warp.configs.randomize import OFF
 from synpick_warp.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -83,6 +84,11 @@ class Rig:
     def is_placed(self, index: int) -> bool:
         """Whether a camera's matrix and pose are not the same in all views."""
         return self.rows[index].jitter is not None or self.moves(index)
+
+    def draws_lens(self, index: int) -> bool:
+        """Whether episodes draw focal length or centre behind a lens that distorts, and with these the rays of its pixels."""
+        row = self.rows[index]
+        return bool(row.distortion and row.jitter) and any(kind.kind != OFF for kind in (row.jitter.focal_length, row.jitter.center))
 
     def moves(self, index: int) -> bool:
         """Whether a camera moves within an episode."""

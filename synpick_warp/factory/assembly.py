@@ -220,7 +220,8 @@ def _build_group(config: Config, scene: RenderScene, cameras: tuple[Camera, ...]
     scene = with_cameras(scene, tuple(cameras[camera] for camera in indices))
     renderer = make_renderer(config, scene, objects, sizes["view"], history_count(config.rig, worlds, index))
     rig, first = config.rig, indices[0]
-    return CameraGroup(indices, sizes, renderer, rig.is_placed(first), rig.moves(first), rig.every[first])
+    lenses = tuple(cameras[camera].lens for camera in indices) if any(map(rig.draws_lens, indices)) else ()
+    return CameraGroup(indices, sizes, renderer, rig.is_placed(first), rig.moves(first), rig.every[first], lenses)
 
 
 def _fit_to_catalog(config: Config, catalog: Catalog, bins: Sequence[Bin], device: wp.Device, progress: Progress) -> Config:

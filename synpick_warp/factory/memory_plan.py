@@ -36,7 +36,7 @@ from synpick_warp.stages.sim.step_log import allocate_record, record_sizes
 from synpick_warp.stages.sim.worlds import world_sizes
 from synpick_warp.stages.stream import TickReader
 from synpick_warp.stages.tick_queue import allocate_rings, queue_lead, record_bytes
-from synpick_warp.stages.view_ring import RING, allocate_ring, history_count, view_sizes
+from synpick_warp.stages.view_ring import RING, allocate_lenses, allocate_ring, history_count, view_sizes
 from synpick_warp.system.hardware.device import pick_device
 from synpick_warp.system.hardware.free_memory import free_device_memory, free_host_memory
 
@@ -104,6 +104,8 @@ def plan_memory(config: Config, device: wp.Device, writers: int = 1) -> list[Ter
             scene = blank_scene(count, *size, device)
             counts = {"instances": objects, "views": views["view"], "histories": history_count(rig, worlds, index)}
             Renderer(scene, *sections, seed=0, depth_scale=1.0, **counts)
+            if any(map(rig.draws_lens, group)):
+                _ = [allocate_lenses(views, device) for _ in range(RING if device.is_cuda else 1)]
         host = host_images(config.bop, size[1], device, needs.images, needs.depth_files) if writers else None
         terms += _images(arrays, views, count, config.render.layers, host, device)
     if may_pick(config.bake, config.splits):

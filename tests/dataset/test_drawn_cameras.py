@@ -1,5 +1,5 @@
-"""A bake of cameras that are not the same in all views: drawn anew by each episode, or carried by the gripper. Files against formulas, in
-float64."""
+"""A bake of cameras that are not the same in all views: drawn anew by each episode, behind a lens, or carried by the
+gripper. Files against formulas, in float64."""
 
 from __future__ import annotations
 
@@ -33,6 +33,7 @@ CELL = """preset = "smoke"
 name = "drawn"
 resolution = [96, 72]
 matrix = [[82.5, 0.0, 49.14], [0.0, 82.38, 35.25], [0.0, 0.0, 1.0]]
+distortion = [-0.12, 0.08, 0.0005, -0.0003, 0.0]
 pose = { position = [0.0, -0.4, 1.1], look_at = [0.0, 0.0, 0.1], up = [0.0, 1.0, 0.0] }
 [camera.jitter]
 position = { normal = [0.0, 0.01] }
