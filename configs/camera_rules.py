@@ -119,7 +119,7 @@ def _view(rig: Rig, index: int, config: Config) -> Iterator[Conflict]:
     if "lerobot" in config.bake.formats and (width % 2 or height % 2):
         key = rig.key(index, "resolution") if config.camera and config.camera[index].resolution else "cameras.resolution"
         yield key, "even width and height with the format lerobot, whose videos have a colour for 2 x 2 pixels"
-    shown = [name for name in config.render.layers if rig.writes(index, name)]
+    shown = rig.chosen(index, config.render.layers)
     if rig.every[index] > 1:
         yield from _every(rig.key(index, "every"), config.bake.formats, shown)
     if row.modalities is not None:

@@ -14,6 +14,7 @@ from typing import Any
 
 import warp as wp
 
+from synpick_warp.configs.cameras import COLOR
 from synpick_warp.configs.fields import INT32_MAX
 from synpick_warp.configs.modes import may_pick
 from synpick_warp.configs.schema import Config, Perception, Physics
@@ -99,15 +100,16 @@ def plan_memory(config: Config, device: wp.Device, writers: int = 1) -> list[Ter
     terms = [*_simulation(sizes, config.trajectory.steps if needs.physics else None, device)]
     for index, group in enumerate(rig.groups):
         count, views = len(group), view_sizes(config.render, rig, worlds, objects, device, index)
-        size, sections = rig.sizes[group[0]], (config.render, config.effects, config.depth_sensor)
+        size, layers = rig.sizes[group[0]], rig.chosen(group[0], config.render.layers)
+        sections = replace(config.render, layers=layers), config.effects, config.depth_sensor
         with dry_run() as arrays:
             scene = blank_scene(count, *size, device)
             counts = {"instances": objects, "views": views["view"], "histories": history_count(rig, worlds, index)}
-            Renderer(scene, *sections, seed=0, depth_scale=1.0, **counts)
+            Renderer(scene, *sections, seed=0, depth_scale=1.0, colors=rig.writes(group[0], COLOR), **counts)
             if any(map(rig.draws_lens, group)):
                 _ = [allocate_lenses(views, device) for _ in range(RING if device.is_cuda else 1)]
         host = host_images(config.bop, size[1], device, needs.images, needs.depth_files) if writers else None
-        terms += _images(arrays, views, count, config.render.layers, host, device)
+        terms += _images(arrays, views, count, layers, host, device)
     if may_pick(config.bake, config.splits):
         terms.append(_perception(config.perception, worlds, objects, device))
     terms += _newton(config.physics, worlds, device.is_cuda)

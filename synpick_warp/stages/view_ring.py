@@ -45,7 +45,7 @@ def views_per_batch(render: Render, rig: Rig, worlds: int, device: wp.Device, gr
         return views
     width, height = rig.sizes[cameras[0]]
     with dry_run() as layers:
-        allocate(LayerBuffers, {"view": 1, "row": height, "column": width}, device, render.layers)
+        allocate(LayerBuffers, {"view": 1, "row": height, "column": width}, device, rig.chosen(cameras[0], render.layers))
     each = width * height * PIXEL_BYTES + sum(layer.row[3] for layer in layers)
     pixels = sum(map(math.prod, rig.sizes))
     return max(1, min(BATCH_BYTES * views * width * height // (pixels * each), views * worlds))
@@ -82,6 +82,8 @@ class CameraGroup:
     """Whether the cameras move within an episode, as of `Rig.moves`."""
     every: int = 1
     """Frames from one picture to the next."""
+    colors: bool = True
+    """Whether they have colour images."""
     lenses: tuple[LensMap | None, ...] = ()
     """Lens of each camera (None: a pinhole) if views have lenses of their own, as episodes draw their camera matrices; none: the scene has
     those of all views."""
@@ -220,7 +222,7 @@ class ViewRing:
         """
         batch = self.slots[slot]
         list_boundaries(self.boundary_scratch, count, batch.images, batch.boundaries)
-        if self.compressor is not None and batch.jpeg is not None:
+        if self.compressor is not None and batch.jpeg is not None and self.group.colors:
             self.compressor.compress(count, batch.images, batch.jpeg)
         if self.depth_encoder is not None and batch.depth is not None:
             self.depth_encoder.encode(batch.images.depth, count, batch.depth)

@@ -17,12 +17,11 @@ from scipy.spatial.transform import Rotation
 import synpick_warp
 from synpick_warp.codes import Stream
 from synpick_warp.configs.load import load_config
-from synpick_warp.errors import ConfigError, OutputError
-from synpick_warp.factory import pipeline
+from synpick_warp.errors import ConfigError
 from synpick_warp.factory.pipeline import run_bake
 from synpick_warp.scenes.cameras import make_cameras
 from synpick_warp.system.progress import SilentProgress
-from tests.builders import STIRRING, boxes, once, run
+from tests.builders import STIRRING, boxes, failing_after, once, run
 from tests.harness.exporter_contract import digests
 from tests.twins import rng
 from tests.worlds.small_worlds import settings
@@ -211,20 +210,10 @@ def test_the_number_of_worlds_changes_no_byte(cell, tmp_path, worlds):
     assert {name for name, _ in ours.items() ^ theirs.items()} <= {"config.toml"}
 
 
-def test_an_interrupted_bake_resumes_to_the_same_bytes(cell, tmp_path, monkeypatch):
+def test_an_interrupted_bake_resumes_to_the_same_bytes(cell, tmp_path):
     """The first episode is committed when the second fails; the settings are then read back from the data set."""
-    ended, end = [], pipeline._Run._end
-
-    def fail(*arguments) -> None:
-        ended.append(arguments)
-        if len(ended) > 1:
-            raise OutputError("no space left")
-        end(*arguments)
-
-    with monkeypatch.context() as patch:
-        patch.setattr(pipeline._Run, "_end", fail)
-        with pytest.raises(OutputError, match="no space left"):
-            bake(tmp_path / "set", **{"bake.worlds": 1})
+    with failing_after(1):
+        bake(tmp_path / "set", **{"bake.worlds": 1})
     assert len(list((tmp_path / "set/manifest").glob("0*.json"))) == 1
     with boxes():
         summary = run_bake(load_config(str(tmp_path / "set/config.toml")), tmp_path / "set", SilentProgress())
