@@ -120,6 +120,13 @@ def test_rays_of_lenses_that_episodes_draw_are_counted():
         assert found == [("Lenses.ray", (5, 180, 320), "", 5 * 180 * 320 * 8)] * count
 
 
+@pytest.mark.parametrize(("given", "rows"), [({}, []), ({"randomize__lamps": 1}, [(5 * 25,)])])
+def test_materials_of_views_are_counted_where_looks_are_drawn(given, rows):
+    """Of 20 objects, 3 fixtures, table and background."""
+    config = settings(render__views_per_batch=5, arrangement__max_objects=20, **given)
+    assert [row[1] for term in plan_memory(config, CPU) for row in term.rows if row[0] == "Surfaces.recolor"] == rows
+
+
 @pytest.mark.parametrize(("most", "count"), [(0.0, 256), (100.0, 102)])
 def test_one_cost_volume_of_stereo_matching_is_counted_for_all_views(most, count):
     def rows(*layers: str) -> dict[str, tuple[int, ...]]:

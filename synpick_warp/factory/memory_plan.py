@@ -17,6 +17,7 @@ import warp as wp
 from synpick_warp.configs.cameras import COLOR
 from synpick_warp.configs.fields import INT32_MAX
 from synpick_warp.configs.modes import may_pick
+from synpick_warp.configs.randomize import Randomize
 from synpick_warp.configs.schema import Config, Perception, Physics
 from synpick_warp.errors import ConfigError, SynpickError, format_value
 from synpick_warp.exporters.registry import Needs
@@ -28,6 +29,7 @@ from synpick_warp.stages.host_copies import HostImages, host_images
 from synpick_warp.stages.online.batches import allocate_slot
 from synpick_warp.stages.perception.images import allocate_batch, count_views
 from synpick_warp.stages.perception.plan import allocate_votes
+from synpick_warp.stages.render.looks import allocate_materials, materials_of_view
 from synpick_warp.stages.render.raster import allocate_background, allocate_visibility
 from synpick_warp.stages.render.renderer import Renderer
 from synpick_warp.stages.render.scene import blank_scene
@@ -106,6 +108,8 @@ def plan_memory(config: Config, device: wp.Device, writers: int = 1) -> list[Ter
             scene = blank_scene(count, *size, device)
             counts = {"instances": objects, "views": views["view"], "histories": history_count(rig, worlds, index)}
             Renderer(scene, *sections, seed=0, depth_scale=1.0, colors=rig.writes(group[0], COLOR), **counts)
+            if config.randomize != Randomize():
+                allocate_materials(views["view"] * materials_of_view(objects), 1, device)
             if any(map(rig.draws_lens, group)):
                 _ = [allocate_lenses(views, device) for _ in range(RING if device.is_cuda else 1)]
         host = host_images(config.bop, size[1], device, needs.images, needs.depth_files) if writers else None

@@ -179,7 +179,7 @@ class Producer:
             row = episode_row(layout, config.cell.recorded, self.stages.tick_time, self.stages.draws, report, world, record)
             if is_resampled(row, config.settle.tries):
                 self.summary.take_resample(row.ending)
-                self.progress.note(f"episode {row.episode}, arrangement {row.arrangement + 1}: {row.ending.sentence}")
+                self.progress.note(f"episode {row.episode}, arrangement {row.arrangement + 1}: {row.sentence}")
             else:
                 self.summary.take_episode(row, record)
             if advice := remedy(row.ending, config.physics, config.perception, config.arrangement, config.settle):

@@ -22,6 +22,7 @@ from synpick_warp.kernels.render.visibility.gbuffer import FIXTURES
 from synpick_warp.kernels.render.visibility.variants import kernel_for
 from synpick_warp.scenes.looks import Looks
 from synpick_warp.scenes.tote import FLOOR_DROP
+from synpick_warp.stages.arrays import ArraySpec, StructArrays, allocate_struct
 from synpick_warp.stages.buffers import Snapshot
 from synpick_warp.stages.launch import launch_pixels
 from synpick_warp.stages.render.scene import RenderScene
@@ -46,7 +47,15 @@ SETTINGS = {
 }
 """Setting of `Randomize` that has a part's distribution of a parameter."""
 _COPIED = ("color", "metallic", "roughness", "texture_size", "first_texel", "texture_levels")
-"""Arrays of `Surfaces` with a row for each material."""
+"""Arrays of `Surfaces` with a row for each material, of every scene ..."""
+_MATERIALS = StructArrays(
+    Surfaces,
+    {
+        name: ArraySpec(("material", "level")[: Surfaces.vars[name].type.ndim], Surfaces.vars[name].type.dtype, "")
+        for name in (*_COPIED, "recolor", "repeats")
+    },
+)
+"""... and all that the materials of views have."""
 
 _ROW: Any = LookDistribution.numpy_dtype()
 
@@ -106,6 +115,16 @@ def _pack_choice(distribution: Distribution) -> list[np.ndarray]:
     return list(np.column_stack([_vectors(distribution), np.cumsum(weights) / weights.sum()]))
 
 
+def materials_of_view(instances: int, background: bool = True) -> int:
+    """Number of materials of a view of `instances` instances: theirs, of fixtures, table and background."""
+    return instances + int(FIXTURES) + 1 + background
+
+
+def allocate_materials(rows: int, levels: int, device: wp.Device) -> Any:
+    """Allocate the members of the struct `Surfaces` that materials have, for a number of these and of mip levels."""
+    return allocate_struct(_MATERIALS, {"material": rows, "level": levels}, device)
+
+
 class Dresser:
     """Sampler of the materials of each batch of views. Owns a scene with space for them.
 
@@ -118,18 +137,15 @@ class Dresser:
         self._seed = wp.uint64(seed)
         self._first = scene.surfaces.color.shape[0]
         self._table = build_look_table(scene.looks, self._first - len(scene.looks.all_textures), scene.device)
-        self._materials = instances + int(FIXTURES) + 1 + bool(scene.looks.background_textures)
-        rows = views * self._materials
+        self._materials = materials_of_view(instances, bool(scene.looks.background_textures))
         self.material = wp.zeros((views, self._materials), dtype=wp.int32, device=scene.device)
         surfaces, paths = _copy(Surfaces, scene.surfaces), _copy(PathScene, scene.paths)
-        for name in _COPIED:
+        longer = allocate_materials(self._first + views * self._materials, scene.surfaces.first_texel.shape[1], scene.device)
+        for name in _MATERIALS.specs:
             values = getattr(scene.surfaces, name)
-            longer = wp.zeros((values.shape[0] + rows, *values.shape[1:]), dtype=values.dtype, device=scene.device)
-            wp.copy(longer, values, count=values.size)
-            setattr(surfaces, name, longer)
-        total = surfaces.color.shape[0]
-        surfaces.recolor = wp.zeros(total, dtype=wp.mat33, device=scene.device)
-        surfaces.repeats = wp.zeros(total, dtype=wp.float32, device=scene.device)
+            if name in _COPIED:
+                wp.copy(getattr(longer, name), values, count=values.size)
+            setattr(surfaces, name, getattr(longer, name))
         paths.surfaces = surfaces
         self.scene = replace(scene, surfaces=surfaces, paths=paths)
 
