@@ -3,42 +3,30 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 import synpick_warp
-from synpick_warp.configs.load import load_config
-from synpick_warp.configs.schema import Config
 from synpick_warp.dataset.commit.merge import merge
 from synpick_warp.errors import DatasetError
-from synpick_warp.factory.pipeline import run_bake
-from synpick_warp.system.progress import SilentProgress
-from tests.builders import STIRRING, boxes, failing_after, once, run
-from tests.dataset.test_sparse_cameras import CELL
+from tests.builders import boxes, failing_after, once, run
 from tests.harness.exporter_contract import digests
 from tests.online.test_stream import taken
-from tests.worlds.small_worlds import settings
+from tests.worlds.cells import SIDE, bake_cell, cell_config, make_camera
 
-CHOSEN = CELL.replace("every = 3", 'every = 3\nmodalities = ["masks", "depth"]')
-CHOSEN = CHOSEN.replace('"fast"', '"fast"\nmodalities = ["color", "normals"]')
+CAMERAS = (
+    make_camera("slow", **SIDE, every=3, modalities=["masks", "depth"], fov=40.0),
+    make_camera("fast", modalities=["color", "normals"], fov=40.0),
+)
 KINDS = ({"depth", "mask", "mask_visib"}, {"rgb", "normals"})
 EPISODES = 2
-
-
-def chosen_config(folder: Path, **given: object) -> Config:
-    folder.mkdir(exist_ok=True)
-    (folder / "cell.toml").write_text(CHOSEN)
-    rows = load_config(str(folder / "cell.toml"), {"render.layers": ["normals"]}).camera
-    ours = {"bake.formats": ["bop", "shards", "zarr"], "render.layers": ["normals", "nocs"], "bake.episodes": EPISODES, "bake.worlds": 2}
-    return replace(settings(**STIRRING | ours | given), camera=rows)
+GIVEN = {"bake.formats": ["bop", "shards", "zarr"], "render.layers": ["normals", "nocs"], "bake.episodes": EPISODES, "bake.worlds": 2}
 
 
 def bake(out: Path, shard: tuple[int, int] = (0, 1), **given: object) -> None:
-    with boxes():
-        run_bake(chosen_config(out.parent, **given), out, SilentProgress(), shard)
+    bake_cell(out, cell_config(CAMERAS, **GIVEN | given), shard)
 
 
 @pytest.fixture(scope="module", params=["classic", "multisensor"])
@@ -108,10 +96,10 @@ def test_interrupted_or_in_shares_it_has_the_same_bytes(chosen, tmp_path):
 
 
 @pytest.mark.parametrize("chosen", ["classic"], indirect=True)
-def test_a_stream_has_the_images_of_each_camera(chosen, tmp_path):
+def test_a_stream_has_the_images_of_each_camera(chosen):
     """What a camera lacks is not rendered; depth and masks, from which all follows, are there for all."""
     with boxes():
-        views = taken(synpick_warp.stream(chosen_config(tmp_path)))
+        views = taken(synpick_warp.stream(cell_config(CAMERAS, **GIVEN)))
     data = synpick_warp.open(chosen)
     assert views.keys() == {(view.episode, view.camera, view.frame) for view in data.views()}
     for (episode, camera, frame), made in views.items():
