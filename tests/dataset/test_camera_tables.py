@@ -125,6 +125,7 @@ def test_zarr_and_lerobot_have_cameras_of_their_sizes(cell):
     cameras = zarr.open_group(str(cell / "trajectory.zarr"), mode="r")["cameras"]
     np.testing.assert_array_equal(cameras["resolution"][:], SIZES)
     np.testing.assert_allclose(cameras["matrix"][:], MATRICES, rtol=1e-12)
+    assert cameras.attrs["distortion"] == [values and {"cam_dist_model": "pinhole", "cam_dist": values} for values in DISTORTION]
     features = json.loads(next(cell.rglob("meta/info.json")).read_text())["features"]
     for name, (width, height) in zip(NAMES, SIZES, strict=True):
         assert features[f"observation.images.{name}"]["shape"] == [height, width, 3]
