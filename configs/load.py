@@ -6,11 +6,11 @@ import dataclasses
 import functools
 import os
 import typing
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-from synpick_warp.configs.bins import check_meshes
+from synpick_warp.configs.bins import BinRow, check_meshes
 from synpick_warp.configs.calibration.sensor_presets import sensor_settings
 from synpick_warp.configs.calibration.tables import fill_tables
 from synpick_warp.configs.cameras import Cameras
@@ -42,6 +42,7 @@ def load_config(
     *,
     source: str = "in the settings passed",
     splits: bool = False,
+    measure: Callable[[tuple[BinRow, ...]], Mapping[str, tuple[BinRow, ...]]] | None = None,
 ) -> Config:
     """Load a preset or a TOML file, override single settings, and validate the result.
 
@@ -60,6 +61,7 @@ def load_config(
         source: Where `settings` come from, for error messages.
         splits: Whether the splits of a preset hold, such as train and test of "synpick", unless a file sets mode or episodes otherwise;
             the [splits] of a file always hold.
+        measure: Lists of tables to replace, of the bins with what their meshes measure; None: without.
 
     Returns:
         The complete configuration: frozen dataclasses, see `synpick_warp.configs.schema`.
@@ -80,6 +82,9 @@ def load_config(
             values |= _section_values(section, {name: value}, source)
     config = _build(values, source if settings else "")
     _check_conflicts(config, values)
+    if measure is not None and (found := measure(config.bin)):
+        config = dataclasses.replace(config, **found)
+        _check_conflicts(config, values)
     return config
 
 

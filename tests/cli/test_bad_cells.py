@@ -11,6 +11,7 @@ import trimesh
 
 from synpick_warp.stages.sim.simulate import Simulation
 from tests.builders import mistake
+from tests.worlds.bin_meshes import sloped_bin
 from tests.worlds.model_files import exported, put
 
 K = "matrix = [[275.0, 0.0, 163.8], [0.0, 274.6, 117.5], [0.0, 0.0, 1.0]]"
@@ -64,6 +65,8 @@ CASES = {
     "compartments without room": (BIN + "floor_size = [0.1, 0.1]\ncompartments = [6, 6]\n", "bin[0].compartments is [6, 6]"),
     "dividers above the rim": (BIN + "compartments = [2, 1]\ndivider_height = 0.5\n", "bin[0].divider_height is 0.5"),
     "corners without room": (BIN + "floor_size = [0.035, 0.319]\n", "bin a: floor_size: a length of 0.035 m is too small"),
+    "camera below a mesh's floor": (CAMERA + BIN + 'file = "bin.stl"\nplace = "file"\n',
+                                    "in cell.toml; allowed: positions above the bin's floor, z > 1.5"),
     "own bins without a table": ('[bins]\nkind = "own"\n', "bins.kind is "),
     "no weight": (BIN + "weight = 0.0\n", "bin[0].weight is 0.0"),
     "tote without floor": ("[tote]\nfloor_size = [0.0, 0.0]\n", "tote.floor_size is [0.0, 0.0]"),
@@ -106,6 +109,7 @@ def test_a_cell_that_cannot_be_is_one_line(tmp_path, monkeypatch, case):
     put(Path("cell.toml"), f'preset = "smoke"\n{text}'.encode())
     put(Path("parts/long.stl"), exported(trimesh.creation.box((90.0, 80.0, 70.0)), "stl"))
     put(Path("parts/void.stl"), b"") if case == "file without numbers" else None
+    put(Path("bin.stl"), exported(sloped_bin().apply_translation((0.0, 0.0, 1.5)), "stl")) if "bin.stl" in text else None
     put(Path("cut/a.png"), picture()[:3000])
     put(Path("text/a.png"), b"no picture")
     Path("empty").mkdir()
