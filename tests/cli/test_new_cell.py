@@ -162,6 +162,8 @@ def test_parts_are_copied_with_their_unit(tmp_path, drawn, offset, center):
     assert config.bake.models == str(tmp_path / "cell" / "parts")
     assert (config.objects.unit, config.objects.center, config.objects.symmetries) == ("mm", center, "detect")
     assert drawn == ["cell/cell.toml"]
+    (tmp_path / "cell").rename(tmp_path / "moved")
+    assert load_config(tmp_path / "moved" / "cell.toml").bake.models == str(tmp_path / "moved" / "parts")
 
 
 def test_a_large_part_has_its_volume_and_a_folder_is_named(tmp_path, drawn):

@@ -327,5 +327,5 @@ def _write_cell(cell: NewCell, name: str, stage: Path) -> None:
         try:
             volume = largest(cell)
         except CatalogError:
-            raise error from None
+            raise CatalogError(str(error).replace('objects.unit = "', '--unit "')) from None
     write(replace(cell, volume=2.0 * volume))
