@@ -124,7 +124,7 @@ def test_rays_of_lenses_that_episodes_draw_are_counted():
 def test_materials_of_views_are_counted_where_looks_are_drawn(given, rows):
     """Of 20 objects, 3 fixtures, table and background."""
     config = settings(render__views_per_batch=5, arrangement__max_objects=20, **given)
-    assert [row[1] for term in plan_memory(config, CPU) for row in term.rows if row[0] == "Surfaces.recolor"] == rows
+    assert [row[1] for term in plan_memory(config, CPU) for row in term.rows if row[0] == "DressedSurfaces.recolor"] == rows
 
 
 @pytest.mark.parametrize(("most", "count"), [(0.0, 256), (100.0, 102)])
@@ -133,7 +133,7 @@ def test_one_cost_volume_of_stereo_matching_is_counted_for_all_views(most, count
         given = {"render__layers": list(layers), "depth_sensor__max_disparity": most, "render__views_per_batch": 5}
         return {name: shape for term in plan_memory(settings(**given), CPU) for name, shape, *_ in term.rows}
 
-    assert rows("depth_stereo")["MatchingScratch.cost"] == (180, 320, count)
+    assert rows("depth_stereo")["MatchingScratch.cost"] == (1, 180, 320, count)
     assert rows("depth_stereo")["InfraredImages.ir_left"] == (5, 180, 320)
     assert not [name for name in rows("depth_sensor", "ir_left") if "Matching" in name or "ir_right" in name]
 

@@ -15,8 +15,8 @@ from synpick_warp.configs.randomize import CHOICE, FIXED, LOG_UNIFORM, NORMAL, U
 from synpick_warp.kernels.distributions import LookDistribution, LookTable
 from synpick_warp.kernels.render.lighting.background import shade_floor_kernel
 from synpick_warp.kernels.render.lighting.looks import draw_looks_kernel, dress_bodies_kernel
-from synpick_warp.kernels.render.lighting.materials import Surfaces
-from synpick_warp.kernels.render.lighting.paths.tracing import PathScene
+from synpick_warp.kernels.render.lighting.materials import DressedSurfaces, Surfaces
+from synpick_warp.kernels.render.lighting.paths.tracing import DressedScene, PathScene
 from synpick_warp.kernels.render.visibility.camera import TILE_PIXELS
 from synpick_warp.kernels.render.visibility.gbuffer import FIXTURES
 from synpick_warp.kernels.render.visibility.variants import kernel_for
@@ -48,12 +48,9 @@ SETTINGS = {
 """Setting of `Randomize` that has a part's distribution of a parameter."""
 _COPIED = ("color", "metallic", "roughness", "texture_size", "first_texel", "texture_levels")
 """Arrays of `Surfaces` with a row for each material, of every scene ..."""
+_TYPES = {name: DressedSurfaces.vars[name].type for name in (*_COPIED, "recolor", "repeats")}
 _MATERIALS = StructArrays(
-    Surfaces,
-    {
-        name: ArraySpec(("material", "level")[: Surfaces.vars[name].type.ndim], Surfaces.vars[name].type.dtype, "")
-        for name in (*_COPIED, "recolor", "repeats")
-    },
+    DressedSurfaces, {name: ArraySpec(("material", "level")[: kind.ndim], kind.dtype, "") for name, kind in _TYPES.items()}
 )
 """... and all that the materials of views have."""
 
@@ -121,7 +118,7 @@ def materials_of_view(instances: int, background: bool = True) -> int:
 
 
 def allocate_materials(rows: int, levels: int, device: wp.Device) -> Any:
-    """Allocate the members of the struct `Surfaces` that materials have, for a number of these and of mip levels."""
+    """Allocate the members of the struct `DressedSurfaces` that materials have, for a number of these and of mip levels."""
     return allocate_struct(_MATERIALS, {"material": rows, "level": levels}, device)
 
 
@@ -138,26 +135,29 @@ class Dresser:
         self._first = scene.surfaces.color.shape[0]
         self._table = build_look_table(scene.looks, self._first - len(scene.looks.all_textures), scene.device)
         self._materials = materials_of_view(instances, bool(scene.looks.background_textures))
-        self.material = wp.zeros((views, self._materials), dtype=wp.int32, device=scene.device)
-        surfaces, paths = _copy(Surfaces, scene.surfaces), _copy(PathScene, scene.paths)
-        longer = allocate_materials(self._first + views * self._materials, scene.surfaces.first_texel.shape[1], scene.device)
-        for name in _MATERIALS.specs:
+        levels = scene.surfaces.first_texel.shape[1]
+        surfaces = allocate_materials(self._first + views * self._materials, levels, scene.device)
+        for name in Surfaces.vars:
             values = getattr(scene.surfaces, name)
             if name in _COPIED:
-                wp.copy(getattr(longer, name), values, count=values.size)
-            setattr(surfaces, name, getattr(longer, name))
-        paths.surfaces = surfaces
+                wp.copy(getattr(surfaces, name), values, count=values.size)
+            else:
+                setattr(surfaces, name, values)
+        surfaces.row = wp.zeros((views, self._materials), dtype=wp.int32, device=scene.device)
+        paths = DressedScene()
+        for name in PathScene.vars:
+            setattr(paths, name, surfaces if name == "surfaces" else getattr(scene.paths, name))
         self.scene = replace(scene, surfaces=surfaces, paths=paths)
 
     def dress(self, snapshot: Snapshot, views: Any, bodies: Any) -> None:
         """Make the materials of the bodies of all views, of their tables and backgrounds; `bodies` must be set up."""
         scene = self.scene
-        inputs = [self._seed, scene.meshes, self._table, snapshot.episode, views, self._first]
+        inputs = [self._seed, scene.meshes, self._table, snapshot.episode, views, bodies, self._first]
         wp.launch(
             kernel_for(dress_bodies_kernel, views),
             dim=(views.count, self._materials),
             inputs=inputs,
-            outputs=[bodies, scene.surfaces],
+            outputs=[scene.surfaces],
             device=scene.device,
         )
 
@@ -167,14 +167,6 @@ def shade_floor(scene: RenderScene, snapshot: Snapshot, bodies: Any, gbuffer: An
     if scene.looks is not None and scene.looks.background_textures:
         inputs = [scene.paths, scene.grid, FLOOR_DROP, snapshot.light, bodies, gbuffer, views]
         launch_pixels(shade_floor_kernel, views.count * scene.grid.tiles * int(TILE_PIXELS), inputs, [radiance], scene.device)
-
-
-def _copy(kind: Any, struct: Any) -> Any:
-    """Shallow copy of a Warp struct."""
-    result = kind()
-    for name in kind.vars:
-        setattr(result, name, getattr(struct, name))
-    return result
 
 
 def draw_parameters(looks: Looks, seed: int, episode: int, parts: list[tuple[LookPart, int]]) -> tuple[np.ndarray, np.ndarray]:
