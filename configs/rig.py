@@ -69,10 +69,11 @@ class Rig:
 
     @cached_property
     def groups(self) -> tuple[tuple[int, ...], ...]:
-        """Indices of the cameras that are rendered together: of one image size and `every`, all placed or none, all moving or none, and
-        all with the same colour and layers."""
+        """Indices of the cameras that are rendered together: of one image size and `every`, all placed or none, all moving or none, all
+        with lenses that are drawn or none, and all with the same colour and layers."""
+        states = [(self.is_placed(index), self.moves(index), self.draws_lens(index)) for index in range(len(self))]
         made = [self.chosen(index, (COLOR, *LAYER_TABLE)) for index in range(len(self))]
-        kinds = [(size, self.every[index], self.is_placed(index), self.moves(index), made[index]) for index, size in enumerate(self.sizes)]
+        kinds = list(zip(self.sizes, self.every, states, made, strict=True))
         return tuple(tuple(index for index, own in enumerate(kinds) if own == kind) for kind in dict.fromkeys(kinds))
 
     @cached_property

@@ -228,7 +228,7 @@ def _build_group(config: Config, scene: RenderScene, cameras: tuple[Camera, ...]
     chosen = replace(config, render=replace(config.render, layers=group_layers(config, index)))
     colors = rig.writes(first, COLOR)
     renderer = make_renderer(chosen, scene, objects, sizes["view"], history_count(rig, worlds, index), colors)
-    lenses = tuple(cameras[camera].lens for camera in indices) if any(map(rig.draws_lens, indices)) else ()
+    lenses = tuple(cameras[camera].lens for camera in indices) if rig.draws_lens(first) else ()
     return CameraGroup(indices, sizes, renderer, rig.is_placed(first), rig.moves(first), rig.every[first], colors, lenses)
 
 

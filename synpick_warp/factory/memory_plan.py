@@ -110,7 +110,7 @@ def plan_memory(config: Config, device: wp.Device, writers: int = 1) -> list[Ter
             Renderer(scene, *sections, seed=0, depth_scale=1.0, colors=rig.writes(group[0], COLOR), **counts)
             if config.randomize != Randomize():
                 allocate_materials(views["view"] * materials_of_view(objects), 1, device)
-            if any(map(rig.draws_lens, group)):
+            if rig.draws_lens(group[0]):
                 _ = [allocate_lenses(views, device) for _ in range(RING if device.is_cuda else 1)]
         host = host_images(config.bop, size[1], device, needs.images, needs.depth_files) if writers else None
         terms += _images(arrays, views, count, layers, host, device)

@@ -200,6 +200,16 @@ def test_jitter_is_kept_and_makes_a_group_of_its_own(tmp_path):
     assert config.rig.groups == ((0,), (1,))
 
 
+def test_cameras_are_rendered_together_where_they_are_alike(tmp_path):
+    def groups(*more: str) -> tuple[tuple[int, ...], ...]:
+        return load(tmp_path, "".join(LEFT.replace('"left"', f'"c{index}"') + text for index, text in enumerate(more))).rig.groups
+
+    lens, drawn = "distortion = [-0.1, 0, 0, 0]\n", "jitter.center = { uniform = [-1, 1] }\n"
+    assert groups("", lens, "") == ((0, 1, 2),)
+    assert groups(drawn, lens + drawn, drawn, lens) == ((0, 2), (1,), (3,))
+    assert groups('modalities = ["color"]\n', 'modalities = ["depth"]\n', 'modalities = ["color", "masks"]\n') == ((0, 2), (1,))
+
+
 def test_options_that_would_have_no_effect_are_refused(tmp_path):
     for key, value in (("cameras.resolution", [64, 48]), ("cameras.fov", 30.0)):
         with pytest.raises(ConfigError, match=rf"{key} is .* on the command line; allowed: none, as the \[\[camera\]\] tables"):
