@@ -60,6 +60,7 @@ class Surface:
     def deviation(self, matrix: np.ndarray, limit: float = np.inf) -> float:
         """Hausdorff distance between the surface and itself, moved by a rigid 4 x 4 matrix [m]; beyond the limit, a lower bound of it."""
         rotation, translation = matrix[:3, :3], matrix[:3, 3]
+        off = 0.0
         for points in (self.coarse, self.queries) if limit < np.inf else (self.queries,):
             off = max(self.distances(points @ rotation.T + translation).max(), self.distances((points - translation) @ rotation).max())
             if off > limit:
