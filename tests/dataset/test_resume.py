@@ -83,7 +83,7 @@ def changes(server, whole, tmp_path_factory) -> int:
     return int((folder / "count").read_text())
 
 
-@pytest.mark.parametrize("share", [0.0, 0.02, 0.4, 0.97, 0.995])
+@pytest.mark.parametrize("share", [0.4, *(pytest.param(share, marks=pytest.mark.slow) for share in (0.0, 0.02, 0.97, 0.995))])
 def test_killed_before_some_change_of_its_folder_a_bake_goes_on(server, expected, changes, tmp_path, share):
     """Killed, resumed, killed again and resumed. One process writes all files (`alone`), so that the places are known."""
     out = tmp_path / "set"
@@ -227,7 +227,7 @@ def test_parts_that_do_not_fit(server, whole, tmp_path):
     assert not (tmp_path / "set").exists()
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("number", [signal.SIGINT, pytest.param(signal.SIGTERM, marks=pytest.mark.slow)])
 def test_stopped_once_it_finishes_what_is_whole(server, expected, tmp_path, number):
     out, log = tmp_path / "set", tmp_path / "log"
     process = server.start(out, log=str(log), settings={"bake.worlds": 1})

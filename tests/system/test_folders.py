@@ -17,7 +17,7 @@ from synpick_warp.system.hardware.caches import link_files
 from tests.harness.scripted_bake import bake, settings
 
 FACES = np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]], np.int32)
-DEPTH = 1200
+DEPTH = 1050
 """More than Python's stack has calls, 1,000; the path is shorter than Linux allows, 4,096 bytes. Time grows with its square."""
 
 

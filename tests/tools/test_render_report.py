@@ -62,6 +62,7 @@ def test_a_report_of_one_pile_has_all_rows_and_images(tmp_path):
     assert cv2.imread(str(sheet)).shape[1] == 3 * (32 * 20 + render_sheet.GAP)
 
 
+@pytest.mark.slow
 def test_a_second_reference_measures_noise(tmp_path, monkeypatch):
     file = tmp_path / "numbers.json"
     for name in ("measure_furnaces", "measure_planes"):
