@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import os
 import subprocess
+import sys
+import traceback
 from pathlib import Path
 
 import numpy as np
@@ -17,8 +19,10 @@ from synpick_warp.system.hardware.caches import link_files
 from tests.harness.scripted_bake import bake, settings
 
 FACES = np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]], np.int32)
-DEPTH = 1050
-"""More than Python's stack has calls, 1,000; the path is shorter than Linux allows, 4,096 bytes. Time grows with its square."""
+CALLS = 450
+"""Calls that Python's stack has room for, instead of 1,000: time grows with the square of the depth."""
+DEPTH = 500
+"""More than that; the path is shorter than Linux allows, 4,096 bytes."""
 
 
 def test_a_folder_with_parents_a_folder_that_is_there_and_a_file(tmp_path):
@@ -35,7 +39,10 @@ def test_a_folder_with_parents_a_folder_that_is_there_and_a_file(tmp_path):
 def here(tmp_path, monkeypatch):
     """The current folder, which is removed again by a program that is not recursive, as pytest's is."""
     monkeypatch.chdir(tmp_path)
+    before = sys.getrecursionlimit()
+    sys.setrecursionlimit(len(traceback.extract_stack()) + CALLS)
     yield tmp_path
+    sys.setrecursionlimit(before)
     subprocess.run(["rm", "-rf", "d"], cwd=tmp_path, check=True)
 
 
