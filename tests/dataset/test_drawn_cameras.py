@@ -180,13 +180,14 @@ def test_it_is_whole_and_valid(cell):
     np.testing.assert_allclose(view.intrinsics, drawn_camera(CONFIG, 1)[0], rtol=0, atol=1e-12)
 
 
-@pytest.mark.parametrize("worlds", [1, 8])
+@pytest.mark.parametrize("worlds", [1, pytest.param(8, marks=pytest.mark.slow)])
 def test_the_number_of_worlds_changes_no_byte(cell, tmp_path, worlds):
     bake(tmp_path / "set", **{"bake.worlds": worlds, "bake.formats": ["bop", "usd", "zarr"]})
     ours, theirs = digests(cell), digests(tmp_path / "set")
     assert {name for name, _ in ours.items() ^ theirs.items()} <= {"config.toml"}
 
 
+@pytest.mark.slow
 def test_an_interrupted_bake_resumes_to_the_same_bytes(cell, tmp_path):
     """The first episode is committed when the second fails; the settings are then read back from the data set."""
     with failing_after(1):
