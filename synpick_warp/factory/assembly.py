@@ -16,7 +16,8 @@ import numpy as np
 import warp as wp
 
 from synpick_warp.configs.cameras import COLOR
-from synpick_warp.configs.schema import Config
+from synpick_warp.configs.rig import Rig
+from synpick_warp.configs.schema import Config, Render
 from synpick_warp.configs.splits import DataLayout
 from synpick_warp.exporters.registry import Needs
 from synpick_warp.factory.attempts import AttemptLog
@@ -176,7 +177,12 @@ def _add_stream(stages: Stages, device: wp.Device, needs_images: bool, depth_fil
     """Add a stream of views to stages; arguments as of `host_images`."""
     config, table, tick_time = stages.config, stages.light_table, stages.tick_time
     rings = [
-        ViewRing(group, group_layers(config, index), device, host_images(config.bop, group.sizes["row"], device, needs_images, depth_files))
+        ViewRing(
+            group,
+            group_layers(config.rig, config.render, index),
+            device,
+            host_images(config.bop, group.sizes["row"], device, needs_images, depth_files),
+        )
         for index, group in enumerate(stages.groups)
     ]
     stream = FrameStream(rings, tick_time, stages.object_ids, table, device, config.cell.recorded, stages.episode_cameras)
@@ -214,9 +220,9 @@ def build_stages(
     return Stages(config, catalog, episode_cameras, lights, simulation, groups, catalog.object_ids, table)
 
 
-def group_layers(config: Config, index: int) -> tuple[str, ...]:
+def group_layers(rig: Rig, render: Render, index: int) -> tuple[str, ...]:
     """Layers of a group of cameras."""
-    return config.rig.chosen(config.rig.groups[index][0], config.render.layers)
+    return rig.chosen(rig.groups[index][0], render.layers)
 
 
 def _build_group(config: Config, scene: RenderScene, cameras: tuple[Camera, ...], index: int) -> CameraGroup:
@@ -225,7 +231,7 @@ def _build_group(config: Config, scene: RenderScene, cameras: tuple[Camera, ...]
     sizes = view_sizes(config.render, config.rig, worlds, objects, scene.device, index)
     scene = with_cameras(scene, tuple(cameras[camera] for camera in indices))
     rig, first = config.rig, indices[0]
-    chosen = replace(config, render=replace(config.render, layers=group_layers(config, index)))
+    chosen = replace(config, render=replace(config.render, layers=group_layers(config.rig, config.render, index)))
     colors = rig.writes(first, COLOR)
     renderer = make_renderer(chosen, scene, objects, sizes["view"], history_count(rig, worlds, index), colors)
     lenses = tuple(cameras[camera].lens for camera in indices) if rig.draws_lens(first) else ()
