@@ -176,15 +176,10 @@ def build_smallest(config: Config, device: wp.Device, progress: Progress, record
 def _add_stream(stages: Stages, device: wp.Device, needs_images: bool, depth_files: bool) -> Factory:
     """Add a stream of views to stages; arguments as of `host_images`."""
     config, table, tick_time = stages.config, stages.light_table, stages.tick_time
-    rings = [
-        ViewRing(
-            group,
-            group_layers(config.rig, config.render, index),
-            device,
-            host_images(config.bop, group.sizes["row"], device, needs_images, depth_files),
-        )
-        for index, group in enumerate(stages.groups)
-    ]
+    rings = []
+    for index, group in enumerate(stages.groups):
+        host = host_images(config.bop, group.sizes["row"], device, needs_images, depth_files)
+        rings.append(ViewRing(group, group_layers(config.rig, config.render, index), device, host))
     stream = FrameStream(rings, tick_time, stages.object_ids, table, device, config.cell.recorded, stages.episode_cameras)
     return Factory(**vars(stages), stream=stream, log=stages.make_log())
 
