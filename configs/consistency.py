@@ -12,6 +12,7 @@ from synpick_warp.configs.bins import OWN, PALLET, TOTE, BinRow, Bins, Tote
 from synpick_warp.configs.camera_rules import Conflict, find_camera_conflicts
 from synpick_warp.configs.cell import BinSizes
 from synpick_warp.configs.modes import bake_modes
+from synpick_warp.configs.objects import EMBEDDED
 from synpick_warp.configs.randomize import Randomize
 from synpick_warp.configs.schema import (
     FORMATS,
@@ -59,6 +60,8 @@ def find_conflicts(config: Config) -> Iterator[Conflict]:
     yield from _jpeg_quality(config.effects, bop)
     yield from _split_folders(config.splits, bop)
     yield from _scene_ids(DataLayout.of(config))
+    if not config.objects.embedded:
+        yield "objects.embedded", f"at least one of {', '.join(EMBEDDED)}"
     yield from _object_rows(config.object_rows)
     yield from _distractors(config.randomize, config.arrangement, config.bake)
     if config.randomize.background_textures and config.render.table and not any(config.render.table_size):

@@ -88,6 +88,7 @@ YOUNGER_SETTINGS: dict[str, Any] = {
     "render.table_size": (0.0, 0.0),
     "camera": [],
     "bin": [],
+    "objects.embedded": Objects().embedded,
     "objects.unit": AUTO_UNIT,
     "objects.symmetries": Objects().symmetries,
     "objects.symmetry_tolerance": Objects().symmetry_tolerance,
