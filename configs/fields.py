@@ -20,6 +20,7 @@ def setting(
     above: float | None = None,
     choices: tuple[str, ...] = (),
     parse: Callable[[Any], Any] | None = None,
+    allowed: str = "",
 ) -> Any:
     """Declare a setting: a dataclass field whose metadata are unit, meaning (one sentence) and allowed values.
 
@@ -32,6 +33,8 @@ def setting(
         above: Minimum, exclusive.
         choices: Allowed strings; empty: any.
         parse: Converts a value as TOML has it to one of the field's type; raises ValueError with what is allowed.
+        allowed: What is allowed, where type, range and choices do not say it.
     """
     metadata = {"unit": unit, "doc": doc, "low": low, "high": high, "above": above, "choices": choices, "parse": parse}
+    metadata["allowed"] = allowed
     return field(default=default, metadata=metadata)

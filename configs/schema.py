@@ -16,6 +16,7 @@ from synpick_warp.configs.bins import BinRow, Bins, Tote
 from synpick_warp.configs.cameras import CameraRow, Cameras
 from synpick_warp.configs.cell import Cell
 from synpick_warp.configs.fields import INT32_MAX, setting
+from synpick_warp.configs.fills import COUNTS, Counts, parse_counts
 from synpick_warp.configs.manipulation import Move, Perception, Pick, Suction, Target
 from synpick_warp.configs.objects import ObjectRow, Objects
 from synpick_warp.configs.randomize import Randomize
@@ -119,6 +120,14 @@ class Gripper:
 class Arrangement:
     """Which objects an episode contains, and how they are dropped into the tote."""
 
+    counts: Counts = setting(
+        (),
+        "",
+        "Parts, by name or obj_id, and how many of each an episode has: one (homogeneous) or several (kitted), with a range drawn anew for "
+        "each episode (mixed); empty: objects are drawn up to volume. Parts mix in the drop.",
+        parse=parse_counts,
+        allowed=COUNTS,
+    )
     volume: float = setting(
         7e-3,
         "m³",

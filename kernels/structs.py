@@ -59,6 +59,12 @@ class CatalogData:
     """Diagonal of that box [m]."""
     compound: wp.array[int]
     """1: several convex pieces, in a compound slot; 0: one, in a single slot."""
+    least: wp.array[int]
+    """Least number of the object in an episode, where numbers are set ..."""
+    most: wp.array[int]
+    """... and largest number; all 0: objects are drawn up to the volume budget."""
+    counted: int
+    """Largest number of an episode's objects where numbers are set; 0: they are not."""
     variant: wp.array[int]
     """Variant of the object, in slots of its class (single or compound)."""
     empty_single: int

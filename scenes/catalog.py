@@ -65,7 +65,8 @@ def load_catalog(config: Config, cache_dir: Path | None = None, report: Callable
     """
     rules = _Rules(config.objects, config.object_rows, config.cell.bins)
     entries = _load_entries(config.bake.models, rules, cache_dir, report)
-    _report_undrawable(entries, config.arrangement.volume, report)
+    if not config.arrangement.counts:
+        _report_undrawable(entries, config.arrangement.volume, report)
     if not config.randomize.most_distractors:
         return Catalog(tuple(entries))
     others = _load_entries(config.randomize.distractor_models, rules, cache_dir, report, tuple(entry.name for entry in entries))

@@ -120,6 +120,53 @@ def fits_budget(total: float, volume: float, drop: DropData) -> bool:
     return wp.where(drop.exceed == 1, volume, total + volume) <= drop.volume
 
 
+@wp.func
+def assign_slots(
+    layout: LayoutData,
+    catalog: CatalogData,
+    catalog_index: wp.array2d[int],
+    body_slot: wp.array2d[int],
+    world: int,
+    first: int,
+    count: int,
+) -> bool:
+    """Assign the next free body slot of its class to each instance from `first` to before `count`; False: some have none."""
+    singles = int(0)
+    compounds = int(0)
+    for instance in range(count):
+        compound = catalog.compound[catalog_index[world, instance]]
+        if instance >= first:
+            slot = singles
+            if compound == 1:
+                slot = layout.single_slots + compounds
+            body_slot[world, instance] = slot
+        compounds += compound
+        singles += 1 - compound
+    return singles <= layout.single_slots and compounds <= layout.slots - layout.single_slots
+
+
+@wp.func
+def draw_counted(catalog: CatalogData, key: wp.uint64, catalog_index: wp.array2d[int], world: int) -> int:
+    """Draw the number of each object, and their order (Fisher and Yates, 1938); returns the number of objects.
+
+    Samples 0 to E - 1 of the stream are the numbers, uniform from least to most, of E objects; sample E + i swaps instance i with one up
+    to it.
+    """
+    count = int(0)
+    for entry in range(catalog.count):
+        number = catalog.least[entry] + uniform_index(key, entry, catalog.most[entry] - catalog.least[entry] + 1)
+        for _copy in range(number):
+            catalog_index[world, count] = entry
+            count += 1
+    for back in range(count - 1):
+        instance = count - 1 - back
+        other = uniform_index(key, catalog.count + instance, instance + 1)
+        swapped = catalog_index[world, other]
+        catalog_index[world, other] = catalog_index[world, instance]
+        catalog_index[world, instance] = swapped
+    return count
+
+
 @wp.kernel
 def sample_objects_kernel(
     # Scene:
@@ -138,8 +185,9 @@ def sample_objects_kernel(
 ):
     """Sample objects up to a volume budget V: with `exceed` until Σ volume ≥ V, else while Σ volume ≤ V. Launched over world.
 
-    An object larger than V is resampled; without `exceed`, after the first one, it ends the draw. `catalog_index` receives the objects (-1:
-    none), `body_slot` the next free slot of their class; without one the episode ends (ARRANGEMENT_OVERFLOW).
+    An object larger than V is resampled; without `exceed`, after the first one, it ends the draw. Where numbers of objects are set, these
+    are drawn instead. `catalog_index` receives the objects (-1: none), `body_slot` the next free slot of their class; without one the
+    episode ends (ARRANGEMENT_OVERFLOW).
     """
     world = wp.tid()
     phase = phase_inout[world]
@@ -151,11 +199,10 @@ def sample_objects_kernel(
     key = stream_key(seed, arrangement_id[world][0], arrangement_id[world][1], Stream.OBJECTS)
     repeats = wp.where(mode[world] == Mode.MOVE, drop.move_repeats, drop.pick_repeats)
     count = int(0)
-    singles = int(0)
-    compounds = int(0)
     total = float(0.0)
-    overflow = bool(False)
-    open = bool(True)
+    open = catalog.counted == 0
+    if not open:
+        count = draw_counted(catalog, key, catalog_index_out, world)
     for sample in range(MAX_SAMPLES):
         if open:
             candidate = uniform_index(key, sample, catalog.count)
@@ -164,20 +211,13 @@ def sample_objects_kernel(
             if drop.exceed == 0 and not repeated and not fits and count > 0:
                 open = False
             if not repeated and fits:
-                slot = singles
-                if catalog.compound[candidate] == 1:
-                    slot = layout.single_slots + compounds
-                compounds += catalog.compound[candidate]
-                singles += 1 - catalog.compound[candidate]
-                overflow = overflow or singles > layout.single_slots or compounds > layout.slots - layout.single_slots
                 catalog_index_out[world, count] = candidate
-                body_slot_out[world, count] = slot
                 total += catalog.volume[candidate]
                 count += 1
             full = count == drop.objects or (repeats == 0 and count == catalog.count)
-            if overflow or full or (drop.exceed == 1 and total >= drop.volume):
+            if full or (drop.exceed == 1 and total >= drop.volume):
                 open = False
-    if overflow:
+    if not assign_slots(layout, catalog, catalog_index_out, body_slot_out, world, 0, count):
         clear_catalog_indices(catalog_index_out, world, layout.instances)
         ending_inout[world] = Ending.ARRANGEMENT_OVERFLOW
         phase_inout[world] = Phase.OVER
@@ -218,24 +258,11 @@ def sample_distractors_kernel(
     key = stream_key(seed, arrangement_id[world][0], arrangement_id[world][1], Stream.DISTRACTORS)
     wanted = int(wp.rint(draw_look(looks, key, LookPart.EPISODE, Look.COUNT)[0]))
     first = count_instances(catalog_index_inout, world, layout.instances)
-    singles = int(0)
-    compounds = int(0)
-    for instance in range(first):
-        compounds += catalog.compound[catalog_index_inout[world, instance]]
-    singles = first - compounds
-    overflow = bool(False)
     choices = pixel_key(key, 0)
-    for instance in range(first, wp.min(first + wanted, layout.instances)):
-        chosen = catalog.count + uniform_index(choices, instance - first, catalog.distractors)
-        slot = singles
-        if catalog.compound[chosen] == 1:
-            slot = layout.single_slots + compounds
-        compounds += catalog.compound[chosen]
-        singles += 1 - catalog.compound[chosen]
-        overflow = overflow or singles > layout.single_slots or compounds > layout.slots - layout.single_slots
-        catalog_index_inout[world, instance] = chosen
-        body_slot_inout[world, instance] = slot
-    if overflow:
+    count = wp.min(first + wanted, layout.instances)
+    for instance in range(first, count):
+        catalog_index_inout[world, instance] = catalog.count + uniform_index(choices, instance - first, catalog.distractors)
+    if not assign_slots(layout, catalog, catalog_index_inout, body_slot_inout, world, first, count):
         clear_catalog_indices(catalog_index_inout, world, layout.instances)
         ending_inout[world] = Ending.ARRANGEMENT_OVERFLOW
         phase_inout[world] = Phase.OVER

@@ -199,6 +199,33 @@ def test_a_budget_for_everything_draws_everything_without_repeats(device):
     assert len(np.unique(worlds.state.catalog_index.numpy(), axis=0)) == 6
 
 
+@pytest.mark.parametrize("counts", [[(0, 0), (8, 8), (0, 0)], [(3, 3), (4, 4), (1, 1)], [(0, 2), (1, 3), (2, 3)]])
+def test_numbers_of_parts_are_those_that_are_set_whatever_the_budget(device, counts):
+    """Homogeneous, kitted and mixed fills; the second object has compound slots. Episodes do not depend on their worlds."""
+    worlds = arrangement_worlds(device, WORLDS, counts=counts, drop={"volume": 1e-3})
+    worlds.begin(Phase.START, np.arange(WORLDS)[::-1] + 7, 1)
+    arrange.sample_episodes(worlds.scene, worlds.state, SEED)
+    found, slot = worlds.state.catalog_index.numpy(), worlds.state.body_slot.numpy()
+    for world, episode in enumerate(range(WORLDS + 6, 6, -1)):
+        expected = arrangement.draw_counted(SEED, episode, 1, counts)
+        assert found[world].tolist() == expected + [-1] * (8 - len(expected))
+        kinds = np.array(expected) == 1
+        for kind, first in ((False, 0), (True, worlds.single_slots)):
+            assert slot[world, : len(expected)][kinds == kind].tolist() == list(range(first, first + (kinds == kind).sum()))
+    drawn = (found[:, :, None] == np.arange(3)).sum(axis=1)
+    assert drawn.min(axis=0).tolist() == [low for low, _ in counts]
+    assert drawn.max(axis=0).tolist() == [high for _, high in counts]
+    assert len(np.unique(found, axis=0)) > (WORLDS // 2 if sum(high > 0 for _, high in counts) > 1 else 0)
+
+
+def test_numbers_of_parts_without_slots_for_them_end_the_episode(device):
+    worlds = arrangement_worlds(device, WORLDS, counts=[(0, 0), (5, 5), (0, 0)], compound_slots=4)
+    worlds.begin(Phase.START)
+    arrange.sample_episodes(worlds.scene, worlds.state, SEED)
+    assert (worlds.state.ending.numpy() == Ending.ARRANGEMENT_OVERFLOW).all()
+    assert (worlds.state.catalog_index.numpy() == -1).all()
+
+
 @pytest.mark.parametrize(
     ("volume", "exceed", "objects"), [(1.0, 0, 4), (1.0, 1, 4), (1.1, 0, 4), (1.1, 1, 5), (0.9, 0, 3), (0.9, 1, 4), (9.0, 1, 8)]
 )

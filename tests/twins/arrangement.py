@@ -69,6 +69,17 @@ def sample_objects(
     return Arrangement(tuple(entries), tuple(slots))
 
 
+def draw_counted(seed: int, episode: int, arrangement: int, counts: list[tuple[int, int]]) -> list[int]:
+    """Entries of an episode: each as often as drawn from its least to its largest number, then swapped from the last one down."""
+    key, entries = rng.stream_key(seed, episode, arrangement, Stream.OBJECTS), []
+    for entry, (low, high) in enumerate(counts):
+        entries += [entry] * (low + int(rng.uniform_index(key, entry, high - low + 1)))
+    for instance in range(len(entries) - 1, 0, -1):
+        other = int(rng.uniform_index(key, len(counts) + instance, instance + 1))
+        entries[instance], entries[other] = entries[other], entries[instance]
+    return entries
+
+
 def drop_poses(
     seed: int, episode: int, arrangement: int, radius: np.ndarray, *, rim: tuple[float, float, float], clearance: float, spread: float
 ) -> np.ndarray:

@@ -99,6 +99,8 @@ class KernelWorlds:
     randomize: Randomize = field(default_factory=Randomize)
     distractors: int = 0
     """The last of the objects, without labels."""
+    counts: Sequence[tuple[int, int]] = ()
+    """Least and largest number of each object; empty: not set."""
     parts: Sequence[tuple[int, int, bool]] = tuple((shape, 0, True) for shape in GUIDES)
 
     def __post_init__(self) -> None:
@@ -157,6 +159,7 @@ class KernelWorlds:
         compound = np.asarray(self.compound, np.int32)
         # Variants as in scenes.build: position among the objects of the same slot class.
         variant = np.where(compound == 1, np.cumsum(compound), np.cumsum(1 - compound)) - 1
+        limits = np.array(self.counts or np.zeros((len(compound), 2)), np.int32)
         columns = {
             "volume": (self.volume, float),
             "radius": (self.radius, float),
@@ -165,12 +168,15 @@ class KernelWorlds:
             "diagonal": (self.radius, float),
             "compound": (compound, int),
             "variant": (variant, int),
+            "least": (limits[:, 0], int),
+            "most": (limits[:, 1], int),
         }
         arrays = {name: wp.array(np.asarray(values), dtype=dtype, device=self.device) for name, (values, dtype) in columns.items()}
         return fill(
             structs.CatalogData,
             count=len(compound) - self.distractors,
             distractors=self.distractors,
+            counted=int(limits[:, 1].sum()),
             empty_single=int((compound == 0).sum()),
             empty_compound=int(compound.sum()),
             empty_mass=0.1,

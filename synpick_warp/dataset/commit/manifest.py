@@ -76,6 +76,7 @@ YOUNGER_SETTINGS: dict[str, Any] = {
     "bop.layout": CLASSIC,
     "bop.keypoints": 0,
     "arrangement.fill": WITHIN,
+    "arrangement.counts": (),
     "depth_sensor.preset": "",
     "depth_sensor.disparity_noise": 0.0,
     "depth_sensor.max_disparity": 0.0,

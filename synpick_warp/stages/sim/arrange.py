@@ -11,7 +11,7 @@ from synpick_warp.kernels import structs
 from synpick_warp.kernels.sim import arrangement, endings, rest
 from synpick_warp.scenes.build import without_distractors
 from synpick_warp.scenes.types import Catalog
-from synpick_warp.stages.constants import SceneData, drop_data, mode_data, mode_rows
+from synpick_warp.stages.constants import SceneData, count_columns, drop_data, mode_data, mode_rows
 from synpick_warp.stages.launch import launch
 from synpick_warp.stages.perception.arrays import Observation
 from synpick_warp.stages.sim.physics import Physics, contact_arrays
@@ -61,6 +61,8 @@ def sample_episodes_ahead(config: Config, catalog: Catalog, episodes: np.ndarray
     objects.count = len(catalog)
     objects.volume = wp.array([entry.volume for entry in catalog.entries], dtype=float, device=device)
     objects.compound = wp.zeros(len(catalog), dtype=int, device=device)
+    for name, value in count_columns(config.arrangement.counts, catalog, device).items():
+        setattr(objects, name, value)
     labelled = without_distractors(config.arrangement, config.randomize.most_distractors)
     drop = drop_data(labelled, config.render, config.pick, config.move, config.physics.gravity, 1)
     index, slot = (wp.empty((count, layout.instances), dtype=wp.int32, device=device) for _ in range(2))
