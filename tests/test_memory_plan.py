@@ -113,7 +113,7 @@ def test_one_cost_volume_of_stereo_matching_is_counted_for_all_views(most, count
         given = {"render__layers": list(layers), "depth_sensor__max_disparity": most, "render__views_per_batch": 5}
         return {name: shape for term in plan_memory(settings(**given), CPU) for name, shape, *_ in term.rows}
 
-    assert rows("depth_stereo")["MatchingScratch.cost"] == (180, 320, count)
+    assert rows("depth_stereo")["MatchingScratch.cost"] == (1, 180, 320, count)
     assert rows("depth_stereo")["InfraredImages.ir_left"] == (5, 180, 320)
     assert not [name for name in rows("depth_sensor", "ir_left") if "Matching" in name or "ir_right" in name]
 

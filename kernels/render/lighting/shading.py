@@ -26,7 +26,7 @@ from synpick_warp.kernels.render.lighting.materials import (
     sample_base_color,
     widen_roughness,
 )
-from synpick_warp.kernels.render.lighting.paths.tracing import PathScene
+from synpick_warp.kernels.render.lighting.paths.tracing import AnyScene
 from synpick_warp.kernels.render.lighting.plane_distance import tangent_plane
 from synpick_warp.kernels.render.lighting.shadow_filter import LampShadows
 from synpick_warp.kernels.render.lighting.shadow_upsampling import upsample_shadows
@@ -105,7 +105,7 @@ def shade_surface(
 
 @wp.func
 def gather_light(
-    scene: PathScene,
+    scene: AnyScene,
     cameras: AnyCameras,
     coarse: CoarseGrid,
     shadow_grid: CoarseGrid,
@@ -135,7 +135,7 @@ def gather_light(
 
 
 @wp.func
-def shade_point(scene: PathScene, sky: Sky, surface: Surface, outgoing: wp.vec3, light: PixelLight) -> wp.vec3:
+def shade_point(scene: AnyScene, sky: Sky, surface: Surface, outgoing: wp.vec3, light: PixelLight) -> wp.vec3:
     """Radiance of a point of a surface towards the camera, the direction `outgoing`."""
     color = sample_base_color(scene.surfaces, surface)
     metallic = scene.surfaces.metallic[surface.row]
@@ -189,7 +189,7 @@ def world_sky(light: wp.array[int], light_yaw: wp.array[float], world: int) -> S
 
 @wp.func
 def shade_pixel(
-    scene: PathScene,
+    scene: AnyScene,
     coarse: CoarseGrid,
     shadow_grid: CoarseGrid,
     sky: Sky,
@@ -219,12 +219,12 @@ def shade_pixel(
     barycentric = gbuffer.barycentric[view, row, column]
     body = body_of(segment, views.instances)
     width = gbuffer.depth[view, row, column] / intrinsics[0]
-    surface = make_table_surface(scene.meshes, bodies, view, outgoing)
-    if segment == Segment.TABLE:
+    surface = make_table_surface(scene.meshes, scene.surfaces, bodies, view, outgoing)
+    if segment != Segment.TABLE:
+        surface = interpolate_surface(scene.meshes, scene.surfaces, bodies, view, body, triangle, barycentric, outgoing, width)
+    else:
         position = hit_position(views.cameras, view, middle_ray, gbuffer.depth[view, row, column])
         surface = map_table(scene.surfaces, surface, position, outgoing, width)
-    else:
-        surface = interpolate_surface(scene.meshes, scene.surfaces, bodies, view, body, triangle, barycentric, outgoing, width)
     normal = surface.face_normal
     light = gather_light(scene, views.cameras, coarse, shadow_grid, sky, gbuffer, ratios, shadows, edges, view, row, column, normal)
     if segment == Segment.TABLE or samples_per_axis == 1:
@@ -249,7 +249,7 @@ def shade_pixel(
 @kernel_of_views(cuda_max_registers=SHADE_REGISTERS)
 def shade_kernel(
     # Scene:
-    scene: PathScene,
+    scene: AnyScene,
     coarse: CoarseGrid,
     shadow_grid: CoarseGrid,
     # State: worlds
@@ -281,7 +281,7 @@ def shade_kernel(
 @kernel_of_views(cuda_max_registers=SAMPLE_SHADE_REGISTERS)
 def shade_samples_kernel(
     # Scene:
-    scene: PathScene,
+    scene: AnyScene,
     coarse: CoarseGrid,
     shadow_grid: CoarseGrid,
     # State: worlds

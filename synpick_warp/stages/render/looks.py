@@ -15,8 +15,8 @@ from synpick_warp.configs.randomize import CHOICE, FIXED, LOG_UNIFORM, NORMAL, U
 from synpick_warp.kernels.distributions import LookDistribution, LookTable
 from synpick_warp.kernels.render.lighting.background import shade_floor_kernel
 from synpick_warp.kernels.render.lighting.looks import draw_looks_kernel, dress_bodies_kernel
-from synpick_warp.kernels.render.lighting.materials import Surfaces
-from synpick_warp.kernels.render.lighting.paths.tracing import PathScene
+from synpick_warp.kernels.render.lighting.materials import DressedSurfaces, Surfaces
+from synpick_warp.kernels.render.lighting.paths.tracing import DressedScene, PathScene
 from synpick_warp.kernels.render.visibility.camera import TILE_PIXELS
 from synpick_warp.kernels.render.visibility.gbuffer import FIXTURES
 from synpick_warp.kernels.render.visibility.variants import kernel_for
@@ -120,28 +120,31 @@ class Dresser:
         self._table = build_look_table(scene.looks, self._first - len(scene.looks.all_textures), scene.device)
         self._materials = instances + int(FIXTURES) + 1 + bool(scene.looks.background_textures)
         rows = views * self._materials
-        self.material = wp.zeros((views, self._materials), dtype=wp.int32, device=scene.device)
-        surfaces, paths = _copy(Surfaces, scene.surfaces), _copy(PathScene, scene.paths)
-        for name in _COPIED:
+        surfaces = DressedSurfaces()
+        for name in Surfaces.vars:
             values = getattr(scene.surfaces, name)
-            longer = wp.zeros((values.shape[0] + rows, *values.shape[1:]), dtype=values.dtype, device=scene.device)
-            wp.copy(longer, values, count=values.size)
-            setattr(surfaces, name, longer)
-        total = surfaces.color.shape[0]
-        surfaces.recolor = wp.zeros(total, dtype=wp.mat33, device=scene.device)
-        surfaces.repeats = wp.zeros(total, dtype=wp.float32, device=scene.device)
-        paths.surfaces = surfaces
+            if name in _COPIED:
+                longer = wp.zeros((values.shape[0] + rows, *values.shape[1:]), dtype=values.dtype, device=scene.device)
+                wp.copy(longer, values, count=values.size)
+                values = longer
+            setattr(surfaces, name, values)
+        surfaces.row = wp.zeros((views, self._materials), dtype=wp.int32, device=scene.device)
+        surfaces.recolor = wp.zeros(self._first + rows, dtype=wp.mat33, device=scene.device)
+        surfaces.repeats = wp.zeros(self._first + rows, dtype=wp.float32, device=scene.device)
+        paths = DressedScene()
+        for name in PathScene.vars:
+            setattr(paths, name, surfaces if name == "surfaces" else getattr(scene.paths, name))
         self.scene = replace(scene, surfaces=surfaces, paths=paths)
 
     def dress(self, snapshot: Snapshot, views: Any, bodies: Any) -> None:
         """Make the materials of the bodies of all views, of their tables and backgrounds; `bodies` must be set up."""
         scene = self.scene
-        inputs = [self._seed, scene.meshes, self._table, snapshot.episode, views, self._first]
+        inputs = [self._seed, scene.meshes, self._table, snapshot.episode, views, bodies, self._first]
         wp.launch(
             kernel_for(dress_bodies_kernel, views),
             dim=(views.count, self._materials),
             inputs=inputs,
-            outputs=[bodies, scene.surfaces],
+            outputs=[scene.surfaces],
             device=scene.device,
         )
 
@@ -151,14 +154,6 @@ def shade_floor(scene: RenderScene, snapshot: Snapshot, bodies: Any, gbuffer: An
     if scene.looks is not None and scene.looks.background_textures:
         inputs = [scene.paths, scene.grid, FLOOR_DROP, snapshot.light, bodies, gbuffer, views]
         launch_pixels(shade_floor_kernel, views.count * scene.grid.tiles * int(TILE_PIXELS), inputs, [radiance], scene.device)
-
-
-def _copy(kind: Any, struct: Any) -> Any:
-    """Shallow copy of a Warp struct."""
-    result = kind()
-    for name in kind.vars:
-        setattr(result, name, getattr(struct, name))
-    return result
 
 
 def draw_parameters(looks: Looks, seed: int, episode: int, parts: list[tuple[LookPart, int]]) -> tuple[np.ndarray, np.ndarray]:

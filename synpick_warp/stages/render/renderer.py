@@ -79,8 +79,6 @@ class Renderer:
         self.views = views
         self.cameras = allocate_view_cameras(views, scene.device, scene.cameras)
         self.bodies = allocate_struct(VIEW_BODIES, sizes, scene.device)
-        if self.dresser:
-            self.bodies.material = self.dresser.material
         self.gbuffer = allocate_struct(GBUFFER, sizes, scene.device)
         self.image = allocate_struct(SHADED_IMAGE, sizes, scene.device)
         if settings.mode == schema.REFERENCE:

@@ -22,7 +22,6 @@ VIEW_BODIES = struct_arrays(
     ViewBodies,
     "view",
     "body",
-    material=("view", "material"),
     ray_record=("view", "body", "record"),
     present=("view",),
     uses_background=("view",),
@@ -112,7 +111,7 @@ def first_views(count: int, cameras: int, instances: int, device: wp.Device, len
 
 def body_sizes(instances: int, width: int, height: int) -> dict[str, int]:
     """Extents of the dimensions that `VIEW_BODIES` names beside the view, for images of `width` x `height` px."""
-    return {"body": instances + len(FIXTURES), "material": 0, "tile": build_grid(width, height).tiles, "record": int(RAY_RECORDS)}
+    return {"body": instances + len(FIXTURES), "tile": build_grid(width, height).tiles, "record": int(RAY_RECORDS)}
 
 
 def set_up_views(
