@@ -43,6 +43,8 @@ LAYOUTS = (CLASSIC, MULTISENSOR)
 """Layouts of scene folders: BOP's classic one, and that of BOP-Industrial 2025."""
 EXCEED = "exceed"
 WITHIN = "within"
+COLUMN, LAYERED = "column", "layers"
+"""Stacks from which objects begin to fall."""
 FILLS = (EXCEED, WITHIN)
 """Rules that end the draw of an episode's objects at the volume budget."""
 FORMATS = ("bop", "shards", "usd", "zarr", "lerobot", "coco", "yolo")
@@ -153,9 +155,22 @@ class Arrangement:
         above=0.0,
         high=0.5,
     )
-    clearance: float = setting(0.01, "m", "Gap between the bounding spheres of consecutive objects in the drop column.", low=0.0, high=1.0)
+    drop: str = setting(
+        COLUMN,
+        "",
+        "Where objects begin to fall: column (one above the other, over the middle) or layers (side by side over the whole opening: many "
+        "from a low height).",
+        choices=(COLUMN, LAYERED),
+    )
+    clearance: float = setting(
+        0.01, "m", "Gap between the bounding spheres of consecutive objects in the drop column, or in layers.", low=0.0, high=1.0
+    )
     spread: float = setting(
-        0.3, "", "Drop positions are uniform over this fraction of the tote's opening, less the object's radius.", low=0.0, high=1.0
+        0.3,
+        "",
+        "Drop positions are uniform over this fraction of the tote's opening, in layers of an object's cell, less the object's radius.",
+        low=0.0,
+        high=1.0,
     )
 
 

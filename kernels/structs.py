@@ -90,9 +90,12 @@ class DropData:
     pick_repeats: int
     """The same for the picking modes."""
     clearance: float
-    """Gap between bounding spheres in the drop column [m]."""
+    """Gap between bounding spheres in the drop column, or between layers and within them [m]."""
     spread: float
-    """Fraction of the opening of a compartment, less the object's bounding radius, over which drop positions spread."""
+    """Fraction of the opening of a compartment, or in layers of a cell, less the object's bounding radius, over which drop positions
+    spread."""
+    layers: int
+    """1: objects begin to fall from layers of cells; 0: from a column."""
     gravity: float
     """Gravitational acceleration [m/s²]."""
     gripper_home: wp.vec3

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
 
 from synpick_warp.configs.cell import BinSizes
 from synpick_warp.configs.fills import Counts
+from synpick_warp.configs.schema import COLUMN, LAYERED, Arrangement
 from synpick_warp.errors import ConfigError, format_value, suggest
 from synpick_warp.scenes.types import Catalog
 
@@ -40,14 +42,41 @@ def count_entries(counts: Counts, catalog: Catalog) -> np.ndarray:
     return numbers
 
 
-def check_fill(counts: Counts, catalog: Catalog, bins: Sequence[BinSizes]) -> None:
-    """Refuse more parts than fit into each bin with walls, at the densest packing of spheres.
+def drop_height(most: np.ndarray, radius: np.ndarray, arrangement: Arrangement, sizes: BinSizes) -> float:
+    """Height of the stack from which a bin's objects begin to fall [m], by `kernels.sim.arrangement.drop_objects_kernel`.
+
+    Args:
+        most: Largest number of each object in an episode (entry).
+        radius: Bounding radii (entry) [m].
+        arrangement: Settings of the drop.
+        sizes: The bin; in layers its compartments are taken to have equal shares of the objects.
+    """
+    if arrangement.drop == COLUMN:
+        return float(most @ (2.0 * radius + arrangement.clearance))
+    pitch = float(2.0 * radius[most > 0].max(initial=0.0) + arrangement.clearance)
+    cells = sum(max(1, int(length / pitch)) * max(1, int(width / pitch)) for length, width in sizes.mouths)
+    return pitch * math.ceil(int(most.sum()) / cells)
+
+
+def check_fill(arrangement: Arrangement, guide_height: float, catalog: Catalog, bins: Sequence[BinSizes]) -> None:
+    """Refuse parts by `counts` that do not fit into each bin with walls, at the densest packing of spheres, or between its guide walls.
 
     Raises:
         ConfigError: They do not, or `count_entries` refuses a part.
     """
-    volume = float(count_entries(counts, catalog)[:, 1] @ np.array([entry.volume for entry in catalog.entries]))
+    if not arrangement.counts:
+        return
+    most = count_entries(arrangement.counts, catalog)[:, 1]
+    volume, radius = (np.array([getattr(entry, name) for entry in catalog.entries]) for name in ("volume", "radius"))
+    volume = float(most @ volume)
     for sizes in bins:
+        height = drop_height(most, radius, arrangement, sizes)
+        if height > guide_height:
+            other = f'set arrangement.drop = "{LAYERED}"' if arrangement.drop == COLUMN else "raise physics.guide_height"
+            raise ConfigError(
+                f"the {most.sum()} parts of arrangement.counts begin to fall from up to {height:.3g} m above the {sizes.noun}, but the "
+                f"walls that guide them are {guide_height:g} m high; {other}, or take fewer"
+            )
         inside = sizes.height * (np.prod(sizes.floor) + np.prod(sizes.opening)) / 2.0
         if sizes.shell is not None and volume > _DENSEST * inside:
             raise ConfigError(

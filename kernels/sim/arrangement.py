@@ -342,18 +342,41 @@ def choose_compartment(bins: BinData, world: int, key: wp.uint64, instance: int)
 
 @wp.func
 def drop_pose(
-    key: wp.uint64, index: int, radius: float, height: float, drop: DropData, bins: BinData, world: int, compartment: int
+    key: wp.uint64, index: int, radius: float, height: float, spread: float, pose: wp.transform, center: wp.vec2, half: wp.vec2
 ) -> wp.transform:
-    """Sample a drop pose at a height above the floor [m]: uniform rotation, position uniform over a fraction of a compartment's opening.
+    """Sample a drop pose at a height above the floor [m]: uniform rotation, position uniform over a fraction `spread` of an area.
 
-    The opening is reduced by the object's bounding radius [m]; `index` counts the drops of the stream.
+    The area, about `center` in the frame of the bin at `pose`, is reduced by the object's bounding radius [m]; `index` counts the drops of
+    the stream.
     """
     first = index * DROP_SAMPLES
-    center = bins.center[compartment]
-    half = bins.half[compartment]
-    x = (2.0 * uniform(key, first) - 1.0) * drop.spread * wp.max(0.0, half[0] - radius) + center[0]
-    y = (2.0 * uniform(key, first + 1) - 1.0) * drop.spread * wp.max(0.0, half[1] - radius) + center[1]
-    return bins.pose[world] * wp.transform(wp.vec3(x, y, height), uniform_rotation(key, first + 2))
+    x = (2.0 * uniform(key, first) - 1.0) * spread * wp.max(0.0, half[0] - radius) + center[0]
+    y = (2.0 * uniform(key, first + 1) - 1.0) * spread * wp.max(0.0, half[1] - radius) + center[1]
+    return pose * wp.transform(wp.vec3(x, y, height), uniform_rotation(key, first + 2))
+
+
+@wp.func
+def largest_radius(catalog: CatalogData, catalog_index: wp.array2d[int], world: int, count: int) -> float:
+    """Largest bounding radius of a world's objects [m]."""
+    result = float(0.0)
+    for instance in range(count):
+        result = wp.max(result, catalog.radius[catalog_index[world, instance]])
+    return result
+
+
+@wp.func
+def layer_cell(half: wp.vec2, side: float, place: int):
+    """Cell of a place in layers over an area of half extents `half` [m]: index of the layer, centre of the cell and its half extents [m].
+
+    Layers are grids of as many cells as fit that are at least `side` [m] long and wide, one at least.
+    """
+    columns = wp.max(1, int(2.0 * half[0] / side))
+    rows = wp.max(1, int(2.0 * half[1] / side))
+    cell = wp.vec2(half[0] / float(columns), half[1] / float(rows))
+    index = place % (columns * rows)
+    across = float(2 * (index % columns) + 1 - columns)
+    along = float(2 * (index // columns) + 1 - rows)
+    return place // (columns * rows), wp.vec2(across * cell[0], along * cell[1]), cell
 
 
 @wp.func
@@ -441,11 +464,12 @@ def drop_objects_kernel(
     joint_qd_out: wp.array[float],  # (dof) [m/s, rad/s]
     joint_f_out: wp.array[float],  # (dof) [N, N·m]
 ):
-    """Assign objects to their body slots and stack them above the bin in a column of bounding spheres, at rest; phase becomes SETTLE.
+    """Assign objects to their body slots and stack them above the bin, at rest; phase becomes SETTLE. Launched over world.
 
-    Height of sphere i above the floor: z_i = rim + r_i + Σ_{j<i} (2 r_j + clearance), in whichever compartment. With distractors, which are
-    the last instances, the column begins with a random instance and goes on from the last to the first, so that they lie anywhere in the
-    pile. Launched over world.
+    In a column of bounding spheres, sphere i has the height z_i = rim + r_i + Σ_{j<i} (2 r_j + clearance) above the floor, in whichever
+    compartment. In layers, each compartment has its own, of cells as wide as the largest sphere and the clearance, and z_i = rim + r_i +
+    l_i (2 max r + clearance) in layer l_i. With distractors, which are the last instances, the stack begins with a random instance and goes
+    on from the last to the first, so that they lie anywhere in the pile.
     """
     world = wp.tid()
     if phase_inout[world] != Phase.START:
@@ -453,8 +477,10 @@ def drop_objects_kernel(
     body = world * layout.bodies + layout.gripper_bodies
     key = stream_key(seed, arrangement_id[world][0], arrangement_id[world][1], Stream.DROP)
     places = stream_key(seed, arrangement_id[world][0], arrangement_id[world][1], Stream.COMPARTMENT)
-    height = bins.rim_height[bins.chosen[world]]
+    rim = bins.rim_height[bins.chosen[world]]
+    height = rim
     count = count_instances(catalog_index, world, layout.instances)
+    pitch = 2.0 * largest_radius(catalog, catalog_index, world, count) + drop.clearance
     first = int(0)
     if catalog.distractors > 0 and count > 0:
         order = stream_key(seed, arrangement_id[world][0], arrangement_id[world][1], Stream.DISTRACTORS)
@@ -469,7 +495,18 @@ def drop_objects_kernel(
             qd = world * layout.dofs + layout.gripper_dofs + 6 * slot
             radius = catalog.radius[index]
             compartment = choose_compartment(bins, world, places, instance)
-            pose = drop_pose(key, instance, radius, height + radius, drop, bins, world, compartment)
+            center = bins.center[compartment]
+            half = bins.half[compartment]
+            bottom = height
+            if drop.layers == 1:
+                below = int(0)
+                for other in range(place):
+                    below += int(choose_compartment(bins, world, places, (first + other) % count) == compartment)
+                layer, offset, cell = layer_cell(half, pitch, below)
+                center = center + offset
+                half = cell
+                bottom = rim + float(layer) * pitch
+            pose = drop_pose(key, instance, radius, bottom + radius, drop.spread, bins.pose[world], center, half)
             write_body(joint_q_out, joint_qd_out, q, qd, pose)
             joint_f_out[qd + 2] = 0.0
             height += 2.0 * radius + drop.clearance

@@ -231,7 +231,7 @@ def _fit_to_catalog(config: Config, catalog: Catalog, bins: Sequence[Bin], devic
         ConfigError: The capacities do not fit into the device's memory, or the parts of `arrangement.counts` not into the bins.
     """
     labelled = without_distractors(config.arrangement, config.randomize.most_distractors)
-    check_fill(labelled.counts, catalog, config.cell.bins)
+    check_fill(labelled, config.physics.guide_height, catalog, config.cell.bins)
     filled = config.with_values(REPEATS) if must_repeat(labelled, catalog) else config
     if find_repeat_rules(filled.bake, filled.pick, filled.move) != find_repeat_rules(config.bake, config.pick, config.move):
         total = sum(entry.volume for entry in catalog.entries)

@@ -184,6 +184,7 @@ def drop_data(
         render,
         objects=arrangement.max_objects,
         exceed=arrangement.fill == schema.EXCEED,
+        layers=arrangement.drop == schema.LAYERED,
         move_repeats=move.repeats,
         pick_repeats=pick.repeats,
         gravity=gravity,

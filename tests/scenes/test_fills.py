@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 
 from synpick_warp.configs.load import load_config, parse_assignment
+from synpick_warp.configs.schema import Arrangement
 from synpick_warp.configs.write import config_to_toml
 from synpick_warp.errors import ConfigError
 from synpick_warp.scenes import build
-from synpick_warp.scenes.fills import check_fill, count_entries
+from synpick_warp.scenes.fills import check_fill, count_entries, drop_height
 from tests.worlds.small_worlds import BOX, CUBE, PLATE, catalog
 
 OBJECTS = catalog(BOX, CUBE, PLATE)
@@ -91,10 +92,25 @@ def test_more_than_the_bin_holds_is_refused():
     bins = load_config("smoke").cell.bins
     inside = bins[0].height * (np.prod(bins[0].floor) + np.prod(bins[0].opening)) / 2.0
     room = int(0.74 * inside / OBJECTS.entries[1].volume)
-    check_fill(((NAMES[1], room, room),), OBJECTS, bins)
+    few, many = (Arrangement(counts=((NAMES[1], 1, most),), drop="layers") for most in (room, room + 1))
+    check_fill(few, 100.0, OBJECTS, bins)
     with pytest.raises(ConfigError, match="the tote has room for"):
-        check_fill(((NAMES[1], 1, room + 1),), OBJECTS, bins)
-    check_fill(((NAMES[1], 1, room + 1),), OBJECTS, load_config("tabletop").cell.bins)
+        check_fill(many, 100.0, OBJECTS, bins)
+    check_fill(many, 100.0, OBJECTS, load_config("tabletop").cell.bins)
+
+
+def test_stacks_above_the_guide_walls_are_refused():
+    """Known: cubes of 50 mm have spheres of 86.6 mm: in a column each takes 96.6 mm, over 545 x 352 mm a layer has 5 x 3 of them."""
+    bins = load_config("smoke").cell.bins
+    most, radius = np.array([0, 31, 0]), np.array([entry.radius for entry in OBJECTS.entries])
+    column, layers = (Arrangement(counts=((NAMES[1], 31, 31),), drop=drop) for drop in ("column", "layers"))
+    assert drop_height(most, radius, column, bins[0]) == pytest.approx(31 * 0.0966, rel=1e-3)
+    assert drop_height(most, radius, layers, bins[0]) == pytest.approx(3 * 0.0966, rel=1e-3)
+    check_fill(column, 3.0, OBJECTS, bins)
+    check_fill(layers, 0.3, OBJECTS, bins)
+    for arrangement, height, hint in ((column, 2.9, 'arrangement.drop = "layers"'), (layers, 0.28, "raise physics.guide_height")):
+        with pytest.raises(ConfigError, match=hint):
+            check_fill(arrangement, height, OBJECTS, bins)
 
 
 def test_slots_are_those_of_the_largest_numbers():

@@ -9,15 +9,15 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from synpick_warp.codes import Ending, Mode, Phase
+from synpick_warp.codes import Ending, Mode, Phase, Stream
 from synpick_warp.configs.schema import Split
 from synpick_warp.kernels.sim import arrangement as kernels
 from synpick_warp.scenes import build
 from synpick_warp.stages.constants import make_scene_data
 from synpick_warp.stages.sim import arrange
-from tests.twins import arrangement
+from tests.twins import arrangement, rng
 from tests.worlds import small_worlds
-from tests.worlds.kernel_worlds import KernelWorlds, arrangement_worlds
+from tests.worlds.kernel_worlds import BIN, KernelWorlds, arrangement_worlds
 
 WORLDS = 24
 SEED = 2**40 + 3
@@ -344,6 +344,37 @@ def test_objects_fall_from_a_column_within_the_opening(sizes, spread, clearance,
         assert (gaps[~np.eye(len(catalog_index), dtype=bool)] >= -1e-5).all()
         for axis in range(2):
             assert (np.abs(place[:, axis]) <= np.maximum(0.0, rim[axis] / 2 - radius) + 1e-6).all()
+
+
+@given(seed=st.integers(0, 2**32 - 1), compartments=st.sampled_from([(1, 1), (3, 2)]), spread=st.sampled_from([0.0, 0.3, 1.0]))
+def test_in_layers_objects_fall_from_cells_of_their_compartments(seed, compartments, spread, device):
+    """No two bounding spheres overlap, all are over the opening, and no layer is empty below another; the twin has the same poses."""
+    numbers = np.random.default_rng(seed)
+    radius, most = numbers.uniform(0.008, 0.03, 3), numbers.integers(0, 14, 3) + 1
+    sizes = dataclasses.replace(BIN, floor=(0.5, 0.3), compartments=compartments)
+    counts = [(int(number), int(number)) for number in most]
+    room = {"instances": 40, "single_slots": 40, "compound_slots": 40, "counts": counts, "radius": radius}
+    worlds = arrangement_worlds(device, 4, **room, bins=(sizes,), drop={"spread": spread, "layers": 1, "clearance": 0.004})
+    worlds.begin(Phase.START, seed % 1000 + np.arange(4))
+    arrange.sample_episodes(worlds.scene, worlds.state, SEED)
+    arrange.drop_objects(worlds.scene, worlds.state, worlds.physics, SEED)
+    count, pitch = int(most.sum()), np.float32(2 * radius.max()) + np.float32(0.004)
+    halves = np.array(sizes.mouths) / 2
+    for world in range(4):
+        entries, slots = (array.numpy()[world, :count] for array in (worlds.state.catalog_index, worlds.state.body_slot))
+        place, each = worlds.coordinates()[world, slots, :3].astype(np.float64), radius[entries]
+        episode = seed % 1000 + world
+        places = rng.stream_key(SEED, episode, 0, Stream.COMPARTMENT)
+        chosen = rng.uniform_index(places, np.arange(count), len(halves))
+        layer, middle, cell = arrangement.layer_places(chosen, pitch, np.array(sizes.centers), halves)
+        key, index = rng.stream_key(SEED, episode, 0, Stream.DROP), np.arange(count)
+        sides = np.stack([2 * rng.uniform(key, 5 * index + axis) - 1 for axis in (0, 1)], axis=1)
+        across = middle + sides * spread * np.maximum(0.0, cell - each[:, None])
+        np.testing.assert_allclose(place, np.column_stack([across, sizes.height + each + layer * pitch]), atol=2e-6)
+        gaps = np.linalg.norm(place[:, None] - place[None], axis=2) - each[:, None] - each[None]
+        assert gaps[~np.eye(count, dtype=bool)].min() > -1e-6
+        assert (np.abs(place[:, :2] - np.array(sizes.centers)[chosen]) <= halves[chosen] - each[:, None] + 1e-6).all()
+        assert place[:, 2].max() < sizes.height + each.max() + pitch * (count - 1) / 2
 
 
 def test_the_drop_uses_the_whole_spread(device):

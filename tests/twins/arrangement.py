@@ -80,6 +80,21 @@ def draw_counted(seed: int, episode: int, arrangement: int, counts: list[tuple[i
     return entries
 
 
+def layer_places(
+    compartments: np.ndarray, pitch: float, centers: np.ndarray, halves: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Layer, centre (2) and half extents (2) of the cell of each place, from the compartments of all places, in order."""
+    layers, middles, cells = [], [], []
+    for place, compartment in enumerate(compartments):
+        grid = np.maximum(1, (2 * halves[compartment] / pitch).astype(int))
+        layer, index = divmod(int((compartments[:place] == compartment).sum()), int(grid.prod()))
+        cell = halves[compartment] / grid
+        layers.append(layer)
+        middles.append(centers[compartment] - halves[compartment] + cell * (1 + 2 * np.array([index % grid[0], index // grid[0]])))
+        cells.append(cell)
+    return np.array(layers), np.array(middles), np.array(cells)
+
+
 def drop_poses(
     seed: int, episode: int, arrangement: int, radius: np.ndarray, *, rim: tuple[float, float, float], clearance: float, spread: float
 ) -> np.ndarray:

@@ -36,6 +36,7 @@ DROP: dict[str, Any] = {
     "pick_repeats": 1,
     "clearance": 0.01,
     "spread": 0.5,
+    "layers": 0,
     "gravity": 9.81,
     "gripper_home": wp.vec3(3.0, 0.0, 1.0),
     "lights": 5,
