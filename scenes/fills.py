@@ -43,7 +43,7 @@ def count_entries(counts: Counts, catalog: Catalog) -> np.ndarray:
 
 
 def drop_height(most: np.ndarray, radius: np.ndarray, arrangement: Arrangement, sizes: BinSizes) -> float:
-    """Height of the stack from which a bin's objects begin to fall [m], by `kernels.sim.arrangement.drop_objects_kernel`.
+    """Height of the stack from which a bin's objects begin to fall [m], by `kernels.sim.drop.drop_objects_kernel`.
 
     Args:
         most: Largest number of each object in an episode (entry).

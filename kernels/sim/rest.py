@@ -4,7 +4,7 @@ import warp as wp
 
 from synpick_warp.codes import Phase, Stream
 from synpick_warp.kernels.rng import stream_key
-from synpick_warp.kernels.sim.arrangement import choose_compartment, drop_pose, write_body
+from synpick_warp.kernels.sim.drop import choose_compartment, drop_pose, top_of_objects, write_body
 from synpick_warp.kernels.structs import BinData, CatalogData, DropData, LayoutData, SettleData
 
 wp.set_module_options({"enable_backward": False})
@@ -146,12 +146,8 @@ def redrop_objects_kernel(
     height = bins.rim_height[bins.chosen[world]]
     body = world * layout.bodies + layout.gripper_bodies
     if drop.layers == 1:
-        floor = wp.transform_get_translation(bins.pose[world])[2]
-        for instance in range(layout.instances):
-            index = catalog_index[world, instance]
-            if index >= 0:
-                falling = wp.transform_get_translation(body_q[body + body_slot[world, instance]])[2] - floor
-                height = wp.max(height, falling + catalog.radius[index] + drop.clearance)
+        top = top_of_objects(layout, catalog, catalog_index, body_slot, body_q, world)
+        height = wp.max(height, top - wp.transform_get_translation(bins.pose[world])[2] + drop.clearance)
     for instance in range(layout.instances):
         index = catalog_index[world, instance]
         if index >= 0:

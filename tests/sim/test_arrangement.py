@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from synpick_warp.codes import Ending, Mode, Phase, Stream
 from synpick_warp.configs.schema import Split
-from synpick_warp.kernels.sim import arrangement as kernels
+from synpick_warp.kernels.sim.drop import PARKED_HEIGHT
 from synpick_warp.scenes import build
 from synpick_warp.stages.constants import make_scene_data
 from synpick_warp.stages.sim import arrange
@@ -406,7 +406,7 @@ def test_empty_slots_wait_without_weight_and_full_ones_get_their_variant(device)
     np.testing.assert_array_equal(variant[:, 2:][~full], np.broadcast_to(empty, full.shape)[~full])
     weight = np.array([0.0, 0.0, catalog.empty_mass * worlds.scene.drop.gravity, 0.0, 0.0, 0.0])
     np.testing.assert_allclose(worlds.forces(), np.where(full[:, :, None], 0.0, weight), rtol=1e-6)
-    parked = [0.0, 0.0, kernels.PARKED_HEIGHT, 0.0, 0.0, 0.0, 1.0]
+    parked = [0.0, 0.0, PARKED_HEIGHT, 0.0, 0.0, 0.0, 1.0]
     np.testing.assert_array_equal(worlds.coordinates()[~full], np.broadcast_to(np.float32(parked), worlds.coordinates()[~full].shape))
     assert (worlds.physics.state.joint_qd.numpy() == 0.0).all()
     assert (state.stuck.numpy() == 0).all()
@@ -426,5 +426,5 @@ def test_a_world_without_room_for_what_was_drawn_has_no_objects(device):
     assert over.any()
     assert not over.all()
     assert (worlds.state.catalog_index.numpy()[over] == -1).all()
-    assert (worlds.coordinates()[over][:, :, 2] == kernels.PARKED_HEIGHT).all()
+    assert (worlds.coordinates()[over][:, :, 2] == PARKED_HEIGHT).all()
     assert (worlds.forces()[over][:, :, 2] > 0.0).all()

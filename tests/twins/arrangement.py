@@ -1,4 +1,4 @@
-"""Sampling of modes, objects and drop poses in NumPy, from the laws in kernels.sim.arrangement's docstrings."""
+"""Sampling of modes, objects and drop poses in NumPy, from the laws in the docstrings of kernels.sim.arrangement and drop."""
 
 from __future__ import annotations
 
