@@ -359,7 +359,7 @@ def resolve_footprints_kernel(
             normal = wp.vec3(0.0, 0.0, 0.0)
             if hit.segment != Segment.NOTHING:
                 normal = wp.transpose(views.cameras.to_world[view]) * face_normal(meshes, bodies, view, hit, views.instances)
-            plane = tangent_plane(views.cameras, view, r, c, wp.uint8(hit.segment), hit.depth, normal)
+            plane = tangent_plane(views.cameras, intrinsics, view, r, c, wp.uint8(hit.segment), hit.depth, normal)
             plane.height = hit.depth * wp.dot(normal, ray)
             mesh = int(-1)
             if hit.segment != Segment.NOTHING and hit.segment != Segment.TABLE:

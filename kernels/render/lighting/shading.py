@@ -33,7 +33,7 @@ from synpick_warp.kernels.render.lighting.shadow_upsampling import upsample_shad
 from synpick_warp.kernels.render.lighting.shadows import byte_of
 from synpick_warp.kernels.render.lighting.unoccluded import unoccluded_light
 from synpick_warp.kernels.render.lighting.upsampling import RatioImages, Ratios, upsample_ratios
-from synpick_warp.kernels.render.visibility.camera import AnyCameras, AnyViews, camera_ray, hit_position, in_image, tile_pixel
+from synpick_warp.kernels.render.visibility.camera import AnyCameras, AnyViews, hit_position, in_image, loop_ray, tile_pixel
 from synpick_warp.kernels.render.visibility.gbuffer import GBuffer, ViewBodies, body_of
 from synpick_warp.kernels.render.visibility.triangles import camera_triangle, edge_areas
 from synpick_warp.kernels.render.visibility.variants import kernel_of_views
@@ -107,6 +107,7 @@ def shade_surface(
 def gather_light(
     scene: AnyScene,
     cameras: AnyCameras,
+    intrinsics: wp.vec4,
     coarse: CoarseGrid,
     shadow_grid: CoarseGrid,
     sky: Sky,
@@ -117,15 +118,14 @@ def gather_light(
     view: int,
     row: int,
     column: int,
-    face_normal: wp.vec3,
+    normal: wp.vec3,
 ) -> PixelLight:
-    """Upsample the denoised light and the lamps' shadows to a pixel whose surface has the geometric normal `face_normal`.
+    """Upsample the denoised light and the lamps' shadows to a pixel whose surface has the geometric `normal` in camera space.
 
-    `edges` is that of `upsample_shadows`.
+    `intrinsics` are those of the view; `edges` is that of `upsample_shadows`.
     """
     segment = gbuffer.segment[view, row, column]
-    normal = wp.transpose(cameras.to_world[view]) * face_normal
-    plane = tangent_plane(cameras, view, row, column, segment, gbuffer.depth[view, row, column], normal)
+    plane = tangent_plane(cameras, intrinsics, view, row, column, segment, gbuffer.depth[view, row, column], normal)
     result = PixelLight()
     if scene.lights.lamps[sky.light] > 0:
         result.lamps = upsample_shadows(shadows, edges, shadow_grid, view, row, column, plane)
@@ -210,8 +210,9 @@ def shade_pixel(
     pass a constant, so that the compiler removes the loop if there is one sample. `edges` is that of `upsample_shadows`.
     """
     intrinsics = views.cameras.intrinsics[view]
-    middle_ray = camera_ray(views.cameras, view, row, column, wp.vec2(0.0, 0.0))
-    outgoing = -wp.normalize(views.cameras.to_world[view] * middle_ray)
+    to_world = views.cameras.to_world[view]
+    middle_ray = loop_ray(views.cameras, intrinsics, view, row, column, wp.vec2(0.0, 0.0))
+    outgoing = -wp.normalize(to_world * middle_ray)
     segment = int(gbuffer.segment[view, row, column])
     if segment == Segment.NOTHING:
         return environment_radiance(scene.lights, sky.light, rotate_z(-outgoing, -sky.yaw))
@@ -225,8 +226,10 @@ def shade_pixel(
     else:
         position = hit_position(views.cameras, view, middle_ray, gbuffer.depth[view, row, column])
         surface = map_table(scene.surfaces, surface, position, outgoing, width)
-    normal = surface.face_normal
-    light = gather_light(scene, views.cameras, coarse, shadow_grid, sky, gbuffer, ratios, shadows, edges, view, row, column, normal)
+    normal = wp.transpose(to_world) * surface.face_normal
+    light = gather_light(
+        scene, views.cameras, intrinsics, coarse, shadow_grid, sky, gbuffer, ratios, shadows, edges, view, row, column, normal
+    )
     if segment == Segment.TABLE or samples_per_axis == 1:
         return shade_point(scene, sky, surface, outgoing, light)
     corners = camera_triangle(scene.meshes, bodies, view, body, triangle)
@@ -235,7 +238,7 @@ def shade_pixel(
     samples = samples_per_axis * samples_per_axis
     total = wp.vec3(0.0)
     for sample in range(samples):
-        ray = camera_ray(views.cameras, view, row, column, sample_offset(sample, samples_per_axis))
+        ray = loop_ray(views.cameras, intrinsics, view, row, column, sample_offset(sample, samples_per_axis))
         weights, moved = move_weights(center, orientation, edge_areas(corners, ray))
         outgoing = -wp.normalize(views.cameras.to_world[view] * ray)
         # A sample that stays at the center has the footprint of a whole pixel.

@@ -190,7 +190,7 @@ def camera_ray(cameras: AnyCameras, view: int, row: int, column: int, offset: wp
 
 @wp.func
 def loop_ray(cameras: AnyCameras, intrinsics: wp.vec4, view: int, row: int, column: int, offset: wp.vec2) -> wp.vec3:
-    """As `camera_ray`, for a loop that writes memory: `intrinsics`, those of the view, are not read anew for each ray."""
+    """As `camera_ray`, with the view's `intrinsics`: where more is done with them, and in loops, which would read them for each ray."""
     lens = lens_of(cameras, view)
     if lens >= 0:
         return table_ray(cameras.lenses, lens, row, column, offset)

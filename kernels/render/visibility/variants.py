@@ -3,6 +3,7 @@
 A branch that is never taken still costs registers, and changes which products the compiler fuses with sums: the last bits of a picture.
 """
 
+import functools
 from collections.abc import Callable
 from typing import Any
 
@@ -47,6 +48,7 @@ def kernel_for(kernel: wp.Kernel, *arguments: Any) -> wp.Kernel:
     return _kernels[kernel, given]
 
 
+@functools.cache
 def _variable(template: wp.Kernel) -> dict[str, tuple[Any, Any]]:
     """Parameters of a kernel that are annotated `Any`, with their structs."""
     return {name: VARIANTS[name] for name, given in template.func.__annotations__.items() if given is Any}

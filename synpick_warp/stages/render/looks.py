@@ -22,6 +22,7 @@ from synpick_warp.kernels.render.visibility.gbuffer import FIXTURES
 from synpick_warp.kernels.render.visibility.variants import kernel_for
 from synpick_warp.scenes.looks import Looks
 from synpick_warp.scenes.tote import FLOOR_DROP
+from synpick_warp.stages.arrays import ArraySpec, StructArrays, allocate_struct
 from synpick_warp.stages.buffers import Snapshot
 from synpick_warp.stages.launch import launch_pixels
 from synpick_warp.stages.render.scene import RenderScene
@@ -46,7 +47,12 @@ SETTINGS = {
 }
 """Setting of `Randomize` that has a part's distribution of a parameter."""
 _COPIED = ("color", "metallic", "roughness", "texture_size", "first_texel", "texture_levels")
-"""Arrays of `Surfaces` with a row for each material."""
+"""Arrays of `Surfaces` with a row for each material, of every scene ..."""
+_TYPES = {name: DressedSurfaces.vars[name].type for name in (*_COPIED, "recolor", "repeats")}
+_MATERIALS = StructArrays(
+    DressedSurfaces, {name: ArraySpec(("material", "level")[: kind.ndim], kind.dtype, "") for name, kind in _TYPES.items()}
+)
+"""... and all that the materials of views have."""
 
 _ROW: Any = LookDistribution.numpy_dtype()
 
@@ -106,6 +112,16 @@ def _pack_choice(distribution: Distribution) -> list[np.ndarray]:
     return list(np.column_stack([_vectors(distribution), np.cumsum(weights) / weights.sum()]))
 
 
+def materials_of_view(instances: int, background: bool = True) -> int:
+    """Number of materials of a view of `instances` instances: theirs, of fixtures, table and background."""
+    return instances + int(FIXTURES) + 1 + background
+
+
+def allocate_materials(rows: int, levels: int, device: wp.Device) -> Any:
+    """Allocate the members of the struct `DressedSurfaces` that materials have, for a number of these and of mip levels."""
+    return allocate_struct(_MATERIALS, {"material": rows, "level": levels}, device)
+
+
 class Dresser:
     """Sampler of the materials of each batch of views. Owns a scene with space for them.
 
@@ -118,19 +134,16 @@ class Dresser:
         self._seed = wp.uint64(seed)
         self._first = scene.surfaces.color.shape[0]
         self._table = build_look_table(scene.looks, self._first - len(scene.looks.all_textures), scene.device)
-        self._materials = instances + int(FIXTURES) + 1 + bool(scene.looks.background_textures)
-        rows = views * self._materials
-        surfaces = DressedSurfaces()
+        self._materials = materials_of_view(instances, bool(scene.looks.background_textures))
+        levels = scene.surfaces.first_texel.shape[1]
+        surfaces = allocate_materials(self._first + views * self._materials, levels, scene.device)
         for name in Surfaces.vars:
             values = getattr(scene.surfaces, name)
             if name in _COPIED:
-                longer = wp.zeros((values.shape[0] + rows, *values.shape[1:]), dtype=values.dtype, device=scene.device)
-                wp.copy(longer, values, count=values.size)
-                values = longer
-            setattr(surfaces, name, values)
+                wp.copy(getattr(surfaces, name), values, count=values.size)
+            else:
+                setattr(surfaces, name, values)
         surfaces.row = wp.zeros((views, self._materials), dtype=wp.int32, device=scene.device)
-        surfaces.recolor = wp.zeros(self._first + rows, dtype=wp.mat33, device=scene.device)
-        surfaces.repeats = wp.zeros(self._first + rows, dtype=wp.float32, device=scene.device)
         paths = DressedScene()
         for name in PathScene.vars:
             setattr(paths, name, surfaces if name == "surfaces" else getattr(scene.paths, name))

@@ -177,13 +177,13 @@ def make_vertex(
     """Build the path vertex at a hit. `outgoing` points back along the ray; `width` [m] is the footprint's, across the ray."""
     surface = make_table_surface(scene.meshes, scene.surfaces, bodies, view, outgoing)
     at = position
-    if hit.segment == Segment.TABLE:
+    if hit.segment != Segment.TABLE:
+        body = body_of(hit.segment, instances)
+        surface = interpolate_surface(scene.meshes, scene.surfaces, bodies, view, body, hit.triangle, hit.barycentric, outgoing, width)
+    else:
         # Far away, rounding would lift or sink it by more than the rays' offset.
         at = wp.vec3(position[0], position[1], scene.table.height)
         surface = map_table(scene.surfaces, surface, at, outgoing, width)
-    else:
-        body = body_of(hit.segment, instances)
-        surface = interpolate_surface(scene.meshes, scene.surfaces, bodies, view, body, hit.triangle, hit.barycentric, outgoing, width)
     vertex = Vertex()
     vertex.origin = at + RAY_OFFSET * surface.face_normal
     vertex.face_normal = surface.face_normal
