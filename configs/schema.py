@@ -128,6 +128,8 @@ class Arrangement:
         "",
         "Parts, by name or obj_id, and how many of each an episode has: one (homogeneous) or several (kitted), with a range drawn anew for "
         "each episode (mixed); empty: objects are drawn up to volume. Parts mix in the drop.",
+        low=0,
+        high=INT32_MAX,
         parse=parse_counts,
         allowed=COUNTS,
     )
