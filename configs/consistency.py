@@ -11,7 +11,9 @@ from collections.abc import Iterator, Sequence
 from synpick_warp.configs.bins import OWN, PALLET, TOTE, BinRow, Bins, Tote
 from synpick_warp.configs.camera_rules import Conflict, find_camera_conflicts
 from synpick_warp.configs.cell import BinSizes
+from synpick_warp.configs.fills import most_objects
 from synpick_warp.configs.modes import bake_modes
+from synpick_warp.configs.objects import EMBEDDED
 from synpick_warp.configs.randomize import Randomize
 from synpick_warp.configs.schema import (
     FORMATS,
@@ -59,8 +61,11 @@ def find_conflicts(config: Config) -> Iterator[Conflict]:
     yield from _jpeg_quality(config.effects, bop)
     yield from _split_folders(config.splits, bop)
     yield from _scene_ids(DataLayout.of(config))
+    if not config.objects.embedded:
+        yield "objects.embedded", f"at least one of {', '.join(EMBEDDED)}"
     yield from _object_rows(config.object_rows)
     yield from _distractors(config.randomize, config.arrangement, config.bake)
+    yield from _counts(config.arrangement, config.randomize.most_distractors)
     if config.randomize.background_textures and config.render.table and not any(config.render.table_size):
         yield "render.table_size", "above 0 with randomize.background_textures, which are seen beyond the edge of the table [m]"
 
@@ -72,6 +77,16 @@ def _distractors(randomize: Randomize, arrangement: Arrangement, bake: Bake) -> 
         yield "randomize.distractors", f"less than arrangement.max_objects, {arrangement.max_objects}, which counts them, too"
     if most and bake.models and os.path.realpath(randomize.distractor_models) == os.path.realpath(bake.models):
         yield "randomize.distractor_models", "another folder than bake.models: its objects would be without labels"
+
+
+def _counts(arrangement: Arrangement, distractors: int) -> Iterator[Conflict]:
+    """Yield conflicts of the numbers of parts: more than there is room for, or none in some episodes."""
+    most, room = most_objects(arrangement.counts), arrangement.max_objects - distractors
+    if most > room:
+        beside = f", less {distractors} distractors" if distractors else ""
+        yield "arrangement.counts", f"at most arrangement.max_objects, {arrangement.max_objects}{beside}, together, which are {most}"
+    if arrangement.counts and not any(least for _, least, _ in arrangement.counts):
+        yield "arrangement.counts", "at least one part that each episode has"
 
 
 def _mix(bake: Bake, splits: Sequence[Split]) -> Iterator[Conflict]:

@@ -16,6 +16,7 @@ from synpick_warp.configs.bins import BinRow, Bins, Tote
 from synpick_warp.configs.cameras import CameraRow, Cameras
 from synpick_warp.configs.cell import Cell
 from synpick_warp.configs.fields import INT32_MAX, setting
+from synpick_warp.configs.fills import COUNTS, Counts, parse_counts
 from synpick_warp.configs.manipulation import Move, Perception, Pick, Suction, Target
 from synpick_warp.configs.objects import ObjectRow, Objects
 from synpick_warp.configs.randomize import Randomize
@@ -42,6 +43,8 @@ LAYOUTS = (CLASSIC, MULTISENSOR)
 """Layouts of scene folders: BOP's classic one, and that of BOP-Industrial 2025."""
 EXCEED = "exceed"
 WITHIN = "within"
+COLUMN, LAYERED = "column", "layers"
+"""Stacks from which objects begin to fall."""
 FILLS = (EXCEED, WITHIN)
 """Rules that end the draw of an episode's objects at the volume budget."""
 FORMATS = ("bop", "shards", "usd", "zarr", "lerobot", "coco", "yolo")
@@ -120,6 +123,16 @@ class Gripper:
 class Arrangement:
     """Which objects an episode contains, and how they are dropped into the tote."""
 
+    counts: Counts = setting(
+        (),
+        "",
+        "Parts, by name or obj_id, and how many of each an episode has: one (homogeneous) or several (kitted), with a range drawn anew for "
+        "each episode (mixed); empty: objects are drawn up to volume. Parts mix in the drop.",
+        low=0,
+        high=INT32_MAX,
+        parse=parse_counts,
+        allowed=COUNTS,
+    )
     volume: float = setting(
         7e-3,
         "m³",
@@ -145,9 +158,22 @@ class Arrangement:
         above=0.0,
         high=0.5,
     )
-    clearance: float = setting(0.01, "m", "Gap between the bounding spheres of consecutive objects in the drop column.", low=0.0, high=1.0)
+    drop: str = setting(
+        COLUMN,
+        "",
+        "Where objects begin to fall: column (one above the other, over the middle) or layers (side by side over the whole opening: many "
+        "from a low height).",
+        choices=(COLUMN, LAYERED),
+    )
+    clearance: float = setting(
+        0.01, "m", "Gap between the bounding spheres of consecutive objects in the drop column, or in layers.", low=0.0, high=1.0
+    )
     spread: float = setting(
-        0.3, "", "Drop positions are uniform over this fraction of the tote's opening, less the object's radius.", low=0.0, high=1.0
+        0.3,
+        "",
+        "Drop positions are uniform over this fraction of the tote's opening, in layers of an object's cell, less the object's radius.",
+        low=0.0,
+        high=1.0,
     )
 
 

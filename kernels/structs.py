@@ -59,6 +59,12 @@ class CatalogData:
     """Diagonal of that box [m]."""
     compound: wp.array[int]
     """1: several convex pieces, in a compound slot; 0: one, in a single slot."""
+    least: wp.array[int]
+    """Least number of the object in an episode, where numbers are set ..."""
+    most: wp.array[int]
+    """... and largest number; all 0: objects are drawn up to the volume budget."""
+    counted: int
+    """Largest number of an episode's objects where numbers are set; 0: they are not."""
     variant: wp.array[int]
     """Variant of the object, in slots of its class (single or compound)."""
     empty_single: int
@@ -84,9 +90,12 @@ class DropData:
     pick_repeats: int
     """The same for the picking modes."""
     clearance: float
-    """Gap between bounding spheres in the drop column [m]."""
+    """Gap between bounding spheres in the drop column, or between layers and within them [m]."""
     spread: float
-    """Fraction of the opening of a compartment, less the object's bounding radius, over which drop positions spread."""
+    """Fraction of the opening of a compartment, or in layers of a cell, less the object's bounding radius, over which drop positions
+    spread."""
+    layers: int
+    """1: objects begin to fall from layers of cells; 0: from a column."""
     gravity: float
     """Gravitational acceleration [m/s²]."""
     gripper_home: wp.vec3

@@ -23,6 +23,7 @@ from synpick_warp.configs.schema import EXCEED, Arrangement, Bake, Config, Gripp
 from synpick_warp.errors import ConfigError
 from synpick_warp.scenes.bin_meshes.inside import HeightField
 from synpick_warp.scenes.bins import Bin, guide_walls, make_bins
+from synpick_warp.scenes.fills import count_entries
 from synpick_warp.scenes.gripper import cup_collider, finger_collider, rod_inertia
 from synpick_warp.scenes.tote import TABLE_SIZE
 from synpick_warp.scenes.types import Catalog, CatalogEntry, ConvexPiece
@@ -120,7 +121,7 @@ REPEATS: Mapping[str, object] = {"pick.repeats": True, "move.repeats": True}
 def count_slots(arrangement: Arrangement, rules: Iterable[bool], catalog: Catalog) -> tuple[int, int]:
     """Determine the body slots (single, compound) that suffice for all draws but a fraction `slot_shortfall`, in each possible mode.
 
-    The object that exceeds the budget, if `fill` keeps it, has its slot as well.
+    The object that exceeds the budget, if `fill` keeps it, has its slot as well. Where `counts` are set, they suffice for the largest ones.
 
     A Monte Carlo estimate: the volume budget couples how many objects are drawn with which ones, so there is no simple formula.
     Slots cost time whether used or not, and compound ones most: their count is minimized first, then that of single slots.
@@ -131,8 +132,12 @@ def count_slots(arrangement: Arrangement, rules: Iterable[bool], catalog: Catalo
         catalog: The objects.
 
     Raises:
-        ConfigError: No object fits into the volume budget.
+        ConfigError: No object fits into the volume budget, or `count_entries` refuses a part.
     """
+    if arrangement.counts:
+        most = count_entries(arrangement.counts, catalog)[:, 1]
+        compounds = sum(int(number) for number, entry in zip(most, catalog.entries, strict=True) if len(entry.pieces) > 1)
+        return int(most.sum()) - compounds, compounds
     budget, shortfall = arrangement.volume, arrangement.slot_shortfall
     compound = np.array([len(entry.pieces) > 1 for entry in catalog.entries])
     volume = np.array([entry.volume for entry in catalog.entries])
@@ -256,6 +261,8 @@ def build_model(config: Config, catalog: Catalog, device: wp.Device) -> BuiltMod
 
 def must_repeat(arrangement: Arrangement, catalog: Catalog) -> bool:
     """Whether objects repeat in an episode since all together stay below the volume budget: a catalog of one object fills the tote, too."""
+    if arrangement.counts:
+        return False
     volumes = [entry.volume for entry in catalog.entries if entry.volume <= arrangement.volume]
     return arrangement.repeat_to_fill and sum(volumes) < arrangement.volume and len(volumes) < arrangement.max_objects
 

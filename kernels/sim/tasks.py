@@ -3,7 +3,7 @@
 import warp as wp
 
 from synpick_warp.codes import Mode, Outcome, Phase, Removal, Task
-from synpick_warp.kernels.sim.arrangement import PARKED_HEIGHT, write_body
+from synpick_warp.kernels.sim.drop import PARKED_HEIGHT, write_body
 from synpick_warp.kernels.sim.gripper import place_gripper, task_setpoint
 from synpick_warp.kernels.sim.rest import is_outside, shape_pose
 from synpick_warp.kernels.structs import TILT, BinData, DropData, LayoutData, MoveData, PickData, SettleData

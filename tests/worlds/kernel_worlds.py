@@ -36,6 +36,7 @@ DROP: dict[str, Any] = {
     "pick_repeats": 1,
     "clearance": 0.01,
     "spread": 0.5,
+    "layers": 0,
     "gravity": 9.81,
     "gripper_home": wp.vec3(3.0, 0.0, 1.0),
     "lights": 5,
@@ -99,6 +100,8 @@ class KernelWorlds:
     randomize: Randomize = field(default_factory=Randomize)
     distractors: int = 0
     """The last of the objects, without labels."""
+    counts: Sequence[tuple[int, int]] = ()
+    """Least and largest number of each object; empty: not set."""
     parts: Sequence[tuple[int, int, bool]] = tuple((shape, 0, True) for shape in GUIDES)
 
     def __post_init__(self) -> None:
@@ -157,6 +160,7 @@ class KernelWorlds:
         compound = np.asarray(self.compound, np.int32)
         # Variants as in scenes.build: position among the objects of the same slot class.
         variant = np.where(compound == 1, np.cumsum(compound), np.cumsum(1 - compound)) - 1
+        limits = np.array(self.counts or np.zeros((len(compound), 2)), np.int32)
         columns = {
             "volume": (self.volume, float),
             "radius": (self.radius, float),
@@ -165,12 +169,15 @@ class KernelWorlds:
             "diagonal": (self.radius, float),
             "compound": (compound, int),
             "variant": (variant, int),
+            "least": (limits[:, 0], int),
+            "most": (limits[:, 1], int),
         }
         arrays = {name: wp.array(np.asarray(values), dtype=dtype, device=self.device) for name, (values, dtype) in columns.items()}
         return fill(
             structs.CatalogData,
             count=len(compound) - self.distractors,
             distractors=self.distractors,
+            counted=int(limits[:, 1].sum()),
             empty_single=int((compound == 0).sum()),
             empty_compound=int(compound.sum()),
             empty_mass=0.1,
