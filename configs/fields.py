@@ -6,6 +6,8 @@ from collections.abc import Callable
 from dataclasses import field
 from typing import Any
 
+Conflict = tuple[str, str]
+"""Key of the wrong setting, and its allowed values."""
 INT32_MAX = 2**31 - 1
 """Largest whole number of kernels and largest index of their arrays: the upper limit of settings that become one of them."""
 

@@ -17,6 +17,7 @@ from synpick_warp.kernels import structs
 from synpick_warp.kernels.distributions import LookTable
 from synpick_warp.scenes import build
 from synpick_warp.scenes.bin_meshes.inside import HeightField
+from synpick_warp.scenes.grippers.mechanism import CUP_ARMATURE
 from synpick_warp.scenes.looks import Looks
 from synpick_warp.scenes.types import Catalog, CatalogEntry
 from synpick_warp.stages.render.looks import build_look_table
@@ -267,6 +268,6 @@ def _suction_data(suction: schema.Suction, gripper: schema.Gripper, step: float)
         gripper,
         swing_limit=math.radians(suction.swing_limit),
         tcp_offset=gripper.cup_length,
-        tilt_inertia=build.CUP_ARMATURE + step * (gripper.tilt_damping + step * gripper.tilt_stiffness),
+        tilt_inertia=CUP_ARMATURE + step * (gripper.tilt_damping + step * gripper.tilt_stiffness),
         step=step,
     )

@@ -14,7 +14,8 @@ from synpick_warp.configs.schema import Gripper, Tote
 from synpick_warp.errors import ConfigError
 from synpick_warp.scenes.assets.meshes import merge_positions, signed_volume
 from synpick_warp.scenes.bins import guide_walls
-from synpick_warp.scenes.gripper import cup_collider, cup_fixture, finger_collider, finger_fixture
+from synpick_warp.scenes.grippers.mechanism import finger_collider, finger_fixture
+from synpick_warp.scenes.grippers.suction1 import cup_collider, cup_fixture
 from synpick_warp.scenes.modelling import at_height, cap, join, loft, make_mesh, rounded_rectangle, strips
 from synpick_warp.scenes.tote import CORNER_RADIUS, FLOOR_DEPTH, MIN_WALL, rim_height, tote_colliders, tote_fixture
 from tests.twins.rays import edges_match, first_hit

@@ -13,7 +13,7 @@ from synpick_warp.codes import Phase, Task
 from synpick_warp.configs.load import load_config
 from synpick_warp.scenes.collision.hull_planes import hull_planes
 from synpick_warp.stages.render.scene import build_meshes
-from synpick_warp.stages.sim.suction import Suction
+from synpick_warp.stages.sim.suction import SuctionHold
 from tests.twins import suction as twin
 from tests.twins.raycast import rotation_of
 from tests.worlds.kernel_worlds import KernelWorlds, filled
@@ -50,7 +50,7 @@ class Cups(KernelWorlds):
         )
         meshes, keep = build_meshes([entry.mesh for entry in ENTRIES.entries], len(ENTRIES), device)
         config = load_config("smoke", {"suction.surface": surface})
-        self.suction = Suction(config.suction, ENTRIES, SimpleNamespace(meshes=meshes, keep=keep), device)
+        self.suction = SuctionHold(config.suction, ENTRIES, SimpleNamespace(meshes=meshes, keep=keep), device)
         self.begin(Phase.ACT)
         self.set(self.state.catalog_index, -1)
         # Slots in an order of their own.

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from synpick_warp.configs.load import load_config
 from synpick_warp.scenes import build
 from synpick_warp.stages.sim import physics
-from synpick_warp.stages.sim.suction import Suction
+from synpick_warp.stages.sim.suction import SuctionHold
 from tests.twins import suction as twin
 from tests.twins.raycast import rotation_of
 from tests.worlds.hanging import Hanging
@@ -217,7 +217,7 @@ def test_attached_objects_touch_each_other_and_detached_ones_touch_the_cup(pair)
     both = {(one + cup, one + first), (one + cup, one + second)}
     before = pairs()
     assert {(cup, first), (cup, second), (first, second)} | both <= set(before)
-    pair.suction.ignore_attached_contacts(pair.scene, pair.state, pair.seals, pair.physics)
+    pair.suction.ignore_contacts(pair.scene, pair.state, pair.seals, pair.physics)
     assert set(pairs()) == set(before) - {(cup, first)} - both
 
 
@@ -322,8 +322,8 @@ def test_wrenches_are_those_of_the_twin_and_detached_objects_feel_none(seed, att
         seal_forces[instance], kept[instance] = seal_force, int(not breaks)
         peak_force = max(peak_force, seal_forces[instance])
     meshes = SimpleNamespace(id=wp.zeros(1, dtype=wp.uint64, device=device))
-    suction = Suction(load_config("smoke", {}).suction, catalog(CUBE), SimpleNamespace(meshes=meshes, keep=()), device)
-    suction.apply_seal_forces(worlds.scene, worlds.state, worlds.seals, worlds.physics, worlds.physics.state)
+    suction = SuctionHold(load_config("smoke", {}).suction, catalog(CUBE), SimpleNamespace(meshes=meshes, keep=()), device)
+    suction.apply_forces(worlds.scene, worlds.state, worlds.seals, worlds.physics, worlds.physics.state)
     # Offsets are differences of positions of about 1 m in single precision: the spring multiplies their rounding.
     atol = 1e-4 * np.abs(expected).max() + LAW["stiffness"] * np.finfo(np.float32).eps
     np.testing.assert_allclose(worlds.physics.control.joint_f.numpy(), expected, rtol=3e-4, atol=atol)

@@ -26,6 +26,7 @@ import msgspec
 
 from synpick_warp import __version__
 from synpick_warp.configs.bins import Bins
+from synpick_warp.configs.gripper import SUCTION1
 from synpick_warp.configs.load import load_config, override_config, table_lists
 from synpick_warp.configs.objects import AUTO_UNIT, Objects
 from synpick_warp.configs.randomize import Randomize
@@ -88,6 +89,7 @@ YOUNGER_SETTINGS: dict[str, Any] = {
     "render.table_size": (0.0, 0.0),
     "camera": [],
     "bin": [],
+    "gripper.kind": SUCTION1,
     "objects.unit": AUTO_UNIT,
     "objects.symmetries": Objects().symmetries,
     "objects.symmetry_tolerance": Objects().symmetry_tolerance,
