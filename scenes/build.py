@@ -23,6 +23,7 @@ from synpick_warp.configs.schema import EXCEED, Arrangement, Bake, Config, Move,
 from synpick_warp.errors import ConfigError
 from synpick_warp.scenes.bin_meshes.inside import HeightField
 from synpick_warp.scenes.bins import Bin, guide_walls, make_bins
+from synpick_warp.scenes.grippers.head import Head
 from synpick_warp.scenes.grippers.mechanism import GRIPPER_BODIES, GRIPPER_DOFS, add_gripper, hull_mesh
 from synpick_warp.scenes.grippers.registry import make_head
 from synpick_warp.scenes.tote import TABLE_SIZE
@@ -102,6 +103,7 @@ class BuiltModel:
 
     model: newton.Model
     layout: Layout
+    head: Head
     variant: np.ndarray
     """Variant index of each catalog entry in slots of its type (entry) int32."""
     empty_variant: tuple[int, int]
@@ -238,7 +240,8 @@ def build_model(config: Config, catalog: Catalog, device: wp.Device) -> BuiltMod
     for index, one in enumerate(bins):
         parts += [] if index == 0 else add(index, one.pieces, False)
         parts += add(index, guide_walls(one.sizes, config.physics.guide_height), True)
-    gripper = add_gripper(world, config.gripper, make_head(config.gripper), shape)
+    head = make_head(config.gripper)
+    gripper = add_gripper(world, config.gripper, head, shape)
     variant, empty = _add_slots(world, config.physics, catalog, shape, (single, compound))
     scene = newton.ModelBuilder(gravity=(0.0, 0.0, -config.physics.gravity))
     newton.solvers.SolverSteel.register_custom_attributes(scene)
@@ -248,7 +251,7 @@ def build_model(config: Config, catalog: Catalog, device: wp.Device) -> BuiltMod
         warnings.filterwarnings("ignore", "Eigenvalues below threshold")
         model = scene.finalize(device=device)
     layout = Layout(config.bake.worlds, config.arrangement.max_objects, single, compound, world.shape_count, tuple(parts), *gripper)
-    return BuiltModel(model, layout, variant, empty, tuple(one.limits for one in bins))
+    return BuiltModel(model, layout, head, variant, empty, tuple(one.limits for one in bins))
 
 
 def must_repeat(arrangement: Arrangement, catalog: Catalog) -> bool:

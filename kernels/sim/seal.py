@@ -1,17 +1,20 @@
-"""Suction seals: breakable implicit spring-dampers between the cup and the attached objects, which replace contacts between the two.
+"""Suction seals: breakable implicit spring-dampers between cups and the attached objects, which replace contacts between the two.
+
+A cup has a seal with each object that it holds. Seals that pull at the same body share its mass (mass splitting; Tonge et al., 2012).
 
 Frames; `X_in_Y` is the pose of frame X in frame Y, so that `Z_in_Y = X_in_Y * Z_in_X`:
 
 - world: z up.
-- tcp: at the tool centre point (TCP), the centre of the cup's lip, with the cup's axes; +z points into the gripper, +y is the wrist axis.
+- tcp: at the tool centre point (TCP), the middle of the plane of the cups' lips, with the head's axes; +z points into the gripper, +y is
+  the wrist axis. Each cup has a TCP of its own there, the centre of its lip; one cup's is that of the tool.
 - object: the object's body frame.
-- grip: fixed to the object; coincides with tcp while the seal is at rest. `object_in_tcp`, stored when the seal engages, equals
+- grip: fixed to the object; coincides with tcp while the seals are at rest. `object_in_tcp`, stored when the seals engage, equals
   `object_in_grip` ever after, hence `grip_in_world = object_in_world * inverse(object_in_tcp)`.
 """
 
 import warp as wp
 
-from synpick_warp.kernels.sim.cup_rays import CUP, tcp_pose
+from synpick_warp.kernels.sim.cup_rays import CUP, has_bit, tcp_pose
 from synpick_warp.kernels.structs import TILT, LayoutData, SuctionData
 
 wp.set_module_options({"enable_backward": False})
@@ -57,7 +60,7 @@ class Wrench:
 
 @wp.struct
 class TcpMotion:
-    """Pose and velocity of the TCP frame, and its arm from the wrist, in the world's axes."""
+    """Pose and velocity of a cup's TCP frame, and its arm from the wrist, in the world's axes."""
 
     position: wp.vec3
     """[m]"""
@@ -76,18 +79,18 @@ class TcpMotion:
 
 
 @wp.func
-def tcp_motion(cup_in_world: wp.transform, cup_velocity: wp.spatial_vector, cup_com: wp.vec3, suction: SuctionData) -> TcpMotion:
-    """Motion of the tcp frame from pose and velocity of the cup, whose centre of mass is `cup_com` in its frame [m]."""
-    tcp_in_world = tcp_pose(cup_in_world, suction.tcp_offset)
+def tcp_motion(head_in_world: wp.transform, head_velocity: wp.spatial_vector, head_com: wp.vec3, place: wp.vec3) -> TcpMotion:
+    """Motion of the TCP frame of the cup at `place` [m], from the head's: its centre of mass is at `head_com` in its frame [m]."""
+    tcp_in_world = tcp_pose(head_in_world, place)
     result = TcpMotion()
     result.position = wp.transform_get_translation(tcp_in_world)
     result.rotation = wp.transform_get_rotation(tcp_in_world)
     result.axis = wp.transform_vector(tcp_in_world, wp.vec3(0.0, 0.0, 1.0))
     result.wrist_axis = wp.transform_vector(tcp_in_world, wp.vec3(0.0, 1.0, 0.0))
-    result.wrist_arm = result.position - wp.transform_get_translation(cup_in_world)
-    result.angular_velocity = wp.spatial_bottom(cup_velocity)
-    com_arm = result.position - wp.transform_point(cup_in_world, cup_com)
-    result.velocity = wp.spatial_top(cup_velocity) + wp.cross(result.angular_velocity, com_arm)
+    result.wrist_arm = result.position - wp.transform_get_translation(head_in_world)
+    result.angular_velocity = wp.spatial_bottom(head_velocity)
+    com_arm = result.position - wp.transform_point(head_in_world, head_com)
+    result.velocity = wp.spatial_top(head_velocity) + wp.cross(result.angular_velocity, com_arm)
     return result
 
 
@@ -192,28 +195,61 @@ def tension_and_shear(force: wp.vec3, axis: wp.vec3) -> float:
 
 
 @wp.func
-def break_seal(attached: wp.array2d[int], joint_f: wp.array[float], world: int, instance: int, first_dof: int):
-    """Detach an instance and clear the joint forces of its six degrees of freedom, which begin at `first_dof`."""
-    attached[world, instance] = 0
-    for axis in range(6):
-        joint_f[first_dof + axis] = 0.0
+def count_seals(attached: int, suction: SuctionData) -> int:
+    """Number of cups that hold an instance, from its bits in `attached`."""
+    count = int(0)
+    for cup in range(suction.cups):
+        count += (attached >> cup) & 1
+    return count
 
 
 @wp.func
-def apply_wrench(
-    wrench: Wrench, object_arm: wp.vec3, wrist_arm: wp.vec3, wrist_axis: wp.vec3, joint_f: wp.array[float], gripper_dof: int, first_dof: int
-):
-    """Write a wrench at the TCP to the object's six joint forces, and subtract it from the gripper's four: x, y, z and tilt.
+def split_mass(inverse_mass: InverseMass, seals: int) -> InverseMass:
+    """Inverse effective mass of the n-th of a body, of which each of n seals is given one."""
+    result = InverseMass()
+    result.linear = float(seals) * inverse_mass.linear
+    result.mixed = float(seals) * inverse_mass.mixed
+    result.angular = float(seals) * inverse_mass.angular
+    return result
 
-    The moment arms lead to the TCP, from the object's centre of mass and from the wrist [m]. The torque about other axes than the
-    wrist's is borne by the gripper's joint.
+
+@wp.func
+def pull_object(
+    tcp: TcpMotion,
+    grip: wp.vec3,
+    grip_rotation: wp.quat,
+    object_velocity: wp.spatial_vector,
+    object_arm: wp.vec3,
+    inverse_mass: InverseMass,
+    suction: SuctionData,
+) -> Wrench:
+    """Wrench of one seal on its object.
+
+    Args:
+        tcp: Motion of the cup's TCP.
+        grip: Point of the object that coincides with it at rest, in the world [m].
+        grip_rotation: From the grip frame to the world.
+        object_velocity: Of the object [m/s, rad/s].
+        object_arm: Moment arm from the object's centre of mass to the TCP [m].
+        inverse_mass: Of the relative motion of both.
+        suction: Stiffness and damping.
     """
-    torque = wrench.torque + wp.cross(object_arm, wrench.force)
+    object_angular_velocity = wp.spatial_bottom(object_velocity)
+    slip = tcp.velocity - wp.spatial_top(object_velocity) - wp.cross(object_angular_velocity, object_arm)
+    error = rotation_error(tcp.rotation, grip_rotation, suction)
+    return seal_wrench(tcp.position - grip, error, slip, tcp.angular_velocity - object_angular_velocity, inverse_mass, suction)
+
+
+@wp.func
+def pull_gripper(wrench: Wrench, tcp: TcpMotion, joint_f: wp.array[float], gripper_dof: int):
+    """Subtract a seal's wrench from the gripper's joint forces: x, y, z and tilt.
+
+    The torque about other axes than the wrist's is borne by the gripper's joint.
+    """
     for axis in range(3):
-        joint_f[first_dof + axis] = wrench.force[axis]
-        joint_f[first_dof + 3 + axis] = torque[axis]
         joint_f[gripper_dof + axis] = joint_f[gripper_dof + axis] - wrench.force[axis]
-    joint_f[gripper_dof + TILT] = joint_f[gripper_dof + TILT] - wp.dot(wrist_axis, wrench.torque + wp.cross(wrist_arm, wrench.force))
+    torque = wrench.torque + wp.cross(tcp.wrist_arm, wrench.force)
+    joint_f[gripper_dof + TILT] = joint_f[gripper_dof + TILT] - wp.dot(tcp.wrist_axis, torque)
 
 
 @wp.kernel
@@ -227,53 +263,72 @@ def apply_seal_forces_kernel(
     # State:
     body_slot: wp.array2d[int],  # (world, instance)
     object_in_tcp: wp.array2d[wp.transform],  # (world, instance) [m]
-    break_force: wp.array[float],  # (world) [N]
     body_q: wp.array[wp.transform],  # (body) [m]
     body_qd: wp.array[wp.spatial_vector],  # (body) [m/s, rad/s]
     attached_inout: wp.array2d[int],  # (world, instance)
+    break_force_inout: wp.array2d[float],  # (world, cup) [N]
     seal_force_inout: wp.array2d[float],  # (world, instance) [N]
+    cup_force_inout: wp.array2d[float],  # (world, cup) [N]
     peak_force_inout: wp.array[float],  # (world) [N]
     joint_f_inout: wp.array[float],  # (dof) [N, N·m]
 ):
-    """Apply every seal's wrench to its object and the opposite to the gripper; break seals whose force exceeds the break force.
+    """Apply every seal's wrench to its object and the opposite to the gripper; break seals whose force exceeds the cup's break force.
 
-    `seal_force` receives this step's force of each seal, that of a breaking one included, and 0 without a seal; `peak_force` its maximum
-    over seals and steps since it was cleared. Launched over world.
+    `seal_force` receives the largest force of an instance's seals in this step, that of a breaking one included, and 0 without a seal;
+    `cup_force` the sum over a cup's seals; `peak_force` the maximum over seals and steps since it was cleared. Where a seal of a common
+    valve breaks, the others are poor from the next step on. Launched over world.
     """
     world = wp.tid()
     seals = int(0)
     for instance in range(layout.instances):
-        seals += attached_inout[world, instance]
+        seals += count_seals(attached_inout[world, instance], suction)
         seal_force_inout[world, instance] = 0.0
+    for cup in range(suction.cups):
+        cup_force_inout[world, cup] = 0.0
     if seals == 0:
         return
-    cup = world * layout.bodies + CUP
-    tcp = tcp_motion(body_q[cup], body_qd[cup], body_com[cup], suction)
-    gripper_inverse = gripper_inverse_mass(suction, tcp.wrist_axis, tcp.wrist_arm, seals)
+    head = world * layout.bodies + CUP
     gripper_dof = world * layout.dofs
+    broken = int(0)
     for instance in range(layout.instances):
-        if attached_inout[world, instance] != 0:
+        held = attached_inout[world, instance]
+        if held != 0:
             slot = body_slot[world, instance]
             body = world * layout.bodies + layout.gripper_bodies + slot
             grip_in_world = body_q[body] * wp.transform_inverse(object_in_tcp[world, instance])
-            object_arm = tcp.position - wp.transform_point(body_q[body], body_com[body])
             rotation = wp.transform_get_rotation(body_q[body])
-            object_inverse = object_inverse_mass(rotation, body_inv_mass[body], body_inv_inertia[body], object_arm)
-            object_angular_velocity = wp.spatial_bottom(body_qd[body])
-            slip = tcp.velocity - wp.spatial_top(body_qd[body]) - wp.cross(object_angular_velocity, object_arm)
-            error = rotation_error(tcp.rotation, wp.transform_get_rotation(grip_in_world), suction)
-            offset = tcp.position - wp.transform_get_translation(grip_in_world)
-            angular_slip = tcp.angular_velocity - object_angular_velocity
-            inverse_mass = add_inverse_masses(object_inverse, gripper_inverse)
-            wrench = seal_wrench(offset, error, slip, angular_slip, inverse_mass, suction)
-            force = tension_and_shear(wrench.force, tcp.axis)
+            total = Wrench()
+            for cup in range(suction.cups):
+                if has_bit(held, cup):
+                    place = suction.place[cup]
+                    tcp = tcp_motion(body_q[head], body_qd[head], body_com[head], place)
+                    grip = wp.transform_point(grip_in_world, wp.vec3(place[0], place[1], 0.0))
+                    object_arm = tcp.position - wp.transform_point(body_q[body], body_com[body])
+                    object_inverse = object_inverse_mass(rotation, body_inv_mass[body], body_inv_inertia[body], object_arm)
+                    object_inverse = split_mass(object_inverse, count_seals(held, suction))
+                    gripper_inverse = gripper_inverse_mass(suction, tcp.wrist_axis, tcp.wrist_arm, seals)
+                    inverse_mass = add_inverse_masses(object_inverse, gripper_inverse)
+                    wrench = pull_object(
+                        tcp, grip, wp.transform_get_rotation(grip_in_world), body_qd[body], object_arm, inverse_mass, suction
+                    )
+                    force = tension_and_shear(wrench.force, tcp.axis)
+                    seal_force_inout[world, instance] = wp.max(seal_force_inout[world, instance], force)
+                    cup_force_inout[world, cup] = cup_force_inout[world, cup] + force
+                    peak_force_inout[world] = wp.max(peak_force_inout[world], force)
+                    if force > break_force_inout[world, cup]:
+                        broken += 1
+                        attached_inout[world, instance] = attached_inout[world, instance] - (1 << cup)
+                    else:
+                        total.force += wrench.force
+                        total.torque += wrench.torque + wp.cross(object_arm, wrench.force)
+                        pull_gripper(wrench, tcp, joint_f_inout, gripper_dof)
             first_dof = gripper_dof + layout.gripper_dofs + 6 * slot
-            seal_force_inout[world, instance] = force
-            peak_force_inout[world] = wp.max(peak_force_inout[world], force)
-            if force > break_force[world]:
-                break_seal(attached_inout, joint_f_inout, world, instance, first_dof)
-            else:
-                apply_wrench(wrench, object_arm, tcp.wrist_arm, tcp.wrist_axis, joint_f_inout, gripper_dof, first_dof)
+            for axis in range(3):
+                joint_f_inout[first_dof + axis] = total.force[axis]
+                joint_f_inout[first_dof + 3 + axis] = total.torque[axis]
+    if suction.common_valve != 0 and broken > 0:
+        for cup in range(suction.cups):
+            break_force_inout[world, cup] = suction.poor_force
 
 
 @wp.func
@@ -301,7 +356,7 @@ def ignore_attached_contacts_kernel(
     # Out:
     margin_out: wp.array[float],  # (contact) [m]
 ):
-    """Disable contacts between a cup and its attached objects, which would fight the seal: set their margin to -APART.
+    """Disable contacts between a gripper head and its attached objects, which would fight the seal: set their margin to -APART.
 
     The solver makes no constraint rows for contacts that far apart. The collision pipeline writes all margins anew each time, after it has
     stored what it matches the next step's contacts with. Disabling the shapes instead would put all such contacts of all worlds into one

@@ -157,7 +157,7 @@ def record_forces_kernel(
         holds = int(0)
         if body >= 0:
             seal = seal_force[world, place]
-            holds = attached[world, place]
+            holds = wp.where(attached[world, place] != 0, 1, 0)
         seal_force_out[world, step, place] = seal
         attached_out[world, step, place] = wp.uint8(holds)
 

@@ -24,6 +24,8 @@ class Head:
     """Principal moments about the centre of mass, in the axes of the frame [kg·m²]."""
     cups: tuple[tuple[float, float], ...] = ((0.0, 0.0),)
     """(x, y) of the centre of each cup's lip, in the plane of the tool centre point [m]."""
+    has_common_valve: bool = False
+    """Whether a leak at one cup spoils the vacuum of all."""
 
 
 def rod_inertia(mass: float, length: float) -> tuple[float, float, float]:

@@ -230,18 +230,18 @@ LAW = {
     "twist_damping": 0.1,
     "swing_limit": np.radians(5.0),
     "swing_stiffness": 50.0,
-    "tcp_offset": 0.055,
     "finger_mass": 1.5,
     "cup_mass": 0.5,
     "tilt_inertia": 0.4,
     "step": 2e-3,
 }
 SLOTS = (3, 0, 2)
+TIP = 0.055
 
 
 def scripted(device, bodies: list[twin.Body], objects_in_tcp: np.ndarray, attached: list[int], break_force: float) -> KernelWorlds:
     """One world with a moving cup and three moving objects in the slots SLOTS."""
-    worlds = KernelWorlds(device, 1, instances=3, single_slots=4)
+    worlds = KernelWorlds(device, 1, instances=3, single_slots=4, move={"tcp_offset": TIP})
     filled(worlds.scene.suction, LAW)
     rows = [1, *(2 + slot for slot in SLOTS)]
     columns = {
@@ -285,7 +285,7 @@ def random_bodies(seed: int) -> tuple[list[twin.Body], np.ndarray]:
             pose = np.array(
                 _times(
                     _times(
-                        _times(bodies[0].pose, [0, 0, -LAW["tcp_offset"], 0, 0, 0, 1]),
+                        _times(bodies[0].pose, [0, 0, -TIP, 0, 0, 0, 1]),
                         [*numbers.normal(scale=5e-4, size=3), *quaternion(0.05)],
                     ),
                     objects_in_tcp[-1],
@@ -313,7 +313,7 @@ def test_wrenches_are_those_of_the_twin_and_detached_objects_feel_none(seed, att
     seal_forces, kept, peak_force = [0.0] * 3, list(attached), 1.0
     for instance in np.flatnonzero(attached):
         force, reaction, seal_force = twin.seal_wrench(
-            bodies[0], bodies[1 + instance], objects_in_tcp[instance], SimpleNamespace(**LAW), sum(attached)
+            bodies[0], bodies[1 + instance], objects_in_tcp[instance], SimpleNamespace(**LAW, tcp_offset=TIP), sum(attached)
         )
         first = GRIPPER_DOFS + 6 * SLOTS[instance]
         breaks = seal_force > break_force

@@ -47,9 +47,8 @@ class Hanging:
         built = build.build_model(self.config, objects, device)
         self.layout, self.physics = built.layout, EagerPhysics(self.config.physics, built)
         self.scene = make_scene_data(self.config, objects, built, 1, device)
-        extents = world_sizes(
-            self.config.bake.worlds, self.config.arrangement.max_objects, self.config.move.rounds, built.layout.bodies_per_world
-        )
+        sizes = (self.worlds, self.instances, self.config.move.rounds, built.layout.bodies_per_world, len(built.head.cups))
+        extents = world_sizes(*sizes)
         self.state, self.attempts, self.seals = (allocate(kind, extents, device) for kind in (WorldState, AttemptState, SealState))
         meshes = SimpleNamespace(id=wp.zeros(1, dtype=wp.uint64, device=device))
         self.suction = SuctionHold(self.config.suction, objects, SimpleNamespace(meshes=meshes, keep=()), device)
@@ -77,7 +76,7 @@ class Hanging:
         self.physics.control.joint_f.zero_()
         self.physics.load(self.state.variant, self.state.restarted)
         self.seals.object_in_tcp.assign(np.concatenate([place, turn], axis=2))
-        self.seals.attached.fill_(1)
+        self.seals.attached.fill_((1 << self.scene.suction.cups) - 1)
         self.seals.break_force.fill_(break_force)
         self.seals.peak_force.zero_()
         self.setpoint[:], self.speed[:] = (0.0, 0.0, HEIGHT), 0.0

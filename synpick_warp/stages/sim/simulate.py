@@ -90,7 +90,9 @@ class Simulation:
         planned = [index for each in DataLayout.of(config).plan() for index in each] if episodes is None else episodes
         indices = np.asarray(planned, np.int32)
         self.episodes = wp.array(indices, dtype=wp.int32, device=device)
-        sizes = world_sizes(config.bake.worlds, config.arrangement.max_objects, config.move.rounds, built.layout.bodies_per_world)
+        sizes = world_sizes(
+            config.bake.worlds, config.arrangement.max_objects, config.move.rounds, built.layout.bodies_per_world, len(built.head.cups)
+        )
         self.state, self.attempts, self.seals, self.last, record = allocate_worlds(sizes, device)
         self.state.bin_pose.fill_(wp.transform_identity())
         self.scene.bins.chosen, self.scene.bins.pose = self.state.bin, self.state.bin_pose

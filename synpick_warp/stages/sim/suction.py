@@ -37,7 +37,7 @@ class SuctionHold:
     def engage(self, scene: SceneData, state: WorldState, attempts: AttemptState, seals: SealState, physics: Physics) -> None:
         """Switch suction on where task PRESS is complete: cast the rays and attach the engaged objects. Runs at the end of a tick."""
         sources = (scene, state, attempts, physics.state)
-        launch(cup_rays.count_seal_rays_kernel, len(state.phase), *sources, self)
+        launch(cup_rays.count_seal_rays_kernel, len(state.phase), *sources, seals, self)
         launch(cup_rays.engage_seals_kernel, state.catalog_index.shape, *sources, seals)
 
     def apply_forces(self, scene: SceneData, state: WorldState, seals: SealState, physics: Physics, current: newton.State) -> None:
