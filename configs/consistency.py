@@ -53,7 +53,8 @@ def find_conflicts(config: Config) -> Iterator[Conflict]:
         yield from find_camera_conflicts(config)
         yield from _pick(config.pick, bins)
     yield from _times(config.settle, config.physics)
-    yield from find_gripper_conflicts(config.gripper, config.suction)
+    mouths = [mouth for one in bins if one.shell for mouth in one.mouths]
+    yield from find_gripper_conflicts(config.gripper, config.suction, mouths)
     yield from _layers(config.render.layers)
     yield from _ranges(config.effects, config.depth_sensor)
     yield from _jpeg_quality(config.effects, bop)

@@ -2,21 +2,43 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import itertools
+import math
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
+from synpick_warp.codes import MAX_CUPS
 from synpick_warp.configs.fields import INT32_MAX, Conflict, setting
 
 SUCTION1 = "suction1"
-GRIPPERS = (SUCTION1,)
+SUCTION_ARRAY = "suction_array"
+GRIPPERS = (SUCTION1, SUCTION_ARRAY)
 """Kinds of gripper."""
+EACH = "each"
+COMMON = "common"
 
 
 @dataclass(frozen=True)
 class Gripper:
     """The gripper: a conical shaft that translates along x, y and z, and a head with suction on a wrist joint about the y axis."""
 
-    kind: str = setting(SUCTION1, "", "Kind of gripper: suction1 (one cup).", choices=GRIPPERS)
+    kind: str = setting(
+        SUCTION1, "", "Kind of gripper: suction1 (one cup) or suction_array (a plate with the cups of gripper.cups).", choices=GRIPPERS
+    )
+    cups: tuple[tuple[float, float], ...] = setting(
+        (),
+        "m",
+        "Centres [x, y] of the cups of a suction_array: x across the wrist axis, y along it, from the tool centre point; "
+        f"at most {MAX_CUPS}.",
+        low=-0.5,
+        high=0.5,
+    )
+    valve: str = setting(
+        EACH,
+        "",
+        "Vacuum of a suction_array: each (a valve for each cup) or common (one for all: if one leaks or breaks off, all seals are poor).",
+        choices=(EACH, COMMON),
+    )
     finger_length: float = setting(0.35, "m", "Length of the shaft, from its top to the wrist axis.", low=0.005, high=2.0)
     finger_width: float = setting(0.075, "m", "Diameter of the shaft at its top.", low=0.005, high=1.0)
     cup_width: float = setting(0.042, "m", "Diameter of the suction cup.", low=0.005, high=0.5)
@@ -67,8 +89,8 @@ class Suction:
     )
 
 
-def find_gripper_conflicts(gripper: Gripper, suction: Suction) -> Iterator[Conflict]:
-    """Yield conflicts of cup, rays and break forces."""
+def find_gripper_conflicts(gripper: Gripper, suction: Suction, mouths: Sequence[tuple[float, float]]) -> Iterator[Conflict]:
+    """Yield conflicts of cups, rays and break forces; `mouths` are the sides of the openings of all compartments [m]."""
     max_radius = gripper.cup_width / 2
     if suction.radius > max_radius:
         yield "suction.radius", f"at most half of gripper.cup_width, {max_radius:g} [m]"
@@ -76,3 +98,21 @@ def find_gripper_conflicts(gripper: Gripper, suction: Suction) -> Iterator[Confl
         yield "suction.tolerated_misses", f"less than suction.rays, {suction.rays}: one ray must hit"
     if suction.poor_force > suction.good_force:
         yield "suction.poor_force", f"at most suction.good_force, {suction.good_force:g} [N]"
+    if gripper.kind != SUCTION_ARRAY:
+        if gripper.cups:
+            yield "gripper.cups", f'none with gripper.kind "{gripper.kind}"; set gripper.kind = "{SUCTION_ARRAY}"'
+        return
+    if not 1 <= len(gripper.cups) <= MAX_CUPS:
+        yield "gripper.cups", f"1 to {MAX_CUPS} places [x, y] with gripper.kind {SUCTION_ARRAY}, such as [[-0.03, 0.0], [0.03, 0.0]]"
+        return
+    pairs = itertools.combinations(enumerate(gripper.cups), 2)
+    distance, first, second = min(((math.dist(a, b), i, j) for (i, a), (j, b) in pairs), default=(math.inf, 0, 0))
+    if distance < gripper.cup_width:
+        apart = f"{first} and {second} are {distance:g} m apart"
+        yield "gripper.cups", f"cups that do not overlap: {apart}, gripper.cup_width is {gripper.cup_width:g}"
+    limit = max((min(sides) for sides in mouths), default=math.inf) / 2 - max_radius
+    if max(math.hypot(*place) for place in gripper.cups) > limit:
+        yield (
+            "gripper.cups",
+            f"within {max(limit, 0.0):g} m of the middle: the tool must fit into a compartment, however it is turned",
+        )

@@ -1,6 +1,7 @@
 """Suction seals: breakable implicit spring-dampers between cups and the attached objects, which replace contacts between the two.
 
-A cup has a seal with each object that it holds. Seals that pull at the same body share its mass (mass splitting; Tonge et al., 2012).
+A cup has a seal with each object that it holds. Seals that pull at the same body share its mass (mass splitting; Tonge et al., 2012), and
+those of an object have one inverse effective mass, so that they bear a load as springs of equal stiffness do.
 
 Frames; `X_in_Y` is the pose of frame X in frame Y, so that `Z_in_Y = X_in_Y * Z_in_X`:
 
@@ -115,8 +116,8 @@ def gripper_inverse_mass(suction: SuctionData, wrist_axis: wp.vec3, arm: wp.vec3
     """Inverse effective mass of the gripper at `arm` [m] from the wrist, times the number of seals.
 
     The gripper translates as a whole and tilts about the wrist axis against its drive. With n seals that pull at the same mass, each
-    is given an n-th of it. An approximation that shapes how a seal's oscillation decays, not the force that it bears: translation and
-    tilt are taken as independent.
+    is given an n-th of it (mass splitting). An approximation that shapes how a seal's oscillation decays, not the force that it bears:
+    translation and tilt are taken as independent.
     """
     direction = wp.cross(wrist_axis, arm)
     slide = float(seals) / (suction.finger_mass + suction.cup_mass)
@@ -204,13 +205,50 @@ def count_seals(attached: int, suction: SuctionData) -> int:
 
 
 @wp.func
-def split_mass(inverse_mass: InverseMass, seals: int) -> InverseMass:
-    """Inverse effective mass of the n-th of a body, of which each of n seals is given one."""
+def scale_inverse_mass(inverse_mass: InverseMass, factor: float) -> InverseMass:
+    """Inverse effective mass times a factor."""
     result = InverseMass()
-    result.linear = float(seals) * inverse_mass.linear
-    result.mixed = float(seals) * inverse_mass.mixed
-    result.angular = float(seals) * inverse_mass.angular
+    result.linear = factor * inverse_mass.linear
+    result.mixed = factor * inverse_mass.mixed
+    result.angular = factor * inverse_mass.angular
     return result
+
+
+@wp.func
+def shared_inverse_mass(
+    held: int,
+    seals: int,
+    head_in_world: wp.transform,
+    object_in_world: wp.transform,
+    com: wp.vec3,
+    inverse_mass: float,
+    inverse_inertia: wp.mat33,
+    suction: SuctionData,
+) -> InverseMass:
+    """Inverse effective mass of the relative motion of gripper and object, for each of the object's n seals: n times its mean over them.
+
+    Args:
+        held: Cups that hold the object, as bits.
+        seals: Number of all seals of the gripper.
+        head_in_world: Pose of the gripper head [m].
+        object_in_world: Pose of the object [m].
+        com: Its centre of mass in its frame [m].
+        inverse_mass: Its inverse mass [1/kg].
+        inverse_inertia: Its inverse inertia, in its axes [1/(kg·m²)].
+        suction: Cups and masses.
+    """
+    of_object = InverseMass()
+    of_gripper = InverseMass()
+    rotation = wp.transform_get_rotation(object_in_world)
+    wrist_axis = wp.transform_vector(head_in_world, wp.vec3(0.0, 1.0, 0.0))
+    for cup in range(suction.cups):
+        if has_bit(held, cup):
+            tcp = wp.transform_get_translation(tcp_pose(head_in_world, suction.place[cup]))
+            object_arm = tcp - wp.transform_point(object_in_world, com)
+            of_object = add_inverse_masses(of_object, object_inverse_mass(rotation, inverse_mass, inverse_inertia, object_arm))
+            wrist_arm = tcp - wp.transform_get_translation(head_in_world)
+            of_gripper = add_inverse_masses(of_gripper, gripper_inverse_mass(suction, wrist_axis, wrist_arm, seals))
+    return add_inverse_masses(of_object, scale_inverse_mass(of_gripper, 1.0 / float(count_seals(held, suction))))
 
 
 @wp.func
@@ -296,7 +334,8 @@ def apply_seal_forces_kernel(
             slot = body_slot[world, instance]
             body = world * layout.bodies + layout.gripper_bodies + slot
             grip_in_world = body_q[body] * wp.transform_inverse(object_in_tcp[world, instance])
-            rotation = wp.transform_get_rotation(body_q[body])
+            mass, inertia = body_inv_mass[body], body_inv_inertia[body]
+            inverse_mass = shared_inverse_mass(held, seals, body_q[head], body_q[body], body_com[body], mass, inertia, suction)
             total = Wrench()
             for cup in range(suction.cups):
                 if has_bit(held, cup):
@@ -304,10 +343,6 @@ def apply_seal_forces_kernel(
                     tcp = tcp_motion(body_q[head], body_qd[head], body_com[head], place)
                     grip = wp.transform_point(grip_in_world, wp.vec3(place[0], place[1], 0.0))
                     object_arm = tcp.position - wp.transform_point(body_q[body], body_com[body])
-                    object_inverse = object_inverse_mass(rotation, body_inv_mass[body], body_inv_inertia[body], object_arm)
-                    object_inverse = split_mass(object_inverse, count_seals(held, suction))
-                    gripper_inverse = gripper_inverse_mass(suction, tcp.wrist_axis, tcp.wrist_arm, seals)
-                    inverse_mass = add_inverse_masses(object_inverse, gripper_inverse)
                     wrench = pull_object(
                         tcp, grip, wp.transform_get_rotation(grip_in_world), body_qd[body], object_arm, inverse_mass, suction
                     )

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 
-from synpick_warp.configs.gripper import SUCTION1, Gripper
-from synpick_warp.scenes.grippers import suction1
+from synpick_warp.configs.gripper import SUCTION1, SUCTION_ARRAY, Gripper
+from synpick_warp.scenes.grippers import suction1, suction_array
 from synpick_warp.scenes.grippers.head import Head
 
-HEADS: Mapping[str, Callable[[Gripper], Head]] = {SUCTION1: suction1.make_head}
+HEADS: Mapping[str, Callable[[Gripper], Head]] = {SUCTION1: suction1.make_head, SUCTION_ARRAY: suction_array.make_head}
 """Builder of the head, by `gripper.kind`."""
 
 

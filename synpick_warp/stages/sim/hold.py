@@ -8,7 +8,7 @@ from typing import Protocol
 import newton
 import warp as wp
 
-from synpick_warp.configs.gripper import SUCTION1, Gripper, Suction
+from synpick_warp.configs.gripper import SUCTION1, SUCTION_ARRAY, Gripper, Suction
 from synpick_warp.scenes.types import Catalog
 from synpick_warp.stages.constants import SceneData
 from synpick_warp.stages.render.scene import RenderScene
@@ -33,7 +33,10 @@ class Hold(Protocol):
         ...
 
 
-HOLDS: Mapping[str, Callable[[Suction, Catalog, RenderScene, wp.Device], Hold]] = {SUCTION1: SuctionHold}
+HOLDS: Mapping[str, Callable[[Suction, Catalog, RenderScene, wp.Device], Hold]] = {
+    SUCTION1: SuctionHold,
+    SUCTION_ARRAY: SuctionHold,
+}
 """Class of the hold, by `gripper.kind`."""
 
 
