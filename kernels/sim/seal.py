@@ -1,7 +1,7 @@
 """Suction seals: breakable implicit spring-dampers between cups and the attached objects, which replace contacts between the two.
 
-A cup has a seal with each object that it holds. Seals that pull at the same body share its mass (mass splitting; Tonge et al., 2012), and
-those of an object have one inverse effective mass, so that they bear a load as springs of equal stiffness do.
+A cup has a seal with each object that it holds. The seals of an object act on two rigid bodies: together they are one spring-damper at the
+middle of their cups, whose resistance to rotation grows with the distances of the cups from it. It is solved as one, then shared out.
 
 Frames; `X_in_Y` is the pose of frame X in frame Y, so that `Z_in_Y = X_in_Y * Z_in_X`:
 
@@ -50,6 +50,16 @@ class RotationError:
 
 
 @wp.struct
+class CupSpread:
+    """Elastic torque of an object's cups beside their middle, and the second moment of their places."""
+
+    torque: wp.vec3
+    """Σ r x k (r - r_grip) about the middle, on the object [N·m]."""
+    moment: wp.mat33
+    """Σ |r|² 1 - r rᵀ, in the world's axes [m²]."""
+
+
+@wp.struct
 class Wrench:
     """Force [N] and torque [N·m] on the object at the TCP, in the world's axes."""
 
@@ -60,8 +70,22 @@ class Wrench:
 
 
 @wp.struct
+class HeldObject:
+    """What the seals of an object do in a step: cups that hold on, and their wrench about the object's centre of mass."""
+
+    cups: int
+    """Bits of the cups whose seals did not break."""
+    peak_force: float
+    """Largest tension and shear of a seal, that of one that breaks included [N]."""
+    force: wp.vec3
+    """On the object, in the world's axes [N]."""
+    torque: wp.vec3
+    """[N·m]"""
+
+
+@wp.struct
 class TcpMotion:
-    """Pose and velocity of a cup's TCP frame, and its arm from the wrist, in the world's axes."""
+    """Pose and velocity of a frame with the head's axes in the plane of the lips, and its arm from the wrist, in the world's axes."""
 
     position: wp.vec3
     """[m]"""
@@ -81,7 +105,7 @@ class TcpMotion:
 
 @wp.func
 def tcp_motion(head_in_world: wp.transform, head_velocity: wp.spatial_vector, head_com: wp.vec3, place: wp.vec3) -> TcpMotion:
-    """Motion of the TCP frame of the cup at `place` [m], from the head's: its centre of mass is at `head_com` in its frame [m]."""
+    """Motion of the frame with the head's axes at `place` [m], from the head's: its centre of mass is at `head_com` in its frame [m]."""
     tcp_in_world = tcp_pose(head_in_world, place)
     result = TcpMotion()
     result.position = wp.transform_get_translation(tcp_in_world)
@@ -112,16 +136,16 @@ def object_inverse_mass(object_rotation: wp.quat, inverse_mass: float, inverse_i
 
 
 @wp.func
-def gripper_inverse_mass(suction: SuctionData, wrist_axis: wp.vec3, arm: wp.vec3, seals: int) -> InverseMass:
-    """Inverse effective mass of the gripper at `arm` [m] from the wrist, times the number of seals.
+def gripper_inverse_mass(suction: SuctionData, wrist_axis: wp.vec3, arm: wp.vec3, objects: int) -> InverseMass:
+    """Inverse effective mass of the gripper at `arm` [m] from the wrist, times the number of objects that it holds.
 
-    The gripper translates as a whole and tilts about the wrist axis against its drive. With n seals that pull at the same mass, each
-    is given an n-th of it (mass splitting). An approximation that shapes how a seal's oscillation decays, not the force that it bears:
-    translation and tilt are taken as independent.
+    The gripper translates as a whole and tilts about the wrist axis against its drive. With n objects that pull at the same mass, each
+    is given an n-th of it (mass splitting; Tonge et al., 2012). An approximation that shapes how a seal's oscillation decays, not the force
+    that it bears: translation and tilt are taken as independent.
     """
     direction = wp.cross(wrist_axis, arm)
-    slide = float(seals) / (suction.finger_mass + suction.cup_mass)
-    tilt = float(seals) / suction.tilt_inertia
+    slide = float(objects) / (suction.finger_mass + suction.cup_mass)
+    tilt = float(objects) / suction.tilt_inertia
     result = InverseMass()
     result.linear = slide * wp.identity(n=3, dtype=float) + tilt * wp.outer(direction, direction)
     result.mixed = tilt * wp.outer(direction, wrist_axis)
@@ -164,20 +188,63 @@ def rotation_error(cup: wp.quat, grip: wp.quat, suction: SuctionData) -> Rotatio
 
 
 @wp.func
+def count_seals(held: int, suction: SuctionData) -> int:
+    """Number of cups that hold an object; `held`: its bits in `attached`."""
+    count = int(0)
+    for cup in range(suction.cups):
+        count += (held >> cup) & 1
+    return count
+
+
+@wp.func
+def middle_of_cups(held: int, suction: SuctionData) -> wp.vec3:
+    """Middle of the cups that hold an object, in the head's frame [m]."""
+    total = wp.vec3(0.0, 0.0, 0.0)
+    for cup in range(suction.cups):
+        if has_bit(held, cup):
+            total += suction.place[cup]
+    return total / float(count_seals(held, suction))
+
+
+@wp.func
+def spread_of_cups(held: int, middle: wp.vec3, head: wp.quat, grip: wp.quat, suction: SuctionData) -> CupSpread:
+    """Spread of the cups that hold an object about their middle; rotations from the head's and from the grip's axes to the world."""
+    result = CupSpread()
+    for cup in range(suction.cups):
+        if has_bit(held, cup):
+            arm = wp.quat_rotate(head, suction.place[cup] - middle)
+            stretch = arm - wp.quat_rotate(grip, suction.place[cup] - middle)
+            result.torque += wp.cross(arm, suction.stiffness * stretch)
+            result.moment += wp.dot(arm, arm) * wp.identity(n=3, dtype=float) - wp.outer(arm, arm)
+    return result
+
+
+@wp.func
 def seal_wrench(
-    offset: wp.vec3, error: RotationError, velocity: wp.vec3, angular_velocity: wp.vec3, inverse_mass: InverseMass, suction: SuctionData
+    offset: wp.vec3,
+    error: RotationError,
+    spread: CupSpread,
+    seals: int,
+    velocity: wp.vec3,
+    angular_velocity: wp.vec3,
+    inverse_mass: InverseMass,
+    suction: SuctionData,
 ) -> Wrench:
-    """Wrench w on the object of a spring-damper that is implicit in offset and velocity at the end of the step h.
+    """Wrench w on an object of its n seals, a spring-damper that is implicit in offset and velocity at the end of the step h.
 
     w = K (e + h u') + D u' with u' = u - h W w, hence (1 + h (h K + D) W) w = K e + (h K + D) u. Offset e and velocity u are those of the
-    tcp frame relative to the grip frame, W is the sum of both inverse effective masses. Stable for every mass, stiffness and damping.
+    tcp frame relative to the grip frame at the middle of the cups, W is the sum of both inverse effective masses. K is n times a seal's
+    stiffness; against rotation, k Σ |r|² 1 - r rᵀ of the cups' places r is added, and the same to D. Stable for every mass, stiffness and
+    damping.
     """
     h = suction.step
+    n = float(seals)
     one = wp.identity(n=3, dtype=float)
-    linear_gain = h * suction.stiffness + suction.damping
-    angular_gain = h * error.stiffness + suction.twist_damping * one
-    force = suction.stiffness * offset + linear_gain * velocity
-    torque = error.torque + angular_gain * angular_velocity
+    gain = h * suction.stiffness + suction.damping
+    linear_gain = n * gain
+    angular_gain = n * (h * error.stiffness + suction.twist_damping * one) + gain * spread.moment
+    force = n * suction.stiffness * offset + linear_gain * velocity
+    torque = n * error.torque + spread.torque + angular_gain * angular_velocity
     # Blocks of the 6 x 6 system, solved for the torque first (Schur complement).
     upper = wp.inverse(one + (h * linear_gain) * inverse_mass.linear)
     right = (h * linear_gain) * inverse_mass.mixed
@@ -190,104 +257,85 @@ def seal_wrench(
 
 
 @wp.func
+def force_of_cup(whole: Wrench, seals: int, arm: wp.vec3, grip_arm: wp.vec3, spin: wp.vec3, suction: SuctionData) -> wp.vec3:
+    """Force of one cup's seal on the object, a share of that of its n seals: F / n + k (r - r_grip) + (h k + d) ω' x r [N].
+
+    Args:
+        whole: Wrench of all seals of the object at the middle of their cups.
+        seals: Their number.
+        arm: From the middle to the cup, r [m].
+        grip_arm: The same on the object, r_grip [m].
+        spin: Angular velocity of the head relative to the object at the end of the step, ω' [rad/s].
+        suction: Stiffness and damping.
+    """
+    gain = suction.step * suction.stiffness + suction.damping
+    return whole.force / float(seals) + suction.stiffness * (arm - grip_arm) + gain * wp.cross(spin, arm)
+
+
+@wp.func
 def tension_and_shear(force: wp.vec3, axis: wp.vec3) -> float:
     """Seal force [N] that is compared with the break force: norm of the force on the object without compression along the cup's axis."""
     return wp.length(force - wp.min(wp.dot(force, axis), 0.0) * axis)
 
 
 @wp.func
-def count_seals(attached: int, suction: SuctionData) -> int:
-    """Number of cups that hold an instance, from its bits in `attached`."""
-    count = int(0)
-    for cup in range(suction.cups):
-        count += (attached >> cup) & 1
-    return count
-
-
-@wp.func
-def scale_inverse_mass(inverse_mass: InverseMass, factor: float) -> InverseMass:
-    """Inverse effective mass times a factor."""
-    result = InverseMass()
-    result.linear = factor * inverse_mass.linear
-    result.mixed = factor * inverse_mass.mixed
-    result.angular = factor * inverse_mass.angular
-    return result
-
-
-@wp.func
-def shared_inverse_mass(
-    held: int,
-    seals: int,
-    head_in_world: wp.transform,
-    object_in_world: wp.transform,
-    com: wp.vec3,
-    inverse_mass: float,
-    inverse_inertia: wp.mat33,
-    suction: SuctionData,
-) -> InverseMass:
-    """Inverse effective mass of the relative motion of gripper and object, for each of the object's n seals: n times its mean over them.
-
-    Args:
-        held: Cups that hold the object, as bits.
-        seals: Number of all seals of the gripper.
-        head_in_world: Pose of the gripper head [m].
-        object_in_world: Pose of the object [m].
-        com: Its centre of mass in its frame [m].
-        inverse_mass: Its inverse mass [1/kg].
-        inverse_inertia: Its inverse inertia, in its axes [1/(kg·m²)].
-        suction: Cups and masses.
-    """
-    of_object = InverseMass()
-    of_gripper = InverseMass()
-    rotation = wp.transform_get_rotation(object_in_world)
-    wrist_axis = wp.transform_vector(head_in_world, wp.vec3(0.0, 1.0, 0.0))
-    for cup in range(suction.cups):
-        if has_bit(held, cup):
-            tcp = wp.transform_get_translation(tcp_pose(head_in_world, suction.place[cup]))
-            object_arm = tcp - wp.transform_point(object_in_world, com)
-            of_object = add_inverse_masses(of_object, object_inverse_mass(rotation, inverse_mass, inverse_inertia, object_arm))
-            wrist_arm = tcp - wp.transform_get_translation(head_in_world)
-            of_gripper = add_inverse_masses(of_gripper, gripper_inverse_mass(suction, wrist_axis, wrist_arm, seals))
-    return add_inverse_masses(of_object, scale_inverse_mass(of_gripper, 1.0 / float(count_seals(held, suction))))
-
-
-@wp.func
-def pull_object(
-    tcp: TcpMotion,
-    grip: wp.vec3,
-    grip_rotation: wp.quat,
-    object_velocity: wp.spatial_vector,
-    object_arm: wp.vec3,
-    inverse_mass: InverseMass,
-    suction: SuctionData,
-) -> Wrench:
-    """Wrench of one seal on its object.
-
-    Args:
-        tcp: Motion of the cup's TCP.
-        grip: Point of the object that coincides with it at rest, in the world [m].
-        grip_rotation: From the grip frame to the world.
-        object_velocity: Of the object [m/s, rad/s].
-        object_arm: Moment arm from the object's centre of mass to the TCP [m].
-        inverse_mass: Of the relative motion of both.
-        suction: Stiffness and damping.
-    """
-    object_angular_velocity = wp.spatial_bottom(object_velocity)
-    slip = tcp.velocity - wp.spatial_top(object_velocity) - wp.cross(object_angular_velocity, object_arm)
-    error = rotation_error(tcp.rotation, grip_rotation, suction)
-    return seal_wrench(tcp.position - grip, error, slip, tcp.angular_velocity - object_angular_velocity, inverse_mass, suction)
-
-
-@wp.func
-def pull_gripper(wrench: Wrench, tcp: TcpMotion, joint_f: wp.array[float], gripper_dof: int):
-    """Subtract a seal's wrench from the gripper's joint forces: x, y, z and tilt.
+def pull_gripper(force: wp.vec3, torque: wp.vec3, arm: wp.vec3, wrist_axis: wp.vec3, joint_f: wp.array[float], gripper_dof: int):
+    """Subtract a seal's wrench, at `arm` [m] from the wrist, from the gripper's joint forces: x, y, z and tilt.
 
     The torque about other axes than the wrist's is borne by the gripper's joint.
     """
     for axis in range(3):
-        joint_f[gripper_dof + axis] = joint_f[gripper_dof + axis] - wrench.force[axis]
-    torque = wrench.torque + wp.cross(tcp.wrist_arm, wrench.force)
-    joint_f[gripper_dof + TILT] = joint_f[gripper_dof + TILT] - wp.dot(tcp.wrist_axis, torque)
+        joint_f[gripper_dof + axis] = joint_f[gripper_dof + axis] - force[axis]
+    joint_f[gripper_dof + TILT] = joint_f[gripper_dof + TILT] - wp.dot(wrist_axis, torque + wp.cross(arm, force))
+
+
+@wp.func
+def share_wrench(
+    held: int,
+    whole: Wrench,
+    tcp: TcpMotion,
+    middle: wp.vec3,
+    grip_rotation: wp.quat,
+    object_arm: wp.vec3,
+    spin: wp.vec3,
+    world: int,
+    gripper_dof: int,
+    suction: SuctionData,
+    break_force: wp.array2d[float],  # (world, cup) [N]
+    cup_force: wp.array2d[float],  # (world, cup) [N]
+    joint_f: wp.array[float],  # (dof) [N, N·m]
+) -> HeldObject:
+    """Share the wrench of an object's seals out to its cups, and break those whose force exceeds the break force.
+
+    `held`, `middle`, `grip_rotation` and `spin` are those of `middle_of_cups`, `spread_of_cups` and `force_of_cup`; `object_arm` leads
+    from the object's centre of mass to the middle [m]. Adds the forces to `cup_force`, and those that hold on to the gripper's `joint_f`.
+    """
+    seals = count_seals(held, suction)
+    # What the forces of the cups do not explain of the torque is twist and swing of the seals, the same of each.
+    rest = whole.torque
+    for cup in range(suction.cups):
+        if has_bit(held, cup):
+            arm = wp.quat_rotate(tcp.rotation, suction.place[cup] - middle)
+            grip_arm = wp.quat_rotate(grip_rotation, suction.place[cup] - middle)
+            rest -= wp.cross(arm, force_of_cup(whole, seals, arm, grip_arm, spin, suction))
+    torque = rest / float(seals)
+    result = HeldObject()
+    result.cups = held
+    for cup in range(suction.cups):
+        if has_bit(held, cup):
+            arm = wp.quat_rotate(tcp.rotation, suction.place[cup] - middle)
+            grip_arm = wp.quat_rotate(grip_rotation, suction.place[cup] - middle)
+            force = force_of_cup(whole, seals, arm, grip_arm, spin, suction)
+            borne = tension_and_shear(force, tcp.axis)
+            result.peak_force = wp.max(result.peak_force, borne)
+            cup_force[world, cup] = cup_force[world, cup] + borne
+            if borne > break_force[world, cup]:
+                result.cups -= 1 << cup
+            else:
+                result.force += force
+                result.torque += torque + wp.cross(object_arm + arm, force)
+                pull_gripper(force, torque, tcp.wrist_arm + arm, tcp.wrist_axis, joint_f, gripper_dof)
+    return result
 
 
 @wp.kernel
@@ -317,13 +365,13 @@ def apply_seal_forces_kernel(
     valve breaks, the others are poor from the next step on. Launched over world.
     """
     world = wp.tid()
-    seals = int(0)
+    objects = int(0)
     for instance in range(layout.instances):
-        seals += count_seals(attached_inout[world, instance], suction)
+        objects += wp.where(attached_inout[world, instance] != 0, 1, 0)
         seal_force_inout[world, instance] = 0.0
     for cup in range(suction.cups):
         cup_force_inout[world, cup] = 0.0
-    if seals == 0:
+    if objects == 0:
         return
     head = world * layout.bodies + CUP
     gripper_dof = world * layout.dofs
@@ -333,34 +381,34 @@ def apply_seal_forces_kernel(
         if held != 0:
             slot = body_slot[world, instance]
             body = world * layout.bodies + layout.gripper_bodies + slot
+            middle = middle_of_cups(held, suction)
+            tcp = tcp_motion(body_q[head], body_qd[head], body_com[head], middle)
             grip_in_world = body_q[body] * wp.transform_inverse(object_in_tcp[world, instance])
-            mass, inertia = body_inv_mass[body], body_inv_inertia[body]
-            inverse_mass = shared_inverse_mass(held, seals, body_q[head], body_q[body], body_com[body], mass, inertia, suction)
-            total = Wrench()
-            for cup in range(suction.cups):
-                if has_bit(held, cup):
-                    place = suction.place[cup]
-                    tcp = tcp_motion(body_q[head], body_qd[head], body_com[head], place)
-                    grip = wp.transform_point(grip_in_world, wp.vec3(place[0], place[1], 0.0))
-                    object_arm = tcp.position - wp.transform_point(body_q[body], body_com[body])
-                    wrench = pull_object(
-                        tcp, grip, wp.transform_get_rotation(grip_in_world), body_qd[body], object_arm, inverse_mass, suction
-                    )
-                    force = tension_and_shear(wrench.force, tcp.axis)
-                    seal_force_inout[world, instance] = wp.max(seal_force_inout[world, instance], force)
-                    cup_force_inout[world, cup] = cup_force_inout[world, cup] + force
-                    peak_force_inout[world] = wp.max(peak_force_inout[world], force)
-                    if force > break_force_inout[world, cup]:
-                        broken += 1
-                        attached_inout[world, instance] = attached_inout[world, instance] - (1 << cup)
-                    else:
-                        total.force += wrench.force
-                        total.torque += wrench.torque + wp.cross(object_arm, wrench.force)
-                        pull_gripper(wrench, tcp, joint_f_inout, gripper_dof)
+            grip_rotation = wp.transform_get_rotation(grip_in_world)
+            object_arm = tcp.position - wp.transform_point(body_q[body], body_com[body])
+            rotation = wp.transform_get_rotation(body_q[body])
+            object_inverse = object_inverse_mass(rotation, body_inv_mass[body], body_inv_inertia[body], object_arm)
+            inverse_mass = add_inverse_masses(object_inverse, gripper_inverse_mass(suction, tcp.wrist_axis, tcp.wrist_arm, objects))
+            object_spin = wp.spatial_bottom(body_qd[body])
+            slip = tcp.velocity - wp.spatial_top(body_qd[body]) - wp.cross(object_spin, object_arm)
+            spin = tcp.angular_velocity - object_spin
+            offset = tcp.position - wp.transform_point(grip_in_world, wp.vec3(middle[0], middle[1], 0.0))
+            error = rotation_error(tcp.rotation, grip_rotation, suction)
+            spread = spread_of_cups(held, middle, tcp.rotation, grip_rotation, suction)
+            whole = seal_wrench(offset, error, spread, count_seals(held, suction), slip, spin, inverse_mass, suction)
+            spin -= suction.step * (wp.transpose(inverse_mass.mixed) * whole.force + inverse_mass.angular * whole.torque)
+            shared = share_wrench(
+                held, whole, tcp, middle, grip_rotation, object_arm, spin, world, gripper_dof, suction,
+                break_force_inout, cup_force_inout, joint_f_inout,
+            )  # fmt: skip
+            seal_force_inout[world, instance] = shared.peak_force
+            peak_force_inout[world] = wp.max(peak_force_inout[world], shared.peak_force)
+            broken += held - shared.cups
+            attached_inout[world, instance] = shared.cups
             first_dof = gripper_dof + layout.gripper_dofs + 6 * slot
             for axis in range(3):
-                joint_f_inout[first_dof + axis] = total.force[axis]
-                joint_f_inout[first_dof + 3 + axis] = total.torque[axis]
+                joint_f_inout[first_dof + axis] = shared.force[axis]
+                joint_f_inout[first_dof + 3 + axis] = shared.torque[axis]
     if suction.common_valve != 0 and broken > 0:
         for cup in range(suction.cups):
             break_force_inout[world, cup] = suction.poor_force

@@ -116,10 +116,13 @@ def test_what_hangs_by_its_edge_swings_little_more_than_the_limit(device):
 # ---- momentum and energy ----
 
 
-@pytest.fixture(scope="module")
-def floating(device) -> Hanging:
-    """The lightest and the heaviest object, without weight, on grippers that nothing holds."""
-    hanging = Hanging(device, [[0.016], [1.131]], [[(0.12, 0.02, 0.02)], [(0.2, 0.08, 0.06)]], physics__gravity=0.0)
+THREE = {"gripper__kind": "suction_array", "gripper__cups": [[-0.05, 0.0], [0.0, 0.04], [0.05, 0.0]]}
+
+
+@pytest.fixture(scope="module", params=[{}, THREE], ids=["one", "three"])
+def floating(device, request) -> Hanging:
+    """The lightest and the heaviest object, without weight, on grippers that nothing holds; on one cup, or on three."""
+    hanging = Hanging(device, [[0.016], [1.131]], [[(0.12, 0.02, 0.02)], [(0.2, 0.08, 0.06)]], physics__gravity=0.0, **request.param)
     hanging.carried = False
     return hanging
 
