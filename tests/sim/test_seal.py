@@ -242,9 +242,11 @@ SLOTS = (3, 0, 2)
 TIP = 0.055
 
 
-def scripted(device, bodies: list[twin.Body], objects_in_tcp: np.ndarray, attached: list[int], break_force: float) -> KernelWorlds:
-    """One world with a moving cup and three moving objects in the slots SLOTS."""
-    worlds = KernelWorlds(device, 1, instances=3, single_slots=4, move={"tcp_offset": TIP})
+def scripted(
+    device, bodies: list[twin.Body], objects_in_tcp: np.ndarray, attached: list[int], break_force: float, cups=((0.0, 0.0),)
+) -> KernelWorlds:
+    """One world with a moving gripper and three moving objects in the slots SLOTS."""
+    worlds = KernelWorlds(device, 1, instances=3, single_slots=4, move={"tcp_offset": TIP}, cups=cups)
     filled(worlds.scene.suction, LAW)
     rows = [1, *(2 + slot for slot in SLOTS)]
     columns = {
@@ -307,22 +309,41 @@ def _times(a, b) -> list[float]:
     return [*(np.asarray(a[:3]) + rotation_of(np.array(a[3:])) @ b[:3]), *turned]
 
 
-@given(seed=st.integers(0, 10_000), attached=st.sampled_from([[1, 0, 0], [0, 1, 1], [1, 1, 1]]), break_force=st.sampled_from([1e6, 5.0]))
-@settings(max_examples=30)
-def test_wrenches_are_those_of_the_twin_and_detached_objects_feel_none(seed, attached, break_force, device):
+ONE, ROW = ((0.0, 0.0),), ((0.05, 0.01), (-0.03, 0.04), (0.02, -0.04))
+"""Places of cups [m]."""
+
+
+@given(
+    seed=st.integers(0, 10_000),
+    tool=st.sampled_from([(ONE, [1, 0, 0]), (ONE, [0, 1, 1]), (ONE, [1, 1, 1]), (ROW, [7, 0, 0]), (ROW, [0, 5, 2]), (ROW, [4, 7, 3])]),
+    break_force=st.sampled_from([1e6, 5.0]),
+)
+@settings(max_examples=40)
+def test_wrenches_are_those_of_the_twin_and_detached_objects_feel_none(seed, tool, break_force, device):
+    cups, attached = tool
     bodies, objects_in_tcp = random_bodies(seed)
-    worlds = scripted(device, bodies, objects_in_tcp, attached, break_force)
+    worlds = scripted(device, bodies, objects_in_tcp, attached, break_force, cups)
     expected = np.full(worlds.dofs, 7.0)
-    seal_forces, kept, peak_force = [0.0] * 3, list(attached), 1.0
+    seal_forces, cup_forces, kept, peak_force = [0.0] * 3, np.zeros(len(cups)), list(attached), 1.0
     for instance in np.flatnonzero(attached):
-        force, reaction, seal_force = twin.seal_wrench(
-            bodies[0], bodies[1 + instance], objects_in_tcp[instance], SimpleNamespace(**LAW, tcp_offset=TIP), sum(attached)
+        held = [cup for cup in range(len(cups)) if attached[instance] >> cup & 1]
+        seals = twin.seal_wrenches(
+            bodies[0],
+            bodies[1 + instance],
+            objects_in_tcp[instance],
+            SimpleNamespace(**LAW, tcp_offset=TIP),
+            np.count_nonzero(attached),
+            np.array(cups)[held],
         )
         first = GRIPPER_DOFS + 6 * SLOTS[instance]
-        breaks = seal_force > break_force
-        expected[first : first + 6] = 0.0 if breaks else force
-        expected[:GRIPPER_DOFS] += 0.0 if breaks else reaction
-        seal_forces[instance], kept[instance] = seal_force, int(not breaks)
+        expected[first : first + 6] = 0.0
+        for cup, (force, reaction, seal_force) in zip(held, seals, strict=True):
+            breaks = seal_force > break_force
+            expected[first : first + 6] += 0.0 if breaks else force
+            expected[:GRIPPER_DOFS] += 0.0 if breaks else reaction
+            kept[instance] -= int(breaks) << cup
+            cup_forces[cup] += seal_force
+            seal_forces[instance] = max(seal_forces[instance], seal_force)
         peak_force = max(peak_force, seal_forces[instance])
     meshes = SimpleNamespace(id=wp.zeros(1, dtype=wp.uint64, device=device))
     suction = SuctionHold(load_config("smoke", {}).suction, catalog(CUBE), SimpleNamespace(meshes=meshes, keep=()), device)
@@ -331,5 +352,6 @@ def test_wrenches_are_those_of_the_twin_and_detached_objects_feel_none(seed, att
     atol = 1e-4 * np.abs(expected).max() + LAW["stiffness"] * np.finfo(np.float32).eps
     np.testing.assert_allclose(worlds.physics.control.joint_f.numpy(), expected, rtol=3e-4, atol=atol)
     np.testing.assert_allclose(worlds.seals.seal_force.numpy()[0], seal_forces, rtol=3e-4, atol=atol)
+    np.testing.assert_allclose(worlds.seals.cup_force.numpy()[0], cup_forces, rtol=3e-4, atol=atol)
     assert worlds.seals.attached.numpy()[0].tolist() == kept
     assert worlds.seals.peak_force.numpy()[0] == pytest.approx(peak_force, rel=3e-4, abs=atol)
