@@ -15,6 +15,8 @@ VENV := .venv
 BIN := $(VENV)/bin
 DEMO := demo
 WORKERS := 2
+# Neighbours in one process, which makes what they share once.
+PYTEST = $(BIN)/python -m pytest -n $(WORKERS) --dist worksteal
 
 .PHONY: demo test test-slow checks clean
 .DELETE_ON_ERROR:
@@ -25,10 +27,10 @@ demo: $(VENV)/installed
 	$(BIN)/synpick-warp preview $(DEMO) --out $(DEMO)/contact-sheet.png
 
 test: checks
-	$(BIN)/python -m pytest -n $(WORKERS) -m 'not slow'
+	$(PYTEST) -m 'not slow'
 
 test-slow: $(VENV)/installed-dev
-	$(BIN)/python -m pytest -n $(WORKERS) -m slow
+	$(PYTEST) -m slow
 
 checks: $(VENV)/installed-dev
 	$(BIN)/ruff check --quiet --output-format concise .

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import os
 import signal
 import subprocess
@@ -40,6 +41,7 @@ def pytest_configure(config: pytest.Config) -> None:
 
     Shells let background jobs ignore SIGINT, and so would all processes that tests start; it acts here as in the foreground.
     """
+    gc.disable()  # What is imported stays: to look through it again and again takes a third of the time of the collection of tests.
     if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
         signal.signal(signal.SIGINT, signal.default_int_handler)
     os.environ[VARIABLE] = devices(config)[0]
@@ -48,6 +50,12 @@ def pytest_configure(config: pytest.Config) -> None:
     if config.getoption("--check-bounds"):
         _check_bounds(config)
     start_warp()
+
+
+def pytest_collection_finish() -> None:
+    """Garbage collections pass over modules and tests from here on."""
+    gc.freeze()
+    gc.enable()
 
 
 def _check_bounds(config: pytest.Config) -> None:
@@ -78,10 +86,10 @@ def device(request: pytest.FixtureRequest) -> wp.Device:
 
 @pytest.fixture(scope="session", autouse=True)
 def quick_worlds() -> Iterator[None]:
-    """What takes most of the time to build small worlds is made once a process."""
-    from tests.harness.made_once import made_once
+    """What takes most of the time to build small worlds is made once a process, and small data sets are written in it."""
+    from tests.harness.made_once import made_once, written_here
 
-    with made_once():
+    with made_once(), written_here():
         yield
 
 

@@ -97,7 +97,7 @@ def test_the_same_settings_give_the_same_bytes_with_a_profile_too(baked, tmp_pat
     assert recorder.times["simulate",].host < recorder.wall
 
 
-@pytest.mark.parametrize(("worlds", "lead"), [(1, 0), (2, 5), (4, 5)])
+@pytest.mark.parametrize(("worlds", "lead"), [(1, 0), pytest.param(2, 5, marks=pytest.mark.slow), (4, 5)])
 def test_neither_the_number_of_worlds_nor_the_lead_of_physics_changes_a_scene(baked, tmp_path, monkeypatch, worlds, lead):
     """Two worlds are fewer than the episodes, so physics leads only once a world is idle; with four it leads from the start."""
     leads, may_begin = set(), TickLoop._may_begin

@@ -131,10 +131,11 @@ def _find_turns(surface: Surface, diameter: float, tolerance: float) -> tuple[li
         axis, point = _refine(surface, axis, surface.center, fold, _ROUGH)
         if is_known(axis, fold):
             continue
-        turn = _turn(surface, axis, point, fold)
+        turn = _turn(surface, axis, point, fold, 2.0 * tolerance)
         if turn.deviation <= 2.0 * tolerance:
-            fine = _turn(surface, *_refine(surface, axis, point, fold, _FINE), fold)
-            turn = fine if fine.deviation <= turn.deviation + 0.1 * tolerance else turn
+            limit = turn.deviation + 0.1 * tolerance
+            fine = _turn(surface, *_refine(surface, axis, point, fold, _FINE), fold, limit)
+            turn = fine if fine.deviation <= limit else turn
         seen.append((turn.axis, fold if turn.deviation > tolerance else 0))
         if turn.deviation > tolerance:
             if turn.deviation <= 2.0 * tolerance and (missed is None or turn.deviation < missed.deviation):
@@ -204,10 +205,10 @@ def _refine(surface: Surface, axis: np.ndarray, point: np.ndarray, fold: int, co
     return axis, point
 
 
-def _turn(surface: Surface, axis: np.ndarray, point: np.ndarray, fold: int) -> Turn:
-    """Rotation by a fold's angle with its distance."""
+def _turn(surface: Surface, axis: np.ndarray, point: np.ndarray, fold: int, limit: float = np.inf) -> Turn:
+    """Rotation by a fold's angle with its distance; beyond the limit, a lower bound of it."""
     axis = _upward(axis)
-    return Turn(axis, point, fold, surface.deviation(turn_matrix(axis, point, 2.0 * np.pi / fold)))
+    return Turn(axis, point, fold, surface.deviation(turn_matrix(axis, point, 2.0 * np.pi / fold), limit))
 
 
 def _snap(surface: Surface, turn: Turn, tolerance: float) -> Turn:
@@ -218,8 +219,9 @@ def _snap(surface: Surface, turn: Turn, tolerance: float) -> Turn:
         options.insert(0, np.sign(turn.axis[near]) * np.eye(3)[near])
     for axis in options:
         for point in (np.zeros(3), turn.point - axis * (axis @ turn.point)):
-            found = _turn(surface, axis, point, turn.fold)
-            if found.deviation <= turn.deviation + 0.05 * tolerance:
+            limit = turn.deviation + 0.05 * tolerance
+            found = _turn(surface, axis, point, turn.fold, limit)
+            if found.deviation <= limit:
                 return found
     return turn
 
@@ -231,10 +233,7 @@ def _all_folds(surface: Surface, turn: Turn, tolerance: float) -> list[Turn]:
     for fold in range(2, MAX_FOLD + 1):
         if fold == turn.fold:
             continue
-        matrix = turn_matrix(turn.axis, turn.point, 2.0 * np.pi / fold)
-        if surface.deviation(matrix, surface.coarse) > tolerance:
-            continue
-        off = surface.deviation(matrix)
+        off = surface.deviation(turn_matrix(turn.axis, turn.point, 2.0 * np.pi / fold), tolerance)
         if off <= tolerance:
             worst = max(worst, off)
             result.append(Turn(turn.axis, turn.point, fold, off))
@@ -270,7 +269,7 @@ def _close(surface: Surface, turns: list[Turn], tolerance: float) -> tuple[np.nd
         if larger is None:
             continue
         middle = _common_point([*used, turn], surface.center)
-        distances = np.array([surface.deviation(_about(rotation, middle)) for rotation in larger])
+        distances = np.array([surface.deviation(_about(rotation, middle), tolerance) for rotation in larger])
         if distances.max() <= tolerance:
             group, offs, center = larger, distances, middle
             used.append(turn)

@@ -57,11 +57,15 @@ class Surface:
         aside = np.sqrt(np.maximum(distance**2 - along**2, 0.0))
         return np.hypot(along, np.maximum(aside - self.gap, 0.0)).min(axis=1)
 
-    def deviation(self, matrix: np.ndarray, queries: np.ndarray | None = None) -> float:
-        """Hausdorff distance between the surface and itself, moved by a rigid 4 x 4 matrix [m], from all queries or those given."""
-        points = self.queries if queries is None else queries
+    def deviation(self, matrix: np.ndarray, limit: float = np.inf) -> float:
+        """Hausdorff distance between the surface and itself, moved by a rigid 4 x 4 matrix [m]; beyond the limit, a lower bound of it."""
         rotation, translation = matrix[:3, :3], matrix[:3, 3]
-        return float(max(self.distances(points @ rotation.T + translation).max(), self.distances((points - translation) @ rotation).max()))
+        off = 0.0
+        for points in (self.coarse, self.queries) if limit < np.inf else (self.queries,):
+            off = max(self.distances(points @ rotation.T + translation).max(), self.distances((points - translation) @ rotation).max())
+            if off > limit:
+                break
+        return float(off)
 
     def mean_distances(self, rotations: np.ndarray) -> np.ndarray:
         """Mean distances (N) of a coarse sample to another one, when rotated about the centroid by (N, 3, 3) [m]."""

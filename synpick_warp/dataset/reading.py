@@ -38,7 +38,6 @@ from synpick_warp.errors import DatasetError, format_value
 from synpick_warp.exporters.formats import PartFiles, part_files
 from synpick_warp.exporters.trajectory.arrays import EPISODE_GROUPS, EPISODES, STORE
 from synpick_warp.system.inputs.json import decode_json
-from synpick_warp.system.inputs.paths import path_inside
 
 if TYPE_CHECKING:
     import numpy as np
@@ -305,9 +304,7 @@ class DataSet(Mapping[int, Episode]):
         """
         if not (self.folder / f"{entry}.json").exists():
             return frozenset()
-        source = f"{self.folder / entry}.sha256"
-        names = (name for name in read_checksums(self.folder, entry) if name.startswith(f"{STORE}/"))
-        return frozenset(path_inside(self.folder, name, source, DatasetError) for name in names)
+        return frozenset(self.folder / name for name in read_checksums(self.folder, entry) if name.startswith(f"{STORE}/"))
 
     @cached_property
     def models_info(self) -> dict[int, dict[str, Any]]:

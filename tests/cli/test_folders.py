@@ -18,6 +18,7 @@ from synpick_warp.configs.schema import Config
 from synpick_warp.configs.write import config_to_toml
 from synpick_warp.dataset.commit.manifest import encode_manifest, make_manifest
 from synpick_warp.errors import OutputError
+from tests.builders import mistake
 from tests.harness.scripted_bake import bake, settings
 
 
@@ -122,7 +123,7 @@ def test_what_only_looks_like_a_folder_of_ours_is_left_alone(here):
     assert choose_output(config)[0] == Path("synpick-data-5")
 
 
-def test_a_bake_within_a_data_set_needs_a_folder(here, monkeypatch, capsys):
+def test_a_bake_within_a_data_set_needs_a_folder(here, monkeypatch):
     monkeypatch.chdir(start("DATA", load_config("smoke")) / "manifest")
     with pytest.raises(OutputError, match=r"the current folder is in the data set .*DATA; name the new data set's folder with --out"):
         choose_output(load_config("smoke"))
@@ -136,12 +137,11 @@ COMMANDS = ["preview", "explain", "stats", "report", "validate --fast", "verify"
 
 
 @pytest.mark.parametrize("command", [*COMMANDS, "estimate --method single"])
-def test_without_a_data_set_the_commands_say_what_to_do(here, capsys, command):
+def test_without_a_data_set_the_commands_say_what_to_do(here, command):
     (here / "other").mkdir()
     (here / "manifest.json").write_text("{}")
-    assert main(command.split()) == 2
-    (line,) = capsys.readouterr().err.splitlines()
-    assert line.startswith("synpick-warp: error: there is no data set in the current folder; name one (synpick-warp ")
+    line = mistake(*command.split())
+    assert line.startswith("there is no data set in the current folder; name one (synpick-warp ")
     assert line.endswith(" DIR), or make one first (synpick-warp bake)")
 
 
@@ -204,7 +204,7 @@ OWN = ["manifest.json", "config.toml", "episodes.jsonl", "camera.json", "new.jso
 
 @pytest.mark.parametrize("foreign", [False, True])
 @pytest.mark.parametrize("name", OWN)
-def test_no_output_replaces_or_adds_a_file_of_a_data_set(made, here, capsys, name, foreign):
+def test_no_output_replaces_or_adds_a_file_of_a_data_set(made, here, name, foreign):
     """Not of the one that is read, and not of another one; nor of one of other programs."""
     if foreign:
         made = shutil.copytree(made, here / "foreign")
@@ -220,41 +220,38 @@ def test_no_output_replaces_or_adds_a_file_of_a_data_set(made, here, capsys, nam
         "estimate": ["estimate", "--data", str(made), "--method", "single"],
     }
     for command, arguments in commands.items():
-        assert main([*arguments, "--out", target]) == 2
-        (line,) = capsys.readouterr().err.splitlines()
+        line = mistake(*arguments, "--out", target)
         if target.endswith(suffixes.get(command, "")):
-            assert line == f"synpick-warp: error: --out is {target}, among the files of the data set {made}; name a file outside of it"
+            assert line == f"--out is {target}, among the files of the data set {made}; name a file outside of it"
     if not foreign:
-        assert main(["bake", "--config", "smoke", "--out", str(here / "new"), "--device", "cpu", "--profile-out", target]) == 2
-        assert "--profile-out is " in capsys.readouterr().err
+        arguments = ("--config", "smoke", "--out", here / "new", "--device", "cpu", "--profile-out", target)
+        assert "--profile-out is " in mistake("bake", *arguments)
     assert {path: path.read_bytes() for path in made.iterdir() if path.is_file()} == before
 
 
-def test_no_folder_is_made_in_a_data_set(made, here, capsys):
+def test_no_folder_is_made_in_a_data_set(made, here):
     """Neither of pictures, nor of another data set."""
     names = sorted(made.rglob("*"))
     for name in ("plots", "plots.png", "train/plots"):
         for arguments in (["eval", "--data", str(made), "--results", "a.csv", "--plots"], ["merge", str(here / "other"), "--out"]):
             if arguments[0] == "merge" and not (here / "other").exists():
                 shutil.copytree(made, here / "other")
-            assert main([*arguments, str(made / name)]) == 2
             said = f"{arguments[-1]} is {made / name}, among the files of the data set {made}; name a folder outside of it"
-            assert capsys.readouterr().err == f"synpick-warp: error: {said}\n"
+            assert mistake(*arguments, made / name) == said
     assert sorted(made.rglob("*")) == names
 
 
-def test_a_picture_in_the_folder_of_a_data_set_is_a_file_of_nobody(made, capsys):
+def test_a_picture_in_the_folder_of_a_data_set_is_a_file_of_nobody(made):
     assert main(["preview", str(made), "--out", str(made / "contact-sheet.png"), "--views", "1"]) == 0
     assert main(["preview", str(made), "--out", str(made / "contact-sheet.png"), "--views", "1"]) == 0
     assert main(["verify", str(made)]) == 0
     (made / "contact-sheet.png").unlink()
 
 
-def test_an_output_through_a_link_or_onto_an_input_is_found(made, here, capsys):
+def test_an_output_through_a_link_or_onto_an_input_is_found(made, here):
     (here / "link").symlink_to(made)
     (here / "a.csv").write_text("scene_id,im_id,obj_id,score,R,t,time\n")
     (here / "targets.json").write_text(json.dumps([]))
     arguments = ["eval", "--data", str(made), "--results", "a.csv", "--targets", "targets.json", "--out"]
     for out, said in (("link/manifest.json", "among the files"), ("a.csv", "which the command reads"), ("targets.json", "which the com")):
-        assert main([*arguments, out]) == 2
-        assert said in capsys.readouterr().err
+        assert said in mistake(*arguments, out)

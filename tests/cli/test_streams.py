@@ -109,6 +109,7 @@ sys.exit(code)
 """
 
 
+@pytest.mark.slow
 def test_a_bake_on_a_full_device_stops_in_its_first_progress_line(tmp_path):
     """Fault 10: nothing is left behind. By then, all is imported: neither evaluation nor estimation."""
     out, modules = tmp_path / "deep" / "set", tmp_path / "modules"

@@ -83,7 +83,7 @@ def changes(server, whole, tmp_path_factory) -> int:
     return int((folder / "count").read_text())
 
 
-@pytest.mark.parametrize("share", [0.0, 0.02, 0.4, 0.97, 0.995])
+@pytest.mark.parametrize("share", [0.4, *(pytest.param(share, marks=pytest.mark.slow) for share in (0.0, 0.02, 0.97, 0.995))])
 def test_killed_before_some_change_of_its_folder_a_bake_goes_on(server, expected, changes, tmp_path, share):
     """Killed, resumed, killed again and resumed. One process writes all files (`alone`), so that the places are known."""
     out = tmp_path / "set"
@@ -103,6 +103,7 @@ def test_a_finished_bake_killed_before_it_removed_its_partial_files(server, expe
     assert digests(out) == expected
 
 
+@pytest.mark.slow
 def test_a_shard_removes_the_uncommitted_files_of_others(server, whole, tmp_path):
     """A whole bake was killed when the shard's episodes were committed, and files of another one were in place without an entry."""
     out = tmp_path / "set"
@@ -210,6 +211,7 @@ def test_shares_are_joined_to_what_one_bake_makes(server, expected, tmp_path):
     assert verify(tmp_path / "set") == ("", EPISODES, len(expected) - FILES_OF_THE_MANIFEST, True)
 
 
+@pytest.mark.slow
 def test_a_part_that_lacks_episodes_is_joined_and_goes_on(server, expected, tmp_path):
     assert server.bake(tmp_path / "part", arguments=["--shard", "1/2"]) == 0
     merged = merge([tmp_path / "part"], tmp_path / "set")
@@ -227,7 +229,7 @@ def test_parts_that_do_not_fit(server, whole, tmp_path):
     assert not (tmp_path / "set").exists()
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("number", [signal.SIGINT, pytest.param(signal.SIGTERM, marks=pytest.mark.slow)])
 def test_stopped_once_it_finishes_what_is_whole(server, expected, tmp_path, number):
     out, log = tmp_path / "set", tmp_path / "log"
     process = server.start(out, log=str(log), settings={"bake.worlds": 1})
@@ -246,6 +248,7 @@ def test_stopped_once_it_finishes_what_is_whole(server, expected, tmp_path, numb
     assert digests(out) == expected
 
 
+@pytest.mark.slow
 def test_stopped_twice_it_ends_at_once(server, expected, tmp_path):
     out, log = tmp_path / "set", tmp_path / "log"
     process = server.start(out, log=str(log))

@@ -33,6 +33,7 @@ def test_scenes_are_whole_after_kills(server, once, tmp_path):
     assert digests(out) == digests(once)
 
 
+@pytest.mark.slow
 def test_parts_are_merged(server, once, tmp_path):
     parts = [tmp_path / str(part) for part in range(2)]
     for part, folder in enumerate(parts):

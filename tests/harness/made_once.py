@@ -1,9 +1,10 @@
-"""Memory of what takes most of the time to build small worlds, and follows from its arguments alone."""
+"""Memory of what takes most of the time to build small worlds, and follows from its arguments alone; and no wait for disks."""
 
 from __future__ import annotations
 
 import functools
 import hashlib
+import os
 import pickle
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -11,6 +12,10 @@ from contextlib import contextmanager
 import pytest
 from newton._src.geometry import narrow_phase
 
+from synpick_warp.apps.conversion import found, run
+from synpick_warp.dataset.commit import merge
+from synpick_warp.exporters.writing.pool import WriterPool
+from synpick_warp.factory import pipeline
 from synpick_warp.stages.render import scene
 
 MOST_MAPS = 50
@@ -21,7 +26,10 @@ KERNELS = ("create_narrow_phase_kernel_gjk_mpr", "create_narrow_phase_primitive_
 
 @contextmanager
 def made_once() -> Iterator[None]:
-    """Tables of environment maps, and Newton's kernels of the narrow phase, are made once a process and its forks."""
+    """Tables of environment maps, and Newton's kernels of the narrow phase, are made once a process and its forks.
+
+    Files are not synchronized with the disk, as no test cuts the power: killed processes leave what they wrote.
+    """
     tables, make = {}, scene.precompute_environment
 
     def remember(*arguments: object) -> object:
@@ -36,4 +44,18 @@ def made_once() -> Iterator[None]:
         patch.setattr(scene, "precompute_environment", remember)
         for name in KERNELS:
             patch.setattr(narrow_phase, name, functools.cache(getattr(narrow_phase, name)))
+        patch.setattr(os, "fsync", lambda handle: None)
+        yield
+
+
+@contextmanager
+def written_here() -> Iterator[None]:
+    """Bakes, conversions and merges with one writer write in their own process: another takes longer to start than to write a small set."""
+
+    def pool(processes: int, *arguments: int) -> WriterPool:
+        return WriterPool(processes if processes > 1 else 0, *arguments)
+
+    with pytest.MonkeyPatch.context() as patch:
+        for module in (pipeline, run, found, merge):
+            patch.setattr(module, "WriterPool", pool)
         yield

@@ -5,6 +5,8 @@ from __future__ import annotations
 import subprocess
 import sys
 
+import pytest
+
 SHARED_MODULES = """
 from warp._src import context
 from synpick_warp.factory import assembly
@@ -15,6 +17,7 @@ for name, module in context.user_modules.items():
 """
 
 
+@pytest.mark.slow
 def test_no_two_kernels_of_newton_share_a_module():
     """In a process of its own: what others have imported before decides nothing."""
     assert subprocess.run([sys.executable, "-c", SHARED_MODULES], check=True, capture_output=True, text=True).stdout == ""

@@ -192,7 +192,7 @@ def test_devices_that_do_not_exist_are_one_line(capsys):
     assert "cuda:98" in capsys.readouterr().err.splitlines()[-1]
 
 
-@pytest.mark.parametrize("part", ["steady", "whole"])
+@pytest.mark.parametrize("part", ["steady", pytest.param("whole", marks=pytest.mark.slow)])
 def test_damage_ends_a_bake_with_one_line(monkeypatch, capsys, part):
     monkeypatch.setattr(steady.Cleaner, "poll", lambda self: Tally(problem="a file is missing"))
     assert bench.main([*TINY, "--parts", part, "--seconds", "60"]) == 2
@@ -292,6 +292,7 @@ def test_the_setup_names_what_determines_the_worlds(arguments, expected):
     assert bench._describe_setup(config.bake.worlds, config.cameras, options) == f"{expected}, 3 cameras, 1920x1080"
 
 
+@pytest.mark.slow
 def test_trajectories_are_baked_without_rendering_views(tmp_path, monkeypatch):
     rendered = mock.Mock(side_effect=AssertionError("a view was rendered"))
     monkeypatch.setattr(Renderer, "render", rendered)
@@ -330,6 +331,7 @@ def test_more_cameras_are_turned_about_the_vertical():
     assert varied.cameras.ups == ((0.0, 0.0, 1.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 
 
+@pytest.mark.slow
 def test_growth_has_rows_of_all_factors(tmp_path, monkeypatch):
     monkeypatch.setattr(growth, "DROP_TICKS", 1)
     monkeypatch.setattr(growth, "BURST", 1)

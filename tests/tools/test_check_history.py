@@ -54,6 +54,7 @@ def test_of_programs_docstrings_and_comments_are_read():
     assert kinds('name = "2026-11-24"  # 2026-11-25\n', "a.toml") == [(1, "date")]
 
 
+@pytest.mark.slow  # `make checks` finds it, too.
 def test_the_project_tells_no_history():
     found = [f"{finding.path}:{finding.line}: {finding.text}" for path in documents() for finding in find_history(path, path.read_text())]
     assert found == []

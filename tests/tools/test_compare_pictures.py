@@ -74,6 +74,7 @@ def test_counts_and_boxes_are_compared_value_by_value():
     assert values(tool.compare(FAST, "boxes", a, b)) == pytest.approx((100 / 48, 2 / 48, 2.0, 100 / 48))
 
 
+@pytest.mark.slow
 def test_a_device_equals_itself(tmp_path):
     file = tmp_path / "numbers.json"
     options = ["--devices", "cpu,cpu", "--scenes", "1", "--size", "16x9", "--samples", "2", "--json", str(file), *assignments(ONE_OBJECT)]

@@ -62,6 +62,7 @@ def test_a_report_of_one_pile_has_all_rows_and_images(tmp_path):
     assert cv2.imread(str(sheet)).shape[1] == 3 * (32 * 20 + render_sheet.GAP)
 
 
+@pytest.mark.slow
 def test_a_second_reference_measures_noise(tmp_path, monkeypatch):
     file = tmp_path / "numbers.json"
     for name in ("measure_furnaces", "measure_planes"):
@@ -110,6 +111,7 @@ def test_a_bad_size_or_setting_is_an_error(capsys):
     assert capsys.readouterr().err.count("reports.render: ") == 4
 
 
+@pytest.mark.slow
 def test_a_report_of_a_sequence_compares_its_frames_with_references(tmp_path, capsys):
     """A bound of 35 dB does not hold for tiny images of few paths: exit code 1."""
     file, sheet = tmp_path / "numbers.json", tmp_path / "sheet.png"

@@ -12,6 +12,7 @@ is written after it and commits them. Nothing here depends on the machine, the t
 from __future__ import annotations
 
 import dataclasses
+import functools
 import hashlib
 import importlib.metadata
 import json
@@ -163,6 +164,7 @@ def fixed_settings(config: Config) -> dict[str, Any]:
     return settings
 
 
+@functools.cache
 def _version(name: str) -> str:
     """Version of an installed package; empty: not installed."""
     try:

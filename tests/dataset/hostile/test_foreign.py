@@ -20,7 +20,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from synpick_warp.apps.conversion import run as conversion
 from synpick_warp.configs.splits import DataLayout
 from synpick_warp.dataset.commit.file_names import check_file_names, describe_strays
 from synpick_warp.dataset.commit.manifest import CONSTANTS, episode_entry, read_checksums
@@ -31,7 +30,6 @@ from synpick_warp.exporters.bop.shards.tar_files import list_keys
 from synpick_warp.exporters.lerobot.exporter import LerobotExporter
 from synpick_warp.exporters.lerobot.layout import ROW
 from synpick_warp.exporters.writing import files
-from synpick_warp.exporters.writing.pool import WriterPool
 from tests.builders import once, run
 from tests.harness.scripted_bake import bake, settings, snapshot
 
@@ -63,13 +61,12 @@ def narrow(tmp_path_factory) -> Path:
 
 
 @pytest.fixture(autouse=True)
-def guarded(inline, monkeypatch) -> Iterator[None]:
-    """Conversions write in this process, too; what hangs is ended."""
+def guarded(inline) -> Iterator[None]:
+    """What hangs is ended."""
 
     def end(*_: object) -> None:
         raise TimeoutError("it hangs")
 
-    monkeypatch.setattr(conversion, "WriterPool", lambda _, size, handle: WriterPool(0, size, handle))
     before = signal.signal(signal.SIGALRM, end)
     signal.alarm(HANG)
     yield
