@@ -133,7 +133,7 @@ def align_cups_kernel(
     for candidate in range(YAWS + 1):
         yaw = yaw_inout[world]
         if candidate > 0:
-            yaw = TAU * float(candidate - 1) / float(YAWS)
+            yaw = TAU * float(candidate - 1) / float(YAWS) - wp.PI
         frame = head_frame(normal, yaw)
         # Sine of the angle between axis and normal.
         deviation = wp.abs(wp.dot(frame.across, normal))

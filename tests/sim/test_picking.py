@@ -85,17 +85,6 @@ def test_the_seal_bears_the_weight_at_the_end_of_the_lift(emptied):
             assert row.column("hits")[0] == 10
 
 
-def test_four_cups_share_a_box(device):
-    cups = [[0.05, 0.04], [-0.05, 0.04], [-0.05, -0.04], [0.05, -0.04]]
-    objects = catalog(((0.2, 0.16, 0.05),))
-    array = {"gripper__kind": "suction_array", "gripper__cups": cups, "gripper__cup_width": 0.036}
-    reports = run(picking(settings(arrangement__max_objects=1, **SHORT, **array), objects, device))
-    (end,) = [index for index, row in enumerate(reports) if row.column("outcome")[0]]
-    names = ("outcome", "hits", "sealed", "attached")
-    assert [int(reports[end].column(name)[0]) for name in names] == [Outcome.TARGET_PICKED, 40, 0b1111, 1]
-    assert reports[end - 1].measure("peak_force")[0] == pytest.approx(objects.entries[0].mass * GRAVITY / 4, rel=0.1)
-
-
 def test_the_first_two_frames_show_the_same_pile(emptied):
     """Looking takes no time, and the gripper that appears touches nothing."""
     live = [row for row in emptied[0] if row.column("live")[0]]
