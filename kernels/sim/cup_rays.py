@@ -106,6 +106,34 @@ def has_bit(bits: int, index: int) -> bool:
     return (bits >> index) & 1 != 0
 
 
+@wp.func
+def first_instance(
+    start: wp.vec3,
+    direction: wp.vec3,
+    layout: LayoutData,
+    suction: SuctionData,
+    surface: SurfaceData,
+    world: int,
+    catalog_index: wp.array2d[int],  # (world, instance)
+    body_slot: wp.array2d[int],  # (world, instance)
+    body_q: wp.array[wp.transform],  # (body) [m]
+) -> int:
+    """Instance that a ray hits first within reach, the first of several at the same distance; -1: none."""
+    nearest = float(MISS)
+    hit = int(-1)
+    for instance in range(layout.instances):
+        index = catalog_index[world, instance]
+        if index >= 0:
+            pose = body_q[world * layout.bodies + layout.gripper_bodies + body_slot[world, instance]]
+            # Bounding-sphere test: no point of the ray is farther from its start than its reach.
+            if wp.length(wp.transform_get_translation(pose) - start) <= surface.radius[index] + suction.reach:
+                distance = cast_ray(start, direction, suction.reach, pose, index, surface)
+                if distance >= 0.0 and (nearest < 0.0 or distance < nearest):
+                    nearest = distance
+                    hit = instance
+    return hit
+
+
 @wp.kernel
 def count_seal_rays_kernel(
     # Scene:
@@ -148,18 +176,7 @@ def count_seal_rays_kernel(
         hits = int(0)
         for ray in range(suction.rays):
             start = wp.transform_point(tcp_in_world, ray_start(ray, suction))
-            nearest = float(MISS)
-            hit = int(-1)
-            for instance in range(layout.instances):
-                index = catalog_index[world, instance]
-                if index >= 0:
-                    pose = body_q[body + layout.gripper_bodies + body_slot[world, instance]]
-                    # Bounding-sphere test: no point of the ray is farther from its start than its reach.
-                    if wp.length(wp.transform_get_translation(pose) - start) <= surface.radius[index] + suction.reach:
-                        distance = cast_ray(start, direction, suction.reach, pose, index, surface)
-                        if distance >= 0.0 and (nearest < 0.0 or distance < nearest):
-                            nearest = distance
-                            hit = instance
+            hit = first_instance(start, direction, layout, suction, surface, world, catalog_index, body_slot, body_q)
             if hit >= 0:
                 hits += 1
                 engaged = engaged | (wp.uint32(1) << wp.uint32(hit))

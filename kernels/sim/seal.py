@@ -1,4 +1,4 @@
-"""Suction seals: breakable implicit spring-dampers between cups and the attached objects, which replace contacts between the two.
+"""Suction seals: breakable implicit spring-dampers between cups and the attached objects.
 
 A cup has a seal with each object that it holds. The seals of an object act on two rigid bodies: together they are one spring-damper at the
 middle of their cups, whose resistance to rotation grows with the distances of the cups from it. It is solved as one, then shared out.
@@ -19,9 +19,6 @@ from synpick_warp.kernels.sim.cup_rays import CUP, has_bit, tcp_pose
 from synpick_warp.kernels.structs import TILT, LayoutData, SuctionData
 
 wp.set_module_options({"enable_backward": False})
-
-# Gap of a contact that must not act [m]; stages.sim.physics makes the solver skip contacts with far smaller gaps.
-APART = wp.constant(1.0)
 
 
 @wp.struct
@@ -67,6 +64,20 @@ class Wrench:
     """[N]"""
     torque: wp.vec3
     """[N·m]"""
+
+
+@wp.struct
+class SolvedSeals:
+    """Wrench of an object's seals at the middle of their cups, and what it takes to share it out."""
+
+    whole: Wrench
+    """Of all seals, on the object."""
+    grip_rotation: wp.quat
+    """From the grip frame to the world."""
+    object_arm: wp.vec3
+    """From the object's centre of mass to the middle of the cups [m]."""
+    spin: wp.vec3
+    """Angular velocity of the head relative to the object at the end of the step [rad/s]."""
 
 
 @wp.struct
@@ -290,14 +301,55 @@ def pull_gripper(force: wp.vec3, torque: wp.vec3, arm: wp.vec3, wrist_axis: wp.v
 
 
 @wp.func
+def solve_seals(
+    held: int,
+    objects: int,
+    tcp: TcpMotion,
+    object_in_world: wp.transform,
+    velocity: wp.spatial_vector,
+    com: wp.vec3,
+    inverse_mass: float,
+    inverse_inertia: wp.mat33,
+    object_in_tcp: wp.transform,
+    suction: SuctionData,
+) -> SolvedSeals:
+    """Wrench of an object's seals in this step.
+
+    Args:
+        held: Cups that hold it, as bits.
+        objects: Number of objects on the gripper.
+        tcp: Motion at the middle of these cups.
+        object_in_world: Pose of the object [m].
+        velocity: Of the object [m/s, rad/s].
+        com: Its centre of mass in its frame [m].
+        inverse_mass: Its inverse mass [1/kg].
+        inverse_inertia: Its inverse inertia, in its axes [1/(kg·m²)].
+        object_in_tcp: Its pose in the tool's TCP frame at rest [m].
+        suction: Cups, stiffness and damping.
+    """
+    result = SolvedSeals()
+    middle = middle_of_cups(held, suction)
+    grip_in_world = object_in_world * wp.transform_inverse(object_in_tcp)
+    result.grip_rotation = wp.transform_get_rotation(grip_in_world)
+    result.object_arm = tcp.position - wp.transform_point(object_in_world, com)
+    rotation = wp.transform_get_rotation(object_in_world)
+    of_object = object_inverse_mass(rotation, inverse_mass, inverse_inertia, result.object_arm)
+    both = add_inverse_masses(of_object, gripper_inverse_mass(suction, tcp.wrist_axis, tcp.wrist_arm, objects))
+    slip = tcp.velocity - wp.spatial_top(velocity) - wp.cross(wp.spatial_bottom(velocity), result.object_arm)
+    spin = tcp.angular_velocity - wp.spatial_bottom(velocity)
+    offset = tcp.position - wp.transform_point(grip_in_world, wp.vec3(middle[0], middle[1], 0.0))
+    error = rotation_error(tcp.rotation, result.grip_rotation, suction)
+    spread = spread_of_cups(held, middle, tcp.rotation, result.grip_rotation, suction)
+    result.whole = seal_wrench(offset, error, spread, count_seals(held, suction), slip, spin, both, suction)
+    result.spin = spin - suction.step * (wp.transpose(both.mixed) * result.whole.force + both.angular * result.whole.torque)
+    return result
+
+
+@wp.func
 def share_wrench(
     held: int,
-    whole: Wrench,
+    solved: SolvedSeals,
     tcp: TcpMotion,
-    middle: wp.vec3,
-    grip_rotation: wp.quat,
-    object_arm: wp.vec3,
-    spin: wp.vec3,
     world: int,
     gripper_dof: int,
     suction: SuctionData,
@@ -307,25 +359,25 @@ def share_wrench(
 ) -> HeldObject:
     """Share the wrench of an object's seals out to its cups, and break those whose force exceeds the break force.
 
-    `held`, `middle`, `grip_rotation` and `spin` are those of `middle_of_cups`, `spread_of_cups` and `force_of_cup`; `object_arm` leads
-    from the object's centre of mass to the middle [m]. Adds the forces to `cup_force`, and those that hold on to the gripper's `joint_f`.
+    Adds the forces to `cup_force`, and those that hold on to the gripper's `joint_f`.
     """
+    middle = middle_of_cups(held, suction)
     seals = count_seals(held, suction)
     # What the forces of the cups do not explain of the torque is twist and swing of the seals, the same of each.
-    rest = whole.torque
+    rest = solved.whole.torque
     for cup in range(suction.cups):
         if has_bit(held, cup):
             arm = wp.quat_rotate(tcp.rotation, suction.place[cup] - middle)
-            grip_arm = wp.quat_rotate(grip_rotation, suction.place[cup] - middle)
-            rest -= wp.cross(arm, force_of_cup(whole, seals, arm, grip_arm, spin, suction))
+            grip_arm = wp.quat_rotate(solved.grip_rotation, suction.place[cup] - middle)
+            rest -= wp.cross(arm, force_of_cup(solved.whole, seals, arm, grip_arm, solved.spin, suction))
     torque = rest / float(seals)
     result = HeldObject()
     result.cups = held
     for cup in range(suction.cups):
         if has_bit(held, cup):
             arm = wp.quat_rotate(tcp.rotation, suction.place[cup] - middle)
-            grip_arm = wp.quat_rotate(grip_rotation, suction.place[cup] - middle)
-            force = force_of_cup(whole, seals, arm, grip_arm, spin, suction)
+            grip_arm = wp.quat_rotate(solved.grip_rotation, suction.place[cup] - middle)
+            force = force_of_cup(solved.whole, seals, arm, grip_arm, solved.spin, suction)
             borne = tension_and_shear(force, tcp.axis)
             result.peak_force = wp.max(result.peak_force, borne)
             cup_force[world, cup] = cup_force[world, cup] + borne
@@ -333,7 +385,7 @@ def share_wrench(
                 result.cups -= 1 << cup
             else:
                 result.force += force
-                result.torque += torque + wp.cross(object_arm + arm, force)
+                result.torque += torque + wp.cross(solved.object_arm + arm, force)
                 pull_gripper(force, torque, tcp.wrist_arm + arm, tcp.wrist_axis, joint_f, gripper_dof)
     return result
 
@@ -381,26 +433,20 @@ def apply_seal_forces_kernel(
         if held != 0:
             slot = body_slot[world, instance]
             body = world * layout.bodies + layout.gripper_bodies + slot
-            middle = middle_of_cups(held, suction)
-            tcp = tcp_motion(body_q[head], body_qd[head], body_com[head], middle)
-            grip_in_world = body_q[body] * wp.transform_inverse(object_in_tcp[world, instance])
-            grip_rotation = wp.transform_get_rotation(grip_in_world)
-            object_arm = tcp.position - wp.transform_point(body_q[body], body_com[body])
-            rotation = wp.transform_get_rotation(body_q[body])
-            object_inverse = object_inverse_mass(rotation, body_inv_mass[body], body_inv_inertia[body], object_arm)
-            inverse_mass = add_inverse_masses(object_inverse, gripper_inverse_mass(suction, tcp.wrist_axis, tcp.wrist_arm, objects))
-            object_spin = wp.spatial_bottom(body_qd[body])
-            slip = tcp.velocity - wp.spatial_top(body_qd[body]) - wp.cross(object_spin, object_arm)
-            spin = tcp.angular_velocity - object_spin
-            offset = tcp.position - wp.transform_point(grip_in_world, wp.vec3(middle[0], middle[1], 0.0))
-            error = rotation_error(tcp.rotation, grip_rotation, suction)
-            spread = spread_of_cups(held, middle, tcp.rotation, grip_rotation, suction)
-            whole = seal_wrench(offset, error, spread, count_seals(held, suction), slip, spin, inverse_mass, suction)
-            spin -= suction.step * (wp.transpose(inverse_mass.mixed) * whole.force + inverse_mass.angular * whole.torque)
-            shared = share_wrench(
-                held, whole, tcp, middle, grip_rotation, object_arm, spin, world, gripper_dof, suction,
-                break_force_inout, cup_force_inout, joint_f_inout,
-            )  # fmt: skip
+            tcp = tcp_motion(body_q[head], body_qd[head], body_com[head], middle_of_cups(held, suction))
+            seals = solve_seals(
+                held,
+                objects,
+                tcp,
+                body_q[body],
+                body_qd[body],
+                body_com[body],
+                body_inv_mass[body],
+                body_inv_inertia[body],
+                object_in_tcp[world, instance],
+                suction,
+            )
+            shared = share_wrench(held, seals, tcp, world, gripper_dof, suction, break_force_inout, cup_force_inout, joint_f_inout)
             seal_force_inout[world, instance] = shared.peak_force
             peak_force_inout[world] = wp.max(peak_force_inout[world], shared.peak_force)
             broken += held - shared.cups
@@ -412,52 +458,3 @@ def apply_seal_forces_kernel(
     if suction.common_valve != 0 and broken > 0:
         for cup in range(suction.cups):
             break_force_inout[world, cup] = suction.poor_force
-
-
-@wp.func
-def is_attached(layout: LayoutData, world: int, body: int, body_slot: wp.array2d[int], attached: wp.array2d[int]) -> bool:
-    """True if a seal holds the body, which must not be the gripper's."""
-    result = bool(False)
-    slot = body - world * layout.bodies - layout.gripper_bodies
-    for instance in range(layout.instances):
-        if attached[world, instance] != 0 and body_slot[world, instance] == slot:
-            result = True
-    return result
-
-
-@wp.kernel
-def ignore_attached_contacts_kernel(
-    # Scene:
-    layout: LayoutData,
-    shape_body: wp.array[int],  # (shape)
-    # State:
-    contact_count: wp.array[int],  # (one)
-    body_slot: wp.array2d[int],  # (world, instance)
-    attached: wp.array2d[int],  # (world, instance)
-    shape0: wp.array[int],  # (contact)
-    shape1: wp.array[int],  # (contact)
-    # Out:
-    margin_out: wp.array[float],  # (contact) [m]
-):
-    """Disable contacts between a gripper head and its attached objects, which would fight the seal: set their margin to -APART.
-
-    The solver makes no constraint rows for contacts that far apart. The collision pipeline writes all margins anew each time, after it has
-    stored what it matches the next step's contacts with. Disabling the shapes instead would put all such contacts of all worlds into one
-    pair of bodies, and the solver's time grows with the square of a pair's contacts. Launched over contact.
-    """
-    contact = wp.tid()
-    if contact >= contact_count[0] or shape0[contact] < 0 or shape1[contact] < 0:
-        return
-    a = shape_body[shape0[contact]]
-    b = shape_body[shape1[contact]]
-    if a < 0 or b < 0:
-        return
-    cup = a
-    other = b
-    if b % layout.bodies == CUP:
-        cup = b
-        other = a
-    if cup % layout.bodies != CUP:
-        return
-    if is_attached(layout, cup // layout.bodies, other, body_slot, attached):
-        margin_out[contact] = -APART

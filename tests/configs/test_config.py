@@ -231,9 +231,6 @@ def test_a_bad_value_in_the_file_is_reported_even_if_the_command_line_replaces_i
     assert " in " in message(write(tmp_path, "[bake]\nworlds = -1\n"), {"bake.worlds": 1})
 
 
-ARRAY = {"gripper.kind": "suction_array"}
-
-
 @pytest.mark.parametrize(
     ("overrides", "expected"),
     [
@@ -257,11 +254,6 @@ ARRAY = {"gripper.kind": "suction_array"}
         ({"pick.near_speed": 1.5}, r"pick.speed is 1.0 by default; allowed: at least pick.near_speed, 1.5 \[m/s\]"),
         ({"pick.lift_height": 0.1}, r"pick.lift_height is 0.1 on the command line; allowed: at least the inner height of the tote, 0.195"),
         ({"suction.radius": 0.022}, r"suction.radius is 0.022 on .*; allowed: at most half of gripper.cup_width, 0.021 \[m\]"),
-        ({"gripper.kind": "suction_array"}, r"gripper.cups is \[\] by default; allowed: 1 to 16 places \[x, y\]"),
-        ({"gripper.cups": [[0.0, 0.0]]}, r'gripper.cups is .*; allowed: none with gripper.kind "suction1"'),
-        (ARRAY | {"gripper.cups": [[0.0, 0.0], [0.03, 0.0]]}, r"gripper.cups is .*; allowed: cups that do not overlap: 0 and 1 are 0.03"),
-        (ARRAY | {"gripper.cups": [[0.0, 0.0], [0.3, 0.0]]}, r"gripper.cups is .*; allowed: within 0.155 m of the middle: the tool"),
-        (ARRAY | {"gripper.cups": [[0.05 * i - 0.4, 0.0] for i in range(17)]}, r"gripper.cups is .*; allowed: 1 to 16 places"),
         ({"suction.rays": 4, "suction.tolerated_misses": 4}, "suction.tolerated_misses is 4 on .*; allowed: less than suction.rays, 4: "),
         ({"suction.poor_force": 41}, r"suction.poor_force is 41.0 on the command line; allowed: at most suction.good_force, 40 \[N\]"),
         ({"bop.split": "train"}, 'bop.color_format is "jpg" by default; allowed: png with the split train: '),

@@ -7,6 +7,7 @@ import pytest
 
 from synpick_warp.configs.gripper import GRIPPERS
 from synpick_warp.configs.load import load_config
+from synpick_warp.errors import ConfigError
 from synpick_warp.scenes.assets.meshes import merge_positions, signed_volume
 from synpick_warp.scenes.grippers.registry import HEADS, make_head
 from synpick_warp.stages.sim.hold import HOLDS
@@ -46,3 +47,21 @@ def test_a_head_ends_in_the_lips_of_its_cups(row):
         x, y = place
         assert first_hit(mesh.vertices, mesh.faces, (x + 1e-4, y + 2e-4, -1.0), UP) > 1.0 + lip + 0.003
         assert felt(head.pieces, (x + 0.9 * radius, y + 1e-3, -1.0), UP) == pytest.approx(1.0 + lip, abs=1e-6)
+
+
+ARRAY = {"gripper.kind": "suction_array"}
+
+
+@pytest.mark.parametrize(
+    ("overrides", "expected"),
+    [
+        ({"gripper.kind": "suction_array"}, r"gripper.cups is \[\] by default; allowed: 1 to 16 places \[x, y\]"),
+        ({"gripper.cups": [[0.0, 0.0]]}, r'gripper.cups is .*; allowed: none with gripper.kind "suction1"'),
+        (ARRAY | {"gripper.cups": [[0.0, 0.0], [0.03, 0.0]]}, r"gripper.cups is .*; allowed: cups that do not overlap: 0 and 1 are 0.03"),
+        (ARRAY | {"gripper.cups": [[0.0, 0.0], [0.3, 0.0]]}, r"gripper.cups is .*; allowed: within 0.155 m of the middle: the tool"),
+        (ARRAY | {"gripper.cups": [[0.05 * i - 0.4, 0.0] for i in range(17)]}, r"gripper.cups is .*; allowed: 1 to 16 places"),
+    ],
+)
+def test_tools_that_cannot_be_are_refused(overrides, expected):
+    with pytest.raises(ConfigError, match=expected):
+        load_config("smoke", overrides)

@@ -1,4 +1,4 @@
-"""Suction: ray test, seal forces, and contacts that the seals replace. Launches kernels.sim.cup_rays and seal."""
+"""Suction: ray test, seal forces, and contacts that the seals replace. Launches kernels.sim.cup_rays, seal and seal_contacts."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 import warp as wp
 
 from synpick_warp.configs.gripper import Suction
-from synpick_warp.kernels.sim import cup_rays, seal
+from synpick_warp.kernels.sim import cup_rays, seal, seal_contacts
 from synpick_warp.scenes.collision.hull_planes import plane_table
 from synpick_warp.scenes.types import Catalog
 from synpick_warp.stages.constants import SceneData, fill
@@ -52,7 +52,7 @@ class SuctionHold:
         """Disable contacts between cups and their attached objects. Runs between collision detection and solver."""
         contacts = physics.contacts
         sources, margin = (scene, state, seals, contact_arrays(physics)), contacts.rigid_contact_margin0
-        launch(seal.ignore_attached_contacts_kernel, contacts.rigid_contact_max, *sources, margin_out=margin)
+        launch(seal_contacts.ignore_attached_contacts_kernel, contacts.rigid_contact_max, *sources, margin_out=margin)
 
 
 def _surface_data(use_mesh: bool, catalog: Catalog, meshes: wp.array, device: wp.Device) -> Any:
