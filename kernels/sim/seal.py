@@ -434,18 +434,9 @@ def apply_seal_forces_kernel(
             slot = body_slot[world, instance]
             body = world * layout.bodies + layout.gripper_bodies + slot
             tcp = tcp_motion(body_q[head], body_qd[head], body_com[head], middle_of_cups(held, suction))
-            seals = solve_seals(
-                held,
-                objects,
-                tcp,
-                body_q[body],
-                body_qd[body],
-                body_com[body],
-                body_inv_mass[body],
-                body_inv_inertia[body],
-                object_in_tcp[world, instance],
-                suction,
-            )
+            pose, grip = body_q[body], object_in_tcp[world, instance]
+            mass, inertia = body_inv_mass[body], body_inv_inertia[body]
+            seals = solve_seals(held, objects, tcp, pose, body_qd[body], body_com[body], mass, inertia, grip, suction)
             shared = share_wrench(held, seals, tcp, world, gripper_dof, suction, break_force_inout, cup_force_inout, joint_f_inout)
             seal_force_inout[world, instance] = shared.peak_force
             peak_force_inout[world] = wp.max(peak_force_inout[world], shared.peak_force)
