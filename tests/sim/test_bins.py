@@ -15,7 +15,6 @@ from synpick_warp.configs.bins import BinRow, Bins
 from synpick_warp.scenes.bin_meshes.reading import measure_bins
 from synpick_warp.scenes.bins import make_bins
 from synpick_warp.stages.sim import arrange, gripper
-from synpick_warp.stages.sim.physics import MIN_GPU_WORLDS
 from synpick_warp.stages.sim.simulate import Simulation
 from synpick_warp.stages.stream import read_tick
 from tests.twins import rng
@@ -158,11 +157,6 @@ def test_the_gripper_passes_over_dividers_and_nowhere_below_the_rim_through_them
     assert np.linalg.norm(np.diff(points, axis=0), axis=1).max() < 2.0 * 2e-3 + 1e-6
 
 
-def numbers_of_worlds(config) -> tuple[int, int]:
-    """Two numbers of worlds in which episodes must be equal; a bake on a GPU has no fewer than the first (`with_enough_worlds`)."""
-    return (MIN_GPU_WORLDS, 3 * MIN_GPU_WORLDS) if wp.get_device(config.bake.device).is_cuda else (1, 4)
-
-
 def first_frames(config, worlds: int) -> dict[int, tuple[int, np.ndarray, np.ndarray, np.ndarray]]:
     """Bin, its pose, and poses and catalog indices of the objects in the first frame of each episode."""
     config = dataclasses.replace(config, bake=dataclasses.replace(config.bake, worlds=worlds))
@@ -204,8 +198,7 @@ def test_piles_rest_within_meshes_and_sized_bins_in_any_number_of_worlds(tmp_pat
     rows = (*(BinRow(name=name, file=str(tmp_path / f"{name}.stl")) for name in meshes), ROWS[0])
     base = settings(bake__episodes=8, bake__mode="move", move__speed=10.0, **COARSE)
     config = dataclasses.replace(base, bins=dataclasses.replace(PLACES, kind="own"), **measure_bins(rows))
-    few, many = numbers_of_worlds(config)
-    found, bins, objects = first_frames(config, many), make_bins(config.cell.bins), catalog().entries
+    found, bins, objects = first_frames(config, 4), make_bins(config.cell.bins), catalog().entries
     assert len({chosen for chosen, *_ in found.values()}) >= 3
     for chosen, pose, poses, indices in found.values():
         assert len(poses) > 0
@@ -216,7 +209,7 @@ def test_piles_rest_within_meshes_and_sized_bins_in_any_number_of_worlds(tmp_pat
             assert (np.abs(local[:, :2]) < np.array(bins[chosen].sizes.opening) / 2 + 2e-3).all()
             assert (local[:, 2] > -2e-3).all()
             assert (local[:, 2] < 0.25).all()
-    assert_same_frames(found, first_frames(config, few))
+    assert_same_frames(found, first_frames(config, 1))
 
 
 def assert_same_frames(found, one) -> None:
@@ -233,8 +226,7 @@ def assert_same_frames(found, one) -> None:
 def test_piles_rest_in_or_on_the_bin_that_is_drawn_in_any_number_of_worlds(bins):
     base = settings(bake__episodes=4, bake__mode="move", move__speed=10.0, **COARSE)
     config = dataclasses.replace(base, bins=bins, bin=ROWS if bins.kind == "own" else ())
-    few, many = numbers_of_worlds(config)
-    sizes, found = config.cell.bins, first_frames(config, many)
+    sizes, found = config.cell.bins, first_frames(config, 4)
     assert {chosen for chosen, *_ in found.values()} == set(range(len(sizes)))
     for chosen, pose, objects, _ in found.values():
         local = Rotation.from_quat(pose[3:]).inv().apply(objects[:, :3] - pose[:3])
@@ -244,4 +236,4 @@ def test_piles_rest_in_or_on_the_bin_that_is_drawn_in_any_number_of_worlds(bins)
         # The smallest side of an object is 3 cm, and no object rests on the rim or a divider.
         assert (local[:, 2] > 0.014).all()
         assert (local[:, 2] < 0.15).all()
-    assert_same_frames(found, first_frames(config, few))
+    assert_same_frames(found, first_frames(config, 1))
