@@ -237,7 +237,7 @@ def turned(yaw: float, lean: float) -> tuple[float, ...]:
 
 
 def test_two_cups_turn_along_a_narrow_sheet(device):
-    """Also where it leans to its side by less than the free swing; by more, they meet the normal, and fit no longer."""
+    """Also where it leans to its side by less than the free swing; by more, they meet the normal, and do not fit."""
     poses = [turned(30, 0), turned(-65, 0), turned(30, 3), turned(120, 12)]
     toy = ToyScene([entry(sheet(0.2, 0.04))], [[(0, pose)] for pose in poses], (camera(320, 240, 1600.0, (0.0, 0.0, 2.0)),))
     planned = GraspHarness(device, toy).plan_grasps()
