@@ -9,9 +9,11 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 
 from synpick_warp.configs.bins import OWN, PALLET, TOTE, BinRow, Bins, Tote
-from synpick_warp.configs.camera_rules import Conflict, find_camera_conflicts
+from synpick_warp.configs.camera_rules import find_camera_conflicts
 from synpick_warp.configs.cell import BinSizes
+from synpick_warp.configs.fields import Conflict
 from synpick_warp.configs.fills import most_objects
+from synpick_warp.configs.gripper import find_gripper_conflicts
 from synpick_warp.configs.modes import bake_modes
 from synpick_warp.configs.objects import EMBEDDED
 from synpick_warp.configs.randomize import Randomize
@@ -24,13 +26,11 @@ from synpick_warp.configs.schema import (
     Config,
     DepthSensor,
     Effects,
-    Gripper,
     ObjectRow,
     Physics,
     Pick,
     Settle,
     Split,
-    Suction,
 )
 from synpick_warp.configs.splits import MAX_SHARD_SCENES, DataLayout
 from synpick_warp.errors import format_value
@@ -55,7 +55,8 @@ def find_conflicts(config: Config) -> Iterator[Conflict]:
         yield from find_camera_conflicts(config)
         yield from _pick(config.pick, bins)
     yield from _times(config.settle, config.physics)
-    yield from _suction(config.suction, config.gripper)
+    mouths = [mouth for one in bins if one.shell for mouth in one.mouths]
+    yield from find_gripper_conflicts(config.gripper, config.suction, mouths)
     yield from _layers(config.render.layers)
     yield from _ranges(config.effects, config.depth_sensor)
     yield from _jpeg_quality(config.effects, bop)
@@ -153,17 +154,6 @@ def _pick(pick: Pick, bins: Sequence[BinSizes]) -> Iterator[Conflict]:
         yield "pick.floor", f"at most the floor of the {bins[0].noun}, {bins[0].origin[2]:g}: what is below it is removed [m]"
     if pick.lift_height < height:
         yield "pick.lift_height", f"at least the inner height of the {bins[0].noun}, {height:g}: attached objects must leave it [m]"
-
-
-def _suction(suction: Suction, gripper: Gripper) -> Iterator[Conflict]:
-    """Yield conflicts of cup, rays and break forces."""
-    max_radius = gripper.cup_width / 2
-    if suction.radius > max_radius:
-        yield "suction.radius", f"at most half of gripper.cup_width, {max_radius:g} [m]"
-    if suction.tolerated_misses >= suction.rays:
-        yield "suction.tolerated_misses", f"less than suction.rays, {suction.rays}: one ray must hit"
-    if suction.poor_force > suction.good_force:
-        yield "suction.poor_force", f"at most suction.good_force, {suction.good_force:g} [N]"
 
 
 def _layers(layers: tuple[str, ...]) -> Iterator[Conflict]:

@@ -6,6 +6,8 @@ from collections.abc import Callable
 from dataclasses import field
 from typing import Any
 
+Conflict = tuple[str, str]
+"""Key of the wrong setting, and its allowed values."""
 PATH_RULE = "a path in a file of settings is relative to that file"
 """For messages about what is missing."""
 INT32_MAX = 2**31 - 1

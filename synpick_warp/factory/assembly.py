@@ -31,6 +31,7 @@ from synpick_warp.scenes.cameras import EpisodeCameras
 from synpick_warp.scenes.catalog import load_catalog
 from synpick_warp.scenes.fills import check_fill
 from synpick_warp.scenes.fixtures import make_fixtures
+from synpick_warp.scenes.grippers.registry import make_head
 from synpick_warp.scenes.looks import Looks, load_looks
 from synpick_warp.scenes.types import Camera, Catalog, EnvironmentMap
 from synpick_warp.stages.host_copies import host_images
@@ -91,7 +92,8 @@ class Stages:
     def make_log(self) -> AttemptLog:
         """Create an empty attempt log."""
         distractors = {body.obj_id: body.name for body in self.catalog.distractors}
-        return AttemptLog(self.config.suction, self.config.perception.resolution, self.object_ids, distractors)
+        cups = len(make_head(self.config.gripper).cups)
+        return AttemptLog(self.config.suction, self.config.perception.resolution, self.object_ids, distractors, cups)
 
 
 @dataclass(frozen=True, eq=False)

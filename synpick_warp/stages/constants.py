@@ -19,6 +19,8 @@ from synpick_warp.kernels.distributions import LookTable
 from synpick_warp.scenes import build
 from synpick_warp.scenes.bin_meshes.inside import HeightField
 from synpick_warp.scenes.fills import count_entries
+from synpick_warp.scenes.grippers.head import Head
+from synpick_warp.scenes.grippers.mechanism import CUP_ARMATURE
 from synpick_warp.scenes.looks import Looks
 from synpick_warp.scenes.types import Catalog, CatalogEntry
 from synpick_warp.stages.render.looks import build_look_table
@@ -94,7 +96,7 @@ def make_scene_data(config: schema.Config, catalog: Catalog, built: build.BuiltM
             tilt_limit=math.radians(gripper.tilt_limit),
         ),
         fill(structs.PerceptionData, config.perception),
-        _suction_data(config.suction, gripper, physics.step),
+        _suction_data(config.suction, gripper, built.head, physics.step, device),
         bin_data(config.cell.bins, config.bins, config.move, built.layout.parts, device, built.fields),
         build_look_table(Looks(config.randomize, (), ()), 0, device),
     )
@@ -269,14 +271,17 @@ def _move_data(move: schema.Move, gripper: schema.Gripper, physics: schema.Physi
     )
 
 
-def _suction_data(suction: schema.Suction, gripper: schema.Gripper, step: float) -> structs.SuctionData:
+def _suction_data(suction: schema.Suction, gripper: schema.Gripper, head: Head, step: float, device: wp.Device) -> structs.SuctionData:
     """Fill `SuctionData` from the settings; `step` is the time step [s]."""
+    places = [(x, y, -gripper.cup_length) for x, y in head.cups]
     return fill(
         structs.SuctionData,
         suction,
         gripper,
+        cups=len(places),
+        place=wp.array(np.array(places), dtype=wp.vec3, device=device),
+        common_valve=head.has_common_valve,
         swing_limit=math.radians(suction.swing_limit),
-        tcp_offset=gripper.cup_length,
-        tilt_inertia=build.CUP_ARMATURE + step * (gripper.tilt_damping + step * gripper.tilt_stiffness),
+        tilt_inertia=CUP_ARMATURE + step * (gripper.tilt_damping + step * gripper.tilt_stiffness),
         step=step,
     )

@@ -102,6 +102,8 @@ class KernelWorlds:
     """The last of the objects, without labels."""
     counts: Sequence[tuple[int, int]] = ()
     """Least and largest number of each object; empty: not set."""
+    cups: Sequence[tuple[float, float]] = ((0.0, 0.0),)
+    """Places of the cups in the plane of the TCP [m]."""
     parts: Sequence[tuple[int, int, bool]] = tuple((shape, 0, True) for shape in GUIDES)
 
     def __post_init__(self) -> None:
@@ -121,7 +123,7 @@ class KernelWorlds:
             fill(structs.MoveData, **(MOVE | self.move)),
             filled(structs.PickData(), self.pick),
             structs.PerceptionData(),
-            structs.SuctionData(),
+            filled(structs.SuctionData(), {"cups": len(self.cups), "place": self._places()}),
             self._bins(),
             build_look_table(Looks(self.randomize, (), ()), 0, self.device),
         )
@@ -132,6 +134,7 @@ class KernelWorlds:
             "instance": self.instances,
             "body": self.worlds * self.bodies,
             "waypoint": self.scene.move.waypoints,
+            "cup": len(self.cups),
         }
         self.state = allocate(WorldState, sizes, self.device)
         self.state.bin_pose.fill_(wp.transform_identity())
@@ -151,6 +154,10 @@ class KernelWorlds:
             shapes=SHAPES,
             finger_shape=10,
         )
+
+    def _places(self) -> wp.array:
+        tcp_offset = (MOVE | self.move)["tcp_offset"]
+        return wp.array([(x, y, -tcp_offset) for x, y in self.cups], dtype=wp.vec3, device=self.device)
 
     def _bins(self) -> Any:
         """Bins by `bins`."""

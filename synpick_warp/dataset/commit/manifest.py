@@ -27,6 +27,7 @@ import msgspec
 
 from synpick_warp import __version__
 from synpick_warp.configs.bins import Bins
+from synpick_warp.configs.gripper import EACH, SUCTION1
 from synpick_warp.configs.load import load_config, override_config, table_lists
 from synpick_warp.configs.objects import AUTO_UNIT, Objects
 from synpick_warp.configs.randomize import Randomize
@@ -92,6 +93,9 @@ YOUNGER_SETTINGS: dict[str, Any] = {
     "camera": [],
     "bin": [],
     "objects.embedded": Objects().embedded,
+    "gripper.kind": SUCTION1,
+    "gripper.cups": (),
+    "gripper.valve": EACH,
     "objects.unit": AUTO_UNIT,
     "objects.symmetries": Objects().symmetries,
     "objects.symmetry_tolerance": Objects().symmetry_tolerance,
