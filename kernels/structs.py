@@ -288,7 +288,7 @@ class PerceptionData:
 
 @wp.struct
 class SuctionData:
-    """Cups with their rays, and stiffness, damping, masses and break forces of the seals; see `configs.schema.Suction`."""
+    """Geometry of a cup's rays, and stiffness, damping, masses and break forces of the seals; see `configs.schema.Suction`."""
 
     rays: int
     """Rays on the ring."""
@@ -314,12 +314,8 @@ class SuctionData:
     """Angle of free swing [rad]."""
     swing_stiffness: float
     """Stiffness beyond it [N·m/rad]."""
-    cups: int
-    """Number of cups."""
-    place: wp.array[wp.vec3]
-    """(cup): centre of the lip, in the frame of the gripper head, whose origin is on the wrist axis [m]."""
-    common_valve: int
-    """1: all cups share one vacuum, which a leak at one spoils; 0: a valve each."""
+    tcp_offset: float
+    """Distance from wrist axis to TCP [m]."""
     finger_mass: float
     """Mass of the gripper shaft [kg]."""
     cup_mass: float
@@ -328,3 +324,18 @@ class SuctionData:
     """Effective inertia about the wrist axis in one step: armature + step · damping + step² · stiffness of the implicit drive [kg·m²]."""
     step: float
     """Time step [s]."""
+
+
+@wp.struct
+class CupData:
+    """Cups of the gripper head.
+
+    Apart from `SuctionData`: a struct with an array is read from memory where it is used, which changes what the compiler fuses there.
+    """
+
+    count: int
+    """Number of cups."""
+    place: wp.array[wp.vec3]
+    """(cup): centre of the lip, in the frame of the gripper head, whose origin is on the wrist axis [m]."""
+    common_valve: int
+    """1: all cups share one vacuum, which a leak at one spoils; 0: a valve each."""

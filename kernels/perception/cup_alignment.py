@@ -4,7 +4,7 @@ import warp as wp
 
 from synpick_warp.kernels.render.visibility.camera import NEAR_PLANE, ImageGrid, Views, in_image
 from synpick_warp.kernels.rng import TAU
-from synpick_warp.kernels.structs import PickData, SuctionData
+from synpick_warp.kernels.structs import CupData, PickData, SuctionData
 
 wp.set_module_options({"enable_backward": False})
 
@@ -75,6 +75,7 @@ def score_frame(
     frame: HeadFrame,
     origin: wp.vec3,
     suction: SuctionData,
+    cups: CupData,
     views: Views,
     grid: ImageGrid,
     view: int,
@@ -83,8 +84,8 @@ def score_frame(
 ) -> int:
     """WHOLE for each cup of which all points of the ring show the target, and 1 for each point that does of the wider rings."""
     score = int(0)
-    for cup in range(suction.cups):
-        center = origin + suction.place[cup][0] * frame.along + suction.place[cup][1] * frame.across
+    for cup in range(cups.count):
+        center = origin + cups.place[cup][0] * frame.along + cups.place[cup][1] * frame.across
         hits = int(0)
         for index in range(RIM):
             angle = TAU * float(index) / float(RIM)
@@ -103,6 +104,7 @@ def align_cups_kernel(
     # Scene:
     pick: PickData,
     suction: SuctionData,
+    cups: CupData,
     grid: ImageGrid,
     # In:
     views: Views,
@@ -138,7 +140,7 @@ def align_cups_kernel(
         # Sine of the angle between axis and normal.
         deviation = wp.abs(wp.dot(frame.across, normal))
         if candidate == 0 or (deviation <= wp.sin(suction.swing_limit) and wp.abs(frame.tilt) <= pick.tilt_limit):
-            score = score_frame(frame, point[world], suction, views, grid, view, component, label)
+            score = score_frame(frame, point[world], suction, cups, views, grid, view, component, label)
             if score > most or (score == most and deviation < least):
                 most = score
                 least = deviation

@@ -4,7 +4,7 @@ import warp as wp
 
 from synpick_warp.codes import Phase, Task
 from synpick_warp.kernels.rng import TAU
-from synpick_warp.kernels.structs import LayoutData, MoveData, PickData, SuctionData
+from synpick_warp.kernels.structs import CupData, LayoutData, PickData, SuctionData
 
 wp.set_module_options({"enable_backward": False})
 
@@ -140,6 +140,7 @@ def count_seal_rays_kernel(
     layout: LayoutData,
     pick: PickData,
     suction: SuctionData,
+    cups: CupData,
     surface: SurfaceData,
     # State:
     phase: wp.array[int],  # (world)
@@ -170,12 +171,13 @@ def count_seal_rays_kernel(
     engaged = wp.uint32(0)
     for instance in range(layout.instances):
         attached_inout[world, instance] = 0
-    for cup in range(suction.cups):
-        tcp_in_world = tcp_pose(body_q[body + CUP], suction.place[cup])
-        direction = wp.transform_vector(tcp_in_world, wp.vec3(0.0, 0.0, -1.0))
+    tcp_in_world = tcp_pose(body_q[body + CUP], wp.vec3(0.0, 0.0, -suction.tcp_offset))
+    direction = wp.transform_vector(tcp_in_world, wp.vec3(0.0, 0.0, -1.0))
+    for cup in range(cups.count):
+        place = cups.place[cup]
         hits = int(0)
         for ray in range(suction.rays):
-            start = wp.transform_point(tcp_in_world, ray_start(ray, suction))
+            start = wp.transform_point(tcp_in_world, ray_start(ray, suction) + wp.vec3(place[0], place[1], 0.0))
             hit = first_instance(start, direction, layout, suction, surface, world, catalog_index, body_slot, body_q)
             if hit >= 0:
                 hits += 1
@@ -184,9 +186,9 @@ def count_seal_rays_kernel(
         total += hits
         if suction.rays - hits <= suction.tolerated_misses:
             sealed = sealed | (1 << cup)
-    if suction.common_valve != 0 and sealed != (1 << suction.cups) - 1:
+    if cups.common_valve != 0 and sealed != (1 << cups.count) - 1:
         sealed = 0
-    for cup in range(suction.cups):
+    for cup in range(cups.count):
         break_force_out[world, cup] = wp.where(has_bit(sealed, cup), suction.good_force, suction.poor_force)
     hits_out[world] = wp.vec2i(total, sealed)
     engaged_bits_out[world] = engaged
@@ -197,7 +199,7 @@ def engage_seals_kernel(
     # Scene:
     layout: LayoutData,
     pick: PickData,
-    move: MoveData,
+    suction: SuctionData,
     # State:
     phase: wp.array[int],  # (world)
     task: wp.array[int],  # (world)
@@ -218,7 +220,7 @@ def engage_seals_kernel(
     if not suction_begins(phase[world], task[world], steps[world], pick) or attached[world, instance] == 0:
         return
     body = world * layout.bodies
-    tcp_in_world = tcp_pose(body_q[body + CUP], wp.vec3(0.0, 0.0, -move.tcp_offset))
+    tcp_in_world = tcp_pose(body_q[body + CUP], wp.vec3(0.0, 0.0, -suction.tcp_offset))
     object_in_world = body_q[body + layout.gripper_bodies + body_slot[world, instance]]
     object_in_tcp_out[world, instance] = wp.transform_inverse(tcp_in_world) * object_in_world
     seal_force_out[world, instance] = 0.0

@@ -25,17 +25,17 @@ def choose_compartment(bins: BinData, world: int, key: wp.uint64, instance: int)
 
 @wp.func
 def drop_pose(
-    key: wp.uint64, index: int, radius: float, height: float, spread: float, pose: wp.transform, center: wp.vec2, half: wp.vec2
+    key: wp.uint64, index: int, radius: float, height: float, spread: float, bins: BinData, world: int, center: wp.vec2, half: wp.vec2
 ) -> wp.transform:
     """Sample a drop pose at a height above the floor [m]: uniform rotation, position uniform over a fraction `spread` of an area.
 
-    The area, about `center` in the frame of the bin at `pose`, is reduced by the object's bounding radius [m]; `index` counts the drops of
+    The area, about `center` in the frame of the world's bin, is reduced by the object's bounding radius [m]; `index` counts the drops of
     the stream.
     """
     first = index * DROP_SAMPLES
     x = (2.0 * uniform(key, first) - 1.0) * spread * wp.max(0.0, half[0] - radius) + center[0]
     y = (2.0 * uniform(key, first + 1) - 1.0) * spread * wp.max(0.0, half[1] - radius) + center[1]
-    return pose * wp.transform(wp.vec3(x, y, height), uniform_rotation(key, first + 2))
+    return bins.pose[world] * wp.transform(wp.vec3(x, y, height), uniform_rotation(key, first + 2))
 
 
 @wp.func
@@ -213,7 +213,7 @@ def drop_objects_kernel(
             center = center + offset
             half = cell
             bottom = bins.rim_height[bins.chosen[world]] + float(layer) * pitch
-        pose = drop_pose(key, instance, radius, bottom + radius, drop.spread, bins.pose[world], center, half)
+        pose = drop_pose(key, instance, radius, bottom + radius, drop.spread, bins, world, center, half)
         write_body(joint_q_out, joint_qd_out, q, qd, pose)
         joint_f_out[qd + 2] = 0.0
         height += 2.0 * radius + drop.clearance

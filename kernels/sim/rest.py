@@ -162,7 +162,7 @@ def redrop_objects_kernel(
                 compartment = choose_compartment(bins, world, places, instance)
                 center = bins.center[compartment]
                 half = bins.half[compartment]
-                pose = drop_pose(key, progress[2], radius, height + radius, drop.spread, bins.pose[world], center, half)
+                pose = drop_pose(key, progress[2], radius, height + radius, drop.spread, bins, world, center, half)
                 height += 2.0 * radius + drop.clearance
                 q = world * layout.coords + layout.gripper_dofs + 7 * slot
                 write_body(joint_q_inout, joint_qd_inout, q, world * layout.dofs + layout.gripper_dofs + 6 * slot, pose)

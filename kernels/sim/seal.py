@@ -13,7 +13,7 @@ Frames; `X_in_Y` is the pose of frame X in frame Y, so that `Z_in_Y = X_in_Y * Z
 import warp as wp
 
 from synpick_warp.kernels.sim.cup_rays import CUP, tcp_pose
-from synpick_warp.kernels.structs import TILT, LayoutData, MoveData, SuctionData
+from synpick_warp.kernels.structs import TILT, LayoutData, SuctionData
 
 wp.set_module_options({"enable_backward": False})
 
@@ -71,26 +71,6 @@ class TcpMotion:
     """[m/s]"""
     angular_velocity: wp.vec3
     """[rad/s]"""
-
-
-@wp.struct
-class GripMotion:
-    """Motion of the TCP frame relative to the grip frame, at the TCP, in the world's axes."""
-
-    grip_rotation: wp.quat
-    """From the grip frame to the world."""
-    object_arm: wp.vec3
-    """From the object's centre of mass to the TCP [m]."""
-    offset: wp.vec3
-    """From the grip frame's origin to the TCP [m]."""
-    slip: wp.vec3
-    """Velocity of the TCP [m/s]."""
-    spin: wp.vec3
-    """Angular velocity [rad/s]."""
-    error: RotationError
-    """Rotation, with the elastic torque of one seal against it."""
-    inverse_mass: InverseMass
-    """Of the relative motion, at the TCP."""
 
 
 @wp.func
@@ -178,54 +158,14 @@ def rotation_error(cup: wp.quat, grip: wp.quat, suction: SuctionData) -> Rotatio
 
 
 @wp.func
-def grip_motion(
-    tcp: TcpMotion,
-    gripper_inverse: InverseMass,
-    grip_rotation: wp.quat,
-    grip_position: wp.vec3,
-    object_in_world: wp.transform,
-    velocity: wp.spatial_vector,
-    com: wp.vec3,
-    inverse_mass: float,
-    inverse_inertia: wp.mat33,
-    suction: SuctionData,
-) -> GripMotion:
-    """Motion of a TCP frame relative to an object's grip frame, with the inverse effective mass of both.
-
-    Args:
-        tcp: Motion of the TCP frame.
-        gripper_inverse: Inverse effective mass of the gripper there.
-        grip_rotation: From the grip frame to the world.
-        grip_position: Point of the object that coincides with the TCP at rest [m].
-        object_in_world: Pose of the object [m].
-        velocity: Of the object [m/s, rad/s].
-        com: Its centre of mass in its frame [m].
-        inverse_mass: Its inverse mass [1/kg].
-        inverse_inertia: Its inverse inertia, in its axes [1/(kg·m²)].
-        suction: Stiffness of a seal.
-    """
-    result = GripMotion()
-    result.grip_rotation = grip_rotation
-    result.object_arm = tcp.position - wp.transform_point(object_in_world, com)
-    rotation = wp.transform_get_rotation(object_in_world)
-    object_inverse = object_inverse_mass(rotation, inverse_mass, inverse_inertia, result.object_arm)
-    result.slip = tcp.velocity - wp.spatial_top(velocity) - wp.cross(wp.spatial_bottom(velocity), result.object_arm)
-    result.error = rotation_error(tcp.rotation, grip_rotation, suction)
-    result.offset = tcp.position - grip_position
-    result.spin = tcp.angular_velocity - wp.spatial_bottom(velocity)
-    result.inverse_mass = add_inverse_masses(object_inverse, gripper_inverse)
-    return result
-
-
-@wp.func
 def solve_wrench(
     force: wp.vec3, torque: wp.vec3, linear_gain: float, angular_gain: wp.mat33, inverse_mass: InverseMass, h: float
 ) -> Wrench:
     """Wrench w on the object of a spring-damper that is implicit in offset and velocity at the end of the step h [s].
 
     w = K (e + h u') + D u' with u' = u - h W w, hence (1 + h (h K + D) W) w = K e + (h K + D) u. Offset e and velocity u are those of the
-    tcp frame relative to the grip frame, W is the sum of both inverse effective masses. The arguments are K e + (h K + D) u as force [N] and
-    torque [N·m], and h K + D of both [N·s/m, N·m·s/rad]. Stable for every mass, stiffness and damping.
+    tcp frame relative to the grip frame, W is the sum of both inverse effective masses. The arguments are K e + (h K + D) u as force [N]
+    and torque [N·m], and h K + D of both [N·s/m, N·m·s/rad]. Stable for every mass, stiffness and damping.
     """
     one = wp.identity(n=3, dtype=float)
     # Blocks of the 6 x 6 system, solved for the torque first (Schur complement).
@@ -240,14 +180,16 @@ def solve_wrench(
 
 
 @wp.func
-def seal_wrench(motion: GripMotion, suction: SuctionData) -> Wrench:
-    """Wrench on the object of the seal of one cup."""
+def seal_wrench(
+    offset: wp.vec3, error: RotationError, velocity: wp.vec3, angular_velocity: wp.vec3, inverse_mass: InverseMass, suction: SuctionData
+) -> Wrench:
+    """Wrench of the seal of one cup on the object; offset and velocities are those of the tcp frame relative to the grip frame."""
     h = suction.step
     linear_gain = h * suction.stiffness + suction.damping
-    angular_gain = h * motion.error.stiffness + suction.twist_damping * wp.identity(n=3, dtype=float)
-    force = suction.stiffness * motion.offset + linear_gain * motion.slip
-    torque = motion.error.torque + angular_gain * motion.spin
-    return solve_wrench(force, torque, linear_gain, angular_gain, motion.inverse_mass, h)
+    angular_gain = h * error.stiffness + suction.twist_damping * wp.identity(n=3, dtype=float)
+    force = suction.stiffness * offset + linear_gain * velocity
+    torque = error.torque + angular_gain * angular_velocity
+    return solve_wrench(force, torque, linear_gain, angular_gain, inverse_mass, h)
 
 
 @wp.func
@@ -279,7 +221,6 @@ def pull_gripper(force: wp.vec3, torque: wp.vec3, arm: wp.vec3, wrist_axis: wp.v
 def apply_seal_forces_kernel(
     # Scene:
     layout: LayoutData,
-    move: MoveData,
     suction: SuctionData,
     body_com: wp.array[wp.vec3],  # (body) [m]
     body_inv_mass: wp.array[float],  # (body) [1/kg]
@@ -310,19 +251,24 @@ def apply_seal_forces_kernel(
     if seals == 0:
         return
     cup = world * layout.bodies + CUP
-    tcp = tcp_motion(body_q[cup], body_qd[cup], body_com[cup], wp.vec3(0.0, 0.0, -move.tcp_offset))
+    tcp = tcp_motion(body_q[cup], body_qd[cup], body_com[cup], wp.vec3(0.0, 0.0, -suction.tcp_offset))
     gripper_inverse = gripper_inverse_mass(suction, tcp.wrist_axis, tcp.wrist_arm, seals)
     gripper_dof = world * layout.dofs
     for instance in range(layout.instances):
         if attached_inout[world, instance] != 0:
             slot = body_slot[world, instance]
             body = world * layout.bodies + layout.gripper_bodies + slot
-            pose, velocity, com = body_q[body], body_qd[body], body_com[body]
-            mass, inertia = body_inv_mass[body], body_inv_inertia[body]
-            grip_in_world = pose * wp.transform_inverse(object_in_tcp[world, instance])
-            rotation, position = wp.transform_get_rotation(grip_in_world), wp.transform_get_translation(grip_in_world)
-            motion = grip_motion(tcp, gripper_inverse, rotation, position, pose, velocity, com, mass, inertia, suction)
-            wrench = seal_wrench(motion, suction)
+            grip_in_world = body_q[body] * wp.transform_inverse(object_in_tcp[world, instance])
+            object_arm = tcp.position - wp.transform_point(body_q[body], body_com[body])
+            rotation = wp.transform_get_rotation(body_q[body])
+            object_inverse = object_inverse_mass(rotation, body_inv_mass[body], body_inv_inertia[body], object_arm)
+            object_angular_velocity = wp.spatial_bottom(body_qd[body])
+            slip = tcp.velocity - wp.spatial_top(body_qd[body]) - wp.cross(object_angular_velocity, object_arm)
+            error = rotation_error(tcp.rotation, wp.transform_get_rotation(grip_in_world), suction)
+            offset = tcp.position - wp.transform_get_translation(grip_in_world)
+            angular_slip = tcp.angular_velocity - object_angular_velocity
+            inverse_mass = add_inverse_masses(object_inverse, gripper_inverse)
+            wrench = seal_wrench(offset, error, slip, angular_slip, inverse_mass, suction)
             force = tension_and_shear(wrench.force, tcp.axis)
             first_dof = gripper_dof + layout.gripper_dofs + 6 * slot
             seal_force_inout[world, instance] = force
@@ -332,5 +278,5 @@ def apply_seal_forces_kernel(
                 attached_inout[world, instance] = 0
                 push_object(wp.vec3(), wp.vec3(), joint_f_inout, first_dof)
             else:
-                push_object(wrench.force, wrench.torque + wp.cross(motion.object_arm, wrench.force), joint_f_inout, first_dof)
+                push_object(wrench.force, wrench.torque + wp.cross(object_arm, wrench.force), joint_f_inout, first_dof)
                 pull_gripper(wrench.force, wrench.torque, tcp.wrist_arm, tcp.wrist_axis, joint_f_inout, gripper_dof)

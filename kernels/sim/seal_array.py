@@ -1,25 +1,29 @@
 """Seals of several cups with an object: together one spring-damper at the middle of the cups, shared out to them.
 
-The seals of an object act on two rigid bodies: together they are one spring-damper at the middle of their cups, whose resistance to rotation
-grows with the distances of the cups from it. It is solved as one, then shared out. Frames are those of `kernels.sim.seal`.
+The seals of an object act on two rigid bodies. Their resistance to rotation grows with the distances of the cups from the middle. They are
+solved as one spring-damper, then shared out. Frames are those of `kernels.sim.seal`. One cup has a kernel of its own there: sums over cups
+change which products the compiler fuses with sums, and so the last bits of every pick.
 """
 
 import warp as wp
 
 from synpick_warp.kernels.sim.cup_rays import CUP, has_bit
 from synpick_warp.kernels.sim.seal import (
-    GripMotion,
+    InverseMass,
+    RotationError,
     TcpMotion,
     Wrench,
-    grip_motion,
+    add_inverse_masses,
     gripper_inverse_mass,
+    object_inverse_mass,
     pull_gripper,
     push_object,
+    rotation_error,
     solve_wrench,
     tcp_motion,
     tension_and_shear,
 )
-from synpick_warp.kernels.structs import LayoutData, SuctionData
+from synpick_warp.kernels.structs import CupData, LayoutData, SuctionData
 
 wp.set_module_options({"enable_backward": False})
 
@@ -40,8 +44,10 @@ class SolvedSeals:
 
     whole: Wrench
     """Of all seals, on the object."""
-    motion: GripMotion
-    """At the middle of the cups, at the beginning of the step."""
+    grip_rotation: wp.quat
+    """From the grip frame to the world."""
+    object_arm: wp.vec3
+    """From the object's centre of mass to the middle of the cups [m]."""
     spin: wp.vec3
     """Angular velocity of the head relative to the object at the end of the step [rad/s]."""
 
@@ -61,40 +67,49 @@ class HeldObject:
 
 
 @wp.func
-def count_seals(held: int, suction: SuctionData) -> int:
+def count_seals(held: int, cups: CupData) -> int:
     """Number of cups that hold an object; `held`: its bits in `attached`."""
     count = int(0)
-    for cup in range(suction.cups):
+    for cup in range(cups.count):
         count += (held >> cup) & 1
     return count
 
 
 @wp.func
-def middle_of_cups(held: int, suction: SuctionData) -> wp.vec3:
+def middle_of_cups(held: int, cups: CupData) -> wp.vec3:
     """Middle of the cups that hold an object, in the head's frame [m]."""
     total = wp.vec3(0.0, 0.0, 0.0)
-    for cup in range(suction.cups):
+    for cup in range(cups.count):
         if has_bit(held, cup):
-            total += suction.place[cup]
-    return total / float(count_seals(held, suction))
+            total += cups.place[cup]
+    return total / float(count_seals(held, cups))
 
 
 @wp.func
-def spread_of_cups(held: int, middle: wp.vec3, head: wp.quat, grip: wp.quat, suction: SuctionData) -> CupSpread:
+def spread_of_cups(held: int, middle: wp.vec3, head: wp.quat, grip: wp.quat, suction: SuctionData, cups: CupData) -> CupSpread:
     """Spread of the cups that hold an object about their middle; rotations from the head's and from the grip's axes to the world."""
     result = CupSpread()
-    for cup in range(suction.cups):
+    for cup in range(cups.count):
         if has_bit(held, cup):
-            arm = wp.quat_rotate(head, suction.place[cup] - middle)
-            stretch = arm - wp.quat_rotate(grip, suction.place[cup] - middle)
+            arm = wp.quat_rotate(head, cups.place[cup] - middle)
+            stretch = arm - wp.quat_rotate(grip, cups.place[cup] - middle)
             result.torque += wp.cross(arm, suction.stiffness * stretch)
             result.moment += wp.dot(arm, arm) * wp.identity(n=3, dtype=float) - wp.outer(arm, arm)
     return result
 
 
 @wp.func
-def wrench_of_seals(motion: GripMotion, spread: CupSpread, seals: int, suction: SuctionData) -> Wrench:
-    """Wrench of an object's n seals on it.
+def wrench_of_seals(
+    offset: wp.vec3,
+    error: RotationError,
+    spread: CupSpread,
+    seals: int,
+    velocity: wp.vec3,
+    angular_velocity: wp.vec3,
+    inverse_mass: InverseMass,
+    suction: SuctionData,
+) -> Wrench:
+    """Wrench of an object's n seals on it; offset and velocities are those at the middle of the cups.
 
     The stiffness is n times a seal's; against rotation, k Σ |r|² 1 - r rᵀ of the cups' places r is added. So is the damping.
     """
@@ -102,10 +117,10 @@ def wrench_of_seals(motion: GripMotion, spread: CupSpread, seals: int, suction: 
     n = float(seals)
     gain = h * suction.stiffness + suction.damping
     linear_gain = n * gain
-    angular_gain = n * (h * motion.error.stiffness + suction.twist_damping * wp.identity(n=3, dtype=float)) + gain * spread.moment
-    force = n * suction.stiffness * motion.offset + linear_gain * motion.slip
-    torque = n * motion.error.torque + spread.torque + angular_gain * motion.spin
-    return solve_wrench(force, torque, linear_gain, angular_gain, motion.inverse_mass, h)
+    angular_gain = n * (h * error.stiffness + suction.twist_damping * wp.identity(n=3, dtype=float)) + gain * spread.moment
+    force = n * suction.stiffness * offset + linear_gain * velocity
+    torque = n * error.torque + spread.torque + angular_gain * angular_velocity
+    return solve_wrench(force, torque, linear_gain, angular_gain, inverse_mass, h)
 
 
 @wp.func
@@ -136,6 +151,7 @@ def solve_seals(
     inverse_inertia: wp.mat33,
     object_in_tcp: wp.transform,
     suction: SuctionData,
+    cups: CupData,
 ) -> SolvedSeals:
     """Wrench of an object's seals in this step.
 
@@ -149,23 +165,24 @@ def solve_seals(
         inverse_mass: Its inverse mass [1/kg].
         inverse_inertia: Its inverse inertia, in its axes [1/(kg·m²)].
         object_in_tcp: Its pose in the tool's TCP frame at rest [m].
-        suction: Cups, stiffness and damping.
+        suction: Stiffness and damping of a seal.
+        cups: Places of the cups.
     """
     result = SolvedSeals()
-    middle = middle_of_cups(held, suction)
+    middle = middle_of_cups(held, cups)
     grip_in_world = object_in_world * wp.transform_inverse(object_in_tcp)
-    rotation = wp.transform_get_rotation(grip_in_world)
-    position = wp.transform_point(grip_in_world, wp.vec3(middle[0], middle[1], 0.0))
-    gripper_inverse = gripper_inverse_mass(suction, tcp.wrist_axis, tcp.wrist_arm, objects)
-    motion = grip_motion(
-        tcp, gripper_inverse, rotation, position, object_in_world, velocity, com, inverse_mass, inverse_inertia, suction
-    )
-    spread = spread_of_cups(held, middle, tcp.rotation, rotation, suction)
-    whole = wrench_of_seals(motion, spread, count_seals(held, suction), suction)
-    both = motion.inverse_mass
-    result.motion = motion
-    result.whole = whole
-    result.spin = motion.spin - suction.step * (wp.transpose(both.mixed) * whole.force + both.angular * whole.torque)
+    result.grip_rotation = wp.transform_get_rotation(grip_in_world)
+    result.object_arm = tcp.position - wp.transform_point(object_in_world, com)
+    rotation = wp.transform_get_rotation(object_in_world)
+    of_object = object_inverse_mass(rotation, inverse_mass, inverse_inertia, result.object_arm)
+    both = add_inverse_masses(of_object, gripper_inverse_mass(suction, tcp.wrist_axis, tcp.wrist_arm, objects))
+    slip = tcp.velocity - wp.spatial_top(velocity) - wp.cross(wp.spatial_bottom(velocity), result.object_arm)
+    spin = tcp.angular_velocity - wp.spatial_bottom(velocity)
+    offset = tcp.position - wp.transform_point(grip_in_world, wp.vec3(middle[0], middle[1], 0.0))
+    error = rotation_error(tcp.rotation, result.grip_rotation, suction)
+    spread = spread_of_cups(held, middle, tcp.rotation, result.grip_rotation, suction, cups)
+    result.whole = wrench_of_seals(offset, error, spread, count_seals(held, cups), slip, spin, both, suction)
+    result.spin = spin - suction.step * (wp.transpose(both.mixed) * result.whole.force + both.angular * result.whole.torque)
     return result
 
 
@@ -177,6 +194,7 @@ def share_wrench(
     world: int,
     gripper_dof: int,
     suction: SuctionData,
+    cups: CupData,
     break_force: wp.array2d[float],  # (world, cup) [N]
     cup_force: wp.array2d[float],  # (world, cup) [N]
     joint_f: wp.array[float],  # (dof) [N, N·m]
@@ -185,22 +203,22 @@ def share_wrench(
 
     Adds the forces to `cup_force`, and those that hold on to the gripper's `joint_f`.
     """
-    middle = middle_of_cups(held, suction)
-    seals = count_seals(held, suction)
+    middle = middle_of_cups(held, cups)
+    seals = count_seals(held, cups)
     # What the forces of the cups do not explain of the torque is twist and swing of the seals, the same of each.
     rest = solved.whole.torque
-    for cup in range(suction.cups):
+    for cup in range(cups.count):
         if has_bit(held, cup):
-            arm = wp.quat_rotate(tcp.rotation, suction.place[cup] - middle)
-            grip_arm = wp.quat_rotate(solved.motion.grip_rotation, suction.place[cup] - middle)
+            arm = wp.quat_rotate(tcp.rotation, cups.place[cup] - middle)
+            grip_arm = wp.quat_rotate(solved.grip_rotation, cups.place[cup] - middle)
             rest -= wp.cross(arm, force_of_cup(solved.whole, seals, arm, grip_arm, solved.spin, suction))
     torque = rest / float(seals)
     result = HeldObject()
     result.cups = held
-    for cup in range(suction.cups):
+    for cup in range(cups.count):
         if has_bit(held, cup):
-            arm = wp.quat_rotate(tcp.rotation, suction.place[cup] - middle)
-            grip_arm = wp.quat_rotate(solved.motion.grip_rotation, suction.place[cup] - middle)
+            arm = wp.quat_rotate(tcp.rotation, cups.place[cup] - middle)
+            grip_arm = wp.quat_rotate(solved.grip_rotation, cups.place[cup] - middle)
             force = force_of_cup(solved.whole, seals, arm, grip_arm, solved.spin, suction)
             borne = tension_and_shear(force, tcp.axis)
             result.peak_force = wp.max(result.peak_force, borne)
@@ -209,7 +227,7 @@ def share_wrench(
                 result.cups -= 1 << cup
             else:
                 result.force += force
-                result.torque += torque + wp.cross(solved.motion.object_arm + arm, force)
+                result.torque += torque + wp.cross(solved.object_arm + arm, force)
                 pull_gripper(force, torque, tcp.wrist_arm + arm, tcp.wrist_axis, joint_f, gripper_dof)
     return result
 
@@ -219,6 +237,7 @@ def apply_array_forces_kernel(
     # Scene:
     layout: LayoutData,
     suction: SuctionData,
+    cups: CupData,
     body_com: wp.array[wp.vec3],  # (body) [m]
     body_inv_mass: wp.array[float],  # (body) [1/kg]
     body_inv_inertia: wp.array[wp.mat33],  # (body) [1/(kg·m²)]
@@ -245,7 +264,7 @@ def apply_array_forces_kernel(
     for instance in range(layout.instances):
         objects += wp.where(attached_inout[world, instance] != 0, 1, 0)
         seal_force_inout[world, instance] = 0.0
-    for cup in range(suction.cups):
+    for cup in range(cups.count):
         cup_force_inout[world, cup] = 0.0
     if objects == 0:
         return
@@ -257,17 +276,17 @@ def apply_array_forces_kernel(
         if held != 0:
             slot = body_slot[world, instance]
             body = world * layout.bodies + layout.gripper_bodies + slot
-            tcp = tcp_motion(body_q[head], body_qd[head], body_com[head], middle_of_cups(held, suction))
+            tcp = tcp_motion(body_q[head], body_qd[head], body_com[head], middle_of_cups(held, cups))
             pose, grip = body_q[body], object_in_tcp[world, instance]
             mass, inertia = body_inv_mass[body], body_inv_inertia[body]
-            seals = solve_seals(held, objects, tcp, pose, body_qd[body], body_com[body], mass, inertia, grip, suction)
-            shared = share_wrench(held, seals, tcp, world, gripper_dof, suction, break_force_inout, cup_force_inout, joint_f_inout)
+            seals = solve_seals(held, objects, tcp, pose, body_qd[body], body_com[body], mass, inertia, grip, suction, cups)
+            shared = share_wrench(held, seals, tcp, world, gripper_dof, suction, cups, break_force_inout, cup_force_inout, joint_f_inout)
             seal_force_inout[world, instance] = shared.peak_force
             peak_force_inout[world] = wp.max(peak_force_inout[world], shared.peak_force)
             broken += held - shared.cups
             attached_inout[world, instance] = shared.cups
             first_dof = gripper_dof + layout.gripper_dofs + 6 * slot
             push_object(shared.force, shared.torque, joint_f_inout, first_dof)
-    if suction.common_valve != 0 and broken > 0:
-        for cup in range(suction.cups):
+    if cups.common_valve != 0 and broken > 0:
+        for cup in range(cups.count):
             break_force_inout[world, cup] = suction.poor_force

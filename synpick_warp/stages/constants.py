@@ -45,6 +45,7 @@ class SceneData:
     pick: structs.PickData
     perception: structs.PerceptionData
     suction: structs.SuctionData
+    cups: structs.CupData
     bins: structs.BinData
     looks: LookTable
 
@@ -96,7 +97,8 @@ def make_scene_data(config: schema.Config, catalog: Catalog, built: build.BuiltM
             tilt_limit=math.radians(gripper.tilt_limit),
         ),
         fill(structs.PerceptionData, config.perception),
-        _suction_data(config.suction, gripper, built.head, physics.step, device),
+        _suction_data(config.suction, gripper, physics.step),
+        _cup_data(gripper, built.head, device),
         bin_data(config.cell.bins, config.bins, config.move, built.layout.parts, device, built.fields),
         build_look_table(Looks(config.randomize, (), ()), 0, device),
     )
@@ -271,17 +273,21 @@ def _move_data(move: schema.Move, gripper: schema.Gripper, physics: schema.Physi
     )
 
 
-def _suction_data(suction: schema.Suction, gripper: schema.Gripper, head: Head, step: float, device: wp.Device) -> structs.SuctionData:
+def _suction_data(suction: schema.Suction, gripper: schema.Gripper, step: float) -> structs.SuctionData:
     """Fill `SuctionData` from the settings; `step` is the time step [s]."""
-    places = [(x, y, -gripper.cup_length) for x, y in head.cups]
     return fill(
         structs.SuctionData,
         suction,
         gripper,
-        cups=len(places),
-        place=wp.array(np.array(places), dtype=wp.vec3, device=device),
-        common_valve=head.has_common_valve,
         swing_limit=math.radians(suction.swing_limit),
+        tcp_offset=gripper.cup_length,
         tilt_inertia=CUP_ARMATURE + step * (gripper.tilt_damping + step * gripper.tilt_stiffness),
         step=step,
     )
+
+
+def _cup_data(gripper: schema.Gripper, head: Head, device: wp.Device) -> structs.CupData:
+    """Fill `CupData` from the cups of the gripper head."""
+    places = np.array([(x, y, -gripper.cup_length) for x, y in head.cups])
+    place = wp.array(places, dtype=wp.vec3, device=device)
+    return fill(structs.CupData, count=len(places), place=place, common_valve=head.has_common_valve)

@@ -79,7 +79,8 @@ def test_where_one_seal_of_a_common_valve_breaks_the_others_are_poor(device, val
 @pytest.mark.parametrize(("valve", "sealed"), [(0, 0b0110), (1, 0)])
 def test_one_leaking_cup_spoils_a_common_valve_alone(device, valve, sealed):
     """The plate ends half a ring's radius beyond the middle of cups 0 and 3; seven of their ten rays hit."""
-    cups = Cups(device, cups=SQUARE, common_valve=valve)
+    cups = Cups(device, cups=SQUARE)
+    cups.scene.cups.common_valve = valve
     cups.put(0, 2, 0, below(0.01) - [0.15 - ARM - 0.005, 0.0, 0.0])
     assert cups.cast() == ([2 * RAYS + 14], [0b100])
     assert cups.attempts.hits.numpy()[0, 1] == sealed

@@ -76,7 +76,7 @@ class Hanging:
         self.physics.control.joint_f.zero_()
         self.physics.load(self.state.variant, self.state.restarted)
         self.seals.object_in_tcp.assign(np.concatenate([place, turn], axis=2))
-        self.seals.attached.fill_((1 << self.scene.suction.cups) - 1)
+        self.seals.attached.fill_((1 << self.scene.cups.count) - 1)
         self.seals.break_force.fill_(break_force)
         self.seals.peak_force.zero_()
         self.setpoint[:], self.speed[:] = (0.0, 0.0, HEIGHT), 0.0

@@ -123,7 +123,8 @@ class KernelWorlds:
             fill(structs.MoveData, **(MOVE | self.move)),
             filled(structs.PickData(), self.pick),
             structs.PerceptionData(),
-            filled(structs.SuctionData(), {"cups": len(self.cups), "place": self._places()}),
+            filled(structs.SuctionData(), {"tcp_offset": (MOVE | self.move)["tcp_offset"]}),
+            filled(structs.CupData(), {"count": len(self.cups), "place": self._places()}),
             self._bins(),
             build_look_table(Looks(self.randomize, (), ()), 0, self.device),
         )

@@ -85,7 +85,7 @@ class GraspPlanner:
         self.choose_target(scene, state, attempts, observation, plan, seed)
         self.smooth_normal(scene, observation, plan)
         self.frame_grasp(scene, observation, plan)
-        if scene.suction.cups > 1:
+        if scene.cups.count > 1:
             self.align_cups(scene, plan)
 
     def bound_contours(self, scene: SceneData, state: WorldState, observation: Observation) -> None:
