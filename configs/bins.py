@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import os
 from dataclasses import dataclass
-from pathlib import Path
 from typing import ClassVar
 
 from synpick_warp.configs.fields import setting
@@ -60,9 +58,7 @@ class BinRow(Tote):
     weight: float = setting(1.0, "", "Weight with which an episode draws it.", low=0.0, high=1e6)
     compartments: tuple[int, int] = setting((1, 1), "", "Columns (along x) and rows of compartments of equal floors.", low=1, high=6)
     divider_height: float = setting(0.1, "m", "Height of the dividers between compartments.", above=0.0, high=10.0)
-    file: str | None = setting(
-        None, "", "Mesh (.stl, .ply, .obj, .glb, .gltf, .step) instead of sizes and compartments; relative to the file of settings."
-    )
+    file: str | None = setting(None, "", "Mesh (.stl, .ply, .obj, .glb, .gltf, .step) instead of sizes and compartments.", path=True)
     unit: str | None = setting(None, "", "Unit of the mesh; m unless it is given.", choices=tuple(UNITS))
     up: str | None = setting(None, "", "Axis of the mesh that points up; z unless it is given.", choices=AXES)
     place: str | None = setting(
@@ -109,27 +105,18 @@ _OF_FILE = ("unit", "up", "place", "measured")
 """Keys that say how a mesh is read, or what it is."""
 
 
-def locate_meshes(tables: object, folder: Path, source: str) -> object:
-    """Content of [[bin]] tables with absolute paths of meshes; anything that is no such table is left as it is.
+def check_meshes(tables: object, source: str) -> None:
+    """Check which keys stand together in [[bin]] tables; anything that is no such table is passed over.
 
     Args:
         tables: Value of `bin` as parsed from TOML.
-        folder: Folder to which names of files are relative.
         source: Where the tables come from, for messages.
 
     Raises:
         ConfigError: A file stands beside sizes, or something that belongs to a file without one.
     """
-    if not isinstance(tables, list):
-        return tables
-    found = []
-    for index, table in enumerate(tables):
-        if isinstance(table, dict):
-            file = table.get("file", "")
-            others = [name for name in (_OF_FILE if file == "" else _SIZES) if name in table]
-            if others:
-                rule = "none without bin.file" if file == "" else "none beside bin.file, whose mesh has it"
-                raise ConfigError(f"bin[{index}].{others[0]} is {format_value(table[others[0]])} {source}; allowed: {rule}")
-            table = table | ({"file": os.path.abspath(folder / file)} if file and isinstance(file, str) else {})
-        found.append(table)
-    return found
+    for index, table in enumerate(tables if isinstance(tables, list) else ()):
+        names = () if not isinstance(table, dict) else _SIZES if table.get("file", "") else _OF_FILE
+        if others := [name for name in names if name in table]:
+            rule = "none beside bin.file, whose mesh has it" if names is _SIZES else "none without bin.file"
+            raise ConfigError(f"bin[{index}].{others[0]} is {format_value(table[others[0]])} {source}; allowed: {rule}")

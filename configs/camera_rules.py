@@ -14,7 +14,7 @@ from synpick_warp.codes import MAX_DISPARITIES
 from synpick_warp.configs.cameras import COLOR, DEPTH, MASKS, MODALITIES, CameraRow, Cameras, Jitter, Pose
 from synpick_warp.configs.cell import BinSizes, Sides
 from synpick_warp.configs.modes import may_pick
-from synpick_warp.configs.randomize import FIXED, OFF
+from synpick_warp.configs.randomize import FIXED
 from synpick_warp.configs.rig import Rig, intrinsics, lens_map, moved, position, viewing_direction
 from synpick_warp.configs.schema import Bop, Config, DepthSensor, Gripper
 from synpick_warp.errors import ConfigError
@@ -119,7 +119,7 @@ def _view(rig: Rig, index: int, config: Config) -> Iterator[Conflict]:
     if "lerobot" in config.bake.formats and (width % 2 or height % 2):
         key = rig.key(index, "resolution") if config.camera and config.camera[index].resolution else "cameras.resolution"
         yield key, "even width and height with the format lerobot, whose videos have a colour for 2 x 2 pixels"
-    shown = [name for name in config.render.layers if rig.writes(index, name)]
+    shown = rig.chosen(index, config.render.layers)
     if rig.every[index] > 1:
         yield from _every(rig.key(index, "every"), config.bake.formats, shown)
     if row.modalities is not None:
@@ -210,13 +210,13 @@ def _jitter(key: str, row: CameraRow, jitter: Jitter, placement: Callable[..., I
         kind = getattr(jitter, name)
         if kind.kind == FIXED and kind.bounds() != (0.0, 0.0):
             yield f"{key}.{name}", "a distribution, such as { normal = [0, 0.002] }; what all episodes share belongs to pose and matrix"
-    if row.distortion and (jitter.focal_length.kind, jitter.center.kind) != (OFF, OFF):
-        yield key, "position and rotation alone with distortion, whose rays belong to one focal length and centre"
     turn = math.radians(math.sqrt(2.0) * max(map(abs, jitter.rotation.bounds())))
     for name, drawn in _extremes(row, jitter):
         width, height = drawn.resolution or (0, 0)
         found = [*_matrix(key, drawn.matrix, width, height)] if drawn.matrix is not None else []
         found += placement(drawn, (key,) * 3, turn if name == "rotation" else 0.0)
+        if name in ("focal_length", "center") and (fault := _lens_fault(drawn)):
+            found.append((key, f"a lens that covers the image, but {fault}"))
         yield from ((f"{key}.{name}", f"less, so that every draw has {rule}") for _, rule in found)
 
 
@@ -230,11 +230,13 @@ def _extremes(row: CameraRow, jitter: Jitter) -> Iterator[tuple[str, CameraRow]]
         yield "position", replace(row, pose=moved(row.pose, offset))
     yield "rotation", row
     fx, fy, cx, cy = intrinsics(row)
-    for zoom in jitter.focal_length.bounds():
+    zooms, ends = jitter.focal_length.bounds(), jitter.center.bounds()
+    for zoom in zooms:
         yield "focal_length", replace(row, fov=None, matrix=((fx * (1.0 + zoom), 0.0, cx), (0.0, fy * (1.0 + zoom), cy), (0.0, 0.0, 1.0)))
-    ends = jitter.center.bounds()
     for x, y in itertools.product(ends, ends):
-        yield "center", replace(row, fov=None, matrix=((fx, 0.0, cx + x), (0.0, fy, cy + y), (0.0, 0.0, 1.0)))
+        # A lens bends most where the image reaches farthest from its axis: with the shortest focal length.
+        zoom = 1.0 + (min(zooms) if row.distortion else 0.0)
+        yield "center", replace(row, fov=None, matrix=((fx * zoom, 0.0, cx + x), (0.0, fy * zoom, cy + y), (0.0, 0.0, 1.0)))
 
 
 def _matrix(key: str, matrix: tuple[tuple[float, float, float], ...], width: int, height: int) -> Iterator[Conflict]:
@@ -256,13 +258,19 @@ def _matrix(key: str, matrix: tuple[tuple[float, float, float], ...], width: int
 
 def _lens(key: str, row: CameraRow, layers: tuple[str, ...]) -> Iterator[Conflict]:
     """Yield a distortion that is not invertible over the image, or with which a layer cannot be rendered."""
-    try:
-        lens = lens_map(row)
-    except ConfigError as error:
-        yield key, f"that of a lens which covers the image, but {error}"
-        return
-    if lens is not None and (found := [name for name in layers if name in SENSOR_LAYERS]):
+    if fault := _lens_fault(row):
+        yield key, f"that of a lens which covers the image, but {fault}"
+    elif lens_map(row) is not None and (found := [name for name in layers if name in SENSOR_LAYERS]):
         yield key, f"none with the layer {found[0]}, which is the rectified image of a sensor"
+
+
+def _lens_fault(row: CameraRow) -> str:
+    """Why a camera's distortion is not invertible over its image; empty: it is."""
+    try:
+        lens_map(row)
+    except ConfigError as error:
+        return str(error)
+    return ""
 
 
 def _depth_sensor(sensor: DepthSensor, rig: Rig, bins: Sequence[BinSizes]) -> Iterator[Conflict]:

@@ -98,7 +98,7 @@ class CameraRow:
     )
     model: str | None = setting(None, "", "Distortion model, pinhole unless it is given.", choices=MODELS)
     file: str | None = setting(
-        None, "", "Calibration file of OpenCV, ROS, BOP, RealSense or Zivid, instead of matrix, distortion and resolution."
+        None, "", "Calibration file of OpenCV, ROS, BOP, RealSense or Zivid, instead of matrix, distortion and resolution.", path=True
     )
     sensor: str | None = setting(None, "", "Depth sensor whose resolution and matrix the camera has, [as listed](#sensor-presets).")
     pixel_center: float | None = setting(

@@ -68,6 +68,8 @@ def describe_allowed(item: dataclasses.Field[Any], annotation: Any) -> str:
     rules = item.metadata
     if rules["choices"]:
         return ("any of " if typing.get_origin(annotation) is tuple else "") + ", ".join(choice or '""' for choice in rules["choices"])
+    if rules["path"]:
+        return "a path, in a file relative to it"
     words = [f"{word} {_number(rules[name])}" for name, word in _BOUNDS if rules[name] is not None]
     if _is_distribution(annotation):
         off = f'"{OFF}", ' if item.default.kind == OFF else ""

@@ -6,6 +6,8 @@ from collections.abc import Callable
 from dataclasses import field
 from typing import Any
 
+PATH_RULE = "a path in a file of settings is relative to that file"
+"""For messages about what is missing."""
 INT32_MAX = 2**31 - 1
 """Largest whole number of kernels and largest index of their arrays: the upper limit of settings that become one of them."""
 
@@ -20,6 +22,7 @@ def setting(
     above: float | None = None,
     choices: tuple[str, ...] = (),
     parse: Callable[[Any], Any] | None = None,
+    path: bool = False,
 ) -> Any:
     """Declare a setting: a dataclass field whose metadata are unit, meaning (one sentence) and allowed values.
 
@@ -32,6 +35,7 @@ def setting(
         above: Minimum, exclusive.
         choices: Allowed strings; empty: any.
         parse: Converts a value as TOML has it to one of the field's type; raises ValueError with what is allowed.
+        path: Whether it names a file or folder; in a file of settings it is then relative to that file, else to the current folder.
     """
-    metadata = {"unit": unit, "doc": doc, "low": low, "high": high, "above": above, "choices": choices, "parse": parse}
+    metadata = {"unit": unit, "doc": doc, "low": low, "high": high, "above": above, "choices": choices, "parse": parse, "path": path}
     return field(default=default, metadata=metadata)

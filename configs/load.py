@@ -6,11 +6,11 @@ import dataclasses
 import functools
 import os
 import typing
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-from synpick_warp.configs.bins import locate_meshes
+from synpick_warp.configs.bins import BinRow, check_meshes
 from synpick_warp.configs.calibration.sensor_presets import sensor_settings
 from synpick_warp.configs.calibration.tables import fill_tables
 from synpick_warp.configs.cameras import Cameras
@@ -42,6 +42,7 @@ def load_config(
     *,
     source: str = "in the settings passed",
     splits: bool = False,
+    measure: Callable[[tuple[BinRow, ...]], Mapping[str, tuple[BinRow, ...]]] | None = None,
 ) -> Config:
     """Load a preset or a TOML file, override single settings, and validate the result.
 
@@ -55,10 +56,12 @@ def load_config(
     Args:
         preset_or_file: Name of a preset (`preset_names`), or path of a file that ends in .toml; a file that names no preset builds on
             "synpick". None: the preset "synpick".
-        settings: Full key, such as "physics.step", -> value, with lists for TOML's arrays.
+        settings: Full key, such as "physics.step", -> value, with lists for TOML's arrays. Paths are relative to the current folder; those
+            in a file to that file.
         source: Where `settings` come from, for error messages.
         splits: Whether the splits of a preset hold, such as train and test of "synpick", unless a file sets mode or episodes otherwise;
             the [splits] of a file always hold.
+        measure: Lists of tables to replace, of the bins with what their meshes measure; None: without.
 
     Returns:
         The complete configuration: frozen dataclasses, see `synpick_warp.configs.schema`.
@@ -79,6 +82,9 @@ def load_config(
             values |= _section_values(section, {name: value}, source)
     config = _build(values, source if settings else "")
     _check_conflicts(config, values)
+    if measure is not None and (found := measure(config.bin)):
+        config = dataclasses.replace(config, **found)
+        _check_conflicts(config, values)
     return config
 
 
@@ -174,14 +180,26 @@ def _read(preset_or_file: str) -> Values:
     """Values of a preset or a .toml file over the preset it is based on, with the source of each."""
     if preset_or_file.endswith(".toml"):
         document = _parse(Path(preset_or_file))
-        for name, fill in (("camera", fill_tables), ("bin", locate_meshes)):
-            if name in document:
-                document[name] = fill(document[name], Path(preset_or_file).parent, f"in {preset_or_file}")
+        _locate(document, os.path.dirname(preset_or_file))
+        check_meshes(document.get("bin"), f"in {preset_or_file}")
+        if CAMERA in document:
+            document[CAMERA] = fill_tables(document[CAMERA], f"in {preset_or_file}")
         base = document.pop(_BASE, DEFAULT_PRESET)
         if not isinstance(base, str):
             raise ConfigError(f"{_BASE} is {format_value(base)} in {preset_or_file}; allowed: {', '.join(preset_names())}")
         return _override(_offer_splits(_read_preset(base, f" in {preset_or_file}")), document, f"in {preset_or_file}")
     return _offer_splits(_read_preset(preset_or_file, ""))
+
+
+def _locate(document: dict[str, Any], folder: str) -> None:
+    """Make the paths in a document absolute that are relative to its folder; whatever else is wrong with them is left as it is."""
+    for name, kind in (sections() | table_lists()).items():
+        paths = [key for key, (item, _) in settings_of(kind).items() if item.metadata["path"]]
+        content = document.get(name)
+        for table in content if isinstance(content, list) else [content]:
+            for key in paths:
+                if isinstance(table, dict) and table.get(key) and isinstance(table[key], str):
+                    table[key] = os.path.abspath(os.path.join(folder, os.path.expanduser(table[key])))
 
 
 def _offer_splits(values: Values) -> Values:

@@ -171,15 +171,18 @@ class Randomize:
     bin_color: ColorDistribution = setting(_NO_COLOR, "sRGB", "Base colour of the bin; with a texture, its factor.", low=0.0, high=1.0)
     bin_roughness: Distribution = setting(_NONE, "", "Roughness of the bin.", low=0.0, high=1.0)
     bin_metallic: Distribution = setting(_NONE, "", "Metallic factor of the bin.", low=0.0, high=1.0)
-    bin_textures: str = setting("", "", "Folder of images, one of which each episode draws as the bin's texture; empty: none.")
+    bin_textures: str = setting("", "", "Folder of images, one of which each episode draws as the bin's texture; empty: none.", path=True)
     table_color: ColorDistribution = setting(_NO_COLOR, "sRGB", "Base colour of the table; with a texture, its factor.", low=0.0, high=1.0)
     table_roughness: Distribution = setting(_NONE, "", "Roughness of the table.", low=0.0, high=1.0)
-    table_textures: str = setting("", "", "Folder of images, one of which each episode draws as the table's texture; empty: none.")
+    table_textures: str = setting(
+        "", "", "Folder of images, one of which each episode draws as the table's texture; empty: none.", path=True
+    )
     background_textures: str = setting(
         "",
         "",
         "Folder of images, one of which each episode draws as the texture of a floor, which is seen beyond the edge of the table "
         "(render.table_size); empty: the environment map is seen there.",
+        path=True,
     )
     texture_width: Distribution = setting(
         _HALF_METRE, "m", "Width of one repeat of the textures of bin, table and floor.", low=0.01, high=100.0
@@ -210,6 +213,7 @@ class Randomize:
         "",
         "",
         "Folder of distractors, as bake.models; empty: the embedded objects that the catalog lacks, or, if it has all, geometric solids.",
+        path=True,
     )
     exposure: Distribution = setting(_NONE, "EV", "Exposure offset, in place of what render.exposure_spread draws.", low=-5.0, high=5.0)
 

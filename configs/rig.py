@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING
 
-from synpick_warp.configs.cameras import GRIPPER, CameraRow, Cameras, Pose, Vector
+from synpick_warp.configs.cameras import COLOR, GRIPPER, CameraRow, Cameras, Pose, Vector
+from synpick_warp.configs.randomize import OFF
 from synpick_warp.errors import ConfigError
+from synpick_warp.views.layers import LAYER_TABLE
 
 if TYPE_CHECKING:
     from synpick_warp.configs.calibration.lens import LensMap
@@ -66,8 +69,11 @@ class Rig:
 
     @cached_property
     def groups(self) -> tuple[tuple[int, ...], ...]:
-        """Indices of the cameras that are rendered together: of one image size and `every`, all placed or none, all moving or none."""
-        kinds = [(size, self.every[index], self.is_placed(index), self.moves(index)) for index, size in enumerate(self.sizes)]
+        """Indices of the cameras that are rendered together: of one image size and `every`, all placed or none, all moving or none, all
+        with lenses that are drawn or none, and all with the same colour and layers."""
+        states = [(self.is_placed(index), self.moves(index), self.draws_lens(index)) for index in range(len(self))]
+        made = [self.chosen(index, (COLOR, *LAYER_TABLE)) for index in range(len(self))]
+        kinds = list(zip(self.sizes, self.every, states, made, strict=True))
         return tuple(tuple(index for index, own in enumerate(kinds) if own == kind) for kind in dict.fromkeys(kinds))
 
     @cached_property
@@ -80,9 +86,20 @@ class Rig:
         chosen = self.rows[index].modalities
         return chosen is None or modality in chosen
 
+    def chosen(self, index: int, modalities: Iterable[str]) -> tuple[str, ...]:
+        """Those of MODALITIES that a camera has, by `writes`."""
+        return tuple(name for name in modalities if self.writes(index, name))
+
     def is_placed(self, index: int) -> bool:
         """Whether a camera's matrix and pose are not the same in all views."""
         return self.rows[index].jitter is not None or self.moves(index)
+
+    def draws_lens(self, index: int) -> bool:
+        """Whether episodes draw focal length or centre behind a lens that distorts, and with these the rays of its pixels."""
+        row = self.rows[index]
+        if not row.distortion or row.jitter is None:
+            return False
+        return (row.jitter.focal_length.kind, row.jitter.center.kind) != (OFF, OFF)
 
     def moves(self, index: int) -> bool:
         """Whether a camera moves within an episode."""

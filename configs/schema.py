@@ -82,8 +82,9 @@ class Bake:
         "",
         "",
         "Folder of BOP models, of PLY, OBJ, glTF, STL and STEP files, or of a folder per object; empty: the embedded procedural objects.",
+        path=True,
     )
-    lights: str = setting("", "", "Folder of HDR environment maps (.hdr) and sIBL sets; empty: the embedded procedural maps.")
+    lights: str = setting("", "", "Folder of HDR environment maps (.hdr) and sIBL sets; empty: the embedded procedural maps.", path=True)
     formats: tuple[str, ...] = setting(
         ("bop",),
         "",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import re
 from dataclasses import Field
 from typing import Any
@@ -20,7 +21,7 @@ _DELETE = "\x7f"
 
 
 def config_to_toml(config: Config, *, comments: bool = False) -> str:
-    """All settings as TOML text, including defaults.
+    """All settings as TOML text, including defaults; paths are absolute, so that it holds wherever it is written to.
 
     Args:
         config: The configuration.
@@ -52,7 +53,8 @@ def _table(values: Any, kind: type[Any], comments: bool) -> list[str]:
             continue
         if comments:
             lines.append(f"# {describe_setting(item, annotation)}")
-        lines.append(f"{name} = {format_toml(given[name])}")
+        value = os.path.abspath(given[name]) if item.metadata["path"] and given[name] else given[name]
+        lines.append(f"{name} = {format_toml(value)}")
     return lines
 
 

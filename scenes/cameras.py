@@ -10,6 +10,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from synpick_warp.codes import Stream
+from synpick_warp.configs.calibration.lens import with_matrix
 from synpick_warp.configs.cameras import WORLD, CameraRow, Jitter
 from synpick_warp.configs.rig import Rig, lens_map
 from synpick_warp.errors import ConfigError
@@ -128,7 +129,8 @@ class EpisodeCameras:
         matrix[:2, 2] += center
         at = position - camera.rotation.T @ camera.translation
         turned = Rotation.from_rotvec(rotation, degrees=True).as_matrix().T @ camera.rotation
-        return replace(camera, matrix=matrix, rotation=turned, translation=-turned @ at)
+        lens = with_matrix(camera.lens, matrix)
+        return replace(camera, matrix=matrix, rotation=turned, translation=-turned @ at, lens=lens)
 
 
 def carry(rotation: np.ndarray, translation: np.ndarray, pose: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -11,6 +11,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from synpick_warp.configs.fields import PATH_RULE
 from synpick_warp.errors import LightError, SynpickError
 from synpick_warp.scenes.assets.appearance import srgb_to_linear
 from synpick_warp.scenes.assets.asset_files import check_file_name, locate
@@ -73,7 +74,9 @@ def load_lights(folder: str, report: Callable[[str], None] = _ignore, strict: bo
         return skies()
     root = Path(folder)
     if not root.is_dir():
-        raise LightError(f"lights folder {folder} does not exist; give a folder with .hdr maps or sIBL sets, or none for the embedded maps")
+        raise LightError(
+            f"lights folder {folder} does not exist; give a folder with .hdr maps or sIBL sets, or none for the embedded maps; {PATH_RULE}"
+        )
     try:
         folders = [root, *sorted(path for path in root.iterdir() if path.is_dir())]
         files = [path for each in folders for path in _list_maps(each)]

@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 
 from synpick_warp.codes import LookPart
+from synpick_warp.configs.fields import PATH_RULE
 from synpick_warp.configs.randomize import Randomize
 from synpick_warp.errors import CatalogError, SynpickError
 from synpick_warp.scenes.assets.appearance import MAX_TEXTURE_FILE, decode_texture
@@ -76,7 +77,7 @@ def load_textures(key: str, folder: str, report: Callable[[str], None], strict: 
     try:
         files = sorted(path for path in Path(folder).iterdir() if path.suffix.lower() in SUFFIXES)
     except OSError as error:
-        raise CatalogError(f"{key}: the folder {folder} cannot be read: {error.strerror}") from error
+        raise CatalogError(f"{key}: the folder {folder} cannot be read: {error.strerror}; {PATH_RULE}") from error
     if not 0 < len(files) <= MAX_TEXTURES:
         raise CatalogError(f"{key}: the folder {folder} has {len(files)} images ({', '.join(SUFFIXES)}); allowed: 1 to {MAX_TEXTURES}")
     textures, faults = [], []

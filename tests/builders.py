@@ -15,7 +15,8 @@ from typing import Any, NamedTuple
 import pytest
 
 from synpick_warp.cli.main import main
-from synpick_warp.factory import assembly
+from synpick_warp.errors import OutputError
+from synpick_warp.factory import assembly, pipeline
 from synpick_warp.factory.episodes import BakeSummary
 from synpick_warp.factory.pipeline import run_bake
 from synpick_warp.scenes.types import Catalog
@@ -70,6 +71,23 @@ def boxes(objects: Callable[[], Catalog] = catalog) -> Iterator[pytest.MonkeyPat
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(assembly, "load_catalog", lambda config, report: objects())
         yield patch
+
+
+@contextmanager
+def failing_after(episodes: int) -> Iterator[None]:
+    """Bakes within fail when they are to commit one episode more."""
+    ended, end = [], pipeline._Run._end
+
+    def fail(*arguments) -> None:
+        ended.append(arguments)
+        if len(ended) > episodes:
+            raise OutputError("no space left")
+        end(*arguments)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(pipeline._Run, "_end", fail)
+        with pytest.raises(OutputError, match="no space left"):
+            yield
 
 
 def bake_boxes(

@@ -13,8 +13,10 @@ from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
 
 from synpick_warp.configs.bins import BinRow
+from synpick_warp.configs.cameras import CameraRow, Jitter, Pose
 from synpick_warp.configs.fields import INT32_MAX
 from synpick_warp.configs.load import load_config, sections, settings_of
+from synpick_warp.configs.randomize import Distribution
 from synpick_warp.configs.schema import FAST, REFERENCE, UNOCCLUDED, Config, Physics, Settle
 from synpick_warp.errors import ConfigError, SynpickError
 from synpick_warp.factory import assembly, memory_plan, pipeline
@@ -107,13 +109,31 @@ def test_arrays_longer_than_32_bit_indices_are_refused_on_any_machine(overrides,
     assert said.endswith(advice)
 
 
+def test_rays_of_lenses_that_episodes_draw_are_counted():
+    row = CameraRow(
+        fov=40.0, distortion=(-0.1, 0.0, 0.0, 0.0), pose=Pose(position=(0.0, 0.0, 1.2), look_at=(0.0, 0.0, 0.0), up=(0.0, 1.0, 0.0))
+    )
+    drawn = replace(row, jitter=Jitter(center=Distribution("uniform", ((-2.0,), (2.0,)))))
+    for rows, count in (((row,), 0), ((drawn,), 1), ((row, drawn), 1)):
+        config = replace(settings(render__views_per_batch=5), camera=rows)
+        found = [row for term in plan_memory(config, CPU) for row in term.rows if row[0] == "Lenses.ray"]
+        assert found == [("Lenses.ray", (5, 180, 320), "", 5 * 180 * 320 * 8)] * count
+
+
+@pytest.mark.parametrize(("given", "rows"), [({}, []), ({"randomize__lamps": 1}, [(5 * 25,)])])
+def test_materials_of_views_are_counted_where_looks_are_drawn(given, rows):
+    """Of 20 objects, 3 fixtures, table and background."""
+    config = settings(render__views_per_batch=5, arrangement__max_objects=20, **given)
+    assert [row[1] for term in plan_memory(config, CPU) for row in term.rows if row[0] == "DressedSurfaces.recolor"] == rows
+
+
 @pytest.mark.parametrize(("most", "count"), [(0.0, 256), (100.0, 102)])
 def test_one_cost_volume_of_stereo_matching_is_counted_for_all_views(most, count):
     def rows(*layers: str) -> dict[str, tuple[int, ...]]:
         given = {"render__layers": list(layers), "depth_sensor__max_disparity": most, "render__views_per_batch": 5}
         return {name: shape for term in plan_memory(settings(**given), CPU) for name, shape, *_ in term.rows}
 
-    assert rows("depth_stereo")["MatchingScratch.cost"] == (180, 320, count)
+    assert rows("depth_stereo")["MatchingScratch.cost"] == (1, 180, 320, count)
     assert rows("depth_stereo")["InfraredImages.ir_left"] == (5, 180, 320)
     assert not [name for name in rows("depth_sensor", "ir_left") if "Matching" in name or "ir_right" in name]
 

@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 
 from synpick_warp.codes import LookKind
-from synpick_warp.configs.load import load_config
 from synpick_warp.configs.randomize import Distribution, Randomize
 from synpick_warp.factory.pipeline import run_bake
 from synpick_warp.system.progress import SilentProgress
 from tests.builders import PICKING, boxes
 from tests.harness.exporter_contract import digests
+from tests.worlds.cells import make_camera
 from tests.worlds.small_worlds import cluttered_catalog, settings
 
 ANY_COLOR = {"uniform": [[0, 0, 0], [1, 1, 1]]}
@@ -40,23 +40,22 @@ DRAWN: dict[str, Any] = {
     "distractors": {"choice": [0, 1, 2]},
     "exposure": {"normal": [0, 1]},
 }
-CAMERAS = """
-[[camera]]
-name = "jittered"
-resolution = [48, 27]
-fov = 60.0
-pose = { position = [0.0, -0.6, 1.2], look_at = [0.0, 0.0, 0.1], up = [0.0, 1.0, 0.0] }
-jitter.position = { normal = [0.0, 0.02] }
-jitter.rotation = { uniform = [-1.0, 1.0] }
-jitter.focal_length = { choice = [-0.02, 0.02] }
-jitter.center = { uniform = [-1.0, 1.0] }
-[[camera]]
-name = "still"
-resolution = [32, 32]
-fov = 50.0
-distortion = [-0.1, 0.05, 0.0, 0.0, 0.0]
-pose = { position = [0.0, 0.0, 1.4], look_at = [0.0, 0.0, 0.1], up = [0.0, 1.0, 0.0] }
-"""
+CAMERAS = (
+    make_camera(
+        "jittered",
+        (0.0, -0.6, 1.2),
+        (0.0, 0.0, 0.1),
+        resolution=[48, 27],
+        fov=60.0,
+        jitter={
+            "position": {"normal": [0.0, 0.02]},
+            "rotation": {"uniform": [-1.0, 1.0]},
+            "focal_length": {"choice": [-0.02, 0.02]},
+            "center": {"uniform": [-1.0, 1.0]},
+        },
+    ),
+    make_camera("still", (0.0, 0.0, 1.4), (0.0, 0.0, 0.1), resolution=[32, 32], fov=50.0, distortion=[-0.1, 0.05, 0.0, 0.0, 0.0]),
+)
 FOLDERS = ("bin_textures", "table_textures", "background_textures", "distractor_models")
 GIVEN = PICKING | {
     "arrangement.max_objects": 4,
@@ -86,10 +85,8 @@ def bake(place: Path, worlds: int) -> dict[str, str]:
         image[:4] //= 2
         cv2.imwrite(str(textures / f"{index}.png"), image)
     folders = {f"randomize.{name}": str(textures) for name in FOLDERS}
-    (place.parent / "cameras.toml").write_text(CAMERAS)
-    cameras = load_config(place.parent / "cameras.toml").camera
     with boxes(cluttered_catalog):
-        run_bake(replace(settings(**(GIVEN | folders | {"bake.worlds": worlds})), camera=cameras), place, SilentProgress())
+        run_bake(replace(settings(**(GIVEN | folders | {"bake.worlds": worlds})), camera=CAMERAS), place, SilentProgress())
     return {name: digest for name, digest in digests(place).items() if not name.endswith(("config.toml", "manifest.json"))}
 
 

@@ -1,6 +1,7 @@
-"""Draw the README's pictures anew: a strip of one view's images, and an animated pick.
+"""Draw the documents' pictures anew: a strip of one view's images, an animated pick, and the cell of configs/CELL.md.
 
-Two small bakes of embedded objects under embedded light maps, removed afterwards; some minutes on two CPU cores.
+Two small bakes of embedded objects under embedded light maps, and the page's first steps, removed afterwards; some minutes on two CPU
+cores.
 
     python -m tools.draw_pictures                     # into tools/pictures/
     python -m tools.draw_pictures --out DIR --device cuda:0
@@ -8,6 +9,10 @@ Two small bakes of embedded objects under embedded light maps, removed afterward
 
 from __future__ import annotations
 
+import os
+import re
+import shlex
+import subprocess
 import sys
 import tempfile
 from pathlib import Path
@@ -26,7 +31,8 @@ from synpick_warp.errors import SynpickError
 from tools.options import fail, make_parser
 
 PICTURES = Path(__file__).resolve().parent / "pictures"
-STRIP, PICK = "strip.jpg", "pick.gif"
+PAGE = PICTURES.parents[1] / "configs" / "CELL.md"
+STRIP, PICK, CELL = "strip.jpg", "pick.gif", "cell.jpg"
 COMMON = {"bake.worlds": 1, "bake.episodes": 1, "bop.color_format": "png", "bop.coco": False}
 STRIP_SETTINGS = COMMON | {
     "bake.mode": "move",
@@ -49,6 +55,8 @@ PICK_SETTINGS = COMMON | {
 PANEL = (480, 270)
 """Width and height of an image in the strip [px]."""
 CAPTION_SCALE = 0.5
+CELL_WIDTH, STEPS = 1000, 3
+"""Width of the picture of the cell [px], and blocks of the page that lead to it: files, a mesh, and the cell."""
 GIF_WIDTH, GIF_COLORS, GIF_STRIDE = 400, 96, 2
 """Width [px], palette size, and frames per drawn frame: 7.5 Hz of simulated time."""
 LEAD_OUT = 6
@@ -72,6 +80,7 @@ def main(arguments: list[str] | None = None) -> int:
             print(write_picture(options.out / STRIP, draw_strip(strip)))
             (pick,) = synpick_warp.open(Path(folder) / "pick").values()
             print(write_animation(options.out / PICK, draw_pick(pick)))
+            print(write_picture(options.out / CELL, draw_cell(Path(folder))))
     except SynpickError as error:
         return fail("draw_pictures", error)
     return 0
@@ -129,6 +138,23 @@ def draw_pick(episode: Episode) -> list[Image]:
     frames = [episode.view(frame, camera=1).rgb for frame in range(attempt["frame"], last, GIF_STRIDE)]
     height = round(GIF_WIDTH * frames[0].shape[0] / frames[0].shape[1])
     return [cv2.resize(frame, (GIF_WIDTH, height), interpolation=cv2.INTER_AREA)[..., ::-1] for frame in frames]
+
+
+def draw_cell(folder: Path) -> Image:
+    """Picture of the cell that the first blocks of the page make, in an empty folder.
+
+    Raises:
+        SynpickError: A block failed.
+    """
+    command, root = f'synpick-warp() {{ {shlex.quote(sys.executable)} -m synpick_warp "$@"; }}\n', str(PAGE.parents[1])
+    for language, text in re.findall(r"```(bash|python)\n(.*?)```", PAGE.read_text(encoding="utf-8"), re.DOTALL)[:STEPS]:
+        program = [sys.executable, "-c", text] if language == "python" else ["bash", "-e", "-c", command + text]
+        done = subprocess.run(program, cwd=folder, env=os.environ | {"PYTHONPATH": root}, capture_output=True, text=True)
+        if done.returncode:
+            raise SynpickError(f"a block of {PAGE.name} failed: {done.stderr.strip().splitlines()[-1:]}")
+    with PillowImage.open(folder / "CELL" / "cell.png") as image:
+        picture = np.array(image.convert("RGB"))[..., ::-1]
+    return cv2.resize(picture, (CELL_WIDTH, round(CELL_WIDTH * picture.shape[0] / picture.shape[1])), interpolation=cv2.INTER_AREA)
 
 
 def write_animation(path: Path, frames: list[Image]) -> Path:

@@ -147,12 +147,24 @@ def read_lens(camera: Mapping[str, Any], size: tuple[int, int]) -> LensMap | Non
     return None if made.lens.is_identity else made
 
 
-@functools.lru_cache(maxsize=64)
+@functools.lru_cache(maxsize=4096)
 def make_lens_map(
     model: str, coefficients: tuple[float, ...], intrinsics: tuple[float, float, float, float], size: tuple[int, int]
 ) -> LensMap:
     """Projection through a lens, as of `LensMap`; made once for the same numbers."""
     return LensMap(Lens(model, coefficients), intrinsics, size)
+
+
+def with_matrix(lens: LensMap | None, matrix: np.ndarray, size: tuple[int, int] | None = None) -> LensMap | None:
+    """The same lens before a sensor with another camera matrix (3, 3) [px], and of another size [px] unless None; None: a pinhole.
+
+    Raises:
+        ConfigError: The lens does not cover the image.
+    """
+    if lens is None:
+        return None
+    fx, fy, cx, cy = matrix[[0, 1, 0, 1], [0, 1, 2, 2]].tolist()
+    return make_lens_map(lens.lens.model, lens.lens.coefficients, (fx, fy, cx, cy), size or lens.size)
 
 
 class LensMap:
@@ -182,7 +194,7 @@ class LensMap:
         """
         self.lens, self.size = lens, size
         self._focal, self._center = np.array(intrinsics[:2], float), np.array(intrinsics[2:], float)
-        limit, folds = self._limit()
+        limit, folds = _limit(lens)
         inner = np.abs(self._rays_of_border(0, limit))
         if not (inner <= limit).all():
             raise ConfigError(self._refusal(limit, folds))
@@ -223,20 +235,6 @@ class LensMap:
         """
         places = self.project((_pixel_centers(self.size) - self._center) / self._focal) - 0.5
         return np.ascontiguousarray(np.moveaxis(places, -1, 0), np.float32)
-
-    def _limit(self) -> tuple[float, bool]:
-        """Radius of the largest disc in which the lens is invertible and has no pole, and whether it folds over at its edge."""
-        most = min(np.tan(np.radians(MAX_ANGLE)), self.lens.pole() * (1 - 1e-6))
-        directions = _directions(_ANGLES)
-        # Squared, so that samples are close where those of a long lens are.
-        radii = most * np.linspace(0, 1, _RADII) ** 2
-        for _ in range(4):
-            _, jacobian = self.lens.linearize(radii[:, None, None] * directions)
-            bad = np.nonzero((np.linalg.det(jacobian) <= 0).any(axis=1))[0]
-            if not len(bad):
-                return float(most), False
-            radii = np.linspace(radii[max(bad[0] - 1, 0)], radii[bad[0]], 64)
-        return float(radii[0]), True
 
     def _rays_of_border(self, border: int, limit: float) -> np.ndarray:
         """Radii of the rays of an enlarged image's edge; infinity where no ray within `limit` has such a pixel."""
@@ -330,6 +328,22 @@ class LensMap:
         return float(_BOUND_MARGIN * bend), float(_BOUND_MARGIN / least)
 
 
+@functools.lru_cache(maxsize=64)
+def _limit(lens: Lens) -> tuple[float, bool]:
+    """Radius of the largest disc in which a lens is invertible and has no pole, and whether it folds over at its edge."""
+    most = min(np.tan(np.radians(MAX_ANGLE)), lens.pole() * (1 - 1e-6))
+    directions = _directions(_ANGLES)
+    # Squared, so that samples are close where those of a long lens are.
+    radii = most * np.linspace(0, 1, _RADII) ** 2
+    for _ in range(4):
+        _, jacobian = lens.linearize(radii[:, None, None] * directions)
+        bad = np.nonzero((np.linalg.det(jacobian) <= 0).any(axis=1))[0]
+        if not len(bad):
+            return float(most), False
+        radii = np.linspace(radii[max(bad[0] - 1, 0)], radii[bad[0]], 64)
+    return float(radii[0]), True
+
+
 def _directions(count: int) -> np.ndarray:
     """Unit vectors (count, 2) all around."""
     angle = np.arange(count) * (2 * np.pi / count)
@@ -343,6 +357,16 @@ def _pixel_centers(size: tuple[int, int]) -> np.ndarray:
 
 def _winding(curve: np.ndarray, points: np.ndarray) -> np.ndarray:
     """Winding number of a closed polygon (n, 2) about each of the points (m, 2): how often an invertible map of a disc reaches a point."""
+    # It is the same at all points of a disc about the origin that the polygon does not enter.
+    free = np.min(np.linalg.norm(curve, axis=1)) - np.max(np.linalg.norm(np.diff(curve, axis=0, append=curve[:1]), axis=1))
+    beyond = np.linalg.norm(points, axis=1) >= free
+    found = np.full(len(points), _turns(curve, np.zeros((1, 2)))[0])
+    found[beyond] = _turns(curve, points[beyond])
+    return found
+
+
+def _turns(curve: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """Winding number as of `_winding`, by the edges that a ray from each point crosses."""
     start, stop = curve, np.roll(curve, -1, axis=0)
     above = (start[:, 1] <= points[:, None, 1]) & (stop[:, 1] > points[:, None, 1])
     below = (start[:, 1] > points[:, None, 1]) & (stop[:, 1] <= points[:, None, 1])

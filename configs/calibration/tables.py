@@ -2,24 +2,25 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from synpick_warp.configs.calibration.files import HALVES, INTEGERS, MODELS, Calibration, read_calibration
 from synpick_warp.configs.calibration.sensor_presets import SENSORS, sensor_camera
+from synpick_warp.configs.fields import PATH_RULE
 from synpick_warp.errors import ConfigError, format_value, suggest
 
 _INTRINSICS = ("matrix", "fov", "distortion")
 """Keys that a file or a sensor stands for, with `model` and `resolution`."""
 
 
-def fill_tables(tables: object, folder: Path, source: str) -> object:
+def fill_tables(tables: object, source: str) -> object:
     """Replace `file` or `sensor`, and `pixel_center`, in the content of [[camera]] tables; anything that is no such table is left as it is.
 
     Args:
         tables: Value of `camera` as parsed from TOML.
-        folder: Folder to which names of files are relative.
         source: Where the tables come from, for messages.
 
     Raises:
@@ -27,10 +28,10 @@ def fill_tables(tables: object, folder: Path, source: str) -> object:
     """
     if not isinstance(tables, list):
         return tables
-    return [_fill(f"camera[{index}]", table, folder, source) if isinstance(table, dict) else table for index, table in enumerate(tables)]
+    return [_fill(f"camera[{index}]", table, source) if isinstance(table, dict) else table for index, table in enumerate(tables)]
 
 
-def _fill(key: str, table: Mapping[str, Any], folder: Path, source: str) -> dict[str, Any]:
+def _fill(key: str, table: Mapping[str, Any], source: str) -> dict[str, Any]:
     """One table with numbers."""
     rest = {name: value for name, value in table.items() if name not in ("file", "sensor", "pixel_center")}
     center = table.get("pixel_center")
@@ -47,7 +48,9 @@ def _fill(key: str, table: Mapping[str, Any], folder: Path, source: str) -> dict
     model = table.get("model", "")
     if model not in ("", *MODELS):
         raise ConfigError(f"{key}.model is {format_value(model)} {source}; allowed: {', '.join(MODELS)}")
-    found = _sensor(key, table["sensor"], source) if named == ["sensor"] else read_calibration(folder / table["file"], model, center)
+    if named == ["file"] and not os.path.lexists(table["file"]):
+        raise ConfigError(f"{key}.file: there is no file {table['file']}; {PATH_RULE}")
+    found = _sensor(key, table["sensor"], source) if named == ["sensor"] else read_calibration(Path(table["file"]), model, center)
     size = [found.width, found.height]
     if found.width == 0 and "resolution" not in table:
         raise ConfigError(f"{key}.file does not say the image's size {source}; set {key}.resolution")

@@ -11,6 +11,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
+from synpick_warp.configs.fields import PATH_RULE
 from synpick_warp.errors import CatalogError
 from synpick_warp.scenes.assets.asset_files import check_file_name
 from synpick_warp.scenes.assets.meshes import SUFFIXES
@@ -58,7 +59,7 @@ def list_models(folder: Path, report: Say, fault: Fault) -> list[ModelFile]:
     """
     if not folder.is_dir():
         raise CatalogError(
-            f"models folder {folder}: no such folder; give a BOP model folder, or a folder of PLY, OBJ, glTF, STL or STEP files"
+            f"models folder {folder}: no such folder; give one of BOP models, or of PLY, OBJ, glTF, STL or STEP files; {PATH_RULE}"
         )
     try:
         entries = sorted(entry for entry in folder.iterdir() if not entry.name.startswith("."))

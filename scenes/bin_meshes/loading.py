@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from pathlib import Path
 
-from synpick_warp.configs.load import load_config, override_config
+from synpick_warp.configs.bins import BinRow
+from synpick_warp.configs.load import load_config
 from synpick_warp.configs.schema import Config
 
 
@@ -24,10 +25,14 @@ def load_settings(
     Raises:
         ConfigError: As of `load_config`, or a mesh cannot be used as a bin.
     """
-    config = load_config(preset_or_file, settings, source=source, splits=splits)
-    if not any(row.file for row in config.bin):
-        return config
+    return load_config(preset_or_file, settings, source=source, splits=splits, measure=_measure)
+
+
+def _measure(rows: tuple[BinRow, ...]) -> dict[str, tuple[BinRow, ...]]:
+    """As `measure_bins`."""
+    if not any(row.file for row in rows):
+        return {}
     # Readers of meshes take a while to import.
     from synpick_warp.scenes.bin_meshes.reading import measure_bins
 
-    return override_config(config, measure_bins(config.bin))
+    return measure_bins(rows)

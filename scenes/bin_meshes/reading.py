@@ -11,6 +11,7 @@ import numpy as np
 from scipy.spatial import ConvexHull
 
 from synpick_warp.configs.bins import AXES, FILE, BinRow, MeasuredBin
+from synpick_warp.configs.fields import PATH_RULE
 from synpick_warp.configs.objects import UNITS
 from synpick_warp.errors import CatalogError, ConfigError, SynpickError
 from synpick_warp.scenes.assets.appearance import FileMaterial
@@ -79,7 +80,7 @@ def read_bin(row: BinRow) -> BinModel:
     try:
         stat = path.stat()
     except OSError as error:
-        raise ConfigError(f"bin {row.name}: {path} cannot be read ({error.strerror})") from error
+        raise ConfigError(f"bin {row.name}: {path} cannot be read ({error.strerror}); {PATH_RULE}") from error
     return _read(replace(row, measured=None, weight=1.0), (stat.st_mtime_ns, stat.st_size))
 
 

@@ -192,9 +192,7 @@ def print_profile(console: Console, recorder: Recorder) -> None:
 def _listing(rows: Sequence[EpisodeRow]) -> Table:
     """Table of episodes, one line each: mode, ending, resamples, frames, time, and attempts if there are any."""
     columns = ["episode", "mode", "ending", "resampled", "frames", "time"]
-    cells = [
-        [str(row.episode), row.mode, row.ending.sentence, str(row.arrangement), str(row.frames), _duration(row.seconds)] for row in rows
-    ]
+    cells = [[str(row.episode), row.mode, row.sentence, str(row.arrangement), str(row.frames), _duration(row.seconds)] for row in rows]
     if any(row.attempts for row in rows):
         columns += ["attempts", "picked", "lost"]
         for row, line in zip(rows, cells, strict=True):
@@ -214,12 +212,11 @@ def _counts(summary: BakeSummary) -> Table:
     episodes: Counter = Counter()
     frames: Counter = Counter()
     for row in summary.episodes:
-        kind = row.mode, row.ending
+        kind = row.mode, row.sentence
         episodes[kind] += 1
         frames[kind] += row.frames
     for kind in sorted(episodes, key=lambda kind: (kind[0], -episodes[kind])):
-        mode, ending = kind
-        table.add_row(mode, ending.sentence, f"{episodes[kind]:,}", f"{frames[kind]:,}")
+        table.add_row(*kind, f"{episodes[kind]:,}", f"{frames[kind]:,}")
     return table
 
 

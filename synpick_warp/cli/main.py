@@ -36,6 +36,7 @@ from synpick_warp.cli.options import (
 )
 from synpick_warp.cli.streams import SafeStreams, StreamError, describe_fault
 from synpick_warp.configs.check import describe_allowed
+from synpick_warp.configs.fields import PATH_RULE
 from synpick_warp.configs.load import (
     COMMAND_LINE,
     DEFAULT_PRESET,
@@ -356,10 +357,11 @@ def _check_inputs(models: str, lights: str) -> None:
     """
     if models and not os.path.isdir(models):
         raise CatalogError(
-            f"there is no models folder {models}; --models takes a folder of BOP models or of PLY, OBJ, glTF, STL or STEP files"
+            f"there is no models folder {models}; --models takes a folder of BOP models or of PLY, OBJ, glTF, STL or STEP files; "
+            f"{PATH_RULE}"
         )
     if lights and not os.path.isdir(lights):
-        raise LightError(f"there is no lights folder {lights}; --lights takes a folder of .hdr maps and sIBL sets")
+        raise LightError(f"there is no lights folder {lights}; --lights takes a folder of .hdr maps and sIBL sets; {PATH_RULE}")
 
 
 def _bake(config: Config, out: Path, shard: tuple[int, int], splits: Sequence[str], devices: Sequence[str] = ()) -> int:

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from synpick_warp.configs.cameras import COLOR
 from synpick_warp.configs.schema import Config
 from synpick_warp.configs.splits import DataLayout
 from synpick_warp.exporters.registry import Needs
@@ -175,8 +176,8 @@ def _add_stream(stages: Stages, device: wp.Device, needs_images: bool, depth_fil
     """Add a stream of views to stages; arguments as of `host_images`."""
     config, table, tick_time = stages.config, stages.light_table, stages.tick_time
     rings = [
-        ViewRing(group, config.render.layers, device, host_images(config.bop, group.sizes["row"], device, needs_images, depth_files))
-        for group in stages.groups
+        ViewRing(group, group_layers(config, index), device, host_images(config.bop, group.sizes["row"], device, needs_images, depth_files))
+        for index, group in enumerate(stages.groups)
     ]
     stream = FrameStream(rings, tick_time, stages.object_ids, table, device, config.cell.recorded, stages.episode_cameras)
     return Factory(**vars(stages), stream=stream, log=stages.make_log())
@@ -213,14 +214,22 @@ def build_stages(
     return Stages(config, catalog, episode_cameras, lights, simulation, groups, catalog.object_ids, table)
 
 
+def group_layers(config: Config, index: int) -> tuple[str, ...]:
+    """Layers of a group of cameras."""
+    return config.rig.chosen(config.rig.groups[index][0], config.render.layers)
+
+
 def _build_group(config: Config, scene: RenderScene, cameras: tuple[Camera, ...], index: int) -> CameraGroup:
     """Renderer of a group of cameras, for `bake.worlds` worlds; they share all constant data but the cameras."""
     indices, worlds, objects = config.rig.groups[index], config.bake.worlds, config.arrangement.max_objects
     sizes = view_sizes(config.render, config.rig, worlds, objects, scene.device, index)
     scene = with_cameras(scene, tuple(cameras[camera] for camera in indices))
-    renderer = make_renderer(config, scene, objects, sizes["view"], history_count(config.rig, worlds, index))
     rig, first = config.rig, indices[0]
-    return CameraGroup(indices, sizes, renderer, rig.is_placed(first), rig.moves(first), rig.every[first])
+    chosen = replace(config, render=replace(config.render, layers=group_layers(config, index)))
+    colors = rig.writes(first, COLOR)
+    renderer = make_renderer(chosen, scene, objects, sizes["view"], history_count(rig, worlds, index), colors)
+    lenses = tuple(cameras[camera].lens for camera in indices) if rig.draws_lens(first) else ()
+    return CameraGroup(indices, sizes, renderer, rig.is_placed(first), rig.moves(first), rig.every[first], colors, lenses)
 
 
 def _fit_to_catalog(config: Config, catalog: Catalog, bins: Sequence[Bin], device: wp.Device, progress: Progress) -> Config:
@@ -245,11 +254,11 @@ def _fit_to_catalog(config: Config, catalog: Catalog, bins: Sequence[Bin], devic
     return fitted
 
 
-def make_renderer(config: Config, scene: RenderScene, instances: int, views: int, histories: int = 0) -> Renderer:
+def make_renderer(config: Config, scene: RenderScene, instances: int, views: int, histories: int = 0, colors: bool = True) -> Renderer:
     """Create the renderer of a bake from its sections of the settings, for `instances` instances of a world and at most `views` views of a
     batch.
 
-    `histories` as in `Renderer`.
+    `histories` and `colors` as in `Renderer`.
     """
     return Renderer(
         scene,
@@ -261,4 +270,5 @@ def make_renderer(config: Config, scene: RenderScene, instances: int, views: int
         instances=instances,
         views=views,
         histories=histories,
+        colors=colors,
     )

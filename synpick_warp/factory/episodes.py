@@ -53,12 +53,16 @@ class EpisodeRow(NamedTuple):
     cameras: dict[str, Any] | None = None
     """Record of the cameras by name, as `EpisodeCameras.record` has it; None, and no key: all are those of the settings."""
 
+    @property
+    def sentence(self) -> str:
+        """How the episode ended, of the bin that it has."""
+        return self.ending.sentence.replace("tote", bin_noun(self.bin["name"])) if self.bin else self.ending.sentence
+
     def as_json(self) -> dict[str, Any]:
         """Row as the dictionary of a line of episodes.jsonl."""
         row = {**self._asdict(), "ending": self.ending.name.lower()}
         row = {name: value for name, value in row.items() if name not in _OPTIONAL or value != _OPTIONAL[name]}
-        sentence = self.ending.sentence.replace("tote", bin_noun(self.bin["name"])) if self.bin else self.ending.sentence
-        return {**row, "sentence": sentence}
+        return {**row, "sentence": self.sentence}
 
     @classmethod
     def from_json(cls, row: Mapping[str, Any]) -> EpisodeRow:

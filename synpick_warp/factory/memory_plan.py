@@ -14,8 +14,10 @@ from typing import Any
 
 import warp as wp
 
+from synpick_warp.configs.cameras import COLOR
 from synpick_warp.configs.fields import INT32_MAX
 from synpick_warp.configs.modes import may_pick
+from synpick_warp.configs.randomize import Randomize
 from synpick_warp.configs.schema import Config, Perception, Physics
 from synpick_warp.errors import ConfigError, SynpickError, format_value
 from synpick_warp.exporters.registry import Needs
@@ -27,6 +29,7 @@ from synpick_warp.stages.host_copies import HostImages, host_images
 from synpick_warp.stages.online.batches import allocate_slot
 from synpick_warp.stages.perception.images import allocate_batch, count_views
 from synpick_warp.stages.perception.plan import allocate_votes
+from synpick_warp.stages.render.looks import allocate_materials, materials_of_view
 from synpick_warp.stages.render.raster import allocate_background, allocate_visibility
 from synpick_warp.stages.render.renderer import Renderer
 from synpick_warp.stages.render.scene import blank_scene
@@ -36,7 +39,7 @@ from synpick_warp.stages.sim.step_log import allocate_record, record_sizes
 from synpick_warp.stages.sim.worlds import world_sizes
 from synpick_warp.stages.stream import TickReader
 from synpick_warp.stages.tick_queue import allocate_rings, queue_lead, record_bytes
-from synpick_warp.stages.view_ring import RING, allocate_ring, history_count, view_sizes
+from synpick_warp.stages.view_ring import RING, allocate_lenses, allocate_ring, history_count, view_sizes
 from synpick_warp.system.hardware.device import pick_device
 from synpick_warp.system.hardware.free_memory import free_device_memory, free_host_memory
 
@@ -99,13 +102,18 @@ def plan_memory(config: Config, device: wp.Device, writers: int = 1) -> list[Ter
     terms = [*_simulation(sizes, config.trajectory.steps if needs.physics else None, device)]
     for index, group in enumerate(rig.groups):
         count, views = len(group), view_sizes(config.render, rig, worlds, objects, device, index)
-        size, sections = rig.sizes[group[0]], (config.render, config.effects, config.depth_sensor)
+        size, layers = rig.sizes[group[0]], rig.chosen(group[0], config.render.layers)
+        sections = replace(config.render, layers=layers), config.effects, config.depth_sensor
         with dry_run() as arrays:
             scene = blank_scene(count, *size, device)
             counts = {"instances": objects, "views": views["view"], "histories": history_count(rig, worlds, index)}
-            Renderer(scene, *sections, seed=0, depth_scale=1.0, **counts)
+            Renderer(scene, *sections, seed=0, depth_scale=1.0, colors=rig.writes(group[0], COLOR), **counts)
+            if config.randomize != Randomize():
+                allocate_materials(views["view"] * materials_of_view(objects), 1, device)
+            if rig.draws_lens(group[0]):
+                _ = [allocate_lenses(views, device) for _ in range(RING if device.is_cuda else 1)]
         host = host_images(config.bop, size[1], device, needs.images, needs.depth_files) if writers else None
-        terms += _images(arrays, views, count, config.render.layers, host, device)
+        terms += _images(arrays, views, count, layers, host, device)
     if may_pick(config.bake, config.splits):
         terms.append(_perception(config.perception, worlds, objects, device))
     terms += _newton(config.physics, worlds, device.is_cuda)

@@ -240,7 +240,7 @@ class _Run:
             self.summary.remedies[row.ending] = advice
         if is_resampled(row, tries):
             self.summary.take_resample(row.ending)
-            note = f"episode {row.episode}, arrangement {row.arrangement + 1}: {row.ending.sentence}"
+            note = f"episode {row.episode}, arrangement {row.arrangement + 1}: {row.sentence}"
             self.progress.note(note + (f"; {advice}" if advice else ""))
             self.exporters.end_episode(end, lambda: None)
         else:

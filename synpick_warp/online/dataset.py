@@ -17,6 +17,7 @@ from typing import Any
 import torch  # pyright: ignore[reportMissingImports]
 from torch.utils.data import IterableDataset, get_worker_info  # pyright: ignore[reportMissingImports]
 
+from synpick_warp.configs.cameras import COLOR
 from synpick_warp.configs.check import to_index
 from synpick_warp.configs.schema import Config
 from synpick_warp.configs.splits import DataLayout
@@ -127,7 +128,14 @@ class StreamDataset(IterableDataset):
         if unknown:
             raise TypeError(f"StreamDataset has no argument {unknown[0]!r}; settings have their full key: {{'physics.step': 2e-3}}")
         self.config = resolve_settings(config, settings or {}, arguments, bool(splits))
+        rig = self.config.rig
+        self.selection = Selection(cameras, stride).resolve(len(rig))
         for name in fields:
+            image = COLOR if name == "rgb" else name
+            if image in (COLOR, *self.config.render.layers) and not all(
+                rig.writes(camera, image) for camera in self.selection.cameras or ()
+            ):
+                raise ConfigError(f"the field {name} is not among the modalities of all cameras; choose others, by cameras or fields")
             if name not in FIELDS and name not in self.config.render.layers:
                 known = ", ".join((*FIELDS, *self.config.render.layers))
                 raise ConfigError(f"there is no field {name}; fields: {known}; others are layers that render.layers names")
@@ -138,7 +146,6 @@ class StreamDataset(IterableDataset):
         self.fields, self.batched, self.shuffle, self.transform = tuple(fields), batched, shuffle, transform
         self.episodes = range(episodes) if isinstance(episodes, int) else episodes
         self.fresh, self.shard, self.splits = fresh, shard, tuple(splits)
-        self.selection = Selection(cameras, stride).resolve(len(self.config.rig))
         choose_episodes(DataLayout.of(self.config), self.episodes, shard, self.splits)
         self._epoch = torch.zeros((), dtype=torch.int64).share_memory_()  # Workers that live through all epochs see it change.
 

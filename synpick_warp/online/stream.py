@@ -22,7 +22,7 @@ from synpick_warp.codes import Phase
 from synpick_warp.configs.schema import Config
 from synpick_warp.configs.splits import DataLayout
 from synpick_warp.errors import ConfigError
-from synpick_warp.factory.assembly import Stages, build_smallest, build_stages, compiling_if_cold
+from synpick_warp.factory.assembly import Stages, build_smallest, build_stages, compiling_if_cold, group_layers
 from synpick_warp.factory.episodes import BakeSummary, episode_row, is_resampled, remedy
 from synpick_warp.factory.memory_plan import check_episodes, check_memory, explain_shortage, plan_memory
 from synpick_warp.factory.sizes import fit_to_device
@@ -179,7 +179,7 @@ class Producer:
             row = episode_row(layout, config.cell.recorded, self.stages.tick_time, self.stages.draws, report, world, record)
             if is_resampled(row, config.settle.tries):
                 self.summary.take_resample(row.ending)
-                self.progress.note(f"episode {row.episode}, arrangement {row.arrangement + 1}: {row.ending.sentence}")
+                self.progress.note(f"episode {row.episode}, arrangement {row.arrangement + 1}: {row.sentence}")
             else:
                 self.summary.take_episode(row, record)
             if advice := remedy(row.ending, config.physics, config.perception, config.arrangement, config.settle):
@@ -212,7 +212,8 @@ def open_stream(
         smallest = partial(build_smallest, config, device, SilentProgress(), False, True)
         with compiling_if_cold(smallest, device, progress):
             stages = build_stages(config, device, progress, indices)
-        rings = tuple(BatchRing(group, config.render.layers, config.bop.depth_scale) for group in stages.groups)
+        scale = config.bop.depth_scale
+        rings = tuple(BatchRing(group, group_layers(config, index), scale) for index, group in enumerate(stages.groups))
     return ViewStream(Producer(stages, rings, selection, BakeSummary(len(indices)), progress))
 
 

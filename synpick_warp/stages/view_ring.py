@@ -10,16 +10,18 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from synpick_warp.configs.calibration.lens import LensMap, with_matrix
 from synpick_warp.configs.rig import Rig
 from synpick_warp.configs.schema import Render
-from synpick_warp.stages.arrays import allocate, dry_run
+from synpick_warp.kernels.render.visibility.lens import NUMBERS
+from synpick_warp.stages.arrays import allocate, allocate_struct, dry_run
 from synpick_warp.stages.buffers import LayerBuffers, Snapshot, ViewBuffers, view_buffer_sizes
 from synpick_warp.stages.encoding.jpeg import Compressor, JpegBuffers, JpegScratch, jpeg_sizes
 from synpick_warp.stages.encoding.png import DepthBuffers, DepthEncoder, DepthScratch, allocate_depth_scratch, depth_sizes
 from synpick_warp.stages.host_copies import DeviceImages, HostCopy, HostImages
 from synpick_warp.stages.render.mask_runs import BoundaryBuffers, BoundaryScratch, boundary_sizes, list_boundaries
 from synpick_warp.stages.render.renderer import Renderer
-from synpick_warp.stages.render.view_setup import PlacedCameras, allocate_view_cameras, make_views, place_cameras
+from synpick_warp.stages.render.view_setup import LENSES, PlacedCameras, allocate_view_cameras, make_views, place_cameras, place_lenses
 from synpick_warp.stages.render_streams import RenderStreams
 from synpick_warp.stages.timing import scope
 
@@ -43,7 +45,7 @@ def views_per_batch(render: Render, rig: Rig, worlds: int, device: wp.Device, gr
         return views
     width, height = rig.sizes[cameras[0]]
     with dry_run() as layers:
-        allocate(LayerBuffers, {"view": 1, "row": height, "column": width}, device, render.layers)
+        allocate(LayerBuffers, {"view": 1, "row": height, "column": width}, device, rig.chosen(cameras[0], render.layers))
     each = width * height * PIXEL_BYTES + sum(layer.row[3] for layer in layers)
     pixels = sum(map(math.prod, rig.sizes))
     return max(1, min(BATCH_BYTES * views * width * height // (pixels * each), views * worlds))
@@ -80,6 +82,11 @@ class CameraGroup:
     """Whether the cameras move within an episode, as of `Rig.moves`."""
     every: int = 1
     """Frames from one picture to the next."""
+    colors: bool = True
+    """Whether they have colour images."""
+    lenses: tuple[LensMap | None, ...] = ()
+    """Lens of each camera (None: a pinhole) if views have lenses of their own, as episodes draw their camera matrices; none: the scene has
+    those of all views."""
 
     def slots(self, camera: np.ndarray) -> np.ndarray:
         """Row of cameras in the renderer's scene (view) int32, by their indices (view)."""
@@ -91,6 +98,8 @@ class CameraGroup:
             return None
         scene, views = self.renderer.scene, self.sizes["view"]
         now, last = (allocate_view_cameras(views, scene.device, scene.cameras) for _ in range(2))
+        if self.lenses:
+            now.lenses = allocate_lenses(self.sizes, scene.device)
         return PlacedCameras(now, last if self.moves else now)
 
     def place(self, cameras: PlacedCameras | None, camera: np.ndarray, placed: Placements) -> None:
@@ -102,6 +111,14 @@ class CameraGroup:
         place_cameras(cameras.now, self.renderer.scene, self.slots(camera), now)
         if self.moves:
             place_cameras(cameras.last, self.renderer.scene, self.slots(camera), last)
+        if self.lenses:
+            drawn = [with_matrix(self.lenses[slot], matrix) for slot, matrix in zip(self.slots(camera), now["matrix"], strict=True)]
+            place_lenses(cameras.now, self.renderer.scene, self.slots(camera), drawn)
+
+
+def allocate_lenses(sizes: dict[str, int], device: wp.Device) -> Any:
+    """Allocate a lens of its own for each view of a batch, whose extents are those of `view_sizes`."""
+    return allocate_struct(LENSES, sizes | {"number": int(NUMBERS)}, device)
 
 
 @dataclass(frozen=True, eq=False)
@@ -205,7 +222,7 @@ class ViewRing:
         """
         batch = self.slots[slot]
         list_boundaries(self.boundary_scratch, count, batch.images, batch.boundaries)
-        if self.compressor is not None and batch.jpeg is not None:
+        if self.compressor is not None and batch.jpeg is not None and self.group.colors:
             self.compressor.compress(count, batch.images, batch.jpeg)
         if self.depth_encoder is not None and batch.depth is not None:
             self.depth_encoder.encode(batch.images.depth, count, batch.depth)

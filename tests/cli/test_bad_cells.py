@@ -11,6 +11,7 @@ import trimesh
 
 from synpick_warp.stages.sim.simulate import Simulation
 from tests.builders import mistake
+from tests.worlds.bin_meshes import sloped_bin
 from tests.worlds.model_files import exported, put
 
 K = "matrix = [[275.0, 0.0, 163.8], [0.0, 274.6, 117.5], [0.0, 0.0, 1.0]]"
@@ -50,7 +51,7 @@ CASES = {
     "singular file": (FILE.replace("FILE", "singular.yaml"), "singular.yaml (OpenCV): the focal lengths are 0 and 0; allowed: above 0"),
     "transposed file": (FILE.replace("FILE", "transposed.yaml"), "transposed.yaml (OpenCV): the camera matrix is written column by column"),
     "file without numbers": (FILE.replace("FILE", "parts/void.stl"), "parts/void.stl is no calibration file"),
-    "no file": (FILE.replace("FILE", "gone.yaml"), "there is no file gone.yaml"),
+    "no file": (FILE.replace("FILE", "gone.yaml"), "gone.yaml; a path in a file of settings is relative to that file"),
     "fold inside": (lens(-2.0, 0.0, 0.0, 0.0, 0.0), "camera[0].distortion is [-2.0, 0.0, 0.0, 0.0, 0.0] in cell.toml; allowed: that of "),
     "fold of a file": (FILE.replace("FILE", "folds.yaml"), "camera[0].distortion is "),
     "fold of the rational model": (lens(0.0, 0.0, 0.0, 0.0, 0.0, 8.0, 0.0, 0.0), "camera[0].distortion is "),
@@ -64,6 +65,8 @@ CASES = {
     "compartments without room": (BIN + "floor_size = [0.1, 0.1]\ncompartments = [6, 6]\n", "bin[0].compartments is [6, 6]"),
     "dividers above the rim": (BIN + "compartments = [2, 1]\ndivider_height = 0.5\n", "bin[0].divider_height is 0.5"),
     "corners without room": (BIN + "floor_size = [0.035, 0.319]\n", "bin a: floor_size: a length of 0.035 m is too small"),
+    "camera below a mesh's floor": (CAMERA + BIN + 'file = "bin.stl"\nplace = "file"\n',
+                                    "in cell.toml; allowed: positions above the bin's floor, z > 1.5"),
     "own bins without a table": ('[bins]\nkind = "own"\n', "bins.kind is "),
     "no weight": (BIN + "weight = 0.0\n", "bin[0].weight is 0.0"),
     "tote without floor": ("[tote]\nfloor_size = [0.0, 0.0]\n", "tote.floor_size is [0.0, 0.0]"),
@@ -72,11 +75,11 @@ CASES = {
                                        "rim_size = [0.07, 0.07]\n"), "long: too large for the bin"),
     "part larger than a compartment": (parts('[objects]\nunit = "mm"\n' + BIN + "compartments = [6, 6]\n"), "long: too large for the bin"),
     "part larger than the budget": (parts('[objects]\nunit = "mm"\n[arrangement]\nvolume = 1e-5\n'), "arrangement.volume is 1e-05 m³"),
-    "no parts": ('[bake]\nmodels = "empty"\n', "models folder empty: it contains no models"),
+    "no parts": ('[bake]\nmodels = "empty"\n', "empty: it contains no models"),
     "texture that is cut": (looks('bin_textures = "cut"'), "cut"),
     "texture that is text": (looks('table_textures = "text"'), "text"),
-    "no textures": (looks('bin_textures = "empty"'), "randomize.bin_textures: the folder empty has 0 images"),
-    "no folder of textures": (looks('table_textures = "gone"'), "randomize.table_textures: the folder gone cannot be read"),
+    "no textures": (looks('bin_textures = "empty"'), "empty has 0 images"),
+    "no folder of textures": (looks('table_textures = "gone"'), "gone cannot be read: No such file or directory; a path in a file "),
     "range beyond what is allowed": (looks("object_roughness = { uniform = [0.5, 1.5] }"), "randomize.object_roughness is "),
     "value beyond": (looks("bin_metallic = 2.0"), "randomize.bin_metallic is 2.0"),
     "choice beyond": (looks("lamps = { choice = [0, 9] }"), "randomize.lamps is "),
@@ -106,6 +109,7 @@ def test_a_cell_that_cannot_be_is_one_line(tmp_path, monkeypatch, case):
     put(Path("cell.toml"), f'preset = "smoke"\n{text}'.encode())
     put(Path("parts/long.stl"), exported(trimesh.creation.box((90.0, 80.0, 70.0)), "stl"))
     put(Path("parts/void.stl"), b"") if case == "file without numbers" else None
+    put(Path("bin.stl"), exported(sloped_bin().apply_translation((0.0, 0.0, 1.5)), "stl")) if "bin.stl" in text else None
     put(Path("cut/a.png"), picture()[:3000])
     put(Path("text/a.png"), b"no picture")
     Path("empty").mkdir()

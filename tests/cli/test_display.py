@@ -51,6 +51,14 @@ def test_a_bake_that_picked_tells_of_attempts():
     assert expected in text.splitlines()
 
 
+@pytest.mark.parametrize("many", [False, True])
+def test_endings_are_those_of_the_bin(many):
+    given = EpisodeRow(0, 0, Ending.EMPTIED, 9, 1.0, "pick", 3, 3, 3, 0, 0, bin={"name": "kanban"})
+    text = printed(BakeSummary(100, [given] * (100 if many else 1)))
+    assert "no object is left in the bin" in text
+    assert "tote" not in text
+
+
 def test_a_summary_names_the_settings_that_cure_its_endings():
     text = printed(
         BakeSummary(1, [row(0, 1, Ending.FINISHED, 9, 1.0)], remedies={Ending.PERCEPTION_OVERFLOW: "raise perception.contour_points (16)"})

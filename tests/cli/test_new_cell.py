@@ -55,7 +55,7 @@ def drawn(monkeypatch) -> list[str]:
     """Pictures are not rendered; titles of those asked for."""
     titles: list[str] = []
 
-    def draw(file, settings, name, out, say):
+    def draw(file, name, out, say):
         titles.append(name)
         out.write_bytes(b"")
 
@@ -162,6 +162,8 @@ def test_parts_are_copied_with_their_unit(tmp_path, drawn, offset, center):
     assert config.bake.models == str(tmp_path / "cell" / "parts")
     assert (config.objects.unit, config.objects.center, config.objects.symmetries) == ("mm", center, "detect")
     assert drawn == ["cell/cell.toml"]
+    (tmp_path / "cell").rename(tmp_path / "moved")
+    assert load_config(tmp_path / "moved" / "cell.toml").bake.models == str(tmp_path / "moved" / "parts")
 
 
 def test_a_large_part_has_its_volume_and_a_folder_is_named(tmp_path, drawn):
@@ -273,7 +275,7 @@ def test_mistakes_are_one_line_and_leave_nothing(tmp_path, monkeypatch, drawn, a
 
 @pytest.mark.parametrize("exists", [False, True])
 def test_nothing_is_half_written(tmp_path, monkeypatch, exists):
-    def fail(file, settings, name, out, say):
+    def fail(file, name, out, say):
         raise LightError("no light")
 
     monkeypatch.setattr(new_cell, "draw_cell", fail)
@@ -282,6 +284,6 @@ def test_nothing_is_half_written(tmp_path, monkeypatch, exists):
         folder.mkdir(parents=True)
     assert mistake("new-cell", folder) == "no light"
     assert list(tmp_path.rglob("*")) == ([folder.parent, folder] if exists else [])
-    monkeypatch.setattr(new_cell, "draw_cell", lambda file, settings, name, out, say: out.write_bytes(b""))
+    monkeypatch.setattr(new_cell, "draw_cell", lambda file, name, out, say: out.write_bytes(b""))
     assert run("new-cell", folder).code == 0
     assert sorted(path.name for path in folder.iterdir()) == ["cell.png", "cell.toml"]

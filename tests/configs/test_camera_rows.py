@@ -114,6 +114,10 @@ def test_what_is_refused_and_said(tmp_path, text, words):
     assert "\n" not in str(caught.value)
 
 
+CLOSE = "distortion = [-0.25, 0, 0, 0]\n[camera.jitter]\n"
+"""A lens that folds over 4 % farther from the axis than the image's corners are."""
+
+
 @pytest.mark.parametrize(
     ("text", "words"),
     [
@@ -135,6 +139,12 @@ def test_what_is_refused_and_said(tmp_path, text, words):
             "less, so that every draw has a point that lets each camera see the tote",
         ),
         ("[camera.jitter]\ncenter = { uniform = [-170, 0] }\n", "less, so that every draw has a principal point cx, cy inside"),
+        # Close to the fold of the lens: over it by a shorter focal length, and by both ends at once.
+        (
+            f"{CLOSE}focal_length = {{ normal = [0, 0.015] }}\n",
+            "less, so that every draw has a lens that covers the image, but distortion ",
+        ),
+        (f"{CLOSE}focal_length = {{ choice = [-0.02, 0] }}\ncenter = {{ uniform = [-3, 3] }}\n", "camera[0].jitter.center is "),
     ],
 )
 def test_jitter_that_is_refused(tmp_path, text, words):
@@ -188,6 +198,16 @@ def test_jitter_is_kept_and_makes_a_group_of_its_own(tmp_path):
     again.write_text(config_to_toml(config))
     assert load_config(str(again)) == config
     assert config.rig.groups == ((0,), (1,))
+
+
+def test_cameras_are_rendered_together_where_they_are_alike(tmp_path):
+    def groups(*more: str) -> tuple[tuple[int, ...], ...]:
+        return load(tmp_path, "".join(LEFT.replace('"left"', f'"c{index}"') + text for index, text in enumerate(more))).rig.groups
+
+    lens, drawn = "distortion = [-0.1, 0, 0, 0]\n", "jitter.center = { uniform = [-1, 1] }\n"
+    assert groups("", lens, "") == ((0, 1, 2),)
+    assert groups(drawn, lens + drawn, drawn, lens) == ((0, 2), (1,), (3,))
+    assert groups('modalities = ["color"]\n', 'modalities = ["depth"]\n', 'modalities = ["color", "masks"]\n') == ((0, 2), (1,))
 
 
 def test_options_that_would_have_no_effect_are_refused(tmp_path):

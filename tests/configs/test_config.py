@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import json
+import os
 import re
 from pathlib import Path
 
@@ -392,6 +393,26 @@ def test_presets_survive_writing_and_reading(tmp_path, name, comments):
     assert ("[N·s/m]" in text) == comments
 
 
+PATHS = sorted(
+    f"{section}.{name}" for section, kind in sections().items() for name, (item, _) in settings_of(kind).items() if item.metadata["path"]
+)
+
+
+def test_paths_in_a_file_are_relative_to_it_and_others_to_the_current_folder(tmp_path, monkeypatch):
+    """Which both hold where a written configuration is read."""
+    lines = {key: f'[{key.split(".")[0]}]\n{key.split(".")[1]} = "a/../{key}"\n' for key in PATHS}
+    (tmp_path / "cell").mkdir()
+    monkeypatch.chdir(tmp_path)
+    for key in PATHS:
+        Path("cell/cell.toml").write_text(f"[render]\ntable_size = [1, 1]\n{lines[key]}")
+        others = {other: other for other in PATHS if other != key}
+        config = load_config("cell/cell.toml", others)
+        Path("cell/written.toml").write_text(config_to_toml(config))
+        for found, expected in ((config, others), (load_config("cell/written.toml"), {other: str(tmp_path / other) for other in others})):
+            assert {name: found.value(name) for name in PATHS} == expected | {key: str(tmp_path / "cell" / key)}
+    assert len(PATHS) == 6
+
+
 TEXT = st.text(st.characters(exclude_categories=["Cs"]), max_size=20)
 
 
@@ -407,7 +428,8 @@ def values(item: dataclasses.Field, kind: object) -> st.SearchStrategy:
         return st.floats(low, rules["high"], exclude_min=rules["above"] is not None, allow_nan=False, allow_infinity=False)
     if kind is int:
         return st.integers(rules["low"], min(rules["high"] or 2**63 - 1, 2**63 - 1))
-    return st.booleans() if kind is bool else TEXT
+    text = TEXT.map(lambda name: name and os.path.abspath(name)) if rules["path"] else TEXT
+    return st.booleans() if kind is bool else text
 
 
 def free_settings() -> dict[str, st.SearchStrategy]:

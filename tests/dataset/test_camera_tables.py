@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,48 +15,33 @@ import trimesh
 import zarr
 
 import synpick_warp
-from synpick_warp.configs.load import load_config
 from synpick_warp.configs.schema import FORMATS
-from synpick_warp.factory.pipeline import run_bake
-from synpick_warp.system.progress import SilentProgress
-from tests.builders import STIRRING, boxes, once, run
-from tests.worlds.small_worlds import settings
+from tests.builders import once, run
+from tests.worlds.cells import SIDE, bake_cell, camera_matrix, cell_config, make_camera
 
-CELL = """preset = "smoke"
-[[camera]]
-name = "left"
-resolution = [96, 72]
-matrix = [[82.5, 0.0, 49.14], [0.0, 82.38, 35.25], [0.0, 0.0, 1.0]]
-pose = { position = [0.0, -0.4, 1.1], look_at = [0.0, 0.0, 0.1], up = [0.0, 1.0, 0.0] }
-[[camera]]
-name = "top"
-resolution = [64, 48]
-fov = 40.0
-pose = { position = [0.0, 0.0, 1.2], look_at = [0.0, 0.0, 0.0], up = [0.0, 1.0, 0.0] }
-[[camera]]
-name = "right"
-resolution = [80, 60]
-matrix = [[75.0, 0.0, 41.5], [0.0, 74.5, 28.75], [0.0, 0.0, 1.0]]
-distortion = [-0.12, 0.08, 0.0005, -0.0003, 0.01]
-pose = { position = [0.5, 0.2, 0.9], look_at = [0.0, 0.0, 0.1], up = [0.0, 0.0, 1.0] }
-"""
+CAMERAS = (
+    make_camera("left", **SIDE, matrix=camera_matrix(82.5, 82.38, 49.14, 35.25)),
+    make_camera("top", resolution=[64, 48], fov=40.0),
+    make_camera(
+        "right",
+        (0.5, 0.2, 0.9),
+        (0.0, 0.0, 0.1),
+        (0.0, 0.0, 1.0),
+        resolution=[80, 60],
+        matrix=camera_matrix(75.0, 74.5, 41.5, 28.75),
+        distortion=[-0.12, 0.08, 0.0005, -0.0003, 0.01],
+    ),
+)
 NAMES = ("left", "top", "right")
 SIZES = [(96, 72), (64, 48), (80, 60)]
 TOP = 32.0 / np.tan(np.radians(20.0))
-MATRICES = [
-    np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
-    for fx, fy, cx, cy in ((82.5, 82.38, 49.14, 35.25), (TOP, TOP, 32.0, 24.0), (75.0, 74.5, 41.5, 28.75))
-]
+INTRINSICS = (82.5, 82.38, 49.14, 35.25), (TOP, TOP, 32.0, 24.0), (75.0, 74.5, 41.5, 28.75)
+MATRICES = [np.array(camera_matrix(*numbers)) for numbers in INTRINSICS]
 DISTORTION = [None, None, [-0.12, 0.08, 0.0005, -0.0003, 0.01]]
 
 
 def bake(out, layout: str, formats: tuple[str, ...]) -> None:
-    out.parent.mkdir(exist_ok=True)
-    (out.parent / "cell.toml").write_text(CELL)
-    rows = load_config(str(out.parent / "cell.toml")).camera
-    config = settings(**STIRRING | {"bake.formats": list(formats), "bop.layout": layout})
-    with boxes():
-        run_bake(replace(config, camera=rows), out, SilentProgress())
+    bake_cell(out, cell_config(CAMERAS, **{"bake.formats": list(formats), "bop.layout": layout}))
 
 
 @pytest.fixture(scope="module", params=["classic", "multisensor"])
@@ -141,6 +125,7 @@ def test_zarr_and_lerobot_have_cameras_of_their_sizes(cell):
     cameras = zarr.open_group(str(cell / "trajectory.zarr"), mode="r")["cameras"]
     np.testing.assert_array_equal(cameras["resolution"][:], SIZES)
     np.testing.assert_allclose(cameras["matrix"][:], MATRICES, rtol=1e-12)
+    assert cameras.attrs["distortion"] == [values and {"cam_dist_model": "pinhole", "cam_dist": values} for values in DISTORTION]
     features = json.loads(next(cell.rglob("meta/info.json")).read_text())["features"]
     for name, (width, height) in zip(NAMES, SIZES, strict=True):
         assert features[f"observation.images.{name}"]["shape"] == [height, width, 3]

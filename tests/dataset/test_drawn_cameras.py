@@ -1,5 +1,5 @@
-"""A bake of cameras that are not the same in all views: drawn anew by each episode, or carried by the gripper. Files against formulas, in
-float64."""
+"""A bake of cameras that are not the same in all views: drawn anew by each episode, behind a lens, or carried by the
+gripper. Files against formulas, in float64."""
 
 from __future__ import annotations
 
@@ -17,63 +17,40 @@ from scipy.spatial.transform import Rotation
 import synpick_warp
 from synpick_warp.codes import Stream
 from synpick_warp.configs.load import load_config
-from synpick_warp.errors import ConfigError, OutputError
-from synpick_warp.factory import pipeline
+from synpick_warp.errors import ConfigError
 from synpick_warp.factory.pipeline import run_bake
 from synpick_warp.scenes.cameras import make_cameras
 from synpick_warp.system.progress import SilentProgress
-from tests.builders import STIRRING, boxes, once, run
+from tests.builders import boxes, failing_after, once, run
 from tests.harness.exporter_contract import digests
 from tests.twins import rng
-from tests.worlds.small_worlds import settings
+from tests.worlds.cells import SIDE, bake_cell, camera_matrix, cell_config, make_camera
 from tools.checks.dataset import check
 
-CELL = """preset = "smoke"
-[[camera]]
-name = "drawn"
-resolution = [96, 72]
-matrix = [[82.5, 0.0, 49.14], [0.0, 82.38, 35.25], [0.0, 0.0, 1.0]]
-pose = { position = [0.0, -0.4, 1.1], look_at = [0.0, 0.0, 0.1], up = [0.0, 1.0, 0.0] }
-[camera.jitter]
-position = { normal = [0.0, 0.01] }
-rotation = { uniform = [-1.0, 1.5] }
-focal_length = { choice = [-0.02, 0.03], weights = [1, 3] }
-center = { normal = [0.5, 1.0] }
-[[camera]]
-name = "still"
-resolution = [96, 72]
-fov = 40.0
-pose = { position = [0.0, 0.0, 1.2], look_at = [0.0, 0.0, 0.0], up = [0.0, 1.0, 0.0] }
-[[camera]]
-name = "hand"
-resolution = [96, 72]
-fov = 70.0
-fixed_to = "gripper"
-pose = { position = [0.12, 0.02, 0.4], look_at = [0.02, 0.0, -0.1], up = [0.0, 1.0, 0.0] }
-"""
-CAMERAS = 3
+CELL = (
+    make_camera(
+        "drawn",
+        **SIDE,
+        matrix=camera_matrix(82.5, 82.38, 49.14, 35.25),
+        distortion=[-0.12, 0.08, 0.0005, -0.0003, 0.0],
+        jitter={
+            "position": {"normal": [0.0, 0.01]},
+            "rotation": {"uniform": [-1.0, 1.5]},
+            "focal_length": {"choice": [-0.02, 0.03], "weights": [1, 3]},
+            "center": {"normal": [0.5, 1.0]},
+        },
+    ),
+    make_camera("still", fov=40.0),
+    make_camera("hand", (0.12, 0.02, 0.4), (0.02, 0.0, -0.1), fov=70.0, fixed_to="gripper"),
+)
+CAMERAS, EPISODES = len(CELL), 2
 FORMATS = ("bop", "usd", "zarr")
-EPISODES = 2
-
-
-def cell_config(folder: Path, **given: object):
-    """Settings of the cell, of boxes that are stirred."""
-    folder.mkdir(exist_ok=True, parents=True)
-    (folder / "cell.toml").write_text(CELL)
-    rows = load_config(str(folder / "cell.toml")).camera
-    return replace(
-        settings(
-            **STIRRING
-            | {"bake.formats": list(FORMATS), "render.layers": ["flow", "scene_flow"], "bake.episodes": EPISODES, "bake.worlds": 2}
-            | given
-        ),
-        camera=rows,
-    )
+GIVEN = {"bake.formats": list(FORMATS), "render.layers": ["flow", "scene_flow"], "bake.episodes": EPISODES, "bake.worlds": 2}
+CONFIG = cell_config(CELL, **GIVEN)
 
 
 def bake(out: Path, **given: object) -> None:
-    with boxes():
-        run_bake(cell_config(out.parent, **given), out, SilentProgress())
+    bake_cell(out, cell_config(CELL, **GIVEN | given))
 
 
 @pytest.fixture(scope="module")
@@ -110,11 +87,11 @@ def drawn_camera(config, episode: int) -> tuple[np.ndarray, np.ndarray, np.ndarr
 
 
 def test_each_episode_draws_its_own_camera_and_all_formats_have_it(cell):
-    config, seen = cell_config(cell.parent / "again"), []
+    seen = []
     rows = [json.loads(line) for line in (cell / "episodes.jsonl").read_text().splitlines()]
     store = zarr.open_group(cell / "trajectory.zarr", mode="r")
     for episode in range(EPISODES):
-        matrix, rotation, translation = drawn_camera(config, episode)
+        matrix, rotation, translation = drawn_camera(CONFIG, episode)
         scene = json.loads((cell / f"train/{CAMERAS * episode:06d}/scene_camera.json").read_text())
         for entry in scene.values():
             np.testing.assert_allclose(np.reshape(entry["cam_K"], (3, 3)), matrix, rtol=0, atol=1e-12)
@@ -134,12 +111,12 @@ def test_each_episode_draws_its_own_camera_and_all_formats_have_it(cell):
         assert focal == pytest.approx(matrix[0, 0], rel=1e-6)
         seen.append(translation)
     assert np.abs(seen[0] - seen[1]).max() > 1e-3
-    assert np.linalg.norm(Rotation.from_matrix(rotation @ make_cameras(config.rig)[0].rotation.T).as_rotvec()) > 1e-3
+    assert np.linalg.norm(Rotation.from_matrix(rotation @ make_cameras(CONFIG.rig)[0].rotation.T).as_rotvec()) > 1e-3
 
 
 def hand_poses(cell: Path, episode: int) -> tuple[np.ndarray, np.ndarray]:
     """World-to-camera rotations and translations of the camera on the gripper, from the recorded poses of the shaft."""
-    down = make_cameras(cell_config(cell.parent / "again").rig)[2]
+    down = make_cameras(CONFIG.rig)[2]
     shaft = np.array(zarr.open_group(cell / "trajectory.zarr", mode="r")[f"episodes/{episode:06d}/ticks/fixture_pose"])[:, 1].astype(float)
     turned = np.stack([down.rotation @ Rotation.from_quat(pose[3:]).as_matrix().T for pose in shaft])
     center = [pose[:3] + Rotation.from_quat(pose[3:]).as_matrix() @ [0.12, 0.02, 0.4] for pose in shaft]
@@ -200,7 +177,7 @@ def test_it_is_whole_and_valid(cell):
         assert ran.code == 0, ran
     assert "0 errors" in ran.out
     view = synpick_warp.open(cell)[1].view(3, 0)
-    np.testing.assert_allclose(view.intrinsics, drawn_camera(cell_config(cell.parent / "again"), 1)[0], rtol=0, atol=1e-12)
+    np.testing.assert_allclose(view.intrinsics, drawn_camera(CONFIG, 1)[0], rtol=0, atol=1e-12)
 
 
 @pytest.mark.parametrize("worlds", [1, pytest.param(8, marks=pytest.mark.slow)])
@@ -211,20 +188,10 @@ def test_the_number_of_worlds_changes_no_byte(cell, tmp_path, worlds):
 
 
 @pytest.mark.slow
-def test_an_interrupted_bake_resumes_to_the_same_bytes(cell, tmp_path, monkeypatch):
+def test_an_interrupted_bake_resumes_to_the_same_bytes(cell, tmp_path):
     """The first episode is committed when the second fails; the settings are then read back from the data set."""
-    ended, end = [], pipeline._Run._end
-
-    def fail(*arguments) -> None:
-        ended.append(arguments)
-        if len(ended) > 1:
-            raise OutputError("no space left")
-        end(*arguments)
-
-    with monkeypatch.context() as patch:
-        patch.setattr(pipeline._Run, "_end", fail)
-        with pytest.raises(OutputError, match="no space left"):
-            bake(tmp_path / "set", **{"bake.worlds": 1})
+    with failing_after(1):
+        bake(tmp_path / "set", **{"bake.worlds": 1})
     assert len(list((tmp_path / "set/manifest").glob("0*.json"))) == 1
     with boxes():
         summary = run_bake(load_config(str(tmp_path / "set/config.toml")), tmp_path / "set", SilentProgress())
@@ -232,11 +199,11 @@ def test_an_interrupted_bake_resumes_to_the_same_bytes(cell, tmp_path, monkeypat
     assert {name for name, _ in digests(cell).items() ^ digests(tmp_path / "set").items()} <= {"config.toml"}
 
 
-@pytest.mark.parametrize(("old", "new"), [("[0.0, 0.01]", "[0.0, 0.02]"), ('"gripper"', '"world"'), ("70.0", "71.0")])
-def test_other_cameras_do_not_resume(cell, old, new):
-    changed = CELL.replace(old, new)
-    assert changed != CELL
-    (cell.parent / "other.toml").write_text(changed)
-    config = replace(cell_config(cell.parent / "again"), camera=load_config(str(cell.parent / "other.toml")).camera)
+@pytest.mark.parametrize(
+    ("index", "change"),
+    [(0, {"distortion": (-0.12, 0.08, 0.0, 0.0)}), (0, {"jitter": None}), (2, {"fixed_to": "world"}), (2, {"fov": 71.0})],
+)
+def test_other_cameras_do_not_resume(cell, index, change):
+    other = replace(CELL[index], **change)
     with pytest.raises(ConfigError, match="camera"):
-        run_bake(config, cell, SilentProgress())
+        bake_cell(cell, cell_config((*CELL[:index], other, *CELL[index + 1 :]), **GIVEN))

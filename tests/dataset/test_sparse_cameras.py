@@ -3,49 +3,26 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 import synpick_warp
-from synpick_warp.configs.load import load_config
 from synpick_warp.dataset.pytorch import Views
 from synpick_warp.errors import DatasetError
-from synpick_warp.factory.pipeline import run_bake
-from synpick_warp.system.progress import SilentProgress
-from tests.builders import STIRRING, boxes, once, run
+from tests.builders import boxes, once, run
 from tests.harness.exporter_contract import digests
 from tests.online.test_stream import taken
-from tests.worlds.small_worlds import settings
+from tests.worlds.cells import SIDE, bake_cell, cell_config, make_camera
 
-CELL = """preset = "smoke"
-[[camera]]
-name = "slow"
-every = 3
-resolution = [96, 72]
-fov = 40.0
-pose = { position = [0.0, -0.4, 1.1], look_at = [0.0, 0.0, 0.1], up = [0.0, 1.0, 0.0] }
-[[camera]]
-name = "fast"
-resolution = [96, 72]
-fov = 40.0
-pose = { position = [0.0, 0.0, 1.2], look_at = [0.0, 0.0, 0.0], up = [0.0, 1.0, 0.0] }
-"""
+CAMERAS = make_camera("slow", **SIDE, every=3, fov=40.0), make_camera("fast", fov=40.0)
 EVERY = (3, 1)
-
-
-def cell_config(folder: Path, **given: object):
-    folder.mkdir(exist_ok=True, parents=True)
-    (folder / "cell.toml").write_text(CELL)
-    ours = {"bake.formats": ["bop", "shards", "coco", "yolo", "usd", "zarr"], "bake.episodes": 2, "bake.worlds": 2}
-    return replace(settings(**STIRRING | ours | given), camera=load_config(str(folder / "cell.toml")).camera)
+GIVEN = {"bake.formats": ["bop", "shards", "coco", "yolo", "usd", "zarr"], "bake.episodes": 2, "bake.worlds": 2}
 
 
 def bake(out: Path, **given: object) -> None:
-    with boxes():
-        run_bake(cell_config(out.parent, **given), out, SilentProgress())
+    bake_cell(out, cell_config(CAMERAS, **GIVEN | given))
 
 
 @pytest.fixture(scope="module")
@@ -107,7 +84,7 @@ def test_it_is_converted_and_streamed(cell, tmp_path):
     assert same
     assert [name for name in same if ours[name] != theirs.get(name)] == []
     with boxes():
-        views = taken(synpick_warp.stream(cell_config(tmp_path)))
+        views = taken(synpick_warp.stream(cell_config(CAMERAS, **GIVEN)))
     data = synpick_warp.open(cell)
     assert views.keys() == {(view.episode, view.camera, view.frame) for view in data.views()}
     for (episode, camera, frame), made in views.items():

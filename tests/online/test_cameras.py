@@ -7,24 +7,17 @@ from dataclasses import replace
 import numpy as np
 
 import synpick_warp
-from synpick_warp.configs.load import load_config
 from tests.dataset.test_drawn_cameras import CELL
 from tests.online.conftest import tiny
 from tests.online.test_stream import taken
+from tests.worlds.cells import make_camera
 
-TOP = """[[camera]]
-name = "small"
-resolution = [64, 48]
-fov = 40.0
-pose = { position = [0.0, 0.0, 1.2], look_at = [0.0, 0.0, 0.0], up = [0.0, 1.0, 0.0] }
-"""
+CAMERAS = (*CELL, make_camera("small", resolution=[64, 48], fov=40.0))
 SIZES = [(96, 72)] * 3 + [(64, 48)]
 
 
 def test_views_of_two_sizes_are_those_that_a_bake_writes(tmp_path):
-    (tmp_path / "cell.toml").write_text(CELL + TOP)
-    rows = load_config(str(tmp_path / "cell.toml")).camera
-    config = replace(tiny(bake__episodes=1, bake__worlds=1, render__layers=["flow"]), camera=rows)
+    config = replace(tiny(bake__episodes=1, bake__worlds=1, render__layers=["flow"]), camera=CAMERAS)
     synpick_warp.bake(config, tmp_path / "set")
     data, stream = synpick_warp.open(tmp_path / "set"), synpick_warp.stream(config)
     views = taken(stream)
@@ -43,9 +36,8 @@ def test_views_of_two_sizes_are_those_that_a_bake_writes(tmp_path):
             np.testing.assert_allclose(made["host_translation"], view.world_to_camera[:3, 3], rtol=0, atol=1e-12)
 
 
-def test_a_choice_of_cameras_gives_those_alone(tmp_path):
-    (tmp_path / "cell.toml").write_text(CELL + TOP)
-    config = replace(tiny(bake__episodes=1, bake__worlds=1), camera=load_config(str(tmp_path / "cell.toml")).camera)
+def test_a_choice_of_cameras_gives_those_alone():
+    config = replace(tiny(bake__episodes=1, bake__worlds=1), camera=CAMERAS)
     views = taken(synpick_warp.stream(config, cameras=[3, 0], stride=2))
     assert {camera for _, camera, _ in views} == {0, 3}
     assert {frame % 2 for *_, frame in views} == {0}

@@ -24,7 +24,7 @@ from tests.harness.processes import wait_for
 from tests.tools.test_tools import SHORT_PICKS
 from tools.bench import __main__ as bench
 from tools.bench import cleaner as cleaner_module
-from tools.bench import growth, meter, physics, steady, whole
+from tools.bench import growth, meter, patches, physics, steady, whole
 from tools.bench.cleaner import Assignment, Cleaner, Tally, clean_episode
 from tools.bench.usage import Usage, measure_usage
 from tools.figures import read_runs
@@ -344,3 +344,15 @@ def test_growth_has_rows_of_all_factors(tmp_path, monkeypatch):
     wanted = ["as set", "worlds 1", "objects 0.5 l", "resolution 16x9", "paths 4", "cameras 6"]
     assert [name for name in names if name.endswith("a view")] == [f"{point}: a view" for point in wanted]
     assert [name for name in names if name.endswith("world-steps")] == [f"{point}: world-steps" for point in wanted[:3]]
+
+
+def test_each_replacement_of_newton_is_left_out_once(monkeypatch):
+    def left_out(config, catalog) -> int:
+        """Number whose bits are the parts that are Newton's own."""
+        return sum(2**bit for bit, (name, own) in enumerate(patches.NEWTONS_OWN.values()) if getattr(patches.physics, name) is own)
+
+    config = bench.Config().with_values({"bake.worlds": 4})
+    steps = patches.TICKS * config.physics.steps_per_tick * config.bake.worlds
+    monkeypatch.setattr(patches, "load_catalog", lambda config: None)
+    monkeypatch.setattr(patches, "_seconds", lambda *given: steps / (1.0 + left_out(*given)))
+    assert [row.value - 1.0 for row in patches.measure_patches(config)] == pytest.approx([0, 1, 2, 4, 7, 0])

@@ -180,12 +180,12 @@ def test_the_command_draws_a_cell(tmp_path, own, request):
         (["smoke", "--config", "smoke"], "--config is given beside --cell"),
         (["smoke", "--out", "a.txt"], "a.txt is not an image file"),
         (["cell.toml"], "camera[0].fov is 500.0 in cell.toml"),
-        (["parts.toml"], "models folder gone: no such folder"),
+        (["parts.toml"], "models folder {here}/gone: no such folder"),
     ],
 )
 def test_mistakes_are_one_line(tmp_path, monkeypatch, arguments, said):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "cell.toml").write_text(CELL.replace("50.0", "500.0"))
     (tmp_path / "parts.toml").write_text('preset = "smoke"\n[bake]\nmodels = "gone"\n')
-    assert mistake("preview", "--cell", *arguments).startswith(said)
+    assert mistake("preview", "--cell", *arguments).startswith(said.format(here=tmp_path))
     assert len(list(tmp_path.iterdir())) == 2

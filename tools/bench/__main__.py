@@ -41,6 +41,7 @@ from synpick_warp.system.progress import SilentProgress
 from tools.bench.compare.peers import PEERS, check_installed, measure_peers
 from tools.bench.encode import measure_encoding
 from tools.bench.growth import measure_growth
+from tools.bench.patches import measure_patches
 from tools.bench.physics import BURST, measure_simulation, seconds_per_call
 from tools.bench.pictures import measure_pictures
 from tools.bench.steady import measure_steady
@@ -62,8 +63,8 @@ from tools.options import (
 )
 
 DEFAULT_PARTS = ("physics", "perception", "render", "encode", "write", "stream", "steady")
-PARTS = (*DEFAULT_PARTS, "pictures", "whole", "trajectories", "growth")
-OWN_WORLDS = {"pictures", "steady", "whole", "trajectories", "growth"}
+PARTS = (*DEFAULT_PARTS, "pictures", "whole", "trajectories", "growth", "patches")
+OWN_WORLDS = {"pictures", "steady", "whole", "trajectories", "growth", "patches"}
 """Parts that build worlds of their own."""
 WORLDS = 512
 """Default number of worlds of all parts but `whole`."""
@@ -210,6 +211,8 @@ def measure(
         yield from of_part("trajectories", measure_trajectories(config, min_seconds))
     if "growth" in parts:
         yield from of_part("growth", measure_growth(config, min_seconds))
+    if "patches" in parts:
+        yield from of_part("patches", measure_patches(config))
 
 
 def _measure_worlds(quality: int, factory: Factory, min_seconds: float, parts: tuple[str, ...]) -> Iterator[Row]:

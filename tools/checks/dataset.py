@@ -1,8 +1,8 @@
 """Accuracy check of a baked BOP data set: images and scene_gt_info against models and poses, cameras against each other.
 
-Independent of the kernels that made it: triangles of models/ are intersected with the rays of pixel centres here, in float64. Prints a
-table; exits with 1 if a bound is violated, with 2 if the folder cannot be checked. What files say of each other, without models (counts
-of masks, COCO annotations, missing files), is checked by `synpick-warp validate`.
+Independent of the kernels that made it: triangles of models/ are intersected with the rays of pixel centres here, in float64, through
+the lens of a distorted camera. Prints a table; exits with 1 if a bound is violated, with 2 if the folder cannot be checked. What files
+say of each other, without models (counts of masks, COCO annotations, missing files), is checked by `synpick-warp validate`.
 
     python -m tools.checks.dataset DIR --views 24
 """
@@ -22,6 +22,7 @@ import cv2
 import numpy as np
 import trimesh
 
+from synpick_warp.configs.calibration.lens import LensMap, read_lens
 from synpick_warp.configs.load import load_config
 from tools.checks.measures import Measure, UnusableError, run_check
 
@@ -73,18 +74,22 @@ class Silhouette:
         return tight_box(np.isfinite(self.depth), self.left, self.top)
 
 
-def cast_rays(corners: np.ndarray, matrix: np.ndarray, height: int, width: int) -> Silhouette:
-    """Ray casting: intersect the rays of pixel centres with triangles (F, 3, 3) in the camera's frame [mm].
+def cast_rays(corners: np.ndarray, matrix: np.ndarray, height: int, width: int, lens: LensMap | None = None) -> Silhouette:
+    """Ray casting: intersect the rays of pixel centres, through a lens unless None, with triangles (F, 3, 3) in the camera's frame [mm].
 
     A ray d through the camera's centre hits the triangle a, b, c if d·(b x c), d·(c x a) and d·(a x b) have the same sign;
     its depth then is a·(b x c) over their sum.
     """
     if not (corners[..., 2] > 0).all():
         raise UnusableError("an object reaches behind a camera; this check does not support that")
-    plane = corners @ matrix.T
-    pixel = plane[..., :2] / plane[..., 2:] - 0.5
-    low = np.maximum(np.ceil(pixel.min(axis=1)), (-width, -height)).astype(int)
-    high = np.minimum(np.floor(pixel.max(axis=1)), (2 * width - 1, 2 * height - 1)).astype(int)
+    slope, beside = corners / corners[..., 2:], np.zeros((len(corners), 1))
+    pixel = (slope @ matrix.T)[..., :2] - 0.5
+    if lens is not None:
+        # Bent edges lie this close to their chords.
+        edge = np.linalg.norm(slope - np.roll(slope, 1, axis=1), axis=-1).max(axis=1, keepdims=True)
+        pixel, beside = lens.project(slope[..., :2]) - 0.5, lens.bend * edge**2 / 8
+    low = np.maximum(np.ceil(pixel.min(axis=1) - beside), (-width, -height)).astype(int)
+    high = np.minimum(np.floor(pixel.max(axis=1) + beside), (2 * width - 1, 2 * height - 1)).astype(int)
     extent = np.maximum(high - low + 1, 0)
     covers = extent.prod(axis=1) > 0
     corners, low, high, extent = corners[covers], low[covers], high[covers], extent[covers]
@@ -94,10 +99,11 @@ def cast_rays(corners: np.ndarray, matrix: np.ndarray, height: int, width: int) 
     depth = np.full((bottom - top + 1, right - left + 1), np.inf)
     edges = np.stack([np.cross(corners[:, (i + 1) % 3], corners[:, (i + 2) % 3]) for i in range(3)], axis=1)
     volume = np.einsum("fi,fi->f", corners[:, 0], edges[:, 0])
-    inverse = np.linalg.inv(matrix)
+    centers = np.stack(np.meshgrid(np.arange(left, right + 1) + 0.5, np.arange(top, bottom + 1) + 0.5), -1)
+    rays = (centers - matrix[:2, 2]) / np.diag(matrix)[:2] if lens is None else lens.unproject(centers)
+    rays = np.concatenate([rays, np.ones((*depth.shape, 1))], axis=-1)
     for triangle, column, row in box_pixels(low, extent):
-        ray = np.stack([column + 0.5, row + 0.5, np.ones(len(row))], axis=1) @ inverse.T
-        sides = np.einsum("nij,nj->ni", edges[triangle], ray)
+        sides = np.einsum("nij,nj->ni", edges[triangle], rays[row - top, column - left])
         hit = ((sides >= 0).all(axis=1) | (sides <= 0).all(axis=1)) & (sides.sum(axis=1) != 0)
         np.minimum.at(depth, (row[hit] - top, column[hit] - left), volume[triangle[hit]] / sides[hit].sum(axis=1))
     return Silhouette(depth, int(left), int(top))
@@ -200,11 +206,12 @@ def read_view(scene: Path, frame: str) -> View:
     counts = read_image(scene / "depth" / f"{stem}.png")
     height, width = counts.shape
     silhouettes = []
-    records = read_json(scene / "scene_gt.json")[frame]
+    records, lens = read_json(scene / "scene_gt.json")[frame], read_lens(camera, (width, height))
     for record in records:
         corners = read_model(scene.parent.parent / "models" / f"obj_{record['obj_id']:06d}.ply")
         pose = transform_matrix(record, "cam_R_m2c", "cam_t_m2c")
-        silhouettes.append(cast_rays(corners @ pose[:3, :3].T + pose[:3, 3], np.reshape(camera["cam_K"], (3, 3)), height, width))
+        matrix = np.reshape(camera["cam_K"], (3, 3))
+        silhouettes.append(cast_rays(corners @ pose[:3, :3].T + pose[:3, 3], matrix, height, width, lens))
     images = {}
     for name in ("mask", "mask_visib"):
         paths = [scene / name / f"{stem}_{index:06d}.png" for index in range(len(records))] if (scene / name).is_dir() else []

@@ -11,7 +11,7 @@ from synpick_warp.codes import Segment
 from synpick_warp.kernels.render.lighting.plane_distance import Plane, plane_distance, tangent_plane
 from synpick_warp.kernels.render.lighting.sampling import UNIT, reverse_bits
 from synpick_warp.kernels.render.visibility.bvh_rays import hit_table, trace_bodies
-from synpick_warp.kernels.render.visibility.camera import AnyViews, ImageGrid, camera_ray, clamp_index, in_image, tile_of, tile_pixel
+from synpick_warp.kernels.render.visibility.camera import AnyViews, ImageGrid, clamp_index, in_image, loop_ray, tile_of, tile_pixel
 from synpick_warp.kernels.render.visibility.gbuffer import GBuffer, Hit, Meshes, Table, ViewBodies, body_of, face_normal, triangle_normal
 from synpick_warp.kernels.render.visibility.variants import kernel_of_views
 from synpick_warp.kernels.tuning import RAY_REGISTERS
@@ -339,6 +339,7 @@ def resolve_footprints_kernel(
     chunks = wp.uint32(count.shape[1])
     view = int(place // chunks)
     chunk = int(place % chunks)
+    intrinsics = views.cameras.intrinsics[view]
     for index in range(int(thread % wp.uint32(threads)), samples * count[view, chunk], threads):
         cell = wp.uint32(footprint[view, chunk, int(wp.uint32(index) // wp.uint32(samples))])
         row = int(cell // wp.uint32(footprints.width))
@@ -350,7 +351,7 @@ def resolve_footprints_kernel(
         c = corner_column(column, own)
         if in_image(grid, r, c):
             offset = sample_offset(sample, samples)
-            ray = camera_ray(views.cameras, view, r, c, offset)
+            ray = loop_ray(views.cameras, intrinsics, view, r, c, offset)
             visible = visible_bodies(gbuffer, grid, view, row, column, views.instances)
             body_mask = filter_body_mask(bodies, view, tile_of(grid, r, c), visible)
             hit = trace_bodies(meshes, bodies, view, body_mask, ray, views.instances)
@@ -358,7 +359,7 @@ def resolve_footprints_kernel(
             normal = wp.vec3(0.0, 0.0, 0.0)
             if hit.segment != Segment.NOTHING:
                 normal = wp.transpose(views.cameras.to_world[view]) * face_normal(meshes, bodies, view, hit, views.instances)
-            plane = tangent_plane(views.cameras, view, r, c, wp.uint8(hit.segment), hit.depth, normal)
+            plane = tangent_plane(views.cameras, intrinsics, view, r, c, wp.uint8(hit.segment), hit.depth, normal)
             plane.height = hit.depth * wp.dot(normal, ray)
             mesh = int(-1)
             if hit.segment != Segment.NOTHING and hit.segment != Segment.TABLE:

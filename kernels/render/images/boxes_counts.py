@@ -209,6 +209,7 @@ def count_border_pixels_kernel(
         view = border_boxes.owner[listed] // views.instances
         instance = border_boxes.owner[listed] % views.instances
         box = bodies.box[view, instance]
+        intrinsics = views.cameras.intrinsics[view]
         columns = box[2] - box[0] + 1
         begin = (index - border_boxes.first_chunk[listed]) * chunk
         amodal = int(0)
@@ -217,7 +218,7 @@ def count_border_pixels_kernel(
             row = box[1] + i // columns
             column = box[0] + i % columns
             if not in_image(grid, row, column):
-                if hits_body(meshes, bodies, view, instance, border_ray(views.cameras, view, row, column)):
+                if hits_body(meshes, bodies, view, instance, border_ray(views.cameras, intrinsics, view, row, column)):
                     amodal += 1
                     amodal_box = extend_box(amodal_box, row, column)
         if amodal > 0:

@@ -4,7 +4,7 @@ import warp as wp
 
 from synpick_warp.codes import Segment, Stream
 from synpick_warp.kernels.render.images.layers import hit_surface
-from synpick_warp.kernels.render.lighting.materials import Surfaces
+from synpick_warp.kernels.render.lighting.materials import AnySurfaces
 from synpick_warp.kernels.render.visibility.camera import AnyViews, ImageGrid, camera_ray, in_image, tile_pixel
 from synpick_warp.kernels.render.visibility.gbuffer import MAX_COUNTS, GBuffer, Meshes, ViewBodies
 from synpick_warp.kernels.render.visibility.variants import kernel_of_views
@@ -156,7 +156,7 @@ def quantize_depth(sensor: SensorParameters, focal_baseline: float, depth: float
 def render_depth_sensor_kernel(
     # Scene:
     meshes: Meshes,
-    surfaces: Surfaces,
+    surfaces: AnySurfaces,
     grid: ImageGrid,
     # State:
     episode: wp.array[int],  # (world)

@@ -18,7 +18,7 @@ from synpick_warp.kernels.render.lighting.materials import (
     sample_base_color,
     widen_roughness,
 )
-from synpick_warp.kernels.render.lighting.paths.tracing import PathScene
+from synpick_warp.kernels.render.lighting.paths.tracing import AnyScene
 from synpick_warp.kernels.render.lighting.unoccluded import unoccluded_light
 from synpick_warp.kernels.render.visibility.bvh_rays import RAY_OFFSET, is_blocked, trace_ray
 from synpick_warp.kernels.render.visibility.camera import AnyCameras, AnyViews, ImageGrid, camera_ray, in_image, tile_pixel
@@ -58,7 +58,7 @@ def dot_pattern(column: float, row: float, spacing: float) -> float:
 
 
 @wp.func
-def right_camera_hit(scene: PathScene, bodies: ViewBodies, views: AnyViews, view: int, ray: wp.vec3, baseline: float) -> Hit:
+def right_camera_hit(scene: AnyScene, bodies: ViewBodies, views: AnyViews, view: int, ray: wp.vec3, baseline: float) -> Hit:
     """Closest hit of a ray of the right camera, with planar depth."""
     cameras = views.cameras
     origin = wp.vec3(cameras.center[view]) + cameras.to_world[view] * wp.vec3(baseline, 0.0, 0.0)
@@ -70,7 +70,7 @@ def right_camera_hit(scene: PathScene, bodies: ViewBodies, views: AnyViews, view
 
 @wp.func
 def dot_light(
-    scene: PathScene,
+    scene: AnyScene,
     sensor: SensorParameters,
     bodies: ViewBodies,
     views: AnyViews,
@@ -100,13 +100,14 @@ def dot_light(
 
 @wp.func
 def seen_surface(
-    scene: PathScene, bodies: ViewBodies, cameras: AnyCameras, view: int, hit: Hit, point: wp.vec3, outgoing: wp.vec3, instances: int
+    scene: AnyScene, bodies: ViewBodies, cameras: AnyCameras, view: int, hit: Hit, point: wp.vec3, outgoing: wp.vec3, instances: int
 ) -> Surface:
     """Surface attributes of a hit at `point` in the camera's axes [m]; the hit must be of a body or the table."""
     width = hit.depth / cameras.intrinsics[view][0]
     if hit.segment == Segment.TABLE:
         position = wp.vec3(cameras.center[view]) + cameras.to_world[view] * point
-        return map_table(scene.surfaces, make_table_surface(scene.meshes, bodies, view, outgoing), position, outgoing, width)
+        table = make_table_surface(scene.meshes, scene.surfaces, bodies, view, outgoing)
+        return map_table(scene.surfaces, table, position, outgoing, width)
     body = body_of(hit.segment, instances)
     return interpolate_surface(scene.meshes, scene.surfaces, bodies, view, body, hit.triangle, hit.barycentric, outgoing, width)
 
@@ -114,7 +115,7 @@ def seen_surface(
 @kernel_of_views(cuda_max_registers=RAY_REGISTERS)
 def render_infrared_kernel(
     # Scene:
-    scene: PathScene,
+    scene: AnyScene,
     grid: ImageGrid,
     # State:
     episode: wp.array[int],  # (world)

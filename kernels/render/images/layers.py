@@ -8,8 +8,8 @@ import warp as wp
 from synpick_warp.codes import Segment
 from synpick_warp.kernels.render.lighting.color import srgb_byte
 from synpick_warp.kernels.render.lighting.materials import (
+    AnySurfaces,
     Surface,
-    Surfaces,
     interpolate_surface,
     make_table_surface,
     map_table,
@@ -125,7 +125,7 @@ def compute_motions_kernel(
 @wp.func
 def hit_surface(
     meshes: Meshes,
-    surfaces: Surfaces,
+    surfaces: AnySurfaces,
     cameras: AnyCameras,
     bodies: ViewBodies,
     gbuffer: GBuffer,
@@ -141,7 +141,7 @@ def hit_surface(
     depth = gbuffer.depth[view, row, column]
     width = depth / cameras.intrinsics[view][0]
     if segment == Segment.TABLE:
-        table = make_table_surface(meshes, bodies, view, to_camera)
+        table = make_table_surface(meshes, surfaces, bodies, view, to_camera)
         return map_table(surfaces, table, hit_position(cameras, view, ray, depth), to_camera, width)
     triangle = gbuffer.triangle[view, row, column]
     barycentric = gbuffer.barycentric[view, row, column]
@@ -152,7 +152,7 @@ def hit_surface(
 def render_normals_kernel(
     # Scene:
     meshes: Meshes,
-    surfaces: Surfaces,
+    surfaces: AnySurfaces,
     grid: ImageGrid,
     # In:
     bodies: ViewBodies,
@@ -180,7 +180,7 @@ def render_normals_kernel(
 def render_albedo_kernel(
     # Scene:
     meshes: Meshes,
-    surfaces: Surfaces,
+    surfaces: AnySurfaces,
     grid: ImageGrid,
     # In:
     bodies: ViewBodies,
@@ -268,7 +268,7 @@ def render_classes_kernel(
 
 @wp.func
 def point_displacement(
-    motions: BodyMotions, gbuffer: GBuffer, view: int, row: int, column: int, ray: wp.vec3, follows: int, instances: int
+    motions: BodyMotions, gbuffer: GBuffer, cameras: AnyCameras, view: int, row: int, column: int, follows: int, instances: int
 ) -> wp.vec3:
     """Displacement from a pixel's surface point to its position in the previous frame, each in the axes of its camera [m]; NaN: unknown."""
     unknown = wp.vec3(wp.NAN, wp.NAN, wp.NAN)
@@ -283,7 +283,11 @@ def point_displacement(
         if body == table:
             return wp.vec3(0.0, 0.0, 0.0)
         return unknown
-    point = gbuffer.depth[view, row, column] * ray
+    depth = gbuffer.depth[view, row, column]
+    # One component after the other: their order decides which product is fused with the difference below, and so the last bits.
+    x = depth * camera_ray(cameras, view, row, column, wp.vec2(0.0, 0.0))[0]
+    y = depth * camera_ray(cameras, view, row, column, wp.vec2(0.0, 0.0))[1]
+    point = wp.vec3(x, y, depth)
     return motions.rotation[view, body] * (point - motions.origin[view, body]) + motions.displacement[view, body]
 
 
@@ -308,8 +312,7 @@ def render_scene_flow_kernel(
     view, row, column = tile_pixel(grid, wp.tid() + first)
     if not in_image(grid, row, column):
         return
-    ray = camera_ray(views.cameras, view, row, column, wp.vec2(0.0, 0.0))
-    displacement = point_displacement(motions, gbuffer, view, row, column, ray, follows[views.world[view]], views.instances)
+    displacement = point_displacement(motions, gbuffer, views.cameras, view, row, column, follows[views.world[view]], views.instances)
     scene_flow_out[view, row, column] = displacement
 
 
@@ -338,7 +341,7 @@ def render_flow_kernel(
         return
     intrinsics = views.cameras.intrinsics[view]
     ray = camera_ray(views.cameras, view, row, column, wp.vec2(0.0, 0.0))
-    d = point_displacement(motions, gbuffer, view, row, column, ray, follows[views.world[view]], views.instances)
+    d = point_displacement(motions, gbuffer, views.cameras, view, row, column, follows[views.world[view]], views.instances)
     depth = gbuffer.depth[view, row, column] + d[2]
     flow = wp.vec2(wp.NAN, wp.NAN)
     if depth > NEAR_PLANE:

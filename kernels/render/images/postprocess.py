@@ -15,7 +15,7 @@ from synpick_warp.kernels.render.images.camera_effects import (
 )
 from synpick_warp.kernels.render.lighting.color import srgb_byte
 from synpick_warp.kernels.render.lighting.environment import Lights
-from synpick_warp.kernels.render.visibility.camera import PIXEL_CENTER, AnyCameras, AnyViews, ImageGrid, camera_ray, in_image, tile_pixel
+from synpick_warp.kernels.render.visibility.camera import PIXEL_CENTER, AnyCameras, AnyViews, ImageGrid, in_image, loop_ray, tile_pixel
 from synpick_warp.kernels.render.visibility.variants import kernel_of_views
 from synpick_warp.kernels.rng import view_key
 
@@ -84,6 +84,7 @@ def filter_lens(
     image: ShadedImage,
     parameters: EffectParameters,
     cameras: AnyCameras,
+    intrinsics: wp.vec4,
     grid: ImageGrid,
     view: int,
     row: int,
@@ -96,7 +97,6 @@ def filter_lens(
     The channel is magnified by `channel_magnification`: it is resampled at the inverse position, between two pixels, with Gaussian
     weights; coordinates are clamped to the image. The first pass, along the row, reads resolved radiance and applies the vignette.
     """
-    intrinsics = cameras.intrinsics[view]
     size = grid.height
     center = intrinsics[3]
     position = float(row) + PIXEL_CENTER
@@ -128,7 +128,7 @@ def filter_lens(
         value = float(0.0)
         if along_row != 0:
             value = resolve_radiance(image, view, row, at)[channel]
-            value *= vignette_factor(loss, camera_ray(cameras, view, row, at, wp.vec2(0.0, 0.0)), slope)
+            value *= vignette_factor(loss, loop_ray(cameras, intrinsics, view, row, at, wp.vec2(0.0, 0.0)), slope)
         else:
             value = image.radiance[view, at, column][channel]
         total += ((1.0 - fraction) * weight + fraction * before) * value
@@ -156,9 +156,10 @@ def filter_lens_rows_kernel(
     view, row, column = tile_pixel(grid, wp.tid() + first)
     if not in_image(grid, row, column):
         return
+    intrinsics = views.cameras.intrinsics[view]
     value = wp.vec3(0.0, 0.0, 0.0)
     for channel in range(3):
-        value[channel] = filter_lens(image, effects[view], views.cameras, grid, view, row, column, channel, 1)
+        value[channel] = filter_lens(image, effects[view], views.cameras, intrinsics, grid, view, row, column, channel, 1)
     radiance_out[view, row, column] = value
 
 
@@ -209,10 +210,11 @@ def postprocess_effects_kernel(
     value = resolve_radiance(image, view, row, column)
     if settings.lens_filter != 0:
         for channel in range(3):
-            value[channel] = filter_lens(image, parameters, views.cameras, grid, view, row, column, channel, 0)
+            value[channel] = filter_lens(image, parameters, views.cameras, intrinsics, grid, view, row, column, channel, 0)
     else:
         corner = corner_slope(intrinsics, grid.width, grid.height)
-        value *= vignette_factor(parameters[Effect.VIGNETTE], camera_ray(views.cameras, view, row, column, wp.vec2(0.0, 0.0)), corner)
+        ray = loop_ray(views.cameras, intrinsics, view, row, column, wp.vec2(0.0, 0.0))
+        value *= vignette_factor(parameters[Effect.VIGNETTE], ray, corner)
     value *= lights.exposure[light[world]] * wp.pow(2.0, light_exposure[world])
     value = wp.cw_mul(value, color_gains(parameters))
     key = view_key(settings.seed, episode[world], frame[world], camera, Stream.COLOR_NOISE)

@@ -1,6 +1,7 @@
 """Stereo matching of rectified images: semi-global matching (SGM, Hirschmüller, PAMI 2008) of census-transformed images along four paths.
 
-All costs are integers, so that no order of threads changes a result. Images are matched view by view, with one cost volume for all.
+All costs are integers, so that no order of threads changes a result. A few views at a time are matched, each with a slot of the scratch:
+its cost volume is 2 bytes a pixel and disparity, and a path is one chain of dependent steps, so that those of one view do not fill a GPU.
 Penalties, windows, uniqueness and checks are those that simsense (Zhang et al., 2023) publishes for RealSense-like cameras. Fractions of
 a pixel come from costs summed over a block instead of along paths: the penalties there pull disparities to whole pixels, by up to 0.25 px
 (SGBM of OpenCV does so, too), while these are within 0.03 px.
@@ -49,19 +50,22 @@ def transform_census_kernel(
     # In:
     left: wp.array3d[wp.uint8],  # (view, row, column)
     right: wp.array3d[wp.uint8],  # (view, row, column)
-    view: int,
+    first_view: int,
     first: int,
     # Out:
-    census_out: wp.array3d[wp.uint32],  # (eye, row, column)
+    census_out: wp.array4d[wp.uint32],  # (slot, eye, row, column)
 ):
-    """Centre-symmetric census transform (Spangenberg et al., 2013) of both images of a view.
+    """Centre-symmetric census transform (Spangenberg et al., 2013) of both images of the views from `first_view` on.
 
-    A bit tells which one of two opposite pixels of the window is brighter; windows end at the border. Launched over eye, pixel (tile order,
-    from flat index `first` on).
+    A bit tells which one of two opposite pixels of the window is brighter; windows end at the border. Launched over slot, eye, pixel (tile
+    order, from flat index `first` on).
     """
-    eye, row, column = tile_pixel(grid, wp.tid() + first)
+    image, row, column = tile_pixel(grid, wp.tid() + first)
     if not in_image(grid, row, column):
         return
+    slot = image // 2
+    eye = image % 2
+    view = first_view + slot
     bits = wp.uint32(0)
     # Not unrolled.
     radius = int(RADIUS)
@@ -77,7 +81,7 @@ def transform_census_kernel(
                     bits |= wp.where(left[view, upper, one] > left[view, lower, other], wp.uint32(1), wp.uint32(0))
                 else:
                     bits |= wp.where(right[view, upper, one] > right[view, lower, other], wp.uint32(1), wp.uint32(0))
-    census_out[eye, row, column] = bits
+    census_out[slot, eye, row, column] = bits
 
 
 @wp.func_native(f"""
@@ -91,18 +95,19 @@ def transform_census_kernel(
 #endif
     // A lane has `each` disparities in a row, `most` of them if all are searched.
     constexpr int most = {MAX_DISPARITIES} / lanes, none = 1 << 20;
-    const int width = census.shape[2], height = census.shape[1], count = cost_inout.shape[2];
+    const int width = census.shape[3], height = census.shape[2], count = cost_inout.shape[3];
     const int each = (count + lanes - 1) / lanes, begin = lane * each, owned = wp::min(each, count - begin);
     const int across = direction == 0 ? 1 : direction == 1 ? -1 : 0, down = direction == 2 ? 1 : direction == 3 ? -1 : 0;
     int row = across ? line : (down > 0 ? 0 : height - 1), column = down ? line : (across > 0 ? 0 : width - 1);
-    const wp::uint32* right = census.data + (size_t)height * width;
+    const wp::uint32* left = census.data + (size_t)slot * 2 * height * width;
+    const wp::uint32* right = left + (size_t)height * width;
     int path[most], least = 0, top = begin < count ? 0 : none;
     for (int k = 0; k < most; ++k) path[k] = k < owned ? 0 : none;
     for (int step = across ? width : height; step > 0; --step, row += down, column += across) {{
-        const wp::uint32 here = census.data[row * width + column];
+        const wp::uint32 here = left[row * width + column];
         const wp::uint32* partner = right + row * width + column - lowest - begin;
         const int partners = column - lowest - begin + 1;
-        wp::uint16* total = cost_inout.data + ((size_t)row * width + column) * count + begin;
+        wp::uint16* total = cost_inout.data + (((size_t)slot * height + row) * width + column) * count + begin;
         int before = none, after = none, next_least = none, next_top = none;
 #if defined(__CUDA_ARCH__)
         before = __shfl_up_sync(~0u, top, 1);
@@ -132,8 +137,8 @@ def transform_census_kernel(
         top = next_top;
     }}
 """)
-def follow_path(census: wp.array3d[wp.uint32], lowest: int, line: int, direction: int, cost_inout: wp.array3d[wp.uint16]):
-    """Accumulate the costs of one path across the image, `line` of those in a direction (0 right, 1 left, 2 down, 3 up).
+def follow_path(census: wp.array4d[wp.uint32], slot: int, lowest: int, line: int, direction: int, cost_inout: wp.array4d[wp.uint16]):
+    """Accumulate the costs of one path across an image, `line` of those in a direction (0 right, 1 left, 2 down, 3 up).
 
     L(p, d) = C(p, d) + min(L(q, d), L(q, d - 1) + P1, L(q, d + 1) + P1, m + P2) - m, where q is the pixel before p and m its least L. On a
     GPU a warp shares a path, each thread some disparities in a row. Direction 0 writes the costs, the others add theirs.
@@ -146,17 +151,19 @@ def sum_path_costs_kernel(
     # In:
     sensor: SensorParameters,
     views: AnyViews,
-    census: wp.array3d[wp.uint32],  # (eye, row, column)
-    view: int,
+    census: wp.array4d[wp.uint32],  # (slot, eye, row, column)
+    first_view: int,
     direction: int,
+    lines: int,
     lanes: int,
     first: int,
     # Out:
-    cost_inout: wp.array3d[wp.uint16],  # (row, column, disparity)
+    cost_inout: wp.array4d[wp.uint16],  # (slot, row, column, disparity)
 ):
-    """Add the costs of all paths in one direction, see `follow_path`. Launched over line, lane (from flat index `first` on)."""
-    line = (wp.tid() + first) // lanes
-    follow_path(census, first_disparity(sensor, views, view), line, direction, cost_inout)
+    """Add the costs of all paths in one direction, see `follow_path`. Launched over slot, line, lane (from flat index `first` on)."""
+    path = (wp.tid() + first) // lanes
+    slot = path // lines
+    follow_path(census, slot, first_disparity(sensor, views, first_view + slot), path % lines, direction, cost_inout)
 
 
 @kernel_of_views
@@ -166,25 +173,25 @@ def match_right_kernel(
     # In:
     sensor: SensorParameters,
     views: AnyViews,
-    cost: wp.array3d[wp.uint16],  # (row, column, disparity)
-    view: int,
+    cost: wp.array4d[wp.uint16],  # (slot, row, column, disparity)
+    first_view: int,
     first: int,
     # Out:
-    right_match_out: wp.array2d[int],  # (row, column)
+    right_match_out: wp.array3d[int],  # (slot, row, column)
 ):
-    """Index of the cheapest disparity of each pixel of the right image. Launched over pixel (tile order, from flat index `first` on)."""
-    _, row, column = tile_pixel(grid, wp.tid() + first)
+    """Index of the cheapest disparity of each pixel of right images. Launched over slot, pixel (tile order, from flat index `first` on)."""
+    slot, row, column = tile_pixel(grid, wp.tid() + first)
     if not in_image(grid, row, column):
         return
-    shift = column + first_disparity(sensor, views, view)
+    shift = column + first_disparity(sensor, views, first_view + slot)
     best = int(NO_MATCH)
     least = int(1 << 20)
-    for index in range(wp.min(cost.shape[2], grid.width - shift)):
-        value = int(cost[row, shift + index, index])
+    for index in range(wp.min(cost.shape[3], grid.width - shift)):
+        value = int(cost[slot, row, shift + index, index])
         if value < least:
             least = value
             best = index
-    right_match_out[row, column] = best
+    right_match_out[slot, row, column] = best
 
 
 @wp.func_native("""
@@ -200,17 +207,17 @@ def count_bits(bits: wp.uint32) -> int:
 
 
 @wp.func
-def block_cost(census: wp.array3d[wp.uint32], row: int, column: int, disparity: int) -> int:
+def block_cost(census: wp.array4d[wp.uint32], slot: int, row: int, column: int, disparity: int) -> int:
     """Sum of the costs of a disparity over the block around a pixel; the block ends at the border."""
     total = int(0)
     # Not unrolled.
     radius = int(RADIUS)
     for down in range(-radius, radius + 1):
-        at_row = clamp_index(row + down, census.shape[1])
+        at_row = clamp_index(row + down, census.shape[2])
         for right in range(-radius, radius + 1):
-            at_column = clamp_index(column + right, census.shape[2])
+            at_column = clamp_index(column + right, census.shape[3])
             if at_column >= disparity:
-                total += count_bits(census[0, at_row, at_column] ^ census[1, at_row, at_column - disparity])
+                total += count_bits(census[slot, 0, at_row, at_column] ^ census[slot, 1, at_row, at_column - disparity])
             else:
                 total += CENSUS_BITS
     return total
@@ -231,55 +238,55 @@ def match_left_kernel(
     # In:
     sensor: SensorParameters,
     views: AnyViews,
-    cost: wp.array3d[wp.uint16],  # (row, column, disparity)
-    right_match: wp.array2d[int],  # (row, column)
-    census: wp.array3d[wp.uint32],  # (eye, row, column)
-    view: int,
+    cost: wp.array4d[wp.uint16],  # (slot, row, column, disparity)
+    right_match: wp.array3d[int],  # (slot, row, column)
+    census: wp.array4d[wp.uint32],  # (slot, eye, row, column)
+    first_view: int,
     first: int,
     # Out:
-    disparity_out: wp.array2d[int],  # (row, column) [px/FRACTIONS]
+    disparity_out: wp.array3d[int],  # (slot, row, column) [px/FRACTIONS]
 ):
-    """Sub-pixel disparity of each pixel of the left image, NO_MATCH where there is none.
+    """Sub-pixel disparity of each pixel of left images, NO_MATCH where there is none.
 
-    The cheapest disparity must be unique, not at an end of the search, and within MAX_DIFFERENCE of its partner's. Launched over pixel
-    (tile order, from flat index `first` on).
+    The cheapest disparity must be unique, not at an end of the search, and within MAX_DIFFERENCE of its partner's. Launched over slot,
+    pixel (tile order, from flat index `first` on).
     """
-    _, row, column = tile_pixel(grid, wp.tid() + first)
+    slot, row, column = tile_pixel(grid, wp.tid() + first)
     if not in_image(grid, row, column):
         return
-    disparity_out[row, column] = NO_MATCH
-    count = cost.shape[2]
+    disparity_out[slot, row, column] = NO_MATCH
+    count = cost.shape[3]
     best = int(0)
     least = int(1 << 20)
     for index in range(count):
-        value = int(cost[row, column, index])
+        value = int(cost[slot, row, column, index])
         if value < least:
             least = value
             best = index
-    lowest = first_disparity(sensor, views, view)
+    lowest = first_disparity(sensor, views, first_view + slot)
     partner = column - lowest - best
     if best == 0 or best == count - 1 or partner < 0:
         return
-    if wp.abs(right_match[row, partner] - best) > MAX_DIFFERENCE:
+    if wp.abs(right_match[slot, row, partner] - best) > MAX_DIFFERENCE:
         return
     for index in range(count):
-        if wp.abs(index - best) > 1 and int(cost[row, column, index]) * (100 - UNIQUENESS) < least * 100:
+        if wp.abs(index - best) > 1 and int(cost[slot, row, column, index]) * (100 - UNIQUENESS) < least * 100:
             return
     disparity = lowest + best
-    before = block_cost(census, row, column, disparity - 1)
-    after = block_cost(census, row, column, disparity + 1)
-    disparity_out[row, column] = FRACTIONS * disparity + sub_pixel(before, block_cost(census, row, column, disparity), after)
+    before = block_cost(census, slot, row, column, disparity - 1)
+    after = block_cost(census, slot, row, column, disparity + 1)
+    disparity_out[slot, row, column] = FRACTIONS * disparity + sub_pixel(before, block_cost(census, slot, row, column, disparity), after)
 
 
 @wp.func
-def median_disparity(disparity: wp.array2d[int], grid: ImageGrid, row: int, column: int) -> int:
+def median_disparity(disparity: wp.array3d[int], grid: ImageGrid, slot: int, row: int, column: int) -> int:
     """Median of 3 x 3 pixels, of which those without a match count as the least; windows end at the border."""
     for at in range(9):
-        value = disparity[clamp_index(row + at // 3 - 1, grid.height), clamp_index(column + at % 3 - 1, grid.width)]
+        value = disparity[slot, clamp_index(row + at // 3 - 1, grid.height), clamp_index(column + at % 3 - 1, grid.width)]
         less = int(0)
         same = int(0)
         for other in range(9):
-            compared = disparity[clamp_index(row + other // 3 - 1, grid.height), clamp_index(column + other % 3 - 1, grid.width)]
+            compared = disparity[slot, clamp_index(row + other // 3 - 1, grid.height), clamp_index(column + other % 3 - 1, grid.width)]
             less += int(compared < value)
             same += int(compared == value)
         if less <= 4 and less + same > 4:
@@ -294,21 +301,22 @@ def measure_depth_kernel(
     # In:
     sensor: SensorParameters,
     views: AnyViews,
-    disparity: wp.array2d[int],  # (row, column) [px/FRACTIONS]
-    view: int,
+    disparity: wp.array3d[int],  # (slot, row, column) [px/FRACTIONS]
+    first_view: int,
     first: int,
     # Out:
     depth_stereo_out: wp.array3d[wp.uint16],  # (view, row, column) [counts]
 ):
     """Depth f b / d of the filtered disparity, in steps of `disparity_step`; 0 (hole): no match, or outside of the measuring range.
 
-    Launched over pixel (tile order, from flat index `first` on).
+    Launched over slot, pixel (tile order, from flat index `first` on).
     """
-    _, row, column = tile_pixel(grid, wp.tid() + first)
+    slot, row, column = tile_pixel(grid, wp.tid() + first)
     if not in_image(grid, row, column):
         return
+    view = first_view + slot
     depth_stereo_out[view, row, column] = wp.uint16(0)
-    matched = float(median_disparity(disparity, grid, row, column)) / float(FRACTIONS)
+    matched = float(median_disparity(disparity, grid, slot, row, column)) / float(FRACTIONS)
     steps = wp.rint(matched / sensor.disparity_step)
     if steps < 1.0 or (sensor.max_disparity > 0.0 and matched > sensor.max_disparity):
         return

@@ -9,7 +9,7 @@ from synpick_warp.kernels.render.lighting.environment import (
     sh_irradiance,
 )
 from synpick_warp.kernels.render.lighting.materials import Surface, map_table, sample_base_color
-from synpick_warp.kernels.render.lighting.paths.tracing import PathScene
+from synpick_warp.kernels.render.lighting.paths.tracing import DressedScene
 from synpick_warp.kernels.render.visibility.camera import AnyCameras, AnyViews, ImageGrid, camera_ray, in_image, tile_pixel
 from synpick_warp.kernels.render.visibility.gbuffer import GBuffer, ViewBodies
 from synpick_warp.kernels.render.visibility.variants import kernel_of_views
@@ -22,7 +22,7 @@ HORIZON = wp.constant(0.02)
 
 @wp.func
 def floor_radiance(
-    scene: PathScene, drop: float, bodies: ViewBodies, cameras: AnyCameras, view: int, light: int, direction: wp.vec3
+    scene: DressedScene, drop: float, bodies: ViewBodies, cameras: AnyCameras, view: int, light: int, direction: wp.vec3
 ) -> wp.vec3:
     """Radiance of the floor, `drop` [m] below the table, along a unit direction in the world, which points down: diffuse, in unoccluded
     light.
@@ -30,7 +30,7 @@ def floor_radiance(
     center = wp.vec3(cameras.center[view])
     distance = wp.max(center[2] - scene.table.height + drop, 0.0) / -direction[2]
     surface = Surface()
-    surface.row = bodies.material[view, bodies.mesh.shape[1] + 1]
+    surface.row = scene.surfaces.row[view, bodies.mesh.shape[1] + 1]
     width = distance / cameras.intrinsics[view][0]
     surface = map_table(scene.surfaces, surface, center + distance * direction, -direction, width)
     irradiance = sh_irradiance(scene.lights, light, wp.vec3(0.0, 0.0, 1.0))
@@ -42,7 +42,7 @@ def floor_radiance(
 @kernel_of_views
 def shade_floor_kernel(
     # Scene:
-    scene: PathScene,
+    scene: DressedScene,
     grid: ImageGrid,
     drop: float,
     # State: worlds

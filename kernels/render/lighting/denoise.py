@@ -53,7 +53,9 @@ def coarse_plane(coarse: CoarseGrid, surface: wp.vec4, cameras: AnyCameras, view
     """Tangent plane at a coarse pixel of packed `surface`, whose `down`, `right` and `width` are per coarse pixel."""
     pixel = middle_pixel(coarse, row, column)
     depth = surface_depth(surface)
-    plane = tangent_plane(cameras, view, pixel[0], pixel[1], surface_segment(surface), depth, surface_normal(surface))
+    intrinsics = cameras.intrinsics[view]
+    segment, normal = surface_segment(surface), surface_normal(surface)
+    plane = tangent_plane(cameras, intrinsics, view, pixel[0], pixel[1], segment, depth, normal)
     size = float(coarse.size)
     plane.down = size * plane.down
     plane.right = size * plane.right

@@ -8,7 +8,7 @@ import warp as wp
 
 from synpick_warp.codes import Look, LookKind, LookPart
 from synpick_warp.kernels.distributions import LookTable, draw_look, look_key
-from synpick_warp.kernels.render.lighting.materials import Surfaces
+from synpick_warp.kernels.render.lighting.materials import DressedSurfaces
 from synpick_warp.kernels.render.visibility.camera import AnyViews
 from synpick_warp.kernels.render.visibility.gbuffer import FIXTURES, Meshes, ViewBodies
 from synpick_warp.kernels.render.visibility.variants import kernel_of_views
@@ -63,15 +63,15 @@ class DrawnMaterial:
     metallic: float
     roughness: float
     recolor: wp.mat33
-    """As in `Surfaces`."""
+    """As in `DressedSurfaces`."""
     texture: int
-    """Row of `Surfaces` whose texture it has."""
+    """Row of `DressedSurfaces` whose texture it has."""
     repeats: float
-    """As in `Surfaces`."""
+    """As in `DressedSurfaces`."""
 
 
 @wp.func
-def draw_material(table: LookTable, surfaces: Surfaces, base: int, key: wp.uint64, part: int) -> DrawnMaterial:
+def draw_material(table: LookTable, surfaces: DressedSurfaces, base: int, key: wp.uint64, part: int) -> DrawnMaterial:
     """Change material `base` by what is drawn for a part; of part -1 nothing is."""
     result = DrawnMaterial()
     result.color = surfaces.color[base]
@@ -110,32 +110,32 @@ def dress_bodies_kernel(
     episode: wp.array[int],  # (world)
     # In:
     views: AnyViews,
+    bodies: ViewBodies,
     first_row: int,
     # Out:
-    bodies_inout: ViewBodies,
-    surfaces_inout: Surfaces,
+    surfaces_inout: DressedSurfaces,
 ):
     """Materials of the bodies of each view, of its table and of its background: those of their meshes, changed by what the episode draws.
 
-    `first_row`: row of `Surfaces` of the first view's first body; the rows before are those of meshes, table and textures. Launched over
-    view, material.
+    `first_row`: row of `DressedSurfaces` of the first view's first body; the rows before are those of meshes, table and textures. Launched
+    over view, material.
     """
     view, body = wp.tid()
-    instances = bodies_inout.mesh.shape[1] - FIXTURES
-    at_table = body >= bodies_inout.mesh.shape[1]
+    instances = bodies.mesh.shape[1] - FIXTURES
+    at_table = body >= bodies.mesh.shape[1]
     world = views.world[view]
     if world < 0:
         return
     base = meshes.entries + FIXTURES
     if not at_table:
-        base = bodies_inout.mesh[view, body]
+        base = bodies.mesh[view, body]
     if base < 0:
         return
-    row = first_row + view * bodies_inout.material.shape[1] + body
-    bodies_inout.material[view, body] = row
+    row = first_row + view * surfaces_inout.row.shape[1] + body
+    surfaces_inout.row[view, body] = row
     part = int(-1)
     slot = int(0)
-    if body > bodies_inout.mesh.shape[1]:
+    if body > bodies.mesh.shape[1]:
         part = LookPart.BACKGROUND
     elif at_table:
         part = LookPart.TABLE

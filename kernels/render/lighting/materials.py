@@ -1,10 +1,13 @@
 """Surface shading data at a hit: geometric and interpolated normals, mip-mapped base colour, roughness with specular anti-aliasing."""
 
+from typing import Any
+
 import warp as wp
 
 from synpick_warp.kernels.render.lighting.brdf import AlbedoTables
 from synpick_warp.kernels.render.visibility.gbuffer import FIXTURES, Meshes, ViewBodies
 from synpick_warp.kernels.render.visibility.records import read_flat_record
+from synpick_warp.kernels.render.visibility.variants import VARIANTS
 
 wp.set_module_options({"enable_backward": False})
 
@@ -31,10 +34,9 @@ TRIANGLE_RECORDS = wp.constant(5)
 
 @wp.struct
 class Surfaces:
-    """Materials, textures and shading normals of all meshes. Constant, but for the materials of views.
+    """Materials, textures and shading normals of all meshes. Constant.
 
-    Rows called material are those of `Meshes`, one for the table, and where episodes draw their looks (`looks`) one for each texture that
-    they draw from and for each body of each view.
+    Rows called material are those of `Meshes`, and one for the table.
     """
 
     triangle: wp.array[wp.vec4]
@@ -57,10 +59,35 @@ class Surfaces:
     """(texel): square roots of linear red, green and blue in TEXEL_BITS bits each, red in the lowest, so that one load reads all."""
     albedo: AlbedoTables
     """Directional albedo of the specular lobe, the same for all surfaces."""
+
+
+@wp.struct
+class DressedSurfaces:
+    """Surfaces as `Surfaces`, where episodes draw their looks (`looks`): constant, but for the materials of views.
+
+    More rows called material follow: one for each texture that episodes draw from, and one for each body of each view.
+    """
+
+    triangle: wp.array[wp.vec4]
+    color: wp.array[wp.vec3]
+    metallic: wp.array[float]
+    roughness: wp.array[float]
+    texture_size: wp.array[wp.vec2i]
+    first_texel: wp.array2d[int]
+    texture_levels: wp.array[int]
+    texel: wp.array[wp.uint32]
+    albedo: AlbedoTables
+    row: wp.array2d[int]
+    """(view, body, then the table and the floor): row of its material."""
     recolor: wp.array[wp.mat33]
-    """(material): matrix on the linear base colour, whose result is clamped to 0..1; empty: none."""
+    """(material): matrix on the linear base colour, whose result is clamped to 0..1."""
     repeats: wp.array[float]
-    """(material): factor on texture coordinates; empty: none."""
+    """(material): factor on texture coordinates."""
+
+
+AnySurfaces = Any
+"""`Surfaces`, or `DressedSurfaces`: functions are compiled for each; see `variants`."""
+VARIANTS["surfaces"] = Surfaces, DressedSurfaces
 
 
 @wp.struct
@@ -89,12 +116,22 @@ def face_forward(normal: wp.vec3, reference: wp.vec3) -> wp.vec3:
 
 
 @wp.func
-def make_table_surface(meshes: Meshes, bodies: ViewBodies, view: int, view_direction: wp.vec3) -> Surface:
+def material_of(surfaces: Surfaces, view: int, body: int, mesh: int) -> int:
+    """Row of the material of a body of a view, whose mesh is in row `mesh`; bodies after the last are the table and the floor."""
+    return mesh
+
+
+@wp.func
+def material_of(surfaces: DressedSurfaces, view: int, body: int, mesh: int) -> int:  # noqa: F811
+    """Row of the material of a body of a view, which its episode has drawn."""
+    return surfaces.row[view, body]
+
+
+@wp.func
+def make_table_surface(meshes: Meshes, surfaces: AnySurfaces, bodies: ViewBodies, view: int, view_direction: wp.vec3) -> Surface:
     """Shading data of the table, without texture coordinates; `view_direction` points to the viewer."""
     result = Surface()
-    result.row = meshes.entries + FIXTURES
-    if bodies.material:
-        result.row = bodies.material[view, bodies.mesh.shape[1]]
+    result.row = material_of(surfaces, view, bodies.mesh.shape[1], meshes.entries + FIXTURES)
     result.face_normal = face_forward(wp.vec3(0.0, 0.0, 1.0), view_direction)
     result.normal = result.face_normal
     return result
@@ -106,19 +143,41 @@ def map_table(surfaces: Surfaces, surface: Surface, position: wp.vec3, view_dire
 
     Arguments as of `interpolate_surface`; `position` in the world [m].
     """
+    return surface
+
+
+@wp.func
+def map_table(  # noqa: F811
+    surfaces: DressedSurfaces, surface: Surface, position: wp.vec3, view_direction: wp.vec3, pixel_width: float
+) -> Surface:
+    """The table's shading data with texture coordinates."""
     result = surface
-    if surfaces.repeats:
-        scale = surfaces.repeats[surface.row]
-        tilt = wp.sqrt(wp.max(wp.abs(view_direction[2]), MIN_TILT))
-        result.uv = scale * wp.vec2(position[0], position[1])
-        result.uv_footprint = scale * pixel_width / tilt
+    scale = surfaces.repeats[surface.row]
+    tilt = wp.sqrt(wp.max(wp.abs(view_direction[2]), MIN_TILT))
+    result.uv = scale * wp.vec2(position[0], position[1])
+    result.uv_footprint = scale * pixel_width / tilt
+    return result
+
+
+@wp.func
+def repeat_texture(surfaces: Surfaces, surface: Surface) -> Surface:
+    """Shading data with its texture coordinates, and their footprint, scaled as the material says."""
+    return surface
+
+
+@wp.func
+def repeat_texture(surfaces: DressedSurfaces, surface: Surface) -> Surface:  # noqa: F811
+    """Shading data with its texture coordinates, and their footprint, scaled as the material says."""
+    result = surface
+    result.uv = surfaces.repeats[surface.row] * surface.uv
+    result.uv_footprint = surfaces.repeats[surface.row] * surface.uv_footprint
     return result
 
 
 @wp.func
 def interpolate_surface(
     meshes: Meshes,
-    surfaces: Surfaces,
+    surfaces: AnySurfaces,
     bodies: ViewBodies,
     view: int,
     body: int,
@@ -134,9 +193,7 @@ def interpolate_surface(
     mesh = bodies.mesh[view, body]
     to_world = wp.transpose(bodies.world_rotation[view, body])
     result = Surface()
-    result.row = mesh
-    if bodies.material:
-        result.row = bodies.material[view, body]
+    result.row = material_of(surfaces, view, body, mesh)
     first = TRIANGLE_RECORDS * (meshes.first_triangle[mesh] + triangle)
     a = read_flat_record(surfaces.triangle, first)
     b = read_flat_record(surfaces.triangle, first + 1)
@@ -156,14 +213,11 @@ def interpolate_surface(
     tilt = wp.sqrt(wp.max(wp.dot(result.face_normal, view_direction), MIN_TILT))
     result.uv_footprint = pixel_width / tilt * more[3]
     result.normal_spread = pixel_width / tilt * face[3]
-    if surfaces.repeats:
-        result.uv = surfaces.repeats[result.row] * result.uv
-        result.uv_footprint = surfaces.repeats[result.row] * result.uv_footprint
-    return result
+    return repeat_texture(surfaces, result)
 
 
 @wp.func
-def decode_texel(surfaces: Surfaces, index: int) -> wp.vec3:
+def decode_texel(surfaces: AnySurfaces, index: int) -> wp.vec3:
     """Decode a texel: its linear colour divided by TEXEL_SCALE."""
     texel = int(surfaces.texel[index])
     red = float(texel & TEXEL_MASK)
@@ -173,7 +227,7 @@ def decode_texel(surfaces: Surfaces, index: int) -> wp.vec3:
 
 
 @wp.func
-def sample_mip_level(surfaces: Surfaces, row: int, level: int, uv: wp.vec2) -> wp.vec3:
+def sample_mip_level(surfaces: AnySurfaces, row: int, level: int, uv: wp.vec2) -> wp.vec3:
     """Bilinear look-up in one mip level of a repeating texture: linear colour divided by TEXEL_SCALE.
 
     v grows upward, row 0 is the image's top; `row` is that of `Surfaces`.
@@ -205,15 +259,18 @@ def sample_mip_level(surfaces: Surfaces, row: int, level: int, uv: wp.vec2) -> w
 @wp.func
 def sample_base_color(surfaces: Surfaces, surface: Surface) -> wp.vec3:
     """Linear base colour: material colour times texture, changed by the material's matrix if there is one."""
-    color = sample_texture(surfaces, surface)
-    if surfaces.recolor:
-        turned = surfaces.recolor[surface.row] * color
-        return wp.vec3(wp.clamp(turned[0], 0.0, 1.0), wp.clamp(turned[1], 0.0, 1.0), wp.clamp(turned[2], 0.0, 1.0))
-    return color
+    return sample_texture(surfaces, surface)
 
 
 @wp.func
-def sample_texture(surfaces: Surfaces, surface: Surface) -> wp.vec3:
+def sample_base_color(surfaces: DressedSurfaces, surface: Surface) -> wp.vec3:  # noqa: F811
+    """Linear base colour: material colour times texture, changed by the material's matrix."""
+    turned = surfaces.recolor[surface.row] * sample_texture(surfaces, surface)
+    return wp.vec3(wp.clamp(turned[0], 0.0, 1.0), wp.clamp(turned[1], 0.0, 1.0), wp.clamp(turned[2], 0.0, 1.0))
+
+
+@wp.func
+def sample_texture(surfaces: AnySurfaces, surface: Surface) -> wp.vec3:
     """Material colour times texture, linear, filtered trilinearly at the mip level given by TEXEL_WIDTH."""
     color = surfaces.color[surface.row]
     size = surfaces.texture_size[surface.row]

@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from synpick_warp.kernels.render.visibility.camera import AnyCameras, camera_ray
+from synpick_warp.kernels.render.visibility.camera import AnyCameras, loop_ray
 
 wp.set_module_options({"enable_backward": False})
 
@@ -28,13 +28,14 @@ class Plane:
 
 
 @wp.func
-def tangent_plane(cameras: AnyCameras, view: int, row: int, column: int, segment: wp.uint8, depth: float, normal: wp.vec3) -> Plane:
-    """Tangent plane of the surface at a pixel; `depth` is planar [m], `normal` is in camera space."""
-    intrinsics = cameras.intrinsics[view]
+def tangent_plane(
+    cameras: AnyCameras, intrinsics: wp.vec4, view: int, row: int, column: int, segment: wp.uint8, depth: float, normal: wp.vec3
+) -> Plane:
+    """Tangent plane of the surface at a pixel; `depth` is planar [m], `normal` is in camera space, `intrinsics` are those of the view."""
     plane = Plane()
     plane.segment = segment
     plane.normal = normal
-    plane.facing = wp.dot(normal, camera_ray(cameras, view, row, column, wp.vec2(0.0, 0.0)))
+    plane.facing = wp.dot(normal, loop_ray(cameras, intrinsics, view, row, column, wp.vec2(0.0, 0.0)))
     plane.down = normal[1] / intrinsics[1]
     plane.right = normal[0] / intrinsics[0]
     plane.height = depth * plane.facing

@@ -26,14 +26,14 @@ from synpick_warp.kernels.render.lighting.materials import (
     sample_base_color,
     widen_roughness,
 )
-from synpick_warp.kernels.render.lighting.paths.tracing import PathScene
+from synpick_warp.kernels.render.lighting.paths.tracing import AnyScene
 from synpick_warp.kernels.render.lighting.plane_distance import tangent_plane
 from synpick_warp.kernels.render.lighting.shadow_filter import LampShadows
 from synpick_warp.kernels.render.lighting.shadow_upsampling import upsample_shadows
 from synpick_warp.kernels.render.lighting.shadows import byte_of
 from synpick_warp.kernels.render.lighting.unoccluded import unoccluded_light
 from synpick_warp.kernels.render.lighting.upsampling import RatioImages, Ratios, upsample_ratios
-from synpick_warp.kernels.render.visibility.camera import AnyCameras, AnyViews, camera_ray, hit_position, in_image, tile_pixel
+from synpick_warp.kernels.render.visibility.camera import AnyCameras, AnyViews, hit_position, in_image, loop_ray, tile_pixel
 from synpick_warp.kernels.render.visibility.gbuffer import GBuffer, ViewBodies, body_of
 from synpick_warp.kernels.render.visibility.triangles import camera_triangle, edge_areas
 from synpick_warp.kernels.render.visibility.variants import kernel_of_views
@@ -105,8 +105,9 @@ def shade_surface(
 
 @wp.func
 def gather_light(
-    scene: PathScene,
+    scene: AnyScene,
     cameras: AnyCameras,
+    intrinsics: wp.vec4,
     coarse: CoarseGrid,
     shadow_grid: CoarseGrid,
     sky: Sky,
@@ -117,15 +118,14 @@ def gather_light(
     view: int,
     row: int,
     column: int,
-    face_normal: wp.vec3,
+    normal: wp.vec3,
 ) -> PixelLight:
-    """Upsample the denoised light and the lamps' shadows to a pixel whose surface has the geometric normal `face_normal`.
+    """Upsample the denoised light and the lamps' shadows to a pixel whose surface has the geometric `normal` in camera space.
 
-    `edges` is that of `upsample_shadows`.
+    `intrinsics` are those of the view; `edges` is that of `upsample_shadows`.
     """
     segment = gbuffer.segment[view, row, column]
-    normal = wp.transpose(cameras.to_world[view]) * face_normal
-    plane = tangent_plane(cameras, view, row, column, segment, gbuffer.depth[view, row, column], normal)
+    plane = tangent_plane(cameras, intrinsics, view, row, column, segment, gbuffer.depth[view, row, column], normal)
     result = PixelLight()
     if scene.lights.lamps[sky.light] > 0:
         result.lamps = upsample_shadows(shadows, edges, shadow_grid, view, row, column, plane)
@@ -135,7 +135,7 @@ def gather_light(
 
 
 @wp.func
-def shade_point(scene: PathScene, sky: Sky, surface: Surface, outgoing: wp.vec3, light: PixelLight) -> wp.vec3:
+def shade_point(scene: AnyScene, sky: Sky, surface: Surface, outgoing: wp.vec3, light: PixelLight) -> wp.vec3:
     """Radiance of a point of a surface towards the camera, the direction `outgoing`."""
     color = sample_base_color(scene.surfaces, surface)
     metallic = scene.surfaces.metallic[surface.row]
@@ -189,7 +189,7 @@ def world_sky(light: wp.array[int], light_yaw: wp.array[float], world: int) -> S
 
 @wp.func
 def shade_pixel(
-    scene: PathScene,
+    scene: AnyScene,
     coarse: CoarseGrid,
     shadow_grid: CoarseGrid,
     sky: Sky,
@@ -210,8 +210,9 @@ def shade_pixel(
     pass a constant, so that the compiler removes the loop if there is one sample. `edges` is that of `upsample_shadows`.
     """
     intrinsics = views.cameras.intrinsics[view]
-    middle_ray = camera_ray(views.cameras, view, row, column, wp.vec2(0.0, 0.0))
-    outgoing = -wp.normalize(views.cameras.to_world[view] * middle_ray)
+    to_world = views.cameras.to_world[view]
+    middle_ray = loop_ray(views.cameras, intrinsics, view, row, column, wp.vec2(0.0, 0.0))
+    outgoing = -wp.normalize(to_world * middle_ray)
     segment = int(gbuffer.segment[view, row, column])
     if segment == Segment.NOTHING:
         return environment_radiance(scene.lights, sky.light, rotate_z(-outgoing, -sky.yaw))
@@ -219,14 +220,16 @@ def shade_pixel(
     barycentric = gbuffer.barycentric[view, row, column]
     body = body_of(segment, views.instances)
     width = gbuffer.depth[view, row, column] / intrinsics[0]
-    surface = make_table_surface(scene.meshes, bodies, view, outgoing)
-    if segment == Segment.TABLE:
+    surface = make_table_surface(scene.meshes, scene.surfaces, bodies, view, outgoing)
+    if segment != Segment.TABLE:
+        surface = interpolate_surface(scene.meshes, scene.surfaces, bodies, view, body, triangle, barycentric, outgoing, width)
+    else:
         position = hit_position(views.cameras, view, middle_ray, gbuffer.depth[view, row, column])
         surface = map_table(scene.surfaces, surface, position, outgoing, width)
-    else:
-        surface = interpolate_surface(scene.meshes, scene.surfaces, bodies, view, body, triangle, barycentric, outgoing, width)
-    normal = surface.face_normal
-    light = gather_light(scene, views.cameras, coarse, shadow_grid, sky, gbuffer, ratios, shadows, edges, view, row, column, normal)
+    normal = wp.transpose(to_world) * surface.face_normal
+    light = gather_light(
+        scene, views.cameras, intrinsics, coarse, shadow_grid, sky, gbuffer, ratios, shadows, edges, view, row, column, normal
+    )
     if segment == Segment.TABLE or samples_per_axis == 1:
         return shade_point(scene, sky, surface, outgoing, light)
     corners = camera_triangle(scene.meshes, bodies, view, body, triangle)
@@ -235,7 +238,7 @@ def shade_pixel(
     samples = samples_per_axis * samples_per_axis
     total = wp.vec3(0.0)
     for sample in range(samples):
-        ray = camera_ray(views.cameras, view, row, column, sample_offset(sample, samples_per_axis))
+        ray = loop_ray(views.cameras, intrinsics, view, row, column, sample_offset(sample, samples_per_axis))
         weights, moved = move_weights(center, orientation, edge_areas(corners, ray))
         outgoing = -wp.normalize(views.cameras.to_world[view] * ray)
         # A sample that stays at the center has the footprint of a whole pixel.
@@ -249,7 +252,7 @@ def shade_pixel(
 @kernel_of_views(cuda_max_registers=SHADE_REGISTERS)
 def shade_kernel(
     # Scene:
-    scene: PathScene,
+    scene: AnyScene,
     coarse: CoarseGrid,
     shadow_grid: CoarseGrid,
     # State: worlds
@@ -281,7 +284,7 @@ def shade_kernel(
 @kernel_of_views(cuda_max_registers=SAMPLE_SHADE_REGISTERS)
 def shade_samples_kernel(
     # Scene:
-    scene: PathScene,
+    scene: AnyScene,
     coarse: CoarseGrid,
     shadow_grid: CoarseGrid,
     # State: worlds

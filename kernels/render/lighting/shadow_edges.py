@@ -98,7 +98,7 @@ def pixel_plane(
     normal = visible_normal(meshes, bodies, view, read_hit(gbuffer, view, row, column), views.instances, outward)
     local = wp.transpose(views.cameras.to_world[view]) * normal
     segment, depth = gbuffer.segment[view, row, column], gbuffer.depth[view, row, column]
-    return tangent_plane(views.cameras, view, row, column, segment, depth, local), normal
+    return tangent_plane(views.cameras, views.cameras.intrinsics[view], view, row, column, segment, depth, local), normal
 
 
 @kernel_of_views

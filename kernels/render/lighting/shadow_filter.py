@@ -149,7 +149,8 @@ def grid_plane(
     depth = gbuffer.depth[view, pixel[0], pixel[1]]
     ray = views.cameras.to_world[view] * camera_ray(views.cameras, view, pixel[0], pixel[1], wp.vec2(0.0, 0.0))
     normal = visible_normal(meshes, bodies, view, read_hit(gbuffer, view, pixel[0], pixel[1]), views.instances, ray)
-    return tangent_plane(views.cameras, view, pixel[0], pixel[1], segment, depth, wp.transpose(views.cameras.to_world[view]) * normal)
+    local = wp.transpose(views.cameras.to_world[view]) * normal
+    return tangent_plane(views.cameras, views.cameras.intrinsics[view], view, pixel[0], pixel[1], segment, depth, local)
 
 
 @wp.func

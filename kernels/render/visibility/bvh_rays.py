@@ -120,9 +120,12 @@ def hit_table(table: Table, cameras: AnyCameras, view: int, ray: wp.vec3, best: 
         if fall * height < 0.0:
             depth = -height / fall
             if depth < best.depth:
-                x = float(cameras.center[view][0]) + depth * along[0]
-                y = float(cameras.center[view][1]) + depth * along[1]
-                if wp.abs(x) <= table.half[0] and wp.abs(y) <= table.half[1]:
+                seen = True
+                if table.half[0] < FAR or table.half[1] < FAR:
+                    x = float(cameras.center[view][0]) + depth * along[0]
+                    y = float(cameras.center[view][1]) + depth * along[1]
+                    seen = wp.abs(x) <= table.half[0] and wp.abs(y) <= table.half[1]
+                if seen:
                     result.segment = Segment.TABLE
                     result.depth = depth
     return result

@@ -185,16 +185,22 @@ def camera_ray(cameras: AnyCameras, view: int, row: int, column: int, offset: wp
 
     `offset` [px] from the pixel's centre; zero for depth, ids and masks. The ray of a lens is that of the nearest pixel in the image.
     """
-    lens = lens_of(cameras, view)
-    if lens >= 0:
-        return table_ray(cameras.lenses, lens, row, column, offset)
-    return pinhole_ray(cameras.intrinsics[view], row, column, offset)
+    return loop_ray(cameras, cameras.intrinsics[view], view, row, column, offset)
 
 
 @wp.func
-def border_ray(cameras: AnyCameras, view: int, row: int, column: int) -> wp.vec3:
-    """As `camera_ray`, of a pixel's centre that may lie outside the image, where a lens is continued."""
-    ray = pinhole_ray(cameras.intrinsics[view], row, column, wp.vec2(0.0, 0.0))
+def loop_ray(cameras: AnyCameras, intrinsics: wp.vec4, view: int, row: int, column: int, offset: wp.vec2) -> wp.vec3:
+    """As `camera_ray`, with the view's `intrinsics`: where more is done with them, and in loops, which would read them for each ray."""
+    lens = lens_of(cameras, view)
+    if lens >= 0:
+        return table_ray(cameras.lenses, lens, row, column, offset)
+    return pinhole_ray(intrinsics, row, column, offset)
+
+
+@wp.func
+def border_ray(cameras: AnyCameras, intrinsics: wp.vec4, view: int, row: int, column: int) -> wp.vec3:
+    """As `loop_ray`, of a pixel's centre that may lie outside the image, where a lens is continued."""
+    ray = pinhole_ray(intrinsics, row, column, wp.vec2(0.0, 0.0))
     lens = lens_of(cameras, view)
     if lens >= 0:
         near = table_ray(cameras.lenses, lens, row, column, wp.vec2(0.0, 0.0))

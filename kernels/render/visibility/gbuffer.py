@@ -79,8 +79,6 @@ class ViewBodies:
 
     mesh: wp.array2d[int]
     """(view, body): row of `Meshes`; -1: the body is absent."""
-    material: wp.array2d[int]
-    """(view, body, and last the table): row of `Surfaces`; empty: that of the mesh."""
     rotation: wp.array2d[wp.mat33]
     """(view, body): camera to body frame."""
     start: wp.array2d[wp.vec3]

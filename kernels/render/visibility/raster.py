@@ -9,7 +9,7 @@ import warp as wp
 
 from synpick_warp.codes import Segment
 from synpick_warp.kernels.render.visibility.bvh_rays import hit_table
-from synpick_warp.kernels.render.visibility.camera import AnyCameras, AnyViews, ImageGrid, camera_ray, in_image, tile_pixel
+from synpick_warp.kernels.render.visibility.camera import AnyCameras, AnyViews, ImageGrid, camera_ray, in_image, loop_ray, tile_pixel
 from synpick_warp.kernels.render.visibility.gbuffer import (
     FAR,
     MAX_COUNTS,
@@ -103,6 +103,7 @@ def rasterize_footprint(
     visibility: VisibilityBuffer,
     amodal: wp.array3d[wp.uint32],
     cameras: AnyCameras,
+    intrinsics: wp.vec4,
     view: int,
     pixels: wp.vec4i,
     triangle: Triangle,
@@ -125,7 +126,7 @@ def rasterize_footprint(
             last = span[1]
         if column > last:
             break
-        ray = camera_ray(cameras, view, row, column, wp.vec2(0.0, 0.0))
+        ray = loop_ray(cameras, intrinsics, view, row, column, wp.vec2(0.0, 0.0))
         write_sample(visibility, amodal, view, row, column, triangle, ray, low_half, bit)
         column += 1
 
@@ -199,11 +200,12 @@ def rasterize_triangles_kernel(
     box = bodies.box[view, body]
     if box[2] < 0 or box[3] < 0 or box[0] >= grid.width or box[1] >= grid.height:
         return
+    intrinsics = views.cameras.intrinsics[view]
     mesh = bodies.mesh[view, body]
     bit = amodal_bit(body, views.instances)
     for k in range(index % threads, meshes.first_triangle[mesh + 1] - meshes.first_triangle[mesh], threads):
         triangle = camera_triangle(meshes, bodies, view, body, k)
-        footprint = find_footprint(grid, views.cameras, view, triangle)
+        footprint = find_footprint(grid, views.cameras, intrinsics, view, triangle)
         pixels = footprint.pixels
         columns = pixels[2] - pixels[0] + 1
         rows = pixels[3] - pixels[1] + 1
@@ -213,7 +215,9 @@ def rasterize_triangles_kernel(
                 listed = list_blocks(visibility_inout, view, rank, k, pixels)
             if not listed:
                 low_half = pack_low_half(body, k)
-                rasterize_footprint(visibility_inout, amodal_inout, views.cameras, view, pixels, triangle, footprint, low_half, bit)
+                rasterize_footprint(
+                    visibility_inout, amodal_inout, views.cameras, intrinsics, view, pixels, triangle, footprint, low_half, bit
+                )
 
 
 @kernel_of_views
@@ -240,18 +244,19 @@ def rasterize_blocks_kernel(
     camera = views.camera[view]
     if camera < 0:
         return
+    intrinsics = views.cameras.intrinsics[view]
     blocks = wp.min(visibility_inout.blocks[view], visibility_inout.block.shape[1])
     for i in range(index % threads, BLOCK_ROWS * blocks, threads):
         block = visibility_inout.block[view, i // BLOCK_ROWS]
         row = block[2] + i % BLOCK_ROWS
         body = bodies.order[view, block[0]]
         triangle = camera_triangle(meshes, bodies, view, body, block[1])
-        footprint = find_footprint(grid, views.cameras, view, triangle)
+        footprint = find_footprint(grid, views.cameras, intrinsics, view, triangle)
         if row <= footprint.pixels[3]:
             pixels = wp.vec4i(block[3], row, wp.min(block[3] + BLOCK_COLUMNS - 1, footprint.pixels[2]), row)
             low_half = pack_low_half(body, block[1])
             bit = amodal_bit(body, views.instances)
-            rasterize_footprint(visibility_inout, amodal_inout, views.cameras, view, pixels, triangle, footprint, low_half, bit)
+            rasterize_footprint(visibility_inout, amodal_inout, views.cameras, intrinsics, view, pixels, triangle, footprint, low_half, bit)
 
 
 @wp.func

@@ -111,7 +111,7 @@ def edge_line(start: wp.vec2, end: wp.vec2, sense: float, margin: float) -> wp.v
 
 
 @wp.func
-def find_footprint(grid: ImageGrid, cameras: AnyCameras, view: int, triangle: Triangle) -> Footprint:
+def find_footprint(grid: ImageGrid, cameras: AnyCameras, intrinsics: wp.vec4, view: int, triangle: Triangle) -> Footprint:
     """Project a triangle and compute its conservative footprint, clipped to the image.
 
     A lens bends the edges: the image lies within bend D² / 6 of that of the corners, D the longest edge in the normalised plane.
@@ -122,7 +122,6 @@ def find_footprint(grid: ImageGrid, cameras: AnyCameras, view: int, triangle: Tr
     if wp.min(depth) < NEAR_PLANE:
         # A corner so close has no useful projection.
         return found
-    intrinsics = cameras.intrinsics[view]
     focal = wp.vec2(intrinsics[0], intrinsics[1])
     middle = wp.vec2(intrinsics[2] - PIXEL_CENTER, intrinsics[3] - PIXEL_CENTER)
     a = wp.vec2(triangle.a[0], triangle.a[1]) / depth[0]

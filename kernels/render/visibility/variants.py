@@ -1,8 +1,9 @@
-"""Permutations of kernels over views: without code for lenses, as all are for pinhole cameras, and with it, where a camera is distorted.
+"""Permutations of kernels: without code for lenses and for drawn looks, as the default's are, and with it, where a cell has them.
 
 A branch that is never taken still costs registers, and changes which products the compiler fuses with sums: the last bits of a picture.
 """
 
+import functools
 from collections.abc import Callable
 from typing import Any
 
@@ -10,34 +11,44 @@ import warp as wp
 
 from synpick_warp.kernels.render.visibility.camera import LensViews, Views
 
+VARIANTS: dict[str, tuple[Any, Any]] = {"views": (Views, LensViews), "views_inout": (Views, LensViews)}
+"""Structs of a parameter that is annotated `Any`, by its name: the plain one and that of the variant. Modules that define structs add
+theirs."""
 _templates: dict[wp.Kernel, wp.Kernel] = {}
-"""Generic kernel of each kernel for pinhole cameras."""
-_lens_kernels: dict[wp.Kernel, wp.Kernel] = {}
-"""Kernel for distorted cameras of each kernel for pinhole cameras; filled by module."""
+"""Generic kernel of each plain kernel."""
+_kernels: dict[tuple[wp.Kernel, frozenset[Any]], wp.Kernel] = {}
+"""Variant of each plain kernel by the structs that are not plain; filled by module."""
 
 
 def kernel_of_views(function: Callable[..., None] | None = None, **options: Any) -> Any:
-    """Decorate a kernel with a parameter of type `AnyViews`, as `wp.kernel` does; the result is the kernel for pinhole cameras."""
+    """Decorate a kernel with parameters of `VARIANTS`, as `wp.kernel` does; the result is the plain kernel."""
     if function is None:
         return lambda decorated: kernel_of_views(decorated, **options)
-    template = wp.kernel(function, **options)
-    kernel = wp.overload(template, {_views_of(template): Views})
+    template: Any = wp.kernel(function, **options)
+    kernel = wp.overload(template, {name: plain for name, (plain, _) in _variable(template).items()})
     _templates[kernel] = template
     return kernel
 
 
 def kernel_for(kernel: wp.Kernel, *arguments: Any) -> wp.Kernel:
-    """Kernel to launch with these arguments: its variant if the struct `LensViews` is among them."""
-    if kernel not in _templates or not any(isinstance(argument, LensViews.cls) for argument in arguments):
+    """Kernel to launch with these arguments: its variant for the structs among them that are not plain."""
+    if kernel not in _templates:
         return kernel
-    if kernel not in _lens_kernels:
+    structs = {special for _, special in _variable(_templates[kernel]).values()}
+    given = frozenset(special for special in structs if any(isinstance(argument, special.cls) for argument in arguments))
+    if not given:
+        return kernel
+    if (kernel, given) not in _kernels:
         # All of the module at once: a further kernel compiles its module again.
-        for pinhole, template in _templates.items():
-            if pinhole.module is kernel.module:
-                _lens_kernels[pinhole] = wp.overload(template, {_views_of(template): LensViews})
-    return _lens_kernels[kernel]
+        for plain, template in _templates.items():
+            variable = _variable(template)
+            if plain.module is kernel.module and given <= {special for _, special in variable.values()}:
+                types = {name: special if special in given else one for name, (one, special) in variable.items()}
+                _kernels[plain, given] = wp.overload(template, types)
+    return _kernels[kernel, given]
 
 
-def _views_of(template: wp.Kernel) -> str:
-    """Name of the parameter of type `AnyViews`."""
-    return next(name for name in ("views", "views_inout") if name in template.arg_indices)
+@functools.cache
+def _variable(template: wp.Kernel) -> dict[str, tuple[Any, Any]]:
+    """Parameters of a kernel that are annotated `Any`, with their structs."""
+    return {name: VARIANTS[name] for name, given in template.func.__annotations__.items() if given is Any}

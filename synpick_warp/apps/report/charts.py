@@ -253,7 +253,7 @@ def _outcomes(source: Source) -> Chart | None:
 def _endings(source: Source) -> Chart | None:
     """Chart of episodes by ending and mode; None: no ending."""
     rows, order = _named(source, _sum_modes([(group.mode, group.episodes.endings) for group in source.statistics.groups]), "episodes")
-    caption = "Why the episodes ended: tote empty, corners visited, or too many failures."
+    caption = "Why the episodes ended: bin empty, corners visited, or too many failures."
     return (
         Chart("endings", "Episodes by ending", caption, _stack(rows, "what", "episodes", order, ("ending", "episodes"))) if rows else None
     )

@@ -72,7 +72,8 @@ def make_attempt(data_set: DataSet, found: Found, content: Content, names: Mappi
     attempt = parse_attempt(episode.attempts[found.place], f"{data_set.folder / episode_entry(found.episode)}.json")
     if not attempt.frame < len(episode):
         raise DatasetError(f"attempt {attempt.attempt} of episode {found.episode} begins in frame {attempt.frame}; it has {len(episode)}")
-    view = episode.view(attempt.frame - attempt.frame % episode.frames(0).step)
+    camera = config.rig.index(config.perception.camera)
+    view = episode.view(attempt.frame - attempt.frame % episode.frames(camera).step, camera)
     if not view.has("rgb"):
         return None
     picture = draw_observation(attempt, view)

@@ -158,7 +158,7 @@ def _endings(figures: Figures) -> Iterator[Finding]:
         yield Finding(
             WARNING,
             f"{given_up / picking:.0%} of the picking episodes were given up",
-            f"{given_up:,} of {picking:,}: {Ending.GAVE_UP.sentence}. Their totes are not empty at the end.",
+            f"{given_up:,} of {picking:,}: {Ending.GAVE_UP.sentence}. Their bins are not empty at the end.",
         )
     short = [index for index, row in figures.episodes.rows.items() if row.frames <= 1]
     if short:

@@ -73,7 +73,7 @@ def write_explanation(dataset: Path, out: Path, episode: int | None, attempt: in
     suction, tick_time = config.suction, config.physics.tick_time
     rows = []
     for each in attempts:
-        view = _open_view(dataset, scenes, each, config.rig.index(config.perception.camera))
+        view = _open_view(dataset, scenes, each, camera := config.rig.index(config.perception.camera), config.rig.every[camera])
         rows.append(_row(each, view, draw_words(each, names, config.target, suction), config.perception.min_votes))
     charts = [load_chart(each, suction, tick_time, IMAGE_WIDTH, room) for each, (_, room) in zip(attempts, rows, strict=True)]
     for (sheet, _), data in zip(rows, render_charts(charts, scale=1.0), strict=True):
@@ -82,12 +82,12 @@ def write_explanation(dataset: Path, out: Path, episode: int | None, attempt: in
     return write_picture(out, np.concatenate([sheet for sheet, _ in rows]))
 
 
-def _open_view(dataset: Path, scenes: SceneIndex, attempt: Attempt, camera: int) -> View:
-    """View of the camera of perception in which an attempt's choice was made."""
-    files = scenes.files(attempt.episode, camera)
-    if attempt.frame not in files.frames():
-        raise DatasetError(f"{files.place} has no image {attempt.frame}, which {dataset}/attempts.jsonl names")
-    return View(files, attempt.episode, camera, attempt.frame)
+def _open_view(dataset: Path, scenes: SceneIndex, attempt: Attempt, camera: int, every: int) -> View:
+    """View of the camera of perception in which an attempt's choice was made, or the last before, as it has one every so many frames."""
+    files, frame = scenes.files(attempt.episode, camera), attempt.frame - attempt.frame % every
+    if frame not in files.frames():
+        raise DatasetError(f"{files.place} has no image {frame}, as {dataset}/attempts.jsonl names frame {attempt.frame}")
+    return View(files, attempt.episode, camera, frame)
 
 
 def to_color_image(pixel: Pixel, resolution: tuple[int, int], size: tuple[int, int]) -> tuple[float, float]:

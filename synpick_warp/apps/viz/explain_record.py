@@ -218,5 +218,5 @@ def break_force(attempt: Attempt, suction: Suction) -> float:
 
 
 def _listed(instances: Sequence[int], full: Mapping[int, str]) -> str:
-    """List names of instances; an engaged object can be invisible to camera 0."""
+    """List names of instances; an engaged object can be invisible to the camera of perception."""
     return ", ".join(full.get(instance, f"instance {instance}, unseen") for instance in instances) or "nothing"

@@ -6,7 +6,7 @@ import contextlib
 import os
 import re
 import shutil
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -103,16 +103,15 @@ def new_cell(
         copied = [file for file in parts if not file.is_dir()]
         for file in copied:
             _copy(file, stage / PARTS)
-        models = os.path.realpath(parts[0]) if parts and not copied else str(place / PARTS) if parts else ""
+        models = os.path.realpath(parts[0]) if parts and not copied else PARTS if parts else ""
         rows = _read_cameras(calibration or [], resolution, lens or "", stage)
         sizes, shape = BinSizes.of_row(shape), _copy_bin(shape, stage)
         cameras = [NewCamera(row.name, given, pose_for(row, index, sizes)) for index, (row, given) in enumerate(rows)]
         width, height = rows[0][0].resolution or _RESOLUTION
         perception = (_PERCEPTION, max(_LEAST, round(_PERCEPTION * height / width)))
         cell = NewCell(cameras, shape, models, unit or AUTO_UNIT, perception=perception)
-        staged = {"bake.models": str(stage / PARTS)} if copied else {}
-        _write_cell(cell, escape(str(folder)), stage, staged)
-        draw_cell(stage / CELL, staged, f"{place.name}/{CELL}", stage / PICTURE, lambda note: escape(note.replace(str(stage), str(folder))))
+        _write_cell(cell, escape(str(folder)), stage)
+        draw_cell(stage / CELL, f"{place.name}/{CELL}", stage / PICTURE, lambda note: escape(note.replace(str(stage), str(folder))))
     print(f"cell: {escape(str(folder / CELL))}, picture: {escape(str(folder / PICTURE))}")
     print(f"bake it: synpick-warp bake --config {escape(str(folder / CELL))} --out DATA")
     return 0
@@ -301,9 +300,8 @@ def _name_camera(stem: str, taken: Sequence[str]) -> str:
     return next(each for each in (name, *(f"{name}_{number}" for number in range(2, 1000))) if each not in taken)
 
 
-def _write_cell(cell: NewCell, name: str, stage: Path, staged: Mapping[str, object]) -> None:
-    """Write the settings, with a volume budget for the parts, and moved to their middle if they are too far from their origin; `staged`:
-    settings while the files are there.
+def _write_cell(cell: NewCell, name: str, stage: Path) -> None:
+    """Write the settings, with a volume budget for the parts, and moved to their middle if they are too far from their origin.
 
     Raises:
         SynpickError: A setting, or a part, cannot be used.
@@ -312,11 +310,11 @@ def _write_cell(cell: NewCell, name: str, stage: Path, staged: Mapping[str, obje
 
     def write(cell: NewCell) -> Config:
         (stage / CELL).write_text(cell_toml(cell, name), encoding="utf-8")
-        return load_settings(stage / CELL, staged)
+        return load_settings(stage / CELL)
 
     def largest(cell: NewCell) -> float:
         config = write(cell)
-        objects = replace(config.objects, strict=bool(staged))
+        objects = replace(config.objects, strict=cell.models == PARTS)
         return max(raw.hull.volume for raw in read_objects(config.bake.models, objects, config.object_rows, config.cell.bins))
 
     if not cell.models:
@@ -329,5 +327,5 @@ def _write_cell(cell: NewCell, name: str, stage: Path, staged: Mapping[str, obje
         try:
             volume = largest(cell)
         except CatalogError:
-            raise error from None
+            raise CatalogError(str(error).replace('objects.unit = "', '--unit "')) from None
     write(replace(cell, volume=2.0 * volume))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated
 
@@ -107,16 +107,16 @@ def _preview_cell(cell: str, out: Path | None) -> int:
 
     check_picture_name(sheet)
     check_output_file(sheet, "--out", inputs=[Path(cell)])
-    draw_cell(cell, {}, Path(cell).name, sheet)
+    draw_cell(cell, Path(cell).name, sheet)
     print(f"cell: {escape(str(sheet))}")
     return 0
 
 
-def draw_cell(preset_or_file: str | Path, settings: Mapping[str, object], name: str, out: Path, say: Callable[[str], str] = escape) -> None:
+def draw_cell(preset_or_file: str | Path, name: str, out: Path, say: Callable[[str], str] = escape) -> None:
     """Draw the cell of settings, as of `load_settings`, with the progress on the console.
 
     Args:
-        preset_or_file, settings: As of `load_settings`.
+        preset_or_file: As of `load_settings`.
         name: What the sheet is of, for its title.
         out: PNG or JPEG file to write.
         say: Words a note.
@@ -124,7 +124,7 @@ def draw_cell(preset_or_file: str | Path, settings: Mapping[str, object], name: 
     Raises:
         SynpickError: Settings, device, bins, cameras or all objects cannot be used, or the file cannot be written.
     """
-    config = load_settings(preset_or_file, settings)
+    config = load_settings(preset_or_file)
     from synpick_warp.apps.viz.cell.rendering import CellScene
     from synpick_warp.apps.viz.cell.sheet import write_cell_sheet
     from synpick_warp.cli.display import make_console, make_progress

@@ -79,7 +79,7 @@ class SceneExporter(EpisodeExporter[tuple[Path, ...]]):
                 resolution=(camera.width, camera.height),
                 color=settings.rig.writes(index, COLOR),
                 depth=self.writes_depth and settings.rig.writes(index, DEPTH),
-                layers=tuple(name for name in layers if settings.rig.writes(index, name)),
+                layers=settings.rig.chosen(index, layers),
                 keypoints=self._keypoints,
                 polygons=bop.polygons,
             )

@@ -141,8 +141,10 @@ def write_constants(
     for name, spec in OBJECTS.arrays.items():
         values = [entry.obj_id if name == "object_id" else getattr(entry, name) for entry in entries]
         add_array(objects, name, spec, np.array(values, spec.dtype), level)
-    fixed_to = [camera.fixed_to for camera in cameras]
-    group = add_group(root, "cameras", CAMERAS, {"fixed_to": fixed_to} if set(fixed_to) != {WORLD} else {})
+    known = {"fixed_to": [camera.fixed_to for camera in cameras], "distortion": [camera.distortion or None for camera in cameras]}
+    usual = {"fixed_to": WORLD, "distortion": None}
+    told = {name: values for name, values in known.items() if any(value != usual[name] for value in values)}
+    group = add_group(root, "cameras", CAMERAS, told)
     for name, spec in CAMERAS.arrays.items():
         values = [(camera.width, camera.height) if name == "resolution" else getattr(camera, name) for camera in cameras]
         add_array(group, name, spec, np.array(values, spec.dtype), level)

@@ -99,12 +99,13 @@ class ViewBatch:
     denotes the same object for the whole episode.
 
     Attributes:
-        color: Colour image, sRGB, red first (B, H, W, 3) uint8.
+        color: Colour image, sRGB, red first (B, H, W, 3) uint8; None for cameras without colour in their modalities.
         depth: Planar depth in units of `depth_scale` mm; 0: no surface (B, H, W) uint16.
         instance: Segmentation id of the nearest surface: 0 none, 1 + instance_id, 252 to 255 table and fixtures (`Segment`)
             (B, H, W) uint8.
         amodal: Amodal masks as a bit field: bit i is set where the pixel's ray hits instance i, hidden or not (B, H, W) uint32.
-        layers: Layers (AOVs) that `render.layers` names, as they are before quantization (B, H, W[, C]); see `synpick_warp.views.layers`.
+        layers: Layers (AOVs) that `render.layers` names and the modalities of the cameras have, as they are before quantization
+            (B, H, W[, C]); see `synpick_warp.views.layers`.
         object_id: obj_id of each instance; -1: the instance is not in the scene; below: a distractor, without label (B, I) int32.
         pose: Object to world: x, y, z [m], quaternion x, y, z, w (B, I, 7) float32.
         object_to_camera: The same in the camera's frame, as matrices (B, I, 4, 4) float32 [m].
@@ -123,7 +124,7 @@ class ViewBatch:
             translation where these are not those of the cameras; see `synpick_warp.views.frames.FrameBatch`.
     """
 
-    color: DeviceArray
+    color: DeviceArray | None
     depth: DeviceArray
     instance: DeviceArray
     amodal: DeviceArray
@@ -139,11 +140,12 @@ class ViewBatch:
     intrinsics: DeviceArray
     world_to_camera: DeviceArray
 
-    def __init__(self, slot: Slot, count: int, depth_scale: float, host: Mapping[str, np.ndarray]) -> None:
+    def __init__(self, slot: Slot, count: int, depth_scale: float, host: Mapping[str, np.ndarray], colors: bool) -> None:
         self._slot, self._count, self.depth_scale, self.host = slot, count, depth_scale, host
         for part in (slot.images, slot.truth):
             for item in fields(part):
                 setattr(self, item.name, self._export(getattr(part, item.name)))
+        self.color = self.color if colors else None
         present = {item.name: getattr(slot.layers, item.name) for item in fields(slot.layers)}
         self.layers = {name: self._export(array) for name, array in present.items() if array is not None}
 
@@ -161,7 +163,7 @@ class ViewBatch:
 
     def _masks(self, name: str) -> DeviceArray:
         """Expand the masks of a kind (B, I, H, W), and export these."""
-        self.color.check()
+        self.depth.check()
         return self._export(self._slot.expand_masks(name, self._count))
 
     def _export(self, array: wp.array) -> DeviceArray:
@@ -173,7 +175,7 @@ class ViewBatch:
         return self._count
 
     def __repr__(self) -> str:
-        return f"ViewBatch({self._count} views of {self.color.shape[2]}x{self.color.shape[1]} px on {self.color.device})"
+        return f"ViewBatch({self._count} views of {self.depth.shape[2]}x{self.depth.shape[1]} px on {self.depth.device})"
 
 
 class BatchRing:
@@ -220,7 +222,7 @@ class BatchRing:
             self.renderer.render(snapshot, views, slot.images, slot.layers, cameras)
             self._gather(snapshot, views, slot.truth)
         slot.gate.mark_ready()
-        return ViewBatch(slot, count, self.depth_scale, host)
+        return ViewBatch(slot, count, self.depth_scale, host, self.group.colors)
 
     def _gather(self, snapshot: Snapshot, views: Any, truth: TruthBuffers) -> None:
         """Launch the kernels that write `truth` for a batch of views."""

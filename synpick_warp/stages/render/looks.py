@@ -15,13 +15,14 @@ from synpick_warp.configs.randomize import CHOICE, FIXED, LOG_UNIFORM, NORMAL, U
 from synpick_warp.kernels.distributions import LookDistribution, LookTable
 from synpick_warp.kernels.render.lighting.background import shade_floor_kernel
 from synpick_warp.kernels.render.lighting.looks import draw_looks_kernel, dress_bodies_kernel
-from synpick_warp.kernels.render.lighting.materials import Surfaces
-from synpick_warp.kernels.render.lighting.paths.tracing import PathScene
+from synpick_warp.kernels.render.lighting.materials import DressedSurfaces, Surfaces
+from synpick_warp.kernels.render.lighting.paths.tracing import DressedScene, PathScene
 from synpick_warp.kernels.render.visibility.camera import TILE_PIXELS
 from synpick_warp.kernels.render.visibility.gbuffer import FIXTURES
 from synpick_warp.kernels.render.visibility.variants import kernel_for
 from synpick_warp.scenes.looks import Looks
 from synpick_warp.scenes.tote import FLOOR_DROP
+from synpick_warp.stages.arrays import ArraySpec, StructArrays, allocate_struct
 from synpick_warp.stages.buffers import Snapshot
 from synpick_warp.stages.launch import launch_pixels
 from synpick_warp.stages.render.scene import RenderScene
@@ -46,7 +47,12 @@ SETTINGS = {
 }
 """Setting of `Randomize` that has a part's distribution of a parameter."""
 _COPIED = ("color", "metallic", "roughness", "texture_size", "first_texel", "texture_levels")
-"""Arrays of `Surfaces` with a row for each material."""
+"""Arrays of `Surfaces` with a row for each material, of every scene ..."""
+_TYPES = {name: DressedSurfaces.vars[name].type for name in (*_COPIED, "recolor", "repeats")}
+_MATERIALS = StructArrays(
+    DressedSurfaces, {name: ArraySpec(("material", "level")[: kind.ndim], kind.dtype, "") for name, kind in _TYPES.items()}
+)
+"""... and all that the materials of views have."""
 
 _ROW: Any = LookDistribution.numpy_dtype()
 
@@ -106,6 +112,16 @@ def _pack_choice(distribution: Distribution) -> list[np.ndarray]:
     return list(np.column_stack([_vectors(distribution), np.cumsum(weights) / weights.sum()]))
 
 
+def materials_of_view(instances: int, background: bool = True) -> int:
+    """Number of materials of a view of `instances` instances: theirs, of fixtures, table and background."""
+    return instances + int(FIXTURES) + 1 + background
+
+
+def allocate_materials(rows: int, levels: int, device: wp.Device) -> Any:
+    """Allocate the members of the struct `DressedSurfaces` that materials have, for a number of these and of mip levels."""
+    return allocate_struct(_MATERIALS, {"material": rows, "level": levels}, device)
+
+
 class Dresser:
     """Sampler of the materials of each batch of views. Owns a scene with space for them.
 
@@ -118,30 +134,30 @@ class Dresser:
         self._seed = wp.uint64(seed)
         self._first = scene.surfaces.color.shape[0]
         self._table = build_look_table(scene.looks, self._first - len(scene.looks.all_textures), scene.device)
-        self._materials = instances + int(FIXTURES) + 1 + bool(scene.looks.background_textures)
-        rows = views * self._materials
-        self.material = wp.zeros((views, self._materials), dtype=wp.int32, device=scene.device)
-        surfaces, paths = _copy(Surfaces, scene.surfaces), _copy(PathScene, scene.paths)
-        for name in _COPIED:
+        self._materials = materials_of_view(instances, bool(scene.looks.background_textures))
+        levels = scene.surfaces.first_texel.shape[1]
+        surfaces = allocate_materials(self._first + views * self._materials, levels, scene.device)
+        for name in Surfaces.vars:
             values = getattr(scene.surfaces, name)
-            longer = wp.zeros((values.shape[0] + rows, *values.shape[1:]), dtype=values.dtype, device=scene.device)
-            wp.copy(longer, values, count=values.size)
-            setattr(surfaces, name, longer)
-        total = surfaces.color.shape[0]
-        surfaces.recolor = wp.zeros(total, dtype=wp.mat33, device=scene.device)
-        surfaces.repeats = wp.zeros(total, dtype=wp.float32, device=scene.device)
-        paths.surfaces = surfaces
+            if name in _COPIED:
+                wp.copy(getattr(surfaces, name), values, count=values.size)
+            else:
+                setattr(surfaces, name, values)
+        surfaces.row = wp.zeros((views, self._materials), dtype=wp.int32, device=scene.device)
+        paths = DressedScene()
+        for name in PathScene.vars:
+            setattr(paths, name, surfaces if name == "surfaces" else getattr(scene.paths, name))
         self.scene = replace(scene, surfaces=surfaces, paths=paths)
 
     def dress(self, snapshot: Snapshot, views: Any, bodies: Any) -> None:
         """Make the materials of the bodies of all views, of their tables and backgrounds; `bodies` must be set up."""
         scene = self.scene
-        inputs = [self._seed, scene.meshes, self._table, snapshot.episode, views, self._first]
+        inputs = [self._seed, scene.meshes, self._table, snapshot.episode, views, bodies, self._first]
         wp.launch(
             kernel_for(dress_bodies_kernel, views),
             dim=(views.count, self._materials),
             inputs=inputs,
-            outputs=[bodies, scene.surfaces],
+            outputs=[scene.surfaces],
             device=scene.device,
         )
 
@@ -151,14 +167,6 @@ def shade_floor(scene: RenderScene, snapshot: Snapshot, bodies: Any, gbuffer: An
     if scene.looks is not None and scene.looks.background_textures:
         inputs = [scene.paths, scene.grid, FLOOR_DROP, snapshot.light, bodies, gbuffer, views]
         launch_pixels(shade_floor_kernel, views.count * scene.grid.tiles * int(TILE_PIXELS), inputs, [radiance], scene.device)
-
-
-def _copy(kind: Any, struct: Any) -> Any:
-    """Shallow copy of a Warp struct."""
-    result = kind()
-    for name in kind.vars:
-        setattr(result, name, getattr(struct, name))
-    return result
 
 
 def draw_parameters(looks: Looks, seed: int, episode: int, parts: list[tuple[LookPart, int]]) -> tuple[np.ndarray, np.ndarray]:

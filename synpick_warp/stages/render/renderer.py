@@ -44,6 +44,7 @@ class Renderer:
         bodies: The struct `ViewBodies` of the last batch.
         gbuffer: The struct `GBuffer` of the last batch.
         image: The struct `ShadedImage` of the last batch: linear radiance.
+        shading: Shades it; None: there are no colour images.
     """
 
     def __init__(
@@ -58,6 +59,7 @@ class Renderer:
         instances: int,
         views: int,
         histories: int = 0,
+        colors: bool = True,
     ) -> None:
         """Allocate scratch.
 
@@ -71,6 +73,7 @@ class Renderer:
             instances: Instance capacity of a world, at most 32: one bit each in the amodal image.
             views: Maximum number of views of a batch.
             histories: Worlds times cameras whose light is averaged over the frames of an episode; 0: each frame is rendered by itself.
+            colors: Whether colour images are wanted; else they stay as they are, and nothing is shaded.
         """
         sizes = {"view": views, "row": scene.height, "column": scene.width} | body_sizes(instances, scene.width, scene.height)
         self.dresser = Dresser(scene, seed, instances, views) if scene.looks is not None else None
@@ -79,19 +82,19 @@ class Renderer:
         self.views = views
         self.cameras = allocate_view_cameras(views, scene.device, scene.cameras)
         self.bodies = allocate_struct(VIEW_BODIES, sizes, scene.device)
-        if self.dresser:
-            self.bodies.material = self.dresser.material
         self.gbuffer = allocate_struct(GBUFFER, sizes, scene.device)
-        self.image = allocate_struct(SHADED_IMAGE, sizes, scene.device)
-        if settings.mode == schema.REFERENCE:
-            self.shading: DenoisedRenderer | ReferenceRenderer = ReferenceRenderer(settings, seed, scene)
-        else:
-            self.shading = DenoisedRenderer(settings, seed, scene, instances, views, histories)
+        self.shading: DenoisedRenderer | ReferenceRenderer | None = None
+        if colors:
+            self.image = allocate_struct(SHADED_IMAGE, sizes, scene.device)
+            if settings.mode == schema.REFERENCE:
+                self.shading = ReferenceRenderer(settings, seed, scene)
+            else:
+                self.shading = DenoisedRenderer(settings, seed, scene, instances, views, histories)
+            self.postprocessor = PostProcessor(effects, settings.tone, seed, scene, views)
         self.rasterizer = Rasterizer(scene, 1000.0 / depth_scale, views)
         sensor = sensor_parameters(depth_sensor, seed, depth_scale)
         self.layer_renderer = LayerRenderer(settings.layers, sensor, scene, instances, views)
         self.annotator = Annotator(scene, instances, views)
-        self.postprocessor = PostProcessor(effects, settings.tone, seed, scene, views)
 
     def render(
         self, snapshot: Snapshot, views: Any, out: ViewBuffers, layers: LayerBuffers | None = None, placed: PlacedCameras | None = None
@@ -118,10 +121,11 @@ class Renderer:
             with scope("layers", device):
                 last = views.cameras if placed is None else placed.last
                 self.layer_renderer.render(snapshot, self.bodies, self.gbuffer, views, layers, last)
-        with scope("shade", device):
-            self.shading.shade(snapshot, self.bodies, self.gbuffer, views, self.image)
-        with scope("post-process", device):
-            self.postprocessor.process(snapshot, views, self.image, out)
+        if self.shading is not None:
+            with scope("shade", device):
+                self.shading.shade(snapshot, self.bodies, self.gbuffer, views, self.image)
+            with scope("post-process", device):
+                self.postprocessor.process(snapshot, views, self.image, out)
         with scope("annotate", device):
             self.annotator.annotate(self.bodies, views, out)
 

@@ -1,4 +1,4 @@
-"""Active stereo camera of a batch of views: launches of the infrared pair, and of stereo matching, view by view."""
+"""Active stereo camera of a batch of views: launches of the infrared pair, and of stereo matching, a few views at a time."""
 
 from __future__ import annotations
 
@@ -30,6 +30,10 @@ STEREO_LAYERS = {*EYES, DEPTH}
 """Layers of an active stereo camera."""
 DIRECTIONS = 4
 """Directions of paths: right, left, down and up."""
+GPU_SLOTS, CPU_SLOTS = 8, 1
+"""Views that are matched at a time: their paths, a warp each, fill the multiprocessors of a GPU."""
+MAX_COSTS = 1 << 30
+"""Elements of the cost volumes of these views together, 2 bytes each, above which fewer are matched at a time."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,13 +46,13 @@ class InfraredImages:
 
 @dataclass(frozen=True, eq=False)
 class MatchingScratch:
-    """Scratch of matching, of one view."""
+    """Scratch of matching: a slot for each view that is matched at a time."""
 
-    census: wp.array = device_array("eye", "row", "column", dtype=wp.uint32)
-    cost: wp.array = device_array("row", "column", "disparity", dtype=wp.uint16)
-    """Cost volume: sum of the costs of all paths."""
-    right_match: wp.array = device_array("row", "column", dtype=wp.int32)
-    disparity: wp.array = device_array("row", "column", dtype=wp.int32)
+    census: wp.array = device_array("slot", "eye", "row", "column", dtype=wp.uint32)
+    cost: wp.array = device_array("slot", "row", "column", "disparity", dtype=wp.uint16)
+    """Cost volumes: sum of the costs of all paths."""
+    right_match: wp.array = device_array("slot", "row", "column", dtype=wp.int32)
+    disparity: wp.array = device_array("slot", "row", "column", dtype=wp.int32)
 
 
 def count_disparities(max_disparity: float) -> int:
@@ -70,8 +74,10 @@ class StereoRenderer:
         """
         self.scene, self.sensor = scene, sensor
         self.matches = DEPTH in names
-        sizes = {"view": views, "eye": len(EYES), "row": scene.height, "column": scene.width}
-        sizes["disparity"] = count_disparities(sensor.max_disparity)
+        disparities = count_disparities(sensor.max_disparity)
+        most = MAX_COSTS // (scene.height * scene.width * disparities)
+        self.slots = max(1, min(views, GPU_SLOTS if scene.device.is_cuda else CPU_SLOTS, most))
+        sizes = {"view": views, "slot": self.slots, "eye": len(EYES), "row": scene.height, "column": scene.width, "disparity": disparities}
         self.eyes = [eye for eye in EYES if eye in names or self.matches]
         self.images = allocate(InfraredImages, sizes, scene.device, set(self.eyes) - set(names))
         self.scratch = allocate(MatchingScratch, sizes, scene.device) if self.matches else None
@@ -87,22 +93,22 @@ class StereoRenderer:
             inputs = [scene.paths, scene.grid, *worlds, self.sensor, bodies, gbuffer, views, EYES.index(eye)]
             launch_pixels(render_infrared_kernel, pixels, inputs, [image], scene.device)
         if self.scratch is not None:
-            for view in range(views.count):
-                self.match(view, views, list(images.values()), out.depth_stereo)
+            for first in range(0, views.count, self.slots):
+                self.match(first, min(self.slots, views.count - first), views, list(images.values()), out.depth_stereo)
 
-    def match(self, view: int, views: Any, images: list[wp.array], depth: wp.array) -> None:
-        """Match the left and right images of a view."""
+    def match(self, first_view: int, count: int, views: Any, images: list[wp.array], depth: wp.array) -> None:
+        """Match the left and right images of `count` views, at most as many as there are slots."""
         grid, sensor, scratch, device = self.scene.grid, self.sensor, self.scratch, self.scene.device
         assert scratch is not None
-        pixels = grid.tiles * int(TILE_PIXELS)
-        launch_pixels(transform_census_kernel, len(EYES) * pixels, [grid, *images, view], [scratch.census], device)
+        pixels = count * grid.tiles * int(TILE_PIXELS)
+        launch_pixels(transform_census_kernel, len(EYES) * pixels, [grid, *images, first_view], [scratch.census], device)
         lanes = WARP if device.is_cuda else 1
         for direction in range(DIRECTIONS):
             lines = grid.height if direction < DIRECTIONS // 2 else grid.width
-            inputs = [sensor, views, scratch.census, view, direction, lanes]
-            launch_views(sum_path_costs_kernel, lines, lanes, inputs, [scratch.cost], device)
+            inputs = [sensor, views, scratch.census, first_view, direction, lines, lanes]
+            launch_views(sum_path_costs_kernel, count * lines, lanes, inputs, [scratch.cost], device)
         inputs = [grid, sensor, views, scratch.cost]
-        launch_pixels(match_right_kernel, pixels, [*inputs, view], [scratch.right_match], device)
-        inputs += [scratch.right_match, scratch.census, view]
+        launch_pixels(match_right_kernel, pixels, [*inputs, first_view], [scratch.right_match], device)
+        inputs += [scratch.right_match, scratch.census, first_view]
         launch_pixels(match_left_kernel, pixels, inputs, [scratch.disparity], device)
-        launch_pixels(measure_depth_kernel, pixels, [grid, sensor, views, scratch.disparity, view], [depth], device)
+        launch_pixels(measure_depth_kernel, pixels, [grid, sensor, views, scratch.disparity, first_view], [depth], device)

@@ -2,27 +2,29 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import warp as wp
 
+from synpick_warp.configs.calibration.lens import LensMap
 from synpick_warp.kernels.render.visibility.camera import LensCameras, LensViews, ViewCameras, Views
 from synpick_warp.kernels.render.visibility.gbuffer import GBuffer, ViewBodies
+from synpick_warp.kernels.render.visibility.lens import NUMBERS, Lenses
+from synpick_warp.kernels.render.visibility.lens_rays import compute_rays_kernel
 from synpick_warp.kernels.render.visibility.ray_bodies import RAY_RECORDS
 from synpick_warp.kernels.render.visibility.variants import kernel_for
 from synpick_warp.kernels.render.visibility.view_setup import aim_cameras_kernel, bin_bodies_kernel, set_up_views_kernel, sort_bodies_kernel
 from synpick_warp.stages.arrays import allocate_struct, struct_arrays
 from synpick_warp.stages.buffers import FIXTURES, Snapshot
-from synpick_warp.stages.render.scene import RenderScene, build_grid, camera_arrays
+from synpick_warp.stages.render.scene import RenderScene, build_grid, camera_arrays, lens_numbers
 
 VIEW_BODIES = struct_arrays(
     ViewBodies,
     "view",
     "body",
-    material=("view", "material"),
     ray_record=("view", "body", "record"),
     present=("view",),
     uses_background=("view",),
@@ -32,6 +34,7 @@ VIEW_BODIES = struct_arrays(
 VIEWS = struct_arrays(Views, "view")
 VIEW_CAMERAS = struct_arrays(ViewCameras, "view", units={"intrinsics": "px", "center": "m"})
 LENS_CAMERAS = struct_arrays(LensCameras, "view", units={"intrinsics": "px", "center": "m"})
+LENSES = struct_arrays(Lenses, "view", ray=("view", "row", "column"), number=("view", "number"))
 GBUFFER = struct_arrays(GBuffer, "view", "row", "column", units={"depth": "m"})
 BACKGROUND = struct_arrays(GBuffer, "camera", "row", "column", units={"depth": "m"})
 
@@ -86,6 +89,24 @@ class PlacedCameras:
     """The same struct if the cameras do not move."""
 
 
+def place_lenses(cameras: Any, scene: RenderScene, slot: np.ndarray, lenses: Sequence[LensMap | None]) -> None:
+    """Give the first views of the struct `LensCameras` a lens of their own, and compute the rays of its pixels.
+
+    Args:
+        cameras: Written; its cameras are set, and its lenses are those of `LENSES`.
+        scene: Scene that has these lenses with other camera matrices.
+        slot: Row of each view's camera in the scene (view) int32.
+        lenses: Lens of each view; None: a pinhole.
+    """
+    views, table = np.arange(len(lenses), dtype=np.int32), cameras.lenses
+    cameras.lens[: len(views)].assign(np.where([lens is not None for lens in lenses], views, -1).astype(np.int32))
+    numbers = [np.zeros(int(NUMBERS), np.float32) if lens is None else lens_numbers(lens) for lens in lenses]
+    table.number[: len(views)].assign(np.stack(numbers))
+    inputs = [scene.cameras, wp.array(slot, dtype=wp.int32, device=scene.device), cameras]
+    dim = (len(views), *table.ray.shape[1:])
+    wp.launch(compute_rays_kernel, dim=dim, inputs=inputs, outputs=[table.ray], device=scene.device)
+
+
 def place_cameras(cameras: Any, scene: RenderScene, slot: np.ndarray, placed: Mapping[str, np.ndarray]) -> None:
     """Set the first views of the struct `ViewCameras` on the host.
 
@@ -112,7 +133,7 @@ def first_views(count: int, cameras: int, instances: int, device: wp.Device, len
 
 def body_sizes(instances: int, width: int, height: int) -> dict[str, int]:
     """Extents of the dimensions that `VIEW_BODIES` names beside the view, for images of `width` x `height` px."""
-    return {"body": instances + len(FIXTURES), "material": 0, "tile": build_grid(width, height).tiles, "record": int(RAY_RECORDS)}
+    return {"body": instances + len(FIXTURES), "tile": build_grid(width, height).tiles, "record": int(RAY_RECORDS)}
 
 
 def set_up_views(

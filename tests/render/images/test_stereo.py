@@ -14,6 +14,7 @@ from synpick_warp.codes import MAX_DISPARITIES
 from synpick_warp.configs.schema import Config
 from synpick_warp.configs.sensors import DepthSensor
 from synpick_warp.kernels.render.images.stereo_matching import sum_path_costs_kernel
+from synpick_warp.stages.render import stereo
 from synpick_warp.stages.render.layers import sensor_parameters
 from synpick_warp.stages.render.scene import blank_scene
 from synpick_warp.stages.render.stereo import StereoRenderer, count_disparities
@@ -168,9 +169,9 @@ def match(renderer: StereoRenderer, views: Any, left: np.ndarray, right: np.ndar
     """Costs along paths, and sub-pixel disparity of two images before it is filtered [px]; negative: none."""
     device = renderer.scene.device
     images = [wp.array(image[None], dtype=wp.uint8, device=device) for image in (left, right)]
-    renderer.match(0, views, images, wp.zeros((1, *left.shape), dtype=wp.uint16, device=device))
+    renderer.match(0, 1, views, images, wp.zeros((1, *left.shape), dtype=wp.uint16, device=device))
     assert renderer.scratch is not None
-    return renderer.scratch.cost.numpy(), renderer.scratch.disparity.numpy() / 256.0
+    return renderer.scratch.cost.numpy()[0], renderer.scratch.disparity.numpy()[0] / 256.0
 
 
 @pytest.mark.parametrize("tilt", [0.0, 0.3, 0.8])
@@ -233,7 +234,11 @@ def test_fractions_of_a_pixel_are_not_drawn_to_whole_ones(device, fraction):
     assert off.std() < 0.08
 
 
-def test_depth_is_that_of_single_views_and_of_unstored_images(device):
+@pytest.mark.parametrize("slots", [1, 2])
+def test_depth_is_that_of_single_views_and_of_unstored_images(device, slots, monkeypatch):
+    """Also if the last views do not fill the slots."""
+    monkeypatch.setattr(stereo, "CPU_SLOTS", slots)
+    monkeypatch.setattr(stereo, "GPU_SLOTS", slots)
     toy = step_scene()
     toy.placed = [*toy.placed, *wall(1.3, 0.5).placed, *toy.placed]
     together = see(toy, device, **NOISY)

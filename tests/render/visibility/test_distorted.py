@@ -11,19 +11,23 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from synpick_warp.configs.calibration.lens import FISHEYE
+from synpick_warp.configs.calibration.lens import FISHEYE, with_matrix
 from synpick_warp.configs.schema import UNOCCLUDED
 from synpick_warp.scenes.types import Camera
+from synpick_warp.stages.render.view_setup import allocate_view_cameras, place_cameras, place_lenses
+from synpick_warp.stages.view_ring import allocate_lenses
 from synpick_warp.system.hardware.device import pick_device
 from tests.harness.devices import default_device
 from tests.render.visibility.test_raster import NEVER, depth_in_float64, gbuffer_of, random_triangles, triangles
 from tests.twins.annotate import count_pixels
 from tests.twins.layers import PreviousFrame, render_layers
 from tests.worlds.toy_scene import (
+    DOWN,
     UPRIGHT,
     ToyScene,
     ball,
     box,
+    build_scene,
     camera,
     distorted,
     entry,
@@ -80,6 +84,26 @@ def test_depth_and_masks_are_those_of_float64(device, name, size):
     assert both.sum() > 20
     np.testing.assert_allclose(found["depth"][both], depth[both], rtol=2e-4)
     assert (found["amodal"][both] == 1).all()
+
+
+@pytest.mark.parametrize("name", VIEWS)
+@pytest.mark.parametrize(("zoom", "shift"), [(0.0, (3.0, -2.0)), (0.05, (-4.5, 0.25)), (-0.02, (0.5, 1.5))])
+def test_rays_of_a_drawn_camera_matrix_are_those_of_float64(device, name, zoom, shift):
+    """Beside a pinhole, in a batch of three views with a lens of their own."""
+    view = VIEWS[name]
+    matrix = view.matrix * (1.0 + zoom * np.eye(3))
+    matrix[:2, 2], matrix[2, 2] = view.matrix[:2, 2] + shift, 1.0
+    lenses = (with_matrix(view.lens, matrix), None, view.lens)
+    scene = build_scene(ToyScene([entry(sheet(1.0, 1.0))], [[]], (view, WIDE)), device)
+    slot, matrices = np.array([0, 1, 0], np.int32), np.array([matrix, WIDE.matrix, view.matrix])
+    cameras = allocate_view_cameras(4, device, scene.cameras)
+    cameras.lenses = allocate_lenses({"view": 4, "row": view.height, "column": view.width}, device)
+    place_cameras(cameras, scene, slot, {"matrix": matrices, "rotation": np.array([DOWN] * 3), "translation": np.zeros((3, 3))})
+    place_lenses(cameras, scene, slot, lenses)
+    assert cameras.lens.numpy()[:3].tolist() == [0, -1, 2]
+    for row in (0, 2):
+        # A thousandth of a pixel is 1.5e-5 here.
+        np.testing.assert_allclose(cameras.lenses.ray.numpy()[row], lenses[row].rays(), rtol=0, atol=5e-7)
 
 
 @pytest.mark.parametrize("name", VIEWS)

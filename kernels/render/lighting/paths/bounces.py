@@ -15,7 +15,7 @@ from synpick_warp.kernels.render.lighting.paths.queues import (
     read_path,
     requeue_path,
 )
-from synpick_warp.kernels.render.lighting.paths.tracing import TERMINATED, PathRules, PathScene, extend_path, next_vertex
+from synpick_warp.kernels.render.lighting.paths.tracing import TERMINATED, AnyScene, PathRules, extend_path, next_vertex
 from synpick_warp.kernels.render.visibility.camera import AnyViews
 from synpick_warp.kernels.render.visibility.gbuffer import ViewBodies
 from synpick_warp.kernels.render.visibility.variants import kernel_of_views
@@ -27,7 +27,7 @@ wp.set_module_options({"enable_backward": False, "fast_math": True})
 @kernel_of_views(cuda_max_registers=SINGLE_PATH_REGISTERS)
 def extend_queued_paths_kernel(
     # Scene:
-    scene: PathScene,
+    scene: AnyScene,
     coarse: CoarseGrid,
     # State: worlds
     episode: wp.array[int],  # (world)

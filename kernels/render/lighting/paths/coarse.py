@@ -29,9 +29,9 @@ from synpick_warp.kernels.render.lighting.paths.queues import PathPixel, PathQue
 from synpick_warp.kernels.render.lighting.paths.surface import coarse_surface, write_guide
 from synpick_warp.kernels.render.lighting.paths.tracing import (
     TERMINATED,
+    AnyScene,
     PathContext,
     PathRules,
-    PathScene,
     Vertex,
     extend_path,
     init_path,
@@ -58,7 +58,7 @@ within a filter kernel, and a range of 1 leaves the image's mean unbiased."""
 
 @wp.func
 def make_context(
-    scene: PathScene,
+    scene: AnyScene,
     coarse: CoarseGrid,
     rules: PathRules,
     views: AnyViews,
@@ -88,7 +88,7 @@ def make_context(
 
 @wp.func
 def average_paths(
-    scene: PathScene,
+    scene: AnyScene,
     bodies: ViewBodies,
     rules: PathRules,
     context: PathContext,
@@ -173,7 +173,7 @@ def finish_pixel(
 
 @wp.func
 def finish_path(
-    scene: PathScene,
+    scene: AnyScene,
     rules: PathRules,
     context: PathContext,
     out: CoarseLight,
@@ -196,7 +196,7 @@ def finish_path(
 
 @wp.func
 def make_path_pixel(
-    scene: PathScene, rules: PathRules, context: PathContext, vertex: Vertex, index: int, segment: int, known: int, number: int
+    scene: AnyScene, rules: PathRules, context: PathContext, vertex: Vertex, index: int, segment: int, known: int, number: int
 ) -> PathPixel:
     """Data with which the light of a coarse pixel's paths is combined: unoccluded light, diffuse colour, firefly limit, history length.
 
@@ -220,7 +220,7 @@ def make_path_pixel(
 
 @wp.func
 def trace_pixel(
-    scene: PathScene,
+    scene: AnyScene,
     coarse: CoarseGrid,
     episode: wp.array[int],
     light: wp.array[int],
@@ -283,7 +283,7 @@ def trace_pixel(
 @kernel_of_views(cuda_max_registers=COARSE_PATH_REGISTERS)
 def trace_coarse_paths_kernel(
     # Scene:
-    scene: PathScene,
+    scene: AnyScene,
     coarse: CoarseGrid,
     # State: worlds
     episode: wp.array[int],  # (world)
@@ -331,7 +331,7 @@ def trace_coarse_paths_kernel(
 @kernel_of_views(cuda_max_registers=SINGLE_PATH_REGISTERS)
 def start_paths_kernel(
     # Scene:
-    scene: PathScene,
+    scene: AnyScene,
     coarse: CoarseGrid,
     # State: worlds
     episode: wp.array[int],  # (world)

@@ -16,7 +16,7 @@ from synpick_warp.kernels.render.lighting.history import (
 from synpick_warp.kernels.render.lighting.paths.light import CoarseLight, store_light
 from synpick_warp.kernels.render.lighting.paths.lists import PathLists, append_pixel
 from synpick_warp.kernels.render.lighting.paths.surface import coarse_surface, write_guide
-from synpick_warp.kernels.render.lighting.paths.tracing import PathScene, make_vertex
+from synpick_warp.kernels.render.lighting.paths.tracing import AnyScene, make_vertex
 from synpick_warp.kernels.render.lighting.unoccluded import unoccluded_light
 from synpick_warp.kernels.render.visibility.camera import AnyViews, in_image
 from synpick_warp.kernels.render.visibility.gbuffer import GBuffer, ViewBodies
@@ -30,7 +30,7 @@ wp.set_module_options({"enable_backward": False, "fast_math": True})
 @kernel_of_views(cuda_max_registers=RAY_REGISTERS)
 def reuse_histories_kernel(
     # Scene:
-    scene: PathScene,
+    scene: AnyScene,
     coarse: CoarseGrid,
     # State: worlds
     light: wp.array[int],  # (world)

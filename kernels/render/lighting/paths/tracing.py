@@ -7,12 +7,15 @@ sampling with the power heuristic (Veach, 1997), w_l = p_l² / (p_l² + p_s²). 
 `trace_paths_kernel` is the path-traced reference; `coarse` uses the same functions at few paths per coarse pixel.
 """
 
+from typing import Any
+
 import warp as wp
 
 from synpick_warp.codes import Segment, Stream
 from synpick_warp.kernels.render.lighting.brdf import Brdf, BrdfValue, SplitRadiance, brdf_pdf, evaluate_brdf, make_brdf, sample_brdf
 from synpick_warp.kernels.render.lighting.environment import Lights, environment_radiance, rotate_z
 from synpick_warp.kernels.render.lighting.materials import (
+    DressedSurfaces,
     Surfaces,
     interpolate_surface,
     make_table_surface,
@@ -29,7 +32,7 @@ from synpick_warp.kernels.render.lighting.sampling import (
 from synpick_warp.kernels.render.visibility.bvh_rays import RAY_OFFSET, hit_table, is_blocked, trace_camera_ray, trace_ray
 from synpick_warp.kernels.render.visibility.camera import AnyViews, ImageGrid, camera_ray, hit_position, in_image, tile_of, tile_pixel
 from synpick_warp.kernels.render.visibility.gbuffer import FAR, Hit, Meshes, Table, ViewBodies, body_of
-from synpick_warp.kernels.render.visibility.variants import kernel_of_views
+from synpick_warp.kernels.render.visibility.variants import VARIANTS, kernel_of_views
 from synpick_warp.kernels.rng import mix, stream_key
 
 wp.set_module_options({"enable_backward": False})
@@ -60,6 +63,22 @@ class PathScene:
     lights: Lights
     cdf: EnvironmentCdf
     """Rows are those of `Lights.radiance`."""
+
+
+@wp.struct
+class DressedScene:
+    """Scene as `PathScene`, where episodes draw their looks."""
+
+    meshes: Meshes
+    table: Table
+    surfaces: DressedSurfaces
+    lights: Lights
+    cdf: EnvironmentCdf
+
+
+AnyScene = Any
+"""`PathScene`, or `DressedScene`: functions are compiled for each; see `variants`."""
+VARIANTS["scene"] = PathScene, DressedScene
 
 
 @wp.struct
@@ -145,7 +164,7 @@ class Path:
 
 @wp.func
 def make_vertex(
-    scene: PathScene,
+    scene: AnyScene,
     bodies: ViewBodies,
     view: int,
     instances: int,
@@ -156,15 +175,15 @@ def make_vertex(
     min_roughness: float,
 ) -> Vertex:
     """Build the path vertex at a hit. `outgoing` points back along the ray; `width` [m] is the footprint's, across the ray."""
-    surface = make_table_surface(scene.meshes, bodies, view, outgoing)
+    surface = make_table_surface(scene.meshes, scene.surfaces, bodies, view, outgoing)
     at = position
-    if hit.segment == Segment.TABLE:
+    if hit.segment != Segment.TABLE:
+        body = body_of(hit.segment, instances)
+        surface = interpolate_surface(scene.meshes, scene.surfaces, bodies, view, body, hit.triangle, hit.barycentric, outgoing, width)
+    else:
         # Far away, rounding would lift or sink it by more than the rays' offset.
         at = wp.vec3(position[0], position[1], scene.table.height)
         surface = map_table(scene.surfaces, surface, at, outgoing, width)
-    else:
-        body = body_of(hit.segment, instances)
-        surface = interpolate_surface(scene.meshes, scene.surfaces, bodies, view, body, hit.triangle, hit.barycentric, outgoing, width)
     vertex = Vertex()
     vertex.origin = at + RAY_OFFSET * surface.face_normal
     vertex.face_normal = surface.face_normal
@@ -223,7 +242,7 @@ def sample_point(context: PathContext, index: int, dimension: int) -> wp.vec2:
 
 @wp.func
 def sample_direct_light(
-    scene: PathScene, bodies: ViewBodies, rules: PathRules, context: PathContext, light: int, vertex: Vertex, u: wp.vec2
+    scene: AnyScene, bodies: ViewBodies, rules: PathRules, context: PathContext, light: int, vertex: Vertex, u: wp.vec2
 ) -> EnvironmentSample:
     """Next-event estimation: sample a direction of the map and test it by a shadow ray.
 
@@ -245,7 +264,7 @@ def sample_direct_light(
 
 
 @wp.func
-def escaped_radiance(scene: PathScene, rules: PathRules, context: PathContext, light: int, direction: wp.vec3, pdf: float) -> wp.vec3:
+def escaped_radiance(scene: AnyScene, rules: PathRules, context: PathContext, light: int, direction: wp.vec3, pdf: float) -> wp.vec3:
     """Radiance of the map for a path that left the scene, times its MIS weight; `pdf` is the BRDF's for `direction`."""
     local = rotate_z(direction, -context.yaw)
     radiance = environment_radiance(scene.lights, light, local)
@@ -261,7 +280,7 @@ def init_path(width: float) -> Path:
 
 
 @wp.func
-def next_vertex(scene: PathScene, bodies: ViewBodies, rules: PathRules, context: PathContext, path: Path) -> Vertex:
+def next_vertex(scene: AnyScene, bodies: ViewBodies, rules: PathRules, context: PathContext, path: Path) -> Vertex:
     """Build the vertex at the last hit of a path that goes on."""
     return make_vertex(
         scene, bodies, context.view, context.instances, path.hit, path.position, -path.direction, path.width, rules.min_roughness
@@ -270,7 +289,7 @@ def next_vertex(scene: PathScene, bodies: ViewBodies, rules: PathRules, context:
 
 @wp.func
 def extend_path(
-    scene: PathScene,
+    scene: AnyScene,
     bodies: ViewBodies,
     rules: PathRules,
     context: PathContext,
@@ -330,7 +349,7 @@ def extend_path(
 @kernel_of_views
 def trace_paths_kernel(
     # Scene:
-    scene: PathScene,
+    scene: AnyScene,
     grid: ImageGrid,
     # State: worlds
     episode: wp.array[int],  # (world)

@@ -9,7 +9,7 @@ from functools import partial
 import numpy as np
 import warp as wp
 
-from synpick_warp.configs.calibration.lens import make_lens_map
+from synpick_warp.configs.calibration.lens import with_matrix
 from synpick_warp.configs.cameras import WORLD
 from synpick_warp.configs.cell import BinSizes
 from synpick_warp.configs.schema import FAST, Config
@@ -144,11 +144,7 @@ def scaled_down(camera: Camera, most: int = _PIXELS) -> Camera:
     width, height = max(1, round(scale * camera.width)), max(1, round(scale * camera.height))
     # Pixel centres are at + 0.5, so that coordinates scale about the corner of the image.
     matrix = np.diag((width / camera.width, height / camera.height, 1.0)) @ camera.matrix
-    lens = camera.lens
-    if lens is not None:
-        numbers = (float(matrix[0, 0]), float(matrix[1, 1]), float(matrix[0, 2]), float(matrix[1, 2]))
-        lens = make_lens_map(lens.lens.model, lens.lens.coefficients, numbers, (width, height))
-    return replace(camera, width=width, height=height, matrix=matrix, lens=lens)
+    return replace(camera, width=width, height=height, matrix=matrix, lens=with_matrix(camera.lens, matrix, (width, height)))
 
 
 def lay_out(objects: Sequence[RawObject], sizes: BinSizes) -> Laid:

@@ -1,0 +1,45 @@
+"""Cells with cameras of their own: rows of [[camera]] tables, and bakes of boxes that are stirred under them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+from synpick_warp.configs.cameras import CameraRow
+from synpick_warp.configs.schema import Config
+from synpick_warp.configs.table_lists import read_rows
+from synpick_warp.factory.pipeline import run_bake
+from synpick_warp.system.progress import SilentProgress
+from tests.builders import STIRRING, boxes
+from tests.worlds.small_worlds import settings
+
+Point = Sequence[float]
+
+
+def make_camera(
+    name: str, position: Point = (0.0, 0.0, 1.2), look_at: Point = (0.0, 0.0, 0.0), up: Point = (0.0, 1.0, 0.0), **given: object
+) -> CameraRow:
+    """A camera of 96 x 72 px that looks down at the bin; `given`: other keys of its table, with values as TOML has them."""
+    pose = {"position": list(position), "look_at": list(look_at), "up": list(up)}
+    (row,) = read_rows("camera", CameraRow, [{"name": name, "resolution": [96, 72], "pose": pose} | given], "in a test")
+    return row
+
+
+SIDE = {"position": (0.0, -0.4, 1.1), "look_at": (0.0, 0.0, 0.1)}
+"""Place of a camera beside the bin."""
+
+
+def camera_matrix(fx: float, fy: float, cx: float, cy: float) -> list[list[float]]:
+    return [[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]]
+
+
+def cell_config(cameras: tuple[CameraRow, ...], **given: object) -> Config:
+    """Settings of boxes that are stirred under cameras."""
+    return replace(settings(**STIRRING | given), camera=cameras)
+
+
+def bake_cell(out: Path, config: Config, shard: tuple[int, int] = (0, 1)) -> None:
+    """Bake boxes."""
+    with boxes():
+        run_bake(config, out, SilentProgress(), shard)
