@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 import textwrap
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -22,10 +23,10 @@ FILL, _FEW = 0.1, 4
 _HEAD = """Cell {name}: cameras, bin, parts and what is randomized. Meaning, unit and allowed values stand above each setting.
 Lines that begin with # and a key, as in #seed = 7, are examples: remove the # to use them.
 
-    synpick-warp preview --cell {name}/cell.toml             # picture of the cell, after a change
-    synpick-warp bake --config {name}/cell.toml --out DATA   # a small data set
+    synpick-warp preview --cell {file}             # picture of the cell, after a change
+    synpick-warp bake --config {file} --out DATA   # a small data set
 
-All settings: `synpick-warp config --config {name}/cell.toml`, and configs/README.md."""
+All settings: `synpick-warp config --config {file}`, and configs/README.md."""
 
 
 @dataclass(frozen=True)
@@ -63,7 +64,7 @@ def cell_toml(cell: NewCell, name: str) -> str:
     volume = float(f"{max(FILL * inside, cell.volume):.2g}")
     parts = {"unit": cell.unit, "center": cell.center, "symmetries": "detect"} if cell.models else {}
     mass = {"id": 1, "name": "NAME", "diameter": 0.0, "mass": 0.1, "metallic": 0.6, "roughness": 0.3}
-    lines = [*(f"# {line}".rstrip() for line in _HEAD.format(name=name).splitlines()), ""]
+    lines = [*(f"# {line}".rstrip() for line in _HEAD.format(name=name, file=shlex.quote(f"{name}/cell.toml")).splitlines()), ""]
     lines += ['# Preset below these settings: "smoke" is small and fast, to try a cell; "synpick" is for training.', 'preset = "smoke"', ""]
     models = {"models": cell.models} if cell.models else {}
     lines += _section("bake", {"mode": "pick", "worlds": 1, "episodes": 1, **models}, {"seed": 7, "formats": ("bop", "zarr")})

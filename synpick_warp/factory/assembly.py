@@ -16,7 +16,8 @@ import numpy as np
 import warp as wp
 
 from synpick_warp.configs.cameras import COLOR
-from synpick_warp.configs.schema import Config
+from synpick_warp.configs.rig import Rig
+from synpick_warp.configs.schema import Config, Render
 from synpick_warp.configs.splits import DataLayout
 from synpick_warp.exporters.registry import Needs
 from synpick_warp.factory.attempts import AttemptLog
@@ -28,7 +29,9 @@ from synpick_warp.scenes.bins import Bin, make_bins
 from synpick_warp.scenes.build import REPEATS, find_repeat_rules, must_repeat, with_capacities, without_distractors
 from synpick_warp.scenes.cameras import EpisodeCameras
 from synpick_warp.scenes.catalog import load_catalog
+from synpick_warp.scenes.fills import check_fill
 from synpick_warp.scenes.fixtures import make_fixtures
+from synpick_warp.scenes.grippers.registry import make_head
 from synpick_warp.scenes.looks import Looks, load_looks
 from synpick_warp.scenes.types import Camera, Catalog, EnvironmentMap
 from synpick_warp.stages.host_copies import host_images
@@ -89,7 +92,8 @@ class Stages:
     def make_log(self) -> AttemptLog:
         """Create an empty attempt log."""
         distractors = {body.obj_id: body.name for body in self.catalog.distractors}
-        return AttemptLog(self.config.suction, self.config.perception.resolution, self.object_ids, distractors)
+        cups = len(make_head(self.config.gripper).cups)
+        return AttemptLog(self.config.suction, self.config.perception.resolution, self.object_ids, distractors, cups)
 
 
 @dataclass(frozen=True, eq=False)
@@ -175,10 +179,10 @@ def build_smallest(config: Config, device: wp.Device, progress: Progress, record
 def _add_stream(stages: Stages, device: wp.Device, needs_images: bool, depth_files: bool) -> Factory:
     """Add a stream of views to stages; arguments as of `host_images`."""
     config, table, tick_time = stages.config, stages.light_table, stages.tick_time
-    rings = [
-        ViewRing(group, group_layers(config, index), device, host_images(config.bop, group.sizes["row"], device, needs_images, depth_files))
-        for index, group in enumerate(stages.groups)
-    ]
+    rings = []
+    for index, group in enumerate(stages.groups):
+        host = host_images(config.bop, group.sizes["row"], device, needs_images, depth_files)
+        rings.append(ViewRing(group, group_layers(config.rig, config.render, index), device, host))
     stream = FrameStream(rings, tick_time, stages.object_ids, table, device, config.cell.recorded, stages.episode_cameras)
     return Factory(**vars(stages), stream=stream, log=stages.make_log())
 
@@ -214,9 +218,9 @@ def build_stages(
     return Stages(config, catalog, episode_cameras, lights, simulation, groups, catalog.object_ids, table)
 
 
-def group_layers(config: Config, index: int) -> tuple[str, ...]:
+def group_layers(rig: Rig, render: Render, index: int) -> tuple[str, ...]:
     """Layers of a group of cameras."""
-    return config.rig.chosen(config.rig.groups[index][0], config.render.layers)
+    return rig.chosen(rig.groups[index][0], render.layers)
 
 
 def _build_group(config: Config, scene: RenderScene, cameras: tuple[Camera, ...], index: int) -> CameraGroup:
@@ -225,7 +229,7 @@ def _build_group(config: Config, scene: RenderScene, cameras: tuple[Camera, ...]
     sizes = view_sizes(config.render, config.rig, worlds, objects, scene.device, index)
     scene = with_cameras(scene, tuple(cameras[camera] for camera in indices))
     rig, first = config.rig, indices[0]
-    chosen = replace(config, render=replace(config.render, layers=group_layers(config, index)))
+    chosen = replace(config, render=replace(config.render, layers=group_layers(config.rig, config.render, index)))
     colors = rig.writes(first, COLOR)
     renderer = make_renderer(chosen, scene, objects, sizes["view"], history_count(rig, worlds, index), colors)
     lenses = tuple(cameras[camera].lens for camera in indices) if rig.draws_lens(first) else ()
@@ -236,9 +240,10 @@ def _fit_to_catalog(config: Config, catalog: Catalog, bins: Sequence[Bin], devic
     """Resolve settings that depend on objects and bins: repetition of objects in an episode, and contact capacities.
 
     Raises:
-        ConfigError: The capacities do not fit into the device's memory.
+        ConfigError: The capacities do not fit into the device's memory, or the parts of `arrangement.counts` not into the bins.
     """
     labelled = without_distractors(config.arrangement, config.randomize.most_distractors)
+    check_fill(labelled, config.physics.guide_height, catalog, config.cell.bins)
     filled = config.with_values(REPEATS) if must_repeat(labelled, catalog) else config
     if find_repeat_rules(filled.bake, filled.pick, filled.move) != find_repeat_rules(config.bake, config.pick, config.move):
         total = sum(entry.volume for entry in catalog.entries)

@@ -213,7 +213,7 @@ def open_stream(
         with compiling_if_cold(smallest, device, progress):
             stages = build_stages(config, device, progress, indices)
         scale = config.bop.depth_scale
-        rings = tuple(BatchRing(group, group_layers(config, index), scale) for index, group in enumerate(stages.groups))
+        rings = tuple(BatchRing(group, group_layers(config.rig, config.render, index), scale) for index, group in enumerate(stages.groups))
     return ViewStream(Producer(stages, rings, selection, BakeSummary(len(indices)), progress))
 
 

@@ -81,6 +81,13 @@ def test_a_cell_without_options_is_complete(tmp_path, monkeypatch):
     assert config.cell.bins[0].outer == (0.6, 0.4)
 
 
+def test_commands_are_quoted_where_the_folder_needs_it(tmp_path, monkeypatch, drawn):
+    monkeypatch.chdir(tmp_path)
+    ran = run("new-cell", "Zelle ö 1")
+    assert ran.out.endswith("bake it: synpick-warp bake --config 'Zelle ö 1/cell.toml' --out DATA\n")
+    assert "preview --cell 'Zelle ö 1/cell.toml'" in Path("Zelle ö 1/cell.toml").read_text()
+
+
 @pytest.mark.parametrize("options", [[], ["--bin", "kanban.stl"]])
 def test_each_setting_is_explained_and_each_example_is_valid(tmp_path, monkeypatch, drawn, options):
     monkeypatch.chdir(tmp_path)

@@ -13,19 +13,23 @@ import pytest
 
 from synpick_warp.apps.viz import explain
 from synpick_warp.apps.viz.drawing import FONT, instance_color
-from synpick_warp.apps.viz.explain import object_names, to_color_image, write_explanation
+from synpick_warp.apps.viz.explain import object_names, planning_camera, to_color_image, to_view, write_explanation
 from synpick_warp.apps.viz.explain_panels import fitted, load_chart, wrapped
 from synpick_warp.apps.viz.explain_record import choice_words, labels, seal_words
 from synpick_warp.cli.main import main
 from synpick_warp.configs.schema import Config, Perception, Target
 from synpick_warp.configs.write import config_to_toml
+from synpick_warp.dataset.view import View
 from synpick_warp.errors import DatasetError, OutputError
 from synpick_warp.exporters.bop.exporter import BopExporter
+from synpick_warp.scenes.cameras import EpisodeCameras
+from synpick_warp.scenes.types import Camera
 from tests.builders import mistake
 from tests.harness.charts import near, picture_of
 from tests.harness.exporter_contract import export
 from tests.worlds.attempt_records import attempt, nothing_seen, record, seen, seen_object
 from tests.worlds.box_views import config
+from tests.worlds.cells import cell_config, make_camera
 
 EPISODES = (0, 1)
 TOP, LEFT = explain.MARGIN + explain.HEAD, explain.MARGIN
@@ -140,6 +144,32 @@ def test_known_answers_of_scaling():
     assert to_color_image((0.0, 0.0), (96, 36), (96, 72)) == (0.0, 18.0)
 
 
+@pytest.mark.parametrize("distortion", [{}, {"distortion": [-0.12, 0.08, 0.0005, -0.0003]}])
+def test_points_lie_where_the_drawn_camera_sees_them(distortion):
+    """Points that perception sees with the camera of the table, in a view of the camera that an episode has drawn, through its lens."""
+    jitter = {"position": {"uniform": [-0.02, 0.02]}, "rotation": {"uniform": [-2, 2]}, "center": {"uniform": [-3, 3]}}
+    rig = cell_config((make_camera("a", fov=50.0, jitter=jitter, **distortion), make_camera("b", fov=50.0))).rig
+    drawn, planned = EpisodeCameras(rig, 3).of_episode(1)[0], planning_camera(rig, 0)
+    points = np.array([[x, y, 0.1] for x in (-0.2, 0.0, 0.15) for y in (-0.1, 0.1)])
+
+    def slopes_of(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
+        there = points @ camera.rotation.T + camera.translation
+        return there[:, :2] / there[:, 2:], there[:, 2]
+
+    flat, _ = slopes_of(planned)
+    slopes, depth = slopes_of(drawn)
+    expected = np.column_stack((slopes, np.ones(len(points)))) @ drawn.matrix.T if drawn.lens is None else drawn.lens.project(slopes)
+    view = View.__new__(View)
+    pose = np.vstack((np.column_stack((drawn.rotation, drawn.translation)), (0.0, 0.0, 0.0, 1.0)))
+    vars(view).update(lens=drawn.lens, intrinsics=drawn.matrix, world_to_camera=pose, rgb=np.zeros((72, 96, 3)))
+    vars(view).update(depth=np.full((72, 96), depth.mean()), has=lambda name: True)
+    places = (np.column_stack((flat, np.ones(len(points)))) @ planned.matrix.T)[:, :2] - 0.5
+    found = np.array(to_view(view, planned, [tuple(place) for place in places.tolist()]))
+    np.testing.assert_allclose(found, expected[:, :2] - 0.5, atol=0.1)  # Depth is even here.
+    assert np.abs(places - (expected[:, :2] - 0.5)).max() > 1.0
+    assert planning_camera(rig, 1) is None
+
+
 def test_all_attempts_stand_below_each_other_in_order(dataset):
     rows = [drawn(dataset, number) for number in range(3)]
     np.testing.assert_array_equal(drawn(dataset, None), np.concatenate(rows))
@@ -224,6 +254,8 @@ def test_what_the_seal_bore():
     poor = attempt((FIRST,), {}, 0, hits=3, good_seal=False, engaged=(7,))
     said = ["rays: 3 of 10 hit; poor seal, breaks at 2 N", "engaged: instance 7, unseen", "picked: nothing"]
     assert seal_words(poor, NAMES, Config().suction) == said
+    four = attempt((FIRST,), {}, 0, rays=40, hits=37, good_seal=False, sealed=[0, 1, 3], engaged=(7,))
+    assert seal_words(four, NAMES, Config().suction)[0] == "rays: 37 of 40 hit; 3 of 4 cups with a good seal, break at 40 N"
     assert seal_words(attempt((FIRST,), {}, 0, hits=0, peak_force=(0.0, 0.0)), NAMES, Config().suction) == ["rays: 0 of 10 hit"]
     assert seal_words(attempt((), {}), NAMES, Config().suction) == []
 

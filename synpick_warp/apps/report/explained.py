@@ -11,7 +11,7 @@ import numpy as np
 from synpick_warp.apps.report.album import Album, Section, encode_photo
 from synpick_warp.apps.report.sampling import Content, Episodes, spread
 from synpick_warp.apps.viz.drawing import instance_color
-from synpick_warp.apps.viz.explain import draw_observation
+from synpick_warp.apps.viz.explain import draw_observation, planning_camera
 from synpick_warp.apps.viz.explain_graph import KEPT, clutter_edges, lay_out
 from synpick_warp.apps.viz.explain_record import (
     CANDIDATES,
@@ -24,7 +24,7 @@ from synpick_warp.apps.viz.explain_record import (
     suction_kind,
 )
 from synpick_warp.codes import Outcome
-from synpick_warp.configs.manipulation import Suction
+from synpick_warp.configs.gripper import Suction
 from synpick_warp.dataset.commit.manifest import episode_entry
 from synpick_warp.dataset.reading import DataSet
 from synpick_warp.errors import DatasetError
@@ -76,7 +76,7 @@ def make_attempt(data_set: DataSet, found: Found, content: Content, names: Mappi
     view = episode.view(attempt.frame - attempt.frame % episode.frames(camera).step, camera)
     if not view.has("rgb"):
         return None
-    picture = draw_observation(attempt, view)
+    picture = draw_observation(attempt, view, planning_camera(config.rig, camera))
     places = album.add(Section.ATTEMPTS, [encode_photo(picture)])
     if places is None:
         return None

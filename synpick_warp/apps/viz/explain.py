@@ -16,12 +16,15 @@ from synpick_warp.apps.viz.explain_graph import CYCLIC, GREY, OUTVOTED, RED, clu
 from synpick_warp.apps.viz.explain_panels import GREEN, LINE, PLOT_HEIGHT, SMALL, SOFT, TEXT, WORDS_WIDTH, draw_words, load_chart
 from synpick_warp.apps.viz.explain_record import MODE_WORDS, Attempt, choose_attempts, labels, read_attempts
 from synpick_warp.configs.load import load_config
+from synpick_warp.configs.rig import Rig
 from synpick_warp.configs.splits import DataLayout
 from synpick_warp.dataset.object_names import object_names
 from synpick_warp.dataset.records import Pixel
 from synpick_warp.dataset.scene_index import SceneIndex
 from synpick_warp.dataset.view import View
 from synpick_warp.errors import DatasetError
+from synpick_warp.scenes.cameras import make_cameras
+from synpick_warp.scenes.types import Camera
 from synpick_warp.system.codecs.charts import render_charts
 
 DEFAULT_ATTEMPTS = 3
@@ -71,10 +74,11 @@ def write_explanation(dataset: Path, out: Path, episode: int | None, attempt: in
     names = object_names(dataset, seen, config.object_rows, config.objects.diameter_tolerance)
     scenes = SceneIndex(dataset, DataLayout.of(config), config.rig.sizes)
     suction, tick_time = config.suction, config.physics.tick_time
-    rows = []
+    camera, rows = config.rig.index(config.perception.camera), []
+    planned = planning_camera(config.rig, camera)
     for each in attempts:
-        view = _open_view(dataset, scenes, each, camera := config.rig.index(config.perception.camera), config.rig.every[camera])
-        rows.append(_row(each, view, draw_words(each, names, config.target, suction), config.perception.min_votes))
+        view = _open_view(dataset, scenes, each, camera, config.rig.every[camera])
+        rows.append(_row(each, view, planned, draw_words(each, names, config.target, suction), config.perception.min_votes))
     charts = [load_chart(each, suction, tick_time, IMAGE_WIDTH, room) for each, (_, room) in zip(attempts, rows, strict=True)]
     for (sheet, _), data in zip(rows, render_charts(charts, scale=1.0), strict=True):
         plot = np.asarray(cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR))
@@ -105,12 +109,23 @@ def to_color_image(pixel: Pixel, resolution: tuple[int, int], size: tuple[int, i
     return column, row
 
 
-def _through_lens(view: View, places: list[tuple[float, float]]) -> list[tuple[float, float]]:
-    """Places (column, row) in the image of a pinhole, as the view's lens shows them."""
-    assert view.lens is not None
-    matrix = view.intrinsics
-    slopes = (np.array(places) + 0.5 - matrix[:2, 2]) / matrix[[0, 1], [0, 1]]
-    return [(x, y) for x, y in (view.lens.project(slopes) - 0.5).tolist()]
+def planning_camera(rig: Rig, camera: int) -> Camera | None:
+    """The camera by which perception sees, where views differ from it: behind a lens, or drawn anew by each episode; None: they do not."""
+    planned = make_cameras(rig)[camera]
+    return planned if planned.lens is not None or rig.is_placed(camera) else None
+
+
+def to_view(view: View, planned: Camera, places: list[tuple[float, float]]) -> list[tuple[float, float]]:
+    """Places (column, row) in the pinhole image of the camera by which perception sees, in a view of the drawn camera or through its lens.
+
+    Both differ little, so that the depth of the point is that of the same pixel in the view.
+    """
+    matrix, (columns, rows) = planned.matrix, np.round(places).astype(int).T
+    height, width = view.rgb.shape[:2]
+    near = view.depth[rows.clip(0, height - 1), columns.clip(0, width - 1)] if view.has("depth") else np.zeros(len(places))
+    rays = np.column_stack(((np.array(places) + 0.5 - matrix[:2, 2]) / matrix[[0, 1], [0, 1]], np.ones(len(places))))
+    points = (rays * np.where(near > 0.0, near, 1.0)[:, None] - planned.translation) @ planned.rotation
+    return [(x, y) for x, y in (view.project(points, view.world_to_camera) - 0.5).tolist()]
 
 
 def image_scale(size: tuple[int, int]) -> float:
@@ -118,10 +133,10 @@ def image_scale(size: tuple[int, int]) -> float:
     return min(IMAGE_WIDTH / size[0], _MAX_IMAGE_HEIGHT / size[1])
 
 
-def _row(attempt: Attempt, view: View, words: Image, min_votes: float) -> tuple[Image, int]:
+def _row(attempt: Attempt, view: View, planned: Camera | None, words: Image, min_votes: float) -> tuple[Image, int]:
     """Draw one attempt: image, clutter graph, and text and table (`words`), with room at the lower left for the force's plot, whose height
     [px] is returned, too."""
-    image = draw_observation(attempt, view)
+    image = draw_observation(attempt, view, planned)
     left = image.shape[0] + 2 * LINE + MARGIN + PLOT_HEIGHT
     height = max(left, words.shape[0], _MIN_ROW_HEIGHT)
     sheet = np.full((HEAD + height + 2 * MARGIN, IMAGE_WIDTH + _GRAPH_WIDTH + WORDS_WIDTH + 4 * MARGIN, 3), 255, np.uint8)
@@ -138,7 +153,7 @@ def _row(attempt: Attempt, view: View, words: Image, min_votes: float) -> tuple[
     head = f"Episode {attempt.episode}, attempt {attempt.attempt} ({MODE_WORDS[attempt.mode]}): {attempt.sentence}"
     put_text(sheet, head, (MARGIN, MARGIN + 20), 0.68, GREEN if attempt.picked else RED, 2)
     scene = Path(view.place)
-    captions = [f"camera {view.camera}: {scene.parent.name}/{scene.name}, image {attempt.frame}", "clutter graph", "choice and outcome"]
+    captions = [f"camera {view.camera}: {scene.parent.name}/{scene.name}, image {view.frame}", "clutter graph", "choice and outcome"]
     if not view.has("mask_visib"):
         captions[0] += "; no contours: this data set has no masks"
     for text, column in zip(captions, columns, strict=True):
@@ -151,12 +166,13 @@ def _paste(sheet: Image, picture: Image, column: int, row: int) -> None:
     sheet[row : row + picture.shape[0], column : column + picture.shape[1]] = picture
 
 
-def draw_observation(attempt: Attempt, view: View) -> Image:
+def draw_observation(attempt: Attempt, view: View, planned: Camera | None) -> Image:
     """Draw contours, if the data set has masks, and suction points on the colour image, which is darkened except for the target.
 
     Args:
         attempt: The attempt.
         view: The camera of perception at the observation.
+        planned: As of `planning_camera`.
 
     Raises:
         DatasetError: A file is missing or damaged, or has no such view.
@@ -176,8 +192,8 @@ def draw_observation(attempt: Attempt, view: View) -> Image:
     short = labels(attempt)
     for one in attempt.seen:
         places = [to_color_image(point, attempt.observation.resolution, (width, height)) for point in (*one.candidates, one.grasp_pixel)]
-        if view.lens is not None:
-            places = _through_lens(view, places)
+        if planned is not None:
+            places = to_view(view, planned, places)
         points = [(scale * (x + 0.5) - 0.5, scale * (y + 0.5) - 0.5) for x, y in places]
         target = one.instance == attempt.target
         for kind, point in enumerate(points[:-1]):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import os
 import re
+import shlex
 import shutil
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -113,7 +114,7 @@ def new_cell(
         _write_cell(cell, escape(str(folder)), stage)
         draw_cell(stage / CELL, f"{place.name}/{CELL}", stage / PICTURE, lambda note: escape(note.replace(str(stage), str(folder))))
     print(f"cell: {escape(str(folder / CELL))}, picture: {escape(str(folder / PICTURE))}")
-    print(f"bake it: synpick-warp bake --config {escape(str(folder / CELL))} --out DATA")
+    print(f"bake it: synpick-warp bake --config {shlex.quote(escape(str(folder / CELL)))} --out DATA")
     return 0
 
 
