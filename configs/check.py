@@ -66,6 +66,8 @@ def check_value(key: str, value: object, item: dataclasses.Field[Any], annotatio
 def describe_allowed(item: dataclasses.Field[Any], annotation: Any) -> str:
     """Describe the range or the choices of a setting, or its type if it has neither."""
     rules = item.metadata
+    if rules["allowed"]:
+        return rules["allowed"]
     if rules["choices"]:
         return ("any of " if typing.get_origin(annotation) is tuple else "") + ", ".join(choice or '""' for choice in rules["choices"])
     if rules["path"]:

@@ -9,9 +9,13 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 
 from synpick_warp.configs.bins import OWN, PALLET, TOTE, BinRow, Bins, Tote
-from synpick_warp.configs.camera_rules import Conflict, find_camera_conflicts
+from synpick_warp.configs.camera_rules import find_camera_conflicts
 from synpick_warp.configs.cell import BinSizes
+from synpick_warp.configs.fields import Conflict
+from synpick_warp.configs.fills import most_objects
+from synpick_warp.configs.gripper import find_gripper_conflicts
 from synpick_warp.configs.modes import bake_modes
+from synpick_warp.configs.objects import EMBEDDED
 from synpick_warp.configs.randomize import Randomize
 from synpick_warp.configs.schema import (
     FORMATS,
@@ -22,13 +26,11 @@ from synpick_warp.configs.schema import (
     Config,
     DepthSensor,
     Effects,
-    Gripper,
     ObjectRow,
     Physics,
     Pick,
     Settle,
     Split,
-    Suction,
 )
 from synpick_warp.configs.splits import MAX_SHARD_SCENES, DataLayout
 from synpick_warp.errors import format_value
@@ -53,14 +55,18 @@ def find_conflicts(config: Config) -> Iterator[Conflict]:
         yield from find_camera_conflicts(config)
         yield from _pick(config.pick, bins)
     yield from _times(config.settle, config.physics)
-    yield from _suction(config.suction, config.gripper)
+    mouths = [mouth for one in bins if one.shell for mouth in one.mouths]
+    yield from find_gripper_conflicts(config.gripper, config.suction, mouths)
     yield from _layers(config.render.layers)
     yield from _ranges(config.effects, config.depth_sensor)
     yield from _jpeg_quality(config.effects, bop)
     yield from _split_folders(config.splits, bop)
     yield from _scene_ids(DataLayout.of(config))
+    if not config.objects.embedded:
+        yield "objects.embedded", f"at least one of {', '.join(EMBEDDED)}"
     yield from _object_rows(config.object_rows)
     yield from _distractors(config.randomize, config.arrangement, config.bake)
+    yield from _counts(config.arrangement, config.randomize.most_distractors)
     if config.randomize.background_textures and config.render.table and not any(config.render.table_size):
         yield "render.table_size", "above 0 with randomize.background_textures, which are seen beyond the edge of the table [m]"
 
@@ -72,6 +78,16 @@ def _distractors(randomize: Randomize, arrangement: Arrangement, bake: Bake) -> 
         yield "randomize.distractors", f"less than arrangement.max_objects, {arrangement.max_objects}, which counts them, too"
     if most and bake.models and os.path.realpath(randomize.distractor_models) == os.path.realpath(bake.models):
         yield "randomize.distractor_models", "another folder than bake.models: its objects would be without labels"
+
+
+def _counts(arrangement: Arrangement, distractors: int) -> Iterator[Conflict]:
+    """Yield conflicts of the numbers of parts: more than there is room for, or none in some episodes."""
+    most, room = most_objects(arrangement.counts), arrangement.max_objects - distractors
+    if most > room:
+        beside = f", less {distractors} distractors" if distractors else ""
+        yield "arrangement.counts", f"at most arrangement.max_objects, {arrangement.max_objects}{beside}, together, which are {most}"
+    if arrangement.counts and not any(least for _, least, _ in arrangement.counts):
+        yield "arrangement.counts", "at least one part that each episode has"
 
 
 def _mix(bake: Bake, splits: Sequence[Split]) -> Iterator[Conflict]:
@@ -138,17 +154,6 @@ def _pick(pick: Pick, bins: Sequence[BinSizes]) -> Iterator[Conflict]:
         yield "pick.floor", f"at most the floor of the {bins[0].noun}, {bins[0].origin[2]:g}: what is below it is removed [m]"
     if pick.lift_height < height:
         yield "pick.lift_height", f"at least the inner height of the {bins[0].noun}, {height:g}: attached objects must leave it [m]"
-
-
-def _suction(suction: Suction, gripper: Gripper) -> Iterator[Conflict]:
-    """Yield conflicts of cup, rays and break forces."""
-    max_radius = gripper.cup_width / 2
-    if suction.radius > max_radius:
-        yield "suction.radius", f"at most half of gripper.cup_width, {max_radius:g} [m]"
-    if suction.tolerated_misses >= suction.rays:
-        yield "suction.tolerated_misses", f"less than suction.rays, {suction.rays}: one ray must hit"
-    if suction.poor_force > suction.good_force:
-        yield "suction.poor_force", f"at most suction.good_force, {suction.good_force:g} [N]"
 
 
 def _layers(layers: tuple[str, ...]) -> Iterator[Conflict]:

@@ -6,6 +6,8 @@ from collections.abc import Callable
 from dataclasses import field
 from typing import Any
 
+Conflict = tuple[str, str]
+"""Key of the wrong setting, and its allowed values."""
 PATH_RULE = "a path in a file of settings is relative to that file"
 """For messages about what is missing."""
 INT32_MAX = 2**31 - 1
@@ -22,6 +24,7 @@ def setting(
     above: float | None = None,
     choices: tuple[str, ...] = (),
     parse: Callable[[Any], Any] | None = None,
+    allowed: str = "",
     path: bool = False,
 ) -> Any:
     """Declare a setting: a dataclass field whose metadata are unit, meaning (one sentence) and allowed values.
@@ -35,7 +38,9 @@ def setting(
         above: Minimum, exclusive.
         choices: Allowed strings; empty: any.
         parse: Converts a value as TOML has it to one of the field's type; raises ValueError with what is allowed.
+        allowed: What is allowed, where type, range and choices do not say it.
         path: Whether it names a file or folder; in a file of settings it is then relative to that file, else to the current folder.
     """
     metadata = {"unit": unit, "doc": doc, "low": low, "high": high, "above": above, "choices": choices, "parse": parse, "path": path}
+    metadata["allowed"] = allowed
     return field(default=default, metadata=metadata)

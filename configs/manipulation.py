@@ -1,4 +1,4 @@
-"""Settings of the gripper's tasks: stirring, picking, targeted picking, perception, and the suction seal."""
+"""Settings of the gripper's tasks: stirring, picking, targeted picking, and perception."""
 
 from __future__ import annotations
 
@@ -122,36 +122,4 @@ class Perception:
     )
     normal_window: int = setting(
         10, "px", "Half width of the window around the suction point over which the surface normal is averaged.", low=0, high=256
-    )
-
-
-@dataclass(frozen=True)
-class Suction:
-    """The suction cup: seal test by rays, and the compliant constraint (spring-damper) that holds attached objects."""
-
-    rays: int = setting(10, "", "Rays of the seal test, on a circle at the cup's lip (paper).", low=3, high=64)
-    radius: float = setting(0.01, "m", "Radius of that circle (released).", above=0.0, high=0.25)
-    reach: float = setting(0.03, "m", "Length of the rays (paper).", above=0.0, high=1.0)
-    surface: str = setting(
-        "hull",
-        "",
-        "Geometry that the rays intersect: hull (collision shapes, on which the cup rests) or mesh (visual mesh: a pitcher is open).",
-        choices=("hull", "mesh"),
-    )
-    tolerated_misses: int = setting(0, "", "Maximum rays that may miss for a good seal (paper: 0; released: 2).", low=0, high=INT32_MAX)
-    good_force: float = setting(40.0, "N", "Break force of a good seal (paper).", above=0.0, high=1e5)
-    poor_force: float = setting(2.0, "N", "Break force of any other seal (paper: 2; released: 0.2).", above=0.0, high=1e5)
-    stiffness: float = setting(
-        2e4, "N/m", "Linear stiffness of a seal; 40 N stretch it by 2 mm, within the paper's 5 mm.", above=0.0, high=1e6
-    )
-    damping: float = setting(100.0, "N·s/m", "Linear damping of a seal.", low=0.0, high=1e5)
-    twist_stiffness: float = setting(50.0, "N·m/rad", "Torsional stiffness about the cup's axis.", low=0.0, high=1e6)
-    twist_damping: float = setting(0.1, "N·m·s/rad", "Angular damping of twist and swing.", low=0.0, high=1e5)
-    swing_limit: float = setting(5.0, "°", "Angle by which an attached object may swing freely (released).", low=0.0, high=90.0)
-    swing_stiffness: float = setting(
-        50.0,
-        "N·m/rad",
-        "Stiffness against swing beyond that angle; with 10, an object of 1.1 kg that hangs by its end swings by 18°.",
-        low=0.0,
-        high=1e6,
     )

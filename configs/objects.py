@@ -13,6 +13,9 @@ AUTO_UNIT = "auto"
 """Unit of mesh files by their kind: millimetres of BOP models, metres of others."""
 UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254}
 """Units of mesh files [m]."""
+HOUSEHOLD, INDUSTRIAL = "household", "industrial"
+EMBEDDED = (HOUSEHOLD, INDUSTRIAL)
+"""Sets of embedded objects."""
 DECLARED, DETECT = "declared", "detect"
 SYMMETRIES = (DECLARED, DETECT)
 """Sources of an object's symmetries."""
@@ -90,6 +93,13 @@ def _is_rigid(row: list[Any]) -> bool:
 class Objects:
     """How a mesh becomes a rigid body: collision shape, mass and material."""
 
+    embedded: tuple[str, ...] = setting(
+        (HOUSEHOLD,),
+        "",
+        "Sets of embedded objects, where bake.models is empty: household (21, like those of YCB-Video), industrial (bolt, nut, bracket, "
+        "pipe_tee, gear, sheet_part, box).",
+        choices=EMBEDDED,
+    )
     unit: str = setting(
         AUTO_UNIT,
         "",

@@ -1,8 +1,8 @@
 """Settings schema of a bake: frozen dataclasses, each field with default, unit, range and meaning. Nothing else has defaults.
 
 The defaults are the paper's values (preset `synpick`); where the paper names none, the help text says where a value comes from.
-"Released" means the generator that the paper's authors published. Sections: here, `cameras`, `manipulation`, `objects`, `randomize` and
-`sensors`.
+"Released" means the generator that the paper's authors published. Sections: here, `cameras`, `gripper`, `manipulation`, `objects`,
+`randomize` and `sensors`.
 """
 
 from __future__ import annotations
@@ -16,7 +16,9 @@ from synpick_warp.configs.bins import BinRow, Bins, Tote
 from synpick_warp.configs.cameras import CameraRow, Cameras
 from synpick_warp.configs.cell import Cell
 from synpick_warp.configs.fields import INT32_MAX, setting
-from synpick_warp.configs.manipulation import Move, Perception, Pick, Suction, Target
+from synpick_warp.configs.fills import COUNTS, Counts, parse_counts
+from synpick_warp.configs.gripper import Gripper, Suction
+from synpick_warp.configs.manipulation import Move, Perception, Pick, Target
 from synpick_warp.configs.objects import ObjectRow, Objects
 from synpick_warp.configs.randomize import Randomize
 from synpick_warp.configs.rig import Rig
@@ -42,6 +44,8 @@ LAYOUTS = (CLASSIC, MULTISENSOR)
 """Layouts of scene folders: BOP's classic one, and that of BOP-Industrial 2025."""
 EXCEED = "exceed"
 WITHIN = "within"
+COLUMN, LAYERED = "column", "layers"
+"""Stacks from which objects begin to fall."""
 FILLS = (EXCEED, WITHIN)
 """Rules that end the draw of an episode's objects at the volume budget."""
 FORMATS = ("bop", "shards", "usd", "zarr", "lerobot", "coco", "yolo")
@@ -95,31 +99,19 @@ class Bake:
 
 
 @dataclass(frozen=True)
-class Gripper:
-    """The suction gripper: a conical shaft that translates along x, y and z, and a suction cup on a wrist joint about the y axis."""
-
-    finger_length: float = setting(0.35, "m", "Length of the shaft, from its top to the wrist axis.", low=0.005, high=2.0)
-    finger_width: float = setting(0.075, "m", "Diameter of the shaft at its top.", low=0.005, high=1.0)
-    cup_width: float = setting(0.042, "m", "Diameter of the suction cup.", low=0.005, high=0.5)
-    cup_length: float = setting(
-        0.055, "m", "Distance from the wrist axis to the tool centre point (TCP) at the cup's lip.", low=0.005, high=0.5
-    )
-    finger_mass: float = setting(1.5, "kg", "Mass of the shaft.", low=0.001, high=1e3)
-    cup_mass: float = setting(0.5, "kg", "Mass of the cup.", low=0.001, high=1e3)
-    tilt_limit: float = setting(90.0, "°", "Joint limit of the wrist, to both sides.", above=0.0, high=90.0)
-    tilt_stiffness: float = setting(2500.0, "N·m/rad", "Stiffness of the wrist's PD position drive.", above=0.0, high=1e6)
-    tilt_damping: float = setting(200.0, "N·m·s/rad", "Damping of the wrist's PD position drive.", low=0.0, high=1e5)
-    tilt_torque: float = setting(200.0, "N·m", "Torque limit of the wrist's drive.", above=0.0, high=1e5)
-    color: tuple[float, float, float] = setting((0.55, 0.56, 0.58), "sRGB", "Base colour of the shaft.", low=0.0, high=1.0)
-    cup_color: tuple[float, float, float] = setting((0.05, 0.05, 0.055), "sRGB", "Base colour of the cup.", low=0.0, high=1.0)
-    metallic: float = setting(0.01, "", "Metallic factor of shaft and cup (released).", low=0.0, high=1.0)
-    roughness: float = setting(0.9, "", "Roughness of shaft and cup (released).", low=0.0, high=1.0)
-
-
-@dataclass(frozen=True)
 class Arrangement:
     """Which objects an episode contains, and how they are dropped into the tote."""
 
+    counts: Counts = setting(
+        (),
+        "",
+        "Parts, by name or obj_id, and how many of each an episode has: one (homogeneous) or several (kitted), with a range drawn anew for "
+        "each episode (mixed); empty: objects are drawn up to volume. Parts mix in the drop.",
+        low=0,
+        high=INT32_MAX,
+        parse=parse_counts,
+        allowed=COUNTS,
+    )
     volume: float = setting(
         7e-3,
         "m³",
@@ -145,9 +137,22 @@ class Arrangement:
         above=0.0,
         high=0.5,
     )
-    clearance: float = setting(0.01, "m", "Gap between the bounding spheres of consecutive objects in the drop column.", low=0.0, high=1.0)
+    drop: str = setting(
+        COLUMN,
+        "",
+        "Where objects begin to fall: column (one above the other, over the middle) or layers (side by side over the whole opening: many "
+        "from a low height).",
+        choices=(COLUMN, LAYERED),
+    )
+    clearance: float = setting(
+        0.01, "m", "Gap between the bounding spheres of consecutive objects in the drop column, or in layers.", low=0.0, high=1.0
+    )
     spread: float = setting(
-        0.3, "", "Drop positions are uniform over this fraction of the tote's opening, less the object's radius.", low=0.0, high=1.0
+        0.3,
+        "",
+        "Drop positions are uniform over this fraction of the tote's opening, in layers of an object's cell, less the object's radius.",
+        low=0.0,
+        high=1.0,
     )
 
 

@@ -59,6 +59,12 @@ class CatalogData:
     """Diagonal of that box [m]."""
     compound: wp.array[int]
     """1: several convex pieces, in a compound slot; 0: one, in a single slot."""
+    least: wp.array[int]
+    """Least number of the object in an episode, where numbers are set ..."""
+    most: wp.array[int]
+    """... and largest number; all 0: objects are drawn up to the volume budget."""
+    counted: int
+    """Largest number of an episode's objects where numbers are set; 0: they are not."""
     variant: wp.array[int]
     """Variant of the object, in slots of its class (single or compound)."""
     empty_single: int
@@ -84,9 +90,12 @@ class DropData:
     pick_repeats: int
     """The same for the picking modes."""
     clearance: float
-    """Gap between bounding spheres in the drop column [m]."""
+    """Gap between bounding spheres in the drop column, or between layers and within them [m]."""
     spread: float
-    """Fraction of the opening of a compartment, less the object's bounding radius, over which drop positions spread."""
+    """Fraction of the opening of a compartment, or in layers of a cell, less the object's bounding radius, over which drop positions
+    spread."""
+    layers: int
+    """1: objects begin to fall from layers of cells; 0: from a column."""
     gravity: float
     """Gravitational acceleration [m/s²]."""
     gripper_home: wp.vec3
@@ -279,7 +288,7 @@ class PerceptionData:
 
 @wp.struct
 class SuctionData:
-    """Geometry of the cup's rays, and stiffness, damping, masses and break forces of the seals; see `configs.schema.Suction`."""
+    """Cups with their rays, and stiffness, damping, masses and break forces of the seals; see `configs.schema.Suction`."""
 
     rays: int
     """Rays on the ring."""
@@ -305,12 +314,16 @@ class SuctionData:
     """Angle of free swing [rad]."""
     swing_stiffness: float
     """Stiffness beyond it [N·m/rad]."""
-    tcp_offset: float
-    """Distance from wrist axis to TCP [m]."""
+    cups: int
+    """Number of cups."""
+    place: wp.array[wp.vec3]
+    """(cup): centre of the lip, in the frame of the gripper head, whose origin is on the wrist axis [m]."""
+    common_valve: int
+    """1: all cups share one vacuum, which a leak at one spoils; 0: a valve each."""
     finger_mass: float
     """Mass of the gripper shaft [kg]."""
     cup_mass: float
-    """Mass of the cup [kg]."""
+    """Mass of the gripper head [kg]."""
     tilt_inertia: float
     """Effective inertia about the wrist axis in one step: armature + step · damping + step² · stiffness of the implicit drive [kg·m²]."""
     step: float

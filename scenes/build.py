@@ -19,19 +19,20 @@ from scipy.spatial import ConvexHull
 from scipy.stats import binom
 
 from synpick_warp.configs.modes import mode_weights
-from synpick_warp.configs.schema import EXCEED, Arrangement, Bake, Config, Gripper, Move, Physics, Pick
+from synpick_warp.configs.schema import EXCEED, Arrangement, Bake, Config, Move, Physics, Pick
 from synpick_warp.errors import ConfigError
 from synpick_warp.scenes.bin_meshes.inside import HeightField
 from synpick_warp.scenes.bins import Bin, guide_walls, make_bins
-from synpick_warp.scenes.gripper import cup_collider, finger_collider, rod_inertia
+from synpick_warp.scenes.fills import count_entries
+from synpick_warp.scenes.grippers.head import Head
+from synpick_warp.scenes.grippers.mechanism import GRIPPER_BODIES, GRIPPER_DOFS, add_gripper, hull_mesh
+from synpick_warp.scenes.grippers.registry import make_head
 from synpick_warp.scenes.tote import TABLE_SIZE
 from synpick_warp.scenes.types import Catalog, CatalogEntry, ConvexPiece
 
 # Mass [kg] and inertia [kg·m²] of an empty slot. Its gravity is compensated, so any positive values will do.
 EMPTY_MASS = 0.1
 EMPTY_INERTIA = 1e-3
-# Armature (rotor inertia) of the wrist joint [kg·m²], which keeps the stiff drive well conditioned at 2 ms.
-CUP_ARMATURE = 1e-3
 # Monte Carlo trials that determine the slot counts; a fraction of 1e-3 of them is known to 10 %.
 SLOT_TRIALS = 100_000
 # Contacts of two convex shapes side by side, and such pairs of an object with floor and walls: a pile of 24 plates of 1 mm has up to 713.
@@ -45,8 +46,6 @@ MAX_ROWS = 3072
 take two rows each, where a pile rests."""
 MIN_SIDE = 1e-5
 """Least side of a box about an object [m]."""
-GRIPPER_BODIES = 2
-GRIPPER_DOFS = 4
 FREE_COORDS = 7
 FREE_DOFS = 6
 
@@ -75,8 +74,8 @@ class Layout:
     """Collision shapes and guide walls of all bins, of which each world has one in place."""
     finger_shape: int
     """Shape index of the gripper shaft within a world."""
-    cup_shape: int
-    """Shape index of the suction cup within a world."""
+    head_shapes: tuple[int, ...]
+    """Shape indices of the gripper head within a world."""
 
     @property
     def slots(self) -> int:
@@ -105,6 +104,7 @@ class BuiltModel:
 
     model: newton.Model
     layout: Layout
+    head: Head
     variant: np.ndarray
     """Variant index of each catalog entry in slots of its type (entry) int32."""
     empty_variant: tuple[int, int]
@@ -120,7 +120,7 @@ REPEATS: Mapping[str, object] = {"pick.repeats": True, "move.repeats": True}
 def count_slots(arrangement: Arrangement, rules: Iterable[bool], catalog: Catalog) -> tuple[int, int]:
     """Determine the body slots (single, compound) that suffice for all draws but a fraction `slot_shortfall`, in each possible mode.
 
-    The object that exceeds the budget, if `fill` keeps it, has its slot as well.
+    The object that exceeds the budget, if `fill` keeps it, has its slot as well. Where `counts` are set, they suffice for the largest ones.
 
     A Monte Carlo estimate: the volume budget couples how many objects are drawn with which ones, so there is no simple formula.
     Slots cost time whether used or not, and compound ones most: their count is minimized first, then that of single slots.
@@ -131,8 +131,12 @@ def count_slots(arrangement: Arrangement, rules: Iterable[bool], catalog: Catalo
         catalog: The objects.
 
     Raises:
-        ConfigError: No object fits into the volume budget.
+        ConfigError: No object fits into the volume budget, or `count_entries` refuses a part.
     """
+    if arrangement.counts:
+        most = count_entries(arrangement.counts, catalog)[:, 1]
+        compounds = sum(int(number) for number, entry in zip(most, catalog.entries, strict=True) if len(entry.pieces) > 1)
+        return int(most.sum()) - compounds, compounds
     budget, shortfall = arrangement.volume, arrangement.slot_shortfall
     compound = np.array([len(entry.pieces) > 1 for entry in catalog.entries])
     volume = np.array([entry.volume for entry in catalog.entries])
@@ -233,7 +237,7 @@ def build_model(config: Config, catalog: Catalog, device: wp.Device) -> BuiltMod
     bins = make_bins(config.cell.bins)
 
     def add(index: int, pieces: Sequence[ConvexPiece], guide: bool) -> list[Part]:
-        return [Part(world.add_shape_convex_hull(-1, mesh=_hull(piece), cfg=shape), index, guide) for piece in pieces]
+        return [Part(world.add_shape_convex_hull(-1, mesh=hull_mesh(piece), cfg=shape), index, guide) for piece in pieces]
 
     parts = add(0, bins[0].pieces, False)
     table = wp.transform(wp.vec3(0.0, 0.0, bins[0].sizes.ground - TABLE_SIZE[2]), wp.quat_identity())
@@ -241,7 +245,8 @@ def build_model(config: Config, catalog: Catalog, device: wp.Device) -> BuiltMod
     for index, one in enumerate(bins):
         parts += [] if index == 0 else add(index, one.pieces, False)
         parts += add(index, guide_walls(one.sizes, config.physics.guide_height), True)
-    gripper = _add_gripper(world, config.gripper, shape)
+    head = make_head(config.gripper)
+    gripper = add_gripper(world, config.gripper, head, shape)
     variant, empty = _add_slots(world, config.physics, catalog, shape, (single, compound))
     scene = newton.ModelBuilder(gravity=(0.0, 0.0, -config.physics.gravity))
     newton.solvers.SolverSteel.register_custom_attributes(scene)
@@ -251,11 +256,13 @@ def build_model(config: Config, catalog: Catalog, device: wp.Device) -> BuiltMod
         warnings.filterwarnings("ignore", "Eigenvalues below threshold")
         model = scene.finalize(device=device)
     layout = Layout(config.bake.worlds, config.arrangement.max_objects, single, compound, world.shape_count, tuple(parts), *gripper)
-    return BuiltModel(model, layout, variant, empty, tuple(one.limits for one in bins))
+    return BuiltModel(model, layout, head, variant, empty, tuple(one.limits for one in bins))
 
 
 def must_repeat(arrangement: Arrangement, catalog: Catalog) -> bool:
     """Whether objects repeat in an episode since all together stay below the volume budget: a catalog of one object fills the tote, too."""
+    if arrangement.counts:
+        return False
     volumes = [entry.volume for entry in catalog.entries if entry.volume <= arrangement.volume]
     return arrangement.repeat_to_fill and sum(volumes) < arrangement.volume and len(volumes) < arrangement.max_objects
 
@@ -315,52 +322,6 @@ def oriented_sides(pieces: Sequence[ConvexPiece]) -> np.ndarray:
     return np.maximum(np.ptp(centered @ np.linalg.svd(centered, full_matrices=False)[2].T, axis=0), MIN_SIDE)
 
 
-def _hull(piece: ConvexPiece) -> newton.Mesh:
-    """Newton's mesh of a convex piece."""
-    return newton.Mesh(piece.vertices, piece.faces.reshape(-1), compute_inertia=False)
-
-
-def _add_gripper(world: newton.ModelBuilder, gripper: Gripper, shape: newton.ModelBuilder.ShapeConfig) -> tuple[int, int]:
-    """Add shaft (three prismatic axes) and cup (revolute wrist about y); returns their shape indices.
-
-    The impedance controller compensates their weight.
-    """
-    dof = newton.ModelBuilder.JointDofConfig
-    finger = world.add_link(
-        mass=gripper.finger_mass,
-        inertia=wp.mat33(np.diag(rod_inertia(gripper.finger_mass, gripper.finger_length))),
-        com=wp.vec3(0.0, 0.0, gripper.finger_length / 2),
-        lock_inertia=True,
-        label="finger",
-    )
-    cup = world.add_link(
-        mass=gripper.cup_mass,
-        inertia=wp.mat33(np.diag(rod_inertia(gripper.cup_mass, gripper.cup_length))),
-        com=wp.vec3(0.0, 0.0, -gripper.cup_length / 2),
-        lock_inertia=True,
-        label="cup",
-    )
-    axes = [dof(axis=axis, limit_lower=-np.inf, limit_upper=np.inf, armature=0.0) for axis in (newton.Axis.X, newton.Axis.Y, newton.Axis.Z)]
-    slide = world.add_joint_d6(-1, finger, linear_axes=axes)
-    limit = np.radians(gripper.tilt_limit)
-    wrist = world.add_joint_revolute(
-        finger,
-        cup,
-        axis=newton.Axis.Y,
-        target_ke=gripper.tilt_stiffness,
-        target_kd=gripper.tilt_damping,
-        limit_lower=-limit,
-        limit_upper=limit,
-        effort_limit=gripper.tilt_torque,
-        armature=CUP_ARMATURE,
-    )
-    world.add_articulation([slide, wrist], label="gripper")
-    finger_shape = world.add_shape_convex_hull(finger, mesh=_hull(finger_collider(gripper)), cfg=shape)
-    cup_shape = world.add_shape_convex_hull(cup, mesh=_hull(cup_collider(gripper)), cfg=shape)
-    world.add_shape_collision_filter_pair(finger_shape, cup_shape)
-    return finger_shape, cup_shape
-
-
 def _add_slots(
     world: newton.ModelBuilder,
     physics: Physics,
@@ -401,5 +362,5 @@ def _variant(physics: Physics, entry: CatalogEntry | None, shape: newton.ModelBu
         mass=entry.mass, com=wp.vec3(*entry.center_of_mass), inertia=wp.mat33(entry.inertia), lock_inertia=True, label=entry.name
     )
     for piece in entry.pieces:
-        builder.add_shape_convex_hull(body, mesh=_hull(piece), cfg=shape)
+        builder.add_shape_convex_hull(body, mesh=hull_mesh(piece), cfg=shape)
     return builder

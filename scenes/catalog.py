@@ -10,7 +10,7 @@ import numpy as np
 from trimesh.bounds import oriented_bounds
 
 from synpick_warp.configs.cell import BinSizes
-from synpick_warp.configs.objects import AUTO_UNIT, UNITS
+from synpick_warp.configs.objects import AUTO_UNIT, HOUSEHOLD, UNITS
 from synpick_warp.configs.schema import Config, ObjectRow, Objects
 from synpick_warp.errors import CatalogError, SynpickError
 from synpick_warp.scenes.assets.appearance import FileMaterial
@@ -65,7 +65,8 @@ def load_catalog(config: Config, cache_dir: Path | None = None, report: Callable
     """
     rules = _Rules(config.objects, config.object_rows, config.cell.bins)
     entries = _load_entries(config.bake.models, rules, cache_dir, report)
-    _report_undrawable(entries, config.arrangement.volume, report)
+    if not config.arrangement.counts:
+        _report_undrawable(entries, config.arrangement.volume, report)
     if not config.randomize.most_distractors:
         return Catalog(tuple(entries))
     others = _load_entries(config.randomize.distractor_models, rules, cache_dir, report, tuple(entry.name for entry in entries))
@@ -200,9 +201,10 @@ def _read_folder(folder: Path, rules: _Rules, report: Callable[[str], None], fau
 
 
 def _embedded_objects(rules: _Rules, faults: _Faults, catalog: Sequence[str]) -> list[RawObject]:
-    """Embedded objects that have no name of `catalog`, or if there are none geometric solids, that fit into the bins."""
+    """Embedded objects that fit into the bins; beside a `catalog` household objects without a name of it, or else geometric solids."""
     raws = []
-    for raw in [raw for raw in procedural_objects() if raw.name not in catalog] or solids():
+    made = procedural_objects((HOUSEHOLD,) if catalog else rules.objects.embedded)
+    for raw in [raw for raw in made if raw.name not in catalog] or solids():
         try:
             _check_size(raw, raw.name, rules.bins)
         except CatalogError as error:

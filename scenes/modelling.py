@@ -9,6 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from synpick_warp.scenes.assets.polygons import clip_ears
 from synpick_warp.scenes.types import TriangleMesh
 
 Rect = tuple[float, float, float, float]
@@ -140,6 +141,23 @@ def cap(ring: np.ndarray, rect: Rect = NO_TEXTURE, *, below: bool = False) -> Pa
     if below:
         uv = uv * (-1, 1) + (1, 0)
     return Patch(corners, np.array(rect[:2]) + uv * (rect[2] - rect[0], rect[3] - rect[1]))
+
+
+def face(outline: np.ndarray, *holes: np.ndarray) -> Patch:
+    """Triangulate a planar polygon (n, 3), counter-clockwise as seen from outside, with holes (m, 3) of either direction.
+
+    Each hole is joined to the outline by a bridge, the shortest one; then ears are clipped.
+    """
+    first = outline - outline[0]
+    normal = np.cross(first, np.roll(first, -1, axis=0)).sum(axis=0)
+    for hole in holes:
+        turn = np.cross(hole - hole[0], np.roll(hole, -1, axis=0) - hole[0]).sum(axis=0)
+        ring = hole[::-1] if turn @ normal > 0.0 else hole
+        near, to = np.unravel_index(np.linalg.norm(outline[:, None] - ring[None], axis=2).argmin(), (len(outline), len(ring)))
+        bridged = [outline[: near + 1], np.roll(ring, -to, axis=0), ring[to : to + 1], outline[near:]]
+        outline = np.concatenate(bridged)
+    triangles = outline[np.array(clip_ears(outline))]
+    return Patch(triangles, np.zeros((*triangles.shape[:2], 2)))
 
 
 def strips(ring: np.ndarray, *, below: bool = False) -> Patch:

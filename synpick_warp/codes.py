@@ -1,4 +1,4 @@
-"""Enumerations: every integer code that device arrays, host code and files share, and a limit of both. Imports nothing else of the project.
+"""Enumerations: every integer code that device arrays, host code and files share, and limits of both. Imports nothing else of the project.
 
 Warp resolves members of an `IntEnum` in kernels, so device code, stages and exporters name the same member. The members of a
 `_Described` enum carry a sentence for people.
@@ -12,6 +12,8 @@ from collections.abc import Mapping
 from types import MappingProxyType
 from typing import Self
 
+MAX_CUPS = 16
+"""Most suction cups of a gripper: the bits of a word that says which of them hold an instance."""
 MAX_DISPARITIES = 256
 """Largest number of disparities that stereo matching searches, from the smallest on [px]; a multiple of the 32 threads of a warp."""
 
@@ -138,7 +140,9 @@ class Status(enum.IntEnum):
     ENGAGED = 12
     """Bit i: instance i was engaged by a ray."""
     ATTACHED = 13
-    """Bit i: instance i is attached to the cup, or was picked in this tick."""
+    """Bit i: instance i is attached to the gripper, or was picked in this tick."""
+    SEALED = 14
+    """Bit k: cup k has a good seal, if suction was switched on."""
 
 
 class Measure(enum.IntEnum):

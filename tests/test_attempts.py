@@ -179,12 +179,17 @@ def test_the_last_of_32_instances_is_a_bit_like_the_others(device):
     assert (record.attempts[0].engaged, record.attempts[0].picked) == ((0, 31), (31,))
 
 
-@pytest.mark.parametrize(("hits", "tolerated", "good"), [(RAYS, 0, True), (RAYS - 1, 0, False), (RAYS - 2, 2, True), (0, RAYS - 1, False)])
-def test_a_good_seal(device, hits, tolerated, good):
+@pytest.mark.parametrize(
+    ("cups", "sealed", "good", "listed"),
+    [(1, 1, True, None), (1, 0, False, None), (4, 0b1011, False, (0, 1, 3)), (4, 15, True, (0, 1, 2, 3))],
+)
+def test_a_good_seal_is_one_of_all_cups(device, cups, sealed, good, listed):
     world = new_world(device)
-    log = AttemptLog(settings(suction__tolerated_misses=tolerated).suction, CONFIG.perception.resolution, OBJECT_IDS)
-    (record,) = play({world: one_attempt(world, outcome=Outcome.DROPPED, hits=hits, attached=0)}, log).values()
-    assert record.attempts[0].good_seal is good
+    log = AttemptLog(CONFIG.suction, CONFIG.perception.resolution, OBJECT_IDS, cups=cups)
+    (record,) = play({world: one_attempt(world, outcome=Outcome.DROPPED, hits=3, sealed=sealed, attached=0)}, log).values()
+    attempt = record.attempts[0]
+    assert (attempt.good_seal, attempt.sealed, attempt.rays) == (good, listed, cups * RAYS)
+    assert json.loads(attempt.line()).get("sealed") == (None if listed is None else list(listed))
 
 
 def test_missing_reports_are_noticed(device):

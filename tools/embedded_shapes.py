@@ -1,6 +1,6 @@
 """Compute the collision shapes of the embedded objects again, and write the file that is shipped with them.
 
-    python -m tools.embedded_shapes      # in a minute
+    python -m tools.embedded_shapes      # in some minutes
 
 Run it when an embedded object, a default of the section objects, or the decomposition changes.
 """
@@ -14,27 +14,44 @@ from pathlib import Path
 import numpy as np
 
 from synpick_warp.configs.load import load_config
+from synpick_warp.configs.objects import EMBEDDED
 from synpick_warp.scenes.catalog import shape_recipe
 from synpick_warp.scenes.collision import embedded_shapes
+from synpick_warp.scenes.collision.decomposition import ShapeRecipe
 from synpick_warp.scenes.collision.shapes import collision_shapes
-from synpick_warp.scenes.embedded.objects import procedural_objects
+from synpick_warp.scenes.collision.simplification import simplify_hull
+from synpick_warp.scenes.embedded.objects import PIECES, procedural_objects
+from synpick_warp.scenes.embedded.parts import MILLIMETER
+from synpick_warp.scenes.types import Shape
 
 
 def main() -> None:
     """Compute the collision shapes of all embedded objects, and write their file."""
     objects = load_config("synpick").objects
-    raws = procedural_objects()
-    names, meshes, recipes = [raw.name for raw in raws], [raw.mesh for raw in raws], [shape_recipe(raw, objects) for raw in raws]
+    raws = procedural_objects(EMBEDDED)
+    recipes = {raw.name: shape_recipe(raw, objects) for raw in raws}
+    others = [raw for raw in raws if raw.name not in PIECES]
+    names, meshes, rules = [raw.name for raw in others], [raw.mesh for raw in others], [recipes[raw.name] for raw in others]
     embedded_shapes._read_shapes = dict  # type: ignore[assignment]  # nothing is taken from the present file
     with tempfile.TemporaryDirectory() as cache:
-        shapes = collision_shapes(names, meshes, recipes, Path(cache), lambda line: print(line, file=sys.stderr))
+        found = collision_shapes(names, meshes, rules, Path(cache), lambda line: print(line, file=sys.stderr))
+    shapes = dict(zip(names, found, strict=True)) | {name: modelled_shape(name, recipes[name]) for name in PIECES}
     arrays = {}
-    for mesh, recipe, shape in zip(meshes, recipes, shapes, strict=True):
+    for raw in raws:
+        shape = shapes[raw.name]
         if not isinstance(shape, tuple):
             raise shape
-        key = embedded_shapes.shape_key(mesh, recipe)
+        key = embedded_shapes.shape_key(raw.mesh, recipes[raw.name])
         arrays |= {f"{key}.{name}": array for name, array in embedded_shapes.pack_pieces(shape).items()}
     np.savez_compressed(embedded_shapes.FILE, **arrays)
+
+
+def modelled_shape(name: str, recipe: ShapeRecipe) -> Shape:
+    """Collision shape of an object that comes with its convex pieces, moved as its mesh: the middle of the bounding box to the origin."""
+    pieces = PIECES[name]()
+    points = np.concatenate(pieces)
+    middle = (points.min(axis=0) + points.max(axis=0)) / 2
+    return tuple(simplify_hull(MILLIMETER * (piece - middle), recipe.piece_vertices) for piece in pieces)
 
 
 if __name__ == "__main__":

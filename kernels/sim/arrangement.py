@@ -1,10 +1,10 @@
-"""Episode start: assign episodes to worlds, sample mode, bin, objects and light, and stack the objects above the bin to be dropped."""
+"""Episode start: assign episodes to worlds, sample mode, bin, objects and light."""
 
 import warp as wp
 
 from synpick_warp.codes import Ending, Look, LookKind, LookPart, Mode, Phase, Stream
 from synpick_warp.kernels.distributions import LookTable, draw_look, look_key
-from synpick_warp.kernels.rng import TAU, pixel_key, stream_key, uniform, uniform_index, uniform_rotation
+from synpick_warp.kernels.rng import TAU, pixel_key, stream_key, uniform, uniform_index
 from synpick_warp.kernels.sim.endings import delivers
 from synpick_warp.kernels.structs import BinData, CatalogData, DropData, LayoutData, ModeData
 
@@ -13,10 +13,6 @@ wp.set_module_options({"enable_backward": False})
 # Samples after which an arrangement without repeats counts as complete; each sample finds a new object with
 # probability 1 / entries at least, so 4,096 miss one with probability e^-8 at 512 entries.
 MAX_SAMPLES = wp.constant(4096)
-# Height of unused body slots, far below everything [m].
-PARKED_HEIGHT = wp.constant(-100.0)
-# Samples of the random stream that one drop uses: x, y and three for the rotation.
-DROP_SAMPLES = wp.constant(5)
 
 
 @wp.kernel
@@ -120,6 +116,53 @@ def fits_budget(total: float, volume: float, drop: DropData) -> bool:
     return wp.where(drop.exceed == 1, volume, total + volume) <= drop.volume
 
 
+@wp.func
+def assign_slots(
+    layout: LayoutData,
+    catalog: CatalogData,
+    catalog_index: wp.array2d[int],
+    body_slot: wp.array2d[int],
+    world: int,
+    first: int,
+    count: int,
+) -> bool:
+    """Assign the next free body slot of its class to each instance from `first` to before `count`; False: some have none."""
+    singles = int(0)
+    compounds = int(0)
+    for instance in range(count):
+        compound = catalog.compound[catalog_index[world, instance]]
+        if instance >= first:
+            slot = singles
+            if compound == 1:
+                slot = layout.single_slots + compounds
+            body_slot[world, instance] = slot
+        compounds += compound
+        singles += 1 - compound
+    return singles <= layout.single_slots and compounds <= layout.slots - layout.single_slots
+
+
+@wp.func
+def draw_counted(catalog: CatalogData, key: wp.uint64, catalog_index: wp.array2d[int], world: int) -> int:
+    """Draw the number of each object, and their order (Fisher and Yates, 1938); returns the number of objects.
+
+    Samples 0 to E - 1 of the stream are the numbers, uniform from least to most, of E objects; sample E + i swaps instance i with one up
+    to it.
+    """
+    count = int(0)
+    for entry in range(catalog.count):
+        number = catalog.least[entry] + uniform_index(key, entry, catalog.most[entry] - catalog.least[entry] + 1)
+        for _copy in range(number):
+            catalog_index[world, count] = entry
+            count += 1
+    for back in range(count - 1):
+        instance = count - 1 - back
+        other = uniform_index(key, catalog.count + instance, instance + 1)
+        swapped = catalog_index[world, other]
+        catalog_index[world, other] = catalog_index[world, instance]
+        catalog_index[world, instance] = swapped
+    return count
+
+
 @wp.kernel
 def sample_objects_kernel(
     # Scene:
@@ -138,8 +181,9 @@ def sample_objects_kernel(
 ):
     """Sample objects up to a volume budget V: with `exceed` until Σ volume ≥ V, else while Σ volume ≤ V. Launched over world.
 
-    An object larger than V is resampled; without `exceed`, after the first one, it ends the draw. `catalog_index` receives the objects (-1:
-    none), `body_slot` the next free slot of their class; without one the episode ends (ARRANGEMENT_OVERFLOW).
+    An object larger than V is resampled; without `exceed`, after the first one, it ends the draw. Where numbers of objects are set, these
+    are drawn instead. `catalog_index` receives the objects (-1: none), `body_slot` the next free slot of their class; without one the
+    episode ends (ARRANGEMENT_OVERFLOW).
     """
     world = wp.tid()
     phase = phase_inout[world]
@@ -151,11 +195,10 @@ def sample_objects_kernel(
     key = stream_key(seed, arrangement_id[world][0], arrangement_id[world][1], Stream.OBJECTS)
     repeats = wp.where(mode[world] == Mode.MOVE, drop.move_repeats, drop.pick_repeats)
     count = int(0)
-    singles = int(0)
-    compounds = int(0)
     total = float(0.0)
-    overflow = bool(False)
-    open = bool(True)
+    open = catalog.counted == 0
+    if not open:
+        count = draw_counted(catalog, key, catalog_index_out, world)
     for sample in range(MAX_SAMPLES):
         if open:
             candidate = uniform_index(key, sample, catalog.count)
@@ -164,20 +207,13 @@ def sample_objects_kernel(
             if drop.exceed == 0 and not repeated and not fits and count > 0:
                 open = False
             if not repeated and fits:
-                slot = singles
-                if catalog.compound[candidate] == 1:
-                    slot = layout.single_slots + compounds
-                compounds += catalog.compound[candidate]
-                singles += 1 - catalog.compound[candidate]
-                overflow = overflow or singles > layout.single_slots or compounds > layout.slots - layout.single_slots
                 catalog_index_out[world, count] = candidate
-                body_slot_out[world, count] = slot
                 total += catalog.volume[candidate]
                 count += 1
             full = count == drop.objects or (repeats == 0 and count == catalog.count)
-            if overflow or full or (drop.exceed == 1 and total >= drop.volume):
+            if full or (drop.exceed == 1 and total >= drop.volume):
                 open = False
-    if overflow:
+    if not assign_slots(layout, catalog, catalog_index_out, body_slot_out, world, 0, count):
         clear_catalog_indices(catalog_index_out, world, layout.instances)
         ending_inout[world] = Ending.ARRANGEMENT_OVERFLOW
         phase_inout[world] = Phase.OVER
@@ -218,24 +254,11 @@ def sample_distractors_kernel(
     key = stream_key(seed, arrangement_id[world][0], arrangement_id[world][1], Stream.DISTRACTORS)
     wanted = int(wp.rint(draw_look(looks, key, LookPart.EPISODE, Look.COUNT)[0]))
     first = count_instances(catalog_index_inout, world, layout.instances)
-    singles = int(0)
-    compounds = int(0)
-    for instance in range(first):
-        compounds += catalog.compound[catalog_index_inout[world, instance]]
-    singles = first - compounds
-    overflow = bool(False)
     choices = pixel_key(key, 0)
-    for instance in range(first, wp.min(first + wanted, layout.instances)):
-        chosen = catalog.count + uniform_index(choices, instance - first, catalog.distractors)
-        slot = singles
-        if catalog.compound[chosen] == 1:
-            slot = layout.single_slots + compounds
-        compounds += catalog.compound[chosen]
-        singles += 1 - catalog.compound[chosen]
-        overflow = overflow or singles > layout.single_slots or compounds > layout.slots - layout.single_slots
-        catalog_index_inout[world, instance] = chosen
-        body_slot_inout[world, instance] = slot
-    if overflow:
+    count = wp.min(first + wanted, layout.instances)
+    for instance in range(first, count):
+        catalog_index_inout[world, instance] = catalog.count + uniform_index(choices, instance - first, catalog.distractors)
+    if not assign_slots(layout, catalog, catalog_index_inout, body_slot_inout, world, first, count):
         clear_catalog_indices(catalog_index_inout, world, layout.instances)
         ending_inout[world] = Ending.ARRANGEMENT_OVERFLOW
         phase_inout[world] = Phase.OVER
@@ -303,147 +326,3 @@ def sample_bins_kernel(
     angle = 2.0 * bins.yaw * uniform(key, 3) - bins.yaw
     bin_out[world] = chosen
     bin_pose_out[world] = wp.transform(origin + wp.vec3(x, y, 0.0), wp.quat_from_axis_angle(wp.vec3(0.0, 0.0, 1.0), angle))
-
-
-@wp.func
-def choose_compartment(bins: BinData, world: int, key: wp.uint64, instance: int) -> int:
-    """Sample the compartment of the world's bin that an instance is dropped into, from the stream of `Stream.COMPARTMENT`."""
-    chosen = bins.chosen[world]
-    first = bins.first_compartment[chosen]
-    return first + uniform_index(key, instance, bins.first_compartment[chosen + 1] - first)
-
-
-@wp.func
-def drop_pose(
-    key: wp.uint64, index: int, radius: float, height: float, drop: DropData, bins: BinData, world: int, compartment: int
-) -> wp.transform:
-    """Sample a drop pose at a height above the floor [m]: uniform rotation, position uniform over a fraction of a compartment's opening.
-
-    The opening is reduced by the object's bounding radius [m]; `index` counts the drops of the stream.
-    """
-    first = index * DROP_SAMPLES
-    center = bins.center[compartment]
-    half = bins.half[compartment]
-    x = (2.0 * uniform(key, first) - 1.0) * drop.spread * wp.max(0.0, half[0] - radius) + center[0]
-    y = (2.0 * uniform(key, first + 1) - 1.0) * drop.spread * wp.max(0.0, half[1] - radius) + center[1]
-    return bins.pose[world] * wp.transform(wp.vec3(x, y, height), uniform_rotation(key, first + 2))
-
-
-@wp.func
-def write_body(joint_q: wp.array[float], joint_qd: wp.array[float], first_q: int, first_qd: int, pose: wp.transform):
-    """Write the joint coordinates of a free body at a pose [m] and clear its velocity; its joints begin at `first_q` and `first_qd`."""
-    p = wp.transform_get_translation(pose)
-    r = wp.transform_get_rotation(pose)
-    for axis in range(3):
-        joint_q[first_q + axis] = p[axis]
-    for axis in range(4):
-        joint_q[first_q + 3 + axis] = r[axis]
-    for axis in range(6):
-        joint_qd[first_qd + axis] = 0.0
-
-
-@wp.kernel
-def reset_worlds_kernel(
-    # Scene:
-    layout: LayoutData,
-    catalog: CatalogData,
-    drop: DropData,
-    # State:
-    phase: wp.array[int],  # (world)
-    # Out:
-    variant_out: wp.array[int],  # (body)
-    joint_q_out: wp.array[float],  # (coord) [m, rad]
-    joint_qd_out: wp.array[float],  # (dof) [m/s, rad/s]
-    joint_f_out: wp.array[float],  # (dof) [N, N·m]
-    restarted_out: wp.array[wp.bool],  # (world_and_global)
-    progress_out: wp.array[wp.vec4i],  # (world) [ticks]
-    stuck_out: wp.array2d[int],  # (world, instance) [ticks]
-):
-    """Reset worlds in the phases START, IDLE and OVER: all body slots empty and parked, the gripper at home.
-
-    `variant` receives each slot's empty variant, or -1 (no change) in other worlds; `restarted` is True for reset worlds. A force m g on
-    each parked body cancels its weight. Launched over world.
-    """
-    world = wp.tid()
-    fresh = phase[world] == Phase.START or phase[world] == Phase.IDLE or phase[world] == Phase.OVER
-    restarted_out[world] = fresh
-    body = world * layout.bodies + layout.gripper_bodies
-    for slot in range(layout.slots):
-        variant_out[body + slot] = -1
-    if not fresh:
-        return
-    # Ticks since the drop, ticks at rest, re-drops, whether the guide walls stand.
-    progress_out[world] = wp.vec4i(0, 0, 0, 1)
-    for instance in range(layout.instances):
-        stuck_out[world, instance] = 0
-    q = world * layout.coords
-    qd = world * layout.dofs
-    for axis in range(layout.gripper_dofs):
-        joint_q_out[q + axis] = 0.0
-        joint_qd_out[qd + axis] = 0.0
-    for axis in range(3):
-        joint_q_out[q + axis] = drop.gripper_home[axis]
-    parked = wp.transform(wp.vec3(0.0, 0.0, PARKED_HEIGHT), wp.quat_identity())
-    for slot in range(layout.slots):
-        variant_out[body + slot] = catalog.empty_single
-        if slot >= layout.single_slots:
-            variant_out[body + slot] = catalog.empty_compound
-        first = qd + layout.gripper_dofs + 6 * slot
-        write_body(joint_q_out, joint_qd_out, q + layout.gripper_dofs + 7 * slot, first, parked)
-        for axis in range(6):
-            joint_f_out[first + axis] = 0.0
-        joint_f_out[first + 2] = catalog.empty_mass * drop.gravity
-
-
-@wp.kernel
-def drop_objects_kernel(
-    # Scene:
-    seed: wp.uint64,
-    layout: LayoutData,
-    catalog: CatalogData,
-    drop: DropData,
-    bins: BinData,
-    # State:
-    arrangement_id: wp.array[wp.vec2i],  # (world)
-    catalog_index: wp.array2d[int],  # (world, instance)
-    body_slot: wp.array2d[int],  # (world, instance)
-    phase_inout: wp.array[int],  # (world)
-    # Out:
-    variant_out: wp.array[int],  # (body)
-    joint_q_out: wp.array[float],  # (coord) [m, rad]
-    joint_qd_out: wp.array[float],  # (dof) [m/s, rad/s]
-    joint_f_out: wp.array[float],  # (dof) [N, N·m]
-):
-    """Assign objects to their body slots and stack them above the bin in a column of bounding spheres, at rest; phase becomes SETTLE.
-
-    Height of sphere i above the floor: z_i = rim + r_i + Σ_{j<i} (2 r_j + clearance), in whichever compartment. With distractors, which are
-    the last instances, the column begins with a random instance and goes on from the last to the first, so that they lie anywhere in the
-    pile. Launched over world.
-    """
-    world = wp.tid()
-    if phase_inout[world] != Phase.START:
-        return
-    body = world * layout.bodies + layout.gripper_bodies
-    key = stream_key(seed, arrangement_id[world][0], arrangement_id[world][1], Stream.DROP)
-    places = stream_key(seed, arrangement_id[world][0], arrangement_id[world][1], Stream.COMPARTMENT)
-    height = bins.rim_height[bins.chosen[world]]
-    count = count_instances(catalog_index, world, layout.instances)
-    first = int(0)
-    if catalog.distractors > 0 and count > 0:
-        order = stream_key(seed, arrangement_id[world][0], arrangement_id[world][1], Stream.DISTRACTORS)
-        first = uniform_index(pixel_key(order, 1), 0, count)
-    for place in range(count):
-        instance = (first + place) % count
-        index = catalog_index[world, instance]
-        if index >= 0:
-            slot = body_slot[world, instance]
-            variant_out[body + slot] = catalog.variant[index]
-            q = world * layout.coords + layout.gripper_dofs + 7 * slot
-            qd = world * layout.dofs + layout.gripper_dofs + 6 * slot
-            radius = catalog.radius[index]
-            compartment = choose_compartment(bins, world, places, instance)
-            pose = drop_pose(key, instance, radius, height + radius, drop, bins, world, compartment)
-            write_body(joint_q_out, joint_qd_out, q, qd, pose)
-            joint_f_out[qd + 2] = 0.0
-            height += 2.0 * radius + drop.clearance
-    phase_inout[world] = Phase.SETTLE

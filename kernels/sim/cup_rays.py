@@ -1,16 +1,16 @@
-"""Suction test: rays cast from a ring on the suction cup's lip decide which objects it engages, and how strong the seals are."""
+"""Suction test: rays cast from a ring on each suction cup's lip decide which objects it engages, and how strong its seal is."""
 
 import warp as wp
 
 from synpick_warp.codes import Phase, Task
 from synpick_warp.kernels.rng import TAU
-from synpick_warp.kernels.structs import LayoutData, PickData, SuctionData
+from synpick_warp.kernels.structs import LayoutData, MoveData, PickData, SuctionData
 
 wp.set_module_options({"enable_backward": False})
 
 # Ray distance that stands for no hit.
 MISS = wp.constant(-1.0)
-# Index of the cup among a world's bodies; the gripper shaft ("finger") is 0.
+# Index of the gripper head, which has the cups, among a world's bodies; the gripper shaft ("finger") is 0.
 CUP = wp.constant(1)
 
 
@@ -35,9 +35,9 @@ class SurfaceData:
 
 
 @wp.func
-def tcp_pose(cup_in_world: wp.transform, tcp_offset: float) -> wp.transform:
-    """Pose of the TCP frame in the world: the cup's axes at (0, 0, -tcp_offset) [m] in the cup's frame."""
-    return cup_in_world * wp.transform(wp.vec3(0.0, 0.0, -tcp_offset), wp.quat_identity())
+def tcp_pose(head_in_world: wp.transform, place: wp.vec3) -> wp.transform:
+    """Pose of a cup's TCP frame in the world: the head's axes at `place` [m] in the head's frame."""
+    return head_in_world * wp.transform(place, wp.quat_identity())
 
 
 @wp.func
@@ -100,6 +100,40 @@ def suction_begins(phase: int, task: int, steps: int, pick: PickData) -> bool:
     return phase == Phase.ACT and task == Task.PRESS and steps >= pick.press_steps
 
 
+@wp.func
+def has_bit(bits: int, index: int) -> bool:
+    """True if bit `index` is set."""
+    return (bits >> index) & 1 != 0
+
+
+@wp.func
+def first_instance(
+    start: wp.vec3,
+    direction: wp.vec3,
+    layout: LayoutData,
+    suction: SuctionData,
+    surface: SurfaceData,
+    world: int,
+    catalog_index: wp.array2d[int],  # (world, instance)
+    body_slot: wp.array2d[int],  # (world, instance)
+    body_q: wp.array[wp.transform],  # (body) [m]
+) -> int:
+    """Instance that a ray hits first within reach, the first of several at the same distance; -1: none."""
+    nearest = float(MISS)
+    hit = int(-1)
+    for instance in range(layout.instances):
+        index = catalog_index[world, instance]
+        if index >= 0:
+            pose = body_q[world * layout.bodies + layout.gripper_bodies + body_slot[world, instance]]
+            # Bounding-sphere test: no point of the ray is farther from its start than its reach.
+            if wp.length(wp.transform_get_translation(pose) - start) <= surface.radius[index] + suction.reach:
+                distance = cast_ray(start, direction, suction.reach, pose, index, surface)
+                if distance >= 0.0 and (nearest < 0.0 or distance < nearest):
+                    nearest = distance
+                    hit = instance
+    return hit
+
+
 @wp.kernel
 def count_seal_rays_kernel(
     # Scene:
@@ -115,40 +149,46 @@ def count_seal_rays_kernel(
     body_slot: wp.array2d[int],  # (world, instance)
     body_q: wp.array[wp.transform],  # (body) [m]
     # Out:
-    hits_out: wp.array[int],  # (world)
+    hits_out: wp.array[wp.vec2i],  # (world)
     engaged_bits_out: wp.array[wp.uint32],  # (world)
+    attached_inout: wp.array2d[int],  # (world, instance)
+    break_force_out: wp.array2d[float],  # (world, cup) [N]
 ):
-    """Cast the suction rays where suction is switched on: count the rays that hit, and set bit i for every instance i that is hit.
+    """Cast the suction rays where suction is switched on: `hits` receives the number of rays that hit and the cups with a good seal as
+    bits, `engaged_bits` bit i for every instance i that is hit, `attached` bit k for every cup k of which a ray hits the instance.
 
-    Rays run from a circle about the TCP along the cup's -z: x_k = tcp + r (cos a, sin a, 0), a = 2 π k / rays. Each engages the nearest
-    object within reach, the first of several at the same distance. Only the world's own objects are tested. Launched over world.
+    Rays run from a circle about a cup's TCP along the cup's -z: x_k = tcp + r (cos a, sin a, 0), a = 2 π k / rays. Each engages the
+    nearest object within reach, the first of several at the same distance. Only the world's own objects are tested. A seal is good if at
+    most `tolerated_misses` of the cup's rays miss; with a common valve, if that holds for every cup. Launched over world.
     """
     world = wp.tid()
     if not suction_begins(phase[world], task[world], steps[world], pick):
         return
     body = world * layout.bodies
-    tcp_in_world = tcp_pose(body_q[body + CUP], suction.tcp_offset)
-    direction = wp.transform_vector(tcp_in_world, wp.vec3(0.0, 0.0, -1.0))
-    hits = int(0)
+    total = int(0)
+    sealed = int(0)
     engaged = wp.uint32(0)
-    for ray in range(suction.rays):
-        start = wp.transform_point(tcp_in_world, ray_start(ray, suction))
-        nearest = float(MISS)
-        hit = int(-1)
-        for instance in range(layout.instances):
-            index = catalog_index[world, instance]
-            if index >= 0:
-                pose = body_q[body + layout.gripper_bodies + body_slot[world, instance]]
-                # Bounding-sphere test: no point of the ray is farther from its start than its reach.
-                if wp.length(wp.transform_get_translation(pose) - start) <= surface.radius[index] + suction.reach:
-                    distance = cast_ray(start, direction, suction.reach, pose, index, surface)
-                    if distance >= 0.0 and (nearest < 0.0 or distance < nearest):
-                        nearest = distance
-                        hit = instance
-        if hit >= 0:
-            hits += 1
-            engaged = engaged | (wp.uint32(1) << wp.uint32(hit))
-    hits_out[world] = hits
+    for instance in range(layout.instances):
+        attached_inout[world, instance] = 0
+    for cup in range(suction.cups):
+        tcp_in_world = tcp_pose(body_q[body + CUP], suction.place[cup])
+        direction = wp.transform_vector(tcp_in_world, wp.vec3(0.0, 0.0, -1.0))
+        hits = int(0)
+        for ray in range(suction.rays):
+            start = wp.transform_point(tcp_in_world, ray_start(ray, suction))
+            hit = first_instance(start, direction, layout, suction, surface, world, catalog_index, body_slot, body_q)
+            if hit >= 0:
+                hits += 1
+                engaged = engaged | (wp.uint32(1) << wp.uint32(hit))
+                attached_inout[world, hit] = attached_inout[world, hit] | (1 << cup)
+        total += hits
+        if suction.rays - hits <= suction.tolerated_misses:
+            sealed = sealed | (1 << cup)
+    if suction.common_valve != 0 and sealed != (1 << suction.cups) - 1:
+        sealed = 0
+    for cup in range(suction.cups):
+        break_force_out[world, cup] = wp.where(has_bit(sealed, cup), suction.good_force, suction.poor_force)
+    hits_out[world] = wp.vec2i(total, sealed)
     engaged_bits_out[world] = engaged
 
 
@@ -157,7 +197,7 @@ def engage_seals_kernel(
     # Scene:
     layout: LayoutData,
     pick: PickData,
-    suction: SuctionData,
+    move: MoveData,
     # State:
     phase: wp.array[int],  # (world)
     task: wp.array[int],  # (world)
@@ -165,29 +205,20 @@ def engage_seals_kernel(
     body_slot: wp.array2d[int],  # (world, instance)
     body_q: wp.array[wp.transform],  # (body) [m]
     # In:
-    hits: wp.array[int],  # (world)
-    engaged_bits: wp.array[wp.uint32],  # (world)
+    attached: wp.array2d[int],  # (world, instance)
     # Out:
-    attached_out: wp.array2d[int],  # (world, instance)
     object_in_tcp_out: wp.array2d[wp.transform],  # (world, instance) [m]
     seal_force_out: wp.array2d[float],  # (world, instance) [N]
-    break_force_out: wp.array[float],  # (world) [N]
 ):
-    """Attach every engaged object where suction is switched on, at its current pose: object_in_tcp = tcp_in_world⁻¹ object_in_world.
+    """Store the pose of every attached object where suction is switched on: object_in_tcp = tcp_in_world⁻¹ object_in_world.
 
-    The break force is `good_force` if at most `tolerated_misses` rays miss, else `poor_force`; seal forces begin at 0. Launched over world,
-    instance.
+    Seal forces begin at 0. Launched over world, instance.
     """
     world, instance = wp.tid()
-    if not suction_begins(phase[world], task[world], steps[world], pick):
-        return
-    if instance == 0:
-        break_force_out[world] = wp.where(suction.rays - hits[world] <= suction.tolerated_misses, suction.good_force, suction.poor_force)
-    if (engaged_bits[world] & (wp.uint32(1) << wp.uint32(instance))) == wp.uint32(0):
+    if not suction_begins(phase[world], task[world], steps[world], pick) or attached[world, instance] == 0:
         return
     body = world * layout.bodies
-    tcp_in_world = tcp_pose(body_q[body + CUP], suction.tcp_offset)
+    tcp_in_world = tcp_pose(body_q[body + CUP], wp.vec3(0.0, 0.0, -move.tcp_offset))
     object_in_world = body_q[body + layout.gripper_bodies + body_slot[world, instance]]
-    attached_out[world, instance] = 1
     object_in_tcp_out[world, instance] = wp.transform_inverse(tcp_in_world) * object_in_world
     seal_force_out[world, instance] = 0.0

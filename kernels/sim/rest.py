@@ -4,7 +4,7 @@ import warp as wp
 
 from synpick_warp.codes import Phase, Stream
 from synpick_warp.kernels.rng import stream_key
-from synpick_warp.kernels.sim.arrangement import choose_compartment, drop_pose, write_body
+from synpick_warp.kernels.sim.drop import choose_compartment, drop_pose, top_of_objects, write_body
 from synpick_warp.kernels.structs import BinData, CatalogData, DropData, LayoutData, SettleData
 
 wp.set_module_options({"enable_backward": False})
@@ -133,8 +133,9 @@ def redrop_objects_kernel(
 ):
     """Drop objects again that left the bin or were stuck, that is, in deep penetration for longer than `stuck_ticks`.
 
-    They are stacked one above the other, and the guide walls return. `progress` holds ticks since the drop, ticks at rest, re-drops, and
-    whether the guide walls stand; `stuck` counts each instance's ticks in deep penetration. Launched over world.
+    They are stacked one above the other, with layers above all other objects, and the guide walls return. `progress` holds ticks since the
+    drop, ticks at rest, re-drops, and whether the guide walls stand; `stuck` counts each instance's ticks in deep penetration. Launched
+    over world.
     """
     world = wp.tid()
     if phase[world] != Phase.SETTLE:
@@ -144,6 +145,9 @@ def redrop_objects_kernel(
     places = stream_key(seed, arrangement_id[world][0], arrangement_id[world][1], Stream.COMPARTMENT)
     height = bins.rim_height[bins.chosen[world]]
     body = world * layout.bodies + layout.gripper_bodies
+    if drop.layers == 1:
+        top = top_of_objects(layout, catalog, catalog_index, body_slot, body_q, world)
+        height = wp.max(height, top - wp.transform_get_translation(bins.pose[world])[2] + drop.clearance)
     for instance in range(layout.instances):
         index = catalog_index[world, instance]
         if index >= 0:
@@ -156,7 +160,9 @@ def redrop_objects_kernel(
                 stuck = 0
                 radius = catalog.radius[index]
                 compartment = choose_compartment(bins, world, places, instance)
-                pose = drop_pose(key, progress[2], radius, height + radius, drop, bins, world, compartment)
+                center = bins.center[compartment]
+                half = bins.half[compartment]
+                pose = drop_pose(key, progress[2], radius, height + radius, drop.spread, bins.pose[world], center, half)
                 height += 2.0 * radius + drop.clearance
                 q = world * layout.coords + layout.gripper_dofs + 7 * slot
                 write_body(joint_q_inout, joint_qd_inout, q, world * layout.dofs + layout.gripper_dofs + 6 * slot, pose)

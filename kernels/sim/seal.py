@@ -1,23 +1,24 @@
-"""Suction seals: breakable implicit spring-dampers between the cup and the attached objects, which replace contacts between the two.
+"""Suction seals: breakable implicit spring-dampers between cups and the attached objects.
+
+A cup has a seal with each object that it holds. The seals of an object act on two rigid bodies: together they are one spring-damper at the
+middle of their cups, whose resistance to rotation grows with the distances of the cups from it. It is solved as one, then shared out.
 
 Frames; `X_in_Y` is the pose of frame X in frame Y, so that `Z_in_Y = X_in_Y * Z_in_X`:
 
 - world: z up.
-- tcp: at the tool centre point (TCP), the centre of the cup's lip, with the cup's axes; +z points into the gripper, +y is the wrist axis.
+- tcp: at the tool centre point (TCP), the middle of the plane of the cups' lips, with the head's axes; +z points into the gripper, +y is
+  the wrist axis. Each cup has a TCP of its own there, the centre of its lip; one cup's is that of the tool.
 - object: the object's body frame.
-- grip: fixed to the object; coincides with tcp while the seal is at rest. `object_in_tcp`, stored when the seal engages, equals
+- grip: fixed to the object; coincides with tcp while the seals are at rest. `object_in_tcp`, stored when the seals engage, equals
   `object_in_grip` ever after, hence `grip_in_world = object_in_world * inverse(object_in_tcp)`.
 """
 
 import warp as wp
 
-from synpick_warp.kernels.sim.cup_rays import CUP, tcp_pose
+from synpick_warp.kernels.sim.cup_rays import CUP, has_bit, tcp_pose
 from synpick_warp.kernels.structs import TILT, LayoutData, SuctionData
 
 wp.set_module_options({"enable_backward": False})
-
-# Gap of a contact that must not act [m]; stages.sim.physics makes the solver skip contacts with far smaller gaps.
-APART = wp.constant(1.0)
 
 
 @wp.struct
@@ -46,6 +47,16 @@ class RotationError:
 
 
 @wp.struct
+class CupSpread:
+    """Elastic torque of an object's cups beside their middle, and the second moment of their places."""
+
+    torque: wp.vec3
+    """Σ r x k (r - r_grip) about the middle, on the object [N·m]."""
+    moment: wp.mat33
+    """Σ |r|² 1 - r rᵀ, in the world's axes [m²]."""
+
+
+@wp.struct
 class Wrench:
     """Force [N] and torque [N·m] on the object at the TCP, in the world's axes."""
 
@@ -56,8 +67,36 @@ class Wrench:
 
 
 @wp.struct
+class SolvedSeals:
+    """Wrench of an object's seals at the middle of their cups, and what it takes to share it out."""
+
+    whole: Wrench
+    """Of all seals, on the object."""
+    grip_rotation: wp.quat
+    """From the grip frame to the world."""
+    object_arm: wp.vec3
+    """From the object's centre of mass to the middle of the cups [m]."""
+    spin: wp.vec3
+    """Angular velocity of the head relative to the object at the end of the step [rad/s]."""
+
+
+@wp.struct
+class HeldObject:
+    """What the seals of an object do in a step: cups that hold on, and their wrench about the object's centre of mass."""
+
+    cups: int
+    """Bits of the cups whose seals did not break."""
+    peak_force: float
+    """Largest tension and shear of a seal, that of one that breaks included [N]."""
+    force: wp.vec3
+    """On the object, in the world's axes [N]."""
+    torque: wp.vec3
+    """[N·m]"""
+
+
+@wp.struct
 class TcpMotion:
-    """Pose and velocity of the TCP frame, and its arm from the wrist, in the world's axes."""
+    """Pose and velocity of a frame with the head's axes in the plane of the lips, and its arm from the wrist, in the world's axes."""
 
     position: wp.vec3
     """[m]"""
@@ -76,18 +115,18 @@ class TcpMotion:
 
 
 @wp.func
-def tcp_motion(cup_in_world: wp.transform, cup_velocity: wp.spatial_vector, cup_com: wp.vec3, suction: SuctionData) -> TcpMotion:
-    """Motion of the tcp frame from pose and velocity of the cup, whose centre of mass is `cup_com` in its frame [m]."""
-    tcp_in_world = tcp_pose(cup_in_world, suction.tcp_offset)
+def tcp_motion(head_in_world: wp.transform, head_velocity: wp.spatial_vector, head_com: wp.vec3, place: wp.vec3) -> TcpMotion:
+    """Motion of the frame with the head's axes at `place` [m], from the head's: its centre of mass is at `head_com` in its frame [m]."""
+    tcp_in_world = tcp_pose(head_in_world, place)
     result = TcpMotion()
     result.position = wp.transform_get_translation(tcp_in_world)
     result.rotation = wp.transform_get_rotation(tcp_in_world)
     result.axis = wp.transform_vector(tcp_in_world, wp.vec3(0.0, 0.0, 1.0))
     result.wrist_axis = wp.transform_vector(tcp_in_world, wp.vec3(0.0, 1.0, 0.0))
-    result.wrist_arm = result.position - wp.transform_get_translation(cup_in_world)
-    result.angular_velocity = wp.spatial_bottom(cup_velocity)
-    com_arm = result.position - wp.transform_point(cup_in_world, cup_com)
-    result.velocity = wp.spatial_top(cup_velocity) + wp.cross(result.angular_velocity, com_arm)
+    result.wrist_arm = result.position - wp.transform_get_translation(head_in_world)
+    result.angular_velocity = wp.spatial_bottom(head_velocity)
+    com_arm = result.position - wp.transform_point(head_in_world, head_com)
+    result.velocity = wp.spatial_top(head_velocity) + wp.cross(result.angular_velocity, com_arm)
     return result
 
 
@@ -108,16 +147,16 @@ def object_inverse_mass(object_rotation: wp.quat, inverse_mass: float, inverse_i
 
 
 @wp.func
-def gripper_inverse_mass(suction: SuctionData, wrist_axis: wp.vec3, arm: wp.vec3, seals: int) -> InverseMass:
-    """Inverse effective mass of the gripper at `arm` [m] from the wrist, times the number of seals.
+def gripper_inverse_mass(suction: SuctionData, wrist_axis: wp.vec3, arm: wp.vec3, objects: int) -> InverseMass:
+    """Inverse effective mass of the gripper at `arm` [m] from the wrist, times the number of objects that it holds.
 
-    The gripper translates as a whole and tilts about the wrist axis against its drive. With n seals that pull at the same mass, each
-    is given an n-th of it. An approximation that shapes how a seal's oscillation decays, not the force that it bears: translation and
-    tilt are taken as independent.
+    The gripper translates as a whole and tilts about the wrist axis against its drive. With n objects that pull at the same mass, each
+    is given an n-th of it (mass splitting; Tonge et al., 2012). An approximation that shapes how a seal's oscillation decays, not the force
+    that it bears: translation and tilt are taken as independent.
     """
     direction = wp.cross(wrist_axis, arm)
-    slide = float(seals) / (suction.finger_mass + suction.cup_mass)
-    tilt = float(seals) / suction.tilt_inertia
+    slide = float(objects) / (suction.finger_mass + suction.cup_mass)
+    tilt = float(objects) / suction.tilt_inertia
     result = InverseMass()
     result.linear = slide * wp.identity(n=3, dtype=float) + tilt * wp.outer(direction, direction)
     result.mixed = tilt * wp.outer(direction, wrist_axis)
@@ -160,20 +199,63 @@ def rotation_error(cup: wp.quat, grip: wp.quat, suction: SuctionData) -> Rotatio
 
 
 @wp.func
+def count_seals(held: int, suction: SuctionData) -> int:
+    """Number of cups that hold an object; `held`: its bits in `attached`."""
+    count = int(0)
+    for cup in range(suction.cups):
+        count += (held >> cup) & 1
+    return count
+
+
+@wp.func
+def middle_of_cups(held: int, suction: SuctionData) -> wp.vec3:
+    """Middle of the cups that hold an object, in the head's frame [m]."""
+    total = wp.vec3(0.0, 0.0, 0.0)
+    for cup in range(suction.cups):
+        if has_bit(held, cup):
+            total += suction.place[cup]
+    return total / float(count_seals(held, suction))
+
+
+@wp.func
+def spread_of_cups(held: int, middle: wp.vec3, head: wp.quat, grip: wp.quat, suction: SuctionData) -> CupSpread:
+    """Spread of the cups that hold an object about their middle; rotations from the head's and from the grip's axes to the world."""
+    result = CupSpread()
+    for cup in range(suction.cups):
+        if has_bit(held, cup):
+            arm = wp.quat_rotate(head, suction.place[cup] - middle)
+            stretch = arm - wp.quat_rotate(grip, suction.place[cup] - middle)
+            result.torque += wp.cross(arm, suction.stiffness * stretch)
+            result.moment += wp.dot(arm, arm) * wp.identity(n=3, dtype=float) - wp.outer(arm, arm)
+    return result
+
+
+@wp.func
 def seal_wrench(
-    offset: wp.vec3, error: RotationError, velocity: wp.vec3, angular_velocity: wp.vec3, inverse_mass: InverseMass, suction: SuctionData
+    offset: wp.vec3,
+    error: RotationError,
+    spread: CupSpread,
+    seals: int,
+    velocity: wp.vec3,
+    angular_velocity: wp.vec3,
+    inverse_mass: InverseMass,
+    suction: SuctionData,
 ) -> Wrench:
-    """Wrench w on the object of a spring-damper that is implicit in offset and velocity at the end of the step h.
+    """Wrench w on an object of its n seals, a spring-damper that is implicit in offset and velocity at the end of the step h.
 
     w = K (e + h u') + D u' with u' = u - h W w, hence (1 + h (h K + D) W) w = K e + (h K + D) u. Offset e and velocity u are those of the
-    tcp frame relative to the grip frame, W is the sum of both inverse effective masses. Stable for every mass, stiffness and damping.
+    tcp frame relative to the grip frame at the middle of the cups, W is the sum of both inverse effective masses. K is n times a seal's
+    stiffness; against rotation, k Σ |r|² 1 - r rᵀ of the cups' places r is added, and the same to D. Stable for every mass, stiffness and
+    damping.
     """
     h = suction.step
+    n = float(seals)
     one = wp.identity(n=3, dtype=float)
-    linear_gain = h * suction.stiffness + suction.damping
-    angular_gain = h * error.stiffness + suction.twist_damping * one
-    force = suction.stiffness * offset + linear_gain * velocity
-    torque = error.torque + angular_gain * angular_velocity
+    gain = h * suction.stiffness + suction.damping
+    linear_gain = n * gain
+    angular_gain = n * (h * error.stiffness + suction.twist_damping * one) + gain * spread.moment
+    force = n * suction.stiffness * offset + linear_gain * velocity
+    torque = n * error.torque + spread.torque + angular_gain * angular_velocity
     # Blocks of the 6 x 6 system, solved for the torque first (Schur complement).
     upper = wp.inverse(one + (h * linear_gain) * inverse_mass.linear)
     right = (h * linear_gain) * inverse_mass.mixed
@@ -186,34 +268,126 @@ def seal_wrench(
 
 
 @wp.func
+def force_of_cup(whole: Wrench, seals: int, arm: wp.vec3, grip_arm: wp.vec3, spin: wp.vec3, suction: SuctionData) -> wp.vec3:
+    """Force of one cup's seal on the object, a share of that of its n seals: F / n + k (r - r_grip) + (h k + d) ω' x r [N].
+
+    Args:
+        whole: Wrench of all seals of the object at the middle of their cups.
+        seals: Their number.
+        arm: From the middle to the cup, r [m].
+        grip_arm: The same on the object, r_grip [m].
+        spin: Angular velocity of the head relative to the object at the end of the step, ω' [rad/s].
+        suction: Stiffness and damping.
+    """
+    gain = suction.step * suction.stiffness + suction.damping
+    return whole.force / float(seals) + suction.stiffness * (arm - grip_arm) + gain * wp.cross(spin, arm)
+
+
+@wp.func
 def tension_and_shear(force: wp.vec3, axis: wp.vec3) -> float:
     """Seal force [N] that is compared with the break force: norm of the force on the object without compression along the cup's axis."""
     return wp.length(force - wp.min(wp.dot(force, axis), 0.0) * axis)
 
 
 @wp.func
-def break_seal(attached: wp.array2d[int], joint_f: wp.array[float], world: int, instance: int, first_dof: int):
-    """Detach an instance and clear the joint forces of its six degrees of freedom, which begin at `first_dof`."""
-    attached[world, instance] = 0
-    for axis in range(6):
-        joint_f[first_dof + axis] = 0.0
+def pull_gripper(force: wp.vec3, torque: wp.vec3, arm: wp.vec3, wrist_axis: wp.vec3, joint_f: wp.array[float], gripper_dof: int):
+    """Subtract a seal's wrench, at `arm` [m] from the wrist, from the gripper's joint forces: x, y, z and tilt.
+
+    The torque about other axes than the wrist's is borne by the gripper's joint.
+    """
+    for axis in range(3):
+        joint_f[gripper_dof + axis] = joint_f[gripper_dof + axis] - force[axis]
+    joint_f[gripper_dof + TILT] = joint_f[gripper_dof + TILT] - wp.dot(wrist_axis, torque + wp.cross(arm, force))
 
 
 @wp.func
-def apply_wrench(
-    wrench: Wrench, object_arm: wp.vec3, wrist_arm: wp.vec3, wrist_axis: wp.vec3, joint_f: wp.array[float], gripper_dof: int, first_dof: int
-):
-    """Write a wrench at the TCP to the object's six joint forces, and subtract it from the gripper's four: x, y, z and tilt.
+def solve_seals(
+    held: int,
+    objects: int,
+    tcp: TcpMotion,
+    object_in_world: wp.transform,
+    velocity: wp.spatial_vector,
+    com: wp.vec3,
+    inverse_mass: float,
+    inverse_inertia: wp.mat33,
+    object_in_tcp: wp.transform,
+    suction: SuctionData,
+) -> SolvedSeals:
+    """Wrench of an object's seals in this step.
 
-    The moment arms lead to the TCP, from the object's centre of mass and from the wrist [m]. The torque about other axes than the
-    wrist's is borne by the gripper's joint.
+    Args:
+        held: Cups that hold it, as bits.
+        objects: Number of objects on the gripper.
+        tcp: Motion at the middle of these cups.
+        object_in_world: Pose of the object [m].
+        velocity: Of the object [m/s, rad/s].
+        com: Its centre of mass in its frame [m].
+        inverse_mass: Its inverse mass [1/kg].
+        inverse_inertia: Its inverse inertia, in its axes [1/(kg·m²)].
+        object_in_tcp: Its pose in the tool's TCP frame at rest [m].
+        suction: Cups, stiffness and damping.
     """
-    torque = wrench.torque + wp.cross(object_arm, wrench.force)
-    for axis in range(3):
-        joint_f[first_dof + axis] = wrench.force[axis]
-        joint_f[first_dof + 3 + axis] = torque[axis]
-        joint_f[gripper_dof + axis] = joint_f[gripper_dof + axis] - wrench.force[axis]
-    joint_f[gripper_dof + TILT] = joint_f[gripper_dof + TILT] - wp.dot(wrist_axis, wrench.torque + wp.cross(wrist_arm, wrench.force))
+    result = SolvedSeals()
+    middle = middle_of_cups(held, suction)
+    grip_in_world = object_in_world * wp.transform_inverse(object_in_tcp)
+    result.grip_rotation = wp.transform_get_rotation(grip_in_world)
+    result.object_arm = tcp.position - wp.transform_point(object_in_world, com)
+    rotation = wp.transform_get_rotation(object_in_world)
+    of_object = object_inverse_mass(rotation, inverse_mass, inverse_inertia, result.object_arm)
+    both = add_inverse_masses(of_object, gripper_inverse_mass(suction, tcp.wrist_axis, tcp.wrist_arm, objects))
+    slip = tcp.velocity - wp.spatial_top(velocity) - wp.cross(wp.spatial_bottom(velocity), result.object_arm)
+    spin = tcp.angular_velocity - wp.spatial_bottom(velocity)
+    offset = tcp.position - wp.transform_point(grip_in_world, wp.vec3(middle[0], middle[1], 0.0))
+    error = rotation_error(tcp.rotation, result.grip_rotation, suction)
+    spread = spread_of_cups(held, middle, tcp.rotation, result.grip_rotation, suction)
+    result.whole = seal_wrench(offset, error, spread, count_seals(held, suction), slip, spin, both, suction)
+    result.spin = spin - suction.step * (wp.transpose(both.mixed) * result.whole.force + both.angular * result.whole.torque)
+    return result
+
+
+@wp.func
+def share_wrench(
+    held: int,
+    solved: SolvedSeals,
+    tcp: TcpMotion,
+    world: int,
+    gripper_dof: int,
+    suction: SuctionData,
+    break_force: wp.array2d[float],  # (world, cup) [N]
+    cup_force: wp.array2d[float],  # (world, cup) [N]
+    joint_f: wp.array[float],  # (dof) [N, N·m]
+) -> HeldObject:
+    """Share the wrench of an object's seals out to its cups, and break those whose force exceeds the break force.
+
+    Adds the forces to `cup_force`, and those that hold on to the gripper's `joint_f`.
+    """
+    middle = middle_of_cups(held, suction)
+    seals = count_seals(held, suction)
+    # What the forces of the cups do not explain of the torque is twist and swing of the seals, the same of each.
+    rest = solved.whole.torque
+    for cup in range(suction.cups):
+        if has_bit(held, cup):
+            arm = wp.quat_rotate(tcp.rotation, suction.place[cup] - middle)
+            grip_arm = wp.quat_rotate(solved.grip_rotation, suction.place[cup] - middle)
+            rest -= wp.cross(arm, force_of_cup(solved.whole, seals, arm, grip_arm, solved.spin, suction))
+    torque = rest / float(seals)
+    result = HeldObject()
+    result.cups = held
+    for cup in range(suction.cups):
+        if has_bit(held, cup):
+            arm = wp.quat_rotate(tcp.rotation, suction.place[cup] - middle)
+            grip_arm = wp.quat_rotate(solved.grip_rotation, suction.place[cup] - middle)
+            force = force_of_cup(solved.whole, seals, arm, grip_arm, solved.spin, suction)
+            borne = tension_and_shear(force, tcp.axis)
+            result.peak_force = wp.max(result.peak_force, borne)
+            cup_force[world, cup] = cup_force[world, cup] + borne
+            if borne > break_force[world, cup]:
+                result.cups -= 1 << cup
+            else:
+                result.force += force
+                result.torque += torque + wp.cross(solved.object_arm + arm, force)
+                pull_gripper(force, torque, tcp.wrist_arm + arm, tcp.wrist_axis, joint_f, gripper_dof)
+    return result
 
 
 @wp.kernel
@@ -227,99 +401,51 @@ def apply_seal_forces_kernel(
     # State:
     body_slot: wp.array2d[int],  # (world, instance)
     object_in_tcp: wp.array2d[wp.transform],  # (world, instance) [m]
-    break_force: wp.array[float],  # (world) [N]
     body_q: wp.array[wp.transform],  # (body) [m]
     body_qd: wp.array[wp.spatial_vector],  # (body) [m/s, rad/s]
     attached_inout: wp.array2d[int],  # (world, instance)
+    break_force_inout: wp.array2d[float],  # (world, cup) [N]
     seal_force_inout: wp.array2d[float],  # (world, instance) [N]
+    cup_force_inout: wp.array2d[float],  # (world, cup) [N]
     peak_force_inout: wp.array[float],  # (world) [N]
     joint_f_inout: wp.array[float],  # (dof) [N, N·m]
 ):
-    """Apply every seal's wrench to its object and the opposite to the gripper; break seals whose force exceeds the break force.
+    """Apply every seal's wrench to its object and the opposite to the gripper; break seals whose force exceeds the cup's break force.
 
-    `seal_force` receives this step's force of each seal, that of a breaking one included, and 0 without a seal; `peak_force` its maximum
-    over seals and steps since it was cleared. Launched over world.
+    `seal_force` receives the largest force of an instance's seals in this step, that of a breaking one included, and 0 without a seal;
+    `cup_force` the sum over a cup's seals; `peak_force` the maximum over seals and steps since it was cleared. Where a seal of a common
+    valve breaks, the others are poor from the next step on. Launched over world.
     """
     world = wp.tid()
-    seals = int(0)
+    objects = int(0)
     for instance in range(layout.instances):
-        seals += attached_inout[world, instance]
+        objects += wp.where(attached_inout[world, instance] != 0, 1, 0)
         seal_force_inout[world, instance] = 0.0
-    if seals == 0:
+    for cup in range(suction.cups):
+        cup_force_inout[world, cup] = 0.0
+    if objects == 0:
         return
-    cup = world * layout.bodies + CUP
-    tcp = tcp_motion(body_q[cup], body_qd[cup], body_com[cup], suction)
-    gripper_inverse = gripper_inverse_mass(suction, tcp.wrist_axis, tcp.wrist_arm, seals)
+    head = world * layout.bodies + CUP
     gripper_dof = world * layout.dofs
+    broken = int(0)
     for instance in range(layout.instances):
-        if attached_inout[world, instance] != 0:
+        held = attached_inout[world, instance]
+        if held != 0:
             slot = body_slot[world, instance]
             body = world * layout.bodies + layout.gripper_bodies + slot
-            grip_in_world = body_q[body] * wp.transform_inverse(object_in_tcp[world, instance])
-            object_arm = tcp.position - wp.transform_point(body_q[body], body_com[body])
-            rotation = wp.transform_get_rotation(body_q[body])
-            object_inverse = object_inverse_mass(rotation, body_inv_mass[body], body_inv_inertia[body], object_arm)
-            object_angular_velocity = wp.spatial_bottom(body_qd[body])
-            slip = tcp.velocity - wp.spatial_top(body_qd[body]) - wp.cross(object_angular_velocity, object_arm)
-            error = rotation_error(tcp.rotation, wp.transform_get_rotation(grip_in_world), suction)
-            offset = tcp.position - wp.transform_get_translation(grip_in_world)
-            angular_slip = tcp.angular_velocity - object_angular_velocity
-            inverse_mass = add_inverse_masses(object_inverse, gripper_inverse)
-            wrench = seal_wrench(offset, error, slip, angular_slip, inverse_mass, suction)
-            force = tension_and_shear(wrench.force, tcp.axis)
+            tcp = tcp_motion(body_q[head], body_qd[head], body_com[head], middle_of_cups(held, suction))
+            pose, grip = body_q[body], object_in_tcp[world, instance]
+            mass, inertia = body_inv_mass[body], body_inv_inertia[body]
+            seals = solve_seals(held, objects, tcp, pose, body_qd[body], body_com[body], mass, inertia, grip, suction)
+            shared = share_wrench(held, seals, tcp, world, gripper_dof, suction, break_force_inout, cup_force_inout, joint_f_inout)
+            seal_force_inout[world, instance] = shared.peak_force
+            peak_force_inout[world] = wp.max(peak_force_inout[world], shared.peak_force)
+            broken += held - shared.cups
+            attached_inout[world, instance] = shared.cups
             first_dof = gripper_dof + layout.gripper_dofs + 6 * slot
-            seal_force_inout[world, instance] = force
-            peak_force_inout[world] = wp.max(peak_force_inout[world], force)
-            if force > break_force[world]:
-                break_seal(attached_inout, joint_f_inout, world, instance, first_dof)
-            else:
-                apply_wrench(wrench, object_arm, tcp.wrist_arm, tcp.wrist_axis, joint_f_inout, gripper_dof, first_dof)
-
-
-@wp.func
-def is_attached(layout: LayoutData, world: int, body: int, body_slot: wp.array2d[int], attached: wp.array2d[int]) -> bool:
-    """True if a seal holds the body, which must not be the gripper's."""
-    result = bool(False)
-    slot = body - world * layout.bodies - layout.gripper_bodies
-    for instance in range(layout.instances):
-        if attached[world, instance] != 0 and body_slot[world, instance] == slot:
-            result = True
-    return result
-
-
-@wp.kernel
-def ignore_attached_contacts_kernel(
-    # Scene:
-    layout: LayoutData,
-    shape_body: wp.array[int],  # (shape)
-    # State:
-    contact_count: wp.array[int],  # (one)
-    body_slot: wp.array2d[int],  # (world, instance)
-    attached: wp.array2d[int],  # (world, instance)
-    shape0: wp.array[int],  # (contact)
-    shape1: wp.array[int],  # (contact)
-    # Out:
-    margin_out: wp.array[float],  # (contact) [m]
-):
-    """Disable contacts between a cup and its attached objects, which would fight the seal: set their margin to -APART.
-
-    The solver makes no constraint rows for contacts that far apart. The collision pipeline writes all margins anew each time, after it has
-    stored what it matches the next step's contacts with. Disabling the shapes instead would put all such contacts of all worlds into one
-    pair of bodies, and the solver's time grows with the square of a pair's contacts. Launched over contact.
-    """
-    contact = wp.tid()
-    if contact >= contact_count[0] or shape0[contact] < 0 or shape1[contact] < 0:
-        return
-    a = shape_body[shape0[contact]]
-    b = shape_body[shape1[contact]]
-    if a < 0 or b < 0:
-        return
-    cup = a
-    other = b
-    if b % layout.bodies == CUP:
-        cup = b
-        other = a
-    if cup % layout.bodies != CUP:
-        return
-    if is_attached(layout, cup // layout.bodies, other, body_slot, attached):
-        margin_out[contact] = -APART
+            for axis in range(3):
+                joint_f_inout[first_dof + axis] = shared.force[axis]
+                joint_f_inout[first_dof + 3 + axis] = shared.torque[axis]
+    if suction.common_valve != 0 and broken > 0:
+        for cup in range(suction.cups):
+            break_force_inout[world, cup] = suction.poor_force

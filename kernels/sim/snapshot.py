@@ -127,7 +127,7 @@ def pack_status_kernel(
     attempt: wp.array[int],  # (world)
     outcome: wp.array[int],  # (world)
     target: wp.array[int],  # (world)
-    hits: wp.array[int],  # (world)
+    hits: wp.array[wp.vec2i],  # (world)
     engaged_bits: wp.array[wp.uint32],  # (world)
     attached_bits: wp.array[wp.uint32],  # (world)
     peak_force: wp.array[float],  # (world) [N]
@@ -149,9 +149,11 @@ def pack_status_kernel(
     status_out[world, Status.OUTCOME] = outcome[world]
     status_out[world, Status.TARGET] = target[world]
     status_out[world, Status.HITS] = 0
+    status_out[world, Status.SEALED] = 0
     status_out[world, Status.ENGAGED] = 0
     if attempt[world] >= 0:
-        status_out[world, Status.HITS] = hits[world]
+        status_out[world, Status.HITS] = hits[world][0]
+        status_out[world, Status.SEALED] = hits[world][1]
         status_out[world, Status.ENGAGED] = int(engaged_bits[world])
     status_out[world, Status.ATTACHED] = int(attached_bits[world])
     measure_out[world, Measure.PEAK_FORCE] = peak_force[world]

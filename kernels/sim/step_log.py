@@ -157,7 +157,7 @@ def record_forces_kernel(
         holds = int(0)
         if body >= 0:
             seal = seal_force[world, place]
-            holds = attached[world, place]
+            holds = wp.where(attached[world, place] != 0, 1, 0)
         seal_force_out[world, step, place] = seal
         attached_out[world, step, place] = wp.uint8(holds)
 
@@ -171,14 +171,16 @@ def record_gripper_kernel(
     mode: wp.array[int],  # (world)
     task: wp.array[int],  # (world)
     setpoint: wp.array[wp.vec3],  # (world) [m]
+    cup_force: wp.array2d[float],  # (world, cup) [N]
     # In:
     force: wp.array[wp.vec3],  # (world) [N]
     # Out:
     setpoint_out: wp.array2d[wp.vec3],  # (world, step) [m]
     force_out: wp.array2d[wp.vec3],  # (world, step) [N]
     task_out: wp.array2d[wp.int8],  # (world, step)
+    cup_force_out: wp.array3d[float],  # (world, step, cup) [N]
 ):
-    """Record the gripper's task, its setpoint (NaN without one) and its impedance force in a step. Launched over world."""
+    """Record the gripper's task, setpoint (NaN without one), impedance force and forces of its cups in a step. Launched over world."""
     world = wp.tid()
     current_task = int(Task.NONE)
     if phase[world] == Phase.ACT:
@@ -189,6 +191,8 @@ def record_gripper_kernel(
     setpoint_out[world, step] = target
     force_out[world, step] = force[world]
     task_out[world, step] = wp.int8(current_task)
+    for cup in range(cup_force.shape[1]):
+        cup_force_out[world, step, cup] = cup_force[world, cup]
 
 
 @wp.kernel

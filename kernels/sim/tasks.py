@@ -3,7 +3,7 @@
 import warp as wp
 
 from synpick_warp.codes import Mode, Outcome, Phase, Removal, Task
-from synpick_warp.kernels.sim.arrangement import PARKED_HEIGHT, write_body
+from synpick_warp.kernels.sim.drop import PARKED_HEIGHT, write_body
 from synpick_warp.kernels.sim.gripper import place_gripper, task_setpoint
 from synpick_warp.kernels.sim.rest import is_outside, shape_pose
 from synpick_warp.kernels.structs import TILT, BinData, DropData, LayoutData, MoveData, PickData, SettleData
@@ -261,7 +261,7 @@ def begin_attempts_kernel(
     attempt_inout: wp.array[int],  # (world)
     # Out:
     steps_out: wp.array[int],  # (world)
-    hits_out: wp.array[int],  # (world)
+    hits_out: wp.array[wp.vec2i],  # (world)
     engaged_bits_out: wp.array[wp.uint32],  # (world)
 ):
     """Begin an attempt in worlds at task LOOK after perception: no ray hits, no engaged instances; with a target, change to APPROACH.
@@ -273,7 +273,7 @@ def begin_attempts_kernel(
         return
     attempt_inout[world] = attempt_inout[world] + 1
     steps_out[world] = 0
-    hits_out[world] = 0
+    hits_out[world] = wp.vec2i(0, 0)
     engaged_bits_out[world] = wp.uint32(0)
     if target[world] >= 0:
         task_inout[world] = Task.APPROACH

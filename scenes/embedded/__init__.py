@@ -1,1 +1,1 @@
-"""Embedded assets, made procedurally: 21 household objects with textures, and six HDR environment maps."""
+"""Embedded assets, made procedurally: 21 household objects with textures, seven industrial parts, and six HDR environment maps."""

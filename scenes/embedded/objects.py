@@ -1,16 +1,17 @@
-"""The embedded object set: 21 procedural household objects, with sizes and masses like those of the YCB-Video objects."""
+"""The embedded object sets: 21 household objects, with sizes and masses like those of the YCB-Video objects, and 7 industrial parts."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import dataclass
 
 import numpy as np
 
+from synpick_warp.configs.objects import HOUSEHOLD, INDUSTRIAL
 from synpick_warp.scenes.collision.hulls import hull_size
-from synpick_warp.scenes.embedded import goods, tools, vessels
+from synpick_warp.scenes.embedded import goods, parts, tools, vessels
 from synpick_warp.scenes.embedded.packs import Shape
-from synpick_warp.scenes.modelling import make_mesh, rotation
+from synpick_warp.scenes.modelling import Patch, make_mesh, rotation
 from synpick_warp.scenes.types import Material, RawObject
 
 Matrix = tuple[float, ...]
@@ -41,16 +42,17 @@ def _about(axis: tuple[float, float, float]) -> tuple[tuple[tuple[float, float, 
 
 @dataclass(frozen=True)
 class _Row:
-    """An embedded object: name, constructor, mass [kg], material, concavity, symmetries."""
+    """An embedded object: name, constructor, with a texture or without, mass [kg], material, concavity, symmetries."""
 
     name: str
-    make: Callable[[], Shape]
+    make: Callable[[], Shape | Patch]
     mass: float
     metallic: float
     roughness: float
     concave: bool = False
     discrete: tuple[Matrix, ...] = ()
     continuous: tuple[tuple[tuple[float, float, float], tuple[float, float, float]], ...] = ()
+    color: tuple[float, float, float] = (1.0, 1.0, 1.0)
 
 
 ROWS = (
@@ -79,24 +81,44 @@ ROWS = (
 """The objects with obj_id 1 to 21, in this order; masses, concavity and materials are those of the object table (configs/synpick.toml)."""
 
 
-def procedural_objects() -> list[RawObject]:
-    """Make the 21 embedded objects: closed meshes [m], centred on their bounding boxes, with textures; deterministic."""
-    objects = []
-    for obj_id, row in enumerate(ROWS, start=1):
-        patch, texture = row.make()
-        mesh = make_mesh(patch, centered=True)
-        objects.append(
-            RawObject(
-                obj_id=obj_id,
-                name=row.name,
-                mesh=mesh,
-                hull=hull_size(mesh.vertices),
-                material=Material(color=(1.0, 1.0, 1.0), texture=texture, metallic=row.metallic, roughness=row.roughness),
-                mass=row.mass,
-                concave=row.concave,
-                symmetries_discrete=row.discrete,
-                symmetries_continuous=row.continuous,
-                source=None,
-            )
-        )
-    return objects
+STEEL, ZINC, IRON, PLASTIC = (0.62, 0.63, 0.65), (0.72, 0.73, 0.74), (0.3, 0.3, 0.31), (0.16, 0.34, 0.55)
+"""Base colours of parts [sRGB]."""
+PARTS = (
+    _Row("bolt", parts.bolt, 0.065, 0.8, 0.35, concave=True, discrete=_rotations(("z", 60)), color=ZINC),
+    _Row("nut", parts.nut, 0.0162, 0.8, 0.35, discrete=_rotations(("z", 60), ("x", 180)), color=ZINC),
+    _Row("bracket", parts.bracket, 0.155, 0.7, 0.4, concave=True, color=STEEL),
+    _Row("pipe_tee", parts.pipe_tee, 0.251, 0.5, 0.6, concave=True, discrete=_rotations(("z", 180)), color=IRON),
+    _Row("gear", parts.gear, 0.104, 0.8, 0.4, discrete=_rotations(("z", 18), ("x", 180)), color=STEEL),
+    _Row("sheet_part", parts.sheet_part, 0.0601, 0.7, 0.4, concave=True, discrete=_rotations(("y", 180)), color=ZINC),
+    _Row("box", parts.box, 0.15, 0.0, 0.5, discrete=_rotations(("z", 180), ("x", 180)), color=PLASTIC),
+)
+"""The parts with obj_id 22 to 28; of steel (7850 kg/m³), the tee of malleable iron (7200 kg/m³), the box filled to 0.15 kg."""
+PIECES = {"bracket": parts.bracket_pieces, "pipe_tee": parts.tee_pieces, "sheet_part": parts.sheet_pieces}
+"""Convex pieces of parts [mm], in the frame of their drawing: fewer than a decomposition that follows holes would have."""
+SETS = {HOUSEHOLD: ROWS, INDUSTRIAL: PARTS}
+"""Sets by their name in `objects.embedded`; obj_ids are counted over all of them."""
+
+
+def procedural_objects(sets: Collection[str] = (HOUSEHOLD,)) -> list[RawObject]:
+    """Make the embedded objects of these sets: closed meshes [m], centred on their bounding boxes; deterministic."""
+    rows = enumerate(((name, row) for name, members in SETS.items() for row in members), start=1)
+    return [_make_object(obj_id, row) for obj_id, (name, row) in rows if name in sets]
+
+
+def _make_object(obj_id: int, row: _Row) -> RawObject:
+    """Make an embedded object."""
+    made = row.make()
+    patch, texture = (made, None) if isinstance(made, Patch) else made
+    mesh = make_mesh(patch, centered=True)
+    return RawObject(
+        obj_id=obj_id,
+        name=row.name,
+        mesh=mesh,
+        hull=hull_size(mesh.vertices),
+        material=Material(color=row.color, texture=texture, metallic=row.metallic, roughness=row.roughness),
+        mass=row.mass,
+        concave=row.concave,
+        symmetries_discrete=row.discrete,
+        symmetries_continuous=row.continuous,
+        source=None,
+    )

@@ -10,7 +10,7 @@ from typing import Annotated, Any, Literal, TypeVar
 
 import msgspec
 
-from synpick_warp.codes import Ending, Mode, Outcome, names
+from synpick_warp.codes import MAX_CUPS, Ending, Mode, Outcome, names
 from synpick_warp.configs.cameras import WORLD
 from synpick_warp.dataset.annotations import Index, Side
 from synpick_warp.errors import DatasetError
@@ -171,6 +171,7 @@ class Attempt(AttemptKey):
     picked: Instances
     peak_force: Annotated[list[Amount], msgspec.Meta(max_length=100_000)]
     observation: Observation
+    sealed: Annotated[list[Index], msgspec.Meta(max_length=MAX_CUPS)] | None = None
 
     def __post_init__(self) -> None:
         _check_name("outcome", self.outcome, names(Outcome)[1:])

@@ -29,7 +29,9 @@ from synpick_warp.scenes.bins import Bin, make_bins
 from synpick_warp.scenes.build import REPEATS, find_repeat_rules, must_repeat, with_capacities, without_distractors
 from synpick_warp.scenes.cameras import EpisodeCameras
 from synpick_warp.scenes.catalog import load_catalog
+from synpick_warp.scenes.fills import check_fill
 from synpick_warp.scenes.fixtures import make_fixtures
+from synpick_warp.scenes.grippers.registry import make_head
 from synpick_warp.scenes.looks import Looks, load_looks
 from synpick_warp.scenes.types import Camera, Catalog, EnvironmentMap
 from synpick_warp.stages.host_copies import host_images
@@ -90,7 +92,8 @@ class Stages:
     def make_log(self) -> AttemptLog:
         """Create an empty attempt log."""
         distractors = {body.obj_id: body.name for body in self.catalog.distractors}
-        return AttemptLog(self.config.suction, self.config.perception.resolution, self.object_ids, distractors)
+        cups = len(make_head(self.config.gripper).cups)
+        return AttemptLog(self.config.suction, self.config.perception.resolution, self.object_ids, distractors, cups)
 
 
 @dataclass(frozen=True, eq=False)
@@ -237,9 +240,10 @@ def _fit_to_catalog(config: Config, catalog: Catalog, bins: Sequence[Bin], devic
     """Resolve settings that depend on objects and bins: repetition of objects in an episode, and contact capacities.
 
     Raises:
-        ConfigError: The capacities do not fit into the device's memory.
+        ConfigError: The capacities do not fit into the device's memory, or the parts of `arrangement.counts` not into the bins.
     """
     labelled = without_distractors(config.arrangement, config.randomize.most_distractors)
+    check_fill(labelled, config.physics.guide_height, catalog, config.cell.bins)
     filled = config.with_values(REPEATS) if must_repeat(labelled, catalog) else config
     if find_repeat_rules(filled.bake, filled.pick, filled.move) != find_repeat_rules(config.bake, config.pick, config.move):
         total = sum(entry.volume for entry in catalog.entries)

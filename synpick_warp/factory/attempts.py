@@ -89,7 +89,7 @@ class AttemptRecord:
     hits: int
     """Rays that hit an object when suction was switched on."""
     good_seal: bool
-    """True if at most `suction.tolerated_misses` rays missed, so that seals had the break force of a good seal."""
+    """True if at most `suction.tolerated_misses` rays of each cup missed, so that seals had the break force of a good seal."""
     engaged: tuple[int, ...]
     """Engaged instances: those that rays hit."""
     picked: tuple[int, ...]
@@ -97,6 +97,8 @@ class AttemptRecord:
     peak_force: Vector
     """Peak seal force [N] in each tick of the lift, that of a seal that broke included; 0 in the first, which ends as suction begins."""
     observation: ObservationRecord
+    sealed: tuple[int, ...] | None = None
+    """Cups with a good seal; None, and not in the file, for a gripper of one cup."""
 
     def line(self) -> str:
         """Serialize the record as one line of JSON with line break.
@@ -106,7 +108,8 @@ class AttemptRecord:
         """
         record: dict[str, Any] = {}
         for item in fields(self):
-            record[item.name] = getattr(self, item.name)
+            if item.name != "sealed" or self.sealed is not None:
+                record[item.name] = getattr(self, item.name)
             if item.name == "outcome":
                 record |= {item.name: self.outcome.name.lower(), "sentence": self.outcome.sentence}
         # `dataclasses.asdict` would copy every number, which is slower than the serialization itself.
@@ -163,7 +166,12 @@ class AttemptLog:
     """State machine that turns the reports of all ticks into episode records."""
 
     def __init__(
-        self, suction: Suction, resolution: tuple[int, int], object_ids: np.ndarray, distractors: Mapping[int, str] | None = None
+        self,
+        suction: Suction,
+        resolution: tuple[int, int],
+        object_ids: np.ndarray,
+        distractors: Mapping[int, str] | None = None,
+        cups: int = 1,
     ) -> None:
         """Start with no episode running.
 
@@ -172,11 +180,12 @@ class AttemptLog:
             resolution: Width and height of the perception image [px].
             object_ids: obj_id of each body of the catalog (body) int32.
             distractors: Name of each distractor, by its obj_id; None: there is none.
+            cups: Number of the gripper's cups.
         """
         self.object_ids = np.append(object_ids, -1)
         self.distractors = distractors or {}
         self.resolution = resolution
-        self.rays, self.tolerated_misses = suction.rays, suction.tolerated_misses
+        self.rays, self.cups = cups * suction.rays, cups
         self._running: dict[int, _Running] = {}
 
     def update(self, report: TickReport) -> dict[int, EpisodeRecord]:
@@ -253,7 +262,8 @@ class AttemptLog:
         if planned is None or planned["attempt"] != attempt:
             raise ValueError(f"attempt {attempt} of episode {running.episode} ends, but its begin is not in the log")
         seen = outcome is not Outcome.NOTHING_SEEN
-        hits = _status(report, "hits", world) if seen else 0
+        hits, bits = (_status(report, name, world) if seen else 0 for name in ("hits", "sealed"))
+        sealed = tuple(cup for cup in range(self.cups) if bits >> cup & 1)
         running.attempts.append(
             AttemptRecord(
                 **planned,
@@ -261,10 +271,11 @@ class AttemptLog:
                 outcome=outcome,
                 rays=self.rays,
                 hits=hits,
-                good_seal=self.rays - hits <= self.tolerated_misses,
+                good_seal=len(sealed) == self.cups,
                 engaged=_instances(_status(report, "engaged", world), running.distractors) if seen else (),
                 picked=_instances(_status(report, "attached", world), running.distractors),
                 peak_force=tuple(running.forces),
+                sealed=sealed if self.cups > 1 else None,
             )
         )
         running.planned = None

@@ -23,6 +23,7 @@ from synpick_warp.errors import ConfigError, SynpickError, format_value
 from synpick_warp.exporters.registry import Needs
 from synpick_warp.scenes import build
 from synpick_warp.scenes.bins import GUIDES, make_bins
+from synpick_warp.scenes.grippers.registry import make_head
 from synpick_warp.stages.arrays import DryArray, Row, dry_run
 from synpick_warp.stages.buffers import Snapshot
 from synpick_warp.stages.host_copies import HostImages, host_images
@@ -98,7 +99,9 @@ def plan_memory(config: Config, device: wp.Device, writers: int = 1) -> list[Ter
     config, needs = with_enough_worlds(config, device), Needs.of(config)
     worlds, objects, rig = config.bake.worlds, config.arrangement.max_objects, config.rig
     bodies = build.GRIPPER_BODIES + 2 * objects
-    sizes = record_sizes(world_sizes(worlds, objects, config.move.rounds, bodies), config.physics.steps_per_tick)
+    sizes = record_sizes(
+        world_sizes(worlds, objects, config.move.rounds, bodies, len(make_head(config.gripper).cups)), config.physics.steps_per_tick
+    )
     terms = [*_simulation(sizes, config.trajectory.steps if needs.physics else None, device)]
     for index, group in enumerate(rig.groups):
         count, views = len(group), view_sizes(config.render, rig, worlds, objects, device, index)

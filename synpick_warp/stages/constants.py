@@ -12,11 +12,15 @@ import warp as wp
 
 from synpick_warp.configs import schema
 from synpick_warp.configs.cell import BinSizes
+from synpick_warp.configs.fills import Counts, most_objects
 from synpick_warp.configs.modes import mode_weights
 from synpick_warp.kernels import structs
 from synpick_warp.kernels.distributions import LookTable
 from synpick_warp.scenes import build
 from synpick_warp.scenes.bin_meshes.inside import HeightField
+from synpick_warp.scenes.fills import count_entries
+from synpick_warp.scenes.grippers.head import Head
+from synpick_warp.scenes.grippers.mechanism import CUP_ARMATURE
 from synpick_warp.scenes.looks import Looks
 from synpick_warp.scenes.types import Catalog, CatalogEntry
 from synpick_warp.stages.render.looks import build_look_table
@@ -79,7 +83,7 @@ def make_scene_data(config: schema.Config, catalog: Catalog, built: build.BuiltM
     labelled = build.without_distractors(config.arrangement, config.randomize.most_distractors)
     return SceneData(
         _layout_data(built.layout),
-        _catalog_data(catalog, built, device),
+        _catalog_data(catalog, built, config.arrangement.counts, device),
         drop_data(labelled, config.render, config.pick, config.move, physics.gravity, lights),
         _settle_data(config.settle, physics.tick_time),
         mode_data(mode_rows(config.bake, config.splits), device),
@@ -92,7 +96,7 @@ def make_scene_data(config: schema.Config, catalog: Catalog, built: build.BuiltM
             tilt_limit=math.radians(gripper.tilt_limit),
         ),
         fill(structs.PerceptionData, config.perception),
-        _suction_data(config.suction, gripper, physics.step),
+        _suction_data(config.suction, gripper, built.head, physics.step, device),
         bin_data(config.cell.bins, config.bins, config.move, built.layout.parts, device, built.fields),
         build_look_table(Looks(config.randomize, (), ()), 0, device),
     )
@@ -112,7 +116,13 @@ def _layout_data(layout: build.Layout) -> structs.LayoutData:
     )
 
 
-def _catalog_data(catalog: Catalog, built: build.BuiltModel, device: wp.Device) -> structs.CatalogData:
+def count_columns(counts: Counts, catalog: Catalog, device: wp.Device) -> dict[str, Any]:
+    """Members of `CatalogData` that set the numbers of objects."""
+    least, most = (wp.array(column, dtype=int, device=device) for column in count_entries(counts, catalog).T)
+    return {"least": least, "most": most, "counted": most_objects(counts)}
+
+
+def _catalog_data(catalog: Catalog, built: build.BuiltModel, counts: Counts, device: wp.Device) -> structs.CatalogData:
     """Fill `CatalogData`: a column for each property of the entries of the catalog."""
 
     def column(values: list[float], dtype: type) -> wp.array:
@@ -131,6 +141,7 @@ def _catalog_data(catalog: Catalog, built: build.BuiltModel, device: wp.Device) 
         diagonal=column([float(np.linalg.norm(_extents(entry))) for entry in entries], float),
         compound=column([int(len(entry.pieces) > 1) for entry in entries], int),
         variant=wp.array(built.variant, dtype=int, device=device),
+        **count_columns(counts, catalog, device),
         empty_single=empty_single,
         empty_compound=empty_compound,
         empty_mass=build.EMPTY_MASS,
@@ -175,6 +186,7 @@ def drop_data(
         render,
         objects=arrangement.max_objects,
         exceed=arrangement.fill == schema.EXCEED,
+        layers=arrangement.drop == schema.LAYERED,
         move_repeats=move.repeats,
         pick_repeats=pick.repeats,
         gravity=gravity,
@@ -259,14 +271,17 @@ def _move_data(move: schema.Move, gripper: schema.Gripper, physics: schema.Physi
     )
 
 
-def _suction_data(suction: schema.Suction, gripper: schema.Gripper, step: float) -> structs.SuctionData:
+def _suction_data(suction: schema.Suction, gripper: schema.Gripper, head: Head, step: float, device: wp.Device) -> structs.SuctionData:
     """Fill `SuctionData` from the settings; `step` is the time step [s]."""
+    places = [(x, y, -gripper.cup_length) for x, y in head.cups]
     return fill(
         structs.SuctionData,
         suction,
         gripper,
+        cups=len(places),
+        place=wp.array(np.array(places), dtype=wp.vec3, device=device),
+        common_valve=head.has_common_valve,
         swing_limit=math.radians(suction.swing_limit),
-        tcp_offset=gripper.cup_length,
-        tilt_inertia=build.CUP_ARMATURE + step * (gripper.tilt_damping + step * gripper.tilt_stiffness),
+        tilt_inertia=CUP_ARMATURE + step * (gripper.tilt_damping + step * gripper.tilt_stiffness),
         step=step,
     )

@@ -19,7 +19,8 @@ from synpick_warp.configs.schema import Config, ObjectRow
 from synpick_warp.configs.write import config_to_toml
 from synpick_warp.errors import ConfigError
 from synpick_warp.scenes.collision.hulls import hull_size
-from synpick_warp.scenes.gripper import cup_collider, finger_collider
+from synpick_warp.scenes.grippers.mechanism import finger_collider
+from synpick_warp.scenes.grippers.suction1 import cup_collider
 from tests.configs.test_presets import resolved
 
 COUPLED = {

@@ -102,7 +102,7 @@ def test_zero_and_downward_normals_become_vertical(device):
 class GraspHarness:
     """Worlds rendered by one camera; instance 0 of each is the target."""
 
-    def __init__(self, device, toy: ToyScene, window: int = 10, tilt_limit: float = QUARTER) -> None:
+    def __init__(self, device, toy: ToyScene, window: int = 10, tilt_limit: float = QUARTER, cups=((0.0, 0.0),)) -> None:
         views, instances = len(toy.placed), toy.instances
         scene = build_scene(toy, device)
         renderer = make_renderer(toy.settings(), scene, instances, views)
@@ -117,7 +117,7 @@ class GraspHarness:
         self.arrays.component.assign(self.expected["component"])
         self.arrays.largest.assign(self.expected["largest"])
         self.grasp_pixel = self.expected["grasp_pixel"]
-        self.worlds = KernelWorlds(device, views, len(toy.entries), instances)
+        self.worlds = KernelWorlds(device, views, len(toy.entries), instances, cups=cups)
         filled(self.worlds.scene.perception, {**planning.SETTINGS, "normal_window": window})
         self.worlds.scene.pick.tilt_limit = tilt_limit
         self.scene = self.worlds.scene
@@ -128,6 +128,8 @@ class GraspHarness:
         self.observation.grasp_pixel.assign(self.grasp_pixel)
         self.planner.smooth_normal(self.scene, self.observation, self.grasp)
         self.planner.frame_grasp(self.scene, self.observation, self.grasp)
+        if self.scene.suction.cups > 1:
+            self.planner.align_cups(self.scene, self.grasp)
         return self.grasp
 
 
@@ -226,6 +228,28 @@ def test_worlds_without_a_target_and_unused_views_keep_their_plan(device):
     for array in (plan.normal, plan.point, plan.yaw, plan.tilt):
         assert (array.numpy()[[0, 2]] == 5.0).all()
         assert (array.numpy()[1] != 5.0).all()
+
+
+def turned(yaw: float, lean: float) -> tuple[float, ...]:
+    """Pose of a sheet about the origin: leaning about its long axis x, which points along `yaw`; angles [°]."""
+    half, other = np.radians(yaw) / 2, np.radians(lean) / 2
+    return (0, 0, 0, np.cos(half) * np.sin(other), np.sin(half) * np.sin(other), np.sin(half) * np.cos(other), np.cos(half) * np.cos(other))
+
+
+def test_two_cups_turn_along_a_narrow_sheet(device):
+    """Also where it leans to its side by less than the free swing; by more, they meet the normal, and do not fit."""
+    poses = [turned(30, 0), turned(-65, 0), turned(30, 3), turned(120, 12)]
+    toy = ToyScene([entry(sheet(0.2, 0.04))], [[(0, pose)] for pose in poses], (camera(320, 240, 1600.0, (0.0, 0.0, 2.0)),))
+    planned = GraspHarness(device, toy).plan_grasps()
+    harness = GraspHarness(device, toy, cups=((-0.06, 0.0), (0.06, 0.0)))
+    filled(harness.scene.suction, {"radius": 0.01, "swing_limit": np.radians(5)})
+    plan = harness.plan_grasps()
+    yaw, tilt, axis = (getattr(plan, name).numpy() for name in ("yaw", "tilt", "normal"))
+    for index, expected in enumerate((30, -65, 30)):
+        assert abs((np.degrees(yaw[index]) - expected + 90) % 180 - 90) < 6
+    np.testing.assert_allclose(np.arccos((axis * planned.normal.numpy()).sum(axis=1).clip(-1, 1)), np.radians([0, 0, 3, 0]), atol=1e-2)
+    assert (yaw[3], tilt[3]) == (planned.yaw.numpy()[3], planned.tilt.numpy()[3])
+    np.testing.assert_allclose(axis.T, [np.sin(tilt) * np.cos(yaw), np.sin(tilt) * np.sin(yaw), np.cos(tilt)], atol=1e-5)
 
 
 def test_the_whole_planner(device):

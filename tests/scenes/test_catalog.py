@@ -344,7 +344,7 @@ def test_the_diameter_is_the_largest_distance(seed, count):
 def test_embedded_objects_need_no_folder_and_no_table(tmp_path, monkeypatch):
     # Hulls only: decompositions of the embedded objects take longer than all other tests here.
     raws = [replace(raw, concave=False) for raw in procedural_objects()]
-    monkeypatch.setattr(catalog, "procedural_objects", lambda: raws)
+    monkeypatch.setattr(catalog, "procedural_objects", lambda sets: raws)
     rows = tuple(ObjectRow(id=raw.obj_id, name="table", mass=99.0) for raw in raws)
     entries = load(Config(object_rows=rows), tmp_path)
     assert [entry.obj_id for entry in entries] == sorted(raw.obj_id for raw in raws)

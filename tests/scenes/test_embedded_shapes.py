@@ -6,16 +6,19 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.spatial import ConvexHull
 
 from synpick_warp.configs.load import load_config
+from synpick_warp.configs.objects import EMBEDDED
 from synpick_warp.scenes.catalog import shape_recipe
 from synpick_warp.scenes.collision import embedded_shapes
 from synpick_warp.scenes.collision.decomposition import decompose
 from synpick_warp.scenes.collision.embedded_shapes import embedded_shape
 from synpick_warp.scenes.collision.simplification import simplify_hull
-from synpick_warp.scenes.embedded.objects import procedural_objects
+from synpick_warp.scenes.embedded.objects import PIECES, procedural_objects
+from tools.embedded_shapes import modelled_shape
 
-OBJECTS = {raw.name: raw for raw in procedural_objects()}
+OBJECTS = {raw.name: raw for raw in procedural_objects(EMBEDDED)}
 SETTINGS = load_config("synpick").objects
 
 
@@ -29,6 +32,12 @@ def test_each_object_has_its_shape(name):
     raw, recipe = OBJECTS[name], shape_recipe(OBJECTS[name], SETTINGS)
     shape = embedded_shape(raw.mesh, recipe)
     assert shape is not None
+    if name in PIECES:
+        assert pieces_of(shape) == pieces_of(modelled_shape(name, recipe))
+        # Nothing of the surface is far outside of all pieces, which have no holes: least the bracket's fillet of 3 mm.
+        equations = [ConvexHull(piece.vertices.astype(np.float64)).equations for piece in shape]
+        outside = np.min([(raw.mesh.vertices @ each[:, :3].T + each[:, 3]).max(axis=1) for each in equations], axis=0)
+        assert outside.max() < 9e-4
     if not recipe.concave:
         (found,), computed = shape, simplify_hull(raw.mesh.vertices, recipe.hull_vertices)
         np.testing.assert_array_equal(found.faces, computed.faces)

@@ -14,7 +14,7 @@ from synpick_warp.configs.schema import Gripper, Tote
 from synpick_warp.errors import ConfigError
 from synpick_warp.scenes.assets.meshes import merge_positions, signed_volume
 from synpick_warp.scenes.bins import guide_walls
-from synpick_warp.scenes.gripper import cup_collider, cup_fixture, finger_collider, finger_fixture
+from synpick_warp.scenes.grippers.mechanism import finger_collider, finger_fixture
 from synpick_warp.scenes.modelling import at_height, cap, join, loft, make_mesh, rounded_rectangle, strips
 from synpick_warp.scenes.tote import CORNER_RADIUS, FLOOR_DEPTH, MIN_WALL, rim_height, tote_colliders, tote_fixture
 from tests.twins.rays import edges_match, first_hit
@@ -50,7 +50,7 @@ def convex(piece):
     return edges_match(piece.faces) and signed_volume(piece.vertices, piece.faces) > 0 and height.max() < 1e-6
 
 
-@pytest.mark.parametrize("fixture", [tote_fixture(TOTE), finger_fixture(GRIPPER), cup_fixture(GRIPPER)], ids=("tote", "finger", "cup"))
+@pytest.mark.parametrize("fixture", [tote_fixture(TOTE), finger_fixture(GRIPPER)], ids=("tote", "finger"))
 def test_fixtures_are_closed_and_face_outward(fixture):
     mesh = fixture.mesh
     assert edges_match(merge_positions(mesh.vertices, mesh.faces)[1])
@@ -181,26 +181,11 @@ def test_the_finger_is_a_cone_above_the_tilt_axis():
     assert np.ptp(low[:, 0]) == pytest.approx(0.03, abs=1e-3)
 
 
-def test_the_cup_ends_in_its_lip():
-    mesh = cup_fixture(GRIPPER).mesh
-    assert mesh.vertices[:, 2].min() == pytest.approx(-GRIPPER.cup_length)
-    tip = mesh.vertices[mesh.vertices[:, 2] < -GRIPPER.cup_length + 1e-6]
-    assert np.ptp(tip[:, 0]) == pytest.approx(GRIPPER.cup_width)
-    # Hollow: from below, the middle lies deeper than the lip.
-    assert first_hit(mesh.vertices, mesh.faces, (1e-4, 2e-4, -1.0), UP) > 1.0 - GRIPPER.cup_length + 0.003
-
-
-def test_gripper_colliders_enclose_the_working_parts():
-    cup, finger = cup_collider(GRIPPER), finger_collider(GRIPPER)
-    assert convex(cup)
+def test_the_fingers_collision_shape_is_as_long_as_it_is():
+    finger = finger_collider(GRIPPER)
     assert convex(finger)
-    assert len(cup.vertices) <= 32
-    assert cup.vertices[:, 2].min() == pytest.approx(-GRIPPER.cup_length)
-    assert np.ptp(cup.vertices[:, 0]) == pytest.approx(GRIPPER.cup_width)
     assert finger.vertices[:, 2].max() == pytest.approx(GRIPPER.finger_length)
     assert finger.vertices[:, 2].min() == 0
-    # The cup's underside is what presses: hull and picture end at the same height.
-    assert felt((cup,), (0.018, 1e-3, -1.0), UP) == pytest.approx(1.0 - GRIPPER.cup_length, abs=1e-6)
 
 
 def areas(patch):

@@ -9,15 +9,15 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from synpick_warp.codes import Ending, Mode, Phase
+from synpick_warp.codes import Ending, Mode, Phase, Stream
 from synpick_warp.configs.schema import Split
-from synpick_warp.kernels.sim import arrangement as kernels
+from synpick_warp.kernels.sim.drop import PARKED_HEIGHT
 from synpick_warp.scenes import build
 from synpick_warp.stages.constants import make_scene_data
 from synpick_warp.stages.sim import arrange
-from tests.twins import arrangement
+from tests.twins import arrangement, rng
 from tests.worlds import small_worlds
-from tests.worlds.kernel_worlds import KernelWorlds, arrangement_worlds
+from tests.worlds.kernel_worlds import BIN, KernelWorlds, arrangement_worlds
 
 WORLDS = 24
 SEED = 2**40 + 3
@@ -199,6 +199,33 @@ def test_a_budget_for_everything_draws_everything_without_repeats(device):
     assert len(np.unique(worlds.state.catalog_index.numpy(), axis=0)) == 6
 
 
+@pytest.mark.parametrize("counts", [[(0, 0), (8, 8), (0, 0)], [(3, 3), (4, 4), (1, 1)], [(0, 2), (1, 3), (2, 3)]])
+def test_numbers_of_parts_are_those_that_are_set_whatever_the_budget(device, counts):
+    """Homogeneous, kitted and mixed fills; the second object has compound slots. Episodes do not depend on their worlds."""
+    worlds = arrangement_worlds(device, WORLDS, counts=counts, drop={"volume": 1e-3})
+    worlds.begin(Phase.START, np.arange(WORLDS)[::-1] + 7, 1)
+    arrange.sample_episodes(worlds.scene, worlds.state, SEED)
+    found, slot = worlds.state.catalog_index.numpy(), worlds.state.body_slot.numpy()
+    for world, episode in enumerate(range(WORLDS + 6, 6, -1)):
+        expected = arrangement.draw_counted(SEED, episode, 1, counts)
+        assert found[world].tolist() == expected + [-1] * (8 - len(expected))
+        kinds = np.array(expected) == 1
+        for kind, first in ((False, 0), (True, worlds.single_slots)):
+            assert slot[world, : len(expected)][kinds == kind].tolist() == list(range(first, first + (kinds == kind).sum()))
+    drawn = (found[:, :, None] == np.arange(3)).sum(axis=1)
+    assert drawn.min(axis=0).tolist() == [low for low, _ in counts]
+    assert drawn.max(axis=0).tolist() == [high for _, high in counts]
+    assert len(np.unique(found, axis=0)) > (WORLDS // 2 if sum(high > 0 for _, high in counts) > 1 else 0)
+
+
+def test_numbers_of_parts_without_slots_for_them_end_the_episode(device):
+    worlds = arrangement_worlds(device, WORLDS, counts=[(0, 0), (5, 5), (0, 0)], compound_slots=4)
+    worlds.begin(Phase.START)
+    arrange.sample_episodes(worlds.scene, worlds.state, SEED)
+    assert (worlds.state.ending.numpy() == Ending.ARRANGEMENT_OVERFLOW).all()
+    assert (worlds.state.catalog_index.numpy() == -1).all()
+
+
 @pytest.mark.parametrize(
     ("volume", "exceed", "objects"), [(1.0, 0, 4), (1.0, 1, 4), (1.1, 0, 4), (1.1, 1, 5), (0.9, 0, 3), (0.9, 1, 4), (9.0, 1, 8)]
 )
@@ -319,6 +346,37 @@ def test_objects_fall_from_a_column_within_the_opening(sizes, spread, clearance,
             assert (np.abs(place[:, axis]) <= np.maximum(0.0, rim[axis] / 2 - radius) + 1e-6).all()
 
 
+@given(seed=st.integers(0, 2**32 - 1), compartments=st.sampled_from([(1, 1), (3, 2)]), spread=st.sampled_from([0.0, 0.3, 1.0]))
+def test_in_layers_objects_fall_from_cells_of_their_compartments(seed, compartments, spread, device):
+    """No two bounding spheres overlap, all are over the opening, and no layer is empty below another; the twin has the same poses."""
+    numbers = np.random.default_rng(seed)
+    radius, most = numbers.uniform(0.008, 0.03, 3), numbers.integers(0, 14, 3) + 1
+    sizes = dataclasses.replace(BIN, floor=(0.5, 0.3), compartments=compartments)
+    counts = [(int(number), int(number)) for number in most]
+    room = {"instances": 40, "single_slots": 40, "compound_slots": 40, "counts": counts, "radius": radius}
+    worlds = arrangement_worlds(device, 4, **room, bins=(sizes,), drop={"spread": spread, "layers": 1, "clearance": 0.004})
+    worlds.begin(Phase.START, seed % 1000 + np.arange(4))
+    arrange.sample_episodes(worlds.scene, worlds.state, SEED)
+    arrange.drop_objects(worlds.scene, worlds.state, worlds.physics, SEED)
+    count, pitch = int(most.sum()), np.float32(2 * radius.max()) + np.float32(0.004)
+    halves = np.array(sizes.mouths) / 2
+    for world in range(4):
+        entries, slots = (array.numpy()[world, :count] for array in (worlds.state.catalog_index, worlds.state.body_slot))
+        place, each = worlds.coordinates()[world, slots, :3].astype(np.float64), radius[entries]
+        episode = seed % 1000 + world
+        places = rng.stream_key(SEED, episode, 0, Stream.COMPARTMENT)
+        chosen = rng.uniform_index(places, np.arange(count), len(halves))
+        layer, middle, cell = arrangement.layer_places(chosen, pitch, np.array(sizes.centers), halves)
+        key, index = rng.stream_key(SEED, episode, 0, Stream.DROP), np.arange(count)
+        sides = np.stack([2 * rng.uniform(key, 5 * index + axis) - 1 for axis in (0, 1)], axis=1)
+        across = middle + sides * spread * np.maximum(0.0, cell - each[:, None])
+        np.testing.assert_allclose(place, np.column_stack([across, sizes.height + each + layer * pitch]), atol=2e-6)
+        gaps = np.linalg.norm(place[:, None] - place[None], axis=2) - each[:, None] - each[None]
+        assert gaps[~np.eye(count, dtype=bool)].min() > -1e-6
+        assert (np.abs(place[:, :2] - np.array(sizes.centers)[chosen]) <= halves[chosen] - each[:, None] + 1e-6).all()
+        assert place[:, 2].max() < sizes.height + each.max() + pitch * (count - 1) / 2
+
+
 def test_the_drop_uses_the_whole_spread(device):
     worlds = arrangement_worlds(device, worlds=500, radius=np.full(3, 0.05), drop={"spread": 1.0})
     worlds.begin(Phase.START)
@@ -348,7 +406,7 @@ def test_empty_slots_wait_without_weight_and_full_ones_get_their_variant(device)
     np.testing.assert_array_equal(variant[:, 2:][~full], np.broadcast_to(empty, full.shape)[~full])
     weight = np.array([0.0, 0.0, catalog.empty_mass * worlds.scene.drop.gravity, 0.0, 0.0, 0.0])
     np.testing.assert_allclose(worlds.forces(), np.where(full[:, :, None], 0.0, weight), rtol=1e-6)
-    parked = [0.0, 0.0, kernels.PARKED_HEIGHT, 0.0, 0.0, 0.0, 1.0]
+    parked = [0.0, 0.0, PARKED_HEIGHT, 0.0, 0.0, 0.0, 1.0]
     np.testing.assert_array_equal(worlds.coordinates()[~full], np.broadcast_to(np.float32(parked), worlds.coordinates()[~full].shape))
     assert (worlds.physics.state.joint_qd.numpy() == 0.0).all()
     assert (state.stuck.numpy() == 0).all()
@@ -368,5 +426,5 @@ def test_a_world_without_room_for_what_was_drawn_has_no_objects(device):
     assert over.any()
     assert not over.all()
     assert (worlds.state.catalog_index.numpy()[over] == -1).all()
-    assert (worlds.coordinates()[over][:, :, 2] == kernels.PARKED_HEIGHT).all()
+    assert (worlds.coordinates()[over][:, :, 2] == PARKED_HEIGHT).all()
     assert (worlds.forces()[over][:, :, 2] > 0.0).all()

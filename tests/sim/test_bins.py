@@ -30,7 +30,7 @@ LOW = dataclasses.replace(BIN, name="low", opening=(0.3, 0.2), height=0.1, base=
 
 def started(device, worlds: int = WORLDS, **more) -> KernelWorlds:
     """Worlds that start episodes of five small objects, with bins drawn."""
-    result = KernelWorlds(device, worlds, objects=5, radius=np.full(5, 0.05), drop=DROP, **more)
+    result = KernelWorlds(device, worlds, **{"objects": 5, "radius": np.full(5, 0.05), "drop": DROP} | more)
     result.set(result.state.phase, Phase.START)
     result.set(result.state.arrangement_id, np.stack([np.arange(worlds), np.arange(worlds) % 3], axis=1))
     arrange.sample_episodes(result.scene, result.state, SEED)
@@ -100,6 +100,18 @@ def test_what_is_outside_is_outside_in_the_bins_frame(device, sizes, place, outs
     worlds.physics.contacts.rigid_contact_max = 0
     arrange.launch(arrange.rest.redrop_objects_kernel, 1, worlds.scene, worlds.state, worlds.physics.state, seed=np.uint64(SEED))
     assert worlds.state.progress.numpy()[0, 2] == int(outside)
+
+
+@pytest.mark.parametrize(("layers", "height"), [(0, BIN.height), (1, 1.5 + 0.05 + 0.01)])
+def test_what_is_dropped_again_begins_above_layers_that_still_fall(device, layers, height):
+    worlds = started(device, 1, bins=(BIN,), drop=DROP | {"layers": layers})
+    arrange.drop_objects(worlds.scene, worlds.state, worlds.physics, SEED)
+    worlds.set(worlds.state.phase, Phase.SETTLE)
+    for instance, z in enumerate((0.1, -0.5, 1.5, 0.9, -0.5)):
+        worlds.place(0, instance, [0.0, 0.0, z, 0.0, 0.0, 0.0, 1.0])
+    arrange.launch(arrange.rest.redrop_objects_kernel, 1, worlds.scene, worlds.state, worlds.physics.state, seed=np.uint64(SEED))
+    slots = worlds.state.body_slot.numpy()[0, [1, 4]]
+    np.testing.assert_allclose(worlds.coordinates()[0, slots, 2], [height + 0.05, height + 0.05 + 0.11], atol=1e-5)
 
 
 def test_shapes_of_the_drawn_bin_are_at_its_pose_and_all_others_away(device):

@@ -13,7 +13,7 @@ from synpick_warp.codes import Phase, Task
 from synpick_warp.configs.load import load_config
 from synpick_warp.scenes.collision.hull_planes import hull_planes
 from synpick_warp.stages.render.scene import build_meshes
-from synpick_warp.stages.sim.suction import Suction
+from synpick_warp.stages.sim.suction import SuctionHold
 from tests.twins import suction as twin
 from tests.twins.raycast import rotation_of
 from tests.worlds.kernel_worlds import KernelWorlds, filled
@@ -33,8 +33,10 @@ PLACE = np.array([0.05, -0.03, 0.1])
 class Cups(KernelWorlds):
     """Worlds whose cups press for long enough, with room for four objects."""
 
-    def __init__(self, device, worlds: int = 1, surface: str = "hull", **suction) -> None:
-        super().__init__(device, worlds, 3, 4, compound=np.array([0, 0, 1]), pick={"press_steps": PRESS_STEPS})
+    def __init__(self, device, worlds: int = 1, surface: str = "hull", cups=((0.0, 0.0),), **suction) -> None:
+        super().__init__(
+            device, worlds, 3, 4, compound=np.array([0, 0, 1]), pick={"press_steps": PRESS_STEPS}, move={"tcp_offset": TIP}, cups=cups
+        )
         filled(
             self.scene.suction,
             {
@@ -44,13 +46,12 @@ class Cups(KernelWorlds):
                 "tolerated_misses": 0,
                 "good_force": GOOD,
                 "poor_force": POOR,
-                "tcp_offset": TIP,
                 **suction,
             },
         )
         meshes, keep = build_meshes([entry.mesh for entry in ENTRIES.entries], len(ENTRIES), device)
         config = load_config("smoke", {"suction.surface": surface})
-        self.suction = Suction(config.suction, ENTRIES, SimpleNamespace(meshes=meshes, keep=keep), device)
+        self.suction = SuctionHold(config.suction, ENTRIES, SimpleNamespace(meshes=meshes, keep=keep), device)
         self.begin(Phase.ACT)
         self.set(self.state.catalog_index, -1)
         # Slots in an order of their own.
@@ -77,7 +78,7 @@ class Cups(KernelWorlds):
     def cast(self) -> tuple[list[int], list[int]]:
         """Count of rays that hit and bit mask of engaged objects, of every world."""
         self.suction.engage(self.scene, self.state, self.attempts, self.seals, self.physics)
-        return self.attempts.hits.numpy().tolist(), self.attempts.engaged_bits.numpy().tolist()
+        return self.attempts.hits.numpy()[:, 0].tolist(), self.attempts.engaged_bits.numpy().tolist()
 
     def attached(self) -> list[list[int]]:
         return self.seals.attached.numpy().tolist()
@@ -99,7 +100,7 @@ def test_a_plate_is_hit_by_all_rays_and_held_as_it_lies(device):
     assert cups.cast() == ([0, RAYS], [0, 0b100])
     assert cups.attached() == [[0, 0, 0, 0], [0, 0, 1, 0]]
     np.testing.assert_allclose(cups.seals.object_in_tcp.numpy()[1, 2], [0, 0, -0.004 - THICKNESS / 2, *turned], atol=1e-6)
-    assert cups.seals.break_force.numpy().tolist() == [POOR, GOOD]
+    assert cups.seals.break_force.numpy().tolist() == [[POOR], [GOOD]]
     assert cups.seals.seal_force.numpy()[1].tolist() == [3.0, 3.0, 0.0, 3.0]
 
 
@@ -109,7 +110,7 @@ def test_over_an_edge_those_rays_hit_that_start_above_the_plate(device, edge, co
     cups = Cups(device)
     cups.put(0, 0, 0, below(0.01) - [0.15 - edge * RADIUS, 0.0, 0.0])
     assert cups.cast() == ([count], [int(count > 0)])
-    assert cups.seals.break_force.numpy()[0] == (GOOD if count == RAYS else POOR)
+    assert cups.seals.break_force.numpy()[0, 0] == (GOOD if count == RAYS else POOR)
 
 
 @pytest.mark.parametrize(("tolerated", "break_force"), [(2, POOR), (3, GOOD)])
@@ -117,7 +118,7 @@ def test_so_many_misses_are_tolerated(device, tolerated, break_force):
     cups = Cups(device, tolerated_misses=tolerated)
     cups.put(0, 0, 0, below(0.01) - [0.15 - 0.5 * RADIUS, 0.0, 0.0])
     assert cups.cast()[0] == [7]
-    assert cups.seals.break_force.numpy()[0] == break_force
+    assert cups.seals.break_force.numpy()[0, 0] == break_force
 
 
 @pytest.mark.parametrize(("distance", "count"), [(0.0299, RAYS), (0.0301, 0), (-0.002, RAYS), (-0.0099, RAYS), (-0.0101, 0)])
@@ -184,7 +185,7 @@ def test_rays_are_cast_when_the_time_to_press_is_up(device, phase, task, steps):
         cups.set(array, 7)
     assert cups.cast() == ([7, RAYS], [7, 1])
     assert cups.attached() == [[0, 0, 0, 0], [1, 0, 0, 0]]
-    assert cups.seals.break_force.numpy().tolist() == [7.0, GOOD]
+    assert cups.seals.break_force.numpy().tolist() == [[7.0], [GOOD]]
 
 
 def test_meshes_are_hit_from_both_sides(device):

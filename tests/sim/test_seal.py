@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from synpick_warp.configs.load import load_config
 from synpick_warp.scenes import build
 from synpick_warp.stages.sim import physics
-from synpick_warp.stages.sim.suction import Suction
+from synpick_warp.stages.sim.suction import SuctionHold
 from tests.twins import suction as twin
 from tests.twins.raycast import rotation_of
 from tests.worlds.hanging import Hanging
@@ -116,10 +116,13 @@ def test_what_hangs_by_its_edge_swings_little_more_than_the_limit(device):
 # ---- momentum and energy ----
 
 
-@pytest.fixture(scope="module")
-def floating(device) -> Hanging:
-    """The lightest and the heaviest object, without weight, on grippers that nothing holds."""
-    hanging = Hanging(device, [[0.016], [1.131]], [[(0.12, 0.02, 0.02)], [(0.2, 0.08, 0.06)]], physics__gravity=0.0)
+THREE = {"gripper__kind": "suction_array", "gripper__cups": [[-0.05, 0.0], [0.0, 0.04], [0.05, 0.0]]}
+
+
+@pytest.fixture(scope="module", params=[{}, THREE], ids=["one", "three"])
+def floating(device, request) -> Hanging:
+    """The lightest and the heaviest object, without weight, on grippers that nothing holds; on one cup, or on three."""
+    hanging = Hanging(device, [[0.016], [1.131]], [[(0.12, 0.02, 0.02)], [(0.2, 0.08, 0.06)]], physics__gravity=0.0, **request.param)
     hanging.carried = False
     return hanging
 
@@ -217,7 +220,7 @@ def test_attached_objects_touch_each_other_and_detached_ones_touch_the_cup(pair)
     both = {(one + cup, one + first), (one + cup, one + second)}
     before = pairs()
     assert {(cup, first), (cup, second), (first, second)} | both <= set(before)
-    pair.suction.ignore_attached_contacts(pair.scene, pair.state, pair.seals, pair.physics)
+    pair.suction.ignore_contacts(pair.scene, pair.state, pair.seals, pair.physics)
     assert set(pairs()) == set(before) - {(cup, first)} - both
 
 
@@ -230,18 +233,20 @@ LAW = {
     "twist_damping": 0.1,
     "swing_limit": np.radians(5.0),
     "swing_stiffness": 50.0,
-    "tcp_offset": 0.055,
     "finger_mass": 1.5,
     "cup_mass": 0.5,
     "tilt_inertia": 0.4,
     "step": 2e-3,
 }
 SLOTS = (3, 0, 2)
+TIP = 0.055
 
 
-def scripted(device, bodies: list[twin.Body], objects_in_tcp: np.ndarray, attached: list[int], break_force: float) -> KernelWorlds:
-    """One world with a moving cup and three moving objects in the slots SLOTS."""
-    worlds = KernelWorlds(device, 1, instances=3, single_slots=4)
+def scripted(
+    device, bodies: list[twin.Body], objects_in_tcp: np.ndarray, attached: list[int], break_force: float, cups=((0.0, 0.0),)
+) -> KernelWorlds:
+    """One world with a moving gripper and three moving objects in the slots SLOTS."""
+    worlds = KernelWorlds(device, 1, instances=3, single_slots=4, move={"tcp_offset": TIP}, cups=cups)
     filled(worlds.scene.suction, LAW)
     rows = [1, *(2 + slot for slot in SLOTS)]
     columns = {
@@ -285,7 +290,7 @@ def random_bodies(seed: int) -> tuple[list[twin.Body], np.ndarray]:
             pose = np.array(
                 _times(
                     _times(
-                        _times(bodies[0].pose, [0, 0, -LAW["tcp_offset"], 0, 0, 0, 1]),
+                        _times(bodies[0].pose, [0, 0, -TIP, 0, 0, 0, 1]),
                         [*numbers.normal(scale=5e-4, size=3), *quaternion(0.05)],
                     ),
                     objects_in_tcp[-1],
@@ -304,29 +309,49 @@ def _times(a, b) -> list[float]:
     return [*(np.asarray(a[:3]) + rotation_of(np.array(a[3:])) @ b[:3]), *turned]
 
 
-@given(seed=st.integers(0, 10_000), attached=st.sampled_from([[1, 0, 0], [0, 1, 1], [1, 1, 1]]), break_force=st.sampled_from([1e6, 5.0]))
-@settings(max_examples=30)
-def test_wrenches_are_those_of_the_twin_and_detached_objects_feel_none(seed, attached, break_force, device):
+ONE, ROW = ((0.0, 0.0),), ((0.05, 0.01), (-0.03, 0.04), (0.02, -0.04))
+"""Places of cups [m]."""
+
+
+@given(
+    seed=st.integers(0, 10_000),
+    tool=st.sampled_from([(ONE, [1, 0, 0]), (ONE, [0, 1, 1]), (ONE, [1, 1, 1]), (ROW, [7, 0, 0]), (ROW, [0, 5, 2]), (ROW, [4, 7, 3])]),
+    break_force=st.sampled_from([1e6, 5.0]),
+)
+@settings(max_examples=40)
+def test_wrenches_are_those_of_the_twin_and_detached_objects_feel_none(seed, tool, break_force, device):
+    cups, attached = tool
     bodies, objects_in_tcp = random_bodies(seed)
-    worlds = scripted(device, bodies, objects_in_tcp, attached, break_force)
+    worlds = scripted(device, bodies, objects_in_tcp, attached, break_force, cups)
     expected = np.full(worlds.dofs, 7.0)
-    seal_forces, kept, peak_force = [0.0] * 3, list(attached), 1.0
+    seal_forces, cup_forces, kept, peak_force = [0.0] * 3, np.zeros(len(cups)), list(attached), 1.0
     for instance in np.flatnonzero(attached):
-        force, reaction, seal_force = twin.seal_wrench(
-            bodies[0], bodies[1 + instance], objects_in_tcp[instance], SimpleNamespace(**LAW), sum(attached)
+        held = [cup for cup in range(len(cups)) if attached[instance] >> cup & 1]
+        seals = twin.seal_wrenches(
+            bodies[0],
+            bodies[1 + instance],
+            objects_in_tcp[instance],
+            SimpleNamespace(**LAW, tcp_offset=TIP),
+            np.count_nonzero(attached),
+            np.array(cups)[held],
         )
         first = GRIPPER_DOFS + 6 * SLOTS[instance]
-        breaks = seal_force > break_force
-        expected[first : first + 6] = 0.0 if breaks else force
-        expected[:GRIPPER_DOFS] += 0.0 if breaks else reaction
-        seal_forces[instance], kept[instance] = seal_force, int(not breaks)
+        expected[first : first + 6] = 0.0
+        for cup, (force, reaction, seal_force) in zip(held, seals, strict=True):
+            breaks = seal_force > break_force
+            expected[first : first + 6] += 0.0 if breaks else force
+            expected[:GRIPPER_DOFS] += 0.0 if breaks else reaction
+            kept[instance] -= int(breaks) << cup
+            cup_forces[cup] += seal_force
+            seal_forces[instance] = max(seal_forces[instance], seal_force)
         peak_force = max(peak_force, seal_forces[instance])
     meshes = SimpleNamespace(id=wp.zeros(1, dtype=wp.uint64, device=device))
-    suction = Suction(load_config("smoke", {}).suction, catalog(CUBE), SimpleNamespace(meshes=meshes, keep=()), device)
-    suction.apply_seal_forces(worlds.scene, worlds.state, worlds.seals, worlds.physics, worlds.physics.state)
+    suction = SuctionHold(load_config("smoke", {}).suction, catalog(CUBE), SimpleNamespace(meshes=meshes, keep=()), device)
+    suction.apply_forces(worlds.scene, worlds.state, worlds.seals, worlds.physics, worlds.physics.state)
     # Offsets are differences of positions of about 1 m in single precision: the spring multiplies their rounding.
     atol = 1e-4 * np.abs(expected).max() + LAW["stiffness"] * np.finfo(np.float32).eps
     np.testing.assert_allclose(worlds.physics.control.joint_f.numpy(), expected, rtol=3e-4, atol=atol)
     np.testing.assert_allclose(worlds.seals.seal_force.numpy()[0], seal_forces, rtol=3e-4, atol=atol)
+    np.testing.assert_allclose(worlds.seals.cup_force.numpy()[0], cup_forces, rtol=3e-4, atol=atol)
     assert worlds.seals.attached.numpy()[0].tolist() == kept
     assert worlds.seals.peak_force.numpy()[0] == pytest.approx(peak_force, rel=3e-4, abs=atol)

@@ -7,7 +7,7 @@ import pytest
 import warp as wp
 from scipy.spatial.transform import Rotation
 
-from synpick_warp.codes import Phase, Task
+from synpick_warp.codes import Outcome, Phase, Task
 from synpick_warp.kernels.sim import step_log
 from synpick_warp.scenes import build
 from synpick_warp.scenes.types import Catalog
@@ -261,3 +261,18 @@ def test_sums_of_contact_forces_are_exact_and_opposite(device):
     forces = wp.array(force, dtype=wp.spatial_vector, device=device)
     wp.launch(step_log.sum_contacts_kernel, dim=5, inputs=[*inputs, forces], outputs=[total], device=device)
     np.testing.assert_array_equal(total.numpy() / float(step_log.COUNTS_PER_NEWTON), [[0.5, -2.0, 2.0, 3.5], [-0.5, 2.0, 6.0, 11.5]])
+
+
+def test_four_cups_pick_a_box_and_share_its_weight(device):
+    cups = [[0.05, 0.04], [-0.05, 0.04], [-0.05, -0.04], [0.05, -0.04]]
+    objects = catalog(((0.2, 0.16, 0.05),))
+    array = {"gripper__kind": "suction_array", "gripper__cups": cups, "gripper__cup_width": 0.036}
+    array |= {"arrangement__max_objects": 1, "arrangement__volume": 2e-3}
+    log = Log(picking(settings(**SHORT, **array), objects, device, records_physics=True))
+    (end,) = np.flatnonzero(log.column("outcome"))
+    assert [log.column(name)[end] for name in ("outcome", "hits", "sealed", "attached")] == [Outcome.TARGET_PICKED, 40, 0b1111, 1]
+    force, weight = log.steps[end - 1]["cup_force"][0, -1], objects.entries[0].mass * GRAVITY
+    np.testing.assert_allclose(force[:4], weight / 4, rtol=0.1)
+    assert force.sum() == pytest.approx(weight, rel=0.03)
+    assert force[4:].tolist() == [0.0] * 12
+    assert log.steps[end - 1]["seal_force"][0, -1, 0] == force.max()

@@ -1,4 +1,4 @@
-"""Sampling of modes, objects and drop poses in NumPy, from the laws in kernels.sim.arrangement's docstrings."""
+"""Sampling of modes, objects and drop poses in NumPy, from the laws in the docstrings of kernels.sim.arrangement and drop."""
 
 from __future__ import annotations
 
@@ -67,6 +67,32 @@ def sample_objects(
         if (exceed and total >= np.float32(budget)) or len(entries) == room or (not repeats and len(entries) == len(volume)):
             break
     return Arrangement(tuple(entries), tuple(slots))
+
+
+def draw_counted(seed: int, episode: int, arrangement: int, counts: list[tuple[int, int]]) -> list[int]:
+    """Entries of an episode: each as often as drawn from its least to its largest number, then swapped from the last one down."""
+    key, entries = rng.stream_key(seed, episode, arrangement, Stream.OBJECTS), []
+    for entry, (low, high) in enumerate(counts):
+        entries += [entry] * (low + int(rng.uniform_index(key, entry, high - low + 1)))
+    for instance in range(len(entries) - 1, 0, -1):
+        other = int(rng.uniform_index(key, len(counts) + instance, instance + 1))
+        entries[instance], entries[other] = entries[other], entries[instance]
+    return entries
+
+
+def layer_places(
+    compartments: np.ndarray, pitch: float, centers: np.ndarray, halves: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Layer, centre (2) and half extents (2) of the cell of each place, from the compartments of all places, in order."""
+    layers, middles, cells = [], [], []
+    for place, compartment in enumerate(compartments):
+        grid = np.maximum(1, (2 * halves[compartment] / pitch).astype(int))
+        layer, index = divmod(int((compartments[:place] == compartment).sum()), int(grid.prod()))
+        cell = halves[compartment] / grid
+        layers.append(layer)
+        middles.append(centers[compartment] - halves[compartment] + cell * (1 + 2 * np.array([index % grid[0], index // grid[0]])))
+        cells.append(cell)
+    return np.array(layers), np.array(middles), np.array(cells)
 
 
 def drop_poses(

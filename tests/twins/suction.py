@@ -70,10 +70,14 @@ class Body:
         return np.block([[np.eye(3), -_cross(self.moment_arm(point))], [np.zeros((3, 3)), np.eye(3)]])
 
 
-def seal_wrench(cup: Body, body: Body, object_in_tcp: np.ndarray, law: SimpleNamespace, seals: int) -> tuple[np.ndarray, np.ndarray, float]:
-    """Generalized forces of one of `seals` seals on its object (6) and on x, y, z and tilt of the gripper (4), and its seal force [N].
+def seal_wrenches(
+    cup: Body, body: Body, object_in_tcp: np.ndarray, law: SimpleNamespace, objects: int, places: np.ndarray
+) -> list[tuple[np.ndarray, np.ndarray, float]]:
+    """Of each of an object's seals, by cups at `places` (cup, 2): generalized forces on the object (6) and on x, y, z and tilt of the
+    gripper (4), and its seal force [N]; `objects` hang on the gripper.
 
-    By the whole 6 x 6 system: w = K (e + h u') + D u' with u' = u - h W w, and W = J M⁻¹ Jᵀ of both sides.
+    By whole 6 x 6 systems at the tool's TCP: w = K (e + h u') + D u' with u' = u - h W w, W = J M⁻¹ Jᵀ of both sides, and sums over the
+    cups of their stiffness and damping.
     """
     turn, rotation = rotation_of(cup.pose[3:]), rotation_of(body.pose[3:])
     axis, wrist_axis = turn[:, 2], turn[:, 1]
@@ -92,15 +96,31 @@ def seal_wrench(cup: Body, body: Body, object_in_tcp: np.ndarray, law: SimpleNam
     gain = h * np.block([[law.stiffness * one, zero], [zero, stiffness]])
     gain += np.block([[law.damping * one, zero], [zero, law.twist_damping * one]])
     object_inverse = np.block([[one / body.mass, zero], [zero, rotation @ np.linalg.inv(body.inertia) @ rotation.T]])
-    slide = np.zeros((6, 4))
-    slide[:3, :3], slide[:3, 3], slide[3:, 3] = one, np.cross(wrist_axis, tcp - cup.pose[:3]), wrist_axis
     gripper_inverse = np.diag(1 / np.array([law.finger_mass + law.cup_mass] * 3 + [law.tilt_inertia]))
-    inverse_mass = body.motion(tcp) @ object_inverse @ body.motion(tcp).T + seals * slide @ gripper_inverse @ slide.T
+
+    def slide(point: np.ndarray) -> np.ndarray:
+        """(6, 4): from the speeds of x, y, z and tilt to those of the frame at a point."""
+        result = np.zeros((6, 4))
+        result[:3, :3], result[:3, 3], result[3:, 3] = one, np.cross(wrist_axis, point - cup.pose[:3]), wrist_axis
+        return result
+
+    inverse_mass = body.motion(tcp) @ object_inverse @ body.motion(tcp).T + objects * slide(tcp) @ gripper_inverse @ slide(tcp).T
     relative = cup.motion(tcp) @ cup.velocity - body.motion(tcp) @ body.velocity
-    spring = np.concatenate([law.stiffness * (tcp - origin), torque])
-    wrench = np.linalg.solve(np.eye(6) + h * gain @ inverse_mass, spring + gain @ relative)
-    borne = wrench[:3] - min(wrench[:3] @ axis, 0.0) * axis
-    return body.motion(tcp).T @ wrench, -slide.T @ wrench, float(np.linalg.norm(borne))
+    arms = [turn @ (x, y, 0.0) for x, y in places]
+    springs = [
+        np.concatenate([law.stiffness * (tcp + r - origin - grip @ (x, y, 0.0)), torque]) for r, (x, y) in zip(arms, places, strict=True)
+    ]
+    shifts = [np.block([[one, -_cross(r)], [zero, one]]) for r in arms]
+    whole_spring = sum(shift.T @ spring for shift, spring in zip(shifts, springs, strict=True))
+    whole_gain = sum(shift.T @ gain @ shift for shift in shifts)
+    whole = np.linalg.solve(np.eye(6) + h * whole_gain @ inverse_mass, whole_spring + whole_gain @ relative)
+    after = relative - h * inverse_mass @ whole
+    result = []
+    for r, spring, shift in zip(arms, springs, shifts, strict=True):
+        wrench = spring + gain @ shift @ after
+        borne = wrench[:3] - min(wrench[:3] @ axis, 0.0) * axis
+        result.append((body.motion(tcp + r).T @ wrench, -slide(tcp + r).T @ wrench, float(np.linalg.norm(borne))))
+    return result
 
 
 def _cross(v: np.ndarray) -> np.ndarray:

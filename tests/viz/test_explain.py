@@ -254,6 +254,8 @@ def test_what_the_seal_bore():
     poor = attempt((FIRST,), {}, 0, hits=3, good_seal=False, engaged=(7,))
     said = ["rays: 3 of 10 hit; poor seal, breaks at 2 N", "engaged: instance 7, unseen", "picked: nothing"]
     assert seal_words(poor, NAMES, Config().suction) == said
+    four = attempt((FIRST,), {}, 0, rays=40, hits=37, good_seal=False, sealed=[0, 1, 3], engaged=(7,))
+    assert seal_words(four, NAMES, Config().suction)[0] == "rays: 37 of 40 hit; 3 of 4 cups with a good seal, break at 40 N"
     assert seal_words(attempt((FIRST,), {}, 0, hits=0, peak_force=(0.0, 0.0)), NAMES, Config().suction) == ["rays: 0 of 10 hit"]
     assert seal_words(attempt((), {}), NAMES, Config().suction) == []
 

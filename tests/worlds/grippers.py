@@ -126,6 +126,6 @@ def _on_cups(physics: Physics, contact_f: wp.array) -> np.ndarray:
     shapes = [array.numpy()[:count] for array in (contacts.rigid_contact_shape0, contacts.rigid_contact_shape1)]
     total = np.zeros((layout.worlds, 3))
     for shape, sign in zip(shapes, (1.0, -1.0), strict=True):
-        cup = shape % layout.shapes_per_world == layout.cup_shape
+        cup = np.isin(shape % layout.shapes_per_world, layout.head_shapes)
         np.add.at(total, shape[cup] // layout.shapes_per_world, sign * forces[cup])
     return total

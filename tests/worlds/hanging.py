@@ -13,7 +13,7 @@ from synpick_warp.scenes import build
 from synpick_warp.scenes.types import Catalog
 from synpick_warp.stages.arrays import allocate
 from synpick_warp.stages.constants import make_scene_data
-from synpick_warp.stages.sim.suction import Suction
+from synpick_warp.stages.sim.suction import SuctionHold
 from synpick_warp.stages.sim.worlds import AttemptState, SealState, WorldState, world_sizes
 from tests.twins.raycast import rotation_of
 from tests.worlds.eager_physics import EagerPhysics
@@ -47,12 +47,11 @@ class Hanging:
         built = build.build_model(self.config, objects, device)
         self.layout, self.physics = built.layout, EagerPhysics(self.config.physics, built)
         self.scene = make_scene_data(self.config, objects, built, 1, device)
-        extents = world_sizes(
-            self.config.bake.worlds, self.config.arrangement.max_objects, self.config.move.rounds, built.layout.bodies_per_world
-        )
+        sizes = (self.worlds, self.instances, self.config.move.rounds, built.layout.bodies_per_world, len(built.head.cups))
+        extents = world_sizes(*sizes)
         self.state, self.attempts, self.seals = (allocate(kind, extents, device) for kind in (WorldState, AttemptState, SealState))
         meshes = SimpleNamespace(id=wp.zeros(1, dtype=wp.uint64, device=device))
-        self.suction = Suction(self.config.suction, objects, SimpleNamespace(meshes=meshes, keep=()), device)
+        self.suction = SuctionHold(self.config.suction, objects, SimpleNamespace(meshes=meshes, keep=()), device)
         order = np.arange(self.mass.size).reshape(self.mass.shape)
         self.state.catalog_index.assign(order)
         self.state.body_slot.assign(np.tile(np.arange(self.instances), (self.worlds, 1)))
@@ -77,7 +76,7 @@ class Hanging:
         self.physics.control.joint_f.zero_()
         self.physics.load(self.state.variant, self.state.restarted)
         self.seals.object_in_tcp.assign(np.concatenate([place, turn], axis=2))
-        self.seals.attached.fill_(1)
+        self.seals.attached.fill_((1 << self.scene.suction.cups) - 1)
         self.seals.break_force.fill_(break_force)
         self.seals.peak_force.zero_()
         self.setpoint[:], self.speed[:] = (0.0, 0.0, HEIGHT), 0.0
@@ -103,12 +102,12 @@ class Hanging:
             force[:, :3] = (pick.stiffness * (offset - step * velocity) - pick.damping * velocity) / gain
             force[:, 2] += self.gripper_mass * self.config.physics.gravity
         self.physics.control.joint_f.assign(force.reshape(-1))
-        self.suction.apply_seal_forces(self.scene, self.state, self.seals, self.physics, current)
+        self.suction.apply_forces(self.scene, self.state, self.seals, self.physics, current)
 
     def ignore(self) -> None:
         """Disable contacts of cups with their attached objects."""
         if self.ignoring:
-            self.suction.ignore_attached_contacts(self.scene, self.state, self.seals, self.physics)
+            self.suction.ignore_contacts(self.scene, self.state, self.seals, self.physics)
 
     def bodies(self) -> tuple[np.ndarray, np.ndarray]:
         """Poses (world, body, 7) and velocities (world, body, 6): gripper shaft, cup, objects."""

@@ -36,6 +36,7 @@ DROP: dict[str, Any] = {
     "pick_repeats": 1,
     "clearance": 0.01,
     "spread": 0.5,
+    "layers": 0,
     "gravity": 9.81,
     "gripper_home": wp.vec3(3.0, 0.0, 1.0),
     "lights": 5,
@@ -99,6 +100,10 @@ class KernelWorlds:
     randomize: Randomize = field(default_factory=Randomize)
     distractors: int = 0
     """The last of the objects, without labels."""
+    counts: Sequence[tuple[int, int]] = ()
+    """Least and largest number of each object; empty: not set."""
+    cups: Sequence[tuple[float, float]] = ((0.0, 0.0),)
+    """Places of the cups in the plane of the TCP [m]."""
     parts: Sequence[tuple[int, int, bool]] = tuple((shape, 0, True) for shape in GUIDES)
 
     def __post_init__(self) -> None:
@@ -118,7 +123,7 @@ class KernelWorlds:
             fill(structs.MoveData, **(MOVE | self.move)),
             filled(structs.PickData(), self.pick),
             structs.PerceptionData(),
-            structs.SuctionData(),
+            filled(structs.SuctionData(), {"cups": len(self.cups), "place": self._places()}),
             self._bins(),
             build_look_table(Looks(self.randomize, (), ()), 0, self.device),
         )
@@ -129,6 +134,7 @@ class KernelWorlds:
             "instance": self.instances,
             "body": self.worlds * self.bodies,
             "waypoint": self.scene.move.waypoints,
+            "cup": len(self.cups),
         }
         self.state = allocate(WorldState, sizes, self.device)
         self.state.bin_pose.fill_(wp.transform_identity())
@@ -149,6 +155,10 @@ class KernelWorlds:
             finger_shape=10,
         )
 
+    def _places(self) -> wp.array:
+        tcp_offset = (MOVE | self.move)["tcp_offset"]
+        return wp.array([(x, y, -tcp_offset) for x, y in self.cups], dtype=wp.vec3, device=self.device)
+
     def _bins(self) -> Any:
         """Bins by `bins`."""
         return bin_data(self.bins, self.places, Move(corner=0.5), [Part(*part) for part in self.parts], self.device)
@@ -157,6 +167,7 @@ class KernelWorlds:
         compound = np.asarray(self.compound, np.int32)
         # Variants as in scenes.build: position among the objects of the same slot class.
         variant = np.where(compound == 1, np.cumsum(compound), np.cumsum(1 - compound)) - 1
+        limits = np.array(self.counts or np.zeros((len(compound), 2)), np.int32)
         columns = {
             "volume": (self.volume, float),
             "radius": (self.radius, float),
@@ -165,12 +176,15 @@ class KernelWorlds:
             "diagonal": (self.radius, float),
             "compound": (compound, int),
             "variant": (variant, int),
+            "least": (limits[:, 0], int),
+            "most": (limits[:, 1], int),
         }
         arrays = {name: wp.array(np.asarray(values), dtype=dtype, device=self.device) for name, (values, dtype) in columns.items()}
         return fill(
             structs.CatalogData,
             count=len(compound) - self.distractors,
             distractors=self.distractors,
+            counted=int(limits[:, 1].sum()),
             empty_single=int((compound == 0).sum()),
             empty_compound=int(compound.sum()),
             empty_mass=0.1,

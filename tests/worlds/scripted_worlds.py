@@ -31,7 +31,7 @@ class World:
     """One world's rows of the reports. Observation and plan stay until the next perception, as on the device."""
 
     def __init__(self, config: Config, device: Any) -> None:
-        sizes = worlds.world_sizes(1, config.arrangement.max_objects, config.move.rounds, 1)
+        sizes = worlds.world_sizes(1, config.arrangement.max_objects, config.move.rounds, 1, 1)
         self.room = sizes["instance"]
         self.observation, self.plan = (_host(allocate(kind, sizes, device)) for kind in (Observation, Plan))
         self.status = np.zeros((1, len(Status)), np.int32)
@@ -39,7 +39,9 @@ class World:
         self.catalog_index = np.full((1, self.room), -1, np.int32)
 
     def now(self, *, load: float | None = None, catalog_index: list[int] | None = None, **columns: int) -> None:
-        """Change columns; the rest stays."""
+        """Change columns; the rest stays, but a cup seals well if as many rays hit as CONFIG demands."""
+        if "hits" in columns:
+            columns = {"sealed": int(RAYS - columns["hits"] <= CONFIG.suction.tolerated_misses)} | columns
         for name, value in columns.items():
             # As the device writes bits of 32 instances.
             self.status[0, column_names(Status)[name]] = np.uint32(value).astype(np.int32) if value > 2**31 - 1 else value

@@ -9,7 +9,8 @@ from pathlib import Path
 from typing import Any
 
 from synpick_warp.apps.viz.drawing import short_labels
-from synpick_warp.configs.manipulation import Suction, Target
+from synpick_warp.configs.gripper import Suction
+from synpick_warp.configs.manipulation import Target
 from synpick_warp.dataset import records
 from synpick_warp.dataset.annotations import ADVICE, check_content
 from synpick_warp.dataset.commit.manifest import ATTEMPTS_FILE
@@ -205,7 +206,10 @@ def seal_words(attempt: Attempt, names: Mapping[int, str], suction: Suction) -> 
     full = full_names(attempt, names)
     lines = [f"rays: {attempt.hits} of {attempt.rays} hit"]
     if attempt.hits:
-        lines[0] += f"; {'good' if attempt.good_seal else 'poor'} seal, breaks at {break_force(attempt, suction):g} N"
+        seal = f"{'good' if attempt.good_seal else 'poor'} seal, breaks"
+        if attempt.sealed is not None:
+            seal = f"{len(attempt.sealed)} of {attempt.rays // suction.rays} cups with a good seal, break"
+        lines[0] += f"; {seal} at {break_force(attempt, suction):g} N"
         peak = f"; largest force {max(attempt.peak_force):.1f} N" if attempt.peak_force else ""
         lines.append(f"engaged: {_listed(attempt.engaged, full)}{peak}")
         lines.append(f"picked: {_listed(attempt.picked, full)}")
@@ -213,8 +217,8 @@ def seal_words(attempt: Attempt, names: Mapping[int, str], suction: Suction) -> 
 
 
 def break_force(attempt: Attempt, suction: Suction) -> float:
-    """Force at which a seal of the attempt breaks [N]."""
-    return suction.good_force if attempt.good_seal else suction.poor_force
+    """Force at which the strongest seal of the attempt breaks [N]."""
+    return suction.good_force if attempt.good_seal or attempt.sealed else suction.poor_force
 
 
 def _listed(instances: Sequence[int], full: Mapping[int, str]) -> str:

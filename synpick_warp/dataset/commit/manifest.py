@@ -27,10 +27,11 @@ import msgspec
 
 from synpick_warp import __version__
 from synpick_warp.configs.bins import Bins
+from synpick_warp.configs.gripper import EACH, SUCTION1
 from synpick_warp.configs.load import load_config, override_config, table_lists
 from synpick_warp.configs.objects import AUTO_UNIT, Objects
 from synpick_warp.configs.randomize import Randomize
-from synpick_warp.configs.schema import CLASSIC, WITHIN, Config
+from synpick_warp.configs.schema import CLASSIC, COLUMN, WITHIN, Config
 from synpick_warp.configs.table_lists import given_values
 from synpick_warp.dataset.records import Entry, EpisodeEntry, IndicesEntry, Manifest, read_record
 from synpick_warp.errors import DatasetError
@@ -77,6 +78,8 @@ YOUNGER_SETTINGS: dict[str, Any] = {
     "bop.layout": CLASSIC,
     "bop.keypoints": 0,
     "arrangement.fill": WITHIN,
+    "arrangement.counts": (),
+    "arrangement.drop": COLUMN,
     "depth_sensor.preset": "",
     "depth_sensor.disparity_noise": 0.0,
     "depth_sensor.max_disparity": 0.0,
@@ -89,6 +92,10 @@ YOUNGER_SETTINGS: dict[str, Any] = {
     "render.table_size": (0.0, 0.0),
     "camera": [],
     "bin": [],
+    "objects.embedded": Objects().embedded,
+    "gripper.kind": SUCTION1,
+    "gripper.cups": (),
+    "gripper.valve": EACH,
     "objects.unit": AUTO_UNIT,
     "objects.symmetries": Objects().symmetries,
     "objects.symmetry_tolerance": Objects().symmetry_tolerance,

@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from synpick_warp.codes import Outcome, Phase, Task, names
+from synpick_warp.codes import MAX_CUPS, Outcome, Phase, Task, names
 
 STORE = Path("trajectory.zarr")
 """Path in the data set."""
@@ -23,6 +23,7 @@ LABELS = {
     "axis": ("x", "y", "z"),
     "fixture": ("tote", "finger", "cup"),
     "link": ("finger", "cup"),
+    "cup": tuple(str(cup) for cup in range(MAX_CUPS)),
 }
 """Dimensions with named indices. No dimension has the name of an array: xarray takes such an array for the dimension's coordinate."""
 
@@ -111,6 +112,9 @@ STEPS = GroupSpec(
             "Impedance force on the gripper towards the setpoint, held for the step; without gravity compensation.",
         ),
         "task": ArraySpec(("step",), "|i1", "1", "Task of the gripper in the step.", names(Task)),
+        "cup_force": ArraySpec(
+            ("step", "cup"), "<f4", "N", "Tension and shear that each cup's seals bore; only of a gripper of several cups. 0: no seal."
+        ),
     },
     ("time",),
 )

@@ -29,7 +29,9 @@ from synpick_warp.exporters.usd.parts import (
 )
 from synpick_warp.exporters.usd.types import FLOOR, TEXTURES, bin_asset, drawn_texture, object_asset
 from synpick_warp.scenes.bins import Bin
-from synpick_warp.scenes.gripper import cup_collider, cup_fixture, finger_collider, finger_fixture, rod_inertia
+from synpick_warp.scenes.grippers.head import rod_inertia
+from synpick_warp.scenes.grippers.mechanism import finger_collider, finger_fixture
+from synpick_warp.scenes.grippers.registry import make_head
 from synpick_warp.scenes.looks import Looks, project_from_box
 from synpick_warp.scenes.tote import FLOOR_DROP, TABLE_ROUGHNESS, TABLE_SIZE
 from synpick_warp.scenes.types import Catalog, CatalogEntry, ConvexPiece, EnvironmentMap, Fixture, Material, TriangleMesh
@@ -65,9 +67,10 @@ def write_library(
     length, mass = gripper.finger_length, gripper.finger_mass
     add_body(finger.GetDefaultPrim(), mass, np.array([0.0, 0.0, length / 2]), np.diag(rod_inertia(mass, length)), kinematic=True)
     _save(library, "finger", finger)
-    cup = _make_fixture(library, physics, "cup", cup_fixture(gripper), (cup_collider(gripper),))
-    length, mass = gripper.cup_length, gripper.cup_mass
-    add_body(cup.GetDefaultPrim(), mass, np.array([0.0, 0.0, -length / 2]), np.diag(rod_inertia(mass, length)), kinematic=True)
+    head = make_head(gripper)
+    cup = _make_fixture(library, physics, "cup", head.fixture, head.pieces)
+    center = np.array([0.0, 0.0, -gripper.cup_length / 2])
+    add_body(cup.GetDefaultPrim(), gripper.cup_mass, center, np.diag(head.inertia), kinematic=True)
     _save(library, "cup", cup)
     textures = {} if looks is None else looks.textures
     if textures.get(LookPart.BACKGROUND):

@@ -9,6 +9,7 @@ import warp as wp
 
 from synpick_warp.configs import schema
 from synpick_warp.kernels.perception.clutter_graph import Cycles, order_clutter_kernel
+from synpick_warp.kernels.perception.cup_alignment import align_cups_kernel
 from synpick_warp.kernels.perception.grasp import frame_grasp_kernel, smooth_normal_kernel
 from synpick_warp.kernels.perception.occlusion_votes import (
     CONTOUR_LANES,
@@ -84,6 +85,8 @@ class GraspPlanner:
         self.choose_target(scene, state, attempts, observation, plan, seed)
         self.smooth_normal(scene, observation, plan)
         self.frame_grasp(scene, observation, plan)
+        if scene.suction.cups > 1:
+            self.align_cups(scene, plan)
 
     def bound_contours(self, scene: SceneData, state: WorldState, observation: Observation) -> None:
         """Compute each contour's bounding box, and its instance's reach."""
@@ -118,3 +121,7 @@ class GraspPlanner:
     def frame_grasp(self, scene: SceneData, observation: Observation, plan: Plan) -> None:
         """Compute the grasp point in the world, its unit normal, and the gripper's angles."""
         launch(frame_grasp_kernel, self.views, scene, observation, plan, *self._sources, block_dim=VIEW_BLOCK)
+
+    def align_cups(self, scene: SceneData, plan: Plan) -> None:
+        """Turn the gripper about the grasp point, so that as many cups as possible lie on the target."""
+        launch(align_cups_kernel, self.views, scene, plan, *self._sources, block_dim=VIEW_BLOCK)

@@ -1,4 +1,4 @@
-"""Episode life cycle: assign, sample, drop, settle, end. Launches kernels.sim.arrangement, rest and endings."""
+"""Episode life cycle: assign, sample, drop, settle, end. Launches kernels.sim.arrangement, drop, rest and endings."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ import warp as wp
 from synpick_warp.codes import Phase
 from synpick_warp.configs.schema import Config
 from synpick_warp.kernels import structs
-from synpick_warp.kernels.sim import arrangement, endings, rest
+from synpick_warp.kernels.sim import arrangement, drop, endings, rest
 from synpick_warp.scenes.build import without_distractors
 from synpick_warp.scenes.types import Catalog
-from synpick_warp.stages.constants import SceneData, drop_data, mode_data, mode_rows
+from synpick_warp.stages.constants import SceneData, count_columns, drop_data, mode_data, mode_rows
 from synpick_warp.stages.launch import launch
 from synpick_warp.stages.perception.arrays import Observation
 from synpick_warp.stages.sim.physics import Physics, contact_arrays
@@ -61,13 +61,15 @@ def sample_episodes_ahead(config: Config, catalog: Catalog, episodes: np.ndarray
     objects.count = len(catalog)
     objects.volume = wp.array([entry.volume for entry in catalog.entries], dtype=float, device=device)
     objects.compound = wp.zeros(len(catalog), dtype=int, device=device)
+    for name, value in count_columns(config.arrangement.counts, catalog, device).items():
+        setattr(objects, name, value)
     labelled = without_distractors(config.arrangement, config.randomize.most_distractors)
-    drop = drop_data(labelled, config.render, config.pick, config.move, config.physics.gravity, 1)
+    rules = drop_data(labelled, config.render, config.pick, config.move, config.physics.gravity, 1)
     index, slot = (wp.empty((count, layout.instances), dtype=wp.int32, device=device) for _ in range(2))
     wp.launch(
         arrangement.sample_objects_kernel,
         dim=count,
-        inputs=[seed, layout, objects, drop, identity, mode, phase, ending],
+        inputs=[seed, layout, objects, rules, identity, mode, phase, ending],
         outputs=[index, slot],
         device=device,
     )
@@ -77,8 +79,8 @@ def sample_episodes_ahead(config: Config, catalog: Catalog, episodes: np.ndarray
 def drop_objects(scene: SceneData, state: WorldState, physics: Physics, seed: int) -> None:
     """Reset free worlds, stack sampled objects above the bin, and load variants and joint coordinates into the physics."""
     sources = (scene, state, physics.state, physics.control)
-    launch(arrangement.reset_worlds_kernel, len(state.phase), *sources)
-    launch(arrangement.drop_objects_kernel, len(state.phase), *sources, seed=wp.uint64(seed))
+    launch(drop.reset_worlds_kernel, len(state.phase), *sources)
+    launch(drop.drop_objects_kernel, len(state.phase), *sources, seed=wp.uint64(seed))
     physics.load(state.variant, state.restarted)
 
 

@@ -24,9 +24,9 @@ from synpick_warp.stages.perception.arrays import Observation, Plan
 from synpick_warp.stages.perception.perceive import Perception
 from synpick_warp.stages.render.scene import RenderScene
 from synpick_warp.stages.sim import arrange, gripper
+from synpick_warp.stages.sim.hold import Hold, make_hold
 from synpick_warp.stages.sim.physics import ENDED, Physics
 from synpick_warp.stages.sim.step_log import PhysicsRecord, StepRecorder
-from synpick_warp.stages.sim.suction import Suction
 from synpick_warp.stages.sim.worlds import AttemptState, SealState, WorldState, WorldStatus, world_sizes
 from synpick_warp.stages.timing import scope
 
@@ -90,7 +90,9 @@ class Simulation:
         planned = [index for each in DataLayout.of(config).plan() for index in each] if episodes is None else episodes
         indices = np.asarray(planned, np.int32)
         self.episodes = wp.array(indices, dtype=wp.int32, device=device)
-        sizes = world_sizes(config.bake.worlds, config.arrangement.max_objects, config.move.rounds, built.layout.bodies_per_world)
+        sizes = world_sizes(
+            config.bake.worlds, config.arrangement.max_objects, config.move.rounds, built.layout.bodies_per_world, len(built.head.cups)
+        )
         self.state, self.attempts, self.seals, self.last, record = allocate_worlds(sizes, device)
         self.state.bin_pose.fill_(wp.transform_identity())
         self.scene.bins.chosen, self.scene.bins.pose = self.state.bin, self.state.bin_pose
@@ -101,12 +103,12 @@ class Simulation:
                 config.trajectory, config.gripper, self.scene, self.state, self.attempts, self.seals, self.physics, sizes
             )
         self.record = replace(record, physics=self.recorder.record if self.recorder is not None else None)
-        self.suction: Suction | None = None
+        self.hold: Hold | None = None
         self.perception: Perception | None = None
         if may_pick(config.bake, config.splits):
             if render_scene is None:
                 raise ValueError("episodes that pick need a render_scene for perception")
-            self.suction = Suction(config.suction, catalog, render_scene, device)
+            self.hold = make_hold(config.gripper, config.suction, catalog, render_scene, device)
             state = (self.scene, self.state, self.attempts, self.observation, self.plan)
             self.perception = Perception(config.perception, config.rig, config.bake.seed, render_scene, *state)
 
@@ -169,25 +171,25 @@ class Simulation:
         gripper.begin_moving(scene, state, physics, seed)
         gripper.begin_picking(scene, state, self.attempts, self.observation, self.plan, physics)
         gripper.remove_lost(scene, state, self.attempts, self.seals, physics)
-        if self.suction is not None:
-            self.suction.engage(scene, state, self.attempts, self.seals, physics)
+        if self.hold is not None:
+            self.hold.engage(scene, state, self.attempts, self.seals, physics)
             gripper.advance_tasks(scene, state, self.attempts, self.seals, self.plan, physics)
         gripper.park_removed(scene, state, self.attempts, physics)
         physics.refresh_poses()
         arrange.judge_episodes(scene, state, self.attempts, self.observation, physics)
 
     def _drive(self, current: newton.State) -> None:
-        """Hook before a step: forces of gripper and seals."""
+        """Hook before a step: forces of gripper and hold."""
         gripper.drive_gripper(self.scene, self.state, self.attempts, self.plan, self.physics, current)
         if self.recorder is not None:
             self.recorder.save_impedance_force()
-        if self.suction is not None:
-            self.suction.apply_seal_forces(self.scene, self.state, self.seals, self.physics, current)
+        if self.hold is not None:
+            self.hold.apply_forces(self.scene, self.state, self.seals, self.physics, current)
 
     def _ignore_contacts(self) -> None:
-        """Hook after collision detection: disable contacts between cup and attached objects, which seals replace."""
-        if self.suction is not None:
-            self.suction.ignore_attached_contacts(self.scene, self.state, self.seals, self.physics)
+        """Hook after collision detection: disable contacts that the hold replaces."""
+        if self.hold is not None:
+            self.hold.ignore_contacts(self.scene, self.state, self.seals, self.physics)
 
     def _take_snapshot(self) -> None:
         """Copy the state of the worlds into the snapshot of the record, with the previous frame beside it, and pack the status rows."""

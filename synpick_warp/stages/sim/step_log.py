@@ -9,6 +9,7 @@ import newton
 import numpy as np
 import warp as wp
 
+from synpick_warp.codes import MAX_CUPS
 from synpick_warp.configs.schema import Gripper, Trajectory
 from synpick_warp.kernels.sim import step_log
 from synpick_warp.scenes import build
@@ -47,6 +48,8 @@ class StepArrays:
     """Impedance force on the gripper, without gravity compensation."""
     task: wp.array = device_array("world", "step", dtype=wp.int8)
     """`Task` at the step's end."""
+    cup_force: wp.array = device_array("world", "step", "cup", dtype=wp.float32, unit="N")
+    """Tension and shear of each cup's seals in the step, as `seal_force`."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -148,7 +151,7 @@ class StepRecorder:
         given = {"substep_fraction": self._substep_fraction, "total": self._total}
         launch(step_log.record_forces_kernel, places, *sources, self._seals, step=step, out=log, **given)
         given = {"force": self._force, "force_out": log.impedance_force}
-        launch(step_log.record_gripper_kernel, worlds, *sources, self._attempts, step=step, out=log, **given)
+        launch(step_log.record_gripper_kernel, worlds, *sources, self._attempts, self._seals, step=step, out=log, **given)
 
     def end_tick(self) -> None:
         """Complete the record at the end of a tick."""
@@ -166,12 +169,18 @@ def host_record(arrays: list[np.ndarray], instances: int) -> tuple[dict[str, np.
     Args:
         arrays: Arrays of `record_arrays`, copied to the host.
         instances: Capacity for instances of a world.
+
+    Forces of cups are left out for a gripper of one cup, whose forces are those of the instances' seals.
     """
     drops = [item.name for item in fields(DropArrays)]
     names = [item.name for item in fields(StepArrays)] if len(arrays) > len(drops) else []
     values = dict(zip([*names, *drops], arrays, strict=True))
     tick = {"drop_pose": values["drop_pose"], "redrops": values["progress"][:, 2]}
-    return tick, _split_places(values, names, instances)
+    steps = _split_places(values, names, instances)
+    cups = steps.pop("cup_force", None)
+    if cups is not None and cups.shape[2] > 1:
+        steps["cup_force"] = np.pad(cups, ((0, 0), (0, 0), (0, MAX_CUPS - cups.shape[2])))
+    return tick, steps
 
 
 def _split_places(arrays: Mapping[str, np.ndarray], names: list[str], instances: int) -> dict[str, np.ndarray]:

@@ -1,4 +1,4 @@
-"""Suction gripper: ray test, seal forces, and contacts that the seals replace. Launches kernels.sim.cup_rays and seal."""
+"""Suction: ray test, seal forces, and contacts that the seals replace. Launches kernels.sim.cup_rays, seal and seal_contacts."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ import newton
 import numpy as np
 import warp as wp
 
-from synpick_warp.configs.schema import Suction as SuctionConfig
-from synpick_warp.kernels.sim import cup_rays, seal
+from synpick_warp.configs.gripper import Suction
+from synpick_warp.kernels.sim import cup_rays, seal, seal_contacts
 from synpick_warp.scenes.collision.hull_planes import plane_table
 from synpick_warp.scenes.types import Catalog
 from synpick_warp.stages.constants import SceneData, fill
@@ -19,10 +19,10 @@ from synpick_warp.stages.sim.physics import Physics, contact_arrays
 from synpick_warp.stages.sim.worlds import AttemptState, SealState, WorldState
 
 
-class Suction:
-    """Suction rays and seals of all cups."""
+class SuctionHold:
+    """Hold by suction: rays and seals of all cups."""
 
-    def __init__(self, settings: SuctionConfig, catalog: Catalog, render_scene: RenderScene, device: wp.Device) -> None:
+    def __init__(self, settings: Suction, catalog: Catalog, render_scene: RenderScene, device: wp.Device) -> None:
         """Upload the surfaces that the rays hit: collision shapes or visual meshes, by `settings.surface`.
 
         Args:
@@ -37,10 +37,10 @@ class Suction:
     def engage(self, scene: SceneData, state: WorldState, attempts: AttemptState, seals: SealState, physics: Physics) -> None:
         """Switch suction on where task PRESS is complete: cast the rays and attach the engaged objects. Runs at the end of a tick."""
         sources = (scene, state, attempts, physics.state)
-        launch(cup_rays.count_seal_rays_kernel, len(state.phase), *sources, self)
+        launch(cup_rays.count_seal_rays_kernel, len(state.phase), *sources, seals, self)
         launch(cup_rays.engage_seals_kernel, state.catalog_index.shape, *sources, seals)
 
-    def apply_seal_forces(self, scene: SceneData, state: WorldState, seals: SealState, physics: Physics, current: newton.State) -> None:
+    def apply_forces(self, scene: SceneData, state: WorldState, seals: SealState, physics: Physics, current: newton.State) -> None:
         """Add the seals' wrenches to the joint forces of objects and gripper, and break overloaded seals.
 
         Runs before a step, after the gripper's forces were written.
@@ -48,11 +48,11 @@ class Suction:
         bodies = {name: getattr(physics.model, name) for name in ("body_com", "body_inv_mass", "body_inv_inertia")}
         launch(seal.apply_seal_forces_kernel, len(state.phase), scene, state, seals, current, physics.control, **bodies)
 
-    def ignore_attached_contacts(self, scene: SceneData, state: WorldState, seals: SealState, physics: Physics) -> None:
+    def ignore_contacts(self, scene: SceneData, state: WorldState, seals: SealState, physics: Physics) -> None:
         """Disable contacts between cups and their attached objects. Runs between collision detection and solver."""
         contacts = physics.contacts
         sources, margin = (scene, state, seals, contact_arrays(physics)), contacts.rigid_contact_margin0
-        launch(seal.ignore_attached_contacts_kernel, contacts.rigid_contact_max, *sources, margin_out=margin)
+        launch(seal_contacts.ignore_attached_contacts_kernel, contacts.rigid_contact_max, *sources, margin_out=margin)
 
 
 def _surface_data(use_mesh: bool, catalog: Catalog, meshes: wp.array, device: wp.Device) -> Any:

@@ -82,8 +82,8 @@ class AttemptState:
     """`Outcome` of the attempt that ended in this tick."""
     failures: wp.array = device_array("world", dtype=wp.int32)
     """Failed attempts that count towards the limit."""
-    hits: wp.array = device_array("world", dtype=wp.int32)
-    """Suction rays that hit an object when suction was switched on."""
+    hits: wp.array = device_array("world", dtype=wp.vec2i)
+    """Suction rays that hit an object when suction was switched on, and the cups with a good seal: bit k, cup k."""
     engaged_bits: wp.array = device_array("world", dtype=wp.uint32)
     """Bit i: instance i was engaged, that is, hit by a ray."""
     attached_bits: wp.array = device_array("world", dtype=wp.uint32)
@@ -94,16 +94,18 @@ class AttemptState:
 
 @dataclass(frozen=True, eq=False)
 class SealState:
-    """Seals of each world's cup: attached instances, with their poses and forces."""
+    """Seals of each world's cups: attached instances, with their poses and forces."""
 
     attached: wp.array = device_array("world", "instance", dtype=wp.int32)
-    """1: a seal holds the instance."""
+    """Cups that hold the instance: bit k, cup k; 0: none."""
     object_in_tcp: wp.array = device_array("world", "instance", dtype=wp.transformf, unit="m")
-    """Object pose in the TCP frame when the seal engaged."""
+    """Object pose in the TCP frame when the seals engaged."""
     seal_force: wp.array = device_array("world", "instance", dtype=wp.float32, unit="N")
-    """Tension and shear of the seal in the last step, that of a seal that broke in it included; 0: no seal."""
-    break_force: wp.array = device_array("world", dtype=wp.float32, unit="N")
-    """Break force of every seal of the world."""
+    """Largest tension and shear of the instance's seals in the last step, that of a seal that broke in it included; 0: no seal."""
+    cup_force: wp.array = device_array("world", "cup", dtype=wp.float32, unit="N")
+    """The same of each cup, summed over its instances."""
+    break_force: wp.array = device_array("world", "cup", dtype=wp.float32, unit="N")
+    """Break force of a cup's seals."""
     peak_force: wp.array = device_array("world", dtype=wp.float32, unit="N")
     """Largest seal force since the tick began, that of a seal that broke included."""
 
@@ -118,7 +120,7 @@ class WorldStatus:
     """Columns: `Measure`."""
 
 
-def world_sizes(worlds: int, objects: int, rounds: int, bodies_per_world: int) -> dict[str, int]:
+def world_sizes(worlds: int, objects: int, rounds: int, bodies_per_world: int, cups: int) -> dict[str, int]:
     """Extents of the dimensions of the dataclasses here, and of `Snapshot` and `Observation`."""
     return {
         "one": 1,
@@ -127,6 +129,7 @@ def world_sizes(worlds: int, objects: int, rounds: int, bodies_per_world: int) -
         "instance": objects,
         "body": worlds * bodies_per_world,
         "waypoint": CORNERS * rounds,
+        "cup": cups,
         "status": len(Status),
         "measure": len(Measure),
         "fixture": len(FIXTURES),

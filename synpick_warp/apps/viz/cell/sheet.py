@@ -178,7 +178,9 @@ def _facts(scene: CellScene, bins: Bins, index: int, title: str) -> Image:
     if any(shift) or yaw:
         lines += [f"  moves by up to {_millimetres(shift)} mm, {yaw:g} deg"]
     if index == 0:
-        lines += ["", "gripper", f"  cup {1e3 * scene.config.gripper.cup_width:.0f} mm wide, drawn over the {sizes.noun};"]
+        gripper = scene.config.gripper
+        cups = f"{len(gripper.cups)} cups" if gripper.cups else "cup"
+        lines += ["", "gripper", f"  {cups} {1e3 * gripper.cup_width:.0f} mm wide, drawn over the {sizes.noun};"]
         lines += [f"  home, out of view: {GRIPPER_HOME[0]:g}, {GRIPPER_HOME[1]:g}, {GRIPPER_HOME[2]:g} m"]
     lines += ["", f"{len(laid.indices)} of {len(scene.objects)} objects", "  laid out on the floor, not dropped [mm]:"]
     shown = [scene.objects[which] for which in laid.indices[:_MAX_NAMED]]

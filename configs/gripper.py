@@ -1,0 +1,118 @@
+"""Settings of the gripper and its suction, and the constraints between them."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+from synpick_warp.codes import MAX_CUPS
+from synpick_warp.configs.fields import INT32_MAX, Conflict, setting
+
+SUCTION1 = "suction1"
+SUCTION_ARRAY = "suction_array"
+GRIPPERS = (SUCTION1, SUCTION_ARRAY)
+"""Kinds of gripper."""
+EACH = "each"
+COMMON = "common"
+
+
+@dataclass(frozen=True)
+class Gripper:
+    """The gripper: a conical shaft that translates along x, y and z, and a head with suction on a wrist joint about the y axis."""
+
+    kind: str = setting(
+        SUCTION1, "", "Kind of gripper: suction1 (one cup) or suction_array (a plate with the cups of gripper.cups).", choices=GRIPPERS
+    )
+    cups: tuple[tuple[float, float], ...] = setting(
+        (),
+        "m",
+        "Centres [x, y] of the cups of a suction_array: x across the wrist axis, y along it, from the tool centre point; "
+        f"at most {MAX_CUPS}.",
+        low=-0.5,
+        high=0.5,
+    )
+    valve: str = setting(
+        EACH,
+        "",
+        "Vacuum of a suction_array: each (a valve for each cup) or common (one for all: if one leaks or breaks off, all seals are poor).",
+        choices=(EACH, COMMON),
+    )
+    finger_length: float = setting(0.35, "m", "Length of the shaft, from its top to the wrist axis.", low=0.005, high=2.0)
+    finger_width: float = setting(0.075, "m", "Diameter of the shaft at its top.", low=0.005, high=1.0)
+    cup_width: float = setting(0.042, "m", "Diameter of the suction cup.", low=0.005, high=0.5)
+    cup_length: float = setting(
+        0.055, "m", "Distance from the wrist axis to the tool centre point (TCP) at the cup's lip.", low=0.005, high=0.5
+    )
+    finger_mass: float = setting(1.5, "kg", "Mass of the shaft.", low=0.001, high=1e3)
+    cup_mass: float = setting(0.5, "kg", "Mass of the cup.", low=0.001, high=1e3)
+    tilt_limit: float = setting(90.0, "°", "Joint limit of the wrist, to both sides.", above=0.0, high=90.0)
+    tilt_stiffness: float = setting(2500.0, "N·m/rad", "Stiffness of the wrist's PD position drive.", above=0.0, high=1e6)
+    tilt_damping: float = setting(200.0, "N·m·s/rad", "Damping of the wrist's PD position drive.", low=0.0, high=1e5)
+    tilt_torque: float = setting(200.0, "N·m", "Torque limit of the wrist's drive.", above=0.0, high=1e5)
+    color: tuple[float, float, float] = setting((0.55, 0.56, 0.58), "sRGB", "Base colour of the shaft.", low=0.0, high=1.0)
+    cup_color: tuple[float, float, float] = setting((0.05, 0.05, 0.055), "sRGB", "Base colour of the cup.", low=0.0, high=1.0)
+    metallic: float = setting(0.01, "", "Metallic factor of shaft and cup (released).", low=0.0, high=1.0)
+    roughness: float = setting(0.9, "", "Roughness of shaft and cup (released).", low=0.0, high=1.0)
+
+
+@dataclass(frozen=True)
+class Suction:
+    """The suction cup: seal test by rays, and the compliant constraint (spring-damper) that holds attached objects."""
+
+    rays: int = setting(10, "", "Rays of the seal test, on a circle at the cup's lip (paper).", low=3, high=64)
+    radius: float = setting(0.01, "m", "Radius of that circle (released).", above=0.0, high=0.25)
+    reach: float = setting(0.03, "m", "Length of the rays (paper).", above=0.0, high=1.0)
+    surface: str = setting(
+        "hull",
+        "",
+        "Geometry that the rays intersect: hull (collision shapes, on which the cup rests) or mesh (visual mesh: a pitcher is open).",
+        choices=("hull", "mesh"),
+    )
+    tolerated_misses: int = setting(0, "", "Maximum rays that may miss for a good seal (paper: 0; released: 2).", low=0, high=INT32_MAX)
+    good_force: float = setting(40.0, "N", "Break force of a good seal (paper).", above=0.0, high=1e5)
+    poor_force: float = setting(2.0, "N", "Break force of any other seal (paper: 2; released: 0.2).", above=0.0, high=1e5)
+    stiffness: float = setting(
+        2e4, "N/m", "Linear stiffness of a seal; 40 N stretch it by 2 mm, within the paper's 5 mm.", above=0.0, high=1e6
+    )
+    damping: float = setting(100.0, "N·s/m", "Linear damping of a seal.", low=0.0, high=1e5)
+    twist_stiffness: float = setting(50.0, "N·m/rad", "Torsional stiffness about the cup's axis.", low=0.0, high=1e6)
+    twist_damping: float = setting(0.1, "N·m·s/rad", "Angular damping of twist and swing.", low=0.0, high=1e5)
+    swing_limit: float = setting(5.0, "°", "Angle by which an attached object may swing freely (released).", low=0.0, high=90.0)
+    swing_stiffness: float = setting(
+        50.0,
+        "N·m/rad",
+        "Stiffness against swing beyond that angle; with 10, an object of 1.1 kg that hangs by its end swings by 18°.",
+        low=0.0,
+        high=1e6,
+    )
+
+
+def find_gripper_conflicts(gripper: Gripper, suction: Suction, mouths: Sequence[tuple[float, float]]) -> Iterator[Conflict]:
+    """Yield conflicts of cups, rays and break forces; `mouths` are the sides of the openings of all compartments [m]."""
+    max_radius = gripper.cup_width / 2
+    if suction.radius > max_radius:
+        yield "suction.radius", f"at most half of gripper.cup_width, {max_radius:g} [m]"
+    if suction.tolerated_misses >= suction.rays:
+        yield "suction.tolerated_misses", f"less than suction.rays, {suction.rays}: one ray must hit"
+    if suction.poor_force > suction.good_force:
+        yield "suction.poor_force", f"at most suction.good_force, {suction.good_force:g} [N]"
+    if gripper.kind != SUCTION_ARRAY:
+        if gripper.cups:
+            yield "gripper.cups", f'none with gripper.kind "{gripper.kind}"; set gripper.kind = "{SUCTION_ARRAY}"'
+        return
+    if not 1 <= len(gripper.cups) <= MAX_CUPS:
+        yield "gripper.cups", f"1 to {MAX_CUPS} places [x, y] with gripper.kind {SUCTION_ARRAY}, such as [[-0.03, 0.0], [0.03, 0.0]]"
+        return
+    pairs = itertools.combinations(enumerate(gripper.cups), 2)
+    distance, first, second = min(((math.dist(a, b), i, j) for (i, a), (j, b) in pairs), default=(math.inf, 0, 0))
+    if distance < gripper.cup_width:
+        apart = f"{first} and {second} are {distance:g} m apart"
+        yield "gripper.cups", f"cups that do not overlap: {apart}, gripper.cup_width is {gripper.cup_width:g}"
+    limit = max((min(sides) for sides in mouths), default=math.inf) / 2 - max_radius
+    if max(math.hypot(*place) for place in gripper.cups) > limit:
+        yield (
+            "gripper.cups",
+            f"within {max(limit, 0.0):g} m of the middle: the tool must fit into a compartment, however it is turned",
+        )

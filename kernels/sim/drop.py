@@ -1,0 +1,220 @@
+"""Drop of an episode's objects: worlds are reset, and objects stacked above the bin, in a column or in layers."""
+
+import warp as wp
+
+from synpick_warp.codes import Phase, Stream
+from synpick_warp.kernels.rng import pixel_key, stream_key, uniform, uniform_index, uniform_rotation
+from synpick_warp.kernels.sim.arrangement import count_instances
+from synpick_warp.kernels.structs import BinData, CatalogData, DropData, LayoutData
+
+wp.set_module_options({"enable_backward": False})
+
+# Height of unused body slots, far below everything [m].
+PARKED_HEIGHT = wp.constant(-100.0)
+# Samples of the random stream that one drop uses: x, y and three for the rotation.
+DROP_SAMPLES = wp.constant(5)
+
+
+@wp.func
+def choose_compartment(bins: BinData, world: int, key: wp.uint64, instance: int) -> int:
+    """Sample the compartment of the world's bin that an instance is dropped into, from the stream of `Stream.COMPARTMENT`."""
+    chosen = bins.chosen[world]
+    first = bins.first_compartment[chosen]
+    return first + uniform_index(key, instance, bins.first_compartment[chosen + 1] - first)
+
+
+@wp.func
+def drop_pose(
+    key: wp.uint64, index: int, radius: float, height: float, spread: float, pose: wp.transform, center: wp.vec2, half: wp.vec2
+) -> wp.transform:
+    """Sample a drop pose at a height above the floor [m]: uniform rotation, position uniform over a fraction `spread` of an area.
+
+    The area, about `center` in the frame of the bin at `pose`, is reduced by the object's bounding radius [m]; `index` counts the drops of
+    the stream.
+    """
+    first = index * DROP_SAMPLES
+    x = (2.0 * uniform(key, first) - 1.0) * spread * wp.max(0.0, half[0] - radius) + center[0]
+    y = (2.0 * uniform(key, first + 1) - 1.0) * spread * wp.max(0.0, half[1] - radius) + center[1]
+    return pose * wp.transform(wp.vec3(x, y, height), uniform_rotation(key, first + 2))
+
+
+@wp.func
+def top_of_objects(
+    layout: LayoutData,
+    catalog: CatalogData,
+    catalog_index: wp.array2d[int],
+    body_slot: wp.array2d[int],
+    body_q: wp.array[wp.transform],
+    world: int,
+) -> float:
+    """Height up to which bounding spheres of a world's objects reach in the world [m]; PARKED_HEIGHT without objects."""
+    result = float(PARKED_HEIGHT)
+    for instance in range(layout.instances):
+        index = catalog_index[world, instance]
+        if index >= 0:
+            body = world * layout.bodies + layout.gripper_bodies + body_slot[world, instance]
+            result = wp.max(result, wp.transform_get_translation(body_q[body])[2] + catalog.radius[index])
+    return result
+
+
+@wp.func
+def largest_radius(catalog: CatalogData, catalog_index: wp.array2d[int], world: int, count: int) -> float:
+    """Largest bounding radius of a world's objects [m]."""
+    result = float(0.0)
+    for instance in range(count):
+        result = wp.max(result, catalog.radius[catalog_index[world, instance]])
+    return result
+
+
+@wp.func
+def layer_cell(half: wp.vec2, side: float, place: int):
+    """Cell of a place in layers over an area of half extents `half` [m]: index of the layer, centre of the cell and its half extents [m].
+
+    Layers are grids of as many cells as fit that are at least `side` [m] long and wide, one at least.
+    """
+    columns = wp.max(1, int(2.0 * half[0] / side))
+    rows = wp.max(1, int(2.0 * half[1] / side))
+    cell = wp.vec2(half[0] / float(columns), half[1] / float(rows))
+    index = place % (columns * rows)
+    across = float(2 * (index % columns) + 1 - columns)
+    along = float(2 * (index // columns) + 1 - rows)
+    return place // (columns * rows), wp.vec2(across * cell[0], along * cell[1]), cell
+
+
+@wp.func
+def count_before(bins: BinData, world: int, key: wp.uint64, first: int, place: int, count: int) -> int:
+    """Number of the instances before a place that fall into the compartment of the one there; the first place has instance `first`."""
+    compartment = choose_compartment(bins, world, key, (first + place) % count)
+    result = int(0)
+    for other in range(place):
+        result += int(choose_compartment(bins, world, key, (first + other) % count) == compartment)
+    return result
+
+
+@wp.func
+def write_body(joint_q: wp.array[float], joint_qd: wp.array[float], first_q: int, first_qd: int, pose: wp.transform):
+    """Write the joint coordinates of a free body at a pose [m] and clear its velocity; its joints begin at `first_q` and `first_qd`."""
+    p = wp.transform_get_translation(pose)
+    r = wp.transform_get_rotation(pose)
+    for axis in range(3):
+        joint_q[first_q + axis] = p[axis]
+    for axis in range(4):
+        joint_q[first_q + 3 + axis] = r[axis]
+    for axis in range(6):
+        joint_qd[first_qd + axis] = 0.0
+
+
+@wp.kernel
+def reset_worlds_kernel(
+    # Scene:
+    layout: LayoutData,
+    catalog: CatalogData,
+    drop: DropData,
+    # State:
+    phase: wp.array[int],  # (world)
+    # Out:
+    variant_out: wp.array[int],  # (body)
+    joint_q_out: wp.array[float],  # (coord) [m, rad]
+    joint_qd_out: wp.array[float],  # (dof) [m/s, rad/s]
+    joint_f_out: wp.array[float],  # (dof) [N, N·m]
+    restarted_out: wp.array[wp.bool],  # (world_and_global)
+    progress_out: wp.array[wp.vec4i],  # (world) [ticks]
+    stuck_out: wp.array2d[int],  # (world, instance) [ticks]
+):
+    """Reset worlds in the phases START, IDLE and OVER: all body slots empty and parked, the gripper at home.
+
+    `variant` receives each slot's empty variant, or -1 (no change) in other worlds; `restarted` is True for reset worlds. A force m g on
+    each parked body cancels its weight. Launched over world.
+    """
+    world = wp.tid()
+    fresh = phase[world] == Phase.START or phase[world] == Phase.IDLE or phase[world] == Phase.OVER
+    restarted_out[world] = fresh
+    body = world * layout.bodies + layout.gripper_bodies
+    for slot in range(layout.slots):
+        variant_out[body + slot] = -1
+    if not fresh:
+        return
+    # Ticks since the drop, ticks at rest, re-drops, whether the guide walls stand.
+    progress_out[world] = wp.vec4i(0, 0, 0, 1)
+    for instance in range(layout.instances):
+        stuck_out[world, instance] = 0
+    q = world * layout.coords
+    qd = world * layout.dofs
+    for axis in range(layout.gripper_dofs):
+        joint_q_out[q + axis] = 0.0
+        joint_qd_out[qd + axis] = 0.0
+    for axis in range(3):
+        joint_q_out[q + axis] = drop.gripper_home[axis]
+    parked = wp.transform(wp.vec3(0.0, 0.0, PARKED_HEIGHT), wp.quat_identity())
+    for slot in range(layout.slots):
+        variant_out[body + slot] = catalog.empty_single
+        if slot >= layout.single_slots:
+            variant_out[body + slot] = catalog.empty_compound
+        first = qd + layout.gripper_dofs + 6 * slot
+        write_body(joint_q_out, joint_qd_out, q + layout.gripper_dofs + 7 * slot, first, parked)
+        for axis in range(6):
+            joint_f_out[first + axis] = 0.0
+        joint_f_out[first + 2] = catalog.empty_mass * drop.gravity
+
+
+@wp.kernel
+def drop_objects_kernel(
+    # Scene:
+    seed: wp.uint64,
+    layout: LayoutData,
+    catalog: CatalogData,
+    drop: DropData,
+    bins: BinData,
+    # State:
+    arrangement_id: wp.array[wp.vec2i],  # (world)
+    catalog_index: wp.array2d[int],  # (world, instance)
+    body_slot: wp.array2d[int],  # (world, instance)
+    phase_inout: wp.array[int],  # (world)
+    # Out:
+    variant_out: wp.array[int],  # (body)
+    joint_q_out: wp.array[float],  # (coord) [m, rad]
+    joint_qd_out: wp.array[float],  # (dof) [m/s, rad/s]
+    joint_f_out: wp.array[float],  # (dof) [N, N·m]
+):
+    """Assign objects to their body slots and stack them above the bin, at rest; phase becomes SETTLE. Launched over world.
+
+    In a column of bounding spheres, sphere i has the height z_i = rim + r_i + Σ_{j<i} (2 r_j + clearance) above the floor, in whichever
+    compartment. In layers, each compartment has its own, of cells as wide as the largest sphere and the clearance, and z_i = rim + r_i +
+    l_i (2 max r + clearance) in layer l_i. With distractors, which are the last instances, the stack begins with a random instance and goes
+    on from the last to the first, so that they lie anywhere in the pile.
+    """
+    world = wp.tid()
+    if phase_inout[world] != Phase.START:
+        return
+    body = world * layout.bodies + layout.gripper_bodies
+    key = stream_key(seed, arrangement_id[world][0], arrangement_id[world][1], Stream.DROP)
+    places = stream_key(seed, arrangement_id[world][0], arrangement_id[world][1], Stream.COMPARTMENT)
+    height = bins.rim_height[bins.chosen[world]]
+    count = count_instances(catalog_index, world, layout.instances)
+    pitch = 2.0 * largest_radius(catalog, catalog_index, world, count) + drop.clearance
+    first = int(0)
+    if catalog.distractors > 0 and count > 0:
+        order = stream_key(seed, arrangement_id[world][0], arrangement_id[world][1], Stream.DISTRACTORS)
+        first = uniform_index(pixel_key(order, 1), 0, count)
+    for place in range(count):
+        instance = (first + place) % count
+        index = catalog_index[world, instance]
+        slot = body_slot[world, instance]
+        variant_out[body + slot] = catalog.variant[index]
+        q = world * layout.coords + layout.gripper_dofs + 7 * slot
+        qd = world * layout.dofs + layout.gripper_dofs + 6 * slot
+        radius = catalog.radius[index]
+        compartment = choose_compartment(bins, world, places, instance)
+        center = bins.center[compartment]
+        half = bins.half[compartment]
+        bottom = height
+        if drop.layers == 1:
+            layer, offset, cell = layer_cell(half, pitch, count_before(bins, world, places, first, place, count))
+            center = center + offset
+            half = cell
+            bottom = bins.rim_height[bins.chosen[world]] + float(layer) * pitch
+        pose = drop_pose(key, instance, radius, bottom + radius, drop.spread, bins.pose[world], center, half)
+        write_body(joint_q_out, joint_qd_out, q, qd, pose)
+        joint_f_out[qd + 2] = 0.0
+        height += 2.0 * radius + drop.clearance
+    phase_inout[world] = Phase.SETTLE

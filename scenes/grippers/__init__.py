@@ -1,0 +1,1 @@
+"""Grippers: the mechanism that all share, and a file for the head of each kind."""
