@@ -90,7 +90,7 @@ def _open_view(dataset: Path, scenes: SceneIndex, attempt: Attempt, camera: int,
     """View of the camera of perception in which an attempt's choice was made, or the last before, as it has one every so many frames."""
     files, frame = scenes.files(attempt.episode, camera), attempt.frame - attempt.frame % every
     if frame not in files.frames():
-        raise DatasetError(f"{files.place} has no image {frame}, which {dataset}/attempts.jsonl names")
+        raise DatasetError(f"{files.place} has no image {frame}, as {dataset}/attempts.jsonl names frame {attempt.frame}")
     return View(files, attempt.episode, camera, frame)
 
 
