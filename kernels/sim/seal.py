@@ -1,7 +1,4 @@
-"""Suction seals: breakable implicit spring-dampers between cups and the attached objects.
-
-A cup has a seal with each object that it holds. The seals of an object act on two rigid bodies: together they are one spring-damper at the
-middle of their cups, whose resistance to rotation grows with the distances of the cups from it. It is solved as one, then shared out.
+"""Seal of one cup: a breakable implicit spring-damper between the cup and each attached object; what seals of several cups share with it.
 
 Frames; `X_in_Y` is the pose of frame X in frame Y, so that `Z_in_Y = X_in_Y * Z_in_X`:
 
@@ -15,8 +12,8 @@ Frames; `X_in_Y` is the pose of frame X in frame Y, so that `Z_in_Y = X_in_Y * Z
 
 import warp as wp
 
-from synpick_warp.kernels.sim.cup_rays import CUP, has_bit, tcp_pose
-from synpick_warp.kernels.structs import TILT, LayoutData, SuctionData
+from synpick_warp.kernels.sim.cup_rays import CUP, tcp_pose
+from synpick_warp.kernels.structs import TILT, LayoutData, MoveData, SuctionData
 
 wp.set_module_options({"enable_backward": False})
 
@@ -47,49 +44,11 @@ class RotationError:
 
 
 @wp.struct
-class CupSpread:
-    """Elastic torque of an object's cups beside their middle, and the second moment of their places."""
-
-    torque: wp.vec3
-    """Σ r x k (r - r_grip) about the middle, on the object [N·m]."""
-    moment: wp.mat33
-    """Σ |r|² 1 - r rᵀ, in the world's axes [m²]."""
-
-
-@wp.struct
 class Wrench:
     """Force [N] and torque [N·m] on the object at the TCP, in the world's axes."""
 
     force: wp.vec3
     """[N]"""
-    torque: wp.vec3
-    """[N·m]"""
-
-
-@wp.struct
-class SolvedSeals:
-    """Wrench of an object's seals at the middle of their cups, and what it takes to share it out."""
-
-    whole: Wrench
-    """Of all seals, on the object."""
-    grip_rotation: wp.quat
-    """From the grip frame to the world."""
-    object_arm: wp.vec3
-    """From the object's centre of mass to the middle of the cups [m]."""
-    spin: wp.vec3
-    """Angular velocity of the head relative to the object at the end of the step [rad/s]."""
-
-
-@wp.struct
-class HeldObject:
-    """What the seals of an object do in a step: cups that hold on, and their wrench about the object's centre of mass."""
-
-    cups: int
-    """Bits of the cups whose seals did not break."""
-    peak_force: float
-    """Largest tension and shear of a seal, that of one that breaks included [N]."""
-    force: wp.vec3
-    """On the object, in the world's axes [N]."""
     torque: wp.vec3
     """[N·m]"""
 
@@ -112,6 +71,26 @@ class TcpMotion:
     """[m/s]"""
     angular_velocity: wp.vec3
     """[rad/s]"""
+
+
+@wp.struct
+class GripMotion:
+    """Motion of the TCP frame relative to the grip frame, at the TCP, in the world's axes."""
+
+    grip_rotation: wp.quat
+    """From the grip frame to the world."""
+    object_arm: wp.vec3
+    """From the object's centre of mass to the TCP [m]."""
+    offset: wp.vec3
+    """From the grip frame's origin to the TCP [m]."""
+    slip: wp.vec3
+    """Velocity of the TCP [m/s]."""
+    spin: wp.vec3
+    """Angular velocity [rad/s]."""
+    error: RotationError
+    """Rotation, with the elastic torque of one seal against it."""
+    inverse_mass: InverseMass
+    """Of the relative motion, at the TCP."""
 
 
 @wp.func
@@ -199,63 +178,56 @@ def rotation_error(cup: wp.quat, grip: wp.quat, suction: SuctionData) -> Rotatio
 
 
 @wp.func
-def count_seals(held: int, suction: SuctionData) -> int:
-    """Number of cups that hold an object; `held`: its bits in `attached`."""
-    count = int(0)
-    for cup in range(suction.cups):
-        count += (held >> cup) & 1
-    return count
+def grip_motion(
+    tcp: TcpMotion,
+    gripper_inverse: InverseMass,
+    grip_rotation: wp.quat,
+    grip_position: wp.vec3,
+    object_in_world: wp.transform,
+    velocity: wp.spatial_vector,
+    com: wp.vec3,
+    inverse_mass: float,
+    inverse_inertia: wp.mat33,
+    suction: SuctionData,
+) -> GripMotion:
+    """Motion of a TCP frame relative to an object's grip frame, with the inverse effective mass of both.
 
-
-@wp.func
-def middle_of_cups(held: int, suction: SuctionData) -> wp.vec3:
-    """Middle of the cups that hold an object, in the head's frame [m]."""
-    total = wp.vec3(0.0, 0.0, 0.0)
-    for cup in range(suction.cups):
-        if has_bit(held, cup):
-            total += suction.place[cup]
-    return total / float(count_seals(held, suction))
-
-
-@wp.func
-def spread_of_cups(held: int, middle: wp.vec3, head: wp.quat, grip: wp.quat, suction: SuctionData) -> CupSpread:
-    """Spread of the cups that hold an object about their middle; rotations from the head's and from the grip's axes to the world."""
-    result = CupSpread()
-    for cup in range(suction.cups):
-        if has_bit(held, cup):
-            arm = wp.quat_rotate(head, suction.place[cup] - middle)
-            stretch = arm - wp.quat_rotate(grip, suction.place[cup] - middle)
-            result.torque += wp.cross(arm, suction.stiffness * stretch)
-            result.moment += wp.dot(arm, arm) * wp.identity(n=3, dtype=float) - wp.outer(arm, arm)
+    Args:
+        tcp: Motion of the TCP frame.
+        gripper_inverse: Inverse effective mass of the gripper there.
+        grip_rotation: From the grip frame to the world.
+        grip_position: Point of the object that coincides with the TCP at rest [m].
+        object_in_world: Pose of the object [m].
+        velocity: Of the object [m/s, rad/s].
+        com: Its centre of mass in its frame [m].
+        inverse_mass: Its inverse mass [1/kg].
+        inverse_inertia: Its inverse inertia, in its axes [1/(kg·m²)].
+        suction: Stiffness of a seal.
+    """
+    result = GripMotion()
+    result.grip_rotation = grip_rotation
+    result.object_arm = tcp.position - wp.transform_point(object_in_world, com)
+    rotation = wp.transform_get_rotation(object_in_world)
+    object_inverse = object_inverse_mass(rotation, inverse_mass, inverse_inertia, result.object_arm)
+    result.slip = tcp.velocity - wp.spatial_top(velocity) - wp.cross(wp.spatial_bottom(velocity), result.object_arm)
+    result.error = rotation_error(tcp.rotation, grip_rotation, suction)
+    result.offset = tcp.position - grip_position
+    result.spin = tcp.angular_velocity - wp.spatial_bottom(velocity)
+    result.inverse_mass = add_inverse_masses(object_inverse, gripper_inverse)
     return result
 
 
 @wp.func
-def seal_wrench(
-    offset: wp.vec3,
-    error: RotationError,
-    spread: CupSpread,
-    seals: int,
-    velocity: wp.vec3,
-    angular_velocity: wp.vec3,
-    inverse_mass: InverseMass,
-    suction: SuctionData,
+def solve_wrench(
+    force: wp.vec3, torque: wp.vec3, linear_gain: float, angular_gain: wp.mat33, inverse_mass: InverseMass, h: float
 ) -> Wrench:
-    """Wrench w on an object of its n seals, a spring-damper that is implicit in offset and velocity at the end of the step h.
+    """Wrench w on the object of a spring-damper that is implicit in offset and velocity at the end of the step h [s].
 
     w = K (e + h u') + D u' with u' = u - h W w, hence (1 + h (h K + D) W) w = K e + (h K + D) u. Offset e and velocity u are those of the
-    tcp frame relative to the grip frame at the middle of the cups, W is the sum of both inverse effective masses. K is n times a seal's
-    stiffness; against rotation, k Σ |r|² 1 - r rᵀ of the cups' places r is added, and the same to D. Stable for every mass, stiffness and
-    damping.
+    tcp frame relative to the grip frame, W is the sum of both inverse effective masses. The arguments are K e + (h K + D) u as force [N] and
+    torque [N·m], and h K + D of both [N·s/m, N·m·s/rad]. Stable for every mass, stiffness and damping.
     """
-    h = suction.step
-    n = float(seals)
     one = wp.identity(n=3, dtype=float)
-    gain = h * suction.stiffness + suction.damping
-    linear_gain = n * gain
-    angular_gain = n * (h * error.stiffness + suction.twist_damping * one) + gain * spread.moment
-    force = n * suction.stiffness * offset + linear_gain * velocity
-    torque = n * error.torque + spread.torque + angular_gain * angular_velocity
     # Blocks of the 6 x 6 system, solved for the torque first (Schur complement).
     upper = wp.inverse(one + (h * linear_gain) * inverse_mass.linear)
     right = (h * linear_gain) * inverse_mass.mixed
@@ -268,25 +240,28 @@ def seal_wrench(
 
 
 @wp.func
-def force_of_cup(whole: Wrench, seals: int, arm: wp.vec3, grip_arm: wp.vec3, spin: wp.vec3, suction: SuctionData) -> wp.vec3:
-    """Force of one cup's seal on the object, a share of that of its n seals: F / n + k (r - r_grip) + (h k + d) ω' x r [N].
-
-    Args:
-        whole: Wrench of all seals of the object at the middle of their cups.
-        seals: Their number.
-        arm: From the middle to the cup, r [m].
-        grip_arm: The same on the object, r_grip [m].
-        spin: Angular velocity of the head relative to the object at the end of the step, ω' [rad/s].
-        suction: Stiffness and damping.
-    """
-    gain = suction.step * suction.stiffness + suction.damping
-    return whole.force / float(seals) + suction.stiffness * (arm - grip_arm) + gain * wp.cross(spin, arm)
+def seal_wrench(motion: GripMotion, suction: SuctionData) -> Wrench:
+    """Wrench on the object of the seal of one cup."""
+    h = suction.step
+    linear_gain = h * suction.stiffness + suction.damping
+    angular_gain = h * motion.error.stiffness + suction.twist_damping * wp.identity(n=3, dtype=float)
+    force = suction.stiffness * motion.offset + linear_gain * motion.slip
+    torque = motion.error.torque + angular_gain * motion.spin
+    return solve_wrench(force, torque, linear_gain, angular_gain, motion.inverse_mass, h)
 
 
 @wp.func
 def tension_and_shear(force: wp.vec3, axis: wp.vec3) -> float:
     """Seal force [N] that is compared with the break force: norm of the force on the object without compression along the cup's axis."""
     return wp.length(force - wp.min(wp.dot(force, axis), 0.0) * axis)
+
+
+@wp.func
+def push_object(force: wp.vec3, torque: wp.vec3, joint_f: wp.array[float], first_dof: int):
+    """Write a wrench about the centre of mass to the six joint forces of an object, which begin at `first_dof`."""
+    for axis in range(3):
+        joint_f[first_dof + axis] = force[axis]
+        joint_f[first_dof + 3 + axis] = torque[axis]
 
 
 @wp.func
@@ -300,100 +275,11 @@ def pull_gripper(force: wp.vec3, torque: wp.vec3, arm: wp.vec3, wrist_axis: wp.v
     joint_f[gripper_dof + TILT] = joint_f[gripper_dof + TILT] - wp.dot(wrist_axis, torque + wp.cross(arm, force))
 
 
-@wp.func
-def solve_seals(
-    held: int,
-    objects: int,
-    tcp: TcpMotion,
-    object_in_world: wp.transform,
-    velocity: wp.spatial_vector,
-    com: wp.vec3,
-    inverse_mass: float,
-    inverse_inertia: wp.mat33,
-    object_in_tcp: wp.transform,
-    suction: SuctionData,
-) -> SolvedSeals:
-    """Wrench of an object's seals in this step.
-
-    Args:
-        held: Cups that hold it, as bits.
-        objects: Number of objects on the gripper.
-        tcp: Motion at the middle of these cups.
-        object_in_world: Pose of the object [m].
-        velocity: Of the object [m/s, rad/s].
-        com: Its centre of mass in its frame [m].
-        inverse_mass: Its inverse mass [1/kg].
-        inverse_inertia: Its inverse inertia, in its axes [1/(kg·m²)].
-        object_in_tcp: Its pose in the tool's TCP frame at rest [m].
-        suction: Cups, stiffness and damping.
-    """
-    result = SolvedSeals()
-    middle = middle_of_cups(held, suction)
-    grip_in_world = object_in_world * wp.transform_inverse(object_in_tcp)
-    result.grip_rotation = wp.transform_get_rotation(grip_in_world)
-    result.object_arm = tcp.position - wp.transform_point(object_in_world, com)
-    rotation = wp.transform_get_rotation(object_in_world)
-    of_object = object_inverse_mass(rotation, inverse_mass, inverse_inertia, result.object_arm)
-    both = add_inverse_masses(of_object, gripper_inverse_mass(suction, tcp.wrist_axis, tcp.wrist_arm, objects))
-    slip = tcp.velocity - wp.spatial_top(velocity) - wp.cross(wp.spatial_bottom(velocity), result.object_arm)
-    spin = tcp.angular_velocity - wp.spatial_bottom(velocity)
-    offset = tcp.position - wp.transform_point(grip_in_world, wp.vec3(middle[0], middle[1], 0.0))
-    error = rotation_error(tcp.rotation, result.grip_rotation, suction)
-    spread = spread_of_cups(held, middle, tcp.rotation, result.grip_rotation, suction)
-    result.whole = seal_wrench(offset, error, spread, count_seals(held, suction), slip, spin, both, suction)
-    result.spin = spin - suction.step * (wp.transpose(both.mixed) * result.whole.force + both.angular * result.whole.torque)
-    return result
-
-
-@wp.func
-def share_wrench(
-    held: int,
-    solved: SolvedSeals,
-    tcp: TcpMotion,
-    world: int,
-    gripper_dof: int,
-    suction: SuctionData,
-    break_force: wp.array2d[float],  # (world, cup) [N]
-    cup_force: wp.array2d[float],  # (world, cup) [N]
-    joint_f: wp.array[float],  # (dof) [N, N·m]
-) -> HeldObject:
-    """Share the wrench of an object's seals out to its cups, and break those whose force exceeds the break force.
-
-    Adds the forces to `cup_force`, and those that hold on to the gripper's `joint_f`.
-    """
-    middle = middle_of_cups(held, suction)
-    seals = count_seals(held, suction)
-    # What the forces of the cups do not explain of the torque is twist and swing of the seals, the same of each.
-    rest = solved.whole.torque
-    for cup in range(suction.cups):
-        if has_bit(held, cup):
-            arm = wp.quat_rotate(tcp.rotation, suction.place[cup] - middle)
-            grip_arm = wp.quat_rotate(solved.grip_rotation, suction.place[cup] - middle)
-            rest -= wp.cross(arm, force_of_cup(solved.whole, seals, arm, grip_arm, solved.spin, suction))
-    torque = rest / float(seals)
-    result = HeldObject()
-    result.cups = held
-    for cup in range(suction.cups):
-        if has_bit(held, cup):
-            arm = wp.quat_rotate(tcp.rotation, suction.place[cup] - middle)
-            grip_arm = wp.quat_rotate(solved.grip_rotation, suction.place[cup] - middle)
-            force = force_of_cup(solved.whole, seals, arm, grip_arm, solved.spin, suction)
-            borne = tension_and_shear(force, tcp.axis)
-            result.peak_force = wp.max(result.peak_force, borne)
-            cup_force[world, cup] = cup_force[world, cup] + borne
-            if borne > break_force[world, cup]:
-                result.cups -= 1 << cup
-            else:
-                result.force += force
-                result.torque += torque + wp.cross(solved.object_arm + arm, force)
-                pull_gripper(force, torque, tcp.wrist_arm + arm, tcp.wrist_axis, joint_f, gripper_dof)
-    return result
-
-
 @wp.kernel
 def apply_seal_forces_kernel(
     # Scene:
     layout: LayoutData,
+    move: MoveData,
     suction: SuctionData,
     body_com: wp.array[wp.vec3],  # (body) [m]
     body_inv_mass: wp.array[float],  # (body) [1/kg]
@@ -401,51 +287,50 @@ def apply_seal_forces_kernel(
     # State:
     body_slot: wp.array2d[int],  # (world, instance)
     object_in_tcp: wp.array2d[wp.transform],  # (world, instance) [m]
+    break_force: wp.array2d[float],  # (world, cup) [N]
     body_q: wp.array[wp.transform],  # (body) [m]
     body_qd: wp.array[wp.spatial_vector],  # (body) [m/s, rad/s]
     attached_inout: wp.array2d[int],  # (world, instance)
-    break_force_inout: wp.array2d[float],  # (world, cup) [N]
     seal_force_inout: wp.array2d[float],  # (world, instance) [N]
     cup_force_inout: wp.array2d[float],  # (world, cup) [N]
     peak_force_inout: wp.array[float],  # (world) [N]
     joint_f_inout: wp.array[float],  # (dof) [N, N·m]
 ):
-    """Apply every seal's wrench to its object and the opposite to the gripper; break seals whose force exceeds the cup's break force.
+    """Apply every seal's wrench to its object and the opposite to the gripper; break seals whose force exceeds the break force.
 
-    `seal_force` receives the largest force of an instance's seals in this step, that of a breaking one included, and 0 without a seal;
-    `cup_force` the sum over a cup's seals; `peak_force` the maximum over seals and steps since it was cleared. Where a seal of a common
-    valve breaks, the others are poor from the next step on. Launched over world.
+    `seal_force` receives this step's force of each seal, that of a breaking one included, and 0 without a seal; `cup_force` their sum;
+    `peak_force` the maximum over seals and steps since it was cleared. Launched over world.
     """
     world = wp.tid()
-    objects = int(0)
+    seals = int(0)
     for instance in range(layout.instances):
-        objects += wp.where(attached_inout[world, instance] != 0, 1, 0)
+        seals += attached_inout[world, instance]
         seal_force_inout[world, instance] = 0.0
-    for cup in range(suction.cups):
-        cup_force_inout[world, cup] = 0.0
-    if objects == 0:
+    cup_force_inout[world, 0] = 0.0
+    if seals == 0:
         return
-    head = world * layout.bodies + CUP
+    cup = world * layout.bodies + CUP
+    tcp = tcp_motion(body_q[cup], body_qd[cup], body_com[cup], wp.vec3(0.0, 0.0, -move.tcp_offset))
+    gripper_inverse = gripper_inverse_mass(suction, tcp.wrist_axis, tcp.wrist_arm, seals)
     gripper_dof = world * layout.dofs
-    broken = int(0)
     for instance in range(layout.instances):
-        held = attached_inout[world, instance]
-        if held != 0:
+        if attached_inout[world, instance] != 0:
             slot = body_slot[world, instance]
             body = world * layout.bodies + layout.gripper_bodies + slot
-            tcp = tcp_motion(body_q[head], body_qd[head], body_com[head], middle_of_cups(held, suction))
-            pose, grip = body_q[body], object_in_tcp[world, instance]
+            pose, velocity, com = body_q[body], body_qd[body], body_com[body]
             mass, inertia = body_inv_mass[body], body_inv_inertia[body]
-            seals = solve_seals(held, objects, tcp, pose, body_qd[body], body_com[body], mass, inertia, grip, suction)
-            shared = share_wrench(held, seals, tcp, world, gripper_dof, suction, break_force_inout, cup_force_inout, joint_f_inout)
-            seal_force_inout[world, instance] = shared.peak_force
-            peak_force_inout[world] = wp.max(peak_force_inout[world], shared.peak_force)
-            broken += held - shared.cups
-            attached_inout[world, instance] = shared.cups
+            grip_in_world = pose * wp.transform_inverse(object_in_tcp[world, instance])
+            rotation, position = wp.transform_get_rotation(grip_in_world), wp.transform_get_translation(grip_in_world)
+            motion = grip_motion(tcp, gripper_inverse, rotation, position, pose, velocity, com, mass, inertia, suction)
+            wrench = seal_wrench(motion, suction)
+            force = tension_and_shear(wrench.force, tcp.axis)
             first_dof = gripper_dof + layout.gripper_dofs + 6 * slot
-            for axis in range(3):
-                joint_f_inout[first_dof + axis] = shared.force[axis]
-                joint_f_inout[first_dof + 3 + axis] = shared.torque[axis]
-    if suction.common_valve != 0 and broken > 0:
-        for cup in range(suction.cups):
-            break_force_inout[world, cup] = suction.poor_force
+            seal_force_inout[world, instance] = force
+            cup_force_inout[world, 0] = cup_force_inout[world, 0] + force
+            peak_force_inout[world] = wp.max(peak_force_inout[world], force)
+            if force > break_force[world, 0]:
+                attached_inout[world, instance] = 0
+                push_object(wp.vec3(), wp.vec3(), joint_f_inout, first_dof)
+            else:
+                push_object(wrench.force, wrench.torque + wp.cross(motion.object_arm, wrench.force), joint_f_inout, first_dof)
+                pull_gripper(wrench.force, wrench.torque, tcp.wrist_arm, tcp.wrist_axis, joint_f_inout, gripper_dof)

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from synpick_warp.configs.load import load_config
 from synpick_warp.scenes import build
 from synpick_warp.stages.sim import physics
-from synpick_warp.stages.sim.suction import SuctionHold
+from synpick_warp.stages.sim.suction import ArrayHold, SuctionHold
 from tests.twins import suction as twin
 from tests.twins.raycast import rotation_of
 from tests.worlds.hanging import Hanging
@@ -315,12 +315,15 @@ ONE, ROW = ((0.0, 0.0),), ((0.05, 0.01), (-0.03, 0.04), (0.02, -0.04))
 
 @given(
     seed=st.integers(0, 10_000),
-    tool=st.sampled_from([(ONE, [1, 0, 0]), (ONE, [0, 1, 1]), (ONE, [1, 1, 1]), (ROW, [7, 0, 0]), (ROW, [0, 5, 2]), (ROW, [4, 7, 3])]),
+    tool=st.sampled_from(
+        [(hold, ONE, attached) for hold in (SuctionHold, ArrayHold) for attached in ([1, 0, 0], [0, 1, 1], [1, 1, 1])]
+        + [(ArrayHold, ROW, attached) for attached in ([7, 0, 0], [0, 5, 2], [4, 7, 3])]
+    ),
     break_force=st.sampled_from([1e6, 5.0]),
 )
 @settings(max_examples=40)
 def test_wrenches_are_those_of_the_twin_and_detached_objects_feel_none(seed, tool, break_force, device):
-    cups, attached = tool
+    hold, cups, attached = tool
     bodies, objects_in_tcp = random_bodies(seed)
     worlds = scripted(device, bodies, objects_in_tcp, attached, break_force, cups)
     expected = np.full(worlds.dofs, 7.0)
@@ -346,7 +349,7 @@ def test_wrenches_are_those_of_the_twin_and_detached_objects_feel_none(seed, too
             seal_forces[instance] = max(seal_forces[instance], seal_force)
         peak_force = max(peak_force, seal_forces[instance])
     meshes = SimpleNamespace(id=wp.zeros(1, dtype=wp.uint64, device=device))
-    suction = SuctionHold(load_config("smoke", {}).suction, catalog(CUBE), SimpleNamespace(meshes=meshes, keep=()), device)
+    suction = hold(load_config("smoke", {}).suction, catalog(CUBE), SimpleNamespace(meshes=meshes, keep=()), device)
     suction.apply_forces(worlds.scene, worlds.state, worlds.seals, worlds.physics, worlds.physics.state)
     # Offsets are differences of positions of about 1 m in single precision: the spring multiplies their rounding.
     atol = 1e-4 * np.abs(expected).max() + LAW["stiffness"] * np.finfo(np.float32).eps

@@ -13,7 +13,7 @@ from synpick_warp.scenes.types import Catalog
 from synpick_warp.stages.constants import SceneData
 from synpick_warp.stages.render.scene import RenderScene
 from synpick_warp.stages.sim.physics import Physics
-from synpick_warp.stages.sim.suction import SuctionHold
+from synpick_warp.stages.sim.suction import ArrayHold, SuctionHold
 from synpick_warp.stages.sim.worlds import AttemptState, SealState, WorldState
 
 
@@ -35,7 +35,7 @@ class Hold(Protocol):
 
 HOLDS: Mapping[str, Callable[[Suction, Catalog, RenderScene, wp.Device], Hold]] = {
     SUCTION1: SuctionHold,
-    SUCTION_ARRAY: SuctionHold,
+    SUCTION_ARRAY: ArrayHold,
 }
 """Class of the hold, by `gripper.kind`."""
 

@@ -1,15 +1,17 @@
-"""Suction: ray test, seal forces, and contacts that the seals replace. Launches kernels.sim.cup_rays, seal and seal_contacts."""
+"""Suction: ray test, seal forces, and contacts that the seals replace. Launches kernels.sim.cup_rays, seal, seal_array and
+seal_contacts.
+"""
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, ClassVar
 
 import newton
 import numpy as np
 import warp as wp
 
 from synpick_warp.configs.gripper import Suction
-from synpick_warp.kernels.sim import cup_rays, seal, seal_contacts
+from synpick_warp.kernels.sim import cup_rays, seal, seal_array, seal_contacts
 from synpick_warp.scenes.collision.hull_planes import plane_table
 from synpick_warp.scenes.types import Catalog
 from synpick_warp.stages.constants import SceneData, fill
@@ -20,7 +22,9 @@ from synpick_warp.stages.sim.worlds import AttemptState, SealState, WorldState
 
 
 class SuctionHold:
-    """Hold by suction: rays and seals of all cups."""
+    """Hold by suction: rays and seals of a head of one cup."""
+
+    seal_kernel: ClassVar[wp.Kernel] = seal.apply_seal_forces_kernel
 
     def __init__(self, settings: Suction, catalog: Catalog, render_scene: RenderScene, device: wp.Device) -> None:
         """Upload the surfaces that the rays hit: collision shapes or visual meshes, by `settings.surface`.
@@ -46,13 +50,19 @@ class SuctionHold:
         Runs before a step, after the gripper's forces were written.
         """
         bodies = {name: getattr(physics.model, name) for name in ("body_com", "body_inv_mass", "body_inv_inertia")}
-        launch(seal.apply_seal_forces_kernel, len(state.phase), scene, state, seals, current, physics.control, **bodies)
+        launch(self.seal_kernel, len(state.phase), scene, state, seals, current, physics.control, **bodies)
 
     def ignore_contacts(self, scene: SceneData, state: WorldState, seals: SealState, physics: Physics) -> None:
         """Disable contacts between cups and their attached objects. Runs between collision detection and solver."""
         contacts = physics.contacts
         sources, margin = (scene, state, seals, contact_arrays(physics)), contacts.rigid_contact_margin0
         launch(seal_contacts.ignore_attached_contacts_kernel, contacts.rigid_contact_max, *sources, margin_out=margin)
+
+
+class ArrayHold(SuctionHold):
+    """Hold of a head of several cups, or of one beside the middle."""
+
+    seal_kernel = seal_array.apply_array_forces_kernel
 
 
 def _surface_data(use_mesh: bool, catalog: Catalog, meshes: wp.array, device: wp.Device) -> Any:

@@ -1,0 +1,273 @@
+"""Seals of several cups with an object: together one spring-damper at the middle of the cups, shared out to them.
+
+The seals of an object act on two rigid bodies: together they are one spring-damper at the middle of their cups, whose resistance to rotation
+grows with the distances of the cups from it. It is solved as one, then shared out. Frames are those of `kernels.sim.seal`.
+"""
+
+import warp as wp
+
+from synpick_warp.kernels.sim.cup_rays import CUP, has_bit
+from synpick_warp.kernels.sim.seal import (
+    GripMotion,
+    TcpMotion,
+    Wrench,
+    grip_motion,
+    gripper_inverse_mass,
+    pull_gripper,
+    push_object,
+    solve_wrench,
+    tcp_motion,
+    tension_and_shear,
+)
+from synpick_warp.kernels.structs import LayoutData, SuctionData
+
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.struct
+class CupSpread:
+    """Elastic torque of an object's cups beside their middle, and the second moment of their places."""
+
+    torque: wp.vec3
+    """Σ r x k (r - r_grip) about the middle, on the object [N·m]."""
+    moment: wp.mat33
+    """Σ |r|² 1 - r rᵀ, in the world's axes [m²]."""
+
+
+@wp.struct
+class SolvedSeals:
+    """Wrench of an object's seals at the middle of their cups, and what it takes to share it out."""
+
+    whole: Wrench
+    """Of all seals, on the object."""
+    motion: GripMotion
+    """At the middle of the cups, at the beginning of the step."""
+    spin: wp.vec3
+    """Angular velocity of the head relative to the object at the end of the step [rad/s]."""
+
+
+@wp.struct
+class HeldObject:
+    """What the seals of an object do in a step: cups that hold on, and their wrench about the object's centre of mass."""
+
+    cups: int
+    """Bits of the cups whose seals did not break."""
+    peak_force: float
+    """Largest tension and shear of a seal, that of one that breaks included [N]."""
+    force: wp.vec3
+    """On the object, in the world's axes [N]."""
+    torque: wp.vec3
+    """[N·m]"""
+
+
+@wp.func
+def count_seals(held: int, suction: SuctionData) -> int:
+    """Number of cups that hold an object; `held`: its bits in `attached`."""
+    count = int(0)
+    for cup in range(suction.cups):
+        count += (held >> cup) & 1
+    return count
+
+
+@wp.func
+def middle_of_cups(held: int, suction: SuctionData) -> wp.vec3:
+    """Middle of the cups that hold an object, in the head's frame [m]."""
+    total = wp.vec3(0.0, 0.0, 0.0)
+    for cup in range(suction.cups):
+        if has_bit(held, cup):
+            total += suction.place[cup]
+    return total / float(count_seals(held, suction))
+
+
+@wp.func
+def spread_of_cups(held: int, middle: wp.vec3, head: wp.quat, grip: wp.quat, suction: SuctionData) -> CupSpread:
+    """Spread of the cups that hold an object about their middle; rotations from the head's and from the grip's axes to the world."""
+    result = CupSpread()
+    for cup in range(suction.cups):
+        if has_bit(held, cup):
+            arm = wp.quat_rotate(head, suction.place[cup] - middle)
+            stretch = arm - wp.quat_rotate(grip, suction.place[cup] - middle)
+            result.torque += wp.cross(arm, suction.stiffness * stretch)
+            result.moment += wp.dot(arm, arm) * wp.identity(n=3, dtype=float) - wp.outer(arm, arm)
+    return result
+
+
+@wp.func
+def wrench_of_seals(motion: GripMotion, spread: CupSpread, seals: int, suction: SuctionData) -> Wrench:
+    """Wrench of an object's n seals on it.
+
+    The stiffness is n times a seal's; against rotation, k Σ |r|² 1 - r rᵀ of the cups' places r is added. So is the damping.
+    """
+    h = suction.step
+    n = float(seals)
+    gain = h * suction.stiffness + suction.damping
+    linear_gain = n * gain
+    angular_gain = n * (h * motion.error.stiffness + suction.twist_damping * wp.identity(n=3, dtype=float)) + gain * spread.moment
+    force = n * suction.stiffness * motion.offset + linear_gain * motion.slip
+    torque = n * motion.error.torque + spread.torque + angular_gain * motion.spin
+    return solve_wrench(force, torque, linear_gain, angular_gain, motion.inverse_mass, h)
+
+
+@wp.func
+def force_of_cup(whole: Wrench, seals: int, arm: wp.vec3, grip_arm: wp.vec3, spin: wp.vec3, suction: SuctionData) -> wp.vec3:
+    """Force of one cup's seal on the object, a share of that of its n seals: F / n + k (r - r_grip) + (h k + d) ω' x r [N].
+
+    Args:
+        whole: Wrench of all seals of the object at the middle of their cups.
+        seals: Their number.
+        arm: From the middle to the cup, r [m].
+        grip_arm: The same on the object, r_grip [m].
+        spin: Angular velocity of the head relative to the object at the end of the step, ω' [rad/s].
+        suction: Stiffness and damping.
+    """
+    gain = suction.step * suction.stiffness + suction.damping
+    return whole.force / float(seals) + suction.stiffness * (arm - grip_arm) + gain * wp.cross(spin, arm)
+
+
+@wp.func
+def solve_seals(
+    held: int,
+    objects: int,
+    tcp: TcpMotion,
+    object_in_world: wp.transform,
+    velocity: wp.spatial_vector,
+    com: wp.vec3,
+    inverse_mass: float,
+    inverse_inertia: wp.mat33,
+    object_in_tcp: wp.transform,
+    suction: SuctionData,
+) -> SolvedSeals:
+    """Wrench of an object's seals in this step.
+
+    Args:
+        held: Cups that hold it, as bits.
+        objects: Number of objects on the gripper.
+        tcp: Motion at the middle of these cups.
+        object_in_world: Pose of the object [m].
+        velocity: Of the object [m/s, rad/s].
+        com: Its centre of mass in its frame [m].
+        inverse_mass: Its inverse mass [1/kg].
+        inverse_inertia: Its inverse inertia, in its axes [1/(kg·m²)].
+        object_in_tcp: Its pose in the tool's TCP frame at rest [m].
+        suction: Cups, stiffness and damping.
+    """
+    result = SolvedSeals()
+    middle = middle_of_cups(held, suction)
+    grip_in_world = object_in_world * wp.transform_inverse(object_in_tcp)
+    rotation = wp.transform_get_rotation(grip_in_world)
+    position = wp.transform_point(grip_in_world, wp.vec3(middle[0], middle[1], 0.0))
+    gripper_inverse = gripper_inverse_mass(suction, tcp.wrist_axis, tcp.wrist_arm, objects)
+    motion = grip_motion(
+        tcp, gripper_inverse, rotation, position, object_in_world, velocity, com, inverse_mass, inverse_inertia, suction
+    )
+    spread = spread_of_cups(held, middle, tcp.rotation, rotation, suction)
+    whole = wrench_of_seals(motion, spread, count_seals(held, suction), suction)
+    both = motion.inverse_mass
+    result.motion = motion
+    result.whole = whole
+    result.spin = motion.spin - suction.step * (wp.transpose(both.mixed) * whole.force + both.angular * whole.torque)
+    return result
+
+
+@wp.func
+def share_wrench(
+    held: int,
+    solved: SolvedSeals,
+    tcp: TcpMotion,
+    world: int,
+    gripper_dof: int,
+    suction: SuctionData,
+    break_force: wp.array2d[float],  # (world, cup) [N]
+    cup_force: wp.array2d[float],  # (world, cup) [N]
+    joint_f: wp.array[float],  # (dof) [N, N·m]
+) -> HeldObject:
+    """Share the wrench of an object's seals out to its cups, and break those whose force exceeds the break force.
+
+    Adds the forces to `cup_force`, and those that hold on to the gripper's `joint_f`.
+    """
+    middle = middle_of_cups(held, suction)
+    seals = count_seals(held, suction)
+    # What the forces of the cups do not explain of the torque is twist and swing of the seals, the same of each.
+    rest = solved.whole.torque
+    for cup in range(suction.cups):
+        if has_bit(held, cup):
+            arm = wp.quat_rotate(tcp.rotation, suction.place[cup] - middle)
+            grip_arm = wp.quat_rotate(solved.motion.grip_rotation, suction.place[cup] - middle)
+            rest -= wp.cross(arm, force_of_cup(solved.whole, seals, arm, grip_arm, solved.spin, suction))
+    torque = rest / float(seals)
+    result = HeldObject()
+    result.cups = held
+    for cup in range(suction.cups):
+        if has_bit(held, cup):
+            arm = wp.quat_rotate(tcp.rotation, suction.place[cup] - middle)
+            grip_arm = wp.quat_rotate(solved.motion.grip_rotation, suction.place[cup] - middle)
+            force = force_of_cup(solved.whole, seals, arm, grip_arm, solved.spin, suction)
+            borne = tension_and_shear(force, tcp.axis)
+            result.peak_force = wp.max(result.peak_force, borne)
+            cup_force[world, cup] = cup_force[world, cup] + borne
+            if borne > break_force[world, cup]:
+                result.cups -= 1 << cup
+            else:
+                result.force += force
+                result.torque += torque + wp.cross(solved.motion.object_arm + arm, force)
+                pull_gripper(force, torque, tcp.wrist_arm + arm, tcp.wrist_axis, joint_f, gripper_dof)
+    return result
+
+
+@wp.kernel
+def apply_array_forces_kernel(
+    # Scene:
+    layout: LayoutData,
+    suction: SuctionData,
+    body_com: wp.array[wp.vec3],  # (body) [m]
+    body_inv_mass: wp.array[float],  # (body) [1/kg]
+    body_inv_inertia: wp.array[wp.mat33],  # (body) [1/(kg·m²)]
+    # State:
+    body_slot: wp.array2d[int],  # (world, instance)
+    object_in_tcp: wp.array2d[wp.transform],  # (world, instance) [m]
+    body_q: wp.array[wp.transform],  # (body) [m]
+    body_qd: wp.array[wp.spatial_vector],  # (body) [m/s, rad/s]
+    attached_inout: wp.array2d[int],  # (world, instance)
+    break_force_inout: wp.array2d[float],  # (world, cup) [N]
+    seal_force_inout: wp.array2d[float],  # (world, instance) [N]
+    cup_force_inout: wp.array2d[float],  # (world, cup) [N]
+    peak_force_inout: wp.array[float],  # (world) [N]
+    joint_f_inout: wp.array[float],  # (dof) [N, N·m]
+):
+    """Apply every seal's wrench to its object and the opposite to the gripper; break seals whose force exceeds the cup's break force.
+
+    `seal_force` receives the largest force of an instance's seals in this step, that of a breaking one included, and 0 without a seal;
+    `cup_force` the sum over a cup's seals; `peak_force` the maximum over seals and steps since it was cleared. Where a seal of a common
+    valve breaks, the others are poor from the next step on. Launched over world.
+    """
+    world = wp.tid()
+    objects = int(0)
+    for instance in range(layout.instances):
+        objects += wp.where(attached_inout[world, instance] != 0, 1, 0)
+        seal_force_inout[world, instance] = 0.0
+    for cup in range(suction.cups):
+        cup_force_inout[world, cup] = 0.0
+    if objects == 0:
+        return
+    head = world * layout.bodies + CUP
+    gripper_dof = world * layout.dofs
+    broken = int(0)
+    for instance in range(layout.instances):
+        held = attached_inout[world, instance]
+        if held != 0:
+            slot = body_slot[world, instance]
+            body = world * layout.bodies + layout.gripper_bodies + slot
+            tcp = tcp_motion(body_q[head], body_qd[head], body_com[head], middle_of_cups(held, suction))
+            pose, grip = body_q[body], object_in_tcp[world, instance]
+            mass, inertia = body_inv_mass[body], body_inv_inertia[body]
+            seals = solve_seals(held, objects, tcp, pose, body_qd[body], body_com[body], mass, inertia, grip, suction)
+            shared = share_wrench(held, seals, tcp, world, gripper_dof, suction, break_force_inout, cup_force_inout, joint_f_inout)
+            seal_force_inout[world, instance] = shared.peak_force
+            peak_force_inout[world] = wp.max(peak_force_inout[world], shared.peak_force)
+            broken += held - shared.cups
+            attached_inout[world, instance] = shared.cups
+            first_dof = gripper_dof + layout.gripper_dofs + 6 * slot
+            push_object(shared.force, shared.torque, joint_f_inout, first_dof)
+    if suction.common_valve != 0 and broken > 0:
+        for cup in range(suction.cups):
+            break_force_inout[world, cup] = suction.poor_force
