@@ -93,7 +93,7 @@ def test_a_dry_run_lists_what_the_same_calls_allocate(device, monkeypatch):
     rooms, layers, room = config.perception, config.render.layers, config.arrangement.max_objects
 
     def build() -> None:
-        sizes = record_sizes(world_sizes(2, room, 3, 4), 5)
+        sizes = record_sizes(world_sizes(2, room, 3, 4, 1), 5)
         allocate_worlds(sizes, device)
         allocate_record(True, sizes, device)
         sections = (config.render, config.effects, config.depth_sensor)

@@ -293,7 +293,7 @@ def test_main_lights_are_told_in_the_world_and_maps_without_any_as_zero(device):
 
 def new_record(device) -> TickRecord:
     config = config_of()
-    sizes = worlds.world_sizes(config.bake.worlds, config.arrangement.max_objects, config.move.rounds, 4)
+    sizes = worlds.world_sizes(config.bake.worlds, config.arrangement.max_objects, config.move.rounds, 4, 1)
     return TickRecord(*(allocate(kind, sizes, device) for kind in (Snapshot, worlds.WorldStatus, Observation, Plan)))
 
 

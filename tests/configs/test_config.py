@@ -44,6 +44,7 @@ COUPLED = {
     "pick.lift_height",
     "suction.radius",
     "gripper.cup_width",
+    "gripper.kind",
     "suction.rays",
     "suction.tolerated_misses",
     "suction.good_force",

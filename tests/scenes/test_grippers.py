@@ -7,6 +7,7 @@ import pytest
 
 from synpick_warp.configs.gripper import GRIPPERS
 from synpick_warp.configs.load import load_config
+from synpick_warp.configs.write import config_to_toml
 from synpick_warp.errors import ConfigError
 from synpick_warp.scenes.assets.meshes import merge_positions, signed_volume
 from synpick_warp.scenes.grippers.registry import HEADS, make_head
@@ -25,6 +26,13 @@ EXAMPLES = [
 
 def test_every_kind_has_a_head_a_hold_and_an_example():
     assert set(GRIPPERS) == set(HEADS) == set(HOLDS) == {"suction1", *(row["kind"] for row in EXAMPLES[1:])}
+
+
+@pytest.mark.parametrize("row", EXAMPLES)
+def test_settings_survive_writing_and_reading(row, tmp_path):
+    config = load_config("smoke", {f"gripper.{name}": value for name, value in row.items()})
+    (tmp_path / "written.toml").write_text(config_to_toml(config))
+    assert load_config(str(tmp_path / "written.toml"), {}) == config
 
 
 @pytest.mark.parametrize("row", EXAMPLES)

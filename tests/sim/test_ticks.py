@@ -33,7 +33,7 @@ SOME_IDLE, ALL_IDLE = 8, 16
 
 def new_record(device: wp.Device) -> TickRecord:
     config = settings()
-    sizes = world_sizes(WORLDS, config.arrangement.max_objects, config.move.rounds, bodies_per_world=1)
+    sizes = world_sizes(WORLDS, config.arrangement.max_objects, config.move.rounds, bodies_per_world=1, cups=1)
     return TickRecord(*(allocate(kind, sizes, device) for kind in (Snapshot, WorldStatus, Observation, Plan)))
 
 

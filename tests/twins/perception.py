@@ -55,7 +55,7 @@ class SegmenterHarness:
         self.scene: Any = SimpleNamespace(catalog=catalog, perception=rules)
         self.catalog_index = wp.array(np.tile(np.arange(instances), (worlds, 1)), dtype=wp.int32, device=device)
         self.observation = allocate(
-            Observation, world_sizes(self.config.bake.worlds, self.config.arrangement.max_objects, self.config.move.rounds, 0), device
+            Observation, world_sizes(self.config.bake.worlds, self.config.arrangement.max_objects, self.config.move.rounds, 0, 1), device
         )
 
     def observe(self, *segments: np.ndarray, depth: np.ndarray | float = 2.0, worlds: list[int] | None = None) -> None:

@@ -312,7 +312,7 @@ CIRCLE = {
         (damaged(peak_force=[float("inf")]), r"line 2, is damaged: JSON is malformed"),
         (damaged(observation=NO_POLE), r"line 2, is damaged: expected array, got null - at \$\.observation\.instances\[0\]\.pole"),
         (damaged(observation=CIRCLE), r"the clutter graph of attempt 0 of episode 1 has a cycle"),
-        (damaged(frame=77), r"000003 has no image 77, which .*attempts\.jsonl names"),
+        (damaged(frame=77), r"000003 has no image 77, as .*attempts\.jsonl names frame 77"),
     ],
 )
 def test_a_damaged_record_is_one_clear_line(dataset, line, said):

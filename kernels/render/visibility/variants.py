@@ -3,7 +3,6 @@
 A branch that is never taken still costs registers, and changes which products the compiler fuses with sums: the last bits of a picture.
 """
 
-import functools
 from collections.abc import Callable
 from typing import Any
 
@@ -14,6 +13,8 @@ from synpick_warp.kernels.render.visibility.camera import LensViews, Views
 VARIANTS: dict[str, tuple[Any, Any]] = {"views": (Views, LensViews), "views_inout": (Views, LensViews)}
 """Structs of a parameter that is annotated `Any`, by its name: the plain one and that of the variant. Modules that define structs add
 theirs."""
+_parameters: dict[wp.Kernel, dict[str, tuple[Any, Any]]] = {}
+"""Parameters of each generic kernel that are annotated `Any`, with their structs."""
 _templates: dict[wp.Kernel, wp.Kernel] = {}
 """Generic kernel of each plain kernel."""
 _kernels: dict[tuple[wp.Kernel, frozenset[Any]], wp.Kernel] = {}
@@ -25,7 +26,8 @@ def kernel_of_views(function: Callable[..., None] | None = None, **options: Any)
     if function is None:
         return lambda decorated: kernel_of_views(decorated, **options)
     template: Any = wp.kernel(function, **options)
-    kernel = wp.overload(template, {name: plain for name, (plain, _) in _variable(template).items()})
+    _parameters[template] = {name: VARIANTS[name] for name, given in template.func.__annotations__.items() if given is Any}
+    kernel = wp.overload(template, {name: plain for name, (plain, _) in _parameters[template].items()})
     _templates[kernel] = template
     return kernel
 
@@ -34,21 +36,15 @@ def kernel_for(kernel: wp.Kernel, *arguments: Any) -> wp.Kernel:
     """Kernel to launch with these arguments: its variant for the structs among them that are not plain."""
     if kernel not in _templates:
         return kernel
-    structs = {special for _, special in _variable(_templates[kernel]).values()}
+    structs = {special for _, special in _parameters[_templates[kernel]].values()}
     given = frozenset(special for special in structs if any(isinstance(argument, special.cls) for argument in arguments))
     if not given:
         return kernel
     if (kernel, given) not in _kernels:
         # All of the module at once: a further kernel compiles its module again.
         for plain, template in _templates.items():
-            variable = _variable(template)
+            variable = _parameters[template]
             if plain.module is kernel.module and given <= {special for _, special in variable.values()}:
                 types = {name: special if special in given else one for name, (one, special) in variable.items()}
                 _kernels[plain, given] = wp.overload(template, types)
     return _kernels[kernel, given]
-
-
-@functools.cache
-def _variable(template: wp.Kernel) -> dict[str, tuple[Any, Any]]:
-    """Parameters of a kernel that are annotated `Any`, with their structs."""
-    return {name: VARIANTS[name] for name, given in template.func.__annotations__.items() if given is Any}

@@ -23,12 +23,9 @@ def write_episode(spool: Path, instances: int, place: Path, metadata: EpisodeMet
         metadata: Properties of the episode.
         settings: Settings common to all episodes.
     """
-    from pxr import Work
-
     from synpick_warp.exporters.usd.parts import save_layer
     from synpick_warp.exporters.usd.stage import make_episode_layer
 
-    Work.SetConcurrencyLimit(1)  # type: ignore[attr-defined]  # The processes are the parallelism.
     ticks = read_ticks(spool, instances)
     if ticks["frame"].tolist() != list(range(metadata.frames)):
         raise OutputError(f"{place} has {len(ticks)} of {metadata.frames} frames; this is an error of synpick-warp, please report it")

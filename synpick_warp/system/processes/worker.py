@@ -24,7 +24,13 @@ from synpick_warp.system.descriptors import duplicate_above_streams
 
 END_TIMEOUT = 10.0
 """How long an idle process may take to exit [s]."""
-_ENVIRONMENT = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "OPENCV_FOR_THREADS_NUM": "1"}
+_ENVIRONMENT = {
+    "OMP_NUM_THREADS": "1",
+    "OPENBLAS_NUM_THREADS": "1",
+    "OPENCV_FOR_THREADS_NUM": "1",
+    "PXR_WORK_THREAD_LIMIT": "1",  # Not by `Work.SetConcurrencyLimit`: after its second call, a thread of USD's TBB polls on for good.
+    "TF_ENV_SETTING_ALERTS_ENABLED": "0",  # Or USD reports the limit at length.
+}
 """The processes are the parallelism: libraries start no threads within them."""
 
 

@@ -15,7 +15,9 @@ from pxr import Sdf, Usd, UsdGeom, UsdLux, UsdPhysics, UsdSemantics, UsdShade, U
 from synpick_warp.errors import OutputError
 from synpick_warp.exporters.usd.exporter import UsdExporter
 from synpick_warp.exporters.usd.parts import new_asset, save_layer
+from synpick_warp.exporters.writing.pool import WriterPool
 from synpick_warp.scenes.assets.appearance import srgb_to_linear
+from tests.harness import scripted_bake
 from tests.harness.exporter_contract import ExporterContract, digests
 from tests.worlds import small_worlds, usd_sets
 
@@ -71,6 +73,23 @@ def test_a_truncated_file_is_an_error(tmp_path):
     """In a separate process, since the file size limit applies to the whole process."""
     limited = subprocess.run((sys.executable, "-c", LIMITED, str(tmp_path / "thing.usdc")), capture_output=True, text=True)
     assert limited.stderr == f"cannot write {tmp_path / 'thing.usdc'}: File too large; free space or rights there\n"
+
+
+def test_a_writer_has_no_thread_beside_its_own(tmp_path, monkeypatch):
+    """After its second episode, a thread of USD's TBB polled on, which took a core of each writer."""
+    threads = []
+
+    class Pool(WriterPool):
+        def __init__(self, _: int, *arguments: int) -> None:
+            super().__init__(1, *arguments)
+
+        def __exit__(self, *error: object) -> None:
+            threads.append(sum(1 for _ in Path(f"/proc/{self.pids()[0]}/task").iterdir()))
+            super().__exit__(*error)
+
+    monkeypatch.setattr(scripted_bake, "WriterPool", Pool)
+    scripted_bake.bake(tmp_path / "set", scripted_bake.settings(2, ("usd",)))
+    assert threads == [1]
 
 
 def test_one_file_per_episode_and_shared_assets(folder):
