@@ -11,6 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from synpick_warp.configs.load import load_config
+from synpick_warp.kernels.structs import SuctionData
 from synpick_warp.scenes import build
 from synpick_warp.stages.sim import physics
 from synpick_warp.stages.sim.suction import ArrayHold, SuctionHold
@@ -225,6 +226,12 @@ def test_attached_objects_touch_each_other_and_detached_ones_touch_the_cup(pair)
 
 
 # ---- the law ----
+
+
+def test_settings_of_the_seal_are_numbers_alone():
+    """With an array in the struct, a GPU's compiler fuses other products with sums: the last bits of picks change."""
+    assert {member.type for member in SuctionData.vars.values()} <= {int, float, wp.int32, wp.float32}
+
 
 LAW = {
     "stiffness": 2e4,
