@@ -256,8 +256,7 @@ def apply_seal_forces_kernel(
     gripper_dof = world * layout.dofs
     for instance in range(layout.instances):
         if attached_inout[world, instance] != 0:
-            slot = body_slot[world, instance]
-            body = world * layout.bodies + layout.gripper_bodies + slot
+            body = world * layout.bodies + layout.gripper_bodies + body_slot[world, instance]
             grip_in_world = body_q[body] * wp.transform_inverse(object_in_tcp[world, instance])
             object_arm = tcp.position - wp.transform_point(body_q[body], body_com[body])
             rotation = wp.transform_get_rotation(body_q[body])
@@ -266,11 +265,10 @@ def apply_seal_forces_kernel(
             slip = tcp.velocity - wp.spatial_top(body_qd[body]) - wp.cross(object_angular_velocity, object_arm)
             error = rotation_error(tcp.rotation, wp.transform_get_rotation(grip_in_world), suction)
             offset = tcp.position - wp.transform_get_translation(grip_in_world)
-            angular_slip = tcp.angular_velocity - object_angular_velocity
-            inverse_mass = add_inverse_masses(object_inverse, gripper_inverse)
-            wrench = seal_wrench(offset, error, slip, angular_slip, inverse_mass, suction)
+            spin = tcp.angular_velocity - object_angular_velocity
+            wrench = seal_wrench(offset, error, slip, spin, add_inverse_masses(object_inverse, gripper_inverse), suction)
             force = tension_and_shear(wrench.force, tcp.axis)
-            first_dof = gripper_dof + layout.gripper_dofs + 6 * slot
+            first_dof = gripper_dof + layout.gripper_dofs + 6 * body_slot[world, instance]
             seal_force_inout[world, instance] = force
             cup_force_inout[world, 0] = cup_force_inout[world, 0] + force
             peak_force_inout[world] = wp.max(peak_force_inout[world], force)

@@ -490,10 +490,9 @@ def test_a_sensor_preset_sets_its_figures(name, tmp_path):
 
 
 def test_a_sensor_preset_gives_way_to_what_stands_beside_it(tmp_path):
-    path = tmp_path / "cell.toml"
-    path.write_text('preset = "smoke"\n[depth_sensor]\nbaseline = 0.06\npreset = "d435"\n')
-    assert load_config(str(path)).depth_sensor.baseline == 0.06
-    assert load_config(str(path), {"depth_sensor.preset": "d415"}).depth_sensor.baseline == 0.055
+    path = write(tmp_path, 'preset = "smoke"\n[depth_sensor]\nbaseline = 0.06\npreset = "d435"\n')
+    assert load_config(path).depth_sensor.baseline == 0.06
+    assert load_config(path, {"depth_sensor.preset": "d415"}).depth_sensor.baseline == 0.055
     with pytest.raises(ConfigError, match=r"depth_sensor\.preset is \"d453\" .*; allowed: .*d435.*did you mean d4"):
         load_config("smoke", {"depth_sensor.preset": "d453"})
     # The paper's long lens at 2 m has more disparity than the D435 searches.

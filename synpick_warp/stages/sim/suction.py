@@ -24,7 +24,7 @@ from synpick_warp.stages.sim.worlds import AttemptState, SealState, WorldState
 class SuctionHold:
     """Hold by suction: rays and seals of a head of one cup."""
 
-    seal_kernel: ClassVar[wp.Kernel] = seal.apply_seal_forces_kernel
+    seal_kernel: ClassVar[Any] = seal.apply_seal_forces_kernel
 
     def __init__(self, settings: Suction, catalog: Catalog, render_scene: RenderScene, device: wp.Device) -> None:
         """Upload the surfaces that the rays hit: collision shapes or visual meshes, by `settings.surface`.
