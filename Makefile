@@ -26,8 +26,9 @@ demo: $(VENV)/installed
 	$(BIN)/synpick-warp bake --config smoke --episodes 1 --device cpu --out $(DEMO)
 	$(BIN)/synpick-warp preview $(DEMO) --out $(DEMO)/contact-sheet.png
 
-test: checks
-	$(PYTEST) -m 'not slow'
+# Checks take one core for half a minute, in which tests can have the other.
+test: $(VENV)/installed-dev
+	$(MAKE) --no-print-directory checks & checks=$$!; $(PYTEST) -m 'not slow'; tests=$$?; wait $$checks && exit $$tests
 
 test-slow: $(VENV)/installed-dev
 	$(PYTEST) -m slow
