@@ -18,7 +18,7 @@ WORKERS := 2
 # Neighbours in one process, which makes what they share once.
 PYTEST = $(BIN)/python -m pytest -n $(WORKERS) --dist worksteal
 
-.PHONY: demo test test-slow checks clean
+.PHONY: demo test test-slow checks pytest clean
 .DELETE_ON_ERROR:
 
 demo: $(VENV)/installed
@@ -28,7 +28,10 @@ demo: $(VENV)/installed
 
 # Checks take one core for half a minute, in which tests can have the other.
 test: $(VENV)/installed-dev
-	$(MAKE) --no-print-directory checks & checks=$$!; $(PYTEST) -m 'not slow'; tests=$$?; wait $$checks && exit $$tests
+	$(MAKE) --no-print-directory -j2 checks pytest
+
+pytest: $(VENV)/installed-dev
+	$(PYTEST) -m 'not slow'
 
 test-slow: $(VENV)/installed-dev
 	$(PYTEST) -m slow
