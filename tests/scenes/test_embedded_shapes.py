@@ -26,14 +26,19 @@ def pieces_of(shape):
     return [(piece.vertices.tolist(), piece.faces.tolist()) for piece in shape]
 
 
+def corners(shape):
+    """Vertices of each convex piece as a set, in nanometres: zeros of either sign decide their order, and how planar faces are divided."""
+    return [set(map(tuple, np.rint(1e9 * piece.vertices).astype(int).tolist())) for piece in shape]
+
+
 @pytest.mark.parametrize("name", OBJECTS)
 def test_each_object_has_its_shape(name):
-    """`python -m tools.embedded_shapes` computes it again where an object has changed. Releases of NumPy differ by 1e-15 m at zero."""
+    """`python -m tools.embedded_shapes` computes it again where an object has changed. Releases of NumPy differ by 5e-14 m at zero."""
     raw, recipe = OBJECTS[name], shape_recipe(OBJECTS[name], SETTINGS)
     shape = embedded_shape(raw.mesh, recipe)
     assert shape is not None
     if name in PIECES:
-        assert pieces_of(shape) == pieces_of(modelled_shape(name, recipe))
+        assert corners(shape) == corners(modelled_shape(name, recipe))
         # Nothing of the surface is far outside of all pieces, which have no holes: least the bracket's fillet of 3 mm.
         equations = [ConvexHull(piece.vertices.astype(np.float64)).equations for piece in shape]
         outside = np.min([(raw.mesh.vertices @ each[:, :3].T + each[:, 3]).max(axis=1) for each in equations], axis=0)
@@ -41,7 +46,7 @@ def test_each_object_has_its_shape(name):
     if not recipe.concave:
         (found,), computed = shape, simplify_hull(raw.mesh.vertices, recipe.hull_vertices)
         np.testing.assert_array_equal(found.faces, computed.faces)
-        np.testing.assert_allclose(found.vertices, computed.vertices, rtol=0, atol=1e-14)
+        np.testing.assert_allclose(found.vertices, computed.vertices, rtol=0, atol=1e-13)
 
 
 @pytest.mark.slow
