@@ -1,4 +1,4 @@
-"""Fills: which parts an episode's bin holds, and how many of each."""
+"""Part counts of an episode's bin (`arrangement.counts`): parsing of the table of parts and their numbers."""
 
 from __future__ import annotations
 

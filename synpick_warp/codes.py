@@ -1,4 +1,4 @@
-"""Enumerations: every integer code that device arrays, host code and files share, and limits of both. Imports nothing else of the project.
+"""Integer enumerations shared by device arrays, host code and files, and limits shared by them. Imports nothing else of the project.
 
 Warp resolves members of an `IntEnum` in kernels, so device code, stages and exporters name the same member. The members of a
 `_Described` enum carry a sentence for people.

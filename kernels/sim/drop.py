@@ -93,7 +93,7 @@ def count_before(bins: BinData, world: int, key: wp.uint64, first: int, place: i
 
 @wp.func
 def write_body(joint_q: wp.array[float], joint_qd: wp.array[float], first_q: int, first_qd: int, pose: wp.transform):
-    """Write the joint coordinates of a free body at a pose [m] and clear its velocity; its joints begin at `first_q` and `first_qd`."""
+    """Set a free body to a pose [m], at rest: its joint coordinates begin at `first_q`, its joint velocities at `first_qd`."""
     p = wp.transform_get_translation(pose)
     r = wp.transform_get_rotation(pose)
     for axis in range(3):

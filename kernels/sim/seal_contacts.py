@@ -7,7 +7,7 @@ from synpick_warp.kernels.structs import LayoutData
 
 wp.set_module_options({"enable_backward": False})
 
-# Gap of a contact that must not act [m]; stages.sim.physics makes the solver skip contacts with far smaller gaps.
+# Gap that disables a contact [m]: ten times CONTACT_GAP of stages.sim.physics, beyond which the solver skips contacts.
 APART = wp.constant(1.0)
 
 

@@ -15,6 +15,10 @@ PLATE = (-0.42, -0.22)
 """Lower and upper side of the plate, as fractions of the cup's length."""
 BEVEL = 0.02
 """Height of its bevelled edges, as fraction of the cup's length; cups and stem end this deep in it."""
+CORNER = 0.45
+"""Radius of its rounded corners, in widths of a cup: less than a half, so that its sides keep a length about a single row of cups."""
+INSET = 0.98
+"""Outline of its upper and lower side, relative to that between the bevels."""
 CORNER_SEGMENTS = 6
 """Segments of a rounded corner of the plate."""
 TAPER = 0.5
@@ -34,15 +38,15 @@ def _sides(gripper: Gripper) -> tuple[float, float]:
 
 
 def _outline(gripper: Gripper, segments: int) -> np.ndarray:
-    """Ring of the plate: corners of a little less than the cup's radius, so that its sides have a length about a single row of cups."""
-    return rounded_rectangle(*_sides(gripper), 0.45 * gripper.cup_width, segments)
+    """Outline of the plate: a rounded rectangle (point, 2) [m]."""
+    return rounded_rectangle(*_sides(gripper), CORNER * gripper.cup_width, segments)
 
 
 def _fixture(gripper: Gripper) -> Fixture:
     """Build the visual mesh: plate, stem and hinge on the wrist axis, and a cup with bellows at each place."""
     ring, length = _outline(gripper, CORNER_SEGMENTS), gripper.cup_length
     low, high = PLATE
-    heights = ((0.98, low), (1.0, low + BEVEL), (1.0, high - BEVEL), (0.98, high))
+    heights = ((INSET, low), (1.0, low + BEVEL), (1.0, high - BEVEL), (INSET, high))
     plate = solid(np.stack([at_height(scale * ring, z * length) for scale, z in heights]))
     radius = HINGE * gripper.cup_width / 2
     stem = solid(lathe([(radius, (high - BEVEL) * length), (radius, 0.0)], SIDES))

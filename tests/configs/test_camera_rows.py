@@ -139,7 +139,7 @@ CLOSE = "distortion = [-0.25, 0, 0, 0]\n[camera.jitter]\n"
             "less, so that every draw has a point that lets each camera see the tote",
         ),
         ("[camera.jitter]\ncenter = { uniform = [-170, 0] }\n", "less, so that every draw has a principal point cx, cy inside"),
-        # Close to the fold of the lens: over it by a shorter focal length, and by both ends at once.
+        # Near the radius where the distortion folds over: beyond it with a shorter focal length, and with both extremes together.
         (
             f"{CLOSE}focal_length = {{ normal = [0, 0.015] }}\n",
             "less, so that every draw has a lens that covers the image, but distortion ",

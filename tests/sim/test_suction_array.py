@@ -17,7 +17,7 @@ STEPS = 400
 
 
 def hanging(device, cups, offset=(0.0, 0.0), **overrides) -> Hanging:
-    """A box whose top the cups touch, with its centre at an offset from the tool's."""
+    """Box held at its top face, with its centre at a horizontal offset from the tool's axis [m]."""
     array = {"gripper__kind": "suction_array", "gripper__cups": [list(map(float, place)) for place in cups]}
     result = Hanging(device, [[MASS]], [[SIZE]], **array, **overrides)
     result.start(np.array([[[*offset, -SIZE[2] / 2]]]))

@@ -1,4 +1,4 @@
-"""Permutations of kernels: without code for lenses and for drawn looks, as the default's are, and with it, where a cell has them.
+"""Kernel permutations: the default's kernels have no code for lens distortion and randomized materials; cells that use these get theirs.
 
 A branch that is never taken still costs registers, and changes which products the compiler fuses with sums: the last bits of a picture.
 """

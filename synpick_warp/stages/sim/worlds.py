@@ -101,13 +101,13 @@ class SealState:
     object_in_tcp: wp.array = device_array("world", "instance", dtype=wp.transformf, unit="m")
     """Object pose in the TCP frame when the seals engaged."""
     seal_force: wp.array = device_array("world", "instance", dtype=wp.float32, unit="N")
-    """Largest tension and shear of the instance's seals in the last step, that of a seal that broke in it included; 0: no seal."""
+    """Largest force of tension and shear among the instance's seals in the last step, including seals that broke; 0 without a seal."""
     cup_force: wp.array = device_array("world", "cup", dtype=wp.float32, unit="N")
-    """The same of each cup, summed over its instances."""
+    """Force of tension and shear of each cup, summed over the instances that it holds."""
     break_force: wp.array = device_array("world", "cup", dtype=wp.float32, unit="N")
     """Break force of a cup's seals."""
     peak_force: wp.array = device_array("world", dtype=wp.float32, unit="N")
-    """Largest seal force since the tick began, that of a seal that broke included."""
+    """Largest seal force since the beginning of the tick, including seals that broke."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,4 +1,4 @@
-"""Line drawing over a rendered view, with a depth test: camera frusta to scale, their footprints and axes; hidden lines are faint."""
+"""Wireframe overlay on a rendered view, with a depth test: camera frusta to scale, their footprints and axes; hidden lines are faint."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from synpick_warp.scenes.types import Camera
 Color = tuple[int, int, int]
 """Blue, green, red."""
 _STEP = 4.0
-"""Length of the pieces whose visibility is tested [px]."""
+"""Length of the line segments whose visibility is tested [px]."""
 _SLACK = 0.004
 """Depth bias of the visibility test, relative to the distance of the point."""
 _NEAR = 0.05
@@ -20,11 +20,11 @@ _NEAR = 0.05
 _FAINT = 0.3
 """Opacity of hidden lines."""
 _EDGE = 12
-"""Samples along each side of an image border; their rays bound its footprint."""
+"""Samples per side of the image border; the rays through them outline the camera's footprint on the floor."""
 _SHIFT = 4
 """Fractional bits of OpenCV's coordinates."""
 _WIDE = 1.3
-"""Largest ratio of edge length to depth of a camera pyramid; pyramids of wider lenses are drawn less deep."""
+"""Maximum ratio of edge length to depth of a drawn frustum; those of wide-angle lenses are drawn shorter."""
 _LIFT = 1e-3
 """Height of footprints over the floor [m]."""
 

@@ -68,7 +68,7 @@ def write_cell_sheet(scene: CellScene, rig: Rig, bins: Bins, name: str, out: Pat
 
 
 def _outside_camera(scene: CellScene, cameras: tuple[Camera, ...]) -> Camera:
-    """Overview camera that has all cameras, bins and the gripper in view; its principal point is shifted so that they are centred."""
+    """Overview camera whose image contains all cameras, bins and the gripper; a shifted principal point centres them."""
     corners = np.array([corner for one in scene.sizes for corner in one.corners])
     top = (*scene.tcp[:2], scene.tcp[2] + scene.config.gripper.cup_length + scene.config.gripper.finger_length)
     points = np.concatenate([corners, [center(camera) for camera in cameras], [scene.tcp, top]])
