@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 from scipy.spatial import KDTree
+from trimesh.triangles import closest_point
 
 from synpick_warp.scenes.assets.meshes import merge_positions
 
@@ -11,6 +12,8 @@ _DENSE = 60_000
 """Points of the sample that distances are measured to."""
 _QUERIES = 2_000
 """Points of the sample, and at most as many vertices, that distances are measured from first: vertices have the tips of small features."""
+_TRIANGLES = 8
+"""Points of the dense sample to whose triangles distances are measured where those to tangent planes are too large."""
 _APPROXIMATE = 2.0
 """Relative error of the nearest point of the sample where it only has to be within a distance."""
 _NEIGHBOURS = 4
@@ -34,7 +37,7 @@ class Surface:
         rows = np.searchsorted(np.cumsum(areas), (np.arange(_DENSE) + random.random(_DENSE)) * areas.sum() / _DENSE).clip(
             max=len(areas) - 1
         )
-        self.rows = rows
+        self.corners, self.rows = corners, rows
         root, share = np.sqrt(random.random(_DENSE)), random.random(_DENSE)
         self.weights = np.stack([1.0 - root, root * (1.0 - share), root * share], axis=1)
         self.points = np.einsum("nc,nci->ni", self.weights, corners[rows])
@@ -87,8 +90,20 @@ class Surface:
             within = off if limit == np.inf else limit
             left = moved[distances[self.nearest] + self.spread > within]
             left = left[np.isinf(self.tree.query(left, eps=_APPROXIMATE, distance_upper_bound=within)[0])]
-            off = max(off, self.distances(left).max(initial=0.0))
+            far = self.distances(left)
+            beyond = far > within
+            far[beyond] = np.minimum(far[beyond], self._triangle_distances(left[beyond]))
+            off = max(off, far.max(initial=0.0))
         return float(off)
+
+    def _triangle_distances(self, points: np.ndarray) -> np.ndarray:
+        """Distances (N) of points to the triangles of the nearest points of the sample, which has gaps [m]."""
+        if not len(points):
+            return np.zeros(0)
+        index = self.tree.query(points, _TRIANGLES)[1]
+        corners = self.corners[self.rows[index]].reshape(-1, 3, 3)
+        again = np.repeat(points, _TRIANGLES, axis=0)
+        return np.linalg.norm(closest_point(corners, again) - again, axis=1).reshape(-1, _TRIANGLES).min(axis=1)
 
     def mean_distances(self, rotations: np.ndarray) -> np.ndarray:
         """Mean distances (N) of a coarse sample to another one, when rotated about the centroid by (N, 3, 3) [m]."""
