@@ -9,6 +9,8 @@ from synpick_warp.kernels.structs import BinData, CatalogData, DropData, LayoutD
 
 wp.set_module_options({"enable_backward": False})
 
+# Slack of a number of objects that is a fraction of them, for rounding.
+COUNT_ROUNDING = wp.constant(1.0e-3)
 # Height of an object's origin below which it has left the bin, through its floor or beside it [m].
 BELOW_FLOOR = wp.constant(-0.01)
 # Offset of collision shapes that must not touch anything: above whatever falls [m].
@@ -176,6 +178,7 @@ def judge_rest_kernel(
     # Scene:
     layout: LayoutData,
     settle: SettleData,
+    restless: float,
     # State:
     catalog_index: wp.array2d[int],  # (world, instance)
     displacement: wp.array2d[float],  # (world, instance) [m]
@@ -184,8 +187,8 @@ def judge_rest_kernel(
 ):
     """Count ticks at rest; after `rest_ticks` of them remove the guide walls, after as many again begin phase ACT.
 
-    A pile is at rest if no object's displacement exceeds `rest_threshold`, or `relaxed_rest_threshold` after `late_ticks`. Launched over
-    world.
+    A pile is at rest if no object's displacement exceeds `rest_threshold`, or `relaxed_rest_threshold` after `late_ticks`. Up to a fraction
+    `restless` of its objects may have displacements between the two. Launched over world.
     """
     world = wp.tid()
     if phase_inout[world] != Phase.SETTLE:
@@ -196,9 +199,17 @@ def judge_rest_kernel(
     allowed = settle.rest_threshold
     if ticks > settle.late_ticks:
         allowed = settle.relaxed_rest_threshold
+    objects = int(0)
+    moving = int(0)
     for instance in range(layout.instances):
-        if catalog_index[world, instance] >= 0 and displacement[world, instance] > allowed:
-            resting = 0
+        if catalog_index[world, instance] >= 0:
+            objects += 1
+            if displacement[world, instance] > allowed:
+                moving += 1
+            if displacement[world, instance] > wp.max(allowed, settle.relaxed_rest_threshold):
+                resting = 0
+    if float(moving) > restless * float(objects) + COUNT_ROUNDING:
+        resting = 0
     if resting >= settle.rest_ticks and ticks >= settle.min_ticks:
         if guides == 1:
             guides = 0

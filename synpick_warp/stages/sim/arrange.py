@@ -95,12 +95,13 @@ def measure_displacement(scene: SceneData, state: WorldState, physics: Physics) 
     launch(rest.measure_displacement_kernel, state.catalog_index.shape, scene, state, physics.state)
 
 
-def judge_settling(scene: SceneData, state: WorldState, physics: Physics, seed: int) -> None:
-    """Re-drop objects that left the bin or are stuck, count ticks at rest, and begin phase ACT in worlds at rest."""
+def judge_settling(scene: SceneData, state: WorldState, physics: Physics, seed: int, restless: float) -> None:
+    """Re-drop objects that left the bin or are stuck, count ticks at rest, and begin phase ACT in worlds at rest; `restless`: of
+    `settle`."""
     measure_penetration(state, physics)
     measure_displacement(scene, state, physics)
     launch(rest.redrop_objects_kernel, len(state.phase), scene, state, physics.state, seed=wp.uint64(seed))
-    launch(rest.judge_rest_kernel, len(state.phase), scene, state)
+    launch(rest.judge_rest_kernel, len(state.phase), scene, state, restless=restless)
 
 
 def judge_episodes(scene: SceneData, state: WorldState, attempts: AttemptState, observation: Observation, physics: Physics) -> None:
