@@ -191,14 +191,18 @@ class Physics:
         """Drop the captured graphs; the next tick begins eagerly, and captures them anew."""
         self._graphs = {}
 
+    @property
+    def overlap_count(self) -> wp.array:
+        """Number of pairs of shapes of all worlds whose bounding boxes overlap (one) int32; with Newton's broad phase those it keeps."""
+        return getattr(self.pipeline.broad_phase, "overlap_count", self.pipeline.broad_phase_pair_count)
+
     def flag_lost_pairs(self) -> None:
         """Flag worlds that lost broad-phase pairs: Newton drops these silently, while its solver flags overflows of contacts and rows."""
         pairs, found = self.pipeline.broad_phase_shape_pairs, self.pipeline.broad_phase_pair_count
-        overlaps = getattr(self.pipeline.broad_phase, "overlap_count", found)
         wp.launch(
             rest.flag_lost_pairs_kernel,
             dim=self.layout.worlds,
-            inputs=[pairs.shape[0], overlaps, found],
+            inputs=[pairs.shape[0], self.overlap_count, found],
             outputs=[self.solver.constraint_overflow],
             device=self.device,
         )
