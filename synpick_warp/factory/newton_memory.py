@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from synpick_warp.configs.fills import most_objects
+from synpick_warp.configs.episodes.fills import most_objects
 from synpick_warp.configs.schema import Config
 from synpick_warp.scenes.bins import GUIDES, make_bins
 from synpick_warp.scenes.build import FREE_DOFS

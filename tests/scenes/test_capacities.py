@@ -6,8 +6,8 @@ import math
 
 import pytest
 
-from synpick_warp.configs.bins import BinRow
-from synpick_warp.configs.cell import BinSizes
+from synpick_warp.configs.cell.bins import BinRow
+from synpick_warp.configs.cell.extents import BinSizes
 from synpick_warp.configs.schema import Config, Physics
 from synpick_warp.kernels.newton_patches import contact_sweep
 from synpick_warp.scenes import capacities
