@@ -259,6 +259,18 @@ def test_the_plan_is_below_what_a_bake_allocates(device, overrides, pieces, leas
     assert least * sum(sizes) < planned <= sum(sizes)
 
 
+def test_a_catalog_too_large_for_the_memory_is_refused_in_one_line(monkeypatch):
+    """What the settings alone need is free, but not what 100 bolts of two pieces need."""
+    config = settings(bake__worlds=64, **FULL | {"arrangement__counts": {"bolt": 100}, "arrangement__max_objects": 100})
+    needed = sum(term.size for term in plan_memory(config, CPU, 0))
+    monkeypatch.setattr(memory_plan, "free_host_memory", lambda: needed)
+    objects, bins = load_catalog(config), make_bins(config.cell.bins)
+    with pytest.raises(
+        ConfigError, match=r"for .*, but this machine has .* GiB free; lower (bake\.worlds|arrangement\.max_objects) \(\d+\)\Z"
+    ):
+        assembly.fit_to_catalog(config, objects, bins, wp.get_device("cpu"), SilentProgress())
+
+
 def test_without_paths_images_need_less():
     """Mode unoccluded has G-buffer and shadows, but neither coarse pixels nor histories; mode reference has not even those."""
     sizes = {}

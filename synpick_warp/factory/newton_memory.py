@@ -8,6 +8,7 @@ from synpick_warp.configs.episodes.fills import most_objects
 from synpick_warp.configs.schema import Config
 from synpick_warp.scenes.bins import GUIDES, make_bins
 from synpick_warp.scenes.build import FREE_DOFS
+from synpick_warp.scenes.capacities import FEW
 from synpick_warp.stages.arrays import Row
 
 # Allocations for each item of a world's capacities [bytes]: name, setting, size on a CPU, size on a GPU. Measured on a CPU from the growth
@@ -36,17 +37,19 @@ def newton_rows(config: Config, is_cuda: bool, pieces: int = 1) -> Iterator[tupl
         pieces: Convex pieces of each object, as far as they are known.
     """
     worlds, bodies = config.bake.worlds, most_objects(config.arrangement.counts)
+    # The capacities of many objects follow from their number.
+    many = ("bake.worlds", "arrangement.max_objects") if config.arrangement.max_objects > FEW else ()
     for name, setting, cpu, gpu in _CAPACITIES:
         count, each = getattr(config.physics, setting), gpu if is_cuda else cpu
         if name == "Newton's gripper rows":
             each += _ROW_DOF * FREE_DOFS * bodies
-        yield (name, (worlds * count,), "", worlds * count * each), (f"physics.{setting}", "bake.worlds")
+        yield (name, (worlds * count,), "", worlds * count * each), many or (f"physics.{setting}", "bake.worlds")
     if bodies:
         size = worlds * bodies * (_BODY[is_cuda] + _SHAPE * pieces)
-        yield ("Newton's bodies", (worlds * bodies,), "", size), ("bake.worlds", "arrangement.counts")
+        yield ("Newton's bodies", (worlds * bodies,), "", size), ("bake.worlds", "arrangement.max_objects")
     if config.bin or bodies:
         # A separating axis for each pair of a world's shapes, of all bins with their guide walls, and at least one for each object.
         objects = pieces * bodies or config.arrangement.max_objects
         shapes = sum(len(one.pieces) + GUIDES for one in make_bins(config.cell.bins)) + objects
         row = ("separating axes", (worlds, shapes * (shapes - 1) // 2), "", worlds * 2 * shapes * (shapes - 1))
-        yield row, ("bake.worlds",)
+        yield row, many or ("bake.worlds",)
