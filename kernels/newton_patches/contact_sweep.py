@@ -6,8 +6,6 @@ lane loads one of 32 contacts, consecutive in the order of colors, and the color
 next 32 are prefetched. The arithmetic is the solver's, bit by bit, but for the friction rows (`friction`).
 """
 
-from dataclasses import dataclass
-
 import warp as wp
 
 from synpick_warp.kernels.newton_patches.contact_rows import (
@@ -80,20 +78,7 @@ def compose_contact_sweep(rows: int, bodies: int, offsets: int, friction: str = 
     return sweep_contacts
 
 
-@dataclass(frozen=True)
-class _Rows:
-    """CUDA source of where impulses and patch lists lie: declarations, and statements before the first and after the last iteration;
-    {rows} stands for the capacity of a world.
-    """
-
-    declare: str
-    begin: str = ""
-    end: str = ""
-    prefetch: str = ""
-    """Statement for the row `next_row`, which is read 32 contacts later."""
-
-
-_SHARED = _Rows(
+_SHARED = (
     """    __shared__ float impulses[{rows}];
     __shared__ int patch_list[{rows}];""",
     """
@@ -103,18 +88,24 @@ _SHARED = _Rows(
     """
     if (ends)
         for (int i = lane; i < row_count; i += 32) contacts.impulse.data[first_row + i] = impulses[i];""",
+    "",
 )
-_GLOBAL = _Rows(
+"""CUDA source of impulses and patch lists in shared memory: declarations, statements before the first and after the last iteration, and
+where the contact 32 places further is prefetched; {rows} stands for the capacity of a world."""
+_GLOBAL = (
     """    float* const impulses = &contacts.impulse.data[first_row];
     const int* const patch_list = &contacts.patch_lists.data[first_row];""",
-    prefetch="""
+    "",
+    "",
+    """
             prefetch(&impulses[next_row]);""",
 )
+"""As `_SHARED`, in global memory."""
 
 
-def _source(rows: int, bodies: int, offsets: int, friction: str, places: _Rows) -> str:
+def _source(rows: int, bodies: int, offsets: int, friction: str, places: tuple[str, str, str, str]) -> str:
     """CUDA source of the sweep. A static body's twist is that of a slot behind the others, zero."""
-    declare, begin, end = (part.replace("{rows}", str(rows)) for part in (places.declare, places.begin, places.end))
+    declare, begin, end, prefetch = (part.replace("{rows}", str(rows)) for part in places)
     return f"""
 #if defined(__CUDA_ARCH__)
 {friction}
@@ -139,7 +130,7 @@ def _source(rows: int, bodies: int, offsets: int, friction: str, places: _Rows) 
     __syncwarp();
     for (int first = 0; first < count; first += 32) {{
         const int index = first + lane;
-{_LOAD.replace("PREFETCH", places.prefetch)}
+{_LOAD.replace("PREFETCH", prefetch)}
         unsigned starts = color_starts[first / 32];
         for (int begin = 0; begin < 32;) {{
             const int end = starts ? __ffs(starts) - 1 : 32;

@@ -41,7 +41,6 @@ from synpick_warp.system.progress import SilentProgress
 from tools.bench.compare.peers import PEERS, check_installed, measure_peers
 from tools.bench.encode import measure_encoding
 from tools.bench.growth import measure_growth
-from tools.bench.instances import measure_instances
 from tools.bench.patches import measure_patches
 from tools.bench.physics import BURST, measure_simulation, seconds_per_call
 from tools.bench.pictures import measure_pictures
@@ -221,8 +220,7 @@ def measure(
     if "trajectories" in parts:
         yield from of_part("trajectories", measure_trajectories(config, min_seconds))
     if "growth" in parts:
-        growth = measure_instances(config, instances, min_seconds) if instances else measure_growth(config, min_seconds)
-        yield from of_part("growth", growth)
+        yield from of_part("growth", measure_growth(config, min_seconds, instances))
     if "patches" in parts:
         yield from of_part("patches", measure_patches(config))
 
