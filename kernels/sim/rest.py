@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from synpick_warp.codes import Phase, Stream
+from synpick_warp.codes import Lost, Phase, Stream
 from synpick_warp.kernels.rng import stream_key
 from synpick_warp.kernels.sim.drop import choose_compartment, drop_pose, top_of_objects, write_body
 from synpick_warp.kernels.structs import BinData, CatalogData, DropData, LayoutData, SettleData
@@ -220,22 +220,30 @@ def judge_rest_kernel(
 
 
 @wp.kernel
-def flag_lost_pairs_kernel(
+def flag_lost_kernel(
     # Scene:
-    capacity: int,
+    pairs: int,
+    contacts: int,
     # State:
     overlap_count: wp.array[int],  # (one)
     pair_count: wp.array[int],  # (one)
+    contact_count: wp.array[int],  # (one)
     # Out:
     overflow_out: wp.array[wp.bool],  # (world)
+    lost_inout: wp.array[int],  # (world)
 ):
-    """Flag all worlds if the broad phase found more overlaps or shape pairs than its capacity: pairs of any world may be lost.
-
-    Launched over world.
+    """Flag all worlds if collision detection found more overlaps or shape pairs, or contacts, than its capacities: those of any world may
+    be lost. `lost` receives bits of `Lost`. Launched over world.
     """
     world = wp.tid()
-    if wp.max(overlap_count[0], pair_count[0]) > capacity:
+    lost = int(0)
+    if wp.max(overlap_count[0], pair_count[0]) > pairs:
+        lost = lost | Lost.PAIRS
+    if contact_count[0] > contacts:
+        lost = lost | Lost.CONTACTS
+    if lost != 0:
         overflow_out[world] = True
+        lost_inout[world] = lost_inout[world] | lost
 
 
 @wp.func

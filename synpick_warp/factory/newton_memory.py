@@ -11,14 +11,15 @@ from synpick_warp.scenes.build import FREE_DOFS
 from synpick_warp.scenes.capacities import FEW
 from synpick_warp.stages.arrays import Row
 
-# Allocations for each item of a world's capacities [bytes]: name, setting, size on a CPU, size on a GPU. Measured on a CPU from the growth
-# of all allocations of model, collision pipeline and solver: 928, 24, 180 and, with the options of a GPU, 952, 24, 156. On a GPU rows have
-# further arrays (solve mode "colored"): by Newton's source 109 for its graph coloring, and 128 for our packed row.
+# Allocations for each item of a world's capacities [bytes]: name, setting, size on a CPU, on a GPU, and there at least. Measured on a CPU
+# from the growth of all allocations of model, collision pipeline and solver: 928, 24, 180 and, with the options of a GPU, 952, 24, 156. On
+# a GPU rows have further arrays (solve mode "colored"): by Newton's source 109 for its graph coloring, and 128 for our packed row.
+# Contacts and pairs have at least those of `newton.Contacts` and their sorter.
 _CAPACITIES = (
-    ("Newton's contacts", "contacts_per_world", 900, 900),
-    ("Newton's shape pairs", "pairs_per_world", 24, 24),
-    ("Newton's contact rows", "rows_per_world", 160, 397),
-    ("Newton's gripper rows", "gripper_rows_per_world", 48, 40),
+    ("Newton's contacts", "contacts_per_world", 900, 900, 250),
+    ("Newton's shape pairs", "pairs_per_world", 24, 24, 16),
+    ("Newton's contact rows", "rows_per_world", 160, 397, 397),
+    ("Newton's gripper rows", "gripper_rows_per_world", 48, 40, 40),
 )
 _ROW_DOF = 16
 """Memory of a gripper's row for each degree of freedom of its world: Jacobian and response, for all of them and by body [bytes]."""
@@ -29,7 +30,8 @@ _BODY, _SHAPE = (3200, 5700), 680
 def newton_rows(config: Config, is_cuda: bool, pieces: int = 1) -> Iterator[tuple[Row, tuple[str, ...]]]:
     """Rows of Newton's arrays, each with the full keys of the settings by which it grows.
 
-    Bodies are counted where `arrangement.counts` sets their number: a volume budget may need few of them.
+    Where `arrangement.counts` sets the number of bodies, they are counted, and rows are within 10 % of what is allocated. A volume budget
+    may need few of them, and rows are a lower bound.
 
     Args:
         config: All settings.
@@ -39,8 +41,8 @@ def newton_rows(config: Config, is_cuda: bool, pieces: int = 1) -> Iterator[tupl
     worlds, bodies = config.bake.worlds, most_objects(config.arrangement.counts)
     # The capacities of many objects follow from their number.
     many = ("bake.worlds", "arrangement.max_objects") if config.arrangement.max_objects > FEW else ()
-    for name, setting, cpu, gpu in _CAPACITIES:
-        count, each = getattr(config.physics, setting), gpu if is_cuda else cpu
+    for name, setting, cpu, gpu, least in _CAPACITIES:
+        count, each = getattr(config.physics, setting), (gpu if bodies else least) if is_cuda else cpu
         if name == "Newton's gripper rows":
             each += _ROW_DOF * FREE_DOFS * bodies
         yield (name, (worlds * count,), "", worlds * count * each), many or (f"physics.{setting}", "bake.worlds")

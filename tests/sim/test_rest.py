@@ -8,7 +8,7 @@ import warp as wp
 from hypothesis import given
 from hypothesis import strategies as st
 
-from synpick_warp.codes import Ending, Phase, Stream
+from synpick_warp.codes import Ending, Lost, Phase, Stream
 from synpick_warp.kernels.sim import rest
 from synpick_warp.stages.sim import arrange
 from tests.twins import rng
@@ -354,13 +354,24 @@ def test_a_pose_that_is_no_number_ends_the_episode(device, phase, value, axis):
 
 
 @pytest.mark.parametrize("phase", [Phase.SETTLE, Phase.ACT])
-def test_a_solver_overflow_ends_the_episode(device, phase):
+@pytest.mark.parametrize(
+    ("lost", "ending"),
+    [
+        (0, Ending.SOLVER_OVERFLOW),
+        (Lost.CONTACTS, Ending.CONTACT_OVERFLOW),
+        (Lost.PAIRS, Ending.PAIR_OVERFLOW),
+        (Lost.PAIRS | Lost.CONTACTS, Ending.PAIR_OVERFLOW),
+    ],
+)
+def test_an_overflow_ends_the_episode(device, phase, lost, ending):
     worlds = made(device, worlds=2)
     worlds.begin(phase)
     worlds.set(worlds.physics.solver.constraint_overflow, [True, False])
+    worlds.set(worlds.physics.lost, [lost, 0])
     arrange.judge_episodes(worlds.scene, worlds.state, worlds.attempts, worlds.observation, worlds.physics)
-    assert state_of(worlds, 0)[:2] == (Phase.OVER, Ending.SOLVER_OVERFLOW)
+    assert state_of(worlds, 0)[:2] == (Phase.OVER, ending)
     assert state_of(worlds, 1)[:2] == (phase, Ending.RUNNING)
+    assert not worlds.physics.lost.numpy().any()
 
 
 def test_a_gripper_that_has_been_everywhere_ends_the_episode(device):

@@ -108,7 +108,7 @@ def judge_episodes(scene: SceneData, state: WorldState, attempts: AttemptState, 
     """End episodes that failed or are complete."""
     launch(endings.judge_tasks_kernel, len(state.phase), scene, state, attempts)
     overflows = {"solver_overflow": physics.solver.constraint_overflow, "perception_overflow": observation.overflow}
-    launch(endings.judge_episodes_kernel, len(state.phase), scene, state, physics.state, **overflows)
+    launch(endings.judge_episodes_kernel, len(state.phase), scene, state, physics.state, lost=physics.lost, **overflows)
 
 
 def place_bins(scene: SceneData, state: WorldState, physics: Physics) -> None:
