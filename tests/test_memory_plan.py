@@ -232,7 +232,7 @@ def test_the_gpus_memory_is_its_own(monkeypatch):
 
 
 ROOMY = {"physics__contacts_per_world": 2048, "physics__gripper_rows_per_world": 1024}
-FULL = {"objects__embedded": ["industrial"], "arrangement__max_objects": 150, "arrangement__drop": "layers"}
+FULL = {"objects__embedded": ["industrial"], "arrangement__max_objects": 150, "arrangement__drop": "layers", "bake__formats": ["zarr"]}
 
 
 @pytest.mark.parametrize(

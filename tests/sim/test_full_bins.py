@@ -26,6 +26,7 @@ def fitted(objects: Catalog, number: int, device, **overrides: object) -> Config
     """Settings of a bin with `number` of the first object, in layers."""
     counts = ((objects.entries[0].name, number, number),)
     fill = {"arrangement__counts": counts, "arrangement__max_objects": number, "arrangement__drop": "layers", "settle__restless": 0.05}
+    fill["bake__formats"] = ["zarr"]
     config = settings(**COARSE | fill | overrides)
     return fit_to_catalog(config, objects, make_bins(config.cell.bins), device, SilentProgress())
 
