@@ -36,7 +36,7 @@ def test_views_are_listed_world_by_world_and_camera_by_camera():
 def test_tile_body_masks_are_conservative(device, seed):
     toy = pile(np.random.default_rng(seed), 14)
     out, renderer = render_gbuffer(toy, device)
-    masks = renderer.bodies.body_mask.numpy()[0].copy()
+    masks = renderer.bodies.body_mask.numpy()[0, :, 0].copy()
     present = renderer.bodies.present.numpy()[0]
     assert present == 14
     expected = {name: getattr(out, name).numpy().copy() for name in ("instance", "depth", "amodal")}
