@@ -56,7 +56,7 @@ _NEWTON = (
     ("Newton's contact rows", "rows_per_world", 160, 397),
     ("Newton's gripper rows", "gripper_rows_per_world", 640, 40),
 )
-_VIEWS = ("cameras.resolution", "render.views_per_batch", "cameras.positions")
+_VIEWS = ("cameras.resolution", "render.views_per_batch", "cameras.positions", "arrangement.max_objects")
 _CAMERAS = ("cameras.resolution", "cameras.positions")
 _HISTORY = ("bake.worlds", "cameras.resolution", "render.history", "cameras.positions")
 _WORLDS = ("bake.worlds", "arrangement.max_objects", "move.rounds")

@@ -39,7 +39,7 @@ def test_tile_body_masks_are_conservative(device, seed):
     masks = renderer.bodies.body_mask.numpy()[0, :, 0].copy()
     present = renderer.bodies.present.numpy()[0]
     assert present == 14
-    expected = {name: getattr(out, name).numpy().copy() for name in ("instance", "depth", "amodal")}
+    expected = {name: getattr(out, name).numpy().copy() for name in ("instance", "depth", "mask_words")}
     renderer.bodies.body_mask.fill_(wp.uint64((1 << 14) - 1))
     zero = wp.zeros(1, dtype=wp.int32, device=device)
     renderer.rasterizer.rasterize(renderer.bodies, make_views(zero, zero, 1, toy.instances, renderer.cameras), renderer.gbuffer, out)
