@@ -11,7 +11,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-from synpick_warp.codes import Tone, names
+from synpick_warp.codes import MAX_INSTANCES, Tone, names
 from synpick_warp.configs.cell.bins import BinRow, Bins, Tote
 from synpick_warp.configs.cell.cameras import CameraRow, Cameras
 from synpick_warp.configs.cell.extents import Cell
@@ -126,7 +126,7 @@ class Arrangement:
         "(that object is left out). An object that alone is larger is never drawn.",
         choices=FILLS,
     )
-    max_objects: int = setting(24, "", "Maximum objects of an episode.", low=1, high=251)
+    max_objects: int = setting(24, "", "Maximum objects of an episode.", low=1, high=MAX_INSTANCES)
     repeat_to_fill: bool = setting(
         True, "", "Let objects repeat in an episode, as pick.repeats does, where all of the catalog together stay below the budget."
     )

@@ -39,6 +39,10 @@ TRIANGLE_THREADS = 4096
 Rasterizing triangles takes 0.10 of the 0.18 ms of a view's G-buffer."""
 BLOCK_THREADS = 16384
 """Threads that share a view's blocks of large triangles in the rasterizer (0.015 ms of a view)."""
+RUN_LANES = 32
+"""Lanes that share the columns of an amodal mask when its runs are listed: a warp."""
+CLEAR_THREADS = 4096
+"""Threads that clear the words in use of a view's amodal masks: some 30,000 in a full-HD view of a tote."""
 COUNT_THREADS = 1024
 """Threads that share the pixels of one instance in counts and boxes: enough to hide the latency of reads, few enough that their atomics do
 not contend."""

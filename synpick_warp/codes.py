@@ -14,6 +14,8 @@ from typing import Self
 
 MAX_CUPS = 16
 """Most suction cups of a gripper: the bits of a word that says which of them hold an instance."""
+MASK_ROWS = 32
+"""Rows of an image column that a word of an amodal mask covers, the first in its lowest bit."""
 MAX_DISPARITIES = 256
 """Largest number of disparities that stereo matching searches, from the smallest on [px]; a multiple of the 32 threads of a warp."""
 
@@ -246,6 +248,10 @@ class Segment(enum.IntEnum):
     TOTE = 253
     FINGER = 254
     CUP = 255
+
+
+MAX_INSTANCES = int(Segment.TABLE) - 1
+"""Most instances of a world: segmentation ids that are left beside those of `Segment`."""
 
 
 class Tone(enum.IntEnum):

@@ -13,16 +13,16 @@ import numpy as np
 import pytest
 import warp as wp
 
-from synpick_warp.codes import Effect, Measure, Phase, Status
+from synpick_warp.codes import MAX_INSTANCES, Effect, Measure, Phase, Status
 from synpick_warp.configs.cell.cameras import CameraRow
 from synpick_warp.configs.schema import LAYERS, Config
 from synpick_warp.exporters.writing.rle import find_run_boundaries, unpack_run_boundaries
 from synpick_warp.stages import host_copies, view_ring
 from synpick_warp.stages.arrays import allocate
-from synpick_warp.stages.buffers import Snapshot, ViewBuffers
+from synpick_warp.stages.buffers import Snapshot, ViewBuffers, view_buffer_sizes
 from synpick_warp.stages.host_copies import HostCopy
 from synpick_warp.stages.perception.arrays import Observation, Plan
-from synpick_warp.stages.render.mask_runs import BOUNDARIES_PER_COLUMN, FIELDS
+from synpick_warp.stages.render.mask_runs import FIELDS, boundary_sizes
 from synpick_warp.stages.render.scene import build_lights
 from synpick_warp.stages.sim import worlds
 from synpick_warp.stages.sim.simulate import TickRecord
@@ -48,14 +48,15 @@ LIGHTS = LightTable(np.array(["lamp", "even"]), np.array([[0.6, 0.0, 0.8], [0.0,
 
 @dataclass
 class FakeRenderer:
-    """Writes into each view which world and camera it was made for; remembers how it was called."""
+    """Writes into each view which world and camera it was made for, and lays out no masks; remembers how it was called."""
 
     calls: list[tuple[Any, list[int], list[int], int]]
 
     def render(self, snapshot, views, out, layers, placed=None) -> None:
         world, camera, count = views.world.numpy(), views.camera.numpy(), views.count
         self.calls.append((snapshot, world.tolist(), camera.tolist(), count))
-        for array in (*vars(out).values(), *(array for array in vars(layers).values() if array is not None)):
+        shown = [array for name, array in vars(out).items() if name not in ("mask_first", "mask_box", "mask_length")]
+        for array in (*shown, *(array for array in vars(layers).values() if array is not None)):
             values = array.numpy()
             shape = (count,) + (1,) * (values.ndim - 1)
             values[:count] = (10 * world[:count] + camera[:count] + 1).reshape(shape)
@@ -63,7 +64,7 @@ class FakeRenderer:
 
 
 def batch_of(config: Config, device: Any) -> int:
-    return views_per_batch(config.render, config.rig, config.bake.worlds, device)
+    return views_per_batch(config.render, config.rig, config.bake.worlds, config.arrangement.max_objects, device)
 
 
 def config_of(**overrides: object):
@@ -100,6 +101,9 @@ def rendered(device, live: list[int], batch: int, **overrides: object) -> tuple[
 
 def copied(batch: FrameBatch) -> dict[str, Any]:
     arrays = {name: np.array(value) for name, value in vars(batch).items() if name != "layers"}
+    # What follows the end of a list is of no meaning.
+    for runs, counts in zip(arrays["runs"], arrays["run_count"], strict=True):
+        runs[counts.sum() :] = 0
     return arrays | {"layers": {name: value.copy() for name, value in batch.layers.items()}, "length": len(batch)}
 
 
@@ -118,7 +122,7 @@ def test_live_views_come_world_by_world_and_camera_by_camera(device, live, batch
         # What pads the batch must be worlds and cameras that exist.
         assert world[count:] == camera[count:] == [0] * (batch - count)
         code = 10 * (made["episode"] - 20) + made["camera"] + 1
-        for name in ("color", "depth", "instance", "amodal", "pixels", "boxes", "effects"):
+        for name in ("color", "depth", "instance", "mask_words", "pixels", "boxes", "effects"):
             assert len(made[name]) == count
             assert (made[name].reshape(count, -1) == code[:, None]).all(), name
 
@@ -153,7 +157,7 @@ def test_layers_make_batches_smaller():
     gpu = SimpleNamespace(is_cuda=True)
     large = {"bake__worlds": 1000, "cameras__resolution": [1920, 1080]}
     count = batch_of(settings(**large, render__layers=list(LAYERS)), gpu)
-    pixel = view_ring.PIXEL_BYTES + 12 + 3 + 12 + 2 + 8 + 12 + 2 + 1 + 1 + 2
+    pixel = view_ring.PIXEL_BYTES + view_ring.MASK_BYTES + 12 + 3 + 12 + 2 + 8 + 12 + 2 + 1 + 1 + 2
     assert count * 1920 * 1080 * pixel <= view_ring.BATCH_BYTES < (count + 1) * 1920 * 1080 * pixel
 
 
@@ -177,7 +181,7 @@ def test_what_a_batch_says_of_its_views(device):
     np.testing.assert_array_equal(made["object_id"], ids[world])
     assert ids.min() == -1
     assert {made[name].dtype.name for name in ("episode", "camera", "frame", "object_id", "pixels", "boxes")} == {"int32"}
-    assert [made[name].dtype.name for name in ("time", "pose", "color", "depth", "instance", "amodal")] == [
+    assert [made[name].dtype.name for name in ("time", "pose", "color", "depth", "instance", "mask_words")] == [
         "float64",
         "float32",
         "uint8",
@@ -263,7 +267,8 @@ def test_batch_sizes():
     assert batch_of(config_of(), gpu) == 3 * WORLDS
     huge = settings(bake__worlds=1000, cameras__resolution=[1920, 1080])
     count = batch_of(huge, gpu)
-    assert count * 1920 * 1080 * view_ring.PIXEL_BYTES <= view_ring.BATCH_BYTES < (count + 1) * 1920 * 1080 * view_ring.PIXEL_BYTES
+    pixel = view_ring.PIXEL_BYTES + view_ring.MASK_BYTES
+    assert count * 1920 * 1080 * pixel <= view_ring.BATCH_BYTES < (count + 1) * 1920 * 1080 * pixel
     assert batch_of(settings(cameras__resolution=[8192, 8192]), gpu) == 1
 
 
@@ -272,7 +277,9 @@ def test_view_sizes_are_those_of_the_buffers(device):
     buffers = allocate(ViewBuffers, sizes_of(config_of(), device), device)
     assert buffers.color.shape == (views, 6, 8)
     assert buffers.pixels.shape == (views, ROOM, 3)
-    pixel = sum(wp.types.type_size_in_bytes(getattr(buffers, name).dtype) for name in ("color", "depth", "instance", "amodal"))
+    # A word covers 32 rows, of which an image of six leaves most unused; a full-HD image leaves eight of 1088.
+    assert buffers.mask_words.shape == (views, ROOM * 8)
+    pixel = sum(wp.types.type_size_in_bytes(getattr(buffers, name).dtype) for name in ("color", "depth", "instance"))
     assert pixel == view_ring.PIXEL_BYTES
 
 
@@ -352,24 +359,23 @@ def test_run_boundaries_are_those_of_the_batchs_own_images(device):
     assert sum(made["length"] for made in batches) == 12
     for made in batches:
         for view in range(made["length"]):
-            for which, image in enumerate((made["instance"][view], made["amodal"][view])):
-                count = made["boundary_count"][view, which]
-                boundaries = unpack_run_boundaries(made["boundaries"][view, which, :, :count], len(image))
-                assert len(boundaries.place) == 2 * image.shape[1]
-                for name, values in vars(find_run_boundaries(image)).items():
-                    np.testing.assert_array_equal(getattr(boundaries, name), values)
+            image, count = made["instance"][view], made["boundary_count"][view]
+            boundaries = unpack_run_boundaries(made["boundaries"][view, :, :count], len(image))
+            assert len(boundaries.place) == 2 * image.shape[1]
+            for name, values in vars(find_run_boundaries(image)).items():
+                np.testing.assert_array_equal(getattr(boundaries, name), values)
 
 
 def test_files_and_lists_stand_for_images(device):
     """JPEG and depth files equal the encoded images; images that stay on the device are copied on demand, one at a time."""
     renderer, config = FakeRenderer([]), config_of(render__views_per_batch=4)
-    host = host_copies.HostImages(("color", "depth", "instance", "amodal"), 90, depth_files=True)
+    host = host_copies.HostImages(("color", "depth", "instance", "mask_words"), 90, depth_files=True)
     frames = frame_stream(config, renderer, device, host)
     code = iter([11, 12, 13, 41, 42, 43])
     for batch in frames.render("snapshot", report_of([0, 1, 0, 0, 1])):  # type: ignore[arg-type]
         for view in range(len(batch)):
             value = next(code)
-            for name, shape in (("color", (6, 8, 3)), ("depth", (6, 8)), ("instance", (6, 8)), ("amodal", (6, 8))):
+            for name, shape in (("color", (6, 8, 3)), ("depth", (6, 8)), ("instance", (6, 8)), ("mask_words", (ROOM * 8,))):
                 image = getattr(batch, name)[view]
                 assert image.shape == shape
                 assert (image == value).all()
@@ -383,14 +389,15 @@ def test_files_and_lists_stand_for_images(device):
     ("cuda", "needs_images", "settings_", "expected"),
     [
         (False, False, {}, host_copies.HostImages(depth_files=True)),
-        (True, True, {}, host_copies.HostImages(depth_files=True)),
+        (True, True, {}, host_copies.HostImages(("mask_words",), depth_files=True)),
+        (True, True, {"cameras__resolution": [300, 287]}, host_copies.HostImages(depth_files=True)),
         (
             True,
             False,
             {"bop__split": "train_pbr", "bop__color_format": "jpg", "bop__jpeg_quality": 90},
-            host_copies.HostImages(("depth", "color", "instance", "amodal"), 90, True),
+            host_copies.HostImages(("depth", "color", "instance", "mask_words"), 90, True),
         ),
-        (True, False, {"bop__color_format": "png"}, host_copies.HostImages(("depth", "instance", "amodal"), depth_files=True)),
+        (True, False, {"bop__color_format": "png"}, host_copies.HostImages(("depth", "instance", "mask_words"), depth_files=True)),
         (True, False, {"cameras__resolution": [300, 287]}, host_copies.HostImages(("depth",), depth_files=True)),
     ],
 )
@@ -399,9 +406,11 @@ def test_what_is_copied_to_the_host(cuda, needs_images, settings_, expected):
     assert host_copies.host_images(config.bop, config.rig.largest[1], SimpleNamespace(is_cuda=cuda), needs_images, True) == expected  # type: ignore[arg-type]
 
 
-def test_the_largest_lists_are_no_larger_than_images():
+@pytest.mark.parametrize("objects", [1, 24, MAX_INSTANCES])
+def test_the_largest_lists_are_no_larger_than_images(objects):
     one, columns = np.dtype(np.uint32).itemsize * FIELDS, 7
-    assert one * BOUNDARIES_PER_COLUMN * columns <= host_copies.MIN_LISTED_ROWS * columns
+    sizes = boundary_sizes(view_buffer_sizes(1, columns, host_copies.MIN_LISTED_ROWS, objects))
+    assert one * sizes["boundary"] <= host_copies.MIN_LISTED_ROWS * columns
 
 
 def test_groups_of_cameras_take_turns_in_a_tick(device):

@@ -40,9 +40,7 @@ _NAME = re.compile(r"(?!(tote|table|pallet)$)[a-z0-9_]{1,32}")
 _MIN_COMPARTMENT = 0.03
 """Least length and width of a compartment [m]."""
 _BITS = 32
-"""Most objects of a world whose masks and relations are bits of a word."""
-PHYSICS_FORMATS = ("usd", "zarr")
-"""Formats without pictures."""
+"""Most objects of a world whose relations are bits of a word."""
 _SPLIT = re.compile(r"(train|val|test)(_[A-Za-z0-9]+)*")
 
 
@@ -96,16 +94,9 @@ def _counts(arrangement: Arrangement, distractors: int) -> Iterator[Conflict]:
 
 
 def _many(arrangement: Arrangement, bake: Bake, splits: Sequence[Split]) -> Iterator[Conflict]:
-    """Yield conflicts of worlds of many objects: pictures have a bit for each, and so has the clutter graph of modes that pick."""
-    if arrangement.max_objects <= _BITS:
-        return
-    pictures = [name for name in bake.formats if name not in PHYSICS_FORMATS]
-    if pictures or may_pick(bake, splits):
-        cause = f"the formats {', '.join(pictures)}" if pictures else "modes that pick"
-        yield (
-            "arrangement.max_objects",
-            f"at most {_BITS} with {cause}; more with bake.mode = move and the formats {' and '.join(PHYSICS_FORMATS)}",
-        )
+    """Yield conflicts of worlds of many objects: the clutter graph of modes that pick has a bit for each."""
+    if arrangement.max_objects > _BITS and may_pick(bake, splits):
+        yield "arrangement.max_objects", f"at most {_BITS} with modes that pick; more with bake.mode = move"
 
 
 def _mix(bake: Bake, splits: Sequence[Split]) -> Iterator[Conflict]:

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from msgspec import Meta, Struct
 
+from synpick_warp.codes import MAX_INSTANCES
 from synpick_warp.dataset.annotations import ADVICE
 from synpick_warp.errors import DatasetError
 from synpick_warp.exporters.trajectory.arrays import LABELS, ArraySpec
@@ -23,10 +24,10 @@ if TYPE_CHECKING:
 
 MAX_STEPS_PER_TICK = 1000
 """As in `physics.steps_per_tick`."""
-_MAX_INSTANCES, _MAX_CHUNK_TICKS = 32, 4096
-"""As in `arrangement.max_objects` and `trajectory.chunk_ticks`: an array may have one chunk that is longer than itself."""
+_MAX_CHUNK_TICKS = 4096
+"""As in `trajectory.chunk_ticks`: an array may have one chunk that is longer than itself."""
 _MAX_ARRAY = 2**36
-"""Largest array [bytes]: 64 GiB, the poses of 32 objects in 76 million steps."""
+"""Largest array [bytes]: 64 GiB, the poses of as many objects as a world has room for in 9 million steps."""
 _SMALL, _MAX_RATIO = 2**20, 1000
 """Arrays whose shape nothing else tells: size that any may have [bytes], and most bytes for each byte that is stored."""
 _FEW_STEPS, _STEPS_PER_BYTE = 100_000, 8
@@ -136,7 +137,7 @@ def _check_extent(folder: Path, free: Mapping[str, int], size: int, ticks: int |
         size: Size of the array [bytes].
         ticks: Number of frames, if it is known.
     """
-    most = {"instance": _MAX_INSTANCES, "lift_tick": ticks}
+    most = {"instance": MAX_INSTANCES, "lift_tick": ticks}
     stored = _stored_bytes(folder)
     exceeds = any(given > (most.get(name) or given) for name, given in free.items())
     if exceeds or size > _MAX_ARRAY or (free.keys() - most.keys() and size > _SMALL + _MAX_RATIO * stored):

@@ -19,9 +19,10 @@ from synpick_warp.scenes.types import Camera, Catalog, EnvironmentMap
 from synpick_warp.system.codecs.depth_png import max_data_bytes
 from synpick_warp.system.processes.shared_memory import shared_bytes
 from synpick_warp.views.frames import EpisodeEnd, FrameBatch, TickBatch
+from synpick_warp.views.masks import WORD_BYTES, most_words
 
-PIXEL_BYTES = (3, 2, 1, 4)
-"""Bytes of a pixel of `FrameBatch`'s color, depth, instance and amodal."""
+PIXEL_BYTES = (3, 2, 1)
+"""Bytes of a pixel of `FrameBatch`'s color, depth and instance."""
 LAYER_BYTES = 12
 """Bytes of a pixel of the largest layer."""
 
@@ -299,14 +300,16 @@ class Exporter(Protocol):
         ...
 
 
-def view_bytes(resolution: tuple[int, int], has_layers: bool) -> int:
+def view_bytes(resolution: tuple[int, int], objects: int, has_layers: bool) -> int:
     """Maximum size of a view's images, or of one of its layers, in the pool's shared memory [B].
 
     Args:
         resolution: Width and height [px].
+        objects: Most objects of an episode.
         has_layers: Whether layers are rendered.
     """
     width, height = resolution
     layer = (height * width * LAYER_BYTES,) if has_layers else ()
-    color, depth, *sources = (height * width * size for size in PIXEL_BYTES)
-    return max(shared_bytes((color, max(depth, max_data_bytes(width, height)), *sources)), shared_bytes(layer))
+    color, depth, instance = (height * width * size for size in PIXEL_BYTES)
+    masks = objects * most_words(width, height) * WORD_BYTES
+    return max(shared_bytes((color, max(depth, max_data_bytes(width, height)), instance, masks)), shared_bytes(layer))

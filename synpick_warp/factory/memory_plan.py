@@ -46,7 +46,7 @@ from synpick_warp.system.hardware.free_memory import free_device_memory, free_ho
 
 EPISODE_BYTES = 100
 """Lists and sets of episode indices of a bake at their peak, for each episode [bytes]: tracemalloc has 115 for two million."""
-_VIEWS = ("cameras.resolution", "render.views_per_batch", "cameras.positions")
+_VIEWS = ("cameras.resolution", "render.views_per_batch", "cameras.positions", "arrangement.max_objects")
 _CAMERAS = ("cameras.resolution", "cameras.positions")
 _HISTORY = ("bake.worlds", "cameras.resolution", "render.history", "cameras.positions")
 _WORLDS = ("bake.worlds", "arrangement.max_objects", "move.rounds")

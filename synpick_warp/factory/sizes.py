@@ -56,7 +56,7 @@ def fit_to_device(config: Config, device: wp.Device, episodes: int, writers: int
         worlds, objects = config.bake.worlds, config.arrangement.max_objects
         amounts = {
             "render.views_per_batch": max(
-                views_per_batch(config.render, config.rig, worlds, device, group) for group in range(len(config.rig.groups))
+                views_per_batch(config.render, config.rig, worlds, objects, device, group) for group in range(len(config.rig.groups))
             ),
             "perception.views": count_views(config.perception, worlds, objects, device),
             "bake.worlds": worlds,

@@ -63,7 +63,6 @@ FIELDS: Mapping[str, Callable[[ViewBatch], Any]] = {
     "depth": lambda batch: torch.from_dlpack(batch.depth).float().mul_(batch.depth_scale / MILLIMETERS).unsqueeze(1),
     "classes": _classes,
     "instances": lambda batch: torch.from_dlpack(batch.instance),
-    "amodal_bits": lambda batch: torch.from_dlpack(batch.amodal).view(torch.int32),
     "masks": lambda batch: torch.from_dlpack(batch.visible_masks()),
     "amodal_masks": lambda batch: torch.from_dlpack(batch.amodal_masks()),
     "boxes": lambda batch: _corners(batch, VISIBLE_BOX),
@@ -75,8 +74,8 @@ FIELDS: Mapping[str, Callable[[ViewBatch], Any]] = {
     "world_to_camera": lambda batch: torch.from_dlpack(batch.world_to_camera),
 }
 """Contents of a sample; names as in `dataset.pytorch.FIELDS`, with a first dimension B of views. Images: rgb (B, 3, H, W) uint8, depth
-(B, 1, H, W) float32 [m], classes (B, H, W) int64: obj_id, 0: no object; instances (B, H, W) uint8 and amodal_bits (B, H, W) int32 as
-`ViewBatch.instance` and `amodal`. One row per instance_id, present or not: object_ids (B, I) int32, below 0: none or no label; masks
+(B, 1, H, W) float32 [m], classes (B, H, W) int64: obj_id, 0: no object; instances (B, H, W) uint8 as
+`ViewBatch.instance`. One row per instance_id, present or not: object_ids (B, I) int32, below 0: none or no label; masks
 (B, I, H, W) bool, boxes (B, I, 4) float32 [px], visibility (B, I) float32, poses (B, I, 4, 4) float32, object to camera [m]. Cameras:
 intrinsics (B, 3, 3) [px], world_to_camera (B, 4, 4) [m], float32. Layers by name, as they are before quantization."""
 

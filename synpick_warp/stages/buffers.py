@@ -8,8 +8,10 @@ from typing import Any
 import warp as wp
 
 from synpick_warp.kernels.render.images.camera_effects import EffectParameters
+from synpick_warp.kernels.render.visibility.masks import InstanceMasks
 from synpick_warp.stages.arrays import allocate, device_array
 from synpick_warp.views.layers import LAYER_TABLE, Layer
+from synpick_warp.views.masks import most_words
 
 FIXTURES = ("tote", "finger", "cup")
 """Order of the dimension "fixture"; finger: the gripper shaft."""
@@ -69,8 +71,8 @@ class LastFrame:
 
 @dataclass(frozen=True, eq=False)
 class ViewBuffers:
-    """Output of the renderer for one batch of views: colour, depth in counts (0: none), instance and amodal images, pixel counts, boxes,
-    effects.
+    """Output of the renderer for one batch of views: colour, depth in counts (0: none), segmentation ids, amodal masks, pixel counts,
+    boxes, effects.
     """
 
     color: wp.array = device_array("view", "row", "column", dtype=wp.vec3ub)
@@ -79,8 +81,15 @@ class ViewBuffers:
     """Planar depth in counts of the depth scale; 0: no surface, or above 65,535 counts."""
     instance: wp.array = device_array("view", "row", "column", dtype=wp.uint8)
     """Instance segmentation: 1 + instance_id, or a `Segment`."""
-    amodal: wp.array = device_array("view", "row", "column", dtype=wp.uint32)
-    """Amodal masks: bit i: the pixel's ray hits instance i, occluded or not."""
+    mask_words: wp.array = device_array("view", "word", dtype=wp.uint32)
+    """Amodal masks: a bit a pixel for each instance in its own box, see `InstanceMasks.words`: set where the pixel's ray hits the instance,
+    occluded or not."""
+    mask_first: wp.array = device_array("view", "instance", dtype=wp.int32)
+    """Index of the first word of each mask."""
+    mask_box: wp.array = device_array("view", "instance", dtype=wp.vec4i, unit="px")
+    """Box of each mask within the image: x_min, y_min, x_max, y_max, inclusive; x_max < x_min: empty. It holds the mask, not tightly."""
+    mask_length: wp.array = device_array("view", dtype=wp.int32)
+    """Words in use."""
     pixels: wp.array = device_array("view", "instance", "count", dtype=wp.int32, unit="px")
     """BOP's px_count_all, px_count_valid, px_count_visib."""
     boxes: wp.array = device_array("view", "instance", "box", "side", dtype=wp.int32, unit="px")
@@ -90,13 +99,22 @@ class ViewBuffers:
 
 
 def view_buffer_sizes(views: int, width: int, height: int, instances: int) -> dict[str, int]:
-    """Extents of the dimensions of `ViewBuffers` and `LayerBuffers`."""
-    return {"view": views, "row": height, "column": width, "instance": instances, "count": 3, "box": 2, "side": 4}
+    """Extents of the dimensions of `ViewBuffers` and `LayerBuffers`. There are words for masks as large as the image, so none can lack."""
+    sizes = {"view": views, "row": height, "column": width, "instance": instances, "count": 3, "box": 2, "side": 4}
+    return sizes | {"word": instances * most_words(width, height)}
 
 
 def allocate_view_buffers(views: int, width: int, height: int, instances: int, device: wp.Device) -> ViewBuffers:
     """`ViewBuffers` of a batch of at most `views` views of `width` x `height` px, with space for `instances` instances of a world."""
     return allocate(ViewBuffers, view_buffer_sizes(views, width, height, instances), device)
+
+
+def masks_of(buffers: ViewBuffers | None) -> Any:
+    """The struct `InstanceMasks` of a batch's masks; None: that of no masks."""
+    masks = InstanceMasks()
+    if buffers is not None:
+        masks.words, masks.first, masks.box, masks.length = buffers.mask_words, buffers.mask_first, buffers.mask_box, buffers.mask_length
+    return masks
 
 
 def _declare_layer(layer: Layer) -> Any:

@@ -26,9 +26,9 @@ class DeviceImages:
     def __init__(self, array: wp.array) -> None:
         self.array = array
 
-    def __getitem__(self, view: int) -> np.ndarray:
-        """Copy an image to the host; waits for the device."""
-        return self.array[view].numpy()
+    def __getitem__(self, index: int | tuple[int, slice]) -> np.ndarray:
+        """Copy an image, or a part of it, to the host; waits for the device."""
+        return self.array[index].numpy()
 
 
 @dataclass(frozen=True)
@@ -46,9 +46,9 @@ class HostImages:
 def host_images(bop: Bop, height: int, device: wp.Device, needs_images: bool, depth_files: bool) -> HostImages:
     """Choose which images of a batch are copied to the host and which stay on the device.
 
-    On the CPU, or if an exporter needs all images, all are copied. Else files and run boundaries replace them; below MIN_LISTED_ROWS rows
-    only depth is left out, since lists of run boundaries may be incomplete there, and copying single images waits for the device. Depth
-    files are made on every device, so that their bytes do not depend on it.
+    On the CPU all are copied; for an exporter that needs all images, all but masks. Else files and run boundaries replace them. Below
+    MIN_LISTED_ROWS rows masks are always copied, and depth alone is left out, since lists of run boundaries may be incomplete there, and
+    copying single images waits for the device. Depth files are made on every device, so that their bytes do not depend on it.
 
     Args:
         bop: Settings of the files.
@@ -57,15 +57,17 @@ def host_images(bop: Bop, height: int, device: wp.Device, needs_images: bool, de
         needs_images: Whether an exporter reads all images.
         depth_files: Whether an exporter writes depth files.
     """
-    if not device.is_cuda or needs_images:
+    if not device.is_cuda:
         return HostImages(depth_files=depth_files)
+    if needs_images:
+        return HostImages(("mask_words",) if height >= MIN_LISTED_ROWS else (), depth_files=depth_files)
     # Without files, keypoints are the only ones to read depth.
     depth = ("depth",) if depth_files or not bop.keypoints else ()
     if height < MIN_LISTED_ROWS:
         return HostImages(depth, depth_files=depth_files)
     if bop.color_format != "jpg":
-        return HostImages((*depth, "instance", "amodal"), depth_files=depth_files)
-    return HostImages((*depth, "color", "instance", "amodal"), bop.jpeg_quality, depth_files)
+        return HostImages((*depth, "instance", "mask_words"), depth_files=depth_files)
+    return HostImages((*depth, "color", "instance", "mask_words"), bop.jpeg_quality, depth_files)
 
 
 class HostCopy:

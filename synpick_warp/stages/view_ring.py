@@ -24,16 +24,17 @@ from synpick_warp.stages.render.renderer import Renderer
 from synpick_warp.stages.render.view_setup import LENSES, PlacedCameras, allocate_view_cameras, make_views, place_cameras, place_lenses
 from synpick_warp.stages.render_streams import RenderStreams
 from synpick_warp.stages.timing import scope
+from synpick_warp.views.masks import WORD_BYTES, most_words
 
 # Size of one batch's images on a GPU [bytes]: large enough to fill the GPU, small enough for several batches in flight.
 BATCH_BYTES = 512 << 20
-# Size of color, depth, segmentation id and amodal bits of one pixel [bytes].
-PIXEL_BYTES = 3 + 2 + 1 + 4
+# Size of color, depth and segmentation id of one pixel, and size that amodal masks are counted with at least [bytes].
+PIXEL_BYTES, MASK_BYTES = 3 + 2 + 1, 4
 # Ring size of view batches: one is read while another is copied and a third is rendered.
 RING = 3
 
 
-def views_per_batch(render: Render, rig: Rig, worlds: int, device: wp.Device, group: int = 0) -> int:
+def views_per_batch(render: Render, rig: Rig, worlds: int, objects: int, device: wp.Device, group: int = 0) -> int:
     """Number of views of a group of cameras rendered at once: as set; else on a CPU one world's, on a GPU what the group's share of
     BATCH_BYTES holds, up to all worlds'.
     """
@@ -46,7 +47,8 @@ def views_per_batch(render: Render, rig: Rig, worlds: int, device: wp.Device, gr
     width, height = rig.sizes[cameras[0]]
     with dry_run() as layers:
         allocate(LayerBuffers, {"view": 1, "row": height, "column": width}, device, rig.chosen(cameras[0], render.layers))
-    each = width * height * PIXEL_BYTES + sum(layer.row[3] for layer in layers)
+    masks = max(width * height * MASK_BYTES, objects * most_words(width, height) * WORD_BYTES)
+    each = width * height * PIXEL_BYTES + masks + sum(layer.row[3] for layer in layers)
     pixels = sum(map(math.prod, rig.sizes))
     return max(1, min(BATCH_BYTES * views * width * height // (pixels * each), views * worlds))
 
@@ -54,7 +56,7 @@ def views_per_batch(render: Render, rig: Rig, worlds: int, device: wp.Device, gr
 def view_sizes(render: Render, rig: Rig, worlds: int, objects: int, device: wp.Device, group: int = 0) -> dict[str, int]:
     """Extents of `ViewBuffers` and `LayerBuffers` of a group of cameras, for `worlds` worlds of at most `objects` objects."""
     size = rig.sizes[rig.groups[group][0]]
-    return view_buffer_sizes(views_per_batch(render, rig, worlds, device, group), *size, objects)
+    return view_buffer_sizes(views_per_batch(render, rig, worlds, objects, device, group), *size, objects)
 
 
 Placements = tuple[Mapping[str, Any], Mapping[str, Any]]
@@ -214,7 +216,7 @@ class ViewRing:
         return slot
 
     def _encode(self, slot: int, count: int) -> None:
-        """Encode `count` views of a slot, on the device: run boundaries of the instance and amodal images, and JPEG and PNG data where
+        """Encode `count` views of a slot, on the device: run boundaries of ids and amodal masks, and JPEG and PNG data where
         these are enabled. Starts no copy; `launch` does.
 
         Runs on the copy stream: after these views are rendered, beside the rendering of the next batch. Batches share one scratch; the

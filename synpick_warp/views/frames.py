@@ -15,8 +15,8 @@ import numpy as np
 class Images(Protocol):
     """Images of a batch on the device, of which single ones can be copied to the host."""
 
-    def __getitem__(self, view: int) -> np.ndarray:
-        """Copy an image to the host; waits for the device."""
+    def __getitem__(self, index: int | tuple[int, slice]) -> np.ndarray:
+        """Copy an image, or a part of it, to the host; waits for the device."""
         ...
 
 
@@ -42,8 +42,15 @@ class FrameBatch:
     """Planar depth (along the optical axis) in units of `bop.depth_scale` mm; 0: no surface (B, H, W) uint16."""
     instance: np.ndarray | Images
     """Segmentation id of the nearest surface: 0 none, 1 + instance_id, or a `Segment` (B, H, W) uint8."""
-    amodal: np.ndarray | Images
-    """Amodal masks as a bit field: bit i is set where the pixel's ray hits instance i, hidden or not (B, H, W) uint32."""
+    mask_words: np.ndarray | Images
+    """Amodal masks: a bit a pixel for each instance in its own box, set where the pixel's ray hits it, hidden or not (B, W) uint32; see
+    `synpick_warp.views.masks`."""
+    mask_first: np.ndarray
+    """Index of the first word of each mask (B, I) int32."""
+    mask_box: np.ndarray
+    """Box of each mask in the image, x_min, y_min, x_max, y_max [px], inclusive, not tight; x_max < x_min: empty (B, I, 4) int32."""
+    mask_length: np.ndarray
+    """Number of words in use (B) int32."""
     object_id: np.ndarray
     """obj_id of each instance; -1: the instance is not in the scene; below: a distractor, without label (B, I) int32."""
     pose: np.ndarray
@@ -75,10 +82,13 @@ class FrameBatch:
     bin_pose: np.ndarray | None = None
     """Its pose to the world: x, y, z [m], quaternion x, y, z, w (B, 7) float32."""
     boundary_count: np.ndarray | None = None
-    """Number of run boundaries (value changes down a column) of `instance` and `amodal` (B, 2) int32; above R: `boundaries` is cut."""
+    """Number of run boundaries (value changes down a column) of `instance` (B) int32; above R: `boundaries` is cut."""
     boundaries: np.ndarray | None = None
-    """Per run boundary column · (H + 1) + row of the pixel below, value above, value below; sorted by the first (B, 2, 3, R) uint32."""
-
+    """Per run boundary column · (H + 1) + row of the pixel below; value above + 256 · value below; sorted by the first (B, 2, R) uint32."""
+    run_count: np.ndarray | None = None
+    """Number of run boundaries of each amodal mask (B, I) int32; above S in all: `runs` is cut."""
+    runs: np.ndarray | None = None
+    """Positions of the run boundaries of the amodal masks, as those of `boundaries`, mask by mask (B, S) uint32."""
     jpeg_size: np.ndarray | None = None
     """Size of each JPEG file [B] (B) int32; above F: `jpeg` is cut."""
     jpeg: np.ndarray | None = None

@@ -14,6 +14,7 @@ from synpick_warp.exporters.bop.exporter import BopExporter
 from synpick_warp.exporters.bop.shards.exporter import ShardsExporter
 from synpick_warp.views.frames import FrameBatch
 from tests.harness.exporter_contract import FRAMES, LENSES
+from tests.twins.masks import masks_of_batch
 from tests.worlds.box_sets import ATTEMPT, EPISODES, LAYERS, write_set
 from tests.worlds.box_views import OBJECT_IDS, SIZES, batches
 
@@ -48,7 +49,7 @@ def test_images_and_truth_are_those_that_were_written(data):
         assert len(view) == len(PRESENT)
         assert (view.instance_ids.tolist(), view.object_ids.tolist()) == (PRESENT.tolist(), OBJECT_IDS[PRESENT].tolist())
         np.testing.assert_array_equal(view.masks, [one.instance[0] == 1 + instance for instance in PRESENT])
-        np.testing.assert_array_equal(view.amodal_masks, [one.amodal[0] >> np.uint32(instance) & 1 for instance in PRESENT])
+        np.testing.assert_array_equal(view.amodal_masks, masks_of_batch(one)[PRESENT])
         counts = one.pixels[0][PRESENT]
         np.testing.assert_allclose(view.visibility, counts[:, 2] / np.maximum(counts[:, 0], 1))
 

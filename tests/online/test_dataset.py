@@ -46,7 +46,6 @@ def test_tensors_are_the_stream(tmp_path):
             np.testing.assert_array_equal(sample["object_ids"][there], view.object_ids)
             np.testing.assert_array_equal(sample["masks"][there], view.masks)
             np.testing.assert_array_equal(sample["amodal_masks"][there], view.amodal_masks)
-            np.testing.assert_array_equal((sample["amodal_bits"] >> np.flatnonzero(there)[:, None, None]) & 1, view.amodal_masks)
             np.testing.assert_array_equal(sample["instances"] == 1, view.masks[0])
             np.testing.assert_allclose(sample["visibility"][there], view.visibility, rtol=1e-6)
             np.testing.assert_allclose(sample["poses"][there], view.object_to_camera, atol=1e-6)

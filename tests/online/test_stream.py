@@ -45,6 +45,7 @@ def taken(stream) -> dict[tuple[int, int, int], View]:
         arrays |= {name: value.numpy().copy() for name, value in batch.layers.items()}
         for view in range(len(batch)):
             row = {name: values[view] for name, values in arrays.items()}
+            row["mask_words"] = row["mask_words"][: row["mask_length"]]  # What follows is of no meaning.
             row |= {f"host_{name}": values[view] for name, values in batch.host.items()}
             views[int(row["episode"]), int(row["camera"]), int(row["frame"])] = row
     return views

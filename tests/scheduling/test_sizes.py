@@ -32,7 +32,7 @@ GPU = SimpleNamespace(is_cuda=True, alias="cuda:0", total_memory=64 * GIB)
 
 
 def views_per_batch(config: Config, device: Any) -> int:
-    return view_ring.views_per_batch(config.render, config.rig, config.bake.worlds, device)
+    return view_ring.views_per_batch(config.render, config.rig, config.bake.worlds, config.arrangement.max_objects, device)
 
 
 @pytest.fixture

@@ -20,14 +20,16 @@ def values(difference) -> tuple[float, ...]:
 
 
 def test_every_output_has_a_tolerance():
-    assert {item.name for item in fields(ViewBuffers)} | set(LAYERS) == {*tool.TOLERANCES, "color"}
+    arrays = {item.name for item in fields(ViewBuffers)}
+    assert arrays - set(tool.PACKED) | set(LAYERS) | {"masks"} == {*tool.TOLERANCES, "color"}
+    assert set(tool.PACKED) < arrays
     assert set(tool.COLORS) == set(RENDER_MODES)
 
 
 def test_equal_outputs_do_not_differ():
     for name, array in (
         ("color", np.full((1, 2, 5, 3), 7, np.uint8)),
-        ("amodal", np.full((1, 2, 5), 2**32 - 1, np.uint32)),
+        ("masks", np.full((1, 2, 5, 3), True)),
         ("boxes", np.full((1, 2, 2, 4), -1, np.int32)),
         ("flow", np.full((1, 2, 5, 2), np.nan, np.float32)),
     ):
@@ -48,10 +50,10 @@ def test_a_pixel_differs_if_one_of_its_channels_does():
 
 
 def test_labels_are_equal_or_not():
-    a = np.zeros((1, 2, 5), np.uint32)
+    a = np.zeros((1, 2, 5, 3), bool)
     b = a.copy()
-    b[0, 0, 0] = 2**31
-    assert values(tool.compare(REFERENCE, "amodal", a, b)) == pytest.approx((10.0, 0.1, 1.0, 10.0))
+    b[0, 0, 0, 2] = True
+    assert values(tool.compare(REFERENCE, "masks", a, b)) == pytest.approx((10.0, 0.1, 1.0, 10.0))
 
 
 def test_a_rounded_depth_may_be_one_count_off():

@@ -14,26 +14,22 @@ def box_of(mask: np.ndarray, origin: tuple[int, int] = (0, 0)) -> tuple[int, int
     return int(columns.min()) + left, int(rows.min()) + top, int(columns.max()) + left, int(rows.max()) + top
 
 
-def count_pixels(
-    instance: np.ndarray, depth: np.ndarray, amodal: np.ndarray, canvas: np.ndarray, count: int
-) -> tuple[np.ndarray, np.ndarray]:
+def count_pixels(instance: np.ndarray, depth: np.ndarray, masks: np.ndarray, canvas: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Expected pixel counts and boxes of one view.
 
     Args:
         instance: Segmentation ids (H, W).
         depth: Counts (H, W).
-        amodal: Bit i: instance i (H, W).
-        canvas: Amodal bits (3H, 3W), with the image in the middle.
-        count: Number of instances.
+        masks: Amodal masks (I, H, W) bool.
+        canvas: Amodal masks (I, 3H, 3W) bool, with the image in the middle.
 
     Returns:
-        px_count_all, px_count_valid, px_count_visib (count, 3); bbox_obj and bbox_visib (count, 2, 4).
+        px_count_all, px_count_valid, px_count_visib (I, 3); bbox_obj and bbox_visib (I, 2, 4).
     """
     height, width = instance.shape
-    pixels, boxes = np.zeros((count, 3), int), np.zeros((count, 2, 4), int)
-    for i in range(count):
-        bit = np.uint32(1) << np.uint32(i)
-        full, inside, visible = (canvas & bit) != 0, (amodal & bit) != 0, instance == 1 + i
+    pixels, boxes = np.zeros((len(masks), 3), int), np.zeros((len(masks), 2, 4), int)
+    for i, (full, inside) in enumerate(zip(canvas, masks, strict=True)):
+        visible = instance == 1 + i
         pixels[i] = full.sum(), (inside & (depth != 0)).sum(), visible.sum()
         boxes[i] = box_of(full, (-width, -height)), box_of(visible)
     return pixels, boxes

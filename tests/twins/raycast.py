@@ -48,9 +48,8 @@ def cast_mesh(mesh: TriangleMesh, pose: np.ndarray, camera: Camera) -> np.ndarra
 
 
 def cast_scene(meshes: list[TriangleMesh], poses: list[np.ndarray], camera: Camera) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Depth (H, W) float64 [m], inf: a miss; segmentation ids (H, W), 0 or 1 + index; amodal bits (H, W) uint32."""
+    """Depth (H, W) float64 [m], inf: a miss; segmentation ids (H, W), 0 or 1 + index; amodal masks (N, H, W) bool."""
     depths = np.stack([cast_mesh(mesh, pose, camera) for mesh, pose in zip(meshes, poses, strict=True)])
     depth = depths.min(axis=0)
     instance = np.where(np.isfinite(depth), 1 + depths.argmin(axis=0), 0).astype(np.uint8)
-    bits = np.isfinite(depths) * (np.uint32(1) << np.arange(len(meshes), dtype=np.uint32))[:, None, None]
-    return depth, instance, bits.sum(axis=0).astype(np.uint32)
+    return depth, instance, np.isfinite(depths)

@@ -13,6 +13,7 @@ from synpick_warp.codes import Effect, Ending, Segment
 from synpick_warp.configs.schema import Bop, Cameras, Config, Render
 from synpick_warp.scenes.types import Camera, Catalog, CatalogEntry, Material, TriangleMesh
 from synpick_warp.views.frames import EpisodeEnd, FrameBatch, TickBatch
+from tests.twins.masks import pack_masks
 
 ROOM = 5
 """Instance capacity of a world; instances 1 and 4 do not exist."""
@@ -166,7 +167,7 @@ def _view(episode: int, frame: int, index: int, camera: Camera, depth_scale: flo
         "color": np.stack([shade, shade[::-1], np.full_like(shade, 90)], axis=-1),
         "depth": np.rint(depth * 1000 / depth_scale).astype(np.uint16),
         "instance": instance,
-        "amodal": sum(np.isfinite(inner[i]).astype(np.uint32) << np.uint32(i) for i in range(ROOM)),
+        **pack_masks(np.isfinite(inner)),
         "object_id": OBJECT_IDS,
         "pose": pose,
         "pixels": pixels,

@@ -19,6 +19,7 @@ from synpick_warp.stages.buffers import Snapshot, ViewBuffers, allocate_view_buf
 from synpick_warp.stages.render.renderer import Renderer
 from synpick_warp.stages.render.scene import RenderScene, build_render_scene
 from synpick_warp.stages.render.view_setup import make_views
+from tests.twins.masks import bits_of, masks_of_buffers
 
 GREY = Material(color=(0.7, 0.7, 0.7), texture=None, metallic=0.0, roughness=0.8)
 DOWN = np.diag([1.0, -1.0, -1.0])
@@ -170,7 +171,8 @@ class RenderedViews:
     color: np.ndarray
     depth: np.ndarray
     instance: np.ndarray
-    amodal: np.ndarray
+    masks: np.ndarray
+    """Amodal mask of each instance (B, I, H, W) bool."""
     pixels: np.ndarray
     boxes: np.ndarray
     exact_depth: np.ndarray
@@ -178,6 +180,11 @@ class RenderedViews:
     radiance: np.ndarray
     resolve: np.ndarray
     """Anti-aliasing resolve codes, see `ShadedImage` (B, H, W) uint32."""
+
+    @property
+    def amodal(self) -> np.ndarray:
+        """Bit i: the mask of instance i (B, H, W) uint32."""
+        return bits_of(self.masks)
 
 
 def snapshot(toy: ToyScene, device: wp.Device) -> Snapshot:
@@ -218,7 +225,8 @@ def render(toy: ToyScene, device: wp.Device) -> RenderedViews:
     view_world = wp.array(np.repeat(np.arange(worlds), cameras), dtype=wp.int32, device=device)
     view_camera = wp.array(np.tile(np.arange(cameras), worlds), dtype=wp.int32, device=device)
     renderer.render(snapshot(toy, device), make_views(view_world, view_camera, views, toy.instances), out)
-    images = {name: getattr(out, name).numpy() for name in ("color", "depth", "instance", "amodal", "pixels", "boxes")}
+    images = {name: getattr(out, name).numpy() for name in ("color", "depth", "instance", "pixels", "boxes")}
+    images["masks"] = masks_of_buffers(out)
     shown = renderer.image
     return RenderedViews(
         **images, exact_depth=renderer.gbuffer.depth.numpy(), radiance=shown.radiance.numpy(), resolve=shown.resolve.numpy()

@@ -34,6 +34,7 @@ from synpick_warp.stages.render.view_setup import first_views
 from synpick_warp.stages.sim.physics import with_enough_worlds
 from synpick_warp.stages.sim.simulate import Simulation
 from synpick_warp.system.hardware.device import pick_device
+from synpick_warp.views.masks import paint_masks
 from tools.options import configure, fail, make_parser, write_json
 from tools.reports.render_piles import next_frame, settle_piles
 
@@ -58,9 +59,11 @@ class Tolerance:
     unit: str = ""
 
 
+PACKED = ("mask_words", "mask_first", "mask_box", "mask_length")
+"""Outputs that are compared as the masks that they are."""
 TOLERANCES = {
     "instance": Tolerance(None, 0.05),
-    "amodal": Tolerance(None, 0.1),
+    "masks": Tolerance(None, 0.1),
     "classes": Tolerance(None, 0.05),
     "depth": Tolerance(1.0, 0.05, "counts"),
     "pixels": Tolerance(4.0, 1.0, "px"),
@@ -195,6 +198,10 @@ def render_views(renderer: Renderer, snapshot: Snapshot) -> dict[str, np.ndarray
     out, layers = allocate(ViewBuffers, sizes, device), allocate(LayerBuffers, sizes, device, LAYERS)
     renderer.render(snapshot, first_views(renderer.views, scene.camera_count, renderer.instances, device), out, layers)
     images = {item.name: getattr(out, item.name).numpy() for item in fields(ViewBuffers)}
+    packed = [images.pop(name) for name in PACKED]
+    words, first, box = packed[:3]
+    masks = [paint_masks(words[view], first[view], box[view], scene.width, scene.height) for view in range(len(words))]
+    images["masks"] = np.moveaxis(np.array(masks), 1, -1)
     return images | {name: getattr(layers, name).numpy() for name in LAYERS}
 
 

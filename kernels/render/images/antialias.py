@@ -5,16 +5,31 @@ the whole footprint. Where they do not, coverage rays within the footprint find 
 whichever of the four pixels shows that surface; so a ray costs no shading. Textures are filtered already.
 """
 
+from typing import Any
+
 import warp as wp
 
 from synpick_warp.codes import Segment
 from synpick_warp.kernels.render.lighting.plane_distance import Plane, plane_distance, tangent_plane
 from synpick_warp.kernels.render.lighting.sampling import UNIT, reverse_bits
-from synpick_warp.kernels.render.visibility.bvh_rays import hit_table, trace_bodies
+from synpick_warp.kernels.render.visibility.bvh_rays import hit_table, no_hit, trace_bodies
 from synpick_warp.kernels.render.visibility.camera import AnyViews, ImageGrid, clamp_index, in_image, loop_ray, tile_of, tile_pixel
-from synpick_warp.kernels.render.visibility.gbuffer import GBuffer, Hit, Meshes, Table, ViewBodies, body_of, face_normal, triangle_normal
-from synpick_warp.kernels.render.visibility.variants import kernel_of_views
+from synpick_warp.kernels.render.visibility.gbuffer import (
+    MASK_BITS,
+    GBuffer,
+    Hit,
+    Meshes,
+    Table,
+    ViewBodies,
+    body_of,
+    face_normal,
+    segment_of,
+    triangle_normal,
+)
+from synpick_warp.kernels.render.visibility.variants import VARIANTS, kernel_of_views
 from synpick_warp.kernels.tuning import RAY_REGISTERS
+
+AnyCrowd = Any
 
 wp.set_module_options({"enable_backward": False, "fast_math": True})
 
@@ -237,6 +252,23 @@ def corner_column(column: int, corner: int) -> int:
     return column - 1 + corner % 2
 
 
+@wp.struct
+class FewBodies:
+    """Marks views whose bodies fit a word of `ViewBodies.body_mask`, without its highest bit."""
+
+    words: int
+
+
+@wp.struct
+class ManyBodies:
+    """Marks views whose bodies take several words of `ViewBodies.body_mask`."""
+
+    words: int
+
+
+VARIANTS["crowd"] = FewBodies, ManyBodies
+
+
 @wp.func
 def visible_bodies(gbuffer: GBuffer, grid: ImageGrid, view: int, row: int, column: int, instances: int) -> wp.uint64:
     """Bit mask, by body index, of the bodies that a footprint's corners show."""
@@ -254,7 +286,7 @@ def visible_bodies(gbuffer: GBuffer, grid: ImageGrid, view: int, row: int, colum
 @wp.func
 def filter_body_mask(bodies: ViewBodies, view: int, tile: int, visible: wp.uint64) -> wp.uint64:
     """Body mask of a tile without the bodies that have no bit in `visible`: rays test no others."""
-    body_mask = bodies.body_mask[view, tile]
+    body_mask = bodies.body_mask[view, tile, 0]
     result = wp.uint64(0)
     rank = int(0)
     while (body_mask >> wp.uint64(rank)) != wp.uint64(0):
@@ -264,6 +296,77 @@ def filter_body_mask(bodies: ViewBodies, view: int, tile: int, visible: wp.uint6
                 result = result | bit
         rank += 1
     return result
+
+
+@wp.func
+def visible_segments(gbuffer: GBuffer, grid: ImageGrid, view: int, row: int, column: int) -> wp.vec4i:
+    """Segmentation ids at a footprint's corners; a corner outside the image has that of another."""
+    segments = wp.vec4i(0, 0, 0, 0)
+    for corner in range(FOOTPRINT_PIXELS):
+        r = clamp_index(corner_row(row, corner), grid.height)
+        segments[corner] = int(gbuffer.segment[view, r, clamp_index(corner_column(column, corner), grid.width)])
+    return segments
+
+
+@wp.func
+def filter_word(bodies: ViewBodies, view: int, tile: int, word: int, segments: wp.vec4i, instances: int) -> wp.uint64:
+    """Word of a tile's body mask without the bodies that have none of these segmentation ids."""
+    result = wp.uint64(0)
+    left = bodies.body_mask[view, tile, word]
+    bit = wp.uint64(1)
+    rank = word * MASK_BITS
+    while left != wp.uint64(0):
+        if (left & wp.uint64(1)) != wp.uint64(0):
+            segment = segment_of(bodies.order[view, rank], instances)
+            if segment == segments[0] or segment == segments[1] or segment == segments[2] or segment == segments[3]:
+                result = result | bit
+        left = left >> wp.uint64(1)
+        bit = bit << wp.uint64(1)
+        rank += 1
+    return result
+
+
+@wp.func
+def trace_visible(
+    crowd: FewBodies,
+    meshes: Meshes,
+    bodies: ViewBodies,
+    gbuffer: GBuffer,
+    grid: ImageGrid,
+    view: int,
+    row: int,
+    column: int,
+    tile: int,
+    ray: wp.vec3,
+    instances: int,
+) -> Hit:
+    """Closest hit of a coverage ray among the bodies that its footprint's corners show."""
+    visible = visible_bodies(gbuffer, grid, view, row, column, instances)
+    body_mask = filter_body_mask(bodies, view, tile, visible)
+    return trace_bodies(meshes, bodies, view, 0, body_mask, ray, instances, no_hit())
+
+
+@wp.func
+def trace_visible(  # noqa: F811
+    crowd: ManyBodies,
+    meshes: Meshes,
+    bodies: ViewBodies,
+    gbuffer: GBuffer,
+    grid: ImageGrid,
+    view: int,
+    row: int,
+    column: int,
+    tile: int,
+    ray: wp.vec3,
+    instances: int,
+) -> Hit:
+    """Closest hit of a coverage ray among the bodies that its footprint's corners show, word by word."""
+    segments = visible_segments(gbuffer, grid, view, row, column)
+    hit = no_hit()
+    for word in range(crowd.words):
+        body_mask = filter_word(bodies, view, tile, word, segments, instances)
+        hit = trace_bodies(meshes, bodies, view, word * MASK_BITS, body_mask, ray, instances, hit)
+    return hit
 
 
 @wp.func
@@ -324,6 +427,7 @@ def resolve_footprints_kernel(
     views: AnyViews,
     samples: int,
     threads: int,
+    crowd: AnyCrowd,
     # Out:
     resolve_inout: wp.array3d[wp.uint32],  # (view, row, column)
 ):
@@ -352,9 +456,7 @@ def resolve_footprints_kernel(
         if in_image(grid, r, c):
             offset = sample_offset(sample, samples)
             ray = loop_ray(views.cameras, intrinsics, view, r, c, offset)
-            visible = visible_bodies(gbuffer, grid, view, row, column, views.instances)
-            body_mask = filter_body_mask(bodies, view, tile_of(grid, r, c), visible)
-            hit = trace_bodies(meshes, bodies, view, body_mask, ray, views.instances)
+            hit = trace_visible(crowd, meshes, bodies, gbuffer, grid, view, row, column, tile_of(grid, r, c), ray, views.instances)
             hit = hit_table(table, views.cameras, view, ray, hit)
             normal = wp.vec3(0.0, 0.0, 0.0)
             if hit.segment != Segment.NOTHING:

@@ -5,6 +5,7 @@ import warp as wp
 from synpick_warp.kernels.render.visibility.bvh_rays import hits_body
 from synpick_warp.kernels.render.visibility.camera import AnyViews, ImageGrid, border_ray, in_image
 from synpick_warp.kernels.render.visibility.gbuffer import Meshes, ViewBodies
+from synpick_warp.kernels.render.visibility.masks import ROWS, InstanceMasks, count_words, read_mask
 from synpick_warp.kernels.render.visibility.variants import kernel_of_views
 
 wp.set_module_options({"enable_backward": False})
@@ -63,13 +64,10 @@ def merge_box(
 
 @wp.kernel
 def count_image_pixels_kernel(
-    # Scene:
-    grid: ImageGrid,
     # In:
-    bodies: ViewBodies,
     instance_image: wp.array3d[wp.uint8],  # (view, row, column)
     depth_image: wp.array3d[wp.uint16],  # (view, row, column)
-    amodal_image: wp.array3d[wp.uint32],  # (view, row, column)
+    masks: InstanceMasks,
     threads: int,
     # Out:
     pixels_inout: wp.array3d[int],  # (view, instance, count)
@@ -78,36 +76,31 @@ def count_image_pixels_kernel(
     """Count an instance's pixels inside the image and extend its boxes: reduction in registers, then one atomic operation per thread.
 
     `pixels_inout` is increased by the three counts, `boxes_inout` is extended by the amodal and the visible pixels. Launched over view,
-    instance, thread: `threads` threads stride over the projected box of an instance.
+    instance, thread: `threads` threads stride over the words of an instance's mask.
     """
     view, instance, thread = wp.tid()
-    box = bodies.box[view, instance]
-    left = wp.max(box[0], 0)
-    top = wp.max(box[1], 0)
-    right = wp.min(box[2], grid.width - 1)
-    bottom = wp.min(box[3], grid.height - 1)
-    columns = right - left + 1
-    rows = bottom - top + 1
-    if columns <= 0 or rows <= 0:
-        return
-    bit = wp.uint32(1) << wp.uint32(instance)
+    mask = read_mask(masks, view, instance)
     segment = wp.uint8(instance + 1)
     amodal = int(0)
     valid = int(0)
     visible = int(0)
     amodal_box = wp.vec4i(UNSET, UNSET, -UNSET, -UNSET)
     visible_box = wp.vec4i(UNSET, UNSET, -UNSET, -UNSET)
-    for i in range(thread, rows * columns, threads):
-        row = top + i // columns
-        column = left + i % columns
-        if (amodal_image[view, row, column] & bit) != wp.uint32(0):
-            amodal += 1
-            amodal_box = extend_box(amodal_box, row, column)
-            if depth_image[view, row, column] != wp.uint16(0):
-                valid += 1
-            if instance_image[view, row, column] == segment:
-                visible += 1
-                visible_box = extend_box(visible_box, row, column)
+    for i in range(thread, count_words(mask), threads):
+        word = masks.words[view, mask.first + i]
+        row = mask.top + i // mask.columns * ROWS
+        column = mask.left + i % mask.columns
+        while word != wp.uint32(0):
+            if (word & wp.uint32(1)) != wp.uint32(0):
+                amodal += 1
+                amodal_box = extend_box(amodal_box, row, column)
+                if depth_image[view, row, column] != wp.uint16(0):
+                    valid += 1
+                if instance_image[view, row, column] == segment:
+                    visible += 1
+                    visible_box = extend_box(visible_box, row, column)
+            word = word >> wp.uint32(1)
+            row += 1
     if amodal > 0:
         wp.atomic_add(pixels_inout, view, instance, ALL, amodal)
         wp.atomic_add(pixels_inout, view, instance, VALID, valid)

@@ -1,9 +1,10 @@
-"""Per-view ground truth on the device: gather of each view's episode, camera, object ids and poses; masks from ids and amodal bits."""
+"""Per-view ground truth on the device: gather of each view's episode, camera, object ids and poses; a mask image per instance."""
 
 import warp as wp
 
 from synpick_warp.kernels.render.images.layers import position_of, rotation_of
 from synpick_warp.kernels.render.visibility.camera import AnyViews
+from synpick_warp.kernels.render.visibility.masks import InstanceMasks, has_pixel, read_mask
 from synpick_warp.kernels.render.visibility.variants import kernel_of_views
 
 wp.set_module_options({"enable_backward": False})
@@ -91,17 +92,17 @@ def gather_objects_kernel(
 def expand_masks_kernel(
     # In:
     instance: wp.array3d[wp.uint8],  # (view, row, column)
-    amodal: wp.array3d[wp.uint32],  # (view, row, column)
+    masks: InstanceMasks,
     is_amodal: bool,
     # Out:
     mask_out: wp.array4d[wp.bool],  # (view, instance, row, column)
 ):
-    """Make one binary mask per instance: visible masks from the id image or, if `is_amodal`, amodal masks from the bit field.
+    """Make one binary mask per instance: visible masks from the id image or, if `is_amodal`, amodal masks from their boxes.
 
     Launched over view, instance, row, column.
     """
     view, index, row, column = wp.tid()
     if is_amodal:
-        mask_out[view, index, row, column] = ((amodal[view, row, column] >> wp.uint32(index)) & wp.uint32(1)) != wp.uint32(0)
+        mask_out[view, index, row, column] = has_pixel(masks, view, read_mask(masks, view, index), row, column)
     else:
         mask_out[view, index, row, column] = int(instance[view, row, column]) == index + 1

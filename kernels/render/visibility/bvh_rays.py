@@ -7,7 +7,7 @@ import warp as wp
 
 from synpick_warp.codes import Segment
 from synpick_warp.kernels.render.visibility.camera import AnyCameras
-from synpick_warp.kernels.render.visibility.gbuffer import FAR, Hit, Interior, Meshes, Table, ViewBodies, segment_of
+from synpick_warp.kernels.render.visibility.gbuffer import FAR, MASK_BITS, Hit, Interior, Meshes, Table, ViewBodies, segment_of
 from synpick_warp.kernels.render.visibility.ray_bodies import first_ray_record, read_ray_body
 from synpick_warp.kernels.render.visibility.records import read_record
 from synpick_warp.kernels.render.visibility.wide_bvh import query_any_hit, query_closest_hit
@@ -66,20 +66,30 @@ def hits_body(meshes: Meshes, bodies: ViewBodies, view: int, body: int, ray: wp.
 
 
 @wp.func
+def no_hit() -> Hit:
+    """Hit of a ray that meets nothing."""
+    hit = Hit()
+    hit.segment = Segment.NOTHING
+    hit.depth = FAR
+    return hit
+
+
+@wp.func
 def trace_bodies(
     meshes: Meshes,
     bodies: ViewBodies,
     view: int,
+    first: int,
     body_mask: wp.uint64,
     ray: wp.vec3,
     instances: int,
+    nearest: Hit,
 ) -> Hit:
-    """Closest hit of a camera ray among the bodies in a mask, as in `ViewBodies.body_mask`; front to back, so that most are skipped."""
-    best = Hit()
-    best.segment = Segment.NOTHING
-    best.depth = FAR
+    """Closest hit of a camera ray among the bodies in a word of `ViewBodies.body_mask`, front to back, so that most are skipped; `nearest`
+    unless one of them is nearer. `first`: rank of the lowest bit."""
+    best = nearest
     left = body_mask
-    rank = int(0)
+    rank = int(first)
     while left != wp.uint64(0):
         # Each ray goes on to its next body by itself: rays of a warp then traverse BVHs at the same time, even of different bodies.
         while (left & wp.uint64(1)) == wp.uint64(0):
@@ -106,7 +116,10 @@ def trace_bodies(
 @wp.func
 def trace_camera_ray(meshes: Meshes, bodies: ViewBodies, view: int, tile: int, ray: wp.vec3, instances: int) -> Hit:
     """Closest hit of a camera ray among the bodies that its tile can show."""
-    return trace_bodies(meshes, bodies, view, bodies.body_mask[view, tile], ray, instances)
+    best = no_hit()
+    for word in range(bodies.body_mask.shape[2]):
+        best = trace_bodies(meshes, bodies, view, MASK_BITS * word, bodies.body_mask[view, tile, word], ray, instances, best)
+    return best
 
 
 @wp.func

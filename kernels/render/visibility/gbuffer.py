@@ -15,6 +15,10 @@ MAX_COUNTS = wp.constant(65535.0)
 """Largest value of a 16-bit depth image."""
 
 
+MASK_BITS = wp.constant(64)
+"""Bodies of a word of `ViewBodies.body_mask`."""
+
+
 @wp.struct
 class Interior:
     """Empty interior of the tote: a convex region in its own frame that no triangle reaches into, open at the top; see
@@ -102,8 +106,8 @@ class ViewBodies:
     """(view): number of present bodies."""
     uses_background: wp.array[int]
     """(view): 1: the tote has the pose at which the cached static background was rendered."""
-    body_mask: wp.array2d[wp.uint64]
-    """(view, tile): bit k: rays through the tile can hit body order[k]."""
+    body_mask: wp.array3d[wp.uint64]
+    """(view, tile, word): bit k of word w: rays through the tile can hit body order[64 w + k]."""
 
 
 @wp.struct

@@ -22,6 +22,7 @@ from synpick_warp.kernels.render.visibility.gbuffer import (
     segment_of,
     store_hit,
 )
+from synpick_warp.kernels.render.visibility.masks import InstanceMasks, Mask, add_pixel, read_mask
 from synpick_warp.kernels.render.visibility.triangles import Footprint, Triangle, camera_triangle, find_footprint, ray_weights, row_span
 from synpick_warp.kernels.render.visibility.variants import kernel_of_views
 
@@ -31,8 +32,9 @@ EMPTY = wp.constant(wp.uint64(0xFFFFFFFFFFFFFFFF))
 """Cleared value of the visibility buffer: no triangle."""
 DEPTH_BITS = wp.constant(wp.uint64(32))
 """Position of the depth in a visibility key: the upper half, so that the minimum is the nearest sample."""
-TRIANGLE_BITS = wp.constant(wp.uint32(26))
-"""Position of the row of `ViewBodies` in the lower half, above the triangle index: it breaks ties of depth."""
+TRIANGLE_BITS = wp.constant(wp.uint32(24))
+"""Position of the row of `ViewBodies` in the lower half, above the triangle index: it breaks ties of depth. A row takes 8 bits: instances
+and fixtures have an id each."""
 MAX_TRIANGLES = 1 << int(TRIANGLE_BITS)
 """Maximum number of triangles of a mesh."""
 SMALL_PIXELS = wp.constant(256)
@@ -60,18 +62,18 @@ class VisibilityBuffer:
 @wp.func
 def write_sample(
     visibility: VisibilityBuffer,
-    amodal: wp.array3d[wp.uint32],
+    masks: InstanceMasks,
     view: int,
     row: int,
     column: int,
     triangle: Triangle,
     ray: wp.vec3,
     low_half: wp.uint64,
-    bit: wp.uint32,
+    mask: Mask,
 ):
-    """Depth test by atomic min where a pixel's ray hits a triangle, and atomic or of the instance's amodal bit.
+    """Depth test by atomic min where a pixel's ray hits a triangle, and atomic or of the pixel's bit in the instance's amodal mask.
 
-    `low_half` is the lower half of the key, `bit` the instance's bit in the amodal image (0: none).
+    `low_half` is the lower half of the key.
     """
     weights = ray_weights(triangle, ray)
     if weights[0] >= 0.0:
@@ -80,8 +82,7 @@ def write_sample(
             key = (wp.uint64(wp.cast(depth, wp.uint32)) << DEPTH_BITS) | low_half
             # Reading first, to skip atomics that change nothing, costs more: a thread waits for reads, but not for atomics without result.
             wp.atomic_min(visibility.nearest, view, row, column, key)
-            if amodal and bit != wp.uint32(0):
-                wp.atomic_or(amodal, view, row, column, bit)
+            add_pixel(masks, view, mask, row, column)
 
 
 @wp.func
@@ -91,17 +92,9 @@ def pack_low_half(body: int, triangle: int) -> wp.uint64:
 
 
 @wp.func
-def amodal_bit(body: int, instances: int) -> wp.uint32:
-    """Bit of an instance in the amodal image; 0 for fixtures."""
-    if body < instances:
-        return wp.uint32(1) << wp.uint32(body)
-    return wp.uint32(0)
-
-
-@wp.func
 def rasterize_footprint(
     visibility: VisibilityBuffer,
-    amodal: wp.array3d[wp.uint32],
+    masks: InstanceMasks,
     cameras: AnyCameras,
     intrinsics: wp.vec4,
     view: int,
@@ -109,7 +102,7 @@ def rasterize_footprint(
     triangle: Triangle,
     footprint: Footprint,
     low_half: wp.uint64,
-    bit: wp.uint32,
+    mask: Mask,
 ):
     """Scanline loop: `write_sample` for the pixels of a footprint within the box `pixels` (x_min, y_min, x_max, y_max, inclusive).
 
@@ -127,7 +120,7 @@ def rasterize_footprint(
         if column > last:
             break
         ray = loop_ray(cameras, intrinsics, view, row, column, wp.vec2(0.0, 0.0))
-        write_sample(visibility, amodal, view, row, column, triangle, ray, low_half, bit)
+        write_sample(visibility, masks, view, row, column, triangle, ray, low_half, mask)
         column += 1
 
 
@@ -153,9 +146,8 @@ def clear_visibility_kernel(
     first: int,
     # Out:
     visibility_out: VisibilityBuffer,
-    amodal_out: wp.array3d[wp.uint32],  # (view, row, column)
 ):
-    """Clear visibility buffer, amodal bits (unless null) and the work list; unused views (camera -1) keep theirs.
+    """Clear visibility buffer and the work list; unused views (camera -1) keep theirs.
 
     Launched over view, pixel (tile order, from flat index `first` on).
     """
@@ -163,8 +155,6 @@ def clear_visibility_kernel(
     if not in_image(grid, row, column) or views.camera[view] < 0:
         return
     visibility_out.nearest[view, row, column] = EMPTY
-    if amodal_out:
-        amodal_out[view, row, column] = wp.uint32(0)
     if row == 0 and column == 0:
         visibility_out.blocks[view] = 0
 
@@ -181,9 +171,9 @@ def rasterize_triangles_kernel(
     first: int,
     # Out:
     visibility_inout: VisibilityBuffer,
-    amodal_inout: wp.array3d[wp.uint32],  # (view, row, column)
+    masks_inout: InstanceMasks,
 ):
-    """Rasterize small triangles into visibility buffer and amodal bits, and list the blocks of large triangles.
+    """Rasterize small triangles into visibility buffer and amodal masks, and list the blocks of large triangles.
 
     A tote whose pose is that of the static background is skipped. Launched over view, rank, thread (flat, from `first` on): the `threads`
     threads of a body stride over its triangles.
@@ -202,7 +192,7 @@ def rasterize_triangles_kernel(
         return
     intrinsics = views.cameras.intrinsics[view]
     mesh = bodies.mesh[view, body]
-    bit = amodal_bit(body, views.instances)
+    mask = read_mask(masks_inout, view, body)
     for k in range(index % threads, meshes.first_triangle[mesh + 1] - meshes.first_triangle[mesh], threads):
         triangle = camera_triangle(meshes, bodies, view, body, k)
         footprint = find_footprint(grid, views.cameras, intrinsics, view, triangle)
@@ -216,7 +206,7 @@ def rasterize_triangles_kernel(
             if not listed:
                 low_half = pack_low_half(body, k)
                 rasterize_footprint(
-                    visibility_inout, amodal_inout, views.cameras, intrinsics, view, pixels, triangle, footprint, low_half, bit
+                    visibility_inout, masks_inout, views.cameras, intrinsics, view, pixels, triangle, footprint, low_half, mask
                 )
 
 
@@ -232,9 +222,9 @@ def rasterize_blocks_kernel(
     first: int,
     # Out:
     visibility_inout: VisibilityBuffer,
-    amodal_inout: wp.array3d[wp.uint32],  # (view, row, column)
+    masks_inout: InstanceMasks,
 ):
-    """Rasterize the listed blocks of large triangles into visibility buffer and amodal bits.
+    """Rasterize the listed blocks of large triangles into visibility buffer and amodal masks.
 
     Launched over view, thread (flat, from `first` on): the `threads` threads of a view stride over the rows of its blocks, whose number the
     host does not know.
@@ -255,8 +245,8 @@ def rasterize_blocks_kernel(
         if row <= footprint.pixels[3]:
             pixels = wp.vec4i(block[3], row, wp.min(block[3] + BLOCK_COLUMNS - 1, footprint.pixels[2]), row)
             low_half = pack_low_half(body, block[1])
-            bit = amodal_bit(body, views.instances)
-            rasterize_footprint(visibility_inout, amodal_inout, views.cameras, intrinsics, view, pixels, triangle, footprint, low_half, bit)
+            mask = read_mask(masks_inout, view, body)
+            rasterize_footprint(visibility_inout, masks_inout, views.cameras, intrinsics, view, pixels, triangle, footprint, low_half, mask)
 
 
 @wp.func

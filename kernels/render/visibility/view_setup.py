@@ -14,7 +14,7 @@ from synpick_warp.kernels.render.visibility.camera import (
     lens_of,
     projected_box,
 )
-from synpick_warp.kernels.render.visibility.gbuffer import FAR, FIXTURES, Meshes, ViewBodies, fixture_mesh
+from synpick_warp.kernels.render.visibility.gbuffer import FAR, FIXTURES, MASK_BITS, Meshes, ViewBodies, fixture_mesh
 from synpick_warp.kernels.render.visibility.lens import STRETCH
 from synpick_warp.kernels.render.visibility.ray_bodies import write_ray_body
 from synpick_warp.kernels.render.visibility.variants import kernel_of_views
@@ -192,6 +192,7 @@ def bin_bodies_kernel(
     view, tile = wp.tid()
     camera = views.camera[view]
     mask = wp.uint64(0)
+    word = int(0)
     if camera >= 0:
         intrinsics = views.cameras.intrinsics[view]
         tile_row = tile // grid.tile_columns
@@ -206,6 +207,10 @@ def bin_bodies_kernel(
             ray = camera_ray(views.cameras, view, row + TILE_HEIGHT // 2, column + TILE_WIDTH // 2, wp.vec2(0.0, 0.0))
             spread = 2.0 * TILE_RADIUS * views.cameras.lenses.number[lens, STRETCH]
         for rank in range(bodies_inout.present[view]):
+            if rank == (word + 1) * MASK_BITS:
+                bodies_inout.body_mask[view, tile, word] = mask
+                mask = wp.uint64(0)
+                word += 1
             body = bodies_inout.order[view, rank]
             box = bodies_inout.box[view, body]
             if column <= box[2] and column + TILE_WIDTH > box[0] and row <= box[3] and row + TILE_HEIGHT > box[1]:
@@ -215,5 +220,8 @@ def bin_bodies_kernel(
                 start = body_ray_start(bodies_inout, view, body, ray)
                 direction = bodies_inout.rotation[view, body] * ray
                 if hits_box(meshes.lower[mesh] - margin, meshes.upper[mesh] + margin, start, direction):
-                    mask = mask | (wp.uint64(1) << wp.uint64(rank))
-    bodies_inout.body_mask[view, tile] = mask
+                    mask = mask | (wp.uint64(1) << wp.uint64(rank - word * MASK_BITS))
+    while word < bodies_inout.body_mask.shape[2]:
+        bodies_inout.body_mask[view, tile, word] = mask
+        mask = wp.uint64(0)
+        word += 1

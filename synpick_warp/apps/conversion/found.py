@@ -13,7 +13,7 @@ from collections.abc import Iterator, Sequence
 from functools import cached_property
 from pathlib import Path
 
-from synpick_warp.apps.conversion.scenes import StoredSceneFiles, StoredViewFiles, find_runs
+from synpick_warp.apps.conversion.scenes import StoredSceneFiles, StoredViewFiles
 from synpick_warp.codes import Ending
 from synpick_warp.configs.dataset.export import ExportSettings
 from synpick_warp.configs.files.load import load_config
@@ -34,7 +34,7 @@ from synpick_warp.exporters.writing.folder import Buffer
 from synpick_warp.exporters.writing.notes import CAMERA_FILE, NOTES_FILE
 from synpick_warp.exporters.writing.png import encode_png
 from synpick_warp.exporters.writing.pool import WriterPool
-from synpick_warp.exporters.writing.rle import Masks, Runs
+from synpick_warp.exporters.writing.rle import Masks, Runs, find_runs
 from synpick_warp.scenes.cameras import make_cameras
 from synpick_warp.scenes.types import Catalog
 from synpick_warp.system.codecs.jpeg import encode_jpeg

@@ -13,7 +13,7 @@ from synpick_warp.dataset.annotations import ADVICE
 from synpick_warp.dataset.view_files import SceneFiles, ViewRecords
 from synpick_warp.errors import DatasetError
 from synpick_warp.exporters.writing.folder import Buffer
-from synpick_warp.exporters.writing.rle import Masks, Runs, find_run_boundaries
+from synpick_warp.exporters.writing.rle import Masks, Runs, find_runs
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,8 +114,3 @@ class StoredViewFiles:
             if runs.count == count:
                 return runs
         return find_runs(self.files.mask(name, self.frame, index))
-
-
-def find_runs(mask: np.ndarray, top: int = 0, left: int = 0) -> Runs:
-    """Runs of a mask (H, W), or of a crop of it that begins at a row and a column."""
-    return find_run_boundaries(mask.astype(np.uint8), top, left).runs_of(1)

@@ -120,7 +120,7 @@ class SceneExporter(EpisodeExporter[tuple[Path, ...]]):
     @staticmethod
     def slot_bytes(settings: ExportSettings) -> int:
         """Bytes of a view's images in shared memory. See `Exporter`."""
-        return view_bytes(settings.rig.largest, bool(settings.render.layers))
+        return view_bytes(settings.rig.largest, settings.objects, bool(settings.render.layers))
 
     def write_constants(self) -> list[Path]:
         """Create the folders, and write models, camera and notes, or copy them when converting; returns their paths. See `Exporter`."""

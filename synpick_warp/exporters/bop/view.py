@@ -20,12 +20,13 @@ from synpick_warp.exporters.base import PIXEL_BYTES, EncodedView, StoredScene
 from synpick_warp.exporters.bop.keypoints import MILLIMETERS, Keypoints, project_keypoints
 from synpick_warp.exporters.writing.folder import Buffer
 from synpick_warp.exporters.writing.png import encode_png, frame_depth_png
-from synpick_warp.exporters.writing.rle import Masks, Runs, find_run_boundaries, unpack_run_boundaries
+from synpick_warp.exporters.writing.rle import Masks, Runs, find_run_boundaries, find_runs, split_listed_runs, unpack_run_boundaries
 from synpick_warp.scenes.types import Camera
 from synpick_warp.system.codecs.jpeg import encode_jpeg
 from synpick_warp.views.bins import bin_record
 from synpick_warp.views.frames import FrameBatch
 from synpick_warp.views.layer_codec import encode_layer
+from synpick_warp.views.masks import most_words, unpack_mask
 
 ANNOTATIONS = "annotations"
 """Spool file of a staged scene: the annotation blocks of its views, in order of arrival; see `annotation_block`.
@@ -102,11 +103,17 @@ class ViewTruth:
     boxes: np.ndarray
     """Amodal and visible boxes (N, 2, 4) [px]."""
     listed: bool
-    """Whether the mask sources of the view's task are lists of run boundaries (True) or image crops (False)."""
+    """Whether the source of visible masks is a list of run boundaries (True) or an image crop (False)."""
     top: int
-    """First row of the crops."""
+    """First row of the crop."""
     left: int
-    """First column of the crops."""
+    """First column of the crop."""
+    run_count: np.ndarray
+    """Run boundaries of each amodal mask of the view (I), if their source is a list; else empty, and it is the view's words."""
+    mask_first: np.ndarray
+    """First word of each amodal mask (N)."""
+    mask_box: np.ndarray
+    """Box of each amodal mask (N, 4) [px]."""
 
 
 class RenderedView:
@@ -207,14 +214,14 @@ def make_view_task(batch: FrameBatch, view: int, scene: int, settings: ViewSetti
 
     Returns:
         Colour (image or file), depth (image, data of its file, or nothing if neither files nor keypoints need it), and two mask sources,
-        of visible and of amodal masks: the device's run boundaries of the images `instance` and `amodal`, or, if these lists are incomplete
-        or larger, the images themselves, cropped to the objects. And the ground truth.
+        of visible and of amodal masks: the device's run boundaries of `instance` and of the masks, or, if a list is incomplete or larger,
+        the image cropped to the objects, and the words of the masks. And the ground truth.
     """
     present = np.flatnonzero(batch.object_id[view] >= 0)
     boxes = batch.boxes[view][present]
     width, height = settings.resolution
-    boundaries = _select_boundaries(batch, view, width * height)
-    rows, columns = (slice(0, 0), slice(0, 0)) if boundaries else _crop_to_boxes(boxes, height, width)
+    boundaries, runs = _select_boundaries(batch, view, width * height), _select_runs(batch, view, most_words(width, height))
+    rows, columns = (slice(0, 0), slice(0, 0)) if boundaries is not None else _crop_to_boxes(boxes, height, width)
     depth = batch.depth_source(view) if settings.depth or settings.keypoints else np.empty(0, np.uint8)
     parameters: dict[str, float] = dict(zip(names(Effect), batch.effects[view].tolist(), strict=True))
     truth = ViewTruth(
@@ -227,13 +234,17 @@ def make_view_task(batch: FrameBatch, view: int, scene: int, settings: ViewSetti
         pose=batch.pose[view][present],
         pixels=batch.pixels[view][present],
         boxes=boxes,
-        listed=bool(boundaries),
+        listed=boundaries is not None,
         top=rows.start,
         left=columns.start,
+        run_count=np.empty(0, np.int32) if runs is None or batch.run_count is None else batch.run_count[view].copy(),
+        mask_first=batch.mask_first[view][present],
+        mask_box=batch.mask_box[view][present],
     )
-    sources = boundaries or tuple(images[view][rows, columns] for images in (batch.instance, batch.amodal))
+    visible = batch.instance[view][rows, columns] if boundaries is None else boundaries
+    amodal = batch.mask_words[view, : batch.mask_length[view]] if runs is None else runs
     color = batch.color_source(view) if settings.color else np.empty(0, np.uint8)
-    return (color, depth, *sources), truth
+    return (color, depth, visible, amodal), truth
 
 
 def _make_extras(batch: FrameBatch, view: int, effects: dict[str, float]) -> dict[str, Any]:
@@ -251,14 +262,20 @@ def _make_extras(batch: FrameBatch, view: int, effects: dict[str, float]) -> dic
     return {"light": light} | own | ({"effects": {name: round(value, _DIGITS) for name, value in effects.items()}} if effects else {})
 
 
-def _select_boundaries(batch: FrameBatch, view: int, pixels: int) -> tuple[np.ndarray, ...]:
-    """Run boundaries of `instance` and `amodal`; empty unless both are present, complete, and no larger than images of `pixels` pixels."""
-    if batch.boundaries is None or batch.boundary_count is None or (batch.boundary_count[view] > batch.boundaries.shape[-1]).any():
-        return ()
-    counts = batch.boundary_count[view].tolist()
-    lists = tuple(packed[:, :count] for packed, count in zip(batch.boundaries[view], counts, strict=True))
-    sizes = [pixels * size for size in PIXEL_BYTES[-2:]]
-    return lists if all(packed.nbytes <= size for packed, size in zip(lists, sizes, strict=True)) else ()
+def _select_boundaries(batch: FrameBatch, view: int, pixels: int) -> np.ndarray | None:
+    """Run boundaries of `instance`; None unless they are present, complete, and no larger than an image of `pixels` pixels."""
+    if batch.boundaries is None or batch.boundary_count is None or batch.boundary_count[view] > batch.boundaries.shape[-1]:
+        return None
+    listed = batch.boundaries[view, :, : batch.boundary_count[view]]
+    return listed if listed.nbytes <= pixels * PIXEL_BYTES[-1] else None
+
+
+def _select_runs(batch: FrameBatch, view: int, words: int) -> np.ndarray | None:
+    """Run boundaries of the amodal masks; None unless they are present, complete, and no more than masks of `words` words each have."""
+    if batch.runs is None or batch.run_count is None:
+        return None
+    counts = batch.run_count[view]
+    return batch.runs[view, : counts.sum()] if counts.sum() <= min(batch.runs.shape[-1], counts.size * words) else None
 
 
 def _crop_to_boxes(boxes: np.ndarray, height: int, width: int) -> tuple[slice, slice]:
@@ -271,12 +288,14 @@ def _crop_to_boxes(boxes: np.ndarray, height: int, width: int) -> tuple[slice, s
 
 def extract_masks(visible_source: np.ndarray, amodal_source: np.ndarray, truth: ViewTruth, height: int) -> list[Masks]:
     """Extract the masks of all instances, in their order, from the two mask sources of `make_view_task`."""
-    visible, amodal = (
-        unpack_run_boundaries(source, height) if truth.listed else find_run_boundaries(source, truth.top, truth.left)
-        for source in (visible_source, amodal_source)
-    )
     instances = truth.instance_id.tolist()
-    return [Masks(*pair) for pair in zip(amodal.split_by_bit(instances), visible.split_by_value(instances), strict=True)]
+    ids = unpack_run_boundaries(visible_source, height) if truth.listed else find_run_boundaries(visible_source, truth.top, truth.left)
+    if truth.run_count.size:
+        amodal = split_listed_runs(amodal_source, truth.run_count, height, instances)
+    else:
+        parts = zip(truth.mask_first.tolist(), truth.mask_box, strict=True)
+        amodal = [find_runs(unpack_mask(amodal_source, first, box), box[1], box[0]) for first, box in parts]
+    return [Masks(*pair) for pair in zip(amodal, ids.split_by_value(instances), strict=True)]
 
 
 def annotation_block(frame: int, entries: Iterable[bytes]) -> bytes:

@@ -1,4 +1,4 @@
-"""Run-length encoding of masks along image columns, as in COCO RLE: from run boundaries of id images to runs, boxes and counts."""
+"""Run-length encoding of masks along image columns, as in COCO RLE: from run boundaries of masks and id images to runs, boxes, counts."""
 
 from __future__ import annotations
 
@@ -7,8 +7,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-MAX_INSTANCES = 32
-"""Largest number of instances of an image: bits of `FrameBatch.amodal`."""
+from synpick_warp.codes import MAX_INSTANCES
+
+_ID_BITS = 8
+"""Bits of an id in a packed boundary, see `FrameBatch.boundaries`."""
 
 
 @dataclass(eq=False, slots=True)
@@ -90,12 +92,9 @@ class RunBoundaries:
 
     def split_by_value(self, instances: Sequence[int]) -> list[Runs]:
         """Masks of the pixels that equal 1 + i for instances i, from one pass over the boundaries."""
-        return self._split(self._list_values(self.below), self._list_values(self.above), instances)
-
-    def split_by_bit(self, instances: Sequence[int]) -> list[Runs]:
-        """Masks of the pixels that have bit i set for instances i, 0 the lowest, from one pass over the boundaries."""
-        changed = self.above ^ self.below
-        return self._split(self._list_bits(changed & self.below), self._list_bits(changed & self.above), instances)
+        begin, end = self._list_values(self.below), self._list_values(self.above)
+        bounds = np.searchsorted(begin, np.arange(max(instances, default=-1) + 2, dtype=begin.dtype) * self._places)
+        return _split_runs(_divide(begin, self._places)[1], end - begin, self.span, bounds, instances)
 
     def _make_keys(self, instance: np.ndarray, place: np.ndarray) -> np.ndarray:
         """Sort keys, by instance and then by position (M): of 32 bits if they suffice, which NumPy sorts in half the time."""
@@ -114,45 +113,58 @@ class RunBoundaries:
         listed = np.flatnonzero(instance < MAX_INSTANCES)
         return np.sort(self._make_keys(instance[listed], self.place[listed]))
 
-    def _list_bits(self, words: np.ndarray) -> np.ndarray:
-        """List the boundaries beside which a bit is set in a word (N), each once for each bit, as sorted keys (M)."""
-        keys: list[np.ndarray] = []
-        listed = np.flatnonzero(words != 0)
-        words, place = words[listed].astype(np.uint32, copy=False), self.place[listed]
-        while words.size or not keys:
-            # Take the lowest bit of each word, and go on with the few words that have another.
-            others = words & (words - np.uint32(1))
-            bit = np.bitwise_count((words ^ others) - np.uint32(1))
-            keys.append(self._make_keys(bit, place))
-            rest = np.flatnonzero(others != 0)
-            words, place = others[rest], place[rest]
-        return np.sort(np.concatenate(keys))
 
-    def _split(self, begin: np.ndarray, end: np.ndarray, instances: Sequence[int]) -> list[Runs]:
-        """Pair the keys (M) at which runs begin and end, and split the runs by instance: those of one do not overlap."""
-        bounds = np.searchsorted(begin, np.arange(MAX_INSTANCES + 1, dtype=begin.dtype) * self._places)
-        length = (end - begin).astype(np.int64)
-        column, first = (part.astype(np.int64) for part in _divide(_divide(begin, self._places)[1], self.span))
-        past = first + length
-        # `reduceat` takes no empty segments.
-        filled = np.flatnonzero(bounds[1:] > bounds[:-1])
-        measures = np.zeros((3, MAX_INSTANCES), np.int64)
-        if filled.size:
-            starts = bounds[filled]
-            measures[:, filled] = np.add.reduceat(length, starts), np.minimum.reduceat(first, starts), np.maximum.reduceat(past, starts)
-        rows = list(zip(bounds.tolist(), bounds[1:].tolist(), *measures.tolist(), strict=False))
-        chosen = (rows[instance] for instance in instances)
-        return [Runs(column[start:stop], first[start:stop], past[start:stop], *measured) for start, stop, *measured in chosen]
+def split_listed_runs(places: np.ndarray, count: np.ndarray, height: int, instances: Sequence[int]) -> list[Runs]:
+    """Masks of some instances, from the run boundaries of all masks that the device has listed.
+
+    Args:
+        places: Positions (M) column · (height + 1) + row, in turn of a run's first pixel and of the pixel below its last, mask by mask.
+        count: Number of positions of each mask (I).
+        height: Height of the image [px].
+        instances: Indices of the masks.
+    """
+    bounds = np.concatenate(([0], np.cumsum(count // 2)))
+    return _split_runs(places[::2], places[1::2] - places[::2], height + 1, bounds, instances)
+
+
+def _split_runs(begin: np.ndarray, length: np.ndarray, span: int, bounds: np.ndarray, instances: Sequence[int]) -> list[Runs]:
+    """Split runs by instance.
+
+    Args:
+        begin: Position of each run's first pixel (M), sorted by instance, then by position.
+        length: Pixels of each run (M).
+        span: Positions per column.
+        bounds: Index of each instance's first run, and behind them that past the last one (N + 1).
+        instances: Indices of the instances whose runs are returned.
+    """
+    length = length.astype(np.int64)
+    column, first = (part.astype(np.int64) for part in _divide(begin, span))
+    past = first + length
+    # `reduceat` takes no empty segments; the last one ends at the last bound.
+    filled = np.flatnonzero(bounds[1:] > bounds[:-1])
+    measures = np.zeros((3, bounds.size - 1), np.int64)
+    if filled.size:
+        starts, stop = bounds[filled], bounds[-1]
+        parts = ((np.add, length), (np.minimum, first), (np.maximum, past))
+        measures[:, filled] = [operation.reduceat(values[:stop], starts) for operation, values in parts]
+    rows = list(zip(bounds.tolist(), bounds[1:].tolist(), *measures.tolist(), strict=False))
+    chosen = (rows[instance] for instance in instances)
+    return [Runs(column[start:stop], first[start:stop], past[start:stop], *measured) for start, stop, *measured in chosen]
+
+
+def find_runs(mask: np.ndarray, top: int = 0, left: int = 0) -> Runs:
+    """Runs of a mask (h, w) bool or uint8 of 0 and 1, or of a crop of it that begins at a row and a column."""
+    return find_run_boundaries(mask.view(np.uint8), top, left).runs_of(1)
 
 
 def unpack_run_boundaries(packed: np.ndarray, height: int) -> RunBoundaries:
     """Unpack run boundaries that the device has listed.
 
     Args:
-        packed: (3, N): column · (height + 1) + row, value above, value below; see `FrameBatch.boundaries`.
+        packed: (2, N): column · (height + 1) + row; value above, and that below shifted by 8 bits; see `FrameBatch.boundaries`.
         height: Height of the image [px].
     """
-    return RunBoundaries(packed[0], height + 1, packed[1], packed[2])
+    return RunBoundaries(packed[0], height + 1, packed[1] & ((1 << _ID_BITS) - 1), packed[1] >> _ID_BITS)
 
 
 def find_run_boundaries(image: np.ndarray, top: int = 0, left: int = 0) -> RunBoundaries:

@@ -11,7 +11,7 @@ import warp as wp
 
 from synpick_warp.kernels.render.images.ground_truth import expand_masks_kernel, gather_cameras_kernel, gather_objects_kernel
 from synpick_warp.stages.arrays import allocate, device_array
-from synpick_warp.stages.buffers import LayerBuffers, Snapshot, ViewBuffers
+from synpick_warp.stages.buffers import LayerBuffers, Snapshot, ViewBuffers, masks_of
 from synpick_warp.stages.launch import launch
 from synpick_warp.stages.online.exchange import DeviceArray, Gate
 from synpick_warp.stages.render.view_setup import make_views, with_cameras
@@ -75,20 +75,20 @@ class Slot:
         """Masks of the first `count` views; `name` is a field of `MaskBuffers`."""
         if name not in self.masks:
             self.masks[name] = getattr(allocate(MaskBuffers, self.sizes, self.device, [name]), name)
-        masks, images = self.masks[name], self.images
+        mask, images = self.masks[name], self.images
         if self._expanded.get(name) == self.gate.turn:
-            return masks
+            return mask
         self._expanded[name] = self.gate.turn
         self.gate.admit_current()
         wp.launch(
             expand_masks_kernel,
-            dim=(count, *masks.shape[1:]),
-            inputs=[images.instance, images.amodal, name == "amodal"],
-            outputs=[masks],
+            dim=(count, *mask.shape[1:]),
+            inputs=[images.instance, masks_of(images), name == "amodal"],
+            outputs=[mask],
             device=self.device,
         )
         self.gate.mark_ready()
-        return masks
+        return mask
 
 
 class ViewBatch:
@@ -103,7 +103,8 @@ class ViewBatch:
         depth: Planar depth in units of `depth_scale` mm; 0: no surface (B, H, W) uint16.
         instance: Segmentation id of the nearest surface: 0 none, 1 + instance_id, 252 to 255 table and fixtures (`Segment`)
             (B, H, W) uint8.
-        amodal: Amodal masks as a bit field: bit i is set where the pixel's ray hits instance i, hidden or not (B, H, W) uint32.
+        mask_words, mask_first, mask_box, mask_length: Amodal masks as bits, each in its own box (B, W) uint32, (B, I) int32, (B, I, 4)
+            int32 [px], (B) int32: words in use, the others mean nothing; see `InstanceMasks`. `amodal_masks` makes images of them.
         layers: Layers (AOVs) that `render.layers` names and the modalities of the cameras have, as they are before quantization
             (B, H, W[, C]); see `synpick_warp.views.layers`.
         object_id: obj_id of each instance; -1: the instance is not in the scene; below: a distractor, without label (B, I) int32.
@@ -127,7 +128,10 @@ class ViewBatch:
     color: DeviceArray | None
     depth: DeviceArray
     instance: DeviceArray
-    amodal: DeviceArray
+    mask_words: DeviceArray
+    mask_first: DeviceArray
+    mask_box: DeviceArray
+    mask_length: DeviceArray
     pixels: DeviceArray
     boxes: DeviceArray
     effects: DeviceArray

@@ -16,7 +16,7 @@ from synpick_warp.kernels.render.images.boxes_counts import (
 )
 from synpick_warp.kernels.tuning import BORDER_CHUNK, BORDER_GROUPS, BORDER_THREADS, COUNT_THREADS
 from synpick_warp.stages.arrays import allocate_struct, struct_arrays
-from synpick_warp.stages.buffers import ViewBuffers
+from synpick_warp.stages.buffers import ViewBuffers, masks_of
 from synpick_warp.stages.launch import launch
 from synpick_warp.stages.render.scene import RenderScene
 
@@ -43,13 +43,13 @@ class Annotator:
         Args:
             bodies: The struct `ViewBodies` that `set_up_views` filled for these views.
             views: The struct `Views`.
-            out: Its images are read, its counts and boxes written.
+            out: Its images and masks are read, its counts and boxes written.
         """
         scene, instances = self.scene, out.pixels.shape[1]
         threads = COUNT_THREADS if scene.device.is_cuda else 1
-        images = {"instance_image": out.instance, "depth_image": out.depth, "amodal_image": out.amodal}
+        images = {"instance_image": out.instance, "depth_image": out.depth, "masks": masks_of(out)}
         launch(clear_boxes_counts_kernel, (views.count, instances), out)
-        launch(count_image_pixels_kernel, (views.count, instances, threads), scene, out, bodies=bodies, threads=threads, **images)
+        launch(count_image_pixels_kernel, (views.count, instances, threads), out, threads=threads, **images)
         self._count_border_pixels(bodies, views, out)
         launch(reset_empty_boxes_kernel, (views.count, instances, 2), out)
 

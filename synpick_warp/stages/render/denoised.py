@@ -11,7 +11,13 @@ from typing import Any
 import warp as wp
 
 from synpick_warp.configs.schema import Render
-from synpick_warp.kernels.render.images.antialias import CHUNK_TILES, find_footprints_kernel, resolve_footprints_kernel
+from synpick_warp.kernels.render.images.antialias import (
+    CHUNK_TILES,
+    FewBodies,
+    ManyBodies,
+    find_footprints_kernel,
+    resolve_footprints_kernel,
+)
 from synpick_warp.kernels.render.lighting.coarse_grid import CoarseGrid, Guide
 from synpick_warp.kernels.render.lighting.denoise import choose_widths_kernel, filter_blocks_kernel, smooth_ratios_kernel
 from synpick_warp.kernels.render.lighting.history import (
@@ -398,10 +404,10 @@ class DenoisedRenderer:
         )
         threads = FOOTPRINT_THREADS if scene.device.is_cuda else CPU_FOOTPRINT_THREADS
         inputs = [scene.meshes, scene.table, scene.grid, self.footprints, bodies, gbuffer, lists.footprint, lists.count]
-        inputs += [views, image.samples, threads]
+        inputs += [views, image.samples, threads, crowd_of(bodies)]
         samples = views.count * lists.count.shape[1] * threads
         wp.launch(
-            kernel_for(resolve_footprints_kernel, views),
+            kernel_for(resolve_footprints_kernel, *inputs),
             dim=samples,
             inputs=inputs,
             outputs=[image.resolve],
@@ -412,3 +418,10 @@ class DenoisedRenderer:
     def _launch(self, kernel: wp.Kernel, grid: Any, views: Any, inputs: list[Any], outputs: list[Any]) -> None:
         """Launch a kernel over all pixels of a grid in all views."""
         launch_pixels(kernel, views.count * grid.tiles * int(TILE_PIXELS), inputs, outputs, self.scene.device)
+
+
+def crowd_of(bodies: Any) -> Any:
+    """The struct that chooses the kernel for the number of words of the struct `ViewBodies`' masks."""
+    crowd = FewBodies() if bodies.body_mask.shape[2] == 1 else ManyBodies()
+    crowd.words = bodies.body_mask.shape[2]
+    return crowd

@@ -8,6 +8,7 @@ import warp as wp
 
 from synpick_warp.errors import CatalogError
 from synpick_warp.kernels.render.visibility.camera import TILE_PIXELS
+from synpick_warp.kernels.render.visibility.masks import clear_masks_kernel, lay_out_masks_kernel
 from synpick_warp.kernels.render.visibility.raster import (
     MAX_TRIANGLES,
     VisibilityBuffer,
@@ -16,9 +17,9 @@ from synpick_warp.kernels.render.visibility.raster import (
     rasterize_triangles_kernel,
     resolve_visibility_kernel,
 )
-from synpick_warp.kernels.tuning import BLOCK_THREADS, TRIANGLE_THREADS
+from synpick_warp.kernels.tuning import BLOCK_THREADS, CLEAR_THREADS, TRIANGLE_THREADS
 from synpick_warp.stages.arrays import allocate, allocate_struct, struct_arrays
-from synpick_warp.stages.buffers import FIXTURES, Snapshot, ViewBuffers
+from synpick_warp.stages.buffers import FIXTURES, Snapshot, ViewBuffers, masks_of
 from synpick_warp.stages.launch import launch_pixels, launch_views
 from synpick_warp.stages.render.scene import RenderScene
 from synpick_warp.stages.render.view_setup import BACKGROUND, VIEW_BODIES, body_sizes, first_views, set_up_views
@@ -69,17 +70,21 @@ class Rasterizer:
             bodies: The struct `ViewBodies` of these views.
             views: The struct `Views`.
             gbuffer: The struct `GBuffer`; written.
-            out: `instance`, `depth` and `amodal` are written; None: only the G-buffer is needed.
+            out: `instance`, `depth` and the amodal masks are written; None: only the G-buffer is needed.
         """
-        scene, visibility, device = self.scene, self.visibility, self.scene.device
+        scene, visibility, device, masks = self.scene, self.visibility, self.scene.device, masks_of(out)
         pixels = views.count * scene.grid.tiles * int(TILE_PIXELS)
-        instance, depth, amodal = (None, None, None) if out is None else (out.instance, out.depth, out.amodal)
-        launch_pixels(clear_visibility_kernel, pixels, [scene.grid, views], [visibility, amodal], device)
+        instance, depth = (None, None) if out is None else (out.instance, out.depth)
+        launch_pixels(clear_visibility_kernel, pixels, [scene.grid, views], [visibility], device)
+        if out is not None:
+            dim = (views.count, out.mask_first.shape[1])
+            wp.launch(lay_out_masks_kernel, dim=dim, inputs=[scene.grid, bodies], outputs=[masks], device=device)
+            wp.launch(clear_masks_kernel, dim=(views.count, CLEAR_THREADS), inputs=[CLEAR_THREADS], outputs=[masks], device=device)
         inputs = [scene.meshes, scene.grid, bodies, views]
         per_body, per_view = (TRIANGLE_THREADS, BLOCK_THREADS) if device.is_cuda else (1, 1)
         threads = bodies.mesh.shape[1] * per_body
-        launch_views(rasterize_triangles_kernel, views.count, threads, [*inputs, per_body], [visibility, amodal], device)
-        launch_views(rasterize_blocks_kernel, views.count, per_view, [*inputs, per_view], [visibility, amodal], device)
+        launch_views(rasterize_triangles_kernel, views.count, threads, [*inputs, per_body], [visibility, masks], device)
+        launch_views(rasterize_blocks_kernel, views.count, per_view, [*inputs, per_view], [visibility, masks], device)
         inputs = [scene.meshes, scene.table, scene.grid, self.background, bodies, visibility, views, self.counts_per_meter]
         launch_pixels(resolve_visibility_kernel, pixels, inputs, [gbuffer, instance, depth], device)
 

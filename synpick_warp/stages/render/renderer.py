@@ -70,7 +70,7 @@ class Renderer:
             depth_sensor: Settings of the simulated depth camera.
             seed: Seed of all random numbers.
             depth_scale: Millimetres per count of the depth image.
-            instances: Instance capacity of a world, at most 32: one bit each in the amodal image.
+            instances: Instance capacity of a world, at most `MAX_INSTANCES`.
             views: Maximum number of views of a batch.
             histories: Worlds times cameras whose light is averaged over the frames of an episode; 0: each frame is rendered by itself.
             colors: Whether colour images are wanted; else they stay as they are, and nothing is shaded.
@@ -130,7 +130,7 @@ class Renderer:
             self.annotator.annotate(self.bodies, views, out)
 
     def render_gbuffer(self, snapshot: Snapshot, views: Any, out: ViewBuffers, placed: PlacedCameras | None = None) -> Any:
-        """First part of `render`: G-buffer, and images of depth, instances and amodal bits. Returns the views with their cameras."""
+        """First part of `render`: G-buffer, images of depth and instances, and amodal masks. Returns the views with their cameras."""
         scene, views = self.scene, with_cameras(views, self.cameras if placed is None else placed.now)
         with scope("set up views", scene.device):
             set_up_views(scene, snapshot, snapshot.fixture_visible, views, self.bodies, placed is not None)

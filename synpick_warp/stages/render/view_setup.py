@@ -11,7 +11,7 @@ import warp as wp
 
 from synpick_warp.configs.calibration.lens import LensMap
 from synpick_warp.kernels.render.visibility.camera import LensCameras, LensViews, ViewCameras, Views
-from synpick_warp.kernels.render.visibility.gbuffer import GBuffer, ViewBodies
+from synpick_warp.kernels.render.visibility.gbuffer import MASK_BITS, GBuffer, ViewBodies
 from synpick_warp.kernels.render.visibility.lens import NUMBERS, Lenses
 from synpick_warp.kernels.render.visibility.lens_rays import compute_rays_kernel
 from synpick_warp.kernels.render.visibility.ray_bodies import RAY_RECORDS
@@ -28,7 +28,7 @@ VIEW_BODIES = struct_arrays(
     ray_record=("view", "body", "record"),
     present=("view",),
     uses_background=("view",),
-    body_mask=("view", "tile"),
+    body_mask=("view", "tile", "body_word"),
     units={"start": "m", "near": "m", "box": "px", "position": "m", "sphere": "m, m²"},
 )
 VIEWS = struct_arrays(Views, "view")
@@ -133,7 +133,10 @@ def first_views(count: int, cameras: int, instances: int, device: wp.Device, len
 
 def body_sizes(instances: int, width: int, height: int) -> dict[str, int]:
     """Extents of the dimensions that `VIEW_BODIES` names beside the view, for images of `width` x `height` px."""
-    return {"body": instances + len(FIXTURES), "tile": build_grid(width, height).tiles, "record": int(RAY_RECORDS)}
+    bodies = instances + len(FIXTURES)
+    # The highest bit of the only word stays free: anti-aliasing shifts past the last body.
+    words = bodies // int(MASK_BITS) + 1
+    return {"body": bodies, "tile": build_grid(width, height).tiles, "body_word": words, "record": int(RAY_RECORDS)}
 
 
 def set_up_views(

@@ -31,6 +31,7 @@ from synpick_warp.scenes.types import Catalog
 from synpick_warp.system.codecs.jpeg import encode_jpeg
 from tests.exporters.writing.test_rle import decode
 from tests.harness.exporter_contract import ExporterContract, digests, export, export_context, exporting, feed, finish, with_files
+from tests.twins.masks import masks_of_batch
 from tests.worlds.box_views import OBJECT_IDS, SIZES, batches, cameras, catalog, config, ends, poses
 
 EPISODES = (0, 2)
@@ -111,7 +112,7 @@ def test_images_and_masks_read_back(split):
             amodal = cv2.imread(str(split / scene / "mask" / name), cv2.IMREAD_UNCHANGED)
             visible = cv2.imread(str(split / scene / "mask_visib" / name), cv2.IMREAD_UNCHANGED)
             assert amodal.dtype == visible.dtype == np.uint8
-            np.testing.assert_array_equal(amodal, np.where(batch.amodal[0] >> np.uint32(instance) & 1, 255, 0))
+            np.testing.assert_array_equal(amodal, np.where(masks_of_batch(batch)[instance], 255, 0))
             np.testing.assert_array_equal(visible, np.where(batch.instance[0] == 1 + instance, 255, 0))
 
 

@@ -14,6 +14,7 @@ from pycocotools.coco import COCO
 from synpick_warp.exporters.bop.coco.exporter import CocoExporter
 from synpick_warp.exporters.bop.exporter import BopExporter
 from tests.harness.exporter_contract import export
+from tests.twins.masks import masks_of_batch
 from tests.worlds.box_views import batches, cameras, config
 
 FRAMES = 3
@@ -46,7 +47,7 @@ def test_boxes_of_an_instance_agree_between_formats(sets):
         scene = read(folder / "scene_gt_coco.json")
         amodal_boxes = [row["bbox"] for row in scene.loadAnns(scene.getAnnIds(imgIds=frame))]
         for place, (index, row) in enumerate(annotations.items()):
-            visible, inside = tight(batch.instance[0] == 1 + index), tight(batch.amodal[0] >> index & 1)
+            visible, inside = tight(batch.instance[0] == 1 + index), tight(masks_of_batch(batch)[index])
             amodal = batch.boxes[0, index, 0].tolist()
             assert visible == corners(row["bbox"], 1) == corners(info[index]["bbox_visib"], 0)
             assert amodal == corners(row["bbox_amodal"], 1) == corners(info[index]["bbox_obj"], 0)

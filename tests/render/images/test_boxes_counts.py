@@ -27,7 +27,7 @@ def check_view(toy: ToyScene, device) -> tuple[np.ndarray, np.ndarray]:
     """Compare a toy scene's counts and boxes with those of the NumPy twin, and return them."""
     picture = render(toy, device)
     canvas = render(replace(toy, cameras=(canvas_camera(toy.cameras[0]),)), device)
-    pixels, boxes = count_pixels(picture.instance[0], picture.depth[0], picture.amodal[0], canvas.amodal[0], toy.instances)
+    pixels, boxes = count_pixels(picture.instance[0], picture.depth[0], picture.masks[0], canvas.masks[0])
     np.testing.assert_array_equal(picture.pixels[0], pixels)
     np.testing.assert_array_equal(picture.boxes[0], boxes)
     return picture.pixels[0], picture.boxes[0]

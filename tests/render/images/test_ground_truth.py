@@ -10,8 +10,10 @@ from synpick_warp.exporters.bop.view import rotation_matrices
 from synpick_warp.kernels.render.images.ground_truth import expand_masks_kernel, gather_cameras_kernel, gather_objects_kernel
 from synpick_warp.kernels.render.visibility.camera import Cameras
 from synpick_warp.stages.arrays import allocate
+from synpick_warp.stages.buffers import allocate_view_buffers, masks_of
 from synpick_warp.stages.online.batches import TruthBuffers
 from tests.harness.aimed_views import aimed_views
+from tests.twins.masks import pack_into
 
 WORLDS, ROOM, CAMERAS, VIEWS = 4, 3, 2, 7
 WORLD = np.array([3, 3, 0, 1, 2, 2, 1], np.int32)
@@ -88,11 +90,15 @@ def test_poses_equal_their_twin(device, seed):
 
 def test_masks_equal_their_twin(device):
     rng = np.random.default_rng(0)
-    ids = rng.choice(np.array([0, 1, 2, 3, 32, 252, 253, 254, 255], np.uint8), (2, 5, 6))
-    bits = rng.integers(0, 2**32, (2, 5, 6), dtype=np.uint32)
-    images = wp.array(ids, dtype=wp.uint8, device=device), wp.array(bits, dtype=wp.uint32, device=device)
-    index = np.arange(32)[:, None, None]
-    for hidden, expected in ((False, ids[:, None] == 1 + index), (True, (bits[:, None] >> index.astype(np.uint32)) & 1 == 1)):
-        out = wp.zeros((2, 32, 5, 6), dtype=wp.bool, device=device)
-        wp.launch(expand_masks_kernel, dim=out.shape, inputs=[*images, hidden], outputs=[out], device=device)
+    ids = rng.choice(np.array([0, 1, 2, 3, 40, 252, 253, 254, 255], np.uint8), (2, 35, 6))
+    masks = rng.integers(0, 2, (2, 40, 35, 6)).astype(bool)
+    masks[:, ::3, :, rng.integers(1, 5) :] = False
+    masks[:, ::7] = False
+    images = allocate_view_buffers(2, 6, 35, 40, device)
+    images.instance.assign(ids)
+    pack_into(images, masks)
+    for hidden, expected in ((False, ids[:, None] == 1 + np.arange(40)[:, None, None]), (True, masks)):
+        out = wp.zeros(masks.shape, dtype=wp.bool, device=device)
+        inputs = [images.instance, masks_of(images), hidden]
+        wp.launch(expand_masks_kernel, dim=out.shape, inputs=inputs, outputs=[out], device=device)
         np.testing.assert_array_equal(out.numpy(), expected)

@@ -8,6 +8,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from synpick_warp.scenes.types import Camera
+from tests.twins.masks import masks_of_buffers
 from tests.worlds.toy_scene import ToyScene, box, entry, render_gbuffer
 
 SIZE = (0.12, 0.08, 0.05)
@@ -31,6 +32,6 @@ def test_the_edges_of_a_box_are_where_opencv_projects_them(device, seed):
     points, _ = cv2.projectPoints(corners, cv2.Rodrigues(rotation)[0], camera.translation, matrix, None)
     hull = cv2.convexHull(points.astype(np.float32))
     inside = np.array([[cv2.pointPolygonTest(hull, (column + 0.5, row + 0.5), True) for column in range(320)] for row in range(240)])
-    mask = out.amodal.numpy()[0] == 1
+    mask = masks_of_buffers(out)[0, 0]
     np.testing.assert_array_equal(mask[np.abs(inside) > EDGE], inside[np.abs(inside) > EDGE] > 0.0)
     assert mask.sum() > 500

@@ -18,6 +18,7 @@ from synpick_warp.stages.render.view_setup import make_views
 from synpick_warp.system.hardware.device import pick_device
 from tests.harness.devices import default_device
 from tests.harness.trace_probe import trace_gbuffer
+from tests.twins.masks import bits_of, masks_of_buffers
 from tests.worlds.toy_scene import GREY, UPRIGHT, ToyScene, ball, box, camera, entry, flat_shaded, render, render_gbuffer, sheet
 
 VIEW = camera(96, 64, 150.0, (0.0, 0.0, 1.0))
@@ -37,7 +38,7 @@ def gbuffer_of(toy: ToyScene, device: wp.Device, by_rays: bool = False) -> dict[
         zero = wp.zeros(1, dtype=wp.int32, device=device)
         trace_gbuffer(renderer.scene, renderer.bodies, make_views(zero, zero, 1, toy.instances, renderer.cameras), renderer.gbuffer, 1)
     found = {name: getattr(renderer.gbuffer, name).numpy()[0].copy() for name in ("segment", "triangle", "barycentric", "depth")}
-    return found | {"amodal": out.amodal.numpy()[0].copy()}
+    return found | {"amodal": bits_of(masks_of_buffers(out))[0]}
 
 
 def depth_in_float64(corners: np.ndarray, view=VIEW) -> tuple[np.ndarray, np.ndarray]:

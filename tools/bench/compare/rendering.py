@@ -63,15 +63,17 @@ def _measure_size(factory: Factory, cameras: tuple[Camera, ...], worlds: int, mi
     segment, counts = (array[: len(index)].numpy() for array in (ours.out.instance, ours.out.depth))
     for row in compare_hits(theirs.segment, index, depth, segment, counts, config.bop.depth_scale):
         yield replace(row, name=f"{size}: {row.name}")
-    yield from _pair(size, pixels, "depth, ids, amodal bits", "depth, ids", seconds)
+    yield from _pair(size, pixels, "depth, ids, amodal masks", "depth, ids", seconds)
     context = theirs.make_context(color=True)
     seconds = time_view(functools.partial(ours.render)), time_view(functools.partial(theirs.render, context))
-    everything = "color by light maps with indirect light and anti-aliasing, depth, ids, amodal bits, counts, boxes"
+    everything = "color by light maps with indirect light and anti-aliasing, depth, ids, amodal masks, counts, boxes"
     theirs_colored = "color by one light with shadows, depth, ids"
     yield from _pair(size, pixels, everything, theirs_colored, seconds)
     unoccluded = make_views_of(factory, UNOCCLUDED, cameras, snapshot, worlds)
     seconds = time_view(functools.partial(unoccluded.render)), seconds[1]
-    plain = "render.mode unoccluded, color by light maps with shadows of one lamp and anti-aliasing, depth, ids, amodal bits, counts, boxes"
+    plain = (
+        "render.mode unoccluded, color by light maps with shadows of one lamp and anti-aliasing, depth, ids, amodal masks, counts, boxes"
+    )
     yield from _pair(size, pixels, plain, theirs_colored, seconds)
 
 

@@ -216,7 +216,7 @@ def measure_sensor(factory: Factory, min_seconds: float) -> Iterator[Row]:
     """Benchmark of both renderers for three sets of outputs.
 
     Both update poses and render a batch of views. On CUDA both launch without waiting, so that launch overhead is hidden. The
-    sensor has no light maps, amodal bits, counts, boxes, or texture minification.
+    sensor has no light maps, amodal masks, counts, boxes, or texture minification.
     """
     simulation, renderer, config = factory.simulation, factory.stream.rings[0].renderer, factory.config
     device, snapshot = simulation.device, simulation.record.snapshot
@@ -240,7 +240,7 @@ def measure_sensor(factory: Factory, min_seconds: float) -> Iterator[Row]:
         return seconds_per_call(function, device, min_seconds / 4, BURST) / count
 
     def render_layers() -> None:
-        """Layers, besides depth, ids and amodal bits."""
+        """Layers, besides depth, ids and amodal masks."""
         ours.render_gbuffer()
         layer_renderer.render(snapshot, renderer.bodies, renderer.gbuffer, ours.views, our_layers, renderer.cameras)
 
@@ -255,17 +255,17 @@ def measure_sensor(factory: Factory, min_seconds: float) -> Iterator[Row]:
         yield Row(f"SensorCamera, pixels {name}: depth, index", 1e3 * seconds, "ms")
         yield Row(f"SensorCamera's time over ours: depth, index, pixels {name}", seconds / times[0], "")
     pixels = factory.cameras[0].width * factory.cameras[0].height
-    yield from _comparison_rows("depth, index", ", amodal bits", "", (times[0], orders[best]), pixels)
+    yield from _comparison_rows("depth, index", ", amodal masks", "", (times[0], orders[best]), pixels)
     textured = replace(ORDERS[best], enable_textures=True)
     times = [time_view(render_layers), time_view(functools.partial(scene.render, textured, hit_images | surface_images))]
     layers = {name: getattr(our_layers, name)[:checked].numpy() for name in LAYERS}
     normal, albedo = (image[:checked].numpy() for image in surface_images.values())
     yield from compare_surfaces(factory.cameras, normal, albedo, layers)
-    yield from _comparison_rows("depth, index, normals, albedo", ", amodal bits", "", (times[0], times[1]), pixels)
+    yield from _comparison_rows("depth, index, normals, albedo", ", amodal masks", "", (times[0], times[1]), pixels)
     lit = replace(textured, enable_shadows=True)
     times = [time_view(ours.render), time_view(functools.partial(scene.render, lit, hit_images | color_images))]
     yield from _comparison_rows(
-        "color, depth, index", ", indirect light, anti-aliasing, amodal bits, counts, boxes", ", one light", (times[0], times[1]), pixels
+        "color, depth, index", ", indirect light, anti-aliasing, amodal masks, counts, boxes", ", one light", (times[0], times[1]), pixels
     )
 
 
@@ -279,7 +279,7 @@ class OurViews:
         self.views = first_views(count, scene.camera_count, renderer.instances, scene.device)
 
     def render_gbuffer(self) -> None:
-        """Depth, ids and amodal bits alone."""
+        """Depth, ids and amodal masks alone."""
         self.renderer.render_gbuffer(self.snapshot, self.views, self.out)
 
     def render(self) -> None:

@@ -1,0 +1,113 @@
+"""Views of 200 instances in BOP's formats and COCO: read back by their clients, from lists and from words, and checked in float64."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import io
+import json
+import tarfile
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from pycocotools import mask as coco_mask
+from pycocotools.coco import COCO
+
+from synpick_warp.codes import MAX_INSTANCES
+from synpick_warp.configs.schema import Arrangement
+from synpick_warp.exporters.bop.coco.exporter import CocoExporter
+from synpick_warp.exporters.bop.exporter import BopExporter
+from synpick_warp.exporters.bop.shards.exporter import ShardsExporter
+from synpick_warp.exporters.bop.yolo.exporter import YoloExporter
+from synpick_warp.system.hardware.device import pick_device
+from tests.harness.devices import default_device
+from tests.harness.exporter_contract import digests, exporting, finish
+from tests.twins.masks import masks_of_batch
+from tests.worlds.box_views import cameras, config, ends
+from tests.worlds.dense_views import dense_batch, dense_toy
+from tools.checks import dataset as check
+
+COUNT = 200
+LENSES = cameras(240, 180)
+
+
+@pytest.fixture(scope="module")
+def batch():
+    return dense_batch(dense_toy(COUNT, LENSES, MAX_INSTANCES), pick_device(default_device()))
+
+
+@pytest.fixture(scope="module")
+def masks(batch) -> list[np.ndarray]:
+    """Amodal masks of each view (N, H, W)."""
+    return [masks_of_batch(batch, view)[:COUNT] for view in range(len(batch))]
+
+
+def write(kind: type, out: Path, batch) -> Path:
+    """A data set of one frame."""
+    settings = dataclasses.replace(config(), arrangement=Arrangement(max_objects=MAX_INSTANCES))
+    with exporting(kind, out, settings, 0, LENSES) as exporter:
+        exporter.write_constants()
+        exporter.write_views(batch)
+        exporter.end_episode(ends((0,), 1)[0], lambda: None)
+        finish(exporter)
+    return out
+
+
+@pytest.fixture(scope="module")
+def bop(batch, tmp_path_factory) -> Path:
+    return write(BopExporter, tmp_path_factory.mktemp("dense") / "set", batch)
+
+
+def test_masks_and_counts_of_files_are_those_of_the_renderer(bop, batch, masks):
+    for view, expected in enumerate(masks):
+        scene = bop / "train_pbr" / f"{view:06d}"
+        for name, images in (("mask", expected), ("mask_visib", batch.instance[view] == 1 + np.arange(COUNT)[:, None, None])):
+            read = [cv2.imread(str(scene / name / f"000000_{index:06d}.png"), cv2.IMREAD_UNCHANGED) for index in range(COUNT)]
+            np.testing.assert_array_equal(np.array(read) == 255, images)
+        info = json.loads((scene / "scene_gt_info.json").read_text())["0"]
+        assert [row["px_count_visib"] for row in info] == [(batch.instance[view] == 1 + index).sum() for index in range(COUNT)]
+        inside = np.array([row["px_count_all"] for row in info]) - expected.sum(axis=(1, 2))
+        assert (inside >= 0).all()
+        assert (inside == 0).sum() > COUNT // 10
+    assert len(np.unique(batch.instance)) > 60
+
+
+def test_an_independent_check_in_float64_finds_nothing(bop):
+    check.read_json.cache_clear()
+    check.read_model.cache_clear()
+    report = check.check(bop, 3)
+    assert [name for name, measure in vars(report).items() if not measure.holds] == []
+
+
+@pytest.mark.parametrize("kind", [BopExporter, CocoExporter, ShardsExporter, YoloExporter])
+def test_files_are_the_same_from_lists_and_from_words(kind, batch, tmp_path):
+    words = dataclasses.replace(batch, boundaries=None, boundary_count=None, runs=None, run_count=None)
+    assert digests(write(kind, tmp_path / "lists", batch)) == digests(write(kind, tmp_path / "words", words))
+
+
+@pytest.mark.filterwarnings("ignore:__array__:DeprecationWarning")
+def test_pycocotools_reads_what_is_visible(batch, tmp_path):
+    out = write(CocoExporter, tmp_path / "set", batch)
+    with contextlib.redirect_stdout(io.StringIO()):
+        read = COCO(out / "coco" / "annotations" / "instances_train_pbr.json")
+    assert len(read.imgs) == len(batch)
+    for index, image in read.imgs.items():
+        rows, ids = read.loadAnns(read.getAnnIds(imgIds=index)), batch.instance[image["camera"]]
+        assert [row["instance_id"] for row in rows] == [one for one in range(COUNT) if (ids == 1 + one).any()]
+        for row in rows:
+            np.testing.assert_array_equal(read.annToMask(row), ids == 1 + row["instance_id"])
+
+
+@pytest.mark.filterwarnings("ignore:__array__:DeprecationWarning")
+def test_run_lengths_of_shards_are_the_masks(batch, masks, tmp_path):
+    split = write(ShardsExporter, tmp_path / "set", batch) / "train_pbr_web"
+    for view, expected in enumerate(masks):
+        with tarfile.open(split / f"shard-{view:06d}.tar") as shard:
+            content = next(shard.extractfile(member).read() for member in shard.getmembers() if member.name.endswith(".mask.json"))
+        records = json.loads(content)
+        assert list(map(int, records)) == list(range(COUNT))
+        for index, record in records.items():
+            decoded = coco_mask.decode(coco_mask.frPyObjects(record, *record["size"]))
+            np.testing.assert_array_equal(decoded, expected[int(index)])

@@ -1,0 +1,66 @@
+"""NumPy twin of amodal masks in boxes: packed from mask images, and unpacked to these pixel by pixel."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+ROWS = 32
+"""Rows of a word."""
+
+
+def pack_masks(masks: np.ndarray, margin: int = 1) -> dict[str, np.ndarray]:
+    """Fields of a view of `FrameBatch` from its masks (I, H, W) bool; boxes are wider than the masks by `margin` [px]."""
+    count, height, width = masks.shape
+    words = np.zeros(count * width * -(-height // ROWS), np.uint32)
+    first, box = np.zeros(count, np.int32), np.tile(np.array([0, 0, -1, -1], np.int32), (count, 1))
+    used = 0
+    for index, mask in enumerate(masks):
+        first[index] = used
+        rows, columns = np.nonzero(mask)
+        if not rows.size:
+            continue
+        left, top = max(0, columns.min() - margin), max(0, rows.min() - margin)
+        right, bottom = min(width - 1, columns.max() + margin), min(height - 1, rows.max() + margin)
+        box[index] = left, top, right, bottom
+        down, right_by = rows - top, columns - left
+        np.bitwise_or.at(words, used + down // ROWS * (right - left + 1) + right_by, np.uint32(1) << (down % ROWS).astype(np.uint32))
+        used += (right - left + 1) * -(-(bottom - top + 1) // ROWS)
+    return {"mask_words": words, "mask_first": first, "mask_box": box, "mask_length": np.array(used, np.int32)}
+
+
+def pack_into(buffers: Any, masks: np.ndarray) -> None:
+    """Assign masks (B, I, H, W) bool to `ViewBuffers`."""
+    packed = [pack_masks(view) for view in masks]
+    for name in packed[0]:
+        getattr(buffers, name).assign(np.stack([view[name] for view in packed]))
+
+
+def unpack_view(views: Any, view: int, height: int, width: int) -> np.ndarray:
+    """Masks (I, H, W) bool of a view of a `FrameBatch` or, on the host, of `ViewBuffers`."""
+    words, first, box = (np.asarray(getattr(views, name)[view]) for name in ("mask_words", "mask_first", "mask_box"))
+    masks = np.zeros((len(first), height, width), bool)
+    for index, (left, top, right, bottom) in enumerate(box.tolist()):
+        rows, columns = np.mgrid[top : bottom + 1, left : right + 1]
+        place = first[index] + (rows - top) // ROWS * (right - left + 1) + columns - left
+        masks[index, top : bottom + 1, left : right + 1] = words[place] >> ((rows - top) % ROWS).astype(np.uint32) & 1
+    return masks
+
+
+def masks_of_batch(batch: Any, view: int = 0) -> np.ndarray:
+    """Masks (I, H, W) bool of a view of a `FrameBatch`."""
+    return unpack_view(batch, view, *batch.instance[view].shape)
+
+
+def masks_of_buffers(buffers: Any) -> np.ndarray:
+    """Masks (B, I, H, W) bool of `ViewBuffers`."""
+    views, height, width = buffers.instance.shape
+    host = type("Host", (), {name: getattr(buffers, name).numpy() for name in ("mask_words", "mask_first", "mask_box")})
+    return np.stack([unpack_view(host, view, height, width) for view in range(views)])
+
+
+def bits_of(masks: np.ndarray) -> np.ndarray:
+    """Bit i: instance i (..., H, W) uint32, from masks (..., I, H, W) bool of at most 32 instances."""
+    bits = np.uint32(1) << np.arange(masks.shape[-3], dtype=np.uint32)
+    return (masks * bits[:, None, None]).sum(axis=-3).astype(np.uint32)
