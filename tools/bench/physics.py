@@ -231,7 +231,7 @@ def _measure_picking(simulation: Simulation, pile_seconds: float) -> Iterator[Ro
             report = reader.wait()
             act = report.column("phase") == Phase.ACT
             acting += int(act.sum())
-            attached += int((act & (report.column("attached") != 0)).sum())
+            attached += int((act & report.attached.any(axis=1)).sum())
             perceptions += int((act & (report.column("task") == Task.LOOK)).sum())
     wp.synchronize_device(device)
     tick = (time.perf_counter() - started) / PICK_TICKS
