@@ -1,7 +1,7 @@
 """Clutter graph: edges from occlusion votes, made acyclic by a minimum feedback arc set, and its transitive closure (ancestors).
 
-An edge runs from the upper object to the lower one; the instances above another are a bit set (`kernels.bitsets`). What takes more than
-linear time is shared among threads: edges and closure by a thread a row, cycles by the lanes of a warp a view; on a CPU a view has one lane.
+An edge runs from the upper object to the lower one; the instances above another are a bit set (`kernels.bitsets`). Threads share
+what takes more than linear time: edges and closure a thread a row, cycles a warp a view, whose threads are called lanes (one on a CPU).
 """
 
 import warp as wp

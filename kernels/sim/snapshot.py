@@ -129,18 +129,12 @@ def pack_status_kernel(
     outcome: wp.array[int],  # (world)
     target: wp.array[int],  # (world)
     hits: wp.array[wp.vec2i],  # (world)
-    engaged_words: wp.array2d[wp.uint32],  # (world, word)
-    attached_words: wp.array2d[wp.uint32],  # (world, word)
     peak_force: wp.array[float],  # (world) [N]
     # Out:
     status_out: wp.array2d[int],  # (world, status)
     measure_out: wp.array2d[float],  # (world, measure)
-    engaged_out: wp.array2d[wp.uint32],  # (world, word)
-    attached_out: wp.array2d[wp.uint32],  # (world, word)
 ):
-    """Pack the columns of `Status` and `Measure` of each world, and its sets of engaged and attached instances, which the host reads after
-    each tick. Launched over world.
-    """
+    """Pack the columns of `Status` and `Measure` of each world, which the host reads after each tick. Launched over world."""
     world = wp.tid()
     status_out[world, Status.PHASE] = phase[world]
     status_out[world, Status.ENDING] = ending[world]
@@ -158,9 +152,24 @@ def pack_status_kernel(
     if attempt[world] >= 0:
         status_out[world, Status.HITS] = hits[world][0]
         status_out[world, Status.SEALED] = hits[world][1]
-    for word in range(engaged_words.shape[1]):
-        engaged_out[world, word] = NO_MEMBERS
-        if attempt[world] >= 0:
-            engaged_out[world, word] = engaged_words[world, word]
-        attached_out[world, word] = attached_words[world, word]
     measure_out[world, Measure.PEAK_FORCE] = peak_force[world]
+
+
+@wp.kernel
+def copy_sets_kernel(
+    # State:
+    attempt: wp.array[int],  # (world)
+    engaged_words: wp.array2d[wp.uint32],  # (world, word)
+    attached_words: wp.array2d[wp.uint32],  # (world, word)
+    # Out:
+    engaged_out: wp.array2d[wp.uint32],  # (world, word)
+    attached_out: wp.array2d[wp.uint32],  # (world, word)
+):
+    """Copy the bit sets of engaged and attached instances beside the status rows; engaged are none before the first attempt. Launched over
+    world, word.
+    """
+    world, word = wp.tid()
+    engaged_out[world, word] = NO_MEMBERS
+    if attempt[world] >= 0:
+        engaged_out[world, word] = engaged_words[world, word]
+    attached_out[world, word] = attached_words[world, word]

@@ -268,7 +268,7 @@ def test_the_whole_planner(device):
     harness.grasp.target.fill_(7)
     worlds.state.mode.assign(np.array([Mode.PICK, Mode.TARGET, Mode.PICK, Mode.PICK]))
     harness.planner.plan(harness.scene, worlds.state, attempts, harness.observation, harness.grasp, 0)
-    assert harness.observation.above.numpy().tolist() == [[0b10, 0, 0, 0], [0, 0b01, 0, 0], [0] * 4, [0] * 4]
+    assert harness.observation.above.numpy()[..., 0].tolist() == [[0b10, 0, 0, 0], [0, 0b01, 0, 0], [0] * 4, [0] * 4]
     assert harness.grasp.target.numpy().tolist() == [1, 1, -1, 7]
     np.testing.assert_allclose(harness.grasp.normal.numpy()[:2], [(np.sin(0.1), 0, np.cos(0.1)), (0, 0, 1)], atol=1e-5)
     np.testing.assert_allclose(harness.grasp.point.numpy()[1, 2], 0.02, atol=1e-6)

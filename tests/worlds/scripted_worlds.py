@@ -132,9 +132,7 @@ def report(side_by_side: list[World]) -> TickReport:
         parts = [vars(getattr(world, part)) for world in side_by_side]
         return SimpleNamespace(**{name: np.concatenate([arrays[name] for arrays in parts]) for name in parts[0]})
 
-    parts = [
-        np.concatenate([getattr(world, name) for world in side_by_side]) for name in ("status", "measures", *SETS, "catalog_index")
-    ]
+    parts = [np.concatenate([getattr(world, name) for world in side_by_side]) for name in ("status", "measures", *SETS, "catalog_index")]
     pose = np.zeros((*parts[-1].shape, 7), np.float32)
     return TickReport(*parts, pose, stacked("observation"), stacked("plan"), SimpleNamespace())
 
