@@ -9,7 +9,7 @@ import typing
 from collections.abc import Iterator
 from typing import Any
 
-from synpick_warp.configs.randomize import OFF, Distribution
+from synpick_warp.configs.episodes.randomize import OFF, Distribution
 from synpick_warp.errors import ConfigError, format_value, suggest
 
 _NAMES = {

@@ -12,17 +12,17 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 from synpick_warp.codes import Tone, names
-from synpick_warp.configs.bins import BinRow, Bins, Tote
-from synpick_warp.configs.cameras import CameraRow, Cameras
-from synpick_warp.configs.cell import Cell
+from synpick_warp.configs.cell.bins import BinRow, Bins, Tote
+from synpick_warp.configs.cell.cameras import CameraRow, Cameras
+from synpick_warp.configs.cell.extents import Cell
+from synpick_warp.configs.cell.gripper import Gripper, Suction
+from synpick_warp.configs.cell.rig import Rig
+from synpick_warp.configs.cell.sensors import DepthSensor, Effects
+from synpick_warp.configs.episodes.fills import COUNTS, Counts, parse_counts
+from synpick_warp.configs.episodes.manipulation import Move, Perception, Pick, Target
+from synpick_warp.configs.episodes.objects import ObjectRow, Objects
+from synpick_warp.configs.episodes.randomize import Randomize
 from synpick_warp.configs.fields import INT32_MAX, setting
-from synpick_warp.configs.fills import COUNTS, Counts, parse_counts
-from synpick_warp.configs.gripper import Gripper, Suction
-from synpick_warp.configs.manipulation import Move, Perception, Pick, Target
-from synpick_warp.configs.objects import ObjectRow, Objects
-from synpick_warp.configs.randomize import Randomize
-from synpick_warp.configs.rig import Rig
-from synpick_warp.configs.sensors import DepthSensor, Effects
 from synpick_warp.views.layers import LAYER_TABLE
 
 MODES = ("pick", "target", "move")

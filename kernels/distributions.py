@@ -15,7 +15,7 @@ PART_BODIES = wp.constant(1024)
 
 @wp.struct
 class LookDistribution:
-    """Probability distribution of one parameter; see `configs.randomize.Distribution`."""
+    """Probability distribution of one parameter; see `configs.episodes.randomize.Distribution`."""
 
     kind: int
     """`LookKind`."""

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from synpick_warp.configs.bins import TOTE, BinRow, Tote
-from synpick_warp.configs.cell import DIVIDER, BinSizes, Point
+from synpick_warp.configs.cell.bins import TOTE, BinRow, Tote
+from synpick_warp.configs.cell.extents import DIVIDER, BinSizes, Point
 from synpick_warp.errors import ConfigError
 from synpick_warp.scenes.bin_meshes.inside import HeightField
 from synpick_warp.scenes.bin_meshes.reading import bin_material, read_bin

@@ -11,8 +11,8 @@ from scipy.spatial.transform import Rotation
 
 from synpick_warp.codes import Stream
 from synpick_warp.configs.calibration.lens import with_matrix
-from synpick_warp.configs.cameras import WORLD, CameraRow, Jitter
-from synpick_warp.configs.rig import Rig, lens_map
+from synpick_warp.configs.cell.cameras import WORLD, CameraRow, Jitter
+from synpick_warp.configs.cell.rig import Rig, lens_map
 from synpick_warp.errors import ConfigError
 from synpick_warp.scenes.types import Camera
 from synpick_warp.system.random_numbers import stream_key, uniform

@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 from trimesh.bounds import oriented_bounds
 
-from synpick_warp.configs.cell import BinSizes
-from synpick_warp.configs.objects import AUTO_UNIT, HOUSEHOLD, UNITS
+from synpick_warp.configs.cell.extents import BinSizes
+from synpick_warp.configs.episodes.objects import AUTO_UNIT, HOUSEHOLD, UNITS
 from synpick_warp.configs.schema import Config, ObjectRow, Objects
 from synpick_warp.errors import CatalogError, SynpickError
 from synpick_warp.scenes.assets.appearance import FileMaterial

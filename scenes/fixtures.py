@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from synpick_warp.configs.gripper import Gripper
+from synpick_warp.configs.cell.gripper import Gripper
 from synpick_warp.scenes.bins import Bin
 from synpick_warp.scenes.grippers.mechanism import finger_fixture
 from synpick_warp.scenes.grippers.registry import make_head

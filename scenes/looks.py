@@ -10,8 +10,8 @@ import cv2
 import numpy as np
 
 from synpick_warp.codes import LookPart
+from synpick_warp.configs.episodes.randomize import Randomize
 from synpick_warp.configs.fields import PATH_RULE
-from synpick_warp.configs.randomize import Randomize
 from synpick_warp.errors import CatalogError, SynpickError
 from synpick_warp.scenes.assets.appearance import MAX_TEXTURE_FILE, decode_texture
 from synpick_warp.scenes.assets.asset_files import check_file_name

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from synpick_warp.configs.bins import Tote
+from synpick_warp.configs.cell.bins import Tote
 from synpick_warp.errors import ConfigError
 from synpick_warp.scenes.collision.simplification import simplify_hull
 from synpick_warp.scenes.modelling import Patch, join, loft, make_mesh, rounded_rectangle, solid, strips

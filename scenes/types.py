@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from synpick_warp.configs.calibration.lens import LensMap
-from synpick_warp.configs.cameras import WORLD
+from synpick_warp.configs.cell.cameras import WORLD
 
 
 @dataclass(frozen=True, eq=False)

@@ -166,7 +166,7 @@ def load_config(preset_or_file: Path | str | None = None, settings: Mapping[str,
     Raises:
         ConfigError: There is no such preset, file or key, or a value is not allowed.
     """
-    from synpick_warp.configs.load import load_config as load
+    from synpick_warp.configs.files.load import load_config as load
 
     return load(None if preset_or_file is None else str(preset_or_file), settings or {}, splits=splits)
 

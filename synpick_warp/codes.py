@@ -171,7 +171,7 @@ class Stream(enum.IntEnum):
 
 
 class Look(enum.IntEnum):
-    """Parameter that is drawn, of a body, the table, a lamp or the episode; see `configs.randomize`."""
+    """Parameter that is drawn, of a body, the table, a lamp or the episode; see `configs.episodes.randomize`."""
 
     HUE = 0
     """Rotation of the hue [°]."""
@@ -215,7 +215,7 @@ class LookPart(enum.IntEnum):
 
 
 class LookKind(enum.IntEnum):
-    """Kind of a probability distribution; see `configs.randomize.Distribution`."""
+    """Kind of a probability distribution; see `configs.episodes.randomize.Distribution`."""
 
     OFF = 0
     FIXED = 1

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 import synpick_warp
-from synpick_warp.configs.load import load_config
+from synpick_warp.configs.files.load import load_config
 from synpick_warp.system.progress import SilentProgress
 
 ROOT = Path(__file__).resolve().parent.parent

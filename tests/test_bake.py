@@ -14,7 +14,7 @@ import pytest
 
 from synpick_warp.cli import main as commands
 from synpick_warp.codes import Ending, Outcome
-from synpick_warp.configs.load import load_config
+from synpick_warp.configs.files.load import load_config
 from synpick_warp.errors import OutputError
 from synpick_warp.exporters.bop.exporter import BopExporter
 from synpick_warp.exporters.writing.png import frame_depth_png

@@ -13,8 +13,8 @@ import zarr
 
 import synpick_warp
 from synpick_warp.codes import Ending, Mode, Phase, Stream, Task
-from synpick_warp.configs.load import load_config
-from synpick_warp.configs.randomize import Distribution, Randomize
+from synpick_warp.configs.episodes.randomize import Distribution, Randomize
+from synpick_warp.configs.files.load import load_config
 from synpick_warp.dataset.commit.digests import digest_inputs
 from synpick_warp.errors import CatalogError, ConfigError
 from synpick_warp.scenes.build import count_distractor_slots

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from synpick_warp.configs.load import sections, settings_of
+from synpick_warp.configs.files.load import sections, settings_of
 from synpick_warp.configs.schema import ObjectRow
 
 ROOT = Path(__file__).resolve().parent.parent

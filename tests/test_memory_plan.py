@@ -12,11 +12,11 @@ from hypothesis import given
 from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
 
-from synpick_warp.configs.bins import BinRow
-from synpick_warp.configs.cameras import CameraRow, Jitter, Pose
+from synpick_warp.configs.cell.bins import BinRow
+from synpick_warp.configs.cell.cameras import CameraRow, Jitter, Pose
+from synpick_warp.configs.episodes.randomize import Distribution
 from synpick_warp.configs.fields import INT32_MAX
-from synpick_warp.configs.load import load_config, sections, settings_of
-from synpick_warp.configs.randomize import Distribution
+from synpick_warp.configs.files.load import load_config, sections, settings_of
 from synpick_warp.configs.schema import FAST, REFERENCE, UNOCCLUDED, Config, Physics, Settle
 from synpick_warp.errors import ConfigError, SynpickError
 from synpick_warp.factory import assembly, memory_plan, pipeline

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from synpick_warp.apps.validation.run import Options, Summary, validate
 from synpick_warp.apps.viz.explain import write_explanation
 from synpick_warp.apps.viz.preview import write_contact_sheet
-from synpick_warp.configs.load import load_config
+from synpick_warp.configs.files.load import load_config
 from synpick_warp.configs.schema import FORMATS
 from synpick_warp.dataset.reading import DataSet
 from synpick_warp.factory.pipeline import run_bake

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from synpick_warp.codes import LookKind
-from synpick_warp.configs.randomize import Distribution, Randomize
+from synpick_warp.configs.episodes.randomize import Distribution, Randomize
 from synpick_warp.factory.pipeline import run_bake
 from synpick_warp.system.progress import SilentProgress
 from tests.builders import PICKING, boxes

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import trimesh
 
-from synpick_warp.configs.load import load_config
+from synpick_warp.configs.files.load import load_config
 from synpick_warp.factory.pipeline import run_bake
 from synpick_warp.system.progress import SilentProgress
 from tests.builders import PICKING

@@ -14,7 +14,7 @@ import pytest
 import warp as wp
 
 from synpick_warp.codes import Effect, Measure, Phase, Status
-from synpick_warp.configs.cameras import CameraRow
+from synpick_warp.configs.cell.cameras import CameraRow
 from synpick_warp.configs.schema import LAYERS, Config
 from synpick_warp.exporters.writing.rle import find_run_boundaries, unpack_run_boundaries
 from synpick_warp.stages import host_copies, view_ring

@@ -9,7 +9,7 @@ import pytest
 import warp as wp
 
 from synpick_warp.cli.main import main
-from synpick_warp.configs.cameras import CameraRow, Pose
+from synpick_warp.configs.cell.cameras import CameraRow, Pose
 from synpick_warp.factory import assembly, warmup
 from synpick_warp.factory.compilation import launch_all
 from synpick_warp.newton_patches.narrow_phase import slow_builds

@@ -16,11 +16,11 @@ from typing import Any
 from synpick_warp.apps.validation.registry import load_rules
 from synpick_warp.configs.calibration.sensor_presets import SENSORS
 from synpick_warp.configs.check import describe_allowed, is_table
-from synpick_warp.configs.load import sections, table_lists
+from synpick_warp.configs.files.load import sections, table_lists
+from synpick_warp.configs.files.split_tables import SPLITS, split_settings
+from synpick_warp.configs.files.table_lists import settings_of
+from synpick_warp.configs.files.write import format_toml
 from synpick_warp.configs.schema import Split
-from synpick_warp.configs.split_tables import SPLITS, split_settings
-from synpick_warp.configs.table_lists import settings_of
-from synpick_warp.configs.write import format_toml
 from tools.figures import figures_tables, read_runs
 
 ROOT = Path(__file__).resolve().parents[1]

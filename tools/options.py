@@ -15,7 +15,7 @@ from rich.console import Console
 from rich.table import Table
 
 from synpick_warp.configs.fields import INT32_MAX
-from synpick_warp.configs.load import COMMAND_LINE, load_config, parse_assignment
+from synpick_warp.configs.files.load import COMMAND_LINE, load_config, parse_assignment
 from synpick_warp.configs.schema import Config
 from synpick_warp.errors import SynpickError
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from pathlib import Path
 
-from synpick_warp.configs.bins import BinRow
-from synpick_warp.configs.load import load_config
+from synpick_warp.configs.cell.bins import BinRow
+from synpick_warp.configs.files.load import load_config
 from synpick_warp.configs.schema import Config
 
 

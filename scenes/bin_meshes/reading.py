@@ -10,9 +10,9 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial import ConvexHull
 
-from synpick_warp.configs.bins import AXES, FILE, BinRow, MeasuredBin
+from synpick_warp.configs.cell.bins import AXES, FILE, BinRow, MeasuredBin
+from synpick_warp.configs.episodes.objects import UNITS
 from synpick_warp.configs.fields import PATH_RULE
-from synpick_warp.configs.objects import UNITS
 from synpick_warp.errors import CatalogError, ConfigError, SynpickError
 from synpick_warp.scenes.assets.appearance import FileMaterial
 from synpick_warp.scenes.assets.mesh_parts import NO_MATERIAL

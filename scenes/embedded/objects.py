@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from synpick_warp.configs.objects import HOUSEHOLD, INDUSTRIAL
+from synpick_warp.configs.episodes.objects import HOUSEHOLD, INDUSTRIAL
 from synpick_warp.scenes.collision.hulls import hull_size
 from synpick_warp.scenes.embedded import goods, parts, tools, vessels
 from synpick_warp.scenes.embedded.packs import Shape
@@ -78,7 +78,7 @@ ROWS = (
     _Row("large_clamp", tools.large_clamp, 0.202, 0.1, 0.5, discrete=_rotations(("x", 180))),
     _Row("foam_block", tools.foam_block, 0.028, 0.1, 0.7, discrete=_rotations(("z", 180), ("x", 180))),
 )
-"""The objects with obj_id 1 to 21, in this order; masses, concavity and materials are those of the object table (configs/synpick.toml)."""
+"""The objects with obj_id 1 to 21, in this order; masses, concavity and materials are in the preset `synpick`."""
 
 
 STEEL, ZINC, IRON, PLASTIC = (0.62, 0.63, 0.65), (0.72, 0.73, 0.74), (0.3, 0.3, 0.31), (0.16, 0.34, 0.55)

@@ -9,7 +9,7 @@ import newton
 import numpy as np
 import warp as wp
 
-from synpick_warp.configs.gripper import Gripper
+from synpick_warp.configs.cell.gripper import Gripper
 from synpick_warp.scenes.collision.simplification import simplify_hull
 from synpick_warp.scenes.grippers.head import COLLIDER_SIDES, SIDES, Head, rod_inertia
 from synpick_warp.scenes.modelling import lathe, make_mesh, solid

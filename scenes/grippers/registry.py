@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 
-from synpick_warp.configs.gripper import SUCTION1, SUCTION_ARRAY, Gripper
+from synpick_warp.configs.cell.gripper import SUCTION1, SUCTION_ARRAY, Gripper
 from synpick_warp.scenes.grippers import suction1, suction_array
 from synpick_warp.scenes.grippers.head import Head
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from synpick_warp.configs.gripper import Gripper
+from synpick_warp.configs.cell.gripper import Gripper
 from synpick_warp.scenes.collision.simplification import simplify_hull
 from synpick_warp.scenes.grippers.head import COLLIDER_SIDES, SIDES, Head, rod_inertia
 from synpick_warp.scenes.modelling import Patch, join, lathe, make_mesh, solid

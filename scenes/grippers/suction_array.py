@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from synpick_warp.configs.gripper import COMMON, Gripper
+from synpick_warp.configs.cell.gripper import COMMON, Gripper
 from synpick_warp.scenes.collision.simplification import simplify_hull
 from synpick_warp.scenes.grippers.head import COLLIDER_SIDES, SIDES, Head
 from synpick_warp.scenes.grippers.suction1 import HINGE, LIP, STEM_SIDES, cup_patch, hinge_patch

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from synpick_warp.configs.objects import DETECT, ObjectRow, Objects
+from synpick_warp.configs.episodes.objects import DETECT, ObjectRow, Objects
 from synpick_warp.errors import CatalogError
 from synpick_warp.scenes.assets.meshes import MeshFile
 from synpick_warp.scenes.assets.models_info import ModelInfo, check_against_mesh

@@ -36,8 +36,9 @@ from synpick_warp.cli.options import (
 )
 from synpick_warp.cli.streams import SafeStreams, StreamError, describe_fault
 from synpick_warp.configs.check import describe_allowed
+from synpick_warp.configs.dataset.splits import DataLayout
 from synpick_warp.configs.fields import PATH_RULE
-from synpick_warp.configs.load import (
+from synpick_warp.configs.files.load import (
     COMMAND_LINE,
     DEFAULT_PRESET,
     parse_assignment,
@@ -45,9 +46,8 @@ from synpick_warp.configs.load import (
     sections,
     settings_of,
 )
+from synpick_warp.configs.files.write import config_to_toml
 from synpick_warp.configs.schema import Config
-from synpick_warp.configs.splits import DataLayout
-from synpick_warp.configs.write import config_to_toml
 from synpick_warp.errors import CatalogError, ConfigError, LightError, SynpickError
 from synpick_warp.scenes.bin_meshes.loading import load_settings
 from synpick_warp.system.processes.garbage import collection_paused

@@ -17,7 +17,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from synpick_warp.configs.splits import DataLayout, episode_range
+from synpick_warp.configs.dataset.splits import DataLayout, episode_range
 from synpick_warp.dataset.annotations import ADVICE, EpisodeEntry, EpisodeRow, Key, ModelInfo, check_content, read_checked
 from synpick_warp.dataset.commit.frame_counts import check_frames
 from synpick_warp.dataset.commit.manifest import CONFIG_FILE, CONSTANTS, ENTRIES, MANIFEST_FILE, episode_entry, read_checksums
@@ -267,7 +267,7 @@ class DataSet(Mapping[int, Episode]):
         """
         if self.found is not None:
             raise DatasetError(f"{self.folder} has no settings: it is from another source than synpick-warp bake")
-        from synpick_warp.configs.load import load_config
+        from synpick_warp.configs.files.load import load_config
 
         return load_config(str(self.folder / CONFIG_FILE), {})
 

@@ -11,7 +11,7 @@ from typing import Annotated, Any, Literal, TypeVar
 import msgspec
 
 from synpick_warp.codes import MAX_CUPS, Ending, Mode, Outcome, names
-from synpick_warp.configs.cameras import WORLD
+from synpick_warp.configs.cell.cameras import WORLD
 from synpick_warp.dataset.annotations import Index, Side
 from synpick_warp.errors import DatasetError
 from synpick_warp.system.inputs.files import read_file

@@ -7,8 +7,8 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from synpick_warp.configs.rig import Size
-from synpick_warp.configs.splits import DataLayout
+from synpick_warp.configs.cell.rig import Size
+from synpick_warp.configs.dataset.splits import DataLayout
 from synpick_warp.dataset.commit.manifest import CONFIG_FILE
 from synpick_warp.errors import DatasetError
 from synpick_warp.system.inputs.paths import path_inside

@@ -21,8 +21,8 @@ import re
 from collections.abc import Callable
 from typing import Literal, NamedTuple
 
+from synpick_warp.configs.dataset.splits import DataLayout
 from synpick_warp.configs.schema import Bop
-from synpick_warp.configs.splits import DataLayout
 from synpick_warp.system.inputs.image_files import TEXTURE_KINDS
 
 Content = Literal["views", "masks", "poses", "gripper"]

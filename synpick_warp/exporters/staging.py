@@ -14,7 +14,7 @@ from typing import Any, ClassVar, Generic, TypeVar
 import numpy as np
 
 from synpick_warp.codes import Ending
-from synpick_warp.configs.export import ExportSettings
+from synpick_warp.configs.dataset.export import ExportSettings
 from synpick_warp.exporters.base import ExportContext, StoredScene
 from synpick_warp.exporters.writing.files import PARTIAL, output_errors
 from synpick_warp.exporters.writing.pool import WriterPool, WriteTask

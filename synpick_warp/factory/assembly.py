@@ -15,10 +15,10 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from synpick_warp.configs.cameras import COLOR
-from synpick_warp.configs.rig import Rig
+from synpick_warp.configs.cell.cameras import COLOR
+from synpick_warp.configs.cell.rig import Rig
+from synpick_warp.configs.dataset.splits import DataLayout
 from synpick_warp.configs.schema import Config, Render
-from synpick_warp.configs.splits import DataLayout
 from synpick_warp.exporters.registry import Needs
 from synpick_warp.factory.attempts import AttemptLog
 from synpick_warp.factory.compilation import is_cache_warm, make_compiler, sole_compiler, submit_launches, submit_slow

@@ -8,9 +8,9 @@ from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 from synpick_warp.codes import Ending, Outcome
-from synpick_warp.configs.manipulation import Perception
+from synpick_warp.configs.dataset.splits import DataLayout
+from synpick_warp.configs.episodes.manipulation import Perception
 from synpick_warp.configs.schema import Arrangement, Physics, Settle
-from synpick_warp.configs.splits import DataLayout
 from synpick_warp.factory.attempts import EpisodeRecord
 from synpick_warp.stages.stream import TickReport
 from synpick_warp.views.bins import bin_noun, bin_record

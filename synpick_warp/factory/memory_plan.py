@@ -14,10 +14,10 @@ from typing import Any
 
 import warp as wp
 
-from synpick_warp.configs.cameras import COLOR
+from synpick_warp.configs.cell.cameras import COLOR
+from synpick_warp.configs.dataset.modes import may_pick
+from synpick_warp.configs.episodes.randomize import Randomize
 from synpick_warp.configs.fields import INT32_MAX
-from synpick_warp.configs.modes import may_pick
-from synpick_warp.configs.randomize import Randomize
 from synpick_warp.configs.schema import Config, Perception, Physics
 from synpick_warp.errors import ConfigError, SynpickError, format_value
 from synpick_warp.exporters.registry import Needs

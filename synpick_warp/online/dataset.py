@@ -17,10 +17,10 @@ from typing import Any
 import torch  # pyright: ignore[reportMissingImports]
 from torch.utils.data import IterableDataset, get_worker_info  # pyright: ignore[reportMissingImports]
 
-from synpick_warp.configs.cameras import COLOR
+from synpick_warp.configs.cell.cameras import COLOR
 from synpick_warp.configs.check import to_index
+from synpick_warp.configs.dataset.splits import DataLayout
 from synpick_warp.configs.schema import Config
-from synpick_warp.configs.splits import DataLayout
 from synpick_warp.dataset.view import MILLIMETERS
 from synpick_warp.errors import ConfigError
 from synpick_warp.online.selection import Selection, choose_episodes

@@ -6,8 +6,8 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
 from synpick_warp.configs.check import to_index
+from synpick_warp.configs.dataset.splits import DataLayout, check_shard
 from synpick_warp.configs.fields import INT32_MAX
-from synpick_warp.configs.splits import DataLayout, check_shard
 from synpick_warp.errors import ConfigError
 from synpick_warp.factory.memory_plan import check_episodes
 

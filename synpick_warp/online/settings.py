@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from pathlib import Path
 
-from synpick_warp.configs.load import override_config
+from synpick_warp.configs.files.load import override_config
 from synpick_warp.configs.schema import Config
 from synpick_warp.scenes.bin_meshes.loading import load_settings
 from synpick_warp.scenes.bin_meshes.reading import measure_bins

@@ -19,8 +19,8 @@ import numpy as np
 import warp as wp
 
 from synpick_warp.codes import Phase
+from synpick_warp.configs.dataset.splits import DataLayout
 from synpick_warp.configs.schema import Config
-from synpick_warp.configs.splits import DataLayout
 from synpick_warp.errors import ConfigError
 from synpick_warp.factory.assembly import Stages, build_smallest, build_stages, compiling_if_cold, group_layers
 from synpick_warp.factory.episodes import BakeSummary, episode_row, is_resampled, remedy

@@ -11,9 +11,9 @@ import numpy as np
 import warp as wp
 
 from synpick_warp.configs import schema
-from synpick_warp.configs.cell import BinSizes
-from synpick_warp.configs.fills import Counts, most_objects
-from synpick_warp.configs.modes import mode_weights
+from synpick_warp.configs.cell.extents import BinSizes
+from synpick_warp.configs.dataset.modes import mode_weights
+from synpick_warp.configs.episodes.fills import Counts, most_objects
 from synpick_warp.kernels import structs
 from synpick_warp.kernels.distributions import LookTable
 from synpick_warp.scenes import build

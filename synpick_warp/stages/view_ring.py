@@ -11,7 +11,7 @@ import numpy as np
 import warp as wp
 
 from synpick_warp.configs.calibration.lens import LensMap, with_matrix
-from synpick_warp.configs.rig import Rig
+from synpick_warp.configs.cell.rig import Rig
 from synpick_warp.configs.schema import Render
 from synpick_warp.kernels.render.visibility.lens import NUMBERS
 from synpick_warp.stages.arrays import allocate, allocate_struct, dry_run

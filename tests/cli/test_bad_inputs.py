@@ -17,7 +17,7 @@ from PIL import Image
 from trimesh.visual import TextureVisuals
 from trimesh.visual.material import PBRMaterial
 
-from synpick_warp.configs.load import load_config
+from synpick_warp.configs.files.load import load_config
 from synpick_warp.configs.schema import Config
 from synpick_warp.factory.assembly import make_renderer
 from synpick_warp.scenes.assets.appearance import decode_texture

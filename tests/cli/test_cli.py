@@ -19,7 +19,7 @@ from synpick_warp import __version__
 from synpick_warp.cli.commands import doctor
 from synpick_warp.cli.main import main
 from synpick_warp.codes import Ending
-from synpick_warp.configs.load import load_config
+from synpick_warp.configs.files.load import load_config
 from synpick_warp.errors import DatasetError, DeviceError, OutputError, SynpickError
 from synpick_warp.exporters.writing.pool import WriterPool
 from synpick_warp.factory.episodes import BakeSummary, EpisodeRow

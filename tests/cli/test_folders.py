@@ -13,9 +13,9 @@ import pytest
 
 from synpick_warp.cli.folders import beside, choose_output
 from synpick_warp.cli.main import main
-from synpick_warp.configs.load import load_config
+from synpick_warp.configs.files.load import load_config
+from synpick_warp.configs.files.write import config_to_toml
 from synpick_warp.configs.schema import Config
-from synpick_warp.configs.write import config_to_toml
 from synpick_warp.dataset.commit.manifest import encode_manifest, make_manifest
 from synpick_warp.errors import OutputError
 from tests.builders import mistake

@@ -14,9 +14,9 @@ import trimesh
 
 from synpick_warp.apps.viz.cell.frusta import project
 from synpick_warp.cli.commands import new_cell
-from synpick_warp.configs.cell_file import WIDTH
-from synpick_warp.configs.load import load_config
-from synpick_warp.configs.rig import intrinsics
+from synpick_warp.configs.cell.rig import intrinsics
+from synpick_warp.configs.files.cell_file import WIDTH
+from synpick_warp.configs.files.load import load_config
 from synpick_warp.errors import LightError
 from synpick_warp.scenes.bin_meshes.loading import load_settings
 from synpick_warp.scenes.cameras import make_cameras

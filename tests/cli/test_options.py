@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 
 from synpick_warp.cli.main import main
 from synpick_warp.cli.options import MAX_LINE, one_line, parse_resolution, parse_shard
-from synpick_warp.configs.load import load_config
-from synpick_warp.configs.splits import DataLayout
+from synpick_warp.configs.dataset.splits import DataLayout
+from synpick_warp.configs.files.load import load_config
 from synpick_warp.errors import ConfigError
 from tests.builders import mistake
 from tests.harness.fuzz import fuzz_examples

@@ -6,11 +6,11 @@ from pathlib import Path
 
 import pytest
 
-from synpick_warp.configs.cameras import CameraRow
-from synpick_warp.configs.load import COMMAND_LINE, load_config
-from synpick_warp.configs.rig import Rig, intrinsics, resized, viewing_direction
+from synpick_warp.configs.cell.cameras import CameraRow
+from synpick_warp.configs.cell.rig import Rig, intrinsics, resized, viewing_direction
+from synpick_warp.configs.files.load import COMMAND_LINE, load_config
+from synpick_warp.configs.files.write import config_to_toml
 from synpick_warp.configs.schema import Cameras, Config
-from synpick_warp.configs.write import config_to_toml
 from synpick_warp.errors import ConfigError
 
 K = "matrix = [[275.0, 0.0, 163.8], [0.0, 274.6, 117.5], [0.0, 0.0, 1.0]]"

@@ -12,9 +12,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from synpick_warp.cli.main import main
-from synpick_warp.configs.load import load_config, parse_assignment, sections, settings_of
+from synpick_warp.configs.files.load import load_config, parse_assignment, sections, settings_of
+from synpick_warp.configs.files.write import config_to_toml
 from synpick_warp.configs.schema import Config, ObjectRow
-from synpick_warp.configs.write import config_to_toml
 from synpick_warp.errors import ConfigError
 from tests.harness.fuzz import fuzz_examples
 

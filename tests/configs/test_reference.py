@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from synpick_warp.configs.load import preset_names, sections, settings_of
+from synpick_warp.configs.files.load import preset_names, sections, settings_of
 from tools.docs import SETTINGS_REFERENCE, settings_reference
 
 

@@ -12,11 +12,11 @@ from hypothesis import strategies as st
 
 from synpick_warp.cli.main import main
 from synpick_warp.codes import Stream
-from synpick_warp.configs.load import load_config
-from synpick_warp.configs.modes import may_pick
+from synpick_warp.configs.dataset.modes import may_pick
+from synpick_warp.configs.dataset.splits import DataLayout, episode_range
+from synpick_warp.configs.files.load import load_config
+from synpick_warp.configs.files.write import config_to_toml
 from synpick_warp.configs.schema import Split
-from synpick_warp.configs.splits import DataLayout, episode_range
-from synpick_warp.configs.write import config_to_toml
 from synpick_warp.dataset.commit.manifest import make_manifest
 from synpick_warp.errors import ConfigError
 from tests.twins import rng

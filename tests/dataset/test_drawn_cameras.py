@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 
 import synpick_warp
 from synpick_warp.codes import Stream
-from synpick_warp.configs.load import load_config
+from synpick_warp.configs.files.load import load_config
 from synpick_warp.errors import ConfigError
 from synpick_warp.factory.pipeline import run_bake
 from synpick_warp.scenes.cameras import make_cameras

@@ -12,10 +12,10 @@ import numpy as np
 import pytest
 
 from synpick_warp.codes import Ending
-from synpick_warp.configs.load import load_config, sections, settings_of
-from synpick_warp.configs.randomize import FIXED, Distribution
+from synpick_warp.configs.episodes.randomize import FIXED, Distribution
+from synpick_warp.configs.files.load import load_config, sections, settings_of
+from synpick_warp.configs.files.write import config_to_toml
 from synpick_warp.configs.schema import Config
-from synpick_warp.configs.write import config_to_toml
 from synpick_warp.dataset.commit import manifest
 from synpick_warp.dataset.commit.digests import digest_inputs
 from synpick_warp.dataset.commit.writing import commit_episode

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 import synpick_warp
-from synpick_warp.configs.load import load_config
-from synpick_warp.configs.write import config_to_toml
+from synpick_warp.configs.files.load import load_config
+from synpick_warp.configs.files.write import config_to_toml
 from synpick_warp.errors import DatasetError
 from tests.harness.environment import checkout_environment
 from tests.worlds import box_views

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from synpick_warp.cli.main import main
-from synpick_warp.configs.write import config_to_toml
+from synpick_warp.configs.files.write import config_to_toml
 from synpick_warp.dataset.commit import manifest, verify
 from synpick_warp.exporters.writing.checksums import write_manifest_entry
 from synpick_warp.system.processes import pool

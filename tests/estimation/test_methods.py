@@ -24,7 +24,7 @@ from synpick_warp.apps.estimation.run import (
 )
 from synpick_warp.apps.estimation.scenes import ABSENT, ScenePlan, read_scene
 from synpick_warp.apps.evaluation.truth import read_truth
-from synpick_warp.configs.sensors import DepthSensor
+from synpick_warp.configs.cell.sensors import DepthSensor
 from synpick_warp.errors import DatasetError
 from synpick_warp.exporters.bop.exporter import BopExporter
 from tests.estimation.fakes import FakeEstimator

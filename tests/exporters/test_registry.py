@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from synpick_warp.configs.export import ExportSettings
+from synpick_warp.configs.dataset.export import ExportSettings
 from synpick_warp.configs.schema import FORMATS, Config
 from synpick_warp.errors import ConfigError
 from synpick_warp.exporters import registry

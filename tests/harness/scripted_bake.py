@@ -8,9 +8,9 @@ import os
 from pathlib import Path
 
 from synpick_warp.codes import Ending
-from synpick_warp.configs.export import ExportSettings
+from synpick_warp.configs.dataset.export import ExportSettings
+from synpick_warp.configs.dataset.splits import DataLayout
 from synpick_warp.configs.schema import FORMATS, Config
-from synpick_warp.configs.splits import DataLayout
 from synpick_warp.dataset.commit.manifest import episode_entry, read_entry
 from synpick_warp.dataset.commit.writing import OutputFolder, finalize_data_set
 from synpick_warp.exporters.base import ExportContext

@@ -13,8 +13,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from synpick_warp.configs.load import load_config
-from synpick_warp.configs.write import config_to_toml
+from synpick_warp.configs.files.load import load_config
+from synpick_warp.configs.files.write import config_to_toml
 from synpick_warp.errors import DatasetError
 from synpick_warp.system.inputs.files import check_regular_file, read_file
 from synpick_warp.system.inputs.json import decode_json

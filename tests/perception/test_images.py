@@ -10,7 +10,7 @@ import pytest
 import warp as wp
 
 from synpick_warp.codes import Segment
-from synpick_warp.configs.rig import Rig
+from synpick_warp.configs.cell.rig import Rig
 from synpick_warp.configs.schema import Config
 from synpick_warp.errors import ConfigError
 from synpick_warp.scenes.cameras import make_cameras

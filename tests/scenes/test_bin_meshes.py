@@ -9,9 +9,9 @@ import pytest
 import trimesh
 from scipy.spatial import ConvexHull
 
-from synpick_warp.configs.bins import AXES, BinRow
-from synpick_warp.configs.load import load_config, override_config
-from synpick_warp.configs.write import config_to_toml
+from synpick_warp.configs.cell.bins import AXES, BinRow
+from synpick_warp.configs.files.load import load_config, override_config
+from synpick_warp.configs.files.write import config_to_toml
 from synpick_warp.dataset.commit.manifest import make_manifest
 from synpick_warp.errors import ConfigError
 from synpick_warp.scenes.bin_meshes import reading

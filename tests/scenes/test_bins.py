@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from synpick_warp.configs.load import load_config
-from synpick_warp.configs.write import config_to_toml
+from synpick_warp.configs.files.load import load_config
+from synpick_warp.configs.files.write import config_to_toml
 from synpick_warp.dataset.commit.manifest import make_manifest
 from synpick_warp.errors import ConfigError
 from synpick_warp.scenes.bins import guide_walls, make_bins

@@ -12,8 +12,8 @@ from hypothesis import given
 from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
 
-from synpick_warp.configs.bins import BinRow
-from synpick_warp.configs.cell import BinSizes
+from synpick_warp.configs.cell.bins import BinRow
+from synpick_warp.configs.cell.extents import BinSizes
 from synpick_warp.configs.schema import Config, Physics
 from synpick_warp.errors import ConfigError
 from synpick_warp.kernels.newton_patches import contact_sweep

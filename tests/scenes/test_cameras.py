@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from synpick_warp.configs.rig import Rig
+from synpick_warp.configs.cell.rig import Rig
 from synpick_warp.configs.schema import Cameras
 from synpick_warp.errors import ConfigError
 from synpick_warp.scenes.cameras import make_cameras

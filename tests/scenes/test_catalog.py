@@ -12,7 +12,7 @@ import trimesh
 from hypothesis import given
 from hypothesis import strategies as st
 
-from synpick_warp.configs.load import load_config
+from synpick_warp.configs.files.load import load_config
 from synpick_warp.configs.schema import Arrangement, Bake, Config, ObjectRow, Objects, Tote
 from synpick_warp.errors import CatalogError
 from synpick_warp.scenes import catalog

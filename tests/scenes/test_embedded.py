@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial import ConvexHull, cKDTree
 
-from synpick_warp.configs.objects import EMBEDDED, INDUSTRIAL
+from synpick_warp.configs.episodes.objects import EMBEDDED, INDUSTRIAL
 from synpick_warp.scenes.assets.meshes import merge_positions, signed_volume
 from synpick_warp.scenes.embedded.objects import procedural_objects
 from synpick_warp.scenes.embedded.textures import PADDING, blank, pack

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from scipy.spatial import ConvexHull
 
-from synpick_warp.configs.load import load_config
-from synpick_warp.configs.objects import EMBEDDED
+from synpick_warp.configs.episodes.objects import EMBEDDED
+from synpick_warp.configs.files.load import load_config
 from synpick_warp.scenes.catalog import shape_recipe
 from synpick_warp.scenes.collision import embedded_shapes
 from synpick_warp.scenes.collision.decomposition import decompose

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from synpick_warp.configs.load import load_config, parse_assignment
+from synpick_warp.configs.files.load import load_config, parse_assignment
+from synpick_warp.configs.files.write import config_to_toml
 from synpick_warp.configs.schema import Arrangement
-from synpick_warp.configs.write import config_to_toml
 from synpick_warp.errors import ConfigError
 from synpick_warp.scenes import build
 from synpick_warp.scenes.fills import check_fill, count_entries, drop_height

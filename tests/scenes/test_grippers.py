@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from synpick_warp.configs.gripper import GRIPPERS
-from synpick_warp.configs.load import load_config
-from synpick_warp.configs.write import config_to_toml
+from synpick_warp.configs.cell.gripper import GRIPPERS
+from synpick_warp.configs.files.load import load_config
+from synpick_warp.configs.files.write import config_to_toml
 from synpick_warp.errors import ConfigError
 from synpick_warp.scenes.assets.meshes import merge_positions, signed_volume
 from synpick_warp.scenes.grippers.registry import HEADS, make_head

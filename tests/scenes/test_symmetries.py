@@ -13,9 +13,9 @@ from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
 from synpick_warp.apps.evaluation.models import read_models
-from synpick_warp.configs.load import load_config
+from synpick_warp.configs.files.load import load_config
+from synpick_warp.configs.files.write import config_to_toml
 from synpick_warp.configs.schema import Bake, Config, ObjectRow, Objects
-from synpick_warp.configs.write import config_to_toml
 from synpick_warp.errors import CatalogError, ConfigError
 from synpick_warp.exporters.bop.shared.models import write_models
 from synpick_warp.scenes.assets.models_info import read_models_info

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from synpick_warp.configs.cell import BinSizes
+from synpick_warp.configs.cell.extents import BinSizes
 from synpick_warp.configs.schema import Gripper, Tote
 from synpick_warp.errors import ConfigError
 from synpick_warp.scenes.assets.meshes import merge_positions, signed_volume

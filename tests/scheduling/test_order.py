@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from synpick_warp.codes import Mode
-from synpick_warp.configs.load import load_config
+from synpick_warp.configs.files.load import load_config
 from synpick_warp.factory import order
 from synpick_warp.factory.order import DEVIATIONS, FRAMES_OF_MODE, SORTED_EPISODES, deal_episodes, deal_writers, order_longest_first
 from tests.twins.arrangement import sample_modes, sample_objects

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from synpick_warp.configs.load import load_config
+from synpick_warp.configs.files.load import load_config
 from synpick_warp.configs.schema import Config
 from synpick_warp.exporters.registry import Needs
 from synpick_warp.factory import memory_plan, sizes

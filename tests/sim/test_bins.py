@@ -11,7 +11,7 @@ from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
 from synpick_warp.codes import Mode, Phase, Stream
-from synpick_warp.configs.bins import BinRow, Bins
+from synpick_warp.configs.cell.bins import BinRow, Bins
 from synpick_warp.scenes.bin_meshes.reading import measure_bins
 from synpick_warp.scenes.bins import make_bins
 from synpick_warp.stages.sim import arrange, gripper

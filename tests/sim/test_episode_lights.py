@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from synpick_warp.codes import Phase, Stream
-from synpick_warp.configs.randomize import Distribution, Randomize
+from synpick_warp.configs.episodes.randomize import Distribution, Randomize
 from synpick_warp.scenes.looks import Looks
 from synpick_warp.stages.render.looks import draw_looks
 from synpick_warp.stages.sim import arrange

@@ -10,7 +10,7 @@ import warp as wp
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from synpick_warp.configs.load import load_config
+from synpick_warp.configs.files.load import load_config
 from synpick_warp.kernels.structs import SuctionData
 from synpick_warp.scenes import build
 from synpick_warp.stages.sim import physics

@@ -16,8 +16,8 @@ import pytest
 import zarr
 from pxr import Usd, UsdGeom
 
-from synpick_warp.configs.load import load_config
-from synpick_warp.configs.write import config_to_toml
+from synpick_warp.configs.files.load import load_config
+from synpick_warp.configs.files.write import config_to_toml
 from tools.compare import runs as tool
 
 

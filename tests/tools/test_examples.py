@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 import synpick_warp
-from synpick_warp.configs.load import load_config
+from synpick_warp.configs.files.load import load_config
 from synpick_warp.dataset.webdataset import decode_view
 from tools.examples import bake_and_show, read_trajectory, train_loop
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import warp as wp
 
-from synpick_warp.configs.load import load_config
+from synpick_warp.configs.files.load import load_config
 from synpick_warp.stages.arrays import allocate
 from synpick_warp.stages.buffers import Snapshot
 from tests.builders import FEW_STEPS, ONE_OBJECT

@@ -9,7 +9,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from synpick_warp.configs.cell import BinSizes
+from synpick_warp.configs.cell.extents import BinSizes
 from synpick_warp.configs.schema import Config
 from tests.builders import FEW_STEPS, assignments
 from tools.bench import __main__ as bench

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 import warp as wp
 
-from synpick_warp.configs.rig import Rig
+from synpick_warp.configs.cell.rig import Rig
 from synpick_warp.configs.schema import Config, Perception
 from synpick_warp.kernels import structs
 from synpick_warp.scenes.cameras import make_cameras

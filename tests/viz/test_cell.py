@@ -12,7 +12,7 @@ import pytest
 from synpick_warp.apps.viz.cell.frusta import Canvas, center, draw_camera, footprint, image_border, project, rays
 from synpick_warp.apps.viz.cell.rendering import CellScene, Picture, lay_out, scaled_down
 from synpick_warp.apps.viz.cell.sheet import describe_camera
-from synpick_warp.configs.load import load_config
+from synpick_warp.configs.files.load import load_config
 from synpick_warp.scenes.bin_meshes.loading import load_settings
 from synpick_warp.scenes.embedded.objects import procedural_objects
 from tests.builders import mistake, run

@@ -17,8 +17,8 @@ from synpick_warp.apps.viz.explain import object_names, planning_camera, to_colo
 from synpick_warp.apps.viz.explain_panels import fitted, load_chart, wrapped
 from synpick_warp.apps.viz.explain_record import choice_words, labels, seal_words
 from synpick_warp.cli.main import main
+from synpick_warp.configs.files.write import config_to_toml
 from synpick_warp.configs.schema import Config, Perception, Target
-from synpick_warp.configs.write import config_to_toml
 from synpick_warp.dataset.view import View
 from synpick_warp.errors import DatasetError, OutputError
 from synpick_warp.exporters.bop.exporter import BopExporter
@@ -195,7 +195,7 @@ def test_a_target_that_is_not_in_the_ground_truth_of_the_image_is_drawn_without_
 def test_names_come_from_the_models_or_from_the_object_table(dataset):
     assert object_names(dataset, {3, 7}) == {3: "box 3", 7: "box 7"}
     assert object_names(dataset, {5}) == {}
-    from synpick_warp.configs.load import load_config
+    from synpick_warp.configs.files.load import load_config
 
     (dataset / "models" / "models_info.json").write_text(json.dumps({"2": {"diameter": 269.6}, "4": {"diameter": 60.0}}))
     config = load_config("synpick", {})

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from synpick_warp.apps.viz.explain_graph import clutter_edges, draw_graph, lay_out
 from synpick_warp.apps.viz.explain_panels import draw_words, load_chart
 from synpick_warp.apps.viz.explain_record import MAX_ATTEMPTS, Attempt, read_attempts
-from synpick_warp.configs.load import load_config
+from synpick_warp.configs.files.load import load_config
 from synpick_warp.errors import DatasetError
 from tests.harness.charts import picture_of
 from tests.harness.fuzz import fuzz_examples

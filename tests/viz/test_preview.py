@@ -17,7 +17,7 @@ from synpick_warp.apps.viz.drawing import instance_color, short_labels
 from synpick_warp.apps.viz.preview import MAX_VIEWS, find_scenes, read_baked, sample, write_contact_sheet
 from synpick_warp.apps.viz.preview_legend import COLUMN, LINE, Box, draw_legend, legend_width, place_labels
 from synpick_warp.cli.main import main
-from synpick_warp.configs.write import config_to_toml
+from synpick_warp.configs.files.write import config_to_toml
 from synpick_warp.errors import DatasetError, OutputError
 from synpick_warp.exporters.bop.exporter import BopExporter
 from synpick_warp.exporters.bop.scene import write_layer

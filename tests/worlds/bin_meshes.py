@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import trimesh
 
-from synpick_warp.configs.bins import Tote
+from synpick_warp.configs.cell.bins import Tote
 from synpick_warp.scenes.tote import tote_fixture
 
 Mesh = trimesh.Trimesh

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import cv2
 
-from synpick_warp.configs.write import config_to_toml
+from synpick_warp.configs.files.write import config_to_toml
 from synpick_warp.dataset.commit.manifest import CONFIG_FILE, ENTRIES, MANIFEST_FILE, episode_entry
 from tests.harness.entries import episode_content
 from tests.harness.exporter_contract import FRAMES, export

@@ -6,7 +6,7 @@ import json
 import os
 from pathlib import Path
 
-from synpick_warp.configs.splits import DataLayout
+from synpick_warp.configs.dataset.splits import DataLayout
 from synpick_warp.exporters.base import EncodedView, SharedFiles
 from synpick_warp.exporters.bop.scene_exporter import SceneExporter
 from synpick_warp.exporters.bop.view import ViewSettings

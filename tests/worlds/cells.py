@@ -6,9 +6,9 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from synpick_warp.configs.cameras import CameraRow
+from synpick_warp.configs.cell.cameras import CameraRow
+from synpick_warp.configs.files.table_lists import read_rows
 from synpick_warp.configs.schema import Config
-from synpick_warp.configs.table_lists import read_rows
 from synpick_warp.factory.pipeline import run_bake
 from synpick_warp.system.progress import SilentProgress
 from tests.builders import STIRRING, boxes

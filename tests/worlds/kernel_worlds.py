@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from synpick_warp.configs.bins import Bins, Tote
-from synpick_warp.configs.cell import BinSizes
-from synpick_warp.configs.manipulation import Move
-from synpick_warp.configs.randomize import Randomize
+from synpick_warp.configs.cell.bins import Bins, Tote
+from synpick_warp.configs.cell.extents import BinSizes
+from synpick_warp.configs.episodes.manipulation import Move
+from synpick_warp.configs.episodes.randomize import Randomize
 from synpick_warp.kernels import structs
 from synpick_warp.scenes.build import Part
 from synpick_warp.scenes.looks import Looks

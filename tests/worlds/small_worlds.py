@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import trimesh
 
-from synpick_warp.configs.load import load_config
+from synpick_warp.configs.files.load import load_config
 from synpick_warp.configs.schema import Config
 from synpick_warp.scenes.collision.hulls import mass_properties
 from synpick_warp.scenes.collision.simplification import simplify_hull

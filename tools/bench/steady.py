@@ -10,9 +10,9 @@ import tempfile
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
+from synpick_warp.configs.dataset.splits import DataLayout
 from synpick_warp.configs.fields import INT32_MAX
 from synpick_warp.configs.schema import Config
-from synpick_warp.configs.splits import DataLayout
 from synpick_warp.errors import DatasetError
 from synpick_warp.exporters.registry import load_exporter_classes, shared_files
 from synpick_warp.factory.pipeline import run_bake

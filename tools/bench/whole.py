@@ -16,8 +16,8 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from synpick_warp.configs.dataset.splits import DataLayout
 from synpick_warp.configs.schema import Config
-from synpick_warp.configs.splits import DataLayout
 from synpick_warp.dataset.commit.manifest import committed_episodes
 from synpick_warp.factory.pipeline import run_bake
 from synpick_warp.system.progress import SilentProgress

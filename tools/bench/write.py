@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from synpick_warp.codes import Ending
-from synpick_warp.configs.export import ExportSettings
+from synpick_warp.configs.dataset.export import ExportSettings
 from synpick_warp.exporters.base import ExportContext, Exporter
 from synpick_warp.exporters.registry import load_exporter_classes
 from synpick_warp.exporters.writing.files import PARTIAL

@@ -23,7 +23,7 @@ import numpy as np
 import trimesh
 
 from synpick_warp.configs.calibration.lens import LensMap, read_lens
-from synpick_warp.configs.load import load_config
+from synpick_warp.configs.files.load import load_config
 from tools.checks.measures import Measure, UnusableError, run_check
 
 DEPTH_TOLERANCE = 0.2

@@ -21,7 +21,7 @@ import warp as wp
 from rich.console import Console
 
 from synpick_warp.apps.viz.preview import put_text, write_picture
-from synpick_warp.configs.load import load_config
+from synpick_warp.configs.files.load import load_config
 from synpick_warp.errors import SynpickError
 from synpick_warp.factory.assembly import make_renderer
 from synpick_warp.scenes.assets.meshes import SUFFIXES, MeshOptions, read_mesh

@@ -10,7 +10,7 @@ import numpy as np
 import trimesh
 import warp as wp
 
-from synpick_warp.configs.rig import Rig
+from synpick_warp.configs.cell.rig import Rig
 from synpick_warp.configs.schema import FAST, REFERENCE, Cameras, Config
 from synpick_warp.factory.assembly import make_renderer
 from synpick_warp.scenes.bins import make_bins

@@ -19,7 +19,7 @@ from rich.console import Console
 from scipy.spatial.transform import Rotation
 
 from synpick_warp.codes import Ending, Phase
-from synpick_warp.configs.cell import BinSizes
+from synpick_warp.configs.cell.extents import BinSizes
 from synpick_warp.errors import SynpickError
 from synpick_warp.scenes import build
 from synpick_warp.scenes.catalog import load_catalog

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from synpick_warp.configs.objects import Objects
+from synpick_warp.configs.episodes.objects import Objects
 from synpick_warp.scenes.assets.meshes import read_mesh
 from synpick_warp.scenes.assets.models_info import ModelInfo, bop_obj_id, read_models_info
 from synpick_warp.scenes.collision.hulls import hull_size

@@ -18,7 +18,7 @@ BLUR_REACH = wp.constant(3.0)
 
 @wp.struct
 class EffectRanges:
-    """Lower and upper bound of each effect parameter, and the seed of the data set; see configs.sensors.Effects."""
+    """Lower and upper bound of each effect parameter, and the seed of the data set; see configs.cell.sensors.Effects."""
 
     seed: wp.uint64
     """Seed of the bake."""

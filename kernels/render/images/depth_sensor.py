@@ -24,7 +24,7 @@ MIN_DEPTH = wp.constant(1.0e-3)
 class SensorParameters:
     """Depth sensor model: seed, baseline [m], disparity quantization, noise and limit [px], range [m]; of structured light axial and
     lateral noise, grazing limit, matching window, and whether projector shadows are invalid; of infrared images projector, dots, light
-    and noise. See configs.sensors.DepthSensor.
+    and noise. See configs.cell.sensors.DepthSensor.
     """
 
     seed: wp.uint64
@@ -129,7 +129,7 @@ def in_projector_shadow(
 
 @wp.func
 def axial_noise(sensor: SensorParameters, depth: float, cosine: float) -> float:
-    """Standard deviation of a measured depth [m] for the cosine of the angle of incidence; the law of configs.sensors.DepthSensor."""
+    """Standard deviation of a measured depth [m] for the cosine of the angle of incidence; the law of configs.cell.sensors.DepthSensor."""
     off = depth - sensor.noise_distance
     angle = wp.acos(wp.clamp(cosine, 0.0, 1.0))
     ratio = angle / (wp.HALF_PI - angle)

@@ -6,9 +6,7 @@ The light of resting surfaces is reused (`history`, `shadows`) where none of the
 import warp as wp
 
 from synpick_warp.kernels.render.visibility.bvh_rays import RAY_OFFSET
-from synpick_warp.kernels.render.visibility.camera import AnyViews
 from synpick_warp.kernels.render.visibility.gbuffer import FAR, Meshes, fixture_mesh
-from synpick_warp.kernels.render.visibility.variants import kernel_of_views
 
 wp.set_module_options({"enable_backward": False})
 
@@ -111,7 +109,7 @@ def list_moving_body(
     moving.all_upper[view] = wp.max(moving.all_upper[view], upper)
 
 
-@kernel_of_views
+@wp.kernel
 def find_moving_bodies_kernel(
     # Scene:
     meshes: Meshes,
@@ -126,7 +124,8 @@ def find_moving_bodies_kernel(
     last_fixture_pose: wp.array2d[wp.transformf],  # (world, fixture) [m]
     last_fixture_visible: wp.array2d[int],  # (world, fixture)
     # In:
-    views: AnyViews,
+    view_world: wp.array[int],  # (view)
+    instances: int,
     bodies: int,
     # Out:
     moving_inout: MovingBodies,
@@ -134,12 +133,13 @@ def find_moving_bodies_kernel(
     """List the bodies of each view that moved, appeared or disappeared since the previous frame, if the history contains that frame
     (`holds`).
 
-    Writes all members of `MovingBodies` but `holds`. Launched over view.
+    Writes all members of `MovingBodies` but `holds`. Launched over view. The struct `Views` is not an argument, since its cameras change
+    which products the compiler fuses with sums.
     """
     view = wp.tid()
     if moving_inout.holds[view] == 0:
         return
-    world = views.world[view]
+    world = view_world[view]
     count = int(0)
     moving_inout.all_lower[view] = wp.vec3(FAR, FAR, FAR)
     moving_inout.all_upper[view] = wp.vec3(-FAR, -FAR, -FAR)
@@ -148,13 +148,13 @@ def find_moving_bodies_kernel(
         last_mesh = int(-1)
         now = wp.transform_identity(dtype=float)
         then = wp.transform_identity(dtype=float)
-        if body < views.instances:
+        if body < instances:
             mesh = catalog_index[world, body]
             last_mesh = last_catalog_index[world, body]
             now = pose[world, body]
             then = last_pose[world, body]
         else:
-            fixture = body - views.instances
+            fixture = body - instances
             mesh = wp.where(fixture_visible[world, fixture] != 0, fixture_mesh(meshes, bin[world], fixture), -1)
             last_mesh = wp.where(last_fixture_visible[world, fixture] != 0, fixture_mesh(meshes, bin[world], fixture), -1)
             now = fixture_pose[world, fixture]

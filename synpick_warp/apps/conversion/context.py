@@ -6,7 +6,7 @@ from functools import cached_property
 from pathlib import Path
 
 from synpick_warp.apps.conversion.source import Source
-from synpick_warp.configs.export import ExportSettings
+from synpick_warp.configs.dataset.export import ExportSettings
 from synpick_warp.dataset.object_names import object_names
 from synpick_warp.errors import DatasetError
 from synpick_warp.exporters.base import ExportContext

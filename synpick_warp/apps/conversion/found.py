@@ -15,8 +15,8 @@ from pathlib import Path
 
 from synpick_warp.apps.conversion.scenes import StoredSceneFiles, StoredViewFiles, find_runs
 from synpick_warp.codes import Ending
-from synpick_warp.configs.export import ExportSettings
-from synpick_warp.configs.load import load_config
+from synpick_warp.configs.dataset.export import ExportSettings
+from synpick_warp.configs.files.load import load_config
 from synpick_warp.configs.schema import Config
 from synpick_warp.dataset.bop.layout import TARGETS
 from synpick_warp.dataset.bop.models import models_folder

@@ -11,7 +11,7 @@ from synpick_warp.apps.conversion.context import StoredContext
 from synpick_warp.apps.conversion.found import convert_found
 from synpick_warp.apps.conversion.source import Source
 from synpick_warp.codes import Ending
-from synpick_warp.configs.export import ExportSettings
+from synpick_warp.configs.dataset.export import ExportSettings
 from synpick_warp.configs.schema import CLASSIC
 from synpick_warp.dataset.commit.writing import OutputFolder, finalize_data_set
 from synpick_warp.dataset.reading import open_data_set

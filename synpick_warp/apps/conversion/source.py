@@ -12,8 +12,8 @@ from typing import Any
 from synpick_warp.apps.conversion.scenes import StoredSceneFiles
 from synpick_warp.apps.conversion.trajectories import check_trajectory, read_ticks
 from synpick_warp.codes import Ending
+from synpick_warp.configs.dataset.splits import DataLayout
 from synpick_warp.configs.schema import Config
-from synpick_warp.configs.splits import DataLayout
 from synpick_warp.dataset.annotations import ADVICE, check_content
 from synpick_warp.dataset.commit.file_names import check_file_names
 from synpick_warp.dataset.commit.frame_counts import check_frames

@@ -8,7 +8,7 @@ import numpy as np
 
 from synpick_warp.apps.estimation.methods import GICP, EstimatorFactory
 from synpick_warp.apps.estimation.scenes import Scene
-from synpick_warp.configs.sensors import DepthSensor
+from synpick_warp.configs.cell.sensors import DepthSensor
 from synpick_warp.stages.pose.batch import ObjectModel
 
 

@@ -24,7 +24,7 @@ from synpick_warp.apps.viz.explain_record import (
     suction_kind,
 )
 from synpick_warp.codes import Outcome
-from synpick_warp.configs.gripper import Suction
+from synpick_warp.configs.cell.gripper import Suction
 from synpick_warp.dataset.commit.manifest import episode_entry
 from synpick_warp.dataset.reading import DataSet
 from synpick_warp.errors import DatasetError

@@ -9,9 +9,9 @@ from synpick_warp.apps.report.markup import Html, element, join
 from synpick_warp.apps.statistics import Statistics
 from synpick_warp.apps.statistics.tables import make_tables
 from synpick_warp.codes import Outcome
-from synpick_warp.configs.load import load_config, sections, settings_of
+from synpick_warp.configs.files.load import load_config, sections, settings_of
+from synpick_warp.configs.files.write import config_to_toml, format_toml
 from synpick_warp.configs.schema import Config
-from synpick_warp.configs.write import config_to_toml, format_toml
 from synpick_warp.system.codecs.tables import Table
 
 SHOWN_TABLES = ("groups", "paper", "attempts", "depth", "looks")

@@ -16,8 +16,8 @@ from synpick_warp.apps.statistics.lights import Lights
 from synpick_warp.apps.statistics.looks import LookStatistics
 from synpick_warp.apps.statistics.paper import Comparison, compare
 from synpick_warp.apps.statistics.timeline import TimePoint
+from synpick_warp.configs.dataset.splits import split_kind
 from synpick_warp.configs.schema import Config
-from synpick_warp.configs.splits import split_kind
 from synpick_warp.dataset.object_names import object_names
 from synpick_warp.dataset.reading import DataSet
 from synpick_warp.errors import DatasetError

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 
 from synpick_warp.apps.viz.drawing import Image
-from synpick_warp.configs.cell import BinSizes
+from synpick_warp.configs.cell.extents import BinSizes
 
 _RANGE = (1.0, 99.0)
 """Percentiles of the depths that map to the first and the last colour, where no bin gives the range."""

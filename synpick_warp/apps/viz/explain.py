@@ -15,9 +15,9 @@ from synpick_warp.apps.viz.drawing import FONT, INK, WHITE, Image, check_picture
 from synpick_warp.apps.viz.explain_graph import CYCLIC, GREY, OUTVOTED, RED, clutter_edges, disc, draw_graph, fixed, put_boxed
 from synpick_warp.apps.viz.explain_panels import GREEN, LINE, PLOT_HEIGHT, SMALL, SOFT, TEXT, WORDS_WIDTH, draw_words, load_chart
 from synpick_warp.apps.viz.explain_record import MODE_WORDS, Attempt, choose_attempts, labels, read_attempts
-from synpick_warp.configs.load import load_config
-from synpick_warp.configs.rig import Rig
-from synpick_warp.configs.splits import DataLayout
+from synpick_warp.configs.cell.rig import Rig
+from synpick_warp.configs.dataset.splits import DataLayout
+from synpick_warp.configs.files.load import load_config
 from synpick_warp.dataset.object_names import object_names
 from synpick_warp.dataset.records import Pixel
 from synpick_warp.dataset.scene_index import SceneIndex

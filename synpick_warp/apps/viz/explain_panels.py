@@ -10,8 +10,8 @@ import numpy as np
 from synpick_warp.apps.viz.drawing import FONT, INK, Image, instance_color, put_text
 from synpick_warp.apps.viz.explain_graph import GREY, RED, disc
 from synpick_warp.apps.viz.explain_record import Attempt, break_force, choice_words, labels, seal_words, suction_kind
-from synpick_warp.configs.gripper import Suction
-from synpick_warp.configs.manipulation import Target
+from synpick_warp.configs.cell.gripper import Suction
+from synpick_warp.configs.episodes.manipulation import Target
 from synpick_warp.system.codecs.charts import Spec, axis, limit, line, points, theme
 
 WORDS_WIDTH = 470

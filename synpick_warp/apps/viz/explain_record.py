@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Any
 
 from synpick_warp.apps.viz.drawing import short_labels
-from synpick_warp.configs.gripper import Suction
-from synpick_warp.configs.manipulation import Target
+from synpick_warp.configs.cell.gripper import Suction
+from synpick_warp.configs.episodes.manipulation import Target
 from synpick_warp.dataset import records
 from synpick_warp.dataset.annotations import ADVICE, check_content
 from synpick_warp.dataset.commit.manifest import ATTEMPTS_FILE

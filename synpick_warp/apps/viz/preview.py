@@ -17,9 +17,9 @@ from synpick_warp.apps.viz.depth_colors import DepthScale, bin_scale, color_dept
 from synpick_warp.apps.viz.drawing import GOLDEN, Image, check_picture_name, instance_color, put_text, write_picture
 from synpick_warp.apps.viz.preview_layers import layer_pictures
 from synpick_warp.apps.viz.preview_legend import PAPER, Box, draw_labels, draw_legend, label_texts, legend_width
-from synpick_warp.configs.load import load_config
+from synpick_warp.configs.dataset.splits import DataLayout
+from synpick_warp.configs.files.load import load_config
 from synpick_warp.configs.schema import Config
-from synpick_warp.configs.splits import DataLayout
 from synpick_warp.dataset.bop.layout import NoLayoutError
 from synpick_warp.dataset.bop.scenes import FoundScenes
 from synpick_warp.dataset.commit.manifest import CONFIG_FILE, episode_entry, read_entry

@@ -12,8 +12,8 @@ import warp as wp
 from rich.table import Table
 
 from synpick_warp import __version__
+from synpick_warp.configs.dataset.splits import DataLayout
 from synpick_warp.configs.schema import Config
-from synpick_warp.configs.splits import DataLayout
 from synpick_warp.errors import DeviceError
 from synpick_warp.scenes.collision.shapes import default_cache_dir
 from synpick_warp.system.hardware.caches import KERNEL_VARIABLE, USER_VARIABLE, find_fault

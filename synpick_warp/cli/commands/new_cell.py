@@ -18,14 +18,14 @@ from cyclopts import Parameter
 from synpick_warp.cli.commands.pictures import draw_cell
 from synpick_warp.cli.folders import check_output_file
 from synpick_warp.cli.options import parse_resolution
-from synpick_warp.configs.bins import AXES, BinRow
 from synpick_warp.configs.calibration.files import MODELS, read_calibration
-from synpick_warp.configs.camera_rules import NAME, RESERVED
-from synpick_warp.configs.cameras import CameraRow
-from synpick_warp.configs.cell import BinSizes
-from synpick_warp.configs.cell_file import NewCamera, NewCell, bin_of_size, cell_toml
-from synpick_warp.configs.objects import AUTO_UNIT, UNITS
-from synpick_warp.configs.rig import lens_map
+from synpick_warp.configs.cell.bins import AXES, BinRow
+from synpick_warp.configs.cell.cameras import CameraRow
+from synpick_warp.configs.cell.extents import BinSizes
+from synpick_warp.configs.cell.rig import lens_map
+from synpick_warp.configs.episodes.objects import AUTO_UNIT, UNITS
+from synpick_warp.configs.files.cell_file import NewCamera, NewCell, bin_of_size, cell_toml
+from synpick_warp.configs.rules.camera_rules import NAME, RESERVED
 from synpick_warp.configs.schema import Config
 from synpick_warp.errors import CatalogError, ConfigError, OutputError, SynpickError, escape, format_value, suggest
 from synpick_warp.scenes.bin_meshes.loading import load_settings

@@ -10,8 +10,8 @@ from cyclopts import Parameter
 
 from synpick_warp.cli.folders import beside, check_output_file, find_data_set, has_attempts, has_scenes
 from synpick_warp.cli.options import WholeNumber
-from synpick_warp.configs.load import load_config
-from synpick_warp.configs.objects import AUTO_UNIT, DECLARED, DETECT
+from synpick_warp.configs.episodes.objects import AUTO_UNIT, DECLARED, DETECT
+from synpick_warp.configs.files.load import load_config
 from synpick_warp.errors import ConfigError, escape
 from synpick_warp.scenes.bin_meshes.loading import load_settings
 

@@ -12,7 +12,7 @@ import re
 from collections.abc import Iterable
 from pathlib import Path
 
-from synpick_warp.configs.splits import DataLayout
+from synpick_warp.configs.dataset.splits import DataLayout
 from synpick_warp.dataset.commit.manifest import CONSTANTS, MAX_SHOWN, entry_advice
 from synpick_warp.errors import DatasetError
 from synpick_warp.exporters.formats import FORMAT_TABLE

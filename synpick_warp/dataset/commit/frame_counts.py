@@ -17,7 +17,7 @@ from synpick_warp.exporters.trajectory.arrays import EPISODES, STORE
 from synpick_warp.system.inputs.files import describe_bytes
 
 if TYPE_CHECKING:
-    from synpick_warp.configs.splits import DataLayout
+    from synpick_warp.configs.dataset.splits import DataLayout
 
 _HARMLESS = 1000
 """Number of frames up to which nothing is compared: reading finds what is missing, and says so better."""

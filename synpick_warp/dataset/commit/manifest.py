@@ -26,13 +26,13 @@ from typing import Any
 import msgspec
 
 from synpick_warp import __version__
-from synpick_warp.configs.bins import Bins
-from synpick_warp.configs.gripper import EACH, SUCTION1
-from synpick_warp.configs.load import load_config, override_config, table_lists
-from synpick_warp.configs.objects import AUTO_UNIT, Objects
-from synpick_warp.configs.randomize import Randomize
+from synpick_warp.configs.cell.bins import Bins
+from synpick_warp.configs.cell.gripper import EACH, SUCTION1
+from synpick_warp.configs.episodes.objects import AUTO_UNIT, Objects
+from synpick_warp.configs.episodes.randomize import Randomize
+from synpick_warp.configs.files.load import load_config, override_config, table_lists
+from synpick_warp.configs.files.table_lists import given_values
 from synpick_warp.configs.schema import CLASSIC, COLUMN, WITHIN, Config
-from synpick_warp.configs.table_lists import given_values
 from synpick_warp.dataset.records import Entry, EpisodeEntry, IndicesEntry, Manifest, read_record
 from synpick_warp.errors import DatasetError
 from synpick_warp.exporters.formats import FORMAT_TABLE

@@ -15,10 +15,10 @@ from itertools import takewhile
 from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple
 
-from synpick_warp.configs.export import ExportSettings
+from synpick_warp.configs.dataset.export import ExportSettings
+from synpick_warp.configs.dataset.splits import DataLayout
+from synpick_warp.configs.files.write import config_to_toml
 from synpick_warp.configs.schema import Config
-from synpick_warp.configs.splits import DataLayout
-from synpick_warp.configs.write import config_to_toml
 from synpick_warp.dataset.commit.file_names import check_file_names, describe_strays
 from synpick_warp.dataset.commit.manifest import (
     ATTEMPTS_FILE,

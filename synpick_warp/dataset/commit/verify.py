@@ -11,8 +11,8 @@ from itertools import islice
 from pathlib import Path
 from typing import NamedTuple
 
+from synpick_warp.configs.dataset.splits import DataLayout
 from synpick_warp.configs.schema import Config
-from synpick_warp.configs.splits import DataLayout
 from synpick_warp.dataset.commit.file_names import check_file_names
 from synpick_warp.dataset.commit.frame_counts import check_frames, check_listed_frames
 from synpick_warp.dataset.commit.manifest import (

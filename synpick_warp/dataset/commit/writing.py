@@ -18,12 +18,12 @@ from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 
-from synpick_warp.configs.export import ExportSettings
-from synpick_warp.configs.load import load_config
-from synpick_warp.configs.modes import may_pick
+from synpick_warp.configs.dataset.export import ExportSettings
+from synpick_warp.configs.dataset.modes import may_pick
+from synpick_warp.configs.dataset.splits import DataLayout
+from synpick_warp.configs.files.load import load_config
+from synpick_warp.configs.files.write import config_to_toml
 from synpick_warp.configs.schema import Config
-from synpick_warp.configs.splits import DataLayout
-from synpick_warp.configs.write import config_to_toml
 from synpick_warp.dataset.commit.manifest import (
     ATTEMPTS_FILE,
     CONFIG_FILE,

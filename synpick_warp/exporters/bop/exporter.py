@@ -8,9 +8,9 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from synpick_warp.configs.export import ExportSettings
+from synpick_warp.configs.dataset.export import ExportSettings
+from synpick_warp.configs.dataset.splits import DataLayout
 from synpick_warp.configs.schema import Bop
-from synpick_warp.configs.splits import DataLayout
 from synpick_warp.exporters.base import ExportContext, SharedFiles
 from synpick_warp.exporters.bop.keypoints import make_category_keys
 from synpick_warp.exporters.bop.scene import SceneSettings, commit_scenes, create_scene_folders, write_layer, write_view

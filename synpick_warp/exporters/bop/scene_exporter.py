@@ -8,10 +8,10 @@ from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar
 
-from synpick_warp.configs.cameras import COLOR, DEPTH, MASKS
-from synpick_warp.configs.export import ExportSettings
+from synpick_warp.configs.cell.cameras import COLOR, DEPTH, MASKS
+from synpick_warp.configs.dataset.export import ExportSettings
+from synpick_warp.configs.dataset.splits import DataLayout
 from synpick_warp.configs.schema import Bop
-from synpick_warp.configs.splits import DataLayout
 from synpick_warp.exporters.base import ExportContext, StoredScene, view_bytes
 from synpick_warp.exporters.bop.keypoints import sample_keypoints
 from synpick_warp.exporters.bop.shared.models import MODEL_FOLDERS, describe_dataset, write_models_folders

@@ -11,7 +11,7 @@ from pathlib import Path
 import msgspec
 import numpy as np
 
-from synpick_warp.configs.rig import Size
+from synpick_warp.configs.cell.rig import Size
 from synpick_warp.exporters.lerobot.layout import part_path, video_path
 from synpick_warp.exporters.lerobot.part import TICK, Part, describe_tasks, make_rows
 from synpick_warp.exporters.lerobot.video import GROUP, join_groups

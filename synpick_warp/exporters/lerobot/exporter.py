@@ -13,9 +13,9 @@ from pathlib import Path
 import numpy as np
 
 from synpick_warp.codes import Ending, Task
-from synpick_warp.configs.export import ExportSettings
+from synpick_warp.configs.dataset.export import ExportSettings
+from synpick_warp.configs.dataset.splits import DataLayout
 from synpick_warp.configs.schema import Physics
-from synpick_warp.configs.splits import DataLayout
 from synpick_warp.exporters.base import ExportContext, SharedFiles, StoredScene
 from synpick_warp.exporters.lerobot.episode import EpisodeContent, EpisodeSettings, commit_episode, frame_path, group_path
 from synpick_warp.exporters.lerobot.index import write_indices

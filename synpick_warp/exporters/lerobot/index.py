@@ -17,10 +17,10 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from synpick_warp.configs.export import ExportSettings
-from synpick_warp.configs.rig import Size
+from synpick_warp.configs.cell.rig import Size
+from synpick_warp.configs.dataset.export import ExportSettings
+from synpick_warp.configs.dataset.splits import DataLayout
 from synpick_warp.configs.schema import Bake
-from synpick_warp.configs.splits import DataLayout
 from synpick_warp.errors import DatasetError
 from synpick_warp.exporters.lerobot.episode import make_folders
 from synpick_warp.exporters.lerobot.layout import (

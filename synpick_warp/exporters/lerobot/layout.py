@@ -14,9 +14,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from synpick_warp.configs.rig import Rig
+from synpick_warp.configs.cell.rig import Rig
+from synpick_warp.configs.dataset.splits import DataLayout, split_kind
 from synpick_warp.configs.schema import Physics
-from synpick_warp.configs.splits import DataLayout, split_kind
 
 FOLDER = Path("lerobot")
 """Folder of the LeRobot data set, in ours."""

@@ -11,7 +11,7 @@ import numpy as np
 import zarr
 from zarr.codecs import ZstdCodec
 
-from synpick_warp.configs.cameras import WORLD
+from synpick_warp.configs.cell.cameras import WORLD
 from synpick_warp.configs.schema import Physics, Trajectory
 from synpick_warp.exporters.trajectory.arrays import CAMERAS, CONSTANT_GROUPS, EPISODES, FORMAT, LABELS, OBJECTS, ArraySpec, GroupSpec
 from synpick_warp.scenes.types import FIRST_DISTRACTOR, Camera, Catalog, EnvironmentMap

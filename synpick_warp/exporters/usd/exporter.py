@@ -6,8 +6,8 @@ import os
 from functools import cached_property, partial
 from pathlib import Path
 
-from synpick_warp.configs.export import ExportSettings
-from synpick_warp.configs.splits import DataLayout
+from synpick_warp.configs.dataset.export import ExportSettings
+from synpick_warp.configs.dataset.splits import DataLayout
 from synpick_warp.exporters.base import SharedFiles
 from synpick_warp.exporters.staging import EpisodeExporter, StagedEpisode
 from synpick_warp.exporters.usd.episode import write_episode

@@ -13,7 +13,7 @@ from dataclasses import replace
 import numpy as np
 from pxr import Gf, Kind, Sdf, Usd, UsdGeom, UsdLux, UsdPhysics, UsdRender
 
-from synpick_warp.configs.cameras import GRIPPER
+from synpick_warp.configs.cell.cameras import GRIPPER
 from synpick_warp.exporters.usd.looks import add_looks
 from synpick_warp.exporters.usd.parts import add_label, add_property, set_units
 from synpick_warp.exporters.usd.types import EpisodeMetadata, EpisodeSettings, StageLight, object_asset

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 from synpick_warp.codes import Ending, LookPart
-from synpick_warp.configs.cell import BinSizes
+from synpick_warp.configs.cell.extents import BinSizes
 from synpick_warp.scenes.types import FIRST_DISTRACTOR, Camera, Material
 from synpick_warp.views.frames import EpisodeEnd
 

@@ -6,8 +6,8 @@ import json
 from collections.abc import Mapping
 from pathlib import Path
 
-from synpick_warp.configs.export import ExportSettings
-from synpick_warp.configs.splits import DataLayout
+from synpick_warp.configs.dataset.export import ExportSettings
+from synpick_warp.configs.dataset.splits import DataLayout
 from synpick_warp.scenes.types import Camera
 
 _INTRINSICS = ("`camera.json` has the intrinsics of all cameras", "`camera_NAME.json` has the intrinsics of each camera")

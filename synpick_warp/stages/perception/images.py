@@ -7,7 +7,7 @@ from typing import Any
 import warp as wp
 
 from synpick_warp.configs import schema
-from synpick_warp.configs.rig import Rig, resized
+from synpick_warp.configs.cell.rig import Rig, resized
 from synpick_warp.errors import ConfigError
 from synpick_warp.kernels.perception.exact_hits import intersect_hits_kernel
 from synpick_warp.kernels.render.visibility.camera import TILE_PIXELS

@@ -5,7 +5,7 @@ from __future__ import annotations
 import warp as wp
 
 from synpick_warp.configs import schema
-from synpick_warp.configs.rig import Rig
+from synpick_warp.configs.cell.rig import Rig
 from synpick_warp.kernels.perception import worklist
 from synpick_warp.stages.buffers import Snapshot
 from synpick_warp.stages.constants import SceneData

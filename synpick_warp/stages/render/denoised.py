@@ -299,8 +299,8 @@ class DenoisedRenderer:
         wp.launch(kernel_for(advance_history_kernel, views), inputs=inputs, outputs=[self.history, self.moving], **options)
         inputs = [self.scene.meshes, snapshot.bin, snapshot.catalog_index, snapshot.pose, snapshot.fixture_pose, snapshot.fixture_visible]
         inputs += [snapshot.last_catalog_index, snapshot.last_pose, snapshot.last_fixture_pose, snapshot.last_fixture_visible]
-        inputs += [views, self.moving.mesh.shape[1]]
-        wp.launch(kernel_for(find_moving_bodies_kernel, views), inputs=inputs, outputs=[self.moving], **options)
+        inputs += [views.world, views.instances, self.moving.mesh.shape[1]]
+        wp.launch(find_moving_bodies_kernel, inputs=inputs, outputs=[self.moving], **options)
 
     def trace_coarse_paths(self, snapshot: Snapshot, bodies: Any, gbuffer: Any, views: Any) -> None:
         """Coarse path pass: guide image and light of coarse pixels, traced or taken from the history (temporal accumulation).

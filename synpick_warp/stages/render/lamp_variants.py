@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from synpick_warp.codes import Look, LookPart
-from synpick_warp.configs.randomize import OFF, Randomize
+from synpick_warp.configs.episodes.randomize import OFF, Randomize
 from synpick_warp.scenes.environment import LUMINANCE, map_directions
 from synpick_warp.scenes.lights import load_lights
 from synpick_warp.scenes.looks import Looks

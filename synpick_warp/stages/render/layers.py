@@ -7,7 +7,7 @@ from typing import Any
 
 import warp as wp
 
-from synpick_warp.configs.sensors import DepthSensor
+from synpick_warp.configs.cell.sensors import DepthSensor
 from synpick_warp.errors import CatalogError
 from synpick_warp.kernels.render.images.depth_sensor import SensorParameters, render_depth_sensor_kernel
 from synpick_warp.kernels.render.images.layers import (

@@ -11,7 +11,7 @@ import numpy as np
 import warp as wp
 
 from synpick_warp.codes import Look, LookKind, LookPart
-from synpick_warp.configs.randomize import CHOICE, FIXED, LOG_UNIFORM, NORMAL, UNIFORM, Distribution, Randomize
+from synpick_warp.configs.episodes.randomize import CHOICE, FIXED, LOG_UNIFORM, NORMAL, UNIFORM, Distribution, Randomize
 from synpick_warp.kernels.distributions import LookDistribution, LookTable
 from synpick_warp.kernels.render.lighting.background import shade_floor_kernel
 from synpick_warp.kernels.render.lighting.looks import draw_looks_kernel, dress_bodies_kernel

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from synpick_warp.configs import schema
-from synpick_warp.configs.sensors import DepthSensor, Effects
+from synpick_warp.configs.cell.sensors import DepthSensor, Effects
 from synpick_warp.kernels.render.images.antialias import ShadedImage
 from synpick_warp.stages.arrays import allocate_struct, struct_arrays
 from synpick_warp.stages.buffers import LayerBuffers, Snapshot, ViewBuffers

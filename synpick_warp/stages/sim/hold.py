@@ -8,7 +8,7 @@ from typing import Protocol
 import newton
 import warp as wp
 
-from synpick_warp.configs.gripper import SUCTION1, SUCTION_ARRAY, Gripper, Suction
+from synpick_warp.configs.cell.gripper import SUCTION1, SUCTION_ARRAY, Gripper, Suction
 from synpick_warp.scenes.types import Catalog
 from synpick_warp.stages.constants import SceneData
 from synpick_warp.stages.render.scene import RenderScene

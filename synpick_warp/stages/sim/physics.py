@@ -11,9 +11,9 @@ import newton
 import numpy as np
 import warp as wp
 
+from synpick_warp.configs.dataset.splits import DataLayout
 from synpick_warp.configs.schema import Config
 from synpick_warp.configs.schema import Physics as PhysicsConfig
-from synpick_warp.configs.splits import DataLayout
 from synpick_warp.kernels.sim import gripper, rest
 from synpick_warp.newton_patches import KNOWN_NEWTON
 from synpick_warp.newton_patches.broad_phase import replace_broad_phase

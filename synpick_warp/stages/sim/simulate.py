@@ -10,9 +10,9 @@ import newton
 import numpy as np
 import warp as wp
 
-from synpick_warp.configs.modes import may_pick
+from synpick_warp.configs.dataset.modes import may_pick
+from synpick_warp.configs.dataset.splits import DataLayout
 from synpick_warp.configs.schema import Config
-from synpick_warp.configs.splits import DataLayout
 from synpick_warp.kernels.sim import snapshot as pack
 from synpick_warp.scenes.build import build_model
 from synpick_warp.scenes.types import Catalog

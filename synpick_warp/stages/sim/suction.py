@@ -10,7 +10,7 @@ import newton
 import numpy as np
 import warp as wp
 
-from synpick_warp.configs.gripper import Suction
+from synpick_warp.configs.cell.gripper import Suction
 from synpick_warp.kernels.sim import cup_rays, seal, seal_array, seal_contacts
 from synpick_warp.scenes.collision.hull_planes import plane_table
 from synpick_warp.scenes.types import Catalog

@@ -19,7 +19,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import synpick_warp
-from synpick_warp.configs.write import config_to_toml
+from synpick_warp.configs.files.write import config_to_toml
 from synpick_warp.dataset import view_files
 from synpick_warp.dataset.annotations import MASK_SCHEMA, SCENE_SCHEMAS, ModelInfo, check_json, read_checked
 from synpick_warp.dataset.commit.manifest import CONFIG_FILE, CONSTANTS, ENTRIES, MANIFEST_FILE, encode_manifest

@@ -20,7 +20,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from synpick_warp.configs.splits import DataLayout
+from synpick_warp.configs.dataset.splits import DataLayout
 from synpick_warp.dataset.commit.file_names import check_file_names, describe_strays
 from synpick_warp.dataset.commit.manifest import CONSTANTS, episode_entry, read_checksums
 from synpick_warp.dataset.commit.merge import merge

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from synpick_warp.configs.splits import DataLayout
+from synpick_warp.configs.dataset.splits import DataLayout
 from synpick_warp.dataset.commit.manifest import episode_entry, read_checksums
 from synpick_warp.dataset.commit.merge import merge
 from synpick_warp.dataset.commit.verify import verify

@@ -17,8 +17,8 @@ import numpy as np
 import pytest
 import trimesh
 
+from synpick_warp.configs.cell.sensors import Effects
 from synpick_warp.configs.schema import Config
-from synpick_warp.configs.sensors import Effects
 from synpick_warp.errors import CatalogError, OutputError
 from synpick_warp.exporters.bop.exporter import BopExporter
 from synpick_warp.exporters.bop.scene import SceneSettings, commit_scenes, create_scene_folders

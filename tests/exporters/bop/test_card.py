@@ -11,8 +11,8 @@ from pathlib import Path
 
 import pytest
 
+from synpick_warp.configs.dataset.splits import DataLayout
 from synpick_warp.configs.schema import Config, Split
-from synpick_warp.configs.splits import DataLayout
 from synpick_warp.exporters.bop.shards.card import CARD_FILE, CardContent, SplitContent, hub_splits, make_card, size_category
 from synpick_warp.exporters.bop.shards.exporter import ShardsExporter
 from tests.harness.exporter_contract import export

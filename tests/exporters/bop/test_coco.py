@@ -14,9 +14,9 @@ import numpy as np
 import pytest
 from pycocotools.coco import COCO
 
-from synpick_warp.configs.export import ExportSettings
+from synpick_warp.configs.dataset.export import ExportSettings
+from synpick_warp.configs.dataset.splits import DataLayout
 from synpick_warp.configs.schema import Split
-from synpick_warp.configs.splits import DataLayout
 from synpick_warp.errors import DatasetError, OutputError
 from synpick_warp.exporters.bop.coco.annotation_files import CATEGORIES, IMAGES, PARTS, commit_scenes, write_view
 from synpick_warp.exporters.bop.coco.exporter import CocoExporter

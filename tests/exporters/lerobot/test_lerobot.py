@@ -15,10 +15,10 @@ import pyarrow.parquet as pq
 import pytest
 
 from synpick_warp.codes import Outcome, Task
-from synpick_warp.configs.export import ExportSettings
-from synpick_warp.configs.load import load_config
+from synpick_warp.configs.dataset.export import ExportSettings
+from synpick_warp.configs.dataset.splits import DataLayout
+from synpick_warp.configs.files.load import load_config
 from synpick_warp.configs.schema import Config, Split
-from synpick_warp.configs.splits import DataLayout
 from synpick_warp.errors import ConfigError, DatasetError
 from synpick_warp.exporters.base import list_folders
 from synpick_warp.exporters.formats import FORMAT_TABLE

@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 from pxr import Usd
 
-from synpick_warp.configs.bins import BinRow, Bins
+from synpick_warp.configs.cell.bins import BinRow, Bins
 from synpick_warp.configs.schema import Config
 from tests.worlds.small_worlds import catalog
 from tests.worlds.usd_sets import write_set

@@ -13,9 +13,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from synpick_warp.codes import Effect, Tone, names
-from synpick_warp.configs.load import load_config
+from synpick_warp.configs.cell.sensors import Effects, effect_ranges
+from synpick_warp.configs.files.load import load_config
 from synpick_warp.configs.schema import Config
-from synpick_warp.configs.sensors import Effects, effect_ranges
 from synpick_warp.errors import ConfigError
 from synpick_warp.kernels.render.images.antialias import ShadedImage
 from synpick_warp.kernels.render.images.camera_effects import EffectParameters

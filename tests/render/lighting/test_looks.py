@@ -12,8 +12,8 @@ import scipy.stats
 from scipy.spatial.transform import Rotation
 
 from synpick_warp.codes import Segment
-from synpick_warp.configs.load import load_config
-from synpick_warp.configs.randomize import ColorDistribution, Distribution, Randomize
+from synpick_warp.configs.episodes.randomize import ColorDistribution, Distribution, Randomize
+from synpick_warp.configs.files.load import load_config
 from synpick_warp.errors import ConfigError
 from synpick_warp.scenes.assets.appearance import linear_to_srgb, srgb_to_linear
 from synpick_warp.scenes.environment import LUMINANCE, map_directions
@@ -250,7 +250,7 @@ def test_what_is_no_distribution_is_one_line(value, said):
     ],
 )
 def test_distributions_are_written_as_they_are_read(value, tmp_path):
-    from synpick_warp.configs.write import config_to_toml
+    from synpick_warp.configs.files.write import config_to_toml
 
     config = load_config("smoke", {"randomize.object_roughness": value, "randomize.bin_color": {"choice": [[0.1, 0.2, 0.3]]}})
     (tmp_path / "c.toml").write_text(config_to_toml(config, comments=True))

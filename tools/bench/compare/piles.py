@@ -9,7 +9,7 @@ import newton
 import numpy as np
 import warp as wp
 
-from synpick_warp.configs.cell import BinSizes
+from synpick_warp.configs.cell.extents import BinSizes
 from synpick_warp.configs.schema import Physics, Tote
 from synpick_warp.scenes.bins import guide_walls
 from synpick_warp.scenes.tote import TABLE_SIZE, tote_colliders

@@ -9,7 +9,7 @@ from dataclasses import fields, replace
 import numpy as np
 import warp as wp
 
-from synpick_warp.configs.rig import Rig
+from synpick_warp.configs.cell.rig import Rig
 from synpick_warp.configs.schema import UNOCCLUDED
 from synpick_warp.factory.assembly import Factory, make_renderer
 from synpick_warp.scenes.bins import make_bins

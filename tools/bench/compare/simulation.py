@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from synpick_warp.configs.cell import BinSizes
+from synpick_warp.configs.cell.extents import BinSizes
 from synpick_warp.configs.schema import Tote
 from tools.bench.compare.engines import Engine
 from tools.bench.compare.piles import Pile

@@ -8,9 +8,9 @@ from dataclasses import replace
 import numpy as np
 
 from synpick_warp.apps.viz.cell.frusta import project
-from synpick_warp.configs.cameras import CameraRow, Cameras, Pose
-from synpick_warp.configs.cell import BinSizes
-from synpick_warp.configs.rig import Rig
+from synpick_warp.configs.cell.cameras import CameraRow, Cameras, Pose
+from synpick_warp.configs.cell.extents import BinSizes
+from synpick_warp.configs.cell.rig import Rig
 from synpick_warp.scenes.cameras import make_cameras
 
 _DIRECTIONS = ((-90.0, 90.0), (-90.0, 55.0), (90.0, 55.0), (0.0, 55.0), (180.0, 55.0), (-45.0, 55.0), (135.0, 55.0))

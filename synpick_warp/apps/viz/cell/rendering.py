@@ -10,8 +10,8 @@ import numpy as np
 import warp as wp
 
 from synpick_warp.configs.calibration.lens import with_matrix
-from synpick_warp.configs.cameras import WORLD
-from synpick_warp.configs.cell import BinSizes
+from synpick_warp.configs.cell.cameras import WORLD
+from synpick_warp.configs.cell.extents import BinSizes
 from synpick_warp.configs.schema import FAST, Config
 from synpick_warp.factory.assembly import build_smallest, compiling_if_cold, make_renderer
 from synpick_warp.scenes.bins import make_bins

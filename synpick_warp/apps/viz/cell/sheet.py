@@ -12,9 +12,9 @@ import numpy as np
 from synpick_warp.apps.viz.cell.frusta import Canvas, center, draw_axes, draw_camera, project, rays
 from synpick_warp.apps.viz.cell.rendering import CellScene, scaled_down
 from synpick_warp.apps.viz.drawing import GOLDEN, INK, WHITE, Image, check_picture_name, put_text, write_picture
-from synpick_warp.configs.bins import Bins
-from synpick_warp.configs.cell import BinSizes
-from synpick_warp.configs.rig import Rig
+from synpick_warp.configs.cell.bins import Bins
+from synpick_warp.configs.cell.extents import BinSizes
+from synpick_warp.configs.cell.rig import Rig
 from synpick_warp.scenes.cameras import make_cameras
 from synpick_warp.scenes.types import Camera
 from synpick_warp.stages.constants import GRIPPER_HOME

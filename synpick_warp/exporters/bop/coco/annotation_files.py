@@ -16,8 +16,8 @@ from typing import Any
 
 import msgspec
 
-from synpick_warp.configs.export import ExportSettings
-from synpick_warp.configs.rig import Size
+from synpick_warp.configs.cell.rig import Size
+from synpick_warp.configs.dataset.export import ExportSettings
 from synpick_warp.errors import DatasetError
 from synpick_warp.exporters.base import EncodedView
 from synpick_warp.exporters.bop.keypoints import Keypoints, make_category_keys

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
-from synpick_warp.configs.splits import DataLayout, split_kind
+from synpick_warp.configs.dataset.splits import DataLayout, split_kind
 
 CARD_FILE = "README.md"
 """Name that the hub gives the card."""

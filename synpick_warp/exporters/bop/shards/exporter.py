@@ -7,9 +7,9 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from synpick_warp.configs.export import ExportSettings
-from synpick_warp.configs.rig import lens_map
-from synpick_warp.configs.splits import DataLayout
+from synpick_warp.configs.cell.rig import lens_map
+from synpick_warp.configs.dataset.export import ExportSettings
+from synpick_warp.configs.dataset.splits import DataLayout
 from synpick_warp.exporters.base import SharedFiles
 from synpick_warp.exporters.bop.scene_exporter import SceneExporter, SceneImages, constant_files
 from synpick_warp.exporters.bop.shards.card import CARD_FILE, CardContent, SplitContent, hub_splits, make_card

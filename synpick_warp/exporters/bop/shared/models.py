@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from synpick_warp.configs.export import ExportSettings
-from synpick_warp.configs.splits import DataLayout
+from synpick_warp.configs.dataset.export import ExportSettings
+from synpick_warp.configs.dataset.splits import DataLayout
 from synpick_warp.errors import CatalogError
 from synpick_warp.exporters.bop.shared.toolkit import describe_toolkit
 from synpick_warp.exporters.bop.view import MILLIMETERS

@@ -11,7 +11,7 @@ from typing import Annotated, TypeVar
 
 import msgspec
 
-from synpick_warp.configs.splits import DataLayout, split_kind
+from synpick_warp.configs.dataset.splits import DataLayout, split_kind
 from synpick_warp.errors import DatasetError
 from synpick_warp.exporters.writing.files import write_atomically
 from synpick_warp.system.inputs.json import read_json

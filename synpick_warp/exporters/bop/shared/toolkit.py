@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import Any
 
-from synpick_warp.configs.cameras import COLOR, DEPTH
-from synpick_warp.configs.rig import Rig
-from synpick_warp.configs.splits import DataLayout
+from synpick_warp.configs.cell.cameras import COLOR, DEPTH
+from synpick_warp.configs.cell.rig import Rig
+from synpick_warp.configs.dataset.splits import DataLayout
 from synpick_warp.scenes.types import Camera, Catalog
 
 PARAMS_FILE = "bop_dataset_params.py"

@@ -9,11 +9,11 @@ from dataclasses import Field
 from typing import Any
 
 from synpick_warp.configs.check import describe_allowed
-from synpick_warp.configs.load import sections, table_lists
-from synpick_warp.configs.randomize import Distribution
+from synpick_warp.configs.episodes.randomize import Distribution
+from synpick_warp.configs.files.load import sections, table_lists
+from synpick_warp.configs.files.split_tables import SPLITS, split_settings
+from synpick_warp.configs.files.table_lists import given_values, settings_of
 from synpick_warp.configs.schema import Config, Split
-from synpick_warp.configs.split_tables import SPLITS, split_settings
-from synpick_warp.configs.table_lists import given_values, settings_of
 
 CAMERAS = "cameras"
 _DELETE = "\x7f"

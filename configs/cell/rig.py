@@ -8,8 +8,8 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING
 
-from synpick_warp.configs.cameras import COLOR, GRIPPER, CameraRow, Cameras, Pose, Vector
-from synpick_warp.configs.randomize import OFF
+from synpick_warp.configs.cell.cameras import COLOR, GRIPPER, CameraRow, Cameras, Pose, Vector
+from synpick_warp.configs.episodes.randomize import OFF
 from synpick_warp.errors import ConfigError
 from synpick_warp.views.layers import LAYER_TABLE
 

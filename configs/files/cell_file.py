@@ -8,13 +8,13 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-from synpick_warp.configs.bins import BinRow
-from synpick_warp.configs.cameras import Jitter, Pose
+from synpick_warp.configs.cell.bins import BinRow
+from synpick_warp.configs.cell.cameras import Jitter, Pose
 from synpick_warp.configs.check import is_table
-from synpick_warp.configs.load import sections, table_lists
-from synpick_warp.configs.randomize import ColorDistribution, Distribution
-from synpick_warp.configs.table_lists import given_values, settings_of
-from synpick_warp.configs.write import describe_setting, format_toml
+from synpick_warp.configs.episodes.randomize import ColorDistribution, Distribution
+from synpick_warp.configs.files.load import sections, table_lists
+from synpick_warp.configs.files.table_lists import given_values, settings_of
+from synpick_warp.configs.files.write import describe_setting, format_toml
 
 WIDTH = 120
 """Longest comment line [characters]."""

@@ -16,7 +16,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from synpick_warp.configs.check import check_value, is_table
-from synpick_warp.configs.randomize import Distribution
+from synpick_warp.configs.episodes.randomize import Distribution
 from synpick_warp.errors import ConfigError, format_value, shorten, suggest
 
 Settings = dict[str, tuple[dataclasses.Field[Any], Any]]

@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import ClassVar
 
+from synpick_warp.configs.episodes.objects import UNITS
 from synpick_warp.configs.fields import setting
-from synpick_warp.configs.objects import UNITS
 from synpick_warp.errors import ConfigError, format_value
 
 TOTE, OWN, NONE, PALLET = "tote", "own", "none", "pallet"

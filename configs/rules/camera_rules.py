@@ -11,12 +11,12 @@ from dataclasses import replace
 from functools import partial
 
 from synpick_warp.codes import MAX_DISPARITIES
-from synpick_warp.configs.cameras import COLOR, DEPTH, MASKS, MODALITIES, CameraRow, Cameras, Jitter, Pose
-from synpick_warp.configs.cell import BinSizes, Sides
+from synpick_warp.configs.cell.cameras import COLOR, DEPTH, MASKS, MODALITIES, CameraRow, Cameras, Jitter, Pose
+from synpick_warp.configs.cell.extents import BinSizes, Sides
+from synpick_warp.configs.cell.rig import Rig, intrinsics, lens_map, moved, position, viewing_direction
+from synpick_warp.configs.dataset.modes import may_pick
+from synpick_warp.configs.episodes.randomize import FIXED
 from synpick_warp.configs.fields import Conflict
-from synpick_warp.configs.modes import may_pick
-from synpick_warp.configs.randomize import FIXED
-from synpick_warp.configs.rig import Rig, intrinsics, lens_map, moved, position, viewing_direction
 from synpick_warp.configs.schema import Bop, Config, DepthSensor, Gripper
 from synpick_warp.errors import ConfigError
 

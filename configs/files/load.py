@@ -10,15 +10,15 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-from synpick_warp.configs.bins import BinRow, check_meshes
 from synpick_warp.configs.calibration.sensor_presets import sensor_settings
 from synpick_warp.configs.calibration.tables import fill_tables
-from synpick_warp.configs.cameras import Cameras
+from synpick_warp.configs.cell.bins import BinRow, check_meshes
+from synpick_warp.configs.cell.cameras import Cameras
 from synpick_warp.configs.check import check_value
-from synpick_warp.configs.consistency import find_conflicts
+from synpick_warp.configs.files.split_tables import SPLITS, override_table, read_tables, resolve_splits, split_settings
+from synpick_warp.configs.files.table_lists import change_rows, given_values, read_rows, settings_of
+from synpick_warp.configs.rules.consistency import find_conflicts
 from synpick_warp.configs.schema import Bake, Bop, Config
-from synpick_warp.configs.split_tables import SPLITS, override_table, read_tables, resolve_splits, split_settings
-from synpick_warp.configs.table_lists import change_rows, given_values, read_rows, settings_of
 from synpick_warp.errors import ConfigError, format_value, shorten, suggest
 from synpick_warp.system.inputs.toml import decode_toml, read_toml
 
@@ -173,7 +173,7 @@ def table_lists() -> dict[str, type[Any]]:
 
 def _folder() -> Path:
     """Folder of the presets."""
-    return Path(__file__).parent
+    return Path(__file__).parents[1] / "presets"
 
 
 def _read(preset_or_file: str) -> Values:

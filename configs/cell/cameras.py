@@ -6,8 +6,8 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 from synpick_warp.configs.calibration.files import MODELS
+from synpick_warp.configs.episodes.randomize import Distribution
 from synpick_warp.configs.fields import setting
-from synpick_warp.configs.randomize import Distribution
 from synpick_warp.views.layers import LAYER_TABLE
 
 Vector = tuple[float, float, float]

@@ -8,15 +8,16 @@ import re
 from collections import Counter
 from collections.abc import Iterator, Sequence
 
-from synpick_warp.configs.bins import OWN, PALLET, TOTE, BinRow, Bins, Tote
-from synpick_warp.configs.camera_rules import find_camera_conflicts
-from synpick_warp.configs.cell import BinSizes
+from synpick_warp.configs.cell.bins import OWN, PALLET, TOTE, BinRow, Bins, Tote
+from synpick_warp.configs.cell.extents import BinSizes
+from synpick_warp.configs.cell.gripper import find_gripper_conflicts
+from synpick_warp.configs.dataset.modes import bake_modes
+from synpick_warp.configs.dataset.splits import MAX_SHARD_SCENES, DataLayout
+from synpick_warp.configs.episodes.fills import most_objects
+from synpick_warp.configs.episodes.objects import EMBEDDED
+from synpick_warp.configs.episodes.randomize import Randomize
 from synpick_warp.configs.fields import Conflict
-from synpick_warp.configs.fills import most_objects
-from synpick_warp.configs.gripper import find_gripper_conflicts
-from synpick_warp.configs.modes import bake_modes
-from synpick_warp.configs.objects import EMBEDDED
-from synpick_warp.configs.randomize import Randomize
+from synpick_warp.configs.rules.camera_rules import find_camera_conflicts
 from synpick_warp.configs.schema import (
     FORMATS,
     MIXED,
@@ -32,7 +33,6 @@ from synpick_warp.configs.schema import (
     Settle,
     Split,
 )
-from synpick_warp.configs.splits import MAX_SHARD_SCENES, DataLayout
 from synpick_warp.errors import format_value
 
 _NAME = re.compile(r"(?!(tote|table|pallet)$)[a-z0-9_]{1,32}")

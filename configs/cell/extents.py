@@ -6,7 +6,7 @@ import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
-from synpick_warp.configs.bins import NONE, OWN, PALLET, TOTE, BinRow, Bins, MeasuredBin, Tote
+from synpick_warp.configs.cell.bins import NONE, OWN, PALLET, TOTE, BinRow, Bins, MeasuredBin, Tote
 
 Sides = tuple[float, float]
 """Length (along x) and width (along y) [m]."""

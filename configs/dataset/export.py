@@ -5,12 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-from synpick_warp.configs.cell import BinSizes
-from synpick_warp.configs.modes import bake_modes
-from synpick_warp.configs.rig import Rig
+from synpick_warp.configs.cell.extents import BinSizes
+from synpick_warp.configs.cell.rig import Rig
+from synpick_warp.configs.cell.sensors import effect_ranges
+from synpick_warp.configs.dataset.modes import bake_modes
+from synpick_warp.configs.dataset.splits import DataLayout
 from synpick_warp.configs.schema import Bake, Bop, Config, Gripper, Physics, Render, Trajectory
-from synpick_warp.configs.sensors import effect_ranges
-from synpick_warp.configs.splits import DataLayout
 
 
 @dataclass(frozen=True)

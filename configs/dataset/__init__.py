@@ -1,0 +1,1 @@
+"""Data set: modes, splits, and the settings that all writers share."""

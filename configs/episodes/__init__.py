@@ -1,0 +1,1 @@
+"""Episodes: objects and fills, tasks of the gripper, domain randomization."""

@@ -1,0 +1,1 @@
+"""Settings files: loading, tables and lists of tables, serialization."""

@@ -1,0 +1,1 @@
+"""Validation across settings."""
