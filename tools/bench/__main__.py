@@ -221,9 +221,10 @@ def measure(
 def _measure_worlds(quality: int, factory: Factory, min_seconds: float, parts: tuple[str, ...]) -> Iterator[Row]:
     """Benchmark of simulation and perception, and then of rendering the same worlds."""
     yield from of_part("physics", measure_simulation(factory, min_seconds, parts))
-    perception = factory.simulation.perception
-    if perception is not None and "perception" in parts:
-        yield from of_part("perception", measure_perception(perception, factory.simulation.record.snapshot, min_seconds))
+    simulation = factory.simulation
+    if simulation.perception is not None and "perception" in parts:
+        rows = measure_perception(simulation.perception, simulation.record.snapshot, simulation.device, min_seconds)
+        yield from of_part("perception", rows)
     if "render" in parts:
         yield from of_part("render", _measure_rendering(factory, min_seconds))
     if "encode" in parts:

@@ -40,9 +40,8 @@ MAX_HEIGHT = 0.4
 """Height of a heap [m]; of more objects, it is denser."""
 
 
-def measure_perception(perception: Perception, snapshot: Snapshot, min_seconds: float) -> Iterator[Row]:
+def measure_perception(perception: Perception, snapshot: Snapshot, device: wp.Device, min_seconds: float) -> Iterator[Row]:
     """Measure perception and planning by stage, in full batches of worlds that all look."""
-    device = perception.device
     perception.state.phase.fill_(Phase.ACT)
     perception.attempts.task.fill_(Task.LOOK)
     stages = (
@@ -88,7 +87,7 @@ def measure_heaps(config: Config, min_seconds: float) -> Iterator[Row]:
         record.snapshot.catalog_index.assign(entry)
         record.snapshot.pose.assign(pose)
         record.snapshot.fixture_pose.fill_(wp.transform_identity())
-        for row in measure_perception(perception, record.snapshot, min_seconds):
+        for row in measure_perception(perception, record.snapshot, own.device, min_seconds):
             yield replace(row, name=f"{count} instances: {row.name}")
         seen, above = record.observation.visible.numpy(), record.observation.above.numpy()
         yield Row(f"{count} instances: visible", float((seen > 0).sum(axis=1).mean()))
