@@ -89,9 +89,10 @@ def measure_heaps(config: Config, min_seconds: float) -> Iterator[Row]:
         record.snapshot.fixture_pose.fill_(wp.transform_identity())
         for row in measure_perception(perception, record.snapshot, own.device, min_seconds):
             yield replace(row, name=f"{count} instances: {row.name}")
-        seen, above = record.observation.visible.numpy(), record.observation.above.numpy()
-        yield Row(f"{count} instances: visible", float((seen > 0).sum(axis=1).mean()))
-        yield Row(f"{count} instances: edges of the clutter graph", float(np.bitwise_count(above).sum() / worlds))
+        seen = perception.images.views.world.numpy()
+        visible, above = (getattr(record.observation, name).numpy()[seen] for name in ("visible", "above"))
+        yield Row(f"{count} instances: visible", float((visible > 0).sum() / len(seen)))
+        yield Row(f"{count} instances: edges of the clutter graph", float(np.bitwise_count(above).sum() / len(seen)))
 
 
 def heap(catalog: Catalog, config: Config, worlds: int, count: int) -> tuple[np.ndarray, np.ndarray]:
