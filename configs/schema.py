@@ -126,7 +126,7 @@ class Arrangement:
         "(that object is left out). An object that alone is larger is never drawn.",
         choices=FILLS,
     )
-    max_objects: int = setting(24, "", "Maximum objects of an episode.", low=1, high=32)
+    max_objects: int = setting(24, "", "Maximum objects of an episode.", low=1, high=251)
     repeat_to_fill: bool = setting(
         True, "", "Let objects repeat in an episode, as pick.repeats does, where all of the catalog together stay below the budget."
     )
@@ -178,6 +178,14 @@ class Settle:
         2e-3, "m", "Relaxed rest threshold after relax_time: displacement in a tick.", above=0.0, high=0.1
     )
     rest_ticks: int = setting(8, "", "Consecutive ticks for which all objects must be at rest.", low=1, high=INT32_MAX)
+    restless: float = setting(
+        0.0,
+        "",
+        "Fraction of the objects that may move by more than rest_displacement, though not by more than relaxed_displacement, in a pile at "
+        "rest: of 150, a few hardly noticeably do for seconds.",
+        low=0.0,
+        high=0.5,
+    )
     stuck_depth: float = setting(0.01, "m", "An object that penetrates another by more is stuck (released).", above=0.0, high=1.0)
     stuck_time: float = setting(0.4, "s", "An object stuck for this long is dropped again (released).", above=0.0, high=3600.0)
     max_redrops: int = setting(8, "", "Maximum objects dropped again in an arrangement; one with more is resampled.", low=0, high=INT32_MAX)

@@ -15,14 +15,13 @@ from typing import NamedTuple
 import newton
 import numpy as np
 import warp as wp
-from scipy.spatial import ConvexHull
 from scipy.stats import binom
 
 from synpick_warp.configs.dataset.modes import mode_weights
 from synpick_warp.configs.schema import EXCEED, Arrangement, Bake, Config, Move, Physics, Pick
 from synpick_warp.errors import ConfigError
 from synpick_warp.scenes.bin_meshes.inside import HeightField
-from synpick_warp.scenes.bins import Bin, guide_walls, make_bins
+from synpick_warp.scenes.bins import guide_walls, make_bins
 from synpick_warp.scenes.fills import count_entries
 from synpick_warp.scenes.grippers.head import Head
 from synpick_warp.scenes.grippers.mechanism import GRIPPER_BODIES, GRIPPER_DOFS, add_gripper, hull_mesh
@@ -35,17 +34,6 @@ EMPTY_MASS = 0.1
 EMPTY_INERTIA = 1e-3
 # Monte Carlo trials that determine the slot counts; a fraction of 1e-3 of them is known to 10 %.
 SLOT_TRIALS = 100_000
-# Contacts of two convex shapes side by side, and such pairs of an object with floor and walls: a pile of 24 plates of 1 mm has up to 713.
-_PAIR_CONTACTS, _FIXTURES = 5, 1.5
-# Where shapes beside an object are counted, as fractions of the way from the middle of a compartment to its corners.
-_SHARES = (0.25, 0.5, 0.75, 1.0)
-MAX_CONTACTS = 4096
-"""Contacts of a world that thin objects get at most, 1 MB on a GPU."""
-MAX_ROWS = 3072
-"""Rows of a world that thin objects get at most: `contact_sweep.MAX_SHARED_ROWS`, up to which a GPU keeps them in shared memory. Contacts
-take two rows each, where a pile rests."""
-MIN_SIDE = 1e-5
-"""Least side of a box about an object [m]."""
 FREE_COORDS = 7
 FREE_DOFS = 6
 
@@ -247,7 +235,7 @@ def build_model(config: Config, catalog: Catalog, device: wp.Device) -> BuiltMod
         parts += add(index, guide_walls(one.sizes, config.physics.guide_height), True)
     head = make_head(config.gripper)
     gripper = add_gripper(world, config.gripper, head, shape)
-    variant, empty = _add_slots(world, config.physics, catalog, shape, (single, compound))
+    variant, empty = _add_slots(world, config.physics, catalog, shape, (single, compound), find_drawn(config.arrangement, catalog))
     scene = newton.ModelBuilder(gravity=(0.0, 0.0, -config.physics.gravity))
     newton.solvers.SolverSteel.register_custom_attributes(scene)
     scene.replicate(world, copy_count=config.bake.worlds)
@@ -259,6 +247,15 @@ def build_model(config: Config, catalog: Catalog, device: wp.Device) -> BuiltMod
     return BuiltModel(model, layout, head, variant, empty, tuple(one.limits for one in bins))
 
 
+def find_drawn(arrangement: Arrangement, catalog: Catalog) -> np.ndarray:
+    """Indices of the catalog's bodies that episodes can have: all, or those of `arrangement.counts` and distractors."""
+    drawn = np.arange(len(catalog.bodies))
+    if not arrangement.counts:
+        return drawn
+    most = count_entries(arrangement.counts, catalog)[:, 1]
+    return np.concatenate([np.flatnonzero(most), drawn[len(most) :]])
+
+
 def must_repeat(arrangement: Arrangement, catalog: Catalog) -> bool:
     """Whether objects repeat in an episode since all together stay below the volume budget: a catalog of one object fills the tote, too."""
     if arrangement.counts:
@@ -267,72 +264,18 @@ def must_repeat(arrangement: Arrangement, catalog: Catalog) -> bool:
     return arrangement.repeat_to_fill and sum(volumes) < arrangement.volume and len(volumes) < arrangement.max_objects
 
 
-def with_capacities(physics: Physics, count: int, catalog: Catalog, bins: Sequence[Bin] = ()) -> Physics:
-    """Raise the capacities of a world of at most `count` objects if some are thinner than the contact margin, so touch through others, or
-    if bins have more shapes beside an object than a box has.
-
-    The margin of two shapes is twice `physics.gap`. Within a margin m of an object of side lengths a, b, c there is room for about
-    (a + 2 m)(b + 2 m)(c + 2 m) / (a b c) - 1 others of its kind: 23 for plates of 100 x 80 x 1 mm. Piles of objects that are thicker than
-    the margin keep the capacities of the settings.
-    """
-    margin, needed = 2.0 * physics.gap, 0.0
-    reach = float(np.mean([entry.radius for entry in catalog.bodies])) + margin
-    shapes = max((_count_beside(one, reach) for one in bins if one.is_detailed), default=_FIXTURES)
-    if shapes > _FIXTURES:
-        needed = physics.contacts_per_world + _PAIR_CONTACTS * (shapes - _FIXTURES) * count
-    for entry in catalog.bodies:
-        sides = np.sort(oriented_sides(entry.pieces))
-        if sides[0] >= margin:
-            continue
-        neighbors = float(np.prod(sides + 2.0 * margin) / np.prod(sides)) - 1.0
-        pairs = min(count * neighbors, count * (count - 1)) / 2.0 + max(shapes, _FIXTURES) * count
-        needed = max(needed, _PAIR_CONTACTS * pairs * len(entry.pieces))
-    if needed <= physics.contacts_per_world:
-        return physics
-    contacts = min(int(np.ceil(needed)), max(MAX_CONTACTS, physics.contacts_per_world))
-    share = contacts / physics.contacts_per_world
-    return replace(
-        physics,
-        contacts_per_world=contacts,
-        pairs_per_world=round(share * physics.pairs_per_world),
-        rows_per_world=max(physics.rows_per_world, min(3 * contacts, MAX_ROWS)),
-        gripper_rows_per_world=round(share * physics.gripper_rows_per_world),
-    )
-
-
-def _count_beside(one: Bin, reach: float) -> float:
-    """Mean number of a bin's collision shapes beside an object on its floor, in proportion to _FIXTURES of a box.
-
-    Over a grid of places in all compartments, shapes are counted whose planes are within `reach`, the object's bounding radius and margin
-    [m]; and so are floor and walls of boxes as large as the compartments.
-    """
-    planes = [ConvexHull(piece.vertices.astype(np.float64)).equations for piece in one.pieces]
-    shapes, sides = 0, 0
-    for center, mouth, *parts in zip(one.sizes.centers, one.sizes.mouths, *(one.sizes.waypoints(k, reach) for k in _SHARES), strict=True):
-        places, half = np.concatenate(parts), np.array(mouth) / 2.0
-        sides += len(places) + int((half - np.abs(places[:, :2] - center) <= reach).sum())
-        shapes += sum(int(((places @ each[:, :3].T + each[:, 3]).max(axis=1) <= reach).sum()) for each in planes)
-    return _FIXTURES * shapes / sides
-
-
-def oriented_sides(pieces: Sequence[ConvexPiece]) -> np.ndarray:
-    """Side lengths (3) [m] of a box about convex pieces, along their principal axes."""
-    points = np.concatenate([piece.vertices for piece in pieces]).astype(np.float64)
-    centered = points - points.mean(axis=0)
-    return np.maximum(np.ptp(centered @ np.linalg.svd(centered, full_matrices=False)[2].T, axis=0), MIN_SIDE)
-
-
 def _add_slots(
     world: newton.ModelBuilder,
     physics: Physics,
     catalog: Catalog,
     shape: newton.ModelBuilder.ShapeConfig,
     slots: tuple[int, int],
+    drawn: np.ndarray,
 ) -> tuple[np.ndarray, tuple[int, int]]:
-    """Add the body slots for objects.
+    """Add the body slots for objects. A slot has as many shapes as the largest of the objects that episodes can have, `drawn`.
 
     Returns:
-        Variant of each catalog entry (entry) int32, and the empty variants of single and compound slots.
+        Variant of each catalog entry (entry) int32, 0 of those that no episode has, and the empty variants of single and compound slots.
     """
     variant, empty = np.zeros(len(catalog.bodies), np.int32), []
     damping = {
@@ -340,7 +283,7 @@ def _add_slots(
         "steel:rigid_body_max_linear_velocity": physics.max_speed,
     }
     for compound, count in enumerate(slots):
-        entries = [index for index, entry in enumerate(catalog.bodies) if (len(entry.pieces) > 1) == bool(compound)]
+        entries = [index for index in drawn.tolist() if (len(catalog.bodies[index].pieces) > 1) == bool(compound)]
         variants = [_variant(physics, catalog.bodies[index], shape) for index in entries] + [_variant(physics, None, shape)]
         for position, index in enumerate(entries):
             variant[index] = position

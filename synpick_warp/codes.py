@@ -82,6 +82,13 @@ class Removal(enum.IntEnum):
     LOST = 2
 
 
+class Lost(enum.IntEnum):
+    """Bits of what collision detection had no room for."""
+
+    PAIRS = 1
+    CONTACTS = 2
+
+
 class Ending(_Described):
     """Why an episode stopped. The endings that deliver are consecutive; device code relies on it."""
 
@@ -91,9 +98,11 @@ class Ending(_Described):
     GAVE_UP = "too many attempts have failed"
     UNSETTLED = "the objects did not come to rest in time, or were dropped again too often, so the arrangement was resampled"
     ARRANGEMENT_OVERFLOW = "more objects of a kind were drawn than a world has body slots for, so the arrangement was resampled"
-    SOLVER_OVERFLOW = "more contacts arose than the solver has capacity for, so the episode was resampled"
+    SOLVER_OVERFLOW = "more constraint rows arose than the solver has capacity for, so the episode was resampled"
     NOT_FINITE = "a pose became infinite or not a number, so the episode was resampled"
     PERCEPTION_OVERFLOW = "a contour has more points than its capacity, so the episode was resampled"
+    CONTACT_OVERFLOW = "more contacts arose than the worlds have capacity for, so the episode was resampled"
+    PAIR_OVERFLOW = "more pairs of shapes came near each other than the worlds have capacity for, so the episode was resampled"
 
     @property
     def delivers(self) -> bool:

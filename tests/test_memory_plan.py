@@ -17,15 +17,20 @@ from synpick_warp.configs.cell.cameras import CameraRow, Jitter, Pose
 from synpick_warp.configs.episodes.randomize import Distribution
 from synpick_warp.configs.fields import INT32_MAX
 from synpick_warp.configs.files.load import load_config, sections, settings_of
-from synpick_warp.configs.schema import FAST, REFERENCE, UNOCCLUDED, Config, Physics, Settle
+from synpick_warp.configs.schema import FAST, REFERENCE, UNOCCLUDED, Config, Settle
+from synpick_warp.configs.schema import Physics as PhysicsSettings
 from synpick_warp.errors import ConfigError, SynpickError
 from synpick_warp.factory import assembly, memory_plan, pipeline
 from synpick_warp.factory.memory_plan import check_memory, plan_memory
+from synpick_warp.scenes.bins import make_bins
+from synpick_warp.scenes.build import build_model
+from synpick_warp.scenes.catalog import load_catalog
+from synpick_warp.stages.sim.physics import Physics
 from synpick_warp.system.hardware.free_memory import free_host_memory
 from synpick_warp.system.progress import SilentProgress
 from tests.harness.fuzz import fuzz_examples
 from tests.harness.kernel_files import write
-from tests.worlds.small_worlds import settings
+from tests.worlds.small_worlds import catalog, settings
 
 GIB = 1024**3
 CPU = SimpleNamespace(is_cuda=False, alias="cpu")
@@ -161,7 +166,7 @@ def test_times_of_more_ticks_than_32_bits_count_are_out_of_range(key):
         ConfigError, match=rf"{key} is 1e\+300 in the settings passed; allowed: (above|at least) 0, at most (3600|60) \[s\]"
     ):
         load_config("smoke", {key: 1e300})
-    step = settings_of(Physics)["step"][0].metadata["low"]
+    step = settings_of(PhysicsSettings)["step"][0].metadata["low"]
     assert settings_of(Settle)["max_time"][0].metadata["high"] < INT32_MAX * step
 
 
@@ -226,24 +231,44 @@ def test_the_gpus_memory_is_its_own(monkeypatch):
         check_memory(plan_memory(load_config("synpick", {"bake.worlds": 64}), GPU), GPU)
 
 
-def test_the_plan_is_below_what_a_small_bake_allocates(device):
-    """Lower bound: Newton's terms are at most what building its model and solver allocates on a CPU."""
+ROOMY = {"physics__contacts_per_world": 2048, "physics__gripper_rows_per_world": 1024}
+FULL = {"objects__embedded": ["industrial"], "arrangement__max_objects": 150, "arrangement__drop": "layers", "bake__formats": ["zarr"]}
+
+
+@pytest.mark.parametrize(
+    ("overrides", "pieces", "least"),
+    [(ROOMY, 1, 0.5), (FULL | {"arrangement__counts": {"bracket": 150}}, 2, 0.9), (FULL | {"arrangement__counts": {"box": 100}}, 1, 0.9)],
+)
+def test_the_plan_is_below_what_a_bake_allocates(device, overrides, pieces, least):
+    """Lower bound: Newton's terms are at most what building its model and solver allocates on a CPU, and within 10 % of it for parts whose
+    number is set."""
     if device.is_cuda:
         pytest.skip("allocations of a GPU's memory pool are not counted by this test")
-    from synpick_warp.scenes.build import build_model
-    from synpick_warp.stages.sim.physics import Physics
-    from tests.worlds.small_worlds import catalog
-
-    config = settings(bake__worlds=4, bake__device="cpu", physics__contacts_per_world=2048, physics__gripper_rows_per_world=1024)
+    config = settings(bake__worlds=4, bake__device="cpu", **overrides)
+    objects = load_catalog(config) if "arrangement__counts" in overrides else catalog()
+    config = assembly.fit_to_catalog(config, objects, make_bins(config.cell.bins), device, SilentProgress())
     kind = type(device.default_allocator)
     sizes: list[int] = []
     allocate = kind.allocate
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(kind, "allocate", lambda self, size: (sizes.append(size), allocate(self, size))[1])
-        physics = Physics(config.physics, build_model(config, catalog(), device))
+        physics = Physics(config.physics, build_model(config, objects, device))
     assert physics.layout.worlds == 4
-    planned = sum(term.size for term in plan_memory(config, wp.get_device("cpu")) if term.name.startswith("Newton"))
-    assert sum(sizes) / 2 < planned <= sum(sizes)
+    terms = plan_memory(config, wp.get_device("cpu"), pieces=pieces)
+    planned = sum(term.size for term in terms if term.name.startswith("Newton") or term.name == "separating axes")
+    assert least * sum(sizes) < planned <= sum(sizes)
+
+
+def test_a_catalog_too_large_for_the_memory_is_refused_in_one_line(monkeypatch):
+    """What the settings alone need is free, but not what 100 bolts of two pieces need."""
+    config = settings(bake__worlds=64, **FULL | {"arrangement__counts": {"bolt": 100}, "arrangement__max_objects": 100})
+    needed = sum(term.size for term in plan_memory(config, CPU, 0))
+    monkeypatch.setattr(memory_plan, "free_host_memory", lambda: needed)
+    objects, bins = load_catalog(config), make_bins(config.cell.bins)
+    with pytest.raises(
+        ConfigError, match=r"for .*, but this machine has .* GiB free; lower (bake\.worlds|arrangement\.max_objects) \(\d+\)\Z"
+    ):
+        assembly.fit_to_catalog(config, objects, bins, wp.get_device("cpu"), SilentProgress())
 
 
 def test_without_paths_images_need_less():
@@ -261,8 +286,8 @@ def test_shapes_of_bins_take_a_separating_axis_a_pair():
     config = replace(base, bins=replace(base.bins, kind="own"), bin=(BinRow(name="a"), BinRow(name="b")))
     sizes = {term.name: term.size for term in plan_memory(config, wp.get_device("cpu"))}
     shapes = 2 * (9 + 4) + 24
-    assert sizes["separating axes of shape pairs"] == 4 * 5 * shapes * (shapes - 1) // 2
-    assert "separating axes of shape pairs" not in {term.name for term in plan_memory(base, wp.get_device("cpu"))}
+    assert sizes["separating axes"] == 4 * 5 * shapes * (shapes - 1) // 2
+    assert "separating axes" not in {term.name for term in plan_memory(base, wp.get_device("cpu"))}
 
 
 def test_the_plan_has_the_arrays_of_all_stages_and_its_estimates():

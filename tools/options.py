@@ -56,6 +56,7 @@ def image_resolution(text: str) -> list[int | str]:
 
 
 OPTIONS: Mapping[str, Mapping[str, Any]] = {
+    "config": {"metavar": "PRESET_OR_FILE", "help": "preset or .toml file (default: the default settings)"},
     "device": {"default": "auto", "help": "cpu, cuda:N or auto (default: auto)"},
     "models": {"default": "", "help": "folder of BOP models (default: the embedded objects)"},
     "lights": {"default": "", "help": "folder of light maps (default: the embedded skies)"},
@@ -115,14 +116,18 @@ def make_parser(
 
 
 def configure(options: argparse.Namespace, fixed: Mapping[str, object], defaults: Mapping[str, object] | None = None) -> Config:
-    """Load the settings of a tool: `defaults`, overridden by `--set`, then by shared options, then by `fixed`.
+    """Load the settings of a tool: `--config`, overridden by `defaults`, `--set`, then shared options (with `--config` those given), then
+    by `fixed`.
 
     Raises:
         ConfigError: A setting is unknown or out of its range.
     """
     overrides: dict[str, object] = dict(defaults or {}) | dict(parse_assignment(text) for text in options.set)
-    overrides |= {setting: getattr(options, name) for name, setting in SETTINGS.items() if hasattr(options, name)}
-    return load_config(None, overrides | dict(fixed), source=COMMAND_LINE)
+    preset = getattr(options, "config", None)
+    for name, setting in SETTINGS.items():
+        if hasattr(options, name) and (preset is None or getattr(options, name) != OPTIONS[name].get("default")):
+            overrides[setting] = getattr(options, name)
+    return load_config(preset, overrides | dict(fixed), source=COMMAND_LINE)
 
 
 def make_names_parser(allowed: Iterable[str], noun: str) -> Callable[[str], tuple[str, ...]]:

@@ -115,6 +115,62 @@ def list_overlaps_kernel(
                 append_pair(wp.vec2i(first + a, first + b), pair_out, pair_count_inout)
 
 
+@wp.kernel
+def list_occupied_kernel(
+    # Scene:
+    shapes: ShapeData,
+    # In:
+    lower: wp.array[wp.vec3],  # (shape) [m]
+    upper: wp.array[wp.vec3],  # (shape) [m]
+    # Out:
+    occupied_out: wp.array2d[int],  # (world, shape of a world)
+    occupied_count_inout: wp.array[int],  # (world), zero before the launch
+):
+    """Stream compaction: list the shapes of each world that are neither empty nor UNREACHED, in arbitrary order. Launched over world, shape
+    of a world."""
+    world, shape = wp.tid()
+    index = world * shapes.count + shape
+    if lower[index][0] <= upper[index][0] and lower[index][2] < UNREACHED:
+        occupied_out[world, wp.atomic_add(occupied_count_inout, world, 1)] = shape
+
+
+@wp.kernel
+def list_overlaps_of_shapes_kernel(
+    # Scene:
+    shapes: ShapeData,
+    # In:
+    lower: wp.array[wp.vec3],  # (shape) [m]
+    upper: wp.array[wp.vec3],  # (shape) [m]
+    occupied: wp.array2d[int],  # (world, shape of a world)
+    occupied_count: wp.array[int],  # (world)
+    # Out:
+    pair_out: wp.array[wp.vec2i],  # (overlap)
+    pair_count_inout: wp.array[int],  # (1)
+):
+    """All-pairs broad phase of worlds of many shapes: as `list_overlaps_kernel`, with a thread a shape instead of a block a world.
+
+    Launched over world, place in the world's list of occupied shapes; a thread tests its shape against those behind it in the list.
+    """
+    world, row = wp.tid()
+    count = occupied_count[world]
+    if row >= count:
+        return
+    first = world * shapes.count
+    one = occupied[world, row]
+    low = lower[first + one]
+    high = upper[first + one]
+    for column in range(row + 1, count):
+        other = occupied[world, column]
+        other_low = lower[first + other]
+        other_high = upper[first + other]
+        below = low[0] <= other_high[0] and low[1] <= other_high[1] and low[2] <= other_high[2]
+        if below and other_low[0] <= high[0] and other_low[1] <= high[1] and other_low[2] <= high[2]:
+            a = wp.min(one, other)
+            b = wp.max(one, other)
+            if shapes.collides[a, b] != wp.uint8(0):
+                append_pair(wp.vec2i(first + a, first + b), pair_out, pair_count_inout)
+
+
 @wp.func
 def find_support(shapes: ShapeData, shape: int, geometry: wp.vec4, direction: wp.vec3) -> wp.vec3:
     """Support mapping of a box or convex hull: its point farthest in a direction, both in the shape's frame [m]."""

@@ -29,14 +29,21 @@ from synpick_warp.kernels.newton_patches.solver_iterations import ContactRowData
 HAS_FRICTION = f"record[{KIND}] == {WITH_FRICTION}"
 """CUDA expression for whether a contact has friction rows."""
 MAX_SHARED_ROWS = 3072
-"""Maximum number of rows of a world: their impulses and the lists of patch members take 24 of the 48 KB of shared memory of a block."""
+"""Maximum number of rows of a world whose impulses and lists of patch members lie in shared memory: they take 24 of the 48 KB of a block.
+Those of more rows lie in global memory, and are prefetched to the L1 cache."""
 SECTOR = 8
 """Words that a prefetch brings to the L1 cache at least: 32 bytes."""
 TWIST_STRIDE = 8
 """Words of a body's twist in shared memory, so that it is read at once."""
 
 
-def compose_contact_sweep(rows: int, bodies: int, offsets: int, friction: str = SOLVE_FRICTION) -> wp.Function:
+def shared_bytes(rows: int, bodies: int, stages_rows: bool = True) -> int:
+    """Shared memory of the sweep over the contacts of a world [bytes]; arguments as of `compose_contact_sweep`."""
+    words = (bodies + 1) * TWIST_STRIDE + bodies * 6 + (rows + 31) // 32 + (2 * rows if stages_rows else 0)
+    return 4 * words + bodies + 1
+
+
+def compose_contact_sweep(rows: int, bodies: int, offsets: int, friction: str = SOLVE_FRICTION, stages_rows: bool = True) -> wp.Function:
     """Create the sweep over the contacts of a world, for a GPU: all iterations of a solve in one launch, with a warp for each block.
 
     Impulses, patch lists and starts of colors stay in shared memory from the first iteration to the last, which writes the impulses. Two
@@ -48,14 +55,15 @@ def compose_contact_sweep(rows: int, bodies: int, offsets: int, friction: str = 
         offsets: Color offsets of a world. The last two are where contacts without a color begin (solved one by one), and the number of
             contacts.
         friction: Source of the function `solve_friction`.
+        stages_rows: Whether impulses and patch lists lie in shared memory; the arithmetic is the same.
 
     Raises:
-        ValueError: `rows` exceeds `MAX_SHARED_ROWS`.
+        ValueError: `rows` exceeds `MAX_SHARED_ROWS`, and they are to lie in shared memory.
     """
-    if rows > MAX_SHARED_ROWS:
+    if stages_rows and rows > MAX_SHARED_ROWS:
         raise ValueError(f"{rows:,} contact rows of a world do not fit into shared memory; at most {MAX_SHARED_ROWS:,} do.")
 
-    @wp.func_native(_source(rows, bodies, offsets, friction))
+    @wp.func_native(_source(rows, bodies, offsets, friction, _SHARED if stages_rows else _GLOBAL))
     def sweep_contacts(
         world: int,
         iteration: int,
@@ -70,8 +78,34 @@ def compose_contact_sweep(rows: int, bodies: int, offsets: int, friction: str = 
     return sweep_contacts
 
 
-def _source(rows: int, bodies: int, offsets: int, friction: str) -> str:
+_SHARED = (
+    """    __shared__ float impulses[{rows}];
+    __shared__ int patch_list[{rows}];""",
+    """
+        const int listed = min(contacts.patch_list_length.data[world], {rows});
+        for (int i = lane; i < row_count; i += 32) impulses[i] = contacts.impulse.data[first_row + i];
+        for (int i = lane; i < listed; i += 32) patch_list[i] = contacts.patch_lists.data[first_row + i];""",
+    """
+    if (ends)
+        for (int i = lane; i < row_count; i += 32) contacts.impulse.data[first_row + i] = impulses[i];""",
+    "",
+)
+"""CUDA source of impulses and patch lists in shared memory: declarations, statements before the first and after the last iteration, and
+where the contact 32 places further is prefetched; {rows} stands for the capacity of a world."""
+_GLOBAL = (
+    """    float* const impulses = &contacts.impulse.data[first_row];
+    const int* const patch_list = &contacts.patch_lists.data[first_row];""",
+    "",
+    "",
+    """
+            prefetch(&impulses[next_row]);""",
+)
+"""As `_SHARED`, in global memory."""
+
+
+def _source(rows: int, bodies: int, offsets: int, friction: str, places: tuple[str, str, str, str]) -> str:
     """CUDA source of the sweep. A static body's twist is that of a slot behind the others, zero."""
+    declare, begin, end, prefetch = (part.replace("{rows}", str(rows)) for part in places)
     return f"""
 #if defined(__CUDA_ARCH__)
 {friction}
@@ -85,22 +119,18 @@ def _source(rows: int, bodies: int, offsets: int, friction: str) -> str:
     __shared__ __align__(16) float twists[({bodies} + 1) * {TWIST_STRIDE}];
     __shared__ float body_impulses[{bodies} * 6];
     __shared__ bool is_free[{bodies} + 1];
-    __shared__ float impulses[{rows}];
-    __shared__ int patch_list[{rows}];
+{declare}
     __shared__ unsigned color_starts[({rows} + 31) / 32];
     const bool begins = iteration == settings.iteration_offset, ends = iteration + 1 == settings.iteration_offset + settings.iterations;
     const int row_count = min(contacts.row_count.data[world], {rows}), slots = contacts.body_count.data[world];
-    if (begins) {{
-        const int listed = min(contacts.patch_list_length.data[world], {rows});
-        for (int i = lane; i < row_count; i += 32) impulses[i] = contacts.impulse.data[first_row + i];
-        for (int i = lane; i < listed; i += 32) patch_list[i] = contacts.patch_lists.data[first_row + i];
+    if (begins) {{{begin}
 {_FIND_COLORS.replace("OFFSETS", str(offsets))}
     }}
 {_LOAD_BODIES.replace("BODIES", str(bodies))}
     __syncwarp();
     for (int first = 0; first < count; first += 32) {{
         const int index = first + lane;
-{_LOAD}
+{_LOAD.replace("PREFETCH", prefetch)}
         unsigned starts = color_starts[first / 32];
         for (int begin = 0; begin < 32;) {{
             const int end = starts ? __ffs(starts) - 1 : 32;
@@ -112,9 +142,7 @@ def _source(rows: int, bodies: int, offsets: int, friction: str) -> str:
             begin = end;
         }}
     }}
-{_STORE_BODIES.replace("BODIES", str(bodies))}
-    if (ends)
-        for (int i = lane; i < row_count; i += 32) contacts.impulse.data[first_row + i] = impulses[i];
+{_STORE_BODIES.replace("BODIES", str(bodies))}{end}
 #endif
 """
 
@@ -153,7 +181,7 @@ _LOAD = f"""
             const int next_row = __ldg(next_record), next_rows = __ldg(next_record + {KIND}) == {WITH_FRICTION} ? 3 : 1;
             const float* packed = &contacts.rows.data[(size_t)(first_row + next_row) * {ROW}];
             for (int k = 0; k < next_rows * {ROW}; k += {SECTOR}) prefetch(packed + k);
-            prefetch(&contacts.rhs.data[first_row + next_row]);
+            prefetch(&contacts.rhs.data[first_row + next_row]);PREFETCH
             if (next_rows == 3) {{
                 prefetch(&contacts.rhs.data[first_row + next_row + 2]);
                 prefetch(&contacts.friction_operator.data[(first_row + next) * {FRICTION_OPERATOR}]);

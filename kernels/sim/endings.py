@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from synpick_warp.codes import Ending, Mode, Phase, Task
+from synpick_warp.codes import Ending, Lost, Mode, Phase, Task
 from synpick_warp.kernels.structs import CatalogData, LayoutData, MoveData, PickData, SettleData
 
 wp.set_module_options({"enable_backward": False})
@@ -75,14 +75,18 @@ def judge_episodes_kernel(
     progress: wp.array[wp.vec4i],  # (world) [ticks]
     phase_inout: wp.array[int],  # (world)
     ending_inout: wp.array[int],  # (world)
+    lost_inout: wp.array[int],  # (world)
 ):
     """Move worlds whose episode has an ending to phase OVER; failures override the endings of `judge_tasks_kernel`.
 
     Failures, each overriding those before it: not settled in time or within the allowed re-drops, an overflow of contour points in
-    perception, an overflow of contacts or constraint rows in the solver, a pose that is not finite. Launched over world.
+    perception, an overflow of constraint rows in the solver, of contacts or pairs in collision detection, a pose that is not finite.
+    `lost`, bits of `Lost`, ends as 0. Launched over world.
     """
     world = wp.tid()
     phase = phase_inout[world]
+    lost = lost_inout[world]
+    lost_inout[world] = 0
     if phase != Phase.SETTLE and phase != Phase.ACT:
         return
     ending = ending_inout[world]
@@ -92,6 +96,10 @@ def judge_episodes_kernel(
         ending = Ending.PERCEPTION_OVERFLOW
     if solver_overflow[world]:
         ending = Ending.SOLVER_OVERFLOW
+    if (lost & Lost.CONTACTS) != 0:
+        ending = Ending.CONTACT_OVERFLOW
+    if (lost & Lost.PAIRS) != 0:
+        ending = Ending.PAIR_OVERFLOW
     body = world * layout.bodies
     for link in range(layout.gripper_bodies):
         if not is_finite(body_q[body + link]):

@@ -2,13 +2,15 @@
 
 import warp as wp
 
-from synpick_warp.codes import Phase, Stream
+from synpick_warp.codes import Lost, Phase, Stream
 from synpick_warp.kernels.rng import stream_key
 from synpick_warp.kernels.sim.drop import choose_compartment, drop_pose, top_of_objects, write_body
 from synpick_warp.kernels.structs import BinData, CatalogData, DropData, LayoutData, SettleData
 
 wp.set_module_options({"enable_backward": False})
 
+# Slack of a number of objects that is a fraction of them, for rounding.
+COUNT_ROUNDING = wp.constant(1.0e-3)
 # Height of an object's origin below which it has left the bin, through its floor or beside it [m].
 BELOW_FLOOR = wp.constant(-0.01)
 # Offset of collision shapes that must not touch anything: above whatever falls [m].
@@ -176,6 +178,7 @@ def judge_rest_kernel(
     # Scene:
     layout: LayoutData,
     settle: SettleData,
+    restless: float,
     # State:
     catalog_index: wp.array2d[int],  # (world, instance)
     displacement: wp.array2d[float],  # (world, instance) [m]
@@ -184,8 +187,8 @@ def judge_rest_kernel(
 ):
     """Count ticks at rest; after `rest_ticks` of them remove the guide walls, after as many again begin phase ACT.
 
-    A pile is at rest if no object's displacement exceeds `rest_threshold`, or `relaxed_rest_threshold` after `late_ticks`. Launched over
-    world.
+    A pile is at rest if no object's displacement exceeds `rest_threshold`, or `relaxed_rest_threshold` after `late_ticks`. Up to a fraction
+    `restless` of its objects may have displacements between the two. Launched over world.
     """
     world = wp.tid()
     if phase_inout[world] != Phase.SETTLE:
@@ -196,9 +199,17 @@ def judge_rest_kernel(
     allowed = settle.rest_threshold
     if ticks > settle.late_ticks:
         allowed = settle.relaxed_rest_threshold
+    objects = int(0)
+    moving = int(0)
     for instance in range(layout.instances):
-        if catalog_index[world, instance] >= 0 and displacement[world, instance] > allowed:
-            resting = 0
+        if catalog_index[world, instance] >= 0:
+            objects += 1
+            if displacement[world, instance] > allowed:
+                moving += 1
+            if displacement[world, instance] > wp.max(allowed, settle.relaxed_rest_threshold):
+                resting = 0
+    if float(moving) > restless * float(objects) + COUNT_ROUNDING:
+        resting = 0
     if resting >= settle.rest_ticks and ticks >= settle.min_ticks:
         if guides == 1:
             guides = 0
@@ -209,22 +220,30 @@ def judge_rest_kernel(
 
 
 @wp.kernel
-def flag_lost_pairs_kernel(
+def flag_lost_kernel(
     # Scene:
-    capacity: int,
+    pairs: int,
+    contacts: int,
     # State:
     overlap_count: wp.array[int],  # (one)
     pair_count: wp.array[int],  # (one)
+    contact_count: wp.array[int],  # (one)
     # Out:
     overflow_out: wp.array[wp.bool],  # (world)
+    lost_inout: wp.array[int],  # (world)
 ):
-    """Flag all worlds if the broad phase found more overlaps or shape pairs than its capacity: pairs of any world may be lost.
-
-    Launched over world.
+    """Flag all worlds if collision detection found more overlaps or shape pairs, or contacts, than its capacities: those of any world may
+    be lost. `lost` receives bits of `Lost`. Launched over world.
     """
     world = wp.tid()
-    if wp.max(overlap_count[0], pair_count[0]) > capacity:
+    lost = int(0)
+    if wp.max(overlap_count[0], pair_count[0]) > pairs:
+        lost = lost | Lost.PAIRS
+    if contact_count[0] > contacts:
+        lost = lost | Lost.CONTACTS
+    if lost != 0:
         overflow_out[world] = True
+        lost_inout[world] = lost_inout[world] | lost
 
 
 @wp.func

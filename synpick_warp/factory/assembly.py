@@ -26,8 +26,9 @@ from synpick_warp.factory.memory_plan import check_memory, plan_memory
 from synpick_warp.factory.order import order_longest_first
 from synpick_warp.factory.sizes import count_writers, fit_to_device, without_pictures
 from synpick_warp.scenes.bins import Bin, make_bins
-from synpick_warp.scenes.build import REPEATS, find_repeat_rules, must_repeat, with_capacities, without_distractors
+from synpick_warp.scenes.build import REPEATS, find_drawn, find_repeat_rules, must_repeat, without_distractors
 from synpick_warp.scenes.cameras import EpisodeCameras
+from synpick_warp.scenes.capacities import FEW, with_capacities
 from synpick_warp.scenes.catalog import load_catalog
 from synpick_warp.scenes.fills import check_fill
 from synpick_warp.scenes.fixtures import make_fixtures
@@ -205,7 +206,7 @@ def build_stages(
         progress.note(line)
     catalog = load_catalog(config, report=progress.note)
     lights = load_scene_lights(config.bake.lights, config.randomize, config.bake.seed, progress.note, config.objects.strict)
-    config = _fit_to_catalog(config, catalog, bins, device, progress)
+    config = fit_to_catalog(config, catalog, bins, device, progress)
     if longest_first and episodes is not None:
         episodes = order_longest_first(config, catalog, episodes, device)
     progress.stage(f"building {config.bake.worlds} worlds of {len(catalog)} objects on {device.alias}")
@@ -236,7 +237,7 @@ def _build_group(config: Config, scene: RenderScene, cameras: tuple[Camera, ...]
     return CameraGroup(indices, sizes, renderer, rig.is_placed(first), rig.moves(first), rig.every[first], colors, lenses)
 
 
-def _fit_to_catalog(config: Config, catalog: Catalog, bins: Sequence[Bin], device: wp.Device, progress: Progress) -> Config:
+def fit_to_catalog(config: Config, catalog: Catalog, bins: Sequence[Bin], device: wp.Device, progress: Progress) -> Config:
     """Resolve settings that depend on objects and bins: repetition of objects in an episode, and contact capacities.
 
     Raises:
@@ -249,13 +250,16 @@ def _fit_to_catalog(config: Config, catalog: Catalog, bins: Sequence[Bin], devic
         total = sum(entry.volume for entry in catalog.entries)
         budget = config.arrangement.volume
         progress.note(f"{len(catalog)} objects take {total:.3g} of {budget:g} m³ together, so that they repeat in an episode")
-    physics = with_capacities(filled.physics, filled.arrangement.max_objects, catalog, bins)
+    arrangement = filled.arrangement
+    physics = with_capacities(filled.physics, arrangement.max_objects, catalog, bins, arrangement.counts)
     if physics is filled.physics:
         return filled
-    cause = "bins of many shapes" if any(one.is_detailed for one in bins) else "thin objects"
+    cause = "thin objects" if arrangement.max_objects <= FEW else "many objects"
+    cause = "bins of many shapes" if any(one.is_detailed for one in bins) else cause
     progress.note(f"{cause}: capacity for {physics.contacts_per_world:,} contacts a world")
     fitted = replace(filled, physics=physics)
-    check_memory(plan_memory(fitted, device, 0), device)
+    pieces = max(len(catalog.bodies[index].pieces) for index in find_drawn(arrangement, catalog))
+    check_memory(plan_memory(fitted, device, 0, pieces), device)
     return fitted
 
 

@@ -171,10 +171,18 @@ def is_resampled(row: EpisodeRow, tries: int) -> bool:
     return not row.ending.delivers and row.arrangement + 1 < tries
 
 
+_CAPACITIES = {
+    Ending.SOLVER_OVERFLOW: ("rows_per_world", "gripper_rows_per_world"),
+    Ending.CONTACT_OVERFLOW: ("contacts_per_world",),
+    Ending.PAIR_OVERFLOW: ("pairs_per_world",),
+}
+"""Settings of physics to raise after an ending."""
+
+
 def remedy(ending: Ending, physics: Physics, perception: Perception, arrangement: Arrangement, settle: Settle) -> str:
     """Advice against an ending that is caused by a setting, with the current values; empty: no setting cures it."""
-    if ending is Ending.SOLVER_OVERFLOW:
-        capacities = ("contacts_per_world", "pairs_per_world", "rows_per_world", "gripper_rows_per_world")
+    capacities = _CAPACITIES.get(ending, ())
+    if capacities:
         return "raise " + " or ".join(f"physics.{name} ({getattr(physics, name)})" for name in capacities)
     if ending is Ending.PERCEPTION_OVERFLOW:
         return f"raise perception.contour_points ({perception.contour_points})"

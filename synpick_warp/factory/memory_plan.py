@@ -18,11 +18,11 @@ from synpick_warp.configs.cell.cameras import COLOR
 from synpick_warp.configs.dataset.modes import may_pick
 from synpick_warp.configs.episodes.randomize import Randomize
 from synpick_warp.configs.fields import INT32_MAX
-from synpick_warp.configs.schema import Config, Perception, Physics
+from synpick_warp.configs.schema import Config, Perception
 from synpick_warp.errors import ConfigError, SynpickError, format_value
 from synpick_warp.exporters.registry import Needs
+from synpick_warp.factory.newton_memory import newton_rows
 from synpick_warp.scenes import build
-from synpick_warp.scenes.bins import GUIDES, make_bins
 from synpick_warp.scenes.grippers.registry import make_head
 from synpick_warp.stages.arrays import DryArray, Row, dry_run
 from synpick_warp.stages.buffers import Snapshot
@@ -46,16 +46,6 @@ from synpick_warp.system.hardware.free_memory import free_device_memory, free_ho
 
 EPISODE_BYTES = 100
 """Lists and sets of episode indices of a bake at their peak, for each episode [bytes]: tracemalloc has 115 for two million."""
-# Newton's allocations for each item of a world's capacities [bytes]: name, setting, size on a CPU, size on a GPU. Measured on a CPU with
-# Newton 1.8 from the growth of all allocations of model, collision pipeline and solver: 932, 16, 180 and 688. On a GPU rows have other
-# arrays (solve mode "colored"): by Newton's source 160 bytes per row and 109 for its graph coloring, plus 128 for our packed row.
-# Contacts and pairs have at least those of `newton.Contacts` and their sorter.
-_NEWTON = (
-    ("Newton's contacts", "contacts_per_world", 900, 250),
-    ("Newton's shape pairs", "pairs_per_world", 24, 16),
-    ("Newton's contact rows", "rows_per_world", 160, 397),
-    ("Newton's gripper rows", "gripper_rows_per_world", 640, 40),
-)
 _VIEWS = ("cameras.resolution", "render.views_per_batch", "cameras.positions")
 _CAMERAS = ("cameras.resolution", "cameras.positions")
 _HISTORY = ("bake.worlds", "cameras.resolution", "render.history", "cameras.positions")
@@ -86,7 +76,7 @@ class Term:
         return sum(row[3] for row in self.rows)
 
 
-def plan_memory(config: Config, device: wp.Device, writers: int = 1) -> list[Term]:
+def plan_memory(config: Config, device: wp.Device, writers: int = 1, pieces: int = 1) -> list[Term]:
     """Work out what a bake takes on a device by a dry run of its stages: nothing is allocated.
 
     Body slots are counted at their maximum: the object capacity for each slot type.
@@ -95,6 +85,7 @@ def plan_memory(config: Config, device: wp.Device, writers: int = 1) -> list[Ter
         config: All settings.
         device: Device of the simulation; on a GPU the plan is for `with_enough_worlds`.
         writers: Writer processes; 0: nothing is written, views stay on the device.
+        pieces: Convex pieces of each object, as far as they are known.
     """
     config, needs = with_enough_worlds(config, device), Needs.of(config)
     worlds, objects, rig = config.bake.worlds, config.arrangement.max_objects, config.rig
@@ -119,12 +110,7 @@ def plan_memory(config: Config, device: wp.Device, writers: int = 1) -> list[Ter
         terms += _images(arrays, views, count, layers, host, device)
     if may_pick(config.bake, config.splits):
         terms.append(_perception(config.perception, worlds, objects, device))
-    terms += _newton(config.physics, worlds, device.is_cuda)
-    if config.bin:
-        # A separating axis for each pair of a world's shapes, of all bins with their guide walls, and at least one for each object.
-        shapes = sum(len(one.pieces) + GUIDES for one in make_bins(config.cell.bins)) + objects
-        row = ("separating axes", (worlds, shapes * (shapes - 1) // 2), "", worlds * 2 * shapes * (shapes - 1))
-        terms.append(Term("separating axes of shape pairs", (row,), ("bake.worlds",)))
+    terms += [Term(row[0], (row,), keys) for row, keys in newton_rows(config, device.is_cuda, pieces)]
     if writers:
         # A writer is counted with one slot of shared memory: those of its queue get memory only once they are used.
         row = ("shared memory of writers", (writers, needs.slot_bytes), "", writers * needs.slot_bytes)
@@ -294,13 +280,6 @@ def _perception(settings: Perception, worlds: int, objects: int, device: wp.Devi
         allocate_background(1, width, height, device)
         allocate_votes(settings, objects, count, device)
     return _term(f"perception of {count:,} worlds at {width:,}x{height:,} px", arrays, _PERCEPTION)
-
-
-def _newton(physics: Physics, worlds: int, is_cuda: bool) -> Iterator[Term]:
-    """Contacts, pairs and constraint rows of Newton's collision pipeline and solver, which cannot be built in a dry run."""
-    for name, setting, cpu, gpu in _NEWTON:
-        count = worlds * getattr(physics, setting)
-        yield Term(name, ((name, (count,), "", count * (gpu if is_cuda else cpu)),), (f"physics.{setting}", "bake.worlds"))
 
 
 def _advice(term: Term) -> str:

@@ -21,6 +21,8 @@ more worlds, those with the most contact colors start first, or they would run o
 PATCH_WARP_CONTACTS = 8
 """Number of contacts of two bodies above which a warp grows their friction patches, and not a thread; Newton's is 32. The patches are the
 same, in four fifths of the time (2,048 worlds, H200)."""
+TREE_BYTES = 2048
+"""Shared memory of the functions of the gripper's tree, at most, and of what alignment leaves out: the assembler counts 1,634 bytes."""
 
 steel: Any = sys.modules[newton.solvers.SolverSteel.__module__]
 """The solver's module, with the factories of its kernels."""
@@ -142,7 +144,8 @@ class FusedSteel(newton.solvers.SolverSteel):
     def _iterations_kernel(self) -> wp.Kernel:
         """Kernel of the iterations, made of the device functions of the solver's own kernels."""
         size = self._propagation_tree_sizes[0]
-        sweep_contacts = compose_contacts(self._propagation_max_constraints, self._max_propagation_bodies)
+        rows, bodies = self._propagation_max_constraints, self._max_propagation_bodies
+        sweep_contacts = compose_contacts(rows, bodies, stages_rows=keeps_rows_shared(self))
         return compose_kernel(
             self._pgs_solve_mf_gs_kernel_for_phase(),
             self._propagation_refresh_kernels[size],
@@ -265,12 +268,26 @@ def find_unsupported(solver: Any) -> list[str]:
         "enable_joint_velocity_limits": solver._enable_joint_velocity_limits,
         "propagation_cached_response": bool(solver._propagation_cached_warps),
         "no articulation, or several kinds": len(solver._propagation_tree_sizes) != 1,
-        "too many rows for shared memory": solver._propagation_max_constraints > contact_sweep.MAX_SHARED_ROWS,
-        "too many bodies for shared memory": solver._pgs_solve_propagation_colored_warp_kernel is None,
+        "too many bodies for shared memory": not _fits(solver, False),
         # Without limits the solver skips the gripper's pass in worlds without contacts in generalized coordinates; the kernel does not.
         "neither joint limits nor speed limits": not any(solver._internal_row_phases()),
     }
     return [name for name, is_unsupported in unsupported.items() if is_unsupported]
+
+
+def keeps_rows_shared(solver: Any) -> bool:
+    """Whether impulses of a SolverSteel's contact rows, and its patch lists, fit into shared memory beside all else."""
+    return solver._propagation_max_constraints <= contact_sweep.MAX_SHARED_ROWS and _fits(solver, True)
+
+
+def _fits(solver: Any, stages: bool) -> bool:
+    """Whether the kernel of the iterations fits into the static shared memory of a block, with or without impulses and patch lists."""
+    contacts = contact_sweep.shared_bytes(solver._propagation_max_constraints, solver._max_propagation_bodies, stages)
+    rows, bodies_rows, dofs = solver._articulation_constraint_max, solver._mf_meta_packed.shape[1] // 4, solver._max_world_dofs
+    options = {"has_drive_rows": False, "fuse_vel_limits": False}
+    resident = steel._mfgs_metadata_bytes(rows, **options) <= steel._MFGS_RESIDENT_METADATA_MAX_BYTES
+    joints = steel._mfgs_block_shared_bytes(rows, bodies_rows, dofs, shared_metadata=resident, **options)
+    return contacts + joints + TREE_BYTES <= steel._STATIC_SHARED_MEMORY_BYTES
 
 
 def fill(struct: Any, values: Iterable[wp.array | None]) -> Any:
@@ -292,9 +309,9 @@ def compose_kernel(rows: wp.Kernel, refresh: wp.Kernel, contacts: wp.Function, p
 
 
 @cache
-def compose_contacts(rows: int, bodies: int) -> wp.Function:
-    """Sweep over the contacts of a world with at most `rows` rows and `bodies` bodies."""
-    return contact_sweep.compose_contact_sweep(rows, bodies, OFFSETS)
+def compose_contacts(rows: int, bodies: int, stages_rows: bool = True) -> wp.Function:
+    """Sweep over the contacts of a world with at most `rows` rows and `bodies` bodies; `stages_rows`: as of `compose_contact_sweep`."""
+    return contact_sweep.compose_contact_sweep(rows, bodies, OFFSETS, stages_rows=stages_rows)
 
 
 def device_function(kernel: wp.Kernel) -> wp.Function:

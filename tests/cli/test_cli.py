@@ -117,9 +117,9 @@ def test_bake_says_so_by_exit_code_if_episodes_are_missing(tmp_path, bakes, caps
         (["--lights", "no-such"], "there is no lights folder no-such; --lights takes a folder of .hdr maps and sIBL sets"),
         (
             ["--config", "no-such.toml"],
-            "there is no file no-such.toml; give a .toml file or a preset: randomized, smoke, synpick, synpick-hard, synpick-released",
+            "there is no file no-such.toml; give a .toml file or a preset: full-bin, randomized, smoke, synpick, synpick-hard, ",
         ),
-        (["--config", "smook"], 'there is no preset "smook"; presets: randomized, smoke, synpick, synpick-hard, '),
+        (["--config", "smook"], 'there is no preset "smook"; presets: full-bin, randomized, smoke, synpick, synpick-hard, '),
         (["--set", "physics.stepp=1"], "there is no key physics.stepp, set on the command line; keys of physics: step, "),
         (["--set", "physics.step"], "--set physics.step has no value; "),
         (["--wrlds", "3"], "Unknown option: --wrlds. Did you mean --worlds?"),

@@ -29,6 +29,7 @@ from tests.configs.test_presets import resolved
 
 COUPLED = {
     "bake.episodes",
+    "arrangement.max_objects",
     "perception.camera",
     "randomize.background_textures",
     "pick.press_time",
@@ -89,7 +90,7 @@ def test_object_rows_have_the_diameters_of_the_real_models(real_models):
 
 
 def test_other_presets_build_on_the_default_preset():
-    assert preset_names() == ["randomized", "smoke", "synpick", "synpick-hard", "synpick-released", "synpick-test", "tabletop"]
+    assert preset_names() == ["full-bin", "randomized", "smoke", "synpick", "synpick-hard", "synpick-released", "synpick-test", "tabletop"]
     released = load_config("synpick-released", {})
     assert released.move.damping == 1.0
     assert released.object_rows == load_config(None, {}).object_rows
@@ -209,8 +210,8 @@ def test_an_unknown_key_is_reported_with_a_suggestion(key, hint):
         ("[fysics]\nstep = 1\n", "there is no section fysics, set in {path}; sections: bake, objects, "),
         ("physics = 3\n", "physics is 3 in {path}; allowed: a section, [physics]"),
         ("worlds = 3\n", "there is no section worlds, set in {path}; "),
-        ('preset = "synpik"\n', 'there is no preset "synpik" in {path}; presets: randomized, smoke, synpick, synpick-hard, '),
-        ("preset = 3\n", "preset is 3 in {path}; allowed: randomized, smoke, synpick, synpick-hard, synpick-released, synpick-test, "),
+        ('preset = "synpik"\n', 'there is no preset "synpik" in {path}; presets: full-bin, randomized, smoke, synpick, synpick-hard, '),
+        ("preset = 3\n", "preset is 3 in {path}; allowed: full-bin, randomized, smoke, synpick, synpick-hard, synpick-released, "),
         ("object_rows = 3\n", "object_rows is 3 in {path}; allowed: [[object_rows]] tables"),
         ("[[object_rows]]\nid = 1\n", "object_rows[0] has no diameter in {path}; a row needs id and diameter"),
         ("[[object_rows]]\nid = 1\nweight = 2\n", "there is no key object_rows[0].weight, set in {path}; keys: id, "),

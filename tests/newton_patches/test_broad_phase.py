@@ -67,8 +67,11 @@ def read_contacts(contacts: newton.Contacts) -> list[np.ndarray]:
     return [getattr(contacts, f"rigid_contact_{name}").numpy()[:count] for name in ARRAYS]
 
 
-def test_contacts_of_moving_and_jumping_bodies_are_those_of_newton(device, monkeypatch):
-    """Bodies jump to random poses in the tote and then move by millimeters, so that cached axes are stale, valid and nearly valid."""
+@pytest.mark.parametrize("most", [broad_phase.MANY_SHAPES, 0])
+def test_contacts_of_moving_and_jumping_bodies_are_those_of_newton(device, monkeypatch, most):
+    """Bodies jump to random poses in the tote and then move by millimeters, so that cached axes are stale, valid and nearly valid. Worlds
+    of more shapes than `most` have a thread for each."""
+    monkeypatch.setattr(broad_phase, "MANY_SHAPES", most)
     config = settings(bake__worlds=WORLDS, arrangement__max_objects=6)
     model = make_model(config, device).model
     reference, found = make_newton_pipeline(monkeypatch, config, model), physics.make_pipeline(config.physics, model)
@@ -158,8 +161,10 @@ def test_newton_lets_all_pairs_collide_but_static_ones_and_those_of_a_body(devic
     assert colliding.sum() > 0.5 * len(lower)
 
 
-def test_pairs_up_to_the_capacity_keep_their_contacts(device):
+@pytest.mark.parametrize("most", [broad_phase.MANY_SHAPES, 0])
+def test_pairs_up_to_the_capacity_keep_their_contacts(device, monkeypatch, most):
     """Overlaps beyond the capacity are dropped, the others kept; `overlap_count` includes both."""
+    monkeypatch.setattr(broad_phase, "MANY_SHAPES", most)
     config = settings(bake__worlds=1, arrangement__max_objects=6, physics__pairs_per_world=16)
     model = make_model(config, device).model
     pipeline, state = physics.make_pipeline(config.physics, model), model.state()

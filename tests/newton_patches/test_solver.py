@@ -25,8 +25,23 @@ from tests.worlds.cubes import place_cubes
 from tests.worlds.small_worlds import catalog, settings
 
 TICKS = 30
-ARCHITECTURE, DOFS, BODIES, ROWS = 90, 16, 5, 96
-"""Compile-time constants of the kernel under test: CUDA compute capability, and capacities of a small world."""
+ARCHITECTURE, BODIES, ROWS, GRIPPER_ROWS, MOST_BODIES = 90, 5, 96, 256, 253
+"""Compile-time constants of the kernel under test: CUDA compute capability, capacities of a small world, the gripper's, and bodies of a
+world of the most objects."""
+KNOWN = {
+    "_propagation_colored": True,
+    "_row_schedule": "interleaved",
+    "_friction_mode": "fixed_normal",
+    "_contact_compliance": False,
+    "_regularization_enabled": False,
+    "_contact_torsion_enabled": False,
+    "_has_drive_rows": False,
+    "_enable_joint_velocity_limits": False,
+    "_propagation_cached_warps": {},
+    "_propagation_tree_sizes": [4],
+    "_internal_row_phases": lambda: (True, False),
+}
+"""Private attributes of a solver whose options the fused kernel supports."""
 NEWTONS_FRICTION = (
     steel.FRICTION_PAIR_CUDA
     + """
@@ -45,49 +60,64 @@ NEWTONS_FRICTION = (
 """The function of `friction.SOLVE_FRICTION` with the solver's arithmetic."""
 
 
+def sizes_of(rows: int, bodies: int) -> dict[str, object]:
+    """Private attributes of a solver of worlds of `bodies` bodies, two of which are the gripper's, with `rows` contact rows."""
+    free = build.FREE_DOFS * (bodies - 2)
+    return {
+        "_propagation_max_constraints": rows,
+        "_max_propagation_bodies": bodies,
+        "_articulation_constraint_max": GRIPPER_ROWS,
+        "_mf_meta_packed": np.zeros((1, 4 * free)),
+        "_max_world_dofs": free + 4,
+    }
+
+
 def test_the_installed_version_of_newton_is_fused():
     assert newton.__version__ == fused_solver.KNOWN_NEWTON
 
 
-def test_the_kernel_of_the_iterations_compiles(tmp_path):
-    """Its calls match the signatures of the solver's device functions. Compilation for a GPU needs none."""
+@pytest.mark.parametrize(
+    ("rows", "bodies", "stages_rows"), [(ROWS, BODIES, True), pytest.param(3 * 5384, MOST_BODIES, False, marks=pytest.mark.slow)]
+)
+def test_the_kernel_of_the_iterations_compiles(tmp_path, rows, bodies, stages_rows):
+    """Its calls match the signatures of the solver's device functions, and the assembler, which knows the limit, finds that it fits into
+    shared memory, also with 251 brackets. Compilation for a GPU needs none."""
+    free_rows, dofs = build.FREE_DOFS * (bodies - 2), build.FREE_DOFS * (bodies - 2) + 4
     joint_rows = steel._get_pgs_solve_mf_gs_kernel(
-        ROWS, ROWS, DOFS, ARCHITECTURE, has_dense_velocity_limit_rows=False, shared_metadata=True, row_phases=True
+        GRIPPER_ROWS, free_rows, dofs, ARCHITECTURE, has_dense_velocity_limit_rows=False, shared_metadata=True, row_phases=True
     )
     refresh = steel._get_refresh_propagation_tree_body_qd_warp_kernel(4, 2, ARCHITECTURE)
-    contacts = fused_solver.compose_contacts(ROWS, BODIES)
+    contacts = fused_solver.compose_contacts(rows, bodies, stages_rows)
     propagate = steel._get_propagate_tree_impulses_revolute_kernel(4, 2, ARCHITECTURE, has_free_root=True)
     kernel = fused_solver.compose_kernel(joint_rows, refresh, contacts, propagate)
-    wp.compile_aot_module(kernel.module, arch=ARCHITECTURE, module_dir=tmp_path, use_ptx=True)
-    (program,) = tmp_path.glob("*.ptx")
+    wp.compile_aot_module(kernel.module, arch=ARCHITECTURE, module_dir=tmp_path, use_ptx=False)
+    (program,) = tmp_path.glob("*.cubin")
     assert b"solver_iterations_kernel" in program.read_bytes()
 
 
-def test_more_rows_than_fit_into_shared_memory_are_refused():
+def test_more_rows_than_fit_into_shared_memory_lie_in_global_memory():
+    """Known: 8 bytes a row, and 57 a body, of 48 KB: 3,072 rows and 32 objects fit, 251 objects do not, nor do more rows."""
     with pytest.raises(ValueError, match="4,096 contact rows"):
         fused_solver.compose_contacts(4096, BODIES)
+    for rows, bodies, shared in (
+        (1536, 26, True),
+        (3072, 34, True),
+        (3072, MOST_BODIES, False),
+        (4096, 34, False),
+        (16152, MOST_BODIES, False),
+    ):
+        solver = SimpleNamespace(**KNOWN | sizes_of(rows, bodies))
+        assert fused_solver.keeps_rows_shared(solver) is shared
+        assert fused_solver.find_unsupported(solver) == []
+    assert fused_solver.find_unsupported(SimpleNamespace(**KNOWN | sizes_of(3072, 504))) == ["too many bodies for shared memory"]
 
 
 def test_what_the_kernel_does_not_support_is_found():
     """Each unsupported value of the private attributes that `FusedSteel` checks after construction is reported."""
-    known = {
-        "_propagation_colored": True,
-        "_row_schedule": "interleaved",
-        "_friction_mode": "fixed_normal",
-        "_contact_compliance": False,
-        "_regularization_enabled": False,
-        "_contact_torsion_enabled": False,
-        "_has_drive_rows": False,
-        "_enable_joint_velocity_limits": False,
-        "_propagation_cached_warps": {},
-        "_propagation_tree_sizes": [4],
-        "_propagation_max_constraints": 1536,
-        "_pgs_solve_propagation_colored_warp_kernel": "kernel",
-        "_internal_row_phases": lambda: (True, False),
-    }
-    others: list[object] = [False, "phased", "bisection", True, True, True, True, True, {4: 1}, [4, 7], 4096, None, lambda: (False, False)]
+    others: list[object] = [False, "phased", "bisection", True, True, True, True, True, {4: 1}, [4, 7], lambda: (False, False)]
+    known = KNOWN | sizes_of(1536, BODIES)
     assert fused_solver.find_unsupported(SimpleNamespace(**known)) == []
-    for name, value in zip(known, others, strict=True):
+    for name, value in zip(KNOWN, others, strict=True):
         assert len(fused_solver.find_unsupported(SimpleNamespace(**known | {name: value}))) == 1
 
 
@@ -99,7 +129,7 @@ def test_a_solver_with_the_settings_of_a_gpu_differs_by_the_device_alone(monkeyp
     config = settings(bake__worlds=3, arrangement__max_objects=2)
     with pytest.warns(newton.NewtonWarning, match="colored"):
         solver = place_cubes(config, wp.get_device("cpu"), np.tile((0.1, 0.0, 0.1, 0.0, 0.0, 0.0, 1.0), (3, 1))).solver
-    assert fused_solver.find_unsupported(solver) == ["solve_mode", "too many bodies for shared memory"]
+    assert fused_solver.find_unsupported(solver) == ["solve_mode"]
     bodies, rows = solver._bodies(), solver._joint_rows(solver._rhs)
     assert bodies.free_bodies.shape == bodies.free_body_dofs.shape == (3, solver._free_rigid_body_count // 3)
     assert (np.diff(bodies.free_body_dofs.numpy(), axis=1) == build.FREE_DOFS).all()
@@ -171,17 +201,23 @@ def test_worlds_with_the_most_colors_come_first(device):
     assert (np.diff(np.minimum(colors, bins - 1)[found]) <= 0).all()
 
 
-@pytest.mark.parametrize(("worlds", "resident", "max_speed"), [(8, 8, 0.3), (8, 8, 4.0), (24, 8, 4.0), (24, 0, 4.0)])
-def test_worlds_move_as_with_the_launches_of_newton(device, monkeypatch, worlds, resident, max_speed):
+@pytest.mark.parametrize(
+    ("worlds", "resident", "max_speed", "shared"),
+    [(8, 8, 0.3, True), (8, 8, 4.0, True), (24, 8, 4.0, True), (24, 0, 4.0, True), (8, 8, 4.0, False)],
+)
+def test_worlds_move_as_with_the_launches_of_newton(device, monkeypatch, worlds, resident, max_speed, shared):
     """All but the friction rows is bitwise the same, so the solver's are compiled in. Piles fall, rest and are stirred; at the lower speed
     limit, falling bodies have velocity limit rows. Newton does not load 32 contacts at a time, takes worlds in their order (they are sorted
-    if none is resident), its narrow phase uses larger blocks, and each of its friction patches is grown by one thread here."""
+    if none is resident), its narrow phase uses larger blocks, and each of its friction patches is grown by one thread here. Worlds of many
+    objects have impulses and patch lists in global memory."""
     if not device.is_cuda:
         pytest.skip("on a CPU the solver's own launches run")
     config = settings(
         bake__worlds=worlds, bake__episodes=worlds, bake__mode="move", physics__max_speed=max_speed, physics__deterministic=True
     )
     monkeypatch.setattr(fused_solver, "RESIDENT_WORLDS", resident)
+    if not shared:
+        monkeypatch.setattr(fused_solver, "keeps_rows_shared", lambda _: False)
     compose = cache(partial(contact_sweep.compose_contact_sweep, offsets=fused_solver.OFFSETS, friction=NEWTONS_FRICTION))
     monkeypatch.setattr(fused_solver, "compose_contacts", compose)
     found, phases = {}, set()

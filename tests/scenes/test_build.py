@@ -12,19 +12,14 @@ from hypothesis import given
 from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
 
-from synpick_warp.configs.cell.bins import BinRow
 from synpick_warp.configs.cell.extents import BinSizes
-from synpick_warp.configs.schema import Config, Physics
+from synpick_warp.configs.schema import Config
 from synpick_warp.errors import ConfigError
-from synpick_warp.kernels.newton_patches import contact_sweep
 from synpick_warp.scenes import build
-from synpick_warp.scenes.bin_meshes.reading import measure_bins
-from synpick_warp.scenes.bins import guide_walls, make_bins
-from synpick_warp.scenes.embedded.objects import procedural_objects
-from synpick_warp.scenes.types import Catalog, ConvexPiece
+from synpick_warp.scenes.bins import guide_walls
+from synpick_warp.scenes.types import Catalog
 from tests.harness.fuzz import fuzz_examples
 from tests.twins import arrangement
-from tests.worlds.bin_meshes import round_bin, sloped_bin
 from tests.worlds.small_worlds import ANGLE, BOX, CUBE, catalog, settings
 
 WORLDS = 3
@@ -36,10 +31,6 @@ def config_of(**overrides: object):
 
 def count_slots(config: Config, objects: Catalog) -> tuple[int, int]:
     return build.count_slots(config.arrangement, build.find_repeat_rules(config.bake, config.pick, config.move), objects)
-
-
-def with_capacities(config: Config, objects: Catalog) -> Physics:
-    return build.with_capacities(config.physics, config.arrangement.max_objects, objects)
 
 
 @pytest.fixture(scope="module")
@@ -381,46 +372,6 @@ def test_any_catalog_of_one_to_three_objects_gets_arrangements(data, budget, roo
 
 
 # ---- settings that follow from the catalog ----
-
-
-def test_only_objects_thinner_than_the_contact_margin_raise_capacities():
-    config = settings(bake__mode="move", arrangement__max_objects=24)
-    assert with_capacities(config, catalog(BOX, CUBE, ANGLE)) is config.physics
-    for size, least in (((0.1, 0.08, 0.001), 1300), ((0.002, 0.002, 0.1), 1300), ((0.3, 0.2, 0.0005), 1300), ((0.2, 0.2, 0.0079), 512)):
-        physics = with_capacities(config, catalog(BOX, (size,)))
-        assert least <= physics.contacts_per_world <= build.MAX_CONTACTS
-        assert physics.rows_per_world in (1536, build.MAX_ROWS)
-        assert physics.pairs_per_world >= 1024
-    few = settings(bake__mode="move", arrangement__max_objects=3)
-    assert with_capacities(few, catalog(((0.1, 0.08, 0.001),))) is few.physics
-    roomy = settings(arrangement__max_objects=24, physics__contacts_per_world=8192)
-    assert with_capacities(roomy, catalog(((0.1, 0.08, 0.001),))) is roomy.physics
-
-
-def test_bins_of_more_shapes_than_a_box_raise_capacities(tmp_path):
-    """By the shapes that are near an object on the floor, however many there are elsewhere."""
-    config = settings(bake__mode="move", arrangement__max_objects=24)
-    raised = {}
-    for name, mesh in {"plain": sloped_bin(0.0, 0.0), "round": round_bin(0.1)}.items():
-        mesh.export(tmp_path / f"{name}.stl")
-        row = BinRow(name=name, file=str(tmp_path / f"{name}.stl"))
-        bins = make_bins([BinSizes.of_row(each) for each in measure_bins((row,))["bin"]])
-        raised[name] = build.with_capacities(config.physics, 24, catalog(BOX, CUBE), bins)
-    assert raised["plain"] is config.physics
-    assert 512 < raised["round"].contacts_per_world < 1024
-    share = raised["round"].contacts_per_world / 512
-    assert raised["round"].pairs_per_world == round(share * config.physics.pairs_per_world)
-    assert build.with_capacities(config.physics, 24, catalog(BOX, CUBE), make_bins(config.cell.bins)) is config.physics
-
-
-def test_rows_stay_in_shared_memory():
-    assert build.MAX_ROWS == contact_sweep.MAX_SHARED_ROWS
-
-
-def test_the_embedded_objects_keep_the_capacities():
-    margin = 2.0 * settings().physics.gap
-    for raw in procedural_objects():
-        assert build.oriented_sides([ConvexPiece(raw.mesh.vertices, raw.mesh.faces)]).min() > margin
 
 
 @pytest.mark.parametrize(

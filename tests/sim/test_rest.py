@@ -8,7 +8,7 @@ import warp as wp
 from hypothesis import given
 from hypothesis import strategies as st
 
-from synpick_warp.codes import Ending, Phase, Stream
+from synpick_warp.codes import Ending, Lost, Phase, Stream
 from synpick_warp.kernels.sim import rest
 from synpick_warp.stages.sim import arrange
 from tests.twins import rng
@@ -54,7 +54,7 @@ def touch(worlds: KernelWorlds, contacts: list[dict], room: int = 8) -> None:
     worlds.physics.contacts.rigid_contact_count = wp.array([len(contacts)], dtype=int, device=worlds.device)
 
 
-def judge(worlds: KernelWorlds, shift: float = 0.0, contacts: list[dict] | None = None) -> None:
+def judge(worlds: KernelWorlds, shift: float = 0.0, contacts: list[dict] | None = None, restless: float = 0.0) -> None:
     """One tick in which the first instance of every world moves by `shift`."""
     touch(worlds, contacts or [])
     previous = worlds.state.previous_pose.numpy()
@@ -62,7 +62,7 @@ def judge(worlds: KernelWorlds, shift: float = 0.0, contacts: list[dict] | None 
         previous[world, 0, :3] = worlds.physics.state.body_q.numpy()[world * worlds.bodies + 2, :3]
         previous[world, 0, 0] += shift
     worlds.set(worlds.state.previous_pose, previous)
-    arrange.judge_settling(worlds.scene, worlds.state, worlds.physics, SEED)
+    arrange.judge_settling(worlds.scene, worlds.state, worlds.physics, SEED, restless)
     arrange.judge_episodes(worlds.scene, worlds.state, worlds.attempts, worlds.observation, worlds.physics)
 
 
@@ -195,6 +195,25 @@ def test_late_piles_may_buzz_a_little(device):
     assert state_of(worlds)[2][1] == 1
     judge(worlds, 2e-3)
     assert state_of(worlds)[2][1] == 0
+
+
+@pytest.mark.parametrize(
+    ("objects", "restless", "shift", "rests"),
+    [
+        (2, 0.5, 5e-4, 1),
+        (2, 0.49, 5e-4, 0),
+        (2, 0.5, 2e-3, 0),
+        (4, 0.25, 5e-4, 1),
+        (4, 0.24, 5e-4, 0),
+        (4, 0.0, 5e-4, 0),
+        (4, 0.0, 0.5e-4, 1),
+    ],
+)
+def test_a_fraction_of_the_objects_may_be_restless(device, objects, restless, shift, rests):
+    """Known: one object moves, which is half or a quarter of them; beyond the relaxed bound none may."""
+    worlds = made(device, objects=objects, settle={"min_ticks": 0, "rest_ticks": 2})
+    judge(worlds, shift, restless=restless)
+    assert state_of(worlds)[2][1] == rests
 
 
 def test_an_empty_tote_is_at_rest(device):
@@ -335,13 +354,24 @@ def test_a_pose_that_is_no_number_ends_the_episode(device, phase, value, axis):
 
 
 @pytest.mark.parametrize("phase", [Phase.SETTLE, Phase.ACT])
-def test_a_solver_overflow_ends_the_episode(device, phase):
+@pytest.mark.parametrize(
+    ("lost", "ending"),
+    [
+        (0, Ending.SOLVER_OVERFLOW),
+        (Lost.CONTACTS, Ending.CONTACT_OVERFLOW),
+        (Lost.PAIRS, Ending.PAIR_OVERFLOW),
+        (Lost.PAIRS | Lost.CONTACTS, Ending.PAIR_OVERFLOW),
+    ],
+)
+def test_an_overflow_ends_the_episode(device, phase, lost, ending):
     worlds = made(device, worlds=2)
     worlds.begin(phase)
     worlds.set(worlds.physics.solver.constraint_overflow, [True, False])
+    worlds.set(worlds.physics.lost, [lost, 0])
     arrange.judge_episodes(worlds.scene, worlds.state, worlds.attempts, worlds.observation, worlds.physics)
-    assert state_of(worlds, 0)[:2] == (Phase.OVER, Ending.SOLVER_OVERFLOW)
+    assert state_of(worlds, 0)[:2] == (Phase.OVER, ending)
     assert state_of(worlds, 1)[:2] == (phase, Ending.RUNNING)
+    assert not worlds.physics.lost.numpy().any()
 
 
 def test_a_gripper_that_has_been_everywhere_ends_the_episode(device):

@@ -301,14 +301,20 @@ def test_guide_walls_stop_what_flies_while_they_stand(bench):
 # ---- ends ----
 
 
-@pytest.mark.parametrize("key", ["physics__contacts_per_world", "physics__pairs_per_world", "physics__rows_per_world"])
-def test_too_little_room_for_contacts_ends_episodes(device, key):
+@pytest.mark.parametrize(
+    ("key", "room", "ending"),
+    [
+        ("physics__contacts_per_world", 16, Ending.CONTACT_OVERFLOW),
+        ("physics__pairs_per_world", 16, Ending.PAIR_OVERFLOW),
+        ("physics__rows_per_world", 48, Ending.SOLVER_OVERFLOW),
+    ],
+)
+def test_too_little_room_for_contacts_ends_episodes(device, key, room, ending):
     """Contacts, pairs or rows that find no room are never lost in silence."""
-    room = 48 if "rows" in key else 16
     config = settings(arrangement__max_objects=12, arrangement__volume=3e-3, settle__tries=1, **COARSE | {key: room})
     simulation = Simulation(config, catalog(BOX, CUBE), 1, device)
     endings = [int(row.column("ending")[0]) for row in run_ticks(simulation, 20)]
-    assert Ending.SOLVER_OVERFLOW in endings
+    assert ending in endings
 
 
 def test_a_pile_without_time_is_unsettled(device):

@@ -24,7 +24,7 @@ from tests.harness.processes import wait_for
 from tests.tools.test_tools import SHORT_PICKS
 from tools.bench import __main__ as bench
 from tools.bench import cleaner as cleaner_module
-from tools.bench import growth, meter, patches, physics, steady, whole
+from tools.bench import growth, instances, meter, patches, physics, steady, whole
 from tools.bench.cleaner import Assignment, Cleaner, Tally, clean_episode
 from tools.bench.usage import Usage, measure_usage
 from tools.figures import read_runs
@@ -344,6 +344,22 @@ def test_growth_has_rows_of_all_factors(tmp_path, monkeypatch):
     wanted = ["as set", "worlds 1", "objects 0.5 l", "resolution 16x9", "paths 4", "cameras 6"]
     assert [name for name in names if name.endswith("a view")] == [f"{point}: a view" for point in wanted]
     assert [name for name in names if name.endswith("world-steps")] == [f"{point}: world-steps" for point in wanted[:3]]
+
+
+def test_growth_by_instances_has_rows_of_each_number(tmp_path, monkeypatch):
+    for name in ("DROP_TICKS", "REST_TICKS", "BURST"):
+        monkeypatch.setattr(instances, name, 1)
+    monkeypatch.setattr(physics, "MIN_REPEATS", 1)
+    file = tmp_path / "growth.json"
+    fewer_steps = ("--set", "physics.steps_per_tick=1")
+    assert bench.main([*TINY, *fewer_steps, "--parts", "growth", "--instances", "2,40", "--seconds", "0", "--json", str(file)]) == 0
+    rows = {row["name"]: row["value"] for row in json.loads(file.read_text())["rows"]}
+    for number in (2, 40):
+        name = f"{number} instances"
+        for state in ("landing", "at rest"):
+            assert rows[f"{name}, {state}: part-steps"] == pytest.approx(number * rows[f"{name}, {state}: world-steps"])
+        assert rows[f"{name}: worlds without overflow"] == 100.0
+    assert rows["40 instances: memory planned for it, at least"] > rows["2 instances: memory planned for it, at least"]
 
 
 def test_each_replacement_of_newton_is_left_out_once(monkeypatch):

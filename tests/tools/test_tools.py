@@ -54,9 +54,12 @@ def pile(**changes):
     return rest_report.Pile(**values | changes)
 
 
-def violated(results) -> list[str]:
+SETTINGS = Config()
+
+
+def violated(results, config=SETTINGS) -> list[str]:
     """Names of the report's rows whose bound is violated."""
-    return [row.name for row in rest_report.report(results) if not row.holds]
+    return [row.name for row in rest_report.report(results, config) if not row.holds]
 
 
 def test_a_settled_pile_is_within_all_bounds():
@@ -76,6 +79,15 @@ def test_a_settled_pile_is_within_all_bounds():
 )
 def test_each_bound_is_checked(changes, names):
     assert violated(rest_report.Results([pile(**changes)])) == names
+
+
+def test_fills_by_number_may_have_any_volume_but_not_more_contacts_than_there_is_room_for():
+    config = Config().with_values({"arrangement.counts": (("bracket", 150, 150),)})
+    assert violated(rest_report.Results([pile(volume=28.0)]), config) == []
+    assert violated(rest_report.Results([pile()], contacts=512.0, pairs=1024.0), config) == [
+        "contacts a world, most in a tick",
+        "pairs of shapes a world, most in a tick",
+    ]
 
 
 def test_without_piles_all_bounds_are_violated():

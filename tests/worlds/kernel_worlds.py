@@ -204,6 +204,7 @@ class KernelWorlds:
             state=SimpleNamespace(joint_q=zeros(self.coords), joint_qd=zeros(self.dofs), body_q=body_q),
             control=SimpleNamespace(joint_f=zeros(self.dofs), joint_target_q=zeros(self.coords)),
             solver=SimpleNamespace(constraint_overflow=zeros(1, wp.bool)),
+            lost=zeros(1, wp.int32),
             model=SimpleNamespace(shape_transform=zeros(SHAPES, wp.transform), shape_body=zeros(SHAPES, int)),
             contacts=contacts,
             load=lambda variant, restarted: None,

@@ -95,7 +95,7 @@ def main(arguments: list[str] | None = None) -> int:
             console.print(f"{name:20} {value}")
         measured_peers = measure_peers(config, options.compare, options.seconds)
         bake = WholeBake(options.episodes, options.worlds or 0)
-        parts = measure(config, options.parts, options.seconds, traces, bake, options.devices, options.after)
+        parts = measure(config, options.parts, options.seconds, traces, bake, options.devices, options.after, options.instances)
         for row in itertools.chain(parts, measured_peers):
             rows.append(row)
             console.print(f"{row.part:11} {row.name:52} {row.value:14,.3f} {row.unit}", soft_wrap=True)
@@ -119,7 +119,7 @@ def _describe_setup(count: int, cameras: Cameras, options: argparse.Namespace) -
 
 
 def _parse(arguments: list[str] | None) -> argparse.Namespace:
-    parser = make_parser(__doc__, "device", "models", "lights", "set", "json")
+    parser = make_parser(__doc__, "config", "device", "models", "lights", "set", "json")
     worlds_help = f"worlds simulated in parallel (default: {WORLDS}; the part whole: as many as a bake of --episodes chooses)"
     parser.add_argument("--worlds", type=positive_count, help=worlds_help)
     parser.add_argument("--resolution", default="1920x1080", help="WIDTHxHEIGHT [px] (default: 1920x1080)")
@@ -133,6 +133,8 @@ def _parse(arguments: list[str] | None) -> argparse.Namespace:
     parser.add_argument("--episodes", type=positive_count, help=f"episodes of the part whole (default: {WHOLE_EPISODES})")
     devices_help = "several devices of the part steady, as of bake: cuda:0,cuda:1 or all; --worlds is the number of each"
     parser.add_argument("--devices", default="", help=devices_help)
+    instances_help = "numbers of like parts, of which the part growth measures physics alone: 10,32,64,128,251"
+    parser.add_argument("--instances", type=_parse_numbers, default=(), metavar="NUMBERS", help=instances_help)
     parser.add_argument("--seconds", type=finite_seconds, default=2.0, help="minimum time of a measurement [s] (default: 2)")
     options = parser.parse_args(arguments)
     if options.parts is None:
@@ -142,6 +144,7 @@ def _parse(arguments: list[str] | None) -> argparse.Namespace:
         ("devices", "steady", "several"),
         ("episodes", "whole", "it"),
         ("after", "pictures", "it"),
+        ("instances", "growth", "it"),
     ):
         if getattr(options, name) and part not in options.parts:
             parser.error(f"--{name} needs the part {part}, the only one that uses {use}")
@@ -149,6 +152,11 @@ def _parse(arguments: list[str] | None) -> argparse.Namespace:
         parser.error("--device and --devices are both given; name one device by --device, or several by --devices")
     options.episodes = options.episodes or WHOLE_EPISODES
     return options
+
+
+def _parse_numbers(text: str) -> tuple[int, ...]:
+    """Argument type of an option: comma-separated integers above 0."""
+    return tuple(positive_count(part) for part in text.split(","))
 
 
 def _config(options: argparse.Namespace) -> Config:
@@ -164,6 +172,7 @@ def measure(
     bake: WholeBake,
     devices: tuple[str, ...] = (),
     after: int = 0,
+    instances: tuple[int, ...] = (),
 ) -> Iterator[Row]:
     """Measure the parts; yields rows as they arrive.
 
@@ -175,6 +184,7 @@ def measure(
         bake: Size of the bake of the part whole.
         devices: Devices of the part steady; empty: that of the settings.
         after: Ticks simulated before the part pictures.
+        instances: Numbers of parts that the part growth measures, instead of its factors.
     """
     if set(parts) - OWN_WORLDS:
         started = time.perf_counter()
@@ -211,7 +221,7 @@ def measure(
     if "trajectories" in parts:
         yield from of_part("trajectories", measure_trajectories(config, min_seconds))
     if "growth" in parts:
-        yield from of_part("growth", measure_growth(config, min_seconds))
+        yield from of_part("growth", measure_growth(config, min_seconds, instances))
     if "patches" in parts:
         yield from of_part("patches", measure_patches(config))
     if "heaps" in parts:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import warp as wp
@@ -28,11 +28,10 @@ from synpick_warp.stages.sim.physics import with_enough_worlds
 from synpick_warp.stages.sim.simulate import Simulation
 from synpick_warp.stages.view_ring import view_sizes
 from synpick_warp.system.hardware.device import pick_device
+from tools.bench.instances import DROP_TICKS, measure_instances
 from tools.bench.physics import BURST, FOREVER, seconds_per_call
 from tools.options import Row
 
-DROP_TICKS = 24
-"""Ticks from the drop to the measurement: 1.6 s, in which nearly all objects land."""
 FACTORS = {"worlds": (0.125, 0.25, 0.5), "objects": (0.25, 0.5), "resolution": (1 / 3, 2 / 3), "paths": (1, 2, 4), "cameras": (1 / 3, 2.0)}
 """Values of each factor: paths per coarse pixel, and multiples of the settings' own worlds, volume of the objects, image width and height,
 cameras."""
@@ -121,8 +120,12 @@ def _turn(cameras: Cameras, name: str, count: int) -> tuple[tuple[float, float, 
     return tuple(((-1) ** turn * x, (-1) ** turn * y, z) for turn in range(repeats) for x, y, z in vectors)[:count]
 
 
-def measure_growth(config: Config, min_seconds: float) -> Iterator[Row]:
-    """Measure the settings themselves, then each factor's values; a measurement is repeated for at least `min_seconds` [s]."""
+def measure_growth(config: Config, min_seconds: float, instances: Sequence[int] = ()) -> Iterator[Row]:
+    """Measure the settings themselves, then each factor's values, or physics alone of `instances` like parts; a measurement is repeated for
+    at least `min_seconds` [s]."""
+    if instances:
+        yield from measure_instances(config, instances, min_seconds)
+        return
     started = time.perf_counter()
     own = Variant(config, load_catalog(config), load_lights(config.bake.lights), pick_device(config.bake.device), min_seconds)
     scene = own.build_scene()

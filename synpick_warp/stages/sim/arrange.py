@@ -95,19 +95,20 @@ def measure_displacement(scene: SceneData, state: WorldState, physics: Physics) 
     launch(rest.measure_displacement_kernel, state.catalog_index.shape, scene, state, physics.state)
 
 
-def judge_settling(scene: SceneData, state: WorldState, physics: Physics, seed: int) -> None:
-    """Re-drop objects that left the bin or are stuck, count ticks at rest, and begin phase ACT in worlds at rest."""
+def judge_settling(scene: SceneData, state: WorldState, physics: Physics, seed: int, restless: float) -> None:
+    """Re-drop objects that left the bin or are stuck, count ticks at rest, and begin phase ACT in worlds at rest; `restless`: of
+    `settle`."""
     measure_penetration(state, physics)
     measure_displacement(scene, state, physics)
     launch(rest.redrop_objects_kernel, len(state.phase), scene, state, physics.state, seed=wp.uint64(seed))
-    launch(rest.judge_rest_kernel, len(state.phase), scene, state)
+    launch(rest.judge_rest_kernel, len(state.phase), scene, state, restless=restless)
 
 
 def judge_episodes(scene: SceneData, state: WorldState, attempts: AttemptState, observation: Observation, physics: Physics) -> None:
     """End episodes that failed or are complete."""
     launch(endings.judge_tasks_kernel, len(state.phase), scene, state, attempts)
     overflows = {"solver_overflow": physics.solver.constraint_overflow, "perception_overflow": observation.overflow}
-    launch(endings.judge_episodes_kernel, len(state.phase), scene, state, physics.state, **overflows)
+    launch(endings.judge_episodes_kernel, len(state.phase), scene, state, physics.state, lost=physics.lost, **overflows)
 
 
 def place_bins(scene: SceneData, state: WorldState, physics: Physics) -> None:

@@ -94,6 +94,8 @@ class Physics:
         self.state = self.model.state()
         self._other = self.model.state()
         self.control = self.model.control()
+        self.lost = wp.zeros(worlds, dtype=wp.int32, device=self.device)
+        """Bits of `Lost` of each world since the last judgement of episodes (world) int32."""
         self.solver_stream: wp.Stream | None = None
         """CUDA stream for the captured kernels of the solver, from the next tick on; None: the current stream. It may be confined to few
         multiprocessors, since these kernels are short and small, while those of collision detection need many."""
@@ -191,15 +193,20 @@ class Physics:
         """Drop the captured graphs; the next tick begins eagerly, and captures them anew."""
         self._graphs = {}
 
-    def flag_lost_pairs(self) -> None:
-        """Flag worlds that lost broad-phase pairs: Newton drops these silently, while its solver flags overflows of contacts and rows."""
-        pairs, found = self.pipeline.broad_phase_shape_pairs, self.pipeline.broad_phase_pair_count
-        overlaps = getattr(self.pipeline.broad_phase, "overlap_count", found)
+    @property
+    def overlap_count(self) -> wp.array:
+        """Number of pairs of shapes of all worlds whose bounding boxes overlap (one) int32; with Newton's broad phase those it keeps."""
+        return getattr(self.pipeline.broad_phase, "overlap_count", self.pipeline.broad_phase_pair_count)
+
+    def flag_lost(self) -> None:
+        """Flag worlds that lost pairs of shapes or contacts: Newton drops pairs silently, and its solver flags contacts and rows alike."""
+        pipeline, contacts = self.pipeline, self.contacts
+        pairs, found = pipeline.broad_phase_shape_pairs, pipeline.broad_phase_pair_count
         wp.launch(
-            rest.flag_lost_pairs_kernel,
+            rest.flag_lost_kernel,
             dim=self.layout.worlds,
-            inputs=[pairs.shape[0], overlaps, found],
-            outputs=[self.solver.constraint_overflow],
+            inputs=[pairs.shape[0], contacts.rigid_contact_max, self.overlap_count, found, contacts.rigid_contact_count],
+            outputs=[self.solver.constraint_overflow, self.lost],
             device=self.device,
         )
 
@@ -224,7 +231,7 @@ class Physics:
                     watcher.begin_step()
                 before_step(current)
             self.pipeline.collide(current, self.contacts)
-            self.flag_lost_pairs()
+            self.flag_lost()
             if after_collide is not None:
                 after_collide()
             with wp.ScopedStream(solver_stream, sync_exit=True):

@@ -166,7 +166,7 @@ class Simulation:
     def _judge(self) -> None:
         """Update phases and tasks after physics, remove objects that were picked or lost, and end episodes."""
         state, scene, physics, seed = self.state, self.scene, self.physics, self.config.bake.seed
-        arrange.judge_settling(scene, state, physics, seed)
+        arrange.judge_settling(scene, state, physics, seed, self.config.settle.restless)
         arrange.place_bins(scene, state, physics)
         gripper.begin_moving(scene, state, physics, seed)
         gripper.begin_picking(scene, state, self.attempts, self.observation, self.plan, physics)
