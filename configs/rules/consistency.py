@@ -11,7 +11,7 @@ from collections.abc import Iterator, Sequence
 from synpick_warp.configs.cell.bins import OWN, PALLET, TOTE, BinRow, Bins, Tote
 from synpick_warp.configs.cell.extents import BinSizes
 from synpick_warp.configs.cell.gripper import find_gripper_conflicts
-from synpick_warp.configs.dataset.modes import bake_modes, may_pick
+from synpick_warp.configs.dataset.modes import bake_modes
 from synpick_warp.configs.dataset.splits import MAX_SHARD_SCENES, DataLayout
 from synpick_warp.configs.episodes.fills import most_objects
 from synpick_warp.configs.episodes.objects import EMBEDDED
@@ -40,7 +40,7 @@ _NAME = re.compile(r"(?!(tote|table|pallet)$)[a-z0-9_]{1,32}")
 _MIN_COMPARTMENT = 0.03
 """Least length and width of a compartment [m]."""
 _BITS = 32
-"""Most objects of a world whose masks and relations are bits of a word."""
+"""Most objects of a world whose masks are bits of a word."""
 PHYSICS_FORMATS = ("usd", "zarr")
 """Formats without pictures."""
 _SPLIT = re.compile(r"(train|val|test)(_[A-Za-z0-9]+)*")
@@ -71,7 +71,7 @@ def find_conflicts(config: Config) -> Iterator[Conflict]:
     yield from _object_rows(config.object_rows)
     yield from _distractors(config.randomize, config.arrangement, config.bake)
     yield from _counts(config.arrangement, config.randomize.most_distractors)
-    yield from _many(config.arrangement, config.bake, config.splits)
+    yield from _many(config.arrangement, config.bake)
     if config.randomize.background_textures and config.render.table and not any(config.render.table_size):
         yield "render.table_size", "above 0 with randomize.background_textures, which are seen beyond the edge of the table [m]"
 
@@ -95,17 +95,12 @@ def _counts(arrangement: Arrangement, distractors: int) -> Iterator[Conflict]:
         yield "arrangement.counts", "at least one part that each episode has"
 
 
-def _many(arrangement: Arrangement, bake: Bake, splits: Sequence[Split]) -> Iterator[Conflict]:
-    """Yield conflicts of worlds of many objects: pictures have a bit for each, and so has the clutter graph of modes that pick."""
-    if arrangement.max_objects <= _BITS:
-        return
+def _many(arrangement: Arrangement, bake: Bake) -> Iterator[Conflict]:
+    """Yield conflicts of worlds of many objects: pictures have a bit for each."""
     pictures = [name for name in bake.formats if name not in PHYSICS_FORMATS]
-    if pictures or may_pick(bake, splits):
-        cause = f"the formats {', '.join(pictures)}" if pictures else "modes that pick"
-        yield (
-            "arrangement.max_objects",
-            f"at most {_BITS} with {cause}; more with bake.mode = move and the formats {' and '.join(PHYSICS_FORMATS)}",
-        )
+    if pictures and arrangement.max_objects > _BITS:
+        most = f"at most {_BITS} with the formats {', '.join(pictures)}"
+        yield "arrangement.max_objects", f"{most}; more with the formats {' and '.join(PHYSICS_FORMATS)}"
 
 
 def _mix(bake: Bake, splits: Sequence[Split]) -> Iterator[Conflict]:
