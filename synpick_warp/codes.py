@@ -131,7 +131,7 @@ class Outcome(_Described):
 class Status(enum.IntEnum):
     """Column of a world's status row: integers that the host reads after each tick.
 
-    The row describes the end of the tick, before perception runs: attempt, target, hits and engaged instances belong to the running
+    The row describes the end of the tick, before perception runs: attempt, target, hits and seals belong to the running
     attempt, or in a tick with an outcome to the attempt that ended. Reports and data sets call the columns by `column_names`.
     """
 
@@ -148,11 +148,7 @@ class Status(enum.IntEnum):
     OUTCOME = 9
     TARGET = 10
     HITS = 11
-    ENGAGED = 12
-    """Bit i: instance i was engaged by a ray."""
-    ATTACHED = 13
-    """Bit i: instance i is attached to the gripper, or was picked in this tick."""
-    SEALED = 14
+    SEALED = 12
     """Bit k: cup k has a good seal, if suction was switched on."""
 
 

@@ -29,8 +29,8 @@ def see_a_pair(world: World) -> None:
     seen.grasp_pixel[0, [1, 3]] = (11, 21), (-1, -1)
     seen.depth[0, [1, 3]] = 1.98765432, 0.0
     seen.votes[0][np.ix_([1, 3], [1, 3])] = [[0.0, 12.3], [0.1, 0.0]]
-    seen.above[0, [1, 3]] = bits(3), 0
-    seen.ancestors[0, [1, 3]] = bits(0, 3), 0
+    seen.above[0, [1, 3], 0] = bits(3), 0
+    seen.ancestors[0, [1, 3], 0] = bits(0, 3), 0
     plan.target[0] = 1
     plan.point[0] = 0.1, -0.2, 0.0345678912
     plan.normal[0] = -3.0e-9, 0.6, 0.8

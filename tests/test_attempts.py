@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from synpick_warp.codes import Ending, Mode, Outcome, Task
 from synpick_warp.configs.dataset.modes import may_pick
 from synpick_warp.factory.attempts import AttemptLog, EpisodeRecord
-from tests.worlds.scripted_worlds import CONFIG, OBJECT_IDS, RAYS, Ticks, World, bits, new_world, play, report, run
+from tests.worlds.scripted_worlds import CONFIG, OBJECT_IDS, RAYS, ROOM, Ticks, World, bits, new_world, play, report, run
 from tests.worlds.small_worlds import settings
 
 
@@ -163,7 +163,7 @@ def test_an_arrangement_that_is_drawn_again_leaves_no_attempt(mixed):
 
 
 def one_attempt(world: World, **found: object) -> Ticks:
-    world.settle(0, 0, Mode.PICK, [0, 1, 2, 0])
+    world.settle(0, 0, Mode.PICK, [0, 1, 2, 0] + [-1] * (world.room - ROOM))
     world.first_frame()
     world.look(0)
     yield
@@ -172,11 +172,12 @@ def one_attempt(world: World, **found: object) -> Ticks:
     yield
 
 
-def test_the_last_of_32_instances_is_a_bit_like_the_others(device):
-    world = new_world(device)
-    script = one_attempt(world, outcome=Outcome.OTHER_PICKED, hits=1, engaged=bits(0, 31), attached=bits(31))
+@pytest.mark.parametrize(("room", "last"), [(32, 31), (33, 32), (251, 250)])
+def test_the_last_instance_is_a_bit_like_the_others(device, room, last):
+    world = World(CONFIG, device, room)
+    script = one_attempt(world, outcome=Outcome.OTHER_PICKED, hits=1, engaged=bits(*{0, 31, last}), attached=bits(last))
     (record,) = run((world, script)).values()
-    assert (record.attempts[0].engaged, record.attempts[0].picked) == ((0, 31), (31,))
+    assert (record.attempts[0].engaged, record.attempts[0].picked) == (tuple(sorted({0, 31, last})), (last,))
 
 
 @pytest.mark.parametrize(

@@ -81,7 +81,8 @@ def report_of(live: list[int]) -> TickReport:
     pose = np.arange(WORLDS * ROOM * 7, dtype=np.float32).reshape(WORLDS, ROOM, 7)
     measures = np.zeros((WORLDS, len(Measure)), np.float32)
     light = SimpleNamespace(light=number % 2, light_yaw=0.5 * number.astype(np.float32), light_exposure=0.1 * number.astype(np.float32))
-    return TickReport(status, measures, entry, pose, SimpleNamespace(), SimpleNamespace(), light)
+    nobody = np.zeros((WORLDS, 1), np.uint32)
+    return TickReport(status, measures, nobody, nobody, entry, pose, SimpleNamespace(), SimpleNamespace(), light)
 
 
 def sizes_of(config: Config, device: wp.Device) -> dict[str, int]:

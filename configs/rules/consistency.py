@@ -11,7 +11,7 @@ from collections.abc import Iterator, Sequence
 from synpick_warp.configs.cell.bins import OWN, PALLET, TOTE, BinRow, Bins, Tote
 from synpick_warp.configs.cell.extents import BinSizes
 from synpick_warp.configs.cell.gripper import find_gripper_conflicts
-from synpick_warp.configs.dataset.modes import bake_modes, may_pick
+from synpick_warp.configs.dataset.modes import bake_modes
 from synpick_warp.configs.dataset.splits import MAX_SHARD_SCENES, DataLayout
 from synpick_warp.configs.episodes.fills import most_objects
 from synpick_warp.configs.episodes.objects import EMBEDDED
@@ -40,7 +40,6 @@ _NAME = re.compile(r"(?!(tote|table|pallet)$)[a-z0-9_]{1,32}")
 _MIN_COMPARTMENT = 0.03
 """Least length and width of a compartment [m]."""
 _BITS = 32
-"""Most objects of a world whose relations are bits of a word."""
 _SPLIT = re.compile(r"(train|val|test)(_[A-Za-z0-9]+)*")
 
 
@@ -69,7 +68,6 @@ def find_conflicts(config: Config) -> Iterator[Conflict]:
     yield from _object_rows(config.object_rows)
     yield from _distractors(config.randomize, config.arrangement, config.bake)
     yield from _counts(config.arrangement, config.randomize.most_distractors)
-    yield from _many(config.arrangement, config.bake, config.splits)
     if config.randomize.background_textures and config.render.table and not any(config.render.table_size):
         yield "render.table_size", "above 0 with randomize.background_textures, which are seen beyond the edge of the table [m]"
 
@@ -91,12 +89,6 @@ def _counts(arrangement: Arrangement, distractors: int) -> Iterator[Conflict]:
         yield "arrangement.counts", f"at most arrangement.max_objects, {arrangement.max_objects}{beside}, together, which are {most}"
     if arrangement.counts and not any(least for _, least, _ in arrangement.counts):
         yield "arrangement.counts", "at least one part that each episode has"
-
-
-def _many(arrangement: Arrangement, bake: Bake, splits: Sequence[Split]) -> Iterator[Conflict]:
-    """Yield conflicts of worlds of many objects: the clutter graph of modes that pick has a bit for each."""
-    if arrangement.max_objects > _BITS and may_pick(bake, splits):
-        yield "arrangement.max_objects", f"at most {_BITS} with modes that pick; more with bake.mode = move"
 
 
 def _mix(bake: Bake, splits: Sequence[Split]) -> Iterator[Conflict]:

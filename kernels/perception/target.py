@@ -34,7 +34,7 @@ def sample_visible(visible: wp.array2d[int], world: int, key: wp.uint64, index: 
 def rank_visible(
     visible: wp.array2d[int],
     visible_fraction: wp.array2d[float],
-    ancestors: wp.array2d[wp.uint32],
+    ancestors: wp.array3d[wp.uint32],
     world: int,
     sign: float,
 ) -> int:
@@ -44,7 +44,10 @@ def rank_visible(
     largest = float(0.0)
     for i in range(visible.shape[1]):
         if visible[world, i] > 0:
-            count = sign * float(wp.bit_count(ancestors[world, i]))
+            members = int(0)
+            for word in range(ancestors.shape[2]):
+                members += int(wp.bit_count(ancestors[world, i, word]))
+            count = sign * float(members)
             fraction = sign * visible_fraction[world, i]
             if chosen < 0 or count < least or (count == least and fraction > largest):
                 chosen = i
@@ -67,7 +70,7 @@ def choose_target_kernel(
     views: Views,
     visible: wp.array2d[int],  # (world, instance) [px]
     visible_fraction: wp.array2d[float],  # (world, instance)
-    ancestors: wp.array2d[wp.uint32],  # (world, instance)
+    ancestors: wp.array3d[wp.uint32],  # (world, instance, word)
     # Out:
     target_out: wp.array[int],  # (world)
 ):

@@ -3,6 +3,7 @@
 import warp as wp
 
 from synpick_warp.codes import Phase, Task
+from synpick_warp.kernels.bitsets import pack_word
 from synpick_warp.kernels.rng import TAU
 from synpick_warp.kernels.structs import CupData, LayoutData, PickData, SuctionData
 
@@ -151,12 +152,12 @@ def count_seal_rays_kernel(
     body_q: wp.array[wp.transform],  # (body) [m]
     # Out:
     hits_out: wp.array[wp.vec2i],  # (world)
-    engaged_bits_out: wp.array[wp.uint32],  # (world)
+    engaged_words_out: wp.array2d[wp.uint32],  # (world, word)
     attached_inout: wp.array2d[int],  # (world, instance)
     break_force_out: wp.array2d[float],  # (world, cup) [N]
 ):
     """Cast the suction rays where suction is switched on: `hits` receives the number of rays that hit and the cups with a good seal as
-    bits, `engaged_bits` bit i for every instance i that is hit, `attached` bit k for every cup k of which a ray hits the instance.
+    bits, `engaged_words` the bit set of the instances that are hit, `attached` bit k for every cup k of which a ray hits the instance.
 
     Rays run from a circle about a cup's TCP along the cup's -z: x_k = tcp + r (cos a, sin a, 0), a = 2 π k / rays. Each engages the
     nearest object within reach, the first of several at the same distance. Only the world's own objects are tested. A seal is good if at
@@ -168,7 +169,6 @@ def count_seal_rays_kernel(
     body = world * layout.bodies
     total = int(0)
     sealed = int(0)
-    engaged = wp.uint32(0)
     for instance in range(layout.instances):
         attached_inout[world, instance] = 0
     tcp_in_world = tcp_pose(body_q[body + CUP], wp.vec3(0.0, 0.0, -suction.tcp_offset))
@@ -181,7 +181,6 @@ def count_seal_rays_kernel(
             hit = first_instance(start, direction, layout, suction, surface, world, catalog_index, body_slot, body_q)
             if hit >= 0:
                 hits += 1
-                engaged = engaged | (wp.uint32(1) << wp.uint32(hit))
                 attached_inout[world, hit] = attached_inout[world, hit] | (1 << cup)
         total += hits
         if suction.rays - hits <= suction.tolerated_misses:
@@ -191,7 +190,8 @@ def count_seal_rays_kernel(
     for cup in range(cups.count):
         break_force_out[world, cup] = wp.where(has_bit(sealed, cup), suction.good_force, suction.poor_force)
     hits_out[world] = wp.vec2i(total, sealed)
-    engaged_bits_out[world] = engaged
+    for word in range(engaged_words_out.shape[1]):
+        engaged_words_out[world, word] = pack_word(attached_inout, catalog_index, world, word)
 
 
 @wp.kernel

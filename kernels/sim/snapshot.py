@@ -3,6 +3,7 @@
 import warp as wp
 
 from synpick_warp.codes import Measure, Phase, Status, Task
+from synpick_warp.kernels.bitsets import NO_MEMBERS
 from synpick_warp.kernels.sim.endings import delivers
 from synpick_warp.kernels.structs import BinData, LayoutData
 
@@ -128,8 +129,6 @@ def pack_status_kernel(
     outcome: wp.array[int],  # (world)
     target: wp.array[int],  # (world)
     hits: wp.array[wp.vec2i],  # (world)
-    engaged_bits: wp.array[wp.uint32],  # (world)
-    attached_bits: wp.array[wp.uint32],  # (world)
     peak_force: wp.array[float],  # (world) [N]
     # Out:
     status_out: wp.array2d[int],  # (world, status)
@@ -150,10 +149,27 @@ def pack_status_kernel(
     status_out[world, Status.TARGET] = target[world]
     status_out[world, Status.HITS] = 0
     status_out[world, Status.SEALED] = 0
-    status_out[world, Status.ENGAGED] = 0
     if attempt[world] >= 0:
         status_out[world, Status.HITS] = hits[world][0]
         status_out[world, Status.SEALED] = hits[world][1]
-        status_out[world, Status.ENGAGED] = int(engaged_bits[world])
-    status_out[world, Status.ATTACHED] = int(attached_bits[world])
     measure_out[world, Measure.PEAK_FORCE] = peak_force[world]
+
+
+@wp.kernel
+def copy_sets_kernel(
+    # State:
+    attempt: wp.array[int],  # (world)
+    engaged_words: wp.array2d[wp.uint32],  # (world, word)
+    attached_words: wp.array2d[wp.uint32],  # (world, word)
+    # Out:
+    engaged_out: wp.array2d[wp.uint32],  # (world, word)
+    attached_out: wp.array2d[wp.uint32],  # (world, word)
+):
+    """Copy the bit sets of engaged and attached instances beside the status rows; engaged are none before the first attempt. Launched over
+    world, word.
+    """
+    world, word = wp.tid()
+    engaged_out[world, word] = NO_MEMBERS
+    if attempt[world] >= 0:
+        engaged_out[world, word] = engaged_words[world, word]
+    attached_out[world, word] = attached_words[world, word]

@@ -3,6 +3,7 @@
 import warp as wp
 
 from synpick_warp.codes import Mode, Outcome, Phase, Removal, Task
+from synpick_warp.kernels.bitsets import NO_MEMBERS, has_member, has_members, pack_word
 from synpick_warp.kernels.sim.drop import PARKED_HEIGHT, write_body
 from synpick_warp.kernels.sim.gripper import place_gripper, task_setpoint
 from synpick_warp.kernels.sim.rest import is_outside, shape_pose
@@ -106,31 +107,25 @@ def remove_lost_kernel(
 
 @wp.kernel
 def pack_attached_kernel(
-    # Scene:
-    layout: LayoutData,
     # State:
     catalog_index: wp.array2d[int],  # (world, instance)
     attached: wp.array2d[int],  # (world, instance)
     # Out:
-    attached_bits_out: wp.array[wp.uint32],  # (world)
+    attached_words_out: wp.array2d[wp.uint32],  # (world, word)
 ):
-    """Pack the attached instances of each world into a bit mask: bit i is set if instance i is attached. Launched over world."""
-    world = wp.tid()
-    bits = wp.uint32(0)
-    for instance in range(layout.instances):
-        if attached[world, instance] != 0 and catalog_index[world, instance] >= 0:
-            bits = bits | (wp.uint32(1) << wp.uint32(instance))
-    attached_bits_out[world] = bits
+    """Pack the attached instances of each world into a bit set. Launched over world, word."""
+    world, word = wp.tid()
+    attached_words_out[world, word] = pack_word(attached, catalog_index, world, word)
 
 
 @wp.func
-def judge_attempt(target: int, engaged_bits: wp.uint32, attached_bits: wp.uint32) -> int:
-    """`Outcome` of an attempt from the instances that it engaged (hit by a ray) and those still attached after the lift, as bit masks."""
-    if attached_bits != wp.uint32(0):
-        if target >= 0 and (attached_bits & (wp.uint32(1) << wp.uint32(target))) != wp.uint32(0):
+def judge_attempt(target: int, engaged: wp.array2d[wp.uint32], attached: wp.array2d[wp.uint32], world: int) -> int:
+    """`Outcome` of an attempt from the instances that it engaged (hit by a ray) and those still attached after the lift, as bit sets."""
+    if has_members(attached, world):
+        if target >= 0 and has_member(attached, world, target):
             return Outcome.TARGET_PICKED
         return Outcome.OTHER_PICKED
-    if engaged_bits != wp.uint32(0):
+    if has_members(engaged, world):
         return Outcome.DROPPED
     return Outcome.NOTHING_CAUGHT
 
@@ -157,8 +152,8 @@ def advance_tasks_kernel(
     point: wp.array[wp.vec3],  # (world) [m]
     normal: wp.array[wp.vec3],  # (world)
     target: wp.array[int],  # (world)
-    engaged_bits: wp.array[wp.uint32],  # (world)
-    attached_bits: wp.array[wp.uint32],  # (world)
+    engaged_words: wp.array2d[wp.uint32],  # (world, word)
+    attached_words: wp.array2d[wp.uint32],  # (world, word)
     task_inout: wp.array[int],  # (world)
     steps_inout: wp.array[int],  # (world)
     failures_inout: wp.array[int],  # (world)
@@ -181,7 +176,7 @@ def advance_tasks_kernel(
         task == Task.LIFT
         and wp.length(setpoint[world] - task_setpoint(Task.LIFT, point[world], normal[world], pick, move.tcp_offset)) < ARRIVED
     ):
-        outcome = judge_attempt(target[world], engaged_bits[world], attached_bits[world])
+        outcome = judge_attempt(target[world], engaged_words, attached_words, world)
     elif task == Task.LOOK and target[world] < 0 and steps_inout[world] > 0:
         outcome = Outcome.NOTHING_SEEN
     if outcome != Outcome.NONE:
@@ -199,7 +194,7 @@ def end_attempts_kernel(
     # State:
     phase: wp.array[int],  # (world)
     task: wp.array[int],  # (world)
-    attached_bits: wp.array[wp.uint32],  # (world)
+    attached_words: wp.array2d[wp.uint32],  # (world, word)
     # Out:
     catalog_index_out: wp.array2d[int],  # (world, instance)
     removed_out: wp.array2d[int],  # (world, instance)
@@ -216,7 +211,7 @@ def end_attempts_kernel(
     if phase[world] != Phase.ACT or task[world] != Task.LOOK:
         return
     for instance in range(layout.instances):
-        if (attached_bits[world] & (wp.uint32(1) << wp.uint32(instance))) != wp.uint32(0):
+        if has_member(attached_words, world, instance):
             catalog_index_out[world, instance] = -1
             removed_out[world, instance] = Removal.PICKED
         attached_out[world, instance] = 0
@@ -262,7 +257,7 @@ def begin_attempts_kernel(
     # Out:
     steps_out: wp.array[int],  # (world)
     hits_out: wp.array[wp.vec2i],  # (world)
-    engaged_bits_out: wp.array[wp.uint32],  # (world)
+    engaged_words_out: wp.array2d[wp.uint32],  # (world, word)
 ):
     """Begin an attempt in worlds at task LOOK after perception: no ray hits, no engaged instances; with a target, change to APPROACH.
 
@@ -274,7 +269,8 @@ def begin_attempts_kernel(
     attempt_inout[world] = attempt_inout[world] + 1
     steps_out[world] = 0
     hits_out[world] = wp.vec2i(0, 0)
-    engaged_bits_out[world] = wp.uint32(0)
+    for word in range(engaged_words_out.shape[1]):
+        engaged_words_out[world, word] = NO_MEMBERS
     if target[world] >= 0:
         task_inout[world] = Task.APPROACH
 

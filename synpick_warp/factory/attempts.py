@@ -14,6 +14,7 @@ import numpy as np
 
 from synpick_warp.codes import Ending, Mode, Outcome, Phase, Task
 from synpick_warp.configs.schema import Suction
+from synpick_warp.stages.arrays import WORD_BITS, unpack_words
 from synpick_warp.stages.stream import TickReport
 from synpick_warp.views.bins import name_bin
 
@@ -21,8 +22,6 @@ DIGITS, PLACES = 6, 6
 """Significant digits and decimal places of the numbers in a record; more would be noise of single precision."""
 FORCE_PLACES = 4
 """Decimal places of a seal force [N]."""
-MASK_BITS = 32
-"""Bits of a mask of instances."""
 
 Vector = tuple[float, ...]
 
@@ -273,8 +272,8 @@ class AttemptLog:
                 rays=self.rays,
                 hits=hits,
                 good_seal=len(sealed) == self.cups,
-                engaged=_instances(_status(report, "engaged", world), running.distractors) if seen else (),
-                picked=_instances(_status(report, "attached", world), running.distractors),
+                engaged=_instances(report.engaged[world], running.distractors) if seen else (),
+                picked=_instances(report.attached[world], running.distractors),
                 peak_force=tuple(running.forces),
                 sealed=sealed if self.cups > 1 else None,
             )
@@ -289,7 +288,9 @@ class AttemptLog:
         pairs = zip(present[lower].tolist(), present[upper].tolist(), _round_vector(votes[lower, upper].tolist()), strict=True)
         columns = {name: getattr(report.observation, name)[world, present] for name in _OBSERVED}
         columns |= {"instance": present, "object_id": self.object_ids[report.catalog_index[world, present]]}
-        rows = zip(*(values.tolist() for values in columns.values()), strict=True)
+        sets = {name: [_instances(words) for words in columns.pop(name)] for name in ("above", "ancestors")}
+        columns = {name: values.tolist() for name, values in columns.items()} | sets
+        rows = zip(*columns.values(), strict=True)
         instances = tuple(_instance(dict(zip(columns, row, strict=True))) for row in rows)
         return ObservationRecord(self.resolution, instances, tuple(pairs))
 
@@ -319,8 +320,8 @@ def _instance(row: Mapping[str, Any]) -> InstanceObservation:
         distances=_round_vector(row["distances"]),
         grasp_pixel=tuple(row["grasp_pixel"]),
         depth=_round(row["depth"]),
-        above=_instances(row["above"]),
-        ancestors=_instances(row["ancestors"]),
+        above=row["above"],
+        ancestors=row["ancestors"],
     )
 
 
@@ -329,9 +330,10 @@ def _status(report: TickReport, name: str, world: int) -> int:
     return int(report.column(name)[world])
 
 
-def _instances(bits: int, but: Collection[int] = ()) -> tuple[int, ...]:
-    """Indices of the bits set in a mask of MASK_BITS bits, which may be signed, but for those in `but`."""
-    return tuple(instance for instance in range(MASK_BITS) if bits >> instance & 1 and instance not in but)
+def _instances(words: np.ndarray, but: Collection[int] = ()) -> tuple[int, ...]:
+    """Members of a bit set of instances (word) uint32, but for those in `but`."""
+    members = np.flatnonzero(unpack_words(words, WORD_BITS * len(words))).tolist()
+    return tuple(instance for instance in members if instance not in but)
 
 
 def _round(value: float) -> float:

@@ -17,8 +17,11 @@ from dataclasses import dataclass, field, fields
 from types import SimpleNamespace
 from typing import Any, TypeVar
 
+import numpy as np
 import warp as wp
 
+WORD_BITS = 32
+"""Instances of a word of a bit set; see `kernels.bitsets`."""
 Arrays = TypeVar("Arrays")
 Row = tuple[str, tuple[int, ...], str, int]
 """Name, shape, unit and size [bytes] of an array."""
@@ -159,3 +162,14 @@ def _allocate(owner: str, specs: Mapping[str, ArraySpec], sizes: dict[str, int],
     return {
         name: _zeros(f"{owner}.{name}", spec, tuple(sizes[dimension] for dimension in spec.shape), device) for name, spec in specs.items()
     }
+
+
+def count_words(instances: int) -> int:
+    """Words of a bit set of instances."""
+    return -(-instances // WORD_BITS)
+
+
+def unpack_words(words: np.ndarray, instances: int) -> np.ndarray:
+    """Unpack bit sets (..., word) uint32: 1 for each member (..., instance) uint8."""
+    octets = np.ascontiguousarray(words, "<u4").view(np.uint8)
+    return np.unpackbits(octets, axis=-1, bitorder="little")[..., :instances]

@@ -22,6 +22,8 @@ from synpick_warp.stages.sim.step_log import host_record, record_arrays, tick_me
 from synpick_warp.stages.view_ring import ViewRing
 from synpick_warp.views.frames import FrameBatch, SelectedRows, TickBatch
 
+OWN_ARRAYS = 6
+"""Arrays that a report copies before those of its namespaces: of `WorldStatus`, then objects and poses."""
 SHAFT = 1
 """Column of the gripper's shaft in poses of fixtures."""
 # Names of the snapshot's arrays that are copied to `TickReport.snapshot`.
@@ -40,6 +42,10 @@ class TickReport:
     """Status rows (world, status) int32; columns: `Status`."""
     measures: np.ndarray
     """Rows of real numbers (world, measure) float32; columns: `Measure`."""
+    engaged: np.ndarray
+    """Bit sets of the instances that rays hit in the running attempt (world, word) uint32; see `stages.arrays.unpack_words`."""
+    attached: np.ndarray
+    """Bit sets of the instances that are attached to the gripper, or were picked in this tick (world, word) uint32."""
     catalog_index: np.ndarray
     """Object of each instance; -1: none (world, instance) int32."""
     pose: np.ndarray
@@ -56,7 +62,7 @@ class TickReport:
     """Arrays (world, step, ...) for `TickBatch.steps`, likewise."""
 
     def column(self, name: str) -> np.ndarray:
-        """Column of the status rows by its name, such as "phase" or "attached" (world) int32."""
+        """Column of the status rows by its name, such as "phase" or "hits" (world) int32."""
         return self.status[:, column_names(Status)[name]]
 
     def measure(self, name: str) -> np.ndarray:
@@ -103,7 +109,8 @@ class TickReader:
     @staticmethod
     def reported(record: TickRecord) -> list[wp.array]:
         """Arrays of a record that a report copies to the host."""
-        first = [record.status.table, record.status.measures, record.snapshot.catalog_index, record.snapshot.pose]
+        first = [getattr(record.status, item.name) for item in fields(record.status)]
+        first += [record.snapshot.catalog_index, record.snapshot.pose]
         arrays = first + [getattr(part, name) for part, names in _reported_parts(record) for name in names]
         return arrays + (record_arrays(record.physics) if record.physics is not None else [])
 
@@ -124,14 +131,15 @@ class TickReader:
         copied = self.copy.wait()
         last = len(copied) - len(self.physics)
         arrays = iter([array.copy() for array in copied[:last]])
-        first = [next(arrays) for _ in range(4)]
+        first = [next(arrays) for _ in range(OWN_ARRAYS)]
         report = TickReport(*first, *(SimpleNamespace(**{name: next(arrays) for name in names}) for _, names in self.parts))
         if not self.physics:
             return report
         tick, steps = host_record(copied[last:], report.catalog_index.shape[1])
         columns = dict(zip(column_names(Status), report.status.T, strict=True))
         columns |= dict(zip(column_names(Measure), report.measures.T, strict=True))
-        return replace(report, tick=tick | tick_measures(columns, report.catalog_index.shape[1]), steps=steps)
+        sets = {"engaged": report.engaged, "attached": report.attached}
+        return replace(report, tick=tick | tick_measures(columns, sets, report.catalog_index.shape[1]), steps=steps)
 
 
 def read_tick(record: TickRecord) -> TickReport:

@@ -29,7 +29,6 @@ from tests.configs.test_presets import resolved
 
 COUPLED = {
     "bake.episodes",
-    "arrangement.max_objects",
     "perception.camera",
     "randomize.background_textures",
     "pick.press_time",

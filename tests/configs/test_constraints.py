@@ -32,10 +32,6 @@ from tests.configs.test_config import message
             {"bake.mode": "mixed", "bake.mix": [0, 0, 0]},
             r"bake.mix is \[0.0, 0.0, 0.0\] on the command line; allowed: at least one weight above 0, with the mode mixed",
         ),
-        (
-            {"arrangement.max_objects": 33},
-            "arrangement.max_objects is 33 on .*; allowed: at most 32 with modes that pick; more with bake.mode = move",
-        ),
         ({"pick.near": 1.5}, r"pick.appear_height is 1.0 by default; allowed: at least pick.near, 1.5 \[m\]"),
         ({"pick.near_speed": 1.5}, r"pick.speed is 1.0 by default; allowed: at least pick.near_speed, 1.5 \[m/s\]"),
         ({"pick.lift_height": 0.1}, r"pick.lift_height is 0.1 on the command line; allowed: at least the inner height of the tote, 0.195"),

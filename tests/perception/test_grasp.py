@@ -106,7 +106,7 @@ class GraspHarness:
         views, instances = len(toy.placed), toy.instances
         scene = build_scene(toy, device)
         renderer = make_renderer(toy.settings(), scene, instances, views)
-        sizes = view_buffer_sizes(views, scene.width, scene.height, instances) | {"world": views, "point": planning.CAPACITY}
+        sizes = view_buffer_sizes(views, scene.width, scene.height, instances) | {"world": views, "word": 1, "point": planning.CAPACITY}
         self.arrays, self.observation = allocate(PerceptionArrays, sizes, device), allocate(Observation, sizes, device)
         self.grasp = allocate(Plan, sizes, device)
         world, camera_index = (wp.array(values, dtype=wp.int32, device=device) for values in (range(views), [0] * views))
@@ -259,7 +259,7 @@ def test_the_whole_planner(device):
     placed = [[(wide, lower), (small, upper)], [(small, upper), (wide, lower)], [], [(wide, lower)]]
     harness = GraspHarness(device, ToyScene([entry(box(0.2, 0.15, 0.04)), entry(box(0.12, 0.08, 0.04))], placed, (VIEW,)))
     harness.images.views.world.assign(np.array([0, 1, 2, -1]))
-    worlds, attempts = harness.worlds, allocate(AttemptState, {"world": 4, "instance": 4}, device)
+    worlds, attempts = harness.worlds, allocate(AttemptState, {"world": 4, "instance": 4, "word": 1}, device)
     worlds.set(worlds.state.catalog_index, [[0, 1, -1, -1], [1, 0, -1, -1], [-1] * 4, [0, -1, -1, -1]])
     for name in ("contour", "contour_length"):
         getattr(harness.arrays, name).assign(harness.expected[name])
@@ -268,7 +268,7 @@ def test_the_whole_planner(device):
     harness.grasp.target.fill_(7)
     worlds.state.mode.assign(np.array([Mode.PICK, Mode.TARGET, Mode.PICK, Mode.PICK]))
     harness.planner.plan(harness.scene, worlds.state, attempts, harness.observation, harness.grasp, 0)
-    assert harness.observation.above.numpy().tolist() == [[0b10, 0, 0, 0], [0, 0b01, 0, 0], [0] * 4, [0] * 4]
+    assert harness.observation.above.numpy()[..., 0].tolist() == [[0b10, 0, 0, 0], [0, 0b01, 0, 0], [0] * 4, [0] * 4]
     assert harness.grasp.target.numpy().tolist() == [1, 1, -1, 7]
     np.testing.assert_allclose(harness.grasp.normal.numpy()[:2], [(np.sin(0.1), 0, np.cos(0.1)), (0, 0, 1)], atol=1e-5)
     np.testing.assert_allclose(harness.grasp.point.numpy()[1, 2], 0.02, atol=1e-6)

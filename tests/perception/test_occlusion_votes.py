@@ -174,7 +174,7 @@ def test_unused_views_write_nothing(device):
     assert (votes[1] == 7.0).all()
     harness.observation.above.fill_(3)
     harness.planner.order_clutter(harness.scene, harness.observation)
-    assert harness.observation.above.numpy().tolist() == [[2, 0, 0, 0, 0], [3] * 5]
+    assert harness.observation.above.numpy()[..., 0].tolist() == [[2, 0, 0, 0, 0], [3] * 5]
 
 
 def test_votes_of_an_earlier_observation_are_cleared(device):

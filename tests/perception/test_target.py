@@ -21,7 +21,7 @@ def harness_of(device, visible, fraction, ancestors) -> PlannerHarness:
     harness = PlannerHarness(device, [EMPTY[0]] * len(visible), [EMPTY[1]] * len(visible), visible.shape[1])
     harness.observation.visible.assign(visible)
     harness.observation.visible_fraction.assign(np.atleast_2d(fraction))
-    harness.observation.ancestors.assign(np.atleast_2d(ancestors).astype(np.uint32))
+    harness.observation.ancestors.assign(np.reshape(ancestors, harness.observation.ancestors.shape).astype(np.uint32))
     harness.worlds.begin(Phase.ACT)
     harness.attempts.attempt.fill_(-1)
     return harness

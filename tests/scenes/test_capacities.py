@@ -83,7 +83,7 @@ def test_the_embedded_objects_keep_the_capacities():
     ],
 )
 def test_many_objects_have_contacts_in_proportion_and_three_rows_for_each(shapes, count, each):
-    config = settings(arrangement__max_objects=count, bake__formats=["zarr"])
+    config = settings(arrangement__max_objects=count)
     contacts, pairs, rows, gripper = capacities_of(with_capacities(config, catalog(*shapes)))
     assert contacts == pytest.approx(count * each, abs=1)
     assert pairs == 2 * contacts
@@ -105,5 +105,5 @@ def test_numbers_of_parts_count_by_their_own_contacts():
 
 
 def test_larger_capacities_of_the_settings_stay():
-    config = settings(arrangement__max_objects=251, bake__formats=["zarr"], physics__contacts_per_world=20000)
+    config = settings(arrangement__max_objects=251, physics__contacts_per_world=20000)
     assert with_capacities(config, catalog(CUBE)) is config.physics

@@ -76,9 +76,9 @@ class Cups(KernelWorlds):
         self.place(world, instance, [*place, *quaternion])
 
     def cast(self) -> tuple[list[int], list[int]]:
-        """Count of rays that hit and bit mask of engaged objects, of every world."""
+        """Count of rays that hit and first word of the set of engaged objects, of every world."""
         self.suction.engage(self.scene, self.state, self.attempts, self.seals, self.physics)
-        return self.attempts.hits.numpy()[:, 0].tolist(), self.attempts.engaged_bits.numpy().tolist()
+        return self.attempts.hits.numpy()[:, 0].tolist(), self.attempts.engaged_words.numpy()[:, 0].tolist()
 
     def attached(self) -> list[list[int]]:
         return self.seals.attached.numpy().tolist()
@@ -181,7 +181,7 @@ def test_rays_are_cast_when_the_time_to_press_is_up(device, phase, task, steps):
         (cups.attempts.steps, steps, PRESS_STEPS),
     ):
         cups.set(array, [value, due])
-    for array in (cups.attempts.hits, cups.attempts.engaged_bits, cups.seals.break_force):
+    for array in (cups.attempts.hits, cups.attempts.engaged_words, cups.seals.break_force):
         cups.set(array, 7)
     assert cups.cast() == ([7, RAYS], [7, 1])
     assert cups.attached() == [[0, 0, 0, 0], [1, 0, 0, 0]]

@@ -64,7 +64,7 @@ def test_what_was_picked_is_gone_from_the_next_picture(emptied):
     assert np.diff(present).tolist() == [-int(end) for end in ended[1:]]
     for row, end in zip(live, ended, strict=True):
         if end:
-            assert row.column("attached")[0] == 1 << row.column("target")[0]
+            assert row.attached[0, 0] == 1 << row.column("target")[0]
 
 
 def test_tasks_come_in_order(emptied):

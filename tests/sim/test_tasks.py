@@ -173,7 +173,7 @@ def lifted(device, target: int, engaged: int, attached: tuple[int, ...], mode: i
     worlds.set(worlds.state.mode, mode)
     worlds.set(worlds.attempts.task, Task.LIFT)
     worlds.set(worlds.plan.target, target)
-    worlds.set(worlds.attempts.engaged_bits, engaged)
+    worlds.set(worlds.attempts.engaged_words, [engaged])
     worlds.set(worlds.seals.attached, attached)
     worlds.set(worlds.state.setpoint, LIFTED)
     step(worlds)
@@ -187,7 +187,7 @@ def test_what_hangs_after_the_lift_leaves_the_scene(device, target, engaged, att
     assert worlds.attempts.outcome.numpy()[0] == outcome
     assert worlds.attempts.failures.numpy()[0] == failures
     assert worlds.attempts.task.numpy()[0] == Task.LOOK
-    assert worlds.attempts.attached_bits.numpy()[0] == sum(bit << i for i, bit in enumerate(attached))
+    assert worlds.attempts.attached_words.numpy()[0, 0] == sum(bit << i for i, bit in enumerate(attached))
     assert worlds.attempts.removed.numpy()[0].tolist() == [Removal.PICKED * bit for bit in attached]
     assert worlds.state.catalog_index.numpy()[0].tolist() == [-1 if bit else i for i, bit in enumerate(attached)]
     assert not worlds.seals.attached.numpy().any()

@@ -11,7 +11,7 @@ import numpy as np
 
 from synpick_warp.configs.schema import Perception
 from synpick_warp.scenes.types import Camera
-from synpick_warp.stages.arrays import allocate, allocate_struct
+from synpick_warp.stages.arrays import allocate, allocate_struct, count_words, unpack_words
 from synpick_warp.stages.perception.arrays import Observation, PerceptionArrays, Plan
 from synpick_warp.stages.perception.plan import GraspPlanner
 from synpick_warp.stages.render.scene import build_cameras, build_grid
@@ -70,6 +70,7 @@ class PlannerHarness:
         self.worlds.set(self.worlds.state.catalog_index, np.arange(instances))
         kernel_worlds.filled(self.worlds.scene.perception, {**SETTINGS, **(settings or {})})
         sizes = {"view": self.views, "world": self.views, "instance": instances, "row": height, "column": width, "point": CAPACITY}
+        sizes["word"] = count_words(instances)
         self.arrays, self.observation = allocate(PerceptionArrays, sizes, device), allocate(Observation, sizes, device)
         self.grasp, self.attempts = allocate(Plan, sizes, device), allocate(AttemptState, sizes, device)
         self.gbuffer = allocate_struct(GBUFFER, sizes, device)
@@ -104,8 +105,8 @@ class PlannerHarness:
         else:
             self.observation.votes.assign(votes)
         self.planner.order_clutter(self.scene, self.observation)
-        bits = np.arange(self.arrays.largest.shape[1])
-        return tuple((array.numpy()[..., None] >> bits) & 1 == 1 for array in (self.observation.above, self.observation.ancestors))
+        sets = (self.observation.above, self.observation.ancestors)
+        return tuple(unpack_words(array.numpy(), self.arrays.largest.shape[1]) == 1 for array in sets)
 
     def choose(self, seed: int = 0) -> list[int]:
         """Target of each world."""
@@ -228,6 +229,21 @@ def heaviest_by_subsets(weights: np.ndarray) -> tuple[float, set[bytes]]:
             sets = {kept.tobytes()} | (sets if weight == best else set())
             best = weight
     return best, sets
+
+
+def greedy_order(weights: np.ndarray) -> list[int]:
+    """Order of a greedy feedback arc set, the uppermost first: sources first, sinks last, else the largest gain; ties by index."""
+    left, first, last = list(range(len(weights))), [], []
+    while left:
+        inner = weights[np.ix_(left, left)]
+        leaving, entering = inner.sum(axis=0), inner.sum(axis=1)
+        gain = np.where((leaving == 0) | (entering == 0), np.inf, leaving - entering)
+        place = int(np.argmax(gain))
+        if entering[place] > 0 and leaving[place] == 0:
+            last.insert(0, left.pop(place))
+        else:
+            first.append(left.pop(place))
+    return first + last
 
 
 def choose_target(visible: np.ndarray, fraction: np.ndarray, above: np.ndarray, targeted: bool) -> int:

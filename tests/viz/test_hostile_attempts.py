@@ -15,6 +15,7 @@ from synpick_warp.apps.viz.explain_graph import clutter_edges, draw_graph, lay_o
 from synpick_warp.apps.viz.explain_panels import draw_words, load_chart
 from synpick_warp.apps.viz.explain_record import MAX_ATTEMPTS, Attempt, read_attempts
 from synpick_warp.configs.files.load import load_config
+from synpick_warp.dataset.records import MAX_OBSERVED
 from synpick_warp.errors import DatasetError
 from tests.harness.charts import picture_of
 from tests.harness.fuzz import fuzz_examples
@@ -81,11 +82,11 @@ def test_a_point_outside_of_the_image_is_named(tmp_path, point):
 
 def test_a_graph_of_all_edges_ends(tmp_path):
     """More objects than a world can have are refused where they are read."""
-    pile = [seen_object(index, 1, (index % 80, 30), above=list(range(index))) for index in range(33)]
+    pile = [seen_object(index, 1, (index % 80, 30), above=list(range(index))) for index in range(MAX_OBSERVED + 1)]
     (tmp_path / "attempts.jsonl").write_text(json.dumps(record(pile)))
-    with pytest.raises(DatasetError, match="expected array of length <= 32"):
+    with pytest.raises(DatasetError, match=f"expected array of length <= {MAX_OBSERVED}"):
         read_attempts(tmp_path, 0, None)
-    (tmp_path / "attempts.jsonl").write_text(json.dumps(record(pile[:32])))
+    (tmp_path / "attempts.jsonl").write_text(json.dumps(record(pile[:MAX_OBSERVED])))
     [attempt] = read_attempts(tmp_path, 0, None)
     started = time.monotonic()
     with pytest.raises(DatasetError, match="has too many edges to be drawn"):

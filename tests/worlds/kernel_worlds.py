@@ -17,7 +17,7 @@ from synpick_warp.configs.episodes.randomize import Randomize
 from synpick_warp.kernels import structs
 from synpick_warp.scenes.build import Part
 from synpick_warp.scenes.looks import Looks
-from synpick_warp.stages.arrays import allocate
+from synpick_warp.stages.arrays import allocate, count_words
 from synpick_warp.stages.constants import SceneData, bin_data, fill, mode_data
 from synpick_warp.stages.perception.arrays import Observation, Plan
 from synpick_warp.stages.render.looks import build_look_table
@@ -133,6 +133,7 @@ class KernelWorlds:
             "world": self.worlds,
             "world_and_global": self.worlds + 1,
             "instance": self.instances,
+            "word": count_words(self.instances),
             "body": self.worlds * self.bodies,
             "waypoint": self.scene.move.waypoints,
             "cup": len(self.cups),

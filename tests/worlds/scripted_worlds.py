@@ -24,27 +24,31 @@ Ticks = Iterator[None]
 ROOM = 4
 OBJECT_IDS = np.array([3, 8, 21], np.int32)
 CONFIG = settings(bake__mode="mixed", arrangement__max_objects=ROOM, perception__resolution=[64, 48], suction__tolerated_misses=1)
+SETS = ("engaged", "attached")
 RAYS = CONFIG.suction.rays
 
 
 class World:
     """One world's rows of the reports. Observation and plan stay until the next perception, as on the device."""
 
-    def __init__(self, config: Config, device: Any) -> None:
-        sizes = worlds.world_sizes(1, config.arrangement.max_objects, config.move.rounds, 1, 1)
+    def __init__(self, config: Config, device: Any, room: int = ROOM) -> None:
+        sizes = worlds.world_sizes(1, room, config.move.rounds, 1, 1)
         self.room = sizes["instance"]
         self.observation, self.plan = (_host(allocate(kind, sizes, device)) for kind in (Observation, Plan))
         self.status = np.zeros((1, len(Status)), np.int32)
         self.measures = np.zeros((1, len(Measure)), np.float32)
+        self.engaged, self.attached = np.zeros((2, 1, sizes["word"]), np.uint32)
         self.catalog_index = np.full((1, self.room), -1, np.int32)
 
     def now(self, *, load: float | None = None, catalog_index: list[int] | None = None, **columns: int) -> None:
-        """Change columns; the rest stays, but a cup seals well if as many rays hit as CONFIG demands."""
+        """Change columns and sets of instances; the rest stays, but a cup seals well if as many rays hit as CONFIG demands."""
         if "hits" in columns:
             columns = {"sealed": int(RAYS - columns["hits"] <= CONFIG.suction.tolerated_misses)} | columns
         for name, value in columns.items():
-            # As the device writes bits of 32 instances.
-            self.status[0, column_names(Status)[name]] = np.uint32(value).astype(np.int32) if value > 2**31 - 1 else value
+            if name in SETS:
+                getattr(self, name)[0] = words(value, self.engaged.shape[1])
+            else:
+                self.status[0, column_names(Status)[name]] = value
         if load is not None:
             self.measures[0, Measure.PEAK_FORCE] = load
         if catalog_index is not None:
@@ -128,16 +132,19 @@ def report(side_by_side: list[World]) -> TickReport:
         parts = [vars(getattr(world, part)) for world in side_by_side]
         return SimpleNamespace(**{name: np.concatenate([arrays[name] for arrays in parts]) for name in parts[0]})
 
-    status, measures, catalog_index = (
-        np.concatenate([getattr(world, name) for world in side_by_side]) for name in ("status", "measures", "catalog_index")
-    )
-    pose = np.zeros((*catalog_index.shape, 7), np.float32)
-    return TickReport(status, measures, catalog_index, pose, stacked("observation"), stacked("plan"), SimpleNamespace())
+    parts = [np.concatenate([getattr(world, name) for world in side_by_side]) for name in ("status", "measures", *SETS, "catalog_index")]
+    pose = np.zeros((*parts[-1].shape, 7), np.float32)
+    return TickReport(*parts, pose, stacked("observation"), stacked("plan"), SimpleNamespace())
 
 
 def bits(*instances: int) -> int:
     """One bit an instance."""
     return sum(1 << instance for instance in instances)
+
+
+def words(members: int, count: int) -> list[int]:
+    """Words of a bit set from one integer."""
+    return [members >> 32 * word & 0xFFFFFFFF for word in range(count)]
 
 
 def new_world(device: Any) -> World:

@@ -41,6 +41,7 @@ from synpick_warp.system.progress import SilentProgress
 from tools.bench.compare.peers import PEERS, check_installed, measure_peers
 from tools.bench.encode import measure_encoding
 from tools.bench.growth import measure_growth
+from tools.bench.heaps import measure_heaps, measure_perception
 from tools.bench.patches import measure_patches
 from tools.bench.physics import BURST, measure_simulation, seconds_per_call
 from tools.bench.pictures import measure_pictures
@@ -63,8 +64,8 @@ from tools.options import (
 )
 
 DEFAULT_PARTS = ("physics", "perception", "render", "encode", "write", "stream", "steady")
-PARTS = (*DEFAULT_PARTS, "pictures", "whole", "trajectories", "growth", "patches")
-OWN_WORLDS = {"pictures", "steady", "whole", "trajectories", "growth", "patches"}
+PARTS = (*DEFAULT_PARTS, "pictures", "whole", "trajectories", "growth", "patches", "heaps")
+OWN_WORLDS = {"pictures", "steady", "whole", "trajectories", "growth", "patches", "heaps"}
 """Parts that build worlds of their own."""
 WORLDS = 512
 """Default number of worlds of all parts but `whole`."""
@@ -223,11 +224,17 @@ def measure(
         yield from of_part("growth", measure_growth(config, min_seconds, instances))
     if "patches" in parts:
         yield from of_part("patches", measure_patches(config))
+    if "heaps" in parts:
+        yield from of_part("heaps", measure_heaps(config, min_seconds))
 
 
 def _measure_worlds(quality: int, factory: Factory, min_seconds: float, parts: tuple[str, ...]) -> Iterator[Row]:
     """Benchmark of simulation and perception, and then of rendering the same worlds."""
     yield from of_part("physics", measure_simulation(factory, min_seconds, parts))
+    simulation = factory.simulation
+    if simulation.perception is not None and "perception" in parts:
+        rows = measure_perception(simulation.perception, simulation.record.snapshot, simulation.device, min_seconds)
+        yield from of_part("perception", rows)
     if "render" in parts:
         yield from of_part("render", _measure_rendering(factory, min_seconds))
     if "encode" in parts:

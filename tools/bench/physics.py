@@ -149,8 +149,6 @@ def measure_simulation(factory: Factory, min_seconds: float, parts: tuple[str, .
         yield Row("worlds that act", 100.0 * acting, "%")
         contacts = int(simulation.physics.contacts.rigid_contact_count.numpy()[0])
         yield Row("contacts per world", contacts / simulation.layout.worlds, "")
-    if simulation.perception is not None and "perception" in parts:
-        yield from of_part("perception", _measure_perception(simulation, min_seconds))
 
 
 def _measure_ticks(simulation: Simulation, tick: Callable[[], None], min_seconds: float, state: str) -> Iterator[Row]:
@@ -231,7 +229,7 @@ def _measure_picking(simulation: Simulation, pile_seconds: float) -> Iterator[Ro
             report = reader.wait()
             act = report.column("phase") == Phase.ACT
             acting += int(act.sum())
-            attached += int((act & (report.column("attached") != 0)).sum())
+            attached += int((act & report.attached.any(axis=1)).sum())
             perceptions += int((act & (report.column("task") == Task.LOOK)).sum())
     wp.synchronize_device(device)
     tick = (time.perf_counter() - started) / PICK_TICKS
@@ -245,34 +243,3 @@ def _measure_picking(simulation: Simulation, pile_seconds: float) -> Iterator[Ro
     yield Row("worlds perceived a tick", perceptions / PICK_TICKS, part="perception")
     yield Row("perception and planning, a tick", 1e3 * perceive, "ms", part="perception")
     yield Row("perception and planning: fraction of the simulation's time", 100.0 * perceive / tick, "%", part="perception")
-
-
-def _measure_perception(simulation: Simulation, min_seconds: float) -> Iterator[Row]:
-    """Benchmark of perception and planning by stage, in full batches."""
-    perception, snapshot = simulation.perception, simulation.record.snapshot
-    assert perception is not None  # The mode has worlds that pick.
-    simulation.state.phase.fill_(Phase.ACT)
-    simulation.attempts.task.fill_(Task.LOOK)
-    stages = (
-        (perception.images, "render", "ray tracing"),
-        (perception.segmenter, "find_grasp_points", "components, distance transform, contours, suction points"),
-        (perception.planner, "plan", "occlusion votes, clutter graph, target, grasp"),
-    )
-
-    def perceive_batch() -> None:
-        perception.list_worlds()
-        perception.perceive_batch(snapshot)
-
-    seconds_per_call(perceive_batch, simulation.device, 0.0)
-    watch, calls = Stopwatch(simulation.device), 0
-    with contextlib.ExitStack() as patches:
-        for stage in stages:
-            patches.enter_context(watch.time_method(*stage))
-        while calls < MIN_REPEATS or sum(watch.seconds(name) for _, _, name in stages) < min_seconds:
-            perceive_batch()
-            calls += 1
-    views = perception.images.views.count
-    yield Row("views in a batch", views, "")
-    for _, _, name in stages:
-        yield Row(f"a view: {name}", 1e3 * watch.seconds(name) / (calls * views), "ms")
-    yield Row("a view", 1e3 * sum(watch.seconds(name) for _, _, name in stages) / (calls * views), "ms")

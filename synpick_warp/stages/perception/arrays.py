@@ -55,7 +55,7 @@ class SegmentationScratch:
 @dataclass(frozen=True, eq=False)
 class Observation:
     """Perception result of each instance, when its world was last observed: visible pixels and fraction, grasp point candidates [px], depth
-    [m], votes[i, j] for j lying above i, clutter graph as bit fields of the instances above.
+    [m], votes[i, j] for j lying above i, clutter graph as bit sets of the instances above.
 
     `factory.attempts.InstanceObservation` maps it to JSON.
     """
@@ -78,10 +78,10 @@ class Observation:
     """Planar depth of the grasp point."""
     votes: wp.array = device_array("world", "instance", "instance", dtype=wp.float32)
     """Occlusion votes: votes[i, j] is the evidence along i's contour that j lies on top of i; not thresholded."""
-    above: wp.array = device_array("world", "instance", dtype=wp.uint32)
-    """Edges of the clutter graph. Bit j: edge from j, on top, to this instance."""
-    ancestors: wp.array = device_array("world", "instance", dtype=wp.uint32)
-    """Transitive closure of `above`. Bit j: a path leads from j to this instance."""
+    above: wp.array = device_array("world", "instance", "word", dtype=wp.uint32)
+    """Edges of the clutter graph, as bit sets (`kernels.bitsets`). Member j: edge from j, on top, to this instance."""
+    ancestors: wp.array = device_array("world", "instance", "word", dtype=wp.uint32)
+    """Transitive closure of `above`. Member j: a path leads from j to this instance."""
     overflow: wp.array = device_array("world", dtype=wp.int32)
     """1: a contour exceeded its capacity."""
 

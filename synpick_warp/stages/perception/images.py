@@ -80,7 +80,7 @@ class PerceptionImages:
             rig: The cameras; the resolution is that of `settings`.
             render_scene: Meshes, materials and table of the renderer; its cameras are not used.
             worlds: Number of worlds.
-            instances: Instance capacity of a world, at most 32.
+            instances: Instance capacity of a world.
 
         Raises:
             ConfigError: A batch has more pixels than 31 bits can count.

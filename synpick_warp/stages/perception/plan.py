@@ -8,7 +8,7 @@ from typing import Any
 import warp as wp
 
 from synpick_warp.configs import schema
-from synpick_warp.kernels.perception.clutter_graph import Cycles, order_clutter_kernel
+from synpick_warp.kernels.perception.clutter_graph import WARP, Cycles, break_cycles_kernel, close_clutter_kernel, link_clutter_kernel
 from synpick_warp.kernels.perception.cup_alignment import align_cups_kernel
 from synpick_warp.kernels.perception.grasp import frame_grasp_kernel, smooth_normal_kernel
 from synpick_warp.kernels.perception.occlusion_votes import (
@@ -20,7 +20,7 @@ from synpick_warp.kernels.perception.occlusion_votes import (
 )
 from synpick_warp.kernels.perception.target import choose_target_kernel
 from synpick_warp.kernels.tuning import VIEW_BLOCK
-from synpick_warp.stages.arrays import allocate, allocate_struct, device_array, struct_arrays
+from synpick_warp.stages.arrays import allocate, allocate_struct, count_words, device_array, struct_arrays
 from synpick_warp.stages.constants import SceneData
 from synpick_warp.stages.launch import launch
 from synpick_warp.stages.perception.arrays import Observation, PerceptionArrays, Plan
@@ -40,12 +40,20 @@ class VoteArrays:
     """Largest distance allowed between a pixel where the instance gets a vote and any point of its contour."""
 
 
-CYCLES = struct_arrays(Cycles, "view", "instance", weight=("view", "instance", "instance"), best=("view", "subset"))
+CYCLES = struct_arrays(
+    Cycles,
+    "view",
+    "instance",
+    pending=("view", "instance", "word"),
+    weight=("view", "instance", "instance"),
+    best=("view", "subset"),
+)
 
 
 def allocate_votes(settings: schema.Perception, instances: int, views: int, device: wp.Device) -> tuple[VoteArrays, Any]:
     """Allocate the scratch of a batch: `VoteArrays`, and the struct `Cycles`."""
-    sizes = {"view": views, "instance": instances, "kind": 2, "subset": 1 << min(settings.exact_cycle, instances)}
+    sizes = {"view": views, "instance": instances, "word": count_words(instances), "kind": 2}
+    sizes["subset"] = 1 << min(settings.exact_cycle, instances)
     return allocate(VoteArrays, sizes, device), allocate_struct(CYCLES, sizes, device)
 
 
@@ -57,7 +65,7 @@ class GraspPlanner:
 
         Args:
             settings: Settings of perception.
-            images: G-buffers of a batch; unused views have world -1; at most 32 instances, one bit each.
+            images: G-buffers of a batch; unused views have world -1.
             arrays: Components and contours of the batch.
         """
         self.images, self.arrays = images, arrays
@@ -104,7 +112,17 @@ class GraspPlanner:
 
     def order_clutter(self, scene: SceneData, observation: Observation) -> None:
         """Build the acyclic clutter graph and its transitive closure."""
-        launch(order_clutter_kernel, self.views, scene, observation, self.images, cycles=self.cycles, block_dim=VIEW_BLOCK)
+        sources = (scene, observation, self.images)
+        launch(link_clutter_kernel, (self.views, *observation.above.shape[1:]), *sources)
+        self._close_clutter(observation)
+        lanes = WARP if self.device.is_cuda else 1
+        launch(break_cycles_kernel, (self.views, lanes), *sources, lanes=lanes, cycles=self.cycles, block_dim=WARP)
+        self._close_clutter(observation)
+
+    def _close_clutter(self, observation: Observation) -> None:
+        """Compute the transitive closure of the clutter graph."""
+        dim = (self.views, self.instances)
+        launch(close_clutter_kernel, dim, observation, self.images, cycles=self.cycles, block_dim=VIEW_BLOCK)
 
     def choose_target(
         self, scene: SceneData, state: WorldState, attempts: AttemptState, observation: Observation, plan: Plan, seed: int

@@ -50,7 +50,7 @@ def remove_lost(scene: SceneData, state: WorldState, attempts: AttemptState, sea
 def advance_tasks(scene: SceneData, state: WorldState, attempts: AttemptState, seals: SealState, plan: Plan, physics: Physics) -> None:
     """Task transitions at the end of a tick: judge complete lifts, remove picked objects, send grippers home."""
     sources = (scene, state, attempts, seals)
-    launch(tasks.pack_attached_kernel, len(state.phase), *sources)
+    launch(tasks.pack_attached_kernel, attempts.attached_words.shape, *sources)
     launch(tasks.advance_tasks_kernel, len(state.phase), *sources, plan)
     launch(tasks.end_attempts_kernel, len(state.phase), *sources, physics.state, tilt_out=physics.control.joint_target_q)
 

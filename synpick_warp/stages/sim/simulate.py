@@ -197,6 +197,7 @@ class Simulation:
         launch(pack.take_snapshot_kernel, worlds, self.scene, state, self.attempts, self.physics.state, now=_frame_poses(snapshot))
         tables = {"status_out": status.table, "measure_out": status.measures}
         launch(pack.pack_status_kernel, worlds, state, self.attempts, self.seals, live=snapshot.live, target=self.plan.target, **tables)
+        launch(pack.copy_sets_kernel, status.engaged.shape, self.attempts, out=status)
         outputs = [_frame_poses(self.last), snapshot.follows, snapshot.last_catalog_index, snapshot.last_pose, snapshot.last_fixture_pose]
         outputs += [snapshot.last_fixture_visible]
         wp.launch(pack.link_frames_kernel, dim=worlds, inputs=[_frame_poses(snapshot)], outputs=outputs, device=self.device)

@@ -13,7 +13,7 @@ from synpick_warp.codes import MAX_CUPS
 from synpick_warp.configs.schema import Gripper, Trajectory
 from synpick_warp.kernels.sim import step_log
 from synpick_warp.scenes import build
-from synpick_warp.stages.arrays import allocate, device_array
+from synpick_warp.stages.arrays import allocate, device_array, unpack_words
 from synpick_warp.stages.constants import SceneData
 from synpick_warp.stages.launch import launch
 from synpick_warp.stages.sim.physics import Physics, contact_arrays
@@ -198,13 +198,13 @@ def _split_places(arrays: Mapping[str, np.ndarray], names: list[str], instances:
     return steps
 
 
-def tick_measures(columns: Mapping[str, np.ndarray], instances: int) -> dict[str, np.ndarray]:
-    """Select the columns of physics and attempts for `TickBatch.tick`; bit masks are unpacked to (world, instance) uint8.
+def tick_measures(columns: Mapping[str, np.ndarray], sets: Mapping[str, np.ndarray], instances: int) -> dict[str, np.ndarray]:
+    """Select the columns of physics and attempts for `TickBatch.tick`; bit sets are unpacked to (world, instance) uint8.
 
     Args:
         columns: Columns (world) of status and measures, by `codes.column_names`.
+        sets: Bit sets of instances (world, word) uint32, by name.
         instances: Capacity for instances of a world.
     """
     result = {name: columns[name] for name in ("phase", "mode", "task", "attempt", "outcome", "target", "hits", "peak_force")}
-    bits = np.arange(instances, dtype=np.int32)
-    return result | {name: (columns[name][:, None] >> bits & 1).astype(np.uint8) for name in ("engaged", "attached")}
+    return result | {name: unpack_words(words, instances) for name, words in sets.items()}

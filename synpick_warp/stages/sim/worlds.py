@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import warp as wp
 
 from synpick_warp.codes import Measure, Status
-from synpick_warp.stages.arrays import device_array
+from synpick_warp.stages.arrays import count_words, device_array
 from synpick_warp.stages.buffers import FIXTURES
 
 # Waypoints of a round of moving: the corners of a compartment.
@@ -84,10 +84,10 @@ class AttemptState:
     """Failed attempts that count towards the limit."""
     hits: wp.array = device_array("world", dtype=wp.vec2i)
     """Suction rays that hit an object when suction was switched on, and the cups with a good seal: bit k, cup k."""
-    engaged_bits: wp.array = device_array("world", dtype=wp.uint32)
-    """Bit i: instance i was engaged, that is, hit by a ray."""
-    attached_bits: wp.array = device_array("world", dtype=wp.uint32)
-    """Bit i: instance i was attached to the cup at the end of the tick, before picked objects were removed."""
+    engaged_words: wp.array = device_array("world", "word", dtype=wp.uint32)
+    """Bit set of the instances that were engaged, that is, hit by a ray."""
+    attached_words: wp.array = device_array("world", "word", dtype=wp.uint32)
+    """Bit set of the instances that were attached to the cup at the end of the tick, before picked objects were removed."""
     removed: wp.array = device_array("world", "instance", dtype=wp.int32)
     """`Removal`: why the instance has left the scene."""
 
@@ -112,12 +112,17 @@ class SealState:
 
 @dataclass(frozen=True, eq=False)
 class WorldStatus:
-    """Status rows of the worlds, integers (`Status`) and real numbers (`Measure`), which the host reads after each tick."""
+    """Status rows of the worlds, integers (`Status`) and real numbers (`Measure`), and sets of instances, which the host reads after each
+    tick."""
 
     table: wp.array = device_array("world", "status", dtype=wp.int32)
     """Columns: `Status`."""
     measures: wp.array = device_array("world", "measure", dtype=wp.float32)
     """Columns: `Measure`."""
+    engaged: wp.array = device_array("world", "word", dtype=wp.uint32)
+    """Bit set of the instances that rays hit in the attempt to which the row belongs."""
+    attached: wp.array = device_array("world", "word", dtype=wp.uint32)
+    """Bit set of the instances that are attached to the gripper, or were picked in this tick."""
 
 
 def world_sizes(worlds: int, objects: int, rounds: int, bodies_per_world: int, cups: int) -> dict[str, int]:
@@ -127,6 +132,7 @@ def world_sizes(worlds: int, objects: int, rounds: int, bodies_per_world: int, c
         "world": worlds,
         "world_and_global": worlds + 1,
         "instance": objects,
+        "word": count_words(objects),
         "body": worlds * bodies_per_world,
         "waypoint": CORNERS * rounds,
         "cup": cups,
