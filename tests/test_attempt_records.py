@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -151,6 +152,13 @@ def test_a_line_is_json_with_the_keys_of_the_format(picked):
         "above": [3],
         "ancestors": [0, 3],
     }
+
+
+@pytest.mark.parametrize(("name", "noun"), [(None, "tote"), ("tote", "tote"), ("pallet", "pallet"), ("kanban", "bin")])
+def test_a_line_names_the_bin_of_its_episode(picked, name, noun):
+    unseen = replace(picked.attempts[0], outcome=Outcome.NOTHING_SEEN)
+    record = None if name is None else {"name": name, "position": [0.0, 0.0, 0.0], "yaw": 0.0}
+    assert json.loads(unseen.line(record))["sentence"] == f"no object in the {noun} is visible"
 
 
 def test_explain_reads_what_is_written(picked, tmp_path):

@@ -20,13 +20,14 @@ from synpick_warp.exporters.bop.exporter import BopExporter
 from synpick_warp.exporters.writing.png import frame_depth_png
 from synpick_warp.factory.episodes import BakeSummary
 from synpick_warp.factory.pipeline import run_bake
+from synpick_warp.scenes.types import Catalog
 from synpick_warp.stages import ticks, timing
 from synpick_warp.stages.ticks import TickLoop
 from synpick_warp.system.progress import SilentProgress
 from tests.builders import PICKED, STIRRING, assignments, bake_boxes, boxes, once
 from tests.harness.exporter_contract import digests
 from tests.twins.depth_png import encode_depth
-from tests.worlds.small_worlds import QUICK, settings
+from tests.worlds.small_worlds import QUICK, catalog, settings
 
 EPISODES, CAMERAS = 3, 3
 WIDTH, HEIGHT = 96, 54
@@ -263,6 +264,34 @@ def test_what_was_picked_is_in_the_truth_until_then(picked):
 def test_attempts_are_the_same_in_any_number_of_worlds(picked, tmp_path):
     other = Baked(tmp_path / "other", PICKED | {"bake.worlds": 1, "perception.views": 1})
     assert {name for name, _ in other.files().items() ^ picked.files().items()} == {"config.toml"}
+
+
+FOUR_CUPS = PICKED | {
+    "gripper.kind": "suction_array",
+    "gripper.cups": [[0.03, 0.02], [-0.03, 0.02], [-0.03, -0.02], [0.03, -0.02]],
+    "gripper.cup_width": 0.03,
+    "arrangement.volume": 4e-3,
+    "bake.episodes": 3,
+    "bake.formats": ["bop", "zarr"],
+}
+
+
+def large_boxes() -> Catalog:
+    return catalog(((0.2, 0.16, 0.05),))
+
+
+@pytest.fixture(scope="module")
+def four_cups(tmp_path_factory) -> Baked:
+    with boxes(large_boxes):
+        return Baked(tmp_path_factory.mktemp("cups") / "1", FOUR_CUPS | {"bake.worlds": 1})
+
+
+@pytest.mark.parametrize("worlds", [2, pytest.param(8, marks=pytest.mark.slow)])
+def test_four_cups_pick_the_same_in_any_number_of_worlds(four_cups, tmp_path, worlds):
+    with boxes(large_boxes):
+        other = Baked(tmp_path / "other", FOUR_CUPS | {"bake.worlds": worlds})
+    assert {name for name, _ in other.files().items() ^ four_cups.files().items()} == {"config.toml"}
+    assert max(len(attempt["sealed"]) for attempt in records(four_cups, "attempts")) > 1
 
 
 @pytest.mark.slow

@@ -101,6 +101,8 @@ def find_gripper_conflicts(gripper: Gripper, suction: Suction, mouths: Sequence[
     if gripper.kind != SUCTION_ARRAY:
         if gripper.cups:
             yield "gripper.cups", f'none with gripper.kind "{gripper.kind}"; set gripper.kind = "{SUCTION_ARRAY}"'
+        if gripper.valve != EACH:
+            yield "gripper.valve", f'{EACH} with gripper.kind "{gripper.kind}", which has one; set gripper.kind = "{SUCTION_ARRAY}"'
         return
     if not 1 <= len(gripper.cups) <= MAX_CUPS:
         yield "gripper.cups", f"1 to {MAX_CUPS} places [x, y] with gripper.kind {SUCTION_ARRAY}, such as [[-0.03, 0.0], [0.03, 0.0]]"

@@ -6,7 +6,7 @@ condition (Hodaň et al., BOP Challenge 2020), which takes 0.1 of the diameter, 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -32,7 +32,7 @@ _STEPS, _ROUGH, _FINE = 8, 600, 6_000
 
 @dataclass(frozen=True)
 class Turn:
-    """A rotation that maps a surface onto itself: unit axis, a point on it [m], fold (0: any angle), Hausdorff distance [m]."""
+    """A rotation that maps a surface onto itself: unit axis, a point on it [m], fold (0: any angle), distance of subsamples [m]."""
 
     axis: np.ndarray
     point: np.ndarray
@@ -47,7 +47,8 @@ class Turn:
 @dataclass(frozen=True)
 class Symmetries:
     """Symmetries that were found: discrete ones (N, 4, 4) without the identity, closed under composition up to the continuous ones,
-    with their distances (N) [m], and continuous ones; and the best rotation beyond the tolerance, up to twice of it."""
+    with their distances (N) [m], the largest from all points, others from subsamples, and continuous ones; and the best rotation beyond the
+    tolerance, up to twice of it."""
 
     discrete: np.ndarray
     deviations: np.ndarray
@@ -107,9 +108,9 @@ def find_symmetries(vertices: np.ndarray, faces: np.ndarray, diameter: float, to
         others = [turn for turn in turns if turn.fold == 0 and abs(turn.axis @ first.axis) < _PARALLEL]
         if others:
             return Symmetries(np.zeros((0, 4, 4)), np.zeros(0), _ball(surface, tolerance) or (first,), None)
-        flips = [flip for turn in turns if turn.fold == 2 and (flip := _flip(surface, first, turn)).deviation <= tolerance]
-        best = min(flips, key=lambda turn: turn.deviation, default=None)
-        found = [] if best is None else [best]
+        flips = sorted((_flip(surface, first, turn) for turn in turns if turn.fold == 2), key=lambda turn: turn.deviation)
+        confirmed = (_confirmed(surface, flip, tolerance) for flip in flips if flip.deviation <= tolerance)
+        found = [_confirmed(surface, flip, np.inf) for flip in confirmed if flip.deviation <= tolerance][:1]
         return Symmetries(
             np.array([turn.matrix() for turn in found]).reshape(-1, 4, 4), np.array([turn.deviation for turn in found]), (first,), missed
         )
@@ -136,12 +137,13 @@ def _find_turns(surface: Surface, diameter: float, tolerance: float) -> tuple[li
             limit = turn.deviation + 0.1 * tolerance
             fine = _turn(surface, *_refine(surface, axis, point, fold, _FINE), fold, limit)
             turn = fine if fine.deviation <= limit else turn
+        if turn.deviation <= tolerance:
+            turn = _confirmed(surface, _snap(surface, turn, tolerance), tolerance)
         seen.append((turn.axis, fold if turn.deviation > tolerance else 0))
         if turn.deviation > tolerance:
             if turn.deviation <= 2.0 * tolerance and (missed is None or turn.deviation < missed.deviation):
                 missed = turn
             continue
-        turn = _snap(surface, turn, tolerance)
         turns += _all_folds(surface, turn, tolerance)
         if sum(each.fold == 0 for each in turns) > 1:
             break
@@ -206,9 +208,14 @@ def _refine(surface: Surface, axis: np.ndarray, point: np.ndarray, fold: int, co
 
 
 def _turn(surface: Surface, axis: np.ndarray, point: np.ndarray, fold: int, limit: float = np.inf) -> Turn:
-    """Rotation by a fold's angle with its distance; beyond the limit, a lower bound of it."""
+    """Rotation by a fold's angle with a lower bound of its distance, from subsamples."""
     axis = _upward(axis)
-    return Turn(axis, point, fold, surface.deviation(turn_matrix(axis, point, 2.0 * np.pi / fold), limit))
+    return Turn(axis, point, fold, surface.rough_deviation(turn_matrix(axis, point, 2.0 * np.pi / fold), limit))
+
+
+def _confirmed(surface: Surface, turn: Turn, limit: float) -> Turn:
+    """The rotation, beyond the limit if any point is; without a limit with its distance from all points."""
+    return replace(turn, deviation=surface.deviation(turn.matrix(), limit))
 
 
 def _snap(surface: Surface, turn: Turn, tolerance: float) -> Turn:
@@ -229,15 +236,16 @@ def _snap(surface: Surface, turn: Turn, tolerance: float) -> Turn:
 def _all_folds(surface: Surface, turn: Turn, tolerance: float) -> list[Turn]:
     """All folds of an axis within the tolerance; if all are, one rotation of fold 0 with the largest distance."""
     result = [turn]
-    worst = turn.deviation
     for fold in range(2, MAX_FOLD + 1):
         if fold == turn.fold:
             continue
-        off = surface.deviation(turn_matrix(turn.axis, turn.point, 2.0 * np.pi / fold), tolerance)
-        if off <= tolerance:
-            worst = max(worst, off)
-            result.append(Turn(turn.axis, turn.point, fold, off))
-    return [Turn(turn.axis, turn.point, 0, worst)] if len(result) == MAX_FOLD - 1 else result
+        other = _confirmed(surface, replace(turn, fold=fold), tolerance)
+        if other.deviation <= tolerance:
+            result.append(other)
+    if len(result) < MAX_FOLD - 1:
+        return result
+    worst = max(result, key=lambda each: each.deviation)
+    return [replace(_confirmed(surface, worst, np.inf), fold=0)]
 
 
 def _flip(surface: Surface, main: Turn, turn: Turn) -> Turn:
@@ -273,7 +281,11 @@ def _close(surface: Surface, turns: list[Turn], tolerance: float) -> tuple[np.nd
         if distances.max() <= tolerance:
             group, offs, center = larger, distances, middle
             used.append(turn)
-    return np.array([_about(rotation, center) for rotation in group[1:]]).reshape(-1, 4, 4), offs[1:]
+    matrices, offs = np.array([_about(rotation, center) for rotation in group[1:]]).reshape(-1, 4, 4), offs[1:]
+    if len(offs):
+        worst = int(np.argmax(offs))
+        offs[worst] = surface.deviation(matrices[worst])
+    return matrices, offs
 
 
 def _about(rotation: np.ndarray, center: np.ndarray) -> np.ndarray:

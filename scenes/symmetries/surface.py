@@ -4,13 +4,18 @@ from __future__ import annotations
 
 import numpy as np
 from scipy.spatial import KDTree
+from trimesh.triangles import closest_point
 
 from synpick_warp.scenes.assets.meshes import merge_positions
 
 _DENSE = 60_000
 """Points of the sample that distances are measured to."""
 _QUERIES = 2_000
-"""Points of the sample, and at most as many vertices, that distances are measured from: vertices have the tips of small features."""
+"""Points of the sample, and at most as many vertices, that distances are measured from first: vertices have the tips of small features."""
+_TRIANGLES = 8
+"""Points of the dense sample to whose triangles distances are measured where those to tangent planes are too large."""
+_APPROXIMATE = 2.0
+"""Relative error of the nearest point of the sample where it only has to be within a distance."""
 _NEIGHBOURS = 4
 """Points of the dense sample whose tangent planes are tried: beside an edge, the nearest point may lie on the other side of it."""
 _THIN, _COARSE = 6_000, 150
@@ -32,7 +37,7 @@ class Surface:
         rows = np.searchsorted(np.cumsum(areas), (np.arange(_DENSE) + random.random(_DENSE)) * areas.sum() / _DENSE).clip(
             max=len(areas) - 1
         )
-        self.rows = rows
+        self.corners, self.rows = corners, rows
         root, share = np.sqrt(random.random(_DENSE)), random.random(_DENSE)
         self.weights = np.stack([1.0 - root, root * (1.0 - share), root * share], axis=1)
         self.points = np.einsum("nc,nci->ni", self.weights, corners[rows])
@@ -45,6 +50,9 @@ class Surface:
         used = np.unique(faces)
         picked = [random.permutation(_DENSE)[:_QUERIES], random.permutation(used)[:_QUERIES]]
         self.queries = np.concatenate([self.points[picked[0]], positions[picked[1]]])
+        self.every = np.concatenate([self.points, positions[np.sort(random.permutation(used)[:_DENSE])]])
+        """The sample, and its number of vertices at most."""
+        self.spread, self.nearest = KDTree(self.queries).query(self.every)
         self.coarse = self.points[picked[0][:_COARSE]]
         self.tree, self.thin = KDTree(self.points), KDTree(self.points[:: _DENSE // _THIN])
         self.gap = _GAP * float(np.sqrt(self.area / _DENSE))
@@ -57,20 +65,57 @@ class Surface:
         aside = np.sqrt(np.maximum(distance**2 - along**2, 0.0))
         return np.hypot(along, np.maximum(aside - self.gap, 0.0)).min(axis=1)
 
-    def deviation(self, matrix: np.ndarray, limit: float = np.inf) -> float:
-        """Hausdorff distance between the surface and itself, moved by a rigid 4 x 4 matrix [m]; beyond the limit, a lower bound of it."""
-        rotation, translation = matrix[:3, :3], matrix[:3, 3]
+    def rough_deviation(self, matrix: np.ndarray, limit: float) -> float:
+        """Lower bound of `deviation`, from subsamples: beyond the limit, the first that is found."""
         off = 0.0
-        for points in (self.coarse, self.queries) if limit < np.inf else (self.queries,):
-            off = max(self.distances(points @ rotation.T + translation).max(), self.distances((points - translation) @ rotation).max())
+        for points in (self.coarse, self.queries):
+            off = max(off, *(self.distances(moved).max() for moved in _both_ways(points, matrix)))
             if off > limit:
                 break
         return float(off)
+
+    def deviation(self, matrix: np.ndarray, limit: float = np.inf) -> float:
+        """Hausdorff distance between the surface and itself, moved by a rigid 4 x 4 matrix [m], from all points.
+
+        With a limit, that of a subsample unless a point is beyond the limit; and a lower bound if many are. A point is passed over if the
+        nearest one of the subsample is so close to the surface that it cannot be beyond, or if a point of the sample is near.
+        """
+        off = max(self.distances(moved).max() for moved in _both_ways(self.coarse, matrix))
+        if off > limit:
+            return float(off)
+        pairs = list(zip(_both_ways(self.queries, matrix), _both_ways(self.every, matrix), strict=True))
+        known = [self.distances(queries) for queries, _ in pairs]
+        off = max(off, *(distances.max() for distances in known))
+        for distances, (_, moved) in zip(known, pairs, strict=True):
+            within = off if limit == np.inf else limit
+            left = moved[distances[self.nearest] + self.spread > within]
+            left = left[np.isinf(self.tree.query(left, eps=_APPROXIMATE, distance_upper_bound=within)[0])]
+            far = self.distances(left)
+            beyond = far > within
+            far[beyond] = np.minimum(far[beyond], self._triangle_distances(left[beyond]))
+            off = max(off, far.max(initial=0.0))
+        return float(off)
+
+    def _triangle_distances(self, points: np.ndarray) -> np.ndarray:
+        """Distances (N) of points to the triangles of the nearest points of the sample, which has gaps [m]."""
+        if not len(points):
+            return np.zeros(0)
+        index = self.tree.query(points, _TRIANGLES)[1]
+        corners = self.corners[self.rows[index]].reshape(-1, 3, 3)
+        again = np.repeat(points, _TRIANGLES, axis=0)
+        return np.linalg.norm(closest_point(corners, again) - again, axis=1).reshape(-1, _TRIANGLES).min(axis=1)
 
     def mean_distances(self, rotations: np.ndarray) -> np.ndarray:
         """Mean distances (N) of a coarse sample to another one, when rotated about the centroid by (N, 3, 3) [m]."""
         moved = (self.coarse - self.center) @ rotations.transpose(0, 2, 1) + self.center
         return self.thin.query(moved.reshape(-1, 3))[0].reshape(len(rotations), -1).mean(axis=1)
+
+
+def _both_ways(points: np.ndarray, matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Points (N, 3), moved by a rigid 4 x 4 matrix and by its inverse."""
+    rotation, translation = matrix[:3, :3], matrix[:3, 3]
+    # Products of so few columns are slower by the threads of BLAS.
+    return np.einsum("ni,ji->nj", points, rotation) + translation, np.einsum("ni,ij->nj", points - translation, rotation)
 
 
 def _facet_normals(crosses: np.ndarray, areas: np.ndarray, count: int = 16) -> np.ndarray:

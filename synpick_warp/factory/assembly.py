@@ -17,6 +17,7 @@ import warp as wp
 
 from synpick_warp.configs.cell.cameras import COLOR
 from synpick_warp.configs.cell.rig import Rig
+from synpick_warp.configs.dataset.modes import may_pick
 from synpick_warp.configs.dataset.splits import DataLayout
 from synpick_warp.configs.schema import Config, Render
 from synpick_warp.exporters.registry import Needs
@@ -32,7 +33,7 @@ from synpick_warp.scenes.capacities import FEW, with_capacities
 from synpick_warp.scenes.catalog import load_catalog
 from synpick_warp.scenes.fills import check_fill
 from synpick_warp.scenes.fixtures import make_fixtures
-from synpick_warp.scenes.grippers.registry import make_head
+from synpick_warp.scenes.grippers.registry import check_reach, make_head
 from synpick_warp.scenes.looks import Looks, load_looks
 from synpick_warp.scenes.types import Camera, Catalog, EnvironmentMap
 from synpick_warp.stages.host_copies import host_images
@@ -241,10 +242,13 @@ def fit_to_catalog(config: Config, catalog: Catalog, bins: Sequence[Bin], device
     """Resolve settings that depend on objects and bins: repetition of objects in an episode, and contact capacities.
 
     Raises:
-        ConfigError: The capacities do not fit into the device's memory, or the parts of `arrangement.counts` not into the bins.
+        ConfigError: The capacities do not fit into the device's memory, or the parts of `arrangement.counts` not into the bins; or no cup
+            reaches an object.
     """
     labelled = without_distractors(config.arrangement, config.randomize.most_distractors)
     check_fill(labelled, config.physics.guide_height, catalog, config.cell.bins)
+    if may_pick(config.bake, config.splits):
+        check_reach(config.gripper, config.suction, catalog)
     filled = config.with_values(REPEATS) if must_repeat(labelled, catalog) else config
     if find_repeat_rules(filled.bake, filled.pick, filled.move) != find_repeat_rules(config.bake, config.pick, config.move):
         total = sum(entry.volume for entry in catalog.entries)

@@ -16,6 +16,7 @@ from synpick_warp.codes import Ending, Mode, Outcome, Phase, Task
 from synpick_warp.configs.schema import Suction
 from synpick_warp.stages.arrays import WORD_BITS, unpack_words
 from synpick_warp.stages.stream import TickReport
+from synpick_warp.views.bins import name_bin
 
 DIGITS, PLACES = 6, 6
 """Significant digits and decimal places of the numbers in a record; more would be noise of single precision."""
@@ -99,8 +100,8 @@ class AttemptRecord:
     sealed: tuple[int, ...] | None = None
     """Cups with a good seal; None, and not in the file, for a gripper of one cup."""
 
-    def line(self) -> str:
-        """Serialize the record as one line of JSON with line break.
+    def line(self, bin: Mapping[str, Any] | None = None) -> str:
+        """Serialize the record as one line of JSON with line break; `bin`: record of the episode's bin, if it is not a tote in its place.
 
         Raises:
             ValueError: A number is not finite.
@@ -110,7 +111,7 @@ class AttemptRecord:
             if item.name != "sealed" or self.sealed is not None:
                 record[item.name] = getattr(self, item.name)
             if item.name == "outcome":
-                record |= {item.name: self.outcome.name.lower(), "sentence": self.outcome.sentence}
+                record |= {item.name: self.outcome.name.lower(), "sentence": name_bin(self.outcome.sentence, bin)}
         # `dataclasses.asdict` would copy every number, which is slower than the serialization itself.
         return json.dumps(record, allow_nan=False, default=vars) + "\n"
 

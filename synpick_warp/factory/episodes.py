@@ -13,7 +13,7 @@ from synpick_warp.configs.episodes.manipulation import Perception
 from synpick_warp.configs.schema import Arrangement, Physics, Settle
 from synpick_warp.factory.attempts import EpisodeRecord
 from synpick_warp.stages.stream import TickReport
-from synpick_warp.views.bins import bin_noun, bin_record
+from synpick_warp.views.bins import bin_record, name_bin
 from synpick_warp.views.frames import EpisodeEnd
 
 PLACES = 6
@@ -56,7 +56,7 @@ class EpisodeRow(NamedTuple):
     @property
     def sentence(self) -> str:
         """How the episode ended, of the bin that it has."""
-        return self.ending.sentence.replace("tote", bin_noun(self.bin["name"])) if self.bin else self.ending.sentence
+        return name_bin(self.ending.sentence, self.bin)
 
     def as_json(self) -> dict[str, Any]:
         """Row as the dictionary of a line of episodes.jsonl."""
@@ -197,6 +197,5 @@ def episode_end(row: EpisodeRow, record: EpisodeRecord, tries: int) -> EpisodeEn
     """Build the end-of-episode message for exporters; a resampled episode (`is_resampled`) has neither row nor attempts."""
     if is_resampled(row, tries):
         return EpisodeEnd(row.episode, row.arrangement, row.frames, int(row.ending))
-    return EpisodeEnd(
-        row.episode, row.arrangement, row.frames, int(row.ending), row.as_json(), tuple(one.line() for one in record.attempts)
-    )
+    lines = tuple(attempt.line(row.bin) for attempt in record.attempts)
+    return EpisodeEnd(row.episode, row.arrangement, row.frames, int(row.ending), row.as_json(), lines)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -17,6 +18,8 @@ def bin_record(name: str, pose: np.ndarray) -> dict[str, Any]:
     return {"name": name, "position": [round(part, _DIGITS) for part in (x, y, z)], "yaw": yaw}
 
 
-def bin_noun(name: str) -> str:
-    """Noun for a bin of this name in sentences."""
-    return name if name in ("tote", "table", "pallet") else "bin"
+def name_bin(sentence: str, record: Mapping[str, Any] | None) -> str:
+    """Sentence on an episode's tote, said of the bin that it has; None: a tote that is always in its place."""
+    if record is None:
+        return sentence
+    return sentence.replace("tote", record["name"] if record["name"] in ("tote", "table", "pallet") else "bin")

@@ -50,6 +50,7 @@ COUPLED = {
     "suction.radius",
     "gripper.cup_width",
     "gripper.kind",
+    "gripper.valve",
     "suction.rays",
     "suction.tolerated_misses",
     "suction.good_force",

@@ -10,10 +10,11 @@ from synpick_warp.configs.files.load import load_config
 from synpick_warp.configs.files.write import config_to_toml
 from synpick_warp.errors import ConfigError
 from synpick_warp.scenes.assets.meshes import merge_positions, signed_volume
-from synpick_warp.scenes.grippers.registry import HEADS, make_head
+from synpick_warp.scenes.grippers.registry import HEADS, check_reach, make_head
 from synpick_warp.stages.sim.hold import HOLDS
 from tests.scenes.test_tote_gripper import UP, convex, felt
 from tests.twins.rays import edges_match, first_hit
+from tests.worlds.small_worlds import catalog
 
 EXAMPLES = [
     {},
@@ -65,6 +66,10 @@ ARRAY = {"gripper.kind": "suction_array"}
     [
         ({"gripper.kind": "suction_array"}, r"gripper.cups is \[\] by default; allowed: 1 to 16 places \[x, y\]"),
         ({"gripper.cups": [[0.0, 0.0]]}, r'gripper.cups is .*; allowed: none with gripper.kind "suction1"'),
+        (
+            {"gripper.valve": "common"},
+            r'^gripper.valve is "common" .*; allowed: each with gripper.kind "suction1", which [^\n]*$',
+        ),
         (ARRAY | {"gripper.cups": [[0.0, 0.0], [0.03, 0.0]]}, r"gripper.cups is .*; allowed: cups that do not overlap: 0 and 1 are 0.03"),
         (ARRAY | {"gripper.cups": [[0.0, 0.0], [0.3, 0.0]]}, r"gripper.cups is .*; allowed: within 0.155 m of the middle: the tool"),
         (ARRAY | {"gripper.cups": [[0.05 * i - 0.4, 0.0] for i in range(17)]}, r"gripper.cups is .*; allowed: 1 to 16 places"),
@@ -73,3 +78,12 @@ ARRAY = {"gripper.kind": "suction_array"}
 def test_tools_that_cannot_be_are_refused(overrides, expected):
     with pytest.raises(ConfigError, match=expected):
         load_config("smoke", overrides)
+
+
+def test_cups_that_reach_no_object_are_refused():
+    """Objects are gripped at the tool centre point: a cup farther from it than any object is long holds nothing."""
+    config = load_config("tabletop", ARRAY | {"gripper.cups": [[0.3, 0.0], [0.4, 0.0]]})
+    long, short = (catalog([(size, 0.03, 0.02)]) for size in (0.29, 0.28))
+    check_reach(config.gripper, config.suction, long)
+    with pytest.raises(ConfigError, match=r"^no cup of gripper.cups reaches an object: the nearest is 0.3 m from the tool centre[^\n]*$"):
+        check_reach(config.gripper, config.suction, short)

@@ -22,6 +22,7 @@ from synpick_warp.scenes.assets.models_info import read_models_info
 from synpick_warp.scenes.catalog import load_catalog
 from synpick_warp.scenes.symmetries.detection import find_symmetries
 from synpick_warp.scenes.symmetries.groups import close_group, find_element
+from synpick_warp.scenes.symmetries.surface import Surface
 from tests.worlds.model_files import exported, put
 
 MAKE = trimesh.creation
@@ -116,6 +117,18 @@ def test_a_feature_above_the_tolerance_breaks_a_symmetry():
     missed = find_symmetries(mesh.vertices, mesh.faces, size, 0.02 * size).missed
     assert missed is not None
     assert missed.deviation == pytest.approx(0.003, rel=0.1)
+
+
+def test_a_single_vertex_above_the_tolerance_breaks_a_symmetry():
+    """Of some thousands, pulled out of a side by 3.5 diameters in a hundred: subsamples miss it."""
+    mesh = MAKE.box((0.1, 0.06, 0.02)).subdivide_to_size(0.002)
+    size = diameter(mesh)
+    inside = np.abs(mesh.vertices - (0.03, 0.015, 0.01)).sum(axis=1).argmin()
+    mesh.vertices[inside, 2] += 0.035 * size
+    surface, half_turn = Surface(mesh.vertices, mesh.faces), np.diag([-1.0, -1.0, 1.0, 1.0])
+    assert surface.rough_deviation(half_turn, np.inf) < 0.03 * size
+    assert surface.deviation(half_turn) == pytest.approx(0.035 * size, rel=0.02)
+    assert [len(find_symmetries(mesh.vertices, mesh.faces, size, share * size).discrete) for share in (0.03, 0.04)] == [0, 3]
 
 
 def test_a_group_is_closed_and_exact_from_axes_that_are_a_degree_off():

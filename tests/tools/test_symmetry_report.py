@@ -9,12 +9,12 @@ from tools.reports.symmetries import compare
 SAME, MORE = "the same", "more than stated: shape alone, which texture tells apart"
 
 
-LACKS = "lacks what is stated: 3.6 % are more than 3 %"
+LACKS = "lacks what is stated: {} % are more than 3 %"
 ROWS = {
     1: ((1, 0), (1, 1), MORE),  # Cans are round, and most the same upside down.
     2: ((0, 0), (3, 0), MORE),  # Boxes, which differ by their print.
     3: ((0, 0), (3, 0), MORE),
-    4: ((0, 0), (1, 0), MORE),
+    4: ((0, 0), (0, 0), SAME),  # Its dent is 3.5 % deep.
     5: ((0, 0), (1, 0), MORE),
     6: ((0, 0), (1, 1), MORE),
     7: ((0, 0), (3, 0), MORE),
@@ -29,12 +29,12 @@ ROWS = {
     16: ((7, 0), (7, 0), SAME),
     17: ((0, 0), (0, 0), SAME),
     18: ((0, 1), (0, 1), SAME),
-    19: ((1, 0), (0, 0), LACKS),
-    20: ((1, 0), (1, 0), SAME),
+    19: ((1, 0), (0, 0), LACKS.format(3.8)),
+    20: ((1, 0), (0, 0), LACKS.format(3.3)),
     21: ((1, 0), (1, 0), SAME),
 }
 """obj_id -> numbers of discrete and continuous symmetries, stated and detected, and the verdict."""
-QUICK = (2, 13, 16, 17, 19)
+QUICK = (2, 13, 16, 17, 19, 20)
 
 
 @pytest.mark.parametrize("obj_id", [row if row in QUICK else pytest.param(row, marks=pytest.mark.slow) for row in ROWS])

@@ -52,8 +52,9 @@ class ViewCameras:
     """(view): optical centre in the world [m]."""
     to_world: wp.array[wp.mat33]
     """(view): camera to world, in float32 for the per-pixel kernels."""
+    # Never read. Functions for both kinds of cameras name them, in branches that are removed for pinholes; and without `lens` alone the
+    # compiler orders the instructions of every kernel of views otherwise, so that last bits of pictures could change.
     lens: wp.array[int]
-    """As of `LensCameras`; never read."""
     lenses: Lenses
 
 

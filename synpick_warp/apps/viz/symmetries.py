@@ -73,7 +73,7 @@ def _row(raw: RawObject, tolerance: float) -> Image:
     for turn in turns[:_TURNS]:
         angles = [2.0 * np.pi / turn.fold] if turn.fold else [2.0 * np.pi * (step + 0.5) / _CHECKED for step in range(_CHECKED)]
         matrices = [turn_matrix(turn.axis, turn.point, angle) for angle in angles]
-        matrix = max(matrices, key=surface.deviation)
+        matrix = max(matrices, key=lambda matrix: surface.rough_deviation(matrix, np.inf))
         panels.append(_overlay(surface, itself, turn, matrix, scale, tolerance, raw.hull.diameter))
     return np.concatenate(panels, axis=1)
 
