@@ -189,12 +189,8 @@ def measure(
     if set(parts) - OWN_WORLDS:
         started = time.perf_counter()
         needs = Needs.of(config)
-        factory = build_factory(
-            config,
-            SilentProgress(),
-            records_physics="write" in parts and needs.physics,
-            needs_images=needs.images,
-        )
+        records = "write" in parts and needs.physics
+        factory = build_factory(config, SilentProgress(), records_physics=records, needs_images=needs.images)
         wp.synchronize_device(factory.simulation.device)
         yield Row("load and build", time.perf_counter() - started, "s", part="setup")
         values: dict[str, float] = {}
@@ -218,14 +214,15 @@ def measure(
             yield row
     if "whole" in parts:
         yield from of_part("whole", measure_whole(config, bake, steady_rate, traces))
-    if "trajectories" in parts:
-        yield from of_part("trajectories", measure_trajectories(config, min_seconds))
-    if "growth" in parts:
-        yield from of_part("growth", measure_growth(config, min_seconds, instances))
-    if "patches" in parts:
-        yield from of_part("patches", measure_patches(config))
-    if "heaps" in parts:
-        yield from of_part("heaps", measure_heaps(config, min_seconds))
+    others = {
+        "trajectories": measure_trajectories(config, min_seconds),
+        "growth": measure_growth(config, min_seconds, instances),
+        "patches": measure_patches(config),
+        "heaps": measure_heaps(config, min_seconds),
+    }
+    for part, rows in others.items():
+        if part in parts:
+            yield from of_part(part, rows)
 
 
 def _measure_worlds(quality: int, factory: Factory, min_seconds: float, parts: tuple[str, ...]) -> Iterator[Row]:
