@@ -10,7 +10,8 @@ from typing import Annotated, Any, Literal, TypeVar
 
 import msgspec
 
-from synpick_warp.codes import MAX_CUPS, Ending, Mode, Outcome, Segment, names
+from synpick_warp.codes import MAX_CUPS, Ending, Mode, Outcome, names
+from synpick_warp.codes import MAX_INSTANCES as MAX_OBSERVED
 from synpick_warp.configs.cell.cameras import WORLD
 from synpick_warp.dataset.annotations import Index, Side
 from synpick_warp.errors import DatasetError
@@ -23,8 +24,6 @@ Checksum = Annotated[str, msgspec.Meta(pattern=r"\A[0-9a-f]{64}\Z")]
 """SHA-256 in hexadecimal."""
 MAX_INSTANCES = 255
 """Most instances of a scene: their ids are bytes of an image."""
-MAX_OBSERVED = int(Segment.TABLE) - 1
-"""Most instances that perception sees: those of a world, which segmentation ids number."""
 Instances = Annotated[list[Index], msgspec.Meta(max_length=MAX_INSTANCES)]
 Amount = Annotated[float, msgspec.Meta(ge=0.0, le=1e9)]
 """Non-negative quantity in any unit; small enough for every drawing."""
