@@ -81,7 +81,7 @@ class ViewBuffers:
     """Planar depth in counts of the depth scale; 0: no surface, or above 65,535 counts."""
     instance: wp.array = device_array("view", "row", "column", dtype=wp.uint8)
     """Instance segmentation: 1 + instance_id, or a `Segment`."""
-    mask_words: wp.array = device_array("view", "word", dtype=wp.uint32)
+    mask_words: wp.array = device_array("view", "mask_word", dtype=wp.uint32)
     """Amodal masks: a bit a pixel for each instance in its own box, see `InstanceMasks.words`: set where the pixel's ray hits the instance,
     occluded or not."""
     mask_first: wp.array = device_array("view", "instance", dtype=wp.int32)
@@ -101,7 +101,7 @@ class ViewBuffers:
 def view_buffer_sizes(views: int, width: int, height: int, instances: int) -> dict[str, int]:
     """Extents of the dimensions of `ViewBuffers` and `LayerBuffers`. There are words for masks as large as the image, so none can lack."""
     sizes = {"view": views, "row": height, "column": width, "instance": instances, "count": 3, "box": 2, "side": 4}
-    return sizes | {"word": instances * most_words(width, height)}
+    return sizes | {"mask_word": instances * most_words(width, height)}
 
 
 def allocate_view_buffers(views: int, width: int, height: int, instances: int, device: wp.Device) -> ViewBuffers:
