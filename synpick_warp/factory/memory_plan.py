@@ -110,7 +110,8 @@ def plan_memory(config: Config, device: wp.Device, writers: int = 1, pieces: int
         terms += _images(arrays, views, count, layers, host, device)
     if may_pick(config.bake, config.splits):
         terms.append(_perception(config.perception, worlds, objects, device))
-    terms += [Term(row[0], (row,), keys) for row, keys in newton_rows(config, device.is_cuda, pieces)]
+    newton = newton_rows(worlds, config.arrangement, config.physics, config.cell.bins, bool(config.bin), device.is_cuda, pieces)
+    terms += [Term(row[0], (row,), keys) for row, keys in newton]
     if writers:
         # A writer is counted with one slot of shared memory: those of its queue get memory only once they are used.
         row = ("shared memory of writers", (writers, needs.slot_bytes), "", writers * needs.slot_bytes)

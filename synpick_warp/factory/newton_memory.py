@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
+from synpick_warp.configs.cell.extents import BinSizes
 from synpick_warp.configs.episodes.fills import most_objects
-from synpick_warp.configs.schema import Config
+from synpick_warp.configs.schema import Arrangement, Physics
 from synpick_warp.scenes.bins import GUIDES, make_bins
 from synpick_warp.scenes.build import FREE_DOFS
 from synpick_warp.scenes.capacities import FEW
@@ -27,31 +28,36 @@ _BODY, _SHAPE = (3200, 5700), 680
 """Memory of a body slot, on a CPU and on a GPU, and of each of its shapes, measured as above [bytes]."""
 
 
-def newton_rows(config: Config, is_cuda: bool, pieces: int = 1) -> Iterator[tuple[Row, tuple[str, ...]]]:
+def newton_rows(
+    worlds: int, arrangement: Arrangement, physics: Physics, bins: Sequence[BinSizes], own_bins: bool, is_cuda: bool, pieces: int = 1
+) -> Iterator[tuple[Row, tuple[str, ...]]]:
     """Rows of Newton's arrays, each with the full keys of the settings by which it grows.
 
     Where `arrangement.counts` sets the number of bodies, they are counted, and rows are within 10 % of what is allocated. A volume budget
     may need few of them, and rows are a lower bound.
 
     Args:
-        config: All settings.
-        is_cuda: Whether they lie in a GPU's memory.
+        worlds: Number of worlds.
+        arrangement, physics: Settings.
+        bins: Sizes of all bins.
+        own_bins: Whether they are the user's own, which have shapes of their own.
+        is_cuda: Whether the arrays lie in a GPU's memory.
         pieces: Convex pieces of each object, as far as they are known.
     """
-    worlds, bodies = config.bake.worlds, most_objects(config.arrangement.counts)
+    bodies = most_objects(arrangement.counts)
     # The capacities of many objects follow from their number.
-    many = ("bake.worlds", "arrangement.max_objects") if config.arrangement.max_objects > FEW else ()
+    many = ("bake.worlds", "arrangement.max_objects") if arrangement.max_objects > FEW else ()
     for name, setting, cpu, gpu, least in _CAPACITIES:
-        count, each = getattr(config.physics, setting), (gpu if bodies else least) if is_cuda else cpu
+        count, each = getattr(physics, setting), (gpu if bodies else least) if is_cuda else cpu
         if name == "Newton's gripper rows":
             each += _ROW_DOF * FREE_DOFS * bodies
         yield (name, (worlds * count,), "", worlds * count * each), many or (f"physics.{setting}", "bake.worlds")
     if bodies:
         size = worlds * bodies * (_BODY[is_cuda] + _SHAPE * pieces)
         yield ("Newton's bodies", (worlds * bodies,), "", size), ("bake.worlds", "arrangement.max_objects")
-    if config.bin or bodies:
+    if own_bins or bodies:
         # A separating axis for each pair of a world's shapes, of all bins with their guide walls, and at least one for each object.
-        objects = pieces * bodies or config.arrangement.max_objects
-        shapes = sum(len(one.pieces) + GUIDES for one in make_bins(config.cell.bins)) + objects
+        objects = pieces * bodies or arrangement.max_objects
+        shapes = sum(len(one.pieces) + GUIDES for one in make_bins(bins)) + objects
         row = ("separating axes", (worlds, shapes * (shapes - 1) // 2), "", worlds * 2 * shapes * (shapes - 1))
         yield row, many or ("bake.worlds",)

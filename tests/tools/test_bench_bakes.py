@@ -363,12 +363,13 @@ def test_growth_by_instances_has_rows_of_each_number(tmp_path, monkeypatch):
 
 
 def test_each_replacement_of_newton_is_left_out_once(monkeypatch):
-    def left_out(config, catalog) -> int:
+    def left_out() -> int:
         """Number whose bits are the parts that are Newton's own."""
         return sum(2**bit for bit, (name, own) in enumerate(patches.NEWTONS_OWN.values()) if getattr(patches.physics, name) is own)
 
     config = bench.Config().with_values({"bake.worlds": 4})
     steps = patches.TICKS * config.physics.steps_per_tick * config.bake.worlds
     monkeypatch.setattr(patches, "load_catalog", lambda config: None)
-    monkeypatch.setattr(patches, "_seconds", lambda *given: steps / (1.0 + left_out(*given)))
+    monkeypatch.setattr(patches, "Simulation", lambda *given: given)
+    monkeypatch.setattr(patches, "_seconds", lambda simulation: steps / (1.0 + left_out()))
     assert [row.value - 1.0 for row in patches.measure_patches(config)] == pytest.approx([0, 1, 2, 4, 7, 0])

@@ -82,7 +82,7 @@ def measure_heaps(config: Config, min_seconds: float) -> Iterator[Row]:
         state, attempts, _, _, record = allocate_worlds(sizes, own.device)
         parts = (render_scene, scene, state, attempts, record.observation, record.plan)
         perception = Perception(config.perception, config.rig, config.bake.seed, *parts)
-        entry, pose = heap(own.catalog, config, worlds, count)
+        entry, pose = heap(own.catalog, config.tote.floor_size, config.bake.seed, worlds, count)
         state.catalog_index.assign(entry)
         record.snapshot.catalog_index.assign(entry)
         record.snapshot.pose.assign(pose)
@@ -95,11 +95,11 @@ def measure_heaps(config: Config, min_seconds: float) -> Iterator[Row]:
         yield Row(f"{count} instances: edges of the clutter graph", float(np.bitwise_count(above).sum() / len(seen)))
 
 
-def heap(catalog: Catalog, config: Config, worlds: int, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Small objects, repeated (world, instance) int32, and their random poses in the bin (world, instance, 7) float32 [m]."""
-    numbers = np.random.default_rng(config.bake.seed)
+def heap(catalog: Catalog, floor: tuple[float, ...], seed: int, worlds: int, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Small objects, repeated (world, instance) int32, and their random poses above a floor [m] (world, instance, 7) float32."""
+    numbers = np.random.default_rng(seed)
     volume = np.array([entry.volume for entry in catalog.entries])
-    room = np.array(config.tote.floor_size)
+    room = np.array(floor)
     small = np.argsort(volume, stable=True)[: max(1, len(volume) // SMALL)]
     entry = numbers.permuted(np.resize(small, (worlds, count)), axis=1).astype(np.int32)
     height = np.minimum(volume[entry].sum(axis=1) / (DENSITY * room.prod()), MAX_HEIGHT)

@@ -9,11 +9,14 @@ from __future__ import annotations
 import resource
 import time
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import warp as wp
 
 from synpick_warp.cli.commands.doctor import GIB
+from synpick_warp.configs.episodes.fills import Counts
 from synpick_warp.configs.schema import LAYERED, Config
 from synpick_warp.factory.assembly import fit_to_catalog
 from synpick_warp.factory.memory_plan import plan_memory
@@ -35,13 +38,11 @@ PART = "bracket"
 """Part whose piles are measured if the settings have no counts."""
 
 
-def vary_number(config: Config, number: int) -> Config:
-    """The settings with `number` of the part that there are most of, alone, dropped in layers."""
-    counts = config.arrangement.counts or ((PART, 1, 1),)
-    part = max(counts, key=lambda row: row[2])[0]
+def number_settings(counts: Counts, number: int) -> dict[str, Any]:
+    """Settings of `number` of the part of `counts` that there are most of, alone, dropped in layers."""
+    part = max(counts or ((PART, 1, 1),), key=lambda row: row[2])[0]
     fill = {"arrangement.counts": ((part, number, number),), "arrangement.max_objects": number, "arrangement.drop": LAYERED}
-    objects = {} if config.arrangement.counts else {"objects.embedded": ("industrial",)}
-    return config.with_values({"bake.mode": "move"} | fill | objects)
+    return {"bake.mode": "move"} | fill | ({} if counts else {"objects.embedded": ("industrial",)})
 
 
 def measure_instances(config: Config, numbers: Sequence[int], min_seconds: float) -> Iterator[Row]:
@@ -51,34 +52,13 @@ def measure_instances(config: Config, numbers: Sequence[int], min_seconds: float
         ConfigError: A number does not fit into the bin, or into the device's memory.
     """
     started, device = time.perf_counter(), pick_device(config.bake.device)
-    catalog = load_catalog(vary_number(config, max(numbers)))
+    varied = [config.with_values(number_settings(config.arrangement.counts, number)) for number in numbers]
+    catalog = load_catalog(max(varied, key=lambda each: each.arrangement.max_objects))
     bins = make_bins(config.cell.bins)
-    piles = [fit_to_catalog(vary_number(config, number), catalog, bins, device, SilentProgress()) for number in numbers]
+    piles = [_Pile(fit_to_catalog(each, catalog, bins, device, SilentProgress()), catalog, device) for each in varied]
     for pile in piles:
-        yield from _measure_pile(pile, catalog, device, min_seconds)
+        yield from pile.measure(min_seconds)
     yield Row("all measurements", time.perf_counter() - started, "s")
-
-
-def _measure_pile(config: Config, catalog: Catalog, device: wp.Device, min_seconds: float) -> Iterator[Row]:
-    """Rows of worlds with the parts of the settings."""
-    worlds, steps = config.bake.worlds, config.physics.steps_per_tick * config.bake.worlds
-    before = _memory_in_use(device)
-    simulation = Simulation(config, catalog, 1, device, None, range(worlds))
-    simulation.scene.settle.rest_ticks = simulation.scene.settle.max_ticks = FOREVER
-    physics, name = simulation.physics, f"{config.arrangement.max_objects} instances"
-    for state, ticks in (("landing", DROP_TICKS), ("at rest", REST_TICKS)):
-        for _ in range(ticks):
-            simulation.tick()
-        seconds = seconds_per_call(simulation.tick, device, min_seconds, BURST)
-        yield Row(f"{name}, {state}: physics of a tick", 1e3 * seconds, "ms")
-        yield Row(f"{name}, {state}: world-steps", steps / seconds, "1/s")
-        yield Row(f"{name}, {state}: part-steps", steps * config.arrangement.max_objects / seconds, "1/s")
-    for what, array in (("contacts", physics.contacts.rigid_contact_count), ("overlaps", physics.overlap_count)):
-        yield Row(f"{name}: {what} a world", int(array.numpy()[0]) / worlds)
-    yield Row(f"{name}: worlds without overflow", 100.0 * float(np.mean(~physics.solver.constraint_overflow.numpy()[:-1])), "%")
-    planned = _planned(config, catalog, device)
-    yield Row(f"{name}: memory of the physics", (_memory_in_use(device) - before) / GIB, "GiB")
-    yield Row(f"{name}: memory planned for it, at least", planned / GIB, "GiB")
 
 
 def _memory_in_use(device: wp.Device) -> int:
@@ -89,8 +69,37 @@ def _memory_in_use(device: wp.Device) -> int:
     return 1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
 
 
-def _planned(config: Config, catalog: Catalog, device: wp.Device) -> int:
-    """Memory that the plan has for Newton, the state of the worlds and separating axes [bytes]."""
-    pieces = max(len(catalog.bodies[index].pieces) for index in find_drawn(config.arrangement, catalog))
-    terms = plan_memory(config, device, 0, pieces)
-    return sum(term.size for term in terms if term.name.startswith(("Newton", "the state", "separating")))
+@dataclass(frozen=True, eq=False)
+class _Pile:
+    """Worlds with piles of a number of like parts."""
+
+    config: Config
+    catalog: Catalog
+    device: wp.Device
+
+    def measure(self, min_seconds: float) -> Iterator[Row]:
+        """Rows of landing and resting parts, each repeated for at least `min_seconds` [s], of contacts and of memory."""
+        config = self.config
+        worlds, steps = config.bake.worlds, config.physics.steps_per_tick * config.bake.worlds
+        before = _memory_in_use(self.device)
+        simulation = Simulation(config, self.catalog, 1, self.device, None, range(worlds))
+        simulation.scene.settle.rest_ticks = simulation.scene.settle.max_ticks = FOREVER
+        physics, name = simulation.physics, f"{config.arrangement.max_objects} instances"
+        for state, ticks in (("landing", DROP_TICKS), ("at rest", REST_TICKS)):
+            for _ in range(ticks):
+                simulation.tick()
+            seconds = seconds_per_call(simulation.tick, self.device, min_seconds, BURST)
+            yield Row(f"{name}, {state}: physics of a tick", 1e3 * seconds, "ms")
+            yield Row(f"{name}, {state}: world-steps", steps / seconds, "1/s")
+            yield Row(f"{name}, {state}: part-steps", steps * config.arrangement.max_objects / seconds, "1/s")
+        for what, array in (("contacts", physics.contacts.rigid_contact_count), ("overlaps", physics.overlap_count)):
+            yield Row(f"{name}: {what} a world", int(array.numpy()[0]) / worlds)
+        yield Row(f"{name}: worlds without overflow", 100.0 * float(np.mean(~physics.solver.constraint_overflow.numpy()[:-1])), "%")
+        yield Row(f"{name}: memory of the physics", (_memory_in_use(self.device) - before) / GIB, "GiB")
+        yield Row(f"{name}: memory planned for it, at least", self.planned() / GIB, "GiB")
+
+    def planned(self) -> int:
+        """Memory that the plan has for Newton, the state of the worlds and separating axes [bytes]."""
+        pieces = max(len(self.catalog.bodies[index].pieces) for index in find_drawn(self.config.arrangement, self.catalog))
+        terms = plan_memory(self.config, self.device, 0, pieces)
+        return sum(term.size for term in terms if term.name.startswith(("Newton", "the state", "separating")))

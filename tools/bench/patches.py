@@ -15,7 +15,6 @@ import warp as wp
 
 from synpick_warp.configs.schema import Config
 from synpick_warp.scenes.catalog import load_catalog
-from synpick_warp.scenes.types import Catalog
 from synpick_warp.stages.sim import physics
 from synpick_warp.stages.sim.simulate import Simulation
 from synpick_warp.system.hardware.device import pick_device
@@ -44,13 +43,12 @@ def measure_patches(config: Config) -> Iterator[Row]:
         with contextlib.ExitStack() as stack:
             for function, own in map(NEWTONS_OWN.__getitem__, names):
                 stack.enter_context(mock.patch.object(physics, function, own))
-            seconds = _seconds(config, catalog)
+            seconds = _seconds(Simulation(config, catalog, 1, pick_device(config.bake.device)))
         yield Row(f"{run}: world-steps", TICKS * config.physics.steps_per_tick * config.bake.worlds / seconds, "1/s")
 
 
-def _seconds(config: Config, catalog: Catalog) -> float:
+def _seconds(simulation: Simulation) -> float:
     """Time of TICKS ticks [s]."""
-    simulation = Simulation(config, catalog, 1, pick_device(config.bake.device))
     started = 0.0
     for tick in range(WARM_UP_TICKS + TICKS):
         if tick == WARM_UP_TICKS:

@@ -98,7 +98,8 @@ def measure_furnaces(config: Config, device: Any) -> list[Row]:
     )
     rows = []
     for mode in (REFERENCE, FAST):
-        studio = _probe_studio(config, mode, mesh, surfaces, make_cameras(Rig.of(above)), _uniform_light(), device)
+        probe = config.with_values({"render.table": False, "render.mode": mode})
+        studio = make_studio(probe, _white_catalog(mesh, surfaces), make_cameras(Rig.of(above)), (_uniform_light(),), device)
         snapshot = _probe_snapshot(config.arrangement.max_objects, len(surfaces), device)
         for world, (metallic, roughness) in enumerate(surfaces):
             shot = studio.render(snapshot, world, 0)
@@ -130,10 +131,10 @@ def measure_planes(config: Config, device: Any) -> list[Row]:
         target=(0.0, 0.0, 0.0),
         ups=((0.0, 0.0, 1.0),) * len(positions),
     )
-    rows = []
+    rows, probe = [], config.with_values({"render.table": False, "render.mode": REFERENCE})
     for height in LAMP_HEIGHTS:
         cosine = float(np.sin(np.radians(height)))
-        studio = _probe_studio(config, REFERENCE, mesh, [(0.0, 1.0)], make_cameras(Rig.of(around)), _lamp_light(cosine), device)
+        studio = make_studio(probe, _white_catalog(mesh, [(0.0, 1.0)]), make_cameras(Rig.of(around)), (_lamp_light(cosine),), device)
         snapshot = _probe_snapshot(config.arrangement.max_objects, 1, device)
         radiance = [float(studio.render(snapshot, 0, camera).radiance.mean()) for camera in range(len(positions))]
         error = 100.0 * (float(node_weights @ radiance) / (np.sin(LAMP_RADIUS) ** 2 * cosine) - 1.0)
@@ -154,23 +155,12 @@ def _lamp_light(cosine: float) -> EnvironmentMap:
     return EnvironmentMap("lamp", np.repeat(coverage[..., None], 3, axis=2).astype(np.float32))
 
 
-def _probe_studio(
-    config: Config,
-    mode: str,
-    mesh: TriangleMesh,
-    surfaces: list[tuple[float, float]],
-    cameras: tuple[Camera, ...],
-    light: EnvironmentMap,
-    device: Any,
-) -> Studio:
-    """Studio of a white mesh alone, with one catalog entry per surface (metallic, roughness)."""
-    config = config.with_values({"render.table": False, "render.mode": mode})
+def _white_catalog(mesh: TriangleMesh, surfaces: list[tuple[float, float]]) -> Catalog:
+    """Catalog of a white mesh, with one entry per surface (metallic, roughness)."""
     white = [Material((1.0, 1.0, 1.0), None, metallic, roughness) for metallic, roughness in surfaces]
     # Volume, radius, mass and diameter do not affect rendering.
-    entries = tuple(
-        CatalogEntry(1, "probe", mesh, material, (), 1.0, 1.0, 1.0, np.zeros(3), np.eye(3), 1.0, (), (), None) for material in white
-    )
-    return make_studio(config, Catalog(entries), cameras, (light,), device)
+    numbers = (1.0, 1.0, 1.0, np.zeros(3), np.eye(3), 1.0)
+    return Catalog(tuple(CatalogEntry(1, "probe", mesh, material, (), *numbers, (), (), None) for material in white))
 
 
 def _probe_snapshot(capacity: int, worlds: int, device: Any) -> Snapshot:

@@ -21,7 +21,7 @@ from scipy.spatial.transform import Rotation
 
 from synpick_warp.codes import Ending, Phase
 from synpick_warp.configs.cell.extents import BinSizes
-from synpick_warp.configs.schema import Config
+from synpick_warp.configs.schema import Physics
 from synpick_warp.errors import SynpickError
 from synpick_warp.factory.assembly import fit_to_catalog
 from synpick_warp.scenes import build
@@ -123,7 +123,15 @@ def main(arguments: list[str] | None = None) -> int:
     wall = time.perf_counter() - started
     objects = "the models folder's objects" if config.bake.models else "the embedded objects"
     title = f"{config.bake.episodes} arrangements of {objects} in {config.bake.worlds} worlds, seed {config.bake.seed}, {wall:.0f} s"
-    code = finish_report("tools.reports.rest", options.json, device, "at rest", title, report(results, config), interrupted=interrupted)
+    code = finish_report(
+        "tools.reports.rest",
+        options.json,
+        device,
+        "at rest",
+        title,
+        report(results, config.physics, bool(config.arrangement.counts)),
+        interrupted=interrupted,
+    )
     return INTERRUPTED if interrupted else code
 
 
@@ -217,9 +225,9 @@ def is_inside(sizes: BinSizes, position: np.ndarray) -> np.ndarray:
     return (np.abs(position[:, :2]) < rim).all(axis=1) & (position[:, 2] > 0.0) & (position[:, 2] < sizes.height + HEAP_HEIGHT)
 
 
-def report(results: Results, config: Config) -> list[Row]:
-    """Rows of the report; without a pile at rest, bounds are violated. Fills by `arrangement.counts` may have any volume."""
-    piles, physics = results.piles, config.physics
+def report(results: Results, physics: Physics, any_volume: bool) -> list[Row]:
+    """Rows of the report; without a pile at rest, bounds are violated. Fills by `arrangement.counts` have `any_volume`."""
+    piles = results.piles
 
     def over_objects(name: str) -> np.ndarray:
         return np.concatenate([getattr(pile, name) for pile in piles]) if piles else np.full(1, np.nan)
@@ -231,7 +239,7 @@ def report(results: Results, config: Config) -> list[Row]:
     speed, tick_speed, depth = over_objects("speed"), over_objects("tick_speed"), over_objects("depth")
     inside = 100.0 * float(over_objects("inside").mean())
     largest = Row("total volume, max", float(volume.max()), "l")
-    if not config.arrangement.counts:
+    if not any_volume:
         largest = _bounded(largest.name, largest.value, "l", MAX_VOLUME * (1 + ROUNDING), f"<= {MAX_VOLUME:g}")
     return [
         Row("arrangements at rest", len(piles), ""),

@@ -331,9 +331,9 @@ def test_episodes_in_the_settings_are_not_believed(narrow, tmp_path):
 
 def test_an_attempt_has_as_many_votes_as_pairs_of_objects(whole, tmp_path):
     folder = copied(whole, tmp_path / "set")
-    votes = [[index % 30, 31, 0.5] for index in range(100_000)]
+    votes = [[index % 250, 250, 0.5] for index in range(100_000)]
     edit(folder / "manifest" / "000000.json", lambda content: content["attempts"][0]["observation"].update(votes=votes))
-    assert "length <= 992" in verify(folder).problem
+    assert "length <= 62750" in verify(folder).problem
     assert told("merge", folder, "--out", tmp_path / "merged")[0] == 2
 
 
