@@ -17,9 +17,9 @@ WARP = 32
 CERTAIN = wp.constant(1.0e30)
 """Gain of placing a source or a sink of the graph, which removes no edge."""
 UNPLACED = wp.constant(-1)
-"""Rank of a member that the greedy order has not placed."""
+"""Value of `Cycles.rank` for members that the greedy order has not placed yet."""
 NO_CYCLE = wp.constant(-1)
-"""Leader of an instance that is on no cycle."""
+"""Value of `Cycles.leader` for instances that are not part of a cycle."""
 
 
 @wp.struct
@@ -29,7 +29,7 @@ class Cycles:
     """
 
     pending: wp.array3d[wp.uint32]
-    """Bit sets of the ancestors whose own predecessors are still to be added (view, instance, word)."""
+    """Frontier of the graph search: bit sets of ancestors not expanded yet (view, instance, word)."""
     leader: wp.array2d[int]
     """Smallest instance of each instance's component; -1: it is on no cycle (view, instance)."""
     member: wp.array2d[int]
@@ -39,9 +39,9 @@ class Cycles:
     rank: wp.array2d[int]
     """Position of each member in the linear order, the uppermost first (view, instance)."""
     leaving: wp.array2d[float]
-    """Weight of the edges that leave each member towards unplaced ones, in a greedy order (view, instance)."""
+    """Weight of the edges from each member to unplaced members, during the greedy order (view, instance)."""
     entering: wp.array2d[float]
-    """Weight of those that enter it (view, instance)."""
+    """Weight of the edges from unplaced members that enter each member (view, instance)."""
     best: wp.array2d[float]
     """Dynamic programming table: maximum weight of an acyclic subgraph of each set of members; bit k of the index stands for member k
     (view, subset)."""
@@ -53,7 +53,7 @@ class Cycles:
 #endif
 """)
 def sync_lanes():
-    """Barrier of a view's lanes, behind which each sees what the others wrote."""
+    """Warp-level barrier (`__syncwarp`): what lanes wrote before it is visible to all lanes of the view after it."""
     ...
 
 
@@ -71,7 +71,7 @@ def sync_lanes():
     return choice;
 """)
 def best_choice(gain: float, choice: int) -> int:
-    """Argmax over a view's lanes: the choice with the largest gain, ties by the smallest choice; -1: a lane has none."""
+    """Warp-level argmax: the choice with the largest gain over all lanes of the view, ties by the smallest index; -1: no candidate."""
     ...
 
 

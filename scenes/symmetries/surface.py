@@ -9,9 +9,10 @@ from trimesh.triangles import closest_point
 from synpick_warp.scenes.assets.meshes import merge_positions
 
 _DENSE = 60_000
-"""Points of the sample that distances are measured to."""
+"""Number of sample points to which distances are measured."""
 _QUERIES = 2_000
-"""Points of the sample, and at most as many vertices, that distances are measured from first: vertices have the tips of small features."""
+"""Number of sample points, and maximum number of vertices, in the subset from which distances are measured first. Vertices are included,
+since the tips of small features fall between sample points."""
 _TRIANGLES = 8
 """Points of the dense sample to whose triangles distances are measured where those to tangent planes are too large."""
 _APPROXIMATE = 2.0

@@ -82,7 +82,7 @@ class ViewBuffers:
     instance: wp.array = device_array("view", "row", "column", dtype=wp.uint8)
     """Instance segmentation: 1 + instance_id, or a `Segment`."""
     mask_words: wp.array = device_array("view", "mask_word", dtype=wp.uint32)
-    """Amodal masks: a bit a pixel for each instance in its own box, see `InstanceMasks.words`: set where the pixel's ray hits the instance,
+    """Amodal masks, one bit per pixel of each instance's box (see `InstanceMasks.words`): set where the pixel's ray hits the instance,
     occluded or not."""
     mask_first: wp.array = device_array("view", "instance", dtype=wp.int32)
     """Index of the first word of each mask."""

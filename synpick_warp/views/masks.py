@@ -1,4 +1,4 @@
-"""Amodal masks on the host, as the renderer packs them: a bit a pixel for each instance in its own box, in words of MASK_ROWS rows."""
+"""Amodal masks on the host: one bit per pixel of each instance's bounding box, in words of MASK_ROWS rows, as the renderer packs them."""
 
 from __future__ import annotations
 

@@ -20,9 +20,9 @@ from tests.worlds.small_worlds import ANGLE, BOX, CUBE, catalog, cluttered_catal
 
 SMALL = ((0.012, 0.013, 0.014),)
 OF_SMALL = 5 * ((28 * 29 * 30 / (12 * 13 * 14) - 1) / 2 + 1.5)
-"""Contacts of each of many small boxes: five with a half of the others of which 8 mm have room for, and with 1.5 shapes of the bin."""
+"""Contacts per small box in a large pile: five per pair, with half of the boxes that fit within 8 mm around it, and with 1.5 bin shapes."""
 LEAST = 512 / 24
-"""Contacts of each of many larger objects, as many as the default settings have for theirs."""
+"""Minimum number of contacts per object in a large pile: that of the default settings."""
 
 
 def with_capacities(config: Config, objects: Catalog) -> Physics:

@@ -201,7 +201,7 @@ def test_a_budget_for_everything_draws_everything_without_repeats(device):
 
 @pytest.mark.parametrize("counts", [[(0, 0), (8, 8), (0, 0)], [(3, 3), (4, 4), (1, 1)], [(0, 2), (1, 3), (2, 3)]])
 def test_numbers_of_parts_are_those_that_are_set_whatever_the_budget(device, counts):
-    """Bins of one part, of fixed numbers and of random numbers of several parts, among them a compound object; in any number of worlds."""
+    """Homogeneous, kitted and random fills, with a compound object among the parts; results do not depend on the number of worlds."""
     worlds = arrangement_worlds(device, WORLDS, counts=counts, drop={"volume": 1e-3})
     worlds.begin(Phase.START, np.arange(WORLDS)[::-1] + 7, 1)
     arrange.sample_episodes(worlds.scene, worlds.state, SEED)

@@ -76,7 +76,7 @@ class Cups(KernelWorlds):
         self.place(world, instance, [*place, *quaternion])
 
     def cast(self) -> tuple[list[int], list[int]]:
-        """Count of rays that hit and first word of the set of engaged objects, of every world."""
+        """Number of ray hits, and first word of the bit set of engaged instances, per world."""
         self.suction.engage(self.scene, self.state, self.attempts, self.seals, self.physics)
         return self.attempts.hits.numpy()[:, 0].tolist(), self.attempts.engaged_words.numpy()[:, 0].tolist()
 

@@ -11,7 +11,7 @@ ROWS = 32
 
 
 def pack_masks(masks: np.ndarray, margin: int = 1) -> dict[str, np.ndarray]:
-    """Fields of a view of `FrameBatch` from its masks (I, H, W) bool; boxes are wider than the masks by `margin` [px]."""
+    """Pack masks (I, H, W) bool of one view into the mask fields of `FrameBatch`; boxes are bounding boxes enlarged by `margin` [px]."""
     count, height, width = masks.shape
     words = np.zeros(count * width * -(-height // ROWS), np.uint32)
     first, box = np.zeros(count, np.int32), np.tile(np.array([0, 0, -1, -1], np.int32), (count, 1))

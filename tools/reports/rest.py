@@ -226,7 +226,8 @@ def is_inside(sizes: BinSizes, position: np.ndarray) -> np.ndarray:
 
 
 def report(results: Results, physics: Physics, any_volume: bool) -> list[Row]:
-    """Rows of the report; without a pile at rest, bounds are violated. Fills by `arrangement.counts` have `any_volume`."""
+    """Rows of the report. Bounds are violated if no pile came to rest; `any_volume` lifts the bound of the total volume, which fills by
+    `arrangement.counts` need not keep."""
     piles = results.piles
 
     def over_objects(name: str) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""Amodal masks: a bit a pixel for each instance, in its own box, as words of MASK_ROWS rows of a column; each view has a pool of words.
+"""Amodal masks: one bit per pixel of each instance's bounding box, in words of MASK_ROWS rows of a column, from a pool of words per view.
 
 A box takes as many words as it needs, wherever the boxes before it end (prefix sum), so work and copies grow with covered area, not with
 the number of instances; the pool has room for masks as large as the image. Words lie along the rows of the image, as its pixels do:

@@ -26,8 +26,8 @@ FIELDS = 2
 
 @dataclass(frozen=True, eq=False)
 class BoundaryBuffers:
-    """Run boundaries of the segmentation ids and amodal masks of one batch of views, and their numbers, which may exceed the capacity; see
-    `FrameBatch`.
+    """Run boundaries of the segmentation ids and amodal masks of a batch of views, and their counts. A count may exceed the capacity of its
+    list; the list is then truncated. See `FrameBatch`.
     """
 
     boundary_count: wp.array = device_array("view", dtype=wp.int32)
