@@ -71,11 +71,15 @@ class ContactHistory:
 
 @wp.struct
 class ContactNumbers:
-    """How a list numbers shapes and bodies: those of each world, 0 where all worlds count from 0; all bodies; bits of a matcher's key."""
+    """How a list numbers shapes, bodies and contacts: those of each world, 0 where all worlds count from 0; all bodies; bits of a matcher's
+    key.
+    """
 
     shapes: int
     bodies: int
     all_bodies: int
+    contacts: int
+    """1: contacts are numbered through all worlds; 0: from 0 in each."""
     shape_bits: int
     """Bits of a shape in a key ..."""
     contact_bits: int
@@ -192,8 +196,8 @@ def place_contacts_kernel(
     live_start: wp.array[int],  # (world + 1)
     # Out:
     kept_out: wp.array[int],  # (world)
-    start_out: wp.array[int],  # (world + 1)
-    count_out: wp.array[int],  # (world)
+    target_start_out: wp.array[int],  # (world + 1)
+    target_count_out: wp.array[int],  # (world)
     lost_inout: wp.array[int],  # (world)
 ):
     """Place the contacts of all worlds in a new list: those of a saved `row`, or with -1 the world's own, which `kept` then names.
@@ -215,10 +219,10 @@ def place_contacts_kernel(
             fits = False
         if not fits:
             lost_inout[world] = lost_inout[world] | contacts_lost
-        start_out[world] = total
-        count_out[world] = count
+        target_start_out[world] = total
+        target_count_out[world] = count
         total += count
-    start_out[row.shape[0]] = total
+    target_start_out[row.shape[0]] = total
 
 
 @wp.kernel
@@ -248,6 +252,7 @@ def copy_contacts_kernel(
     start = target_start[world]
     shapes = world * target_numbers.shapes - origin * source_numbers.shapes
     bodies = world * target_numbers.bodies - origin * source_numbers.bodies
+    contacts = start * target_numbers.contacts - first * source_numbers.contacts
     for contact in range(lane, wp.min(count[world], capacity), int(LANES)):
         one = first + contact
         other = start + contact
@@ -262,8 +267,8 @@ def copy_contacts_kernel(
         copy_anchor(source, one, target_out, other)
         target_out.key[other] = renumber_key(source.key[one], source_numbers, target_numbers, shapes)
         target_out.pair[other] = renumber_pair(source.pair[one], source_numbers, target_numbers, shapes, bodies)
-        target_out.pair_contact[other] = renumber(source.pair_contact[one], start - first)
-        target_out.owner[other] = renumber(source.owner[one], start - first)
+        target_out.pair_contact[other] = renumber(source.pair_contact[one], contacts)
+        target_out.owner[other] = renumber(source.owner[one], contacts)
         target_out.body_a[other] = renumber(source.body_a[one], bodies)
         target_out.body_b[other] = renumber(source.body_b[one], bodies)
         target_out.shape_a[other] = renumber(source.shape_a[one], shapes)

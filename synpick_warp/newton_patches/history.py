@@ -93,7 +93,7 @@ class History:
         self.capacity = self.live.key.shape[0]
         numbers = kernels.ContactNumbers()
         numbers.shapes, numbers.bodies = model.shape_count // self.worlds, model.body_count // self.worlds
-        numbers.all_bodies = model.body_count
+        numbers.all_bodies, numbers.contacts = model.body_count, 1
         numbers.shape_bits, numbers.contact_bits = self.matcher._shape_index_bits, self.matcher._sub_key_bits
         self._numbers, self._saved_numbers = numbers, kernels.ContactNumbers()
         self._saved_numbers.all_bodies, self._saved_numbers.contact_bits = numbers.bodies, numbers.contact_bits

@@ -79,8 +79,7 @@ def main(arguments: list[str] | None = None) -> int:
             few = build(configure(options, fixed | {"bake.worlds": min(MIN_GPU_WORLDS, options.worlds)}))
             result = check_branches(simulation, few, options.states, options.moments, options.ticks, options.apart)
             rows += report(f"mode {mode.name.lower()}", result)
-            moments = ", ".join(f"{count} {name}" for name, count in sorted(result.moments.items()))
-            console.print(f"{mode.name.lower()}: {moments}", *result.differences[:20], sep="\n")
+            console.print(*(f"{count} x {name}" for name, count in sorted(result.moments.items())), *result.differences[:20], sep="\n")
         fixed = {"bake.mode": "mixed", "bake.worlds": min(POISONED_WORLDS, options.worlds), "bake.episodes": 8 * POISONED_WORLDS}
         kinds = Counter[str]()
         differences = list(check_arrays(build(configure(options, fixed)), options.repeated, kinds))
@@ -152,13 +151,14 @@ def choose_worlds(simulation: Simulation, count: int, moments: Counter[str]) -> 
     """Worlds with an episode, at moments that were chosen least often so far, which are counted."""
     state, task = simulation.state, simulation.attempts.task.numpy()
     phase, progress, removed = state.phase.numpy(), state.progress.numpy(), simulation.attempts.removed.numpy().any(axis=1)
-    names = {}
+    mode, names = state.mode.numpy(), {}
     for world in np.flatnonzero((phase == Phase.SETTLE) | (phase == Phase.ACT)):
         name = "settling" if progress[world][3] else "settling without guide walls"
         if phase[world] == Phase.ACT:
             name = Task(int(task[world])).name.lower() if task[world] else "moving"
             name += " after a removal" if removed[world] else ""
-        names[int(world)] = name + (", dropped again" if progress[world][2] else "")
+        name += ", dropped again" if progress[world][2] else ""
+        names[int(world)] = f"{Mode(int(mode[world])).name.lower()}: {name}"
     chosen: list[int] = []
     while len(chosen) < min(count, len(names)):
         world = min((world for world in names if world not in chosen), key=lambda world: moments[names[world]])
@@ -189,16 +189,17 @@ def compare(begin: Rows, own: Sequence[Rows], branch: Sequence[Rows], where: str
                 break
 
 
-def differing(expected: Rows, found: Rows, row: int) -> Iterator[str]:
-    """Names of the arrays that differ in a row."""
+def differing(expected: Rows, found: Rows, row: int, other: int | None = None) -> Iterator[str]:
+    """Names of the arrays in which a row differs from another one, None: the same one, of what was found."""
+    other = row if other is None else other
     count = int(expected["contacts.count"][row])
     for name, array in expected.items():
         if array.ndim == 0:
             continue
-        one, other = array[row], found[name][row]
+        pair = [array[row], found[name][other]]
         if name.startswith(CONTACTS) and array.ndim > 1:
-            one, other = one[:count], other[:count]
-        if np.ascontiguousarray(one).tobytes() != np.ascontiguousarray(other).tobytes():
+            pair = [values[:count] for values in pair]
+        if len({np.ascontiguousarray(values).tobytes() for values in pair}) > 1:
             yield name
 
 
