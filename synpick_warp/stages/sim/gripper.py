@@ -63,6 +63,11 @@ def park_removed(scene: SceneData, state: WorldState, attempts: AttemptState, ph
 def begin_attempts(scene: SceneData, state: WorldState, attempts: AttemptState, plan: Plan, physics: Physics) -> None:
     """Begin the planned attempts: place the gripper above the grasp, with the planned yaw and tilt."""
     launch(tasks.begin_attempts_kernel, len(state.phase), state, attempts, plan)
+    place_grippers(scene, state, attempts, plan, physics)
+
+
+def place_grippers(scene: SceneData, state: WorldState, attempts: AttemptState, plan: Plan, physics: Physics) -> None:
+    """Place the gripper above the grasp where task APPROACH begins, with the planned yaw and tilt."""
     sources = (scene, state, attempts, plan, physics.state)
     launch(tasks.place_grippers_kernel, len(state.phase), *sources, tilt_out=physics.control.joint_target_q)
     physics.set_yaw(plan.yaw)
