@@ -81,6 +81,33 @@ def count_lost(removed: wp.array2d[int], world: int) -> int:
     return lost
 
 
+@wp.func
+def measure_motion(
+    layout: LayoutData,
+    world: int,
+    target: int,
+    moved_distance: float,
+    catalog_index: wp.array2d[int],
+    body_slot: wp.array2d[int],
+    body_q: wp.array[wp.transform],
+    pose: wp.array2d[wp.transform],
+):
+    """Number of a world's objects, but for the target, whose origins are farther than `moved_distance` from `pose`, and the largest such
+    distance [m].
+    """
+    body = world * layout.bodies + layout.gripper_bodies
+    moved = int(0)
+    farthest = float(0.0)
+    for instance in range(layout.instances):
+        if catalog_index[world, instance] >= 0 and instance != target:
+            now = wp.transform_get_translation(body_q[body + body_slot[world, instance]])
+            distance = wp.length(now - wp.transform_get_translation(pose[world, instance]))
+            farthest = wp.max(farthest, distance)
+            if distance > moved_distance:
+                moved += 1
+    return moved, farthest
+
+
 @wp.kernel
 def assign_trials_kernel(
     # In:
@@ -188,16 +215,9 @@ def judge_trials_kernel(
     progress_inout.peak_force[world] = wp.max(progress_inout.peak_force[world], peak_force[world])
     if outcome[world] == Outcome.NONE and phase[world] == Phase.ACT:
         return
-    body = world * layout.bodies + layout.gripper_bodies
-    moved = int(0)
-    farthest = float(0.0)
-    for instance in range(layout.instances):
-        if catalog_index[world, instance] >= 0 and instance != grasps.target[trial]:
-            now = wp.transform_get_translation(body_q[body + body_slot[world, instance]])
-            distance = wp.length(now - wp.transform_get_translation(progress_inout.pose[world, instance]))
-            farthest = wp.max(farthest, distance)
-            if distance > moved_distance:
-                moved += 1
+    moved, farthest = measure_motion(
+        layout, world, grasps.target[trial], moved_distance, catalog_index, body_slot, body_q, progress_inout.pose
+    )
     labels_out.outcome[trial] = outcome[world]
     labels_out.ending[trial] = ending[world]
     labels_out.hits[trial] = hits[world]

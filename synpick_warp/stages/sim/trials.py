@@ -89,7 +89,7 @@ def find_choices(simulation: Simulation) -> np.ndarray:
 def own_grasps(simulation: Simulation, worlds: Sequence[int]) -> dict[str, np.ndarray]:
     """Grasps that worlds have planned themselves, with rows in the order of the worlds. Waits for the device."""
     plan = simulation.plan
-    arrays = {name: getattr(plan, name).numpy()[np.asarray(worlds)] for name in ("target", "point", "normal", "yaw", "tilt")}
+    arrays = {name: getattr(plan, name).numpy()[np.asarray(worlds, int)] for name in ("target", "point", "normal", "yaw", "tilt")}
     return {"row": np.arange(len(worlds), dtype=np.int32)} | arrays
 
 
