@@ -12,6 +12,7 @@ import warp as wp
 from synpick_warp.codes import Ending, Phase, Task
 from synpick_warp.errors import StateError
 from synpick_warp.kernels.newton_patches import contact_history
+from synpick_warp.newton_patches import history
 from synpick_warp.stages.sim import states
 from synpick_warp.stages.sim.simulate import Simulation
 from tests.worlds.sights import brief
@@ -142,10 +143,10 @@ def without(known: states.WorldStates, name: str):
 
 @pytest.mark.parametrize("forgotten", ["key", "midpoint", "solved_normal", "row", "pair", "displacement", "valid"])
 def test_a_forgotten_contact_is_found_out(scene, monkeypatch, forgotten):
-    history = scene.simulation.states.history
+    known = scene.simulation.states.history
     name = {"row": "propagation_slot" if scene.simulation.device.is_cuda else "free_slot"}.get(forgotten, forgotten)
     with monkeypatch.context() as patch:
-        patch.setattr(history, "live", replaced(history.live, name, wp.zeros_like(getattr(history.live, name))))
+        patch.setattr(known, "live", replaced(known.live, name, wp.zeros_like(getattr(known.live, name))))
         scene.simulation.branch(0, [WORLDS])
     assert scene.differences(0, WORLDS) != []
 
@@ -223,6 +224,14 @@ def test_there_is_no_state_before_and_within_a_tick(device):
         with pytest.raises(StateError, match="between two ticks alone"):
             simulation.get_state([0])
     assert len(simulation.get_state([0])) == 1
+
+
+def test_another_version_of_newton_has_no_states(device, monkeypatch):
+    simulation = brief(device, 1, bake__mode="move")
+    simulation.tick()
+    monkeypatch.setattr(history, "KNOWN_NEWTON", "1.7.0")
+    with pytest.raises(StateError, match=r"states need Newton 1.7.0; what .*, which is installed, keeps of a step is unknown"):
+        simulation.get_state([0])
 
 
 def test_a_world_with_more_contacts_than_a_state_has_room_for_ends_as_a_branch(device):
