@@ -58,7 +58,9 @@ def test_bounds_are_above_the_words_of_a_view_and_not_far_above(device, lens):
     assert worse >= most_words(WIDTH, HEIGHT)
 
 
-@pytest.mark.parametrize(("views", "instances", "masks"), [(25, 10, 10), (25, 150, SHARE), (3, MAX_INSTANCES, 84), (1, MAX_INSTANCES, MAX_INSTANCES)])
+@pytest.mark.parametrize(
+    ("views", "instances", "masks"), [(25, 10, 10), (25, 150, SHARE), (3, MAX_INSTANCES, 84), (1, MAX_INSTANCES, MAX_INSTANCES)]
+)
 def test_a_pool_has_room_for_all_masks_of_a_view(views, instances, masks):
     share = share_words(views, instances, WIDTH, HEIGHT)
     assert share == masks * most_words(WIDTH, HEIGHT)
