@@ -36,8 +36,9 @@ def widen(images: ViewBuffers) -> ViewBuffers:
     """The same buffers with a pool that is divided among fewer views, all of whose masks may be as large as the image."""
     height, width = images.instance.shape[1:]
     share = images.mask_first.shape[1] * most_words(width, height)
-    views = images.mask_words.size // share
-    return replace(images, mask_words=images.mask_words.flatten()[: views * share].reshape((views, share)))
+    pool: Any = images.mask_words.flatten()
+    views = pool.size // share
+    return replace(images, mask_words=pool[: views * share].reshape((views, share)))
 
 
 @dataclass(frozen=True, eq=False)
