@@ -1,9 +1,9 @@
 """Matching of contacts between substeps: those that Newton's matching leaves without a partner, and so without a warm start, get one.
 
-Newton lets each contact choose the nearest of the last substep's contacts of its two shapes, and if two choose the same one, the farther one
-starts without impulse. Its narrow phase writes contacts twice where an edge lies on a face: once as an end of the clipped edge, once as the
-deepest point. Both choose the same one, and up to half of the load of that edge was lost in every substep. Other contacts lose theirs where
-a manifold has other corners than before.
+Newton lets each contact choose the nearest of the last substep's contacts of its two shapes, and if two choose the same one, the farther
+one starts without impulse. Its narrow phase writes contacts twice where an edge lies on a face: once as an end of the clipped edge, once
+as the deepest point. Both choose the same one, so that up to half of the load of that edge is lost in every substep. Other contacts lose
+theirs where a manifold has other corners than before.
 """
 
 import warp as wp
