@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import warp as wp
@@ -194,12 +196,36 @@ def test_what_hangs_after_the_lift_leaves_the_scene(device, target, engaged, att
     np.testing.assert_allclose(worlds.physics.state.joint_q.numpy()[:4], [3.0, 0.0, 1.0, 0.0])
 
 
-@pytest.mark.parametrize(("mode", "forgive", "failures"), [(Mode.TARGET, 1, 0), (Mode.TARGET, 0, 2), (Mode.PICK, 1, 2)])
+IN_PICK, IN_TARGET = 1 << Mode.PICK, 1 << Mode.TARGET
+
+
+@pytest.mark.parametrize(
+    ("mode", "forgive", "failures"),
+    [(Mode.TARGET, IN_TARGET, 0), (Mode.TARGET, IN_PICK, 2), (Mode.PICK, IN_TARGET, 2), (Mode.PICK, IN_PICK | IN_TARGET, 0)],
+)
 def test_a_success_may_be_forgiving(device, mode, forgive, failures):
     worlds = lifted(device, 1, 2, (0, 1, 0), mode=mode, forgive=forgive)
     worlds.set(worlds.attempts.failures, 2)
     end(worlds)
     assert worlds.attempts.failures.numpy()[0] == failures
+
+
+def test_failed_attempts_are_counted_by_target_if_it_is_asked(device):
+    """Attempts at 1, 1, 2, of which the second succeeds with another object; then a new episode."""
+    for tries_another, expected in ((False, [[0, 0, 0]] * 4), (True, [[0, 1, 0], [0, 1, 0], [0, 1, 1], [0, 0, 0]])):
+        worlds = made(device)
+        worlds.scene = replace(worlds.scene, tries_another=tries_another)
+        counts = []
+        for frame, target, attached in ((3, 1, (0, 0, 0)), (4, 1, (1, 0, 0)), (5, 2, (0, 0, 0)), (0, 2, (0, 0, 0))):
+            worlds.set(worlds.state.frame, frame)
+            worlds.set(worlds.attempts.task, Task.LIFT if frame else Task.LOOK)
+            worlds.set(worlds.plan.target, target)
+            worlds.set(worlds.attempts.outcome, Outcome.NONE)
+            worlds.set(worlds.seals.attached, attached)
+            worlds.set(worlds.state.setpoint, LIFTED)
+            end(worlds)
+            counts.append(worlds.attempts.target_failures.numpy()[0].tolist())
+        assert counts == expected
 
 
 def test_a_look_that_finds_nothing_is_a_failure_a_tick_later(device):

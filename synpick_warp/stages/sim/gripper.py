@@ -52,6 +52,8 @@ def advance_tasks(scene: SceneData, state: WorldState, attempts: AttemptState, s
     sources = (scene, state, attempts, seals)
     launch(tasks.pack_attached_kernel, attempts.attached_words.shape, *sources)
     launch(tasks.advance_tasks_kernel, len(state.phase), *sources, plan)
+    if scene.tries_another:
+        launch(tasks.count_target_failures_kernel, attempts.target_failures.shape, state, attempts, plan)
     launch(tasks.end_attempts_kernel, len(state.phase), *sources, physics.state, tilt_out=physics.control.joint_target_q)
 
 
