@@ -3,7 +3,7 @@
 import warp as wp
 
 from synpick_warp.codes import Stream
-from synpick_warp.kernels.render.visibility.camera import ImageGrid, Views, in_image
+from synpick_warp.kernels.render.visibility.camera import Views
 from synpick_warp.kernels.render.visibility.gbuffer import GBuffer
 from synpick_warp.kernels.rng import stream_key, uniform_index
 from synpick_warp.kernels.structs import CupData, SuctionData
@@ -34,11 +34,17 @@ def head_span(suction: SuctionData, cups: CupData) -> float:
 
 
 @wp.func
+def lies_on(component: wp.array3d[int], view: int, pixel: wp.vec2i, other: wp.vec2i) -> bool:
+    """True if the other pixel (column, row) is in the image (view, row, column) and belongs to the same component."""
+    if other[0] < 0 or other[1] < 0 or other[0] >= component.shape[2] or other[1] >= component.shape[1]:
+        return False
+    return component[view, other[1], other[0]] == component[view, pixel[1], pixel[0]]
+
+
+@wp.func
 def measure_bump(
-    grid: ImageGrid,
     gbuffer: GBuffer,
     component: wp.array3d[int],  # (view, row, column)
-    label: int,
     view: int,
     pixel: wp.vec2i,
     radius: float,
@@ -51,15 +57,12 @@ def measure_bump(
     total = float(0.0)
     for index in range(DIAMETERS):
         angle = wp.PI * float(index) / float(DIAMETERS)
-        across = int(wp.rint(radius * wp.cos(angle)))
-        down = int(wp.rint(radius * wp.sin(angle)))
+        offset = wp.vec2i(int(wp.rint(radius * wp.cos(angle))), int(wp.rint(radius * wp.sin(angle))))
         deviation = float(OUTSIDE)
-        if in_image(grid, pixel[1] + down, pixel[0] + across) and in_image(grid, pixel[1] - down, pixel[0] - across):
-            is_on = component[view, pixel[1] + down, pixel[0] + across] == label
-            if is_on and component[view, pixel[1] - down, pixel[0] - across] == label:
-                first = gbuffer.depth[view, pixel[1] + down, pixel[0] + across]
-                second = gbuffer.depth[view, pixel[1] - down, pixel[0] - across]
-                deviation = wp.min(z * z * wp.abs(0.5 * (1.0 / first + 1.0 / second) - 1.0 / z), OUTSIDE)
+        if lies_on(component, view, pixel, pixel + offset) and lies_on(component, view, pixel, pixel - offset):
+            first = gbuffer.depth[view, pixel[1] + offset[1], pixel[0] + offset[0]]
+            second = gbuffer.depth[view, pixel[1] - offset[1], pixel[0] - offset[0]]
+            deviation = wp.min(z * z * wp.abs(0.5 * (1.0 / first + 1.0 / second) - 1.0 / z), OUTSIDE)
         total += deviation
     return total
 
@@ -70,7 +73,6 @@ def choose_flat_points_kernel(
     seed: wp.uint64,
     suction: SuctionData,
     cups: CupData,
-    grid: ImageGrid,
     least_failures: int,
     # State: worlds, attempts
     arrangement_id: wp.array[wp.vec2i],  # (world)
@@ -80,7 +82,6 @@ def choose_flat_points_kernel(
     views: Views,
     gbuffer: GBuffer,
     component: wp.array3d[int],  # (view, row, column)
-    largest: wp.array2d[int],  # (view, instance)
     distance: wp.array3d[float],  # (view, row, column) [px]
     extent: wp.array2d[wp.vec4i],  # (view, instance) [px]
     distances: wp.array2d[wp.vec3],  # (world, instance) [px]
@@ -103,14 +104,14 @@ def choose_flat_points_kernel(
     failures = target_failures[world, instance]
     if failures < least_failures:
         return
-    label = largest[view, instance]
     key = stream_key(seed, arrangement_id[world][0], arrangement_id[world][1], Stream.GRASPS)
     box = extent[view, instance]
     chosen = grasp_pixel_inout[world, instance]
+    label = component[view, chosen[1], chosen[0]]
     radius = head_span(suction, cups) * views.cameras.intrinsics[view][0]
     bump = float(DIAMETERS + 1) * OUTSIDE
     if failures == 0:
-        bump = measure_bump(grid, gbuffer, component, label, view, chosen, radius / gbuffer.depth[view, chosen[1], chosen[0]])
+        bump = measure_bump(gbuffer, component, view, chosen, radius / gbuffer.depth[view, chosen[1], chosen[0]])
     first = 2 * DRAWS * (attempt[world] + 1)
     draw = int(0)
     while draw < DRAWS and bump > FLAT:
@@ -119,7 +120,7 @@ def choose_flat_points_kernel(
         draw += 1
         if component[view, row, column] == label and distance[view, row, column] >= MARGIN * distances[world, instance][0]:
             pixel = wp.vec2i(column, row)
-            other = measure_bump(grid, gbuffer, component, label, view, pixel, radius / gbuffer.depth[view, row, column])
+            other = measure_bump(gbuffer, component, view, pixel, radius / gbuffer.depth[view, row, column])
             if other < bump:
                 bump = other
                 chosen = pixel
