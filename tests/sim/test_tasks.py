@@ -228,6 +228,33 @@ def test_failed_attempts_are_counted_by_target_if_it_is_asked(device):
         assert counts == expected
 
 
+class Hovering(gripper.TwoSpeedLaw):
+    """A law of another gripper: it begins at the grasp, and judges nothing."""
+
+    def begin(self, scene, state, attempts, plan, physics):
+        state.setpoint.assign(plan.point)
+
+    def advance(self, scene, state, attempts, plan):
+        state.setpoint.assign(state.setpoint.numpy() + np.array([0.0, 0.0, 0.01]))
+
+    def end_tick(self, scene, state, attempts, plan):
+        attempts.outcome.fill_(int(Outcome.NOTHING_CAUGHT))
+
+
+def test_the_law_of_a_gripper_replaces_the_setpoints(device):
+    worlds, law = made(device), Hovering()
+    state = (worlds.scene, worlds.state, worlds.attempts)
+    begin(worlds)
+    worlds.set(worlds.plan.target, 1)
+    worlds.physics.set_yaw = lambda yaw: None
+    gripper.begin_attempts(*state, worlds.plan, worlds.physics, law)
+    gripper.drive_gripper(*state, worlds.plan, worlds.physics, worlds.physics.state, law)
+    np.testing.assert_allclose(worlds.state.setpoint.numpy()[0], np.add(POINT, (0.0, 0.0, 0.01)), atol=1e-6)
+    worlds.set(worlds.attempts.task, Task.PRESS)
+    gripper.advance_tasks(*state, worlds.seals, worlds.plan, worlds.physics, law)
+    assert (worlds.attempts.outcome.numpy()[0], worlds.attempts.task.numpy()[0]) == (Outcome.NOTHING_CAUGHT, Task.PRESS)
+
+
 def test_a_look_that_finds_nothing_is_a_failure_a_tick_later(device):
     worlds = made(device)
     begin(worlds)

@@ -70,6 +70,7 @@ FREE_SETTINGS = (
     "bake.writers",
     "render.views_per_batch",
     "perception.views",
+    "gripper.mesh",
 )
 """Settings that may differ when a bake is resumed: no episode depends on them. Objects, lights, textures and meshes of bins are compared by
 content, not by the name of their file or folder. A device of another type computes the same episodes up to rounding."""
@@ -101,6 +102,8 @@ YOUNGER_SETTINGS: dict[str, Any] = {
     "gripper.kind": SUCTION1,
     "gripper.cups": (),
     "gripper.valve": EACH,
+    "gripper.mesh_unit": "m",
+    "gripper.mesh_checksum": "",
     "objects.unit": AUTO_UNIT,
     "objects.symmetries": Objects().symmetries,
     "objects.symmetry_tolerance": Objects().symmetry_tolerance,

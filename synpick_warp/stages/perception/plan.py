@@ -98,8 +98,6 @@ class GraspPlanner:
             self.choose_flat_points(scene, state, attempts, observation, plan, seed)
         self.smooth_normal(scene, observation, plan)
         self.frame_grasp(scene, observation, plan)
-        if scene.cups.count > 1:
-            self.align_cups(scene, plan)
 
     def bound_contours(self, scene: SceneData, state: WorldState, observation: Observation) -> None:
         """Compute each contour's bounding box, and its instance's reach."""
@@ -155,4 +153,5 @@ class GraspPlanner:
 
     def align_cups(self, scene: SceneData, plan: Plan) -> None:
         """Turn the gripper about the grasp point, so that as many cups as possible lie on the target."""
-        launch(align_cups_kernel, self.views, scene, plan, *self._sources, block_dim=VIEW_BLOCK)
+        if scene.cups.count > 1:
+            launch(align_cups_kernel, self.views, scene, plan, *self._sources, block_dim=VIEW_BLOCK)
