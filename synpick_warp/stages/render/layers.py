@@ -103,7 +103,7 @@ class LayerRenderer:
         motion = [scene.grid, snapshot.follows, self.motions, gbuffer, views]
         objects = [scene.meshes, scene.grid, scene.obj_id, bodies, gbuffer, views]
         classes = [scene.grid, scene.obj_id, bodies, gbuffer, views]
-        wrench = [scene.meshes, scene.surfaces, scene.grid, scene.obj_id, scene.suction, bodies, gbuffer, views]
+        wrench = [scene.meshes, scene.surfaces, scene.grid, scene.obj_id, scene.suction_maps, bodies, gbuffer, views]
         seal = [*wrench[:5], scene.table, *wrench[5:]]
         count = views.count
         launches = {

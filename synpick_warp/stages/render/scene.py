@@ -64,7 +64,7 @@ class RenderScene:
     """Owners of the meshes whose handles `meshes` holds."""
     looks: Looks | None = None
     """What episodes draw their looks from; the textures' materials are the last rows of `surfaces`."""
-    suction: Any = None
+    suction_maps: Any = None
     """The struct `SuctionScene`: cup and centres of mass, of the layers `suction_seal` and `suction_wrench`."""
 
     @property
@@ -385,5 +385,5 @@ def build_render_scene(
         device=device,
         keep=keep,
         looks=looks,
-        suction=suction,
+        suction_maps=suction,
     )
