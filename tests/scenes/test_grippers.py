@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,11 +12,12 @@ import trimesh
 from synpick_warp.configs.cell.gripper import GRIPPERS
 from synpick_warp.configs.files.load import load_config
 from synpick_warp.configs.files.write import config_to_toml
-from synpick_warp.dataset.commit.manifest import make_manifest
+from synpick_warp.dataset.commit.manifest import describe_differences, make_manifest
 from synpick_warp.errors import ConfigError
 from synpick_warp.scenes.assets.meshes import merge_positions, signed_volume
 from synpick_warp.scenes.bin_meshes.loading import load_settings
 from synpick_warp.scenes.grippers.registry import HEADS, check_reach, make_head
+from synpick_warp.scenes.grippers.tool_mesh import measure_tool
 from synpick_warp.stages.sim.behavior import BEHAVIORS
 from tests.scenes.test_tote_gripper import UP, convex, felt
 from tests.twins.rays import edges_match, first_hit
@@ -66,6 +68,8 @@ def test_a_mesh_is_the_body_of_a_tool(tmp_path):
     beam_file(tmp_path, half=90.0)
     with pytest.raises(ConfigError, match=r"^gripper.mesh: \S*beam.stl is not the mesh that was measured; restore it[^\n]*$"):
         make_head(gripper)
+    other = replace(config, **measure_tool(gripper))
+    assert describe_differences(make_manifest(other), make_manifest(config)).startswith("gripper.mesh_checksum is ")
 
 
 @pytest.mark.parametrize(

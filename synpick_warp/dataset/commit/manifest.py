@@ -72,8 +72,8 @@ FREE_SETTINGS = (
     "perception.views",
     "gripper.mesh",
 )
-"""Settings that may differ when a bake is resumed: no episode depends on them. Objects, lights, textures and meshes of bins are compared by
-content, not by the name of their file or folder. A device of another type computes the same episodes up to rounding."""
+"""Settings that may differ when a bake is resumed: no episode depends on them. Objects, lights, textures and meshes of bins and gripper are
+compared by content, not by the name of their file or folder. A device of another type computes the same episodes up to rounding."""
 
 
 YOUNGER_SETTINGS: dict[str, Any] = {
