@@ -36,18 +36,17 @@ def widen(images: ViewBuffers) -> ViewBuffers:
     """The same buffers with a pool that is divided among fewer views, all of whose masks may be as large as the image."""
     height, width = images.instance.shape[1:]
     share = images.mask_first.shape[1] * most_words(width, height)
-    views = images.mask_words.size // share
-    return replace(images, mask_words=images.mask_words.flatten()[: views * share].reshape((views, share)))
+    pool: Any = images.mask_words.flatten()
+    views = pool.size // share
+    return replace(images, mask_words=pool[: views * share].reshape((views, share)))
 
 
 @dataclass(frozen=True, eq=False)
 class MaskBounds:
-    """Upper bounds of the words of views, by the spheres around the objects' bounding boxes; for cameras without lenses."""
+    """Upper bounds of the words of views, by spheres about the objects' origins that hold their boxes; for cameras without lenses."""
 
-    center: np.ndarray
-    """Centre of each object's bounding box (entry, 3) [m]."""
     radius: np.ndarray
-    """Half of its diagonal, and behind the objects a negative number for none (entry + 1) [m]."""
+    """Radius of each object's sphere, and behind them a negative number for none (entry + 1) [m]."""
     cameras: Mapping[str, np.ndarray]
     """Matrices and poses of the cameras, by CAMERA_KEYS (slot, ...)."""
     size: tuple[int, int]
@@ -56,10 +55,9 @@ class MaskBounds:
     @classmethod
     def of(cls, meshes: Any, cameras: Sequence[Camera]) -> MaskBounds:
         """Bounds for the objects of the struct `Meshes`, and the cameras of a group."""
-        lower, upper = (array.numpy()[: meshes.entries].astype(np.float64) for array in (meshes.lower, meshes.upper))
-        radius = np.append(0.5 * np.linalg.norm(upper - lower, axis=1), -1.0)
+        corner = np.abs(np.stack((meshes.lower.numpy(), meshes.upper.numpy()))).max(axis=0)[: meshes.entries].astype(np.float64)
         placed = {key: np.stack([getattr(camera, key) for camera in cameras]) for key in CAMERA_KEYS}
-        return cls(0.5 * (lower + upper), radius, placed, (cameras[0].width, cameras[0].height))
+        return cls(np.append(np.linalg.norm(corner, axis=1), -1.0), placed, (cameras[0].width, cameras[0].height))
 
     def count_words(self, index: np.ndarray, pose: np.ndarray, cameras: Mapping[str, np.ndarray]) -> np.ndarray:
         """Upper bound of the words of each view's masks (B) int64.
@@ -70,8 +68,7 @@ class MaskBounds:
             cameras: Matrix and pose of each view's camera, by CAMERA_KEYS (B, ...).
         """
         matrix, rotation, translation = (cameras[key] for key in CAMERA_KEYS)
-        center = rotate(pose[..., 3:].astype(np.float64), np.vstack((self.center, np.zeros(3)))[index]) + pose[..., :3]
-        x, y, z = np.moveaxis(center @ rotation.swapaxes(1, 2) + translation[:, None], -1, 0)
+        x, y, z = np.moveaxis(pose[..., :3] @ rotation.swapaxes(1, 2) + translation[:, None], -1, 0)
         radius = self.radius[index]
         near = np.maximum(z - radius, NEAR_PLANE)
         far = np.maximum(z + radius, near)
@@ -86,13 +83,6 @@ class MaskBounds:
         is_before = z - radius > 2.0 * NEAR_PLANE
         words = np.where(is_before, columns * -(-rows // MASK_ROWS), most_words(*self.size))
         return np.where((radius < 0) | (z + radius <= 0), 0, words).sum(axis=1)
-
-
-def rotate(quaternion: np.ndarray, vector: np.ndarray) -> np.ndarray:
-    """Rotate vectors (..., 3) by quaternions x, y, z, w (..., 4), which are normalised."""
-    unit = quaternion / np.maximum(np.linalg.norm(quaternion, axis=-1, keepdims=True), np.finfo(float).tiny)
-    twice = 2.0 * np.cross(unit[..., :3], vector)
-    return vector + unit[..., 3:] * twice + np.cross(unit[..., :3], twice)
 
 
 def split_batches(words: np.ndarray, share: int, views: int, wide: int) -> Iterator[tuple[slice, bool]]:
