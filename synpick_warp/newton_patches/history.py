@@ -39,6 +39,9 @@ ROW_FAMILIES = ("", "mf_", "propagation_")
 STEP_COUNTERS = ("_ws_history_dt", "_ws_history_generation", "_ws_history_stream")
 """Which step the history is of, the same for all worlds."""
 
+CONTACT_BYTES = sum(wp.types.type_size_in_bytes(member.type.dtype) for member in kernels.ContactHistory.vars.values())
+"""Size of a contact in its history [bytes]."""
+
 
 @dataclass(frozen=True, eq=False)
 class SavedContacts:

@@ -150,13 +150,13 @@ def check_branches(simulation: Simulation, few: Simulation, states: int, moments
 def choose_worlds(simulation: Simulation, count: int, moments: Counter[str]) -> list[int]:
     """Worlds with an episode, at moments that were chosen least often so far, which are counted."""
     state, task = simulation.state, simulation.attempts.task.numpy()
-    phase, progress, removed = state.phase.numpy(), state.progress.numpy(), simulation.attempts.removed.numpy().any(axis=1)
+    phase, progress, removed = state.phase.numpy(), state.progress.numpy(), simulation.attempts.removed.numpy()
     mode, names = state.mode.numpy(), {}
     for world in np.flatnonzero((phase == Phase.SETTLE) | (phase == Phase.ACT)):
         name = "settling" if progress[world][3] else "settling without guide walls"
         if phase[world] == Phase.ACT:
             name = Task(int(task[world])).name.lower() if task[world] else "moving"
-            name += " after a removal" if removed[world] else ""
+            name += " after a removal" if removed[world].any() else ""
         name += ", dropped again" if progress[world][2] else ""
         names[int(world)] = f"{Mode(int(mode[world])).name.lower()}: {name}"
     chosen: list[int] = []
@@ -275,8 +275,9 @@ def find_arrays(root: object) -> dict[str, wp.array]:
 
 def overlap(one: wp.array, other: wp.array) -> bool:
     """Whether two arrays share memory."""
+    first, second = (int(array.ptr or 0) for array in (one, other))
     sizes = [array.size * wp.types.type_size_in_bytes(array.dtype) for array in (one, other)]
-    return one.ptr < other.ptr + sizes[1] and other.ptr < one.ptr + sizes[0]
+    return first < second + sizes[1] and second < first + sizes[0]
 
 
 def overwrite(array: wp.array, elements: np.ndarray, older: np.ndarray) -> None:

@@ -122,5 +122,12 @@ def begin_attempts(
 ) -> None:
     """Begin the planned attempts: place the gripper where the approach begins, with the planned yaw and tilt."""
     launch(tasks.begin_attempts_kernel, len(state.phase), state, attempts, plan)
+    place_grippers(scene, state, attempts, plan, physics, law)
+
+
+def place_grippers(
+    scene: SceneData, state: WorldState, attempts: AttemptState, plan: Plan, physics: Physics, law: SetpointLaw = TWO_SPEEDS
+) -> None:
+    """Place the gripper where task APPROACH begins, with the planned yaw and tilt."""
     law.begin(scene, state, attempts, plan, physics)
     physics.set_yaw(plan.yaw)

@@ -118,12 +118,12 @@ class Simulation:
             state = (self.scene, self.state, self.attempts, self.observation, self.plan)
             self.perception = Perception(config.perception, config.rig, config.bake.seed, render_scene, *state, self.behavior.choose_grasps)
 
-    def tick(self) -> None:
-        """Advance all worlds by one tick; `record` has its output."""
-        for _ in self.tick_parts():
+    def tick(self, perceives: bool = True) -> None:
+        """Advance all worlds by one tick; `record` has its output. `perceives`: False: worlds whose task is LOOK wait."""
+        for _ in self.tick_parts(perceives):
             pass
 
-    def tick_parts(self) -> Iterator[None]:
+    def tick_parts(self, perceives: bool = True) -> Iterator[None]:
         """Advance all worlds by one tick: a generator that yields after episodes are started and after each substep of physics.
 
         The caller can enqueue other work on other streams between.
@@ -146,7 +146,7 @@ class Simulation:
             self._take_snapshot()
             if self.recorder is not None:
                 self.recorder.end_tick()
-        if self.perception is not None:
+        if self.perception is not None and perceives:
             with scope("perceive", self.device):
                 self.perception.perceive(self.record.snapshot)
                 gripper.begin_attempts(self.scene, self.state, self.attempts, self.plan, self.physics, self.behavior.law)

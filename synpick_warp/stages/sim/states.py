@@ -18,7 +18,7 @@ import warp as wp
 from synpick_warp.codes import Lost
 from synpick_warp.errors import StateError
 from synpick_warp.kernels import world_rows
-from synpick_warp.newton_patches.history import ROW_ARRAYS, History, SavedContacts
+from synpick_warp.newton_patches.history import CONTACT_BYTES, ROW_ARRAYS, History, SavedContacts
 from synpick_warp.scenes.types import Catalog
 from synpick_warp.stages.arrays import ArraySpec
 from synpick_warp.stages.sim.physics import Physics
@@ -88,7 +88,7 @@ class WorldStates:
         addresses, strides, first = [], [], 0
         for name, array in named.items():
             self.fields[name] = field = _describe(name, array, self.worlds, first)
-            addresses.append(array.ptr + WORD * np.arange(field.words, dtype=np.uint64))
+            addresses.append(np.uint64(array.ptr or 0) + WORD * np.arange(field.words, dtype=np.uint64))
             strides.append(np.full(field.words, WORD * field.words))
             first += field.words
         self._arrays, self.words = list(named.values()), first
@@ -112,7 +112,7 @@ class WorldStates:
         Raises:
             StateError: Memory is too short.
         """
-        each = WORD * self.words + self.contact_capacity * _contact_bytes()
+        each = WORD * self.words + self.contact_capacity * CONTACT_BYTES
         free = free_device_memory(self.device) if self.device.is_cuda else free_host_memory()
         if rows * each > free:
             need, most = rows * each / 1e9, free // each
@@ -265,10 +265,3 @@ def _describe(name: str, array: wp.array, worlds: int, first: int) -> Field:
     if array.shape[0] % worlds or not array.is_contiguous or field.dtype.itemsize % WORD:
         raise ValueError(f"{name} does not hold whole words of each of {worlds} worlds")
     return field
-
-
-def _contact_bytes() -> int:
-    """Size of a contact in a state [bytes]."""
-    from synpick_warp.kernels.newton_patches.contact_history import ContactHistory
-
-    return sum(wp.types.type_size_in_bytes(member.type.dtype) for member in ContactHistory.vars.values())
