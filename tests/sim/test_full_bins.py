@@ -66,7 +66,12 @@ def test_a_full_bin_rests_within_its_walls_and_capacities(device, shape):
 @pytest.mark.slow
 def test_bytes_of_full_bins_do_not_depend_on_worlds(tmp_path):
     """Three episodes of 40 boxes, with masks of each."""
-    fill = {"arrangement.counts": [["boxes_1", 40, 40]], "arrangement.max_objects": 40, "arrangement.drop": "layers", "settle.restless": 0.5}
+    fill = {
+        "arrangement.counts": [["boxes_1", 40, 40]],
+        "arrangement.max_objects": 40,
+        "arrangement.drop": "layers",
+        "settle.restless": 0.5,
+    }
     given = STIRRING | fill | {"bake.episodes": 3, "bake.formats": ["bop", "usd", "zarr"], "cameras.resolution": [48, 27]}
     found = []
     for worlds in (1, 2, 8):
