@@ -175,7 +175,7 @@ def test_whole_numbers_are_allowed_for_floats():
             "render.layers",
             ["flow", "normal"],
             'render.layers is ["flow", "normal"] on the command line; allowed: any of normals, albedo, nocs, classes, flow, scene_flow, '
-            "depth_sensor, ir_left, ir_right, depth_stereo; did you mean normals?",
+            "depth_sensor, ir_left, ir_right, depth_stereo, suction_seal, suction_wrench; did you mean normals?",
         ),
         ("render.layers", "flow", 'render.layers is "flow" on the command line; allowed: a list of strings'),
         ("tote.color", [0.5, 0.5, 1.5], "tote.color is [0.5, 0.5, 1.5] on the command line; allowed: each at least 0, at most 1 [sRGB]"),

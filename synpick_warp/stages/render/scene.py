@@ -324,6 +324,14 @@ def shadowed_lamps(settings: schema.Render) -> int:
     return min(settings.lamps, 1) if settings.mode == schema.UNOCCLUDED else settings.lamps
 
 
+def build_suction_scene(catalog: Catalog, radius: float, device: wp.Device) -> Any:
+    """The struct `SuctionScene` of a cup of `radius` [m]."""
+    suction = SuctionScene()
+    suction.radius = radius
+    suction.center_of_mass = wp.array([entry.center_of_mass for entry in catalog.bodies], dtype=wp.vec3, device=device)
+    return suction
+
+
 def build_render_scene(
     settings: schema.Render,
     table_height: float,
@@ -369,9 +377,6 @@ def build_render_scene(
     paths.surfaces = build_surfaces(shapes, materials, device)
     paths.lights = build_lights(lights, ground, settings.exposure, device, shadowed_lamps(settings))
     paths.cdf = build_environment_cdf(paths.lights.radiance.numpy()[..., :3], device, settings.table)
-    suction = SuctionScene()
-    suction.radius = cup_radius
-    suction.center_of_mass = wp.array([entry.center_of_mass for entry in catalog.bodies], dtype=wp.vec3, device=device)
     return RenderScene(
         meshes=meshes,
         surfaces=paths.surfaces,
@@ -385,5 +390,5 @@ def build_render_scene(
         device=device,
         keep=keep,
         looks=looks,
-        suction_maps=suction,
+        suction_maps=build_suction_scene(catalog, cup_radius, device),
     )
