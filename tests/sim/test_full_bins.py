@@ -66,13 +66,9 @@ def test_a_full_bin_rests_within_its_walls_and_capacities(device, shape):
 @pytest.mark.slow
 def test_bytes_of_full_bins_do_not_depend_on_worlds(tmp_path):
     """Three episodes of 40 boxes, with masks of each."""
-    fill = {
-        "arrangement.counts": [["boxes_1", 40, 40]],
-        "arrangement.max_objects": 40,
-        "arrangement.drop": "layers",
-        "settle.restless": 0.5,
-    }
-    given = STIRRING | fill | {"bake.episodes": 3, "bake.formats": ["bop", "usd", "zarr"], "cameras.resolution": [48, 27]}
+    fill = {"counts": [["boxes_1", 40, 40]], "max_objects": 40, "drop": "layers"}
+    given = STIRRING | {f"arrangement.{name}": value for name, value in fill.items()} | {"settle.restless": 0.5}
+    given |= {"bake.episodes": 3, "bake.formats": ["bop", "usd", "zarr"], "cameras.resolution": [48, 27]}
     found = []
     for worlds in (1, 2, 8):
         bake_boxes(tmp_path / str(worlds), given | {"bake.worlds": worlds}, objects=lambda: catalog(BOX))
