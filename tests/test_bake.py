@@ -271,8 +271,9 @@ FOUR_CUPS = PICKED | {
     "gripper.cups": [[0.03, 0.02], [-0.03, 0.02], [-0.03, -0.02], [0.03, -0.02]],
     "gripper.cup_width": 0.03,
     "arrangement.volume": 4e-3,
-    "bake.episodes": 3,
     "bake.formats": ["bop", "zarr"],
+    "render.mode": "unoccluded",
+    "render.layers": [],
 }
 
 

@@ -9,6 +9,7 @@ import re
 import tomllib
 from collections.abc import Iterator
 from pathlib import Path
+from typing import NamedTuple
 
 import pytest
 
@@ -32,9 +33,26 @@ def sources() -> Iterator[Path]:
         yield from (path for path in sorted((ROOT / folder).rglob("*.py")) if path.resolve() == path)
 
 
+class Module(NamedTuple):
+    """What rules ask of a file, whose syntax tree is too large to keep."""
+
+    documented: bool
+    postponed: bool
+    """Annotations are."""
+    code: bool
+    """It has functions or classes."""
+    functions: tuple[tuple[int, str, int], ...]
+    """First line, name and number of lines."""
+
+
 @functools.cache
-def parsed(path: Path) -> ast.Module:
-    return ast.parse(path.read_text())
+def parsed(path: Path) -> Module:
+    tree = ast.parse(path.read_text())
+    postponed = any(isinstance(node, ast.ImportFrom) and node.module == "__future__" for node in tree.body)
+    code = any(isinstance(node, ast.FunctionDef | ast.ClassDef) for node in tree.body)
+    functions = [node for node in ast.walk(tree) if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef)]
+    sizes = tuple((node.lineno, node.name, (node.end_lineno or node.lineno) - node.lineno + 1) for node in functions)
+    return Module(ast.get_docstring(tree) is not None, postponed, code, sizes)
 
 
 def ignored(name: str) -> bool:
@@ -69,30 +87,23 @@ def test_files_are_short():
 
 
 def test_functions_are_short():
-    long = {}
-    for path in sources():
-        for node in ast.walk(parsed(path)):
-            if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
-                length = (node.end_lineno or node.lineno) - node.lineno + 1
-                if length > MAX_FUNCTION_LINES:
-                    long[f"{path.relative_to(ROOT)}:{node.lineno} {node.name}"] = length
+    long = {
+        f"{path.relative_to(ROOT)}:{line} {name}": length
+        for path in sources()
+        for line, name, length in parsed(path).functions
+        if length > MAX_FUNCTION_LINES
+    }
     assert long == {}
 
 
 def test_every_module_says_what_it_is_for():
     modules = [path for path in sources() if path.relative_to(ROOT).parts[0] != "tests"]
-    assert [str(path.relative_to(ROOT)) for path in modules if ast.get_docstring(parsed(path)) is None] == []
+    assert [str(path.relative_to(ROOT)) for path in modules if not parsed(path).documented] == []
 
 
 def test_host_code_postpones_annotations():
-    lacking = []
-    for path in sources():
-        body = parsed(path).body
-        postponed = any(isinstance(node, ast.ImportFrom) and node.module == "__future__" for node in body)
-        code = any(isinstance(node, ast.FunctionDef | ast.ClassDef) for node in body)
-        if code and not postponed and path.relative_to(ROOT).parts[0] not in ("kernels", "tests"):
-            lacking.append(str(path.relative_to(ROOT)))
-    assert lacking == []
+    host = [path for path in sources() if path.relative_to(ROOT).parts[0] not in ("kernels", "tests")]
+    assert [str(path.relative_to(ROOT)) for path in host if parsed(path).code and not parsed(path).postponed] == []
 
 
 def test_nobodys_own_paths_are_in_the_tree():

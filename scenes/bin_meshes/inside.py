@@ -88,20 +88,21 @@ class Surface:
 
 def subdivide(corners: np.ndarray, longest: float) -> tuple[np.ndarray, np.ndarray]:
     """Bisect the longest edges of triangles (F, 3, 3) until none exceeds `longest`; returns the triangles, and the given one of each."""
-    owner = np.arange(len(corners))
-    done, owners = [], []
-    while len(corners):
-        lengths = np.linalg.norm(corners - np.roll(corners, -1, axis=1), axis=2)
-        small = lengths.max(axis=1) <= longest
-        done.append(corners[small])
-        owners.append(owner[small])
-        rest, owner = corners[~small], owner[~small]
-        first = lengths[~small].argmax(axis=1)
-        a, b, c = (np.take_along_axis(rest, ((first + k) % 3)[:, None, None], axis=1)[:, 0] for k in range(3))
+    owner, done, owners = np.arange(len(corners)), [], []
+    corners = np.ascontiguousarray(corners.transpose(1, 2, 0))  # corner, coordinate, triangle
+    while len(owner):
+        squares = (corners - corners[[1, 2, 0]]) ** 2
+        lengths = np.sqrt(squares[:, 0] + squares[:, 1] + squares[:, 2])
+        large = lengths.max(axis=0) > longest
+        done.append(corners[..., ~large])
+        owners.append(owner[~large])
+        corners, owner = corners[..., large], owner[large]
+        first = lengths[:, large].argmax(axis=0)
+        a, b, c = (np.where(first == 0, corners[k], np.where(first == 1, corners[k - 2], corners[k - 1])) for k in range(3))
         middle = (a + b) / 2.0
-        corners = np.concatenate([np.stack([a, middle, c], axis=1), np.stack([middle, b, c], axis=1)])
+        corners = np.concatenate([np.stack([a, middle, c]), np.stack([middle, b, c])], axis=2)
         owner = np.concatenate([owner, owner])
-    return np.concatenate(done), np.concatenate(owners)
+    return np.concatenate(done, axis=2).transpose(2, 0, 1), np.concatenate(owners)
 
 
 def find_inside(corners: np.ndarray, count: int = CELLS) -> Surface | None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import cache
+
 import numpy as np
 
 from synpick_warp.scenes.environment import map_directions
@@ -13,8 +15,9 @@ HEIGHT = 128
 Rgb = tuple[float, float, float]
 
 
+@cache
 def skies() -> tuple[EnvironmentMap, ...]:
-    """Make the embedded environment maps, sorted by name; deterministic."""
+    """Make the embedded environment maps, sorted by name; deterministic, once a process, so read only."""
     view, _ = map_directions(HEIGHT)
     functions = {
         "low_sun": _low_sun,
@@ -24,7 +27,10 @@ def skies() -> tuple[EnvironmentMap, ...]:
         "warehouse": _warehouse,
         "window": _window,
     }
-    return tuple(EnvironmentMap(name, np.maximum(make(view), 0.0).astype(np.float32)) for name, make in sorted(functions.items()))
+    maps = {name: np.maximum(make(view), 0.0).astype(np.float32) for name, make in sorted(functions.items())}
+    for radiance in maps.values():
+        radiance.flags.writeable = False
+    return tuple(EnvironmentMap(name, radiance) for name, radiance in maps.items())
 
 
 def _overcast(view: np.ndarray) -> np.ndarray:

@@ -15,6 +15,8 @@ from synpick_warp.scenes.build import GRIPPER_BODIES
 from synpick_warp.scenes.types import Catalog
 from synpick_warp.stages.sim.simulate import Simulation
 from synpick_warp.system.progress import SilentProgress
+from tests.builders import STIRRING, bake_boxes
+from tests.harness.exporter_contract import digests
 from tests.worlds.small_worlds import ANGLE, BOX, COARSE, catalog, run_ticks, settings
 
 TICKS = 80
@@ -59,3 +61,18 @@ def test_a_full_bin_rests_within_its_walls_and_capacities(device, shape):
     physics = simulation.physics
     assert 60 < int(physics.contacts.rigid_contact_count.numpy()[0]) < config.physics.contacts_per_world
     assert 60 < int(physics.overlap_count.numpy()[0]) < config.physics.pairs_per_world
+
+
+@pytest.mark.slow
+def test_bytes_of_full_bins_do_not_depend_on_worlds(tmp_path):
+    """Three episodes of 40 boxes, with masks of each."""
+    fill = {"counts": [["boxes_1", 40, 40]], "max_objects": 40, "drop": "layers"}
+    given = STIRRING | {f"arrangement.{name}": value for name, value in fill.items()} | {"settle.restless": 0.5}
+    given |= {"bake.episodes": 3, "bake.formats": ["bop", "usd", "zarr"], "cameras.resolution": [48, 27]}
+    found = []
+    for worlds in (1, 2, 8):
+        bake_boxes(tmp_path / str(worlds), given | {"bake.worlds": worlds}, objects=lambda: catalog(BOX))
+        files = digests(tmp_path / str(worlds)).items()
+        found.append({name: digest for name, digest in files if not name.endswith(("config.toml", "manifest.json"))})
+    assert found[0] == found[1] == found[2]
+    assert len(found[0]) > 300

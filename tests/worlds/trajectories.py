@@ -67,24 +67,29 @@ def config(**trajectory: Any) -> Config:
 
 def ticks(episodes: tuple[int, ...], frames: int, steps: bool = True) -> Iterator[TickBatch]:
     """Like `box_views.ticks` for all episodes in parallel, with physics arrays."""
-    for batch in box_views.ticks(len(episodes), episodes, frames):
-        rows = [_physics(int(episode), int(frame), steps) for episode, frame in zip(batch.episode, batch.frame, strict=True)]
-        parts = [{name: np.stack([row[part][name] for row in rows]) for name in rows[0][part]} for part in range(2)]
-        yield dataclasses.replace(batch, tick=parts[0], steps=parts[1])
+    yield from (with_physics(batch, steps) for batch in box_views.ticks(len(episodes), episodes, frames))
 
 
-def _physics(episode: int, frame: int, steps: bool) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
+def with_physics(batch: TickBatch, steps: bool = True) -> TickBatch:
+    """A batch with physics arrays."""
+    room, names = batch.pose.shape[1], zip(batch.episode, batch.frame, strict=True)
+    rows = [_physics(int(episode), int(frame), steps, room) for episode, frame in names]
+    parts = [{name: np.stack([row[part][name] for row in rows]) for name in rows[0][part]} for part in range(2)]
+    return dataclasses.replace(batch, tick=parts[0], steps=parts[1])
+
+
+def _physics(episode: int, frame: int, steps: bool, room: int) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
     numbers = np.random.default_rng((episode, frame))
     own = {item.name for item in dataclasses.fields(TickBatch)}
-    tick = {name: _random_array(numbers, spec) for name, spec in TICKS.arrays.items() if name not in own}
-    drops = np.random.default_rng(episode).normal(size=(box_views.ROOM, 7)).astype(np.float32)
+    tick = {name: _random_array(numbers, spec, room) for name, spec in TICKS.arrays.items() if name not in own}
+    drops = np.random.default_rng(episode).normal(size=(room, 7)).astype(np.float32)
     tick |= {"mode": np.int32(1), "redrops": np.int32(episode), "drop_pose": drops}
-    step_arrays = {name: _random_array(numbers, spec) for name, spec in STEPS.arrays.items() if name not in COMPUTED} if steps else {}
-    return tick, step_arrays
+    stepped = {name: _random_array(numbers, spec, room) for name, spec in STEPS.arrays.items() if name not in COMPUTED} if steps else {}
+    return tick, stepped
 
 
-def _random_array(numbers: np.random.Generator, spec: ArraySpec) -> np.ndarray:
-    shape = spec.shape({"tick": 1, "step": STEP_COUNT, "instance": box_views.ROOM})
+def _random_array(numbers: np.random.Generator, spec: ArraySpec, room: int) -> np.ndarray:
+    shape = spec.shape({"tick": 1, "step": STEP_COUNT, "instance": room})
     shape = shape[1:] if spec.dims[0] == "tick" else shape
     kind = np.dtype(spec.dtype)
     if kind.kind == "f":

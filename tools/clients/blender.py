@@ -22,7 +22,7 @@ BOUNDS = {"object_to_world": 2e-6, "camera_to_world": 2e-6, "focal": 1e-3}
 """32-bit matrices [m]; focal length in pixels."""
 WIDTH = 320
 """Width of the picture [px]."""
-PATHS = 48
+PATHS = 192
 """Cycles' samples a pixel."""
 SHOULDER_START = 0.6
 """Knee of the tone curve (kernels/render/images/postprocess.py)."""

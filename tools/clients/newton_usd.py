@@ -31,9 +31,10 @@ def read(place: Path, data: Path, sources: Sources) -> Reading:
 
         builder = newton.ModelBuilder()
         builder.add_usd(str(place))
-    poses = {label: pose for label, pose in zip(builder.body_label, builder.body_q, strict=True) if "/Objects/" in label}
-    values = {"instance_id": np.array(sorted(int(label.rpartition("_")[2]) for label in poses))}
-    values["object_to_world"] = np.array([pose_matrix(np.array(poses[label])) for label in sorted(poses)])
+    bodies = zip(builder.body_label, builder.body_q, strict=True)
+    poses = {int(label.rpartition("_")[2]): pose for label, pose in bodies if "/Objects/" in label}
+    values = {"instance_id": np.array(sorted(poses))}
+    values["object_to_world"] = np.array([pose_matrix(np.array(poses[index])) for index in sorted(poses)])
     return Reading(f"{place.parent.name}/{place.name}: {builder.body_count} bodies, {builder.shape_count} shapes", values)
 
 

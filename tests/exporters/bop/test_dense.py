@@ -1,4 +1,4 @@
-"""Views of 200 instances in BOP's formats and COCO: read back by their clients, from lists and from words, and checked in float64."""
+"""A tick and views of 200 instances in all formats: read back by their clients, from lists and from words, and checked in float64."""
 
 from __future__ import annotations
 
@@ -11,7 +11,9 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import pyarrow.parquet as parquet
 import pytest
+import zarr
 from pycocotools import mask as coco_mask
 from pycocotools.coco import COCO
 
@@ -21,13 +23,19 @@ from synpick_warp.exporters.bop.coco.exporter import CocoExporter
 from synpick_warp.exporters.bop.exporter import BopExporter
 from synpick_warp.exporters.bop.shards.exporter import ShardsExporter
 from synpick_warp.exporters.bop.yolo.exporter import YoloExporter
+from synpick_warp.exporters.lerobot.exporter import LerobotExporter
+from synpick_warp.exporters.trajectory.exporter import TrajectoryExporter
+from synpick_warp.exporters.usd.exporter import UsdExporter
 from synpick_warp.system.hardware.device import pick_device
 from tests.harness.devices import default_device
 from tests.harness.exporter_contract import digests, exporting, finish
 from tests.twins.masks import masks_of_batch
-from tests.worlds.box_views import cameras, config, ends
+from tests.worlds import trajectories
+from tests.worlds.box_views import cameras, ends, ticks
 from tests.worlds.dense_views import dense_batch, dense_toy
 from tools.checks import dataset as check
+from tools.clients import newton_usd
+from tools.clients.base import Sources, pose_matrix
 
 COUNT = 200
 LENSES = cameras(240, 180)
@@ -46,9 +54,11 @@ def masks(batch) -> list[np.ndarray]:
 
 def write(kind: type, out: Path, batch) -> Path:
     """A data set of one frame."""
-    settings = dataclasses.replace(config(), arrangement=Arrangement(max_objects=MAX_INSTANCES))
+    settings = dataclasses.replace(trajectories.config(), arrangement=Arrangement(max_objects=MAX_INSTANCES))
+    tick = dataclasses.replace(next(ticks(1, (0,), 1)), object_id=batch.object_id[:1], pose=batch.pose[:1])
     with exporting(kind, out, settings, 0, LENSES) as exporter:
         exporter.write_constants()
+        exporter.write_ticks(trajectories.with_physics(tick))
         exporter.write_views(batch)
         exporter.end_episode(ends((0,), 1)[0], lambda: None)
         finish(exporter)
@@ -111,3 +121,32 @@ def test_run_lengths_of_shards_are_the_masks(batch, masks, tmp_path):
         for index, record in records.items():
             decoded = coco_mask.decode(coco_mask.frPyObjects(record, *record["size"]))
             np.testing.assert_array_equal(decoded, expected[int(index)])
+
+
+def read_zarr(out: Path) -> tuple[np.ndarray, np.ndarray]:
+    """Instances and poses (N, 4, 4) in the first tick of the zarr store."""
+    tick = zarr.open_group(out / "trajectory.zarr", mode="r")["episodes/000000/ticks"]
+    present = np.flatnonzero(tick["object_id"][0] >= 0)
+    return present, np.array([pose_matrix(pose) for pose in tick["pose"][0][present]])
+
+
+def read_usd(out: Path) -> tuple[np.ndarray, np.ndarray]:
+    """Instances and poses (N, 4, 4) of the bodies that Newton imports."""
+    values = newton_usd.read(out / "usd" / "000000.usdc", out, Sources()).values
+    return values["instance_id"], values["object_to_world"]
+
+
+@pytest.mark.parametrize(("kind", "read"), [(TrajectoryExporter, read_zarr), (UsdExporter, read_usd)])
+def test_stores_of_trajectories_have_every_body(batch, tmp_path, kind, read):
+    present, poses = read(write(kind, tmp_path / "set", batch))
+    assert present.tolist() == list(range(COUNT))
+    np.testing.assert_allclose(poses, [pose_matrix(pose) for pose in batch.pose[0, :COUNT]], atol=1e-6)
+
+
+def test_lerobot_has_gripper_and_pictures_without_instances(batch, tmp_path):
+    root = write(LerobotExporter, tmp_path / "set", batch) / "lerobot"
+    features = json.loads((root / "meta" / "info.json").read_text())["features"]
+    numbers = {name: one["shape"] for name, one in features.items() if one["dtype"] != "video"}
+    assert max(map(max, numbers.values())) == len(parquet.read_table(root / "data").to_pylist()[0]["observation.state"]) == 9
+    assert len(features) - len(numbers) == len(LENSES)
+    assert not [name for name in features if "mask" in name or "instance" in name]
