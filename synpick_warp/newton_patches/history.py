@@ -15,6 +15,7 @@ import warp as wp
 from newton._src.geometry.contact_data import CONTACT_SORT_MAX_SHAPE_INDEX_BITS
 from newton._src.solvers.steel import friction_patches
 
+from synpick_warp.errors import StateError
 from synpick_warp.kernels.newton_patches import contact_history as kernels
 from synpick_warp.newton_patches import KNOWN_NEWTON
 
@@ -78,10 +79,12 @@ class History:
         """Find the arrays, which must have been allocated: after the first step.
 
         Raises:
-            RuntimeError: Another version of Newton is installed, whose history is unknown.
+            StateError: Another version of Newton is installed, whose history is unknown.
         """
         if newton.__version__ != KNOWN_NEWTON:
-            raise RuntimeError(f"the history of Newton {newton.__version__} is unknown, only that of {KNOWN_NEWTON}")
+            raise StateError(
+                f"states need Newton {KNOWN_NEWTON}; what {newton.__version__}, which is installed, keeps of a step is unknown"
+            )
         self.device, self.worlds = model.device, model.world_count
         self.patches: Any = solver._friction_patches
         self.matcher: Any = pipeline._contact_matcher

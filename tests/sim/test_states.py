@@ -12,24 +12,16 @@ import warp as wp
 from synpick_warp.codes import Ending, Phase, Task
 from synpick_warp.errors import StateError
 from synpick_warp.kernels.newton_patches import contact_history
+from synpick_warp.newton_patches import history
 from synpick_warp.stages.sim import states
-from synpick_warp.stages.sim.physics import MIN_GPU_WORLDS
 from synpick_warp.stages.sim.simulate import Simulation
-from tests.worlds.sights import SHORT, picking
-from tests.worlds.small_worlds import BOX, COARSE, CUBE, catalog, settings
+from tests.worlds.sights import brief
+from tests.worlds.small_worlds import BOX, CUBE, catalog
 from tools.checks.states import Rows, check_arrays, check_branches, differing, find_arrays, watch
 
 WORLDS, TICKS = 4, 3
-SMALL = COARSE | SHORT | {"arrangement__max_objects": 3, "pick__failures": 1, "perception__resolution": [160, 90]}
-SMALL |= {"bake__mode": "mixed", "bake__episodes": 8}
 RESTLESS = {"settle__stuck_depth": 1e-7, "settle__stuck_time": 0.05}
 """Objects that touch anything are dropped again."""
-
-
-def worlds(device, count: int = WORLDS, **changed: object) -> Simulation:
-    """Small worlds that pick; on a GPU as many as agree with larger numbers to the bit."""
-    count = max(count, MIN_GPU_WORLDS) if device.is_cuda else count
-    return picking(settings(**SMALL | {"bake__worlds": count} | changed), catalog(), device)
 
 
 @dataclass
@@ -64,8 +56,8 @@ class Scene:
 
 def test_a_branch_continues_as_its_episode_does(device):
     """To the bit, in other worlds and among fewer of them, beside worlds that do other things, from the drop to the next look."""
-    changed = {"bake__mode": "cycle", "physics__guide_height": 0.4}
-    result = check_branches(worlds(device, **changed), worlds(device, 2, **changed), states=28, moments=7, ticks=TICKS, apart=5)
+    changed = {"bake__mode": "cycle"}
+    result = check_branches(brief(device, WORLDS, **changed), brief(device, 2, **changed), states=28, moments=7, ticks=TICKS, apart=5)
     assert result.differences == []
     assert result.compared > 100
     seen = " ".join(result.moments)
@@ -74,7 +66,7 @@ def test_a_branch_continues_as_its_episode_does(device):
 
 
 def test_a_branch_of_objects_that_are_dropped_again_continues_so(device):
-    result = check_branches(worlds(device, 2, **RESTLESS), worlds(device, 2, **RESTLESS), states=2, moments=1, ticks=TICKS, apart=7)
+    result = check_branches(brief(device, 2, **RESTLESS), brief(device, 2, **RESTLESS), states=2, moments=1, ticks=TICKS, apart=7)
     assert result.differences == []
     assert any("dropped again" in moment for moment in result.moments)
 
@@ -82,7 +74,7 @@ def test_a_branch_of_objects_that_are_dropped_again_continues_so(device):
 @pytest.fixture(scope="module")
 def moment(device):
     """World 0 presses, 1 descends, 2 has moved, 3 picks, and 4 is idle."""
-    simulation = worlds(device, WORLDS + 1, bake__mode="cycle", bake__episodes=WORLDS, physics__guide_height=0.4)
+    simulation = brief(device, WORLDS + 1, bake__mode="cycle", bake__episodes=WORLDS)
     while simulation.attempts.task.numpy()[0] != Task.PRESS:
         simulation.tick()
     assert (simulation.attempts.task.numpy()[[1, 3]] >= Task.APPROACH).all()
@@ -118,7 +110,7 @@ def test_a_branch_in_several_worlds_is_the_same_in_each(acting):
 
 def test_all_that_is_no_state_may_be_anything(device):
     kinds = Counter()
-    assert list(check_arrays(worlds(device, 3), 24, kinds)) == []
+    assert list(check_arrays(brief(device, 3), 24, kinds)) == []
     assert kinds["overwritten"] > 100
     assert kinds["state"] > 100
 
@@ -151,10 +143,10 @@ def without(known: states.WorldStates, name: str):
 
 @pytest.mark.parametrize("forgotten", ["key", "midpoint", "solved_normal", "row", "pair", "displacement", "valid"])
 def test_a_forgotten_contact_is_found_out(scene, monkeypatch, forgotten):
-    history = scene.simulation.states.history
+    known = scene.simulation.states.history
     name = {"row": "propagation_slot" if scene.simulation.device.is_cuda else "free_slot"}.get(forgotten, forgotten)
     with monkeypatch.context() as patch:
-        patch.setattr(history, "live", replaced(history.live, name, wp.zeros_like(getattr(history.live, name))))
+        patch.setattr(known, "live", replaced(known.live, name, wp.zeros_like(getattr(known.live, name))))
         scene.simulation.branch(0, [WORLDS])
     assert scene.differences(0, WORLDS) != []
 
@@ -174,7 +166,7 @@ def test_a_state_survives_a_file(scene, device, tmp_path):
     """In another simulation of other worlds, too."""
     known = scene.simulation.states
     np.savez(tmp_path / "state.npz", **known.to_host(known.get([0, 3])))
-    other = worlds(device, 3)
+    other = brief(device, 3)
     other.tick()
     with np.load(tmp_path / "state.npz") as file:
         other.set_state(other.states.from_host(dict(file)), [2, 1])
@@ -224,7 +216,7 @@ def test_wrong_worlds_and_rows_are_refused(acting, ask, message):
 
 
 def test_there_is_no_state_before_and_within_a_tick(device):
-    simulation = worlds(device, 1)
+    simulation = brief(device, 1)
     with pytest.raises(StateError, match="between two ticks alone"):
         simulation.get_state([0])
     parts = simulation.tick_parts()
@@ -234,10 +226,17 @@ def test_there_is_no_state_before_and_within_a_tick(device):
     assert len(simulation.get_state([0])) == 1
 
 
+def test_another_version_of_newton_has_no_states(device, monkeypatch):
+    simulation = brief(device, 1, bake__mode="move")
+    simulation.tick()
+    monkeypatch.setattr(history, "KNOWN_NEWTON", "1.7.0")
+    with pytest.raises(StateError, match=r"states need Newton 1.7.0; what .*, which is installed, keeps of a step is unknown"):
+        simulation.get_state([0])
+
+
 def test_a_world_with_more_contacts_than_a_state_has_room_for_ends_as_a_branch(device):
     """And no other world."""
-    changed = {"bake__worlds": 4, "bake__episodes": 1, "physics__contacts_per_world": 16}
-    simulation = worlds(device, **changed)
+    simulation = brief(device, WORLDS, bake__episodes=1, physics__contacts_per_world=16)
     while simulation.physics.contacts.rigid_contact_count.numpy()[0] <= 16:
         simulation.tick()
     simulation.branch(0, [2])

@@ -9,9 +9,8 @@ from synpick_warp.codes import Outcome
 from synpick_warp.errors import StateError
 from synpick_warp.stages.sim.simulate import Simulation
 from synpick_warp.stages.sim.trials import Trials, check_grasps, find_choices, own_grasps
-from tests.sim.test_states import SMALL
-from tests.worlds.sights import picking
-from tests.worlds.small_worlds import BOX, CUBE, catalog, report, settings
+from tests.worlds.sights import brief
+from tests.worlds.small_worlds import report
 
 LONGEST = 60
 ABOVE = 0.25
@@ -19,8 +18,7 @@ ABOVE = 0.25
 
 
 def worlds(device, count: int) -> Simulation:
-    config = settings(**SMALL | {"bake__worlds": count, "bake__mode": "pick", "arrangement__max_objects": 2, "physics__guide_height": 0.4})
-    return picking(config, catalog(BOX, CUBE), device)
+    return brief(device, count, bake__mode="pick", arrangement__max_objects=2)
 
 
 class Choice:
