@@ -123,11 +123,15 @@ class Physics:
             variant: Variant of each body; -1: no change (body) int32.
             restarted: Worlds with new objects (world + 1) bool.
         """
+        self.select(variant, restarted)
+        self.pipeline.reset_contact_matching(restarted)
+        self.refresh_poses()
+
+    def select(self, variant: wp.array, restarted: wp.array) -> None:
+        """Select body variants and reset solver history, as `load` does, but without contact matching and poses."""
         flags = self.model.select_body_variants(variant)
         self.solver.notify_model_changed(flags, world_mask=restarted)
         self.solver.reset(self.state, world_mask=restarted)
-        self.pipeline.reset_contact_matching(restarted)
-        self.refresh_poses()
 
     def refresh_poses(self) -> None:
         """Compute body poses from joint coordinates (forward kinematics)."""
