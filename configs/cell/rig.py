@@ -101,6 +101,10 @@ class Rig:
             return False
         return (row.jitter.focal_length.kind, row.jitter.center.kind) != (OFF, OFF)
 
+    def bends(self, cameras: Iterable[int]) -> bool:
+        """Whether one of some cameras has a lens that distorts."""
+        return any(self.rows[index].distortion for index in cameras)
+
     def moves(self, index: int) -> bool:
         """Whether a camera moves within an episode."""
         return self.rows[index].fixed_to == GRIPPER

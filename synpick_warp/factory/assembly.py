@@ -37,6 +37,7 @@ from synpick_warp.scenes.grippers.registry import check_reach, make_head
 from synpick_warp.scenes.looks import Looks, load_looks
 from synpick_warp.scenes.types import Camera, Catalog, EnvironmentMap
 from synpick_warp.stages.host_copies import host_images
+from synpick_warp.stages.mask_pool import MaskBounds
 from synpick_warp.stages.render.lamp_variants import load_scene_lights
 from synpick_warp.stages.render.looks import draw_looks
 from synpick_warp.stages.render.renderer import Renderer
@@ -47,6 +48,7 @@ from synpick_warp.stages.view_ring import CameraGroup, ViewRing, history_count, 
 from synpick_warp.system.hardware.device import pick_device
 from synpick_warp.system.processes.garbage import collection_paused
 from synpick_warp.system.progress import Progress, SilentProgress
+from synpick_warp.views.masks import most_words
 
 
 @dataclass(frozen=True, eq=False)
@@ -229,13 +231,15 @@ def _build_group(config: Config, scene: RenderScene, cameras: tuple[Camera, ...]
     """Renderer of a group of cameras, for `bake.worlds` worlds; they share all constant data but the cameras."""
     indices, worlds, objects = config.rig.groups[index], config.bake.worlds, config.arrangement.max_objects
     sizes = view_sizes(config.render, config.rig, worlds, objects, scene.device, index)
-    scene = with_cameras(scene, tuple(cameras[camera] for camera in indices))
-    rig, first = config.rig, indices[0]
+    own = tuple(cameras[camera] for camera in indices)
+    scene, rig, first = with_cameras(scene, own), config.rig, indices[0]
     chosen = replace(config, render=replace(config.render, layers=group_layers(config.rig, config.render, index)))
     colors = rig.writes(first, COLOR)
     renderer = make_renderer(chosen, scene, objects, sizes["view"], history_count(rig, worlds, index), colors)
-    lenses = tuple(cameras[camera].lens for camera in indices) if rig.draws_lens(first) else ()
-    return CameraGroup(indices, sizes, renderer, rig.is_placed(first), rig.moves(first), rig.every[first], colors, lenses)
+    lenses = tuple(camera.lens for camera in own) if rig.draws_lens(first) else ()
+    pooled = sizes["mask_word"] < objects * most_words(*rig.sizes[first])
+    bounds = MaskBounds.of(scene.meshes, own) if pooled else None
+    return CameraGroup(indices, sizes, renderer, rig.is_placed(first), rig.moves(first), rig.every[first], colors, lenses, bounds)
 
 
 def fit_to_catalog(config: Config, catalog: Catalog, bins: Sequence[Bin], device: wp.Device, progress: Progress) -> Config:

@@ -277,7 +277,7 @@ def _perception(settings: Perception, worlds: int, objects: int, device: wp.Devi
     width, height = settings.resolution
     with dry_run() as arrays:
         allocate_batch(settings, objects, count, device)
-        allocate_visibility(count, width, height, device)
+        allocate_visibility(count, width, height, objects, device)
         allocate_background(1, width, height, device)
         allocate_votes(settings, objects, count, device)
     return _term(f"perception of {count:,} worlds at {width:,}x{height:,} px", arrays, _PERCEPTION)

@@ -30,7 +30,7 @@ from synpick_warp.online.selection import Selection, choose_episodes
 from synpick_warp.stages.buffers import Snapshot
 from synpick_warp.stages.online.batches import BatchRing, ViewBatch
 from synpick_warp.stages.render.view_setup import pair_views
-from synpick_warp.stages.stream import TickReport, describe_views, last_cameras
+from synpick_warp.stages.stream import TickReport, describe_views, last_cameras, split_views
 from synpick_warp.stages.ticks import TickLoop
 from synpick_warp.system.hardware.device import pick_device
 from synpick_warp.system.progress import Progress, SilentProgress
@@ -162,13 +162,12 @@ class Producer:
     ) -> Iterator[ViewBatch]:
         """Render views (world, camera) of a group."""
         stages = self.stages
-        for first in range(0, len(world), ring.views):
-            part = slice(first, first + ring.views)
+        for part, wide in split_views(ring.group, report, world, camera, stages.episode_cameras):
             known = (self.object_ids, stages.light_table, stages.config.cell.recorded, stages.episode_cameras)
             host = describe_views(report, world[part], camera[part], stages.tick_time, *known)
             host["arrangement"] = report.column("arrangement")[world[part]]
             last = last_cameras(stages.episode_cameras, report, world[part], camera[part])
-            yield ring.render(snapshot, world[part], camera[part], host, last)
+            yield ring.render(snapshot, world[part], camera[part], host, last, wide)
 
     def _end_episodes(self, report: TickReport) -> None:
         """Add the episodes that ended in a tick to the summary."""

@@ -99,7 +99,7 @@ class ViewBuffers:
 
 
 def view_buffer_sizes(views: int, width: int, height: int, instances: int) -> dict[str, int]:
-    """Extents of the dimensions of `ViewBuffers` and `LayerBuffers`. There are words for masks as large as the image, so none can lack."""
+    """Extents of the dimensions of `ViewBuffers` and `LayerBuffers`, with words for masks as large as the image, so that none can lack."""
     sizes = {"view": views, "row": height, "column": width, "instance": instances, "count": 3, "box": 2, "side": 4}
     return sizes | {"mask_word": instances * most_words(width, height)}
 

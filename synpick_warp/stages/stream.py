@@ -15,12 +15,14 @@ from synpick_warp.codes import Measure, Status, column_names
 from synpick_warp.scenes.cameras import EpisodeCameras
 from synpick_warp.stages.buffers import Snapshot
 from synpick_warp.stages.host_copies import HostCopy
+from synpick_warp.stages.mask_pool import split_batches
 from synpick_warp.stages.render.view_setup import pair_views
 from synpick_warp.stages.render_streams import RenderStreams
 from synpick_warp.stages.sim.simulate import TickRecord
 from synpick_warp.stages.sim.step_log import host_record, record_arrays, tick_measures
-from synpick_warp.stages.view_ring import ViewRing
+from synpick_warp.stages.view_ring import CameraGroup, ViewRing
 from synpick_warp.views.frames import FrameBatch, SelectedRows, TickBatch
+from synpick_warp.views.masks import most_words
 
 OWN_ARRAYS = 6
 """Arrays that a report copies before those of its namespaces: of `WorldStatus`, then objects and poses."""
@@ -219,6 +221,20 @@ def describe_views(
     }
 
 
+def split_views(
+    group: CameraGroup, report: TickReport, world: np.ndarray, camera: np.ndarray, cameras: EpisodeCameras | None
+) -> Iterator[tuple[slice, bool]]:
+    """Split a tick's views (world, camera) of a group into batches whose masks fit, see `split_batches`; other arguments as of
+    `describe_views`."""
+    views, share, bounds = group.sizes["view"], group.sizes["mask_word"], group.bounds
+    if bounds is None:
+        return split_batches(np.zeros(len(world), np.int64), share, views, views)
+    placed = cameras.of_views(report.column("episode")[world], camera, report.snapshot.fixture_pose[world, SHAFT]) if cameras else {}
+    placed = placed or {key: values[group.slots(camera)] for key, values in bounds.cameras.items()}
+    words = bounds.count_words(report.catalog_index[world], report.pose[world], placed)
+    return split_batches(words, share, views, views * share // (group.sizes["instance"] * most_words(*bounds.size)))
+
+
 def last_cameras(cameras: EpisodeCameras | None, report: TickReport, world: np.ndarray, camera: np.ndarray) -> dict[str, np.ndarray]:
     """As matrix, rotation and translation of `describe_views`, in the tick before."""
     if cameras is None:
@@ -302,15 +318,14 @@ class FrameStream:
         for ring in self.rings:
             shown = report.column("live").astype(bool) & (report.column("frame") % ring.group.every == 0)
             world, camera = pair_views(np.flatnonzero(shown), np.array(ring.cameras))
-            for first in range(0, len(world), ring.batch):
+            for part, wide in split_views(ring.group, report, world, camera, self.cameras):
                 while sum(batch.ring is ring for batch in self.in_flight) == len(ring.slots):
                     yield from self._deliver()
-                part = slice(first, min(first + ring.batch, len(world)))
                 known = (self.tick_time, self.object_ids, self.lights, self.bins, self.cameras)
                 description = describe_views(report, world[part], camera[part], *known)
                 last = last_cameras(self.cameras, report, world[part], camera[part])
-                slot = ring.launch(snapshot, world[part], camera[part], self.streams, (description, last))
-                self.in_flight.append(_Launched(ring, slot, part.stop - first, description))
+                slot = ring.launch(snapshot, world[part], camera[part], self.streams, (description, last), wide)
+                self.in_flight.append(_Launched(ring, slot, part.stop - part.start, description))
                 launched, ahead = launched + 1, ahead + int(self.device.is_cuda)
         if launched:
             self.in_flight[-1].finished = finished

@@ -19,6 +19,7 @@ from synpick_warp.stages.buffers import LayerBuffers, Snapshot, ViewBuffers, vie
 from synpick_warp.stages.encoding.jpeg import Compressor, JpegBuffers, JpegScratch, jpeg_sizes
 from synpick_warp.stages.encoding.png import DepthBuffers, DepthEncoder, DepthScratch, allocate_depth_scratch, depth_sizes
 from synpick_warp.stages.host_copies import DeviceImages, HostCopy, HostImages
+from synpick_warp.stages.mask_pool import SHARE, MaskBounds, share_words, widen
 from synpick_warp.stages.render.mask_runs import BoundaryBuffers, BoundaryScratch, boundary_sizes, list_boundaries
 from synpick_warp.stages.render.renderer import Renderer
 from synpick_warp.stages.render.view_setup import LENSES, PlacedCameras, allocate_view_cameras, make_views, place_cameras, place_lenses
@@ -29,7 +30,7 @@ from synpick_warp.views.masks import WORD_BYTES, most_words
 # Size of one batch's images on a GPU [bytes]: large enough to fill the GPU, small enough for several batches in flight.
 BATCH_BYTES = 512 << 20
 # Size of color, depth and segmentation id of one pixel, and size that amodal masks are counted with at least [bytes].
-PIXEL_BYTES, MASK_BYTES = 3 + 2 + 1, 4
+PIXEL_BYTES, MASK_BYTES = 3 + 2 + 1, SHARE // 8
 # Ring size of view batches: one is read while another is copied and a third is rendered.
 RING = 3
 
@@ -47,7 +48,8 @@ def views_per_batch(render: Render, rig: Rig, worlds: int, objects: int, device:
     width, height = rig.sizes[cameras[0]]
     with dry_run() as layers:
         allocate(LayerBuffers, {"view": 1, "row": height, "column": width}, device, rig.chosen(cameras[0], render.layers))
-    masks = max(width * height * MASK_BYTES, objects * most_words(width, height) * WORD_BYTES)
+    counted = objects if rig.bends(cameras) else min(objects, SHARE)
+    masks = max(width * height * MASK_BYTES, counted * most_words(width, height) * WORD_BYTES)
     each = width * height * PIXEL_BYTES + masks + sum(layer.row[3] for layer in layers)
     pixels = sum(map(math.prod, rig.sizes))
     return max(1, min(BATCH_BYTES * views * width * height // (pixels * each), views * worlds))
@@ -55,8 +57,10 @@ def views_per_batch(render: Render, rig: Rig, worlds: int, objects: int, device:
 
 def view_sizes(render: Render, rig: Rig, worlds: int, objects: int, device: wp.Device, group: int = 0) -> dict[str, int]:
     """Extents of `ViewBuffers` and `LayerBuffers` of a group of cameras, for `worlds` worlds of at most `objects` objects."""
-    size = rig.sizes[rig.groups[group][0]]
-    return view_buffer_sizes(views_per_batch(render, rig, worlds, objects, device, group), *size, objects)
+    cameras, views = rig.groups[group], views_per_batch(render, rig, worlds, objects, device, group)
+    size = rig.sizes[cameras[0]]
+    sizes = view_buffer_sizes(views, *size, objects)
+    return sizes if rig.bends(cameras) else sizes | {"mask_word": share_words(views, objects, *size)}
 
 
 Placements = tuple[Mapping[str, Any], Mapping[str, Any]]
@@ -89,6 +93,8 @@ class CameraGroup:
     lenses: tuple[LensMap | None, ...] = ()
     """Lens of each camera (None: a pinhole) if views have lenses of their own, as episodes draw their camera matrices; none: the scene has
     those of all views."""
+    bounds: MaskBounds | None = None
+    """Bounds of the words of views' masks; None: any masks fit a view's share of the pool."""
 
     def slots(self, camera: np.ndarray) -> np.ndarray:
         """Row of cameras in the renderer's scene (view) int32, by their indices (view)."""
@@ -191,14 +197,19 @@ class ViewRing:
         self.copies = [HostCopy(list(arrays.values())) for arrays in copied]
         self.lists = [wp.zeros((3, self.batch), dtype=wp.int32, device=device) for _ in self.slots]
         self.view_cameras = [group.allocate_cameras() for _ in self.slots]
+        self.divided = [batch.images for batch in self.slots]
+        """Images of each slot, with its pool of mask words as it is divided among the views."""
         self._next = 0
 
-    def launch(self, snapshot: Snapshot, world: np.ndarray, camera: np.ndarray, streams: RenderStreams, placed: Placements) -> int:
+    def launch(
+        self, snapshot: Snapshot, world: np.ndarray, camera: np.ndarray, streams: RenderStreams, placed: Placements, wide: bool = False
+    ) -> int:
         """Render the views (world, camera) of a snapshot into the next slot, then start to encode and copy the images; returns the slot.
 
-        `placed`: matrices and poses of the views' cameras, see `CameraGroup.place`.
+        `placed`: matrices and poses of the views' cameras, see `CameraGroup.place`. `wide`: the pool of mask words is divided by `widen`.
         """
         slot, count = self._next, len(world)
+        images = self.divided[slot] = widen(self.slots[slot].images) if wide else self.slots[slot].images
         self._next = (slot + 1) % len(self.slots)
         rows = self.lists[slot]
         padded = np.zeros((3, self.batch), dtype=np.int32)
@@ -208,7 +219,7 @@ class ViewRing:
         views, cameras = make_views(rows[0], rows[1], count, self.instances, slot=rows[2]), self.view_cameras[slot]
         self.group.place(cameras, camera, placed)
         with wp.ScopedStream(streams.render, sync_exit=True), scope("render", self.device):
-            self.renderer.render(snapshot, views, self.slots[slot].images, self.slots[slot].layers, cameras)
+            self.renderer.render(snapshot, views, images, self.slots[slot].layers, cameras)
         with wp.ScopedStream(streams.copy):
             with scope("encode", self.device):
                 self._encode(slot, count)
@@ -223,7 +234,7 @@ class ViewRing:
         order of this stream protects it.
         """
         batch = self.slots[slot]
-        list_boundaries(self.boundary_scratch, count, batch.images, batch.boundaries)
+        list_boundaries(self.boundary_scratch, count, self.divided[slot], batch.boundaries)
         if self.compressor is not None and batch.jpeg is not None and self.group.colors:
             self.compressor.compress(count, batch.images, batch.jpeg)
         if self.depth_encoder is not None and batch.depth is not None:
@@ -237,9 +248,15 @@ class ViewRing:
         """Wait for the copies of a slot; returns the images of its `count` views as fields of `FrameBatch`."""
         with scope("wait for images"):
             copied = self.wait(slot)
-        arrays = {name: array[:count] for name, array in zip(self.images + self.layers, copied, strict=True)}
+        images, arrays = self.divided[slot], dict(zip(self.images + self.layers, copied, strict=True))
+        views, words = images.mask_words.shape
+        if "mask_words" in arrays:
+            arrays["mask_words"] = arrays["mask_words"].reshape(-1)[: views * words].reshape(views, words)
+        arrays = {name: array[:count] for name, array in arrays.items()}
+        if (arrays["mask_length"] > words).any():
+            raise RuntimeError("masks take more words than their bound; this is an error of synpick-warp, please report it")
         return {
             **{name: arrays[name] for name in self.images},
-            **{name: DeviceImages(getattr(self.slots[slot].images, name)) for name in self.host.on_demand},
+            **{name: DeviceImages(getattr(images, name)) for name in self.host.on_demand},
             "layers": {name: arrays[name] for name in self.layers},
         }

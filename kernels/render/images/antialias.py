@@ -41,6 +41,8 @@ SOURCE_BITS = wp.constant(2)
 """Bits of a sample in `ShadedImage.resolve`."""
 SOURCE_MASK = wp.constant(wp.uint32(3))
 """The lowest SOURCE_BITS."""
+RANK_BITS, RANK_MASK = wp.constant(8), wp.constant(wp.uint32(0xFF))
+"""Bits of a body's rank in `find_ranks`, and these bits: there are as many bodies as ids, which are bytes."""
 CHUNK_TILES = wp.constant(32)
 """Tiles of footprints that share a list and its counter: one counter per view would serialize the atomic additions of all threads."""
 CREASE_SLOPE = wp.constant(1.5)
@@ -309,21 +311,23 @@ def visible_segments(gbuffer: GBuffer, grid: ImageGrid, view: int, row: int, col
 
 
 @wp.func
-def filter_word(bodies: ViewBodies, view: int, tile: int, word: int, segments: wp.vec4i, instances: int) -> wp.uint64:
-    """Word of a tile's body mask without the bodies that have none of these segmentation ids."""
-    result = wp.uint64(0)
-    left = bodies.body_mask[view, tile, word]
-    bit = wp.uint64(1)
-    rank = word * MASK_BITS
-    while left != wp.uint64(0):
-        if (left & wp.uint64(1)) != wp.uint64(0):
+def find_ranks(bodies: ViewBodies, view: int, tile: int, words: int, segments: wp.vec4i, instances: int) -> tuple[wp.uint32, int]:
+    """Ranks, ascending, of those bodies in a tile's body mask of `words` words that have one of four segmentation ids, each in RANK_BITS
+    from the lowest on; and their number."""
+    ranks = wp.uint32(0)
+    found = int(0)
+    for word in range(words):
+        left = bodies.body_mask[view, tile, word]
+        while left != wp.uint64(0):
+            others = left & (left - wp.uint64(1))
+            # The number of bits below the lowest one that is set.
+            rank = word * MASK_BITS + int(wp.bit_count((left ^ others) - wp.uint64(1)))
             segment = segment_of(bodies.order[view, rank], instances)
             if segment == segments[0] or segment == segments[1] or segment == segments[2] or segment == segments[3]:
-                result = result | bit
-        left = left >> wp.uint64(1)
-        bit = bit << wp.uint64(1)
-        rank += 1
-    return result
+                ranks = ranks | (wp.uint32(rank) << wp.uint32(RANK_BITS * found))
+                found += 1
+            left = others
+    return ranks, found
 
 
 @wp.func
@@ -360,12 +364,15 @@ def trace_visible(  # noqa: F811
     ray: wp.vec3,
     instances: int,
 ) -> Hit:
-    """Closest hit of a coverage ray among the bodies that its footprint's corners show, word by word."""
-    segments = visible_segments(gbuffer, grid, view, row, column)
+    """Closest hit of a coverage ray among the bodies that its footprint's corners show, at most four.
+
+    All are found before the first is traced, so that rays of a warp traverse BVHs at the same time.
+    """
+    ranks, found = find_ranks(bodies, view, tile, crowd.words, visible_segments(gbuffer, grid, view, row, column), instances)
     hit = no_hit()
-    for word in range(crowd.words):
-        body_mask = filter_word(bodies, view, tile, word, segments, instances)
-        hit = trace_bodies(meshes, bodies, view, word * MASK_BITS, body_mask, ray, instances, hit)
+    for index in range(found):
+        rank = int((ranks >> wp.uint32(RANK_BITS * index)) & RANK_MASK)
+        hit = trace_bodies(meshes, bodies, view, rank, wp.uint64(1), ray, instances, hit)
     return hit
 
 

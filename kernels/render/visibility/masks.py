@@ -1,8 +1,8 @@
 """Amodal masks: one bit per pixel of each instance's bounding box, in words of MASK_ROWS rows of a column, from a pool of words per view.
 
-A box takes as many words as it needs, wherever the boxes before it end (prefix sum), so work and copies grow with covered area, not with
-the number of instances; the pool has room for masks as large as the image. Words lie along the rows of the image, as its pixels do:
-neighbouring columns are neighbouring words.
+A box takes as many words as it needs, wherever the boxes before it end (prefix sum), so work, copies and memory grow with covered area,
+not with the number of instances; `stages.mask_pool` forms batches whose masks fit. Words lie along the rows of the image, as its pixels
+do: neighbouring columns are neighbouring words.
 """
 
 import warp as wp
@@ -28,7 +28,7 @@ class InstanceMasks:
     words: wp.array2d[wp.uint32]
     """(view, word): word (band, column) of an instance's box, `first + band * columns + column`; bit i is row `y_min + 32 band + i`."""
     length: wp.array[int]
-    """(view): words in use."""
+    """(view): words of all masks; more than the pool has: the last masks are empty."""
 
 
 @wp.struct
@@ -108,17 +108,21 @@ def lay_out_masks_kernel(
 ):
     """Lay out each view's masks in its pool: boxes, first words and the number of words, by exclusive prefix sums over the instances.
 
-    Launched over view, instance: each thread sums the words of the instances before its own.
+    A mask that does not fit is empty, and `length` then exceeds the pool. Launched over view, instance: each thread sums the words of the
+    instances before its own.
     """
     view, instance = wp.tid()
     first = int(0)
     for before in range(instance):
         first += count_words(make_mask(clip_box(grid, bodies.box[view, before]), 0))
     box = clip_box(grid, bodies.box[view, instance])
+    past = first + count_words(make_mask(box, 0))
+    if past > masks_out.words.shape[1]:
+        box = wp.vec4i(0, 0, -1, -1)
     masks_out.box[view, instance] = box
     masks_out.first[view, instance] = first
     if instance == masks_out.first.shape[1] - 1:
-        masks_out.length[view] = first + count_words(make_mask(box, 0))
+        masks_out.length[view] = past
 
 
 @wp.kernel
@@ -132,5 +136,5 @@ def clear_masks_kernel(
     know.
     """
     view, thread = wp.tid()
-    for word in range(thread, masks_inout.length[view], threads):
+    for word in range(thread, wp.min(masks_inout.length[view], masks_inout.words.shape[1]), threads):
         masks_inout.words[view, word] = wp.uint32(0)

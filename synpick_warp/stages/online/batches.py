@@ -13,6 +13,7 @@ from synpick_warp.kernels.render.images.ground_truth import expand_masks_kernel,
 from synpick_warp.stages.arrays import allocate, device_array
 from synpick_warp.stages.buffers import LayerBuffers, Snapshot, ViewBuffers, masks_of
 from synpick_warp.stages.launch import launch
+from synpick_warp.stages.mask_pool import widen
 from synpick_warp.stages.online.exchange import DeviceArray, Gate
 from synpick_warp.stages.render.view_setup import make_views, with_cameras
 from synpick_warp.stages.timing import scope
@@ -64,7 +65,9 @@ class Slot:
 
     def __init__(self, sizes: dict[str, int], layers: list[str], device: wp.Device) -> None:
         self.sizes, self.device = sizes, device
-        self.images, self.truth, self.layers = allocate_slot(sizes, layers, device)
+        self.pooled, self.truth, self.layers = allocate_slot(sizes, layers, device)
+        self.images = self.pooled
+        """The same with the pool of mask words as it is divided among the views."""
         self.lists = wp.zeros((3, sizes["view"]), dtype=wp.int32, device=device)
         self.masks: dict[str, wp.array] = {}
         self.gate = Gate(device)
@@ -104,7 +107,8 @@ class ViewBatch:
         instance: Segmentation id of the nearest surface: 0 none, 1 + instance_id, 252 to 255 table and fixtures (`Segment`)
             (B, H, W) uint8.
         mask_words, mask_first, mask_box, mask_length: Amodal masks as bits, each in its own box (B, W) uint32, (B, I) int32, (B, I, 4)
-            int32 [px], (B) int32: words in use, the others mean nothing; see `InstanceMasks`. `amodal_masks` makes images of them.
+            int32 [px], (B) int32: words in use, the others mean nothing; see `InstanceMasks`. `amodal_masks` makes images of them. W is not
+            the same in all batches of many instances.
         layers: Layers (AOVs) that `render.layers` names and the modalities of the cameras have, as they are before quantization
             (B, H, W[, C]); see `synpick_warp.views.layers`.
         object_id: obj_id of each instance; -1: the instance is not in the scene; below: a distractor, without label (B, I) int32.
@@ -202,7 +206,13 @@ class BatchRing:
         self._next = 0
 
     def render(
-        self, snapshot: Snapshot, world: np.ndarray, camera: np.ndarray, host: Mapping[str, Any], last: Mapping[str, np.ndarray]
+        self,
+        snapshot: Snapshot,
+        world: np.ndarray,
+        camera: np.ndarray,
+        host: Mapping[str, Any],
+        last: Mapping[str, np.ndarray],
+        wide: bool = False,
     ) -> ViewBatch:
         """Render views into the next slot, whose last batch must have expired.
 
@@ -212,10 +222,12 @@ class BatchRing:
             camera: Camera of each view (B) int32.
             host: For `ViewBatch.host`.
             last: As of `stream.last_cameras`.
+            wide: As of `ViewRing.launch`.
         """
         slot, cameras, count = self.slots[self._next], self._cameras[self._next], len(world)
         self._next = (self._next + 1) % len(self.slots)
         slot.gate.wait_for_consumers()
+        slot.images = widen(slot.pooled) if wide else slot.pooled
         padded = np.zeros((3, self.views), dtype=np.int32)
         padded[:, :count] = world, camera, self.group.slots(camera)
         slot.lists.assign(padded)

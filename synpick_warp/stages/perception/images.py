@@ -48,7 +48,7 @@ def view_bytes(settings: schema.Perception, instances: int) -> int:
     device = wp.get_device("cpu")
     with dry_run() as arrays:
         allocate_batch(settings, instances, 1, device)
-        allocate_visibility(1, *settings.resolution, device)
+        allocate_visibility(1, *settings.resolution, instances, device)
     return sum(array.row[3] for array in arrays)
 
 
@@ -98,7 +98,7 @@ class PerceptionImages:
         self.views.world.fill_(-1)
         self.views.count, self.views.instances = count, instances
         self.fixture_visible = wp.array([[1, 0, 0]] * worlds, dtype=wp.int32, device=device)
-        self.rasterizer = Rasterizer(self.scene, 1.0, count)
+        self.rasterizer = Rasterizer(self.scene, 1.0, count, instances)
 
     def render(self, snapshot: Snapshot) -> None:
         """Rasterize each view's world without gripper shaft and cup. Unused views keep their content."""

@@ -24,10 +24,10 @@ from synpick_warp.stages.launch import launch_pixels, launch_views
 from synpick_warp.stages.render.scene import RenderScene
 from synpick_warp.stages.render.view_setup import BACKGROUND, VIEW_BODIES, body_sizes, first_views, set_up_views
 
-BLOCKS = 32768
-"""Capacity for pixel blocks of large triangles per view. A full-HD view filled by thirteen low-polygon objects (hundreds to thousands of
-triangles each, such as the embedded ones) needs 14,000 blocks, dense meshes a tenth of that. If the capacity is exceeded, the remaining
-triangles are rasterized by one thread each, which is slow."""
+BLOCKS, INSTANCE_BLOCKS = 32768, 512
+"""Capacity for pixel blocks of large triangles per view, at least, and for each instance. A full-HD view filled by thirteen low-polygon
+objects (hundreds to thousands of triangles each, such as the embedded ones) needs 14,000 blocks, dense meshes a tenth of that; each of 128
+or 251 brackets needs 320. If the capacity is exceeded, the remaining triangles are rasterized by one thread each, which is slow."""
 
 VISIBILITY_BUFFER = struct_arrays(VisibilityBuffer, "view", "row", "column", block=("view", "block"), blocks=("view",))
 
@@ -39,13 +39,14 @@ class Rasterizer:
         background: Cached static background: the struct `GBuffer`, one view a camera, of the tote at its usual pose and the table.
     """
 
-    def __init__(self, scene: RenderScene, counts_per_meter: float, views: int, background: Any = None) -> None:
+    def __init__(self, scene: RenderScene, counts_per_meter: float, views: int, instances: int = 0, background: Any = None) -> None:
         """Allocate scratch.
 
         Args:
             scene: Constant data.
             counts_per_meter: Counts of the depth image per metre.
             views: Maximum number of views of a batch.
+            instances: Instance capacity of a world.
             background: As the attribute; None: it is rendered.
 
         Raises:
@@ -56,7 +57,7 @@ class Rasterizer:
             raise CatalogError(f"a mesh has {most} triangles; at most {MAX_TRIANGLES} can be rendered")
         self.scene = scene
         self.counts_per_meter = counts_per_meter
-        self.visibility = allocate_visibility(views, scene.width, scene.height, scene.device)
+        self.visibility = allocate_visibility(views, scene.width, scene.height, instances, scene.device)
         self.background = background
         if background is None:
             self.background = allocate_background(scene.camera_count, scene.width, scene.height, scene.device)
@@ -104,9 +105,10 @@ def render_background(scene: RenderScene, gbuffer: Any) -> None:
     Rasterizer(scene, 1.0, cameras, background=gbuffer).rasterize(bodies, views, gbuffer)
 
 
-def allocate_visibility(views: int, width: int, height: int, device: wp.Device) -> Any:
+def allocate_visibility(views: int, width: int, height: int, instances: int, device: wp.Device) -> Any:
     """Allocate the struct `VisibilityBuffer`."""
-    return allocate_struct(VISIBILITY_BUFFER, {"view": views, "row": height, "column": width, "block": BLOCKS}, device)
+    sizes = {"view": views, "row": height, "column": width, "block": max(BLOCKS, INSTANCE_BLOCKS * instances)}
+    return allocate_struct(VISIBILITY_BUFFER, sizes, device)
 
 
 def allocate_background(cameras: int, width: int, height: int, device: wp.Device) -> Any:

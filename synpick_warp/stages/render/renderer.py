@@ -91,7 +91,7 @@ class Renderer:
             else:
                 self.shading = DenoisedRenderer(settings, seed, scene, instances, views, histories)
             self.postprocessor = PostProcessor(effects, settings.tone, seed, scene, views)
-        self.rasterizer = Rasterizer(scene, 1000.0 / depth_scale, views)
+        self.rasterizer = Rasterizer(scene, 1000.0 / depth_scale, views, instances)
         sensor = sensor_parameters(depth_sensor, seed, depth_scale)
         self.layer_renderer = LayerRenderer(settings.layers, sensor, scene, instances, views)
         self.annotator = Annotator(scene, instances, views)

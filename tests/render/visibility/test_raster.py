@@ -169,6 +169,7 @@ def test_large_triangles_are_complete_with_any_capacity_for_blocks(device, capac
     toy = ToyScene([entry(box(0.3, 0.2, 0.1))], [[(0, (0.0, 0.0, 0.0, 0.1, 0.2, 0.3, 0.927))]], (camera(192, 128, 300.0, (0.0, 0.0, 1.0)),))
     expected = gbuffer_of(toy, device, by_rays=True)
     monkeypatch.setattr(raster, "BLOCKS", capacity)
+    monkeypatch.setattr(raster, "INSTANCE_BLOCKS", 0)
     found = gbuffer_of(toy, device)
     np.testing.assert_array_equal(found["segment"], expected["segment"])
     np.testing.assert_array_equal(found["amodal"], (expected["segment"] == 1).astype(np.uint32))
