@@ -41,6 +41,10 @@ class DatasetError(SynpickError):
     """A folder is not a data set, or a file in it is missing or damaged."""
 
 
+class StateError(SynpickError):
+    """A state of worlds does not fit the simulation, or cannot be taken."""
+
+
 class ResultError(SynpickError):
     """A file of pose estimates cannot be used."""
 

@@ -11,7 +11,9 @@ from synpick_warp.scenes.fixtures import make_fixtures
 from synpick_warp.scenes.lights import load_lights
 from synpick_warp.scenes.types import Catalog
 from synpick_warp.stages.render.scene import RenderScene, build_render_scene
+from synpick_warp.stages.sim.physics import MIN_GPU_WORLDS
 from synpick_warp.stages.sim.simulate import Simulation
+from tests.worlds.small_worlds import COARSE, catalog, settings
 
 LIGHTS = 1
 
@@ -25,11 +27,23 @@ SHORT = {
 }
 """Settings under which an attempt takes about 20 ticks instead of 55."""
 
+BRIEF = (
+    COARSE | SHORT | {"arrangement__max_objects": 3, "pick__failures": 1, "perception__resolution": [160, 90], "physics__guide_height": 0.4}
+)
+BRIEF |= {"bake__mode": "mixed", "bake__episodes": 8}
+"""Settings under which an attempt takes few and short ticks."""
+
 
 def render_scene(config: Config, objects: Catalog, device: Any) -> RenderScene:
     """The scene of a bake, under one light."""
     fixtures, lights = make_fixtures(make_bins(config.cell.bins), config.gripper), load_lights("")[:LIGHTS]
     return build_render_scene(config.render, -config.tote.wall, objects, fixtures, make_cameras(config.rig), lights, device)
+
+
+def brief(device: Any, worlds: int, **changed: Any) -> Simulation:
+    """Small worlds of BRIEF, with changes; on a GPU as many as agree with larger numbers to the bit."""
+    worlds = max(worlds, MIN_GPU_WORLDS) if device.is_cuda else worlds
+    return picking(settings(**BRIEF | {"bake__worlds": worlds} | changed), catalog(), device)
 
 
 def picking(config: Config, objects: Catalog, device: Any, **other: Any) -> Simulation:

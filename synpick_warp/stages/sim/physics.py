@@ -17,6 +17,7 @@ from synpick_warp.configs.schema import Physics as PhysicsConfig
 from synpick_warp.kernels.sim import gripper, rest
 from synpick_warp.newton_patches import KNOWN_NEWTON
 from synpick_warp.newton_patches.broad_phase import replace_broad_phase
+from synpick_warp.newton_patches.contact_matching import complete_matching
 from synpick_warp.newton_patches.narrow_phase import resize_blocks
 from synpick_warp.newton_patches.solver import choose_solver
 from synpick_warp.scenes import build
@@ -122,11 +123,15 @@ class Physics:
             variant: Variant of each body; -1: no change (body) int32.
             restarted: Worlds with new objects (world + 1) bool.
         """
+        self.select(variant, restarted)
+        self.pipeline.reset_contact_matching(restarted)
+        self.refresh_poses()
+
+    def select(self, variant: wp.array, restarted: wp.array) -> None:
+        """Select body variants and reset solver history, as `load` does, but without contact matching and poses."""
         flags = self.model.select_body_variants(variant)
         self.solver.notify_model_changed(flags, world_mask=restarted)
         self.solver.reset(self.state, world_mask=restarted)
-        self.pipeline.reset_contact_matching(restarted)
-        self.refresh_poses()
 
     def refresh_poses(self) -> None:
         """Compute body poses from joint coordinates (forward kinematics)."""
@@ -271,6 +276,8 @@ def make_pipeline(physics: PhysicsConfig, model: newton.Model) -> newton.Collisi
     )
     if newton.__version__ != KNOWN_NEWTON:
         return pipeline
+    if physics.match_all:
+        complete_matching(pipeline)
     replace_broad_phase(pipeline)
     resize_blocks(pipeline)
     return pipeline

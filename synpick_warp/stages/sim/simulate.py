@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import newton
@@ -13,6 +14,7 @@ import warp as wp
 from synpick_warp.configs.dataset.modes import may_pick
 from synpick_warp.configs.dataset.splits import DataLayout
 from synpick_warp.configs.schema import Config
+from synpick_warp.errors import StateError
 from synpick_warp.kernels.sim import snapshot as pack
 from synpick_warp.scenes.build import build_model
 from synpick_warp.scenes.types import Catalog
@@ -24,8 +26,9 @@ from synpick_warp.stages.perception.arrays import Observation, Plan
 from synpick_warp.stages.perception.perceive import Perception
 from synpick_warp.stages.render.scene import RenderScene
 from synpick_warp.stages.sim import arrange, gripper
-from synpick_warp.stages.sim.hold import Hold, make_hold
+from synpick_warp.stages.sim.behavior import BEHAVIORS, Hold
 from synpick_warp.stages.sim.physics import ENDED, Physics
+from synpick_warp.stages.sim.states import State, WorldStates
 from synpick_warp.stages.sim.step_log import PhysicsRecord, StepRecorder
 from synpick_warp.stages.sim.worlds import AttemptState, SealState, WorldState, WorldStatus, world_sizes
 from synpick_warp.stages.timing import scope
@@ -81,7 +84,7 @@ class Simulation:
         Raises:
             ValueError: An episode may pick, but there is no `render_scene`.
         """
-        self.config = config
+        self.config, self.catalog = config, catalog
         self.device = device
         built = build_model(config, catalog, device)
         self.layout = built.layout
@@ -103,27 +106,31 @@ class Simulation:
                 config.trajectory, config.gripper, self.scene, self.state, self.attempts, self.seals, self.physics, sizes
             )
         self.record = replace(record, physics=self.recorder.record if self.recorder is not None else None)
+        self.behavior = BEHAVIORS[config.gripper.kind]
+        self._is_between_ticks = False
+        """Whether a tick is complete and none has begun."""
         self.hold: Hold | None = None
         self.perception: Perception | None = None
         if may_pick(config.bake, config.splits):
             if render_scene is None:
                 raise ValueError("episodes that pick need a render_scene for perception")
-            self.hold = make_hold(config.gripper, config.suction, catalog, render_scene, device)
+            self.hold = self.behavior.hold(config.suction, catalog, render_scene, device)
             state = (self.scene, self.state, self.attempts, self.observation, self.plan)
-            self.perception = Perception(config.perception, config.rig, config.bake.seed, render_scene, *state)
+            self.perception = Perception(config.perception, config.rig, config.bake.seed, render_scene, *state, self.behavior.choose_grasps)
 
-    def tick(self) -> None:
-        """Advance all worlds by one tick; `record` has its output."""
-        for _ in self.tick_parts():
+    def tick(self, perceives: bool = True) -> None:
+        """Advance all worlds by one tick; `record` has its output. `perceives`: False: worlds whose task is LOOK wait."""
+        for _ in self.tick_parts(perceives):
             pass
 
-    def tick_parts(self) -> Iterator[None]:
+    def tick_parts(self, perceives: bool = True) -> Iterator[None]:
         """Advance all worlds by one tick: a generator that yields after episodes are started and after each substep of physics.
 
         The caller can enqueue other work on other streams between.
 
         Start episodes, step physics, update tasks, end episodes, copy the snapshot, then plan attempts in worlds whose task is LOOK.
         """
+        self._is_between_ticks = False
         with scope("arrange", self.device):
             self._arrange()
         yield
@@ -139,10 +146,42 @@ class Simulation:
             self._take_snapshot()
             if self.recorder is not None:
                 self.recorder.end_tick()
-        if self.perception is not None:
+        if self.perception is not None and perceives:
             with scope("perceive", self.device):
                 self.perception.perceive(self.record.snapshot)
-                gripper.begin_attempts(self.scene, self.state, self.attempts, self.plan, self.physics)
+                gripper.begin_attempts(self.scene, self.state, self.attempts, self.plan, self.physics, self.behavior.law)
+        self._is_between_ticks = True
+
+    @property
+    def states(self) -> WorldStates:
+        """What saves and loads the worlds' states, between two ticks and on their stream.
+
+        Raises:
+            StateError: The worlds have not ticked yet, or are in a tick.
+        """
+        if not self._is_between_ticks:
+            raise StateError("the state of a world is complete between two ticks alone, after the first one")
+        return self._states
+
+    @cached_property
+    def _states(self) -> WorldStates:
+        groups = {"worlds": self.state, "attempts": self.attempts, "seals": self.seals, "last": self.last}
+        groups |= {name: getattr(self.record, name) for name in ("snapshot", "status", "observation", "plan")}
+        if self.recorder is not None:
+            groups["drops"] = self.recorder.record.drops
+        return WorldStates(groups, self.physics, self.catalog, self.state.variant, self.state.restarted)
+
+    def get_state(self, worlds: Sequence[int]) -> State:
+        """State of worlds; see `WorldStates.get`."""
+        return self.states.get(worlds)
+
+    def set_state(self, state: State, worlds: Sequence[int], rows: Sequence[int] | None = None) -> None:
+        """Have worlds continue from the rows of a state; see `WorldStates.set`. `record` has the tick in which they were saved."""
+        self.states.set(state, worlds, rows)
+
+    def branch(self, world: int, into: Sequence[int]) -> None:
+        """Have worlds continue as another does; see `WorldStates.branch`."""
+        self.states.branch(world, into)
 
     def clear_graphs(self) -> None:
         """Drop captured graphs: the next tick launches all kernels one by one, and captures them anew."""
@@ -173,14 +212,14 @@ class Simulation:
         gripper.remove_lost(scene, state, self.attempts, self.seals, physics)
         if self.hold is not None:
             self.hold.engage(scene, state, self.attempts, self.seals, physics)
-            gripper.advance_tasks(scene, state, self.attempts, self.seals, self.plan, physics)
+            gripper.advance_tasks(scene, state, self.attempts, self.seals, self.plan, physics, self.behavior.law)
         gripper.park_removed(scene, state, self.attempts, physics)
         physics.refresh_poses()
         arrange.judge_episodes(scene, state, self.attempts, self.observation, physics)
 
     def _drive(self, current: newton.State) -> None:
         """Hook before a step: forces of gripper and hold."""
-        gripper.drive_gripper(self.scene, self.state, self.attempts, self.plan, self.physics, current)
+        gripper.drive_gripper(self.scene, self.state, self.attempts, self.plan, self.physics, current, self.behavior.law)
         if self.recorder is not None:
             self.recorder.save_impedance_force()
         if self.hold is not None:

@@ -1,0 +1,106 @@
+"""Rows of worlds: the words that the arrays of a simulation hold of one world, gathered into a record, or scattered from it.
+
+An array of all worlds has the same number of 32-bit words for each world, one world after the other. A table lists where each word of a
+record lies in the first world, and how far from there in the next one, so that one launch copies from or to all arrays.
+"""
+
+import warp as wp
+
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.struct
+class WordTable:
+    """Places of the words of a record: addresses in the first world, distances between worlds."""
+
+    address: wp.array[wp.uint64]
+    """(word): address in the first world [bytes]."""
+    stride: wp.array[int]
+    """(word): distance from a world to the next one [bytes]."""
+
+
+@wp.func
+def word_of(table: WordTable, world: int, word: int):
+    """A word of a world in the array that holds it, as an array of one element."""
+    offset = wp.uint64(world) * wp.uint64(table.stride[word])
+    return wp.array(ptr=table.address[word] + offset, shape=(1,), dtype=wp.uint32)
+
+
+@wp.kernel
+def save_rows_kernel(
+    # Scene:
+    table: WordTable,
+    # In:
+    world: wp.array[int],  # (row)
+    # Out:
+    record_out: wp.array2d[wp.uint32],  # (row, word)
+):
+    """Gather the words of the world of each row; -1: the row keeps its content. Launched over row, word."""
+    row, word = wp.tid()
+    if world[row] < 0:
+        return
+    live = word_of(table, world[row], word)
+    record_out[row, word] = live[0]
+
+
+@wp.kernel
+def load_rows_kernel(
+    # Scene:
+    table: WordTable,
+    # In:
+    row: wp.array[int],  # (world)
+    record: wp.array2d[wp.uint32],  # (row, word)
+):
+    """Scatter the words of the row of each world to the arrays of the table; -1: the world keeps its own. Launched over world, word."""
+    world, word = wp.tid()
+    if row[world] < 0:
+        return
+    live = word_of(table, world, word)
+    live[0] = record[row[world], word]
+
+
+@wp.kernel
+def select_variants_kernel(
+    # Scene:
+    bodies: int,
+    first_word: int,
+    # In:
+    row: wp.array[int],  # (world)
+    record: wp.array2d[wp.uint32],  # (row, word)
+    # Out:
+    variant_out: wp.array[int],  # (body)
+    restarted_out: wp.array[wp.bool],  # (world_and_global)
+):
+    """Write the body variants of the row of each world, which begin at `first_word` of a record, and which worlds get any.
+
+    `variant` is -1, no change, in other worlds. Launched over world, body.
+    """
+    world, body = wp.tid()
+    variant = int(-1)
+    if row[world] >= 0:
+        variant = int(record[row[world], first_word + body])
+    variant_out[world * bodies + body] = variant
+    if body == 0:
+        restarted_out[world] = row[world] >= 0
+
+
+@wp.kernel
+def clear_idle_rows_kernel(
+    # Scene:
+    impulses: int,
+    row_type: int,
+    row_parent: int,
+    # In:
+    world: wp.array[int],  # (row)
+    # Out:
+    record_inout: wp.array2d[wp.uint32],  # (row, word)
+):
+    """Set type and parent of constraint rows without impulse to -1, none: they start nothing, and may be left from any earlier step.
+
+    `impulses`, `row_type` and `row_parent` are the first words of a family of constraint rows in a record. Launched over row, constraint
+    row.
+    """
+    row, index = wp.tid()
+    if world[row] >= 0 and record_inout[row, impulses + index] == wp.uint32(0):
+        record_inout[row, row_type + index] = wp.uint32(-1)
+        record_inout[row, row_parent + index] = wp.uint32(-1)

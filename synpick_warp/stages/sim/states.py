@@ -1,0 +1,267 @@
+"""Exact states of worlds: saved rows that continue, in any world of any simulation of the same objects, bit by bit as the world itself.
+
+A row holds what a tick reads of the last one: the arrays that `WorldState` and its like declare by world, those of Newton that
+`newton_patches.history` names, and the world's contacts. All else is constant or derived within a tick: `tools.checks.states` finds every
+array of a simulation and proves it. Random numbers have addresses, not generators: they follow from episode, arrangement and attempt.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, fields
+
+import numpy as np
+import warp as wp
+
+from synpick_warp.codes import Lost
+from synpick_warp.errors import StateError
+from synpick_warp.kernels import world_rows
+from synpick_warp.newton_patches.history import CONTACT_BYTES, ROW_ARRAYS, History, SavedContacts
+from synpick_warp.scenes.types import Catalog
+from synpick_warp.stages.arrays import ArraySpec
+from synpick_warp.stages.sim.physics import Physics
+from synpick_warp.system.hardware.free_memory import free_device_memory, free_host_memory
+
+VERSION = 1
+"""Version of the content of states."""
+WORD = 4
+"""Size of a word [bytes]."""
+VARIANTS = "physics.body_variant"
+"""Field of the body variants, by which a world gets the shapes and masses of its objects."""
+
+
+@dataclass(frozen=True, eq=False)
+class State:
+    """Saved states of worlds, a row each, on the device. Independent of the world and the number of worlds they were saved from."""
+
+    words: wp.array
+    """What arrays hold of the world, one after the other (row, word) uint32."""
+    contacts: SavedContacts
+    """Contacts of the last step."""
+
+    def __len__(self) -> int:
+        return self.words.shape[0]
+
+
+@dataclass(frozen=True)
+class Field:
+    """Part of a row: name, scalar type, shape in a world, and the first of its words."""
+
+    name: str
+    dtype: np.dtype
+    shape: tuple[int, ...]
+    first: int
+
+    @property
+    def words(self) -> int:
+        """Number of words."""
+        return math.prod(self.shape) * self.dtype.itemsize // WORD
+
+
+class WorldStates:
+    """Saves and loads the states of a simulation's worlds. All of it runs on the device; only host copies wait for it.
+
+    Attributes:
+        fields: Parts of a row.
+        history: Newton's part of the simulation's state.
+    """
+
+    def __init__(self, groups: Mapping[str, object], physics: Physics, catalog: Catalog, variant: wp.array, restarted: wp.array) -> None:
+        """Find all arrays of the state, after the first tick.
+
+        Args:
+            groups: Dataclasses whose arrays are state where `world` is their first dimension, by the name of their part of a row.
+            physics: The physics.
+            catalog: The objects; only states of the same can be loaded.
+            variant: Written: body variants to select (body) int32 ...
+            restarted: ... in these worlds (world + 1) bool.
+        """
+        self.physics, self.catalog = physics, catalog
+        self.device, self.worlds = physics.device, physics.layout.worlds
+        self._variant, self._restarted = variant, restarted
+        self.history = History(physics.model, physics.state, physics.control, physics.pipeline, physics.contacts, physics.solver)
+        named = dict(_find_arrays(groups))
+        named |= {f"physics.{name}": array for name, array in self.history.rows.items()}
+        self.fields: dict[str, Field] = {}
+        addresses, strides, first = [], [], 0
+        for name, array in named.items():
+            self.fields[name] = field = _describe(name, array, self.worlds, first)
+            addresses.append(np.uint64(array.ptr or 0) + WORD * np.arange(field.words, dtype=np.uint64))
+            strides.append(np.full(field.words, WORD * field.words))
+            first += field.words
+        self._arrays, self.words = list(named.values()), first
+        self._table = world_rows.WordTable()
+        self._table.address = wp.array(np.concatenate(addresses), dtype=wp.uint64, device=self.device)
+        self._table.stride = wp.array(np.concatenate(strides), dtype=wp.int32, device=self.device)
+        self._branch = self.allocate(1)
+
+    def arrays(self) -> list[wp.array]:
+        """All arrays of the simulation that are saved."""
+        return [*self._arrays, *self.history.arrays()]
+
+    @property
+    def contact_capacity(self) -> int:
+        """Contacts of a row: those of a world that has more are lost, which ends its episode."""
+        return self.physics.settings.contacts_per_world
+
+    def allocate(self, rows: int) -> State:
+        """Allocate an empty state of `rows` rows.
+
+        Raises:
+            StateError: Memory is too short.
+        """
+        each = WORD * self.words + self.contact_capacity * CONTACT_BYTES
+        free = free_device_memory(self.device) if self.device.is_cuda else free_host_memory()
+        if rows * each > free:
+            need, most = rows * each / 1e9, free // each
+            raise StateError(f"states of {rows:,} worlds take {need:.3g} GB, but {free / 1e9:.3g} GB are free; take at most {most:,}")
+        words = wp.zeros((rows, self.words), dtype=wp.uint32, device=self.device)
+        return State(words, self.history.allocate_contacts(rows, self.contact_capacity))
+
+    def save(self, state: State, world: wp.array) -> None:
+        """Save the world of each row (row) int32; -1: the row keeps its content. Only launches kernels."""
+        wp.launch(
+            world_rows.save_rows_kernel,
+            dim=state.words.shape,
+            inputs=[self._table, world],
+            outputs=[state.words],
+            device=self.device,
+        )
+        for family in self.history.families:
+            impulses, *others = (self.fields[f"physics.{family}{name}"] for name in ROW_ARRAYS)
+            wp.launch(
+                world_rows.clear_idle_rows_kernel,
+                dim=(len(world), impulses.words),
+                inputs=[impulses.first, *(field.first for field in others), world],
+                outputs=[state.words],
+                device=self.device,
+            )
+        self.history.save_contacts(world, state.contacts)
+
+    def load(self, state: State, row: wp.array) -> None:
+        """Load the row of each world (world) int32; -1: the world goes on as it is. Only launches kernels."""
+        bodies = self.physics.layout.bodies_per_world
+        wp.launch(
+            world_rows.select_variants_kernel,
+            dim=(self.worlds, bodies),
+            inputs=[bodies, self.fields[VARIANTS].first, row, state.words],
+            outputs=[self._variant, self._restarted],
+            device=self.device,
+        )
+        self.physics.select(self._variant, self._restarted)
+        dim = (self.worlds, self.words)
+        wp.launch(world_rows.load_rows_kernel, dim=dim, inputs=[self._table, row, state.words], device=self.device)
+        self.history.load_contacts(row, state.contacts, self.physics.lost, int(Lost.CONTACTS))
+
+    def get(self, worlds: Sequence[int]) -> State:
+        """State of worlds, a row each.
+
+        Raises:
+            StateError: A world does not exist, or memory is too short.
+        """
+        state = self.allocate(len(self._checked(worlds)))
+        self.save(state, wp.array(worlds, dtype=wp.int32, device=self.device))
+        return state
+
+    def set(self, state: State, worlds: Sequence[int], rows: Sequence[int] | None = None) -> None:
+        """Load rows into worlds; `rows` names the row of each, None: all in order, or the only one into every world.
+
+        Raises:
+            StateError: A world or a row does not exist, or there is not a row for each world.
+        """
+        if rows is None:
+            rows = [0] * len(worlds) if len(state) == 1 else range(len(state))
+        if len(rows) != len(worlds):
+            raise StateError(f"{len(rows)} rows cannot be loaded into {len(worlds)} worlds; name the row of each")
+        if wrong := [row for row in rows if not 0 <= row < len(state)]:
+            raise StateError(f"there is no row {wrong[0]}; the state has rows 0 to {len(state) - 1}")
+        if state.words.shape[1] != self.words or state.contacts.capacity != self.contact_capacity:
+            raise StateError("the state is of a simulation with other capacities; load it from the host to see which")
+        table = np.full(self.worlds, -1)
+        table[np.asarray(self._checked(worlds), int)] = rows
+        self.load(state, wp.array(table, dtype=wp.int32, device=self.device))
+
+    def branch(self, world: int, into: Sequence[int]) -> None:
+        """Copy a world into others: they continue as it does. Raises StateError if a world does not exist."""
+        self._checked([world])
+        self.save(self._branch, wp.array([world], dtype=wp.int32, device=self.device))
+        self.set(self._branch, into)
+
+    def to_host(self, state: State) -> dict[str, np.ndarray]:
+        """Copy a state to the host: by name the arrays of its rows and contacts, and what they fit; `np.savez` can store them."""
+        words, contacts = state.words.numpy(), state.contacts
+        arrays = {name: words[:, field.first : field.first + field.words].view(field.dtype) for name, field in self.fields.items()}
+        arrays = {name: array.reshape(len(state), *self.fields[name].shape) for name, array in arrays.items()}
+        arrays["contacts.count"] = contacts.count.numpy()
+        for name in contacts.history._cls.vars:
+            values = getattr(contacts.history, name).numpy()
+            arrays[f"contacts.{name}"] = values.reshape(len(state), contacts.capacity, *values.shape[1:])
+        return {"version": np.array(VERSION), "catalog": np.array(checksum(self.catalog))} | arrays
+
+    def from_host(self, arrays: Mapping[str, np.ndarray]) -> State:
+        """Copy a state of `to_host` to the device.
+
+        Raises:
+            StateError: It is of another version, of other objects or capacities, or an array is missing.
+        """
+        given = {name: str(arrays[name]) if name in arrays else "unknown" for name in ("version", "catalog")}
+        if given["version"] != str(VERSION):
+            raise StateError(f"the state has version {given['version']}, but this release reads version {VERSION}")
+        if given["catalog"] != checksum(self.catalog):
+            raise StateError(f"the state is of another catalog of objects ({given['catalog'][:8]}, not {checksum(self.catalog)[:8]})")
+        empty = self.to_host(self.allocate(1))
+        rows = len(arrays[VARIANTS]) if VARIANTS in arrays else 0
+        for name, like in empty.items():
+            known = arrays[name].shape[1:] == like.shape[1:] and arrays[name].dtype == like.dtype if name in arrays else False
+            if not known:
+                raise StateError(f"{name} of the state does not have the shape and type that these settings give it: {like.shape[1:]}")
+        state = self.allocate(rows)
+        words = [np.ascontiguousarray(arrays[name]).reshape(rows, -1).view(np.uint32) for name in self.fields]
+        state.words.assign(np.concatenate(words, axis=1))
+        state.contacts.start.assign(np.arange(rows) * state.contacts.capacity)
+        state.contacts.count.assign(arrays["contacts.count"])
+        for name in state.contacts.history._cls.vars:
+            target = getattr(state.contacts.history, name)
+            target.assign(arrays[f"contacts.{name}"].reshape(target.shape[0], *arrays[f"contacts.{name}"].shape[2:]))
+        return state
+
+    def _checked(self, worlds: Sequence[int]) -> Sequence[int]:
+        """The worlds, if all of them exist, once each."""
+        if wrong := [world for world in worlds if not 0 <= world < self.worlds]:
+            raise StateError(f"there is no world {wrong[0]}; the simulation has worlds 0 to {self.worlds - 1}")
+        if len(set(worlds)) < len(worlds):
+            raise StateError("a world is named twice")
+        return worlds
+
+
+def checksum(catalog: Catalog) -> str:
+    """SHA-256 of what physics and perception know of a catalog's objects, in hexadecimal digits."""
+    digest = hashlib.sha256()
+    for entry in catalog.bodies:
+        shapes = (entry.mesh.vertices, entry.mesh.faces, *(piece.vertices for piece in entry.pieces), entry.inertia, entry.center_of_mass)
+        digest.update(repr((entry.obj_id, entry.mass, [np.shape(shape) for shape in shapes])).encode())
+        for shape in shapes:
+            digest.update(np.ascontiguousarray(shape))
+    return digest.hexdigest()
+
+
+def _find_arrays(groups: Mapping[str, object]) -> Iterator[tuple[str, wp.array]]:
+    """Arrays by world that dataclasses declare, by name of the group and the field."""
+    for group, owner in groups.items():
+        for item in fields(owner):  # type: ignore[arg-type]
+            spec: ArraySpec = item.metadata["array"]
+            if spec.shape[0] == "world":
+                yield f"{group}.{item.name}", getattr(owner, item.name)
+
+
+def _describe(name: str, array: wp.array, worlds: int, first: int) -> Field:
+    """Part of a row that an array holds of a world; its words begin at `first`."""
+    scalar = getattr(array.dtype, "_wp_scalar_type_", array.dtype)
+    shape = (array.shape[0] // worlds, *array.shape[1:], *getattr(array.dtype, "_shape_", ()))
+    shape = shape[1:] if shape[0] == 1 and array.shape[0] == worlds else shape
+    field = Field(name, np.dtype(wp.dtype_to_numpy(scalar)), shape, first)
+    if array.shape[0] % worlds or not array.is_contiguous or field.dtype.itemsize % WORD:
+        raise ValueError(f"{name} does not hold whole words of each of {worlds} worlds")
+    return field

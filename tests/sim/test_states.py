@@ -1,0 +1,254 @@
+"""Exact states: branches continue as their episodes do, nothing is forgotten, and what does not fit is refused."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+import warp as wp
+
+from synpick_warp.codes import Ending, Phase, Task
+from synpick_warp.errors import StateError
+from synpick_warp.kernels.newton_patches import contact_history
+from synpick_warp.newton_patches import history
+from synpick_warp.stages.sim import states
+from synpick_warp.stages.sim.simulate import Simulation
+from tests.worlds.sights import brief
+from tests.worlds.small_worlds import BOX, CUBE, catalog
+from tools.checks.states import Rows, check_arrays, check_branches, differing, find_arrays, watch
+
+WORLDS, TICKS = 4, 3
+RESTLESS = {"settle__stuck_depth": 1e-7, "settle__stuck_time": 0.05}
+"""Objects that touch anything are dropped again."""
+
+
+@dataclass
+class Scene:
+    """A simulation at a moment that can be set again, and how its worlds go on."""
+
+    simulation: Simulation
+    before: states.State
+    queue: np.ndarray
+    own: list[Rows]
+
+    @classmethod
+    def of(cls, simulation: Simulation) -> Scene:
+        every, queue = range(simulation.layout.worlds), simulation.state.next_episode.numpy().copy()
+        scene = cls(simulation, simulation.get_state(every), queue, watch(simulation, every, TICKS))
+        scene.reset()
+        return scene
+
+    def reset(self) -> None:
+        """To the moment."""
+        self.simulation.set_state(self.before, range(self.simulation.layout.worlds))
+        self.simulation.state.next_episode.assign(self.queue)
+
+    def differences(self, world: int, into: int) -> list[str]:
+        """Names of what differs as a branch goes on."""
+        later = watch(self.simulation, range(self.simulation.layout.worlds), TICKS)
+        return [name for expected, found in zip(self.own, later, strict=True) for name in differing(expected, found, world, into)]
+
+
+# ---- branch and continuation ----
+
+
+def test_a_branch_continues_as_its_episode_does(device):
+    """To the bit, in other worlds and among fewer of them, beside worlds that do other things, from the drop to the next look."""
+    changed = {"bake__mode": "cycle"}
+    result = check_branches(brief(device, WORLDS, **changed), brief(device, 2, **changed), states=28, moments=7, ticks=TICKS, apart=5)
+    assert result.differences == []
+    assert result.compared > 100
+    seen = " ".join(result.moments)
+    for moment in ("pick: settling", "move: moving", "pick: approach", "pick: press", "target: descend", "target: lift"):
+        assert moment in seen
+
+
+def test_a_branch_of_objects_that_are_dropped_again_continues_so(device):
+    result = check_branches(brief(device, 2, **RESTLESS), brief(device, 2, **RESTLESS), states=2, moments=1, ticks=TICKS, apart=7)
+    assert result.differences == []
+    assert any("dropped again" in moment for moment in result.moments)
+
+
+@pytest.fixture(scope="module")
+def moment(device):
+    """World 0 presses, 1 descends, 2 has moved, 3 picks, and 4 is idle."""
+    simulation = brief(device, WORLDS + 1, bake__mode="cycle", bake__episodes=WORLDS)
+    while simulation.attempts.task.numpy()[0] != Task.PRESS:
+        simulation.tick()
+    assert (simulation.attempts.task.numpy()[[1, 3]] >= Task.APPROACH).all()
+    assert simulation.state.phase.numpy()[WORLDS] == Phase.IDLE
+    return Scene.of(simulation)
+
+
+@pytest.fixture
+def scene(moment):
+    """The same moment for each test."""
+    yield moment
+    moment.reset()
+
+
+@pytest.fixture
+def acting(scene):
+    return scene.simulation
+
+
+def test_an_idle_world_continues_as_a_branch(scene):
+    scene.simulation.branch(0, [WORLDS])
+    assert scene.differences(0, WORLDS) == []
+
+
+def test_a_branch_in_several_worlds_is_the_same_in_each(acting):
+    acting.branch(1, [0, 2, 3, 4])
+    for rows in watch(acting, range(WORLDS + 1), TICKS):
+        assert [list(differing(rows, rows, 1, world)) for world in (0, 2, 3, 4)] == [[]] * 4
+
+
+# ---- nothing is forgotten ----
+
+
+def test_all_that_is_no_state_may_be_anything(device):
+    kinds = Counter()
+    assert list(check_arrays(brief(device, 3), 24, kinds)) == []
+    assert kinds["overwritten"] > 100
+    assert kinds["state"] > 100
+
+
+@pytest.mark.parametrize(
+    ("world", "forgotten"),
+    [(0, "physics.joint_qd"), (0, "physics.mf_impulses"), (1, "worlds.setpoint"), (1, "plan.point"), (0, "attempts.task")],
+)
+def test_a_state_that_forgets_an_array_is_found_out(scene, monkeypatch, world, forgotten):
+    """The checks can fail: without one of its arrays, a branch in an idle world differs."""
+    known = scene.simulation.states
+    name = forgotten.replace("mf_", "propagation_") if scene.simulation.device.is_cuda else forgotten
+    with monkeypatch.context() as patch:
+        patch.setattr(known, "_table", without(known, name))
+        scene.simulation.branch(world, [WORLDS])
+    assert scene.differences(world, WORLDS) != []
+
+
+def without(known: states.WorldStates, name: str):
+    """The table of a state's words, of which those of an array lie in memory of no use."""
+    table, waste = states.world_rows.WordTable(), wp.zeros(known.words, dtype=wp.uint32, device=known.device)
+    address, stride = known._table.address.numpy().copy(), known._table.stride.numpy().copy()
+    words = slice(known.fields[name].first, known.fields[name].first + known.fields[name].words)
+    address[words] = waste.ptr + states.WORD * np.arange(known.fields[name].words, dtype=np.uint64)
+    stride[words] = 0
+    table.address, table.stride = (wp.array(values, device=known.device) for values in (address, stride))
+    known.waste = waste
+    return table
+
+
+@pytest.mark.parametrize("forgotten", ["key", "midpoint", "solved_normal", "row", "pair", "displacement", "valid"])
+def test_a_forgotten_contact_is_found_out(scene, monkeypatch, forgotten):
+    known = scene.simulation.states.history
+    name = {"row": "propagation_slot" if scene.simulation.device.is_cuda else "free_slot"}.get(forgotten, forgotten)
+    with monkeypatch.context() as patch:
+        patch.setattr(known, "live", replaced(known.live, name, wp.zeros_like(getattr(known.live, name))))
+        scene.simulation.branch(0, [WORLDS])
+    assert scene.differences(0, WORLDS) != []
+
+
+def replaced(contacts, name: str, array: wp.array):
+    """Contacts with another array."""
+    copy = contact_history.ContactHistory()
+    for member in contact_history.ContactHistory.vars:
+        setattr(copy, member, array if member == name else getattr(contacts, member))
+    return copy
+
+
+# ---- on the host ----
+
+
+def test_a_state_survives_a_file(scene, device, tmp_path):
+    """In another simulation of other worlds, too."""
+    known = scene.simulation.states
+    np.savez(tmp_path / "state.npz", **known.to_host(known.get([0, 3])))
+    other = brief(device, 3)
+    other.tick()
+    with np.load(tmp_path / "state.npz") as file:
+        other.set_state(other.states.from_host(dict(file)), [2, 1])
+    for expected, found in zip(scene.own, watch(other, range(3), TICKS), strict=True):
+        assert list(differing(expected, found, 0, 2)) == []
+        assert list(differing(expected, found, 3, 1)) == []
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"version": np.array(0)}, "the state has version 0, but this release reads version 1"),
+        ({"version": None}, "the state has version unknown"),
+        ({"catalog": np.array("0123456789")}, "the state is of another catalog of objects"),
+        ({"plan.point": None}, "plan.point of the state does not have the shape and type"),
+        ({"worlds.stuck": np.zeros((2, 9), np.int32)}, "worlds.stuck of the state does not have the shape and type"),
+    ],
+)
+def test_a_state_that_does_not_fit_is_refused(acting, changes, message):
+    arrays = acting.states.to_host(acting.get_state([0, 1])) | changes
+    with pytest.raises(StateError, match=message):
+        acting.states.from_host({name: array for name, array in arrays.items() if array is not None})
+
+
+def test_catalogs_are_told_apart():
+    assert states.checksum(catalog()) == states.checksum(catalog())
+    assert len({states.checksum(one) for one in (catalog(), catalog(BOX), catalog(CUBE, BOX))}) == 3
+
+
+# ---- what is asked for must be there ----
+
+
+@pytest.mark.parametrize(
+    ("ask", "message"),
+    [
+        (lambda one: one.get_state([9]), "there is no world 9; the simulation has worlds 0 to"),
+        (lambda one: one.branch(-1, [0]), "there is no world -1"),
+        (lambda one: one.branch(0, [1, 1]), "a world is named twice"),
+        (lambda one: one.set_state(one.get_state([0, 1]), [0, 1, 2]), "2 rows cannot be loaded into 3 worlds"),
+        (lambda one: one.set_state(one.get_state([0, 1]), [0], [2]), "there is no row 2; the state has rows 0 to 1"),
+        (lambda one: one.states.allocate(10**12), "states of 1,000,000,000,000 worlds take"),
+    ],
+)
+def test_wrong_worlds_and_rows_are_refused(acting, ask, message):
+    with pytest.raises(StateError, match=message):
+        ask(acting)
+
+
+def test_there_is_no_state_before_and_within_a_tick(device):
+    simulation = brief(device, 1)
+    with pytest.raises(StateError, match="between two ticks alone"):
+        simulation.get_state([0])
+    parts = simulation.tick_parts()
+    for _ in parts:
+        with pytest.raises(StateError, match="between two ticks alone"):
+            simulation.get_state([0])
+    assert len(simulation.get_state([0])) == 1
+
+
+def test_another_version_of_newton_has_no_states(device, monkeypatch):
+    simulation = brief(device, 1, bake__mode="move")
+    simulation.tick()
+    monkeypatch.setattr(history, "KNOWN_NEWTON", "1.7.0")
+    with pytest.raises(StateError, match=r"states need Newton 1.7.0; what .*, which is installed, keeps of a step is unknown"):
+        simulation.get_state([0])
+
+
+def test_a_world_with_more_contacts_than_a_state_has_room_for_ends_as_a_branch(device):
+    """And no other world."""
+    simulation = brief(device, WORLDS, bake__episodes=1, physics__contacts_per_world=16)
+    while simulation.physics.contacts.rigid_contact_count.numpy()[0] <= 16:
+        simulation.tick()
+    simulation.branch(0, [2])
+    simulation.tick()
+    phase, ending = simulation.state.phase.numpy(), simulation.state.ending.numpy()
+    assert Phase(phase[2]) is Phase.OVER
+    assert Ending(ending[2]) is Ending.CONTACT_OVERFLOW
+    assert ending[0] == Ending.RUNNING
+
+
+def test_every_array_of_the_state_is_found(acting):
+    found = list(find_arrays(acting).values())
+    assert len(found) > 500
+    pointers = {array.ptr for array in found}
+    assert [array.shape for array in acting.states.arrays() if array.ptr not in pointers] == []

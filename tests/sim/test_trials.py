@@ -1,0 +1,106 @@
+"""Trials: the episode's own grasp has its own outcome, labels do not depend on the worlds, and bad grasps are refused."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from synpick_warp.codes import Outcome
+from synpick_warp.errors import StateError
+from synpick_warp.stages.sim.simulate import Simulation
+from synpick_warp.stages.sim.trials import Trials, check_grasps, find_choices, own_grasps
+from tests.worlds.sights import brief
+from tests.worlds.small_worlds import report
+
+LONGEST = 60
+ABOVE = 0.25
+"""Height of a grasp in the air above the pile [m]."""
+
+
+def worlds(device, count: int) -> Simulation:
+    return brief(device, count, bake__mode="pick", arrangement__max_objects=2)
+
+
+class Choice:
+    """A world at a moment of choice: its state and plan, and how its own attempt ends."""
+
+    def __init__(self, simulation: Simulation) -> None:
+        while not len(find_choices(simulation)):
+            simulation.tick()
+        (self.world,) = find_choices(simulation)[:1]
+        self.state, self.grasps = simulation.get_state([self.world]), own_grasps(simulation, [self.world])
+        self.peak, self.ticks, row = 0.0, 0, None
+        while row is None or not row.column("outcome")[self.world]:
+            simulation.tick()
+            row, self.ticks = report(simulation.record), self.ticks + 1
+            self.peak = max(self.peak, row.measure("peak_force")[self.world])
+        self.outcome, self.hits = row.column("outcome")[self.world], row.column("hits")[self.world]
+
+    def repeated(self, count: int, **changed: np.ndarray) -> dict[str, np.ndarray]:
+        """The own grasp several times, with changes."""
+        return {name: np.repeat(values, count, axis=0) for name, values in self.grasps.items()} | changed
+
+
+@pytest.fixture(scope="module")
+def choice(device):
+    return Choice(worlds(device, 3))
+
+
+@pytest.fixture(scope="module")
+def labels(choice, device):
+    """Of seven trials in three worlds: the own grasp, but the second and the fifth are in the air, and the third is turned."""
+    grasps = choice.repeated(7)
+    grasps["point"][[1, 4], 2] += ABOVE
+    grasps["yaw"][2] += 0.5
+    found = {}
+    for count in (3, 2):
+        simulation = worlds(device, count)
+        simulation.tick()
+        found[count] = Trials(simulation, choice.state, grasps).run()
+    return found
+
+
+def test_the_own_grasp_has_the_outcome_of_the_own_attempt(choice, labels):
+    own = {name: values[0] for name, values in labels[3].items()}
+    assert Outcome(choice.outcome) is Outcome.TARGET_PICKED
+    assert own["outcome"] == choice.outcome
+    assert own["hits"][0] == choice.hits
+    assert own["picked"] == choice.grasps["target"][0]
+    assert own["peak_force"] == np.float32(choice.peak)
+    assert own["ticks"] == choice.ticks
+    assert 0 < own["held"] < own["ticks"]
+
+
+def test_the_same_trial_has_the_same_labels(labels):
+    for name, values in labels[3].items():
+        assert len({values[trial].tobytes() for trial in (0, 3, 5, 6)}) == 1, name
+        assert values[1].tobytes() == values[4].tobytes(), name
+
+
+def test_labels_do_not_depend_on_the_number_of_worlds(labels):
+    for name, values in labels[3].items():
+        np.testing.assert_array_equal(values, labels[2][name], err_msg=name)
+
+
+def test_a_grasp_in_the_air_catches_nothing(labels):
+    assert Outcome(labels[3]["outcome"][1]) is Outcome.NOTHING_CAUGHT
+    assert labels[3]["hits"][1].tolist() == [0, 0]
+    assert (labels[3]["picked"][1], labels[3]["held"][1], labels[3]["moved"][1], labels[3]["lost"][1]) == (-1, 0, 0, 0)
+    assert labels[3]["peak_force"][1] == 0.0
+    assert labels[3]["farthest"][1] < 5e-3
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"yaw": None}, "grasps lack yaw"),
+        ({"point": np.zeros((2, 2))}, r"point of 2 grasps has the shape \(2, 2\), not \(2, 3\)"),
+        ({"tilt": np.array([0.0, np.nan])}, "tilt of grasp 1 is not finite"),
+        ({"row": np.array([0, 3])}, "row is 3; allowed: 0 to 0"),
+        ({"target": np.array([-2, 0])}, "target is -2; allowed: -1 to 1"),
+    ],
+)
+def test_bad_grasps_are_refused(choice, changes, message):
+    grasps = {name: values for name, values in (choice.repeated(2) | changes).items() if values is not None}
+    with pytest.raises(StateError, match=message):
+        check_grasps(grasps, 1, 2)
