@@ -14,7 +14,8 @@ PYTHON ?= $(shell for python in python3 python3.12 python3.11; do \
 VENV := .venv
 BIN := $(VENV)/bin
 DEMO := demo
-WORKERS := 2
+# One more than the cores: tests also wait, for processes that they start.
+WORKERS := 3
 # Neighbours in one process, which makes what they share once.
 PYTEST = $(BIN)/python -m pytest -n $(WORKERS) --dist worksteal
 

@@ -209,6 +209,12 @@ class Physics:
         high=100,
     )
     iterations: int = setting(16, "", "Projected Gauss-Seidel iterations per solver substep.", low=1, high=1000)
+    match_all: bool = setting(
+        False,
+        "",
+        "Warm start every contact from one of the last substep. Newton leaves one of two coincident contacts out, as edges on a face have: "
+        "up to half of their load is lost in every substep, and boxes that lie ten deep move five times as fast.",
+    )
     friction: float = setting(0.5, "", "Coulomb friction coefficient of every shape.", low=0.0, high=10.0)
     gap: float = setting(4e-3, "m", "Contact margin of a shape: contacts are generated below twice this distance.", low=0.0, high=0.1)
     angular_damping: float = setting(0.05, "1/s", "Angular damping of the objects (PhysX's default).", low=0.0, high=1e3)

@@ -251,7 +251,7 @@ class PickData:
     tilt_limit: float
     """Largest tilt of the cup [rad]."""
     forgive: int
-    """1: a success in mode TARGET resets the count of failures."""
+    """Bit m: a success in mode m (`Mode`) resets the count of failures."""
     random_after_failure: int
     """1: after a failure in mode TARGET the next target is sampled at random."""
 

@@ -179,6 +179,7 @@ class Stream(enum.IntEnum):
     COMPARTMENT = 15
     INFRARED_NOISE = 16
     CAMERA = 17
+    GRASPS = 18
 
 
 class Look(enum.IntEnum):

@@ -97,6 +97,8 @@ VALUES = {
     "ir_left": np.array([[0, 128, 255], [1, 127, 254]], np.uint8),
     "ir_right": np.array([[0, 128, 255], [1, 127, 254]], np.uint8),
     "depth_stereo": np.array([[0, 18000, 65535], [1, 17999, 18001]], np.uint16),
+    "suction_seal": np.array([[0, 0.5, 1], [0.25, 0, 0.125]], np.float32),
+    "suction_wrench": np.array([[0, 0.5, 1], [0.25, 0, 0.125]], np.float32),
 }
 
 

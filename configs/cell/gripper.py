@@ -8,6 +8,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 from synpick_warp.codes import MAX_CUPS
+from synpick_warp.configs.episodes.objects import UNITS
 from synpick_warp.configs.fields import INT32_MAX, Conflict, setting
 
 SUCTION1 = "suction1"
@@ -39,6 +40,15 @@ class Gripper:
         "Vacuum of a suction_array: each (a valve for each cup) or common (one for all: if one leaks or breaks off, all seals are poor).",
         choices=(EACH, COMMON),
     )
+    mesh: str = setting(
+        "",
+        "",
+        "Mesh (.stl, .ply, .obj, .glb, .gltf, .step) of the body of a suction_array: origin on the wrist axis, which is "
+        "y, cups towards -z. Empty: a plate.",
+        path=True,
+    )
+    mesh_unit: str = setting("m", "", "Unit of that mesh.", choices=tuple(UNITS))
+    mesh_checksum: str = setting("", "", "SHA-256 of that mesh; the program writes it.")
     finger_length: float = setting(0.35, "m", "Length of the shaft, from its top to the wrist axis.", low=0.005, high=2.0)
     finger_width: float = setting(0.075, "m", "Diameter of the shaft at its top.", low=0.005, high=1.0)
     cup_width: float = setting(0.042, "m", "Diameter of the suction cup.", low=0.005, high=0.5)
@@ -103,6 +113,8 @@ def find_gripper_conflicts(gripper: Gripper, suction: Suction, mouths: Sequence[
             yield "gripper.cups", f'none with gripper.kind "{gripper.kind}"; set gripper.kind = "{SUCTION_ARRAY}"'
         if gripper.valve != EACH:
             yield "gripper.valve", f'{EACH} with gripper.kind "{gripper.kind}", which has one; set gripper.kind = "{SUCTION_ARRAY}"'
+        if gripper.mesh:
+            yield "gripper.mesh", f'none with gripper.kind "{gripper.kind}"; set gripper.kind = "{SUCTION_ARRAY}"'
         return
     if not 1 <= len(gripper.cups) <= MAX_CUPS:
         yield "gripper.cups", f"1 to {MAX_CUPS} places [x, y] with gripper.kind {SUCTION_ARRAY}, such as [[-0.03, 0.0], [0.03, 0.0]]"

@@ -6,6 +6,11 @@ from dataclasses import dataclass
 
 from synpick_warp.configs.fields import INT32_MAX, setting
 
+SAME, ANOTHER = "same", "another"
+"""Targets after a failed attempt."""
+MASK, FLAT = "mask", "flat"
+"""Rules of the grasp point."""
+
 
 @dataclass(frozen=True)
 class Move:
@@ -57,6 +62,14 @@ class Pick:
     lift_height: float = setting(1.0, "m", "Height by which the setpoint is lifted (released).", above=0.0, high=10.0)
     lift_speed: float = setting(0.5, "m/s", "Speed of the setpoint while lifting (released).", low=1e-3, high=100.0)
     failures: int = setting(3, "", "Failed attempts that end the episode (paper: 3; released: 4).", low=1, high=INT32_MAX)
+    forgive: bool = setting(False, "", "A successful pick resets the count of failed attempts: those in a row end the episode.")
+    retry: str = setting(
+        SAME,
+        "",
+        "Target after a failed attempt: same (the rule chooses as if none had failed) or another (of objects with the fewest failed "
+        "attempts; one that has failed is grasped at a random point, flat if one is found).",
+        choices=(SAME, ANOTHER),
+    )
     floor: float = setting(-0.1, "m", "Objects below this height are removed from the scene (released).", low=-10.0, high=0.0)
     repeats: bool = setting(False, "", "Whether an episode may contain several instances of an object (paper: no).")
 
@@ -95,6 +108,13 @@ class Perception:
         "Centroid, or midpoint to the pole of inaccessibility, is used if its distance to the contour exceeds this fraction of the pole's.",
         low=0.0,
         high=10.0,
+    )
+    grasp_point: str = setting(
+        MASK,
+        "",
+        "Rule of the grasp point: mask (pole, centroid or midpoint of the mask, as in the paper) or flat (that point if the surface around "
+        "it is flat and as wide as the tool, else a random one where it is).",
+        choices=(MASK, FLAT),
     )
     heavy_mass: float = setting(0.8, "kg", "Mass above which objects are grasped nearer to their centroid.", low=0.0, high=1e6)
     heavy_center_fraction: float = setting(0.4, "", "Same as center_fraction, for heavy objects.", low=0.0, high=10.0)

@@ -14,6 +14,7 @@ from synpick_warp.configs.calibration.sensor_presets import sensor_settings
 from synpick_warp.configs.calibration.tables import fill_tables
 from synpick_warp.configs.cell.bins import BinRow, check_meshes
 from synpick_warp.configs.cell.cameras import Cameras
+from synpick_warp.configs.cell.gripper import Gripper
 from synpick_warp.configs.check import check_value
 from synpick_warp.configs.files.split_tables import SPLITS, override_table, read_tables, resolve_splits, split_settings
 from synpick_warp.configs.files.table_lists import change_rows, given_values, read_rows, settings_of
@@ -42,7 +43,7 @@ def load_config(
     *,
     source: str = "in the settings passed",
     splits: bool = False,
-    measure: Callable[[tuple[BinRow, ...]], Mapping[str, tuple[BinRow, ...]]] | None = None,
+    measure: Callable[[tuple[BinRow, ...], Gripper], Mapping[str, Any]] | None = None,
 ) -> Config:
     """Load a preset or a TOML file, override single settings, and validate the result.
 
@@ -61,7 +62,7 @@ def load_config(
         source: Where `settings` come from, for error messages.
         splits: Whether the splits of a preset hold, such as train and test of "synpick", unless a file sets mode or episodes otherwise;
             the [splits] of a file always hold.
-        measure: Lists of tables to replace, of the bins with what their meshes measure; None: without.
+        measure: Tables and sections to replace, of bins and gripper, with what their meshes measure; None: without.
 
     Returns:
         The complete configuration: frozen dataclasses, see `synpick_warp.configs.schema`.
@@ -82,7 +83,7 @@ def load_config(
             values |= _section_values(section, {name: value}, source)
     config = _build(values, source if settings else "")
     _check_conflicts(config, values)
-    if measure is not None and (found := measure(config.bin)):
+    if measure is not None and (found := measure(config.bin, config.gripper)):
         config = dataclasses.replace(config, **found)
         _check_conflicts(config, values)
     return config
@@ -93,7 +94,7 @@ def override_config(config: Config, settings: Mapping[str, object], source: str 
 
     Args:
         config: The configuration.
-        settings: Full key, such as "physics.step", -> value; or list of tables, such as "bin", -> its rows.
+        settings: Full key, such as "physics.step", -> value; or list of tables or section, such as "bin", -> its rows or content.
         source: Where `settings` come from, for error messages.
 
     Raises:
@@ -102,7 +103,7 @@ def override_config(config: Config, settings: Mapping[str, object], source: str 
     """
     values: Values = {}
     for key, value in settings.items():
-        if key in table_lists():
+        if key in table_lists() or dataclasses.is_dataclass(value):
             config = dataclasses.replace(config, **{key: value})
             continue
         section, _, name = key.partition(".")

@@ -31,6 +31,9 @@ HAS_FRICTION = f"record[{KIND}] == {WITH_FRICTION}"
 MAX_SHARED_ROWS = 3072
 """Maximum number of rows of a world whose impulses and lists of patch members lie in shared memory: they take 24 of the 48 KB of a block.
 Those of more rows lie in global memory, and are prefetched to the L1 cache."""
+WARPS_OF_MANY = 4
+"""Warps of a block, which sweeps a world, where rows lie in global memory: as many times 32 contacts are loaded at a time, and those of one
+color solved at once. Of 3,600 contacts, a color has 50. Two such blocks fit into the registers of a multiprocessor."""
 SECTOR = 8
 """Words that a prefetch brings to the L1 cache at least: 32 bytes."""
 TWIST_STRIDE = 8
@@ -44,7 +47,8 @@ def shared_bytes(rows: int, bodies: int, stages_rows: bool = True) -> int:
 
 
 def compose_contact_sweep(rows: int, bodies: int, offsets: int, friction: str = SOLVE_FRICTION, stages_rows: bool = True) -> wp.Function:
-    """Create the sweep over the contacts of a world, for a GPU: all iterations of a solve in one launch, with a warp for each block.
+    """Create the sweep over the contacts of a world, for a GPU: all iterations of a solve in one launch, with a block for each world: one
+    warp, or `WARPS_OF_MANY` unless rows are in shared memory, which changes no result.
 
     Impulses, patch lists and starts of colors stay in shared memory from the first iteration to the last, which writes the impulses. Two
     contacts that share a body, or a patch, must have different colors. A contact of another kind than `WITH_FRICTION` and `NORMAL_ONLY` is
@@ -63,7 +67,7 @@ def compose_contact_sweep(rows: int, bodies: int, offsets: int, friction: str = 
     if stages_rows and rows > MAX_SHARED_ROWS:
         raise ValueError(f"{rows:,} contact rows of a world do not fit into shared memory; at most {MAX_SHARED_ROWS:,} do.")
 
-    @wp.func_native(_source(rows, bodies, offsets, friction, _SHARED if stages_rows else _GLOBAL))
+    @wp.func_native(_source(rows, bodies, offsets, friction, 1 if stages_rows else WARPS_OF_MANY))
     def sweep_contacts(
         world: int,
         iteration: int,
@@ -72,7 +76,7 @@ def compose_contact_sweep(rows: int, bodies: int, offsets: int, friction: str = 
         twist_inout: wp.array2d[float],
         impulse_inout: wp.array2d[float],
     ):
-        """Gauss-Seidel sweep over the contacts of a world: updates the impulses of rows and bodies, and the twists, by one warp."""
+        """Gauss-Seidel sweep over the contacts of a world: updates the impulses of rows and bodies, and the twists, by one block."""
         ...
 
     return sweep_contacts
@@ -103,14 +107,15 @@ _GLOBAL = (
 """As `_SHARED`, in global memory."""
 
 
-def _source(rows: int, bodies: int, offsets: int, friction: str, places: tuple[str, str, str, str]) -> str:
-    """CUDA source of the sweep. A static body's twist is that of a slot behind the others, zero."""
-    declare, begin, end, prefetch = (part.replace("{rows}", str(rows)) for part in places)
-    return f"""
+def _source(rows: int, bodies: int, offsets: int, friction: str, warps: int) -> str:
+    """CUDA source of the sweep by `warps` warps a block. A static body's twist is that of a slot behind the others, zero."""
+    declare, begin, end, prefetch = (part.replace("{rows}", str(rows)) for part in (_SHARED if warps == 1 else _GLOBAL))
+    find, visit = (_FIND_COLORS, _VISIT_COLORS) if warps == 1 else (_FIND_COLORS_OF_MANY, _VISIT_COLORS_OF_MANY)
+    source = f"""
 #if defined(__CUDA_ARCH__)
 {friction}
     const auto prefetch = [](const void* address) {{ asm volatile("prefetch.global.L1 [%0];" :: "l"(address)); }};
-    const int lane = threadIdx.x & 31;
+    const int lane = threadIdx.x & LAST;
     if (contacts.row_count.data[world] == 0) return;
     const int first_row = world * {rows};
     const int* color_offsets = &contacts.color_offsets.data[world * {offsets}];
@@ -124,31 +129,27 @@ def _source(rows: int, bodies: int, offsets: int, friction: str, places: tuple[s
     const bool begins = iteration == settings.iteration_offset, ends = iteration + 1 == settings.iteration_offset + settings.iterations;
     const int row_count = min(contacts.row_count.data[world], {rows}), slots = contacts.body_count.data[world];
     if (begins) {{{begin}
-{_FIND_COLORS.replace("OFFSETS", str(offsets))}
+{find.replace("OFFSETS", str(offsets))}
     }}
-{_LOAD_BODIES.replace("BODIES", str(bodies))}
-    __syncwarp();
-    for (int first = 0; first < count; first += 32) {{
+{_LOAD_BODIES}
+    SYNCHRONIZE
+    for (int first = 0; first < count; first += THREADS) {{
         const int index = first + lane;
 {_LOAD.replace("PREFETCH", prefetch)}
-        unsigned starts = color_starts[first / 32];
-        for (int begin = 0; begin < 32;) {{
-            const int end = starts ? __ffs(starts) - 1 : 32;
-            if (record[{KIND}] != 0 && begin <= lane && lane < end) {{
-{_SOLVE.replace("BODIES", str(bodies))}
-            }}
-            __syncwarp();
-            starts &= starts - 1;
-            begin = end;
-        }}
+{visit}
     }}
-{_STORE_BODIES.replace("BODIES", str(bodies))}{end}
+{_STORE_BODIES}{end}
 #endif
 """
+    synchronize = "__syncwarp();" if warps == 1 else "__syncthreads();"
+    values = {"BODIES": bodies, "WARPS": warps, "THREADS": 32 * warps, "LAST": 32 * warps - 1, "SYNCHRONIZE": synchronize}
+    for name, value in values.items():
+        source = source.replace(name, str(value))
+    return source
 
 
 _LOAD_BODIES = f"""
-    for (int i = lane; i < slots * 6; i += 32) {{
+    for (int i = lane; i < slots * 6; i += THREADS) {{
         const int slot = i / 6, component = i - 6 * slot, body = contacts.bodies.data[world * BODIES + slot];
         twists[slot * {TWIST_STRIDE} + component] = twist_inout.data[body * 6 + component];
         body_impulses[i] = impulse_inout.data[body * 6 + component];
@@ -159,7 +160,7 @@ _LOAD_BODIES = f"""
 """Load the twists of a world's bodies, the impulses on them, and which ones are free."""
 
 _STORE_BODIES = f"""
-    for (int i = lane; i < slots * 6; i += 32) {{
+    for (int i = lane; i < slots * 6; i += THREADS) {{
         const int slot = i / 6, component = i - 6 * slot, body = contacts.bodies.data[world * BODIES + slot];
         twist_inout.data[body * 6 + component] = twists[slot * {TWIST_STRIDE} + component];
         impulse_inout.data[body * 6 + component] = body_impulses[i];
@@ -168,9 +169,9 @@ _STORE_BODIES = f"""
 
 _LOAD = f"""
         // The next iteration begins with the first contacts again. The record of a contact is prefetched before its rows, which it tells.
-        const int padded = (count + 31) / 32 * 32;
-        const int next = index + 32 < padded ? index + 32 : lane;
-        const int after = next + 32 < padded ? next + 32 : lane;
+        const int padded = (count + LAST) / THREADS * THREADS;
+        const int next = index + THREADS < padded ? index + THREADS : lane;
+        const int after = next + THREADS < padded ? next + THREADS : lane;
         if (after < count) {{
             const int* after_record = &contacts.records.data[(first_row + after) * {RECORD}];
             prefetch(after_record);
@@ -348,3 +349,31 @@ _SOLVE = f"""
                     }}
                 }}"""
 """Solve the lane's contact: its normal row, then its two friction rows together, whose responses are added in the order of the solver."""
+
+_VISIT_COLORS = f"""        unsigned starts = color_starts[first / 32];
+        for (int begin = 0; begin < 32;) {{
+            const int end = starts ? __ffs(starts) - 1 : 32;
+            if (record[{KIND}] != 0 && begin <= lane && lane < end) {{
+{_SOLVE}
+            }}
+            SYNCHRONIZE
+            starts &= starts - 1;
+            begin = end;
+        }}"""
+"""Solve the colors among the contacts of a warp one after the other."""
+
+_FIND_COLORS_OF_MANY = f"        if (lane < 32) {{{_FIND_COLORS.replace('starts & ~1u', 'starts')}\n        }}"
+"""As `_FIND_COLORS`, by the first of several warps; a bit also tells whether a color starts at the first of 32 contacts."""
+
+_VISIT_COLORS_OF_MANY = f"""        unsigned starts = color_starts[first / 32] & ~1u;
+        for (int begin = 0, word = 0; begin < THREADS;) {{
+            while (starts == 0 && ++word < WARPS && first + 32 * word < count) starts = color_starts[first / 32 + word];
+            const int end = starts ? 32 * word + __ffs(starts) - 1 : THREADS;
+            if (record[{KIND}] != 0 && begin <= lane && lane < end) {{
+{_SOLVE}
+            }}
+            SYNCHRONIZE
+            starts &= starts - 1;
+            begin = end;
+        }}"""
+"""As `_VISIT_COLORS`, for the contacts of several warps."""

@@ -7,9 +7,12 @@ solver's; twists are at centers of mass.
 
 import warp as wp
 
+from synpick_warp.kernels.newton_patches.broad_phase import synchronize_block
+
 wp.set_module_options({"enable_backward": False})
 
-# Threads of a warp. A block is one warp, which owns one world, so that a barrier of the warp orders the functions of an iteration.
+# Threads of a warp. A block owns one world: it is one warp, so that a barrier of the warp orders the functions of an iteration, or several
+# that sweep contacts, the first of which does all else.
 WARP = wp.constant(32)
 # Components of a twist: linear and angular velocity.
 TWIST = wp.constant(6)
@@ -158,6 +161,18 @@ def synchronize_warp():
 
 
 @wp.func
+def is_any(thread: int) -> bool:
+    """True: all threads of a block are of its first warp."""
+    return True
+
+
+@wp.func
+def is_of_first_warp(thread: int) -> bool:
+    """Whether a thread of a block is of its first warp."""
+    return thread < WARP
+
+
+@wp.func
 def load_free_twists(world: int, lane: int, bodies: BodyData, v: wp.array[float], twist_inout: wp.array2d[float]):
     """Copy the velocities of the free bodies of a world from generalized velocities to twists, by one warp."""
     for element in range(lane, bodies.free_bodies.shape[1] * TWIST, WARP):
@@ -236,9 +251,10 @@ def bind_propagation(function: wp.Function) -> wp.Function:
 
 
 def compose_iterations(
-    sweep_rows: wp.Function, refresh_tree: wp.Function, sweep_contacts: wp.Function, propagate: wp.Function
+    sweep_rows: wp.Function, refresh_tree: wp.Function, sweep_contacts: wp.Function, propagate: wp.Function, warps: int = 1
 ) -> wp.Kernel:
-    """Create the kernel of the iterations from the solver's device functions, wrapped by the functions above."""
+    """Create the kernel of the iterations from the solver's device functions, wrapped by the functions above, for blocks of `warps`."""
+    leads, synchronize = (is_any, synchronize_warp) if warps == 1 else (is_of_first_warp, synchronize_block)
 
     @wp.kernel(enable_backward=False, module="unique")
     def solver_iterations_kernel(
@@ -260,7 +276,7 @@ def compose_iterations(
         An iteration sweeps joint limits, contacts in generalized coordinates, colored contacts, the response of the gripper to these, and
         speed limits; sweeps without rows are skipped. Velocities of free bodies exist twice: in `v`, generalized velocities, and as twists.
         They are copied between the two in every iteration if a sweep over `v` can change them, otherwise before the first and after the
-        last one. `impulse_inout` ends as 0. Launched over rank, lane: one warp per world, worlds in `order`.
+        last one. `impulse_inout` ends as 0. Launched over rank, thread of a block: one block per world, worlds in `order`.
         """
         rank, lane = wp.tid()
         world = order[rank]
@@ -271,21 +287,23 @@ def compose_iterations(
         last = settings.iterations - 1
         for step in range(settings.iterations):
             iteration = settings.iteration_offset + step
-            if has_limits:
-                sweep_rows(world, INTERNAL_ROWS, iteration, settings, rows, v_inout)
-            if has_contacts:
-                sweep_rows(world, CONTACT_ROWS, iteration, settings, rows, v_inout)
-            refresh_tree(world, bodies, v_inout, twist_inout)
-            if step == 0 or has_contacts or has_velocity_limits:
-                load_free_twists(world, lane, bodies, v_inout, twist_inout)
-            synchronize_warp()
+            if leads(lane):
+                if has_limits:
+                    sweep_rows(world, INTERNAL_ROWS, iteration, settings, rows, v_inout)
+                if has_contacts:
+                    sweep_rows(world, CONTACT_ROWS, iteration, settings, rows, v_inout)
+                refresh_tree(world, bodies, v_inout, twist_inout)
+                if step == 0 or has_contacts or has_velocity_limits:
+                    load_free_twists(world, lane, bodies, v_inout, twist_inout)
+            synchronize()
             sweep_contacts(world, iteration, settings, contacts, twist_inout, impulse_inout)
-            synchronize_warp()
-            propagate(world, bodies, impulse_inout, twist_inout, v_inout)
-            if step == last or has_contacts or has_velocity_limits:
-                store_free_twists(world, lane, bodies, twist_inout, impulse_inout, v_inout)
-            synchronize_warp()
-            if has_velocity_limits:
-                sweep_rows(world, VELOCITY_LIMITS, iteration, settings, rows, v_inout)
+            synchronize()
+            if leads(lane):
+                propagate(world, bodies, impulse_inout, twist_inout, v_inout)
+                if step == last or has_contacts or has_velocity_limits:
+                    store_free_twists(world, lane, bodies, twist_inout, impulse_inout, v_inout)
+                synchronize_warp()
+                if has_velocity_limits:
+                    sweep_rows(world, VELOCITY_LIMITS, iteration, settings, rows, v_inout)
 
     return solver_iterations_kernel

@@ -4,6 +4,33 @@ import warp as wp
 
 wp.set_module_options({"enable_backward": False})
 
+TWIST = wp.constant(6)
+"""Components of a twist."""
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    return __ballot_sync(~0u, value);
+#else
+    return value ? 1u : 0u;
+#endif
+""")
+def ballot(value: bool) -> wp.uint32:
+    """Vote of a warp: bits of the lanes whose `value` is true; on a CPU a warp has one lane."""
+    ...
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    return __ffs(bits) - 1;
+#else
+    return 0;
+#endif
+""")
+def first_lane(bits: wp.uint32) -> int:
+    """Lowest lane of a vote that is not empty."""
+    ...
+
 
 @wp.kernel
 def apply_warm_start_kernel(
@@ -45,3 +72,47 @@ def apply_warm_start_kernel(
                 total = total + jacobian_b[world, row, axis] * strength
     twist_inout[body, axis] = velocity
     body_impulse_inout[body, axis] = total
+
+
+@wp.kernel(enable_backward=False, module="unique")
+def apply_warm_start_of_many_kernel(
+    # State:
+    row_count: wp.array[int],  # (world)
+    body_count: wp.array[int],  # (world)
+    body_list: wp.array2d[int],  # (world, slot)
+    body_a: wp.array2d[int],  # (world, row)
+    body_b: wp.array2d[int],  # (world, row)
+    jacobian_a: wp.array3d[float],  # (world, row, 6) [1, m]
+    jacobian_b: wp.array3d[float],  # (world, row, 6) [1, m]
+    response_a: wp.array3d[float],  # (world, row, 6) [1/kg, 1/(kg m)]
+    response_b: wp.array3d[float],  # (world, row, 6) [1/kg, 1/(kg m)]
+    impulse: wp.array2d[float],  # (world, row) [N s]
+    twist_inout: wp.array2d[float],  # (body, 6) [m/s, rad/s]
+    body_impulse_inout: wp.array2d[float],  # (body, 6) [N s, N m s]
+):
+    """Warm start of worlds of many rows: as `apply_warm_start_kernel`, bit by bit, with a warp a body that votes on 32 rows at a time.
+
+    Launched over world, body with contacts, lane: a block of one warp for each body, on a CPU of one thread.
+    """
+    world, slot, lane = wp.tid()
+    if slot >= body_count[world]:
+        return
+    body = body_list[world, slot]
+    count = wp.min(row_count[world], impulse.shape[1])
+    for start in range(0, count, wp.block_dim()):
+        mine = start + lane
+        touches = bool(False)
+        if mine < count:
+            touches = impulse[world, mine] != 0.0 and (body_a[world, mine] == body or body_b[world, mine] == body)
+        touching = ballot(touches)
+        while touching != wp.uint32(0):
+            row = start + first_lane(touching)
+            touching = touching & (touching - wp.uint32(1))
+            strength = impulse[world, row]
+            for axis in range(lane, TWIST, wp.block_dim()):
+                if body_a[world, row] == body:
+                    twist_inout[body, axis] = twist_inout[body, axis] + response_a[world, row, axis] * strength
+                    body_impulse_inout[body, axis] = body_impulse_inout[body, axis] + jacobian_a[world, row, axis] * strength
+                if body_b[world, row] == body:
+                    twist_inout[body, axis] = twist_inout[body, axis] + response_b[world, row, axis] * strength
+                    body_impulse_inout[body, axis] = body_impulse_inout[body, axis] + jacobian_b[world, row, axis] * strength

@@ -35,11 +35,15 @@ def rank_visible(
     visible: wp.array2d[int],
     visible_fraction: wp.array2d[float],
     ancestors: wp.array3d[wp.uint32],
+    target_failures: wp.array2d[int],
     world: int,
     sign: float,
 ) -> int:
-    """Visible instance with the smallest sign · (number of ancestors), then the largest sign · fraction, then the smallest index; or -1."""
+    """Visible instance with the fewest failures, then the smallest sign · (number of ancestors), then the largest sign · fraction, then
+    the smallest index; or -1.
+    """
     chosen = int(-1)
+    fewest = int(0)
     least = float(0.0)
     largest = float(0.0)
     for i in range(visible.shape[1]):
@@ -49,8 +53,13 @@ def rank_visible(
                 members += int(wp.bit_count(ancestors[world, i, word]))
             count = sign * float(members)
             fraction = sign * visible_fraction[world, i]
-            if chosen < 0 or count < least or (count == least and fraction > largest):
+            failures = target_failures[world, i]
+            comes_first = failures < fewest
+            if failures == fewest:
+                comes_first = count < least or (count == least and fraction > largest)
+            if chosen < 0 or comes_first:
                 chosen = i
+                fewest = failures
                 least = count
                 largest = fraction
     return chosen
@@ -66,6 +75,7 @@ def choose_target_kernel(
     mode: wp.array[int],  # (world)
     attempt: wp.array[int],  # (world)
     outcome: wp.array[int],  # (world)
+    target_failures: wp.array2d[int],  # (world, instance)
     # In:
     views: Views,
     visible: wp.array2d[int],  # (world, instance) [px]
@@ -76,9 +86,9 @@ def choose_target_kernel(
 ):
     """Choose a target: the visible instance with the fewest ancestors, ties by the largest visible fraction; -1: none is visible.
 
-    In mode TARGET the one with the most ancestors, ties by the smallest fraction. With `random_after_failure`, mode TARGET samples a
-    visible instance uniformly after an attempt that failed in this tick; the index of the coming attempt is the sample's index in the
-    stream. Launched over view.
+    In mode TARGET the one with the most ancestors, ties by the smallest fraction. Instances at which more attempts have failed come after
+    all others. With `random_after_failure`, mode TARGET samples a visible instance uniformly after an attempt that failed in this tick; the
+    index of the coming attempt is the sample's index in the stream. Launched over view.
     """
     view = wp.tid()
     world = views.world[view]
@@ -86,10 +96,10 @@ def choose_target_kernel(
         return
     chosen = int(-1)
     if mode[world] != Mode.TARGET:
-        chosen = rank_visible(visible, visible_fraction, ancestors, world, 1.0)
+        chosen = rank_visible(visible, visible_fraction, ancestors, target_failures, world, 1.0)
     elif pick.random_after_failure != 0 and outcome[world] >= Outcome.DROPPED:
         key = stream_key(seed, arrangement_id[world][0], arrangement_id[world][1], Stream.TARGETS)
         chosen = sample_visible(visible, world, key, attempt[world] + 1)
     else:
-        chosen = rank_visible(visible, visible_fraction, ancestors, world, -1.0)
+        chosen = rank_visible(visible, visible_fraction, ancestors, target_failures, world, -1.0)
     target_out[world] = chosen

@@ -132,9 +132,9 @@ def judge_attempt(target: int, engaged: wp.array2d[wp.uint32], attached: wp.arra
 
 @wp.func
 def count_failures(failures: int, outcome: int, mode: int, pick: PickData) -> int:
-    """Count of failed attempts after one more outcome; with `forgive`, a success in mode TARGET resets it."""
+    """Count of failed attempts after one more outcome; a success resets it where `forgive` has the mode's bit."""
     if outcome == Outcome.TARGET_PICKED or outcome == Outcome.OTHER_PICKED:
-        if mode == Mode.TARGET and pick.forgive != 0:
+        if (pick.forgive >> mode) & 1 != 0:
             return 0
         return failures
     return failures + 1
@@ -184,6 +184,27 @@ def advance_tasks_kernel(
         failures_inout[world] = count_failures(failures_inout[world], outcome, mode[world], pick)
         task_inout[world] = Task.LOOK
         steps_inout[world] = 0
+
+
+@wp.kernel
+def count_target_failures_kernel(
+    # State:
+    phase: wp.array[int],  # (world)
+    frame: wp.array[int],  # (world)
+    outcome: wp.array[int],  # (world)
+    target: wp.array[int],  # (world)
+    # Out:
+    target_failures_inout: wp.array2d[int],  # (world, instance)
+):
+    """Count the failed attempts at each instance where an attempt has ended in this tick; 0 before the second frame of phase ACT.
+
+    Launched over world, instance.
+    """
+    world, instance = wp.tid()
+    if phase[world] != Phase.ACT or frame[world] == 0:
+        target_failures_inout[world, instance] = 0
+    elif outcome[world] >= Outcome.DROPPED and target[world] == instance:
+        target_failures_inout[world, instance] = target_failures_inout[world, instance] + 1
 
 
 @wp.kernel

@@ -1,11 +1,13 @@
-"""Settings loading, with what the meshes of bins measure."""
+"""Settings loading, with what the meshes of bins and gripper measure."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 from synpick_warp.configs.cell.bins import BinRow
+from synpick_warp.configs.cell.gripper import Gripper
 from synpick_warp.configs.files.load import load_config
 from synpick_warp.configs.schema import Config
 
@@ -17,22 +19,27 @@ def load_settings(
     source: str = "in the settings passed",
     splits: bool = False,
 ) -> Config:
-    """Load a preset or a TOML file as `load_config` does, and measure the meshes of its bins.
+    """Load a preset or a TOML file as `load_config` does, and measure the meshes of its bins and gripper.
 
     Args:
         preset_or_file, settings, source, splits: As of `load_config`.
 
     Raises:
-        ConfigError: As of `load_config`, or a mesh cannot be used as a bin.
+        ConfigError: As of `load_config`, or a mesh cannot be used.
     """
-    return load_config(preset_or_file, settings, source=source, splits=splits, measure=_measure)
+    return load_config(preset_or_file, settings, source=source, splits=splits, measure=measure_meshes)
 
 
-def _measure(rows: tuple[BinRow, ...]) -> dict[str, tuple[BinRow, ...]]:
-    """As `measure_bins`."""
-    if not any(row.file for row in rows):
+def measure_meshes(rows: tuple[BinRow, ...], gripper: Gripper) -> dict[str, Any]:
+    """Settings, for `override_config`, with what the meshes of bins and gripper measure; none if they have it.
+
+    Raises:
+        ConfigError: A mesh cannot be used.
+    """
+    if not any(row.file for row in rows) and not gripper.mesh and not gripper.mesh_checksum:
         return {}
     # Readers of meshes take a while to import.
     from synpick_warp.scenes.bin_meshes.reading import measure_bins
+    from synpick_warp.scenes.grippers.tool_mesh import measure_tool
 
-    return measure_bins(rows)
+    return {**measure_bins(rows), **measure_tool(gripper)}

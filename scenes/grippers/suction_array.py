@@ -1,15 +1,19 @@
-"""Gripper `suction_array`: suction cups at given places under a plate, whose middle is on the wrist's axis."""
+"""Gripper `suction_array`: suction cups at given places under a body, a plate whose middle is on the wrist's axis or a mesh."""
 
 from __future__ import annotations
+
+from collections.abc import Sequence
 
 import numpy as np
 
 from synpick_warp.configs.cell.gripper import COMMON, Gripper
+from synpick_warp.errors import ConfigError
 from synpick_warp.scenes.collision.simplification import simplify_hull
 from synpick_warp.scenes.grippers.head import COLLIDER_SIDES, SIDES, Head
 from synpick_warp.scenes.grippers.suction1 import HINGE, LIP, STEM_SIDES, cup_patch, hinge_patch
-from synpick_warp.scenes.modelling import at_height, join, lathe, make_mesh, rounded_rectangle, solid
-from synpick_warp.scenes.types import ConvexPiece, Fixture, Material
+from synpick_warp.scenes.grippers.tool_mesh import read_body
+from synpick_warp.scenes.modelling import Patch, at_height, join, lathe, make_mesh, rounded_rectangle, solid
+from synpick_warp.scenes.types import ConvexPiece, Fixture, Material, TriangleMesh
 
 PLATE = (-0.42, -0.22)
 """Lower and upper side of the plate, as fractions of the cup's length."""
@@ -23,12 +27,47 @@ CORNER_SEGMENTS = 6
 """Segments of a rounded corner of the plate."""
 TAPER = 0.5
 """Radius of a cup's collision shape at the plate, as a fraction of the cup's."""
+HULL_VERTICES = 32
+"""Vertices of the collision shape of a mesh."""
 
 
 def make_head(gripper: Gripper) -> Head:
-    """Build the head of the cups `gripper.cups`."""
-    pieces = (_plate_collider(gripper), *(_cup_collider(gripper, x, y) for x, y in gripper.cups))
-    return Head(_fixture(gripper), pieces, _inertia(gripper), gripper.cups, gripper.valve == COMMON)
+    """Build the head of the cups `gripper.cups`, with a plate or the body of `gripper.mesh`.
+
+    Raises:
+        ConfigError: The mesh cannot be used, or is not the one that was measured.
+    """
+    if gripper.mesh:
+        return _mesh_head(gripper)
+    top, sides = PLATE[0], _sides(gripper)
+    pieces = (_plate_collider(gripper), *(_cup_collider(gripper, place, top) for place in gripper.cups))
+    patches = (*_plate(gripper), *_cup_patches(gripper, [top] * len(gripper.cups)))
+    return _head(gripper, make_mesh(join(*patches), centered=False), pieces, (*sides, gripper.cup_length))
+
+
+def _mesh_head(gripper: Gripper) -> Head:
+    """Build the head whose body is a mesh; its collision shape is the convex hull."""
+    body = read_body(gripper)
+    if gripper.mesh_checksum not in ("", body.checksum):
+        raise ConfigError(f"gripper.mesh: {gripper.mesh} is not the mesh that was measured; restore it, or bake again into another folder")
+    tops = [height / gripper.cup_length - 1.0 for height in body.undersides]
+    cups = make_mesh(join(*_cup_patches(gripper, tops)), centered=False)
+    names = ("vertices", "normals", "uv")
+    arrays = {name: np.concatenate([getattr(body.mesh, name), getattr(cups, name)]) for name in names}
+    mesh = TriangleMesh(faces=np.concatenate([body.mesh.faces, cups.faces + len(body.mesh.vertices)]), **arrays)
+    hull = simplify_hull(body.mesh.vertices.astype(np.float64), HULL_VERTICES)
+    pieces = (hull, *(_cup_collider(gripper, *cup) for cup in zip(gripper.cups, tops, strict=True)))
+    x, y, z = np.ptp(mesh.vertices, axis=0).tolist()
+    return _head(gripper, mesh, pieces, (x, y, z))
+
+
+def _head(gripper: Gripper, mesh: TriangleMesh, pieces: tuple[ConvexPiece, ...], box: tuple[float, float, float]) -> Head:
+    """Head of a mesh and collision shapes, with the inertia of a box of these sides [m]."""
+    x, y, z = box
+    share = gripper.cup_mass / 12
+    inertia = share * (y * y + z * z), share * (x * x + z * z), share * (x * x + y * y)
+    fixture = Fixture(mesh, Material(gripper.cup_color, None, gripper.metallic, gripper.roughness))
+    return Head(fixture, pieces, inertia, gripper.cups, gripper.valve == COMMON)
 
 
 def _sides(gripper: Gripper) -> tuple[float, float]:
@@ -42,17 +81,21 @@ def _outline(gripper: Gripper, segments: int) -> np.ndarray:
     return rounded_rectangle(*_sides(gripper), CORNER * gripper.cup_width, segments)
 
 
-def _fixture(gripper: Gripper) -> Fixture:
-    """Build the visual mesh: plate, stem and hinge on the wrist axis, and a cup with bellows at each place."""
+def _plate(gripper: Gripper) -> tuple[Patch, Patch, Patch]:
+    """Surfaces of plate, stem and hinge on the wrist axis."""
     ring, length = _outline(gripper, CORNER_SEGMENTS), gripper.cup_length
     low, high = PLATE
     heights = ((INSET, low), (1.0, low + BEVEL), (1.0, high - BEVEL), (INSET, high))
     plate = solid(np.stack([at_height(scale * ring, z * length) for scale, z in heights]))
     radius = HINGE * gripper.cup_width / 2
     stem = solid(lathe([(radius, (high - BEVEL) * length), (radius, 0.0)], SIDES))
-    cups = [cup_patch(gripper, low + BEVEL).translate(x, y, 0.0) for x, y in gripper.cups]
-    mesh = make_mesh(join(plate, stem, hinge_patch(gripper), *cups), centered=False)
-    return Fixture(mesh, Material(gripper.cup_color, None, gripper.metallic, gripper.roughness))
+    return plate, stem, hinge_patch(gripper)
+
+
+def _cup_patches(gripper: Gripper, tops: Sequence[float]) -> list[Patch]:
+    """Surface of each cup, which ends in the body whose lower side is at `tops` [cup lengths]."""
+    places = zip(gripper.cups, tops, strict=True)
+    return [cup_patch(gripper, top + BEVEL).translate(x, y, 0.0) for (x, y), top in places]
 
 
 def _plate_collider(gripper: Gripper) -> ConvexPiece:
@@ -61,17 +104,10 @@ def _plate_collider(gripper: Gripper) -> ConvexPiece:
     return simplify_hull(points, len(points))
 
 
-def _cup_collider(gripper: Gripper, x: float, y: float) -> ConvexPiece:
-    """Build the collision shape of the cup at (x, y) [m]: lip, and a cone up to the plate."""
+def _cup_collider(gripper: Gripper, place: tuple[float, float], top: float) -> ConvexPiece:
+    """Build the collision shape of the cup at a place [m]: lip, and a cone up to the body at `top` [cup lengths]."""
     radius, length = gripper.cup_width / 2, gripper.cup_length
     lip = lathe([(radius, -length), (radius, -(1 - LIP) * length)], COLLIDER_SIDES).reshape(-1, 3)
-    top = lathe([(TAPER * radius, PLATE[0] * length)], STEM_SIDES)[0]
-    points = np.concatenate([lip, top]) + np.array([x, y, 0.0])
+    cone = lathe([(TAPER * radius, top * length)], STEM_SIDES)[0]
+    points = np.concatenate([lip, cone]) + np.array([*place, 0.0])
     return simplify_hull(points, len(points))
-
-
-def _inertia(gripper: Gripper) -> tuple[float, float, float]:
-    """Principal moments of inertia [kg·m²] of a box about plate and cups."""
-    x, y, z = (*_sides(gripper), gripper.cup_length)
-    share = gripper.cup_mass / 12
-    return share * (y * y + z * z), share * (x * x + z * z), share * (x * x + y * y)

@@ -215,7 +215,9 @@ def build_stages(
     progress.stage(f"building {config.bake.worlds} worlds of {len(catalog)} objects on {device.alias}")
     looks = load_looks(config.randomize, progress.note, config.objects.strict)
     fixtures = make_fixtures(bins, config.gripper)
-    scene = build_render_scene(config.render, bins[0].sizes.ground, catalog, fixtures, cameras, lights, device, looks)
+    scene = build_render_scene(
+        config.render, bins[0].sizes.ground, catalog, fixtures, cameras, lights, device, looks, config.suction.radius
+    )
     simulation = Simulation(config, catalog, len(lights), device, scene, episodes, records_physics)
     groups = tuple(_build_group(config, scene, cameras, index) for index in range(len(config.rig.groups)))
     table = name_lights([light.name for light in lights], scene.lights)

@@ -30,7 +30,7 @@ from synpick_warp.factory.memory_plan import check_episodes, explain_shortage
 from synpick_warp.factory.meter import ThroughputMeter
 from synpick_warp.factory.sizes import advise_processes, count_writers, pick_processes
 from synpick_warp.factory.worker import BakeLink
-from synpick_warp.scenes.bin_meshes.reading import measure_bins
+from synpick_warp.scenes.bin_meshes.loading import measure_meshes
 from synpick_warp.scenes.catalog import load_catalog
 from synpick_warp.scenes.looks import load_looks
 from synpick_warp.stages.buffers import Snapshot
@@ -75,7 +75,7 @@ def run_bake(
     Raises:
         SynpickError: An error that the user can correct; committed episodes stay, and the same bake resumes.
     """
-    if measured := measure_bins(config.bin):
+    if measured := measure_meshes(config.bin, config.gripper):
         config = override_config(config, measured)
     if devices:
         config = config.with_values({"bake.device": pick_devices(devices)[0]})

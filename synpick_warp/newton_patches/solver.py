@@ -82,7 +82,7 @@ class FusedSteel(newton.solvers.SolverSteel):
             dim=[self._world_count],
             inputs=[settings, self._bodies(), self._joint_rows(rhs), self._contact_rows(propagation_rhs), self._order_worlds()],
             outputs=[self._propagation_body_qd, self._propagation_body_impulses, self._v_out],
-            block_dim=int(solver_iterations.WARP),
+            block_dim=int(solver_iterations.WARP) * self._sweep_warps,
             device=self.model.device,
         )
 
@@ -116,25 +116,32 @@ class FusedSteel(newton.solvers.SolverSteel):
         if not (self._is_fusable and self._ordered_rows):
             super()._apply_propagation_warmstart_velocity()
             return
-        wp.launch(
-            warm_start.apply_warm_start_kernel,
-            dim=(self._world_count, self._max_propagation_bodies, int(solver_iterations.TWIST)),
-            inputs=[
-                self._propagation_constraint_count,
-                self._propagation_body_count,
-                self._propagation_body_list,
-                self._propagation_body_a,
-                self._propagation_body_b,
-                self._propagation_J_a,
-                self._propagation_J_b,
-                self._propagation_MiJt_a,
-                self._propagation_MiJt_b,
-                self._propagation_impulses,
-            ],
-            outputs=[self._propagation_body_qd, self._propagation_body_impulses],
-            device=self.model.device,
-        )
+        inputs = [
+            self._propagation_constraint_count,
+            self._propagation_body_count,
+            self._propagation_body_list,
+            self._propagation_body_a,
+            self._propagation_body_b,
+            self._propagation_J_a,
+            self._propagation_J_b,
+            self._propagation_MiJt_a,
+            self._propagation_MiJt_b,
+            self._propagation_impulses,
+        ]
+        outputs, device = [self._propagation_body_qd, self._propagation_body_impulses], self.model.device
+        dim = self._world_count, self._max_propagation_bodies
+        if self._sweep_warps == 1:
+            dim = *dim, int(solver_iterations.TWIST)
+            wp.launch(warm_start.apply_warm_start_kernel, dim=dim, inputs=inputs, outputs=outputs, device=device)
+        else:
+            block, kernel = int(solver_iterations.WARP), warm_start.apply_warm_start_of_many_kernel
+            wp.launch_tiled(kernel, dim=dim, inputs=inputs, outputs=outputs, block_dim=block, device=device)
         self._propagation_propagate_impulses()
+
+    @cached_property
+    def _sweep_warps(self) -> int:
+        """Warps that sweep the contacts of a world."""
+        return 1 if keeps_rows_shared(self) else contact_sweep.WARPS_OF_MANY
 
     @cached_property
     def _is_fusable(self) -> bool:
@@ -145,18 +152,19 @@ class FusedSteel(newton.solvers.SolverSteel):
         """Kernel of the iterations, made of the device functions of the solver's own kernels."""
         size = self._propagation_tree_sizes[0]
         rows, bodies = self._propagation_max_constraints, self._max_propagation_bodies
-        sweep_contacts = compose_contacts(rows, bodies, stages_rows=keeps_rows_shared(self))
+        sweep_contacts = compose_contacts(rows, bodies, stages_rows=self._sweep_warps == 1)
         return compose_kernel(
             self._pgs_solve_mf_gs_kernel_for_phase(),
             self._propagation_refresh_kernels[size],
             sweep_contacts,
             self._propagation_propagate_kernels[size],
+            self._sweep_warps,
         )
 
     def _order_worlds(self) -> wp.array:
         """Order in which the worlds' iterations start (rank) int32; sorted only if not all are resident at a time."""
         order, bins, places, sizes = self._schedule
-        if self._world_count > RESIDENT_WORLDS * self.model.device.sm_count:
+        if self._world_count > RESIDENT_WORLDS // self._sweep_warps * self.model.device.sm_count:
             options: dict[str, Any] = {"dim": self._world_count, "device": self.model.device}
             sizes.zero_()
             inputs = [self._color_world_offsets, OFFSETS]
@@ -298,13 +306,15 @@ def fill(struct: Any, values: Iterable[wp.array | None]) -> Any:
 
 
 @cache
-def compose_kernel(rows: wp.Kernel, refresh: wp.Kernel, contacts: wp.Function, propagation: wp.Kernel) -> wp.Kernel:
-    """Kernel of the iterations from the sweep over contacts, and kernels of the solver, each of which calls one device function."""
+def compose_kernel(rows: wp.Kernel, refresh: wp.Kernel, contacts: wp.Function, propagation: wp.Kernel, warps: int = 1) -> wp.Kernel:
+    """Kernel of the iterations from the sweep over contacts by `warps` a block, and kernels of the solver, each of which calls one device
+    function."""
     return solver_iterations.compose_iterations(
         solver_iterations.bind_row_sweep(device_function(rows)),
         solver_iterations.bind_tree_refresh(device_function(refresh)),
         contacts,
         solver_iterations.bind_propagation(device_function(propagation)),
+        warps,
     )
 
 

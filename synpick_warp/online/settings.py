@@ -7,8 +7,7 @@ from pathlib import Path
 
 from synpick_warp.configs.files.load import override_config
 from synpick_warp.configs.schema import Config
-from synpick_warp.scenes.bin_meshes.loading import load_settings
-from synpick_warp.scenes.bin_meshes.reading import measure_bins
+from synpick_warp.scenes.bin_meshes.loading import load_settings, measure_meshes
 
 ARGUMENTS = {
     "worlds": "bake.worlds",
@@ -45,7 +44,7 @@ def resolve_settings(
     if not isinstance(config, Config):
         return load_settings(config, overrides, splits=splits)
     config = override_config(config, overrides)
-    return override_config(config, measure_bins(config.bin))
+    return override_config(config, measure_meshes(config.bin, config.gripper))
 
 
 def _plain(value: object) -> object:

@@ -10,10 +10,12 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from synpick_warp.codes import Mode
 from synpick_warp.configs import schema
 from synpick_warp.configs.cell.extents import BinSizes
 from synpick_warp.configs.dataset.modes import mode_weights
 from synpick_warp.configs.episodes.fills import Counts, most_objects
+from synpick_warp.configs.episodes.manipulation import ANOTHER
 from synpick_warp.kernels import structs
 from synpick_warp.kernels.distributions import LookTable
 from synpick_warp.scenes import build
@@ -34,7 +36,10 @@ GRIPPER_HOME = (3.0, 0.0, 1.0)
 
 @dataclass(frozen=True, eq=False)
 class SceneData:
-    """Constants of the kernels: one struct for each subject, and the modes of the splits: `modes` has one `ModeData` each."""
+    """Constants of the kernels: one struct for each subject, and the modes of the splits: `modes` has one `ModeData` each.
+
+    `tries_another`: whether failed attempts are counted by instance (`pick.retry`).
+    """
 
     layout: structs.LayoutData
     catalog: structs.CatalogData
@@ -48,6 +53,7 @@ class SceneData:
     cups: structs.CupData
     bins: structs.BinData
     looks: LookTable
+    tries_another: bool = False
 
 
 def fill(kind: Any, *sections: Any, **derived: Any) -> Any:
@@ -93,6 +99,7 @@ def make_scene_data(config: schema.Config, catalog: Catalog, built: build.BuiltM
             structs.PickData,
             config.pick,
             config.target,
+            forgive=(config.pick.forgive << Mode.PICK) | (config.target.forgive << Mode.TARGET),
             press_steps=math.ceil(config.pick.press_time / physics.step),
             tilt_limit=math.radians(gripper.tilt_limit),
         ),
@@ -101,6 +108,7 @@ def make_scene_data(config: schema.Config, catalog: Catalog, built: build.BuiltM
         _cup_data(gripper, built.head, device),
         bin_data(config.cell.bins, config.bins, config.move, built.layout.parts, device, built.fields),
         build_look_table(Looks(config.randomize, (), ()), 0, device),
+        config.pick.retry == ANOTHER,
     )
 
 

@@ -32,8 +32,8 @@ def decode_layer(name: str, image: np.ndarray) -> np.ndarray:
 
     Returns:
         Values of the type, components, unit and meaning that `LAYER_TABLE` states: normals, nocs and scene_flow (H, W, 3) float32, flow
-        (H, W, 2) float32, albedo (H, W, 3) uint8, classes, depth_sensor and depth_stereo (H, W) uint16, ir_left and ir_right (H, W)
-        uint8.
+        (H, W, 2) float32, suction_seal and suction_wrench (H, W) float32, albedo (H, W, 3) uint8, classes, depth_sensor and depth_stereo
+        (H, W) uint16, ir_left and ir_right (H, W) uint8.
     """
     return CODECS[LAYER_TABLE[name].encoding].decode(image)
 
@@ -49,10 +49,11 @@ def layer_notes(names: tuple[str, ...]) -> str:
 
 
 def image_format(name: str) -> tuple[str, int | None]:
-    """Type and channels (None: two dimensions) of a layer's image: raw layers keep theirs, all others have three channels of 16 bits."""
+    """Type and channels (None: two dimensions) of a layer's image: raw layers keep theirs, all others have 16 bits and, but for layers of
+    one component, three channels."""
     layer = LAYER_TABLE[name]
     if layer.encoding != "raw":
-        return "uint16", 3
+        return "uint16", 3 if layer.components > 1 else None
     return layer.dtype, layer.components if layer.components > 1 else None
 
 

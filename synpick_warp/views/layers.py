@@ -137,5 +137,23 @@ LAYER_TABLE = {
         note="depth matched from `ir_left` and `ir_right`, whether these are stored or not: holes, which are 0, where nothing matches; "
         "counts as in `depth/`.",
     ),
+    "suction_seal": Layer(
+        dtype="float32",
+        components=1,
+        unit="",
+        values="Seal score of a suction cup set on the pixel along its normal, 0 to 1; 0: no seal, something in the way, or no instance.",
+        encoding="fraction",
+        note=f"analytic seal score of a cup of `suction.radius` on the pixel, {MAX_CODE} times, as SuctionNet-1Billion defines it: how "
+        "little the surface below the cup's rim deforms it; 0 where the rim meets no surface, or something stands in the cup's way.",
+    ),
+    "suction_wrench": Layer(
+        dtype="float32",
+        components=1,
+        unit="",
+        values="Wrench score of a suction cup set on the pixel along its normal, 0 to 1; 0: too long a lever, or no instance.",
+        encoding="fraction",
+        note=f"analytic wrench score of the same cup, {MAX_CODE} times: 1 if the object's centre of mass hangs on its axis, 0 where 1 kg "
+        "at that centre would bend the cup off. The product of both is SuctionNet's score.",
+    ),
 }
 """Layers by name, in the order of files, buffers and notes."""

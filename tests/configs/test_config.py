@@ -30,6 +30,7 @@ from tests.configs.test_presets import resolved
 COUPLED = {
     "bake.episodes",
     "perception.camera",
+    "gripper.mesh",
     "randomize.background_textures",
     "pick.press_time",
     "bop.split",
@@ -174,7 +175,7 @@ def test_whole_numbers_are_allowed_for_floats():
             "render.layers",
             ["flow", "normal"],
             'render.layers is ["flow", "normal"] on the command line; allowed: any of normals, albedo, nocs, classes, flow, scene_flow, '
-            "depth_sensor, ir_left, ir_right, depth_stereo; did you mean normals?",
+            "depth_sensor, ir_left, ir_right, depth_stereo, suction_seal, suction_wrench; did you mean normals?",
         ),
         ("render.layers", "flow", 'render.layers is "flow" on the command line; allowed: a list of strings'),
         ("tote.color", [0.5, 0.5, 1.5], "tote.color is [0.5, 0.5, 1.5] on the command line; allowed: each at least 0, at most 1 [sRGB]"),
@@ -292,11 +293,11 @@ def test_paths_in_a_file_are_relative_to_it_and_others_to_the_current_folder(tmp
     for key in PATHS:
         Path("cell/cell.toml").write_text(f"[render]\ntable_size = [1, 1]\n{lines[key]}")
         others = {other: other for other in PATHS if other != key}
-        config = load_config("cell/cell.toml", others)
+        config = load_config("cell/cell.toml", others | {"gripper.kind": "suction_array", "gripper.cups": [[0.0, 0.0]]})
         Path("cell/written.toml").write_text(config_to_toml(config))
         for found, expected in ((config, others), (load_config("cell/written.toml"), {other: str(tmp_path / other) for other in others})):
             assert {name: found.value(name) for name in PATHS} == expected | {key: str(tmp_path / "cell" / key)}
-    assert len(PATHS) == 6
+    assert len(PATHS) == 7
 
 
 TEXT = st.text(st.characters(exclude_categories=["Cs"]), max_size=20)

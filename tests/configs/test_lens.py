@@ -54,7 +54,9 @@ def test_each_pixel_is_the_projection_of_its_ray(name):
     pixels = np.stack(np.meshgrid(np.arange(size[0]) + 0.5, np.arange(size[1]) + 0.5), -1)
     rays = lens.unproject(pixels)
     assert np.abs(lens.project(rays) - pixels).max() < TOLERANCE
-    assert np.abs(opencv_projection(model, intrinsics, coefficients, rays.reshape(-1, 2)) - pixels.reshape(-1, 2)).max() < TOLERANCE
+    some = tuple(np.unique(np.linspace(0, side - 1, 160, dtype=int)) for side in rays.shape[:2])
+    few, there = (each[np.ix_(*some)].reshape(-1, 2) for each in (rays, pixels))
+    assert np.abs(opencv_projection(model, intrinsics, coefficients, few) - there).max() < TOLERANCE
     assert np.linalg.norm(rays, axis=-1).max() <= lens.radius <= np.tan(np.radians(MAX_ANGLE))
     assert np.array_equal(lens.rays(), rays.astype(np.float32))
     assert lens.lens.is_identity == (name == "none")

@@ -15,7 +15,7 @@ from newton._src.solvers.steel.kernels import accumulate_propagation_warmstart_b
 
 from synpick_warp.codes import Phase
 from synpick_warp.kernels.newton_patches import contact_sweep, world_order
-from synpick_warp.kernels.newton_patches.warm_start import apply_warm_start_kernel
+from synpick_warp.kernels.newton_patches.warm_start import apply_warm_start_kernel, apply_warm_start_of_many_kernel
 from synpick_warp.newton_patches import solver as fused_solver
 from synpick_warp.newton_patches.narrow_phase import BLOCK
 from synpick_warp.scenes import build
@@ -89,7 +89,7 @@ def test_the_kernel_of_the_iterations_compiles(tmp_path, rows, bodies, stages_ro
     refresh = steel._get_refresh_propagation_tree_body_qd_warp_kernel(4, 2, ARCHITECTURE)
     contacts = fused_solver.compose_contacts(rows, bodies, stages_rows)
     propagate = steel._get_propagate_tree_impulses_revolute_kernel(4, 2, ARCHITECTURE, has_free_root=True)
-    kernel = fused_solver.compose_kernel(joint_rows, refresh, contacts, propagate)
+    kernel = fused_solver.compose_kernel(joint_rows, refresh, contacts, propagate, 1 if stages_rows else contact_sweep.WARPS_OF_MANY)
     wp.compile_aot_module(kernel.module, arch=ARCHITECTURE, module_dir=tmp_path, use_ptx=False)
     (program,) = tmp_path.glob("*.cubin")
     assert b"solver_iterations_kernel" in program.read_bytes()
@@ -173,13 +173,17 @@ def test_warm_start_sums_impulses_as_newton_does(device):
             wp.array(np.ascontiguousarray(values), dtype=int, device=device) for values in (count, *lists, pairs[..., 0], pairs[..., 1])
         ]
         floats = [wp.array(values, dtype=float, device=device) for values in (*jacobians, impulse)]
-        wp.launch(kernel, dim=dim, inputs=[*ints, *floats, *last], outputs=out, device=device)
+        inputs = [*ints, *floats, *last]
+        if kernel is apply_warm_start_of_many_kernel:
+            wp.launch_tiled(kernel, dim=dim, inputs=inputs, outputs=out, block_dim=32 if device.is_cuda else 1, device=device)
+        else:
+            wp.launch(kernel, dim=dim, inputs=inputs, outputs=out, device=device)
         return out[0].numpy(), out[1].numpy()
 
-    found = run(apply_warm_start_kernel, (worlds, bodies, 6), np.full(worlds, bodies), listed)
     expected = run(accumulate_propagation_warmstart_body_impulses_ordered, (worlds, 6), last=(rows,))
-    np.testing.assert_array_equal(found, expected)
-    assert not np.array_equal(found[0], found[1])
+    assert not np.array_equal(expected[0], expected[1])
+    for kernel, dim in ((apply_warm_start_kernel, (worlds, bodies, 6)), (apply_warm_start_of_many_kernel, (worlds, bodies))):
+        np.testing.assert_array_equal(run(kernel, dim, np.full(worlds, bodies), listed), expected)
 
 
 def test_worlds_with_the_most_colors_come_first(device):
@@ -209,7 +213,7 @@ def test_worlds_move_as_with_the_launches_of_newton(device, monkeypatch, worlds,
     """All but the friction rows is bitwise the same, so the solver's are compiled in. Piles fall, rest and are stirred; at the lower speed
     limit, falling bodies have velocity limit rows. Newton does not load 32 contacts at a time, takes worlds in their order (they are sorted
     if none is resident), its narrow phase uses larger blocks, and each of its friction patches is grown by one thread here. Worlds of many
-    objects have impulses and patch lists in global memory."""
+    objects have impulses and patch lists in global memory, several warps, and a warm start by votes."""
     if not device.is_cuda:
         pytest.skip("on a CPU the solver's own launches run")
     config = settings(

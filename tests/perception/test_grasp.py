@@ -128,8 +128,7 @@ class GraspHarness:
         self.observation.grasp_pixel.assign(self.grasp_pixel)
         self.planner.smooth_normal(self.scene, self.observation, self.grasp)
         self.planner.frame_grasp(self.scene, self.observation, self.grasp)
-        if self.scene.cups.count > 1:
-            self.planner.align_cups(self.scene, self.grasp)
+        self.planner.align_cups(self.scene, self.grasp)
         return self.grasp
 
 

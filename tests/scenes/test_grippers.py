@@ -2,16 +2,23 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from pathlib import Path
+
 import numpy as np
 import pytest
+import trimesh
 
 from synpick_warp.configs.cell.gripper import GRIPPERS
 from synpick_warp.configs.files.load import load_config
 from synpick_warp.configs.files.write import config_to_toml
+from synpick_warp.dataset.commit.manifest import describe_differences, make_manifest
 from synpick_warp.errors import ConfigError
 from synpick_warp.scenes.assets.meshes import merge_positions, signed_volume
+from synpick_warp.scenes.bin_meshes.loading import load_settings
 from synpick_warp.scenes.grippers.registry import HEADS, check_reach, make_head
-from synpick_warp.stages.sim.hold import HOLDS
+from synpick_warp.scenes.grippers.tool_mesh import measure_tool
+from synpick_warp.stages.sim.behavior import BEHAVIORS
 from tests.scenes.test_tote_gripper import UP, convex, felt
 from tests.twins.rays import edges_match, first_hit
 from tests.worlds.small_worlds import catalog
@@ -23,10 +30,19 @@ EXAMPLES = [
     {"kind": "suction_array", "cups": [[0.04, 0.03], [-0.04, 0.03], [-0.04, -0.03]], "cup_width": 0.03, "cup_length": 0.08},
 ]
 """Settings of grippers. To add a kind, add a row."""
+BEAM = {"kind": "suction_array", "cups": [[0.0, 0.06], [0.0, -0.06]], "mesh_unit": "mm"}
+"""Two cups, 120 mm apart along the wrist axis, under the beam of `beam_file`."""
 
 
-def test_every_kind_has_a_head_a_hold_and_an_example():
-    assert set(GRIPPERS) == set(HEADS) == set(HOLDS) == {"suction1", *(row["kind"] for row in EXAMPLES[1:])}
+def beam_file(folder: Path, low: float = -20.0, half: float = 80.0) -> Path:
+    """STL file of a beam of 30 mm x 2 `half` from z = `low` to 5 mm, in millimetres."""
+    path = folder / "beam.stl"
+    trimesh.creation.box(bounds=[[-15.0, -half, low], [15.0, half, 5.0]]).export(path)
+    return path
+
+
+def test_every_kind_has_a_head_a_behavior_and_an_example():
+    assert set(GRIPPERS) == set(HEADS) == set(BEHAVIORS) == {"suction1", *(row["kind"] for row in EXAMPLES[1:])}
 
 
 @pytest.mark.parametrize("row", EXAMPLES)
@@ -34,6 +50,45 @@ def test_settings_survive_writing_and_reading(row, tmp_path):
     config = load_config("smoke", {f"gripper.{name}": value for name, value in row.items()})
     (tmp_path / "written.toml").write_text(config_to_toml(config))
     assert load_config(str(tmp_path / "written.toml"), {}) == config
+
+
+def test_a_mesh_is_the_body_of_a_tool(tmp_path):
+    """Its cups end in it; its checksum is written, so that another mesh under the same name is refused."""
+    config = load_settings("smoke", {f"gripper.{name}": value for name, value in BEAM.items()} | {"gripper.mesh": str(beam_file(tmp_path))})
+    gripper, head = config.gripper, make_head(config.gripper)
+    low, high = head.fixture.mesh.vertices.min(axis=0), head.fixture.mesh.vertices.max(axis=0)
+    np.testing.assert_allclose([low, high], [(-0.021, -0.081, -0.055), (0.021, 0.081, 0.005)], atol=1.2e-3)
+    for x, y in head.cups:
+        assert felt(head.pieces, (x + 0.02, y, -1.0), UP) == pytest.approx(0.945, abs=1e-6)
+        # From below, beside the middle: the cup's stem, up to the beam.
+        assert first_hit(head.fixture.mesh.vertices, head.fixture.mesh.faces, (x, y, -0.04), UP) < 0.021
+    assert felt(head.pieces, (0.0, 0.0, -1.0), UP) == pytest.approx(0.98, abs=1e-6)
+    assert "mesh" not in make_manifest(config)["settings"]["gripper"]
+    assert make_manifest(config)["settings"]["gripper"]["mesh_checksum"] == gripper.mesh_checksum != ""
+    beam_file(tmp_path, half=90.0)
+    with pytest.raises(ConfigError, match=r"^gripper.mesh: \S*beam.stl is not the mesh that was measured; restore it[^\n]*$"):
+        make_head(gripper)
+    other = replace(config, **measure_tool(gripper))
+    assert describe_differences(make_manifest(other), make_manifest(config)).startswith("gripper.mesh_checksum is ")
+
+
+@pytest.mark.parametrize(
+    ("size", "other", "said"),
+    [
+        ({}, {"mesh_unit": "m"}, r"beam.stl is 30 x 160 x 25 m, unit m; .*did you mean gripper.mesh_unit = \"mm\"\?"),
+        ({"low": -60.0}, {}, r"beam.stl reaches 5 mm below the cups' lips, -0.055 m; they must be its lowest points"),
+        ({"low": -50.0}, {}, r"beam.stl has cup 0 at \[0.0, 0.06\] m inside it: 5 mm above its lip; allowed: at least 24.2 mm"),
+        ({"half": 50.0}, {}, r"beam.stl has nothing above cup 0 at \[0.0, 0.06\] m, which it must hold"),
+        ({}, {"mesh": "none.stl"}, r"none.stl cannot be read \(No such file or directory\)"),
+        ({}, {"mesh": "beam.txt"}, r"beam.txt is no mesh; allowed: "),
+    ],
+)
+def test_meshes_that_cannot_hold_the_cups_are_refused(size, other, said, tmp_path):
+    path = beam_file(tmp_path, **size)
+    (tmp_path / "beam.txt").write_bytes(path.read_bytes())
+    given = BEAM | other | {"mesh": str(tmp_path / other.get("mesh", path.name))}
+    with pytest.raises(ConfigError, match=r"^gripper.mesh: [^\n]*" + said + r"[^\n]*$"):
+        load_settings("smoke", {f"gripper.{name}": value for name, value in given.items()})
 
 
 @pytest.mark.parametrize("row", EXAMPLES)
@@ -65,6 +120,7 @@ ARRAY = {"gripper.kind": "suction_array"}
     ("overrides", "expected"),
     [
         ({"gripper.kind": "suction_array"}, r"gripper.cups is \[\] by default; allowed: 1 to 16 places \[x, y\]"),
+        ({"gripper.mesh": "a.stl"}, r'gripper.mesh is "a.stl" .*; allowed: none with gripper.kind "suction1"'),
         ({"gripper.cups": [[0.0, 0.0]]}, r'gripper.cups is .*; allowed: none with gripper.kind "suction1"'),
         (
             {"gripper.valve": "common"},

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import warp as wp
@@ -194,12 +196,63 @@ def test_what_hangs_after_the_lift_leaves_the_scene(device, target, engaged, att
     np.testing.assert_allclose(worlds.physics.state.joint_q.numpy()[:4], [3.0, 0.0, 1.0, 0.0])
 
 
-@pytest.mark.parametrize(("mode", "forgive", "failures"), [(Mode.TARGET, 1, 0), (Mode.TARGET, 0, 2), (Mode.PICK, 1, 2)])
+IN_PICK, IN_TARGET = 1 << Mode.PICK, 1 << Mode.TARGET
+
+
+@pytest.mark.parametrize(
+    ("mode", "forgive", "failures"),
+    [(Mode.TARGET, IN_TARGET, 0), (Mode.TARGET, IN_PICK, 2), (Mode.PICK, IN_TARGET, 2), (Mode.PICK, IN_PICK | IN_TARGET, 0)],
+)
 def test_a_success_may_be_forgiving(device, mode, forgive, failures):
     worlds = lifted(device, 1, 2, (0, 1, 0), mode=mode, forgive=forgive)
     worlds.set(worlds.attempts.failures, 2)
     end(worlds)
     assert worlds.attempts.failures.numpy()[0] == failures
+
+
+def test_failed_attempts_are_counted_by_target_if_it_is_asked(device):
+    """Attempts at 1, 1, 2, of which the second succeeds with another object; then a new episode."""
+    for tries_another, expected in ((False, [[0, 0, 0]] * 4), (True, [[0, 1, 0], [0, 1, 0], [0, 1, 1], [0, 0, 0]])):
+        worlds = made(device)
+        worlds.scene = replace(worlds.scene, tries_another=tries_another)
+        counts = []
+        for frame, target, attached in ((3, 1, (0, 0, 0)), (4, 1, (1, 0, 0)), (5, 2, (0, 0, 0)), (0, 2, (0, 0, 0))):
+            worlds.set(worlds.state.frame, frame)
+            worlds.set(worlds.attempts.task, Task.LIFT if frame else Task.LOOK)
+            worlds.set(worlds.plan.target, target)
+            worlds.set(worlds.attempts.outcome, Outcome.NONE)
+            worlds.set(worlds.seals.attached, attached)
+            worlds.set(worlds.state.setpoint, LIFTED)
+            end(worlds)
+            counts.append(worlds.attempts.target_failures.numpy()[0].tolist())
+        assert counts == expected
+
+
+class Hovering(gripper.TwoSpeedLaw):
+    """A law of another gripper: it begins at the grasp, and judges nothing."""
+
+    def begin(self, scene, state, attempts, plan, physics):
+        state.setpoint.assign(plan.point)
+
+    def advance(self, scene, state, attempts, plan):
+        state.setpoint.assign(state.setpoint.numpy() + np.array([0.0, 0.0, 0.01]))
+
+    def end_tick(self, scene, state, attempts, plan):
+        attempts.outcome.fill_(int(Outcome.NOTHING_CAUGHT))
+
+
+def test_the_law_of_a_gripper_replaces_the_setpoints(device):
+    worlds, law = made(device), Hovering()
+    state = (worlds.scene, worlds.state, worlds.attempts)
+    begin(worlds)
+    worlds.set(worlds.plan.target, 1)
+    worlds.physics.set_yaw = lambda yaw: None
+    gripper.begin_attempts(*state, worlds.plan, worlds.physics, law)
+    gripper.drive_gripper(*state, worlds.plan, worlds.physics, worlds.physics.state, law)
+    np.testing.assert_allclose(worlds.state.setpoint.numpy()[0], np.add(POINT, (0.0, 0.0, 0.01)), atol=1e-6)
+    worlds.set(worlds.attempts.task, Task.PRESS)
+    gripper.advance_tasks(*state, worlds.seals, worlds.plan, worlds.physics, law)
+    assert (worlds.attempts.outcome.numpy()[0], worlds.attempts.task.numpy()[0]) == (Outcome.NOTHING_CAUGHT, Task.PRESS)
 
 
 def test_a_look_that_finds_nothing_is_a_failure_a_tick_later(device):

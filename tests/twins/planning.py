@@ -114,6 +114,11 @@ class PlannerHarness:
         self.planner.choose_target(self.scene, worlds.state, self.attempts, self.observation, self.grasp, seed)
         return self.grasp.target.numpy().tolist()
 
+    def choose_flat_points(self, seed: int) -> None:
+        """Move the grasp points of instance 0 of each world to where they are flat."""
+        self.grasp.target.zero_()
+        self.planner.choose_flat_points(self.scene, self.worlds.state, self.attempts, self.observation, self.grasp, seed)
+
 
 def segment(ids: np.ndarray, depths: np.ndarray, instances: int) -> dict[str, np.ndarray]:
     """Components, contours and grasp points (the poles) of images (V, H, W), by OpenCV."""
@@ -124,6 +129,7 @@ def segment(ids: np.ndarray, depths: np.ndarray, instances: int) -> dict[str, np
         "contour": np.zeros((views, instances, CAPACITY, 2), np.int32),
         "contour_length": np.zeros((views, instances), np.int32),
         "visible": np.zeros((views, instances), np.int32),
+        "distance": np.zeros(ids.shape, np.float32),
         "grasp_pixel": np.zeros((views, instances, 2), np.int32),
         "depth": np.zeros((views, instances), np.float32),
         "visible_fraction": np.zeros((views, instances), np.float32),
@@ -146,6 +152,7 @@ def segment(ids: np.ndarray, depths: np.ndarray, instances: int) -> dict[str, np
         result["contour"][view, i, : len(points)], result["contour_length"][view, i] = points, len(points)
         distance = cv2.distanceTransform(mask, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
         row, column = np.unravel_index(np.argmax(distance), distance.shape)
+        result["distance"][view] = np.maximum(result["distance"][view], distance)
         result["visible"][view, i], result["visible_fraction"][view, i] = best, best / (height * width)
         result["grasp_pixel"][view, i], result["depth"][view, i] = (column, row), depths[view, row, column]
     return result

@@ -18,7 +18,7 @@ from synpick_warp.apps.viz.explain_panels import fitted, load_chart, wrapped
 from synpick_warp.apps.viz.explain_record import choice_words, labels, seal_words
 from synpick_warp.cli.main import main
 from synpick_warp.configs.files.write import config_to_toml
-from synpick_warp.configs.schema import Config, Perception, Target
+from synpick_warp.configs.schema import Config, Perception, Pick, Target
 from synpick_warp.dataset.view import View
 from synpick_warp.errors import DatasetError, OutputError
 from synpick_warp.exporters.bop.exporter import BopExporter
@@ -222,13 +222,22 @@ FIRST, SECOND, THIRD = seen(0, visible_fraction=0.4), seen(1, visible_fraction=0
     ],
 )
 def test_why_it_was_chosen(objects, target, mode, said):
-    assert choice_words(attempt(objects, {}, target, mode=mode), NAMES, Config().target)[0] == said
+    assert choice_words(attempt(objects, {}, target, mode=mode), NAMES, Config().target, Config().pick)[0] == said
 
 
 def test_a_draw_after_a_failure_is_named_where_the_settings_have_it():
     drawn_one = attempt((FIRST, SECOND, THIRD), {}, 0, mode="target")
     released = Config(target=Target(random_after_failure=True))
-    assert choice_words(drawn_one, NAMES, released.target)[0] == "target: 1 tin: 0 objects above; chosen at random after a failed attempt"
+    assert (
+        choice_words(drawn_one, NAMES, released.target, released.pick)[0]
+        == "target: 1 tin: 0 objects above; chosen at random after a failed attempt"
+    )
+
+
+def test_a_target_after_failures_of_others_is_named_where_the_settings_have_it():
+    another = Config(pick=Pick(retry="another"))
+    said = choice_words(attempt((FIRST, SECOND, THIRD), {}, 0), NAMES, another.target, another.pick)[0]
+    assert said == "target: 1 tin: 0 objects above; fewer attempts at it have failed than at 2 box"
 
 
 @pytest.mark.parametrize(
@@ -236,12 +245,13 @@ def test_a_draw_after_a_failure_is_named_where_the_settings_have_it():
     [
         ((10.0, 10.0), "suction point: pole of inaccessibility; cup tilted by 90 degrees"),
         ((18.0, 10.0), "suction point: centroid, 0.50 of the pole's distance; cup tilted by 90 degrees"),
+        ((14.0, 13.0), "suction point: drawn where the surface is flattest; cup tilted by 90 degrees"),
         ((14.0, 11.0), "suction point: half-way point, 0.85 of the pole's distance; cup tilted by 90 degrees"),
     ],
 )
 def test_where_the_suction_point_is(suction, said):
     one = attempt((seen(0, grasp_pixel=suction),), {}, 0, tilt=-np.pi / 2)
-    assert choice_words(one, NAMES, Config().target)[1] == said
+    assert choice_words(one, NAMES, Config().target, Config().pick)[1] == said
 
 
 def test_what_the_seal_bore():

@@ -13,7 +13,7 @@ from synpick_warp.scenes import build
 from synpick_warp.scenes.types import Catalog
 from synpick_warp.stages.arrays import allocate
 from synpick_warp.stages.constants import make_scene_data
-from synpick_warp.stages.sim.hold import make_hold
+from synpick_warp.stages.sim.behavior import BEHAVIORS
 from synpick_warp.stages.sim.worlds import AttemptState, SealState, WorldState, world_sizes
 from tests.twins.raycast import rotation_of
 from tests.worlds.eager_physics import EagerPhysics
@@ -51,7 +51,9 @@ class Hanging:
         extents = world_sizes(*sizes)
         self.state, self.attempts, self.seals = (allocate(kind, extents, device) for kind in (WorldState, AttemptState, SealState))
         meshes = SimpleNamespace(id=wp.zeros(1, dtype=wp.uint64, device=device))
-        self.suction = make_hold(self.config.gripper, self.config.suction, objects, SimpleNamespace(meshes=meshes, keep=()), device)
+        self.suction = BEHAVIORS[self.config.gripper.kind].hold(
+            self.config.suction, objects, SimpleNamespace(meshes=meshes, keep=()), device
+        )
         order = np.arange(self.mass.size).reshape(self.mass.shape)
         self.state.catalog_index.assign(order)
         self.state.body_slot.assign(np.tile(np.arange(self.instances), (self.worlds, 1)))

@@ -78,6 +78,8 @@ TOLERANCES = {
     "ir_left": Tolerance(1.0, 0.1, "grey"),
     "ir_right": Tolerance(1.0, 0.1, "grey"),
     "depth_stereo": Tolerance(1.0, 5.0, "counts"),
+    "suction_seal": Tolerance(1e-2, 0.5),
+    "suction_wrench": Tolerance(1e-4, 0.1),
 }
 """Tolerances of all outputs but color, which are the same in all modes."""
 TABLES = ("pixels", "boxes", "effects")

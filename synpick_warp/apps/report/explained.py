@@ -90,7 +90,7 @@ def make_attempt(data_set: DataSet, found: Found, content: Content, names: Mappi
         "frame": attempt.frame,
         "picture": places[0],
         "size": [picture.shape[1], picture.shape[0]],
-        "words": [*choice_words(attempt, names, config.target), *seal_words(attempt, names, config.suction)],
+        "words": [*choice_words(attempt, names, config.target, config.pick), *seal_words(attempt, names, config.suction)],
         "objects": _objects(attempt, names),
         "graph": _graph(attempt, config.perception.min_votes),
         "force": _force(attempt, config.suction, config.physics.tick_time),

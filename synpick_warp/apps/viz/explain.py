@@ -78,7 +78,7 @@ def write_explanation(dataset: Path, out: Path, episode: int | None, attempt: in
     planned = planning_camera(config.rig, camera)
     for each in attempts:
         view = _open_view(dataset, scenes, each, camera, config.rig.every[camera])
-        rows.append(_row(each, view, planned, draw_words(each, names, config.target, suction), config.perception.min_votes))
+        rows.append(_row(each, view, planned, draw_words(each, names, (config.target, config.pick), suction), config.perception.min_votes))
     charts = [load_chart(each, suction, tick_time, IMAGE_WIDTH, room) for each, (_, room) in zip(attempts, rows, strict=True)]
     for (sheet, _), data in zip(rows, render_charts(charts, scale=1.0), strict=True):
         plot = np.asarray(cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR))

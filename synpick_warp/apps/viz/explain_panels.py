@@ -11,7 +11,7 @@ from synpick_warp.apps.viz.drawing import FONT, INK, Image, instance_color, put_
 from synpick_warp.apps.viz.explain_graph import GREY, RED, disc
 from synpick_warp.apps.viz.explain_record import Attempt, break_force, choice_words, labels, seal_words, suction_kind
 from synpick_warp.configs.cell.gripper import Suction
-from synpick_warp.configs.episodes.manipulation import Target
+from synpick_warp.configs.episodes.manipulation import Pick, Target
 from synpick_warp.system.codecs.charts import Spec, axis, limit, line, points, theme
 
 WORDS_WIDTH = 470
@@ -38,9 +38,9 @@ _COLUMNS = ((0, "object"), (236, "above"), (296, "share"), (356, "pixels"), (416
 """Position [px] and heading of the table's columns."""
 
 
-def draw_words(attempt: Attempt, names: Mapping[int, str], target: Target, suction: Suction) -> Image:
+def draw_words(attempt: Attempt, names: Mapping[int, str], rules: tuple[Target, Pick], suction: Suction) -> Image:
     """Draw the explanation in sentences, and below it the table of objects, ranked by the choice rule."""
-    lines = [(line, INK) for text in choice_words(attempt, names, target) for line in wrapped(text, TEXT, WORDS_WIDTH)]
+    lines = [(line, INK) for text in choice_words(attempt, names, *rules) for line in wrapped(text, TEXT, WORDS_WIDTH)]
     lines += [(line, INK) for text in seal_words(attempt, names, suction) for line in wrapped(text, TEXT, WORDS_WIDTH)]
     outcome = attempt.sentence[:1].upper() + attempt.sentence[1:]
     lines += [(line, GREEN if attempt.picked else RED) for line in wrapped(outcome, TEXT, WORDS_WIDTH)]
@@ -66,7 +66,7 @@ def _draw_table(canvas: Image, attempt: Attempt, names: Mapping[int, str], top: 
         disc(canvas, (8, y - 5), 7, INK)
         disc(canvas, (8, y - 5), 6, instance_color(one.instance))
         name = fitted(f"{short[one.instance]} {names.get(one.object_id, '')}", TEXT, _COLUMNS[1][0] - 30)
-        kind = ("pole", "centr.", "half")[suction_kind(one)]
+        kind = ("pole", "centr.", "half", "drawn")[suction_kind(one)]
         cells = ((22, name), (244, f"{len(one.ancestors)}"), (296, f"{one.visible_fraction:.2f}"), (356, f"{one.visible}"), (416, kind))
         for x, text in cells:
             put_text(canvas, text, (x, y), TEXT, INK, 2 if target and x == 22 else 1)

@@ -10,7 +10,7 @@ from typing import Any
 
 from synpick_warp.apps.viz.drawing import short_labels
 from synpick_warp.configs.cell.gripper import Suction
-from synpick_warp.configs.episodes.manipulation import Target
+from synpick_warp.configs.episodes.manipulation import ANOTHER, Pick, Target
 from synpick_warp.dataset import records
 from synpick_warp.dataset.annotations import ADVICE, check_content
 from synpick_warp.dataset.commit.manifest import ATTEMPTS_FILE
@@ -20,8 +20,8 @@ from synpick_warp.system.inputs.files import read_file
 from synpick_warp.system.inputs.json import MAX_JSON, decode_json
 
 MODE_WORDS = {"pick": "untargeted", "target": "targeted"}
-CANDIDATES = ("pole", "centroid", "midpoint")
-"""Candidates of the suction point, in the order of `InstanceObservation.candidates`."""
+CANDIDATES = ("pole", "centroid", "midpoint", "drawn")
+"""Kinds of suction points: those in the order of `InstanceObservation.candidates`, and one drawn where the surface is flat."""
 
 MAX_ATTEMPTS = 100
 """Most attempts of one figure."""
@@ -164,32 +164,36 @@ def full_names(attempt: Attempt, names: Mapping[int, str]) -> dict[int, str]:
 
 
 def suction_kind(one: InstanceObservation) -> int:
-    """Index of the candidate that became the suction point: the nearest, as the point is rounded to a pixel."""
-    return min(range(len(CANDIDATES)), key=lambda kind: math.dist(one.candidates[kind], one.grasp_pixel))
+    """Index in CANDIDATES of the suction point: of the nearest candidate, as the point is rounded to a pixel; the last beyond that."""
+    distances = [math.dist(point, one.grasp_pixel) for point in one.candidates]
+    return distances.index(min(distances)) if min(distances) <= 1.0 else len(distances)
 
 
-def choice_words(attempt: Attempt, names: Mapping[int, str], settings: Target) -> list[str]:
+def choice_words(attempt: Attempt, names: Mapping[int, str], target: Target, pick: Pick) -> list[str]:
     """Explain in sentences the chosen target, the reason, and the suction point."""
     if attempt.target is None:
         return ["target: none, nothing is visible"]
     full = full_names(attempt, names)
     one = attempt.objects[attempt.target]
     kind = suction_kind(one)
-    share = one.distances[kind] / one.distances[0] if one.distances[0] else 1.0
-    where = ("pole of inaccessibility", "centroid", "half-way point")[kind] + (f", {share:.2f} of the pole's distance" if kind else "")
+    where = ("pole of inaccessibility", "centroid", "half-way point", "drawn where the surface is flattest")[kind]
+    if 0 < kind < len(one.distances):
+        where += f", {one.distances[kind] / one.distances[0] if one.distances[0] else 1.0:.2f} of the pole's distance"
     tilt = "" if attempt.tilt is None else f"; cup tilted by {abs(math.degrees(attempt.tilt)):.0f} degrees"
-    return [f"target: {full[attempt.target]}: {_reason(attempt, one, full, settings)}", f"suction point: {where}{tilt}"]
+    return [f"target: {full[attempt.target]}: {_reason(attempt, one, full, target, pick)}", f"suction point: {where}{tilt}"]
 
 
-def _reason(attempt: Attempt, one: InstanceObservation, full: Mapping[int, str], settings: Target) -> str:
+def _reason(attempt: Attempt, one: InstanceObservation, full: Mapping[int, str], target: Target, pick: Pick) -> str:
     """Clause on why an object was chosen: number of objects above it, and its visible fraction if several have as many."""
     targeted = attempt.mode == "target"
     count = len(one.ancestors)
     above = f"{count} object{'' if count == 1 else 's'} above"
     first = attempt.ranked()[0]
     if first.visible_fraction != one.visible_fraction or len(first.ancestors) != count:
-        if targeted and settings.random_after_failure:
+        if targeted and target.random_after_failure:
             return f"{above}; chosen at random after a failed attempt"
+        if pick.retry == ANOTHER:
+            return f"{above}; fewer attempts at it have failed than at {full[first.instance]}"
         return f"{above}; the rule would name {full[first.instance]}"
     equals = sum(len(other.ancestors) == count for other in attempt.seen)
     if len(attempt.seen) == 1:

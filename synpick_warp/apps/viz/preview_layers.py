@@ -1,4 +1,5 @@
-"""False-colour images of layers (AOVs): normals, coordinates, classes, optical flow, scene flow, infrared images, sensor depth."""
+"""False-colour images of layers (AOVs): normals, coordinates, classes, optical flow, scene flow, infrared images, sensor depth,
+suction scores."""
 
 from __future__ import annotations
 
@@ -92,6 +93,12 @@ def _draw_infrared(caption: str, values: np.ndarray) -> tuple[str, Image]:
     return caption, np.repeat(values[..., None], 3, axis=-1)
 
 
+def _draw_score(caption: str, values: np.ndarray) -> tuple[str, Image]:
+    """Scores 0 to 1 as a VIRIDIS colour map; 0 is black."""
+    colors = cv2.applyColorMap(np.rint(255.0 * values).astype(np.uint8), cv2.COLORMAP_VIRIDIS)
+    return caption, np.where((values > 0.0)[..., None], colors, np.uint8(0))
+
+
 def _full_scale(size: np.ndarray) -> float:
     """Motion that maps to full colour; 1 if nothing moves."""
     known = size[np.isfinite(size) & (size > 0.0)]
@@ -123,6 +130,8 @@ _DRAW: dict[str, Callable[[np.ndarray], tuple[str, Image]]] = {
     "scene_flow": _draw_scene_flow,
     "ir_left": functools.partial(_draw_infrared, "infrared, left"),
     "ir_right": functools.partial(_draw_infrared, "infrared, right"),
+    "suction_seal": functools.partial(_draw_score, "suction: seal, yellow 1, blue near 0, black 0"),
+    "suction_wrench": functools.partial(_draw_score, "suction: wrench, yellow 1, blue near 0, black 0"),
 }
 _DEPTHS = {"depth_sensor": "depth sensor", "depth_stereo": "stereo depth"}
 """Layers of depth, and their captions."""

@@ -28,6 +28,7 @@ import msgspec
 from synpick_warp import __version__
 from synpick_warp.configs.cell.bins import Bins
 from synpick_warp.configs.cell.gripper import EACH, SUCTION1
+from synpick_warp.configs.episodes.manipulation import MASK, SAME
 from synpick_warp.configs.episodes.objects import AUTO_UNIT, Objects
 from synpick_warp.configs.episodes.randomize import Randomize
 from synpick_warp.configs.files.load import load_config, override_config, table_lists
@@ -69,9 +70,10 @@ FREE_SETTINGS = (
     "bake.writers",
     "render.views_per_batch",
     "perception.views",
+    "gripper.mesh",
 )
-"""Settings that may differ when a bake is resumed: no episode depends on them. Objects, lights, textures and meshes of bins are compared by
-content, not by the name of their file or folder. A device of another type computes the same episodes up to rounding."""
+"""Settings that may differ when a bake is resumed: no episode depends on them. Objects, lights, textures and meshes of bins and gripper are
+compared by content, not by the name of their file or folder. A device of another type computes the same episodes up to rounding."""
 
 
 YOUNGER_SETTINGS: dict[str, Any] = {
@@ -81,6 +83,7 @@ YOUNGER_SETTINGS: dict[str, Any] = {
     "arrangement.counts": (),
     "arrangement.drop": COLUMN,
     "settle.restless": 0.0,
+    "physics.match_all": False,
     "depth_sensor.preset": "",
     "depth_sensor.disparity_noise": 0.0,
     "depth_sensor.max_disparity": 0.0,
@@ -89,7 +92,10 @@ YOUNGER_SETTINGS: dict[str, Any] = {
     "depth_sensor.dot_brightness": 2.0,
     "depth_sensor.ambient": 0.25,
     "depth_sensor.infrared_noise": 0.005,
+    "pick.forgive": False,
+    "pick.retry": SAME,
     "perception.camera": "",
+    "perception.grasp_point": MASK,
     "render.table_size": (0.0, 0.0),
     "camera": [],
     "bin": [],
@@ -97,6 +103,8 @@ YOUNGER_SETTINGS: dict[str, Any] = {
     "gripper.kind": SUCTION1,
     "gripper.cups": (),
     "gripper.valve": EACH,
+    "gripper.mesh_unit": "m",
+    "gripper.mesh_checksum": "",
     "objects.unit": AUTO_UNIT,
     "objects.symmetries": Objects().symmetries,
     "objects.symmetry_tolerance": Objects().symmetry_tolerance,

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import warp as wp
 
 from synpick_warp.configs import schema
@@ -32,6 +34,7 @@ class Perception:
         attempts: AttemptState,
         observation: Observation,
         plan: Plan,
+        choose_grasps: Callable[[GraspPlanner, SceneData, Plan], None] | None = None,
     ) -> None:
         """Allocate scratch.
 
@@ -45,9 +48,10 @@ class Perception:
             attempts: State of their attempts; `task` selects the worlds.
             observation: Written: perception results of the worlds processed.
             plan: Written: their targets and grasps.
+            choose_grasps: The gripper's choice among other grasps of the target; None: it takes the first.
         """
         self.scene, self.state, self.attempts, self.observation, self.plan = scene, state, attempts, observation, plan
-        self.seed = seed
+        self.seed, self.choose_grasps = seed, choose_grasps
         self.device = state.phase.device
         worlds, instances = observation.visible.shape
         self.images = PerceptionImages(settings, rig, render_scene, worlds, instances)
@@ -103,5 +107,7 @@ class Perception:
         self.images.render(snapshot)
         self.segmenter.find_grasp_points(self.scene, snapshot.catalog_index, self.observation)
         self.planner.plan(self.scene, self.state, self.attempts, self.observation, self.plan, self.seed)
+        if self.choose_grasps is not None:
+            self.choose_grasps(self.planner, self.scene, self.plan)
         given = {"views": views.count, "length": self._length, "next": self._next, "remaining": self._remaining}
         launch(worklist.advance_batch_kernel, 1, **given)

@@ -8,8 +8,10 @@ from typing import Any
 import warp as wp
 
 from synpick_warp.configs import schema
+from synpick_warp.configs.episodes.manipulation import FLAT
 from synpick_warp.kernels.perception.clutter_graph import WARP, Cycles, break_cycles_kernel, close_clutter_kernel, link_clutter_kernel
 from synpick_warp.kernels.perception.cup_alignment import align_cups_kernel
+from synpick_warp.kernels.perception.flat_points import choose_flat_points_kernel
 from synpick_warp.kernels.perception.grasp import frame_grasp_kernel, smooth_normal_kernel
 from synpick_warp.kernels.perception.occlusion_votes import (
     CONTOUR_LANES,
@@ -69,6 +71,7 @@ class GraspPlanner:
             arrays: Components and contours of the batch.
         """
         self.images, self.arrays = images, arrays
+        self.flat = settings.grasp_point == FLAT
         self.device = arrays.largest.device
         self.views, self.instances = arrays.largest.shape
         self.voting, self.cycles = allocate_votes(settings, self.instances, self.views, self.device)
@@ -82,19 +85,19 @@ class GraspPlanner:
             scene: Constants.
             state: State of the worlds.
             attempts: State of the attempts; `outcome` belongs to the attempt that ended in this tick.
-            observation: Visibility, grasp points and depths are read.
+            observation: Visibility, grasp points and depths are read; point and depth of targets may change.
             plan: Written; a world without a visible instance gets target -1 and keeps the rest.
-            seed: Seed of the random choice of targets.
+            seed: Seed of the random choice of targets and grasp points.
         """
         self.bound_contours(scene, state, observation)
         self.count_votes(scene, observation)
         self.weigh_votes(scene, observation)
         self.order_clutter(scene, observation)
         self.choose_target(scene, state, attempts, observation, plan, seed)
+        if scene.tries_another or self.flat:
+            self.choose_flat_points(scene, state, attempts, observation, plan, seed)
         self.smooth_normal(scene, observation, plan)
         self.frame_grasp(scene, observation, plan)
-        if scene.cups.count > 1:
-            self.align_cups(scene, plan)
 
     def bound_contours(self, scene: SceneData, state: WorldState, observation: Observation) -> None:
         """Compute each contour's bounding box, and its instance's reach."""
@@ -131,6 +134,14 @@ class GraspPlanner:
         sources = (scene, state, attempts, observation, plan, self.images)
         launch(choose_target_kernel, self.views, *sources, seed=wp.uint64(seed), block_dim=VIEW_BLOCK)
 
+    def choose_flat_points(
+        self, scene: SceneData, state: WorldState, attempts: AttemptState, observation: Observation, plan: Plan, seed: int
+    ) -> None:
+        """Move the targets' grasp points to where they are flat, those of all or of such as have failed."""
+        sources = (scene, state, attempts, observation, plan, *self._sources)
+        least = 0 if self.flat else 1
+        launch(choose_flat_points_kernel, self.views, *sources, seed=wp.uint64(seed), least_failures=least, block_dim=VIEW_BLOCK)
+
     def smooth_normal(self, scene: SceneData, observation: Observation, plan: Plan) -> None:
         """Sum the normals in the window around the target's grasp point."""
         window = scene.perception.normal_window
@@ -142,4 +153,5 @@ class GraspPlanner:
 
     def align_cups(self, scene: SceneData, plan: Plan) -> None:
         """Turn the gripper about the grasp point, so that as many cups as possible lie on the target."""
-        launch(align_cups_kernel, self.views, scene, plan, *self._sources, block_dim=VIEW_BLOCK)
+        if scene.cups.count > 1:
+            launch(align_cups_kernel, self.views, scene, plan, *self._sources, block_dim=VIEW_BLOCK)

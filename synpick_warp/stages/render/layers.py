@@ -20,6 +20,7 @@ from synpick_warp.kernels.render.images.layers import (
     render_normals_kernel,
     render_scene_flow_kernel,
 )
+from synpick_warp.kernels.render.images.suction_map import render_suction_seal_kernel, render_suction_wrench_kernel
 from synpick_warp.kernels.render.visibility.camera import TILE_PIXELS
 from synpick_warp.kernels.render.visibility.variants import kernel_for
 from synpick_warp.scenes.types import FIRST_DISTRACTOR
@@ -102,6 +103,8 @@ class LayerRenderer:
         motion = [scene.grid, snapshot.follows, self.motions, gbuffer, views]
         objects = [scene.meshes, scene.grid, scene.obj_id, bodies, gbuffer, views]
         classes = [scene.grid, scene.obj_id, bodies, gbuffer, views]
+        wrench = [scene.meshes, scene.surfaces, scene.grid, scene.obj_id, scene.suction_maps, bodies, gbuffer, views]
+        seal = [*wrench[:5], scene.table, *wrench[5:]]
         count = views.count
         launches = {
             "normals": lambda: self._launch(render_normals_kernel, count, surface, out.normals),
@@ -111,6 +114,8 @@ class LayerRenderer:
             "flow": lambda: self._launch(render_flow_kernel, count, motion, out.flow),
             "scene_flow": lambda: self._launch(render_scene_flow_kernel, count, motion, out.scene_flow),
             "depth_sensor": lambda: self._launch(render_depth_sensor_kernel, count, sensor, out.depth_sensor),
+            "suction_seal": lambda: self._launch(render_suction_seal_kernel, count, seal, out.suction_seal),
+            "suction_wrench": lambda: self._launch(render_suction_wrench_kernel, count, wrench, out.suction_wrench),
         }
         for name in self.names:
             if name not in STEREO_LAYERS:

@@ -11,6 +11,7 @@ import warp as wp
 
 from synpick_warp.configs import schema
 from synpick_warp.configs.calibration.lens import FISHEYE, LensMap
+from synpick_warp.kernels.render.images.suction_map import SuctionScene
 from synpick_warp.kernels.render.lighting.color import MAX_HALF
 from synpick_warp.kernels.render.lighting.environment import MAX_LAMPS, Lights
 from synpick_warp.kernels.render.lighting.materials import TEXEL_BITS, TEXEL_MASK, TRIANGLE_RECORDS, Surfaces
@@ -63,6 +64,8 @@ class RenderScene:
     """Owners of the meshes whose handles `meshes` holds."""
     looks: Looks | None = None
     """What episodes draw their looks from; the textures' materials are the last rows of `surfaces`."""
+    suction_maps: Any = None
+    """The struct `SuctionScene`: cup and centres of mass, of the layers `suction_seal` and `suction_wrench`."""
 
     @property
     def width(self) -> int:
@@ -321,6 +324,14 @@ def shadowed_lamps(settings: schema.Render) -> int:
     return min(settings.lamps, 1) if settings.mode == schema.UNOCCLUDED else settings.lamps
 
 
+def build_suction_scene(catalog: Catalog, radius: float, device: wp.Device) -> Any:
+    """The struct `SuctionScene` of a cup of `radius` [m]."""
+    suction = SuctionScene()
+    suction.radius = radius
+    suction.center_of_mass = wp.array([entry.center_of_mass for entry in catalog.bodies], dtype=wp.vec3, device=device)
+    return suction
+
+
 def build_render_scene(
     settings: schema.Render,
     table_height: float,
@@ -330,6 +341,7 @@ def build_render_scene(
     lights: tuple[EnvironmentMap, ...],
     device: wp.Device,
     looks: Looks | None = None,
+    cup_radius: float = schema.Suction().radius,
 ) -> RenderScene:
     """Put all constant data of the renderer on the device.
 
@@ -342,6 +354,7 @@ def build_render_scene(
         lights: Environment maps; `Snapshot.light` is the index into it.
         device: Device of the arrays.
         looks: What episodes draw their looks from; None: nothing.
+        cup_radius: Radius of the suction cup of the layers `suction_seal` and `suction_wrench` [m].
     """
     # The first bin comes last, see `fixture_mesh`.
     bins, grip = fixtures[:-GRIPPER], fixtures[-GRIPPER:]
@@ -377,4 +390,5 @@ def build_render_scene(
         device=device,
         keep=keep,
         looks=looks,
+        suction_maps=build_suction_scene(catalog, cup_radius, device),
     )

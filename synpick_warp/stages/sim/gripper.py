@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Protocol
+
 import newton
 import warp as wp
 
@@ -11,6 +13,43 @@ from synpick_warp.stages.launch import launch
 from synpick_warp.stages.perception.arrays import Observation, Plan
 from synpick_warp.stages.sim.physics import Physics
 from synpick_warp.stages.sim.worlds import AttemptState, SealState, WorldState
+
+
+class SetpointLaw(Protocol):
+    """Path of a gripper's setpoint through the tasks of an attempt, and when each is complete; all `Task`s come in their order."""
+
+    def begin(self, scene: SceneData, state: WorldState, attempts: AttemptState, plan: Plan, physics: Physics) -> None:
+        """Place gripper and setpoint where task APPROACH begins. Runs after perception."""
+        ...
+
+    def advance(self, scene: SceneData, state: WorldState, attempts: AttemptState, plan: Plan) -> None:
+        """Advance the setpoints by a step of physics, in mode MOVE, too, up to task PRESS. Runs before the step."""
+        ...
+
+    def end_tick(self, scene: SceneData, state: WorldState, attempts: AttemptState, plan: Plan) -> None:
+        """Begin task LIFT, and after it judge the attempt and begin LOOK. Runs at the end of a tick, after the hold has engaged."""
+        ...
+
+
+class TwoSpeedLaw:
+    """Setpoint law of the paper: fast to a point before the grasp, slowly along its normal, a rest, and up."""
+
+    def begin(self, scene: SceneData, state: WorldState, attempts: AttemptState, plan: Plan, physics: Physics) -> None:
+        """Place the gripper `appear_height` above the grasp."""
+        sources = (scene, state, attempts, plan, physics.state)
+        launch(tasks.place_grippers_kernel, len(state.phase), *sources, tilt_out=physics.control.joint_target_q)
+
+    def advance(self, scene: SceneData, state: WorldState, attempts: AttemptState, plan: Plan) -> None:
+        """Advance the setpoints by a step."""
+        launch(gripper.advance_setpoints_kernel, len(state.phase), scene, state, attempts, plan)
+
+    def end_tick(self, scene: SceneData, state: WorldState, attempts: AttemptState, plan: Plan) -> None:
+        """Complete tasks PRESS, by time, and LIFT, by the setpoint's arrival."""
+        launch(tasks.advance_tasks_kernel, len(state.phase), scene, state, attempts, plan)
+
+
+TWO_SPEEDS: SetpointLaw = TwoSpeedLaw()
+"""Setpoint law of the grippers that ship."""
 
 
 def begin_moving(scene: SceneData, state: WorldState, physics: Physics, seed: int) -> None:
@@ -36,9 +75,17 @@ def set_shaft_collision(scene: SceneData, state: WorldState, physics: Physics) -
     launch(tasks.set_shaft_collision_kernel, len(state.phase), scene, state, shape_transform=physics.model.shape_transform)
 
 
-def drive_gripper(scene: SceneData, state: WorldState, attempts: AttemptState, plan: Plan, physics: Physics, current: newton.State) -> None:
+def drive_gripper(
+    scene: SceneData,
+    state: WorldState,
+    attempts: AttemptState,
+    plan: Plan,
+    physics: Physics,
+    current: newton.State,
+    law: SetpointLaw = TWO_SPEEDS,
+) -> None:
     """Advance the setpoints by one step and write the grippers' joint forces."""
-    launch(gripper.advance_setpoints_kernel, len(state.phase), scene, state, attempts, plan)
+    law.advance(scene, state, attempts, plan)
     launch(gripper.drive_gripper_kernel, len(state.phase), scene, state, attempts, current, physics.control)
 
 
@@ -47,11 +94,21 @@ def remove_lost(scene: SceneData, state: WorldState, attempts: AttemptState, sea
     launch(tasks.remove_lost_kernel, state.catalog_index.shape, scene, state, attempts, seals, physics.state)
 
 
-def advance_tasks(scene: SceneData, state: WorldState, attempts: AttemptState, seals: SealState, plan: Plan, physics: Physics) -> None:
+def advance_tasks(
+    scene: SceneData,
+    state: WorldState,
+    attempts: AttemptState,
+    seals: SealState,
+    plan: Plan,
+    physics: Physics,
+    law: SetpointLaw = TWO_SPEEDS,
+) -> None:
     """Task transitions at the end of a tick: judge complete lifts, remove picked objects, send grippers home."""
     sources = (scene, state, attempts, seals)
     launch(tasks.pack_attached_kernel, attempts.attached_words.shape, *sources)
-    launch(tasks.advance_tasks_kernel, len(state.phase), *sources, plan)
+    law.end_tick(scene, state, attempts, plan)
+    if scene.tries_another:
+        launch(tasks.count_target_failures_kernel, attempts.target_failures.shape, state, attempts, plan)
     launch(tasks.end_attempts_kernel, len(state.phase), *sources, physics.state, tilt_out=physics.control.joint_target_q)
 
 
@@ -60,14 +117,17 @@ def park_removed(scene: SceneData, state: WorldState, attempts: AttemptState, ph
     launch(tasks.park_removed_kernel, state.catalog_index.shape, scene, state, attempts, physics.state, physics.control)
 
 
-def begin_attempts(scene: SceneData, state: WorldState, attempts: AttemptState, plan: Plan, physics: Physics) -> None:
-    """Begin the planned attempts: place the gripper above the grasp, with the planned yaw and tilt."""
+def begin_attempts(
+    scene: SceneData, state: WorldState, attempts: AttemptState, plan: Plan, physics: Physics, law: SetpointLaw = TWO_SPEEDS
+) -> None:
+    """Begin the planned attempts: place the gripper where the approach begins, with the planned yaw and tilt."""
     launch(tasks.begin_attempts_kernel, len(state.phase), state, attempts, plan)
-    place_grippers(scene, state, attempts, plan, physics)
+    place_grippers(scene, state, attempts, plan, physics, law)
 
 
-def place_grippers(scene: SceneData, state: WorldState, attempts: AttemptState, plan: Plan, physics: Physics) -> None:
-    """Place the gripper above the grasp where task APPROACH begins, with the planned yaw and tilt."""
-    sources = (scene, state, attempts, plan, physics.state)
-    launch(tasks.place_grippers_kernel, len(state.phase), *sources, tilt_out=physics.control.joint_target_q)
+def place_grippers(
+    scene: SceneData, state: WorldState, attempts: AttemptState, plan: Plan, physics: Physics, law: SetpointLaw = TWO_SPEEDS
+) -> None:
+    """Place the gripper where task APPROACH begins, with the planned yaw and tilt."""
+    law.begin(scene, state, attempts, plan, physics)
     physics.set_yaw(plan.yaw)

@@ -17,6 +17,7 @@ from synpick_warp.configs.schema import Physics as PhysicsConfig
 from synpick_warp.kernels.sim import gripper, rest
 from synpick_warp.newton_patches import KNOWN_NEWTON
 from synpick_warp.newton_patches.broad_phase import replace_broad_phase
+from synpick_warp.newton_patches.contact_matching import complete_matching
 from synpick_warp.newton_patches.narrow_phase import resize_blocks
 from synpick_warp.newton_patches.solver import choose_solver
 from synpick_warp.scenes import build
@@ -275,6 +276,8 @@ def make_pipeline(physics: PhysicsConfig, model: newton.Model) -> newton.Collisi
     )
     if newton.__version__ != KNOWN_NEWTON:
         return pipeline
+    if physics.match_all:
+        complete_matching(pipeline)
     replace_broad_phase(pipeline)
     resize_blocks(pipeline)
     return pipeline

@@ -26,7 +26,7 @@ from synpick_warp.stages.perception.arrays import Observation, Plan
 from synpick_warp.stages.perception.perceive import Perception
 from synpick_warp.stages.render.scene import RenderScene
 from synpick_warp.stages.sim import arrange, gripper
-from synpick_warp.stages.sim.hold import Hold, make_hold
+from synpick_warp.stages.sim.behavior import BEHAVIORS, Hold
 from synpick_warp.stages.sim.physics import ENDED, Physics
 from synpick_warp.stages.sim.states import State, WorldStates
 from synpick_warp.stages.sim.step_log import PhysicsRecord, StepRecorder
@@ -106,6 +106,7 @@ class Simulation:
                 config.trajectory, config.gripper, self.scene, self.state, self.attempts, self.seals, self.physics, sizes
             )
         self.record = replace(record, physics=self.recorder.record if self.recorder is not None else None)
+        self.behavior = BEHAVIORS[config.gripper.kind]
         self._is_between_ticks = False
         """Whether a tick is complete and none has begun."""
         self.hold: Hold | None = None
@@ -113,9 +114,9 @@ class Simulation:
         if may_pick(config.bake, config.splits):
             if render_scene is None:
                 raise ValueError("episodes that pick need a render_scene for perception")
-            self.hold = make_hold(config.gripper, config.suction, catalog, render_scene, device)
+            self.hold = self.behavior.hold(config.suction, catalog, render_scene, device)
             state = (self.scene, self.state, self.attempts, self.observation, self.plan)
-            self.perception = Perception(config.perception, config.rig, config.bake.seed, render_scene, *state)
+            self.perception = Perception(config.perception, config.rig, config.bake.seed, render_scene, *state, self.behavior.choose_grasps)
 
     def tick(self, perceives: bool = True) -> None:
         """Advance all worlds by one tick; `record` has its output. `perceives`: False: worlds whose task is LOOK wait."""
@@ -148,7 +149,7 @@ class Simulation:
         if self.perception is not None and perceives:
             with scope("perceive", self.device):
                 self.perception.perceive(self.record.snapshot)
-                gripper.begin_attempts(self.scene, self.state, self.attempts, self.plan, self.physics)
+                gripper.begin_attempts(self.scene, self.state, self.attempts, self.plan, self.physics, self.behavior.law)
         self._is_between_ticks = True
 
     @property
@@ -211,14 +212,14 @@ class Simulation:
         gripper.remove_lost(scene, state, self.attempts, self.seals, physics)
         if self.hold is not None:
             self.hold.engage(scene, state, self.attempts, self.seals, physics)
-            gripper.advance_tasks(scene, state, self.attempts, self.seals, self.plan, physics)
+            gripper.advance_tasks(scene, state, self.attempts, self.seals, self.plan, physics, self.behavior.law)
         gripper.park_removed(scene, state, self.attempts, physics)
         physics.refresh_poses()
         arrange.judge_episodes(scene, state, self.attempts, self.observation, physics)
 
     def _drive(self, current: newton.State) -> None:
         """Hook before a step: forces of gripper and hold."""
-        gripper.drive_gripper(self.scene, self.state, self.attempts, self.plan, self.physics, current)
+        gripper.drive_gripper(self.scene, self.state, self.attempts, self.plan, self.physics, current, self.behavior.law)
         if self.recorder is not None:
             self.recorder.save_impedance_force()
         if self.hold is not None:

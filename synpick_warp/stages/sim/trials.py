@@ -73,7 +73,7 @@ class Trials:
         self.states.load(self.state, self._row)
         sources = (simulation.scene, state, attempts, plan, physics.state)
         launch(kernels.begin_trials_kernel, worlds, *sources, **given, row=self._row)
-        gripper.place_grippers(simulation.scene, state, attempts, plan, physics)
+        gripper.place_grippers(simulation.scene, state, attempts, plan, physics, simulation.behavior.law)
         simulation.tick(perceives=False)
         sources = (simulation.scene, state, attempts, simulation.seals, physics.state)
         given |= {"labels": self.labels, "done": self._done, "moved_distance": MOVED}

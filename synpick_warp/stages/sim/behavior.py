@@ -1,17 +1,21 @@
-"""What the simulation asks of a gripper's hold, that is, of what binds objects to its head; and the table of holds."""
+"""What the simulation asks of a kind of gripper: what binds objects to its head, the path of its setpoint, and its choice of grasps."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from typing import Protocol
 
 import newton
 import warp as wp
 
-from synpick_warp.configs.cell.gripper import SUCTION1, SUCTION_ARRAY, Gripper, Suction
+from synpick_warp.configs.cell.gripper import SUCTION1, SUCTION_ARRAY, Suction
 from synpick_warp.scenes.types import Catalog
 from synpick_warp.stages.constants import SceneData
+from synpick_warp.stages.perception.arrays import Plan
+from synpick_warp.stages.perception.plan import GraspPlanner
 from synpick_warp.stages.render.scene import RenderScene
+from synpick_warp.stages.sim.gripper import TWO_SPEEDS, SetpointLaw
 from synpick_warp.stages.sim.physics import Physics
 from synpick_warp.stages.sim.suction import ArrayHold, SuctionHold
 from synpick_warp.stages.sim.worlds import AttemptState, SealState, WorldState
@@ -33,13 +37,18 @@ class Hold(Protocol):
         ...
 
 
-HOLDS: Mapping[str, Callable[[Suction, Catalog, RenderScene, wp.Device], Hold]] = {
-    SUCTION1: SuctionHold,
-    SUCTION_ARRAY: ArrayHold,
+@dataclass(frozen=True)
+class Behavior:
+    """Behaviour of a kind of gripper: class of its hold, law of its setpoint, and its choice among the candidates of a grasp."""
+
+    hold: Callable[[Suction, Catalog, RenderScene, wp.Device], Hold]
+    law: SetpointLaw = TWO_SPEEDS
+    choose_grasps: Callable[[GraspPlanner, SceneData, Plan], None] | None = None
+    """Replaces grasps of `Plan` by others of the target (point, normal, yaw, tilt), after it was framed; None: the frame is taken."""
+
+
+BEHAVIORS: Mapping[str, Behavior] = {
+    SUCTION1: Behavior(SuctionHold),
+    SUCTION_ARRAY: Behavior(ArrayHold, choose_grasps=GraspPlanner.align_cups),
 }
-"""Class of the hold, by `gripper.kind`."""
-
-
-def make_hold(gripper: Gripper, suction: Suction, catalog: Catalog, render_scene: RenderScene, device: wp.Device) -> Hold:
-    """Create the hold of the gripper that the settings name."""
-    return HOLDS[gripper.kind](suction, catalog, render_scene, device)
+"""Behaviour, by `gripper.kind`."""
