@@ -326,3 +326,27 @@ def sample_bins_kernel(
     angle = 2.0 * bins.yaw * uniform(key, 3) - bins.yaw
     bin_out[world] = chosen
     bin_pose_out[world] = wp.transform(origin + wp.vec3(x, y, 0.0), wp.quat_from_axis_angle(wp.vec3(0.0, 0.0, 1.0), angle))
+
+
+@wp.kernel
+def reset_shapes_kernel(
+    # Scene:
+    shape_body: wp.array[int],  # (shape)
+    first_radius: wp.array[float],  # (shape) [m]
+    first_transform: wp.array[wp.transform],  # (shape) [m]
+    # State:
+    variant: wp.array[int],  # (body)
+    # Out:
+    radius_inout: wp.array[float],  # (shape) [m]
+    transform_inout: wp.array[wp.transform],  # (shape) [m]
+):
+    """Reset bounding radius and pose of the shapes of bodies that get another variant to those of a new model.
+
+    A variant sets its own shapes alone, and Newton bounds a body, for its patches of friction, by all. Launched over shape.
+    """
+    shape = wp.tid()
+    body = shape_body[shape]
+    if body >= 0:
+        if variant[body] >= 0:
+            radius_inout[shape] = first_radius[shape]
+            transform_inout[shape] = first_transform[shape]

@@ -243,6 +243,16 @@ def bench(device):
     return Simulation(settings(bake__worlds=2, arrangement__max_objects=1), catalog(BOX), 1, device)
 
 
+def test_an_object_moves_as_in_a_new_world_whatever_its_slot_had_before(device):
+    """Newton's bound of a body, which limits its patches of friction, counts shapes that an object of fewer pieces leaves unused."""
+    kinds = ANGLE, (*ANGLE, (0.05, 0.05, 0.05)), (*ANGLE, (0.09, 0.09, 0.09))
+    simulation = Simulation(settings(bake__worlds=2, arrangement__max_objects=1), catalog(*kinds), 1, device)
+    for world, entry in ((0, 2), (0, 0), (1, 0)):
+        placed(simulation, world, entry, [0.0, 0.0, 0.05, 0.0, 0.0, 0.0, 1.0])
+    used, new = simulation.physics.solver._friction_patches.body_radius.numpy().reshape(2, -1)[:, build.GRIPPER_BODIES]
+    assert used == new
+
+
 def advance(simulation: Simulation, ticks: int) -> np.ndarray:
     """Poses (world, 7) of the first slots after so many ticks of physics alone; a view of the state."""
     for _ in range(ticks):

@@ -14,7 +14,7 @@ import warp as wp
 from synpick_warp.configs.dataset.splits import DataLayout
 from synpick_warp.configs.schema import Config
 from synpick_warp.configs.schema import Physics as PhysicsConfig
-from synpick_warp.kernels.sim import gripper, rest
+from synpick_warp.kernels.sim import arrangement, gripper, rest
 from synpick_warp.newton_patches import KNOWN_NEWTON
 from synpick_warp.newton_patches.broad_phase import replace_broad_phase
 from synpick_warp.newton_patches.contact_matching import complete_matching
@@ -100,6 +100,7 @@ class Physics:
         self.solver_stream: wp.Stream | None = None
         """CUDA stream for the captured kernels of the solver, from the next tick on; None: the current stream. It may be confined to few
         multiprocessors, since these kernels are short and small, while those of collision detection need many."""
+        self._first_radius, self._first_transform = wp.clone(self.model.shape_collision_radius), wp.clone(self.model.shape_transform)
         self._graphs: dict[wp.Stream | None, list[wp.Graph]] = {}
         self._observables = self.solver.observables({self.solver.ObservableKind.CONTACT_F}, contacts=self.contacts)
         fingers = np.arange(worlds) * built.layout.bodies_per_world
@@ -128,8 +129,15 @@ class Physics:
         self.refresh_poses()
 
     def select(self, variant: wp.array, restarted: wp.array) -> None:
-        """Select body variants and reset solver history, as `load` does, but without contact matching and poses."""
-        flags = self.model.select_body_variants(variant)
+        """Select body variants and reset solver history, as `load` does, but without contact matching and poses.
+
+        What a world simulates then does not depend on what it had before: shapes that a variant leaves unused are those of a new model.
+        """
+        model = self.model
+        inputs = [model.shape_body, self._first_radius, self._first_transform, variant]
+        outputs = [model.shape_collision_radius, model.shape_transform]
+        wp.launch(arrangement.reset_shapes_kernel, dim=model.shape_count, inputs=inputs, outputs=outputs, device=self.device)
+        flags = model.select_body_variants(variant)
         self.solver.notify_model_changed(flags, world_mask=restarted)
         self.solver.reset(self.state, world_mask=restarted)
 
