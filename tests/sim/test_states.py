@@ -7,11 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 import pytest
-import warp as wp
 
 from synpick_warp.codes import Ending, Phase, Task
 from synpick_warp.errors import StateError
-from synpick_warp.kernels.newton_patches import contact_history
 from synpick_warp.newton_patches import history
 from synpick_warp.stages.sim import states
 from synpick_warp.stages.sim.simulate import Simulation
@@ -119,44 +117,25 @@ def test_all_that_is_no_state_may_be_anything(device):
     ("world", "forgotten"),
     [(0, "physics.joint_qd"), (0, "physics.mf_impulses"), (1, "worlds.setpoint"), (1, "plan.point"), (0, "attempts.task")],
 )
-def test_a_state_that_forgets_an_array_is_found_out(scene, monkeypatch, world, forgotten):
+def test_a_state_that_forgets_an_array_is_found_out(scene, world, forgotten):
     """The checks can fail: without one of its arrays, a branch in an idle world differs."""
-    known = scene.simulation.states
-    name = forgotten.replace("mf_", "propagation_") if scene.simulation.device.is_cuda else forgotten
-    with monkeypatch.context() as patch:
-        patch.setattr(known, "_table", without(known, name))
-        scene.simulation.branch(world, [WORLDS])
+    states = scene.simulation.states
+    part = states.fields[forgotten.replace("mf_", "propagation_") if scene.simulation.device.is_cuda else forgotten]
+    state = states.get([world])
+    words = state.words.numpy().copy()
+    words[:, part.first : part.first + part.words] = 0
+    state.words.assign(words)
+    states.set(state, [WORLDS])
     assert scene.differences(world, WORLDS) != []
 
 
-def without(known: states.WorldStates, name: str):
-    """The table of a state's words, of which those of an array lie in memory of no use."""
-    table, waste = states.world_rows.WordTable(), wp.zeros(known.words, dtype=wp.uint32, device=known.device)
-    address, stride = known._table.address.numpy().copy(), known._table.stride.numpy().copy()
-    words = slice(known.fields[name].first, known.fields[name].first + known.fields[name].words)
-    address[words] = waste.ptr + states.WORD * np.arange(known.fields[name].words, dtype=np.uint64)
-    stride[words] = 0
-    table.address, table.stride = (wp.array(values, device=known.device) for values in (address, stride))
-    known.waste = waste
-    return table
-
-
 @pytest.mark.parametrize("forgotten", ["key", "midpoint", "solved_normal", "row", "pair", "displacement", "valid"])
-def test_a_forgotten_contact_is_found_out(scene, monkeypatch, forgotten):
-    known = scene.simulation.states.history
+def test_a_forgotten_contact_is_found_out(scene, forgotten):
+    state = scene.simulation.get_state([0])
     name = {"row": "propagation_slot" if scene.simulation.device.is_cuda else "free_slot"}.get(forgotten, forgotten)
-    with monkeypatch.context() as patch:
-        patch.setattr(known, "live", replaced(known.live, name, wp.zeros_like(getattr(known.live, name))))
-        scene.simulation.branch(0, [WORLDS])
+    getattr(state.contacts.history, name).zero_()
+    scene.simulation.set_state(state, [WORLDS])
     assert scene.differences(0, WORLDS) != []
-
-
-def replaced(contacts, name: str, array: wp.array):
-    """Contacts with another array."""
-    copy = contact_history.ContactHistory()
-    for member in contact_history.ContactHistory.vars:
-        setattr(copy, member, array if member == name else getattr(contacts, member))
-    return copy
 
 
 # ---- on the host ----

@@ -11,27 +11,26 @@ ticks, by NaN or by numbers of an earlier tick, and then the state is loaded int
 
 from __future__ import annotations
 
+import argparse
 import sys
 import types
 from collections import Counter, deque
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import warp as wp
 from rich.console import Console
 
 from synpick_warp.codes import Mode, Phase, Task
-from synpick_warp.configs.schema import Config
 from synpick_warp.errors import SynpickError
 from synpick_warp.factory.assembly import fit_to_catalog
-from synpick_warp.scenes.bins import Bin, make_bins
+from synpick_warp.scenes.bins import make_bins
 from synpick_warp.scenes.cameras import make_cameras
 from synpick_warp.scenes.catalog import load_catalog
 from synpick_warp.scenes.fixtures import make_fixtures
 from synpick_warp.scenes.lights import load_lights
-from synpick_warp.scenes.types import Catalog
 from synpick_warp.stages.render.scene import RenderScene, build_render_scene
 from synpick_warp.stages.sim.physics import MIN_GPU_WORLDS
 from synpick_warp.stages.sim.simulate import Simulation
@@ -48,6 +47,8 @@ OWN = {
     "repeated": {"type": positive_count, "default": 100, "help": "ticks that are repeated with overwritten arrays (default: 100)"},
 }
 """Options of this check; see `tools.options.OPTIONS`."""
+EPISODES = 8
+"""Episodes for each world."""
 POISONED_WORLDS = 16
 """Worlds of the check of arrays."""
 OLDER = 3
@@ -74,17 +75,16 @@ def main(arguments: list[str] | None = None) -> int:
     options = make_parser(__doc__, "config", "models", "device", "seed", "set", own=OWN).parse_args(arguments)
     console, rows = Console(highlight=False), []
     try:
-        assets = load_assets(configure(options, {"bake.mode": "mixed"}))
+        maker, episodes = Maker(options), EPISODES * options.worlds
         for mode in Mode:
-            fixed = {"bake.mode": mode.name.lower(), "bake.worlds": options.worlds, "bake.episodes": 8 * options.worlds}
-            simulation = build(configure(options, fixed), assets)
-            few = build(configure(options, fixed | {"bake.worlds": min(MIN_GPU_WORLDS, options.worlds)}), assets)
+            simulation = maker.make(mode.name.lower(), options.worlds, episodes)
+            few = maker.make(mode.name.lower(), min(MIN_GPU_WORLDS, options.worlds), episodes)
             result = check_branches(simulation, few, options.states, options.moments, options.ticks, options.apart)
             rows += report(mode.name.lower(), result)
             console.print(*(f"{count} x {name}" for name, count in sorted(result.moments.items())), *result.differences[:20], sep="\n")
-        fixed = {"bake.mode": "mixed", "bake.worlds": min(POISONED_WORLDS, options.worlds), "bake.episodes": 8 * POISONED_WORLDS}
         kinds = Counter[str]()
-        differences = list(check_arrays(build(configure(options, fixed), assets), options.repeated, kinds))
+        simulation = maker.make("mixed", min(POISONED_WORLDS, options.worlds), episodes)
+        differences = list(check_arrays(simulation, options.repeated, kinds))
         rows += [Row(f"arrays: {kind}", count) for kind, count in sorted(kinds.items())]
         rows.append(Row("arrays: ticks that overwritten ones change", len(differences), "", "= 0", not differences))
         console.print(*differences[:20], sep="\n")
@@ -94,29 +94,24 @@ def main(arguments: list[str] | None = None) -> int:
     return 0 if all(row.holds for row in rows) else 1
 
 
-class Assets(NamedTuple):
-    """What all simulations share: objects, bins, number of lights, and the scene that is seen."""
+class Maker:
+    """Makes simulations by the options of a tool; all share objects, lights, and the scene that is seen."""
 
-    catalog: Catalog
-    bins: Sequence[Bin]
-    lights: int
-    scene: RenderScene
+    def __init__(self, options: argparse.Namespace) -> None:
+        self.options = options
+        config = configure(options, {"bake.mode": "mixed"})
+        self.bins = make_bins(config.cell.bins)
+        self.catalog, lights = load_catalog(config, report=lambda line: None), load_lights("")
+        cameras, fixtures = make_cameras(config.rig), make_fixtures(self.bins, config.gripper)
+        self.device, self.lights = pick_device(config.bake.device), len(lights)
+        ground = self.bins[0].sizes.ground
+        self.scene = build_render_scene(config.render, ground, self.catalog, fixtures, cameras, lights, self.device)
 
-
-def load_assets(config: Config) -> Assets:
-    """Load objects, and build the scene on the device of the settings."""
-    device, bins = pick_device(config.bake.device), make_bins(config.cell.bins)
-    catalog, lights = load_catalog(config, report=lambda line: None), load_lights("")
-    cameras, fixtures = make_cameras(config.rig), make_fixtures(bins, config.gripper)
-    scene = build_render_scene(config.render, bins[0].sizes.ground, catalog, fixtures, cameras, lights, device)
-    return Assets(catalog, bins, len(lights), scene)
-
-
-def build(config: Config, assets: Assets) -> Simulation:
-    """Worlds that can see."""
-    device = assets.scene.device
-    config = fit_to_catalog(config, assets.catalog, assets.bins, device, SilentProgress())
-    return Simulation(config, assets.catalog, assets.lights, device, assets.scene)
+    def make(self, mode: str, worlds: int, episodes: int) -> Simulation:
+        """Worlds that can see."""
+        config = configure(self.options, {"bake.mode": mode, "bake.worlds": worlds, "bake.episodes": episodes})
+        config = fit_to_catalog(config, self.catalog, self.bins, self.device, SilentProgress())
+        return Simulation(config, self.catalog, self.lights, self.device, self.scene)
 
 
 def report(mode: str, result: Result) -> list[Row]:
