@@ -66,8 +66,8 @@ class Pick:
     retry: str = setting(
         SAME,
         "",
-        "Target after a failed attempt: same (the rule chooses as if none had failed) or another (of objects with the fewest failed "
-        "attempts; one that has failed is grasped at a random point, flat if one is found).",
+        "Target after a failed attempt: same (the rule chooses as if none had failed) or another (one that has not failed since the last "
+        "success; earlier failures count as objects above it, and one that has failed is grasped at a random point, flat if one is found).",
         choices=(SAME, ANOTHER),
     )
     floor: float = setting(-0.1, "m", "Objects below this height are removed from the scene (released).", low=-10.0, high=0.0)

@@ -39,11 +39,10 @@ def rank_visible(
     world: int,
     sign: float,
 ) -> int:
-    """Visible instance with the fewest failures, then the smallest sign · (number of ancestors), then the largest sign · fraction, then
-    the smallest index; or -1.
+    """Visible instance with the smallest sign · (number of ancestors) + failures, then the largest sign · fraction, then the smallest
+    index; or -1. A failed attempt weighs as one more object above, one since the last success more than all objects.
     """
     chosen = int(-1)
-    fewest = int(0)
     least = float(0.0)
     largest = float(0.0)
     for i in range(visible.shape[1]):
@@ -51,15 +50,11 @@ def rank_visible(
             members = int(0)
             for word in range(ancestors.shape[2]):
                 members += int(wp.bit_count(ancestors[world, i, word]))
-            count = sign * float(members)
+            # Whole numbers, which are exact in single precision.
+            count = sign * float(members) + float(target_failures[world, i])
             fraction = sign * visible_fraction[world, i]
-            failures = target_failures[world, i]
-            comes_first = failures < fewest
-            if failures == fewest:
-                comes_first = count < least or (count == least and fraction > largest)
-            if chosen < 0 or comes_first:
+            if chosen < 0 or count < least or (count == least and fraction > largest):
                 chosen = i
-                fewest = failures
                 least = count
                 largest = fraction
     return chosen
@@ -86,9 +81,9 @@ def choose_target_kernel(
 ):
     """Choose a target: the visible instance with the fewest ancestors, ties by the largest visible fraction; -1: none is visible.
 
-    In mode TARGET the one with the most ancestors, ties by the smallest fraction. Instances at which more attempts have failed come after
-    all others. With `random_after_failure`, mode TARGET samples a visible instance uniformly after an attempt that failed in this tick; the
-    index of the coming attempt is the sample's index in the stream. Launched over view.
+    In mode TARGET the one with the most ancestors, ties by the smallest fraction. `target_failures` weigh as `rank_visible` says. With
+    `random_after_failure`, mode TARGET samples a visible instance uniformly after an attempt that failed in this tick; the index of the
+    coming attempt is the sample's index in the stream. Launched over view.
     """
     view = wp.tid()
     world = views.world[view]

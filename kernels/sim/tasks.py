@@ -16,6 +16,9 @@ PARKED_PITCH = wp.constant(5.0)
 # Distance to the target at which a setpoint has arrived [m]; two kernels may round the target differently.
 ARRIVED = wp.constant(1.0e-4)
 
+# Weight of a failed attempt since the last success, against 1 for each in the episode: more than a world has instances.
+SINCE_SUCCESS = wp.constant(1024)
+
 
 @wp.kernel
 def begin_picking_kernel(
@@ -198,13 +201,15 @@ def count_target_failures_kernel(
 ):
     """Count the failed attempts at each instance where an attempt has ended in this tick; 0 before the second frame of phase ACT.
 
-    Launched over world, instance.
+    1 for each in the episode, plus SINCE_SUCCESS for each since the world's last success. Launched over world, instance.
     """
     world, instance = wp.tid()
     if phase[world] != Phase.ACT or frame[world] == 0:
         target_failures_inout[world, instance] = 0
     elif outcome[world] >= Outcome.DROPPED and target[world] == instance:
-        target_failures_inout[world, instance] = target_failures_inout[world, instance] + 1
+        target_failures_inout[world, instance] = target_failures_inout[world, instance] + SINCE_SUCCESS + 1
+    elif outcome[world] == Outcome.TARGET_PICKED or outcome[world] == Outcome.OTHER_PICKED:
+        target_failures_inout[world, instance] = target_failures_inout[world, instance] % SINCE_SUCCESS
 
 
 @wp.kernel

@@ -46,9 +46,16 @@ def test_order_by_ancestors_then_visible_fraction_then_index(device):
 
 @pytest.mark.parametrize(
     ("failures", "picked", "targeted"),
-    [([0, 0, 0, 0], 0, 2), ([1, 0, 0, 0], 1, 2), ([1, 0, 1, 0], 1, 3), ([1, 2, 1, 2], 0, 2), ([3, 2, 2, 1], 3, 3)],
+    [
+        ([0, 0, 0, 0], 0, 2),
+        ([1, 0, 0, 0], 1, 2),
+        ([1, 2, 0, 0], 0, 2),
+        ([4, 2, 0, 0], 2, 2),
+        ([0, 0, 1, 0], 0, 3),
+        ([1025, 9, 1025, 3], 3, 3),
+    ],
 )
-def test_instances_that_have_failed_come_after_all_others(device, failures, picked, targeted):
+def test_a_failure_weighs_as_an_object_above_or_more_than_all_since_the_last_success(device, failures, picked, targeted):
     harness = harness_of(device, [1, 1, 1, 1], [0.1, 0.9, 0.5, 0.5], [0b0000, 0b0001, 0b1001, 0b0011])
     harness.attempts.target_failures.assign(np.array([failures]))
     assert (choose(harness, Mode.PICK), choose(harness, Mode.TARGET)) == ([picked], [targeted])

@@ -212,7 +212,7 @@ def test_a_success_may_be_forgiving(device, mode, forgive, failures):
 
 def test_failed_attempts_are_counted_by_target_if_it_is_asked(device):
     """Attempts at 1, 1, 2, of which the second succeeds with another object; then a new episode."""
-    for tries_another, expected in ((False, [[0, 0, 0]] * 4), (True, [[0, 1, 0], [0, 1, 0], [0, 1, 1], [0, 0, 0]])):
+    for tries_another, expected in ((False, [[0, 0, 0]] * 4), (True, [[0, 1025, 0], [0, 1, 0], [0, 1, 1025], [0, 0, 0]])):
         worlds = made(device)
         worlds.scene = replace(worlds.scene, tries_another=tries_another)
         counts = []

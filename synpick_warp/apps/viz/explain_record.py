@@ -193,7 +193,7 @@ def _reason(attempt: Attempt, one: InstanceObservation, full: Mapping[int, str],
         if targeted and target.random_after_failure:
             return f"{above}; chosen at random after a failed attempt"
         if pick.retry == ANOTHER:
-            return f"{above}; fewer attempts at it have failed than at {full[first.instance]}"
+            return f"{above}; attempts have failed at {full[first.instance]}"
         return f"{above}; the rule would name {full[first.instance]}"
     equals = sum(len(other.ancestors) == count for other in attempt.seen)
     if len(attempt.seen) == 1:

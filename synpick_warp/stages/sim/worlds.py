@@ -83,7 +83,7 @@ class AttemptState:
     failures: wp.array = device_array("world", dtype=wp.int32)
     """Failed attempts that count towards the limit."""
     target_failures: wp.array = device_array("world", "instance", dtype=wp.int32)
-    """Failed attempts at the instance in the episode; 0 with `pick.retry` "same"."""
+    """Failed attempts at the instance in the episode, plus 1024 times those since the last success; 0 with `pick.retry` "same"."""
     hits: wp.array = device_array("world", dtype=wp.vec2i)
     """Suction rays that hit an object when suction was switched on, and the cups with a good seal: bit k, cup k."""
     engaged_words: wp.array = device_array("world", "word", dtype=wp.uint32)
