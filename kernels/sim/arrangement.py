@@ -335,18 +335,19 @@ def reset_shapes_kernel(
     first_radius: wp.array[float],  # (shape) [m]
     first_transform: wp.array[wp.transform],  # (shape) [m]
     # State:
+    body_variant: wp.array[int],  # (body)
     variant: wp.array[int],  # (body)
     # Out:
     radius_inout: wp.array[float],  # (shape) [m]
     transform_inout: wp.array[wp.transform],  # (shape) [m]
 ):
-    """Reset bounding radius and pose of the shapes of bodies that get another variant to those of a new model.
+    """Reset bounding radius and pose of the shapes of bodies that have variants and get another one to those of a new model.
 
     A variant sets its own shapes alone, and Newton bounds a body, for its patches of friction, by all. Launched over shape.
     """
     shape = wp.tid()
     body = shape_body[shape]
     if body >= 0:
-        if variant[body] >= 0:
+        if body_variant[body] >= 0 and variant[body] >= 0:
             radius_inout[shape] = first_radius[shape]
             transform_inout[shape] = first_transform[shape]

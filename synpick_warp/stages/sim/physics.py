@@ -134,7 +134,7 @@ class Physics:
         What a world simulates then does not depend on what it had before: shapes that a variant leaves unused are those of a new model.
         """
         model = self.model
-        inputs = [model.shape_body, self._first_radius, self._first_transform, variant]
+        inputs = [model.shape_body, self._first_radius, self._first_transform, model.body_variant, variant]
         outputs = [model.shape_collision_radius, model.shape_transform]
         wp.launch(arrangement.reset_shapes_kernel, dim=model.shape_count, inputs=inputs, outputs=outputs, device=self.device)
         flags = model.select_body_variants(variant)
