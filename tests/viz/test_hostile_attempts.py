@@ -33,7 +33,7 @@ VALUES = (
 
 def draw(attempt: Attempt) -> None:
     """Draw all panels that need no image."""
-    draw_words(attempt, {7: "tin"}, CONFIG.target, CONFIG.suction)
+    draw_words(attempt, {7: "tin"}, (CONFIG.target, CONFIG.pick), CONFIG.suction)
     assert picture_of(load_chart(attempt, CONFIG.suction, CONFIG.physics.tick_time, 800, 200), 1.0).shape == (200, 800, 3)
     draw_graph(attempt, CONFIG.perception.min_votes, (500, 640))
 
