@@ -189,6 +189,7 @@ def test_a_bake_of_other_settings_is_refused_and_says_which(server, whole, expec
     assert digests(whole) == expected
 
 
+@pytest.mark.slow
 def test_a_data_set_can_grow_with_other_worlds_and_writers(server, expected, tmp_path):
     out = tmp_path / "set"
     free = {"bake.worlds": 1, "bake.writers": 2, "render.views_per_batch": 2}

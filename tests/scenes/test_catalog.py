@@ -354,6 +354,7 @@ def test_embedded_objects_need_no_folder_and_no_table(tmp_path, monkeypatch):
         assert_physical(entry)
 
 
+@pytest.mark.slow
 def test_the_real_objects(real_models, tmp_path):
     """They agree with their models_info.json, too: nothing is said."""
     # Rows from the preset, but no decompositions: they take minutes. `test_collision` decomposes a small bowl.

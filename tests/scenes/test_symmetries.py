@@ -85,7 +85,11 @@ def diameter(mesh: trimesh.Trimesh) -> float:
     return float(np.linalg.norm(corners[:, None] - corners[None], axis=2).max())
 
 
-@pytest.mark.parametrize("name", [pytest.param(name, marks=pytest.mark.slow) if name in ("cube", "can") else name for name in BODIES])
+SLOW = ("cube", "can", "ring", "ball")
+"""Bodies of the largest groups, or of the most triangles."""
+
+
+@pytest.mark.parametrize("name", [pytest.param(name, marks=pytest.mark.slow) if name in SLOW else name for name in BODIES])
 def test_the_groups_of_known_bodies_in_any_orientation(name):
     mesh, discrete, continuous = BODIES[name]
     size = diameter(mesh)

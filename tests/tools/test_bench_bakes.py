@@ -205,6 +205,7 @@ def test_ctrl_c_ends_the_benchmark(monkeypatch, capsys):
     assert capsys.readouterr().err.splitlines()[-1] == "bench: interrupted"
 
 
+@pytest.mark.slow
 def test_a_steady_bake_verifies_what_it_writes(tmp_path, monkeypatch):
     monkeypatch.setattr(meter, "SLICE_SECONDS", 1.0)
     file = tmp_path / "bench.json"
