@@ -1,7 +1,7 @@
-"""Rows of worlds: the words that the arrays of a simulation hold of one world, gathered into a record, or scattered from it.
+"""Gather and scatter of per-world data: copies the 32-bit words of one world between many arrays and a contiguous record.
 
-An array of all worlds has the same number of 32-bit words for each world, one world after the other. A table lists where each word of a
-record lies in the first world, and how far from there in the next one, so that one launch copies from or to all arrays.
+The arrays are world-major with a constant stride. A table holds the address of each word in the first world and the stride to the next
+world, so that one launch copies from or to all arrays.
 """
 
 import warp as wp
@@ -11,17 +11,17 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.struct
 class WordTable:
-    """Places of the words of a record: addresses in the first world, distances between worlds."""
+    """Addresses of the words of a record in the first world, and strides between worlds."""
 
     address: wp.array[wp.uint64]
     """(word): address in the first world [bytes]."""
     stride: wp.array[int]
-    """(word): distance from a world to the next one [bytes]."""
+    """(word): stride between consecutive worlds [bytes]."""
 
 
 @wp.func
 def word_of(table: WordTable, world: int, word: int):
-    """A word of a world in the array that holds it, as an array of one element."""
+    """View of one word of a world, as an array of one element."""
     offset = wp.uint64(world) * wp.uint64(table.stride[word])
     return wp.array(ptr=table.address[word] + offset, shape=(1,), dtype=wp.uint32)
 

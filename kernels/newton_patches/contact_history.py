@@ -1,8 +1,7 @@
-"""Contact history of a world: what Newton's collision pipeline and solver keep of its contacts from one step for the next.
+"""Contact history: the data of a world's contacts that Newton's collision pipeline and solver keep from one step for the next.
 
-Newton keeps the contacts of all worlds in one list, in the order of their shapes, so that a world's contacts are consecutive. To save a
-world's contacts, or to load saved ones into any world, they are copied between lists, and all numbers of shapes, bodies and contacts in
-them are changed from those of the one world to those of the other. In a saved list, worlds count from 0.
+Newton keeps the contacts of all worlds in one list sorted by shape, so that those of a world are consecutive. Saving and loading copies
+this segment to another list and renumbers the indices of shapes, bodies and contacts in it. In a saved list, worlds count from 0.
 """
 
 import warp as wp
@@ -26,19 +25,19 @@ class ContactHistory:
     midpoint: wp.array[wp.vec3]
     """(contact): point halfway between the two surfaces [m]."""
     normal: wp.array[wp.vec3]
-    """(contact): normal."""
+    """(contact): contact normal."""
     dense_slot: wp.array[int]
-    """(contact): its first row among those of joint space; -1: none."""
+    """(contact): index of the first joint-space constraint row; -1: none."""
     free_slot: wp.array[int]
-    """(contact): the same among rows of free bodies."""
+    """(contact): index of the first row among those of free bodies; -1: none."""
     propagation_slot: wp.array[int]
-    """(contact): the same among rows of contacts by color."""
+    """(contact): index of the first row among those of graph-colored contacts; -1: none."""
     solved_normal: wp.array[wp.vec3]
-    """(contact): normal in the solver."""
+    """(contact): contact normal at the last solve."""
     pair: wp.array[wp.int64]
     """(pair): two bodies, 1 + index each, or behind all bodies 1 + index of a static shape; ascending."""
     pair_contact: wp.array[int]
-    """(pair): the contact."""
+    """(pair): index of the contact."""
     patch_normal: wp.array[wp.vec3]
     """(contact): normal in the frame of the first body, if `valid`."""
     displacement: wp.array[wp.vec3]
@@ -46,27 +45,27 @@ class ContactHistory:
     friction: wp.array[wp.vec2]
     """(contact): coefficients of friction of the two shapes."""
     body_a: wp.array[int]
-    """(contact): first body; -1: static ..."""
+    """(contact): index of the first body; -1: static."""
     body_b: wp.array[int]
-    """(contact): ... and second one."""
+    """(contact): index of the second body; -1: static."""
     shape_a: wp.array[int]
-    """(contact): first shape ..."""
+    """(contact): index of the first shape."""
     shape_b: wp.array[int]
-    """(contact): ... and second one."""
+    """(contact): index of the second shape."""
     owner: wp.array[int]
-    """(contact): contact that stands for the patch; -1: none."""
+    """(contact): index of the contact that represents its friction patch; -1: none."""
     anchor_a: wp.array[wp.vec3]
-    """(contact): anchor on the first body [m] ..."""
+    """(contact): friction anchor in the first body's frame [m]."""
     anchor_b: wp.array[wp.vec3]
-    """(contact): ... and on the second one."""
+    """(contact): friction anchor in the second body's frame [m]."""
     surface_a: wp.array[wp.vec3]
-    """(contact): point of the first surface [m] ..."""
+    """(contact): contact point on the first surface, in the frame of its body [m]."""
     surface_b: wp.array[wp.vec3]
-    """(contact): ... and of the second one."""
+    """(contact): contact point on the second surface, in the frame of its body [m]."""
     valid: wp.array[int]
-    """(contact): 1: it is an anchor of its patch."""
+    """(contact): 1 if the contact is an anchor of its patch."""
     tangent_impulse: wp.array[wp.vec3]
-    """(contact): friction impulse [N·s]."""
+    """(contact): tangential impulse [N·s]."""
 
 
 @wp.struct

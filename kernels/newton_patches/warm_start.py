@@ -16,7 +16,7 @@ TWIST = wp.constant(6)
 #endif
 """)
 def ballot(value: bool) -> wp.uint32:
-    """Vote of a warp: bits of the lanes whose `value` is true; on a CPU a warp has one lane."""
+    """Warp vote (ballot): bit mask of the lanes whose `value` is true. On the CPU a warp has one lane."""
     ...
 
 
@@ -28,7 +28,7 @@ def ballot(value: bool) -> wp.uint32:
 #endif
 """)
 def first_lane(bits: wp.uint32) -> int:
-    """Lowest lane of a vote that is not empty."""
+    """Index of the lowest set bit of a ballot that is not 0."""
     ...
 
 

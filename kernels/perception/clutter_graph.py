@@ -17,7 +17,7 @@ WARP = 32
 CERTAIN = wp.constant(1.0e30)
 """Gain of placing a source or a sink of the graph, which removes no edge."""
 UNPLACED = wp.constant(-1)
-"""Value of `Cycles.rank` for members that the greedy order has not placed yet."""
+"""`Cycles.rank` of vertices that the greedy ordering has not placed yet."""
 NO_CYCLE = wp.constant(-1)
 """Value of `Cycles.leader` for instances that are not part of a cycle."""
 

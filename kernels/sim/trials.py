@@ -1,4 +1,4 @@
-"""Trials: one attempt to pick after another, each from a saved state and with a grasp of its own; a world that is done takes the next."""
+"""Grasp trials: pick attempts from saved states, each with a given grasp; worlds that finish a trial begin the next one."""
 
 import warp as wp
 
@@ -11,7 +11,7 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.struct
 class Grasps:
-    """Grasps to try: the row of the state that each begins with, intended instance (-1: none), point, normal, angles of the gripper."""
+    """Grasp candidates: row of the saved state, intended instance, grasp point and normal, and gripper angles."""
 
     row: wp.array[int]
     """(trial): row of the state."""
@@ -29,46 +29,46 @@ class Grasps:
 
 @wp.struct
 class Labels:
-    """Labels of trials: how each ended, with which seals, what it carried, and what became of the other objects."""
+    """Results of the trials: outcome, suction seals, picked instance, and collateral motion of other objects."""
 
     outcome: wp.array[int]
-    """(trial): `Outcome`; NONE: its episode ended before, for `ending`."""
+    """(trial): `Outcome`; NONE if the episode ended first, with `ending`."""
     ending: wp.array[int]
     """(trial): `Ending`."""
     hits: wp.array[wp.vec2i]
     """(trial): suction rays that hit an object, and the cups with a good seal: bit k, cup k."""
     picked: wp.array[int]
-    """(trial): first instance that was attached at the end; -1: none."""
+    """(trial): first instance attached at the end; -1: none."""
     peak_force: wp.array[float]
-    """(trial): largest force of a seal, one that broke included [N]."""
+    """(trial): largest seal force, including seals that broke [N]."""
     ticks: wp.array[int]
-    """(trial): its duration [ticks] ..."""
+    """(trial): duration [ticks]."""
     held: wp.array[int]
-    """(trial): ... and how long an object was attached [ticks]."""
+    """(trial): time with an attached object [ticks]."""
     moved: wp.array[int]
-    """(trial): other objects that moved farther than a distance ..."""
+    """(trial): number of other objects displaced by more than a threshold."""
     farthest: wp.array[float]
-    """(trial): ... how far the farthest moved [m] ..."""
+    """(trial): largest displacement of another object [m]."""
     lost: wp.array[int]
-    """(trial): ... and objects that left the bin, and were not picked."""
+    """(trial): number of objects that left the bin without being picked."""
 
 
 @wp.struct
 class Progress:
-    """Progress of each world's trial; -1: the world has none."""
+    """State of the trial that runs in each world."""
 
     trial: wp.array[int]
-    """(world): trial that runs; -1: none."""
+    """(world): index of the running trial; -1: none."""
     ticks: wp.array[int]
-    """(world): ticks since its begin."""
+    """(world): ticks since the trial began."""
     held: wp.array[int]
     """(world): ticks with an attached object."""
     peak_force: wp.array[float]
     """(world): largest force of a seal [N]."""
     lost: wp.array[int]
-    """(world): objects that had been lost before."""
+    """(world): number of objects lost before the trial."""
     pose: wp.array2d[wp.transform]
-    """(world, instance): object to world at its begin [m]."""
+    """(world, instance): pose of each object when the trial began [m]."""
 
 
 @wp.func
@@ -196,7 +196,7 @@ def judge_trials_kernel(
     labels_out: Labels,
     done_inout: wp.array[int],  # (one)
 ):
-    """Count ticks and forces of the running trials; label those whose attempt or episode has ended, which frees their worlds.
+    """Update duration and peak force of running trials; write the labels of finished ones, and free their worlds.
 
     An object other than the intended one has moved if its origin is farther than `moved_distance` from where it was [m]. `done` counts
     labelled trials. Launched over world, at the end of a tick.

@@ -1,6 +1,7 @@
-"""History of Newton's collision pipeline and solver: all that they keep from one step for the next, world by world.
+"""Persistent state of Newton's collision pipeline and solver: everything that one step keeps for the next, accessed per world.
 
-Newton can forget a world's history, but neither copy it to another world nor save it, and continues differently without it.
+Newton can reset this state for a world, but can neither save it nor copy it to another world, and without it a simulation continues
+differently.
 """
 
 from __future__ import annotations
@@ -34,19 +35,19 @@ PATCH_ARRAYS |= {
 PATCH_ARRAYS |= {name: name for name in ("valid", "tangent_impulse")}
 """Newton's names of the members of `ContactHistory`: in its contact matcher, its solver, and the previous frame of friction patches."""
 ROW_ARRAYS = ("impulses", "row_type", "row_parent")
-"""What the solver keeps of each family of constraint rows, for the warm start."""
+"""Warm-start data of each family of constraint rows."""
 ROW_FAMILIES = ("", "mf_", "propagation_")
-"""Families: of joint space, of free bodies, of contacts by color; the last two not in every solver."""
+"""Families of constraint rows: joint-space, free bodies, and graph-colored contacts; the last two exist only in some solvers."""
 STEP_COUNTERS = ("_ws_history_dt", "_ws_history_generation", "_ws_history_stream")
-"""Which step the history is of, the same for all worlds."""
+"""Counters that identify the step of the history, shared by all worlds."""
 
 CONTACT_BYTES = sum(wp.types.type_size_in_bytes(member.type.dtype) for member in kernels.ContactHistory.vars.values())
-"""Size of a contact in its history [bytes]."""
+"""Size of one contact in a contact history [bytes]."""
 
 
 @dataclass(frozen=True, eq=False)
 class SavedContacts:
-    """Contact history of saved worlds, `capacity` contacts apart in the arrays of `history`."""
+    """Contact history of saved worlds; the contacts of row r begin at index r `capacity` of the arrays of `history`."""
 
     history: Any
     """The struct `ContactHistory`; worlds count from 0."""
@@ -58,13 +59,13 @@ class SavedContacts:
 
 
 class History:
-    """History of all worlds: `rows`, arrays that hold the same of each world, one after the other; and a list of contacts.
+    """Persistent solver state of all worlds: world-major arrays of fixed size (`rows`), and the contact history, a list of variable length.
 
     Attributes:
         rows: Arrays by name.
         families: Those of `ROW_FAMILIES` that the solver has.
         live: The struct `ContactHistory` of Newton's own arrays.
-        counters: Numbers of the step, which are those of all worlds.
+        counters: Step counters, shared by all worlds.
     """
 
     def __init__(
@@ -184,15 +185,14 @@ class History:
 def _find_rows(
     model: newton.Model, state: newton.State, control: newton.Control, solver: Any, families: Sequence[str]
 ) -> Iterator[tuple[str, wp.array]]:
-    """Arrays that hold the same of each world, by name: motion, forces, what is set in the model, warm start, poses of friction patches.
+    """World-major arrays of fixed size, by name: joint and body motion, forces, model data set at run time, warm start, friction patches.
 
-    Body variants select most of what the model has of an object; what they leave of an unused shape still counts for the radius of its
-    body.
+    Masses and shapes of objects are not among them: they follow from the body variants (`Physics.select`).
     """
     names: Mapping[Any, tuple[str, ...]] = {
         state: ("joint_q", "joint_qd", "body_q", "body_qd"),
         control: ("joint_f", "joint_target_q"),
-        model: ("body_variant", "joint_X_c", "shape_transform", "shape_collision_radius"),
+        model: ("body_variant", "joint_X_c", "shape_transform"),
     }
     for owner, listed in names.items():
         yield from ((name, getattr(owner, name)) for name in listed)

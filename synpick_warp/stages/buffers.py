@@ -87,7 +87,7 @@ class ViewBuffers:
     mask_first: wp.array = device_array("view", "instance", dtype=wp.int32)
     """Index of the first word of each mask."""
     mask_box: wp.array = device_array("view", "instance", dtype=wp.vec4i, unit="px")
-    """Box of each mask within the image: x_min, y_min, x_max, y_max, inclusive; x_max < x_min: empty. It holds the mask, not tightly."""
+    """Box of each mask within the image: x_min, y_min, x_max, y_max, inclusive; x_max < x_min: empty. Conservative."""
     mask_length: wp.array = device_array("view", dtype=wp.int32)
     """Words in use."""
     pixels: wp.array = device_array("view", "instance", "count", dtype=wp.int32, unit="px")

@@ -1,4 +1,4 @@
-"""Batches of views whose amodal masks fit the batch's pool of words, by upper bounds from poses that the host knows before it renders.
+"""Memory pool of amodal masks: splits views into batches whose masks fit, by upper bounds computed on the host from the poses.
 
 A view's share of the pool is that of some dozens of masks as large as the image; 150 parts in a bin take a fifteenth of it. Views that
 might take more are rendered in batches of fewer views, each with room for masks as large as the image, so that no mask can lack words, and
@@ -21,9 +21,9 @@ from synpick_warp.stages.buffers import ViewBuffers
 from synpick_warp.views.masks import most_words
 
 SHARE = 32
-"""A view's share of the pool, in masks as large as the image: a bit for each of 32 instances a pixel."""
+"""Pool size per view, in full-image masks: 32 bits a pixel."""
 ROUNDING = 1.0
-"""Margin beside that of the device's boxes [px], which are computed in float32."""
+"""Additional margin of the bounds [px], since the device computes boxes in float32."""
 
 
 def share_words(views: int, instances: int, width: int, height: int) -> int:
@@ -33,7 +33,7 @@ def share_words(views: int, instances: int, width: int, height: int) -> int:
 
 
 def widen(images: ViewBuffers) -> ViewBuffers:
-    """The same buffers with a pool that is divided among fewer views, all of whose masks may be as large as the image."""
+    """The same buffers with the pool divided among fewer views, so that every mask may cover the whole image."""
     height, width = images.instance.shape[1:]
     share = images.mask_first.shape[1] * most_words(width, height)
     pool: Any = images.mask_words.flatten()
@@ -43,10 +43,10 @@ def widen(images: ViewBuffers) -> ViewBuffers:
 
 @dataclass(frozen=True, eq=False)
 class MaskBounds:
-    """Upper bounds of the words of views, by spheres about the objects' origins that hold their boxes; for cameras without lenses."""
+    """Upper bounds of the mask words of views, from bounding spheres about the objects' origins; for cameras without lens distortion."""
 
     radius: np.ndarray
-    """Radius of each object's sphere, and behind them a negative number for none (entry + 1) [m]."""
+    """Radius of each object's bounding sphere; the last entry is negative and stands for an empty slot (entry + 1) [m]."""
     cameras: Mapping[str, np.ndarray]
     """Matrices and poses of the cameras, by CAMERA_KEYS (slot, ...)."""
     size: tuple[int, int]

@@ -17,7 +17,7 @@ STEPS = 200
 
 
 def hanging(device, cups, offsets=((0.0, 0.0),), **overrides) -> Hanging:
-    """A world for each horizontal offset of a box's centre from the tool's axis [m], which holds the box at its top face."""
+    """One world per horizontal offset [m] between a box's centre and the axis of the tool, which holds the box by its top face."""
     array = {"gripper__kind": "suction_array", "gripper__cups": [list(map(float, place)) for place in cups]}
     result = Hanging(device, [[MASS]] * len(offsets), [[SIZE]] * len(offsets), **array, **overrides)
     result.start(np.array([[[*offset, -SIZE[2] / 2]] for offset in offsets]))

@@ -38,7 +38,7 @@ def pack_into(buffers: Any, masks: np.ndarray) -> None:
 
 
 def unpack_view(views: Any, view: int, height: int, width: int) -> np.ndarray:
-    """Masks (I, H, W) bool of a view of a `FrameBatch` or, on the host, of `ViewBuffers`."""
+    """Unpack the instance masks (I, H, W) bool of one view from a `FrameBatch`, or from `ViewBuffers` copied to the host."""
     words, first, box = (np.asarray(getattr(views, name)[view]) for name in ("mask_words", "mask_first", "mask_box"))
     masks = np.zeros((len(first), height, width), bool)
     for index, (left, top, right, bottom) in enumerate(box.tolist()):

@@ -115,7 +115,7 @@ class PlannerHarness:
         return self.grasp.target.numpy().tolist()
 
     def choose_flat_points(self, seed: int) -> None:
-        """Move the grasp points of instance 0 of each world to where they are flat."""
+        """Replace the grasp points of instance 0 of each world by points on flat surface."""
         self.grasp.target.zero_()
         self.planner.choose_flat_points(self.scene, self.worlds.state, self.attempts, self.observation, self.grasp, seed)
 

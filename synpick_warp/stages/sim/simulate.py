@@ -154,7 +154,7 @@ class Simulation:
 
     @property
     def states(self) -> WorldStates:
-        """What saves and loads the worlds' states, between two ticks and on their stream.
+        """Checkpoints of the worlds (`WorldStates`), to be used between two ticks and on the stream of the ticks.
 
         Raises:
             StateError: The worlds have not ticked yet, or are in a tick.

@@ -1,8 +1,9 @@
-"""Exact states of worlds: saved rows that continue, in any world of any simulation of the same objects, bit by bit as the world itself.
+"""Checkpoints of worlds: complete simulation states, from which any world of any simulation of the same objects continues bit by bit.
 
-A row holds what a tick reads of the last one: the arrays that `WorldState` and its like declare by world, those of Newton that
-`newton_patches.history` names, and the world's contacts. All else is constant or derived within a tick: `tools.checks.states` finds every
-array of a simulation and proves it. Random numbers have addresses, not generators: they follow from episode, arrangement and attempt.
+A checkpoint has a row for each saved world. It holds everything that a tick reads from the previous tick: the per-world arrays of
+`WorldState` and the other state groups, Newton's own arrays listed in `newton_patches.history`, and the world's contacts. All other arrays
+are constant or recomputed within a tick; `tools.checks.states` finds every array of a simulation and verifies this. Random numbers are
+counter-based: functions of episode, arrangement and attempt, without a state of their own.
 """
 
 from __future__ import annotations
@@ -37,9 +38,9 @@ class State:
     """Saved states of worlds, a row each, on the device. Independent of the world and the number of worlds they were saved from."""
 
     words: wp.array
-    """What arrays hold of the world, one after the other (row, word) uint32."""
+    """Content of the per-world arrays, concatenated (row, word) uint32."""
     contacts: SavedContacts
-    """Contacts of the last step."""
+    """Contact history of the last step."""
 
     def __len__(self) -> int:
         return self.words.shape[0]
@@ -47,7 +48,7 @@ class State:
 
 @dataclass(frozen=True)
 class Field:
-    """Part of a row: name, scalar type, shape in a world, and the first of its words."""
+    """Layout of one array within a row: name, scalar type, shape per world, and offset in words."""
 
     name: str
     dtype: np.dtype
@@ -61,11 +62,11 @@ class Field:
 
 
 class WorldStates:
-    """Saves and loads the states of a simulation's worlds. All of it runs on the device; only host copies wait for it.
+    """Saves, loads and branches the states of a simulation's worlds. Runs on the device; only copies to the host wait for it.
 
     Attributes:
-        fields: Parts of a row.
-        history: Newton's part of the simulation's state.
+        fields: Layout of a row.
+        history: State that Newton keeps between steps.
     """
 
     def __init__(self, groups: Mapping[str, object], physics: Physics, catalog: Catalog, variant: wp.array, restarted: wp.array) -> None:

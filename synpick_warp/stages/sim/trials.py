@@ -1,4 +1,4 @@
-"""Trials: many grasps, each tried from a saved state. Worlds that are done take the next one at once, so none waits for the slowest."""
+"""Grasp trials: executes many grasps in parallel, each from a saved state. Worlds that finish a trial begin the next one immediately."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ GRASPS = struct_arrays(kernels.Grasps, "trial", units={"point": "m", "yaw": "rad
 LABELS = struct_arrays(kernels.Labels, "trial", units={"peak_force": "N", "farthest": "m", "ticks": "ticks", "held": "ticks"})
 PROGRESS = struct_arrays(kernels.Progress, "world", pose=("world", "instance"), units={"peak_force": "N", "pose": "m"})
 MOVED = 5e-3
-"""Distance from which another object counts as moved [m]: as collateral in picking.md of the references, above what resting piles creep."""
+"""Displacement above which another object counts as moved [m]; resting piles creep by far less."""
 POLL = 8
-"""Ticks between two questions to the device whether all trials are done."""
+"""Polling interval for completion of all trials [ticks]."""
 
 
 class Trials:
