@@ -44,6 +44,7 @@ from tools.bench.growth import measure_growth
 from tools.bench.heaps import measure_heaps, measure_perception
 from tools.bench.patches import measure_patches
 from tools.bench.physics import BURST, measure_simulation, seconds_per_call
+from tools.bench.picks import measure_picks
 from tools.bench.pictures import measure_pictures
 from tools.bench.steady import measure_steady
 from tools.bench.stream import measure_stream
@@ -64,8 +65,8 @@ from tools.options import (
 )
 
 DEFAULT_PARTS = ("physics", "perception", "render", "encode", "write", "stream", "steady")
-PARTS = (*DEFAULT_PARTS, "pictures", "whole", "trajectories", "growth", "patches", "heaps")
-OWN_WORLDS = {"pictures", "steady", "whole", "trajectories", "growth", "patches", "heaps"}
+PARTS = (*DEFAULT_PARTS, "pictures", "whole", "trajectories", "growth", "patches", "heaps", "picks")
+OWN_WORLDS = {"pictures", "steady", "whole", "trajectories", "growth", "patches", "heaps", "picks"}
 """Parts that build worlds of their own."""
 WORLDS = 512
 """Default number of worlds of all parts but `whole`."""
@@ -219,6 +220,7 @@ def measure(
         "growth": measure_growth(config, min_seconds, instances),
         "patches": measure_patches(config),
         "heaps": measure_heaps(config, min_seconds),
+        "picks": measure_picks(config),
     }
     for part, rows in others.items():
         if part in parts:
