@@ -330,6 +330,20 @@ def find_stratum(pool: Pool, view: int, instance: int, place: int) -> wp.vec2i:
     return wp.vec2i(found, members)
 
 
+@wp.func
+def find_draw(pool: Pool, component: wp.array3d[int], view: int, instance: int, stratum: int, place: int) -> int:
+    """Draw of the first phase that is member `place` of a stratum of an instance, in their order."""
+    left = int(place)
+    for draw in range(POOL):
+        pixel = pool.pixel[view, draw]
+        if component[view, pixel[1], pixel[0]] == instance:
+            if stratum_of(pool.seal[view, draw], pool.wrench[view, draw]) == stratum:
+                if left == 0:
+                    return draw
+                left -= 1
+    return -1
+
+
 @wp.kernel
 def choose_candidates_kernel(
     # Scene:
@@ -377,14 +391,7 @@ def choose_candidates_kernel(
         visit = (candidate - 1) // instances
         chosen = find_stratum(pool, view, instance, visit + wide_index(key, STARTS + 1 + instance, STRATA * (STRATA - 1) * 12))
         size = stratum_size(pool, view, instance, chosen[0])
-        left = (visit // chosen[1]) % size
-        for index in range(POOL):
-            pixel = pool.pixel[view, index]
-            if component[view, pixel[1], pixel[0]] == instance:
-                if stratum_of(pool.seal[view, index], pool.wrench[view, index]) == chosen[0]:
-                    if left == 0:
-                        draw = index
-                    left -= 1
+        draw = find_draw(pool, component, view, instance, chosen[0], (visit // chosen[1]) % size)
         weight = float(pool.pixels[view]) / float(POOL) * float(instances * chosen[1] * size)
     grasp = (first + view) * candidates + candidate
     pixel = pool.pixel[view, draw]

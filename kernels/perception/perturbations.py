@@ -4,7 +4,7 @@ import warp as wp
 
 from synpick_warp.codes import Stream
 from synpick_warp.kernels.grasps import Grasps, PerturbationData, Perturbations
-from synpick_warp.kernels.perception.cup_alignment import head_frame
+from synpick_warp.kernels.perception.cup_alignment import HeadFrame, head_frame
 from synpick_warp.kernels.perception.grasp import gripper_angles, limit_normal
 from synpick_warp.kernels.rng import pixel_key, stream_key, uniform
 from synpick_warp.kernels.structs import CupData, PickData
@@ -22,6 +22,20 @@ def symmetric_vector(key: wp.uint64, first: int, half_width: float) -> wp.vec3:
     y = 2.0 * uniform(key, first + 1) - 1.0
     z = 2.0 * uniform(key, first + 2) - 1.0
     return half_width * wp.vec3(x, y, z)
+
+
+@wp.func
+def turn_head(frame: HeadFrame, rotation: wp.vec3, pick: PickData, cups: CupData) -> HeadFrame:
+    """Frame of a head turned by a rotation vector [rad]: of one cup it follows its axis, of several cups the yaw turns as well."""
+    normal = wp.quat_rotate(wp.quat_from_axis_angle(wp.normalize(rotation), wp.length(rotation)), frame.axis)
+    if cups.count > 1:
+        return head_frame(normal, frame.yaw + rotation[2])
+    result = HeadFrame()
+    result.axis = limit_normal(normal, pick.tilt_limit)
+    angles = gripper_angles(result.axis)
+    result.yaw = angles[0]
+    result.tilt = angles[1]
+    return result
 
 
 @wp.kernel
@@ -46,8 +60,7 @@ def plan_trials_kernel(
 ):
     """Make the grasps of trials the plans of worlds with a row. Repeats, all but the first trial of a grasp, are perturbed.
 
-    Samples are named by (seed, episode, arrangement, attempt, candidate, repeat). A turned head of one cup gets the angles of its axis, of
-    several cups its yaw turns as well. Launched over world.
+    Samples are named by (seed, episode, arrangement, attempt, candidate, repeat). Launched over world.
     """
     world = wp.tid()
     if row[world] < 0:
@@ -55,9 +68,10 @@ def plan_trials_kernel(
     grasp = trial[world] // spread.repeats
     repeat = trial[world] % spread.repeats
     point = grasps.point[grasp]
-    normal = grasps.normal[grasp]
-    yaw = grasps.yaw[grasp]
-    tilt = grasps.tilt[grasp]
+    frame = HeadFrame()
+    frame.axis = grasps.normal[grasp]
+    frame.yaw = grasps.yaw[grasp]
+    frame.tilt = grasps.tilt[grasp]
     offset = wp.vec3(0.0, 0.0, 0.0)
     rotation = wp.vec3(0.0, 0.0, 0.0)
     friction = float(1.0)
@@ -68,22 +82,12 @@ def plan_trials_kernel(
         rotation = symmetric_vector(key, SAMPLES * repeat + 3, spread.angle)
         friction = 1.0 + spread.friction * (2.0 * uniform(key, SAMPLES * repeat + 6) - 1.0)
         point = point + offset
-        normal = wp.quat_rotate(wp.quat_from_axis_angle(wp.normalize(rotation), wp.length(rotation)), normal)
-        if cups.count == 1:
-            normal = limit_normal(normal, pick.tilt_limit)
-            angles = gripper_angles(normal)
-            yaw = angles[0]
-            tilt = angles[1]
-        else:
-            frame = head_frame(normal, yaw + rotation[2])
-            normal = frame.axis
-            yaw = frame.yaw
-            tilt = frame.tilt
+        frame = turn_head(frame, rotation, pick, cups)
     perturbations_out.offset[trial[world]] = offset
     perturbations_out.rotation[trial[world]] = rotation
     perturbations_out.friction[trial[world]] = friction
     target_out[world] = grasps.target[grasp]
     point_out[world] = point
-    normal_out[world] = normal
-    yaw_out[world] = yaw
-    tilt_out[world] = tilt
+    normal_out[world] = frame.axis
+    yaw_out[world] = frame.yaw
+    tilt_out[world] = frame.tilt
