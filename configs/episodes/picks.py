@@ -6,6 +6,9 @@ from dataclasses import dataclass
 
 from synpick_warp.configs.fields import INT32_MAX, setting
 
+PICKS = "picks"
+"""Format that has the trials."""
+
 
 @dataclass(frozen=True)
 class Picks:
@@ -44,4 +47,4 @@ class Picks:
     lift_height: float = setting(0.15, "m", "Height of the lift, at pick.lift_speed.", above=0.0, high=10.0)
     hold: float = setting(0.3, "s", "Time for which the gripper holds still after the lift before the trial is judged.", low=0.0, high=60.0)
     settle: float = setting(0.0, "s", "Time for which the other objects settle before their displacement is measured.", low=0.0, high=60.0)
-    worlds: int = setting(0, "", "Worlds in which trials run; 0: as many as bake.worlds.", low=0, high=INT32_MAX)
+    worlds: int = setting(0, "", "Worlds in which trials run, beside those of the episodes; 0: chosen by device.", low=0, high=INT32_MAX)

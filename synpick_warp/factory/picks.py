@@ -36,7 +36,7 @@ class PickEngine:
 
     def __init__(self, config: Config, catalog: Catalog, lights: int, device: wp.Device, render_scene: RenderScene) -> None:
         """Build the worlds; arguments as of `Simulation`."""
-        self.config = config = trial_config(config)
+        self.config = config = trial_config(config, device)
         self.device, self.object_ids = device, catalog.object_ids
         self.simulation = Simulation(config, catalog, lights, device, render_scene, episodes=[])
         self.simulation.tick()
@@ -106,12 +106,16 @@ class PickQueue:
     """Saved states of a bake's episodes that wait for their trials, and ends of episodes that wait for their states."""
 
     def __init__(self, simulation: Simulation, engine: PickEngine, labelled: int) -> None:
-        """Save states of the simulation from its next tick on; `labelled`: objects of the catalog that have labels."""
+        """Save states of the simulation from its next tick on; `labelled`: objects of the catalog that have labels.
+
+        `lead`: ticks by which physics may be ahead; the ring of states has room for no more.
+        """
         self.engine = engine
         worlds = simulation.layout.worlds
         self.batch = count_batch(engine.simulation.layout.worlds, engine.trials_of_state)
         self.recorder = ChoiceRecorder(simulation, engine.config.picks.states, count_rows(self.batch, worlds))
         self.reader = ChoiceReader(self.recorder, labelled)
+        self.lead = MAX_LEAD if simulation.device.is_cuda else 0
         self.pending: list[Choice] = []
         self._ends: list[tuple[int, Callable[[], None]]] = []
 
@@ -119,14 +123,14 @@ class PickQueue:
         """Note the states that a tick has saved."""
         self.pending += self.reader.read(report)
 
-    def drop(self, episode: int) -> None:
-        """Forget the states of an episode that is not delivered; its trials would be in vain."""
-        self.pending = [choice for choice in self.pending if choice.episode != episode]
+    def drop(self, episode: int, arrangement: int) -> None:
+        """Forget the states of an arrangement that is not delivered."""
+        self.pending = [choice for choice in self.pending if (choice.episode, choice.arrangement) != (episode, arrangement)]
 
     def end(self, episode: int, then: Callable[[], None]) -> None:
-        """Call `then` once no state of an episode waits: at once, or in `run`."""
+        """Call `then` once no state of an episode waits: at once, or in `release`."""
         self._ends.append((episode, then))
-        self._release()
+        self.release()
 
     @property
     def is_due(self) -> bool:
@@ -140,9 +144,6 @@ class PickQueue:
 
     def release(self) -> None:
         """End the episodes of which no state waits."""
-        self._release()
-
-    def _release(self) -> None:
         waiting = {choice.episode for choice in self.pending}
         ready = [then for episode, then in self._ends if episode not in waiting]
         self._ends = [(episode, then) for episode, then in self._ends if episode in waiting]

@@ -101,7 +101,7 @@ def test_repeats_are_perturbed_alike_in_any_world(choice, device):
     for count in (3, 2):
         ordinary = worlds(device, count)
         config = replace(ordinary.config, picks=replace(settings, worlds=ordinary.layout.worlds))
-        simulation = ticked(picking(trial_config(config), ordinary.catalog, device, episodes=[]))
+        simulation = ticked(picking(trial_config(config, device), ordinary.catalog, device, episodes=[]))
         trials = Trials(simulation, settings)
         found[count] = trials.run(choice.state, trials.upload(grasps, 1))
     mu = simulation.physics.model.shape_material_mu.numpy().reshape(simulation.layout.worlds, -1)

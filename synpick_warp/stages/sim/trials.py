@@ -12,6 +12,7 @@ import numpy as np
 import warp as wp
 
 from synpick_warp.codes import Task
+from synpick_warp.configs.dataset.splits import DataLayout
 from synpick_warp.configs.episodes.manipulation import Pick
 from synpick_warp.configs.episodes.picks import Picks
 from synpick_warp.configs.schema import Config
@@ -26,7 +27,7 @@ from synpick_warp.stages.launch import launch
 from synpick_warp.stages.perception.arrays import Plan
 from synpick_warp.stages.sim import gripper
 from synpick_warp.stages.sim.behavior import Hold
-from synpick_warp.stages.sim.physics import Physics
+from synpick_warp.stages.sim.physics import MAX_CPU_WORLDS, MAX_GPU_WORLDS, Physics, with_enough_worlds
 from synpick_warp.stages.sim.simulate import Simulation
 from synpick_warp.stages.sim.states import State
 from synpick_warp.stages.sim.worlds import AttemptState, SealState, WorldState
@@ -158,14 +159,16 @@ class Trials:
         launch(kernels.judge_trials_kernel, worlds, *sources, simulation.seals, physics.state, **given)
 
 
-def trial_config(config: Config) -> Config:
+def trial_config(config: Config, device: wp.Device) -> Config:
     """Settings of a simulation in which trials run, from those of the episodes: number of worlds, height of the lift.
 
     An episode that a trial ends is not repeated.
     """
     picks = config.picks
-    values = {"bake.worlds": picks.worlds or config.bake.worlds, "pick.lift_height": picks.lift_height, "settle.tries": 1}
-    return config.with_values(values)
+    most = DataLayout.of(config).planned * picks.states * picks.candidates * picks.repeats
+    worlds = picks.worlds or min(most, MAX_GPU_WORLDS if device.is_cuda else MAX_CPU_WORLDS)
+    values = {"bake.worlds": worlds, "pick.lift_height": picks.lift_height, "settle.tries": 1}
+    return with_enough_worlds(config.with_values(values), device)
 
 
 def make_course(settings: Picks, physics: PhysicsConfig, pick: Pick) -> Any:
