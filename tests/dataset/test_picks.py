@@ -18,7 +18,7 @@ from synpick_warp.exporters.bop.exporter import BopExporter
 from synpick_warp.exporters.picks import FOLDER, PicksExporter, make_table
 from synpick_warp.views.picks import COLUMNS, are_sorted, make_rows, sort_rows
 from tests.harness.exporter_contract import export
-from tests.worlds.box_sets import EPISODES, write_set
+from tests.worlds.box_sets import write_pick_set, write_set
 from tests.worlds.box_views import config
 from tests.worlds.pick_tables import EACH, REPEATS, pick_batch
 
@@ -26,9 +26,7 @@ from tests.worlds.pick_tables import EACH, REPEATS, pick_batch
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory) -> Path:
     """Boxes as BOP scenes, with picks."""
-    folder = write_set(tmp_path_factory.mktemp("picks") / "set", BopExporter)
-    export(PicksExporter, folder, config(), EPISODES, processes=0)
-    return folder
+    return write_pick_set(tmp_path_factory.mktemp("picks") / "set")
 
 
 def test_tables_of_an_episode_are_those_of_its_batches(whole):
