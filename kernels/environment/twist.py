@@ -29,50 +29,66 @@ def start_setpoint(bins: BinData, world: int, tcp_offset: float) -> wp.vec3:
 
 
 @wp.kernel
-def begin_twists_kernel(
+def start_twists_kernel(
     # Scene:
     layout: LayoutData,
     move: MoveData,
-    pick: PickData,
     bins: BinData,
+    # State:
+    phase: wp.array[int],  # (world)
+    mode: wp.array[int],  # (world)
+    task: wp.array[int],  # (world)
+    # Out:
+    attempt_inout: wp.array[int],  # (world)
+    yaw_out: wp.array[float],  # (world) [rad]
+    tilt_out: wp.array[float],  # (world) [rad]
+    setpoint_out: wp.array[wp.vec3],  # (world) [m]
+    hits_out: wp.array[wp.vec2i],  # (world)
+    engaged_words_out: wp.array2d[wp.uint32],  # (world, word)
+    joint_q_out: wp.array[float],  # (coord) [m, rad]
+    joint_qd_out: wp.array[float],  # (dof) [m/s, rad/s]
+):
+    """Begin an attempt where the gripper is at home (task LOOK): it appears above the middle of the bin. Launched over world."""
+    world = wp.tid()
+    if phase[world] != Phase.ACT or mode[world] == Mode.MOVE or task[world] > Task.LOOK:
+        return
+    setpoint = start_setpoint(bins, world, move.tcp_offset)
+    setpoint_out[world] = setpoint
+    place_gripper(layout, world, setpoint, 0.0, joint_q_out, joint_qd_out)
+    attempt_inout[world] = attempt_inout[world] + 1
+    yaw_out[world] = 0.0
+    tilt_out[world] = 0.0
+    hits_out[world] = wp.vec2i(0, 0)
+    for word in range(engaged_words_out.shape[1]):
+        engaged_words_out[world, word] = NO_MEMBERS
+
+
+@wp.kernel
+def begin_twists_kernel(
+    # Scene:
+    layout: LayoutData,
+    pick: PickData,
     tick_time: float,
     # State:
     phase: wp.array[int],  # (world)
     mode: wp.array[int],  # (world)
     command: wp.array2d[float],  # (world, column)
-    # Out:
-    task_inout: wp.array[int],  # (world)
-    attempt_inout: wp.array[int],  # (world)
     yaw_inout: wp.array[float],  # (world) [rad]
     tilt_inout: wp.array[float],  # (world) [rad]
     attached_inout: wp.array2d[int],  # (world, instance)
-    setpoint_out: wp.array[wp.vec3],  # (world) [m]
+    # Out:
+    task_out: wp.array[int],  # (world)
     steps_out: wp.array[int],  # (world)
-    hits_out: wp.array[wp.vec2i],  # (world)
-    engaged_words_out: wp.array2d[wp.uint32],  # (world, word)
-    joint_q_out: wp.array[float],  # (coord) [m, rad]
-    joint_qd_out: wp.array[float],  # (dof) [m/s, rad/s]
     tilt_target_out: wp.array[float],  # (coord) [rad]
 ):
     """Apply commands for a tick: turn yaw and tilt, release without suction, and choose the task that drives and engages.
 
-    An attempt begins, above the middle of the bin, where the gripper is at home (task LOOK). Task LIFT: an object hangs on the cup; PRESS:
-    suction is on, and rays are cast at the end of the tick; else DESCEND. In mode MOVE nothing but the setpoint moves. Launched over world.
+    Task LIFT: an object hangs on the cup; PRESS: suction is on, and rays are cast at the end of the tick; else DESCEND. In mode MOVE
+    nothing but the setpoint moves. Launched over world.
     """
     world = wp.tid()
     if phase[world] != Phase.ACT or mode[world] == Mode.MOVE:
         return
-    q = world * layout.coords
-    if task_inout[world] <= Task.LOOK:
-        setpoint = start_setpoint(bins, world, move.tcp_offset)
-        setpoint_out[world] = setpoint
-        place_gripper(layout, world, setpoint, 0.0, joint_q_out, joint_qd_out)
-        attempt_inout[world] = attempt_inout[world] + 1
-        hits_out[world] = wp.vec2i(0, 0)
-        yaw_inout[world] = 0.0
-        tilt_inout[world] = 0.0
-        for word in range(engaged_words_out.shape[1]):
-            engaged_words_out[world, word] = NO_MEMBERS
     yaw = yaw_inout[world] + command[world, YAW_RATE] * tick_time
     if yaw > 0.5 * TAU:
         yaw -= TAU
@@ -81,19 +97,16 @@ def begin_twists_kernel(
     yaw_inout[world] = yaw
     tilt = wp.clamp(tilt_inout[world] + command[world, TILT_RATE] * tick_time, -pick.tilt_limit, pick.tilt_limit)
     tilt_inout[world] = tilt
-    tilt_target_out[q + TILT] = tilt
-    held = int(0)
+    tilt_target_out[world * layout.coords + TILT] = tilt
+    task = int(Task.DESCEND)
+    if command[world, SUCTION] > 0.0:
+        task = int(Task.PRESS)
     for instance in range(layout.instances):
-        if command[world, SUCTION] <= 0.0:
+        if task == Task.DESCEND:
             attached_inout[world, instance] = 0
         elif attached_inout[world, instance] != 0:
-            held = 1
-    task = int(Task.DESCEND)
-    if held != 0:
-        task = int(Task.LIFT)
-    elif command[world, SUCTION] > 0.0:
-        task = int(Task.PRESS)
-    task_inout[world] = task
+            task = int(Task.LIFT)
+    task_out[world] = task
     steps_out[world] = pick.press_steps
 
 

@@ -190,7 +190,7 @@ class PickingEnvironment:
         if action == PIXEL:
             if wrong := np.flatnonzero((given != np.floor(given)).any(axis=1)).tolist():
                 raise ActionError(f"the action of environment {wrong[0]} is no pixel: {given[wrong[0]].tolist()}; allowed: column and row")
-            self._check_within(given, np.zeros(2), np.array(self.choice.resolution) - 1, active, "image")
+            self._check_within(given, np.zeros(2, int), np.array(self.choice.resolution) - 1, active, "image")
         if action == POINT:
             self._check_within(given[:, :3], *self.bounds, active, "space about the bin")
         return given

@@ -138,7 +138,7 @@ def action_bounds(config: Config) -> tuple[np.ndarray, np.ndarray]:
     across = np.max(sides, axis=0)
     ground = min(one.origin[2] for one in bins)
     height = max(one.origin[2] + one.height for one in bins)
-    return np.array([*-across, ground]), np.array([*across, height + HEADROOM])
+    return np.array([*-across, ground], np.float32), np.array([*across, height + HEADROOM], np.float32)
 
 
 def _rest(limits: Mapping[str, int]) -> tuple[int, int]:

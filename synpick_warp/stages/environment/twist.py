@@ -43,9 +43,11 @@ class TwistLaw:
         """Apply the commands that hold for a tick, and begin attempts. Runs before the tick."""
         simulation = self.simulation
         state, attempts, plan, physics = simulation.state, simulation.attempts, simulation.plan, simulation.physics
+        sources = (simulation.scene, state, attempts, plan)
+        launch(kernels.start_twists_kernel, len(state.phase), *sources, physics.state)
         given: dict[str, Any] = {"command": self.command, "tick_time": simulation.config.physics.tick_time}
         given |= {"tilt_target": physics.control.joint_target_q, "attached": simulation.seals.attached}
-        launch(kernels.begin_twists_kernel, len(state.phase), simulation.scene, state, attempts, plan, physics.state, **given)
+        launch(kernels.begin_twists_kernel, len(state.phase), *sources, **given)
         physics.set_yaw(plan.yaw)
 
     def advance(self, scene: SceneData, state: WorldState, attempts: AttemptState, plan: Plan) -> None:
