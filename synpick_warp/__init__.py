@@ -215,11 +215,14 @@ def make_env(
         ModuleNotFoundError: Gymnasium is not installed, or for backend "torch" PyTorch.
     """
     with collection_paused():
-        from synpick_warp.environment.make import make_vector
+        from synpick_warp.environment.make import make_picking, require_libraries
+        from synpick_warp.environment.settings import make_choice
 
-    arguments = {"task": task, "num_envs": num_envs, "obs": obs, "resolution": resolution, "action": action, "autoreset": autoreset}
-    arguments |= {"backend": backend, "seed": seed, "max_steps": max_steps, "piles": piles}
-    return make_vector(config, settings or {}, device, arguments, progress)
+    choice = make_choice(task, num_envs, obs, resolution, action, autoreset, backend, seed, max_steps, piles)
+    require_libraries(backend)
+    from synpick_warp.environment.vector import PickingVectorEnv
+
+    return PickingVectorEnv(make_picking(choice, config, settings or {}, device, progress))
 
 
 def load_config(preset_or_file: Path | str | None = None, settings: Mapping[str, object] | None = None, *, splits: bool = False) -> Config:

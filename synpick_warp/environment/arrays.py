@@ -38,10 +38,8 @@ class Exporter:
         """The first `count` rows of an array on the device; vectors become a last dimension."""
         if self.backend == NUMPY:
             return array[:count].numpy().copy()
-        kept = wp.clone(array[:count])
-        if kept.dtype in VECTORS:
-            kept = _flatten_vectors(kept)
-        return self._export(kept)
+        rows: Any = array[:count]
+        return self._export(wp.clone(_flatten_vectors(rows) if array.dtype in VECTORS else rows))
 
     def from_host(self, values: np.ndarray) -> Any:
         """An array of the host."""
@@ -59,11 +57,9 @@ class Exporter:
 
 
 def _flatten_vectors(array: wp.array) -> wp.array:
-    """View of an array of vectors as scalars, with their components as the last dimension."""
+    """View of a contiguous array of vectors as scalars, with their components as the last dimension; valid as long as the array."""
     scalar, length = array.dtype._wp_scalar_type_, array.dtype._length_
-    made = wp.array(ptr=array.ptr, dtype=scalar, shape=(*array.shape, length), device=array.device, copy=False)
-    made._kept = array  # The memory belongs to it.
-    return made
+    return wp.array(ptr=array.ptr, dtype=scalar, shape=(*array.shape, length), device=array.device, copy=False)
 
 
 def _scalar(dtype: np.dtype) -> Any:

@@ -39,8 +39,8 @@ class Episodes:
     @classmethod
     def of(cls, count: int) -> Episodes:
         """Episodes of `count` environments, none of which has begun."""
-        numbers = [np.zeros(count, np.int64) for _ in range(3)]
-        return cls(np.zeros(count, np.uint64), *numbers, np.zeros(count, bool), np.ones(count, bool))
+        episodes, index, steps = (np.zeros(count, np.int64) for _ in range(3))
+        return cls(np.zeros(count, np.uint64), episodes, index, steps, np.zeros(count, bool), np.ones(count, bool))
 
     @property
     def over(self) -> np.ndarray:

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from types import MappingProxyType
 
 import numpy as np
 
@@ -22,13 +22,13 @@ from synpick_warp.environment.settings import (
     TWIST,
     Choice,
     action_bounds,
-    make_choice,
-    make_config,
+    fixed_settings,
 )
 from synpick_warp.errors import ConfigError
 from synpick_warp.factory.assembly import build_smallest, build_stages, compiling_if_cold
 from synpick_warp.factory.memory_plan import check_memory, explain_shortage, plan_memory
 from synpick_warp.factory.sizes import fit_to_device
+from synpick_warp.online.settings import resolve_settings
 from synpick_warp.stages.environment.sight import Sight
 from synpick_warp.stages.environment.twist import TwistLaw
 from synpick_warp.stages.environment.worlds import EnvironmentWorlds
@@ -41,31 +41,36 @@ CACHE = 4096
 """Most piles that are kept of those that `piles` names; others are settled again when they are wanted."""
 
 
-def make_vector(
-    config: Config | Path | str | None,
-    settings: Mapping[str, object],
-    device: str | None,
-    arguments: Mapping[str, Any],
-    progress: Progress | None,
-) -> Any:
-    """Make a `PickingVectorEnv`; arguments and errors as of `synpick_warp.make_env`, `arguments` being those of `make_choice`."""
-    choice = make_choice(**arguments)
-    for module, package in (("gymnasium", "gymnasium"), *([("torch", "torch")] if choice.backend == TORCH else [])):
+def require_libraries(backend: str) -> None:
+    """Raise ModuleNotFoundError unless Gymnasium and the library of the arrays are installed."""
+    wanted = {"gymnasium": "make_env needs Gymnasium"} | ({"torch": f'backend="{TORCH}" needs PyTorch'} if backend == TORCH else {})
+    for module, reason in wanted.items():
         if importlib.util.find_spec(module) is None:
-            wanted = f'backend="{choice.backend}" needs PyTorch' if module == "torch" else "make_env needs Gymnasium"
-            raise ModuleNotFoundError(f"{wanted}, which is not installed: pip install {package}", name=module)
-    from synpick_warp.environment.vector import PickingVectorEnv
-
-    resolved = make_config(choice, config, settings, device)
-    return PickingVectorEnv(make_picking(choice, resolved, progress or SilentProgress()))
+            raise ModuleNotFoundError(f"{reason}, which is not installed: pip install {module}", name=module)
 
 
-def make_picking(choice: Choice, config: Config, progress: Progress) -> PickingEnvironment:
-    """Build worlds and observations on the device of the settings.
+def make_picking(
+    choice: Choice,
+    source: Config | Path | str | None = None,
+    settings: Mapping[str, object] = MappingProxyType({}),
+    device_name: str | None = None,
+    progress: Progress | None = None,
+) -> PickingEnvironment:
+    """Build worlds and observations on a device.
+
+    Args:
+        choice: What `make_env` was asked for.
+        source, settings: Settings, as for `bake`.
+        device_name: Overrides `bake.device`.
+        progress: Observer.
 
     Raises:
-        SynpickError: The machine has too little memory, or device, models, lights, bin or cameras cannot be used.
+        SynpickError: A setting is not allowed, the machine has too little memory, or device, models, lights, bin or cameras cannot be used.
     """
+    progress = progress or SilentProgress()
+    config = resolve_settings(source, {**settings, **fixed_settings(choice)}, {"device": device_name})
+    if config.splits:
+        raise ConfigError("the settings have splits, which an environment has not; remove them")
     device = pick_device(config.bake.device)
     config = fit_to_device(config, device, 1, NO_WRITERS)
     check_memory(plan_memory(config, device, NO_WRITERS), device)
@@ -78,7 +83,7 @@ def make_picking(choice: Choice, config: Config, progress: Progress) -> PickingE
         group = next(one for one in stages.groups if camera in one.cameras)
         if group.placed:
             raise ConfigError(f"{config.rig.label(camera)} is not the same in all episodes; environments observe a fixed camera")
-        bounds = action_bounds(config)
+        bounds = action_bounds(config.cell.bins, config.bins)
         law = None
         if choice.action == TWIST:
             tcp = np.array([0.0, 0.0, config.gripper.cup_length])

@@ -127,7 +127,8 @@ class PickingEnvironment:
             info |= {"final_obs": obs, "_final_obs": mask, "final_observation": obs, "_final_observation": mask}
             info |= {"final_info": final, "_final_info": mask}
             obs = self.observe()
-        return Step(obs, *(self.exporter.from_host(values) for values in (reward, terminated, truncated)), info)
+        reward, terminated, truncated = (self.exporter.from_host(values) for values in (reward, terminated, truncated))
+        return Step(obs, reward, terminated, truncated, info)
 
     def observe(self) -> dict[str, Any]:
         """Observation of the environments as they are."""

@@ -1,6 +1,6 @@
-"""Gymnasium's registry: ids of the environments; `gymnasium.make_vec("SynPick/Pick-v0", num_envs=8)`.
+"""Ids of the environments in Gymnasium's registry, which importing this module fills.
 
-Gymnasium finds `register` by the entry point of this distribution.
+env = gymnasium.make_vec("synpick_warp.environment.registration:SynPick/Pick-v0", num_envs=8)
 """
 
 from __future__ import annotations
@@ -16,13 +16,10 @@ IDS = {task: f"SynPick/{task.capitalize()}-v0" for task in TASKS}
 """Id of each task."""
 
 
-def register() -> None:
-    """Register all tasks, once."""
-    for task, name in IDS.items():
-        if name not in gymnasium.registry:
-            gymnasium.register(name, vector_entry_point=f"{__name__}:make", kwargs={"task": task})
-
-
 def make(num_envs: int = 1, max_episode_steps: int | None = None, **arguments: Any) -> Any:
     """Make an environment as `make_env` does, from the arguments of `gymnasium.make_vec`."""
     return synpick_warp.make_env(num_envs=num_envs, max_steps=max_episode_steps, **arguments)
+
+
+for _task, _name in IDS.items():
+    gymnasium.register(_name, vector_entry_point=f"{__name__}:make", kwargs={"task": _task})

@@ -4,15 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 
+from synpick_warp.configs.cell.extents import BinSizes
 from synpick_warp.configs.check import to_index
 from synpick_warp.configs.fields import INT32_MAX
-from synpick_warp.configs.schema import Config
+from synpick_warp.configs.schema import Bins
 from synpick_warp.errors import ConfigError, format_value, suggest
-from synpick_warp.online.settings import resolve_settings
 
 PICK, TARGET, MOVE = TASKS = ("pick", "target", "move")
 PIXEL, POINT, TWIST = ACTIONS = ("pixel", "point", "twist")
@@ -103,14 +102,12 @@ def make_choice(
     )
 
 
-def make_config(choice: Choice, config: Config | Path | str | None, settings: Mapping[str, object], device: str | None) -> Config:
-    """Settings of the worlds: those given, and what `make_env` decides.
-
-    Raises:
-        ConfigError: A setting is unknown or not allowed.
-    """
+def fixed_settings(choice: Choice) -> dict[str, object]:
+    """Settings that the arguments of `make_env` decide, by full key."""
     fixed: dict[str, object] = {
-        "bake.episodes": 1,
+        "bake.worlds": choice.num_envs,
+        "bake.mode": choice.task,
+        "cameras.resolution": list(choice.resolution),
         "pick.failures": INT32_MAX,
         "settle.tries": RESAMPLES,
         "render.mode": "unoccluded",
@@ -121,23 +118,19 @@ def make_config(choice: Choice, config: Config | Path | str | None, settings: Ma
         fixed["perception.views"] = 1
     if "rgb" not in choice.obs:
         fixed["render.views_per_batch"] = 1
-    given = {"worlds": choice.num_envs, "device": device, "mode": choice.task, "resolution": choice.resolution}
-    resolved = resolve_settings(config, {**settings, **fixed}, given)
-    if resolved.splits:
-        raise ConfigError("the settings have splits, which an environment has not; remove them")
-    return resolved
+    return fixed
 
 
-def action_bounds(config: Config) -> tuple[np.ndarray, np.ndarray]:
-    """Lowest and highest point that an action may name (3) each [m], in the world: a box about all bins, wherever they are placed."""
-    sides, bins = [], config.cell.bins
-    for one in bins:
+def action_bounds(sizes: Sequence[BinSizes], bins: Bins) -> tuple[np.ndarray, np.ndarray]:
+    """Lowest and highest point that an action may name (3) each float32 [m], in the world: a box about all bins wherever they stand."""
+    sides = []
+    for one in sizes:
         half = np.array(one.opening) / 2
-        reach = np.full(2, np.hypot(*half)) if config.bins.yaw > 0 else half
-        sides.append(np.abs(one.origin[:2]) + reach + np.abs(config.bins.shift))
+        reach = np.full(2, np.hypot(*half)) if bins.yaw > 0 else half
+        sides.append(np.abs(one.origin[:2]) + reach + np.abs(bins.shift))
     across = np.max(sides, axis=0)
-    ground = min(one.origin[2] for one in bins)
-    height = max(one.origin[2] + one.height for one in bins)
+    ground = min(one.origin[2] for one in sizes)
+    height = max(one.origin[2] + one.height for one in sizes)
     return np.array([*-across, ground], np.float32), np.array([*across, height + HEADROOM], np.float32)
 
 

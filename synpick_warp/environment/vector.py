@@ -46,7 +46,7 @@ class PickingVectorEnv(VectorEnv):
 
     def step(self, actions: Any) -> tuple[dict[str, Any], Any, Any, Any, dict[str, Any]]:
         """Carry out an action in each environment; see `PickingEnvironment.step`."""
-        return tuple(self.environment.step(actions))
+        return self.environment.step(actions)
 
     def observe(self) -> dict[str, Any]:
         """Observation of the environments as they are."""

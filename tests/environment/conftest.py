@@ -10,8 +10,7 @@ import pytest
 
 from synpick_warp.environment.make import make_picking
 from synpick_warp.environment.picking import PickingEnvironment
-from synpick_warp.environment.settings import make_choice, make_config
-from synpick_warp.system.progress import SilentProgress
+from synpick_warp.environment.settings import make_choice
 from tests.worlds.small_worlds import COARSE, QUICK
 
 SIZE = (64, 48)
@@ -42,7 +41,7 @@ ARGUMENTS: dict[str, Any] = {
 def build(device: Any, **changed: Any) -> PickingEnvironment:
     """An environment of ARGUMENTS with changes, which need not be Gymnasium's."""
     choice = make_choice(**(ARGUMENTS | changed))
-    return make_picking(choice, make_config(choice, "smoke", SETTINGS, str(device)), SilentProgress())
+    return make_picking(choice, "smoke", SETTINGS, str(device))
 
 
 def centers(instances: np.ndarray) -> np.ndarray:

@@ -8,9 +8,11 @@ import numpy as np
 import pytest
 
 import synpick_warp
-from synpick_warp.environment.settings import action_bounds, make_choice, make_config
+from synpick_warp.configs.files.load import load_config
+from synpick_warp.environment.make import make_picking
+from synpick_warp.environment.settings import action_bounds, make_choice
 from synpick_warp.errors import ActionError, ConfigError
-from tests.environment.conftest import ARGUMENTS, SETTINGS, SIZE, build, same
+from tests.environment.conftest import ARGUMENTS, SIZE, build, same
 
 needs_gymnasium = pytest.mark.skipif(importlib.util.find_spec("gymnasium") is None, reason="Gymnasium is not installed")
 
@@ -51,7 +53,8 @@ def test_points_beside_the_bin_are_refused(target, point):
 
 
 def test_bounds_hold_all_bins(target):
-    low, high = action_bounds(target.worlds.simulation.config)
+    config = target.worlds.simulation.config
+    low, high = action_bounds(config.cell.bins, config.bins)
     positions = target.reset(seed=3)[0]["state"][:, 6:].reshape(-1, 10)
     positions = positions[positions[:, 0] > 0, 3:6]
     assert ((positions > low) & (positions < high)).all()
@@ -86,13 +89,15 @@ def test_bad_arguments_are_refused(changed, message):
         make_choice(**(ARGUMENTS | changed))
 
 
-def test_settings_are_those_given_but_for_what_an_environment_decides():
-    config = make_config(make_choice(**ARGUMENTS), "smoke", SETTINGS | {"pick.failures": 1}, "cpu")
+def test_settings_are_those_given_but_for_what_an_environment_decides(target):
+    config = target.worlds.simulation.config
     assert config.pick.failures > 1000
-    assert config.bake.mode == "pick"
+    assert config.bake.mode == "target"
     assert config.arrangement.max_objects == 3
-    with pytest.raises(ConfigError, match=r"pick.near_sped"):
-        make_config(make_choice(**ARGUMENTS), "smoke", {"pick.near_sped": 1}, "cpu")
+    with pytest.raises(ConfigError, match=r"pick\.near_sped"):
+        make_picking(make_choice(**ARGUMENTS), "smoke", {"pick.near_sped": 1})
+    with pytest.raises(ConfigError, match="the settings have splits"):
+        make_picking(make_choice(**ARGUMENTS), load_config("synpick", splits=True))
 
 
 def test_without_gymnasium_there_is_one_line(monkeypatch):
@@ -108,7 +113,7 @@ def test_without_gymnasium_there_is_one_line(monkeypatch):
 def test_the_environment_is_gymnasiums(target):
     import gymnasium
 
-    from synpick_warp.environment.registration import IDS, register
+    from synpick_warp.environment.registration import IDS
     from synpick_warp.environment.vector import PickingVectorEnv
 
     env = PickingVectorEnv(target)
@@ -119,8 +124,6 @@ def test_the_environment_is_gymnasiums(target):
     assert env.action_space.sample() in env.action_space
     assert env.single_action_space.shape == (6,)
     assert same(env.set_state(env.get_state()), obs)
-    register()
-    register()
     assert {gymnasium.spec(name).kwargs["task"] for name in IDS.values()} == {"pick", "target", "move"}
 
 

@@ -62,7 +62,7 @@ def run_client(name: str, python: str, device: str) -> Result:
 
 def interpreters(given: list[str]) -> dict[str, str]:
     """Interpreter of each client; raises ValueError if an option is not NAME=PATH with the name of a client, or "all"."""
-    chosen = dict.fromkeys(NAMES, sys.executable)
+    chosen: dict[str, str] = dict.fromkeys(NAMES, sys.executable)
     for text in given:
         name, _, path = text.partition("=")
         if name not in (*NAMES, ALL) or not path:

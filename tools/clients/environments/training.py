@@ -37,10 +37,8 @@ def check_gymnasium(device: str) -> str:
     import gymnasium
     from gymnasium.utils.env_checker import data_equivalence
 
-    from synpick_warp.environment.registration import register
-
-    register()
-    env = gymnasium.make_vec("SynPick/Pick-v0", **SMALL, device=device, backend="numpy", obs=("depth", "state"), max_episode_steps=3)
+    name = "synpick_warp.environment.registration:SynPick/Pick-v0"
+    env = gymnasium.make_vec(name, **SMALL, device=device, backend="numpy", obs=("depth", "state"), max_episode_steps=3)
     assert isinstance(env, gymnasium.vector.VectorEnv)
     assert isinstance(env.metadata["autoreset_mode"], gymnasium.vector.AutoresetMode)
     runs = []
