@@ -11,7 +11,7 @@ import os
 import re
 import stat
 import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -56,7 +56,7 @@ def _has(path: str, kind: Callable[[int], bool]) -> bool:
 # ---- where a bake writes ----
 
 
-def choose_output(manifest: Mapping[str, Any], bake: Bake, splits: Sequence[Split]) -> tuple[Path, str]:
+def choose_output(manifest: dict[str, Any], bake: Bake, splits: Sequence[Split]) -> tuple[Path, str]:
     """Choose the folder of a bake without --out: that of the same bake, else the first of DEFAULT_NAME and its neighbours that is free.
 
     The same bake has the same settings, number of episodes, and folders of objects and lights; it resumes.

@@ -69,8 +69,6 @@ def make_picking(
     """
     progress = progress or SilentProgress()
     config = resolve_settings(source, {**settings, **fixed_settings(choice)}, {"device": device_name})
-    if config.splits:
-        raise ConfigError("the settings have splits, which an environment has not; remove them")
     device = pick_device(config.bake.device)
     config = fit_to_device(config, device, 1, NO_WRITERS)
     check_memory(plan_memory(config, device, NO_WRITERS), device)

@@ -96,7 +96,7 @@ def test_settings_are_those_given_but_for_what_an_environment_decides(target):
     assert config.arrangement.max_objects == 3
     with pytest.raises(ConfigError, match=r"pick\.near_sped"):
         make_picking(make_choice(**ARGUMENTS), "smoke", {"pick.near_sped": 1})
-    with pytest.raises(ConfigError, match="the settings have splits"):
+    with pytest.raises(ConfigError, match="the configuration has its splits already"):
         make_picking(make_choice(**ARGUMENTS), load_config("synpick", splits=True))
 
 
