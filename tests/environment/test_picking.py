@@ -44,6 +44,7 @@ def test_an_episode_index_names_a_pile(environment):
     assert again["episode_index"].tolist() == info["episode_index"].tolist()
 
 
+@pytest.mark.slow
 def test_the_number_of_environments_changes_nothing(environment, device):
     wide, narrow = build(device, num_envs=3), environment
     actions = np.append(centers(narrow.observe()["instances"]), [[1, 1]], axis=0)
