@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import warp as wp
 
-from synpick_warp.codes import Outcome, Phase, Task
+from synpick_warp.codes import Outcome, Phase, Removal, Task
 from synpick_warp.errors import SynpickError
 from synpick_warp.kernels.sim import sleep as kernels
 from synpick_warp.stages.sim import sleep
@@ -17,10 +17,14 @@ from tools.checks.states import Rows, check_arrays, check_branches
 
 SLEEP = {"physics__sleep": 2e-4}
 CREEP = 5e-4
-"""Largest distance that a pile, awake, moves in the ticks of a test [m]."""
+"""Largest distance that objects, awake, move in the ticks of a test [m]."""
 ATTEMPT = 40
 NEVER = -(10**6)
 """Ticks of quiet from which none falls asleep in a test."""
+BOX, CUBE, ANGLE = range(3)
+"""Objects of the catalog."""
+STACK = {BOX: (-0.08, 0.04, 0.02), CUBE: (-0.08, 0.04, 0.065)}
+"""Positions of a cube on a box [m]."""
 
 
 def set_rows(simulation: Simulation, worlds: list[int], **changed: object) -> None:
@@ -51,30 +55,55 @@ def positions(simulation: Simulation) -> np.ndarray:
     return np.take_along_axis(bodies[..., :3], 2 + np.maximum(slot, 0)[..., None], axis=1)
 
 
+def instance_of(simulation: Simulation, entry: int) -> int:
+    """The only instance of an object in world 0."""
+    (found,) = np.flatnonzero(simulation.state.catalog_index.numpy()[0] == entry)
+    return int(found)
+
+
+def moved_to(simulation: Simulation, places: dict[int, tuple[float, float, float]]) -> np.ndarray:
+    """Joint coordinates of world 0 with objects upright at other places [m]."""
+    coords, layout = row(simulation, 0)["physics.joint_q"].copy(), simulation.scene.layout
+    for entry, place in places.items():
+        first = layout.gripper_dofs + 7 * simulation.state.body_slot.numpy()[0, instance_of(simulation, entry)]
+        coords[first : first + 7] = [*place, 0.0, 0.0, 0.0, 1.0]
+    return coords
+
+
 @pytest.fixture(scope="module")
-def pile(device):
-    """World 0 begins its first attempt while its whole pile sleeps; the state of the moment."""
-    simulation = brief(device, 3, bake__mode="pick", **SLEEP)
-    for _ in range(200):
-        simulation.tick()
-        if simulation.attempts.task.numpy()[0] == Task.APPROACH and asleep(simulation)[0].sum() == 3:
-            return simulation, simulation.get_state([0])
-    raise AssertionError("the pile never slept")
+def stack(device):
+    """World 0: a cube sleeps on a box, beside an L, and the gripper waits; the state of the moment."""
+    simulation = brief(device, 3, bake__mode="pick", pick__failures=1000, **SLEEP)
+    while simulation.state.phase.numpy()[0] != Phase.ACT:
+        simulation.tick(perceives=False)
+    set_rows(simulation, [0], physics__joint_q=moved_to(simulation, STACK), physics__joint_qd=0.0, sleep__asleep=0, sleep__quiet=0)
+    simulation.physics.refresh_poses()
+    for _ in range(12):
+        simulation.tick(perceives=False)
+    assert asleep(simulation)[0].sum() == 3
+    return simulation, simulation.get_state([0])
 
 
 @pytest.fixture
-def twins(pile):
+def twins(stack):
     """Worlds 0 and 1 continue from the moment, asleep and awake; world 1 never falls asleep."""
-    simulation, state = pile
+    simulation, state = stack
     simulation.set_state(state, [0, 1])
     set_rows(simulation, [1], sleep__asleep=0, sleep__quiet=NEVER)
     assert asleep(simulation)[:2].sum(axis=1).tolist() == [3, 0]
     return simulation
 
 
+def apart(simulation: Simulation) -> float:
+    """Largest distance of an object from where it is in the other twin [m]."""
+    there, left = positions(simulation), simulation.state.catalog_index.numpy()[:2] >= 0
+    assert (left[0] == left[1]).all()
+    return float(np.linalg.norm(there[0] - there[1], axis=1)[left[0]].max())
+
+
 def test_what_sleeps_does_not_move_and_has_no_contacts(twins):
     before = positions(twins)
-    twins.tick()
+    twins.tick(perceives=False)
     after = positions(twins)
     assert (after[0] == before[0]).all()
     assert 0 < np.abs(after[1] - before[1]).max() < CREEP
@@ -84,72 +113,65 @@ def test_what_sleeps_does_not_move_and_has_no_contacts(twins):
     assert (shapes >= twins.layout.shapes_per_world).all()
 
 
+def test_a_stack_is_an_island(twins):
+    names = row(twins, 0)["sleep.island"][twins.state.body_slot.numpy()[0]]
+    box, cube, angle = (names[instance_of(twins, entry)] for entry in (BOX, CUBE, ANGLE))
+    assert box == cube != angle
+
+
 def test_a_pick_from_a_sleeping_pile_ends_as_from_an_awake_one(twins):
-    """The gripper wakes what it touches, the seal holds, and the others come to rest where they do in the awake twin."""
-    woke, seen, peak = False, {}, np.zeros(2)
+    """Objects that the gripper presses wake, the seal holds, and all others rest where they do in the awake twin."""
+    angle = instance_of(twins, ANGLE)
+    pressed, seen, peak = [], dict[int, tuple[int, Outcome]](), np.zeros(2)
     for tick in range(ATTEMPT):
         twins.tick()
         now = report(twins.record)
-        peak = np.maximum(peak, [now.measure("peak_force")[world] for world in (0, 1)])
-        woke |= not asleep(twins)[0].all()
+        peak = np.maximum(peak, now.measure("peak_force")[:2])
+        if twins.attempts.task.numpy()[0] == Task.PRESS:
+            pressed.append(asleep(twins)[0])
         for world in (0, 1):
-            if now.column("outcome")[world]:
+            if tick and now.column("outcome")[world]:  # Before the first look, attempts without a plan fail.
                 seen.setdefault(world, (tick, Outcome(now.column("outcome")[world])))
         if len(seen) == 2:
             break
-    assert woke
+    assert pressed[-1].tolist() == [instance == angle for instance in range(3)]
     assert seen[0] == seen[1]
     assert seen[0][1] is Outcome.TARGET_PICKED
     assert peak[0] == pytest.approx(peak[1], rel=0.1)
-    left = twins.state.catalog_index.numpy()[:2] >= 0
-    assert (left[0] == left[1]).all()
-    there = positions(twins)
-    assert np.linalg.norm(there[0] - there[1], axis=1)[left[0]].max() < 2 * CREEP
-
-
-def falling_row(simulation: Simulation, world: int, instance: int, height: float) -> np.ndarray:
-    """Joint coordinates of a world with an object lifted by `height` [m]."""
-    coords = row(simulation, world)["physics.joint_q"].copy()
-    scene = simulation.scene.layout
-    coords[scene.gripper_dofs + 7 * simulation.state.body_slot.numpy()[world, instance] + 2] += height
-    return coords
+    assert apart(twins) < CREEP
 
 
 def test_an_object_that_falls_on_a_sleeping_pile_wakes_it(twins):
-    """The topmost one is lifted in both twins, and falls back."""
-    top = int(positions(twins)[0, :, 2].argmax())
-    slot = twins.state.body_slot.numpy()[0, top]
-    lifted = falling_row(twins, 0, top, 0.06)
-    flags = row(twins, 0)["sleep.asleep"].copy()
-    flags[slot] = 0
-    set_rows(twins, [0], physics__joint_q=lifted, sleep__asleep=flags)
-    set_rows(twins, [1], physics__joint_q=falling_row(twins, 1, top, 0.06))
+    """The L falls on the cube: both twins come to rest alike, and the sleeper sleeps again."""
+    coords = moved_to(twins, {ANGLE: (-0.07, 0.04, 0.17)})
+    flags = twins.sleep.state.asleep.numpy()[0]
+    flags[twins.state.body_slot.numpy()[0, instance_of(twins, ANGLE)]] = 0
+    set_rows(twins, [0], physics__joint_q=coords, sleep__asleep=flags)
+    set_rows(twins, [1], physics__joint_q=coords)
     twins.physics.refresh_poses()
-    others = [instance for instance in range(3) if instance != top]
-    slept, woken = [], []
-    for _ in range(10):
-        twins.tick()
-        slept.append(asleep(twins)[0, others].sum())
-        woken.append(asleep(twins)[0, top])
-    assert slept[0] == 2  # It is still in the air.
-    assert min(slept) < 2
-    there = positions(twins)
-    assert np.linalg.norm(there[0] - there[1], axis=1).max() < 0.01
+    slept = []
+    for _ in range(25):
+        twins.tick(perceives=False)
+        slept.append(asleep(twins)[0].tolist())
+    assert sum(slept[0]) == 2  # It is in the air.
+    assert [False] * 3 in slept
+    assert slept[-1] == [True] * 3
+    assert apart(twins) < 0.01
 
 
-def test_what_loses_an_object_of_its_island_wakes(pile):
-    simulation, state = pile
-    simulation.set_state(state, [0])
-    arrays = row(simulation, 0)
-    live = np.flatnonzero(arrays["worlds.catalog_index"] >= 0)
-    slots = arrays["worlds.body_slot"]
-    island = arrays["sleep.island"].copy()
-    island[slots[live]] = slots[live[0]]
-    removed = arrays["attempts.removed"].copy()
-    removed[live[0]] = 1
-    set_rows(simulation, [0], sleep__island=island, attempts__removed=removed)
-    simulation.tick()
-    assert not asleep(simulation)[0].any()
+def test_what_loses_its_support_wakes(twins):
+    """The box below the cube leaves the scene: the cube falls as in the awake twin, and what lies apart sleeps on."""
+    box, cube, angle = (instance_of(twins, entry) for entry in (BOX, CUBE, ANGLE))
+    removed = row(twins, 0)["attempts.removed"].copy()
+    index = row(twins, 0)["worlds.catalog_index"].copy()
+    removed[box], index[box] = Removal.LOST, -1
+    set_rows(twins, [0, 1], attempts__removed=removed, worlds__catalog_index=index)
+    twins.tick(perceives=False)
+    assert asleep(twins)[0].tolist() == [entry == angle for entry in range(3)]
+    for _ in range(15):
+        twins.tick(perceives=False)
+    assert positions(twins)[0, cube, 2] == pytest.approx(0.025, abs=1e-3)
+    assert apart(twins) < CREEP
 
 
 # ---- states ----
