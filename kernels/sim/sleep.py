@@ -186,6 +186,14 @@ def join_islands_kernel(
         other = find_root(parent_inout, low)
 
 
+@wp.func
+def stop(layout: LayoutData, world: int, slot: int, joint_qd_out: wp.array[float], body_qd_out: wp.array[wp.spatial_vector]):
+    """Set the velocities of a body to zero."""
+    for axis in range(6):
+        joint_qd_out[world * layout.dofs + layout.gripper_dofs + 6 * slot + axis] = 0.0
+    body_qd_out[world * layout.bodies + layout.gripper_bodies + slot] = wp.spatial_vector(0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+
+
 @wp.kernel
 def judge_sleep_kernel(
     # Scene:
@@ -227,9 +235,8 @@ def judge_sleep_kernel(
         is_gone = removed[world, instance] != 0
         if is_gone or catalog_index[world, instance] >= 0:
             is_held = is_gone or attached[world, instance] != 0
-            quiet = quiet_inout[world, slot] + 1
-            if is_held or not displacement[world, instance] <= threshold:
-                quiet = 0
+            is_quiet = not is_held and displacement[world, instance] <= threshold
+            quiet = wp.where(is_quiet, quiet_inout[world, slot] + 1, 0)
             quiet_inout[world, slot] = quiet
             if asleep_inout[world, slot] == 0 and quiet < QUIET_TICKS:
                 restless_inout[find_root(parent, first + slot)] = 1
@@ -237,17 +244,14 @@ def judge_sleep_kernel(
                 woken_inout[world, island_inout[world, slot]] = 1
     for instance in range(layout.instances):
         slot = body_slot[world, instance]
-        root = find_root(parent, first + slot)
         if removed[world, instance] != 0 or catalog_index[world, instance] >= 0:
             if asleep_inout[world, slot] != 0:
                 if woken_inout[world, island_inout[world, slot]] != 0:
                     asleep_inout[world, slot] = 0
                     quiet_inout[world, slot] = 0
-            elif restless_inout[root] == 0:
+            elif restless_inout[find_root(parent, first + slot)] == 0:
                 asleep_inout[world, slot] = 1
-                island_inout[world, slot] = root - first
-                for axis in range(6):
-                    joint_qd_out[world * layout.dofs + layout.gripper_dofs + 6 * slot + axis] = 0.0
-                body_qd_out[first + slot] = wp.spatial_vector(0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+                island_inout[world, slot] = find_root(parent, first + slot) - first
+                stop(layout, world, slot, joint_qd_out, body_qd_out)
     for slot in range(layout.slots):
         woken_inout[world, slot] = 0
