@@ -128,6 +128,17 @@ class Outcome(_Described):
         return self in (Outcome.TARGET_PICKED, Outcome.OTHER_PICKED)
 
 
+class Share(enum.IntEnum):
+    """Share of the grasp candidates of a state to which one belongs: how it was sampled."""
+
+    OWN = 0
+    """The grasp that the episode itself executes from the state."""
+    STRATIFIED = 1
+    """Stratified over visible instances and analytic scores, so that failures are present."""
+    UNIFORM = 2
+    """Uniform over the visible pixels of all instances."""
+
+
 class Status(enum.IntEnum):
     """Column of a world's status row: integers that the host reads after each tick.
 

@@ -20,6 +20,7 @@ from synpick_warp.system.codecs.depth_png import max_data_bytes
 from synpick_warp.system.processes.shared_memory import shared_bytes
 from synpick_warp.views.frames import EpisodeEnd, FrameBatch, TickBatch
 from synpick_warp.views.masks import WORD_BYTES, most_words
+from synpick_warp.views.picks import PickBatch
 
 PIXEL_BYTES = (3, 2, 1)
 """Bytes of a pixel of `FrameBatch`'s color, depth and instance."""
@@ -278,6 +279,10 @@ class Exporter(Protocol):
 
         An episode's frames come in order, all before its end. They may come before or after the views of the same frame.
         """
+        ...
+
+    def write_picks(self, batch: PickBatch) -> None:
+        """Enqueue the grasp trials of states of an episode, before its end; states may come in any order, each once."""
         ...
 
     def end_episode(self, end: EpisodeEnd, on_committed: Callable[[], None]) -> None:

@@ -16,6 +16,7 @@ from synpick_warp.exporters.base import ExportContext, Exporter, SharedFiles, St
 from synpick_warp.exporters.formats import FORMAT_TABLE
 from synpick_warp.exporters.writing.pool import WriterPool
 from synpick_warp.views.frames import EpisodeEnd, FrameBatch, TickBatch
+from synpick_warp.views.picks import PickBatch
 
 
 def load_exporter_classes(names: Iterable[str]) -> tuple[type[Exporter], ...]:
@@ -97,6 +98,11 @@ class Exporters:
         """Pass a batch of ticks to all formats. See `Exporter`."""
         for exporter in self._all:
             exporter.write_ticks(batch)
+
+    def write_picks(self, batch: PickBatch) -> None:
+        """Pass grasp trials to all formats. See `Exporter`."""
+        for exporter in self._all:
+            exporter.write_picks(batch)
 
     def end_episode(self, end: EpisodeEnd, on_committed: Callable[[], None]) -> None:
         """End an episode in all formats; `on_committed` is called when the last one has committed it. See `Exporter`."""

@@ -19,6 +19,7 @@ from synpick_warp.exporters.base import ExportContext, StoredScene
 from synpick_warp.exporters.writing.files import PARTIAL, output_errors
 from synpick_warp.exporters.writing.pool import WriterPool, WriteTask
 from synpick_warp.views.frames import EpisodeEnd, FrameBatch, TickBatch
+from synpick_warp.views.picks import PickBatch
 
 _Content = TypeVar("_Content")
 
@@ -89,6 +90,9 @@ class EpisodeExporter(ABC, Generic[_Content]):
 
     def write_ticks(self, batch: TickBatch) -> None:
         """Ignore ticks: nothing of the simulation unless a format overrides this. See `Exporter`."""
+
+    def write_picks(self, batch: PickBatch) -> None:
+        """Ignore grasp trials unless a format overrides this. See `Exporter`."""
 
     def end_episode(self, end: EpisodeEnd, on_committed: Callable[[], None]) -> None:
         """Commit or discard an episode once all its tasks are done; at once if nothing was staged of it. See `Exporter`."""

@@ -1,0 +1,132 @@
+"""Schema of simulated picks: columns of the tables of grasp trials and of states, and the batches in which a bake hands them to exporters.
+
+A state is a checkpoint of an episode at a moment of choice; a grasp candidate is a point on a surface that camera 0 sees in it; a trial
+executes a candidate from the state, possibly perturbed. One trial is one row.
+"""
+
+from __future__ import annotations
+
+import enum
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from synpick_warp.codes import Ending, Outcome, Share
+
+ORDER = ("state", "candidate", "repeat")
+"""Columns that identify a trial within its episode, and by which its table is sorted."""
+
+
+class Column(NamedTuple):
+    """Schema of a column: name, type, unit (1: none), meaning, components (1: a scalar), and enumeration of its codes."""
+
+    name: str
+    dtype: str
+    unit: str
+    """1: dimensionless."""
+    meaning: str
+    size: int = 1
+    """Components of a value: 3 is a vector."""
+    codes: type[enum.IntEnum] | None = None
+    """Enumeration whose values it holds."""
+
+    @property
+    def field(self) -> tuple[str, str, tuple[int, ...]]:
+        """Field of a structured type."""
+        return self.name, self.dtype, (self.size,) * (self.size > 1)
+
+
+COLUMNS = (
+    Column("state", "<i4", "1", "Index of the state within the episode."),
+    Column("frame", "<i4", "1", "Frame of the episode at which the state was saved, and from which the candidate was drawn."),
+    Column("candidate", "<i4", "1", "Index of the candidate within the state."),
+    Column("repeat", "<i4", "1", "Repeat of the candidate; 0: not perturbed."),
+    Column("share", "|u1", "1", "How the candidate was sampled.", codes=Share),
+    Column("weight", "<f4", "1", "Inverse of the probability with which its pixel was sampled, for unbiased estimates over pixels."),
+    Column("column", "<i4", "px", "Pixel in the perception image of camera 0, from the left; its size is in the table of states."),
+    Column("row", "<i4", "px", "Pixel in the perception image, from the top."),
+    Column("instance", "<i4", "1", "Instance that the pixel shows, which the pick intends; -1: none."),
+    Column("obj_id", "<i4", "1", "Its object id; -1: none."),
+    Column("point", "<f4", "m", "Grasp point in the world: surface point at the pixel's centre.", 3),
+    Column("normal", "<f4", "1", "Unit surface normal there in the world, out of the object.", 3),
+    Column("yaw", "<f4", "rad", "Rotation of the gripper shaft about the vertical."),
+    Column("tilt", "<f4", "rad", "Rotation of the cup about the wrist axis."),
+    Column("approach", "<f4", "1", "Unit direction in which the cup is pressed on, in the world.", 3),
+    Column("seal", "<f4", "1", "Analytic seal score of SuctionNet at the pixel, 0 to 1."),
+    Column("wrench", "<f4", "1", "Analytic wrench score of SuctionNet at the pixel, 0 to 1."),
+    Column("offset", "<f4", "m", "Perturbation of the grasp point.", 3),
+    Column("rotation", "<f4", "rad", "Perturbation of the cup's orientation, as a rotation vector in the world.", 3),
+    Column("friction", "<f4", "1", "Factor on all coefficients of friction."),
+    Column("outcome", "|u1", "1", "Outcome of the attempt; none: the simulation ended first.", codes=Outcome),
+    Column("ending", "|u1", "1", "Why the simulation ended during the trial; running: it did not.", codes=Ending),
+    Column("success", "|b1", "1", "Whether any object hung on the cup after lift and hold."),
+    Column("intended", "|b1", "1", "Whether the intended instance hung on the cup after lift and hold."),
+    Column("hits", "<i4", "1", "Suction rays that hit an object when the suction was switched on."),
+    Column("sealed", "<i4", "1", "Cups with a good seal: bit k, cup k."),
+    Column("picked", "<i4", "1", "First instance on the cup at the end; -1: none."),
+    Column("peak_force", "<f4", "N", "Largest force of any seal, seals that broke included."),
+    Column("margin", "<f4", "1", "Least margin of a seal: 1 - force / break force; 0 or less: it broke. NaN: there was no seal."),
+    Column("time_to_break", "<f4", "s", "Time from suction on until the last seal broke. NaN: it did not, or there was none."),
+    Column("held", "<f4", "s", "Time with an object on the cup."),
+    Column("moved", "<i4", "1", "Collateral: other objects displaced by more than 5 mm."),
+    Column("farthest", "<f4", "m", "Largest displacement of another object."),
+    Column("lost", "<i4", "1", "Objects that left the bin without being picked."),
+    Column("duration", "<f4", "s", "Simulated duration of the trial."),
+)
+"""Columns of the table of trials, in the order of files."""
+STATES = (
+    Column("state", "<i4", "1", "Index of the state within the episode."),
+    Column("frame", "<i4", "1", "Frame of the episode at which it was saved."),
+    Column("camera", "<i4", "1", "Index of the camera from whose image the candidates were drawn."),
+    Column("width", "<i4", "px", "Width of its perception image."),
+    Column("height", "<i4", "px", "Height of its perception image."),
+    Column("candidates", "<i4", "1", "Number of candidates."),
+    Column("visible", "|b1", "1", "Whether each instance is visible in the perception image."),
+)
+"""Columns of the table of states. `visible` has a component for each instance of the episode."""
+
+
+@dataclass(frozen=True, eq=False)
+class PickBatch:
+    """Trials of one or more states of an episode, complete, in any order. Exporters copy what they keep.
+
+    Raises:
+        ValueError: Columns are missing, unknown, or of other shapes.
+    """
+
+    episode: int
+    """Episode index."""
+    trials: Mapping[str, np.ndarray]
+    """Columns of COLUMNS by name, each (trial[, 3])."""
+    states: Mapping[str, np.ndarray]
+    """Columns of STATES by name, each (state); `visible` (state, instance)."""
+
+    def __post_init__(self) -> None:
+        make_rows(COLUMNS, self.trials)
+        make_rows(STATES, self.states)
+
+    def __len__(self) -> int:
+        """Number of trials."""
+        return len(self.trials["state"])
+
+
+def row_type(columns: Sequence[Column], instances: int = 1) -> np.dtype:
+    """Structured type of a row; `visible` has `instances` components."""
+    return np.dtype([(column.name, column.dtype, (instances,)) if column.name == "visible" else column.field for column in columns])
+
+
+def make_rows(columns: Sequence[Column], arrays: Mapping[str, np.ndarray]) -> np.ndarray:
+    """Rows of a table (row) of `row_type` from its columns; raises ValueError as `PickBatch`."""
+    if wrong := {column.name for column in columns} ^ set(arrays):
+        raise ValueError(f"{sorted(wrong)[0]} is missing, or no column of picks")
+    visible = np.asarray(arrays.get("visible", np.zeros((0, 1))))
+    kind = row_type(columns, visible.shape[1])
+    rows = np.empty(len(arrays[columns[0].name]), kind)
+    for column in columns:
+        values = np.asarray(arrays[column.name])
+        if values.shape != rows[column.name].shape:
+            raise ValueError(f"{column.name} of {len(rows)} rows has the shape {values.shape}, not {rows[column.name].shape}")
+        rows[column.name] = values
+    return rows
