@@ -200,8 +200,8 @@ class View:
 
     @cached_property
     def support(self) -> np.ndarray:
-        """Weighted support graph (N, N + 1) float64 [N]: upward force on the instance of the row by that of the column, mean over a frame; in
-        the last column that of bin, table and objects without label. 0: it does not carry the instance."""
+        """Weighted support graph (N, N + 1) float64 [N]: upward force on the row's instance by the column's, mean over a frame;
+        in the last column that of bin, table and objects without label. 0: it does not carry the instance."""
         edges = self._graph("support")
         support = np.zeros((len(self), len(self) + 1))
         for one, other, force in edges:

@@ -68,8 +68,8 @@ def find_occlusions(masks: Sequence[Masks]) -> list[tuple[int, int, int]]:
 
 def count_common(one: Runs, other: Runs) -> int:
     """Number of pixels that two masks have in common."""
-    boxes = one.box(), other.box()
-    if boxes[0] is None or boxes[1] is None or any(boxes[i][side] > boxes[1 - i][side + 2] for i in (0, 1) for side in (0, 1)):
+    box, own = one.box(), other.box()
+    if box is None or own is None or any(box[side] > own[side + 2] or own[side] > box[side + 2] for side in (0, 1)):
         return 0
     span = max(one.bottom, other.bottom)
     (start, end), (first, past) = ((span * runs.column + runs.first, span * runs.column + runs.past) for runs in (one, other))

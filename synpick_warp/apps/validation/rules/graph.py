@@ -55,13 +55,14 @@ def check_support(scene: SceneSubject) -> Findings:
         for one, other, _ in _supports(record.entries[image]):
             if not 0 <= other < len(truths) or one >= len(truths):
                 continue
-            pair = truths[one], truths[other]
-            last = tuple(before.get(truth.instance_id) for truth in pair)
-            shapes = [hulls.of(truth.obj_id) for truth in pair]
-            if None in last or shapes[0] is None or shapes[1] is None:
+            upper, lower = truths[one], truths[other]
+            last = before.get(upper.instance_id), before.get(lower.instance_id)
+            shapes = hulls.of(upper.obj_id), hulls.of(lower.obj_id)
+            if last[0] is None or last[1] is None or shapes[0] is None or shapes[1] is None:
                 continue
-            pose = relative_pose(*pair)
-            if np.abs(pose - relative_pose(*last)).max() <= STILL and (gap := find_gap(shapes[0], shapes[1], pose)) > SUPPORT_GAP:
+            pose = relative_pose(upper, lower)
+            still = np.abs(pose - relative_pose(last[0], last[1])).max() <= STILL
+            if still and (gap := find_gap(shapes[0], shapes[1], pose)) > SUPPORT_GAP:
                 yield record.where(image), f"image {image}: instance {other} carries {one}, but is {gap:.3g} mm from it"
 
 
