@@ -48,7 +48,7 @@ COLUMN, LAYERED = "column", "layers"
 """Stacks from which objects begin to fall."""
 FILLS = (EXCEED, WITHIN)
 """Rules that end the draw of an episode's objects at the volume budget."""
-FORMATS = ("bop", "shards", "usd", "zarr", "lerobot", "coco", "yolo")
+FORMATS = ("bop", "shards", "usd", "zarr", "picks", "lerobot", "coco", "yolo")
 """Output formats."""
 
 
@@ -92,7 +92,8 @@ class Bake:
     formats: tuple[str, ...] = setting(
         ("bop",),
         "",
-        "Output formats: bop (scene folders), shards (webdataset), usd (a stage per episode), zarr (trajectories), lerobot, coco, yolo.",
+        "Output formats: bop (scene folders), shards (webdataset), usd (a stage per episode), zarr (trajectories), picks (grasp trials), "
+        "lerobot, coco, yolo.",
         choices=FORMATS,
     )
     writers: int = setting(0, "", "Processes that write files, for all devices; 0: one per CPU core, if memory suffices.", low=0, high=1024)

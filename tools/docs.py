@@ -1,6 +1,7 @@
 """Generate the tables of READMEs that follow from code and results; the prose around them is as committed.
 
-configs/README.md: the settings; synpick_warp/apps/validation/README.md: the rules; tools/README.md: the figures in tools/results.
+configs/README.md: the settings; synpick_warp/apps/validation/README.md: the rules; synpick_warp/exporters/README.md: the columns of picks;
+tools/README.md: the figures in tools/results.
 
     python -m tools.docs          # writes them
 """
@@ -13,7 +14,10 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from synpick_warp.apps.validation.registry import load_rules
+from synpick_warp.codes import names
 from synpick_warp.configs.calibration.sensor_presets import SENSORS
 from synpick_warp.configs.check import describe_allowed, is_table
 from synpick_warp.configs.files.load import sections, table_lists
@@ -21,14 +25,17 @@ from synpick_warp.configs.files.split_tables import SPLITS, split_settings
 from synpick_warp.configs.files.table_lists import settings_of
 from synpick_warp.configs.files.write import format_toml
 from synpick_warp.configs.schema import Split
+from synpick_warp.views.picks import COLUMNS, STATES
 from tools.figures import figures_tables, read_runs
 
 ROOT = Path(__file__).resolve().parents[1]
 SETTINGS_REFERENCE = ROOT / "configs" / "README.md"
+FORMATS = ROOT / "synpick_warp" / "exporters" / "README.md"
 VALIDATION = ROOT / "synpick_warp" / "apps" / "validation" / "README.md"
 FIGURES = ROOT / "tools" / "README.md"
 _SETTINGS_BEGIN = "from the schema in this folder; edit the help texts there. -->\n"
-_RULES_BEGIN, _RULES_END = "from the rules' declarations. -->\n", "<!-- End. -->"
+_RULES_BEGIN, _END = "from the rules' declarations. -->\n", "<!-- End. -->"
+_COLUMNS_BEGIN = "from `synpick_warp/views/picks.py`. -->\n"
 _RESULTS = re.compile(r"(<!-- results: (\w+) -->\n).*?(<!-- end of results -->)", re.DOTALL)
 
 
@@ -71,10 +78,26 @@ def _section(title: str, kind: type[Any], prefix: str) -> list[str]:
 
 def validation_reference() -> str:
     """The README of the validation with its table of rules; the rest is as committed."""
-    head, rest = VALIDATION.read_text(encoding="utf-8").split(_RULES_BEGIN)
     rows = [f"| `{item.name}` | {item.level} | {item.sentence} |" for item in load_rules().values()]
-    table = "\n".join(["| rule | level | what holds |", "|---|---|---|", *rows])
-    return f"{head}{_RULES_BEGIN}\n{table}\n\n{_RULES_END}{rest.split(_RULES_END)[1]}"
+    return _with_table(VALIDATION, _RULES_BEGIN, ["| rule | level | what holds |", "|---|---|---|", *rows])
+
+
+def formats_reference() -> str:
+    """The README of the exporters with the columns of picks; the rest is as committed."""
+    lines = []
+    for title, columns in ("trials", COLUMNS), ("states", STATES):
+        lines += [*[""] * bool(lines), f"| column of {title} | type | unit | content |", "|---|---|---|---|"]
+        for column in columns:
+            codes = f" Codes from 0: {', '.join(f'`{name}`' for name in names(column.codes))}." if column.codes else ""
+            kind = f"{np.dtype(column.dtype).name}" + (f" x {column.size}" if column.size > 1 else "")
+            lines.append(f"| `{column.name}` | {kind} | {column.unit if column.unit != '1' else ''} | {column.meaning}{codes} |")
+    return _with_table(FORMATS, _COLUMNS_BEGIN, lines)
+
+
+def _with_table(path: Path, begin: str, lines: list[str]) -> str:
+    """A README with these lines between a mark and the end of generated text; the rest is as committed."""
+    head, rest = path.read_text(encoding="utf-8").split(begin)
+    return f"{head}{begin}\n" + "\n".join(lines) + f"\n\n{_END}{rest.split(_END)[1]}"
 
 
 def figures_reference() -> str:
@@ -89,6 +112,7 @@ def figures_reference() -> str:
 
 REFERENCES: dict[Path, Callable[[], str]] = {
     SETTINGS_REFERENCE: settings_reference,
+    FORMATS: formats_reference,
     VALIDATION: validation_reference,
     FIGURES: figures_reference,
 }

@@ -21,6 +21,7 @@ from synpick_warp.configs.dataset.splits import DataLayout, episode_range
 from synpick_warp.dataset.annotations import ADVICE, EpisodeEntry, EpisodeRow, Key, ModelInfo, check_content, read_checked
 from synpick_warp.dataset.commit.frame_counts import check_frames
 from synpick_warp.dataset.commit.manifest import CONFIG_FILE, CONSTANTS, ENTRIES, MANIFEST_FILE, episode_entry, read_checksums
+from synpick_warp.dataset.picks import PickTables
 from synpick_warp.dataset.scene_index import SceneIndex, numbered
 from synpick_warp.dataset.trajectory import (
     GROUP_FILE,
@@ -54,12 +55,12 @@ UNKNOWN = "unknown"
 """Mode and ending of an episode that no bake has described."""
 
 
-class Episode:
+class Episode(PickTables):
     """One episode: row of the episode list, pick attempts, views, and arrays of the trajectory."""
 
     def __init__(self, data_set: DataSet, index: int) -> None:
         """Episode `index` of a data set, which has it."""
-        self._data_set = data_set
+        self._data_set, self.folder = data_set, data_set.folder
         self.group = data_set.folder / STORE / EPISODES / f"{index:06d}"
         """Folder of its group in the trajectory store, if there is one."""
         self._scenes: dict[int, SceneFiles] = {}
@@ -199,7 +200,7 @@ class Episode:
             raise IndexError(f"episode {self.index} has no frame {frame}; it has {frames} frames")
         if frame % frames not in (own := self.frames(camera)):
             raise IndexError(f"episode {self.index} has no picture of camera {camera} in frame {frame}; it has one every {own.step} frames")
-        return View(self._files_of(camera), self.index, camera, frame % frames, self.image_ids[frame % frames])
+        return View(self._files_of(camera), self.index, camera, frame % frames, self.image_ids[frame % frames], self)
 
     def _files_of(self, camera: int) -> SceneFiles:
         """Files of the scene that a camera recorded."""

@@ -21,6 +21,7 @@ from synpick_warp.views.layer_codec import decode_layer, image_format
 
 if TYPE_CHECKING:
     from synpick_warp.configs.calibration.lens import LensMap
+    from synpick_warp.dataset.reading import Episode
 
 MILLIMETERS = 1000.0
 """In a metre: BOP's files are in millimetres, this module is in metres."""
@@ -56,7 +57,9 @@ class CameraMatrix(np.ndarray):
 class View:
     """One camera image with its ground truth. Arrays with N rows have one per instance, in BOP's order of ground-truth indices."""
 
-    def __init__(self, files: SceneFiles, episode: int, camera: int, frame: int, image_id: int | None = None) -> None:
+    def __init__(
+        self, files: SceneFiles, episode: int, camera: int, frame: int, image_id: int | None = None, owner: Episode | None = None
+    ) -> None:
         """
         Args:
             files: The scene's files.
@@ -64,8 +67,9 @@ class View:
             camera: Index of the camera.
             frame: Index of the frame in the episode.
             image_id: BOP's im_id; None: the same.
+            owner: The episode, for its picks.
         """
-        self._files = files
+        self._files, self._owner = files, owner
         self.episode, self.camera, self.frame = episode, camera, frame
         self.image_id = frame if image_id is None else image_id
 
@@ -232,6 +236,39 @@ class View:
                 f"{self._files.place}: the {key} graph of image {self.image_id} names an instance that is not there; {ADVICE}"
             )
         return entry[key]
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Width and height [px]."""
+        return self._files.image_size(self.image_id)
+
+    @cached_property
+    def picks(self) -> np.recarray:
+        """Trials of grasps from the state of this frame, in the columns of `synpick_warp.views.picks.COLUMNS`; none if it is no state.
+
+        Raises:
+            DatasetError: The data set has no picks.
+        """
+        if self._owner is None:
+            raise DatasetError(f"{self._files.place} is read without its episode, which has the picks")
+        trials = self._owner.picks
+        return trials[trials["frame"] == self.frame].view(np.recarray)
+
+    @cached_property
+    def graspable(self) -> np.ndarray:
+        """Simulated success at tried pixels (H, W) float32; NaN elsewhere. See `grasp_maps.graspable_map`; errors as of `picks`."""
+        from synpick_warp.dataset.grasp_maps import graspable_map
+
+        picks = self.picks
+        states = self._owner.pick_states if self._owner else ()
+        return graspable_map(self, picks, hides=any(each.frame == self.frame and each.camera != self.camera for each in states))
+
+    @property
+    def suctions(self) -> np.ndarray:
+        """Grasp candidates as suctionnetAPI has them (candidate, 7) float32; see `grasp_maps.suction_group`, errors as of `picks`."""
+        from synpick_warp.dataset.grasp_maps import suction_group
+
+        return suction_group(self, self.picks)
 
     def _column(self, record: str, key: str, dtype: type) -> np.ndarray:
         """Array of one key over the entries of `gt` or `gt_info`."""

@@ -49,7 +49,7 @@ class PartFiles(NamedTuple):
     suffix: str
     """Of their names, behind six digits: the episode's index, or the BOP scene_id of a scene."""
     frame_bytes: int
-    """Least size of a frame in a file [B], 1 or more: numbers of frames are checked against the sizes of files."""
+    """Least size of a frame in a file [B]: numbers of frames are checked against the sizes of files. 0: they say nothing of frames."""
     per_scene: bool = False
     joined: bool = False
     """Whether an index is joined from them; those of no committed episode are then left out, with a note."""
@@ -117,6 +117,11 @@ def _zarr(_: DataLayout, episode: int) -> str:
     return rf"{_STORE}/episodes/{episode:06d}/(?:zarr\.json|[a-z_]+/(?:zarr\.json|{_ZARR_ARRAY}))"
 
 
+def _picks(_: DataLayout, episode: int) -> str:
+    """Regular expression that matches the paths of an episode's tables of picks."""
+    return rf"picks/(?:states/)?{episode:06d}\.parquet"
+
+
 def _lerobot(layout: DataLayout, episode: int) -> str:
     """Regular expression that matches the paths of an episode's part and videos in the LeRobot folder."""
     video = rf"chunk-{episode // 1000:03d}/file-{episode % 1000:03d}\.mp4"
@@ -163,6 +168,15 @@ FORMAT_TABLE: dict[str, Format] = {
         "TrajectoryExporter",
         rf"{_STORE}/(?:(?:episodes/)?zarr\.json|(?:objects|cameras)/(?:zarr\.json|{_ZARR_ARRAY}))",
         _zarr,
+    ),
+    "picks": Format(
+        "picks",
+        "PicksExporter",
+        r"(?!)",  # None.
+        _picks,
+        part=PartFiles("picks", ".parquet", 0),
+        packages=("pyarrow",),
+        remedy="install it by pip install 'synpick-warp[picks]'",
     ),
     "lerobot": Format(
         "lerobot.exporter",

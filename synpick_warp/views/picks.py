@@ -130,3 +130,22 @@ def make_rows(columns: Sequence[Column], arrays: Mapping[str, np.ndarray]) -> np
             raise ValueError(f"{column.name} of {len(rows)} rows has the shape {values.shape}, not {rows[column.name].shape}")
         rows[column.name] = values
     return rows
+
+
+def sort_rows(rows: np.ndarray) -> np.ndarray:
+    """Rows of a table in the order of files, by ORDER."""
+    return rows[np.lexsort(_keys(rows)[::-1])]
+
+
+def are_sorted(rows: np.ndarray) -> bool:
+    """Whether rows are in the order of files, each once."""
+    keys = np.stack(_keys(rows)).astype(np.int64)
+    steps = np.diff(keys, axis=1)
+    # The first key that differs decides.
+    decisive = np.take_along_axis(steps, (steps != 0).argmax(axis=0)[None], axis=0)
+    return bool((decisive > 0).all())
+
+
+def _keys(rows: np.ndarray) -> list[np.ndarray]:
+    """Columns of ORDER that the table has."""
+    return [rows[name] for name in ORDER if name in (rows.dtype.names or ())]

@@ -171,7 +171,7 @@ def test_splits_are_passed_on(bakes, tmp_path):
     [
         (
             "--formats=bop,obj",
-            'bake.formats is ["bop", "obj"] on the command line; allowed: any of bop, shards, usd, zarr, lerobot, coco, yolo',
+            'bake.formats is ["bop", "obj"] on the command line; allowed: any of bop, shards, usd, zarr, picks, lerobot, coco, yolo',
         ),
         ("--shard=3", '--shard is "3"; allowed: i/n with i from 0 to n - 1, such as 0/4'),
         ("--shard=4/4", "--shard is 4/4; allowed: i/n with i from 0 to n - 1, such as 0/4"),

@@ -18,6 +18,7 @@ from synpick_warp.configs.dataset.export import ExportSettings
 from synpick_warp.configs.schema import Config
 from synpick_warp.errors import OutputError
 from synpick_warp.exporters.base import ExportContext, Exporter
+from synpick_warp.exporters.picks import PicksExporter
 from synpick_warp.exporters.writing.files import PARTIAL
 from synpick_warp.exporters.writing.png import encode_png
 from synpick_warp.exporters.writing.pool import WriterPool
@@ -27,6 +28,7 @@ from synpick_warp.system.codecs.jpeg import encode_jpeg
 from synpick_warp.views.frames import EpisodeEnd, FrameBatch, TickBatch
 from tests.worlds import box_views
 from tests.worlds.box_views import batches, cameras, catalog, ends, ticks
+from tests.worlds.pick_tables import pick_batch
 
 FRAMES = 3
 MOST_EPISODES = 100
@@ -92,6 +94,8 @@ def feed(
         for batch in view_batches[first:last]:
             exporter.write_views(batch)
             overwrite(batch)
+    for episode in episodes if isinstance(exporter, PicksExporter) else ():
+        exporter.write_picks(pick_batch(episode))
     for end in ends(episodes, frames, ending):
         exporter.end_episode(end, lambda index=end.episode: committed.append(index))
     return committed

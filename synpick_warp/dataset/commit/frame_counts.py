@@ -68,7 +68,7 @@ def _sizes(folder: Path, layout: DataLayout | None, episode: int) -> Iterator[tu
     if times.is_dir():
         yield times, sum(_size(path) for path in times.iterdir() if path.name.startswith("c")), _TIME
     parts = part_files(None if layout is None else layout.cameras)
-    places: list[tuple[Path, float]] = [(folder / part.file(episode), part.frame_bytes) for part in parts]
+    places: list[tuple[Path, float]] = [(folder / part.file(episode), part.frame_bytes) for part in parts if part.frame_bytes]
     if layout is not None:
         cameras, (scene, sensor) = layout.cameras, layout.scene(episode, 0)
         split = folder / layout.folder(episode)

@@ -1,0 +1,136 @@
+"""Exporter of simulated picks: two Parquet tables an episode, of grasp trials and of the states from which they start."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from synpick_warp.codes import Ending, names
+from synpick_warp.configs.dataset.export import ExportSettings
+from synpick_warp.configs.dataset.splits import DataLayout
+from synpick_warp.exporters.base import SharedFiles
+from synpick_warp.exporters.staging import EpisodeExporter, StagedEpisode
+from synpick_warp.exporters.writing.files import output_errors, sync_file, sync_folder
+from synpick_warp.exporters.writing.pool import WriteTask
+from synpick_warp.views.frames import EpisodeEnd
+from synpick_warp.views.picks import COLUMNS, STATES, Column, PickBatch, make_rows, row_type, sort_rows
+
+FOLDER = Path("picks")
+"""Folder in the data set, with the tables of trials."""
+STATES_FOLDER = FOLDER / "states"
+"""Folder of the tables of states."""
+_Tables = list[tuple[np.ndarray, np.ndarray]]
+"""Rows of trials and of states, of each batch."""
+
+
+class PicksExporter(EpisodeExporter[_Tables]):
+    """`Exporter` of picks. Episode k becomes picks/k.parquet and picks/states/k.parquet, empty tables if it has no trials."""
+
+    staging = FOLDER.name
+
+    @staticmethod
+    def slot_bytes(settings: ExportSettings) -> int:
+        """See `Exporter`: tasks have no images."""
+        return 0
+
+    @staticmethod
+    def shared_files(layout: DataLayout) -> SharedFiles:
+        """See `Exporter`."""
+        return SharedFiles((), (), (STATES_FOLDER, FOLDER))
+
+    def write_constants(self) -> list[Path]:
+        """See `Exporter`: the folders alone."""
+        for folder in (FOLDER, STATES_FOLDER):
+            with output_errors(place := self._context.out / folder):
+                place.mkdir(exist_ok=True)
+        return []
+
+    def write_picks(self, batch: PickBatch) -> None:
+        """See `Exporter`."""
+        content = self._staged(batch.episode, _make_content).content
+        content.append((make_rows(COLUMNS, batch.trials), make_rows(STATES, batch.states)))
+
+    def end_episode(self, end: EpisodeEnd, on_committed: Callable[[], None]) -> None:
+        """See `Exporter`: an episode without trials is written, too."""
+        if Ending(end.ending).delivers:
+            self._staged(end.episode, _make_content)
+        super().end_episode(end, on_committed)
+
+    def files(self, episode: int) -> list[Path]:
+        """See `Exporter`: both tables."""
+        return [place for place in pick_files(episode) if os.path.lexists(self._context.out / place)]
+
+    def _commit(self, episode: StagedEpisode[_Tables], end: EpisodeEnd) -> WriteTask:
+        out, places = self._context.out, pick_files(end.episode)
+        return WriteTask(write_tables, (), (episode.folder, episode.content, out, places), out / places[0])
+
+
+def _make_content(_: Path) -> _Tables:
+    return []
+
+
+def pick_files(episode: int) -> tuple[Path, Path]:
+    """Tables of trials and of states of an episode, relative to the data set."""
+    name = f"{episode:06d}.parquet"
+    return FOLDER / name, STATES_FOLDER / name
+
+
+def write_tables(folder: Path, batches: _Tables, out: Path, places: tuple[Path, Path]) -> None:
+    """Task: write an episode's tables, sorted, and rename them to their places in the data set: the table of trials last."""
+    for place, columns, index in (places[1], STATES, 1), (places[0], COLUMNS, 0):
+        parts = [batch[index] for batch in batches] or [np.empty(0, row_type(columns))]
+        rows = sort_rows(np.concatenate(parts))
+        pq.write_table(make_table(columns, rows), folder / place.name, compression="zstd")
+        sync_file(folder / place.name)
+        (folder / place.name).rename(out / place)
+        sync_folder((out / place).parent)
+
+
+def make_table(columns: Sequence[Column], rows: np.ndarray) -> pa.Table:
+    """Arrow table of rows; its fields tell units, meanings and names of codes as metadata."""
+    arrays = []
+    for column in columns:
+        values = np.ascontiguousarray(rows[column.name])
+        flat = pa.array(values.ravel())
+        arrays.append(pa.FixedSizeListArray.from_arrays(flat, values.shape[1]) if values.ndim > 1 else flat)
+    return pa.table(arrays, schema=table_schema(columns, rows.dtype))
+
+
+def table_schema(columns: Sequence[Column], kind: np.dtype) -> pa.Schema:
+    """Arrow schema of a table whose rows have this structured type."""
+    fields = []
+    for column in columns:
+        scalar, shape = kind[column.name].subdtype or (kind[column.name], ())
+        arrow = pa.from_numpy_dtype(scalar)
+        codes = {"codes": ",".join(names(column.codes))} if column.codes else {}
+        notes = {"unit": column.unit, "meaning": column.meaning} | codes
+        fields.append(pa.field(column.name, pa.list_(arrow, shape[0]) if shape else arrow, nullable=False, metadata=notes))
+    return pa.schema(fields)
+
+
+def read_type(schema: pa.Schema, columns: Sequence[Column]) -> np.dtype | None:
+    """Structured type of the rows of a stored table; None: it does not have these columns."""
+    sizes = [item.type.list_size for item in schema if item.name == "visible" and pa.types.is_fixed_size_list(item.type)]
+    kind = row_type(columns, *sizes)
+    return kind if schema.equals(table_schema(columns, kind)) else None
+
+
+def from_table(table: pa.Table, columns: Sequence[Column], kind: np.dtype) -> np.recarray:
+    """Rows of an Arrow table; the inverse of `make_table`.
+
+    Raises:
+        ValueError: A value is missing.
+    """
+    rows = np.empty(table.num_rows, kind).view(np.recarray)
+    for column in columns:
+        values = table[column.name].combine_chunks()
+        flat = values.flatten() if pa.types.is_fixed_size_list(values.type) else values
+        if values.null_count or flat.null_count:
+            raise ValueError(f"{column.name} lacks values")
+        rows[column.name] = flat.to_numpy(zero_copy_only=False).reshape(rows[column.name].shape)
+    return rows

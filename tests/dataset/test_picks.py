@@ -1,0 +1,130 @@
+"""Reading of simulated picks: tables of episodes and views, maps, arrays of suctionnetAPI, and what a damaged or missing table says."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+
+import synpick_warp
+from synpick_warp.configs.files.write import config_to_toml
+from synpick_warp.dataset import picks as reader
+from synpick_warp.dataset.grasp_maps import find_pixels, mean_by_candidate
+from synpick_warp.errors import DatasetError
+from synpick_warp.exporters.bop.exporter import BopExporter
+from synpick_warp.exporters.picks import FOLDER, PicksExporter, make_table
+from synpick_warp.views.picks import COLUMNS, are_sorted, make_rows, sort_rows
+from tests.harness.exporter_contract import export
+from tests.worlds.box_sets import EPISODES, write_set
+from tests.worlds.box_views import config
+from tests.worlds.pick_tables import EACH, REPEATS, pick_batch
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory) -> Path:
+    """Boxes as BOP scenes, with picks."""
+    folder = write_set(tmp_path_factory.mktemp("picks") / "set", BopExporter)
+    export(PicksExporter, folder, config(), EPISODES, processes=0)
+    return folder
+
+
+def test_tables_of_an_episode_are_those_of_its_batches(whole):
+    episode, batch = synpick_warp.open(whole)[2], pick_batch(2)
+    assert episode.picks.tobytes() == sort_rows(make_rows(COLUMNS, batch.trials)).tobytes()
+    assert episode.picks.point.shape == (len(batch), 3)
+    np.testing.assert_array_equal(episode.pick_states.visible, batch.states["visible"])
+
+
+def test_trials_of_a_view_lie_on_their_objects(whole):
+    """Grasp points project to their pixels in camera 0, and to visible pixels of the same instance or behind others in camera 1."""
+    episode = synpick_warp.open(whole)[0]
+    view = episode.view(2)
+    assert len(view.picks) == 3 * EACH * REPEATS
+    assert set(view.picks.frame) == {2}
+    np.testing.assert_array_equal(find_pixels(view, view.picks), np.column_stack((view.picks.column, view.picks.row)))
+    assert len(episode.view(1).picks) == 0
+    assert np.isnan(episode.view(1).graspable).all()
+
+
+@pytest.mark.parametrize("camera", [0, 1])
+def test_graspable_is_the_share_of_successes_at_tried_pixels(whole, camera):
+    view = synpick_warp.open(whole)[0].view(0, camera)
+    known = np.argwhere(~np.isnan(view.graspable))
+    shown = view.masks.any(axis=0)[tuple(known.T)]
+    assert shown.all()
+    pixels, picks = find_pixels(view, view.picks), view.picks
+    for row, column in known:
+        here = (pixels == (column, row)).all(axis=1)
+        assert view.graspable[row, column] == np.float32(picks.success[here].mean())
+    assert len(known) == 3 * EACH if camera == 0 else 0 < len(known) <= 3 * EACH
+
+
+def test_suctions_are_candidates_in_the_camera_frame(whole):
+    view = synpick_warp.open(whole)[0].view(0)
+    first, success = mean_by_candidate(view.picks)
+    assert view.suctions.shape == (3 * EACH, 7)
+    np.testing.assert_array_equal(view.suctions[:, 0], success.astype(np.float32))
+    np.testing.assert_allclose(view.project(view.suctions[:, 4:]), view.project(view.picks.point[first], view.world_to_camera), atol=1e-2)
+    assert (view.suctions[:, 3] < 0).all(), "normals face the camera"
+
+
+def damage(place: Path, change: str) -> None:
+    """Damage a table."""
+    table = pq.read_table(place)
+    if change == "cut":
+        place.write_bytes(place.read_bytes()[:-9])
+    elif change == "column":
+        pq.write_table(table.drop_columns("seal"), place)
+    elif change == "order":
+        pq.write_table(table.take(np.arange(len(table))[::-1]), place)
+    elif change == "twice":
+        rows = make_rows(COLUMNS, pick_batch(2).trials)
+        pq.write_table(make_table(COLUMNS, sort_rows(np.concatenate((rows, rows[:1])))), place)
+    else:
+        place.unlink()
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ("cut", "000002.parquet cannot be read: "),
+        ("column", "000002.parquet does not have the columns of picks"),
+        ("order", "000002.parquet is not sorted, or has a row twice"),
+        ("twice", "000002.parquet is not sorted, or has a row twice"),
+        ("missing", "there is no file .*000002.parquet"),
+    ],
+)
+def test_damaged_tables_are_refused(whole, tmp_path, change, message):
+    shutil.copytree(whole, tmp_path / "set")
+    damage(tmp_path / "set" / FOLDER / "000002.parquet", change)
+    data = synpick_warp.open(tmp_path / "set")
+    with pytest.raises(DatasetError, match=message):
+        data[2].picks  # noqa: B018
+    assert len(data[0].picks)
+
+
+def test_limits_and_missing_tables(whole, tmp_path, monkeypatch):
+    with pytest.raises(DatasetError, match=r"set has no picks; bake it with picks\.candidates, and --formats picks"):
+        synpick_warp.open(write_set(tmp_path / "set", BopExporter))[0].picks  # noqa: B018
+    monkeypatch.setattr(reader, "MAX_ROWS", 5)
+    with pytest.raises(DatasetError, match=r"000000\.parquet has 48 rows; at most 5 are read"):
+        synpick_warp.open(whole)[0].picks  # noqa: B018
+
+
+def test_a_data_set_of_picks_alone_has_its_episodes(tmp_path):
+    folder = export(PicksExporter, tmp_path / "set", config(), (0, 2), processes=0)
+    (folder / "config.toml").write_text(config_to_toml(config()))
+    (folder / "manifest.json").write_text("{}")
+    assert list(synpick_warp.open(folder)) == [0, 2]
+
+
+def test_order_of_rows():
+    rows = sort_rows(make_rows(COLUMNS, pick_batch(0).trials))
+    assert are_sorted(rows)
+    assert are_sorted(rows[:1])
+    assert are_sorted(rows[:0])
+    assert not are_sorted(rows[[1, 0]])
+    assert not are_sorted(rows[[0, 0]])
