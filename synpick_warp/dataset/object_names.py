@@ -5,12 +5,16 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from synpick_warp.configs.schema import ObjectRow
 from synpick_warp.dataset.annotations import Key, ModelDiameter, read_checked
 from synpick_warp.dataset.bop.models import INFO, models_folder
 from synpick_warp.errors import DatasetError
 from synpick_warp.system.inputs.files import check_regular_file
+
+if TYPE_CHECKING:
+    from synpick_warp.dataset.reading import DataSet
 
 _MODEL_NAME = re.compile(rb"^comment (.+), millimetres\r?$", re.MULTILINE)
 """Comment in a PLY file that the BOP exporter wrote: the object's name."""
@@ -41,6 +45,17 @@ def object_names(dataset: Path, object_ids: set[int], rows: Sequence[ObjectRow] 
         if name:
             names[object_id] = name
     return names
+
+
+def names_of(data: DataSet) -> dict[int, str]:
+    """Names of a data set's objects: from the trajectory store, else from models and settings, else "obj_NNNNNN"; none without both."""
+    if data.has_store:
+        return {item.object_id: item.name for item in data.objects}
+    config = data.config
+    if not {"bop", "shards"} & set(config.bake.formats):
+        return {}
+    known = object_names(data.folder, set(data.models_info), config.object_rows, config.objects.diameter_tolerance)
+    return {index: known.get(index, f"obj_{index:06d}") for index in data.models_info}
 
 
 def _fits(expected: float, size: float, tolerance: float) -> bool:

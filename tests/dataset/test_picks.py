@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 from pathlib import Path
 
@@ -18,7 +19,7 @@ from synpick_warp.exporters.bop.exporter import BopExporter
 from synpick_warp.exporters.picks import FOLDER, PicksExporter, make_table
 from synpick_warp.views.picks import COLUMNS, are_sorted, make_rows, sort_rows
 from tests.harness.exporter_contract import export
-from tests.worlds.box_sets import EPISODES, write_set
+from tests.worlds.box_sets import write_pick_set, write_set
 from tests.worlds.box_views import config
 from tests.worlds.pick_tables import EACH, REPEATS, pick_batch
 
@@ -26,9 +27,7 @@ from tests.worlds.pick_tables import EACH, REPEATS, pick_batch
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory) -> Path:
     """Boxes as BOP scenes, with picks."""
-    folder = write_set(tmp_path_factory.mktemp("picks") / "set", BopExporter)
-    export(PicksExporter, folder, config(), EPISODES, processes=0)
-    return folder
+    return write_pick_set(tmp_path_factory.mktemp("picks") / "set")
 
 
 def test_tables_of_an_episode_are_those_of_its_batches(whole):
@@ -69,6 +68,23 @@ def test_suctions_are_candidates_in_the_camera_frame(whole):
     np.testing.assert_array_equal(view.suctions[:, 0], success.astype(np.float32))
     np.testing.assert_allclose(view.project(view.suctions[:, 4:]), view.project(view.picks.point[first], view.world_to_camera), atol=1e-2)
     assert (view.suctions[:, 3] < 0).all(), "normals face the camera"
+
+
+def test_the_file_beside_a_scene_has_the_candidates_of_its_frames(whole):
+    """Candidates in camera coordinates: their points project to the pixels of the table, and success is the share of their trials."""
+    content = json.loads((whole / "train" / "000000" / "scene_picks.json").read_text())
+    assert list(content) == ["0", "2"]
+    assert not (whole / "train" / "000001" / "scene_picks.json").exists(), "camera 1 has chosen nothing"
+    view = synpick_warp.open(whole)[0].view(2)
+    first, success = mean_by_candidate(view.picks)
+    tried, found = view.picks[first], content["2"]
+    assert [one["instance_id"] for one in found] == tried["instance"].tolist()
+    np.testing.assert_allclose([one["success"] for one in found], success)
+    np.testing.assert_allclose([one["score"] for one in found], tried["seal"] * tried["wrench"], atol=2e-6)
+    np.testing.assert_array_equal(np.floor([one["pixel"] for one in found]), np.column_stack((tried["column"], tried["row"])))
+    np.testing.assert_allclose(np.array([one["point"] for one in found]) / 1e3, view.suctions[:, 4:], atol=1e-6)
+    np.testing.assert_allclose([one["normal"] for one in found], view.suctions[:, 1:4], atol=1e-6)
+    assert {one["trials"] for one in found} == {REPEATS}
 
 
 def damage(place: Path, change: str) -> None:

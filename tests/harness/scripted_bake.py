@@ -20,6 +20,7 @@ from synpick_warp.factory.episodes import BakeSummary, EpisodeRow
 from synpick_warp.scenes.embedded.skies import skies
 from synpick_warp.views.frames import EpisodeEnd
 from tests.worlds import box_views, trajectories
+from tests.worlds.pick_tables import pick_batch
 
 FRAMES = 2
 INPUTS = {"objects": 64 * "0", "lights": 64 * "1"}
@@ -62,8 +63,9 @@ def small_settings() -> Config:
     return dataclasses.replace(config, bop=dataclasses.replace(config.bop, split="train", color_format="png", masks=False, coco=False))
 
 
-def bake(out: Path, config: Config, shard: tuple[int, int] = (0, 1), stop_after: int | None = None) -> BakeSummary:
-    """Write a data set, or the remaining episodes of one, as `factory.pipeline.run_bake` does; `stop_after` episodes it is stopped."""
+def bake(out: Path, config: Config, shard: tuple[int, int] = (0, 1), stop_after: int | None = None, picks: bool = False) -> BakeSummary:
+    """Write a data set, or the remaining episodes of one, as `factory.pipeline.run_bake` does; `stop_after` episodes it is stopped. With
+    `picks`, grasps are tried from both frames."""
     needs = Needs.of(config)
     with OutputFolder(out, config, [index for part in DataLayout.of(config).plan((), shard) for index in part]) as output:
         summary = BakeSummary(len(output.episodes))
@@ -75,7 +77,7 @@ def bake(out: Path, config: Config, shard: tuple[int, int] = (0, 1), stop_after:
             exporters = Exporters(needs.classes, ExportContext(out, ExportSettings.of(config), box_views.catalog(), _LENSES, skies(), pool))
             output.prepare(exporters, INPUTS, pool)
             for episode in output.remaining[:stop_after]:
-                _write_episode(output, exporters, pool, episode)
+                _write_episode(output, exporters, pool, episode, picks)
             pool.wait()
             exporters.close()
             if stop_after is None:
@@ -83,11 +85,13 @@ def bake(out: Path, config: Config, shard: tuple[int, int] = (0, 1), stop_after:
     return summary
 
 
-def _write_episode(output: OutputFolder, exporters: Exporters, pool: WriterPool, episode: int) -> None:
+def _write_episode(output: OutputFolder, exporters: Exporters, pool: WriterPool, episode: int, picks: bool) -> None:
     for batch in trajectories.ticks((episode,), FRAMES):
         exporters.write_ticks(batch)
     for batch in box_views.batches(len(_LENSES), (episode,), FRAMES, _LENSES):
         exporters.write_views(batch)
+    if picks:
+        exporters.write_picks(pick_batch(episode, (0, 1), own=False))
     split = DataLayout.of(output.config).split_of(episode)
     row = EpisodeRow(episode, 0, Ending.FINISHED, FRAMES, 0.5, "pick", 3, 1, 1, 0, 2, split.name if split else "")
     end = EpisodeEnd(episode, 0, FRAMES, int(Ending.FINISHED), row.as_json(), (json.dumps(ATTEMPT | {"episode": episode}) + "\n",))

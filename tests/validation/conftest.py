@@ -19,14 +19,14 @@ WIDTH, HEIGHT = 200, 150
 
 @pytest.fixture(scope="session")
 def good(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A correct data set: an episode of two frames in three cameras, with masks, COCO annotations and shards. Read only."""
+    """A correct data set: an episode of two frames in three cameras, with masks, COCO annotations, shards and picks. Read only."""
     out = tmp_path_factory.mktemp("validation") / "set"
-    config = scripted_bake.settings(1, ("bop", "shards"))
+    config = scripted_bake.settings(1, ("bop", "shards", "picks"))
     cameras = dataclasses.replace(config.cameras, resolution=(WIDTH, HEIGHT))
     bop = dataclasses.replace(config.bop, split="train", color_format="png", masks=True, coco=True)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(scripted_bake, "_LENSES", box_views.cameras(WIDTH, HEIGHT))
-        scripted_bake.bake(out, dataclasses.replace(config, cameras=cameras, bop=bop))
+        scripted_bake.bake(out, dataclasses.replace(config, cameras=cameras, bop=bop), picks=True)
     return out
 
 

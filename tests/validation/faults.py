@@ -33,6 +33,7 @@ from tests.validation.planting import (
     put,
     raw,
     read,
+    trials,
     whole,
     write,
 )
@@ -276,6 +277,12 @@ def depth_of_something_else(folder: Path) -> None:
     pixels(DEPTH, lambda depth: depth - 300 * visible.astype(np.uint16))(folder)
 
 
+def put_value(rows: np.ndarray, column: str, value: Any, where: str = "") -> None:
+    """Set a column of the first trial and its repeats, or of the first where another column is not 0."""
+    first = int(np.flatnonzero(rows[where])[0]) if where else 0
+    rows[column][(rows["state"] == rows["state"][first]) & (rows["candidate"] == rows["candidate"][first])] = value
+
+
 RENDERED: Faults = {
     "depth scaled up": ("depth-scaled", "1.02 times", scale_depth(1.02)),
     "depth scaled down": ("depth-scaled", "0.99 times", scale_depth(0.99)),
@@ -304,4 +311,27 @@ RENDERED: Faults = {
     ),
     "depth of something else": ("depth-rendered", "", depth_of_something_else),
 }
-FAULTS = FILES | ANNOTATIONS | IMAGES | SETS | RENDERED
+PICKS: Faults = {
+    "table cut": ("picks-states", "cannot be read", raw("picks/000000.parquet", lambda data: data[:-5])),
+    "frame of a trial": ("picks-states", "its frame is not its state's", trials(lambda rows: put_value(rows, "frame", 1))),
+    "trials of a candidate gone": ("picks-states", "has trials of 11 candidates", trials(lambda rows: rows[rows["candidate"] > 0])),
+    "normal too long": ("picks-geometry", "normal is no unit vector", trials(lambda rows: put_value(rows, "normal", (0.0, 0.0, 2.0)))),
+    "seal above 1": ("picks-geometry", "seal is not between 0 and 1", trials(lambda rows: put_value(rows, "seal", 1.5))),
+    "pixel beside": (
+        "picks-pixels",
+        "does not project to its pixel",
+        trials(lambda rows: put_value(rows, "column", rows["column"][0] + 1)),
+    ),
+    "point above the surface": (
+        "picks-surface",
+        "from the surface",
+        trials(lambda rows: put_value(rows, "point", rows["point"][0] + 0.02)),
+    ),
+    "other instance": ("picks-surface", "does not show its instance", trials(lambda rows: put_value(rows, "instance", 3))),
+    "other object": ("picks-surface", "not an object of that obj_id", trials(lambda rows: put_value(rows, "obj_id", 7))),
+    "success without outcome": ("picks-outcomes", "success does not agree", trials(lambda rows: put_value(rows, "outcome", 4, "success"))),
+    "moved nothing": ("picks-outcomes", "moved and farthest do not agree", trials(lambda rows: put_value(rows, "moved", 2))),
+    "own grasp of another attempt": ("picks-own", "chose another grasp", trials(lambda rows: put_value(rows, "share", 0, "frame"))),
+    "own grasp of no attempt": ("picks-own", "no attempt chose from frame 0", trials(lambda rows: put_value(rows, "share", 0))),
+}
+FAULTS = FILES | ANNOTATIONS | IMAGES | SETS | PICKS | ANNOTATIONS | IMAGES | SETS | RENDERED

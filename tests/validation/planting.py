@@ -9,7 +9,11 @@ from typing import Any
 
 import cv2
 import numpy as np
+import pyarrow.parquet as pq
 
+from synpick_warp.dataset.reading import open_data_set
+from synpick_warp.exporters.picks import make_table, pick_files
+from synpick_warp.views.picks import COLUMNS
 from tests.harness.hostile import removed, replaced
 
 SCENE = "train/000001"
@@ -75,6 +79,17 @@ def doubled(name: str, other: str) -> Plant:
 def raw(name: str, change: Callable[[bytes], bytes]) -> Plant:
     """A file has other bytes."""
     return lambda folder: (folder / name).write_bytes(change((folder / name).read_bytes()))
+
+
+def trials(change: Callable[[np.ndarray], Any]) -> Plant:
+    """The trials of picks are changed in place or, if the change returns some, replaced."""
+
+    def damage(folder: Path) -> None:
+        path, rows = folder / pick_files(0)[0], open_data_set(folder)[0].picks
+        changed = change(rows)
+        pq.write_table(make_table(COLUMNS, rows if changed is None else changed), path)
+
+    return damage
 
 
 def pixels(name: str, change: Callable[[np.ndarray], np.ndarray]) -> Plant:

@@ -4,16 +4,21 @@ from __future__ import annotations
 
 import json
 import shutil
+from collections.abc import Callable
 from pathlib import Path
 
 import cv2
 
 from synpick_warp.configs.files.write import config_to_toml
 from synpick_warp.dataset.commit.manifest import CONFIG_FILE, ENTRIES, MANIFEST_FILE, episode_entry
+from synpick_warp.exporters.bop.exporter import BopExporter
+from synpick_warp.exporters.picks import PicksExporter
+from synpick_warp.views.frames import EpisodeEnd
 from tests.harness.entries import episode_content
 from tests.harness.exporter_contract import FRAMES, export
 from tests.worlds import trajectories
 from tests.worlds.box_views import config
+from tests.worlds.pick_tables import pick_batch
 
 EPISODES = (0, 2)
 LAYERS = ("classes", "flow")
@@ -32,6 +37,23 @@ def write_set(folder: Path, exporter: type, **bop: object) -> Path:
     for episode in EPISODES:
         content = episode_content(episode, FRAMES, [ATTEMPT] if episode == 2 else [])
         (folder / f"{episode_entry(episode)}.json").write_text(json.dumps(content | {"files": 0, "bytes": 0, "checksum": 64 * "0"}))
+    return folder
+
+
+class _BopWithPicks(BopExporter):
+    """Scenes of boxes with scene_picks.json."""
+
+    def end_episode(self, end: EpisodeEnd, on_committed: Callable[[], None]) -> None:
+        self.write_picks(pick_batch(end.episode))
+        super().end_episode(end, on_committed)
+
+
+def write_pick_set(folder: Path) -> Path:
+    """A finished data set of boxes with picks, in the formats bop and picks."""
+    write_set(folder, _BopWithPicks)
+    export(PicksExporter, folder, config(), EPISODES, processes=0)
+    settings = (folder / CONFIG_FILE).read_text()
+    (folder / CONFIG_FILE).write_text(settings.replace('formats = ["bop"]', 'formats = ["bop", "picks"]'))
     return folder
 
 

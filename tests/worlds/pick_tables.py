@@ -15,14 +15,15 @@ EACH = 4
 """Candidates of a visible instance."""
 
 
-def pick_batch(episode: int, frames: tuple[int, ...] = (0, 2), seed: int = 0) -> PickBatch:
+def pick_batch(episode: int, frames: tuple[int, ...] = (0, 2), seed: int = 0, own: bool = True) -> PickBatch:
     """Trials from states at these frames, in descending order of the states: EACH candidates of each visible box, REPEATS times each.
 
-    Candidates are uniform over visible pixels. A pick succeeds by chance, with a probability that rises with seal times wrench.
+    The first one is the episode's own, if `own` says so; the others are uniform
+    over visible pixels. A pick succeeds by chance, with a probability of seal times wrench.
     """
     generator = np.random.default_rng((episode, seed))
     views = {int(batch.frame[0]): batch for batch in batches(1, (episode,), max(frames) + 1, cameras()[:1])}
-    tables = [_trials(views[frame], state, generator) for state, frame in reversed(list(enumerate(frames)))]
+    tables = [_trials(views[frame], state, generator, own) for state, frame in reversed(list(enumerate(frames)))]
     trials = {name: np.concatenate([table[name] for table in tables]) for name in tables[0]}
     size = views[frames[0]].instance.shape[1:]
     states = {
@@ -37,7 +38,7 @@ def pick_batch(episode: int, frames: tuple[int, ...] = (0, 2), seed: int = 0) ->
     return PickBatch(episode, trials, states)
 
 
-def _trials(view: FrameBatch, state: int, generator: np.random.Generator) -> dict[str, np.ndarray]:
+def _trials(view: FrameBatch, state: int, generator: np.random.Generator, has_own: bool) -> dict[str, np.ndarray]:
     """Columns of the trials of a state."""
     seen = [index for index in range(len(OBJECT_IDS)) if (view.instance[0] == 1 + index).any()]
     pixels = {index: np.argwhere(view.instance[0] == 1 + index) for index in seen}
@@ -46,7 +47,7 @@ def _trials(view: FrameBatch, state: int, generator: np.random.Generator) -> dic
     point, normal = _surface(view, chosen, instance)
     count, trials = len(chosen), len(chosen) * REPEATS
     seal, wrench = generator.random((2, count)).astype(np.float32)
-    own = np.arange(count) == 0
+    own = has_own & (np.arange(count) == 0)
     each = {
         "candidate": np.arange(count),
         "share": np.where(own, Share.OWN, Share.UNIFORM),

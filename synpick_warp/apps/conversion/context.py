@@ -7,7 +7,7 @@ from pathlib import Path
 
 from synpick_warp.apps.conversion.source import Source
 from synpick_warp.configs.dataset.export import ExportSettings
-from synpick_warp.dataset.object_names import object_names
+from synpick_warp.dataset.object_names import names_of
 from synpick_warp.errors import DatasetError
 from synpick_warp.exporters.base import ExportContext
 from synpick_warp.exporters.writing.pool import WriterPool
@@ -69,13 +69,7 @@ class StoredContext(ExportContext):
     @property
     def names(self) -> dict[int, str]:
         """Names by obj_id, sorted: from the zarr store; without one from models and settings, else "obj_NNNNNN". See `ExportContext`."""
-        data = self._source.data
-        if data.has_store:
-            found = {item.object_id: item.name for item in data.objects}
-        else:
-            config, found = self._source.config, set(data.models_info)
-            known = object_names(self._source.folder, found, config.object_rows, config.objects.diameter_tolerance)
-            found = {index: known.get(index, f"obj_{index:06d}") for index in data.models_info}
+        found = names_of(self._source.data)
         return dict(sorted(found.items()))
 
     def copy_constants(self, names: tuple[Path, ...]) -> bool:

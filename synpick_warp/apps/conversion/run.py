@@ -101,6 +101,8 @@ def _convert_episodes(
         if Ending(end.ending).delivers:
             if "views" in contents:
                 exporters.write_stored(index, source.scenes(end))
+                if (picks := source.picks(index)) is not None:
+                    exporters.write_picks(picks)
             for batch in source.ticks(end) if "poses" in contents else ():
                 exporters.write_ticks(batch)
         exporters.end_episode(end, partial(commit, end))

@@ -35,6 +35,7 @@ from synpick_warp.exporters.trajectory.arrays import STORE
 from synpick_warp.exporters.writing.checksums import open_regular
 from synpick_warp.exporters.writing.files import remove_folder
 from synpick_warp.views.frames import EpisodeEnd, TickBatch
+from synpick_warp.views.picks import PickBatch
 
 _COPY_BYTES = 1 << 20
 """Size of a copy block [B]."""
@@ -103,6 +104,13 @@ class Source:
     def ticks(self, end: EpisodeEnd) -> Iterator[TickBatch]:
         """Yield the ticks of an episode's stored trajectory. See `trajectories.read_ticks`."""
         return read_ticks(self.data[end.episode], self.config.physics.steps_per_tick, self.config.cell.recorded)
+
+    def picks(self, index: int) -> PickBatch | None:
+        """Grasp trials of an episode; None: the data set has none. Raises DatasetError if a table is damaged."""
+        if "picks" not in self.config.bake.formats:
+            return None
+        trials, states = self.data[index].picks, self.data[index].pick_states
+        return PickBatch(index, *({name: table[name] for name in table.dtype.names or ()} for table in (trials, states)))
 
     def episode_end(self, index: int) -> EpisodeEnd:
         """How a committed episode ended.

@@ -17,6 +17,7 @@ from synpick_warp.apps.report.findings import WARNING, Figures, Finding, find
 from synpick_warp.apps.report.frames import make_frame
 from synpick_warp.apps.report.markup import Html, element, join
 from synpick_warp.apps.report.page import Page, Part, read_vega, render, summary
+from synpick_warp.apps.report.picks import DRAWS, PICKS_LEAD, calibration_chart, picks_section
 from synpick_warp.apps.report.sampling import (
     SURVEY_VIEWS,
     Brightness,
@@ -29,6 +30,7 @@ from synpick_warp.apps.report.sampling import (
 from synpick_warp.apps.report.strips import choose_episodes, make_strip
 from synpick_warp.apps.report.tables import findings_list, settings_tables, statistics_tables, tiles
 from synpick_warp.apps.statistics import Statistics, compute_statistics
+from synpick_warp.apps.statistics.picks import find_picks
 from synpick_warp.apps.viz.depth_colors import bin_scale
 from synpick_warp.dataset.commit.manifest import read_manifest
 from synpick_warp.dataset.reading import DataSet
@@ -88,14 +90,17 @@ def write_report(
     findings.sort(key=lambda finding: finding.level != WARNING)
     shown = statistics if (statistics.has_paper_objects if paper is None else paper) else replace(statistics, paper=())
     config = data_set.config if data_set.found is None else None
+    picks = find_picks(data_set, DRAWS)
+    tried = [] if picks is None else [Part("picks", "Picks", PICKS_LEAD, picks_section(data_set, picks))]
+    parts, calibration = _parts(data_set, shown, samples, findings, versions), [] if picks is None else [calibration_chart(picks)]
     page = Page(
         title=data_set.folder.resolve().name or "data set",
         lead=_lead(data_set, statistics, findings),
         tiles=tiles(statistics),
-        parts=_parts(data_set, shown, samples, findings, versions),
+        parts=[*parts[:3], *tried, *parts[3:]],
         findings=findings,
         data=samples.data,
-        charts=make_charts(Source(statistics, samples.brightness, config, _durations(data_set, episodes))),
+        charts=[*calibration, *make_charts(Source(statistics, samples.brightness, config, _durations(data_set, episodes)))],
         album=album,
         footer=f"synpick-warp {__version__}, report of {data_set.folder.resolve().name}. The page loads nothing from anywhere.",
     )

@@ -30,6 +30,11 @@ def element(tag: str, *children: str | Iterable[str], **attributes: str) -> Html
     return Html(f"<{tag}{written}>{''.join(_markup(child) for child in children)}</{tag}>")
 
 
+def image(kind: str, data: str, text: str) -> Html:
+    """An HTML image with its content; `kind` as in its media type, `data` in Base64, `text` for those who do not see it."""
+    return Html(f'<img src="data:image/{kind};base64,{data}" alt="{html.escape(printable(text))}">')
+
+
 def join(parts: Iterable[str]) -> Html:
     """Concatenate markup and texts (escaped)."""
     return Html("".join(map(_markup, parts)))

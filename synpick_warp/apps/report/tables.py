@@ -43,10 +43,10 @@ _SUCCESSES = {outcome.name.lower() for outcome in Outcome if outcome.succeeded}
 
 def statistics_tables(statistics: Statistics) -> Html:
     """HTML of SHOWN_TABLES: views by split and mode, comparison with the paper, attempts and seals, quantiles of depth and of looks."""
-    return join(_table(table) for table in make_tables(statistics) if table.name in SHOWN_TABLES and table.rows)
+    return join(table_html(table) for table in make_tables(statistics) if table.name in SHOWN_TABLES and table.rows)
 
 
-def _table(table: Table) -> Html:
+def table_html(table: Table) -> Html:
     """HTML of a table below its title, numbers aligned at the right."""
     classes = ["num" if column.style else "" for column in table.columns]
     return element("div", element("h3", table.title), plain_table(table.labels(), table.cells(UNKNOWN), classes), class_="scroll")

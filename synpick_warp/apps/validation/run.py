@@ -14,11 +14,12 @@ from synpick_warp.apps.validation.registry import Level, Violation, apply_rules
 from synpick_warp.apps.validation.scene_files import FolderScene, open_scene
 from synpick_warp.apps.validation.subjects import TreeSubject
 from synpick_warp.apps.validation.target_lists import TargetLists
-from synpick_warp.apps.validation.tasks import CheckModel, CheckRig, CheckScene, State, Task
+from synpick_warp.apps.validation.tasks import CheckModel, CheckPicks, CheckRig, CheckScene, State, Task
+from synpick_warp.configs.schema import Config
 from synpick_warp.dataset.bop.keyed import KeyedFolder
 from synpick_warp.dataset.bop.layout import Layout, SceneRef
-from synpick_warp.dataset.commit.manifest import read_manifest, read_settings
-from synpick_warp.errors import DatasetError, SynpickError
+from synpick_warp.dataset.commit.manifest import committed_episodes, read_manifest, read_settings
+from synpick_warp.errors import SynpickError
 from synpick_warp.system.hardware.cores import count_cores
 from synpick_warp.system.processes.pool import WorkerProgram, map_ordered
 from synpick_warp.system.progress import Report
@@ -79,7 +80,7 @@ def validate(folder: Path, options: Options, summary: Summary, report: Report = 
     for violation in _check_folders(layout, lists):
         yield _finish(violation, layout, summary)
     models = list(_plan_models(layout, summary))
-    tasks: list[Task] = [*models, *_plan_scenes(scenes, lists, options), *_plan_rigs(layout, scenes)]
+    tasks: list[Task] = [*models, *_plan_scenes(scenes, lists, options), *_plan_rigs(layout, scenes), *_plan_picks(layout)]
     processes = max(1, min(options.threads, -(-total // VIEWS_PER_PROCESS) if options.images else 1, len(tasks)))
     for checked in map_ordered(WorkerProgram(partial(State, layout.root), "process that validates"), tasks, processes):
         summary.views += checked.views
@@ -165,11 +166,22 @@ def _plan_rigs(layout: Layout, scenes: list[tuple[SceneRef, np.ndarray]]) -> Ite
             yield CheckRig(tuple(refs), cameras)
 
 
+def _plan_picks(layout: Layout) -> Iterator[Task]:
+    """Yield a task for each committed episode of a data set with picks."""
+    config = _read_config(layout)
+    if config is not None and "picks" in config.bake.formats:
+        yield from map(CheckPicks, committed_episodes(layout.root))
+
+
 def _count_cameras(layout: Layout) -> int:
     """Number of cameras of a data set of this program; 1 for other data sets."""
-    if not layout.ours:
-        return 1
+    config = _read_config(layout)
+    return 1 if config is None else len(config.rig)
+
+
+def _read_config(layout: Layout) -> Config | None:
+    """Settings of a data set of this program; None: it is from another source, or they are damaged."""
     try:
-        return len(read_settings(layout.root, read_manifest(layout.root)).rig)
-    except (SynpickError, DatasetError):
-        return 1
+        return read_settings(layout.root, read_manifest(layout.root)) if layout.ours else None
+    except SynpickError:
+        return None

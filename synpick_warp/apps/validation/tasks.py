@@ -129,3 +129,16 @@ class CheckRig:
         """See `Task`."""
         scenes = tuple(SceneSubject(state.layout, open_scene(state.layout, ref)) for ref in self.refs)
         return Checked(list(apply_rules(RigSubject(self.refs[0].place, scenes, self.cameras))))
+
+
+@dataclass(frozen=True)
+class CheckPicks:
+    """Task: check the tables of picks of an episode."""
+
+    index: int
+
+    def __call__(self, state: State) -> Checked:
+        """See `Task`."""
+        from synpick_warp.apps.validation.rules.trials import PicksSubject
+
+        return Checked(list(apply_rules(PicksSubject(state.layout.root, self.index))))

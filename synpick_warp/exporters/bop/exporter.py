@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import shutil
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,7 @@ from synpick_warp.configs.dataset.splits import DataLayout
 from synpick_warp.configs.schema import Bop
 from synpick_warp.exporters.base import ExportContext, SharedFiles
 from synpick_warp.exporters.bop.keypoints import make_category_keys
+from synpick_warp.exporters.bop.picks import spool_picks
 from synpick_warp.exporters.bop.scene import SceneSettings, commit_scenes, create_scene_folders, write_layer, write_view
 from synpick_warp.exporters.bop.scene_exporter import SceneExporter, SceneImages, constant_files
 from synpick_warp.exporters.bop.sensors import commit_sensor_scene
@@ -27,6 +29,7 @@ from synpick_warp.exporters.bop.shared.targets import (
 from synpick_warp.exporters.bop.view import ViewSettings
 from synpick_warp.exporters.writing.files import PARTIAL, output_errors
 from synpick_warp.exporters.writing.pool import WriterPool
+from synpick_warp.views.picks import PickBatch
 
 
 class BopExporter(SceneExporter):
@@ -76,6 +79,12 @@ class BopExporter(SceneExporter):
             pool.wait()
             concatenate_targets(parts, out, names)
         return [Path(name) for name in names]
+
+    def write_picks(self, batch: PickBatch) -> None:
+        """Keep grasp trials for scene_picks.json. See `Exporter`."""
+        scenes = self._staged(batch.episode, partial(self._create_scenes, batch.episode)).content
+        with output_errors(scenes[0]):
+            spool_picks(batch, scenes)
 
     def files(self, episode: int) -> list[Path]:
         """Existing scene folders of an episode, relative to the data set. See `Exporter`."""

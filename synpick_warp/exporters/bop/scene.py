@@ -19,6 +19,7 @@ import orjson
 from synpick_warp.errors import OutputError
 from synpick_warp.exporters.base import EncodedView
 from synpick_warp.exporters.bop.graph import GRAPH_FILE, FrameSupport, find_occlusions, graph_entry
+from synpick_warp.exporters.bop.picks import PICKS, format_picks
 from synpick_warp.exporters.bop.view import ANNOTATIONS, ViewSettings, annotation_block, make_keypoints, make_rle, to_json
 from synpick_warp.exporters.writing.files import sync_folder
 from synpick_warp.exporters.writing.folder import Buffer, open_folder
@@ -142,9 +143,18 @@ def complete_scene(scene: Path, settings: SceneSettings) -> None:
             _write_lines(scene / GRAPH_FILE, _format_keyed(blocks, len(names), partial(_complete_graph, settings.supports)))
         if settings.coco:
             _write_lines(scene / "scene_gt_coco.json", _format_coco(blocks, len(names) + settings.graph, settings))
+        if (scene / PICKS).exists():
+            size = settings.width, settings.height
+            _write_lines(scene / "scene_picks.json", format_picks(scene / PICKS, partial(_read_camera, blocks), size))
+            (scene / PICKS).unlink()
     (scene / ANNOTATIONS).unlink()
     for folder in (*(entry for entry in sorted(scene.iterdir()) if entry.is_dir()), scene):
         sync_folder(folder)
+
+
+def _read_camera(blocks: AnnotationBlocks, frame: int) -> dict[str, Any] | None:
+    """Entry of a frame in scene_camera.json; None: the scene has no such image."""
+    return json.loads(next(blocks.read(frame, 0, 1))) if frame in blocks.frames else None
 
 
 class AnnotationBlocks:

@@ -1,0 +1,201 @@
+"""How well the analytic suction scores predict simulated success: AUC, calibration, by share of the sampling and by object."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from synpick_warp.apps.statistics.ranking import BINS, DRAWS, Calibration, Interval, Scored, calibrate, estimate, success_rate, weighted_auc
+from synpick_warp.codes import Outcome, Share
+from synpick_warp.dataset.object_names import names_of
+from synpick_warp.errors import DatasetError
+from synpick_warp.system.codecs.tables import Column, Table
+
+if TYPE_CHECKING:
+    from synpick_warp.dataset.reading import DataSet
+
+SCORES = ("seal x wrench", "seal", "wrench")
+"""Analytic scores; the first is SuctionNet's."""
+UNIFORM, ALL = "uniform over visible pixels, weighted", "all candidates"
+"""Populations: the unbiased share, with weights, and everything that was sampled, each trial alike."""
+MIN_OUTCOMES = 5
+"""Fewest successes and failures of an object of which an AUC is shown."""
+_KEPT = ("state", "candidate", "repeat", "share", "weight", "obj_id", "seal", "wrench", "outcome", "success")
+
+
+@dataclass(frozen=True)
+class ScoreFigures:
+    """How well a score predicts success in a population of trials: AUC and calibration."""
+
+    score: str
+    population: str
+    trials: int
+    success: Interval
+    """Share of successful trials."""
+    auc: Interval
+    calibration: Calibration
+
+
+@dataclass(frozen=True)
+class ObjectFigures:
+    """The same of the trials that intended an object, over all candidates, by SuctionNet's score."""
+
+    obj_id: int
+    name: str
+    trials: int
+    success: Interval
+    auc: Interval | None
+    """None: fewer than MIN_OUTCOMES successes or failures."""
+
+
+@dataclass(frozen=True)
+class PickFigures:
+    """Figures on the picks of a data set: numbers of states, candidates and trials, figures of scores, and of objects."""
+
+    episodes: int
+    states: int
+    candidates: int
+    trials: int
+    """Trials that count: with an outcome, and sampled, not the episode's own."""
+    left_out: int
+    """Trials that do not: own grasps, or ended by the simulation."""
+    scores: tuple[ScoreFigures, ...]
+    objects: tuple[ObjectFigures, ...]
+
+
+def collect_picks(data_set: DataSet) -> tuple[np.ndarray, int]:
+    """Trials of all episodes, in a structured array with a column `cluster` that numbers states; and the number of episodes with any.
+
+    Raises:
+        DatasetError: There are none, or a table is damaged.
+    """
+    parts, states, episodes = [], 0, 0
+    for episode in data_set.values():
+        picks = episode.picks
+        if not len(picks):
+            continue
+        part = np.empty(len(picks), [(name, picks.dtype[name]) for name in _KEPT] + [("cluster", np.int64)])
+        for name in _KEPT:
+            part[name] = picks[name]
+        _, order = np.unique(picks["state"], return_inverse=True)
+        part["cluster"] = states + order
+        states, episodes = states + int(order.max()) + 1, episodes + 1
+        parts.append(part)
+    if not parts:
+        raise DatasetError(f"{data_set.folder} has no trials; its episodes never chose a grasp")
+    return np.concatenate(parts), episodes
+
+
+def evaluate_picks(trials: np.ndarray, episodes: int, names: dict[int, str], draws: int = DRAWS) -> PickFigures:
+    """Evaluate the analytic scores on trials.
+
+    Args:
+        trials: As of `collect_picks`.
+        episodes: Number of episodes with trials.
+        names: Name of each object.
+        draws: Bootstrap samples of the intervals.
+
+    Raises:
+        DatasetError: No trial counts.
+    """
+    counted = trials[(trials["share"] != Share.OWN) & (trials["outcome"] != Outcome.NONE)]
+    if not len(counted):
+        raise DatasetError("no trial of a sampled candidate has an outcome; bake with more of picks.candidates")
+    both = {"seal x wrench": counted["seal"] * counted["wrench"], "seal": counted["seal"], "wrench": counted["wrench"]}
+    uniform = counted["share"] == Share.UNIFORM
+    populations = {UNIFORM: (uniform, np.where(uniform, counted["weight"], 0.0)), ALL: (np.ones(len(counted), bool), np.ones(len(counted)))}
+    figures = []
+    for population, (kept, weight) in populations.items():
+        for score, values in both.items() if kept.any() else ():
+            scored = Scored(
+                values[kept].astype(np.float64), counted["success"][kept], weight[kept].astype(np.float64), counted["cluster"][kept]
+            )
+            rate, auc = estimate(scored, success_rate, draws), estimate(scored, weighted_auc, draws)
+            figures.append(ScoreFigures(score, population, len(scored.score), rate, auc, calibrate(scored, draws)))
+    whole = Scored(both[SCORES[0]].astype(np.float64), counted["success"], np.ones(len(counted)), counted["cluster"])
+    candidates = len(np.unique(counted[["cluster", "candidate"]]))
+    states = len(np.unique(counted["cluster"]))
+    objects = tuple(_by_object(counted, whole, names, draws))
+    return PickFigures(episodes, states, candidates, len(counted), len(trials) - len(counted), tuple(figures), objects)
+
+
+def _by_object(trials: np.ndarray, scored: Scored, names: dict[int, str], draws: int) -> Iterator[ObjectFigures]:
+    """Figures of each object, by obj_id."""
+    for obj_id in np.unique(trials["obj_id"]).tolist():
+        own = scored.select(trials["obj_id"] == obj_id)
+        enough = min(own.outcome.sum(), (~own.outcome).sum()) >= MIN_OUTCOMES
+        auc = estimate(own, weighted_auc, draws) if enough else None
+        yield ObjectFigures(obj_id, names.get(obj_id, f"object {obj_id}"), len(own.score), estimate(own, success_rate, draws), auc)
+
+
+def picks_figures(data_set: DataSet, draws: int = DRAWS) -> PickFigures:
+    """Collect and evaluate the picks of a data set. Errors: see `collect_picks` and `evaluate_picks`."""
+    trials, episodes = collect_picks(data_set)
+    return evaluate_picks(trials, episodes, names_of(data_set), draws)
+
+
+def find_picks(data_set: DataSet, draws: int = DRAWS) -> PickFigures | None:
+    """The same; None: the data set has no picks. Raises DatasetError if a table is damaged."""
+    if data_set.found is not None or "picks" not in data_set.config.bake.formats or not any(len(each.picks) for each in data_set.values()):
+        return None
+    return picks_figures(data_set, draws)
+
+
+def picks_tables(figures: PickFigures) -> tuple[Table, ...]:
+    """Tables of the figures: scores, calibration of SuctionNet's score, objects."""
+    interval = (Column("auc", ".3f", "AUC"), Column("auc_low", ".3f", "from"), Column("auc_high", ".3f", "to"))
+    rate = (Column("success", ".1%"), Column("success_low", ".1%", "from"), Column("success_high", ".1%", "to"))
+    error = (Column("ece", ".3f", "calibration error"), Column("ece_low", ".3f", "from"), Column("ece_high", ".3f", "to"))
+    scores = [
+        (each.population, each.score, each.trials, *_values(each.success), *_values(each.auc), *_values(each.calibration.error))
+        for each in figures.scores
+    ]
+    bins = [
+        (
+            each.population,
+            f"{number / BINS:.1f} to {(number + 1) / BINS:.1f}",
+            int(each.calibration.count[number]),
+            *map(_known, (each.calibration.predicted[number], each.calibration.observed[number])),
+            *map(_known, (each.calibration.low[number], each.calibration.high[number])),
+        )
+        for each in figures.scores
+        if each.score == SCORES[0]
+        for number in range(BINS)
+    ]
+    objects = [
+        (each.obj_id, each.name, each.trials, *_values(each.success), *(_values(each.auc) if each.auc else (None,) * 3))
+        for each in figures.objects
+    ]
+    return (
+        Table(
+            "pick_scores",
+            "Simulated success by analytic scores, 95 % intervals over states",
+            (Column("candidates"), Column("score"), Column("trials", ","), *rate, *interval, *error),
+            scores,
+        ),
+        Table(
+            "pick_calibration",
+            "Calibration of seal x wrench",
+            (Column("candidates"), Column("score"), Column("trials", ","), Column("mean_score", ".3f"), *rate),
+            bins,
+        ),
+        Table(
+            "pick_objects",
+            "By object: all candidates, seal x wrench",
+            (Column("obj_id", "d"), Column("name"), Column("trials", ","), *rate, *interval),
+            objects,
+        ),
+    )
+
+
+def _values(interval: Interval) -> tuple[float | None, ...]:
+    """Value and ends of an interval, None where undefined."""
+    return tuple(map(_known, (interval.value, interval.low, interval.high)))
+
+
+def _known(value: Any) -> float | None:
+    """A number; None for NaN."""
+    return None if np.isnan(value) else float(value)

@@ -1,0 +1,242 @@
+"""Pictures of simulated picks: heat maps of success over the visible objects beside the analytic score, and one trial explained."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import cv2
+import numpy as np
+from scipy.spatial import KDTree
+
+from synpick_warp.apps.viz.drawing import INK, WHITE, Image, check_picture_name, put_text, write_picture
+from synpick_warp.apps.viz.explain_graph import disc, fixed
+from synpick_warp.apps.viz.explain_panels import GREEN, LINE, TEXT, wrapped
+from synpick_warp.codes import Ending, Outcome, Share
+from synpick_warp.dataset.grasp_maps import mean_by_candidate
+from synpick_warp.dataset.object_names import names_of
+from synpick_warp.errors import DatasetError
+
+if TYPE_CHECKING:
+    from synpick_warp.dataset.reading import DataSet, Episode
+    from synpick_warp.dataset.view import View
+
+NEIGHBOURS = 4
+"""Tried pixels of the same instance between which a pixel of a heat map is interpolated."""
+WIDTH = 880
+"""Width of a heat map on a sheet [px]."""
+CROP = 0.12
+"""Side of the square around the grasp point of an explained trial [m]."""
+_CROP_WIDTH = 440
+"""Width of its picture [px]."""
+_RED = (40, 40, 200)
+_DIM = 0.35
+"""Brightness of the colour image under a heat map."""
+_OPACITY = 0.72
+"""Of a heat map."""
+_MARGIN = 20
+_HEAD = 48
+"""Height of the headline and of the captions below it [px]."""
+
+
+def spread_over_surface(view: View, points: np.ndarray, instances: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Interpolate values at points over the visible pixels of their instances (H, W) float64; NaN: no point lies on the instance.
+
+    Weights are inverse squared distances to the NEIGHBOURS nearest points of the same instance in the image (Shepard, 1968).
+
+    Args:
+        view: The view.
+        points: Places in the image (point, 2) [px].
+        instances: Instance of each (point).
+        values: Value of each (point).
+    """
+    width, height = view.size
+    result = np.full((height, width), np.nan)
+    for instance, mask in zip(view.instance_ids.tolist(), view.masks, strict=True):
+        own = instances == instance
+        pixels = np.argwhere(mask)
+        if not own.any() or not len(pixels):
+            continue
+        distance, nearest = KDTree(points[own]).query(pixels[:, ::-1] + 0.5, k=min(NEIGHBOURS, int(own.sum())))
+        weight = 1.0 / np.maximum(np.reshape(distance, (len(pixels), -1)), 0.5) ** 2
+        near = np.reshape(values[own][nearest], weight.shape)
+        result[mask] = (weight * near).sum(axis=1) / weight.sum(axis=1)
+    return result
+
+
+def draw_heat(view: View, values: np.ndarray) -> Image:
+    """Values from 0 (blue) to 1 (yellow) over a view's dimmed grey image; NaN: nothing."""
+    grey = cv2.cvtColor(cv2.cvtColor(view.rgb, cv2.COLOR_RGB2GRAY), cv2.COLOR_GRAY2BGR)
+    colors = heat_colors(np.nan_to_num(values))
+    known = ~np.isnan(values)[..., None]
+    shade = 0.6 + 0.4 * grey / 255.0  # The relief of the surface stays visible.
+    return np.where(known, _OPACITY * colors * shade + (1 - _OPACITY) * grey, _DIM * grey).astype(np.uint8)
+
+
+def heat_colors(values: np.ndarray) -> Image:
+    """VIRIDIS colours of values (H, W) from 0 to 1, as of the layers of suction."""
+    return cv2.applyColorMap(np.rint(255.0 * np.clip(values, 0.0, 1.0)).astype(np.uint8), cv2.COLORMAP_VIRIDIS)
+
+
+def draw_pick_maps(view: View, picks: np.ndarray, width: int = WIDTH) -> list[tuple[str, Image]]:
+    """Heat maps of the picks that were tried from a view's frame, with the tried points: simulated success, and the analytic score.
+
+    Returns:
+        Caption and picture of each, `width` pixels wide.
+    """
+    first, success = mean_by_candidate(picks)
+    tried = picks[first]
+    score = (tried["seal"] * tried["wrench"]).astype(np.float64)
+    points = view.project(tried["point"], view.world_to_camera)
+    scale = width / view.size[0]
+    size = (width, round(scale * view.size[1]))
+    maps = []
+    for name, values in (("simulated success", success), ("analytic score, seal x wrench", score)):
+        heat = cv2.resize(draw_heat(view, spread_over_surface(view, points, tried["instance"], values)), size, interpolation=cv2.INTER_AREA)
+        for place, color, won in zip(scale * points, heat_colors(values[None])[0].tolist(), success > 0.5, strict=True):
+            disc(heat, place - 0.5, 4.6, WHITE if won else INK)
+            disc(heat, place - 0.5, 3.2, tuple(color))
+        mean = f"mean {values.mean():.2f}" if len(values) else "none tried"
+        maps.append((f"{name}: yellow 1, blue 0; {mean} of {len(values)} points; white rim: it held", heat))
+    return maps
+
+
+def describe_trial(trial: Mapping[str, Any] | np.void, name: str) -> list[str]:
+    """Explain the course of a trial in sentences, from its row; `name`: of the intended object."""
+    tilt = math.degrees(math.acos(float(np.clip(-trial["approach"][2], -1.0, 1.0))))
+    place = ", ".join(f"{1e3 * value:.0f}" for value in trial["point"])
+    how = Share(int(trial["share"])).name.lower()
+    lines = [
+        f"candidate {trial['candidate']} of state {trial['state']} ({how}), trial {trial['repeat']}: on {name} at ({place}) mm,"
+        f" pressed {tilt:.0f} degrees off the vertical",
+        f"analytic: seal {trial['seal']:.2f}, wrench {trial['wrench']:.2f}, score {trial['seal'] * trial['wrench']:.2f}",
+    ]
+    if np.any(trial["offset"]) or np.any(trial["rotation"]) or trial["friction"] != 1.0:
+        turned = math.degrees(float(np.linalg.norm(trial["rotation"])))
+        lines.append(
+            f"perturbed: point by {1e3 * float(np.linalg.norm(trial['offset'])):.1f} mm, cup by {turned:.1f} degrees, "
+            f"friction by a factor of {trial['friction']:.2f}"
+        )
+    outcome, ending = Outcome(int(trial["outcome"])), Ending(int(trial["ending"]))
+    if outcome is Outcome.NONE:
+        return [*lines, f"no outcome: {ending.sentence}"]
+    if not trial["hits"]:
+        lines.append("suction on: no ray of the cup hit an object")
+    else:
+        sealed = int(trial["sealed"]).bit_count()
+        lines.append(f"suction on: {trial['hits']} rays hit; {'good' if sealed else 'poor'} seal{'s' if sealed > 1 else ''}")
+        load = f"largest seal force {trial['peak_force']:.1f} N"
+        if not np.isnan(trial["margin"]):
+            load += f", margin {trial['margin']:.2f}"
+        lines.append(load if np.isnan(trial["time_to_break"]) else f"{load}: it broke after {trial['time_to_break']:.2f} s")
+    lines.append(f"outcome: {outcome.sentence}")
+    moved = (
+        f"{trial['moved']} other objects moved, by up to {1e3 * trial['farthest']:.0f} mm" if trial["moved"] else "no other object moved"
+    )
+    return [*lines, moved + (f"; {trial['lost']} fell out of the bin" if trial["lost"] else "")]
+
+
+def draw_trial(view: View, trial: np.void, radius: float) -> Image:
+    """Colour image around the grasp point of a trial: rim of the cup (`radius` [m]) on the surface, and the direction of its approach."""
+    point, normal = np.asarray(trial["point"], np.float64), np.asarray(trial["normal"], np.float64)
+    center = view.project(point, view.world_to_camera)
+    depth = (view.world_to_camera[:3, :3] @ point + view.world_to_camera[:3, 3])[2]
+    scale = _CROP_WIDTH / (CROP * view.intrinsics[0, 0] / depth)
+    corner = center - _CROP_WIDTH / scale / 2
+    move = np.array([[scale, 0.0, -scale * corner[0]], [0.0, scale, -scale * corner[1]]])
+    crop = cv2.warpAffine(view.rgb[..., ::-1], move, (_CROP_WIDTH, _CROP_WIDTH), flags=cv2.INTER_LINEAR, borderValue=WHITE)
+    first = np.cross(normal, np.eye(3)[np.argmin(np.abs(normal))])
+    first /= np.linalg.norm(first)
+    turn = np.linspace(0.0, 2 * np.pi, 49)
+    rim = point + radius * (np.outer(np.cos(turn), first) + np.outer(np.sin(turn), np.cross(normal, first)))
+    shaft = np.stack((point - 0.04 * np.asarray(trial["approach"], np.float64), point))
+    color = GREEN if trial["success"] else _RED
+    for line, closed in ((rim, True), (shaft, False)):
+        places = fixed(scale * (view.project(line, view.world_to_camera) - corner) - 0.5)
+        cv2.polylines(crop, [places], closed, WHITE, 6, cv2.LINE_AA, 4)
+        cv2.polylines(crop, [places], closed, color, 3, cv2.LINE_AA, 4)
+    return crop
+
+
+def choose_trial(picks: np.ndarray, candidate: int | None = None) -> np.void:
+    """Trial that is worth explaining: the failure, of unperturbed trials, with the highest analytic score; without failures the success
+    with the lowest; or the first trial of a candidate.
+
+    Raises:
+        DatasetError: There is no such candidate.
+    """
+    if candidate is not None:
+        own = np.flatnonzero(picks["candidate"] == candidate)
+        if not len(own):
+            raise DatasetError(f"the state has no candidate {candidate}; it has {len(np.unique(picks['candidate']))} candidates")
+        return _row(picks, int(own[0]))
+    plain = np.flatnonzero(picks["repeat"] == picks["repeat"].min())
+    score, failed = picks["seal"][plain] * picks["wrench"][plain], ~picks["success"][plain]
+    return _row(picks, plain[np.argmax(np.where(failed, score, -1.0)) if failed.any() else np.argmin(score)])
+
+
+def _row(picks: np.ndarray, index: int) -> Any:
+    """One row of a table."""
+    return picks[index]
+
+
+def write_pick_sheet(data_set: DataSet, out: Path, episode: int | None, state: int | None = None, candidate: int | None = None) -> Path:
+    """Draw the heat maps of a state, and below them a trial explained: picture and sentences.
+
+    Args:
+        data_set: A data set with picks and images.
+        out: PNG or JPEG file.
+        episode: Index of the episode; None: the first with trials.
+        state: Index of the state in it; None: the first.
+        candidate: Candidate that is explained; None: as `choose_trial`.
+
+    Raises:
+        DatasetError: There is no such state or candidate, or a file is missing or damaged.
+        OutputError: The picture cannot be written.
+    """
+    check_picture_name(out)
+    chosen = _find_episode(data_set, episode)
+    states = chosen.pick_states
+    index = int(states["state"][0]) if state is None else state
+    if index not in states["state"]:
+        raise DatasetError(f"episode {chosen.index} has no state {index}; it has {len(states)} states")
+    row = states[states["state"] == index][0]
+    picks = chosen.picks[chosen.picks["state"] == index]
+    view = chosen.view(int(row["frame"]), int(row["camera"]))
+    if not len(picks):
+        raise DatasetError(f"state {index} of episode {chosen.index} has no trials")
+    return write_picture(out, _compose(view, picks, choose_trial(picks, candidate), names_of(data_set), data_set.config.suction.radius))
+
+
+def _find_episode(data_set: DataSet, episode: int | None) -> Episode:
+    """An episode with states; None: the first of them. Raises DatasetError if there is none."""
+    if episode is not None and episode not in data_set:
+        raise DatasetError(f"{data_set.folder} has no episode {episode}")
+    found = next((each for each in ([data_set[episode]] if episode is not None else data_set.values()) if len(each.pick_states)), None)
+    if found is None:
+        raise DatasetError(f"{data_set.folder if episode is None else f'episode {episode}'} has no state from which picks were tried")
+    return found
+
+
+def _compose(view: View, picks: np.ndarray, trial: np.void, names: Mapping[int, str], radius: float) -> Image:
+    """Sheet of a state: two heat maps beside each other, below them the picture of a trial and its sentences."""
+    maps = draw_pick_maps(view, picks)
+    crop = draw_trial(view, trial, radius)
+    name = f"{names.get(int(trial['obj_id']), 'object')} (instance {trial['instance']})"
+    room = 2 * WIDTH + _MARGIN - _CROP_WIDTH - _MARGIN
+    lines = [line for text in describe_trial(trial, name) for line in wrapped(text, 1.3 * TEXT, room)]
+    top, below = _HEAD + maps[0][1].shape[0] + _MARGIN, max(_CROP_WIDTH, round(1.3 * LINE) * len(lines))
+    sheet = np.full((top + below + _MARGIN, 2 * WIDTH + 3 * _MARGIN, 3), 255, np.uint8)
+    head = f"Episode {view.episode}, frame {view.frame}, camera {view.camera}: {len(picks):,} trials from one state"
+    put_text(sheet, head, (_MARGIN, 18), 1.3 * TEXT, INK, 2)
+    for number, (caption, picture) in enumerate(maps):
+        left = _MARGIN + number * (WIDTH + _MARGIN)
+        put_text(sheet, caption, (left, _HEAD - 8), TEXT, INK)
+        sheet[_HEAD : _HEAD + picture.shape[0], left : left + WIDTH] = picture
+    sheet[top : top + _CROP_WIDTH, _MARGIN : _MARGIN + _CROP_WIDTH] = crop
+    for number, line in enumerate(lines):
+        place = (2 * _MARGIN + _CROP_WIDTH, top + round(1.3 * LINE) * (number + 1) - 8)
+        put_text(sheet, line, place, 1.3 * TEXT, (GREEN if trial["success"] else _RED) if line.startswith("outcome") else INK)
+    return sheet
