@@ -352,6 +352,12 @@ class Bop:
         low=0,
         high=64,
     )
+    graph: bool = setting(
+        False,
+        "",
+        "Write who lies on whom and who hides whom in each frame: scene_graph.json, with an unstacking order, and support in zarr; and "
+        "into models_info.json mass, centre of mass, inertia and suctionable area.",
+    )
     target_visibility: float = setting(
         0.1, "", "Minimum visible fraction of an instance listed in test_targets_bop19.json.", low=0.0, high=1.0
     )
