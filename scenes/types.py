@@ -118,6 +118,8 @@ class CatalogEntry:
     """(unit axis, point on it [m])."""
     source: Path | None
     """The PLY file of a BOP model folder; None: embedded, or from another format."""
+    suctionable: tuple[float, float] | None = field(default=None, hash=False)
+    """Area on which a suction cup seals [m²], and its fraction of the surface; None: not measured."""
 
 
 FIRST_DISTRACTOR = -2

@@ -44,6 +44,7 @@ PICKED = PICKING | {
     "bake.formats": ["bop", "shards", "usd", "zarr"],
     "cameras.resolution": [96, 54],
     "render.layers": ["flow", "classes"],
+    "bop.graph": True,
 }
 """Settings of the fixture `picked_set`."""
 ONE_OBJECT = {

@@ -95,7 +95,7 @@ def test_a_dry_run_lists_what_the_same_calls_allocate(device, monkeypatch):
     def build() -> None:
         sizes = record_sizes(world_sizes(2, room, 3, 4, 1), 5)
         allocate_worlds(sizes, device)
-        allocate_record(True, sizes, device)
+        allocate_record(sizes, device, steps=True, supports=True)
         sections = (config.render, config.effects, config.depth_sensor)
         Renderer(blank_scene(3, 40, 24, device), *sections, seed=0, depth_scale=0.1, instances=room, views=4, histories=6)
         allocate_ring(view_buffer_sizes(4, 40, 24, room), layers, HostImages(jpeg_quality=95, depth_files=True), device)

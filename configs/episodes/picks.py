@@ -37,7 +37,7 @@ class Picks:
     angle: float = setting(2.0, "°", "Half width of the perturbation of the cup's rotation about each axis.", low=0.0, high=45.0)
     friction: float = setting(0.2, "", "Half width of the perturbation of all friction coefficients, as a fraction.", low=0.0, high=1.0)
     near: float = setting(
-        0.03,
+        0.02,
         "m",
         "Distance to the grasp point at which the gripper appears, on the surface normal, and descends at pick.near_speed; 0: it takes the "
         "path of an attempt.",

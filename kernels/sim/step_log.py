@@ -1,4 +1,4 @@
-"""Step log: poses, velocities, contact and seal forces of every physics step, for trajectories.
+"""Step log: poses, velocities, contact and seal forces of every physics step, for trajectories; who lies on whom in a tick.
 
 A row of the log, called "place", is an instance; the rows of the gripper shaft and the cup follow those of the instances.
 """
@@ -65,6 +65,70 @@ def sum_contacts_kernel(
             force = -force
         if shape >= 0 and shape_body[shape] >= 0:
             add_force(shape_body[shape], force, total_inout)
+
+
+@wp.kernel
+def sum_supports_kernel(
+    # Scene:
+    layout: LayoutData,
+    shape_body: wp.array[int],  # (shape)
+    # State:
+    contact_count: wp.array[int],  # (one)
+    shape0: wp.array[int],  # (contact)
+    shape1: wp.array[int],  # (contact)
+    # In:
+    contact_force: wp.array[wp.spatial_vector],  # (contact) [N, N·m]
+    # Out:
+    total_inout: wp.array2d[wp.int64],  # (body, other)
+):
+    """Sum the upward contact forces on each body by the body that exerts them, in fixed point; downward ones count negative.
+
+    Column `other` is the body's index in its world; the last one is for everything static: bins and table. Launched over contact.
+    """
+    contact = wp.tid()
+    if contact >= contact_count[0] or shape0[contact] < 0 or shape1[contact] < 0:
+        return
+    upward = contact_force[contact][2]
+    if not wp.isfinite(upward):
+        return
+    counts = wp.int64(wp.rint(upward * COUNTS_PER_NEWTON))
+    a = shape_body[shape0[contact]]
+    b = shape_body[shape1[contact]]
+    static = total_inout.shape[1] - 1
+    if a >= 0:
+        wp.atomic_add(total_inout, a, wp.where(b >= 0, b % layout.bodies, static), counts)
+    if b >= 0:
+        wp.atomic_add(total_inout, b, wp.where(a >= 0, a % layout.bodies, static), -counts)
+
+
+@wp.kernel
+def record_supports_kernel(
+    # Scene:
+    layout: LayoutData,
+    scale: float,
+    # State:
+    catalog_index: wp.array2d[int],  # (world, instance)
+    body_slot: wp.array2d[int],  # (world, instance)
+    # In:
+    total: wp.array2d[wp.int64],  # (body, other)
+    # Out:
+    support_out: wp.array3d[float],  # (world, instance, supporter) [N]
+):
+    """Record what carries each instance: mean upward force of each supporter on it, `scale` x `total`; 0 for instances not in the scene.
+
+    Supporters are the instances, then everything static. Launched over world, instance, supporter.
+    """
+    world, instance, supporter = wp.tid()
+    body = body_of(layout, world, instance, catalog_index, body_slot)
+    other = total.shape[1] - 1
+    if supporter < layout.instances:
+        other = body_of(layout, world, supporter, catalog_index, body_slot)
+        if other >= 0:
+            other = other % layout.bodies
+    support = float(0.0)
+    if body >= 0 and other >= 0:
+        support = scale * float(total[body, other])
+    support_out[world, instance, supporter] = support
 
 
 @wp.kernel

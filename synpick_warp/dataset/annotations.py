@@ -23,6 +23,8 @@ ADVICE = "restore the file, or bake the data set again"
 
 Index = Annotated[int, Meta(ge=0, lt=2**31)]
 """Index, id or count."""
+Supporter = Annotated[int, Meta(ge=-1, lt=2**31)]
+"""Index, or -1."""
 Key = Annotated[int, Meta(ge=0, lt=2**31)]
 """Index as a key of an object."""
 Length = Annotated[float, Meta(ge=-1e9, le=1e9)]
@@ -122,6 +124,17 @@ class ModelInfo(ModelDiameter, gc=False):
     symmetries_continuous: Annotated[list[ContinuousSymmetry], Meta(max_length=MAX_SYMMETRIES)] | UnsetType = UNSET
 
 
+class GraphEntry(Struct, gc=False):
+    """Schema of a view's entry in scene_graph.json: edges of support and occlusion between ground-truth indices, and unstacking order."""
+
+    occlusion: list[tuple[Index, Index, Index]]
+    """Occluder, occluded, pixels."""
+    support: list[tuple[Index, Supporter, Annotated[float, Meta(ge=0.0, le=1e9)]]] | UnsetType = UNSET
+    """Object, supporter (-1: none that has a label), upward force [N]."""
+    order: list[list[Index]] | UnsetType = UNSET
+    """Strongly connected components of the support graph, none of which carries a later one."""
+
+
 class TargetEntry(Struct, gc=False):
     """Schema of a record of a target list, such as test_targets_bop19.json; those of 2024 have neither object nor count."""
 
@@ -150,6 +163,8 @@ class EpisodeEntry(Struct, gc=False):
 
 VIEW_SCHEMAS: dict[str, Any] = {"camera": CameraEntry, "gt": list[TruthEntry], "gt_info": list[InfoEntry]}
 """Schema of a view's entry in scene_camera.json, scene_gt.json and scene_gt_info.json."""
+GRAPH_SCHEMA = dict[Key, GraphEntry]
+"""Schema of scene_graph.json: the entries by frame."""
 SCENE_SCHEMAS: dict[str, Any] = {name: dict[Key, schema] for name, schema in VIEW_SCHEMAS.items()}
 """Schema of these files: the entries by frame."""
 LENIENT_VIEW_SCHEMAS = VIEW_SCHEMAS | {"camera": LenientCameraEntry}

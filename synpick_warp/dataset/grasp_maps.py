@@ -20,6 +20,11 @@ def mean_by_candidate(picks: np.ndarray, name: str = "success") -> tuple[np.ndar
     return first, np.bincount(which, picks[name], len(first)) / np.bincount(which, minlength=len(first))
 
 
+def candidates(picks: np.ndarray) -> np.ndarray:
+    """The first trial of each candidate, with the columns of a trial, in the order of `mean_by_candidate`."""
+    return picks[mean_by_candidate(picks)[0]]
+
+
 def find_pixels(view: View, picks: np.ndarray) -> np.ndarray:
     """Pixels (column, row) of grasp points in a view (trial, 2) int64; they may be hidden, or outside of the image."""
     return np.floor(view.project(picks["point"], view.world_to_camera)).astype(np.int64)

@@ -57,7 +57,7 @@ def _read(folder: Path, episode: int, *, states: bool) -> np.recarray:
         raise DatasetError(f"picks cannot be read: {error}; install it by pip install 'synpick-warp[picks]'") from None
     path = folder / pick_files(episode)[int(states)]
     if not (folder / FOLDER).is_dir():
-        raise DatasetError(f"{folder} has no picks; bake it with picks.candidates, and --formats picks, which can be combined with others")
+        raise DatasetError(f"{folder} has no picks; bake it with --formats picks, which can be combined with others, as in bop,picks")
     check_regular_file(path, _MAX_FILE, DatasetError)
     columns = STATES if states else COLUMNS
     try:

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from synpick_warp.dataset.grasp_maps import candidates, find_pixels, mean_by_candidate
 from synpick_warp.dataset.reading import open_data_set
 from synpick_warp.errors import DatasetError
 
@@ -47,11 +48,17 @@ FIELDS: Mapping[str, Callable[[View], np.ndarray]] = {
     "poses": lambda view: view.object_to_camera.astype(np.float32),
     "intrinsics": lambda view: view.intrinsics.astype(np.float32),
     "world_to_camera": lambda view: view.world_to_camera.astype(np.float32),
+    "pick_pixels": lambda view: find_pixels(view, candidates(view.picks)),
+    "pick_success": lambda view: mean_by_candidate(view.picks)[1].astype(np.float32),
+    "pick_weights": lambda view: candidates(view.picks)["weight"],
 }
 """Contents of a sample. Images: rgb (3, H, W) uint8, depth (1, H, W) float32 [m]. One row per instance of the sample: masks (N, H, W) bool,
 boxes (N, 4) float32 [px] of the visible part, as x_min, y_min, x_max, y_max, object_ids and instance_ids (N,) int64, visibility (N,)
-float32, poses (N, 4, 4) float32, object to camera [m]. Cameras: intrinsics (3, 3) [px], world_to_camera (4, 4) [m], float32."""
+float32, poses (N, 4, 4) float32, object to camera [m]. Cameras: intrinsics (3, 3) [px], world_to_camera (4, 4) [m], float32. One row per
+grasp candidate of the format picks: pick_pixels (C, 2) int64, column and row, pick_success (C,) float32, the share of successful trials,
+and pick_weights (C,) float32, the inverse of the sampling probability (0: the episode's own grasp)."""
 _PER_INSTANCE = ("masks", "amodal_masks", "boxes", "amodal_boxes", "object_ids", "instance_ids", "visibility", "poses")
+_PER_CANDIDATE = ("pick_pixels", "pick_success", "pick_weights")
 
 
 class Views:
@@ -141,7 +148,7 @@ class Views:
 
 
 def collate(samples: Sequence[Sample]) -> dict[str, Any]:
-    """Collate samples to a batch: arrays of equal shape for all become one tensor, those with a row per instance a list of tensors.
+    """Collate samples to a batch: arrays of equal shape become one tensor, those with a row per instance or candidate a list of tensors.
 
     Raises:
         ImportError: PyTorch is not installed.
@@ -153,7 +160,7 @@ def collate(samples: Sequence[Sample]) -> dict[str, Any]:
         values = [sample[name] for sample in samples]
         if not isinstance(first, np.ndarray):
             batch[name] = torch.as_tensor(values)
-        elif name in _PER_INSTANCE:
+        elif name in (*_PER_INSTANCE, *_PER_CANDIDATE):
             batch[name] = [torch.from_numpy(np.ascontiguousarray(value)) for value in values]
         else:
             batch[name] = torch.from_numpy(np.stack(values))

@@ -202,6 +202,41 @@ class View:
         """Bounding boxes of the visible parts (N, 4) int64 [px]; as `boxes`."""
         return self._column("gt_info", "bbox_visib", np.int64).reshape(-1, 4)
 
+    @cached_property
+    def support(self) -> np.ndarray:
+        """Weighted support graph (N, N + 1) float64 [N]: upward force on the row's instance by the column's, mean over a frame;
+        in the last column that of bin, table and objects without label. 0: it does not carry the instance."""
+        edges = self._graph("support")
+        support = np.zeros((len(self), len(self) + 1))
+        for one, other, force in edges:
+            support[one, other] = force
+        return support
+
+    @cached_property
+    def occlusion(self) -> np.ndarray:
+        """Occlusion graph, weighted (N, N) int64 [px]: pixels at which the instance of the row hides that of the column."""
+        occlusion = np.zeros((len(self), len(self)), np.int64)
+        for one, other, pixels in self._graph("occlusion"):
+            occlusion[one, other] = pixels
+        return occlusion
+
+    @cached_property
+    def order(self) -> tuple[tuple[int, ...], ...]:
+        """Unstacking order: rows of the instances in an order in which none carries a later one; several at once carry each other."""
+        return tuple(map(tuple, self._graph("order")))
+
+    def _graph(self, key: str) -> list[Any]:
+        """Part of the view's entry in scene_graph.json; raises DatasetError if there is none, or it names instances that do not exist."""
+        entry = self._files.graph(self.image_id)
+        if entry is None or key not in entry:
+            raise DatasetError(f"{self._files.place} has no {key} graph of image {self.image_id}; bake bop with bop.graph = true")
+        named = entry["order"] if key == "order" else [edge[:2] for edge in entry[key]]
+        if any(index >= len(self) for indices in named for index in indices):
+            raise DatasetError(
+                f"{self._files.place}: the {key} graph of image {self.image_id} names an instance that is not there; {ADVICE}"
+            )
+        return entry[key]
+
     @property
     def size(self) -> tuple[int, int]:
         """Width and height [px]."""

@@ -16,6 +16,7 @@ import numpy as np
 
 from synpick_warp.dataset.annotations import (
     ADVICE,
+    GRAPH_SCHEMA,
     LENIENT_SCENE_SCHEMAS,
     LENIENT_VIEW_SCHEMAS,
     MASK_SCHEMA,
@@ -131,6 +132,10 @@ class SceneFiles(ABC):
             info = measure_info(self.masks("mask_visib", frame, len(gt)), amodal)
         return ViewRecords(self.camera(frame), gt, [dict(UNKNOWN) for _ in gt] if info is None else info)
 
+    def graph(self, frame: int) -> dict[str, Any] | None:
+        """A frame's entry in scene_graph.json; None: there is none, as in shards."""
+        return None
+
     def _need(self, name: str, frame: int, index: int | None = None) -> tuple[str, bytes, str]:
         """(suffix, content, source) of an image; raises DatasetError if there is none."""
         found = self._find(name, frame, index)
@@ -200,7 +205,7 @@ class SceneFolder(SceneFiles):
         return self.folder / (f"{name}{self.suffix}" if self._images is None else self._images.folder(name))
 
     def annotations(self, name: str) -> Path:
-        """Path of an annotation file: "camera", "gt" or "gt_info"."""
+        """Path of an annotation file: "camera", "gt", "gt_info" or "graph"."""
         return self.folder / f"scene_{name}{self.suffix}.json"
 
     @cached_property
@@ -210,6 +215,16 @@ class SceneFolder(SceneFiles):
         return [
             read_checked(self.annotations(name), schemas[name]) if not self.lenient or self.has(name) else None for name in RECORD_NAMES
         ]
+
+    @cached_property
+    def _graphs(self) -> dict[int, dict[str, Any]]:
+        """Entries of scene_graph.json by image; empty: there is no such file."""
+        path = self.annotations("graph")
+        return read_checked(path, GRAPH_SCHEMA) if path.exists() else {}
+
+    def graph(self, frame: int) -> dict[str, Any] | None:
+        """Entry of a frame. See `SceneFiles`."""
+        return self._graphs.get(frame)
 
     def _part(self, name: str, frame: int) -> Any:
         """Record of a frame by name; None: none, but an empty list if a lenient gt or gt_info file exists without it. See `SceneFiles`."""

@@ -129,6 +129,11 @@ class EncodedView(Protocol):
         """Entry in scene_gt_info.json: one per instance, in the same order."""
         ...
 
+    @property
+    def graph(self) -> dict[str, Any] | None:
+        """Entry in scene_graph.json, if it is stored; None: it is to be made."""
+        ...
+
     def masks(self) -> list[Masks]:
         """Run lengths of the amodal and visible mask of each instance, in the order of `gt`."""
         ...

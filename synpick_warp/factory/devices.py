@@ -42,6 +42,7 @@ from synpick_warp.scenes.catalog import load_catalog
 from synpick_warp.scenes.looks import Looks, load_looks
 from synpick_warp.scenes.types import Catalog, EnvironmentMap
 from synpick_warp.stages.render.lamp_variants import load_scene_lights
+from synpick_warp.stages.render.suction_surface import with_suctionable_area
 from synpick_warp.system.descriptors import duplicate_above_streams, open_standard_descriptors
 from synpick_warp.system.hardware.caches import KERNEL_VARIABLE
 from synpick_warp.system.hardware.device import describe_kinds, pick_device
@@ -233,8 +234,9 @@ def _wait_for_hangup(pipes: Sequence[int], timeout: float) -> None:
 def prepare_folder(output: OutputFolder, needs: Needs, catalog: Catalog, lights: tuple[EnvironmentMap, ...], looks: Looks | None) -> None:
     """Prepare the output folder (`OutputFolder.prepare`) in a process that generates no episodes itself."""
     config = output.config
+    known = with_suctionable_area(catalog, config.suction.radius) if config.bop.graph else catalog
     with WriterPool(1, needs.slot_bytes, output.lock) as pool:
-        context = ExportContext(output.out, ExportSettings.of(config), catalog, make_cameras(config.rig), lights, pool, looks)
+        context = ExportContext(output.out, ExportSettings.of(config), known, make_cameras(config.rig), lights, pool, looks)
         exporters = Exporters(needs.classes, context)
         with aborting(pool, exporters):
             output.prepare(exporters, digest_inputs(catalog, lights, looks), pool)

@@ -99,7 +99,7 @@ def plan_memory(config: Config, device: wp.Device, writers: int = 1, pieces: int
     sizes = record_sizes(
         world_sizes(worlds, objects, config.move.rounds, bodies, len(make_head(config.gripper).cups)), config.physics.steps_per_tick
     )
-    terms = [*_simulation(sizes, config.trajectory.steps if needs.physics else None, device)]
+    terms = [*_simulation(sizes, config.trajectory.steps if needs.physics else None, config.bop.graph, device)]
     for index, group in enumerate(rig.groups):
         count, views = len(group), view_sizes(config.render, rig, worlds, objects, device, index)
         size, layers = rig.sizes[group[0]], rig.chosen(group[0], config.render.layers)
@@ -225,20 +225,21 @@ def _term(
     return Term(name, rows, settings, on_device=on_device, indexed=indexed)
 
 
-def _simulation(sizes: dict[str, int], stores_steps: bool | None, device: wp.Device) -> Iterator[Term]:
+def _simulation(sizes: dict[str, int], stores_steps: bool | None, supports: bool, device: wp.Device) -> Iterator[Term]:
     """State and record of the worlds, and the queue of ticks as `TickLoop` chooses it.
 
     Args:
         sizes: Extents by `record_sizes`.
         stores_steps: Whether each step is recorded, not only each tick; None: no physics is.
+        supports: Whether support is recorded.
         device: Device of the simulation.
     """
     with dry_run() as state:
         *_, record = allocate_worlds(sizes, device)
     yield _term(f"the state of {sizes['world']:,} worlds", state, _WORLDS)
-    if stores_steps is not None:
+    if stores_steps is not None or supports:
         with dry_run() as steps:
-            record = replace(record, physics=allocate_record(stores_steps, sizes, device))
+            record = replace(record, physics=allocate_record(sizes, device, steps=bool(stores_steps), supports=supports))
         yield _term("the record of physics steps", steps, _STEPS)
     slots = 1 + queue_lead(record_bytes(record), device)
     with dry_run() as queued:

@@ -20,13 +20,11 @@ from synpick_warp.stages.render.scene import RenderScene
 from synpick_warp.stages.sim.choices import Choice, ChoiceReader, ChoiceRecorder
 from synpick_warp.stages.sim.simulate import Simulation
 from synpick_warp.stages.sim.states import State
-from synpick_warp.stages.sim.trials import Trials, trial_config
+from synpick_warp.stages.sim.trials import ROUNDS, Trials, trial_config
 from synpick_warp.stages.stream import TickReport
 from synpick_warp.stages.timing import scope
 from synpick_warp.views.picks import PickBatch
 
-ROUNDS = 16
-"""Trials of a batch for each world in which they run: in its last round worlds wait for the slowest."""
 MAX_LEAD = 1
 """Ticks by which physics may be ahead, so that the ring of states needs room for few."""
 

@@ -37,6 +37,7 @@ from synpick_warp.scenes.looks import load_looks
 from synpick_warp.stages.buffers import Snapshot
 from synpick_warp.stages.launch import limit_threads
 from synpick_warp.stages.render.lamp_variants import load_scene_lights
+from synpick_warp.stages.render.suction_surface import with_suctionable_area
 from synpick_warp.stages.stream import TickReport, tick_batch
 from synpick_warp.stages.ticks import TickLoop
 from synpick_warp.stages.timing import scope
@@ -120,7 +121,8 @@ def _fill(config: Config, output: OutputFolder, needs: Needs, names: Sequence[st
     with WriterPool(count_writers(config.bake.writers, needs.slot_bytes), needs.slot_bytes, output.lock) as pool:
         started = time.perf_counter()
         if factory is not None:
-            context = ExportContext(output.out, settings, factory.catalog, factory.cameras, factory.lights, pool, factory.randomized)
+            catalog = with_suctionable_area(factory.catalog, config.suction.radius) if config.bop.graph else factory.catalog
+            context = ExportContext(output.out, settings, catalog, factory.cameras, factory.lights, pool, factory.randomized)
             exporters = Exporters(needs.classes, context)
             with aborting(pool, exporters):
                 output.prepare(exporters, digest_inputs(factory.catalog, factory.lights, factory.randomized), pool)

@@ -105,7 +105,7 @@ class TickReader:
             target: Arrays on the host for copies of `reported`; None: on a GPU the reader's own, on a CPU the record's.
         """
         self.parts = _reported_parts(record)
-        self.physics = record_arrays(record.physics) if record.physics is not None else []
+        self.physics, self.arrays = record.physics, record_arrays(record.physics) if record.physics is not None else []
         self.copy = HostCopy(self.reported(record), target)
 
     @staticmethod
@@ -131,13 +131,13 @@ class TickReader:
         `target` there is no copy: when the next tick runs).
         """
         copied = self.copy.wait()
-        last = len(copied) - len(self.physics)
+        last = len(copied) - len(self.arrays)
         arrays = iter([array.copy() for array in copied[:last]])
         first = [next(arrays) for _ in range(OWN_ARRAYS)]
         report = TickReport(*first, *(SimpleNamespace(**{name: next(arrays) for name in names}) for _, names in self.parts))
-        if not self.physics:
+        if self.physics is None:
             return report
-        tick, steps = host_record(copied[last:], report.catalog_index.shape[1])
+        tick, steps = host_record(self.physics, copied[last:], report.catalog_index.shape[1])
         columns = dict(zip(column_names(Status), report.status.T, strict=True))
         columns |= dict(zip(column_names(Measure), report.measures.T, strict=True))
         sets = {"engaged": report.engaged, "attached": report.attached}

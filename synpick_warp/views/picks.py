@@ -44,13 +44,15 @@ COLUMNS = (
     Column("candidate", "<i4", "1", "Index of the candidate within the state."),
     Column("repeat", "<i4", "1", "Repeat of the candidate; 0: not perturbed."),
     Column("share", "|u1", "1", "How the candidate was sampled.", codes=Share),
-    Column("weight", "<f4", "1", "Inverse of the probability with which its pixel was sampled, for unbiased estimates over pixels."),
+    Column(
+        "weight", "<f4", "1", "Inverse of the probability with which a draw gets its pixel, for unbiased estimates over pixels; 0: own."
+    ),
     Column("column", "<i4", "px", "Pixel in the perception image of camera 0, from the left; its size is in the table of states."),
     Column("row", "<i4", "px", "Pixel in the perception image, from the top."),
     Column("instance", "<i4", "1", "Instance that the pixel shows, which the pick intends; -1: none."),
     Column("obj_id", "<i4", "1", "Its object id; -1: none."),
     Column("point", "<f4", "m", "Grasp point in the world: surface point at the pixel's centre.", 3),
-    Column("normal", "<f4", "1", "Unit surface normal there in the world, out of the object.", 3),
+    Column("normal", "<f4", "1", "Unit surface normal there in the world, out of the object, smoothed as perception does.", 3),
     Column("yaw", "<f4", "rad", "Rotation of the gripper shaft about the vertical."),
     Column("tilt", "<f4", "rad", "Rotation of the cup about the wrist axis."),
     Column("approach", "<f4", "1", "Unit direction in which the cup is pressed on, in the world.", 3),

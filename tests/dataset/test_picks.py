@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,16 +12,20 @@ import pyarrow.parquet as pq
 import pytest
 
 import synpick_warp
+from synpick_warp.apps.conversion.run import convert
+from synpick_warp.cli.main import main
 from synpick_warp.configs.files.write import config_to_toml
+from synpick_warp.configs.schema import Config
 from synpick_warp.dataset import picks as reader
 from synpick_warp.dataset.grasp_maps import find_pixels, mean_by_candidate
 from synpick_warp.errors import DatasetError
 from synpick_warp.exporters.bop.exporter import BopExporter
 from synpick_warp.exporters.picks import FOLDER, PicksExporter, make_table
 from synpick_warp.views.picks import COLUMNS, are_sorted, make_rows, sort_rows
+from tests.harness import scripted_bake
 from tests.harness.exporter_contract import export
 from tests.worlds.box_sets import write_pick_set, write_set
-from tests.worlds.box_views import config
+from tests.worlds.box_views import cameras, config
 from tests.worlds.pick_tables import EACH, REPEATS, pick_batch
 
 
@@ -123,7 +128,7 @@ def test_damaged_tables_are_refused(whole, tmp_path, change, message):
 
 
 def test_limits_and_missing_tables(whole, tmp_path, monkeypatch):
-    with pytest.raises(DatasetError, match=r"set has no picks; bake it with picks\.candidates, and --formats picks"):
+    with pytest.raises(DatasetError, match=r"set has no picks; bake it with --formats picks"):
         synpick_warp.open(write_set(tmp_path / "set", BopExporter))[0].picks  # noqa: B018
     monkeypatch.setattr(reader, "MAX_ROWS", 5)
     with pytest.raises(DatasetError, match=r"000000\.parquet has 48 rows; at most 5 are read"):
@@ -144,3 +149,32 @@ def test_order_of_rows():
     assert are_sorted(rows[:0])
     assert not are_sorted(rows[[1, 0]])
     assert not are_sorted(rows[[0, 0]])
+
+
+def test_a_bake_is_verified_joined_and_converted_with_its_picks(tmp_path):
+    """Two shards of a bake are joined to its bytes; scenes that are made of shards have the same scene_picks.json."""
+    config = scripted_bake.settings(2, ("bop", "shards", "picks"))
+    config = replace(config, bop=replace(config.bop, split="train", color_format="png", masks=True, coco=False))
+    whole, parts = tmp_path / "whole", [tmp_path / f"part{index}" for index in range(2)]
+    scripted_bake.bake(whole, config, picks=True)
+    for index, part in enumerate(parts):
+        scripted_bake.bake(part, config, (index, 2), picks=True)
+    assert main(["merge", *map(str, parts), f"--out={tmp_path / 'joined'}"]) == 0
+    assert main(["verify", str(tmp_path / "joined")]) == 0
+    joined = {name: content for name, content in scripted_bake.snapshot(tmp_path / "joined").items() if "picks" in name}
+    assert joined == {name: content for name, content in scripted_bake.snapshot(whole).items() if "picks" in name}
+    assert {"picks/000001.parquet", "picks/states/000001.parquet", "train/000003/scene_picks.json"} <= set(joined)
+    (whole / "picks" / "000001.parquet").write_bytes(b"PAR1")
+    assert main(["verify", str(whole)]) == 1
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("synpick_warp.scenes.cameras.make_cameras", lambda _: cameras(16, 12))
+        scripted_bake.bake(tmp_path / "shards", with_formats(config, "shards", "picks"), picks=True)
+        scripted_bake.bake(tmp_path / "bop", with_formats(config, "bop", "picks"), picks=True)
+        convert(tmp_path / "shards", tmp_path / "scenes", ("bop",), 1, lambda *_: None)
+    made, baked = (tmp_path / name / "train/000003/scene_picks.json" for name in ("scenes", "bop"))
+    assert made.read_bytes() == baked.read_bytes()
+
+
+def with_formats(config: Config, *formats: str) -> Config:
+    """Settings with other formats."""
+    return replace(config, bake=replace(config.bake, formats=formats))

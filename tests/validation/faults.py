@@ -74,6 +74,26 @@ FILES: Faults = {
     ),
     "image without entry": ("image-extra", "no entry 9", doubled(f"{SCENE}/{RGB}", f"{SCENE}/rgb/000009.png")),
 }
+
+
+def with_graph(order: list[int], support: list[list[float]]) -> Plant:
+    """Image 1 has a scene graph, whose order begins with some instances."""
+
+    def plant(folder: Path) -> None:
+        rest = sorted(set(range(len(json.loads((folder / GT).read_text())["1"]))) - set(order))
+        entry = {"occlusion": [], "support": support, "order": [[index] for index in (*order, *rest)]}
+        (folder / SCENE / "scene_graph.json").write_text(json.dumps({"1": entry}))
+
+    return plant
+
+
+def carried_from_afar(folder: Path) -> None:
+    """Two instances rest in both images, 2 m from each other, and one carries the other."""
+    whole(GT, lambda content: [item.update(cam_t_m2c=[2e3 * index, 0.0, 1e3]) for index, item in enumerate(content["1"])] and None)(folder)
+    whole(GT, lambda content: content.update({"0": content["1"]}))(folder)
+    with_graph([0, 1], [[0, 1, 2.5]])(folder)
+
+
 ANNOTATIONS: Faults = {
     "translation of two numbers": ("json-schema", "", put(GT, "1", 0, "cam_t_m2c", [1.0, 2.0])),
     "padded key": ("json-keys", "leading zeros", whole(GT, lambda content: {f"{int(key):06d}": value for key, value in content.items()})),
@@ -102,6 +122,9 @@ ANNOTATIONS: Faults = {
     "wrong fraction": ("visible-fraction", "", put(INFO, "1", 0, "visib_fract", 0.5)),
     "counts in the wrong order": ("count-order", "", put(INFO, "1", 0, "px_count_all", 10)),
     "zero box of a visible instance": ("hidden-boxes", "", put(INFO, "1", 0, "bbox_visib", [-1, -1, -1, -1])),
+    "graph of strangers": ("scene-graph", "above", with_graph([9], [])),
+    "taken from below": ("scene-graph", "1 comes before 0, which it carries", with_graph([1, 0], [[0, 1, 2.5]])),
+    "carried from afar": ("support-touches", "instance 1 carries 0, but is", carried_from_afar),
     "box reaches out": ("box-inside-box", "", put(INFO, "1", 0, "bbox_visib", [0, 0, 199, 149])),
 }
 

@@ -13,8 +13,11 @@ import synpick_warp
 from synpick_warp.apps.report import compose
 from synpick_warp.apps.statistics.picks import ALL, SCORES, UNIFORM, evaluate_picks, picks_figures
 from synpick_warp.apps.viz.picks import choose_trial, describe_trial, draw_pick_maps, spread_over_surface, write_pick_sheet
+from synpick_warp.cli.main import main
 from synpick_warp.codes import Ending, Outcome, Share
+from synpick_warp.dataset.pytorch import Views
 from synpick_warp.errors import DatasetError
+from tests.builders import mistake
 from tests.worlds.box_sets import write_pick_set
 from tools.reports import picks as report
 
@@ -95,6 +98,28 @@ def test_a_sheet_has_two_maps_and_a_trial(data, tmp_path):
     for wrong, said in (((1, None), "has no episode 1"), ((0, 7), "episode 0 has no state 7; it has 2 states")):
         with pytest.raises(DatasetError, match=said):
             write_pick_sheet(data, tmp_path / "none.png", *wrong)
+
+
+def test_commands_draw_picks(data, tmp_path, capsys):
+    maps, sheet = tmp_path / "maps.png", tmp_path / "sheet.png"
+    assert main(["preview", str(data.folder), "--picks", "--views=3", f"--out={maps}"]) == 0
+    assert main(["explain", str(data.folder), "--state=1", f"--out={sheet}"]) == 0
+    assert cv2.imread(str(maps)).shape == (3 * (48 + 660 + 20), 2 * 880 + 60, 3)
+    assert cv2.imread(str(sheet)).shape[1] == 2 * 880 + 60
+    for options, said in (
+        (["--state=5"], "episode 0 has no state 5; it has 2 states"),
+        (["--candidate=5"], "--candidate is 5, but no state is named; add --state"),
+        (["--episode=0", "--attempt=0", "--state=0"], "--attempt is given beside --state, which is of picks; allowed: one of both"),
+    ):
+        assert mistake("explain", str(data.folder), *options) == said
+
+
+def test_samples_of_pytorch_have_candidates(data):
+    sample = Views(data.folder, fields=("pick_pixels", "pick_success", "pick_weights"), cameras=(0,))[2]
+    view = data[0].view(2)
+    assert len(sample["pick_pixels"]) == len(sample["pick_weights"]) == 12
+    columns, rows = sample["pick_pixels"].T
+    np.testing.assert_array_equal(sample["pick_success"], view.graspable[rows, columns])
 
 
 def test_the_page_has_a_section_of_picks(data, tmp_path, monkeypatch):

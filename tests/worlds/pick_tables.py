@@ -51,7 +51,7 @@ def _trials(view: FrameBatch, state: int, generator: np.random.Generator, has_ow
     each = {
         "candidate": np.arange(count),
         "share": np.where(own, Share.OWN, Share.UNIFORM),
-        "weight": np.where(own, np.nan, np.repeat([len(pixels[index]) / EACH for index in seen], EACH)),
+        "weight": np.where(own, 0.0, np.repeat([len(pixels[index]) / EACH for index in seen], EACH)),
         "row": chosen[:, 0],
         "column": chosen[:, 1],
         "instance": instance,

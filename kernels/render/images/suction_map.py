@@ -242,3 +242,31 @@ def render_suction_wrench_kernel(
         weight = bodies.world_rotation[view, cup.body] * wp.vec3(0.0, 0.0, -GRAVITY)
         score = wrench_score(cup, center, weight, suction.radius)
     wrench_out[view, row, column] = score
+
+
+@wp.kernel(enable_backward=False, module="unique")
+def score_points_kernel(
+    # Scene:
+    meshes: Meshes,
+    # In:
+    radius: float,
+    samples: int,
+    point: wp.array[wp.vec3],  # (point) [m]
+    normal: wp.array[wp.vec3],  # (point)
+    # Out:
+    seal_out: wp.array[float],  # (point)
+):
+    """Seal scores of a cup of `radius` [m] on points of the meshes, in each mesh's frame: `samples` points of the first, and so on.
+
+    Launched over point.
+    """
+    index = wp.tid()
+    cup = PlacedCup()
+    cup.point = point[index]
+    cup.axis = normal[index]
+    other = wp.vec3(1.0, 0.0, 0.0)
+    if wp.abs(cup.axis[0]) > 0.5:
+        other = wp.vec3(0.0, 1.0, 0.0)
+    cup.across = wp.normalize(wp.cross(cup.axis, other))
+    cup.along = wp.cross(cup.axis, cup.across)
+    seal_out[index] = seal_score(meshes, index // samples, cup, radius)

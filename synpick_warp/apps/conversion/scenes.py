@@ -70,6 +70,11 @@ class StoredViewFiles:
         return self._records.gt_info
 
     @property
+    def graph(self) -> dict[str, Any] | None:
+        """Entry in scene_graph.json; None: there is none. See `EncodedView`."""
+        return self.files.graph(self.frame)
+
+    @property
     def color(self) -> tuple[str, Buffer]:
         """Suffix and bytes of the colour file, as stored. See `EncodedView`."""
         return self.files.image_file("rgb", self.frame)

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple, TypeVar
 
 from synpick_warp.errors import SynpickError
 
-MODULES = ("tree", "records", "info", "images", "masks", "coco", "models", "targets", "rig", "shards", "poses", "trials")
+MODULES = ("tree", "records", "info", "images", "masks", "coco", "models", "targets", "rig", "shards", "graph", "poses", "trials")
 """Modules in `validation.rules`, in the order of their rules."""
 Findings = Iterator[tuple[str, str]]
 """What a check yields: (file, what is wrong) for each violation."""

@@ -8,7 +8,7 @@ from typing import Annotated, Any
 import msgspec
 from msgspec import UNSET, Struct, UnsetType
 
-from synpick_warp.dataset.annotations import Index, InfoEntry, Length, LenientCameraEntry, Matrix3, TruthEntry
+from synpick_warp.dataset.annotations import GraphEntry, Index, InfoEntry, Length, LenientCameraEntry, Matrix3, TruthEntry
 
 PLAIN_KEY = re.compile(r"0|[1-9][0-9]{0,8}")
 """An index as a key: decimal digits without leading zeros."""
@@ -79,7 +79,7 @@ class Coco(Struct, gc=False):
     categories: list[Category]
 
 
-RECORDS: dict[str, Any] = {"camera": Camera, "gt": list[Truth], "gt_info": list[Info]}
+RECORDS: dict[str, Any] = {"camera": Camera, "gt": list[Truth], "gt_info": list[Info], "graph": GraphEntry}
 """Schema of an image's entry by file."""
 
 

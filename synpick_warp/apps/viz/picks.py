@@ -210,6 +210,31 @@ def write_pick_sheet(data_set: DataSet, out: Path, episode: int | None, state: i
     return write_picture(out, _compose(view, picks, choose_trial(picks, candidate), names_of(data_set), data_set.config.suction.radius))
 
 
+def write_pick_maps(data_set: DataSet, out: Path, count: int) -> Path:
+    """Draw the heat maps of states, evenly spread over those of the data set, one below the other.
+
+    Args:
+        data_set: A data set with picks and images.
+        out: PNG or JPEG file.
+        count: Maximum number of states.
+
+    Raises:
+        DatasetError: There is no state, or a file is missing or damaged.
+        OutputError: The picture cannot be written.
+    """
+    check_picture_name(out)
+    states = [(episode, state) for episode in data_set.values() for state in episode.pick_states if state["candidates"]]
+    if not states:
+        raise DatasetError(f"{data_set.folder} has no state from which picks were tried")
+    rows = []
+    for place in np.linspace(0, len(states) - 1, min(count, len(states))).round().astype(int).tolist():
+        episode, state = states[place]
+        view = episode.view(int(state["frame"]), int(state["camera"]))
+        picks = episode.picks[episode.picks["state"] == state["state"]]
+        rows.append(_maps_row(f"Episode {episode.index}, frame {view.frame}: {len(picks):,} trials from one state", view, picks))
+    return write_picture(out, np.concatenate(rows))
+
+
 def _find_episode(data_set: DataSet, episode: int | None) -> Episode:
     """An episode with states; None: the first of them. Raises DatasetError if there is none."""
     if episode is not None and episode not in data_set:
@@ -220,23 +245,27 @@ def _find_episode(data_set: DataSet, episode: int | None) -> Episode:
     return found
 
 
-def _compose(view: View, picks: np.ndarray, trial: np.void, names: Mapping[int, str], radius: float) -> Image:
-    """Sheet of a state: two heat maps beside each other, below them the picture of a trial and its sentences."""
+def _maps_row(head: str, view: View, picks: np.ndarray) -> Image:
+    """Two heat maps beside each other, with a headline and their captions above."""
     maps = draw_pick_maps(view, picks)
-    crop = draw_trial(view, trial, radius)
-    name = f"{names.get(int(trial['obj_id']), 'object')} (instance {trial['instance']})"
-    room = 2 * WIDTH + _MARGIN - _CROP_WIDTH - _MARGIN
-    lines = [line for text in describe_trial(trial, name) for line in wrapped(text, 1.3 * TEXT, room)]
-    top, below = _HEAD + maps[0][1].shape[0] + _MARGIN, max(_CROP_WIDTH, round(1.3 * LINE) * len(lines))
-    sheet = np.full((top + below + _MARGIN, 2 * WIDTH + 3 * _MARGIN, 3), 255, np.uint8)
-    head = f"Episode {view.episode}, frame {view.frame}, camera {view.camera}: {len(picks):,} trials from one state"
-    put_text(sheet, head, (_MARGIN, 18), 1.3 * TEXT, INK, 2)
+    row = np.full((_HEAD + maps[0][1].shape[0] + _MARGIN, 2 * WIDTH + 3 * _MARGIN, 3), 255, np.uint8)
+    put_text(row, head, (_MARGIN, 18), 1.3 * TEXT, INK, 2)
     for number, (caption, picture) in enumerate(maps):
         left = _MARGIN + number * (WIDTH + _MARGIN)
-        put_text(sheet, caption, (left, _HEAD - 8), TEXT, INK)
-        sheet[_HEAD : _HEAD + picture.shape[0], left : left + WIDTH] = picture
-    sheet[top : top + _CROP_WIDTH, _MARGIN : _MARGIN + _CROP_WIDTH] = crop
+        put_text(row, caption, (left, _HEAD - 8), TEXT, INK)
+        row[_HEAD : _HEAD + picture.shape[0], left : left + WIDTH] = picture
+    return row
+
+
+def _compose(view: View, picks: np.ndarray, trial: np.void, names: Mapping[int, str], radius: float) -> Image:
+    """Sheet of a state: two heat maps beside each other, below them the picture of a trial and its sentences."""
+    head = f"Episode {view.episode}, frame {view.frame}, camera {view.camera}: {len(picks):,} trials from one state"
+    maps, crop = _maps_row(head, view, picks), draw_trial(view, trial, radius)
+    name = f"{names.get(int(trial['obj_id']), 'object')} (instance {trial['instance']})"
+    lines = [line for text in describe_trial(trial, name) for line in wrapped(text, 1.3 * TEXT, 2 * WIDTH - _CROP_WIDTH)]
+    below = np.full((max(_CROP_WIDTH, round(1.3 * LINE) * len(lines)) + _MARGIN, maps.shape[1], 3), 255, np.uint8)
+    below[:_CROP_WIDTH, _MARGIN : _MARGIN + _CROP_WIDTH] = crop
     for number, line in enumerate(lines):
-        place = (2 * _MARGIN + _CROP_WIDTH, top + round(1.3 * LINE) * (number + 1) - 8)
-        put_text(sheet, line, place, 1.3 * TEXT, (GREEN if trial["success"] else _RED) if line.startswith("outcome") else INK)
-    return sheet
+        color = (GREEN if trial["success"] else _RED) if line.startswith("outcome") else INK
+        put_text(below, line, (2 * _MARGIN + _CROP_WIDTH, round(1.3 * LINE) * (number + 1) - 8), 1.3 * TEXT, color)
+    return np.concatenate((maps, below))

@@ -30,6 +30,13 @@ def preview(
             "where they are detected unless they are declared.",
         ),
     ] = False,
+    picks: Annotated[
+        bool,
+        Parameter(
+            negative=(),
+            help="Draw the picks that were tried from up to --views states instead: heat maps of success and of the analytic score.",
+        ),
+    ] = False,
     config: Annotated[
         str | None, Parameter(help="Settings of a folder of models (unit, object table, tolerance): a preset or .toml file.")
     ] = None,
@@ -55,12 +62,18 @@ def preview(
     if views < 1:
         raise ConfigError(f"--views is {views}; allowed: at least 1")
     folder = find_data_set(folder, "synpick-warp preview DIR", has_scenes)
-    sheet = out or beside(folder, "-contact-sheet.png")
+    sheet = out or beside(folder, "-picks.png" if picks else "-contact-sheet.png")
     from synpick_warp.apps.viz.preview import check_picture_name, write_contact_sheet
 
     check_picture_name(sheet)
     check_output_file(sheet, "--out", folder)
-    write_contact_sheet(folder, sheet, views)
+    if picks:
+        from synpick_warp.apps.viz.picks import write_pick_maps
+        from synpick_warp.dataset.reading import open_data_set
+
+        write_pick_maps(open_data_set(folder), sheet, views)
+    else:
+        write_contact_sheet(folder, sheet, views)
     print(f"contact sheet: {escape(str(sheet))}")
     return 0
 
@@ -145,6 +158,16 @@ def explain(
         WholeNumber | None, Parameter(help="Index of the episode (default: the first three attempts worth seeing, of any).")
     ] = None,
     attempt: Annotated[WholeNumber | None, Parameter(help="Index of the attempt in the episode (default: all).")] = None,
+    state: Annotated[
+        WholeNumber | None,
+        Parameter(
+            help="Explain picks that were tried from this state of the episode (default: the first with any) instead: heat maps of success "
+            "and of the analytic score, and a trial."
+        ),
+    ] = None,
+    candidate: Annotated[
+        WholeNumber | None, Parameter(help="Candidate whose trial is explained (default: the failure with the highest analytic score).")
+    ] = None,
     out: Annotated[
         Path | None,
         Parameter(help="PNG or JPEG file to write (default DIR-explain.png, with indices if they are given, beside the data set)."),
@@ -156,7 +179,13 @@ def explain(
     """
     if episode is None and attempt is not None:
         raise ConfigError(f"--attempt is {attempt}, but no episode is named; add --episode")
+    if attempt is not None and state is not None:
+        raise ConfigError("--attempt is given beside --state, which is of picks; allowed: one of both")
+    if candidate is not None and state is None:
+        raise ConfigError(f"--candidate is {candidate}, but no state is named; add --state")
     folder = find_data_set(folder, "synpick-warp explain DIR", has_attempts)
+    if state is not None:
+        return _explain_picks(folder, episode, state, candidate, out)
     ending = "" if episode is None else f"-{episode:06d}" if attempt is None else f"-{episode:06d}-{attempt:03d}"
     picture = out or beside(folder, f"-explain{ending}.png")
     from synpick_warp.apps.viz.explain import check_picture_name, write_explanation
@@ -164,5 +193,18 @@ def explain(
     check_picture_name(picture)
     check_output_file(picture, "--out", folder)
     write_explanation(folder, picture, episode, attempt)
+    print(f"explanation: {escape(str(picture))}")
+    return 0
+
+
+def _explain_picks(folder: Path, episode: int | None, state: int, candidate: int | None, out: Path | None) -> int:
+    """Explain a trial among the picks of a state."""
+    from synpick_warp.apps.viz.picks import check_picture_name, write_pick_sheet
+    from synpick_warp.dataset.reading import open_data_set
+
+    picture = out or beside(folder, f"-picks-{'' if episode is None else f'{episode:06d}-'}{state:03d}.png")
+    check_picture_name(picture)
+    check_output_file(picture, "--out", folder)
+    write_pick_sheet(open_data_set(folder), picture, episode, state, candidate)
     print(f"explanation: {escape(str(picture))}")
     return 0

@@ -38,6 +38,7 @@ class BopExporter(SceneExporter):
     staging = "bop"
     write_view = staticmethod(write_view)
     write_layer = staticmethod(write_layer)
+    has_graph = True
 
     def __init__(self, context: ExportContext) -> None:
         """See `Exporter`."""
@@ -98,9 +99,11 @@ class BopExporter(SceneExporter):
     def _commit_task(self, scenes: tuple[tuple[Path, int], ...], images: SceneImages) -> tuple[Callable[..., None], tuple[Any, ...]]:
         """Task that completes an episode: writes the annotation files of its scenes, and renames the folders to their places."""
         layout = self._context.layout
+        episode = scenes[0][1] // len(self._cameras)
+        supports = tuple(self._supports.pop(episode, ()))
         settings = tuple(
             SceneSettings(
-                split=layout.folder(scenes[0][1] // len(self._cameras)),
+                split=layout.folder(episode),
                 images=images[index],
                 width=camera.width,
                 height=camera.height,
@@ -108,6 +111,8 @@ class BopExporter(SceneExporter):
                 coco=self._views[index].coco,
                 categories=self._categories,
                 sensor=layout.scene(0, index)[1],
+                graph=self._views[index].graph,
+                supports=supports,
             )
             for index, camera in enumerate(self._cameras)
         )

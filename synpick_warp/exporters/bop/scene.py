@@ -8,14 +8,17 @@ from __future__ import annotations
 import itertools
 import json
 import os
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import Any, BinaryIO
 
+import orjson
+
 from synpick_warp.errors import OutputError
 from synpick_warp.exporters.base import EncodedView
+from synpick_warp.exporters.bop.graph import GRAPH_FILE, FrameSupport, find_occlusions, graph_entry
 from synpick_warp.exporters.bop.picks import PICKS, format_picks
 from synpick_warp.exporters.bop.view import ANNOTATIONS, ViewSettings, annotation_block, make_keypoints, make_rle, to_json
 from synpick_warp.exporters.writing.files import sync_folder
@@ -46,6 +49,10 @@ class SceneSettings:
     """COCO's category of every object of the catalog."""
     sensor: str = ""
     """Suffix of the image folders, such as "_cam1"; empty: classic."""
+    graph: bool = False
+    """Whether scene_graph.json is written."""
+    supports: Sequence[FrameSupport] = ()
+    """Support edges by frame of the episode; empty: those of stored entries."""
 
 
 def create_scene_folders(scene: Path, kinds: Iterable[str]) -> None:
@@ -58,7 +65,8 @@ def create_scene_folders(scene: Path, kinds: Iterable[str]) -> None:
 def write_view(view: EncodedView, scene: Path, settings: ViewSettings) -> None:
     """Write a view's images into the folders of a staged scene, and append its annotation block to `ANNOTATIONS`.
 
-    The block holds the entries of scene_camera, scene_gt and scene_gt_info, then the COCO annotations, without their ids.
+    The block holds the entries of scene_camera, scene_gt, scene_gt_info and, if that is written, scene_graph, then the COCO annotations,
+    without their ids.
     """
     name = f"{view.frame:06d}"
     with open_folder(scene) as folder:
@@ -67,13 +75,14 @@ def write_view(view: EncodedView, scene: Path, settings: ViewSettings) -> None:
             folder.write(f"rgb/{name}{suffix}", color)
         if settings.depth:
             folder.write(f"depth/{name}.png", view.depth)
-        masks = view.masks() if settings.masks or settings.coco else []
+        masks = view.masks() if settings.masks or settings.coco or settings.graph else []
         for index, mask in enumerate(masks if settings.masks else ()):
             amodal, visible = _encode_masks(mask, *settings.resolution)
             folder.write(f"mask/{name}_{index:06d}.png", amodal)
             folder.write(f"mask_visib/{name}_{index:06d}.png", visible)
         annotations = _make_annotations(view, masks, settings) if settings.coco else ()
-        folder.append(ANNOTATIONS, annotation_block(view.frame, map(to_json, (view.camera, view.gt, view.gt_info, *annotations))))
+        graph = (view.graph or {"occlusion": find_occlusions(masks)},) if settings.graph else ()
+        folder.append(ANNOTATIONS, annotation_block(view.frame, map(to_json, (view.camera, view.gt, view.gt_info, *graph, *annotations))))
 
 
 def write_layer(data: Buffer, scene: Path, _: int, name: str, frame: int) -> None:
@@ -130,8 +139,10 @@ def complete_scene(scene: Path, settings: SceneSettings) -> None:
         names = ("scene_camera.json", "scene_gt.json", "scene_gt_info.json")
         for index, name in enumerate(names):
             _write_lines(scene / name, _format_keyed(blocks, index))
+        if settings.graph:
+            _write_lines(scene / GRAPH_FILE, _format_keyed(blocks, len(names), partial(_complete_graph, settings.supports)))
         if settings.coco:
-            _write_lines(scene / "scene_gt_coco.json", _format_coco(blocks, len(names), settings))
+            _write_lines(scene / "scene_gt_coco.json", _format_coco(blocks, len(names) + settings.graph, settings))
         if (scene / PICKS).exists():
             size = settings.width, settings.height
             _write_lines(scene / "scene_picks.json", format_picks(scene / PICKS, partial(_read_camera, blocks), size))
@@ -179,12 +190,17 @@ class AnnotationBlocks:
             yield self._file.read(size).decode("ascii")
 
 
-def _format_keyed(blocks: AnnotationBlocks, index: int) -> Iterator[str]:
-    """Format entry `index` of all views as a JSON object with a key for each frame."""
+def _complete_graph(supports: Sequence[FrameSupport], frame: int, text: str) -> str:
+    """Complete the JSON of a view's entry in scene_graph.json by what its frame's contacts tell."""
+    return to_json(graph_entry(orjson.loads(text), supports[frame] if supports else None)).decode("ascii")
+
+
+def _format_keyed(blocks: AnnotationBlocks, index: int, change: Callable[[int, str], str] = lambda frame, text: text) -> Iterator[str]:
+    """Format entry `index` of all views, as `change` of frame and text returns it, as a JSON object with a key for each frame."""
     yield "{\n"
     for position, frame in enumerate(blocks.frames):
         (text,) = blocks.read(frame, index, index + 1)
-        yield ("" if position == 0 else ",\n") + f'  "{frame}": {text}'
+        yield ("" if position == 0 else ",\n") + f'  "{frame}": {change(frame, text)}'
     yield "\n}\n"
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Callable, Iterator, Sequence
-from functools import partial
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -13,6 +13,7 @@ from synpick_warp.configs.dataset.export import ExportSettings
 from synpick_warp.configs.dataset.splits import DataLayout
 from synpick_warp.configs.schema import Bop
 from synpick_warp.exporters.base import ExportContext, StoredScene, view_bytes
+from synpick_warp.exporters.bop.graph import FrameSupport, find_supports
 from synpick_warp.exporters.bop.keypoints import sample_keypoints
 from synpick_warp.exporters.bop.shared.models import MODEL_FOLDERS, describe_dataset, write_models_folders
 from synpick_warp.exporters.bop.shared.toolkit import PARAMS_FILE, format_dataset_params
@@ -30,7 +31,7 @@ from synpick_warp.exporters.staging import EpisodeExporter, StagedEpisode
 from synpick_warp.exporters.writing.files import output_errors
 from synpick_warp.exporters.writing.notes import CAMERA_FILE, NOTES_FILE, camera_files, write_cameras
 from synpick_warp.exporters.writing.pool import WriteTask
-from synpick_warp.views.frames import EpisodeEnd, FrameBatch
+from synpick_warp.views.frames import EpisodeEnd, FrameBatch, TickBatch
 
 
 def constant_files(layout: DataLayout) -> tuple[Path, ...]:
@@ -55,6 +56,8 @@ class SceneExporter(EpisodeExporter[tuple[Path, ...]]):
     write_view: ClassVar[WriteView]
     write_layer: ClassVar[WriteLayer | None] = None
     """None: the format has no layers."""
+    has_graph: ClassVar[bool] = False
+    """Whether the format has scene graphs."""
 
     def __init__(self, context: ExportContext) -> None:
         """See `Exporter`."""
@@ -66,6 +69,8 @@ class SceneExporter(EpisodeExporter[tuple[Path, ...]]):
         self._pool = context.pool
         self._suffix = f".{bop.color_format}"
         layers = settings.render.layers if self.write_layer else ()
+        self._supports: dict[int, list[FrameSupport]] = {}
+        """Support edges of the frames of each episode that runs."""
         entries = context.catalog.entries if bop.keypoints and self.annotates(bop) else ()
         self._keypoints = {entry.obj_id: sample_keypoints(entry.mesh.vertices, bop.keypoints) for entry in entries}
         self._views = tuple(
@@ -82,6 +87,7 @@ class SceneExporter(EpisodeExporter[tuple[Path, ...]]):
                 layers=settings.rig.chosen(index, layers),
                 keypoints=self._keypoints,
                 polygons=bop.polygons,
+                graph=bop.graph and self.has_graph,
             )
             for index, camera in enumerate(context.cameras)
         )
@@ -137,11 +143,25 @@ class SceneExporter(EpisodeExporter[tuple[Path, ...]]):
                     context.layout, self._bop.color_format, context.catalog, self._cameras, context.settings.rig
                 ),
             }
-            write_models_folders(self._out, context.catalog)
+            write_models_folders(self._out, context.catalog, mechanics=self._bop.graph)
             write_cameras(self._out, context.layout, self._cameras, self._bop.depth_scale)
             for name, text in texts.items():
                 (self._out / name).write_text(text, encoding="utf-8", newline="\n")
             return list(names)
+
+    @cached_property
+    def _weights(self) -> dict[int, float]:
+        """Weight of each object [N] by obj_id."""
+        return {body.obj_id: self._context.settings.physics.gravity * body.mass for body in self._context.catalog.bodies}
+
+    def write_ticks(self, batch: TickBatch) -> None:
+        """Keep the support edges of a tick's frames, if the format writes them. See `Exporter`."""
+        if not (self._bop.graph and self.has_graph and "support" in batch.tick):
+            return
+        for episode, frame, support in zip(batch.episode.tolist(), batch.frame.tolist(), find_supports(batch, self._weights), strict=True):
+            if frame == 0:
+                self._supports[episode] = []
+            self._supports[episode].append(support)
 
     def write_views(self, batch: FrameBatch) -> None:
         """Submit a task for each view of a batch. See `Exporter`."""

@@ -75,6 +75,8 @@ class ViewSettings:
     """Keypoints in COCO annotations, by obj_id; empty: none."""
     polygons: bool = False
     """Whether the format coco has polygons instead of run lengths."""
+    graph: bool = False
+    """Whether scene_graph.json is written."""
     classes: tuple[int, ...] = ()
     """obj_id of each class of the format yolo."""
 
@@ -118,6 +120,8 @@ class ViewTruth:
 
 class RenderedView:
     """`EncodedView` of a rendered view, from the arrays and the ground truth that `make_view_task` collects."""
+
+    graph = None
 
     def __init__(self, images: Sequence[np.ndarray], settings: ViewSettings, truth: ViewTruth) -> None:
         """

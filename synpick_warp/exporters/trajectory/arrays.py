@@ -61,6 +61,7 @@ _POSE = "x, y, z [m], then the quaternion x, y, z, w."
 _COM = "Linear velocity of the centre of mass, in the world's axes."
 _SPIN = "Angular velocity, in the world's axes."
 _CONTACT = "Vector sum of the forces of all contacts on the body, in the world's axes, mean over the step; a seal's force is no contact."
+_SUPPORT = "Upward force of the second instance's contacts on the first, mean over the tick; below 0: it lies on it. With bop.graph only."
 _LOAD = "Sum of the magnitudes of all contact forces on the body, mean over the step: how much it is squeezed."
 
 TICKS = GroupSpec(
@@ -80,6 +81,10 @@ TICKS = GroupSpec(
         "engaged": ArraySpec(("tick", "instance"), "|b1", "1", "Whether one of them hit the instance."),
         "attached": ArraySpec(("tick", "instance"), "|b1", "1", "Whether the instance hangs on the cup, or was picked in this tick."),
         "peak_force": ArraySpec(("tick",), "<f4", "N", "Largest force of any seal in any step of the tick."),
+        "support": ArraySpec(("tick", "instance", "instance"), "<f4", "N", _SUPPORT),
+        "static_support": ArraySpec(
+            ("tick", "instance"), "<f4", "N", "Upward force of bin or table on the instance, mean over the tick; with bop.graph only."
+        ),
     },
     ("time",),
 )

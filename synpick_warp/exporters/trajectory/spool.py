@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from synpick_warp.exporters.trajectory.arrays import STEPS, TICKS, ArraySpec
+from synpick_warp.exporters.trajectory.arrays import STEPS, TICKS
 from synpick_warp.views.frames import TickBatch
 
 SPOOL_ROWS = 32
@@ -93,20 +93,14 @@ def make_rows(batch: TickBatch, row: np.dtype, instances: int) -> np.ndarray:
     for name in row.names or ():
         group, _, array = name.partition("/")
         if group == "steps":
-            values, axis = batch.steps[array], 2
+            values, frames = batch.steps[array], 1
         else:
-            values, axis = getattr(batch, array) if array in _OWN else batch.tick[array], 1
-        if _has_instances(_TABLES[group][array]):
-            values = values[(slice(None),) * axis + (slice(instances),)]
-        rows[name] = values
+            values, frames = getattr(batch, array) if array in _OWN else batch.tick[array], 0
+        dims = _TABLES[group][array].dims
+        rows[name] = values[(slice(None),) * frames + tuple(slice(instances if dim == "instance" else None) for dim in dims)]
     # The buffer's content for an absent instance depends on the world's earlier episodes.
     rows["ticks/pose"][rows["ticks/object_id"] == -1] = np.nan
     return rows
-
-
-def _has_instances(quantity: ArraySpec) -> bool:
-    """Whether the second dimension of an array is the instance."""
-    return quantity.dims[1:2] == ("instance",)
 
 
 def write_rows(rows: np.ndarray, staging: Path, places: Sequence[Place]) -> None:

@@ -28,6 +28,7 @@ from synpick_warp.stages.render.scene import RenderScene
 from synpick_warp.stages.sim import arrange, gripper
 from synpick_warp.stages.sim.behavior import BEHAVIORS, Hold
 from synpick_warp.stages.sim.physics import ENDED, Physics
+from synpick_warp.stages.sim.sleep import Sleep
 from synpick_warp.stages.sim.states import State, WorldStates
 from synpick_warp.stages.sim.step_log import PhysicsRecord, StepRecorder
 from synpick_warp.stages.sim.worlds import AttemptState, SealState, WorldState, WorldStatus, world_sizes
@@ -79,7 +80,7 @@ class Simulation:
             device: Device of all arrays.
             render_scene: Scene that perception renders; not needed if all episodes have mode MOVE.
             episodes: Indices of the episodes to simulate, in order; None: all.
-            records_physics: True if records contain `physics`.
+            records_physics: True if records contain `physics`, with steps if `trajectory.steps`; with `bop.graph` they contain support.
 
         Raises:
             ValueError: An episode may pick, but there is no `render_scene`.
@@ -101,11 +102,12 @@ class Simulation:
         self.scene.bins.chosen, self.scene.bins.pose = self.state.bin, self.state.bin_pose
         self.observation, self.plan = record.observation, record.plan
         self.recorder: StepRecorder | None = None
-        if records_physics:
-            self.recorder = StepRecorder(
-                config.trajectory, config.gripper, self.scene, self.state, self.attempts, self.seals, self.physics, sizes
-            )
+        if records_physics or config.bop.graph:
+            parts = {"steps": records_physics and config.trajectory.steps, "supports": config.bop.graph}
+            states = (self.state, self.attempts, self.seals)
+            self.recorder = StepRecorder(config.gripper, self.scene, *states, self.physics, sizes, **parts)
         self.record = replace(record, physics=self.recorder.record if self.recorder is not None else None)
+        self.sleep = Sleep(self.scene, self.physics) if config.physics.sleep > 0.0 else None
         self.behavior = BEHAVIORS[config.gripper.kind]
         self.after_tick: Callable[[], None] | None = None
         """Launches kernels at the end of a tick, after perception."""
@@ -136,7 +138,7 @@ class Simulation:
         with scope("arrange", self.device):
             self._arrange()
         yield
-        substeps = self.physics.tick_parts(self._drive, self._ignore_contacts, self.recorder if self.config.trajectory.steps else None)
+        substeps = self.physics.tick_parts(self._drive, self._ignore_contacts, self._watcher)
         while True:
             with scope("physics", self.device):
                 if next(substeps, ENDED) is ENDED:
@@ -156,6 +158,11 @@ class Simulation:
             with scope("save states", self.device):
                 self.after_tick()
         self._is_between_ticks = True
+
+    @property
+    def _watcher(self) -> StepRecorder | None:
+        """Recorder, if it must see the steps of a tick."""
+        return self.recorder if self.recorder is not None and self.recorder.watches else None
 
     @property
     def states(self) -> WorldStates:
@@ -183,6 +190,8 @@ class Simulation:
         """Checkpoints of the groups of arrays of this simulation, and of others by name."""
         groups = {"worlds": self.state, "attempts": self.attempts, "seals": self.seals, "last": self.last}
         groups |= {name: getattr(self.record, name) for name in ("snapshot", "status", "observation", "plan")}
+        if self.sleep is not None:
+            groups["sleep"] = self.sleep.state
         return WorldStates(groups | recorded, self.physics, self.catalog, self.state.variant, self.state.restarted)
 
     def get_state(self, worlds: Sequence[int]) -> State:
@@ -214,7 +223,7 @@ class Simulation:
         gripper.clear_seals(state, self.seals)
         self.seals.peak_force.zero_()
         if self.recorder is not None:
-            self.recorder.save_drop_poses()
+            self.recorder.begin_tick()
 
     def _judge(self) -> None:
         """Update phases and tasks after physics, remove objects that were picked or lost, and end episodes."""
@@ -230,6 +239,8 @@ class Simulation:
         gripper.park_removed(scene, state, self.attempts, physics)
         physics.refresh_poses()
         arrange.judge_episodes(scene, state, self.attempts, self.observation, physics)
+        if self.sleep is not None:
+            self.sleep.judge(state, self.attempts, self.seals, self.config.physics.sleep)
 
     def _drive(self, current: newton.State) -> None:
         """Hook before a step: forces of gripper and hold."""

@@ -1,4 +1,4 @@
-"""Step log: records poses, velocities and forces of every physics step on the device, for trajectory exporters."""
+"""Step log: records poses, velocities and forces of every physics step on the device, and the support graph of every tick."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 import warp as wp
 
 from synpick_warp.codes import MAX_CUPS
-from synpick_warp.configs.schema import Gripper, Trajectory
+from synpick_warp.configs.schema import Gripper
 from synpick_warp.kernels.sim import step_log
 from synpick_warp.scenes import build
 from synpick_warp.stages.arrays import allocate, device_array, unpack_words
@@ -63,26 +63,39 @@ class DropArrays:
 
 
 @dataclass(frozen=True, eq=False)
+class SupportArrays:
+    """Support of the instances in a tick, as the weighted support graph has it."""
+
+    support: wp.array = device_array("world", "instance", "supporter", dtype=wp.float32, unit="N")
+    """Upward force on the instance of each supporter's contacts, mean over the tick; below 0: the supporter lies on the instance.
+    Supporters are the instances, then all that is static."""
+
+
+@dataclass(frozen=True, eq=False)
 class PhysicsRecord:
-    """Step log and drop poses of one tick, for the host."""
+    """Step log, drop poses and support of one tick, for the host."""
 
     steps: StepArrays | None
     """None: steps are not recorded."""
     drops: DropArrays
+    supports: SupportArrays | None = None
+    """None: support is not recorded."""
 
 
 def record_sizes(sizes: dict[str, int], steps_per_tick: int) -> dict[str, int]:
     """Extents of the dimensions of the dataclasses here; `sizes` are those of `world_sizes`."""
-    return sizes | {"step": steps_per_tick, "place": sizes["instance"] + build.GRIPPER_BODIES}
+    return sizes | {"step": steps_per_tick, "place": sizes["instance"] + build.GRIPPER_BODIES, "supporter": sizes["instance"] + 1}
 
 
-def allocate_record(stores_steps: bool, sizes: dict[str, int], device: wp.Device) -> PhysicsRecord:
-    """Allocate the record of a tick's physics; `sizes`: extents by `record_sizes`."""
-    return PhysicsRecord(allocate(StepArrays, sizes, device) if stores_steps else None, allocate(DropArrays, sizes, device))
+def allocate_record(sizes: dict[str, int], device: wp.Device, *, steps: bool, supports: bool) -> PhysicsRecord:
+    """Allocate the record of a tick's physics, with steps and support or without; `sizes`: extents by `record_sizes`."""
+    kinds = (StepArrays if steps else None, DropArrays, SupportArrays if supports else None)
+    return PhysicsRecord(*(allocate(kind, sizes, device) if kind is not None else None for kind in kinds))
 
 
 class StepRecorder:
-    """Watcher that records the steps of a tick. Its launches never change, because `Physics.tick` captures them in a graph.
+    """Watcher that records the steps of a tick, or its support graph, or both. Its launches never change, because `Physics.tick` captures
+    them in a graph.
 
     Attributes:
         record: Physics of the last tick, once `end_tick` was called; the next tick overwrites it.
@@ -90,7 +103,6 @@ class StepRecorder:
 
     def __init__(
         self,
-        settings: Trajectory,
         gripper: Gripper,
         scene: SceneData,
         state: WorldState,
@@ -98,11 +110,13 @@ class StepRecorder:
         seals: SealState,
         physics: Physics,
         sizes: dict[str, int],
+        *,
+        steps: bool,
+        supports: bool,
     ) -> None:
         """Allocate the record and scratch.
 
         Args:
-            settings: Settings of trajectories; `steps` selects whether steps are recorded.
             gripper: Settings of the gripper; its weight is subtracted from joint forces.
             scene: Constants of the simulation.
             state: State of the worlds.
@@ -110,19 +124,28 @@ class StepRecorder:
             seals: State of their seals.
             physics: Source of poses, contact forces and joint forces.
             sizes: Extents by `world_sizes`.
+            steps, supports: Whether steps and support are recorded.
         """
         self._scene, self._state, self._attempts, self._seals, self._physics = scene, state, attempts, seals, physics
         self._device = state.phase.device
         self._sizes = record_sizes(sizes, physics.settings.steps_per_tick)
-        self._steps = settings.steps
-        self.record = allocate_record(settings.steps, self._sizes, self._device)
+        self._steps = steps
+        self.record = allocate_record(self._sizes, self._device, steps=steps, supports=supports)
         self._substep_fraction = 1.0 / physics.settings.substeps
         self._weight = (gripper.finger_mass + gripper.cup_mass) * physics.settings.gravity
         self._total = wp.zeros((sizes["body"], int(step_log.MAGNITUDE) + 1), dtype=wp.int64, device=self._device)
         self._force = wp.zeros(sizes["world"], dtype=wp.vec3, device=self._device)
+        others = self._scene.layout.bodies + 1 if supports else 0
+        self._supports = wp.zeros((sizes["body"], others), dtype=wp.int64, device=self._device)
 
-    def save_drop_poses(self) -> None:
-        """Save the drop poses of objects that have just been dropped."""
+    @property
+    def watches(self) -> bool:
+        """Whether it must see the steps of a tick."""
+        return self._steps or self.record.supports is not None
+
+    def begin_tick(self) -> None:
+        """Begin the record of a tick: clear sums of support, and save the drop poses of objects that have just been dropped."""
+        self._supports.zero_()
         state, drop = self._state, self.record.drops.drop_pose
         launch(step_log.save_drop_poses_kernel, state.catalog_index.shape, self._scene, state, self._physics.state, drop_out=drop)
 
@@ -139,7 +162,11 @@ class StepRecorder:
     def after_solve(self, contact_f: wp.array) -> None:
         """Add the contact forces of a solver substep: the force of each contact on its first shape (contact) spatial vector [N]."""
         physics, given = self._physics, {"contact_force": contact_f, "total_inout": self._total}
-        launch(step_log.sum_contacts_kernel, physics.contacts.rigid_contact_max, contact_arrays(physics), **given)
+        if self._steps:
+            launch(step_log.sum_contacts_kernel, physics.contacts.rigid_contact_max, contact_arrays(physics), **given)
+        if self.record.supports is not None:
+            given["total_inout"] = self._supports
+            launch(step_log.sum_supports_kernel, physics.contacts.rigid_contact_max, self._scene, contact_arrays(physics), **given)
 
     def end_step(self, step: int, current: newton.State) -> None:
         """Record step `step` of the tick from the state at its end."""
@@ -155,39 +182,47 @@ class StepRecorder:
 
     def end_tick(self) -> None:
         """Complete the record at the end of a tick."""
+        supports = self.record.supports
+        if supports is not None:
+            scale = self._substep_fraction / (self._physics.settings.steps_per_tick * float(step_log.COUNTS_PER_NEWTON))
+            given = {"scale": scale, "total": self._supports, "out": supports}
+            launch(step_log.record_supports_kernel, supports.support.shape, self._scene, self._state, **given)
         wp.copy(self.record.drops.progress, self._state.progress)
 
 
 def record_arrays(record: PhysicsRecord) -> list[wp.array]:
     """List the arrays of a record, in the order that `host_record` expects."""
-    return [getattr(part, item.name) for part in (record.steps, record.drops) if part is not None for item in fields(part)]
+    parts = (record.steps, record.drops, record.supports)
+    return [getattr(part, item.name) for part in parts if part is not None for item in fields(part)]
 
 
-def host_record(arrays: list[np.ndarray], instances: int) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
+def host_record(record: PhysicsRecord, arrays: list[np.ndarray], instances: int) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
     """Convert a record to the arrays of `TickBatch.tick` and `TickBatch.steps`, by their names in data sets.
 
     Args:
-        arrays: Arrays of `record_arrays`, copied to the host.
+        record: The record.
+        arrays: Its `record_arrays`, copied to the host.
         instances: Capacity for instances of a world.
 
     Forces of cups are left out for a gripper of one cup, whose forces are those of the instances' seals.
     """
-    drops = [item.name for item in fields(DropArrays)]
-    names = [item.name for item in fields(StepArrays)] if len(arrays) > len(drops) else []
-    values = dict(zip([*names, *drops], arrays, strict=True))
+    parts = (record.steps, record.drops, record.supports)
+    values = dict(zip((item.name for part in parts if part is not None for item in fields(part)), arrays, strict=True))
     tick = {"drop_pose": values["drop_pose"], "redrops": values["progress"][:, 2]}
-    steps = _split_places(values, names, instances)
+    if "support" in values:
+        tick |= {"support": values["support"][..., :instances], "static_support": values["support"][..., instances]}
+    steps = _split_places(values, instances)
     cups = steps.pop("cup_force", None)
     if cups is not None and cups.shape[2] > 1:
         steps["cup_force"] = np.pad(cups, ((0, 0), (0, 0), (0, MAX_CUPS - cups.shape[2])))
     return tick, steps
 
 
-def _split_places(arrays: Mapping[str, np.ndarray], names: list[str], instances: int) -> dict[str, np.ndarray]:
+def _split_places(arrays: Mapping[str, np.ndarray], instances: int) -> dict[str, np.ndarray]:
     """Split arrays by place into those of objects and those of the gripper, named `gripper_*`."""
     steps = {}
     for item in fields(StepArrays):
-        if item.name not in names:
+        if item.name not in arrays:
             continue
         values = arrays[item.name]
         if "place" in item.metadata["array"].shape:

@@ -54,7 +54,7 @@ class PicksSubject:
         return self.episode.picks
 
     def views(self) -> Iterator[tuple[np.void, np.ndarray, View]]:
-        """State, trials and view of each state that has both; none without images."""
+        """State, trials on objects with labels, and view of each state that has both; none without images."""
         episode = self.episode
         if not {"bop", "shards"} & set(open_data_set(self.root).config.bake.formats):
             return
@@ -62,7 +62,7 @@ class PicksSubject:
             frame, camera = int(state["frame"]), int(state["camera"])
             if camera < len(episode.cameras) and frame in episode.frames(camera):
                 view = episode.view(frame, camera)
-                own = self.picks[self.picks["state"] == state["state"]]
+                own = self.picks[(self.picks["state"] == state["state"]) & (self.picks["obj_id"] >= 0)]
                 if len(own) and view.lens is None:
                     yield state, own, view
 
@@ -153,7 +153,7 @@ def check_outcomes(subject: PicksSubject) -> Findings:
         "it succeeded, but nothing was held": held & ~(picks["held"] > 0.0),
         "it succeeded, but no ray hit": held & (picks["hits"] <= 0),
         "rays hit, but nothing was caught": (outcome == Outcome.NOTHING_CAUGHT) & (picks["hits"] > 0),
-        "its seals broke, but when is not known": (outcome == Outcome.DROPPED) & np.isnan(picks["time_to_break"]),
+        "its seals broke, but when is not known": (outcome == Outcome.DROPPED) & (picks["held"] > 0.0) & np.isnan(picks["time_to_break"]),
         "it broke, but also succeeded": held & ~np.isnan(picks["time_to_break"]),
         "its margin is above 1": picks["margin"] > 1.0 + UNIT,
         "it has no outcome, but nothing ended it": (outcome == Outcome.NONE) & (picks["ending"] == Ending.RUNNING),

@@ -30,8 +30,8 @@ MODEL_FOLDERS = ("models", "models_eval")
 """The toolkit renders the first and evaluates with the second; ours are equal."""
 
 
-def write_models_folders(out: Path, catalog: Catalog) -> None:
-    """Write models/ and models_eval/, replacing existing ones.
+def write_models_folders(out: Path, catalog: Catalog, *, mechanics: bool = False) -> None:
+    """Write models/ and models_eval/, replacing existing ones; `mechanics`: as of `write_models`.
 
     Raises:
         CatalogError: A model file or its texture is not what was read for the catalog.
@@ -40,11 +40,11 @@ def write_models_folders(out: Path, catalog: Catalog) -> None:
     for name in MODEL_FOLDERS:
         if (out / name).exists():
             shutil.rmtree(out / name)
-        write_models(out / name, catalog)
+        write_models(out / name, catalog, mechanics)
 
 
-def write_models(folder: Path, catalog: Catalog) -> None:
-    """Write every object's PLY file and texture, and models_info.json.
+def write_models(folder: Path, catalog: Catalog, mechanics: bool = False) -> None:
+    """Write every object's PLY file and texture, and models_info.json, with the keys of `make_mechanics` if `mechanics`.
 
     Models loaded from BOP models are copied byte for byte, and their entries as they are, if these have the sizes of the meshes.
     """
@@ -58,7 +58,8 @@ def write_models(folder: Path, catalog: Catalog) -> None:
                 path.with_suffix(".png").write_bytes(encode_png(_tint_texture(entry.material)))
         else:
             _copy_model(entry, entry.source, path)
-        infos[str(entry.obj_id)] = corrected_entry(_read_source_info(entry), make_model_info(entry))
+        info = corrected_entry(_read_source_info(entry), make_model_info(entry))
+        infos[str(entry.obj_id)] = info | make_mechanics(entry) if mechanics else info
     _write_json(folder / "models_info.json", infos)
 
 
@@ -109,6 +110,17 @@ def make_model_info(entry: CatalogEntry) -> dict[str, Any]:
         info["symmetries_continuous"] = [
             {"axis": list(axis), "offset": [MILLIMETERS * value for value in offset]} for axis, offset in entry.symmetries_continuous
         ]
+    return info
+
+
+def make_mechanics(entry: CatalogEntry) -> dict[str, Any]:
+    """Keys of an object in models_info.json for manipulation: mass [kg], centre of mass [mm], inertia about it (row by row) [kg·mm²], and
+    the area on which a suction cup seals [mm²], with its fraction of the surface, if measured."""
+    center, inertia = MILLIMETERS * entry.center_of_mass, MILLIMETERS**2 * entry.inertia
+    info: dict[str, Any] = {"mass": entry.mass, "center_of_mass": center.tolist(), "inertia": inertia.ravel().tolist()}
+    if entry.suctionable is not None:
+        area, fraction = entry.suctionable
+        info |= {"suctionable_area": MILLIMETERS**2 * area, "suctionable_fraction": fraction}
     return info
 
 
