@@ -226,9 +226,7 @@ def measure(
         "environment": measure_environment(functools.partial(make_picking, source=config), config.bake.worlds, min_seconds),
         "picks": measure_picks(config),
     }
-    for part, rows in others.items():
-        if part in parts:
-            yield from of_part(part, rows)
+    yield from itertools.chain.from_iterable(of_part(part, rows) for part, rows in others.items() if part in parts)
 
 
 def _measure_worlds(quality: int, factory: Factory, min_seconds: float, parts: tuple[str, ...]) -> Iterator[Row]:
