@@ -216,6 +216,14 @@ class Physics:
         "Warm start every contact from one of the last substep. Newton leaves one of two coincident contacts out, as edges on a face have: "
         "up to half of their load is lost in every substep, and boxes that lie ten deep move five times as fast.",
     )
+    sleep: float = setting(
+        0.0,
+        "m",
+        "Objects in contact with each other fall asleep when none moved farther in each of three ticks, such as 2e-4, and are not "
+        "simulated until one is touched; 0: none do. Records have no contact forces of sleeping objects.",
+        low=0.0,
+        high=0.01,
+    )
     friction: float = setting(0.5, "", "Coulomb friction coefficient of every shape.", low=0.0, high=10.0)
     gap: float = setting(4e-3, "m", "Contact margin of a shape: contacts are generated below twice this distance.", low=0.0, high=0.1)
     angular_damping: float = setting(0.05, "1/s", "Angular damping of the objects (PhysX's default).", low=0.0, high=1e3)

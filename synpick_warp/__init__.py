@@ -6,6 +6,7 @@
     view = synpick_warp.open("DATA")[0].view(frame=3)
     for batch in synpick_warp.stream("smoke", worlds=8):     # the same views on the device, without files
         ...
+    env = synpick_warp.make_env(task="pick", num_envs=8)      # the same worlds, and you choose the picks
 
 Importing this package loads neither simulator, NumPy nor OpenCV; the functions import them when they are called.
 """
@@ -17,28 +18,42 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from synpick_warp.errors import CatalogError, ConfigError, DatasetError, DeviceError, LightError, OutputError, SynpickError
+from synpick_warp.errors import (
+    ActionError,
+    CatalogError,
+    ConfigError,
+    DatasetError,
+    DeviceError,
+    LightError,
+    OutputError,
+    StateError,
+    SynpickError,
+)
 from synpick_warp.system.processes.garbage import collection_paused
 
 if TYPE_CHECKING:
     from synpick_warp.configs.schema import Config
     from synpick_warp.dataset.reading import DataSet
+    from synpick_warp.environment.vector import PickingVectorEnv
     from synpick_warp.factory.episodes import BakeSummary
     from synpick_warp.online.stream import ViewStream
     from synpick_warp.system.progress import Progress
 
 __version__ = "0.2.0"
 __all__ = [
+    "ActionError",
     "CatalogError",
     "ConfigError",
     "DatasetError",
     "DeviceError",
     "LightError",
     "OutputError",
+    "StateError",
     "SynpickError",
     "__version__",
     "bake",
     "load_config",
+    "make_env",
     "open",
     "stream",
 ]
@@ -153,6 +168,61 @@ def stream(
     selection = Selection(cameras, stride)
     progress = progress if progress is not None else SilentProgress()
     return open_stream(resolved, progress, episodes=episodes, shard=shard, splits=splits, selection=selection)
+
+
+def make_env(
+    config: Config | Path | str | None = None,
+    settings: Mapping[str, object] | None = None,
+    *,
+    task: str = "pick",
+    num_envs: int = 1,
+    device: str | None = None,
+    obs: Sequence[str] = ("depth", "state"),
+    resolution: tuple[int, int] = (160, 90),
+    action: str | None = None,
+    autoreset: str = "next_step",
+    backend: str = "torch",
+    seed: int = 0,
+    max_steps: int | None = None,
+    piles: int | None = None,
+    progress: Progress | None = None,
+) -> PickingVectorEnv:
+    """Make a batched environment (`gymnasium.vector.VectorEnv`) in which an action is a pick, or a twist of the gripper for a tick.
+
+        env = synpick_warp.make_env(task="pick", num_envs=512, device="cuda:0", obs=("depth",), resolution=(160, 90), action="pixel")
+        obs, info = env.reset(seed=3)
+        obs, reward, terminated, truncated, info = env.step(env.action_space.sample())
+
+    Piles are those of a bake with the same settings, at rest. See `synpick_warp/environment/README.md`.
+
+    Args:
+        config, settings: Settings, as for `bake`.
+        task: "pick": any object; "target": the one that the observation names; "move": stir the bin.
+        num_envs: Number of environments.
+        device: Overrides `bake.device`.
+        obs: Contents of the observation, a dict: of depth, rgb, instances, normals, state.
+        resolution: Width and height of images of camera 0 [px].
+        action: "pixel" or "point": a whole pick; "twist": a tick. None: "pixel", of task "move" "twist".
+        autoreset: "next_step", "same_step" or "disabled", as Gymnasium defines them.
+        backend: Library of the arrays: "torch" or "warp", on the device, or "numpy".
+        seed: Seed of the first environment's episodes if `reset` gets none; the others follow.
+        max_steps: Steps after which an episode is truncated; None: 30 attempts, or 600 ticks.
+        piles: Number of different episodes; None: no two are the same.
+        progress: Receives stages and notes; None: silent.
+
+    Raises:
+        SynpickError: An error that the user can correct.
+        ModuleNotFoundError: Gymnasium is not installed, or for backend "torch" PyTorch.
+    """
+    with collection_paused():
+        from synpick_warp.environment.make import make_picking, require_libraries
+        from synpick_warp.environment.settings import make_choice
+
+    choice = make_choice(task, num_envs, obs, resolution, action, autoreset, backend, seed, max_steps, piles)
+    require_libraries(backend)
+    from synpick_warp.environment.vector import PickingVectorEnv
+
+    return PickingVectorEnv(make_picking(choice, config, settings or {}, device, progress))
 
 
 def load_config(preset_or_file: Path | str | None = None, settings: Mapping[str, object] | None = None, *, splits: bool = False) -> Config:

@@ -45,6 +45,10 @@ class StateError(SynpickError):
     """A state of worlds does not fit the simulation, or cannot be taken."""
 
 
+class ActionError(SynpickError):
+    """Actions for an environment cannot be carried out."""
+
+
 class ResultError(SynpickError):
     """A file of pose estimates cannot be used."""
 

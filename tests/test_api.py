@@ -32,13 +32,13 @@ def test_everything_offered_exists():
     assert all(hasattr(synpick_warp, name) for name in synpick_warp.__all__)
     errors = [getattr(synpick_warp, name) for name in synpick_warp.__all__ if name.endswith("Error")]
     assert all(issubclass(error, synpick_warp.SynpickError) for error in errors)
-    assert len(errors) == 7
+    assert len(errors) == 9
 
 
 def test_no_module_takes_the_name_of_a_function():
     """Importing a submodule sets an attribute of its package, which would replace the function."""
     functions = [name for name in synpick_warp.__all__ if isinstance(getattr(synpick_warp, name), types.FunctionType)]
-    assert functions == ["bake", "load_config", "open", "stream"]
+    assert functions == ["bake", "load_config", "make_env", "open", "stream"]
     modules = {path.stem for path in (ROOT / "synpick_warp").iterdir()}
     assert modules.isdisjoint(functions)
 

@@ -28,7 +28,7 @@ SOURCE = re.compile(r"`([\w.-]+(?:/[\w.*-]+)+)/?(?::[\w.]+)?`")
 """A path in backticks, such as `stages/ticks:TickLoop.advance` or `tests/stubs/`."""
 BASES = ("", "synpick_warp", "synpick_warp/stages", "synpick_warp/exporters", "kernels", "kernels/render")
 """Folders that paths in backticks leave out, besides that of their document."""
-DATA = {"..", "SPLIT", "Shoe", "coco", "episodes", "manifest", "materials", "meta", "models", "source", "train_pbr_web", "usd"}
+DATA = {"..", "SPLIT", "Shoe", "coco", "episodes", "manifest", "materials", "meta", "models", "picks", "source", "train_pbr_web", "usd"}
 """First parts of paths in data sets, in folders of models, and beside the checkout."""
 SECONDS = 600
 """Longest time that a block may take."""

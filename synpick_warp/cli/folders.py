@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from synpick_warp.cli.options import one_line
-from synpick_warp.configs.schema import Bake, Config, Split
+from synpick_warp.configs.schema import Bake, Split
 from synpick_warp.errors import DatasetError, OutputError, SynpickError, escape
 
 if TYPE_CHECKING:
@@ -56,10 +56,14 @@ def _has(path: str, kind: Callable[[int], bool]) -> bool:
 # ---- where a bake writes ----
 
 
-def choose_output(config: Config) -> tuple[Path, str]:
+def choose_output(manifest: dict[str, Any], bake: Bake, splits: Sequence[Split]) -> tuple[Path, str]:
     """Choose the folder of a bake without --out: that of the same bake, else the first of DEFAULT_NAME and its neighbours that is free.
 
     The same bake has the same settings, number of episodes, and folders of objects and lights; it resumes.
+
+    Args:
+        manifest: Its manifest.
+        bake, splits: Of its settings.
 
     Returns:
         The folder, relative to the current one, and the choice in a line.
@@ -74,10 +78,8 @@ def choose_output(config: Config) -> tuple[Path, str]:
         raise OutputError(f"the current folder cannot be read: {error.strerror}; name the data set's folder with --out") from None
     if inside is not None:
         raise OutputError(f"the current folder is in the data set {inside}; name the new data set's folder with --out")
-    from synpick_warp.dataset.commit.manifest import make_manifest
-
-    known, manifest = {number: Path(name) for number, name in names}, make_manifest(config)
-    own = next((folder for folder in known.values() if _is_same_bake(folder, manifest, _extent(config.bake, config.splits))), None)
+    known = {number: Path(name) for number, name in names}
+    own = next((folder for folder in known.values() if _is_same_bake(folder, manifest, _extent(bake, splits))), None)
     if own is not None:
         return own, f"data set: ./{own}, which the same bake has started"
     number = 1

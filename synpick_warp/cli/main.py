@@ -172,7 +172,9 @@ def bake(
     part = parse_shard(shard) if shard is not None else (0, 1)
     DataLayout.of(resolved).plan_shard(names, part, "--shard")
     if out is None:
-        out, choice = choose_output(resolved)
+        from synpick_warp.dataset.commit.manifest import make_manifest
+
+        out, choice = choose_output(make_manifest(resolved), resolved.bake, resolved.splits)
         print(choice, flush=True)
     if not profile and profile_out is None:
         return _bake(resolved, out, part, names, several)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any, cast
 
 import newton
@@ -29,6 +30,7 @@ class SeparatingBroadPhase(newton.geometry.BroadPhaseAllPairs):
 
     Attributes:
         overlap_count: Number of pairs whose bounding boxes overlap (one) int32; those beyond the capacity for pairs are dropped.
+        choose: Lists those of these pairs (overlap) vec2i, and their number (one) int32, that may have contacts; None: all may.
     """
 
     def __init__(self, pipeline: newton.CollisionPipeline) -> None:
@@ -45,6 +47,7 @@ class SeparatingBroadPhase(newton.geometry.BroadPhaseAllPairs):
         self._occupied_count = wp.zeros(worlds, dtype=wp.int32, device=device)
         self._overlaps = wp.zeros(pipeline.broad_phase_shape_pairs.shape[0], dtype=wp.vec2i, device=device)
         self.overlap_count = wp.zeros(1, dtype=wp.int32, device=device)
+        self.choose: Callable[[wp.array, wp.array], tuple[wp.array, wp.array]] | None = None
         self._axes = wp.zeros((worlds, shapes.count * (shapes.count - 1) // 2), dtype=wp.uint32, device=device)
 
     def launch(  # pyright: ignore[reportIncompatibleMethodOverride]  # Newton passes further arguments by keyword.
@@ -87,7 +90,8 @@ class SeparatingBroadPhase(newton.geometry.BroadPhaseAllPairs):
                 device=device,
             )
         threads = worlds * SEPARATION_THREADS if device.is_cuda else 1
-        inputs = [shapes, threads, self._axes, self._poses, self._geometry, shape_lower, shape_upper, self._overlaps, self.overlap_count]
+        chosen = (self._overlaps, self.overlap_count) if self.choose is None else self.choose(self._overlaps, self.overlap_count)
+        inputs = [shapes, threads, self._axes, self._poses, self._geometry, shape_lower, shape_upper, *chosen]
         wp.launch(
             broad_phase.reject_separated_kernel,
             dim=threads,

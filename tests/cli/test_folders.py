@@ -77,18 +77,22 @@ def test_splits_set_their_own_episodes():
     assert load_config("synpick", {"bake.worlds": 512}, splits=True).bake.episodes == 300
 
 
+def chosen(config: Config) -> tuple[Path, str]:
+    return choose_output(make_manifest(config), config.bake, config.splits)
+
+
 def test_a_bake_without_a_folder_takes_the_first_that_is_free_or_its_own(here):
     config, other = load_config("smoke"), load_config("smoke", {"bake.seed": 5})
-    assert choose_output(config) == (Path("synpick-data"), "data set: ./synpick-data (--out names another folder)")
+    assert chosen(config) == (Path("synpick-data"), "data set: ./synpick-data (--out names another folder)")
     (here / "synpick-data").mkdir()
     (here / "synpick-data" / ".git").mkdir()
-    assert choose_output(config)[0] == Path("synpick-data")
+    assert chosen(config)[0] == Path("synpick-data")
     start("synpick-data", config)
-    assert choose_output(config) == (Path("synpick-data"), "data set: ./synpick-data, which the same bake has started")
+    assert chosen(config) == (Path("synpick-data"), "data set: ./synpick-data, which the same bake has started")
     said = "data set: ./synpick-data-2 (--out names another folder; synpick-data is taken)"
-    assert choose_output(other) == (Path("synpick-data-2"), said)
+    assert chosen(other) == (Path("synpick-data-2"), said)
     start("synpick-data-12", other)
-    assert choose_output(other)[0] == Path("synpick-data-12")
+    assert chosen(other)[0] == Path("synpick-data-12")
 
 
 @pytest.mark.parametrize(
@@ -97,13 +101,13 @@ def test_a_bake_without_a_folder_takes_the_first_that_is_free_or_its_own(here):
 )
 def test_another_bake_is_one_of_other_settings_extent_or_inputs(here, given):
     start("synpick-data", load_config("smoke"))
-    assert choose_output(load_config("smoke", given))[0] == Path("synpick-data-2")
+    assert chosen(load_config("smoke", given))[0] == Path("synpick-data-2")
 
 
 def test_where_it_was_baked_and_how_fast_makes_no_other_bake(here):
     start("synpick-data", load_config("smoke", {"bake.models": "there"}))
     same = load_config("smoke", {"bake.models": str(here / "there"), "bake.worlds": 1, "bake.episodes": 2, "bake.writers": 3})
-    assert choose_output(same)[0] == Path("synpick-data")
+    assert chosen(same)[0] == Path("synpick-data")
 
 
 def test_what_only_looks_like_a_folder_of_ours_is_left_alone(here):
@@ -116,17 +120,17 @@ def test_what_only_looks_like_a_folder_of_ours_is_left_alone(here):
     (here / "synpick-data-5").mkdir()
     handle = os.open("synpick-data-5", os.O_RDONLY)
     fcntl.flock(handle, fcntl.LOCK_EX)  # A bake that has not written its manifest yet.
-    folder, said = choose_output(config)
+    folder, said = chosen(config)
     os.close(handle)
     assert folder == Path("synpick-data-6")
     assert said.endswith("synpick-data, synpick-data-2, synpick-data-3 and 2 more are taken)")
-    assert choose_output(config)[0] == Path("synpick-data-5")
+    assert chosen(config)[0] == Path("synpick-data-5")
 
 
 def test_a_bake_within_a_data_set_needs_a_folder(here, monkeypatch):
     monkeypatch.chdir(start("DATA", load_config("smoke")) / "manifest")
     with pytest.raises(OutputError, match=r"the current folder is in the data set .*DATA; name the new data set's folder with --out"):
-        choose_output(load_config("smoke"))
+        chosen(load_config("smoke"))
     assert main(["bake", "--config", "smoke", "--device", "cpu"]) == 2
 
 

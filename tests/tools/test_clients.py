@@ -15,6 +15,7 @@ from tests.harness.exporter_contract import export
 from tests.worlds.box_views import cameras, config
 from tools.clients import __main__ as tool
 from tools.clients import base, blender, coco
+from tools.clients.environments import __main__ as environments
 
 CAMERAS = cameras(160, 120)
 FRAMES = 2
@@ -109,3 +110,26 @@ def test_blenders_light_goes_through_our_tone_curve():
 @pytest.mark.parametrize(("count", "frames"), [(1, [0]), (2, [0, 1]), (221, [0, 110, 220])])
 def test_sampled_frames_are_spread_evenly(count, frames):
     assert base.sample_frames(count) == frames
+
+
+# ---- libraries of reinforcement learning ----
+
+
+def test_the_table_of_libraries(tmp_path, monkeypatch, capsys):
+    """Of one that runs, one that fails and one that is not there; the others are not installed."""
+    answers = {
+        "gymnasium": "print('gymnasium 1.4.0', '16 steps', sep=chr(9))",
+        "skrl": "raise ValueError('spaces differ')",
+        "torchrl": "import no_such_library",
+    }
+    for name, text in answers.items():
+        (tmp_path / name).write_text(f"#!{sys.executable}\n{text}\n")
+        (tmp_path / name).chmod(0o755)
+    given = [f"--python={name}={tmp_path / name}" for name in ("all", *answers)]
+    assert environments.main([*given, "--json", str(tmp_path / "table.json")]) == 1
+    rows = {row["client"]: row for row in json.loads((tmp_path / "table.json").read_text())["more"]["clients"]}
+    assert (rows["gymnasium"]["version"], rows["gymnasium"]["remark"]) == ("gymnasium 1.4.0", "16 steps")
+    assert rows["skrl"]["remark"] == "FAILED: ValueError: spaces differ"
+    assert [name for name, row in rows.items() if row["remark"].startswith("not installed")] == ["statistics", "torchrl", "rsl_rl"]
+    assert "spaces differ" in capsys.readouterr().out
+    assert environments.main(["--python", "keras=python"]) == 2

@@ -13,6 +13,7 @@ unless --parts names some.
 from __future__ import annotations
 
 import argparse
+import functools
 import itertools
 import resource
 import sys
@@ -28,6 +29,7 @@ from synpick_warp.cli.commands.doctor import GIB, describe_machine
 from synpick_warp.cli.main import parse_resolution
 from synpick_warp.codes import Status
 from synpick_warp.configs.schema import Cameras, Config
+from synpick_warp.environment.make import make_picking
 from synpick_warp.errors import SynpickError
 from synpick_warp.exporters.registry import Needs
 from synpick_warp.factory.assembly import Factory, build_factory
@@ -40,6 +42,7 @@ from synpick_warp.system.hardware.device import pick_device
 from synpick_warp.system.progress import SilentProgress
 from tools.bench.compare.peers import PEERS, check_installed, measure_peers
 from tools.bench.encode import measure_encoding
+from tools.bench.environment import measure_environment
 from tools.bench.growth import measure_growth
 from tools.bench.heaps import measure_heaps, measure_perception
 from tools.bench.patches import measure_patches
@@ -64,8 +67,8 @@ from tools.options import (
 )
 
 DEFAULT_PARTS = ("physics", "perception", "render", "encode", "write", "stream", "steady")
-PARTS = (*DEFAULT_PARTS, "pictures", "whole", "trajectories", "growth", "patches", "heaps")
-OWN_WORLDS = {"pictures", "steady", "whole", "trajectories", "growth", "patches", "heaps"}
+PARTS = (*DEFAULT_PARTS, "pictures", "whole", "trajectories", "growth", "patches", "heaps", "environment")
+OWN_WORLDS = {*PARTS[len(DEFAULT_PARTS) :], "steady"}
 """Parts that build worlds of their own."""
 WORLDS = 512
 """Default number of worlds of all parts but `whole`."""
@@ -219,6 +222,7 @@ def measure(
         "growth": measure_growth(config, min_seconds, instances),
         "patches": measure_patches(config),
         "heaps": measure_heaps(config, min_seconds),
+        "environment": measure_environment(functools.partial(make_picking, source=config), config.bake.worlds, min_seconds),
     }
     for part, rows in others.items():
         if part in parts:

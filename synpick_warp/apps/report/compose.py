@@ -28,10 +28,11 @@ from synpick_warp.apps.report.sampling import (
     sample_views,
 )
 from synpick_warp.apps.report.strips import choose_episodes, make_strip
-from synpick_warp.apps.report.tables import findings_list, settings_tables, statistics_tables, tiles
+from synpick_warp.apps.report.tables import changed_settings, findings_list, settings_tables, statistics_tables, tiles
 from synpick_warp.apps.statistics import Statistics, compute_statistics
 from synpick_warp.apps.statistics.picks import find_picks
 from synpick_warp.apps.viz.depth_colors import bin_scale
+from synpick_warp.configs.files.write import config_to_toml
 from synpick_warp.dataset.commit.manifest import read_manifest
 from synpick_warp.dataset.reading import DataSet
 from synpick_warp.dataset.view import View
@@ -215,9 +216,14 @@ def _parts(data_set: DataSet, statistics: Statistics, samples: Samples, findings
             "settings",
             "Configuration",
             "Settings that differ from the preset synpick, which has the paper's values.",
-            settings_tables(data_set.config, versions) if data_set.found is None else element("p", _NO_SETTINGS, class_="empty"),
+            _settings_tables(data_set, versions) if data_set.found is None else element("p", _NO_SETTINGS, class_="empty"),
         ),
     ]
+
+
+def _settings_tables(data_set: DataSet, versions: Mapping[str, str]) -> Html:
+    """Tables of a data set's settings."""
+    return settings_tables(changed_settings(data_set.config), config_to_toml(data_set.config, comments=True), versions)
 
 
 _NO_SETTINGS = "A BOP data set from another source than synpick-warp bake: there are no settings."

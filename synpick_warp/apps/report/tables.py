@@ -10,7 +10,7 @@ from synpick_warp.apps.statistics import Statistics
 from synpick_warp.apps.statistics.tables import make_tables
 from synpick_warp.codes import Outcome
 from synpick_warp.configs.files.load import load_config, sections, settings_of
-from synpick_warp.configs.files.write import config_to_toml, format_toml
+from synpick_warp.configs.files.write import format_toml
 from synpick_warp.configs.schema import Config
 from synpick_warp.system.codecs.tables import Table
 
@@ -74,9 +74,8 @@ def findings_list(findings: Sequence[Finding]) -> Html:
     return element("ul", items, class_="findings")
 
 
-def settings_tables(config: Config, versions: Mapping[str, str]) -> Html:
-    """Settings that differ from the default preset with their meaning, versions, and all settings as TOML."""
-    rows = changed_settings(config)
+def settings_tables(rows: Sequence[tuple[str, str, str, str]], toml: str, versions: Mapping[str, str]) -> Html:
+    """Settings that differ from the default preset, as `changed_settings` has them, versions, and all settings as TOML."""
     if rows:
         changed = plain_table(("setting", "here", "default", "meaning"), rows, ("", "wide", "wide", "meaning"))
     else:
@@ -85,8 +84,8 @@ def settings_tables(config: Config, versions: Mapping[str, str]) -> Html:
     if versions:
         shown = [(name, version or "not installed") for name, version in versions.items()]
         parts.append(element("div", element("h3", "Versions"), plain_table(("package", "version"), shown, ("", "")), class_="scroll"))
-    toml = element("pre", config_to_toml(config, comments=True), tabindex="0")
-    return join([*parts, element("details", element("summary", "All settings, with units and ranges"), toml)])
+    text = element("pre", toml, tabindex="0")
+    return join([*parts, element("details", element("summary", "All settings, with units and ranges"), text)])
 
 
 def changed_settings(config: Config) -> list[tuple[str, str, str, str]]:

@@ -84,6 +84,7 @@ YOUNGER_SETTINGS: dict[str, Any] = {
     "arrangement.drop": COLUMN,
     "settle.restless": 0.0,
     "physics.match_all": False,
+    "physics.sleep": 0.0,
     "depth_sensor.preset": "",
     "depth_sensor.disparity_noise": 0.0,
     "depth_sensor.max_disparity": 0.0,

@@ -77,6 +77,16 @@ class Watcher(Protocol):
         """Called after a step; `step` is its index in the tick, `current` the state at its end."""
 
 
+class Sleepers(Protocol):
+    """Bodies that a substep leaves out. Its launches are captured in graphs."""
+
+    def touch(self) -> None:
+        """Called between collision detection and solver."""
+
+    def hold(self, before: newton.State, after: newton.State) -> None:
+        """Called after the solver, with the states before and after the substep."""
+
+
 class Physics:
     """Newton's model, state, solver and collision pipeline. `state` is the current state before and after `tick`.
 
@@ -100,6 +110,8 @@ class Physics:
         self.solver_stream: wp.Stream | None = None
         """CUDA stream for the captured kernels of the solver, from the next tick on; None: the current stream. It may be confined to few
         multiprocessors, since these kernels are short and small, while those of collision detection need many."""
+        self.sleepers: Sleepers | None = None
+        """None: all bodies are simulated."""
         self._first_radius, self._first_transform = wp.clone(self.model.shape_collision_radius), wp.clone(self.model.shape_transform)
         self._graphs: dict[wp.Stream | None, list[wp.Graph]] = {}
         self._observables = self.solver.observables({self.solver.ObservableKind.CONTACT_F}, contacts=self.contacts)
@@ -245,10 +257,14 @@ class Physics:
                 before_step(current)
             self.pipeline.collide(current, self.contacts)
             self.flag_lost()
+            if self.sleepers is not None:
+                self.sleepers.touch()
             if after_collide is not None:
                 after_collide()
             with wp.ScopedStream(solver_stream, sync_exit=True):
                 self.solver.step(current, following, self.control, self.contacts, physics.step / physics.substeps, observables=observables)
+            if self.sleepers is not None:
+                self.sleepers.hold(current, following)
             current, following = following, current
             ends_step = substep + 1 == physics.substeps
             if ends_step and current is not self.state:

@@ -28,6 +28,7 @@ from synpick_warp.stages.render.scene import RenderScene
 from synpick_warp.stages.sim import arrange, gripper
 from synpick_warp.stages.sim.behavior import BEHAVIORS, Hold
 from synpick_warp.stages.sim.physics import ENDED, Physics
+from synpick_warp.stages.sim.sleep import Sleep
 from synpick_warp.stages.sim.states import State, WorldStates
 from synpick_warp.stages.sim.step_log import PhysicsRecord, StepRecorder
 from synpick_warp.stages.sim.worlds import AttemptState, SealState, WorldState, WorldStatus, world_sizes
@@ -106,6 +107,7 @@ class Simulation:
             states = (self.state, self.attempts, self.seals)
             self.recorder = StepRecorder(config.gripper, self.scene, *states, self.physics, sizes, **parts)
         self.record = replace(record, physics=self.recorder.record if self.recorder is not None else None)
+        self.sleep = Sleep(self.scene, self.physics) if config.physics.sleep > 0.0 else None
         self.behavior = BEHAVIORS[config.gripper.kind]
         self._is_between_ticks = False
         """Whether a tick is complete and none has begun."""
@@ -174,6 +176,8 @@ class Simulation:
         groups |= {name: getattr(self.record, name) for name in ("snapshot", "status", "observation", "plan")}
         if self.recorder is not None:
             groups["drops"] = self.recorder.record.drops
+        if self.sleep is not None:
+            groups["sleep"] = self.sleep.state
         return WorldStates(groups, self.physics, self.catalog, self.state.variant, self.state.restarted)
 
     def get_state(self, worlds: Sequence[int]) -> State:
@@ -221,6 +225,8 @@ class Simulation:
         gripper.park_removed(scene, state, self.attempts, physics)
         physics.refresh_poses()
         arrange.judge_episodes(scene, state, self.attempts, self.observation, physics)
+        if self.sleep is not None:
+            self.sleep.judge(state, self.attempts, self.seals, self.config.physics.sleep)
 
     def _drive(self, current: newton.State) -> None:
         """Hook before a step: forces of gripper and hold."""

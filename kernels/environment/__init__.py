@@ -1,0 +1,1 @@
+"""Device code of the batched environment: starts of episodes, actions, observations."""

@@ -1,0 +1,135 @@
+"""Attempts of the environment: a world begins the one that its action plans, waits when it has ended, and measures what it did."""
+
+import warp as wp
+
+from synpick_warp.codes import Outcome, Phase, Task
+from synpick_warp.kernels.bitsets import NO_MEMBERS, has_member
+from synpick_warp.kernels.sim.trials import count_lost, measure_motion
+from synpick_warp.kernels.structs import LayoutData
+
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.struct
+class Results:
+    """What the last attempt of each world did, and what it is measured from."""
+
+    outcome: wp.array[int]
+    """(world): `Outcome`; NONE if the episode failed first, with its `Ending`."""
+    picked: wp.array[int]
+    """(world): first instance attached at the end; -1: none."""
+    hits: wp.array[wp.vec2i]
+    """(world): suction rays that hit an object, and the cups with a good seal: bit k, cup k."""
+    peak_force: wp.array[float]
+    """(world): largest seal force, including seals that broke [N]."""
+    ticks: wp.array[int]
+    """(world): duration [ticks]."""
+    moved: wp.array[int]
+    """(world): number of objects, but for the one picked, displaced by more than a threshold."""
+    farthest: wp.array[float]
+    """(world): largest displacement of one of them [m]."""
+    lost: wp.array[int]
+    """(world): objects that left the bin without being picked."""
+    lost_before: wp.array[int]
+    """(world): objects lost in the episode before the attempt began."""
+    pose: wp.array2d[wp.transform]
+    """(world, instance): pose of each object when the attempt began [m]."""
+
+
+@wp.kernel
+def begin_results_kernel(
+    # Scene:
+    layout: LayoutData,
+    # State:
+    removed: wp.array2d[int],  # (world, instance)
+    body_slot: wp.array2d[int],  # (world, instance)
+    body_q: wp.array[wp.transform],  # (body) [m]
+    # Out:
+    results_out: Results,
+):
+    """Write results without effect, and what effects are measured from. Launched over world."""
+    world = wp.tid()
+    results_out.outcome[world] = Outcome.NONE
+    results_out.picked[world] = -1
+    results_out.hits[world] = wp.vec2i(0, 0)
+    results_out.peak_force[world] = 0.0
+    results_out.ticks[world] = 0
+    results_out.moved[world] = 0
+    results_out.farthest[world] = 0.0
+    results_out.lost[world] = 0
+    results_out.lost_before[world] = count_lost(removed, world)
+    body = world * layout.bodies + layout.gripper_bodies
+    for instance in range(layout.instances):
+        results_out.pose[world, instance] = body_q[body + body_slot[world, instance]]
+
+
+@wp.kernel
+def begin_attempts_kernel(
+    # State:
+    running: wp.array[int],  # (world)
+    task_inout: wp.array[int],  # (world)
+    attempt_inout: wp.array[int],  # (world)
+    # Out:
+    steps_out: wp.array[int],  # (world)
+    hits_out: wp.array[wp.vec2i],  # (world)
+    engaged_words_out: wp.array2d[wp.uint32],  # (world, word)
+):
+    """Begin the planned attempt in running worlds, with task APPROACH. Launched over world."""
+    world = wp.tid()
+    if running[world] == 0:
+        return
+    attempt_inout[world] = attempt_inout[world] + 1
+    task_inout[world] = Task.APPROACH
+    steps_out[world] = 0
+    hits_out[world] = wp.vec2i(0, 0)
+    for word in range(engaged_words_out.shape[1]):
+        engaged_words_out[world, word] = NO_MEMBERS
+
+
+@wp.kernel
+def judge_attempts_kernel(
+    # Scene:
+    layout: LayoutData,
+    moved_distance: float,
+    # State:
+    phase: wp.array[int],  # (world)
+    outcome: wp.array[int],  # (world)
+    hits: wp.array[wp.vec2i],  # (world)
+    attached_words: wp.array2d[wp.uint32],  # (world, word)
+    peak_force: wp.array[float],  # (world) [N]
+    catalog_index: wp.array2d[int],  # (world, instance)
+    removed: wp.array2d[int],  # (world, instance)
+    body_slot: wp.array2d[int],  # (world, instance)
+    body_q: wp.array[wp.transform],  # (body) [m]
+    # Out:
+    running_inout: wp.array[int],  # (world)
+    results_inout: Results,
+    world_out: wp.array[int],  # (world)
+    done_inout: wp.array[int],  # (one)
+):
+    """Measure running attempts; `running` of those that have ended in this tick becomes 0, and `done` counts them.
+
+    `world` receives the index of their world, else -1. Launched over world, at the end of a tick.
+    """
+    world = wp.tid()
+    world_out[world] = -1
+    if running_inout[world] == 0:
+        return
+    picked = int(-1)
+    for instance in range(layout.instances):
+        if picked < 0 and has_member(attached_words, world, instance):
+            picked = instance
+    moved, farthest = measure_motion(layout, world, picked, moved_distance, catalog_index, body_slot, body_q, results_inout.pose)
+    results_inout.outcome[world] = outcome[world]
+    results_inout.picked[world] = picked
+    results_inout.hits[world] = hits[world]
+    results_inout.peak_force[world] = wp.max(results_inout.peak_force[world], peak_force[world])
+    results_inout.ticks[world] = results_inout.ticks[world] + 1
+    results_inout.moved[world] = moved
+    results_inout.farthest[world] = farthest
+    results_inout.lost[world] = count_lost(removed, world) - results_inout.lost_before[world]
+    if outcome[world] == Outcome.NONE and phase[world] == Phase.ACT:
+        return
+    world_out[world] = world
+    running_inout[world] = 0
+    wp.atomic_add(done_inout, 0, 1)

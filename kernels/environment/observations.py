@@ -1,0 +1,132 @@
+"""Observations: images of every world without loss of precision, and the state as a vector."""
+
+import warp as wp
+
+from synpick_warp.codes import Segment
+from synpick_warp.kernels.render.lighting.materials import Surfaces, interpolate_surface
+from synpick_warp.kernels.render.visibility.camera import ImageGrid, Views, camera_ray, in_image, tile_pixel
+from synpick_warp.kernels.render.visibility.gbuffer import GBuffer, Meshes, ViewBodies, body_of
+from synpick_warp.kernels.structs import TILT, LayoutData
+
+wp.set_module_options({"enable_backward": False})
+
+# Values of the gripper at the beginning of a state vector: wrist (3), yaw, tilt, number of held objects.
+GRIPPER_VALUES = wp.constant(6)
+# Values of an instance: present, obj_id, held, pose (7).
+INSTANCE_VALUES = wp.constant(10)
+
+
+@wp.kernel
+def copy_images_kernel(
+    # Scene:
+    meshes: Meshes,
+    surfaces: Surfaces,
+    grid: ImageGrid,
+    # In:
+    bodies: ViewBodies,
+    gbuffer: GBuffer,
+    views: Views,
+    first: int,
+    # Out:
+    depth_out: wp.array3d[float],  # (world, row, column) [m]
+    segment_out: wp.array3d[wp.uint8],  # (world, row, column)
+    normal_out: wp.array3d[wp.vec3],  # (world, row, column)
+):
+    """Write planar depth (0: no surface), segmentation id and unit shading normal (up where no mesh is seen) to the images of the worlds.
+
+    Launched over view, pixel (tile order, from flat index `first` on).
+    """
+    view, row, column = tile_pixel(grid, wp.tid() + first)
+    if not in_image(grid, row, column) or views.world[view] < 0:
+        return
+    world = views.world[view]
+    seen = gbuffer.segment[view, row, column]
+    segment = int(seen)
+    segment_out[world, row, column] = seen
+    depth = float(0.0)
+    if segment != Segment.NOTHING:
+        depth = gbuffer.depth[view, row, column]
+    depth_out[world, row, column] = depth
+    normal = wp.vec3(0.0, 0.0, 1.0)
+    if segment != Segment.NOTHING and segment != Segment.TABLE:
+        ray = views.cameras.to_world[view] * camera_ray(views.cameras, view, row, column, wp.vec2(0.0, 0.0))
+        triangle = gbuffer.triangle[view, row, column]
+        barycentric = gbuffer.barycentric[view, row, column]
+        body = body_of(segment, views.instances)
+        # Only the normal is used; the pixel width (0) affects texture filtering alone.
+        surface = interpolate_surface(meshes, surfaces, bodies, view, body, triangle, barycentric, -wp.normalize(ray), 0.0)
+        normal = surface.normal
+    normal_out[world, row, column] = normal
+
+
+@wp.kernel
+def write_target_masks_kernel(
+    # In:
+    segment: wp.array3d[wp.uint8],  # (world, row, column)
+    target: wp.array[int],  # (world)
+    # Out:
+    mask_out: wp.array3d[wp.uint8],  # (world, row, column)
+):
+    """Mask of the visible pixels of each world's target: 1, elsewhere 0. Launched over world, row, column."""
+    world, row, column = wp.tid()
+    mask_out[world, row, column] = wp.uint8(0)
+    if target[world] >= 0 and int(segment[world, row, column]) == target[world] + 1:
+        mask_out[world, row, column] = wp.uint8(1)
+
+
+@wp.kernel
+def write_target_points_kernel(
+    # In:
+    target: wp.array[int],  # (world)
+    planned: wp.array[wp.vec3],  # (world) [m]
+    # Out:
+    point_out: wp.array[wp.vec3],  # (world) [m]
+):
+    """Copy the planned grasp points of worlds with a target; 0 elsewhere. Launched over world."""
+    world = wp.tid()
+    point_out[world] = wp.vec3(0.0, 0.0, 0.0)
+    if target[world] >= 0:
+        point_out[world] = planned[world]
+
+
+@wp.kernel
+def write_states_kernel(
+    # Scene:
+    layout: LayoutData,
+    object_id: wp.array[int],  # (body)
+    # State:
+    catalog_index: wp.array2d[int],  # (world, instance)
+    body_slot: wp.array2d[int],  # (world, instance)
+    attached: wp.array2d[int],  # (world, instance)
+    yaw: wp.array[float],  # (world) [rad]
+    joint_q: wp.array[float],  # (coord) [m, rad]
+    body_q: wp.array[wp.transform],  # (body) [m]
+    # Out:
+    state_out: wp.array2d[float],  # (world, value)
+):
+    """Write each world's state vector: wrist, yaw, tilt, number of held objects; then for each instance present, obj_id, held, pose.
+
+    An instance that is not in the scene has zeros. Launched over world.
+    """
+    world = wp.tid()
+    q = world * layout.coords
+    for axis in range(3):
+        state_out[world, axis] = joint_q[q + axis]
+    state_out[world, 3] = yaw[world]
+    state_out[world, 4] = joint_q[q + TILT]
+    held = float(0.0)
+    for instance in range(layout.instances):
+        first = int(GRIPPER_VALUES) + instance * int(INSTANCE_VALUES)
+        index = catalog_index[world, instance]
+        for value in range(int(INSTANCE_VALUES)):
+            state_out[world, first + value] = 0.0
+        if index >= 0:
+            state_out[world, first] = 1.0
+            state_out[world, first + 1] = float(object_id[index])
+            if attached[world, instance] != 0:
+                state_out[world, first + 2] = 1.0
+                held += 1.0
+            pose = body_q[world * layout.bodies + layout.gripper_bodies + body_slot[world, instance]]
+            for value in range(7):
+                state_out[world, first + 3 + value] = pose[value]
+    state_out[world, 5] = held

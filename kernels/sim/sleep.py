@@ -1,0 +1,257 @@
+"""Island sleeping: objects that rest in contact with each other fall asleep together, and are not simulated until something touches one.
+
+An island is a connected component of the contact graph; bins and the table, which never move, connect nothing. Islands fall asleep at the
+end of a tick and may wake in any substep. What sleeps is a pose without velocity: it has neither contacts nor constraint rows.
+"""
+
+import warp as wp
+
+from synpick_warp.codes import Phase
+from synpick_warp.kernels.structs import LayoutData
+
+wp.set_module_options({"enable_backward": False})
+
+# Ticks in a row in which an object must be quiet before it falls asleep.
+QUIET_TICKS = wp.constant(3)
+
+
+@wp.func
+def body_of(shape_body: wp.array[int], shape: int) -> int:
+    """Body of a contact's shape; -1: none, it is fixed."""
+    if shape < 0:
+        return -1
+    return shape_body[shape]
+
+
+@wp.func
+def is_asleep(layout: LayoutData, asleep: wp.array2d[int], body: int) -> bool:
+    """Whether a body is that of an object that sleeps; False for the gripper, and for -1, a fixed shape."""
+    if body < 0:
+        return False
+    world = body // layout.bodies
+    slot = body - world * layout.bodies - layout.gripper_bodies
+    return slot >= 0 and asleep[world, wp.max(slot, 0)] != 0
+
+
+@wp.kernel
+def list_awake_pairs_kernel(
+    # Scene:
+    layout: LayoutData,
+    threads: int,
+    shape_body: wp.array[int],  # (shape)
+    # State:
+    asleep: wp.array2d[int],  # (world, slot)
+    # In:
+    overlap: wp.array[wp.vec2i],  # (overlap)
+    overlap_count: wp.array[int],  # (one)
+    # Out:
+    pair_out: wp.array[wp.vec2i],  # (overlap)
+    pair_count_inout: wp.array[int],  # (one)
+):
+    """Stream compaction: list the pairs of shapes of which one belongs to a body that is awake, in arbitrary order.
+
+    Launched over a fixed number of threads, which stride over the pairs.
+    """
+    thread = wp.tid()
+    for index in range(thread, wp.min(overlap_count[0], overlap.shape[0]), threads):
+        one = shape_body[overlap[index][0]]
+        other = shape_body[overlap[index][1]]
+        if (one >= 0 and not is_asleep(layout, asleep, one)) or (other >= 0 and not is_asleep(layout, asleep, other)):
+            pair_out[wp.atomic_add(pair_count_inout, 0, 1)] = overlap[index]
+
+
+@wp.kernel
+def wake_touched_kernel(
+    # Scene:
+    layout: LayoutData,
+    threads: int,
+    # State:
+    contact_count: wp.array[int],  # (one)
+    shape0: wp.array[int],  # (contact)
+    shape1: wp.array[int],  # (contact)
+    shape_body: wp.array[int],  # (shape)
+    asleep: wp.array2d[int],  # (world, slot)
+    island: wp.array2d[int],  # (world, slot)
+    # Out:
+    woken_out: wp.array2d[int],  # (world, slot)
+):
+    """Mark the islands of sleeping bodies in contact with a body that is awake: `woken` is 1 for the slot that names the island.
+
+    Contacts exist before surfaces meet, at twice the contact margin. Launched over a fixed number of threads, which stride over the
+    contacts.
+    """
+    thread = wp.tid()
+    for contact in range(thread, wp.min(contact_count[0], shape0.shape[0]), threads):
+        one = body_of(shape_body, shape0[contact])
+        other = body_of(shape_body, shape1[contact])
+        if one >= 0 and other >= 0:
+            one_sleeps = is_asleep(layout, asleep, one)
+            if one_sleeps != is_asleep(layout, asleep, other):
+                sleeper = wp.where(one_sleeps, one, other)
+                world = sleeper // layout.bodies
+                slot = sleeper - world * layout.bodies - layout.gripper_bodies
+                woken_out[world, island[world, slot]] = 1
+
+
+@wp.kernel
+def hold_sleepers_kernel(
+    # Scene:
+    layout: LayoutData,
+    # State:
+    joint_q: wp.array[float],  # (coord) [m, rad]
+    joint_qd: wp.array[float],  # (dof) [m/s, rad/s]
+    body_q: wp.array[wp.transform],  # (body) [m]
+    body_qd: wp.array[wp.spatial_vector],  # (body) [m/s, rad/s]
+    island: wp.array2d[int],  # (world, slot)
+    woken: wp.array2d[int],  # (world, slot)
+    asleep_inout: wp.array2d[int],  # (world, slot)
+    # Out:
+    quiet_out: wp.array2d[int],  # (world, slot) [ticks]
+    joint_q_out: wp.array[float],  # (coord) [m, rad]
+    joint_qd_out: wp.array[float],  # (dof) [m/s, rad/s]
+    body_q_out: wp.array[wp.transform],  # (body) [m]
+    body_qd_out: wp.array[wp.spatial_vector],  # (body) [m/s, rad/s]
+):
+    """Hold the sleeping bodies through a substep: they get the coordinates that they had before it; then wake those of woken islands.
+
+    Without contacts the solver let them fall. Launched over world, slot.
+    """
+    world, slot = wp.tid()
+    if asleep_inout[world, slot] == 0:
+        return
+    q = world * layout.coords + layout.gripper_dofs + 7 * slot
+    qd = world * layout.dofs + layout.gripper_dofs + 6 * slot
+    body = world * layout.bodies + layout.gripper_bodies + slot
+    for axis in range(7):
+        joint_q_out[q + axis] = joint_q[q + axis]
+    for axis in range(6):
+        joint_qd_out[qd + axis] = joint_qd[qd + axis]
+    body_q_out[body] = body_q[body]
+    body_qd_out[body] = body_qd[body]
+    if woken[world, island[world, slot]] != 0:
+        asleep_inout[world, slot] = 0
+        quiet_out[world, slot] = 0
+
+
+@wp.func
+def find_root(parent: wp.array[int], body: int) -> int:
+    """Root of a body's tree in a forest of parents."""
+    root = body
+    while parent[root] != root:
+        root = parent[root]
+    return root
+
+
+@wp.kernel
+def begin_islands_kernel(
+    # Out:
+    parent_out: wp.array[int],  # (body)
+):
+    """Make each body an island of its own. Launched over body."""
+    body = wp.tid()
+    parent_out[body] = body
+
+
+@wp.kernel
+def join_islands_kernel(
+    # State:
+    contact_count: wp.array[int],  # (one)
+    shape0: wp.array[int],  # (contact)
+    shape1: wp.array[int],  # (contact)
+    shape_body: wp.array[int],  # (shape)
+    # Out:
+    parent_inout: wp.array[int],  # (body)
+):
+    """Union-find (disjoint sets) without locks: join the islands of the two bodies of each contact under the smaller root.
+
+    A root's parent only ever becomes smaller, and what it replaces is joined in turn; so the roots do not depend on the order of threads.
+    Launched over contact.
+    """
+    contact = wp.tid()
+    if contact >= contact_count[0]:
+        return
+    one = body_of(shape_body, shape0[contact])
+    other = body_of(shape_body, shape1[contact])
+    if one < 0 or other < 0:
+        return
+    one = find_root(parent_inout, one)
+    other = find_root(parent_inout, other)
+    while one != other:
+        high = wp.max(one, other)
+        low = wp.min(one, other)
+        before = wp.atomic_min(parent_inout, high, low)
+        if before == high:
+            return
+        one = find_root(parent_inout, before)
+        other = find_root(parent_inout, low)
+
+
+@wp.func
+def stop(layout: LayoutData, world: int, slot: int, joint_qd_out: wp.array[float], body_qd_out: wp.array[wp.spatial_vector]):
+    """Set the velocities of a body to zero."""
+    for axis in range(6):
+        joint_qd_out[world * layout.dofs + layout.gripper_dofs + 6 * slot + axis] = 0.0
+    body_qd_out[world * layout.bodies + layout.gripper_bodies + slot] = wp.spatial_vector(0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+
+
+@wp.kernel
+def judge_sleep_kernel(
+    # Scene:
+    layout: LayoutData,
+    threshold: float,
+    # State:
+    phase: wp.array[int],  # (world)
+    catalog_index: wp.array2d[int],  # (world, instance)
+    body_slot: wp.array2d[int],  # (world, instance)
+    displacement: wp.array2d[float],  # (world, instance) [m]
+    removed: wp.array2d[int],  # (world, instance)
+    attached: wp.array2d[int],  # (world, instance)
+    parent: wp.array[int],  # (body)
+    # Out:
+    restless_inout: wp.array[int],  # (body), zero before the launch
+    woken_inout: wp.array2d[int],  # (world, slot)
+    asleep_inout: wp.array2d[int],  # (world, slot)
+    island_inout: wp.array2d[int],  # (world, slot)
+    quiet_inout: wp.array2d[int],  # (world, slot) [ticks]
+    joint_qd_out: wp.array[float],  # (dof) [m/s, rad/s]
+    body_qd_out: wp.array[wp.spatial_vector],  # (body) [m/s, rad/s]
+):
+    """Send islands to sleep of which no object moved by more than `threshold` in each of the last QUIET_TICKS ticks, none is held by a
+    cup, and none touches the gripper; wake those of which an object was attached or left the scene. Only in phase ACT.
+
+    `woken` ends as zero, `island` is the slot of the island's root. Launched over world.
+    """
+    world = wp.tid()
+    first = world * layout.bodies + layout.gripper_bodies
+    if phase[world] != Phase.ACT:
+        for slot in range(layout.slots):
+            asleep_inout[world, slot] = 0
+            quiet_inout[world, slot] = 0
+        return
+    for body in range(world * layout.bodies, first):
+        restless_inout[find_root(parent, body)] = 1
+    for instance in range(layout.instances):
+        slot = body_slot[world, instance]
+        is_gone = removed[world, instance] != 0
+        if is_gone or catalog_index[world, instance] >= 0:
+            is_held = is_gone or attached[world, instance] != 0
+            is_quiet = not is_held and displacement[world, instance] <= threshold
+            quiet = wp.where(is_quiet, quiet_inout[world, slot] + 1, 0)
+            quiet_inout[world, slot] = quiet
+            if asleep_inout[world, slot] == 0 and quiet < QUIET_TICKS:
+                restless_inout[find_root(parent, first + slot)] = 1
+            if asleep_inout[world, slot] != 0 and is_held:
+                woken_inout[world, island_inout[world, slot]] = 1
+    for instance in range(layout.instances):
+        slot = body_slot[world, instance]
+        if removed[world, instance] != 0 or catalog_index[world, instance] >= 0:
+            if asleep_inout[world, slot] != 0:
+                if woken_inout[world, island_inout[world, slot]] != 0:
+                    asleep_inout[world, slot] = 0
+                    quiet_inout[world, slot] = 0
+            elif restless_inout[find_root(parent, first + slot)] == 0:
+                asleep_inout[world, slot] = 1
+                island_inout[world, slot] = find_root(parent, first + slot) - first
+                stop(layout, world, slot, joint_qd_out, body_qd_out)
+    for slot in range(layout.slots):
+        woken_inout[world, slot] = 0

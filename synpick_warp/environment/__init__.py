@@ -1,0 +1,1 @@
+"""Batched suction environment for reinforcement learning, planning and evaluation of pickers."""

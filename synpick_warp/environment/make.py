@@ -1,0 +1,96 @@
+"""Assembly of an environment from settings."""
+
+from __future__ import annotations
+
+import importlib.util
+from collections.abc import Mapping
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from types import MappingProxyType
+
+import numpy as np
+
+from synpick_warp.configs.schema import Config
+from synpick_warp.environment.picking import PickingEnvironment
+from synpick_warp.environment.settings import (
+    HEADROOM,
+    OBSERVATIONS,
+    PIXEL,
+    TARGET,
+    TORCH,
+    TWIST,
+    Choice,
+    action_bounds,
+    fixed_settings,
+)
+from synpick_warp.errors import ConfigError
+from synpick_warp.factory.assembly import build_smallest, build_stages, compiling_if_cold
+from synpick_warp.factory.memory_plan import check_memory, explain_shortage, plan_memory
+from synpick_warp.factory.sizes import fit_to_device
+from synpick_warp.online.settings import resolve_settings
+from synpick_warp.stages.environment.sight import Sight
+from synpick_warp.stages.environment.twist import TwistLaw
+from synpick_warp.stages.environment.worlds import EnvironmentWorlds
+from synpick_warp.system.hardware.device import pick_device
+from synpick_warp.system.progress import Progress, SilentProgress
+
+NO_WRITERS = 0
+"""Writer processes in the memory plan: none."""
+CACHE = 4096
+"""Most piles that are kept of those that `piles` names; others are settled again when they are wanted."""
+
+
+def require_libraries(backend: str) -> None:
+    """Raise ModuleNotFoundError unless Gymnasium and the library of the arrays are installed."""
+    wanted = {"gymnasium": "make_env needs Gymnasium"} | ({"torch": f'backend="{TORCH}" needs PyTorch'} if backend == TORCH else {})
+    for module, reason in wanted.items():
+        if importlib.util.find_spec(module) is None:
+            raise ModuleNotFoundError(f"{reason}, which is not installed: pip install {module}", name=module)
+
+
+def make_picking(
+    choice: Choice,
+    source: Config | Path | str | None = None,
+    settings: Mapping[str, object] = MappingProxyType({}),
+    device_name: str | None = None,
+    progress: Progress | None = None,
+) -> PickingEnvironment:
+    """Build worlds and observations on a device.
+
+    Args:
+        choice: What `make_env` was asked for.
+        source, settings: Settings, as for `bake`.
+        device_name: Overrides `bake.device`.
+        progress: Observer.
+
+    Raises:
+        SynpickError: A setting is not allowed, the machine has too little memory, or device, models, lights, bin or cameras cannot be used.
+    """
+    progress = progress or SilentProgress()
+    config = resolve_settings(source, {**settings, **fixed_settings(choice)}, {"device": device_name})
+    device = pick_device(config.bake.device)
+    config = fit_to_device(config, device, 1, NO_WRITERS)
+    check_memory(plan_memory(config, device, NO_WRITERS), device)
+    with explain_shortage(config):
+        smallest = partial(build_smallest, config, device, SilentProgress(), False, True)
+        with compiling_if_cold(smallest, device, progress):
+            stages = build_stages(config, device, progress, [])
+        config, simulation = stages.config, stages.simulation
+        camera = config.rig.index(config.perception.camera)
+        group = next(one for one in stages.groups if camera in one.cameras)
+        if group.placed:
+            raise ConfigError(f"{config.rig.label(camera)} is not the same in all episodes; environments observe a fixed camera")
+        bounds = action_bounds(config.cell.bins, config.bins)
+        law = None
+        if choice.action == TWIST:
+            tcp = np.array([0.0, 0.0, config.gripper.cup_length])
+            law = TwistLaw(simulation, bounds[0] + tcp, bounds[1] + tcp + (0.0, 0.0, HEADROOM))
+            simulation.behavior = replace(simulation.behavior, law=law)
+        wanted = [OBSERVATIONS[name] for name in choice.obs] + (["depth"] if choice.action == PIXEL else [])
+        if "rgb" in choice.obs and not group.colors:
+            raise ConfigError(f"obs has rgb, but {config.rig.label(camera)} has none among its modalities")
+        sight = Sight(config.perception, config.rig, simulation, group, choice.resolution, wanted, shows_gripper=law is not None)
+        kept = choice.piles if choice.piles <= CACHE else 0
+        worlds = EnvironmentWorlds(simulation, sight, choice.num_envs, kept, law, choice.task == TARGET)
+    return PickingEnvironment(choice, worlds, bounds)

@@ -1,0 +1,249 @@
+"""Batched suction environment, without a library of environments: reset, step, states and branches.
+
+`vector` makes a Gymnasium environment of it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from synpick_warp.codes import Ending, Outcome, Phase
+from synpick_warp.environment.arrays import Exporter, to_host
+from synpick_warp.environment.episodes import Episodes, check_mask, choose_environments, choose_indices, make_seeds
+from synpick_warp.environment.settings import (
+    MOVE,
+    NEXT_STEP,
+    OBSERVATIONS,
+    PIXEL,
+    POINT,
+    SAME_STEP,
+    TARGET,
+    Choice,
+)
+from synpick_warp.errors import ActionError, StateError
+from synpick_warp.stages.environment.worlds import EnvironmentWorlds
+from synpick_warp.stages.sim.states import State
+
+TWIST_SPEED, TWIST_RATE = 0.25, 1.0
+"""Velocity [m/s] and rates [rad/s] of a twist of 1; of the ways to a seal, an attempt takes the last 5 cm at 0.1 m/s."""
+ACTION_SIZES = {PIXEL: 2, POINT: 6}
+COMMAND = 6
+
+
+@dataclass(frozen=True, eq=False)
+class EnvironmentState:
+    """State of all environments: simulation, on the device, and counters."""
+
+    worlds: State
+    episodes: Episodes
+
+
+class Step(NamedTuple):
+    """Result of a step, in arrays of the caller's library, by environment."""
+
+    obs: dict[str, Any]
+    reward: Any
+    terminated: Any
+    truncated: Any
+    info: dict[str, Any]
+
+
+class PickingEnvironment:
+    """Environments whose actions are picks, or twists of the gripper; see the README of this package.
+
+    Attributes:
+        choice: Arguments of `make_env`.
+        worlds: The simulation.
+        episodes: Counters.
+        bounds: Lowest and highest point that an action may name.
+    """
+
+    def __init__(self, choice: Choice, worlds: EnvironmentWorlds, bounds: tuple[np.ndarray, np.ndarray]) -> None:
+        self.choice, self.worlds, self.bounds = choice, worlds, bounds
+        self.count = choice.num_envs
+        self.exporter = Exporter(choice.backend, worlds.device)
+        self.episodes = Episodes.of(self.count)
+        self.episodes.reseed(make_seeds(choice.seed, self.count), np.arange(self.count))
+        self._is_new = True
+        """Whether no environment has been reset yet."""
+
+    def reset(
+        self, seed: int | Sequence[int | None] | None = None, options: Mapping[str, Any] | None = None
+    ) -> tuple[dict[str, Any], dict[str, Any]]:
+        """Begin episodes: in all environments, or those that `options` choose.
+
+        Args:
+            seed: Seed of the first environment, those of the others follow; or one for each; None: their next episodes.
+            options: "reset_mask" (environment) bool or "env_idx": environments to reset; "episode": index of the episode, or one for each
+                of them.
+
+        Returns:
+            Observation and info.
+
+        Raises:
+            ConfigError: A seed or an option is not allowed.
+            StateError: A pile does not come to rest.
+        """
+        options = options or {}
+        chosen = np.arange(self.count) if self._is_new else choose_environments(options, self.count)
+        if seed is not None:
+            self.episodes.reseed(make_seeds(seed, self.count)[chosen], chosen)
+        self._begin(chosen, choose_indices(options, len(chosen)))
+        self._is_new = False
+        return self.observe(), self._describe()
+
+    def step(self, actions: Any) -> Step:
+        """Carry out an action in each environment: an attempt to its end, or a tick.
+
+        Raises:
+            ActionError: Actions have another shape, are not finite, or lie outside of image or bin.
+            StateError: `reset` comes first.
+        """
+        if self._is_new:
+            raise StateError("an environment is reset before its first step")
+        episodes, autoreset = self.episodes, self.choice.autoreset
+        over = episodes.over.copy()
+        results = self._act(~over, self.check_actions(actions, ~over))
+        reward = np.where(over, 0.0, self._reward(results)).astype(np.float32)
+        self._judge(~over)
+        terminated, truncated = episodes.terminated.copy(), episodes.truncated.copy()
+        info = self._describe(results)
+        if autoreset == NEXT_STEP:
+            terminated[over] = truncated[over] = False
+            if over.any():
+                self._begin(np.flatnonzero(over))
+                info = self._describe(results)
+        obs = self.observe()
+        if autoreset == SAME_STEP and episodes.over.any():
+            ended = episodes.over.copy()
+            final, info = info, {}
+            self._begin(np.flatnonzero(ended))
+            mask = self.exporter.from_host(ended)
+            info = self._describe(results)
+            info |= {"final_obs": obs, "_final_obs": mask, "final_observation": obs, "_final_observation": mask}
+            info |= {"final_info": final, "_final_info": mask}
+            obs = self.observe()
+        reward, terminated, truncated = (self.exporter.from_host(values) for values in (reward, terminated, truncated))
+        return Step(obs, reward, terminated, truncated, info)
+
+    def observe(self) -> dict[str, Any]:
+        """Observation of the environments as they are."""
+        arrays = self.worlds.sight.observe(self.worlds.simulation.record.snapshot)
+        return {name: self.exporter.from_device(getattr(arrays, OBSERVATIONS[name]), self.count) for name in self.choice.obs}
+
+    def get_state(self) -> EnvironmentState:
+        """State of all environments, from which they continue bit by bit; raises StateError if memory is too short."""
+        return EnvironmentState(self.worlds.get_state(), self.episodes.copy())
+
+    def set_state(self, state: EnvironmentState, mask: Any = None) -> dict[str, Any]:
+        """Have the environments of a mask (environment) bool continue from a state; None: all. Returns the observation.
+
+        Raises:
+            ConfigError: The mask is none.
+            StateError: The state is of other environments.
+        """
+        chosen = np.arange(self.count) if mask is None else np.flatnonzero(check_mask("mask", mask, self.count))
+        self.worlds.set_state(state.worlds, chosen.tolist())
+        self.episodes.assign(state.episodes, chosen)
+        self._is_new = False
+        return self.observe()
+
+    def branch(self, environment: int, into: Sequence[int]) -> dict[str, Any]:
+        """Have environments continue as another does, bit by bit; returns the observation. Raises StateError if one does not exist."""
+        self.worlds.branch(environment, into)
+        self.episodes.assign(self.episodes.copy(), list(into), environment)
+        return self.observe()
+
+    def state_to_host(self, state: EnvironmentState) -> dict[str, np.ndarray]:
+        """Copy a state to the host, by name; `np.savez` can store it."""
+        counters = {f"episodes.{name}": array for name, array in vars(state.episodes).items()}
+        return self.worlds.simulation.states.to_host(state.worlds) | counters
+
+    def state_from_host(self, arrays: Mapping[str, np.ndarray]) -> EnvironmentState:
+        """Copy a state of `state_to_host` to the device.
+
+        Raises:
+            StateError: It is of another version, of other objects or capacities, or an array is missing.
+        """
+        counters = {name: f"episodes.{name}" for name in vars(self.episodes)}
+        if missing := [key for key in counters.values() if key not in arrays]:
+            raise StateError(f"the state lacks {missing[0]}; it is of worlds, not of environments")
+        worlds = self.worlds.simulation.states.from_host(arrays)
+        return EnvironmentState(worlds, Episodes(**{name: np.array(arrays[key]) for name, key in counters.items()}))
+
+    def check_actions(self, actions: Any, active: np.ndarray) -> np.ndarray:
+        """Actions on the host (environment, value), those of inactive environments replaced by 0.
+
+        Raises:
+            ActionError: See `step`.
+        """
+        given, action = to_host(actions), self.choice.action
+        shape = (self.count, ACTION_SIZES.get(action, COMMAND))
+        if given.shape != shape:
+            raise ActionError(f"actions have the shape {given.shape}; allowed: {shape}, of a {action} for each environment")
+        given = np.where(active[:, None], given, np.zeros((), given.dtype))
+        if wrong := np.flatnonzero(~np.isfinite(given).all(axis=1)).tolist():
+            raise ActionError(f"the action of environment {wrong[0]} is not finite: {given[wrong[0]].tolist()}")
+        if action == PIXEL:
+            if wrong := np.flatnonzero((given != np.floor(given)).any(axis=1)).tolist():
+                raise ActionError(f"the action of environment {wrong[0]} is no pixel: {given[wrong[0]].tolist()}; allowed: column and row")
+            self._check_within(given, np.zeros(2, int), np.array(self.choice.resolution) - 1, active, "image")
+        if action == POINT:
+            self._check_within(given[:, :3], *self.bounds, active, "space about the bin")
+        return given
+
+    def _check_within(self, given: np.ndarray, low: np.ndarray, high: np.ndarray, active: np.ndarray, place: str) -> None:
+        """Raise ActionError if an active environment's values lie outside of low to high."""
+        outside = active & ((given < low) | (given > high)).any(axis=1)
+        if wrong := np.flatnonzero(outside).tolist():
+            where = f"allowed: {low.round(3).tolist()} to {high.round(3).tolist()}"
+            raise ActionError(f"the action of environment {wrong[0]} lies outside of the {place}: {given[wrong[0]].tolist()}; {where}")
+
+    def _act(self, active: np.ndarray, actions: np.ndarray) -> dict[str, np.ndarray]:
+        """Carry out checked actions in active environments; returns the results by name."""
+        if self.choice.action == PIXEL:
+            return self.worlds.attempt_pixels(active, actions.astype(np.int32))
+        if self.choice.action == POINT:
+            return self.worlds.attempt_points(active, actions[:, :3], actions[:, 3:])
+        scale = np.array([TWIST_SPEED] * 3 + [TWIST_RATE] * 2 + [1.0])
+        return self.worlds.tick(active, np.clip(actions, -1.0, 1.0) * scale)
+
+    def _reward(self, results: Mapping[str, np.ndarray]) -> np.ndarray:
+        """Reward of each environment; see the README."""
+        if self.choice.task == MOVE:
+            return results["moved"]
+        if self.choice.task == TARGET:
+            return results["outcome"] == Outcome.TARGET_PICKED
+        return np.isin(results["outcome"], (Outcome.TARGET_PICKED, Outcome.OTHER_PICKED))
+
+    def _judge(self, active: np.ndarray) -> None:
+        """Count a step of active environments, and end their episodes."""
+        episodes, (phase, ending) = self.episodes, self.worlds.status()
+        ended = active & (phase == Phase.OVER)
+        emptied = ended & (ending == Ending.EMPTIED)
+        episodes.steps[active] += 1
+        episodes.terminated[active] = emptied[active]
+        episodes.truncated[active] = (ended & ~emptied | (episodes.steps >= self.choice.max_steps) & ~emptied)[active]
+
+    def _begin(self, environments: np.ndarray, indices: np.ndarray | None = None) -> None:
+        """Begin the next episodes of environments, or those of the indices."""
+        episodes, piles = self.episodes, self.choice.piles
+        drawn = episodes.draw(environments, piles)
+        episodes.count[environments] += 1
+        following = episodes.draw(np.arange(self.count), piles)
+        chosen = drawn if indices is None else indices
+        self.worlds.reset(environments, chosen.tolist(), following.tolist())
+        episodes.begin(environments, chosen)
+
+    def _describe(self, results: Mapping[str, np.ndarray] | None = None) -> dict[str, Any]:
+        """Info of the environments, arrays by name: episode and steps, and after a step its results, with a mask of each."""
+        episodes = self.episodes
+        arrays: dict[str, np.ndarray] = {"episode_index": episodes.index.copy(), "steps": episodes.steps.copy()}
+        arrays["ending"] = self.worlds.status()[1].copy()
+        arrays |= results or {}
+        exported = {name: self.exporter.from_host(values) for name, values in arrays.items()}
+        return exported | {f"_{name}": self.exporter.from_host(np.ones(self.count, bool)) for name in arrays}

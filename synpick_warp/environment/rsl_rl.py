@@ -1,0 +1,81 @@
+"""Adapter for rsl_rl: its `VecEnv`, with observations as a TensorDict.
+
+    env = RslRlEnv(synpick_warp.make_env(task="pick", num_envs=512, action="point", obs=("state",), autoreset="same_step"))
+    OnPolicyRunner(env, settings).learn(100)
+
+This module needs rsl_rl.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch  # pyright: ignore[reportMissingImports]
+from rsl_rl.env import VecEnv  # pyright: ignore[reportMissingImports]
+from tensordict import TensorDict  # pyright: ignore[reportMissingImports]
+
+from synpick_warp.environment.settings import PIXEL, SAME_STEP, TORCH
+from synpick_warp.environment.vector import PickingVectorEnv
+from synpick_warp.errors import ConfigError
+
+GROUPS = ("rgb", "normals")
+"""Observations whose last dimension is that of channels."""
+WHITE = 255.0
+
+
+class RslRlEnv(VecEnv):
+    """Environment of rsl_rl: actions from -1 to 1, images with their channels first, colours from 0 to 1.
+
+    Attributes:
+        max_episode_length: Steps after which an episode is truncated.
+        cfg: Arguments of the environment, for rsl_rl's logs.
+    """
+
+    def __init__(self, env: PickingVectorEnv) -> None:
+        """
+        Args:
+            env: Environment with actions "point" or "twist", autoreset "same_step" and backend "torch".
+
+        Raises:
+            ConfigError: It has others.
+        """
+        choice = env.environment.choice
+        if choice.action == PIXEL or choice.autoreset != SAME_STEP or choice.backend != TORCH:
+            raise ConfigError(f'rsl_rl needs action "point" or "twist", autoreset "{SAME_STEP}" and backend "{TORCH}"')
+        self.env, self.num_envs, self.device = env, env.num_envs, torch.device(env.device)
+        low, high = (torch.as_tensor(end, device=self.device) for end in (env.single_action_space.low, env.single_action_space.high))
+        self._middle, self._half = (low + high) / 2, (high - low) / 2
+        self.num_actions, self.max_episode_length, self.cfg = len(low), choice.max_steps, {"task": choice.task, "action": choice.action}
+        self._obs = env.reset()[0]
+
+    @property
+    def episode_length_buf(self) -> Any:
+        """Steps of each environment's episode."""
+        return torch.as_tensor(self.env.environment.episodes.steps, device=self.device)
+
+    @episode_length_buf.setter
+    def episode_length_buf(self, steps: Any) -> None:
+        self.env.environment.episodes.steps[:] = steps.cpu().numpy()
+
+    def get_observations(self) -> Any:
+        """Observations, a TensorDict (environment)."""
+        return TensorDict({name: _channels_first(name, values) for name, values in self._obs.items()}, batch_size=[self.num_envs])
+
+    def reset(self) -> tuple[Any, dict[str, Any]]:
+        """Begin the next episodes everywhere."""
+        self._obs, info = self.env.reset()
+        return self.get_observations(), info
+
+    def step(self, actions: Any) -> tuple[Any, Any, Any, dict[str, Any]]:
+        """Carry out actions (environment, value), clamped to -1 to 1."""
+        self._obs, reward, terminated, truncated, info = self.env.step(self._middle + self._half * actions.clamp(-1.0, 1.0))
+        log = {f"/{name}": info[name].float().mean() for name in ("moved", "lost")}
+        return self.get_observations(), reward, terminated | truncated, {"time_outs": truncated, "log": log}
+
+
+def _channels_first(name: str, values: Any) -> Any:
+    """Observation as rsl_rl's networks take it: vectors as they are, images (environment, channel, row, column) float32."""
+    if values.ndim < 3:
+        return values
+    images = values.movedim(-1, 1) if name in GROUPS else values.unsqueeze(1)
+    return images.float() / WHITE if name == "rgb" else images.float()

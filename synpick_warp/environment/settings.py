@@ -1,0 +1,146 @@
+"""Arguments of `make_env`, checked, and the settings of the worlds that follow from them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from synpick_warp.configs.cell.extents import BinSizes
+from synpick_warp.configs.check import to_index
+from synpick_warp.configs.fields import INT32_MAX
+from synpick_warp.configs.schema import Bins
+from synpick_warp.errors import ConfigError, format_value, suggest
+
+PICK, TARGET, MOVE = TASKS = ("pick", "target", "move")
+PIXEL, POINT, TWIST = ACTIONS = ("pixel", "point", "twist")
+NEXT_STEP, SAME_STEP, DISABLED = AUTORESETS = ("next_step", "same_step", "disabled")
+TORCH, NUMPY, WARP = BACKENDS = ("torch", "numpy", "warp")
+OBSERVATIONS: Mapping[str, str] = {
+    "depth": "depth",
+    "rgb": "color",
+    "instances": "segment",
+    "normals": "normal",
+    "state": "state",
+    "target_mask": "mask",
+    "target_point": "point",
+}
+"""Field of `SightArrays` of each observation, by its name."""
+TARGETS = ("target_mask", "target_point")
+"""Observations of task TARGET alone, which has them without being asked: the mask if there are images."""
+IMAGES = ("depth", "rgb", "instances", "normals", "target_mask")
+MAX_STEPS: Mapping[str, int] = {PIXEL: 30, POINT: 30, TWIST: 600}
+"""Steps after which an episode is truncated, by action: attempts, or ticks (40 s)."""
+RESAMPLES = 1000
+"""Arrangements that a pile may take to come to rest: an environment cannot go without."""
+HEADROOM = 0.3
+"""Height above the rim up to which points are actions, and beyond that setpoints stay [m]."""
+
+
+@dataclass(frozen=True)
+class Choice:
+    """Arguments of `make_env`, checked."""
+
+    task: str
+    num_envs: int
+    obs: tuple[str, ...]
+    resolution: tuple[int, int]
+    action: str
+    autoreset: str
+    backend: str
+    seed: int
+    max_steps: int
+    piles: int
+    """Number of different episodes."""
+
+
+def make_choice(
+    task: str,
+    num_envs: int,
+    obs: Sequence[str],
+    resolution: Sequence[int],
+    action: str | None,
+    autoreset: str,
+    backend: str,
+    seed: int,
+    max_steps: int | None,
+    piles: int | None,
+) -> Choice:
+    """Check arguments of `make_env`.
+
+    Raises:
+        ConfigError: A value is not allowed.
+    """
+    _check_choice("task", task, TASKS)
+    action = action or (TWIST if task == MOVE else PIXEL)
+    for name, value, allowed in (("action", action, ACTIONS), ("autoreset", autoreset, AUTORESETS), ("backend", backend, BACKENDS)):
+        _check_choice(name, value, allowed)
+    if task == MOVE and action != TWIST:
+        raise ConfigError(f'action is "{action}"; task "{MOVE}" is driven by "{TWIST}" alone')
+    names = (obs,) if isinstance(obs, str) else tuple(obs)
+    for name in names:
+        _check_choice("obs", name, tuple(OBSERVATIONS))
+        if name in TARGETS and task != TARGET:
+            raise ConfigError(f'obs has {name}, but task "{task}" has no target')
+    if task == TARGET:
+        names += (TARGETS[1],) if not set(names) & set(IMAGES) else TARGETS
+    if not names:
+        raise ConfigError(f"obs is empty; allowed: one or more of {', '.join(OBSERVATIONS)}")
+    limits = {"num_envs": num_envs, "max_steps": MAX_STEPS[action] if max_steps is None else max_steps}
+    limits |= {"piles": INT32_MAX if piles is None else piles}
+    for name, value in limits.items():
+        if (to_index(value) or 0) < 1:
+            raise ConfigError(f"{name} is {format_value(value)}; allowed: a whole number from 1 on")
+    sides = [to_index(side) or 0 for side in resolution] if isinstance(resolution, Sequence) else []
+    if len(sides) != 2 or min(sides) < 1:
+        raise ConfigError(f"resolution is {format_value(resolution)}; allowed: width and height [px]")
+    if to_index(seed) is None:
+        raise ConfigError(f"seed is {format_value(seed)}; allowed: a whole number")
+    return Choice(
+        task, int(num_envs), tuple(dict.fromkeys(names)), (sides[0], sides[1]), action, autoreset, backend, int(seed), *_rest(limits)
+    )
+
+
+def fixed_settings(choice: Choice) -> dict[str, object]:
+    """Settings that the arguments of `make_env` decide, by full key."""
+    fixed: dict[str, object] = {
+        "bake.worlds": choice.num_envs,
+        "bake.mode": choice.task,
+        "cameras.resolution": list(choice.resolution),
+        "pick.failures": INT32_MAX,
+        "settle.tries": RESAMPLES,
+        "render.mode": "unoccluded",
+        "render.history": 0,
+        "render.layers": [],
+    }
+    if choice.task != TARGET:
+        fixed["perception.views"] = 1
+    if "rgb" not in choice.obs:
+        fixed["render.views_per_batch"] = 1
+    return fixed
+
+
+def action_bounds(sizes: Sequence[BinSizes], bins: Bins) -> tuple[np.ndarray, np.ndarray]:
+    """Lowest and highest point that an action may name (3) each float32 [m], in the world: a box about all bins wherever they stand."""
+    sides = []
+    for one in sizes:
+        half = np.array(one.opening) / 2
+        reach = np.full(2, np.hypot(*half)) if bins.yaw > 0 else half
+        sides.append(np.abs(one.origin[:2]) + reach + np.abs(bins.shift))
+    across = np.max(sides, axis=0)
+    ground = min(one.origin[2] for one in sizes)
+    height = max(one.origin[2] + one.height for one in sizes)
+    return np.array([*-across, ground], np.float32), np.array([*across, height + HEADROOM], np.float32)
+
+
+def _rest(limits: Mapping[str, int]) -> tuple[int, int]:
+    """Steps of an episode, and number of episodes."""
+    return int(limits["max_steps"]), min(int(limits["piles"]), INT32_MAX)
+
+
+def _check_choice(name: str, value: object, allowed: Sequence[str]) -> None:
+    """Raise ConfigError unless a value is one of the allowed."""
+    if value not in allowed:
+        hint = suggest(value, allowed) if isinstance(value, str) else ""
+        raise ConfigError(f"{name} is {format_value(value)}; allowed: {', '.join(allowed)}{hint}")

@@ -1,0 +1,243 @@
+"""Environment of whole picks: seeds, rewards, resets, states, and actions that are refused."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from synpick_warp.codes import Outcome, Segment
+from synpick_warp.environment.episodes import Episodes
+from synpick_warp.errors import ActionError, ConfigError, StateError
+from synpick_warp.system.random_numbers import _mix
+from tests.environment.conftest import SIZE, build, centers, same
+
+FLOOR = 1e-3
+"""Error of a point on the floor of the tote, by a depth in single precision [m]."""
+
+
+def floor_pixels(obs) -> np.ndarray:
+    """A pixel of each image that shows the floor of the tote: of those of the tote the farthest."""
+    depth = np.where(obs["instances"] == Segment.TOTE, obs["depth"], 0.0)
+    rows, columns = np.unravel_index(depth.reshape(len(depth), -1).argmax(axis=1), depth.shape[1:])
+    return np.stack([columns, rows], axis=1)
+
+
+# ---- seeds ----
+
+
+def test_a_seed_names_the_piles_whatever_world_they_are_in(environment):
+    first = environment.reset(seed=[3, 4])[0]
+    assert same(first, environment.reset(seed=3)[0])
+    swapped = environment.reset(seed=[4, 3])[0]
+    assert same({name: values[::-1].copy() for name, values in swapped.items()}, first)
+    assert not same(environment.reset()[0], first)
+
+
+def test_an_episode_index_names_a_pile(environment):
+    info = environment.reset(seed=3)[1]
+    first = environment.observe()
+    environment.reset()
+    obs, again = environment.reset(options={"episode": info["episode_index"]})
+    assert same(obs, first)
+    assert again["episode_index"].tolist() == info["episode_index"].tolist()
+
+
+@pytest.mark.slow
+def test_the_number_of_environments_changes_nothing(environment, device):
+    wide, narrow = build(device, num_envs=3), environment
+    actions = np.append(centers(narrow.observe()["instances"]), [[1, 1]], axis=0)
+    for one, count in ((wide, 3), (narrow, 2)):
+        one.reset(seed=3)
+        one.step(actions[:count])
+    for name, values in narrow.observe().items():
+        assert wide.observe()[name][:2].tobytes() == values.tobytes(), name
+
+
+def test_episodes_are_a_hash_of_seed_and_count():
+    episodes = Episodes.of(2)
+    episodes.reseed(np.array([3, 4], np.uint64), np.arange(2))
+    drawn = [episodes.draw(np.arange(2), 2**31 - 1, ahead).tolist() for ahead in range(3)]
+    gamma = 0x9E3779B97F4A7C15
+    assert drawn == [[_mix(seed * gamma + count + 1) % (2**31 - 1) for seed in (3, 4)] for count in range(3)]
+    assert len({index for row in drawn for index in row}) == 6
+    assert (episodes.draw(np.arange(2), 5) < 5).all()
+
+
+# ---- actions and rewards ----
+
+
+def test_a_pick_of_an_object_is_rewarded_and_takes_it_away(environment):
+    obs = environment.observe()
+    step = environment.step(centers(obs["instances"]))
+    assert step.reward.tolist() == [1.0, 1.0]
+    assert [Outcome(outcome) for outcome in step.info["outcome"]] == [Outcome.TARGET_PICKED] * 2
+    present = [values[:, 6::10].sum(axis=1) for values in (obs["state"], step.obs["state"])]
+    assert (present[1] < present[0]).all()
+    for world, picked in enumerate(step.info["picked"]):
+        assert step.obs["state"][world, 6 + 10 * picked] == 0.0
+        assert not (step.obs["instances"][world] == picked + 1).any()
+
+
+def test_a_pick_of_the_floor_catches_nothing(environment):
+    step = environment.step(floor_pixels(environment.observe()))
+    assert step.reward.tolist() == [0.0, 0.0]
+    plan = environment.worlds.simulation.plan
+    np.testing.assert_allclose(plan.point.numpy()[:2, 2], 0.0, atol=FLOOR)
+    np.testing.assert_allclose(plan.normal.numpy()[:2], [[0, 0, 1]] * 2, atol=1e-3)
+    assert plan.target.numpy()[:2].tolist() == [-1, -1]
+
+
+def test_an_empty_bin_terminates_the_episode(environment):
+    environment.choice = replace(environment.choice, max_steps=50)
+    terminated = np.zeros(2, bool)
+    for _ in range(9):
+        step = environment.step(centers(environment.observe()["instances"]))
+        terminated |= step.terminated
+        if terminated.any():
+            break
+    world = int(terminated.argmax())
+    assert step.obs["state"][world, 6::10].sum() == 0.0
+    assert not step.truncated[world]
+    again = environment.step(centers(step.obs["instances"]))
+    assert again.obs["state"][world, 6::10].sum() > 0.0
+    assert (again.reward[world], again.terminated[world], again.info["steps"][world]) == (0.0, False, 0)
+
+
+@pytest.mark.parametrize(
+    ("actions", "message"),
+    [
+        ([[1, 2], [64, 2]], r"environment 1 lies outside of the image: \[64, 2\]; allowed: \[0, 0\] to \[63, 47\]"),
+        ([[-1, 2], [3, 2]], "environment 0 lies outside of the image"),
+        ([[1.0, np.nan], [3, 2]], "the action of environment 0 is not finite"),
+        ([[1.5, 2.0], [3, 2]], "the action of environment 0 is no pixel"),
+        ([1, 2], r"actions have the shape \(2,\); allowed: \(2, 2\), of a pixel for each environment"),
+        ([[1, 2], [3]], "actions have no common shape"),
+        ([["a", "b"]] * 2, "allowed: numbers"),
+    ],
+)
+def test_bad_actions_are_refused(environment, actions, message):
+    before = environment.observe()
+    with pytest.raises(ActionError, match=message):
+        environment.step(actions)
+    assert same(environment.observe(), before)
+
+
+# ---- the ends of episodes ----
+
+
+def test_next_step_begins_an_episode_with_the_step_after(environment):
+    environment.choice = replace(environment.choice, max_steps=1)
+    last = environment.step(floor_pixels(environment.observe()))
+    assert last.truncated.all()
+    first = environment.step(np.zeros((2, 2), int))
+    assert not first.truncated.any()
+    assert (first.info["episode_index"] != last.info["episode_index"]).all()
+    assert (first.info["steps"] == 0).all()
+
+
+def test_same_step_has_the_last_observation_in_its_info(environment):
+    pixels = floor_pixels(environment.observe())
+    environment.choice = replace(environment.choice, max_steps=1)
+    last = environment.step(pixels)
+    environment.reset(seed=3)
+    environment.choice = replace(environment.choice, autoreset="same_step")
+    step = environment.step(pixels)
+    assert same(step.info["final_obs"], last.obs)
+    assert step.info["final_obs"] is step.info["final_observation"]
+    assert step.info["_final_obs"].all()
+    assert step.info["_final_info"].all()
+    assert (step.info["final_info"]["episode_index"] == last.info["episode_index"]).all()
+    assert (step.info["episode_index"] != last.info["episode_index"]).all()
+    assert step.truncated.all()
+
+
+def test_disabled_waits_for_a_reset_of_the_mask(environment):
+    environment.choice = replace(environment.choice, autoreset="disabled", max_steps=1)
+    last = environment.step(floor_pixels(environment.observe()))
+    waiting = environment.step(floor_pixels(last.obs))
+    assert same(waiting.obs, last.obs)
+    assert waiting.truncated.all()
+    obs, info = environment.reset(options={"reset_mask": np.array([False, True])})
+    assert info["episode_index"][0] == last.info["episode_index"][0]
+    assert info["episode_index"][1] != last.info["episode_index"][1]
+    assert obs["depth"][0].tobytes() == last.obs["depth"][0].tobytes()
+    assert environment.step(floor_pixels(obs)).info["steps"].tolist() == [1, 1]
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"env": [0]}, "reset has no option env; options: reset_mask, env_idx, episode"),
+        ({"reset_mask": np.ones(3, bool)}, "reset_mask has the type bool and the shape"),
+        ({"reset_mask": np.ones(2)}, "reset_mask has the type float64"),
+        ({"env_idx": [2]}, "allowed: different environments of 0 to 1"),
+        ({"env_idx": [0, 0]}, "allowed: different environments"),
+        ({"episode": -1}, "allowed: an index from 0 on, or one for each of 2 environments"),
+        ({"episode": [1, 2, 3]}, "episode is"),
+    ],
+)
+def test_bad_options_are_refused(environment, options, message):
+    with pytest.raises(ConfigError, match=message):
+        environment.reset(options=options)
+
+
+@pytest.mark.parametrize("seed", [[1], [1, None], "a"])
+def test_bad_seeds_are_refused(environment, seed):
+    with pytest.raises(ConfigError, match="one for each of 2 environments"):
+        environment.reset(seed=seed)
+
+
+# ---- states and branches ----
+
+
+def test_a_branch_sees_what_its_origin_sees(environment):
+    environment.step(centers(environment.observe()["instances"]))
+    obs = environment.branch(0, [1])
+    for _ in range(2):
+        for name, values in obs.items():
+            assert values[0].tobytes() == values[1].tobytes(), name
+        obs = environment.step(np.repeat(centers(obs["instances"])[:1], 2, axis=0)).obs
+    assert environment.episodes.steps.tolist() == [3, 3]
+
+
+def test_a_state_continues_as_before(environment):
+    state, actions = environment.get_state(), centers(environment.observe()["instances"])
+    before, step = environment.observe(), environment.step(actions)
+    host = environment.state_to_host(state)
+    assert same(environment.set_state(environment.state_from_host(host)), before)
+    again = environment.step(actions)
+    assert same(again.obs, step.obs)
+    assert again.reward.tolist() == step.reward.tolist()
+    obs = environment.set_state(state, np.array([True, False]))
+    assert obs["depth"][0].tobytes() == before["depth"][0].tobytes()
+    assert obs["depth"][1].tobytes() == step.obs["depth"][1].tobytes()
+    assert environment.episodes.steps.tolist() == [0, 1]
+
+
+@pytest.mark.parametrize(
+    ("ask", "message"),
+    [
+        (lambda one: one.branch(0, [2]), "there is no environment 2; there are 0 to 1"),
+        (lambda one: one.state_from_host({}), "the state lacks episodes.seed; it is of worlds"),
+        (lambda one: one.state_from_host(one.state_to_host(one.get_state()) | {"version": np.array(0)}), "the state has version 0"),
+        (lambda one: one.state_from_host(one.state_to_host(one.get_state()) | {"catalog": np.array("ab")}), "of another catalog"),
+        (lambda one: one.worlds.bank.fetch(range(99)), "99 piles are asked for at once, but the bank keeps 4"),
+        (lambda one: one.worlds.set_state(one.worlds.simulation.get_state([0]), [0]), "the state is of 1 environments, not of 2"),
+    ],
+)
+def test_states_that_do_not_fit_are_refused(environment, ask, message):
+    with pytest.raises(StateError, match=message):
+        ask(environment)
+
+
+def test_more_branches_than_memory_holds_are_refused(environment, monkeypatch):
+    monkeypatch.setattr("synpick_warp.stages.sim.states.free_host_memory", lambda: 1000)
+    monkeypatch.setattr("synpick_warp.stages.sim.states.free_device_memory", lambda device: 1000)
+    with pytest.raises(StateError, match=r"states of 2 worlds take .* are free; take at most 0"):
+        environment.get_state()
+
+
+def test_pixels_are_those_of_the_user(environment):
+    assert environment.observe()["depth"].shape == (2, SIZE[1], SIZE[0])

@@ -1,0 +1,139 @@
+"""The face to Gymnasium, and arguments that are refused; what needs Gymnasium is skipped where it is not installed."""
+
+from __future__ import annotations
+
+import importlib.util
+
+import numpy as np
+import pytest
+
+import synpick_warp
+from synpick_warp.configs.files.load import load_config
+from synpick_warp.environment.make import make_picking
+from synpick_warp.environment.settings import action_bounds, make_choice
+from synpick_warp.errors import ActionError, ConfigError
+from tests.environment.conftest import ARGUMENTS, SIZE, build, same
+
+needs_gymnasium = pytest.mark.skipif(importlib.util.find_spec("gymnasium") is None, reason="Gymnasium is not installed")
+
+
+@pytest.fixture(scope="module")
+def target(device):
+    """Task TARGET, with points as actions and all observations."""
+    return build(device, task="target", action="point", obs=("rgb", "depth", "normals", "instances", "state"), max_steps=3)
+
+
+# ---- observations and points ----
+
+
+def test_a_target_is_named_by_mask_and_point(target):
+    obs = target.reset(seed=3)[0]
+    assert obs.keys() == {"rgb", "depth", "normals", "instances", "state", "target_mask", "target_point"}
+    for mask, instances in zip(obs["target_mask"], obs["instances"], strict=True):
+        (number,) = np.unique(instances[mask == 1])
+        assert 1 <= number <= 3
+        assert ((instances == number) == (mask == 1)).all()
+    np.testing.assert_allclose(np.linalg.norm(obs["normals"], axis=-1), 1.0, atol=1e-5)
+    assert obs["rgb"].std() > 1.0
+
+
+def test_the_point_of_the_target_picks_it(target):
+    """Along its normal, which the plan of perception has."""
+    obs = target.reset(seed=3)[0]
+    normal = target.worlds.simulation.plan.normal.numpy()[:2]
+    step = target.step(np.concatenate([obs["target_point"], normal], axis=1))
+    assert step.reward.tolist() == [1.0, 1.0]
+
+
+@pytest.mark.parametrize("point", [(0.0, 0.0, 2.0), (0.3, 0.0, 0.1), (0.0, -0.2, 0.1), (0.0, 0.0, -0.01)])
+def test_points_beside_the_bin_are_refused(target, point):
+    target.reset(seed=3)
+    with pytest.raises(ActionError, match=r"environment 1 lies outside of the space about the bin: .*; allowed: \[-0.2"):
+        target.step([[0, 0, 0.1, 0, 0, 1], [*point, 0, 0, 1]])
+
+
+def test_bounds_hold_all_bins(target):
+    config = target.worlds.simulation.config
+    low, high = action_bounds(config.cell.bins, config.bins)
+    positions = target.reset(seed=3)[0]["state"][:, 6:].reshape(-1, 10)
+    positions = positions[positions[:, 0] > 0, 3:6]
+    assert ((positions > low) & (positions < high)).all()
+
+
+# ---- arguments ----
+
+
+@pytest.mark.parametrize(
+    ("changed", "message"),
+    [
+        ({"task": "push"}, 'task is "push"; allowed: pick, target, move'),
+        ({"task": "pik"}, "did you mean pick"),
+        ({"action": "joint"}, "action is"),
+        ({"task": "move", "action": "pixel"}, 'action is "pixel"; task "move" is driven by "twist" alone'),
+        ({"obs": ("depht",)}, "obs is .*; did you mean depth"),
+        ({"obs": ()}, "obs is empty"),
+        ({"obs": ("target_mask",)}, 'obs has target_mask, but task "pick" has no target'),
+        ({"backend": "jax"}, "backend is .*; allowed: torch, numpy, warp"),
+        ({"autoreset": True}, "autoreset is true; allowed: next_step, same_step, disabled"),
+        ({"num_envs": 0}, "num_envs is 0; allowed: a whole number from 1 on"),
+        ({"num_envs": 1.5}, "num_envs is 1.5"),
+        ({"max_steps": -1}, "max_steps is -1"),
+        ({"piles": 0}, "piles is 0"),
+        ({"resolution": (64,)}, r"resolution is \[64\]; allowed: width and height"),
+        ({"resolution": (64, 0)}, "resolution is"),
+        ({"seed": "a"}, 'seed is "a"; allowed: a whole number'),
+    ],
+)
+def test_bad_arguments_are_refused(changed, message):
+    with pytest.raises(ConfigError, match=message):
+        make_choice(**(ARGUMENTS | changed))
+
+
+def test_settings_are_those_given_but_for_what_an_environment_decides(target):
+    config = target.worlds.simulation.config
+    assert config.pick.failures > 1000
+    assert config.bake.mode == "target"
+    assert config.arrangement.max_objects == 3
+    with pytest.raises(ConfigError, match=r"pick\.near_sped"):
+        make_picking(make_choice(**ARGUMENTS), "smoke", {"pick.near_sped": 1})
+    with pytest.raises(ConfigError, match="the configuration has its splits already"):
+        make_picking(make_choice(**ARGUMENTS), load_config("synpick", splits=True))
+
+
+def test_without_gymnasium_there_is_one_line(monkeypatch):
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
+    with pytest.raises(ModuleNotFoundError, match=r"^make_env needs Gymnasium, which is not installed: pip install gymnasium$"):
+        synpick_warp.make_env(backend="numpy")
+
+
+# ---- Gymnasium ----
+
+
+@needs_gymnasium
+def test_the_environment_is_gymnasiums(target):
+    import gymnasium
+
+    from synpick_warp.environment.registration import IDS
+    from synpick_warp.environment.vector import PickingVectorEnv
+
+    env = PickingVectorEnv(target)
+    assert PickingVectorEnv.__bases__ == (gymnasium.vector.VectorEnv,)
+    assert env.metadata["autoreset_mode"] is env.autoreset_mode is gymnasium.vector.AutoresetMode.NEXT_STEP
+    obs, _ = env.reset(seed=3)
+    assert obs in env.observation_space
+    assert env.action_space.sample() in env.action_space
+    assert env.single_action_space.shape == (6,)
+    assert same(env.set_state(env.get_state()), obs)
+    assert {gymnasium.spec(name).kwargs["task"] for name in IDS.values()} == {"pick", "target", "move"}
+
+
+@needs_gymnasium
+@pytest.mark.slow
+def test_the_lines_of_the_readme():
+    env = synpick_warp.make_env(
+        task="pick", num_envs=2, device="cpu", obs=("depth",), resolution=SIZE, action="pixel", backend="numpy", seed=3
+    )
+    env.reset(seed=3)
+    obs, reward, *_ = env.step(env.action_space.sample())
+    assert obs["depth"].shape == (2, *SIZE[::-1])
+    assert reward.shape == (2,)

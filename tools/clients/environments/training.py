@@ -1,0 +1,190 @@
+"""What each library does with the environment: two iterations of its training loop, or its own checks. Runs in its interpreter."""
+
+# Runs where these libraries are, which the type checker may not see.
+# pyright: reportMissingImports=false
+
+from __future__ import annotations
+
+import sys
+import tempfile
+from collections.abc import Callable, Mapping
+from importlib.metadata import version
+from typing import Any
+
+import numpy as np
+
+import synpick_warp
+
+SMALL: dict[str, Any] = {
+    "config": "smoke",
+    "num_envs": 2,
+    "resolution": (64, 48),
+    "seed": 3,
+    "settings": {"arrangement.max_objects": 3, "pick.appear_height": 0.3, "pick.lift_height": 0.3, "pick.lift_speed": 1.0},
+}
+"""Small piles, whose attempts are short."""
+STEPS, ITERATIONS = 4, 2
+"""Steps of an iteration, and iterations."""
+
+
+def make(device: str, **arguments: Any) -> Any:
+    """A small environment."""
+    return synpick_warp.make_env(**{**SMALL, "device": device, **arguments})
+
+
+def check_gymnasium(device: str) -> str:
+    """Spaces, autoreset, seeds and wrappers, as Gymnasium's tests of vector environments ask; `make_vec` by id."""
+    import gymnasium
+    from gymnasium.utils.env_checker import data_equivalence
+
+    name = "synpick_warp.environment.registration:SynPick/Pick-v0"
+    env = gymnasium.make_vec(name, **SMALL, device=device, backend="numpy", obs=("depth", "state"), max_episode_steps=3)
+    assert isinstance(env, gymnasium.vector.VectorEnv)
+    assert isinstance(env.metadata["autoreset_mode"], gymnasium.vector.AutoresetMode)
+    runs = []
+    for _ in range(2):
+        env.action_space.seed(3)
+        results: list[Any] = [env.reset(seed=3)]
+        for _ in range(2 * STEPS):
+            actions = env.action_space.sample()
+            assert actions in env.action_space
+            results.append(env.step(actions))
+            obs, reward, terminated, truncated, _ = results[-1]
+            assert obs in env.observation_space
+            assert reward.dtype == np.float32
+            assert reward.shape == terminated.shape == truncated.shape == (env.num_envs,)
+            assert terminated.dtype == truncated.dtype == bool
+        runs.append(results)
+    assert data_equivalence(*runs, exact=True)
+    assert any(result[3].any() for result in runs[0][1:])
+    return f"{2 * 2 * STEPS} steps, twice equal"
+
+
+def record_statistics(device: str) -> str:
+    """`RecordEpisodeStatistics` counts returns and lengths of episodes, in both modes of autoreset that it knows."""
+    from gymnasium.wrappers.vector import RecordEpisodeStatistics
+
+    lengths = []
+    for mode in ("next_step", "same_step"):
+        env = RecordEpisodeStatistics(make(device, backend="numpy", obs=("state",), autoreset=mode, max_steps=2))
+        env.reset(seed=3)
+        env.action_space.seed(3)
+        for _ in range(STEPS * ITERATIONS):
+            info = env.step(env.action_space.sample())[4]
+            if "episode" in info:
+                lengths += info["episode"]["l"][info["_episode"]].tolist()
+    assert lengths
+    assert set(lengths) <= {1, 2}
+    return f"{len(lengths)} episodes"
+
+
+def train_skrl(device: str) -> str:
+    """PPO with a categorical policy over pixels."""
+    import torch
+    from skrl.agents.torch.ppo import PPO, PPO_CFG
+    from skrl.envs.wrappers.torch import wrap_env
+    from skrl.memories.torch import RandomMemory
+    from skrl.models.torch import DeterministicMixin, Model, MultiCategoricalMixin
+    from skrl.trainers.torch import SequentialTrainer
+
+    env = wrap_env(make(device, backend="torch", obs=("depth",)))
+
+    class Policy(MultiCategoricalMixin, Model):
+        def __init__(self) -> None:
+            Model.__init__(self, observation_space=env.observation_space, action_space=env.action_space, device=env.device)
+            MultiCategoricalMixin.__init__(self)
+            self.net = torch.nn.LazyLinear(sum(SMALL["resolution"]))
+
+        def compute(self, inputs: Mapping[str, Any], role: str) -> Any:
+            return self.net(inputs["observations"]), {}
+
+    class Value(DeterministicMixin, Model):
+        def __init__(self) -> None:
+            Model.__init__(self, observation_space=env.observation_space, action_space=env.action_space, device=env.device)
+            DeterministicMixin.__init__(self)
+            self.net = torch.nn.LazyLinear(1)
+
+        def compute(self, inputs: Mapping[str, Any], role: str) -> Any:
+            return self.net(inputs["observations"]), {}
+
+    models = {"policy": Policy(), "value": Value()}
+    for model in models.values():
+        model.init_state_dict(role="policy")
+    memory = RandomMemory(memory_size=STEPS, num_envs=env.num_envs, device=env.device)
+    with tempfile.TemporaryDirectory() as folder:
+        settings = {"rollouts": STEPS, "learning_epochs": 1, "mini_batches": 1, "experiment": {"directory": folder, "write_interval": 0}}
+        agent = PPO(
+            models=models,
+            memory=memory,
+            cfg=settings,
+            observation_space=env.observation_space,
+            state_space=None,
+            action_space=env.action_space,
+            device=env.device,
+        )
+        before = {name: values.clone() for name, values in models["policy"].state_dict().items()}
+        trainer = SequentialTrainer(
+            env=env, agents=agent, cfg={"timesteps": STEPS * ITERATIONS, "headless": True, "disable_progressbar": True}
+        )
+        trainer.train()
+    assert any((values != before[name]).any() for name, values in models["policy"].state_dict().items())
+    return f"{ITERATIONS} updates; {PPO_CFG.__name__}"
+
+
+def check_torchrl(device: str) -> str:
+    """`check_env_specs` of our adapter and of TorchRL's own wrapper, and a rollout with partial resets."""
+    from torchrl.envs.libs.gym import GymWrapper
+    from torchrl.envs.utils import check_env_specs
+
+    from synpick_warp.environment.torchrl import TorchRlEnv
+
+    env = TorchRlEnv(make(device, obs=("depth", "state"), autoreset="disabled", max_steps=2))
+    check_env_specs(env)
+    frames = env.rollout(STEPS * ITERATIONS, break_when_any_done=False)
+    assert bool(frames["next", "done"].any())
+    if device == "cpu":
+        check_env_specs(GymWrapper(make(device, obs=("state",), action="twist", autoreset="disabled", max_steps=2)))
+    return f"rollout {tuple(frames.shape)}"
+
+
+def train_rsl_rl(device: str) -> str:
+    """`OnPolicyRunner` with PPO on the state, actions being points."""
+    from rsl_rl.runners import OnPolicyRunner
+
+    from synpick_warp.environment.rsl_rl import RslRlEnv
+
+    env = RslRlEnv(make(device, obs=("state",), action="point", autoreset="same_step", max_steps=2))
+    model = {"class_name": "MLPModel", "hidden_dims": [32], "activation": "elu", "obs_normalization": True}
+    gaussian = {"class_name": "GaussianDistribution", "init_std": 0.5, "std_type": "scalar"}
+    ppo = {"class_name": "PPO", "num_learning_epochs": 1, "num_mini_batches": 1, "learning_rate": 1e-3, "gamma": 0.9, "lam": 0.9}
+    settings = {
+        "num_steps_per_env": STEPS,
+        "save_interval": 100,
+        "obs_groups": {"actor": ["state"], "critic": ["state"]},
+        "actor": {**model, "distribution_cfg": gaussian},
+        "critic": model,
+        "algorithm": ppo,
+    }
+    OnPolicyRunner(env, settings, log_dir=None, device=device).learn(ITERATIONS, init_at_random_ep_len=True)
+    return f"{ITERATIONS} iterations"
+
+
+CLIENTS: Mapping[str, tuple[str, Callable[[str], str]]] = {
+    "gymnasium": ("gymnasium", check_gymnasium),
+    "statistics": ("gymnasium", record_statistics),
+    "skrl": ("skrl", train_skrl),
+    "torchrl": ("torchrl", check_torchrl),
+    "rsl_rl": ("rsl-rl-lib", train_rsl_rl),
+}
+"""Distribution and function of each client, which returns a remark, and raises what is wrong."""
+
+
+def main() -> None:
+    """Run the client that the first argument names on the device of the second; prints version and remark as the last line."""
+    package, run = CLIENTS[sys.argv[1]]
+    remark = run(sys.argv[2])
+    print(f"\n{package} {version(package)}\t{remark}")
+
+
+if __name__ == "__main__":
+    main()
