@@ -5,6 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from synpick_warp.configs.files.load import load_config
+from tests.builders import PICKING, boxes
+from tests.worlds.small_worlds import QUICK
+
 torch = pytest.importorskip("torch", exc_type=ImportError)
 train_picker = pytest.importorskip("tools.examples.train_picker", exc_type=ImportError)
 scores = pytest.importorskip("tools.examples.picking_scores", exc_type=ImportError)
@@ -100,3 +104,19 @@ def test_a_mistake_is_one_line(capsys, arguments, said):
     (line,) = capsys.readouterr().err.splitlines()
     assert line.startswith("train_picker: ")
     assert said in line
+
+
+def test_pickers_are_run_from_the_same_piles(device):
+    """In bins of two boxes, whose middles can be picked: distances to contours find them, and each bin becomes empty."""
+    runs = pytest.importorskip("tools.examples.picking_runs", exc_type=ImportError)
+    with boxes():
+        config = load_config("smoke", QUICK | PICKING)
+        environment = runs.make_environment(config, 2, (64, 36), 0, max_steps=6)
+    pickers = train_picker.dense_scores(None, torch.device(str(environment.worlds.device)))
+    picked, piles = runs.run_first_choices(environment, pickers, 2)
+    assert piles == environment.count
+    assert picked.keys() == {"contour", "flatness", "random"}
+    assert picked["contour"] == piles
+    total = runs.run_until_empty(environment, pickers["contour"])
+    assert total.empty == total.bins == environment.count
+    assert total.picked == 2 * total.bins <= total.attempts
