@@ -11,7 +11,7 @@ import pytest
 
 import synpick_warp
 from synpick_warp.apps.report import compose
-from synpick_warp.apps.statistics.picks import ALL, SCORES, UNIFORM, evaluate_picks, picks_figures
+from synpick_warp.apps.statistics.picks import ALL, FACED, SCORES, UNIFORM, evaluate_picks, picks_figures
 from synpick_warp.apps.viz.picks import choose_trial, describe_trial, draw_pick_maps, spread_over_surface, write_pick_sheet
 from synpick_warp.cli.main import main
 from synpick_warp.codes import Ending, Outcome, Share
@@ -58,7 +58,16 @@ def test_maps_mark_the_tried_points(data):
 def trial(data, **changes) -> np.void:
     """A trial that fails after a poor seal, with some columns changed."""
     row = data[0].picks[data[0].picks["repeat"] == 0][:1].copy()
-    values = {"point": (0.1, 0.0, 0.02), "approach": (0.0, 0.6, -0.8), "seal": 0.5, "wrench": 0.8, "hits": 7, "sealed": 0, "success": False}
+    values = {
+        "point": (0.1, 0.0, 0.02),
+        "approach": (0.0, 0.6, -0.8),
+        "normal": (0.0, -1.0, 0.0),
+        "seal": 0.5,
+        "wrench": 0.8,
+        "hits": 7,
+        "sealed": 0,
+        "success": False,
+    }
     values |= {"peak_force": 2.5, "margin": -0.25, "time_to_break": 0.4, "outcome": Outcome.DROPPED, "share": Share.UNIFORM, "moved": 0}
     for name, value in (values | changes).items():
         row[name] = value
@@ -68,7 +77,7 @@ def trial(data, **changes) -> np.void:
 @pytest.mark.parametrize(
     ("changes", "said"),
     [
-        ({}, r"on the box at \(100, 0, 20\) mm, pressed 37 degrees off the vertical"),
+        ({}, r"on the box at \(100, 0, 20\) mm, pressed 37 degrees off the vertical, 53 off the surface normal"),
         ({}, r"seal 0\.50, wrench 0\.80, score 0\.40"),
         ({}, r"7 rays hit; poor seal\|largest seal force 2\.5 N, margin -0\.25: it broke after 0\.40 s\|outcome: every seal broke"),
         ({"hits": 0, "outcome": Outcome.NOTHING_CAUGHT}, r"no ray of the cup hit an object\|outcome: no ray"),
@@ -134,9 +143,10 @@ def test_the_page_has_a_section_of_picks(data, tmp_path, monkeypatch):
 def test_figures_of_hand_made_trials():
     """Success follows the seal alone: its AUC is 1, that of a wrench without meaning 0.5; own grasps and those without outcome are out."""
     count = 8
-    names = ("cluster", "candidate", "share", "weight", "obj_id", "seal", "wrench", "outcome", "success")
+    names = ("cluster", "candidate", "share", "weight", "obj_id", "seal", "wrench", "angle", "outcome", "success")
     trials = np.zeros(
-        count, [(name, np.float64 if name in ("weight", "seal", "wrench") else np.int64) for name in names[:-1]] + [("success", bool)]
+        count,
+        [(name, np.float64 if name in ("weight", "seal", "wrench", "angle") else np.int64) for name in names[:-1]] + [("success", bool)],
     )
     trials["cluster"], trials["candidate"], trials["weight"] = np.arange(count) // 4, np.arange(count) % 4, 2.0
     trials["share"], trials["outcome"], trials["obj_id"] = Share.UNIFORM, Outcome.DROPPED, 3
@@ -146,7 +156,7 @@ def test_figures_of_hand_made_trials():
     figures = evaluate_picks(np.concatenate((trials, extra)), 1, {3: "box"}, draws=20)
     assert (figures.trials, figures.left_out, figures.states, figures.candidates) == (8, 2, 2, 8)
     areas = {(each.population, each.score): each.auc.value for each in figures.scores}
-    assert areas == {(where, score): 0.5 if score == "wrench" else 1.0 for where in (UNIFORM, ALL) for score in SCORES}
+    assert areas == {(where, score): 0.5 if score == "wrench" else 1.0 for where in (UNIFORM, FACED, ALL) for score in SCORES}
     assert figures.objects[0].success.value == 0.5
 
 

@@ -19,8 +19,11 @@ if TYPE_CHECKING:
 
 SCORES = ("seal x wrench", "seal", "wrench")
 """Analytic scores; the first is SuctionNet's."""
-UNIFORM, ALL = "uniform over visible pixels, weighted", "all candidates"
-"""Populations: the unbiased share, with weights, and everything that was sampled, each trial alike."""
+FACING = 10.0
+"""Largest angle between the direction of the press and the surface normal of trials that are pressed along it [°]."""
+UNIFORM, FACED, ALL = "uniform over visible pixels, weighted", f"of these, pressed within {FACING:.0f}° of the normal", "all candidates"
+"""Populations: the unbiased share, with weights; those of it where the gripper can do what the analytic score supposes, as it tilts only so
+far; and everything that was sampled, each trial alike."""
 MIN_OUTCOMES = 5
 """Fewest successes and failures of an object of which an AUC is shown."""
 _KEPT = ("state", "candidate", "repeat", "share", "weight", "obj_id", "seal", "wrench", "outcome", "success")
@@ -67,7 +70,8 @@ class PickFigures:
 
 
 def collect_picks(data_set: DataSet) -> tuple[np.ndarray, int]:
-    """Trials of all episodes, in a structured array with a column `cluster` that numbers states; and the number of episodes with any.
+    """Trials of all episodes, in a structured array with columns `cluster`, which numbers states, and `angle`, between press and surface
+    normal [°]; and the number of episodes with any.
 
     Raises:
         DatasetError: There are none, or a table is damaged.
@@ -77,9 +81,11 @@ def collect_picks(data_set: DataSet) -> tuple[np.ndarray, int]:
         picks = episode.picks
         if not len(picks):
             continue
-        part = np.empty(len(picks), [(name, picks.dtype[name]) for name in _KEPT] + [("cluster", np.int64)])
+        part = np.empty(len(picks), [(name, picks.dtype[name]) for name in _KEPT] + [("cluster", np.int64), ("angle", np.float64)])
         for name in _KEPT:
             part[name] = picks[name]
+        along = -(picks["approach"].astype(np.float64) * picks["normal"]).sum(axis=1)
+        part["angle"] = np.degrees(np.arccos(np.clip(along, -1.0, 1.0)))
         _, order = np.unique(picks["state"], return_inverse=True)
         part["cluster"] = states + order
         states, episodes = states + int(order.max()) + 1, episodes + 1
@@ -105,8 +111,9 @@ def evaluate_picks(trials: np.ndarray, episodes: int, names: dict[int, str], dra
     if not len(counted):
         raise DatasetError("no trial of a sampled candidate has an outcome; bake with more of picks.candidates")
     both = {"seal x wrench": counted["seal"] * counted["wrench"], "seal": counted["seal"], "wrench": counted["wrench"]}
-    uniform = counted["share"] == Share.UNIFORM
-    populations = {UNIFORM: (uniform, np.where(uniform, counted["weight"], 0.0)), ALL: (np.ones(len(counted), bool), np.ones(len(counted)))}
+    uniform, weight = counted["share"] == Share.UNIFORM, counted["weight"]
+    faced = uniform & (counted["angle"] <= FACING)
+    populations = {UNIFORM: (uniform, weight), FACED: (faced, weight), ALL: (np.ones(len(counted), bool), np.ones(len(counted)))}
     figures = []
     for population, (kept, weight) in populations.items():
         for score, values in both.items() if kept.any() else ():

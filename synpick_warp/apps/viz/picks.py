@@ -105,12 +105,15 @@ def draw_pick_maps(view: View, picks: np.ndarray, width: int = WIDTH) -> list[tu
 
 def describe_trial(trial: Mapping[str, Any] | np.void, name: str) -> list[str]:
     """Explain the course of a trial in sentences, from its row; `name`: of the intended object."""
-    tilt = math.degrees(math.acos(float(np.clip(-trial["approach"][2], -1.0, 1.0))))
+    tilt, aside = (
+        math.degrees(math.acos(float(np.clip(-trial["approach"] @ axis, -1.0, 1.0))))
+        for axis in (np.array([0.0, 0.0, 1.0]), trial["normal"])
+    )
     place = ", ".join(f"{1e3 * value:.0f}" for value in trial["point"])
     how = Share(int(trial["share"])).name.lower()
     lines = [
         f"candidate {trial['candidate']} of state {trial['state']} ({how}), trial {trial['repeat']}: on {name} at ({place}) mm,"
-        f" pressed {tilt:.0f} degrees off the vertical",
+        f" pressed {tilt:.0f} degrees off the vertical, {aside:.0f} off the surface normal",
         f"analytic: seal {trial['seal']:.2f}, wrench {trial['wrench']:.2f}, score {trial['seal'] * trial['wrench']:.2f}",
     ]
     if np.any(trial["offset"]) or np.any(trial["rotation"]) or trial["friction"] != 1.0:
