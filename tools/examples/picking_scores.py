@@ -12,12 +12,12 @@ import numpy as np
 import torch  # pyright: ignore[reportMissingImports]
 from torch.nn import functional  # pyright: ignore[reportMissingImports]
 
+from synpick_warp.apps.statistics.ranking import Scored
+
 WINDOW = 7
 """Side of the window over which normals vary [px]: about the cup's lip (10 mm radius) in 320 px of the tote's width."""
 LONGEST = 40
 """Largest distance to a contour that is told apart [px]."""
-DRAWS = 1000
-"""Bootstrap samples."""
 Z = 1.959964
 """Quantile of the normal distribution for a 95 % interval."""
 
@@ -71,31 +71,19 @@ def score_random(sight: Sight, generator: torch.Generator) -> torch.Tensor:
     return torch.where(sight.instance > 0, drawn, 0.0)
 
 
-def average_precision(score: np.ndarray, success: np.ndarray, weight: np.ndarray) -> float:
-    """Average precision of scores (sample) for successes, with weights; NaN without successes. Ties in the order of samples."""
-    order = np.argsort(-score, kind="stable")
+def average_precision(scored: Scored, weight: np.ndarray) -> float:
+    """Average precision of scores, with these weights (sample); NaN without successes. Ties in the order of samples."""
+    order = np.argsort(-scored.score, kind="stable")
     order = order[weight[order] > 0.0]
-    gained, all_of = np.cumsum((weight * success)[order]), np.cumsum(weight[order])
+    gained, all_of = np.cumsum((weight * scored.outcome)[order]), np.cumsum(weight[order])
     if not gained.size or gained[-1] <= 0.0:
         return float("nan")
-    return float((gained / all_of * (weight * success)[order]).sum() / gained[-1])
+    return float((gained / all_of * (weight * scored.outcome)[order]).sum() / gained[-1])
 
 
-def area_under_roc(score: np.ndarray, success: np.ndarray, weight: np.ndarray) -> float:
-    """Probability that a success has a higher score than a failure, ties half; NaN without one of both. Arguments (sample), weighted."""
-    values, rank = np.unique(score, return_inverse=True)
-    gained, lost = (np.bincount(rank, weight * side, len(values)) for side in (success, 1.0 - success))
-    pairs = gained.sum() * lost.sum()
-    return float(gained @ (np.cumsum(lost) - lost / 2.0) / pairs) if pairs > 0.0 else float("nan")
-
-
-def bootstrap(values: np.ndarray) -> tuple[float, float, float]:
-    """Mean of values of independent states (state), and its 95 % percentile interval by resampling states; NaN without any."""
-    if not values.size:
-        return float("nan"), float("nan"), float("nan")
-    means = values[np.random.default_rng(0).integers(len(values), size=(DRAWS, len(values)))].mean(axis=1)
-    low, high = np.percentile(means, (2.5, 97.5))
-    return float(values.mean()), float(low), float(high)
+def mean_score(scored: Scored, weight: np.ndarray) -> float:
+    """Weighted mean of the scores."""
+    return float(weight @ scored.score / weight.sum())
 
 
 def wilson(successes: int, count: int) -> tuple[float, float]:

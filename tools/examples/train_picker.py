@@ -30,6 +30,7 @@ except ModuleNotFoundError as missing:
     raise SystemExit(f"train_picker: {missing.name} is not installed; pip install torch") from None
 
 import synpick_warp
+from synpick_warp.apps.statistics.ranking import Interval, Scored, estimate, weighted_auc
 from synpick_warp.codes import Share
 from synpick_warp.dataset.grasp_maps import find_pixels
 from synpick_warp.dataset.reading import Episode
@@ -38,10 +39,9 @@ from synpick_warp.errors import ConfigError, DatasetError, SynpickError
 from synpick_warp.system.hardware.device import pick_device
 from tools.examples.picking_scores import (
     Sight,
-    area_under_roc,
     average_precision,
-    bootstrap,
     find_normals,
+    mean_score,
     score_contour_distance,
     score_flatness,
     score_random,
@@ -58,6 +58,8 @@ LIGHTEST, HEAVIEST = 0.1, 10.0
 """Least and largest weight of a trial beside its image's mean: weights are inverse probabilities, of which few may be very large, and 0 of
 the episode's own grasp."""
 LEARNING_RATE, WARM_UP, BATCH = 2e-3, 0.05, 16
+FEW_DRAWS = 200
+"""Bootstrap samples of what takes all trials."""
 HINTS = 0.3
 """Factor on the loss of the analytic maps, which are auxiliary targets where a data set has them."""
 MAPS = ("suction_seal", "suction_wrench")
@@ -225,7 +227,7 @@ def evaluate(
     """Score the pickers at tried pixels of states: a row for each picker, of objects seen, unseen and all.
 
     AUC and AP are over trials, weighted by inverse probability; the first choice is the tried candidate with the largest score, its regret
-    the difference to the best candidate of the state, each with a bootstrap interval over states.
+    the difference to the best candidate of the state, each with a bootstrap interval over states. Figures are `Interval`s.
     """
     trials, sight = samples.trials_of(states), samples.sight.part(torch.from_numpy(states))
     at = trials["state"], trials["y"], trials["x"]
@@ -255,22 +257,28 @@ def _measure(trials: dict[str, np.ndarray], score: np.ndarray | None) -> dict[st
         tops = rows[score[rows] == score[rows].max()]
         firsts.append(rates[tops].mean())
         best.append(rates[rows].max())
-    chosen, regret = np.array(firsts), np.array(best) - np.array(firsts)
+    scored = Scored(score, trials["success"].astype(bool), trials["weight"].astype(float), trials["state"])
     return {
-        "states": len(chosen),
-        "auc": area_under_roc(score, success, trials["weight"]),
-        "ap": average_precision(score, success, trials["weight"]),
-        "first": bootstrap(chosen),
-        "regret": bootstrap(regret),
+        "states": len(firsts),
+        "auc": estimate(scored, weighted_auc, FEW_DRAWS),
+        "ap": estimate(scored, average_precision, FEW_DRAWS),
+        "first": _mean_over_states(np.array(firsts)),
+        "regret": _mean_over_states(np.array(best) - np.array(firsts)),
     }
 
 
+def _mean_over_states(values: np.ndarray) -> Interval:
+    """Mean of one value of each state, with its bootstrap interval."""
+    count = len(values)
+    return estimate(Scored(values, np.zeros(count, bool), np.ones(count), np.arange(count)), mean_score)
+
+
 def show_rows(rows: list[dict[str, Any]]) -> None:
-    """Print a table of `evaluate`."""
-    print(f"{'picker':14} {'objects':8} {'states':>6} {'AUC':>6} {'AP':>6}  first choice (95 %)      regret (95 %)")
+    """Print a table of `evaluate`, each figure with its 95 % interval."""
+    print(f"{'picker':14} {'objects':8} {'states':>6}  " + "".join(f"{name:25}" for name in ("AUC", "AP", "first choice", "regret")))
     for row in rows:
-        first, regret = ("{:.3f} ({:.3f} to {:.3f})".format(*row[key]) for key in ("first", "regret"))
-        print(f"{row['picker']:14} {row['objects']:8} {row['states']:6} {row['auc']:6.3f} {row['ap']:6.3f}  {first}  {regret}")
+        figures = (f"{row[key].value:.3f} ({row[key].low:.3f} to {row[key].high:.3f})" for key in ("auc", "ap", "first", "regret"))
+        print(f"{row['picker']:14} {row['objects']:8} {row['states']:6}  " + "".join(f"{figure:25}" for figure in figures))
 
 
 def save_picker(path: Path, network: Network, width: int, size: tuple[int, int], unseen: np.ndarray, everything: np.ndarray) -> None:
