@@ -18,14 +18,19 @@ from tools.options import Row
 
 TWISTS = 4
 """Worlds that twist for each that picks: 2,048 by default, as peers publish."""
-CASES = (
-    ("attempts, state alone", 1, {"action": "point", "obs": ("state",)}),
-    ("attempts, depth 160x90", 1, {"action": "pixel", "obs": ("depth",), "resolution": (160, 90)}),
-    ("ticks, state alone", TWISTS, {"action": "twist", "obs": ("state",)}),
-    ("ticks, depth 64x64", TWISTS, {"action": "twist", "obs": ("depth",), "resolution": (64, 64)}),
-    ("ticks, colour and depth 64x64", TWISTS, {"action": "twist", "obs": ("rgb", "depth"), "resolution": (64, 64)}),
+PILES = 128
+"""Different piles of all cases but the first, so that their resets are short."""
+SHORT = {"pick.appear_height": 0.1, "pick.lift_height": 0.2}
+"""Settings of attempts that begin near the object and end soon, as trials do."""
+CASES: tuple[tuple[str, int, dict[str, Any], dict[str, Any]], ...] = (
+    ("attempts, state alone", 1, {"action": "point", "obs": ("state",), "piles": None}, {}),
+    ("attempts, depth 160x90", 1, {"action": "pixel", "obs": ("depth",)}, {}),
+    ("short attempts, depth 160x90", 1, {"action": "pixel", "obs": ("depth",)}, SHORT),
+    ("ticks, state alone", TWISTS, {"action": "twist", "obs": ("state",)}, {}),
+    ("ticks, depth 64x64", TWISTS, {"action": "twist", "obs": ("depth",), "resolution": (64, 64)}, {}),
+    ("ticks, colour and depth 64x64", TWISTS, {"action": "twist", "obs": ("rgb", "depth"), "resolution": (64, 64)}, {}),
 )
-"""Name, worlds relative to those of the benchmark, and what differs from DEFAULTS."""
+"""Name, worlds relative to those of the benchmark, what differs from DEFAULTS, and settings."""
 DEFAULTS: dict[str, Any] = {
     "task": "pick",
     "resolution": (160, 90),
@@ -33,7 +38,7 @@ DEFAULTS: dict[str, Any] = {
     "backend": "warp",
     "seed": 0,
     "max_steps": 10**6,
-    "piles": None,
+    "piles": PILES,
 }
 SPREAD = 0.15
 """Half width of the square of points that are tried, and their height [m]; most of them end on an object."""
@@ -48,9 +53,9 @@ def measure_environment(make: Callable[..., PickingEnvironment], worlds: int, mi
         worlds: Environments that pick.
         min_seconds: Time for which steps are repeated, at least [s].
     """
-    for name, factor, given in CASES:
+    for name, factor, given, settings in CASES:
         count = factor * worlds
-        environment = make(make_choice(**{**DEFAULTS, **given, "num_envs": count}))
+        environment = make(make_choice(**{**DEFAULTS, **given, "num_envs": count}), settings=settings)
         started = time.perf_counter()
         environment.reset(seed=0)
         settled = time.perf_counter() - started
@@ -63,6 +68,7 @@ def measure_environment(make: Callable[..., PickingEnvironment], worlds: int, mi
         seconds = time.perf_counter() - started
         yield Row(f"{name}, {count} worlds", steps * count / seconds, "1/s")
         yield Row(f"{name}: a reset of all", settled, "s")
+        del environment
 
 
 def _sample(environment: PickingEnvironment, random: np.random.Generator) -> np.ndarray:
