@@ -44,16 +44,16 @@ WARM_UP = 0.1
 class Network(nn.Module):
     """U-Net: four levels of two convolutions each, with `width` to 8 x `width` channels."""
 
-    def __init__(self, classes: int, width: int) -> None:
+    def __init__(self, classes: int, width: int, inputs: int = 3) -> None:
         super().__init__()
         widths = [width * factor for factor in (1, 2, 4, 8)]
-        self.down = nn.ModuleList(_convolutions(before, after) for before, after in itertools.pairwise((3, *widths)))
+        self.down = nn.ModuleList(_convolutions(before, after) for before, after in itertools.pairwise((inputs, *widths)))
         self.up = nn.ModuleList(_convolutions(low + high, high) for high, low in itertools.pairwise(widths))
         self.head = nn.Conv2d(width, classes, 1)
 
-    def forward(self, rgb: torch.Tensor) -> torch.Tensor:
-        """Logits (B, classes, H, W) of an image (B, 3, H, W) uint8."""
-        x, skips = rgb.float().div(255).sub(0.5), []
+    def forward(self, image: torch.Tensor) -> torch.Tensor:
+        """Logits (B, classes, H, W) of an image (B, inputs, H, W): uint8, or float32 as it is."""
+        x, skips = image.float().div(255).sub(0.5) if image.dtype == torch.uint8 else image, []
         for level in self.down:
             x = level(functional.max_pool2d(x, 2) if skips else x)
             skips.append(x)

@@ -1,0 +1,124 @@
+"""The picker on drawn boxes whose tops are flat in the middle alone; skipped without PyTorch."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from synpick_warp.apps.statistics import ranking
+from synpick_warp.configs.files.load import load_config
+from tests.builders import PICKING, boxes
+from tests.worlds.small_worlds import QUICK
+
+torch = pytest.importorskip("torch", exc_type=ImportError)
+train_picker = pytest.importorskip("tools.examples.train_picker", exc_type=ImportError)
+scores = pytest.importorskip("tools.examples.picking_scores", exc_type=ImportError)
+
+SIZE = (32, 56)
+CPU = torch.device("cpu")
+
+
+@pytest.fixture(autouse=True)
+def one_thread():
+    """Small images: threads cost more than they save."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(threads)
+
+
+def draw_samples(states: int, tried: int = 40) -> train_picker.Samples:
+    """Boxes 2 cm above a floor: a pick on a top succeeds, one within 3 px of its edge fails."""
+    rng = np.random.default_rng(0)
+    depth, instance = np.full((states, *SIZE), 1.0, np.float32), np.zeros((states, *SIZE), np.uint8)
+    for state in range(states):
+        for index, left in enumerate((4, 32)):
+            top, height, width = rng.integers(2, 8), rng.integers(14, 22), rng.integers(14, 20)
+            place = (state, slice(top, top + height), slice(left, left + width))
+            depth[place], instance[place] = 0.95 - 0.02 * rng.random(), index + 1
+    sight = scores.Sight(torch.from_numpy(depth), torch.from_numpy(instance), 60.0)
+    apart = scores.score_contour_distance(sight).numpy()
+    rows = []
+    for state in range(states):
+        places = np.argwhere(instance[state] > 0)
+        for candidate, (y, x) in enumerate(places[rng.choice(len(places), tried, replace=False)].tolist()):
+            rows.append((state, candidate, int(instance[state, y, x]), x, y, apart[state, y, x] >= 3.5, rng.random()))
+    columns = dict(zip(("state", "candidate", "obj_id", "x", "y", "success", "seal"), map(np.array, zip(*rows, strict=True)), strict=True))
+    count = len(rows)
+    columns |= {"frame": columns["state"], "repeat": np.zeros(count, int), "share": np.ones(count, int)}
+    columns |= {"weight": np.ones(count, np.float32), "wrench": np.ones(count)}
+    return train_picker.Samples(sight, None, np.arange(states), columns)
+
+
+def test_a_network_learns_where_picks_succeed():
+    samples = draw_samples(16)
+    network, losses = train_picker.train(samples, np.arange(12), np.zeros(0, int), 6, 100, CPU)
+    assert np.mean(losses[-10:]) < 0.7 * losses[0]
+    rows = train_picker.evaluate(samples, np.arange(12, 16), np.array([2]), train_picker.dense_scores(network, CPU), CPU)
+    found = {(row["picker"], row["objects"]): row for row in rows}
+    assert {group for _, group in found} == {"all", "seen", "unseen"}
+    assert found["learned", "all"]["auc"].value > 0.8
+    assert found["learned", "all"]["first"].value == 1.0
+    assert abs(found["seal x wrench", "all"]["auc"].value - 0.5) < 0.15
+    assert found["oracle", "all"]["regret"] == ranking.Interval(0.0, 0.0, 0.0)
+    assert found["contour", "all"]["auc"].value == pytest.approx(1.0, abs=1e-6)
+
+
+def test_objects_that_are_not_trained_on_are_a_fixed_draw():
+    samples = draw_samples(1)
+    assert len(train_picker.split_objects(samples, 1)) == 1
+    with pytest.raises(train_picker.ConfigError, match="2 objects were tried"):
+        train_picker.split_objects(samples, 2)
+
+
+def test_statistics_are_those_of_hand_made_samples():
+    scored = ranking.Scored(
+        np.array([0.9, 0.8, 0.8, 0.1]), np.array([True, False, True, False]), np.array([1.0, 1.0, 2.0, 1.0]), np.arange(4)
+    )
+    assert scores.average_precision(scored, scored.weight) == pytest.approx((1.0 * 1 + 0.75 * 2) / 3)
+    assert scores.average_precision(scored, np.array([0.0, 1.0, 2.0, 1.0])) == pytest.approx(2 / 3)
+    assert scores.mean_score(scored, scored.weight) == pytest.approx((0.9 + 0.8 + 1.6 + 0.1) / 5)
+    low, high = scores.wilson(930, 1000)
+    assert (low, high) == pytest.approx((0.9125, 0.9443), abs=1e-4)
+    assert scores.wilson(0, 0) == (0.0, 1.0)
+
+
+def test_normals_of_a_plane_are_its_own():
+    """A plane z = 1 + x tan 30° of a weak perspective leans by 30°, and is flat everywhere."""
+    x = np.arange(-28, 28) / 2000.0
+    depth = torch.from_numpy(np.tile(1.0 + np.tan(np.radians(30.0)) * x, (32, 1)).astype(np.float32))[None]
+    normal = scores.find_normals(depth, 2000.0)[0, :, 16, 28]
+    np.testing.assert_allclose(normal.numpy(), [0.5, 0.0, -np.sqrt(0.75)], atol=2e-3)
+    sight = scores.Sight(depth, torch.ones(1, *SIZE, dtype=torch.uint8), 2000.0)
+    assert float(scores.score_flatness(sight)[0, 16, 28]) == pytest.approx(1.0, abs=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["train", "/nowhere"], "/nowhere"),
+        (["evaluate", "/nowhere", "--picker", "/nowhere.pt"], "/nowhere.pt is no picker"),
+        (["run", "--device", "gpu"], 'bake.device is "gpu"'),
+    ],
+)
+def test_a_mistake_is_one_line(capsys, arguments, said):
+    assert train_picker.main([*arguments, *(() if "--device" in arguments else ("--device", "cpu"))]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith("train_picker: ")
+    assert said in line
+
+
+def test_pickers_are_run_from_the_same_piles(device):
+    """In bins of two boxes, whose middles can be picked: distances to contours find them, and each bin becomes empty."""
+    runs = pytest.importorskip("tools.examples.picking_runs", exc_type=ImportError)
+    with boxes():
+        config = load_config("smoke", QUICK | PICKING)
+        environment = runs.make_environment(config, 2, (64, 36), 0, max_steps=6)
+    pickers = train_picker.dense_scores(None, torch.device(str(environment.worlds.device)))
+    picked, piles = runs.run_first_choices(environment, pickers, 2)
+    assert piles == environment.count
+    assert picked.keys() == {"contour", "flatness", "random"}
+    assert picked["contour"] == piles
+    total = runs.run_until_empty(environment, pickers["contour"])
+    assert total.empty == total.bins == environment.count
+    assert total.picked == 2 * total.bins <= total.attempts

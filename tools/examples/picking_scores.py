@@ -1,0 +1,95 @@
+"""Dense scores of where to pick, from depth or segmentation, and how well scores choose among tried candidates. Needs PyTorch.
+
+A score is an image (B, H, W) of which a picker takes the largest value. Baselines: variance of surface normals (Zeng et al., 2017/19),
+distance to the contour of the object (Cartman, Morrison et al., 2018), a random visible point.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch  # pyright: ignore[reportMissingImports]
+from torch.nn import functional  # pyright: ignore[reportMissingImports]
+
+from synpick_warp.apps.statistics.ranking import Scored
+
+WINDOW = 7
+"""Side of the window over which normals vary [px]: about the cup's lip (10 mm radius) in 320 px of the tote's width."""
+LONGEST = 40
+"""Largest distance to a contour that is told apart [px]."""
+Z = 1.959964
+"""Quantile of the normal distribution for a 95 % interval."""
+
+
+@dataclass(frozen=True, eq=False)
+class Sight:
+    """What pickers may see of B images, on a device."""
+
+    depth: torch.Tensor
+    """Planar depth (B, H, W) float32 [m]; 0: nothing."""
+    instance: torch.Tensor
+    """1 + instance that is visible (B, H, W) uint8; 0: none. For the baselines that segment."""
+    focal: float
+    """Focal length [px]."""
+
+    def part(self, rows: torch.Tensor | slice) -> Sight:
+        """Some of the images."""
+        return Sight(self.depth[rows], self.instance[rows], self.focal)
+
+
+def find_normals(depth: torch.Tensor, focal: float) -> torch.Tensor:
+    """Surface normals towards the camera (B, 3, H, W), by central differences of depth (B, H, W) [m]; in the camera's axes, but as of a
+    weak perspective about each pixel."""
+    padded = functional.pad(depth[:, None], (1, 1, 1, 1), mode="replicate")[:, 0]
+    across, along = padded[:, 1:-1, 2:] - padded[:, 1:-1, :-2], padded[:, 2:, 1:-1] - padded[:, :-2, 1:-1]
+    slope = focal / (2.0 * depth.clamp(min=1e-3))
+    return functional.normalize(torch.stack((across * slope, along * slope, -torch.ones_like(depth)), dim=1), dim=1)
+
+
+def score_flatness(sight: Sight) -> torch.Tensor:
+    """Length of the mean normal in a window, 1 where it is flat, of visible objects (B, H, W)."""
+    mean = functional.avg_pool2d(find_normals(sight.depth, sight.focal), WINDOW, 1, WINDOW // 2, count_include_pad=False)
+    return torch.where(sight.instance > 0, mean.norm(dim=1), 0.0)
+
+
+def score_contour_distance(sight: Sight) -> torch.Tensor:
+    """Chessboard distance to the contour of each visible instance (B, H, W) [px], at most LONGEST; flat tops of it by smoothing."""
+    segment = sight.instance.float()[:, None]
+    apart = (functional.max_pool2d(segment, 3, 1, 1) != segment) | (-functional.max_pool2d(-segment, 3, 1, 1) != segment)
+    inside = ((segment > 0) & ~apart).float()
+    distance = inside.clone()
+    for _ in range(LONGEST - 1):
+        inside = -functional.max_pool2d(-inside, 3, 1, 1)
+        distance += inside
+    return (distance + 1e-2 * functional.avg_pool2d(distance, 5, 1, 2))[:, 0]
+
+
+def score_random(sight: Sight, generator: torch.Generator) -> torch.Tensor:
+    """Random scores of visible objects (B, H, W)."""
+    drawn = torch.rand(sight.depth.shape, generator=generator, device=sight.depth.device)
+    return torch.where(sight.instance > 0, drawn, 0.0)
+
+
+def average_precision(scored: Scored, weight: np.ndarray) -> float:
+    """Average precision of scores, with these weights (sample); NaN without successes. Ties in the order of samples."""
+    order = np.argsort(-scored.score, kind="stable")
+    order = order[weight[order] > 0.0]
+    gained, all_of = np.cumsum((weight * scored.outcome)[order]), np.cumsum(weight[order])
+    if not gained.size or gained[-1] <= 0.0:
+        return float("nan")
+    return float((gained / all_of * (weight * scored.outcome)[order]).sum() / gained[-1])
+
+
+def mean_score(scored: Scored, weight: np.ndarray) -> float:
+    """Weighted mean of the scores."""
+    return float(weight @ scored.score / weight.sum())
+
+
+def wilson(successes: int, count: int) -> tuple[float, float]:
+    """Wilson's 95 % score interval of a share of successes; (0, 1) without samples."""
+    if not count:
+        return 0.0, 1.0
+    share, spread = successes / count, Z * Z / count
+    middle, half = share + spread / 2.0, Z * np.sqrt((share * (1.0 - share) + spread / 4.0) / count)
+    return float((middle - half) / (1.0 + spread)), float((middle + half) / (1.0 + spread))
