@@ -148,12 +148,10 @@ def build_factory(
 
 def _add_picks(factory: Factory, progress: Progress) -> Factory:
     """Add the worlds of grasp trials, if the format picks is written."""
-    config, device = factory.config, factory.simulation.device
-    if PICKS not in config.bake.formats:
+    if PICKS not in factory.config.bake.formats:
         return factory
     progress.stage("building worlds of grasp trials")
-    engine = PickEngine(config, factory.catalog, len(factory.lights), device, factory.groups[0].renderer.scene)
-    return replace(factory, picks=PickQueue(factory.simulation, engine, len(factory.catalog)))
+    return replace(factory, picks=PickQueue(factory.simulation, PickEngine(factory), len(factory.catalog)))
 
 
 @contextlib.contextmanager

@@ -16,6 +16,7 @@ import warp as wp
 
 from synpick_warp.configs.cell.cameras import COLOR
 from synpick_warp.configs.dataset.modes import may_pick
+from synpick_warp.configs.dataset.splits import DataLayout
 from synpick_warp.configs.episodes.picks import PICKS
 from synpick_warp.configs.episodes.randomize import Randomize
 from synpick_warp.configs.fields import INT32_MAX
@@ -40,7 +41,7 @@ from synpick_warp.stages.render.scene import blank_scene
 from synpick_warp.stages.sim.physics import with_enough_worlds
 from synpick_warp.stages.sim.simulate import allocate_worlds
 from synpick_warp.stages.sim.step_log import allocate_record, record_sizes
-from synpick_warp.stages.sim.trials import trial_config
+from synpick_warp.stages.sim.trials import count_trial_worlds
 from synpick_warp.stages.sim.worlds import world_sizes
 from synpick_warp.stages.stream import TickReader
 from synpick_warp.stages.tick_queue import allocate_rings, queue_lead, record_bytes
@@ -119,7 +120,7 @@ def plan_memory(config: Config, device: wp.Device, writers: int = 1, pieces: int
     built = (config.arrangement, config.physics, config.cell.bins, bool(config.bin), device.is_cuda, pieces)
     terms += [Term(row[0], (row,), keys) for row, keys in newton_rows(worlds, *built)]
     if PICKS in config.bake.formats:
-        trying = trial_config(config, device).bake.worlds
+        trying = count_trial_worlds(config.picks, DataLayout.of(config).planned, device)
         batch = count_batch(trying, config.picks.candidates * config.picks.repeats)
         terms += _trials(sizes | {"world": trying, "body": trying * bodies}, count_rows(batch, worlds), config.physics, device)
         terms.append(_perception(config.perception, trying, objects, device))

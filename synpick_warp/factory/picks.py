@@ -7,23 +7,23 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from itertools import groupby
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import warp as wp
 
 from synpick_warp.codes import Outcome
-from synpick_warp.configs.schema import Config
-from synpick_warp.scenes.types import Catalog
+from synpick_warp.configs.dataset.splits import DataLayout
 from synpick_warp.stages.perception.candidates import CandidateSampler
-from synpick_warp.stages.render.scene import RenderScene
 from synpick_warp.stages.sim.choices import Choice, ChoiceReader, ChoiceRecorder
 from synpick_warp.stages.sim.simulate import Simulation
 from synpick_warp.stages.sim.states import State
-from synpick_warp.stages.sim.trials import ROUNDS, Trials, trial_config
+from synpick_warp.stages.sim.trials import ROUNDS, Trials, count_trial_worlds, trial_values
 from synpick_warp.stages.stream import TickReport
 from synpick_warp.stages.timing import scope
 from synpick_warp.views.picks import PickBatch
+
+if TYPE_CHECKING:
+    from synpick_warp.factory.assembly import Stages
 
 MAX_LEAD = 1
 """Ticks by which physics may be ahead, so that the ring of states needs room for few."""
@@ -32,11 +32,13 @@ MAX_LEAD = 1
 class PickEngine:
     """Samples and tries the grasp candidates of saved states, in worlds of its own."""
 
-    def __init__(self, config: Config, catalog: Catalog, lights: int, device: wp.Device, render_scene: RenderScene) -> None:
-        """Build the worlds; arguments as of `Simulation`."""
-        self.config = config = trial_config(config, device)
-        self.device, self.object_ids = device, catalog.object_ids
-        self.simulation = Simulation(config, catalog, lights, device, render_scene, episodes=[])
+    def __init__(self, stages: Stages) -> None:
+        """Build the worlds, of the same objects and settings as stages have, whose meshes they share."""
+        config, self.device = stages.config, stages.simulation.device
+        worlds = count_trial_worlds(config.picks, DataLayout.of(config).planned, self.device)
+        self.config, self.object_ids = config.with_values(trial_values(config.picks, worlds)), stages.catalog.object_ids
+        scene, lights = stages.groups[0].renderer.scene, len(stages.lights)
+        self.simulation = Simulation(self.config, stages.catalog, lights, self.device, scene, episodes=[])
         self.simulation.tick()
         self.sampler = CandidateSampler(self.simulation, config.picks)
         self.trials = Trials(self.simulation, config.picks)

@@ -10,13 +10,14 @@ from collections.abc import Iterable, Sequence
 
 import warp as wp
 
+from synpick_warp.configs.dataset.splits import DataLayout
 from synpick_warp.configs.schema import Config
 from synpick_warp.exporters.registry import Needs
 from synpick_warp.exporters.writing.pool import QUEUE_DEPTH
 from synpick_warp.factory.memory_plan import Term, free_memory, plan_memory, split_memories
 from synpick_warp.stages.perception.images import count_views
 from synpick_warp.stages.sim.physics import MIN_GPU_WORLDS, with_enough_worlds
-from synpick_warp.stages.sim.trials import trial_config
+from synpick_warp.stages.sim.trials import count_trial_worlds
 from synpick_warp.stages.view_ring import views_per_batch
 from synpick_warp.system.hardware.cores import count_cores
 from synpick_warp.system.hardware.device import ALL, pick_device, pick_devices
@@ -60,7 +61,7 @@ def fit_to_device(config: Config, device: wp.Device, episodes: int, writers: int
                 views_per_batch(config.render, config.rig, worlds, objects, device, group) for group in range(len(config.rig.groups))
             ),
             "perception.views": count_views(config.perception, worlds, objects, device),
-            "picks.worlds": trial_config(config, device).bake.worlds,
+            "picks.worlds": count_trial_worlds(config.picks, DataLayout.of(config).planned, device),
             "bake.worlds": worlds,
         }
         lowered = [key for key in _OPEN_SIZES if is_open[key] and amounts[key] > _least(key, device)]

@@ -28,6 +28,7 @@ from synpick_warp.errors import ConfigError
 from tests.configs.test_presets import resolved
 
 COUPLED = {
+    "bake.formats",
     "bake.episodes",
     "perception.camera",
     "gripper.mesh",
@@ -195,7 +196,7 @@ def test_whole_numbers_beyond_the_range_of_floats_are_refused():
         ("physics.stepp", "did you mean step?"),
         ("physics.spread", "did you mean arrangement.spread?"),
         ("phisics.step", "did you mean physics?"),
-        ("friction", "did you mean physics.friction?"),
+        ("friction", "did you mean physics.friction or picks.friction?"),
         ("object_rows.mass", "write [[object_rows]] tables into a file"),
     ],
 )

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
@@ -11,7 +9,7 @@ from synpick_warp.codes import Outcome
 from synpick_warp.configs.episodes.picks import Picks
 from synpick_warp.errors import StateError
 from synpick_warp.stages.sim.simulate import Simulation
-from synpick_warp.stages.sim.trials import Trials, check_grasps, find_choices, own_grasps, trial_config
+from synpick_warp.stages.sim.trials import Trials, check_grasps, find_choices, own_grasps, trial_values
 from tests.worlds.sights import brief, picking
 from tests.worlds.small_worlds import report
 
@@ -100,8 +98,8 @@ def test_repeats_are_perturbed_alike_in_any_world(choice, device):
     grasps, found = choice.repeated(2, candidate=np.arange(2)), {}
     for count in (3, 2):
         ordinary = worlds(device, count)
-        config = replace(ordinary.config, picks=replace(settings, worlds=ordinary.layout.worlds))
-        simulation = ticked(picking(trial_config(config, device), ordinary.catalog, device, episodes=[]))
+        config = ordinary.config.with_values(trial_values(settings, ordinary.layout.worlds))
+        simulation = ticked(picking(config, ordinary.catalog, device, episodes=[]))
         trials = Trials(simulation, settings)
         found[count] = trials.run(choice.state, trials.upload(grasps, 1))
     mu = simulation.physics.model.shape_material_mu.numpy().reshape(simulation.layout.worlds, -1)

@@ -25,7 +25,7 @@ def measure_picks(config: Config) -> Iterator[Row]:
     device = pick_device(config.bake.device)
     stages = build_stages(config, device, SilentProgress(), range(config.bake.worlds))
     simulation = stages.simulation
-    engine = PickEngine(stages.config, stages.catalog, len(stages.lights), device, stages.groups[0].renderer.scene)
+    engine = PickEngine(stages)
     batch = count_batch(engine.simulation.layout.worlds, engine.trials_of_state)
     recorder = ChoiceRecorder(simulation, stages.config.picks.states, batch + simulation.layout.worlds)
     reader, choices = ChoiceReader(recorder, len(stages.catalog)), []

@@ -81,6 +81,7 @@ compared by content, not by the name of their file or folder. A device of anothe
 YOUNGER_SETTINGS: dict[str, Any] = {
     "bop.layout": CLASSIC,
     "bop.keypoints": 0,
+    "bop.graph": False,
     "arrangement.fill": WITHIN,
     "arrangement.counts": (),
     "arrangement.drop": COLUMN,

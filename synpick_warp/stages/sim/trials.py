@@ -12,10 +12,8 @@ import numpy as np
 import warp as wp
 
 from synpick_warp.codes import Task
-from synpick_warp.configs.dataset.splits import DataLayout
 from synpick_warp.configs.episodes.manipulation import Pick
 from synpick_warp.configs.episodes.picks import Picks
-from synpick_warp.configs.schema import Config
 from synpick_warp.configs.schema import Physics as PhysicsConfig
 from synpick_warp.errors import StateError
 from synpick_warp.kernels.grasps import Grasps, PerturbationData, Perturbations
@@ -27,7 +25,7 @@ from synpick_warp.stages.launch import launch
 from synpick_warp.stages.perception.arrays import Plan
 from synpick_warp.stages.sim import gripper
 from synpick_warp.stages.sim.behavior import Hold
-from synpick_warp.stages.sim.physics import MAX_CPU_WORLDS, Physics, with_enough_worlds
+from synpick_warp.stages.sim.physics import MAX_CPU_WORLDS, MIN_GPU_WORLDS, Physics
 from synpick_warp.stages.sim.simulate import Simulation
 from synpick_warp.stages.sim.states import State
 from synpick_warp.stages.sim.worlds import AttemptState, SealState, WorldState
@@ -92,7 +90,7 @@ class Trials:
     """
 
     def __init__(self, simulation: Simulation, settings: Picks) -> None:
-        """Take over a simulation, after a tick; see `trial_config`. Its perception is not used."""
+        """Take over a simulation, after a tick; see `trial_values`. Its perception is not used."""
         self.simulation, self.device = simulation, simulation.device
         self.states = simulation.states
         assert simulation.hold is not None
@@ -164,16 +162,16 @@ class Trials:
         launch(kernels.judge_trials_kernel, worlds, *sources, simulation.seals, physics.state, **given)
 
 
-def trial_config(config: Config, device: wp.Device) -> Config:
-    """Settings of a simulation in which trials run, from those of the episodes: number of worlds, height of the lift.
-
-    An episode that a trial ends is not repeated.
-    """
-    picks = config.picks
-    most = DataLayout.of(config).planned * picks.states * picks.candidates * picks.repeats
+def count_trial_worlds(picks: Picks, episodes: int, device: wp.Device) -> int:
+    """Worlds in which the trials of a bake of `episodes` episodes run: as set, or as many as the device is best used by."""
+    most = episodes * picks.states * picks.candidates * picks.repeats
     worlds = picks.worlds or min(-(-most // ROUNDS), GPU_WORLDS if device.is_cuda else MAX_CPU_WORLDS)
-    values = {"bake.worlds": worlds, "pick.lift_height": picks.lift_height, "settle.tries": 1, "bop.graph": False}
-    return with_enough_worlds(config.with_values(values), device)
+    return max(worlds, MIN_GPU_WORLDS) if device.is_cuda else worlds
+
+
+def trial_values(picks: Picks, worlds: int) -> dict[str, Any]:
+    """Settings, by full key, of a simulation in which trials run: an episode that a trial ends is not repeated."""
+    return {"bake.worlds": worlds, "pick.lift_height": picks.lift_height, "settle.tries": 1, "bop.graph": False}
 
 
 def make_course(settings: Picks, physics: PhysicsConfig, pick: Pick) -> Any:
