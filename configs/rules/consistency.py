@@ -61,6 +61,8 @@ def find_conflicts(config: Config) -> Iterator[Conflict]:
     yield from _layers(config.render.layers)
     yield from _ranges(config.effects, config.depth_sensor)
     yield from _jpeg_quality(config.effects, bop)
+    if bop.graph and config.physics.sleep > 0.0:
+        yield "physics.sleep", "0 with bop.graph, which reads the contact forces of what rests [m]"
     yield from _split_folders(config.splits, bop)
     yield from _scene_ids(DataLayout.of(config))
     if not config.objects.embedded:

@@ -250,10 +250,23 @@ def bind_propagation(function: wp.Function) -> wp.Function:
     return propagate
 
 
+@wp.func
+def count_all(iterations: int, rows: int, has_others: bool) -> int:
+    """Number of iterations of every world."""
+    return iterations
+
+
+@wp.func
+def count_needed(iterations: int, rows: int, has_others: bool) -> int:
+    """Number of iterations of a world: one, with the same result, where it has neither contact rows nor others. Worth it where many do."""
+    return wp.where(rows > 0 or has_others, iterations, wp.min(iterations, 1))
+
+
 def compose_iterations(
-    sweep_rows: wp.Function, refresh_tree: wp.Function, sweep_contacts: wp.Function, propagate: wp.Function, warps: int = 1
+    sweep_rows: wp.Function, refresh_tree: wp.Function, sweep_contacts: wp.Function, propagate: wp.Function, warps: int, count: wp.Function
 ) -> wp.Kernel:
-    """Create the kernel of the iterations from the solver's device functions, wrapped by the functions above, for blocks of `warps`."""
+    """Create the kernel of the iterations from the device functions of the solver, wrapped by those above, for blocks of `warps`; `count`
+    is `count_all` or `count_needed`."""
     leads, synchronize = (is_any, synchronize_warp) if warps == 1 else (is_of_first_warp, synchronize_block)
 
     @wp.kernel(enable_backward=False, module="unique")
@@ -284,8 +297,9 @@ def compose_iterations(
         free_contacts = rows.mf_contact_rows_end[world]
         has_contacts = bodies.dense_contact_world_flag[world] != 0 or free_contacts > 0
         has_velocity_limits = settings.velocity_limits != 0 and rows.mf_constraint_count[world] > free_contacts
-        last = settings.iterations - 1
-        for step in range(settings.iterations):
+        iterations = count(settings.iterations, contacts.row_count[world], has_limits or has_contacts or has_velocity_limits)
+        last = iterations - 1
+        for step in range(iterations):
             iteration = settings.iteration_offset + step
             if leads(lane):
                 if has_limits:

@@ -42,6 +42,9 @@ class FusedSteel(newton.solvers.SolverSteel):
     `physics.make_solver` sets. Others, such as piles without a gripper, run SolverSteel's own kernels.
     """
 
+    skips_idle = False
+    """Whether worlds without constraint rows have one iteration, to be set before the first step."""
+
     def __init__(self, *args: Any, **kwargs: Any):
         """Prepare a solver for a model; arguments as in SolverSteel."""
         share_patches()
@@ -159,6 +162,7 @@ class FusedSteel(newton.solvers.SolverSteel):
             sweep_contacts,
             self._propagation_propagate_kernels[size],
             self._sweep_warps,
+            self.skips_idle,
         )
 
     def _order_worlds(self) -> wp.array:
@@ -306,15 +310,18 @@ def fill(struct: Any, values: Iterable[wp.array | None]) -> Any:
 
 
 @cache
-def compose_kernel(rows: wp.Kernel, refresh: wp.Kernel, contacts: wp.Function, propagation: wp.Kernel, warps: int = 1) -> wp.Kernel:
+def compose_kernel(
+    rows: wp.Kernel, refresh: wp.Kernel, contacts: wp.Function, propagation: wp.Kernel, warps: int = 1, skips_idle: bool = False
+) -> wp.Kernel:
     """Kernel of the iterations from the sweep over contacts by `warps` a block, and kernels of the solver, each of which calls one device
-    function."""
+    function; `skips_idle`: worlds without rows have one iteration."""
     return solver_iterations.compose_iterations(
         solver_iterations.bind_row_sweep(device_function(rows)),
         solver_iterations.bind_tree_refresh(device_function(refresh)),
         contacts,
         solver_iterations.bind_propagation(device_function(propagation)),
         warps,
+        solver_iterations.count_needed if skips_idle else solver_iterations.count_all,
     )
 
 

@@ -38,6 +38,10 @@ from tests.configs.test_config import message
         ({"suction.radius": 0.022}, r"suction.radius is 0.022 on .*; allowed: at most half of gripper.cup_width, 0.021 \[m\]"),
         ({"suction.rays": 4, "suction.tolerated_misses": 4}, "suction.tolerated_misses is 4 on .*; allowed: less than suction.rays, 4: "),
         ({"suction.poor_force": 41}, r"suction.poor_force is 41.0 on the command line; allowed: at most suction.good_force, 40 \[N\]"),
+        (
+            {"physics.sleep": 2e-4, "bop.graph": True},
+            r"physics.sleep is 0.0002 on the command line; allowed: 0 with bop.graph, which reads",
+        ),
         ({"bop.split": "train"}, 'bop.color_format is "jpg" by default; allowed: png with the split train: '),
         ({"bop.color_format": "png"}, 'bop.color_format is "png" on the command line; allowed: jpg with the split train_pbr: '),
         ({"bop.split": "a/b"}, 'bop.split is "a/b" on the command line; allowed: train, val or test'),

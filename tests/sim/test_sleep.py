@@ -13,7 +13,7 @@ from synpick_warp.stages.sim import sleep
 from synpick_warp.stages.sim.simulate import Simulation
 from tests.worlds.sights import brief
 from tests.worlds.small_worlds import report
-from tools.checks.states import Rows, check_arrays, check_branches
+from tools.checks.states import Rows, check_arrays, check_branches, differing
 
 SLEEP = {"physics__sleep": 2e-4}
 CREEP = 5e-4
@@ -190,6 +190,21 @@ def test_all_that_is_no_state_may_be_anything(device):
         simulation.tick()
     assert list(check_arrays(simulation, 12, {})) == []
     assert asleep(simulation).any()
+
+
+def test_worlds_without_rows_need_one_iteration(device):
+    """On a GPU: with all iterations, the result is the same."""
+    if not device.is_cuda:
+        pytest.skip("a CPU runs the solver's own kernels")
+    one, all_of_them = (brief(device, 3, **SLEEP) for _ in range(2))
+    assert one.physics.solver.skips_idle
+    all_of_them.physics.solver.skips_idle = False
+    for _ in range(40):
+        one.tick()
+        all_of_them.tick()
+    worlds = range(one.layout.worlds)
+    found, expected = (simulation.states.to_host(simulation.get_state(worlds)) for simulation in (one, all_of_them))
+    assert [name for world in worlds for name in differing(expected, found, world)] == []
 
 
 # ---- kernels ----

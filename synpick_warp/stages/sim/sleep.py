@@ -14,6 +14,7 @@ import warp as wp
 from synpick_warp.errors import SynpickError
 from synpick_warp.kernels.sim import sleep
 from synpick_warp.newton_patches.broad_phase import SeparatingBroadPhase
+from synpick_warp.newton_patches.solver import FusedSteel
 from synpick_warp.stages.arrays import allocate, device_array
 from synpick_warp.stages.constants import SceneData
 from synpick_warp.stages.launch import launch
@@ -58,6 +59,8 @@ class Sleep:
         self._pair_count = wp.zeros(1, dtype=wp.int32, device=device)
         pipeline.broad_phase.choose = self.choose
         physics.sleepers = self
+        if isinstance(physics.solver, FusedSteel):
+            physics.solver.skips_idle = True
 
     def choose(self, overlaps: wp.array, count: wp.array) -> tuple[wp.array, wp.array]:
         """Of pairs of shapes and their number, those of which one belongs to a body that is awake."""
