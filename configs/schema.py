@@ -2,7 +2,7 @@
 
 The defaults are the paper's values (preset `synpick`); where the paper names none, the help text says where a value comes from.
 "Released" means the generator that the paper's authors published. Sections: here, `cameras`, `gripper`, `manipulation`, `objects`,
-`randomize` and `sensors`.
+`picks`, `randomize` and `sensors`.
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ from synpick_warp.configs.cell.sensors import DepthSensor, Effects
 from synpick_warp.configs.episodes.fills import COUNTS, Counts, parse_counts
 from synpick_warp.configs.episodes.manipulation import Move, Perception, Pick, Target
 from synpick_warp.configs.episodes.objects import ObjectRow, Objects
+from synpick_warp.configs.episodes.picks import Picks
 from synpick_warp.configs.episodes.randomize import Randomize
 from synpick_warp.configs.fields import INT32_MAX, setting
 from synpick_warp.views.layers import LAYER_TABLE
@@ -422,6 +423,7 @@ class Config:
     randomize: Randomize = field(default_factory=Randomize)
     bop: Bop = field(default_factory=Bop)
     trajectory: Trajectory = field(default_factory=Trajectory)
+    picks: Picks = field(default_factory=Picks)
     camera: tuple[CameraRow, ...] = ()
     bin: tuple[BinRow, ...] = ()
     object_rows: tuple[ObjectRow, ...] = ()

@@ -191,6 +191,8 @@ class Stream(enum.IntEnum):
     INFRARED_NOISE = 16
     CAMERA = 17
     GRASPS = 18
+    CANDIDATES = 19
+    TRIALS = 20
 
 
 class Look(enum.IntEnum):

@@ -11,10 +11,11 @@ from collections.abc import Iterator, Sequence
 from synpick_warp.configs.cell.bins import OWN, PALLET, TOTE, BinRow, Bins, Tote
 from synpick_warp.configs.cell.extents import BinSizes
 from synpick_warp.configs.cell.gripper import find_gripper_conflicts
-from synpick_warp.configs.dataset.modes import bake_modes
+from synpick_warp.configs.dataset.modes import bake_modes, may_pick
 from synpick_warp.configs.dataset.splits import MAX_SHARD_SCENES, DataLayout
 from synpick_warp.configs.episodes.fills import most_objects
 from synpick_warp.configs.episodes.objects import EMBEDDED
+from synpick_warp.configs.episodes.picks import PICKS
 from synpick_warp.configs.episodes.randomize import Randomize
 from synpick_warp.configs.fields import Conflict
 from synpick_warp.configs.rules.camera_rules import find_camera_conflicts
@@ -47,6 +48,8 @@ def find_conflicts(config: Config) -> Iterator[Conflict]:
     """Find all violated constraints, the most basic first."""
     bins, bop = config.cell.bins, config.bop
     yield from _mix(config.bake, config.splits)
+    if PICKS in config.bake.formats and not may_pick(config.bake, config.splits):
+        yield "bake.formats", "without picks where no episode picks, as in mode move"
     yield from _bins(config.bins, config.bin)
     for key, row in config.cell.tables.items():
         yield from _box(key, row)

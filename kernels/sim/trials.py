@@ -3,28 +3,38 @@
 import warp as wp
 
 from synpick_warp.codes import Outcome, Phase, Removal, Task
-from synpick_warp.kernels.bitsets import NO_MEMBERS, has_member
-from synpick_warp.kernels.structs import LayoutData
+from synpick_warp.kernels.bitsets import NO_MEMBERS, has_member, has_members
+from synpick_warp.kernels.grasps import Grasps
+from synpick_warp.kernels.sim.gripper import place_gripper, task_setpoint
+from synpick_warp.kernels.sim.tasks import ARRIVED, judge_attempt
+from synpick_warp.kernels.structs import TILT, LayoutData, MoveData, PickData
 
 wp.set_module_options({"enable_backward": False})
 
+NO_FAILURES = wp.constant(-(2**30))
+"""Count of failed attempts with which a trial begins, so that it does not end the episode."""
+ATTEMPT = wp.constant(-1)
+"""Remaining settling time of a trial whose attempt still runs."""
+
 
 @wp.struct
-class Grasps:
-    """Grasp candidates: row of the saved state, intended instance, grasp point and normal, and gripper angles."""
+class TrialData:
+    """Course of trials; see `configs.episodes.picks.Picks`."""
 
-    row: wp.array[int]
-    """(trial): row of the state."""
-    target: wp.array[int]
-    """(trial): intended instance; -1: none."""
-    point: wp.array[wp.vec3]
-    """(trial): grasp point in the world [m]."""
-    normal: wp.array[wp.vec3]
-    """(trial): outward unit normal."""
-    yaw: wp.array[float]
-    """(trial): rotation of the gripper shaft about the vertical [rad]."""
-    tilt: wp.array[float]
-    """(trial): rotation of the cup about the wrist axis [rad]."""
+    repeats: int
+    """Trials of each grasp."""
+    near: float
+    """Distance before the grasp point at which the gripper appears [m]; 0: as in an attempt."""
+    lift_steps: int
+    """Duration of the lift [steps]."""
+    hold_steps: int
+    """Time between the end of the lift and judgement [steps]."""
+    settle_ticks: int
+    """Time between judgement and measurement of the other objects [ticks]."""
+    moved_distance: float
+    """Displacement above which another object counts as moved [m]."""
+    base_friction: float
+    """Coefficient of friction of all shapes."""
 
 
 @wp.struct
@@ -34,17 +44,19 @@ class Labels:
     outcome: wp.array[int]
     """(trial): `Outcome`; NONE if the episode ended first, with `ending`."""
     ending: wp.array[int]
-    """(trial): `Ending`."""
+    """(trial): `Ending`; RUNNING if there is an outcome."""
     hits: wp.array[wp.vec2i]
     """(trial): suction rays that hit an object, and the cups with a good seal: bit k, cup k."""
     picked: wp.array[int]
     """(trial): first instance attached at the end; -1: none."""
     peak_force: wp.array[float]
     """(trial): largest seal force, including seals that broke [N]."""
+    load: wp.array[float]
+    """(trial): largest force of a cup relative to its break force."""
     ticks: wp.array[int]
-    """(trial): duration [ticks]."""
+    """(trial): duration up to the outcome [ticks]."""
     held: wp.array[int]
-    """(trial): time with an attached object [ticks]."""
+    """(trial): time with an attached object [steps]."""
     moved: wp.array[int]
     """(trial): number of other objects displaced by more than a threshold."""
     farthest: wp.array[float]
@@ -61,10 +73,14 @@ class Progress:
     """(world): index of the running trial; -1: none."""
     ticks: wp.array[int]
     """(world): ticks since the trial began."""
+    settling: wp.array[int]
+    """(world): ticks until the other objects are measured; ATTEMPT: the attempt is not over."""
     held: wp.array[int]
-    """(world): ticks with an attached object."""
+    """(world): steps with an attached object."""
     peak_force: wp.array[float]
     """(world): largest force of a seal [N]."""
+    load: wp.array[float]
+    """(world): largest force of a cup relative to its break force."""
     lost: wp.array[int]
     """(world): number of objects lost before the trial."""
     pose: wp.array2d[wp.transform]
@@ -108,8 +124,21 @@ def measure_motion(
     return moved, farthest
 
 
+@wp.func
+def largest_load(cup_force: wp.array2d[float], break_force: wp.array2d[float], world: int) -> float:
+    """Largest force of a world's cups relative to their break forces."""
+    load = float(0.0)
+    for cup in range(cup_force.shape[1]):
+        if cup_force[world, cup] > 0.0 and break_force[world, cup] > 0.0:
+            load = wp.max(load, cup_force[world, cup] / break_force[world, cup])
+    return load
+
+
 @wp.kernel
 def assign_trials_kernel(
+    # Scene:
+    count: int,
+    repeats: int,
     # In:
     grasps: Grasps,
     # Out:
@@ -117,13 +146,16 @@ def assign_trials_kernel(
     next_inout: wp.array[int],  # (one)
     row_out: wp.array[int],  # (world)
 ):
-    """Give each world without a trial the next one, in order: `row` receives its row of the state, or -1. A single thread (dim 1)."""
+    """Give each world without a trial the next of `count` ones, in order: `row` receives its row of the state, or -1.
+
+    A single thread (dim 1).
+    """
     following = next_inout[0]
     for world in range(row_out.shape[0]):
         row_out[world] = -1
-        if progress_inout.trial[world] < 0 and following < grasps.row.shape[0]:
+        if progress_inout.trial[world] < 0 and following < count:
             progress_inout.trial[world] = following
-            row_out[world] = grasps.row[following]
+            row_out[world] = grasps.row[following // repeats]
             following += 1
     next_inout[0] = following
 
@@ -134,40 +166,32 @@ def begin_trials_kernel(
     layout: LayoutData,
     # State:
     row: wp.array[int],  # (world)
-    grasps: Grasps,
     removed: wp.array2d[int],  # (world, instance)
     body_slot: wp.array2d[int],  # (world, instance)
     body_q: wp.array[wp.transform],  # (body) [m]
     # Out:
     progress_inout: Progress,
-    target_out: wp.array[int],  # (world)
-    point_out: wp.array[wp.vec3],  # (world) [m]
-    normal_out: wp.array[wp.vec3],  # (world)
-    yaw_out: wp.array[float],  # (world) [rad]
-    tilt_out: wp.array[float],  # (world) [rad]
     task_out: wp.array[int],  # (world)
     steps_out: wp.array[int],  # (world)
+    failures_out: wp.array[int],  # (world)
     hits_out: wp.array[wp.vec2i],  # (world)
     engaged_words_out: wp.array2d[wp.uint32],  # (world, word)
 ):
-    """Begin the trials of worlds with a row: their grasps become the plans, with task APPROACH. Launched over world."""
+    """Begin the trials of worlds with a row: attempts with task APPROACH, which end no episode. Launched over world."""
     world = wp.tid()
     if row[world] < 0:
         return
-    trial = progress_inout.trial[world]
-    target_out[world] = grasps.target[trial]
-    point_out[world] = grasps.point[trial]
-    normal_out[world] = grasps.normal[trial]
-    yaw_out[world] = grasps.yaw[trial]
-    tilt_out[world] = grasps.tilt[trial]
     task_out[world] = Task.APPROACH
     steps_out[world] = 0
+    failures_out[world] = NO_FAILURES
     hits_out[world] = wp.vec2i(0, 0)
     for word in range(engaged_words_out.shape[1]):
         engaged_words_out[world, word] = NO_MEMBERS
     progress_inout.ticks[world] = 0
+    progress_inout.settling[world] = ATTEMPT
     progress_inout.held[world] = 0
     progress_inout.peak_force[world] = 0.0
+    progress_inout.load[world] = 0.0
     progress_inout.lost[world] = count_lost(removed, world)
     body = world * layout.bodies + layout.gripper_bodies
     for instance in range(layout.instances):
@@ -175,10 +199,127 @@ def begin_trials_kernel(
 
 
 @wp.kernel
+def set_friction_kernel(
+    # Scene:
+    layout: LayoutData,
+    course: TrialData,
+    # State:
+    row: wp.array[int],  # (world)
+    progress: Progress,
+    friction: wp.array[float],  # (trial)
+    # Out:
+    mu_out: wp.array[float],  # (shape)
+):
+    """Set the coefficients of friction of worlds with a row: the base, times the factor of the trial. Launched over world, shape of it."""
+    world, shape = wp.tid()
+    if row[world] >= 0:
+        mu_out[world * layout.shapes + shape] = friction[progress.trial[world]] * course.base_friction
+
+
+@wp.kernel
+def place_near_kernel(
+    # Scene:
+    layout: LayoutData,
+    move: MoveData,
+    course: TrialData,
+    # State:
+    phase: wp.array[int],  # (world)
+    steps: wp.array[int],  # (world)
+    point: wp.array[wp.vec3],  # (world) [m]
+    normal: wp.array[wp.vec3],  # (world)
+    tilt: wp.array[float],  # (world) [rad]
+    task_inout: wp.array[int],  # (world)
+    # Out:
+    setpoint_out: wp.array[wp.vec3],  # (world) [m]
+    joint_q_out: wp.array[float],  # (coord) [m, rad]
+    joint_qd_out: wp.array[float],  # (dof) [m/s, rad/s]
+    tilt_out: wp.array[float],  # (coord) [rad]
+):
+    """Place grippers where a trial begins, `course.near` before the grasp point, with task DESCEND in place of APPROACH.
+
+    `tilt_out` are drive targets. Launched over world.
+    """
+    world = wp.tid()
+    if phase[world] != Phase.ACT or task_inout[world] != Task.APPROACH or steps[world] != 0:
+        return
+    task_inout[world] = Task.DESCEND
+    setpoint = point[world] + (move.tcp_offset + course.near) * normal[world]
+    setpoint_out[world] = setpoint
+    place_gripper(layout, world, setpoint, tilt[world], joint_q_out, joint_qd_out)
+    tilt_out[world * layout.coords + TILT] = tilt[world]
+
+
+@wp.kernel
+def watch_seals_kernel(
+    # State:
+    attached: wp.array2d[int],  # (world, instance)
+    cup_force: wp.array2d[float],  # (world, cup) [N]
+    break_force: wp.array2d[float],  # (world, cup) [N]
+    # Out:
+    progress_inout: Progress,
+):
+    """Count the steps with an attached object, and update the largest load, of running trials.
+
+    Launched over world, after the forces of each step.
+    """
+    world = wp.tid()
+    if progress_inout.trial[world] < 0 or progress_inout.settling[world] != ATTEMPT:
+        return
+    progress_inout.load[world] = wp.max(progress_inout.load[world], largest_load(cup_force, break_force, world))
+    for instance in range(attached.shape[1]):
+        if attached[world, instance] != 0:
+            progress_inout.held[world] = progress_inout.held[world] + 1
+            return
+
+
+@wp.kernel
+def advance_trials_kernel(
+    # Scene:
+    move: MoveData,
+    pick: PickData,
+    course: TrialData,
+    # State:
+    phase: wp.array[int],  # (world)
+    setpoint: wp.array[wp.vec3],  # (world) [m]
+    point: wp.array[wp.vec3],  # (world) [m]
+    normal: wp.array[wp.vec3],  # (world)
+    target: wp.array[int],  # (world)
+    engaged_words: wp.array2d[wp.uint32],  # (world, word)
+    attached_words: wp.array2d[wp.uint32],  # (world, word)
+    task_inout: wp.array[int],  # (world)
+    steps_inout: wp.array[int],  # (world)
+    # Out:
+    outcome_out: wp.array[int],  # (world)
+):
+    """Task transitions of trials at the end of a tick: PRESS to LIFT; `outcome` and LOOK after lift and hold, or once nothing is attached.
+
+    Launched over world.
+    """
+    world = wp.tid()
+    task = task_inout[world]
+    if phase[world] != Phase.ACT or (task != Task.PRESS and task != Task.LIFT):
+        return
+    if task == Task.PRESS:
+        if steps_inout[world] < pick.press_steps:
+            return
+        task_inout[world] = Task.LIFT
+        steps_inout[world] = 0
+    if has_members(attached_words, world):
+        goal = task_setpoint(Task.LIFT, point[world], normal[world], pick, move.tcp_offset)
+        if task == Task.PRESS or wp.length(setpoint[world] - goal) >= ARRIVED:
+            return
+        if course.hold_steps > 0 and steps_inout[world] < course.lift_steps + course.hold_steps:
+            return
+    outcome_out[world] = judge_attempt(target[world], engaged_words, attached_words, world)
+    task_inout[world] = Task.LOOK
+    steps_inout[world] = 0
+
+
+@wp.kernel
 def judge_trials_kernel(
     # Scene:
     layout: LayoutData,
-    moved_distance: float,
+    course: TrialData,
     # State:
     grasps: Grasps,
     phase: wp.array[int],  # (world)
@@ -198,33 +339,37 @@ def judge_trials_kernel(
 ):
     """Update duration and peak force of running trials; write the labels of finished ones, and free their worlds.
 
-    An object other than the intended one has moved if its origin is farther than `moved_distance` from where it was [m]. `done` counts
-    labelled trials. Launched over world, at the end of a tick.
+    An object other than the intended one has moved if its origin is farther than `moved_distance` from where it was [m]; that is measured
+    `settle_ticks` after the outcome. `done` counts labelled trials. Launched over world, at the end of a tick.
     """
     world = wp.tid()
     trial = progress_inout.trial[world]
     if trial < 0:
         return
-    picked = int(-1)
-    for instance in range(layout.instances):
-        if picked < 0 and has_member(attached_words, world, instance):
-            picked = instance
-    progress_inout.ticks[world] = progress_inout.ticks[world] + 1
-    if picked >= 0:
-        progress_inout.held[world] = progress_inout.held[world] + 1
-    progress_inout.peak_force[world] = wp.max(progress_inout.peak_force[world], peak_force[world])
-    if outcome[world] == Outcome.NONE and phase[world] == Phase.ACT:
+    settling = progress_inout.settling[world] - 1
+    if progress_inout.settling[world] == ATTEMPT:
+        progress_inout.ticks[world] = progress_inout.ticks[world] + 1
+        progress_inout.peak_force[world] = wp.max(progress_inout.peak_force[world], peak_force[world])
+        if outcome[world] == Outcome.NONE and phase[world] == Phase.ACT:
+            return
+        picked = int(-1)
+        for instance in range(layout.instances):
+            if picked < 0 and has_member(attached_words, world, instance):
+                picked = instance
+        labels_out.outcome[trial] = outcome[world]
+        labels_out.ending[trial] = wp.where(outcome[world] == Outcome.NONE, ending[world], 0)
+        labels_out.hits[trial] = hits[world]
+        labels_out.picked[trial] = picked
+        labels_out.peak_force[trial] = progress_inout.peak_force[world]
+        labels_out.load[trial] = progress_inout.load[world]
+        labels_out.ticks[trial] = progress_inout.ticks[world]
+        labels_out.held[trial] = progress_inout.held[world]
+        settling = course.settle_ticks
+    progress_inout.settling[world] = settling
+    if settling > 0 and phase[world] == Phase.ACT:
         return
-    moved, farthest = measure_motion(
-        layout, world, grasps.target[trial], moved_distance, catalog_index, body_slot, body_q, progress_inout.pose
-    )
-    labels_out.outcome[trial] = outcome[world]
-    labels_out.ending[trial] = ending[world]
-    labels_out.hits[trial] = hits[world]
-    labels_out.picked[trial] = picked
-    labels_out.peak_force[trial] = progress_inout.peak_force[world]
-    labels_out.ticks[trial] = progress_inout.ticks[world]
-    labels_out.held[trial] = progress_inout.held[world]
+    target = grasps.target[trial // course.repeats]
+    moved, farthest = measure_motion(layout, world, target, course.moved_distance, catalog_index, body_slot, body_q, progress_inout.pose)
     labels_out.moved[trial] = moved
     labels_out.farthest[trial] = farthest
     labels_out.lost[trial] = count_lost(removed, world) - progress_inout.lost[world]

@@ -19,12 +19,14 @@ from synpick_warp.configs.cell.cameras import COLOR
 from synpick_warp.configs.cell.rig import Rig
 from synpick_warp.configs.dataset.modes import may_pick
 from synpick_warp.configs.dataset.splits import DataLayout
+from synpick_warp.configs.episodes.picks import PICKS
 from synpick_warp.configs.schema import Config, Render
 from synpick_warp.exporters.registry import Needs
 from synpick_warp.factory.attempts import AttemptLog
 from synpick_warp.factory.compilation import is_cache_warm, make_compiler, sole_compiler, submit_launches, submit_slow
 from synpick_warp.factory.memory_plan import check_memory, plan_memory
 from synpick_warp.factory.order import order_longest_first
+from synpick_warp.factory.picks import PickEngine, PickQueue
 from synpick_warp.factory.sizes import count_writers, fit_to_device, without_pictures
 from synpick_warp.scenes.bins import Bin, make_bins
 from synpick_warp.scenes.build import REPEATS, find_drawn, find_repeat_rules, must_repeat, without_distractors
@@ -106,6 +108,8 @@ class Factory(Stages):
 
     stream: FrameStream
     log: AttemptLog
+    picks: PickQueue | None = None
+    """Grasp trials; None: the format picks is not written."""
 
 
 def build_factory(
@@ -139,7 +143,17 @@ def build_factory(
     smallest = partial(build_smallest, config, device, SilentProgress(), records_physics, needs_images)
     with compiling_if_cold(smallest, device, progress, needs.views):
         stages = build_stages(config, device, progress, episodes, records_physics, longest_first)
-        return _add_stream(stages, device, needs_images, needs.depth_files)
+        return _add_picks(_add_stream(stages, device, needs_images, needs.depth_files), progress)
+
+
+def _add_picks(factory: Factory, progress: Progress) -> Factory:
+    """Add the worlds of grasp trials, if the format picks is written."""
+    config, device = factory.config, factory.simulation.device
+    if PICKS not in config.bake.formats:
+        return factory
+    progress.stage("building worlds of grasp trials")
+    engine = PickEngine(config, factory.catalog, len(factory.lights), device, factory.groups[0].renderer.scene)
+    return replace(factory, picks=PickQueue(factory.simulation, engine, len(factory.catalog)))
 
 
 @contextlib.contextmanager

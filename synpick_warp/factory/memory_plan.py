@@ -16,12 +16,15 @@ import warp as wp
 
 from synpick_warp.configs.cell.cameras import COLOR
 from synpick_warp.configs.dataset.modes import may_pick
+from synpick_warp.configs.episodes.picks import PICKS
 from synpick_warp.configs.episodes.randomize import Randomize
 from synpick_warp.configs.fields import INT32_MAX
-from synpick_warp.configs.schema import Config, Perception
+from synpick_warp.configs.schema import Config, Perception, Physics
 from synpick_warp.errors import ConfigError, SynpickError, format_value
 from synpick_warp.exporters.registry import Needs
 from synpick_warp.factory.newton_memory import newton_rows
+from synpick_warp.factory.picks import count_batch, count_rows
+from synpick_warp.newton_patches.history import CONTACT_BYTES
 from synpick_warp.scenes import build
 from synpick_warp.scenes.grippers.registry import make_head
 from synpick_warp.stages.arrays import DryArray, Row, dry_run
@@ -37,6 +40,7 @@ from synpick_warp.stages.render.scene import blank_scene
 from synpick_warp.stages.sim.physics import with_enough_worlds
 from synpick_warp.stages.sim.simulate import allocate_worlds
 from synpick_warp.stages.sim.step_log import allocate_record, record_sizes
+from synpick_warp.stages.sim.trials import trial_config
 from synpick_warp.stages.sim.worlds import world_sizes
 from synpick_warp.stages.stream import TickReader
 from synpick_warp.stages.tick_queue import allocate_rings, queue_lead, record_bytes
@@ -46,6 +50,8 @@ from synpick_warp.system.hardware.free_memory import free_device_memory, free_ho
 
 EPISODE_BYTES = 100
 """Lists and sets of episode indices of a bake at their peak, for each episode [bytes]: tracemalloc has 115 for two million."""
+ROW_BYTES = 12
+"""A constraint row in a saved state: impulse, type and parent [bytes]."""
 _VIEWS = ("cameras.resolution", "render.views_per_batch", "cameras.positions", "arrangement.max_objects")
 _CAMERAS = ("cameras.resolution", "cameras.positions")
 _HISTORY = ("bake.worlds", "cameras.resolution", "render.history", "cameras.positions")
@@ -110,8 +116,14 @@ def plan_memory(config: Config, device: wp.Device, writers: int = 1, pieces: int
         terms += _images(arrays, views, count, layers, host, device)
     if may_pick(config.bake, config.splits):
         terms.append(_perception(config.perception, worlds, objects, device))
-    newton = newton_rows(worlds, config.arrangement, config.physics, config.cell.bins, bool(config.bin), device.is_cuda, pieces)
-    terms += [Term(row[0], (row,), keys) for row, keys in newton]
+    built = (config.arrangement, config.physics, config.cell.bins, bool(config.bin), device.is_cuda, pieces)
+    terms += [Term(row[0], (row,), keys) for row, keys in newton_rows(worlds, *built)]
+    if PICKS in config.bake.formats:
+        trying = trial_config(config, device).bake.worlds
+        batch = count_batch(trying, config.picks.candidates * config.picks.repeats)
+        terms += _trials(sizes | {"world": trying, "body": trying * bodies}, count_rows(batch, worlds), config.physics, device)
+        terms.append(_perception(config.perception, trying, objects, device))
+        terms += [Term(f"{row[0]} of trials", (row,), ("picks.worlds", *keys)) for row, keys in newton_rows(trying, *built)]
     if writers:
         # A writer is counted with one slot of shared memory: those of its queue get memory only once they are used.
         row = ("shared memory of writers", (writers, needs.slot_bytes), "", writers * needs.slot_bytes)
@@ -238,6 +250,18 @@ def _simulation(sizes: dict[str, int], stores_steps: bool | None, supports: bool
         allocate_rings(TickReader.reported(record), slots, device)
     settings = _WORLDS if stores_steps is None else _STEPS
     yield _term(f"reports of {slots:,} ticks", reported, settings, "reported ", on_device=False, indexed=False)
+
+
+def _trials(sizes: dict[str, int], rows: int, physics: Physics, device: wp.Device) -> Iterator[Term]:
+    """State of the worlds of grasp trials, whose extents by `record_sizes` are `sizes`, and a ring of saved states with `rows` rows."""
+    with dry_run() as state:
+        allocate_worlds(sizes, device)
+    settings = ("picks.worlds", "arrangement.max_objects")
+    yield _term(f"the state of {sizes['world']:,} worlds of grasp trials", state, settings, "trial ")
+    each = sum(array.row[3] for array in state) // sizes["world"]
+    each += physics.contacts_per_world * CONTACT_BYTES + ROW_BYTES * (physics.rows_per_world + physics.gripper_rows_per_world)
+    row = ("saved states", (rows, each), "", rows * each)
+    yield Term(f"{rows:,} saved states", (row,), ("bake.worlds", "picks.worlds"), indexed=False)
 
 
 def _images(

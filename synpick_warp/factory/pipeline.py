@@ -28,6 +28,7 @@ from synpick_warp.factory.devices import Share, bake_on_devices, prepare_folder
 from synpick_warp.factory.episodes import BakeSummary, episode_end, episode_row, is_resampled, remedy
 from synpick_warp.factory.memory_plan import check_episodes, explain_shortage
 from synpick_warp.factory.meter import ThroughputMeter
+from synpick_warp.factory.picks import PickQueue
 from synpick_warp.factory.sizes import advise_processes, count_writers, pick_processes
 from synpick_warp.factory.worker import BakeLink
 from synpick_warp.scenes.bin_meshes.loading import measure_meshes
@@ -183,21 +184,26 @@ class _Run:
         self.factory, self.exporters, self.writes_views = factory, exporters, writes_views
         self.commit, self.summary, self.progress = commit, summary, progress
         self.meter = ThroughputMeter(len(factory.cameras), summary, progress)
-        self.layout = DataLayout.of(factory.config)
+        self.layout, self.picks = DataLayout.of(factory.config), factory.picks
 
     def run(self) -> None:
         """Tick until no episode remains or a signal requests a stop."""
         self.progress.stage("loading kernels, dropping objects")
         done = False
-        with self.stop as stop, self.factory.stream.streams, TickLoop(self.factory.simulation) as ticks:
+        simulation, lead = self.factory.simulation, None if self.picks is None else self.picks.lead
+        with self.stop as stop, self.factory.stream.streams, TickLoop(simulation, lead) as ticks:
             while not (done or stop.number):
                 report, snapshot = ticks.advance()
                 self._hand_over(report, snapshot, ticks)
+                if self.picks is not None and self.picks.is_due:
+                    self._try_picks(self.picks)
                 phase = report.column("phase")
                 self.meter.show(int(np.isin(phase, (Phase.SETTLE, Phase.ACT)).sum()))
                 done = bool((phase == Phase.IDLE).all())
             for views in self.factory.stream.drain():
                 self._write(views)
+            if self.picks is not None and done:
+                self._try_picks(self.picks)
         self.summary.stopped = 0 if done else stop.number
 
     def _hand_over(self, report: TickReport, snapshot: Snapshot, ticks: TickLoop) -> None:
@@ -209,6 +215,8 @@ class _Run:
                 self.exporters.write_ticks(batch.select(frames))
             ticks.enqueue()
         records = self.factory.log.update(report)
+        if self.picks is not None:
+            self.picks.take(report)
         if self.writes_views:
             streams = self.factory.stream.streams
             streams.confine(ticks.reserved_share)
@@ -224,6 +232,14 @@ class _Run:
         with scope("hand over views"):
             self.exporters.write_views(views)
         self.summary.views += len(views)
+
+    def _try_picks(self, picks: PickQueue) -> None:
+        """Run the grasp trials of all states that wait, hand them to the exporters, and end the episodes that waited for them."""
+        batches = picks.run()
+        with scope("hand over picks"):
+            for batch in batches:
+                self.exporters.write_picks(batch)
+            picks.release()
 
     def _end_episodes(self, report: TickReport, records: Mapping[int, EpisodeRecord]) -> None:
         """End the episodes that ended in a tick, after its views."""
@@ -244,7 +260,13 @@ class _Run:
             self.summary.take_resample(row.ending)
             note = f"episode {row.episode}, arrangement {row.arrangement + 1}: {row.sentence}"
             self.progress.note(note + (f"; {advice}" if advice else ""))
+            if self.picks is not None:
+                self.picks.drop(row.episode, row.arrangement)
             self.exporters.end_episode(end, lambda: None)
+            return
+        self.summary.take_episode(row, record)
+        commit = partial(self.exporters.end_episode, end, partial(self.commit, end))
+        if self.picks is None:
+            commit()
         else:
-            self.summary.take_episode(row, record)
-            self.exporters.end_episode(end, partial(self.commit, end))
+            self.picks.end(row.episode, commit)

@@ -16,6 +16,7 @@ from synpick_warp.exporters.writing.pool import QUEUE_DEPTH
 from synpick_warp.factory.memory_plan import Term, free_memory, plan_memory, split_memories
 from synpick_warp.stages.perception.images import count_views
 from synpick_warp.stages.sim.physics import MIN_GPU_WORLDS, with_enough_worlds
+from synpick_warp.stages.sim.trials import trial_config
 from synpick_warp.stages.view_ring import views_per_batch
 from synpick_warp.system.hardware.cores import count_cores
 from synpick_warp.system.hardware.device import ALL, pick_device, pick_devices
@@ -29,7 +30,7 @@ WRITER_BYTES = 100 << 20
 with bop and shards; the rest is headroom for formats with larger libraries."""
 WRITERS_FRACTION = 0.5
 """Fraction of the free host memory that writer processes may take if their number is chosen."""
-_OPEN_SIZES = ("render.views_per_batch", "perception.views", "bake.worlds")
+_OPEN_SIZES = ("render.views_per_batch", "perception.views", "picks.worlds", "bake.worlds")
 """Settings of sizes that are chosen automatically if they are 0. (So is `bake.writers`, see `count_writers`.)"""
 
 
@@ -59,6 +60,7 @@ def fit_to_device(config: Config, device: wp.Device, episodes: int, writers: int
                 views_per_batch(config.render, config.rig, worlds, objects, device, group) for group in range(len(config.rig.groups))
             ),
             "perception.views": count_views(config.perception, worlds, objects, device),
+            "picks.worlds": trial_config(config, device).bake.worlds,
             "bake.worlds": worlds,
         }
         lowered = [key for key in _OPEN_SIZES if is_open[key] and amounts[key] > _least(key, device)]
@@ -122,7 +124,7 @@ def _planned(terms: Sequence[Term]) -> int:
 
 def _least(key: str, device: wp.Device) -> int:
     """Least value that automatic sizing chooses for a setting."""
-    return MIN_GPU_WORLDS if key == "bake.worlds" and device.is_cuda else 1
+    return MIN_GPU_WORLDS if key in ("bake.worlds", "picks.worlds") and device.is_cuda else 1
 
 
 def _reduce(key: str, amount: int, device: wp.Device) -> int:

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from synpick_warp.codes import Outcome
+from synpick_warp.configs.episodes.picks import Picks
 from synpick_warp.errors import StateError
 from synpick_warp.stages.sim.simulate import Simulation
-from synpick_warp.stages.sim.trials import Trials, check_grasps, find_choices, own_grasps
-from tests.worlds.sights import brief
+from synpick_warp.stages.sim.trials import Trials, check_grasps, find_choices, own_grasps, trial_config
+from tests.worlds.sights import brief, picking
 from tests.worlds.small_worlds import report
 
 LONGEST = 60
@@ -19,6 +22,15 @@ ABOVE = 0.25
 
 def worlds(device, count: int) -> Simulation:
     return brief(device, count, bake__mode="pick", arrangement__max_objects=2)
+
+
+WHOLE = Picks(near=0.0, hold=0.0)
+"""Trials that take the path of an attempt."""
+
+
+def ticked(simulation: Simulation) -> Simulation:
+    simulation.tick()
+    return simulation
 
 
 class Choice:
@@ -54,9 +66,8 @@ def labels(choice, device):
     grasps["yaw"][2] += 0.5
     found = {}
     for count in (3, 2):
-        simulation = worlds(device, count)
-        simulation.tick()
-        found[count] = Trials(simulation, choice.state, grasps).run()
+        trials = Trials(ticked(worlds(device, count)), WHOLE)
+        found[count] = trials.run(choice.state, trials.upload(grasps, 1))
     return found
 
 
@@ -67,8 +78,9 @@ def test_the_own_grasp_has_the_outcome_of_the_own_attempt(choice, labels):
     assert own["hits"][0] == choice.hits
     assert own["picked"] == choice.grasps["target"][0]
     assert own["peak_force"] == np.float32(choice.peak)
+    assert own["load"] == pytest.approx(choice.peak / 40.0, rel=1e-5)
     assert own["ticks"] == choice.ticks
-    assert 0 < own["held"] < own["ticks"]
+    assert 0 < own["held"] < own["ticks"] * 16
 
 
 def test_the_same_trial_has_the_same_labels(labels):
@@ -80,6 +92,32 @@ def test_the_same_trial_has_the_same_labels(labels):
 def test_labels_do_not_depend_on_the_number_of_worlds(labels):
     for name, values in labels[3].items():
         np.testing.assert_array_equal(values, labels[2][name], err_msg=name)
+
+
+def test_repeats_are_perturbed_alike_in_any_world(choice, device):
+    """Near the grasp, with a short lift: the first repeat is not perturbed, and is held for as long as it is to be."""
+    settings = Picks(near=0.02, lift_height=0.05, hold=0.1, repeats=3, angle=5.0)
+    grasps, found = choice.repeated(2, candidate=np.arange(2)), {}
+    for count in (3, 2):
+        ordinary = worlds(device, count)
+        config = replace(ordinary.config, picks=replace(settings, worlds=ordinary.layout.worlds))
+        simulation = ticked(picking(trial_config(config, device), ordinary.catalog, device, episodes=[]))
+        trials = Trials(simulation, settings)
+        found[count] = trials.run(choice.state, trials.upload(grasps, 1))
+    mu = simulation.physics.model.shape_material_mu.numpy().reshape(simulation.layout.worlds, -1)
+    assert all(len(set(row)) == 1 for row in mu)
+    labels = found[3]
+    for name, values in labels.items():
+        np.testing.assert_array_equal(values, found[2][name], err_msg=name)
+        assert values[0].tobytes() == values[3].tobytes(), name
+    for name, centre, width in (("offset", 0.0, 1e-3), ("rotation", 0.0, np.radians(5.0)), ("friction", 1.0, 0.2)):
+        drawn = labels[name][[1, 2, 4, 5]]
+        assert len(np.unique(drawn)) == drawn.size
+        assert (labels[name][::3] == centre).all()
+        assert (np.abs(drawn - centre) <= width).all()
+        assert np.ptp(drawn) > 0.2 * width
+    assert Outcome(labels["outcome"][0]) is Outcome.TARGET_PICKED
+    assert labels["held"][0] * 4e-3 == pytest.approx(0.05 / 0.6 + 0.1, abs=16 * 4e-3)
 
 
 def test_a_grasp_in_the_air_catches_nothing(labels):

@@ -47,6 +47,7 @@ from tools.bench.growth import measure_growth
 from tools.bench.heaps import measure_heaps, measure_perception
 from tools.bench.patches import measure_patches
 from tools.bench.physics import BURST, measure_simulation, seconds_per_call
+from tools.bench.picks import measure_picks
 from tools.bench.pictures import measure_pictures
 from tools.bench.steady import measure_steady
 from tools.bench.stream import measure_stream
@@ -67,7 +68,7 @@ from tools.options import (
 )
 
 DEFAULT_PARTS = ("physics", "perception", "render", "encode", "write", "stream", "steady")
-PARTS = (*DEFAULT_PARTS, "pictures", "whole", "trajectories", "growth", "patches", "heaps", "environment")
+PARTS = (*DEFAULT_PARTS, "pictures", "whole", "trajectories", "growth", "patches", "heaps", "environment", "picks")
 OWN_WORLDS = {*PARTS[len(DEFAULT_PARTS) :], "steady"}
 """Parts that build worlds of their own."""
 WORLDS = 512
@@ -223,10 +224,9 @@ def measure(
         "patches": measure_patches(config),
         "heaps": measure_heaps(config, min_seconds),
         "environment": measure_environment(functools.partial(make_picking, source=config), config.bake.worlds, min_seconds),
+        "picks": measure_picks(config),
     }
-    for part, rows in others.items():
-        if part in parts:
-            yield from of_part(part, rows)
+    yield from itertools.chain.from_iterable(of_part(part, rows) for part, rows in others.items() if part in parts)
 
 
 def _measure_worlds(quality: int, factory: Factory, min_seconds: float, parts: tuple[str, ...]) -> Iterator[Row]:

@@ -30,6 +30,7 @@ from synpick_warp.configs.cell.bins import Bins
 from synpick_warp.configs.cell.gripper import EACH, SUCTION1
 from synpick_warp.configs.episodes.manipulation import MASK, SAME
 from synpick_warp.configs.episodes.objects import AUTO_UNIT, Objects
+from synpick_warp.configs.episodes.picks import Picks
 from synpick_warp.configs.episodes.randomize import Randomize
 from synpick_warp.configs.files.load import load_config, override_config, table_lists
 from synpick_warp.configs.files.table_lists import given_values
@@ -71,6 +72,7 @@ FREE_SETTINGS = (
     "render.views_per_batch",
     "perception.views",
     "gripper.mesh",
+    "picks.worlds",
 )
 """Settings that may differ when a bake is resumed: no episode depends on them. Objects, lights, textures and meshes of bins and gripper are
 compared by content, not by the name of their file or folder. A device of another type computes the same episodes up to rounding."""
@@ -111,6 +113,7 @@ YOUNGER_SETTINGS: dict[str, Any] = {
     "objects.symmetry_tolerance": Objects().symmetry_tolerance,
 }
 YOUNGER_SETTINGS |= {f"bins.{item.name}": item.default for item in dataclasses.fields(Bins)}
+YOUNGER_SETTINGS |= {f"picks.{item.name}": item.default for item in dataclasses.fields(Picks)}
 YOUNGER_SETTINGS |= {f"randomize.{name}": value for name, value in given_values(Randomize()).items()}
 """Settings that older manifests lack, and what held before: left out where they have these values, so that older data sets can still be
 read, and resumed with them."""

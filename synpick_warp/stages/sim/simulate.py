@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -109,6 +109,8 @@ class Simulation:
         self.record = replace(record, physics=self.recorder.record if self.recorder is not None else None)
         self.sleep = Sleep(self.scene, self.physics) if config.physics.sleep > 0.0 else None
         self.behavior = BEHAVIORS[config.gripper.kind]
+        self.after_tick: Callable[[], None] | None = None
+        """Launches kernels at the end of a tick, after perception."""
         self._is_between_ticks = False
         """Whether a tick is complete and none has begun."""
         self.hold: Hold | None = None
@@ -152,6 +154,9 @@ class Simulation:
             with scope("perceive", self.device):
                 self.perception.perceive(self.record.snapshot)
                 gripper.begin_attempts(self.scene, self.state, self.attempts, self.plan, self.physics, self.behavior.law)
+        if self.after_tick is not None:
+            with scope("save states", self.device):
+                self.after_tick()
         self._is_between_ticks = True
 
     @property
@@ -172,13 +177,22 @@ class Simulation:
 
     @cached_property
     def _states(self) -> WorldStates:
+        if self.recorder is None:
+            return self.checkpoints
+        return self._make_states(drops=self.recorder.record.drops)
+
+    @cached_property
+    def checkpoints(self) -> WorldStates:
+        """Checkpoints without what a record of physics keeps, so that simulations without one can load them; after the first tick."""
+        return self._make_states()
+
+    def _make_states(self, **recorded: object) -> WorldStates:
+        """Checkpoints of the groups of arrays of this simulation, and of others by name."""
         groups = {"worlds": self.state, "attempts": self.attempts, "seals": self.seals, "last": self.last}
         groups |= {name: getattr(self.record, name) for name in ("snapshot", "status", "observation", "plan")}
-        if self.recorder is not None:
-            groups["drops"] = self.recorder.record.drops
         if self.sleep is not None:
             groups["sleep"] = self.sleep.state
-        return WorldStates(groups, self.physics, self.catalog, self.state.variant, self.state.restarted)
+        return WorldStates(groups | recorded, self.physics, self.catalog, self.state.variant, self.state.restarted)
 
     def get_state(self, worlds: Sequence[int]) -> State:
         """State of worlds; see `WorldStates.get`."""

@@ -2,82 +2,191 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
+import newton
 import numpy as np
 import warp as wp
 
 from synpick_warp.codes import Task
+from synpick_warp.configs.dataset.splits import DataLayout
+from synpick_warp.configs.episodes.manipulation import Pick
+from synpick_warp.configs.episodes.picks import Picks
+from synpick_warp.configs.schema import Config
+from synpick_warp.configs.schema import Physics as PhysicsConfig
 from synpick_warp.errors import StateError
+from synpick_warp.kernels.grasps import Grasps, PerturbationData, Perturbations
+from synpick_warp.kernels.perception.perturbations import plan_trials_kernel
 from synpick_warp.kernels.sim import trials as kernels
 from synpick_warp.stages.arrays import allocate_struct, struct_arrays
+from synpick_warp.stages.constants import SceneData, fill
 from synpick_warp.stages.launch import launch
+from synpick_warp.stages.perception.arrays import Plan
 from synpick_warp.stages.sim import gripper
+from synpick_warp.stages.sim.behavior import Hold
+from synpick_warp.stages.sim.physics import MAX_CPU_WORLDS, Physics, with_enough_worlds
 from synpick_warp.stages.sim.simulate import Simulation
 from synpick_warp.stages.sim.states import State
+from synpick_warp.stages.sim.worlds import AttemptState, SealState, WorldState
+from synpick_warp.stages.timing import scope
 
-GRASPS = struct_arrays(kernels.Grasps, "trial", units={"point": "m", "yaw": "rad", "tilt": "rad"})
-LABELS = struct_arrays(kernels.Labels, "trial", units={"peak_force": "N", "farthest": "m", "ticks": "ticks", "held": "ticks"})
+GRASPS = struct_arrays(Grasps, "grasp", units={"point": "m", "yaw": "rad", "tilt": "rad"})
+PERTURBATIONS = struct_arrays(Perturbations, "trial", units={"offset": "m", "rotation": "rad"})
+LABELS = struct_arrays(kernels.Labels, "trial", units={"peak_force": "N", "farthest": "m", "ticks": "ticks", "held": "steps"})
 PROGRESS = struct_arrays(kernels.Progress, "world", pose=("world", "instance"), units={"peak_force": "N", "pose": "m"})
 MOVED = 5e-3
 """Displacement above which another object counts as moved [m]; resting piles creep by far less."""
+GPU_WORLDS = 2048
+"""Most worlds of trials on a GPU if `picks.worlds` is 0. On an H200, 512 worlds try 293 grasps of the synpick preset a second, 2,048 more
+than 530."""
+ROUNDS = 8
+"""Trials of a batch for each world: in its last round worlds wait for the slowest."""
 POLL = 8
 """Polling interval for completion of all trials [ticks]."""
 
 
-class Trials:
-    """Runs trials in the worlds of a simulation, which simulates nothing else meanwhile.
-
-    Attributes:
-        grasps: The struct `Grasps`.
-        labels: The struct `Labels`, complete once `run` returns.
+class TrialLaw(gripper.TwoSpeedLaw):
+    """Setpoint law of trials: that of the paper, but the gripper appears near the grasp and holds after the lift, and a trial ends once
+    nothing is attached.
     """
 
-    def __init__(self, simulation: Simulation, state: State, grasps: Mapping[str, np.ndarray]) -> None:
-        """Upload the grasps.
+    def __init__(self, course: Any) -> None:
+        """Take the struct `TrialData`."""
+        self.course = course
+
+    def begin(self, scene: SceneData, state: WorldState, attempts: AttemptState, plan: Plan, physics: Physics) -> None:
+        """Place the gripper near the grasp, or where an attempt begins."""
+        if self.course.near == 0.0:
+            super().begin(scene, state, attempts, plan, physics)
+            return
+        given = {"course": self.course, "tilt_out": physics.control.joint_target_q}
+        launch(kernels.place_near_kernel, len(state.phase), scene, state, attempts, plan, physics.state, **given)
+
+    def end_tick(self, scene: SceneData, state: WorldState, attempts: AttemptState, plan: Plan) -> None:
+        """Complete tasks PRESS, by time, and LIFT, after the hold."""
+        launch(kernels.advance_trials_kernel, len(state.phase), scene, state, attempts, plan, course=self.course)
+
+
+class WatchedHold:
+    """Hold whose forces are recorded in each step, in the struct `Progress`."""
+
+    def __init__(self, hold: Hold, progress: Any) -> None:
+        self.hold, self.progress = hold, progress
+        self.engage, self.ignore_contacts = hold.engage, hold.ignore_contacts
+
+    def apply_forces(self, scene: SceneData, state: WorldState, seals: SealState, physics: Physics, current: newton.State) -> None:
+        """Apply the forces, and record them."""
+        self.hold.apply_forces(scene, state, seals, physics, current)
+        launch(kernels.watch_seals_kernel, len(state.phase), seals, progress=self.progress)
+
+
+class Trials:
+    """Runs trials in the worlds of a simulation, which simulates nothing else from then on.
+
+    Attributes:
+        course: The struct `TrialData`.
+        spread: The struct `PerturbationData`.
+    """
+
+    def __init__(self, simulation: Simulation, settings: Picks) -> None:
+        """Take over a simulation, after a tick; see `trial_config`. Its perception is not used."""
+        self.simulation, self.device = simulation, simulation.device
+        self.states = simulation.states
+        assert simulation.hold is not None
+        self.course = make_course(settings, simulation.config.physics, simulation.config.pick)
+        seed = wp.uint64(simulation.config.bake.seed)
+        self.spread = fill(PerturbationData, settings, angle=math.radians(settings.angle), seed=seed)
+        sizes = {"world": simulation.layout.worlds, "instance": simulation.layout.instances}
+        self._progress = allocate_struct(PROGRESS, sizes, self.device)
+        self._progress.trial.fill_(-1)
+        self._next, self._done = (wp.zeros(1, dtype=wp.int32, device=self.device) for _ in range(2))
+        self._row = wp.zeros(simulation.layout.worlds, dtype=wp.int32, device=self.device)
+        simulation.behavior = replace(simulation.behavior, law=TrialLaw(self.course))
+        simulation.hold = WatchedHold(simulation.hold, self._progress)
+        simulation.clear_graphs()
+
+    def upload(self, grasps: Mapping[str, np.ndarray], rows: int) -> Any:
+        """Copy grasps to the device: the struct `Grasps`.
 
         Args:
-            simulation: The worlds, after a tick; they may belong to a simulation of other episodes than the state. Its perception is not
-                used.
-            state: States at moments of choice: an attempt has been planned, and has made no step (`find_choices`).
-            grasps: Arrays of `Grasps` by name.
+            grasps: Its arrays by name.
+            rows: Rows of the state.
 
         Raises:
             StateError: Arrays are missing or of other lengths, a row does not exist, or a number is not finite.
         """
-        self.simulation, self.state = simulation, state
-        self.states, self.device = simulation.states, simulation.device
-        self.count = check_grasps(grasps, len(state), simulation.layout.instances)
-        sizes = {"trial": self.count, "world": simulation.layout.worlds, "instance": simulation.layout.instances}
-        self.grasps, self.labels, self._progress = (allocate_struct(kind, sizes, self.device) for kind in (GRASPS, LABELS, PROGRESS))
-        for name in kernels.Grasps.vars:
-            getattr(self.grasps, name).assign(np.asarray(grasps[name]))
-        self._progress.trial.fill_(-1)
-        self._next, self._done = (wp.zeros(1, dtype=wp.int32, device=self.device) for _ in range(2))
-        self._row = wp.zeros(simulation.layout.worlds, dtype=wp.int32, device=self.device)
+        count = check_grasps(grasps, rows, self.simulation.layout.instances)
+        result = allocate_struct(GRASPS, {"grasp": count}, self.device)
+        for name in Grasps.vars:
+            getattr(result, name).assign(np.asarray(grasps[name]))
+        return result
 
-    def run(self) -> dict[str, np.ndarray]:
-        """Run all trials; returns the labels by name."""
-        while int(self._done.numpy()[0]) < self.count:
+    def run(self, state: State, grasps: Any) -> dict[str, np.ndarray]:
+        """Run all trials.
+
+        Args:
+            state: States at moments of choice: an attempt has been planned, and has made no step (`find_choices`). They may come from a
+                simulation of other episodes.
+            grasps: The struct `Grasps`.
+
+        Returns:
+            The labels by name (trial, ...); trials of a grasp are neighbours.
+        """
+        sizes = {"trial": len(grasps.row) * self.course.repeats}
+        labels, perturbations = (allocate_struct(kind, sizes, self.device) for kind in (LABELS, PERTURBATIONS))
+        self._next.zero_()
+        self._done.zero_()
+        while int(self._done.numpy()[0]) < sizes["trial"]:
             for _ in range(POLL):
-                self.tick()
-        return {name: getattr(self.labels, name).numpy() for name in kernels.Labels.vars}
+                self.tick(state, grasps, labels, perturbations)
+        return {name: getattr(part, name).numpy() for part in (labels, perturbations) for name in part._cls.vars}
 
-    def tick(self) -> None:
+    def tick(self, state: State, grasps: Any, labels: Any, perturbations: Any) -> None:
         """Begin trials in free worlds, advance all worlds by one tick, and label what has ended. Only launches kernels."""
-        simulation, worlds = self.simulation, self.simulation.layout.worlds
-        state, attempts, plan, physics = simulation.state, simulation.attempts, simulation.plan, simulation.physics
-        given: dict[str, Any] = {"progress": self._progress, "grasps": self.grasps}
-        launch(kernels.assign_trials_kernel, 1, **given, next=self._next, row_out=self._row)
-        self.states.load(self.state, self._row)
-        sources = (simulation.scene, state, attempts, plan, physics.state)
-        launch(kernels.begin_trials_kernel, worlds, *sources, **given, row=self._row)
-        gripper.place_grippers(simulation.scene, state, attempts, plan, physics, simulation.behavior.law)
+        simulation, progress, worlds = self.simulation, self._progress, self.simulation.layout.worlds
+        scene, physics, plan = simulation.scene, simulation.physics, simulation.plan
+        sources = (scene, simulation.state, simulation.attempts)
+        with scope("load states", self.device):
+            numbers = {"count": len(labels.outcome), "repeats": self.course.repeats, "next": self._next, "row_out": self._row}
+            launch(kernels.assign_trials_kernel, 1, progress=progress, grasps=grasps, **numbers)
+            self.states.load(state, self._row)
+            planned = {"spread": self.spread, "trial": progress.trial, "grasps": grasps, "perturbations": perturbations}
+            launch(plan_trials_kernel, worlds, *sources, row=self._row, **planned, out=plan)
+            launch(kernels.begin_trials_kernel, worlds, *sources, physics.state, row=self._row, progress=progress)
+            given = {"row": self._row, "progress": progress, "friction": perturbations.friction, "mu": physics.model.shape_material_mu}
+            launch(kernels.set_friction_kernel, (worlds, simulation.layout.shapes_per_world), scene, course=self.course, **given)
+            gripper.place_grippers(scene, simulation.state, simulation.attempts, plan, physics, simulation.behavior.law)
         simulation.tick(perceives=False)
-        sources = (simulation.scene, state, attempts, simulation.seals, physics.state)
-        given |= {"labels": self.labels, "done": self._done, "moved_distance": MOVED}
-        launch(kernels.judge_trials_kernel, worlds, *sources, **given)
+        given = {"course": self.course, "grasps": grasps, "labels": labels, "progress": progress, "done": self._done}
+        launch(kernels.judge_trials_kernel, worlds, *sources, simulation.seals, physics.state, **given)
+
+
+def trial_config(config: Config, device: wp.Device) -> Config:
+    """Settings of a simulation in which trials run, from those of the episodes: number of worlds, height of the lift.
+
+    An episode that a trial ends is not repeated.
+    """
+    picks = config.picks
+    most = DataLayout.of(config).planned * picks.states * picks.candidates * picks.repeats
+    worlds = picks.worlds or min(-(-most // ROUNDS), GPU_WORLDS if device.is_cuda else MAX_CPU_WORLDS)
+    values = {"bake.worlds": worlds, "pick.lift_height": picks.lift_height, "settle.tries": 1, "bop.graph": False}
+    return with_enough_worlds(config.with_values(values), device)
+
+
+def make_course(settings: Picks, physics: PhysicsConfig, pick: Pick) -> Any:
+    """The struct `TrialData`, for a simulation with these settings of physics and attempts."""
+    return fill(
+        kernels.TrialData,
+        settings,
+        lift_steps=math.ceil(pick.lift_height / (pick.lift_speed * physics.step)),
+        hold_steps=round(settings.hold / physics.step),
+        settle_ticks=math.ceil(settings.settle / physics.tick_time),
+        moved_distance=MOVED,
+        base_friction=physics.friction,
+    )
 
 
 def find_choices(simulation: Simulation) -> np.ndarray:
@@ -90,12 +199,12 @@ def own_grasps(simulation: Simulation, worlds: Sequence[int]) -> dict[str, np.nd
     """Grasps that worlds have planned themselves, with rows in the order of the worlds. Waits for the device."""
     plan = simulation.plan
     arrays = {name: getattr(plan, name).numpy()[np.asarray(worlds, int)] for name in ("target", "point", "normal", "yaw", "tilt")}
-    return {"row": np.arange(len(worlds), dtype=np.int32)} | arrays
+    return {"row": np.arange(len(worlds), dtype=np.int32), "candidate": np.zeros(len(worlds), np.int32)} | arrays
 
 
 def check_grasps(grasps: Mapping[str, np.ndarray], rows: int, instances: int) -> int:
-    """Number of grasps; raises StateError as `Trials`."""
-    shapes = {name: (3,) if name in ("point", "normal") else () for name in kernels.Grasps.vars}
+    """Number of grasps; raises StateError as `Trials.upload`."""
+    shapes = {name: (3,) if name in ("point", "normal") else () for name in Grasps.vars}
     if missing := shapes.keys() - grasps.keys():
         raise StateError(f"grasps lack {sorted(missing)[0]}")
     count = len(np.atleast_1d(grasps["row"]))

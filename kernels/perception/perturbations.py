@@ -1,0 +1,93 @@
+"""Plans of grasp trials: candidates become plans of their worlds, perturbed in repeats by counter-based random numbers."""
+
+import warp as wp
+
+from synpick_warp.codes import Stream
+from synpick_warp.kernels.grasps import Grasps, PerturbationData, Perturbations
+from synpick_warp.kernels.perception.cup_alignment import HeadFrame, head_frame
+from synpick_warp.kernels.perception.grasp import gripper_angles, limit_normal
+from synpick_warp.kernels.rng import pixel_key, stream_key, uniform
+from synpick_warp.kernels.structs import CupData, PickData
+
+wp.set_module_options({"enable_backward": False})
+
+SAMPLES = wp.constant(7)
+"""Samples of a perturbation: three of the point, three of the rotation, one of the friction."""
+
+
+@wp.func
+def symmetric_vector(key: wp.uint64, first: int, half_width: float) -> wp.vec3:
+    """Uniform sample of a cube about 0, from three samples of a stream."""
+    x = 2.0 * uniform(key, first) - 1.0
+    y = 2.0 * uniform(key, first + 1) - 1.0
+    z = 2.0 * uniform(key, first + 2) - 1.0
+    return half_width * wp.vec3(x, y, z)
+
+
+@wp.func
+def turn_head(frame: HeadFrame, rotation: wp.vec3, pick: PickData, cups: CupData) -> HeadFrame:
+    """Frame of a head turned by a rotation vector [rad]: of one cup it follows its axis, of several cups the yaw turns as well."""
+    normal = wp.quat_rotate(wp.quat_from_axis_angle(wp.normalize(rotation), wp.length(rotation)), frame.axis)
+    if cups.count > 1:
+        return head_frame(normal, frame.yaw + rotation[2])
+    result = HeadFrame()
+    result.axis = limit_normal(normal, pick.tilt_limit)
+    angles = gripper_angles(result.axis)
+    result.yaw = angles[0]
+    result.tilt = angles[1]
+    return result
+
+
+@wp.kernel
+def plan_trials_kernel(
+    # Scene:
+    pick: PickData,
+    cups: CupData,
+    spread: PerturbationData,
+    # State:
+    row: wp.array[int],  # (world)
+    trial: wp.array[int],  # (world)
+    grasps: Grasps,
+    arrangement_id: wp.array[wp.vec2i],  # (world)
+    attempt: wp.array[int],  # (world)
+    # Out:
+    perturbations_out: Perturbations,
+    target_out: wp.array[int],  # (world)
+    point_out: wp.array[wp.vec3],  # (world) [m]
+    normal_out: wp.array[wp.vec3],  # (world)
+    yaw_out: wp.array[float],  # (world) [rad]
+    tilt_out: wp.array[float],  # (world) [rad]
+):
+    """Make the grasps of trials the plans of worlds with a row. Repeats, all but the first trial of a grasp, are perturbed.
+
+    Samples are named by (seed, episode, arrangement, attempt, candidate, repeat). Launched over world.
+    """
+    world = wp.tid()
+    if row[world] < 0:
+        return
+    grasp = trial[world] // spread.repeats
+    repeat = trial[world] % spread.repeats
+    point = grasps.point[grasp]
+    frame = HeadFrame()
+    frame.axis = grasps.normal[grasp]
+    frame.yaw = grasps.yaw[grasp]
+    frame.tilt = grasps.tilt[grasp]
+    offset = wp.vec3(0.0, 0.0, 0.0)
+    rotation = wp.vec3(0.0, 0.0, 0.0)
+    friction = float(1.0)
+    if repeat > 0:
+        key = pixel_key(stream_key(spread.seed, arrangement_id[world][0], arrangement_id[world][1], Stream.TRIALS), attempt[world])
+        key = pixel_key(key, grasps.candidate[grasp])
+        offset = symmetric_vector(key, SAMPLES * repeat, spread.offset)
+        rotation = symmetric_vector(key, SAMPLES * repeat + 3, spread.angle)
+        friction = 1.0 + spread.friction * (2.0 * uniform(key, SAMPLES * repeat + 6) - 1.0)
+        point = point + offset
+        frame = turn_head(frame, rotation, pick, cups)
+    perturbations_out.offset[trial[world]] = offset
+    perturbations_out.rotation[trial[world]] = rotation
+    perturbations_out.friction[trial[world]] = friction
+    target_out[world] = grasps.target[grasp]
+    point_out[world] = point
+    normal_out[world] = frame.axis
+    yaw_out[world] = frame.yaw
+    tilt_out[world] = frame.tilt

@@ -1,0 +1,145 @@
+"""Grasp candidates of saved states: pixels drawn in perception's images, and their grasps, framed as those of attempts."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from synpick_warp.configs.episodes.picks import Picks
+from synpick_warp.kernels.perception import candidates as kernels
+from synpick_warp.stages.arrays import allocate_struct, struct_arrays
+from synpick_warp.stages.launch import launch
+from synpick_warp.stages.perception.perceive import Perception
+from synpick_warp.stages.sim.simulate import Simulation
+from synpick_warp.stages.sim.states import State
+from synpick_warp.stages.sim.trials import GRASPS
+from synpick_warp.stages.timing import scope
+
+POOL = struct_arrays(
+    kernels.Pool,
+    "view",
+    "draw",
+    row_first=("view", "row"),
+    pixels=("view",),
+    visible=("view", "instance"),
+    count=("view", "instance", "stratum"),
+    units={"pixel": "px", "pixels": "px"},
+)
+CANDIDATES = struct_arrays(kernels.Candidates, "grasp", units={"pixel": "px"})
+
+
+class CandidateSampler:
+    """Samples grasp candidates of states, in batches of as many as perception has views. Uses worlds and perception of a simulation.
+
+    Attributes:
+        count: Candidates of a state.
+        uniform: Number of them that are uniform over visible pixels; they come last.
+    """
+
+    def __init__(self, simulation: Simulation, settings: Picks) -> None:
+        """Allocate scratch for a simulation, after a tick, whose worlds may be overwritten; it must have perception."""
+        assert simulation.perception is not None
+        self.simulation, self.device = simulation, simulation.device
+        self.perception: Perception = simulation.perception
+        self.images = self.perception.images
+        self.count, self.uniform = settings.candidates, round(settings.uniform * (settings.candidates - 1))
+        views, width, height = self.images.views, *simulation.config.perception.resolution
+        self._dim = (views.count, height, width)
+        sizes = {"view": views.count, "row": height, "instance": views.instances, "stratum": int(kernels.STRATA)}
+        self._draws = sizes["draw"] = int(kernels.POOL) + self.uniform + 1
+        self._pool = allocate_struct(POOL, sizes, self.device)
+        self._row = wp.zeros(simulation.layout.worlds, dtype=wp.int32, device=self.device)
+        self._index = wp.zeros(1, dtype=wp.int32, device=self.device)
+        self._graph: wp.Graph | None = None
+
+    def sample(self, state: State, rows: Sequence[int]) -> tuple[Any, Any, np.ndarray]:
+        """Sample the candidates of rows of a state, which must be at moments of choice (`trials.find_choices`).
+
+        Returns:
+            Structs `Grasps` and `Candidates`, `count` elements a row in their order, and which instances each row's image shows
+            (row, instance) bool. Waits for the device.
+        """
+        sizes = {"grasp": len(rows) * self.count}
+        grasps, candidates = (allocate_struct(kind, sizes, self.device) for kind in (GRASPS, CANDIDATES))
+        uploaded = wp.array(rows, dtype=wp.int32, device=self.device)
+        views, visible = self.images.views.count, []
+        for first in range(0, len(rows), views):
+            self._sample_batch(state, first, uploaded, grasps, candidates)
+            visible.append(self._pool.visible.numpy()[: len(rows) - first] > 0)
+        return grasps, candidates, np.concatenate(visible)
+
+    def _sample_batch(self, state: State, first: int, rows: wp.array, grasps: Any, candidates: Any) -> None:
+        """Sample the candidates of the rows that a batch of views shows, from `first` on."""
+        simulation, views = self.simulation, self.images.views
+        assigned = {"first": first, "rows": rows, "views": views.count, "row_out": self._row}
+        launch(kernels.assign_states_kernel, simulation.layout.worlds, **assigned, world_out=views.world)
+        with scope("load states", self.device):
+            simulation.states.load(state, self._row)
+        with scope("render", self.device):
+            self.images.render(simulation.record.snapshot)
+        with scope("draw and score pixels", self.device):
+            self._draw()
+        sources = (simulation.state, simulation.attempts)
+        drawn = {"component": self.images.arrays.component, "pool": self._pool, "views": views, "row": self._row}
+        chosen = {"row_out": grasps.row, "candidate_out": grasps.candidate, "target_out": grasps.target}
+        numbers = {"seed": self._seed, "uniform": self.uniform, "candidates": self.count, "first": first}
+        launch(
+            kernels.choose_candidates_kernel, (views.count, self.count), *sources, **numbers, **drawn, **chosen, candidates_out=candidates
+        )
+        with scope("frame grasps", self.device):
+            self._frame(first, grasps, candidates)
+
+    @property
+    def _seed(self) -> Any:
+        return wp.uint64(self.simulation.config.bake.seed)
+
+    def _draw(self) -> None:
+        """Draw and score the pixels of a batch of views."""
+        simulation, images, pool = self.simulation, self.images, self._pool
+        views, scene = images.views, images.scene
+        launch(kernels.label_instances_kernel, self._dim, scene, images, component=images.arrays.component)
+        pool.visible.zero_()
+        seen = {"pool": pool, "views": views, "component": images.arrays.component}
+        launch(kernels.count_rows_kernel, self._dim[:2], **seen)
+        launch(kernels.sum_rows_kernel, views.count, views=views, pool=pool, largest=images.arrays.largest)
+        sources = (simulation.state, simulation.attempts, simulation.observation, simulation.plan)
+        launch(kernels.draw_pixels_kernel, (views.count, self._draws), *sources, **seen, seed=self._seed)
+        launch(kernels.score_pixels_kernel, (views.count, self._draws), scene, images, pool=pool, suction=scene.suction_maps)
+        launch(kernels.count_strata_kernel, (views.count, views.instances), **seen)
+
+    def _frame(self, first: int, grasps: Any, candidates: Any) -> None:
+        """Frame the grasps of the chosen candidates, one of each view at a time, by the functions by which an attempt is planned."""
+        simulation, planner, views = self.simulation, self.perception.planner, self.images.views
+        scene, observation, plan, device = simulation.scene, simulation.observation, simulation.plan, self.device
+        at = {"candidates": self.count, "first": first, "index": self._index, "views": views}
+        stored = {f"grasp_{name}_out": getattr(grasps, name) for name in ("point", "normal", "yaw", "tilt")}
+        target = {"pixel": candidates.pixel, "grasp_target": grasps.target, "target_out": plan.target}
+        self._index.zero_()
+        launch(kernels.store_grasps_kernel, views.count, plan, **at, **stored)
+
+        def frame(stores: bool) -> None:
+            launch(kernels.aim_candidates_kernel, views.count, **at, **target, grasp_pixel_out=observation.grasp_pixel)
+            planner.smooth_normal(scene, observation, plan)
+            launch(kernels.store_normals_kernel, views.count, plan, **at, surface_normal=candidates.surface_normal)
+            if stores:
+                planner.frame_grasp(scene, observation, plan)
+                if simulation.behavior.choose_grasps is not None:
+                    simulation.behavior.choose_grasps(planner, scene, plan)
+                launch(kernels.store_grasps_kernel, views.count, plan, **at, **stored)
+            launch(kernels.increment_kernel, 1, index=self._index)
+
+        frame(False)
+        if self.count == 1:
+            return
+        frame(True)
+        if not device.is_cuda:
+            for _ in range(2, self.count):
+                frame(True)
+            return
+        with wp.ScopedCapture(device=device) as capture:
+            frame(True)
+        for _ in range(2, self.count):
+            wp.capture_launch(capture.graph)
