@@ -13,6 +13,9 @@ import cv2
 import numpy as np
 import trimesh
 
+from synpick_warp.codes import Outcome, Share
+from synpick_warp.configs.files.load import load_config
+from synpick_warp.configs.files.write import config_to_toml
 from tests.validation.planting import (
     CAMERA,
     COCO,
@@ -277,6 +280,19 @@ def depth_of_something_else(folder: Path) -> None:
     pixels(DEPTH, lambda depth: depth - 300 * visible.astype(np.uint16))(folder)
 
 
+def other_outcome(folder: Path) -> None:
+    """The own grasp of the episode's attempt is dropped, on the same path."""
+    path = folder / "config.toml"
+    same = load_config(str(path), {"picks.near": 0.0, "picks.hold": 0.0, "picks.lift_height": 1.0})
+    path.write_text(config_to_toml(same))
+
+    def change(rows: np.ndarray) -> None:
+        first = int(np.flatnonzero((rows["frame"] == 1) & (rows["instance"] == 2))[0])
+        rows["share"][first], rows["point"][first], rows["outcome"][first] = Share.OWN, (0.1, 0.2, 0.3), Outcome.DROPPED
+
+    trials(change)(folder)
+
+
 def put_value(rows: np.ndarray, column: str, value: Any, where: str = "") -> None:
     """Set a column of the first trial and its repeats, or of the first where another column is not 0."""
     first = int(np.flatnonzero(rows[where])[0]) if where else 0
@@ -332,6 +348,7 @@ PICKS: Faults = {
     "success without outcome": ("picks-outcomes", "success does not agree", trials(lambda rows: put_value(rows, "outcome", 4, "success"))),
     "moved nothing": ("picks-outcomes", "moved and farthest do not agree", trials(lambda rows: put_value(rows, "moved", 2))),
     "own grasp of another attempt": ("picks-own", "chose another grasp", trials(lambda rows: put_value(rows, "share", 0, "frame"))),
+    "own grasp with another outcome": ("picks-own", "its outcome is dropped, that of attempt 0 is target_picked", other_outcome),
     "own grasp of no attempt": ("picks-own", "no attempt chose from frame 0", trials(lambda rows: put_value(rows, "share", 0))),
 }
 FAULTS = FILES | ANNOTATIONS | IMAGES | SETS | PICKS | ANNOTATIONS | IMAGES | SETS | RENDERED

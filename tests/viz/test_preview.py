@@ -87,6 +87,22 @@ def test_layers_get_columns_of_their_own(dataset, tmp_path):
         write_contact_sheet(dataset, tmp_path / "sheet.png", 100)
 
 
+def test_support_is_drawn_from_the_load_to_what_bears_it(dataset, tmp_path):
+    """An arrow in the colour of the first instance, between the middles of both boxes."""
+    for scene in (each.folder for each in find_scenes(dataset)):
+        graph = {"occlusion": [], "support": [[0, 1, 9.0], [1, -1, 3.0]], "order": [[0], [1]]}
+        (scene / "scene_graph.json").write_text(json.dumps({str(frame): graph for frame in range(FRAMES)}))
+    sheet = cv2.imread(str(write_contact_sheet(dataset, tmp_path / "sheet.png", 1)))
+    assert sheet.shape[1] == 5 * (480 + 4) + LEGEND
+    scene, frame = sample(find_scenes(dataset), 1)[0]
+    infos = json.loads((scene.folder / "scene_gt_info.json").read_text())[str(frame)][:2]
+    (x, y), (u, v) = ((box[0] + box[2] / 2, box[1] + box[3] / 2) for box in (info["bbox_visib"] for info in infos))
+    panel, scale = sheet[20:380, -484:-4], 5.0
+    middle = panel[round(scale * (y + v) / 2), round(scale * (x + u) / 2)]
+    record = json.loads((scene.folder / "scene_gt.json").read_text())[str(frame)][0]
+    np.testing.assert_allclose(middle, instance_color(record["instance_id"]), atol=40)
+
+
 def test_views_are_spread_over_cameras_scenes_and_time(dataset):
     views = sample(find_scenes(dataset), 6)
     assert [int(scene.folder.name) for scene, _ in views] == [0, 1, 2, 3, 4, 5]

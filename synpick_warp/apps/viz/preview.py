@@ -37,6 +37,8 @@ _CAPTION = 20
 """Height of the caption above an image [px]."""
 _GAP = 4
 """Gap between images [px]."""
+_WIDEST_ARROW = 4
+"""Force at which an arrow of the support graph becomes no wider [N]."""
 _MIN_LEGEND = 120
 """Minimum height of a row without its caption [px], for the legend of low images."""
 
@@ -228,6 +230,8 @@ def _row(view: _View, depth_scale: DepthScale | None, baked: Baked, most: int) -
     counts = depth_scale and DepthScale(*(each / count for each in depth_scale))
     layers = layer_pictures(view.files, view.frame, counts)
     panels += [(caption, partial(_fit, picture, smooth=False)) for caption, picture in layers]
+    if graph := view.files.graph(view.frame):
+        panels.append(("arrows: lies on; numbers: unstacking order", lambda scale: _draw_graph(view, graph, _fit(color, scale), scale)))
     scale = min(_PANEL_WIDTH / size[0], _MAX_PANEL_HEIGHT / size[1])
     drawn = [(caption, draw(scale)) for caption, draw in panels]
     height = max(image.shape[0] for _, image in drawn)
@@ -275,6 +279,27 @@ def _placeholder(color: Image, text: str) -> Image:
     drawn = np.repeat(cv2.cvtColor(color, cv2.COLOR_BGR2GRAY)[..., None] // 3, 3, axis=2)
     put_text(drawn, text, (8, 24), 0.5, (230, 230, 230))
     return drawn
+
+
+def _draw_graph(view: _View, graph: Mapping[str, Any], image: Image, scale: float) -> Image:
+    """Draw the support graph over the darkened image: an arrow from each object to each that carries it, wider for a larger force, and the
+    object's place in the unstacking order."""
+    image //= 2
+    place = {index: step + 1 for step, group in enumerate(graph.get("order", ())) for index in group}
+    points, colors = {}, {}
+    for index, (record, info) in enumerate(view.truth):
+        if info["px_count_visib"] > 0:
+            x, y, width, height = info["bbox_visib"]
+            points[index] = round(scale * (x + width / 2)), round(scale * (y + height / 2))
+            colors[index] = instance_color(record.get("instance_id", index))
+    for upper, lower, force in graph.get("support", ()):
+        if upper in points and lower in points:
+            thickness = 1 + min(_WIDEST_ARROW, round(force))
+            cv2.arrowedLine(image, points[upper], points[lower], colors[upper], thickness, cv2.LINE_AA, tipLength=0.2)
+    for index, (x, y) in points.items():
+        cv2.circle(image, (x, y), 4, colors[index], -1, cv2.LINE_AA)
+        put_text(image, str(place.get(index, "")), (x + 5, y - 4), 0.42, PAPER)
+    return image
 
 
 def _draw_boxes(view: _View, image: Image, scale: float) -> Image:

@@ -165,7 +165,9 @@ def check_outcomes(subject: PicksSubject) -> Findings:
 
 @rule(PicksSubject, "picks-own", "bake the episode again: attempts and picks are not of the same run")
 def check_own(subject: PicksSubject) -> Findings:
-    """The own grasp of a state of picks is that of the attempt that chose from its frame."""
+    """The own grasp of a state of picks is that of the attempt that chose from its frame, with its outcome where it takes its path."""
+    config = open_data_set(subject.root).config
+    is_same = (config.picks.near, config.picks.hold, config.picks.lift_height) == (0.0, 0.0, config.pick.lift_height)
     attempts = {attempt["frame"]: attempt for attempt in subject.episode.attempts if attempt.get("point") is not None}
     own = subject.picks[(subject.picks["share"] == Share.OWN) & (subject.picks["repeat"] == 0)]
     for trial in own:
@@ -175,3 +177,5 @@ def check_own(subject: PicksSubject) -> Findings:
             yield subject.place, f"{where}: no attempt chose from frame {trial['frame']}"
         elif attempt["target"] != trial["instance"] or np.abs(np.array(attempt["point"]) - trial["point"]).max() > SAME:
             yield subject.place, f"{where}: attempt {attempt['attempt']} chose another grasp"
+        elif is_same and attempt["outcome"] != (outcome := Outcome(int(trial["outcome"])).name.lower()):
+            yield subject.place, f"{where}: its outcome is {outcome}, that of attempt {attempt['attempt']} is {attempt['outcome']}"
