@@ -32,7 +32,7 @@ from synpick_warp.configs.schema import Cameras, Config
 from synpick_warp.environment.make import make_picking
 from synpick_warp.errors import SynpickError
 from synpick_warp.exporters.registry import Needs
-from synpick_warp.factory.assembly import Factory, build_factory
+from synpick_warp.factory.assembly import Factory, build_factory, build_stages
 from synpick_warp.stages import timing
 from synpick_warp.stages.render.view_setup import first_views
 from synpick_warp.stages.sim.physics import with_enough_worlds
@@ -224,7 +224,7 @@ def measure(
         "patches": measure_patches(config),
         "heaps": measure_heaps(config, min_seconds),
         "environment": measure_environment(functools.partial(make_picking, source=config), config.bake.worlds, min_seconds),
-        "picks": measure_picks(config),
+        "picks": measure_picks(functools.partial(build_stages, config.with_values({"bake.mode": "pick"})), config.bake),
     }
     yield from itertools.chain.from_iterable(of_part(part, rows) for part, rows in others.items() if part in parts)
 

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 
 import numpy as np
 import warp as wp
 
-from synpick_warp.configs.schema import Config
-from synpick_warp.factory.assembly import build_stages
+from synpick_warp.configs.schema import Bake
+from synpick_warp.factory.assembly import Stages
 from synpick_warp.factory.picks import PickEngine, count_batch
 from synpick_warp.stages import timing
 from synpick_warp.stages.sim.choices import ChoiceReader, ChoiceRecorder
@@ -19,11 +19,13 @@ from synpick_warp.system.progress import SilentProgress
 from tools.options import Row
 
 
-def measure_picks(config: Config) -> Iterator[Row]:
-    """Save as many states as a batch of a bake has, and run their trials twice; the second run is measured."""
-    config = config.with_values({"bake.mode": "pick"})
-    device = pick_device(config.bake.device)
-    stages = build_stages(config, device, SilentProgress(), range(config.bake.worlds))
+def measure_picks(build: Callable[..., Stages], bake: Bake) -> Iterator[Row]:
+    """Save as many states as a batch of a bake has, and run their trials twice; the second run is measured.
+
+    `build`: `build_stages` with settings of episodes that pick; `bake`: their section.
+    """
+    device = pick_device(bake.device)
+    stages = build(device, SilentProgress(), range(bake.worlds))
     simulation = stages.simulation
     engine = PickEngine(stages)
     batch = count_batch(engine.simulation.layout.worlds, engine.trials_of_state)
