@@ -7,6 +7,7 @@ import pytest
 
 from synpick_warp.apps.statistics import ranking
 from synpick_warp.configs.files.load import load_config
+from synpick_warp.environment.make import make_picking
 from tests.builders import PICKING, boxes
 from tests.worlds.small_worlds import QUICK
 
@@ -113,7 +114,7 @@ def test_pickers_are_run_from_the_same_piles(device):
     runs = pytest.importorskip("tools.examples.picking_runs", exc_type=ImportError)
     with boxes():
         config = load_config("smoke", QUICK | PICKING)
-        environment = runs.make_environment(config, 2, (64, 36), 0, max_steps=6)
+        environment = make_picking(runs.choose_environment(2, (64, 36), 0, max_steps=6), config)
     pickers = train_picker.dense_scores(None, torch.device(str(environment.worlds.device)))
     picked, piles = runs.run_first_choices(environment, pickers, 2)
     assert piles == environment.count

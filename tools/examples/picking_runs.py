@@ -8,10 +8,8 @@ from dataclasses import dataclass
 import torch  # pyright: ignore[reportMissingImports]
 
 from synpick_warp.codes import MAX_INSTANCES
-from synpick_warp.configs.schema import Config
-from synpick_warp.environment.make import make_picking
 from synpick_warp.environment.picking import PickingEnvironment
-from synpick_warp.environment.settings import DISABLED, PICK, PIXEL, TORCH, make_choice
+from synpick_warp.environment.settings import DISABLED, PICK, PIXEL, TORCH, Choice, make_choice
 from synpick_warp.scenes.cameras import make_cameras
 from tools.examples.picking_scores import Sight
 
@@ -30,12 +28,9 @@ class Emptied:
     empty: int = 0
 
 
-def make_environment(
-    config: Config, worlds: int, resolution: tuple[int, int], seed: int, max_steps: int | None = None
-) -> PickingEnvironment:
-    """Environment of whole picks at pixels, which observes depth and instances; raises SynpickError if it cannot be built."""
-    choice = make_choice(PICK, worlds, ("depth", "instances"), resolution, PIXEL, DISABLED, TORCH, seed, max_steps, None)
-    return make_picking(choice, config, {}, config.bake.device)
+def choose_environment(worlds: int, resolution: tuple[int, int], seed: int, max_steps: int | None = None) -> Choice:
+    """Options, for `make_picking`, of an environment of whole picks at pixels, which observes depth and instances."""
+    return make_choice(PICK, worlds, ("depth", "instances"), resolution, PIXEL, DISABLED, TORCH, seed, max_steps, None)
 
 
 def observe(environment: PickingEnvironment, obs: Mapping[str, torch.Tensor]) -> Sight:

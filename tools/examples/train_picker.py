@@ -326,7 +326,8 @@ def run_evaluate(options: argparse.Namespace, device: torch.device) -> None:
 
 def run_simulation(options: argparse.Namespace, device: torch.device) -> None:
     """Command `run`: success of the first choice of each picker from the same piles, then picks until empty of the learned one."""
-    from tools.examples.picking_runs import make_environment, run_first_choices, run_until_empty
+    from synpick_warp.environment.make import make_picking
+    from tools.examples.picking_runs import choose_environment, run_first_choices, run_until_empty
 
     network, parts = load_picker(options.picker, device)
     named = {"seen": sorted(set(parts["objects"]) - set(parts["unseen"])), "unseen": parts["unseen"], "all": []}[options.objects]
@@ -334,7 +335,7 @@ def run_simulation(options: argparse.Namespace, device: torch.device) -> None:
         raise ConfigError(f"--objects is {options.objects}, but {options.picker} was trained with --unseen 0")
     counts = {"arrangement.counts": {str(obj_id): [0, MOST_OF_EACH] for obj_id in named}} if named else {}
     config, scores = configure(options, counts), dense_scores(network, device)
-    environment = make_environment(config, options.worlds, tuple(parts["size"]), options.seed)
+    environment = make_picking(choose_environment(options.worlds, tuple(parts["size"]), options.seed), config)
     started = time.perf_counter()
     picked, piles = run_first_choices(environment, scores, options.attempts)
     print(f"first choice, {piles} piles of {options.objects} objects, in {time.perf_counter() - started:.0f} s")

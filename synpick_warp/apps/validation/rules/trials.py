@@ -22,6 +22,9 @@ PIXEL = 0.01
 """Largest distance of a projected point from its pixel, beyond its sides [px of the perception image]."""
 MOVED = 5e-3
 """Displacement above which an object counts as moved [m]."""
+UNSEEN = 0.05
+"""Share of points that may lie on what no pixel of a view shows, where its pixels are wider than those of the perception image: thin parts
+and edges. It is 0.2 % of a pile's points in 320 px of a perception image of 1280, 0.6 % in 160 px; an object elsewhere has more."""
 SAME = 1e-4
 """Largest distance between an attempt's grasp point and that of the own grasp's trial [m]."""
 _AROUND = np.stack(np.meshgrid([-1, 0, 1], [-1, 0, 1]), axis=-1).reshape(-1, 2)
@@ -116,9 +119,10 @@ def check_pixels(subject: PicksSubject) -> Findings:
 
 @rule(PicksSubject, "picks-surface", "bake the episode again: points and poses are not of the same run")
 def check_surface(subject: PicksSubject) -> Findings:
-    """Grasp points of picks lie on the visible surface of their instance: mask and depth show it there."""
-    for _, picks, view in subject.views():
+    """Grasp points of picks lie on the visible surface of their instance: mask and depth show it there, in coarse views but for UNSEEN."""
+    for state, picks, view in subject.views():
         width, height = view.size
+        allowed = UNSEEN if width < state["width"] else 0.0
         rotation, offset = view.world_to_camera[:3, :3], view.world_to_camera[:3, 3]
         point, normal = picks["point"] @ rotation.T + offset, picks["normal"] @ rotation.T
         pixel = np.floor(view.project(point)).astype(np.int64)[:, None] + _AROUND
@@ -129,12 +133,15 @@ def check_surface(subject: PicksSubject) -> Findings:
             # The depth at a neighbouring pixel is that of the tangent plane; where that is nearly seen from the side, that of the point.
             plane = np.einsum("nc,nc->n", point, normal)[:, None] / np.where(np.abs(facing) < 0.05, np.nan, facing)
             near = np.fmin(np.abs(view.depth[row, column] - plane), np.abs(view.depth[row, column] - point[:, 2:])).min(axis=1)
-            yield from subject.tell(~(near <= NEAR), f"its point is more than {1e3 * NEAR:.0f} mm from the surface that depth shows", picks)
+            off = ~(near <= NEAR)
+            if off.sum() > allowed * len(off):
+                yield from subject.tell(off, f"its point is more than {1e3 * NEAR:.0f} mm from the surface that depth shows", picks)
         if view.has("mask_visib"):
             shown = np.zeros(len(picks), bool)
             for instance, mask in zip(view.instance_ids.tolist(), view.masks, strict=True):
                 shown |= (picks["instance"] == instance) & mask[row, column].any(axis=1)
-            yield from subject.tell(~shown, "its pixel does not show its instance", picks)
+            if (~shown).sum() > allowed * len(shown):
+                yield from subject.tell(~shown, "its pixel does not show its instance", picks)
         known = dict(zip(view.instance_ids.tolist(), view.object_ids.tolist(), strict=True))
         wrong = np.array([known.get(instance) != obj_id for instance, obj_id in zip(picks["instance"], picks["obj_id"], strict=True)])
         yield from subject.tell(wrong, "its instance is not an object of that obj_id", picks)
