@@ -153,6 +153,9 @@ def test_figures_of_hand_made_trials():
     trials["seal"], trials["success"], trials["wrench"] = [0.1, 0.2, 0.8, 0.9] * 2, [0, 0, 1, 1] * 2, 0.5
     extra = trials[:2].copy()
     extra["share"], extra["outcome"] = (Share.OWN, Share.UNIFORM), (Outcome.DROPPED, Outcome.NONE)
+    alike = evaluate_picks(np.concatenate((trials, extra)), 1, {3: "box"}, draws=20)
+    assert {each.population for each in alike.scores} == {UNIFORM, ALL}, "all are pressed along the normal"
+    trials["angle"][0] = 20.0
     figures = evaluate_picks(np.concatenate((trials, extra)), 1, {3: "box"}, draws=20)
     assert (figures.trials, figures.left_out, figures.states, figures.candidates) == (8, 2, 2, 8)
     areas = {(each.population, each.score): each.auc.value for each in figures.scores}

@@ -114,6 +114,8 @@ def evaluate_picks(trials: np.ndarray, episodes: int, names: dict[int, str], dra
     uniform, weight = counted["share"] == Share.UNIFORM, counted["weight"]
     faced = uniform & (counted["angle"] <= FACING)
     populations = {UNIFORM: (uniform, weight), FACED: (faced, weight), ALL: (np.ones(len(counted), bool), np.ones(len(counted)))}
+    if faced.sum() == uniform.sum():
+        del populations[FACED]  # It is the same as UNIFORM.
     figures = []
     for population, (kept, weight) in populations.items():
         for score, values in both.items() if kept.any() else ():
