@@ -187,7 +187,7 @@ def make_env(
     piles: int | None = None,
     progress: Progress | None = None,
 ) -> PickingVectorEnv:
-    """Make a batched environment (`gymnasium.vector.VectorEnv`) in which an action is a pick, or a twist of the gripper for a tick.
+    """Make a vector environment (`gymnasium.vector.VectorEnv`) in which an action is a pick, or a twist of the gripper for a tick.
 
         env = synpick_warp.make_env(task="pick", num_envs=512, device="cuda:0", obs=("depth",), resolution=(160, 90), action="pixel")
         obs, info = env.reset(seed=3)
@@ -201,13 +201,13 @@ def make_env(
         num_envs: Number of environments.
         device: Overrides `bake.device`.
         obs: Contents of the observation, a dict: of depth, rgb, instances, normals, state.
-        resolution: Width and height of images of camera 0 [px].
+        resolution: Width and height of images, of `perception.camera` or the first camera [px].
         action: "pixel" or "point": a whole pick; "twist": a tick. None: "pixel", of task "move" "twist".
         autoreset: "next_step", "same_step" or "disabled", as Gymnasium defines them.
         backend: Library of the arrays: "torch" or "warp", on the device, or "numpy".
         seed: Seed of the first environment's episodes if `reset` gets none; the others follow.
         max_steps: Steps after which an episode is truncated; None: 30 attempts, or 600 ticks.
-        piles: Number of different episodes; None: no two are the same.
+        piles: Number of different piles that episodes are drawn from; None: 2^31 - 1, so that repeats are rare.
         progress: Receives stages and notes; None: silent.
 
     Raises:

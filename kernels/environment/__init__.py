@@ -1,1 +1,1 @@
-"""Device code of the batched environment: starts of episodes, actions, observations."""
+"""Device code of the vector environment: settling of piles, actions, observations."""

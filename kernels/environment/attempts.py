@@ -1,4 +1,4 @@
-"""Attempts of the environment: a world begins the one that its action plans, waits when it has ended, and measures what it did."""
+"""Attempts of the vector environment: their start from planned actions, their end, and their results."""
 
 import warp as wp
 
@@ -12,22 +12,22 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.struct
 class Results:
-    """What the last attempt of each world did, and what it is measured from."""
+    """Results of the last attempt of each world, and the poses and counts that they are measured against."""
 
     outcome: wp.array[int]
     """(world): `Outcome`; NONE if the episode failed first, with its `Ending`."""
     picked: wp.array[int]
     """(world): first instance attached at the end; -1: none."""
     hits: wp.array[wp.vec2i]
-    """(world): suction rays that hit an object, and the cups with a good seal: bit k, cup k."""
+    """(world): number of suction rays that hit an object, and bit mask of cups with a good seal."""
     peak_force: wp.array[float]
     """(world): largest seal force, including seals that broke [N]."""
     ticks: wp.array[int]
     """(world): duration [ticks]."""
     moved: wp.array[int]
-    """(world): number of objects, but for the one picked, displaced by more than a threshold."""
+    """(world): number of objects other than the one picked that were displaced by more than a threshold."""
     farthest: wp.array[float]
-    """(world): largest displacement of one of them [m]."""
+    """(world): largest displacement of any object but the one picked [m]."""
     lost: wp.array[int]
     """(world): objects that left the bin without being picked."""
     lost_before: wp.array[int]
@@ -47,7 +47,7 @@ def begin_results_kernel(
     # Out:
     results_out: Results,
 ):
-    """Write results without effect, and what effects are measured from. Launched over world."""
+    """Reset the results, and write the references of their measurement: poses and number of lost objects. Launched over world."""
     world = wp.tid()
     results_out.outcome[world] = Outcome.NONE
     results_out.picked[world] = -1
@@ -74,7 +74,7 @@ def begin_attempts_kernel(
     hits_out: wp.array[wp.vec2i],  # (world)
     engaged_words_out: wp.array2d[wp.uint32],  # (world, word)
 ):
-    """Begin the planned attempt in running worlds, with task APPROACH. Launched over world."""
+    """Begin the planned attempts of running worlds: write task APPROACH and reset the counters. Launched over world."""
     world = wp.tid()
     if running[world] == 0:
         return
@@ -107,9 +107,9 @@ def judge_attempts_kernel(
     world_out: wp.array[int],  # (world)
     done_inout: wp.array[int],  # (one)
 ):
-    """Measure running attempts; `running` of those that have ended in this tick becomes 0, and `done` counts them.
+    """Write the results of running attempts after a tick. Those that ended in it get `running` 0, and `done` is incremented.
 
-    `world` receives the index of their world, else -1. Launched over world, at the end of a tick.
+    `world` becomes the world's own index where its attempt ended in this tick, for a save; else -1. Launched over world.
     """
     world = wp.tid()
     world_out[world] = -1

@@ -1,4 +1,4 @@
-"""Episodes of the environment: piles that come to rest in any world."""
+"""Settling of piles for the checkpoint bank: assignment of episodes to worlds, and detection of rest."""
 
 import warp as wp
 
@@ -16,7 +16,7 @@ def start_piles_kernel(
     phase_out: wp.array[int],  # (world)
     ending_out: wp.array[int],  # (world)
 ):
-    """Assign an episode to each world, which starts with its first arrangement in the next tick; -1: none, and the world is idle.
+    """Assign an episode to each world, which starts in the next tick from its first arrangement; -1: the world becomes idle.
 
     Launched over world.
     """
@@ -38,9 +38,9 @@ def list_settled_kernel(
     world_out: wp.array[int],  # (row)
     done_inout: wp.array[int],  # (two)
 ):
-    """Write the world of each row whose pile has come to rest in this tick, and -1 to that world's `row`.
+    """List the piles that came to rest in this tick: write the world of each bank row, and -1 to that world's `row`.
 
-    `done` counts these, and worlds whose episode has used up its arrangements. Launched over world.
+    `done` counts the piles at rest, and the worlds whose episode has used up its arrangements. Launched over world.
     """
     world = wp.tid()
     row = row_inout[world]

@@ -1,4 +1,4 @@
-"""Actions as suction grasps: a pixel of the observed image, or a point with a direction."""
+"""Suction grasps from actions: a pixel of the observed depth image, or a point with a direction."""
 
 import warp as wp
 
@@ -25,9 +25,10 @@ def grasp_pixels_kernel(
     instance_out: wp.array[int],  # (world)
     running_inout: wp.array[int],  # (world)
 ):
-    """Surface point at a pixel (column, row) of each world's image, the sum of the normals of the same surface in the window, and instance.
+    """Back-project a pixel (column, row) of each world's depth image: write surface point, smoothed normal and instance.
 
-    `instance` is -1 where the pixel shows none; `running` becomes 0 where it shows no surface. The camera is that of the first view.
+    `direction` is the sum of the normals of the same segment in a square of 2 `window` + 1 pixels; `instance` is -1 where none is shown.
+    `running` becomes 0 where the pixel shows no surface. The camera is that of the first view.
     Launched over world.
     """
     world = wp.tid()
@@ -70,9 +71,9 @@ def plan_grasps_kernel(
     yaw_out: wp.array[float],  # (world) [rad]
     tilt_out: wp.array[float],  # (world) [rad]
 ):
-    """Write the plans of running worlds: a grasp at a point, along `direction` out of the surface, of any length.
+    """Write the grasp plans of running worlds: point, normal along `direction` (out of the surface, of any length), yaw and tilt.
 
-    The normal is at most the tilt limit from the vertical. The target becomes `instance`, unless `keeps_target`. Launched over world.
+    The normal is clamped to the tilt limit about the vertical. The target becomes `instance`, unless `keeps_target`. Launched over world.
     """
     world = wp.tid()
     if running[world] == 0:

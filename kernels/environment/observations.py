@@ -1,4 +1,4 @@
-"""Observations: images of every world without loss of precision, and the state as a vector."""
+"""Observations of the vector environment: depth, segmentation and normals in full precision, target masks, and state vectors."""
 
 import warp as wp
 
@@ -12,7 +12,7 @@ wp.set_module_options({"enable_backward": False})
 
 # Values of the gripper at the beginning of a state vector: wrist (3), yaw, tilt, number of held objects.
 GRIPPER_VALUES = wp.constant(6)
-# Values of an instance: present, obj_id, held, pose (7).
+# Values of an instance: present (0 or 1), obj_id, held (0 or 1), pose (7).
 INSTANCE_VALUES = wp.constant(10)
 
 
@@ -32,7 +32,7 @@ def copy_images_kernel(
     segment_out: wp.array3d[wp.uint8],  # (world, row, column)
     normal_out: wp.array3d[wp.vec3],  # (world, row, column)
 ):
-    """Write planar depth (0: no surface), segmentation id and unit shading normal (up where no mesh is seen) to the images of the worlds.
+    """Copy the G-buffer to the worlds' images: planar depth (0: no surface), segmentation id, unit shading normal (up where no mesh is).
 
     Launched over view, pixel (tile order, from flat index `first` on).
     """
@@ -67,7 +67,7 @@ def write_target_masks_kernel(
     # Out:
     mask_out: wp.array3d[wp.uint8],  # (world, row, column)
 ):
-    """Mask of the visible pixels of each world's target: 1, elsewhere 0. Launched over world, row, column."""
+    """Write the visible mask of each world's target: 1, elsewhere 0. Launched over world, row, column."""
     world, row, column = wp.tid()
     mask_out[world, row, column] = wp.uint8(0)
     if target[world] >= 0 and int(segment[world, row, column]) == target[world] + 1:
@@ -93,7 +93,7 @@ def write_target_points_kernel(
 def write_states_kernel(
     # Scene:
     layout: LayoutData,
-    object_id: wp.array[int],  # (body)
+    object_id: wp.array[int],  # (entry)
     # State:
     catalog_index: wp.array2d[int],  # (world, instance)
     body_slot: wp.array2d[int],  # (world, instance)
@@ -104,7 +104,7 @@ def write_states_kernel(
     # Out:
     state_out: wp.array2d[float],  # (world, value)
 ):
-    """Write each world's state vector: wrist, yaw, tilt, number of held objects; then for each instance present, obj_id, held, pose.
+    """Write each world's state vector: wrist, yaw, tilt, number of objects held; then by instance 1 (present), obj_id, held, pose.
 
     An instance that is not in the scene has zeros. Launched over world.
     """

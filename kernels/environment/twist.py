@@ -1,4 +1,4 @@
-"""Twist control: the setpoint of the gripper follows a commanded velocity, and suction a bit, instead of the tasks of an attempt."""
+"""Twist control: commands drive the gripper's setpoint, yaw and tilt by velocity, and switch its suction, in place of a planned attempt."""
 
 import warp as wp
 
@@ -13,7 +13,7 @@ wp.set_module_options({"enable_backward": False})
 
 # Height of the cup's lip above the rim where an attempt begins, and beyond which an object that hangs on it counts as picked [m].
 START_HEIGHT = wp.constant(0.15)
-# Largest distance of the setpoint from the wrist [m]: as of a spring, which bounds the force of the controller.
+# Largest distance of the setpoint from the wrist [m], which bounds the force of the position controller.
 LEAD = wp.constant(0.05)
 # Columns of a command: linear velocity (3) [m/s], rates of yaw and tilt [rad/s], suction (on above 0).
 YAW_RATE = wp.constant(3)
@@ -23,7 +23,7 @@ SUCTION = wp.constant(5)
 
 @wp.func
 def start_setpoint(bins: BinData, world: int, tcp_offset: float) -> wp.vec3:
-    """Wrist above the middle of a world's bin, its cup upright [m]."""
+    """Start position of the wrist, above the middle of a world's bin with the cup pointing down [m]."""
     height = bins.rim_height[bins.chosen[world]] + START_HEIGHT + tcp_offset
     return wp.transform_point(bins.pose[world], wp.vec3(0.0, 0.0, height))
 
@@ -48,7 +48,7 @@ def start_twists_kernel(
     joint_q_out: wp.array[float],  # (coord) [m, rad]
     joint_qd_out: wp.array[float],  # (dof) [m/s, rad/s]
 ):
-    """Begin an attempt where the gripper is at home (task LOOK): it appears above the middle of the bin. Launched over world."""
+    """Begin attempts of worlds at task LOOK: write the gripper's start pose above the middle of the bin. Launched over world."""
     world = wp.tid()
     if phase[world] != Phase.ACT or mode[world] == Mode.MOVE or task[world] > Task.LOOK:
         return
@@ -81,10 +81,10 @@ def begin_twists_kernel(
     steps_out: wp.array[int],  # (world)
     tilt_target_out: wp.array[float],  # (coord) [rad]
 ):
-    """Apply commands for a tick: turn yaw and tilt, release without suction, and choose the task that drives and engages.
+    """Apply the commands of a tick: integrate yaw and tilt, release objects if suction is off, and write the task.
 
-    Task LIFT: an object hangs on the cup; PRESS: suction is on, and rays are cast at the end of the tick; else DESCEND. In mode MOVE
-    nothing but the setpoint moves. Launched over world.
+    Task LIFT: an object hangs on the cup; PRESS: suction is on, and its rays are cast at the end of the tick; DESCEND: suction is off.
+    Mode MOVE ignores these commands. Launched over world.
     """
     world = wp.tid()
     if phase[world] != Phase.ACT or mode[world] == Mode.MOVE:
@@ -124,7 +124,7 @@ def follow_twists_kernel(
     # Out:
     setpoint_inout: wp.array[wp.vec3],  # (world) [m]
 ):
-    """Advance the setpoints by a step of physics at the commanded velocity, within a box and at most LEAD from the wrist.
+    """Integrate the setpoints over a step of physics at the commanded velocity, clamped to a box and to LEAD from the wrist.
 
     Launched over world.
     """
@@ -159,7 +159,7 @@ def end_twists_kernel(
     task_inout: wp.array[int],  # (world)
     outcome_out: wp.array[int],  # (world)
 ):
-    """End an attempt whose objects hang as high as it began, or a bin without objects: `outcome`, and task LOOK. Launched over world."""
+    """End attempts (task LOOK) whose objects hang at the start height, writing `outcome`, or whose bin is empty. Launched over world."""
     world = wp.tid()
     if phase[world] != Phase.ACT or mode[world] == Mode.MOVE:
         return

@@ -1,4 +1,4 @@
-"""Simulated picks as a view shows them: pixels of grasp points, success at tried pixels, arrays of suctionnetAPI."""
+"""Simulated picks in image and camera coordinates: pixels of grasp points, success maps, arrays of suctionnetAPI."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ if TYPE_CHECKING:
 
 
 def mean_by_candidate(picks: np.ndarray, name: str = "success") -> tuple[np.ndarray, np.ndarray]:
-    """Candidates of trials, and the mean of a column over the repeats of each.
+    """Group trials by candidate: the first trial of each, and the mean of a column over its repeats.
 
     Returns:
-        The first trial of each candidate (candidate) int64, and the means (candidate) float64.
+        Index of the first trial of each candidate (candidate) int64, and means (candidate) float64.
     """
     _, first, which = np.unique(picks[["state", "candidate"]], return_index=True, return_inverse=True)
     return first, np.bincount(which, picks[name], len(first)) / np.bincount(which, minlength=len(first))
@@ -26,17 +26,17 @@ def candidates(picks: np.ndarray) -> np.ndarray:
 
 
 def find_pixels(view: View, picks: np.ndarray) -> np.ndarray:
-    """Pixels (column, row) of grasp points in a view (trial, 2) int64; they may be hidden, or outside of the image."""
+    """Project grasp points to pixels of a view: column, row (trial, 2) int64; points may be hidden, or outside of the image."""
     return np.floor(view.project(picks["point"], view.world_to_camera)).astype(np.int64)
 
 
 def graspable_map(view: View, picks: np.ndarray, hides: bool) -> np.ndarray:
-    """Simulated success at tried pixels (H, W) float32: share of the trials there that held an object; NaN: none was tried.
+    """Sparse success map (H, W) float32: share of the trials at a pixel that held an object; NaN: not tried.
 
     Args:
         view: The view.
         picks: Trials from its frame.
-        hides: Whether grasp points can be hidden, as the view is not of the camera that saw them; NaN there, too.
+        hides: Whether to leave out (NaN) grasp points that the view does not show: for other cameras than the candidates'.
     """
     width, height = view.size
     result = np.full((height, width), np.nan, np.float32)

@@ -41,7 +41,7 @@ class PickTables:
 
     @cached_property
     def pick_states(self) -> np.recarray:
-        """States from which they start, with the columns of `views.picks.STATES`. Errors: see `picks`."""
+        """States from which trials start, a record array with the columns of `views.picks.STATES`. Errors: see `picks`."""
         return _read(self.folder, self.index, states=True)
 
 

@@ -1,1 +1,1 @@
-"""Batched suction environment for reinforcement learning, planning and evaluation of pickers."""
+"""Vector environment of suction picking for reinforcement learning, planning and the evaluation of pickers."""

@@ -1,4 +1,4 @@
-"""Arrays of the caller's library: actions in, observations and results out."""
+"""Conversion of arrays: actions of NumPy, PyTorch or Warp to the host, observations and results to the caller's library."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ VECTORS = (wp.vec3, wp.vec3ub)
 
 
 def to_host(values: Any) -> np.ndarray:
-    """Copy actions of NumPy, PyTorch, Warp or lists to the host; raises ActionError if they are none."""
+    """Copy actions (array of NumPy, PyTorch or Warp, or nested lists) to the host; raises ActionError if they are not numbers."""
     if isinstance(values, wp.array):
         return values.numpy()
     if hasattr(values, "detach"):
@@ -29,26 +29,26 @@ def to_host(values: Any) -> np.ndarray:
 
 
 class Exporter:
-    """Hands arrays to a library, in memory of their own: a later step does not change them."""
+    """Converter of arrays to the caller's library (`backend`); results own their memory, so that a later step does not change them."""
 
     def __init__(self, backend: str, device: wp.Device) -> None:
         self.backend, self.device = backend, device
 
     def from_device(self, array: wp.array, count: int) -> Any:
-        """The first `count` rows of an array on the device; vectors become a last dimension."""
+        """Copy the first `count` rows of a device array; components of vectors become the last dimension."""
         if self.backend == NUMPY:
             return array[:count].numpy().copy()
         rows: Any = array[:count]
         return self._export(wp.clone(_flatten_vectors(rows) if array.dtype in VECTORS else rows))
 
     def from_host(self, values: np.ndarray) -> Any:
-        """An array of the host."""
+        """Convert an array of the host: to the device, or for backend "numpy" as it is."""
         if self.backend == NUMPY:
             return values
         return self._export(wp.array(np.ascontiguousarray(values), dtype=_scalar(values.dtype), device=self.device))
 
     def _export(self, array: wp.array) -> Any:
-        """An array of the device that nothing else refers to. On a GPU, it is complete on all streams."""
+        """Convert a device array that nothing else refers to; for PyTorch on a GPU, its content is complete on all streams."""
         if self.backend == TORCH:
             if self.device.is_cuda:
                 wp.synchronize_device(self.device)
@@ -63,5 +63,5 @@ def _flatten_vectors(array: wp.array) -> wp.array:
 
 
 def _scalar(dtype: np.dtype) -> Any:
-    """Warp's type of a NumPy type."""
+    """Warp scalar type of a NumPy type."""
     return wp.bool if dtype.kind == "b" else wp.dtype_from_numpy(dtype)

@@ -1,6 +1,6 @@
-"""Episodes of environments: which pile comes next, how many steps it has had, and how it ended.
+"""Episode counters of a vector environment: seeds, indices of the piles, steps, and flags of termination and truncation.
 
-Environment i's k-th episode since its seed was set is a hash of both, so that it depends neither on other environments nor on time.
+The index of an environment's k-th episode is a hash of its seed and k, so that it depends neither on other environments nor on time.
 """
 
 from __future__ import annotations
@@ -21,54 +21,54 @@ OPTIONS = ("reset_mask", "env_idx", "episode")
 
 @dataclass(frozen=True, eq=False)
 class Episodes:
-    """Counters of each environment, on the host."""
+    """Episode counters and end flags of each environment, on the host."""
 
     seed: np.ndarray
     """Seed of its episodes (environment) uint64."""
     count: np.ndarray
-    """Episodes since the seed was set (environment) int64."""
+    """Episodes begun since the seed was set: k of the next one (environment) int64."""
     index: np.ndarray
-    """Index of the episode, as of a bake's with the same settings (environment) int64."""
+    """Index of the current episode, which has the same pile in a bake with the same settings (environment) int64."""
     steps: np.ndarray
     """Steps in the episode (environment) int64."""
     terminated: np.ndarray
-    """The bin is empty (environment) bool."""
+    """Whether the episode has ended with an empty bin (environment) bool."""
     truncated: np.ndarray
-    """The episode has had its steps, or its simulation failed (environment) bool."""
+    """Whether it has reached `max_steps`, or its simulation failed (environment) bool."""
 
     @classmethod
     def of(cls, count: int) -> Episodes:
-        """Episodes of `count` environments, none of which has begun."""
+        """Counters of `count` environments before their first episode: all truncated, so that each is due for a reset."""
         episodes, index, steps = (np.zeros(count, np.int64) for _ in range(3))
         return cls(np.zeros(count, np.uint64), episodes, index, steps, np.zeros(count, bool), np.ones(count, bool))
 
     @property
     def over(self) -> np.ndarray:
-        """Environments whose episode has ended (environment) bool."""
+        """Whether each episode has ended, terminated or truncated (environment) bool."""
         return self.terminated | self.truncated
 
     def copy(self) -> Episodes:
-        """A copy."""
+        """Deep copy."""
         return Episodes(*(getattr(self, item.name).copy() for item in fields(self)))
 
     def assign(self, other: Episodes, environments: Sequence[int] | np.ndarray, rows: Any = None) -> None:
-        """Take the rows of another for environments; None: those of the same index."""
+        """Overwrite the counters of environments with rows of `other`; None: with the rows of the same indices."""
         for item in fields(self):
             getattr(self, item.name)[environments] = getattr(other, item.name)[environments if rows is None else rows]
 
     def begin(self, environments: np.ndarray, index: np.ndarray) -> None:
-        """Begin episodes of these indices in environments."""
+        """Begin episodes with these indices (environment) in environments: no steps, not ended."""
         self.index[environments] = index
         for array in (self.steps, self.terminated, self.truncated):
             array[environments] = 0
 
     def reseed(self, seeds: np.ndarray, environments: np.ndarray) -> None:
-        """Set the seeds of environments, whose next episode is the first."""
+        """Set the seeds of environments and restart k at 0."""
         self.seed[environments] = seeds
         self.count[environments] = 0
 
     def draw(self, environments: np.ndarray, piles: int, ahead: int = 0) -> np.ndarray:
-        """Index of the episode that follows in each environment, after `ahead` others, below `piles`."""
+        """Hash seed and k to the index of each environment's next episode, 0 to `piles` - 1, or of the one `ahead` episodes later."""
         counts = self.count[environments] + ahead
         with np.errstate(over="ignore"):
             key = _mix(self.seed[environments] * _GAMMA + counts.astype(np.uint64) + np.uint64(1))
@@ -79,7 +79,7 @@ _GAMMA = np.uint64(0x9E3779B97F4A7C15)
 
 
 def _mix(x: np.ndarray) -> np.ndarray:
-    """Output function of SplitMix64, as `system.random_numbers` has it, of an array uint64."""
+    """Output function (finalizer) of SplitMix64 for an array of uint64, as in `system.random_numbers`."""
     y = (x ^ (x >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
     y = (y ^ (y >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
     return y ^ (y >> np.uint64(31))
@@ -89,17 +89,18 @@ def make_seeds(seed: int | Sequence[int | None], count: int) -> np.ndarray:
     """Seeds of environments (environment) uint64: `seed`, `seed` + 1 and so on, or one for each.
 
     Raises:
-        ConfigError: There are as many numbers.
+        ConfigError: They are not whole numbers, or not one for each environment.
     """
-    given = [seed + index for index in range(count)] if isinstance(seed, int) else list(seed)
-    numbers = [to_index(one) for one in given]
+    numbers: list[int | None] = [to_index(one) for one in seed] if isinstance(seed, Sequence | np.ndarray) else []
+    if (first := to_index(seed)) is not None:
+        numbers = [first + index for index in range(count)]
     if len(numbers) != count or any(number is None for number in numbers):
         raise ConfigError(f"seed is {format_value(seed)}; allowed: a whole number, or one for each of {count} environments")
     return np.array([(number or 0) % 2**64 for number in numbers], np.uint64)
 
 
 def choose_environments(options: Mapping[str, Any], count: int) -> np.ndarray:
-    """Environments that `reset` begins anew: those of `reset_mask` or `env_idx`, or all.
+    """Indices of the environments that `reset` begins anew (chosen) int64: those of `reset_mask`, else of `env_idx`, else all.
 
     Raises:
         ConfigError: An option is unknown or not allowed.
@@ -117,10 +118,10 @@ def choose_environments(options: Mapping[str, Any], count: int) -> np.ndarray:
 
 
 def choose_indices(options: Mapping[str, Any], count: int) -> np.ndarray | None:
-    """Episode indices that `reset` is asked for, for `count` environments; None: they are drawn.
+    """Episode indices that option `episode` asks for, for `count` environments, int64; None: they are drawn.
 
     Raises:
-        ConfigError: They are none.
+        ConfigError: They are not indices, or not one for each environment.
     """
     if (given := options.get("episode")) is None:
         return None
@@ -131,7 +132,7 @@ def choose_indices(options: Mapping[str, Any], count: int) -> np.ndarray | None:
 
 
 def check_mask(name: str, mask: Any, count: int) -> np.ndarray:
-    """A mask of environments (environment) bool; raises ConfigError if it is none."""
+    """Check a mask of environments (environment) bool and return it on the host; raises ConfigError on another type or shape."""
     given = _host(mask)
     if given.shape != (count,) or given.dtype != bool:
         raise ConfigError(f"{name} has the type {given.dtype} and the shape {given.shape}; allowed: bool, ({count},)")
@@ -139,5 +140,7 @@ def check_mask(name: str, mask: Any, count: int) -> np.ndarray:
 
 
 def _host(values: Any) -> np.ndarray:
-    """Values as an array of the host."""
-    return np.asarray(values.detach().cpu() if hasattr(values, "detach") else values)
+    """Copy an array of NumPy, PyTorch or Warp, or a list, to the host."""
+    if hasattr(values, "detach"):
+        values = values.detach().cpu()
+    return values.numpy() if hasattr(values, "numpy") else np.asarray(values)

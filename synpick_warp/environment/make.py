@@ -1,4 +1,4 @@
-"""Assembly of an environment from settings."""
+"""Builder of the vector environment: resolves settings, and allocates worlds and observations on a device."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ from synpick_warp.system.progress import Progress, SilentProgress
 NO_WRITERS = 0
 """Writer processes in the memory plan: none."""
 CACHE = 4096
-"""Most piles that are kept of those that `piles` names; others are settled again when they are wanted."""
+"""Largest number of different piles (`piles`) at which all are kept; of more, a pile is settled again whenever it is drawn."""
 
 
 def require_libraries(backend: str) -> None:
@@ -56,13 +56,13 @@ def make_picking(
     device_name: str | None = None,
     progress: Progress | None = None,
 ) -> PickingEnvironment:
-    """Build worlds and observations on a device.
+    """Build a vector environment on a device; `vector.PickingVectorEnv` wraps it for Gymnasium.
 
     Args:
-        choice: What `make_env` was asked for.
+        choice: Checked arguments of `make_env`.
         source, settings: Settings, as for `bake`.
         device_name: Overrides `bake.device`.
-        progress: Observer.
+        progress: Receives stages and notes; None: silent.
 
     Raises:
         SynpickError: A setting is not allowed, the machine has too little memory, or device, models, lights, bin or cameras cannot be used.

@@ -1,6 +1,6 @@
-"""Batched suction environment, without a library of environments: reset, step, states and branches.
+"""Vector environment of suction picking, independent of Gymnasium: reset, step, autoreset, checkpoints and branches.
 
-`vector` makes a Gymnasium environment of it.
+`vector` wraps it as a Gymnasium environment.
 """
 
 from __future__ import annotations
@@ -29,21 +29,23 @@ from synpick_warp.stages.environment.worlds import EnvironmentWorlds
 from synpick_warp.stages.sim.states import State
 
 TWIST_SPEED, TWIST_RATE = 0.25, 1.0
-"""Velocity [m/s] and rates [rad/s] of a twist of 1; of the ways to a seal, an attempt takes the last 5 cm at 0.1 m/s."""
+"""Velocity [m/s] and angular rates [rad/s] that a twist of 1 commands; whole picks descend the last 5 cm at 0.1 m/s."""
 ACTION_SIZES = {PIXEL: 2, POINT: 6}
+"""Values of an action of a whole pick."""
 COMMAND = 6
+"""Values of a twist."""
 
 
 @dataclass(frozen=True, eq=False)
 class EnvironmentState:
-    """State of all environments: simulation, on the device, and counters."""
+    """Checkpoint of all environments: states of their worlds on the device, and episode counters on the host."""
 
     worlds: State
     episodes: Episodes
 
 
 class Step(NamedTuple):
-    """Result of a step, in arrays of the caller's library, by environment."""
+    """Result of a step as Gymnasium defines it; arrays (environment, ...) of the caller's library."""
 
     obs: dict[str, Any]
     reward: Any
@@ -53,13 +55,13 @@ class Step(NamedTuple):
 
 
 class PickingEnvironment:
-    """Environments whose actions are picks, or twists of the gripper; see the README of this package.
+    """Vector environment whose actions are whole picks, or twists of the gripper for a tick; see the README of this package.
 
     Attributes:
-        choice: Arguments of `make_env`.
-        worlds: The simulation.
-        episodes: Counters.
-        bounds: Lowest and highest point that an action may name.
+        choice: Checked arguments of `make_env`.
+        worlds: The simulated worlds and their observations.
+        episodes: Episode counters.
+        bounds: Lowest and highest point that an action may name, each (3) float32 [m].
     """
 
     def __init__(self, choice: Choice, worlds: EnvironmentWorlds, bounds: tuple[np.ndarray, np.ndarray]) -> None:
@@ -74,22 +76,24 @@ class PickingEnvironment:
     def reset(
         self, seed: int | Sequence[int | None] | None = None, options: Mapping[str, Any] | None = None
     ) -> tuple[dict[str, Any], dict[str, Any]]:
-        """Begin episodes: in all environments, or those that `options` choose.
+        """Begin episodes in all environments, or after the first reset in those that `options` choose.
 
         Args:
-            seed: Seed of the first environment, those of the others follow; or one for each; None: their next episodes.
-            options: "reset_mask" (environment) bool or "env_idx": environments to reset; "episode": index of the episode, or one for each
-                of them.
+            seed: Seed of environment 0, the others get `seed` + 1 and so on; or a sequence of one for each; None: their next episodes.
+            options: "reset_mask" (environment) bool or "env_idx": environments to reset; "episode": episode index, or one for
+                each environment that is reset.
 
         Returns:
-            Observation and info.
+            Observation of all environments, and info.
 
         Raises:
             ConfigError: A seed or an option is not allowed.
             StateError: A pile does not come to rest.
         """
         options = options or {}
-        chosen = np.arange(self.count) if self._is_new else choose_environments(options, self.count)
+        chosen = choose_environments(options, self.count)
+        if self._is_new:
+            chosen = np.arange(self.count)
         if seed is not None:
             self.episodes.reseed(make_seeds(seed, self.count)[chosen], chosen)
         self._begin(chosen, choose_indices(options, len(chosen)))
@@ -97,11 +101,11 @@ class PickingEnvironment:
         return self.observe(), self._describe()
 
     def step(self, actions: Any) -> Step:
-        """Carry out an action in each environment: an attempt to its end, or a tick.
+        """Carry out an action in each environment, a whole pick or a tick, and reset episodes that have ended, as `autoreset` says.
 
         Raises:
-            ActionError: Actions have another shape, are not finite, or lie outside of image or bin.
-            StateError: `reset` comes first.
+            ActionError: Actions have another shape, are not finite, or lie outside of the image or `bounds`.
+            StateError: The environment has not been reset.
         """
         if self._is_new:
             raise StateError("an environment is reset before its first step")
@@ -131,20 +135,20 @@ class PickingEnvironment:
         return Step(obs, reward, terminated, truncated, info)
 
     def observe(self) -> dict[str, Any]:
-        """Observation of the environments as they are."""
+        """Render the observation of all environments: arrays (environment, ...) by name."""
         arrays = self.worlds.sight.observe(self.worlds.simulation.record.snapshot)
         return {name: self.exporter.from_device(getattr(arrays, OBSERVATIONS[name]), self.count) for name in self.choice.obs}
 
     def get_state(self) -> EnvironmentState:
-        """State of all environments, from which they continue bit by bit; raises StateError if memory is too short."""
+        """Save a checkpoint of all environments, from which they continue bit by bit; raises StateError if memory is too short."""
         return EnvironmentState(self.worlds.get_state(), self.episodes.copy())
 
     def set_state(self, state: EnvironmentState, mask: Any = None) -> dict[str, Any]:
-        """Have the environments of a mask (environment) bool continue from a state; None: all. Returns the observation.
+        """Load a checkpoint into the environments of a mask (environment) bool; None: into all. Returns the observation.
 
         Raises:
-            ConfigError: The mask is none.
-            StateError: The state is of other environments.
+            ConfigError: The mask has another type or shape.
+            StateError: The state has another number of environments, or is of other worlds.
         """
         chosen = np.arange(self.count) if mask is None else np.flatnonzero(check_mask("mask", mask, self.count))
         self.worlds.set_state(state.worlds, chosen.tolist())
@@ -153,18 +157,18 @@ class PickingEnvironment:
         return self.observe()
 
     def branch(self, environment: int, into: Sequence[int]) -> dict[str, Any]:
-        """Have environments continue as another does, bit by bit; returns the observation. Raises StateError if one does not exist."""
+        """Copy the state of an environment to those of `into`; returns the observation. Raises StateError if one does not exist."""
         self.worlds.branch(environment, into)
         self.episodes.assign(self.episodes.copy(), list(into), environment)
         return self.observe()
 
     def state_to_host(self, state: EnvironmentState) -> dict[str, np.ndarray]:
-        """Copy a state to the host, by name; `np.savez` can store it."""
+        """Copy a checkpoint to the host: arrays by name, which `np.savez` can store."""
         counters = {f"episodes.{name}": array for name, array in vars(state.episodes).items()}
         return self.worlds.simulation.states.to_host(state.worlds) | counters
 
     def state_from_host(self, arrays: Mapping[str, np.ndarray]) -> EnvironmentState:
-        """Copy a state of `state_to_host` to the device.
+        """Copy a checkpoint from the host to the device: the inverse of `state_to_host`.
 
         Raises:
             StateError: It is of another version, of other objects or capacities, or an array is missing.
@@ -176,7 +180,7 @@ class PickingEnvironment:
         return EnvironmentState(worlds, Episodes(**{name: np.array(arrays[key]) for name, key in counters.items()}))
 
     def check_actions(self, actions: Any, active: np.ndarray) -> np.ndarray:
-        """Actions on the host (environment, value), those of inactive environments replaced by 0.
+        """Check actions and copy them to the host (environment, value); those of inactive environments are replaced by 0.
 
         Raises:
             ActionError: See `step`.
@@ -213,7 +217,7 @@ class PickingEnvironment:
         return self.worlds.tick(active, np.clip(actions, -1.0, 1.0) * scale)
 
     def _reward(self, results: Mapping[str, np.ndarray]) -> np.ndarray:
-        """Reward of each environment; see the README."""
+        """Reward of the task (environment), see the README."""
         if self.choice.task == MOVE:
             return results["moved"]
         if self.choice.task == TARGET:
@@ -221,7 +225,7 @@ class PickingEnvironment:
         return np.isin(results["outcome"], (Outcome.TARGET_PICKED, Outcome.OTHER_PICKED))
 
     def _judge(self, active: np.ndarray) -> None:
-        """Count a step of active environments, and end their episodes."""
+        """Count a step of active environments, and set their flags `terminated` and `truncated`."""
         episodes, (phase, ending) = self.episodes, self.worlds.status()
         ended = active & (phase == Phase.OVER)
         emptied = ended & (ending == Ending.EMPTIED)
@@ -230,7 +234,7 @@ class PickingEnvironment:
         episodes.truncated[active] = (ended & ~emptied | (episodes.steps >= self.choice.max_steps) & ~emptied)[active]
 
     def _begin(self, environments: np.ndarray, indices: np.ndarray | None = None) -> None:
-        """Begin the next episodes of environments, or those of the indices."""
+        """Begin episodes in environments: those of `indices`, or None: the next ones drawn."""
         episodes, piles = self.episodes, self.choice.piles
         drawn = episodes.draw(environments, piles)
         episodes.count[environments] += 1
@@ -240,7 +244,7 @@ class PickingEnvironment:
         episodes.begin(environments, chosen)
 
     def _describe(self, results: Mapping[str, np.ndarray] | None = None) -> dict[str, Any]:
-        """Info of the environments, arrays by name: episode and steps, and after a step its results, with a mask of each."""
+        """Info of all environments: episode index, steps, ending and results of a step; arrays by name, each with its mask `_name`."""
         episodes = self.episodes
         arrays: dict[str, np.ndarray] = {"episode_index": episodes.index.copy(), "steps": episodes.steps.copy()}
         arrays["ending"] = self.worlds.status()[1].copy()

@@ -1,4 +1,4 @@
-"""Ids of the environments in Gymnasium's registry, which importing this module fills.
+"""Registration of the environments with Gymnasium, by id; importing this module carries it out.
 
 env = gymnasium.make_vec("synpick_warp.environment.registration:SynPick/Pick-v0", num_envs=8)
 """
@@ -17,7 +17,7 @@ IDS = {task: f"SynPick/{task.capitalize()}-v0" for task in TASKS}
 
 
 def make(num_envs: int = 1, max_episode_steps: int | None = None, **arguments: Any) -> Any:
-    """Make an environment as `make_env` does, from the arguments of `gymnasium.make_vec`."""
+    """Entry point of `gymnasium.make_vec`: make a vector environment by `make_env`."""
     return synpick_warp.make_env(num_envs=num_envs, max_steps=max_episode_steps, **arguments)
 
 

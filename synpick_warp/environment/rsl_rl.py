@@ -1,4 +1,4 @@
-"""Adapter for rsl_rl: its `VecEnv`, with observations as a TensorDict.
+"""Adapter for rsl_rl: a `VecEnv` whose observations are a TensorDict.
 
     env = RslRlEnv(synpick_warp.make_env(task="pick", num_envs=512, action="point", obs=("state",), autoreset="same_step"))
     OnPolicyRunner(env, settings).learn(100)
@@ -19,7 +19,7 @@ from synpick_warp.environment.vector import PickingVectorEnv
 from synpick_warp.errors import ConfigError
 
 GROUPS = ("rgb", "normals")
-"""Observations whose last dimension is that of channels."""
+"""Observations whose last dimension is the channel."""
 WHITE = 255.0
 
 
@@ -28,7 +28,7 @@ class RslRlEnv(VecEnv):
 
     Attributes:
         max_episode_length: Steps after which an episode is truncated.
-        cfg: Arguments of the environment, for rsl_rl's logs.
+        cfg: Task and action of the environment, for rsl_rl's logs.
     """
 
     def __init__(self, env: PickingVectorEnv) -> None:
@@ -37,7 +37,7 @@ class RslRlEnv(VecEnv):
             env: Environment with actions "point" or "twist", autoreset "same_step" and backend "torch".
 
         Raises:
-            ConfigError: It has others.
+            ConfigError: The environment has another action, autoreset or backend.
         """
         choice = env.environment.choice
         if choice.action == PIXEL or choice.autoreset != SAME_STEP or choice.backend != TORCH:
@@ -50,7 +50,7 @@ class RslRlEnv(VecEnv):
 
     @property
     def episode_length_buf(self) -> Any:
-        """Steps of each environment's episode."""
+        """Steps of each environment's episode (environment) int64; can be set."""
         return torch.as_tensor(self.env.environment.episodes.steps, device=self.device)
 
     @episode_length_buf.setter
@@ -58,23 +58,23 @@ class RslRlEnv(VecEnv):
         self.env.environment.episodes.steps[:] = steps.cpu().numpy()
 
     def get_observations(self) -> Any:
-        """Observations, a TensorDict (environment)."""
+        """Current observations, a TensorDict with batch size (environment)."""
         return TensorDict({name: _channels_first(name, values) for name, values in self._obs.items()}, batch_size=[self.num_envs])
 
     def reset(self) -> tuple[Any, dict[str, Any]]:
-        """Begin the next episodes everywhere."""
+        """Begin the next episode in all environments; returns observations and info."""
         self._obs, info = self.env.reset()
         return self.get_observations(), info
 
     def step(self, actions: Any) -> tuple[Any, Any, Any, dict[str, Any]]:
-        """Carry out actions (environment, value), clamped to -1 to 1."""
+        """Step with actions (environment, value), clamped to -1 to 1 and scaled to the action space."""
         self._obs, reward, terminated, truncated, info = self.env.step(self._middle + self._half * actions.clamp(-1.0, 1.0))
         log = {f"/{name}": info[name].float().mean() for name in ("moved", "lost")}
         return self.get_observations(), reward, terminated | truncated, {"time_outs": truncated, "log": log}
 
 
 def _channels_first(name: str, values: Any) -> Any:
-    """Observation as rsl_rl's networks take it: vectors as they are, images (environment, channel, row, column) float32."""
+    """Observation in the layout of rsl_rl's networks: vectors as they are, images (environment, channel, row, column) float32."""
     if values.ndim < 3:
         return values
     images = values.movedim(-1, 1) if name in GROUPS else values.unsqueeze(1)

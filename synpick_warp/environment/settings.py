@@ -1,4 +1,4 @@
-"""Arguments of `make_env`, checked, and the settings of the worlds that follow from them."""
+"""Arguments of `make_env`: their check, and the settings of the worlds and action bounds that follow from them."""
 
 from __future__ import annotations
 
@@ -26,16 +26,16 @@ OBSERVATIONS: Mapping[str, str] = {
     "target_mask": "mask",
     "target_point": "point",
 }
-"""Field of `SightArrays` of each observation, by its name."""
+"""Name of an observation -> field of `SightArrays`."""
 TARGETS = ("target_mask", "target_point")
-"""Observations of task TARGET alone, which has them without being asked: the mask if there are images."""
+"""Observations of task TARGET, which are always added to it (the mask only if other images are observed), and which others lack."""
 IMAGES = ("depth", "rgb", "instances", "normals", "target_mask")
 MAX_STEPS: Mapping[str, int] = {PIXEL: 30, POINT: 30, TWIST: 600}
 """Steps after which an episode is truncated, by action: attempts, or ticks (40 s)."""
 RESAMPLES = 1000
-"""Arrangements that a pile may take to come to rest: an environment cannot go without."""
+"""Arrangements that are tried until a pile comes to rest (`settle.tries`): an environment cannot skip a pile, as a bake can."""
 HEADROOM = 0.3
-"""Height above the rim up to which points are actions, and beyond that setpoints stay [m]."""
+"""Height above the rim up to which an action may name points; setpoints of twists may rise by as much again [m]."""
 
 
 @dataclass(frozen=True)
@@ -52,7 +52,7 @@ class Choice:
     seed: int
     max_steps: int
     piles: int
-    """Number of different episodes."""
+    """Number of different piles from which episodes are drawn."""
 
 
 def make_choice(
@@ -103,7 +103,7 @@ def make_choice(
 
 
 def fixed_settings(choice: Choice) -> dict[str, object]:
-    """Settings that the arguments of `make_env` decide, by full key."""
+    """Settings that follow from the arguments of `make_env`: full key -> value; they override the caller's."""
     fixed: dict[str, object] = {
         "bake.worlds": choice.num_envs,
         "bake.mode": choice.task,
@@ -122,7 +122,7 @@ def fixed_settings(choice: Choice) -> dict[str, object]:
 
 
 def action_bounds(sizes: Sequence[BinSizes], bins: Bins) -> tuple[np.ndarray, np.ndarray]:
-    """Lowest and highest point that an action may name (3) each float32 [m], in the world: a box about all bins wherever they stand."""
+    """Bounding box of the points that an action may name, over all bins and their poses: lower and upper corner (3) float32 [m], world."""
     sides = []
     for one in sizes:
         half = np.array(one.opening) / 2
@@ -135,7 +135,7 @@ def action_bounds(sizes: Sequence[BinSizes], bins: Bins) -> tuple[np.ndarray, np
 
 
 def _rest(limits: Mapping[str, int]) -> tuple[int, int]:
-    """Steps of an episode, and number of episodes."""
+    """`max_steps`, and `piles` limited to the range of episode indices."""
     return int(limits["max_steps"]), min(int(limits["piles"]), INT32_MAX)
 
 

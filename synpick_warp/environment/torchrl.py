@@ -1,4 +1,4 @@
-"""Adapter for TorchRL: its `GymWrapper`, whose partial resets work on a GPU, too.
+"""Adapter for TorchRL: a `GymWrapper` whose partial resets also work on a GPU.
 
     env = TorchRlEnv(synpick_warp.make_env(task="pick", num_envs=512, autoreset="disabled"))
 
@@ -17,16 +17,16 @@ from synpick_warp.errors import ConfigError
 
 
 class TorchRlEnv(GymWrapper):
-    """Environment of TorchRL (`EnvBase`): tensors stay on the device, pixels are categorical actions."""
+    """TorchRL environment (`EnvBase`): tensors stay on the device, actions of pixels are categorical."""
 
     def __init__(self, env: PickingVectorEnv | None = None, **options: Any) -> None:
         """
         Args:
             env: Environment with autoreset "disabled" and backend "torch".
-            options: Further ones of `GymWrapper`.
+            options: Further arguments of `GymWrapper`.
 
         Raises:
-            ConfigError: It has others.
+            ConfigError: The environment has another autoreset or backend.
         """
         if env is not None:
             choice = env.environment.choice
@@ -36,6 +36,6 @@ class TorchRlEnv(GymWrapper):
         super().__init__(env=env, **options)
 
     def _replace_reset(self, reset: Any, kwargs: dict[str, Any]) -> dict[str, Any]:
-        """Options of a reset of the environments of a mask (environment, 1) bool on the device."""
+        """Arguments of a partial reset, from TorchRL's mask (environment, 1) bool on the device."""
         kwargs.setdefault("options", {})["reset_mask"] = reset.view(self.batch_size)
         return kwargs

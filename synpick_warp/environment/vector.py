@@ -1,4 +1,4 @@
-"""Gymnasium's vector environment: a direct subclass of `gymnasium.vector.VectorEnv`."""
+"""Gymnasium vector environment: a direct subclass of `gymnasium.vector.VectorEnv`."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv  # pyright: ignore[reportM
 from gymnasium.vector.utils import batch_space  # pyright: ignore[reportMissingImports]
 
 from synpick_warp.codes import Segment
+from synpick_warp.configs.check import to_index
 from synpick_warp.environment.picking import ACTION_SIZES, COMMAND, EnvironmentState, PickingEnvironment
 from synpick_warp.environment.settings import OBSERVATIONS, PIXEL, POINT, Choice
 
@@ -18,11 +19,11 @@ Box = gymnasium.spaces.Box
 
 
 class PickingVectorEnv(VectorEnv):
-    """Suction picking in many piles at once; see `synpick_warp.make_env` and the README of this package.
+    """Vector environment of suction picking; see `synpick_warp.make_env` and the README of this package.
 
     Attributes:
-        environment: The environments.
-        device: Name of the device of observations, unless they are NumPy's.
+        environment: The environment without Gymnasium, which does the work.
+        device: Name of the device of the worlds; results are there unless backend is "numpy".
     """
 
     def __init__(self, environment: PickingEnvironment) -> None:
@@ -41,7 +42,7 @@ class PickingVectorEnv(VectorEnv):
     ) -> tuple[dict[str, Any], dict[str, Any]]:
         """Begin episodes; see `PickingEnvironment.reset`."""
         if seed is not None:
-            self._np_random, self._np_random_seed = gymnasium.utils.seeding.np_random(seed if isinstance(seed, int) else None)
+            self._np_random, self._np_random_seed = gymnasium.utils.seeding.np_random(to_index(seed))
         return self.environment.reset(seed, options)
 
     def step(self, actions: Any) -> tuple[dict[str, Any], Any, Any, Any, dict[str, Any]]:
@@ -49,24 +50,24 @@ class PickingVectorEnv(VectorEnv):
         return self.environment.step(actions)
 
     def observe(self) -> dict[str, Any]:
-        """Observation of the environments as they are."""
+        """Render the current observation; see `PickingEnvironment.observe`."""
         return self.environment.observe()
 
     def get_state(self) -> EnvironmentState:
-        """State of all environments; see `PickingEnvironment.get_state`."""
+        """Save a checkpoint of all environments; see `PickingEnvironment.get_state`."""
         return self.environment.get_state()
 
     def set_state(self, state: EnvironmentState, mask: Any = None) -> dict[str, Any]:
-        """Have environments continue from a state; see `PickingEnvironment.set_state`."""
+        """Load a checkpoint; see `PickingEnvironment.set_state`."""
         return self.environment.set_state(state, mask)
 
     def branch(self, environment: int, into: Sequence[int]) -> dict[str, Any]:
-        """Have environments continue as another does; see `PickingEnvironment.branch`."""
+        """Copy the state of an environment to others; see `PickingEnvironment.branch`."""
         return self.environment.branch(environment, into)
 
 
 def observation_space(choice: Choice, environment: PickingEnvironment) -> Any:
-    """Space of one environment's observation."""
+    """Observation space of a single environment (`Dict` of boxes)."""
     width, height = choice.resolution
     limits: Mapping[str, tuple[float, float, tuple[int, ...], Any]] = {
         "depth": (0.0, np.inf, (height, width), np.float32),
@@ -84,7 +85,7 @@ def observation_space(choice: Choice, environment: PickingEnvironment) -> Any:
 
 
 def action_space(choice: Choice, low: np.ndarray, high: np.ndarray) -> Any:
-    """Space of one environment's action."""
+    """Action space of a single environment."""
     if choice.action == PIXEL:
         return gymnasium.spaces.MultiDiscrete(list(choice.resolution))
     if choice.action == POINT:
@@ -94,5 +95,5 @@ def action_space(choice: Choice, low: np.ndarray, high: np.ndarray) -> Any:
 
 
 def _frames_per_second(environment: PickingEnvironment) -> float:
-    """Ticks per second of simulated time."""
+    """`render_fps` of the metadata: ticks per second of simulated time."""
     return 1.0 / environment.worlds.simulation.config.physics.tick_time

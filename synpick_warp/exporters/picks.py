@@ -1,4 +1,4 @@
-"""Exporter of simulated picks: two Parquet tables an episode, of grasp trials and of the states from which they start."""
+"""Exporter of simulated picks: two Parquet tables per episode, of grasp trials and of the states from which they start."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ FOLDER = Path("picks")
 STATES_FOLDER = FOLDER / "states"
 """Folder of the tables of states."""
 _Tables = list[tuple[np.ndarray, np.ndarray]]
-"""Rows of trials and of states, of each batch."""
+"""For each batch, rows of trials and rows of states."""
 
 
 class PicksExporter(EpisodeExporter[_Tables]):
@@ -75,7 +75,7 @@ def _make_content(_: Path) -> _Tables:
 
 
 def pick_files(episode: int) -> tuple[Path, Path]:
-    """Tables of trials and of states of an episode, relative to the data set."""
+    """Paths of an episode's tables of trials and of states, relative to the data set."""
     name = f"{episode:06d}.parquet"
     return FOLDER / name, STATES_FOLDER / name
 
@@ -92,7 +92,7 @@ def write_tables(folder: Path, batches: _Tables, out: Path, places: tuple[Path, 
 
 
 def make_table(columns: Sequence[Column], rows: np.ndarray) -> pa.Table:
-    """Arrow table of rows; its fields tell units, meanings and names of codes as metadata."""
+    """Convert rows to an Arrow table; field metadata hold units, meanings and names of codes."""
     arrays = []
     for column in columns:
         values = np.ascontiguousarray(rows[column.name])
@@ -102,7 +102,7 @@ def make_table(columns: Sequence[Column], rows: np.ndarray) -> pa.Table:
 
 
 def table_schema(columns: Sequence[Column], kind: np.dtype) -> pa.Schema:
-    """Arrow schema of a table whose rows have this structured type."""
+    """Arrow schema of a table with rows of structured dtype `kind`."""
     fields = []
     for column in columns:
         scalar, shape = kind[column.name].subdtype or (kind[column.name], ())
@@ -114,7 +114,7 @@ def table_schema(columns: Sequence[Column], kind: np.dtype) -> pa.Schema:
 
 
 def read_type(schema: pa.Schema, columns: Sequence[Column]) -> np.dtype | None:
-    """Structured type of the rows of a stored table; None: it does not have these columns."""
+    """Structured dtype of a stored table's rows; None: its schema is not that of `columns`."""
     sizes = [item.type.list_size for item in schema if item.name == "visible" and pa.types.is_fixed_size_list(item.type)]
     kind = row_type(columns, *sizes)
     return kind if schema.equals(table_schema(columns, kind)) else None

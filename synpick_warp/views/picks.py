@@ -1,4 +1,4 @@
-"""Schema of simulated picks: columns of the tables of grasp trials and of states, and the batches in which a bake hands them to exporters.
+"""Table schemas of simulated picks: columns of grasp trials and of states, and the batches that a bake hands to exporters.
 
 A state is a checkpoint of an episode at a moment of choice; a grasp candidate is a point on a surface that camera 0 sees in it; a trial
 executes a candidate from the state, possibly perturbed. One trial is one row.
@@ -44,9 +44,7 @@ COLUMNS = (
     Column("candidate", "<i4", "1", "Index of the candidate within the state."),
     Column("repeat", "<i4", "1", "Repeat of the candidate; 0: not perturbed."),
     Column("share", "|u1", "1", "How the candidate was sampled.", codes=Share),
-    Column(
-        "weight", "<f4", "1", "Inverse of the probability with which a draw gets its pixel, for unbiased estimates over pixels; 0: own."
-    ),
+    Column("weight", "<f4", "1", "Inverse probability weight of its pixel in a draw, for unbiased estimates over pixels; 0: own grasp."),
     Column("column", "<i4", "px", "Pixel in the perception image of camera 0, from the left; its size is in the table of states."),
     Column("row", "<i4", "px", "Pixel in the perception image, from the top."),
     Column("instance", "<i4", "1", "Instance that the pixel shows, which the pick intends; -1: none."),
@@ -81,7 +79,7 @@ COLUMNS = (
 STATES = (
     Column("state", "<i4", "1", "Index of the state within the episode."),
     Column("frame", "<i4", "1", "Frame of the episode at which it was saved."),
-    Column("camera", "<i4", "1", "Index of the camera from whose image the candidates were drawn."),
+    Column("camera", "<i4", "1", "Index of the camera from whose perception image the candidates were drawn."),
     Column("width", "<i4", "px", "Width of its perception image."),
     Column("height", "<i4", "px", "Height of its perception image."),
     Column("candidates", "<i4", "1", "Number of candidates."),
@@ -92,7 +90,7 @@ STATES = (
 
 @dataclass(frozen=True, eq=False)
 class PickBatch:
-    """Trials of one or more states of an episode, complete, in any order. Exporters copy what they keep.
+    """Record batch: all trials of one or more states of an episode, in any order. Exporters copy what they keep.
 
     Raises:
         ValueError: Columns are missing, unknown, or of other shapes.
@@ -115,12 +113,12 @@ class PickBatch:
 
 
 def row_type(columns: Sequence[Column], instances: int = 1) -> np.dtype:
-    """Structured type of a row; `visible` has `instances` components."""
+    """Structured dtype of a table's row; `visible` has `instances` components."""
     return np.dtype([(column.name, column.dtype, (instances,)) if column.name == "visible" else column.field for column in columns])
 
 
 def make_rows(columns: Sequence[Column], arrays: Mapping[str, np.ndarray]) -> np.ndarray:
-    """Rows of a table (row) of `row_type` from its columns; raises ValueError as `PickBatch`."""
+    """Convert columns to the rows of a table: structured array (row) of `row_type`; raises ValueError as `PickBatch`."""
     if wrong := {column.name for column in columns} ^ set(arrays):
         raise ValueError(f"{sorted(wrong)[0]} is missing, or no column of picks")
     visible = np.asarray(arrays.get("visible", np.zeros((0, 1))))
@@ -135,12 +133,12 @@ def make_rows(columns: Sequence[Column], arrays: Mapping[str, np.ndarray]) -> np
 
 
 def sort_rows(rows: np.ndarray) -> np.ndarray:
-    """Rows of a table in the order of files, by ORDER."""
+    """Sort the rows of a table by the key columns ORDER, as in files."""
     return rows[np.lexsort(_keys(rows)[::-1])]
 
 
 def are_sorted(rows: np.ndarray) -> bool:
-    """Whether rows are in the order of files, each once."""
+    """Whether rows are sorted by ORDER, with unique keys."""
     keys = np.stack(_keys(rows)).astype(np.int64)
     steps = np.diff(keys, axis=1)
     # The first key that differs decides.
@@ -149,5 +147,5 @@ def are_sorted(rows: np.ndarray) -> bool:
 
 
 def _keys(rows: np.ndarray) -> list[np.ndarray]:
-    """Columns of ORDER that the table has."""
+    """Key columns of a table: those of ORDER that it has."""
     return [rows[name] for name in ORDER if name in (rows.dtype.names or ())]

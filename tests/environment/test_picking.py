@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from synpick_warp.codes import Outcome, Segment
-from synpick_warp.environment.episodes import Episodes
+from synpick_warp.environment.episodes import Episodes, make_seeds
 from synpick_warp.errors import ActionError, ConfigError, StateError
 from synpick_warp.system.random_numbers import _mix
 from tests.environment.conftest import SIZE, build, centers, same
@@ -187,6 +187,11 @@ def test_bad_options_are_refused(environment, options, message):
 def test_bad_seeds_are_refused(environment, seed):
     with pytest.raises(ConfigError, match="one for each of 2 environments"):
         environment.reset(seed=seed)
+
+
+@pytest.mark.parametrize("seed", [3, np.int64(3), [3, 4], np.array([3, 4])])
+def test_integers_of_numpy_are_seeds_too(seed):
+    assert make_seeds(seed, 2).tolist() == [3, 4]
 
 
 # ---- states and branches ----

@@ -1,4 +1,4 @@
-"""Pickers run in simulation: first choices from the same piles for all, and picks until a bin is empty. Needs PyTorch."""
+"""Closed-loop evaluation of pickers in simulation: first choices from the same piles, and bin emptying. Needs PyTorch."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from synpick_warp.scenes.cameras import make_cameras
 from tools.examples.picking_scores import Sight
 
 REACH = 4
-"""Half side of the square about a failed pick that is not tried again until something else was picked [px]."""
+"""Half side of the square around a failed pick that is barred until another pick succeeds [px]."""
 Score = Callable[[Sight], torch.Tensor]
 
 
 @dataclass
 class Emptied:
-    """Picks until bins are empty: attempts, those that picked, bins, and those that became empty."""
+    """Counts of a bin emptying run: attempts, successful ones, bins, and emptied ones."""
 
     attempts: int = 0
     picked: int = 0
@@ -29,12 +29,12 @@ class Emptied:
 
 
 def choose_environment(worlds: int, resolution: tuple[int, int], seed: int, max_steps: int | None = None) -> Choice:
-    """Options, for `make_picking`, of an environment of whole picks at pixels, which observes depth and instances."""
+    """Options for `make_picking` of a vector environment with whole picks at pixels that observes depth and instances."""
     return make_choice(PICK, worlds, ("depth", "instances"), resolution, PIXEL, DISABLED, TORCH, seed, max_steps, None)
 
 
 def observe(environment: PickingEnvironment, obs: Mapping[str, torch.Tensor]) -> Sight:
-    """What pickers see of an observation."""
+    """Convert an observation of the environment to that of pickers."""
     config = environment.worlds.simulation.config
     camera = make_cameras(config.rig)[config.rig.index(config.perception.camera)]
     instance = obs["instances"]
@@ -43,13 +43,13 @@ def observe(environment: PickingEnvironment, obs: Mapping[str, torch.Tensor]) ->
 
 
 def choose_pixels(value: torch.Tensor) -> torch.Tensor:
-    """Column and row of the largest value of each image (B, H, W); (B, 2) int64."""
+    """Argmax of each image (B, H, W): column and row (B, 2) int64."""
     place = value.flatten(1).argmax(dim=1)
     return torch.stack((place % value.shape[2], place // value.shape[2]), dim=1)
 
 
 def run_first_choices(environment: PickingEnvironment, scores: Mapping[str, Score], attempts: int) -> tuple[dict[str, int], int]:
-    """Have each picker make its first choice from the same piles, new ones until there are at least `attempts`.
+    """Paired comparison: each picker makes its first choice from the same piles, of which at least `attempts` are drawn.
 
     Returns:
         Successes of each picker, and the number of piles.
@@ -67,7 +67,7 @@ def run_first_choices(environment: PickingEnvironment, scores: Mapping[str, Scor
 
 
 def run_until_empty(environment: PickingEnvironment, score: Score) -> Emptied:
-    """Have a picker empty the bins of all environments, or as far as their episodes last; it remembers where it failed."""
+    """Bin emptying: pick in all environments until their episodes end; squares around failed picks are barred."""
     obs, _ = environment.reset()
     result, value = Emptied(bins=environment.count), torch.zeros(0)
     barred = torch.zeros_like(obs["depth"], dtype=torch.bool)

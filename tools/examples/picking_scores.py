@@ -1,7 +1,7 @@
-"""Dense scores of where to pick, from depth or segmentation, and how well scores choose among tried candidates. Needs PyTorch.
+"""Baseline pickers as dense score maps from depth or segmentation, and statistics of scores. Needs PyTorch.
 
-A score is an image (B, H, W) of which a picker takes the largest value. Baselines: variance of surface normals (Zeng et al., 2017/19),
-distance to the contour of the object (Cartman, Morrison et al., 2018), a random visible point.
+A picker chooses the pixel with the largest score (B, H, W). Baselines: variance of surface normals (Zeng et al., 2017/19), distance to
+the contour of the object (Cartman, Morrison et al., 2018), a random visible point.
 """
 
 from __future__ import annotations
@@ -15,16 +15,16 @@ from torch.nn import functional  # pyright: ignore[reportMissingImports]
 from synpick_warp.apps.statistics.ranking import Scored
 
 WINDOW = 7
-"""Side of the window over which normals vary [px]: about the cup's lip (10 mm radius) in 320 px of the tote's width."""
+"""Side of the window over which normals are averaged [px]: about the cup's lip (10 mm radius) in 320 px across the tote."""
 LONGEST = 40
-"""Largest distance to a contour that is told apart [px]."""
+"""Largest distance to a contour; greater ones are clamped [px]."""
 Z = 1.959964
 """Quantile of the normal distribution for a 95 % interval."""
 
 
 @dataclass(frozen=True, eq=False)
 class Sight:
-    """What pickers may see of B images, on a device."""
+    """Observation of pickers: batch of B images on a device."""
 
     depth: torch.Tensor
     """Planar depth (B, H, W) float32 [m]; 0: nothing."""
@@ -34,13 +34,13 @@ class Sight:
     """Focal length [px]."""
 
     def part(self, rows: torch.Tensor | slice) -> Sight:
-        """Some of the images."""
+        """Subset of the images, by index."""
         return Sight(self.depth[rows], self.instance[rows], self.focal)
 
 
 def find_normals(depth: torch.Tensor, focal: float) -> torch.Tensor:
-    """Surface normals towards the camera (B, 3, H, W), by central differences of depth (B, H, W) [m]; in the camera's axes, but as of a
-    weak perspective about each pixel."""
+    """Surface normals towards the camera (B, 3, H, W), by central differences of depth (B, H, W) [m]; camera frame, with weak perspective
+    (scaled orthography) about each pixel."""
     padded = functional.pad(depth[:, None], (1, 1, 1, 1), mode="replicate")[:, 0]
     across, along = padded[:, 1:-1, 2:] - padded[:, 1:-1, :-2], padded[:, 2:, 1:-1] - padded[:, :-2, 1:-1]
     slope = focal / (2.0 * depth.clamp(min=1e-3))
@@ -48,13 +48,13 @@ def find_normals(depth: torch.Tensor, focal: float) -> torch.Tensor:
 
 
 def score_flatness(sight: Sight) -> torch.Tensor:
-    """Length of the mean normal in a window, 1 where it is flat, of visible objects (B, H, W)."""
+    """Flatness of visible objects (B, H, W): length of the mean normal in a window, 1 where it is flat; 0 without object."""
     mean = functional.avg_pool2d(find_normals(sight.depth, sight.focal), WINDOW, 1, WINDOW // 2, count_include_pad=False)
     return torch.where(sight.instance > 0, mean.norm(dim=1), 0.0)
 
 
 def score_contour_distance(sight: Sight) -> torch.Tensor:
-    """Chessboard distance to the contour of each visible instance (B, H, W) [px], at most LONGEST; flat tops of it by smoothing."""
+    """Distance transform (chessboard) of each visible instance to its contour (B, H, W) [px], at most LONGEST; smoothing breaks ties."""
     segment = sight.instance.float()[:, None]
     apart = (functional.max_pool2d(segment, 3, 1, 1) != segment) | (-functional.max_pool2d(-segment, 3, 1, 1) != segment)
     inside = ((segment > 0) & ~apart).float()
@@ -66,13 +66,13 @@ def score_contour_distance(sight: Sight) -> torch.Tensor:
 
 
 def score_random(sight: Sight, generator: torch.Generator) -> torch.Tensor:
-    """Random scores of visible objects (B, H, W)."""
+    """Uniform random scores at pixels of visible objects, 0 elsewhere (B, H, W)."""
     drawn = torch.rand(sight.depth.shape, generator=generator, device=sight.depth.device)
     return torch.where(sight.instance > 0, drawn, 0.0)
 
 
 def average_precision(scored: Scored, weight: np.ndarray) -> float:
-    """Average precision of scores, with these weights (sample); NaN without successes. Ties in the order of samples."""
+    """Average precision (area under the precision-recall curve) with weights (sample); NaN without successes. Ties keep sample order."""
     order = np.argsort(-scored.score, kind="stable")
     order = order[weight[order] > 0.0]
     gained, all_of = np.cumsum((weight * scored.outcome)[order]), np.cumsum(weight[order])
@@ -87,7 +87,7 @@ def mean_score(scored: Scored, weight: np.ndarray) -> float:
 
 
 def wilson(successes: int, count: int) -> tuple[float, float]:
-    """Wilson's 95 % score interval of a share of successes; (0, 1) without samples."""
+    """Wilson score interval, 95 %, of a success rate; (0, 1) without samples."""
     if not count:
         return 0.0, 1.0
     share, spread = successes / count, Z * Z / count

@@ -1,7 +1,7 @@
-"""Train a suction picker on simulated picks alone, and score it among tried candidates and by running it in simulation.
+"""Train a suction picker (pixel-wise success prediction by a U-Net) on simulated picks; score it on tried candidates and in simulation.
 
-The network gives each pixel of camera 0's depth image the logit of success; it learns from tried pixels only, and from pixels of the bin,
-where there is nothing to pick. Needs PyTorch; the defaults are for a GPU.
+The network predicts the logit of success at each pixel of camera 0's depth image; it learns from tried pixels, and from pixels without
+object as failures. Needs PyTorch; the defaults are for a GPU.
 
     synpick-warp bake --config synpick --episodes 300 --formats shards,picks --set cameras.resolution=[320,180] --out DATA
     python -m tools.examples.train_picker train DATA --picker picker.pt --unseen 7
@@ -51,20 +51,19 @@ from tools.examples.train_online import Network
 from tools.options import configure, fail, make_parser, positive_count
 
 HELD_OUT = 5
-"""Every so many episodes one is held out from training."""
+"""One of so many episodes is held out from training."""
 EMPTY_PIXELS = 32
-"""Pixels of bin and table of an image that are learnt as failures: nothing is there to be picked."""
+"""Negative samples of an image: pixels without object, learnt as failures."""
 LIGHTEST, HEAVIEST = 0.1, 10.0
-"""Least and largest weight of a trial beside its image's mean: weights are inverse probabilities, of which few may be very large, and 0 of
-the episode's own grasp."""
+"""Limits of a trial's inverse probability weight, relative to its image's mean: a few may be very large, and the own grasp's is 0."""
 LEARNING_RATE, WARM_UP, BATCH = 2e-3, 0.05, 16
 FEW_DRAWS = 200
-"""Bootstrap samples of what takes all trials."""
+"""Bootstrap resamples of statistics over all trials."""
 HINTS = 0.3
-"""Factor on the loss of the analytic maps, which are auxiliary targets where a data set has them."""
+"""Factor on the auxiliary loss: prediction of the analytic maps, where a data set has them."""
 MAPS = ("suction_seal", "suction_wrench")
 MOST_OF_EACH = 2
-"""Most instances of an object in piles of some objects alone."""
+"""Most instances of an object in piles that are limited to seen or unseen objects."""
 RANDOM, CONTOUR, FLATNESS, LEARNED = "random", "contour", "flatness", "learned"
 ANALYTIC, OWN, ORACLE = "seal x wrench", "heuristic", "oracle"
 Score = Callable[[Sight], torch.Tensor]
@@ -73,10 +72,10 @@ _KEPT = ("frame", "candidate", "repeat", "obj_id", "share", "weight", "seal", "w
 
 @dataclass(frozen=True, eq=False)
 class Samples:
-    """States of a data set as camera 0 sees them, and their trials: rows with the index of the state and the pixel in the image."""
+    """Training samples: images of camera 0 at the states of a data set, and the trials with their state and pixel."""
 
     sight: Sight
-    """On the CPU, a state a row."""
+    """Images on the CPU, a row for each state."""
     maps: torch.Tensor | None
     """Analytic seal and wrench maps (state, 2, H, W) float32; None: the data set has none."""
     episode: np.ndarray
@@ -130,19 +129,19 @@ def _segment(view: View) -> np.ndarray:
 
 
 def _maps(view: View) -> np.ndarray | None:
-    """Analytic maps (2, H, W) float32; None: there are none."""
+    """Analytic seal and wrench maps (2, H, W) float32; None: the view has none."""
     return np.stack([view.layer(name) for name in MAPS]).astype(np.float32) if set(MAPS) <= set(view.layers) else None
 
 
 def make_inputs(sight: Sight) -> torch.Tensor:
-    """Input of the network (B, 5, H, W): depth relative to the image's median [dm], normals, and where depth is known."""
+    """Network input (B, 5, H, W): depth relative to the image's median [dm], normals (3), and mask of known depth."""
     known = (sight.depth > 0.0).float()
     middle = sight.depth.flatten(1).median(dim=1).values[:, None, None]
     return torch.cat((((sight.depth - middle) * known * 10.0)[:, None], find_normals(sight.depth, sight.focal), known[:, None]), dim=1)
 
 
 def split_objects(samples: Samples, unseen: int) -> np.ndarray:
-    """obj_ids that are not trained on: `unseen` of those that were tried, by a fixed draw."""
+    """Hold out objects: obj_ids of `unseen` of the tried ones, drawn with a fixed seed; raises ConfigError if too few were tried."""
     objects = np.unique(samples.trials["obj_id"])
     if unseen >= len(objects):
         raise ConfigError(f"--unseen is {unseen}, but {len(objects)} objects were tried; name fewer")
@@ -152,7 +151,7 @@ def split_objects(samples: Samples, unseen: int) -> np.ndarray:
 def train(
     samples: Samples, states: np.ndarray, unseen: np.ndarray, width: int, steps: int, device: torch.device
 ) -> tuple[Network, list[float]]:
-    """Train a new network on the trials of states, without those of unseen objects; returns it and the loss of each step."""
+    """Train a U-Net (AdamW, cosine decay) on the trials of states, except on unseen objects; returns it and the loss of each step."""
     torch.manual_seed(0)
     trials = samples.trials_of(states)
     seen = ~np.isin(trials["obj_id"], unseen)
@@ -189,7 +188,7 @@ def _loss(
     maps: torch.Tensor | None,
     generator: torch.Generator,
 ) -> torch.Tensor:
-    """Weighted binary cross entropy at tried pixels and at pixels without object, and of the analytic maps on objects."""
+    """Weighted binary cross entropy at tried pixels and negative samples, plus the auxiliary loss of the analytic maps on objects."""
     batch = torch.repeat_interleave(torch.arange(len(rows)), torch.tensor([len(part) for part in rows]))
     index = torch.cat(rows)
     weight = torch.cat([trials["weight"][part] / trials["weight"][part].mean().clamp(min=1e-9) for part in rows]).clamp(LIGHTEST, HEAVIEST)
@@ -207,7 +206,7 @@ def _loss(
 
 
 def score_learned(network: Network, sight: Sight) -> torch.Tensor:
-    """Probability of success at each pixel (B, H, W) by the network."""
+    """Success probability predicted by the network at each pixel (B, H, W)."""
     with torch.no_grad():
         return torch.cat(
             [network(make_inputs(sight.part(slice(at, at + BATCH))))[:, 0].sigmoid() for at in range(0, len(sight.depth), BATCH)]
@@ -215,7 +214,7 @@ def score_learned(network: Network, sight: Sight) -> torch.Tensor:
 
 
 def dense_scores(network: Network | None, device: torch.device) -> dict[str, Score]:
-    """Pickers by name: the learned one, if any, and the baselines."""
+    """Score functions by picker name: the learned picker, if any, and the baselines."""
     generator = torch.Generator(device).manual_seed(0)
     learned: dict[str, Score] = {} if network is None else {LEARNED: partial(score_learned, network)}
     return learned | {CONTOUR: score_contour_distance, FLATNESS: score_flatness, RANDOM: partial(score_random, generator=generator)}
@@ -224,10 +223,10 @@ def dense_scores(network: Network | None, device: torch.device) -> dict[str, Sco
 def evaluate(
     samples: Samples, states: np.ndarray, unseen: np.ndarray, scores: dict[str, Score], device: torch.device
 ) -> list[dict[str, Any]]:
-    """Score the pickers at tried pixels of states: a row for each picker, of objects seen, unseen and all.
+    """Evaluate pickers at tried pixels of states: a row for each picker and group of objects (all, seen, unseen).
 
-    AUC and AP are over trials, weighted by inverse probability; the first choice is the tried candidate with the largest score, its regret
-    the difference to the best candidate of the state, each with a bootstrap interval over states. Figures are `Interval`s.
+    ROC AUC and average precision (AP) are over trials, with inverse probability weights. First choice: success rate of the candidate with
+    the largest score; regret: that of the state's best candidate minus it. Figures are `Interval`s by cluster bootstrap over states.
     """
     trials, sight = samples.trials_of(states), samples.sight.part(torch.from_numpy(states))
     at = trials["state"], trials["y"], trials["x"]
@@ -246,7 +245,7 @@ def evaluate(
 
 
 def _measure(trials: dict[str, np.ndarray], score: np.ndarray | None) -> dict[str, Any]:
-    """AUC, AP, first choice and regret of a score of trials (None: the share of successes of their candidate)."""
+    """AUC, AP, first choice and regret of a score (trial); None: the oracle, which knows the success rate of each candidate."""
     success = trials["success"].astype(float)
     _, which = np.unique(np.stack((trials["state"], trials["candidate"])), axis=1, return_inverse=True)
     rates = (np.bincount(which.ravel(), success) / np.bincount(which.ravel()))[which.ravel()]
@@ -268,7 +267,7 @@ def _measure(trials: dict[str, np.ndarray], score: np.ndarray | None) -> dict[st
 
 
 def _mean_over_states(values: np.ndarray) -> Interval:
-    """Mean of one value of each state, with its bootstrap interval."""
+    """Mean of values (state), with its bootstrap interval."""
     count = len(values)
     return estimate(Scored(values, np.zeros(count, bool), np.ones(count), np.arange(count)), mean_score)
 
@@ -282,13 +281,13 @@ def show_rows(rows: list[dict[str, Any]]) -> None:
 
 
 def save_picker(path: Path, network: Network, width: int, size: tuple[int, int], unseen: np.ndarray, everything: np.ndarray) -> None:
-    """Write network, size of its images, and objects that it has and has not been trained on."""
+    """Write a network's weights with width, image size, held-out objects (`unseen`) and all tried objects (`everything`)."""
     parts = {"width": width, "size": size, "unseen": unseen.tolist(), "objects": everything.tolist(), "weights": network.state_dict()}
     torch.save(parts, path)
 
 
 def load_picker(path: Path, device: torch.device) -> tuple[Network, dict[str, Any]]:
-    """Read a network and what was saved with it; raises DatasetError if the file is none of ours."""
+    """Read a file of `save_picker`: network and all its entries; raises DatasetError if it is no such file."""
     try:
         parts = torch.load(path, map_location=device, weights_only=True)
         network = Network(1 + len(MAPS), parts["width"], inputs=5).to(device)
@@ -299,7 +298,7 @@ def load_picker(path: Path, device: torch.device) -> tuple[Network, dict[str, An
 
 
 def run_train(options: argparse.Namespace, device: torch.device) -> None:
-    """Command `train`: train on all episodes but the held-out ones, and score on these."""
+    """Command `train`: train on all episodes except those held out, and evaluate on these."""
     samples = load_samples(options.folder)
     unseen = split_objects(samples, options.unseen) if options.unseen else np.zeros(0, int)
     held = np.isin(samples.episode, np.unique(samples.episode)[HELD_OUT - 1 :: HELD_OUT])
@@ -318,14 +317,14 @@ def run_train(options: argparse.Namespace, device: torch.device) -> None:
 
 
 def run_evaluate(options: argparse.Namespace, device: torch.device) -> None:
-    """Command `evaluate`: score a picker, and the baselines, at the tried pixels of a whole data set, which should be another one."""
+    """Command `evaluate`: evaluate a picker and the baselines at the tried pixels of a whole data set, not that of the training."""
     network, parts = load_picker(options.picker, device)
     samples = load_samples(options.folder)
     show_rows(evaluate(samples, np.arange(len(samples.episode)), np.array(parts["unseen"]), dense_scores(network, device), device))
 
 
 def run_simulation(options: argparse.Namespace, device: torch.device) -> None:
-    """Command `run`: success of the first choice of each picker from the same piles, then picks until empty of the learned one."""
+    """Command `run`: success rate of each picker's first choice from the same piles, and optionally bin emptying by the learned one."""
     from synpick_warp.environment.make import make_picking
     from tools.examples.picking_runs import choose_environment, run_first_choices, run_until_empty
 

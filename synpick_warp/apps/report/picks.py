@@ -31,8 +31,8 @@ _MAP_WIDTH = 640
 
 
 def calibration_spec(figures: PickFigures) -> Spec:
-    """Calibration curve of SuctionNet's score: share of successes by its mean in each bin, with 95 % intervals; on the diagonal the score
-    is the probability of success. Discs grow with the number of trials."""
+    """Vega-Lite reliability diagram of SuctionNet's score: success rate over mean score by bin, with 95 % intervals; on the diagonal the
+    score is the probability of success. Discs grow with the number of trials."""
     rows = [
         {"predicted": float(predicted), "observed": float(observed), "count": int(count), "candidates": each.population}
         | ({} if low != low else {"low": float(low), "high": float(high)})

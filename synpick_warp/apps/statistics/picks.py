@@ -1,4 +1,4 @@
-"""How well the analytic suction scores predict simulated success: AUC, calibration, by share of the sampling and by object."""
+"""Evaluation of analytic suction scores against simulated success: ROC AUC and calibration, by population of candidates and by object."""
 
 from __future__ import annotations
 
@@ -22,29 +22,29 @@ SCORES = ("seal x wrench", "seal", "wrench")
 FACING = 10.0
 """Largest angle between the direction of the press and the surface normal of trials that are pressed along it [°]."""
 UNIFORM, FACED, ALL = "uniform over visible pixels, weighted", f"of these, pressed within {FACING:.0f}° of the normal", "all candidates"
-"""Populations: the unbiased share, with weights; those of it where the gripper can do what the analytic score supposes, as it tilts only so
-far; and everything that was sampled, each trial alike."""
+"""Populations of trials: the uniform share, with inverse probability weights; its trials that are pressed along the normal, as the analytic
+score supposes (the gripper's tilt is limited); and all sampled candidates, unweighted."""
 MIN_OUTCOMES = 5
-"""Fewest successes and failures of an object of which an AUC is shown."""
+"""Fewest successes, and fewest failures, of an object for which an AUC is estimated."""
 _KEPT = ("state", "candidate", "repeat", "share", "weight", "obj_id", "seal", "wrench", "outcome", "success")
 
 
 @dataclass(frozen=True)
 class ScoreFigures:
-    """How well a score predicts success in a population of trials: AUC and calibration."""
+    """Success rate of a population of trials, with ROC AUC and calibration of a score that predicts it."""
 
     score: str
     population: str
     trials: int
     success: Interval
-    """Share of successful trials."""
+    """Success rate, weighted as its population."""
     auc: Interval
     calibration: Calibration
 
 
 @dataclass(frozen=True)
 class ObjectFigures:
-    """The same of the trials that intended an object, over all candidates, by SuctionNet's score."""
+    """Success rate of trials on an object, with ROC AUC of SuctionNet's score; all candidates, unweighted."""
 
     obj_id: int
     name: str
@@ -56,7 +56,7 @@ class ObjectFigures:
 
 @dataclass(frozen=True)
 class PickFigures:
-    """Figures on the picks of a data set: numbers of states, candidates and trials, figures of scores, and of objects."""
+    """Evaluation of the picks of a data set: numbers of episodes, states, candidates and trials, figures of scores and of objects."""
 
     episodes: int
     states: int
@@ -70,11 +70,12 @@ class PickFigures:
 
 
 def collect_picks(data_set: DataSet) -> tuple[np.ndarray, int]:
-    """Trials of all episodes, in a structured array with columns `cluster`, which numbers states, and `angle`, between press and surface
-    normal [°]; and the number of episodes with any.
+    """Concatenate the trials of all episodes; returns them, and the number of episodes with trials.
+
+    The structured array (trial) also has `cluster`, a number of the state, and `angle` between press and surface normal [°].
 
     Raises:
-        DatasetError: There are none, or a table is damaged.
+        DatasetError: There are no trials, or a table is damaged.
     """
     parts, states, episodes = [], 0, 0
     for episode in data_set.values():
@@ -96,16 +97,16 @@ def collect_picks(data_set: DataSet) -> tuple[np.ndarray, int]:
 
 
 def evaluate_picks(trials: np.ndarray, episodes: int, names: dict[int, str], draws: int = DRAWS) -> PickFigures:
-    """Evaluate the analytic scores on trials.
+    """Evaluate the analytic scores on trials, by population and by object, with cluster bootstrap intervals over states.
 
     Args:
         trials: As of `collect_picks`.
         episodes: Number of episodes with trials.
         names: Name of each object.
-        draws: Bootstrap samples of the intervals.
+        draws: Bootstrap resamples of the intervals.
 
     Raises:
-        DatasetError: No trial counts.
+        DatasetError: There is no trial of a sampled candidate with an outcome.
     """
     counted = trials[(trials["share"] != Share.OWN) & (trials["outcome"] != Outcome.NONE)]
     if not len(counted):
@@ -132,7 +133,7 @@ def evaluate_picks(trials: np.ndarray, episodes: int, names: dict[int, str], dra
 
 
 def _by_object(trials: np.ndarray, scored: Scored, names: dict[int, str], draws: int) -> Iterator[ObjectFigures]:
-    """Figures of each object, by obj_id."""
+    """Figures of each object, in the order of obj_id."""
     for obj_id in np.unique(trials["obj_id"]).tolist():
         own = scored.select(trials["obj_id"] == obj_id)
         enough = min(own.outcome.sum(), (~own.outcome).sum()) >= MIN_OUTCOMES
@@ -147,14 +148,14 @@ def picks_figures(data_set: DataSet, draws: int = DRAWS) -> PickFigures:
 
 
 def find_picks(data_set: DataSet, draws: int = DRAWS) -> PickFigures | None:
-    """The same; None: the data set has no picks. Raises DatasetError if a table is damaged."""
+    """Like `picks_figures`, but None if the data set has no picks. Raises DatasetError if a table is damaged."""
     if data_set.found is not None or "picks" not in data_set.config.bake.formats or not any(len(each.picks) for each in data_set.values()):
         return None
     return picks_figures(data_set, draws)
 
 
 def picks_tables(figures: PickFigures) -> tuple[Table, ...]:
-    """Tables of the figures: scores, calibration of SuctionNet's score, objects."""
+    """Format the figures as tables: scores, calibration curve of SuctionNet's score, objects."""
     interval = (Column("auc", ".3f", "AUC"), Column("auc_low", ".3f", "from"), Column("auc_high", ".3f", "to"))
     rate = (Column("success", ".1%"), Column("success_low", ".1%", "from"), Column("success_high", ".1%", "to"))
     error = (Column("ece", ".3f", "calibration error"), Column("ece_low", ".3f", "from"), Column("ece_high", ".3f", "to"))

@@ -1,4 +1,4 @@
-"""Area under the ROC curve (AUC), calibration and bootstrap intervals of scores that predict binary outcomes, with sample weights.
+"""ROC AUC, calibration and cluster bootstrap intervals of scores that predict binary outcomes, with sample weights.
 
 Fawcett, An introduction to ROC analysis, 2006; expected calibration error: Naeini et al., 2015; cluster bootstrap: Field and Welsh, 2007.
 """
@@ -14,14 +14,14 @@ import numpy as np
 BINS = 10
 """Bins of a calibration curve, of equal width from 0 to 1."""
 DRAWS = 1000
-"""Bootstrap samples."""
+"""Bootstrap resamples."""
 _LEVELS = (2.5, 97.5)
 """Percentiles of a 95 % interval."""
 
 
 @dataclass(frozen=True)
 class Interval:
-    """Estimate with its 95 % interval; NaN: undefined, as an AUC without failures."""
+    """Estimate with its 95 % confidence interval; NaN: undefined, as an AUC without failures."""
 
     value: float
     low: float
@@ -30,7 +30,7 @@ class Interval:
 
 @dataclass(frozen=True, eq=False)
 class Scored:
-    """Scores of samples with their outcomes, weights and clusters.
+    """Sample of a binary predictor: scores with outcomes, weights and clusters.
 
     Samples of a cluster depend on each other, such as picks from one state; clusters are independent.
     """
@@ -46,17 +46,17 @@ class Scored:
 
     @cached_property
     def ties(self) -> tuple[int, np.ndarray]:
-        """Number of distinct scores, and the rank of each sample's among them, ascending (sample) int."""
+        """Dense ranking of the scores: number of distinct scores, and the rank of each sample, ascending from 0 (sample) int."""
         values, rank = np.unique(self.score, return_inverse=True)
         return len(values), rank
 
     def select(self, kept: np.ndarray) -> Scored:
-        """The samples of a mask; clusters keep their indices."""
+        """Subset by a mask (sample) bool; clusters keep their indices."""
         return Scored(self.score[kept], self.outcome[kept], self.weight[kept], self.cluster[kept])
 
 
 def weighted_auc(scored: Scored, weight: np.ndarray | None = None) -> float:
-    """Area under the ROC curve by the rank statistic: probability that a success has a higher score than a failure; ties count half.
+    """ROC AUC by the weighted Mann-Whitney statistic: probability that a success outscores a failure; ties count half.
 
     Args:
         scored: The samples.
@@ -80,24 +80,24 @@ def success_rate(scored: Scored, weight: np.ndarray | None = None) -> float:
 
 @dataclass(frozen=True, eq=False)
 class Calibration:
-    """Calibration curve: by bins of the score the number of samples, the mean score, and the share of successes; and its error."""
+    """Calibration curve (reliability diagram): by bin of the score, sample count, mean score and success rate; and its error."""
 
     count: np.ndarray
     """(bin) int."""
     predicted: np.ndarray
-    """Weighted mean of the scores (bin); NaN: empty, here and below."""
+    """Weighted mean score (bin); NaN here and below: the bin is empty."""
     observed: np.ndarray
-    """Weighted share of successes (bin)."""
+    """Weighted success rate (bin)."""
     low: np.ndarray
-    """Lower end of its 95 % interval (bin)."""
+    """Lower end of the 95 % interval of `observed` (bin)."""
     high: np.ndarray
-    """Upper end (bin)."""
+    """Upper end of that interval (bin)."""
     error: Interval
-    """Expected calibration error: weighted mean distance between the two."""
+    """Expected calibration error: weighted mean of |observed - predicted| over bins."""
 
 
 def calibrate(scored: Scored, draws: int = DRAWS) -> Calibration:
-    """Calibration curve of scores from 0 to 1, taken for probabilities, with bootstrap intervals over clusters."""
+    """Calibration curve of scores from 0 to 1, read as probabilities, with cluster bootstrap intervals."""
     place = np.clip((scored.score * BINS).astype(np.int64), 0, BINS - 1)
 
     def sums(weight: np.ndarray) -> np.ndarray:
@@ -117,7 +117,7 @@ def calibrate(scored: Scored, draws: int = DRAWS) -> Calibration:
 
 
 def estimate(scored: Scored, statistic: Callable[[Scored, np.ndarray], float], draws: int = DRAWS) -> Interval:
-    """A statistic of samples and weights, such as `weighted_auc`, with its bootstrap interval over clusters."""
+    """Estimate of a statistic of samples and weights, such as `weighted_auc`, with its cluster bootstrap interval."""
     value, low, high = bootstrap(scored, lambda weight: np.array([statistic(scored, weight)]), draws)
     return Interval(float(value[0]), float(low[0]), float(high[0]))
 
@@ -125,11 +125,11 @@ def estimate(scored: Scored, statistic: Callable[[Scored, np.ndarray], float], d
 def bootstrap(
     scored: Scored, statistic: Callable[[np.ndarray], np.ndarray], draws: int = DRAWS
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Percentile intervals by resampling whole clusters with replacement; a cluster that is drawn k times counts k times.
+    """Cluster bootstrap, percentile intervals: whole clusters are drawn with replacement; k draws multiply a cluster's weights by k.
 
     Args:
         scored: The samples.
-        statistic: Numbers that follow from weights (sample), of any one shape.
+        statistic: Function of weights (sample) that returns an array of fixed shape.
         draws: Number of resamples, from a fixed seed.
 
     Returns:

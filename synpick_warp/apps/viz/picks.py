@@ -1,4 +1,4 @@
-"""Pictures of simulated picks: heat maps of success over the visible objects beside the analytic score, and one trial explained."""
+"""Pictures of simulated picks: heat maps of success and of the analytic score over visible objects, and one trial explained."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from synpick_warp.dataset.view import View
 
 NEIGHBOURS = 4
-"""Tried pixels of the same instance between which a pixel of a heat map is interpolated."""
+"""Number of nearest tried points of the same instance from which a pixel of a heat map is interpolated."""
 WIDTH = 880
 """Width of a heat map on a sheet [px]."""
 CROP = 0.12
@@ -35,16 +35,16 @@ _RED = (40, 40, 200)
 _DIM = 0.35
 """Brightness of the colour image under a heat map."""
 _OPACITY = 0.72
-"""Of a heat map."""
+"""Opacity of a heat map."""
 _MARGIN = 20
 _HEAD = 48
 """Height of the headline and of the captions below it [px]."""
 
 
 def spread_over_surface(view: View, points: np.ndarray, instances: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """Interpolate values at points over the visible pixels of their instances (H, W) float64; NaN: no point lies on the instance.
+    """Inverse distance weighting (Shepard, 1968) of values over the visible pixels of instances (H, W) float64; NaN: no point on it.
 
-    Weights are inverse squared distances to the NEIGHBOURS nearest points of the same instance in the image (Shepard, 1968).
+    Weights are inverse squared distances in the image to the NEIGHBOURS nearest points of the same instance.
 
     Args:
         view: The view.
@@ -67,7 +67,7 @@ def spread_over_surface(view: View, points: np.ndarray, instances: np.ndarray, v
 
 
 def draw_heat(view: View, values: np.ndarray) -> Image:
-    """Values from 0 (blue) to 1 (yellow) over a view's dimmed grey image; NaN: nothing."""
+    """Blend a heat map of values (H, W) from 0 (blue) to 1 (yellow) over a view's dimmed grey image; NaN: not coloured."""
     grey = cv2.cvtColor(cv2.cvtColor(view.rgb, cv2.COLOR_RGB2GRAY), cv2.COLOR_GRAY2BGR)
     colors = heat_colors(np.nan_to_num(values))
     known = ~np.isnan(values)[..., None]
@@ -76,7 +76,7 @@ def draw_heat(view: View, values: np.ndarray) -> Image:
 
 
 def heat_colors(values: np.ndarray) -> Image:
-    """VIRIDIS colours of values (H, W) from 0 to 1, as of the layers of suction."""
+    """Map values (H, W) from 0 to 1 to VIRIDIS colours, as for the layers of suction."""
     return cv2.applyColorMap(np.rint(255.0 * np.clip(values, 0.0, 1.0)).astype(np.uint8), cv2.COLORMAP_VIRIDIS)
 
 
@@ -104,7 +104,7 @@ def draw_pick_maps(view: View, picks: np.ndarray, width: int = WIDTH) -> list[tu
 
 
 def describe_trial(trial: Mapping[str, Any] | np.void, name: str) -> list[str]:
-    """Explain the course of a trial in sentences, from its row; `name`: of the intended object."""
+    """Explain a trial in sentences, from its row; `name`: that of the intended object."""
     tilt, aside = (
         math.degrees(math.acos(float(np.clip(-trial["approach"] @ axis, -1.0, 1.0))))
         for axis in (np.array([0.0, 0.0, 1.0]), trial["normal"])
@@ -142,7 +142,7 @@ def describe_trial(trial: Mapping[str, Any] | np.void, name: str) -> list[str]:
 
 
 def draw_trial(view: View, trial: np.void, radius: float) -> Image:
-    """Colour image around the grasp point of a trial: rim of the cup (`radius` [m]) on the surface, and the direction of its approach."""
+    """Draw a trial over a crop of the colour image: the cup's rim (`radius` [m]) on the surface, and its direction of approach."""
     point, normal = np.asarray(trial["point"], np.float64), np.asarray(trial["normal"], np.float64)
     center = view.project(point, view.world_to_camera)
     depth = (view.world_to_camera[:3, :3] @ point + view.world_to_camera[:3, 3])[2]
@@ -164,8 +164,9 @@ def draw_trial(view: View, trial: np.void, radius: float) -> Image:
 
 
 def choose_trial(picks: np.ndarray, candidate: int | None = None) -> np.void:
-    """Trial that is worth explaining: the failure, of unperturbed trials, with the highest analytic score; without failures the success
-    with the lowest; or the first trial of a candidate.
+    """Choose a trial to explain: the unperturbed failure with the highest analytic score; without failures, the success with the lowest.
+
+    With `candidate`, its first trial.
 
     Raises:
         DatasetError: There is no such candidate.

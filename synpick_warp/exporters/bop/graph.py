@@ -1,4 +1,4 @@
-"""Scene graph of a frame: support by contact forces, occlusion by masks, and an unstacking order.
+"""Scene graph of a frame: support edges from contact forces, occlusion edges from masks, and an unstacking order.
 
 Nodes are ground-truth indices: positions in a frame's list of scene_gt.json. Runs in writer processes, so it imports neither Warp nor
 Newton.
@@ -20,14 +20,14 @@ SUPPORT_FRACTION = 0.05
 """Least upward force of a supporter, as a fraction of the supported object's weight. At rest the solver leaves 2 % of a load
 unbalanced, and friction at a neighbour that an object only touches carries little more."""
 WITHOUT_LABEL = -1
-"""Supporter that is no node: bin, table, or an object without label."""
+"""Index that stands for a supporter without node: bin, table, or an object without label."""
 _DIGITS = 4
 """Decimal places of forces [N]."""
 
 
 @dataclass(frozen=True, eq=False)
 class FrameSupport:
-    """Support edges of a frame, a row each: object, supporter (or WITHOUT_LABEL), upward force [N]; of `nodes` instances."""
+    """Edge list of a frame's support graph: rows of object, supporter (or WITHOUT_LABEL) and upward force [N]; `nodes` instances."""
 
     nodes: int
     edges: np.ndarray
@@ -35,10 +35,10 @@ class FrameSupport:
 
 
 def find_supports(batch: TickBatch, weights: Mapping[int, float]) -> list[FrameSupport]:
-    """Find the support edges of the frames of a batch, whose ticks have support.
+    """Find the support edges of each frame of a batch: contact forces of at least SUPPORT_FRACTION of the object's weight.
 
     Args:
-        batch: The frames.
+        batch: The frames, with support forces in their ticks.
         weights: Weight of an object [N] by obj_id.
     """
     frames = zip(batch.object_id, batch.tick["support"], batch.tick["static_support"], strict=True)
@@ -46,7 +46,7 @@ def find_supports(batch: TickBatch, weights: Mapping[int, float]) -> list[FrameS
 
 
 def _find_edges(object_id: np.ndarray, support: np.ndarray, static: np.ndarray, weights: Mapping[int, float]) -> FrameSupport:
-    """Support edges of a frame: obj_id of each instance (I), support (I, I) and that of what is static (I) [N]."""
+    """Support edges of a frame: obj_id of instances (I), upward forces between them (I, I) and of static bodies on them (I) [N]."""
     labelled, others = np.flatnonzero(object_id >= 0), np.flatnonzero(object_id < WITHOUT_LABEL)
     # The last column has index -1: WITHOUT_LABEL.
     force = np.column_stack((support[np.ix_(labelled, labelled)], static[labelled] + support[np.ix_(labelled, others)].sum(axis=1)))
@@ -57,7 +57,7 @@ def _find_edges(object_id: np.ndarray, support: np.ndarray, static: np.ndarray, 
 
 
 def find_occlusions(masks: Sequence[Masks]) -> list[tuple[int, int, int]]:
-    """Occlusion edges of a view: (a, b, pixels at which a is visible and b, hidden, would be), by the masks of its instances."""
+    """Occlusion edges of a view, (a, b, pixels): number of pixels common to a's visible mask and b's amodal mask."""
     return [
         (a, b, pixels)
         for a, one in enumerate(masks)
@@ -67,7 +67,7 @@ def find_occlusions(masks: Sequence[Masks]) -> list[tuple[int, int, int]]:
 
 
 def count_common(one: Runs, other: Runs) -> int:
-    """Number of pixels that two masks have in common."""
+    """Intersection area [px] of two run-length encoded masks."""
     box, own = one.box(), other.box()
     if box is None or own is None or any(box[side] > own[side + 2] or own[side] > box[side + 2] for side in (0, 1)):
         return 0
@@ -83,10 +83,10 @@ def find_unstacking_order(nodes: int, supports: Iterable[tuple[int, int]]) -> li
 
     Args:
         nodes: Number of nodes.
-        supports: (object, supporter); no node: the supporter is left out.
+        supports: Edges (object, supporter); those to WITHOUT_LABEL are left out.
 
     Returns:
-        Strongly connected components, none of which carries a later one. Of several objects: they carry each other, a cycle.
+        Strongly connected components, none of which carries a later one. One of several objects is a cycle: they carry each other.
     """
     import networkx
 
@@ -99,7 +99,7 @@ def find_unstacking_order(nodes: int, supports: Iterable[tuple[int, int]]) -> li
 
 
 def graph_entry(entry: Mapping[str, Any], support: FrameSupport | None) -> dict[str, Any]:
-    """A frame's entry in scene_graph.json: that of the view, with support and unstacking order of its frame (None: unknown)."""
+    """A frame's entry in scene_graph.json: the view's `entry`, with support edges and unstacking order (`support` None: without)."""
     if support is None:
         return dict(entry)
     edges = [(int(one), int(other), round(force, _DIGITS)) for one, other, force in support.edges.tolist()]

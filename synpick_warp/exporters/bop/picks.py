@@ -1,6 +1,6 @@
 """File scene_picks.json beside a BOP scene: the grasp candidates of each frame in camera coordinates, with their simulated success.
 
-Trials are spooled to the staged scene when they come, as rows of their table; the file is written when the scene is completed.
+Trials are spooled to the staged scene as table rows when they arrive; the JSON file is written when the scene is complete.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from synpick_warp.configs.calibration.lens import read_lens
 from synpick_warp.views.picks import COLUMNS, PickBatch, make_rows, row_type, sort_rows
 
 PICKS = "picks"
-"""Spool file of a staged scene; there is one if picks were tried from what its camera saw."""
+"""Spool file of a staged scene; absent if no candidates were drawn from its camera's images."""
 _MM = 1000.0
 """Millimetres in a metre."""
 _DIGITS = 6
@@ -24,7 +24,7 @@ _DIGITS = 6
 
 
 def spool_picks(batch: PickBatch, scenes: tuple[Path, ...]) -> None:
-    """Append the trials of a batch to the spool file of the scene whose camera saw their state; `scenes`: of each camera."""
+    """Append the trials of a batch to spool files: each to that of the camera from which its candidate was drawn; `scenes`: by camera."""
     rows = make_rows(COLUMNS, batch.trials)
     state, camera = np.asarray(batch.states["state"]), np.asarray(batch.states["camera"])
     for index in np.unique(camera).astype(int).tolist():
@@ -34,7 +34,7 @@ def spool_picks(batch: PickBatch, scenes: tuple[Path, ...]) -> None:
 
 
 def format_picks(spool: Path, camera: Callable[[int], dict[str, Any] | None], size: tuple[int, int]) -> Iterator[str]:
-    """Format scene_picks.json.
+    """Format scene_picks.json, as lines of text: a list of candidates by frame.
 
     Args:
         spool: The spool file.

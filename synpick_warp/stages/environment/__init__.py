@@ -1,1 +1,1 @@
-"""Host side of the batched environment: piles at rest, attempts and twists, observations."""
+"""Host side of the vector environment: checkpoint bank of piles, attempts, twist control, observations."""

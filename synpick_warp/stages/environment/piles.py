@@ -1,4 +1,4 @@
-"""Bank of piles: episodes that are simulated to rest ahead of resets, as rows of states by episode index."""
+"""Checkpoint bank of settled piles, from which resets are loaded: a cache of states by episode index."""
 
 from __future__ import annotations
 
@@ -17,18 +17,18 @@ POLL = 8
 
 
 class PileBank:
-    """Settled piles of a simulation that simulates nothing else meanwhile: a pile depends on the episode alone, not on world or bank.
+    """Checkpoint bank of settled piles. Settling takes all worlds; a pile depends on its episode alone, not on world or bank.
 
     Attributes:
-        rows: Row of `state` of each episode in the bank.
-        state: The states.
+        rows: Episode index -> row of `state`.
+        state: The checkpoints, one a row.
     """
 
     def __init__(self, simulation: Simulation, capacity: int) -> None:
         """Allocate the bank.
 
         Args:
-            simulation: The worlds, after a tick.
+            simulation: The worlds, after their first tick.
             capacity: Most piles that are kept.
 
         Raises:
@@ -44,11 +44,11 @@ class PileBank:
         self._done = wp.zeros(2, dtype=wp.int32, device=self.device)
 
     def fetch(self, episodes: Sequence[int], ahead: Sequence[int] = ()) -> list[int]:
-        """Rows of episodes, which are settled first where the bank lacks them: then the worlds' states are lost.
+        """Look up the rows of episodes; settles the piles that the bank lacks, whereby the worlds' current states are lost.
 
         Args:
             episodes: Episode indices.
-            ahead: Episodes that will be wanted next; worlds that would be idle settle these.
+            ahead: Episodes to prefetch: settled by worlds that would otherwise be idle.
 
         Raises:
             StateError: The bank is too small, or a pile does not come to rest.
@@ -71,14 +71,14 @@ class PileBank:
         return any(episode not in self.rows for episode in episodes)
 
     def _make_room(self, count: int, kept: set[int]) -> None:
-        """Drop piles that are not kept, the oldest first, until `count` rows are free."""
+        """Evict piles that are not in `kept`, the oldest first, until `count` rows are free."""
         for episode in [episode for episode in self.rows if episode not in kept]:
             if len(self._free) >= count:
                 break
             self._free.append(self.rows.pop(episode))
 
     def _settle(self, episodes: Sequence[int]) -> None:
-        """Settle piles, one a world, and save each in the first tick in which it rests."""
+        """Simulate piles until they rest, one in each world, and save each in the first tick at rest."""
         simulation, worlds, settle = self.simulation, self.simulation.layout.worlds, self.simulation.config.settle
         rows = [self._free.pop() for _ in episodes]
         for array, values in ((self._episode, episodes), (self._row, rows)):

@@ -1,4 +1,4 @@
-"""Observations on the device: images of one camera in all worlds, and state vectors."""
+"""Observations of the vector environment, on the device: images of one camera in all worlds, and state vectors."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from synpick_warp.stages.view_ring import CameraGroup
 
 @dataclass(frozen=True, eq=False)
 class SightArrays:
-    """Images and vectors of every world, as they were observed last; None: not asked for."""
+    """Latest images and state vectors of every world; None: not observed."""
 
     depth: wp.array = device_array("world", "row", "column", dtype=wp.float32, unit="m")
     """Planar depth; 0: no surface."""
@@ -37,15 +37,15 @@ class SightArrays:
     point: wp.array = device_array("world", dtype=wp.vec3, unit="m")
     """Grasp point that perception finds on the target; 0 without one."""
     state: wp.array = device_array("world", "value", dtype=wp.float32)
-    """Gripper and instances; see `write_states_kernel`."""
+    """State vector of gripper and instances; see `write_states_kernel`."""
 
 
 IMAGES = {"depth", "segment", "normal", "mask"}
-"""Arrays that the images without colour yield."""
+"""Arrays that follow from the G-buffer, without shading."""
 
 
 class Sight:
-    """Writes observations of all worlds of a simulation. `observe` copies nothing to the host."""
+    """Sensor suite of all worlds: renders images and writes state vectors, without copies to the host."""
 
     def __init__(
         self,
@@ -61,12 +61,12 @@ class Sight:
 
         Args:
             settings: Settings of perception.
-            rig: The cameras; images are those of `perception.camera`, or the first.
+            rig: The cameras; `perception.camera`, or the first, is observed.
             simulation: The worlds.
-            group: Cameras and their renderer; that of the images is among them.
+            group: The group of the observed camera, with its renderer.
             resolution: Width and height of the images [px].
-            wanted: Fields of `SightArrays`.
-            shows_gripper: Whether images without colour show the gripper.
+            wanted: Fields of `SightArrays` to be observed.
+            shows_gripper: Whether images other than `color` show the gripper.
         """
         self.simulation, self.group, self.renderer, self.device = simulation, group, group.renderer, simulation.device
         self.camera = rig.index(settings.camera)
@@ -87,7 +87,7 @@ class Sight:
         self._buffers = allocate_view_buffers(self.renderer.views, width, height, instances, self.device) if "color" in only else None
 
     def observe(self, snapshot: Snapshot) -> SightArrays:
-        """Write the observations of all worlds; returns the arrays, which the next call overwrites."""
+        """Observe all worlds; returns the arrays, which the next call overwrites."""
         simulation, arrays = self.simulation, self.arrays
         worlds = np.arange(simulation.layout.worlds)
         if self.images is not None:
@@ -109,7 +109,7 @@ class Sight:
         return arrays
 
     def grasp_pixels(self, pixel: wp.array, point: wp.array, direction: wp.array, instance: wp.array, running: wp.array) -> None:
-        """Write surface point, direction and instance at pixels (world) of the last images; 0 to `running` where there is no surface.
+        """Back-project pixels (world) of the last images to surface points, with direction and instance; see `grasp_pixels_kernel`.
 
         Raises:
             ValueError: There are no images.
@@ -121,7 +121,7 @@ class Sight:
         launch(grasps.grasp_pixels_kernel, len(pixel), self.arrays, **given)
 
     def _copy_images(self, snapshot: Snapshot, worlds: np.ndarray) -> None:
-        """Render a batch of worlds without colour, and copy what is seen to their images."""
+        """Render the G-buffer of a batch of worlds, and copy depth, segmentation and normals to their images."""
         images, arrays = self.images, self.arrays
         padded = np.full(images.views.count, -1, np.int32)
         padded[: len(worlds)] = worlds
@@ -131,7 +131,7 @@ class Sight:
         launch_pixels(observations.copy_images_kernel, images.pixels, inputs, [arrays.depth, arrays.segment, arrays.normal], self.device)
 
     def _render(self, snapshot: Snapshot, worlds: np.ndarray) -> None:
-        """Render a batch of worlds in colour."""
+        """Shade the colour images of a batch of worlds."""
         renderer = self.renderer
         camera = np.full(len(worlds), self.camera, np.int32)
         rows = [wp.array(values, dtype=wp.int32, device=self.device) for values in (worlds, camera, self.group.slots(camera))]

@@ -1,4 +1,4 @@
-"""Twist control of the grippers: a setpoint law that follows commanded velocities."""
+"""Twist control (Cartesian velocity control) of the grippers: a setpoint law that integrates commanded velocities."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ COLUMNS = 6
 
 
 class TwistLaw:
-    """Setpoint law of commanded velocities (`SetpointLaw`), in all modes.
+    """Twist control as a `SetpointLaw`, in all modes.
 
     Attributes:
         command: Velocities of each world (world, column) float32; read in every step.
@@ -30,17 +30,17 @@ class TwistLaw:
         """
         Args:
             simulation: The worlds.
-            lower, upper: Box that setpoints stay in (3) [m].
+            lower, upper: Corners of the box to which setpoints are clamped, each (3) [m].
         """
         self.simulation = simulation
         self.lower, self.upper = wp.vec3(*lower.tolist()), wp.vec3(*upper.tolist())
         self.command = wp.zeros((simulation.layout.worlds, COLUMNS), dtype=wp.float32, device=simulation.device)
 
     def begin(self, scene: SceneData, state: WorldState, attempts: AttemptState, plan: Plan, physics: Physics) -> None:
-        """Nothing: attempts begin with the commands of a tick."""
+        """Do nothing: `start_tick` begins attempts."""
 
     def start_tick(self) -> None:
-        """Apply the commands that hold for a tick, and begin attempts. Runs before the tick."""
+        """Begin attempts, and apply the commands of the next tick to yaw, tilt and suction. Runs before the tick."""
         simulation = self.simulation
         state, attempts, plan, physics = simulation.state, simulation.attempts, simulation.plan, simulation.physics
         sources = (simulation.scene, state, attempts, plan)
@@ -51,10 +51,10 @@ class TwistLaw:
         physics.set_yaw(plan.yaw)
 
     def advance(self, scene: SceneData, state: WorldState, attempts: AttemptState, plan: Plan) -> None:
-        """Advance the setpoints by a step."""
+        """Integrate the setpoints over a step of physics."""
         given = {"command": self.command, "lower": self.lower, "upper": self.upper}
         launch(kernels.follow_twists_kernel, len(state.phase), scene, state, self.simulation.physics.state, **given)
 
     def end_tick(self, scene: SceneData, state: WorldState, attempts: AttemptState, plan: Plan) -> None:
-        """End attempts whose objects hang high enough."""
+        """End attempts whose objects have been lifted to the height at which attempts begin."""
         launch(kernels.end_twists_kernel, len(state.phase), scene, state, attempts, plan, self.simulation.physics.state)

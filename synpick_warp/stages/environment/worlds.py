@@ -1,4 +1,4 @@
-"""Worlds of the environment: attempts that end at different ticks, ticks of twists, resets from the bank of piles, branches.
+"""Worlds of the vector environment: attempts of different lengths, ticks of twists, resets from the bank of piles, branches.
 
 A world whose attempt has ended is saved in that tick; when all have ended, every world is loaded as it was saved. So what a world does
 depends neither on the others nor on how long these take.
@@ -28,17 +28,17 @@ from synpick_warp.stages.sim.trials import MOVED
 
 RESULTS = struct_arrays(kernels.Results, "world", pose=("world", "instance"), units={"peak_force": "N", "farthest": "m", "pose": "m"})
 SHOWN = ("outcome", "picked", "hits", "peak_force", "ticks", "moved", "farthest", "lost")
-"""Arrays of `Results` that are read."""
+"""Fields of `Results` that are copied to the host."""
 LONGEST = 4096
-"""Ticks after which an attempt is taken for an error [ticks]: setpoints arrive long before."""
+"""Timeout of an attempt [ticks], which is never reached: setpoints arrive long before."""
 
 
 class EnvironmentWorlds:
-    """Worlds that wait for actions. The first `count` are environments; others, which a GPU needs, are idle.
+    """Simulated worlds that advance by an action at a time. The first `count` are environments; others pad the batch on a GPU, idle.
 
     Attributes:
         simulation: The simulation, whose list of episodes is empty.
-        bank: Settled piles.
+        bank: Checkpoint bank of settled piles.
         sight: Observations.
     """
 
@@ -48,7 +48,7 @@ class EnvironmentWorlds:
             simulation: The worlds, before their first tick.
             sight: Observations of them.
             count: Number of environments.
-            piles: Most piles of the bank.
+            piles: Capacity of the bank; raised to what resets need.
             law: Twist control, if actions are twists.
             targets: Whether perception chooses a target before each attempt.
 
@@ -73,7 +73,7 @@ class EnvironmentWorlds:
         Args:
             environments: Their indices.
             episodes: Episode index of each.
-            ahead: Episodes that will be wanted next; see `PileBank.fetch`.
+            ahead: Episodes to prefetch; see `PileBank.fetch`.
 
         Raises:
             StateError: A pile does not come to rest, or memory is too short.
@@ -128,29 +128,29 @@ class EnvironmentWorlds:
         return state.phase.numpy()[: self.count], state.ending.numpy()[: self.count]
 
     def get_state(self) -> State:
-        """State of the environments, a row each."""
+        """Save a checkpoint of the environments, one a row."""
         return self.simulation.get_state(range(self.count))
 
     def set_state(self, state: State, environments: Sequence[int]) -> None:
-        """Load the rows of environments into these.
+        """Load the rows of environments from a checkpoint.
 
         Raises:
-            StateError: The state has other rows, or is of other worlds.
+            StateError: The state has another number of rows, or is of other worlds.
         """
         if len(state) != self.count:
             raise StateError(f"the state is of {len(state)} environments, not of {self.count}")
         self.simulation.set_state(state, environments, environments)
 
     def branch(self, environment: int, into: Sequence[int]) -> None:
-        """Have environments continue as another does; raises StateError if one does not exist."""
+        """Copy the state of an environment to those of `into`; raises StateError if one does not exist."""
         if wrong := [index for index in (environment, *into) if not 0 <= index < self.count]:
             raise StateError(f"there is no environment {wrong[0]}; there are 0 to {self.count - 1}")
         self.simulation.branch(environment, into)
 
     def _attempt(self, active: np.ndarray) -> dict[str, np.ndarray]:
-        """Run the attempts to their ends; returns the results by name: arrays of SHOWN.
+        """Simulate until every attempt has ended; returns the results: arrays (environment, ...) by the names of SHOWN.
 
-        An environment whose action meets no surface waits, with outcome NOTHING_SEEN.
+        An environment whose pixel shows no surface keeps its state, with outcome NOTHING_SEEN.
         """
         simulation, states = self.simulation, self.simulation.states
         plan = simulation.plan
@@ -178,37 +178,37 @@ class EnvironmentWorlds:
         return results
 
     def _measure(self) -> None:
-        """Begin to measure what running worlds do from here on."""
+        """Reset the results, and take the current poses as the reference from which motion is measured."""
         simulation = self.simulation
         self._done.zero_()
         sources = (simulation.scene, simulation.state, simulation.attempts, simulation.physics.state)
         launch(kernels.begin_results_kernel, simulation.layout.worlds, *sources, results=self._results)
 
     def _judge(self) -> None:
-        """Measure the attempts after a tick."""
+        """Update the results of running attempts after a tick."""
         simulation = self.simulation
         sources = (simulation.scene, simulation.state, simulation.attempts, simulation.seals, simulation.physics.state)
         given: dict[str, Any] = {"running": self._running, "results": self._results, "world": self._world, "done": self._done}
         launch(kernels.judge_attempts_kernel, simulation.layout.worlds, *sources, moved_distance=MOVED, **given)
 
     def _look(self) -> None:
-        """Choose targets in worlds that wait for an attempt."""
+        """Run perception, which chooses targets, in worlds that await an attempt."""
         simulation = self.simulation
         if self.targets and simulation.perception is not None:
             simulation.perception.perceive(simulation.record.snapshot)
 
     def _read(self) -> dict[str, np.ndarray]:
-        """Results of the environments, on the host."""
+        """Copy the results of the environments to the host."""
         return {name: getattr(self._results, name).numpy()[: self.count].copy() for name in SHOWN}
 
     def _table(self, worlds: np.ndarray, rows: Sequence[int] | None = None) -> wp.array:
-        """Table (world) int32 with a row for each of `worlds`, their own if None; -1 elsewhere."""
+        """Index table (world) int32: the row of each of `worlds` (None: its own index), -1 elsewhere."""
         table = np.full(self.simulation.layout.worlds, -1, np.int32)
         table[worlds] = worlds if rows is None else rows
         return wp.array(table, dtype=wp.int32, device=self.device)
 
     def _padded(self, values: np.ndarray) -> np.ndarray:
-        """Values of the environments (environment, ...), with zeros for the other worlds."""
+        """Pad values of the environments (environment, ...) with zeros for the other worlds."""
         padded = np.zeros((self.simulation.layout.worlds, *values.shape[1:]), np.int32 if values.dtype == bool else values.dtype)
         padded[: self.count] = values
         return padded

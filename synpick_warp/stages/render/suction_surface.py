@@ -1,4 +1,4 @@
-"""Suctionable part of the objects' surfaces: points sampled evenly by area, each scored as the seal map scores a pixel."""
+"""Suctionable surface area of objects: low-discrepancy surface samples, each scored as the seal map scores a pixel."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from synpick_warp.stages.render.scene import build_meshes, face_normals
 from synpick_warp.system.low_discrepancy import sample_triangles
 
 SAMPLES = 1024
-"""Points of an object: the fraction has a standard error of at most 1.6 %, that of random points; these are more even."""
+"""Sample points of an object: random ones would give the fraction a standard error of at most 1.6 %; these are more even."""
 SUCTIONABLE_SEAL = 0.5
 """Least seal score of a suctionable point: the heights of the lip deviate by 2.6 mm (root mean square), exp(-1e5 · 0.0026²) = 0.5."""
 
 
 def with_suctionable_area(catalog: Catalog, radius: float) -> Catalog:
-    """The same catalog, whose entries know the area on which a cup of `radius` [m] seals: measured on the CPU, so that no bit depends on
-    the bake's device."""
+    """Copy of a catalog with the area, and share of the surface, on which a cup of `radius` [m] seals: estimated on the CPU, so that no bit
+    depends on the bake's device."""
     device = wp.get_device("cpu")
     meshes, keep = build_meshes([entry.mesh for entry in catalog.entries], len(catalog.entries), device)
     samples = [_sample(entry.mesh) for entry in catalog.entries]
@@ -37,7 +37,7 @@ def with_suctionable_area(catalog: Catalog, radius: float) -> Catalog:
 
 
 def _sample(mesh: TriangleMesh) -> tuple[np.ndarray, np.ndarray, float]:
-    """Points of a surface and their normals (SAMPLES, 3) float32 [m], and its area [m²]."""
+    """Sample a mesh uniformly by area: points [m] and unit face normals, each (SAMPLES, 3) float32, and surface area [m²]."""
     corners = mesh.vertices[mesh.faces].astype(np.float64)
     areas = 0.5 * np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
     face, weights = sample_triangles(areas, SAMPLES)

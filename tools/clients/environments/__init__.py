@@ -1,1 +1,1 @@
-"""Real clients of the environment: libraries of reinforcement learning, as they are published."""
+"""Integration tests of the environment with published libraries of reinforcement learning."""

@@ -1,4 +1,4 @@
-"""Real clients of the environment: libraries of reinforcement learning run it, unpatched, for two iterations or by their own checks.
+"""Integration tests of the environment with libraries of reinforcement learning, unpatched: two iterations, or their own checks.
 
 Each client runs in a process of its own, in our interpreter or in the one that `--python NAME=PATH` names. Prints a table; a client that is
 not installed is listed as such. Exits with 1 if a client fails. Nothing is fetched; an interpreter for all of them:
@@ -24,7 +24,7 @@ from tools.options import Row, fail, writable_file
 
 ROOT = Path(__file__).resolve().parents[3]
 NAMES = ("gymnasium", "statistics", "skrl", "torchrl", "rsl_rl")
-"""Clients of `tools.clients.environments.training`, which imports none of ours here."""
+"""Clients: keys of `training.CLIENTS`, a module that only the client's process imports."""
 TIMEOUT = 900.0
 """Time limit of a client [s]."""
 MISSING = ("ModuleNotFoundError", "PackageNotFoundError")
@@ -33,7 +33,7 @@ ALL = "all"
 
 @dataclass
 class Result:
-    """Row of the table: client, version, what it did or why not, and whether it holds."""
+    """Row of the table: client, version, remark or error, and whether the client works (or is not installed)."""
 
     client: str
     version: str
@@ -42,7 +42,7 @@ class Result:
 
 
 def run_client(name: str, python: str, device: str) -> Result:
-    """Run a client in its interpreter; returns its row."""
+    """Run a client in a process of its interpreter; returns its row."""
     command = (python, "-m", "tools.clients.environments.training", name, device)
     environment = os.environ | {"PYTHONPATH": str(ROOT), "PYTHONWARNINGS": "ignore"}
     try:

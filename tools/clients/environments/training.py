@@ -1,4 +1,4 @@
-"""What each library does with the environment: two iterations of its training loop, or its own checks. Runs in its interpreter."""
+"""Clients of the environment: for each library, two iterations of its training loop, or its own checks. Runs in its interpreter."""
 
 # Runs where these libraries are, which the type checker may not see.
 # pyright: reportMissingImports=false
@@ -33,7 +33,7 @@ def make(device: str, **arguments: Any) -> Any:
 
 
 def check_gymnasium(device: str) -> str:
-    """Spaces, autoreset, seeds and wrappers, as Gymnasium's tests of vector environments ask; `make_vec` by id."""
+    """Check spaces, autoreset metadata and reproducibility by seed, as Gymnasium's tests of vector environments do; `make_vec` by id."""
     import gymnasium
     from gymnasium.utils.env_checker import data_equivalence
 
@@ -61,7 +61,7 @@ def check_gymnasium(device: str) -> str:
 
 
 def record_statistics(device: str) -> str:
-    """`RecordEpisodeStatistics` counts returns and lengths of episodes, in both modes of autoreset that it knows."""
+    """Record lengths of episodes by `RecordEpisodeStatistics`, in both modes of autoreset that it knows."""
     from gymnasium.wrappers.vector import RecordEpisodeStatistics
 
     lengths = []
@@ -79,7 +79,7 @@ def record_statistics(device: str) -> str:
 
 
 def train_skrl(device: str) -> str:
-    """PPO with a categorical policy over pixels."""
+    """Train by skrl's PPO with a categorical policy over columns and rows."""
     import torch
     from skrl.agents.torch.ppo import PPO, PPO_CFG
     from skrl.envs.wrappers.torch import wrap_env
@@ -132,7 +132,7 @@ def train_skrl(device: str) -> str:
 
 
 def check_torchrl(device: str) -> str:
-    """`check_env_specs` of our adapter and of TorchRL's own wrapper, and a rollout with partial resets."""
+    """Run `check_env_specs` on our adapter and on TorchRL's own wrapper, and a rollout with partial resets."""
     from torchrl.envs.libs.gym import GymWrapper
     from torchrl.envs.utils import check_env_specs
 
@@ -148,7 +148,7 @@ def check_torchrl(device: str) -> str:
 
 
 def train_rsl_rl(device: str) -> str:
-    """`OnPolicyRunner` with PPO on the state, actions being points."""
+    """Train by rsl_rl's `OnPolicyRunner` (PPO) on state vectors, with actions as points."""
     from rsl_rl.runners import OnPolicyRunner
 
     from synpick_warp.environment.rsl_rl import RslRlEnv
@@ -176,7 +176,7 @@ CLIENTS: Mapping[str, tuple[str, Callable[[str], str]]] = {
     "torchrl": ("torchrl", check_torchrl),
     "rsl_rl": ("rsl-rl-lib", train_rsl_rl),
 }
-"""Distribution and function of each client, which returns a remark, and raises what is wrong."""
+"""Client -> its package, for the version, and its function, which returns a remark and raises on a failure."""
 
 
 def main() -> None:

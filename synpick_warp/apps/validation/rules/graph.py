@@ -1,4 +1,4 @@
-"""Rules about scene_graph.json: its edges and order against each other, support against the models at their poses."""
+"""Validation rules of scene_graph.json: edges and unstacking order against each other, support edges against the models' geometry."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from synpick_warp.apps.validation.subjects import SceneSubject
 from synpick_warp.dataset.annotations import GraphEntry
 
 SUPPORT_GAP = 5.0
-"""Largest distance of the convex hulls of an object and what carries it [mm]: contacts are between pieces of these hulls, which may lie in
-each other by a millimetre, and poses are rounded."""
+"""Largest distance between the convex hulls of an object and its supporter [mm]: contacts are between convex pieces, which may overlap by
+a millimetre, and poses are rounded."""
 STILL = 0.5
-"""Largest motion of an object against the other since the image before, if the pair is checked [mm]: forces are means over that time."""
+"""Largest relative motion of a pair since the image before at which it is checked [mm]: forces are means over that time."""
 IMAGES = 20
-"""Most images of a scene whose support is checked."""
+"""Most images of a scene in which support is checked."""
 _Hull = tuple[np.ndarray, np.ndarray]
 """Corners [mm] and unit normals of the facets (n, 3)."""
 
@@ -67,12 +67,12 @@ def check_support(scene: SceneSubject) -> Findings:
 
 
 def _supports(graph: GraphEntry) -> list[tuple[int, int, float]]:
-    """Support edges; none if they are unknown."""
+    """Support edges of an image; an empty list if they are unknown."""
     return graph.support or []
 
 
 class _Hulls:
-    """Convex hulls of a data set's models, each made when it is first asked for."""
+    """Cache of the convex hulls of a data set's models."""
 
     def __init__(self, scene: SceneSubject) -> None:
         self._folders = [ModelsFolder(listing) for listing in scene.layout.models.values()]
@@ -96,14 +96,14 @@ class _Hulls:
 
 
 def relative_pose(one: Truth, other: Truth) -> np.ndarray:
-    """Pose of the second in the first one's frame (3, 4): rotation, times 100 mm so that turns count as motions, and translation [mm]."""
+    """Pose of `other` in the frame of `one` (3, 4): rotation matrix times 100 mm, so that turns count as motions, and translation [mm]."""
     turn, move = np.reshape(one.cam_R_m2c, (3, 3)), np.subtract(other.cam_t_m2c, one.cam_t_m2c)
     return np.column_stack((100.0 * turn.T @ np.reshape(other.cam_R_m2c, (3, 3)), turn.T @ move))
 
 
 def find_gap(one: _Hull, other: _Hull, pose: np.ndarray) -> float:
-    """Lower bound of the distance of two hulls [mm], the second at a `relative_pose`: by separating planes along the normals of both, and
-    along the line between their centres; exact where a facet is nearest, negative where hulls overlap."""
+    """Lower bound of the distance of two convex hulls [mm], the second at a `relative_pose`: separating axis test along all facet normals
+    and the line between the centres; exact where a facet is nearest, negative where hulls overlap."""
     turn = pose[:, :3] / 100.0
     corners = other[0] @ turn.T + pose[:, 3]
     line = corners.mean(axis=0) - one[0].mean(axis=0)

@@ -1,4 +1,4 @@
-"""Rules about simulated picks: tables against each other, geometry against views, outcomes against what was measured."""
+"""Validation rules of simulated picks: tables against each other, geometry against views, outcomes against measurements."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ PIXEL = 0.01
 MOVED = 5e-3
 """Displacement above which an object counts as moved [m]."""
 UNSEEN = 0.05
-"""Share of points that may lie on what no pixel of a view shows, where its pixels are wider than those of the perception image: thin parts
+"""Largest share of points that a view with wider pixels than the perception image may miss, as no pixel's centre shows them: thin parts
 and edges. It is 0.2 % of a pile's points in 320 px of a perception image of 1280, 0.6 % in 160 px; an object elsewhere has more."""
 SAME = 1e-4
 """Largest distance between an attempt's grasp point and that of the own grasp's trial [m]."""
@@ -34,7 +34,7 @@ _PICKED = (Outcome.TARGET_PICKED, Outcome.OTHER_PICKED)
 
 @dataclass(eq=False)
 class PicksSubject:
-    """Subject of the rules: the tables of an episode."""
+    """Subject of the rules: an episode's tables of picks."""
 
     root: Path
     """The data set."""
@@ -57,7 +57,7 @@ class PicksSubject:
         return self.episode.picks
 
     def views(self) -> Iterator[tuple[np.void, np.ndarray, View]]:
-        """State, trials on objects with labels, and view of each state that has both; none without images."""
+        """Yield each state with its trials on labelled objects and its view; skips states without either, and views through a lens."""
         episode = self.episode
         if not {"bop", "shards"} & set(open_data_set(self.root).config.bake.formats):
             return
@@ -70,7 +70,7 @@ class PicksSubject:
                     yield state, own, view
 
     def tell(self, wrong: np.ndarray, text: str, rows: np.ndarray | None = None) -> Findings:
-        """Yield one violation for rows (row) bool, which names the first."""
+        """Yield one violation that names the first of the `wrong` rows, a mask (row) bool, and counts them; `rows`: None: all trials."""
         if wrong.any():
             rows = self.picks if rows is None else rows
             first = rows[wrong][0]
