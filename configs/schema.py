@@ -220,8 +220,8 @@ class Physics:
     sleep: float = setting(
         0.0,
         "m",
-        "Objects in contact with each other fall asleep when none moved farther in each of three ticks, such as 2e-4, and are not "
-        "simulated until one is touched; 0: none do. Records have no contact forces of sleeping objects.",
+        "Island sleeping: displacement in a tick up to which an object is at rest, such as 2e-4; 0: off. Islands of touching objects that "
+        "all rest for three ticks are not simulated until one is touched; records lack contact forces of sleeping objects.",
         low=0.0,
         high=0.01,
     )

@@ -1,4 +1,4 @@
-"""Grasp candidates of saved states, and the random perturbations of their trials."""
+"""Grasp candidates of saved states, and random perturbations of their trials."""
 
 import warp as wp
 
@@ -7,18 +7,18 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.struct
 class Grasps:
-    """Grasp candidates: row of the saved state, index in it, intended instance, grasp point and normal, and gripper angles."""
+    """Grasp candidates: row of the saved state, index within the state, intended instance, and grasp pose (point, normal, yaw, tilt)."""
 
     row: wp.array[int]
-    """(grasp): row of the state."""
+    """(grasp): row of the saved state."""
     candidate: wp.array[int]
-    """(grasp): index of the candidate within the state, which names its random numbers."""
+    """(grasp): index of the candidate within the state, part of the key of its random numbers."""
     target: wp.array[int]
     """(grasp): intended instance; -1: none."""
     point: wp.array[wp.vec3]
     """(grasp): grasp point in the world [m]."""
     normal: wp.array[wp.vec3]
-    """(grasp): unit vector against which the cup is pressed, out of the object."""
+    """(grasp): unit vector of the cup's axis in the world, out of the object."""
     yaw: wp.array[float]
     """(grasp): rotation of the gripper shaft about the vertical [rad]."""
     tilt: wp.array[float]
@@ -27,7 +27,7 @@ class Grasps:
 
 @wp.struct
 class PerturbationData:
-    """Distribution of perturbations, uniform about 0; see `configs.episodes.picks.Picks`. The first trial of a grasp has none."""
+    """Uniform distributions of the perturbations; see `configs.episodes.picks.Picks`. The first trial of a grasp is not perturbed."""
 
     repeats: int
     """Trials of each grasp."""
@@ -36,18 +36,18 @@ class PerturbationData:
     angle: float
     """Half width of the rotation of the cup about each axis [rad]."""
     friction: float
-    """Half width of the change of friction, as a fraction."""
+    """Half width of the factor on friction about 1."""
     seed: wp.uint64
     """Seed of the bake."""
 
 
 @wp.struct
 class Perturbations:
-    """Perturbation of each trial."""
+    """Sampled perturbation of each trial."""
 
     offset: wp.array[wp.vec3]
-    """(trial): of the grasp point [m]."""
+    """(trial): offset of the grasp point in the world [m]."""
     rotation: wp.array[wp.vec3]
-    """(trial): of the cup's orientation, a rotation vector in the world [rad]."""
+    """(trial): rotation of the cup, a rotation vector in the world [rad]."""
     friction: wp.array[float]
     """(trial): factor on the coefficients of friction."""

@@ -1,7 +1,8 @@
-"""Grasp candidates of a view: pixels drawn uniformly and by strata of instance and analytic score, for trials of many grasps in a state.
+"""Two-phase stratified sampling (Särndal, Swensson and Wretman, 1992) of grasp candidates, pixels of the perception image of a state.
 
-Two-phase sampling (Särndal, Swensson and Wretman, 1992): a pool of pixels is drawn uniformly and scored, and candidates are drawn from its
-strata. Random numbers are named by (seed, episode, arrangement, attempt, index), so that candidates depend on the state alone.
+Phase one draws a pool of pixels uniformly and scores them; phase two draws candidates from strata of the pool, by instance and score.
+Candidates have inverse-probability weights. Random numbers are functions of (seed, episode, arrangement, attempt, index), so that
+candidates depend on the state alone. A view shows the world into which the state is loaded.
 """
 
 import warp as wp
@@ -17,24 +18,25 @@ from synpick_warp.kernels.rng import GAMMA, mix, pixel_key, stream_key
 wp.set_module_options({"enable_backward": False})
 
 POOL = wp.constant(1024)
-"""Pixels of the first phase."""
+"""Pixels of the pool."""
 STRATA = wp.constant(5)
-"""Strata of an instance's pixels by score: SuctionNet's thresholds 0.2, 0.4, 0.6 and 0.8 are their limits."""
+"""Strata of an instance, of equal width in seal score x wrench score: their limits are SuctionNet's thresholds 0.2, 0.4, 0.6 and 0.8."""
 STARTS = wp.constant(2**30)
-"""Index of the first sample that is not a pixel's."""
+"""Index of the random sample that chooses the first instance; samples below draw the pixels, those above choose strata."""
 NOWHERE = wp.constant(wp.vec2i(-1, -1))
+"""Pixel of a draw without one."""
 
 
 @wp.struct
 class Pool:
-    """Pixels of the first phase of each view, then those of the uniform share and the own grasp's, with their scores; and counts."""
+    """Drawn pixels of each view and their scores (POOL of phase one, the uniform share, the planned grasp's), and pixel counts."""
 
     row_first: wp.array2d[int]
-    """(view, image row): visible pixels of instances in the rows above."""
+    """(view, image row): number of labelled pixels in the rows above (exclusive prefix sum)."""
     pixels: wp.array[int]
-    """(view): their number in the image."""
+    """(view): number of labelled pixels."""
     visible: wp.array2d[int]
-    """(view, instance): 1: it is visible."""
+    """(view, instance): 1: visible; 0: not."""
     pixel: wp.array2d[wp.vec2i]
     """(view, draw): column and row [px]; (-1, -1): none."""
     seal: wp.array2d[float]
@@ -42,23 +44,23 @@ class Pool:
     wrench: wp.array2d[float]
     """(view, draw): wrench score."""
     count: wp.array3d[int]
-    """(view, instance, stratum): number of pixels of the first phase."""
+    """(view, instance, stratum): number of pixels of phase one."""
 
 
 @wp.struct
 class Candidates:
-    """Grasp candidates of states, those of a state in a row: how they were drawn, pixel, instance, surface normal and scores."""
+    """Sampling data of grasp candidates: share, weight, pixel, instance, normal and scores; candidates of a state are consecutive."""
 
     share: wp.array[int]
     """(grasp): `Share`."""
     weight: wp.array[float]
-    """(grasp): inverse of the probability with which a draw of this share gets the pixel; 0: not drawn."""
+    """(grasp): inverse of the probability with which one draw of its share gets the pixel; 0: the planned grasp, which is not drawn."""
     pixel: wp.array[wp.vec2i]
     """(grasp): column and row [px]."""
     entry: wp.array[int]
     """(grasp): catalog index of the instance."""
     surface_normal: wp.array[wp.vec3]
-    """(grasp): smoothed unit normal of the surface; `Grasps.normal` is that of the cup."""
+    """(grasp): smoothed unit normal of the surface in the world; `Grasps.normal` is the axis of the cup."""
     seal: wp.array[float]
     """(grasp): seal score."""
     wrench: wp.array[float]
@@ -67,20 +69,20 @@ class Candidates:
 
 @wp.func
 def view_stream(seed: wp.uint64, arrangement_id: wp.vec2i, attempt: int) -> wp.uint64:
-    """Key of the stream of a state."""
+    """Key of the random stream that samples the candidates of a state."""
     return pixel_key(stream_key(seed, arrangement_id[0], arrangement_id[1], Stream.CANDIDATES), attempt)
 
 
 @wp.func
 def wide_index(key: wp.uint64, index: int, count: int) -> int:
-    """Sample `index` of a stream as an integer, uniform in [0, count); evenly so for millions, as samples have 63 bits."""
+    """Sample `index` of a stream as an integer, uniform in [0, count): 63 bits modulo `count`, where `rng.uniform_index` has 24 bits."""
     bits = mix(key + (wp.uint64(index) + wp.uint64(1)) * GAMMA)
     return int((bits >> wp.uint64(1)) % wp.uint64(count))
 
 
 @wp.func
 def stratum_of(seal: float, wrench: float) -> int:
-    """Stratum of a pixel by the product of its scores."""
+    """Stratum of a pixel: STRATA equal intervals of the product of its scores, each 0 to 1."""
     return wp.min(int(seal * wrench * float(STRATA)), STRATA - 1)
 
 
@@ -95,7 +97,7 @@ def assign_states_kernel(
     row_out: wp.array[int],  # (world)
     world_out: wp.array[int],  # (view)
 ):
-    """Assign the rows of states from `first` on to the first worlds, which views of the same index show; -1: none. Launched over world."""
+    """Assign a batch of states to worlds: world w gets `rows[first + w]`, and view w shows it; -1: none. Launched over world."""
     world = wp.tid()
     row = int(-1)
     if world < views and first + world < rows.shape[0]:
@@ -116,9 +118,9 @@ def label_instances_kernel(
     # Out:
     component_out: wp.array3d[int],  # (view, row, column)
 ):
-    """Label each pixel with the instance that it shows; -1: none, or one without label. Launched over view, row, column.
+    """Instance segmentation: write the instance that each pixel shows; -1: none, or one whose object has no `obj_id`.
 
-    In place of the labels of connected components.
+    Written where perception keeps the labels of connected components. Launched over view, image row, column.
     """
     view, row, column = wp.tid()
     if views.world[view] < 0:
@@ -139,7 +141,7 @@ def count_rows_kernel(
     # Out:
     pool_inout: Pool,
 ):
-    """Count the labelled pixels of each image row, and flag visible instances, which must be 0 before. Launched over view, image row."""
+    """Count the labelled pixels of each image row, and set `visible`, which must be zero before. Launched over view, image row."""
     view, row = wp.tid()
     if views.world[view] < 0:
         return
@@ -160,9 +162,9 @@ def sum_rows_kernel(
     pool_inout: Pool,
     largest_out: wp.array2d[int],  # (view, instance)
 ):
-    """Replace the counts of image rows by exclusive prefix sums; the "largest component" of an instance is all that is visible of it.
+    """Exclusive prefix sum of the counts of image rows, in place, and their total.
 
-    Launched over view.
+    `largest`, perception's largest component of each instance, becomes the instance itself: all its visible pixels. Launched over view.
     """
     view = wp.tid()
     if views.world[view] < 0:
@@ -179,7 +181,7 @@ def sum_rows_kernel(
 
 @wp.func
 def pixel_of_rank(pool: Pool, component: wp.array3d[int], view: int, rank: int) -> wp.vec2i:
-    """The labelled pixel with `rank` others before it in row-major order: binary search of the row, then a walk along it."""
+    """Labelled pixel of a rank, counted from 0 in row-major order: binary search for the row in the prefix sums, then a scan of the row."""
     low = int(0)
     high = int(component.shape[1] - 1)
     while low < high:
@@ -212,7 +214,7 @@ def draw_pixels_kernel(
     # Out:
     pool_inout: Pool,
 ):
-    """Draw pixels uniformly among the labelled ones, with replacement; the last draw is the planned grasp point.
+    """Simple random sampling with replacement: draw labelled pixels uniformly; the last draw is the pixel of the planned grasp.
 
     Launched over view, draw.
     """
@@ -245,7 +247,7 @@ def score_pixels_kernel(
     # Out:
     pool_inout: Pool,
 ):
-    """Analytic scores of a cup at each drawn pixel, as the layers `suction_seal` and `suction_wrench` have them.
+    """Write SuctionNet's analytic scores of each drawn pixel, as in the layers `suction_seal` and `suction_wrench`; 0: no pixel.
 
     Launched over view, draw.
     """
@@ -276,7 +278,7 @@ def count_strata_kernel(
     # Out:
     pool_inout: Pool,
 ):
-    """Count the pixels of the first phase by instance and stratum. Launched over view, instance."""
+    """Histogram of the pixels of phase one by instance and stratum. Launched over view, instance."""
     view, instance = wp.tid()
     if views.world[view] < 0:
         return
@@ -292,7 +294,7 @@ def count_strata_kernel(
 
 @wp.func
 def stratum_size(pool: Pool, view: int, instance: int, stratum: int) -> int:
-    """Pixels of an instance in a stratum; stratum -1: in all."""
+    """Number of pool pixels of an instance in a stratum; stratum -1: in all strata."""
     if stratum >= 0:
         return pool.count[view, instance, stratum]
     total = int(0)
@@ -303,8 +305,9 @@ def stratum_size(pool: Pool, view: int, instance: int, stratum: int) -> int:
 
 @wp.func
 def find_stratum(pool: Pool, view: int, instance: int, place: int) -> wp.vec2i:
-    """Member `place`, modulo their number, of the instances with pixels in the pool (instance -1), or of an instance's strata with pixels;
-    and their number.
+    """Round robin: element `place`, modulo their number, of the list of an instance's strata that have pool pixels; and their number.
+
+    Instance -1: of the list of instances that have pool pixels.
     """
     length = STRATA
     if instance < 0:
@@ -332,7 +335,7 @@ def find_stratum(pool: Pool, view: int, instance: int, place: int) -> wp.vec2i:
 
 @wp.func
 def find_draw(pool: Pool, component: wp.array3d[int], view: int, instance: int, stratum: int, place: int) -> int:
-    """Draw of the first phase that is member `place` of a stratum of an instance, in their order."""
+    """Index of the draw of phase one that is the `place`-th, from 0, in a stratum of an instance; -1: none."""
     left = int(place)
     for draw in range(POOL):
         pixel = pool.pixel[view, draw]
@@ -366,10 +369,10 @@ def choose_candidates_kernel(
     candidate_out: wp.array[int],  # (grasp)
     target_out: wp.array[int],  # (grasp)
 ):
-    """Choose the candidates of each view's state: the planned grasp, then by strata, and `uniform` ones at the end.
+    """Stratified sampling of the pool: write the planned grasp, stratified candidates, and last `uniform` uniform ones of each view.
 
-    Visit v of an instance takes its next stratum that has pixels, and of these the next one, in the order of their draw; which instance and
-    which stratum begin is random. Launched over view, candidate.
+    Two nested round robins with random starts, over instances and over the strata of each that have pixels, equalize their numbers of
+    candidates; pixels of a stratum are taken in the order in which they were drawn. Launched over view, candidate.
     """
     view, candidate = wp.tid()
     world = views.world[view]
@@ -421,7 +424,7 @@ def aim_candidates_kernel(
     target_out: wp.array[int],  # (world)
     grasp_pixel_out: wp.array2d[wp.vec2i],  # (world, instance) [px]
 ):
-    """Make candidate `index` of each view's state the plan's target and grasp pixel. Launched over view."""
+    """Write target and grasp pixel of candidate `index` to the plan of each view's world. Launched over view."""
     view = wp.tid()
     world = views.world[view]
     if world < 0:
@@ -443,7 +446,7 @@ def store_normals_kernel(
     # Out:
     surface_normal_out: wp.array[wp.vec3],  # (grasp)
 ):
-    """Store the smoothed normals as unit vectors, of candidate `index`. Launched over view."""
+    """Write the smoothed surface normals to candidate `index`, as unit vectors. Launched over view."""
     view = wp.tid()
     world = views.world[view]
     if world >= 0:
@@ -468,7 +471,7 @@ def store_grasps_kernel(
     grasp_yaw_out: wp.array[float],  # (grasp) [rad]
     grasp_tilt_out: wp.array[float],  # (grasp) [rad]
 ):
-    """Store the planned grasps as candidate `index`. Launched over view."""
+    """Write the planned grasps of the worlds to candidate `index` of each view's state. Launched over view."""
     view = wp.tid()
     world = views.world[view]
     if world < 0:
@@ -485,5 +488,5 @@ def increment_kernel(
     # Out:
     index_inout: wp.array[int],  # (one)
 ):
-    """Go on to the next candidate. A single thread (dim 1)."""
+    """Increment the candidate index, on the device so that a graph can be replayed. A single thread (dim 1)."""
     index_inout[0] = index_inout[0] + 1

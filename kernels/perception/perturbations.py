@@ -1,4 +1,4 @@
-"""Plans of grasp trials: candidates become plans of their worlds, perturbed in repeats by counter-based random numbers."""
+"""Plans of grasp trials: grasp candidates, with random perturbations of point, rotation and friction (counter-based) in repeats."""
 
 import warp as wp
 
@@ -12,12 +12,12 @@ from synpick_warp.kernels.structs import CupData, PickData
 wp.set_module_options({"enable_backward": False})
 
 SAMPLES = wp.constant(7)
-"""Samples of a perturbation: three of the point, three of the rotation, one of the friction."""
+"""Random samples of a perturbation: three for the point, three for the rotation, one for friction."""
 
 
 @wp.func
 def symmetric_vector(key: wp.uint64, first: int, half_width: float) -> wp.vec3:
-    """Uniform sample of a cube about 0, from three samples of a stream."""
+    """Point uniform in the cube [-half_width, half_width]³, from samples `first` to `first` + 2 of a stream."""
     x = 2.0 * uniform(key, first) - 1.0
     y = 2.0 * uniform(key, first + 1) - 1.0
     z = 2.0 * uniform(key, first + 2) - 1.0
@@ -26,7 +26,10 @@ def symmetric_vector(key: wp.uint64, first: int, half_width: float) -> wp.vec3:
 
 @wp.func
 def turn_head(frame: HeadFrame, rotation: wp.vec3, pick: PickData, cups: CupData) -> HeadFrame:
-    """Frame of a head turned by a rotation vector [rad]: of one cup it follows its axis, of several cups the yaw turns as well."""
+    """Frame of the head turned by a rotation vector in the world [rad], as near as its two joints allow.
+
+    One cup: yaw and tilt follow from the turned axis; several cups: yaw changes by the vertical component, and tilt follows.
+    """
     normal = wp.quat_rotate(wp.quat_from_axis_angle(wp.normalize(rotation), wp.length(rotation)), frame.axis)
     if cups.count > 1:
         return head_frame(normal, frame.yaw + rotation[2])
@@ -58,9 +61,9 @@ def plan_trials_kernel(
     yaw_out: wp.array[float],  # (world) [rad]
     tilt_out: wp.array[float],  # (world) [rad]
 ):
-    """Make the grasps of trials the plans of worlds with a row. Repeats, all but the first trial of a grasp, are perturbed.
+    """Write the plans of worlds that begin a trial (`row` is not -1): its grasp, perturbed unless it is the grasp's first trial (repeat 0).
 
-    Samples are named by (seed, episode, arrangement, attempt, candidate, repeat). Launched over world.
+    Also writes the perturbation, by trial. Samples depend on (seed, episode, arrangement, attempt, candidate, repeat). Launched over world.
     """
     world = wp.tid()
     if row[world] < 0:

@@ -1,4 +1,4 @@
-"""Moments of choice: lists the worlds whose states are saved for grasp trials."""
+"""Moments of choice: list of the worlds whose states are saved for grasp trials."""
 
 import warp as wp
 
@@ -24,16 +24,17 @@ def list_choices_kernel(
     next_inout: wp.array[int],  # (one)
     world_out: wp.array[int],  # (row)
 ):
-    """List the worlds that have planned an attempt in this tick, in order, in the next rows of a ring; other rows get -1.
+    """Write the worlds that planned an attempt in this tick, in order, to the next rows of a ring buffer; other rows become -1.
 
-    Of an episode's attempts every `stride`-th counts, up to `states` of them: that spreads them over as many attempts as the episode begins
-    with labelled objects. A single thread (dim 1).
+    Of an episode's attempts every `stride`-th counts, up to `states` of them, spread over as many attempts as it begins with labelled
+    objects. `stride` is set at the first look of an episode, whether or not it sees a target. A single thread (dim 1).
     """
     rows = world_out.shape[0]
     for row in range(rows):
         world_out[row] = -1
     for world in range(phase.shape[0]):
-        if phase[world] == Phase.ACT and task[world] == Task.APPROACH and steps[world] == 0:
+        is_planned = task[world] == Task.APPROACH
+        if phase[world] == Phase.ACT and steps[world] == 0 and (is_planned or task[world] == Task.LOOK):
             if attempt[world] == 0:
                 objects = int(0)
                 for instance in range(catalog_index.shape[1]):
@@ -41,6 +42,6 @@ def list_choices_kernel(
                         objects += 1
                 stride_inout[world] = (objects + states - 1) // states
             stride = wp.max(stride_inout[world], 1)
-            if attempt[world] % stride == 0 and attempt[world] // stride < states:
+            if is_planned and attempt[world] % stride == 0 and attempt[world] // stride < states:
                 world_out[next_inout[0] % rows] = world
                 next_inout[0] = next_inout[0] + 1

@@ -1,7 +1,7 @@
-"""Island sleeping: objects that rest in contact with each other fall asleep together, and are not simulated until something touches one.
+"""Island sleeping: islands of objects at rest fall asleep as a whole, and are not simulated until an awake body touches one of them.
 
-An island is a connected component of the contact graph; bins and the table, which never move, connect nothing. Islands fall asleep at the
-end of a tick and may wake in any substep. What sleeps is a pose without velocity: it has neither contacts nor constraint rows.
+An island is a connected component of the contact graph; fixed shapes (bins, table) are not nodes of it. Islands fall asleep at the end of
+a tick and may wake in any substep. A sleeping body keeps its pose at zero velocity, without contacts among sleepers or constraint rows.
 """
 
 import warp as wp
@@ -11,13 +11,13 @@ from synpick_warp.kernels.structs import LayoutData
 
 wp.set_module_options({"enable_backward": False})
 
-# Ticks in a row in which an object must be quiet before it falls asleep.
+# Consecutive ticks in which an object must be quiet, that is move at most by the threshold, before it falls asleep.
 QUIET_TICKS = wp.constant(3)
 
 
 @wp.func
 def body_of(shape_body: wp.array[int], shape: int) -> int:
-    """Body of a contact's shape; -1: none, it is fixed."""
+    """Body of a shape of a contact; -1: a fixed shape, or none."""
     if shape < 0:
         return -1
     return shape_body[shape]
@@ -25,7 +25,7 @@ def body_of(shape_body: wp.array[int], shape: int) -> int:
 
 @wp.func
 def is_asleep(layout: LayoutData, asleep: wp.array2d[int], body: int) -> bool:
-    """Whether a body is that of an object that sleeps; False for the gripper, and for -1, a fixed shape."""
+    """Whether a body is a sleeping object; False for the gripper's bodies and for -1 (fixed shape)."""
     if body < 0:
         return False
     world = body // layout.bodies
@@ -48,9 +48,9 @@ def list_awake_pairs_kernel(
     pair_out: wp.array[wp.vec2i],  # (overlap)
     pair_count_inout: wp.array[int],  # (one)
 ):
-    """Stream compaction: list the pairs of shapes of which one belongs to a body that is awake, in arbitrary order.
+    """Stream compaction of the broad phase: list the overlapping pairs with a shape of an awake body, in arbitrary order.
 
-    Launched over a fixed number of threads, which stride over the pairs.
+    Grid-stride loop over the pairs: launched over `threads`.
     """
     thread = wp.tid()
     for index in range(thread, wp.min(overlap_count[0], overlap.shape[0]), threads):
@@ -75,10 +75,9 @@ def wake_touched_kernel(
     # Out:
     woken_out: wp.array2d[int],  # (world, slot)
 ):
-    """Mark the islands of sleeping bodies in contact with a body that is awake: `woken` is 1 for the slot that names the island.
+    """Mark the sleeping islands in contact with an awake body: `woken` becomes 1 at the slot that names the island (`island`).
 
-    Contacts exist before surfaces meet, at twice the contact margin. Launched over a fixed number of threads, which stride over the
-    contacts.
+    Contacts begin at twice the contact margin, before surfaces meet. Grid-stride loop over the contacts: launched over `threads`.
     """
     thread = wp.tid()
     for contact in range(thread, wp.min(contact_count[0], shape0.shape[0]), threads):
@@ -112,9 +111,9 @@ def hold_sleepers_kernel(
     body_q_out: wp.array[wp.transform],  # (body) [m]
     body_qd_out: wp.array[wp.spatial_vector],  # (body) [m/s, rad/s]
 ):
-    """Hold the sleeping bodies through a substep: they get the coordinates that they had before it; then wake those of woken islands.
+    """Restore pose and velocity of sleeping bodies after a substep, in which the solver lets them fall; then wake those of woken islands.
 
-    Without contacts the solver let them fall. Launched over world, slot.
+    Launched over world, slot.
     """
     world, slot = wp.tid()
     if asleep_inout[world, slot] == 0:
@@ -135,7 +134,7 @@ def hold_sleepers_kernel(
 
 @wp.func
 def find_root(parent: wp.array[int], body: int) -> int:
-    """Root of a body's tree in a forest of parents."""
+    """Union-find: root of a body's tree, which names its set; without path compression."""
     root = body
     while parent[root] != root:
         root = parent[root]
@@ -147,7 +146,7 @@ def begin_islands_kernel(
     # Out:
     parent_out: wp.array[int],  # (body)
 ):
-    """Make each body an island of its own. Launched over body."""
+    """Union-find: make each body its own root. Launched over body."""
     body = wp.tid()
     parent_out[body] = body
 
@@ -162,10 +161,10 @@ def join_islands_kernel(
     # Out:
     parent_inout: wp.array[int],  # (body)
 ):
-    """Union-find (disjoint sets) without locks: join the islands of the two bodies of each contact under the smaller root.
+    """Lock-free union-find: unite the sets of the two bodies of each contact under the smaller root.
 
-    A root's parent only ever becomes smaller, and what it replaces is joined in turn; so the roots do not depend on the order of threads.
-    Launched over contact.
+    Parents only decrease (atomic minimum), and a parent that is replaced is united in turn: the root of an island is its smallest body in
+    any order of threads. Launched over contact.
     """
     contact = wp.tid()
     if contact >= contact_count[0]:
@@ -188,7 +187,7 @@ def join_islands_kernel(
 
 @wp.func
 def stop(layout: LayoutData, world: int, slot: int, joint_qd_out: wp.array[float], body_qd_out: wp.array[wp.spatial_vector]):
-    """Set the velocities of a body to zero."""
+    """Set the velocity of the body in a slot to zero, in joint and body coordinates."""
     for axis in range(6):
         joint_qd_out[world * layout.dofs + layout.gripper_dofs + 6 * slot + axis] = 0.0
     body_qd_out[world * layout.bodies + layout.gripper_bodies + slot] = wp.spatial_vector(0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
@@ -216,10 +215,10 @@ def judge_sleep_kernel(
     joint_qd_out: wp.array[float],  # (dof) [m/s, rad/s]
     body_qd_out: wp.array[wp.spatial_vector],  # (body) [m/s, rad/s]
 ):
-    """Send islands to sleep of which no object moved by more than `threshold` in each of the last QUIET_TICKS ticks, none is held by a
-    cup, and none touches the gripper; wake those of which an object was attached or left the scene. Only in phase ACT.
+    """Put islands to sleep in which every object was quiet for QUIET_TICKS ticks and none is attached to a cup or touches the gripper; wake
+    sleeping islands of which an object was attached or removed. Outside of phase ACT all are awake.
 
-    `woken` ends as zero, `island` is the slot of the island's root. Launched over world.
+    Quiet: moved by at most `threshold` [m] in a tick. `island` becomes the slot of the island's root, `woken` zero. Launched over world.
     """
     world = wp.tid()
     first = world * layout.bodies + layout.gripper_bodies
@@ -227,6 +226,7 @@ def judge_sleep_kernel(
         for slot in range(layout.slots):
             asleep_inout[world, slot] = 0
             quiet_inout[world, slot] = 0
+            woken_inout[world, slot] = 0
         return
     for body in range(world * layout.bodies, first):
         restless_inout[find_root(parent, body)] = 1

@@ -1,4 +1,4 @@
-"""Grasp trials: pick attempts from saved states, each with a given grasp; worlds that finish a trial begin the next one."""
+"""Grasp trials: pick attempts from saved states with given grasps, scheduled as a work queue: worlds that finish a trial take the next."""
 
 import warp as wp
 
@@ -12,41 +12,41 @@ from synpick_warp.kernels.structs import TILT, LayoutData, MoveData, PickData
 wp.set_module_options({"enable_backward": False})
 
 NO_FAILURES = wp.constant(-(2**30))
-"""Count of failed attempts with which a trial begins, so that it does not end the episode."""
+"""Initial count of failed attempts of a trial, so low that a failure never ends the episode."""
 ATTEMPT = wp.constant(-1)
-"""Remaining settling time of a trial whose attempt still runs."""
+"""Value of `Progress.settling` while the attempt runs."""
 
 
 @wp.struct
 class TrialData:
-    """Course of trials; see `configs.episodes.picks.Picks`."""
+    """Parameters of trials; see `configs.episodes.picks.Picks`."""
 
     repeats: int
     """Trials of each grasp."""
     near: float
-    """Distance before the grasp point at which the gripper appears [m]; 0: as in an attempt."""
+    """Distance from the grasp point, along the normal, at which the gripper appears [m]; 0: it approaches as in an attempt."""
     lift_steps: int
     """Duration of the lift [steps]."""
     hold_steps: int
-    """Time between the end of the lift and judgement [steps]."""
+    """Time between the end of the lift and the outcome [steps]."""
     settle_ticks: int
-    """Time between judgement and measurement of the other objects [ticks]."""
+    """Time between the outcome and the measurement of the other objects [ticks]."""
     moved_distance: float
     """Displacement above which another object counts as moved [m]."""
     base_friction: float
-    """Coefficient of friction of all shapes."""
+    """Coefficient of friction of all shapes, before perturbation."""
 
 
 @wp.struct
 class Labels:
-    """Results of the trials: outcome, suction seals, picked instance, and collateral motion of other objects."""
+    """Labels of trials: outcome, suction seals, forces, picked instance, duration, and collateral motion of other objects."""
 
     outcome: wp.array[int]
-    """(trial): `Outcome`; NONE if the episode ended first, with `ending`."""
+    """(trial): `Outcome`; NONE: the episode ended first, as `ending` says."""
     ending: wp.array[int]
-    """(trial): `Ending`; RUNNING if there is an outcome."""
+    """(trial): `Ending`; RUNNING: there is an outcome."""
     hits: wp.array[wp.vec2i]
-    """(trial): suction rays that hit an object, and the cups with a good seal: bit k, cup k."""
+    """(trial): number of suction rays that hit an object; bit set of cups with a good seal (bit k: cup k)."""
     picked: wp.array[int]
     """(trial): first instance attached at the end; -1: none."""
     peak_force: wp.array[float]
@@ -58,7 +58,7 @@ class Labels:
     held: wp.array[int]
     """(trial): time with an attached object [steps]."""
     moved: wp.array[int]
-    """(trial): number of other objects displaced by more than a threshold."""
+    """(trial): number of other objects displaced by more than `TrialData.moved_distance`."""
     farthest: wp.array[float]
     """(trial): largest displacement of another object [m]."""
     lost: wp.array[int]
@@ -67,29 +67,29 @@ class Labels:
 
 @wp.struct
 class Progress:
-    """State of the trial that runs in each world."""
+    """Running trial of each world, and what is accumulated for its labels."""
 
     trial: wp.array[int]
     """(world): index of the running trial; -1: none."""
     ticks: wp.array[int]
     """(world): ticks since the trial began."""
     settling: wp.array[int]
-    """(world): ticks until the other objects are measured; ATTEMPT: the attempt is not over."""
+    """(world): remaining ticks until the other objects are measured; ATTEMPT: the attempt still runs."""
     held: wp.array[int]
     """(world): steps with an attached object."""
     peak_force: wp.array[float]
-    """(world): largest force of a seal [N]."""
+    """(world): largest seal force so far [N]."""
     load: wp.array[float]
-    """(world): largest force of a cup relative to its break force."""
+    """(world): largest force of a cup relative to its break force so far."""
     lost: wp.array[int]
-    """(world): number of objects lost before the trial."""
+    """(world): number of objects that were lost when the trial began."""
     pose: wp.array2d[wp.transform]
     """(world, instance): pose of each object when the trial began [m]."""
 
 
 @wp.func
 def count_lost(removed: wp.array2d[int], world: int) -> int:
-    """Number of a world's objects that left its bin, and were not picked."""
+    """Number of a world's objects that left the bin without being picked."""
     lost = int(0)
     for instance in range(removed.shape[1]):
         if removed[world, instance] == Removal.LOST:
@@ -108,8 +108,8 @@ def measure_motion(
     body_q: wp.array[wp.transform],
     pose: wp.array2d[wp.transform],
 ):
-    """Number of a world's objects, but for the target, whose origins are farther than `moved_distance` from `pose`, and the largest such
-    distance [m].
+    """Collateral motion: number of a world's present objects, except the target, whose origins are displaced from `pose` by more than
+    `moved_distance`, and the largest displacement of any of them [m].
     """
     body = world * layout.bodies + layout.gripper_bodies
     moved = int(0)
@@ -146,9 +146,9 @@ def assign_trials_kernel(
     next_inout: wp.array[int],  # (one)
     row_out: wp.array[int],  # (world)
 ):
-    """Give each world without a trial the next of `count` ones, in order: `row` receives its row of the state, or -1.
+    """Work queue: assign the next of `count` trials to each world without one, in order of worlds.
 
-    A single thread (dim 1).
+    `row` becomes the row of the trial's state in worlds that begin one, else -1. A single thread (dim 1).
     """
     following = next_inout[0]
     for world in range(row_out.shape[0]):
@@ -177,7 +177,7 @@ def begin_trials_kernel(
     hits_out: wp.array[wp.vec2i],  # (world)
     engaged_words_out: wp.array2d[wp.uint32],  # (world, word)
 ):
-    """Begin the trials of worlds with a row: attempts with task APPROACH, which end no episode. Launched over world."""
+    """Reset attempt state and `Progress` of worlds that begin a trial (`row` is not -1), with task APPROACH. Launched over world."""
     world = wp.tid()
     if row[world] < 0:
         return
@@ -210,7 +210,7 @@ def set_friction_kernel(
     # Out:
     mu_out: wp.array[float],  # (shape)
 ):
-    """Set the coefficients of friction of worlds with a row: the base, times the factor of the trial. Launched over world, shape of it."""
+    """Set friction in worlds that begin a trial: base coefficient times the trial's factor. Launched over world, shape within the world."""
     world, shape = wp.tid()
     if row[world] >= 0:
         mu_out[world * layout.shapes + shape] = friction[progress.trial[world]] * course.base_friction
@@ -235,9 +235,9 @@ def place_near_kernel(
     joint_qd_out: wp.array[float],  # (dof) [m/s, rad/s]
     tilt_out: wp.array[float],  # (coord) [rad]
 ):
-    """Place grippers where a trial begins, `course.near` before the grasp point, with task DESCEND in place of APPROACH.
+    """Place the gripper at distance `course.near` from the grasp point in worlds that begin a trial; DESCEND replaces task APPROACH.
 
-    `tilt_out` are drive targets. Launched over world.
+    `tilt_out` is the drive target of the tilt joint. Launched over world.
     """
     world = wp.tid()
     if phase[world] != Phase.ACT or task_inout[world] != Task.APPROACH or steps[world] != 0:
@@ -258,9 +258,9 @@ def watch_seals_kernel(
     # Out:
     progress_inout: Progress,
 ):
-    """Count the steps with an attached object, and update the largest load, of running trials.
+    """Count the steps with an attached object and update the largest load of running attempts; once a step, after the seal forces.
 
-    Launched over world, after the forces of each step.
+    Launched over world.
     """
     world = wp.tid()
     if progress_inout.trial[world] < 0 or progress_inout.settling[world] != ATTEMPT:
@@ -291,9 +291,9 @@ def advance_trials_kernel(
     # Out:
     outcome_out: wp.array[int],  # (world)
 ):
-    """Task transitions of trials at the end of a tick: PRESS to LIFT; `outcome` and LOOK after lift and hold, or once nothing is attached.
+    """State machine of trials at the end of a tick: PRESS to LIFT by time; LIFT to LOOK after lift and hold, or once nothing is attached.
 
-    Launched over world.
+    The transition to LOOK writes `outcome`. Launched over world.
     """
     world = wp.tid()
     task = task_inout[world]
@@ -337,10 +337,10 @@ def judge_trials_kernel(
     labels_out: Labels,
     done_inout: wp.array[int],  # (one)
 ):
-    """Update duration and peak force of running trials; write the labels of finished ones, and free their worlds.
+    """Write labels of trials at the end of a tick: of the attempt at its outcome, and of collateral motion `settle_ticks` later.
 
-    An object other than the intended one has moved if its origin is farther than `moved_distance` from where it was [m]; that is measured
-    `settle_ticks` after the outcome. `done` counts labelled trials. Launched over world, at the end of a tick.
+    The latter free the world for its next trial, and increment `done`. Before the outcome, duration and peak force are updated. An episode
+    that ends also ends its trial. Launched over world.
     """
     world = wp.tid()
     trial = progress_inout.trial[world]

@@ -1,6 +1,6 @@
-"""Grasp trials of a bake: tries candidates in the saved states of its episodes, and hands their tables to the exporters.
+"""Grasp trials of a bake: a batch queue of saved states, an engine that runs their trials, and the tables for exporters.
 
-A second simulation of the same objects runs the trials, since the first one goes on with its episodes.
+The engine has a second simulation of the same objects, while the first one continues with the episodes.
 """
 
 from __future__ import annotations
@@ -26,14 +26,14 @@ if TYPE_CHECKING:
     from synpick_warp.factory.assembly import Stages
 
 MAX_LEAD = 1
-"""Ticks by which physics may be ahead, so that the ring of states needs room for few."""
+"""Maximum number of ticks by which physics may run ahead of the host; the ring buffer of states has room for them."""
 
 
 class PickEngine:
-    """Samples and tries the grasp candidates of saved states, in worlds of its own."""
+    """Samples grasp candidates of saved states and runs their trials, in a simulation of its own."""
 
     def __init__(self, stages: Stages) -> None:
-        """Build the worlds, of the same objects and settings as stages have, whose meshes they share."""
+        """Build a simulation with the objects, settings and meshes of `stages`, and the settings of `trial_values`."""
         config, self.device = stages.config, stages.simulation.device
         worlds = count_trial_worlds(config.picks, DataLayout.of(config).planned, self.device)
         self.config, self.object_ids = config.with_values(trial_values(config.picks, worlds)), stages.catalog.object_ids
@@ -49,7 +49,7 @@ class PickEngine:
         return self.config.picks.candidates * self.config.picks.repeats
 
     def run(self, states: State, choices: Sequence[Choice]) -> list[PickBatch]:
-        """Run the trials of saved states, of which `choices` have the rows; returns a batch of each episode. Waits for the device."""
+        """Run the trials of the rows `choices` of saved states; returns a `PickBatch` per episode. Waits for the device."""
         with scope("sample candidates", self.device):
             grasps, candidates, visible = self.sampler.sample(states, [choice.row for choice in choices])
         with scope("run trials", self.device):
@@ -60,7 +60,7 @@ class PickEngine:
     def _trial_columns(
         self, choices: Sequence[Choice], grasps: Any, candidates: Any, labels: dict[str, np.ndarray]
     ) -> dict[str, np.ndarray]:
-        """Columns of the table of trials, of all states in order."""
+        """Columns of `views.picks.COLUMNS` (trial[, 3]), by state, candidate and repeat, in the order of `choices`."""
         picks, step, count = self.config.picks, self.config.physics.step, self.trials_of_state
         given = {
             name: np.repeat(getattr(part, name).numpy(), picks.repeats, axis=0) for part in (grasps, candidates) for name in part._cls.vars
@@ -89,7 +89,7 @@ class PickEngine:
         }
 
     def _split(self, choices: Sequence[Choice], trials: dict[str, np.ndarray], visible: np.ndarray) -> Iterator[PickBatch]:
-        """A batch of each episode."""
+        """Group trials and visible instances (choice, instance) into a `PickBatch` per episode, by state."""
         width, height = self.config.perception.resolution
         camera = self.config.rig.index(self.config.perception.camera)
         order = sorted(range(len(choices)), key=lambda index: (choices[index].episode, choices[index].state))
@@ -103,12 +103,12 @@ class PickEngine:
 
 
 class PickQueue:
-    """Saved states of a bake's episodes that wait for their trials, and ends of episodes that wait for their states."""
+    """Batch queue of saved states that await their trials; defers the end of an episode until no state of it waits."""
 
     def __init__(self, simulation: Simulation, engine: PickEngine, labelled: int) -> None:
-        """Save states of the simulation from its next tick on; `labelled`: objects of the catalog that have labels.
+        """Save states of the simulation from its next tick on; `labelled`: number of catalog objects with labels.
 
-        `lead`: ticks by which physics may be ahead; the ring of states has room for no more.
+        Attribute `lead`: maximum number of ticks by which physics may run ahead of `take`.
         """
         self.engine = engine
         worlds = simulation.layout.worlds
@@ -120,30 +120,30 @@ class PickQueue:
         self._ends: list[tuple[int, Callable[[], None]]] = []
 
     def take(self, report: TickReport) -> None:
-        """Note the states that a tick has saved."""
+        """Enqueue the states that a tick has saved."""
         self.pending += self.reader.read(report)
 
     def drop(self, episode: int, arrangement: int) -> None:
-        """Forget the states of an arrangement that is not delivered."""
+        """Remove the waiting states of an arrangement that is not delivered."""
         self.pending = [choice for choice in self.pending if (choice.episode, choice.arrangement) != (episode, arrangement)]
 
     def end(self, episode: int, then: Callable[[], None]) -> None:
-        """Call `then` once no state of an episode waits: at once, or in `release`."""
+        """Call `then` once no state of an episode waits: now, or in a later `release`."""
         self._ends.append((episode, then))
         self.release()
 
     @property
     def is_due(self) -> bool:
-        """Whether there are states for a whole batch."""
+        """Whether a whole batch of states waits."""
         return len(self.pending) >= self.batch
 
     def run(self) -> list[PickBatch]:
-        """Run the trials of all states that wait; `release` ends their episodes once the batches are handed over."""
+        """Run the trials of all waiting states. Call `release` after the exporters have received the batches."""
         choices, self.pending = self.pending, []
         return self.engine.run(self.recorder.ring, choices) if choices else []
 
     def release(self) -> None:
-        """End the episodes of which no state waits."""
+        """Call the deferred ends of episodes of which no state waits."""
         waiting = {choice.episode for choice in self.pending}
         ready = [then for episode, then in self._ends if episode not in waiting]
         self._ends = [(episode, then) for episode, then in self._ends if episode in waiting]
@@ -152,10 +152,10 @@ class PickQueue:
 
 
 def count_batch(worlds: int, trials_of_state: int) -> int:
-    """States of a batch, for ROUNDS trials in each of the worlds in which they run."""
+    """Number of states of a batch: ROUNDS trials in each of the trial worlds, rounded up."""
     return max(1, -(-ROUNDS * worlds // trials_of_state))
 
 
 def count_rows(batch: int, worlds: int) -> int:
-    """Rows of the ring of states: a batch, what a tick adds beyond it, and what the ticks add that physics is ahead or has begun."""
+    """Rows of the ring buffer: a batch, plus one state per world for the tick that fills it, each tick of lead, and a tick in progress."""
     return batch + (MAX_LEAD + 2) * worlds

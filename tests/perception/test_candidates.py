@@ -1,4 +1,4 @@
-"""Grasp candidates: known shares, strata and weights, uniform pixels, grasps of the surface, and the same in any world."""
+"""Grasp candidates: shares, strata, weights, uniform pixels, grasps on surfaces, and independence of the world."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from synpick_warp.views.layers import LAYER_TABLE
 from tests.worlds.sights import brief
 
 COUNT, UNIFORM = 401, 100
-"""Candidates of a state, and those drawn uniformly."""
+"""Number of candidates of a state, and of those drawn uniformly."""
 
 
 def worlds(device, count: int, **changed) -> Simulation:
@@ -30,7 +30,7 @@ def worlds(device, count: int, **changed) -> Simulation:
 
 
 class Sampled:
-    """Candidates of two rows of the same state, and the sampler that drew them."""
+    """Candidates of two rows with the same state, and their sampler. Attributes: fields of `Grasps` and `Candidates`, of the first row."""
 
     def __init__(self, simulation: Simulation, state, rows: tuple[int, ...]) -> None:
         simulation.tick()
@@ -44,7 +44,7 @@ class Sampled:
 
 @pytest.fixture(scope="module")
 def choice(device):
-    """State of a world at a moment of choice, in two rows; its own grasp and pixel, and its objects and their poses."""
+    """State of a world at a moment of choice, in two rows; planned grasp, its pixel, catalog index and pose of instances, catalog."""
     simulation = worlds(device, 2)
     while not len(find_choices(simulation)):
         simulation.tick()
@@ -79,7 +79,7 @@ def test_the_first_candidate_is_the_own_grasp(sampled, choice):
 
 
 def test_candidates_depend_on_the_state_alone(sampled, choice, device):
-    """Not on its row, nor on the number of worlds or of views in a batch."""
+    """Neither on its row nor on the number of worlds or of views in a batch."""
     other = Sampled(worlds(device, 2, perception__views=1), choice[0], (1, 0))
     for name, values in sampled.arrays.items():
         if name != "row":
@@ -101,7 +101,7 @@ def test_drawn_pixels_are_uniform_over_what_is_visible(sampled):
 
 
 def test_strata_take_turns_and_weights_undo_them(sampled):
-    """Every instance gets its part of the draws, each of its strata, too; weighted, they stand for the pixels of the image."""
+    """Instances have equal numbers of candidates, as have the strata of each; weighted means estimate pixel counts of the image."""
     drawn = sampled.share == Share.STRATIFIED
     counts = np.bincount(sampled.target[drawn])
     assert np.ptp(counts) <= 1

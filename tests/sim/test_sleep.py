@@ -1,4 +1,4 @@
-"""Island sleeping: what rests falls asleep, what is touched wakes and moves as if it had been awake, and states are exact."""
+"""Island sleeping: objects at rest fall asleep; touched ones wake and move as if never asleep; checkpoints are exact."""
 
 from __future__ import annotations
 
@@ -17,18 +17,19 @@ from tools.checks.states import Rows, check_arrays, check_branches, differing
 
 SLEEP = {"physics__sleep": 2e-4}
 CREEP = 5e-4
-"""Largest distance that objects, awake, move in the ticks of a test [m]."""
+"""Upper bound of the creep of awake objects at rest during a test [m]."""
 ATTEMPT = 40
+"""Maximum duration of an attempt [ticks]."""
 NEVER = -(10**6)
-"""Ticks of quiet from which none falls asleep in a test."""
+"""Quiet time so low that no body falls asleep during a test [ticks]."""
 BOX, CUBE, ANGLE = range(3)
-"""Objects of the catalog."""
+"""Catalog indices."""
 STACK = {BOX: (-0.08, 0.04, 0.02), CUBE: (-0.08, 0.04, 0.065)}
-"""Positions of a cube on a box [m]."""
+"""Positions of the box and the cube on top of it, by catalog index [m]."""
 
 
 def set_rows(simulation: Simulation, worlds: list[int], **changed: object) -> None:
-    """Change arrays of the states of worlds, by name with __ for the dot."""
+    """Overwrite arrays of the states of worlds; names have __ for the dot."""
     arrays = dict(simulation.states.to_host(simulation.get_state(worlds)))
     for name, value in changed.items():
         arrays[name.replace("__", ".")] = np.broadcast_to(np.asarray(value), arrays[name.replace("__", ".")].shape).astype(
@@ -42,14 +43,14 @@ def row(simulation: Simulation, world: int) -> Rows:
 
 
 def asleep(simulation: Simulation) -> np.ndarray:
-    """(world, instance) bool."""
+    """Sleep flags of the objects (world, instance) bool."""
     state = simulation.state
     flags = np.take_along_axis(simulation.sleep.state.asleep.numpy(), np.maximum(state.body_slot.numpy(), 0), axis=1)
     return (flags != 0) & (state.catalog_index.numpy() >= 0)
 
 
 def positions(simulation: Simulation) -> np.ndarray:
-    """Of the objects (world, instance, 3) [m]."""
+    """Positions of the objects (world, instance, 3) [m]."""
     layout, slot = simulation.layout, simulation.state.body_slot.numpy()
     bodies = simulation.physics.state.body_q.numpy().reshape(layout.worlds, layout.bodies_per_world, 7)
     return np.take_along_axis(bodies[..., :3], 2 + np.maximum(slot, 0)[..., None], axis=1)
@@ -62,7 +63,7 @@ def instance_of(simulation: Simulation, entry: int) -> int:
 
 
 def moved_to(simulation: Simulation, places: dict[int, tuple[float, float, float]]) -> np.ndarray:
-    """Joint coordinates of world 0 with objects upright at other places [m]."""
+    """Joint coordinates of world 0 with objects upright at other positions, by catalog index [m]."""
     coords, layout = row(simulation, 0)["physics.joint_q"].copy(), simulation.scene.layout
     for entry, place in places.items():
         first = layout.gripper_dofs + 7 * simulation.state.body_slot.numpy()[0, instance_of(simulation, entry)]
@@ -72,7 +73,7 @@ def moved_to(simulation: Simulation, places: dict[int, tuple[float, float, float
 
 @pytest.fixture(scope="module")
 def stack(device):
-    """World 0: a cube sleeps on a box, beside an L, and the gripper waits; the state of the moment."""
+    """Simulation whose world 0 has a cube asleep on a box, beside an L, while the gripper waits; and its checkpoint."""
     simulation = brief(device, 3, bake__mode="pick", pick__failures=1000, **SLEEP)
     while simulation.state.phase.numpy()[0] != Phase.ACT:
         simulation.tick(perceives=False)
@@ -86,7 +87,7 @@ def stack(device):
 
 @pytest.fixture
 def twins(stack):
-    """Worlds 0 and 1 continue from the moment, asleep and awake; world 1 never falls asleep."""
+    """Worlds 0 and 1 continue from the checkpoint: world 0 asleep, world 1 awake for the whole test."""
     simulation, state = stack
     simulation.set_state(state, [0, 1])
     set_rows(simulation, [1], sleep__asleep=0, sleep__quiet=NEVER)
@@ -95,13 +96,13 @@ def twins(stack):
 
 
 def apart(simulation: Simulation) -> float:
-    """Largest distance of an object from where it is in the other twin [m]."""
+    """Largest distance between the positions of an object in the twins [m]."""
     there, left = positions(simulation), simulation.state.catalog_index.numpy()[:2] >= 0
     assert (left[0] == left[1]).all()
     return float(np.linalg.norm(there[0] - there[1], axis=1)[left[0]].max())
 
 
-def test_what_sleeps_does_not_move_and_has_no_contacts(twins):
+def test_sleeping_objects_do_not_move_and_have_no_contacts(twins):
     before = positions(twins)
     twins.tick(perceives=False)
     after = positions(twins)
@@ -120,7 +121,7 @@ def test_a_stack_is_an_island(twins):
 
 
 def test_a_pick_from_a_sleeping_pile_ends_as_from_an_awake_one(twins):
-    """Objects that the gripper presses wake, the seal holds, and all others rest where they do in the awake twin."""
+    """The pressed object wakes, the seal holds, and all others come to rest where they do in the awake twin."""
     angle = instance_of(twins, ANGLE)
     pressed, seen, peak = [], dict[int, tuple[int, Outcome]](), np.zeros(2)
     for tick in range(ATTEMPT):
@@ -159,7 +160,7 @@ def test_an_object_that_falls_on_a_sleeping_pile_wakes_it(twins):
     assert apart(twins) < 0.01
 
 
-def test_what_loses_its_support_wakes(twins):
+def test_an_object_that_loses_its_support_wakes(twins):
     """The box below the cube leaves the scene: the cube falls as in the awake twin, and what lies apart sleeps on."""
     box, cube, angle = (instance_of(twins, entry) for entry in (BOX, CUBE, ANGLE))
     removed = row(twins, 0)["attempts.removed"].copy()
@@ -174,6 +175,14 @@ def test_what_loses_its_support_wakes(twins):
     assert apart(twins) < CREEP
 
 
+def test_the_end_of_an_episode_clears_marks_of_islands(twins):
+    """Else an island would wake when a state is loaded into the world."""
+    set_rows(twins, [0], worlds__phase=Phase.OVER)
+    twins.sleep._woken.fill_(1)
+    twins.sleep.judge(twins.state, twins.attempts, twins.seals, SLEEP["physics__sleep"])
+    assert not twins.sleep._woken.numpy().any()
+
+
 # ---- states ----
 
 
@@ -184,7 +193,7 @@ def test_a_branch_continues_as_its_episode_does(device):
     assert result.compared > 20
 
 
-def test_all_that_is_no_state_may_be_anything(device):
+def test_arrays_outside_the_state_have_no_influence(device):
     simulation = brief(device, 3, **SLEEP)
     for _ in range(20):
         simulation.tick()
@@ -193,7 +202,7 @@ def test_all_that_is_no_state_may_be_anything(device):
 
 
 def test_worlds_without_rows_need_one_iteration(device):
-    """On a GPU: with all iterations, the result is the same."""
+    """On a GPU: the result equals that of a solver that runs all iterations in worlds without constraint rows."""
     if not device.is_cuda:
         pytest.skip("a CPU runs the solver's own kernels")
     one, all_of_them = (brief(device, 3, **SLEEP) for _ in range(2))
@@ -211,7 +220,7 @@ def test_worlds_without_rows_need_one_iteration(device):
 
 
 def joined(device, bodies: int, pairs: list[tuple[int, int]]) -> list[int]:
-    """Roots of the islands of bodies, with a shape each, whose contacts are `pairs`."""
+    """Union-find roots (body) of bodies with one shape each, after contacts `pairs`."""
     parent = wp.array(np.arange(bodies), dtype=int, device=device)
     shapes = [wp.array([pair[side] for pair in pairs], dtype=int, device=device) for side in (0, 1)]
     inputs = [wp.array([len(pairs)], dtype=int, device=device), *shapes, wp.array(np.arange(bodies), dtype=int, device=device)]

@@ -106,7 +106,7 @@ def test_a_branch_in_several_worlds_is_the_same_in_each(acting):
 # ---- nothing is forgotten ----
 
 
-def test_all_that_is_no_state_may_be_anything(device):
+def test_arrays_outside_the_state_have_no_influence(device):
     kinds = Counter()
     assert list(check_arrays(brief(device, 3), 24, kinds)) == []
     assert kinds["overwritten"] > 100

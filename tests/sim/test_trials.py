@@ -1,4 +1,4 @@
-"""Trials: the episode's own grasp has its own outcome, labels do not depend on the worlds, and bad grasps are refused."""
+"""Grasp trials: the planned grasp has the outcome of its attempt, labels do not depend on worlds, and invalid grasps are refused."""
 
 from __future__ import annotations
 
@@ -13,7 +13,6 @@ from synpick_warp.stages.sim.trials import Trials, check_grasps, find_choices, o
 from tests.worlds.sights import brief, picking
 from tests.worlds.small_worlds import report
 
-LONGEST = 60
 ABOVE = 0.25
 """Height of a grasp in the air above the pile [m]."""
 
@@ -23,7 +22,7 @@ def worlds(device, count: int) -> Simulation:
 
 
 WHOLE = Picks(near=0.0, hold=0.0)
-"""Trials that take the path of an attempt."""
+"""Trials with approach and lift of an attempt."""
 
 
 def ticked(simulation: Simulation) -> Simulation:
@@ -32,7 +31,7 @@ def ticked(simulation: Simulation) -> Simulation:
 
 
 class Choice:
-    """A world at a moment of choice: its state and plan, and how its own attempt ends."""
+    """A world at a moment of choice: its state, planned grasp, and the outcome of the attempt."""
 
     def __init__(self, simulation: Simulation) -> None:
         while not len(find_choices(simulation)):
@@ -47,7 +46,7 @@ class Choice:
         self.outcome, self.hits = row.column("outcome")[self.world], row.column("hits")[self.world]
 
     def repeated(self, count: int, **changed: np.ndarray) -> dict[str, np.ndarray]:
-        """The own grasp several times, with changes."""
+        """The planned grasp `count` times, with some arrays replaced."""
         return {name: np.repeat(values, count, axis=0) for name, values in self.grasps.items()} | changed
 
 
@@ -58,7 +57,7 @@ def choice(device):
 
 @pytest.fixture(scope="module")
 def labels(choice, device):
-    """Of seven trials in three worlds: the own grasp, but the second and the fifth are in the air, and the third is turned."""
+    """Labels of seven trials, by number of worlds: the planned grasp, but in the air in trials 1 and 4, and turned in trial 2."""
     grasps = choice.repeated(7)
     grasps["point"][[1, 4], 2] += ABOVE
     grasps["yaw"][2] += 0.5
@@ -93,7 +92,7 @@ def test_labels_do_not_depend_on_the_number_of_worlds(labels):
 
 
 def test_repeats_are_perturbed_alike_in_any_world(choice, device):
-    """Near the grasp, with a short lift: the first repeat is not perturbed, and is held for as long as it is to be."""
+    """With start near the grasp and a short lift: repeat 0 is not perturbed, and is held for lift plus hold."""
     settings = Picks(near=0.02, lift_height=0.05, hold=0.1, repeats=3, angle=5.0)
     grasps, found = choice.repeated(2, candidate=np.arange(2)), {}
     for count in (3, 2):

@@ -1,4 +1,4 @@
-"""Grasp candidates of saved states: pixels drawn in perception's images, and their grasps, framed as those of attempts."""
+"""Two-phase stratified sampling of grasp candidates of saved states, in perception's images; their grasps are planned as in attempts."""
 
 from __future__ import annotations
 
@@ -32,15 +32,17 @@ CANDIDATES = struct_arrays(kernels.Candidates, "grasp", units={"pixel": "px"})
 
 
 class CandidateSampler:
-    """Samples grasp candidates of states, in batches of as many as perception has views. Uses worlds and perception of a simulation.
+    """Sampler of grasp candidates of saved states, in batches of one state per view of perception.
+
+    Overwrites worlds and perception of a simulation.
 
     Attributes:
-        count: Candidates of a state.
-        uniform: Number of them that are uniform over visible pixels; they come last.
+        count: Number of candidates of a state.
+        uniform: Number of candidates that are uniform over visible pixels; they come last.
     """
 
     def __init__(self, simulation: Simulation, settings: Picks) -> None:
-        """Allocate scratch for a simulation, after a tick, whose worlds may be overwritten; it must have perception."""
+        """Allocate scratch arrays for a simulation, which must have perception and have ticked once."""
         assert simulation.perception is not None
         self.simulation, self.device = simulation, simulation.device
         self.perception: Perception = simulation.perception
@@ -56,11 +58,14 @@ class CandidateSampler:
         self._graph: wp.Graph | None = None
 
     def sample(self, state: State, rows: Sequence[int]) -> tuple[Any, Any, np.ndarray]:
-        """Sample the candidates of rows of a state, which must be at moments of choice (`trials.find_choices`).
+        """Sample the candidates of saved states. Waits for the device.
+
+        Args:
+            state: States at moments of choice (`trials.find_choices`).
+            rows: Its rows to sample.
 
         Returns:
-            Structs `Grasps` and `Candidates`, `count` elements a row in their order, and which instances each row's image shows
-            (row, instance) bool. Waits for the device.
+            Structs `Grasps` and `Candidates`, with `count` consecutive elements per row, and the visible instances (row, instance) bool.
         """
         sizes = {"grasp": len(rows) * self.count}
         grasps, candidates = (allocate_struct(kind, sizes, self.device) for kind in (GRASPS, CANDIDATES))
@@ -72,7 +77,7 @@ class CandidateSampler:
         return grasps, candidates, np.concatenate(visible)
 
     def _sample_batch(self, state: State, first: int, rows: wp.array, grasps: Any, candidates: Any) -> None:
-        """Sample the candidates of the rows that a batch of views shows, from `first` on."""
+        """Sample the candidates of one batch: `rows[first]` and following, one per view."""
         simulation, views = self.simulation, self.images.views
         assigned = {"first": first, "rows": rows, "views": views.count, "row_out": self._row}
         launch(kernels.assign_states_kernel, simulation.layout.worlds, **assigned, world_out=views.world)
@@ -97,7 +102,7 @@ class CandidateSampler:
         return wp.uint64(self.simulation.config.bake.seed)
 
     def _draw(self) -> None:
-        """Draw and score the pixels of a batch of views."""
+        """Phase one: draw and score the pixels of a batch of views, and count those of each stratum."""
         simulation, images, pool = self.simulation, self.images, self._pool
         views, scene = images.views, images.scene
         launch(kernels.label_instances_kernel, self._dim, scene, images, component=images.arrays.component)
@@ -111,7 +116,7 @@ class CandidateSampler:
         launch(kernels.count_strata_kernel, (views.count, views.instances), **seen)
 
     def _frame(self, first: int, grasps: Any, candidates: Any) -> None:
-        """Frame the grasps of the chosen candidates, one of each view at a time, by the functions by which an attempt is planned."""
+        """Plan the candidates' grasps by the functions that plan an attempt, one candidate of each view at a time (a CUDA graph)."""
         simulation, planner, views = self.simulation, self.perception.planner, self.images.views
         scene, observation, plan, device = simulation.scene, simulation.observation, simulation.plan, self.device
         at = {"candidates": self.count, "first": first, "index": self._index, "views": views}

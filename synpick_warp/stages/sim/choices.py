@@ -1,4 +1,7 @@
-"""Moments of choice: saves the states of episodes in a ring on the device, in which grasps will be tried."""
+"""Ring buffer of checkpoints at moments of choice, from which grasps are tried.
+
+A moment of choice is the end of a tick in which an attempt was planned; the attempt begins with the next tick.
+"""
 
 from __future__ import annotations
 
@@ -17,7 +20,7 @@ from synpick_warp.stages.stream import TickReport
 
 @dataclass(frozen=True)
 class Choice:
-    """Saved moment of choice: row of the ring, episode and arrangement, index among the episode's states, frame."""
+    """Key of a saved state: row of the ring buffer, episode and arrangement index, index among the episode's states, and frame."""
 
     row: int
     episode: int
@@ -27,13 +30,13 @@ class Choice:
 
 
 class ChoiceRecorder:
-    """Saves the states of worlds that have planned an attempt, at the end of each tick of a simulation.
+    """Writer of the ring buffer: saves the states of worlds at a moment of choice at the end of each tick of a simulation.
 
-    The host is not told which: it works the same rule out from the reports of the ticks (`ChoiceReader`).
+    Does not report to the host which states it saved: `ChoiceReader` applies the same rule to the reports of ticks.
 
     Attributes:
-        states: At most so many states of an episode.
-        rows: Rows of the ring; a row is overwritten after so many states.
+        states: Maximum number of saved states of an episode.
+        rows: Rows of the ring buffer; a row is overwritten `rows` saved states later.
     """
 
     def __init__(self, simulation: Simulation, states: int, rows: int) -> None:
@@ -48,7 +51,7 @@ class ChoiceRecorder:
 
     @property
     def ring(self) -> State:
-        """The saved states; they can be allocated after the first tick."""
+        """The ring buffer, allocated at first use, which must follow the first tick."""
         if self._ring is None:
             self._ring = self.simulation.checkpoints.allocate(self.rows)
         return self._ring
@@ -62,17 +65,17 @@ class ChoiceRecorder:
 
 
 class ChoiceReader:
-    """Finds in the reports of ticks, of which none may be left out, what a `ChoiceRecorder` has saved."""
+    """Derives from the reports of ticks which states a `ChoiceRecorder` has saved, and in which rows. Must read every report, in order."""
 
     def __init__(self, recorder: ChoiceRecorder, labelled: int) -> None:
-        """`labelled`: objects of the catalog that have labels."""
+        """Read from the first tick of `recorder` on; `labelled`: number of catalog objects with labels, which come first."""
         self.states, self.rows, self.labelled = recorder.states, recorder.rows, labelled
         self._strides = np.ones(recorder.simulation.layout.worlds, int)
         self._next = 0
 
     def read(self, report: TickReport) -> list[Choice]:
-        """Choices of a tick, in order of their rows."""
-        looks = (report.column("phase") == Phase.ACT) & (report.column("task") == Task.LOOK) & (report.plan.target >= 0)
+        """States saved in a tick, in order of rows."""
+        looks = (report.column("phase") == Phase.ACT) & (report.column("task") == Task.LOOK)
         found = []
         for world in np.flatnonzero(looks).tolist():
             attempt = int(report.column("attempt")[world]) + 1
@@ -80,7 +83,7 @@ class ChoiceReader:
                 index = report.catalog_index[world]
                 self._strides[world] = max(1, -(-int(((index >= 0) & (index < self.labelled)).sum()) // self.states))
             state, rest = divmod(attempt, int(self._strides[world]))
-            if rest == 0 and state < self.states:
+            if report.plan.target[world] >= 0 and rest == 0 and state < self.states:
                 episode, arrangement, frame = (int(report.column(name)[world]) for name in ("episode", "arrangement", "frame"))
                 found.append(Choice(self._next % self.rows, episode, arrangement, state, frame))
                 self._next += 1

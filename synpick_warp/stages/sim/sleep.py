@@ -1,7 +1,7 @@
-"""Island sleeping (`physics.sleep`): objects at rest are neither collided nor solved until one of their island is touched.
+"""Island sleeping (`physics.sleep`): objects at rest are neither collided nor solved until a body touches their island.
 
-Launches kernels.sim.sleep. All decisions are integers that follow from contacts and displacements, so that they do not depend on the number
-of worlds or the order of threads; they are part of a world's state.
+Launches kernels.sim.sleep. Flags and islands are integers computed from contacts and displacements, independent of the number of worlds
+and the order of threads, and are part of a world's state.
 """
 
 from __future__ import annotations
@@ -22,29 +22,29 @@ from synpick_warp.stages.sim.physics import Physics, contact_arrays
 from synpick_warp.stages.sim.worlds import AttemptState, SealState, WorldState
 
 THREADS = 64
-"""Threads per world that stride over the overlaps, and over the contacts, of all worlds."""
+"""Threads per world of the grid-stride loops over the overlaps and contacts of all worlds."""
 
 
 @dataclass(frozen=True, eq=False)
 class SleepState:
-    """Which bodies sleep, by the slot of a body in its world."""
+    """Per body slot of each world: sleep flag, island, and quiet time."""
 
     asleep: wp.array = device_array("world", "slot", dtype=wp.int32)
-    """1: the body sleeps."""
+    """1: asleep; 0: awake."""
     island: wp.array = device_array("world", "slot", dtype=wp.int32)
-    """Slot that names the island with which it sleeps."""
+    """Slot that names the island of a sleeping body: the smallest of its slots."""
     quiet: wp.array = device_array("world", "slot", dtype=wp.int32, unit="ticks")
-    """Time for which it has been quiet."""
+    """Consecutive ticks in which the body moved by at most `physics.sleep`."""
 
 
 class Sleep:
-    """Sleeping bodies of all worlds: what physics leaves out (`physics.Sleepers`), and the judgement at the end of a tick."""
+    """Island sleeping of all worlds: hooks of a substep (`physics.Sleepers`) and of the broad phase, and `judge` at the end of a tick."""
 
     def __init__(self, scene: SceneData, physics: Physics) -> None:
-        """Have `physics` leave out what sleeps.
+        """Install the hooks in `physics`.
 
         Raises:
-            SynpickError: Newton's version is not the one whose broad phase can.
+            SynpickError: The broad phase is not `SeparatingBroadPhase`, as with another version of Newton.
         """
         pipeline = physics.pipeline
         if not isinstance(pipeline.broad_phase, SeparatingBroadPhase):
@@ -63,25 +63,25 @@ class Sleep:
             physics.solver.skips_idle = True
 
     def choose(self, overlaps: wp.array, count: wp.array) -> tuple[wp.array, wp.array]:
-        """Of pairs of shapes and their number, those of which one belongs to a body that is awake."""
+        """Broad-phase filter: of pairs of shapes (overlap) vec2i and their number (one) int32, those with a shape of an awake body."""
         self._pair_count.zero_()
         given = {"overlap": overlaps, "overlap_count": count, "pair": self._pairs, "pair_count": self._pair_count}
         launch(sleep.list_awake_pairs_kernel, self._threads, self._scene, self._physics.model, self.state, threads=self._threads, **given)
         return self._pairs, self._pair_count
 
     def touch(self) -> None:
-        """Mark the islands that something awake touches. Runs between collision detection and solver."""
+        """Mark sleeping islands in contact with an awake body. Runs between collision detection and solver."""
         sources = self._scene, self.state, contact_arrays(self._physics)
         launch(sleep.wake_touched_kernel, self._threads, *sources, threads=self._threads, woken=self._woken)
 
     def hold(self, before: newton.State, after: newton.State) -> None:
-        """Hold what sleeps where it was before a substep, and wake the islands that were touched in it."""
+        """Restore the sleeping bodies to their state before the substep, and wake the marked islands. Runs after the solver."""
         given = {"woken": self._woken, "quiet": self.state.quiet}
         launch(sleep.hold_sleepers_kernel, self.state.asleep.shape, self._scene, self.state, before, out=after, **given)
 
     def judge(self, state: WorldState, attempts: AttemptState, seals: SealState, threshold: float) -> None:
-        """Send islands to sleep whose objects moved by at most `threshold` [m] in each of the last ticks, and wake those that lost an
-        object. Runs at the end of a tick."""
+        """Put islands to sleep whose objects moved by at most `threshold` [m] in each of the last ticks, and wake those of which an
+        object was attached or removed. Runs at the end of a tick."""
         scene, physics, contacts = self._scene, self._physics, contact_arrays(self._physics)
         launch(sleep.begin_islands_kernel, len(self._parent), parent=self._parent)
         launch(sleep.join_islands_kernel, physics.contacts.rigid_contact_max, contacts, parent=self._parent)

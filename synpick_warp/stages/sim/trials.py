@@ -1,4 +1,4 @@
-"""Grasp trials: executes many grasps in parallel, each from a saved state. Worlds that finish a trial begin the next one immediately."""
+"""Grasp trials: runs many grasps in parallel, each from a saved state; a work queue gives worlds that finish a trial the next one."""
 
 from __future__ import annotations
 
@@ -36,19 +36,19 @@ PERTURBATIONS = struct_arrays(Perturbations, "trial", units={"offset": "m", "rot
 LABELS = struct_arrays(kernels.Labels, "trial", units={"peak_force": "N", "farthest": "m", "ticks": "ticks", "held": "steps"})
 PROGRESS = struct_arrays(kernels.Progress, "world", pose=("world", "instance"), units={"peak_force": "N", "pose": "m"})
 MOVED = 5e-3
-"""Displacement above which another object counts as moved [m]; resting piles creep by far less."""
+"""Displacement above which another object counts as moved [m]; resting piles creep far less."""
 GPU_WORLDS = 2048
-"""Most worlds of trials on a GPU if `picks.worlds` is 0. On an H200, 512 worlds try 293 grasps of the synpick preset a second, 2,048 more
-than 530."""
+"""Maximum number of trial worlds on a GPU if `picks.worlds` is 0. On an H200, 512 worlds run 293 trials of the synpick preset a second,
+2,048 worlds more than 530."""
 ROUNDS = 8
-"""Trials of a batch for each world: in its last round worlds wait for the slowest."""
+"""Trials per world of a batch: more keep worlds busy longer, since at the end of a batch all wait for the slowest."""
 POLL = 8
 """Polling interval for completion of all trials [ticks]."""
 
 
 class TrialLaw(gripper.TwoSpeedLaw):
-    """Setpoint law of trials: that of the paper, but the gripper appears near the grasp and holds after the lift, and a trial ends once
-    nothing is attached.
+    """Setpoint law of trials: the paper's two speeds, but the gripper appears near the grasp and holds after the lift, and the attempt
+    ends once nothing is attached.
     """
 
     def __init__(self, course: Any) -> None:
@@ -64,25 +64,25 @@ class TrialLaw(gripper.TwoSpeedLaw):
         launch(kernels.place_near_kernel, len(state.phase), scene, state, attempts, plan, physics.state, **given)
 
     def end_tick(self, scene: SceneData, state: WorldState, attempts: AttemptState, plan: Plan) -> None:
-        """Complete tasks PRESS, by time, and LIFT, after the hold."""
+        """Task transitions: end PRESS by time, and LIFT after the hold or once nothing is attached."""
         launch(kernels.advance_trials_kernel, len(state.phase), scene, state, attempts, plan, course=self.course)
 
 
 class WatchedHold:
-    """Hold whose forces are recorded in each step, in the struct `Progress`."""
+    """Decorator of a hold that accumulates its forces in the struct `Progress`, in each step."""
 
     def __init__(self, hold: Hold, progress: Any) -> None:
         self.hold, self.progress = hold, progress
         self.engage, self.ignore_contacts = hold.engage, hold.ignore_contacts
 
     def apply_forces(self, scene: SceneData, state: WorldState, seals: SealState, physics: Physics, current: newton.State) -> None:
-        """Apply the forces, and record them."""
+        """Apply the seal forces, then update steps held and largest load."""
         self.hold.apply_forces(scene, state, seals, physics, current)
         launch(kernels.watch_seals_kernel, len(state.phase), seals, progress=self.progress)
 
 
 class Trials:
-    """Runs trials in the worlds of a simulation, which simulates nothing else from then on.
+    """Executor of grasp trials in the worlds of a simulation, which runs nothing else afterwards.
 
     Attributes:
         course: The struct `TrialData`.
@@ -90,7 +90,7 @@ class Trials:
     """
 
     def __init__(self, simulation: Simulation, settings: Picks) -> None:
-        """Take over a simulation, after a tick; see `trial_values`. Its perception is not used."""
+        """Take over a simulation that has ticked once, with the settings of `trial_values`; its perception is not used."""
         self.simulation, self.device = simulation, simulation.device
         self.states = simulation.states
         assert simulation.hold is not None
@@ -107,14 +107,14 @@ class Trials:
         simulation.clear_graphs()
 
     def upload(self, grasps: Mapping[str, np.ndarray], rows: int) -> Any:
-        """Copy grasps to the device: the struct `Grasps`.
+        """Copy grasps to the device; returns the struct `Grasps`.
 
         Args:
-            grasps: Its arrays by name.
-            rows: Rows of the state.
+            grasps: Fields of `Grasps` by name, each (grasp[, 3]).
+            rows: Number of rows of the state.
 
         Raises:
-            StateError: Arrays are missing or of other lengths, a row does not exist, or a number is not finite.
+            StateError: An array is missing or has another shape, a row or target is out of range, or a number is not finite.
         """
         count = check_grasps(grasps, rows, self.simulation.layout.instances)
         result = allocate_struct(GRASPS, {"grasp": count}, self.device)
@@ -123,15 +123,15 @@ class Trials:
         return result
 
     def run(self, state: State, grasps: Any) -> dict[str, np.ndarray]:
-        """Run all trials.
+        """Run all trials of grasps. Waits for the device.
 
         Args:
-            state: States at moments of choice: an attempt has been planned, and has made no step (`find_choices`). They may come from a
-                simulation of other episodes.
+            state: States at moments of choice: an attempt is planned and has made no step (`find_choices`); also of other simulations
+                of the same objects.
             grasps: The struct `Grasps`.
 
         Returns:
-            The labels by name (trial, ...); trials of a grasp are neighbours.
+            Fields of `Labels` and `Perturbations` by name (trial, ...), with `repeats` consecutive trials of each grasp.
         """
         sizes = {"trial": len(grasps.row) * self.course.repeats}
         labels, perturbations = (allocate_struct(kind, sizes, self.device) for kind in (LABELS, PERTURBATIONS))
@@ -143,7 +143,7 @@ class Trials:
         return {name: getattr(part, name).numpy() for part in (labels, perturbations) for name in part._cls.vars}
 
     def tick(self, state: State, grasps: Any, labels: Any, perturbations: Any) -> None:
-        """Begin trials in free worlds, advance all worlds by one tick, and label what has ended. Only launches kernels."""
+        """Begin trials in free worlds, advance all worlds by one tick, and write labels of trials that end. Only launches kernels."""
         simulation, progress, worlds = self.simulation, self._progress, self.simulation.layout.worlds
         scene, physics, plan = simulation.scene, simulation.physics, simulation.plan
         sources = (scene, simulation.state, simulation.attempts)
@@ -163,19 +163,19 @@ class Trials:
 
 
 def count_trial_worlds(picks: Picks, episodes: int, device: wp.Device) -> int:
-    """Worlds in which the trials of a bake of `episodes` episodes run: as set, or as many as the device is best used by."""
+    """Number of trial worlds of a bake of `episodes` episodes: `picks.worlds`; 0: ROUNDS trials per world, within the device's limits."""
     most = episodes * picks.states * picks.candidates * picks.repeats
     worlds = picks.worlds or min(-(-most // ROUNDS), GPU_WORLDS if device.is_cuda else MAX_CPU_WORLDS)
     return max(worlds, MIN_GPU_WORLDS) if device.is_cuda else worlds
 
 
 def trial_values(picks: Picks, worlds: int) -> dict[str, Any]:
-    """Settings, by full key, of a simulation in which trials run: an episode that a trial ends is not repeated."""
+    """Settings of a simulation for trials, by full key; episodes are not retried (`settle.tries`)."""
     return {"bake.worlds": worlds, "pick.lift_height": picks.lift_height, "settle.tries": 1, "bop.graph": False}
 
 
 def make_course(settings: Picks, physics: PhysicsConfig, pick: Pick) -> Any:
-    """The struct `TrialData`, for a simulation with these settings of physics and attempts."""
+    """Convert settings to the struct `TrialData`: times from seconds to steps or ticks of a simulation."""
     return fill(
         kernels.TrialData,
         settings,
@@ -188,20 +188,20 @@ def make_course(settings: Picks, physics: PhysicsConfig, pick: Pick) -> Any:
 
 
 def find_choices(simulation: Simulation) -> np.ndarray:
-    """Worlds at a moment of choice: an attempt has been planned in this tick, and begins with the next one. Waits for the device."""
+    """Worlds at a moment of choice: an attempt was planned in this tick, and begins with the next. Waits for the device."""
     task, steps = simulation.attempts.task.numpy(), simulation.attempts.steps.numpy()
     return np.flatnonzero((task == Task.APPROACH) & (steps == 0))
 
 
 def own_grasps(simulation: Simulation, worlds: Sequence[int]) -> dict[str, np.ndarray]:
-    """Grasps that worlds have planned themselves, with rows in the order of the worlds. Waits for the device."""
+    """Planned grasps of worlds as the arrays of `Trials.upload`: row i is the i-th of `worlds`, candidate 0. Waits for the device."""
     plan = simulation.plan
     arrays = {name: getattr(plan, name).numpy()[np.asarray(worlds, int)] for name in ("target", "point", "normal", "yaw", "tilt")}
     return {"row": np.arange(len(worlds), dtype=np.int32), "candidate": np.zeros(len(worlds), np.int32)} | arrays
 
 
 def check_grasps(grasps: Mapping[str, np.ndarray], rows: int, instances: int) -> int:
-    """Number of grasps; raises StateError as `Trials.upload`."""
+    """Validate the arguments of `Trials.upload`; returns the number of grasps, or raises its StateError."""
     shapes = {name: (3,) if name in ("point", "normal") else () for name in Grasps.vars}
     if missing := shapes.keys() - grasps.keys():
         raise StateError(f"grasps lack {sorted(missing)[0]}")
