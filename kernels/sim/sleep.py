@@ -235,8 +235,7 @@ def judge_sleep_kernel(
         is_gone = removed[world, instance] != 0
         if is_gone or catalog_index[world, instance] >= 0:
             is_held = is_gone or attached[world, instance] != 0
-            is_quiet = not is_held and displacement[world, instance] <= threshold
-            quiet = wp.where(is_quiet, quiet_inout[world, slot] + 1, 0)
+            quiet = wp.where(not is_held and displacement[world, instance] <= threshold, quiet_inout[world, slot] + 1, 0)
             quiet_inout[world, slot] = quiet
             if asleep_inout[world, slot] == 0 and quiet < QUIET_TICKS:
                 restless_inout[find_root(parent, first + slot)] = 1
