@@ -116,7 +116,7 @@ def record_supports_kernel(
 ):
     """Record what carries each instance: mean upward force of each supporter on it, `scale` x `total`; 0 for instances not in the scene.
 
-    Supporters are the instances, then everything static. Launched over world, instance, supporter.
+    The last axis indexes supporters: the instances, then one entry for all static bodies. Launched over world, instance, supporter.
     """
     world, instance, supporter = wp.tid()
     body = body_of(layout, world, instance, catalog_index, body_slot)

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     import numpy as np
 
 MAX_ROWS = 2**22
-"""Most rows of a table that is read: 1 GB of trials."""
+"""Maximum number of rows of a table that the reader accepts: 1 GB of trials."""
 _MAX_FILE = 2**31
 """Largest file of a table [bytes]."""
 

@@ -140,7 +140,7 @@ def _rest(limits: Mapping[str, int]) -> tuple[int, int]:
 
 
 def _check_choice(name: str, value: object, allowed: Sequence[str]) -> None:
-    """Raise ConfigError unless a value is one of the allowed."""
+    """Raise ConfigError if a value is not one of the allowed names."""
     if value not in allowed:
         hint = suggest(value, allowed) if isinstance(value, str) else ""
         raise ConfigError(f"{name} is {format_value(value)}; allowed: {', '.join(allowed)}{hint}")

@@ -15,6 +15,8 @@ import numpy as np
 
 from synpick_warp.codes import Ending, Outcome, Share
 
+MOVED = 5e-3
+"""Displacement above which another object counts as moved [m]; resting piles creep far less."""
 ORDER = ("state", "candidate", "repeat")
 """Columns that identify a trial within its episode, and by which its table is sorted."""
 
@@ -70,7 +72,7 @@ COLUMNS = (
     Column("margin", "<f4", "1", "Least margin of a seal: 1 - force / break force; 0 or less: it broke. NaN: there was no seal."),
     Column("time_to_break", "<f4", "s", "Time from suction on until the last seal broke. NaN: it did not, or there was none."),
     Column("held", "<f4", "s", "Time with an object on the cup."),
-    Column("moved", "<i4", "1", "Collateral: other objects displaced by more than 5 mm."),
+    Column("moved", "<i4", "1", f"Collateral: other objects displaced by more than {1e3 * MOVED:.0f} mm."),
     Column("farthest", "<f4", "m", "Largest displacement of another object."),
     Column("lost", "<i4", "1", "Objects that left the bin without being picked."),
     Column("duration", "<f4", "s", "Simulated duration of the trial."),

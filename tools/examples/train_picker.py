@@ -51,11 +51,11 @@ from tools.examples.train_online import Network
 from tools.options import configure, fail, make_parser, positive_count
 
 HELD_OUT = 5
-"""One of so many episodes is held out from training."""
+"""Stride of the train/test split: every fifth episode is held out from training."""
 EMPTY_PIXELS = 32
 """Negative samples of an image: pixels without object, learnt as failures."""
 LIGHTEST, HEAVIEST = 0.1, 10.0
-"""Limits of a trial's inverse probability weight, relative to its image's mean: a few may be very large, and the own grasp's is 0."""
+"""Clipping range of inverse probability weights, relative to the image's mean: a few are very large, and the planned grasp has 0."""
 LEARNING_RATE, WARM_UP, BATCH = 2e-3, 0.05, 16
 FEW_DRAWS = 200
 """Bootstrap resamples of statistics over all trials."""
@@ -134,7 +134,7 @@ def _maps(view: View) -> np.ndarray | None:
 
 
 def make_inputs(sight: Sight) -> torch.Tensor:
-    """Network input (B, 5, H, W): depth relative to the image's median [dm], normals (3), and mask of known depth."""
+    """Network input (B, 5, H, W): depth less the image's median [0.1 m], surface normals (3), and valid-depth mask."""
     known = (sight.depth > 0.0).float()
     middle = sight.depth.flatten(1).median(dim=1).values[:, None, None]
     return torch.cat((((sight.depth - middle) * known * 10.0)[:, None], find_normals(sight.depth, sight.focal), known[:, None]), dim=1)

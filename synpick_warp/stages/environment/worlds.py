@@ -24,7 +24,7 @@ from synpick_warp.stages.launch import launch
 from synpick_warp.stages.sim import gripper
 from synpick_warp.stages.sim.simulate import Simulation
 from synpick_warp.stages.sim.states import State
-from synpick_warp.stages.sim.trials import MOVED
+from synpick_warp.views.picks import MOVED
 
 RESULTS = struct_arrays(kernels.Results, "world", pose=("world", "instance"), units={"peak_force": "N", "farthest": "m", "pose": "m"})
 SHOWN = ("outcome", "picked", "hits", "peak_force", "ticks", "moved", "farthest", "lost")

@@ -68,7 +68,7 @@ class SupportArrays:
 
     support: wp.array = device_array("world", "instance", "supporter", dtype=wp.float32, unit="N")
     """Upward force on the instance of each supporter's contacts, mean over the tick; below 0: the supporter lies on the instance.
-    Supporters are the instances, then all that is static."""
+    The last axis indexes supporters: the instances, then one entry for all static bodies."""
 
 
 @dataclass(frozen=True, eq=False)

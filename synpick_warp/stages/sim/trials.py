@@ -30,13 +30,12 @@ from synpick_warp.stages.sim.simulate import Simulation
 from synpick_warp.stages.sim.states import State
 from synpick_warp.stages.sim.worlds import AttemptState, SealState, WorldState
 from synpick_warp.stages.timing import scope
+from synpick_warp.views.picks import MOVED
 
 GRASPS = struct_arrays(Grasps, "grasp", units={"point": "m", "yaw": "rad", "tilt": "rad"})
 PERTURBATIONS = struct_arrays(Perturbations, "trial", units={"offset": "m", "rotation": "rad"})
 LABELS = struct_arrays(kernels.Labels, "trial", units={"peak_force": "N", "farthest": "m", "ticks": "ticks", "held": "steps"})
 PROGRESS = struct_arrays(kernels.Progress, "world", pose=("world", "instance"), units={"peak_force": "N", "pose": "m"})
-MOVED = 5e-3
-"""Displacement above which another object counts as moved [m]; resting piles creep far less."""
 GPU_WORLDS = 2048
 """Maximum number of trial worlds on a GPU if `picks.worlds` is 0. On an H200, 512 worlds run 293 trials of the synpick preset a second,
 2,048 worlds more than 530."""

@@ -13,6 +13,7 @@ from synpick_warp.apps.validation.registry import Findings, rule
 from synpick_warp.codes import Ending, Outcome, Share
 from synpick_warp.dataset.reading import Episode, open_data_set
 from synpick_warp.dataset.view import View
+from synpick_warp.views.picks import MOVED
 
 UNIT = 1e-3
 """Largest deviation of a direction's length from 1."""
@@ -20,8 +21,6 @@ NEAR = 5e-3
 """Largest distance of a grasp point from the depth image, along the optical axis [m]."""
 PIXEL = 0.01
 """Largest distance of a projected point from its pixel, beyond its sides [px of the perception image]."""
-MOVED = 5e-3
-"""Displacement above which an object counts as moved [m]."""
 UNSEEN = 0.05
 """Largest share of points that a view with wider pixels than the perception image may miss, as no pixel's centre shows them: thin parts
 and edges. It is 0.2 % of a pile's points in 320 px of a perception image of 1280, 0.6 % in 160 px; an object elsewhere has more."""
