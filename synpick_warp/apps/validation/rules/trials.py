@@ -118,7 +118,10 @@ def check_pixels(subject: PicksSubject) -> Findings:
 
 @rule(PicksSubject, "picks-surface", "bake the episode again: points and poses are not of the same run")
 def check_surface(subject: PicksSubject) -> Findings:
-    """Grasp points of picks lie on the visible surface of their instance: mask and depth show it there, in coarse views but for UNSEEN."""
+    """Grasp points of picks lie on the visible surface of their instance: mask and depth show it there.
+
+    In a view with wider pixels than the perception image, a point may lie between the depths around it, and UNSEEN of them anywhere.
+    """
     for state, picks, view in subject.views():
         width, height = view.size
         allowed = UNSEEN if width < state["width"] else 0.0
@@ -131,8 +134,11 @@ def check_surface(subject: PicksSubject) -> Findings:
             facing = np.einsum("nkc,nc->nk", np.concatenate((rays, np.ones_like(rays[..., :1])), axis=-1), normal)
             # The depth at a neighbouring pixel is that of the tangent plane; where that is nearly seen from the side, that of the point.
             plane = np.einsum("nc,nc->n", point, normal)[:, None] / np.where(np.abs(facing) < 0.05, np.nan, facing)
-            near = np.fmin(np.abs(view.depth[row, column] - plane), np.abs(view.depth[row, column] - point[:, 2:])).min(axis=1)
-            off = ~(near <= NEAR)
+            behind = view.depth[row, column] - point[:, 2:]
+            near = np.fmin(np.abs(view.depth[row, column] - plane), np.abs(behind)).min(axis=1)
+            # Wider pixels miss thin parts: their centres lie before and behind such a point.
+            between = (behind.min(axis=1) < 0.0) & (behind.max(axis=1) > 0.0)
+            off = ~(near <= NEAR) & ~(between & (width < state["width"]))
             if off.sum() > allowed * len(off):
                 yield from subject.tell(off, f"its point is more than {1e3 * NEAR:.0f} mm from the surface that depth shows", picks)
         if view.has("mask_visib"):
