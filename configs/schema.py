@@ -149,6 +149,9 @@ class Arrangement:
     clearance: float = setting(
         0.01, "m", "Gap between the bounding spheres of consecutive objects in the drop column, or in layers.", low=0.0, high=1.0
     )
+    upright: float = setting(
+        0.0, "", "Fraction of the objects that begin to fall with the z axis of their model upwards, so that most stand.", low=0.0, high=1.0
+    )
     spread: float = setting(
         0.3,
         "",

@@ -63,7 +63,7 @@ def load_catalog(config: Config, cache_dir: Path | None = None, report: Callable
         CatalogError: The folder cannot be used, or none of its objects: a file is damaged, an object does not fit into the tote or has an
             invalid mass.
     """
-    rules = _Rules(config.objects, config.object_rows, config.cell.bins)
+    rules = _Rules(config.objects, config.object_rows, config.cell.bins, config.randomize.surfaces)
     entries = _load_entries(config.bake.models, rules, cache_dir, report)
     if not config.arrangement.counts:
         _report_undrawable(entries, config.arrangement.volume, report)
@@ -161,11 +161,13 @@ class _Faults:
 
 @dataclass(frozen=True)
 class _Rules:
-    """Settings by which a model is read and checked: objects, rows of the object table, bins."""
+    """Settings by which a model is read or made, and checked: objects, rows of the object table, bins, textures."""
 
     objects: Objects
     rows: tuple[ObjectRow, ...]
     bins: tuple[BinSizes, ...]
+    surfaces: int
+    """Procedural textures; with some, geometric solids are textured."""
 
 
 def _read_folder(folder: Path, rules: _Rules, report: Callable[[str], None], faults: _Faults) -> list[RawObject]:
@@ -204,7 +206,7 @@ def _embedded_objects(rules: _Rules, faults: _Faults, catalog: Sequence[str]) ->
     """Embedded objects that fit into the bins; beside a `catalog` household objects without a name of it, or else geometric solids."""
     raws = []
     made = procedural_objects((HOUSEHOLD,) if catalog else rules.objects.embedded)
-    for raw in [raw for raw in made if raw.name not in catalog] or solids():
+    for raw in [raw for raw in made if raw.name not in catalog] or solids(rules.surfaces > 0):
         try:
             _check_size(raw, raw.name, rules.bins)
         except CatalogError as error:

@@ -1,4 +1,4 @@
-"""Randomized appearance of a cell: folders of textures, and texture coordinates of the bin by box projection."""
+"""Randomized appearance of a cell: its distributions, and textures from folders and procedural ones."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from synpick_warp.configs.fields import PATH_RULE
 from synpick_warp.errors import CatalogError, SynpickError
 from synpick_warp.scenes.assets.appearance import MAX_TEXTURE_FILE, decode_texture
 from synpick_warp.scenes.assets.asset_files import check_file_name
-from synpick_warp.scenes.types import TriangleMesh
+from synpick_warp.scenes.embedded.surfaces import surface_textures
 from synpick_warp.system.inputs.files import read_file
 from synpick_warp.system.processes.isolation import Failure, Limits, run_isolated
 
@@ -53,11 +53,13 @@ class Looks:
 
 
 def load_looks(randomize: Randomize, report: Callable[[str], None], strict: bool = False) -> Looks | None:
-    """Load the textures that settings name; None: nothing is randomized. Arguments and errors as of `load_textures`."""
+    """Load the textures that settings name, and make the procedural ones; None: nothing is randomized. Arguments and errors as of `load_textures`."""
     if randomize == Randomize():
         return None
     names = ("bin_textures", "table_textures", "background_textures")
-    return Looks(randomize, *(load_textures(f"randomize.{name}", getattr(randomize, name), report, strict) for name in names))
+    bins, table, floor = (load_textures(f"randomize.{name}", getattr(randomize, name), report, strict) for name in names)
+    surfaces = surface_textures(randomize.surfaces)
+    return Looks(randomize, bins, table + surfaces, floor + surfaces)
 
 
 def load_textures(key: str, folder: str, report: Callable[[str], None], strict: bool = False) -> Textures:
@@ -105,16 +107,3 @@ def _read(path: Path) -> np.ndarray:
         return image
     height, width = (max(1, round(scale * side)) for side in image.shape[:2])
     return cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
-
-
-def project_from_box(mesh: TriangleMesh) -> TriangleMesh:
-    """Cube projection of texture coordinates: each triangle takes the two axes [m] across the one that its normal is closest to.
-
-    Triangles get vertices of their own, since neighbours may take other axes.
-    """
-    corners = mesh.vertices[mesh.faces]
-    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    across = np.array([(1, 2), (0, 2), (0, 1)])[np.abs(normal).argmax(axis=1)]
-    uv = np.take_along_axis(corners, across[:, None, :], axis=2)
-    faces = np.arange(3 * len(mesh.faces), dtype=np.int32).reshape(-1, 3)
-    return TriangleMesh(corners.reshape(-1, 3), faces, mesh.normals[mesh.faces].reshape(-1, 3), uv.reshape(-1, 2).astype(np.float32))

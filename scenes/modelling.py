@@ -281,3 +281,16 @@ def _corner_normals(points: np.ndarray, faces: np.ndarray) -> np.ndarray:
         [np.bincount(own[near], weights=(normal[other, axis] * angle[other])[near], minlength=len(normal)) for axis in range(3)], axis=1
     )
     return total / np.maximum(np.linalg.norm(total, axis=1, keepdims=True), SNAP)
+
+
+def project_from_box(mesh: TriangleMesh) -> TriangleMesh:
+    """Cube projection of texture coordinates: each triangle takes the two axes [m] across the one that its normal is closest to.
+
+    Triangles get vertices of their own, since neighbours may take other axes.
+    """
+    corners = mesh.vertices[mesh.faces]
+    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    across = np.array([(1, 2), (0, 2), (0, 1)])[np.abs(normal).argmax(axis=1)]
+    uv = np.take_along_axis(corners, across[:, None, :], axis=2)
+    faces = np.arange(3 * len(mesh.faces), dtype=np.int32).reshape(-1, 3)
+    return TriangleMesh(corners.reshape(-1, 3), faces, mesh.normals[mesh.faces].reshape(-1, 3), uv.reshape(-1, 2).astype(np.float32))

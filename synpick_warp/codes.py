@@ -193,6 +193,7 @@ class Stream(enum.IntEnum):
     GRASPS = 18
     CANDIDATES = 19
     TRIALS = 20
+    UPRIGHT = 21
 
 
 class Look(enum.IntEnum):
@@ -287,6 +288,8 @@ class Effect(enum.IntEnum):
     SHOT_NOISE = 6
     READ_NOISE = 7
     JPEG_QUALITY = 8
+    CONTRAST = 9
+    SATURATION = 10
 
 
 @functools.cache

@@ -38,6 +38,7 @@ DRAWN: dict[str, Any] = {
     "lamp_strength": {"uniform": [0.2, 0.8]},
     "lamp_temperature": {"choice": [2700, 6500]},
     "distractors": {"choice": [0, 1, 2]},
+    "surfaces": 3,
     "exposure": {"normal": [0, 1]},
 }
 CAMERAS = (
@@ -59,6 +60,7 @@ CAMERAS = (
 FOLDERS = ("bin_textures", "table_textures", "background_textures", "distractor_models")
 GIVEN = PICKING | {
     "arrangement.max_objects": 4,
+    "arrangement.upright": 0.5,
     "bake.episodes": 3,
     "bake.formats": ["bop", "usd", "zarr"],
     "bins.shift": [0.05, 0.03],

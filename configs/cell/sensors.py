@@ -51,6 +51,12 @@ class Effects:
         (0.0, 0.0), "", "Standard deviation of signal-independent read noise, relative to full scale.", low=0.0, high=1.0
     )
     jpeg_quality: tuple[int, int] = setting((0, 0), "", "JPEG quality; 0, 0: bop.jpeg_quality.", low=0, high=100)
+    contrast: tuple[float, float] = setting(
+        (0.0, 0.0), "", "Relative change of the contrast of sRGB values about their middle, as by a camera's processing.", low=-0.9, high=4.0
+    )
+    saturation: tuple[float, float] = setting(
+        (0.0, 0.0), "", "Relative change of the difference of sRGB values to their luma; -1: grey.", low=-1.0, high=4.0
+    )
 
 
 def effect_ranges(effects: Effects) -> dict[str, tuple[float, float]]:
@@ -66,6 +72,8 @@ def effect_ranges(effects: Effects) -> dict[str, tuple[float, float]]:
         "shot_noise": effects.shot_noise,
         "read_noise": effects.read_noise,
         "jpeg_quality": effects.jpeg_quality,
+        "contrast": effects.contrast,
+        "saturation": effects.saturation,
     }
 
 

@@ -184,6 +184,14 @@ class Randomize:
         "(render.table_size); empty: the environment map is seen there.",
         path=True,
     )
+    surfaces: int = setting(
+        0,
+        "",
+        "Procedural textures (carpet, boards, checks, print, clutter) of table and floor, beside those of folders; with them the geometric "
+        "solids among distractors are textured, too.",
+        low=0,
+        high=MOST_CHOICES // 2,
+    )
     texture_width: Distribution = setting(
         _HALF_METRE, "m", "Width of one repeat of the textures of bin, table and floor.", low=0.01, high=100.0
     )

@@ -3,7 +3,7 @@
 import warp as wp
 
 from synpick_warp.codes import Phase, Stream
-from synpick_warp.kernels.rng import pixel_key, stream_key, uniform, uniform_index, uniform_rotation
+from synpick_warp.kernels.rng import TAU, pixel_key, stream_key, uniform, uniform_index, uniform_rotation
 from synpick_warp.kernels.sim.arrangement import count_instances
 from synpick_warp.kernels.structs import BinData, CatalogData, DropData, LayoutData
 
@@ -218,3 +218,35 @@ def drop_objects_kernel(
         joint_f_out[qd + 2] = 0.0
         height += 2.0 * radius + drop.clearance
     phase_inout[world] = Phase.SETTLE
+
+
+@wp.kernel
+def raise_objects_kernel(
+    # Scene:
+    seed: wp.uint64,
+    layout: LayoutData,
+    upright: float,
+    # State:
+    arrangement_id: wp.array[wp.vec2i],  # (world)
+    catalog_index: wp.array2d[int],  # (world, instance)
+    body_slot: wp.array2d[int],  # (world, instance)
+    phase: wp.array[int],  # (world)
+    restarted: wp.array[wp.bool],  # (world_and_global)
+    # Out:
+    joint_q_inout: wp.array[float],  # (coord) [m, rad]
+):
+    """Turn a fraction `upright` of the objects that have just been dropped so that their z axis points upwards: yaw = 2π u_1 if u_0 <
+    upright.
+
+    The samples u are those of the stream (seed, episode, arrangement, Stream.UPRIGHT), two an instance. Launched over world, instance.
+    """
+    world, instance = wp.tid()
+    if not restarted[world] or phase[world] != Phase.SETTLE or catalog_index[world, instance] < 0:
+        return
+    key = stream_key(seed, arrangement_id[world][0], arrangement_id[world][1], Stream.UPRIGHT)
+    if uniform(key, 2 * instance) >= upright:
+        return
+    turn = wp.quat_from_axis_angle(wp.vec3(0.0, 0.0, 1.0), TAU * uniform(key, 2 * instance + 1))
+    first = world * layout.coords + layout.gripper_dofs + 7 * body_slot[world, instance] + 3
+    for axis in range(4):
+        joint_q_inout[first + axis] = turn[axis]

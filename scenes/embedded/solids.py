@@ -1,15 +1,22 @@
-"""Geometric solids of plain colours, as distractors beside the embedded objects (Tobin et al., IROS 2017). Lengths [m]."""
+"""Geometric solids of plain colours, or of several sizes with procedural textures, as distractors beside the embedded objects (Tobin et al., IROS 2017). Lengths [m]."""
 
 from __future__ import annotations
+
+from dataclasses import replace
 
 import numpy as np
 
 from synpick_warp.scenes.collision.hulls import hull_size
-from synpick_warp.scenes.modelling import BOX_FACES, NO_TEXTURE, Patch, lathe, make_mesh, rounded_box, solid
+from synpick_warp.scenes.embedded.surfaces import surface_textures
+from synpick_warp.scenes.modelling import BOX_FACES, NO_TEXTURE, Patch, lathe, make_mesh, project_from_box, rounded_box, solid
 from synpick_warp.scenes.types import Material, RawObject
 
 SIDES = 32
 """Points per ring of a round solid."""
+SCALES = ((1.0, 1.0, 1.0), (1.6, 1.6, 1.8), (1.2, 2.0, 2.2), (2.2, 1.4, 1.0))
+"""Factors on x, y and z of textured solids: tins, cartons, books and bottles of a household."""
+REPEAT = 0.3
+"""Width of one repeat of a textured solid's texture [m]."""
 _EDGE = 0.003
 """Radius of the edges of boxes."""
 
@@ -31,8 +38,8 @@ def _ball(radius: float) -> Patch:
     return _turned(SIDES, *((radius * float(np.cos(angle)), radius * float(np.sin(angle))) for angle in angles))
 
 
-def solids() -> list[RawObject]:
-    """Make the solids, all convex: closed meshes [m], centred on their bounding boxes; deterministic."""
+def solids(textured: bool = False) -> list[RawObject]:
+    """Make the solids, all convex: closed meshes [m], centred on their bounding boxes; deterministic. Textured, each has all SCALES."""
     rows = (
         ("cube", _box(0.05, 0.05, 0.05), (0.75, 0.2, 0.15)),
         ("slab", _box(0.12, 0.08, 0.016), (0.2, 0.35, 0.7)),
@@ -48,4 +55,24 @@ def solids() -> list[RawObject]:
         mesh = make_mesh(patch, centered=True)
         material = Material(color, None, 0.0, 0.5)
         made.append(RawObject(obj_id, name, mesh, hull_size(mesh.vertices), material, None, False, (), (), None))
+    return _dress(made) if textured else made
+
+
+def _dress(plain: list[RawObject]) -> list[RawObject]:
+    """Solids in all SCALES, each with a texture of its own by cube projection."""
+    made = []
+    for scale in SCALES:
+        for raw in plain:
+            mesh = replace(raw.mesh, vertices=raw.mesh.vertices * np.array(scale, np.float32))
+            mesh = project_from_box(replace(mesh, normals=_normalize(mesh.normals / np.array(scale, np.float32))))
+            mesh = replace(mesh, uv=(mesh.uv / REPEAT + 0.5).astype(np.float32))
+            index = len(made)
+            (texture,) = surface_textures(1, index)
+            material = Material((1.0, 1.0, 1.0), texture, 0.0, 0.5)
+            made.append(replace(raw, obj_id=index + 1, name=f"{raw.name}_{index}", mesh=mesh, hull=hull_size(mesh.vertices), material=material))
     return made
+
+
+def _normalize(vectors: np.ndarray) -> np.ndarray:
+    """Unit vectors (N, 3) float32."""
+    return (vectors / np.linalg.norm(vectors, axis=1, keepdims=True)).astype(np.float32)

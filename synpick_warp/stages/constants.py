@@ -38,7 +38,7 @@ GRIPPER_HOME = (3.0, 0.0, 1.0)
 class SceneData:
     """Constants of the kernels: one struct for each subject, and the modes of the splits: `modes` has one `ModeData` each.
 
-    `tries_another`: whether failed attempts are counted by instance (`pick.retry`).
+    `tries_another`: whether failed attempts are counted by instance (`pick.retry`); `upright`: of the settings `arrangement`.
     """
 
     layout: structs.LayoutData
@@ -54,6 +54,7 @@ class SceneData:
     bins: structs.BinData
     looks: LookTable
     tries_another: bool = False
+    upright: float = 0.0
 
 
 def fill(kind: Any, *sections: Any, **derived: Any) -> Any:
@@ -109,6 +110,7 @@ def make_scene_data(config: schema.Config, catalog: Catalog, built: build.BuiltM
         bin_data(config.cell.bins, config.bins, config.move, built.layout.parts, device, built.fields),
         build_look_table(Looks(config.randomize, (), ()), 0, device),
         config.pick.retry == ANOTHER,
+        config.arrangement.upright,
     )
 
 

@@ -9,11 +9,15 @@ from synpick_warp.kernels.rng import normal_pair, pixel_key, uniform, view_key
 
 wp.set_module_options({"enable_backward": False})
 
-EffectParameters = wp.types.vector(length=9, dtype=float)
+EffectParameters = wp.types.vector(length=11, dtype=float)
 """Effect parameters of a view, by `Effect`: exposure, red, blue [EV], vignette, chromatic aberration [px], blur [px], shot noise, read
-noise, JPEG quality; zero: off."""
+noise, JPEG quality, contrast, saturation; zero: off."""
 BLUR_REACH = wp.constant(3.0)
 """The blur kernel is cut at this many standard deviations: 0.3 % of a Gaussian lie beyond."""
+
+
+LUMA = wp.constant(wp.vec3(0.299, 0.587, 0.114))
+"""Weights of red, green and blue in luma (ITU-R BT.601)."""
 
 
 @wp.struct
@@ -48,12 +52,33 @@ def sample_effects_kernel(
     world = views.world[view]
     key = view_key(ranges.seed, episode[world], frame[world], views.camera[view], Stream.EFFECTS)
     parameters = EffectParameters()
-    for index in range(wp.static(int(Effect.JPEG_QUALITY))):
+    for index in range(wp.static(len(Effect))):
         parameters[index] = ranges.low[index] + (ranges.high[index] - ranges.low[index]) * uniform(key, index)
     lowest = ranges.low[Effect.JPEG_QUALITY]
     highest = ranges.high[Effect.JPEG_QUALITY]
     parameters[Effect.JPEG_QUALITY] = wp.min(lowest + wp.floor((highest - lowest + 1.0) * uniform(key, Effect.JPEG_QUALITY)), highest)
     effects_out[view] = parameters
+
+
+@wp.func
+def adjust_display(color: wp.vec3ub, parameters: EffectParameters) -> wp.vec3ub:
+    """Contrast c and saturation s of a camera's processing: y = 1/2 + (1 + c)(x - 1/2), then Y + (1 + s)(y - Y) with the luma Y of
+    ITU-R BT.601, clipped and rounded; of sRGB values in 0..1."""
+    contrast = parameters[Effect.CONTRAST]
+    saturation = parameters[Effect.SATURATION]
+    if contrast == 0.0 and saturation == 0.0:
+        return color
+    value = wp.vec3(float(color[0]), float(color[1]), float(color[2])) / 255.0
+    value = wp.vec3(0.5, 0.5, 0.5) + (1.0 + contrast) * (value - wp.vec3(0.5, 0.5, 0.5))
+    luma = wp.dot(LUMA, value)
+    value = wp.vec3(luma, luma, luma) + (1.0 + saturation) * (value - wp.vec3(luma, luma, luma))
+    return wp.vec3ub(to_byte(value[0]), to_byte(value[1]), to_byte(value[2]))
+
+
+@wp.func
+def to_byte(value: float) -> wp.uint8:
+    """A value of 0..1 as a byte, clipped and rounded."""
+    return wp.uint8(int(255.0 * wp.clamp(value, 0.0, 1.0) + 0.5))
 
 
 @wp.kernel

@@ -1,4 +1,5 @@
-"""Post-processing of linear radiance to sRGB bytes: lens, exposure, sensor noise, tone map, sRGB transfer curve, in this order."""
+"""Post-processing of linear radiance to sRGB bytes: lens, exposure, sensor noise, tone map, sRGB transfer curve, contrast, in this
+order."""
 
 import warp as wp
 
@@ -8,6 +9,7 @@ from synpick_warp.kernels.render.images.camera_effects import (
     BLUR_REACH,
     EffectParameters,
     add_sensor_noise,
+    adjust_display,
     channel_magnification,
     color_gains,
     corner_slope,
@@ -194,7 +196,8 @@ def postprocess_effects_kernel(
     # Out:
     color_out: wp.array3d[wp.vec3ub],  # (view, row, column)
 ):
-    """Radiance to sRGB with camera effects: lens, exposure and white balance, sensor noise, tone map, transfer curve.
+    """Radiance to sRGB with camera effects: lens, exposure and white balance, sensor noise, tone map, transfer curve,
+    contrast and saturation.
 
     After `filter_lens_rows_kernel` the lens filter's second pass, along columns, reads `image.radiance` alone, else the vignette is applied
     here. Noise is that of the random number stream (seed, episode, frame, camera, COLOR_NOISE). `color_out` receives red, green, blue
@@ -219,6 +222,7 @@ def postprocess_effects_kernel(
     value = wp.cw_mul(value, color_gains(parameters))
     key = view_key(settings.seed, episode[world], frame[world], camera, Stream.COLOR_NOISE)
     value = add_sensor_noise(value, parameters, key, row * grid.width + column)
-    color_out[view, row, column] = wp.vec3ub(
+    color = wp.vec3ub(
         encode_display(value[0], settings.tone), encode_display(value[1], settings.tone), encode_display(value[2], settings.tone)
     )
+    color_out[view, row, column] = adjust_display(color, parameters)

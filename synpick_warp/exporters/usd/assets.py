@@ -32,7 +32,8 @@ from synpick_warp.scenes.bins import Bin
 from synpick_warp.scenes.grippers.head import rod_inertia
 from synpick_warp.scenes.grippers.mechanism import finger_collider, finger_fixture
 from synpick_warp.scenes.grippers.registry import make_head
-from synpick_warp.scenes.looks import Looks, project_from_box
+from synpick_warp.scenes.looks import Looks
+from synpick_warp.scenes.modelling import project_from_box
 from synpick_warp.scenes.tote import FLOOR_DROP, TABLE_ROUGHNESS, TABLE_SIZE
 from synpick_warp.scenes.types import Catalog, CatalogEntry, ConvexPiece, EnvironmentMap, Fixture, Material, TriangleMesh
 

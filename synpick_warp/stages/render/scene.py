@@ -22,7 +22,8 @@ from synpick_warp.kernels.render.visibility.gbuffer import FAR, Meshes, Table
 from synpick_warp.kernels.render.visibility.lens import BEND, FIRST, FISHEYE_MODEL, MODEL, NUMBERS, RADIUS, STRETCH, Lenses
 from synpick_warp.scenes.assets.appearance import linear_to_srgb, srgb_to_linear
 from synpick_warp.scenes.environment import LUMINANCE
-from synpick_warp.scenes.looks import Looks, project_from_box
+from synpick_warp.scenes.looks import Looks
+from synpick_warp.scenes.modelling import project_from_box
 from synpick_warp.scenes.tote import TABLE_ROUGHNESS
 from synpick_warp.scenes.types import Camera, Catalog, EnvironmentMap, Fixture, Interior, Material, TriangleMesh
 from synpick_warp.stages.render.light_tables import (

@@ -81,6 +81,8 @@ def drop_objects(scene: SceneData, state: WorldState, physics: Physics, seed: in
     sources = (scene, state, physics.state, physics.control)
     launch(drop.reset_worlds_kernel, len(state.phase), *sources)
     launch(drop.drop_objects_kernel, len(state.phase), *sources, seed=wp.uint64(seed))
+    if scene.upright > 0.0:
+        launch(drop.raise_objects_kernel, state.catalog_index.shape, *sources, seed=wp.uint64(seed))
     physics.load(state.variant, state.restarted)
 
 

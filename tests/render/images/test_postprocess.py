@@ -287,6 +287,8 @@ ALL = {
     "shot_noise": (0.01, 0.05),
     "read_noise": (0.001, 0.01),
     "jpeg_quality": (40, 95),
+    "contrast": (-0.2, 0.6),
+    "saturation": (-0.5, 1.0),
 }
 
 
