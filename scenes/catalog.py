@@ -203,10 +203,14 @@ def _read_folder(folder: Path, rules: _Rules, report: Callable[[str], None], fau
 
 
 def _embedded_objects(rules: _Rules, faults: _Faults, catalog: Sequence[str]) -> list[RawObject]:
-    """Embedded objects that fit into the bins; beside a `catalog` household objects without a name of it, or else geometric solids."""
+    """Embedded objects that fit into the bins; beside a `catalog` household objects without a name of it, or else geometric solids.
+
+    With procedural surfaces these are the solids, textured: household objects look like those of real data sets.
+    """
     raws = []
-    made = procedural_objects((HOUSEHOLD,) if catalog else rules.objects.embedded)
-    for raw in [raw for raw in made if raw.name not in catalog] or solids(rules.surfaces > 0):
+    textured = bool(catalog) and rules.surfaces > 0
+    made = [] if textured else procedural_objects((HOUSEHOLD,) if catalog else rules.objects.embedded)
+    for raw in [raw for raw in made if raw.name not in catalog] or solids(textured):
         try:
             _check_size(raw, raw.name, rules.bins)
         except CatalogError as error:

@@ -53,7 +53,10 @@ class Looks:
 
 
 def load_looks(randomize: Randomize, report: Callable[[str], None], strict: bool = False) -> Looks | None:
-    """Load the textures that settings name, and make the procedural ones; None: nothing is randomized. Arguments and errors as of `load_textures`."""
+    """Load the textures that settings name, and make the procedural ones; None: nothing is randomized.
+
+    Arguments and errors as of `load_textures`.
+    """
     if randomize == Randomize():
         return None
     names = ("bin_textures", "table_textures", "background_textures")

@@ -52,7 +52,11 @@ class Effects:
     )
     jpeg_quality: tuple[int, int] = setting((0, 0), "", "JPEG quality; 0, 0: bop.jpeg_quality.", low=0, high=100)
     contrast: tuple[float, float] = setting(
-        (0.0, 0.0), "", "Relative change of the contrast of sRGB values about their middle, as by a camera's processing.", low=-0.9, high=4.0
+        (0.0, 0.0),
+        "",
+        "Relative change of the contrast of sRGB values about their middle, as by a camera's processing.",
+        low=-0.9,
+        high=4.0,
     )
     saturation: tuple[float, float] = setting(
         (0.0, 0.0), "", "Relative change of the difference of sRGB values to their luma; -1: grey.", low=-1.0, high=4.0

@@ -187,8 +187,8 @@ class Randomize:
     surfaces: int = setting(
         0,
         "",
-        "Procedural textures (carpet, boards, checks, print, clutter) of table and floor, beside those of folders; with them the geometric "
-        "solids among distractors are textured, too.",
+        "Procedural textures (carpet, boards, checks, print, clutter) of table and floor, beside those of folders. With them, "
+        "distractors of no folder are geometric solids with such textures.",
         low=0,
         high=MOST_CHOICES // 2,
     )
@@ -220,7 +220,8 @@ class Randomize:
     distractor_models: str = setting(
         "",
         "",
-        "Folder of distractors, as bake.models; empty: the embedded objects that the catalog lacks, or, if it has all, geometric solids.",
+        "Folder of distractors, as bake.models; empty: the embedded objects that the catalog lacks, or, if it has all or with surfaces, "
+        "geometric solids.",
         path=True,
     )
     exposure: Distribution = setting(_NONE, "EV", "Exposure offset, in place of what render.exposure_spread draws.", low=-5.0, high=5.0)

@@ -1,4 +1,4 @@
-"""Geometric solids of plain colours, or of several sizes with procedural textures, as distractors beside the embedded objects (Tobin et al., IROS 2017). Lengths [m]."""
+"""Geometric solids as distractors beside the embedded objects (Tobin et al., IROS 2017), plain or textured. Lengths [m]."""
 
 from __future__ import annotations
 
@@ -69,7 +69,9 @@ def _dress(plain: list[RawObject]) -> list[RawObject]:
             index = len(made)
             (texture,) = surface_textures(1, index)
             material = Material((1.0, 1.0, 1.0), texture, 0.0, 0.5)
-            made.append(replace(raw, obj_id=index + 1, name=f"{raw.name}_{index}", mesh=mesh, hull=hull_size(mesh.vertices), material=material))
+            made.append(
+                replace(raw, obj_id=index + 1, name=f"{raw.name}_{index}", mesh=mesh, hull=hull_size(mesh.vertices), material=material)
+            )
     return made
 
 

@@ -6,6 +6,7 @@ more images keep those before them.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable
 
 import cv2
@@ -62,7 +63,8 @@ def _boards(rng: np.random.Generator, seed: int) -> np.ndarray:
     count = int(rng.integers(1, 7))
     stain = np.array(_color(rng)) / 255.0 * rng.uniform(0.6, 1.3)
     edges = np.linspace(0, SIDE, count + 1).round().astype(int)
-    boards = [wood(right - left, SIDE, seed + index) * rng.uniform(0.6, 1.0) for index, (left, right) in enumerate(zip(edges, edges[1:]))]
+    pairs = enumerate(itertools.pairwise(edges))
+    boards = [wood(right - left, SIDE, seed + index) * rng.uniform(0.6, 1.0) for index, (left, right) in pairs]
     mixed = np.concatenate(boards, axis=1) * (0.35 + 0.65 * stain)
     return np.clip(mixed, 0, 255).astype(np.uint8)
 

@@ -1,0 +1,208 @@
+"""Train a segmentation network on a stream alone, and score it on annotated photographs: mIoU, instances found, background.
+
+Each seed has piles, pictures and a network of its own; values are means over seeds with 95 % intervals. Held-out synthetic views are scored
+beside, so that the gap is seen. Needs PyTorch; the defaults are for a GPU.
+
+    python -m tools.reports.real --real REAL --models YCB --lights HDRI --views 24000 --seeds 3 --json real.json --pictures OUT
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+try:
+    import torch  # pyright: ignore[reportMissingImports]
+
+    from tools.reports.real.detector import average_precision, boxes_of, detect, train_detector
+    from tools.reports.real.scores import Scores, draw_overlay, interval, predict, score, score_pool
+    from tools.reports.real.training import Recipe, Trained, train
+    from tools.reports.real.views import Pool, Source, hold_out
+except ModuleNotFoundError as missing:
+    raise SystemExit(f"reports.real: {missing.name} is not installed; pip install torch") from None
+
+from rich.console import Console
+
+from synpick_warp.errors import ConfigError, SynpickError
+from synpick_warp.system.hardware.device import pick_device
+from tools.figures import describe_run
+from tools.options import Row, configure, fail, make_parser, positive_count, print_rows, write_json
+from tools.reports.real_frames import RealFrame, read_frames
+
+TRAINING, HELD_OUT = range(1_000_000), range(1_000_000, 1_100_000)
+"""Episodes to train on, and to measure on."""
+PRESET = "tabletop-train"
+"""Settings of the stream, unless --config names others."""
+MODELS = 21
+"""Largest obj_id: the networks have a class for each, and one for what is no object."""
+
+
+@dataclass(frozen=True, eq=False)
+class Outcome:
+    """What a seed gave."""
+
+    trained: Trained
+    real: Scores
+    synthetic: Scores
+    overlay: list[tuple[np.ndarray, np.ndarray, np.ndarray]]
+    precision: float
+    """AP50 of the detector; NaN: not trained."""
+
+
+def run_seed(options: argparse.Namespace, seed: int, frames: list[RealFrame], device: Any) -> Outcome:
+    """Train and score with one seed.
+
+    Raises:
+        SynpickError: A setting is wrong, or models or lights cannot be used.
+    """
+    fixed: dict[str, object] = {"bake.worlds": options.worlds, "bake.seed": options.seed + 1000 * seed}
+    fixed |= {"render.views_per_batch": options.batch, "bake.device": device.alias}
+    config = configure(options, fixed)
+    source = Source(config, TRAINING, options.stride, options.shrink)
+    recipe = Recipe(**{name: getattr(options, name) for name in Recipe.__dataclass_fields__})
+    target = torch.device(device.alias)
+    held = hold_out(replace(source, episodes=HELD_OUT), options.held_out)
+    trained, pool = train(source, recipe, 1 + MODELS, target, seed)
+    size = (int(held.images.shape[3]), int(held.images.shape[2])) if held.images is not None else (0, 0)
+    found = [predict(trained.network, frame.color, size, target) for frame in frames]
+    real = score([(frame.name, one, frame.label) for frame, one in zip(frames, found, strict=True)], 1 + MODELS)
+    overlay = [(frame.color, frame.label, one) for frame, one in zip(frames, found, strict=True)]
+    precision = _detector(options, pool, frames, size, target)
+    return Outcome(trained, real, score_pool(trained.network, held, 1 + MODELS), overlay, precision)
+
+
+def _detector(options: argparse.Namespace, pool: Pool, frames: list[RealFrame], size: tuple[int, int], device: Any) -> float:
+    """AP50 of a detector on real frames; NaN: none is asked for, or there is no torchvision, which is said."""
+    if not options.detector:
+        return float("nan")
+    network = train_detector(pool, 1 + MODELS, device, options.detector)
+    if network is None:
+        print("detector: torchvision is not installed; left out")
+        return float("nan")
+    return average_precision([detect(network, frame.color, size, device) for frame in frames], [boxes_of(frame.label) for frame in frames])
+
+
+def rows_of(outcomes: list[Outcome]) -> list[Row]:
+    """Values over seeds, and by object and frame."""
+
+    def row(name: str, values: list[float], unit: str = "", part: str = "") -> Row:
+        return Row(name, round(float(np.mean(values)), 4), " ".join(one for one in (unit, interval(values)) if one), part=part)
+
+    rows = [
+        row("real frames: mIoU", [one.real.mean_iou for one in outcomes]),
+        row("real frames: instances with IoU above 0.5", [100 * one.real.found for one in outcomes], "%"),
+        row("real frames: background taken for objects", [100 * one.real.background for one in outcomes], "%"),
+        row("synthetic, held out: mIoU", [one.synthetic.mean_iou for one in outcomes]),
+        row("synthetic, held out: instances with IoU above 0.5", [100 * one.synthetic.found for one in outcomes], "%"),
+        row("synthetic, held out: background taken for objects", [100 * one.synthetic.background for one in outcomes], "%"),
+    ]
+    precisions = [one.precision for one in outcomes if np.isfinite(one.precision)]
+    rows += [row("real frames: AP50 of the detector", precisions)] if precisions else []
+    rows += [
+        row("training, in all", [one.trained.seconds for one in outcomes], "s"),
+        row("of it the stream", [one.trained.stream_seconds for one in outcomes], "s"),
+        row("views", [float(one.trained.views) for one in outcomes]),
+        row("cross entropy at the end", [one.trained.losses[-1] for one in outcomes]),
+    ]
+    first = outcomes[0].real
+    rows += [row(f"obj_id {index}: IoU", [one.real.iou[index] for one in outcomes], part="object") for index in first.iou]
+    return rows + [row(f"{name}: mean IoU", [one.real.views[name] for one in outcomes], part="frame") for name in first.views]
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run the command line; returns the exit code."""
+    options = parse(arguments)
+    try:
+        frames = read_frames(options.real)
+        device = pick_device(options.device)
+        if options.pictures is not None and not options.pictures.is_dir():
+            raise ConfigError(f"--pictures is {options.pictures}; name a folder that exists")
+        outcomes = []
+        # A stream of its own: work on CUDA's default stream would wait for all that the renderer has queued.
+        with torch.cuda.stream(torch.cuda.Stream(device.alias) if device.is_cuda else None):
+            for seed in range(options.first_seed, options.first_seed + options.seeds):
+                outcome = run_seed(options, seed, frames, device)
+                outcomes.append(outcome)
+                print(_line(seed, outcome), flush=True)
+                if options.pictures is not None:
+                    draw_overlay(options.pictures / f"{options.name}_seed_{seed}.png", outcome.overlay, 1 + MODELS)
+                _write(options, outcomes)
+    except SynpickError as error:
+        return fail("reports.real", error)
+    print_rows(Console(), "", "photographs", rows_of(outcomes))
+    return 0
+
+
+def _line(seed: int, outcome: Outcome) -> str:
+    """What a seed gave, as a line."""
+    trained, real = outcome.trained, outcome.real
+    return (
+        f"seed {seed}: {trained.views} views, {trained.samples} samples, {trained.seconds:.1f} s (stream {trained.stream_seconds:.1f}); "
+        f"cross entropy {trained.losses[0]:.3f} to {trained.losses[-1]:.3f}; mIoU {real.mean_iou:.3f} (synthetic "
+        f"{outcome.synthetic.mean_iou:.3f}), found {100 * real.found:.0f} %, background {100 * real.background:.1f} %"
+    )
+
+
+def _write(options: argparse.Namespace, outcomes: list[Outcome]) -> None:
+    """Write the run so far as JSON, so that a killed one leaves its finished seeds."""
+    by_seed = [
+        {
+            "mean_iou": one.real.mean_iou,
+            "found": one.real.found,
+            "background": one.real.background,
+            "synthetic_mean_iou": one.synthetic.mean_iou,
+            "instances": one.real.instances,
+            "losses": one.trained.losses,
+            "seconds": one.trained.seconds,
+            "stream_seconds": one.trained.stream_seconds,
+            "views": one.trained.views,
+            "samples": one.trained.samples,
+            "ap50": one.precision if np.isfinite(one.precision) else None,
+        }
+        for one in outcomes
+    ]
+    write_json(options.json, describe_run("tools.reports.real", (), rows_of(outcomes), name=options.name, seeds=by_seed))
+
+
+def parse(arguments: list[str] | None) -> argparse.Namespace:
+    """Parse the command line."""
+    parser = make_parser(__doc__, "config", "device", "models", "lights", "seed", "set", "json", config=PRESET)
+    parser.add_argument("--real", type=Path, required=True, help="folder of annotated frames, as tools.reports.real_frames reads them")
+    counts = {
+        "views": (24_000, "views of the stream"),
+        "seeds": (3, "trainings, each with piles of its own"),
+        "worlds": (512, "worlds simulated in parallel"),
+        "batch": (48, "views of a batch"),
+        "width": (48, "channels of the network's first level"),
+        "stride": (2, "every n-th frame of an episode is taken"),
+        "shrink": (1, "factor by which the stream's images are reduced"),
+        "capacity": (48_000, "views in the pool, at most"),
+        "held_out": (400, "synthetic views to measure on"),
+    }
+    for name, (default, text) in counts.items():
+        flag = f"--{name.replace('_', '-')}"
+        parser.add_argument(flag, type=positive_count, default=default, help=f"{text} (default: {default})")
+    numbers = {
+        "passes": (4.0, "how often a view is trained on"),
+        "seconds": (280.0, "time limit of a training with its stream [s]"),
+        "scale": (1.5, "largest factor of augmentation by size; 1: no geometric augmentation"),
+        "rotation": (15.0, "half width of augmentation by rotation [°]"),
+        "jitter": (0.3, "strength of photometric augmentation; 0: none"),
+        "background": (1.0, "weight of the background in the loss"),
+        "detector": (0.0, "seconds to train a detector; 0: none"),
+    }
+    for name, (default, text) in numbers.items():
+        parser.add_argument(f"--{name}", type=float, default=default, help=f"{text} (default: {default:g})")
+    parser.add_argument("--first-seed", type=int, default=0, help="first seed (default: 0)")
+    parser.add_argument("--name", default="real", help="name of the run, in files (default: real)")
+    parser.add_argument("--pictures", type=Path, metavar="DIR", help="write overlays of all frames to this folder")
+    return parser.parse_args(arguments)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,214 @@
+"""Ablation of what the pictures of a stream differ in, on several GPUs, within a time: each lever off, amounts of views, renderers.
+
+Each run is a process of `tools.reports.real` with one seed. Runs start in the order of their priority on the next free GPU, those of a
+first seed before those of a second; one that would not end by the deadline is left out, which is said, and runs that --out has already are
+not repeated. Rows of results are written as they come. Without --out, the plan is printed: runs, expected seconds, and when they would end.
+
+    python -m tools.reports.real.ablation --real REAL --models YCB --lights HDRI --gpus 4 --deadline 1400 --out OUT
+"""
+
+from __future__ import annotations
+
+import argparse
+import heapq
+import json
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy import stats
+
+from tools.options import make_parser, positive_count, write_json
+
+START = 30.0
+"""Imports, kernels from the cache, models and lights, first piles [s]."""
+STREAM_RATE = 500.0
+"""Views/s of still piles at 320x240 with 512 worlds: 8 views a pile, some 35 ticks to settle; the renderer alone makes 1,500."""
+REFERENCE_RATE = 30.0
+"""Views/s of mode reference at 320x240 and 64 paths."""
+TRAIN_RATE = 700.0
+"""Samples/s of the U-Net of width 48 at 320x240 in bfloat16 on an H100: 0.17 TFLOP a sample."""
+SLACK = 1.15
+"""Factor on expected times, for whether a run still starts."""
+METRICS = ("mean_iou", "found", "background", "synthetic_mean_iou", "ap50")
+"""Values of a seed that are collected."""
+PASSES = 6.0
+"""Passes of the runs of an ablation."""
+MIN_STEP_VIEWS = 48_000
+"""Samples that every run trains on at least: little data, as long a training."""
+
+_OFF = "[0.0, 0.0]"
+_EFFECTS = ("vignette", "chromatic_aberration", "blur", "shot_noise", "read_noise", "contrast", "saturation")
+LEVERS: dict[str, tuple[str, ...]] = {
+    "surfaces": ("randomize.surfaces=0", "randomize.table_color={uniform=[[0.05,0.05,0.05],[0.9,0.9,0.9]]}"),
+    "distractors": ("randomize.distractors=off",),
+    "effects": ("effects.exposure_jitter=0", "effects.white_balance_jitter=0", *(f"effects.{name}={_OFF}" for name in _EFFECTS)),
+    "contrast": (f"effects.contrast={_OFF}", f"effects.saturation={_OFF}"),
+    "standing": ("arrangement.upright=0",),
+    "lights": ("randomize.lamps=off", "randomize.exposure=off", "effects.exposure_jitter=0"),
+    "materials": ("randomize.object_hue=off", "randomize.object_brightness=off", "randomize.object_roughness=off"),
+    "edge of the table": ("render.table_size=[0,0]",),
+}
+"""Settings that take a lever away, by its name."""
+
+
+@dataclass(frozen=True)
+class Run:
+    """Runs of one row: arguments of `tools.reports.real` besides the shared ones, and expected time [s]."""
+
+    name: str
+    views: int
+    arguments: tuple[str, ...] = ()
+    seeds: int = 3
+    passes: float = PASSES
+    rate: float = STREAM_RATE
+    limit: float = 280.0
+    """Limit of a training with its stream [s]."""
+
+    @property
+    def seconds(self) -> float:
+        """Expected time of one seed."""
+        return START + min(self.limit, self.views / self.rate + self.views * self.passes / TRAIN_RATE) + 400 / self.rate
+
+    def command(self, options: argparse.Namespace, seed: int, gpu: int, stem: str) -> list[str]:
+        """Command line of one seed."""
+        shared = ["--real", options.real, "--models", options.models, "--lights", options.lights, "--device", f"cuda:{gpu}"]
+        own = ["--views", str(self.views), "--passes", f"{self.passes:g}", "--seconds", f"{self.limit:g}", "--seeds", "1"]
+        files = ["--first-seed", str(seed), "--json", f"{stem}.json", "--name", Path(stem).name, "--pictures", str(Path(stem).parent)]
+        return [sys.executable, "-m", "tools.reports.real", *shared, *own, *files, *self.arguments, *options.pass_on]
+
+
+def _settings(*assignments: str) -> tuple[str, ...]:
+    """Arguments of settings."""
+    return tuple(word for one in assignments for word in ("--set", one))
+
+
+def plan(views: int, main_views: int) -> Iterator[Run]:
+    """All rows in the order of priority."""
+    tote = ("--config", "synpick", "--stride", "3", *_settings("bake.mode=mixed", "cameras.resolution=[320,240]"))
+    yield Run("all levers", main_views, ("--detector", "60"), passes=4.0)
+    yield Run("all levers, ablation's number of views", views)
+    yield Run("tote, not randomized", views, (*tote, "--worlds", "64"))
+    for name, settings in LEVERS.items():
+        yield Run(f"without {name}", views, _settings(*settings))
+    yield Run("without augmentation of the tensors", views, ("--scale", "1", "--jitter", "0"))
+    yield Run("without photometric augmentation", views, ("--jitter", "0"))
+    for amount in (1000, 3000):
+        yield Run(f"{amount:,} views", amount, passes=MIN_STEP_VIEWS / amount)
+    yield Run("200,000 views", 200_000, ("--capacity", "40000"), seeds=1, passes=2.0, limit=560.0)
+    yield Run("2,000 views, fast", 2000, seeds=2, passes=MIN_STEP_VIEWS / 2000)
+    traced = _settings("render.mode=reference", "render.samples=64")
+    yield Run("2,000 views, path-traced", 2000, (*traced, "--held-out", "60"), 2, MIN_STEP_VIEWS / 2000, REFERENCE_RATE)
+    yield Run("without shadows and bounces", views, _settings("render.mode=unoccluded"))
+
+
+def order(rows: list[Run]) -> list[tuple[Run, int]]:
+    """Runs in the order in which they start: the first rows with all seeds, the others by seed."""
+    first = [(run, seed) for run in rows[:2] for seed in range(run.seeds)]
+    rest = [(run, seed) for seed in range(3) for run in rows[2:] if seed < run.seeds]
+    return first + rest
+
+
+def print_plan(jobs: list[tuple[Run, int]], gpus: int, deadline: float) -> None:
+    """Print when each run would start and end on as many GPUs."""
+    free = [0.0] * gpus
+    for run, seed in jobs:
+        start = heapq.heappop(free)
+        ends = start + run.seconds
+        late = " (left out)" if start + SLACK * run.seconds > deadline else ""
+        heapq.heappush(free, start if late else ends)
+        print(f"{start:6.0f} to {ends:6.0f} s  {run.seconds:4.0f} s  seed {seed}  {run.name}{late}")
+
+
+def execute(jobs: list[tuple[Run, int]], options: argparse.Namespace) -> None:
+    """Run all that fits before the deadline, one process a GPU."""
+    started = time.monotonic()
+    waiting = [(run, seed) for run, seed in jobs if not (options.out / f"{stem_of(run, seed)}.json").exists()]
+    running = dict[int, tuple[subprocess.Popen[bytes], Run, int, Any]]()
+    while waiting or running:
+        left = options.deadline - (time.monotonic() - started)
+        for gpu, (process, run, seed, log) in list(running.items()):
+            if left < 0:
+                process.kill()
+            if process.poll() is not None:
+                log.close()
+                print(
+                    f"{time.monotonic() - started:6.0f} s  gpu {gpu}  seed {seed}  {run.name}: exit code {process.returncode}", flush=True
+                )
+                del running[gpu]
+                write_json(options.out / "real_ablation.json", collect(options.out, jobs))
+        for gpu in sorted(set(range(options.gpus)) - running.keys()):
+            if not waiting:
+                break
+            run, seed = waiting.pop(0)
+            if SLACK * run.seconds > left:
+                print(f"left out: seed {seed} of {run.name} needs {run.seconds:.0f} s, {left:.0f} s are left", flush=True)
+                continue
+            stem = str(options.out / stem_of(run, seed))
+            log = open(f"{stem}.log", "wb")  # noqa: SIM115
+            process = subprocess.Popen(run.command(options, seed, gpu, stem), stdout=log, stderr=subprocess.STDOUT)
+            running[gpu] = (process, run, seed, log)
+        time.sleep(0.5)
+
+
+def stem_of(run: Run, seed: int) -> str:
+    """Name of a run's files without suffix."""
+    words = "".join(letter if letter.isalnum() else "_" for letter in run.name)
+    return f"{words}_{seed}"
+
+
+def collect(folder: Path, jobs: list[tuple[Run, int]]) -> dict[str, Any]:
+    """Means over seeds of all rows that have results, with 95 % intervals by Student's t, and their seeds."""
+    rows = []
+    for run in dict.fromkeys(run for run, _ in jobs):
+        paths = [folder / f"{stem_of(run, seed)}.json" for seed in range(run.seeds)]
+        seeds = [json.loads(path.read_text())["more"]["seeds"][0] for path in paths if path.exists()]
+        if not seeds:
+            continue
+        row: dict[str, Any] = {"name": run.name, "views": run.views, "seeds": len(seeds)}
+        for metric in METRICS:
+            values = [seed[metric] for seed in seeds if seed.get(metric) is not None]
+            if values:
+                reach = (
+                    float(stats.t.ppf(0.975, len(values) - 1) * np.std(values, ddof=1) / len(values) ** 0.5) if len(values) > 1 else None
+                )
+                row[metric] = {
+                    "mean": round(float(np.mean(values)), 4),
+                    "reach": None if reach is None else round(reach, 4),
+                    "values": values,
+                }
+        row["seconds"] = [round(seed["seconds"], 1) for seed in seeds]
+        row["stream_seconds"] = [round(seed["stream_seconds"], 1) for seed in seeds]
+        rows.append(row)
+    return {"rows": rows}
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run the command line; returns the exit code."""
+    parser = make_parser(__doc__, "models", "lights")
+    parser.add_argument("--real", required=True, help="folder of annotated frames")
+    parser.add_argument("--gpus", type=positive_count, default=4, help="GPUs of the host (default: 4)")
+    parser.add_argument("--deadline", type=float, default=1400.0, help="seconds after which nothing runs (default: 1400)")
+    parser.add_argument("--views", type=positive_count, default=8000, help="views of the rows of the ablation (default: 8000)")
+    parser.add_argument("--main-views", type=positive_count, default=24_000, help="views of the first row (default: 24000)")
+    parser.add_argument("--out", type=Path, help="existing folder to write to; without it the plan is printed")
+    parser.add_argument("pass_on", nargs="*", help="more arguments of tools.reports.real for all runs, after --")
+    options = parser.parse_args(arguments)
+    jobs = order(list(plan(options.views, options.main_views)))
+    if options.out is None:
+        print_plan(jobs, options.gpus, options.deadline)
+    elif not options.out.is_dir():
+        print(f"reports.real.ablation: --out is {options.out}; name a folder that exists", file=sys.stderr)
+        return 2
+    else:
+        execute(jobs, options)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,104 @@
+"""Faster R-CNN (Ren et al., NeurIPS 2015) of torchvision, from scratch, trained on a pool of views; AP at an IoU of 0.5 on real frames."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from typing import Any
+
+import cv2
+import numpy as np
+import torch  # pyright: ignore[reportMissingImports]
+
+from tools.reports.real.training import jitter_views
+from tools.reports.real.views import Pool
+
+RATE, MOMENTUM, DECAY = 0.02, 0.9, 1e-4
+"""SGD as of Mask R-CNN (He et al., ICCV 2017)."""
+MIN_SIDE = 6
+"""Least width and height of a box that is trained on [px]."""
+JITTER = 0.3
+"""Strength of photometric changes."""
+
+
+def boxes_of(classes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Boxes (N, 4) float32 [px], exclusive maxima, and obj_ids (N) of objects in a label image, of at least MIN_SIDE each way."""
+    boxes, ids = [], []
+    for index in np.unique(classes[classes > 0]):
+        rows, columns = np.nonzero(classes == index)
+        box = (columns.min(), rows.min(), columns.max() + 1, rows.max() + 1)
+        if min(box[2] - box[0], box[3] - box[1]) >= MIN_SIDE:
+            boxes.append(box)
+            ids.append(int(index))
+    return np.array(boxes, np.float32).reshape(-1, 4), np.array(ids, np.int64)
+
+
+def train_detector(pool: Pool, classes: int, device: torch.device, seconds: float, batch: int = 16) -> Any:
+    """Train on the views of a pool for so many seconds; None without torchvision."""
+    try:
+        from torchvision.models.detection import fasterrcnn_mobilenet_v3_large_fpn  # pyright: ignore[reportMissingImports]
+    except ImportError:
+        return None
+    assert pool.images is not None
+    assert pool.classes is not None
+    height, width = pool.images.shape[2:]
+    network = fasterrcnn_mobilenet_v3_large_fpn(
+        weights=None, weights_backbone=None, num_classes=classes, trainable_backbone_layers=6, min_size=2 * height, max_size=2 * width
+    ).to(device)
+    optimizer = torch.optim.SGD(network.parameters(), RATE, momentum=MOMENTUM, weight_decay=DECAY)
+    truth: dict[int, dict[str, torch.Tensor]] = {}
+    started, random = time.perf_counter(), np.random.default_rng(pool.seed)
+    while (done := (time.perf_counter() - started) / seconds) < 1.0:
+        optimizer.param_groups[0]["lr"] = RATE * min(1.0, 20 * done) * (1.0 if done < 0.7 else 0.1)
+        chosen = random.integers(pool.count, size=batch).tolist()
+        for index in chosen:
+            if index not in truth:
+                boxes, ids = boxes_of(pool.classes[index].cpu().numpy())
+                truth[index] = {"boxes": torch.from_numpy(boxes).to(device), "labels": torch.from_numpy(ids).to(device)}
+        images = jitter_views(pool.images[chosen].float() / 255, JITTER)
+        losses = network(list(images), [truth[index] for index in chosen])
+        optimizer.zero_grad()
+        sum(losses.values()).backward()
+        torch.nn.utils.clip_grad_norm_(network.parameters(), 5.0)
+        optimizer.step()
+    return network.eval()
+
+
+def detect(network: Any, color: np.ndarray, size: tuple[int, int], device: torch.device) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Boxes (N, 4) [px of `color`], obj_ids and confidences of an image (H, W, 3) uint8, which the network sees at `size`."""
+    small = cv2.resize(color, size, interpolation=cv2.INTER_AREA)
+    with torch.no_grad():
+        (found,) = network([torch.from_numpy(small).permute(2, 0, 1).float().div(255).to(device)])
+    scale = np.array([color.shape[1] / size[0], color.shape[0] / size[1]] * 2)
+    boxes, ids, confidence = (found[name].cpu().numpy() for name in ("boxes", "labels", "scores"))
+    return boxes * scale, ids, confidence
+
+
+def average_precision(found: Sequence[tuple[np.ndarray, np.ndarray, np.ndarray]], truth: Sequence[tuple[np.ndarray, np.ndarray]]) -> float:
+    """AP at an IoU of 0.5, the area under the interpolated curve (PASCAL VOC 2010), averaged over the objects that occur."""
+    values = []
+    for index in sorted({int(one) for _, ids in truth for one in ids}):
+        hits: list[tuple[float, bool]] = []
+        for (boxes, ids, confidence), (true_boxes, true_ids) in zip(found, truth, strict=True):
+            free = list(true_boxes[true_ids == index])
+            order = np.flatnonzero(ids == index)
+            for one in order[np.argsort(-confidence[order])]:
+                overlaps = [_overlap(boxes[one], box) for box in free]
+                hit = bool(overlaps) and max(overlaps) >= 0.5
+                if hit:
+                    free.pop(int(np.argmax(overlaps)))
+                hits.append((float(confidence[one]), hit))
+        count = sum(int((ids == index).sum()) for _, ids in truth)
+        correct = np.cumsum([hit for _, hit in sorted(hits, key=lambda one: -one[0])])
+        precision = correct / np.arange(1, len(correct) + 1)
+        envelope = np.maximum.accumulate(precision[::-1])[::-1] if len(correct) else precision
+        values.append(float(np.sum(envelope * np.diff(np.concatenate([[0], correct])) / count)))
+    return float(np.mean(values)) if values else float("nan")
+
+
+def _overlap(first: np.ndarray, second: np.ndarray) -> float:
+    """IoU of two boxes."""
+    low, high = np.maximum(first[:2], second[:2]), np.minimum(first[2:], second[2:])
+    common = float(np.prod(np.maximum(high - low, 0)))
+    areas = float(np.prod(first[2:] - first[:2]) + np.prod(second[2:] - second[:2]))
+    return common / max(areas - common, 1e-9)

@@ -1,0 +1,172 @@
+"""Training of the U-Net of `tools.examples.train_online` (Ronneberger et al., MICCAI 2015) from a pool of views, with augmentation.
+
+AdamW with a warm-up and a cosine schedule, mixed precision (bfloat16) on a GPU. Augmentation is geometric (scale, rotation, shift, mirrored
+borders) and photometric (gain, contrast, saturation, gamma, blur, noise), each image by its own draw.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from dataclasses import dataclass
+
+import torch  # pyright: ignore[reportMissingImports]
+from torch import nn  # pyright: ignore[reportMissingImports]
+from torch.nn import functional  # pyright: ignore[reportMissingImports]
+
+from tools.examples.train_online import LEARNING_RATE, WARM_UP, Network
+from tools.reports.real.views import Pool, Source
+
+LUMA = (0.299, 0.587, 0.114)
+"""Weights of red, green and blue in luma (ITU-R BT.601)."""
+LEAST_RATE = 0.01
+"""Fraction of the learning rate at which the schedule ends."""
+MAX_NORM = 5.0
+"""Norm to which gradients are clipped."""
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """Hyper-parameters, none of which is chosen on real pictures."""
+
+    views: int
+    """Views of the stream."""
+    passes: float
+    """How often a view is trained on, on average."""
+    batch: int
+    width: int
+    """Channels of the network's first level."""
+    seconds: float
+    """Time limit of a training with its stream [s]: the schedule ends by then."""
+    capacity: int
+    """Views in the pool, at most."""
+    scale: float = 1.5
+    """Largest factor of the size, and 1 / it the smallest."""
+    rotation: float = 15.0
+    """Half width of the angle [°]."""
+    jitter: float = 0.3
+    """Strength of photometric changes; 0: none."""
+    background: float = 1.0
+    """Weight of pixels without object in the loss."""
+
+
+@dataclass(frozen=True, eq=False)
+class Trained:
+    """A trained network, the loss over its training, and times [s]."""
+
+    network: nn.Module
+    losses: list[float]
+    """Of ten parts of the training."""
+    stream_seconds: float
+    seconds: float
+    """In all."""
+    views: int
+    samples: int
+    """Views trained on, repeats counted."""
+
+
+def warp_views(images: torch.Tensor, classes: torch.Tensor, recipe: Recipe) -> tuple[torch.Tensor, torch.Tensor]:
+    """Scale, rotate and shift views; beyond their borders they are mirrored. images (B, 3, H, W) float32, classes (B, H, W) int64."""
+    count, height, width = classes.shape
+    draw = torch.rand(4, count, device=images.device) * 2 - 1
+    factor, angle = recipe.scale ** -draw[0], draw[1] * math.radians(recipe.rotation)
+    cosine, sine = factor * angle.cos(), factor * angle.sin()
+    room = (factor - 1).abs()
+    aspect = height / width
+    rows = [torch.stack([cosine, -sine * aspect, room * draw[2]], 1), torch.stack([sine / aspect, cosine, room * draw[3]], 1)]
+    grid = functional.affine_grid(torch.stack(rows, 1), [count, 1, height, width], align_corners=False)
+    images = functional.grid_sample(images, grid, "bilinear", "reflection", align_corners=False)
+    labels = functional.grid_sample(classes[:, None].float(), grid, "nearest", "reflection", align_corners=False)
+    return images, labels[:, 0].round().long()
+
+
+def jitter_views(images: torch.Tensor, strength: float) -> torch.Tensor:
+    """Photometric changes of images (B, 3, H, W) in 0..1: gain and balance, contrast, saturation, gamma, blur of half, noise."""
+
+    def spread(channels: int, width: float) -> torch.Tensor:
+        return torch.exp(width * strength * (torch.rand(len(images), channels, 1, 1, device=images.device) * 2 - 1))
+
+    luma = images.new_tensor(LUMA).view(1, 3, 1, 1)
+    images = images * spread(1, 1.0) * spread(3, 0.4)
+    mean = (images * luma).sum(1, keepdim=True).mean((2, 3), keepdim=True)
+    images = mean + spread(1, 1.0) * (images - mean)
+    grey = (images * luma).sum(1, keepdim=True)
+    images = (grey + spread(1, 1.5) * (images - grey)).clamp(1e-4, 1.0) ** spread(1, 1.0)
+    blurred = functional.avg_pool2d(functional.pad(images, (1, 1, 1, 1), "replicate"), 3, 1)
+    share = torch.rand(len(images), 1, 1, 1, device=images.device)
+    images = images + torch.clamp(2 * share - 1, 0) * (blurred - images)
+    level = 0.2 * strength * torch.rand(len(images), 1, 1, 1, device=images.device) ** 2
+    return (images + level * torch.randn_like(images)).clamp(0, 1)
+
+
+def _prepare(images: torch.Tensor, classes: torch.Tensor, recipe: Recipe) -> tuple[torch.Tensor, torch.Tensor]:
+    """Augmented views as the network takes them: float32 in -0.5..0.5."""
+    values = images.float() / 255
+    if recipe.scale > 1:
+        values, classes = warp_views(values, classes, recipe)
+    if recipe.jitter:
+        values = jitter_views(values, recipe.jitter)
+    return values - 0.5, classes
+
+
+class _Trainer:
+    """One training: network, optimizer and schedule."""
+
+    def __init__(self, recipe: Recipe, classes: int, device: torch.device, seed: int) -> None:
+        torch.manual_seed(seed)
+        self.recipe, self.device, self.started = recipe, device, time.perf_counter()
+        self.network = Network(classes, recipe.width).to(device, memory_format=torch.channels_last)
+        self.optimizer = torch.optim.AdamW(self.network.parameters(), LEARNING_RATE)
+        self.weights = torch.ones(classes, device=device)
+        self.weights[0] = recipe.background
+        self.total = max(1, round(recipe.views * recipe.passes / recipe.batch))
+        self.losses: list[torch.Tensor] = []
+        self.waited = 0.0
+        """Time before the first step, in which the stream filled the pool [s]."""
+
+    @property
+    def progress(self) -> float:
+        """Fraction of the schedule: of the steps, or of the time where this is nearer to its end."""
+        left = max(self.recipe.seconds - self.waited, 1.0)
+        return max(len(self.losses) / self.total, (time.perf_counter() - self.started - self.waited) / left)
+
+    def step(self, pool: Pool) -> None:
+        """Train on a batch."""
+        done = self.progress
+        factor = done / WARM_UP if done < WARM_UP else 0.5 + 0.5 * math.cos(math.pi * min(1.0, (done - WARM_UP) / (1 - WARM_UP)))
+        self.optimizer.param_groups[0]["lr"] = LEARNING_RATE * max(factor, LEAST_RATE)
+        images, classes = _prepare(*pool.draw(self.recipe.batch), self.recipe)
+        images = images.contiguous(memory_format=torch.channels_last)
+        with torch.autocast(self.device.type, torch.bfloat16, enabled=self.device.type == "cuda"):
+            logits = self.network(images)
+        loss = functional.cross_entropy(logits.float(), classes, self.weights)
+        self.optimizer.zero_grad()
+        loss.backward()
+        nn.utils.clip_grad_norm_(self.network.parameters(), MAX_NORM)
+        self.optimizer.step()
+        self.losses.append(loss.detach())
+
+
+def train(source: Source, recipe: Recipe, classes: int, device: torch.device, seed: int) -> tuple[Trained, Pool]:
+    """Train a network on views of a stream. The pool is filled first; of more views than it holds, the rest comes while training.
+
+    Raises:
+        SynpickError: Settings, models or lights cannot be used.
+    """
+    pool, trainer = Pool(min(recipe.views, recipe.capacity), seed), _Trainer(recipe, classes, device, seed)
+    batches = source.batches()
+    more = pool.fill(batches, pool.capacity) and pool.seen < recipe.views
+    if not more:
+        batches.close()
+    trainer.waited = time.perf_counter() - trainer.started
+    while trainer.progress < 1.0:
+        if more and pool.seen < recipe.views and len(trainer.losses) >= pool.seen * recipe.passes / recipe.batch:
+            more = pool.fill(batches, min(pool.seen + recipe.batch, recipe.views))
+        trainer.step(pool)
+    batches.close()
+    values = torch.stack(trainer.losses).tolist()
+    parts = [values[len(values) * part // 10 : max(1, len(values) * (part + 1) // 10)] for part in range(10)]
+    losses = [sum(part) / len(part) for part in parts if part]
+    seconds = time.perf_counter() - trainer.started
+    trained = Trained(trainer.network.eval(), losses, pool.seconds, seconds, pool.seen, len(values) * recipe.batch)
+    return trained, pool

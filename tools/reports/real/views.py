@@ -1,0 +1,107 @@
+"""Experience replay (Lin, 1992) for supervised training: a pool of views of a stream on the device, from which batches are drawn.
+
+Views of one batch of a stream show few piles. Batches drawn from a pool mix many, and each view is trained on several times.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Generator, Iterator
+from dataclasses import dataclass, field
+
+import torch  # pyright: ignore[reportMissingImports]
+from torch.nn import functional  # pyright: ignore[reportMissingImports]
+
+from synpick_warp.configs.schema import Config
+from synpick_warp.online.dataset import StreamDataset
+
+
+@dataclass(frozen=True, eq=False)
+class Source:
+    """Settings of a stream, and what is taken of it."""
+
+    config: Config
+    episodes: range
+    stride: int
+    """Every n-th frame of an episode."""
+    shrink: int = 1
+    """Factor by which images are reduced."""
+
+    def batches(self) -> Generator[tuple[torch.Tensor, torch.Tensor]]:
+        """Images (B, 3, H, W) and obj_ids (B, H, W) uint8, valid until the next are taken."""
+        dataset = StreamDataset(self.config, fields=("rgb", "classes"), episodes=self.episodes, stride=self.stride)
+        for batch in torch.utils.data.DataLoader(dataset, batch_size=None):
+            image, classes = batch["rgb"], batch["classes"].to(torch.uint8)
+            if self.shrink > 1:
+                half = self.shrink // 2
+                image = functional.avg_pool2d(image.float(), self.shrink).round_().to(torch.uint8)
+                classes = classes[:, half :: self.shrink, half :: self.shrink][:, : image.shape[2], : image.shape[3]]
+            yield image, classes
+
+
+@dataclass(eq=False)
+class Pool:
+    """Views on the device; once full, new ones replace random ones.
+
+    Attributes:
+        images: (N, 3, H, W) uint8.
+        classes: obj_ids (N, H, W) uint8.
+    """
+
+    capacity: int
+    seed: int
+    count: int = 0
+    """Views in the pool."""
+    seen: int = 0
+    """Views that have been added."""
+    seconds: float = 0.0
+    """Time that the stream took."""
+    images: torch.Tensor | None = field(default=None, repr=False)
+    classes: torch.Tensor | None = field(default=None, repr=False)
+
+    def __post_init__(self) -> None:
+        self._random = torch.Generator().manual_seed(self.seed)
+
+    def add(self, images: torch.Tensor, classes: torch.Tensor) -> None:
+        """Copy views into the pool."""
+        if self.images is None or self.classes is None:
+            self.images = images.new_empty((self.capacity, *images.shape[1:]))
+            self.classes = classes.new_empty((self.capacity, *classes.shape[1:]))
+        for image, classified in zip(images, classes, strict=True):
+            place = self.count
+            if place == self.capacity:
+                place = int(torch.randint(self.capacity, (1,), generator=self._random))
+            self.images[place], self.classes[place] = image, classified
+            self.count = min(self.count + 1, self.capacity)
+            self.seen += 1
+
+    def fill(self, batches: Iterator[tuple[torch.Tensor, torch.Tensor]], views: int) -> bool:
+        """Add views until `views` have been added in all; False: the stream ended before."""
+        started = time.perf_counter()
+        while self.seen < views:
+            batch = next(batches, None)
+            if batch is None:
+                break
+            self.add(*(part[: views - self.seen] for part in batch))
+        self.seconds += time.perf_counter() - started
+        return self.seen >= views
+
+    def draw(self, size: int) -> tuple[torch.Tensor, torch.Tensor]:
+        """Random views, without repeats where there are enough: images (size, 3, H, W) uint8, obj_ids (size, H, W) int64."""
+        assert self.images is not None
+        assert self.classes is not None
+        chosen = torch.randint(self.count, (size,), generator=self._random).to(self.images.device)
+        return self.images[chosen], self.classes[chosen].long()
+
+
+def hold_out(source: Source, views: int) -> Pool:
+    """Views of a stream's episodes to measure on, the first ones.
+
+    Raises:
+        SynpickError: Settings, models or lights cannot be used.
+    """
+    pool = Pool(views, 0)
+    batches = source.batches()
+    pool.fill(batches, views)
+    batches.close()
+    return pool
