@@ -221,21 +221,28 @@ def make_folder(folder: Path, *sides: float) -> Path:
     return folder
 
 
-@pytest.mark.parametrize(("own", "count"), [(True, len(procedural_objects())), (False, len(solids()))])
-def test_embedded_objects_are_distractors_of_other_models_and_solids_of_their_own(tmp_path, own, count):
+@pytest.mark.parametrize(
+    ("own", "surfaces", "count"), [(True, 0, len(procedural_objects())), (False, 0, len(solids())), (True, 1, len(solids(True)))]
+)
+def test_embedded_objects_are_distractors_of_other_models_and_solids_of_their_own(tmp_path, own, surfaces, count):
     models = str(make_folder(tmp_path / "own", 0.05)) if own else ""
-    loaded = load_catalog(load_config("smoke", {"bake.models": models, "randomize.distractors": 2}))
+    loaded = load_catalog(load_config("smoke", {"bake.models": models, "randomize.distractors": 2, "randomize.surfaces": surfaces}))
     assert {body.name for body in loaded.entries}.isdisjoint(body.name for body in loaded.distractors)
     assert loaded.object_ids.tolist()[len(loaded) :] == [-2 - index for index in range(count)]
 
 
-def test_solids_are_closed_convex_and_as_large_as_other_parts():
-    for body in solids():
+@pytest.mark.parametrize(("textured", "largest"), [(False, 0.2), (True, 0.32)])
+def test_solids_are_closed_convex_and_as_large_as_other_parts(textured, largest):
+    made = solids(textured)
+    assert len({body.name for body in made}) == len(made)
+    for body in made:
+        assert (body.material.texture is not None) == textured
+        assert np.ptp(body.mesh.uv) >= 0.1 * textured
         mesh = trimesh.Trimesh(body.mesh.vertices, body.mesh.faces)
         mesh.merge_vertices(merge_norm=True, merge_tex=True)
         assert mesh.is_watertight
         assert mesh.volume == pytest.approx(body.hull.volume, rel=1e-3)
-        assert 0.04 < body.hull.diameter < 0.2
+        assert 0.04 < body.hull.diameter < largest
 
 
 @pytest.mark.parametrize(

@@ -1,7 +1,7 @@
 """Generate the tables of READMEs that follow from code and results; the prose around them is as committed.
 
 configs/README.md: the settings; synpick_warp/apps/validation/README.md: the rules; synpick_warp/exporters/README.md: the columns of picks;
-tools/README.md: the figures in tools/results.
+tools/README.md and tools/reports/real/README.md: the figures in tools/results.
 
     python -m tools.docs          # writes them
 """
@@ -33,6 +33,7 @@ SETTINGS_REFERENCE = ROOT / "configs" / "README.md"
 FORMATS = ROOT / "synpick_warp" / "exporters" / "README.md"
 VALIDATION = ROOT / "synpick_warp" / "apps" / "validation" / "README.md"
 FIGURES = ROOT / "tools" / "README.md"
+PHOTOGRAPHS = ROOT / "tools" / "reports" / "real" / "README.md"
 _SETTINGS_BEGIN = "from the schema in this folder; edit the help texts there. -->\n"
 _RULES_BEGIN, _END = "from the rules' declarations. -->\n", "<!-- End. -->"
 _COLUMNS_BEGIN = "from `synpick_warp/views/picks.py`. -->\n"
@@ -110,11 +111,23 @@ def figures_reference() -> str:
     return _RESULTS.sub(lambda found: f"{found[1]}{tables[found[2]]}\n{found[3]}", FIGURES.read_text(encoding="utf-8"))
 
 
+def photographs_reference() -> str:
+    """The README of the report on photographs with its table of figures, if there are results; the rest is as committed."""
+    tables = figures_tables(read_runs())
+
+    def fill(found: re.Match[str]) -> str:
+        table = tables.get(found[2])
+        return f"{found[1]}{table}\n{found[3]}" if table else f"{found[1]}{found[3]}"
+
+    return _RESULTS.sub(fill, PHOTOGRAPHS.read_text(encoding="utf-8"))
+
+
 REFERENCES: dict[Path, Callable[[], str]] = {
     SETTINGS_REFERENCE: settings_reference,
     FORMATS: formats_reference,
     VALIDATION: validation_reference,
     FIGURES: figures_reference,
+    PHOTOGRAPHS: photographs_reference,
 }
 """File -> its content with generated tables."""
 

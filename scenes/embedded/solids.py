@@ -70,7 +70,9 @@ def _dress(plain: list[RawObject]) -> list[RawObject]:
             (texture,) = surface_textures(1, index)
             material = Material((1.0, 1.0, 1.0), texture, 0.0, 0.5)
             made.append(
-                replace(raw, obj_id=index + 1, name=f"{raw.name}_{index}", mesh=mesh, hull=hull_size(mesh.vertices), material=material)
+                replace(
+                    raw, obj_id=index + 1, name=f"textured_{raw.name}_{index}", mesh=mesh, hull=hull_size(mesh.vertices), material=material
+                )
             )
     return made
 

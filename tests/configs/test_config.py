@@ -92,7 +92,8 @@ def test_object_rows_have_the_diameters_of_the_real_models(real_models):
 
 
 def test_other_presets_build_on_the_default_preset():
-    assert preset_names() == ["full-bin", "randomized", "smoke", "synpick", "synpick-hard", "synpick-released", "synpick-test", "tabletop"]
+    synpick = ["synpick", "synpick-hard", "synpick-released", "synpick-test"]
+    assert preset_names() == ["full-bin", "randomized", "smoke", *synpick, "tabletop", "tabletop-train"]
     released = load_config("synpick-released", {})
     assert released.move.damping == 1.0
     assert released.object_rows == load_config(None, {}).object_rows

@@ -51,6 +51,23 @@ def test_bin_and_pose_follow_the_law(device):
     np.testing.assert_allclose(yaw, np.stack([0 * u[3], 0 * u[3], np.radians(30) * (2 * u[3] - 1)], axis=1), atol=1e-6)
 
 
+def test_a_share_of_the_objects_begins_to_fall_upright_where_the_others_fall(device):
+    worlds = started(device)
+    arrange.drop_objects(worlds.scene, worlds.state, worlds.physics, SEED)
+    lying = worlds.coordinates()
+    worlds.set(worlds.state.phase, Phase.START)
+    arrange.drop_objects(dataclasses.replace(worlds.scene, upright=0.4), worlds.state, worlds.physics, SEED)
+    found, slots = worlds.coordinates(), worlds.state.body_slot.numpy()
+    key = np.array([rng.stream_key(SEED, world, world % 3, Stream.UPRIGHT) for world in range(WORLDS)])
+    for instance in range(5):
+        u, turn = (rng.uniform(key, 2 * instance + index) for index in range(2))
+        before, after = (each[np.arange(WORLDS), slots[:, instance]] for each in (lying, found))
+        np.testing.assert_array_equal(after[u >= 0.4], before[u >= 0.4])
+        np.testing.assert_array_equal(after[:, :3], before[:, :3])
+        expected = Rotation.from_euler("z", 2 * np.pi * turn[u < 0.4][:, None])
+        assert (Rotation.from_quat(after[u < 0.4, 3:]).inv() * expected).magnitude().max() < 1e-5
+
+
 def test_a_bin_that_does_not_move_is_exactly_at_the_origin(device):
     pose = started(device).state.bin_pose.numpy()
     assert pose.tobytes() == np.tile(np.array([0, 0, 0, 0, 0, 0, 1], np.float32), (WORLDS, 1)).tobytes()

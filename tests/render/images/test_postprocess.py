@@ -146,6 +146,17 @@ def test_exposure_and_white_balance_are_gains_of_the_sampled_exposure_values():
     assert np.ptp(parameter(effects, "red") - parameter(effects, "blue")) > 0.1
 
 
+def test_contrast_and_saturation_change_srgb_values():
+    image = np.random.default_rng(3).uniform(0.0, 0.6, (HEIGHT, WIDTH, 3))
+    plain = postprocess(image, make_config(read_noise=(1e-9, 1e-9)))[0][0] / 255.0
+    for contrast, saturation in ((0.5, 0.0), (0.0, -1.0), (-0.3, 0.8)):
+        made = make_config(contrast=(contrast, contrast), saturation=(saturation, saturation))
+        value = 0.5 + (1 + contrast) * (plain - 0.5)
+        luma = value @ np.array([0.299, 0.587, 0.114])
+        expected = luma[..., None] + (1 + saturation) * (value - luma[..., None])
+        np.testing.assert_allclose(postprocess(image, made)[0][0], 255.0 * np.clip(expected, 0.0, 1.0), atol=0.51)
+
+
 def test_vignette_darkens_the_corner_by_its_fraction_and_spares_the_centre():
     lens = replace(LENS, matrix=np.array([[60.0, 0.0, 30.0], [0.0, 60.0, 24.0], [0.0, 0.0, 1.0]]))
     color, effects = postprocess(uniform_image(0.5), make_config(vignette=(0.6, 0.6)), lens=lens)

@@ -1,0 +1,83 @@
+"""The report on photographs: known scores, augmentation that keeps labels on objects, and a tiny training; skipped without PyTorch."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+torch = pytest.importorskip("torch", exc_type=ImportError)
+scores = pytest.importorskip("tools.reports.real.scores", exc_type=ImportError)
+
+from tools.reports.real import ablation  # noqa: E402
+from tools.reports.real.detector import average_precision, boxes_of  # noqa: E402
+from tools.reports.real.training import Recipe, warp_views  # noqa: E402
+from tools.reports.real.views import Pool  # noqa: E402
+
+RECIPE = Recipe(views=8, passes=1.0, batch=4, width=8, seconds=10.0, capacity=8)
+
+
+def test_scores_of_a_known_prediction():
+    truth = np.zeros((2, 10), np.uint8)
+    truth[0, :4], truth[1, :2] = 1, 2
+    found = truth.copy()
+    found[0, 2:4], found[0, 8] = 0, 3
+    made = scores.score([("a", found, truth)], 4)
+    assert made.iou == {1: 0.5, 2: 1.0}
+    assert made.mean_iou == 0.75
+    assert made.found == 0.5
+    assert made.background == pytest.approx(1 / 14)
+    assert made.views == {"a": 0.75}
+
+
+def test_the_interval_is_students():
+    assert scores.interval([1.0, 2.0, 3.0]) == "(-0.484 to 4.48)"
+    assert scores.interval([1.0]) == ""
+
+
+def test_average_precision_of_known_detections():
+    image = np.zeros((20, 20), np.uint8)
+    image[2:12, 3:13] = 5
+    boxes, ids = boxes_of(image)
+    np.testing.assert_array_equal(boxes, [[3, 2, 13, 12]])
+    far = np.array([[0.0, 0.0, 2.0, 2.0]])
+    truth = [(boxes, ids), (boxes, ids)]
+    exact, wrong = (boxes, ids, np.array([0.5])), (far, ids, np.array([0.9]))
+    assert average_precision([exact, exact], truth) == 1.0
+    assert average_precision([exact, wrong], truth) == pytest.approx(0.25)
+    assert average_precision([wrong, wrong], truth) == 0.0
+
+
+def test_augmentation_moves_labels_with_the_image():
+    classes = torch.zeros(6, 40, 60, dtype=torch.int64)
+    classes[:, 10:30, 20:45] = 7
+    images, labels = warp_views((classes[:, None] / 7.0).expand(-1, 3, -1, -1), classes, RECIPE)
+    assert ((images[:, 0] > 0.5) != (labels == 7)).float().mean() < 0.01
+    assert (labels != classes).float().mean() > 0.02
+
+
+def test_a_pool_replaces_views_once_it_is_full():
+    pool = Pool(4, 0)
+    batches = iter([(torch.full((3, 3, 2, 2), index, dtype=torch.uint8), torch.full((3, 2, 2), index)) for index in range(6)])
+    assert pool.fill(batches, 4)
+    assert pool.count == pool.seen == 4
+    assert not pool.fill(batches, 40)
+    assert pool.count == 4
+    assert pool.seen > 4
+    assert pool.draw(9)[0].shape == (9, 3, 2, 2)
+
+
+def test_the_plan_says_what_is_left_out_and_results_are_collected(tmp_path, capsys):
+    jobs = ablation.order(list(ablation.plan(8000, 24_000)))
+    assert len({ablation.stem_of(*job) for job in jobs}) == len(jobs)
+    ablation.print_plan(jobs, 4, 400.0)
+    lines = capsys.readouterr().out.splitlines()
+    assert len(lines) == len(jobs)
+    assert lines[-1].endswith("(left out)")
+    for seed, value in enumerate((0.4, 0.6)):
+        entry = {"mean_iou": value, "seconds": 1.0, "stream_seconds": 0.5}
+        (tmp_path / f"{ablation.stem_of(jobs[0][0], seed)}.json").write_text(json.dumps({"more": {"seeds": [entry]}}))
+    (row,) = ablation.collect(tmp_path, jobs)["rows"]
+    assert row["seeds"] == 2
+    assert row["mean_iou"]["mean"] == 0.5
