@@ -117,7 +117,7 @@ def photographs_reference() -> str:
 
     def fill(found: re.Match[str]) -> str:
         table = tables.get(found[2])
-        return f"{found[1]}{table}\n{found[3]}" if table else f"{found[1]}{found[3]}"
+        return f"{found[1]}## Figures\n\n{table}\n{found[3]}" if table else f"{found[1]}{found[3]}"
 
     return _RESULTS.sub(fill, PHOTOGRAPHS.read_text(encoding="utf-8"))
 

@@ -10,7 +10,7 @@ import pytest
 torch = pytest.importorskip("torch", exc_type=ImportError)
 scores = pytest.importorskip("tools.reports.real.scores", exc_type=ImportError)
 
-from tools.reports.real import ablation  # noqa: E402
+from tools.reports.real import ablation, interval  # noqa: E402
 from tools.reports.real.detector import average_precision, boxes_of  # noqa: E402
 from tools.reports.real.training import Recipe, warp_views  # noqa: E402
 from tools.reports.real.views import Pool  # noqa: E402
@@ -32,8 +32,8 @@ def test_scores_of_a_known_prediction():
 
 
 def test_the_interval_is_students():
-    assert scores.interval([1.0, 2.0, 3.0]) == "(-0.484 to 4.48)"
-    assert scores.interval([1.0]) == ""
+    assert interval([1.0, 2.0, 3.0]) == "(-0.484 to 4.48)"
+    assert interval([1.0]) == ""
 
 
 def test_average_precision_of_known_detections():
@@ -76,8 +76,9 @@ def test_the_plan_says_what_is_left_out_and_results_are_collected(tmp_path, caps
     assert len(lines) == len(jobs)
     assert lines[-1].endswith("(left out)")
     for seed, value in enumerate((0.4, 0.6)):
-        entry = {"mean_iou": value, "seconds": 1.0, "stream_seconds": 0.5}
+        entry = dict.fromkeys(("views", "samples", "seconds", "stream_seconds", *ablation.METRICS), value)
         (tmp_path / f"{ablation.stem_of(jobs[0][0], seed)}.json").write_text(json.dumps({"more": {"seeds": [entry]}}))
-    (row,) = ablation.collect(tmp_path, jobs)["rows"]
-    assert row["seeds"] == 2
-    assert row["mean_iou"]["mean"] == 0.5
+    made = ablation.collect(tmp_path, jobs)
+    assert [row["value"] for row in made["rows"][:3]] == [0.5, 50.0, 50.0]
+    assert made["rows"][0]["name"] == "all levers: mIoU"
+    assert made["more"]["seeds"]["all levers"]["mean_iou"] == [0.4, 0.6]

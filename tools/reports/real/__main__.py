@@ -20,7 +20,7 @@ try:
     import torch  # pyright: ignore[reportMissingImports]
 
     from tools.reports.real.detector import average_precision, boxes_of, detect, train_detector
-    from tools.reports.real.scores import Scores, draw_overlay, interval, predict, score, score_pool
+    from tools.reports.real.scores import Scores, draw_overlay, predict, score, score_pool
     from tools.reports.real.training import Recipe, Trained, train
     from tools.reports.real.views import Pool, Source, hold_out
 except ModuleNotFoundError as missing:
@@ -32,6 +32,7 @@ from synpick_warp.errors import ConfigError, SynpickError
 from synpick_warp.system.hardware.device import pick_device
 from tools.figures import describe_run
 from tools.options import Row, configure, fail, make_parser, positive_count, print_rows, write_json
+from tools.reports.real import interval
 from tools.reports.real_frames import RealFrame, read_frames
 
 TRAINING, HELD_OUT = range(1_000_000), range(1_000_000, 1_100_000)

@@ -21,9 +21,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy import stats
 
-from tools.options import make_parser, positive_count, write_json
+from tools.figures import describe_run
+from tools.options import Row, make_parser, positive_count, write_json
+from tools.reports.real import interval
 
 START = 30.0
 """Imports, kernels from the cache, models and lights, first piles [s]."""
@@ -35,8 +36,14 @@ TRAIN_RATE = 700.0
 """Samples/s of the U-Net of width 48 at 320x240 in bfloat16 on an H100: 0.17 TFLOP a sample."""
 SLACK = 1.15
 """Factor on expected times, for whether a run still starts."""
-METRICS = ("mean_iou", "found", "background", "synthetic_mean_iou", "ap50")
-"""Values of a seed that are collected."""
+METRICS = {
+    "mean_iou": ("mIoU", "", 1.0),
+    "found": ("instances with IoU above 0.5", "%", 100.0),
+    "background": ("background taken for objects", "%", 100.0),
+    "synthetic_mean_iou": ("synthetic mIoU", "", 1.0),
+    "ap50": ("AP50", "", 1.0),
+}
+"""Values of a seed that are collected: label, unit and factor."""
 PASSES = 6.0
 """Passes of the runs of an ablation."""
 MIN_STEP_VIEWS = 48_000
@@ -163,29 +170,21 @@ def stem_of(run: Run, seed: int) -> str:
 
 
 def collect(folder: Path, jobs: list[tuple[Run, int]]) -> dict[str, Any]:
-    """Means over seeds of all rows that have results, with 95 % intervals by Student's t, and their seeds."""
-    rows = []
+    """A run as JSON: means over seeds of all rows that have results, with 95 % intervals by Student's t; values and times of seeds."""
+    rows: list[Row] = []
+    times: dict[str, Any] = {}
     for run in dict.fromkeys(run for run, _ in jobs):
         paths = [folder / f"{stem_of(run, seed)}.json" for seed in range(run.seeds)]
         seeds = [json.loads(path.read_text())["more"]["seeds"][0] for path in paths if path.exists()]
         if not seeds:
             continue
-        row: dict[str, Any] = {"name": run.name, "views": run.views, "seeds": len(seeds)}
-        for metric in METRICS:
-            values = [seed[metric] for seed in seeds if seed.get(metric) is not None]
+        for metric, (label, unit, factor) in METRICS.items():
+            values = [factor * seed[metric] for seed in seeds if seed.get(metric) is not None]
             if values:
-                reach = (
-                    float(stats.t.ppf(0.975, len(values) - 1) * np.std(values, ddof=1) / len(values) ** 0.5) if len(values) > 1 else None
-                )
-                row[metric] = {
-                    "mean": round(float(np.mean(values)), 4),
-                    "reach": None if reach is None else round(reach, 4),
-                    "values": values,
-                }
-        row["seconds"] = [round(seed["seconds"], 1) for seed in seeds]
-        row["stream_seconds"] = [round(seed["stream_seconds"], 1) for seed in seeds]
-        rows.append(row)
-    return {"rows": rows}
+                words = " ".join(word for word in (unit, interval(values)) if word)
+                rows.append(Row(f"{run.name}: {label}", round(float(np.mean(values)), 4), words, part=run.name))
+        times[run.name] = {name: [seed[name] for seed in seeds] for name in ("views", "samples", "seconds", "stream_seconds", *METRICS)}
+    return describe_run("tools.reports.real.ablation", (), rows, seeds=times)
 
 
 def main(arguments: list[str] | None = None) -> int:

@@ -13,7 +13,6 @@ from pathlib import Path
 import cv2
 import numpy as np
 import torch  # pyright: ignore[reportMissingImports]
-from scipy import stats
 from torch import nn  # pyright: ignore[reportMissingImports]
 from torch.nn import functional  # pyright: ignore[reportMissingImports]
 
@@ -94,14 +93,6 @@ def score_pool(network: nn.Module, pool: Pool, classes: int) -> Scores:
             yield str(index), found.cpu().numpy().astype(np.uint8), pool.classes[index].cpu().numpy()
 
     return score(pairs(), classes, MIN_PIXELS)
-
-
-def interval(values: Sequence[float]) -> str:
-    """95 % interval of the mean over seeds by Student's t, as text; empty for fewer than two."""
-    if len(values) < 2:
-        return ""
-    reach = float(stats.t.ppf(0.975, len(values) - 1) * np.std(values, ddof=1) / np.sqrt(len(values)))
-    return f"({np.mean(values) - reach:.3g} to {np.mean(values) + reach:.3g})"
 
 
 def _palette(classes: int) -> np.ndarray:
