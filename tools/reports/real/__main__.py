@@ -37,6 +37,8 @@ from tools.reports.real_frames import RealFrame, read_frames
 
 TRAINING, HELD_OUT = range(1_000_000), range(1_000_000, 1_100_000)
 """Episodes to train on, and to measure on."""
+FEW_WORLDS = 64
+"""Worlds for held-out views, at most."""
 PRESET = "tabletop-train"
 """Settings of the stream, unless --config names others."""
 MODELS = 21
@@ -67,7 +69,8 @@ def run_seed(options: argparse.Namespace, seed: int, frames: list[RealFrame], de
     source = Source(config, TRAINING, options.stride, options.shrink)
     recipe = Recipe(**{name: getattr(options, name) for name in Recipe.__dataclass_fields__})
     target = torch.device(device.alias)
-    held = hold_out(replace(source, episodes=HELD_OUT), options.held_out)
+    few = replace(config, bake=replace(config.bake, worlds=min(options.worlds, FEW_WORLDS)))
+    held = hold_out(replace(source, config=few, episodes=HELD_OUT), options.held_out)
     trained, pool = train(source, recipe, 1 + MODELS, target, seed)
     size = (int(held.images.shape[3]), int(held.images.shape[2])) if held.images is not None else (0, 0)
     found = [predict(trained.network, frame.color, size, target) for frame in frames]
