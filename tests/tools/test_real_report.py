@@ -10,7 +10,9 @@ import pytest
 torch = pytest.importorskip("torch", exc_type=ImportError)
 scores = pytest.importorskip("tools.reports.real.scores", exc_type=ImportError)
 
+from synpick_warp.configs.files.load import load_config, parse_assignment  # noqa: E402
 from tools.reports.real import ablation, interval  # noqa: E402
+from tools.reports.real.__main__ import PRESET  # noqa: E402
 from tools.reports.real.detector import average_precision, boxes_of  # noqa: E402
 from tools.reports.real.training import Recipe, warp_views  # noqa: E402
 from tools.reports.real.views import Pool  # noqa: E402
@@ -66,6 +68,12 @@ def test_a_pool_replaces_views_once_it_is_full():
     assert pool.count == 4
     assert pool.seen > 4
     assert pool.draw(9)[0].shape == (9, 3, 2, 2)
+
+
+@pytest.mark.parametrize("name", ablation.LEVERS)
+def test_each_lever_changes_the_preset(name):
+    changes = dict(parse_assignment(text) for text in ablation.LEVERS[name])
+    assert load_config(PRESET, changes) != load_config(PRESET, {})
 
 
 def test_the_plan_says_what_is_left_out_and_results_are_collected(tmp_path, capsys):

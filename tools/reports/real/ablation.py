@@ -34,6 +34,10 @@ REFERENCE_RATE = 30.0
 """Views/s of mode reference at 320x240 and 64 paths."""
 TRAIN_RATE = 700.0
 """Samples/s of the U-Net of width 48 at 320x240 in bfloat16 on an H100: 0.17 TFLOP a sample."""
+DETECTOR = 60.0
+"""Training of the detector [s]."""
+HELD_OUT = 400
+"""Synthetic views to measure on."""
 SLACK = 1.15
 """Factor on expected times, for whether a run still starts."""
 METRICS = {
@@ -76,11 +80,18 @@ class Run:
     rate: float = STREAM_RATE
     limit: float = 280.0
     """Limit of a training with its stream [s]."""
+    more: float = 0.0
+    """What else takes time [s]."""
 
     @property
     def seconds(self) -> float:
         """Expected time of one seed."""
-        return START + min(self.limit, self.views / self.rate + self.views * self.passes / TRAIN_RATE) + 400 / self.rate
+        return START + min(self.limit, self.views / self.rate + self.views * self.passes / TRAIN_RATE) + HELD_OUT / self.rate + self.more
+
+    @property
+    def most_seconds(self) -> float:
+        """Time that must be left for one seed to start."""
+        return min(SLACK * self.seconds, SLACK * START + self.limit + HELD_OUT / self.rate + self.more)
 
     def command(self, options: argparse.Namespace, seed: int, gpu: int, stem: str) -> list[str]:
         """Command line of one seed."""
@@ -98,7 +109,7 @@ def _settings(*assignments: str) -> tuple[str, ...]:
 def plan(views: int, main_views: int) -> Iterator[Run]:
     """All rows in the order of priority."""
     tote = ("--config", "synpick", "--stride", "3", *_settings("bake.mode=mixed", "cameras.resolution=[320,240]"))
-    yield Run("all levers", main_views, ("--detector", "60"), passes=4.0)
+    yield Run("all levers", main_views, ("--detector", str(DETECTOR)), passes=4.0, more=DETECTOR)
     yield Run("all levers, ablation's number of views", views)
     yield Run("tote, not randomized", views, (*tote, "--worlds", "64"))
     for name, settings in LEVERS.items():
@@ -107,18 +118,18 @@ def plan(views: int, main_views: int) -> Iterator[Run]:
     yield Run("without photometric augmentation", views, ("--jitter", "0"))
     for amount in (1000, 3000):
         yield Run(f"{amount:,} views", amount, passes=MIN_STEP_VIEWS / amount)
-    yield Run("200,000 views", 200_000, ("--capacity", "40000"), seeds=1, passes=2.0, limit=560.0)
+    yield Run("200,000 views", 200_000, ("--capacity", "40000"), seeds=1, passes=2.0, limit=400.0)
     yield Run("2,000 views, fast", 2000, seeds=2, passes=MIN_STEP_VIEWS / 2000)
     traced = _settings("render.mode=reference", "render.samples=64")
     yield Run("2,000 views, path-traced", 2000, (*traced, "--held-out", "60"), 2, MIN_STEP_VIEWS / 2000, REFERENCE_RATE)
     yield Run("without shadows and bounces", views, _settings("render.mode=unoccluded"))
 
 
-def order(rows: list[Run]) -> list[tuple[Run, int]]:
-    """Runs in the order in which they start: the first rows with all seeds, the others by seed."""
+def order(rows: list[Run], preferred: str = "") -> list[tuple[Run, int]]:
+    """Runs in the order in which they start: the first rows with all seeds, the others by seed; rows whose name begins so before all."""
     first = [(run, seed) for run in rows[:2] for seed in range(run.seeds)]
     rest = [(run, seed) for seed in range(3) for run in rows[2:] if seed < run.seeds]
-    return first + rest
+    return sorted(first + rest, key=lambda job: not (preferred and job[0].name.startswith(preferred)))
 
 
 def print_plan(jobs: list[tuple[Run, int]], gpus: int, deadline: float) -> None:
@@ -127,7 +138,7 @@ def print_plan(jobs: list[tuple[Run, int]], gpus: int, deadline: float) -> None:
     for run, seed in jobs:
         start = heapq.heappop(free)
         ends = start + run.seconds
-        late = " (left out)" if start + SLACK * run.seconds > deadline else ""
+        late = " (left out)" if start + run.most_seconds > deadline else ""
         heapq.heappush(free, start if late else ends)
         print(f"{start:6.0f} to {ends:6.0f} s  {run.seconds:4.0f} s  seed {seed}  {run.name}{late}")
 
@@ -153,7 +164,7 @@ def execute(jobs: list[tuple[Run, int]], options: argparse.Namespace) -> None:
             if not waiting:
                 break
             run, seed = waiting.pop(0)
-            if SLACK * run.seconds > left:
+            if run.most_seconds > left:
                 print(f"left out: seed {seed} of {run.name} needs {run.seconds:.0f} s, {left:.0f} s are left", flush=True)
                 continue
             stem = str(options.out / stem_of(run, seed))
@@ -195,10 +206,11 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--deadline", type=float, default=1400.0, help="seconds after which nothing runs (default: 1400)")
     parser.add_argument("--views", type=positive_count, default=8000, help="views of the rows of the ablation (default: 8000)")
     parser.add_argument("--main-views", type=positive_count, default=24_000, help="views of the first row (default: 24000)")
+    parser.add_argument("--first", default="", metavar="NAME", help="rows whose name begins so start before all others")
     parser.add_argument("--out", type=Path, help="existing folder to write to; without it the plan is printed")
     parser.add_argument("pass_on", nargs="*", help="more arguments of tools.reports.real for all runs, after --")
     options = parser.parse_args(arguments)
-    jobs = order(list(plan(options.views, options.main_views)))
+    jobs = order(list(plan(options.views, options.main_views)), options.first)
     if options.out is None:
         print_plan(jobs, options.gpus, options.deadline)
     elif not options.out.is_dir():
