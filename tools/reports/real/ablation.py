@@ -108,10 +108,11 @@ def _settings(*assignments: str) -> tuple[str, ...]:
 
 def plan(views: int, main_views: int) -> Iterator[Run]:
     """All rows in the order of priority."""
-    tote = ("--config", "synpick", "--stride", "3", *_settings("bake.mode=mixed", "cameras.resolution=[320,240]"))
+    tote = ("--stride", "3", "--worlds", "64", *_settings("bake.mode=mixed", "cameras.resolution=[320,240]"))
     yield Run("all levers", main_views, ("--detector", str(DETECTOR)), passes=4.0, more=DETECTOR)
     yield Run("all levers, ablation's number of views", views)
-    yield Run("tote, not randomized", views, (*tote, "--worlds", "64"))
+    yield Run("tote, not randomized", views, ("--config", "synpick", *tote))
+    yield Run("tote, randomized", views, ("--config", "randomized", *tote))
     for name, settings in LEVERS.items():
         yield Run(f"without {name}", views, _settings(*settings))
     yield Run("without augmentation of the tensors", views, ("--scale", "1", "--jitter", "0"))
