@@ -166,7 +166,7 @@ class _Rules:
     objects: Objects
     rows: tuple[ObjectRow, ...]
     bins: tuple[BinSizes, ...]
-    surfaces: int
+    surfaces: int = 0
     """Procedural textures; with some, geometric solids are textured."""
 
 

@@ -72,7 +72,8 @@ def run_seed(options: argparse.Namespace, seed: int, frames: list[RealFrame], de
     few = replace(config, bake=replace(config.bake, worlds=min(options.worlds, FEW_WORLDS)))
     held = hold_out(replace(source, config=few, episodes=HELD_OUT), options.held_out)
     trained, pool = train(source, recipe, 1 + MODELS, target, seed)
-    size = (int(held.images.shape[3]), int(held.images.shape[2])) if held.images is not None else (0, 0)
+    height, width = held.tensors()[0].shape[2:]
+    size = int(width), int(height)
     found = [predict(trained.network, frame.color, size, target) for frame in frames]
     real = score([(frame.name, one, frame.label) for frame, one in zip(frames, found, strict=True)], 1 + MODELS)
     overlay = [(frame.color, frame.label, one) for frame, one in zip(frames, found, strict=True)]

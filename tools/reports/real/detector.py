@@ -39,9 +39,8 @@ def train_detector(pool: Pool, classes: int, device: torch.device, seconds: floa
         from torchvision.models.detection import fasterrcnn_mobilenet_v3_large_fpn  # pyright: ignore[reportMissingImports]
     except ImportError:
         return None
-    assert pool.images is not None
-    assert pool.classes is not None
-    height, width = pool.images.shape[2:]
+    views, classified = pool.tensors()
+    height, width = views.shape[2:]
     network = fasterrcnn_mobilenet_v3_large_fpn(
         weights=None, weights_backbone=None, num_classes=classes, trainable_backbone_layers=6, min_size=2 * height, max_size=2 * width
     ).to(device)
@@ -53,12 +52,12 @@ def train_detector(pool: Pool, classes: int, device: torch.device, seconds: floa
         chosen = random.integers(pool.count, size=batch).tolist()
         for index in chosen:
             if index not in truth:
-                boxes, ids = boxes_of(pool.classes[index].cpu().numpy())
+                boxes, ids = boxes_of(classified[index].cpu().numpy())
                 truth[index] = {"boxes": torch.from_numpy(boxes).to(device), "labels": torch.from_numpy(ids).to(device)}
-        images = jitter_views(pool.images[chosen].float() / 255, JITTER)
+        images = jitter_views(views[chosen].float() / 255, JITTER)
         losses = network(list(images), [truth[index] for index in chosen])
         optimizer.zero_grad()
-        sum(losses.values()).backward()
+        torch.stack(list(losses.values())).sum().backward()
         torch.nn.utils.clip_grad_norm_(network.parameters(), 5.0)
         optimizer.step()
     return network.eval()

@@ -83,14 +83,13 @@ def _ious(table: np.ndarray) -> np.ndarray:
 
 def score_pool(network: nn.Module, pool: Pool, classes: int) -> Scores:
     """Scores on the views of a pool, at their own size."""
-    assert pool.images is not None
-    assert pool.classes is not None
+    images, classified = pool.tensors()
 
     def pairs() -> Iterable[tuple[str, np.ndarray, np.ndarray]]:
         for index in range(pool.count):
             with torch.no_grad():
-                found = network(pool.images[index : index + 1]).argmax(1)[0]
-            yield str(index), found.cpu().numpy().astype(np.uint8), pool.classes[index].cpu().numpy()
+                found = network(images[index : index + 1]).argmax(1)[0]
+            yield str(index), found.cpu().numpy().astype(np.uint8), classified[index].cpu().numpy()
 
     return score(pairs(), classes, MIN_PIXELS)
 

@@ -67,11 +67,12 @@ class Pool:
         if self.images is None or self.classes is None:
             self.images = images.new_empty((self.capacity, *images.shape[1:]))
             self.classes = classes.new_empty((self.capacity, *classes.shape[1:]))
+        kept = self.tensors()
         for image, classified in zip(images, classes, strict=True):
             place = self.count
             if place == self.capacity:
                 place = int(torch.randint(self.capacity, (1,), generator=self._random))
-            self.images[place], self.classes[place] = image, classified
+            kept[0][place], kept[1][place] = image, classified
             self.count = min(self.count + 1, self.capacity)
             self.seen += 1
 
@@ -88,10 +89,15 @@ class Pool:
 
     def draw(self, size: int) -> tuple[torch.Tensor, torch.Tensor]:
         """Random views, without repeats where there are enough: images (size, 3, H, W) uint8, obj_ids (size, H, W) int64."""
+        images, classes = self.tensors()
+        chosen = torch.randint(self.count, (size,), generator=self._random).to(images.device)
+        return images[chosen], classes[chosen].long()
+
+    def tensors(self) -> tuple[torch.Tensor, torch.Tensor]:
+        """Images and obj_ids of the pool, which must have some: all places, of which the first `count` are filled."""
         assert self.images is not None
         assert self.classes is not None
-        chosen = torch.randint(self.count, (size,), generator=self._random).to(self.images.device)
-        return self.images[chosen], self.classes[chosen].long()
+        return self.images, self.classes
 
 
 def hold_out(source: Source, views: int) -> Pool:
