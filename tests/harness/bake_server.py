@@ -37,6 +37,21 @@ TINY = {
     "settle.max_time": 3.0,
 }
 """Overrides on top of QUICK: an episode takes less than a second."""
+TINY_PICKS = {
+    "bake.mode": "pick",
+    "bake.formats": ["bop", "picks"],
+    "pick.appear_height": 0.3,
+    "pick.lift_height": 0.3,
+    "pick.lift_speed": 1.0,
+    "pick.failures": 1,
+    "perception.resolution": [160, 90],
+    "picks.states": 2,
+    "picks.candidates": 3,
+    "picks.lift_height": 0.05,
+    "picks.hold": 0.0,
+    "picks.worlds": 2,
+}
+"""Overrides on top of TINY: short attempts, and few trials from each of two states."""
 _PERTURB = -6
 """M_PERTURB of glibc's malloc.h."""
 _EVENTS = ("open", "os.rename", "os.mkdir", "os.remove", "os.rmdir", "shutil.rmtree")
