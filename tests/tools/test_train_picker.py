@@ -30,7 +30,7 @@ def one_thread():
     torch.set_num_threads(threads)
 
 
-def draw_samples(states: int, tried: int = 40) -> data.Samples:
+def draw_samples(states: int, tried: int = 40):
     """Boxes 2 cm above a floor: a pick on a top succeeds, one within 3 px of its edge fails."""
     rng = np.random.default_rng(0)
     depth, instance = np.full((states, *SIZE), 1.0, np.float32), np.zeros((states, *SIZE), np.uint8)
@@ -141,7 +141,7 @@ def test_pickers_are_run_from_the_same_piles(device, task):
         environment = make_picking(runs.choose_environment(task, 2, (64, 36), 0, max_steps=6), config, perceives=True)
     contour = runs.DenseChoice(scores.score_contour_distance)
     pickers = {"contour": contour, "heuristic": runs.choose_planned, "analytic": runs.AnalyticChoice(environment)}
-    found, piles = runs.run_first_choices(environment, pickers, 2)
+    ((found, piles),) = runs.run_first_choices(environment, pickers, 2)
     assert piles == environment.count
     assert {name: picked for name, (picked, _) in found.items()} == dict.fromkeys(pickers, piles)
     assert all(int(outcomes.sum()) == piles for _, outcomes in found.values())

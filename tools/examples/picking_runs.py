@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 
 import torch  # pyright: ignore[reportMissingImports]
@@ -117,11 +117,10 @@ def act(environment: PickingEnvironment, actions: torch.Tensor) -> Step:
 
 def run_first_choices(
     environment: PickingEnvironment, pickers: Mapping[str, Choose], attempts: int
-) -> tuple[dict[str, tuple[int, torch.Tensor]], int]:
+) -> Iterator[tuple[dict[str, tuple[int, torch.Tensor]], int]]:
     """Paired comparison: each picker makes its first choice from the same piles, of which at least `attempts` are drawn.
 
-    Returns:
-        Successes of each picker with its counts by `Outcome`, and the number of piles.
+    Yields, after each draw, what there is so far: successes of each picker with its counts by `Outcome`, and the number of piles.
     """
     results, piles = {name: (0, torch.zeros(len(Outcome), dtype=torch.int64)) for name in pickers}, 0
     while piles < attempts:
@@ -133,7 +132,7 @@ def run_first_choices(
             results[name] = picked + int(step.reward.sum()), outcomes + _count(step)
         environment.set_state(start)
         piles += environment.count
-    return results, piles
+        yield results, piles
 
 
 def _count(step: Step, counted: torch.Tensor | None = None) -> torch.Tensor:
@@ -145,7 +144,7 @@ def _count(step: Step, counted: torch.Tensor | None = None) -> torch.Tensor:
 def run_until_empty(environment: PickingEnvironment, choose: Choose, failures: int = Pick().failures) -> Emptied:
     """Bin emptying: pick in all environments until their episodes end; squares around failed picks are barred.
 
-    As in the paper, an episode also ends with a number of attempts that catch nothing, counted anew after one that does if there is a target.
+    As in the paper, an episode also ends after `failures` attempts that catch nothing; with a target they are counted anew after a catch.
     """
     sight = observe(environment, environment.reset()[0])
     result, failed = Emptied(bins=environment.count), torch.zeros(environment.count, dtype=torch.int64, device=sight.depth.device)

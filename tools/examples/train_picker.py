@@ -13,6 +13,8 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
+import itertools
+import math
 import sys
 import time
 from collections.abc import Callable
@@ -85,12 +87,14 @@ def evaluate(
     is_unseen, groups = np.isin(trials["obj_id"], unseen), {"all": np.ones(len(at[0]), bool)}
     if len(unseen):
         groups |= {"seen": ~is_unseen, "unseen": is_unseen}
-    return [
-        {"picker": name, "objects": group}
-        | _measure({key: column[kept] for key, column in trials.items()}, value if value is None else value[kept])
-        for group, kept in groups.items()
-        for name, value in values.items()
-    ]
+    rows = []
+    for (group, members), (name, value) in itertools.product(groups.items(), values.items()):
+        # The heuristic chooses in the states whose own grasp is in the group.
+        kept = members & np.isin(at[0], at[0][members & (value > 0)]) if name == OWN else members
+        if kept.any():
+            figures = _measure({key: column[kept] for key, column in trials.items()}, value if value is None else value[kept])
+            rows.append({"picker": name, "objects": group} | figures)
+    return rows
 
 
 def _measure(trials: dict[str, np.ndarray], score: np.ndarray | None) -> dict[str, Any]:
@@ -129,8 +133,13 @@ def show_rows(rows: list[dict[str, Any]]) -> None:
 
 
 def _plain(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Rows of `evaluate` for JSON."""
-    return [{key: dataclasses.asdict(value) if isinstance(value, Interval) else value for key, value in row.items()} for row in rows]
+    """Rows of `evaluate` for JSON: intervals as value, low and high; None for NaN."""
+    return [{key: _numbers(value) if isinstance(value, Interval) else value for key, value in row.items()} for row in rows]
+
+
+def _numbers(interval: Interval) -> dict[str, float | None]:
+    """Fields of an interval; None for NaN."""
+    return {name: value if math.isfinite(value) else None for name, value in dataclasses.asdict(interval).items()}
 
 
 def run_train(options: argparse.Namespace, device: torch.device) -> None:
@@ -173,26 +182,29 @@ def run_simulation(options: argparse.Namespace, device: torch.device) -> None:
     named = {"seen": sorted(set(parts["objects"]) - set(parts["unseen"])), "unseen": parts["unseen"], "all": []}[options.objects]
     if options.objects != "all" and not named:
         raise ConfigError(f"--objects is {options.objects}, but {options.picker} was trained with --unseen 0")
-    counts = {"arrangement.counts": {str(obj_id): [0, MOST_OF_EACH] for obj_id in named}} if named else {}
-    config = configure(options, counts)
+    config = configure(options, {})
+    if named:
+        most = max(1, min(MOST_OF_EACH, config.arrangement.max_objects // len(named)))
+        config = configure(options, {"arrangement.counts": {str(obj_id): [0, most] for obj_id in named}})
     choice = runs.choose_environment(options.task, options.worlds, tuple(parts["size"]), options.seed, LONGEST)
     environment = make_picking(choice, config, perceives=True)
     pickers = {name: runs.DenseChoice(score) for name, score in dense_scores(network, device).items()}
     pickers |= {OWN: runs.choose_planned, ANALYTIC: runs.AnalyticChoice(environment)}
-    chosen, results = {name: pickers[name] for name in options.pickers}, []
-    if options.attempts:
-        started = time.perf_counter()
-        found, piles = runs.run_first_choices(environment, chosen, options.attempts)
+    chosen = {name: pickers[name] for name in options.pickers}
+    facts = {"task": options.task, "objects": options.objects, "seed": options.seed}
+    results, started = [], time.perf_counter()
+    for found, piles in runs.run_first_choices(environment, chosen, options.attempts):
         print(f"first choice, task {options.task}, {piles} piles of {options.objects} objects, in {time.perf_counter() - started:.0f} s")
-        results += [_show_rate({"picker": name, "run": "first choice"}, count, outcomes) for name, (count, outcomes) in found.items()]
+        results = [_show_rate({"picker": name, "run": "first choice"}, count, outcomes) for name, (count, outcomes) in found.items()]
+        write_json(options.json, facts | {"rows": results})
     for name in chosen if options.until_empty else ():
         started = time.perf_counter()
         total = runs.run_until_empty(environment, chosen[name])
         print(f"until empty: {total.empty} of {total.bins} bins emptied in {time.perf_counter() - started:.0f} s")
-        facts = {"picker": name, "run": "until empty", "bins": total.bins, "emptied": total.empty}
-        results.append(_show_rate(facts, total.picked, total.outcomes))
+        emptied = {"picker": name, "run": "until empty", "bins": total.bins, "emptied": total.empty}
+        results.append(_show_rate(emptied, total.picked, total.outcomes))
+        write_json(options.json, facts | {"rows": results})
         environment.episodes.count[:] -= 1  # The next picker gets the same piles.
-    write_json(options.json, {"task": options.task, "objects": options.objects, "seed": options.seed, "rows": results})
 
 
 def _show_rate(facts: dict[str, Any], picked: int, outcomes: torch.Tensor) -> dict[str, Any]:
