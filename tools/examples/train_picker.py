@@ -185,7 +185,7 @@ def run_simulation(options: argparse.Namespace, device: torch.device) -> None:
     config = configure(options, {})
     if named:
         most = max(1, min(MOST_OF_EACH, config.arrangement.max_objects // len(named)))
-        config = configure(options, {"arrangement.counts": {str(obj_id): [0, most] for obj_id in named}})
+        config = configure(options, {"arrangement.counts": {str(obj_id): [1, most] for obj_id in named}})
     choice = runs.choose_environment(options.task, options.worlds, tuple(parts["size"]), options.seed, LONGEST)
     environment = make_picking(choice, config, perceives=True)
     pickers = {name: runs.DenseChoice(score) for name, score in dense_scores(network, device).items()}
