@@ -34,7 +34,7 @@ from synpick_warp.codes import Outcome, Share
 from synpick_warp.environment.settings import PICK, TARGET
 from synpick_warp.errors import ConfigError, DatasetError, SynpickError
 from synpick_warp.system.hardware.device import pick_device
-from tools.examples.picking_data import Samples, load_samples, split_objects
+from tools.examples.picking_data import Samples, load_samples, split_objects, write_maps
 from tools.examples.picking_network import load_picker, save_picker, score_learned, train
 from tools.examples.picking_scores import (
     Sight,
@@ -46,7 +46,7 @@ from tools.examples.picking_scores import (
     wilson,
 )
 from tools.examples.train_online import Network
-from tools.options import configure, fail, make_names_parser, make_parser, positive_count, write_json
+from tools.options import configure, fail, make_names_parser, make_parser, positive_count, writable_file, write_json
 
 HELD_OUT = 5
 """Stride of the train/test split: every fifth episode is held out from training."""
@@ -171,6 +171,8 @@ def run_evaluate(options: argparse.Namespace, device: torch.device) -> None:
     rows = evaluate(samples, np.arange(len(samples.episode)), np.array(parts["unseen"]), dense_scores(network, device), device)
     show_rows(rows)
     write_json(options.json, {"trials": len(samples.trials["state"]), "rows": _plain(rows)})
+    if options.map:
+        write_maps(options.folder, partial(score_learned, network), device, options.map)
 
 
 def run_simulation(options: argparse.Namespace, device: torch.device) -> None:
@@ -237,6 +239,7 @@ def parse(arguments: list[str] | None) -> argparse.Namespace:
     )
     parser.add_argument("folder", nargs="?", type=Path, default=Path(), help="data set with picks and images (train, evaluate)")
     parser.add_argument("--picker", type=Path, default=Path("picker.pt"), help="file of the network (default: picker.pt)")
+    parser.add_argument("--map", type=writable_file, metavar="FILE", help="draw predictions beside simulated picks to this file (evaluate)")
     parser.add_argument("--device", default="auto", help="cpu, cuda:N or auto (default: auto)")
     parser.add_argument("--width", type=positive_count, default=24, help="channels of the network's first level (default: 24)")
     parser.add_argument("--steps", type=positive_count, default=4000, help="steps of training (default: 4000)")
