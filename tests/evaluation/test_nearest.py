@@ -57,7 +57,7 @@ def pairs_of(vertices: np.ndarray, count: int, random: np.random.Generator) -> t
 def test_subdivision_agrees_with_the_toolkit(shape):
     random = np.random.default_rng(SHAPES.index(shape))
     vertices = vertices_of(shape, 500, random)
-    pairs = pairs_of(vertices, fuzz_examples(200), random)
+    pairs = pairs_of(vertices, fuzz_examples(50), random)
     expected = [twin.adi(*row, vertices) for row in zip(*pairs, strict=True)]
     np.testing.assert_allclose(adds_errors(*pairs, vertices), expected, rtol=0.0, atol=1e-9)
 
@@ -67,7 +67,7 @@ def test_subdivision_agrees_with_the_toolkit(shape):
 def test_fuzz_subdivision_agrees_with_the_tree(seed, size, shape):
     random = np.random.default_rng(seed)
     vertices = vertices_of(shape, size, random)
-    pairs = pairs_of(vertices, 20, random)
+    pairs = pairs_of(vertices, 8, random)
     search = VertexSearch(vertices)
     fast = adds_errors(*pairs, vertices, search)
     with pytest.MonkeyPatch.context() as patch:

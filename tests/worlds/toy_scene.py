@@ -243,7 +243,7 @@ def render_objects(device: wp.Device, *placed, view: Camera, config: Config | No
 def render_gbuffer(toy: ToyScene, device: wp.Device) -> tuple[ViewBuffers, Renderer]:
     """Render the G-buffer of world 0 by camera 0 only."""
     scene = build_scene(toy, device)
-    renderer = make_renderer(toy.settings(), scene, toy.instances, 1)
+    renderer = make_renderer(toy.settings(), scene, toy.instances, 1, colors=False)
     out = allocate_view_buffers(1, scene.width, scene.height, toy.instances, device)
     zero = wp.zeros(1, dtype=wp.int32, device=device)
     views = make_views(zero, zero, 1, toy.instances)
