@@ -12,7 +12,7 @@ from synpick_warp.codes import MAX_INSTANCES, Outcome
 from synpick_warp.configs.episodes.manipulation import Pick, Target
 from synpick_warp.configs.episodes.picks import Picks
 from synpick_warp.environment.picking import PickingEnvironment, Step
-from synpick_warp.environment.settings import DISABLED, PIXEL, POINT, TARGET, TORCH, Choice, make_choice
+from synpick_warp.environment.settings import ATTEMPT, DISABLED, PIXEL, POINT, TARGET, TORCH, Choice, make_choice
 from synpick_warp.scenes.cameras import make_cameras
 from synpick_warp.stages.perception.candidates import CandidateSampler
 from tools.examples.picking_scores import Sight
@@ -44,7 +44,7 @@ class Emptied:
 
 def choose_environment(task: str, worlds: int, resolution: tuple[int, int], seed: int, max_steps: int | None = None) -> Choice:
     """Options for `make_picking` of a vector environment with whole picks that observes depth and instances."""
-    return make_choice(task, worlds, ("depth", "instances"), resolution, PIXEL, DISABLED, TORCH, seed, max_steps, None)
+    return make_choice(task, worlds, ("depth", "instances"), resolution, PIXEL, DISABLED, TORCH, seed, max_steps, None, ATTEMPT)
 
 
 def observe(environment: PickingEnvironment, obs: Mapping[str, torch.Tensor]) -> Sight:
