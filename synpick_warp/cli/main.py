@@ -118,6 +118,12 @@ DeviceOption = Annotated[str | None, Parameter(help=_help("bake.device"))]
 ShardOption = Annotated[
     str | None, Parameter(help="i/n: only episodes with index % n == i, such as 0/4; combine the data sets with merge.")
 ]
+ClaimOption = Annotated[
+    bool,
+    Parameter(
+        negative=(), help="Be one of any number of equal workers, which share the episodes of a prefix in an object store among them."
+    ),
+]
 SplitOption = Annotated[
     str | None,
     Parameter(help="Only these splits of the settings, such as train or train,test (default: all of a file's; a preset's must be named)."),
@@ -142,6 +148,7 @@ def bake(
     formats: Annotated[str | None, Parameter(help=_help("bake.formats", " Joined by commas."))] = None,
     shard: ShardOption = None,
     split: SplitOption = None,
+    claim: ClaimOption = False,
     set_: SetOption = None,
     profile: Annotated[
         bool, Parameter(negative=(), help="Print the time of each stage at the end, and write a Chrome trace (see --profile-out).")
@@ -178,10 +185,12 @@ def bake(
 
         out, choice = choose_output(make_manifest(resolved), resolved.bake, resolved.splits)
         print(choice, flush=True)
+    if claim and (as_url(out) is None or shard is not None):
+        raise ConfigError("--claim shares out the episodes of a prefix in an object store; name one by --out, and drop --shard")
     if as_url(out) is not None and (profile or profile_out is not None):
         raise ConfigError(f"--profile writes beside a data set, and --out is {as_url(out)}; profile a bake into a folder")
     if not profile and profile_out is None:
-        return _bake(resolved, out, part, names, several)
+        return _bake(resolved, out, part, names, several, claim)
     trace = profile_out or out.with_name(f"{out.name}-profile.json")
     check_trace_file(trace, out)
     return _profiled(partial(_bake, resolved, out, part, names), trace)
@@ -370,7 +379,9 @@ def _check_inputs(models: str, lights: str) -> None:
         raise LightError(f"there is no lights folder {lights}; --lights takes a folder of .hdr maps and sIBL sets; {PATH_RULE}")
 
 
-def _bake(config: Config, out: Path, shard: tuple[int, int], splits: Sequence[str], devices: Sequence[str] = ()) -> int:
+def _bake(
+    config: Config, out: Path, shard: tuple[int, int], splits: Sequence[str], devices: Sequence[str] = (), claim: bool = False
+) -> int:
     """Check device and folders, which is cheap, then bake."""
     with collection_paused():
         from synpick_warp.cli.display import make_console, make_progress, print_summary
@@ -393,7 +404,7 @@ def _bake(config: Config, out: Path, shard: tuple[int, int], splits: Sequence[st
         else:
             from synpick_warp.cloud.run import bake_into_store
 
-            bake = partial(bake_into_store, config, url)
+            bake = partial(bake_into_store, config, url, claim=claim)
 
     console = make_console()
     with make_progress(console) as progress:
