@@ -22,7 +22,7 @@ from synpick_warp.cli.commands.report import write_page
 from synpick_warp.cli.commands.statistics import show_statistics
 from synpick_warp.cli.commands.validate import validate
 from synpick_warp.cli.commands.verify import verify
-from synpick_warp.cli.folders import DEFAULT_NAME, check_output_file, choose_output
+from synpick_warp.cli.folders import DEFAULT_NAME, check_output_file, choose_output, drop_fetched, name_fetched
 from synpick_warp.cli.limits import describe_limit
 from synpick_warp.cli.options import (
     EXIT_INCOMPLETE,
@@ -310,7 +310,7 @@ def _run(arguments: list[str]) -> int:
         return EXIT_MISTAKE
     except (SynpickError, cyclopts.CycloptsError) as error:
         print(*getattr(error, "__notes__", ()), sep="", end="", file=sys.stderr)  # The traceback of a fault of ours, see `TaskError`.
-        print(f"{NAME}: error: {one_line(str(error))}", file=sys.stderr)
+        print(f"{NAME}: error: {one_line(name_fetched(str(error)))}", file=sys.stderr)
         return EXIT_MISTAKE
     except KeyboardInterrupt:
         print(f"{NAME}: interrupted", file=sys.stderr)
@@ -321,6 +321,8 @@ def _run(arguments: list[str]) -> int:
             raise
         print(f"{NAME}: error: {one_line(said)}", file=sys.stderr)
         return EXIT_MISTAKE
+    finally:
+        drop_fetched()
 
 
 def _resolve(

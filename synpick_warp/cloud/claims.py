@@ -28,7 +28,7 @@ LEASE = 120.0
 BEATS = 4
 """Heartbeats a lease."""
 MARGIN = 0.1
-"""Last part of a lease in which its owner no longer relies on it."""
+"""Last part of a lease in which its owner does not rely on it."""
 MAX_WAIT = 10.0
 """Longest pause between two looks at what others have [s]."""
 CHUNK_WORLDS = 2
