@@ -185,10 +185,7 @@ def bake(
 
         out, choice = choose_output(make_manifest(resolved), resolved.bake, resolved.splits)
         print(choice, flush=True)
-    if claim and (as_url(out) is None or shard is not None):
-        raise ConfigError("--claim shares out the episodes of a prefix in an object store; name one by --out, and drop --shard")
-    if as_url(out) is not None and (profile or profile_out is not None):
-        raise ConfigError(f"--profile writes beside a data set, and --out is {as_url(out)}; profile a bake into a folder")
+    _check_store_options(out, claim=claim, shard=shard, profile=profile or profile_out is not None)
     if not profile and profile_out is None:
         return _bake(resolved, out, part, names, several, claim)
     trace = profile_out or out.with_name(f"{out.name}-profile.json")
@@ -334,6 +331,14 @@ def _resolve(
     if resolution is not None:
         overrides["cameras.resolution"] = parse_resolution(resolution)
     return load_settings(config, overrides, source=COMMAND_LINE, splits=splits)
+
+
+def _check_store_options(out: Path, *, claim: bool, shard: str | None, profile: bool) -> None:
+    """Raise ConfigError if options do not go with a folder, or with a prefix in an object store."""
+    if claim and (as_url(out) is None or shard is not None):
+        raise ConfigError("--claim shares out the episodes of a prefix in an object store; name one by --out, and drop --shard")
+    if as_url(out) is not None and profile:
+        raise ConfigError(f"--profile writes beside a data set, and --out is {as_url(out)}; profile a bake into a folder")
 
 
 def check_trace_file(trace: Path, out: Path) -> None:

@@ -8,7 +8,6 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Protocol
 
 from synpick_warp.cloud.claims import BEATS, CLAIMS, LEASE, MAX_WAIT, Chunks, Claims, LeaseLostError, default_chunk
 from synpick_warp.cloud.delivery import Delivery, WatchedProgress
@@ -27,18 +26,8 @@ MAX_CHUNK = 10_000
 """Most episodes of a bake without claims from one start of the worlds to the next."""
 
 
-class Baker(Protocol):
-    """Function that bakes episodes into a folder, such as `pipeline.bake_episodes`."""
-
-    def __call__(
-        self,
-        config: Config,
-        out: Path,
-        progress: Progress,
-        episodes: Sequence[int],
-        devices: Sequence[str] = (),
-        deliver: Callable[[], None] | None = None,
-    ) -> BakeSummary: ...
+Baker = Callable[..., BakeSummary]
+"""Bakes episodes into a folder, with the arguments of `pipeline.bake_episodes`."""
 
 
 def bake_into_store(

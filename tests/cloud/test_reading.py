@@ -95,9 +95,11 @@ def test_damage_is_named_by_its_address(sets, place, monkeypatch):
 
 
 @pytest.mark.filterwarnings("ignore::ResourceWarning")
-def test_webdataset_streams_shards(sets, place):
+def test_webdataset_streams_shards(prefix, picked_set, place):
     webdataset = pytest.importorskip("webdataset")
-    url, folder = sets
+    url, folder = prefix, picked_set
+    for path in folder.glob("*_web/*.tar"):
+        open_store(url).put(str(path.relative_to(folder)), path.read_bytes())
     reading.stream_shards()
     shards = reading.list_shards(url)
     assert [each.removeprefix(f"{url}/") for each in shards] == sorted(str(path.relative_to(folder)) for path in folder.glob("*_web/*.tar"))
