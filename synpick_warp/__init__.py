@@ -251,9 +251,15 @@ def load_config(preset_or_file: Path | str | None = None, settings: Mapping[str,
 def open(folder: Path | str) -> DataSet:
     """Open a data set for reading; loads no simulator, and reads nothing before it is needed. See `synpick_warp.dataset.reading`.
 
+    One in an object store (s3://bucket/prefix) is read episode by episode, with a cache in a temporary folder.
+
     Raises:
         DatasetError: The folder holds no data set.
     """
+    if (url := as_url(folder)) is not None:
+        from synpick_warp.cloud.reading import open_store_set
+
+        return open_store_set(url)
     from synpick_warp.dataset.reading import open_data_set
 
     return open_data_set(folder)

@@ -13,11 +13,13 @@ import stat
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from synpick_warp.cli.options import one_line
 from synpick_warp.configs.schema import Bake, Split
 from synpick_warp.errors import DatasetError, OutputError, SynpickError, escape
+from synpick_warp.system.inputs.urls import as_url
 
 if TYPE_CHECKING:
     from synpick_warp.dataset.reading import DataSet
@@ -179,7 +181,8 @@ def find_data_set(named: Path | None, usage: str, suits: Callable[[Path], bool] 
         DatasetError: There is none.
     """
     if named is not None:
-        return named
+        url = as_url(named)
+        return named if url is None else _fetch(url)
     try:
         found = [_Found(True, 0, Path.cwd())] if is_data_set(".") else sorted(_list_data_sets(), reverse=True)
     except OSError as error:
@@ -196,6 +199,35 @@ def find_data_set(named: Path | None, usage: str, suits: Callable[[Path], bool] 
     return last.folder
 
 
+_fetched: dict[Path, tuple[str, TemporaryDirectory[str]]] = {}
+"""Temporary copies of data sets in object stores: folder -> URL, and what deletes it."""
+
+
+def _fetch(url: str) -> Path:
+    """Copy a data set in an object store into a temporary folder, which `drop_fetched` deletes; returns the copy's folder."""
+    from synpick_warp.cloud.reading import copy_set
+
+    place = TemporaryDirectory(prefix="synpick-read-")
+    folder = Path(place.name) / url.rpartition("/")[2]
+    _fetched[folder] = url, place
+    folder.mkdir()
+    copy_set(url, folder)
+    return folder
+
+
+def drop_fetched() -> None:
+    """Delete the copies of data sets in object stores."""
+    while _fetched:
+        _fetched.popitem()[1][1].cleanup()
+
+
+def name_fetched(text: str) -> str:
+    """Message with the URLs of data sets in place of their copies' folders."""
+    for folder, (url, _) in _fetched.items():
+        text = text.replace(str(folder), url)
+    return text
+
+
 def _list_data_sets() -> Iterator[_Found]:
     """Yield the data sets among the folders in the current one."""
     with os.scandir() as entries:
@@ -209,7 +241,9 @@ def _list_data_sets() -> Iterator[_Found]:
 
 
 def beside(folder: Path, ending: str) -> Path:
-    """Path of an output beside a data set: its folder's name with an ending."""
+    """Path of an output beside a data set: its folder's name with an ending; in the current folder, if the set is in an object store."""
+    if folder in _fetched:
+        return Path(f"{folder.name}{ending}")
     place = folder if folder.name not in ("", "..") else folder.resolve()
     return place.with_name(f"{place.name or 'data-set'}{ending}")
 

@@ -22,7 +22,7 @@ from synpick_warp.cli.commands.report import write_page
 from synpick_warp.cli.commands.statistics import show_statistics
 from synpick_warp.cli.commands.validate import validate
 from synpick_warp.cli.commands.verify import verify
-from synpick_warp.cli.folders import DEFAULT_NAME, check_output_file, choose_output
+from synpick_warp.cli.folders import DEFAULT_NAME, check_output_file, choose_output, drop_fetched, name_fetched
 from synpick_warp.cli.limits import describe_limit
 from synpick_warp.cli.options import (
     EXIT_INCOMPLETE,
@@ -118,6 +118,12 @@ DeviceOption = Annotated[str | None, Parameter(help=_help("bake.device"))]
 ShardOption = Annotated[
     str | None, Parameter(help="i/n: only episodes with index % n == i, such as 0/4; combine the data sets with merge.")
 ]
+ClaimOption = Annotated[
+    bool,
+    Parameter(
+        negative=(), help="Be one of any number of equal workers, which share the episodes of a prefix in an object store among them."
+    ),
+]
 SplitOption = Annotated[
     str | None,
     Parameter(help="Only these splits of the settings, such as train or train,test (default: all of a file's; a preset's must be named)."),
@@ -142,6 +148,7 @@ def bake(
     formats: Annotated[str | None, Parameter(help=_help("bake.formats", " Joined by commas."))] = None,
     shard: ShardOption = None,
     split: SplitOption = None,
+    claim: ClaimOption = False,
     set_: SetOption = None,
     profile: Annotated[
         bool, Parameter(negative=(), help="Print the time of each stage at the end, and write a Chrome trace (see --profile-out).")
@@ -178,10 +185,9 @@ def bake(
 
         out, choice = choose_output(make_manifest(resolved), resolved.bake, resolved.splits)
         print(choice, flush=True)
-    if as_url(out) is not None and (profile or profile_out is not None):
-        raise ConfigError(f"--profile writes beside a data set, and --out is {as_url(out)}; profile a bake into a folder")
+    _check_store_options(out, claim=claim, shard=shard, profile=profile or profile_out is not None)
     if not profile and profile_out is None:
-        return _bake(resolved, out, part, names, several)
+        return _bake(resolved, out, part, names, several, claim)
     trace = profile_out or out.with_name(f"{out.name}-profile.json")
     check_trace_file(trace, out)
     return _profiled(partial(_bake, resolved, out, part, names), trace)
@@ -301,7 +307,7 @@ def _run(arguments: list[str]) -> int:
         return EXIT_MISTAKE
     except (SynpickError, cyclopts.CycloptsError) as error:
         print(*getattr(error, "__notes__", ()), sep="", end="", file=sys.stderr)  # The traceback of a fault of ours, see `TaskError`.
-        print(f"{NAME}: error: {one_line(str(error))}", file=sys.stderr)
+        print(f"{NAME}: error: {one_line(name_fetched(str(error)))}", file=sys.stderr)
         return EXIT_MISTAKE
     except KeyboardInterrupt:
         print(f"{NAME}: interrupted", file=sys.stderr)
@@ -312,6 +318,8 @@ def _run(arguments: list[str]) -> int:
             raise
         print(f"{NAME}: error: {one_line(said)}", file=sys.stderr)
         return EXIT_MISTAKE
+    finally:
+        drop_fetched()
 
 
 def _resolve(
@@ -323,6 +331,14 @@ def _resolve(
     if resolution is not None:
         overrides["cameras.resolution"] = parse_resolution(resolution)
     return load_settings(config, overrides, source=COMMAND_LINE, splits=splits)
+
+
+def _check_store_options(out: Path, *, claim: bool, shard: str | None, profile: bool) -> None:
+    """Raise ConfigError if options do not go with a folder, or with a prefix in an object store."""
+    if claim and (as_url(out) is None or shard is not None):
+        raise ConfigError("--claim shares out the episodes of a prefix in an object store; name one by --out, and drop --shard")
+    if as_url(out) is not None and profile:
+        raise ConfigError(f"--profile writes beside a data set, and --out is {as_url(out)}; profile a bake into a folder")
 
 
 def check_trace_file(trace: Path, out: Path) -> None:
@@ -370,7 +386,9 @@ def _check_inputs(models: str, lights: str) -> None:
         raise LightError(f"there is no lights folder {lights}; --lights takes a folder of .hdr maps and sIBL sets; {PATH_RULE}")
 
 
-def _bake(config: Config, out: Path, shard: tuple[int, int], splits: Sequence[str], devices: Sequence[str] = ()) -> int:
+def _bake(
+    config: Config, out: Path, shard: tuple[int, int], splits: Sequence[str], devices: Sequence[str] = (), claim: bool = False
+) -> int:
     """Check device and folders, which is cheap, then bake."""
     with collection_paused():
         from synpick_warp.cli.display import make_console, make_progress, print_summary
@@ -393,7 +411,7 @@ def _bake(config: Config, out: Path, shard: tuple[int, int], splits: Sequence[st
         else:
             from synpick_warp.cloud.run import bake_into_store
 
-            bake = partial(bake_into_store, config, url)
+            bake = partial(bake_into_store, config, url, claim=claim)
 
     console = make_console()
     with make_progress(console) as progress:

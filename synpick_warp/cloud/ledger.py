@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 import msgspec
@@ -132,6 +132,10 @@ class Ledger:
             if (match := _ENTRY.fullmatch(key)) and first <= int(match[1]) < end:
                 found.add(int(match[1]))
         return found
+
+    def blocks_of(self, episodes: Iterable[int]) -> list[int]:
+        """Blocks of episodes."""
+        return sorted({episode // BLOCK for episode in episodes})
 
     def remaining(self, ranges: Sequence[range]) -> Iterator[list[int]]:
         """Episodes of these ranges without done mark, block by block; blocks that have none are left out."""

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import shutil
 import tempfile
+import time
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Protocol
 
+from synpick_warp.cloud.claims import BEATS, CLAIMS, LEASE, MAX_WAIT, Chunks, Claims, LeaseLostError, default_chunk
 from synpick_warp.cloud.delivery import Delivery, WatchedProgress
 from synpick_warp.cloud.finish import finalize_store
 from synpick_warp.cloud.ledger import Ledger
@@ -24,18 +26,8 @@ MAX_CHUNK = 10_000
 """Most episodes of a bake without claims from one start of the worlds to the next."""
 
 
-class Baker(Protocol):
-    """Function that bakes episodes into a folder, such as `pipeline.bake_episodes`."""
-
-    def __call__(
-        self,
-        config: Config,
-        out: Path,
-        progress: Progress,
-        episodes: Sequence[int],
-        devices: Sequence[str] = (),
-        deliver: Callable[[], None] | None = None,
-    ) -> BakeSummary: ...
+Baker = Callable[..., BakeSummary]
+"""Bakes episodes into a folder, with the arguments of `pipeline.bake_episodes`."""
 
 
 def bake_into_store(
@@ -46,6 +38,8 @@ def bake_into_store(
     splits: Sequence[str] = (),
     devices: Sequence[str] = (),
     bake: Baker = bake_episodes,
+    *,
+    claim: bool = False,
 ) -> BakeSummary:
     """Simulate, render and upload a data set, or the remaining episodes of one.
 
@@ -57,6 +51,7 @@ def bake_into_store(
         splits: Only episodes of these splits; empty: all.
         devices: As in `pipeline.run_bake`.
         bake: Bakes episodes into a folder.
+        claim: Whether this is one of several equal workers, which share the episodes out among them by claims.
 
     Returns:
         Summary of the episodes of this run; those that were done before are not in it.
@@ -68,23 +63,80 @@ def bake_into_store(
     ranges = DataLayout.of(config).plan_shard(splits, shard)
     store = open_store(url)
     ledger = Ledger(store, config, probe(store))
+    if claim and not ledger.probe.conditional:
+        raise StoreError(f"{url} has no conditional writes, which --claim needs; share the episodes out by --shard i/n instead")
     summary = BakeSummary()
-    with tempfile.TemporaryDirectory(prefix="synpick-store-") as place:
-        for number, episodes in enumerate(_chunks(ledger, ranges)):
-            folder = Path(place, f"{number:06d}")
-            part = _bake_chunk(ledger, folder, episodes, progress, devices, bake)
-            summary.total += part.total
-            summary.take_summary(part)
-            summary.wall_seconds += part.wall_seconds
-            if part.stopped:
-                summary.stopped = part.stopped
-                return summary
+    with tempfile.TemporaryDirectory(prefix="synpick-store-") as name:
+        place = Path(name)
+        baking = partial(_bake_chunk, ledger, place, progress=progress, devices=devices, bake=bake)
+        claims = Claims(store, ledger.probe.offset, LEASE) if claim else None
+        if claims is None:
+            for episodes in _chunks(ledger, ranges):
+                if _take(summary, baking(episodes)):
+                    return summary
+        elif ledger.finished() < ledger.layout.planned and _bake_claims(ledger, claims, ranges, baking, summary, progress):
+            return summary
         if not summary.total:
             progress.note("all episodes are done")
         progress.stage("finishing files")
-        if missing := finalize_store(ledger, Path(place)):
+        missing = finalize_store(ledger, place) if claims is None else _finalize_once(ledger, claims, place)
+        if missing:
             progress.note(f"{missing:,} episodes are not done yet: whoever ends last writes the indices")
     return summary
+
+
+def _take(summary: BakeSummary, part: BakeSummary) -> bool:
+    """Add a chunk to the summary; returns whether it was stopped."""
+    summary.total += part.total
+    summary.take_summary(part)
+    summary.wall_seconds += part.wall_seconds
+    summary.stopped = part.stopped
+    return summary.stopped != 0
+
+
+def _bake_claims(
+    ledger: Ledger,
+    claims: Claims,
+    ranges: Sequence[range],
+    baking: Callable[..., BakeSummary],
+    summary: BakeSummary,
+    progress: Progress,
+) -> bool:
+    """Bake chunks until all are done by somebody; returns whether this worker was stopped."""
+    size = default_chunk(ledger.config.bake.worlds, sum(map(len, ranges)))
+    chunks = Chunks(ledger, claims, ranges, size)
+    for chunk in chunks:
+        try:
+            part = baking(chunk.episodes, permit=chunk.claim.check)
+        except LeaseLostError as error:
+            progress.note(str(error))
+            chunk.claim.stop()
+            continue
+        except SynpickError:
+            chunk.claim.release()
+            raise
+        except BaseException:
+            chunk.claim.stop()
+            raise
+        if _take(summary, part):
+            chunk.claim.release()
+            return True
+        chunks.done(chunk)
+    return False
+
+
+def _finalize_once(ledger: Ledger, claims: Claims, place: Path) -> int:
+    """Finalize by one worker at a time; the others wait for it, and take over if it dies. Returns as `finalize_store`."""
+    planned = ledger.layout.planned
+    while ledger.finished() < planned:
+        claim = claims.take(f"{CLAIMS}/indices-{planned}")
+        if claim is not None:
+            try:
+                return finalize_store(ledger, place)
+            finally:
+                claim.release()
+        time.sleep(min(claims.lease / BEATS, MAX_WAIT))
+    return 0
 
 
 def _chunks(ledger: Ledger, ranges: Sequence[range]) -> Iterator[list[int]]:
@@ -101,7 +153,7 @@ def _chunks(ledger: Ledger, ranges: Sequence[range]) -> Iterator[list[int]]:
 
 def _bake_chunk(
     ledger: Ledger,
-    folder: Path,
+    place: Path,
     episodes: Sequence[int],
     progress: Progress,
     devices: Sequence[str],
@@ -109,17 +161,19 @@ def _bake_chunk(
     permit: Callable[[], None] = lambda: None,
 ) -> BakeSummary:
     """Bake episodes in a new folder, and deliver them; errors name the store in its place."""
-    folder.mkdir()
+    folder = Path(tempfile.mkdtemp(dir=place))
     if ledger.manifest is not None:  # It has the digests of objects and lights, which the bake compares.
         (folder / MANIFEST_FILE).write_bytes(ledger.manifest)
     try:
         with Delivery(ledger, folder, permit) as delivery:
             watched = WatchedProgress(progress, delivery.check)
             return bake(ledger.config, folder, watched, episodes, devices, partial(_finish, delivery))
-    except StoreError:
+    except (StoreError, LeaseLostError):
         raise
     except SynpickError as error:
         raise type(error)(str(error).replace(str(folder), ledger.store.url)) from error
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
 
 
 def _finish(delivery: Delivery) -> None:

@@ -57,6 +57,7 @@ def make_picking(
     settings: Mapping[str, object] = MappingProxyType({}),
     device_name: str | None = None,
     progress: Progress | None = None,
+    perceives: bool = False,
 ) -> PickingEnvironment:
     """Build a vector environment on a device; `vector.PickingVectorEnv` wraps it for Gymnasium.
 
@@ -65,6 +66,8 @@ def make_picking(
         source, settings: Settings, as for `bake`.
         device_name: Overrides `bake.device`.
         progress: Receives stages and notes; None: silent.
+        perceives: Whether the paper's heuristic plans a grasp before each attempt in every task (`worlds.simulation.plan`), not in
+            target alone; it chooses as in a bake of this mode.
 
     Raises:
         SynpickError: A setting is not allowed, the machine has too little memory, or device, models, lights, bin or cameras cannot be used.
@@ -98,5 +101,5 @@ def make_picking(
             raise ConfigError(f"obs has rgb, but {config.rig.label(camera)} has none among its modalities")
         sight = Sight(config.perception, config.rig, simulation, group, choice.resolution, wanted, shows_gripper=law is not None)
         kept = choice.piles if choice.piles <= CACHE else 0
-        worlds = EnvironmentWorlds(simulation, sight, choice.num_envs, kept, law, choice.task == TARGET)
+        worlds = EnvironmentWorlds(simulation, sight, choice.num_envs, kept, law, perceives or choice.task == TARGET)
     return PickingEnvironment(choice, worlds, bounds)

@@ -2,35 +2,49 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field, replace
 
 import torch  # pyright: ignore[reportMissingImports]
+import warp as wp
 
-from synpick_warp.codes import MAX_INSTANCES
-from synpick_warp.environment.picking import PickingEnvironment
-from synpick_warp.environment.settings import ATTEMPT, DISABLED, PICK, PIXEL, TORCH, Choice, make_choice
+from synpick_warp.codes import MAX_INSTANCES, Outcome
+from synpick_warp.configs.episodes.manipulation import Pick, Target
+from synpick_warp.configs.episodes.picks import Picks
+from synpick_warp.environment.picking import PickingEnvironment, Step
+from synpick_warp.environment.settings import ATTEMPT, DISABLED, PIXEL, POINT, TARGET, TORCH, Choice, make_choice
 from synpick_warp.scenes.cameras import make_cameras
+from synpick_warp.stages.perception.candidates import CandidateSampler
 from tools.examples.picking_scores import Sight
 
 REACH = 4
 """Half side of the square around a failed pick that is barred until another pick succeeds [px]."""
+SAMPLED = 256
+"""Grasp candidates among which the analytic picker chooses: the sampler draws them over instances and scores, out of 1,024 pixels."""
+MASK = "target_mask"
 Score = Callable[[Sight], torch.Tensor]
+Choose = Callable[[PickingEnvironment, Sight, torch.Tensor | None], torch.Tensor]
+"""Picker: environment, what it sees and barred pixels (B, H, W) bool -> pixels (B, 2), or grasps (B, 6) as of action `point`."""
 
 
 @dataclass
 class Emptied:
-    """Counts of a bin emptying run: attempts, successful ones, bins, and emptied ones."""
+    """Counts of a bin emptying run: attempts by `Outcome`, successes, bins, emptied bins, and picks of each bin."""
 
-    attempts: int = 0
+    outcomes: torch.Tensor = field(default_factory=lambda: torch.zeros(len(Outcome), dtype=torch.int64))
     picked: int = 0
     bins: int = 0
     empty: int = 0
 
+    @property
+    def attempts(self) -> int:
+        """Number of attempts."""
+        return int(self.outcomes.sum())
 
-def choose_environment(worlds: int, resolution: tuple[int, int], seed: int, max_steps: int | None = None) -> Choice:
-    """Options for `make_picking` of a vector environment with whole picks at pixels that observes depth and instances."""
-    return make_choice(PICK, worlds, ("depth", "instances"), resolution, PIXEL, DISABLED, TORCH, seed, max_steps, None, ATTEMPT)
+
+def choose_environment(task: str, worlds: int, resolution: tuple[int, int], seed: int, max_steps: int | None = None) -> Choice:
+    """Options for `make_picking` of a vector environment with whole picks that observes depth and instances."""
+    return make_choice(task, worlds, ("depth", "instances"), resolution, PIXEL, DISABLED, TORCH, seed, max_steps, None, ATTEMPT)
 
 
 def observe(environment: PickingEnvironment, obs: Mapping[str, torch.Tensor]) -> Sight:
@@ -39,7 +53,8 @@ def observe(environment: PickingEnvironment, obs: Mapping[str, torch.Tensor]) ->
     camera = make_cameras(config.rig)[config.rig.index(config.perception.camera)]
     instance = obs["instances"]
     shown = torch.where(instance <= MAX_INSTANCES, instance, torch.zeros_like(instance))
-    return Sight(obs["depth"].clone(), shown, float(camera.matrix[0, 0]) * obs["depth"].shape[2] / camera.width)
+    target = obs[MASK] > 0 if MASK in obs else None
+    return Sight(obs["depth"].clone(), shown, float(camera.matrix[0, 0]) * obs["depth"].shape[2] / camera.width, target)
 
 
 def choose_pixels(value: torch.Tensor) -> torch.Tensor:
@@ -48,42 +63,106 @@ def choose_pixels(value: torch.Tensor) -> torch.Tensor:
     return torch.stack((place % value.shape[2], place // value.shape[2]), dim=1)
 
 
-def run_first_choices(environment: PickingEnvironment, scores: Mapping[str, Score], attempts: int) -> tuple[dict[str, int], int]:
+class DenseChoice:
+    """Picker by a score map: the pixel with the largest score, on the target if there is one, that is not barred."""
+
+    def __init__(self, score: Score) -> None:
+        """Take the score function."""
+        self.score = score
+
+    def __call__(self, environment: PickingEnvironment, sight: Sight, barred: torch.Tensor | None) -> torch.Tensor:
+        """Choose pixels (B, 2)."""
+        value = self.score(sight)
+        if sight.target is not None:
+            value = torch.where(sight.target, value, value - 2.0)
+        return choose_pixels(value if barred is None else torch.where(barred, value - 1.0, value))
+
+
+def choose_planned(environment: PickingEnvironment, sight: Sight, barred: torch.Tensor | None) -> torch.Tensor:
+    """Choose the grasps (B, 6) that the paper's heuristic has planned; the environment perceives (`make_picking`)."""
+    plan = environment.worlds.simulation.plan
+    return torch.cat([wp.to_torch(part)[: environment.count] for part in (plan.point, plan.normal)], dim=1).clone()
+
+
+class AnalyticChoice:
+    """Picker by SuctionNet's analytic map: of grasp candidates of each state the one with the largest seal score x wrench score."""
+
+    def __init__(self, environment: PickingEnvironment) -> None:
+        """Allocate a sampler of candidates."""
+        self.sampler = CandidateSampler(environment.worlds.simulation, Picks(candidates=SAMPLED, uniform=0.0))
+
+    def __call__(self, environment: PickingEnvironment, sight: Sight, barred: torch.Tensor | None) -> torch.Tensor:
+        """Choose grasps (B, 6)."""
+        count, target = environment.count, wp.to_torch(environment.worlds.simulation.plan.target).clone()
+        state = environment.get_state()
+        grasps, candidates, _ = self.sampler.sample(state.worlds, range(count))
+        environment.set_state(state)
+        score = (wp.to_torch(candidates.seal) * wp.to_torch(candidates.wrench)).view(count, -1)
+        score[:, 0] = -1.0  # The heuristic's own grasp.
+        if sight.target is not None:
+            score = torch.where(wp.to_torch(grasps.target).view(count, -1) == target[:count, None], score, -2.0)
+        best = score.argmax(dim=1) + torch.arange(count, device=score.device) * SAMPLED
+        return torch.cat([wp.to_torch(part)[best] for part in (grasps.point, grasps.normal)], dim=1)
+
+
+def act(environment: PickingEnvironment, actions: torch.Tensor) -> Step:
+    """Carry out picks at pixels (B, 2), or grasps (B, 6)."""
+    choice = environment.choice
+    environment.choice = replace(choice, action=PIXEL if actions.shape[1] == 2 else POINT)
+    try:
+        return environment.step(actions)
+    finally:
+        environment.choice = choice
+
+
+def run_first_choices(
+    environment: PickingEnvironment, pickers: Mapping[str, Choose], attempts: int
+) -> Iterator[tuple[dict[str, tuple[int, torch.Tensor]], int]]:
     """Paired comparison: each picker makes its first choice from the same piles, of which at least `attempts` are drawn.
 
-    Returns:
-        Successes of each picker, and the number of piles.
+    Yields, after each draw, what there is so far: successes of each picker with its counts by `Outcome`, and the number of piles.
     """
-    picked, piles = dict.fromkeys(scores, 0), 0
+    results, piles = {name: (0, torch.zeros(len(Outcome), dtype=torch.int64)) for name in pickers}, 0
     while piles < attempts:
         environment.reset()
         start = environment.get_state()
-        for name, score in scores.items():
-            pixels = choose_pixels(score(observe(environment, environment.set_state(start))))
-            picked[name] += int(environment.step(pixels).reward.sum())
+        for name, choose in pickers.items():
+            step = act(environment, choose(environment, observe(environment, environment.set_state(start)), None))
+            picked, outcomes = results[name]
+            results[name] = picked + int(step.reward.sum()), outcomes + _count(step)
         environment.set_state(start)
         piles += environment.count
-    return picked, piles
+        yield results, piles
 
 
-def run_until_empty(environment: PickingEnvironment, score: Score) -> Emptied:
-    """Bin emptying: pick in all environments until their episodes end; squares around failed picks are barred."""
-    obs, _ = environment.reset()
-    result, value = Emptied(bins=environment.count), torch.zeros(0)
-    barred = torch.zeros_like(obs["depth"], dtype=torch.bool)
-    over = torch.zeros(environment.count, dtype=torch.bool, device=barred.device)
+def _count(step: Step, counted: torch.Tensor | None = None) -> torch.Tensor:
+    """Attempts of a step by `Outcome`, on the host; `counted` (environment) bool: of these alone."""
+    outcome = step.info["outcome"].long()
+    return torch.bincount(outcome if counted is None else outcome[counted], minlength=len(Outcome)).cpu()
+
+
+def run_until_empty(environment: PickingEnvironment, choose: Choose, failures: int = Pick().failures) -> Emptied:
+    """Bin emptying: pick in all environments until their episodes end; squares around failed picks are barred.
+
+    As in the paper, an episode also ends after `failures` attempts that catch nothing; with a target they are counted anew after a catch.
+    """
+    sight = observe(environment, environment.reset()[0])
+    result, failed = Emptied(bins=environment.count), torch.zeros(environment.count, dtype=torch.int64, device=sight.depth.device)
+    barred = torch.zeros_like(sight.depth, dtype=torch.bool)
+    over, forgives = failed > 0, environment.choice.task == TARGET and Target().forgive
     while not bool(over.all()):
-        value = torch.where(barred, -1.0, score(observe(environment, obs)))
-        pixels = choose_pixels(value)
-        step = environment.step(pixels)
-        success = (step.reward > 0) & ~over
-        result.attempts += int((~over).sum())
-        result.picked += int(success.sum())
+        actions = choose(environment, sight, barred)
+        step = act(environment, actions)
+        caught = (step.info["outcome"] == Outcome.TARGET_PICKED) | (step.info["outcome"] == Outcome.OTHER_PICKED)
+        result.outcomes += _count(step, ~over)
+        result.picked += int(((step.reward > 0) & ~over).sum())
         result.empty += int((step.terminated & ~over).sum())
-        barred[success] = False
-        for index in torch.nonzero(~success & ~over)[:, 0].tolist():
-            column, row = pixels[index].tolist()
-            barred[index, max(0, row - REACH) : row + REACH + 1, max(0, column - REACH) : column + REACH + 1] = True
-        over |= step.terminated | step.truncated
-        obs = step.obs
+        barred[caught] = False
+        failed = torch.where(caught, failed * (not forgives), failed + 1)
+        if actions.shape[1] == 2:
+            for index in torch.nonzero(~caught & ~over)[:, 0].tolist():
+                column, row = actions[index].tolist()
+                barred[index, max(0, row - REACH) : row + REACH + 1, max(0, column - REACH) : column + REACH + 1] = True
+        over |= step.terminated | step.truncated | (failed >= failures)
+        sight = observe(environment, step.obs)
     return result

@@ -32,10 +32,16 @@ class Sight:
     """1 + instance that is visible (B, H, W) uint8; 0: none. For the baselines that segment."""
     focal: float
     """Focal length [px]."""
+    target: torch.Tensor | None = None
+    """Pixels of the object that is to be picked (B, H, W) bool; None: any may be."""
 
     def part(self, rows: torch.Tensor | slice) -> Sight:
         """Subset of the images, by index."""
-        return Sight(self.depth[rows], self.instance[rows], self.focal)
+        return Sight(self.depth[rows], self.instance[rows], self.focal, None if self.target is None else self.target[rows])
+
+    def to(self, device: torch.device) -> Sight:
+        """Copy on a device."""
+        return Sight(self.depth.to(device), self.instance.to(device), self.focal, None if self.target is None else self.target.to(device))
 
 
 def find_normals(depth: torch.Tensor, focal: float) -> torch.Tensor:

@@ -1,0 +1,14 @@
+"""Program of a claiming worker that bakes without simulation: URL, number of episodes, lease [s]."""
+
+from __future__ import annotations
+
+import sys
+
+from synpick_warp.cloud import run
+from synpick_warp.system.progress import SilentProgress
+from tests.cloud.conftest import tiny
+from tests.harness import scripted_bake
+
+if __name__ == "__main__":
+    run.LEASE = float(sys.argv[3])
+    run.bake_into_store(tiny(int(sys.argv[2])), sys.argv[1], SilentProgress(), bake=scripted_bake.bake_episodes, claim=True)

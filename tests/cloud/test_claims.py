@@ -1,0 +1,187 @@
+"""Claims: one owner at a time, who learns of his loss before he commits; workers that die are replaced; the set is that of one bake."""
+
+from __future__ import annotations
+
+import os
+import random
+import subprocess
+import sys
+import threading
+import time
+
+import pytest
+
+from synpick_warp.cloud import finish, run
+from synpick_warp.cloud.claims import Claims, LeaseLostError, Sizes, default_chunk
+from synpick_warp.cloud.ledger import Ledger
+from synpick_warp.errors import StoreError
+from synpick_warp.system.progress import SilentProgress
+from synpick_warp.system.stores.opening import Probe, open_store
+from tests.builders import mistake
+from tests.cloud.conftest import EPISODES, files, tiny
+from tests.cloud.mortal import Killed, MortalStore, stored
+from tests.harness import scripted_bake
+
+
+def work(url: str, **given):
+    return run.bake_into_store(tiny(), url, SilentProgress(), bake=given.pop("bake", scripted_bake.bake_episodes), claim=True, **given)
+
+
+@pytest.mark.parametrize(("episodes", "chunk"), [(1, 1), (4, 1), (7, 3), (1_000_000, 512), (1_000, 600)])
+def test_chunks_cover_the_plan_and_shrink_towards_its_end(episodes, chunk):
+    bounds = list(Sizes(episodes, chunk).bounds())
+    assert [start for start, _ in bounds] == [0, *(end for _, end in bounds[:-1])]
+    assert bounds[-1][1] == episodes
+    assert all(0 < end - start <= chunk for start, end in bounds)
+    if episodes == 1_000_000:
+        sizes = [end - start for start, end in bounds]
+        assert sizes[0] == 512
+        assert sizes[-2] == 64
+        assert sum(size == 512 for size in sizes) * 512 == pytest.approx(0.75 * episodes, rel=1e-2)
+
+
+@pytest.mark.parametrize(("worlds", "episodes", "chunk"), [(300, 1_000_000, 600), (0, 1_000_000, 512), (300, 64, 2), (2, 3, 1)])
+def test_a_chunk_fills_the_worlds_of_a_device(worlds, episodes, chunk):
+    assert default_chunk(worlds, episodes) == chunk
+
+
+def test_a_claim_has_one_owner_until_it_runs_out(memory):
+    """Neither a clock that is wrong by less than the probe finds nor a slow owner breaks it: the slow one learns of it."""
+    store = open_store(memory)
+    quick, other = Claims(store, 0.0, 60.0), Claims(store, 0.0, 60.0)
+    claim = quick.take("k")
+    assert claim is not None
+    claim.check()
+    assert other.take("k") is None
+    claim.release()
+    second = other.take("k")
+    assert second is not None
+    with pytest.raises(LeaseLostError):
+        claim.check()
+    second.stop()
+
+
+def test_a_heartbeat_keeps_a_claim_and_a_dead_one_is_taken_over(memory):
+    store = open_store(memory)
+    mine, others = Claims(store, 0.0, 0.4), Claims(store, 0.0, 0.4)
+    claim = mine.take("k")
+    assert claim is not None
+    end = time.monotonic() + 1.0
+    while time.monotonic() < end:
+        assert others.take("k") is None
+        time.sleep(0.05)
+    claim.stop()  # It hangs, or has died.
+    while (second := others.take("k")) is None:
+        time.sleep(0.05)
+    with pytest.raises(LeaseLostError):
+        claim.check()
+    second.check()
+    second.stop()
+
+
+def test_the_winner_of_a_lost_lease_is_one(memory):
+    store, won = open_store(memory), []
+    store.put("k", b"damaged")
+    workers = [Claims(store, 0.0) for _ in range(8)]
+    threads = [threading.Thread(target=lambda each=each: won.append(each.take("k"))) for each in workers]
+    for each in threads:
+        each.start()
+    for each in threads:
+        each.join()
+    (claim,) = filter(None, won)
+    claim.stop()
+
+
+def test_an_overtaken_worker_commits_nothing_more_and_goes_on(memory, local, monkeypatch):
+    """Its lease is stolen in the middle of its first chunk; the thief never does the chunk, so it is claimed again later."""
+    monkeypatch.setattr(run, "LEASE", 0.5)
+    store, stolen, baked = open_store(memory), [], []
+
+    def bake(config, out, progress, episodes, devices=(), deliver=None):
+        baked.extend(episodes)
+        if not stolen:
+            key = next(key for key, _ in store.list(".store/claims") if key[-6:].isdigit() and "done" not in key)
+            found = store.get_tagged(key)
+            stolen.append(store.replace(key, found[0].replace(b'"owner":"', b'"owner":"thief-'), found[1]))
+            time.sleep(0.4)  # Longer than a heartbeat.
+        return scripted_bake.bake_episodes(config, out, progress, episodes, devices, deliver)
+
+    work(memory, bake=bake)
+    assert len(baked) == EPISODES + 1
+    assert stored(memory) == local
+
+
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")  # Its heartbeat dies, too.
+def test_a_dead_workers_chunk_is_done_by_another(memory, local, monkeypatch):
+    monkeypatch.setattr(run, "LEASE", 0.3)
+    with monkeypatch.context() as patch:
+        patch.setattr(run, "open_store", lambda url: MortalStore(open_store(url), 60))
+        with pytest.raises(Killed):
+            work(memory)
+    work(memory)
+    assert stored(memory) == local
+
+
+def test_two_finalizers_at_once_write_one_set(memory, local, tmp_path, monkeypatch):
+    with monkeypatch.context() as patch:
+        patch.setattr(run, "finalize_store", lambda *_: 0)
+        run.bake_into_store(tiny(), memory, SilentProgress(), bake=scripted_bake.bake_episodes)
+    assert "manifest/joined.json" not in stored(memory)
+    ledger = Ledger(open_store(memory), tiny(), Probe(0.0, True))
+    gate, real, places = threading.Barrier(2), finish.finalize_data_set, [tmp_path / "one", tmp_path / "two"]
+    alone = threading.Lock()
+
+    def meet(*arguments):
+        with alone:
+            real(*arguments)
+        gate.wait(60)
+
+    monkeypatch.setattr(finish, "finalize_data_set", meet)
+    for each in places:
+        each.mkdir()
+    threads = [threading.Thread(target=finish.finalize_store, args=(ledger, each)) for each in places]
+    for each in threads:
+        each.start()
+    for each in threads:
+        each.join()
+    assert stored(memory) == local
+
+
+def test_stores_without_conditional_writes_are_recognised(tmp_path):
+    pytest.importorskip("obstore")
+    said = mistake("bake", "--config", "smoke", "--out", f"file://{tmp_path}/set", "--claim", "--device", "cpu")
+    assert "has no conditional writes, which --claim needs; share the episodes out by --shard i/n" in said
+    assert files(tmp_path) == {}
+    assert "--claim shares out" in mistake("bake", "--out", tmp_path / "set", "--claim")
+
+
+def test_a_damaged_plan_is_refused(memory):
+    work(memory)
+    store = open_store(memory)
+    (key,) = (key for key, _ in store.list(".store/claims") if key.endswith("plan.json"))
+    store.put(key, b"none")
+    store.delete(".store/finished")
+    with pytest.raises(StoreError, match="is damaged; delete it"):
+        work(memory)
+
+
+@pytest.mark.slow
+def test_workers_killed_fifty_times_leave_the_set_of_one_bake(prefix, tmp_path):
+    """Three at a time, killed at random moments and replaced; leases of two seconds."""
+    kills, episodes, draw = int(os.environ.get("SYNPICK_KILLS", 50)), 100, random.Random(0)
+    command = [sys.executable, "-m", "tests.cloud.claiming_worker", prefix, str(episodes), "2"]
+    environment = os.environ | {"HOME": str(tmp_path), "TMPDIR": str(tmp_path / "tmp"), "PYTHONPATH": os.pathsep.join(sys.path)}
+    (tmp_path / "tmp").mkdir()
+    workers = [subprocess.Popen(command, env=environment) for _ in range(3)]
+    try:
+        for number in range(kills):
+            time.sleep(draw.uniform(0.5, 6.0))
+            workers[number % 3].kill()
+            workers[number % 3].wait()
+            workers[number % 3] = subprocess.Popen(command, env=environment)
+        assert [each.wait(300) for each in workers] == [0, 0, 0]
+    finally:
+        for each in workers:
+            each.kill()
+    scripted_bake.bake(tmp_path / "local", tiny(episodes))
+    assert stored(prefix) == files(tmp_path / "local")

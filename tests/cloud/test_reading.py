@@ -1,0 +1,118 @@
+"""Sets in a store read where they lie: the same as on disk, a bounded cache, damage that is named, streams for webdataset."""
+
+from __future__ import annotations
+
+import tempfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import synpick_warp
+from synpick_warp.cloud import reading
+from synpick_warp.errors import DatasetError
+from synpick_warp.system.progress import SilentProgress
+from synpick_warp.system.stores.opening import open_store
+from tests.builders import mistake, run
+from tests.cloud.conftest import files
+
+
+@pytest.fixture
+def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Temporary and current folder of the test."""
+    for name in ("temporary", "here"):
+        (tmp_path / name).mkdir()
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "temporary"))
+    monkeypatch.chdir(tmp_path / "here")
+    return tmp_path
+
+
+@pytest.fixture
+def sets(memory: str, picked_set: Path) -> tuple[str, Path]:
+    """The same set in a store and on disk."""
+    store = open_store(f"{memory}/set")
+    for name, data in files(picked_set).items():
+        store.put(name, data)
+    return store.url, picked_set
+
+
+def test_views_are_those_on_disk_and_the_cache_is_bounded(sets, place):
+    url, folder = sets
+    local, stored = synpick_warp.open(folder), reading.open_store_set(url, limit=1)
+    assert list(stored) == list(local)
+    assert list(stored.splits) == list(local.splits)
+    for index, episode in local.items():
+        there = stored[index]
+        assert there.row == episode.row
+        for frame in (0, len(episode) - 1):
+            np.testing.assert_array_equal(there.view(frame, 1).rgb, episode.view(frame, 1).rgb)
+            np.testing.assert_array_equal(there.view(frame, 1).depth, episode.view(frame, 1).depth)
+        assert len(list((stored.folder / "manifest").glob("0*.json"))) == 1
+    with pytest.raises(KeyError):
+        stored[99]
+    assert synpick_warp.open(url).planned == local.planned
+
+
+@pytest.mark.parametrize(
+    "command",
+    [("verify",), ("stats", "--json", "--threads", "1"), ("validate", "--fast", "--threads", "1", "--json")],
+    ids=lambda each: each[0],
+)
+def test_commands_say_what_they_say_of_a_folder(sets, place, command):
+    url, folder = sets
+    name, *options = command
+    here, there = run(name, folder, *options), run(name, url, *options)
+    assert (there.code, there.out) == (here.code, here.out)
+    assert list((place / "temporary").iterdir()) == list((place / "here").iterdir()) == []
+
+
+def test_outputs_of_commands_are_in_the_current_folder(sets, place):
+    url, folder = sets
+    assert run("convert", url, "--to", "coco", "--processes", "1").code == 0
+    assert run("convert", folder, "--to", "coco", "--processes", "1", "--out", place / "local").code == 0
+    assert files(place / "here" / "set-coco") == files(place / "local")
+    assert list((place / "temporary").iterdir()) == []
+
+
+def test_damage_is_named_by_its_address(sets, place, monkeypatch):
+    url, _ = sets
+    store = open_store(url)
+    name = next(name for name, _ in store.list("") if name.endswith(".tar"))
+    data = store.get(name)
+    store.put(name, data[:-1] + b"x")
+    ran = run("verify", url)
+    assert (ran.code, ran.out) == (1, f"{url}/{name} has changed since it was written: its checksum differs\n")
+    with pytest.raises(DatasetError, match="checksum differs"):
+        synpick_warp.open(url)[0]
+    store.delete(name)
+    assert f"{url}/{name} is missing" in run("verify", url).out
+    with pytest.raises(DatasetError, match="is missing"):
+        synpick_warp.open(url)[0]
+    monkeypatch.setattr(reading, "FREE_PART", 0.0)
+    assert "may be copied" in mistake("stats", url)
+    assert "has no manifest.json" in mistake("stats", f"{url}/none")
+    assert list((place / "temporary").iterdir()) == []
+
+
+@pytest.mark.filterwarnings("ignore::ResourceWarning")
+def test_webdataset_streams_shards(prefix, picked_set, place):
+    webdataset = pytest.importorskip("webdataset")
+    url, folder = prefix, picked_set
+    for path in folder.glob("*_web/*.tar"):
+        open_store(url).put(str(path.relative_to(folder)), path.read_bytes())
+    reading.stream_shards()
+    shards = reading.list_shards(url)
+    assert [each.removeprefix(f"{url}/") for each in shards] == sorted(str(path.relative_to(folder)) for path in folder.glob("*_web/*.tar"))
+    keys = {sample["__key__"] for sample in webdataset.WebDataset(shards, shardshuffle=False).decode(synpick_warp.webdataset.decode_view)}
+    local = {sample["__key__"] for sample in webdataset.WebDataset([str(path) for path in folder.glob("*_web/*.tar")], shardshuffle=False)}
+    assert keys == local
+    assert list((place / "temporary").iterdir()) == []
+
+
+def test_a_set_that_was_baked_into_a_store_verifies_there(prefix):
+    from synpick_warp.cloud.run import bake_into_store
+    from tests.cloud.conftest import tiny
+    from tests.harness import scripted_bake
+
+    bake_into_store(tiny(2), prefix, SilentProgress(), bake=scripted_bake.bake_episodes)
+    assert run("verify", prefix).code == 0
