@@ -157,7 +157,7 @@ def check_symmetries(model: ModelSubject) -> Findings:
     transforms = [(f"symmetries_discrete[{index}]", matrix) for index, matrix in _discrete(model) if is_rigid(matrix)]
     for index, (axis, offset) in _continuous(model):
         if np.linalg.norm(axis) > 0.0:
-            transforms += [(f"symmetries_continuous[{index}]", rotation_matrix(angle, axis, offset)) for angle in ANGLES]
+            transforms += [(f"symmetries_continuous[{index}]", np.asarray(rotation_matrix(angle, axis, offset))) for angle in ANGLES]
     mesh = model.mesh[0]
     if not transforms or mesh is None:
         return
