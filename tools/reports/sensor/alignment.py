@@ -30,9 +30,14 @@ def robust_deviation(values: np.ndarray) -> float:
     return float(_MAD * np.median(np.abs(values - np.median(values)))) if len(values) else float("nan")
 
 
+def distances(mask: np.ndarray) -> np.ndarray:
+    """Distance of each pixel of a mask (H, W) bool to what is outside of it [px]; 0 outside."""
+    return cv2.distanceTransform(mask.astype(np.uint8), cv2.DIST_L2, 5)
+
+
 def inside(rendered: Rendered, row: int, index: int, margin: int = _INSIDE) -> np.ndarray:
     """Pixels (H, W) bool of an object in a frame, at least `margin` px from what is not the object."""
-    return cv2.distanceTransform(np.uint8(rendered.owner[row] == index), cv2.DIST_L2, 5) >= margin
+    return distances(rendered.owner[row] == index) >= margin
 
 
 def align(scenes: RealScenes, poses: Sequence[np.ndarray]) -> list[np.ndarray]:

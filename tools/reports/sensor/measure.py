@@ -6,13 +6,12 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
-import cv2
 import numpy as np
 from scipy.optimize import least_squares
 
 from tools.options import Row
 from tools.reports.real_frames import RealFrame
-from tools.reports.sensor.alignment import inside, robust_deviation
+from tools.reports.sensor.alignment import distances, inside, robust_deviation
 from tools.reports.sensor.scene import METRES, Rendered
 
 ANGLES = (0, 20, 35, 50, 65, 80)
@@ -85,7 +84,7 @@ def collect(frames: Sequence[RealFrame], rendered: Rendered, counts: Sequence[np
         angle = np.degrees(np.arccos(np.clip(rendered.cosine[row], 0.0, 1.0)))
         for index, object_id in enumerate(frames[row].object_ids):
             mask = (rendered.owner[row] == index) & frames[row].mask(index)
-            outline = cv2.distanceTransform(np.uint8(rendered.owner[row] == index), cv2.DIST_L2, 5)
+            outline = distances(rendered.owner[row] == index)
             images = (_MILLIMETRES * off, rendered.depth[row], angle, outline, 255.0 * rendered.albedo[row])
             parts.append([*(image[mask] for image in images), np.full(np.count_nonzero(mask), object_id)])
     return Samples(*(np.concatenate(column) for column in zip(*parts, strict=True)))
@@ -95,11 +94,11 @@ def ring_holes(frames: Sequence[RealFrame], rendered: Rendered, counts: Sequence
     """Part of holes in the plane around the objects, where the measured picture shows the plane or a hole."""
     holes = pixels = 0
     for row in rows:
-        near = cv2.distanceTransform(np.uint8(rendered.owner[row] < 0), cv2.DIST_L2, 5) <= RING
+        near = distances(rendered.owner[row] < 0) <= RING
         measured = frames[row].depth
         plane = (np.abs(METRES * measured - rendered.depth[row]) < _ON_PLANE) | (measured == 0)
         use = near & plane & (rendered.owner[row] == -1)
-        holes, pixels = holes + np.count_nonzero((counts[row] == 0) & use), pixels + np.count_nonzero(use)
+        holes, pixels = holes + int(((counts[row] == 0) & use).sum()), pixels + int(use.sum())
     return holes / max(1, pixels)
 
 
@@ -118,7 +117,7 @@ def correlation(frames: Sequence[RealFrame], rendered: Rendered, counts: Sequenc
             squares, pixels = squares + float((off**2).sum()), pixels + np.count_nonzero(use)
             for lag in LAGS:
                 products[lag] += float((off[:, lag:] * off[:, :-lag]).sum())
-                pairs[lag] += np.count_nonzero(use[:, lag:] & use[:, :-lag])
+                pairs[lag] += int((use[:, lag:] & use[:, :-lag]).sum())
     return {lag: products[lag] / max(1, pairs[lag]) / (squares / pixels) for lag in LAGS}
 
 

@@ -53,8 +53,8 @@ def draw_comparison(frame: RealFrame, simulated: np.ndarray) -> np.ndarray:
 
 def _color(counts: np.ndarray, low: float, high: float) -> np.ndarray:
     """Depth in false colours; black: a hole."""
-    levels = np.uint8(255 * np.clip((counts - low) / (high - low), 0.0, 1.0))
-    return cv2.applyColorMap(levels, cv2.COLORMAP_TURBO) * np.uint8(counts > 0)[..., None]
+    levels = (255.0 * np.clip((counts - low) / (high - low), 0.0, 1.0)).astype(np.uint8)
+    return cv2.applyColorMap(levels, cv2.COLORMAP_TURBO) * (counts > 0)[..., None].astype(np.uint8)
 
 
 def _difference(off: np.ndarray) -> np.ndarray:

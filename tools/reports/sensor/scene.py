@@ -69,7 +69,7 @@ def back_project(frame: RealFrame, depth: np.ndarray) -> np.ndarray:
 
 def fit_plane(frame: RealFrame) -> tuple[np.ndarray, float]:
     """Plane that most of the measured points outside of the objects support: unit normal n towards the camera, and n · x [m]."""
-    outside = cv2.dilate(np.uint8(frame.label > 0), np.ones((2 * _MARGIN + 1, 2 * _MARGIN + 1), np.uint8)) == 0
+    outside = cv2.dilate((frame.label > 0).astype(np.uint8), np.ones((2 * _MARGIN + 1, 2 * _MARGIN + 1), np.uint8)) == 0
     points = back_project(frame, METRES * frame.depth.astype(np.float64))[outside & (frame.depth > 0)]
     rng = np.random.default_rng([frame.sequence, frame.image])
     sample = points[rng.integers(len(points), size=5000)]
