@@ -29,6 +29,7 @@ from synpick_warp.errors import (
     StateError,
     SynpickError,
 )
+from synpick_warp.system.inputs.urls import as_url
 from synpick_warp.system.processes.garbage import collection_paused
 
 if TYPE_CHECKING:
@@ -83,7 +84,7 @@ def bake(
 
     Args:
         config: Settings: a `Config`, or a preset's name or a .toml file as for `load_config`; None: the default preset.
-        out: Folder of the data set: new, empty, or of an earlier bake with the same settings.
+        out: Folder of the data set: new, empty, or of an earlier bake with the same settings; or a prefix in an object store.
         settings: Full key, such as "bake.mode", -> value; they override a preset or file.
         shard: (i, n): only episodes with index % n == i.
         splits: Only episodes of these splits of the settings, such as ("train",) of the preset "synpick"; empty: all.
@@ -109,6 +110,10 @@ def bake(
         raise TypeError("settings override a preset or a file; pass them to load_config, or use dataclasses.replace on the Config")
     if isinstance(devices, str):
         devices = tuple(name.strip() for name in devices.split(","))
+    if (url := as_url(out)) is not None:
+        from synpick_warp.cloud.run import bake_into_store
+
+        return bake_into_store(config, url, progress or SilentProgress(), shard, splits, devices)
     return run_bake(config, Path(out), progress if progress is not None else SilentProgress(), shard, splits, devices)
 
 

@@ -37,6 +37,10 @@ class OutputError(SynpickError):
     """The output folder cannot be written."""
 
 
+class StoreError(OutputError):
+    """An object store cannot be used, or does not answer."""
+
+
 class DatasetError(SynpickError):
     """A folder is not a data set, or a file in it is missing or damaged."""
 

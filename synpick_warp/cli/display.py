@@ -139,7 +139,7 @@ class CountProgress:
             self._console.file.flush()
 
 
-def print_summary(console: Console, summary: BakeSummary, out: Path) -> None:
+def print_summary(console: Console, summary: BakeSummary, out: Path | str) -> None:
     """Print endings of the episodes, totals, and advice. Of more than `MAX_ROWS` episodes, only failed ones are listed."""
     many = len(summary.episodes) > MAX_ROWS
     if many:

@@ -50,6 +50,7 @@ from synpick_warp.configs.files.write import config_to_toml
 from synpick_warp.configs.schema import Config
 from synpick_warp.errors import CatalogError, ConfigError, LightError, SynpickError
 from synpick_warp.scenes.bin_meshes.loading import load_settings
+from synpick_warp.system.inputs.urls import as_url
 from synpick_warp.system.processes.garbage import collection_paused
 from synpick_warp.system.processes.interrupt import KeptInterrupt
 
@@ -107,7 +108,8 @@ OutOption = Annotated[
     Path | None,
     Parameter(
         help="Output folder: new, empty, or of an interrupted bake with the same settings "
-        f"(default {DEFAULT_NAME} in the current folder, or {DEFAULT_NAME}-2, ... if other bakes have taken it)."
+        f"(default {DEFAULT_NAME} in the current folder, or {DEFAULT_NAME}-2, ... if other bakes have taken it). Or a prefix in an object "
+        "store, such as s3://bucket/prefix (pip install 'synpick-warp[cloud]')."
     ),
 ]
 DeviceOption = Annotated[str | None, Parameter(help=_help("bake.device"))]
@@ -176,6 +178,8 @@ def bake(
 
         out, choice = choose_output(make_manifest(resolved), resolved.bake, resolved.splits)
         print(choice, flush=True)
+    if as_url(out) is not None and (profile or profile_out is not None):
+        raise ConfigError(f"--profile writes beside a data set, and --out is {as_url(out)}; profile a bake into a folder")
     if not profile and profile_out is None:
         return _bake(resolved, out, part, names, several)
     trace = profile_out or out.with_name(f"{out.name}-profile.json")
@@ -378,14 +382,23 @@ def _bake(config: Config, out: Path, shard: tuple[int, int], splits: Sequence[st
     else:
         pick_device(config.bake.device)
     _check_inputs(config.bake.models, config.bake.lights)
-    check_output_folder(out)
+    url = as_url(out)
+    if url is None:
+        check_output_folder(out)
     with collection_paused():
-        from synpick_warp.factory.pipeline import run_bake
+        if url is None:
+            from synpick_warp.factory.pipeline import run_bake
+
+            bake = partial(run_bake, config, out)
+        else:
+            from synpick_warp.cloud.run import bake_into_store
+
+            bake = partial(bake_into_store, config, url)
 
     console = make_console()
     with make_progress(console) as progress:
-        summary = run_bake(config, out, progress, shard, splits, devices)
-    print_summary(console, summary, out)
+        summary = bake(progress, shard, splits, devices)
+    print_summary(console, summary, url or out)
     if summary.stopped:
         done = f"{len(summary.episodes)} of {summary.total} episodes are complete"
         print(f"{NAME}: interrupted: {done}; the same command resumes with the others", file=sys.stderr)

@@ -18,7 +18,7 @@ format and no NumPy.
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from typing import Literal, NamedTuple
 
 from synpick_warp.configs.dataset.splits import DataLayout
@@ -89,6 +89,8 @@ class Format(NamedTuple):
     """How its episodes are found; None: the reader reads the format (bop, shards, zarr), and finds them itself."""
     packages: tuple[str, ...] = ()
     """Packages of this format alone whose versions its output depends on."""
+    indexed: str = r"(?!)"
+    """Names of the files of episodes, and of constants, that `Exporter.finalize` reads, as a regular expression."""
     remedy: str = "name other formats"
     """What to do if a package that it needs is not installed."""
 
@@ -152,9 +154,17 @@ FORMAT_TABLE: dict[str, Format] = {
         "BopExporter",
         _SCENE_CONSTANTS,
         _bop,
+        indexed=rf"{_PLAIN}/{_INDEX}/scene_gt(?:_info)?(?!_coco)(?:_[^/]*)?\.json",
         sources=lambda bop: ("views", "masks") if bop.coco else ("views",),
     ),
-    "shards": Format("bop.shards.exporter", "ShardsExporter", _SCENE_CONSTANTS, _shards, sources=lambda _: ("views",)),
+    "shards": Format(
+        "bop.shards.exporter",
+        "ShardsExporter",
+        _SCENE_CONSTANTS,
+        _shards,
+        indexed=rf"{_PLAIN}_web/shard-[0-9]+\.tar",  # Their headers.
+        sources=lambda _: ("views",),
+    ),
     "usd": Format(
         "usd.exporter",
         "UsdExporter",
@@ -183,6 +193,7 @@ FORMAT_TABLE: dict[str, Format] = {
         "LerobotExporter",
         _NOTES,
         _lerobot,
+        indexed=rf"lerobot/parts/{_INDEX}\.json",
         sources=lambda _: ("views", "poses", "gripper"),
         part=PartFiles("lerobot/parts", ".json", 64, joined=True),  # A row in base64.
         packages=("av", "pyarrow"),
@@ -193,6 +204,7 @@ FORMAT_TABLE: dict[str, Format] = {
         "CocoExporter",
         rf"coco/categories\.json|{_NOTES}",
         _coco,
+        indexed=rf"coco/(?:categories\.json|parts/{_INDEX}\.jsonl)",
         sources=lambda _: ("views", "masks"),
         part=PartFiles("coco/parts", ".jsonl", 3, per_scene=True, joined=True),  # A line: [] and its end.
     ),
@@ -206,6 +218,11 @@ FORMAT_TABLE: dict[str, Format] = {
     ),
 }
 """Format -> its row."""
+
+
+def indexed_files(names: Collection[str]) -> re.Pattern[str]:
+    """Regular expression of the files that these formats read to write indices over all episodes."""
+    return re.compile("|".join(f"(?:{row.indexed})" for name, row in FORMAT_TABLE.items() if name in names) or r"(?!)")
 
 
 def convertible() -> tuple[str, ...]:

@@ -77,14 +77,42 @@ def run_bake(
     Raises:
         SynpickError: An error that the user can correct; committed episodes stay, and the same bake resumes.
     """
-    if measured := measure_meshes(config.bin, config.gripper):
-        config = override_config(config, measured)
-    if devices:
-        config = config.with_values({"bake.device": pick_devices(devices)[0]})
-    needs = Needs.of(config)
+    config = with_measures(config, devices)
     planned = DataLayout.of(config).plan_shard(splits, shard)
     check_episodes(sum(map(len, planned)), config.bake.episodes)
-    with OutputFolder(out, config, [episode for each in planned for episode in each]) as output:
+    return bake_episodes(config, out, progress, [episode for each in planned for episode in each], devices)
+
+
+def with_measures(config: Config, devices: Sequence[str]) -> Config:
+    """Complete the settings by what files of bins and grippers say of themselves, and by the first of several devices."""
+    if measured := measure_meshes(config.bin, config.gripper):
+        config = override_config(config, measured)
+    return config.with_values({"bake.device": pick_devices(devices)[0]}) if devices else config
+
+
+def bake_episodes(
+    config: Config,
+    out: Path,
+    progress: Progress,
+    episodes: Sequence[int],
+    devices: Sequence[str] = (),
+    deliver: Callable[[], None] | None = None,
+) -> BakeSummary:
+    """Generate these episodes of a data set in a folder, or the remaining ones of them.
+
+    Args:
+        config: All settings, with measures (`with_measures`).
+        out: As in `run_bake`.
+        progress: Observer.
+        episodes: Indices, sorted.
+        devices: As in `run_bake`.
+        deliver: Called at the end, also after a stop, in place of writing the indices: takes the episodes elsewhere. None: writes them.
+
+    Raises:
+        SynpickError: As `run_bake`.
+    """
+    needs = Needs.of(config)
+    with OutputFolder(out, config, episodes) as output:
         summary = BakeSummary(len(output.episodes))
         for episode in output.committed:
             summary.take_record(read_entry(out, episode_entry(episode)) or {})
@@ -98,7 +126,7 @@ def run_bake(
                 names = pick_processes(config, devices, len(output.remaining)) if devices else (config.bake.device,)
                 if advice := advise_processes(config, names, len(output.remaining)):
                     progress.note(advice)
-                _fill(config, output, needs, names, summary, progress)
+                _fill(config, output, needs, names, summary, progress, deliver)
         except OutputError as error:
             if out.exists():
                 raise
@@ -106,8 +134,16 @@ def run_bake(
     return summary
 
 
-def _fill(config: Config, output: OutputFolder, needs: Needs, names: Sequence[str], summary: BakeSummary, progress: Progress) -> None:
-    """Generate the remaining episodes, then the indices over all."""
+def _fill(
+    config: Config,
+    output: OutputFolder,
+    needs: Needs,
+    names: Sequence[str],
+    summary: BakeSummary,
+    progress: Progress,
+    deliver: Callable[[], None] | None,
+) -> None:
+    """Generate the remaining episodes, then the indices over all, or deliver the episodes."""
     factory, settings = None, ExportSettings.of(config)
     if len(names) > 1:
         bake_on_devices(config, output, needs, names, _DEVICE_PROGRAM, summary, progress)
@@ -130,7 +166,9 @@ def _fill(config: Config, output: OutputFolder, needs: Needs, names: Sequence[st
                 with scope("wait for writers"):
                     pool.wait()
                 exporters.close()
-        if not summary.stopped:
+        if deliver is not None:
+            deliver()
+        elif not summary.stopped:
             progress.stage("finishing files")
             with scope("finalize"):
                 finalize_data_set(output.out, settings, needs.classes, pool)

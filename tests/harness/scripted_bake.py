@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import os
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from synpick_warp.codes import Ending
@@ -18,6 +19,7 @@ from synpick_warp.exporters.registry import Exporters, Needs
 from synpick_warp.exporters.writing.pool import WriterPool
 from synpick_warp.factory.episodes import BakeSummary, EpisodeRow
 from synpick_warp.scenes.embedded.skies import skies
+from synpick_warp.system.progress import Progress
 from synpick_warp.views.frames import EpisodeEnd
 from tests.worlds import box_views, trajectories
 from tests.worlds.pick_tables import pick_batch
@@ -66,8 +68,23 @@ def small_settings() -> Config:
 def bake(out: Path, config: Config, shard: tuple[int, int] = (0, 1), stop_after: int | None = None, picks: bool = False) -> BakeSummary:
     """Write a data set, or the remaining episodes of one, as `factory.pipeline.run_bake` does; `stop_after` episodes it is stopped. With
     `picks`, grasps are tried from both frames."""
+    episodes = [index for part in DataLayout.of(config).plan((), shard) for index in part]
+    return bake_episodes(config, out, None, episodes, stop_after=stop_after, picks=picks)
+
+
+def bake_episodes(
+    config: Config,
+    out: Path,
+    progress: Progress | None,
+    episodes: Sequence[int],
+    devices: Sequence[str] = (),
+    deliver: Callable[[], None] | None = None,
+    stop_after: int | None = None,
+    picks: bool = False,
+) -> BakeSummary:
+    """Write these episodes as `factory.pipeline.bake_episodes` does; of the observer's methods, `stage` is called before each."""
     needs = Needs.of(config)
-    with OutputFolder(out, config, [index for part in DataLayout.of(config).plan((), shard) for index in part]) as output:
+    with OutputFolder(out, config, episodes) as output:
         summary = BakeSummary(len(output.episodes))
         for episode in output.committed:
             summary.take_record(read_entry(out, episode_entry(episode)) or {})
@@ -77,10 +94,14 @@ def bake(out: Path, config: Config, shard: tuple[int, int] = (0, 1), stop_after:
             exporters = Exporters(needs.classes, ExportContext(out, ExportSettings.of(config), box_views.catalog(), _LENSES, skies(), pool))
             output.prepare(exporters, INPUTS, pool)
             for episode in output.remaining[:stop_after]:
+                if progress is not None:
+                    progress.stage(f"episode {episode}")
                 _write_episode(output, exporters, pool, episode, picks)
             pool.wait()
             exporters.close()
-            if stop_after is None:
+            if deliver is not None:
+                deliver()
+            elif stop_after is None:
                 finalize_data_set(out, ExportSettings.of(config), needs.classes, pool)
     return summary
 

@@ -1,0 +1,118 @@
+"""Index files: what the indices over all episodes are made of, of one episode as tar.gz, of a block as their concatenation.
+
+Shards are in them as skeletons: headers of members with their offsets, from which a sparse file of the same names and sizes is made.
+"""
+
+from __future__ import annotations
+
+import gzip
+import io
+import re
+import struct
+import tarfile
+import zlib
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from typing import BinaryIO
+
+from synpick_warp.dataset.commit.manifest import episode_entry, read_checksums
+from synpick_warp.errors import DatasetError
+from synpick_warp.system.inputs.paths import path_inside
+from synpick_warp.system.inputs.tar_files import list_members
+
+SKELETON = "skeleton/"
+"""Prefix of a skeleton's name."""
+MAX_BUNDLE = 1 << 30
+"""Largest size of an unpacked index file of an episode [B]: more is not ours."""
+_PLACE = struct.Struct("<Q")
+_LENGTH = struct.Struct("<Q")
+"""Before each index file of a block: its size [B]."""
+
+
+def make_bundle(folder: Path, episode: int, indexed: re.Pattern[str]) -> bytes:
+    """Pack an episode's index file; the same bytes each time.
+
+    Args:
+        folder: Data set with the committed episode.
+        episode: Its index.
+        indexed: Names of the files that indices need.
+    """
+    entry = episode_entry(episode)
+    packed = io.BytesIO()
+    with tarfile.open(fileobj=packed, mode="w", format=tarfile.PAX_FORMAT) as archive:
+        _add(archive, f"{entry}.json", (folder / f"{entry}.json").read_bytes())
+        for name in filter(indexed.fullmatch, read_checksums(folder, entry)):
+            if name.endswith(".tar"):
+                _add(archive, SKELETON + name, _skeleton(folder / name))
+            else:
+                _add(archive, name, (folder / name).read_bytes())
+    return gzip.compress(packed.getvalue(), 6, mtime=0)
+
+
+def _add(archive: tarfile.TarFile, name: str, data: bytes) -> None:
+    info = tarfile.TarInfo(name)
+    info.size = len(data)
+    archive.addfile(info, io.BytesIO(data))
+
+
+def _skeleton(shard: Path) -> bytes:
+    """Size of a tar file, then offset and bytes of each header."""
+    parts = [_PLACE.pack(shard.stat().st_size)]
+    with shard.open("rb") as file:
+        for _, start, _ in list_members(shard):
+            file.seek(start - tarfile.BLOCKSIZE)
+            parts += [_PLACE.pack(start - tarfile.BLOCKSIZE), file.read(tarfile.BLOCKSIZE)]
+    return b"".join(parts)
+
+
+def _grow(skeleton: bytes, path: Path) -> None:
+    """Write the sparse file of a skeleton."""
+    step = _PLACE.size + tarfile.BLOCKSIZE
+    with path.open("wb") as file:
+        file.truncate(_PLACE.unpack_from(skeleton)[0])
+        for start in range(_PLACE.size, len(skeleton), step):
+            file.seek(_PLACE.unpack_from(skeleton, start)[0])
+            file.write(skeleton[start + _PLACE.size : start + step])
+
+
+def unpack_bundle(data: bytes, folder: Path, indexed: re.Pattern[str], source: str) -> None:
+    """Unpack an episode's index file into a folder.
+
+    Raises:
+        DatasetError: It is damaged, or has files that no index is made of.
+    """
+    try:
+        stream = zlib.decompressobj(31)
+        plain = stream.decompress(data, MAX_BUNDLE)
+        if not stream.eof:
+            raise DatasetError(f"{source} is damaged: it is cut off or too large; delete it and its block's mark, and resume the bake")
+        with tarfile.open(fileobj=io.BytesIO(plain), mode="r:") as archive:
+            for info in archive:
+                name = info.name.removeprefix(SKELETON)
+                content = archive.extractfile(info)
+                if content is None or not (indexed.fullmatch(name) or re.fullmatch(r"manifest/[0-9]{6,12}\.json", name)):
+                    raise DatasetError(f"{source} is damaged: it has {name[:80]!r}; delete it and its block's mark, and resume the bake")
+                path = path_inside(folder, name, source, DatasetError)
+                path.parent.mkdir(parents=True, exist_ok=True)
+                _grow(content.read(), path) if info.name != name else path.write_bytes(content.read())
+    except (zlib.error, tarfile.TarError, struct.error, OSError) as error:
+        raise DatasetError(f"{source} is damaged: {error}; delete it and its block's mark, and resume the bake") from None
+
+
+def join_bundles(bundles: Iterable[bytes], target: BinaryIO) -> None:
+    """Write the index files of a block's episodes, each after its size."""
+    for data in bundles:
+        target.write(_LENGTH.pack(len(data)))
+        target.write(data)
+
+
+def split_bundles(blocks: Iterable[bytes]) -> Iterator[bytes]:
+    """Yield the index files of a block from its content; one at a time is held."""
+    held = bytearray()
+    for block in blocks:
+        held += block
+        while len(held) >= _LENGTH.size and len(held) >= (end := _LENGTH.size + _LENGTH.unpack_from(held)[0]):
+            yield bytes(held[_LENGTH.size : end])
+            del held[:end]
+    if held:
+        raise DatasetError("a block's mark is cut off; delete it, and resume the bake")

@@ -1,0 +1,248 @@
+"""Delivery of finished episodes from a local folder into a store, while the bake goes on: files, index file, checksum list, done mark.
+
+A thread watches the folder's manifest, so that nothing in the bake knows of it, and episodes of several devices are delivered alike.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import os
+import threading
+import time
+from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+from synpick_warp.cloud.bundles import make_bundle
+from synpick_warp.cloud.ledger import INDEX, Ledger
+from synpick_warp.dataset.commit.manifest import CONSTANTS, MANIFEST_FILE, committed_episodes, episode_entry, read_checksums, read_entry
+from synpick_warp.errors import OutputError, StoreError, SynpickError
+from synpick_warp.exporters.base import list_folders
+from synpick_warp.exporters.formats import indexed_files
+from synpick_warp.exporters.registry import load_exporter_classes, shared_files
+from synpick_warp.system.progress import Progress
+from synpick_warp.system.stores.base import Store, TransientError, persist
+
+FILES_AT_ONCE, EPISODES_AT_ONCE = 16, 4
+"""Uploads at a time, of files and of episodes: requests of small files wait for the store, not for a core."""
+WHOLE_BYTES = 8 << 20
+"""Largest file that is hashed and sent from memory [B]; larger ones are read twice."""
+MAX_BACKLOG = 16 << 30
+"""Finished data that waits for its upload, beyond which the bake waits [B]."""
+_INTERVAL = 0.1
+"""Time between two looks at the folder [s]."""
+
+
+def send_file(store: Store, path: Path, name: str, digest: str) -> None:
+    """Upload a file and compare its content with its checksum before, and its size in the store after.
+
+    Raises:
+        OutputError: The local file has another checksum.
+        StoreError: It could not be uploaded.
+    """
+    size = path.stat().st_size
+    data = path.read_bytes() if size <= WHOLE_BYTES else None
+    if data is not None:
+        found = hashlib.sha256(data).hexdigest()
+    else:
+        with path.open("rb") as file:
+            found = hashlib.file_digest(file, "sha256").hexdigest()
+    if found != digest:
+        raise OutputError(f"{path} has changed since it was written: its checksum differs; check disk and memory of this machine")
+
+    def send() -> None:
+        store.put_file(name, path) if data is None else store.put(name, data)
+        stat = store.stat(name)
+        if stat is None or stat.size != size:
+            raise TransientError(f"it arrived with {0 if stat is None else stat.size:,} of {size:,} bytes")
+
+    persist(send, f"write {store.url}/{name}")
+
+
+class Delivery:
+    """Uploads of one folder; a context manager that ends its threads. An error ends them, too; `check` and `finish` raise it."""
+
+    def __init__(self, ledger: Ledger, folder: Path, permit: Callable[[], None] = lambda: None) -> None:
+        """
+        Args:
+            ledger: Of the data set.
+            folder: Local data set that a bake fills.
+            permit: Called before an episode's upload and before its mark; raises what forbids it.
+        """
+        self.delivered: list[int] = []
+        """Episodes whose done mark is written."""
+        self._ledger, self._folder, self._permit = ledger, folder, permit
+        self._indexed = indexed_files(ledger.layout.formats)
+        self._shared = shared_files(load_exporter_classes(ledger.layout.formats), ledger.layout).folders
+        self._fault: BaseException | None = None
+        self._waiting: dict[int, int] = {}
+        """Episodes that are committed here and not delivered, with their sizes [B]."""
+        self._ending, self._lock = threading.Event(), threading.Lock()
+        self._files = ThreadPoolExecutor(FILES_AT_ONCE, "upload")
+        self._episodes = ThreadPoolExecutor(EPISODES_AT_ONCE, "deliver")
+        self._watcher = threading.Thread(target=self._watch, name="delivery", daemon=True)
+
+    def __enter__(self) -> Self:
+        self._watcher.start()
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+        if error is not None and self._fault is None:
+            self._fault = error
+        self._ending.set()
+        self._watcher.join()
+        for pool in (self._episodes, self._files):
+            pool.shutdown(cancel_futures=True)
+
+    def check(self) -> None:
+        """Raise the first error; wait while more than MAX_BACKLOG is not delivered."""
+        while True:
+            if self._fault is not None:
+                raise self._fault
+            if sum(list(self._waiting.values())) <= MAX_BACKLOG:
+                return
+            time.sleep(_INTERVAL)
+
+    def finish(self) -> None:
+        """Wait until all committed episodes are delivered. Raises the first error."""
+        self._ending.set()
+        self._watcher.join()
+        self._episodes.shutdown()
+        self.check()
+
+    def _watch(self) -> None:
+        """Thread: hand out what the bake commits, until it has ended."""
+        constants, known = False, set()
+        try:
+            while self._fault is None:
+                ending = self._ending.is_set()
+                if not constants and (self._folder / f"{CONSTANTS}.json").exists():
+                    self._send_constants()
+                    constants = True
+                if constants:
+                    for episode in committed_episodes(self._folder):
+                        if episode not in known:
+                            known.add(episode)
+                            self._hand_out(episode)
+                if ending:
+                    return
+                self._ending.wait(_INTERVAL)
+        except BaseException as error:
+            self._fail(error)
+
+    def _hand_out(self, episode: int) -> None:
+        """Queue an episode's delivery."""
+        with contextlib.suppress(FileNotFoundError):
+            content = read_entry(self._folder, episode_entry(episode))
+            if content is not None:
+                self._waiting[episode] = content["bytes"]
+                self._episodes.submit(self._deliver, episode)
+
+    def _send_constants(self) -> None:
+        """Upload manifest, settings and constants, unless they are there."""
+        ledger, folder, store = self._ledger, self._folder, self._ledger.store
+        ledger.put_manifest((folder / MANIFEST_FILE).read_bytes())
+        ledger.put_settings()
+        lines = (folder / f"{CONSTANTS}.sha256").read_bytes()
+        try:
+            if store.get(f"{CONSTANTS}.sha256") == lines and store.stat(f"{CONSTANTS}.json") is not None:
+                return
+        except FileNotFoundError:
+            pass
+        self._send_files(read_checksums(folder, CONSTANTS))
+        store.put(f"{CONSTANTS}.sha256", lines)
+        store.put(f"{CONSTANTS}.json", (folder / f"{CONSTANTS}.json").read_bytes())
+
+    def _send_files(self, names: dict[str, str]) -> None:
+        """Upload files in parallel; raises the first error."""
+        sent: list[Future[Any]] = [
+            self._files.submit(send_file, self._ledger.store, self._folder / name, name, digest) for name, digest in names.items()
+        ]
+        try:
+            for each in sent:
+                each.result()
+        finally:
+            for each in sent:
+                each.cancel()
+
+    def _deliver(self, episode: int) -> None:
+        """Task: deliver an episode, and delete its local copy."""
+        if self._fault is not None:
+            return
+        try:
+            self._permit()
+            entry, folder, store = episode_entry(episode), self._folder, self._ledger.store
+            names = read_checksums(folder, entry)
+            self._send_files(names)
+            store.put(f"{INDEX}/{episode:06d}.tar.gz", make_bundle(folder, episode, self._indexed))
+            self._permit()
+            self._ledger.commit(episode, (folder / f"{entry}.sha256").read_bytes(), (folder / f"{entry}.json").read_bytes())
+            with self._lock:
+                self.delivered.append(episode)
+            self._remove(episode, names)
+            self._waiting.pop(episode, None)
+        except BaseException as error:
+            self._fail(error)
+
+    def _remove(self, episode: int, names: dict[str, str]) -> None:
+        """Delete an episode's local files, and the folders that hold nothing else."""
+        folder = self._folder
+        for suffix in (".json", ".sha256"):
+            (folder / f"{episode_entry(episode)}{suffix}").unlink(missing_ok=True)
+        kept = {folder, *(folder / name for name in list_folders(folder, self._shared))}
+        for name in names:
+            (folder / name).unlink(missing_ok=True)
+        parents = {parent for name in names for parent in (folder / name).parents if parent.is_relative_to(folder)} - kept
+        for parent in sorted(parents, key=lambda path: len(path.parts), reverse=True):
+            with contextlib.suppress(OSError):
+                os.rmdir(parent)
+
+    def _fail(self, error: BaseException) -> None:
+        """Keep the first error."""
+        with self._lock:
+            if self._fault is None:
+                self._fault = error if isinstance(error, SynpickError) else _describe(error)
+
+
+def _describe(error: BaseException) -> BaseException:
+    """Error of the operating system as `StoreError`; others as they are."""
+    return StoreError(f"an upload failed: {error}; the same command resumes") if isinstance(error, OSError) else error
+
+
+class WatchedProgress:
+    """Observer that passes everything on, and raises the errors of a delivery into the bake, which so ends early."""
+
+    def __init__(self, progress: Progress, check: Callable[[], None]) -> None:
+        self._progress, self._check = progress, check
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+        return None
+
+    def stage(self, text: str) -> None:
+        """See `Progress`."""
+        self._check()
+        self._progress.stage(text)
+
+    def update(
+        self, *, episodes_done: int, episodes: int, worlds_active: int, views: int, views_per_s: float, seconds_left: float | None
+    ) -> None:
+        """See `Progress`."""
+        self._check()
+        self._progress.update(
+            episodes_done=episodes_done,
+            episodes=episodes,
+            worlds_active=worlds_active,
+            views=views,
+            views_per_s=views_per_s,
+            seconds_left=seconds_left,
+        )
+
+    def note(self, text: str) -> None:
+        """See `Progress`."""
+        self._progress.note(text)

@@ -1,0 +1,107 @@
+"""Finalization of a data set in a store: batched marks of full blocks, then the indices over all episodes, made in a local folder."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+from synpick_warp.cloud.bundles import join_bundles, split_bundles, unpack_bundle
+from synpick_warp.cloud.delivery import send_file
+from synpick_warp.cloud.ledger import FINISHED, INDEX, Ledger
+from synpick_warp.configs.dataset.export import ExportSettings
+from synpick_warp.configs.files.write import config_to_toml
+from synpick_warp.dataset.commit.manifest import (
+    CONFIG_FILE,
+    CONSTANTS,
+    ENTRIES,
+    INDICES,
+    MANIFEST_FILE,
+    read_checksums,
+)
+from synpick_warp.dataset.commit.writing import finalize_data_set
+from synpick_warp.errors import StoreError
+from synpick_warp.exporters.formats import indexed_files
+from synpick_warp.exporters.registry import Needs, shared_files
+from synpick_warp.exporters.writing.checksums import parse_checksums
+from synpick_warp.exporters.writing.pool import WriterPool
+from synpick_warp.factory.sizes import count_writers
+from synpick_warp.system.folders import make_folder
+
+
+def close_blocks(ledger: Ledger, folder: Path) -> int:
+    """Write the batched marks of all blocks whose episodes all have done marks; returns the number of episodes that have none.
+
+    Args:
+        ledger: Of the data set.
+        folder: For a temporary file of a block.
+    """
+    missing = 0
+    for block in ledger.open_blocks():
+        planned = ledger.planned(block)
+        if left := len(set(planned) - ledger.done(block)):
+            missing += left
+            continue
+        path = folder / "block"
+        with path.open("wb") as file:
+            join_bundles((ledger.store.get(f"{INDEX}/{episode:06d}.tar.gz") for episode in planned), file)
+        ledger.store.put_file(ledger.mark_key(block), path)
+    return missing
+
+
+def finalize_store(ledger: Ledger, folder: Path) -> int:
+    """Write the indices over all episodes, if all are done and the indices do not cover them yet.
+
+    Args:
+        ledger: Of the data set.
+        folder: An empty folder, for temporary files.
+
+    Returns:
+        Number of episodes that are not done; 0: the data set is finished.
+    """
+    planned = ledger.layout.planned
+    if ledger.finished() >= planned:
+        return 0
+    try:
+        if missing := close_blocks(ledger, folder):
+            return missing
+        work = folder / "set"
+        _gather(ledger, work)
+        needs = Needs.of(ledger.config)
+        with WriterPool(count_writers(ledger.config.bake.writers, needs.slot_bytes), needs.slot_bytes) as pool:
+            finalize_data_set(work, ExportSettings.of(ledger.config), needs.classes, pool)
+    except FileNotFoundError as error:
+        raise StoreError(f"{error} was deleted while the indices were made of it; the same command resumes") from None
+    store = ledger.store
+    if ledger.finished() > planned:  # A bake of more episodes has ended meanwhile.
+        return 0
+    for name, digest in read_checksums(work, INDICES).items():
+        send_file(store, work / name, name, digest)
+    for suffix in (".sha256", ".json"):
+        store.put(f"{INDICES}{suffix}", (work / f"{INDICES}{suffix}").read_bytes())
+    store.put(FINISHED, str(planned).encode())
+    return 0
+
+
+def _gather(ledger: Ledger, work: Path) -> None:
+    """Make a folder that has of the data set what indices are made of."""
+    store, layout = ledger.store, ledger.layout
+    indexed = indexed_files(layout.formats)
+    for name in (ENTRIES, *shared_files(Needs.of(ledger.config).classes, layout).folders):
+        if not name.name.endswith("*"):
+            make_folder(work / name)
+    (work / MANIFEST_FILE).write_bytes(store.get(MANIFEST_FILE))
+    (work / CONFIG_FILE).write_text(config_to_toml(ledger.config))
+    constants = parse_checksums(store.get(f"{CONSTANTS}.sha256"), work, work / f"{CONSTANTS}.sha256", "resume the bake")
+    for name in filter(indexed.fullmatch, constants):
+        (work / name).parent.mkdir(parents=True, exist_ok=True)
+        (work / name).write_bytes(store.get(name))
+    for source, bundle in _bundles(ledger):
+        unpack_bundle(bundle, work, indexed, source)
+
+
+def _bundles(ledger: Ledger) -> Iterator[tuple[str, bytes]]:
+    """Index files of all episodes, with the object that they are from."""
+    for block in ledger.blocks():
+        key = ledger.mark_key(block)
+        for bundle in split_bundles(ledger.store.blocks(key)):
+            yield f"{ledger.store.url}/{key}", bundle

@@ -1,0 +1,203 @@
+"""Store of the Rust crate object_store, by its Python binding obstore: S3, Google Cloud Storage, Azure, a folder, or memory.
+
+It is the one library of these with conditional writes: create if absent, and compare-and-swap by ETag. Folders lack the latter.
+"""
+
+from __future__ import annotations
+
+import datetime
+import importlib
+import os
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any, TypeVar
+
+from synpick_warp.errors import StoreError
+from synpick_warp.system.stores.base import BLOCK_BYTES, Stat, TransientError, persist
+
+TIMEOUT = 60
+"""Longest time of a request [s]."""
+_INSTALL = "install it by pip install 'synpick-warp[cloud]'"
+_ADVICE = (
+    (
+        ("NoSuchBucket", "bucket does not exist", "NoSuchContainer", "ContainerNotFound"),
+        "there is no such bucket; make it first, or correct its name",
+    ),
+    (("RequestTimeTooSkewed",), "the clock of this machine differs from the store's by more than the store allows; set it (NTP)"),
+    (
+        ("AccessDenied", "status code: 403", "PermissionDenied", "Permission denied"),
+        "the credentials may not do that; give them the right to read, list and write there",
+    ),
+    (
+        ("InvalidAccessKeyId", "SignatureDoesNotMatch", "status code: 401", "Unauthenticated", "credentials", "169.254.169.254"),
+        "the store does not accept the credentials; set them, such as AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY",
+    ),
+)
+"""What an error's text has -> what to do about it; the first that fits."""
+_PASSING = (
+    "status code: 5",
+    "status code: 429",
+    "SlowDown",
+    "timed out",
+    "timeout",
+    "connection",
+    "error sending request",
+    "IncompleteBody",
+    "error decoding",
+)
+"""What the text of an error has that may pass (in any case)."""
+
+_Result = TypeVar("_Result")
+_memories: dict[str, Any] = {}
+"""Stores in memory by name, which all who name them share."""
+
+
+class ObjectStore:
+    """`Store` of obstore."""
+
+    def __init__(self, url: str) -> None:
+        """Raises StoreError: obstore is not installed, does not know the URL, or there are no credentials."""
+        try:
+            self._obs = importlib.import_module("obstore")
+            self._kinds = importlib.import_module("obstore.store")
+        except ImportError:
+            raise StoreError(f"{url} needs the package obstore; {_INSTALL}") from None
+        self.url, self.conditional = url.rstrip("/"), not url.startswith("file:")
+        self._errors = self._obs.exceptions
+        try:
+            self._store = self._open(self.url)
+        except (self._errors.BaseError, ValueError) as error:
+            raise StoreError(f"{url} cannot be opened: {_first_line(error)}") from None
+
+    def _open(self, url: str) -> Any:
+        """Make the store of a URL."""
+        scheme, _, rest = url.partition("://")
+        if scheme == "memory":
+            return _memories.setdefault(rest, self._kinds.MemoryStore())
+        if scheme == "file":
+            return self._kinds.LocalStore(rest, mkdir=True)
+        if scheme in ("s3", "s3a"):
+            _check_credentials(url)
+        endpoint = os.environ.get("AWS_ENDPOINT_URL_S3") or os.environ.get("AWS_ENDPOINT_URL") or ""
+        client = {"timeout": f"{TIMEOUT}s", "allow_http": endpoint.startswith("http://")}
+        retries = {"max_retries": 3, "retry_timeout": datetime.timedelta(seconds=TIMEOUT)}
+        return self._kinds.from_url(url, client_options=client, retry_config=retries)
+
+    def _try(self, request: Callable[[], _Result], what: str) -> _Result:
+        """Repeat a request while its errors may pass; others but conditions and missing objects become `StoreError`."""
+
+        def attempt() -> _Result:
+            try:
+                return request()
+            except (self._errors.AlreadyExistsError, self._errors.PreconditionError):
+                raise
+            except (self._errors.BaseError, OSError, NotImplementedError) as error:
+                text = str(error)
+                advice = next((said for signs, said in _ADVICE if any(sign in text for sign in signs)), "")
+                if advice:
+                    raise StoreError(f"cannot {what}: {advice}") from None
+                if isinstance(error, FileNotFoundError):
+                    raise
+                if any(sign.lower() in text.lower() for sign in _PASSING):
+                    raise TransientError(_first_line(error)) from None
+                raise StoreError(f"cannot {what}: {_first_line(error)}") from None
+
+        return persist(attempt, what)
+
+    def put(self, key: str, data: bytes) -> None:
+        """See `Store`."""
+        self._try(lambda: self._obs.put(self._store, key, data, use_multipart=False), f"write {self.url}/{key}")
+
+    def put_file(self, key: str, path: Path) -> None:
+        """See `Store`."""
+        self._try(lambda: self._obs.put(self._store, key, path), f"write {self.url}/{key}")
+
+    def get(self, key: str) -> bytes:
+        """See `Store`."""
+        return self._try(lambda: bytes(self._obs.get(self._store, key).bytes()), f"read {self.url}/{key}")
+
+    def blocks(self, key: str) -> Iterator[bytes]:
+        """See `Store`."""
+        stat = self.stat(key)
+        if stat is None:
+            raise FileNotFoundError(f"{self.url}/{key}")
+        for start in range(0, stat.size, BLOCK_BYTES):
+            end = min(start + BLOCK_BYTES, stat.size)
+            yield self._try(
+                lambda first=start, last=end: bytes(self._obs.get_range(self._store, key, start=first, end=last)), f"read {self.url}/{key}"
+            )
+
+    def stat(self, key: str) -> Stat | None:
+        """See `Store`."""
+        try:
+            found = self._try(lambda: self._obs.head(self._store, key), f"look up {self.url}/{key}")
+        except FileNotFoundError:
+            return None
+        return Stat(found["size"], found["last_modified"])
+
+    def list(self, folder: str, after: str = "") -> Iterator[tuple[str, int]]:
+        """See `Store`."""
+        last = after
+        if self.url.startswith("file:"):  # In the order of the file system, with the files that are being written.
+            found = self._try(lambda: [each for chunk in self._obs.list(self._store, folder or None) for each in chunk], f"list {self.url}")
+            yield from sorted((each["path"], each["size"]) for each in found if each["path"] > after and "#" not in each["path"])
+            return
+        while True:
+            pages = iter(self._obs.list(self._store, folder or None, offset=last or None, chunk_size=1000))
+            page = self._try(lambda pages=pages: next(pages, None), f"list {self.url}/{folder}")
+            if not page:
+                return
+            for each in page:
+                yield each["path"], each["size"]
+            last = page[-1]["path"]
+
+    def delete(self, key: str) -> None:
+        """See `Store`."""
+        try:
+            self._try(lambda: self._obs.delete(self._store, key), f"delete {self.url}/{key}")
+        except FileNotFoundError:
+            return
+
+    def create(self, key: str, data: bytes) -> str | None:
+        """See `Store`."""
+        return self._put_if(key, data, "create")
+
+    def replace(self, key: str, data: bytes, tag: str) -> str | None:
+        """See `Store`."""
+        return self._put_if(key, data, {"e_tag": tag})
+
+    def _put_if(self, key: str, data: bytes, mode: Any) -> str | None:
+        """Write an object under a condition; returns its tag, None: the condition does not hold."""
+        try:
+            request = lambda: self._obs.put(self._store, key, data, mode=mode, use_multipart=False)  # noqa: E731
+            return self._try(request, f"write {self.url}/{key}")["e_tag"]
+        except (self._errors.AlreadyExistsError, self._errors.PreconditionError):
+            return None
+        except FileNotFoundError:  # Compared with an object that was deleted.
+            return None
+
+    def get_tagged(self, key: str) -> tuple[bytes, str] | None:
+        """See `Store`."""
+        try:
+            found = self._try(lambda: self._obs.get(self._store, key), f"read {self.url}/{key}")
+            return self._try(lambda: bytes(found.bytes()), f"read {self.url}/{key}"), found.meta["e_tag"]
+        except FileNotFoundError:
+            return None
+
+
+def _check_credentials(url: str) -> None:
+    """Raise StoreError if neither variables nor a service of the machine give credentials."""
+    given = (
+        "AWS_ACCESS_KEY_ID",
+        "AWS_WEB_IDENTITY_TOKEN_FILE",
+        "AWS_CONTAINER_CREDENTIALS_RELATIVE_URI",
+        "AWS_CONTAINER_CREDENTIALS_FULL_URI",
+    )
+    disabled = os.environ.get("AWS_EC2_METADATA_DISABLED", "").lower() == "true"
+    if disabled and not any(os.environ.get(name) for name in given):
+        raise StoreError(f"there are no credentials for {url}; set AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY")
+
+
+def _first_line(error: BaseException) -> str:
+    """First line of an error's text: the rest is of the library's inside."""
+    return (str(error).splitlines() or [type(error).__name__])[0][:300]

@@ -1,0 +1,117 @@
+"""Stores by their contract: objects, order, conditions; requests that fail for a while, and for good."""
+
+from __future__ import annotations
+
+import itertools
+import threading
+from pathlib import Path
+from uuid import uuid4
+
+import pytest
+
+from synpick_warp.errors import StoreError
+from synpick_warp.system.inputs.urls import as_url
+from synpick_warp.system.stores import object_store
+from synpick_warp.system.stores.file_system import FileSystemStore
+from synpick_warp.system.stores.opening import Probe, open_store, probe
+
+
+@pytest.fixture(params=["memory", "file", "s3", "fsspec"])
+def store(request: pytest.FixtureRequest, tmp_path: Path):
+    if request.param == "fsspec":
+        pytest.importorskip("fsspec")
+        return FileSystemStore(f"memory://{uuid4().hex}/p")
+    pytest.importorskip("obstore")
+    return open_store(
+        {"file": f"file://{tmp_path}/set"}.get(request.param) or request.getfixturevalue({"s3": "prefix"}.get(request.param, "memory"))
+    )
+
+
+def test_a_store_keeps_and_lists_objects(store, tmp_path):
+    keys = [f"{folder}/{number:03d}.json" for folder in ("a", "a-b", "m") for number in range(3)]
+    for key in reversed(keys):
+        store.put(key, key.encode())
+    (tmp_path / "large").write_bytes(bytes(range(256)) * 50_000)
+    store.put_file("z", tmp_path / "large")
+    assert [key for key, _ in store.list("")] == [*sorted(keys), "z"]
+    assert list(store.list("a")) == [(key, 10) for key in keys[:3]]
+    assert [key for key, _ in store.list("m", "m/000.json")] == keys[7:]
+    assert list(store.list("none")) == []
+    assert b"".join(store.blocks("z")) == (tmp_path / "large").read_bytes()
+    assert store.get("m/001.json") == b"m/001.json"
+    assert store.stat("z").size == 12_800_000
+    store.delete("z")
+    store.delete("z")
+    assert store.stat("z") is None
+    with pytest.raises(FileNotFoundError):
+        store.get("z")
+
+
+def test_the_probe_tells_conditional_writes(store):
+    found = probe(store)
+    assert found == Probe(found.offset, store.conditional)
+    assert abs(found.offset) < 60
+    assert list(store.list("")) == []
+    if not store.conditional:
+        return
+    tag = store.create("claim", b"one")
+    assert store.create("claim", b"two") is None
+    assert store.get_tagged("claim") == (b"one", tag)
+    newer = store.replace("claim", b"three", tag)
+    assert newer not in (None, tag)
+    assert store.replace("claim", b"four", tag) is None
+    assert store.get("claim") == b"three"
+    assert store.get_tagged("none") is None
+
+
+def test_of_many_that_create_one_wins(memory):
+    store, won = open_store(memory), []
+    threads = [threading.Thread(target=lambda me=me: won.append(store.create("claim", b"%d" % me))) for me in range(16)]
+    for each in threads:
+        each.start()
+    for each in threads:
+        each.join()
+    assert sum(tag is not None for tag in won) == 1
+
+
+@pytest.mark.parametrize("fault", ["500 InternalError", "503 SlowDown", "lost"])
+def test_requests_are_repeated_while_the_store_fails(server, prefix, fault):
+    count = itertools.count()
+    server.fault = lambda method, path: fault if next(count) < 2 else None
+    store = open_store(prefix)
+    store.put("key", b"data")
+    assert store.get("key") == b"data"
+    assert next(count) > 3
+
+
+def test_a_store_that_does_not_answer_in_time_is_asked_again(server, prefix, monkeypatch):
+    monkeypatch.setattr(object_store, "TIMEOUT", 1)
+    gate, count = threading.Event(), itertools.count()
+    server.fault = lambda method, path: gate.wait(1.5) and None if next(count) == 0 else None
+    store = open_store(prefix)
+    store.put("key", b"data")
+    gate.set()
+    assert store.get("key") == b"data"
+
+
+def test_what_fails_for_good_ends_in_one_line(server, prefix, monkeypatch):
+    monkeypatch.setattr("synpick_warp.system.stores.base.TRIES", 2)
+    server.fault = lambda method, path: "403 AccessDenied"
+    with pytest.raises(StoreError, match="credentials may not do that"):
+        open_store(prefix).put("key", b"data")
+
+
+@pytest.mark.parametrize(
+    ("place", "url"),
+    [
+        (Path("s3://bucket/a/b/"), "s3://bucket/a/b"),
+        ("gs://bucket/a", "gs://bucket/a"),
+        (Path("file:///data/x"), "file:///data/x"),
+        (Path("s3://"), "s3://"),
+        ("folder/x", None),
+        (Path("/a:b/c"), None),
+        (None, None),
+    ],
+)
+def test_urls_are_told_from_folders(place, url):
+    assert as_url(place) == url

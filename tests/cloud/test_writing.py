@@ -1,0 +1,180 @@
+"""Bakes into a store: the files of a local bake, whatever fails or dies meanwhile, and one line for what cannot be used."""
+
+from __future__ import annotations
+
+import random
+from pathlib import Path
+
+import pytest
+
+from synpick_warp.cloud import run
+from synpick_warp.cloud.ledger import FINISHED, Ledger
+from synpick_warp.configs.schema import FORMATS
+from synpick_warp.errors import ConfigError, OutputError, StoreError
+from synpick_warp.system.progress import SilentProgress
+from synpick_warp.system.stores.opening import Probe, open_store
+from tests.builders import mistake
+from tests.cloud.conftest import EPISODES, files, tiny
+from tests.cloud.mortal import Killed, MortalStore, stored
+from tests.harness import scripted_bake
+
+QUIET = SilentProgress()
+
+
+def bake(url: str, config=None, **given):
+    return run.bake_into_store(config or tiny(), url, QUIET, bake=scripted_bake.bake_episodes, **given)
+
+
+def bake_mortal(url: str, lives: int, monkeypatch) -> bool:
+    """Bake until it is done, or dies; returns whether it is done."""
+    with monkeypatch.context() as patch:
+        patch.setattr(run, "open_store", lambda url: MortalStore(open_store(url), lives))
+        try:
+            bake(url)
+        except Killed:
+            return False
+    return True
+
+
+def test_the_set_equals_a_local_one_of_every_format(prefix, tmp_path, monkeypatch):
+    """Nothing is written but into the store and a temporary folder, which is gone."""
+    monkeypatch.setenv("HOME", str(tmp_path / "home"))
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path / "temporary"))
+    for name in ("home", "temporary", "here"):
+        (tmp_path / name).mkdir()
+    monkeypatch.chdir(tmp_path / "here")
+    config = tiny(2, FORMATS)
+    assert bake(prefix, config).total == 2
+    assert [list(folder.iterdir()) for folder in tmp_path.iterdir()] == [[], [], []]
+    scripted_bake.bake(tmp_path / "local", config)
+    assert stored(prefix) == files(tmp_path / "local")
+    assert bake(prefix, config).total == 0
+
+
+def test_shares_are_joined_by_whoever_ends_last(memory, local):
+    bake(memory, shard=(0, 2))
+    assert "manifest/joined.json" not in stored(memory)
+    bake(memory, shard=(1, 2))
+    assert stored(memory) == local
+
+
+def test_a_set_grows(memory, local):
+    bake(memory, tiny(2))
+    assert open_store(memory).get(FINISHED) == b"2"
+    assert bake(memory).total == EPISODES - 2
+    assert stored(memory) == local
+    bake(memory, tiny(2))  # Fewer than are there: nothing is left to do.
+    assert stored(memory) == local
+
+
+@pytest.mark.parametrize(
+    "fault", ["truncated", *(pytest.param(each, marks=pytest.mark.slow) for each in ("500 Internal", "503 SlowDown", "lost"))]
+)
+def test_requests_that_fail_leave_no_trace(server, prefix, local, fault):
+    draw = random.Random(fault)
+    server.fault = lambda method, path: (
+        fault if draw.random() < 0.05 and "/sets/one/" in path and (fault != "truncated" or "/train" in path) else None
+    )
+    bake(prefix)
+    server.fault = lambda method, path: None
+    assert stored(prefix) == local
+
+
+@pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(1, 9))])
+def test_a_worker_may_die_at_any_request(memory, local, monkeypatch, seed):
+    """Each life is longer than the one before, so that the bake ends."""
+    draw, lives = random.Random(seed), 20
+    while not bake_mortal(memory, draw.randrange(1, lives), monkeypatch):
+        lives += 20
+        found = stored(memory)
+        committed = [key for key in found if key.startswith("manifest/0") and key.endswith(".json")]
+        for key in committed:
+            lines = found[key.replace(".json", ".sha256")].decode().splitlines()
+            assert all(found[line.split("  ")[1]] == local[line.split("  ")[1]] for line in lines)
+    assert stored(memory) == local
+
+
+def test_blocks_are_listed_alone(memory, monkeypatch):
+    """A resume holds one block, and lists the marks of open ones only."""
+    store, config = open_store(memory), tiny(3_500)
+    ledger = Ledger(store, config, Probe(0.0, True))
+    for episode in range(3_400):
+        store.put(f"manifest/{episode:06d}.json", b"")
+        store.put(f"manifest/{episode:06d}.sha256", b"")
+    for block in (0, 2):
+        store.put(f".store/done/{block:06d}-1000", b"")
+    listed = []
+    monkeypatch.setattr(Ledger, "done", lambda self, block, done=Ledger.done: listed.append(block) or done(self, block))
+    assert list(ledger.remaining([range(3_500)])) == [list(range(3_400, 3_500))]
+    assert list(ledger.remaining([range(1, 3_500, 2)])) == [list(range(3_401, 3_500, 2))]
+    assert set(listed) == {1, 3}
+    assert list(ledger.blocks()) == [0, 1, 2, 3]
+
+
+def test_another_set_or_other_settings_are_refused(memory):
+    store = open_store(memory)
+    store.put("thesis.txt", b"ten years")
+    with pytest.raises(OutputError, match=r"not empty: it has thesis\.txt"):
+        bake(memory)
+    store.delete("thesis.txt")
+    bake(memory)
+    before = stored(memory)
+    with pytest.raises(ConfigError, match=r"started with other settings: bake\.seed is 8"):
+        bake(memory, tiny().with_values({"bake.seed": 8}))
+    assert stored(memory) == before
+
+
+def test_other_objects_are_refused(memory, monkeypatch):
+    bake(memory, shard=(0, 2))
+    monkeypatch.setattr(scripted_bake, "INPUTS", {"objects": 64 * "2", "lights": 64 * "1"})
+    with pytest.raises(ConfigError, match=r"memory://.* was started with other objects"):
+        bake(memory)
+
+
+def test_a_prefix_in_another_set_is_refused(prefix):
+    bake(prefix, tiny(1))
+    with pytest.raises(OutputError, match=r"in the data set s3://.*/sets/one"):
+        bake(f"{prefix}/more")
+
+
+def _unset(server, monkeypatch) -> None:
+    for name in ("AWS_ACCESS_KEY_ID", "AWS_SECRET_ACCESS_KEY"):
+        monkeypatch.delenv(name)
+    monkeypatch.setenv("AWS_EC2_METADATA_DISABLED", "true")
+
+
+def _fail(fault: str, *methods: str):
+    def prepare(server, monkeypatch) -> None:
+        server.fault = lambda method, path: fault if method in methods else None
+
+    return prepare
+
+
+@pytest.mark.parametrize(
+    ("prepare", "url", "said"),
+    [
+        (_unset, None, "there are no credentials for s3://"),
+        (_fail("", ""), "s3://no-such-bucket/set", "there is no such bucket"),
+        (_fail("403 AccessDenied", "PUT", "POST"), None, "the credentials may not do that"),
+        (_fail("403 RequestTimeTooSkewed", "PUT"), None, "the clock of this machine differs"),
+        (_fail("late clock", "HEAD"), None, "the clock of this machine differs"),
+        (_fail("", ""), "s3://", "names no bucket"),
+        (_fail("", ""), "nowhere://a/b", "nowhere"),
+    ],
+    ids=["credentials", "bucket", "read-only", "skew refused", "skew measured", "no bucket", "scheme"],
+)
+def test_what_cannot_be_used_is_one_line_before_anything_is_simulated(server, prefix, monkeypatch, prepare, url, said):
+    prepare(server, monkeypatch)
+    message = mistake("bake", "--config", "smoke", "--out", url or prefix, "--device", "cpu")
+    assert said in message
+    server.fault = lambda method, path: None
+    if prepare is not _unset:
+        assert stored(prefix) == {}
+
+
+def test_the_local_file_is_checked_before_it_is_sent(memory, monkeypatch):
+    honest = Path.read_bytes
+    monkeypatch.setattr(Path, "read_bytes", lambda path: honest(path) + b"x" * (path.suffix == ".tar"))
+    with pytest.raises((OutputError, StoreError), match="has changed since it was written"):
+        bake(memory)
+    assert not any(key.startswith("manifest/0") for key in stored(memory))
