@@ -190,6 +190,7 @@ def make_env(
     seed: int = 0,
     max_steps: int | None = None,
     piles: int | None = None,
+    course: str = "attempt",
     progress: Progress | None = None,
 ) -> PickingVectorEnv:
     """Make a vector environment (`gymnasium.vector.VectorEnv`) in which an action is a pick, or a twist of the gripper for a tick.
@@ -213,6 +214,7 @@ def make_env(
         seed: Seed of the first environment's episodes if `reset` gets none; the others follow.
         max_steps: Steps after which an episode is truncated; None: 30 attempts, or 600 ticks.
         piles: Number of different piles that episodes are drawn from; None: 2^31 - 1, so that repeats are rare.
+        course: Course of a whole pick: "attempt", as in a bake, or "trial", as in the format picks, which takes a third of the ticks.
         progress: Receives stages and notes; None: silent.
 
     Raises:
@@ -223,7 +225,7 @@ def make_env(
         from synpick_warp.environment.make import make_picking, require_libraries
         from synpick_warp.environment.settings import make_choice
 
-    choice = make_choice(task, num_envs, obs, resolution, action, autoreset, backend, seed, max_steps, piles)
+    choice = make_choice(task, num_envs, obs, resolution, action, autoreset, backend, seed, max_steps, piles, course)
     require_libraries(backend)
     from synpick_warp.environment.vector import PickingVectorEnv
 

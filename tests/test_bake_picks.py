@@ -61,7 +61,7 @@ def test_tables_have_every_trial_and_the_own_grasp_succeeds_as_in_its_episode(ba
 @pytest.mark.slow
 def test_tables_do_not_depend_on_worlds_nor_on_a_failure(baked, tmp_path, monkeypatch):
     """Each state is tried by itself, in other numbers of worlds, by a bake that fails in between and is resumed."""
-    monkeypatch.setattr(picks, "ROUNDS", 0)
+    monkeypatch.setattr(picks, "BATCH_ROUNDS", 0)
     other = GIVEN | {"bake.worlds": 1, "picks.worlds": 3}
     with failing_after(1):
         bake_boxes(tmp_path / "set", other)

@@ -120,7 +120,7 @@ def calls(tmp_path_factory):
         threading.setprofile(calls.watch)
         try:
             bake_boxes(out / "bake", TINY | {"bake.episodes": 1, "bake.worlds": 1})
-            export(BopExporter, out / "export", box_views.config(), (0,), processes=0)
+            export(BopExporter, out / "export", box_views.config(), (0,))
         finally:
             sys.setprofile(None)
             threading.setprofile(None)  # type: ignore[arg-type]

@@ -27,7 +27,7 @@ LENSES = cameras()
 
 @pytest.fixture(scope="module")
 def shard(tmp_path_factory) -> Path:
-    out = export(ShardsExporter, tmp_path_factory.mktemp("decoder") / "set", config(("flow", "classes")), (0,), processes=0)
+    out = export(ShardsExporter, tmp_path_factory.mktemp("decoder") / "set", config(("flow", "classes")), (0,))
     return out / "train_pbr_web" / "shard-000000.tar"
 
 

@@ -45,7 +45,9 @@ class Picks:
         high=10.0,
     )
     lift_height: float = setting(0.15, "m", "Height of the lift, at pick.lift_speed.", above=0.0, high=10.0)
-    hold: float = setting(0.3, "s", "Time for which the gripper holds still between the lift and the outcome.", low=0.0, high=60.0)
+    hold: float = setting(
+        0.3, "s", "Time for which the gripper holds still between the lift and the outcome, to the nearest tick.", low=0.0, high=60.0
+    )
     settle: float = setting(
         0.0, "s", "Time between the outcome and the measurement of the other objects' displacements.", low=0.0, high=60.0
     )

@@ -372,11 +372,11 @@ def choose_candidates_kernel(
     """Stratified sampling of the pool: write the planned grasp, stratified candidates, and last `uniform` uniform ones of each view.
 
     Two nested round robins with random starts, over instances and over the strata of each that have pixels, equalize their numbers of
-    candidates; pixels of a stratum are taken in the order in which they were drawn. Launched over view, candidate.
+    candidates; pixels of a stratum are taken in the order in which they were drawn. Skips empty views. Launched over view, candidate.
     """
     view, candidate = wp.tid()
     world = views.world[view]
-    if world < 0:
+    if world < 0 or pool.pixels[view] == 0:
         return
     draw = int(pool.pixel.shape[1] - 1)
     share = int(Share.OWN)

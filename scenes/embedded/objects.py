@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Collection
 from dataclasses import dataclass
 
@@ -105,8 +106,9 @@ def procedural_objects(sets: Collection[str] = (HOUSEHOLD,)) -> list[RawObject]:
     return [_make_object(obj_id, row) for obj_id, (name, row) in rows if name in sets]
 
 
+@functools.cache
 def _make_object(obj_id: int, row: _Row) -> RawObject:
-    """Make an embedded object."""
+    """Make an embedded object, once a process; nobody changes it."""
     made = row.make()
     patch, texture = (made, None) if isinstance(made, Patch) else made
     mesh = make_mesh(patch, centered=True)

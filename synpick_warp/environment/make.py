@@ -19,6 +19,7 @@ from synpick_warp.environment.settings import (
     PIXEL,
     TARGET,
     TORCH,
+    TRIAL,
     TWIST,
     Choice,
     action_bounds,
@@ -32,6 +33,7 @@ from synpick_warp.online.settings import resolve_settings
 from synpick_warp.stages.environment.sight import Sight
 from synpick_warp.stages.environment.twist import TwistLaw
 from synpick_warp.stages.environment.worlds import EnvironmentWorlds
+from synpick_warp.stages.sim.trials import TrialLaw, make_course
 from synpick_warp.system.hardware.device import pick_device
 from synpick_warp.system.progress import Progress, SilentProgress
 
@@ -69,6 +71,8 @@ def make_picking(
     """
     progress = progress or SilentProgress()
     config = resolve_settings(source, {**settings, **fixed_settings(choice)}, {"device": device_name})
+    if choice.course == TRIAL:
+        config = config.with_values({"pick.lift_height": config.picks.lift_height})
     device = pick_device(config.bake.device)
     config = fit_to_device(config, device, 1, NO_WRITERS)
     check_memory(plan_memory(config, device, NO_WRITERS), device)
@@ -86,7 +90,9 @@ def make_picking(
         if choice.action == TWIST:
             tcp = np.array([0.0, 0.0, config.gripper.cup_length])
             law = TwistLaw(simulation, bounds[0] + tcp, bounds[1] + tcp + (0.0, 0.0, HEADROOM))
-            simulation.behavior = replace(simulation.behavior, law=law)
+        path = law or (TrialLaw(make_course(config.picks, config.physics, config.pick)) if choice.course == TRIAL else None)
+        if path is not None:
+            simulation.behavior = replace(simulation.behavior, law=path)
         wanted = [OBSERVATIONS[name] for name in choice.obs] + (["depth"] if choice.action == PIXEL else [])
         if "rgb" in choice.obs and not group.colors:
             raise ConfigError(f"obs has rgb, but {config.rig.label(camera)} has none among its modalities")

@@ -171,13 +171,16 @@ class PickingEnvironment:
         """Copy a checkpoint from the host to the device: the inverse of `state_to_host`.
 
         Raises:
-            StateError: It is of another version, of other objects or capacities, or an array is missing.
+            StateError: It is of another version, other objects, cell or capacities, or an array is missing or has another shape or type.
         """
-        counters = {name: f"episodes.{name}" for name in vars(self.episodes)}
-        if missing := [key for key in counters.values() if key not in arrays]:
-            raise StateError(f"the state lacks {missing[0]}; it is of worlds, not of environments")
-        worlds = self.worlds.simulation.states.from_host(arrays)
-        return EnvironmentState(worlds, Episodes(**{name: np.array(arrays[key]) for name, key in counters.items()}))
+        counters = {}
+        for name, like in vars(self.episodes).items():
+            if (key := f"episodes.{name}") not in arrays:
+                raise StateError(f"the state lacks {key}; it is of worlds, not of environments")
+            counters[name] = values = np.array(arrays[key])
+            if (values.shape, values.dtype) != (like.shape, like.dtype):
+                raise StateError(f"{key} of the state is {values.dtype} {values.shape}; allowed: {like.dtype} {like.shape}")
+        return EnvironmentState(self.worlds.simulation.states.from_host(arrays), Episodes(**counters))
 
     def check_actions(self, actions: Any, active: np.ndarray) -> np.ndarray:
         """Check actions and copy them to the host (environment, value); those of inactive environments are replaced by 0.

@@ -16,6 +16,7 @@ from synpick_warp.errors import ConfigError, format_value, suggest
 PICK, TARGET, MOVE = TASKS = ("pick", "target", "move")
 PIXEL, POINT, TWIST = ACTIONS = ("pixel", "point", "twist")
 NEXT_STEP, SAME_STEP, DISABLED = AUTORESETS = ("next_step", "same_step", "disabled")
+ATTEMPT, TRIAL = COURSES = ("attempt", "trial")
 TORCH, NUMPY, WARP = BACKENDS = ("torch", "numpy", "warp")
 OBSERVATIONS: Mapping[str, str] = {
     "depth": "depth",
@@ -53,6 +54,8 @@ class Choice:
     max_steps: int
     piles: int
     """Number of different piles from which episodes are drawn."""
+    course: str
+    """Course of a whole pick: that of an attempt of a bake, or of a grasp trial."""
 
 
 def make_choice(
@@ -66,6 +69,7 @@ def make_choice(
     seed: int,
     max_steps: int | None,
     piles: int | None,
+    course: str,
 ) -> Choice:
     """Check arguments of `make_env`.
 
@@ -74,8 +78,11 @@ def make_choice(
     """
     _check_choice("task", task, TASKS)
     action = action or (TWIST if task == MOVE else PIXEL)
-    for name, value, allowed in (("action", action, ACTIONS), ("autoreset", autoreset, AUTORESETS), ("backend", backend, BACKENDS)):
+    _check_choice("action", action, ACTIONS)
+    for name, value, allowed in (("autoreset", autoreset, AUTORESETS), ("backend", backend, BACKENDS), ("course", course, COURSES)):
         _check_choice(name, value, allowed)
+    if course == TRIAL and action == TWIST:
+        raise ConfigError(f'course is "{TRIAL}"; action "{TWIST}" has no course')
     if task == MOVE and action != TWIST:
         raise ConfigError(f'action is "{action}"; task "{MOVE}" is driven by "{TWIST}" alone')
     names = (obs,) if isinstance(obs, str) else tuple(obs)
@@ -97,9 +104,8 @@ def make_choice(
         raise ConfigError(f"resolution is {format_value(resolution)}; allowed: width and height [px]")
     if to_index(seed) is None:
         raise ConfigError(f"seed is {format_value(seed)}; allowed: a whole number")
-    return Choice(
-        task, int(num_envs), tuple(dict.fromkeys(names)), (sides[0], sides[1]), action, autoreset, backend, int(seed), *_rest(limits)
-    )
+    images = tuple(dict.fromkeys(names)), (sides[0], sides[1])
+    return Choice(task, int(num_envs), *images, action, autoreset, backend, int(seed), *_rest(limits), course)
 
 
 def fixed_settings(choice: Choice) -> dict[str, object]:

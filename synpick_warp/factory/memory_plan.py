@@ -120,8 +120,9 @@ def plan_memory(config: Config, device: wp.Device, writers: int = 1, pieces: int
     built = (config.arrangement, config.physics, config.cell.bins, bool(config.bin), device.is_cuda, pieces)
     terms += [Term(row[0], (row,), keys) for row, keys in newton_rows(worlds, *built)]
     if PICKS in config.bake.formats:
-        trying = count_trial_worlds(config.picks, DataLayout.of(config).planned, device)
-        batch = count_batch(trying, config.picks.candidates * config.picks.repeats)
+        planned = DataLayout.of(config).planned
+        trying = count_trial_worlds(config.picks, planned, device)
+        batch = count_batch(config.picks, planned, trying)
         terms += _trials(sizes | {"world": trying, "body": trying * bodies}, count_rows(batch, worlds), config.physics, device)
         terms.append(_perception(config.perception, trying, objects, device))
         terms += [Term(f"{row[0]} of trials", (row,), ("picks.worlds", *keys)) for row, keys in newton_rows(trying, *built)]

@@ -13,11 +13,12 @@ import numpy as np
 
 from synpick_warp.codes import Outcome
 from synpick_warp.configs.dataset.splits import DataLayout
+from synpick_warp.configs.episodes.picks import Picks
 from synpick_warp.stages.perception.candidates import CandidateSampler
 from synpick_warp.stages.sim.choices import Choice, ChoiceReader, ChoiceRecorder
 from synpick_warp.stages.sim.simulate import Simulation
 from synpick_warp.stages.sim.states import State
-from synpick_warp.stages.sim.trials import ROUNDS, Trials, count_trial_worlds, trial_values
+from synpick_warp.stages.sim.trials import BATCH_ROUNDS, Trials, count_trial_worlds, trial_values
 from synpick_warp.stages.stream import TickReport
 from synpick_warp.stages.timing import scope
 from synpick_warp.views.picks import PickBatch
@@ -89,10 +90,10 @@ class PickEngine:
         }
 
     def _split(self, choices: Sequence[Choice], trials: dict[str, np.ndarray], visible: np.ndarray) -> Iterator[PickBatch]:
-        """Group trials and visible instances (choice, instance) into a `PickBatch` per episode, by state."""
+        """Group trials and visible instances (choice, instance) into a `PickBatch` per episode, by state; without states that show none."""
         width, height = self.config.perception.resolution
         camera = self.config.rig.index(self.config.perception.camera)
-        order = sorted(range(len(choices)), key=lambda index: (choices[index].episode, choices[index].state))
+        order = sorted(np.flatnonzero(visible.any(axis=1)).tolist(), key=lambda index: (choices[index].episode, choices[index].state))
         for episode, group in groupby(order, key=lambda index: choices[index].episode):
             rows = np.array(list(group))
             mine = (rows[:, None] * self.trials_of_state + np.arange(self.trials_of_state)).ravel()
@@ -112,7 +113,7 @@ class PickQueue:
         """
         self.engine = engine
         worlds = simulation.layout.worlds
-        self.batch = count_batch(engine.simulation.layout.worlds, engine.trials_of_state)
+        self.batch = count_batch(engine.config.picks, DataLayout.of(engine.config).planned, engine.simulation.layout.worlds)
         self.recorder = ChoiceRecorder(simulation, engine.config.picks.states, count_rows(self.batch, worlds))
         self.reader = ChoiceReader(self.recorder, labelled)
         self.lead = MAX_LEAD if simulation.device.is_cuda else 0
@@ -151,9 +152,9 @@ class PickQueue:
             then()
 
 
-def count_batch(worlds: int, trials_of_state: int) -> int:
-    """Number of states of a batch: ROUNDS trials in each of the trial worlds, rounded up."""
-    return max(1, -(-ROUNDS * worlds // trials_of_state))
+def count_batch(picks: Picks, episodes: int, worlds: int) -> int:
+    """Number of states of a batch: BATCH_ROUNDS trials in each of the trial worlds, rounded up, but not more than `episodes` may have."""
+    return max(1, min(-(-BATCH_ROUNDS * worlds // (picks.candidates * picks.repeats)), episodes * picks.states))
 
 
 def count_rows(batch: int, worlds: int) -> int:

@@ -136,7 +136,7 @@ def test_limits_and_missing_tables(whole, tmp_path, monkeypatch):
 
 
 def test_a_data_set_of_picks_alone_has_its_episodes(tmp_path):
-    folder = export(PicksExporter, tmp_path / "set", config(), (0, 2), processes=0)
+    folder = export(PicksExporter, tmp_path / "set", config(), (0, 2))
     (folder / "config.toml").write_text(config_to_toml(config()))
     (folder / "manifest.json").write_text("{}")
     assert list(synpick_warp.open(folder)) == [0, 2]

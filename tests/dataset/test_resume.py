@@ -21,7 +21,7 @@ from synpick_warp.dataset.commit.merge import merge
 from synpick_warp.dataset.commit.verify import verify
 from synpick_warp.errors import DatasetError, OutputError
 from synpick_warp.exporters.writing.files import PARTIAL
-from tests.harness.bake_server import TINY, BakeServer
+from tests.harness.bake_server import TINY, TINY_PICKS, BakeServer
 from tests.harness.exporter_contract import digests
 from tests.harness.processes import children, kill_after, wait_for
 
@@ -91,6 +91,21 @@ def test_killed_before_some_change_of_its_folder_a_bake_goes_on(server, expected
     server.bake(out, alone=True, kill_at=round((1.0 - share) * changes / 2))
     assert server.bake(out, alone=True) == 0
     assert digests(out) == expected
+
+
+@pytest.mark.slow
+def test_a_killed_bake_has_the_same_tables_of_picks(server, tmp_path):
+    """Killed when some episodes are committed, and resumed, in other numbers of worlds and of trials at once."""
+    whole, out = tmp_path / "whole", tmp_path / "set"
+    other = {"settings": TINY_PICKS | {"bake.worlds": 1, "picks.worlds": 3}, "rounds": 0}
+    assert server.bake(whole, settings=TINY_PICKS, alone=True, count=str(tmp_path / "count")) == 0
+    changes = int((tmp_path / "count").read_text())
+    assert server.bake(out, **other, alone=True, kill_at=round(0.6 * changes)) == -signal.SIGKILL
+    assert 0 < len(committed_episodes(out)) < EPISODES
+    assert server.bake(out, **other) == 0
+    tables = [{name: digest for name, digest in digests(folder).items() if name.startswith(("picks", "train"))} for folder in (whole, out)]
+    assert sum(name.endswith(".parquet") for name in tables[0]) == 2 * EPISODES
+    assert tables[1] == tables[0]
 
 
 def test_a_finished_bake_killed_before_it_removed_its_partial_files(server, expected, changes, tmp_path):

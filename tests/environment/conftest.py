@@ -34,6 +34,7 @@ ARGUMENTS: dict[str, Any] = {
     "seed": 3,
     "max_steps": 4,
     "piles": None,
+    "course": "attempt",
 }
 """Of `make_choice`."""
 

@@ -10,6 +10,7 @@ import pytest
 from synpick_warp.codes import Outcome, Segment
 from synpick_warp.environment.episodes import Episodes, make_seeds
 from synpick_warp.errors import ActionError, ConfigError, StateError
+from synpick_warp.stages.sim.trials import Trials, own_grasps
 from synpick_warp.system.random_numbers import _mix
 from tests.environment.conftest import SIZE, build, centers, same
 
@@ -194,6 +195,21 @@ def test_integers_of_numpy_are_seeds_too(seed):
     assert make_seeds(seed, 2).tolist() == [3, 4]
 
 
+def test_the_course_of_a_trial_has_the_outcome_of_its_table(device):
+    """Sooner than an attempt, and with hits and force of the trial of the planned grasp; on the floor it ends after the press."""
+    environment = build(device, course="trial")
+    obs, _ = environment.reset(seed=3)
+    state, simulation = environment.get_state(), environment.worlds.simulation
+    step = environment.step(np.stack((centers(obs["instances"])[0], floor_pixels(obs)[1])))
+    assert step.reward.tolist() == [1.0, 0.0]
+    assert step.info["ticks"][1] < step.info["ticks"][0] < 20
+    grasps = own_grasps(simulation, range(2))
+    trials = Trials(simulation, simulation.config.picks)
+    labels = trials.run(state.worlds, trials.upload(grasps, 2))
+    for name in ("outcome", "picked", "hits", "peak_force", "ticks"):
+        np.testing.assert_array_equal(labels[name], step.info[name], err_msg=name)
+
+
 # ---- states and branches ----
 
 
@@ -228,6 +244,10 @@ def test_a_state_continues_as_before(environment):
         (lambda one: one.state_from_host({}), "the state lacks episodes.seed; it is of worlds"),
         (lambda one: one.state_from_host(one.state_to_host(one.get_state()) | {"version": np.array(0)}), "the state has version 0"),
         (lambda one: one.state_from_host(one.state_to_host(one.get_state()) | {"catalog": np.array("ab")}), "of another catalog"),
+        (
+            lambda one: one.state_from_host(one.state_to_host(one.get_state()) | {"episodes.steps": np.zeros(3, int)}),
+            r"episodes.steps of the state is int64 \(3,\); allowed: int64 \(2,\)",
+        ),
         (lambda one: one.worlds.bank.fetch(range(99)), "99 piles are asked for at once, but the bank keeps [48]"),
         (lambda one: one.worlds.set_state(one.worlds.simulation.get_state([0]), [0]), "the state is of 1 environments, not of 2"),
     ],

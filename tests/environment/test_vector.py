@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 
 import synpick_warp
-from synpick_warp.configs.files.load import load_config
+from synpick_warp.configs.files.load import load_config, override_config
 from synpick_warp.environment.make import make_picking
-from synpick_warp.environment.settings import action_bounds, make_choice
+from synpick_warp.environment.settings import action_bounds, fixed_settings, make_choice
 from synpick_warp.errors import ActionError, ConfigError
+from synpick_warp.stages.render.sampling_rates import accumulates
 from tests.environment.conftest import ARGUMENTS, SIZE, build, same
 
 needs_gymnasium = pytest.mark.skipif(importlib.util.find_spec("gymnasium") is None, reason="Gymnasium is not installed")
@@ -60,6 +61,16 @@ def test_bounds_hold_all_bins(target):
     assert ((positions > low) & (positions < high)).all()
 
 
+def test_pictures_have_no_memory(target):
+    """A state is complete without the renderer's light history, because environments have none, whatever the settings say."""
+    state, before = target.get_state(), target.observe()
+    target.step(np.array([[0.0, 0.0, 0.1, 0.0, 0.0, 1.0]] * 2))
+    assert same(target.set_state(state), before)
+    config = load_config("synpick", {"render.mode": "fast", "render.history": 64})
+    assert accumulates(config.render, histories=1)
+    assert not accumulates(override_config(config, fixed_settings(target.choice)).render, histories=1)
+
+
 # ---- arguments ----
 
 
@@ -74,6 +85,8 @@ def test_bounds_hold_all_bins(target):
         ({"obs": ()}, "obs is empty"),
         ({"obs": ("target_mask",)}, 'obs has target_mask, but task "pick" has no target'),
         ({"backend": "jax"}, "backend is .*; allowed: torch, numpy, warp"),
+        ({"course": "near"}, "course is .*; allowed: attempt, trial"),
+        ({"course": "trial", "action": "twist"}, 'course is "trial"; action "twist" has no course'),
         ({"autoreset": True}, "autoreset is true; allowed: next_step, same_step, disabled"),
         ({"num_envs": 0}, "num_envs is 0; allowed: a whole number from 1 on"),
         ({"num_envs": 1.5}, "num_envs is 1.5"),

@@ -19,7 +19,7 @@ class TestPicksContract(ExporterContract):
 
 
 def test_tables_hold_the_trials_in_order_with_units(tmp_path):
-    out = export(PicksExporter, tmp_path / "set", config(), (2,), processes=0)
+    out = export(PicksExporter, tmp_path / "set", config(), (2,))
     batch = pick_batch(2)
     for folder, columns, given in (FOLDER, COLUMNS, batch.trials), (STATES_FOLDER, STATES, batch.states):
         table, rows = pq.read_table(out / folder / "000002.parquet"), make_rows(columns, given)

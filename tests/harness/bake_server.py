@@ -37,6 +37,21 @@ TINY = {
     "settle.max_time": 3.0,
 }
 """Overrides on top of QUICK: an episode takes less than a second."""
+TINY_PICKS = {
+    "bake.mode": "pick",
+    "bake.formats": ["bop", "picks"],
+    "pick.appear_height": 0.3,
+    "pick.lift_height": 0.3,
+    "pick.lift_speed": 1.0,
+    "pick.failures": 1,
+    "perception.resolution": [160, 90],
+    "picks.states": 1,
+    "picks.candidates": 3,
+    "picks.lift_height": 0.05,
+    "picks.hold": 0.0,
+    "picks.worlds": 2,
+}
+"""Overrides on top of TINY: short attempts, and few trials from a state."""
 _PERTURB = -6
 """M_PERTURB of glibc's malloc.h."""
 _EVENTS = ("open", "os.rename", "os.mkdir", "os.remove", "os.rmdir", "shutil.rmtree")
@@ -136,8 +151,10 @@ def _serve() -> None:
 def _prepare(request: dict) -> None:
     """Inject the faults that a request names."""
     from synpick_warp.exporters.writing.pool import WriterPool
-    from synpick_warp.factory import pipeline
+    from synpick_warp.factory import picks, pipeline
 
+    if "rounds" in request:
+        picks.BATCH_ROUNDS = request["rounds"]
     if "alone" in request:
         # Write files in the bake's own process.
         def make_inline_pool(_: int, slot_bytes: int, inherited_handle: int) -> WriterPool:

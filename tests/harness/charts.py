@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 
 import cv2
 import numpy as np
@@ -10,11 +11,16 @@ import numpy as np
 from synpick_warp.system.codecs.charts import SCALE, VEGA_LITE, Spec
 
 
-def picture_of(spec: Spec, scale: float = SCALE) -> np.ndarray:
-    """RGB image (H, W, 3) uint8 of a chart."""
+def render_here(specs: Sequence[Spec], scale: float = SCALE) -> list[bytes]:
+    """As `render_charts`, in this process."""
     import vl_convert
 
-    data = vl_convert.vegalite_to_png(spec, vl_version=VEGA_LITE, scale=scale)
+    return [vl_convert.vegalite_to_png(spec, vl_version=VEGA_LITE, scale=scale) for spec in specs]
+
+
+def picture_of(spec: Spec, scale: float = SCALE) -> np.ndarray:
+    """RGB image (H, W, 3) uint8 of a chart."""
+    (data,) = render_here([spec], scale)
     return cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)[..., ::-1]
 
 

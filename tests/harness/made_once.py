@@ -13,10 +13,13 @@ import pytest
 from newton._src.geometry import narrow_phase
 
 from synpick_warp.apps.conversion import found, run
+from synpick_warp.apps.evaluation import figures
+from synpick_warp.apps.viz import explain
 from synpick_warp.dataset.commit import merge
 from synpick_warp.exporters.writing.pool import WriterPool
 from synpick_warp.factory import pipeline
 from synpick_warp.stages.render import scene
+from tests.harness.charts import render_here
 
 MOST_MAPS = 50
 """Environment maps whose tables are kept."""
@@ -50,7 +53,10 @@ def made_once() -> Iterator[None]:
 
 @contextmanager
 def written_here() -> Iterator[None]:
-    """Bakes, conversions and merges with one writer write in their own process: another takes longer to start than to write a small set."""
+    """Bakes, conversions and merges with one writer write in their own process, in which charts are rendered, too.
+
+    Another takes longer to start than to write a small set or to render a few charts.
+    """
 
     def pool(processes: int, *arguments: int) -> WriterPool:
         return WriterPool(processes if processes > 1 else 0, *arguments)
@@ -58,4 +64,6 @@ def written_here() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         for module in (pipeline, run, found, merge):
             patch.setattr(module, "WriterPool", pool)
+        for module in (explain, figures):
+            patch.setattr(module, "render_charts", render_here)
         yield

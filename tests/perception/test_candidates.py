@@ -87,6 +87,23 @@ def test_candidates_depend_on_the_state_alone(sampled, choice, device):
             np.testing.assert_array_equal(values[:COUNT], values[COUNT:], err_msg=name)
 
 
+@pytest.mark.parametrize("height", [None, -5.0], ids=["empty tote", "out of view"])
+def test_a_state_that_shows_nothing_has_no_candidates(choice, device, height):
+    """The other row is that of a state that shows its objects, in the same batch."""
+    simulation = worlds(device, 2)
+    simulation.tick()
+    arrays = simulation.states.to_host(choice[0])
+    if height is None:
+        arrays["snapshot.catalog_index"][0] = -1
+    else:
+        arrays["snapshot.pose"][0, :, 2] = height
+    sampled = Sampled(simulation, simulation.states.from_host(arrays), (0, 1))
+    assert sampled.visible.tolist() == [[False] * 2, [True] * 2]
+    for name in ("target", "entry", "pixel", "weight"):
+        assert not getattr(sampled, name).any()
+    assert sampled.arrays["weight"][COUNT + 1 :].all()
+
+
 def test_drawn_pixels_are_uniform_over_what_is_visible(sampled):
     component = sampled.sampler.images.arrays.component.numpy()[0]
     rank = np.cumsum(component.ravel() >= 0) - 1

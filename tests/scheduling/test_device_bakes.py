@@ -15,12 +15,13 @@ from synpick_warp.dataset.commit.manifest import committed_episodes
 from synpick_warp.dataset.commit.verify import verify
 from synpick_warp.exporters.writing.files import PARTIAL
 from tests.builders import assignments
-from tests.harness.bake_server import TINY
+from tests.harness.bake_server import TINY, TINY_PICKS
 from tests.harness.exporter_contract import digests
 from tests.worlds.small_worlds import QUICK
 
 EPISODES = 6
 SETTINGS = TINY | {"bake.episodes": EPISODES, "bake.worlds": 1, "bake.formats": ["bop"], "arrangement.max_objects": 2, "render.layers": []}
+SETTINGS |= TINY_PICKS
 """Objects are the embedded ones: each process loads them for itself."""
 
 

@@ -99,6 +99,7 @@ def test_there_must_be_something_to_look_at(device):
 def track(device, worlds: int, episodes: int = 3) -> dict[tuple[int, int], list[bytes]]:
     """Results of every tick by (episode, arrangement), in mixed modes and a number of worlds."""
     changed = SHORT | COARSE | {"bake__mode": "mixed", "pick__retry": "another", "perception__grasp_point": "flat"}
+    changed |= {"perception__resolution": [160, 90]}
     config = settings(bake__worlds=worlds, bake__episodes=episodes, arrangement__max_objects=2, pick__failures=1, **changed)
     simulation = picking(config, catalog(), device)
     ticks = defaultdict(list)

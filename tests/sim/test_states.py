@@ -160,6 +160,8 @@ def test_a_state_survives_a_file(scene, device, tmp_path):
         ({"version": np.array(0)}, "the state has version 0, but this release reads version 1"),
         ({"version": None}, "the state has version unknown"),
         ({"catalog": np.array("0123456789")}, "the state is of another catalog of objects"),
+        ({"cell": np.array("0123456789")}, "the state is of another cell or gripper \\(01234567, not "),
+        ({"cell": None}, "the state is of another cell or gripper \\(unknown, not "),
         ({"plan.point": None}, "plan.point of the state does not have the shape and type"),
         ({"worlds.stuck": np.zeros((2, 9), np.int32)}, "worlds.stuck of the state does not have the shape and type"),
     ],
@@ -168,6 +170,14 @@ def test_a_state_that_does_not_fit_is_refused(acting, changes, message):
     arrays = acting.states.to_host(acting.get_state([0, 1])) | changes
     with pytest.raises(StateError, match=message):
         acting.states.from_host({name: array for name, array in arrays.items() if array is not None})
+
+
+def test_a_state_of_another_cell_is_refused(acting, device):
+    """Of a lower tote, whose arrays have the same shapes."""
+    low = brief(device, 1, tote__outer_size=[0.615, 0.373, 0.19])
+    low.tick()
+    with pytest.raises(StateError, match=r"the state is of another cell or gripper \(.{8}, not .{8}\)"):
+        acting.set_state(low.get_state([0]), [0])
 
 
 def test_catalogs_are_told_apart():

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from synpick_warp.codes import Outcome
 from synpick_warp.configs.episodes.picks import Picks
 from synpick_warp.errors import StateError
+from synpick_warp.stages.perception.candidates import CandidateSampler
+from synpick_warp.stages.sim.physics import MIN_GPU_WORLDS
 from synpick_warp.stages.sim.simulate import Simulation
 from synpick_warp.stages.sim.trials import Trials, check_grasps, find_choices, own_grasps, trial_values
 from tests.worlds.sights import brief, picking
@@ -115,6 +119,43 @@ def test_repeats_are_perturbed_alike_in_any_world(choice, device):
         assert np.ptp(drawn) > 0.2 * width
     assert Outcome(labels["outcome"][0]) is Outcome.TARGET_PICKED
     assert labels["held"][0] * 4e-3 == pytest.approx(0.05 / 0.6 + 0.1, abs=16 * 4e-3)
+
+
+FOUR_CUPS = {
+    "gripper__kind": "suction_array",
+    "gripper__cups": [[0.012, 0.012], [-0.012, 0.012], [-0.012, -0.012], [0.012, -0.012]],
+    "gripper__cup_width": 0.02,
+    "suction__radius": 0.008,
+}
+
+
+def test_four_cups_are_tried_alike_in_any_world_and_others_are_measured_later(device):
+    """Candidates, perturbed, with and without `picks.settle`, which changes only what is measured of the other object: it is in the air."""
+    first = brief(device, 2, bake__mode="pick", arrangement__max_objects=2, **FOUR_CUPS)
+    while not len(find_choices(first)):
+        first.tick()
+    (world,) = find_choices(first)[:1].tolist()
+    arrays = first.states.to_host(first.get_state([world]))
+    other = 1 - own_grasps(first, [world])["target"][0]
+    upward = first.scene.layout.gripper_dofs + 6 * arrays["worlds.body_slot"][0, other] + 2
+    arrays["physics.joint_qd"][0, upward] = 3.0
+    state = first.states.from_host(arrays)
+    settings, found = Picks(near=0.02, lift_height=0.05, hold=0.0, repeats=2, candidates=4), {}
+    for count, settle in ((3, 0.0), (2, 0.0), (2, 0.3)):
+        config = first.config.with_values(trial_values(settings, max(count, MIN_GPU_WORLDS) if first.device.is_cuda else count))
+        simulation = ticked(picking(config, first.catalog, device, episodes=[]))
+        grasps, candidates, _ = CandidateSampler(simulation, settings).sample(state, [0])
+        found[count, settle] = Trials(simulation, replace(settings, settle=settle)).run(state, grasps)
+        found[count, settle] |= {name: getattr(candidates, name).numpy() for name in ("pixel", "weight", "seal")}
+    labels, later = found[2, 0.0], found[2, 0.3]
+    for name, values in labels.items():
+        np.testing.assert_array_equal(values, found[3, 0.0][name], err_msg=name)
+        if name not in ("moved", "farthest", "lost"):
+            np.testing.assert_array_equal(values, later[name], err_msg=name)
+    assert labels["farthest"][0] > 0.3 > 0.1 > later["farthest"][0]
+    assert Outcome(labels["outcome"][0]) is Outcome.TARGET_PICKED
+    assert labels["hits"][:, 0].max() > 10
+    assert bin(labels["hits"][0, 1]).count("1") >= 3
 
 
 def test_a_grasp_in_the_air_catches_nothing(labels):

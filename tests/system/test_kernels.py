@@ -15,7 +15,7 @@ import warp as wp
 from synpick_warp.system.hardware import kernels
 from synpick_warp.system.hardware.kernels import Compiler, DryLaunches, ModuleBuild, build_of, compilation_lock, split_modules
 
-MODULES = 3
+MODULES = 1
 
 
 def make_kernel(factor: float) -> wp.Kernel:
@@ -67,7 +67,7 @@ def test_modules_that_the_cache_lacks_are_compiled_once_and_counted(device, empt
             wp.launch(scale, dim=4, inputs=[values], device=device)
     assert (compiler.compiled, reports[-1]) == (MODULES + 2, (MODULES + 2, MODULES + 2))
     assert all(ready <= total for ready, total in reports)
-    np.testing.assert_array_equal(values.numpy(), 5.0 * 6.0 * 7.0 * 8.0 * 9.0)
+    np.testing.assert_array_equal(values.numpy(), 5.0 * 6.0 * 7.0)
     assert len(kernels.list_binaries()) == MODULES + 2
     with Compiler(lambda *_: pytest.fail("nothing is missing")) as compiler:
         compiler.submit(builds)

@@ -56,7 +56,7 @@ def render_layers(
         for name in ("catalog_index", "pose", "fixture_pose", "fixture_visible"):
             wp.copy(getattr(now, f"last_{name}"), getattr(last, name))
         now.follows.assign(np.array(previous.follows))
-    renderer = make_renderer(config, scene, toy.instances, views)
+    renderer = make_renderer(config, scene, toy.instances, views, colors=False)
     sizes = view_buffer_sizes(views, scene.width, scene.height, toy.instances)
     out = allocate(LayerBuffers, sizes, device, names)
     view_world = wp.array(np.repeat(np.arange(worlds), cameras), dtype=wp.int32, device=device)

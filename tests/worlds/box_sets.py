@@ -30,7 +30,7 @@ HOLE = 10
 def write_set(folder: Path, exporter: type, **bop: object) -> Path:
     """A finished data set of boxes, with settings and manifest."""
     settings = config(LAYERS, **({"split": "train", "color_format": "png"} | bop))
-    export(exporter, folder, settings, EPISODES, processes=0)
+    export(exporter, folder, settings, EPISODES)
     (folder / CONFIG_FILE).write_text(config_to_toml(settings))
     (folder / MANIFEST_FILE).write_text("{}")
     (folder / ENTRIES).mkdir()
@@ -51,7 +51,7 @@ class _BopWithPicks(BopExporter):
 def write_pick_set(folder: Path) -> Path:
     """A finished data set of boxes with picks, in the formats bop and picks."""
     write_set(folder, _BopWithPicks)
-    export(PicksExporter, folder, config(), EPISODES, processes=0)
+    export(PicksExporter, folder, config(), EPISODES)
     settings = (folder / CONFIG_FILE).read_text()
     (folder / CONFIG_FILE).write_text(settings.replace('formats = ["bop"]', 'formats = ["bop", "picks"]'))
     return folder

@@ -39,7 +39,7 @@ def card(x: float) -> np.ndarray:
     return pose_of((x, 0.075, 0.4), Rotation.from_euler("xz", [5.0, 90.0], degrees=True))
 
 
-MOVING = 14
+MOVING = 10
 """Frames of `moving_scene`."""
 TIN, MUG, DRILL = 0, 1, 2
 """Its instances."""

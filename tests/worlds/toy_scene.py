@@ -214,23 +214,22 @@ def build_scene(toy: ToyScene, device: wp.Device) -> RenderScene:
     return build_render_scene(settings.render, -settings.tote.wall, catalog, toy.fixtures, toy.cameras, toy.lights, device, toy.looks)
 
 
-def render(toy: ToyScene, device: wp.Device) -> RenderedViews:
-    """Render every world by every camera: view = world x cameras + camera."""
+def render(toy: ToyScene, device: wp.Device, colors: bool = True) -> RenderedViews:
+    """Render every world by every camera: view = world x cameras + camera. Without colours, `color`, `radiance` and `resolve` are empty."""
     config = toy.settings()
     scene = build_scene(toy, device)
     worlds, cameras = len(toy.placed), len(toy.cameras)
     views = worlds * cameras
-    renderer = make_renderer(config, scene, toy.instances, views)
+    renderer = make_renderer(config, scene, toy.instances, views, colors=colors)
     out = allocate_view_buffers(views, scene.width, scene.height, toy.instances, device)
     view_world = wp.array(np.repeat(np.arange(worlds), cameras), dtype=wp.int32, device=device)
     view_camera = wp.array(np.tile(np.arange(cameras), worlds), dtype=wp.int32, device=device)
     renderer.render(snapshot(toy, device), make_views(view_world, view_camera, views, toy.instances), out)
     images = {name: getattr(out, name).numpy() for name in ("color", "depth", "instance", "pixels", "boxes")}
     images["masks"] = masks_of_buffers(out)
-    shown = renderer.image
-    return RenderedViews(
-        **images, exact_depth=renderer.gbuffer.depth.numpy(), radiance=shown.radiance.numpy(), resolve=shown.resolve.numpy()
-    )
+    shown = {name: getattr(renderer.image, name).numpy() if colors else np.empty(0) for name in ("radiance", "resolve")}
+    images |= {} if colors else {"color": np.empty(0)}
+    return RenderedViews(**images, exact_depth=renderer.gbuffer.depth.numpy(), **shown)
 
 
 def render_objects(device: wp.Device, *placed, view: Camera, config: Config | None = None, **more) -> RenderedViews:
@@ -243,7 +242,7 @@ def render_objects(device: wp.Device, *placed, view: Camera, config: Config | No
 def render_gbuffer(toy: ToyScene, device: wp.Device) -> tuple[ViewBuffers, Renderer]:
     """Render the G-buffer of world 0 by camera 0 only."""
     scene = build_scene(toy, device)
-    renderer = make_renderer(toy.settings(), scene, toy.instances, 1)
+    renderer = make_renderer(toy.settings(), scene, toy.instances, 1, colors=False)
     out = allocate_view_buffers(1, scene.width, scene.height, toy.instances, device)
     zero = wp.zeros(1, dtype=wp.int32, device=device)
     views = make_views(zero, zero, 1, toy.instances)

@@ -106,7 +106,7 @@ def ends(episodes: tuple[int, ...], frames: int) -> list[EpisodeEnd]:
     return result
 
 
-def write_set(out: Path, settings: Config, episodes: tuple[int, ...], frames: int, processes: int = 2, steps: bool = True) -> Path:
+def write_set(out: Path, settings: Config, episodes: tuple[int, ...], frames: int, processes: int = 0, steps: bool = True) -> Path:
     """Write a complete data set."""
     with exporting(TrajectoryExporter, out, settings, processes) as exporter:
         exporter.write_constants()

@@ -39,6 +39,7 @@ DEFAULTS: dict[str, Any] = {
     "seed": 0,
     "max_steps": 10**6,
     "piles": PILES,
+    "course": "attempt",
 }
 SPREAD = 0.15
 """Half width of the square of points that are tried, and their height [m]; most of them end on an object."""

@@ -28,7 +28,7 @@ def measure_picks(build: Callable[..., Stages], bake: Bake) -> Iterator[Row]:
     stages = build(device, SilentProgress(), range(bake.worlds))
     simulation = stages.simulation
     engine = PickEngine(stages)
-    batch = count_batch(engine.simulation.layout.worlds, engine.trials_of_state)
+    batch = count_batch(engine.config.picks, bake.worlds, engine.simulation.layout.worlds)
     recorder = ChoiceRecorder(simulation, stages.config.picks.states, batch + simulation.layout.worlds)
     reader, choices = ChoiceReader(recorder, len(stages.catalog)), []
     while len(choices) < batch:

@@ -9,7 +9,7 @@ import torch  # pyright: ignore[reportMissingImports]
 
 from synpick_warp.codes import MAX_INSTANCES
 from synpick_warp.environment.picking import PickingEnvironment
-from synpick_warp.environment.settings import DISABLED, PICK, PIXEL, TORCH, Choice, make_choice
+from synpick_warp.environment.settings import ATTEMPT, DISABLED, PICK, PIXEL, TORCH, Choice, make_choice
 from synpick_warp.scenes.cameras import make_cameras
 from tools.examples.picking_scores import Sight
 
@@ -30,7 +30,7 @@ class Emptied:
 
 def choose_environment(worlds: int, resolution: tuple[int, int], seed: int, max_steps: int | None = None) -> Choice:
     """Options for `make_picking` of a vector environment with whole picks at pixels that observes depth and instances."""
-    return make_choice(PICK, worlds, ("depth", "instances"), resolution, PIXEL, DISABLED, TORCH, seed, max_steps, None)
+    return make_choice(PICK, worlds, ("depth", "instances"), resolution, PIXEL, DISABLED, TORCH, seed, max_steps, None, ATTEMPT)
 
 
 def observe(environment: PickingEnvironment, obs: Mapping[str, torch.Tensor]) -> Sight:

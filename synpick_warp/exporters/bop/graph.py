@@ -23,6 +23,8 @@ WITHOUT_LABEL = -1
 """Index that stands for a supporter without node: bin, table, or an object without label."""
 _DIGITS = 4
 """Decimal places of forces [N]."""
+_BOUNDS = ("column", "first", "past")
+"""Fields of `Runs` that are arrays."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,29 +59,37 @@ def _find_edges(object_id: np.ndarray, support: np.ndarray, static: np.ndarray, 
 
 
 def find_occlusions(masks: Sequence[Masks]) -> list[tuple[int, int, int]]:
-    """Occlusion edges of a view, (a, b, pixels): number of pixels common to a's visible mask and b's amodal mask."""
-    return [
-        (a, b, pixels)
-        for a, one in enumerate(masks)
-        for b, other in enumerate(masks)
-        if a != b and (pixels := count_common(one.visible, other.amodal))
-    ]
+    """Occlusion edges of a view, (a, b, pixels): number of pixels common to a's visible mask and b's amodal mask.
+
+    Interval join: visible masks are disjoint, so the visible runs that overlap an amodal run are consecutive in column-major order.
+    """
+    shown, begin, end = _list_runs([mask.visible for mask in masks], masks)
+    hidden, start, past = _list_runs([mask.amodal for mask in masks], masks)
+    order = np.argsort(begin)
+    shown, begin, end = shown[order], begin[order], end[order]
+    first, last = np.searchsorted(end, start, "right"), np.searchsorted(begin, past, "left")
+    counts = last - first
+    run = np.repeat(np.arange(len(start)), counts)
+    other = np.arange(len(run)) - np.repeat(np.cumsum(counts) - counts - first, counts)
+    pixels = np.minimum(end[other], past[run]) - np.maximum(begin[other], start[run])
+    common = np.zeros((len(masks), len(masks)), np.int64)
+    np.add.at(common, (shown[other], hidden[run]), pixels)
+    np.fill_diagonal(common, 0)
+    return [(a, b, int(common[a, b])) for a, b in np.argwhere(common).tolist()]
 
 
-def count_common(one: Runs, other: Runs) -> int:
-    """Intersection area [px] of two run-length encoded masks."""
-    box, own = one.box(), other.box()
-    if box is None or own is None or any(box[side] > own[side + 2] or own[side] > box[side + 2] for side in (0, 1)):
-        return 0
-    span = max(one.bottom, other.bottom)
-    (start, end), (first, past) = ((span * runs.column + runs.first, span * runs.column + runs.past) for runs in (one, other))
-    # Pixels of `one` before a position, a function of positions that is linear between the ends of its runs.
-    places, before = np.stack((start, end), axis=1).ravel(), np.cumsum(np.stack((0 * start, end - start), axis=1))
-    return round(float((np.interp(past, places, before) - np.interp(first, places, before)).sum()))
+def _list_runs(parts: Sequence[Runs], masks: Sequence[Masks]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Runs of a mask of each instance: instance, and column-major positions of the first pixel and after the last (N)."""
+    span = max((max(mask.amodal.bottom, mask.visible.bottom) for mask in masks), default=0) + 1
+    column, first, past = (np.concatenate([np.zeros(0, np.int64), *(getattr(one, name) for one in parts)]) for name in _BOUNDS)
+    instance = np.repeat(np.arange(len(parts)), [len(one.column) for one in parts])
+    return instance, column * span + first, column * span + past
 
 
 def find_unstacking_order(nodes: int, supports: Iterable[tuple[int, int]]) -> list[list[int]]:
     """Unstacking order: a topological order of the support graph's condensation, the least index first wherever several may follow.
+
+    From the transitive closure, by repeated squaring of the adjacency matrix: bins have few enough objects.
 
     Args:
         nodes: Number of nodes.
@@ -88,14 +98,22 @@ def find_unstacking_order(nodes: int, supports: Iterable[tuple[int, int]]) -> li
     Returns:
         Strongly connected components, none of which carries a later one. One of several objects is a cycle: they carry each other.
     """
-    import networkx
-
-    graph = networkx.DiGraph()
-    graph.add_nodes_from(range(nodes))
-    graph.add_edges_from((one, other) for one, other in supports if other != WITHOUT_LABEL)
-    components = networkx.condensation(graph)
-    members = {node: sorted(components.nodes[node]["members"]) for node in components}
-    return [members[node] for node in networkx.lexicographical_topological_sort(components, key=lambda node: members[node][0])]
+    reach = np.eye(nodes, dtype=np.float32)
+    for one, other in supports:
+        if other != WITHOUT_LABEL:
+            reach[one, other] = 1.0
+    for _ in range(nodes.bit_length()):
+        reach = np.minimum(reach @ reach, 1.0)
+    mutual = (reach * reach.T).astype(bool)
+    heads = np.unique(mutual.argmax(axis=1)) if nodes else np.zeros(0, np.int64)
+    # Number of components that have to be taken before each, itself included; 0: it is taken.
+    above = reach[np.ix_(heads, heads)].astype(np.int64)
+    waiting, order = above.sum(axis=0), []
+    for _ in heads:
+        following = int((waiting == 1).argmax())
+        order.append(np.flatnonzero(mutual[heads[following]]).tolist())
+        waiting -= above[following]
+    return order
 
 
 def graph_entry(entry: Mapping[str, Any], support: FrameSupport | None) -> dict[str, Any]:

@@ -66,6 +66,7 @@ class CandidateSampler:
 
         Returns:
             Structs `Grasps` and `Candidates`, with `count` consecutive elements per row, and the visible instances (row, instance) bool.
+            All fields of a row without visible instances are 0, or the planned grasp's.
         """
         sizes = {"grasp": len(rows) * self.count}
         grasps, candidates = (allocate_struct(kind, sizes, self.device) for kind in (GRASPS, CANDIDATES))

@@ -29,7 +29,7 @@ from synpick_warp.stages.sim import arrange, gripper
 from synpick_warp.stages.sim.behavior import BEHAVIORS, Hold
 from synpick_warp.stages.sim.physics import ENDED, Physics
 from synpick_warp.stages.sim.sleep import Sleep
-from synpick_warp.stages.sim.states import State, WorldStates
+from synpick_warp.stages.sim.states import State, WorldStates, cell_checksum, checksum
 from synpick_warp.stages.sim.step_log import PhysicsRecord, StepRecorder
 from synpick_warp.stages.sim.worlds import AttemptState, SealState, WorldState, WorldStatus, world_sizes
 from synpick_warp.stages.timing import scope
@@ -192,7 +192,8 @@ class Simulation:
         groups |= {name: getattr(self.record, name) for name in ("snapshot", "status", "observation", "plan")}
         if self.sleep is not None:
             groups["sleep"] = self.sleep.state
-        return WorldStates(groups | recorded, self.physics, self.catalog, self.state.variant, self.state.restarted)
+        origin = {"catalog": checksum(self.catalog), "cell": cell_checksum(self.config.cell, self.config.gripper)}
+        return WorldStates(groups | recorded, self.physics, origin, self.state.variant, self.state.restarted)
 
     def get_state(self, worlds: Sequence[int]) -> State:
         """State of worlds; see `WorldStates.get`."""

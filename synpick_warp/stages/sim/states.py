@@ -3,7 +3,8 @@
 A checkpoint has a row for each saved world. It holds everything that a tick reads from the previous tick: the per-world arrays of
 `WorldState` and the other state groups, Newton's own arrays listed in `newton_patches.history`, and the world's contacts. All other arrays
 are constant or recomputed within a tick; `tools.checks.states` finds every array of a simulation and verifies this. Random numbers are
-counter-based: functions of episode, arrangement and attempt, without a state of their own.
+counter-based: functions of episode, arrangement and attempt, without a state of their own. The renderer's light history is not part of a
+checkpoint: environments render without one (`environment.settings.fixed_settings`), and candidates are sampled from G-buffers.
 """
 
 from __future__ import annotations
@@ -11,12 +12,14 @@ from __future__ import annotations
 import hashlib
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 import warp as wp
 
 from synpick_warp.codes import Lost
+from synpick_warp.configs.cell.extents import Cell
+from synpick_warp.configs.cell.gripper import Gripper
 from synpick_warp.errors import StateError
 from synpick_warp.kernels import world_rows
 from synpick_warp.newton_patches.history import CONTACT_BYTES, ROW_ARRAYS, History, SavedContacts
@@ -31,6 +34,8 @@ WORD = 4
 """Size of a word [bytes]."""
 VARIANTS = "physics.body_variant"
 """Field of the body variants, by which a world gets the shapes and masses of its objects."""
+ORIGINS = {"catalog": "catalog of objects", "cell": "cell or gripper"}
+"""Key of a checksum of `WorldStates.origin` -> noun in messages."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,6 +46,8 @@ class State:
     """Content of the per-world arrays, concatenated (row, word) uint32."""
     contacts: SavedContacts
     """Contact history of the last step."""
+    origin: Mapping[str, str]
+    """Checksums by the keys of ORIGINS: a state is only loaded into worlds with the same."""
 
     def __len__(self) -> int:
         return self.words.shape[0]
@@ -67,19 +74,22 @@ class WorldStates:
     Attributes:
         fields: Layout of a row.
         history: State that Newton keeps between steps.
+        origin: Checksums of what the worlds are made of, by the keys of ORIGINS.
     """
 
-    def __init__(self, groups: Mapping[str, object], physics: Physics, catalog: Catalog, variant: wp.array, restarted: wp.array) -> None:
+    def __init__(
+        self, groups: Mapping[str, object], physics: Physics, origin: Mapping[str, str], variant: wp.array, restarted: wp.array
+    ) -> None:
         """Find all arrays of the state, after the first tick.
 
         Args:
             groups: Dataclasses whose arrays are state where `world` is their first dimension, by the name of their part of a row.
             physics: The physics.
-            catalog: The objects; only states of the same can be loaded.
+            origin: Checksums by the keys of ORIGINS (`checksum`, `cell_checksum`).
             variant: Written: body variants to select (body) int32 ...
             restarted: ... in these worlds (world + 1) bool.
         """
-        self.physics, self.catalog = physics, catalog
+        self.physics, self.origin = physics, origin
         self.device, self.worlds = physics.device, physics.layout.worlds
         self._variant, self._restarted = variant, restarted
         self.history = History(physics.model, physics.state, physics.control, physics.pipeline, physics.contacts, physics.solver)
@@ -119,7 +129,7 @@ class WorldStates:
             need, most = rows * each / 1e9, free // each
             raise StateError(f"states of {rows:,} worlds take {need:.3g} GB, but {free / 1e9:.3g} GB are free; take at most {most:,}")
         words = wp.zeros((rows, self.words), dtype=wp.uint32, device=self.device)
-        return State(words, self.history.allocate_contacts(rows, self.contact_capacity))
+        return State(words, self.history.allocate_contacts(rows, self.contact_capacity), self.origin)
 
     def save(self, state: State, world: wp.array) -> None:
         """Save the world of each row (row) int32; -1: the row keeps its content. Only launches kernels."""
@@ -170,8 +180,9 @@ class WorldStates:
         """Load rows into worlds; `rows` names the row of each, None: all in order, or the only one into every world.
 
         Raises:
-            StateError: A world or a row does not exist, or there is not a row for each world.
+            StateError: A world or a row does not exist, there is not a row for each world, or the state is of other worlds.
         """
+        self._check_origin(state.origin)
         if rows is None:
             rows = [0] * len(worlds) if len(state) == 1 else range(len(state))
         if len(rows) != len(worlds):
@@ -199,19 +210,18 @@ class WorldStates:
         for name in contacts.history._cls.vars:
             values = getattr(contacts.history, name).numpy()
             arrays[f"contacts.{name}"] = values.reshape(len(state), contacts.capacity, *values.shape[1:])
-        return {"version": np.array(VERSION), "catalog": np.array(checksum(self.catalog))} | arrays
+        return {"version": np.array(VERSION)} | {key: np.array(value) for key, value in state.origin.items()} | arrays
 
     def from_host(self, arrays: Mapping[str, np.ndarray]) -> State:
         """Copy a state of `to_host` to the device.
 
         Raises:
-            StateError: It is of another version, of other objects or capacities, or an array is missing.
+            StateError: It is of another version, of other objects, cell or capacities, or an array is missing.
         """
-        given = {name: str(arrays[name]) if name in arrays else "unknown" for name in ("version", "catalog")}
+        given = {name: str(arrays[name]) if name in arrays else "unknown" for name in ("version", *ORIGINS)}
         if given["version"] != str(VERSION):
             raise StateError(f"the state has version {given['version']}, but this release reads version {VERSION}")
-        if given["catalog"] != checksum(self.catalog):
-            raise StateError(f"the state is of another catalog of objects ({given['catalog'][:8]}, not {checksum(self.catalog)[:8]})")
+        self._check_origin(given)
         empty = self.to_host(self.allocate(1))
         rows = len(arrays[VARIANTS]) if VARIANTS in arrays else 0
         for name, like in empty.items():
@@ -227,6 +237,12 @@ class WorldStates:
             target = getattr(state.contacts.history, name)
             target.assign(arrays[f"contacts.{name}"].reshape(target.shape[0], *arrays[f"contacts.{name}"].shape[2:]))
         return state
+
+    def _check_origin(self, origin: Mapping[str, str]) -> None:
+        """Raise StateError unless a state of these checksums fits the worlds."""
+        for key, noun in ORIGINS.items():
+            if origin[key] != self.origin[key]:
+                raise StateError(f"the state is of another {noun} ({origin[key][:8]}, not {self.origin[key][:8]})")
 
     def _checked(self, worlds: Sequence[int]) -> Sequence[int]:
         """The worlds, if all of them exist, once each."""
@@ -246,6 +262,12 @@ def checksum(catalog: Catalog) -> str:
         for shape in shapes:
             digest.update(np.ascontiguousarray(shape))
     return digest.hexdigest()
+
+
+def cell_checksum(cell: Cell, gripper: Gripper) -> str:
+    """SHA-256 of the extents of a cell's bins and of the gripper's settings, in hexadecimal digits; meshes count by their own checksums."""
+    parts = [*(bin_.measured or bin_ for bin_ in cell.bins), replace(gripper, mesh="")]
+    return hashlib.sha256(repr(parts).encode()).hexdigest()
 
 
 def _find_arrays(groups: Mapping[str, object]) -> Iterator[tuple[str, wp.array]]:

@@ -40,7 +40,10 @@ GPU_WORLDS = 2048
 """Maximum number of trial worlds on a GPU if `picks.worlds` is 0. On an H200, 512 worlds run 293 trials of the synpick preset a second,
 2,048 worlds more than 530."""
 ROUNDS = 8
-"""Trials per world of a batch: more keep worlds busy longer, since at the end of a batch all wait for the slowest."""
+"""Least trials per world of a bake, by which the number of trial worlds is chosen."""
+BATCH_ROUNDS = 32
+"""Trials per world of a batch. At its end all worlds wait for the slowest: with trials of the synpick preset they are busy for 98 % of the
+time, but for 92 % with 8 per world."""
 POLL = 8
 """Polling interval for completion of all trials [ticks]."""
 
@@ -174,12 +177,17 @@ def trial_values(picks: Picks, worlds: int) -> dict[str, Any]:
 
 
 def make_course(settings: Picks, physics: PhysicsConfig, pick: Pick) -> Any:
-    """Convert settings to the struct `TrialData`: times from seconds to steps or ticks of a simulation."""
+    """Convert settings to the struct `TrialData`: times from seconds to steps or ticks of a simulation.
+
+    Outcomes are judged at the ends of ticks: the hold is such that lift and hold together take the nearest number of them.
+    """
+    lift = math.ceil(pick.lift_height / (pick.lift_speed * physics.step))
+    ticks = round((lift + settings.hold / physics.step) / physics.steps_per_tick)
     return fill(
         kernels.TrialData,
         settings,
-        lift_steps=math.ceil(pick.lift_height / (pick.lift_speed * physics.step)),
-        hold_steps=round(settings.hold / physics.step),
+        lift_steps=lift,
+        hold_steps=max(ticks * physics.steps_per_tick - lift, 0) if settings.hold > 0.0 else 0,
         settle_ticks=math.ceil(settings.settle / physics.tick_time),
         moved_distance=MOVED,
         base_friction=physics.friction,

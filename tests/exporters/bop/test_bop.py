@@ -40,7 +40,7 @@ LENSES = cameras()
 VIEW = next(batches(1, (0,), 1, LENSES))
 
 
-def make(out: Path, processes: int = 2, episodes: tuple[int, ...] = EPISODES, **bop: object) -> Path:
+def make(out: Path, processes: int = 0, episodes: tuple[int, ...] = EPISODES, **bop: object) -> Path:
     return export(BopExporter, out, config(**bop), episodes, processes)
 
 
@@ -264,7 +264,7 @@ def test_an_episode_without_end_is_not_committed(tmp_path):
 
 
 def kill_a_writer(out: Path) -> None:
-    with exporting(BopExporter, out, config()) as exporter:
+    with exporting(BopExporter, out, config(), 2) as exporter:
         exporter.write_constants()
         pool = export_context(exporter).pool
         feed(exporter, (0,))

@@ -23,7 +23,7 @@ FRAMES = 3
 @pytest.fixture(scope="module")
 def sets(tmp_path_factory) -> tuple[Path, Path]:
     folder = tmp_path_factory.mktemp("boxes")
-    bop, coco = (export(kind, folder / kind.__name__, config(), (0,), processes=0) for kind in (BopExporter, CocoExporter))
+    bop, coco = (export(kind, folder / kind.__name__, config(), (0,)) for kind in (BopExporter, CocoExporter))
     return bop, coco
 
 

@@ -52,7 +52,7 @@ print(json.dumps(answers))
 def dataset(tmp_path_factory) -> Path:
     """Two splits of an episode each: the first has no sun, the second does."""
     settings = dataclasses.replace(config(LAYERS), splits=SPLITS)
-    return export(ShardsExporter, tmp_path_factory.mktemp("card") / "set", settings, (0, 2), processes=0)
+    return export(ShardsExporter, tmp_path_factory.mktemp("card") / "set", settings, (0, 2))
 
 
 def load(cache: Path, *arguments: dict[str, str]) -> list[dict]:

@@ -48,7 +48,7 @@ def read(out: Path, split: str = "train_pbr") -> COCO:
 
 @pytest.mark.filterwarnings("ignore:__array__:DeprecationWarning")
 def test_pycocotools_reads_back_masks_boxes_and_images(tmp_path):
-    read_back = read(out := export(CocoExporter, tmp_path / "set", config(), (0, 2), processes=0))
+    read_back = read(out := export(CocoExporter, tmp_path / "set", config(), (0, 2)))
     assert {category["id"]: category["name"] for category in read_back.loadCats(read_back.getCatIds())} == {3: "box 3", 7: "box 7"}
     views = {(row["episode"], row["camera"], row["frame"]): row for row in read_back.loadImgs(read_back.getImgIds())}
     assert len(views) == 18
@@ -68,7 +68,7 @@ def test_pycocotools_reads_back_masks_boxes_and_images(tmp_path):
 
 def test_keypoints_are_those_of_bop_annotations(tmp_path):
     settings = config(keypoints=8)
-    scenes = [export(kind, tmp_path / kind.__name__, settings, (0,), processes=0) for kind in (BopExporter, CocoExporter)]
+    scenes = [export(kind, tmp_path / kind.__name__, settings, (0,)) for kind in (BopExporter, CocoExporter)]
     split = read(scenes[1])
     for camera in range(len(LENSES)):
         scene = json.loads((scenes[0] / "train_pbr" / f"{camera:06d}" / "scene_gt_coco.json").read_text())
@@ -85,7 +85,7 @@ def test_keypoints_are_those_of_bop_annotations(tmp_path):
 def test_every_split_has_an_annotation_file(tmp_path):
     """Two splits of one episode each, and one that has not been baked."""
     settings = dataclasses.replace(config(), splits=SPLITS)
-    out = export(CocoExporter, tmp_path / "set", settings, (0, 2), processes=0)
+    out = export(CocoExporter, tmp_path / "set", settings, (0, 2))
     assert sorted(path.name for path in (out / IMAGES).iterdir()) == [f"{scene:06d}" for scene in (0, 1, 2, 6, 7, 8)]
     assert {out / name for name in CocoExporter.shared_files(DataLayout.of(settings)).indices} == set(
         (out / "coco" / "annotations").iterdir()
@@ -129,7 +129,7 @@ def test_views_without_objects_have_no_annotations(tmp_path):
 
 @pytest.mark.parametrize("name", [str(PARTS / "000001.jsonl"), str(CATEGORIES)])
 def test_damaged_parts_are_one_error(tmp_path, name):
-    out = export(CocoExporter, tmp_path / "set", config(), (0,), processes=0)
+    out = export(CocoExporter, tmp_path / "set", config(), (0,))
     (out / name).write_text("[}\n")
     (out / ".partial").mkdir()
     with pytest.raises(DatasetError, match=Path(name).name):

@@ -10,7 +10,7 @@ import pytest
 
 import synpick_warp
 from synpick_warp.apps.validation.rules.graph import find_gap
-from synpick_warp.exporters.bop.graph import count_common, find_occlusions, find_supports, find_unstacking_order
+from synpick_warp.exporters.bop.graph import find_occlusions, find_supports, find_unstacking_order
 from synpick_warp.exporters.writing.rle import Masks, find_runs
 
 
@@ -21,8 +21,10 @@ from synpick_warp.exporters.writing.rle import Masks, find_runs
         (3, [(2, 0), (2, 1), (0, -1), (1, -1)], [[2], [0], [1]]),
         (4, [(0, 1), (1, 2), (2, 0), (3, 1)], [[3], [0, 1, 2]]),
         (3, [], [[0], [1], [2]]),
+        (70, [(one, one - 1) for one in range(1, 70)], [[one] for one in range(69, -1, -1)]),
+        (0, [], []),
     ],
-    ids=["stack", "bridge", "cycle", "apart"],
+    ids=["stack", "bridge", "cycle", "apart", "tower", "nothing"],
 )
 def test_nothing_is_taken_from_below(nodes, edges, order):
     assert find_unstacking_order(nodes, edges) == order
@@ -40,14 +42,15 @@ def test_support_edges_are_upward_forces_that_matter():
     np.testing.assert_allclose(found.edges, [[0, -1, 2.51], [1, 0, 1.5], [1, -1, 0.5]], rtol=1e-6)
 
 
-def test_common_pixels_are_those_of_the_images():
+def test_occlusions_are_common_pixels_of_the_images():
+    """Of visible masks that share out the image and any amodal ones, against counts in the images; and of no objects."""
     rng = np.random.default_rng(0)
-    images = [rng.random((13, 17)) < 0.4, np.zeros((13, 17), bool), np.ones((13, 17), bool), np.eye(13, 17, dtype=bool)]
-    for one in images:
-        for other in images:
-            assert count_common(find_runs(one), find_runs(other)) == (one & other).sum()
-    hidden = Masks(find_runs(images[0]), find_runs(images[1]))
-    assert find_occlusions([Masks(find_runs(images[3]), find_runs(images[3])), hidden]) == [(0, 1, (images[3] & images[0]).sum())]
+    ids = rng.integers(0, 5, (13, 17))
+    amodal = [rng.random((13, 17)) < 0.4, np.zeros((13, 17), bool), np.ones((13, 17), bool), np.eye(13, 17, dtype=bool)]
+    masks = [Masks(find_runs(other), find_runs(ids == 1 + index)) for index, other in enumerate(amodal)]
+    pairs = [(a, b, int(((ids == 1 + a) & amodal[b]).sum())) for a in range(4) for b in range(4) if a != b and b != 1]
+    assert find_occlusions(masks) == pairs
+    assert find_occlusions([]) == []
 
 
 def test_a_bake_tells_who_lies_on_whom(picked_set):

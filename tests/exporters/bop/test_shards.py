@@ -181,7 +181,7 @@ def test_png_colour_without_masks(tmp_path):
 def test_a_long_scene_has_several_shards(tmp_path, dataset, monkeypatch):
     monkeypatch.setattr(tar_files, "MAX_SHARD_VIEWS", 2)
     out = tmp_path / "set"
-    with exporting(ShardsExporter, out, config(), processes=0) as exporter:
+    with exporting(ShardsExporter, out, config()) as exporter:
         exporter.write_constants()
         for batch in batches(4, (2,), FRAMES, LENSES):
             exporter.write_views(batch)

@@ -37,7 +37,7 @@ def rows(file: Path) -> list[tuple[int, np.ndarray]]:
 
 def test_labels_are_those_of_the_views(tmp_path):
     """Segments as readers fill them, boxes of the visible masks, and oriented boxes that hold them."""
-    out = export(YoloExporter, tmp_path / "set", config(), (0, 2), processes=0) / "yolo"
+    out = export(YoloExporter, tmp_path / "set", config(), (0, 2)) / "yolo"
     assert yaml.safe_load((out / "data.yaml").read_text())["names"] == {0: "box 3", 1: "box 7"}
     whole = unclipped = 0
     for batch in batches(1, (0, 2), 3, LENSES):
@@ -96,7 +96,7 @@ def test_segments_of_several_parts_are_one_row(tmp_path):
 )
 def test_readers_find_images_to_train_and_to_validate(tmp_path, folders, keys):
     splits = tuple(Split(f"s{index}", 1, index, "pick", folder) for index, folder in enumerate(folders))
-    out = export(YoloExporter, tmp_path / "set", dataclasses.replace(config(), splits=splits), (0,), processes=0)
+    out = export(YoloExporter, tmp_path / "set", dataclasses.replace(config(), splits=splits), (0,))
     data = yaml.safe_load((out / "yolo" / "data.yaml").read_text())
     assert [data.get(key) for key in ("train", "val", "test")] == [key and f"images/{key}" for key in keys]
     assert all((out / "yolo" / "images" / folder).is_dir() for folder in folders)

@@ -65,7 +65,7 @@ def measure(
     scene = build_scene(toy, device)
     worlds, cameras = len(toy.placed), len(toy.cameras)
     views = worlds * cameras
-    renderer = make_renderer(config, scene, toy.instances, views)
+    renderer = make_renderer(config, scene, toy.instances, views, colors=False)
     sizes = view_buffer_sizes(views, scene.width, scene.height, toy.instances)
     images, layers = allocate(ViewBuffers, sizes, device), allocate(LayerBuffers, sizes, device, ("depth_sensor",))
     world = wp.array(np.repeat(np.arange(worlds), cameras), dtype=wp.int32, device=device)

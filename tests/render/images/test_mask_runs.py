@@ -129,7 +129,7 @@ def test_lists_that_overflowed_or_are_large_are_not_used(device):
 def test_files_are_the_same_from_lists_and_from_images(tmp_path, device, kind):
     found = []
     for name, change in (("images", lambda batch: batch), ("lists", lambda batch: with_boundaries(batch, device))):
-        with exporting(kind, tmp_path / name, config(), processes=0) as exporter:
+        with exporting(kind, tmp_path / name, config()) as exporter:
             exporter.write_constants()
             for batch in batches(4, (0,), 3, LENSES):
                 exporter.write_views(change(batch))

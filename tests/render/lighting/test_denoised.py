@@ -111,7 +111,7 @@ def test_tables_split_a_map_into_lamps_and_the_rest(degrees, lamps):
 
 
 def test_cluttered_scene_approaches_the_reference(device):
-    view = camera(160, 120, 700.0, (0.0, 0.0, 1.5))
+    view = camera(96, 72, 420.0, (0.0, 0.0, 1.5))
     lights = (EnvironmentMap("room", 0.4 * even_light(1.0, 64).radiance + lamp(0.8, np.radians(14.0), 8.0, rows=64).radiance),)
     reference = render_objects(device, *clutter(), lights=lights, view=view, config=with_render(REFERENCE, samples=256)).radiance[0]
     quality = {}

@@ -254,7 +254,7 @@ def test_a_displacement_below_the_threshold_is_rest(renderer, device):
 
 def test_pictures_approach_the_reference_over_the_frames(renderer, device):
     each = toy()
-    config = Config(render=replace(each.settings().render, mode=REFERENCE, samples=1024))
+    config = Config(render=replace(each.settings().render, mode=REFERENCE, samples=256))
     (reference,) = show(make_renderer(config, renderer.scene, each.instances, 1), [(0, each)], device)
     errors = [
         np.sqrt(np.mean((picture - reference) ** 2)) for picture in show(renderer, [(index, each) for index in range(FILLED)], device)

@@ -47,7 +47,7 @@ def dense(request):
 
 
 def test_masks_agree_with_float64_rays_and_counts_with_masks(device, dense):
-    picture, wide = render(dense, device), render(replace(dense, cameras=(canvas(VIEW),)), device)
+    picture, wide = render(dense, device, colors=False), render(replace(dense, cameras=(canvas(VIEW),)), device, colors=False)
     meshes, poses = [MESHES[index] for index, _ in dense.placed[0]], [pose for _, pose in dense.placed[0]]
     depth, instance, masks = cast_scene(meshes, poses, VIEW)
     seen = masks.any(axis=(1, 2))
@@ -85,7 +85,7 @@ def test_masks_as_large_as_the_image_fit_the_pool(device):
     around = ToyScene([entry(ball(0.4, 2))], [[(0, (0.01 * index, 0.0, 1.0, *UPRIGHT)) for index in range(3)]], (VIEW,), instances=3)
     out, _ = render_gbuffer(around, device)
     assert out.mask_length.numpy()[0] == out.mask_words.shape[1] == 3 * most_words(VIEW.width, VIEW.height)
-    assert render(around, device).masks.all()
+    assert render(around, device, colors=False).masks.all()
 
 
 def test_rays_meet_the_bodies_of_all_words(device, dense):

@@ -35,7 +35,7 @@ def test_the_fixtures_segments_follow_each_other():
 
 
 def test_a_ball_shows_its_area_and_its_nearest_depth(device):
-    picture = render(one(ball(0.1, 5), (0.0, 0.0, 0.3, *UPRIGHT), camera(161, 91, 400.0, (0.0, 0.0, 1.3))), device)
+    picture = render(one(ball(0.1, 5), (0.0, 0.0, 0.3, *UPRIGHT), camera(161, 91, 400.0, (0.0, 0.0, 1.3))), device, colors=False)
     # The silhouette of a sphere of radius r at distance d is a circle of radius f r / sqrt(d² - r²).
     area = np.pi * (400.0 * 0.1) ** 2 / (1.0 - 0.1**2)
     assert abs((picture.instance[0] == 1).sum() / area - 1.0) < 0.01
@@ -50,7 +50,7 @@ def test_pixel_centres_have_half_integer_coordinates(device):
     # rows 36 to 45. Were centres at whole numbers, it would hold columns 71 to 80.
     view = camera(160, 90, 100.0, (0.0, 0.0, 1.0))
     x, y = (75.25 - 80.0) / 100.0, -(40.75 - 45.0) / 100.0
-    picture = render(one(sheet(0.1, 0.1), (x, y, 0.0, *UPRIGHT), view), device)
+    picture = render(one(sheet(0.1, 0.1), (x, y, 0.0, *UPRIGHT), view), device, colors=False)
     rows, columns = np.nonzero(picture.instance[0])
     assert (columns.min(), columns.max(), rows.min(), rows.max()) == (70, 79, 36, 45)
     assert len(rows) == 100
@@ -60,7 +60,7 @@ def test_pixel_centres_have_half_integer_coordinates(device):
 def test_occluded_instances_keep_their_amodal_bits(device):
     toy = one(sheet(0.2, 0.2), (0.0, 0.0, 0.0, *UPRIGHT), NARROW)
     toy.placed[0] += [(0, (0.05, 0.0, 0.1, *UPRIGHT)), (0, (0.0, 0.03, -0.1, *UPRIGHT))]
-    picture = render(toy, device)
+    picture = render(toy, device, colors=False)
     bits, instance = picture.amodal[0], picture.instance[0]
     assert bits[45, 80] == 0b111
     assert instance[45, 80] == 2
@@ -74,7 +74,7 @@ def test_occluded_instances_keep_their_amodal_bits(device):
 def test_a_world_without_instances_shows_none(device):
     toy = one(sheet(0.2, 0.2), (0.0, 0.0, 0.0, *UPRIGHT), NARROW)
     toy.placed = [[], toy.placed[0]]
-    picture = render(toy, device)
+    picture = render(toy, device, colors=False)
     assert not picture.amodal[0].any()
     assert not picture.instance[0].any()
     assert picture.amodal[1].any()
@@ -85,7 +85,7 @@ def test_fixtures_and_table_are_visible_without_amodal_bits(device):
     toy = one(sheet(0.1, 0.1), (0.0, 0.0, 0.07, *UPRIGHT), NARROW, fixtures=fixtures, table=True)
     toy.fixture_poses = ((0.0, 0.0, 0.0, *UPRIGHT), (0.0, 0.0, 0.2, *UPRIGHT), (0.1, 0.0, 0.2, *UPRIGHT))
     toy.fixtures_visible = (1, 1, 0)
-    picture = render(toy, device)
+    picture = render(toy, device, colors=False)
     instance, depth = picture.instance[0], picture.depth[0]
     assert set(np.unique(instance)) == {1, Segment.TABLE, Segment.TOTE, Segment.FINGER}
     assert set(np.unique(picture.amodal[0])) == {0, 1}
@@ -98,7 +98,7 @@ def test_fixtures_and_table_are_visible_without_amodal_bits(device):
 
 def test_depth_above_sixteen_bits_is_0(device):
     config = replace(Config(), bop=replace(Config().bop, depth_scale=0.03))
-    picture = render(one(sheet(0.2, 0.2), (0.0, 0.0, 0.0, *UPRIGHT), NARROW, config=config), device)
+    picture = render(one(sheet(0.2, 0.2), (0.0, 0.0, 0.0, *UPRIGHT), NARROW, config=config), device, colors=False)
     assert picture.instance[0, 45, 80] == 1
     assert picture.depth[0, 45, 80] == 0
 
@@ -123,7 +123,9 @@ def test_the_gbuffer_agrees_with_a_float64_reference(device, seed):
     turn *= np.linalg.det(turn)
     # A camera that looks at the pile from anywhere.
     view = camera(160, 90, 453.7, tuple(turn.T @ (0.0, 0.0, -2.0)), turn)
-    check_against_reference(render(ToyScene([entry(m) for m in meshes], [list(enumerate(poses))], (view,)), device), meshes, poses, view)
+    check_against_reference(
+        render(ToyScene([entry(m) for m in meshes], [list(enumerate(poses))], (view,)), device, colors=False), meshes, poses, view
+    )
 
 
 @pytest.mark.parametrize("numbers", [(3, 13, 15), (11, 14, 17)])
@@ -131,7 +133,7 @@ def test_real_objects_agree_with_a_float64_reference(device, real_models, number
     rng = np.random.default_rng(numbers[0])
     meshes = [read_mesh(real_models / f"obj_{number:06d}.ply", 1e-3)[0] for number in numbers]
     poses = [(*rng.uniform((-0.1, -0.05, 0.0), (0.1, 0.05, 0.2)), *random_quaternion(rng)) for _ in meshes]
-    picture = render(ToyScene([entry(m) for m in meshes], [list(enumerate(poses))], (NARROW,)), device)
+    picture = render(ToyScene([entry(m) for m in meshes], [list(enumerate(poses))], (NARROW,)), device, colors=False)
     check_against_reference(picture, meshes, poses, NARROW)
 
 
@@ -153,6 +155,8 @@ def check_against_reference(picture, meshes, poses, view):
 
 def test_a_fine_mesh_has_no_holes(device):
     # 20,480 triangles over 12,000 pixels: rays pass close to edges and corners everywhere.
-    picture = render(one(ball(0.1, 5), (0.0, 0.0, 0.0, 0.1, 0.2, 0.3, 0.927), camera(160, 90, 700.0, (0.0, 0.0, 1.0))), device)
+    picture = render(
+        one(ball(0.1, 5), (0.0, 0.0, 0.0, 0.1, 0.2, 0.3, 0.927), camera(160, 90, 700.0, (0.0, 0.0, 1.0))), device, colors=False
+    )
     rows, columns = np.mgrid[:90, :160]
     assert picture.amodal[0][np.hypot(rows - 44.5, columns - 79.5) < 65.0].all()

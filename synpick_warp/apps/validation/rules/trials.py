@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 
@@ -11,23 +11,23 @@ import numpy as np
 
 from synpick_warp.apps.validation.registry import Findings, rule
 from synpick_warp.codes import Ending, Outcome, Share
+from synpick_warp.dataset.bop.models import models_folder
 from synpick_warp.dataset.reading import Episode, open_data_set
 from synpick_warp.dataset.view import View
+from synpick_warp.errors import DatasetError
+from synpick_warp.scenes.assets.meshes import read_mesh
+from synpick_warp.system.inputs.paths import path_inside
 from synpick_warp.views.picks import MOVED
 
+MILLIMETRE = 1e-3
 UNIT = 1e-3
 """Largest deviation of a direction's length from 1."""
-NEAR = 5e-3
-"""Largest distance of a grasp point from the depth image, along the optical axis [m]."""
+NEAR = 1e-3
+"""Largest distance of a grasp point from the mesh of its instance [m]: poses and points are in single precision."""
 PIXEL = 0.01
 """Largest distance of a projected point from its pixel, beyond its sides [px of the perception image]."""
-UNSEEN = 0.05
-"""Largest share of points that a view with wider pixels than the perception image may miss, as no pixel's centre shows them: thin parts
-and edges. It is 0.2 % of a pile's points in 320 px of a perception image of 1280, 0.6 % in 160 px; an object elsewhere has more."""
 SAME = 1e-4
 """Largest distance between an attempt's grasp point and that of the own grasp's trial [m]."""
-_AROUND = np.stack(np.meshgrid([-1, 0, 1], [-1, 0, 1]), axis=-1).reshape(-1, 2)
-"""Offsets (column, row) of a pixel and its neighbours (9, 2)."""
 _PICKED = (Outcome.TARGET_PICKED, Outcome.OTHER_PICKED)
 
 
@@ -39,6 +39,7 @@ class PicksSubject:
     """The data set."""
     index: int
     """Index of the episode."""
+    _meshes: dict[int, np.ndarray] = field(default_factory=dict)
 
     @property
     def place(self) -> str:
@@ -55,8 +56,16 @@ class PicksSubject:
         """Table of trials."""
         return self.episode.picks
 
+    def triangles(self, obj_id: int) -> np.ndarray:
+        """Triangles of an object's model (F, 3, 3) [m]; raises DatasetError or CatalogError if it cannot be read."""
+        if obj_id not in self._meshes:
+            path = path_inside(self.root, f"{models_folder(self.root)}/obj_{obj_id:06d}.ply", self.root, DatasetError)
+            mesh = read_mesh(path, MILLIMETRE)[0]
+            self._meshes[obj_id] = mesh.vertices[mesh.faces].astype(np.float64)
+        return self._meshes[obj_id]
+
     def views(self) -> Iterator[tuple[np.void, np.ndarray, View]]:
-        """Yield each state with its trials on labelled objects and its view; skips states without either, and views through a lens."""
+        """Yield each state with its trials on labelled objects and its view; skips states without either."""
         episode = self.episode
         if not {"bop", "shards"} & set(open_data_set(self.root).config.bake.formats):
             return
@@ -65,7 +74,7 @@ class PicksSubject:
             if camera < len(episode.cameras) and frame in episode.frames(camera):
                 view = episode.view(frame, camera)
                 own = self.picks[(self.picks["state"] == state["state"]) & (self.picks["obj_id"] >= 0)]
-                if len(own) and view.lens is None:
+                if len(own):
                     yield state, own, view
 
     def tell(self, wrong: np.ndarray, text: str, rows: np.ndarray | None = None) -> Findings:
@@ -108,6 +117,8 @@ def check_geometry(subject: PicksSubject) -> Findings:
 def check_pixels(subject: PicksSubject) -> Findings:
     """Grasp points of picks project to their pixels in the perception image; the own grasp's may be smoothed."""
     for state, picks, view in subject.views():
+        if view.lens is not None:
+            continue  # The perception image is that of a pinhole.
         (width, height), size = view.size, np.array((int(state["width"]), int(state["height"])))
         place = view.project(picks["point"], view.world_to_camera)
         # Both images have the same horizontal field of view, and the same point in the middle.
@@ -118,38 +129,29 @@ def check_pixels(subject: PicksSubject) -> Findings:
 
 @rule(PicksSubject, "picks-surface", "bake the episode again: points and poses are not of the same run")
 def check_surface(subject: PicksSubject) -> Findings:
-    """Grasp points of picks lie on the visible surface of their instance: mask and depth show it there.
-
-    In a view with wider pixels than the perception image, a point may lie between the depths around it, and UNSEEN of them anywhere.
-    """
-    for state, picks, view in subject.views():
-        width, height = view.size
-        allowed = UNSEEN if width < state["width"] else 0.0
-        rotation, offset = view.world_to_camera[:3, :3], view.world_to_camera[:3, 3]
-        point, normal = picks["point"] @ rotation.T + offset, picks["normal"] @ rotation.T
-        pixel = np.floor(view.project(point)).astype(np.int64)[:, None] + _AROUND
-        column, row = pixel[..., 0].clip(0, width - 1), pixel[..., 1].clip(0, height - 1)
-        if view.has("depth"):
-            rays = (np.stack((column, row), axis=-1) + 0.5 - view.intrinsics[:2, 2]) / view.intrinsics[[0, 1], [0, 1]]
-            facing = np.einsum("nkc,nc->nk", np.concatenate((rays, np.ones_like(rays[..., :1])), axis=-1), normal)
-            # The depth at a neighbouring pixel is that of the tangent plane; where that is nearly seen from the side, that of the point.
-            plane = np.einsum("nc,nc->n", point, normal)[:, None] / np.where(np.abs(facing) < 0.05, np.nan, facing)
-            behind = view.depth[row, column] - point[:, 2:]
-            near = np.fmin(np.abs(view.depth[row, column] - plane), np.abs(behind)).min(axis=1)
-            # Wider pixels miss thin parts: their centres lie before and behind such a point.
-            between = (behind.min(axis=1) < 0.0) & (behind.max(axis=1) > 0.0)
-            off = ~(near <= NEAR) & ~(between & (width < state["width"]))
-            if off.sum() > allowed * len(off):
-                yield from subject.tell(off, f"its point is more than {1e3 * NEAR:.0f} mm from the surface that depth shows", picks)
-        if view.has("mask_visib"):
-            shown = np.zeros(len(picks), bool)
-            for instance, mask in zip(view.instance_ids.tolist(), view.masks, strict=True):
-                shown |= (picks["instance"] == instance) & mask[row, column].any(axis=1)
-            if (~shown).sum() > allowed * len(shown):
-                yield from subject.tell(~shown, "its pixel does not show its instance", picks)
-        known = dict(zip(view.instance_ids.tolist(), view.object_ids.tolist(), strict=True))
-        wrong = np.array([known.get(instance) != obj_id for instance, obj_id in zip(picks["instance"], picks["obj_id"], strict=True)])
+    """Grasp points of picks lie on the mesh of their instance, at its pose in that frame."""
+    for _, picks, view in subject.views():
+        row = {instance: index for index, instance in enumerate(view.instance_ids.tolist())}
+        index = np.array([row.get(instance, -1) for instance in picks["instance"].tolist()])
+        wrong = (index < 0) | (view.object_ids[index] != picks["obj_id"])
         yield from subject.tell(wrong, "its instance is not an object of that obj_id", picks)
+        off = np.zeros(len(picks), bool)
+        for one in np.unique(index[~wrong]):
+            mine = np.flatnonzero((index == one) & ~wrong)
+            triangles = subject.triangles(int(view.object_ids[one]))
+            pose = view.object_to_world[one]
+            local = (picks["point"][mine] - pose[:3, 3]) @ pose[:3, :3]
+            off[mine] = [not is_on_surface(point, triangles) for point in local]
+        yield from subject.tell(off, f"its point is more than {1e3 * NEAR:.0f} mm from the surface of its instance", picks)
+
+
+def is_on_surface(point: np.ndarray, triangles: np.ndarray) -> bool:
+    """Whether a point (3) is at most NEAR from one of the triangles (F, 3, 3), both [m]: exact distances to those whose boxes are."""
+    from trimesh.triangles import closest_point
+
+    near = triangles[((triangles.min(axis=1) - NEAR <= point) & (point <= triangles.max(axis=1) + NEAR)).all(axis=1)]
+    found = closest_point(near, np.broadcast_to(point, (len(near), 3))) if len(near) else np.full((1, 3), np.inf)
+    return bool(np.linalg.norm(found - point, axis=1).min() <= NEAR)
 
 
 @rule(PicksSubject, "picks-outcomes", "bake the episode again, or restore the table")
