@@ -132,6 +132,14 @@ class DepthSensor:
         low=0.0,
         high=16.0,
     )
+    noise_width: int = setting(
+        1,
+        "px",
+        "Distance of lattice points between which noise, axial and lateral, is interpolated, so that neighbours' noise is correlated; 1: "
+        "each pixel has noise of its own.",
+        low=1,
+        high=64,
+    )
     grazing_angle: float = setting(80.0, "°", "Angle of incidence above which there is no depth.", low=10.0, high=89.0)
     edge_width: int = setting(
         1,
@@ -141,7 +149,15 @@ class DepthSensor:
         high=16,
     )
     edge_step: float = setting(1.0, "px", "Disparity difference that makes an edge.", above=0.0, high=1e3)
-    shadows: bool = setting(True, "", "No depth where the projector is occluded.")
+    shadows: bool = setting(True, "", "No depth where the projector is occluded, or the infrared camera that registration names.")
+    registration: float = setting(
+        0.0,
+        "",
+        "Place on the baseline of the camera to whose image depth is registered: 0 that of the infrared camera itself, 1 that of the "
+        "projector. In between there are shadows at both sides of objects.",
+        low=0.0,
+        high=1.0,
+    )
     projector: float = setting(
         0.5, "", "Place of a stereo camera's dot projector on its baseline: 0 at the left camera, 1 at the right one.", low=0.0, high=1.0
     )

@@ -1,6 +1,6 @@
 """Reader of annotated frames of a real RGB-D camera (YCB-Video's, by way of `oprb/ycbvideo`), and their BOP data set, for measuring only.
 
-    python -m tools.reports.real_frames ../shared/data/real/ycb_video ../shared/data/ycbv_models OUT
+    python -m tools.reports.real_frames FRAMES MODELS OUT
 
 writes OUT as a BOP data set of one split, `test`: a scene for each sequence, depth in 0.1 mm, `mask_visib` from the class masks (each class
 is there once), `mask` rendered from pose and model, poses in the frames of the models. `cam_K` has 0.5 px added to the principal point:

@@ -1,6 +1,6 @@
 """Detected symmetries beside those that models_info.json states, as a table with the reasons for differences.
 
-    python -m tools.reports.symmetries ../shared/data/ycbv_models [--tolerance 0.03]
+    python -m tools.reports.symmetries MODELS [--tolerance 0.03]
 
 BOP's lists are geometric, within 0.1 of the diameter and at least 15 mm, and then without what texture tells apart, as people judged.
 """

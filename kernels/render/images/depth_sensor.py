@@ -50,6 +50,8 @@ class SensorParameters:
     """Growth of axial noise with the angle of incidence [m^1.5]."""
     lateral_noise: float
     """Standard deviation of the pixel that is measured instead [px]."""
+    noise_width: int
+    """Distance of the lattice points between which noise is interpolated [px]; 1: each pixel has its own."""
     grazing_cosine: float
     """Cosine of the largest angle of incidence that is measured."""
     edge_width: int
@@ -57,7 +59,9 @@ class SensorParameters:
     edge_step: float
     """Disparity difference within the window that invalidates a pixel [px]."""
     shadows: int
-    """1: pixels that the projector does not light are invalid."""
+    """1: pixels that the projector does not light, or the infrared camera does not see, are invalid."""
+    registration: float
+    """Place on the baseline of the camera of the depth image: 0 that of the infrared camera, 1 that of the projector."""
     counts_per_meter: float
     """Depth counts in a metre."""
     projector: float
@@ -109,22 +113,72 @@ def min_body_depth(bodies: ViewBodies, view: int) -> float:
 
 
 @wp.func
-def in_projector_shadow(
-    gbuffer: GBuffer, bodies: ViewBodies, grid: ImageGrid, focal_baseline: float, view: int, row: int, column: int
+def is_occluded(
+    gbuffer: GBuffer, bodies: ViewBodies, grid: ImageGrid, focal_baseline: float, side: int, view: int, row: int, column: int
 ) -> bool:
-    """Shadow test against the projector, to the camera's right: True if a surface in the same image row occludes it.
+    """Shadow test against a second viewpoint at the camera's right (`side` 1) or left (-1): True if a surface in the same row occludes it.
 
-    The projector column of a pixel is its own column minus its disparity. A pixel k columns to the right whose disparity is larger by k
-    lies on the same projector ray and is nearer to the projector. The largest disparity of any body bounds the search.
+    The column of a pixel in the second view is its own column minus `side` times its disparity. A pixel k columns to that side whose
+    disparity is larger by k lies on the same ray and is nearer. The largest disparity of any body bounds the search.
     """
     here = disparity_at(gbuffer, focal_baseline, view, row, column)
     max_difference = focal_baseline / wp.max(min_body_depth(bodies, view), MIN_DEPTH) - here
-    reach = wp.min(int(wp.ceil(max_difference)), grid.width - 1 - column)
-    for right in range(1, reach + 1):
-        difference = disparity_at(gbuffer, focal_baseline, view, row, column + right) - here
-        if wp.abs(difference - float(right)) <= SAME_RAY:
+    space = grid.width - 1 - column
+    if side < 0:
+        space = column
+    reach = wp.min(int(wp.ceil(max_difference)), space)
+    for away in range(1, reach + 1):
+        difference = disparity_at(gbuffer, focal_baseline, view, row, column + side * away) - here
+        if wp.abs(difference - float(away)) <= SAME_RAY:
             return True
     return False
+
+
+@wp.func
+def in_shadow(
+    gbuffer: GBuffer,
+    bodies: ViewBodies,
+    grid: ImageGrid,
+    sensor: SensorParameters,
+    focal_baseline: float,
+    view: int,
+    row: int,
+    column: int,
+) -> bool:
+    """True if the projector, at the right of the depth image's camera, or the infrared camera, at its left, does not see a pixel's
+    surface."""
+    to_projector = focal_baseline * (1.0 - sensor.registration)
+    if is_occluded(gbuffer, bodies, grid, to_projector, 1, view, row, column):
+        return True
+    if sensor.registration == 0.0:
+        return False
+    return is_occluded(gbuffer, bodies, grid, focal_baseline * sensor.registration, -1, view, row, column)
+
+
+@wp.func
+def lattice_normals(key: wp.uint64, grid: ImageGrid, width: int, row: int, column: int, index: int) -> wp.vec2:
+    """Two independent standard normal samples of a pixel, correlated with those of its neighbours: value noise.
+
+    Bilinear interpolation between samples of the points of a lattice, `width` px apart, divided by the root of the sum of squared
+    weights, so that the variance is 1 everywhere. `key` is that of the view; `index` counts samples as in `normal_pair`.
+    """
+    if width == 1:
+        return normal_pair(pixel_key(key, row * grid.width + column), index)
+    x, y = float(column) / float(width), float(row) / float(width)
+    left, top = int(x), int(y)
+    right_part, lower_part = x - float(left), y - float(top)
+    total, squares = wp.vec2(0.0, 0.0), float(0.0)
+    for corner in range(4):
+        right, lower = corner % 2, corner // 2
+        across, down = 1.0 - right_part, 1.0 - lower_part
+        if right == 1:
+            across = right_part
+        if lower == 1:
+            down = lower_part
+        weight = across * down
+        total += weight * normal_pair(pixel_key(key, (top + lower) * (grid.width + 1) + left + right), index)
+        squares += weight * weight
+    return total / wp.sqrt(squares)
 
 
 @wp.func
@@ -173,9 +227,10 @@ def render_depth_sensor_kernel(
     """Simulate a structured-light depth image: disparity d = f b / (z + σ n) + σ' n', rounded to steps; n and n' are standard normal.
 
     z is the depth of a pixel displaced by lateral noise, σ its axial noise, σ' the noise of disparity. `depth_sensor_out` receives f b / d
-    in counts, 0 for invalid pixels (holes): no surface, grazing incidence, depth discontinuities, projector shadow, outside of the
-    measuring range. n and n' are of the random number stream (seed, episode, frame, camera, DEPTH_NOISE) and the pixel, so each image has
-    noise of its own. Launched over view, pixel (tile order, from flat index `first` on).
+    in counts, 0 for invalid pixels (holes): no surface, grazing incidence, depth discontinuities, shadow of the projector or of the
+    infrared camera, outside of the measuring range. n and n' are of the random number stream (seed, episode, frame, camera, DEPTH_NOISE)
+    and the pixel, or the lattice points around it, so each image has noise of its own. Launched over view, pixel (tile order, from flat
+    index `first` on).
     """
     view, row, column = tile_pixel(grid, wp.tid() + first)
     if not in_image(grid, row, column):
@@ -183,8 +238,8 @@ def render_depth_sensor_kernel(
     depth_sensor_out[view, row, column] = wp.uint16(0)
     camera = views.camera[view]
     world = views.world[view]
-    key = pixel_key(view_key(sensor.seed, episode[world], frame[world], camera, Stream.DEPTH_NOISE), row * grid.width + column)
-    displacement = sensor.lateral_noise * normal_pair(key, 0)
+    key = view_key(sensor.seed, episode[world], frame[world], camera, Stream.DEPTH_NOISE)
+    displacement = sensor.lateral_noise * lattice_normals(key, grid, sensor.noise_width, row, column, 0)
     at_row = wp.clamp(row + int(wp.rint(displacement[0])), 0, grid.height - 1)
     at_column = wp.clamp(column + int(wp.rint(displacement[1])), 0, grid.width - 1)
     if int(gbuffer.segment[view, at_row, at_column]) == Segment.NOTHING:
@@ -200,9 +255,9 @@ def render_depth_sensor_kernel(
     if near_discontinuity(gbuffer, grid, sensor, focal_baseline, view, at_row, at_column):
         return
     if sensor.shadows != 0:
-        if in_projector_shadow(gbuffer, bodies, grid, focal_baseline, view, at_row, at_column):
+        if in_shadow(gbuffer, bodies, grid, sensor, focal_baseline, view, at_row, at_column):
             return
-    noise = normal_pair(key, 2)
+    noise = lattice_normals(key, grid, sensor.noise_width, row, column, 2)
     noisy = depth + axial_noise(sensor, depth, cosine) * noise[0]
     counts = wp.rint(sensor.counts_per_meter * quantize_depth(sensor, focal_baseline, noisy, noise[1]))
     if counts <= MAX_COUNTS:

@@ -91,6 +91,8 @@ YOUNGER_SETTINGS: dict[str, Any] = {
     "depth_sensor.preset": "",
     "depth_sensor.disparity_noise": 0.0,
     "depth_sensor.max_disparity": 0.0,
+    "depth_sensor.noise_width": 1,
+    "depth_sensor.registration": 0.0,
     "depth_sensor.projector": 0.5,
     "depth_sensor.dot_spacing": 4.0,
     "depth_sensor.dot_brightness": 2.0,

@@ -41,7 +41,7 @@ def sensor_parameters(settings: DepthSensor, seed: int, depth_scale: float) -> A
     """The struct `SensorParameters`, for a bake's seed and its depth scale [mm per count]."""
     result = SensorParameters()
     same = ("baseline", "disparity_step", "disparity_noise", "max_disparity", "noise", "noise_growth", "noise_distance", "noise_angle")
-    for name in (*same, "lateral_noise"):
+    for name in (*same, "lateral_noise", "noise_width", "registration"):
         setattr(result, name, getattr(settings, name))
     result.seed = seed
     result.near, result.far = settings.distances

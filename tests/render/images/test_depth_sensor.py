@@ -118,7 +118,12 @@ def test_noise_of_presets_is_that_of_disparity(device, name, depth):
     settings, lens = sensor_settings(name), sensor_camera(name)
     focal = FOCAL if lens is None else lens.fx
     toy = replace(wall(depth), cameras=(camera(WIDTH, HEIGHT, focal, (0.0, 0.0, TOP)),))
-    settings |= {"distances": (0.1, 10.0), "max_disparity": 0.0, "disparity_step": min(settings["disparity_step"], 1 / 32)}
+    settings |= {
+        "noise_width": 1,
+        "distances": (0.1, 10.0),
+        "max_disparity": 0.0,
+        "disparity_step": min(settings["disparity_step"], 1 / 32),
+    }
     settings = {"baseline": DepthSensor().baseline} | settings
     measured = measure(toy, device, count=depth / 60000, **settings)
     expected = depth**2 * settings["disparity_noise"] / (focal * settings["baseline"])
@@ -134,7 +139,7 @@ def test_presets_as_they_are_have_the_noise_of_their_steps_too(device, name, dep
     settings, lens = sensor_settings(name), sensor_camera(name)
     assert lens is not None
     toy = replace(wall(depth), cameras=(camera(WIDTH, HEIGHT, lens.fx, (0.0, 0.0, TOP)),))
-    middle = measure(toy, device, count=depth / 60000, **settings).depth[0, 20:76, 20:140]
+    middle = measure(toy, device, count=depth / 60000, **settings | {"noise_width": 1}).depth[0, 20:76, 20:140]
     scale, (near, far), most = lens.fx * settings["baseline"], settings["distances"], settings["max_disparity"]
     if not near < depth < far or scale > depth * most > 0.0:
         assert np.isnan(middle).all()
@@ -209,6 +214,32 @@ def test_projector_shadow_is_invalid(device):
         assert (holes != (measured.counts[0] == 0)).sum() <= 40
         assert (measured.counts[0][28:68, 60 - width + 1 : 59] == 0).all()
         assert (measured.counts[0][28:68, 100:] > 0).all()
+
+
+@pytest.mark.parametrize("registration", [0.2, 0.5, 1.0])
+def test_registered_depth_has_shadows_at_both_sides(device, registration):
+    # 10 px of disparity: those to the projector, at the right, are hidden at the left, and those to the infrared camera at the right.
+    measured = measure(step_scene(), device, **PERFECT | {"shadows": True, "baseline": 0.15, "registration": registration})
+    left = round(10 * (1.0 - registration))
+    holes = np.flatnonzero(measured.counts[0, 48] == 0)
+    expected = [*range(60 - left, 60), *range(100, 110 - left)]
+    assert len(set(holes) ^ set(expected)) <= 2
+
+
+def test_noise_on_a_lattice_keeps_its_variance_and_correlates_neighbours(device):
+    noise = {"noise": 0.002, "noise_width": 6}
+    measured = measure(wall(1.0), device, frames=40, **PERFECT | noise)
+    off = (measured.depth - 1.0)[:, 12:84, 12:148]
+    # Each phase of the lattice has the variance of one pixel.
+    phases = np.array([[off[:, row::6, column::6].std() for column in range(6)] for row in range(6)])
+    np.testing.assert_allclose(phases, 0.002, rtol=0.05)
+
+    def correlation(away: int) -> float:
+        return float((off[:, :, away:] * off[:, :, : off.shape[2] - away]).mean() / off.var())
+
+    assert correlation(1) > 0.9
+    assert 0.35 < correlation(3) < 0.75
+    assert abs(correlation(12)) < 0.05
 
 
 def test_a_narrow_body_casts_its_shadow_beside_it(device):
