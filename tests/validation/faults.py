@@ -344,6 +344,7 @@ PICKS: Faults = {
         trials(lambda rows: put_value(rows, "point", rows["point"][0] + 0.02)),
     ),
     "other instance": ("picks-surface", "from the surface of its instance", trials(lambda rows: put_value(rows, "instance", 3))),
+    "hidden instance": ("picks-pixels", "does not show its instance", trials(lambda rows: put_value(rows, "instance", 3))),
     "other object": ("picks-surface", "not an object of that obj_id", trials(lambda rows: put_value(rows, "obj_id", 7))),
     "success without outcome": ("picks-outcomes", "success does not agree", trials(lambda rows: put_value(rows, "outcome", 4, "success"))),
     "moved nothing": ("picks-outcomes", "moved and farthest do not agree", trials(lambda rows: put_value(rows, "moved", 2))),

@@ -24,6 +24,11 @@ UNIT = 1e-3
 """Largest deviation of a direction's length from 1."""
 NEAR = 1e-3
 """Largest distance of a grasp point from the mesh of its instance [m]: poses and points are in single precision."""
+UNSEEN = 0.05
+"""Largest share of points that a view with wider pixels than the perception image may miss, as no pixel's centre shows them: thin parts
+and edges. It is 0.2 % of a pile's points in 320 px of a perception image of 1280, 0.6 % in 160 px; an object elsewhere has more."""
+_AROUND = np.stack(np.meshgrid([-1, 0, 1], [-1, 0, 1]), axis=-1).reshape(-1, 2)
+"""Offsets (column, row) of a pixel and its neighbours (9, 2)."""
 PIXEL = 0.01
 """Largest distance of a projected point from its pixel, beyond its sides [px of the perception image]."""
 SAME = 1e-4
@@ -115,8 +120,16 @@ def check_geometry(subject: PicksSubject) -> Findings:
 
 @rule(PicksSubject, "picks-pixels", "bake the episode again: points, pixels or cameras are not of the same run")
 def check_pixels(subject: PicksSubject) -> Findings:
-    """Grasp points of picks project to their pixels in the perception image; the own grasp's may be smoothed."""
+    """Grasp points of picks project to their pixels, where masks show their instance; the own grasp's pixel may be another."""
     for state, picks, view in subject.views():
+        if view.has("mask_visib"):
+            pixel = np.floor(view.project(picks["point"], view.world_to_camera)).astype(np.int64)[:, None] + _AROUND
+            column, row = (pixel[..., axis].clip(0, view.size[axis] - 1) for axis in (0, 1))
+            shown = np.zeros(len(picks), bool)
+            for instance, mask in zip(view.instance_ids.tolist(), view.masks, strict=True):
+                shown |= (picks["instance"] == instance) & mask[row, column].any(axis=1)
+            if (~shown).sum() > (UNSEEN if view.size[0] < state["width"] else 0.0) * len(shown):
+                yield from subject.tell(~shown, "its pixel does not show its instance", picks)
         if view.lens is not None:
             continue  # The perception image is that of a pinhole.
         (width, height), size = view.size, np.array((int(state["width"]), int(state["height"])))
