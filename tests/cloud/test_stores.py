@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import threading
 from pathlib import Path
+from types import SimpleNamespace
 from uuid import uuid4
 
 import pytest
@@ -94,8 +95,36 @@ def test_a_store_that_does_not_answer_in_time_is_asked_again(server, prefix, mon
     assert store.get("key") == b"data"
 
 
-def test_what_fails_for_good_ends_in_one_line(server, prefix, monkeypatch):
-    monkeypatch.setattr("synpick_warp.system.stores.base.TRIES", 2)
+@pytest.mark.parametrize(
+    ("error", "said"),
+    [
+        (NotImplementedError(), "cannot do that"),
+        (FileNotFoundError("no such share"), "no such share"),
+        (RuntimeError("gone"), "6 attempts"),
+    ],
+)
+def test_errors_of_any_library_become_store_errors(monkeypatch, error, said):
+    pytest.importorskip("fsspec")
+    monkeypatch.setattr("synpick_warp.system.stores.base.FIRST_PAUSE", 0.0)
+    store = FileSystemStore(f"memory://{uuid4().hex}/p")
+
+    def fail(*_):
+        raise error
+
+    monkeypatch.setattr(store._files, "pipe_file", fail)
+    with pytest.raises(StoreError, match=said):
+        store.put("key", b"data")
+
+
+def test_a_generation_is_compared_where_the_store_tells_one(memory, monkeypatch):
+    """Google Cloud Storage compares it, in place of the ETag."""
+    store, modes = open_store(memory), []
+    monkeypatch.setattr(store, "_obs", SimpleNamespace(put=lambda *_, mode, **__: modes.append(mode) or {"e_tag": '"b"', "version": "2"}))
+    assert store.replace("key", b"data", '1 "a"') == '2 "b"'
+    assert modes == [{"e_tag": '"a"', "version": "1"}]
+
+
+def test_what_fails_for_good_ends_in_one_line(server, prefix):
     server.fault = lambda method, path: "403 AccessDenied"
     with pytest.raises(StoreError, match="credentials may not do that"):
         open_store(prefix).put("key", b"data")

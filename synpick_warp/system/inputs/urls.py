@@ -1,4 +1,4 @@
-"""Recognition of URLs among folders. Apart from the stores, since each command and `import synpick_warp` need it."""
+"""URL detection: tells URLs of object stores from paths of folders. Imports no store, so that each command can afford it."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ _URL = re.compile(r"([a-z][a-z0-9+.-]+):(?:/+(.*))?", re.DOTALL)
 
 
 def as_url(place: Path | str | None) -> str | None:
-    """URL that a place names; None: it is a folder. A `Path` has lost one of the URL's slashes."""
+    """Normalize a URL: restores the slash that `Path` drops from "://", and strips those at the end. None: the place is a folder."""
     match = _URL.fullmatch(str(place)) if place is not None else None
     if match is None:
         return None

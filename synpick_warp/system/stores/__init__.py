@@ -1,1 +1,1 @@
-"""Object stores: one interface, an implementation for each library, and the choice by URL."""
+"""Object stores: the interface, an implementation for each library (obstore, fsspec), and the choice by URL."""

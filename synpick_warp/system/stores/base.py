@@ -1,6 +1,6 @@
-"""Interface of an object store: whole objects by key, listed in order, written unconditionally, if absent, or if unchanged.
+"""Interface of an object store, and retries: whole objects by key, listed in order, written always, if absent, or if unchanged.
 
-Nothing is renamed or appended to. Keys are relative to the data set's prefix, with "/" between their parts.
+Objects are neither renamed nor appended to. Keys are relative to the data set's prefix, with "/" between their parts.
 """
 
 from __future__ import annotations
@@ -17,8 +17,8 @@ from synpick_warp.errors import StoreError
 TRIES = 6
 """Attempts of a request that may succeed when it is repeated."""
 FIRST_PAUSE, MAX_PAUSE = 0.2, 20.0
-"""Pause before the second attempt, doubled for each further one, and its limit [s]; each is drawn from half of it to all of it, so that
-workers that a store has turned away together don't come back together."""
+"""Exponential back-off: pause before the second attempt, doubled for each further one, and its limit [s]. Jitter: each pause is drawn from
+50 to 100 % of that, so that workers whose requests failed together do not repeat them together."""
 BLOCK_BYTES = 8 << 20
 """Size of the blocks in which large objects are read [B]."""
 
@@ -26,31 +26,31 @@ _Result = TypeVar("_Result")
 
 
 class Stat(NamedTuple):
-    """Size of an object, and when the store received it by its own clock."""
+    """Metadata of an object: its size, and when the store received it, by the store's clock."""
 
     size: int
-    """Bytes."""
+    """Size [B]."""
     modified: datetime.datetime
 
 
 class TransientError(Exception):
-    """A request failed in a way that may pass: the store answered 5xx, not in time or not at all, or the object arrived incomplete."""
+    """Transient failure of a request, which `persist` repeats: the answer was 5xx, late or lost, or the object arrived incomplete."""
 
 
 class Store(Protocol):
-    """Objects below a prefix. Methods may be called from several threads; each repeats what fails for a while, then raises `StoreError`."""
+    """Object store below a prefix. Thread-safe. Each method repeats requests that fail for a while, then raises StoreError."""
 
     url: str
     """Address of the prefix, without a slash at the end."""
     conditional: bool
-    """Whether `create` and `replace` are implemented; whether the store honours them shows a probe (`probing.probe`)."""
+    """Whether `create` and `replace` are implemented; `opening.probe` measures whether the store honours them."""
 
     def put(self, key: str, data: bytes) -> None:
-        """Write an object; readers see the old or the new one, whole."""
+        """Write an object; by obstore atomically: readers see the old or the new one, whole. By fsspec that depends on the server."""
         ...
 
     def put_file(self, key: str, path: Path) -> None:
-        """Write an object from a file, in several parts if it is large."""
+        """Upload a file as an object, in several parts if it is large."""
         ...
 
     def get(self, key: str) -> bytes:
@@ -58,19 +58,19 @@ class Store(Protocol):
         ...
 
     def blocks(self, key: str) -> Iterator[bytes]:
-        """Read an object in blocks of at most BLOCK_BYTES; raises FileNotFoundError."""
+        """Stream an object in blocks of at most BLOCK_BYTES, one range request each; raises FileNotFoundError."""
         ...
 
     def stat(self, key: str) -> Stat | None:
-        """Describe an object; None: there is none."""
+        """Look up the metadata of an object; None: there is no such object."""
         ...
 
     def list(self, folder: str, after: str = "") -> Iterator[tuple[str, int]]:
-        """List key and size [B] of all objects below a folder ("": all), in the order of keys, read as far as they are asked for.
+        """List the objects below a folder, sorted by key, lazily where the store sorts: yields key and size [B].
 
         Args:
-            folder: First parts of their keys, without a slash at the end.
-            after: Only keys behind this one.
+            folder: First parts of their keys, without a slash at the end; empty: all objects.
+            after: Only keys that sort after this one.
         """
         ...
 
@@ -79,23 +79,24 @@ class Store(Protocol):
         ...
 
     def create(self, key: str, data: bytes) -> str | None:
-        """Write an object unless the key is taken; returns its tag. None: it is taken, perhaps by an attempt of ours."""
+        """Write an object if absent; returns its tag. None: the key is taken, perhaps by an attempt of this call whose answer was lost."""
         ...
 
     def replace(self, key: str, data: bytes, tag: str) -> str | None:
-        """Compare-and-swap: write an object if the one that is there has this tag; returns the new tag. None: it has another one."""
+        """Compare-and-swap: write an object if the one that is there has this tag; returns the new tag. None: it has another tag, perhaps
+        that of an attempt of this call whose answer was lost, or was deleted."""
         ...
 
     def get_tagged(self, key: str) -> tuple[bytes, str] | None:
-        """Read an object and its tag; None: there is none."""
+        """Read an object and its tag, which identifies its version; None: there is no such object."""
         ...
 
 
 def persist(request: Callable[[], _Result], what: str, tries: int = TRIES) -> _Result:
-    """Repeat a request while it raises `TransientError`, with randomized exponential back-off.
+    """Retry a request while it raises `TransientError`, with exponential back-off and jitter; returns its result.
 
     Args:
-        request: The request.
+        request: The request; must be safe to repeat.
         what: What it does, for the message: "write s3://bucket/key".
         tries: Attempts.
 

@@ -1,4 +1,7 @@
-"""Store of any file system that fsspec knows, such as hf://, sftp:// or webdav://: without conditional writes."""
+"""Object store on a file system of fsspec, such as hf://, sftp:// or webdav://: without conditional writes.
+
+Whether a write is atomic depends on the server: a worker that is killed may leave an empty or truncated file, over SFTP for example.
+"""
 
 from __future__ import annotations
 
@@ -20,18 +23,18 @@ class FileSystemStore:
     conditional = False
 
     def __init__(self, url: str) -> None:
-        """Raises StoreError: fsspec, or the package that it needs for the URL, is not installed."""
+        """Open the file system; some connect. Raises StoreError: a package is not installed, or the URL cannot be opened."""
         try:
             fsspec = importlib.import_module("fsspec")
             self._files, root = fsspec.core.url_to_fs(url)
         except ImportError as error:
             raise StoreError(f"{url} needs a package that is not installed: {error}; pip install 'synpick-warp[cloud]'") from None
-        except ValueError as error:
-            raise StoreError(f"{url} cannot be opened: {error}") from None
+        except Exception as error:  # Some connect, and each library has errors of its own.
+            raise StoreError(f"{url} cannot be opened: {_text(error)}") from None
         self.url, self._root = url.rstrip("/"), str(root).rstrip("/")
 
     def _try(self, request: Callable[[], _Result], what: str) -> _Result:
-        """Repeat a request while its errors may pass; missing objects pass through."""
+        """Retry a request, whatever its error; FileNotFoundError is raised at once, missing rights and operations as StoreError."""
 
         def attempt() -> _Result:
             try:
@@ -40,31 +43,37 @@ class FileSystemStore:
                 raise
             except PermissionError as error:
                 raise StoreError(f"cannot {what}: {error.strerror or error}; give the right to read, list and write there") from None
-            except OSError as error:
-                raise TransientError(str(error) or type(error).__name__) from None
+            except NotImplementedError:
+                raise StoreError(f"cannot {what}: its file system cannot do that; name another place") from None
+            except Exception as error:  # Errors of libraries (paramiko, ftplib, webdav4) have no common class, so all may pass.
+                raise TransientError(_text(error)) from None
 
         return persist(attempt, what)
 
+    def _write(self, key: str, write: Callable[[str], None]) -> None:
+        """Make the folder of an object, and write it to its path."""
+        path = self._path(key)
+
+        def request() -> None:
+            self._files.makedirs(path.rpartition("/")[0], exist_ok=True)
+            write(path)
+
+        try:
+            self._try(request, f"write {self.url}/{key}")
+        except FileNotFoundError as error:
+            raise StoreError(f"cannot write {self.url}/{key}: {_text(error)}; make the place that it names first") from None
+
     def _path(self, key: str) -> str:
+        """Path of an object in the file system; of the prefix, if the key is empty."""
         return f"{self._root}/{key}" if key else self._root
 
     def put(self, key: str, data: bytes) -> None:
         """See `Store`."""
-
-        def write() -> None:
-            self._files.makedirs(self._path(key).rpartition("/")[0], exist_ok=True)
-            self._files.pipe_file(self._path(key), data)
-
-        self._try(write, f"write {self.url}/{key}")
+        self._write(key, lambda path: self._files.pipe_file(path, data))
 
     def put_file(self, key: str, path: Path) -> None:
         """See `Store`."""
-
-        def write() -> None:
-            self._files.makedirs(self._path(key).rpartition("/")[0], exist_ok=True)
-            self._files.put_file(str(path), self._path(key))
-
-        self._try(write, f"write {self.url}/{key}")
+        self._write(key, lambda place: self._files.put_file(str(path), place))
 
     def get(self, key: str) -> bytes:
         """See `Store`."""
@@ -113,15 +122,20 @@ class FileSystemStore:
         raise StoreError(f"{self.url} has no conditional writes")
 
     def get_tagged(self, key: str) -> tuple[bytes, str] | None:
-        """See `Store`; all tags are empty."""
+        """See `Store`; every tag is the empty string."""
         try:
             return self.get(key), ""
         except FileNotFoundError:
             return None
 
 
+def _text(error: BaseException) -> str:
+    """First line of an error's text; the name of its class, if it has none."""
+    return (str(error).splitlines() or [type(error).__name__])[0][:300]
+
+
 def _time(info: dict[str, Any]) -> datetime.datetime:
-    """When an object was written; the present where the file system does not say."""
+    """Modification time of an object, by fsspec's record of it; the current time where the file system does not tell."""
     found = next((info[name] for name in ("mtime", "LastModified", "last_modified", "created", "updated") if info.get(name)), None)
     if isinstance(found, datetime.datetime):
         return found if found.tzinfo else found.replace(tzinfo=datetime.UTC)

@@ -1,6 +1,6 @@
-"""Store of the Rust crate object_store, by its Python binding obstore: S3, Google Cloud Storage, Azure, a folder, or memory.
+"""Object store by obstore, the Python binding of the Rust crate object_store: S3, Google Cloud Storage, Azure, a folder, or memory.
 
-It is the one library of these with conditional writes: create if absent, and compare-and-swap by ETag. Folders lack the latter.
+It has conditional writes: create if absent, and compare-and-swap by ETag (Google: by generation). Folders lack the latter.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from synpick_warp.errors import StoreError
 from synpick_warp.system.stores.base import BLOCK_BYTES, Stat, TransientError, persist
 
 TIMEOUT = 60
-"""Longest time of a request [s]."""
+"""Timeout of a request [s]."""
 _INSTALL = "install it by pip install 'synpick-warp[cloud]'"
 _ADVICE = (
     (
@@ -33,7 +33,7 @@ _ADVICE = (
         "the store does not accept the credentials; set them, such as AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY",
     ),
 )
-"""What an error's text has -> what to do about it; the first that fits."""
+"""Signs in an error's text, and the advice for it; the first match counts."""
 _PASSING = (
     "status code: 5",
     "status code: 429",
@@ -45,18 +45,18 @@ _PASSING = (
     "IncompleteBody",
     "error decoding",
 )
-"""What the text of an error has that may pass (in any case)."""
+"""Signs of transient errors in their text, in upper or lower case."""
 
 _Result = TypeVar("_Result")
 _memories: dict[str, Any] = {}
-"""Stores in memory by name, which all who name them share."""
+"""Stores in memory by name, shared within the process."""
 
 
 class ObjectStore:
     """`Store` of obstore."""
 
     def __init__(self, url: str) -> None:
-        """Raises StoreError: obstore is not installed, does not know the URL, or there are no credentials."""
+        """Open the store without a request. Raises StoreError: obstore is not installed or refuses the URL, or there are no credentials."""
         try:
             self._obs = importlib.import_module("obstore")
             self._kinds = importlib.import_module("obstore.store")
@@ -66,11 +66,11 @@ class ObjectStore:
         self._errors = self._obs.exceptions
         try:
             self._store = self._open(self.url)
-        except (self._errors.BaseError, ValueError) as error:
+        except (self._errors.BaseError, ValueError, OSError) as error:
             raise StoreError(f"{url} cannot be opened: {_first_line(error)}") from None
 
     def _open(self, url: str) -> Any:
-        """Make the store of a URL."""
+        """Construct obstore's store of a URL."""
         scheme, _, rest = url.partition("://")
         if scheme == "memory":
             return _memories.setdefault(rest, self._kinds.MemoryStore())
@@ -84,7 +84,7 @@ class ObjectStore:
         return self._kinds.from_url(url, client_options=client, retry_config=retries)
 
     def _try(self, request: Callable[[], _Result], what: str) -> _Result:
-        """Repeat a request while its errors may pass; others but conditions and missing objects become `StoreError`."""
+        """Retry a request while its errors are transient; others become StoreError, but for failed conditions and missing objects."""
 
         def attempt() -> _Result:
             try:
@@ -106,11 +106,18 @@ class ObjectStore:
 
     def put(self, key: str, data: bytes) -> None:
         """See `Store`."""
-        self._try(lambda: self._obs.put(self._store, key, data, use_multipart=False), f"write {self.url}/{key}")
+        self._write(key, lambda: self._obs.put(self._store, key, data, use_multipart=False))
 
     def put_file(self, key: str, path: Path) -> None:
         """See `Store`."""
-        self._try(lambda: self._obs.put(self._store, key, path), f"write {self.url}/{key}")
+        self._write(key, lambda: self._obs.put(self._store, key, path))
+
+    def _write(self, key: str, request: Callable[[], object]) -> None:
+        """Retry a request that writes an object; what it does not find is a StoreError."""
+        try:
+            self._try(request, f"write {self.url}/{key}")
+        except FileNotFoundError as error:
+            raise StoreError(f"cannot write {self.url}/{key}: {_first_line(error)}") from None
 
     def get(self, key: str) -> bytes:
         """See `Store`."""
@@ -164,13 +171,14 @@ class ObjectStore:
 
     def replace(self, key: str, data: bytes, tag: str) -> str | None:
         """See `Store`."""
-        return self._put_if(key, data, {"e_tag": tag})
+        version, _, e_tag = tag.partition(" ")
+        return self._put_if(key, data, {"e_tag": e_tag} | ({"version": version} if version else {}))
 
     def _put_if(self, key: str, data: bytes, mode: Any) -> str | None:
-        """Write an object under a condition; returns its tag, None: the condition does not hold."""
+        """Conditional write; returns the tag of the new object. None: the condition does not hold."""
         try:
             request = lambda: self._obs.put(self._store, key, data, mode=mode, use_multipart=False)  # noqa: E731
-            return self._try(request, f"write {self.url}/{key}")["e_tag"]
+            return _tag(self._try(request, f"write {self.url}/{key}"))
         except (self._errors.AlreadyExistsError, self._errors.PreconditionError):
             return None
         except FileNotFoundError:  # Compared with an object that was deleted.
@@ -180,13 +188,13 @@ class ObjectStore:
         """See `Store`."""
         try:
             found = self._try(lambda: self._obs.get(self._store, key), f"read {self.url}/{key}")
-            return self._try(lambda: bytes(found.bytes()), f"read {self.url}/{key}"), found.meta["e_tag"]
+            return self._try(lambda: bytes(found.bytes()), f"read {self.url}/{key}"), _tag(found.meta)
         except FileNotFoundError:
             return None
 
 
 def _check_credentials(url: str) -> None:
-    """Raise StoreError if neither variables nor a service of the machine give credentials."""
+    """Check for credentials of S3: raises StoreError if no variable gives them and the machine's metadata service is disabled."""
     given = (
         "AWS_ACCESS_KEY_ID",
         "AWS_WEB_IDENTITY_TOKEN_FILE",
@@ -198,6 +206,11 @@ def _check_credentials(url: str) -> None:
         raise StoreError(f"there are no credentials for {url}; set AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY")
 
 
+def _tag(state: Any) -> str:
+    """Tag of an object: its generation, which Google compares, a space, and its ETag, which the others compare."""
+    return f"{state['version'] or ''} {state['e_tag']}"
+
+
 def _first_line(error: BaseException) -> str:
-    """First line of an error's text: the rest is of the library's inside."""
+    """First line of an error's text; the others describe the library's internals."""
     return (str(error).splitlines() or [type(error).__name__])[0][:300]

@@ -1,4 +1,4 @@
-"""Choice of a store by its URL, and the probe of what it can do: right to write, clock, conditional writes."""
+"""Factory of object stores by URL, and a capability probe: rights, difference of the clocks, conditional writes."""
 
 from __future__ import annotations
 
@@ -15,34 +15,36 @@ from synpick_warp.system.stores.object_store import ObjectStore
 OBJECT_STORES = ("s3", "s3a", "gs", "az", "abfs", "abfss", "file", "memory")
 """Schemes of obstore; all others are fsspec's."""
 CONTROL = ".store"
-"""Folder of what is no part of a data set: marks, claims and probes. Hidden, so that local commands pass over it in a copy."""
+"""Folder of control objects, which are no part of a data set: marks, claims, probes. Hidden, so that local commands ignore it in a copy."""
 MAX_SKEW = 300.0
 """Largest difference of this machine's clock from the store's [s]: stores refuse signed requests beyond 5 to 15 minutes."""
 
 
 class Probe(NamedTuple):
-    """What a store can do."""
+    """Result of a probe: offset of the clock, and whether conditional writes work."""
 
     offset: float
     """The store's clock less this machine's [s]."""
     conditional: bool
-    """Whether it has and honours conditional writes."""
+    """Whether the store has conditional writes and honours them."""
 
 
 def open_store(url: str) -> Store:
-    """Open a store; nothing is asked of it.
+    """Open the object store of a URL. Object stores are sent no request; file systems of fsspec may connect, and file:// makes its folder.
 
     Raises:
-        StoreError: A package or credentials are missing, or the URL has no meaning.
+        StoreError: A package or credentials are missing, or the URL names no bucket, has a part "." or "..", or an unknown scheme.
     """
     scheme, _, rest = url.partition("://")
+    if not {".", ".."}.isdisjoint(rest.split("/")):
+        raise StoreError(f"{url} has a part . or ..; name a prefix without")
     if not rest.strip("/"):
         raise StoreError(f"{url} names no bucket; name one with a prefix, such as s3://bucket/prefix")
     return ObjectStore(url) if scheme in OBJECT_STORES else FileSystemStore(url)
 
 
 def probe(store: Store) -> Probe:
-    """Write, look up, read and delete a small object.
+    """Probe a store's capabilities: write, look up, read and delete a small object below CONTROL.
 
     Raises:
         StoreError: The store cannot be read and written, or this machine's clock is off by more than MAX_SKEW.
@@ -50,8 +52,8 @@ def probe(store: Store) -> Probe:
     key, data = f"{CONTROL}/probe/{uuid.uuid4().hex}", b"probe"
     sent = datetime.datetime.now(datetime.UTC)
     store.put(key, data)
-    state = store.stat(key)
-    if state is None or store.get(key) != data:
+    state, found = store.stat(key), store.get_tagged(key)
+    if state is None or found is None or found[0] != data:
         raise StoreError(f"{store.url} does not return what was written; name a store that reads what it has just acknowledged")
     offset = (state.modified - sent).total_seconds()
     if abs(offset) > MAX_SKEW:
@@ -63,7 +65,8 @@ def probe(store: Store) -> Probe:
 
 
 def _is_conditional(store: Store, key: str, data: bytes) -> bool:
-    """Whether a store refuses to create an object that is there, and to replace one that has changed, and replaces one that has not."""
+    """Test of conditional writes: whether the store refuses to create an object that exists and to replace one whose tag has changed, and
+    replaces one whose tag has not."""
     try:
         if store.create(key, b"other") is not None:
             return False
@@ -72,5 +75,5 @@ def _is_conditional(store: Store, key: str, data: bytes) -> bool:
             return False
         tag = store.replace(key, b"next", found[1])
         return tag is not None and store.replace(key, b"late", found[1]) is None and store.get(key) == b"next"
-    except StoreError:
+    except (StoreError, FileNotFoundError):
         return False
