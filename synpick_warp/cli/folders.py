@@ -210,7 +210,6 @@ def _fetch(url: str) -> Path:
     place = TemporaryDirectory(prefix="synpick-read-")
     folder = Path(place.name) / url.rpartition("/")[2]
     _fetched[folder] = url, place
-    folder.mkdir()
     copy_set(url, folder)
     return folder
 

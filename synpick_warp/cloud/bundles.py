@@ -1,6 +1,6 @@
-"""Index files: what the indices over all episodes are made of, of one episode as tar.gz, of a block as their concatenation.
+"""Archive format of index files, the inputs of the indices over all episodes: one tar.gz per episode, and their concatenation per block.
 
-Shards are in them as skeletons: headers of members with their offsets, from which a sparse file of the same names and sizes is made.
+A shard is reduced to its skeleton, the tar headers with their offsets, which unpacks to a sparse file with the same members and sizes.
 """
 
 from __future__ import annotations
@@ -16,26 +16,27 @@ from pathlib import Path
 from typing import BinaryIO
 
 from synpick_warp.dataset.commit.manifest import episode_entry, read_checksums
-from synpick_warp.errors import DatasetError
+from synpick_warp.errors import DatasetError, OutputError
 from synpick_warp.system.inputs.paths import path_inside
 from synpick_warp.system.inputs.tar_files import list_members
 
 SKELETON = "skeleton/"
-"""Prefix of a skeleton's name."""
+"""Prefix of the names of skeletons in an index file."""
 MAX_BUNDLE = 1 << 30
-"""Largest size of an unpacked index file of an episode [B]: more is not ours."""
+"""Limit of an episode's index file, unpacked [B]: guards against decompression bombs."""
 _PLACE = struct.Struct("<Q")
+"""In a skeleton: size of the shard [B], then before each header its offset [B]."""
 _LENGTH = struct.Struct("<Q")
-"""Before each index file of a block: its size [B]."""
+"""In a block: length prefix of each index file [B]."""
 
 
 def make_bundle(folder: Path, episode: int, indexed: re.Pattern[str]) -> bytes:
-    """Pack an episode's index file; the same bytes each time.
+    """Pack an episode's index file; deterministic on one machine (another zlib may compress otherwise).
 
     Args:
         folder: Data set with the committed episode.
         episode: Its index.
-        indexed: Names of the files that indices need.
+        indexed: Pattern of the names of files that indices are made of.
     """
     entry = episode_entry(episode)
     packed = io.BytesIO()
@@ -50,13 +51,14 @@ def make_bundle(folder: Path, episode: int, indexed: re.Pattern[str]) -> bytes:
 
 
 def _add(archive: tarfile.TarFile, name: str, data: bytes) -> None:
+    """Append a member to a tar archive."""
     info = tarfile.TarInfo(name)
     info.size = len(data)
     archive.addfile(info, io.BytesIO(data))
 
 
 def _skeleton(shard: Path) -> bytes:
-    """Size of a tar file, then offset and bytes of each header."""
+    """Skeleton of a shard: size of the tar file, then offset and bytes of each header."""
     parts = [_PLACE.pack(shard.stat().st_size)]
     with shard.open("rb") as file:
         for _, start, _ in list_members(shard):
@@ -66,7 +68,7 @@ def _skeleton(shard: Path) -> bytes:
 
 
 def _grow(skeleton: bytes, path: Path) -> None:
-    """Write the sparse file of a skeleton."""
+    """Restore a skeleton as a sparse tar file, with holes in place of the content."""
     step = _PLACE.size + tarfile.BLOCKSIZE
     with path.open("wb") as file:
         file.truncate(_PLACE.unpack_from(skeleton)[0])
@@ -76,10 +78,11 @@ def _grow(skeleton: bytes, path: Path) -> None:
 
 
 def unpack_bundle(data: bytes, folder: Path, indexed: re.Pattern[str], source: str) -> None:
-    """Unpack an episode's index file into a folder.
+    """Unpack an episode's index file into a folder; `source` is its object, for messages.
 
     Raises:
-        DatasetError: It is damaged, or has files that no index is made of.
+        DatasetError: It is damaged, too large, or has files that no index is made of.
+        OutputError: The folder cannot be written.
     """
     try:
         stream = zlib.decompressobj(31)
@@ -95,24 +98,36 @@ def unpack_bundle(data: bytes, folder: Path, indexed: re.Pattern[str], source: s
                 path = path_inside(folder, name, source, DatasetError)
                 path.parent.mkdir(parents=True, exist_ok=True)
                 _grow(content.read(), path) if info.name != name else path.write_bytes(content.read())
-    except (zlib.error, tarfile.TarError, struct.error, OSError) as error:
+    except OSError as error:
+        raise OutputError(f"cannot write {folder}: {error.strerror or error}; set TMPDIR to a folder with more space") from None
+    except (zlib.error, tarfile.TarError, struct.error, OverflowError, ValueError, RecursionError) as error:
         raise DatasetError(f"{source} is damaged: {error}; delete it and its block's mark, and resume the bake") from None
 
 
 def join_bundles(bundles: Iterable[bytes], target: BinaryIO) -> None:
-    """Write the index files of a block's episodes, each after its size."""
+    """Concatenate the index files of a block's episodes, each with a length prefix."""
     for data in bundles:
         target.write(_LENGTH.pack(len(data)))
         target.write(data)
 
 
-def split_bundles(blocks: Iterable[bytes]) -> Iterator[bytes]:
-    """Yield the index files of a block from its content; one at a time is held."""
+def split_bundles(blocks: Iterable[bytes], count: int, source: str) -> Iterator[bytes]:
+    """Split a block's content into index files, lazily.
+
+    Args:
+        blocks: The content, in pieces of any size.
+        count: Number of index files that it must have.
+        source: Its object, for messages.
+
+    Raises:
+        DatasetError: It is truncated, or has another number.
+    """
     held = bytearray()
     for block in blocks:
         held += block
         while len(held) >= _LENGTH.size and len(held) >= (end := _LENGTH.size + _LENGTH.unpack_from(held)[0]):
+            count -= 1
             yield bytes(held[_LENGTH.size : end])
             del held[:end]
-    if held:
-        raise DatasetError("a block's mark is cut off; delete it, and resume the bake")
+    if held or count:
+        raise DatasetError(f"{source} is damaged: it is cut off, or has another number of episodes; delete it, and resume the bake")

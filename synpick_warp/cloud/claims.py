@@ -1,6 +1,6 @@
-"""Claims of chunks of episodes: leases in the store, taken by conditional writes, kept by a heartbeat, taken over when they ran out.
+"""Distributed leases on chunks of episodes: taken by conditional writes, extended by a heartbeat, taken over after they have expired.
 
-The store is the ledger; workers know nothing of each other. See README.md.
+Workers coordinate through the store alone. See README.md.
 """
 
 from __future__ import annotations
@@ -24,39 +24,39 @@ from synpick_warp.system.stores.opening import CONTROL
 
 CLAIMS = f"{CONTROL}/claims"
 LEASE = 120.0
-"""Time for which a claim holds without a heartbeat [s]: a worker that dies costs as much; one that hangs longer loses its chunk."""
+"""Time to live of a lease without heartbeat [s]: a worker's death costs the others as much; one that hangs longer loses its chunk."""
 BEATS = 4
-"""Heartbeats a lease."""
+"""Heartbeats per lease time."""
 MARGIN = 0.1
-"""Last part of a lease in which its owner does not rely on it."""
+"""Safety margin: last part of a lease in which its owner takes it for lost."""
 MAX_WAIT = 10.0
-"""Longest pause between two looks at what others have [s]."""
+"""Limit of the polling interval of a worker that waits for others [s]."""
 CHUNK_WORLDS = 2
-"""Episodes of a whole chunk for each world: enough to keep all worlds busy for longer than it takes to start them."""
+"""Default size of a whole chunk [episodes per world]: keeps all worlds busy for longer than it takes to start them."""
 AUTO_WORLDS = 256
-"""Worlds that a chunk is meant for where the settings leave their number to the device."""
+"""Number of worlds that a chunk is sized for if the settings leave it to the device."""
 LEAST_CHUNKS = 32
-"""Chunks of a small plan, so that several workers find some."""
+"""Minimum number of chunks, as far as the episodes suffice, so that several workers find some in a small plan."""
 TAIL, HALVINGS = 0.25, 3
-"""Last part of the plan that has smaller chunks, and how often they are halved in it."""
+"""Tapering of the chunks: last part of the plan that has smaller ones, and how often they are halved in it."""
 
 
 class LeaseLostError(SynpickError):
-    """Another worker has taken a chunk over."""
+    """A lease has expired, or another worker has taken it over."""
 
 
 class _Lease(msgspec.Struct):
-    """Content of a lease."""
+    """Record of a lease: owner, time of expiry, heartbeats."""
 
     owner: str
     until: float
-    """Time of the store at which it runs out [s since 1970]."""
+    """Time of expiry by the store's clock [s since 1970]."""
     beat: int = 0
-    """Number of heartbeats: no two leases are equal, nor are their tags."""
+    """Number of heartbeats. It makes all records differ, and so their tags."""
 
 
 class Claim:
-    """Lease of a key that this worker owns, kept by a thread. `check` raises when it may have been lost."""
+    """Lease on a key that this worker owns, extended by a heartbeat thread until `stop` or `release`."""
 
     def __init__(self, store: Store, key: str, owner: str, tag: str, until: float, offset: float, lease: float) -> None:
         self._store, self._key, self._owner, self._tag = store, key, owner, tag
@@ -66,12 +66,12 @@ class Claim:
         self._thread.start()
 
     def check(self) -> None:
-        """Raise LeaseLostError if another worker has the lease, or may have taken it by now."""
+        """Check the lease locally, without a request: raises LeaseLostError if another worker has it, or may have taken it over."""
         if self._lost or time.time() + self._offset > self._until - MARGIN * self._lease:
             raise LeaseLostError(f"the claim {self._key} ran out, since this worker was too slow, and others may have it")
 
     def _keep(self) -> None:
-        """Thread: extend the lease until it is released or lost. What fails is tried again: time decides."""
+        """Heartbeat thread: extends the lease until it is stopped or lost. A failed heartbeat is left to the next one; expiry decides."""
         while not self._ending.wait(self._lease / BEATS):
             self._beat += 1
             with contextlib.suppress(StoreError):
@@ -80,24 +80,26 @@ class Claim:
                     return
 
     def _replace(self, until: float) -> bool:
-        """Compare-and-swap of the lease; returns whether it is ours."""
+        """Compare-and-swap of the record; returns whether the lease is still ours."""
         data = msgspec.json.encode(_Lease(self._owner, until, self._beat))
         tag = self._store.replace(self._key, data, self._tag)
-        if tag is None:  # Perhaps by an attempt of ours whose answer was lost.
+        if tag is None:  # Perhaps by an attempt of ours whose answer was lost, at this heartbeat or one that failed.
             found = self._store.get_tagged(self._key)
-            if found is None or found[0] != data:
+            if found is None or _read(found[0]).owner != self._owner:
                 return False
-            tag = found[1]
+            tag = found[1] if found[0] == data else self._store.replace(self._key, data, found[1])
+            if tag is None:
+                return False
         self._tag, self._until = tag, until
         return True
 
     def stop(self) -> None:
-        """End the heartbeat; the lease then runs out by itself."""
+        """End the heartbeat thread; the lease then expires by itself."""
         self._ending.set()
         self._thread.join()
 
     def release(self) -> None:
-        """Give the lease back, so that another worker need not wait."""
+        """Release the lease: ends the heartbeat, and lets the lease expire at once, so that no worker has to wait for it."""
         self.stop()
         self._beat += 1
         with contextlib.suppress(StoreError):
@@ -106,20 +108,20 @@ class Claim:
 
 
 class Claims:
-    """Claims of one worker in a store."""
+    """Lease manager of one worker: takes leases in a store under the worker's unique name."""
 
     def __init__(self, store: Store, offset: float, lease: float = LEASE) -> None:
         """
         Args:
             store: With conditional writes.
             offset: The store's clock less this machine's [s].
-            lease: Time for which a claim holds without a heartbeat [s].
+            lease: Time to live of a lease without heartbeat [s].
         """
         self.store, self.offset, self.lease = store, offset, lease
         self.owner = f"{socket.gethostname()}-{os.getpid()}-{uuid.uuid4().hex[:12]}"
 
     def take(self, key: str) -> Claim | None:
-        """Claim a key: create its lease, or take over one that ran out. None: another worker has it."""
+        """Acquire the lease on a key: creates it, or takes over one that has expired. None: another worker has it."""
         store, until = self.store, time.time() + self.offset + self.lease
         data = msgspec.json.encode(_Lease(self.owner, until))
         tag = store.create(key, data)
@@ -129,7 +131,7 @@ class Claims:
                 return None
             if found[0] == data:  # Created by an attempt of ours whose answer was lost.
                 tag = found[1]
-            elif _until(found[0]) > time.time() + self.offset:
+            elif _read(found[0]).until > time.time() + self.offset:
                 return None
             else:
                 tag = store.replace(key, data, found[1])
@@ -138,24 +140,24 @@ class Claims:
         return None if tag is None else Claim(store, key, self.owner, tag, until, self.offset, self.lease)
 
 
-def _until(data: bytes) -> float:
-    """When a lease runs out; one that cannot be read has."""
+def _read(data: bytes) -> _Lease:
+    """Decode a lease; a damaged one is nobody's, and has expired."""
     try:
-        return msgspec.json.decode(data, type=_Lease).until
-    except msgspec.DecodeError:
-        return 0.0
+        return msgspec.json.decode(data, type=_Lease)
+    except (ValueError, RecursionError):  # msgspec's errors are ValueErrors.
+        return _Lease("", 0.0)
 
 
 class Sizes(NamedTuple):
-    """Cut of a plan into chunks: whole ones, then halves, quarters, ... in its last part. The same for all workers."""
+    """Partition of a plan into chunks: whole ones, then halves, quarters and eighths in its last part. The same for all workers."""
 
     episodes: int
-    """Of the plan."""
+    """Episodes of the plan."""
     chunk: int
-    """Of a whole chunk."""
+    """Episodes of a whole chunk."""
 
     def bounds(self) -> Iterator[tuple[int, int]]:
-        """First position of each chunk in the plan, and the one after its last."""
+        """Yield the bounds of each chunk as positions in the plan: first, and the one after its last."""
         start, tail = 0, int(self.episodes * TAIL)
         for halving in range(HALVINGS + 1):
             end = self.episodes if halving == HALVINGS else self.episodes - (tail >> halving)
@@ -165,12 +167,12 @@ class Sizes(NamedTuple):
 
 
 def default_chunk(worlds: int, episodes: int) -> int:
-    """Episodes of a whole chunk, by the worlds of a device (0: as many as fit) and the episodes of the plan."""
+    """Default size of a whole chunk [episodes], by the number of worlds of a device (0: as many as fit) and of episodes in the plan."""
     return max(1, min(CHUNK_WORLDS * (worlds or AUTO_WORLDS), episodes // LEAST_CHUNKS))
 
 
 class Chunk(NamedTuple):
-    """Chunk that this worker has claimed: its number, its episodes without done mark, its claim."""
+    """Chunk of which this worker has the lease: its number, its episodes without done mark, its claim."""
 
     number: int
     episodes: list[int]
@@ -178,15 +180,15 @@ class Chunk(NamedTuple):
 
 
 class Chunks:
-    """Chunks of the plan that this worker claims, one at a time, until all are done by somebody."""
+    """Work queue in the store: iterates over the chunks that this worker claims, one at a time, until all of the plan are done."""
 
     def __init__(self, ledger: Ledger, claims: Claims, ranges: Sequence[range], chunk: int) -> None:
         """
         Args:
-            ledger: Of the data set.
-            claims: Of this worker.
+            ledger: Ledger of the data set.
+            claims: Lease manager of this worker.
             ranges: Episodes that the bake must deliver.
-            chunk: Episodes of a whole chunk; that of the worker that starts first counts for all.
+            chunk: Proposed number of episodes of a whole chunk; that of the worker that starts first counts for all.
         """
         self._ledger, self._claims, self._ranges = ledger, claims, ranges
         name = hashlib.sha256(repr([(each.start, each.stop, each.step) for each in ranges]).encode()).hexdigest()[:16]
@@ -194,19 +196,19 @@ class Chunks:
         self.sizes = self._agree(Sizes(sum(map(len, ranges)), chunk))
 
     def _agree(self, sizes: Sizes) -> Sizes:
-        """Cut of the worker that started first."""
+        """Agree on the partition by create-if-absent: that of the worker that started first. Raises StoreError: its record is damaged."""
         store, key = self._ledger.store, f"{self._place}/plan.json"
         store.create(key, msgspec.json.encode(sizes.chunk))
         try:
             chunk = msgspec.json.decode(store.get(key), type=int)
-        except (msgspec.DecodeError, FileNotFoundError):
+        except (ValueError, FileNotFoundError):  # msgspec's errors are ValueErrors.
             chunk = 0
         if chunk < 1:
             raise StoreError(f"{store.url}/{key} is damaged; delete it, and start all workers again")
         return sizes._replace(chunk=chunk)
 
     def __iter__(self) -> Iterator[Chunk]:
-        """Claim chunks; waits while other workers have all that are not done. The caller calls `done` or releases each claim."""
+        """Yield claimed chunks; waits while other workers have the leases on all others. The caller calls `done`, or ends the claim."""
         while True:
             found = False
             over = self._over()
@@ -216,7 +218,11 @@ class Chunks:
                 claim = self._claims.take(f"{self._place}/{number:06d}")
                 if claim is None:
                     continue
-                episodes = self._left(start, end)
+                try:
+                    episodes = self._left(start, end)
+                except BaseException:
+                    claim.stop()  # Its heartbeat would outlive the error, and keep others from the chunk.
+                    raise
                 found = True
                 if episodes:
                     yield Chunk(number, episodes, claim)
@@ -228,24 +234,28 @@ class Chunks:
                 time.sleep(min(self._claims.lease / BEATS, MAX_WAIT))
 
     def done(self, chunk: Chunk) -> None:
-        """Note that all episodes of a chunk have done marks, and end its claim."""
-        self._ledger.store.put(f"{self._place}/done/{chunk.number:06d}", b"")
-        chunk.claim.stop()
+        """Write the end mark of a chunk whose episodes all have done marks, and end its claim, also after an error."""
+        try:
+            self._ledger.store.put(f"{self._place}/done/{chunk.number:06d}", b"")
+        finally:
+            chunk.claim.stop()
 
     def _over(self) -> set[int]:
-        """Numbers of the chunks that are done."""
+        """Numbers of the chunks that have end marks."""
         place = f"{self._place}/done"
-        return {int(key.rpartition("/")[2]) for key, _ in self._ledger.store.list(place)}
+        names = (key.rpartition("/")[2] for key, _ in self._ledger.store.list(place))
+        return {int(name) for name in names if name.isdecimal()}
 
     def _order(self) -> Iterator[tuple[int, tuple[int, int]]]:
-        """Chunks with their numbers, whole ones first: from one that follows from the worker's name, in a circle, so that few collide."""
+        """Order in which this worker tries the chunks, as (number, bounds): whole ones cyclically from a hash of the worker's name, so that
+        few workers collide, then the smaller ones."""
         bounds = list(enumerate(self.sizes.bounds()))
         count = sum(1 for _, (start, end) in bounds if end - start == self.sizes.chunk) or len(bounds)
         first = int(hashlib.sha256(self._claims.owner.encode()).hexdigest(), 16) % count
         return iter([*bounds[first:count], *bounds[:first], *bounds[count:]])
 
     def _left(self, start: int, end: int) -> list[int]:
-        """Episodes of a chunk without done mark."""
+        """Episodes of a chunk that have no done mark, sorted; arguments: its bounds in the plan."""
         wanted: list[int] = []
         for each in self._ranges:
             wanted += each[max(0, start) : max(0, end)]

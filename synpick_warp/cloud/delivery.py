@@ -1,6 +1,6 @@
-"""Delivery of finished episodes from a local folder into a store, while the bake goes on: files, index file, checksum list, done mark.
+"""Background upload of finished episodes from a local folder into a store: files, index file, checksum list, done mark, in this order.
 
-A thread watches the folder's manifest, so that nothing in the bake knows of it, and episodes of several devices are delivered alike.
+A thread polls the folder's manifest, so that the bake needs no hook, and episodes of several devices are uploaded alike.
 """
 
 from __future__ import annotations
@@ -27,17 +27,17 @@ from synpick_warp.system.progress import Progress
 from synpick_warp.system.stores.base import Store, TransientError, persist
 
 FILES_AT_ONCE, EPISODES_AT_ONCE = 16, 4
-"""Uploads at a time, of files and of episodes: requests of small files wait for the store, not for a core."""
+"""Concurrent uploads, of files and of episodes: requests of small files wait for the store, not for a core."""
 WHOLE_BYTES = 8 << 20
-"""Largest file that is hashed and sent from memory [B]; larger ones are read twice."""
+"""Largest file that is hashed and sent from one read [B]; larger ones are read twice."""
 MAX_BACKLOG = 16 << 30
-"""Finished data that waits for its upload, beyond which the bake waits [B]."""
+"""Backpressure: amount of finished data that waits for its upload, beyond which the bake waits [B]."""
 _INTERVAL = 0.1
-"""Time between two looks at the folder [s]."""
+"""Polling interval [s]."""
 
 
 def send_file(store: Store, path: Path, name: str, digest: str) -> None:
-    """Upload a file and compare its content with its checksum before, and its size in the store after.
+    """Upload a file with end-to-end checks: its SHA-256 before, its size in the store after.
 
     Raises:
         OutputError: The local file has another checksum.
@@ -63,12 +63,12 @@ def send_file(store: Store, path: Path, name: str, digest: str) -> None:
 
 
 class Delivery:
-    """Uploads of one folder; a context manager that ends its threads. An error ends them, too; `check` and `finish` raise it."""
+    """Uploader of one folder: a context manager that owns its threads. The first error stops the uploads; `check` and `finish` raise it."""
 
     def __init__(self, ledger: Ledger, folder: Path, permit: Callable[[], None] = lambda: None) -> None:
         """
         Args:
-            ledger: Of the data set.
+            ledger: Commit log of the data set.
             folder: Local data set that a bake fills.
             permit: Called before an episode's upload and before its mark; raises what forbids it.
         """
@@ -79,7 +79,7 @@ class Delivery:
         self._shared = shared_files(load_exporter_classes(ledger.layout.formats), ledger.layout).folders
         self._fault: BaseException | None = None
         self._waiting: dict[int, int] = {}
-        """Episodes that are committed here and not delivered, with their sizes [B]."""
+        """Backlog: sizes of the episodes that are committed in the folder and not delivered [B]."""
         self._ending, self._lock = threading.Event(), threading.Lock()
         self._files = ThreadPoolExecutor(FILES_AT_ONCE, "upload")
         self._episodes = ThreadPoolExecutor(EPISODES_AT_ONCE, "deliver")
@@ -98,7 +98,7 @@ class Delivery:
             pool.shutdown(cancel_futures=True)
 
     def check(self) -> None:
-        """Raise the first error; wait while more than MAX_BACKLOG is not delivered."""
+        """Apply backpressure: waits while the backlog exceeds MAX_BACKLOG. Raises the first error."""
         while True:
             if self._fault is not None:
                 raise self._fault
@@ -107,14 +107,14 @@ class Delivery:
             time.sleep(_INTERVAL)
 
     def finish(self) -> None:
-        """Wait until all committed episodes are delivered. Raises the first error."""
+        """Drain the uploads: waits until all episodes that are committed in the folder are delivered. Raises the first error."""
         self._ending.set()
         self._watcher.join()
         self._episodes.shutdown()
         self.check()
 
     def _watch(self) -> None:
-        """Thread: hand out what the bake commits, until it has ended."""
+        """Watcher thread: polls the manifest, uploads the constants once, and queues episodes as the bake commits them."""
         constants, known = False, set()
         try:
             while self._fault is None:
@@ -142,7 +142,7 @@ class Delivery:
                 self._episodes.submit(self._deliver, episode)
 
     def _send_constants(self) -> None:
-        """Upload manifest, settings and constants, unless they are there."""
+        """Upload manifest, settings and constants, unless they are there. Raises ConfigError: the data set was started with others."""
         ledger, folder, store = self._ledger, self._folder, self._ledger.store
         ledger.put_manifest((folder / MANIFEST_FILE).read_bytes())
         ledger.put_settings()
@@ -157,7 +157,7 @@ class Delivery:
         store.put(f"{CONSTANTS}.json", (folder / f"{CONSTANTS}.json").read_bytes())
 
     def _send_files(self, names: dict[str, str]) -> None:
-        """Upload files in parallel; raises the first error."""
+        """Upload files in parallel, given their SHA-256 by name; raises the first error."""
         sent: list[Future[Any]] = [
             self._files.submit(send_file, self._ledger.store, self._folder / name, name, digest) for name, digest in names.items()
         ]
@@ -169,7 +169,7 @@ class Delivery:
                 each.cancel()
 
     def _deliver(self, episode: int) -> None:
-        """Task: deliver an episode, and delete its local copy."""
+        """Task: upload and commit an episode, and delete its local copy."""
         if self._fault is not None:
             return
         try:
@@ -188,7 +188,7 @@ class Delivery:
             self._fail(error)
 
     def _remove(self, episode: int, names: dict[str, str]) -> None:
-        """Delete an episode's local files, and the folders that hold nothing else."""
+        """Delete an episode's local files, and the folders that are empty then, but those that episodes share."""
         folder = self._folder
         for suffix in (".json", ".sha256"):
             (folder / f"{episode_entry(episode)}{suffix}").unlink(missing_ok=True)
@@ -201,19 +201,19 @@ class Delivery:
                 os.rmdir(parent)
 
     def _fail(self, error: BaseException) -> None:
-        """Keep the first error."""
+        """Record an error, if it is the first."""
         with self._lock:
             if self._fault is None:
                 self._fault = error if isinstance(error, SynpickError) else _describe(error)
 
 
 def _describe(error: BaseException) -> BaseException:
-    """Error of the operating system as `StoreError`; others as they are."""
+    """Convert an error of the operating system to StoreError; others stay as they are."""
     return StoreError(f"an upload failed: {error}; the same command resumes") if isinstance(error, OSError) else error
 
 
 class WatchedProgress:
-    """Observer that passes everything on, and raises the errors of a delivery into the bake, which so ends early."""
+    """Decorator of a progress observer that raises the errors of an upload into the bake, which so ends early, and applies backpressure."""
 
     def __init__(self, progress: Progress, check: Callable[[], None]) -> None:
         self._progress, self._check = progress, check

@@ -1,4 +1,4 @@
-"""Finalization of a data set in a store: batched marks of full blocks, then the indices over all episodes, made in a local folder."""
+"""Finalization of a data set in a store: batched marks of complete blocks, then the indices over all episodes, made in a local folder."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from synpick_warp.dataset.commit.manifest import (
     read_checksums,
 )
 from synpick_warp.dataset.commit.writing import finalize_data_set
-from synpick_warp.errors import StoreError
+from synpick_warp.errors import OutputError, StoreError
 from synpick_warp.exporters.formats import indexed_files
 from synpick_warp.exporters.registry import Needs, shared_files
 from synpick_warp.exporters.writing.checksums import parse_checksums
@@ -29,11 +29,17 @@ from synpick_warp.system.folders import make_folder
 
 
 def close_blocks(ledger: Ledger, folder: Path) -> int:
-    """Write the batched marks of all blocks whose episodes all have done marks; returns the number of episodes that have none.
+    """Compact complete blocks: writes the batched mark of each block whose episodes all have done marks.
 
     Args:
-        ledger: Of the data set.
-        folder: For a temporary file of a block.
+        ledger: Ledger of the data set.
+        folder: Folder for a temporary file of a block.
+
+    Returns:
+        Number of planned episodes without done mark.
+
+    Raises:
+        FileNotFoundError: An index file was deleted.
     """
     missing = 0
     for block in ledger.open_blocks():
@@ -49,14 +55,19 @@ def close_blocks(ledger: Ledger, folder: Path) -> int:
 
 
 def finalize_store(ledger: Ledger, folder: Path) -> int:
-    """Write the indices over all episodes, if all are done and the indices do not cover them yet.
+    """Finalize a data set: writes the indices over all episodes, if all are done and the indices do not cover them yet.
 
     Args:
-        ledger: Of the data set.
+        ledger: Ledger of the data set.
         folder: An empty folder, for temporary files.
 
     Returns:
         Number of episodes that are not done; 0: the data set is finished.
+
+    Raises:
+        DatasetError: A batched mark is damaged.
+        OutputError: The temporary folder cannot be written.
+        StoreError: An object was deleted that the indices are made of, or the store does not answer.
     """
     planned = ledger.layout.planned
     if ledger.finished() >= planned:
@@ -70,7 +81,11 @@ def finalize_store(ledger: Ledger, folder: Path) -> int:
         with WriterPool(count_writers(ledger.config.bake.writers, needs.slot_bytes), needs.slot_bytes) as pool:
             finalize_data_set(work, ExportSettings.of(ledger.config), needs.classes, pool)
     except FileNotFoundError as error:
-        raise StoreError(f"{error} was deleted while the indices were made of it; the same command resumes") from None
+        said = (str(error).splitlines() or ["an object"])[0]
+        advice = "restore it, or delete the done mark of its episode, manifest/NUMBER.json, and resume the bake without --claim"
+        raise StoreError(f"what the indices of {ledger.store.url} are made of is missing: {said}; {advice}") from None
+    except OSError as error:
+        raise OutputError(f"cannot write {folder}: {error.strerror or error}; set TMPDIR to a folder with more space") from None
     store = ledger.store
     if ledger.finished() > planned:  # A bake of more episodes has ended meanwhile.
         return 0
@@ -83,7 +98,7 @@ def finalize_store(ledger: Ledger, folder: Path) -> int:
 
 
 def _gather(ledger: Ledger, work: Path) -> None:
-    """Make a folder that has of the data set what indices are made of."""
+    """Gather the inputs of the indices in a local data set: manifest, settings, indexed constants, and the content of all index files."""
     store, layout = ledger.store, ledger.layout
     indexed = indexed_files(layout.formats)
     for name in (ENTRIES, *shared_files(Needs.of(ledger.config).classes, layout).folders):
@@ -100,8 +115,9 @@ def _gather(ledger: Ledger, work: Path) -> None:
 
 
 def _bundles(ledger: Ledger) -> Iterator[tuple[str, bytes]]:
-    """Index files of all episodes, with the object that they are from."""
+    """Yield the index files of all episodes, each after the URL of the batched mark that it is from."""
     for block in ledger.blocks():
         key = ledger.mark_key(block)
-        for bundle in split_bundles(ledger.store.blocks(key)):
-            yield f"{ledger.store.url}/{key}", bundle
+        source = f"{ledger.store.url}/{key}"
+        for bundle in split_bundles(ledger.store.blocks(key), len(ledger.planned(block)), source):
+            yield source, bundle

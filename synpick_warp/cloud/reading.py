@@ -1,7 +1,8 @@
-"""Reading of data sets in stores: whole into a temporary folder of bounded size, or episode by episode with a cache."""
+"""Reader of data sets in stores: copies of whole sets, episodes by an LRU cache, verification, streams of shards."""
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import importlib
 import json
@@ -32,38 +33,39 @@ from synpick_warp.dataset.commit.manifest import (
 )
 from synpick_warp.dataset.commit.verify import CheckPart, Verdict, check_part
 from synpick_warp.dataset.reading import DataSet, Episode
-from synpick_warp.errors import ConfigError, DatasetError
+from synpick_warp.errors import ConfigError, DatasetError, OutputError, StoreError
 from synpick_warp.system.inputs.paths import path_inside
 from synpick_warp.system.progress import Report
 from synpick_warp.system.stores.base import Store
 from synpick_warp.system.stores.opening import CONTROL, open_store
 
 CACHE_BYTES = 8 << 30
-"""Size of the episodes that an opened set keeps in its temporary folder [B]; those used least recently go first."""
+"""Default limit of an opened set's cache of episodes [B]; the least recently used are evicted."""
 FREE_PART = 0.5
-"""Most of the temporary folder's free space that a set may take."""
+"""Fraction of the temporary folder's free space that a copied set may take."""
 _ENTRY = re.compile(rf"{ENTRIES}/([0-9]{{6,12}})\.json")
 
 
 class Copier:
-    """Copies objects of a data set into a folder of the same names."""
+    """Downloader: copies objects of a data set into a folder, under the same names."""
 
     def __init__(self, url: str, folder: Path) -> None:
         self.store: Store = open_store(url)
         self.folder = folder
 
     def fetch(self, name: str, digest: str | None = None) -> bool:
-        """Copy an object, unless it is there; returns whether the store has it.
+        """Download an object atomically, unless it is in the folder; returns whether it is there then. `digest`: expected SHA-256.
 
         Raises:
-            DatasetError: Its checksum is another one.
+            DatasetError: Its checksum differs, or its name leads out of the folder.
+            OutputError: The folder cannot be written.
         """
         path, state = path_inside(self.folder, name, self.store.url, DatasetError), hashlib.sha256()
         if path.exists():
             return True
-        path.parent.mkdir(parents=True, exist_ok=True)
         part = path.with_name(f".{path.name}.part")
         try:
+            path.parent.mkdir(parents=True, exist_ok=True)
             with part.open("wb") as file:
                 for block in self.store.blocks(name):
                     state.update(block)
@@ -73,17 +75,21 @@ class Copier:
             part.replace(path)
         except FileNotFoundError:
             return False
+        except OSError as error:
+            reason = error.strerror or error
+            raise OutputError(f"cannot copy {self.store.url}/{name} to {path}: {reason}; set TMPDIR to a folder with more space") from None
         finally:
-            part.unlink(missing_ok=True)
+            with contextlib.suppress(OSError):
+                part.unlink()
         return True
 
     def fetch_all(self, names: dict[str, str | None]) -> None:
-        """Copy objects in parallel, with their checksums (None: not known). Missing ones are left out."""
+        """Download objects in parallel, given their SHA-256 by name (None: unchecked). Missing objects are skipped."""
         with ThreadPoolExecutor(FILES_AT_ONCE, "download") as pool:
             list(pool.map(lambda item: self.fetch(*item), names.items()))
 
     def fetch_records(self) -> None:
-        """Copy manifest and settings.
+        """Download manifest and settings.
 
         Raises:
             DatasetError: There is no manifest.
@@ -94,28 +100,29 @@ class Copier:
         (self.folder / ENTRIES).mkdir(exist_ok=True)
 
     def fetch_entry(self, entry: Path) -> bool:
-        """Copy a manifest entry; returns whether there is one."""
+        """Download a manifest entry, both files; returns whether there is one."""
         return self.fetch(f"{entry}.json") and self.fetch(f"{entry}.sha256")
 
     def episodes(self) -> Iterator[int]:
-        """Episodes that have a done mark, in the order of their names; read as far as they are asked for."""
+        """Yield the episodes that have a done mark, in the order of their keys, lazily."""
         for key, _ in self.store.list(str(ENTRIES)):
             if match := _ENTRY.fullmatch(key):
                 yield int(match[1])
 
 
 def copy_set(url: str, folder: Path, wanted: Callable[[str], bool] = lambda name: True) -> None:
-    """Copy a data set into an empty folder.
+    """Download a whole data set into a new folder.
 
     Args:
         url: Its prefix.
-        folder: The folder.
-        wanted: Whether a file is copied, by its name.
+        folder: The folder, which is made.
+        wanted: Predicate: whether a file is copied, by its name.
 
     Raises:
         DatasetError: It is no data set, or larger than FREE_PART of the free space there.
     """
-    copier = Copier(url, folder)
+    copier = Copier(url, folder)  # Refuses URLs whose last part would lead elsewhere.
+    folder.mkdir()
     copier.fetch_records()
     names, size = [], 0
     free = int(FREE_PART * shutil.disk_usage(folder).free)
@@ -133,16 +140,18 @@ def copy_set(url: str, folder: Path, wanted: Callable[[str], bool] = lambda name
 
 
 def verify_store(url: str, report: Report = lambda unit, done, total: None) -> Verdict:
-    """Verify the checksum of every file of a data set in a store; as `commit.verify.verify`, one entry at a time in a temporary folder.
+    """Verify the checksum of every file of a data set in a store, as `commit.verify.verify`: downloads one entry at a time.
 
     Raises:
-        DatasetError: The prefix has no data set.
+        DatasetError: The prefix has no data set, or its manifest is damaged.
+        OutputError: The temporary folder cannot be written.
+        StoreError: The store cannot be read.
     """
     with tempfile.TemporaryDirectory(prefix="synpick-verify-") as name:
         folder = Path(name)
         copier = Copier(url, folder)
         copier.fetch_records()
-        manifest, files, episodes, finished = read_manifest(folder), 0, [], False
+        manifest, files, episodes, listed, finished = read_manifest(folder), 0, [], [], False
         try:
             read_settings(folder, manifest)
             episodes = sorted(copier.episodes())
@@ -154,11 +163,13 @@ def verify_store(url: str, report: Report = lambda unit, done, total: None) -> V
                     finished = listed == episodes
         except (ConfigError, DatasetError) as error:
             return Verdict(str(error).replace(name, url), len(episodes), files, finished)
-    return Verdict("", len(episodes), files, finished)
+    names = (f"{episode_entry(episode)}.json" for episode in sorted(set(listed) - set(episodes)))
+    gone = next((name for name in names if copier.store.stat(name) is None), None)  # Others were committed meanwhile.
+    return Verdict(f"{url}/{gone} is missing" if gone else "", len(episodes), files, finished)
 
 
 def _verify_entry(copier: Copier, entry: Path) -> tuple[int, list[int]]:
-    """Verify the files of an entry, and delete them; returns their number, and of the indices the episodes.
+    """Download and verify the files of an entry, and delete them; returns their number, and the episodes that the indices list.
 
     Raises:
         DatasetError: A file is missing or damaged.
@@ -179,27 +190,33 @@ def _verify_entry(copier: Copier, entry: Path) -> tuple[int, list[int]]:
 
 
 class StoreCache:
-    """Temporary folder with the records of a data set in a store, and its episodes used last."""
+    """LRU cache of a data set's episodes in a temporary folder, which also has its records, constants and indices. Not for several threads
+    or processes."""
 
     def __init__(self, url: str, limit: int = CACHE_BYTES) -> None:
+        """Download all but the episodes. Arguments and errors as `open_store_set`."""
         place = tempfile.mkdtemp(prefix="synpick-read-")
         weakref.finalize(self, shutil.rmtree, place, ignore_errors=True)
         self.folder = Path(place) / (url.rpartition("/")[2] or "set")
+        self.copier, self._limit = Copier(url, self.folder), limit  # Refuses URLs whose last part would lead elsewhere.
         self.folder.mkdir()
-        self.copier, self._limit = Copier(url, self.folder), limit
         self._held: OrderedDict[int, int] = OrderedDict()
-        """Episodes that are here, with their sizes [B], the one used last at the end."""
+        """Cached episodes with their sizes [B], least recently used first."""
         self.copier.fetch_records()
         for entry in (CONSTANTS, INDICES):
             if self.copier.fetch_entry(entry):
                 self.copier.fetch_all(dict(read_checksums(self.folder, entry)))
 
     def has(self, episode: int) -> bool:
-        """Whether an episode has a done mark."""
+        """Whether an episode is committed: cached, or its done mark is in the store."""
         return episode in self._held or self.copier.store.stat(f"{episode_entry(episode)}.json") is not None
 
     def fetch(self, episode: int) -> None:
-        """Copy the files of an episode here, checked by their checksums, and drop others beyond the limit."""
+        """Download an episode, checked by its checksums, and evict the least recently used ones beyond the limit.
+
+        Raises:
+            DatasetError: It is damaged, or a file is missing.
+        """
         if episode in self._held:
             self._held.move_to_end(episode)
             return
@@ -218,8 +235,8 @@ class StoreCache:
 
 
 class StoreDataSet(DataSet):
-    """Data set in a store: an episode is copied into a temporary folder when it is asked for, and deleted when others need its place. Files
-    of an episode that was dropped are gone: ask the data set for it again."""
+    """Data set in a store: indexing downloads an episode into the cache. An `Episode` object loses its files when it is evicted; index the
+    data set again."""
 
     def __init__(self, cache: StoreCache, episodes: range | None = None) -> None:
         super().__init__(cache.folder, episodes)
@@ -238,24 +255,24 @@ class StoreDataSet(DataSet):
         return super().__getitem__(index)
 
     def __iter__(self) -> Iterator[int]:
-        """Committed episodes by the order of their marks; those that were given up have no files, and are left out where that is known."""
+        """Iterate over the committed episodes in the order of their keys, without those known to be given up, which have no files."""
         found = (index for index in self._cache.copier.episodes() if self._only is None or index in self._only)
         return (index for index in found if index not in self._given_up)
 
     @cached_property
     def _given_up(self) -> frozenset[int]:
-        """Episodes without frames, by the list of episodes."""
+        """Episodes without frames, by the list of episodes; empty while there is no such list."""
         path = self.folder / "episodes.jsonl"
         rows: list[dict[str, Any]] = [json.loads(line) for line in path.read_text().splitlines()] if path.exists() else []
         return frozenset(row["episode"] for row in rows if not row["frames"])
 
 
 def open_store_set(url: str, limit: int = CACHE_BYTES) -> DataSet:
-    """Open a data set in a store.
+    """Open a data set in a store: downloads its records, constants and indices.
 
     Args:
         url: Its prefix.
-        limit: Size of the episodes that are kept in a temporary folder [B].
+        limit: Size of the cache of episodes [B]; the last one is kept whatever its size.
 
     Raises:
         DatasetError: The prefix has no data set.
@@ -265,19 +282,20 @@ def open_store_set(url: str, limit: int = CACHE_BYTES) -> DataSet:
 
 
 def list_shards(url: str) -> list[str]:
-    """URLs of a set's webdataset shards, sorted; after `stream_shards`, `webdataset.WebDataset` reads them without a copy."""
+    """List the URLs of a set's webdataset shards, sorted, also those of episodes that are not committed. `stream_shards` lets
+    `webdataset.WebDataset` read them without a copy."""
     store = open_store(url)
     return [f"{store.url}/{name}" for name, _ in store.list("") if re.fullmatch(r"[^/]+_web/shard-[0-9]+\.tar", name)]
 
 
 class _Stream:
-    """Object as a file that is read once, from its beginning."""
+    """File-like object that reads blocks sequentially: no seeking, no writing."""
 
     def __init__(self, blocks: Iterator[bytes]) -> None:
         self._blocks, self._held = blocks, bytearray()
 
     def read(self, size: int = -1) -> bytes:
-        """Read up to `size` bytes, -1: all; fewer at the end only."""
+        """Read `size` bytes, fewer only at the end; -1: all."""
         while size < 0 or len(self._held) < size:
             block = next(self._blocks, None)
             if block is None:
@@ -289,7 +307,7 @@ class _Stream:
         return data
 
     def close(self) -> None:
-        """Drop what was not read."""
+        """Discard the rest: further reads return what is buffered, then nothing."""
         self._blocks = iter(())
 
     def __enter__(self) -> _Stream:
@@ -299,14 +317,16 @@ class _Stream:
         self.close()
 
 
-def open_stream(url: str, *_: object, **__: object) -> IO[bytes]:
-    """Open an object of a store as a stream, in the form of webdataset's openers."""
+def open_stream(url: str, mode: str = "rb", *_: object, **__: object) -> IO[bytes]:
+    """Open an object as a binary stream, with the signature of webdataset's openers. Raises StoreError: the mode is not for reading."""
+    if "r" not in mode:
+        raise StoreError(f"{url} can be streamed for reading only; write to a local file")
     place, _slash, name = url.rpartition("/")
     return _Stream(open_store(place).blocks(name))  # type: ignore[return-value]
 
 
 def stream_shards() -> None:
-    """Have webdataset open URLs of object stores by these stores, in place of the programs aws and gsutil."""
+    """Register `open_stream` with webdataset as the opener of s3, gs, az and memory URLs, in place of the programs aws and gsutil."""
     openers = importlib.import_module("webdataset.gopen").gopen_schemes
     for scheme in ("s3", "gs", "az", "memory"):
         openers[scheme] = open_stream

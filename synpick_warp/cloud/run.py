@@ -1,4 +1,4 @@
-"""Bake into a store: episodes are baked in a temporary folder, delivered meanwhile, and finalized by whoever ends last."""
+"""Distributed bake into an object store: episodes are baked in a temporary folder and uploaded meanwhile; the last worker finalizes."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ from synpick_warp.system.progress import Progress
 from synpick_warp.system.stores.opening import open_store, probe
 
 MAX_CHUNK = 10_000
-"""Most episodes of a bake without claims from one start of the worlds to the next."""
+"""Chunk size of a bake without claims [episodes], to within a block; each chunk starts the worlds anew."""
 
 
 Baker = Callable[..., BakeSummary]
-"""Bakes episodes into a folder, with the arguments of `pipeline.bake_episodes`."""
+"""Function that bakes episodes into a folder, with the arguments of `pipeline.bake_episodes`."""
 
 
 def bake_into_store(
@@ -41,7 +41,7 @@ def bake_into_store(
     *,
     claim: bool = False,
 ) -> BakeSummary:
-    """Simulate, render and upload a data set, or the remaining episodes of one.
+    """Bake a data set into an object store: simulates, renders and uploads it, or the remaining episodes of one.
 
     Args:
         config: All settings.
@@ -54,7 +54,7 @@ def bake_into_store(
         claim: Whether this is one of several equal workers, which share the episodes out among them by claims.
 
     Returns:
-        Summary of the episodes of this run; those that were done before are not in it.
+        Summary of this run's episodes, without those that were done before, and those of chunks that were lost to other workers.
 
     Raises:
         SynpickError: An error that the user can correct; done episodes stay, and the same bake resumes.
@@ -86,7 +86,7 @@ def bake_into_store(
 
 
 def _take(summary: BakeSummary, part: BakeSummary) -> bool:
-    """Add a chunk to the summary; returns whether it was stopped."""
+    """Add the summary of a chunk to that of the run; returns whether a signal stopped the bake."""
     summary.total += part.total
     summary.take_summary(part)
     summary.wall_seconds += part.wall_seconds
@@ -102,7 +102,7 @@ def _bake_claims(
     summary: BakeSummary,
     progress: Progress,
 ) -> bool:
-    """Bake chunks until all are done by somebody; returns whether this worker was stopped."""
+    """Worker loop: claims and bakes chunks until all of the plan are done; returns whether a signal stopped this worker."""
     size = default_chunk(ledger.config.bake.worlds, sum(map(len, ranges)))
     chunks = Chunks(ledger, claims, ranges, size)
     for chunk in chunks:
@@ -126,10 +126,10 @@ def _bake_claims(
 
 
 def _finalize_once(ledger: Ledger, claims: Claims, place: Path) -> int:
-    """Finalize by one worker at a time; the others wait for it, and take over if it dies. Returns as `finalize_store`."""
+    """Finalize under a lease, one worker at a time; the others wait, and take over if it dies. Returns as `finalize_store`."""
     planned = ledger.layout.planned
     while ledger.finished() < planned:
-        claim = claims.take(f"{CLAIMS}/indices-{planned}")
+        claim = claims.take(f"{CLAIMS}/indices")
         if claim is not None:
             try:
                 return finalize_store(ledger, place)
@@ -140,7 +140,7 @@ def _finalize_once(ledger: Ledger, claims: Claims, place: Path) -> int:
 
 
 def _chunks(ledger: Ledger, ranges: Sequence[range]) -> Iterator[list[int]]:
-    """Remaining episodes, in lists of at most MAX_CHUNK and a block."""
+    """Yield the remaining episodes in chunks of about MAX_CHUNK: whole blocks, so up to BLOCK - 1 more."""
     held: list[int] = []
     for left in ledger.remaining(ranges):
         held += left
@@ -160,21 +160,17 @@ def _bake_chunk(
     bake: Baker,
     permit: Callable[[], None] = lambda: None,
 ) -> BakeSummary:
-    """Bake episodes in a new folder, and deliver them; errors name the store in its place."""
+    """Bake and upload a chunk of episodes in a new temporary folder; messages of errors name the store in its place."""
     folder = Path(tempfile.mkdtemp(dir=place))
     if ledger.manifest is not None:  # It has the digests of objects and lights, which the bake compares.
         (folder / MANIFEST_FILE).write_bytes(ledger.manifest)
     try:
         with Delivery(ledger, folder, permit) as delivery:
             watched = WatchedProgress(progress, delivery.check)
-            return bake(ledger.config, folder, watched, episodes, devices, partial(_finish, delivery))
+            return bake(ledger.config, folder, watched, episodes, devices, delivery.finish)
     except (StoreError, LeaseLostError):
         raise
     except SynpickError as error:
         raise type(error)(str(error).replace(str(folder), ledger.store.url)) from error
     finally:
         shutil.rmtree(folder, ignore_errors=True)
-
-
-def _finish(delivery: Delivery) -> None:
-    delivery.finish()

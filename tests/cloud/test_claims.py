@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import os
 import random
 import subprocess
@@ -12,7 +13,7 @@ import time
 import pytest
 
 from synpick_warp.cloud import finish, run
-from synpick_warp.cloud.claims import Claims, LeaseLostError, Sizes, default_chunk
+from synpick_warp.cloud.claims import Chunks, Claims, LeaseLostError, Sizes, default_chunk
 from synpick_warp.cloud.ledger import Ledger
 from synpick_warp.errors import StoreError
 from synpick_warp.system.progress import SilentProgress
@@ -77,6 +78,41 @@ def test_a_heartbeat_keeps_a_claim_and_a_dead_one_is_taken_over(memory):
         claim.check()
     second.check()
     second.stop()
+
+
+def test_a_heartbeat_that_failed_after_it_was_written_loses_nothing(memory, monkeypatch):
+    store, answers = open_store(memory), iter([False])
+    real = store.replace
+
+    def replace(*arguments):
+        tag = real(*arguments)
+        if next(answers, True):
+            return tag
+        raise StoreError("no answer")
+
+    monkeypatch.setattr(store, "replace", replace)
+    claim = Claims(store, 0.0, 0.4).take("k")
+    assert claim is not None
+    time.sleep(0.6)
+    claim.check()
+    claim.stop()
+
+
+def test_an_error_ends_the_heartbeat_of_a_chunk(memory, monkeypatch):
+    def fail(*_):
+        raise StoreError("no answer")
+
+    monkeypatch.setattr(Ledger, "done", fail)
+    store = open_store(memory)
+    chunks = Chunks(Ledger(store, tiny(), Probe(0.0, True)), Claims(store, 0.0), [range(4)], 4)
+    with pytest.raises(StoreError):
+        next(iter(chunks))
+    monkeypatch.undo()
+    (chunk,) = itertools.islice(Chunks(chunks._ledger, Claims(store, 1_000.0), [range(4)], 4), 1)
+    monkeypatch.setattr(store, "put", fail)
+    with pytest.raises(StoreError):
+        chunks.done(chunk)
+    assert not any(thread.name == "heartbeat" for thread in threading.enumerate())
 
 
 def test_the_winner_of_a_lost_lease_is_one(memory):

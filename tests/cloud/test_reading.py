@@ -10,7 +10,7 @@ import pytest
 
 import synpick_warp
 from synpick_warp.cloud import reading
-from synpick_warp.errors import DatasetError
+from synpick_warp.errors import DatasetError, StoreError
 from synpick_warp.system.progress import SilentProgress
 from synpick_warp.system.stores.opening import open_store
 from tests.builders import mistake, run
@@ -91,6 +91,22 @@ def test_damage_is_named_by_its_address(sets, place, monkeypatch):
     monkeypatch.setattr(reading, "FREE_PART", 0.0)
     assert "may be copied" in mistake("stats", url)
     assert "has no manifest.json" in mistake("stats", f"{url}/none")
+    assert list((place / "temporary").iterdir()) == []
+
+
+def test_an_episode_that_the_indices_list_and_is_gone_is_named(sets, place):
+    url, folder = sets
+    last = list(synpick_warp.open(folder))[-1]
+    for end in ("json", "sha256"):
+        open_store(url).delete(f"manifest/{last:06d}.{end}")
+    ran = run("verify", url)
+    assert (ran.code, ran.out) == (1, f"{url}/manifest/{last:06d}.json is missing\n")
+
+
+def test_a_url_whose_last_part_leads_out_of_the_temporary_folder_is_refused(memory, place):
+    assert "has a part . or .." in mistake("stats", f"{memory}/..")
+    with pytest.raises(StoreError, match=r"has a part \. or \.\."):
+        synpick_warp.open(f"{memory}/..")
     assert list((place / "temporary").iterdir()) == []
 
 

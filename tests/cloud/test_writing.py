@@ -10,7 +10,7 @@ import pytest
 from synpick_warp.cloud import run
 from synpick_warp.cloud.ledger import FINISHED, Ledger
 from synpick_warp.configs.schema import FORMATS
-from synpick_warp.errors import ConfigError, OutputError, StoreError
+from synpick_warp.errors import ConfigError, DatasetError, OutputError, StoreError
 from synpick_warp.system.progress import SilentProgress
 from synpick_warp.system.stores.opening import Probe, open_store
 from tests.builders import mistake
@@ -99,10 +99,11 @@ def test_blocks_are_listed_alone(memory, monkeypatch):
     store, config = open_store(memory), tiny(3_500)
     ledger = Ledger(store, config, Probe(0.0, True))
     for episode in range(3_400):
-        store.put(f"manifest/{episode:06d}.json", b"")
+        store.put(f"manifest/{episode:06d}.json", b"{}")
         store.put(f"manifest/{episode:06d}.sha256", b"")
     for block in (0, 2):
-        store.put(f".store/done/{block:06d}-1000", b"")
+        store.put(f".store/done/{block:06d}-1000", b"index files")
+    store.put(".store/done/000001-1000", b"")  # Interrupted.
     listed = []
     monkeypatch.setattr(Ledger, "done", lambda self, block, done=Ledger.done: listed.append(block) or done(self, block))
     assert list(ledger.remaining([range(3_500)])) == [list(range(3_400, 3_500))]
@@ -129,6 +130,27 @@ def test_other_objects_are_refused(memory, monkeypatch):
     monkeypatch.setattr(scripted_bake, "INPUTS", {"objects": 64 * "2", "lights": 64 * "1"})
     with pytest.raises(ConfigError, match=r"memory://.* was started with other objects"):
         bake(memory)
+
+
+def test_a_manifest_that_another_worker_wrote_meanwhile_is_compared(memory):
+    """Also by a store without conditional writes."""
+    store = open_store(memory)
+    ledger = Ledger(store, tiny(), Probe(0.0, False))
+    store.put("manifest.json", b"theirs")
+    with pytest.raises(ConfigError, match="by another worker"):
+        ledger.put_manifest(b"ours")
+    assert store.get("manifest.json") == b"theirs"
+
+
+def test_a_damaged_batched_mark_is_named(memory):
+    bake(memory)
+    store = open_store(memory)
+    (key,) = (key for key, _ in store.list(".store/done"))
+    store.delete(FINISHED)
+    for data in (store.get(key)[:-1], b"none"):
+        store.put(key, data)
+        with pytest.raises(DatasetError, match=rf"{key} is damaged: it is cut off"):
+            bake(memory)
 
 
 def test_a_prefix_in_another_set_is_refused(prefix):
@@ -160,8 +182,10 @@ def _fail(fault: str, *methods: str):
         (_fail("late clock", "HEAD"), None, "the clock of this machine differs"),
         (_fail("", ""), "s3://", "names no bucket"),
         (_fail("", ""), "nowhere://a/b", "nowhere"),
+        (_fail("", ""), "memory://a/..", "has a part . or .."),
+        (_fail("", ""), "file:///proc/none", "cannot be opened"),
     ],
-    ids=["credentials", "bucket", "read-only", "skew refused", "skew measured", "no bucket", "scheme"],
+    ids=["credentials", "bucket", "read-only", "skew refused", "skew measured", "no bucket", "scheme", "dots", "folder"],
 )
 def test_what_cannot_be_used_is_one_line_before_anything_is_simulated(server, prefix, monkeypatch, prepare, url, said):
     prepare(server, monkeypatch)
