@@ -72,4 +72,6 @@ def _summarize(meter: SteadyMeter) -> Iterator[Row]:
     yield Row("files of these", last.tally.files - first.tally.files, "")
     yield Row("errors found in them", int(bool(last.tally.problem)), "")
     yield Row("size of a view on disk", 1e-6 * (last.disk + deleted - first.disk) / max(1, last.count - first.count), "MB")
-    yield Row("largest size on disk", 1e-9 * (max(reading.disk for reading in meter.readings) - meter.initial_disk), "GB")
+    # Others may delete files of the same file system meanwhile.
+    disk = max(meter.initial_disk, *(reading.disk for reading in meter.readings))
+    yield Row("largest size on disk", 1e-9 * (disk - meter.initial_disk), "GB")
