@@ -1,8 +1,11 @@
-"""The report on photographs: known scores, augmentation that keeps labels on objects, and a tiny training; skipped without PyTorch."""
+"""The report on photographs: known scores, augmentation that keeps labels on objects, tiny trainings; skipped without PyTorch."""
 
 from __future__ import annotations
 
+import dataclasses
+import itertools
 import json
+import time
 
 import numpy as np
 import pytest
@@ -14,7 +17,7 @@ from synpick_warp.configs.files.load import load_config, parse_assignment  # noq
 from tools.reports.real import ablation, interval  # noqa: E402
 from tools.reports.real.__main__ import PRESET  # noqa: E402
 from tools.reports.real.detector import average_precision, boxes_of  # noqa: E402
-from tools.reports.real.training import Recipe, warp_views  # noqa: E402
+from tools.reports.real.training import Recipe, train, warp_views  # noqa: E402
 from tools.reports.real.views import Pool  # noqa: E402
 
 RECIPE = Recipe(views=8, passes=1.0, batch=4, width=8, seconds=10.0, capacity=8)
@@ -68,6 +71,36 @@ def test_a_pool_replaces_views_once_it_is_full():
     assert pool.count == 4
     assert pool.seen > 4
     assert pool.draw(9)[0].shape == (9, 3, 2, 2)
+
+
+class Drawn:
+    """Source of squares, each batch after a pause."""
+
+    def __init__(self, pause: float = 0.0, most: int | None = None):
+        self.pause, self.most = pause, most
+
+    def batches(self):
+        for _ in itertools.count() if self.most is None else range(self.most):
+            time.sleep(self.pause)
+            classes = torch.zeros(4, 16, 16, dtype=torch.uint8)
+            classes[:, 4:12, 4:12] = 1
+            yield (classes[:, None] * 200).expand(-1, 3, -1, -1), classes
+
+
+def test_a_pool_that_fills_slowly_leaves_time_to_train():
+    recipe = dataclasses.replace(RECIPE, views=4000, capacity=4000, width=2, seconds=0.6)
+    trained, pool = train(Drawn(0.05), recipe, 2, torch.device("cpu"), 0)
+    assert 0 < trained.views < 4000
+    assert trained.views == pool.seen
+    assert trained.stream_seconds < trained.seconds
+    assert trained.samples >= 4 * recipe.batch
+
+
+def test_views_beyond_the_pool_come_while_the_network_trains():
+    recipe = dataclasses.replace(RECIPE, views=16, width=2, seconds=60.0)
+    trained, _ = train(Drawn(most=4), recipe, 2, torch.device("cpu"), 0)
+    assert trained.views == 16
+    assert trained.samples == 16
 
 
 @pytest.mark.parametrize("name", ablation.LEVERS)

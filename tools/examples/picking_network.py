@@ -1,7 +1,8 @@
 """The learned picker: pixel-wise prediction of pick success by a U-Net on depth and normals, its training and its file. Needs PyTorch.
 
-It learns from tried pixels alone, and from pixels without object as failures. The camera looks straight down, so a turned or mirrored image
-shows a possible state: images, normals and grasp points are turned about the principal point at random.
+It learns from tried pixels, from pixels without object as failures, and, where a data set has them, from analytic maps as an auxiliary
+task, which cover unseen objects too. The camera looks straight down, and its principal point is the middle of the image, so a turned or
+mirrored image shows a possible state: images, normals and grasp points are turned about the principal point at random.
 """
 
 from __future__ import annotations
@@ -9,6 +10,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from pathlib import Path
+from pickle import UnpicklingError
 from typing import Any
 
 import numpy as np
@@ -151,7 +153,8 @@ def _loss(output: torch.Tensor, drawn: Batches) -> torch.Tensor:
     if drawn.maps is None:
         return loss
     visible = (drawn.instance > 0).expand_as(drawn.maps)
-    return loss + HINTS * cross_entropy(output[:, len(LABELS) :][visible], drawn.maps[visible])
+    hints = cross_entropy(output[:, len(LABELS) :][visible], drawn.maps[visible], reduction="sum")
+    return loss + HINTS * hints / visible.sum().clamp(min=1)
 
 
 def score_learned(network: Network, sight: Sight) -> torch.Tensor:
@@ -183,6 +186,7 @@ def load_picker(path: Path, device: torch.device) -> tuple[Network, dict[str, An
         parts = torch.load(path, map_location=device, weights_only=True)
         network = Network(len(LABELS) + len(MAPS), parts["width"], inputs=5).to(device)
         network.load_state_dict(parts["weights"])
-    except (OSError, KeyError, TypeError, RuntimeError, ValueError) as error:
-        raise DatasetError(f"{path} is no picker that `train` wrote: {str(error).splitlines()[0]}") from None
+    except (OSError, EOFError, KeyError, TypeError, RuntimeError, ValueError, UnpicklingError) as error:
+        reason = (str(error) or type(error).__name__).splitlines()[0]
+        raise DatasetError(f"{path} is no picker that `train` wrote: {reason}") from None
     return network.eval(), parts

@@ -145,6 +145,8 @@ def _numbers(interval: Interval) -> dict[str, float | None]:
 def run_train(options: argparse.Namespace, device: torch.device) -> None:
     """Command `train`: train on all episodes except those held out, and evaluate on these."""
     started = time.perf_counter()
+    if not options.picker.parent.is_dir():
+        raise ConfigError(f"--picker is {options.picker}; name a file in a folder that exists")
     samples = load_samples(options.folder)
     unseen = split_objects(samples, options.unseen) if options.unseen else np.zeros(0, int)
     held = np.isin(samples.episode, np.unique(samples.episode)[HELD_OUT - 1 :: HELD_OUT])
@@ -210,7 +212,10 @@ def run_simulation(options: argparse.Namespace, device: torch.device) -> None:
 
 
 def _show_rate(facts: dict[str, Any], picked: int, outcomes: torch.Tensor) -> dict[str, Any]:
-    """Print the success rate of a run with its 95 % interval and outcomes, and return them with `facts` for JSON."""
+    """Print the success rate of a run with its 95 % interval and outcomes, and return them with `facts` for JSON.
+
+    The interval takes attempts as independent: first choices are; those from one bin are not, so that of a run until empty is too narrow.
+    """
     count = int(outcomes.sum())
     low, high = wilson(picked, count)
     named = {outcome.name.lower(): int(number) for outcome, number in zip(Outcome, outcomes, strict=True) if number}

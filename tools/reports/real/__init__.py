@@ -1,4 +1,4 @@
-"""Networks that are trained on streams alone, scored on photographs: training, scores, a detector, ablations."""
+"""Sim-to-real transfer of segmentation and detection: training on streams alone, scores on photographs, an ablation study."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from scipy import stats
 
 
 def interval(values: Sequence[float]) -> str:
-    """95 % interval of the mean over seeds by Student's t, as text; empty for fewer than two."""
+    """95 % confidence interval of the mean over seeds by Student's t, as text; empty for fewer than two values."""
     if len(values) < 2:
         return ""
     reach = float(stats.t.ppf(0.975, len(values) - 1) * np.std(values, ddof=1) / np.sqrt(len(values)))

@@ -1,7 +1,7 @@
-"""Train a segmentation network on a stream alone, and score it on annotated photographs: mIoU, instances found, background.
+"""Sim-to-real semantic segmentation: train on a stream alone, score on annotated photographs (mIoU, instances found, background).
 
 Each seed has piles, pictures and a network of its own; values are means over seeds with 95 % intervals. Held-out synthetic views are scored
-beside, so that the gap is seen. Needs PyTorch; the defaults are for a GPU.
+beside them, which shows the domain gap. Needs PyTorch; the defaults are for a GPU.
 
     python -m tools.reports.real --real REAL --models YCB --lights HDRI --views 24000 --seeds 3 --json real.json --pictures OUT
 """
@@ -38,23 +38,24 @@ from tools.reports.real_frames import RealFrame, read_frames
 TRAINING, HELD_OUT = range(1_000_000), range(1_000_000, 1_100_000)
 """Episodes to train on, and to measure on."""
 FEW_WORLDS = 64
-"""Worlds for held-out views, at most."""
+"""Maximum number of worlds for held-out views."""
 PRESET = "tabletop-train"
-"""Settings of the stream, unless --config names others."""
+"""Default preset of the stream."""
 MODELS = 21
-"""Largest obj_id: the networks have a class for each, and one for what is no object."""
+"""Largest obj_id: networks have a class for each, and class 0 for pixels without object."""
 
 
 @dataclass(frozen=True, eq=False)
 class Outcome:
-    """What a seed gave."""
+    """Trained network of one seed with its scores."""
 
     trained: Trained
     real: Scores
     synthetic: Scores
     overlay: list[tuple[np.ndarray, np.ndarray, np.ndarray]]
+    """Colour image (H, W, 3) uint8, true and predicted obj_ids (H, W) uint8 of each frame."""
     precision: float
-    """AP50 of the detector; NaN: not trained."""
+    """AP at an IoU of 0.5 of the detector; NaN: none was trained."""
 
 
 def run_seed(options: argparse.Namespace, seed: int, frames: list[RealFrame], device: Any) -> Outcome:
@@ -82,7 +83,7 @@ def run_seed(options: argparse.Namespace, seed: int, frames: list[RealFrame], de
 
 
 def _detector(options: argparse.Namespace, pool: Pool, frames: list[RealFrame], size: tuple[int, int], device: Any) -> float:
-    """AP50 of a detector on real frames; NaN: none is asked for, or there is no torchvision, which is said."""
+    """AP at an IoU of 0.5 of a detector on real frames; NaN without --detector, or without torchvision, which is printed."""
     if not options.detector:
         return float("nan")
     network = train_detector(pool, 1 + MODELS, device, options.detector)
@@ -93,7 +94,7 @@ def _detector(options: argparse.Namespace, pool: Pool, frames: list[RealFrame], 
 
 
 def rows_of(outcomes: list[Outcome]) -> list[Row]:
-    """Values over seeds, and by object and frame."""
+    """Rows of the report: means over seeds, for all frames, by object and by frame."""
 
     def row(name: str, values: list[float], unit: str = "", part: str = "") -> Row:
         return Row(name, round(float(np.mean(values)), 4), " ".join(one for one in (unit, interval(values)) if one), part=part)
@@ -134,9 +135,9 @@ def main(arguments: list[str] | None = None) -> int:
                 outcome = run_seed(options, seed, frames, device)
                 outcomes.append(outcome)
                 print(_line(seed, outcome), flush=True)
+                _write(options, outcomes)
                 if options.pictures is not None:
                     draw_overlay(options.pictures / f"{options.name}_seed_{seed}.png", outcome.overlay, 1 + MODELS)
-                _write(options, outcomes)
     except SynpickError as error:
         return fail("reports.real", error)
     print_rows(Console(), "", "photographs", rows_of(outcomes))
@@ -144,7 +145,7 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def _line(seed: int, outcome: Outcome) -> str:
-    """What a seed gave, as a line."""
+    """Summary of a seed, as a line."""
     trained, real = outcome.trained, outcome.real
     return (
         f"seed {seed}: {trained.views} views, {trained.samples} samples, {trained.seconds:.1f} s (stream {trained.stream_seconds:.1f}); "
@@ -154,7 +155,9 @@ def _line(seed: int, outcome: Outcome) -> str:
 
 
 def _write(options: argparse.Namespace, outcomes: list[Outcome]) -> None:
-    """Write the run so far as JSON, so that a killed one leaves its finished seeds."""
+    """Write the finished seeds as JSON, atomically: a run that is killed leaves a whole file."""
+    if options.json is None:
+        return
     by_seed = [
         {
             "mean_iou": one.real.mean_iou,
@@ -171,7 +174,9 @@ def _write(options: argparse.Namespace, outcomes: list[Outcome]) -> None:
         }
         for one in outcomes
     ]
-    write_json(options.json, describe_run("tools.reports.real", (), rows_of(outcomes), name=options.name, seeds=by_seed))
+    part = options.json.with_name(f"{options.json.name}.part")
+    write_json(part, describe_run("tools.reports.real", (), rows_of(outcomes), name=options.name, seeds=by_seed))
+    part.replace(options.json)
 
 
 def parse(arguments: list[str] | None) -> argparse.Namespace:
@@ -194,7 +199,7 @@ def parse(arguments: list[str] | None) -> argparse.Namespace:
         parser.add_argument(flag, type=positive_count, default=default, help=f"{text} (default: {default})")
     numbers = {
         "passes": (4.0, "how often a view is trained on"),
-        "seconds": (280.0, "time limit of a training with its stream [s]"),
+        "seconds": (280.0, "time limit of a training with its stream, of which filling the pool takes at most half [s]"),
         "scale": (1.5, "largest factor of augmentation by size; 1: no geometric augmentation"),
         "rotation": (15.0, "half width of augmentation by rotation [°]"),
         "jitter": (0.3, "strength of photometric augmentation; 0: none"),

@@ -1,8 +1,9 @@
-"""Ablation of what the pictures of a stream differ in, on several GPUs, within a time: each lever off, amounts of views, renderers.
+"""Ablation study of domain randomization, amount of data and renderer, on several GPUs within a time limit.
 
-Each run is a process of `tools.reports.real` with one seed. Runs start in the order of their priority on the next free GPU, those of a
-first seed before those of a second; one that would not end by the deadline is left out, which is said, and runs that --out has already are
-not repeated. Rows of results are written as they come. Without --out, the plan is printed: runs, expected seconds, and when they would end.
+Each run is a process of `tools.reports.real` with one seed. Runs start by priority on the next free GPU, those of a first seed before those
+of a second. A run that would not end by the deadline is left out, which is printed; runs with results in --out are not repeated. Results
+are collected after each run. Without --out, the plan is printed: runs, expected seconds, and when they would end. Synthetic scores are on
+held-out views of each row's own settings, so that rows compare by their scores on photographs alone.
 
     python -m tools.reports.real.ablation --real REAL --models YCB --lights HDRI --gpus 4 --deadline 1400 --out OUT
 """
@@ -39,7 +40,7 @@ DETECTOR = 60.0
 HELD_OUT = 400
 """Synthetic views to measure on."""
 SLACK = 1.15
-"""Factor on expected times, for whether a run still starts."""
+"""Safety factor on expected times: a run starts only if so much time is left."""
 METRICS = {
     "mean_iou": ("mIoU", "", 1.0),
     "found": ("instances with IoU above 0.5", "%", 100.0),
@@ -47,11 +48,11 @@ METRICS = {
     "synthetic_mean_iou": ("synthetic mIoU", "", 1.0),
     "ap50": ("AP50", "", 1.0),
 }
-"""Values of a seed that are collected: label, unit and factor."""
+"""Scores that are collected, by key of a seed's results: label, unit and factor."""
 PASSES = 6.0
-"""Passes of the runs of an ablation."""
+"""Epochs: how often each view is trained on."""
 MIN_STEP_VIEWS = 48_000
-"""Samples that every run trains on at least: little data, as long a training."""
+"""Samples that runs with few views train on: as many as the others."""
 
 _OFF = "[0.0, 0.0]"
 _EFFECTS = ("vignette", "chromatic_aberration", "blur", "shot_noise", "read_noise", "contrast", "saturation")
@@ -65,12 +66,12 @@ LEVERS: dict[str, tuple[str, ...]] = {
     "materials": ("randomize.object_hue=off", "randomize.object_brightness=off", "randomize.object_roughness=off"),
     "edge of the table": ("render.table_size=[0,0]",),
 }
-"""Settings that take a lever away, by its name."""
+"""Settings that switch a part of the randomization off, by its name."""
 
 
 @dataclass(frozen=True)
 class Run:
-    """Runs of one row: arguments of `tools.reports.real` besides the shared ones, and expected time [s]."""
+    """Row of the ablation, one run for each seed: its own arguments of `tools.reports.real`, and what its time follows from."""
 
     name: str
     views: int
@@ -79,18 +80,18 @@ class Run:
     passes: float = PASSES
     rate: float = STREAM_RATE
     limit: float = 280.0
-    """Limit of a training with its stream [s]."""
+    """Time limit of a training with its stream [s]."""
     more: float = 0.0
-    """What else takes time [s]."""
+    """Further time, as of a detector [s]."""
 
     @property
     def seconds(self) -> float:
-        """Expected time of one seed."""
+        """Expected time of one seed [s]."""
         return START + min(self.limit, self.views / self.rate + self.views * self.passes / TRAIN_RATE) + HELD_OUT / self.rate + self.more
 
     @property
     def most_seconds(self) -> float:
-        """Time that must be left for one seed to start."""
+        """Time that must be left for one seed to start [s]."""
         return min(SLACK * self.seconds, SLACK * START + self.limit + HELD_OUT / self.rate + self.more)
 
     def command(self, options: argparse.Namespace, seed: int, gpu: int, stem: str) -> list[str]:
@@ -119,7 +120,7 @@ def plan(views: int, main_views: int) -> Iterator[Run]:
     yield Run("without photometric augmentation", views, ("--jitter", "0"))
     for amount in (1000, 3000):
         yield Run(f"{amount:,} views", amount, passes=MIN_STEP_VIEWS / amount)
-    yield Run("200,000 views", 200_000, ("--capacity", "40000"), seeds=1, passes=2.0, limit=400.0)
+    yield Run("up to 200,000 views", 200_000, ("--capacity", "40000"), seeds=1, passes=2.0, limit=400.0)
     yield Run("2,000 views, fast", 2000, seeds=2, passes=MIN_STEP_VIEWS / 2000)
     traced = _settings("render.mode=reference", "render.samples=64")
     yield Run("2,000 views, path-traced", 2000, (*traced, "--held-out", "60"), 2, MIN_STEP_VIEWS / 2000, REFERENCE_RATE)
@@ -144,11 +145,25 @@ def print_plan(jobs: list[tuple[Run, int]], gpus: int, deadline: float) -> None:
         print(f"{start:6.0f} to {ends:6.0f} s  {run.seconds:4.0f} s  seed {seed}  {run.name}{late}")
 
 
-def execute(jobs: list[tuple[Run, int]], options: argparse.Namespace) -> None:
-    """Run all that fits before the deadline, one process a GPU."""
-    started = time.monotonic()
+def execute(jobs: list[tuple[Run, int]], options: argparse.Namespace) -> int:
+    """Run all that fits before the deadline, one process a GPU; returns the number of runs that failed or were stopped at the deadline."""
     waiting = [(run, seed) for run, seed in jobs if not (options.out / f"{stem_of(run, seed)}.json").exists()]
     running = dict[int, tuple[subprocess.Popen[bytes], Run, int, Any]]()
+    try:
+        return _execute(waiting, running, jobs, options)
+    finally:
+        for process, *_ in running.values():
+            process.kill()
+
+
+def _execute(
+    waiting: list[tuple[Run, int]],
+    running: dict[int, tuple[subprocess.Popen[bytes], Run, int, Any]],
+    jobs: list[tuple[Run, int]],
+    options: argparse.Namespace,
+) -> int:
+    """Loop of `execute` over the runs that wait and, by GPU, those that run."""
+    started, failed = time.monotonic(), 0
     while waiting or running:
         left = options.deadline - (time.monotonic() - started)
         for gpu, (process, run, seed, log) in list(running.items()):
@@ -156,6 +171,7 @@ def execute(jobs: list[tuple[Run, int]], options: argparse.Namespace) -> None:
                 process.kill()
             if process.poll() is not None:
                 log.close()
+                failed += process.returncode != 0
                 print(
                     f"{time.monotonic() - started:6.0f} s  gpu {gpu}  seed {seed}  {run.name}: exit code {process.returncode}", flush=True
                 )
@@ -173,6 +189,7 @@ def execute(jobs: list[tuple[Run, int]], options: argparse.Namespace) -> None:
             process = subprocess.Popen(run.command(options, seed, gpu, stem), stdout=log, stderr=subprocess.STDOUT)
             running[gpu] = (process, run, seed, log)
         time.sleep(0.5)
+    return failed
 
 
 def stem_of(run: Run, seed: int) -> str:
@@ -182,7 +199,7 @@ def stem_of(run: Run, seed: int) -> str:
 
 
 def collect(folder: Path, jobs: list[tuple[Run, int]]) -> dict[str, Any]:
-    """A run as JSON: means over seeds of all rows that have results, with 95 % intervals by Student's t; values and times of seeds."""
+    """Results as JSON: means over seeds of all rows that have some, with 95 % intervals by Student's t; scores and times of seeds."""
     rows: list[Row] = []
     times: dict[str, Any] = {}
     for run in dict.fromkeys(run for run, _ in jobs):
@@ -200,7 +217,7 @@ def collect(folder: Path, jobs: list[tuple[Run, int]]) -> dict[str, Any]:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run the command line; returns the exit code."""
+    """Run the command line; returns the exit code: 1 if a run failed."""
     parser = make_parser(__doc__, "models", "lights")
     parser.add_argument("--real", required=True, help="folder of annotated frames")
     parser.add_argument("--gpus", type=positive_count, default=4, help="GPUs of the host (default: 4)")
@@ -218,7 +235,7 @@ def main(arguments: list[str] | None = None) -> int:
         print(f"reports.real.ablation: --out is {options.out}; name a folder that exists", file=sys.stderr)
         return 2
     else:
-        execute(jobs, options)
+        return 1 if execute(jobs, options) else 0
     return 0
 
 

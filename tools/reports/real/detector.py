@@ -22,7 +22,10 @@ JITTER = 0.3
 
 
 def boxes_of(classes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Boxes (N, 4) float32 [px], exclusive maxima, and obj_ids (N) of objects in a label image, of at least MIN_SIDE each way."""
+    """Bounding boxes (N, 4) float32 [px], exclusive maxima, and obj_ids (N) of a label image; an object is all pixels of its obj_id.
+
+    Boxes narrower or lower than MIN_SIDE are left out.
+    """
     boxes, ids = [], []
     for index in np.unique(classes[classes > 0]):
         rows, columns = np.nonzero(classes == index)
@@ -34,7 +37,7 @@ def boxes_of(classes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def train_detector(pool: Pool, classes: int, device: torch.device, seconds: float, batch: int = 16) -> Any:
-    """Train on the views of a pool for so many seconds; None without torchvision."""
+    """Train Faster R-CNN on the views of a pool for so many seconds; None without torchvision."""
     try:
         from torchvision.models.detection import fasterrcnn_mobilenet_v3_large_fpn  # pyright: ignore[reportMissingImports]
     except ImportError:
@@ -64,7 +67,8 @@ def train_detector(pool: Pool, classes: int, device: torch.device, seconds: floa
 
 
 def detect(network: Any, color: np.ndarray, size: tuple[int, int], device: torch.device) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Boxes (N, 4) [px of `color`], obj_ids and confidences of an image (H, W, 3) uint8, which the network sees at `size`."""
+    """Detections in an image (H, W, 3) uint8 that the network sees at `size` (width, height): boxes (N, 4) [px of `color`], obj_ids (N),
+    confidences (N)."""
     small = cv2.resize(color, size, interpolation=cv2.INTER_AREA)
     with torch.no_grad():
         (found,) = network([torch.from_numpy(small).permute(2, 0, 1).float().div(255).to(device)])
@@ -74,7 +78,12 @@ def detect(network: Any, color: np.ndarray, size: tuple[int, int], device: torch
 
 
 def average_precision(found: Sequence[tuple[np.ndarray, np.ndarray, np.ndarray]], truth: Sequence[tuple[np.ndarray, np.ndarray]]) -> float:
-    """AP at an IoU of 0.5, the area under the interpolated curve (PASCAL VOC 2010), averaged over the objects that occur."""
+    """Average precision at an IoU of 0.5, the area under the interpolated curve (PASCAL VOC 2010), averaged over the objects that occur.
+
+    Args:
+        found: Of each image, detections as of `detect`.
+        truth: Of each image, boxes and obj_ids as of `boxes_of`.
+    """
     values = []
     for index in sorted({int(one) for _, ids in truth for one in ids}):
         hits: list[tuple[float, bool]] = []

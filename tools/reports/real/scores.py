@@ -82,7 +82,7 @@ def _ious(table: np.ndarray) -> np.ndarray:
 
 
 def score_pool(network: nn.Module, pool: Pool, classes: int) -> Scores:
-    """Scores on the views of a pool, at their own size."""
+    """Scores of a network on the views of a pool, at their own size."""
     images, classified = pool.tensors()
 
     def pairs() -> Iterable[tuple[str, np.ndarray, np.ndarray]]:
@@ -95,7 +95,7 @@ def score_pool(network: nn.Module, pool: Pool, classes: int) -> Scores:
 
 
 def _palette(classes: int) -> np.ndarray:
-    """Colours (classes, 3) uint8, RGB, of different hues; black for the background."""
+    """Palette (classes, 3) uint8, RGB, of different hues; black for the background."""
     hues = (np.arange(classes) * 67 % 180).astype(np.uint8)
     values = np.stack([hues, np.full(classes, 220, np.uint8), np.where(np.arange(classes) % 2, 255, 190).astype(np.uint8)], axis=-1)
     colors = cv2.cvtColor(values[None], cv2.COLOR_HSV2RGB)[0]
@@ -104,7 +104,7 @@ def _palette(classes: int) -> np.ndarray:
 
 
 def draw_overlay(path: Path, rows: Sequence[tuple[np.ndarray, np.ndarray, np.ndarray]], classes: int, width: int = 240) -> None:
-    """Write a sheet of PNG: of each view, a column, the image, the truth and the prediction laid over it."""
+    """Write a contact sheet (PNG) with a column of `width` px for each view: image, and truth and prediction laid over it."""
     palette, columns = _palette(classes), []
     for color, truth, found in rows:
         height = round(color.shape[0] * width / color.shape[1])

@@ -23,6 +23,8 @@ LEAST_RATE = 0.01
 """Fraction of the learning rate at which the schedule ends."""
 MAX_NORM = 5.0
 """Norm to which gradients are clipped."""
+FILLING = 0.5
+"""Largest fraction of the time limit that passes before the first step, while the stream fills the pool."""
 
 
 @dataclass(frozen=True)
@@ -66,7 +68,7 @@ class Trained:
 
 
 def warp_views(images: torch.Tensor, classes: torch.Tensor, recipe: Recipe) -> tuple[torch.Tensor, torch.Tensor]:
-    """Scale, rotate and shift views; beyond their borders they are mirrored. images (B, 3, H, W) float32, classes (B, H, W) int64."""
+    """Geometric augmentation of images (B, 3, H, W) float32 with classes (B, H, W) int64: scale, rotation, shift, with mirrored borders."""
     count, height, width = classes.shape
     draw = torch.rand(4, count, device=images.device) * 2 - 1
     factor, angle = recipe.scale ** -draw[0], draw[1] * math.radians(recipe.rotation)
@@ -81,7 +83,7 @@ def warp_views(images: torch.Tensor, classes: torch.Tensor, recipe: Recipe) -> t
 
 
 def jitter_views(images: torch.Tensor, strength: float) -> torch.Tensor:
-    """Photometric changes of images (B, 3, H, W) in 0..1: gain and balance, contrast, saturation, gamma, blur of half, noise."""
+    """Photometric augmentation of images (B, 3, H, W) in 0..1: gain and balance, contrast, saturation, gamma, blur of half, noise."""
 
     def spread(channels: int, width: float) -> torch.Tensor:
         return torch.exp(width * strength * (torch.rand(len(images), channels, 1, 1, device=images.device) * 2 - 1))
@@ -148,14 +150,15 @@ class _Trainer:
 
 
 def train(source: Source, recipe: Recipe, classes: int, device: torch.device, seed: int) -> tuple[Trained, Pool]:
-    """Train a network on views of a stream. The pool is filled first; of more views than it holds, the rest comes while training.
+    """Train a network on views of a stream. The pool is filled first, for at most half of the time limit; the rest comes while training.
 
     Raises:
         SynpickError: Settings, models or lights cannot be used.
     """
     pool, trainer = Pool(min(recipe.views, recipe.capacity), seed), _Trainer(recipe, classes, device, seed)
     batches = source.batches()
-    more = pool.fill(batches, pool.capacity) and pool.seen < recipe.views
+    pool.fill(batches, pool.capacity, FILLING * recipe.seconds)
+    more = pool.seen < recipe.views
     if not more:
         batches.close()
     trainer.waited = time.perf_counter() - trainer.started

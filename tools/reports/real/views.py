@@ -5,6 +5,7 @@ Views of one batch of a stream show few piles. Batches drawn from a pool mix man
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Generator, Iterator
 from dataclasses import dataclass, field
@@ -18,7 +19,7 @@ from synpick_warp.online.dataset import StreamDataset
 
 @dataclass(frozen=True, eq=False)
 class Source:
-    """Settings of a stream, and what is taken of it."""
+    """Stream of training views: its settings, episodes, and which frames are taken."""
 
     config: Config
     episodes: range
@@ -41,7 +42,7 @@ class Source:
 
 @dataclass(eq=False)
 class Pool:
-    """Views on the device; once full, new ones replace random ones.
+    """Replay buffer of views on the device; once full, new ones replace random ones.
 
     Attributes:
         images: (N, 3, H, W) uint8.
@@ -76,10 +77,10 @@ class Pool:
             self.count = min(self.count + 1, self.capacity)
             self.seen += 1
 
-    def fill(self, batches: Iterator[tuple[torch.Tensor, torch.Tensor]], views: int) -> bool:
-        """Add views until `views` have been added in all; False: the stream ended before."""
+    def fill(self, batches: Iterator[tuple[torch.Tensor, torch.Tensor]], views: int, seconds: float = math.inf) -> bool:
+        """Add views until `views` have been added in all; False: the stream ended, or `seconds` passed before."""
         started = time.perf_counter()
-        while self.seen < views:
+        while self.seen < views and time.perf_counter() - started < seconds:
             batch = next(batches, None)
             if batch is None:
                 break
@@ -88,20 +89,20 @@ class Pool:
         return self.seen >= views
 
     def draw(self, size: int) -> tuple[torch.Tensor, torch.Tensor]:
-        """Random views, without repeats where there are enough: images (size, 3, H, W) uint8, obj_ids (size, H, W) int64."""
+        """Batch of random views, drawn with replacement: images (size, 3, H, W) uint8, obj_ids (size, H, W) int64."""
         images, classes = self.tensors()
         chosen = torch.randint(self.count, (size,), generator=self._random).to(images.device)
         return images[chosen], classes[chosen].long()
 
     def tensors(self) -> tuple[torch.Tensor, torch.Tensor]:
-        """Images and obj_ids of the pool, which must have some: all places, of which the first `count` are filled."""
+        """Images and obj_ids of all places, of which the first `count` are filled; the pool must have views."""
         assert self.images is not None
         assert self.classes is not None
         return self.images, self.classes
 
 
 def hold_out(source: Source, views: int) -> Pool:
-    """Views of a stream's episodes to measure on, the first ones.
+    """Held-out views of a stream to measure on: the first that come, so those of the piles that settle soonest.
 
     Raises:
         SynpickError: Settings, models or lights cannot be used.

@@ -21,17 +21,19 @@ _MAD = 1.4826
 """Standard deviation over median absolute deviation of normal noise."""
 _INSIDE = 5
 """Least distance of points to the object's outline [px]."""
+_FEWEST = 50
+"""Fewest points by which an instance is aligned; with fewer it keeps its pose."""
 _BLIND = DepthSensor(shadows=False)
-"""Sensor of the rounds, which is not looked at."""
+"""Depth sensor of the renderings, whose image is not used."""
 
 
 def robust_deviation(values: np.ndarray) -> float:
-    """Standard deviation of normal noise with the values' median absolute deviation; NaN without values."""
+    """Robust standard deviation: 1.4826 times the median absolute deviation; NaN without values."""
     return float(_MAD * np.median(np.abs(values - np.median(values)))) if len(values) else float("nan")
 
 
 def distances(mask: np.ndarray) -> np.ndarray:
-    """Distance of each pixel of a mask (H, W) bool to what is outside of it [px]; 0 outside."""
+    """Distance transform: distance of each pixel of a mask (H, W) bool to the nearest pixel outside of it [px]; 0 outside."""
     return cv2.distanceTransform(mask.astype(np.uint8), cv2.DIST_L2, 5)
 
 
@@ -58,6 +60,8 @@ def align(scenes: RealScenes, poses: Sequence[np.ndarray]) -> list[np.ndarray]:
             measured = back_project(frame, METRES * frame.depth.astype(np.float64))
             for index in range(len(frame.object_ids)):
                 use = inside(rendered, row, index) & (frame.label == frame.object_ids[index]) & (frame.depth > 0)
+                if np.count_nonzero(use) < _FEWEST:
+                    continue
                 normals = rendered.normal[row][use]
                 step = _solve(points[use], normals, ((measured - points)[use] * normals).sum(axis=-1))
                 moved[row][index] = step @ moved[row][index]

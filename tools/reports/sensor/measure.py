@@ -35,7 +35,7 @@ _MILLIMETRES = 1e3
 
 @dataclass(frozen=True, eq=False)
 class Samples:
-    """Pixels of the objects of one sequence (P), those with depth and those without."""
+    """Pixel samples (P) of the objects of one sequence, with and without depth."""
 
     off: np.ndarray
     """Measured minus rendered depth [mm]; NaN: a hole."""
@@ -91,7 +91,7 @@ def collect(frames: Sequence[RealFrame], rendered: Rendered, counts: Sequence[np
 
 
 def ring_holes(frames: Sequence[RealFrame], rendered: Rendered, counts: Sequence[np.ndarray], rows: Sequence[int]) -> float:
-    """Part of holes in the plane around the objects, where the measured picture shows the plane or a hole."""
+    """Rate of holes in the plane within RING px of the objects, where measured depth is that of the plane or a hole."""
     holes = pixels = 0
     for row in rows:
         near = distances(rendered.owner[row] < 0) <= RING
@@ -103,7 +103,7 @@ def ring_holes(frames: Sequence[RealFrame], rendered: Rendered, counts: Sequence
 
 
 def correlation(frames: Sequence[RealFrame], rendered: Rendered, counts: Sequence[np.ndarray], rows: Sequence[int]) -> dict[int, float]:
-    """Correlation of errors of pixels of one row, by their distance [px]."""
+    """Autocorrelation of depth errors along image rows, by distance [px]; NaN without errors."""
     products = dict.fromkeys(LAGS, 0.0)
     pairs = dict.fromkeys(LAGS, 0)
     squares = pixels = 0.0
@@ -111,6 +111,8 @@ def correlation(frames: Sequence[RealFrame], rendered: Rendered, counts: Sequenc
         for index in range(len(frames[row].object_ids)):
             use = inside(rendered, row, index) & (counts[row] > 0) & frames[row].mask(index)
             off = _MILLIMETRES * (METRES * counts[row] - np.where(use, rendered.depth[row], 0.0))
+            if not use.any():
+                continue
             off -= np.median(off[use])
             bound = 4.0 * robust_deviation(off[use])
             off = np.where(use, np.clip(off, -bound, bound), 0.0)
@@ -118,7 +120,8 @@ def correlation(frames: Sequence[RealFrame], rendered: Rendered, counts: Sequenc
             for lag in LAGS:
                 products[lag] += float((off[:, lag:] * off[:, :-lag]).sum())
                 pairs[lag] += int((use[:, lag:] & use[:, :-lag]).sum())
-    return {lag: products[lag] / max(1, pairs[lag]) / (squares / pixels) for lag in LAGS}
+    variance = squares / pixels if squares else float("nan")
+    return {lag: products[lag] / max(1, pairs[lag]) / variance for lag in LAGS}
 
 
 def fit_noise(samples: Samples, focal: float) -> tuple[float, float]:

@@ -1,4 +1,4 @@
-"""Pictures of measured and simulated depth: both, their difference, and their holes."""
+"""Comparison pictures of measured and simulated depth: both, their difference, and their holes."""
 
 from __future__ import annotations
 

@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from synpick_warp.configs.cell.sensors import DepthSensor
 from synpick_warp.configs.schema import Config
+from synpick_warp.errors import DatasetError
 from synpick_warp.factory.assembly import make_renderer
 from synpick_warp.scenes.assets.meshes import read_mesh
 from synpick_warp.scenes.bins import make_bins
@@ -44,7 +45,7 @@ _UPRIGHT = np.eye(3)
 
 @dataclass(frozen=True, eq=False)
 class Rendered:
-    """Images of F frames (F, H, W): what the renderer knows, and what the simulated sensor measures."""
+    """Rendered images of F frames (F, H, W): ground truth, and depth of the simulated sensor."""
 
     depth: np.ndarray
     """Planar depth float32 [m]; inf: nothing is there."""
@@ -68,7 +69,11 @@ def back_project(frame: RealFrame, depth: np.ndarray) -> np.ndarray:
 
 
 def fit_plane(frame: RealFrame) -> tuple[np.ndarray, float]:
-    """Plane that most of the measured points outside of the objects support: unit normal n towards the camera, and n · x [m]."""
+    """Fit a plane to the measured points outside of the objects (RANSAC, then least squares on inliers).
+
+    Returns:
+        Unit normal n towards the camera, and n · x [m].
+    """
     outside = cv2.dilate((frame.label > 0).astype(np.uint8), np.ones((2 * _MARGIN + 1, 2 * _MARGIN + 1), np.uint8)) == 0
     points = back_project(frame, METRES * frame.depth.astype(np.float64))[outside & (frame.depth > 0)]
     rng = np.random.default_rng([frame.sequence, frame.image])
@@ -92,7 +97,9 @@ class RealScenes:
     """Renders annotated frames, one world each, on the CPU."""
 
     def __init__(self, frames: Sequence[RealFrame], models: Path) -> None:
-        """Load models, and fit the planes; raises `SynpickError` for models that are missing or damaged."""
+        """Load models, and fit the planes; raises `SynpickError` for models that are missing or damaged, and frames of other intrinsics."""
+        if any(not np.allclose(frame.intrinsics, frames[0].intrinsics) for frame in frames):
+            raise DatasetError("the frames differ in intrinsics; name those of one camera")
         start_warp()
         self.frames = tuple(frames)
         self.planes = [fit_plane(frame) for frame in frames]
