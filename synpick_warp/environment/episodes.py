@@ -1,6 +1,6 @@
 """Episode counters of a vector environment: seeds, indices of the piles, steps, and flags of termination and truncation.
 
-The index of an environment's k-th episode is a hash of its seed and k, so that it depends neither on other environments nor on time.
+The index of an episode is a hash of its environment's seed and episode counter, so it depends neither on other environments nor on time.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ class Episodes:
     seed: np.ndarray
     """Seed of its episodes (environment) uint64."""
     count: np.ndarray
-    """Episodes begun since the seed was set: k of the next one (environment) int64."""
+    """Episode counter: episodes begun since the seed was set (environment) int64."""
     index: np.ndarray
     """Index of the current episode, which has the same pile in a bake with the same settings (environment) int64."""
     steps: np.ndarray
@@ -63,12 +63,12 @@ class Episodes:
             array[environments] = 0
 
     def reseed(self, seeds: np.ndarray, environments: np.ndarray) -> None:
-        """Set the seeds of environments and restart k at 0."""
+        """Set the seeds of environments, and reset their episode counters to 0."""
         self.seed[environments] = seeds
         self.count[environments] = 0
 
     def draw(self, environments: np.ndarray, piles: int, ahead: int = 0) -> np.ndarray:
-        """Hash seed and k to the index of each environment's next episode, 0 to `piles` - 1, or of the one `ahead` episodes later."""
+        """Hash seed and counter to the index of each environment's next episode, 0 to `piles` - 1, or of the one `ahead` episodes later."""
         counts = self.count[environments] + ahead
         with np.errstate(over="ignore"):
             key = _mix(self.seed[environments] * _GAMMA + counts.astype(np.uint64) + np.uint64(1))
@@ -76,6 +76,7 @@ class Episodes:
 
 
 _GAMMA = np.uint64(0x9E3779B97F4A7C15)
+"""Increment of SplitMix64 (Steele et al., 2014): 2^64 over the golden ratio."""
 
 
 def _mix(x: np.ndarray) -> np.ndarray:

@@ -49,7 +49,7 @@ class Recipe:
     jitter: float = 0.3
     """Strength of photometric changes; 0: none."""
     background: float = 1.0
-    """Weight of pixels without object in the loss."""
+    """Class weight of the background in the loss."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -18,7 +18,7 @@ _STEPS = 8
 _TUKEY = 4.685
 """Tukey's constant, in standard deviations: 95 % efficiency for normal noise (Huber, 1981)."""
 _MAD = 1.4826
-"""Standard deviation over median absolute deviation of normal noise."""
+"""Scale factor from the median absolute deviation of a normal distribution to its standard deviation: 1 / 0.6745."""
 _INSIDE = 5
 """Least distance of points to the object's outline [px]."""
 _FEWEST = 50

@@ -56,7 +56,7 @@ class Samples:
 
     @property
     def scaled(self) -> np.ndarray:
-        """Error at 1 m that has the same error of disparity [mm]: over the square of depth in metres."""
+        """Depth error scaled to 1 m at constant disparity error [mm]: the error divided by the square of the depth in metres."""
         return self.off / self.depth**2
 
     def select(self, rows: np.ndarray) -> Samples:

@@ -56,7 +56,7 @@ class Rendered:
     cosine: np.ndarray
     """Cosine of the angle of incidence float32."""
     albedo: np.ndarray
-    """Mean of the base colour's channels float32, sRGB from 0 to 1."""
+    """Albedo float32: mean of the three channels of the base colour, sRGB, from 0 to 1."""
     sensor: np.ndarray
     """Measured depth uint16 [0.1 mm]; 0: a hole."""
 
