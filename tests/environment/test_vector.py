@@ -63,6 +63,7 @@ def test_bounds_hold_all_bins(target):
 
 def test_pictures_have_no_memory(target):
     """A state is complete without the renderer's light history, because environments have none, whatever the settings say."""
+    target.reset(seed=3)
     state, before = target.get_state(), target.observe()
     target.step(np.array([[0.0, 0.0, 0.1, 0.0, 0.0, 1.0]] * 2))
     assert same(target.set_state(state), before)

@@ -166,3 +166,17 @@ def test_a_pixel_is_picked_as_its_label_was(device):
         for name in ("point", "normal", "yaw", "tilt"):
             np.testing.assert_allclose(getattr(worlds.simulation.plan, name).numpy()[0], getattr(grasps, name).numpy()[row], atol=1e-6)
         environment.set_state(state)
+
+
+def test_choices_are_on_the_target_and_not_barred():
+    """Whatever the range of the scores: barred pixels of the target come before those beside it."""
+    runs = pytest.importorskip("tools.examples.picking_runs", exc_type=ImportError)
+    import torch
+
+    value = torch.tensor([[[40.0, 3.0], [2.0, 1.0]]])
+    target, nothing = torch.tensor([[[False, True], [True, False]]]), torch.zeros_like(value, dtype=torch.bool)
+    choose = runs.DenseChoice(lambda _: value)
+    sight = scores.Sight(value, value.to(torch.uint8), 1.0, target)
+    for barred, pixel in ((None, [1, 0]), (nothing, [1, 0]), (nothing | torch.tensor([[False, True], [False, False]]), [0, 1])):
+        assert choose(None, sight, barred).tolist() == [pixel]
+    assert choose(None, sight, target).tolist() == [[1, 0]]

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 
+import numpy as np
 import torch  # pyright: ignore[reportMissingImports]
 import warp as wp
 
@@ -22,6 +23,8 @@ REACH = 4
 SAMPLED = 256
 """Grasp candidates among which the analytic picker chooses: the sampler draws them over instances and scores, out of 1,024 pixels."""
 MASK = "target_mask"
+BARRED, MISSED = 1e3, 1e4
+"""Penalties on the score of barred pixels, and of pixels beside the target: larger than any score."""
 Score = Callable[[Sight], torch.Tensor]
 Choose = Callable[[PickingEnvironment, Sight, torch.Tensor | None], torch.Tensor]
 """Picker: environment, what it sees and barred pixels (B, H, W) bool -> pixels (B, 2), or grasps (B, 6) as of action `point`."""
@@ -74,8 +77,8 @@ class DenseChoice:
         """Choose pixels (B, 2)."""
         value = self.score(sight)
         if sight.target is not None:
-            value = torch.where(sight.target, value, value - 2.0)
-        return choose_pixels(value if barred is None else torch.where(barred, value - 1.0, value))
+            value = torch.where(sight.target, value, value - MISSED)
+        return choose_pixels(value if barred is None else torch.where(barred, value - BARRED, value))
 
 
 def choose_planned(environment: PickingEnvironment, sight: Sight, barred: torch.Tensor | None) -> torch.Tensor:
@@ -106,13 +109,14 @@ class AnalyticChoice:
 
 
 def act(environment: PickingEnvironment, actions: torch.Tensor) -> Step:
-    """Carry out picks at pixels (B, 2), or grasps (B, 6)."""
-    choice = environment.choice
+    """Carry out picks at pixels (B, 2), or grasps (B, 6); these anywhere, as episodes do, since objects may lean over the bin's rim."""
+    choice, bounds = environment.choice, environment.bounds
     environment.choice = replace(choice, action=PIXEL if actions.shape[1] == 2 else POINT)
+    environment.bounds = np.full(3, -np.inf), np.full(3, np.inf)
     try:
         return environment.step(actions)
     finally:
-        environment.choice = choice
+        environment.choice, environment.bounds = choice, bounds
 
 
 def run_first_choices(
