@@ -68,6 +68,21 @@ def test_a_network_learns_where_picks_succeed():
     assert found["contour", "all"]["auc"].value == pytest.approx(1.0, abs=1e-6)
 
 
+def test_an_ensemble_is_the_mean_of_its_networks(tmp_path):
+    paths = [tmp_path / name for name in ("a.pt", "b.pt", "other.pt")]
+    torch.manual_seed(0)
+    networks = [network.Network(len(network.LABELS) + len(data.MAPS), 4, inputs=5).eval() for _ in range(2)]
+    for path, one, unseen in zip(paths, [*networks, networks[0]], ([], [], [3]), strict=True):
+        network.save_picker(path, one, 4, SIZE, np.array(unseen, int), np.arange(3))
+    whole, facts = network.load_ensemble(paths[:2], CPU)
+    assert facts == {"size": SIZE, "unseen": [], "objects": [0, 1, 2]}
+    inputs = torch.rand(1, 5, *SIZE)
+    with torch.no_grad():
+        torch.testing.assert_close(whole(inputs), (networks[0](inputs) + networks[1](inputs)) / 2)
+    with pytest.raises(network.DatasetError, match=r"other.pt differs from .*a.pt in unseen: \[3\], not \[\]"):
+        network.load_ensemble(paths[::2], CPU)
+
+
 def test_objects_that_are_not_trained_on_are_a_fixed_draw():
     samples = draw_samples(1)
     assert len(data.split_objects(samples, 1)) == 1

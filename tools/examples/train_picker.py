@@ -35,7 +35,7 @@ from synpick_warp.environment.settings import PICK, TARGET
 from synpick_warp.errors import ConfigError, DatasetError, SynpickError
 from synpick_warp.system.hardware.device import pick_device
 from tools.examples.picking_data import Samples, load_samples, split_objects, write_maps
-from tools.examples.picking_network import load_picker, save_picker, score_learned, train
+from tools.examples.picking_network import load_ensemble, save_picker, score_learned, train
 from tools.examples.picking_scores import (
     Sight,
     average_precision,
@@ -45,7 +45,6 @@ from tools.examples.picking_scores import (
     score_random,
     wilson,
 )
-from tools.examples.train_online import Network
 from tools.options import configure, fail, make_names_parser, make_parser, positive_count, writable_file, write_json
 
 HELD_OUT = 5
@@ -64,7 +63,7 @@ LONGEST = 100
 Score = Callable[[Sight], torch.Tensor]
 
 
-def dense_scores(network: Network | None, device: torch.device) -> dict[str, Score]:
+def dense_scores(network: torch.nn.Module | None, device: torch.device) -> dict[str, Score]:
     """Score functions by picker name: the learned picker, if any, and the baselines."""
     generator = torch.Generator(device).manual_seed(0)
     learned: dict[str, Score] = {} if network is None else {LEARNED: partial(score_learned, network)}
@@ -145,8 +144,9 @@ def _numbers(interval: Interval) -> dict[str, float | None]:
 def run_train(options: argparse.Namespace, device: torch.device) -> None:
     """Command `train`: train on all episodes except those held out, and evaluate on these."""
     started = time.perf_counter()
-    if not options.picker.parent.is_dir():
-        raise ConfigError(f"--picker is {options.picker}; name a file in a folder that exists")
+    picker = options.picker[0]
+    if len(options.picker) > 1 or not picker.parent.is_dir():
+        raise ConfigError(f"--picker is {' '.join(map(str, options.picker))}; name a file in a folder that exists")
     samples = load_samples(options.folder)
     unseen = split_objects(samples, options.unseen) if options.unseen else np.zeros(0, int)
     held = np.isin(samples.episode, np.unique(samples.episode)[HELD_OUT - 1 :: HELD_OUT])
@@ -159,7 +159,7 @@ def run_train(options: argparse.Namespace, device: torch.device) -> None:
     loss, seconds = sum(losses[-len(losses) // 10 :]) / len(losses[-len(losses) // 10 :]), time.perf_counter() - started
     print(f"read in {read:.1f} s; {len(losses)} steps in {seconds:.1f} s: loss {losses[0]:.3f} to {loss:.3f}")
     height, width = samples.sight.depth.shape[1:]
-    save_picker(options.picker, network, options.width, (width, height), unseen, np.unique(samples.trials["obj_id"]))
+    save_picker(picker, network, options.width, (width, height), unseen, np.unique(samples.trials["obj_id"]))
     rows = evaluate(samples, np.flatnonzero(held), unseen, dense_scores(network, device), device)
     show_rows(rows)
     facts = {"states": len(used), "held_out": int(held.sum()), "trials": trials, "read_s": read, "train_s": seconds, "loss": loss}
@@ -168,7 +168,7 @@ def run_train(options: argparse.Namespace, device: torch.device) -> None:
 
 def run_evaluate(options: argparse.Namespace, device: torch.device) -> None:
     """Command `evaluate`: evaluate a picker and the baselines at the tried pixels of a whole data set, not that of the training."""
-    network, parts = load_picker(options.picker, device)
+    network, parts = load_ensemble(options.picker, device)
     samples = load_samples(options.folder)
     rows = evaluate(samples, np.arange(len(samples.episode)), np.array(parts["unseen"]), dense_scores(network, device), device)
     show_rows(rows)
@@ -182,10 +182,10 @@ def run_simulation(options: argparse.Namespace, device: torch.device) -> None:
     from synpick_warp.environment.make import make_picking
     from tools.examples import picking_runs as runs
 
-    network, parts = load_picker(options.picker, device)
+    network, parts = load_ensemble(options.picker, device)
     named = {"seen": sorted(set(parts["objects"]) - set(parts["unseen"])), "unseen": parts["unseen"], "all": []}[options.objects]
     if options.objects != "all" and not named:
-        raise ConfigError(f"--objects is {options.objects}, but {options.picker} was trained with --unseen 0")
+        raise ConfigError(f"--objects is {options.objects}, but {options.picker[0]} was trained with --unseen 0")
     config = configure(options, {})
     if named:
         most = max(1, min(MOST_OF_EACH, config.arrangement.max_objects // len(named)))
@@ -236,6 +236,9 @@ def main(arguments: list[str] | None = None) -> int:
     return 0
 
 
+NETWORKS = "file of the network (default: picker.pt); several, of other --seed: their mean (evaluate, run)"
+
+
 def parse(arguments: list[str] | None) -> argparse.Namespace:
     """Parse the command line."""
     parser = make_parser(__doc__, "config", "models", "lights", "seed", "set", "json")
@@ -243,7 +246,7 @@ def parse(arguments: list[str] | None) -> argparse.Namespace:
         "command", choices=COMMANDS, help="train and score on held-out episodes; evaluate on another set; run in simulation"
     )
     parser.add_argument("folder", nargs="?", type=Path, default=Path(), help="data set with picks and images (train, evaluate)")
-    parser.add_argument("--picker", type=Path, default=Path("picker.pt"), help="file of the network (default: picker.pt)")
+    parser.add_argument("--picker", type=Path, nargs="+", default=[Path("picker.pt")], metavar="FILE", help=NETWORKS)
     parser.add_argument("--map", type=writable_file, metavar="FILE", help="draw predictions beside simulated picks to this file (evaluate)")
     parser.add_argument("--device", default="auto", help="cpu, cuda:N or auto (default: auto)")
     parser.add_argument("--width", type=positive_count, default=24, help="channels of the network's first level (default: 24)")
